@@ -27,7 +27,7 @@ from benchmarks.script import make_parser, run_script
 from ganlane.agents.checkpoint import save_agents
 from ganlane.compare import available, cells_of, drive, read_cells
 from ganlane.config.command_line import check
-from ganlane.config.commands import ReproduceConfig
+from ganlane.settings.commands import ReproduceConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import write_results
 from ganlane.reproduce import report

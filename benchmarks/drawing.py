@@ -23,8 +23,8 @@ from collections.abc import Sequence
 
 from benchmarks.script import make_parser, run_script
 from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import IdmMobilTrafficConfig
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.traffic import IdmMobilTrafficConfig
 from ganlane.errors import UserError
 from ganlane.sim.random import Stream
 from ganlane.view import FramePainter, Trajectory, WindowParameters, record_episode

@@ -32,7 +32,7 @@ from ganlane.env import HighwayEnv
 from ganlane.sim import Road
 from ganlane.traffic import IdmMobilTraffic
 try:
-    from ganlane.parameters.episode import SpawnParameters
+    from ganlane.settings.episode import SpawnParameters
 except ImportError:
     from ganlane.sim import SpawnParameters
 

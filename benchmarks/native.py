@@ -31,12 +31,12 @@ from torchrl.envs import TransformedEnv
 
 from ganlane import keys
 from ganlane.build import make_env
-from ganlane.config.env import EnvConfig
+from ganlane.settings.env import EnvConfig
 from ganlane.env import HighwayEnv
 from ganlane.native.library import VARIANTS, best_variant
 from ganlane.native.tensors import Kernel, empty_outcome
-from ganlane.parameters.episode import SpawnParameters
-from ganlane.parameters.observation import ObservationConfig
+from ganlane.settings.episode import SpawnParameters
+from ganlane.settings.observation import ObservationConfig
 from ganlane.sim import neighbours
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.idm_mobil import IdmMobilTraffic

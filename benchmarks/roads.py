@@ -24,7 +24,7 @@ from typing import Any
 from benchmarks.script import make_parser, run_script
 from ganlane.compare import available, cells_of, drive, read_cells
 from ganlane.config.command_line import check
-from ganlane.config.commands import ReproduceConfig
+from ganlane.settings.commands import ReproduceConfig
 from ganlane.evaluation import write_results
 from ganlane.reproduce import report
 

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.bench.measure import EAGER, Case, Row, Runner, measure
 from ganlane.bench.suites import TRAFFIC, TrafficSuite
-from ganlane.config.commands import BenchConfig
+from ganlane.settings.commands import BenchConfig
 from ganlane.evaluation import machine_sentence
 from ganlane.evaluation.table import Table, significant
 from ganlane.generator import GeneratorSizes

@@ -33,7 +33,7 @@ from ganlane.agents import Rainbow, rainbow
 from ganlane.bench.measure import EAGER, Case, Runner, take_turns, torch_threads
 from ganlane.bench.suites import TrainSuite
 from ganlane.bench.systems import Scenario, Training, advance, filled_run, make_agent, repeat
-from ganlane.config.commands import BenchConfig
+from ganlane.settings.commands import BenchConfig
 from ganlane.evaluation import machine_sentence
 from ganlane.evaluation.table import Table, count, percent
 from ganlane.training.checkpoint import TrainingState

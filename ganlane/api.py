@@ -37,17 +37,17 @@ from ganlane.build import Driver
 from ganlane.compare import compare
 from ganlane.config.app import Stopped, function_of
 from ganlane.config.command_line import ALIASES
-from ganlane.config.commands import EvaluateConfig, RunConfig
-from ganlane.config.env import check_reward
+from ganlane.settings.commands import EvaluateConfig, RunConfig
+from ganlane.settings.env import check_reward
 from ganlane.config.runs import CONFIG, LAST, cleared_after_mistakes, held
 from ganlane.config.schemas import SCHEMAS
-from ganlane.config.traffic import TrafficConfig, all_traffics
+from ganlane.settings.traffic import TrafficConfig, all_traffics
 from ganlane.errors import UserError
 from ganlane.evaluation import evaluation_rows, paired_rows, write_episodes, write_results
 from ganlane.evaluation.results import Run, TrainingRun, plain
 from ganlane.files import write_bytes
 from ganlane.options import Option, command_config, option
-from ganlane.parameters import did_you_mean
+from ganlane.settings.record import did_you_mean
 from ganlane.sim.random import Stream
 from ganlane.torch_settings import set_threads
 
@@ -101,7 +101,7 @@ def make_env(
         seed: of the random numbers.
         stream: family of the episodes: ``train``, ``select`` or ``report`` (that of ``evaluate``).
         device: ``cpu`` or ``cuda``.
-        overrides: keys of the environment (:class:`ganlane.config.env.EnvConfig`),
+        overrides: keys of the environment (:class:`ganlane.settings.env.EnvConfig`),
             ``lanes=4, idm={"headway_s": 1}``.
 
     Raises:

@@ -20,12 +20,12 @@ from ganlane.agents import load_agent
 from ganlane.agents.checkpoint import SHIPPED, names_agent, with_seeds
 from ganlane.agents.drivers import DRIVERS, MaskedPolicy
 from ganlane.arguments import call_with, import_target, is_import_path
-from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import TrafficConfig
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import ParameterError, UserError
 from ganlane.files import CHECKPOINTS
-from ganlane.parameters.observation import (
+from ganlane.settings.observation import (
     MASKS,
     MaskParameters,
     ObservationConfig,

@@ -23,8 +23,8 @@ from tqdm import tqdm
 
 from ganlane import evaluation
 from ganlane.build import Driver, make_driver, make_drivers, make_env, make_traffic
-from ganlane.config.commands import EvaluateConfig, ReproduceConfig
-from ganlane.config.traffic import TrafficConfig
+from ganlane.settings.commands import EvaluateConfig, ReproduceConfig
+from ganlane.settings.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import entries
 from ganlane.evaluation.table import show

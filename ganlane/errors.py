@@ -6,10 +6,11 @@ connection or a lost process is an OSError that no user can fix: it keeps its tr
 
 from __future__ import annotations
 
+import difflib
 import errno
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -45,28 +46,29 @@ class UserError(Exception):
 
 
 class ParameterError(UserError):
-    """A parameter out of its range, or incompatible parameters.
+    """A parameter out of its range, or parameters that do not fit together.
 
     The record that raises it knows its fields, not their keys. So the sentence has the fields in
-    braces, ``"{timeout_s}=0: expected a number above 0."``, and a caller that knows the key adds it
-    with :meth:`below`.
-
-    Args:
-        text: the sentence.
-        where: key of the record, for instance ``env.idm``; empty: fields without prefix.
+    braces, ``"{timeout_s}=0: expected a number above 0."``, and who knows the key of the record
+    puts it before them with :meth:`below`.
     """
 
-    def __init__(self, text: str, where: str = "") -> None:
-        super().__init__(text, where)
-        self.text, self.where = text, where
-
     def __str__(self) -> str:
-        place = f"{self.where}." if self.where else ""
-        return re.sub(r"\{([\w.]+)\}", rf"{place}\1", self.text)
+        return _FIELD.sub(r"\1", self.args[0])
 
     def below(self, where: str) -> ParameterError:
-        """The same error with the record's key."""
-        return ParameterError(self.text, where)
+        """The same error, of the record at the key ``where``."""
+        return ParameterError(_FIELD.sub(rf"{{{where}.\1}}", self.args[0]))
+
+
+#: A field in braces in the text of a :class:`ParameterError`.
+_FIELD = re.compile(r"\{([\w.]+)\}")
+
+
+def did_you_mean(name: str, candidates: Iterable[str]) -> str:
+    """A hint such as `` (did you mean 'lanes'?)``; empty where nothing is close."""
+    close = difflib.get_close_matches(name, list(candidates), n=1)
+    return f" (did you mean '{close[0]}'?)" if close else ""
 
 
 def as_typed(value: Any) -> str:

@@ -14,10 +14,10 @@ import torch
 import ganlane
 from ganlane.agents.drivers import DRIVERS
 from ganlane.config.app import function_of
-from ganlane.config.env import EnvConfig
+from ganlane.settings.env import EnvConfig
 from ganlane.config.runs import stored_command
 from ganlane.config.schemas import SCHEMAS
-from ganlane.config.traffic import GanTrafficConfig
+from ganlane.settings.traffic import GanTrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.errors import UserError
 from ganlane.options import option

@@ -25,7 +25,7 @@ from ganlane.config.command_line import sentence, typed
 from ganlane.config.schemas import SCHEMAS, node_of
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
-from ganlane.parameters import NO_KEY
+from ganlane.settings.record import NO_KEY
 
 SCENE = Path(__file__).parent / "reference" / "scene.csv"
 

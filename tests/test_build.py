@@ -11,17 +11,17 @@ from torchrl.envs.utils import check_env_specs
 
 from ganlane.agents.drivers import DRIVERS, MobilDriver
 from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.config.env import EnvConfig
-from ganlane.config.recordings import RealismConfig
-from ganlane.config.traffic import (
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.recordings import RealismConfig
+from ganlane.settings.traffic import (
     HighwayEnvTrafficConfig,
     IdmMobilTrafficConfig,
     IdmTrafficConfig,
     SumoTrafficConfig,
 )
 from ganlane.errors import UserError
-from ganlane.parameters.driving import IdmParameters, MobilParameters
-from ganlane.parameters.observation import FORMS, ObservationConfig
+from ganlane.settings.driving import IdmParameters, MobilParameters
+from ganlane.settings.observation import FORMS, ObservationConfig
 from ganlane.sim.random import Stream
 
 ROAD = EnvConfig(

@@ -9,9 +9,9 @@ import pytest
 
 from ganlane.build import make_driver
 from ganlane.compare import compare, publish, recorded_crashes
-from ganlane.config.commands import EvaluateConfig
-from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import IdmTrafficConfig, ReplayTrafficConfig
+from ganlane.settings.commands import EvaluateConfig
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.traffic import IdmTrafficConfig, ReplayTrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.evaluation import crashes_by_scene, failed_episodes
 from ganlane.sim.random import Stream

@@ -7,7 +7,7 @@ import torch
 from reference.worlds import environment, step
 
 from ganlane import keys
-from ganlane.config.env import EnvConfig, check_reward
+from ganlane.settings.env import EnvConfig, check_reward
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.sim.random import Stream

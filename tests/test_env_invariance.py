@@ -12,7 +12,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
-from ganlane.parameters.driving import Visibility
+from ganlane.settings.driving import Visibility
 from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmMobilTraffic

@@ -14,7 +14,7 @@ import ganlane
 import ganlane.gym
 from ganlane import keys
 from ganlane.build import make_traffic
-from ganlane.config.env import EnvConfig
+from ganlane.settings.env import EnvConfig
 from ganlane.env import HighwayEnv
 from ganlane.env.state import ActionCheck
 from ganlane.errors import UserError

@@ -13,7 +13,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
-from ganlane.parameters.driving import Visibility
+from ganlane.settings.driving import Visibility
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
 from ganlane.transforms import OBSERVATIONS, ObservationTransform, RewardTransform, observation

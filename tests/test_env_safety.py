@@ -15,8 +15,8 @@ from reference.worlds import environment, placed, step, vehicles
 from ganlane import keys
 from ganlane.agents.drivers import KeepLaneDriver, MobilDriver
 from ganlane.env import HighwayEnv
-from ganlane.parameters.driving import Visibility
-from ganlane.parameters.episode import SpawnParameters
+from ganlane.settings.driving import Visibility
+from ganlane.settings.episode import SpawnParameters
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.state import Vehicles
 

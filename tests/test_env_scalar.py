@@ -20,7 +20,7 @@ from reference.worlds import (
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
-from ganlane.parameters.episode import SpawnParameters
+from ganlane.settings.episode import SpawnParameters
 from ganlane.sim.state import Vehicles
 
 MOTION = ("x", "y", "heading", "speed", "acceleration")

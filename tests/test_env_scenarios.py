@@ -13,7 +13,7 @@ import torch
 from ganlane import keys
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.config.command_line import check
-from ganlane.config.env import (
+from ganlane.settings.env import (
     BlockedLaneEnvConfig,
     CutInEnvConfig,
     DenseEnvConfig,
@@ -22,7 +22,7 @@ from ganlane.config.env import (
     StopAndGoEnvConfig,
     StopAndGoOptions,
 )
-from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
+from ganlane.settings.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.sim.collisions import pair_overlaps

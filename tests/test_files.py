@@ -38,7 +38,7 @@ from ganlane.files import (
 from ganlane.generator import load_generator
 from ganlane.generator.checkpoint import cached, load_arrays, save_arrays
 from ganlane.generator.tasks import FitLoop
-from ganlane.parameters.generator import LoopConfig, PaperConfig
+from ganlane.settings.generator import LoopConfig, PaperConfig
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
 from ganlane.weights import load_weights, save_weights
 

@@ -21,10 +21,10 @@ from ganlane.agents import load_agent
 from ganlane.arguments import import_target
 from ganlane.build import make_driver
 from ganlane.config.command_line import parse
-from ganlane.config.env import EnvConfig
+from ganlane.settings.env import EnvConfig
 from ganlane.config.runs import refuse_stored_imports
-from ganlane.config.traffic import IdmTrafficConfig
-from ganlane.config.train import FinalEvaluationConfig, TrainConfig
+from ganlane.settings.traffic import IdmTrafficConfig
+from ganlane.settings.train import FinalEvaluationConfig, TrainConfig
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator import load_generator

@@ -29,7 +29,7 @@ from ganlane.data import (
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator.checkpoint import CACHE_VARIABLE, cached, load_generator
-from ganlane.parameters.generator import NgsimParameters
+from ganlane.settings.generator import NgsimParameters
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
 from ganlane.sim.scenarios import read_scene
 from ganlane.training.checkpoint import TrainingState

@@ -22,7 +22,7 @@ from benchmarks.torture.tally import Tally
 from ganlane import build, keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
-from ganlane.parameters.observation import FORMS
+from ganlane.settings.observation import FORMS
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.state import Vehicles
 

@@ -14,7 +14,7 @@ from ganlane.agents.drivers import ExploringPolicy, GreedyPolicy
 from ganlane.agents.n_step import NStepWindow
 from ganlane.agents.network import NetworkConfig, QNetwork
 from ganlane.agents.rainbow import Rainbow
-from ganlane.parameters.agent import RainbowConfig
+from ganlane.settings.agent import RainbowConfig
 
 __all__ = [
     "ExploringPolicy",

@@ -19,7 +19,7 @@ from ganlane.agents.network import NetworkConfig, QNetwork, load_parameters
 from ganlane.agents.rainbow import Rainbow
 from ganlane.errors import UserError, as_typed
 from ganlane.files import CHECKPOINTS
-from ganlane.parameters.agent import without_removed
+from ganlane.settings.agent import without_removed
 from ganlane.weights import load_weights, save_weights
 
 #: Agents that come with the package; others are given by their path.

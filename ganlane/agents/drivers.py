@@ -20,7 +20,7 @@ from ganlane import keys
 from ganlane.agents.network import QNetwork, allowed_values, redraw_noise
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, LEFT, RIGHT
-from ganlane.parameters.driving import IdmParameters, MobilParameters
+from ganlane.settings.driving import IdmParameters, MobilParameters
 from ganlane.sim.dynamics import ego_scene
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV, mobil_wishes

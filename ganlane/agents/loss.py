@@ -28,7 +28,7 @@ from torchrl.objectives import DistributionalDQNLoss, DQNLoss
 
 from ganlane import keys
 from ganlane.agents.network import QNetwork, Weights, allowed_values, matrix_product, noise_of
-from ganlane.parameters.agent import RainbowConfig
+from ganlane.settings.agent import RainbowConfig
 from ganlane.torch_settings import compiled
 
 #: Parameters of a noisy layer.

@@ -22,7 +22,7 @@ from torch.nn import functional
 from torchrl.modules import NoisyLinear
 
 from ganlane.errors import UserError
-from ganlane.parameters.agent import RainbowConfig
+from ganlane.settings.agent import RainbowConfig
 
 #: Weight and bias of each layer.
 Weights = list[tuple[Tensor, Tensor]]

@@ -23,7 +23,7 @@ from ganlane.agents.network import (
 )
 from ganlane.agents.replay import draw, load_replay_state, make_replay, replay_state
 from ganlane.errors import ParameterError, UserError
-from ganlane.parameters.agent import RainbowConfig, without_removed
+from ganlane.settings.agent import RainbowConfig, without_removed
 
 
 class Rainbow:

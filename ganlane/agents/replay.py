@@ -21,7 +21,7 @@ from torchrl.data import (
 from torchrl.data.replay_buffers.storages import Storage
 
 from ganlane.errors import UserError
-from ganlane.parameters.agent import RainbowConfig
+from ganlane.settings.agent import RainbowConfig
 
 #: What a transition consists of; everything else is dropped before storing.
 TRANSITION_KEYS = (

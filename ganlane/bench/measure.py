@@ -20,7 +20,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import torch
 
-from ganlane.config.commands import BenchConfig
+from ganlane.settings.commands import BenchConfig
 from ganlane.errors import UserError
 from ganlane.evaluation.table import NOTHING, Table, count, percent, significant
 from ganlane.runtime import peak_resident_bytes

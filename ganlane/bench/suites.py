@@ -37,10 +37,10 @@ from ganlane.bench.systems import (
     start_training,
 )
 from ganlane.build import make_traffic
-from ganlane.config.commands import BenchConfig
-from ganlane.config.env import DenseEnvConfig, EnvConfig
+from ganlane.settings.commands import BenchConfig
+from ganlane.settings.env import DenseEnvConfig, EnvConfig
 from ganlane.evaluation.table import NOTHING, Table, significant
-from ganlane.parameters.observation import ObservationConfig, RewardParameters
+from ganlane.settings.observation import ObservationConfig, RewardParameters
 
 PHYSICS, ENVIRONMENT, GYMNASIUM = "ganlane physics", "ganlane environment", "ganlane gymnasium"
 TRAFFIC, TRAINING = "ganlane traffic", "ganlane training"

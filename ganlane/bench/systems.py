@@ -25,13 +25,13 @@ from ganlane.agents.drivers import legal_actions
 from ganlane.agents.replay import TRANSITION_KEYS
 from ganlane.bench.measure import COMPILED, EAGER, NATIVE, Runner
 from ganlane.build import make_env, make_road, make_traffic
-from ganlane.config.commands import BenchConfig
-from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import TrafficConfig
+from ganlane.settings.commands import BenchConfig
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.env.highway import native_decision, threads_for
 from ganlane.env.physics import run_decision
-from ganlane.parameters.observation import ObservationConfig, RewardParameters
+from ganlane.settings.observation import ObservationConfig, RewardParameters
 from ganlane.sim.random import episode_key
 from ganlane.sim.state import Vehicles
 from ganlane.training import loop

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ganlane.bench.measure import Suite, measure
 from ganlane.bench.suites import SimSuite, TrafficSuite, TrainSuite
-from ganlane.config.commands import BenchConfig
+from ganlane.settings.commands import BenchConfig
 from ganlane.config.runs import stored_command
 from ganlane.evaluation import machine_sentence, write_results
 from ganlane.evaluation.table import show

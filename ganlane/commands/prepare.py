@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
-from ganlane.config.recordings import PrepareConfig
+from ganlane.settings.recordings import PrepareConfig
 from ganlane.data import (
     Preparation,
     SceneSummary,

@@ -10,17 +10,17 @@ from pathlib import Path
 from typing import Any, Final
 
 from ganlane.build import make_road, make_traffic
-from ganlane.config.env import EnvConfig
-from ganlane.config.recordings import RealismConfig
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.recordings import RealismConfig
 from ganlane.config.runs import stored_command
-from ganlane.config.traffic import TrafficConfig
+from ganlane.settings.traffic import TrafficConfig
 from ganlane.data import data_folder, default_scenes, read_scenes
 from ganlane.errors import UserError
 from ganlane.evaluation import write_results
 from ganlane.evaluation.table import show as show_tables
 from ganlane.files import split_at_markers, write_between_markers, write_bytes
 from ganlane.generator import HELD_OUT, Preset, shipped_generator
-from ganlane.parameters import assign
+from ganlane.settings.record import assign
 from ganlane.realism import measures
 from ganlane.realism.card import Card, card_text, document_text, draw, floors_of, quantity_rows
 from ganlane.realism.driving import Factory, StartOptions

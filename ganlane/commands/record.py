@@ -20,7 +20,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from ganlane.build import make_driver
-from ganlane.config.commands import RecordConfig
+from ganlane.settings.commands import RecordConfig
 from ganlane.config.runs import cleared_after_mistakes
 from ganlane.config.schemas import SCHEMAS
 from ganlane.errors import UserError

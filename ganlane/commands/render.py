@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.config.render import FILMS, MOST_EPISODES, RenderConfig
+from ganlane.settings.render import FILMS, MOST_EPISODES, RenderConfig
 from ganlane.errors import UserError
 from ganlane.evaluation.episodes import ScriptedPolicy
 from ganlane.reproduce.crashes import read_crashes

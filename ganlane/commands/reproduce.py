@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from ganlane.agents import read_agent
 from ganlane.agents.checkpoint import save_agents, with_seeds
 from ganlane.compare import available, cells_of, drive, read_cells
-from ganlane.config.commands import ReproduceConfig
+from ganlane.settings.commands import ReproduceConfig
 from ganlane.config.runs import stored_command
 from ganlane.errors import UserError
 from ganlane.evaluation import failed_episodes, machine_sentence, write_results

@@ -10,7 +10,7 @@ from ganlane.build import make_driver, make_drivers, make_traffic
 from ganlane.compare import compare, publish
 from ganlane.config.app import Stopped
 from ganlane.config.runs import earned
-from ganlane.config.train import TrainConfig
+from ganlane.settings.train import TrainConfig
 from ganlane.errors import UserError
 from ganlane.torch_settings import set_threads
 from ganlane.training.checkpoint import LAST

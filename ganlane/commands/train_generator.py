@@ -13,7 +13,7 @@ from typing import Any
 from tqdm import tqdm
 
 from ganlane import generator
-from ganlane.config.recordings import TrainGeneratorConfig
+from ganlane.settings.recordings import TrainGeneratorConfig
 from ganlane.data import byte_progress, read_recordings, recordings_path
 from ganlane.evaluation import code_version, write_results
 from ganlane.evaluation.table import aligned, show

@@ -56,7 +56,7 @@ from ganlane.data.statistics import (
     leader_gaps,
     survival_curve,
 )
-from ganlane.parameters.generator import NgsimParameters
+from ganlane.settings.generator import NgsimParameters
 
 __all__ = [
     "FRAME_S",

@@ -39,7 +39,7 @@ from ganlane.data.schema import (
     sort,
 )
 from ganlane.errors import UserError
-from ganlane.parameters.generator import MOTORWAYS, NgsimParameters
+from ganlane.settings.generator import MOTORWAYS, NgsimParameters
 
 FOOT_M: Final = 0.3048
 FRAME_MS: Final = 100

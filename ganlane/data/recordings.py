@@ -54,7 +54,7 @@ from ganlane.data.statistics import (
 )
 from ganlane.errors import UserError
 from ganlane.files import PLACE, atomic_path, has_checksum, sealed, write_bytes
-from ganlane.parameters.generator import NgsimParameters
+from ganlane.settings.generator import NgsimParameters
 
 #: Columns of a scene CSV: the schema's, but the speed is ``v``; ``y`` is positive to the left and 0
 #: at the centre of lane 1, which is the leftmost.

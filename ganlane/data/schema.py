@@ -18,7 +18,7 @@ from typing import Final, SupportsInt
 import polars as pl
 
 from ganlane.errors import UserError
-from ganlane.parameters.generator import BLOCK_BYTES
+from ganlane.settings.generator import BLOCK_BYTES
 
 FRAME_S: Final = 0.1
 TRACK_STRIDE: Final = 10_000

@@ -37,7 +37,7 @@ from tqdm import tqdm
 from ganlane.data.schema import FRAME_S, SCHEMA, OnProgress, sort
 from ganlane.errors import UserError
 from ganlane.files import write_json
-from ganlane.parameters.generator import DataConfig, NgsimDataConfig
+from ganlane.settings.generator import DataConfig, NgsimDataConfig
 
 #: Environment variable with the folder of the recordings.
 DATA_VARIABLE: Final = "GANLANE_DATA"

@@ -11,6 +11,6 @@ state travels in the TensorDict, so it can be copied, saved and branched.
 """
 
 from ganlane.env.highway import HighwayEnv
-from ganlane.parameters.episode import EpisodeParameters
+from ganlane.settings.episode import EpisodeParameters
 
 __all__ = ["EpisodeParameters", "HighwayEnv"]

@@ -32,8 +32,8 @@ from ganlane.env.state import (
 from ganlane.errors import UserError
 from ganlane.native.library import torch_on_one_thread, why_not
 from ganlane.native.tensors import Kernel, NativeScenes, moved
-from ganlane.parameters.driving import EgoParameters, IdmParameters, Visibility
-from ganlane.parameters.episode import KERNELS, EpisodeParameters, SpawnParameters
+from ganlane.settings.driving import EgoParameters, IdmParameters, Visibility
+from ganlane.settings.episode import KERNELS, EpisodeParameters, SpawnParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.random import Purpose, episode_key, uniform

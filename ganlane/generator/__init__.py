@@ -26,7 +26,7 @@ from ganlane.generator.fit import (
 from ganlane.generator.networks import Discriminator, Generator
 from ganlane.generator.tasks import Progress
 from ganlane.generator.windows import scene_tracks
-from ganlane.parameters.generator import (
+from ganlane.settings.generator import (
     CalibratedConfig,
     GeneratorSizes,
     LoopConfig,

@@ -27,7 +27,7 @@ from ganlane._version import __version__
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS, has_checksum, sealed_archive, write_bytes
 from ganlane.generator.networks import Generator
-from ganlane.parameters.generator import EXTRA_INPUTS, GeneratorSizes, Preset
+from ganlane.settings.generator import EXTRA_INPUTS, GeneratorSizes, Preset
 from ganlane.weights import load_weights, save_weights
 
 KIND = "generator"

@@ -34,7 +34,7 @@ from ganlane.data import DrivingStatistics
 from ganlane.generator.networks import Generator, Observation
 from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT, Segments
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.parameters.generator import CalibratedConfig
+from ganlane.settings.generator import CalibratedConfig
 from ganlane.sim.idm import TABLE_V, IdmParameters, following_acceleration
 from ganlane.sim.neighbours import FREE_GAP_M, Scene, leader, perceive
 from ganlane.sim.state import ENTRY_M, Road, Vehicles, Visibility

@@ -51,7 +51,7 @@ from ganlane.generator.windows import (
     join_windows,
     scene_tracks,
 )
-from ganlane.parameters.generator import CalibratedConfig, PaperConfig
+from ganlane.settings.generator import CalibratedConfig, PaperConfig
 
 #: Scenes that are held out by default.
 HELD_OUT = ("us101-b", "us101-e", "us101-h", "us101-i")

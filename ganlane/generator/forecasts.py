@@ -42,7 +42,7 @@ from ganlane.generator.windows import (
     segment_batches,
 )
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.parameters.generator import CalibratedConfig
+from ganlane.settings.generator import CalibratedConfig
 from ganlane.sim.idm import TABLE_V, following_acceleration
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.state import Vehicles

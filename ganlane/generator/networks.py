@@ -23,7 +23,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
-from ganlane.parameters.generator import GeneratorSizes
+from ganlane.settings.generator import GeneratorSizes
 
 #: Typical displacement per 0.1 s and typical change of it, along and across the road, m: the
 #: networks' units.

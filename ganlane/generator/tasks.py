@@ -53,7 +53,7 @@ from ganlane.generator.windows import (
     group_windows,
     segment_starts,
 )
-from ganlane.parameters.generator import CalibratedConfig, LoopConfig, PaperConfig
+from ganlane.settings.generator import CalibratedConfig, LoopConfig, PaperConfig
 
 Config = PaperConfig | CalibratedConfig
 

@@ -21,15 +21,15 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 
 from ganlane import keys
-from ganlane.config.commands import RunConfig
-from ganlane.config.env import EnvConfig, check_reward
-from ganlane.config.traffic import TrafficConfig
+from ganlane.settings.commands import RunConfig
+from ganlane.settings.env import EnvConfig, check_reward
+from ganlane.settings.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.native.batch import SPEED_RATIO_LIMIT, NativeBatch, Stepped
 from ganlane.native.library import why_not
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.options import Option, option
-from ganlane.parameters.episode import EpisodeParameters, Stream
+from ganlane.settings.episode import EpisodeParameters, Stream
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]

@@ -21,7 +21,7 @@ from ganlane.gym.rows import Flags, Floats, Rows, observation_space
 from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
 from ganlane.native.batch import Stepped
 from ganlane.options import Option, option
-from ganlane.parameters.observation import largest_number
+from ganlane.settings.observation import largest_number
 from ganlane.sim.state import road_in
 from ganlane.transforms import ObservationTransform
 from ganlane.view import DrawingParameters, EpisodeLabel, FramePainter, Recorder

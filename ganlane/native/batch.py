@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 from ganlane.native import settings
 from ganlane.native.library import addresses, in_threads, load
-from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters, Visibility
-from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
-from ganlane.parameters.observation import (
+from ganlane.settings.driving import EgoParameters, IdmParameters, MobilParameters, Visibility
+from ganlane.settings.episode import EpisodeParameters, SpawnParameters
+from ganlane.settings.observation import (
     MASKS,
     MaskParameters,
     ObservationConfig,

@@ -10,14 +10,14 @@ from collections.abc import Mapping
 from typing import Any, Final, TypeVar
 
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.parameters.driving import (
+from ganlane.settings.driving import (
     EgoParameters,
     IdmParameters,
     MobilParameters,
     SteeringParameters,
 )
-from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
-from ganlane.parameters.observation import NEARNESS_M, OVERLAP_M, ObservationScale, RewardParameters
+from ganlane.settings.episode import EpisodeParameters, SpawnParameters
+from ganlane.settings.observation import NEARNESS_M, OVERLAP_M, ObservationScale, RewardParameters
 
 _FLOAT, _INTEGER, _FLAG = "float32", "int64", "bool"
 #: Arrays [rows, vehicles] and their types.

@@ -15,14 +15,14 @@ from torch import Tensor
 from ganlane.errors import UserError
 from ganlane.native import settings
 from ganlane.native.library import addresses, in_threads, load
-from ganlane.parameters.driving import (
+from ganlane.settings.driving import (
     EgoParameters,
     IdmParameters,
     MobilParameters,
     SteeringParameters,
 )
-from ganlane.parameters.episode import EpisodeParameters
-from ganlane.parameters.observation import ObservationScale
+from ganlane.settings.episode import EpisodeParameters
+from ganlane.settings.observation import ObservationScale
 from ganlane.sim.dynamics import STEERING
 from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road, Vehicles

@@ -23,16 +23,16 @@ from omegaconf.errors import OmegaConfBaseException
 from torchrl.envs import EnvBase
 
 from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.config.commands import EvaluateConfig
-from ganlane.config.env import EnvConfig
+from ganlane.settings.commands import EvaluateConfig
+from ganlane.settings.env import EnvConfig
 from ganlane.config.schemas import SCHEMAS, made, node_of
-from ganlane.config.traffic import TRAFFICS, TrafficConfig
+from ganlane.settings.traffic import TRAFFICS, TrafficConfig
 from ganlane.errors import UserError
 from ganlane.evaluation.episodes import SIDES, Rollout, replay, roll_out
 from ganlane.evaluation.results import plain
 from ganlane.files import write_json
-from ganlane.parameters import NotNegative, Record, Rule, Seed, Text, one_of
-from ganlane.parameters.observation import MaskParameters, ObservationConfig, RewardParameters
+from ganlane.settings.record import NotNegative, Record, Rule, Seed, Text, one_of
+from ganlane.settings.observation import MaskParameters, ObservationConfig, RewardParameters
 from ganlane.sim.random import Stream
 
 #: Rows of every batch in which a list is made and driven again.

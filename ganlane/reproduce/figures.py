@@ -23,8 +23,8 @@ from matplotlib.transforms import Affine2D
 
 from ganlane.agents.checkpoint import with_seeds
 from ganlane.build import Driver, make_driver, make_env, make_traffic
-from ganlane.config.commands import ReproduceConfig
-from ganlane.config.traffic import TrafficConfig
+from ganlane.settings.commands import ReproduceConfig
+from ganlane.settings.traffic import TrafficConfig
 from ganlane.data import FRAME_S, default_scenes, read_scenes
 from ganlane.errors import UserError
 from ganlane.generator import load_generator, shipped_generator

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX, LEFT, RIGHT
-from ganlane.parameters.driving import EgoParameters, IdmParameters, SteeringParameters
+from ganlane.settings.driving import EgoParameters, IdmParameters, SteeringParameters
 from ganlane.sim.collisions import dangerously_close
 from ganlane.sim.idm import acceleration_behind
 from ganlane.sim.neighbours import Neighbour, Scene, follower, leader, perceive

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.parameters.driving import IdmParameters
+from ganlane.settings.driving import IdmParameters
 from ganlane.sim.neighbours import Neighbour, Scene, leader
 from ganlane.sim.state import spanned
 

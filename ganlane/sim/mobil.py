@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
-from ganlane.parameters.driving import MobilParameters
+from ganlane.settings.driving import MobilParameters
 from ganlane.sim.idm import TABLE_V, AnyIdm, DriverIdm, acceleration_behind, idm_acceleration
 from ganlane.sim.neighbours import FREE_GAP_M, Scene, compare, follower, leader
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap

@@ -13,7 +13,7 @@ from enum import IntEnum
 import torch
 from torch import Tensor
 
-from ganlane.parameters.episode import Stream as Stream  # also known as ganlane.sim.Stream
+from ganlane.settings.episode import Stream as Stream  # also known as ganlane.sim.Stream
 
 _GOLDEN = -7046029254386353131  # 0x9E3779B97F4A7C15 as a signed 64-bit integer
 _MIX_A = -4658895280553007687  # 0xBF58476D1CE4E5B9

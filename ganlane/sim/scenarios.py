@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from ganlane.errors import UserError
-from ganlane.parameters.driving import IdmParameters, Visibility
+from ganlane.settings.driving import IdmParameters, Visibility
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.scenes import FixedScene, SceneVehicle, check_count
 from ganlane.sim.state import Road

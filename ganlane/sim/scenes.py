@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.parameters.driving import IdmParameters, Visibility
+from ganlane.settings.driving import IdmParameters, Visibility
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.dynamics import advance, steer
 from ganlane.sim.idm import following_acceleration, needed_deceleration

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from ganlane.errors import ParameterError, UserError
 from ganlane.keys import EGO_INDEX
-from ganlane.parameters.driving import IdmParameters, Visibility
-from ganlane.parameters.episode import SpawnParameters
+from ganlane.settings.driving import IdmParameters, Visibility
+from ganlane.settings.episode import SpawnParameters
 from ganlane.sim.idm import TABLE_V, can_brake, highest_speed, idm_acceleration, least_gap
 from ganlane.sim.neighbours import Scene, perceive
 from ganlane.sim.random import Purpose, draw_keys, uniform

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ganlane.keys import VEHICLE_FIELDS
-from ganlane.parameters.driving import Visibility
+from ganlane.settings.driving import Visibility
 
 ENTRY_M = 0.1
 #: In an initial scene: the traffic sets a :class:`Visibility` per episode.

@@ -12,7 +12,7 @@ not ours: the ego is moved by the environment as always, and there a stand-in dr
 Their packages are imported when a model is made, not before.
 """
 
-from ganlane.parameters.driving import (
+from ganlane.settings.driving import (
     AbortFaults,
     BrakingFaults,
     HesitationFaults,

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.parameters.driving import Visibility
+from ganlane.settings.driving import Visibility
 from ganlane.sim.random import Stream, absorb, episode_key
 from ganlane.sim.scenes import Scenes
 from ganlane.sim.state import Road, Vehicles

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
-from ganlane.parameters.driving import (
+from ganlane.settings.driving import (
     AbortFaults,
     BrakingFaults,
     DriverFaults,

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
-from ganlane.parameters.driving import Visibility
+from ganlane.settings.driving import Visibility
 from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import Memory, Moved, TrafficModule, require

@@ -13,8 +13,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
-from ganlane.parameters import Range
-from ganlane.parameters.driving import IdmParameters, MobilParameters, RandomDrivers
+from ganlane.settings.record import Range
+from ganlane.settings.driving import IdmParameters, MobilParameters, RandomDrivers
 from ganlane.sim.dynamics import STEERING, SteeringParameters, advance, steer
 from ganlane.sim.idm import TABLE_V, DriverIdm, following_acceleration, needed_deceleration
 from ganlane.sim.mobil import TABLE_IV, DriverMobil, mobil_changes

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ganlane.parameters.driving import IdmParameters, MobilParameters
+from ganlane.settings.driving import IdmParameters, MobilParameters
 from ganlane.sim.idm import TABLE_V, acceleration_behind
 from ganlane.sim.mobil import one_at_a_time, safe_change, without_ego
 from ganlane.sim.neighbours import Scene, leader, perceive

@@ -19,7 +19,7 @@ from ganlane.generator import (
     load_generator,
     shipped_generator,
 )
-from ganlane.parameters.driving import (
+from ganlane.settings.driving import (
     CalibratedGanParameters,
     DriverFaults,
     GanParameters,
@@ -123,7 +123,7 @@ def gan_traffic(
 
     Args:
         road, stream: as for every traffic module.
-        path, guard, noise_scale, execute_k: see :class:`~ganlane.parameters.driving.GanParameters`.
+        path, guard, noise_scale, execute_k: see :class:`~ganlane.settings.driving.GanParameters`.
         idm: of the guard's bounds on acceleration.
 
     Raises:
@@ -159,7 +159,7 @@ def gan_calibrated_traffic(
     Args:
         road, stream: as for every traffic module.
         path, noise_scale, noise_period_s: see
-            :class:`~ganlane.parameters.driving.CalibratedGanParameters`.
+            :class:`~ganlane.settings.driving.CalibratedGanParameters`.
         changes_per_km: hazard of wishing for a lane change; by default :data:`WISH_PER_CHANGE`
             times the recorded rate, which gives that rate in the simulation.
         idm: of the gap check; the anchor keeps its own (:data:`SIMULATED_ANCHOR`).

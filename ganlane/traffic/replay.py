@@ -28,7 +28,7 @@ from ganlane.data import (
 )
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, VEHICLE_FLOATS
-from ganlane.parameters.driving import IdmParameters, ReplayParameters, Visibility
+from ganlane.settings.driving import IdmParameters, ReplayParameters, Visibility
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import Memory, Moved, TrafficModule
@@ -200,7 +200,7 @@ class ReplayTraffic(TrafficModule):
 
     Args:
         stream: as for every traffic module.
-        path, least_s: see :class:`~ganlane.parameters.driving.ReplayParameters`.
+        path, least_s: see :class:`~ganlane.settings.driving.ReplayParameters`.
         recordings: tensors instead of a file.
 
     Raises:

@@ -26,8 +26,8 @@ from ganlane.generator.closed_loop import (
 )
 from ganlane.generator.networks import Generator
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.parameters.driving import Visibility
-from ganlane.parameters.generator import EXTRA_INPUTS
+from ganlane.settings.driving import Visibility
+from ganlane.settings.generator import EXTRA_INPUTS
 from ganlane.sim.random import Purpose, Stream, normal, uniform
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import Memory, MemoryFields, Moved, TrafficModule

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
-from ganlane.parameters.driving import IdmParameters, SumoParameters, Visibility
-from ganlane.parameters.episode import SpawnParameters
+from ganlane.settings.driving import IdmParameters, SumoParameters, Visibility
+from ganlane.settings.episode import SpawnParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters, ego_scene, move_ego
 from ganlane.sim.idm import TABLE_V, following_acceleration
 from ganlane.sim.random import Purpose, Stream, uniform
@@ -119,7 +119,7 @@ class SumoTraffic(TrafficModule):
         road, stream, idm, steering: as for every traffic module; idm and steering are the ego's.
         spawn: Table II, for the first scenes.
         truck_share, truck_length_m, lane_change_s, keep_right: see
-            :class:`~ganlane.parameters.driving.SumoParameters`.
+            :class:`~ganlane.settings.driving.SumoParameters`.
         speed_wander: amplitude of a desired speed's variation, as a share of it; the periods are 20
             to 60 s.
 

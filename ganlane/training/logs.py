@@ -13,7 +13,7 @@ from typing import Any, Protocol, TextIO
 
 from tqdm import tqdm
 
-from ganlane.config.train import LoggerConfig
+from ganlane.settings.train import LoggerConfig
 from ganlane.errors import UserError
 from ganlane.files import atomic_path
 

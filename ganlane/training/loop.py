@@ -16,9 +16,9 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from ganlane.agents import GreedyPolicy, Rainbow
-from ganlane.config.train import TrainConfig
+from ganlane.settings.train import TrainConfig
 from ganlane.errors import UserError
-from ganlane.parameters import Count, CountOrZero, NotNegative, Record
+from ganlane.settings.record import Count, CountOrZero, NotNegative, Record
 from ganlane.training.checkpoint import Checkpointer, TrainingState
 from ganlane.training.collectors import STOPPING, Collector
 from ganlane.training.logs import Log, Logs

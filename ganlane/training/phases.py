@@ -33,8 +33,8 @@ from ganlane.agents.checkpoint import SHIPPED, SUPPORT
 from ganlane.agents.drivers import legal_actions
 from ganlane.agents.network import load_parameters
 from ganlane.build import make_env, make_road, make_traffic, observation_of
-from ganlane.config.traffic import TrafficConfig
-from ganlane.config.train import (
+from ganlane.settings.traffic import TrafficConfig
+from ganlane.settings.train import (
     MultiCollectorConfig,
     OverlapCollectorConfig,
     RayCollectorConfig,
@@ -43,8 +43,8 @@ from ganlane.config.train import (
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version, run_episodes
 from ganlane.evaluation.results import plain
-from ganlane.parameters.agent import RemovedOption, without_removed
-from ganlane.parameters.observation import ObservationConfig
+from ganlane.settings.agent import RemovedOption, without_removed
+from ganlane.settings.observation import ObservationConfig
 from ganlane.runtime import keep_freed_memory
 from ganlane.sim.random import Stream
 from ganlane.torch_settings import set_threads

@@ -25,7 +25,7 @@ from ganlane import keys
 from ganlane.agents import NetworkConfig, QNetwork, Rainbow
 from ganlane.agents.drivers import ExploringPolicy, LegalActions
 from ganlane.agents.network import load_parameters
-from ganlane.config.train import MultiCollectorConfig, RayCollectorConfig
+from ganlane.settings.train import MultiCollectorConfig, RayCollectorConfig
 from ganlane.errors import UserError
 from ganlane.training.collectors import (
     EPISODES_PER_WORKER,

@@ -41,7 +41,7 @@ from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.native.tensors import LaneView
-from ganlane.parameters.observation import NEARNESS_M, OVERLAP_M, ObservationScale, SensorParameters
+from ganlane.settings.observation import NEARNESS_M, OVERLAP_M, ObservationScale, SensorParameters
 from ganlane.sim.random import Purpose, Stream, episode_key, normal, uniform
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.torch_settings import compiled

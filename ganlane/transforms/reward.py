@@ -12,7 +12,7 @@ from torchrl.envs import Transform
 
 from ganlane import keys
 from ganlane.keys import EGO_INDEX
-from ganlane.parameters.observation import RewardParameters
+from ganlane.settings.observation import RewardParameters
 
 
 def speed_reward(

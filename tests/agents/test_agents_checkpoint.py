@@ -16,7 +16,7 @@ from ganlane.agents import (
 )
 from ganlane.agents.checkpoint import load_moments
 from ganlane.errors import UserError
-from ganlane.parameters.agent import AGENT_OPTIONS, LAST_REVISION
+from ganlane.settings.agent import AGENT_OPTIONS, LAST_REVISION
 
 
 @pytest.fixture

@@ -19,12 +19,12 @@ from ganlane.bench.suites import (
     TrafficSuite,
     TrainSuite,
 )
-from ganlane.config.commands import BenchConfig
-from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import IdmTrafficConfig, TrafficConfig
+from ganlane.settings.commands import BenchConfig
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.traffic import IdmTrafficConfig, TrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.errors import UserError
-from ganlane.parameters.agent import RainbowConfig
+from ganlane.settings.agent import RainbowConfig
 
 SHORT = {"repetitions": 2, "seconds": 0.001}
 RAINBOW = RainbowConfig(

@@ -25,11 +25,11 @@ from ganlane.bench.systems import (
     start_envpool,
     start_physics,
 )
-from ganlane.config.commands import BenchConfig
-from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
-from ganlane.parameters.agent import RainbowConfig
-from ganlane.parameters.observation import ObservationConfig, RewardParameters
+from ganlane.settings.commands import BenchConfig
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
+from ganlane.settings.agent import RainbowConfig
+from ganlane.settings.observation import ObservationConfig, RewardParameters
 
 
 def scenario(traffic=None, **env):

@@ -15,7 +15,7 @@ from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.evaluation import clopper_pearson, replay, roll_out
 from ganlane.keys import KEEP, LEFT, RIGHT
-from ganlane.parameters.episode import SpawnParameters
+from ganlane.settings.episode import SpawnParameters
 from ganlane.sim.random import Stream
 from ganlane.sim.scenes import FixedScene, SceneVehicle
 from ganlane.sim.state import Road

@@ -20,7 +20,7 @@ from ganlane.agents import (
 )
 from ganlane.agents.checkpoint import with_seeds
 from ganlane.build import make_drivers
-from ganlane.config.env import EnvConfig
+from ganlane.settings.env import EnvConfig
 from ganlane.doctor import State, checkpoints
 from ganlane.errors import UserError
 from ganlane.transforms import observation_size

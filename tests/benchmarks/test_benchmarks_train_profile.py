@@ -20,8 +20,8 @@ from benchmarks.train_profile import (
 )
 from ganlane.bench.suites import TrainSuite
 from ganlane.bench.systems import Scenario, Training, filled_run
-from ganlane.config.commands import BenchConfig
-from ganlane.parameters.agent import RainbowConfig
+from ganlane.settings.commands import BenchConfig
+from ganlane.settings.agent import RainbowConfig
 
 CONFIG = BenchConfig(suite="train", threads=[1, 2])
 AGENT = RainbowConfig(

@@ -19,8 +19,8 @@ from ganlane.config.schemas import SCHEMAS, option_of, options_of
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
 from ganlane.generator import load_generator, shipped_generator
-from ganlane.parameters.generator import CalibratedConfig, PaperConfig
-from ganlane.parameters.observation import (
+from ganlane.settings.generator import CalibratedConfig, PaperConfig
+from ganlane.settings.observation import (
     FORMS,
     MASKS,
     ObservationConfig,

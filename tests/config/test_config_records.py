@@ -8,7 +8,7 @@ from typing import Annotated
 import pytest
 
 from ganlane.errors import ParameterError
-from ganlane.parameters import DIFFERENT, Count, Positive, Range, Record, Share, between, one_of
+from ganlane.settings.record import DIFFERENT, Count, Positive, Range, Record, Share, between, one_of
 
 
 @dataclass(frozen=True)

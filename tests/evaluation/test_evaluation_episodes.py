@@ -20,8 +20,8 @@ from torchrl.envs.utils import ExplorationType, exploration_type, step_mdp
 from ganlane import keys
 from ganlane.agents.drivers import KeepLaneDriver
 from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import (
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.traffic import (
     GanTrafficConfig,
     IdmMobilTrafficConfig,
     IdmTrafficConfig,
@@ -32,7 +32,7 @@ from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.evaluation import replay, roll_out, run_episodes
 from ganlane.evaluation.episodes import SIDES, contact_side, ego_at_fault
-from ganlane.parameters.observation import ObservationConfig, SensorParameters
+from ganlane.settings.observation import ObservationConfig, SensorParameters
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 

@@ -30,7 +30,7 @@ from ganlane.generator.forecasts import (
     scene_metrics,
 )
 from ganlane.generator.windows import cut_windows, group_windows, scene_tracks
-from ganlane.parameters.generator import CalibratedConfig, PaperConfig
+from ganlane.settings.generator import CalibratedConfig, PaperConfig
 from ganlane.weights import save_weights
 
 CONFIGS = {"paper": PaperConfig(), "calibrated": CalibratedConfig()}

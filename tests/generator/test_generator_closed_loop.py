@@ -11,7 +11,7 @@ from reference.worlds import vehicles as placed
 from ganlane.generator import closed_loop
 from ganlane.generator.networks import Generator
 from ganlane.generator.windows import cut_segments
-from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig
+from ganlane.settings.generator import EXTRA_INPUTS, CalibratedConfig
 from ganlane.sim.idm import IdmParameters, equilibrium_gap, idm_acceleration
 from ganlane.sim.state import Road, Visibility
 

@@ -22,7 +22,7 @@ from ganlane.generator.fit import (
     variants,
 )
 from ganlane.generator.windows import count_windows, scene_tracks
-from ganlane.parameters.generator import CalibratedConfig, LoopConfig, PaperConfig
+from ganlane.settings.generator import CalibratedConfig, LoopConfig, PaperConfig
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from reference.small_networks import silenced, small_generator
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.generator import forecasts
 from ganlane.generator.windows import Windows, cut_windows, group_windows, scene_tracks
-from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig
+from ganlane.settings.generator import EXTRA_INPUTS, CalibratedConfig
 
 
 def windows_of(positions: np.ndarray, lanes=0, lengths=4) -> Windows:

@@ -12,7 +12,7 @@ from reference.small_networks import CALIBRATED, PAPER, SIZES, recorded_scenes
 
 from ganlane.errors import UserError
 from ganlane.generator import tasks
-from ganlane.parameters.generator import LoopConfig
+from ganlane.settings.generator import LoopConfig
 
 
 @pytest.fixture(scope="module")

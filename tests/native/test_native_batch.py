@@ -12,11 +12,11 @@ import pytest
 import torch
 
 from ganlane.api import make_env
-from ganlane.config.env import EnvConfig
+from ganlane.settings.env import EnvConfig
 from ganlane.native.batch import NativeBatch
 from ganlane.native.library import VARIANTS, best_variant, why_not
-from ganlane.parameters.driving import EgoParameters
-from ganlane.parameters.observation import MaskParameters, ObservationConfig, RewardParameters
+from ganlane.settings.driving import EgoParameters
+from ganlane.settings.observation import MaskParameters, ObservationConfig, RewardParameters
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason="no C++ compiler")
 ROWS = 37

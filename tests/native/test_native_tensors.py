@@ -18,8 +18,8 @@ from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.native.library import VARIANTS, best_variant, why_not
 from ganlane.native.tensors import Kernel, NativeScenes, Outcome, moved
-from ganlane.parameters.driving import Visibility
-from ganlane.parameters.episode import SpawnParameters
+from ganlane.settings.driving import Visibility
+from ganlane.settings.episode import SpawnParameters
 from ganlane.sim.random import episode_key
 from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road, Vehicles

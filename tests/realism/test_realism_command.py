@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from reference.recordings import following_file
 
-from ganlane.config.recordings import RealismConfig
+from ganlane.settings.recordings import RealismConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.generator import shipped_generator
 from ganlane.realism import main

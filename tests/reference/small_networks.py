@@ -9,7 +9,7 @@ import torch
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.generator.networks import Generator
 from ganlane.generator.windows import SceneTracks, scene_tracks
-from ganlane.parameters.generator import CalibratedConfig, GeneratorSizes, LoopConfig, PaperConfig
+from ganlane.settings.generator import CalibratedConfig, GeneratorSizes, LoopConfig, PaperConfig
 
 SIZES = GeneratorSizes(embedding=16, hidden=12, pooling=10, pooled=6, context=14, noise=4)
 LOOP = LoopConfig(updates=4, evaluate_every=2, warmup=1)

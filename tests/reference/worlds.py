@@ -14,8 +14,8 @@ from tensordict import TensorDictBase
 
 from ganlane import keys
 from ganlane.env import EpisodeParameters, HighwayEnv
-from ganlane.parameters.driving import EgoParameters, Visibility
-from ganlane.parameters.episode import SpawnParameters
+from ganlane.settings.driving import EgoParameters, Visibility
+from ganlane.settings.episode import SpawnParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.random import Stream
 from ganlane.sim.state import Road, Vehicles

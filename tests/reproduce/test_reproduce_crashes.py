@@ -10,8 +10,8 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from ganlane.config.commands import EvaluateConfig
-from ganlane.config.env import EnvConfig
+from ganlane.settings.commands import EvaluateConfig
+from ganlane.settings.env import EnvConfig
 from ganlane.errors import UserError
 from ganlane.render import main
 from ganlane.reproduce.crashes import (

@@ -18,7 +18,7 @@ from reference import scalar
 from reference.worlds import DOUBLE, drawing, moves, random_scenes, vehicles, vehicles_at
 
 from ganlane import keys
-from ganlane.parameters.driving import MobilParameters, Visibility
+from ganlane.settings.driving import MobilParameters, Visibility
 from ganlane.sim import mobil as mobil_module
 from ganlane.sim.idm import TABLE_V, idm_acceleration
 from ganlane.sim.mobil import (

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.worlds import DOUBLE, drawing, vehicles, vehicles_at
 
-from ganlane.parameters.driving import Visibility
+from ganlane.settings.driving import Visibility
 from ganlane.sim import neighbours
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV, _gives_way, one_at_a_time

@@ -11,8 +11,8 @@ from reference.worlds import drawing, environment, random_scenes, step, vehicles
 from ganlane import keys
 from ganlane.agents.drivers import MobilDriver
 from ganlane.errors import UserError
-from ganlane.parameters.driving import Visibility
-from ganlane.parameters.episode import SpawnParameters
+from ganlane.settings.driving import Visibility
+from ganlane.settings.episode import SpawnParameters
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.idm import TABLE_V, following_acceleration
 from ganlane.sim.neighbours import perceive

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from ganlane.errors import UserError
-from ganlane.parameters.driving import Visibility
+from ganlane.settings.driving import Visibility
 from ganlane.sim.scenarios import read_scene
 from ganlane.sim.scenes import SceneVehicle
 from ganlane.sim.state import Road

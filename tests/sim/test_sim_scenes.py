@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from reference.worlds import DOUBLE
 
 from ganlane.errors import UserError
-from ganlane.parameters.driving import Visibility
+from ganlane.settings.driving import Visibility
 from ganlane.sim.idm import TABLE_V, highest_speed
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.scenes import LARGEST, MOST_VEHICLES, FixedScene, SceneVehicle

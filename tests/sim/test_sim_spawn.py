@@ -14,10 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference.worlds import DOUBLE, packed
 
-from ganlane.config.env import CutInEnvConfig, EnvConfig
+from ganlane.settings.env import CutInEnvConfig, EnvConfig
 from ganlane.errors import UserError
-from ganlane.parameters.driving import Visibility
-from ganlane.parameters.episode import SpawnParameters
+from ganlane.settings.driving import Visibility
+from ganlane.settings.episode import SpawnParameters
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.idm import TABLE_V, can_brake
 from ganlane.sim.random import Purpose, episode_key, uniform

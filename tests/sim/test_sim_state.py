@@ -11,7 +11,7 @@ import pytest
 import torch
 from reference.worlds import drawing, moves, vehicles, vehicles_at
 
-from ganlane.parameters.driving import Visibility
+from ganlane.settings.driving import Visibility
 from ganlane.sim import idm
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.idm import idm_acceleration

@@ -18,7 +18,7 @@ from scipy.stats import binomtest
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
-from ganlane.parameters.driving import DriverFaults
+from ganlane.settings.driving import DriverFaults
 from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps, perceive
 from ganlane.traffic import (
     AbortedLaneChange,

@@ -15,7 +15,7 @@ from reference.worlds import vehicles as scene_of
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
-from ganlane.parameters.driving import Visibility
+from ganlane.settings.driving import Visibility
 from ganlane.sim.random import Purpose, episode_key, uniform
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import HighwayEnvTraffic

@@ -15,8 +15,8 @@ from scipy.stats import binomtest
 
 from ganlane import keys
 from ganlane.build import make_env, make_traffic
-from ganlane.config.env import CutInEnvConfig, EnvConfig
-from ganlane.config.traffic import (
+from ganlane.settings.env import CutInEnvConfig, EnvConfig
+from ganlane.settings.traffic import (
     IdmMobilTrafficConfig,
     IdmTrafficConfig,
     MixedTrafficConfig,
@@ -24,7 +24,7 @@ from ganlane.config.traffic import (
     all_traffics,
 )
 from ganlane.errors import UserError
-from ganlane.parameters.driving import (
+from ganlane.settings.driving import (
     AbortFaults,
     BrakingFaults,
     DriverFaults,

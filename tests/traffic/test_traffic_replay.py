@@ -13,7 +13,7 @@ from scipy.stats import chisquare
 from ganlane import keys
 from ganlane.data import SyntheticTraffic, default_scenes, sort, synthetic_scenes, write_scene_csv
 from ganlane.errors import UserError
-from ganlane.parameters.driving import Visibility
+from ganlane.settings.driving import Visibility
 from ganlane.sim import Vehicles
 from ganlane.sim.collisions import ego_overlaps
 from ganlane.sim.random import episode_key

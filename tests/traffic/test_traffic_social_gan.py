@@ -10,7 +10,7 @@ from tensordict import TensorDict
 
 from ganlane.errors import UserError
 from ganlane.generator.networks import Generator
-from ganlane.parameters.generator import EXTRA_INPUTS, GeneratorSizes
+from ganlane.settings.generator import EXTRA_INPUTS, GeneratorSizes
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.spawn import spawn
 from ganlane.sim.state import Road, Vehicles

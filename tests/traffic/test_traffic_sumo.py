@@ -15,7 +15,7 @@ from ganlane.agents.drivers import DRIVERS
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.evaluation import run_episodes
-from ganlane.parameters.driving import Visibility
+from ganlane.settings.driving import Visibility
 from ganlane.sim.state import Road, Vehicles, body_lanes
 from ganlane.traffic import IdmTraffic, SumoTraffic
 from ganlane.traffic.sumo_roads import ORIGIN_M

@@ -22,8 +22,8 @@ from training.toy import ROAD, ToyRoad, check_order, gone, road, steps, toy
 from training.toy import agent as road_agent
 
 from ganlane import keys
-from ganlane.config.traffic import IdmTrafficConfig
-from ganlane.config.train import CollectorConfig, OverlapCollectorConfig, TrainConfig
+from ganlane.settings.traffic import IdmTrafficConfig
+from ganlane.settings.train import CollectorConfig, OverlapCollectorConfig, TrainConfig
 from ganlane.errors import ParameterError, UserError
 from ganlane.training.checkpoint import load_checkpoint
 from ganlane.training.collectors import (

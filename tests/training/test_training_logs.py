@@ -6,7 +6,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from ganlane.config.train import LoggerConfig
+from ganlane.settings.train import LoggerConfig
 from ganlane.errors import UserError
 from ganlane.training.logs import (
     CsvLog,

@@ -18,12 +18,12 @@ import torch
 from ganlane.agents import read_agent, save_agent
 from ganlane.build import make_driver
 from ganlane.config.command_line import check
-from ganlane.config.env import EnvConfig
-from ganlane.config.train import InitConfig, NoInitConfig
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.train import InitConfig, NoInitConfig
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
-from ganlane.parameters.agent import LAST_REVISION, without_removed_overrides
-from ganlane.parameters.observation import MaskParameters
+from ganlane.settings.agent import LAST_REVISION, without_removed_overrides
+from ganlane.settings.observation import MaskParameters
 from ganlane.runtime import has_compiler
 from ganlane.training.checkpoint import LAST, load_checkpoint, save_checkpoint
 from ganlane.training.phases import (

@@ -25,10 +25,10 @@ from training.toy import ROAD, ToyRoad, agent, check_order, gone, road, steps
 from ganlane import keys
 from ganlane.agents import Rainbow, RainbowConfig
 from ganlane.build import make_env, make_traffic
-from ganlane.config.traffic import IdmTrafficConfig
-from ganlane.config.train import MultiCollectorConfig, RayCollectorConfig, TrainConfig
+from ganlane.settings.traffic import IdmTrafficConfig
+from ganlane.settings.train import MultiCollectorConfig, RayCollectorConfig, TrainConfig
 from ganlane.errors import UserError
-from ganlane.parameters.observation import ObservationConfig
+from ganlane.settings.observation import ObservationConfig
 from ganlane.training import TrainingConfig, train
 from ganlane.training.checkpoint import TrainingState
 from ganlane.training.loop import collect

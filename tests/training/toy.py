@@ -12,9 +12,9 @@ from torchrl.envs import EnvBase
 
 from ganlane.agents import Rainbow, RainbowConfig
 from ganlane.build import make_env, make_traffic
-from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import IdmTrafficConfig
-from ganlane.parameters.observation import ObservationConfig
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.traffic import IdmTrafficConfig
+from ganlane.settings.observation import ObservationConfig
 from ganlane.sim.random import draw_keys, episode_key, to_uniform
 
 ACTIONS, LIMIT = 3, 8

@@ -14,9 +14,9 @@ from ganlane import keys
 from ganlane.agents.drivers import ExploringPolicy, GreedyPolicy, MaskedPolicy, RandomDriver
 from ganlane.agents.n_step import NStepWindow
 from ganlane.build import make_driver
-from ganlane.config.env import EnvConfig
+from ganlane.settings.env import EnvConfig
 from ganlane.errors import UserError
-from ganlane.parameters.observation import MaskParameters
+from ganlane.settings.observation import MaskParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.state import Road
 from ganlane.transforms import ActionMaskTransform

@@ -18,12 +18,12 @@ from torchrl.envs.utils import check_env_specs
 from ganlane import keys
 from ganlane.agents import read_agent
 from ganlane.build import make_env, make_traffic, observation_of
-from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import IdmTrafficConfig
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.traffic import IdmTrafficConfig
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.evaluate import main as evaluate
-from ganlane.parameters.observation import ObservationConfig, SensorParameters
+from ganlane.settings.observation import ObservationConfig, SensorParameters
 from ganlane.sim import Vehicles
 from ganlane.sim.random import Stream, episode_key
 from ganlane.traffic import IdmMobilTraffic

@@ -15,8 +15,8 @@ from torchrl.envs import GymEnv
 from view_scenes import straight
 
 from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import IdmMobilTrafficConfig
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.traffic import IdmMobilTrafficConfig
 from ganlane.data import SyntheticTraffic, read_scenes, scene_lane_widths, sort, synthetic_scenes
 from ganlane.data.schema import SCHEMA, TRACK_STRIDE, validate
 from ganlane.env import EpisodeParameters, HighwayEnv

@@ -12,7 +12,7 @@ from enum import IntEnum
 from typing import Annotated
 
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.parameters import (
+from ganlane.settings.record import (
     Negative,
     NotNegative,
     Positive,
@@ -23,7 +23,6 @@ from ganlane.parameters import (
     Rule,
     Share,
     at_least,
-    between,
     one_of,
 )
 
@@ -126,78 +125,6 @@ class SteeringParameters:
 
 #: A time that lasts a physics step at least, s.
 Steps = Annotated[float, at_least(PHYSICS_STEP_S)]
-
-
-@dataclass(frozen=True)
-class GanParameters(Record):
-    """The paper's generated traffic (:func:`ganlane.traffic.presets.gan_traffic`).
-
-    Attributes:
-        path: weights of the preset 'paper'; null: the ones that ship.
-        guard: false: without it vehicles leave the road within a minute.
-        noise_scale: 1 samples trajectories as fitted, 0 takes the mean prediction.
-        execute_k: predicted steps driven before predicting again, 1 (the paper) to 8.
-    """
-
-    path: str | None = None
-    guard: bool = True
-    noise_scale: NotNegative = 1.0
-    execute_k: Annotated[int, between(1, 8)] = 1
-
-
-@dataclass(frozen=True)
-class CalibratedGanParameters(Record):
-    """The calibrated generated traffic (:func:`ganlane.traffic.presets.gan_calibrated_traffic`).
-
-    The two numbers of the noise were chosen on the scenes that the generator is fitted to: as
-    fitted (1 and 5 s) too few drivers accelerate.
-
-    Attributes:
-        path: weights of the preset 'calibrated'; null: the ones that ship.
-        noise_scale: of the latent vectors; 1 as fitted, 0 drives everybody by the mean prediction.
-        noise_period_s: time in which a driver's latent vector is forgotten, s; 5 in fitting, 0: at
-            once.
-        changes_per_km: wishes for a lane change per vehicle-km; null: from the recordings.
-    """
-
-    path: str | None = None
-    noise_scale: NotNegative = 1.4
-    noise_period_s: NotNegative = 3.0
-    changes_per_km: NotNegative | None = None
-
-
-@dataclass(frozen=True)
-class SumoParameters(Record):
-    """What SUMO's drivers have in common (:class:`ganlane.traffic.SumoTraffic`).
-
-    Attributes:
-        truck_share: lorries among the others, 0 to 1, where the first scene has none of its own.
-        truck_length_m: length of a lorry, m.
-        lane_change_s: how long a lane change takes, s; below 1 it would look like a jump.
-        keep_right: LC2013's lcKeepRight; 0: no change to the right for its own sake.
-        speed_wander: how far a driver's desired speed strays from its mean, as a share of it.
-    """
-
-    truck_share: Share = 0.15
-    truck_length_m: Annotated[float, between(4.5, 25)] = 12.0
-    lane_change_s: Annotated[float, at_least(1)] = 4.0
-    keep_right: NotNegative = 1.0
-    speed_wander: Annotated[float, between(0, 0.2)] = 0.03
-
-
-@dataclass(frozen=True)
-class ReplayParameters(Record):
-    """Recorded traffic (:class:`ganlane.traffic.ReplayTraffic`).
-
-    Attributes:
-        path: scene CSV, or Parquet from ganlane prepare; null: US-101 in GANLANE_DATA or
-            ../shared/data.
-        least_s: the vehicle that the ego replaces is recorded at least so long from the start on,
-            s.
-    """
-
-    path: str | None = None
-    least_s: Steps = 4.0
 
 
 @dataclass(frozen=True)

@@ -1,34 +1,36 @@
-"""Configuration of ``ganlane train``, and the groups ``init``, ``collector`` and ``logger``."""
+"""``ganlane train``: the run, and the groups ``init``, ``collector`` and ``logger``."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
-from ganlane.config.commands import DrivingConfig, Environments, Episodes, EvaluateConfig, Names
-from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import ParameterError
-from ganlane.parameters import Count, CountOrZero, NotNegative, Record, Text, between, one_of
-from ganlane.parameters.agent import RainbowConfig
+from ganlane.settings.agent import RainbowConfig
+from ganlane.settings.commands import DrivingConfig, Environments, Episodes, EvaluateConfig, Names
+from ganlane.settings.record import Count, CountOrZero, NotNegative, Record, Text, between, one_of
+from ganlane.settings.traffic import IdmMobilTrafficConfig, TrafficConfig
 
-Workers: TypeAlias = Annotated[int, between(1, 1024)]
 #: Number of decisions above which compiling (one to two minutes) pays off.
 WORTH_COMPILING = 300_000
 
 
-@dataclass
+@dataclass(frozen=True)
 class InitConfig(Record):
-    """``init=idm_ckpt``: start from a trained agent.
+    """``init=idm_ckpt``: start from a trained agent; ``init=none``: from random weights.
 
     Attributes:
-        path: a shipped agent's name, a .safetensors file, or a training run's folder or last.pt.
+        path: a shipped agent's name, a .safetensors file, or a training run's folder or last.pt;
+            null: random weights.
         support: trained: its atoms, v_min and v_max instead of those of agent; run: both must
             agree.
         optimizer: true: Adam's moments too; they are in a run's last.pt, not in a .safetensors
             file.
     """
 
-    path: str | None = "agent_idm"
+    group = "init"
+
+    path: str | None = None
     support: Annotated[str, one_of(("run", "trained"))] = "run"
     optimizer: bool = False
 
@@ -37,33 +39,25 @@ class InitConfig(Record):
         asked = "{optimizer}=true" if self.optimizer else "{support}=trained"
         if self.path is None and (self.optimizer or self.support == "trained"):
             raise ParameterError(
-                f"{asked}: of which agent? give init=idm_ckpt, and {{path}}=PATH unless the shipped one."
+                f"{asked}: of which agent? give init=idm_ckpt, and {{path}}=PATH unless the "
+                "shipped one."
             )
 
 
-@dataclass
-class NoInitConfig(InitConfig):
-    """``init=none``: start from random weights."""
-
-    path: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.path is not None:
-            raise ParameterError(
-                f"{{path}}={self.path}: init=none starts afresh; use init=idm_ckpt {{path}}={self.path}."
-            )
-        super().__post_init__()
-
-
-@dataclass
+@dataclass(frozen=True)
 class CollectorConfig(Record):
     """``collector=single``: one process steps all environments side by side.
 
     Attributes:
+        kind: chosen with the option.
         num_envs: environments of the process, 1 to 65536; a step of the loop has a decision of
             each.
     """
 
+    group = "collector"
+    chosen_by = "kind"
+
+    kind: str = "single"
     num_envs: Environments = 512
 
     @property
@@ -71,40 +65,29 @@ class CollectorConfig(Record):
         """Decisions per step of the loop, over all processes."""
         return self.num_envs
 
-
-@dataclass
-class OverlapCollectorConfig(CollectorConfig):
-    """``collector=overlap``: worker processes drive while this one learns.
-
-    Attributes:
-        num_envs: environments of all workers, which share them out evenly.
-        workers: processes, with one thread each.
-    """
-
-    workers: Workers = 2
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.num_envs % self.workers:
-            raise ParameterError(
-                f"{{num_envs}}={self.num_envs}: cannot be shared out evenly between {{workers}}={self.workers}; "
-                "give a multiple."
-            )
+    @classmethod
+    def kinds(cls) -> dict[str, type[Record]]:
+        """This class, and the one for a cluster."""
+        return {"single": CollectorConfig, "ray": RayCollectorConfig}
 
 
-@dataclass
-class MultiCollectorConfig(CollectorConfig):
-    """``collector=multi``: worker processes on this machine.
+@dataclass(frozen=True)
+class RayCollectorConfig(CollectorConfig):
+    """``collector=ray``: worker processes on this machine or on a Ray cluster.
 
     Attributes:
         num_envs: environments of each worker; a step of the loop has workers * num_envs decisions.
         workers: processes, with one thread each.
         weights_every: decisions, over all workers, between two updates of the workers' weights.
+        address: of the cluster's head: HOST:6379, ray://HOST:10001 or auto; null: a Ray of its own
+            here.
     """
 
+    kind: str = "ray"
     num_envs: Environments = 64
-    workers: Workers = 2
+    workers: Annotated[int, between(1, 1024)] = 2
     weights_every: Count = 1024
+    address: Text | None = None
 
     @property
     def environments(self) -> int:
@@ -117,19 +100,7 @@ class MultiCollectorConfig(CollectorConfig):
         return max(1, self.weights_every // self.environments)
 
 
-@dataclass
-class RayCollectorConfig(MultiCollectorConfig):
-    """``collector=ray``: the same on a Ray cluster.
-
-    Attributes:
-        address: of the cluster's head: HOST:6379, ray://HOST:10001 or auto; null: a Ray of its own
-            here.
-    """
-
-    address: Text | None = None
-
-
-@dataclass
+@dataclass(frozen=True)
 class LoggerConfig(Record):
     """``logger=...``: logs of a training run in addition to ``metrics.csv``.
 
@@ -140,18 +111,20 @@ class LoggerConfig(Record):
         project: of Weights & Biases.
     """
 
+    group = "logger"
+
     kind: Annotated[str, one_of(("csv", "tensorboard", "wandb"))] = "csv"
     progress: bool = True
     project: Text = "ganlane"
 
 
-@dataclass
+@dataclass(frozen=True)
 class PretrainConfig(Record):
     """``pretrain``: a first phase on other traffic, whose agent the main phase starts from.
 
     Attributes:
         total_decisions: 0: no such phase.
-        traffic: traffic@pretrain.traffic=idm_mobil.
+        traffic: pretrain.traffic=idm_mobil.
     """
 
     total_decisions: CountOrZero = 0
@@ -162,17 +135,17 @@ class PretrainConfig(Record):
         if self.total_decisions > 0 and self.traffic is None:
             raise ParameterError(
                 f"{{total_decisions}}={self.total_decisions}: on which traffic? give for instance "
-                "traffic@pretrain.traffic=idm_mobil."
+                "{traffic}=idm_mobil."
             )
 
 
-@dataclass
+@dataclass(frozen=True)
 class FinalEvaluationConfig(Record):
     """``evaluation``: the trained agent and others on the same episodes, when training is over.
 
     Attributes:
         agents: to compare the trained one with.
-        traffic: traffic@evaluation.traffic=NAME for another traffic than that of training.
+        traffic: evaluation.traffic=NAME for another traffic than that of training; null: that one.
         episodes: the episodes 0 to episodes - 1 of the seed, on the stream kept for reports.
         num_envs: episodes driven side by side, at most.
     """
@@ -183,7 +156,7 @@ class FinalEvaluationConfig(Record):
     num_envs: Environments = 512
 
 
-@dataclass
+@dataclass(frozen=True)
 class TrainConfig(DrivingConfig):
     """Inputs of a training run.
 
@@ -213,7 +186,7 @@ class TrainConfig(DrivingConfig):
     checkpoint_every_s: NotNegative = 20.0
     checkpoint_replay: bool = True
     resume: str | None = None
-    traffic: TrafficConfig = field(default_factory=TrafficConfig)
+    traffic: TrafficConfig = field(default_factory=IdmMobilTrafficConfig)
     init: InitConfig = field(default_factory=InitConfig)
     agent: RainbowConfig = field(default_factory=RainbowConfig)
     collector: CollectorConfig = field(default_factory=CollectorConfig)
@@ -238,13 +211,13 @@ class TrainConfig(DrivingConfig):
     def final_evaluation(self) -> EvaluateConfig:
         """Config of the final comparison, by default on the traffic of the training."""
         traffic = self.evaluation.traffic or self.traffic
-        shared = {
-            name: getattr(self, name) for name in ("seed", "device", "env", "observation", "reward")
-        }
         return EvaluateConfig(
-            **shared,
-            traffics=[traffic.label()],
-            traffic_options={traffic.label(): traffic},
+            seed=self.seed,
+            device=self.device,
+            env=self.env,
+            observation=self.observation,
+            reward=self.reward,
+            traffics={traffic.label(): traffic},
             episodes=self.evaluation.episodes,
             num_envs=self.evaluation.num_envs,
         )

@@ -8,10 +8,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
-from ganlane.config.commands import DrivingConfig, Names
-from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import ParameterError, UserError, as_typed
-from ganlane.parameters import (
+from ganlane.settings.commands import DrivingConfig, Names
+from ganlane.settings.record import (
     DIFFERENT,
     Count,
     NotNegative,
@@ -23,6 +22,7 @@ from ganlane.parameters import (
     between,
     one_of,
 )
+from ganlane.settings.traffic import IdmMobilTrafficConfig, TrafficConfig
 
 #: Films of one episode; pages and tables of any number of episodes.
 FILMS = ("gif", "mp4", "png")
@@ -34,7 +34,7 @@ MOST_EPISODES = 12
 GIF_S = 30.0
 
 
-@dataclass
+@dataclass(frozen=True)
 class FilmConfig(Record):
     """``film``: part of the episode, speed and size.
 
@@ -74,7 +74,7 @@ class FilmConfig(Record):
             )
 
 
-@dataclass
+@dataclass(frozen=True)
 class CurvesConfig(Record):
     """``curves``: learning curves of training runs.
 
@@ -88,7 +88,7 @@ class CurvesConfig(Record):
     smooth: Count = 1
 
 
-@dataclass
+@dataclass(frozen=True)
 class RenderConfig(DrivingConfig):
     """Episodes of agents on one traffic, as a film, page or table; or the learning curves of runs.
 
@@ -118,7 +118,7 @@ class RenderConfig(DrivingConfig):
     traffics: Names | None = None
     format: Annotated[str, one_of(FORMATS)] | None = None
     out: str | None = None
-    traffic: TrafficConfig = field(default_factory=TrafficConfig)
+    traffic: TrafficConfig = field(default_factory=IdmMobilTrafficConfig)
     film: FilmConfig = field(default_factory=FilmConfig)
     curves: CurvesConfig = field(default_factory=CurvesConfig)
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from ganlane import keys
 from ganlane.errors import ParameterError
-from ganlane.parameters import (
+from ganlane.settings.record import (
     Negative,
     NotNegative,
     NotPositive,
@@ -19,7 +19,6 @@ from ganlane.parameters import (
     one_of,
     part_of,
 )
-from ganlane.parameters.agent import refuse_removed_observation
 
 #: What the agent can see, see :data:`ganlane.transforms.OBSERVATIONS`.
 FORMS = (
@@ -92,13 +91,14 @@ class ObservationConfig(ObservationScale):
         sensors: errors in what the ego perceives of the others; None, and all 0: none.
     """
 
+    group = "observation"
+
     form: Annotated[str, one_of(FORMS)] = "lane_view_overlap"
     sensors: SensorParameters | None = field(default_factory=SensorParameters)
 
     def __post_init__(self) -> None:
-        refuse_removed_observation(self.form)
         super().__post_init__()
-        # One way to say that there are no errors, which is also that of older runs.
+        # One way to say that there are no errors.
         if self.sensors == SensorParameters():
             assign(self, sensors=None)
 
@@ -133,6 +133,8 @@ class MaskParameters(Record):
         safe_deceleration: MOBIL's ``b_safe``, m/s2, above 0; read by ``safe`` alone.
     """
 
+    group = "mask"
+
     form: Annotated[str, one_of(MASKS)] = "none"
     safe_deceleration: Positive = 4.0
 
@@ -157,6 +159,8 @@ class RewardParameters(Record):
             (:func:`ganlane.sim.dynamics.ego_surroundings`), at most
             0. The paper has no such term; at 0 it is not there.
     """
+
+    group = "reward"
 
     base_speed_mps: Number = 15.0
     low_acceleration: Negative = -2.0

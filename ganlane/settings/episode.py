@@ -7,7 +7,7 @@ from enum import IntEnum
 
 from ganlane.errors import ParameterError, UserError
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.parameters import Positive, PositiveRange, Range, Record, Share
+from ganlane.settings.record import Positive, PositiveRange, Range, Record, Share
 
 #: What drives a decision: the tensor code, the native kernel, or the latter where it can.
 KERNELS = ("torch", "native", "auto")

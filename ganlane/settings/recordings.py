@@ -9,12 +9,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
-from ganlane.config.commands import GeneratorFile, RunConfig
-from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import REACTING, TrafficConfig, chosen_traffics
 from ganlane.errors import UserError
-from ganlane.parameters import CountOrZero, NotNegative, at_least, between, one_of
-from ganlane.parameters.generator import DataConfig, FitConfig
+from ganlane.settings.commands import RunConfig
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.generator import DataConfig, FitConfig
+from ganlane.settings.record import CountOrZero, NotNegative, assign, at_least, between, one_of
+from ganlane.settings.traffic import IdmMobilTrafficConfig, TrafficConfig, traffics_of
 
 #: Names of the card's own references.
 _REFERENCES = ("random", "constant_velocity")
@@ -31,7 +31,7 @@ _QUICK_KM = 5.0
 _QUICK_S = 30.0
 
 
-@dataclass
+@dataclass(frozen=True)
 class PrepareConfig(RunConfig):
     """Recordings, and where their Parquet goes. Nothing is drawn at random; polars takes its own
     number of threads.
@@ -57,7 +57,7 @@ class PrepareConfig(RunConfig):
             raise UserError(f"data={self.data.format}: which file is missing; give data.path=FILE.")
 
 
-@dataclass
+@dataclass(frozen=True)
 class TrainGeneratorConfig(RunConfig):
     """Recordings, what is fitted to them, and how it is measured.
 
@@ -91,13 +91,12 @@ class TrainGeneratorConfig(RunConfig):
             )
 
 
-@dataclass
+@dataclass(frozen=True)
 class RealismConfig(RunConfig):
     """A traffic, what it is compared with, the recordings, and how much is driven.
 
     Attributes:
-        against: further traffics from the same starts: options of the group traffic, or the import
-            path of a model of your own.
+        against: further traffics from the same starts, as traffics of ganlane evaluate; [] for none.
         scenes: starts: held_out (data.held_out) or all, those that the generator was fitted to too.
         repeats: times that every scene is driven, with other random numbers.
         desired_above_mps: mean excess of desired speeds over the speed at entry, m/s; null: fitted
@@ -110,16 +109,14 @@ class RealismConfig(RunConfig):
         resamples: of the bootstrap over scenes.
         quick: true: a check that it runs, in seconds.
         publish: true (maintainers): write the histograms that ship from these recordings.
-        report: write the tables into this document, between the markers of this card.
-        figures: write the figures into this folder too, as realism_NAME.png.
-        generator: weights of generated traffic.
         fold_weights: generators of k folds: every scene is driven by the one that was fitted
             without it.
-        traffic_options: the keys of the traffics of against.
     """
 
-    traffic: TrafficConfig = field(default_factory=TrafficConfig)
-    against: list[str] = field(default_factory=lambda: ["idm_mobil"])
+    traffic: TrafficConfig = field(default_factory=IdmMobilTrafficConfig)
+    against: dict[str, TrafficConfig] = field(
+        default_factory=lambda: traffics_of(["idm_mobil"], "")
+    )
     scenes: Annotated[str, one_of(("held_out", "all"))] = "held_out"
     repeats: Annotated[int, between(1, 1000)] = 4
     desired_above_mps: NotNegative | None = None
@@ -131,17 +128,15 @@ class RealismConfig(RunConfig):
     resamples: Annotated[int, between(100, 100_000)] = 2000
     quick: bool = False
     publish: bool = False
-    report: str | None = None
-    figures: str | None = None
     env: EnvConfig = field(default_factory=EnvConfig)
     data: DataConfig = field(default_factory=DataConfig)
-    generator: GeneratorFile = field(default_factory=GeneratorFile)
     fold_weights: list[str] = field(default_factory=list)
-    traffic_options: dict[str, TrafficConfig] = field(
-        default_factory=lambda: {name: kind() for name, kind in REACTING.items()}
-    )
 
     def __post_init__(self) -> None:
+        if self.against:
+            assign(self, against=traffics_of(self.against, "against"))
+        else:
+            assign(self, against={})
         super().__post_init__()
         if self.device != "cpu":
             raise UserError(
@@ -160,19 +155,14 @@ class RealismConfig(RunConfig):
             raise UserError(
                 "publish=true: the file that ships is made from all recorded scenes; give scenes=all."
             )
-        self.rivals()
-
-    def card(self) -> str:
-        """The card's name in a document: traffic and kind of starts."""
-        return f"{self.traffic.label()} {'folds' if self.fold_weights else self.scenes}"
+        for name in [*self.rivals(), self.traffic.label()]:
+            if name in _REFERENCES:
+                raise UserError(f"against={name}: every card holds it anyway; leave it out.")
 
     def rivals(self) -> dict[str, TrafficConfig]:
         """The traffics to compare with, by name; the traffic itself is left out."""
-        names = [name for name in self.against if name != self.traffic.label()]
-        for name in [*names, self.traffic.label()]:
-            if name in _REFERENCES:
-                raise UserError(f"against={name}: every card holds it anyway; leave it out.")
-        return chosen_traffics("against", names, self.traffic_options)
+        own = self.traffic.label()
+        return {name: traffic for name, traffic in self.against.items() if name != own}
 
     def shortened(self) -> RealismConfig:
         """With ``quick``, a check that it runs.

@@ -9,10 +9,10 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from ganlane.errors import ParameterError
-from ganlane.parameters import (
+from ganlane.settings.record import (
     NO_KEY,
     Count,
     CountOrZero,
@@ -120,10 +120,14 @@ class FitConfig(Record):
     """Settings of a fit: those of one preset or the other.
 
     Attributes:
+        preset: chosen with the option: generator=calibrated.
         seed: of weights, batches, noise, k-means and drivers' parameters.
     """
 
-    preset: ClassVar[Preset]
+    group = "generator"
+    chosen_by = "preset"
+
+    preset: str
     seed: int = field(default=0, kw_only=True, metadata=NO_KEY)
 
 
@@ -145,7 +149,7 @@ class PaperConfig(FitConfig):
         mirror: swap left and right in half of the groups.
     """
 
-    preset: ClassVar[Preset] = "paper"
+    preset: str = "paper"
     sizes: GeneratorSizes = field(default_factory=GeneratorSizes)
     weights: LossWeights = field(default_factory=LossWeights)
     loop: LoopConfig = field(default_factory=LoopConfig)
@@ -179,7 +183,7 @@ class CalibratedConfig(FitConfig):
         traits: whether every driver has its own headway and desired speed.
     """
 
-    preset: ClassVar[Preset] = "calibrated"
+    preset: str = "calibrated"
     sizes: GeneratorSizes = field(
         default_factory=lambda: GeneratorSizes(extra_inputs=EXTRA_INPUTS), metadata=NO_KEY
     )
@@ -254,16 +258,17 @@ class DataConfig(Record):
             third scene.
     """
 
+    group = "data"
+    chosen_by = "format"
+
     format: str = "scenes"
     path: str | None = None
     held_out: tuple[Text, ...] | None = None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.format != type(self).format:
-            raise ParameterError(
-                f"{{format}}={self.format}: expected {type(self).format}; choose data=NAME."
-            )
+    @classmethod
+    def kinds(cls) -> dict[str, type[Record]]:
+        """A class for each format."""
+        return {kind.format: kind for kind in (DataConfig, NgsimDataConfig, HighdDataConfig)}
 
     def parameters(self) -> NgsimParameters | None:
         """Further inputs of the reader; None where it takes nothing."""

@@ -1,0 +1,211 @@
+"""Plain data from words: Hydra composes the YAML files of ``conf/``; the records check the result.
+
+The files hold only what differs from the records and need no schema. Every ``key=value`` reaches
+Hydra as ``++key=value``, and a key that no record has is refused by the record.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from ganlane.errors import UserError, did_you_mean
+from ganlane.files import conf_folder
+from ganlane.settings.record import merged, option_names
+
+VERSION_BASE = "1.3"
+_HELP = "run the command with --help to see all keys"
+#: The keys of Hydra's own configuration that a command line may set, besides launcher and sweeper
+#: and their parameters: most others name code that Hydra would import.
+HYDRA_KEYS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
+_HYDRA_PLUGIN = re.compile(r"hydra(/|\.)(launcher|sweeper)\b")
+#: Keys that a command calls by another name, because ``agent=`` would choose an option of a group.
+ALIASES = {"render": {"agent": "driver"}, "record": {"agent": "driver"}}
+#: A saved configuration is a few kB; a larger file is none.
+_LARGEST_CONFIG_BYTES = 2**20
+
+
+def parsed(command: str, words: Sequence[str]) -> list[Override]:
+    """The words of a command line by Hydra's grammar, as :func:`composed` takes them.
+
+    Raises:
+        UserError: a word is not of the form key=value, names no option, or would make Hydra import
+            something.
+    """
+    try:
+        overrides = OverridesParser.create().parse_overrides([_as_meant(command, w) for w in words])
+    except (ValueError, RecursionError) as error:  # limits of Python
+        raise UserError(
+            "a value of the command line: too long a number or too deep a list; shorten it."
+        ) from error
+    except HydraException as error:
+        raise UserError(sentence(error)) from error
+    for override in overrides:
+        _check(override)
+    return overrides
+
+
+def _as_meant(command: str, word: str) -> str:
+    """A word with the key that the record has.
+
+    The traffic of a phase may be named alone, ``pretrain.traffic=gan``, or as Hydra mounts a group,
+    ``traffic@pretrain.traffic=gan``; both become ``pretrain.traffic.name=gan``, so that keys of
+    that traffic can be set beside it.
+    """
+    key, equals, value = word.partition("=")
+    key = ALIASES.get(command, {}).get(key, key).removeprefix("traffic@")
+    if key.endswith(".traffic") and re.fullmatch(r"[\w,]+", value) and value != "null":
+        key = f"{key}.name"
+    return f"{key}{equals}{value}"
+
+
+def _is_group(key: str) -> bool:
+    return (conf_folder() / key).is_dir()
+
+
+def _check(override: Override) -> None:
+    """Refuse deletions, unknown options of a group, and keys of Hydra that import code."""
+    key, word = override.key_or_group, override.input_line
+    if override.is_delete():
+        raise UserError(f"{word}: keys cannot be deleted; give {key}=null or leave it as it is.")
+    if key.startswith("hydra"):
+        if key not in HYDRA_KEYS and (not _HYDRA_PLUGIN.match(key) or "_target_" in str(word)):
+            raise UserError(
+                f"{key}: no such key here; of Hydra's configuration give {', '.join(HYDRA_KEYS)}, "
+                "hydra/launcher=NAME, hydra.launcher.PARAMETER=... or the same of the sweeper."
+            )
+        return
+    if not _is_group(key):
+        return
+    values = [override.value()]
+    if override.is_sweep_override():
+        values = list(override.sweep_iterator())
+    names = option_names(key)
+    for value in values:
+        if value not in names:
+            shown = word.partition("=")[2] if len(values) == 1 else value
+            hint = did_you_mean(str(value), names)
+            raise UserError(
+                f"{key}={shown}: no such option{hint}; choose one of {', '.join(names)}."
+            )
+
+
+def for_hydra(overrides: Sequence[Override]) -> list[str]:
+    """Words for Hydra: a key is set whether or not a file has it; a mapping replaces one.
+
+    The last of several words with one key counts.
+    """
+    last = {override.key_or_group: override for override in overrides}
+    words: list[str] = []
+    for key, override in last.items():
+        word = str(override.input_line).lstrip("+")
+        if _is_group(key) or key.startswith("hydra"):
+            words.append(word)
+            continue
+        if "{" in word and not override.is_sweep_override():
+            words.append(f"++{key}=null")  # Hydra would merge it into the mapping of an experiment
+        words.append(f"++{word}")
+    return words
+
+
+def composed(command: str, overrides: Sequence[Override] = ()) -> dict[str, Any]:
+    """Plain data of a command line.
+
+    Raises:
+        UserError: the options do not fit the command.
+    """
+    # A sweep, or a user's own application of Hydra, is running around this call: keep its state.
+    outer = GlobalHydra.instance().hydra
+    GlobalHydra.instance().hydra = None
+    folder = str(conf_folder())
+    try:
+        with initialize_config_dir(folder, version_base=VERSION_BASE, job_name=command):
+            config = compose(command, overrides=for_hydra(overrides))
+            return OmegaConf.to_container(config, resolve=True)  # type: ignore[return-value]
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(sentence(error)) from error
+    finally:
+        GlobalHydra.instance().hydra = outer
+
+
+@cache
+def _defaults(command: str, *words: str) -> dict[str, Any]:
+    return composed(command, parsed(command, words))
+
+
+def called(command: str, keys: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain data of a Python call: the command's own defaults with ``keys`` on top."""
+    if not (conf_folder() / f"{command}.yaml").is_file():
+        return dict(keys)
+    words = [f"experiment={keys['experiment']}"] if "experiment" in keys else []
+    others = {name: value for name, value in keys.items() if name != "experiment"}
+    return merged(deepcopy(_defaults(command, *words)), others)
+
+
+def saved_config(path: Path) -> dict[str, Any]:
+    """Plain data of a run's ``config.yaml``.
+
+    Raises:
+        UserError: the file is missing or damaged.
+    """
+    try:
+        if path.stat().st_size > _LARGEST_CONFIG_BYTES:
+            raise ValueError("too large")
+        text = path.read_text(encoding="utf-8")
+        # Aliases can make a short file endless; a saved configuration has none.
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
+            raise ValueError("aliases")
+        data = yaml.safe_load(text)
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        raise UserError(
+            f"{path}: missing or damaged, so the run cannot be resumed; start a new run."
+        ) from error
+    if not isinstance(data, dict):
+        raise UserError(f"{path}: damaged, expected key: value lines; start a new run.")
+    return data
+
+
+def resumed(saved: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
+    """A saved run's data with what a command line names."""
+    config = OmegaConf.create(dict(saved))
+    now = OmegaConf.create(composed("train", overrides))
+    for override in overrides:
+        key = override.key_or_group
+        if not key.startswith("hydra"):
+            OmegaConf.update(config, key, OmegaConf.select(now, key), merge=False, force_add=True)
+    return OmegaConf.to_container(config)  # type: ignore[return-value]
+
+
+def sentence(error: BaseException) -> str:
+    """An error of Hydra or OmegaConf in one sentence: what is wrong, what to do."""
+    if isinstance(error, MissingConfigException):
+        group, _, name = (error.missing_cfg_file or "").rpartition("/")
+        return f"{group}={name}: no such option; {_HELP}."
+    if isinstance(error, OverrideParseException):
+        return (
+            f"{error.override}: not of the form key=value; quote values with spaces or brackets, "
+            f"{_HELP}."
+        )
+    text = " ".join(str(error).split())
+    group = re.search(r"Could not override '([^'@]+)[^']*'", text)
+    if group:
+        plural = f" (did you mean {group[1]}s=[NAME,NAME]?)"
+        hint = plural if group[1] in ("agent", "traffic") else ""
+        return f"{group[1]}: not an option of this command{hint}; {_HELP}."
+    ambiguous = re.search(r"Ambiguous value for argument '\+*([^']+)'", text)
+    if ambiguous:
+        return f"{ambiguous[1]}: several values; write [a,b] for a list, or add -m for a sweep."
+    return f"{text.partition(' full_key')[0].rstrip('.')}; {_HELP}."

@@ -1,0 +1,512 @@
+"""Runs a command: from words to a checked record, a run folder, a result and an exit status.
+
+Exit statuses: 0 done; 2 a user's mistake or a failing disk (one sentence on stderr, nothing left on
+disk); 130 stopped by Ctrl-C, 143 by SIGTERM (training saves first); 141 the reader of the output
+has closed it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import itertools
+import os
+import shutil
+import signal
+import socket
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import hydra
+import yaml
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import Override
+
+from ganlane.arguments import is_import_path
+from ganlane.config.compose import (
+    ALIASES,
+    VERSION_BASE,
+    called,
+    composed,
+    for_hydra,
+    parsed,
+    resumed,
+    saved_config,
+)
+from ganlane.config.help import help_text
+from ganlane.errors import USER_ERROR, UserError, numbered_refusals
+from ganlane.files import conf_folder, remove_leftovers, write_bytes
+from ganlane.runtime import (
+    check_process,
+    keep_freed_memory,
+    open_closed_streams,
+    register_envs,
+    status_of,
+)
+from ganlane.settings.commands import (
+    EvaluateConfig,
+    HighwayConfig,
+    RecordConfig,
+    ReproduceConfig,
+)
+from ganlane.settings.record import Record, key_names, make, plain
+from ganlane.settings.recordings import PrepareConfig, RealismConfig, TrainGeneratorConfig
+from ganlane.settings.render import RenderConfig
+from ganlane.settings.train import TrainConfig
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+#: A command's settings, and the module with the function of its name, which takes settings and run
+#: folder and returns the line that names its results. It is imported once the settings are
+#: checked, since importing torch takes seconds.
+COMMANDS: dict[str, tuple[type[Record], str]] = {
+    "train": (TrainConfig, "ganlane.commands.train"),
+    "evaluate": (EvaluateConfig, "ganlane.compare"),
+    "render": (RenderConfig, "ganlane.commands.render"),
+    "record": (RecordConfig, "ganlane.commands.record"),
+    "prepare": (PrepareConfig, "ganlane.commands.prepare"),
+    "train_generator": (TrainGeneratorConfig, "ganlane.commands.train_generator"),
+    "realism": (RealismConfig, "ganlane.commands.realism"),
+    "reproduce": (ReproduceConfig, "ganlane.commands.reproduce"),
+}
+#: A function that does a command's work.
+Task = Callable[[Any, Path], str | None]
+#: File in the run folder with all settings; what a run is resumed from.
+CONFIG = "config.yaml"
+#: File that names the process that uses the folder.
+LOCK = ".lock"
+#: The checkpoint of a run, below its folder.
+LAST = Path("checkpoints") / "last.pt"
+#: Files that took time to make.
+EARNED = (
+    "results.json",
+    "agent.safetensors",
+    "last.pt",
+    "fits/*.pt",
+    "generator_*.safetensors",
+)
+OUTPUTS = Path("outputs")
+#: Folders of a run that it writes to itself; others below it may be runs of their own.
+_OWN_FOLDERS = (".", "checkpoints", "pretrain", "pretrain/checkpoints", "fits")
+#: Keys that name code to execute: import paths, and the address of a Ray cluster, which sends
+#: pickles.
+_OWN_PACKAGES = ("ganlane.", "ganlane_simulators.")
+_IMPORTING_KEYS = ("_target_", "name", "shares", "agents", "address")
+
+
+class Stopped(BaseException):
+    """A signal ended the command after an orderly stop; the exit status is 128 plus its number."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+# --- the command line
+
+
+def run_command(
+    command: str, arguments: Sequence[str] | None = None, task: Task | None = None
+) -> int:
+    """``ganlane COMMAND key=value ...`` (None: the process's arguments); the exit status.
+
+    A ``task`` takes the place of the command's function.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    open_closed_streams()
+    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL would log every replay buffer
+    keep_freed_memory()
+    try:
+        with _sigterm_as_exception():
+            _dispatch(command, words, task)
+            sys.stdout.flush()
+    except UserError as error:
+        print(f"ganlane {command}: {_one_line(error)}", file=sys.stderr)
+        return USER_ERROR
+    except OSError as error:
+        return status_of(error, f"ganlane {command}")
+    except (KeyboardInterrupt, Stopped) as stop:
+        if isinstance(stop, Stopped):
+            return 128 + stop.number
+        print(f"ganlane {command}: stopped by Ctrl-C.", file=sys.stderr)
+        return 128 + signal.SIGINT
+    return 0
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()).rstrip(".") + "."
+
+
+def _dispatch(command: str, words: list[str], task: Task | None) -> None:
+    """Do what the words ask for: help, printing the configuration, a sweep or a run."""
+    flags = [word for word in words if word.startswith("-")]
+    keys = [word for word in words if word not in flags]
+    if {"-h", "--help"} & set(flags):
+        print(help_text(command, COMMANDS[command][0]))
+        return
+    if flags == ["--cfg"] and keys[:1] == ["job"]:
+        print(as_yaml(settings(command, keys[1:])), end="")
+        return
+    unknown = [flag for flag in flags if flag not in ("-m", "--multirun")]
+    if unknown:
+        raise UserError(f"{unknown[0]}: no such flag; run the command with --help to see them.")
+    check_process()
+    overrides = parsed(command, keys)
+    if flags:
+        _sweep(command, overrides, task)
+        return
+    config, folder = _settings_and_folder(command, overrides)
+    line = run_in(folder, command, config, task)
+    if line:
+        print(line)
+
+
+def settings(command: str, words: Sequence[str]) -> Any:
+    """The checked record of a command line.
+
+    Raises:
+        UserError: an unknown key or option, a value of the wrong type or out of range.
+    """
+    return _settings_and_folder(command, parsed(command, words))[0]
+
+
+def _settings_and_folder(command: str, overrides: list[Override]) -> tuple[Any, Path]:
+    """The checked record, and the folder of its run: the resumed one, that given, or a new one."""
+    values = {str(word.key_or_group): word for word in overrides}
+    resume = values.pop("resume", None) if command == "train" else None
+    rest = [word for word in overrides if word.key_or_group != "resume"]
+    if resume is not None and resume.value() not in (None, ""):
+        folder = _resumed_folder(str(resume.value()))
+        if folder is not None:
+            saved = saved_config(folder / CONFIG)
+            _refuse_stored_imports(saved, [str(word.input_line) for word in rest], str(folder))
+            return make(TrainConfig, {**resumed(saved, rest), "resume": str(folder)}), folder
+    config = make(COMMANDS[command][0], composed(command, rest))
+    where = values.get("hydra.run.dir")
+    return config, new_folder(command) if where is None else Path(str(where.value()))
+
+
+def new_folder(command: str) -> Path:
+    """A folder below ``outputs/`` that is not there yet, named by time and process."""
+    name = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{os.getpid()}"
+    folder = OUTPUTS / command / name
+    numbers = itertools.count(2)
+    while folder.exists():  # two runs of a process within a second
+        folder = folder.with_name(f"{name}_{next(numbers)}")
+    return folder
+
+
+def call_settings(command: str, keys: Mapping[str, Any]) -> Any:
+    """The checked record of a Python call; what is no key of the command is one of its ``env``.
+
+    Raises:
+        UserError: an unknown key or option, a value of the wrong type or out of range.
+    """
+    kind = HighwayConfig if command == "highways" else COMMANDS[command][0]
+    names = {*key_names(kind), "experiment"}
+    aliases = ALIASES.get(command, {})
+    keys = {aliases.get(name, name): value for name, value in keys.items()}
+    of_env = {name: value for name, value in keys.items() if name not in names}
+    if of_env and "env" in names:
+        keys = {name: value for name, value in keys.items() if name in names}
+        base = keys.get("env") or {}
+        if isinstance(base, Record):
+            base = plain(base)
+        keys["env"] = {**({"name": base} if isinstance(base, str) else base), **of_env}
+    return make(kind, called(command, keys))
+
+
+# --- sweeps
+
+
+def _sweep(command: str, overrides: list[Override], task: Task | None) -> None:
+    """All combinations, each in its own folder, by Hydra's launcher; all are checked before."""
+    if any(word.key_or_group == "resume" for word in overrides):
+        raise UserError("resume: one run is resumed at a time; start without -m.")
+    first = None
+    for words in _single_runs(overrides):
+        first = first or settings(command, words)
+        settings(command, words)
+    mistakes: list[Exception] = []
+    here = os.getpid()
+    sweep_folder: list[Path] = []
+
+    def job(_: Any) -> None:
+        state = HydraConfig.get()
+        sweep_folder[:] = [Path(state.sweep.dir)]
+        words = [str(word).lstrip("+") for word in state.overrides.task]
+        try:
+            folder = Path(state.runtime.output_dir)
+            line = run_in(folder, command, settings(command, words), task)
+            if line:
+                print(line, flush=True)
+        except (UserError, OSError) as error:
+            # Hydra would print it too; a worker process must raise.
+            mistakes.append(error)
+            if os.getpid() != here:
+                raise
+
+    application = hydra.main(
+        version_base=VERSION_BASE, config_path=str(conf_folder()), config_name=command
+    )
+    before, full = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    sys.argv = [f"ganlane {command}", "-m", *for_hydra(overrides)]
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # raise, rather than print and exit with status 1
+    try:
+        application(job)()
+    finally:
+        sys.argv = before
+        if full is None:
+            del os.environ["HYDRA_FULL_ERROR"]
+        else:
+            os.environ["HYDRA_FULL_ERROR"] = full
+    if mistakes:
+        raise mistakes[0]
+    if sweep_folder:
+        _show_sweep(sweep_folder[0], getattr(first, "columns", "auto"))
+
+
+def _single_runs(overrides: Sequence[Override]) -> list[list[str]]:
+    """The words of every run of a sweep: all combinations."""
+    choices: list[list[str]] = []
+    for override in overrides:
+        if str(override.key_or_group).startswith("hydra"):
+            continue
+        if override.is_sweep_override():
+            key = override.get_key_element()
+            choices.append([f"{key}={value}" for value in override.sweep_string_iterator()])
+        else:
+            choices.append([str(override.input_line)])
+    return [list(words) for words in itertools.product(*choices)]
+
+
+def _show_sweep(folder: Path, columns: str) -> None:
+    """One table of all comparisons of a sweep."""
+    # Imported here, since they import torch, which takes seconds.
+    from ganlane.evaluation.results import sweep_rows
+    from ganlane.evaluation.table import show, text_table
+
+    rows = sweep_rows(folder)
+    if rows:
+        show("", text_table(rows), f"sweep: {folder}", columns=columns)
+
+
+# --- a run and its folder
+
+
+def as_yaml(config: Record) -> str:
+    """All keys and values of a record."""
+    return yaml.safe_dump(plain(config), sort_keys=False, allow_unicode=True)
+
+
+def run_in(folder: Path, command: str, config: Any, task: Task | None = None) -> str | None:
+    """Run a command in ``folder``; the line that names its results.
+
+    Raises:
+        UserError: another run uses the folder, or whatever the command refuses.
+    """
+    register_envs()  # for a user's own driver or traffic
+    with cleared_after_mistakes(folder), held(folder):
+        write_bytes(folder / CONFIG, as_yaml(config).encode())
+        with numbered_refusals():
+            return (task or function_of(command))(config, folder)
+
+
+def function_of(command: str) -> Callable[[Any, Path], str]:
+    """The command's function; importing its module imports torch, which takes seconds."""
+    return getattr(importlib.import_module(COMMANDS[command][1]), command)
+
+
+@contextmanager
+def cleared_after_mistakes(folder: Path) -> Iterator[None]:
+    """Remove a newly made folder, and newly made folders above it, if a mistake ends the run.
+
+    A folder with results, trained weights or a checkpoint is never removed, nor one that another
+    process uses.
+    """
+    existed = folder.is_dir() and any(folder.iterdir())
+    new_parents = [parent for parent in folder.parents if not parent.exists()]
+    try:
+        yield
+    except (UserError, OSError):
+        precious = (*EARNED, LOCK)
+        if not existed and not any(any(folder.rglob(name)) for name in precious):
+            shutil.rmtree(folder, ignore_errors=True)
+            for parent in new_parents:  # innermost first
+                if parent.is_dir() and not any(parent.iterdir()):
+                    parent.rmdir()
+        raise
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Make and lock a run's folder; a refused run leaves the settings of the run before it.
+
+    Raises:
+        UserError: another run uses the folder.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with _locked(folder):
+        path = folder / CONFIG
+        settings_before = path.read_bytes() if path.is_file() else None
+        earned_before = earned(folder)
+        try:
+            yield
+        except (UserError, OSError):
+            # A run that fails after it has saved something keeps its own, so it can be resumed.
+            if earned(folder) == earned_before:
+                if settings_before is None:
+                    path.unlink(missing_ok=True)
+                else:
+                    write_bytes(path, settings_before)
+            raise
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the system's lock on a file that names this process.
+
+    The system releases it when the process dies, so the file of a killed run blocks nobody. Without
+    locks in the operating or file system, nothing is locked.
+    """
+    path = folder / LOCK
+    while True:
+        file = path.open("a+", errors="replace")
+        try:
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            file.seek(0)
+            owner = file.read().strip() or "another process"
+            file.close()
+            raise UserError(
+                f"{folder}: a run is at work there ({owner}); wait for its end, or give another "
+                "folder."
+            ) from error
+        except OSError:  # the file system has no locks
+            pass
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                break
+        file.close()  # the process that held it has just removed the file
+    try:
+        for part in _OWN_FOLDERS:
+            remove_leftovers(folder / part)  # first, since they may fill the disk
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+        file.flush()
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        file.close()
+
+
+def earned(folder: Path) -> set[tuple[Path, int]]:
+    """The run's files that took time to make, with the times of their last change."""
+    files = [
+        path for part in _OWN_FOLDERS for name in EARNED for path in (folder / part).glob(name)
+    ]
+    return {(path, path.stat().st_mtime_ns) for path in files}
+
+
+# --- resume
+
+
+def _resumed_folder(asked: str) -> Path | None:
+    """The folder of the run to go on with; None: ``auto`` finds none.
+
+    Raises:
+        UserError: no run there.
+    """
+    if asked == "auto":
+        folder = newest_unfinished(OUTPUTS / "train")
+        if folder is None:
+            print(
+                f"resume=auto: no unfinished run below {OUTPUTS / 'train'}; a new one is started.",
+                file=sys.stderr,
+            )
+        return folder
+    path = Path(asked)
+    if path.is_file() and path.name != LAST.name:
+        raise UserError(
+            f"resume={path}: a run continues from its {LAST.name} only; give the run's folder."
+        )
+    for folder in [path, *path.parents[:3]] if path.exists() else []:
+        if (folder / CONFIG).is_file() and any(folder.rglob(LAST.name)):
+            return folder
+    raise UserError(
+        f"resume={path}: no checkpoint there ({path / LAST}); give a run's folder, its {LAST}, or "
+        "auto."
+    )
+
+
+def newest_unfinished(runs: Path) -> Path | None:
+    """The run with the newest checkpoint among those without results; None if there is none."""
+    checkpoints = sorted(runs.rglob(LAST.name), key=lambda path: -path.stat().st_mtime)
+    for checkpoint in checkpoints:
+        for folder in checkpoint.parents:
+            if (folder / CONFIG).is_file():
+                if not (folder / "results.json").is_file():
+                    return folder
+                break
+    return None
+
+
+def _refuse_stored_imports(data: Mapping[str, Any], words: Sequence[str], run: str) -> None:
+    """Refuse code from outside the package that a run's file names, unless a word names it too.
+
+    Raises:
+        UserError: the file names a class or function of another package, or a Ray cluster.
+    """
+    for key, value in _imports(data, ""):
+        if not any(value in word for word in words if "=" in word):
+            raise UserError(
+                f"resume={run}: the run's file names {value}, and code from there would be "
+                f"executed; if you trust it, add {key}={value} to the command line."
+            )
+
+
+def _imports(data: Mapping[str, Any], above: str) -> Iterator[tuple[str, str]]:
+    """Every import path outside the package that ``data`` name, with its key."""
+    for name, value in data.items():
+        key = f"{above}{name}"
+        if isinstance(value, Mapping):
+            names = list(value) if name == "shares" else []
+            yield from _imports(value, f"{key}.")
+        else:
+            names = value if isinstance(value, list) else [value]
+        if name not in _IMPORTING_KEYS:
+            continue
+        for text in names:
+            path = str(text).partition("+")[0]
+            is_own = path.startswith(("ganlane.", "ganlane_simulators.")) or path.endswith(
+                ".safetensors"
+            )
+            if name == "address" and text not in (None, "auto"):
+                yield key, str(text)
+            elif is_import_path(path) and not is_own and not Path(path).is_file():
+                yield key, path
+
+
+@contextmanager
+def _sigterm_as_exception() -> Iterator[None]:
+    """Raise :class:`Stopped` on SIGTERM; the training loop has its own handler."""
+
+    def stop(number: int, frame: Any) -> None:
+        raise Stopped(number)
+
+    try:
+        before = signal.signal(signal.SIGTERM, stop)
+    except ValueError:  # not in the main thread, where Python allows no handlers
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

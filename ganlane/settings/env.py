@@ -1,0 +1,328 @@
+"""``env=...``: road, vehicles, initial scenes, and the end of an episode; m, s, m/s.
+
+``env=highway`` and ``env=dense`` start with random scenes (Table II). ``env=cut_in, stalled_car,
+blocked_lane, stop_and_go`` start with a scene made by :mod:`ganlane.sim.scenarios`, ``env=scene``
+with one from a file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+
+from ganlane.arguments import call_with
+from ganlane.errors import ParameterError, as_typed
+from ganlane.settings.driving import EgoParameters, IdmParameters, MobilParameters, Visibility
+from ganlane.settings.episode import KERNELS, EpisodeParameters, SpawnParameters
+from ganlane.settings.observation import RewardParameters
+from ganlane.settings.record import (
+    NotNegative,
+    Positive,
+    Record,
+    Rule,
+    Share,
+    Text,
+    assign,
+    between,
+    key_names,
+    one_of,
+    part_of,
+)
+
+if TYPE_CHECKING:
+    from ganlane.sim.scenes import FixedScene, SceneVehicle
+
+Vehicles: TypeAlias = Annotated[int, between(2, 1000)]
+_VEHICLES_OR_SCENE = Rule(lambda count: count == 0 or 2 <= count <= 1000, "a number from 2 to 1000")
+#: Keys of Table II, which do not apply to a given scene.
+TABLE_II_KEYS = tuple(
+    name for name in key_names(SpawnParameters) if name != "ego_desired_speed_mps"
+)
+
+
+@dataclass(frozen=True)
+class SceneConfig(Record):
+    """``env.scene``: a first scene set by hand.
+
+    Attributes:
+        kind: which one: a function of :mod:`ganlane.sim.scenarios`, or file.
+        jitter_m: positions vary by up to so much to either side from episode to episode, m.
+        jitter_mps: and speeds, m/s; standing vehicles remain standing.
+    """
+
+    chosen_by = "kind"
+
+    kind: str
+    jitter_m: NotNegative = 0.5
+    jitter_mps: NotNegative = 0.5
+
+    @classmethod
+    def chosen(cls, data: Any) -> tuple[type[Record], Any]:
+        """The scene of this kind; its name alone will do."""
+        return super().chosen({"kind": data} if isinstance(data, str) else data)
+
+    def vehicles(self, env: EnvConfig) -> tuple[SceneVehicle, ...]:
+        """The vehicles, the ego first."""
+        from ganlane.sim import scenarios
+
+        offered = {
+            "lanes": env.lanes,
+            "desired_speed_mps": env.ego_desired_speed_mps,
+            "lane_width_m": env.lane_width_m,
+            "idm": env.idm,
+        }
+        shared = key_names(SceneConfig)
+        names = [name for name in key_names(type(self)) if name not in shared]
+        numbers = {name: getattr(self, name) for name in names}
+        return call_with(getattr(scenarios, self.kind), offered, numbers, self.label())
+
+    def label(self) -> str:
+        """The scene, for messages."""
+        return f"env={self.kind}"
+
+
+@dataclass(frozen=True)
+class CutInScene(SceneConfig):
+    """A slower vehicle changes into the ego's lane, close ahead, at the first moment.
+
+    Attributes:
+        gap_m: from the ego's bumper to the other's when it cuts in, m.
+        speed_mps: of the ego and the others, m/s.
+        cutter_speed_mps: of the vehicle that cuts in, and its desired speed, m/s.
+    """
+
+    kind: str = "cut_in"
+    jitter_m: NotNegative = 1.0
+    gap_m: Positive = 20.0
+    speed_mps: Positive = 20.0
+    cutter_speed_mps: Positive = 17.0
+
+
+@dataclass(frozen=True)
+class StalledCarScene(SceneConfig):
+    """A broken-down vehicle ahead in the ego's lane, the rightmost; traffic in the next lane.
+
+    Attributes:
+        distance_m: from the ego's centre to the stalled car's, m.
+        speed_mps: of the ego and the others, m/s.
+        spacing_m: centre to centre, of those in the next lane, m.
+    """
+
+    kind: str = "stalled_car"
+    jitter_m: NotNegative = 1.0
+    distance_m: Positive = 200.0
+    speed_mps: Positive = 20.0
+    spacing_m: Positive = 120.0
+
+
+@dataclass(frozen=True)
+class BlockedLaneScene(SceneConfig):
+    """The ego's lane, the rightmost, is closed by standing vehicles; traffic passes in the others.
+
+    Attributes:
+        distance_m: from the ego's centre to the first standing vehicle's, m.
+        standing: vehicles that close the lane, 1 to 100.
+        speed_mps: of the ego and the others, m/s.
+        spacing_m: centre to centre, of those in the other lanes, m; from 100 on MOBIL finds a gap.
+    """
+
+    kind: str = "blocked_lane"
+    distance_m: Positive = 250.0
+    standing: Annotated[int, between(1, 100)] = 3
+    speed_mps: Positive = 15.0
+    spacing_m: Positive = 60.0
+
+
+@dataclass(frozen=True)
+class StopAndGoScene(SceneConfig):
+    """Columns in which queues stand and groups flow.
+
+    Attributes:
+        waves: queues in a lane, 1 to 50.
+        per_wave: vehicles in a queue, and in the group behind it, 2 to 50.
+        speed_mps: of those that flow, m/s.
+    """
+
+    kind: str = "stop_and_go"
+    waves: Annotated[int, between(1, 50)] = 2
+    per_wave: Annotated[int, between(2, 50)] = 5
+    speed_mps: Positive = 10.0
+
+
+@dataclass(frozen=True)
+class FileScene(SceneConfig):
+    """A scene of your own.
+
+    Attributes:
+        path: the file; its first vehicle is the ego.
+    """
+
+    kind: str = "file"
+    jitter_m: NotNegative = 0.0
+    jitter_mps: NotNegative = 0.0
+    path: Text | None = None
+
+    def read(self, env: EnvConfig) -> FixedScene:
+        """The file's vehicles and road; the numbers of ``env`` replace the road's unless 0."""
+        from ganlane.sim.scenarios import read_scene, with_ego_speed
+
+        if self.path is None:
+            raise ParameterError(
+                "{scene.path}: no file; give one, env=scene {scene.path}=my_scene.csv."
+            )
+        scene = read_scene(self.path, env.lanes or None, env.lane_width_m or None)
+        speed = env.ego_desired_speed_mps
+        return with_ego_speed(scene, speed) if speed else scene
+
+    def vehicles(self, env: EnvConfig) -> tuple[SceneVehicle, ...]:
+        """Those of the file."""
+        return self.read(env).rows
+
+    def label(self) -> str:
+        """The file."""
+        return str(self.path)
+
+
+@dataclass(frozen=True)
+class EnvConfig(SpawnParameters, EpisodeParameters):
+    """The paper's highway (section IV, Tables II, IV and V).
+
+    Attributes:
+        vehicles: M, the ego included, 2 (Table III has no entry for fewer) to 1000; 0: as many as
+            the scene has.
+        lanes: 1 to 20; 0: as the scene's file says (JSON), or just enough for its vehicles.
+        lane_width_m: above the vehicles' width; the paper gives none. In narrower lanes noise alone
+            makes cars of 2.5 m touch. 0: as the scene's file says, or 4 m.
+        ego_desired_speed_mps: of the ego; 0: as the scene's file says.
+        metres_per_vehicle: spread_m is at least this times vehicles, m (env=dense); null: no bound.
+        recycle: true: vehicles that the ego leaves 200 m behind return ahead of it, and the
+            reverse.
+        recycle_share: share of the episodes in which they do, 0 to 1.
+        compile: true: physics, traffic and the agent's update as compiled graphs (needs a C++
+            compiler); faster, after a minute or so of compiling, and the same up to rounding.
+        kernel: what drives a decision: the tensor code (torch), the native kernel (native), which
+            does the same up to rounding for traffic=idm and idm_mobil on a CPU, or the kernel where
+            it can (auto).
+        scene: the first scene, set by hand; null: Table II.
+        ego: how the ego drives.
+        idm: how all follow, Table V.
+        mobil: how the others change lanes, Table IV.
+    """
+
+    group = "env"
+
+    vehicles: Annotated[int, _VEHICLES_OR_SCENE] = 9
+    lanes: Annotated[int, between(0, 20)] = 3
+    lane_width_m: NotNegative = 4.0
+    ego_desired_speed_mps: NotNegative = 25.0
+    metres_per_vehicle: Positive | None = None
+    recycle: bool = False
+    recycle_share: Share = 1.0
+    compile: bool = False
+    kernel: Annotated[str, one_of(KERNELS)] = "auto"
+    scene: SceneConfig | None = None
+    ego: EgoParameters = field(default_factory=EgoParameters)
+    idm: IdmParameters = field(default_factory=IdmParameters)
+    mobil: MobilParameters = field(default_factory=MobilParameters)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.metres_per_vehicle is not None:
+            assign(self, spread_m=max(self.spread_m, self.metres_per_vehicle * self.vehicles))
+        if isinstance(self.scene, FileScene):
+            self._take_road_of(self.scene)
+        for name in ("vehicles", "lanes", "ego_desired_speed_mps"):
+            if getattr(self, name) == 0 and (self.scene is None or name != "vehicles"):
+                raise ParameterError(
+                    f"{{{name}}}=0: expected a number above 0; 0 means what a scene's file says."
+                )
+        for name in ("width_m", "truck_width_m") if self.truck_share > 0 else ("width_m",):
+            if self.lane_width_m <= getattr(self, name):
+                raise ParameterError(
+                    f"{{lane_width_m}}={self.lane_width_m:g}: expected more than {{{name}}}="
+                    f"{getattr(self, name):g}, or vehicles in neighbouring lanes touch; widen the "
+                    "lanes."
+                )
+        if self.timeout_s < self.decision_period_s:
+            raise ParameterError(
+                f"{{timeout_s}}={self.timeout_s:g}: expected at least {{decision_period_s}}="
+                f"{self.decision_period_s:g}, or every episode ends in its first step."
+            )
+        self._check_start()
+
+    def _take_road_of(self, file: FileScene) -> None:
+        scene = file.read(self)
+        assign(
+            self,
+            lanes=int(scene.road.lanes),
+            lane_width_m=float(scene.road.lane_width_m),
+            ego_desired_speed_mps=scene.rows[0].desired_speed_mps,
+        )
+
+    def _check_start(self) -> None:
+        """Refuse first scenes that do not fit on the road, or make a crash unavoidable."""
+        if self.scene is not None:
+            self._check_scene()
+            return
+        # The check imports torch. The defaults are valid, so a mistake elsewhere is reported
+        # without it.
+        start = (self.spawn_parameters(), self.vehicles, self.lanes, self.idm)
+        if start == (SpawnParameters(), EnvConfig.vehicles, EnvConfig.lanes, IdmParameters()):
+            return
+        from ganlane.sim.spawn import check_start
+
+        check_start(*start)
+
+    def _check_scene(self) -> None:
+        for name in TABLE_II_KEYS:
+            value = getattr(self, name)
+            if value != getattr(SpawnParameters, name):
+                raise ParameterError(
+                    f"{{{name}}}={as_typed(value)}: has no effect on a scene set by hand; leave it "
+                    "out, or take env=highway."
+                )
+        scene = self.scenes()
+        assert scene is not None
+        if self.vehicles not in (0, scene.vehicles):
+            raise ParameterError(
+                f"{{vehicles}}={self.vehicles}: the scene has {scene.vehicles}, the ego included; "
+                "leave this key out."
+            )
+        assign(self, vehicles=scene.vehicles)
+        scene.check(scene.road, self.idm)
+
+    def scenes(self, others_visibility: int | None = None) -> FixedScene | None:
+        """Initial scenes of episodes; None: Table II. ``others_visibility`` is the traffic's."""
+        if self.scene is None:
+            return None
+        from ganlane.sim.scenes import FixedScene
+        from ganlane.sim.state import Road
+
+        signalled = others_visibility is None
+        return FixedScene(
+            self.scene.vehicles(self),
+            Road(self.lanes, self.lane_width_m),
+            jitter_m=self.scene.jitter_m,
+            jitter_mps=self.scene.jitter_mps,
+            ego_visibility=Visibility.named(self.ego.visibility),
+            others_visibility=Visibility.SIGNALLED if signalled else others_visibility,
+            name=self.scene.label(),
+        )
+
+    def spawn_parameters(self) -> SpawnParameters:
+        """The parameters of Table II."""
+        return part_of(self, SpawnParameters)
+
+    def episode_parameters(self) -> EpisodeParameters:
+        """Decision period, goal and time-out."""
+        return part_of(self, EpisodeParameters)
+
+
+def check_reward(env: EnvConfig, reward: RewardParameters) -> None:
+    """Refuse a desired speed of the ego, where the speed reward is 1, not above its base speed."""
+    if env.ego_desired_speed_mps <= reward.base_speed_mps:
+        raise ParameterError(
+            f"{{env.ego_desired_speed_mps}}={env.ego_desired_speed_mps:g}: expected more than "
+            f"{{reward.base_speed_mps}}={reward.base_speed_mps:g}, where the speed reward is 0; "
+            "raise the one or lower the other."
+        )

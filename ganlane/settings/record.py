@@ -1,0 +1,347 @@
+"""Records: frozen dataclasses whose constructor takes plain data and says what is wrong with it.
+
+YAML, command line, Python calls and saved runs all end here, so a parameter is declared once::
+
+    @dataclass(frozen=True)
+    class Agent(Record):
+        gamma: Annotated[float, between(0, 1)] = 0.98
+
+    Agent(gamma=2)                      # gamma=2: expected a number from 0 to 1; give for ...
+    make(Run, {"agent": {"gama": 0.9}}) # agent.gama: no such key (did you mean 'gamma'?); ...
+    make(Run, {"agent": "dqn"})         # what conf/agent/dqn.yaml says
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import MISSING, Field, fields, is_dataclass
+from functools import cache
+from numbers import Real
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Final,
+    NamedTuple,
+    TypeAlias,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+import yaml
+
+from ganlane.errors import ParameterError, as_typed, did_you_mean
+from ganlane.files import conf_folder
+
+Part = TypeVar("Part")
+#: Metadata of a field that is set from Python alone: no key of the command line or of a file.
+NO_KEY: Final[Mapping[str, Any]] = {"no_key": True}
+
+
+# --- ranges
+
+
+class Rule(NamedTuple):
+    """Whether a value of the right type will do, and what was expected in words."""
+
+    holds: Callable[[Any], bool]
+    expected: str
+
+
+def _finite(value: float) -> bool:
+    """Whether a number is finite, and fits into 64 bits if it is whole."""
+    return abs(value) < (2**63 if isinstance(value, int) else math.inf)
+
+
+def at_least(low: float) -> Rule:
+    """Finite and not below ``low``."""
+    return Rule(lambda value: _finite(value) and value >= low, f"at least {as_typed(low)}")
+
+
+def between(low: float, high: float) -> Rule:
+    """From ``low`` to ``high``, both included."""
+    expected = f"a number from {as_typed(low)} to {as_typed(high)}"
+    return Rule(lambda value: low <= value <= high, expected)
+
+
+def one_of(names: Iterable[str]) -> Rule:
+    """One of ``names``."""
+    allowed = tuple(names)
+    return Rule(lambda value: value in allowed, f"one of {', '.join(allowed)}")
+
+
+def _is_range(pair: tuple[float, float]) -> bool:
+    return _finite(pair[0]) and _finite(pair[1]) and 0 <= pair[0] <= pair[1]
+
+
+#: A list without repetitions.
+DIFFERENT = Rule(
+    lambda entries: len(entries) == len(set(entries)) > 0, "a list of different entries, not empty"
+)
+_ABOVE_0 = Rule(lambda value: _finite(value) and value > 0, "a number above 0")
+_BELOW_0 = Rule(lambda value: _finite(value) and value < 0, "a number below 0")
+_AT_MOST_0 = Rule(lambda value: _finite(value) and value <= 0, "at most 0")
+_SHARE_ABOVE_0 = Rule(lambda value: 0 < value <= 1, "a number above 0, at most 1")
+_RANGE = Rule(_is_range, "two numbers [low, high], 0 <= low <= high")
+_RANGE_ABOVE_0 = Rule(
+    lambda pair: _is_range(pair) and pair[0] > 0, "two numbers [low, high], 0 < low <= high"
+)
+
+Number: TypeAlias = Annotated[float, Rule(_finite, "a finite number")]
+Positive: TypeAlias = Annotated[float, _ABOVE_0]
+Negative: TypeAlias = Annotated[float, _BELOW_0]
+NotNegative: TypeAlias = Annotated[float, at_least(0)]
+NotPositive: TypeAlias = Annotated[float, _AT_MOST_0]
+Share: TypeAlias = Annotated[float, between(0, 1)]
+PositiveShare: TypeAlias = Annotated[float, _SHARE_ABOVE_0]
+Count: TypeAlias = Annotated[int, at_least(1)]
+CountOrZero: TypeAlias = Annotated[int, at_least(0)]
+Seed: TypeAlias = Annotated[int, between(0, 2**53)]
+Text: TypeAlias = Annotated[str, Rule(bool, "a text that is not empty")]
+#: Lowest and highest value, from 0 on; or above 0.
+Range: TypeAlias = Annotated[tuple[float, float], _RANGE]
+PositiveRange: TypeAlias = Annotated[tuple[float, float], _RANGE_ABOVE_0]
+
+
+# --- options: a YAML file each
+
+
+def option_names(group: str) -> list[str]:
+    """Names of a group's options, the files ``conf/GROUP/NAME.yaml``."""
+    return sorted(path.stem for path in (conf_folder() / group).glob("*.yaml"))
+
+
+@cache
+def _option_file(path: Path) -> dict[str, Any]:
+    return yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+
+
+def option(group: str, name: str) -> dict[str, Any]:
+    """What ``conf/GROUP/NAME.yaml`` says: the keys that differ from the record's defaults.
+
+    Raises:
+        ParameterError: no such option.
+    """
+    names = option_names(group)
+    if name not in names:
+        raise ParameterError(
+            f"{group}={name!s:.80}: no such option{did_you_mean(str(name), names)}; choose one of "
+            f"{', '.join(names)}."
+        )
+    return deepcopy(_option_file(conf_folder() / group / f"{name}.yaml"))
+
+
+def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """``below`` with ``above`` on top, mapping by mapping; one with a ``name`` begins anew."""
+    result = dict(below)
+    for name, value in above.items():
+        before = result.get(name)
+        if isinstance(before, Mapping) and isinstance(value, Mapping) and "name" not in value:
+            value = merged(before, value)
+        result[name] = value
+    return result
+
+
+# --- records
+
+
+class Record:
+    """Base class of the records: the constructor checks types and ranges, field by field.
+
+    A nested record may be given as a mapping of its keys, or by the name of an option if its class
+    has a ``group``. ``{"name": "gan", "noise_scale": 0.5}`` is that option with changes.
+
+    Attributes:
+        group: folder of ``conf/`` with the options; empty: none.
+        chosen_by: field whose value tells which subclass is meant; empty: there are none.
+
+    Raises:
+        ParameterError: for the first value that will not do; names field, value, what was expected,
+            and a valid value.
+    """
+
+    group: ClassVar[str] = ""
+    chosen_by: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        hints = _hints(type(self))
+        for field in fields(self):  # type: ignore[arg-type]
+            value = _fitted(hints[field.name], getattr(self, field.name), field.name, field)
+            assign(self, **{field.name: value})
+
+    @classmethod
+    def kinds(cls) -> dict[str, type[Record]]:
+        """The subclasses, or the class alone, by the default of the field ``chosen_by``."""
+        return {getattr(kind, cls.chosen_by): kind for kind in (cls.__subclasses__() or [cls])}
+
+    @classmethod
+    def chosen(cls, data: Any) -> tuple[type[Record], Any]:
+        """The class that ``data`` ask for, and the data of its constructor."""
+        if isinstance(data, str) and cls.group:
+            data = {"name": data}
+        if isinstance(data, Mapping) and cls.group and "name" in data:
+            changes = {name: value for name, value in data.items() if name != "name"}
+            data = merged(option(cls.group, data["name"]), changes)
+        kinds = cls.kinds() if cls.chosen_by else {}
+        if not kinds or not isinstance(data, Mapping) or cls.chosen_by not in data:
+            return cls, data
+        choice = data[cls.chosen_by]
+        if not isinstance(choice, str) or choice not in kinds:
+            raise ParameterError(
+                f"{{{cls.chosen_by}}}={as_typed(choice)}: expected one of {', '.join(kinds)}; "
+                "choose one of these."
+            )
+        return kinds[choice], data
+
+
+def make(kind: type[Part], data: Any, key: str = "") -> Part:
+    """A record of ``kind`` from plain data; ``key`` is its own, for messages.
+
+    Raises:
+        ParameterError: for the first key or value that will not do, by its whole key.
+    """
+    if isinstance(data, kind):
+        return data
+    with _below(key):
+        chosen, values = kind.chosen(data)  # type: ignore[attr-defined]
+    if not isinstance(values, Mapping):
+        options = "the name of an option or " if chosen.group else ""
+        raise ParameterError(
+            f"{{{key}}}={as_typed(values)}: it has keys of its own; give {options}{{{key}}}.NAME=VALUE."
+        )
+    names = key_names(chosen)
+    for name in values:
+        if name not in names:
+            whole = f"{key}.{name}" if key else name
+            owner = f"{{{key}}} has" if key else "known are"
+            hint = did_you_mean(str(name), names)
+            raise ParameterError(
+                f"{{{whole}}}: no such key{hint}; {owner} {', '.join(sorted(names))}."
+            )
+    with _below(key):
+        return chosen(**values)
+
+
+@contextmanager
+def _below(key: str) -> Iterator[None]:
+    """Put ``key`` before the fields that an error names."""
+    try:
+        yield
+    except ParameterError as error:
+        raise (error.below(key) if key else error) from error.__cause__
+
+
+def key_names(kind: Any) -> list[str]:
+    """The fields of a record that are keys."""
+    return [field.name for field in fields(kind) if field.metadata != NO_KEY]
+
+
+def assign(record: Any, **values: Any) -> None:
+    """Set fields of a frozen ``record``, for its ``__post_init__``."""
+    for name, value in values.items():
+        object.__setattr__(record, name, value)
+
+
+def part_of(record: Any, kind: type[Part]) -> Part:
+    """The fields that ``record`` inherits from ``kind``, as a ``kind``."""
+    return kind(**{field.name: getattr(record, field.name) for field in fields(kind)})  # type: ignore[arg-type]
+
+
+def plain(record: Any) -> Any:
+    """The keys and values of a record as mappings, lists, texts and numbers, for a YAML file."""
+    if is_dataclass(record):
+        return {name: plain(getattr(record, name)) for name in key_names(record)}
+    if isinstance(record, Mapping):
+        return {str(name): plain(value) for name, value in record.items()}
+    if isinstance(record, list | tuple):
+        return [plain(entry) for entry in record]
+    return record
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind, include_extras=True)
+
+
+_WORDS = {
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    str: "a text",
+    dict: "names with values, {name: value}",
+}
+
+
+def _fitted(hint: Any, value: Any, key: str, field: Field[Any]) -> Any:
+    """``value`` as the annotation ``hint`` wants it, its ranges checked."""
+    kind, inner = get_origin(hint) or hint, get_args(hint)
+    if kind in (Union, UnionType):
+        if value is None and NoneType in inner:
+            return None
+        present = next(alternative for alternative in inner if alternative is not NoneType)
+        return _fitted(present, value, key, field)
+    if kind is Annotated:
+        value = _fitted(inner[0], value, key, field)
+        for rule in inner[1:]:
+            if not rule.holds(value):
+                raise _refusal(key, value, rule.expected, field)
+        return value
+    if is_dataclass(kind):
+        return make(kind, value, key)  # type: ignore[arg-type]
+    if hasattr(value, "tolist"):  # NumPy's and torch's numbers and arrays
+        value = value.tolist()
+    if kind in (list, tuple):
+        entries = [value] if isinstance(value, str) else value  # agents=mobil
+        if not isinstance(entries, Collection) or isinstance(entries, Mapping):
+            raise _refusal(key, value, "a list in brackets", field)
+        if kind is tuple and inner[1] is not Ellipsis and len(entries) != len(inner):
+            raise _refusal(key, value, f"{len(inner)} entries", field)
+        return kind(_fitted(inner[0], entry, key, field) for entry in entries)
+    if kind is dict and isinstance(value, Mapping):
+        return {
+            str(name): _fitted(inner[1], entry, f"{key}.{name}", field)
+            for name, entry in value.items()
+        }
+    return _scalar(kind, value, key, field)
+
+
+def _scalar(kind: Any, value: Any, key: str, field: Field[Any]) -> Any:
+    """A number, text or switch of the type ``kind``."""
+    if kind is Any:
+        return value
+    is_number = isinstance(value, Real) and not isinstance(value, bool)
+    if kind is float and is_number:
+        try:
+            return float(value)
+        except OverflowError as error:
+            raise _refusal(key, value, "a number of fewer digits", field) from error
+    if kind is int and isinstance(value, float) and value.is_integer():
+        return int(value)  # 1e6
+    if kind is int and hasattr(value, "__index__") and not isinstance(value, bool):
+        return operator.index(value)
+    if kind is str and (is_number or isinstance(value, Path)):
+        return str(value)
+    if kind is str and isinstance(value, str) and "\0" in value:
+        raise _refusal(key, value, "a text without a zero byte", field)
+    if isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
+        return value
+    raise _refusal(key, value, _WORDS.get(kind, kind.__name__), field)
+
+
+def _refusal(key: str, value: Any, expected: str, field: Field[Any]) -> ParameterError:
+    has_value = field.default_factory is MISSING
+    default = field.default if has_value else field.default_factory()
+    example = ""
+    if default not in (MISSING, None, "") and not isinstance(default, dict | Record):
+        example = f"; give for instance {{{field.name}}}={as_typed(default)}"
+    text = " ".join(as_typed(value).split())
+    return ParameterError(f"{{{key}}}={text:.80}: expected {expected}{example}.")

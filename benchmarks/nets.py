@@ -187,7 +187,7 @@ def run_command(command: str, folder: Path | None, *arguments: str) -> None:
         "OMP_NUM_THREADS": "1",
         "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
     }
-    line = [sys.executable, "-m", f"ganlane.{command}", *arguments, *home]
+    line = [sys.executable, "-m", "ganlane", command, *arguments, *home]
     done = subprocess.run(line, cwd=ROOT, env=environment, capture_output=True, text=True)
     if done.returncode:
         sys.exit(f"{' '.join(line)} failed:\n{done.stderr[-2000:]}")

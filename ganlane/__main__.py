@@ -1,19 +1,16 @@
-"""``ganlane NAME key=value ...``: the same as ``python -m ganlane.NAME key=value ...``."""
+"""``ganlane COMMAND key=value ...``, the same as ``python -m ganlane COMMAND key=value ...``."""
 
 from __future__ import annotations
 
 import importlib
-import os
-import re
 import sys
 from collections.abc import Sequence
 
 from ganlane._version import __version__
 from ganlane.errors import USER_ERROR
-from ganlane.files import conf_folder
 from ganlane.runtime import open_closed_streams, status_of
 
-#: Commands with a configuration, and what they do; each is a module of the package with a ``main``.
+#: Commands with keys, and what they do.
 COMMANDS = {
     "train": "train an agent on a traffic, then compare it with other drivers",
     "evaluate": "agents x traffics on the same episodes, as one table",
@@ -23,22 +20,17 @@ COMMANDS = {
     "train_generator": "fit a generator to recorded traffic",
     "realism": "how close a traffic comes to recorded driving",
     "reproduce": "the paper's tables and figures, and the matrix behind them, in one folder",
-    "bench": "speed and memory, compared with a peer in the same run",
 }
-#: Commands without a configuration: they take no keys.
-PLAIN_COMMANDS = {"doctor": "check the installation; show the command for what is missing"}
-#: All commands, with and without keys.
-ALL_COMMANDS = COMMANDS | PLAIN_COMMANDS
-COMPLETION_FLAGS = ("-sc", "--shell-completion")
-SHELLS = ("bash", "zsh", "fish")
+#: All commands; ``doctor`` takes no keys.
+ALL_COMMANDS = COMMANDS | {"doctor": "check the installation; show the command for what is missing"}
 
 
 def usage() -> str:
     """The commands in a few lines."""
     listed = "\n".join(f"  {name:<17}{text}" for name, text in ALL_COMMANDS.items())
     return (
-        f"usage: ganlane COMMAND key=value ...\n\n{listed}\n\nganlane COMMAND --help explains its options and keys.\n"
-        'eval "$(ganlane -sc install=bash)" completes commands, options and keys in this shell.'
+        f"usage: ganlane COMMAND key=value ...\n\n{listed}\n\n"
+        "ganlane COMMAND --help explains its options and keys."
     )
 
 
@@ -62,55 +54,16 @@ def dispatch(arguments: Sequence[str] | None = None) -> int:
     if command == "--version":
         print(__version__)
         return 0
-    if set(COMPLETION_FLAGS) & {command, *rest}:
-        return shell_completion([command, *rest])
     if command not in ALL_COMMANDS:
         print(
             f"ganlane: {command}: no such command; choose one of {', '.join(ALL_COMMANDS)}.",
             file=sys.stderr,
         )
         return USER_ERROR
-    return importlib.import_module(f"ganlane.{command}").main(rest)
-
-
-def shell_completion(arguments: Sequence[str]) -> int:
-    """``ganlane [COMMAND] -sc install=SHELL`` and the like; the exit status.
-
-    Hydra completes programs that are a single command: its shell function calls the program,
-    ``ganlane``, without the command, which is therefore read from the line and removed before Hydra
-    completes the rest.
-    """
-    asked = next(
-        filter(
-            None, (re.fullmatch(r"(install|uninstall|query)=(\w+)", each) for each in arguments)
-        ),
-        None,
-    )
-    if asked is None or asked[2] not in SHELLS:
-        print(
-            f'ganlane: {" ".join(arguments)}: expected for instance eval "$(ganlane -sc install=bash)"; shells: '
-            f"{', '.join(SHELLS)}.",
-            file=sys.stderr,
-        )
-        return USER_ERROR
-    action, shell = asked.groups()
-    if action == "query":
-        print(("\n" if shell == "fish" else " ").join(candidates(os.environ.get("COMP_LINE", ""))))
-    else:
-        importlib.import_module("ganlane.config.help").print_completion_script(action, shell)
-    return 0
-
-
-def candidates(line: str) -> list[str]:
-    """Completions of the last word of ``line``, as typed so far, the program's name included."""
-    parts = re.match(r"\s*\S+(?:\s+(\S*)(\s.*)?)?$", line)
-    command, rest = (parts[1] or "", parts[2]) if parts else ("", None)
-    if rest is None:
-        return [name for name in ALL_COMMANDS if name.startswith(command)]
-    if not (conf_folder() / f"{command}.yaml").is_file():
-        return []
-    # Imported here: completing the name of a command takes half of the time without Hydra.
-    return importlib.import_module("ganlane.config.help").completed(command, rest)
+    # Imported here: composing takes a third of a second, the list of commands none.
+    if command == "doctor":
+        return importlib.import_module("ganlane.doctor").main(rest)
+    return importlib.import_module("ganlane.config.run").run_command(command, rest)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from ganlane.agents import load_agent
 from ganlane.agents.checkpoint import SHIPPED, names_agent, with_seeds
 from ganlane.agents.drivers import DRIVERS, MaskedPolicy
 from ganlane.arguments import call_with, import_target, is_import_path
+from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
@@ -47,6 +48,24 @@ from ganlane.transforms import (
 def make_road(env: EnvConfig) -> Road:
     """The road of an environment."""
     return Road(env.lanes, env.lane_width_m)
+
+
+def make_highways(config: HighwayConfig) -> TransformedEnv:
+    """The environments of a call: traffic, road, observation, reward and mask.
+
+    Raises:
+        UserError: see :func:`make_traffic` and :class:`ganlane.env.HighwayEnv`.
+    """
+    return make_env(
+        make_traffic(config.traffic, config.env, Stream.named(config.stream)),
+        config.env,
+        config.observation,
+        config.reward,
+        config.num_envs,
+        config.seed,
+        config.device,
+        mask=config.mask,
+    )
 
 
 def _constructor_arguments(env: EnvConfig, stream: int) -> dict[str, Any]:

@@ -63,8 +63,7 @@ def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = Fal
     env, seed, episodes = config.env, config.seed, config.episodes
     stream = Stream.named(config.stream)
     modules = {
-        name: make_traffic(traffic, env, stream)
-        for name, traffic in config.chosen_traffics().items()
+        name: make_traffic(traffic, env, stream) for name, traffic in config.traffics.items()
     }
     pairs = [(name, driver) for name in modules for driver in drivers]
     rows, tables = min(config.num_envs, episodes), []
@@ -183,7 +182,7 @@ def available(config: ReproduceConfig) -> tuple[dict[str, TrafficConfig], dict[s
     """
     there: dict[str, TrafficConfig] = {}
     missing: dict[str, str] = {}
-    for name, option in config.chosen_traffics().items():
+    for name, option in config.traffics.items():
         try:
             make_traffic(option, config.env)
             there[name] = option

@@ -1,5 +1,4 @@
-"""``ganlane train``: train an agent on a traffic, then compare it with other drivers on the same
-episodes.
+"""``ganlane train``: train an agent on a traffic, then compare it with other drivers.
 
     ganlane train traffic=gan init=idm_ckpt
     ganlane train traffic=idm_mobil init=none total_decisions=2000000 seed=1
@@ -14,13 +13,8 @@ into its run folder.
 """
 
 import sys
-from functools import partial
 
-from ganlane.config.app import run_command
-
-#: Entry point; takes the arguments of the command line, and returns the exit status.
-main = partial(run_command, "train")
-
+from ganlane.config.run import run_command
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_command("train"))

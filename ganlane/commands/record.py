@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from ganlane.build import make_driver
 from ganlane.settings.commands import RecordConfig
-from ganlane.config.runs import cleared_after_mistakes
+from ganlane.config.run import cleared_after_mistakes
 from ganlane.config.schemas import SCHEMAS
 from ganlane.errors import UserError
 from ganlane.evaluation.results import plain, write_results

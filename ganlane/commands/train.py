@@ -8,8 +8,8 @@ from pathlib import Path
 
 from ganlane.build import make_driver, make_drivers, make_traffic
 from ganlane.compare import compare, publish
-from ganlane.config.app import Stopped
-from ganlane.config.runs import earned
+from ganlane.config.run import Stopped
+from ganlane.config.run import earned
 from ganlane.settings.train import TrainConfig
 from ganlane.errors import UserError
 from ganlane.torch_settings import set_threads

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
+import itertools
 import re
 import textwrap
 from collections.abc import Iterator
@@ -45,11 +45,10 @@ def help_text(command: str, kind: type[Record]) -> str:
 
 
 def _purpose(command: str) -> str:
-    """The docstring of the command's module, else the first line of its YAML file."""
-    if command == "train":
-        text = inspect.getdoc(importlib.import_module("ganlane.train")) or ""
-        return text.replace("``", "")
-    return _summary(f"{command}.yaml")
+    """The comment at the head of the command's YAML file."""
+    lines = (conf_folder() / f"{command}.yaml").read_text(encoding="utf-8").splitlines()
+    head = itertools.takewhile(lambda line: line.startswith("#"), lines)
+    return "\n".join(line.removeprefix("#").removeprefix(" ") for line in head)
 
 
 def _options(group: str) -> str:

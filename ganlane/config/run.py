@@ -52,7 +52,7 @@ from ganlane.settings.commands import (
     RecordConfig,
     ReproduceConfig,
 )
-from ganlane.settings.record import Record, key_names, make, plain
+from ganlane.settings.record import Record, key_names, make, merged, plain
 from ganlane.settings.recordings import PrepareConfig, RealismConfig, TrainGeneratorConfig
 from ganlane.settings.render import RenderConfig
 from ganlane.settings.train import TrainConfig
@@ -215,10 +215,12 @@ def call_settings(command: str, keys: Mapping[str, Any]) -> Any:
     of_env = {name: value for name, value in keys.items() if name not in names}
     if of_env and "env" in names:
         keys = {name: value for name, value in keys.items() if name in names}
-        base = keys.get("env") or {}
-        if isinstance(base, Record):
-            base = plain(base)
-        keys["env"] = {**({"name": base} if isinstance(base, str) else base), **of_env}
+        base = keys.get("env", {})
+        if isinstance(base, str):
+            base = {"name": base}
+        keys["env"] = {**(plain(base) if isinstance(base, Record) else base), **of_env}
+    if command == "train" and keys.get("resume") is not None:
+        return make(kind, merged(saved_config(Path(keys["resume"]) / CONFIG), keys))
     return make(kind, called(command, keys))
 
 
@@ -311,6 +313,7 @@ def run_in(folder: Path, command: str, config: Any, task: Task | None = None) ->
     Raises:
         UserError: another run uses the folder, or whatever the command refuses.
     """
+    folder = folder.absolute()
     register_envs()  # for a user's own driver or traffic
     with cleared_after_mistakes(folder), held(folder):
         write_bytes(folder / CONFIG, as_yaml(config).encode())

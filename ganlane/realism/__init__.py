@@ -29,7 +29,7 @@ Modules, from the bottom up:
 
 from functools import partial
 
-from ganlane.config.app import run_command
+from ganlane.config.run import run_command
 
 #: Entry point; takes the arguments of the command line, and returns the exit status.
 main = partial(run_command, "realism")

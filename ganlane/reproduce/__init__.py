@@ -23,7 +23,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from ganlane.config.app import run_command
+from ganlane.config.run import run_command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

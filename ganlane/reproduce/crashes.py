@@ -140,7 +140,7 @@ def find_crashes(
     """
     traffics = {
         name: option
-        for name, option in config.chosen_traffics().items()
+        for name, option in config.traffics.items()
         if name in _LISTED and option._target_ == _LISTED[name]._target_ and not option.parameters
     }
     listed = CrashList(config.env, traffics, config.stream, [])

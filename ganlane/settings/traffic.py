@@ -74,6 +74,11 @@ class TrafficConfig(Record):
             data = {**data, "name": f"{target.__module__}.{target.__qualname__}"}
         if isinstance(data, Mapping) and "." in str(data.get("name")):
             data = {"_target_" if key == "name" else key: value for key, value in data.items()}
+        if isinstance(data, Mapping) and not {"_target_", "name"} & set(data):
+            raise ParameterError(
+                "{_target_}: of which traffic? name it first, as in traffic=gan or "
+                "pretrain.traffic=gan."
+            )
         target = data.get("_target_") if isinstance(data, Mapping) else None
         if not isinstance(target, str) or target in cls.kinds():
             return super().chosen(data)

@@ -221,3 +221,7 @@ class TrainConfig(DrivingConfig):
             episodes=self.evaluation.episodes,
             num_envs=self.evaluation.num_envs,
         )
+
+
+class MultiCollectorConfig(CollectorConfig): pass  # TEMP
+class OverlapCollectorConfig(CollectorConfig): pass  # TEMP

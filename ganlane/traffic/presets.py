@@ -19,13 +19,8 @@ from ganlane.generator import (
     load_generator,
     shipped_generator,
 )
-from ganlane.settings.driving import (
-    CalibratedGanParameters,
-    DriverFaults,
-    GanParameters,
-    IdmParameters,
-    MobilParameters,
-)
+from ganlane.settings.driving import DriverFaults, IdmParameters, MobilParameters
+from ganlane.settings.traffic import GanCalibratedTrafficConfig, GanTrafficConfig
 from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV
@@ -113,9 +108,9 @@ def gan_traffic(
     road: Road | None = None,
     stream: int = Stream.TRAIN,
     path: str | Path | None = None,
-    guard: bool = GanParameters.guard,
-    noise_scale: float = GanParameters.noise_scale,
-    execute_k: int = GanParameters.execute_k,
+    guard: bool = GanTrafficConfig.guard,
+    noise_scale: float = GanTrafficConfig.noise_scale,
+    execute_k: int = GanTrafficConfig.execute_k,
     idm: IdmParameters = TABLE_V,
 ) -> TrafficSequential:
     """``traffic=gan``, the paper's: positions only, literal blind lane changes, sudden
@@ -123,7 +118,7 @@ def gan_traffic(
 
     Args:
         road, stream: as for every traffic module.
-        path, guard, noise_scale, execute_k: see :class:`~ganlane.settings.driving.GanParameters`.
+        path, guard, noise_scale, execute_k: see :class:`~ganlane.settings.traffic.GanTrafficConfig`.
         idm: of the guard's bounds on acceleration.
 
     Raises:
@@ -148,9 +143,9 @@ def gan_calibrated_traffic(
     road: Road | None = None,
     stream: int = Stream.TRAIN,
     path: str | Path | None = None,
-    noise_scale: float = CalibratedGanParameters.noise_scale,
+    noise_scale: float = GanCalibratedTrafficConfig.noise_scale,
     changes_per_km: float | None = None,
-    noise_period_s: float = CalibratedGanParameters.noise_period_s,
+    noise_period_s: float = GanCalibratedTrafficConfig.noise_period_s,
     idm: IdmParameters = TABLE_V,
 ) -> TrafficSequential:
     """``traffic=gan_calibrated``: anchored residual, per-driver headways, checked lane changes at
@@ -159,7 +154,7 @@ def gan_calibrated_traffic(
     Args:
         road, stream: as for every traffic module.
         path, noise_scale, noise_period_s: see
-            :class:`~ganlane.settings.driving.CalibratedGanParameters`.
+            :class:`~ganlane.settings.traffic.GanCalibratedTrafficConfig`.
         changes_per_km: hazard of wishing for a lane change; by default :data:`WISH_PER_CHANGE`
             times the recorded rate, which gives that rate in the simulation.
         idm: of the gap check; the anchor keeps its own (:data:`SIMULATED_ANCHOR`).

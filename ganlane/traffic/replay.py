@@ -28,7 +28,8 @@ from ganlane.data import (
 )
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, VEHICLE_FLOATS
-from ganlane.settings.driving import IdmParameters, ReplayParameters, Visibility
+from ganlane.settings.driving import IdmParameters, Visibility
+from ganlane.settings.traffic import ReplayTrafficConfig
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import Memory, Moved, TrafficModule
@@ -200,7 +201,7 @@ class ReplayTraffic(TrafficModule):
 
     Args:
         stream: as for every traffic module.
-        path, least_s: see :class:`~ganlane.settings.driving.ReplayParameters`.
+        path, least_s: see :class:`~ganlane.settings.traffic.ReplayTrafficConfig`.
         recordings: tensors instead of a file.
 
     Raises:
@@ -214,7 +215,7 @@ class ReplayTraffic(TrafficModule):
         self,
         stream: int = Stream.TRAIN,
         path: str | Path | None = None,
-        least_s: float = ReplayParameters.least_s,
+        least_s: float = ReplayTrafficConfig.least_s,
         recordings: Recordings | None = None,
     ) -> None:
         self.source = "recordings" if recordings else str(path or _found())
@@ -340,5 +341,5 @@ def _found() -> Path:
     try:
         return default_scenes()
     except UserError as missing:
-        keys = "traffic.path=FILE (in evaluate traffic_options.replay.path=FILE)"
+        keys = "traffic.path=FILE (in evaluate traffics=[{name:replay,path:FILE}])"
         raise UserError(str(missing).replace("data.path=FILE", keys)) from missing

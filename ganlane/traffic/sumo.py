@@ -13,7 +13,8 @@ from torch import Tensor
 
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
-from ganlane.settings.driving import IdmParameters, SumoParameters, Visibility
+from ganlane.settings.driving import IdmParameters, Visibility
+from ganlane.settings.traffic import SumoTrafficConfig
 from ganlane.settings.episode import SpawnParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters, ego_scene, move_ego
 from ganlane.sim.idm import TABLE_V, following_acceleration
@@ -119,7 +120,7 @@ class SumoTraffic(TrafficModule):
         road, stream, idm, steering: as for every traffic module; idm and steering are the ego's.
         spawn: Table II, for the first scenes.
         truck_share, truck_length_m, lane_change_s, keep_right: see
-            :class:`~ganlane.settings.driving.SumoParameters`.
+            :class:`~ganlane.settings.traffic.SumoTrafficConfig`.
         speed_wander: amplitude of a desired speed's variation, as a share of it; the periods are 20
             to 60 s.
 
@@ -139,11 +140,11 @@ class SumoTraffic(TrafficModule):
         idm: IdmParameters = TABLE_V,
         steering: SteeringParameters = STEERING,
         spawn: SpawnParameters = TABLE_II,
-        truck_share: float = SumoParameters.truck_share,
-        truck_length_m: float = SumoParameters.truck_length_m,
-        lane_change_s: float = SumoParameters.lane_change_s,
-        keep_right: float = SumoParameters.keep_right,
-        speed_wander: float = SumoParameters.speed_wander,
+        truck_share: float = SumoTrafficConfig.truck_share,
+        truck_length_m: float = SumoTrafficConfig.truck_length_m,
+        lane_change_s: float = SumoTrafficConfig.lane_change_s,
+        keep_right: float = SumoTrafficConfig.keep_right,
+        speed_wander: float = SumoTrafficConfig.speed_wander,
     ) -> None:
         super().__init__(road, stream)
         require(*LIBSUMO)

@@ -17,7 +17,7 @@ from ganlane import keys
 from ganlane.agents import NetworkConfig, Rainbow, save_agent
 from ganlane.agents.n_step import Step
 from ganlane.agents.replay import MASK_KEY, ROW
-from ganlane.config.runs import LAST
+from ganlane.config.run import LAST
 from ganlane.errors import UserError
 from ganlane.files import atomic_path, has_checksum, note_without_checksum, seal_archive
 from ganlane.training.collectors import Collector, SingleCollector

@@ -53,7 +53,7 @@ class TrainingResult:
     """Result of a run.
 
     ``stopped_by`` is the number of the signal that stopped it early, or None (an entry point raises
-    :class:`~ganlane.config.app.Stopped` with it). ``best`` is the ``best_metric`` of the best
+    :class:`~ganlane.config.run.Stopped` with it). ``best`` is the ``best_metric`` of the best
     evaluation. ``checkpoint`` is the file to resume from.
     """
 

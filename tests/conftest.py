@@ -25,15 +25,6 @@ settings.load_profile("ganlane")
 
 
 @pytest.fixture
-def hydra_from_memory(monkeypatch):
-    """For tests of what a command says about a value: see ``reference.hydra_memory``."""
-    from hydra._internal.config_loader_impl import ConfigLoaderImpl
-    from reference.hydra_memory import load_from_memory
-
-    monkeypatch.setattr(ConfigLoaderImpl, "load_configuration", load_from_memory)
-
-
-@pytest.fixture
 def empty_folder(tmp_path, monkeypatch):
     """The working folder: an empty one."""
     monkeypatch.chdir(tmp_path)

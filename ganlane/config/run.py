@@ -232,7 +232,7 @@ def _sweep(command: str, overrides: list[Override], task: Task | None) -> None:
     if any(word.key_or_group == "resume" for word in overrides):
         raise UserError("resume: one run is resumed at a time; start without -m.")
     first = None
-    for words in _single_runs(overrides):
+    for words in single_runs(overrides):
         first = first or settings(command, words)
         settings(command, words)
     mistakes: list[Exception] = []
@@ -274,7 +274,7 @@ def _sweep(command: str, overrides: list[Override], task: Task | None) -> None:
         _show_sweep(sweep_folder[0], getattr(first, "columns", "auto"))
 
 
-def _single_runs(overrides: Sequence[Override]) -> list[list[str]]:
+def single_runs(overrides: Sequence[Override]) -> list[list[str]]:
     """The words of every run of a sweep: all combinations."""
     choices: list[list[str]] = []
     for override in overrides:

@@ -8,130 +8,44 @@ from __future__ import annotations
 
 import errno
 import os
-import pickle
 import signal
 import subprocess
 import sys
-from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import pytest
-from omegaconf import DictConfig, ListConfig, Node, OmegaConf
-from reference.hydra_memory import composed, own_part
+import yaml
 from reference.refusals import everything_below, is_one_sentence, refusal
 
-from ganlane.__main__ import COMMANDS, main
-from ganlane.config.app import Stopped, run_command
-from ganlane.config.command_line import as_meant, check, parse, refuse_unknown_keys, sentence
-from ganlane.config.schemas import SCHEMAS
-from ganlane.errors import ADVICE, UserError, is_users_matter
+from ganlane.__main__ import main
+from ganlane.config.compose import parsed
+from ganlane.config.run import Stopped, run_command, settings
+from ganlane.errors import ADVICE, UserError, file_sentence, is_users_matter
 from ganlane.files import write_bytes
+from ganlane.settings.commands import EvaluateConfig
+from ganlane.settings.record import make
+from ganlane.settings.traffic import TrafficConfig
 
 ROOT = Path(__file__).resolve().parents[2]
-COMPOSED = {command: own_part(composed(command)) for command in COMMANDS}
-
-
-def leaves(node: Any, prefix: str = "") -> list[tuple[str, Any]]:
-    """(key, value) of everything that is not a mapping."""
-    found = []
-    for name in node:
-        key, value = f"{prefix}{name}", OmegaConf.select(node, str(name))
-        found += leaves(value, f"{key}.") if isinstance(value, DictConfig) else [(key, value)]
-    return found
-
-
-KEYS = [
-    (command, key, value) for command, config in COMPOSED.items() for key, value in leaves(config)
-]
-LISTS = [(c, k) for c, k, v in KEYS if isinstance(v, ListConfig)]
-
-
-@pytest.mark.parametrize(
-    ("command", "given", "meant"),
-    [
-        ("render", "run=a", "run=['a']"),
-        ("render", "run=a/b=c,d e", "run=['a/b=c','d e']"),
-        ("render", "run=it's,b", "run=['it\\'s','b']"),
-        ("render", "run=[a,b]", "run=[a,b]"),
-        ("render", "run=null", "run=null"),
-        ("render", "out=a,1e5", "out=a,1e5"),
-        ("render", "episodes=0,1e1", "episodes=[0,10]"),
-        ("evaluate", "agents=mobil", "agents=['mobil']"),
-        ("train", "env.front_speed_mps=10,12.5", "env.front_speed_mps=[10,12.5]"),
-        ("train", "evaluation.agents=mobil", "evaluation.agents=['mobil']"),
-        ("train", "total_decisions=1.5e6", "total_decisions=1500000"),
-        ("train", "total_decisions=1.5e0", "total_decisions=1.5e0"),
-        ("train", "agent.capacity=1e5", "agent.capacity=100000"),
-        ("train", "env.goal_m=1e3", "env.goal_m=1e3"),
-    ],
-)
-def test_lists_need_no_brackets_and_whole_numbers_may_have_an_exponent(command, given, meant):
-    assert as_meant(command, given) == meant
-
-
-def test_in_a_sweep_a_comma_separates_runs():
-    assert (
-        as_meant("evaluate", "agents=mobil,agent_idm", multirun=True)
-        == "agents=['mobil'],['agent_idm']"
-    )
-    assert as_meant("evaluate", "episodes=range(1,3)", multirun=True) == "episodes=range(1,3)"
-    assert (
-        as_meant("train", "total_decisions=1e3,2e3", multirun=True) == "total_decisions=1000,2000"
-    )
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_whole_number_may_have_an_exponent_and_every_list_may_lack_brackets(command):
-    whole = [key for c, key, value in KEYS if c == command and type(value) is int]
-    assert [key for key in whole if as_meant(command, f"{key}=2e1") != f"{key}=20"] == []
-    lists = [
-        key
-        for key in (key for c, key in LISTS if c == command)
-        if "[" not in as_meant(command, f"{key}=1")
-    ]
-    assert lists == []
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_a_key_that_there_is_passes_the_check_before_composing(command):
-    refuse_unknown_keys(command, parse([f"{key}=1" for c, key, _ in KEYS if c == command]))
-
-
-@pytest.mark.parametrize(
-    "group", ["env", "collector", "init", "data", "generator", "agent", "traffic"]
-)
-def test_a_key_that_any_option_of_a_group_has_passes_it_too(group):
-    command = {"data": "train_generator", "generator": "train_generator"}.get(group, "train")
-    of_options = {each.name for kind in SCHEMAS[group].values() for each in fields(kind)}
-    assert of_options
-    refuse_unknown_keys(command, parse([f"{group}.{name}=1" for name in of_options]))
-
-
-#: Flags without effect.
-IDLE_FLAGS = {
-    "--resolve": "--resolve: it goes with --cfg alone",
-    "--package env": "--package: it goes with --cfg alone",
-    "--info config --resolve": "--resolve: it goes with --cfg alone",
-    "--config-dir .": "--config-dir: ganlane has its own configuration",
-    "--config-name train": "--config-name: ganlane has its own configuration",
-    "--cfg job --config-path .": "--config-path: ganlane has its own configuration",
-}
 #: Command line to a part of its sentence.
 MISTAKES = {
     "train env.lane=3": "env.lane: no such key (did you mean 'lanes'?)",
     "train trafic=gan": "trafic: no such key (did you mean 'traffic'?); known are agent",
     "train agent.gama=0.9": "agent.gama: no such key (did you mean 'gamma'?); agent has adam_eps",
-    "train collector.wrkers=2": "collector.wrkers: no such key (did you mean 'workers'?); its options have",
-    "train pretrain.traffic.guard=false": "pretrain.traffic.guard: a key below one that is null",
+    "train collector=ray collector.wrkers=2": "collector.wrkers: no such key (did you mean 'worker",
+    "train env.idm.gap=2": "env.idm.gap: no such key; env.idm has comfortable_deceleration",
+    "train pretrain.traffic.guard=false": "pretrain.traffic._target_: of which traffic? name it",
+    "train traffic=mixed traffic.options.idm.blind_share=1": "traffic.options.idm: it has no share",
+    "train traffic=mixed traffic.shares={replay:1}": "traffic.shares=replay: it plays recordings",
+    "train traffic=idm traffic.pace=2": "traffic.pace: no such key; traffic has _target_, blind_",
     "train traffic=ganny": "traffic=ganny: no such option (did you mean 'gan'?)",
     "train env=[a,b]": "choose one of blocked_lane",
     "train env.idm=3": "env.idm.NAME=VALUE",
-    "train +env.wheels=3": "keys cannot be added",
-    "train ++env.wheels=3": "keys cannot be added",
+    "train +env.wheels=3": "env.wheels: no such key",
+    "train ++env.wheels=3": "env.wheels: no such key",
     "train ~env.lanes": "keys cannot be deleted",
     "train lanes": "not of the form key=value",
-    "train --quick": "unrecognized arguments: --quick",
+    "train --quick": "--quick: no such flag; run the command with --help",
     "train seed=0,1": "add -m for a sweep",
     "train -m seed=0,-1": "seed=-1: expected a number from 0",
     "train -m seed=0,1 traffic=idm,ganny": "traffic=ganny: no such option",
@@ -141,24 +55,29 @@ MISTAKES = {
     "train env.decision_period_s=0.15": "not a multiple of 0.1 s",
     "train env.front_speed_mps=[12,10]": "two numbers [low, high]",
     "train agent.warmup=5": "expected at least agent.batch_size=256",
-    "train init=none init.path=mine": "use init=idm_ckpt init.path=mine",
-    "train pretrain.total_decisions=10": "traffic@pretrain.traffic=idm_mobil",
+    "train init=none init.support=trained": "of which agent? give init=idm_ckpt",
+    "train pretrain.total_decisions=10": "give for instance pretrain.traffic=idm_mobil",
     "train device=tpu": "device=tpu: expected one of cpu, cuda",
     "train traffic._target_=nonsense": "expected an import path",
     "train hydra.nonsense=1": "hydra.nonsense: no such key",
     "evaluate traffic=gan": "did you mean traffics=[NAME,NAME]?",
-    "evaluate traffics=[gann]": "traffics=gann: no such traffic (did you mean 'gan'?)",
+    "evaluate traffics=[gann]": "traffic=gann: no such option (did you mean 'gan'?)",
     "evaluate agents=[mobil,mobil]": "a list of different entries",
-    "render format=avi": "format=avi: expected null or one of gif, mp4, png",
+    "render format=avi": "format=avi: expected one of gif, mp4, png",
     "render film.start_s=9 film.end_s=3": "expected more than film.start_s=9",
     "render out=nowhere/film.gif": "out=nowhere/film.gif: expected a file in a folder that exists",
     "train_generator generator=gann": "choose one of calibrated, paper, social_gan",
     "train_generator folds=1": "one fold leaves nothing to fit to",
     "train env.lanes=many": "env.lanes=many: expected a whole number",
     "train agent.noisy=perhaps": "agent.noisy=perhaps: expected true or false",
-    "evaluate agents={a:1}": "agents: expected a list in brackets",
-    "train traffic=mixed traffic.shares=3": "names of traffics with whole numbers",
-    **{f"evaluate {flags}": told for flags, told in IDLE_FLAGS.items()},
+    "evaluate agents={a:1}": "expected a list in brackets",
+    "train traffic=mixed traffic.shares=3": "expected names with values, {name: value}",
+    "train env=scene": "env.scene.path: no file; give one",
+    "train env.lanes=0": "env.lanes=0: expected a number above 0",
+    "evaluate traffics=[gan,gan]": "expected a list of different traffics",
+    "evaluate seed=1,2": "seed=1,2: several values; write [a,b] for a list, or add -m",
+    "evaluate --config-dir .": "--config-dir: no such flag",
+    "evaluate --cfg job agents=[mobil,mobil]": "a list of different entries",
 }
 
 
@@ -173,12 +92,10 @@ def test_a_mistake_ends_in_one_sentence_and_leaves_nothing(line, empty_folder, c
 def test_a_signal_while_the_configuration_is_composed_is_no_error(
     stop, empty_folder, monkeypatch, capsys
 ):
-
-    def interrupted(self):
+    def interrupted(*_):
         raise stop
 
-    # omegaconf cleans up after it, with an error of its own
-    monkeypatch.setattr(Node, "_key", interrupted)
+    monkeypatch.setattr("ganlane.config.run.composed", interrupted)
     assert main(["train", "traffic=idm"]) == 128 + getattr(stop, "number", signal.SIGINT)
     assert capsys.readouterr().err in ("", "ganlane train: stopped by Ctrl-C.\n")
     assert list(empty_folder.iterdir()) == []
@@ -200,8 +117,10 @@ def loaded(program: str, *names: str) -> str:
 
 
 def test_parameters_are_declared_without_torch():
-    names = sorted(path.stem for path in (ROOT / "ganlane" / "parameters").glob("*.py"))[1:]
-    program = f"import importlib; [importlib.import_module('ganlane.parameters.' + name) for name in {names}]"
+    names = sorted(path.stem for path in (ROOT / "ganlane" / "settings").glob("*.py"))[1:]
+    program = (
+        f"import importlib; [importlib.import_module('ganlane.settings.' + n) for n in {names}]"
+    )
     assert loaded(program, "torch", "hydra", "omegaconf", "ganlane.sim") == "[]\n"
 
 
@@ -227,19 +146,6 @@ def test_a_mistake_is_reported_without_gymnasium(started):
     assert loaded("import ganlane", "gymnasium") == "['gymnasium']\n"
 
 
-class Trap:
-    """Writes a file when it is unpickled."""
-
-    def __reduce__(self):
-        return (open, ("sprung", "w"))
-
-
-def test_a_pickled_run_is_not_opened(empty_folder, capsys):
-    (empty_folder / "run.pkl").write_bytes(pickle.dumps(Trap()))
-    err = refusal(capsys, "evaluate", "--cfg", "job", "--experimental-rerun", "run.pkl")
-    assert "--experimental-rerun: ganlane has its own configuration" in err
-
-
 def test_a_command_that_there_is_not(capsys):
     assert main(["fly"]) == 2
     assert capsys.readouterr().err.startswith(
@@ -247,28 +153,31 @@ def test_a_command_that_there_is_not(capsys):
     )
 
 
-def test_resolve_and_package_go_with_cfg(capsys):
-    assert main(["evaluate", "--cfg", "job", "--resolve", "--package", "env"]) == 0
-    assert "lanes: 3" in capsys.readouterr().out
+def test_cfg_prints_what_a_run_would_be_made_of(capsys, empty_folder):
+    assert main(["evaluate", "--cfg", "job", "env.lanes=4"]) == 0
+    shown = yaml.safe_load(capsys.readouterr().out)
+    assert shown["env"]["lanes"] == 4
+    assert make(EvaluateConfig, shown) == settings("evaluate", ["env.lanes=4"])
+    assert list(empty_folder.iterdir()) == []
 
 
 @pytest.mark.parametrize("override", ["seed=" + "9" * 6000, "agents=" + "[" * 500 + "]" * 500])
 def test_a_number_too_long_or_a_list_too_deep_for_python_is_one_sentence(override):
     with pytest.raises(UserError, match=r"too long a number or too deep a list") as caught:
-        parse([override])
+        parsed("evaluate", [override])
     assert len(str(caught.value)) < 200
 
 
 @pytest.mark.parametrize("key", ["env.goal_m", "checkpoint_every_s", "env.idm.headway_s"])
 def test_a_whole_number_that_no_float_can_hold_is_one_sentence(key):
-    with pytest.raises(UserError, match=r"too large; give a number of fewer digits"):
-        check("train", [f"{key}=1{'0' * 400}"])
+    with pytest.raises(UserError, match=r"expected a number of fewer digits"):
+        settings("train", [f"{key}=1{'0' * 400}"])
 
 
 @pytest.mark.parametrize("key", ["total_decisions", "env.vehicles", "agent.capacity"])
 def test_a_whole_number_of_more_than_64_bits_is_out_of_range(key):
     with pytest.raises(UserError, match=key):
-        check("train", [f"{key}={2**63}"])
+        settings("train", [f"{key}={2**63}"])
 
 
 # --- a disk that refuses
@@ -361,6 +270,44 @@ def test_what_no_user_can_mend_keeps_its_traceback(empty_folder):
 
 @pytest.mark.parametrize("number", ADVICE, ids=errno.errorcode.get)
 def test_every_refusal_has_a_sentence(number):
-    told = sentence(OSError(number, os.strerror(number), "a.txt"))
+    told = file_sentence(OSError(number, os.strerror(number), "a.txt"))
     assert told == f"a.txt: {os.strerror(number)}; {ADVICE[number]}."
     assert is_users_matter(OSError(number, ""))
+
+
+# --- words as they are meant
+
+
+@pytest.mark.parametrize(
+    ("line", "key", "value"),
+    [
+        ("evaluate agents=mobil", "agents", ["mobil"]),
+        ("render agent=mobil", "driver", "mobil"),
+        ("train total_decisions=1.5e6", "total_decisions", 1_500_000),
+        ("train seed=1 seed=2", "seed", 2),
+        (
+            "train pretrain.traffic=gan pretrain.traffic.guard=false",
+            "pretrain.traffic.guard",
+            False,
+        ),
+        ("train traffic@evaluation.traffic=idm", "evaluation.traffic.option", "idm"),
+        ("train experiment=paper pretrain.traffic=idm", "pretrain.traffic.option", "idm"),
+        (
+            "train traffic=idm traffic._target_=a.B traffic.pace=2",
+            "traffic.arguments_",
+            {"pace": 2},
+        ),
+        ("evaluate traffics=[a.B]", "traffics", {"a.B": make(TrafficConfig, "a.B")}),
+        (
+            "evaluate traffics={calm:{name:gan,noise_scale:0.5}}",
+            "traffics",
+            {"calm": make(TrafficConfig, {"name": "gan", "noise_scale": 0.5})},
+        ),
+    ],
+)
+def test_a_word_sets_what_it_says(line, key, value):
+    command, *words = line.split()
+    found_value = settings(command, words)
+    for name in key.split("."):
+        found_value = getattr(found_value, name)
+    assert found_value == value

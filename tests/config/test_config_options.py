@@ -11,11 +11,8 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from ganlane.__main__ import COMMANDS
-from ganlane.agents import read_agent
-from ganlane.config.command_line import check
-from ganlane.config.help import help_text, key_lines
-from ganlane.config.schemas import SCHEMAS, option_of, options_of
+from ganlane.config.help import help_text
+from ganlane.config.run import COMMANDS, settings
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
 from ganlane.generator import load_generator, shipped_generator
@@ -27,6 +24,8 @@ from ganlane.settings.observation import (
     RewardParameters,
     SensorParameters,
 )
+from ganlane.settings.record import make, option, option_names
+from ganlane.settings.traffic import TrafficConfig
 from ganlane.training.phases import describe, phases_of
 from ganlane.transforms import OBSERVATIONS
 
@@ -36,62 +35,41 @@ USED_BY = {"data": "train_generator", "generator": "train_generator"}
 NEEDS = {
     ("env", "scene"): [f"env.scene.path={Path(__file__).parents[1] / 'reference' / 'scene.csv'}"]
 }
-OPTIONS = [(group, name) for group in SCHEMAS if group for name in options_of(group)]
+GROUPS = sorted(path.name for path in conf_folder().iterdir() if path.is_dir())
+OPTIONS = [(group, name) for group in GROUPS for name in option_names(group)]
 
 
 @cache
-def config_of(command, *overrides):
-    """Composed and checked once for all tests, which only look at it."""
-    return check(command, list(overrides)).config
+def config_of(command, *words):
+    """Checked once for all tests, which only look at it."""
+    return settings(command, words)
 
 
-@pytest.mark.parametrize("number", range(max(map(len, map(options_of, SCHEMAS)))))
-def test_every_option_composes(number):
-    """The first of every group together, then the second.
-
-    Experiments are composed in the tests of the phases.
-    """
-    chosen: dict[str, list[str]] = {"train": [], "train_generator": []}
-    for group in filter(None, SCHEMAS):
-        option = (names := options_of(group))[number % len(names)]
-        chosen[USED_BY.get(group, "train")] += [
-            f"{group}={option}",
-            *NEEDS.get((group, option), []),
-        ]
-    for command, overrides in chosen.items():
-        config_of(command, *overrides)
+@pytest.mark.parametrize(("group", "name"), OPTIONS)
+def test_every_option_composes(group, name):
+    words = [f"{group}={name}", *NEEDS.get((group, name), [])]
+    config_of(USED_BY.get(group, "train"), *words)
 
 
 @pytest.mark.parametrize(("group", "names"), [("observation", FORMS), ("mask", MASKS)])
 def test_every_form_is_an_option_of_its_name(group, names):
-    assert set(options_of(group)) == set(names)
-    assert all(option_of(group, name)[1] == {"form": name} for name in names)
+    assert set(option_names(group)) == set(names)
+    assert all(option(group, name) == {"form": name} for name in names)
 
 
-@pytest.mark.parametrize("group", [group for group in SCHEMAS if group])
-def test_every_schema_has_an_option(group):
-    assert set(SCHEMAS[group].values()) <= {option_of(group, name)[0] for name in options_of(group)}
+def test_every_traffic_is_an_option_under_its_own_name():
+    for name in option_names("traffic"):
+        assert make(TrafficConfig, name).label() == name
+    assert len(TrafficConfig.kinds()) == len(option_names("traffic")) + 1  # and one's own
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_gives_every_key_a_meaning(command):
-    missing = re.findall(
-        r"^ +[\w]+: [^#\n]+$", help_text(command).partition("keys (KEY=VALUE)")[2], re.MULTILINE
-    )
-    assert missing == []
-
-
-@pytest.mark.parametrize(("group", "option"), OPTIONS)
-def test_every_key_of_an_option_has_a_meaning(group, option):
-    kind, values = option_of(group, option)
-    for line in key_lines(kind, values, 0):
-        assert "# " in line, line
-
-
-def test_help_shows_what_an_option_sets():
-    shown = "\n".join(key_lines(*option_of("agent", "transfer"), 0))
-    assert "learning_rate_end: 2.5e-05" in shown
-    assert "n_step: 3" in shown
+def test_help_is_plain_text_and_gives_every_key_a_meaning(command):
+    text = help_text(command, COMMANDS[command][0])
+    keys = text.partition("keys (KEY=VALUE")[2].partition("flags")[0]
+    assert re.findall(r"^ +\w+: [^#\n]+$", keys, re.MULTILINE) == []
+    assert text.startswith(("ganlane", "The realism card"))
+    assert not re.search(r":\w+:`|``", text)
 
 
 def test_observation_forms_are_those_of_the_transform():
@@ -116,7 +94,7 @@ def test_considerate_is_the_paper_and_a_price_for_danger_behind():
     milder = config_of("evaluate", "reward.soft_crash_behind=-5").reward
     assert milder == RewardParameters(soft_crash_behind=-5.0)
     with pytest.raises(UserError, match=r"reward\.soft_crash_behind=3: expected at most 0"):
-        check("train", ["reward=considerate", "reward.soft_crash_behind=3"])
+        settings("train", ["reward=considerate", "reward.soft_crash_behind=3"])
 
 
 def test_the_reward_stands_in_the_agents_metadata():
@@ -124,36 +102,6 @@ def test_the_reward_stands_in_the_agents_metadata():
     assert (
         describe(config, phases_of(config, Path("run"))[-1])["reward"]["soft_crash_behind"] == -10.0
     )
-
-
-@pytest.mark.parametrize("name", ["agent_idm", "agent_gan"])
-def test_metadata_are_laid_out_as_in_the_agents_of_released_versions(name):
-    config = config_of("train")
-    now, shipped = describe(config, phases_of(config, Path("run"))[-1]), read_agent(name)[2]
-    parts = [part for part in ("env", "agent", "reward", "observation_scale") if part in shipped]
-    assert parts
-    for part in parts:
-        assert flat_types(shipped[part]).items() <= flat_types(now[part]).items(), part
-
-
-def flat_types(node, prefix=""):
-    """Type of each value by its dotted key.
-
-    A whole number may stand for any, and null for anything.
-    """
-    found = {}
-    for key, value in node.items():
-        nested = (
-            flat_types(value, f"{prefix}{key}.")
-            if isinstance(value, dict)
-            else {f"{prefix}{key}": kind(value)}
-        )
-        found.update(nested)
-    return found
-
-
-def kind(value):
-    return "number" if type(value) in (int, float) or value is None else type(value).__name__
 
 
 def test_dqn_switches_every_component_off():
@@ -165,18 +113,18 @@ def test_dqn_switches_every_component_off():
 
 
 def test_dense_traffic_keeps_the_density_for_any_number_of_vehicles():
-    few, many = (check("train", ["env=dense", f"env.vehicles={n}"]).config.env for n in (30, 90))
+    few, many = (settings("train", ["env=dense", f"env.vehicles={n}"]).env for n in (30, 90))
     assert many.spread_m / many.vehicles == pytest.approx(few.spread_m / few.vehicles)
     assert many.spread_m == pytest.approx(3 * few.spread_m)
 
 
 def test_paper_experiment_is_two_phases_and_can_be_shortened():
-    config = check(
+    config = settings(
         "train", ["experiment=paper", "total_decisions=7", "pretrain.total_decisions=5"]
-    ).config
+    )
     assert (config.pretrain.traffic.label(), config.traffic.label()) == ("idm_mobil", "gan")
     assert (config.pretrain.total_decisions, config.total_decisions) == (5, 7)
-    whole = check("train", ["experiment=paper"]).config
+    whole = settings("train", ["experiment=paper"])
     assert (whole.pretrain.total_decisions, whole.total_decisions) == (10_000_000, 3_000_000)
     assert whole.init.path is None
 
@@ -185,8 +133,8 @@ def test_paper_experiment_is_two_phases_and_can_be_shortened():
     ("control", "first", "second"), [("gan_only", "gan", "gan"), ("idm_long", None, "idm_mobil")]
 )
 def test_a_control_differs_from_the_papers_schedule_in_its_traffic_alone(control, first, second):
-    paper = check("train", ["experiment=paper" if first else "experiment=paper_gan"]).config
-    config = check("train", [f"experiment={control}"]).config
+    paper = settings("train", ["experiment=paper" if first else "experiment=paper_gan"])
+    config = settings("train", [f"experiment={control}"])
     assert config.traffic.label() == second
     assert (
         config.pretrain.traffic is None
@@ -195,17 +143,6 @@ def test_a_control_differs_from_the_papers_schedule_in_its_traffic_alone(control
     )
     assert dataclasses.replace(config, traffic=paper.traffic, pretrain=paper.pretrain) == paper
     assert config.pretrain.total_decisions == paper.pretrain.total_decisions
-
-
-def test_a_generator_file_reaches_every_generated_traffic():
-    config = check("evaluate", ["generator.path=mine.safetensors"]).config
-    assert {config.traffic_options[name].path for name in ("gan", "gan_calibrated")} == {
-        "mine.safetensors"
-    }
-    assert (
-        check("train", ["traffic=gan", "generator.path=mine.safetensors"]).config.traffic.path
-        == "mine.safetensors"
-    )
 
 
 def test_yaml_files_explain_themselves():
@@ -225,7 +162,8 @@ def test_the_weights_that_ship_were_fitted_with_the_commands_defaults(config):
     shipped = load_generator(shipped_generator(preset), preset)[1]["config"]
     chosen = config_of("train_generator", f"generator={preset}").generator
     assert chosen == config
-    assert json.loads(json.dumps(dataclasses.asdict(chosen))) == shipped
+    chosen_data = json.loads(json.dumps(dataclasses.asdict(chosen)))
+    assert shipped.items() <= chosen_data.items()
 
 
 @pytest.mark.parametrize("value", ["auto", "always", "never"])
@@ -257,11 +195,3 @@ def test_shares_on_the_command_line_replace_those_of_an_experiment(shares):
 
 def test_an_experiment_on_top_of_another_sets_its_own_shares():
     assert config_of("train", "experiment=general_continued").traffic.shares["gan"] == 4
-
-
-@pytest.mark.parametrize("command", SCHEMAS[""])
-def test_the_help_is_plain_text_about_the_command(command):
-    text = help_text(command)
-    assert ":mod:" not in text
-    assert "``" not in text.partition("options (GROUP=NAME")[0]
-    assert "Modules" not in text

@@ -10,28 +10,31 @@ import errno
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from training.test_training_loop import ToyRoad, agent, settings, train
+from hydra.core.override_parser.types import Quote, QuotedString
+from training.test_training_loop import ToyRoad, agent, train
+from training.test_training_loop import settings as schedule
 
-from ganlane.config.app import run_command
-from ganlane.config.command_line import parse, quoted, single_runs, without_repetitions
-from ganlane.config.runs import (
+from ganlane.config.compose import parsed
+from ganlane.config.run import (
     CONFIG,
     LOCK,
-    OVERRIDES,
+    as_yaml,
     held,
+    new_folder,
     newest_unfinished,
-    unused,
-    with_resumed,
+    run_command,
+    settings,
+    single_runs,
 )
 from ganlane.errors import UserError
 from ganlane.training.checkpoint import LAST, load_checkpoint
 
 ROOT = Path(__file__).resolve().parents[2]
-pytestmark = pytest.mark.usefixtures("hydra_from_memory")
 COLUMNS = ("decisions", "updates", "mean_return", "loss", "crash_rate")
 
 
@@ -50,7 +53,7 @@ def toy_run(config, folder):
         return dict(figures)
 
     resume = folder / LAST if config.resume else None
-    often = settings(160, log_every=40, evaluate_every=80, checkpoint_every_s=0.0)
+    often = schedule(160, log_every=40, evaluate_every=80, checkpoint_every_s=0.0)
     train(ToyRoad(8), learner, often, folder, evaluate, resume=resume)
 
 
@@ -105,7 +108,7 @@ def test_a_run_ended_by_a_full_disk_goes_on_to_the_same_weights(
     assert not list(here.rglob("*.part"))
     assert (
         (here / "run" / LAST).is_file()
-        == (here / "run" / OVERRIDES).is_file()
+        == (here / "run" / CONFIG).is_file()
         == (here / "run").exists()
     )
     assert command("resume=run" if (here / "run").exists() else "hydra.run.dir=run") == 0
@@ -121,10 +124,9 @@ def test_a_run_that_ends_in_an_error_after_training_keeps_its_command_line(error
         raise error
 
     assert command("hydra.run.dir=run", "env.lanes=4", task=task) == 2
-    assert "env.lanes=4" in (here / "run" / OVERRIDES).read_text()
-    assert (here / "run" / CONFIG).is_file()
+    assert "lanes: 4" in (here / "run" / CONFIG).read_text()
     assert command("resume=run", "log_every=50", task=task) == 2
-    assert "log_every=50" in (here / "run" / OVERRIDES).read_text()
+    assert "log_every: 50" in (here / "run" / CONFIG).read_text()
     assert command("resume=run") == 0
 
 
@@ -134,7 +136,7 @@ def test_a_run_that_is_refused_leaves_the_command_line_of_the_one_before(here, c
 
     assert command("hydra.run.dir=run") == 0
     assert command("resume=run", "log_every=50", task=refused) == 2
-    assert "log_every=50" not in (here / "run" / OVERRIDES).read_text()
+    assert "log_every: 50" not in (here / "run" / CONFIG).read_text()
     assert command("hydra.run.dir=new", task=refused) == 2
     assert not (here / "new").exists()
 
@@ -153,7 +155,7 @@ def test_a_second_run_in_a_folder_is_refused_while_the_first_is_at_work(here, ca
 
 def test_the_lock_of_a_killed_run_stops_nobody_and_its_half_written_files_go(here):
     script = (
-        "import time; from pathlib import Path; from ganlane.config.runs import held\n"
+        "import time; from pathlib import Path; from ganlane.config.run import held\n"
         "from ganlane.files import atomic_path\n"
         "with held(Path('run')), atomic_path('run/checkpoints/last.pt') as part:\n"
         "    part.write_bytes(b'half'); print('at work', flush=True); time.sleep(60)"
@@ -183,7 +185,8 @@ def test_a_run_with_a_limit_on_the_size_of_its_files_goes_on_without_it(here):
     """The checkpoint grows with its replay buffer until the system refuses it."""
     script = (
         "import resource, sys; from config.test_config_runs import command\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), -1)); sys.exit(command(*sys.argv[2:]))"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), -1))\n"
+        "sys.exit(command(*sys.argv[2:]))"
     )
     environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}", "OMP_NUM_THREADS": "1"}
     assert command("hydra.run.dir=whole") == 0
@@ -197,22 +200,19 @@ def test_a_run_with_a_limit_on_the_size_of_its_files_goes_on_without_it(here):
         assert same(left_by(here / f"run{limit}"), left_by(here / "whole"))
 
 
-def test_two_runs_of_one_process_in_one_second_have_folders_of_their_own(tmp_path):
-    first = tmp_path / "2026-01-01_00-00-00_7"
-    assert unused(first) == first
-    for taken, following in ((first, f"{first}_2"), (tmp_path / f"{first.name}_2", f"{first}_3")):
-        taken.mkdir()
-        (taken / "config.yaml").write_text("")
-        assert unused(first) == Path(following)
+def test_two_runs_of_one_process_in_one_second_have_folders_of_their_own(here):
+    first = new_folder("train")
+    first.mkdir(parents=True)
+    assert new_folder("train") != first
 
 
-# --- the command line of a resumed run
+# --- the settings of a resumed run
 
 
-def make_run(folder, overrides, age_s=0, finished=False):
+def make_run(folder, words=(), age_s=0, finished=False):
     """A run's folder as far as resuming looks at it."""
     (folder / "checkpoints").mkdir(parents=True)
-    (folder / OVERRIDES).write_text("".join(f"- {line}\n" for line in overrides) or "[]\n")
+    (folder / CONFIG).write_text(as_yaml(settings("train", list(words))))
     checkpoint = folder / "checkpoints" / "last.pt"
     checkpoint.touch()
     os.utime(checkpoint, (1_000_000 - age_s, 1_000_000 - age_s))
@@ -220,72 +220,94 @@ def make_run(folder, overrides, age_s=0, finished=False):
         (folder / "results.json").touch()
 
 
-def test_a_resumed_run_keeps_its_command_line_and_its_folder(tmp_path):
-    run = tmp_path / "run"
-    make_run(run, ["traffic=idm", "seed=3"])
-    merged = with_resumed("train", [f"resume={run}", "seed=4"], multirun=False)
-    assert merged == ["traffic=idm", "seed=4", f"resume='{run}'", f"hydra.run.dir='{run}'"]
+def test_a_resumed_run_keeps_its_settings_but_for_those_on_the_command_line(here):
+    make_run(here / "run", ["traffic=idm", "seed=3", "env.lanes=4", "agent.gamma=0.5"])
+    config = settings("train", ["resume=run", "seed=4", "agent.gamma=0.6", "env.vehicles=5"])
+    assert (config.traffic.label(), config.seed, config.resume) == ("idm", 4, "run")
+    assert (config.env.lanes, config.env.vehicles, config.agent.gamma) == (4, 5, 0.6)
+    assert settings("train", ["resume=run", "traffic=gan"]).traffic.label() == "gan"
 
 
-def test_a_checkpoint_stands_for_its_run(tmp_path):
-    run = tmp_path / "run"
-    make_run(run, [])
-    make_run(run / "pretrain", [])
-    (run / "pretrain" / OVERRIDES).unlink()
-    for path in (
-        run / "checkpoints" / "last.pt",
-        run / "pretrain",
-        run / "pretrain" / "checkpoints" / "last.pt",
-    ):
-        assert f"hydra.run.dir='{run}'" in with_resumed("train", [f"resume={path}"], multirun=False)
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["experiment=general"],
+        ["env=cut_in", "env.scene.gap_m=12"],
+        ["env=dense", "env.vehicles=40"],
+        ["experiment=paper", "traffic=idm_faults", "mask=safe"],
+        ["traffic=idm", "traffic._target_=a.B", "traffic.pace=2"],
+        ["observation.sensors.delay_s=1", "agent=dqn"],
+    ],
+    ids=" ".join,
+)
+def test_a_resumed_run_is_the_run_that_was_stopped(words, here):
+    make_run(here / "run", words)
+    trusted = [word for word in words if "_target_" in word]
+    resumed = settings("train", ["resume=run", *trusted])
+    assert replace(resumed, resume=None) == settings("train", words)
 
 
-def test_auto_takes_the_newest_unfinished_run(tmp_path):
-    runs = tmp_path / "outputs" / "train"
-    make_run(runs / "old", [], age_s=100)
-    make_run(runs / "new", [], age_s=50)
-    make_run(runs / "done", [], finished=True)
+def test_a_checkpoint_stands_for_its_run(here):
+    make_run(here / "run", ["seed=7"])
+    make_run(here / "run" / "pretrain")
+    (here / "run" / "pretrain" / CONFIG).unlink()
+    for path in ("run/checkpoints/last.pt", "run/pretrain", "run/pretrain/checkpoints/last.pt"):
+        config = settings("train", [f"resume={path}"])
+        assert (config.resume, config.seed) == ("run", 7)
+
+
+def test_auto_takes_the_newest_unfinished_run(here):
+    runs = here / "outputs" / "train"
+    make_run(runs / "old", age_s=100)
+    make_run(runs / "new", age_s=50)
+    make_run(runs / "done", finished=True)
     assert newest_unfinished(runs) == runs / "new"
-    assert "hydra.run.dir='outputs/train/new'" in with_resumed(
-        "train", ["resume=auto"], multirun=False
-    )
+    assert settings("train", ["resume=auto"]).resume == "outputs/train/new"
 
 
-def test_auto_starts_afresh_without_an_unfinished_run():
-    assert with_resumed("train", ["resume=auto", "seed=1"], multirun=False) == [
-        "resume=null",
-        "seed=1",
-    ]
+def test_auto_starts_afresh_without_an_unfinished_run(capsys):
+    assert settings("train", ["resume=auto", "seed=1"]).resume is None
+    assert "a new one is started" in capsys.readouterr().err
 
 
-def test_a_folder_without_a_checkpoint_is_refused(tmp_path):
+def test_a_folder_without_a_checkpoint_is_refused(here):
     with pytest.raises(UserError, match="no checkpoint there"):
-        with_resumed("train", [f"resume={tmp_path}"], multirun=False)
+        settings("train", [f"resume={here}"])
 
 
-def test_the_last_of_several_overrides_counts():
-    assert without_repetitions(["traffic=idm", "seed=1", "traffic=gan"]) == [
-        "traffic=gan",
-        "seed=1",
-    ]
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "- seed=3",
+        "env: {lanes: 3",
+        "a: &a [1]\nb: *a\n",
+        "a: &a [x, x]\nb: &b [*a, *a]\nc: &c [*b, *b]\n",
+        "x: !!python/object/apply:os.system ['touch executed']",
+        "# " + "x" * 2**20,
+    ],
+    ids=["empty", "list", "broken", "alias", "aliases", "code", "large"],
+)
+def test_a_damaged_or_hostile_configuration_is_refused_in_one_sentence(text, here):
+    make_run(here / "run")
+    (here / "run" / CONFIG).write_text(text)
+    with pytest.raises(UserError, match=r"run/config\.yaml: (missing or )?damaged"):
+        settings("train", ["resume=run"])
+    assert not (here / "executed").exists()
 
 
 def test_a_sweep_is_every_combination():
-    runs = single_runs(["seed=0,1", "traffic=idm,gan", "threads=1"], multirun=True)
-    assert [sorted(run) for run in runs] == [
-        sorted([f"seed={seed}", f"traffic={traffic}", "threads=1"])
+    runs = single_runs(parsed("train", ["seed=0,1", "traffic=idm,gan", "threads=1"]))
+    assert runs == [
+        [f"seed={seed}", f"traffic={traffic}", "threads=1"]
         for seed in (0, 1)
         for traffic in ("idm", "gan")
     ]
 
 
-@pytest.mark.parametrize("name", ["it's", "a'b'", "two words, [one]", "back\\\\", "back\\\\'s"])
-def test_a_folder_may_be_called_anything(name, tmp_path):
-    run = tmp_path / name
-    make_run(run, ["seed=3"])
-    merged = with_resumed("train", [f"resume={quoted(run)}"], multirun=False)
-    assert {override.key_or_group: override.value() for override in parse(merged)} == {
-        "seed": 3,
-        "resume": str(run),
-        "hydra.run.dir": str(run),
-    }
+@pytest.mark.parametrize("name", ["it's", "a'b'", "two words, [one]", "back\\"])
+def test_a_folder_may_be_called_anything(name, here):
+    make_run(here / name, ["seed=3"])
+    word = "resume=" + QuotedString(name, Quote.single).with_quotes()
+    config = settings("train", [word])
+    assert (config.seed, config.resume) == (3, name)

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from reference.refusals import last_path, refusal
-
 from ganlane.bench import main
+from reference.refusals import last_path, refusal
 
 TINY = [
     "quick=true",

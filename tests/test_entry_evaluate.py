@@ -6,9 +6,8 @@ import json
 
 import polars as pl
 import pytest
-from reference.refusals import last_path
-
 from ganlane.evaluate import main
+from reference.refusals import last_path
 
 SHORT = ["env.goal_m=40", "episodes=4"]
 pytestmark = pytest.mark.usefixtures("empty_folder")

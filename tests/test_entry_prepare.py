@@ -13,15 +13,15 @@ from pathlib import Path
 
 import polars as pl
 import pytest
+from ganlane.evaluate import main as evaluate
+from ganlane.prepare import main
+from ganlane.train_generator import main as train_generator
 from PIL import Image
 from reference.file_server import SHA256, Server
 from reference.recordings import START_MS, ngsim_rows, portal_csv, raw_text, traffic, write_highd
 from reference.refusals import last_path
 
 from ganlane.data import SyntheticTraffic, read_scenes, synthetic_scenes, write_scene_csv
-from ganlane.evaluate import main as evaluate
-from ganlane.prepare import main
-from ganlane.train_generator import main as train_generator
 
 
 @pytest.fixture(autouse=True)

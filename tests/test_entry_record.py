@@ -82,7 +82,7 @@ def test_the_call_from_python_names_the_dataset_and_says_how_the_episodes_ended(
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["dataset=first"], "dataset=first: expected null or a name such as highway/mobil-v0"),
+        (["dataset=first"], "dataset=first: expected a name such as highway/mobil-v0"),
         (["agent=nobody"], "agent nobody: unknown"),
     ],
 )

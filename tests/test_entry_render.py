@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import re
+from functools import partial
 
 import polars as pl
 import pytest
 from PIL import Image
 from reference.refusals import last_path
 
+from ganlane.config.run import run_command
 from ganlane.data import read_scenes
-from ganlane.render import main
 
 SHORT = ["env.goal_m=40", "film.fps=5", "film.width=640", "film.height=160"]
+main = partial(run_command, "render")
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
@@ -40,14 +42,14 @@ def test_agents_and_episodes_play_beside_each_other(capsys, tmp_path):
     assert capsys.readouterr().out.splitlines()[-1] == "player: player.html"
     page = (tmp_path / "player.html").read_text()
     data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.S)[1])["episodes"]
-    assert [(each["agent"], each["episode"]) for each in data] == [
+    assert [(shown["agent"], shown["episode"]) for shown in data] == [
         ("keep_lane", 2),
         ("agent_idm", 2),
         ("keep_lane", 5),
         ("agent_idm", 5),
     ]
-    assert [len(each["action_values"]) for each in data] == [0, 3, 0, 3]
-    assert all(each["reward"] for each in data)
+    assert [len(shown["action_values"]) for shown in data] == [0, 3, 0, 3]
+    assert all(shown["reward"] for shown in data)
 
 
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
@@ -80,11 +82,11 @@ def test_only_a_part_of_the_episode_is_kept(tmp_path):
     ("format=svg out=curves", "curves", b"<?xml"),
 ])  # fmt: skip
 def test_curves_of_runs_come_in_the_format_that_is_asked_for(asked, file, begins, capsys, tmp_path):
-    for name in ("first", "it's"):
+    for name in ("first", "second"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "metrics.csv").write_text(
             "decisions,mean_return,crash_rate\n1,2,0.5\n10,3,0.2\n"
         )
-    assert main(["run=first,it's", *asked.split()]) == 0
+    assert main(["run=[first,second]", *asked.split()]) == 0
     assert capsys.readouterr().out == f"curves: {file}\n"
     assert (tmp_path / file).read_bytes().startswith(begins)

@@ -14,7 +14,7 @@ import entry_tiny
 import pytest
 from reference.refusals import is_one_sentence
 
-from ganlane.evaluate import main
+from ganlane.__main__ import main
 
 TINY = [*entry_tiny.TINY, "evaluation.agents=[random_legal]"]
 #: Option of hydra/launcher to the package that brings it and what it is told beside.
@@ -28,7 +28,7 @@ LAUNCHERS = {
 
 def sweep(folder, *arguments):
     """Run a sweep over two seeds in a process of its own, in ``folder``."""
-    command = [sys.executable, "-m", "ganlane.train", "-m", "seed=0,1", *TINY, *arguments]
+    command = [sys.executable, "-m", "ganlane", "train", "-m", "seed=0,1", *TINY, *arguments]
     root = str(Path(__file__).parent.parent)
     environment = {**os.environ, "PYTHONPATH": root, "OMP_NUM_THREADS": "1"}
     return subprocess.run(
@@ -103,7 +103,15 @@ def own_logging(monkeypatch):
 @pytest.mark.usefixtures("empty_folder", "own_logging")
 def test_a_sweep_of_evaluate_has_a_folder_for_each_run_and_ends_with_one_table(capsys):
     assert (
-        main(["-m", "seed=0,1", "agents=[mobil,random_legal]", "traffics=[idm]", "episodes=2"]) == 0
+        main(
+            [
+                "evaluate",
+                "-m",
+                "seed=0,1",
+                *["agents=[mobil,random_legal]", "traffics=[idm]", "episodes=2"],
+            ]
+        )
+        == 0
     )
     (folder,) = Path("outputs/evaluate_sweeps").iterdir()
     seeds = [
@@ -119,8 +127,7 @@ def test_a_sweep_of_evaluate_has_a_folder_for_each_run_and_ends_with_one_table(c
 @pytest.mark.usefixtures("empty_folder", "own_logging")
 def test_a_run_of_a_sweep_that_is_refused_ends_it_with_one_sentence(capsys):
     assert (
-        main(["-m", "seed=0,1", "agents=[missing.safetensors]", "traffics=[idm]", "episodes=2"])
-        == 2
+        main(["evaluate", "-m", "seed=0,1", "agents=[missing.safetensors]", "traffics=[idm]"]) == 2
     )
     assert is_one_sentence(capsys.readouterr().err, "evaluate")
     assert not list(Path("outputs").rglob("config.yaml"))

@@ -162,7 +162,7 @@ def _dispatch(command: str, words: list[str], task: Task | None) -> None:
         _sweep(command, overrides, task)
         return
     config, folder = _settings_and_folder(command, overrides)
-    line = run_in(folder, command, config, task)
+    line = run_in(folder.absolute(), command, config, task)
     if line:
         print(line)
 
@@ -296,7 +296,7 @@ def _show_sweep(folder: Path, columns: str) -> None:
 
     rows = sweep_rows(folder)
     if rows:
-        show("", text_table(rows), f"sweep: {folder}", columns=columns)
+        show("", text_table(rows), f"sweep: {folder.absolute()}", columns=columns)
 
 
 # --- a run and its folder
@@ -313,7 +313,6 @@ def run_in(folder: Path, command: str, config: Any, task: Task | None = None) ->
     Raises:
         UserError: another run uses the folder, or whatever the command refuses.
     """
-    folder = folder.absolute()
     register_envs()  # for a user's own driver or traffic
     with cleared_after_mistakes(folder), held(folder):
         write_bytes(folder / CONFIG, as_yaml(config).encode())

@@ -25,7 +25,8 @@ def whole_number(name: str, value: Any, low: int, high: int) -> int:
     if not _is_whole(value) or not low <= int(value) <= high:
         most = "2**63 - 1" if high == 2**63 - 1 else f"{high}"
         raise UserError(
-            f"{name}={_shown(value)}: expected a whole number from {low} to {most}; give for instance {name}={low}."
+            f"{name}={_shown(value)}: expected a whole number from {low} to {most}; give for "
+            f"instance {name}={low}."
         )
     return int(value)
 
@@ -77,13 +78,17 @@ def import_target(path: str, key: str, base: type[Made]) -> Callable[..., Made]:
         ) from error
     except Exception as error:  # a user's module can raise anything when imported
         raise UserError(
-            f"{key}={path}: {module or path!r} cannot be imported ({type(error).__name__}: {error}); give the import "
-            "path of a class or function, and start the command in the folder that holds its module."
+            f"{key}={path}: {module or path!r} cannot be imported ({type(error).__name__}: "
+            f"{error}); give the import "
+            "path of a class or function, and start the command in the folder that holds its "
+            "module."
         ) from error
     if not _makes(target, base):
         raise UserError(
-            f"{key}={path}: expected a subclass of {base.__module__.removesuffix('.base')}.{base.__name__} or a "
-            f"function that is annotated to return one (-> {base.__name__}); derive or annotate yours."
+            f"{key}={path}: expected a subclass of "
+            f"{base.__module__.removesuffix('.base')}.{base.__name__} or a "
+            f"function that is annotated to return one (-> {base.__name__}); derive or annotate "
+            "yours."
         )
     return target
 
@@ -133,9 +138,12 @@ def call_with(
     except TypeError as error:
         name = f"{target.__module__}.{getattr(target, '__qualname__', target)}"
         raise UserError(
-            f"{key}={name}: cannot be called with {', '.join(sorted(arguments)) or 'nothing'} ({error}); "
+            f"{key}={name}: cannot be called with {', '.join(sorted(arguments)) or 'nothing'} "
+            f"({error}); "
             f"it takes {', '.join(parameters) or 'nothing'}."
         ) from error
     return target(**arguments)
 
-def checked_arguments(f): return f  # TEMP
+
+def checked_arguments(f):
+    return f  # TEMP

@@ -99,7 +99,8 @@ def make_traffic(
     module = call_with(target, _constructor_arguments(env, stream), arguments, key)
     if not isinstance(module, TrafficModule):  # an annotation may be wrong
         raise UserError(
-            f"{key}={traffic._target_}: returned a {type(module).__name__}, expected a TrafficModule."
+            f"{key}={traffic._target_}: returned a {type(module).__name__}, expected a "
+            "TrafficModule."
         )
     return BlindTraffic(module, traffic.blind_share) if traffic.blind_share else module
 
@@ -233,14 +234,16 @@ def make_driver(
             policy, "out_keys", []
         ):
             raise UserError(
-                f"agents={name}: expected a TensorDictModule that writes 'action'; its out_keys name it."
+                f"agents={name}: expected a TensorDictModule that writes 'action'; its out_keys "
+                "name it."
             )
         return Driver(name, policy.to(device))
     known = ", ".join(
         (*DRIVERS, *(name for name in SHIPPED if (CHECKPOINTS / f"{name}.safetensors").is_file()))
     )
     raise UserError(
-        f"agent {name:.100}: unknown; choose one of {known}, or give a checkpoint's path (.safetensors) or the "
+        f"agent {name:.100}: unknown; choose one of {known}, or give a checkpoint's path "
+        "(.safetensors) or the "
         "import path of a policy."
     )
 
@@ -279,5 +282,6 @@ def observation_of(metadata: dict[str, Any]) -> ObservationConfig:
         return ObservationConfig(form=metadata["observation"], **metadata["observation_scale"])
     except (KeyError, TypeError) as error:
         raise UserError(
-            f"the agent's metadata name no observation that is known here ({error}); train it again or give another."
+            f"the agent's metadata name no observation that is known here ({error}); train it "
+            "again or give another."
         ) from error

@@ -134,7 +134,8 @@ def split_at_markers(path: Path, begin: str, end: str) -> tuple[str, str]:
     """
     if not path.is_file():
         raise UserError(
-            f"report={path}: no such file; expected a document with the lines {begin} and {end} in it."
+            f"report={path}: no such file; expected a document with the lines {begin} and {end} in "
+            "it."
         )
     text = path.read_text(encoding="utf-8")
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
@@ -198,7 +199,8 @@ def has_checksum(content: bytes | mmap, path: str | Path) -> bool:
     begin += len(_BEGIN)
     if end != begin + len(_ZEROS) or content[begin:end] != _digits(content, begin):
         raise UserError(
-            f"{path}: damaged, its content does not have the checksum that was written with it; take a copy that is "
+            f"{path}: damaged, its content does not have the checksum that was written with it; "
+            "take a copy that is "
             "whole, or make it again."
         )
     return True

@@ -76,7 +76,8 @@ def check_compiler() -> None:
     path, names = find_compiler()
     if path is None:
         raise UserError(
-            f"compile=true needs a C++ compiler, and there is none (looked for {names}); install one "
+            f"compile=true needs a C++ compiler, and there is none (looked for {names}); install "
+            "one "
             "(Debian: apt install g++) or set compile=false."
         )
 

@@ -143,7 +143,8 @@ class HighwayVecEnv(VecEnv):
         """
         if method_name not in _OF_ROWS:
             raise UserError(
-                f"env_method({method_name!r}): the rows have {' and '.join(_OF_ROWS)}; call one of them."
+                f"env_method({method_name!r}): the rows have {' and '.join(_OF_ROWS)}; call one of "
+                "them."
             )
         results = getattr(self.highways, method_name)(*args, **kwargs)
         return [results[row] for row in self._get_indices(indices)]

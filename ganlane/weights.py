@@ -54,13 +54,15 @@ def load_weights(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[s
     # KeyError: a number type that torch lacks
     except (SafetensorError, ValueError, KeyError) as error:
         raise UserError(
-            f"{path}: not a readable safetensors file ({error}); give a checkpoint of kind {kind} that ganlane wrote."
+            f"{path}: not a readable safetensors file ({error}); give a checkpoint of kind {kind} "
+            "that ganlane wrote."
         ) from error
     metadata = _json_object(header.get("ganlane", "{}"))
     if metadata.get("kind") != kind:
         found = metadata.get("kind", "a file that ganlane did not write")
         raise UserError(
-            f"{path}: expected a ganlane checkpoint of kind {kind}, found {found}; give one that ganlane wrote."
+            f"{path}: expected a ganlane checkpoint of kind {kind}, found {found}; give one that "
+            "ganlane wrote."
         )
     for name, tensor in tensors.items():
         if not tensor.isfinite().all():

@@ -92,17 +92,20 @@ class RainbowConfig(Record):
         super().__post_init__()
         if self.v_min >= self.v_max or (self.distributional and self.atoms < 2):
             raise ParameterError(
-                f"{{v_min}}={self.v_min}, {{v_max}}={self.v_max}, {{atoms}}={self.atoms}: expected v_min below "
+                f"{{v_min}}={self.v_min}, {{v_max}}={self.v_max}, {{atoms}}={self.atoms}: expected "
+                "v_min below "
                 "v_max and at least 2 atoms; widen the support."
             )
         if self.learning_rate_end is None and self.learning_rate_decisions > 0:
             raise ParameterError(
-                f"{{learning_rate_decisions}}={self.learning_rate_decisions}: means nothing without "
+                f"{{learning_rate_decisions}}={self.learning_rate_decisions}: means nothing "
+                "without "
                 "{learning_rate_end}; give both or neither."
             )
         if not self.batch_size <= self.warmup <= self.capacity:
             raise ParameterError(
-                f"{{warmup}}={self.warmup}: expected at least {{batch_size}}={self.batch_size} and at most "
+                f"{{warmup}}={self.warmup}: expected at least {{batch_size}}={self.batch_size} and "
+                "at most "
                 f"{{capacity}}={self.capacity} transitions."
             )
 
@@ -115,5 +118,9 @@ class RainbowConfig(Record):
         return self
 
 
-class RemovedOption(Exception): pass  # TEMP
-def without_removed(options, where): return dict(options)  # TEMP
+class RemovedOption(Exception):
+    pass  # TEMP
+
+
+def without_removed(options, where):
+    return dict(options)  # TEMP

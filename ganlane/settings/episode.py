@@ -57,7 +57,8 @@ class EpisodeParameters(Record):
             or abs(self.substeps() * PHYSICS_STEP_S - self.decision_period_s) > 1e-9
         ):
             raise ParameterError(
-                f"{{decision_period_s}}={self.decision_period_s:g} is not a multiple of {PHYSICS_STEP_S:g} s; "
+                f"{{decision_period_s}}={self.decision_period_s:g} is not a multiple of "
+                f"{PHYSICS_STEP_S:g} s; "
                 "choose 0.1, 0.2, ... 1.0 or more."
             )
 

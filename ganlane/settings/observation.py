@@ -76,7 +76,8 @@ class SensorParameters(Record):
         if abs(decisions - round(decisions)) > 1e-6:
             raise ParameterError(
                 f"{{delay_s}}={self.delay_s:g}: expected a multiple of the decision period "
-                f"({decision_period_s:g} s), since the ego measures once per decision; change one of them."
+                f"({decision_period_s:g} s), since the ego measures once per decision; change one "
+                "of them."
             )
         return round(decisions)
 

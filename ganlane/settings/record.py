@@ -216,7 +216,8 @@ def make(kind: type[Part], data: Any, key: str = "") -> Part:
     if not isinstance(values, Mapping):
         options = "the name of an option or " if chosen.group else ""
         raise ParameterError(
-            f"{{{key}}}={as_typed(values)}: it has keys of its own; give {options}{{{key}}}.NAME=VALUE."
+            f"{{{key}}}={as_typed(values)}: it has keys of its own; give "
+            f"{options}{{{key}}}.NAME=VALUE."
         )
     names = key_names(chosen)
     for name in values:

@@ -87,7 +87,8 @@ class TrainGeneratorConfig(RunConfig):
             )
         if self.device != "cpu":
             raise UserError(
-                f"device={self.device}: generators are fitted on the CPU, in minutes; use device=cpu."
+                f"device={self.device}: generators are fitted on the CPU, in minutes; use "
+                "device=cpu."
             )
 
 
@@ -148,12 +149,14 @@ class RealismConfig(RunConfig):
             )
         if self.data.format != "scenes":
             raise UserError(
-                f"data={self.data.format}: the card reads scenes; run ganlane prepare data={self.data.format} first, "
+                f"data={self.data.format}: the card reads scenes; run ganlane prepare "
+                f"data={self.data.format} first, "
                 "and give data=scenes data.path=FOLDER with what it wrote."
             )
         if self.publish and self.scenes != "all":
             raise UserError(
-                "publish=true: the file that ships is made from all recorded scenes; give scenes=all."
+                "publish=true: the file that ships is made from all recorded scenes; give "
+                "scenes=all."
             )
         for name in [*self.rivals(), self.traffic.label()]:
             if name in _REFERENCES:

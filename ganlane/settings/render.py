@@ -128,33 +128,40 @@ class RenderConfig(DrivingConfig):
             path = Path(self.out)
             if path.is_dir() or not os.access(path.parent, os.W_OK):
                 raise UserError(
-                    f"out={path}: expected a file in a folder that exists and can be written to; make it first."
+                    f"out={path}: expected a file in a folder that exists and can be written to; "
+                    "make it first."
                 )
         ending = self._ending()
         if ending and ending not in FORMATS:
             raise UserError(
-                f"out={self.out}: expected one of {', '.join(FORMATS)}; give the file one of these endings."
+                f"out={self.out}: expected one of {', '.join(FORMATS)}; give the file one of these "
+                "endings."
             )
         if ending and ending != self.kind:
             raise UserError(
-                f"out={self.out}: the ending says {ending} and format {self.kind}; give one of them."
+                f"out={self.out}: the ending says {ending} and format {self.kind}; give one of "
+                "them."
             )
         if self.run is not None and self.kind not in CHARTS:
             raise UserError(
-                f"format={self.kind}: learning curves are one of {', '.join(CHARTS)}; choose one of these."
+                f"format={self.kind}: learning curves are one of {', '.join(CHARTS)}; choose one "
+                "of these."
             )
         if self.run is None and self.kind in ("svg", "pdf"):
             raise UserError(
-                f"format={self.kind}: for learning curves only; episodes are gif, mp4, png, html, csv or parquet."
+                f"format={self.kind}: for learning curves only; episodes are gif, mp4, png, html, "
+                "csv or parquet."
             )
         if self.kind == "mp4" and find_spec("imageio_ffmpeg") is None:
             raise UserError(
-                "format=mp4: needs the extra 'video'; run `pip install \"ganlane[video]\"` or choose format=gif."
+                "format=mp4: needs the extra 'video'; run `pip install \"ganlane[video]\"` or "
+                "choose format=gif."
             )
         if self.crashes is not None:
             if self.run is not None:
                 raise UserError(
-                    "crashes and run: either crashes or learning curves are drawn; leave one of them out."
+                    "crashes and run: either crashes or learning curves are drawn; leave one of "
+                    "them out."
                 )
             if self.kind in FILMS:
                 raise UserError(
@@ -163,12 +170,14 @@ class RenderConfig(DrivingConfig):
             return
         if self.traffics is not None:
             raise UserError(
-                f"traffics={as_typed(self.traffics)}: goes with crashes=FILE; else give traffic=NAME."
+                f"traffics={as_typed(self.traffics)}: goes with crashes=FILE; else give "
+                "traffic=NAME."
             )
         count = len(self.pairs())
         if self.kind in FILMS and count > 1:
             raise UserError(
-                f"format={self.kind}: a film shows one episode, not {count}; use format=html for several."
+                f"format={self.kind}: a film shows one episode, not {count}; use format=html for "
+                "several."
             )
         if count > MOST_EPISODES:
             raise UserError(f"agents x episodes: {count} episodes; choose at most {MOST_EPISODES}.")

@@ -223,5 +223,9 @@ class TrainConfig(DrivingConfig):
         )
 
 
-class MultiCollectorConfig(CollectorConfig): pass  # TEMP
-class OverlapCollectorConfig(CollectorConfig): pass  # TEMP
+class MultiCollectorConfig(CollectorConfig):
+    pass  # TEMP
+
+
+class OverlapCollectorConfig(CollectorConfig):
+    pass  # TEMP

@@ -23,7 +23,6 @@ COMMANDS = {
     "train_generator": "fit a generator to recorded traffic",
     "realism": "how close a traffic comes to recorded driving",
     "reproduce": "the paper's tables and figures, and the matrix behind them, in one folder",
-    "bench": "speed and memory, compared with a peer in the same run",
 }
 #: Commands without a configuration: they take no keys.
 PLAIN_COMMANDS = {"doctor": "check the installation; show the command for what is missing"}

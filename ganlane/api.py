@@ -326,8 +326,7 @@ def render(
 
 @checked_arguments
 def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
-    """Run any command that writes ``results.json``: ``record``, ``prepare``, ``realism``, ``bench``
-    ...
+    """Run any command that writes ``results.json``: ``record``, ``prepare``, ``realism`` ...
 
     ``run("prepare", data={"name": "ngsim", "path": "raw.txt"}, out="us101")`` is
     ``ganlane prepare data=ngsim data.path=raw.txt out=us101`` on the command line.
@@ -347,10 +346,6 @@ def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
         hint = did_you_mean(command, known)
         raise UserError(
             f"run({command!r}): no such command{hint}; choose one of {', '.join(known)}."
-        )
-    if command == "bench" and keys.get("report") is not None:
-        raise UserError(
-            "report: tables go into a document with the command only; run ganlane bench report=FILE."
         )
     resumed = keys.get("resume")
     of_folder = (

@@ -15,7 +15,6 @@ import ganlane
 from ganlane.agents.drivers import DRIVERS
 from ganlane.config.app import function_of
 from ganlane.config.env import EnvConfig
-from ganlane.config.runs import stored_command
 from ganlane.config.schemas import SCHEMAS
 from ganlane.config.traffic import GanTrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
@@ -170,20 +169,6 @@ def test_every_command_has_its_function(command):
     assert function_of(command).__name__ == command
 
 
-def test_speed_is_measured_and_no_command_is_made_up_for_a_call():
-    few = {
-        "batches": [2],
-        "modes": ["eager"],
-        "threads": [1],
-        "vehicle_counts": [3],
-        "peers": False,
-        "memory": False,
-    }
-    run = ganlane.api.run("bench", suite="sim", quick=True, **few)
-    assert run.results["rows"][0]["physics_steps_per_s"] > 0
-    assert stored_command(run.folder, "python -m ganlane.bench").startswith("called from Python")
-
-
 def test_recordings_become_a_generator_that_drives():
     write_scene_csv(
         synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=8, seconds=7.0)), Path("mine.csv")
@@ -256,10 +241,6 @@ def test_the_short_blocks_in_the_docs_run(capsys):
         (
             lambda: ganlane.api.run("realism", traffic="replay"),
             "traffic=replay: it is the recordings themselves",
-        ),
-        (
-            lambda: ganlane.api.run("bench", report="x.md"),
-            "report: tables go into a document with the command only",
         ),
         (lambda: ganlane.api.run("prepare", lanes=3), "lanes: no such key"),
         (lambda: ganlane.api.run("prepare", data="ngsim"), "data=ngsim: which file is missing"),

@@ -118,13 +118,6 @@ def test_a_mistake_ends_the_process_with_status_2(tmp_path):
 
 #: Command line to a part of its sentence; what Hydra and the dataclasses refuse is in tests/config.
 MISTAKES = {
-    "bench quick=true report=unmarked.md": "once each",
-    "bench quick=true report=gone.md": "report=gone.md: no such file",
-    "bench batches=[1,1]": "a list of different entries",
-    "bench suite=train train_traffics=[nobody]": "train_traffics=nobody",
-    "bench suite=train train_stored=9": "train_stored=9: expected at least agent.batch_size=256",
-    "bench memory_batches=[8,8]": "two batch sizes, the smaller one first",
-    "bench env.vehicles=100": "env.vehicles=100 do not fit",
     "evaluate agents=[nobody]": "agent nobody: unknown; choose one of random, random_legal, keep_lane, mobil",
     "evaluate agents=[gone.safetensors]": "agent gone.safetensors: no such file",
     "evaluate agents=[no.such.Policy]": "agents=no.such.Policy: 'no.such' cannot be imported",

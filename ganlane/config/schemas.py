@@ -39,7 +39,6 @@ SCHEMAS: dict[str, dict[str, Any]] = {
         "evaluate": commands.EvaluateConfig,
         "render": render.RenderConfig,
         "record": commands.RecordConfig,
-        "bench": commands.BenchConfig,
         "prepare": recordings.PrepareConfig,
         "train_generator": recordings.TrainGeneratorConfig,
         "realism": recordings.RealismConfig,

@@ -78,8 +78,8 @@ def cases_of(options: argparse.Namespace, road: Road, threads: int, batch: int) 
         elif options.suite == "traffic":
             starts = {TRAFFIC: systems.start_traffic}
         else:
-            training = partial(systems.start_training, here, RainbowConfig(), options.stored)
-            starts = {TRAINING: lambda _road, *place: training(*place)}
+            agent = {"config": RainbowConfig(), "stored": options.stored}
+            starts = {TRAINING: partial(systems.start_training, **agent)}
         for system, start in starts.items():
             for mode in options.modes:
                 if start is systems.start_gymnasium and mode != "native":

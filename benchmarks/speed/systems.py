@@ -164,7 +164,7 @@ def start_gymnasium(road: Road, mode: str, device: str, batch: int) -> Runner:
 
 
 def start_training(
-    road: Road, config: RainbowConfig, stored: int, mode: str, device: str, batch: int
+    road: Road, mode: str, device: str, batch: int, config: RainbowConfig, stored: int
 ) -> Runner:
     """Decisions of ``batch`` environments and the updates that go with them; no logs.
 

@@ -107,7 +107,7 @@ def test_a_training_fills_its_buffer_and_learns_as_often_as_it_should(monkeypatc
     monkeypatch.setattr(
         systems, "TrainingState", lambda *parts: states.append(state_of(*parts)) or states[0]
     )
-    run = systems.start_training(Road(), config, 300, "eager", "cpu", 16)
+    run = systems.start_training(Road(), "eager", "cpu", 16, config, 300)
     (state,) = states
     agent, decisions, updates = state.agent, state.decisions, state.agent.updates
     priorities = agent.replay.sampler.priorities.view(-1)

@@ -94,10 +94,9 @@ def examine() -> bool:
         if not {"dev", "test", "docs"} & set(extra):  # which serve a checkout alone
             name = " for extra ".join([name, *extra])
             whole &= look(name, partial(dependency, requirement), not extra)
-    whole &= look("devices", devices, True)
     look("native kernel", kernel)
     look("recordings", recordings)
-    return whole
+    return look("devices", devices, True) and whole
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

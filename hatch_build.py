@@ -4,14 +4,10 @@ Runs when a wheel is built (``pip install .`` builds one), with the compiler tha
 :mod:`ganlane.native.library` finds: g++, clang++ or, where there is none, Clang from the package
 ``ziglang``, which is then fetched for the build. Without any of them the wheel has no kernel, and
 the tensor code drives. An editable install builds at first use.
-
-``GANLANE_LIGHT_WHEEL=1`` leaves the further trainings of the shipped agents (``agent_idm@1``) out:
-12 MB of 17.
 """
 
 from __future__ import annotations
 
-import os
 import sys
 import sysconfig
 from pathlib import Path
@@ -35,17 +31,15 @@ class KernelHook(BuildHookInterface):
         return [] if here or sys.platform == "win32" else ["ziglang>=0.13"]
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Compile into the build folder, and add what was made to the wheel."""
+        """Compile into the build folder, and add what was built to the wheel."""
         if self.target_name != "wheel" or version == "editable":
             return
-        if os.environ.get("GANLANE_LIGHT_WHEEL") == "1":
-            self.build_config.target_config["exclude"] = ["ganlane/checkpoints/seeds_of_*"]
         try:
-            made = library.build_all(Path(self.directory) / "native")
+            built = library.build_all(Path(self.directory) / "native")
         except UserError as error:
             self.app.display_warning(f"the wheel has no native kernel: {error}")
             return
         platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
         build_data["pure_python"], build_data["tag"] = False, f"py3-none-{platform}"
-        for path in made:
+        for path in built:
             build_data["force_include"][str(path)] = f"ganlane/native/prebuilt/{path.name}"

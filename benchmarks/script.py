@@ -1,16 +1,10 @@
-"""Shared by the scripts.
-
-Command line, the part of a document that a script writes, exit status, older revisions.
-"""
+"""Shared by the scripts: command line, the part of a document that one writes, exit status."""
 
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
-import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -65,20 +59,3 @@ def run_script(measure: Callable[[argparse.Namespace], str], arguments: argparse
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
-
-
-@contextmanager
-def checkout_of(revision: str) -> Iterator[Path]:
-    """A worktree of git at ``revision``, removed afterwards."""
-    git = ["git", "-C", str(Path(__file__).resolve().parents[1]), "worktree"]
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place) / "revision"
-        subprocess.run(
-            [*git, "add", "--detach", str(folder), revision], check=True, capture_output=True
-        )
-        try:
-            yield folder
-        finally:
-            subprocess.run(
-                [*git, "remove", "--force", str(folder)], check=True, capture_output=True
-            )

@@ -28,7 +28,7 @@ ORDER = [
     {"build"},
     {"training"},
     {"compare"},
-    {"realism", "bench", "reproduce", "doctor"},
+    {"realism", "reproduce", "doctor"},
     {"options"},
     # The typed calls run the commands' own functions.
     {"api"},

@@ -22,7 +22,7 @@ from ganlane.arguments import import_target
 from ganlane.build import make_driver
 from ganlane.config.command_line import parse
 from ganlane.settings.env import EnvConfig
-from ganlane.config.runs import refuse_stored_imports
+from ganlane.config.run import refuse_stored_imports
 from ganlane.settings.traffic import IdmTrafficConfig
 from ganlane.settings.train import FinalEvaluationConfig, TrainConfig
 from ganlane.errors import UserError

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import zipfile
 from pathlib import Path
@@ -9,7 +10,8 @@ from pathlib import Path
 import pytest
 
 import ganlane
-from ganlane.agents.checkpoint import SHIPPED
+from ganlane.agents.checkpoint import SHIPPED, with_seeds
+from ganlane.errors import UserError
 from ganlane.files import PACKAGE, conf_folder
 from ganlane.native import library
 
@@ -47,51 +49,51 @@ def test_a_conf_folder_of_another_project_is_not_ours(tmp_path, monkeypatch):
     assert conf_folder() == inside
 
 
-def files_of_wheel(folder, monkeypatch):
-    """Names in a wheel and its bytes.
+#: Endings and names of the files in the repository's root.
+KINDS = {".md", ".toml", ".yml", ".yaml", ".cff", ".bib", ".py"}
+NAMES = {"LICENSE", "Dockerfile", ".gitignore", ".dockerignore"}
 
-    Built with one variant of the kernel, since the others take seconds.
-    """
-    monkeypatch.setattr(library, "VARIANTS", {"default": library.VARIANTS["default"]})
-    wheel = pytest.importorskip(
+
+def test_the_root_holds_no_files_of_unexpected_kinds():
+    git = ["git", "-C", str(ROOT), "ls-files"]
+    listed = subprocess.run(git, capture_output=True, text=True, check=False)
+    if listed.returncode:
+        pytest.skip("this is no checkout")
+    names = {name for name in listed.stdout.splitlines() if "/" not in name}
+    assert {name for name in names - NAMES if Path(name).suffix not in KINDS} == set()
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """A built wheel, with one variant of the kernel, since the others take seconds."""
+    builder = pytest.importorskip(
         "hatchling.builders.wheel", reason="hatchling is not installed; CI builds the wheel"
     )
-    (artifact,) = map(
-        Path, wheel.WheelBuilder(str(ROOT)).build(directory=str(folder), versions=["standard"])
-    )
-    assert artifact.name.startswith(f"ganlane-{ganlane.__version__}-")
-    with zipfile.ZipFile(artifact) as packed:
-        return set(packed.namelist()), artifact.stat().st_size
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(library, "VARIANTS", {"default": library.VARIANTS["default"]})
+        folder = str(tmp_path_factory.mktemp("wheel"))
+        (path,) = builder.WheelBuilder(str(ROOT)).build(directory=folder, versions=["standard"])
+    return Path(path)
 
 
-def test_a_light_wheel_leaves_the_further_trainings_out_and_is_below_5_mb(tmp_path, monkeypatch):
-    monkeypatch.setenv("GANLANE_LIGHT_WHEEL", "1")
-    names, size = files_of_wheel(tmp_path, monkeypatch)
-    weights = {path.name for path in (PACKAGE / "checkpoints").glob("*.safetensors")}
-    inside = {name.rpartition("/")[2] for name in names if name.endswith(".safetensors")}
-    assert weights - inside == {f"seeds_of_{agent}.safetensors" for agent in SHIPPED}
-    assert size < 5e6
-
-
-def test_the_wheel_holds_configuration_weights_and_kernel(tmp_path, monkeypatch):
-    names, _ = files_of_wheel(tmp_path, monkeypatch)
-    assert {
-        f"ganlane/conf/{path.relative_to(ROOT / 'conf')}"
-        for path in (ROOT / "conf").rglob("*.yaml")
-    } <= names
-    for kind in ("safetensors", "json"):
-        shipped = {
-            f"ganlane/checkpoints/{path.name}"
-            for path in (PACKAGE / "checkpoints").glob(f"*.{kind}")
-        }
-        assert shipped
-        assert shipped <= names
-    page = {
-        f"ganlane/view/player_page/{path.name}"
-        for path in (PACKAGE / "view" / "player_page").iterdir()
-    }
-    assert "ganlane/view/player_page/page.html" in page <= names
-    assert "ganlane/py.typed" in names
+def test_the_wheel_holds_configuration_weights_and_kernel_and_is_below_5_mb(wheel):
+    names = set(zipfile.ZipFile(wheel).namelist())
+    conf = ROOT / "conf"
+    inside = {f"ganlane/conf/{path.relative_to(conf)}" for path in conf.rglob("*.yaml")}
+    for folder in ("checkpoints", "view/player_page"):
+        inside |= {f"ganlane/{folder}/{path.name}" for path in (PACKAGE / folder).iterdir()}
+    further = {f"ganlane/checkpoints/seeds_of_{agent}.safetensors" for agent in SHIPPED}
+    assert {*inside, "ganlane/py.typed"} - names == further
     kernels = [name for name in names if name.startswith("ganlane/native/prebuilt/kernel-default-")]
     assert len(kernels) == (1 if library.find_compiler() else 0)
     assert not [name for name in names if name.startswith(("tests/", "outputs/"))]
+    assert wheel.name.startswith(f"ganlane-{ganlane.__version__}-")
+    assert wheel.stat().st_size < 5e6
+
+
+def test_without_the_further_trainings_all_of_them_are_refused_in_a_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr("ganlane.agents.checkpoint.CHECKPOINTS", tmp_path)
+    with pytest.raises(
+        UserError, match=r"agent_idm@0 is installed.* run pip install -e \. in a clone"
+    ):
+        with_seeds("agent_idm@all")

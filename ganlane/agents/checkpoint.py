@@ -76,7 +76,8 @@ def with_seeds(name: str) -> list[str]:
     packed = _seeds_file(recipe) if shipped else Path(recipe)
     if shipped and not packed.is_file():
         raise UserError(
-            f"{name}: only the training {recipe}@0 is installed (a light wheel); give that, or install from a clone."
+            f"{name}: only the training {recipe}@0 is installed, since a wheel holds no further ones; "
+            "give that, or run pip install -e . in a clone."
         )
     seeds = sorted(_read_several(packed)[1])
     return [f"{recipe}@{seed}{mask}" for seed in ([0, *seeds] if shipped else seeds)]

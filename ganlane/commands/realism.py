@@ -12,7 +12,7 @@ from typing import Any, Final
 from ganlane.build import make_road, make_traffic
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.recordings import RealismConfig
-from ganlane.config.runs import stored_command
+from ganlane.config.run import stored_command
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.data import data_folder, default_scenes, read_scenes
 from ganlane.errors import UserError

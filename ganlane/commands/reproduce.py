@@ -16,7 +16,7 @@ from ganlane.agents import read_agent
 from ganlane.agents.checkpoint import save_agents, with_seeds
 from ganlane.compare import available, cells_of, drive, read_cells
 from ganlane.settings.commands import ReproduceConfig
-from ganlane.config.runs import stored_command
+from ganlane.config.run import stored_command
 from ganlane.errors import UserError
 from ganlane.evaluation import failed_episodes, machine_sentence, write_results
 from ganlane.evaluation.table import Table

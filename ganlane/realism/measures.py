@@ -103,7 +103,7 @@ def distance(
     0 all of them lie above the estimate. Hence the basic (reverse percentile) interval, taken of
     the squared distance, in which that bias adds up, cut off at 0 and widened to hold the estimate.
     Percentile and BCa intervals consist of resamples, none of which is 0, so they miss a perfect
-    model's distance (``benchmarks/realism_coverage.py``).
+    model's distance (docs/realism.md).
 
     ``paired`` units are the same and are resampled together; else ``simulated`` alone is.
     """

@@ -21,7 +21,6 @@ from ganlane.agents import (
 from ganlane.agents.checkpoint import with_seeds
 from ganlane.build import make_drivers
 from ganlane.settings.env import EnvConfig
-from ganlane.doctor import State, checkpoints
 from ganlane.errors import UserError
 from ganlane.transforms import observation_size
 
@@ -102,12 +101,6 @@ def test_a_table_takes_every_seed_once(packed):
         "mobil",
     ]
     assert {driver.mask.form for driver in drivers[:3]} == {"safe"}
-
-
-def test_the_installation_check_loads_every_seed(packed, monkeypatch):
-    monkeypatch.setattr("ganlane.doctor.CHECKPOINTS", packed.parent)
-    monkeypatch.setattr("ganlane.doctor.NEEDED_WEIGHTS", ())
-    assert [each.state for each in checkpoints()] == [State.OK, State.OK]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,237 @@
+"""How fast it is, compared with a peer in the same run.
+
+    python -m benchmarks.speed --suite sim --report docs/performance.md
+    python -m benchmarks.speed --suite traffic --traffics gan gan_calibrated --modes eager compiled
+    python -m benchmarks.speed --suite train --modes eager native --stored 100000 --seconds 2
+    python -m benchmarks.speed --quick
+
+sim: the simulator, bare, as a whole environment and through gymnasium, beside HighwayEnv and
+EnvPool; traffic: every traffic model; train: the training loop, beside stable-baselines3's DQN on
+HighwayEnv. Peers are measured where they are installed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from datetime import date
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from benchmarks.script import ReportSection, make_parser, run_script
+from benchmarks.speed import systems
+from benchmarks.speed.measure import Case, Labels, Row, best_rows, exponent, measure
+from benchmarks.speed.systems import Road, installed_version
+from ganlane.agents import RainbowConfig
+from ganlane.evaluation import machine_sentence
+from ganlane.evaluation.table import Table, count, percent, significant
+from ganlane.files import write_json
+
+SUITES = ("sim", "traffic", "train")
+#: Defaults of each suite: batches and traffics.
+BATCHES = {
+    "sim": [1, 16, 64, 256, 1024, 4096],
+    "traffic": [512, 2048],
+    "train": [256, 512, 1024],
+}
+TRAFFICS = {
+    "sim": ["idm_mobil"],
+    "traffic": ["idm", "idm_mobil", "gan", "gan_calibrated"],
+    "train": ["idm_mobil", "gan"],
+}
+SIMULATORS: dict[str, Callable[..., Any]] = {
+    "ganlane physics": systems.start_physics,
+    "ganlane environment": systems.start_environment,
+    "ganlane gymnasium": systems.start_gymnasium,
+}
+TRAFFIC, TRAINING = "ganlane traffic", "ganlane training"
+#: What stands for the traffic of HighwayEnv.
+THEIR_TRAFFIC = "its IDM and MOBIL"
+#: Heading to cell of the tables' columns.
+COLUMNS: dict[str, Callable[[Mapping[str, Any]], str]] = {
+    "system": lambda row: row["system"],
+    "traffic": lambda row: row["traffic"],
+    "mode": lambda row: row["mode"],
+    "device": lambda row: row["device"],
+    "threads": lambda row: str(row["threads"]),
+    "batch": lambda row: str(row["batch"]),
+    "physics steps/s": lambda row: count(row["physics_steps_per_s"]),
+    "decisions/s": lambda row: count(row["decisions_per_s"]),
+    "physics steps/CPU-s": lambda row: count(row["physics_steps_per_cpu_s"]),
+    "times the peer": lambda row: significant(row["ratio"]),
+    "in CPU time": lambda row: significant(row["ratio_cpu"]),
+    "spread": lambda row: percent(row["spread"]),
+}
+
+
+def cases_of(options: argparse.Namespace, road: Road, threads: int, batch: int) -> list[Case]:
+    """What takes turns in one group: every system, traffic and mode of the suite."""
+    cases = []
+    for traffic in options.traffics:
+        here = Road(traffic, road.vehicles, road.lanes, road.seed)
+        starts: dict[str, Callable[..., Any]]
+        if options.suite == "sim":
+            starts = SIMULATORS
+        elif options.suite == "traffic":
+            starts = {TRAFFIC: systems.start_traffic}
+        else:
+            agent = {"config": RainbowConfig(), "stored": options.stored}
+            starts = {TRAINING: partial(systems.start_training, **agent)}
+        for system, start in starts.items():
+            for mode in options.modes:
+                if start is systems.start_gymnasium and mode != "native":
+                    continue
+                labels = labels_of(here, "speed", system, mode, options.device, threads, batch)
+                cases.append(Case(labels, partial(start, here, mode, options.device, batch), batch))
+    return cases
+
+
+def labels_of(road: Road, part: str, system: str, *place: Any) -> Labels:
+    """Labels of a case; ``place`` is mode, device, threads and batch."""
+    mode, device, threads, batch = place
+    size = (road.vehicles, road.lanes, batch)
+    return Labels(part, system, road.traffic, mode, device, threads, *size)
+
+
+def peers_of(options: argparse.Namespace, road: Road, threads: int, batch: int) -> list[Case]:
+    """The peers of a group that are installed; ratios are to the first."""
+    theirs = Road(THEIR_TRAFFIC, road.vehicles, road.lanes, road.seed)
+    highway = installed_version("highway-env")
+    envpool, learner = installed_version("envpool"), installed_version("stable-baselines3")
+    peers: list[Case] = []
+    if options.no_peers or options.suite == "traffic":
+        return peers
+    if highway is None:
+        print("left out, HighwayEnv: pip install 'ganlane[bench]' brings it.", file=sys.stderr)
+    elif options.suite == "sim":
+        name = f"HighwayEnv {highway}"
+        labels = labels_of(theirs, "speed", name, "eager", "cpu", threads, 1)
+        peers.append(Case(labels, partial(systems.start_highway, road), 1))
+        if envpool is not None and options.device == "cpu":
+            name = f"EnvPool {envpool}"
+            labels = labels_of(theirs, "speed", name, "native", "cpu", threads, batch)
+            start = partial(systems.start_envpool, road, batch, threads)
+            peers.append(Case(labels, start, batch))
+    elif options.suite == "train" and learner is not None:
+        agent = RainbowConfig()
+        name = f"stable-baselines3 {learner} DQN on HighwayEnv {highway}"
+        labels = labels_of(theirs, "speed", name, "eager", "cpu", threads, 1)
+        start = partial(systems.start_baseline, road, agent)
+        peers.append(Case(labels, start, agent.decisions_per_update))
+    return peers
+
+
+def growth_cases(options: argparse.Namespace, system: str, threads: int) -> list[Case]:
+    """A system, eager, with different numbers of vehicles."""
+    cases = []
+    batch = max(options.batches)
+    for vehicles in options.vehicle_counts:
+        road = Road(options.traffics[0], vehicles, options.lanes, options.seed)
+        labels = labels_of(road, "growth", system, "eager", options.device, threads, batch)
+        start = partial(SIMULATORS[system], road, "eager", options.device, batch)
+        cases.append(Case(labels, start, batch))
+    return cases
+
+
+def rows_of(options: argparse.Namespace) -> list[Row]:
+    """Rows of all groups, each group's peers first."""
+    road = Road(options.traffics[0], options.vehicles, options.lanes, options.seed)
+    rows = []
+    for threads in options.threads:
+        for batch in options.batches:
+            cases = cases_of(options, road, threads, batch)
+            first, *others = peers_of(options, road, threads, batch) or [None]
+            rows += measure([*others, *cases], first, options.repetitions, options.seconds)
+            print(f"threads {threads}, batch {batch}: done", file=sys.stderr, flush=True)
+    if options.suite == "sim" and len(options.vehicle_counts) > 1:
+        for system in ("ganlane physics", "ganlane environment"):
+            cases = growth_cases(options, system, options.threads[0])
+            rows += measure(cases, None, options.repetitions, options.seconds)
+    return rows
+
+
+def tables_of(rows: Sequence[Row]) -> list[Table]:
+    """Speed, the best rows, and growth with the vehicles."""
+    speed = [row for row in rows if row["part"] == "speed"]
+    grown = [row for row in rows if row["part"] == "growth"]
+    place = f"{speed[0]['vehicles']} vehicles on {speed[0]['lanes']} lanes"
+    note = "Medians; spread is the interquartile range of the wall time over its median."
+    short = {name: cell for name, cell in COLUMNS.items() if name != "spread"}
+    tables = [
+        Table.of(f"Speed, {place}", speed, COLUMNS, 4, [note]),
+        Table.of("The best of each", best_rows(speed, "physics_steps_per_s"), short, 4),
+    ]
+    lines = []
+    for system in dict.fromkeys(row["system"] for row in grown):
+        of_system = [row for row in grown if row["system"] == system]
+        vehicles = [row["vehicles"] for row in of_system]
+        costs = [row["ms_per_call"] for row in of_system]
+        cells = [", ".join(map(str, vehicles)), ", ".join(map(significant, costs))]
+        lines.append([system, *cells, f"{exponent(vehicles, costs):.2f}"])
+    if lines:
+        headings = ["system", "vehicles", "ms per decision", "exponent"]
+        tables.append(Table("Growth of the cost", headings, lines))
+    return tables
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The command line."""
+    parser = make_parser(__doc__)
+    add = parser.add_argument
+    add("--suite", choices=SUITES, default="sim")
+    add("--quick", action="store_true", help="a check that it runs: small batches, short turns")
+    add("--traffics", nargs="+", metavar="NAME", help="options of the group traffic")
+    add("--batches", nargs="+", type=int, metavar="N", help="environments side by side")
+    modes = ("eager", "compiled", "native")
+    add("--modes", nargs="+", choices=modes, default=["eager", "native"])
+    add("--threads", nargs="+", type=int, default=[1], metavar="N", help="of torch")
+    add("--device", choices=("cpu", "cuda"), default="cpu")
+    add("--vehicles", type=int, default=9, metavar="N", help="the ego included")
+    add("--lanes", type=int, default=3, metavar="N")
+    add("--vehicle-counts", nargs="*", type=int, default=[9, 15, 30, 60], metavar="N",
+        help="suite sim: how the cost grows with them, at the largest batch")  # fmt: skip
+    add("--stored", type=int, default=1_000_000, metavar="N",
+        help="suite train: transitions in the replay buffer when the clock starts")  # fmt: skip
+    add("--repetitions", type=int, default=5, metavar="N", help="turns of every case")
+    add("--seconds", type=float, default=0.5, help="a turn lasts about so long")
+    add("--no-peers", action="store_true")
+    add("--seed", type=int, default=0)
+    add("--json", type=Path, metavar="FILE", help="all rows as JSON")
+    add("--report", type=Path, metavar="FILE", help="a document with <!-- begin bench SUITE -->")
+    options = parser.parse_args(arguments)
+    options.traffics = options.traffics or TRAFFICS[options.suite]
+    options.batches = options.batches or BATCHES[options.suite]
+    if options.quick:
+        options.batches = [min(*options.batches, 64)]
+        options.vehicle_counts = options.vehicle_counts[:2]
+        options.stored = min(options.stored, 1000)
+        options.repetitions, options.seconds = 2, 0.01
+    options.told = shlex.join(sys.argv[1:] if arguments is None else arguments)
+    return options
+
+
+def compare(options: argparse.Namespace) -> str:
+    """Measure all; the tables, in the document too where one is named."""
+    begin, end = f"<!-- begin bench {options.suite} -->", f"<!-- end bench {options.suite} -->"
+    section = ReportSection(options.report, begin, end)
+    rows = rows_of(options)
+    if options.json is not None:
+        write_json(options.json, {"rows": rows})
+    tables = tables_of(rows)
+    taken = f"Taken on {date.today()}: {machine_sentence(options.threads)}"
+    command = f"    python -m benchmarks.speed {options.told}".rstrip()
+    markdown = [table.markdown() for table in tables]
+    section.write("\n" + "\n\n".join([command, taken, *markdown]) + "\n")
+    return "\n\n".join(table.text() for table in tables)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure; the exit status."""
+    return run_script(compare, parse(arguments))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

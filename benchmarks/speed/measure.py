@@ -1,0 +1,192 @@
+"""Timing of cases that take turns (A B C A B C ...), and the row of figures of each."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from statistics import median
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from ganlane.errors import UserError
+
+#: Makes so many calls; the physics steps simulated in all environments together.
+Runner = Callable[[int], int]
+#: Labels and figures of a case (:func:`make_row`).
+Row = dict[str, Any]
+
+#: Upper limit of the calls in a turn.
+MOST_CALLS = 2**20
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What is measured: the first columns of a row.
+
+    Attributes:
+        part: ``speed``, or ``growth``: the same with other numbers of vehicles.
+        mode: how the environment is computed: ``eager``, ``compiled`` or ``native``.
+        threads: of torch.
+        batch: environments side by side.
+    """
+
+    part: str
+    system: str
+    traffic: str
+    mode: str
+    device: str
+    threads: int
+    vehicles: int
+    lanes: int
+    batch: int
+
+
+class Case(NamedTuple):
+    """Something to measure; ``start`` makes it ready to run.
+
+    A call makes ``decisions_per_call`` decisions, one in every environment as a rule.
+    """
+
+    labels: Labels
+    start: Callable[[], Runner]
+    decisions_per_call: int
+
+
+class Sample(NamedTuple):
+    """One turn of a case: seconds of wall and of CPU time (all threads), and what was done."""
+
+    wall_s: float
+    cpu_s: float
+    decisions: int
+    physics_steps: int
+
+    @property
+    def rates(self) -> tuple[float, float]:
+        """Physics steps per second of wall and of CPU time."""
+        # A coarse CPU clock may not have moved.
+        return self.physics_steps / self.wall_s, self.physics_steps / max(self.cpu_s, 1e-6)
+
+
+@contextmanager
+def torch_threads(threads: int) -> Iterator[None]:
+    """Let torch use so many threads inside."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def take_turn(case: Case, run: Runner, calls: int) -> Sample:
+    """One turn of ``calls``."""
+    wait = torch.cuda.synchronize if case.labels.device == "cuda" else lambda: None
+    wait()
+    wall, cpu = time.perf_counter(), time.process_time()
+    physics_steps = run(calls)
+    wait()
+    wall_s, cpu_s = time.perf_counter() - wall, time.process_time() - cpu
+    return Sample(wall_s, cpu_s, calls * case.decisions_per_call, physics_steps)
+
+
+def calls_per_turn(case: Case, run: Runner, seconds: float) -> int:
+    """How many calls fill a turn of ``seconds``; measuring it is the warm-up."""
+    take_turn(case, run, 1)  # with compilation and caches, so it does not count
+    calls = 1
+    wall_s = take_turn(case, run, calls).wall_s
+    # Until a turn is much longer than the clock's resolution.
+    while wall_s < seconds / 4 and calls < MOST_CALLS:
+        calls *= 2
+        wall_s = take_turn(case, run, calls).wall_s
+    return min(math.ceil(calls * seconds / wall_s), MOST_CALLS)
+
+
+def take_turns(
+    cases: Sequence[Case], runners: Sequence[Runner], repetitions: int, seconds: float
+) -> list[list[Sample]]:
+    """Samples of each case: ``repetitions`` turns of about ``seconds`` each, after a warm-up."""
+    calls = [calls_per_turn(case, run, seconds) for case, run in zip(cases, runners)]
+    samples: list[list[Sample]] = [[] for _ in cases]
+    for _ in range(repetitions):
+        for i, case in enumerate(cases):
+            samples[i].append(take_turn(case, runners[i], calls[i]))
+    return samples
+
+
+def make_row(labels: Labels, samples: Sequence[Sample], peer: Sequence[Sample] = ()) -> Row:
+    """Medians over the turns of a case.
+
+    Args:
+        labels: of the case.
+        samples: its turns.
+        peer: the turns of the system that it is compared with, if any, of the same rounds.
+
+    Returns:
+        The labels; ``physics_steps_per_s``, ``decisions_per_s``, ``physics_steps_per_cpu_s``; the
+        ``ms_per_call`` of wall time; ``spread``, the interquartile range of the turns' wall time
+        over its median; ``ratio`` and ``ratio_cpu``: physics steps per second of wall and of CPU
+        time over the peer's turn of the same round, median of the rounds, or None.
+    """
+    per_s, per_cpu_s = np.median([sample.rates for sample in samples], axis=0).tolist()
+    walls_s = [sample.wall_s for sample in samples]
+    low, high = np.quantile(walls_s, [0.25, 0.75])
+    ratio = ratio_cpu = None
+    if peer:
+        # Within a round other work on the machine slows both alike.
+        rates, of_peer = ([sample.rates for sample in turns] for turns in (samples, peer))
+        ratio, ratio_cpu = np.median(np.divide(rates, of_peer), axis=0).tolist()
+    return {
+        **asdict(labels),
+        "physics_steps_per_s": per_s,
+        "decisions_per_s": median(sample.decisions / sample.wall_s for sample in samples),
+        "physics_steps_per_cpu_s": per_cpu_s,
+        "ms_per_call": 1000 * median(walls_s) * labels.batch / samples[0].decisions,
+        "spread": float(high - low) / median(walls_s),
+        "ratio": ratio,
+        "ratio_cpu": ratio_cpu,
+    }
+
+
+def measure(
+    cases: Sequence[Case], peer: Case | None, repetitions: int, seconds: float
+) -> list[Row]:
+    """Rows of cases with the same number of threads that take turns; the ``peer``'s comes first."""
+    started: list[Case] = []
+    runners: list[Runner] = []
+    with torch_threads(cases[0].labels.threads):
+        if any(case.labels.mode == "compiled" for case in cases):
+            # The cases compile for their own sizes; torch would fall back to eager after a few.
+            torch.compiler.reset()
+        for case in cases if peer is None else [peer, *cases]:
+            try:
+                runners.append(case.start())
+                started.append(case)
+            except UserError as error:
+                if case.labels.mode == "eager":
+                    raise
+                # No compiler here, or a traffic that the kernel does not drive.
+                print(f"left out, {case.labels.mode}: {error}", file=sys.stderr)
+        samples = take_turns(started, runners, repetitions, seconds)
+    of_peer = samples[0] if peer is not None else []
+    return [make_row(case.labels, turns, of_peer) for case, turns in zip(started, samples)]
+
+
+def best_rows(rows: Sequence[Row], figure: str) -> list[Row]:
+    """The row with the highest ``figure`` of each system and traffic, in the order of ``rows``."""
+    best: dict[tuple[str, str], Row] = {}
+    for row in rows:
+        key = row["system"], row["traffic"]
+        if key not in best or row[figure] > best[key][figure]:
+            best[key] = row
+    return list(best.values())
+
+
+def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
+    """``p`` of the least-squares fit ``cost ~ size ** p``; 1 is linear."""
+    return float(np.polyfit(np.log(sizes), np.log(costs), 1)[0])

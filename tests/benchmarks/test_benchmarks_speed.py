@@ -1,0 +1,163 @@
+"""The speed of the simulator: turns of cases, the rows they give, and what the systems count."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import pytest
+import torch
+
+from benchmarks.speed import __main__ as speed
+from benchmarks.speed import systems
+from benchmarks.speed.measure import (
+    Case,
+    Labels,
+    Sample,
+    best_rows,
+    calls_per_turn,
+    exponent,
+    make_row,
+    take_turn,
+    take_turns,
+)
+from benchmarks.speed.systems import Road
+from ganlane.agents import RainbowConfig
+
+LABELS = Labels("speed", "mine", "idm", "eager", "cpu", 1, 9, 3, 4)
+CASE = Case(LABELS, lambda: lambda calls: 0, 4)
+QUICK = ["--quick", "--seconds", "0.001", "--no-peers", "--modes", "eager"]
+
+
+def napping(seconds=0.002, log=None, name=""):
+    """Ten physics steps a call, each call a nap."""
+
+    def run(calls):
+        if log is not None:
+            log.append(name)
+        time.sleep(seconds * calls)
+        return 10 * calls
+
+    return run
+
+
+def test_cases_take_turns_after_the_warm_up():
+    log = []
+    runners = [napping(log=log, name=name) for name in "AB"]
+    take_turns([CASE, CASE], runners, repetitions=3, seconds=0.004)
+    assert "".join(log[-6:]) == "ABABAB"
+
+
+def test_a_turn_lasts_as_long_as_asked_and_holds_one_call_at_least():
+    # Naps are never shorter than asked, and on a busy machine longer.
+    assert 5 <= calls_per_turn(CASE, napping(0.002), 0.1) <= 50
+    assert calls_per_turn(CASE, napping(0.02), 0.001) == 1
+
+
+def test_a_nap_costs_wall_time_but_no_cpu_time():
+    sample = take_turn(CASE, napping(0.05), 2)
+    assert sample.wall_s >= 0.1
+    assert sample.cpu_s < 0.05
+    assert (sample.decisions, sample.physics_steps) == (8, 20)
+
+
+def test_a_row_holds_medians_over_the_turns():
+    row = make_row(LABELS, [Sample(wall_s, 2 * wall_s, 40, 400) for wall_s in (1.0, 4.0, 2.0)])
+    assert (row["physics_steps_per_s"], row["decisions_per_s"]) == (200, 20)
+    assert (row["physics_steps_per_cpu_s"], row["ms_per_call"]) == (100, 200)
+    assert row["spread"] == pytest.approx(1.5 / 2)
+    assert (row["ratio"], row["system"]) == (None, "mine")
+
+
+def test_a_ratio_compares_turns_of_the_same_round():
+    # Both are ten times slower in the second round, when the machine was busy.
+    mine = [Sample(wall_s, 1.0, 1, 300) for wall_s in (1.0, 10.0, 1.0)]
+    peer = [Sample(wall_s, 0.5, 1, 10) for wall_s in (1.0, 10.0, 1.0)]
+    row = make_row(LABELS, mine, peer)
+    assert (row["ratio"], row["ratio_cpu"]) == pytest.approx((30, 15))
+
+
+def test_the_best_row_is_that_of_each_system_and_traffic_and_a_power_is_found():
+    rows = [{"system": "a", "traffic": traffic, "n": n} for traffic, n in (("x", 1), ("x", 3))]
+    rows.append({"system": "b", "traffic": "x", "n": 0})
+    assert [row["n"] for row in best_rows(rows, "n")] == [3, 0]
+    assert exponent([9, 15, 30], [0.3 * n**1.7 for n in (9, 15, 30)]) == pytest.approx(1.7)
+
+
+@pytest.mark.parametrize("mode", ["eager", "native"])
+def test_bare_physics_moves_every_environment_for_the_whole_decision(mode):
+    assert systems.start_physics(Road(), mode, "cpu", 5)(3) == 5 * 3 * 10
+
+
+@pytest.mark.parametrize("start", [systems.start_environment, systems.start_gymnasium])
+@pytest.mark.parametrize("batch", [1, 8])
+def test_only_simulated_steps_count(start, batch):
+    run = start(Road(), "native", "cpu", batch)
+    decisions = 25
+    # Whoever leaves the road, which a third of the random actions may do, is out at once.
+    assert 0.4 * 10 * batch * decisions < run(decisions) < 10 * batch * decisions
+
+
+def test_a_training_fills_its_buffer_and_learns_as_often_as_it_should(monkeypatch):
+    config = RainbowConfig(
+        hidden=(16, 16), batch_size=32, decisions_per_update=8, capacity=512, warmup=64
+    )
+    states = []
+    state_of = systems.TrainingState
+    monkeypatch.setattr(
+        systems, "TrainingState", lambda *parts: states.append(state_of(*parts)) or states[0]
+    )
+    run = systems.start_training(Road(), "eager", "cpu", 16, config, 300)
+    (state,) = states
+    agent, decisions, updates = state.agent, state.decisions, state.agent.updates
+    priorities = agent.replay.sampler.priorities.view(-1)
+    assert len(agent.replay) == 300
+    assert len(priorities[:300].unique()) > 250
+    weights = [value.clone() for value in agent.network.parameters()]
+    assert 0 < run(3) <= 3 * 16 * 10
+    assert (state.decisions - decisions, agent.updates - updates) == (3 * 16, 3 * 16 // 8)
+    assert any(not torch.equal(a, b) for a, b in zip(weights, agent.network.parameters()))
+
+
+def test_peers_drive_our_road_and_the_baseline_has_our_network():
+    pytest.importorskip("highway_env", reason="highway-env comes with the extra 'bench'")
+    pytest.importorskip("stable_baselines3", reason="it comes with the extra 'bench'")
+    env = systems.make_highway(Road(vehicles=4, lanes=2))
+    assert (len(env.road.vehicles), len(env.road.network.lanes_list())) == (4, 2)
+    assert systems.start_highway(Road())(2) == 20
+    config = RainbowConfig(hidden=(12, 8), batch_size=8, decisions_per_update=8)
+    assert systems.start_baseline(Road(vehicles=4), config)(2) == 2 * 8 * 10
+
+
+def test_the_tables_go_into_the_document_and_the_rows_into_a_file(tmp_path, capsys):
+    document, rows = tmp_path / "page.md", tmp_path / "rows.json"
+    document.write_text("before\n<!-- begin bench sim -->\n<!-- end bench sim -->\nafter\n")
+    line = [*QUICK, "--batches", "2", "--vehicle-counts", "9", "12"]
+    assert speed.main([*line, "--report", str(document), "--json", str(rows)]) == 0
+    text = document.read_text()
+    assert text.startswith("before\n")
+    assert text.endswith("after\n")
+    assert "python -m benchmarks.speed --quick" in text
+    assert "| ganlane physics | idm_mobil | eager | cpu | 1 | 2 |" in text
+    assert "### Growth of the cost" in text
+    systems_of = [row["system"] for row in json.loads(rows.read_text())["rows"]]
+    assert systems_of == ["ganlane physics", "ganlane environment"] + 2 * [
+        "ganlane physics"
+    ] + 2 * ["ganlane environment"]
+
+
+def test_every_traffic_is_measured_and_what_the_kernel_does_not_drive_is_left_out(capsys):
+    line = ["--suite", "traffic", "--batches", "2", "--traffics", "idm", "gan"]
+    assert speed.main([*QUICK, *line, "native"]) == 2  # a traffic of that name
+    assert "native" in capsys.readouterr().err
+    assert speed.main([*QUICK, "native", *line]) == 0
+    told = capsys.readouterr()
+    assert "left out, native" in told.err
+    assert told.out.count("ganlane traffic") == 2 * 3 - 1
+
+
+@pytest.mark.parametrize("suite", speed.SUITES)
+def test_the_document_of_the_project_can_be_written(suite):
+    text = (speed.Path(__file__).parents[2] / "docs/performance.md").read_text()
+    assert text.count(f"<!-- begin bench {suite} -->") == 1
+    assert text.count(f"<!-- end bench {suite} -->") == 1

@@ -1,0 +1,104 @@
+"""Tries to break the package, and counts what held.
+
+    python -m tests.trial --minutes 60 --report docs/reliability.md
+    python -m tests.trial kill --runs 45 --minutes 15
+    python -m tests.trial damage --inputs 10000
+    python -m tests.trial damage --input 'scene CSV:17'         a damaged file again
+    python -m tests.trial soak --configurations 500 --minutes 40 --compiled 3
+    python -m tests.trial soak --configuration 12               a configuration again
+
+Parts: kill (kill -9, signals, refused writes, then resumed to the same bits), damage (damaged
+files), misuse (of the API), soak (random configurations). Without a part's name all of them run.
+Exits with 1 after a failure. Needs Linux.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks.script import ReportSection, add_report, make_parser, run_script
+
+from .damage import Trial, damage, good_files
+from .kill import kill
+from .misuse import misuse
+from .soak import once, soak
+from .tally import Tally
+
+MARKERS = "<!-- begin trial -->", "<!-- end trial -->"
+#: Parts, and their shares of the minutes.
+SHARES = {"kill": 6, "damage": 4, "misuse": 2, "soak": 8}
+HEAD = "| part | tried | failed | minutes |\n|---|---|---|---|"
+
+
+def run(part: str, options: argparse.Namespace, minutes: float, scratch: Path) -> Tally:
+    """One part; its counts."""
+    tally = Tally(part)
+    begun = time.monotonic()
+    if part == "kill":
+        kill(tally, options.runs, options.seed, minutes, scratch, options.only_kill)
+    elif part == "damage":
+        damage(tally, options.inputs, options.seed, minutes, scratch)
+    elif part == "misuse":
+        misuse(tally, options.seed, minutes)
+    else:
+        soak(tally, options.configurations, options.seed, minutes, options.compiled)
+    tally.seconds = time.monotonic() - begun
+    return tally
+
+
+def parse() -> argparse.Namespace:
+    """The command line."""
+    parser = make_parser(__doc__)
+    add = parser.add_argument
+    add("parts", nargs="*", choices=[[], *SHARES], default=list(SHARES), metavar="PART")
+    add("--minutes", type=float, default=10.0, help="of all parts together, about")
+    add("--seed", type=int, default=0)
+    add("--runs", type=int, default=45, help="that kill disturbs")
+    add("--only-kill", action="store_true", help="kill -9 alone: no signals, no refused writes")
+    add("--inputs", type=int, default=10_000, help="damaged files")
+    add("--configurations", type=int, default=500, help="that soak drives")
+    add("--compiled", type=int, default=0, help="of them compiled, a minute each before they drive")
+    add("--input", metavar="KIND:NUMBER", help="one damaged file, as a failure names it")
+    add("--configuration", type=int, help="one configuration, as a failure names it")
+    add_report(parser, *MARKERS)
+    return parser.parse_args()
+
+
+def attempt(options: argparse.Namespace) -> str:
+    """The chosen parts one after the other, and their table; a failure ends the process with 1."""
+    # Before the folder changes, which a relative path would not survive.
+    document = None if options.report is None else options.report.absolute()
+    report = ReportSection(document, *MARKERS)
+    whole = sum(SHARES[part] for part in options.parts)
+    with tempfile.TemporaryDirectory(prefix="trial-") as name:
+        scratch = Path(name)
+        os.chdir(scratch)
+        try:
+            if options.input is not None:
+                kind, _, number = options.input.rpartition(":")
+                return Trial(good_files(scratch), scratch / "damaged")((kind, int(number)))
+            if options.configuration is not None:
+                return once(options.configuration)
+            tallies = []
+            for part in options.parts:
+                folder = scratch / part
+                folder.mkdir()
+                minutes = options.minutes * SHARES[part] / whole
+                tallies.append(run(part, options, minutes, folder))
+        finally:
+            os.chdir("/")
+    table = "\n".join([HEAD, *(tally.row() for tally in tallies)])
+    report.write(table)
+    if any(tally.failed for tally in tallies):
+        print(table)
+        sys.exit(1)
+    return table
+
+
+if __name__ == "__main__":
+    sys.exit(run_script(attempt, parse()))

@@ -1,10 +1,5 @@
 """The Social-GAN's two networks (section III; Gupta et al. 2018) and their layers.
 
-**Linear layer.** ``torch.nn.functional.linear`` multiplies float32 by MKL, which uses little of the
-vector units of processors other than Intel's. On an AMD EPYC, oneDNN takes a third of the time from
-a few thousand rows on, and more below :data:`_MANY_ROWS`; its operator has no gradient. Results are
-equal.
-
 **LSTM.** The projection of an input is separate from the recurrence, so that projections can be
 kept when the window of observed motions moves on by one step.
 
@@ -23,6 +18,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
+from ganlane.linear import has_fast_product, matrix_product
 from ganlane.parameters.generator import GeneratorSizes
 
 #: Typical displacement per 0.1 s and typical change of it, along and across the road, m: the
@@ -36,44 +32,26 @@ LARGEST_DIFFERENCE = 5.0
 _PAIR_SCALE = (20.0, 4.0, 0.4, 0.05)
 #: Vehicles further away than this along the road have no influence, m.
 RANGE_M = 100.0
-#: oneDNN is faster from this number of rows.
+#: From this number of rows on, oneDNN is faster than MKL on the processors that we measured.
 _MANY_ROWS = 512
-_ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
 
 def dense(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False) -> Tensor:
-    """Linear layer.
+    """Linear layer [..., O] of ``x`` [..., I], ``weight`` [O, I] and ``bias`` [O].
 
-    ``x`` [..., I], ``weight`` [O, I], ``bias`` [O] -> [..., O], with a ReLU if ``relu``.
+    A ReLU follows if ``relu``.
     """
     many = x.numel() >= _MANY_ROWS * x.shape[-1]
-    float32_on_cpu = x.device.type == "cpu" and x.dtype == torch.float32
-    if _ONEDNN and float32_on_cpu and many and not torch.is_grad_enabled():
-        onednn = _compiled_onednn if torch.compiler.is_compiling() else _onednn
-        return onednn(x, weight, bias, relu)
-    out = nn.functional.linear(x, weight, bias)
-    return torch.relu(out) if relu else out
+    # A fit needs gradients, which the fast product does not have.
+    if many and has_fast_product(x) and not torch.is_grad_enabled():
+        return matrix_product(x, weight, bias, relu)
+    product = nn.functional.linear(x, weight, bias)
+    return torch.relu(product) if relu else product
 
 
 def apply(layer: nn.Linear, x: Tensor, relu: bool = False) -> Tensor:
     """``layer(x)`` computed by :func:`dense`."""
     return dense(x, layer.weight, layer.bias, relu)
-
-
-def _onednn(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
-    return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "relu" if relu else "none", [], "")
-
-
-# Compiled graphs accept oneDNN's operator for constant weights only, so they call it through an
-# operator of our own.
-@torch.library.custom_op("ganlane::dense", mutates_args=())
-def _compiled_onednn(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
-    return _onednn(x, weight, bias, relu)
-
-
-@_compiled_onednn.register_fake
-def _shape(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
-    return x.new_empty((*x.shape[:-1], weight.shape[0]))
 
 
 def motion_features(displacement: Tensor, difference: Tensor) -> Tensor:

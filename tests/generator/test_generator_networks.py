@@ -7,6 +7,7 @@ from torch import nn
 
 from ganlane.generator import networks
 from ganlane.generator.closed_loop import push, recorded, start
+from ganlane.linear import ONEDNN
 
 
 @pytest.fixture
@@ -62,16 +63,16 @@ def test_gradients_reach_the_weights_of_many_rows():
     assert layer.weight.grad.abs().sum() > 0
 
 
-@pytest.mark.skipif(not networks._ONEDNN, reason="this torch was built without oneDNN")
-def test_many_rows_go_to_onednn(monkeypatch):
-    seen = []
-    monkeypatch.setattr(networks, "_onednn", lambda x, *rest: seen.append(len(x)))
+@pytest.mark.skipif(not ONEDNN, reason="this torch was built without oneDNN")
+def test_many_rows_without_gradients_go_to_onednn(monkeypatch):
+    rows = []
+    monkeypatch.setattr(networks, "matrix_product", lambda x, *rest: rows.append(len(x)))
     layer = nn.Linear(5, 7).requires_grad_(False)
     with torch.no_grad():
         networks.apply(layer, torch.randn(700, 5))
         networks.apply(layer, torch.randn(7, 5))
     networks.apply(layer, torch.randn(700, 5))
-    assert seen == [700]
+    assert rows == [700]
 
 
 def test_the_recurrence_is_torchs_own_lstm():

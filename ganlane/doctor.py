@@ -323,20 +323,20 @@ def recordings() -> Finding:
 
 
 def cache() -> Finding:
-    """The folder in which groups of windows are kept between fits."""
-    from ganlane.generator.checkpoint import CACHE_VARIABLE, cache_folder
+    """The folder in which built kernels are kept."""
+    from ganlane.native.library import cache_folder
 
+    if os.environ.get("GANLANE_CACHE") == "":
+        return Finding("cache", State.OK, "off (GANLANE_CACHE is empty)")
     folder = cache_folder()
-    if folder is None:
-        return Finding("cache", State.OK, f"off ({CACHE_VARIABLE} is empty)")
     if not _can_write(folder):
         return Finding(
             "cache",
             State.ABSENT,
             f"{folder} cannot be written to",
-            f"export {CACHE_VARIABLE}=FOLDER",
+            "export GANLANE_CACHE=FOLDER",
         )
-    files = list(folder.glob("*.npz"))
+    files = list(folder.glob("*.so"))
     return Finding("cache", State.OK, f"{folder} ({len(files)} files, {_megabytes(*files)})")
 
 

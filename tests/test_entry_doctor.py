@@ -140,7 +140,7 @@ def test_cache_and_run_folders(tmp_path, monkeypatch):
     monkeypatch.setenv("GANLANE_CACHE", "")
     assert doctor.cache().found == "off (GANLANE_CACHE is empty)"
     monkeypatch.setenv("GANLANE_CACHE", str(tmp_path / "cache"))
-    assert doctor.cache().found == f"{tmp_path / 'cache'} (0 files, 0.0 MB)"
+    assert doctor.cache().found == f"{tmp_path / 'cache' / 'native'} (0 files, 0.0 MB)"
     (tmp_path / "cache").write_text("in the way")
     assert doctor.cache().state is State.ABSENT
     assert doctor.outputs().state is State.OK

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import polars as pl
 
 from benchmarks.torture import damages, runs
@@ -26,9 +24,8 @@ from ganlane.data import (
     write_prepared,
     write_scene_csv,
 )
-from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
-from ganlane.generator.checkpoint import CACHE_VARIABLE, cached, load_generator
+from ganlane.generator.checkpoint import load_generator
 from ganlane.parameters.generator import NgsimParameters
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
 from ganlane.sim.scenarios import read_scene
@@ -80,8 +77,6 @@ def make_files(folder: Path) -> None:
     write_prepared(frame, folder / "recording.parquet")
     (folder / "ngsim.csv").write_text(_ngsim(frame))
     _highd(folder / "highd")
-    os.environ[CACHE_VARIABLE] = str(folder / "cache")
-    cached("groups", "key", lambda: {"labels": np.arange(500)})
     run = folder / "run"
     status = runs.train(
         [*runs.TINY, "traffic=idm", "init=none", "total_decisions=192", f"hydra.run.dir={run}"]
@@ -149,16 +144,6 @@ def _checkpoint(path: Path) -> Any:
     return content
 
 
-def _cache(path: Path) -> Any:
-    """What is damaged is computed again."""
-    os.environ[CACHE_VARIABLE] = str(path.parent)
-
-    def again() -> dict[str, np.ndarray]:
-        raise UserError("computed again")
-
-    return cached("groups", "key", again)
-
-
 def _reference(path: Path) -> Any:
     reference = Reference.load(path)
     return {**vars(reference), "counts": dict(reference.counts)}
@@ -202,7 +187,6 @@ READERS = {
         True,
         1,
     ),
-    "cached windows": Reader("cache/groups_key.npz", _cache, (*BYTES, damages.in_arrays), True),
     "histograms": Reader("reference.json", _reference, (*TEXT, damages.in_json), True),
     "scene CSV": Reader("scene.csv", read_scene, TEXT),
     "scene JSON": Reader("scene.json", read_scene, (*TEXT, damages.in_json, damages.in_json)),

@@ -1,6 +1,6 @@
-"""Forecasts of recorded windows by both presets, by IDM and by baselines without a network, and
-their scores.
+"""Forecasts of recorded windows, and their scores.
 
+Forecasters are both presets, IDM, and baselines without a network.
 Every forecast is positions [W, T, 2] in m relative to the present, for the windows of
 :func:`~ganlane.generator.windows.cut_windows` in the same order. Kinds of forecasts by a generator:
 ``mean`` (z = 0), ``single`` (one sample), ``best_of_20`` (by ADE). ADE is the mean error over the
@@ -94,8 +94,9 @@ def errors_of(forecasts: Forecasts, recorded: np.ndarray) -> Forecasts:
 
 
 def displacement_errors(errors: Forecasts, rows: np.ndarray | None = None) -> Row:
-    """ADE and FDE in m of every forecast over the chosen windows, and the ADE's change to the
-    baseline's in %.
+    """ADE and FDE in m of every forecast over the chosen windows.
+
+    The ADE's change to the baseline's is added, in %.
     """
     chosen = errors if rows is None else {name: values[rows] for name, values in errors.items()}
     ade = {name: float(values.mean()) for name, values in chosen.items()}
@@ -110,14 +111,14 @@ def displacement_errors(errors: Forecasts, rows: np.ndarray | None = None) -> Ro
 
 
 def parts_of(windows: Windows, least: int) -> dict[str, np.ndarray]:
-    """Masks [W] of the windows by lane (1 the leftmost) and by class, of parts with at least
-    ``least`` windows.
+    """Masks [W] of the windows by lane (1 the leftmost) and by class.
+
+    Parts with fewer than ``least`` windows are left out.
     """
-    lanes, truck = windows.lane_from_left, windows.length > TRUCK_M
-    parts = {f"lane {lane}": lanes == lane for lane in np.unique(lanes)} | {
-        "car": ~truck,
-        "truck": truck,
-    }
+    lanes = windows.lane_from_left
+    parts = {f"lane {lane}": lanes == lane for lane in np.unique(lanes)}
+    parts["car"] = windows.length <= TRUCK_M
+    parts["truck"] = windows.length > TRUCK_M
     return {name: rows for name, rows in parts.items() if rows.sum() >= least}
 
 
@@ -130,21 +131,19 @@ def direction_scores(
     """
     lateral = observed + recorded[:, -1, 1]
     moving = np.abs(lateral) > SIDEWAYS_M
-    right = {
-        name: ((observed + course[:, -1, 1]) * lateral > 0)[moving]
-        for name, course in forecasts.items()
-    }
-    shares = {name: float(hits.mean()) if len(hits) else None for name, hits in right.items()}
+    shares: dict[str, float | None] = {}
+    for name, course in forecasts.items():
+        right = ((observed + course[:, -1, 1]) * lateral > 0)[moving]
+        shares[name] = float(right.mean()) if len(right) else None
     return {"windows": int(moving.sum()), "share_right": shares}
 
 
 def side_classifier_share(windows: Windows, fold: np.ndarray) -> float | None:
-    """Share of lateral moves after the present whose side a dedicated classifier predicts; None
-    without moves.
+    """Share of lateral moves after the present whose side a dedicated classifier predicts.
 
-    Gradient boosting on the observed motion, the lane and the length, fitted to the other folds'
-    moving vehicles: a reference for :func:`direction_scores`, about as much as the history
-    contains.
+    None without moves. Gradient boosting on the observed motion, the lane and the length, fitted to
+    the other folds' moving vehicles: a reference for :func:`direction_scores`, about as much as the
+    history contains.
     """
     lateral, past = windows.future[:, -1, 1], windows.past
     moving = np.abs(lateral) > SIDEWAYS_M
@@ -155,22 +154,21 @@ def side_classifier_share(windows: Windows, fold: np.ndarray) -> float | None:
     features, left, fold = features[moving], lateral[moving] > 0, fold[moving]
     hits = []
     for number in np.unique(fold):
-        own = fold == number
-        if len(np.unique(left[~own])) == 2:
+        tested = fold == number
+        if len(np.unique(left[~tested])) == 2:
             model = HistGradientBoostingClassifier(max_iter=150, max_leaf_nodes=15, random_state=0)
-            hits.append(model.fit(features[~own], left[~own]).predict(features[own]) == left[own])
+            model.fit(features[~tested], left[~tested])
+            hits.append(model.predict(features[tested]) == left[tested])
     return float(np.concatenate(hits).mean()) if hits else None
 
 
 def rmse_by_second(errors: Forecasts) -> dict[str, dict[str, float]]:
     """Root mean square error in m after each whole second (10 steps), of every forecast."""
-    return {
-        name: {
-            f"{k} s": float(np.sqrt((each**2).mean()))
-            for k, each in enumerate(values.T[9::10], start=1)
-        }
-        for name, values in errors.items()
-    }
+    rmse: dict[str, dict[str, float]] = {}
+    for name, values in errors.items():
+        seconds = enumerate(values.T[9::10], start=1)
+        rmse[name] = {f"{k} s": float(np.sqrt((error**2).mean())) for k, error in seconds}
+    return rmse
 
 
 def open_loop_scores(
@@ -202,24 +200,26 @@ def open_loop_scores(
 
 
 def long_rollout_scores(windows: Windows, forecasts: Forecasts) -> Row:
-    """RMSE after each second, number of windows and tracks, and the ratio to constant velocity's at
-    the end.
+    """RMSE after each second, and its ratio to constant velocity's at the end.
+
+    The numbers of windows and tracks are added.
     """
     rmse = rmse_by_second(errors_of(forecasts, windows.future))
     last = f"{windows.future.shape[1] // 10} s"
-    ratio = {name: values[last] / rmse[BASELINE][last] for name, values in rmse.items()}
-    tracks = len(np.unique(np.stack([windows.scene, windows.vehicle]), axis=1).T)
     return {
         "windows": len(windows),
-        "tracks": tracks,
+        "tracks": len(set(zip(windows.scene, windows.vehicle))),
         "rmse_m": rmse,
-        "ratio_to_constant_velocity": ratio,
+        "ratio_to_constant_velocity": {
+            name: values[last] / rmse[BASELINE][last] for name, values in rmse.items()
+        },
     }
 
 
 def by_kind(samples: np.ndarray, recorded: np.ndarray) -> Forecasts:
-    """``mean`` (z = 0), ``single`` and ``best_of_20`` (by ADE) of samples [1 + K, W, T, 2], the
-    first with z = 0.
+    """The kinds of forecasts in samples [1 + K, W, T, 2], of which the first has z = 0.
+
+    ``mean``, ``single`` and, of 20 samples or more, ``best_of_20`` (by ADE).
     """
     kinds = dict(zip(("mean", "single"), samples))
     if len(samples) > SAMPLES:
@@ -254,11 +254,10 @@ def driven_windows(
     stride: int,
     samples: int = 1,
 ) -> np.ndarray:
-    """Forecasts [K, W, H, 2] of all windows of 9 + ``horizon`` frames: the vehicles recorded
-    throughout a segment.
+    """Forecasts [K, W, H, 2] of all windows of 9 + ``horizon`` frames.
 
-    ``driver`` drives all vehicles of a batch of segments jointly: positions [K, B, H, V, 2] of K =
-    ``samples``.
+    These are of the vehicles recorded throughout a segment, whose vehicles ``driver`` drives all
+    jointly: positions [K, B, H, V, 2] of K = ``samples``.
     """
     forecasts = []
     for scene in scenes:
@@ -278,8 +277,9 @@ def calibrated_forecasts(
     config: CalibratedConfig,
     samples: int = SAMPLES,
 ) -> Forecasts:
-    """The calibrated preset, rolled out through whole scenes with the target lanes and drivers of
-    the present.
+    """The calibrated preset, rolled out through whole scenes.
+
+    Target lanes and drivers are those of the present.
     """
     random = torch.Generator().manual_seed(0)
 
@@ -323,11 +323,10 @@ def idm_forecasts(scenes: list[SceneTracks], horizon: int, stride: int) -> Forec
 
 
 def baseline_forecasts(windows: Windows, others: list[SceneTracks], stride: int) -> Forecasts:
-    """Forecasts without a network; the ridge regression is fitted to windows of the scenes
-    ``others``.
+    """Forecasts without a network.
 
     ``mean_velocity`` repeats the mean observed displacement, which recorded noise disturbs less
-    than the last one.
+    than the last one. The ridge regression is fitted to windows of the scenes ``others``.
     """
     past, steps = windows.past, windows.future.shape[1]
     return {
@@ -339,9 +338,7 @@ def baseline_forecasts(windows: Windows, others: list[SceneTracks], stride: int)
 
 
 def repeated(displacement: np.ndarray, steps: int) -> np.ndarray:
-    """Positions [W, T, 2] in m relative to the present when ``displacement`` [W, 2] per 0.1 s is
-    repeated.
-    """
+    """Positions [W, T, 2] in m after the present when ``displacement`` [W, 2] per 0.1 s repeats."""
     return displacement[:, None] * np.arange(1.0, steps + 1.0)[:, None]
 
 
@@ -364,18 +361,18 @@ def ridge_forecast(fitted: Windows, past: np.ndarray) -> np.ndarray:
     def features(past: np.ndarray) -> np.ndarray:
         return np.concatenate([past[:, -1:], np.diff(past, axis=1)], axis=1).reshape(len(past), -1)
 
-    known, future = (
-        np.concatenate([each, each * (1.0, -1.0)]) for each in (fitted.past, fitted.future)
-    )
+    mirrored = (1.0, -1.0)
+    observed = np.concatenate([fitted.past, fitted.past * mirrored])
+    future = np.concatenate([fitted.future, fitted.future * mirrored])
     steps = future.shape[1]
+    missing = future - repeated(observed[:, -1], steps)
     model = make_pipeline(StandardScaler(), RidgeCV(alphas=_PENALTIES))
-    model.fit(features(known), (future - repeated(known[:, -1], steps)).reshape(len(known), -1))
+    model.fit(features(observed), missing.reshape(len(missing), -1))
     return repeated(past[:, -1], steps) + model.predict(features(past)).reshape(len(past), steps, 2)
 
 
 def energy_score(one: Tensor, other: Tensor, recorded: Tensor) -> Tensor:
-    """Energy score of two samples, in the unit of the positions: mean error minus half their
-    distance.
+    """Energy score [...] of two samples: mean error minus half their distance, in m.
 
     All are positions [..., 2]. A proper score: least in expectation when the samples are drawn from
     the distribution of the recordings (Gneiting and Raftery 2007).
@@ -394,12 +391,9 @@ def rollout_errors(
     used. Unlike forecasts of windows, these count a vehicle for as long as it is recorded.
 
     Returns:
-        ``{"all"
-        or scene: {"ade_m/KIND" over 0.8 s, "fde_m/KIND" at 0.8 s, "end_m/KIND" at the last step,
-        "relative_mean", "relative_energy", "end_s",
-        "windows"}}``
-        with the kinds ``mean``, ``single``, ``constant_velocity`` and ``energy`` (the energy score
-        of two samples).
+        ``{"all" or scene: {"ade_m/KIND" over 0.8 s, "fde_m/KIND" at 0.8 s, "end_m/KIND" at the last
+        step, "relative_mean", "relative_energy", "end_s", "windows"}}`` with the kinds ``mean``,
+        ``single``, ``constant_velocity`` and ``energy`` (the energy score of two samples).
     """
     random, horizon = torch.Generator().manual_seed(0), config.held_out_horizon
     parts: dict[str, list[tuple[dict[str, Tensor], Tensor]]] = {"all": []}

@@ -201,7 +201,6 @@ def test_a_rollout_is_the_same_with_more_padding(segments, generator):
         present=pad(segments.present, (0, 4)),
         target_lane=pad(segments.target_lane, (0, 4)),
         length=pad(segments.length, (0, 4), value=1.0),
-        width=pad(segments.width, (0, 4), value=1.0),
     )
     torch.testing.assert_close(
         typical_rollout(generator, wide)[:, :, :7], typical_rollout(generator, segments)

@@ -98,7 +98,7 @@ def test_what_was_fitted_stays_where_a_later_step_fails(recordings, capsys, monk
 
 def test_too_many_folds_are_refused_before_ablations_are_fitted(recordings, capsys, monkeypatch):
     fitted = []
-    monkeypatch.setattr(ganlane.generator, "ablate", lambda *given: fitted.append(given))
+    monkeypatch.setattr(ganlane.generator, "ablate", lambda *arguments: fitted.append(arguments))
     assert main([recordings, "ablations=true", "folds=9", *FEW]) == 2
     assert "folds=9" in capsys.readouterr().err
     assert not fitted

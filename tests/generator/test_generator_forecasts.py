@@ -18,16 +18,16 @@ def windows_of(positions: np.ndarray, lanes=0, lengths=4) -> Windows:
     """
     if positions.shape[1] == 8:
         positions = np.concatenate([np.zeros((len(positions), 9, 2)), positions], axis=1)
-    zero, scene = np.zeros(len(positions), dtype=np.int64), np.arange(len(positions)) % 2
+    count = len(positions)
+    zero = np.zeros(count, dtype=np.int64)
     return Windows(
-        positions,
-        scene,
-        zero,
-        zero,
-        zero,
-        zero + lanes,
-        zero + np.array(lengths, float),
-        ("a", "b"),
+        positions=positions,
+        scene=np.array(["a", "b"])[np.arange(count) % 2],
+        start=zero,
+        vehicle=zero,
+        lane=zero,
+        lane_from_left=zero + lanes,
+        length=zero + np.array(lengths, float),
     )
 
 

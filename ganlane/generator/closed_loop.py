@@ -275,13 +275,13 @@ def anchored_step(
     """
     p = parameters
     displacement = displacement_of(vehicles)
-    velocity = displacement / PHYSICS_STEP_S
     history, difference = push(generator, memory.history, displacement)
 
     # The anchor: IDM along the road; a spring and a damper to the target lane's centre across it.
     scene = perceive(vehicles, road)
     anchor_x = following_acceleration(scene, p.idm, memory.headway)
     offset = road.centre_of(vehicles.target_lane, vehicles.y.dtype) - vehicles.y
+    velocity = displacement / PHYSICS_STEP_S
     anchor_y = p.lane_stiffness * offset - p.lane_damping * velocity[..., 1]
 
     # The network's residual, in m/s2. The decoder's first output is enough: each step decides anew.

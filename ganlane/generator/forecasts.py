@@ -60,8 +60,13 @@ _SMALLEST_DISTANCE_M = 1e-4
 #: Name of a forecast to positions [W, T, 2] in m relative to the present, or to errors [W, T] in m.
 Forecasts = dict[str, np.ndarray]
 Row = dict[str, Any]
-#: Groups, segments times samples, and segments with three samples in one pass; bounds the memory.
-_GROUPS, _ROLLOUTS, _SEGMENTS = 128, 160, 16
+# What goes through a network in one pass; bounds the memory.
+#: Groups of windows.
+_GROUPS = 128
+#: Segments times samples.
+_ROLLOUTS = 160
+#: Segments with three samples each.
+_SEGMENTS = 16
 #: Penalties from which the ridge regression chooses by leave-one-out validation.
 _PENALTIES = tuple(10.0**power for power in range(-2, 6))
 
@@ -74,15 +79,15 @@ def distance(one: Tensor, other: Tensor) -> Tensor:
 
 def scene_metrics(windows: Windows, forecasts: Forecasts) -> Metrics:
     """``{"all" or scene: {"ade_m/KIND", "fde_m/KIND", ..., "windows"}}`` of the forecasts, in m."""
-    errors, metrics = errors_of(forecasts, windows.future), {}
-    for name, rows in {"all": np.ones(len(windows), dtype=bool), **windows.by_scene}.items():
+    errors = errors_of(forecasts, windows.future)
+    everywhere = np.ones(len(windows), dtype=bool)
+    metrics: Metrics = {}
+    for name, rows in {"all": everywhere, **windows.by_scene}.items():
         row = displacement_errors(errors, rows)
-        metrics[name] = {
-            f"{error}/{kind}": row[error][kind]
-            for error in ("ade_m", "fde_m")
-            for kind in forecasts
-        }
-        metrics[name]["windows"] = float(row["windows"])
+        metrics[name] = {"windows": float(row["windows"])}
+        for error in ("ade_m", "fde_m"):
+            for kind in forecasts:
+                metrics[name][f"{error}/{kind}"] = row[error][kind]
     return metrics
 
 
@@ -98,12 +103,13 @@ def displacement_errors(errors: Forecasts, rows: np.ndarray | None = None) -> Ro
 
     The ADE's change to the baseline's is added, in %.
     """
-    chosen = errors if rows is None else {name: values[rows] for name, values in errors.items()}
-    ade = {name: float(values.mean()) for name, values in chosen.items()}
-    fde = {name: float(values[:, -1].mean()) for name, values in chosen.items()}
+    if rows is not None:
+        errors = {name: values[rows] for name, values in errors.items()}
+    ade = {name: float(values.mean()) for name, values in errors.items()}
+    fde = {name: float(values[:, -1].mean()) for name, values in errors.items()}
     change = {name: 100.0 * (value / ade[BASELINE] - 1.0) for name, value in ade.items()}
     return {
-        "windows": len(chosen[BASELINE]),
+        "windows": len(errors[BASELINE]),
         "ade_m": ade,
         "fde_m": fde,
         "ade_change_percent": change,
@@ -145,13 +151,18 @@ def side_classifier_share(windows: Windows, fold: np.ndarray) -> float | None:
     the other folds' moving vehicles: a reference for :func:`direction_scores`, about as much as the
     history contains.
     """
-    lateral, past = windows.future[:, -1, 1], windows.past
+    lateral = windows.future[:, -1, 1]
     moving = np.abs(lateral) > SIDEWAYS_M
+
+    # The observed displacements, their changes along the road, how far the vehicle has moved
+    # sideways since each of them; then the lane from both sides, and the length.
+    past = windows.past
     moved = past[..., 1][:, ::-1].cumsum(axis=1)
     others = np.stack([windows.lane, windows.lane_from_left, windows.length], axis=1)
     differences = np.diff(past, axis=1)[..., 0]
     features = np.concatenate([past.reshape(len(past), -1), differences, moved, others], axis=1)
     features, left, fold = features[moving], lateral[moving] > 0, fold[moving]
+
     hits = []
     for number in np.unique(fold):
         tested = fold == number
@@ -179,6 +190,7 @@ def open_loop_scores(
     Parts (lanes, classes) of fewer than ``least_part`` windows are left out.
     """
     errors = errors_of(forecasts, windows.future)
+    folds = {str(number): fold == number for number in range(int(fold.max()) + 1)}
 
     def by(masks: dict[str, np.ndarray]) -> dict[str, Row]:
         return {
@@ -187,15 +199,14 @@ def open_loop_scores(
 
     direction = direction_scores(forecasts, windows.future)
     direction["share_right"]["side classifier"] = side_classifier_share(windows, fold)
+    observed = windows.past[..., 1].sum(1)
     return {
         **displacement_errors(errors),
-        "folds": by({str(number): fold == number for number in range(int(fold.max()) + 1)}),
+        "folds": by(folds),
         "scenes": by(windows.by_scene),
         "parts": by(parts_of(windows, least_part)),
         "direction": direction,
-        "direction_whole_window": direction_scores(
-            forecasts, windows.future, windows.past[..., 1].sum(1)
-        ),
+        "direction_whole_window": direction_scores(forecasts, windows.future, observed),
     }
 
 
@@ -238,12 +249,14 @@ def paper_forecasts(
     for rows in torch.arange(len(groups)).split(_GROUPS):
         chunk = groups.select(rows)
         past = chunk.displacements[..., : generator.sizes.observed, :]
+        observation = generator.observe(past, chunk.position, chunk.mask)
         noise = torch.randn(1 + samples, *chunk.mask.shape, generator.sizes.noise, generator=random)
+        # The first sample is the mean prediction.
         noise[0] = 0.0
-        predicted = generator(generator.observe(past, chunk.position, chunk.mask), noise).cumsum(
-            dim=-2
-        )
-        positions[:, chunk.window[chunk.mask].numpy()] = predicted[:, chunk.mask].double().numpy()
+        predicted = generator(observation, noise).cumsum(dim=-2)
+        # From groups back to the order of the windows.
+        row = chunk.window[chunk.mask].numpy()
+        positions[:, row] = predicted[:, chunk.mask].double().numpy()
     return by_kind(positions, windows.future)
 
 
@@ -259,10 +272,13 @@ def driven_windows(
     These are of the vehicles recorded throughout a segment, whose vehicles ``driver`` drives all
     jointly: positions [K, B, H, V, 2] of K = ``samples``.
     """
+    size = max(1, _ROLLOUTS // samples)
     forecasts = []
     for scene in scenes:
-        for segments in segment_batches(scene, horizon, stride, max(1, _ROLLOUTS // samples)):
-            positions = driver(segments.without_intentions()) - segments.positions[:, PRESENT, None]
+        for segments in segment_batches(scene, horizon, stride, size):
+            present = segments.positions[:, PRESENT, None]
+            positions = driver(segments.without_intentions()) - present
+            # A window is a vehicle that is recorded in all frames.
             complete = segments.present.all(dim=1)
             forecasts.append(positions.transpose(2, 3)[:, complete].double().numpy())
     return np.concatenate(forecasts, axis=1)
@@ -287,7 +303,8 @@ def calibrated_forecasts(
         shape = (1 + horizon, 1 + samples, *segments.length.shape, generator.sizes.noise)
         noise = torch.randn(shape, generator=random)
         noise[:, 0] = 0.0
-        return rollout(generator, segments, driver_params(segments, config.traits), noise, config)
+        drivers = driver_params(segments, config.traits)
+        return rollout(generator, segments, drivers, noise, config)
 
     forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
     recorded = driven_windows(lambda segments: segments.future[None], scenes, horizon, stride)[0]
@@ -306,19 +323,17 @@ def idm_forecasts(scenes: list[SceneTracks], horizon: int, stride: int) -> Forec
         headway, desired = driver_params(segments, traits=own_headway)
 
         def move(vehicles: Vehicles, step: int) -> Vehicles:
-            acceleration = following_acceleration(
-                perceive(vehicles, segments.road), TABLE_V, headway
-            )
-            velocity = (
-                displacement_of(vehicles)[..., 0] / PHYSICS_STEP_S + acceleration * PHYSICS_STEP_S
-            )
+            scene = perceive(vehicles, segments.road)
+            acceleration = following_acceleration(scene, TABLE_V, headway)
+            speed = displacement_of(vehicles)[..., 0] / PHYSICS_STEP_S
+            velocity = speed + acceleration * PHYSICS_STEP_S
             return moved_by(vehicles, velocity, torch.zeros_like(velocity))
 
         return driven_positions(segments, desired, move)[None]
 
     return {
-        name: driven_windows(partial(driver, own_headway=own), scenes, horizon, stride)[0]
-        for name, own in (("idm", False), ("idm_own_headway", True))
+        name: driven_windows(partial(driver, own_headway=balanced), scenes, horizon, stride)[0]
+        for name, balanced in (("idm", False), ("idm_own_headway", True))
     }
 
 
@@ -328,12 +343,14 @@ def baseline_forecasts(windows: Windows, others: list[SceneTracks], stride: int)
     ``mean_velocity`` repeats the mean observed displacement, which recorded noise disturbs less
     than the last one. The ridge regression is fitted to windows of the scenes ``others``.
     """
-    past, steps = windows.past, windows.future.shape[1]
+    past = windows.past
+    steps = windows.future.shape[1]
+    fitted = cut_windows(others, stride, OBSERVED_POSITIONS + steps)
     return {
         BASELINE: repeated(past[:, -1], steps),
         "mean_velocity": repeated(past.mean(axis=1), steps),
         "constant_acceleration": constant_acceleration(past, steps),
-        "ridge": ridge_forecast(cut_windows(others, stride, OBSERVED_POSITIONS + steps), past),
+        "ridge": ridge_forecast(fitted, past),
     }
 
 
@@ -395,16 +412,18 @@ def rollout_errors(
         step, "relative_mean", "relative_energy", "end_s", "windows"}}`` with the kinds ``mean``,
         ``single``, ``constant_velocity`` and ``energy`` (the energy score of two samples).
     """
-    random, horizon = torch.Generator().manual_seed(0), config.held_out_horizon
+    random = torch.Generator().manual_seed(0)
+    horizon = config.held_out_horizon
     parts: dict[str, list[tuple[dict[str, Tensor], Tensor]]] = {"all": []}
     for scene in scenes:
         for batch in segment_batches(scene, horizon, config.held_out_stride, _SEGMENTS):
             segments = batch.without_intentions()
-            fresh = torch.randn(
-                1 + horizon, 2, *segments.length.shape, generator.sizes.noise, generator=random
-            )
+            future = segments.future
+            drivers = driver_params(segments, config.traits)
+            # Three rollouts at once: the mean prediction, and two samples.
+            shape = (1 + horizon, 2, *segments.length.shape, generator.sizes.noise)
+            fresh = torch.randn(shape, generator=random)
             noise = torch.cat([torch.zeros_like(fresh[:, :1]), fresh], dim=1)
-            drivers, future = driver_params(segments, config.traits), segments.future
             mean, one, other = rollout(generator, segments, drivers, noise, config)
             errors = {
                 "mean": distance(mean, future),
@@ -424,20 +443,20 @@ def _step_means(parts: list[tuple[dict[str, Tensor], Tensor]], horizon: int) -> 
         for kind in parts[0][0]
     }
     short = min(PREDICTED_STEPS, horizon)
-    metrics = {
-        "end_s": 0.1 * horizon,
-        "windows": max(1.0, float(sum(scored[:, 0].sum() for _, scored in parts))),
-    }
+    windows = float(sum(scored[:, 0].sum() for _, scored in parts))
+    metrics = {"end_s": 0.1 * horizon, "windows": max(1.0, windows)}
     for kind, errors in means.items():
         metrics[f"ade_m/{kind}"] = float(errors[:short].mean())
         metrics[f"fde_m/{kind}"] = float(errors[short - 1])
         metrics[f"end_m/{kind}"] = float(errors[-1])
     for kind in ("mean", "energy"):
-        metrics[f"relative_{kind}"] = float((means[kind] / means[BASELINE].clamp_min(1e-6)).mean())
+        ratio = means[kind] / means[BASELINE].clamp_min(1e-6)
+        metrics[f"relative_{kind}"] = float(ratio.mean())
     return metrics
 
 
 def mean_by_step(parts: list[tuple[Tensor, Tensor]]) -> Tensor:
     """Mean [H] of errors [B, H, V] where their mask [B, H, V] is true, over all parts."""
     count = torch.stack([scored.sum((0, 2)) for _, scored in parts]).sum(0).clamp_min(1)
-    return torch.stack([(errors * scored).sum((0, 2)) for errors, scored in parts]).sum(0) / count
+    total = torch.stack([(errors * scored).sum((0, 2)) for errors, scored in parts]).sum(0)
+    return total / count

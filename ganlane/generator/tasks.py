@@ -127,18 +127,22 @@ class PaperTask(_Task):
     def update(self, number: int) -> dict[str, float]:
         """One step of the generator, and of the discriminator if the adversarial term is on."""
         config = self.config
-        groups = self.groups.select(
-            torch.randint(len(self.groups), (config.batch,), generator=self.random)
-        )
+        rows = torch.randint(len(self.groups), (config.batch,), generator=self.random)
+        groups = self.groups.select(rows)
         if config.mirror:
             groups = groups.mirrored(torch.rand(len(groups), generator=self.random) < 0.5)
         recorded = groups.displacements[groups.mask]
         generated = self._samples(groups, config.history_noise)
+
+        # The discriminator learns from one sample, which carries no gradient to the generator.
         losses = {}
         if config.weights.adversarial > 0:
-            real, fake = self.discriminator(recorded), self.discriminator(generated[0].detach())
+            real = self.discriminator(recorded)
+            fake = self.discriminator(generated[0].detach())
             loss = 0.5 * (cross_entropy(real, 1.0) + cross_entropy(fake, 0.0))
             losses["discriminator"] = self.descend("discriminator", loss)
+
+        # The generator: what it predicted, in all samples and for z = 0 (the last).
         observed = config.sizes.observed
         errors = distances(generated[..., observed:, :], recorded[..., observed:, :]).mean(-1)
         terms = {
@@ -185,19 +189,21 @@ class PaperTask(_Task):
         The samples come first, the mean prediction last. Only the pooling needs the padded groups;
         the decoder runs without padding.
         """
-        sizes, mask = self.config.sizes, groups.mask
+        sizes = self.config.sizes
+        mask = groups.mask
         past = observed = groups.displacements[..., : sizes.observed, :]
         if history_noise > 0:
             scale = past.new_tensor(DIFFERENCE_SCALE_M)
             observed = past + history_noise * scale * torch.randn(past.shape, generator=self.random)
         observation = self.generator.observe(observed, groups.position, mask)
         context = self.generator.summarise(observation)[mask]
+
+        # [B, G, ...] -> [n, ...]: from here on without padding.
         vehicles = observation._replace(
             displacement=observation.displacement[mask], difference=observation.difference[mask]
         )
-        noise = torch.randn(
-            self.config.samples + 1, len(context), sizes.noise, generator=self.random
-        )
+        shape = (self.config.samples + 1, len(context), sizes.noise)
+        noise = torch.randn(shape, generator=self.random)
         noise[-1] = 0.0
         outputs = self.generator.decode(context, noise, vehicles, sizes.predicted)
         future = displacements_of(outputs, vehicles.displacement)
@@ -211,16 +217,17 @@ class CalibratedTask(_Task):
         self, fitted: list[SceneTracks], validation: list[SceneTracks], config: CalibratedConfig
     ):
         super().__init__(config)
-        self.config, self.validation = config, validation
+        self.config = config
+        self.validation = validation
         longest = max(config.horizons)
         cuts = [(scene, row) for scene in fitted for row in segment_starts(scene, longest)]
         #: All possible segments, sorted by their vehicles, so that neighbours need little padding.
         self.cuts = sorted(cuts, key=lambda cut: int(cut[0].present[cut[1]].sum()))
+        # Some 64 of them, evenly spread, measure constant velocity well enough.
         segments = cut_segments(self.cuts[:: max(1, len(self.cuts) // 64)], longest)
         #: Mean error [H] in m of constant velocity on the fitted scenes.
-        self.scale = mean_by_step(
-            [(distance(segments.constant_velocity, segments.future), segments.scored)]
-        )
+        errors = distance(segments.constant_velocity, segments.future)
+        self.scale = mean_by_step([(errors, segments.scored)])
 
     def update(self, number: int) -> dict[str, float]:
         """One rollout of a batch of segments and one step.
@@ -237,9 +244,12 @@ class CalibratedTask(_Task):
         noise = torch.randn(shape, generator=self.random) if sampled else torch.zeros(shape)
         positions = rollout(self.generator, segments, drivers, noise, config)
         if sampled:
-            name, losses = "energy", energy_score(positions[0], positions[1], segments.future)
+            name = "energy"
+            losses = energy_score(positions[0], positions[1], segments.future)
         else:
-            name, losses = "mean", distance(positions[0], segments.future)
+            name = "mean"
+            losses = distance(positions[0], segments.future)
+        # Late steps err most, so each is measured by what constant velocity errs there.
         loss = masked_mean(losses / self.scale[: losses.shape[1], None], segments.scored)
         return {name: self.descend("generator", loss)}
 
@@ -262,10 +272,13 @@ class CalibratedTask(_Task):
         """
         shares = torch.tensor(self.config.shares, dtype=torch.float32)
         horizon = self.config.horizons[int(torch.multinomial(shares, 1, generator=self.random))]
+
+        # Random ones among neighbours in the order of their size.
         span = min(len(self.cuts), 8 * self.config.batch)
         begin = int(torch.randint(len(self.cuts) - span + 1, (), generator=self.random))
         rows = torch.randperm(span, generator=self.random)[: self.config.batch] + begin
         segments = cut_segments([self.cuts[row] for row in rows.tolist()], horizon)
+
         flip = self.config.mirror and float(torch.rand((), generator=self.random)) < 0.5
         return segments.mirrored() if flip else segments
 
@@ -301,17 +314,23 @@ class FitLoop:
     def __init__(
         self, task: PaperTask | CalibratedTask, path: Path | None = None, name: str = "fit"
     ):
-        self.task, self.config = task, task.config.loop
-        self.path, self.name = path, name
+        self.task = task
+        self.config = task.config.loop
+        self.path = path
+        self.name = name
+        #: Updates so far, evaluations since the best one, updates until the best one.
         self.done, self.waited, self.best_update = 0, 0, 0
-        self.best, self.seconds = math.inf, 0.0
+        self.best = math.inf
+        self.seconds = 0.0
         self.best_weights: dict[str, Tensor] = {}
         if path is not None and path.exists():
             self._resume(path)
 
     def run(self, on_progress: OnProgress | None = None) -> None:
         """Fit, then put the best weights into the task's networks."""
-        begun, earlier, score = time.monotonic(), self.seconds, None
+        begun = time.monotonic()
+        earlier = self.seconds
+        score = None
         while self.done < self.config.updates and self.waited < self.config.patience:
             for optimiser in self.task.optimisers.values():
                 optimiser.param_groups[0]["lr"] = learning_rate(self.config, self.done)
@@ -324,11 +343,16 @@ class FitLoop:
             if due or late or self.done == self.config.updates:
                 score = self._evaluate()
             if on_progress is not None:
-                on_progress(
-                    Progress(
-                        self.name, self.done, self.config.updates, losses, score, self.best, seconds
-                    )
+                progress = Progress(
+                    name=self.name,
+                    update=self.done,
+                    updates=self.config.updates,
+                    losses=losses,
+                    score=score,
+                    best=self.best,
+                    seconds=seconds,
                 )
+                on_progress(progress)
             if late:
                 break
         if self.best_weights:
@@ -373,6 +397,7 @@ class FitLoop:
             raise UserError(
                 f"{path}: not the state of a fit; give the file that a fit keeps, or remove it."
             ) from error
+        # A state that was written whole, but for other settings.
         try:
             self.task.load_state_dict(state["weights"])
             for name, optimiser in self.task.optimisers.items():

@@ -105,6 +105,7 @@ def scene_tracks(frame: pl.DataFrame) -> list[SceneTracks]:
     for name, lane_width_m in sorted(scene_lane_widths(frame).items()):
         rows = frame.filter(pl.col("scene") == name)
         vehicles, column = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)
+        # A scene's first frame is row 0; a frame that nobody is in is a row too.
         row = rows["frame"].to_numpy()
         row = row - row.min()
         shape = (int(row.max()) + 1, len(vehicles))
@@ -151,7 +152,8 @@ class Segments:
 
         The model drives those that are present in all of the first 9 frames.
         """
-        observed, after = self.present[:, :OBSERVED_POSITIONS], self.present[:, OBSERVED_POSITIONS:]
+        observed = self.present[:, :OBSERVED_POSITIONS]
+        after = self.present[:, OBSERVED_POSITIONS:]
         return observed.all(dim=1, keepdim=True) & after
 
     @property
@@ -162,7 +164,8 @@ class Segments:
     @property
     def constant_velocity(self) -> Tensor:
         """Positions [B, H, V, 2] when the last observed displacement is repeated."""
-        now, before = self.positions[:, PRESENT, None], self.positions[:, PRESENT - 1, None]
+        now = self.positions[:, PRESENT, None]
+        before = self.positions[:, PRESENT - 1, None]
         steps = torch.arange(1, self.positions.shape[1] - PRESENT, dtype=now.dtype)
         return now + (now - before) * steps[:, None, None]
 
@@ -177,7 +180,8 @@ class Segments:
 
     def mirrored(self) -> Segments:
         """The segments with left and right swapped."""
-        positions, last = self.positions.clone(), self.lanes - 1
+        positions = self.positions.clone()
+        last = self.lanes - 1
         positions[..., 1] = (last * self.lane_width)[..., None] - positions[..., 1]
         return replace(self, positions=positions, target_lane=last[..., None] - self.target_lane)
 
@@ -187,7 +191,8 @@ class Segments:
         So no information of the future is used.
         """
         y = self.positions[:, PRESENT : PRESENT + 1, :, 1]
-        lane = Road(self.lanes[..., None], self.lane_width[..., None]).lane_of(y).long()
+        road = Road(self.lanes[..., None], self.lane_width[..., None])
+        lane = road.lane_of(y).long()
         return replace(self, target_lane=lane.expand_as(self.target_lane).contiguous())
 
 
@@ -210,6 +215,7 @@ def cut_segments(cuts: list[tuple[SceneTracks, int]], horizon: int) -> Segments:
     They end ``horizon`` steps after the present.
     """
     frames = OBSERVED_POSITIONS + horizon
+    # Who is recorded in any frame of a segment is in it.
     members = [np.flatnonzero(scene.present[row : row + frames].any(0)) for scene, row in cuts]
     batch, most = len(cuts), max(map(len, members))
     segments = Segments(
@@ -222,7 +228,9 @@ def cut_segments(cuts: list[tuple[SceneTracks, int]], horizon: int) -> Segments:
     )
     for number, ((scene, row), who) in enumerate(zip(cuts, members)):
         at = slice(row, row + frames), who
-        positions, count = scene.endless_positions[at], len(who)
+        positions = scene.endless_positions[at]
+        count = len(who)
+        # Far down the road, float32 loses digits; the lateral zero is the road's.
         middle = np.array([positions[PRESENT, :, 0].mean(), 0.0])
         segments.positions[number, :, :count] = torch.from_numpy(positions - middle)
         segments.present[number, :, :count] = torch.from_numpy(scene.present[at])
@@ -344,7 +352,8 @@ class Groups:
         return len(self.mask)
 
     def select(self, rows: Tensor) -> Groups:
-        """The groups of the given rows, without padding that none of them needs."""
+        """The groups of the given rows."""
+        # Vehicles come first, so the columns that only hold padding are the last ones.
         width = int(self.mask[rows].sum(1).max())
         return Groups(*(value[rows, :width] for value in vars(self).values()))
 
@@ -353,7 +362,9 @@ class Groups:
         sign = torch.ones(len(self), 1, 2)
         sign[..., 1] = torch.where(flip, -1.0, 1.0)[:, None]
         return replace(
-            self, displacements=self.displacements * sign[:, :, None], position=self.position * sign
+            self,
+            displacements=self.displacements * sign[:, :, None],
+            position=self.position * sign,
         )
 
 
@@ -378,6 +389,7 @@ def group_windows(windows: Windows, size: int = 9, seed: int = 0) -> Groups:
     other_scene = windows.scene[1:] != windows.scene[:-1]
     other_start = np.diff(windows.start) != 0
     begins = np.flatnonzero(other_scene | other_start) + 1
+
     groups = []
     for rows in np.split(np.arange(len(windows)), begins):
         labels = kmeans_labels(now[rows], size, seed)
@@ -389,7 +401,8 @@ def group_windows(windows: Windows, size: int = 9, seed: int = 0) -> Groups:
     place = np.where(mask[..., None], now[window], 0.0)
     mean = place.sum(axis=1, keepdims=True) / mask.sum(1).numpy()[:, None, None]
     position = np.where(mask[..., None], place - mean, 0.0)
-    displacements = np.where(mask[..., None, None], np.diff(windows.positions, axis=1)[window], 0.0)
+    moves = np.diff(windows.positions, axis=1)
+    displacements = np.where(mask[..., None, None], moves[window], 0.0)
     return Groups(
         displacements=torch.from_numpy(displacements).float(),
         position=torch.from_numpy(position).float(),

@@ -53,7 +53,8 @@ VALIDATION_SHARE = 1 / 12
 #: Frames between the starts of two scored windows, the same for both presets.
 STRIDE = 3
 #: Steps of the long rollouts (5 s), and frames between their starts.
-LONG_STEPS, LONG_STRIDE = 50, 5
+LONG_STEPS = 50
+LONG_STRIDE = 5
 
 
 class Split(NamedTuple):
@@ -108,6 +109,7 @@ def split_for_fit(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> Split
         raise UserError(
             f"data.held_out={unknown}: not among the recorded scenes {names}; choose from these."
         )
+
     others = [scene for scene in scenes if scene.name not in held_out]
     reported = [scene for scene in scenes if scene.name in held_out]
     if not others or not reported:
@@ -115,6 +117,7 @@ def split_for_fit(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> Split
             f"data.held_out={list(held_out)}: of the scenes {names} at least one must be held out "
             "and one fitted to; name some in data.held_out."
         )
+
     chosen = _validation_names(others)
     fitted = [scene for scene in others if scene.name not in chosen]
     validation = [scene for scene in others if scene.name in chosen]
@@ -127,6 +130,7 @@ def _validation_names(scenes: list[SceneTracks]) -> set[str]:
     wanted = VALIDATION_SHARE * sum(sizes.values())
     held = 0
     names = set[str]()
+    # The largest is left for the fit, however little the others hold.
     for name in sorted(sizes, key=lambda name: (sizes[name], name))[:-1]:
         if held >= wanted:
             break
@@ -203,12 +207,18 @@ def _fit_result(
     driven: pl.DataFrame,
 ) -> FitResult:
     """The result of a finished ``loop``; its driving statistics are those of ``driven``."""
-    task, tracks = loop.task, frame.select(TRACK).n_unique()
+    task = loop.task
+    data = {
+        "file": Path(source).name,
+        "rows": frame.height,
+        "tracks": frame.select(TRACK).n_unique(),
+        **split.names,
+    }
     return FitResult(
         config=task.config,
         module=task.generator.eval().requires_grad_(False),
         metrics=metrics,
-        data={"file": Path(source).name, "rows": frame.height, "tracks": tracks, **split.names},
+        data=data,
         statistics=driving_statistics(driven).to_dict(),
         updates=loop.best_update,
         seconds=loop.seconds,
@@ -288,7 +298,9 @@ def cross_validate(
     """
     scenes = scene_tracks(frame)
     splits = [split_for_fit(scenes, names) for names in assign_folds(scenes, folds)]
-    results, short, long = [], [], []
+    results = []
+    short = []
+    long = []
     for number, split in enumerate(splits, start=1):
         loop = run_fit(config, split, folder, on_progress, f"fold {number} of {folds}")
         others = frame.filter(~pl.col("scene").is_in(split.names["held_out"]))
@@ -296,6 +308,8 @@ def cross_validate(
         short.append(short_forecasts(loop.task, split))
         if rollout := long_forecasts(loop.task, split):
             long.append(rollout)
+
+    # All folds are scored together; each window was held out in one of them.
     fold = np.repeat(np.arange(folds), [len(part.windows) for part in short])
     scores: dict[str, Any] = {
         "splits": [split.names for split in splits],
@@ -311,11 +325,13 @@ def variants(config: Config) -> dict[str, Config]:
 
     The first is the preset itself.
     """
-    loop = config.loop
-    quarter = {
-        name: max(1, getattr(loop, name) // 4) for name in ("updates", "evaluate_every", "warmup")
-    }
-    config = replace(config, loop=replace(loop, **quarter))
+    loop = replace(
+        config.loop,
+        updates=max(1, config.loop.updates // 4),
+        evaluate_every=max(1, config.loop.evaluate_every // 4),
+        warmup=max(1, config.loop.warmup // 4),
+    )
+    config = replace(config, loop=loop)
     if isinstance(config, CalibratedConfig):
         return {
             "as it is": config,
@@ -323,7 +339,9 @@ def variants(config: Config) -> dict[str, Config]:
             "without further inputs": replace(config, further_inputs=False),
             "without traits": replace(config, traits=False),
         }
-    sizes, weights = config.sizes, config.weights
+    sizes = config.sizes
+    weights = config.weights
+    alone = replace(weights, single=0.0, mean=0.0, adversarial=0.0)
     return {
         "as it is (p_l = 8)": config,
         "p_l = 4": replace(config, sizes=replace(sizes, predicted=4)),
@@ -332,9 +350,7 @@ def variants(config: Config) -> dict[str, Config]:
         "without differences as inputs": replace(config, sizes=replace(sizes, differences=False)),
         "without adversarial term": replace(config, weights=replace(weights, adversarial=0.0)),
         "without single-sample term": replace(config, weights=replace(weights, single=0.0)),
-        "variety term alone": replace(
-            config, weights=replace(weights, single=0.0, mean=0.0, adversarial=0.0)
-        ),
+        "variety term alone": replace(config, weights=alone),
         "with history noise of 0.5": replace(config, history_noise=0.5),
     }
 

@@ -202,8 +202,8 @@ class CalibratedConfig(FitConfig):
         super().__post_init__()
         if len(self.shares) != len(self.horizons) or sum(self.shares) <= 0:
             raise ParameterError(
-                f"{{shares}}={list(self.shares)}: give one share of the updates for each of the horizons "
-                f"{list(self.horizons)}, not all 0."
+                f"{{shares}}={list(self.shares)}: give one share of the updates for each of the "
+                f"horizons {list(self.horizons)}, not all 0."
             )
 
 

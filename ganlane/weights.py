@@ -47,22 +47,22 @@ def load_weights(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[s
     whole = has_checksum(content, path)
     try:
         tensors = load(content)
-        header = (
-            _json_object(content[8 : 8 + int.from_bytes(content[:8], "little")]).get("__metadata__")
-            or {}
-        )
+        # The format begins with the header's length and the header, JSON. The library's reader of
+        # bytes leaves the metadata out.
+        begin, end = 8, 8 + int.from_bytes(content[:8], "little")
+        header = json.loads(content[begin:end]).get("__metadata__") or {}
+        metadata = json.loads(header.get("ganlane", "{}"))
     # KeyError: a number type that torch lacks
-    except (SafetensorError, ValueError, KeyError) as error:
+    except (SafetensorError, ValueError, KeyError, RecursionError) as error:
         raise UserError(
-            f"{path}: not a readable safetensors file ({error}); give a checkpoint of kind {kind} "
-            "that ganlane wrote."
+            f"{path}: not a readable safetensors file ({error}); "
+            f"give a checkpoint of kind {kind} that ganlane wrote."
         ) from error
-    metadata = _json_object(header.get("ganlane", "{}"))
-    if metadata.get("kind") != kind:
-        found = metadata.get("kind", "a file that ganlane did not write")
+    stored = metadata.get("kind") if isinstance(metadata, dict) else None
+    if stored != kind:
         raise UserError(
-            f"{path}: expected a ganlane checkpoint of kind {kind}, found {found}; give one that "
-            "ganlane wrote."
+            f"{path}: expected a ganlane checkpoint of kind {kind}, found "
+            f"{stored or 'a file that ganlane did not write'}; give one that ganlane wrote."
         )
     for name, tensor in tensors.items():
         if not tensor.isfinite().all():
@@ -72,12 +72,3 @@ def load_weights(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[s
     if not whole:
         note_without_checksum(path)
     return tensors, metadata
-
-
-def _json_object(text: str | bytes) -> dict[str, Any]:
-    """The JSON object ``text``; empty if it is not one."""
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError):
-        return {}
-    return content if isinstance(content, dict) else {}

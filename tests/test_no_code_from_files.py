@@ -11,7 +11,6 @@ import pickle
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from reference.refusals import Bomb, refusal, run_folder
@@ -28,7 +27,6 @@ from ganlane.settings.train import FinalEvaluationConfig, TrainConfig
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator import load_generator
-from ganlane.generator.windows import cached
 from ganlane.realism.measures import Reference
 from ganlane.traffic import TrafficModule
 from ganlane.weights import load_weights, save_weights
@@ -154,12 +152,6 @@ def test_a_pickle_in_the_place_of_another_file_is_refused(arguments, here, capsy
     for name in ("bomb/last.pt", "bomb/metrics.csv", "bomb.json", "bomb.parquet", "bomb.csv"):
         (here / name).write_bytes(file.getvalue())
     assert "bomb" in refusal(capsys, *arguments)
-
-
-def test_pickles_in_the_cache_are_not_read(here, monkeypatch):
-    monkeypatch.setenv("GANLANE_CACHE", str(here))
-    np.savez(here / "groups_key.npz", labels=np.array([Bomb()], dtype=object))
-    assert cached("groups", "key", lambda: {"labels": np.arange(3)})["labels"].tolist() == [0, 1, 2]
 
 
 def test_a_reference_of_recorded_driving_is_plain_numbers(here):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -18,10 +18,10 @@ from ganlane.data import byte_progress, read_recordings, recordings_path
 from ganlane.evaluation import code_version, write_results
 from ganlane.evaluation.table import aligned, show
 from ganlane.generator import FitResult, Progress
+from ganlane.generator.forecasts import BASELINE, SAMPLES
 from ganlane.torch_settings import set_threads
 
 _ERRORS = ("ade_m", "fde_m", "end_m")
-_BASELINE = "constant_velocity"
 _PUBLISHED_VELOCITY_M = (0.73, 1.78, 3.13, 4.78, 6.68)
 #: RMSE in m after 1 to 5 s on NGSIM, as published: on other test sets than ours, so only roughly
 #: comparable.
@@ -42,50 +42,32 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     with byte_progress("read") as read:
         frame = read_recordings(config.data.format, source, config.data.parameters(), read)
     fit_config: Any = replace(config.generator, seed=config.seed)
-    preset = fit_config.preset
     scenes = generator.scene_tracks(frame)
     held_out = config.data.held_out_scenes([scene.name for scene in scenes], generator.HELD_OUT)
-    split = generator.split_for_fit(scenes, held_out)
+    # Scenes that do not fit together are refused now rather than after hours of ablations.
+    generator.split_for_fit(scenes, held_out)
     if config.folds:
-        # too many are refused now rather than after hours of ablations
         generator.assign_folds(scenes, config.folds)
     states = Path(config.resume or folder) / "fits"
+    weights = folder / f"generator_{fit_config.preset}.safetensors"
     further: dict[str, Any] = {}
-    if config.ablations:
-        with FitProgress() as progress:
-            further["ablations"] = generator.ablate(
-                frame, fit_config, held_out, states, progress.next_fit, progress
-            )
-        show(ablation_table(further["ablations"]), columns=config.columns)
-    if config.folds:
-
-        def save(number: int, fold: FitResult) -> None:
-            fold.save(folder / f"generator_{preset}_fold_{number}.safetensors", code=code_version())
-
-        with FitProgress() as progress:
-            further["folds"] = generator.cross_validate(
-                frame,
-                fit_config,
-                config.folds,
-                states,
-                progress.next_fit,
-                progress,
-                save,
-                source=str(source),
-            )
-        show(fold_tables(further["folds"]), columns=config.columns)
     with FitProgress() as progress:
+        if config.ablations:
+            rows = generator.ablate(fit_config, frame, held_out, states, progress)
+            show(ablation_table(rows), columns=config.columns)
+            further["ablations"] = rows
+        if config.folds:
+            further["folds"], results = generator.cross_validate(
+                fit_config, frame, config.folds, states, progress, str(source)
+            )
+            for number, fold in enumerate(results, start=1):
+                path = weights.with_stem(f"{weights.stem}_fold_{number}")
+                fold.save(path, code=code_version())
+            show(fold_tables(further["folds"]), columns=config.columns)
         result = generator.fit_generator(
-            preset,
-            frame,
-            held_out=held_out,
-            config=fit_config,
-            source=str(source),
-            resume_path=states / f"generator_{generator.fit_key(fit_config, split)}.pt",
-            on_progress=progress,
+            fit_config, frame, held_out, states, progress, str(source)
         )
     show(metrics_table(result.metrics), columns=config.columns)
-    weights = folder / f"generator_{preset}.safetensors"
     result.save(weights, further.get("folds"), code_version())
     print(f"weights: {weights}")
     numbers = results_of(result) | further | {"weights": str(weights)}
@@ -95,44 +77,41 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
 
 
 class FitProgress(AbstractContextManager["FitProgress"]):
-    """Shows a fit: a bar on a terminal, else a line per improvement and a last one.
+    """Shows fits, one after the other: a bar on a terminal, else a line per improvement.
 
-    A context that closes the bar.
+    A context that closes the last bar.
     """
 
     def __init__(self) -> None:
+        self._name = ""
         self._bar: tqdm | None = None
         self._best = math.inf
 
-    def next_fit(self, name: str) -> None:
-        """Start the display of another fit."""
-        self.__exit__()
-        self._bar, self._best = None, math.inf
-        print(name, file=sys.stderr, flush=True)
-
     def __call__(self, progress: Progress) -> None:
         """Called by the fit after every update."""
+        if progress.name != self._name:
+            self._start(progress)
         update, updates = progress.update, progress.updates
-        scores = (
-            ""
-            if progress.score is None
-            else f"validation score {progress.score:.4f}, best {progress.best:.4f}"
-        )
-        if sys.stderr.isatty():
-            if self._bar is None:
-                self._bar = tqdm(total=updates, desc="fit", unit="update", file=sys.stderr)
+        scores = ""
+        if progress.score is not None:
+            scores = f"validation score {progress.score:.4f}, best {progress.best:.4f}"
+        if self._bar is not None:
             self._bar.update(update - self._bar.n)
-            if scores:
-                self._bar.set_postfix_str(scores)
+            self._bar.set_postfix_str(scores, refresh=False)
         elif progress.best < self._best or update == updates:
             self._best = progress.best
             left_s = progress.seconds / update * (updates - update)
-            parts = [
-                f"{update} of {updates} updates",
-                f"at most {left_s:.0f} s left",
-                *([scores] if scores else []),
-            ]
-            print(", ".join(parts), file=sys.stderr, flush=True)
+            parts = [f"{update} of {updates} updates", f"at most {left_s:.0f} s left", scores]
+            print(", ".join(filter(None, parts)), file=sys.stderr, flush=True)
+
+    def _start(self, progress: Progress) -> None:
+        """The first update of another fit."""
+        self.__exit__()
+        self._name, self._best = progress.name, math.inf
+        if sys.stderr.isatty():
+            self._bar = tqdm(total=progress.updates, desc=progress.name, unit="update")
+        else:
+            print(progress.name, file=sys.stderr, flush=True)
 
     def __exit__(self, *error: object) -> None:
         if self._bar is not None:
@@ -140,10 +119,7 @@ class FitProgress(AbstractContextManager["FitProgress"]):
 
 
 def _by_kind(measured: Mapping[str, float]) -> dict[str, Any]:
-    """``{"ade_m/mean": x, ..., "windows": n}`` as ``{"ade_m": {"mean": x, ...}, ..., "windows".
-
-    N}``.
-    """
+    """``{"ade_m/mean": x, "windows": n}`` as ``{"ade_m": {"mean": x}, "windows": n}``."""
     nested: dict[str, Any] = {}
     for name, value in measured.items():
         error, _, kind = name.partition("/")
@@ -156,21 +132,17 @@ def _by_kind(measured: Mapping[str, float]) -> dict[str, Any]:
 
 def results_of(result: FitResult) -> dict[str, Any]:
     """The numbers of ``results.json``: errors over all held-out scenes, and per scene."""
+    metrics = dict(result.metrics)
+    overall = _by_kind(metrics.pop("all"))
     scenes = {
-        name: _by_kind(values)
-        for name, values in result.metrics.items()
-        if name in result.data["held_out"]
-    }
-    other = {
-        name: dict(values)
-        for name, values in result.metrics.items()
-        if name != "all" and name not in scenes
+        name: _by_kind(metrics.pop(name)) for name in result.data["held_out"] if name in metrics
     }
     return {
-        "preset": result.preset,
-        **_by_kind(result.metrics["all"]),
+        "preset": result.config.preset,
+        **overall,
         "scenes": scenes,
-        **other,
+        # What is no scene: the discriminator of the paper's preset.
+        **metrics,
         "data": result.data,
         "statistics": result.statistics,
         "updates": result.updates,
@@ -188,10 +160,9 @@ def metrics_table(metrics: Mapping[str, Mapping[str, float]]) -> str:
     errors = [error for error in _ERRORS if error in overall]
     lines = [["held-out scenes", *(error.replace("_m", ", m") for error in errors), "ADE to CV"]]
     for kind, ade in overall["ade_m"].items():
-        change = _percent(100.0 * (ade / overall["ade_m"][_BASELINE] - 1.0))
-        lines.append(
-            [kind, *(f"{overall[error].get(kind, math.nan):.3f}" for error in errors), change]
-        )
+        cells = [f"{overall[error].get(kind, math.nan):.3f}" for error in errors]
+        change = 100.0 * (ade / overall["ade_m"][BASELINE] - 1.0)
+        lines.append([kind, *cells, _percent(change)])
     return aligned(lines)
 
 
@@ -201,31 +172,29 @@ def ablation_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
     Change of ADE over all predicted steps and over 0.4 s, ratio of the RMSE at 5 s.
     """
     first = next(iter(rows.values()))
-    kinds = [kind for kind in first["ade_change_percent"] if kind != _BASELINE]
-    at_5_s = ["RMSE 5 s"] if "rmse_5_s_ratio" in first else []
-    lines = [
-        [
-            "ADE to CV, a quarter of the updates",
-            *kinds,
-            *(f"{kind}, 0.4 s" for kind in kinds),
-            *at_5_s,
-        ]
-    ]
+    kinds = [kind for kind in first["ade_change_percent"] if kind != BASELINE]
+    early = [f"{kind}, 0.4 s" for kind in kinds]
+    lines = [["ADE to CV, a quarter of the updates", *kinds, *early]]
     for name, row in rows.items():
-        parts = (row["ade_change_percent"], row["ade_change_percent_0.4_s"])
-        ratio = [f"{row['rmse_5_s_ratio']['mean']:.2f}"] if at_5_s else []
-        lines.append([name, *(_percent(part[kind]) for part in parts for kind in kinds), *ratio])
+        line = [name]
+        for change in (row["ade_change_percent"], row["ade_change_percent_0.4_s"]):
+            line += [_percent(change[kind]) for kind in kinds]
+        lines.append(line)
+    if "rmse_5_s_ratio" in first:
+        ratios = [f"{row['rmse_5_s_ratio']['mean']:.2f}" for row in rows.values()]
+        lines = [[*line, ratio] for line, ratio in zip(lines, ["RMSE 5 s", *ratios])]
     return aligned(lines)
 
 
 def fold_tables(folds: Mapping[str, Any]) -> str:
-    """All tables of :func:`ganlane.generator.cross_validate`'s result, as text."""
+    """All tables of :func:`ganlane.generator.cross_validate`'s scores, as text."""
     scores = folds["open_loop"]
-    titles = {"folds": "by fold", "scenes": "by scene", "parts": "by lane (1 leftmost) and class"}
     tables = [
         _pooled(scores),
-        *(_rows(title, scores[name]) for name, title in titles.items()),
-        _direction(scores),
+        _parts("by fold", scores["folds"]),
+        _parts("by scene", scores["scenes"]),
+        _parts("by lane (1 leftmost) and class", scores["parts"]),
+        _direction(scores["direction"], scores["direction_whole_window"]),
     ]
     if "rollout" in folds:
         tables.append(_rollout(folds["rollout"]))
@@ -241,22 +210,19 @@ def _pooled(scores: Mapping[str, Any]) -> Lines:
     return lines
 
 
-def _rows(title: str, rows: Mapping[str, Any]) -> Lines:
-    """Windows, constant velocity's ADE and the generator's change relative to it, for every row."""
-    first = next(iter(rows.values()))
-    kinds = [
-        kind for kind in first["ade_m"] if kind in ("mean", "single") or kind.startswith("best_of")
-    ]
+def _parts(title: str, parts: Mapping[str, Any]) -> Lines:
+    """Windows, constant velocity's ADE and the generator's change relative to it, for each part."""
+    generated = ("mean", "single", f"best_of_{SAMPLES}")
+    kinds = [kind for kind in generated if kind in next(iter(parts.values()))["ade_m"]]
     lines = [[title, "windows", "CV, m", *kinds]]
-    for name, row in rows.items():
-        changes = [_percent(row["ade_change_percent"][kind]) for kind in kinds]
-        lines.append([name, str(row["windows"]), f"{row['ade_m'][_BASELINE]:.3f}", *changes])
+    for name, part in parts.items():
+        changes = [_percent(part["ade_change_percent"][kind]) for kind in kinds]
+        lines.append([name, str(part["windows"]), f"{part['ade_m'][BASELINE]:.3f}", *changes])
     return lines
 
 
-def _direction(scores: Mapping[str, Any]) -> Lines:
+def _direction(later: Mapping[str, Any], whole: Mapping[str, Any]) -> Lines:
     """Share of lateral moves of more than 0.1 m whose side is predicted correctly."""
-    later, whole = scores["direction"], scores["direction_whole_window"]
     lines = [
         ["lateral move to the right side", "after present", "whole window"],
         ["windows that move", str(later["windows"]), str(whole["windows"])],
@@ -269,14 +235,15 @@ def _direction(scores: Mapping[str, Any]) -> Lines:
 
 def _rollout(rollout: Mapping[str, Any]) -> Lines:
     """RMSE after 1 to 5 s, with published values."""
-    rmse = {kind: list(values.values()) for kind, values in rollout["rmse_m"].items()}
-    ratios = dict(rollout["ratio_to_constant_velocity"])
+    rmse = rollout["rmse_m"]
+    lines = [[f"RMSE, m ({rollout['windows']} windows)", *rmse[BASELINE], "to CV"]]
+    for kind, ratio in rollout["ratio_to_constant_velocity"].items():
+        lines.append([kind, *_two_digits(rmse[kind].values()), f"{ratio:.2f}"])
     for kind, published in _PUBLISHED_RMSE_M.items():
-        rmse[kind], ratios[kind] = list(published), published[-1] / _PUBLISHED_VELOCITY_M[-1]
-    seconds = next(iter(rollout["rmse_m"].values()))
-    lines = [[f"RMSE, m ({rollout['windows']} windows)", *seconds, "to CV"]]
-    lines += [
-        [kind, *(f"{value:.2f}" for value in values), f"{ratios[kind]:.2f}"]
-        for kind, values in rmse.items()
-    ]
+        ratio = published[-1] / _PUBLISHED_VELOCITY_M[-1]
+        lines.append([kind, *_two_digits(published), f"{ratio:.2f}"])
     return lines
+
+
+def _two_digits(values: Iterable[float]) -> list[str]:
+    return [f"{value:.2f}" for value in values]

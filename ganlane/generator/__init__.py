@@ -2,7 +2,7 @@
 
 Read in this order:
 
-- ``networks``: generator and discriminator; ``checkpoint``: their files, and arrays that are kept;
+- ``networks``: generator and discriminator; ``checkpoint``: their files;
 - ``windows``: recordings to batches (segments of scenes; 9 positions observed, 8 to predict;
   k-means groups);
 - ``closed_loop``: one step of each preset, in fitting and in simulation, and rollouts of whole
@@ -20,7 +20,6 @@ from ganlane.generator.fit import (
     assign_folds,
     cross_validate,
     fit_generator,
-    fit_key,
     split_for_fit,
 )
 from ganlane.generator.networks import Discriminator, Generator
@@ -52,7 +51,6 @@ __all__ = [
     "assign_folds",
     "cross_validate",
     "fit_generator",
-    "fit_key",
     "headway_quantiles",
     "load_generator",
     "scene_tracks",

@@ -1,5 +1,6 @@
-"""Closed loop: one step of each preset, in fitting and in simulation alike, and rollouts of
-recorded scenes.
+"""Closed loop: one step of each preset, and rollouts of recorded scenes.
+
+The same step drives in fitting and in simulation.
 
 **paper**: positions only, the first predicted displacement moves the vehicle (:func:`paper_step`).
 
@@ -41,9 +42,10 @@ from ganlane.sim.state import ENTRY_M, Road, Vehicles, Visibility
 
 #: Tangent of the largest heading.
 STEEPEST = 0.3
-#: The body keeps this distance from the lane's edge; outward residuals fade over the distance
-#: before it, m.
-_MARGIN_M, _FADE_M = 0.1, 0.3
+#: The body keeps this distance from the lane's edge, m.
+_MARGIN_M = 0.1
+#: Outward residuals fade over this distance before it, m.
+_FADE_M = 0.3
 #: Levels of the headway quantiles.
 QUANTILE_LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 #: Quantiles of (gap - 2 m) / speed of recorded followers on US-101, s: the default where no
@@ -91,10 +93,9 @@ def recorded(generator: Generator, displacements: Tensor) -> History:
 
 
 def push(generator: Generator, history: History, displacement: Tensor) -> tuple[History, Tensor]:
-    """The history with the new motion, the only one projected, and its difference [N, M, 2] to the
-    last one, m.
-    """
+    """The history with the new motion, and its difference [N, M, 2] to the last one, m."""
     difference = displacement - history.displacement
+    # Only the new motion is projected; those of the older ones are kept.
     new = generator.encoder.project(displacement, difference)
     return History((*history.motions[1:], new), displacement), difference
 
@@ -114,17 +115,16 @@ def displacement_of(vehicles: Vehicles) -> Tensor:
     after 5 km.
     """
     length = vehicles.speed * PHYSICS_STEP_S
-    return torch.stack(
-        [length * torch.cos(vehicles.heading), length * torch.sin(vehicles.heading)], dim=-1
-    )
+    along = length * torch.cos(vehicles.heading)
+    across = length * torch.sin(vehicles.heading)
+    return torch.stack([along, across], dim=-1)
 
 
 def moved_by(vehicles: Vehicles, velocity_x: Tensor, velocity_y: Tensor) -> Vehicles:
-    """The vehicles 0.1 s later at a new velocity (m/s, [N, M]), without driving backwards or
-    sliding sideways.
+    """The vehicles 0.1 s later at a new velocity (m/s, [N, M]).
 
-    The lateral velocity is limited to :data:`STEEPEST` times the longitudinal one, so a standing
-    car stays in place.
+    Nobody drives backwards or slides sideways: the lateral velocity is limited to :data:`STEEPEST`
+    times the longitudinal one, so a standing car stays in place.
     """
     forward = velocity_x.clamp_min(0.0)
     limit = STEEPEST * forward
@@ -141,14 +141,14 @@ def moved_by(vehicles: Vehicles, velocity_x: Tensor, velocity_y: Tensor) -> Vehi
 
 
 def wander(noise: Tensor, fresh: Tensor, period_s: float) -> Tensor:
-    """``noise`` 0.1 s later: an Ornstein-Uhlenbeck process with unit variance and time constant
-    ``period_s``.
+    """``noise`` 0.1 s later, of unit variance and with the time constant ``period_s``.
 
     ``fresh`` are independent standard normal numbers of the same shape. A period of 0 draws anew at
     every step.
     """
-    kept = math.exp(-PHYSICS_STEP_S / period_s) if period_s > 0 else 0.0
-    return kept * noise + math.sqrt(1.0 - kept * kept) * fresh
+    # An Ornstein-Uhlenbeck process, solved exactly: what stays, and what makes up the variance.
+    share = math.exp(-PHYSICS_STEP_S / period_s) if period_s > 0 else 0.0
+    return share * noise + math.sqrt(1.0 - share * share) * fresh
 
 
 class Plan(NamedTuple):
@@ -168,19 +168,22 @@ def paper_step(
     noise: Tensor,
     plan: Plan | None = None,
 ) -> tuple[Vehicles, History, Plan | None]:
-    """One step of the paper's preset: vehicles 0.1 s later, their history, and the rest of the
-    plan.
+    """One step of the paper's preset: vehicles 0.1 s later, their history, the rest of the plan.
 
     Without a plan (``execute_k`` = 1) one decoder step is run and driven. With one, ``execute_k``
     steps are run for the vehicles whose last plan is finished.
     """
     history, difference = push(generator, history, displacement_of(vehicles))
+    no_extra = difference[..., :0]
+    observation = observe(history, difference, vehicles, no_extra)
     steps = 1 if plan is None else plan.ahead.shape[-2]
-    predicted = generator(observe(history, difference, vehicles, difference[..., :0]), noise, steps)
+    predicted = generator(observation, noise, steps)
     if plan is not None:
+        # All rows predict, so that shapes stay the same; unfinished plans go on as they are.
         finished = plan.left <= 0
         predicted = torch.where(finished[..., None, None], predicted, plan.ahead)
-        plan = Plan(torch.roll(predicted, -1, dims=-2), torch.where(finished, steps, plan.left) - 1)
+        left = torch.where(finished, steps, plan.left) - 1
+        plan = Plan(torch.roll(predicted, -1, dims=-2), left)
     velocity = predicted[..., 0, :] / PHYSICS_STEP_S
     return moved_by(vehicles, velocity[..., 0], velocity[..., 1]), history, plan
 
@@ -223,16 +226,17 @@ class DriverMemory(NamedTuple):
 
 
 def extra_inputs(scene: Scene, anchor: Tensor, offset: Tensor) -> Tensor:
-    """The further inputs [N, M, 4], each bounded and of order 1; without a leader the gap input is
-    1.
+    """The further inputs [N, M, 4], each bounded and of order 1.
 
-    ``anchor`` is IDM's acceleration, m/s2, ``offset`` the distance to the target lane's centre, m.
+    Without a leader the gap input is 1. ``anchor`` is IDM's acceleration, m/s2, ``offset`` the
+    distance to the target lane's centre, m.
     """
     ahead = leader(scene, scene.vehicles.target_lane.to(anchor.dtype))
     gap = ahead.gap.clamp_min(0.0)
     closing = (scene.vehicles.speed - ahead.speed) / 5.0
     columns = [
         anchor.clamp(-4.0, 4.0),
+        # Bounded however large the gap; one half at 20 m.
         gap / (gap + 20.0),
         closing.clamp(-3.0, 3.0),
         (offset / 2.0).clamp(-3.0, 3.0),
@@ -249,6 +253,7 @@ def inside_lane(
     alone, would come to rest ``room`` off the lane's centre: damping alone carries it another
     ``velocity / damping``. ``offset`` is the distance to the target lane's centre, m.
     """
+    # Where it comes to rest, from the lane's centre; then the same in the residual's direction.
     rest = velocity / damping - offset
     outwards = torch.where(residual > 0, rest, -rest)
     return residual * ((room - outwards) / _FADE_M).clamp(0.0, 1.0)
@@ -271,34 +276,41 @@ def anchored_step(
     p = parameters
     displacement = displacement_of(vehicles)
     history, difference = push(generator, memory.history, displacement)
+
+    # The anchor: IDM along the road; a spring and a damper to the target lane's centre across it.
     scene = perceive(vehicles, road)
     anchor_x = following_acceleration(scene, p.idm, memory.headway)
     offset = road.centre_of(vehicles.target_lane, vehicles.y.dtype) - vehicles.y
     velocity = displacement / PHYSICS_STEP_S
     anchor_y = p.lane_stiffness * offset - p.lane_damping * velocity[..., 1]
+
+    # The network's residual, in m/s2. The decoder's first output is enough: each step decides anew.
     extra = extra_inputs(scene, anchor_x, offset)
-    observation = observe(
-        history, difference, vehicles, extra if p.further_inputs else torch.zeros_like(extra)
-    )
-    outputs = generator.decode(generator.summarise(observation), noise, observation, 1)[..., 0, :]
+    if not p.further_inputs:
+        extra = torch.zeros_like(extra)
+    observation = observe(history, difference, vehicles, extra)
+    context = generator.summarise(observation)
+    outputs = generator.decode(context, noise, observation, steps=1)[..., 0, :]
     limit = outputs.new_tensor(p.residual)
     residual = limit * torch.tanh(outputs / limit)
+
+    # The washout: without its mean, the residual cannot hold a speed or an offset of its own.
     mean = memory.mean + (PHYSICS_STEP_S / p.washout_s) * (residual - memory.mean)
     residual = residual - mean
     room = 0.5 * (road.lane_width_m - vehicles.width) - _MARGIN_M
     residual_y = inside_lane(residual[..., 1], offset, velocity[..., 1], room, p.lane_damping)
+
     velocity_x = velocity[..., 0] + (anchor_x + residual[..., 0]) * PHYSICS_STEP_S
     velocity_y = velocity[..., 1] + (anchor_y + residual_y) * PHYSICS_STEP_S
     return moved_by(vehicles, velocity_x, velocity_y), DriverMemory(history, mean, memory.headway)
 
 
 def recorded_vehicles(segments: Segments, frame: int, desired_speed: Tensor) -> Vehicles:
-    """The recorded vehicles [B, V] at ``frame`` (1 or later), their velocity the last
-    displacement's.
+    """The recorded vehicles [B, V] at ``frame`` (1 or later).
 
-    Each occupies the lane of its centre only, with a small width: recorded lanes are narrow and
-    straightened to some decimetres, so by its body one vehicle in ten would occupy two lanes and
-    make others brake.
+    Their velocity is that of the last displacement. Each occupies the lane of its centre only, with
+    a small width: recorded lanes are narrow and straightened to some decimetres, so by its body one
+    vehicle in ten would occupy two lanes and make others brake.
     """
     position, target = segments.positions[:, frame], segments.target_lane[:, frame]
     velocity = (position - segments.positions[:, frame - 1]) / PHYSICS_STEP_S
@@ -321,21 +333,23 @@ def recorded_vehicles(segments: Segments, frame: int, desired_speed: Tensor) -> 
 def driven_positions(
     segments: Segments, desired_speed: Tensor, move: Callable[[Vehicles, int], Vehicles]
 ) -> Tensor:
-    """Positions [B, H, V, 2] in m when ``move`` drives all vehicles jointly for H steps after the
-    observed frames.
+    """Positions [B, H, V, 2] in m when ``move`` drives all vehicles of the segments jointly.
 
-    ``move`` takes the vehicles now and the step's number to the vehicles 0.1 s later. A vehicle
-    that appears later starts at its first recorded position with the velocity of its first
-    displacement. A vehicle is removed at the frame where its recording ends.
+    It drives them for the H steps after the observed frames, and takes the vehicles now and the
+    step's number to the vehicles 0.1 s later. A vehicle that appears later starts at its first
+    recorded position with the velocity of its first displacement. A vehicle is removed at the frame
+    where its recording ends.
     """
-    vehicles, positions = recorded_vehicles(segments, PRESENT, desired_speed), []
+    vehicles = recorded_vehicles(segments, PRESENT, desired_speed)
     appeared = segments.present.cumsum(dim=1) > 0
+    positions = []
     for step in range(segments.positions.shape[1] - OBSERVED_POSITIONS):
+        frame = PRESENT + step
         moved = move(vehicles, step)
-        entering = recorded_vehicles(segments, PRESENT + step + 1, desired_speed)
-        vehicles = moved.where(appeared[:, PRESENT + step], entering).with_(
-            valid=entering.valid, target_lane=entering.target_lane
-        )
+        # Who has not appeared yet goes on as recorded: at constant velocity, up to its first frame.
+        entering = recorded_vehicles(segments, frame + 1, desired_speed)
+        vehicles = moved.where(appeared[:, frame], entering)
+        vehicles = vehicles.with_(valid=entering.valid, target_lane=entering.target_lane)
         positions.append(torch.stack([vehicles.x, vehicles.y], dim=-1))
     return torch.stack(positions, dim=1)
 
@@ -347,20 +361,24 @@ def rollout(
     noise: Tensor,
     config: CalibratedConfig,
 ) -> Tensor:
-    """Positions [K, B, H, V, 2] in m of K joint rollouts (:func:`driven_positions`) by the
-    calibrated preset.
+    """Positions [K, B, H, V, 2] in m of K joint rollouts by the calibrated preset.
 
-    ``drivers`` are the headways in s and desired speeds in m/s, [B, V] each; ``noise`` [1 + H, K,
-    B, V, Z] the latent vectors at the start, then the numbers that change them (:func:`wander`).
+    See :func:`driven_positions`. ``drivers`` are the headways in s and desired speeds in m/s, [B,
+    V] each; ``noise`` [1 + H, K, B, V, Z] the latent vectors at the start, then the numbers that
+    change them (:func:`wander`).
     """
     parameters = replace(ANCHOR, washout_s=config.washout_s, further_inputs=config.further_inputs)
+    # The samples are further rows of the batch.
     samples = noise.shape[1]
     segments = segments.repeated(samples)
-    headway, desired_speed = (each.repeat(samples, 1) for each in drivers)
+    road = segments.road
+    headway, desired_speed = (values.repeat(samples, 1) for values in drivers)
     latent, *fresh = noise.flatten(1, 2)
+
+    # The first step pushes the last observed displacement, so the history ends one before it.
     past = segments.positions[:, :OBSERVED_POSITIONS].diff(dim=1).transpose(1, 2)
     history = recorded(generator, past[..., :-1, :])
-    memory, road = DriverMemory(history, torch.zeros_like(past[..., 0, :]), headway), segments.road
+    memory = DriverMemory(history, torch.zeros_like(past[..., 0, :]), headway)
 
     def move(vehicles: Vehicles, step: int) -> Vehicles:
         nonlocal memory, latent
@@ -378,9 +396,9 @@ def headway_quantiles(statistics: Mapping[str, Any]) -> tuple[float, ...]:
 
 
 def headway_from_uniform(u: Tensor, quantiles_s: tuple[float, ...] = HEADWAY_QUANTILES_S) -> Tensor:
-    """Headways in s from uniform numbers, by linear interpolation of the quantiles.
+    """Headways in s whose quantiles are ``quantiles_s``, from uniform numbers ``u``.
 
-    Flat beyond the outer ones.
+    Linear between the quantiles, flat beyond the outer ones.
     """
     values, levels = u.new_tensor(quantiles_s), u.new_tensor(QUANTILE_LEVELS)
     upper = torch.searchsorted(levels, u.contiguous()).clamp(1, len(QUANTILE_LEVELS) - 1)
@@ -390,18 +408,18 @@ def headway_from_uniform(u: Tensor, quantiles_s: tuple[float, ...] = HEADWAY_QUA
 
 
 def balanced_headway(vehicles: Vehicles, road: Road, otherwise: Tensor) -> Tensor:
-    """The headway [N, M] in s at which IDM neither speeds up nor brakes now; ``otherwise`` where it
-    is unknown.
+    """The headway [N, M] in s at which IDM neither speeds up nor brakes now.
 
-    Uses gap, speed and desired speed. It is unknown for vehicles without a leader, or further
-    behind it than the largest quantile.
+    It follows from gap, speed and desired speed. For vehicles without a leader, or further behind
+    it than the largest quantile, it is unknown: ``otherwise``.
     """
     ahead = leader(perceive(vehicles, road), vehicles.target_lane.to(vehicles.x.dtype))
+    # IDM's equation for an acceleration of 0 at the leader's speed, solved for the headway.
     ratio = vehicles.speed / vehicles.desired_speed
     settled = ahead.gap * torch.sqrt((1.0 - ratio * ratio * ratio * ratio).clamp_min(0.0))
     headway = (settled - TABLE_V.min_gap_m) / vehicles.speed.clamp_min(1.0)
-    known = (ahead.gap < FREE_GAP_M) & (headway <= HEADWAY_QUANTILES_S[-1])
-    return torch.where(known, headway.clamp_min(SHORTEST_HEADWAY_S), otherwise)
+    follows = (ahead.gap < FREE_GAP_M) & (headway <= HEADWAY_QUANTILES_S[-1])
+    return torch.where(follows, headway.clamp_min(SHORTEST_HEADWAY_S), otherwise)
 
 
 def driver_params(
@@ -417,19 +435,17 @@ def driver_params(
     if not traits:
         headway = torch.full_like(segments.length, TABLE_V.headway_s)
         return headway, torch.full_like(headway, COMMON_SPEED_MPS)
-    now, (low, high) = (
-        recorded_vehicles(segments, PRESENT, torch.ones_like(segments.length)),
-        DESIRED_EXCESS_MPS,
-    )
+    low, high = DESIRED_EXCESS_MPS
+    shape = segments.length.shape
+    now = recorded_vehicles(segments, PRESENT, torch.ones_like(segments.length))
     if random is None:
         scatter = torch.ones_like(segments.length)
         otherwise = torch.full_like(scatter, HEADWAY_QUANTILES_S[len(HEADWAY_QUANTILES_S) // 2])
         desired = now.speed + 0.5 * (low + high)
     else:
-        u = torch.rand(2, *segments.length.shape, generator=random)
-        scatter = torch.exp(_SCATTER * torch.randn(segments.length.shape, generator=random))
-        otherwise = headway_from_uniform(u[1])
-        desired = now.speed + low + (high - low) * u[0]
-    return balanced_headway(
-        now.with_(desired_speed=desired), segments.road, otherwise
-    ) * scatter, desired
+        excess, level = torch.rand(2, *shape, generator=random)
+        scatter = torch.exp(_SCATTER * torch.randn(shape, generator=random))
+        otherwise = headway_from_uniform(level)
+        desired = now.speed + low + (high - low) * excess
+    headway = balanced_headway(now.with_(desired_speed=desired), segments.road, otherwise)
+    return headway * scatter, desired

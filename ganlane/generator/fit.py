@@ -1,32 +1,25 @@
-"""Fits of a preset, scored on the scenes that they have not used: one split, k folds by scene,
-ablations.
+"""Fits of a preset, scored on the scenes that they have not used.
 
-State and forecasts of folds and ablations are kept in a folder under a hash of recordings and
-settings, so that an interrupted run resumes and nothing is fitted twice.
+One split, k folds by scene, or ablations. The state of every fit is kept in a folder under a hash
+of recordings and settings: an interrupted run resumes, and nothing is fitted twice.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
+from sklearn.model_selection import GroupKFold
 
 from ganlane.data import TRACK, driving_statistics
 from ganlane.errors import UserError
-from ganlane.generator.checkpoint import (
-    FitResult,
-    Metrics,
-    Preset,
-    content_hash,
-    load_arrays,
-    save_arrays,
-)
+from ganlane.generator.checkpoint import FitResult, Metrics
 from ganlane.generator.forecasts import (
     BASELINE,
     SAMPLES,
@@ -40,7 +33,7 @@ from ganlane.generator.forecasts import (
     open_loop_scores,
     paper_forecasts,
 )
-from ganlane.generator.tasks import CalibratedTask, Config, FitLoop, OnProgress, PaperTask, Task
+from ganlane.generator.tasks import CalibratedTask, Config, FitLoop, OnProgress, PaperTask
 from ganlane.generator.windows import (
     OBSERVED_POSITIONS,
     SceneTracks,
@@ -60,10 +53,8 @@ VALIDATION_SHARE = 1 / 12
 #: Frames between the starts of two scored windows, the same for both presets.
 STRIDE = 3
 #: Steps of the long rollouts (5 s), and frames between their starts.
-LONG_STEPS, LONG_STRIDE = 50, 5
-#: Called with the name of the next fit.
-OnFit = Callable[[str], None]
-_CONFIGS: dict[str, type[Config]] = {"paper": PaperConfig, "calibrated": CalibratedConfig}
+LONG_STEPS = 50
+LONG_STRIDE = 5
 
 
 class Split(NamedTuple):
@@ -80,8 +71,7 @@ class Split(NamedTuple):
 
 
 def assign_folds(scenes: list[SceneTracks], folds: int) -> list[tuple[str, ...]]:
-    """Names of the scenes in each fold, balanced: the largest first, each to the fold with the
-    fewest windows so far.
+    """Names of the scenes in each fold, with about as many windows in each.
 
     Raises:
         UserError: fewer than 2 folds, more folds than scenes with windows, or fewer than 3 such
@@ -90,16 +80,13 @@ def assign_folds(scenes: list[SceneTracks], folds: int) -> list[tuple[str, ...]]
     sizes = {scene.name: count for scene in scenes if (count := count_windows(scene))}
     if not 2 <= folds <= len(sizes) or len(sizes) < 3:
         raise UserError(
-            f"folds={folds}: {len(sizes)} recorded scenes have windows to predict; choose 2 to {len(sizes)} folds "
-            "of at least 3 scenes."
+            f"folds={folds}: {len(sizes)} recorded scenes have windows to predict; "
+            f"choose 2 to {len(sizes)} folds of at least 3 scenes."
         )
-    names: list[list[str]] = [[] for _ in range(folds)]
-    held = [0] * folds
-    for name in sorted(sizes, key=lambda name: (-sizes[name], name)):
-        fold = held.index(min(held))
-        names[fold].append(name)
-        held[fold] += sizes[name]
-    return [tuple(sorted(fold)) for fold in names]
+    # One entry per window, so that the folds get about as many windows each.
+    scene_of = np.repeat(list(sizes), list(sizes.values()))
+    splits = GroupKFold(folds).split(scene_of, groups=scene_of)
+    return [tuple(np.unique(scene_of[tested]).tolist()) for _, tested in splits]
 
 
 def split_for_fit(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> Split:
@@ -115,71 +102,78 @@ def split_for_fit(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> Split
     names = [scene.name for scene in scenes]
     if len(names) < 2:
         raise UserError(
-            f"recordings of one scene, {', '.join(names)}: one has to be fitted to and another held out; cut it into "
-            "several with ganlane prepare ... scene_s=30."
+            f"recordings of one scene, {', '.join(names)}: one has to be fitted to and another "
+            "held out; cut it into several with ganlane prepare ... scene_s=30."
         )
     if unknown := sorted(set(held_out) - set(names)):
         raise UserError(
             f"data.held_out={unknown}: not among the recorded scenes {names}; choose from these."
         )
+
     others = [scene for scene in scenes if scene.name not in held_out]
     reported = [scene for scene in scenes if scene.name in held_out]
     if not others or not reported:
         raise UserError(
-            f"data.held_out={list(held_out)}: of the scenes {names} at least one must be held out and one fitted to; "
-            "name some in data.held_out."
+            f"data.held_out={list(held_out)}: of the scenes {names} at least one must be held out "
+            "and one fitted to; name some in data.held_out."
         )
-    validation = _validation_names(others)
-    fitted = [scene for scene in others if scene.name not in validation]
-    return Split(
-        fitted, [scene for scene in others if scene.name in validation] or fitted, reported
-    )
+
+    chosen = _validation_names(others)
+    fitted = [scene for scene in others if scene.name not in chosen]
+    validation = [scene for scene in others if scene.name in chosen]
+    return Split(fitted, validation or fitted, reported)
 
 
 def _validation_names(scenes: list[SceneTracks]) -> set[str]:
     """The smallest of ``scenes`` that together hold a twelfth of the windows; never all of them."""
     sizes = {scene.name: count_windows(scene) for scene in scenes}
-    wanted, held, names = VALIDATION_SHARE * sum(sizes.values()), 0, set[str]()
+    wanted = VALIDATION_SHARE * sum(sizes.values())
+    held = 0
+    names = set[str]()
+    # The largest is left for the fit, however little the others hold.
     for name in sorted(sizes, key=lambda name: (sizes[name], name))[:-1]:
-        if held >= wanted and held:
+        if held >= wanted:
             break
         names.add(name)
         held += sizes[name]
     return names if held else set()
 
 
-def fit_task(config: Config, split: Split) -> Task:
-    """The task on the fitted and validation scenes of ``split``."""
-    if isinstance(config, PaperConfig):
-        return PaperTask(split.fitted, split.validation, config)
-    return CalibratedTask(split.fitted, split.validation, config)
-
-
 def fit_key(config: Config, split: Split) -> str:
-    """Hash of everything that a fit depends on.
+    """Hash of all that a fit depends on: its settings, and the recordings of each part."""
+    settings = {"preset": config.preset, "config": asdict(config), **split.names}
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
+    for scene in (*split.fitted, *split.validation, *split.held_out):
+        for array in (scene.positions, scene.lane):
+            digest.update(f"{array.dtype.str}{array.shape}".encode())
+            digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()[:12]
 
-    Its settings, and the recordings of each part of the split.
-    """
-    settings = {
-        "preset": config.preset,
-        "config": json.loads(json.dumps(asdict(config))),
-        **split.names,
-    }
-    scenes = (*split.fitted, *split.validation, *split.held_out)
-    return content_hash(
-        settings, *(part for scene in scenes for part in (scene.positions, scene.lane))
-    )[:12]
+
+def run_fit(
+    config: Config,
+    split: Split,
+    folder: Path | None = None,
+    on_progress: OnProgress | None = None,
+    name: str = "fit",
+) -> FitLoop:
+    """Fit to ``split`` until it stops improving; the state in ``folder`` is resumed from."""
+    path = None if folder is None else folder / f"{config.preset}_{fit_key(config, split)}.pt"
+    if isinstance(config, PaperConfig):
+        loop = FitLoop(PaperTask(split.fitted, split.validation, config), path, name)
+    else:
+        loop = FitLoop(CalibratedTask(split.fitted, split.validation, config), path, name)
+    loop.run(on_progress)
+    return loop
 
 
 def fit_generator(
-    preset: Preset,
+    config: Config,
     frame: pl.DataFrame,
-    *,
     held_out: tuple[str, ...] = HELD_OUT,
-    config: Config | None = None,
-    source: str = "",
-    resume_path: str | Path | None = None,
+    folder: Path | None = None,
     on_progress: OnProgress | None = None,
+    source: str = "",
 ) -> FitResult:
     """Fit a generator to recorded trajectories in ``ganlane.data``'s schema.
 
@@ -188,48 +182,44 @@ def fit_generator(
     influence neither the weights nor early stopping. The driving statistics are of all scenes.
 
     Args:
-        preset: ``"paper"`` (positions only, open loop) or ``"calibrated"`` (anchored, closed-loop
-            rollouts).
+        config: :class:`PaperConfig` (positions only, open loop) or :class:`CalibratedConfig`
+            (anchored, closed-loop rollouts).
+        frame: the recordings.
         held_out: names of the scenes that are reported.
-        source: name of the recordings' file, for the metadata.
-        resume_path: file that keeps the state; the fit resumes from it if it exists.
+        folder: where the state is kept; the fit resumes from it.
         on_progress: called after every update.
+        source: name of the recordings' file, for the metadata.
 
     Raises:
-        UserError: unknown preset, a config of the other preset, unusable recordings or scene names.
+        UserError: unusable recordings or scene names.
     """
-    expected = _CONFIGS.get(preset)
-    if expected is None:
-        raise UserError(f"preset {preset!r}: expected one of {sorted(_CONFIGS)}.")
-    config = expected() if config is None else config
-    if not isinstance(config, expected):
-        raise UserError(
-            f"config {type(config).__name__}: not the one of preset {preset!r}; give a {expected.__name__}."
-        )
     split = split_for_fit(scene_tracks(frame), held_out)
-    task = fit_task(config, split)
-    loop = FitLoop(task, resume_path)
-    loop.run(on_progress)
-    return fit_result(loop, split, frame, source, task.metrics(split.held_out), frame)
+    loop = run_fit(config, split, folder, on_progress)
+    return _fit_result(loop, split, frame, source, loop.task.metrics(split.held_out), frame)
 
 
-def fit_result(
+def _fit_result(
     loop: FitLoop,
     split: Split,
     frame: pl.DataFrame,
     source: str,
     metrics: Metrics,
-    others: pl.DataFrame,
+    driven: pl.DataFrame,
 ) -> FitResult:
-    """The result of a finished ``loop``; ``others`` are the recordings of the driving statistics."""
-    task, tracks = loop.task, frame.select(TRACK).n_unique()
+    """The result of a finished ``loop``; its driving statistics are those of ``driven``."""
+    task = loop.task
+    data = {
+        "file": Path(source).name,
+        "rows": frame.height,
+        "tracks": frame.select(TRACK).n_unique(),
+        **split.names,
+    }
     return FitResult(
-        preset=task.config.preset,
+        config=task.config,
         module=task.generator.eval().requires_grad_(False),
         metrics=metrics,
-        config=asdict(task.config),
-        data={"file": Path(source).name, "rows": frame.height, "tracks": tracks, **split.names},
-        statistics=driving_statistics(others).to_dict(),
+        data=data,
+        statistics=driving_statistics(driven).to_dict(),
         updates=loop.best_update,
         seconds=loop.seconds,
     )
@@ -242,111 +232,92 @@ class HeldOut(NamedTuple):
     forecasts: Forecasts
 
 
-class ScoredFit(NamedTuple):
-    """A finished fit and forecasts of its held-out scenes: ``short`` as far as the preset predicts,
-    ``long`` for 5 s.
-
-    Long forecasts are made by the calibrated preset only, and only if a vehicle was recorded for
-    long enough.
-    """
-
-    loop: FitLoop
-    short: HeldOut
-    long: HeldOut | None
-
-
-def fit_and_forecast(
-    config: Config, split: Split, folder: Path, on_progress: OnProgress | None = None
-) -> ScoredFit:
-    """Fit to ``split`` and forecast its held-out scenes; resumes from what ``folder`` holds."""
-    task = fit_task(config, split)
-    path = folder / f"{config.preset}_{fit_key(config, split)}.pt"
-    loop = FitLoop(task, path)
-    loop.run(on_progress)
-    short = _forecasts(path, task, split, config.sizes.predicted, STRIDE)
-    frames = OBSERVED_POSITIONS + LONG_STEPS
-    far = isinstance(task, CalibratedTask) and any(
-        (each.present.sum(0) >= frames).any() for each in split.held_out
-    )
-    return ScoredFit(
-        loop, short, _forecasts(path, task, split, LONG_STEPS, LONG_STRIDE) if far else None
-    )
-
-
-def _forecasts(path: Path, task: Task, split: Split, steps: int, stride: int) -> HeldOut:
-    """Forecasts of the held-out windows by the generator, IDM and all baselines, saved next to the
-    fit's state.
-    """
-    path = path.with_name(f"{path.stem}_{steps}.npz")
+def _held_out(task: PaperTask | CalibratedTask, split: Split, steps: int, stride: int) -> HeldOut:
+    """Forecasts of the held-out windows by the generator, IDM and all baselines."""
     windows = cut_windows(split.held_out, stride, OBSERVED_POSITIONS + steps)
-    kept = load_arrays(path)
-    if kept is not None:
-        return HeldOut(windows, kept)
     if isinstance(task, CalibratedTask):
-        # the best of 20 is for short forecasts only
+        # The best of 20 is for short forecasts only.
         samples = 1 if steps == LONG_STEPS else SAMPLES
-        own = calibrated_forecasts(
+        forecasts = calibrated_forecasts(
             task.generator, split.held_out, steps, stride, task.config, samples
         )
     else:
         groups = group_windows(windows, task.config.group_size, task.config.seed)
-        own = paper_forecasts(task.generator, windows, groups, task.config.seed)
-    baselines = baseline_forecasts(windows, split.fitted + split.validation, stride)
-    every = own | baselines | idm_forecasts(split.held_out, steps, stride)
-    forecasts = {name: positions.astype(np.float32) for name, positions in every.items()}
-    save_arrays(path, forecasts)
+        forecasts = paper_forecasts(task.generator, windows, groups, task.config.seed)
+    forecasts |= baseline_forecasts(windows, split.fitted + split.validation, stride)
+    forecasts |= idm_forecasts(split.held_out, steps, stride)
+    # Half the memory: the windows of all folds are held at the same time.
+    forecasts = {name: positions.astype(np.float32) for name, positions in forecasts.items()}
     return HeldOut(windows, forecasts)
 
 
-def pooled(parts: list[HeldOut]) -> tuple[Windows, Forecasts, np.ndarray]:
-    """All folds' windows and forecasts, and the fold [W] of each window."""
+def short_forecasts(task: PaperTask | CalibratedTask, split: Split) -> HeldOut:
+    """Forecasts of the held-out scenes as far as the preset predicts."""
+    return _held_out(task, split, task.config.sizes.predicted, STRIDE)
+
+
+def long_forecasts(task: PaperTask | CalibratedTask, split: Split) -> HeldOut | None:
+    """Forecasts of the held-out scenes for 5 s.
+
+    By the calibrated preset only, and only if a vehicle was recorded for long enough.
+    """
+    frames = OBSERVED_POSITIONS + LONG_STEPS
+    recorded = any((scene.present.sum(0) >= frames).any() for scene in split.held_out)
+    if isinstance(task, PaperTask) or not recorded:
+        return None
+    return _held_out(task, split, LONG_STEPS, LONG_STRIDE)
+
+
+def pooled(parts: list[HeldOut]) -> HeldOut:
+    """All folds' windows and forecasts."""
     forecasts = {
         name: np.concatenate([part.forecasts[name] for part in parts])
         for name in parts[0].forecasts
     }
-    fold = np.repeat(np.arange(len(parts)), [len(part.windows) for part in parts])
-    return join_windows([part.windows for part in parts]), forecasts, fold
+    return HeldOut(join_windows([part.windows for part in parts]), forecasts)
 
 
 def cross_validate(
-    frame: pl.DataFrame,
     config: Config,
+    frame: pl.DataFrame,
     folds: int,
     folder: Path,
-    on_fit: OnFit | None = None,
     on_progress: OnProgress | None = None,
-    on_fold: Callable[[int, FitResult], None] | None = None,
     source: str = "",
-) -> dict[str, Any]:
+) -> tuple[dict[str, Any], list[FitResult]]:
     """Fit ``folds`` generators, each without its fold's scenes, and score them on these.
 
-    ``on_fold`` gets each fold's number, from 1, and its generator, with driving statistics of its
-    other scenes only; ``source`` names the recordings in its metadata.
-
     Returns:
-        ``open_loop`` (:func:`open_loop_scores`), ``splits`` (names of the scenes of each fold's
-        parts), and for the calibrated preset ``rollout`` (:func:`long_rollout_scores`).
+        The scores: ``open_loop`` (:func:`open_loop_scores`), ``splits`` (names of the scenes of
+        each fold's parts), and for the calibrated preset ``rollout``
+        (:func:`long_rollout_scores`). Then each fold's generator, with driving statistics of its
+        other scenes only and ``source`` as the recordings' name.
 
     Raises:
         UserError: too many folds for the recordings.
     """
     scenes = scene_tracks(frame)
     splits = [split_for_fit(scenes, names) for names in assign_folds(scenes, folds)]
-    fits: list[ScoredFit] = []
+    results = []
+    short = []
+    long = []
     for number, split in enumerate(splits, start=1):
-        if on_fit is not None:
-            on_fit(f"fold {number} of {folds}")
-        fit = fit_and_forecast(config, split, folder, on_progress)
-        fits.append(fit)
-        if on_fold is not None:
-            others = frame.filter(~pl.col("scene").is_in(split.names["held_out"]))
-            on_fold(number, fit_result(fit.loop, split, frame, source, {}, others))
-    open_loop = open_loop_scores(*pooled([fit.short for fit in fits]))
-    scores: dict[str, Any] = {"splits": [split.names for split in splits], "open_loop": open_loop}
-    if long := [fit.long for fit in fits if fit.long is not None]:
-        windows, forecasts, _ = pooled(long)
-        scores["rollout"] = long_rollout_scores(windows, forecasts)
-    return scores
+        loop = run_fit(config, split, folder, on_progress, f"fold {number} of {folds}")
+        others = frame.filter(~pl.col("scene").is_in(split.names["held_out"]))
+        results.append(_fit_result(loop, split, frame, source, {}, others))
+        short.append(short_forecasts(loop.task, split))
+        if rollout := long_forecasts(loop.task, split):
+            long.append(rollout)
+
+    # All folds are scored together; each window was held out in one of them.
+    fold = np.repeat(np.arange(folds), [len(part.windows) for part in short])
+    scores: dict[str, Any] = {
+        "splits": [split.names for split in splits],
+        "open_loop": open_loop_scores(*pooled(short), fold),
+    }
+    if long:
+        scores["rollout"] = long_rollout_scores(*pooled(long))
+    return scores, results
 
 
 def variants(config: Config) -> dict[str, Config]:
@@ -354,11 +325,13 @@ def variants(config: Config) -> dict[str, Config]:
 
     The first is the preset itself.
     """
-    loop = config.loop
-    quarter = {
-        name: max(1, getattr(loop, name) // 4) for name in ("updates", "evaluate_every", "warmup")
-    }
-    config = replace(config, loop=replace(loop, **quarter))
+    loop = replace(
+        config.loop,
+        updates=max(1, config.loop.updates // 4),
+        evaluate_every=max(1, config.loop.evaluate_every // 4),
+        warmup=max(1, config.loop.warmup // 4),
+    )
+    config = replace(config, loop=loop)
     if isinstance(config, CalibratedConfig):
         return {
             "as it is": config,
@@ -366,7 +339,9 @@ def variants(config: Config) -> dict[str, Config]:
             "without further inputs": replace(config, further_inputs=False),
             "without traits": replace(config, traits=False),
         }
-    sizes, weights = config.sizes, config.weights
+    sizes = config.sizes
+    weights = config.weights
+    alone = replace(weights, single=0.0, mean=0.0, adversarial=0.0)
     return {
         "as it is (p_l = 8)": config,
         "p_l = 4": replace(config, sizes=replace(sizes, predicted=4)),
@@ -375,23 +350,19 @@ def variants(config: Config) -> dict[str, Config]:
         "without differences as inputs": replace(config, sizes=replace(sizes, differences=False)),
         "without adversarial term": replace(config, weights=replace(weights, adversarial=0.0)),
         "without single-sample term": replace(config, weights=replace(weights, single=0.0)),
-        "variety term alone": replace(
-            config, weights=replace(weights, single=0.0, mean=0.0, adversarial=0.0)
-        ),
+        "variety term alone": replace(config, weights=alone),
         "with history noise of 0.5": replace(config, history_noise=0.5),
     }
 
 
 def ablate(
-    frame: pl.DataFrame,
     config: Config,
+    frame: pl.DataFrame,
     held_out: tuple[str, ...],
     folder: Path,
-    on_fit: OnFit | None = None,
     on_progress: OnProgress | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """Fit the preset with one part changed at a time to one split, and score every variant on
-    ``held_out``.
+    """Fit the preset with one part changed at a time, and score every variant on ``held_out``.
 
     Returns:
         Per variant ``windows``, the change of ADE to constant velocity's in %
@@ -402,25 +373,20 @@ def ablate(
     split = split_for_fit(scene_tracks(frame), held_out)
     rows = {}
     for name, variant in variants(config).items():
-        if on_fit is not None:
-            on_fit(name)
-        rows[name] = _ablation_row(fit_and_forecast(variant, split, folder, on_progress))
+        task = run_fit(variant, split, folder, on_progress, name).task
+        windows, forecasts = short_forecasts(task, split)
+        kinds = ("mean", "single", f"best_of_{SAMPLES}", BASELINE)
+        errors = errors_of({kind: forecasts[kind] for kind in kinds}, windows.future)
+        # Predictions of any length can be compared over 0.4 s.
+        early = {kind: values[:, :4] for kind, values in errors.items()}
+        scores = displacement_errors(errors)
+        row = {
+            "windows": scores["windows"],
+            "ade_change_percent": scores["ade_change_percent"],
+            "ade_change_percent_0.4_s": displacement_errors(early)["ade_change_percent"],
+        }
+        if rollout := long_forecasts(task, split):
+            ratio = long_rollout_scores(*rollout)["ratio_to_constant_velocity"]
+            row["rmse_5_s_ratio"] = {kind: ratio[kind] for kind in ("mean", "single")}
+        rows[name] = row
     return rows
-
-
-def _ablation_row(fit: ScoredFit) -> dict[str, Any]:
-    kinds = ("mean", "single", f"best_of_{SAMPLES}", BASELINE)
-    errors = errors_of(
-        {kind: fit.short.forecasts[kind] for kind in kinds}, fit.short.windows.future
-    )
-    all_steps = displacement_errors(errors)
-    # Predictions of any length can be compared over 0.4 s.
-    early = displacement_errors({kind: values[:, :4] for kind, values in errors.items()})
-    row = {name: all_steps[name] for name in ("windows", "ade_change_percent")}
-    row["ade_change_percent_0.4_s"] = early["ade_change_percent"]
-    if fit.long is not None:
-        ratio = long_rollout_scores(fit.long.windows, fit.long.forecasts)[
-            "ratio_to_constant_velocity"
-        ]
-        row["rmse_5_s_ratio"] = {kind: ratio[kind] for kind in ("mean", "single")}
-    return row

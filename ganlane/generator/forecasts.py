@@ -1,6 +1,6 @@
-"""Forecasts of recorded windows by both presets, by IDM and by baselines without a network, and
-their scores.
+"""Forecasts of recorded windows, and their scores.
 
+Forecasters are both presets, IDM, and baselines without a network.
 Every forecast is positions [W, T, 2] in m relative to the present, for the windows of
 :func:`~ganlane.generator.windows.cut_windows` in the same order. Kinds of forecasts by a generator:
 ``mean`` (z = 0), ``single`` (one sample), ``best_of_20`` (by ADE). ADE is the mean error over the
@@ -60,8 +60,13 @@ _SMALLEST_DISTANCE_M = 1e-4
 #: Name of a forecast to positions [W, T, 2] in m relative to the present, or to errors [W, T] in m.
 Forecasts = dict[str, np.ndarray]
 Row = dict[str, Any]
-#: Groups, segments times samples, and segments with three samples in one pass; bounds the memory.
-_GROUPS, _ROLLOUTS, _SEGMENTS = 128, 160, 16
+# What goes through a network in one pass; bounds the memory.
+#: Groups of windows.
+_GROUPS = 128
+#: Segments times samples.
+_ROLLOUTS = 160
+#: Segments with three samples each.
+_SEGMENTS = 16
 #: Penalties from which the ridge regression chooses by leave-one-out validation.
 _PENALTIES = tuple(10.0**power for power in range(-2, 6))
 
@@ -74,15 +79,15 @@ def distance(one: Tensor, other: Tensor) -> Tensor:
 
 def scene_metrics(windows: Windows, forecasts: Forecasts) -> Metrics:
     """``{"all" or scene: {"ade_m/KIND", "fde_m/KIND", ..., "windows"}}`` of the forecasts, in m."""
-    errors, metrics = errors_of(forecasts, windows.future), {}
-    for name, rows in {"all": np.ones(len(windows), dtype=bool), **windows.by_scene}.items():
+    errors = errors_of(forecasts, windows.future)
+    everywhere = np.ones(len(windows), dtype=bool)
+    metrics: Metrics = {}
+    for name, rows in {"all": everywhere, **windows.by_scene}.items():
         row = displacement_errors(errors, rows)
-        metrics[name] = {
-            f"{error}/{kind}": row[error][kind]
-            for error in ("ade_m", "fde_m")
-            for kind in forecasts
-        }
-        metrics[name]["windows"] = float(row["windows"])
+        metrics[name] = {"windows": float(row["windows"])}
+        for error in ("ade_m", "fde_m"):
+            for kind in forecasts:
+                metrics[name][f"{error}/{kind}"] = row[error][kind]
     return metrics
 
 
@@ -94,15 +99,17 @@ def errors_of(forecasts: Forecasts, recorded: np.ndarray) -> Forecasts:
 
 
 def displacement_errors(errors: Forecasts, rows: np.ndarray | None = None) -> Row:
-    """ADE and FDE in m of every forecast over the chosen windows, and the ADE's change to the
-    baseline's in %.
+    """ADE and FDE in m of every forecast over the chosen windows.
+
+    The ADE's change to the baseline's is added, in %.
     """
-    chosen = errors if rows is None else {name: values[rows] for name, values in errors.items()}
-    ade = {name: float(values.mean()) for name, values in chosen.items()}
-    fde = {name: float(values[:, -1].mean()) for name, values in chosen.items()}
+    if rows is not None:
+        errors = {name: values[rows] for name, values in errors.items()}
+    ade = {name: float(values.mean()) for name, values in errors.items()}
+    fde = {name: float(values[:, -1].mean()) for name, values in errors.items()}
     change = {name: 100.0 * (value / ade[BASELINE] - 1.0) for name, value in ade.items()}
     return {
-        "windows": len(chosen[BASELINE]),
+        "windows": len(errors[BASELINE]),
         "ade_m": ade,
         "fde_m": fde,
         "ade_change_percent": change,
@@ -110,14 +117,14 @@ def displacement_errors(errors: Forecasts, rows: np.ndarray | None = None) -> Ro
 
 
 def parts_of(windows: Windows, least: int) -> dict[str, np.ndarray]:
-    """Masks [W] of the windows by lane (1 the leftmost) and by class, of parts with at least
-    ``least`` windows.
+    """Masks [W] of the windows by lane (1 the leftmost) and by class.
+
+    Parts with fewer than ``least`` windows are left out.
     """
-    lanes, truck = windows.lane_from_left, windows.length > TRUCK_M
-    parts = {f"lane {lane}": lanes == lane for lane in np.unique(lanes)} | {
-        "car": ~truck,
-        "truck": truck,
-    }
+    lanes = windows.lane_from_left
+    parts = {f"lane {lane}": lanes == lane for lane in np.unique(lanes)}
+    parts["car"] = windows.length <= TRUCK_M
+    parts["truck"] = windows.length > TRUCK_M
     return {name: rows for name, rows in parts.items() if rows.sum() >= least}
 
 
@@ -130,47 +137,49 @@ def direction_scores(
     """
     lateral = observed + recorded[:, -1, 1]
     moving = np.abs(lateral) > SIDEWAYS_M
-    right = {
-        name: ((observed + course[:, -1, 1]) * lateral > 0)[moving]
-        for name, course in forecasts.items()
-    }
-    shares = {name: float(hits.mean()) if len(hits) else None for name, hits in right.items()}
+    shares: dict[str, float | None] = {}
+    for name, course in forecasts.items():
+        right = ((observed + course[:, -1, 1]) * lateral > 0)[moving]
+        shares[name] = float(right.mean()) if len(right) else None
     return {"windows": int(moving.sum()), "share_right": shares}
 
 
 def side_classifier_share(windows: Windows, fold: np.ndarray) -> float | None:
-    """Share of lateral moves after the present whose side a dedicated classifier predicts; None
-    without moves.
+    """Share of lateral moves after the present whose side a dedicated classifier predicts.
 
-    Gradient boosting on the observed motion, the lane and the length, fitted to the other folds'
-    moving vehicles: a reference for :func:`direction_scores`, about as much as the history
-    contains.
+    None without moves. Gradient boosting on the observed motion, the lane and the length, fitted to
+    the other folds' moving vehicles: a reference for :func:`direction_scores`, about as much as the
+    history contains.
     """
-    lateral, past = windows.future[:, -1, 1], windows.past
+    lateral = windows.future[:, -1, 1]
     moving = np.abs(lateral) > SIDEWAYS_M
+
+    # The observed displacements, their changes along the road, how far the vehicle has moved
+    # sideways since each of them; then the lane from both sides, and the length.
+    past = windows.past
     moved = past[..., 1][:, ::-1].cumsum(axis=1)
     others = np.stack([windows.lane, windows.lane_from_left, windows.length], axis=1)
     differences = np.diff(past, axis=1)[..., 0]
     features = np.concatenate([past.reshape(len(past), -1), differences, moved, others], axis=1)
     features, left, fold = features[moving], lateral[moving] > 0, fold[moving]
+
     hits = []
     for number in np.unique(fold):
-        own = fold == number
-        if len(np.unique(left[~own])) == 2:
+        tested = fold == number
+        if len(np.unique(left[~tested])) == 2:
             model = HistGradientBoostingClassifier(max_iter=150, max_leaf_nodes=15, random_state=0)
-            hits.append(model.fit(features[~own], left[~own]).predict(features[own]) == left[own])
+            model.fit(features[~tested], left[~tested])
+            hits.append(model.predict(features[tested]) == left[tested])
     return float(np.concatenate(hits).mean()) if hits else None
 
 
 def rmse_by_second(errors: Forecasts) -> dict[str, dict[str, float]]:
     """Root mean square error in m after each whole second (10 steps), of every forecast."""
-    return {
-        name: {
-            f"{k} s": float(np.sqrt((each**2).mean()))
-            for k, each in enumerate(values.T[9::10], start=1)
-        }
-        for name, values in errors.items()
-    }
+    rmse: dict[str, dict[str, float]] = {}
+    for name, values in errors.items():
+        seconds = enumerate(values.T[9::10], start=1)
+        rmse[name] = {f"{k} s": float(np.sqrt((error**2).mean())) for k, error in seconds}
+    return rmse
 
 
 def open_loop_scores(
@@ -181,6 +190,7 @@ def open_loop_scores(
     Parts (lanes, classes) of fewer than ``least_part`` windows are left out.
     """
     errors = errors_of(forecasts, windows.future)
+    folds = {str(number): fold == number for number in range(int(fold.max()) + 1)}
 
     def by(masks: dict[str, np.ndarray]) -> dict[str, Row]:
         return {
@@ -189,37 +199,38 @@ def open_loop_scores(
 
     direction = direction_scores(forecasts, windows.future)
     direction["share_right"]["side classifier"] = side_classifier_share(windows, fold)
+    observed = windows.past[..., 1].sum(1)
     return {
         **displacement_errors(errors),
-        "folds": by({str(number): fold == number for number in range(int(fold.max()) + 1)}),
+        "folds": by(folds),
         "scenes": by(windows.by_scene),
         "parts": by(parts_of(windows, least_part)),
         "direction": direction,
-        "direction_whole_window": direction_scores(
-            forecasts, windows.future, windows.past[..., 1].sum(1)
-        ),
+        "direction_whole_window": direction_scores(forecasts, windows.future, observed),
     }
 
 
 def long_rollout_scores(windows: Windows, forecasts: Forecasts) -> Row:
-    """RMSE after each second, number of windows and tracks, and the ratio to constant velocity's at
-    the end.
+    """RMSE after each second, and its ratio to constant velocity's at the end.
+
+    The numbers of windows and tracks are added.
     """
     rmse = rmse_by_second(errors_of(forecasts, windows.future))
     last = f"{windows.future.shape[1] // 10} s"
-    ratio = {name: values[last] / rmse[BASELINE][last] for name, values in rmse.items()}
-    tracks = len(np.unique(np.stack([windows.scene, windows.vehicle]), axis=1).T)
     return {
         "windows": len(windows),
-        "tracks": tracks,
+        "tracks": len(set(zip(windows.scene, windows.vehicle))),
         "rmse_m": rmse,
-        "ratio_to_constant_velocity": ratio,
+        "ratio_to_constant_velocity": {
+            name: values[last] / rmse[BASELINE][last] for name, values in rmse.items()
+        },
     }
 
 
 def by_kind(samples: np.ndarray, recorded: np.ndarray) -> Forecasts:
-    """``mean`` (z = 0), ``single`` and ``best_of_20`` (by ADE) of samples [1 + K, W, T, 2], the
-    first with z = 0.
+    """The kinds of forecasts in samples [1 + K, W, T, 2], of which the first has z = 0.
+
+    ``mean``, ``single`` and, of 20 samples or more, ``best_of_20`` (by ADE).
     """
     kinds = dict(zip(("mean", "single"), samples))
     if len(samples) > SAMPLES:
@@ -238,12 +249,14 @@ def paper_forecasts(
     for rows in torch.arange(len(groups)).split(_GROUPS):
         chunk = groups.select(rows)
         past = chunk.displacements[..., : generator.sizes.observed, :]
+        observation = generator.observe(past, chunk.position, chunk.mask)
         noise = torch.randn(1 + samples, *chunk.mask.shape, generator.sizes.noise, generator=random)
+        # The first sample is the mean prediction.
         noise[0] = 0.0
-        predicted = generator(generator.observe(past, chunk.position, chunk.mask), noise).cumsum(
-            dim=-2
-        )
-        positions[:, chunk.window[chunk.mask].numpy()] = predicted[:, chunk.mask].double().numpy()
+        predicted = generator(observation, noise).cumsum(dim=-2)
+        # From groups back to the order of the windows.
+        row = chunk.window[chunk.mask].numpy()
+        positions[:, row] = predicted[:, chunk.mask].double().numpy()
     return by_kind(positions, windows.future)
 
 
@@ -254,16 +267,18 @@ def driven_windows(
     stride: int,
     samples: int = 1,
 ) -> np.ndarray:
-    """Forecasts [K, W, H, 2] of all windows of 9 + ``horizon`` frames: the vehicles recorded
-    throughout a segment.
+    """Forecasts [K, W, H, 2] of all windows of 9 + ``horizon`` frames.
 
-    ``driver`` drives all vehicles of a batch of segments jointly: positions [K, B, H, V, 2] of K =
-    ``samples``.
+    These are of the vehicles recorded throughout a segment, whose vehicles ``driver`` drives all
+    jointly: positions [K, B, H, V, 2] of K = ``samples``.
     """
+    size = max(1, _ROLLOUTS // samples)
     forecasts = []
     for scene in scenes:
-        for segments in segment_batches(scene, horizon, stride, max(1, _ROLLOUTS // samples)):
-            positions = driver(segments.without_intentions()) - segments.positions[:, PRESENT, None]
+        for segments in segment_batches(scene, horizon, stride, size):
+            present = segments.positions[:, PRESENT, None]
+            positions = driver(segments.without_intentions()) - present
+            # A window is a vehicle that is recorded in all frames.
             complete = segments.present.all(dim=1)
             forecasts.append(positions.transpose(2, 3)[:, complete].double().numpy())
     return np.concatenate(forecasts, axis=1)
@@ -278,8 +293,9 @@ def calibrated_forecasts(
     config: CalibratedConfig,
     samples: int = SAMPLES,
 ) -> Forecasts:
-    """The calibrated preset, rolled out through whole scenes with the target lanes and drivers of
-    the present.
+    """The calibrated preset, rolled out through whole scenes.
+
+    Target lanes and drivers are those of the present.
     """
     random = torch.Generator().manual_seed(0)
 
@@ -287,7 +303,8 @@ def calibrated_forecasts(
         shape = (1 + horizon, 1 + samples, *segments.length.shape, generator.sizes.noise)
         noise = torch.randn(shape, generator=random)
         noise[:, 0] = 0.0
-        return rollout(generator, segments, driver_params(segments, config.traits), noise, config)
+        drivers = driver_params(segments, config.traits)
+        return rollout(generator, segments, drivers, noise, config)
 
     forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
     recorded = driven_windows(lambda segments: segments.future[None], scenes, horizon, stride)[0]
@@ -306,42 +323,39 @@ def idm_forecasts(scenes: list[SceneTracks], horizon: int, stride: int) -> Forec
         headway, desired = driver_params(segments, traits=own_headway)
 
         def move(vehicles: Vehicles, step: int) -> Vehicles:
-            acceleration = following_acceleration(
-                perceive(vehicles, segments.road), TABLE_V, headway
-            )
-            velocity = (
-                displacement_of(vehicles)[..., 0] / PHYSICS_STEP_S + acceleration * PHYSICS_STEP_S
-            )
+            scene = perceive(vehicles, segments.road)
+            acceleration = following_acceleration(scene, TABLE_V, headway)
+            speed = displacement_of(vehicles)[..., 0] / PHYSICS_STEP_S
+            velocity = speed + acceleration * PHYSICS_STEP_S
             return moved_by(vehicles, velocity, torch.zeros_like(velocity))
 
         return driven_positions(segments, desired, move)[None]
 
     return {
-        name: driven_windows(partial(driver, own_headway=own), scenes, horizon, stride)[0]
-        for name, own in (("idm", False), ("idm_own_headway", True))
+        name: driven_windows(partial(driver, own_headway=balanced), scenes, horizon, stride)[0]
+        for name, balanced in (("idm", False), ("idm_own_headway", True))
     }
 
 
 def baseline_forecasts(windows: Windows, others: list[SceneTracks], stride: int) -> Forecasts:
-    """Forecasts without a network; the ridge regression is fitted to windows of the scenes
-    ``others``.
+    """Forecasts without a network.
 
     ``mean_velocity`` repeats the mean observed displacement, which recorded noise disturbs less
-    than the last one.
+    than the last one. The ridge regression is fitted to windows of the scenes ``others``.
     """
-    past, steps = windows.past, windows.future.shape[1]
+    past = windows.past
+    steps = windows.future.shape[1]
+    fitted = cut_windows(others, stride, OBSERVED_POSITIONS + steps)
     return {
         BASELINE: repeated(past[:, -1], steps),
         "mean_velocity": repeated(past.mean(axis=1), steps),
         "constant_acceleration": constant_acceleration(past, steps),
-        "ridge": ridge_forecast(cut_windows(others, stride, OBSERVED_POSITIONS + steps), past),
+        "ridge": ridge_forecast(fitted, past),
     }
 
 
 def repeated(displacement: np.ndarray, steps: int) -> np.ndarray:
-    """Positions [W, T, 2] in m relative to the present when ``displacement`` [W, 2] per 0.1 s is
-    repeated.
-    """
+    """Positions [W, T, 2] in m after the present when ``displacement`` [W, 2] per 0.1 s repeats."""
     return displacement[:, None] * np.arange(1.0, steps + 1.0)[:, None]
 
 
@@ -364,18 +378,18 @@ def ridge_forecast(fitted: Windows, past: np.ndarray) -> np.ndarray:
     def features(past: np.ndarray) -> np.ndarray:
         return np.concatenate([past[:, -1:], np.diff(past, axis=1)], axis=1).reshape(len(past), -1)
 
-    known, future = (
-        np.concatenate([each, each * (1.0, -1.0)]) for each in (fitted.past, fitted.future)
-    )
+    mirrored = (1.0, -1.0)
+    observed = np.concatenate([fitted.past, fitted.past * mirrored])
+    future = np.concatenate([fitted.future, fitted.future * mirrored])
     steps = future.shape[1]
+    missing = future - repeated(observed[:, -1], steps)
     model = make_pipeline(StandardScaler(), RidgeCV(alphas=_PENALTIES))
-    model.fit(features(known), (future - repeated(known[:, -1], steps)).reshape(len(known), -1))
+    model.fit(features(observed), missing.reshape(len(missing), -1))
     return repeated(past[:, -1], steps) + model.predict(features(past)).reshape(len(past), steps, 2)
 
 
 def energy_score(one: Tensor, other: Tensor, recorded: Tensor) -> Tensor:
-    """Energy score of two samples, in the unit of the positions: mean error minus half their
-    distance.
+    """Energy score [...] of two samples: mean error minus half their distance, in m.
 
     All are positions [..., 2]. A proper score: least in expectation when the samples are drawn from
     the distribution of the recordings (Gneiting and Raftery 2007).
@@ -394,23 +408,22 @@ def rollout_errors(
     used. Unlike forecasts of windows, these count a vehicle for as long as it is recorded.
 
     Returns:
-        ``{"all"
-        or scene: {"ade_m/KIND" over 0.8 s, "fde_m/KIND" at 0.8 s, "end_m/KIND" at the last step,
-        "relative_mean", "relative_energy", "end_s",
-        "windows"}}``
-        with the kinds ``mean``, ``single``, ``constant_velocity`` and ``energy`` (the energy score
-        of two samples).
+        ``{"all" or scene: {"ade_m/KIND" over 0.8 s, "fde_m/KIND" at 0.8 s, "end_m/KIND" at the last
+        step, "relative_mean", "relative_energy", "end_s", "windows"}}`` with the kinds ``mean``,
+        ``single``, ``constant_velocity`` and ``energy`` (the energy score of two samples).
     """
-    random, horizon = torch.Generator().manual_seed(0), config.held_out_horizon
+    random = torch.Generator().manual_seed(0)
+    horizon = config.held_out_horizon
     parts: dict[str, list[tuple[dict[str, Tensor], Tensor]]] = {"all": []}
     for scene in scenes:
         for batch in segment_batches(scene, horizon, config.held_out_stride, _SEGMENTS):
             segments = batch.without_intentions()
-            fresh = torch.randn(
-                1 + horizon, 2, *segments.length.shape, generator.sizes.noise, generator=random
-            )
+            future = segments.future
+            drivers = driver_params(segments, config.traits)
+            # Three rollouts at once: the mean prediction, and two samples.
+            shape = (1 + horizon, 2, *segments.length.shape, generator.sizes.noise)
+            fresh = torch.randn(shape, generator=random)
             noise = torch.cat([torch.zeros_like(fresh[:, :1]), fresh], dim=1)
-            drivers, future = driver_params(segments, config.traits), segments.future
             mean, one, other = rollout(generator, segments, drivers, noise, config)
             errors = {
                 "mean": distance(mean, future),
@@ -430,20 +443,20 @@ def _step_means(parts: list[tuple[dict[str, Tensor], Tensor]], horizon: int) -> 
         for kind in parts[0][0]
     }
     short = min(PREDICTED_STEPS, horizon)
-    metrics = {
-        "end_s": 0.1 * horizon,
-        "windows": max(1.0, float(sum(scored[:, 0].sum() for _, scored in parts))),
-    }
+    windows = float(sum(scored[:, 0].sum() for _, scored in parts))
+    metrics = {"end_s": 0.1 * horizon, "windows": max(1.0, windows)}
     for kind, errors in means.items():
         metrics[f"ade_m/{kind}"] = float(errors[:short].mean())
         metrics[f"fde_m/{kind}"] = float(errors[short - 1])
         metrics[f"end_m/{kind}"] = float(errors[-1])
     for kind in ("mean", "energy"):
-        metrics[f"relative_{kind}"] = float((means[kind] / means[BASELINE].clamp_min(1e-6)).mean())
+        ratio = means[kind] / means[BASELINE].clamp_min(1e-6)
+        metrics[f"relative_{kind}"] = float(ratio.mean())
     return metrics
 
 
 def mean_by_step(parts: list[tuple[Tensor, Tensor]]) -> Tensor:
     """Mean [H] of errors [B, H, V] where their mask [B, H, V] is true, over all parts."""
     count = torch.stack([scored.sum((0, 2)) for _, scored in parts]).sum(0).clamp_min(1)
-    return torch.stack([(errors * scored).sum((0, 2)) for errors, scored in parts]).sum(0) / count
+    total = torch.stack([(errors * scored).sum((0, 2)) for errors, scored in parts]).sum(0)
+    return total / count

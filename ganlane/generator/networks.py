@@ -1,10 +1,5 @@
 """The Social-GAN's two networks (section III; Gupta et al. 2018) and their layers.
 
-**Linear layer.** ``torch.nn.functional.linear`` multiplies float32 by MKL, which uses little of the
-vector units of processors other than Intel's. On an AMD EPYC, oneDNN takes a third of the time from
-a few thousand rows on, and more below :data:`_MANY_ROWS`; its operator has no gradient. Results are
-equal.
-
 **LSTM.** The projection of an input is separate from the recurrence, so that projections can be
 kept when the window of observed motions moves on by one step.
 
@@ -23,11 +18,14 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
+from ganlane.linear import has_fast_product, matrix_product
 from ganlane.settings.generator import GeneratorSizes
 
-#: Typical displacement per 0.1 s and typical change of it, along and across the road, m: the
-#: networks' units.
-DISPLACEMENT_SCALE_M, DIFFERENCE_SCALE_M = (1.0, 0.05), (0.04, 0.02)
+# The networks' units are typical values, so that inputs are of order 1.
+#: Displacement per 0.1 s, along and across the road, m.
+DISPLACEMENT_SCALE_M = (1.0, 0.05)
+#: Change of the displacement from one step to the next, along and across the road, m.
+DIFFERENCE_SCALE_M = (0.04, 0.02)
 #: Changes of displacement are clipped here (in units of the scale): recorded positions sometimes
 #: jump.
 LARGEST_DIFFERENCE = 5.0
@@ -36,23 +34,21 @@ LARGEST_DIFFERENCE = 5.0
 _PAIR_SCALE = (20.0, 4.0, 0.4, 0.05)
 #: Vehicles further away than this along the road have no influence, m.
 RANGE_M = 100.0
-#: oneDNN is faster from this number of rows.
+#: From this number of rows on, oneDNN is faster than MKL on the processors that we measured.
 _MANY_ROWS = 512
-_ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
 
 def dense(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False) -> Tensor:
-    """Linear layer.
+    """Linear layer [..., O] of ``x`` [..., I], ``weight`` [O, I] and ``bias`` [O].
 
-    ``x`` [..., I], ``weight`` [O, I], ``bias`` [O] -> [..., O], with a ReLU if ``relu``.
+    A ReLU follows if ``relu``.
     """
     many = x.numel() >= _MANY_ROWS * x.shape[-1]
-    float32_on_cpu = x.device.type == "cpu" and x.dtype == torch.float32
-    if _ONEDNN and float32_on_cpu and many and not torch.is_grad_enabled():
-        onednn = _compiled_onednn if torch.compiler.is_compiling() else _onednn
-        return onednn(x, weight, bias, relu)
-    out = nn.functional.linear(x, weight, bias)
-    return torch.relu(out) if relu else out
+    # A fit needs gradients, which the fast product does not have.
+    if many and has_fast_product(x) and not torch.is_grad_enabled():
+        return matrix_product(x, weight, bias, relu)
+    product = nn.functional.linear(x, weight, bias)
+    return torch.relu(product) if relu else product
 
 
 def apply(layer: nn.Linear, x: Tensor, relu: bool = False) -> Tensor:
@@ -60,24 +56,10 @@ def apply(layer: nn.Linear, x: Tensor, relu: bool = False) -> Tensor:
     return dense(x, layer.weight, layer.bias, relu)
 
 
-def _onednn(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
-    return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "relu" if relu else "none", [], "")
-
-
-# Compiled graphs accept oneDNN's operator for constant weights only, so they call it through an
-# operator of our own.
-@torch.library.custom_op("ganlane::dense", mutates_args=())
-def _compiled_onednn(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
-    return _onednn(x, weight, bias, relu)
-
-
-@_compiled_onednn.register_fake
-def _shape(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
-    return x.new_empty((*x.shape[:-1], weight.shape[0]))
-
-
 def motion_features(displacement: Tensor, difference: Tensor) -> Tensor:
-    """Network inputs [..., 4] of displacements [..., 2] per 0.1 s and their differences to the step
+    """Network inputs [..., 4] of a motion.
+
+    ``displacement`` [..., 2] is in m per 0.1 s, ``difference`` [..., 2] its change to the step
     before, in m.
     """
     scaled = displacement / displacement.new_tensor(DISPLACEMENT_SCALE_M)
@@ -86,30 +68,32 @@ def motion_features(displacement: Tensor, difference: Tensor) -> Tensor:
 
 
 class MotionLSTM(nn.Module):
-    """Embedding with ReLU, then an LSTM cell in two parts: the projection of the input, and the
-    recurrence.
+    """Embedding with ReLU, then an LSTM cell.
 
-    The gates are ordered input, forget, output, new: the three with a sigmoid are adjacent.
-    ``hidden`` is the width H of the state; without ``differences`` the displacements' differences
-    are 0 as inputs (an ablation).
+    The cell is in two parts, the projection of the input and the recurrence. The gates are ordered
+    input, forget, output, new: the three with a sigmoid are adjacent. ``hidden`` is the width H of
+    the state; without ``differences`` the displacements' differences are 0 as inputs (an ablation).
     """
 
     def __init__(self, embedding: int, hidden: int, differences: bool = True):
         super().__init__()
-        self.hidden, self.differences = hidden, differences
+        self.hidden = hidden
+        self.differences = differences
         self.embed = nn.Linear(4, embedding)
         self.input = nn.Linear(embedding, 4 * hidden)
         self.recurrent = nn.Parameter(torch.empty(4 * hidden, hidden))
         bound = 1.0 / math.sqrt(hidden)
         nn.init.uniform_(self.recurrent, -bound, bound)
         with torch.no_grad():
-            # forget gate open at the start of the fit
+            # The forget gate is open at the start of the fit.
             self.input.bias[hidden : 2 * hidden].fill_(1.0)
 
     def project(self, displacement: Tensor, difference: Tensor) -> Tensor:
         """Part of the gates [..., 4H] that depends on this motion alone, so it can be kept."""
-        used = difference if self.differences else torch.zeros_like(difference)
-        return apply(self.input, apply(self.embed, motion_features(displacement, used), relu=True))
+        if not self.differences:
+            difference = torch.zeros_like(difference)
+        embedded = apply(self.embed, motion_features(displacement, difference), relu=True)
+        return apply(self.input, embedded)
 
     def step(self, projected: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
         """One recurrence on a projection [..., 4H] and state ([..., H], [..., H]).
@@ -119,11 +103,14 @@ class MotionLSTM(nn.Module):
         return self._update(dense(hidden, self.recurrent).add_(projected), cell)
 
     def encode(self, projections: Tensor | Sequence[Tensor]) -> Tensor:
-        """Last hidden state [..., H] after the projections [..., T, 4H], or T of [..., 4H], from a
-        state of zeros.
+        """Last hidden state [..., H] after projections [..., T, 4H], or T of [..., 4H].
+
+        It begins with a state of zeros.
         """
         steps = projections.unbind(dim=-2) if isinstance(projections, Tensor) else projections
-        hidden, cell = self._update(steps[0], torch.zeros_like(steps[0][..., : self.hidden]))
+        # The recurrence of a hidden state of zeros adds nothing, so the first step does without.
+        no_cell = torch.zeros_like(steps[0][..., : self.hidden])
+        hidden, cell = self._update(steps[0], no_cell)
         for projected in steps[1:]:
             hidden, cell = self.step(projected, hidden, cell)
         return hidden
@@ -142,12 +129,11 @@ def _times_tanh(factor: Tensor, x: Tensor) -> Tensor:
 
 
 def nearest(position: Tensor, valid: Tensor, neighbours: int) -> tuple[Tensor | None, Tensor]:
-    """Indices [B, G, K] of the ``neighbours`` nearest other vehicles of each, and a mask [B, G, K]
-    of the real ones.
+    """Indices [B, G, K] of the ``neighbours`` nearest other vehicles of each, and a mask of them.
 
     ``position`` is [B, G, 2] in m, ``valid`` [B, G]. If there are not more vehicles than that, the
-    indices are None and K is G: all vehicles in order. The mask is false for padding, the vehicle
-    itself and beyond :data:`RANGE_M`.
+    indices are None and K is G: all vehicles in order. The mask [B, G, K] is false for padding, the
+    vehicle itself and beyond :data:`RANGE_M`.
     """
     count = position.shape[-2]
     offset = position[..., None, :, :] - position[..., :, None, :]
@@ -189,19 +175,23 @@ class PairPooling(nn.Module):
     def forward(
         self, hidden: Tensor, position: Tensor, displacement: Tensor, valid: Tensor
     ) -> Tensor:
-        """Pooled states [B, G, P] of states [B, G, H], positions and displacements [B, G, 2] and
-        mask [B, G].
+        """Pooled states [B, G, P] of the vehicles.
+
+        Their states are [B, G, H], positions and displacements [B, G, 2], the mask [B, G].
         """
         if self.neighbours == 0:
             return hidden.new_zeros(*hidden.shape[:-1], self.second.out_features)
         index, real = nearest(position, valid, self.neighbours)
         # Relative to the first vehicle: far down the road, differences of float32 positions lose
         # digits.
-        scale = position.new_tensor(_PAIR_SCALE)
-        state = torch.cat([position - position[..., :1, :], displacement], dim=-1) / scale
-        own = nn.functional.linear(state, self.per_pair.weight)
-        others = gather_vehicles(apply(self.per_vehicle, hidden) + own + self.per_pair.bias, index)
-        first = (others - own[..., None, :]).relu_()
+        state = torch.cat([position - position[..., :1, :], displacement], dim=-1)
+        state = state / position.new_tensor(_PAIR_SCALE)
+
+        # The first layer is linear in (other - self), so it runs once per vehicle, not per pair.
+        itself = nn.functional.linear(state, self.per_pair.weight)
+        terms = apply(self.per_vehicle, hidden) + itself + self.per_pair.bias
+        first = (gather_vehicles(terms, index) - itself[..., None, :]).relu_()
+
         # So much is subtracted where masked that the maximum ignores it.
         second = apply(self.second, first).add_(~real[..., None], alpha=-1e9)
         return torch.relu(second.amax(dim=-2))
@@ -269,14 +259,12 @@ class Generator(nn.Module):
         """
         hidden = self.encoder.encode(now.projections)
         pooled = self.pooling(hidden, now.position, now.displacement, now.valid)
-        first, second = (cast(nn.Linear, self.context[index]) for index in (0, 2))
-        return apply(
-            second, apply(first, torch.cat([hidden, pooled, now.extra], dim=-1), relu=True)
-        )
+        inputs = torch.cat([hidden, pooled, now.extra], dim=-1)
+        first, second = (cast(nn.Linear, self.context[layer]) for layer in (0, 2))
+        return apply(second, apply(first, inputs, relu=True))
 
     def decode(self, context: Tensor, noise: Tensor, now: Observation, steps: int) -> Tensor:
-        """Output of the decoder's first ``steps`` steps [..., steps, 2], in units of
-        ``DIFFERENCE_SCALE_M``.
+        """Output [..., steps, 2] of the decoder's first steps, in units of ``DIFFERENCE_SCALE_M``.
 
         ``context`` is [..., H - Z] and ``noise`` [..., Z]; leading dimensions broadcast, so that
         several samples share one context. Each output is the change of the displacement that the
@@ -286,13 +274,15 @@ class Generator(nn.Module):
         hidden = torch.cat([context.expand(*leading, -1), noise.expand(*leading, -1)], dim=-1)
         cell = torch.zeros_like(hidden)
         scale = hidden.new_tensor(DIFFERENCE_SCALE_M)
-        displacement, difference, outputs = now.displacement, now.difference, []
+        displacement = now.displacement
+        difference = now.difference
+        outputs = []
         for _ in range(steps):
-            hidden, cell = self.decoder.step(
-                self.decoder.project(displacement, difference), hidden, cell
-            )
-            outputs.append(apply(self.head, hidden))
-            difference = outputs[-1] * scale
+            projected = self.decoder.project(displacement, difference)
+            hidden, cell = self.decoder.step(projected, hidden, cell)
+            output = apply(self.head, hidden)
+            outputs.append(output)
+            difference = output * scale
             displacement = displacement + difference
         return torch.stack(outputs, dim=-2)
 
@@ -301,15 +291,15 @@ class Generator(nn.Module):
 
         All by default.
         """
-        outputs = self.decode(
-            self.summarise(now), noise, now, self.sizes.predicted if steps is None else steps
-        )
+        steps = self.sizes.predicted if steps is None else steps
+        outputs = self.decode(self.summarise(now), noise, now, steps)
         return displacements_of(outputs, now.displacement)
 
 
 def displacements_of(outputs: Tensor, last: Tensor) -> Tensor:
-    """Displacements [..., steps, 2] that follow ``last`` [..., 2] when it changes by the decoder's
-    outputs.
+    """Displacements [..., steps, 2] that follow ``last`` [..., 2], of the decoder's outputs.
+
+    The outputs are changes, so an output of 0 repeats the last displacement.
     """
     return last[..., None, :] + outputs.cumsum(dim=-2) * outputs.new_tensor(DIFFERENCE_SCALE_M)
 

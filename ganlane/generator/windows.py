@@ -1,29 +1,26 @@
-"""Recorded scenes as arrays, and what is cut from them: segments for joint rollouts, windows and
-groups of windows.
+"""Recorded scenes as arrays, and what is cut from them: segments, windows and groups of windows.
 
-A segment is a stretch of a scene with all its vehicles; a window is 9 observed and 8 future
-positions of one vehicle. Nothing is smoothed: a filter applied before windows are cut would carry
-the future into the past. Grouping windows takes most of the time before a fit, so it is cached
-under a hash of everything that it follows from.
+A segment is a stretch of a scene with all its vehicles, for joint rollouts; a window is 9 observed
+and 8 future positions of one vehicle. Nothing is smoothed: a filter applied before windows are cut
+would carry the future into the past.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
 import polars as pl
-import sklearn
 import torch
 from numpy.lib.stride_tricks import sliding_window_view
 from sklearn.cluster import KMeans
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from ganlane.data import SCHEMA, scene_lane_widths
 from ganlane.errors import UserError
-from ganlane.generator.checkpoint import cached, content_hash
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.state import Road
 
@@ -44,20 +41,17 @@ class SceneTracks:
     0.
 
     Attributes:
-        vehicles: [V] vehicle numbers.
         positions: [T, V, 2] float64, centre of the body, m; x along the road, y to the left.
         lane, present: [T, V] int64, 0 is the rightmost, and bool.
-        length, width: [V] float64, m.
+        length: [V] float64, m.
     """
 
     name: str
     lane_width_m: float
-    vehicles: np.ndarray
     positions: np.ndarray
     lane: np.ndarray
     present: np.ndarray
     length: np.ndarray
-    width: np.ndarray
 
     @property
     def lanes(self) -> int:
@@ -66,27 +60,24 @@ class SceneTracks:
 
     @cached_property
     def endless_positions(self) -> np.ndarray:
-        """Positions [T, V, 2], at constant velocity before a vehicle's first and after its last
-        present frame.
+        """Positions [T, V, 2], finite in every frame.
+
+        They go on at constant velocity before a vehicle's first and after its last present frame.
         """
-        frames, column = np.arange(len(self.present))[:, None], np.arange(self.present.shape[1])
+        frames = np.arange(len(self.present))[:, None]
+        column = np.arange(self.present.shape[1])
         first, last = self._first_and_last
-        begin, end = self.positions[first, column], self.positions[last, column]
-        longer = (last > first)[:, None]
-        early = np.where(longer, self.positions[np.minimum(first + 1, last), column] - begin, 0.0)
-        late = np.where(longer, end - self.positions[np.maximum(last - 1, first), column], 0.0)
-        before = begin + early * (frames - first)[..., None]
-        after = end + late * (frames - last)[..., None]
-        inside = np.where(self.present[..., None], self.positions, 0.0)
-        return np.where(
-            (frames < first)[..., None], before, np.where((frames > last)[..., None], after, inside)
-        )
+        nearest = np.clip(frames, first, last)
+        # The first and the last displacement of each vehicle; 0 where it was seen only once.
+        early = self.positions[np.minimum(first + 1, last), column] - self.positions[first, column]
+        late = self.positions[last, column] - self.positions[np.maximum(last - 1, first), column]
+        displacement = np.where((frames < first)[..., None], early, late)
+        beyond = (frames - nearest)[..., None]
+        return self.positions[nearest, column] + displacement * beyond
 
     @cached_property
     def target_lane(self) -> np.ndarray:
-        """Lane [T, V] that each vehicle will be in after :data:`INTENTION_S`, or at the end of its
-        track.
-        """
+        """Lane [T, V] of each vehicle after :data:`INTENTION_S`, or at the end of its track."""
         ahead = np.arange(len(self.present))[:, None] + round(INTENTION_S / PHYSICS_STEP_S)
         return np.take_along_axis(self.lane, np.clip(ahead, *self._first_and_last), axis=0)
 
@@ -114,16 +105,23 @@ def scene_tracks(frame: pl.DataFrame) -> list[SceneTracks]:
     for name, lane_width_m in sorted(scene_lane_widths(frame).items()):
         rows = frame.filter(pl.col("scene") == name)
         vehicles, column = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)
+        # A scene's first frame is row 0; a frame that nobody is in is a row too.
         row = rows["frame"].to_numpy()
         row = row - row.min()
         shape = (int(row.max()) + 1, len(vehicles))
-        positions, lane = np.zeros((*shape, 2)), np.zeros(shape, dtype=np.int64)
-        present, size = np.zeros(shape, dtype=bool), np.zeros((2, len(vehicles)))
-        positions[row, column] = rows.select("x", "y").to_numpy()
-        lane[row, column] = rows["lane"].to_numpy()
-        present[row, column] = True
-        size[:, column] = rows.select("length", "width").to_numpy().T
-        scenes.append(SceneTracks(name, lane_width_m, vehicles, positions, lane, present, *size))
+        scene = SceneTracks(
+            name=name,
+            lane_width_m=lane_width_m,
+            positions=np.zeros((*shape, 2)),
+            lane=np.zeros(shape, dtype=np.int64),
+            present=np.zeros(shape, dtype=bool),
+            length=np.zeros(len(vehicles)),
+        )
+        scene.positions[row, column] = rows.select("x", "y").to_numpy()
+        scene.lane[row, column] = rows["lane"].to_numpy()
+        scene.present[row, column] = True
+        scene.length[column] = rows["length"].to_numpy()
+        scenes.append(scene)
     return scenes
 
 
@@ -137,7 +135,7 @@ class Segments:
     Attributes:
         positions: [B, 9 + H, V, 2] float32, m, x relative to the segment's mean at the present.
         present, target_lane: [B, 9 + H, V], bool and int64.
-        length, width: [B, V] m.
+        length: [B, V] m.
         lanes, lane_width: [B, 1].
     """
 
@@ -145,16 +143,17 @@ class Segments:
     present: Tensor
     target_lane: Tensor
     length: Tensor
-    width: Tensor
     lanes: Tensor
     lane_width: Tensor
 
     @property
     def scored(self) -> Tensor:
-        """Vehicles [B, H, V] that the model drives (present in the first 9 frames) and that are
-        still recorded.
+        """Vehicles [B, H, V] that count: driven by the model, and still recorded.
+
+        The model drives those that are present in all of the first 9 frames.
         """
-        observed, after = self.present[:, :OBSERVED_POSITIONS], self.present[:, OBSERVED_POSITIONS:]
+        observed = self.present[:, :OBSERVED_POSITIONS]
+        after = self.present[:, OBSERVED_POSITIONS:]
         return observed.all(dim=1, keepdim=True) & after
 
     @property
@@ -165,7 +164,8 @@ class Segments:
     @property
     def constant_velocity(self) -> Tensor:
         """Positions [B, H, V, 2] when the last observed displacement is repeated."""
-        now, before = self.positions[:, PRESENT, None], self.positions[:, PRESENT - 1, None]
+        now = self.positions[:, PRESENT, None]
+        before = self.positions[:, PRESENT - 1, None]
         steps = torch.arange(1, self.positions.shape[1] - PRESENT, dtype=now.dtype)
         return now + (now - before) * steps[:, None, None]
 
@@ -176,22 +176,23 @@ class Segments:
 
     def repeated(self, times: int) -> Segments:
         """The segments repeated ``times`` times along the batch dimension."""
-        return Segments(
-            *(value.repeat(times, *[1] * (value.dim() - 1)) for value in vars(self).values())
-        )
+        return Segments(*(torch.cat([value] * times) for value in vars(self).values()))
 
     def mirrored(self) -> Segments:
         """The segments with left and right swapped."""
-        positions, last = self.positions.clone(), self.lanes - 1
+        positions = self.positions.clone()
+        last = self.lanes - 1
         positions[..., 1] = (last * self.lane_width)[..., None] - positions[..., 1]
         return replace(self, positions=positions, target_lane=last[..., None] - self.target_lane)
 
     def without_intentions(self) -> Segments:
-        """Target lanes are the present ones, so that no information of the future is used (for
-        evaluation).
+        """The segments with the present lanes as target lanes, for evaluation.
+
+        So no information of the future is used.
         """
         y = self.positions[:, PRESENT : PRESENT + 1, :, 1]
-        lane = Road(self.lanes[..., None], self.lane_width[..., None]).lane_of(y).long()
+        road = Road(self.lanes[..., None], self.lane_width[..., None])
+        lane = road.lane_of(y).long()
         return replace(self, target_lane=lane.expand_as(self.target_lane).contiguous())
 
 
@@ -209,10 +210,12 @@ def segment_batches(scene: SceneTracks, horizon: int, stride: int, size: int) ->
 
 
 def cut_segments(cuts: list[tuple[SceneTracks, int]], horizon: int) -> Segments:
-    """The segments that start at (scene, row), ``horizon`` steps beyond the present, padded to one
-    batch.
+    """The segments that start at (scene, row), padded to one batch.
+
+    They end ``horizon`` steps after the present.
     """
     frames = OBSERVED_POSITIONS + horizon
+    # Who is recorded in any frame of a segment is in it.
     members = [np.flatnonzero(scene.present[row : row + frames].any(0)) for scene, row in cuts]
     batch, most = len(cuts), max(map(len, members))
     segments = Segments(
@@ -220,19 +223,19 @@ def cut_segments(cuts: list[tuple[SceneTracks, int]], horizon: int) -> Segments:
         present=torch.zeros(batch, frames, most, dtype=torch.bool),
         target_lane=torch.zeros(batch, frames, most, dtype=torch.int64),
         length=torch.ones(batch, most),
-        width=torch.ones(batch, most),
         lanes=torch.tensor([[scene.lanes] for scene, _ in cuts]),
         lane_width=torch.tensor([[scene.lane_width_m] for scene, _ in cuts], dtype=torch.float32),
     )
     for number, ((scene, row), who) in enumerate(zip(cuts, members)):
         at = slice(row, row + frames), who
-        positions, count = scene.endless_positions[at], len(who)
+        positions = scene.endless_positions[at]
+        count = len(who)
+        # Far down the road, float32 loses digits; the lateral zero is the road's.
         middle = np.array([positions[PRESENT, :, 0].mean(), 0.0])
         segments.positions[number, :, :count] = torch.from_numpy(positions - middle)
         segments.present[number, :, :count] = torch.from_numpy(scene.present[at])
         segments.target_lane[number, :, :count] = torch.from_numpy(scene.target_lane[at])
         segments.length[number, :count] = torch.from_numpy(scene.length[who])
-        segments.width[number, :count] = torch.from_numpy(scene.width[who])
     return segments
 
 
@@ -242,7 +245,7 @@ class Windows:
 
     Attributes:
         positions: [W, frames, 2] float64, m.
-        scene: [W] int64, index into ``scene_names``.
+        scene: [W] str, the scene's name.
         start, vehicle: [W] int64, row of the scene at which the window starts, and column of its
             vehicle.
         lane, lane_from_left: [W] int64, at the last observed position; 0 is the rightmost, 1 from
@@ -257,16 +260,14 @@ class Windows:
     lane: np.ndarray
     lane_from_left: np.ndarray
     length: np.ndarray
-    scene_names: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.start)
 
     @property
     def by_scene(self) -> dict[str, np.ndarray]:
-        """Masks [W] of the windows of each scene that has any, by name."""
-        numbers = sorted(np.unique(self.scene), key=lambda number: self.scene_names[number])
-        return {self.scene_names[number]: self.scene == number for number in numbers}
+        """Masks [W] of the windows of each scene, by name."""
+        return {str(name): self.scene == name for name in np.unique(self.scene)}
 
     @property
     def future(self) -> np.ndarray:
@@ -280,22 +281,15 @@ class Windows:
 
 
 def join_windows(parts: list[Windows]) -> Windows:
-    """All windows of ``parts`` in order; no two parts share a scene."""
-    joined = {
-        name: np.concatenate([getattr(part, name) for part in parts])
-        for name in ("positions", "start", "vehicle", "lane", "lane_from_left", "length")
-    }
-    before = np.cumsum([0, *(len(part.scene_names) for part in parts[:-1])])
-    scene = np.concatenate([part.scene + first for part, first in zip(parts, before)])
+    """All windows of ``parts`` in order."""
+    names = [field.name for field in fields(Windows)]
     return Windows(
-        **joined,
-        scene=scene,
-        scene_names=tuple(name for part in parts for name in part.scene_names),
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     )
 
 
 def _present_throughout(scene: SceneTracks, frames: int) -> np.ndarray:
-    """Whether each vehicle is present in all ``frames`` frames that start at each row; bool [S, V]."""
+    """Whether each vehicle is present in all ``frames`` that start at a row; bool [rows, V]."""
     if len(scene.present) < frames:
         return np.zeros((0, scene.present.shape[1]), dtype=bool)
     return np.all(sliding_window_view(scene.present, frames, axis=0), axis=-1)
@@ -307,8 +301,9 @@ def count_windows(scene: SceneTracks) -> int:
 
 
 def cut_windows(scenes: list[SceneTracks], stride: int = 1, frames: int = WINDOW_FRAMES) -> Windows:
-    """All windows of ``scenes``, starting at every ``stride``-th frame; a window never spans two
-    scenes.
+    """All windows of ``scenes`` that start at every ``stride``-th frame.
+
+    A window never spans two scenes.
 
     Raises:
         UserError: no vehicle is present for a whole window.
@@ -320,19 +315,19 @@ def cut_windows(scenes: list[SceneTracks], stride: int = 1, frames: int = WINDOW
         lane = scene.lane[start + PRESENT, vehicle]
         part = Windows(
             positions=scene.positions[start[:, None] + np.arange(frames), vehicle[:, None]],
-            scene=np.zeros_like(start),
+            scene=np.full(len(start), scene.name),
             start=start,
             vehicle=vehicle,
             lane=lane,
             lane_from_left=scene.lanes - lane,
             length=scene.length[vehicle],
-            scene_names=(scene.name,),
         )
         parts.append(part)
     windows = join_windows(parts)
     if not len(windows):
         raise UserError(
-            f"recordings: no vehicle is present for {frames} frames in a row; give longer tracks (10 Hz)."
+            f"recordings: no vehicle is present for {frames} frames in a row; "
+            "give longer tracks (10 Hz)."
         )
     return windows
 
@@ -357,7 +352,8 @@ class Groups:
         return len(self.mask)
 
     def select(self, rows: Tensor) -> Groups:
-        """The groups of the given rows, without padding that none of them needs."""
+        """The groups of the given rows."""
+        # Vehicles come first, so the columns that only hold padding are the last ones.
         width = int(self.mask[rows].sum(1).max())
         return Groups(*(value[rows, :width] for value in vars(self).values()))
 
@@ -366,68 +362,50 @@ class Groups:
         sign = torch.ones(len(self), 1, 2)
         sign[..., 1] = torch.where(flip, -1.0, 1.0)[:, None]
         return replace(
-            self, displacements=self.displacements * sign[:, :, None], position=self.position * sign
+            self,
+            displacements=self.displacements * sign[:, :, None],
+            position=self.position * sign,
         )
 
 
 def kmeans_labels(positions: np.ndarray, size: int, seed: int) -> np.ndarray:
-    """Group number [n] of each of n positions [n, 2], in groups of about ``size``, by k-means on
-    metres.
+    """Group number [n] of each of n positions [n, 2] in m, by k-means.
+
+    Groups have about ``size`` members.
     """
     groups = max(1, round(len(positions) / size))
     if groups == 1:
         return np.zeros(len(positions), dtype=np.int64)
-    return KMeans(groups, n_init=1, random_state=seed).fit_predict(positions).astype(np.int64)
+    return KMeans(groups, n_init=1, random_state=seed).fit_predict(positions)
 
 
 def group_windows(windows: Windows, size: int = 9, seed: int = 0) -> Groups:
-    """Split the vehicles of every (scene, start) into k-means groups of about ``size`` and pad
-    them.
+    """Split the vehicles of every (scene, start) into k-means groups of about ``size``, padded.
 
-    Uses the last observed positions only; each scene's groups are cached (:func:`cached`).
+    Uses the last observed positions only.
     """
     now = windows.positions[:, PRESENT]
-    settings = {"size": size, "seed": seed, "k-means": sklearn.__version__}
+    # Windows are ordered by scene and start, so those of one start are neighbours.
+    other_scene = windows.scene[1:] != windows.scene[:-1]
+    other_start = np.diff(windows.start) != 0
+    begins = np.flatnonzero(other_scene | other_start) + 1
 
-    def labels_of_scene(rows: np.ndarray) -> np.ndarray:
-        place, start = now[rows], windows.start[rows]
-
-        def compute() -> dict[str, np.ndarray]:
-            return {
-                "labels": _labels_by_run(
-                    start, lambda chosen: kmeans_labels(place[chosen], size, seed)
-                )
-            }
-
-        return cached("groups", content_hash(settings, place, start), compute)["labels"]
-
-    # Scattered into [B, G] by group number and rank within the group.
-    labels = _labels_by_run(windows.scene, labels_of_scene)
-    _, labels, counts = np.unique(labels, return_inverse=True, return_counts=True)
-    order = np.argsort(labels, kind="stable")
-    rank = np.empty(len(labels), dtype=np.int64)
-    rank[order] = np.arange(len(labels)) - np.repeat(np.cumsum(counts) - counts, counts)
-    window = np.full((len(counts), int(counts.max())), -1)
-    window[labels, rank] = np.arange(len(labels))
-    mean = np.stack([np.bincount(labels, now[:, axis]) / counts for axis in (0, 1)], axis=-1)
+    groups = []
+    for rows in np.split(np.arange(len(windows)), begins):
+        labels = kmeans_labels(now[rows], size, seed)
+        groups += [torch.from_numpy(rows[labels == label]) for label in np.unique(labels)]
+    window = pad_sequence(groups, batch_first=True, padding_value=-1)
     mask = window >= 0
-    displacements = np.where(mask[..., None, None], np.diff(windows.positions, axis=1)[window], 0.0)
-    position = np.where(mask[..., None], now[window] - mean[:, None], 0.0)
+
+    # Padding is row -1 of the windows, so it has to be masked before the mean is taken.
+    place = np.where(mask[..., None], now[window], 0.0)
+    mean = place.sum(axis=1, keepdims=True) / mask.sum(1).numpy()[:, None, None]
+    position = np.where(mask[..., None], place - mean, 0.0)
+    moves = np.diff(windows.positions, axis=1)
+    displacements = np.where(mask[..., None, None], moves[window], 0.0)
     return Groups(
-        torch.from_numpy(displacements).float(),
-        torch.from_numpy(position).float(),
-        torch.from_numpy(mask),
-        torch.from_numpy(window),
+        displacements=torch.from_numpy(displacements).float(),
+        position=torch.from_numpy(position).float(),
+        mask=mask,
+        window=window,
     )
-
-
-def _labels_by_run(values: np.ndarray, labels_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Labels [W] of each run of equal ``values`` [W], by ``labels_of`` its rows.
-
-    No label is used in two runs.
-    """
-    labels, used = np.empty(len(values), dtype=np.int64), 0
-    for rows in np.split(np.arange(len(values)), np.flatnonzero(np.diff(values)) + 1):
-        labels[rows] = used + labels_of(rows)
-        used = int(labels[rows].max()) + 1
-    return labels

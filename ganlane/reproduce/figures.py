@@ -102,11 +102,11 @@ def interesting(windows: Windows) -> list[tuple[str, int]]:
         "completes a lane change": before - 2.0 * after,
         "goes steady": -before - after,
     }
-    chosen, seen = [], set[tuple[int, int]]()
+    chosen, seen = [], set[tuple[str, int]]()
     for kind, count in PANELS.items():
         found = 0
         for row in np.argsort(-scores[kind], kind="stable"):
-            vehicle = int(windows.scene[row]), int(windows.vehicle[row])
+            vehicle = str(windows.scene[row]), int(windows.vehicle[row])
             if found < count and moves[row] and vehicle not in seen:
                 seen.add(vehicle)
                 chosen.append((kind, int(row)))

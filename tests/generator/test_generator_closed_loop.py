@@ -52,9 +52,9 @@ def test_without_a_residual_a_follower_settles_at_its_own_equilibrium_gap():
     state = state.with_(desired_speed=torch.tensor([[25.0, 18.0]]).double())
     state, _ = drive(silent_generator(), state, 60)
     gap = state.x[0, 1] - state.x[0, 0] - 4.5
-    own = IdmParameters(headway_s=1.27)
+    idm = IdmParameters(headway_s=1.27)
     assert gap.item() == pytest.approx(
-        equilibrium_gap(state.speed[0, 0], 25.0, own).item(), rel=0.02
+        equilibrium_gap(state.speed[0, 0], 25.0, idm).item(), rel=0.02
     )
 
 
@@ -71,8 +71,8 @@ def test_the_first_step_is_idm_and_the_lateral_law():
     state = vehicles([0.0, 30.0], y=[0.5, 0.0])
     after, _ = drive(silent_generator(), state, 0.1)
     gap = torch.tensor(30.0 - 4.5, dtype=torch.float64)
-    own = torch.tensor(20.0, dtype=torch.float64)
-    expected = idm_acceleration(own, 25.0, gap, own, closed_loop.ANCHOR.idm, 1.27)
+    speed = torch.tensor(20.0, dtype=torch.float64)
+    expected = idm_acceleration(speed, 25.0, gap, speed, closed_loop.ANCHOR.idm, 1.27)
     assert after.x[0, 0].item() == pytest.approx(2.0 + 0.01 * expected.item(), abs=1e-9)
     assert after.y[0, 0].item() == pytest.approx(0.5 + 0.01 * 0.3 * -0.5, abs=1e-9)
 
@@ -201,7 +201,6 @@ def test_a_rollout_is_the_same_with_more_padding(segments, generator):
         present=pad(segments.present, (0, 4)),
         target_lane=pad(segments.target_lane, (0, 4)),
         length=pad(segments.length, (0, 4), value=1.0),
-        width=pad(segments.width, (0, 4), value=1.0),
     )
     torch.testing.assert_close(
         typical_rollout(generator, wide)[:, :, :7], typical_rollout(generator, segments)

@@ -78,11 +78,11 @@ def test_folds_and_ablations_are_pooled_kept_and_not_fitted_again(recordings, ca
     assert [weights["paper"] for weights in folds.values()] == paths
     check_folds_cover(list(folds), [f"synthetic-{scene}" for scene in range(4)])
 
-    kept = {path: path.stat().st_mtime_ns for path in Path("fit/fits").iterdir()}
+    written = {path: path.stat().st_mtime_ns for path in Path("fit/fits").iterdir()}
     again = run(*options, "resume=fit", folder="again")
     for name in ("folds", "ablations", "ade_m"):
         assert again[name] == results[name]
-    assert {path: path.stat().st_mtime_ns for path in Path("fit/fits").iterdir()} == kept
+    assert {path: path.stat().st_mtime_ns for path in Path("fit/fits").iterdir()} == written
 
 
 def test_what_was_fitted_stays_where_a_later_step_fails(recordings, capsys, monkeypatch, tmp_path):
@@ -98,7 +98,7 @@ def test_what_was_fitted_stays_where_a_later_step_fails(recordings, capsys, monk
 
 def test_too_many_folds_are_refused_before_ablations_are_fitted(recordings, capsys, monkeypatch):
     fitted = []
-    monkeypatch.setattr(ganlane.generator, "ablate", lambda *given: fitted.append(given))
+    monkeypatch.setattr(ganlane.generator, "ablate", lambda *arguments: fitted.append(arguments))
     assert main([recordings, "ablations=true", "folds=9", *FEW]) == 2
     assert "folds=9" in capsys.readouterr().err
     assert not fitted

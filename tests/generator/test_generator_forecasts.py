@@ -18,16 +18,16 @@ def windows_of(positions: np.ndarray, lanes=0, lengths=4) -> Windows:
     """
     if positions.shape[1] == 8:
         positions = np.concatenate([np.zeros((len(positions), 9, 2)), positions], axis=1)
-    zero, scene = np.zeros(len(positions), dtype=np.int64), np.arange(len(positions)) % 2
+    count = len(positions)
+    zero = np.zeros(count, dtype=np.int64)
     return Windows(
-        positions,
-        scene,
-        zero,
-        zero,
-        zero,
-        zero + lanes,
-        zero + np.array(lengths, float),
-        ("a", "b"),
+        positions=positions,
+        scene=np.array(["a", "b"])[np.arange(count) % 2],
+        start=zero,
+        vehicle=zero,
+        lane=zero,
+        lane_from_left=zero + lanes,
+        length=zero + np.array(lengths, float),
     )
 
 
@@ -78,11 +78,11 @@ def test_parts_are_lanes_and_classes_with_enough_windows():
 def test_every_part_is_held_against_the_baseline():
     future = np.ones((4, 8, 2))
     windows = windows_of(future, [1, 1, 2, 2])
-    found = {
+    predicted = {
         "constant_velocity": future + 1.0,
         "mean": future + np.array([0.1, 0.1, 3.0, 3.0])[:, None, None],
     }
-    scores = forecasts.open_loop_scores(windows, found, np.array([0, 0, 1, 1]), least_part=1)
+    scores = forecasts.open_loop_scores(windows, predicted, np.array([0, 0, 1, 1]), least_part=1)
     change = {name: row["ade_change_percent"]["mean"] for name, row in scores["parts"].items()}
     assert change == {
         "lane 1": pytest.approx(-90.0),
@@ -157,19 +157,19 @@ def test_the_best_of_the_samples_is_the_nearest_on_average():
     samples = np.zeros((22, 2, 3, 2))
     samples[1:, ..., 0] = 5.0
     samples[4, 0], samples[9, 1] = 1.0, 2.0
-    found = forecasts.by_kind(samples, recorded)
-    np.testing.assert_array_equal(found["best_of_20"], np.stack([samples[4, 0], samples[9, 1]]))
+    kinds = forecasts.by_kind(samples, recorded)
+    np.testing.assert_array_equal(kinds["best_of_20"], np.stack([samples[4, 0], samples[9, 1]]))
     assert forecasts.by_kind(samples[:1], recorded).keys() == {"mean"}
     assert forecasts.by_kind(samples[:2], recorded).keys() == {"mean", "single"}
 
 
 def test_forecasts_of_the_papers_preset_score_alike_in_a_fit_and_over_folds(scenes):
     generator, windows = small_generator(0), cut_windows(scenes, STRIDE)
-    found = forecasts.paper_forecasts(generator, windows, group_windows(windows, 4))
-    found["constant_velocity"] = forecasts.repeated(windows.past[:, -1], 8)
-    row = forecasts.displacement_errors(forecasts.errors_of(found, windows.future))
-    metrics = forecasts.scene_metrics(windows, found)
-    for kind in found:
+    predicted = forecasts.paper_forecasts(generator, windows, group_windows(windows, 4))
+    predicted["constant_velocity"] = forecasts.repeated(windows.past[:, -1], 8)
+    row = forecasts.displacement_errors(forecasts.errors_of(predicted, windows.future))
+    metrics = forecasts.scene_metrics(windows, predicted)
+    for kind in predicted:
         assert metrics["all"][f"ade_m/{kind}"] == row["ade_m"][kind]
         assert metrics["all"][f"fde_m/{kind}"] == row["fde_m"][kind]
     assert metrics.keys() == {"all", "synthetic-0", "synthetic-1"}
@@ -183,14 +183,14 @@ def test_forecasts_of_the_papers_preset_score_alike_in_a_fit_and_over_folds(scen
 
 def test_without_noise_in_the_weights_all_samples_of_a_rollout_agree(scenes):
     generator = silenced(small_generator(EXTRA_INPUTS))
-    found = forecasts.calibrated_forecasts(
+    driven = forecasts.calibrated_forecasts(
         generator, scenes, 8, STRIDE, CalibratedConfig(), samples=3
     )
-    np.testing.assert_allclose(found["single"], found["mean"], atol=1e-5)
+    np.testing.assert_allclose(driven["single"], driven["mean"], atol=1e-5)
     # without a residual the anchor alone drives: along the road that is IDM with the driver's own
     # headway
     idm = forecasts.idm_forecasts(scenes, 8, STRIDE)["idm_own_headway"]
-    np.testing.assert_allclose(found["mean"][..., 0], idm[..., 0], atol=1e-3)
+    np.testing.assert_allclose(driven["mean"][..., 0], idm[..., 0], atol=1e-3)
 
 
 def test_idm_keeps_the_lateral_position(scenes):
@@ -254,11 +254,11 @@ def noisy_followers(count: int) -> np.ndarray:
 
 
 def test_ridge_regression_finds_a_linear_law_and_keeps_left_and_right_alike():
-    known, fresh = windows_of(noisy_followers(400)), windows_of(noisy_followers(50))
-    predicted = forecasts.ridge_forecast(known, fresh.past)
+    fitted, fresh = windows_of(noisy_followers(400)), windows_of(noisy_followers(50))
+    predicted = forecasts.ridge_forecast(fitted, fresh.past)
     assert np.abs(predicted - fresh.future).mean() < 0.02 * np.abs(fresh.future).mean()
     np.testing.assert_allclose(
-        forecasts.ridge_forecast(known, fresh.past * (1, -1)), predicted * (1, -1), atol=1e-8
+        forecasts.ridge_forecast(fitted, fresh.past * (1, -1)), predicted * (1, -1), atol=1e-8
     )
 
 

@@ -1,4 +1,4 @@
-"""The networks and their layers: the linear layer, the LSTM, pooling, generator and discriminator."""
+"""The networks and their layers."""
 
 import pytest
 import torch
@@ -7,6 +7,7 @@ from torch import nn
 
 from ganlane.generator import networks
 from ganlane.generator.closed_loop import push, recorded, start
+from ganlane.linear import ONEDNN
 
 
 @pytest.fixture
@@ -62,16 +63,16 @@ def test_gradients_reach_the_weights_of_many_rows():
     assert layer.weight.grad.abs().sum() > 0
 
 
-@pytest.mark.skipif(not networks._ONEDNN, reason="this torch was built without oneDNN")
-def test_many_rows_go_to_onednn(monkeypatch):
-    seen = []
-    monkeypatch.setattr(networks, "_onednn", lambda x, *rest: seen.append(len(x)))
+@pytest.mark.skipif(not ONEDNN, reason="this torch was built without oneDNN")
+def test_many_rows_without_gradients_go_to_onednn(monkeypatch):
+    rows = []
+    monkeypatch.setattr(networks, "matrix_product", lambda x, *rest: rows.append(len(x)))
     layer = nn.Linear(5, 7).requires_grad_(False)
     with torch.no_grad():
         networks.apply(layer, torch.randn(700, 5))
         networks.apply(layer, torch.randn(7, 5))
     networks.apply(layer, torch.randn(700, 5))
-    assert seen == [700]
+    assert rows == [700]
 
 
 def test_the_recurrence_is_torchs_own_lstm():
@@ -93,22 +94,22 @@ def test_the_recurrence_is_torchs_own_lstm():
 
 
 def test_pooling_does_not_depend_on_the_order_of_vehicles(pooled):
-    pooling, given = pooled
+    pooling, arguments = pooled
     order = torch.randperm(13)
-    shuffled = pooling(*(part[:, order] for part in given))
-    torch.testing.assert_close(shuffled, pooling(*given)[:, order])
+    shuffled = pooling(*(part[:, order] for part in arguments))
+    torch.testing.assert_close(shuffled, pooling(*arguments)[:, order])
 
 
 @pytest.mark.parametrize("count", [9, 13])
 def test_pooling_ignores_padding(pooled, count):
     pooling, whole = pooled
-    hidden, position, motion, mask = given = [part[:, :count] for part in whole]
-    expected, real = pooling(*given), mask[..., None]
+    hidden, position, motion, mask = arguments = [part[:, :count] for part in whole]
+    expected, real = pooling(*arguments), mask[..., None]
     noisy = pooling(
         torch.where(real, hidden, 99.0), torch.where(real, position, -3.0), motion, mask
     )
     torch.testing.assert_close(noisy[mask], expected[mask])
-    torch.testing.assert_close(pooling(*(part[1:2, :7] for part in given)), expected[1:2, :7])
+    torch.testing.assert_close(pooling(*(part[1:2, :7] for part in arguments)), expected[1:2, :7])
 
 
 def test_the_split_first_layer_equals_the_whole_one(pooled):
@@ -131,10 +132,10 @@ def test_the_nearest_are_found_as_by_sorting(scene):
     _, position, mask = scene
     index, seen = networks.nearest(position, mask, 8)
     for row in range(3):
-        for own in range(13):
-            others = [j for j in range(13) if j != own and mask[row, j]]
-            others.sort(key=lambda j: float((position[row, j] - position[row, own]).norm()))
-            assert set(index[row, own][seen[row, own]].tolist()) == set(others[:8])
+        for vehicle in range(13):
+            others = [j for j in range(13) if j != vehicle and mask[row, j]]
+            others.sort(key=lambda j: float((position[row, j] - position[row, vehicle]).norm()))
+            assert set(index[row, vehicle][seen[row, vehicle]].tolist()) == set(others[:8])
 
 
 def test_a_few_vehicles_are_all_each_others_neighbours(scene):

@@ -108,17 +108,17 @@ def brute_force_windows(frame: pl.DataFrame, stride: int) -> dict[tuple[str, int
     in a dictionary.
     """
     columns = ("scene", "vehicle", "frame", "x", "y", "lane", "length")
-    found, rows = {}, {row[:3]: row[3:] for row in frame.select(columns).iter_rows()}
+    windows, rows = {}, {row[:3]: row[3:] for row in frame.select(columns).iter_rows()}
     begins = dict(frame.group_by("scene").agg(pl.col("frame").min()).iter_rows())
     for scene, vehicle, first in rows:
         course = [rows.get((scene, vehicle, first + step)) for step in range(WINDOW_FRAMES)]
         row = first - begins[scene]
         if None not in course and row % stride == 0:
-            found[scene, row, vehicle] = (
+            windows[scene, row, vehicle] = (
                 np.array([place[:2] for place in course]),
                 course[PRESENT][2:],
             )
-    return found
+    return windows
 
 
 @pytest.mark.parametrize("stride", [1, 3])
@@ -126,10 +126,8 @@ def test_windows_are_those_of_a_brute_force_search(stride):
     frame = recording()
     scenes = scene_tracks(frame)
     windows, expected = cut_windows(scenes, stride), brute_force_windows(frame, stride)
-    numbers = [scenes[s].vehicles[v] for s, v in zip(windows.scene, windows.vehicle)]
-    keys = [
-        (windows.scene_names[s], t, v) for s, t, v in zip(windows.scene, windows.start, numbers)
-    ]
+    # Columns of a scene are its vehicles in the order of their numbers, which begin at 1000.
+    keys = list(zip(windows.scene, windows.start, 1000 + windows.vehicle))
     assert sorted(keys) == sorted(expected)
     np.testing.assert_array_equal(windows.positions, np.stack([expected[key][0] for key in keys]))
     assert list(zip(windows.lane, windows.length)) == [expected[key][1] for key in keys]
@@ -157,8 +155,8 @@ def test_groups_never_mix_scenes_or_frames_lose_nobody_and_hold_the_displacement
     for row, mask in enumerate(groups.mask):
         inside = groups.window[row][mask].numpy()
         assert len(set(zip(windows.scene[inside], windows.start[inside]))) == 1
-        kept, place = groups.displacements[row][mask].numpy(), windows.positions[inside, PRESENT]
-        np.testing.assert_allclose(kept, np.diff(windows.positions[inside], axis=1), atol=1e-6)
+        moves, place = groups.displacements[row][mask].numpy(), windows.positions[inside, PRESENT]
+        np.testing.assert_allclose(moves, np.diff(windows.positions[inside], axis=1), atol=1e-6)
         np.testing.assert_allclose(
             groups.position[row][mask].numpy(), place - place.mean(0), atol=1e-4
         )

@@ -31,13 +31,12 @@ def windows(across):
     number = np.arange(count)
     return Windows(
         positions=np.stack([ahead, np.array(across)], axis=-1),
-        scene=np.zeros(count, np.int64),
+        scene=np.full(count, "a"),
         start=number,
         vehicle=number,
         lane=number,
         lane_from_left=number,
         length=np.full(count, 4.5),
-        scene_names=("a",),
     )
 
 

@@ -164,7 +164,7 @@ class _Evaluation:
                 on_progress(done, self.total)
             if done < self.total:
                 self._go_on()
-        driven = torch.cat(self.finished)
+        driven: TensorDictBase = torch.cat(self.finished)  # type: ignore[assignment, arg-type]
         return driven[driven["place"].argsort()]
 
     def _decide(self) -> None:
@@ -293,7 +293,7 @@ def _how_it_ended(
 ) -> list[pl.Series]:
     """The columns ``actions``, ``contact`` and ``changing``."""
     # A place is driven by one row at a time, so the order of the decisions is the order in time.
-    decisions = torch.cat(list(taken)).cpu()
+    decisions = TensorDict.cat(taken).cpu()
     actions = []
     for place in range(len(driven)):
         digits = decisions["action"][decisions["place"] == place].tolist()

@@ -24,6 +24,7 @@ from ganlane.evaluation.statistics import (
     clopper_pearson,
     entries,
     mean_interval,
+    no_events,
     paired_difference,
     poisson_interval,
     resample_counts,
@@ -70,13 +71,16 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
     ended = {reason: int((pair["reason"] == reason).sum()) for reason in keys.END_EVENTS}
     returns = pair["reward"].to_numpy()
     distance_m, duration_s = float(pair["distance_m"].sum()), float(pair["duration_s"].sum())
-    crashes = poisson_interval(ended[_CRASH]).scaled(1e6 / distance_m) if distance_m > 0.0 else None
-    score = _score(pair, same_traffic)
+    lane_changes_per_km = crashes = lead = None
+    if distance_m > 0.0:
+        lane_changes_per_km = int(pair["lane_changes"].sum()) / distance_m * 1000.0
+        crashes = poisson_interval(ended[_CRASH]).scaled(1e6 / distance_m)
     # MOBIL has no lead over itself, and without it nobody has one.
     mobil = same_traffic.filter(pl.col("agent") == SCALE_TOP)
-    lead = (
-        None if pair["agent"][0] == SCALE_TOP or mobil.height == 0 else paired_lead(pair, mobil)[0]
-    )
+    if pair["agent"][0] != SCALE_TOP and mobil.height > 0:
+        lead, _ = paired_lead(pair, mobil)
+    behind = mean_interval(pair["soft_crash_behind"].to_numpy())
+    score = _score(pair, same_traffic)
     return {
         "agent": pair["agent"][0],
         "traffic": pair["traffic"][0],
@@ -89,15 +93,11 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
         "scene_end": ended["scene_end"],
         "soft_crash_onsets": int(pair["soft_crash"].sum()),
         "soft_crash_behind_onsets": int(pair["soft_crash_behind"].sum()),
-        **entries(
-            "soft_crash_behind_per_episode", mean_interval(pair["soft_crash_behind"].to_numpy())
-        ),
+        **entries("soft_crash_behind_per_episode", behind),
         **entries("mean_reward", mean_interval(returns)),
         "reward_sd": float(np.std(returns, ddof=1)) if len(returns) > 1 else None,
         "mean_speed_mps": distance_m / duration_s if duration_s > 0 else None,
-        "lane_changes_per_km": int(pair["lane_changes"].sum()) / distance_m * 1000.0
-        if distance_m > 0
-        else None,
+        "lane_changes_per_km": lane_changes_per_km,
         "distance_km": distance_m / 1000.0,
         **entries("hard_crash_share", clopper_pearson(ended["hard_crash"], pair.height)),
         **entries("out_of_road_share", clopper_pearson(ended["out_of_road"], pair.height)),
@@ -143,18 +143,18 @@ def paired_rows(episodes: pl.DataFrame) -> list[Row]:
         that share fewer than two episodes are left out.
     """
     first, rows = episodes["agent"][0], []
-    for (traffic,), there in episodes.group_by("traffic", maintain_order=True):
-        own = there.filter(pl.col("agent") == first)
-        for (other,), driven in there.group_by("agent", maintain_order=True):
-            lead, shared = paired_lead(own, driven) if other != first else (None, 0)
-            if lead is not None:
-                row = {"agent": first, "over": other, "traffic": traffic, "episodes": shared}
-                verdict = (
-                    ("above" if lead.value > 0.0 else "below")
-                    if lead.excludes_zero()
-                    else "undecided"
-                )
-                rows.append({**row, **entries("lead", lead), "verdict": verdict})
+    for (traffic,), driven in episodes.group_by("traffic", maintain_order=True):
+        ours = driven.filter(pl.col("agent") == first)
+        others = driven.filter(pl.col("agent") != first)
+        for (other,), theirs in others.group_by("agent", maintain_order=True):
+            lead, shared = paired_lead(ours, theirs)
+            if lead is None:
+                continue
+            verdict = "undecided"
+            if lead.excludes_zero():
+                verdict = "above" if lead.value > 0.0 else "below"
+            row = {"agent": first, "over": other, "traffic": traffic, "episodes": shared}
+            rows.append({**row, **entries("lead", lead), "verdict": verdict})
     return rows
 
 
@@ -225,28 +225,10 @@ def _percent_of_way(means: Array) -> Array:
     return 100.0 * (means[..., 0] - means[..., 2]) / (means[..., 1] - means[..., 2])
 
 
-@dataclass(frozen=True)
-class CrashesByScene:
-    """Hard crashes per km.
-
-    Attributes:
-        per_km: of all scenes together, with the 95 % interval of the bootstrap over scenes; no
-            interval with fewer than two scenes. Where nobody crashed the upper bound is Poisson's
-            exact one for the distance driven, since resampling zeros gives zero.
-        rows: one per scene, by name: ``scene, episodes, hard_crash, distance_km, crashes_per_km``
-            (None where nothing was driven) and ``crashes_per_km_ci`` (exact, Poisson, as if its
-            episodes were independent).
-    """
-
-    per_km: Estimate
-    rows: list[Row]
-
-
 def crashes_by_scene(
     episodes: pl.DataFrame, scenes: Sequence[str], resamples: int = RESAMPLES, seed: int = 0
-) -> CrashesByScene:
-    """Crashes per km on recorded scenes, in all and by scene, with intervals that know how few
-    scenes there are.
+) -> tuple[Estimate, list[Row]]:
+    """Crashes per km on recorded scenes, with intervals that know how few scenes there are.
 
     Episodes of one scene start a tenth of a second apart among the same drivers, so they are no
     independent observations: whole scenes are resampled, and the ratio (all crashes over all km) is
@@ -257,6 +239,14 @@ def crashes_by_scene(
         scenes: the scene of each of them
             (:meth:`ganlane.traffic.ReplayTraffic.scenes_of_episodes`).
         resamples, seed: of the bootstrap.
+
+    Returns:
+        Hard crashes per km of all scenes together, with the 95 % interval of the bootstrap over
+        scenes; no interval with fewer than two scenes. Where nobody crashed the upper bound is
+        Poisson's exact one for the distance driven, since resampling zeros gives zero. And one row
+        per scene, by name: ``scene, episodes, hard_crash, distance_km, crashes_per_km`` (None where
+        nothing was driven) and ``crashes_per_km_ci`` (exact, Poisson, as if its episodes were
+        independent).
 
     Raises:
         UserError: not one scene per episode, or nobody drove.
@@ -275,32 +265,31 @@ def crashes_by_scene(
         )
         .sort("scene")
     )
-    crashes, km = (by_scene[name].to_numpy().astype(np.float64) for name in (_CRASH, "distance_km"))
-    if not km.sum() > 0.0:
+    rows = []
+    for row in by_scene.to_dicts():
+        rate, km = None, row["distance_km"]
+        if km > 0.0:
+            rate = poisson_interval(row[_CRASH]).scaled(per=km)
+        rows.append({**row, **entries("crashes_per_km", rate)})
+    crashes = by_scene[_CRASH].to_numpy().astype(np.float64)
+    driven = by_scene["distance_km"].to_numpy()
+    total = float(driven.sum())
+    if not total > 0.0:
         raise UserError(
             "crashes per km: nobody drove; give episodes that last at least one decision."
         )
-    rows = []
-    for row in by_scene.to_dicts():
-        rate = (
-            poisson_interval(row[_CRASH]).scaled(per=row["distance_km"])
-            if row["distance_km"] > 0.0
-            else None
-        )
-        rows.append({**row, **entries("crashes_per_km", rate)})
-    value = float(crashes.sum() / km.sum())
-    if len(km) < 2:
-        return CrashesByScene(Estimate(value), rows)
+    if len(driven) < 2:
+        return Estimate(float(crashes.sum() / total)), rows
     if crashes.sum() == 0:
-        return CrashesByScene(
-            Estimate(value, 0.0, (poisson_interval(0).high or 0.0) / float(km.sum())), rows
-        )
-    driven = km.clip(min=np.finfo(np.float64).tiny)
+        return no_events(total), rows
+    # A resample may hold nothing but scenes in which nobody drove.
+    driven = driven.clip(min=np.finfo(np.float64).tiny)
     ratios = [
-        counts @ crashes / (counts @ driven) for counts in resample_counts(len(km), resamples, seed)
+        counts @ crashes / (counts @ driven)
+        for counts in resample_counts(len(driven), resamples, seed)
     ]
     low, high = np.quantile(np.concatenate(ratios), TAIL_LEVELS)
-    return CrashesByScene(Estimate(value, float(low), float(high)), rows)
+    return Estimate(float(crashes.sum() / total), float(low), float(high)), rows
 
 
 def failed_episodes(episodes: pl.DataFrame) -> list[Row]:
@@ -309,13 +298,10 @@ def failed_episodes(episodes: pl.DataFrame) -> list[Row]:
     Per ``driver, traffic, seed`` the numbers of the episodes that ended so.
     """
     failed = episodes.filter(pl.col("reason").is_in(FAILURES))
-    return [
-        {"driver": driver, "traffic": traffic, "seed": seed}
-        | {
-            end: frame.filter(pl.col("reason") == end)["episode"].sort().to_list()
-            for end in FAILURES
-        }
-        for (driver, traffic, seed), frame in failed.group_by(
-            "agent", "traffic", "seed", maintain_order=True
-        )
-    ]
+    rows = []
+    for names, frame in failed.group_by("agent", "traffic", "seed", maintain_order=True):
+        row: Row = dict(zip(("driver", "traffic", "seed"), names))
+        for end in FAILURES:
+            row[end] = frame.filter(pl.col("reason") == end)["episode"].sort().to_list()
+        rows.append(row)
+    return rows

@@ -23,7 +23,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import scipy  # scipy.stats, which takes a second to import, comes with its first use
-from scipy.special import betaincinv, gammaincinv
+from scipy.special import betaincinv
+
+from ganlane.data.statistics import poisson_interval as poisson_bounds
 
 Array = npt.NDArray[np.float64]
 
@@ -166,8 +168,15 @@ def clopper_pearson(count: int, trials: int) -> Estimate:
 
 def poisson_interval(count: int) -> Estimate:
     """``count`` observed events with the exact Poisson interval of their expected number."""
-    low = 0.0 if count == 0 else float(gammaincinv(count, _TAIL))
-    return Estimate(float(count), low, float(gammaincinv(count + 1, 1.0 - _TAIL)))
+    return Estimate(float(count), *poisson_bounds(count))
+
+
+def no_events(amount: float) -> Estimate:
+    """The rate where nothing happened in ``amount`` (km, say), with Poisson's exact upper bound.
+
+    Resampling zeros would leave no doubt.
+    """
+    return poisson_interval(0).scaled(per=amount)
 
 
 # The training as the unit: several trainings of one recipe (seeds) on the same episodes.
@@ -209,17 +218,13 @@ def probability_of_improvement(first: npt.ArrayLike, second: npt.ArrayLike) -> E
 
 
 def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate | None:
-    """All events over all of ``per`` (km, say), both [S, E]; None where the latter is 0.
-
-    Where nothing happened the upper bound is Poisson's exact one, since resampling zeros gives
-    zero.
-    """
+    """All events over all of ``per`` (km, say), both [S, E]; None where the latter is 0."""
     happened, amount = _pair(events, per)
     total = float(amount.sum())
     if not total > 0.0:
         return None
     if not happened.any():
-        return Estimate(0.0, 0.0, (poisson_interval(0).high or 0.0) / total)
+        return no_events(total)
 
     def ratio(both: Array) -> Array:
         sums = both.sum(axis=-1)

@@ -13,8 +13,8 @@ import pytest
 from ganlane.config.commands import EvaluateConfig
 from ganlane.config.env import EnvConfig
 from ganlane.errors import UserError
-from ganlane.render import main
 from ganlane.evaluation.rows import FAILURES
+from ganlane.render import main
 from ganlane.reproduce.crashes import (
     Crash,
     CrashList,

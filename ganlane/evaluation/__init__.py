@@ -1,4 +1,4 @@
-"""Measuring drivers: given episodes, intervals, tables, and a record of where the numbers come from.
+"""Measuring drivers: episodes, intervals, tables, and where the numbers come from.
 
 :func:`run_episodes` drives the episodes 0 to E - 1 and gives one row for each;
 :func:`evaluation_rows` turns the rows of several agents and traffics into the evaluation's table,

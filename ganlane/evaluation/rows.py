@@ -6,7 +6,6 @@ By driver and traffic, by pair of drivers, by scene.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from ganlane.evaluation.statistics import (
     mean_interval,
     no_events,
     paired_difference,
+    percent_of_way,
     poisson_interval,
     resample_counts,
 )
@@ -80,7 +80,7 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
     if pair["agent"][0] != SCALE_TOP and mobil.height > 0:
         lead, _ = paired_lead(pair, mobil)
     behind = mean_interval(pair["soft_crash_behind"].to_numpy())
-    score = _score(pair, same_traffic)
+    score, reason = _score(pair, same_traffic)
     return {
         "agent": pair["agent"][0],
         "traffic": pair["traffic"][0],
@@ -103,9 +103,8 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
         **entries("out_of_road_share", clopper_pearson(ended["out_of_road"], pair.height)),
         **entries("crashes_per_1000_km", crashes),
         **entries("minus_mobil", lead),
-        "normalized_percent": score.percent,
-        "normalized_percent_ci": score.interval,
-        "normalized_percent_reason": score.reason,
+        **entries("normalized_percent", score),
+        "normalized_percent_reason": reason,
     }
 
 
@@ -158,33 +157,22 @@ def paired_rows(episodes: pl.DataFrame) -> list[Row]:
     return rows
 
 
-@dataclass(frozen=True)
-class NormalizedScore:
-    """Percent of the way from the random driver to MOBIL.
+def _score(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> tuple[Estimate | None, str | None]:
+    """The normalised score of one agent, from the episodes that it shares with the scale's drivers.
 
-    Without a value, the reason why there is none.
-    """
-
-    percent: float | None = None
-    interval: list[float] | None = None
-    reason: str | None = None
-
-
-def _score(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> NormalizedScore:
-    """The normalised score of one agent, from the episodes that it shares with the two drivers of
-    the scale.
+    As :func:`normalized_percent` gives it.
     """
     drivers = [pair]
     for name in (SCALE_TOP, SCALE_BOTTOM):
         driver = same_traffic.filter(pl.col("agent") == name)
         if driver.height == 0:
-            return NormalizedScore(
-                reason=f"needs {SCALE_TOP} and {SCALE_BOTTOM} among the agents; {name} is missing"
-            )
+            needed = f"needs {SCALE_TOP} and {SCALE_BOTTOM} among the agents"
+            return None, f"{needed}; {name} is missing"
         drivers.append(driver)
-    agent, mobil, random_legal = _paired_rewards(*drivers)
-    if len(agent) < 2:
-        return NormalizedScore(reason="fewer than two episodes are shared by the drivers")
+    returns = _paired_rewards(*drivers)
+    if len(returns[0]) < 2:
+        return None, "fewer than two episodes are shared by the drivers"
+    agent, mobil, random_legal = returns
     return normalized_percent(agent, mobil, random_legal)
 
 
@@ -192,42 +180,35 @@ def normalized_percent(
     agent: npt.ArrayLike,
     mobil: npt.ArrayLike,
     random_legal: npt.ArrayLike,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
-) -> NormalizedScore:
-    """The paper's '% of MOBIL', ``100 (R - R_0) / (R_MOBIL - R_0)``: 0 for ``random_legal``, 100
-    for MOBIL.
+) -> tuple[Estimate | None, str | None]:
+    """The paper's '% of MOBIL': 0 for ``random_legal``, 100 for MOBIL.
 
-    This form fits both rows of the paper's Table VII; a plain ratio of mean rewards has no meaning
-    where rewards can be negative. Returns [E] of the three drivers are on the same episodes, in the
-    same order. The interval resamples episodes, all drivers together; resamples in which MOBIL's
-    lead over the random driver is exactly 0 are left out. There is no score where the paired
-    interval of that lead includes 0: the scale would have no length.
+    It is ``100 (R - R_0) / (R_MOBIL - R_0)``. This form fits both rows of the paper's Table VII; a
+    plain ratio of mean rewards has no meaning where rewards can be negative. Returns [E] of the
+    three drivers are on the same episodes, in the same order. The interval resamples episodes, all
+    drivers together; resamples in which MOBIL's lead over the random driver is exactly 0 are left
+    out.
+
+    Returns:
+        The score, and None; or None, and the reason why there is no score: the paired interval of
+        MOBIL's lead over the random driver includes 0, so the scale would have no length.
     """
-    returns = np.stack(
-        [np.asarray(values, dtype=np.float64) for values in (agent, mobil, random_legal)], axis=1
-    )
-    lead = paired_difference(returns[:, 1], returns[:, 2], resamples, seed)
+    drivers = (agent, mobil, random_legal)
+    returns = np.stack([np.asarray(values, dtype=np.float64) for values in drivers], axis=1)
+    lead = paired_difference(returns[:, 1], returns[:, 2])
     if lead.interval is None:
-        return NormalizedScore(reason="fewer than two episodes")
+        return None, "fewer than two episodes"
     if not lead.excludes_zero():
         interval = f"{lead.low:.1f} to {lead.high:.1f}"
-        return NormalizedScore(
-            reason=f"the interval of mobil's lead over random_legal includes 0 ({interval})"
-        )
-    means = bootstrap_means(returns, resamples, seed)
-    low, high = np.quantile(_percent_of_way(means[means[:, 1] != means[:, 2]]), TAIL_LEVELS)
-    return NormalizedScore(float(_percent_of_way(returns.mean(axis=0))), [float(low), float(high)])
+        return None, f"the interval of mobil's lead over random_legal includes 0 ({interval})"
+    means = bootstrap_means(returns)
+    with_scale = means[means[:, 1] != means[:, 2]]
+    low, high = np.quantile(percent_of_way(*with_scale.T), TAIL_LEVELS)
+    value = percent_of_way(*returns.mean(axis=0))
+    return Estimate(float(value), float(low), float(high)), None
 
 
-def _percent_of_way(means: Array) -> Array:
-    """``100 (R - R_0) / (R_MOBIL - R_0)`` from means [..., 3] of agent, MOBIL and random driver."""
-    return 100.0 * (means[..., 0] - means[..., 2]) / (means[..., 1] - means[..., 2])
-
-
-def crashes_by_scene(
-    episodes: pl.DataFrame, scenes: Sequence[str], resamples: int = RESAMPLES, seed: int = 0
-) -> tuple[Estimate, list[Row]]:
+def crashes_by_scene(episodes: pl.DataFrame, scenes: Sequence[str]) -> tuple[Estimate, list[Row]]:
     """Crashes per km on recorded scenes, with intervals that know how few scenes there are.
 
     Episodes of one scene start a tenth of a second apart among the same drivers, so they are no
@@ -238,7 +219,6 @@ def crashes_by_scene(
         episodes: ``reason`` and ``distance_m`` per episode, of one driver.
         scenes: the scene of each of them
             (:meth:`ganlane.traffic.ReplayTraffic.scenes_of_episodes`).
-        resamples, seed: of the bootstrap.
 
     Returns:
         Hard crashes per km of all scenes together, with the 95 % interval of the bootstrap over
@@ -286,7 +266,7 @@ def crashes_by_scene(
     driven = driven.clip(min=np.finfo(np.float64).tiny)
     ratios = [
         counts @ crashes / (counts @ driven)
-        for counts in resample_counts(len(driven), resamples, seed)
+        for counts in resample_counts(len(driven), RESAMPLES, seed=0)
     ]
     low, high = np.quantile(np.concatenate(ratios), TAIL_LEVELS)
     return Estimate(float(crashes.sum() / total), float(low), float(high)), rows

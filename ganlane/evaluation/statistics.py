@@ -14,9 +14,9 @@ Satterthwaite 1946 (degrees of freedom of a sum of variances); McNemar 1947, in 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from statistics import NormalDist
 from typing import Any
 
@@ -41,7 +41,10 @@ _CHUNK = 500
 #: Counts that are kept for the next interval, 2 bytes each.
 _MOST_KEPT = 20_000_000
 _NORMAL = NormalDist()
-_MEAN: Callable[[Array], Any] = partial(np.mean, axis=-1)
+
+
+def _mean(scores: Array) -> Array:
+    return np.asarray(scores.mean(axis=-1))
 
 
 @dataclass(frozen=True)
@@ -96,24 +99,24 @@ def resample_counts(size: int, resamples: int, seed: int) -> Iterator[Array]:
 
 
 @lru_cache(maxsize=2)
-def kept_counts(size: int, resamples: int, seed: int) -> tuple[npt.NDArray[np.uint16], ...]:
+def kept_counts(size: int, resamples: int) -> tuple[npt.NDArray[np.uint16], ...]:
     """The chunks of :func:`resample_counts`.
 
     A table's intervals draw the same ones, 0.25 s for 1000 episodes.
     """
-    return tuple(counts.astype(np.uint16) for counts in resample_counts(size, resamples, seed))
+    return tuple(counts.astype(np.uint16) for counts in resample_counts(size, resamples, seed=0))
 
 
-def bootstrap_means(values: Array, resamples: int = RESAMPLES, seed: int = 0) -> Array:
+def bootstrap_means(values: Array) -> Array:
     """Means [R] or [R, K] of resampled ``values`` [E] or [E, K].
 
     The K columns of an episode stay together.
     """
     size = len(values)
-    drawn = (kept_counts if size * resamples <= _MOST_KEPT else resample_counts)(
-        size, resamples, seed
-    )
-    return np.concatenate([counts.astype(np.float64) @ values / size for counts in drawn])
+    counts: Iterable[Array | npt.NDArray[np.uint16]] = resample_counts(size, RESAMPLES, seed=0)
+    if size * RESAMPLES <= _MOST_KEPT:
+        counts = kept_counts(size, RESAMPLES)
+    return np.concatenate([chunk.astype(np.float64) @ values / size for chunk in counts])
 
 
 def _bca_levels(values: Array, means: Array) -> Array:
@@ -133,7 +136,7 @@ def _bca_levels(values: Array, means: Array) -> Array:
     return np.array([_NORMAL.cdf(bias + z / (1.0 - acceleration * z)) for z in shifted])
 
 
-def mean_interval(values: npt.ArrayLike, resamples: int = RESAMPLES, seed: int = 0) -> Estimate:
+def mean_interval(values: npt.ArrayLike) -> Estimate:
     """Mean of ``values`` [E] with its BCa bootstrap interval.
 
     No interval for fewer than two values.
@@ -144,19 +147,17 @@ def mean_interval(values: npt.ArrayLike, resamples: int = RESAMPLES, seed: int =
         return Estimate(mean)
     if np.all(data == data[0]):
         return Estimate(mean, mean, mean)
-    means = bootstrap_means(data, resamples, seed)
+    means = bootstrap_means(data)
     low, high = np.quantile(means, _bca_levels(data, means))
     return Estimate(mean, float(low), float(high))
 
 
-def paired_difference(
-    first: npt.ArrayLike, second: npt.ArrayLike, resamples: int = RESAMPLES, seed: int = 0
-) -> Estimate:
+def paired_difference(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
     """Mean of ``first - second`` over the same episodes, in the same order, with its interval."""
     a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     if a.shape != b.shape:
         raise ValueError(f"paired values must have one shape, found {a.shape} and {b.shape}")
-    return mean_interval(a - b, resamples, seed)
+    return mean_interval(a - b)
 
 
 def clopper_pearson(count: int, trials: int) -> Estimate:
@@ -190,11 +191,11 @@ def no_events(amount: float) -> Estimate:
 
 
 def interquartile_mean(scores: npt.ArrayLike) -> Array:
-    """Mean of the middle half of the last axis; a quarter, rounded down, is left out at each end."""
+    """Mean of the middle half of the last axis: without a quarter, rounded down, at both ends."""
     return np.asarray(scipy.stats.trim_mean(np.asarray(scores, dtype=np.float64), 0.25, axis=-1))
 
 
-def over_trainings(scores: npt.ArrayLike, statistic: Callable[[Array], Any] = _MEAN) -> Estimate:
+def over_trainings(scores: npt.ArrayLike, statistic: Callable[[Array], Array] = _mean) -> Estimate:
     """``statistic`` (over the last axis) of the mean scores of trainings [S, E], with its interval.
 
     No interval where there is one training and one episode.
@@ -204,7 +205,7 @@ def over_trainings(scores: npt.ArrayLike, statistic: Callable[[Array], Any] = _M
 
 def difference(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
     """Mean of ``first`` [S, E] minus mean of ``second`` [S', E], on the same episodes."""
-    return _estimate(_pair(first, second), lambda a, b: a.mean(axis=-1) - b.mean(axis=-1))
+    return _estimate(_pair(first, second), lambda a, b: _mean(a) - _mean(b))
 
 
 def probability_of_improvement(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
@@ -243,15 +244,15 @@ def normalized_over_trainings(
     None where the interval of MOBIL's lead over the random driver includes 0: the scale would have
     no length.
     """
-    tables = [_pair(each, mobil)[0] for each in (agent, mobil, random_legal)]
+    tables = [_pair(rewards, mobil)[0] for rewards in (agent, mobil, random_legal)]
     if not difference(tables[1], tables[2]).excludes_zero():
         return None
+    return _estimate(tables, lambda *rewards: percent_of_way(*map(_mean, rewards)))
 
-    def percent(*scores: Array) -> Array:
-        value, top, bottom = (each.mean(axis=-1) for each in scores)
-        return np.asarray(100.0 * (value - bottom) / (top - bottom))
 
-    return _estimate(tables, percent)
+def percent_of_way(value: Array, top: Array, bottom: Array) -> Array:
+    """How far ``value`` is on the way from ``bottom`` to ``top``, in per cent."""
+    return np.asarray(100.0 * (value - bottom) / (top - bottom))
 
 
 @dataclass(frozen=True)
@@ -313,7 +314,7 @@ def _estimate(
     if all(table.shape[-2:] == (1, 1) for table in tables):
         return Estimate(value)
     generator, episodes = np.random.default_rng((0, 1)), tables[0].shape[-1]
-    counts = np.concatenate(kept_counts(episodes, FEWER_RESAMPLES, 0)).astype(np.float64).T
+    counts = np.concatenate(kept_counts(episodes, FEWER_RESAMPLES)).astype(np.float64).T
     parts = [
         statistic(*(np.moveaxis(table @ counts, -1, 0) / episodes for table in tables)) - value
     ]

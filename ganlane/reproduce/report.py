@@ -261,56 +261,57 @@ def matrix_table(rows: Sequence[Row]) -> Table:
 
 def table_vi(rows: Sequence[Row]) -> Table:
     """Crashes among rule-followers, beside the paper's."""
-
-    def trainings(row: Row) -> str:
-        return ", ".join(str(training["hard_crash"]) for training in row["each"])
-
-    columns: Mapping[str, Cell] = {
-        "source": lambda row: "here",
-        "traffic": text_of("traffic"),
-        "driver": text_of("driver"),
-        "episodes": _trainings,
+    columns = {
         "hard": text_of("hard_crash"),
         "soft": text_of("soft_crash"),
         "share of hard [95 %, exact]": number_of("hard_crash_share", 4),
-        "each training": trainings,
+        "each training": _each("hard_crash", 0),
     }
-    ours = rows_of(rows, ["idm", "idm_mobil"], [*PAPER_VI, "mobil"])
-    here = Table.of("Table VI: crashes on rule-driven traffic", ours, columns, names=3)
     paper = [
         ["paper", "Traffic_IDM", name, "not stated", *map(str, counts), "", ""]
         for name, counts in PAPER_VI.items()
     ]
-    return replace(here, lines=[*paper, *here.lines])
+    ours = rows_of(rows, ["idm", "idm_mobil"], [*PAPER_VI, "mobil"])
+    return _beside("Table VI: crashes on rule-driven traffic", paper, ours, columns)
 
 
 def table_vii(rows: Sequence[Row]) -> Table:
     """The normalised score on generated traffic, beside the paper's."""
-
-    def trainings(row: Row) -> str:
-        return ", ".join(number(training["mean_reward"], 1) for training in row["each"])
-
-    columns: Mapping[str, Cell] = {
-        "source": lambda row: "here",
-        "traffic": text_of("traffic"),
-        "driver": text_of("driver"),
-        "episodes": _trainings,
+    columns = {
         "% of MOBIL": number_of("normalized_percent", 1),
         "mean reward": number_of("mean_reward", 1),
         "sd": number_of("reward_sd", 1),
-        "each training": trainings,
+        "each training": _each("mean_reward", 1),
     }
     note = (
         "% of MOBIL is 100 (R - R_random) / (R_MOBIL - R_random): 0 for random legal driving, 100 "
         "for MOBIL; the paper does not define its own."
     )
-    ours = rows_of(rows, ["gan"], [*PAPER_VII, "mobil", "random_legal"])
-    title = "Table VII: performance on generated traffic"
-    here = Table.of(title, ours, columns, names=3, notes=[note])
     paper = [
         ["paper", "Traffic_GAN", name, "1000", *(f"{value:.2f}" for value in numbers), ""]
         for name, numbers in PAPER_VII.items()
     ]
+    ours = rows_of(rows, ["gan"], [*PAPER_VII, "mobil", "random_legal"])
+    title = "Table VII: performance on generated traffic"
+    return replace(_beside(title, paper, ours, columns), notes=[note])
+
+
+def _each(key: str, digits: int) -> Cell:
+    """Makes the cell with a number of every training."""
+    return lambda row: ", ".join(number(training[key], digits) for training in row["each"])
+
+
+def _beside(
+    title: str, paper: list[list[str]], ours: list[Row], columns: Mapping[str, Cell]
+) -> Table:
+    """The paper's lines above our rows."""
+    names: Mapping[str, Cell] = {
+        "source": lambda row: "here",
+        "traffic": text_of("traffic"),
+        "driver": text_of("driver"),
+        "episodes": _trainings,
+    }
+    here = Table.of(title, ours, {**names, **columns}, names=3)
     return replace(here, lines=[*paper, *here.lines])
 
 

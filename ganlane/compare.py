@@ -76,11 +76,13 @@ def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = Fal
                     current = (traffic, observation, mask)
                     batch = make(min(config.num_envs, episodes))
                 report = None if quiet else _reporter(bar, f"{driver.name} on {traffic}")
+                # A compiled environment would be compiled again for every size.
                 smaller = None if env.compile else make
                 table = evaluation.run_episodes(
                     batch, policy, range(episodes), seed, report, smaller
                 )
                 table = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
+                # Episodes of one recorded scene are no independent observations.
                 if isinstance(module, ReplayTraffic):
                     scenes = module.scenes_of_episodes(seed, table["episode"].to_list())
                     table = table.with_columns(pl.Series("scene", scenes, pl.String))
@@ -94,6 +96,7 @@ def _reporter(bar: tqdm, title: str) -> Callable[[int, int], None]:
     On the bar, or as one line without a terminal.
     """
     bar.set_description(title)
+    # The bar counts the episodes of all drivers, the callback those of one.
     before = bar.n
 
     def report(finished: int, wanted: int) -> None:
@@ -136,6 +139,7 @@ def publish(
     ``crashes_by_scene`` where a traffic replays recorded scenes (:func:`recorded_crashes`), and
     further ``numbers``. Returns the line that names it.
     """
+    # On the same episodes a difference shows long before two intervals part.
     rows, paired = evaluation.evaluation_rows(table), evaluation.paired_rows(table)
     tables = [evaluation.text_table(rows)]
     if paired:

@@ -62,6 +62,7 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
     cells = cells_of(config, traffics)
     drive(cells, config)
     episodes, revisions, seconds = read_cells(cells)
+    # From here on nothing is driven but the figure of an episode and the list of crashes.
     by_recipe = report.by_recipe(episodes)
     rows, compared = report.rows(by_recipe), report.comparisons(by_recipe, _pairs(by_recipe))
     tables = {
@@ -134,6 +135,7 @@ def _print_left_out(missing: Mapping[str, str]) -> None:
 
 def _list_crashes(episodes: pl.DataFrame, config: ReproduceConfig, folder: Path) -> None:
     """Write the earliest crashes of every driver but the controls, as ``crashes.json``."""
+    # Who drives at random crashes in most episodes, which shows nothing.
     controls = ["random", "random_legal", "keep_lane"]
     drivers = episodes.filter(~pl.col("agent").is_in(controls))
     listed, others = find_crashes(drivers, config, config.crashes)
@@ -177,8 +179,10 @@ def trained_from_scratch(config: ReproduceConfig) -> ReproduceConfig:
     for seed in to_train:
         path = folders[seed]
         arguments = ["experiment=paper", f"seed={seed}", f"hydra.run.dir={path}"]
+        # A training that was stopped goes on where it was.
         if any(path.rglob("last.pt")):
             arguments = [f"resume={path}"]
+        # A process of its own: a training sets threads and seeds for itself.
         command = [sys.executable, "-m", "ganlane.train", *arguments]
         if subprocess.run(command, check=False).returncode:
             raise UserError(
@@ -187,6 +191,7 @@ def trained_from_scratch(config: ReproduceConfig) -> ReproduceConfig:
     agents = config.agents
     for recipe, phase in (("agent_idm", "pretrain"), ("agent_gan", ".")):
         file = Path(config.trained) / f"{recipe}.safetensors"
+        # Agent_IDM is what the first phase gave, Agent_GAN what the second one did.
         trained = {
             seed: read_agent(path / phase / "agent.safetensors") for seed, path in folders.items()
         }

@@ -193,6 +193,7 @@ class _Evaluation:
 
         Their rows are spare then.
         """
+        # A row is counted until its first end, even where it is driven on until the next look.
         ended = ((self.place < self.total) & ~self.driving).nonzero()[:, 0]
         if len(ended) > 0:
             rows = {"place": self.place, "sums": self.sums, "last": self.last}
@@ -207,6 +208,7 @@ class _Evaluation:
         """
         driving = self.driving.nonzero()[:, 0]
         rows = self.env.batch_size[0]
+        # Nothing is left to hand out, and most rows are spare: a smaller batch is faster.
         wide = rows > SMALL_BATCH and 2 * len(driving) <= rows
         if wide and self.handed_out == self.total and self.make_smaller is not None:
             self.env = self.make_smaller(len(driving))
@@ -258,6 +260,7 @@ def _episode_rows(
 ) -> pl.DataFrame:
     """What :func:`run_episodes` returns without being asked for more."""
     last, ego = driven["last"], driven["last", keys.EGO]
+    # One column per count, each [E].
     columns = dict(driven["sums"].items())
     columns |= {name: last[keys.EVENTS, name].squeeze(-1) for name in keys.END_EVENTS}
     columns |= {name: ego[name] for name in ("distance", "lane_changes", "decisions")}
@@ -266,6 +269,7 @@ def _episode_rows(
     if keys.VEHICLES in last:
         columns["at_fault"] = ego_at_fault(Vehicles.of(last[keys.VEHICLES]), road)
         at_fault = pl.col("at_fault")
+    # The reward's terms are the environment's own, so their names are not known here.
     terms = [name for name in columns if name.startswith("reward_")]
     ends = [pl.when(pl.col(event)).then(pl.lit(event)) for event in keys.END_EVENTS]
     distance, duration = pl.col("distance").cast(pl.Float64), pl.col("duration_s")
@@ -315,6 +319,7 @@ def contact_side(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     is the depth of the overlap over the closing speed. Headings are small, so the axes are those of
     the road. Of several vehicles hit in one physics step the nearest to the front counts.
     """
+    # Higher than all places, so that the lowest of a row is that of a vehicle that was hit.
     nobody = len(SIDES)
     first = torch.where(ego_overlaps(vehicles, road), _sides(vehicles, road), nobody).amin(-1)
     return torch.where(first == nobody, 0, first)
@@ -382,6 +387,7 @@ class ScriptedPolicy(TensorDictModuleBase):
     def __init__(self, actions: Mapping[int, str]) -> None:
         super().__init__()
         numbers = sorted(actions)
+        # One more than the longest, so that every script ends with keeping its lane.
         longest = max(map(len, actions.values())) + 1
         padded = [actions[number].ljust(longest, str(keys.KEEP)) for number in numbers]
         self.episodes = torch.tensor(numbers)

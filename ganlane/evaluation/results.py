@@ -72,6 +72,7 @@ def write_results(
         seeds: the seeds and episode numbers behind the numbers.
     """
     path = Path(folder) / "results.json"
+    # Whoever finds the file later can tell where its numbers come from.
     origin = {"seeds": seeds, "config": config, "code": code_version(), "machine": machine()}
     written = datetime.now(timezone.utc).isoformat(timespec="seconds")
     write_json(path, plain({**numbers, **origin, "written": written}))
@@ -88,10 +89,12 @@ def names_of_runs(folders: Sequence[Path]) -> list[str]:
     keys = sorted(
         {key for options in runs for key in options}, key=lambda key: (key == "seed", key)
     )
+    # What all runs have in common tells none of them apart.
     differing = [key for key in keys if len({options.get(key) for options in runs}) > 1]
     names = []
     for options in runs:
         names.append(", ".join(f"{key}={options[key]}" for key in differing if key in options))
+    # Paths from the right, as long as it takes to tell all of them apart.
     longest = max((len(folder.parts) for folder in folders), default=0)
     for depth in range(1, longest + 1):
         if all(names) and len(set(names)) == len(names):
@@ -152,10 +155,12 @@ def plain(value: Any) -> Any:
         return plain(asdict(value))
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
+    # A tensor or an array becomes nested lists, a scalar of theirs a plain number.
     if isinstance(value, (np.ndarray, np.generic, torch.Tensor)):
         return plain(value.tolist())
     if isinstance(value, (list, tuple, set, range)):
         return [plain(item) for item in value]
+    # JSON has neither NaN nor infinity.
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, (bool, int, str)) else str(value)
@@ -167,6 +172,7 @@ def code_version() -> dict[str, Any]:
     An installed copy inside somebody else's checkout has no revision: git must know the package's
     own file.
     """
+    # None where git does not know: an installed package, or a machine without git.
     version: dict[str, Any] = {"version": __version__, "revision": None, "modified": None}
     if _git("ls-files", "--error-unmatch", "__init__.py") is not None:
         version["revision"] = _git("rev-parse", "HEAD")

@@ -68,7 +68,10 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
 
     ``same_traffic`` also holds the drivers that give the scale.
     """
+    # Every end has its column, also one that never happened.
     ended = {reason: int((pair["reason"] == reason).sum()) for reason in keys.END_EVENTS}
+    # Rates are of all episodes together, not means of the episodes' own rates: short episodes would
+    # count as much as long ones.
     returns = pair["reward"].to_numpy()
     distance_m, duration_s = float(pair["distance_m"].sum()), float(pair["duration_s"].sum())
     lane_changes_per_km = crashes = lead = None
@@ -112,6 +115,7 @@ def _paired_rewards(*drivers: pl.DataFrame) -> list[Array]:
     """The returns of each of ``drivers`` on the episodes that all of them drove, in one order, each
     [E].
     """
+    # Each join leaves the episodes that one more driver has driven, too.
     shared = drivers[0].select(_EPISODE)
     for column, driver in enumerate(drivers):
         shared = shared.join(
@@ -149,6 +153,7 @@ def paired_rows(episodes: pl.DataFrame) -> list[Row]:
             lead, shared = paired_lead(ours, theirs)
             if lead is None:
                 continue
+            # A lead is decided only where its whole interval lies on one side of 0.
             verdict = "undecided"
             if lead.excludes_zero():
                 verdict = "above" if lead.value > 0.0 else "below"
@@ -165,6 +170,7 @@ def _score(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> tuple[Estimate | N
     drivers = [pair]
     for name in (SCALE_TOP, SCALE_BOTTOM):
         driver = same_traffic.filter(pl.col("agent") == name)
+        # Who asks for other drivers than those of the scale gets a reason in place of a score.
         if driver.height == 0:
             needed = f"needs {SCALE_TOP} and {SCALE_BOTTOM} among the agents"
             return None, f"{needed}; {name} is missing"
@@ -202,6 +208,7 @@ def normalized_percent(
         interval = f"{lead.low:.1f} to {lead.high:.1f}"
         return None, f"the interval of mobil's lead over random_legal includes 0 ({interval})"
     means = bootstrap_means(returns)
+    # A resample without MOBIL's lead would divide by zero.
     with_scale = means[means[:, 1] != means[:, 2]]
     low, high = np.quantile(percent_of_way(*with_scale.T), TAIL_LEVELS)
     value = percent_of_way(*returns.mean(axis=0))

@@ -91,6 +91,7 @@ def resample_counts(size: int, resamples: int, seed: int) -> Iterator[Array]:
     """
     generator = np.random.default_rng(seed)
     for start in range(0, resamples, _CHUNK):
+        # Each row of a chunk counts in a range of its own, so that one bincount serves all rows.
         rows = min(_CHUNK, resamples - start)
         drawn = generator.integers(size, size=(rows, size)) + size * np.arange(rows)[:, None]
         yield (
@@ -130,6 +131,7 @@ def _bca_levels(values: Array, means: Array) -> Array:
     # (E - 1).
     acceleration = (centred**3).sum() / (6.0 * (centred**2).sum() ** 1.5)
     below = ((means < mean).mean() + (means <= mean).mean()) / 2.0
+    # Half a resample away from 0 and 1, where the normal quantile is infinite.
     edge = 0.5 / len(means)
     bias = _NORMAL.inv_cdf(float(np.clip(below, edge, 1.0 - edge)))
     shifted = [bias + _NORMAL.inv_cdf(float(level)) for level in TAIL_LEVELS]
@@ -145,6 +147,7 @@ def mean_interval(values: npt.ArrayLike) -> Estimate:
     mean = float(data.mean())
     if len(data) < 2:
         return Estimate(mean)
+    # Where all are equal the correction below would divide by zero.
     if np.all(data == data[0]):
         return Estimate(mean, mean, mean)
     means = bootstrap_means(data)
@@ -162,6 +165,7 @@ def paired_difference(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
 
 def clopper_pearson(count: int, trials: int) -> Estimate:
     """Share ``count / trials`` (at least one trial) with its exact binomial interval."""
+    # The bounds are quantiles of beta distributions; the function knows neither end.
     low = 0.0 if count == 0 else float(betaincinv(count, trials - count + 1, _TAIL))
     high = 1.0 if count == trials else float(betaincinv(count + 1, trials - count, 1.0 - _TAIL))
     return Estimate(count / trials, low, high)
@@ -275,6 +279,7 @@ def mcnemar(first: npt.ArrayLike, second: npt.ArrayLike) -> McNemar:
     a, b = np.asarray(first, dtype=bool), np.asarray(second, dtype=bool)
     if a.shape != b.shape:
         raise ValueError(f"paired episodes must have one shape, found {a.shape} and {b.shape}")
+    # Episodes in which both failed, or neither, say nothing about a difference.
     one, other = int((a & ~b).sum()), int((b & ~a).sum())
     return McNemar(
         one, other, float(scipy.stats.binomtest(one, one + other).pvalue) if one + other else 1.0
@@ -313,6 +318,7 @@ def _estimate(
     value = float(statistic(*means)[0])
     if all(table.shape[-2:] == (1, 1) for table in tables):
         return Estimate(value)
+    # One draw of the episodes serves all tables: all drivers drove the same ones.
     generator, episodes = np.random.default_rng((0, 1)), tables[0].shape[-1]
     counts = np.concatenate(kept_counts(episodes, FEWER_RESAMPLES)).astype(np.float64).T
     parts = [
@@ -323,11 +329,13 @@ def _estimate(
         trainings = table.shape[-2]
         if trainings == 1:
             continue
+        # This table's trainings are drawn anew, the others' stay as they are.
         chosen = generator.integers(trainings, size=(FEWER_RESAMPLES, trainings))
         drawn = list(means)
         drawn[index] = np.moveaxis(means[index][0][..., chosen], -2, 0)
         parts.append(np.sqrt(trainings / (trainings - 1)) * (statistic(*drawn) - value))
         freedom.append(trainings - 1)
+    # Satterthwaite: the degrees of freedom of a sum of variances that are known unequally well.
     variances = np.var(parts, axis=-1)
     uncertainty = float((variances**2 / freedom).sum())
     degrees = variances.sum() ** 2 / uncertainty if uncertainty > 0.0 else np.inf
@@ -338,5 +346,6 @@ def _estimate(
 
 def _share_above(first: Array, second: Array) -> Array:
     """Share of the pairs of [R, S] and [R, S'] in which the first is above; [R]."""
+    # Every training of the first with every training of the second, [R, S, S'].
     a, b = first[:, :, None], second[:, None, :]
     return np.asarray(((a > b) + 0.5 * (a == b)).mean(axis=(1, 2)))

@@ -21,6 +21,7 @@ def aligned(lines: Sequence[Sequence[str]], names: int = 1) -> str:
 
     The first ``names`` columns are left-aligned, the others right-aligned.
     """
+    # A column is as wide as its widest cell, the heading included.
     widths = [max(map(len, column)) for column in zip(*lines)]
 
     def line(cells: Sequence[str]) -> str:
@@ -55,6 +56,7 @@ def fitting(text: str, width: int) -> str:
 
 def _narrowed(lines: Sequence[str], width: int) -> str:
     """One part of a text, as :func:`fitting` does; its lines."""
+    # The ruler below the headings tells a table from other text, and where its columns stand.
     rulers = [place for place, line in enumerate(lines) if re.fullmatch(r"-+(  -+)+", line)]
     if not rulers or len(lines[rulers[0]]) <= width:
         return "\n".join(lines)
@@ -64,6 +66,7 @@ def _narrowed(lines: Sequence[str], width: int) -> str:
     for ruler in re.finditer("-+", lines[head + 1]):
         span = slice(*ruler.span())
         spans[lines[head][span].strip()] = span
+    # Columns go one by one until the rest fits; the first, the name, stays.
     gone: set[str] = set()
     for name in [*_FIRST_TO_GO, *reversed(list(spans)[1:])]:
         left = [span.stop - span.start + 2 for other, span in spans.items() if other not in gone]
@@ -130,6 +133,7 @@ class Table:
 
     def text(self) -> str:
         """Aligned columns, with the title above and the notes below."""
+        # The tables of an evaluation have no title: the command is one.
         lines = [self.title, ""] if self.title else []
         lines.append(aligned([self.headings, *self.lines], self.names))
         if self.notes:
@@ -151,6 +155,7 @@ def significant(value: float | None) -> str:
     """Three significant digits, without exponent."""
     if value is None:
         return NOTHING
+    # Rounded first: 9.996 has three digits as 10.0, not as 10.00.
     rounded = float(f"{value:.3g}")
     whole = len(str(int(abs(rounded))))
     return f"{rounded:.{max(0, 3 - whole)}f}" if abs(rounded) >= 1 else f"{rounded:.3g}"
@@ -161,6 +166,7 @@ def count(value: float | None) -> str:
     if value is None:
         return NOTHING
     for limit, unit in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
+        # What rounds up to the next unit is given in that unit: 1.00 M, not 1000 k.
         if abs(value) >= limit * 0.9995:
             return f"{significant(value / limit)}{unit}"
     return significant(value)

@@ -58,6 +58,7 @@ def available(config: ReproduceConfig) -> tuple[dict[str, TrafficConfig], dict[s
     missing: dict[str, str] = {}
     for name, option in config.chosen_traffics().items():
         try:
+            # Made and thrown away: only now a missing package or recording shows.
             make_traffic(option, config.env)
             at_hand[name] = option
         except UserError as error:
@@ -88,6 +89,7 @@ def _settings(
     driver: Driver, traffic: TrafficConfig, config: ReproduceConfig, episodes: int
 ) -> dict[str, Any]:
     """See :class:`Cell`."""
+    # The weights themselves, not a file's name: a training under the same name is another driver.
     weights = hashlib.sha256()
     for name, value in driver.policy.state_dict().items():
         # Noise for exploring is drawn anew by every process.
@@ -95,6 +97,7 @@ def _settings(
             weights.update(value.cpu().numpy().tobytes())
     mask, _ = driver.behind(config.mask)
     env = asdict(config.env)
+    # It changes how fast the cell is driven, not what happens.
     del env["compile"]
     settings = {
         "driver": driver.name,
@@ -110,6 +113,7 @@ def _settings(
         "num_envs": min(config.num_envs, episodes),
         "device": config.device,
     }
+    # As it will be read from the file again, so that two such records can be compared.
     return json.loads(json.dumps(settings, default=str))
 
 
@@ -150,6 +154,7 @@ def drive_cell(cell: Cell, config: ReproduceConfig) -> None:
     """Drive one cell and write its file."""
     set_threads(config.threads)
     begun = time.monotonic()
+    # The same call as in ganlane evaluate, with one driver on one traffic.
     alone = replace(config, traffics=[cell.traffic], episodes=cell.settings["episodes"])
     driver = make_driver(cell.driver, config.env, device=config.device)
     table = compare([driver], alone, quiet=True)
@@ -174,6 +179,7 @@ def read_cells(cells: Sequence[Cell]) -> tuple[pl.DataFrame, list[str], dict[str
         try:
             origin = json.loads(pl.read_parquet_metadata(cell.path)[_ORIGIN])
             tables.append(pl.read_parquet(cell.path))
+            # An installed package has a version, but no revision.
             revisions.add(str(origin["code"]["revision"] or origin["code"]["version"]))
             seconds[cell.traffic] += float(origin["seconds"])
         except (OSError, KeyError, ValueError, TypeError, pl.exceptions.PolarsError) as error:

@@ -98,6 +98,7 @@ class CrashList:
         mask: MaskParameters | None = None,
     ) -> EnvBase:
         """The environment that repeats this list's episodes on a traffic."""
+        # The tensor code, so that a list plays the same with and without the native kernel.
         env = replace(self.env, kernel="torch", compile=False)
         model = make_traffic(self.traffics[traffic], env, Stream.named(self.stream))
         return make_env(model, env, observation, reward, ROWS, mask=mask)
@@ -108,6 +109,7 @@ class CrashList:
         for (_, traffic, seed), group in groupby(
             self.crashes, attrgetter("driver", "traffic", "seed")
         ):
+            # One script for all episodes of a driver on a traffic: they are driven side by side.
             actions = {crash.episode: crash.actions for crash in group}
             policy = ScriptedPolicy(actions)
             table = run_episodes(self.make_env(traffic), policy, list(actions), seed)
@@ -133,6 +135,7 @@ def find_crashes(
         for name, option in config.chosen_traffics().items()
         if name in _LISTED and option._target_ == _LISTED[name]._target_ and not option.parameters
     }
+    # A list without crashes makes the environment in which they are looked for.
     listed = CrashList(config.env, traffics, config.stream, [])
     pair = ["traffic", "agent"]
     failed = (
@@ -149,6 +152,7 @@ def find_crashes(
         observation = config.observation.read_by(driver.observation)
         env = listed.make_env(str(traffic), observation, config.reward, mask)
         again = run_episodes(env, policy, frame["episode"].to_list(), config.seed, actions=True)
+        # Both tables have the same episodes in the same order.
         same = again.filter(again["reason"] == frame["reason"])
         crashes += [
             Crash(
@@ -169,6 +173,7 @@ def find_crashes(
 
 def write_crashes(path: str | Path, listed: CrashList) -> None:
     """Write a list as JSON, atomically."""
+    # A list names the option of its environment, so that reading knows the type of its values.
     option = next(name for name, kind in SCHEMAS["env"].items() if kind is type(listed.env))
     traffics = {}
     for name in sorted({crash.traffic for crash in listed.crashes}):
@@ -198,6 +203,7 @@ def read_crashes(path: str | Path) -> CrashList:
             f"{path}: cannot be read; give the crashes.json of ganlane reproduce."
         ) from error
     except _BROKEN as error:
+        # Errors of libraries may have many lines; a user's mistake is one sentence.
         reason = " ".join(str(error).split())[:200]
         raise UserError(
             f"{path}: not a list of crashes ({reason}); give the crashes.json of ganlane reproduce."

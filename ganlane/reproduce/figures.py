@@ -103,6 +103,7 @@ def forecasts_to_draw() -> pl.DataFrame:
         raise UserError(f"the recordings have none of the scenes {names}, kept from the fit.")
     windows = cut_windows(scenes, _STRIDE)
     groups = group_windows(windows)
+    # Paths after the present, each [W, frames, 2]. The mean is the same for every seed.
     later = {"recorded": windows.future}
     for seed in range(SAMPLES):
         drawn = paper_forecasts(generator, windows, groups, seed, samples=1)
@@ -112,6 +113,7 @@ def forecasts_to_draw() -> pl.DataFrame:
     for panel, (kind, row) in enumerate(interesting(windows)):
         paths = {name: np.concatenate([now, path[row]]) for name, path in later.items()}
         seen = windows.positions[row, :OBSERVED_POSITIONS] - windows.positions[row, PRESENT]
+        # The observed path ends at the present, the others begin there.
         for name, path in {**paths, "observed": seen}.items():
             present = PRESENT if name == "observed" else 0
             columns = {
@@ -153,6 +155,7 @@ def draw_forecasts(paths: pl.DataFrame) -> Figure:
             path = panel.filter(pl.col("path") == name)
             axes.plot(path["ahead_m"], path["left_m"], **style)
         low, high = axes.get_ylim()
+        # At least 1.6 m of height, so that steady driving does not look like a lane change.
         middle, reach = (low + high) / 2.0, max(0.8, (high - low) / 2.0)
         axes.set_ylim(middle - reach, middle + reach)
     add_legend(figure, colours)
@@ -167,6 +170,7 @@ def drive_beginning(config: ReproduceConfig, traffic: TrafficConfig) -> Trajecto
 
     Without such an agent the last one of ``config`` drives.
     """
+    # The figure shows what generated traffic teaches.
     learnt = [name for name in config.agents if "agent_gan" in name]
     name = with_seeds([*learnt, config.agents[-1]][0])[0]
     driver = make_driver(name, config.env, device=config.device)
@@ -187,11 +191,14 @@ def busiest(episode: Trajectory) -> pl.DataFrame:
     """
     shown = min(round(SHOWN_S / episode.frame_s), len(episode) - 1)
     ahead = episode.x - episode.x[:, :1]
+    # Vehicles in view, the ego left out.
     near = episode.valid & (ahead > AROUND_M[0]) & (ahead < AROUND_M[1] / 2.0)
     near[:, 0] = False
+    # How far each moves across within the seconds that start at a frame, [T - shown, M].
     across = np.abs(episode.y[shown:] - episode.y[: len(episode) - shown])
     first = int(np.argmax((across * near[: len(across)]).sum(axis=1)))
     part = slice(first, first + shown + 1)
+    # A vehicle that is recycled would draw a line across the picture.
     jumps = episode.jumped()[first + 1 : first + shown + 1].any(axis=0)
     frames = []
     for vehicle in np.flatnonzero(episode.valid[part].all(axis=0) & ~jumps).tolist():
@@ -227,6 +234,7 @@ def draw_episode(label: EpisodeLabel, tracks: pl.DataFrame) -> Figure:
             style = {"color": INK, "ls": "-"}
         axes.axhline((line - 0.5) * lane_m, **style)
     colours = {"ego": COLOURS[1], "others": COLOURS[0]}
+    # From the first to the last, at equal times.
     frames = np.linspace(0, len(times) - 1, FRAMES).round().astype(int)
     for track in tracks.partition_by("vehicle", maintain_order=True):
         colour = colours["ego" if track["vehicle"][0] == 0 else "others"]
@@ -276,6 +284,7 @@ def read_curves(folders: Sequence[str]) -> pl.DataFrame | None:
                     pl.lit(phase).alias("phase"),
                 )
             )
+            # The second phase goes on counting where the first one ended.
             before = curve["decisions"][-1]
     return pl.concat(parts, how="vertical_relaxed") if parts else None
 
@@ -294,6 +303,7 @@ def draw_transfer(curves: pl.DataFrame, rows: Sequence[Row]) -> Figure:
     for (_, phase), colour in zip(curves.group_by("phase", maintain_order=True), COLOURS):
         runs = phase.partition_by("run", maintain_order=True)
         points = [run.select("decisions", "mean_reward").to_numpy().T for run in runs]
+        # All runs at the decisions of the first one.
         x = points[0][0]
         y = np.stack([np.interp(x, *run) for run in points])
         axes.fill_between(x, y.min(axis=0), y.max(axis=0), color=colour, alpha=0.2, lw=0)
@@ -324,12 +334,14 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
     shown = [row for row in rows if row["minus_mobil"] is not None]
     drivers = list(dict.fromkeys(row["driver"] for row in shown))
     traffics = list(dict.fromkeys(row["traffic"] for row in shown))
+    # All panels have one scale, so that traffics can be compared.
     bounds = [bound for row in shown for bound in _interval(row)]
     lowest, highest = min(-20.0, *bounds), max(20.0, *bounds)
     figure, grid = panel_grid(len(traffics), 3.4, 1.3 + 0.19 * len(drivers))
     for place, (axes, traffic) in enumerate(zip(grid, traffics)):
         axes.axvline(0.0, color=FAINT, lw=0.9)
         axes.set(title=traffic, xlabel="mean reward minus MOBIL's", ylim=(len(drivers) - 0.5, -0.5))
+        # Most leads lie within 20, those of random driving far below.
         axes.set_xscale("symlog", linthresh=20.0)
         axes.set_yticks(range(len(drivers)), drivers if place % 3 == 0 else [])
         axes.set_xticks([x for x in _LEADS if lowest <= x <= highest], minor=False)

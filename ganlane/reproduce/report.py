@@ -56,6 +56,7 @@ svg { max-width: 100%; height: auto }
 
 def recipe_of(driver: str) -> str:
     """``agent_idm+safe`` of ``agent_idm@3+safe`` and of ``FOLDER/agent_idm.safetensors@3+safe``."""
+    # Name, seed and mask: a folder and the file's ending do not belong to the recipe.
     packed = re.fullmatch(r"(?:.*/)?(.+?)(?:\.safetensors)?@\d+(\+.*)?", driver)
     return driver if packed is None else packed[1] + (packed[2] or "")
 
@@ -73,6 +74,7 @@ def by_recipe(episodes: pl.DataFrame) -> dict[tuple[str, str], dict[str, pl.Data
         recipe = recipe_of(str(driver))
         trainings = cells.setdefault((recipe, str(traffic)), {})
         trainings[str(driver)] = frame.sort("episode")
+        # The same training twice would count as two.
         if len(set(map(seed_of, trainings))) < len(trainings):
             names = ", ".join(trainings)
             raise UserError(
@@ -113,6 +115,7 @@ def rows(cells: Cells) -> list[Row]:
 
 
 def _row(recipe: str, traffic: str, trainings: Mapping[str, pl.DataFrame], cells: Cells) -> Row:
+    # Both [S, E]: trainings by episodes.
     rewards, km = column(trainings, "reward"), column(trainings, pl.col("distance_m") / 1000.0)
     mobil = _rewards(cells, SCALE_TOP, traffic)
     random_legal = _rewards(cells, SCALE_BOTTOM, traffic)
@@ -123,6 +126,7 @@ def _row(recipe: str, traffic: str, trainings: Mapping[str, pl.DataFrame], cells
         mobil = None  # it is not compared with itself
     if mobil is not None:
         lead, probability = difference(rewards, mobil), _probability(rewards, mobil)
+    # Counts and plain rates are of the episodes of all trainings.
     together = pl.concat(trainings.values())
     crashes = together.filter(_ended(FAILURES[:1]))
     seconds, driven = float(together["duration_s"].sum()), float(km.sum())
@@ -192,8 +196,10 @@ def _compared(first: Mapping[str, pl.DataFrame], second: Mapping[str, pl.DataFra
     """The numbers of a row of :func:`comparisons`."""
     rewards, other_rewards = column(first, "reward"), column(second, "reward")
     crashed, other_crashed = (column(cell, _ended(FAILURES[:1])) for cell in (first, second))
+    # Per 1000 episodes, which is easier to read than a share.
     more_crashes = _crash_difference(crashed, other_crashed).scaled(1000.0)
     namesakes = dict(zip(map(seed_of, second), other_crashed))
+    # A driver without trainings, say MOBIL, is held against every training of the first.
     if len(namesakes) == 1:
         namesakes = dict.fromkeys(map(seed_of, first), other_crashed[0])
     tests = []
@@ -227,6 +233,7 @@ def _probability(first: Array, second: Array) -> Estimate | None:
 
 def rows_of(rows: Sequence[Row], traffics: Sequence[str], drivers: Sequence[str]) -> list[Row]:
     """The rows of ``drivers``, which may say that they have no mask, on ``traffics``."""
+    # The default command drives the agents without a mask, under names that say so.
     names = {name for driver in drivers for name in (driver, f"{driver}+none")}
     return [row for row in rows if row["traffic"] in traffics and row["driver"] in names]
 
@@ -343,6 +350,7 @@ def write_report(
     folder: Path, tables: Mapping[str, Table], figures: Mapping[str, Figure], intro: Sequence[str]
 ) -> Path:
     """Write every figure as PNG and SVG, and ``report.html`` with tables and figures; its path."""
+    # Everything is within the page, so that it opens without a network.
     parts = [f"<p>{html.escape(line)}</p>" for line in intro]
     for name, figure in figures.items():
         for kind in ("png", "svg"):
@@ -392,6 +400,7 @@ def write_csv(path: Path, content: pl.DataFrame | Table | Sequence[Row]) -> None
 
 
 def _flat(row: Row) -> Row:
+    # CSV has neither pairs nor lists in a cell.
     flat: Row = {}
     for key, value in row.items():
         if key.endswith("_ci"):

@@ -8,12 +8,13 @@ import polars as pl
 import pytest
 
 from ganlane.build import make_driver
-from ganlane.compare import compare, publish, recorded_crashes
+from ganlane.compare import compare, publish
 from ganlane.settings.commands import EvaluateConfig
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.traffic import IdmTrafficConfig, ReplayTrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
-from ganlane.evaluation import crashes_by_scene, failed_episodes
+from ganlane.evaluation import crashes_by_scene, evaluation_rows, failed_episodes, paired_rows
+from ganlane.evaluation.results import plain
 from ganlane.sim.random import Stream
 from ganlane.traffic import ReplayTraffic
 
@@ -32,58 +33,43 @@ def table(recordings):
     env = EnvConfig(goal_m=60.0)
     traffics = {"idm": IdmTrafficConfig(), "replay": ReplayTrafficConfig(path=str(recordings))}
     drivers = [make_driver(name, env) for name in ("keep_lane", "random_legal")]
-    options = {
-        "traffics": list(traffics),
-        "traffic_options": traffics,
-        "episodes": EPISODES,
-        "num_envs": 4,
-    }
-    return compare(drivers, EvaluateConfig(env=env, seed=5, **options))
+    config = EvaluateConfig(
+        env=env,
+        traffics=list(traffics),
+        traffic_options=traffics,
+        seed=5,
+        episodes=EPISODES,
+        num_envs=4,
+    )
+    return compare(drivers, config)
 
 
 def test_every_replayed_episode_has_the_scene_that_it_ran_in(table, recordings):
     scenes = ReplayTraffic(Stream.REPORT, recordings).scenes_of_episodes(5, range(EPISODES))
     assert len(set(scenes)) == 3
-    for agent in ("keep_lane", "random_legal"):
-        episodes = table.filter(pl.col("traffic") == "replay", pl.col("agent") == agent).sort(
-            "episode"
-        )
-        assert episodes["scene"].to_list() == scenes
+    replayed = table.filter(pl.col("traffic") == "replay")
+    for _, episodes in replayed.group_by("agent"):
+        assert episodes.sort("episode")["scene"].to_list() == scenes
     assert table.filter(pl.col("traffic") == "idm")["scene"].is_null().all()
 
 
-def test_the_record_holds_rows_paired_leads_and_crashes_by_scene(table, tmp_path, capsys):
+def test_the_record_holds_rows_paired_leads_failures_and_crashes_by_scene(table, tmp_path, capsys):
     publish(table, tmp_path, {}, {})
     record = json.loads((tmp_path / "results.json").read_text())
-    assert len(record["rows"]) == 4
-    assert [
-        (row["agent"], row["over"], row["traffic"], row["episodes"]) for row in record["paired"]
-    ] == [
-        ("keep_lane", "random_legal", "idm", EPISODES),
-        ("keep_lane", "random_legal", "replay", EPISODES),
-    ]
-    assert capsys.readouterr().out.count("keep_lane over random_legal") == 2
-    means = {(row["agent"], row["traffic"]): row["mean_reward"] for row in record["rows"]}
-    for row in record["paired"]:
-        lead = means["keep_lane", row["traffic"]] - means["random_legal", row["traffic"]]
-        assert row["lead"] == pytest.approx(lead)
-        assert row["lead_ci"][0] <= row["lead"] <= row["lead_ci"][1]
+    assert record["rows"] == plain(evaluation_rows(table))
+    assert record["paired"] == plain(paired_rows(table))
     assert record["failures"] == failed_episodes(table)
+    assert [row["traffic"] for row in record["paired"]] == ["idm", "replay"]
+    assert capsys.readouterr().out.count("keep_lane over random_legal") == 2
     assert [row["agent"] for row in record["crashes_by_scene"]] == ["keep_lane", "random_legal"]
+    replayed = table.filter(pl.col("traffic") == "replay")
     for row in record["crashes_by_scene"]:
-        own = table.filter(pl.col("traffic") == "replay", pl.col("agent") == row["agent"])
-        expected = crashes_by_scene(own, own["scene"].to_list())
-        assert row["traffic"] == "replay"
-        assert row["per_km"] == pytest.approx(expected.per_km.value)
-        assert row["per_km_ci"] == pytest.approx(expected.per_km.interval)
-        assert sum(scene["episodes"] for scene in row["scenes"]) == EPISODES
-        assert sum(scene["distance_km"] for scene in row["scenes"]) == pytest.approx(
-            own["distance_m"].sum() / 1000
-        )
+        episodes = replayed.filter(pl.col("agent") == row["agent"])
+        per_km, scenes = crashes_by_scene(episodes, episodes["scene"].to_list())
+        assert (row["per_km"], row["per_km_ci"]) == (per_km.value, per_km.interval)
+        assert row["scenes"] == scenes
 
 
 def test_other_traffics_have_no_scenes(table, tmp_path):
-    others = table.filter(pl.col("traffic") == "idm").drop("scene")
-    assert recorded_crashes(others) == []
-    publish(others, tmp_path, {}, {})
+    publish(table.filter(pl.col("traffic") == "idm").drop("scene"), tmp_path, {}, {})
     assert "crashes_by_scene" not in json.loads((tmp_path / "results.json").read_text())

@@ -91,10 +91,8 @@ def _crashes(config: RenderConfig, path: str) -> list[Trajectory]:
         )
     end_s = config.end_s if config.end_s is not None else float("inf")
     for each in chosen[:MOST_EPISODES]:
-        env, policy = (
-            listed.make_env(each.traffic, reward=config.reward),
-            ScriptedPolicy(each.steps()),
-        )
+        env = listed.make_env(each.traffic, reward=config.reward)
+        policy = ScriptedPolicy({each.episode: each.actions})
         episodes.append(
             record_episode(env, policy, each.seed, each.episode, each.driver, each.traffic, end_s)
         )

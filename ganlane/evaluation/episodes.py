@@ -1,18 +1,17 @@
-"""Driving given episodes: one row of facts about each, or a rollout with every action, which can be
-driven again.
+"""Driving given episodes: one row of facts about each.
 
-:func:`run_episodes` drives the rows of a batch side by side. A row whose episode has ended takes
-the next one that has not been driven yet, so none waits for the slowest. Once all have been handed
-out, the last ones move to smaller batches. The simulation is deterministic, so :func:`replay` gives
-the same :class:`Rollout` from its episode number and actions: rule-driven traffic bit for bit in
-any batch, generated traffic in batches of the same size (its network's matrix products round
-differently in others).
+The rows of a batch drive side by side. A row whose episode has ended takes the next one that has
+not been driven yet, so none waits for the slowest. Once all have been handed out, the last ones
+move to smaller batches.
+
+The simulation is deterministic, so :class:`ScriptedPolicy` drives an episode again from its number
+and its actions: rule-driven traffic bit for bit in any batch, generated traffic in batches of the
+same size (its network's matrix products round differently in others).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import polars as pl
 import torch
@@ -25,7 +24,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.sim.collisions import ego_overlaps
-from ganlane.sim.state import STRAIGHT, Road, Vehicles, road_in
+from ganlane.sim.state import STRAIGHT, Road, Vehicles
 
 #: Decisions between two looks at which rows have ended. A look waits for the device and a reset
 #: costs about a tenth of a decision; a row that has ended waits 3.5 decisions on average, of more
@@ -38,6 +37,8 @@ OTHER = "other"
 #: Where the other vehicle of a crash was.
 SIDES = ("none", "ahead", "side", "behind")
 _AHEAD, _SIDE, _BEHIND = 1, 2, 3
+#: What is read from the last state of an episode.
+_LAST = (keys.EVENTS, keys.EGO, keys.STEP, keys.VEHICLES)
 
 
 def run_episodes(
@@ -47,9 +48,9 @@ def run_episodes(
     seed: int,
     on_progress: Callable[[int, int], None] | None = None,
     make_smaller: Callable[[int], EnvBase] | None = None,
+    actions: bool = False,
 ) -> pl.DataFrame:
-    """Drive exactly ``episodes`` of ``seed``, each to its own end; one row per episode, in the
-    order given.
+    """Drive exactly ``episodes`` of ``seed``, each to its own end; one row each, in that order.
 
     Which episodes are counted does not depend on how long any of them takes, so short ones are not
     favoured. The numbers are the same in any batch, with generated traffic up to rounding. The
@@ -65,13 +66,16 @@ def run_episodes(
         make_smaller: makes ``env`` with fewer rows; the last episodes move there when at most half
             of the rows are still driving. Not used where something is held per row: by traffic with
             ``rows_must_stay``, and by every policy without ``rows_must_stay = False``.
+        actions: whether to return the columns ``actions``, ``contact`` and ``changing``, too.
 
     Returns:
         Columns ``episode, seed, reason`` (:data:`ganlane.keys.END_EVENTS`, or ``other``),
         ``soft_crash`` and ``soft_crash_behind`` (onsets), ``had_soft_crash``, ``reward``
         (undiscounted return), ``reward_*`` (each term's sum), ``decisions``, ``duration_s``,
         ``distance_m``, ``mean_speed_mps`` (distance over time), ``lane_changes``, and ``at_fault``
-        of a hard crash (:func:`ego_at_fault`; else null).
+        of a hard crash (:func:`ego_at_fault`; else null). If asked for: ``actions`` (text, a digit
+        per decision), ``contact`` (what a hard crash hit, of :data:`SIDES`) and ``changing``
+        (whether the ego was changing lanes in its last decision).
 
     Raises:
         UserError: no episodes are asked for, the environment is not batched in one dimension, or
@@ -82,16 +86,20 @@ def run_episodes(
         raise UserError(
             f"env: batch size {shape} was found, expected [N]; build the environment with N rows."
         )
+    numbers = list(episodes)
+    taken: list[TensorDict] | None = [] if actions else None
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        counts = _Evaluation(env, policy, list(episodes), seed, make_smaller).run(on_progress)
-    return _episode_rows(counts, list(episodes), seed)
+        driven = _Evaluation(env, policy, numbers, seed, make_smaller, taken).run(on_progress)
+    table = _episode_rows(driven, numbers, seed, getattr(env, "road", STRAIGHT))
+    if taken is not None:
+        return table.with_columns(*_how_it_ended(driven, taken, getattr(env, "road", STRAIGHT)))
+    return table
 
 
 def start_of(env: EnvBase, numbers: Sequence[int], seed: int) -> TensorDict:
-    """The tensordict that makes ``env.reset`` start these episodes; the last one also fills the
-    rows left over.
+    """The tensordict that makes ``env.reset`` start these episodes.
 
-    :class:`UserError` for none.
+    The last one also fills the rows left over. :class:`UserError` for none.
     """
     if len(numbers) == 0:
         raise UserError(
@@ -110,7 +118,8 @@ def start_of(env: EnvBase, numbers: Sequence[int], seed: int) -> TensorDict:
 class _Evaluation:
     """Episodes on their way through the rows of an environment.
 
-    Arguments as in :func:`run_episodes`.
+    Arguments as in :func:`run_episodes`; the actions of every decision go to the list ``taken``,
+    if there is one. All attributes named in :meth:`_keep` have the batch size [N].
     """
 
     def __init__(
@@ -120,71 +129,100 @@ class _Evaluation:
         numbers: list[int],
         seed: int,
         make_smaller: Callable[[int], EnvBase] | None,
+        taken: list[TensorDict] | None,
     ) -> None:
         rows, self.total = env.batch_size[0], len(numbers)
         rows_stay = getattr(getattr(env, "traffic", None), "rows_must_stay", False)
-        self.env, self.policy = env, policy
-        self.make_smaller = (
-            None if rows_stay or getattr(policy, "rows_must_stay", True) else make_smaller
-        )
+        may_move = not rows_stay and not getattr(policy, "rows_must_stay", True)
+        self.env, self.policy, self.taken = env, policy, taken
+        self.make_smaller = make_smaller if may_move else None
         # What holds something per row outside the tensordict might not stand being driven on after
         # an end.
         self.check_every = 1 if rows_stay else CHECK_EVERY
         self.numbers = torch.tensor(numbers, dtype=torch.int64, device=env.device)
-        # Where the episode of a row stands in the list, [N]; the list's length in spare rows.
+        # Where the episode of a row stands in the list; the list's length in spare rows.
         self.place = torch.arange(rows, device=env.device).clamp_max(self.total)
+        self.driving = self.place < self.total
         self.handed_out = min(rows, self.total)
-        # Places and counts of the episodes that have ended.
-        self.finished: list[tuple[Tensor, dict[str, Tensor]]] = []
+        self.finished: list[TensorDictBase] = []
         self.state: TensorDictBase = env.reset(start_of(env, numbers[:rows], seed))
-        self.counts = _Counts(self.place < self.total)
+        # Sums over the decisions of each row's episode, and the last state of it.
+        self.sums: TensorDictBase | None = None
+        self.last: TensorDictBase | None = None
 
-    def run(self, on_progress: Callable[[int, int], None] | None) -> dict[str, Tensor]:
+    def run(self, on_progress: Callable[[int, int], None] | None) -> TensorDictBase:
         """Drive all episodes to their ends.
 
-        The counts by name, each [E], in the order of the episodes.
+        Returns ``sums`` and ``last`` [E] in the order of the episodes, on the CPU.
         """
         done = 0
         while done < self.total:
             for _ in range(self.check_every):
-                after = self.env.step(self.policy(self.state))
-                self.counts.add(after["next"])
-                self.state = step_mdp(after)
-            # Save the counts of the episodes that have ended; their rows are spare then.
-            ended = ((self.place < self.total) & ~self.counts.driving).nonzero()[:, 0]
-            if len(ended) > 0:
-                self.finished.append((self.place[ended].cpu(), self.counts.of(ended)))
-                self.place[ended] = self.total
-            done = sum(len(places) for places, _ in self.finished)
+                self._decide()
+            done += self._collect()
             if on_progress is not None:
                 on_progress(done, self.total)
             if done < self.total:
                 self._go_on()
-        order = torch.cat([places for places, _ in self.finished]).argsort()
-        return {
-            name: torch.cat([counts[name] for _, counts in self.finished])[order]
-            for name in self.finished[0][1]
-        }
+        driven: TensorDictBase = torch.cat(self.finished)  # type: ignore[assignment, arg-type]
+        return driven[driven["place"].argsort()]
+
+    def _decide(self) -> None:
+        """Drive one decision and count it.
+
+        Nothing is read back from the device, so this never waits.
+        """
+        after = self.env.step(self.policy(self.state))
+        if self.taken is not None:
+            place = torch.where(self.driving, self.place, self.total)
+            self.taken.append(
+                TensorDict({"place": place, "action": after[keys.ACTION].clone()}, place.shape)
+            )
+        added = _added(after["next"])
+        state = after["next"].select(*_LAST, strict=False)
+        if self.sums is None or self.last is None:
+            self.sums, self.last = added.apply(torch.zeros_like), state
+        # Rows whose episode has ended keep what they had.
+        self.sums = (self.sums + added).where(self.driving, self.sums)
+        self.last = state.where(self.driving, self.last)
+        self.driving = self.driving & ~after["next", "done"].squeeze(-1)
+        self.state = step_mdp(after)
+
+    def _collect(self) -> int:
+        """Put aside what the episodes that have ended gave; how many there were.
+
+        Their rows are spare then.
+        """
+        # A row is counted until its first end, even where it is driven on until the next look.
+        ended = ((self.place < self.total) & ~self.driving).nonzero()[:, 0]
+        if len(ended) > 0:
+            rows = {"place": self.place, "sums": self.sums, "last": self.last}
+            self.finished.append(TensorDict(rows, self.place.shape)[ended].cpu())
+            self.place[ended] = self.total
+        return len(ended)
 
     def _go_on(self) -> None:
         """Give spare rows the next episodes.
 
         Without any, start the last ones again or leave such rows out.
         """
-        driving = self.counts.driving.nonzero()[:, 0]
+        driving = self.driving.nonzero()[:, 0]
         rows = self.env.batch_size[0]
+        # Nothing is left to hand out, and most rows are spare: a smaller batch is faster.
         wide = rows > SMALL_BATCH and 2 * len(driving) <= rows
         if wide and self.handed_out == self.total and self.make_smaller is not None:
             self.env = self.make_smaller(len(driving))
-            self.state, self.place = self.state[driving], self.place[driving]
-            self.counts.select(driving)
+            self._keep(driving)
             return
-        new = (~self.counts.driving).nonzero()[: self.total - self.handed_out, 0]
+        new = (~self.driving).nonzero()[: self.total - self.handed_out, 0]
         self.place[new] = torch.arange(
             self.handed_out, self.handed_out + len(new), device=self.place.device
         )
         self.handed_out += len(new)
-        self.counts.begin(new)
+        self.driving[new] = True
+        assert self.sums is not None  # a decision has been driven
+        for total in self.sums.values():
+            total[new] = 0.0
         # Spare rows that have ended start theirs again, uncounted.
         mask = self.state["done"] & (self.place == self.total)[:, None]
         mask[new] = True
@@ -195,84 +233,49 @@ class _Evaluation:
         self.state = self.env.reset(self.state.set("_reset", mask), next_episode=wanted)
         if not torch.equal(self.state[keys.EPISODE], wanted):
             raise UserError(
-                "env: its reset did not start the episodes that it was given; take next_episode [N] in _reset and "
-                "start it in the rows of the _reset mask, as ganlane.env.HighwayEnv does."
+                "env: its reset did not start the episodes that it was given; take next_episode "
+                "[N] in _reset and start it in the rows of the _reset mask, as "
+                "ganlane.env.HighwayEnv does."
             )
 
-
-class _Counts:
-    """Sums and last values of the rows ``driving`` [N] bool, each until its first end."""
-
-    def __init__(self, driving: Tensor) -> None:
-        self.driving = driving
-        self._sums: dict[str, Tensor] = {}
-        self._last: dict[str, Tensor] = {}
-        self._vehicles: Vehicles | None = None
-
-    def add(self, after: TensorDictBase) -> None:
-        """Count one decision, from the tensordict after it (``next``).
-
-        Reads nothing back, so it never waits.
-        """
-        events, ego, terms = after[keys.EVENTS], after[keys.EGO], after.get(keys.REWARD_TERMS, None)
-        summed = {"reward": after[keys.REWARD]}
-        summed |= (
-            {} if terms is None else {f"reward_{name}": value for name, value in terms.items()}
-        )
-        summed |= {name: events[name] for name in (keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND)}
-        for name, value in summed.items():
-            flat = value.reshape(value.shape[0]).double()
-            counted = torch.where(self.driving, flat, torch.zeros_like(flat))
-            self._sums[name] = self._sums[name] + counted if name in self._sums else counted
-        last = {name: ego[name] for name in ("distance", "lane_changes", "decisions")}
-        last |= {"duration_s": after[keys.STEP].double() * keys.PHYSICS_STEP_S}
-        last |= {name: events[name].squeeze(-1) for name in keys.END_EVENTS}
-        for name, value in last.items():
-            before = self._last.get(name)
-            self._last[name] = (
-                value.clone() if before is None else torch.where(self.driving, value, before)
-            )
-        if keys.VEHICLES in after:
-            now = Vehicles.of(after[keys.VEHICLES])
-            self._vehicles = now.where(
-                self.driving, now if self._vehicles is None else self._vehicles
-            )
-        self.driving = self.driving & ~after["done"].squeeze(-1)
-
-    def of(self, rows: Tensor) -> dict[str, Tensor]:
-        """All counts of ``rows`` [K] (int64) by name, each [K], on the CPU."""
-        counts = {name: value[rows].cpu() for name, value in (self._sums | self._last).items()}
-        if self._vehicles is not None:
-            counts["at_fault"] = ego_at_fault(
-                Vehicles(*(field[rows] for field in self._vehicles))
-            ).cpu()
-        return counts
-
-    def begin(self, rows: Tensor) -> None:
-        """Count from 0 again in ``rows`` (int64), in which other episodes start."""
-        self.driving[rows] = True
-        for value in self._sums.values():
-            value[rows] = 0.0
-
-    def select(self, rows: Tensor) -> None:
+    def _keep(self, rows: Tensor) -> None:
         """Continue with ``rows`` [K] (int64) alone, in that order."""
-        self.driving = self.driving[rows]
-        self._sums = {name: value[rows] for name, value in self._sums.items()}
-        self._last = {name: value[rows] for name, value in self._last.items()}
-        if self._vehicles is not None:
-            self._vehicles = Vehicles(*(field[rows] for field in self._vehicles))
+        for name in ("state", "place", "driving", "sums", "last"):
+            setattr(self, name, getattr(self, name)[rows])
 
 
-def _episode_rows(counts: dict[str, Tensor], numbers: list[int], seed: int) -> pl.DataFrame:
-    """What :func:`run_episodes` returns."""
-    terms = [name for name in counts if name.startswith("reward_")]
-    ends = (pl.when(pl.col(event)).then(pl.lit(event)) for event in keys.END_EVENTS)
-    fault = pl.col("at_fault") if "at_fault" in counts else pl.lit(None, pl.Boolean)
+def _added(state: TensorDictBase) -> TensorDict:
+    """What one decision, which led to ``state``, adds to the sums of its episode; each [N]."""
+    values = {"reward": state[keys.REWARD]}
+    for name, term in state.get(keys.REWARD_TERMS, {}).items():
+        values[f"reward_{name}"] = term
+    for name in (keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND):
+        values[name] = state[keys.EVENTS, name]
+    rows = state.batch_size
+    return TensorDict({name: value.reshape(rows).double() for name, value in values.items()}, rows)
+
+
+def _episode_rows(
+    driven: TensorDictBase, numbers: list[int], seed: int, road: Road
+) -> pl.DataFrame:
+    """What :func:`run_episodes` returns without being asked for more."""
+    last, ego = driven["last"], driven["last", keys.EGO]
+    # One column per count, each [E].
+    columns = dict(driven["sums"].items())
+    columns |= {name: last[keys.EVENTS, name].squeeze(-1) for name in keys.END_EVENTS}
+    columns |= {name: ego[name] for name in ("distance", "lane_changes", "decisions")}
+    columns["duration_s"] = last[keys.STEP].double() * keys.PHYSICS_STEP_S
+    at_fault = pl.lit(None, pl.Boolean)
+    if keys.VEHICLES in last:
+        columns["at_fault"] = ego_at_fault(Vehicles.of(last[keys.VEHICLES]), road)
+        at_fault = pl.col("at_fault")
+    # The reward's terms are the environment's own, so their names are not known here.
+    terms = [name for name in columns if name.startswith("reward_")]
+    ends = [pl.when(pl.col(event)).then(pl.lit(event)) for event in keys.END_EVENTS]
     distance, duration = pl.col("distance").cast(pl.Float64), pl.col("duration_s")
-    return pl.DataFrame(
-        {"episode": numbers, **{name: value.numpy() for name, value in counts.items()}}
-    ).select(
-        pl.col("episode").cast(pl.Int64),
+    table = pl.DataFrame({name: value.numpy() for name, value in columns.items()})
+    return table.select(
+        pl.Series("episode", numbers, pl.Int64),
         pl.lit(seed, pl.Int64).alias("seed"),
         pl.coalesce(*ends, pl.lit(OTHER)).alias("reason"),
         pl.col(keys.SOFT_CRASH).cast(pl.Int64),
@@ -285,8 +288,28 @@ def _episode_rows(counts: dict[str, Tensor], numbers: list[int], seed: int) -> p
         # Null for an episode that ended before it drove (off the road at once).
         pl.when(duration > 0).then(distance / duration).alias("mean_speed_mps"),
         pl.col("lane_changes").cast(pl.Int64),
-        pl.when(pl.col("hard_crash")).then(fault).alias("at_fault"),
+        pl.when(pl.col("hard_crash")).then(at_fault).alias("at_fault"),
     )
+
+
+def _how_it_ended(
+    driven: TensorDictBase, taken: Sequence[TensorDict], road: Road
+) -> list[pl.Series]:
+    """The columns ``actions``, ``contact`` and ``changing``."""
+    # A place is driven by one row at a time, so the order of the decisions is the order in time.
+    decisions = TensorDict.cat(taken).cpu()
+    actions = []
+    for place in range(len(driven)):
+        digits = decisions["action"][decisions["place"] == place].tolist()
+        actions.append("".join(map(str, digits)))
+    last = driven["last"]
+    crashed = last[keys.EVENTS, "hard_crash"].squeeze(-1)
+    sides = contact_side(Vehicles.of(last[keys.VEHICLES]), road).where(crashed, 0)
+    return [
+        pl.Series("actions", actions, pl.String),
+        pl.Series("contact", [SIDES[side] for side in sides.tolist()]),
+        pl.Series("changing", (last[keys.EGO, "change_direction"] != 0).tolist()),
+    ]
 
 
 def contact_side(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
@@ -296,6 +319,7 @@ def contact_side(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     is the depth of the overlap over the closing speed. Headings are small, so the axes are those of
     the road. Of several vehicles hit in one physics step the nearest to the front counts.
     """
+    # Higher than all places, so that the lowest of a row is that of a vehicle that was hit.
     nobody = len(SIDES)
     first = torch.where(ego_overlaps(vehicles, road), _sides(vehicles, road), nobody).amin(-1)
     return torch.where(first == nobody, 0, first)
@@ -308,25 +332,36 @@ def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     other: a rule of geometry, no law. A driver that cuts in and is struck from behind is not at
     fault by it.
     """
-    v = vehicles
-    side, dy = _sides(v, road), v.y[:, 1:] - v.y[:, :1]
-    across = v.speed * torch.sin(v.heading)
-    pushes = torch.sign(dy) * across[:, :1] > -torch.sign(dy) * across[:, 1:]
-    own = torch.where(side == _SIDE, pushes, side == _AHEAD)
-    return (own & ego_overlaps(v, road)).any(-1)
+    side = _sides(vehicles, road)
+    towards = torch.sign(vehicles.y[:, 1:] - vehicles.y[:, :1])
+    across = vehicles.speed * torch.sin(vehicles.heading)
+    pushes = towards * across[:, :1] > -towards * across[:, 1:]
+    at_fault = torch.where(side == _SIDE, pushes, side == _AHEAD)
+    return (at_fault & ego_overlaps(vehicles, road)).any(-1)
 
 
-def _sides(v: Vehicles, road: Road) -> Tensor:
+def _sides(vehicles: Vehicles, road: Road) -> Tensor:
     """On which side of the ego each of the others would have met it, [N, M - 1] int64."""
-    dx, dy = road.distance_ahead(v.x[:, :1], v.x[:, 1:]), v.y[:, 1:] - v.y[:, :1]
-    along, across = v.speed * torch.cos(v.heading), v.speed * torch.sin(v.heading)
+    ahead = road.distance_ahead(vehicles.x[:, :1], vehicles.x[:, 1:])
     met_along = _time_since(
-        dx, along[:, 1:] - along[:, :1], 0.5 * (v.length[:, 1:] + v.length[:, :1])
+        ahead, _gain(vehicles.speed * torch.cos(vehicles.heading)), _reach(vehicles.length)
     )
     met_across = _time_since(
-        dy, across[:, 1:] - across[:, :1], 0.5 * (v.width[:, 1:] + v.width[:, :1])
+        _gain(vehicles.y),
+        _gain(vehicles.speed * torch.sin(vehicles.heading)),
+        _reach(vehicles.width),
     )
-    return torch.where(met_along < met_across, torch.where(dx > 0, _AHEAD, _BEHIND), _SIDE)
+    return torch.where(met_along < met_across, torch.where(ahead > 0, _AHEAD, _BEHIND), _SIDE)
+
+
+def _gain(values: Tensor) -> Tensor:
+    """What the others have more than the ego, [N, M - 1]."""
+    return values[:, 1:] - values[:, :1]
+
+
+def _reach(sizes: Tensor) -> Tensor:
+    """Distance of two centres at which bodies of these sizes touch, m, [N, M - 1]."""
+    return 0.5 * (sizes[:, 1:] + sizes[:, :1])
 
 
 def _time_since(distance: Tensor, speed: Tensor, reach: Tensor) -> Tensor:
@@ -338,143 +373,30 @@ def _time_since(distance: Tensor, speed: Tensor, reach: Tensor) -> Tensor:
     return torch.where(closing > 0, (reach - distance.abs()) / closing.clamp_min(1e-9), torch.inf)
 
 
-@dataclass(frozen=True)
-class Rollout:
-    """One episode driven to its end.
-
-    Attributes:
-        end: the event that ended it (:data:`ganlane.keys.END_EVENTS`, or ``other``).
-        actions: one per decision.
-        reward: undiscounted return; 0 where the environment pays none.
-        contact: what a hard crash hit (:data:`SIDES`); ``none`` without one.
-        changing: whether the ego was changing lanes in its last decision.
-    """
-
-    episode: int
-    end: str
-    actions: tuple[int, ...]
-    reward: float
-    distance_m: float
-    contact: str
-    changing: bool
-
-    @property
-    def safe(self) -> bool:
-        """Whether the ego neither crashed nor left the road."""
-        return self.end not in ("hard_crash", "out_of_road")
-
-
-@torch.no_grad()
-def roll_out(
-    env: EnvBase, policy: TensorDictModuleBase, episodes: Sequence[int], seed: int
-) -> list[Rollout]:
-    """Drive ``episodes`` side by side, with fewer or more rows.
-
-    One rollout each, in the order given.
-    """
-    state = start_rows(env, episodes, seed)
-    places = torch.arange(len(episodes), device=env.device)
-    totals = torch.zeros(
-        len(episodes), dtype=state.get(keys.VEHICLES).get("x").dtype, device=env.device
-    )
-    taken: list[tuple[Tensor, Tensor]] = []
-    found: dict[int, Rollout] = {}
-    while len(found) < len(episodes):
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            action = policy(state.clone(recurse=False)).get(keys.ACTION)
-        state, reward = step_rows(env, state, torch.arange(len(places), device=env.device), action)
-        totals[places] += reward
-        taken.append((places, action))
-        done = state.get("done")[:, 0]
-        for row in done.nonzero()[:, 0].tolist():
-            place = int(places[row])
-            actions = tuple(int(action[who == place]) for who, action in taken)
-            found[place] = _rollout(
-                env, state[row : row + 1], episodes[place], actions, float(totals[place])
-            )
-        state, places = state[~done], places[~done]
-    return [found[place] for place in range(len(episodes))]
-
-
-def _rollout(
-    env: EnvBase, after: TensorDictBase, episode: int, actions: tuple[int, ...], reward: float
-) -> Rollout:
-    """The rollout of the one row ``after``, which has just ended."""
-    events, ego = after.get(keys.EVENTS), after.get(keys.EGO)
-    end = next((name for name in keys.END_EVENTS if bool(events.get(name))), OTHER)
-    side = contact_side(Vehicles.of(after.get(keys.VEHICLES)), road_in(after, base_of(env).road))
-    contact, changing = (
-        SIDES[int(side) if end == "hard_crash" else 0],
-        bool(ego.get("change_direction") != 0),
-    )
-    return Rollout(episode, end, actions, reward, float(ego.get("distance")), contact, changing)
-
-
-def replay(env: EnvBase, actions: Mapping[int, Sequence[int]], seed: int) -> list[Rollout]:
-    """The rollouts of episodes (number to actions) of ``seed``, driven again; by episode."""
-    return roll_out(env, ScriptedPolicy(actions), sorted(actions), seed) if actions else []
-
-
 class ScriptedPolicy(TensorDictModuleBase):
-    """Takes given actions in given episodes, and keeps its lane after the last of them."""
+    """Takes given actions in given episodes, and keeps its lane after the last of them.
+
+    Args:
+        actions: by the number of the episode a text with one digit per decision (0 keep, 1 left,
+            2 right).
+    """
 
     in_keys = [keys.EPISODE, keys.EGO]  # noqa: RUF012
     out_keys = [keys.ACTION]  # noqa: RUF012
 
-    def __init__(self, actions: Mapping[int, Sequence[int]]) -> None:
+    def __init__(self, actions: Mapping[int, str]) -> None:
         super().__init__()
-        longest = max(len(taken) for taken in actions.values()) + 1
-        self.episodes = torch.tensor(sorted(actions))
-        padded = [
-            [*actions[number], *[keys.KEEP] * (longest - len(actions[number]))]
-            for number in sorted(actions)
-        ]
-        self.table = torch.tensor(padded, dtype=torch.int64)
+        numbers = sorted(actions)
+        # One more than the longest, so that every script ends with keeping its lane.
+        longest = max(map(len, actions.values())) + 1
+        padded = [actions[number].ljust(longest, str(keys.KEEP)) for number in numbers]
+        self.episodes = torch.tensor(numbers)
+        self.table = torch.tensor([list(map(int, digits)) for digits in padded])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action``."""
-        row = torch.searchsorted(self.episodes, tensordict.get(keys.EPISODE).cpu())
-        decision = (
-            tensordict.get(keys.EGO).get("decisions").cpu().clamp_max(self.table.shape[1] - 1)
-        )
-        action = self.table[row, decision]
-        return tensordict.set(keys.ACTION, action.to(tensordict.get(keys.EPISODE).device))
-
-
-def base_of(env: EnvBase) -> EnvBase:
-    """The environment below the transforms."""
-    return getattr(env, "base_env", env)
-
-
-def step_rows(
-    env: EnvBase, state: TensorDictBase, rows: Tensor, action: Tensor
-) -> tuple[TensorDictBase, Tensor]:
-    """The state after one decision from ``rows`` of ``state``, and the reward.
-
-    As many at a time as ``env`` has.
-    """
-    count, size = action.shape[0], env.batch_size[0]
-    states, rewards = [], []
-    for start in range(0, count, size):
-        # Filled up with the last row, so that all batches have one size: a network rounds alike in
-        # all.
-        batch = torch.arange(start, start + size, device=action.device).clamp_max(count - 1)
-        after = env.step(state[rows[batch]].set(keys.ACTION, action[batch])).get("next")
-        real = min(size, count - start)
-        states.append(_decision_state(after)[:real])
-        rewards.append(after.get(keys.REWARD)[:real, 0])
-    return torch.cat(states), torch.cat(rewards)
-
-
-def start_rows(env: EnvBase, episodes: Sequence[int], seed: int) -> TensorDictBase:
-    """The first states of any number of episodes; :class:`UserError` for none."""
-    size = env.batch_size[0]
-    chunks = [episodes[start : start + size] for start in range(0, len(episodes), size)] or [[]]
-    return torch.cat(
-        [_decision_state(env.reset(start_of(env, chunk, seed)))[: len(chunk)] for chunk in chunks]
-    )
-
-
-def _decision_state(state: TensorDictBase) -> TensorDictBase:
-    """What the next decision and step need."""
-    return state.exclude(keys.REWARD, keys.REWARD_TERMS, keys.ACTION)
+        episode = tensordict[keys.EPISODE]
+        row = torch.searchsorted(self.episodes, episode.cpu())
+        last = self.table.shape[1] - 1
+        decision = tensordict[keys.EGO, "decisions"].cpu().clamp_max(last)
+        return tensordict.set(keys.ACTION, self.table[row, decision].to(episode.device))

@@ -31,7 +31,8 @@ class Run:
     results: dict[str, Any]
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}(folder={str(self.folder)!r}, results: {', '.join(self.results)})"
+        names = ", ".join(self.results)
+        return f"{type(self).__name__}(folder={str(self.folder)!r}, results: {names})"
 
     def _repr_html_(self) -> str:
         """For notebooks.
@@ -40,14 +41,12 @@ class Run:
         """
         rows = self.results.get("rows")
         if not isinstance(rows, list):
+            single = int | float | str
             rows = [
-                {
-                    name: value
-                    for name, value in self.results.items()
-                    if isinstance(value, int | float | str)
-                }
+                {key: value for key, value in self.results.items() if isinstance(value, single)}
             ]
-        return f"<p>{escape(str(self.folder))}</p>{pl.DataFrame(rows, infer_schema_length=None)._repr_html_()}"
+        table = pl.DataFrame(rows, infer_schema_length=None)._repr_html_()
+        return f"<p>{escape(str(self.folder))}</p>{table}"
 
 
 @dataclass(frozen=True, repr=False)
@@ -73,6 +72,7 @@ def write_results(
         seeds: the seeds and episode numbers behind the numbers.
     """
     path = Path(folder) / "results.json"
+    # Whoever finds the file later can tell where its numbers come from.
     origin = {"seeds": seeds, "config": config, "code": code_version(), "machine": machine()}
     written = datetime.now(timezone.utc).isoformat(timespec="seconds")
     write_json(path, plain({**numbers, **origin, "written": written}))
@@ -80,17 +80,23 @@ def write_results(
 
 
 def names_of_runs(folders: Sequence[Path]) -> list[str]:
-    """What tells runs apart: the options on their command lines in which they differ, else ends of
-    their paths.
+    """What tells runs apart: the options of their command lines in which they differ.
 
     ``seed=0`` comes last. Two runs of the same options, or one without its command line, are named
-    by their paths.
+    by the ends of their paths.
     """
-    given = [_overrides(folder) for folder in folders]
-    keys = sorted({key for each in given for key in each}, key=lambda key: (key == "seed", key))
-    told = [key for key in keys if len({each.get(key) for each in given}) > 1]
-    names = [", ".join(f"{key}={each[key]}" for key in told if key in each) for each in given]
-    for depth in range(1, max(len(folder.parts) for folder in folders) + 1):
+    runs = [_overrides(folder) for folder in folders]
+    keys = sorted(
+        {key for options in runs for key in options}, key=lambda key: (key == "seed", key)
+    )
+    # What all runs have in common tells none of them apart.
+    differing = [key for key in keys if len({options.get(key) for options in runs}) > 1]
+    names = []
+    for options in runs:
+        names.append(", ".join(f"{key}={options[key]}" for key in differing if key in options))
+    # Paths from the right, as long as it takes to tell all of them apart.
+    longest = max((len(folder.parts) for folder in folders), default=0)
+    for depth in range(1, longest + 1):
         if all(names) and len(set(names)) == len(names):
             break
         names = ["/".join(folder.parts[-depth:]) for folder in folders]
@@ -100,50 +106,40 @@ def names_of_runs(folders: Sequence[Path]) -> list[str]:
 def _overrides(folder: Path) -> dict[str, str]:
     """The command line of a run by key, the newest value of each."""
     file = folder / "overrides.yaml"
-    lines = (
-        re.findall(r"^- (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE)
-        if file.is_file()
-        else []
-    )
-    return {
-        key.strip("'\" +"): value.strip("'\"")
-        for key, _, value in (line.partition("=") for line in lines)
-    }
+    text = file.read_text(encoding="utf-8") if file.is_file() else ""
+    options = {}
+    for line in re.findall(r"^- (.+)$", text, re.MULTILINE):
+        key, _, value = line.partition("=")
+        options[key.strip("'\" +")] = value.strip("'\"")
+    return options
 
 
 def runs_below(folder: Path, file: str) -> list[Path]:
-    """The folder itself if it holds ``file``, else those of its own folders that do, by number.
+    """The folder itself if it holds ``file``, else the runs of a sweep in it, by number."""
+    if (folder / file).is_file():
+        return [folder]
+    runs = [path.parent for path in folder.glob(f"*/{file}")]
 
-    Those of a sweep.
-    """
-    found = (
-        [folder]
-        if (folder / file).is_file()
-        else [path.parent for path in folder.glob(f"*/{file}")]
-    )
-    return sorted(
-        found,
-        key=lambda path: (
-            not path.name.isdigit(),
-            int(path.name) if path.name.isdigit() else 0,
-            path,
-        ),
-    )
+    def order(path: Path) -> tuple[bool, int, Path]:
+        job = path.name.isdigit()
+        return not job, int(path.name) if job else 0, path
+
+    # Job 10 comes after job 9, and what is not a job after all of them.
+    return sorted(runs, key=order)
 
 
 def sweep_rows(folder: Path) -> list[dict[str, Any]]:
     """The rows of all comparisons of a sweep, each with its ``run`` (:func:`names_of_runs`)."""
     runs = runs_below(folder, "results.json")
-    records = [json.loads((run / "results.json").read_text(encoding="utf-8")) for run in runs]
-    named = zip(names_of_runs(runs) if runs else [], records)
-    rows = [{"run": name, **row} for name, record in named for row in record.get("rows") or []]
+    rows = []
+    for name, run in zip(names_of_runs(runs), runs):
+        record = json.loads((run / "results.json").read_text(encoding="utf-8"))
+        rows += [{"run": name, **row} for row in record.get("rows") or []]
     return rows if all("mean_reward" in row for row in rows) else []
 
 
 def write_episodes(folder: str | Path, episodes: pl.DataFrame) -> Path:
-    """Write one row per episode as ``episodes.parquet`` into ``folder`` atomically and return its
-    path.
-    """
+    """Write one row per episode as ``episodes.parquet`` into ``folder``, atomically; its path."""
     path = Path(folder) / "episodes.parquet"
     with atomic_path(path) as part:
         episodes.write_parquet(part)
@@ -159,22 +155,24 @@ def plain(value: Any) -> Any:
         return plain(asdict(value))
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
+    # A tensor or an array becomes nested lists, a scalar of theirs a plain number.
     if isinstance(value, (np.ndarray, np.generic, torch.Tensor)):
         return plain(value.tolist())
     if isinstance(value, (list, tuple, set, range)):
         return [plain(item) for item in value]
+    # JSON has neither NaN nor infinity.
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, (bool, int, str)) else str(value)
 
 
 def code_version() -> dict[str, Any]:
-    """``version`` of the package, and ``revision`` and ``modified`` where it lies in a checkout of
-    its own.
+    """``version`` of the package; ``revision`` and ``modified`` in a checkout of its own.
 
     An installed copy inside somebody else's checkout has no revision: git must know the package's
     own file.
     """
+    # None where git does not know: an installed package, or a machine without git.
     version: dict[str, Any] = {"version": __version__, "revision": None, "modified": None}
     if _git("ls-files", "--error-unmatch", "__init__.py") is not None:
         version["revision"] = _git("rev-parse", "HEAD")
@@ -193,16 +191,18 @@ def _git(*arguments: str) -> str | None:
 
 
 def machine() -> dict[str, Any]:
-    """CPU, usable cores, torch's threads, system, accelerator (or None), and the versions that ran."""
+    """CPU, usable cores, torch's threads, system, accelerator (or None), versions that ran."""
+    cpu, cores = platform.processor() or platform.machine(), os.cpu_count() or 1
+    # Linux names the model of the CPU here, and may leave a process fewer cores than there are.
     info = Path("/proc/cpuinfo")
-    named = re.search(
-        r"^model name\s*:(.*)$", info.read_text(errors="replace") if info.is_file() else "", re.M
-    )
+    if info.is_file():
+        model = re.search(r"^model name\s*:(.*)$", info.read_text(errors="replace"), re.MULTILINE)
+        cpu = model[1].strip() if model else cpu
+    if hasattr(os, "sched_getaffinity"):
+        cores = len(os.sched_getaffinity(0))
     return {
-        "cpu": named[1].strip() if named else platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count() or 1,
+        "cpu": cpu,
+        "cores": cores,
         "threads": torch.get_num_threads(),
         "system": platform.platform(),
         "accelerator": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
@@ -217,14 +217,11 @@ def machine_sentence(threads: Sequence[int]) -> str:
     ``threads`` are torch's.
     """
     here, code = machine(), code_version()
-    usable = f"{here['cores']} usable core{'s' if here['cores'] != 1 else ''}"
-    accelerator = f", {here['accelerator']}" if here["accelerator"] else ""
-    revision = (
-        f" ({code['revision'][:12]}{', modified' if code['modified'] else ''})"
-        if code["revision"]
-        else ""
-    )
-    return (
-        f"{here['cpu']}, {usable}{accelerator}; Python {here['python']}, torch {here['torch']} (threads: "
-        f"{', '.join(map(str, threads))}); ganlane {code['version']}{revision}."
-    )
+    hardware = f"{here['cpu']}, {here['cores']} usable core{'s' if here['cores'] != 1 else ''}"
+    if here["accelerator"]:
+        hardware += f", {here['accelerator']}"
+    version = f"ganlane {code['version']}"
+    if code["revision"]:
+        version += f" ({code['revision'][:12]}{', modified' if code['modified'] else ''})"
+    used = f"Python {here['python']}, torch {here['torch']}"
+    return f"{hardware}; {used} (threads: {', '.join(map(str, threads))}); {version}."

@@ -6,7 +6,6 @@ By driver and traffic, by pair of drivers, by scene.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,9 @@ from ganlane.evaluation.statistics import (
     clopper_pearson,
     entries,
     mean_interval,
+    no_events,
     paired_difference,
+    percent_of_way,
     poisson_interval,
     resample_counts,
 )
@@ -67,16 +68,22 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
 
     ``same_traffic`` also holds the drivers that give the scale.
     """
+    # Every end has its column, also one that never happened.
     ended = {reason: int((pair["reason"] == reason).sum()) for reason in keys.END_EVENTS}
+    # Rates are of all episodes together, not means of the episodes' own rates: short episodes would
+    # count as much as long ones.
     returns = pair["reward"].to_numpy()
     distance_m, duration_s = float(pair["distance_m"].sum()), float(pair["duration_s"].sum())
-    crashes = poisson_interval(ended[_CRASH]).scaled(1e6 / distance_m) if distance_m > 0.0 else None
-    score = _score(pair, same_traffic)
+    lane_changes_per_km = crashes = lead = None
+    if distance_m > 0.0:
+        lane_changes_per_km = int(pair["lane_changes"].sum()) / distance_m * 1000.0
+        crashes = poisson_interval(ended[_CRASH]).scaled(1e6 / distance_m)
     # MOBIL has no lead over itself, and without it nobody has one.
     mobil = same_traffic.filter(pl.col("agent") == SCALE_TOP)
-    lead = (
-        None if pair["agent"][0] == SCALE_TOP or mobil.height == 0 else paired_lead(pair, mobil)[0]
-    )
+    if pair["agent"][0] != SCALE_TOP and mobil.height > 0:
+        lead, _ = paired_lead(pair, mobil)
+    behind = mean_interval(pair["soft_crash_behind"].to_numpy())
+    score, reason = _score(pair, same_traffic)
     return {
         "agent": pair["agent"][0],
         "traffic": pair["traffic"][0],
@@ -89,23 +96,18 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
         "scene_end": ended["scene_end"],
         "soft_crash_onsets": int(pair["soft_crash"].sum()),
         "soft_crash_behind_onsets": int(pair["soft_crash_behind"].sum()),
-        **entries(
-            "soft_crash_behind_per_episode", mean_interval(pair["soft_crash_behind"].to_numpy())
-        ),
+        **entries("soft_crash_behind_per_episode", behind),
         **entries("mean_reward", mean_interval(returns)),
         "reward_sd": float(np.std(returns, ddof=1)) if len(returns) > 1 else None,
         "mean_speed_mps": distance_m / duration_s if duration_s > 0 else None,
-        "lane_changes_per_km": int(pair["lane_changes"].sum()) / distance_m * 1000.0
-        if distance_m > 0
-        else None,
+        "lane_changes_per_km": lane_changes_per_km,
         "distance_km": distance_m / 1000.0,
         **entries("hard_crash_share", clopper_pearson(ended["hard_crash"], pair.height)),
         **entries("out_of_road_share", clopper_pearson(ended["out_of_road"], pair.height)),
         **entries("crashes_per_1000_km", crashes),
         **entries("minus_mobil", lead),
-        "normalized_percent": score.percent,
-        "normalized_percent_ci": score.interval,
-        "normalized_percent_reason": score.reason,
+        **entries("normalized_percent", score),
+        "normalized_percent_reason": reason,
     }
 
 
@@ -113,6 +115,7 @@ def _paired_rewards(*drivers: pl.DataFrame) -> list[Array]:
     """The returns of each of ``drivers`` on the episodes that all of them drove, in one order, each
     [E].
     """
+    # Each join leaves the episodes that one more driver has driven, too.
     shared = drivers[0].select(_EPISODE)
     for column, driver in enumerate(drivers):
         shared = shared.join(
@@ -143,48 +146,39 @@ def paired_rows(episodes: pl.DataFrame) -> list[Row]:
         that share fewer than two episodes are left out.
     """
     first, rows = episodes["agent"][0], []
-    for (traffic,), there in episodes.group_by("traffic", maintain_order=True):
-        own = there.filter(pl.col("agent") == first)
-        for (other,), driven in there.group_by("agent", maintain_order=True):
-            lead, shared = paired_lead(own, driven) if other != first else (None, 0)
-            if lead is not None:
-                row = {"agent": first, "over": other, "traffic": traffic, "episodes": shared}
-                verdict = (
-                    ("above" if lead.value > 0.0 else "below")
-                    if lead.excludes_zero()
-                    else "undecided"
-                )
-                rows.append({**row, **entries("lead", lead), "verdict": verdict})
+    for (traffic,), driven in episodes.group_by("traffic", maintain_order=True):
+        ours = driven.filter(pl.col("agent") == first)
+        others = driven.filter(pl.col("agent") != first)
+        for (other,), theirs in others.group_by("agent", maintain_order=True):
+            lead, shared = paired_lead(ours, theirs)
+            if lead is None:
+                continue
+            # A lead is decided only where its whole interval lies on one side of 0.
+            verdict = "undecided"
+            if lead.excludes_zero():
+                verdict = "above" if lead.value > 0.0 else "below"
+            row = {"agent": first, "over": other, "traffic": traffic, "episodes": shared}
+            rows.append({**row, **entries("lead", lead), "verdict": verdict})
     return rows
 
 
-@dataclass(frozen=True)
-class NormalizedScore:
-    """Percent of the way from the random driver to MOBIL.
+def _score(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> tuple[Estimate | None, str | None]:
+    """The normalised score of one agent, from the episodes that it shares with the scale's drivers.
 
-    Without a value, the reason why there is none.
-    """
-
-    percent: float | None = None
-    interval: list[float] | None = None
-    reason: str | None = None
-
-
-def _score(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> NormalizedScore:
-    """The normalised score of one agent, from the episodes that it shares with the two drivers of
-    the scale.
+    As :func:`normalized_percent` gives it.
     """
     drivers = [pair]
     for name in (SCALE_TOP, SCALE_BOTTOM):
         driver = same_traffic.filter(pl.col("agent") == name)
+        # Who asks for other drivers than those of the scale gets a reason in place of a score.
         if driver.height == 0:
-            return NormalizedScore(
-                reason=f"needs {SCALE_TOP} and {SCALE_BOTTOM} among the agents; {name} is missing"
-            )
+            needed = f"needs {SCALE_TOP} and {SCALE_BOTTOM} among the agents"
+            return None, f"{needed}; {name} is missing"
         drivers.append(driver)
-    agent, mobil, random_legal = _paired_rewards(*drivers)
-    if len(agent) < 2:
-        return NormalizedScore(reason="fewer than two episodes are shared by the drivers")
+    returns = _paired_rewards(*drivers)
+    if len(returns[0]) < 2:
+        return None, "fewer than two episodes are shared by the drivers"
+    agent, mobil, random_legal = returns
     return normalized_percent(agent, mobil, random_legal)
 
 
@@ -192,61 +186,37 @@ def normalized_percent(
     agent: npt.ArrayLike,
     mobil: npt.ArrayLike,
     random_legal: npt.ArrayLike,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
-) -> NormalizedScore:
-    """The paper's '% of MOBIL', ``100 (R - R_0) / (R_MOBIL - R_0)``: 0 for ``random_legal``, 100
-    for MOBIL.
+) -> tuple[Estimate | None, str | None]:
+    """The paper's '% of MOBIL': 0 for ``random_legal``, 100 for MOBIL.
 
-    This form fits both rows of the paper's Table VII; a plain ratio of mean rewards has no meaning
-    where rewards can be negative. Returns [E] of the three drivers are on the same episodes, in the
-    same order. The interval resamples episodes, all drivers together; resamples in which MOBIL's
-    lead over the random driver is exactly 0 are left out. There is no score where the paired
-    interval of that lead includes 0: the scale would have no length.
+    It is ``100 (R - R_0) / (R_MOBIL - R_0)``. This form fits both rows of the paper's Table VII; a
+    plain ratio of mean rewards has no meaning where rewards can be negative. Returns [E] of the
+    three drivers are on the same episodes, in the same order. The interval resamples episodes, all
+    drivers together; resamples in which MOBIL's lead over the random driver is exactly 0 are left
+    out.
+
+    Returns:
+        The score, and None; or None, and the reason why there is no score: the paired interval of
+        MOBIL's lead over the random driver includes 0, so the scale would have no length.
     """
-    returns = np.stack(
-        [np.asarray(values, dtype=np.float64) for values in (agent, mobil, random_legal)], axis=1
-    )
-    lead = paired_difference(returns[:, 1], returns[:, 2], resamples, seed)
+    drivers = (agent, mobil, random_legal)
+    returns = np.stack([np.asarray(values, dtype=np.float64) for values in drivers], axis=1)
+    lead = paired_difference(returns[:, 1], returns[:, 2])
     if lead.interval is None:
-        return NormalizedScore(reason="fewer than two episodes")
+        return None, "fewer than two episodes"
     if not lead.excludes_zero():
         interval = f"{lead.low:.1f} to {lead.high:.1f}"
-        return NormalizedScore(
-            reason=f"the interval of mobil's lead over random_legal includes 0 ({interval})"
-        )
-    means = bootstrap_means(returns, resamples, seed)
-    low, high = np.quantile(_percent_of_way(means[means[:, 1] != means[:, 2]]), TAIL_LEVELS)
-    return NormalizedScore(float(_percent_of_way(returns.mean(axis=0))), [float(low), float(high)])
+        return None, f"the interval of mobil's lead over random_legal includes 0 ({interval})"
+    means = bootstrap_means(returns)
+    # A resample without MOBIL's lead would divide by zero.
+    with_scale = means[means[:, 1] != means[:, 2]]
+    low, high = np.quantile(percent_of_way(*with_scale.T), TAIL_LEVELS)
+    value = percent_of_way(*returns.mean(axis=0))
+    return Estimate(float(value), float(low), float(high)), None
 
 
-def _percent_of_way(means: Array) -> Array:
-    """``100 (R - R_0) / (R_MOBIL - R_0)`` from means [..., 3] of agent, MOBIL and random driver."""
-    return 100.0 * (means[..., 0] - means[..., 2]) / (means[..., 1] - means[..., 2])
-
-
-@dataclass(frozen=True)
-class CrashesByScene:
-    """Hard crashes per km.
-
-    Attributes:
-        per_km: of all scenes together, with the 95 % interval of the bootstrap over scenes; no
-            interval with fewer than two scenes. Where nobody crashed the upper bound is Poisson's
-            exact one for the distance driven, since resampling zeros gives zero.
-        rows: one per scene, by name: ``scene, episodes, hard_crash, distance_km, crashes_per_km``
-            (None where nothing was driven) and ``crashes_per_km_ci`` (exact, Poisson, as if its
-            episodes were independent).
-    """
-
-    per_km: Estimate
-    rows: list[Row]
-
-
-def crashes_by_scene(
-    episodes: pl.DataFrame, scenes: Sequence[str], resamples: int = RESAMPLES, seed: int = 0
-) -> CrashesByScene:
-    """Crashes per km on recorded scenes, in all and by scene, with intervals that know how few
-    scenes there are.
+def crashes_by_scene(episodes: pl.DataFrame, scenes: Sequence[str]) -> tuple[Estimate, list[Row]]:
+    """Crashes per km on recorded scenes, with intervals that know how few scenes there are.
 
     Episodes of one scene start a tenth of a second apart among the same drivers, so they are no
     independent observations: whole scenes are resampled, and the ratio (all crashes over all km) is
@@ -256,7 +226,14 @@ def crashes_by_scene(
         episodes: ``reason`` and ``distance_m`` per episode, of one driver.
         scenes: the scene of each of them
             (:meth:`ganlane.traffic.ReplayTraffic.scenes_of_episodes`).
-        resamples, seed: of the bootstrap.
+
+    Returns:
+        Hard crashes per km of all scenes together, with the 95 % interval of the bootstrap over
+        scenes; no interval with fewer than two scenes. Where nobody crashed the upper bound is
+        Poisson's exact one for the distance driven, since resampling zeros gives zero. And one row
+        per scene, by name: ``scene, episodes, hard_crash, distance_km, crashes_per_km`` (None where
+        nothing was driven) and ``crashes_per_km_ci`` (exact, Poisson, as if its episodes were
+        independent).
 
     Raises:
         UserError: not one scene per episode, or nobody drove.
@@ -275,32 +252,31 @@ def crashes_by_scene(
         )
         .sort("scene")
     )
-    crashes, km = (by_scene[name].to_numpy().astype(np.float64) for name in (_CRASH, "distance_km"))
-    if not km.sum() > 0.0:
+    rows = []
+    for row in by_scene.to_dicts():
+        rate, km = None, row["distance_km"]
+        if km > 0.0:
+            rate = poisson_interval(row[_CRASH]).scaled(per=km)
+        rows.append({**row, **entries("crashes_per_km", rate)})
+    crashes = by_scene[_CRASH].to_numpy().astype(np.float64)
+    driven = by_scene["distance_km"].to_numpy()
+    total = float(driven.sum())
+    if not total > 0.0:
         raise UserError(
             "crashes per km: nobody drove; give episodes that last at least one decision."
         )
-    rows = []
-    for row in by_scene.to_dicts():
-        rate = (
-            poisson_interval(row[_CRASH]).scaled(per=row["distance_km"])
-            if row["distance_km"] > 0.0
-            else None
-        )
-        rows.append({**row, **entries("crashes_per_km", rate)})
-    value = float(crashes.sum() / km.sum())
-    if len(km) < 2:
-        return CrashesByScene(Estimate(value), rows)
+    if len(driven) < 2:
+        return Estimate(float(crashes.sum() / total)), rows
     if crashes.sum() == 0:
-        return CrashesByScene(
-            Estimate(value, 0.0, (poisson_interval(0).high or 0.0) / float(km.sum())), rows
-        )
-    driven = km.clip(min=np.finfo(np.float64).tiny)
+        return no_events(total), rows
+    # A resample may hold nothing but scenes in which nobody drove.
+    driven = driven.clip(min=np.finfo(np.float64).tiny)
     ratios = [
-        counts @ crashes / (counts @ driven) for counts in resample_counts(len(km), resamples, seed)
+        counts @ crashes / (counts @ driven)
+        for counts in resample_counts(len(driven), RESAMPLES, seed=0)
     ]
     low, high = np.quantile(np.concatenate(ratios), TAIL_LEVELS)
-    return CrashesByScene(Estimate(value, float(low), float(high)), rows)
+    return Estimate(float(crashes.sum() / total), float(low), float(high)), rows
 
 
 def failed_episodes(episodes: pl.DataFrame) -> list[Row]:
@@ -309,13 +285,10 @@ def failed_episodes(episodes: pl.DataFrame) -> list[Row]:
     Per ``driver, traffic, seed`` the numbers of the episodes that ended so.
     """
     failed = episodes.filter(pl.col("reason").is_in(FAILURES))
-    return [
-        {"driver": driver, "traffic": traffic, "seed": seed}
-        | {
-            end: frame.filter(pl.col("reason") == end)["episode"].sort().to_list()
-            for end in FAILURES
-        }
-        for (driver, traffic, seed), frame in failed.group_by(
-            "agent", "traffic", "seed", maintain_order=True
-        )
-    ]
+    rows = []
+    for names, frame in failed.group_by("agent", "traffic", "seed", maintain_order=True):
+        row: Row = dict(zip(("driver", "traffic", "seed"), names))
+        for end in FAILURES:
+            row[end] = frame.filter(pl.col("reason") == end)["episode"].sort().to_list()
+        rows.append(row)
+    return rows

@@ -14,16 +14,18 @@ Satterthwaite 1946 (degrees of freedom of a sum of variances); McNemar 1947, in 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import scipy  # scipy.stats, which takes a second to import, comes with its first use
-from scipy.special import betaincinv, gammaincinv
+from scipy.special import betaincinv
+
+from ganlane.data.statistics import poisson_interval as poisson_bounds
 
 Array = npt.NDArray[np.float64]
 
@@ -39,7 +41,10 @@ _CHUNK = 500
 #: Counts that are kept for the next interval, 2 bytes each.
 _MOST_KEPT = 20_000_000
 _NORMAL = NormalDist()
-_MEAN: Callable[[Array], Any] = partial(np.mean, axis=-1)
+
+
+def _mean(scores: Array) -> Array:
+    return np.asarray(scores.mean(axis=-1))
 
 
 @dataclass(frozen=True)
@@ -86,6 +91,7 @@ def resample_counts(size: int, resamples: int, seed: int) -> Iterator[Array]:
     """
     generator = np.random.default_rng(seed)
     for start in range(0, resamples, _CHUNK):
+        # Each row of a chunk counts in a range of its own, so that one bincount serves all rows.
         rows = min(_CHUNK, resamples - start)
         drawn = generator.integers(size, size=(rows, size)) + size * np.arange(rows)[:, None]
         yield (
@@ -94,24 +100,24 @@ def resample_counts(size: int, resamples: int, seed: int) -> Iterator[Array]:
 
 
 @lru_cache(maxsize=2)
-def kept_counts(size: int, resamples: int, seed: int) -> tuple[npt.NDArray[np.uint16], ...]:
+def kept_counts(size: int, resamples: int) -> tuple[npt.NDArray[np.uint16], ...]:
     """The chunks of :func:`resample_counts`.
 
     A table's intervals draw the same ones, 0.25 s for 1000 episodes.
     """
-    return tuple(counts.astype(np.uint16) for counts in resample_counts(size, resamples, seed))
+    return tuple(counts.astype(np.uint16) for counts in resample_counts(size, resamples, seed=0))
 
 
-def bootstrap_means(values: Array, resamples: int = RESAMPLES, seed: int = 0) -> Array:
+def bootstrap_means(values: Array) -> Array:
     """Means [R] or [R, K] of resampled ``values`` [E] or [E, K].
 
     The K columns of an episode stay together.
     """
     size = len(values)
-    drawn = (kept_counts if size * resamples <= _MOST_KEPT else resample_counts)(
-        size, resamples, seed
-    )
-    return np.concatenate([counts.astype(np.float64) @ values / size for counts in drawn])
+    counts: Iterable[Array | npt.NDArray[np.uint16]] = resample_counts(size, RESAMPLES, seed=0)
+    if size * RESAMPLES <= _MOST_KEPT:
+        counts = kept_counts(size, RESAMPLES)
+    return np.concatenate([chunk.astype(np.float64) @ values / size for chunk in counts])
 
 
 def _bca_levels(values: Array, means: Array) -> Array:
@@ -125,13 +131,14 @@ def _bca_levels(values: Array, means: Array) -> Array:
     # (E - 1).
     acceleration = (centred**3).sum() / (6.0 * (centred**2).sum() ** 1.5)
     below = ((means < mean).mean() + (means <= mean).mean()) / 2.0
+    # Half a resample away from 0 and 1, where the normal quantile is infinite.
     edge = 0.5 / len(means)
     bias = _NORMAL.inv_cdf(float(np.clip(below, edge, 1.0 - edge)))
     shifted = [bias + _NORMAL.inv_cdf(float(level)) for level in TAIL_LEVELS]
     return np.array([_NORMAL.cdf(bias + z / (1.0 - acceleration * z)) for z in shifted])
 
 
-def mean_interval(values: npt.ArrayLike, resamples: int = RESAMPLES, seed: int = 0) -> Estimate:
+def mean_interval(values: npt.ArrayLike) -> Estimate:
     """Mean of ``values`` [E] with its BCa bootstrap interval.
 
     No interval for fewer than two values.
@@ -140,25 +147,25 @@ def mean_interval(values: npt.ArrayLike, resamples: int = RESAMPLES, seed: int =
     mean = float(data.mean())
     if len(data) < 2:
         return Estimate(mean)
+    # Where all are equal the correction below would divide by zero.
     if np.all(data == data[0]):
         return Estimate(mean, mean, mean)
-    means = bootstrap_means(data, resamples, seed)
+    means = bootstrap_means(data)
     low, high = np.quantile(means, _bca_levels(data, means))
     return Estimate(mean, float(low), float(high))
 
 
-def paired_difference(
-    first: npt.ArrayLike, second: npt.ArrayLike, resamples: int = RESAMPLES, seed: int = 0
-) -> Estimate:
+def paired_difference(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
     """Mean of ``first - second`` over the same episodes, in the same order, with its interval."""
     a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     if a.shape != b.shape:
         raise ValueError(f"paired values must have one shape, found {a.shape} and {b.shape}")
-    return mean_interval(a - b, resamples, seed)
+    return mean_interval(a - b)
 
 
 def clopper_pearson(count: int, trials: int) -> Estimate:
     """Share ``count / trials`` (at least one trial) with its exact binomial interval."""
+    # The bounds are quantiles of beta distributions; the function knows neither end.
     low = 0.0 if count == 0 else float(betaincinv(count, trials - count + 1, _TAIL))
     high = 1.0 if count == trials else float(betaincinv(count + 1, trials - count, 1.0 - _TAIL))
     return Estimate(count / trials, low, high)
@@ -166,8 +173,15 @@ def clopper_pearson(count: int, trials: int) -> Estimate:
 
 def poisson_interval(count: int) -> Estimate:
     """``count`` observed events with the exact Poisson interval of their expected number."""
-    low = 0.0 if count == 0 else float(gammaincinv(count, _TAIL))
-    return Estimate(float(count), low, float(gammaincinv(count + 1, 1.0 - _TAIL)))
+    return Estimate(float(count), *poisson_bounds(count))
+
+
+def no_events(amount: float) -> Estimate:
+    """The rate where nothing happened in ``amount`` (km, say), with Poisson's exact upper bound.
+
+    Resampling zeros would leave no doubt.
+    """
+    return poisson_interval(0).scaled(per=amount)
 
 
 # The training as the unit: several trainings of one recipe (seeds) on the same episodes.
@@ -181,11 +195,11 @@ def poisson_interval(count: int) -> Estimate:
 
 
 def interquartile_mean(scores: npt.ArrayLike) -> Array:
-    """Mean of the middle half of the last axis; a quarter, rounded down, is left out at each end."""
+    """Mean of the middle half of the last axis: without a quarter, rounded down, at both ends."""
     return np.asarray(scipy.stats.trim_mean(np.asarray(scores, dtype=np.float64), 0.25, axis=-1))
 
 
-def over_trainings(scores: npt.ArrayLike, statistic: Callable[[Array], Any] = _MEAN) -> Estimate:
+def over_trainings(scores: npt.ArrayLike, statistic: Callable[[Array], Array] = _mean) -> Estimate:
     """``statistic`` (over the last axis) of the mean scores of trainings [S, E], with its interval.
 
     No interval where there is one training and one episode.
@@ -195,7 +209,7 @@ def over_trainings(scores: npt.ArrayLike, statistic: Callable[[Array], Any] = _M
 
 def difference(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
     """Mean of ``first`` [S, E] minus mean of ``second`` [S', E], on the same episodes."""
-    return _estimate(_pair(first, second), lambda a, b: a.mean(axis=-1) - b.mean(axis=-1))
+    return _estimate(_pair(first, second), lambda a, b: _mean(a) - _mean(b))
 
 
 def probability_of_improvement(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
@@ -209,17 +223,13 @@ def probability_of_improvement(first: npt.ArrayLike, second: npt.ArrayLike) -> E
 
 
 def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate | None:
-    """All events over all of ``per`` (km, say), both [S, E]; None where the latter is 0.
-
-    Where nothing happened the upper bound is Poisson's exact one, since resampling zeros gives
-    zero.
-    """
+    """All events over all of ``per`` (km, say), both [S, E]; None where the latter is 0."""
     happened, amount = _pair(events, per)
     total = float(amount.sum())
     if not total > 0.0:
         return None
     if not happened.any():
-        return Estimate(0.0, 0.0, (poisson_interval(0).high or 0.0) / total)
+        return no_events(total)
 
     def ratio(both: Array) -> Array:
         sums = both.sum(axis=-1)
@@ -238,15 +248,15 @@ def normalized_over_trainings(
     None where the interval of MOBIL's lead over the random driver includes 0: the scale would have
     no length.
     """
-    tables = [_pair(each, mobil)[0] for each in (agent, mobil, random_legal)]
+    tables = [_pair(rewards, mobil)[0] for rewards in (agent, mobil, random_legal)]
     if not difference(tables[1], tables[2]).excludes_zero():
         return None
+    return _estimate(tables, lambda *rewards: percent_of_way(*map(_mean, rewards)))
 
-    def percent(*scores: Array) -> Array:
-        value, top, bottom = (each.mean(axis=-1) for each in scores)
-        return np.asarray(100.0 * (value - bottom) / (top - bottom))
 
-    return _estimate(tables, percent)
+def percent_of_way(value: Array, top: Array, bottom: Array) -> Array:
+    """How far ``value`` is on the way from ``bottom`` to ``top``, in per cent."""
+    return np.asarray(100.0 * (value - bottom) / (top - bottom))
 
 
 @dataclass(frozen=True)
@@ -269,6 +279,7 @@ def mcnemar(first: npt.ArrayLike, second: npt.ArrayLike) -> McNemar:
     a, b = np.asarray(first, dtype=bool), np.asarray(second, dtype=bool)
     if a.shape != b.shape:
         raise ValueError(f"paired episodes must have one shape, found {a.shape} and {b.shape}")
+    # Episodes in which both failed, or neither, say nothing about a difference.
     one, other = int((a & ~b).sum()), int((b & ~a).sum())
     return McNemar(
         one, other, float(scipy.stats.binomtest(one, one + other).pvalue) if one + other else 1.0
@@ -307,8 +318,9 @@ def _estimate(
     value = float(statistic(*means)[0])
     if all(table.shape[-2:] == (1, 1) for table in tables):
         return Estimate(value)
+    # One draw of the episodes serves all tables: all drivers drove the same ones.
     generator, episodes = np.random.default_rng((0, 1)), tables[0].shape[-1]
-    counts = np.concatenate(kept_counts(episodes, FEWER_RESAMPLES, 0)).astype(np.float64).T
+    counts = np.concatenate(kept_counts(episodes, FEWER_RESAMPLES)).astype(np.float64).T
     parts = [
         statistic(*(np.moveaxis(table @ counts, -1, 0) / episodes for table in tables)) - value
     ]
@@ -317,11 +329,13 @@ def _estimate(
         trainings = table.shape[-2]
         if trainings == 1:
             continue
+        # This table's trainings are drawn anew, the others' stay as they are.
         chosen = generator.integers(trainings, size=(FEWER_RESAMPLES, trainings))
         drawn = list(means)
         drawn[index] = np.moveaxis(means[index][0][..., chosen], -2, 0)
         parts.append(np.sqrt(trainings / (trainings - 1)) * (statistic(*drawn) - value))
         freedom.append(trainings - 1)
+    # Satterthwaite: the degrees of freedom of a sum of variances that are known unequally well.
     variances = np.var(parts, axis=-1)
     uncertainty = float((variances**2 / freedom).sum())
     degrees = variances.sum() ** 2 / uncertainty if uncertainty > 0.0 else np.inf
@@ -332,5 +346,6 @@ def _estimate(
 
 def _share_above(first: Array, second: Array) -> Array:
     """Share of the pairs of [R, S] and [R, S'] in which the first is above; [R]."""
+    # Every training of the first with every training of the second, [R, S, S'].
     a, b = first[:, :, None], second[:, None, :]
     return np.asarray(((a > b) + 0.5 * (a == b)).mean(axis=(1, 2)))

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 Row = Mapping[str, Any]
+#: Makes a cell of a row.
+Cell = Callable[[Any], str]
 
 NOTHING = "-"
 
@@ -19,59 +21,63 @@ def aligned(lines: Sequence[Sequence[str]], names: int = 1) -> str:
 
     The first ``names`` columns are left-aligned, the others right-aligned.
     """
+    # A column is as wide as its widest cell, the heading included.
     widths = [max(map(len, column)) for column in zip(*lines)]
 
     def line(cells: Sequence[str]) -> str:
-        fitted = [
-            cell.ljust(w) if i < names else cell.rjust(w)
-            for i, (cell, w) in enumerate(zip(cells, widths))
-        ]
-        return "  ".join(fitted).rstrip()
+        words = [cell.ljust(width) for cell, width in zip(cells[:names], widths)]
+        numbers = [cell.rjust(width) for cell, width in zip(cells[names:], widths[names:])]
+        return "  ".join([*words, *numbers]).rstrip()
 
-    return "\n".join(
-        [line(lines[0]), "  ".join("-" * width for width in widths), *map(line, lines[1:])]
-    )
+    ruler = "  ".join("-" * width for width in widths)
+    return "\n".join([line(lines[0]), ruler, *map(line, lines[1:])])
 
 
 def show(*texts: str, columns: str = "auto") -> None:
-    """Print texts, a blank line between them, their tables as wide as the terminal (``columns``
-    auto) or whole (all).
+    """Print texts, a blank line between them.
 
-    Where the output is no terminal, tables are whole.
+    Their tables are as wide as the terminal (``columns`` auto) or whole (all). Where the output is
+    no terminal, tables are whole.
     """
-    width = (
-        shutil.get_terminal_size().columns if columns == "auto" and sys.stdout.isatty() else None
-    )
-    print("\n\n".join(texts) if width is None else fitting("\n\n".join(texts), width))
+    text = "\n\n".join(texts)
+    if columns == "auto" and sys.stdout.isatty():
+        text = fitting(text, shutil.get_terminal_size().columns)
+    print(text)
 
 
 def fitting(text: str, width: int) -> str:
-    """``text``, without some columns of each table of :func:`aligned` that is wider; a line below
-    names them.
+    """``text``, without some columns of each table of :func:`aligned` that is wider than ``width``.
 
-    A table ends with a blank line. Columns go from the right, those of :data:`_FIRST_TO_GO` before
-    the others.
+    A table ends with a blank line; a line below it names what is left out. Columns go from the
+    right, those of :data:`_FIRST_TO_GO` before the others.
     """
     return "\n\n".join(_narrowed(part.split("\n"), width) for part in text.split("\n\n"))
 
 
 def _narrowed(lines: Sequence[str], width: int) -> str:
-    ruler = next((at for at, line in enumerate(lines) if re.fullmatch(r"-+(  -+)+", line)), None)
-    if ruler is None or len(lines[ruler]) <= width:
+    """One part of a text, as :func:`fitting` does; its lines."""
+    # The ruler below the headings tells a table from other text, and where its columns stand.
+    rulers = [place for place, line in enumerate(lines) if re.fullmatch(r"-+(  -+)+", line)]
+    if not rulers or len(lines[rulers[0]]) <= width:
         return "\n".join(lines)
-    spans = [slice(*found.span()) for found in re.finditer("-+", lines[ruler])]
-    names = [lines[ruler - 1][span].strip() for span in spans]
-    order = [names.index(name) for name in _FIRST_TO_GO if name in names]
-    kept = set(range(len(spans)))
-    for column in [*order, *reversed(range(1, len(spans)))]:
-        if sum(spans[each].stop - spans[each].start + 2 for each in kept) > width + 2:
-            kept.discard(column)
-    rows = [
-        "  ".join(line[spans[each]] for each in sorted(kept)).rstrip()
-        for line in lines[ruler - 1 :]
-    ]
-    gone = ", ".join(name for each, name in enumerate(names) if each not in kept and name)
-    return "\n".join([*lines[: ruler - 1], *rows, f"(columns=all shows: {gone})"])
+    head = rulers[0] - 1
+    # Where each column stands in a line, by its heading.
+    spans: dict[str, slice] = {}
+    for ruler in re.finditer("-+", lines[head + 1]):
+        span = slice(*ruler.span())
+        spans[lines[head][span].strip()] = span
+    # Columns go one by one until the rest fits; the first, the name, stays.
+    gone: set[str] = set()
+    for name in [*_FIRST_TO_GO, *reversed(list(spans)[1:])]:
+        left = [span.stop - span.start + 2 for other, span in spans.items() if other not in gone]
+        if name in spans and sum(left) > width + 2:
+            gone.add(name)
+    rows = []
+    for line in lines[head:]:
+        cells = [line[span] for name, span in spans.items() if name not in gone]
+        rows.append("  ".join(cells).rstrip())
+    hidden = ", ".join(name for name in spans if name in gone)
+    return "\n".join([*lines[:head], *rows, f"(columns=all shows: {hidden})"])
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -80,11 +86,22 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def with_interval(row: Row, key: str, digits: int = 3) -> str:
-    """A cell with ``row[key]``, followed by ``[low, high]`` where the row has an interval for it
-    (``key_ci``).
-    """
+    """A cell with ``row[key]``, and ``[low, high]`` where the row has its interval, ``key_ci``."""
     text, interval = number(row.get(key), digits), row.get(f"{key}_ci")
-    return text if not interval else f"{text} [{interval[0]:.{digits}f}, {interval[1]:.{digits}f}]"
+    if not interval:
+        return text
+    low, high = interval
+    return f"{text} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def text_of(key: str) -> Cell:
+    """Makes the cell with ``row[key]`` as it is."""
+    return lambda row: str(row.get(key, NOTHING))
+
+
+def number_of(key: str, digits: int) -> Cell:
+    """Makes the cell with the number ``row[key]`` and its interval, if there is one."""
+    return lambda row: with_interval(row, key, digits)
 
 
 @dataclass(frozen=True)
@@ -105,35 +122,40 @@ class Table:
     def of(
         cls,
         title: str,
-        rows: Sequence[Mapping[str, Any]],
-        columns: Mapping[str, Callable[[Any], str]],
+        rows: Sequence[Any],
+        columns: Mapping[str, Cell],
         names: int = 1,
         notes: Sequence[str] = (),
     ) -> Table:
-        """One line per row.
-
-        ``columns`` maps each heading to the function that makes a cell of a row.
-        """
+        """One line per row; ``columns`` maps each heading to the maker of its cells."""
         lines = [[cell(row) for cell in columns.values()] for row in rows]
         return cls(title, list(columns), lines, names, notes)
 
     def text(self) -> str:
-        """Aligned columns, with the notes below."""
-        table = aligned([self.headings, *self.lines], self.names)
-        return "\n".join([self.title, "", table, *(["", *self.notes] if self.notes else [])])
+        """Aligned columns, with the title above and the notes below."""
+        # The tables of an evaluation have no title: the command is one.
+        lines = [self.title, ""] if self.title else []
+        lines.append(aligned([self.headings, *self.lines], self.names))
+        if self.notes:
+            lines += ["", *self.notes]
+        return "\n".join(lines)
 
     def markdown(self, heading: bool = True) -> str:
         """The title as a heading (unless turned off), the table, and the notes below."""
-        rulers = ["---" if i < self.names else "---:" for i in range(len(self.headings))]
+        rulers = ["---"] * self.names + ["---:"] * (len(self.headings) - self.names)
         lines = ["| " + " | ".join(line) + " |" for line in [self.headings, rulers, *self.lines]]
-        parts = [*([f"### {self.title}"] if heading else []), "\n".join(lines)]
-        return "\n\n".join([*parts, "\n".join(self.notes)] if self.notes else parts)
+        parts = [f"### {self.title}"] if heading else []
+        parts.append("\n".join(lines))
+        if self.notes:
+            parts.append("\n".join(self.notes))
+        return "\n\n".join(parts)
 
 
 def significant(value: float | None) -> str:
     """Three significant digits, without exponent."""
     if value is None:
         return NOTHING
+    # Rounded first: 9.996 has three digits as 10.0, not as 10.00.
     rounded = float(f"{value:.3g}")
     whole = len(str(int(abs(rounded))))
     return f"{rounded:.{max(0, 3 - whole)}f}" if abs(rounded) >= 1 else f"{rounded:.3g}"
@@ -144,6 +166,7 @@ def count(value: float | None) -> str:
     if value is None:
         return NOTHING
     for limit, unit in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
+        # What rounds up to the next unit is given in that unit: 1.00 M, not 1000 k.
         if abs(value) >= limit * 0.9995:
             return f"{significant(value / limit)}{unit}"
     return significant(value)
@@ -154,72 +177,76 @@ def percent(share: float | None, digits: int = 0) -> str:
     return NOTHING if share is None else f"{100 * share:.{digits}f} %"
 
 
-#: Heading, key and digits of each column of an evaluation, names before numbers; ``run``: of a
-#: sweep.
-_COLUMNS: Mapping[str, tuple[str, int | None]] = {
-    **{name: (name, None) for name in ("run", "agent", "traffic", "episodes", "goal")},
-    "hard": ("hard_crash", None),
-    "soft": ("soft_crash", None),
-    "off road": ("out_of_road", None),
-    "time-out": ("timeout", None),
-    "scene end": ("scene_end", None),
-    "mean reward [95 %]": ("mean_reward", 1),
-    "minus MOBIL, paired": ("minus_mobil", 1),
-    "m/s": ("mean_speed_mps", 1),
-    "changes/km": ("lane_changes_per_km", 2),
-    "% of MOBIL [95 %]": ("normalized_percent", 0),
-    "crashes/1000 km [95 %]": ("crashes_per_1000_km", 1),
+#: Columns of an evaluation, names before numbers; ``run``: of a sweep.
+_COLUMNS: Mapping[str, Cell] = {
+    "run": text_of("run"),
+    "agent": text_of("agent"),
+    "traffic": text_of("traffic"),
+    "episodes": text_of("episodes"),
+    "goal": text_of("goal"),
+    "hard": text_of("hard_crash"),
+    "soft": text_of("soft_crash"),
+    "off road": text_of("out_of_road"),
+    "time-out": text_of("timeout"),
+    "scene end": text_of("scene_end"),
+    "mean reward [95 %]": number_of("mean_reward", 1),
+    "minus MOBIL, paired": number_of("minus_mobil", 1),
+    "m/s": number_of("mean_speed_mps", 1),
+    "changes/km": number_of("lane_changes_per_km", 2),
+    "% of MOBIL [95 %]": number_of("normalized_percent", 0),
+    "crashes/1000 km [95 %]": number_of("crashes_per_1000_km", 1),
 }
 #: Columns that are left out where no row has anything in them.
 _OPTIONAL = ("run", "time-out", "scene end", "minus MOBIL, paired")
 #: Columns that a narrow terminal does without, the least telling first; the paired leads have a
 #: table of their own.
 _FIRST_TO_GO = (
-    *(
-        "crashes/1000 km [95 %]",
-        "% of MOBIL [95 %]",
-        "changes/km",
-        "minus MOBIL, paired",
-        "episodes",
-    ),
-    *("time-out", "scene end", "soft", "m/s", "goal"),
+    "crashes/1000 km [95 %]",
+    "% of MOBIL [95 %]",
+    "changes/km",
+    "minus MOBIL, paired",
+    "episodes",
+    "time-out",
+    "scene end",
+    "soft",
+    "m/s",
+    "goal",
 )
 
 
 def text_table(rows: Sequence[Row]) -> str:
-    """The rows of :func:`ganlane.evaluation.evaluation_rows`, and a line for each reason why a
-    score is missing.
+    """The rows of :func:`ganlane.evaluation.evaluation_rows`.
+
+    Below them stands a line for each reason why a score is missing.
     """
-    cells = {
-        heading: [
-            str(row.get(key, NOTHING)) if digits is None else with_interval(row, key, digits)
-            for row in rows
-        ]
-        for heading, (key, digits) in _COLUMNS.items()
+    columns = {
+        heading: cell
+        for heading, cell in _COLUMNS.items()
+        if heading not in _OPTIONAL or any(cell(row) not in ("0", NOTHING) for row in rows)
     }
-    cells = {
-        name: column
-        for name, column in cells.items()
-        if name not in _OPTIONAL or {*column} - {"0", NOTHING}
-    }
-    reasons: dict[str, dict[str, None]] = {}
+    # Each reason with its traffics, once each.
+    reasons: dict[str, list[str]] = {}
     for row in rows:
-        reason = row.get("normalized_percent_reason")
-        if reason is not None:
-            reasons.setdefault(reason, {})[row["traffic"]] = None
+        reason, traffic = row.get("normalized_percent_reason"), row.get("traffic")
+        if reason is not None and traffic not in reasons.setdefault(reason, []):
+            reasons[reason].append(str(traffic))
     notes = [
         f"% of MOBIL on {', '.join(traffics)}: none, {reason}"
         for reason, traffics in reasons.items()
     ]
-    table = aligned([list(cells), *map(list, zip(*cells.values()))], 2 + ("run" in cells))
-    return "\n".join([table, *(["", *notes] if notes else [])])
+    return Table.of("", rows, columns, 2 + ("run" in columns), notes).text()
 
 
 def paired_table(rows: Sequence[Row]) -> str:
     """The rows of :func:`ganlane.evaluation.paired_rows`, each lead with its sign."""
-    lines = [["paired lead", "traffic", "reward [95 %]", "verdict"]]
-    for row in rows:
-        sign = "" if row["lead"] < 0.0 else "+"
-        lead = sign + with_interval(row, "lead", 1)
-        lines.append([f"{row['agent']} over {row['over']}", row["traffic"], lead, row["verdict"]])
-    return aligned(lines, names=2)
+
+    def lead(row: Row) -> str:
+        return ("" if row["lead"] < 0.0 else "+") + with_interval(row, "lead", 1)
+
+    columns: Mapping[str, Cell] = {
+        "paired lead": lambda row: f"{row['agent']} over {row['over']}",
+        "traffic": text_of("traffic"),
+        "reward [95 %]": lead,
+        "verdict": text_of("verdict"),
+    }
+    return Table.of("", rows, columns, names=2).text()

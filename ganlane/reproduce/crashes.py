@@ -1,9 +1,8 @@
-"""Crashes and departures from the road as a list that can be driven again: episode numbers and
-actions, as JSON.
+"""Crashes and departures from the road as a list that can be driven again.
 
-``ganlane reproduce`` writes such a list, ``ganlane render crashes=FILE`` plays it. Everything is
-driven by the tensor code in batches of :data:`ROWS` rows: generated traffic repeats bit by bit in
-batches of one size only, and a film shows what the tensor code drives.
+The list is JSON and holds episode numbers and actions. ``ganlane reproduce`` writes it, ``ganlane
+render crashes=FILE`` plays it. Everything is driven by the tensor code in batches of :data:`ROWS`
+rows: generated traffic repeats bit by bit in batches of one size only.
 """
 
 from __future__ import annotations
@@ -28,8 +27,9 @@ from ganlane.settings.env import EnvConfig
 from ganlane.config.schemas import SCHEMAS, made, node_of
 from ganlane.settings.traffic import TRAFFICS, TrafficConfig
 from ganlane.errors import UserError
-from ganlane.evaluation.episodes import SIDES, Rollout, replay, roll_out
+from ganlane.evaluation.episodes import SIDES, ScriptedPolicy, run_episodes
 from ganlane.evaluation.results import plain
+from ganlane.evaluation.rows import FAILURES
 from ganlane.files import write_json
 from ganlane.settings.record import NotNegative, Record, Rule, Seed, Text, one_of
 from ganlane.settings.observation import MaskParameters, ObservationConfig, RewardParameters
@@ -37,8 +37,6 @@ from ganlane.sim.random import Stream
 
 #: Rows of every batch in which a list is made and driven again.
 ROWS = 8
-#: Events that end a listed episode.
-ENDS = ("hard_crash", "out_of_road")
 _KIND = "ganlane crashes"
 _ACTIONS = Rule(
     lambda text: re.fullmatch("[012]{1,100000}", text) is not None,
@@ -76,23 +74,16 @@ class Crash(Record):
     traffic: Annotated[str, one_of(_LISTED)] = "idm_mobil"
     seed: Seed = 0
     episode: Seed = 0
-    end: Annotated[str, one_of(ENDS)] = "hard_crash"
+    end: Annotated[str, one_of(FAILURES)] = "hard_crash"
     distance_m: NotNegative = 0.0
     contact: Annotated[str, one_of(SIDES)] = SIDES[0]
     changing: bool = False
     actions: Annotated[str, _ACTIONS] = "0"
 
-    def steps(self) -> dict[int, list[int]]:
-        """The episode's number and its actions, as :func:`ganlane.evaluation.replay` takes them."""
-        return {self.episode: list(map(int, self.actions))}
-
 
 @dataclass(frozen=True)
 class CrashList:
-    """Crashes, and what their episodes depend on.
-
-    Environment, traffics and stream of random numbers.
-    """
+    """Crashes, and what their episodes depend on: environment, traffics, stream of randomness."""
 
     env: EnvConfig
     traffics: Mapping[str, TrafficConfig]
@@ -107,22 +98,23 @@ class CrashList:
         mask: MaskParameters | None = None,
     ) -> EnvBase:
         """The environment that repeats this list's episodes on a traffic."""
+        # The tensor code, so that a list plays the same with and without the native kernel.
         env = replace(self.env, kernel="torch", compile=False)
         model = make_traffic(self.traffics[traffic], env, Stream.named(self.stream))
         return make_env(model, env, observation, reward, ROWS, mask=mask)
 
-    def drive_again(self) -> list[Rollout]:
-        """The rollouts of the listed actions, in the order of the list."""
-        rollouts: dict[tuple[str, str, int, int], Rollout] = {}
-        for (driver, traffic, seed), group in groupby(
+    def drive_again(self) -> list[str]:
+        """Drive every crash with its actions; how each ends, in the order of the list."""
+        ends: list[str] = []
+        for (_, traffic, seed), group in groupby(
             self.crashes, attrgetter("driver", "traffic", "seed")
         ):
-            actions = {number: steps for each in group for number, steps in each.steps().items()}
-            for rollout in replay(self.make_env(traffic), actions, seed):
-                rollouts[driver, traffic, seed, rollout.episode] = rollout
-        return [
-            rollouts[each.driver, each.traffic, each.seed, each.episode] for each in self.crashes
-        ]
+            # One script for all episodes of a driver on a traffic: they are driven side by side.
+            actions = {crash.episode: crash.actions for crash in group}
+            policy = ScriptedPolicy(actions)
+            table = run_episodes(self.make_env(traffic), policy, list(actions), seed)
+            ends += table["reason"].to_list()
+        return ends
 
 
 def find_crashes(
@@ -143,50 +135,54 @@ def find_crashes(
         for name, option in config.traffics.items()
         if name in _LISTED and option._target_ == _LISTED[name]._target_ and not option.parameters
     }
+    # A list without crashes makes the environment in which they are looked for.
     listed = CrashList(config.env, traffics, config.stream, [])
-    failed = episodes.filter(pl.col("reason").is_in(ENDS), pl.col("traffic").is_in(list(traffics)))
-    chosen = (
-        failed.sort("decisions", "episode")
-        .group_by("agent", "traffic", maintain_order=True)
+    pair = ["traffic", "agent"]
+    failed = (
+        episodes.filter(pl.col("reason").is_in(FAILURES), pl.col("traffic").is_in(list(traffics)))
+        .sort("decisions", "episode")
+        .group_by(pair, maintain_order=True)
         .head(most)
+        .sort(*pair, "episode")
     )
     crashes: list[Crash] = []
-    for (name, traffic), frame in chosen.sort("traffic", "agent").group_by(
-        "agent", "traffic", maintain_order=True
-    ):
-        driver = make_driver(name, config.env)
+    for (traffic, name), frame in failed.group_by(pair, maintain_order=True):
+        driver = make_driver(str(name), config.env)
         mask, policy = driver.behind(config.mask)
-        env = listed.make_env(
-            traffic, config.observation.read_by(driver.observation), config.reward, mask
-        )
-        ends = dict(zip(frame["episode"].to_list(), frame["reason"].to_list()))
-        for each in roll_out(env, policy, sorted(ends), config.seed):
-            if each.end == ends[each.episode]:
-                outcome = (
-                    each.end,
-                    round(max(each.distance_m, 0.0), 1),
-                    each.contact,
-                    each.changing,
-                )
-                actions = "".join(map(str, each.actions))
-                crashes.append(Crash(name, traffic, config.seed, each.episode, *outcome, actions))
-    return replace(listed, crashes=crashes), len(chosen) - len(crashes)
+        observation = config.observation.read_by(driver.observation)
+        env = listed.make_env(str(traffic), observation, config.reward, mask)
+        again = run_episodes(env, policy, frame["episode"].to_list(), config.seed, actions=True)
+        # Both tables have the same episodes in the same order.
+        same = again.filter(again["reason"] == frame["reason"])
+        crashes += [
+            Crash(
+                driver=str(name),
+                traffic=str(traffic),
+                seed=config.seed,
+                episode=row["episode"],
+                end=row["reason"],
+                distance_m=round(max(row["distance_m"], 0.0), 1),
+                contact=row["contact"],
+                changing=row["changing"],
+                actions=row["actions"],
+            )
+            for row in same.to_dicts()
+        ]
+    return replace(listed, crashes=crashes), failed.height - len(crashes)
 
 
 def write_crashes(path: str | Path, listed: CrashList) -> None:
     """Write a list as JSON, atomically."""
+    # A list names the option of its environment, so that reading knows the type of its values.
     option = next(name for name, kind in SCHEMAS["env"].items() if kind is type(listed.env))
-    used = {each.traffic for each in listed.crashes}
-    traffics = {
-        name: {key: value for key, value in asdict(traffic).items() if key not in _CODE}
-        for name, traffic in listed.traffics.items()
-        if name in used
-    }
-    env = {"option": option, **asdict(listed.env)}
+    traffics = {}
+    for name in sorted({crash.traffic for crash in listed.crashes}):
+        keys = asdict(listed.traffics[name])
+        traffics[name] = {key: value for key, value in keys.items() if key not in _CODE}
     content = {
         "kind": _KIND,
         "stream": listed.stream,
-        "env": env,
+        "env": {"option": option, **asdict(listed.env)},
         "traffics": traffics,
         "crashes": listed.crashes,
     }
@@ -201,33 +197,37 @@ def read_crashes(path: str | Path) -> CrashList:
     """
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
-        if content["kind"] != _KIND:
-            raise ValueError("another kind of file")
-        env, traffics = dict(content["env"]), dict(content["traffics"])
-        # OmegaConf would replace ${...}.
-        if "${" in json.dumps(content) or any(
-            _CODE & options.keys() for options in traffics.values()
-        ):
-            raise ValueError("it names what is not plain data")
-        crashes = [_typed(Crash, each) for each in content["crashes"]]
-        return CrashList(
-            _typed(SCHEMAS["env"][env.pop("option")], env),
-            {
-                name: _typed(_LISTED[name], traffics[name])
-                for name in {each.traffic for each in crashes}
-            },
-            {stream: stream for stream in ("report", "select")}[content["stream"]],
-            crashes,
-        )
+        return _checked(content)
     except OSError as error:
         raise UserError(
             f"{path}: cannot be read; give the crashes.json of ganlane reproduce."
         ) from error
     except _BROKEN as error:
+        # Errors of libraries may have many lines; a user's mistake is one sentence.
         reason = " ".join(str(error).split())[:200]
         raise UserError(
             f"{path}: not a list of crashes ({reason}); give the crashes.json of ganlane reproduce."
         ) from error
+
+
+def _checked(content: Any) -> CrashList:
+    """The list of a file's content; one of :data:`_BROKEN` for what is not such a list."""
+    if content["kind"] != _KIND:
+        raise ValueError("another kind of file")
+    if content["stream"] not in ("report", "select"):
+        raise ValueError(f"stream {content['stream']!r}")
+    env, traffics = dict(content["env"]), dict(content["traffics"])
+    # OmegaConf would replace ${...}.
+    if "${" in json.dumps(content) or any(_CODE & options.keys() for options in traffics.values()):
+        raise ValueError("it names what is not plain data")
+    crashes = [_typed(Crash, crash) for crash in content["crashes"]]
+    used = {crash.traffic for crash in crashes}
+    return CrashList(
+        _typed(SCHEMAS["env"][env.pop("option")], env),
+        {name: _typed(_LISTED[name], traffics[name]) for name in used},
+        content["stream"],
+        crashes,
+    )
 
 
 def _typed(kind: Any, values: Any) -> Any:

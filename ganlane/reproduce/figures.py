@@ -1,28 +1,24 @@
-"""The matrix drawn, and the paper's figures.
+"""The paper's figures, and the matrix drawn.
 
-Forecasts (2), an episode among generated drivers (3), transfer (4).
+Forecasts (2), an episode among generated drivers (3), learning curves with the transfer (4).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 from matplotlib import rc_context
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, NullLocator
-from matplotlib.transforms import Affine2D
 
 from ganlane.agents.checkpoint import with_seeds
-from ganlane.build import Driver, make_driver, make_env, make_traffic
+from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.settings.commands import ReproduceConfig
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.data import FRAME_S, default_scenes, read_scenes
@@ -52,71 +48,43 @@ LEAST_M = 8.0
 #: Figure 3: frames over each other, s from the first to the last, s of the episode to choose from,
 #: m around the ego.
 FRAMES, SHOWN_S, LONGEST_S, AROUND_M = 4, 3.0, 30.0, (-70.0, 130.0)
-EGO, OTHER = COLOURS[1], COLOURS[0]
-Positions = npt.NDArray[np.float64]
+#: Ticks of the leads over MOBIL: linear up to 20, logarithmic beyond.
+_LEADS = (-300, -100, -20, -10, 0, 10, 20, 100)
 
 
-class Drawn(NamedTuple):
-    """Figures by name, the numbers behind them, and why others are left out."""
-
-    figures: dict[str, Figure]
-    numbers: dict[str, pl.DataFrame]
-    missing: dict[str, str]
-
-
-def draw_all(config: ReproduceConfig, traffics: Mapping[str, TrafficConfig]) -> Drawn:
-    """``figure_2``, where the recordings are at hand, and ``figure_3``, where ``gan`` is among the
-    traffics.
-    """
-    drawn = Drawn({}, {}, {})
-    try:
-        drawn.numbers["figure_2"] = forecasts_to_draw()
-        drawn.figures["figure_2"] = draw_forecasts(drawn.numbers["figure_2"])
-    except UserError as error:
-        drawn.missing["figure 2"] = str(error)
-    if "gan" in traffics:
-        learnt = [name for name in config.agents if "agent_gan" in name]
-        name = with_seeds([*learnt, config.agents[-1]][0])[0]
-        driver = make_driver(name, config.env, device=config.device)
-        episode = drive_beginning(driver, traffics["gan"], config)
-        drawn.numbers["figure_3"] = busiest(episode)
-        drawn.figures["figure_3"] = draw_episode(episode.label, drawn.numbers["figure_3"])
-    else:
-        drawn.missing["figure 3"] = "the traffic gan is not among the traffics"
-    return drawn
+# Figure 2
 
 
 def interesting(windows: Windows) -> list[tuple[str, int]]:
-    """Kind and row of the windows to draw, :data:`PANELS`, no vehicle twice, none that hardly
-    moves.
+    """Kind and row of the windows to draw (:data:`PANELS`).
 
     A vehicle starts a lane change where it moves across in the future and has not before, completes
-    one the other way round, and goes steady where it moves across least of all.
+    one the other way round, and goes steady where it moves across least of all. No vehicle comes
+    twice, and none that hardly moves.
     """
     along, across = windows.positions[:, :, 0], windows.positions[:, :, 1]
     before = np.abs(across[:, PRESENT] - across[:, 0])
     after = np.abs(across[:, -1] - across[:, PRESENT])
-    moves = along[:, -1] - along[:, 0] > LEAST_M
     scores = {
         "starts a lane change": after - 2.0 * before,
         "completes a lane change": before - 2.0 * after,
         "goes steady": -before - after,
     }
-    chosen, seen = [], set[tuple[str, int]]()
+    moves = along[:, -1] - along[:, 0] > LEAST_M
+    chosen: list[tuple[str, int]] = []
+    seen: set[tuple[int, int]] = set()
     for kind, count in PANELS.items():
-        found = 0
-        for row in np.argsort(-scores[kind], kind="stable"):
-            vehicle = str(windows.scene[row]), int(windows.vehicle[row])
-            if found < count and moves[row] and vehicle not in seen:
+        wanted = len(chosen) + count
+        for row in np.argsort(-scores[kind], kind="stable").tolist():
+            vehicle = int(windows.scene[row]), int(windows.vehicle[row])
+            if len(chosen) < wanted and moves[row] and vehicle not in seen:
                 seen.add(vehicle)
-                chosen.append((kind, int(row)))
-                found += 1
+                chosen.append((kind, row))
     return chosen
 
 
 def forecasts_to_draw() -> pl.DataFrame:
-    """Vehicles of the recordings that the shipped generator was not fitted to, observed, recorded
-    and predicted.
+    """Recorded vehicles that the shipped generator was not fitted to, and what it predicts.
 
     Returns:
         Columns ``panel``, ``kind`` (of :data:`PANELS`), ``path`` (``observed``, ``recorded``,
@@ -128,37 +96,34 @@ def forecasts_to_draw() -> pl.DataFrame:
     """
     generator, metadata = load_generator(shipped_generator("paper"), "paper")
     held_out = set(metadata["data"]["held_out"])
-    scenes = [
-        scene for scene in scene_tracks(read_scenes(default_scenes())) if scene.name in held_out
-    ]
+    tracks = scene_tracks(read_scenes(default_scenes()))
+    scenes = [scene for scene in tracks if scene.name in held_out]
     if not scenes:
-        raise UserError(
-            f"the recordings have none of the scenes {', '.join(sorted(held_out))}, kept from the fit."
-        )
+        names = ", ".join(sorted(held_out))
+        raise UserError(f"the recordings have none of the scenes {names}, kept from the fit.")
     windows = cut_windows(scenes, _STRIDE)
     groups = group_windows(windows)
-    predicted: dict[str, Positions] = {}
+    # Paths after the present, each [W, frames, 2]. The mean is the same for every seed.
+    later = {"recorded": windows.future}
     for seed in range(SAMPLES):
         drawn = paper_forecasts(generator, windows, groups, seed, samples=1)
-        predicted |= {"mean": drawn["mean"], f"sample {seed + 1}": drawn["single"]}
+        later |= {"mean": drawn["mean"], f"sample {seed + 1}": drawn["single"]}
+    now = np.zeros((1, 2))
     parts = []
     for panel, (kind, row) in enumerate(interesting(windows)):
-        observed = windows.positions[row, :OBSERVED_POSITIONS] - windows.positions[row, PRESENT]
-        later = {"recorded": windows.future, **predicted}
-        paths = {
-            name: np.concatenate([np.zeros((1, 2)), each[row]]) for name, each in later.items()
-        }
-        for name, path in {**paths, "observed": observed}.items():
-            time_s = (np.arange(len(path)) - (PRESENT if name == "observed" else 0)) * FRAME_S
-            columns = {"time_s": time_s, "ahead_m": path[:, 0], "left_m": path[:, 1]}
+        paths = {name: np.concatenate([now, path[row]]) for name, path in later.items()}
+        seen = windows.positions[row, :OBSERVED_POSITIONS] - windows.positions[row, PRESENT]
+        # The observed path ends at the present, the others begin there.
+        for name, path in {**paths, "observed": seen}.items():
+            present = PRESENT if name == "observed" else 0
+            columns = {
+                "time_s": (np.arange(len(path)) - present) * FRAME_S,
+                "ahead_m": path[:, 0],
+                "left_m": path[:, 1],
+            }
+            labels = [pl.lit(panel).alias("panel"), pl.lit(kind).alias("kind")]
             parts.append(
-                pl.DataFrame(columns).select(
-                    pl.lit(panel).alias("panel"),
-                    pl.lit(kind).alias("kind"),
-                    # fmt: skip
-                    pl.lit(name).alias("path"),
-                    pl.all(),
-                )
+                pl.DataFrame(columns).select(*labels, pl.lit(name).alias("path"), pl.all())
             )
     return pl.concat(parts)
 
@@ -169,43 +134,50 @@ def draw_forecasts(paths: pl.DataFrame) -> Figure:
 
     The vehicles of :func:`forecasts_to_draw`, 0.8 s observed, then 0.8 s recorded and predicted.
     """
-    panels = paths.partition_by("panel", maintain_order=True)
-    figure, grid = panel_grid(len(panels), 2.5, 1.7)
     colours = {
         "observed": FAINT,
         "recorded": INK,
         "predicted, z = 0": COLOURS[1],
         "predicted": COLOURS[4],
     }
-    styles: dict[str, dict[str, Any]] = {
-        **{
-            f"sample {number + 1}": {"color": colours["predicted"], "lw": 0.8}
-            for number in range(SAMPLES)
-        },
-        "mean": {"color": colours["predicted, z = 0"], "lw": 1.6},
-        **{
-            name: {"color": colours[name], "marker": ".", "ms": 3}
-            for name in ("observed", "recorded")
-        },
-    }
+    # What is drawn last lies above.
+    styles: dict[str, dict[str, Any]] = {}
+    for number in range(SAMPLES):
+        styles[f"sample {number + 1}"] = {"color": colours["predicted"], "lw": 0.8}
+    styles["mean"] = {"color": colours["predicted, z = 0"], "lw": 1.6}
+    for name in ("observed", "recorded"):
+        styles[name] = {"color": colours[name], "marker": ".", "ms": 3}
+    panels = paths.partition_by("panel", maintain_order=True)
+    figure, grid = panel_grid(len(panels), 2.5, 1.7)
     for axes, panel in zip(grid, panels):
         axes.set(title=panel["kind"][0], xlabel="m ahead", ylabel="m to the left")
-        for name, style in styles.items():  # what is drawn last lies above
+        for name, style in styles.items():
             path = panel.filter(pl.col("path") == name)
             axes.plot(path["ahead_m"], path["left_m"], **style)
         low, high = axes.get_ylim()
-        reach = max(0.8, (high - low) / 2.0)
-        axes.set_ylim((low + high) / 2.0 - reach, (low + high) / 2.0 + reach)
+        # At least 1.6 m of height, so that steady driving does not look like a lane change.
+        middle, reach = (low + high) / 2.0, max(0.8, (high - low) / 2.0)
+        axes.set_ylim(middle - reach, middle + reach)
     add_legend(figure, colours)
     return figure
 
 
-def drive_beginning(driver: Driver, traffic: TrafficConfig, config: ReproduceConfig) -> Trajectory:
-    """Episode 0, at most :data:`LONGEST_S` of it."""
-    seen = config.observation.read_by(driver.observation)
+# Figure 3
+
+
+def drive_beginning(config: ReproduceConfig, traffic: TrafficConfig) -> Trajectory:
+    """Episode 0 of an agent that learnt on generated traffic, at most :data:`LONGEST_S` of it.
+
+    Without such an agent the last one of ``config`` drives.
+    """
+    # The figure shows what generated traffic teaches.
+    learnt = [name for name in config.agents if "agent_gan" in name]
+    name = with_seeds([*learnt, config.agents[-1]][0])[0]
+    driver = make_driver(name, config.env, device=config.device)
+    observation = config.observation.read_by(driver.observation)
     mask, policy = driver.behind(config.mask)
-    made = make_traffic(traffic, config.env, Stream[config.stream.upper()])
-    env = make_env(made, config.env, seen, config.reward, device=config.device, mask=mask)
+    module = make_traffic(traffic, config.env, Stream.named(config.stream))
+    env = make_env(module, config.env, observation, config.reward, device=config.device, mask=mask)
     return record_episode(env, policy, config.seed, 0, driver.name, traffic.label(), LONGEST_S)
 
 
@@ -219,27 +191,29 @@ def busiest(episode: Trajectory) -> pl.DataFrame:
     """
     shown = min(round(SHOWN_S / episode.frame_s), len(episode) - 1)
     ahead = episode.x - episode.x[:, :1]
+    # Vehicles in view, the ego left out.
     near = episode.valid & (ahead > AROUND_M[0]) & (ahead < AROUND_M[1] / 2.0)
     near[:, 0] = False
+    # How far each moves across within the seconds that start at a frame, [T - shown, M].
     across = np.abs(episode.y[shown:] - episode.y[: len(episode) - shown])
     first = int(np.argmax((across * near[: len(across)]).sum(axis=1)))
-    part, origin = slice(first, first + shown + 1), episode.x[first, 0]
-    stays = episode.valid[part].all(axis=0) & ~episode.jumped()[first + 1 : first + shown + 1].any(
-        axis=0
-    )
-    numbers = {
-        "x_m": episode.x - origin, "y_m": episode.y, "heading_rad": episode.heading,
-        "length_m": episode.length, "width_m": episode.width,
-    }  # fmt: skip
-    return pl.concat(
-        pl.DataFrame(
-            {
-                "time_s": episode.time_s[part],
-                **{name: each[part, vehicle] for name, each in numbers.items()},
-            }
-        ).insert_column(1, pl.lit(int(vehicle)).alias("vehicle"))
-        for vehicle in np.flatnonzero(stays)
-    )
+    part = slice(first, first + shown + 1)
+    # A vehicle that is recycled would draw a line across the picture.
+    jumps = episode.jumped()[first + 1 : first + shown + 1].any(axis=0)
+    frames = []
+    for vehicle in np.flatnonzero(episode.valid[part].all(axis=0) & ~jumps).tolist():
+        at = part, vehicle
+        columns = {
+            "time_s": episode.time_s[part],
+            "vehicle": np.full(shown + 1, vehicle),
+            "x_m": episode.x[at] - episode.x[first, 0],
+            "y_m": episode.y[at],
+            "heading_rad": episode.heading[at],
+            "length_m": episode.length[at],
+            "width_m": episode.width[at],
+        }
+        frames.append(pl.DataFrame(columns))
+    return pl.concat(frames)
 
 
 @rc_context(STYLE)
@@ -250,37 +224,104 @@ def draw_episode(label: EpisodeLabel, tracks: pl.DataFrame) -> Figure:
     """
     figure = Figure(figsize=(9.0, 1.9))
     axes = figure.subplots()
-    width_m, times = label.lane_width_m, tracks["time_s"].unique().sort().to_numpy()
+    lane_m, times = label.lane_width_m, tracks["time_s"].unique().sort().to_numpy()
     axes.set(xlim=AROUND_M, xlabel="m", yticks=[], aspect="equal")
-    axes.set_ylim(-0.75 * width_m, (label.lanes - 0.25) * width_m)
+    axes.set_ylim(-0.75 * lane_m, (label.lanes - 0.25) * lane_m)
     axes.set_title(f"{label.agent} on {label.traffic}, {times[0]:.1f} to {times[-1]:.1f} s")
     for line in range(label.lanes + 1):
-        edge = line in (0, label.lanes)
-        axes.axhline(
-            (line - 0.5) * width_m, color=INK if edge else FAINT, ls="-" if edge else (0, (8, 8))
-        )
+        style: dict[str, Any] = {"color": FAINT, "ls": (0, (8, 8))}
+        if line in (0, label.lanes):
+            style = {"color": INK, "ls": "-"}
+        axes.axhline((line - 0.5) * lane_m, **style)
+    colours = {"ego": COLOURS[1], "others": COLOURS[0]}
+    # From the first to the last, at equal times.
     frames = np.linspace(0, len(times) - 1, FRAMES).round().astype(int)
     for track in tracks.partition_by("vehicle", maintain_order=True):
-        colour = EGO if track["vehicle"][0] == 0 else OTHER
+        colour = colours["ego" if track["vehicle"][0] == 0 else "others"]
         axes.plot(track["x_m"], track["y_m"], color=colour, lw=0.8)
-        for place, frame in enumerate(frames):
-            _draw_body(
-                axes, track.row(int(frame), named=True), color=colour, alpha=(place + 1.0) / FRAMES
+        for place, frame in enumerate(frames.tolist()):
+            body = track.row(frame, named=True)
+            length, width = body["length_m"], body["width_m"]
+            axes.add_patch(
+                Rectangle(
+                    (body["x_m"] - length / 2.0, body["y_m"] - width / 2.0),
+                    length,
+                    width,
+                    angle=np.rad2deg(body["heading_rad"]),
+                    rotation_point="center",
+                    lw=0,
+                    color=colour,
+                    alpha=(place + 1.0) / FRAMES,
+                )
             )
-    add_legend(figure, {"ego": EGO, "others": OTHER})
+    add_legend(figure, colours)
     return figure
 
 
-def _draw_body(axes: Axes, at: dict[str, float], **style: Any) -> None:
-    length, width = at["length_m"], at["width_m"]
-    turned = Affine2D().rotate(at["heading_rad"]).translate(at["x_m"], at["y_m"]) + axes.transData
-    axes.add_patch(
-        Rectangle((-length / 2.0, -width / 2.0), length, width, lw=0, transform=turned, **style)
-    )
+# Figure 4
 
 
-#: Ticks of the leads: linear up to 20, logarithmic beyond.
-_LEADS = (-300, -100, -20, -10, 0, 10, 20, 100)
+def read_curves(folders: Sequence[str]) -> pl.DataFrame | None:
+    """The evaluations of training runs with two phases; None without any run.
+
+    Returns:
+        Columns ``run``, ``decisions`` (over both phases), ``mean_reward`` and ``phase`` (``first``
+        or ``second``).
+
+    Raises:
+        UserError: a folder without evaluations of both phases.
+    """
+    parts = []
+    for folder in map(Path, folders):
+        before = 0
+        for phase, path in (("first", folder / "pretrain"), ("second", folder)):
+            curve = read_metrics(path / "evaluation.csv")
+            parts.append(
+                curve.select(
+                    pl.lit(folder.name).alias("run"),
+                    pl.col("decisions") + before,
+                    "mean_reward",
+                    pl.lit(phase).alias("phase"),
+                )
+            )
+            # The second phase goes on counting where the first one ended.
+            before = curve["decisions"][-1]
+    return pl.concat(parts, how="vertical_relaxed") if parts else None
+
+
+@rc_context(STYLE)
+def draw_transfer(curves: pl.DataFrame, rows: Sequence[Row]) -> Figure:
+    """Figure 4: every run of :func:`read_curves`, their median, and the range between them.
+
+    The switch of the traffic is marked, and what Agent_IDM of ``rows`` earned on the new traffic
+    before any training there.
+    """
+    figure = Figure(figsize=(7.0, 3.4))
+    axes = figure.subplots()
+    axes.set(title="evaluations during training", xlabel="decisions", ylabel="mean reward")
+    axes.xaxis.set_major_formatter(EngFormatter())
+    for (_, phase), colour in zip(curves.group_by("phase", maintain_order=True), COLOURS):
+        runs = phase.partition_by("run", maintain_order=True)
+        points = [run.select("decisions", "mean_reward").to_numpy().T for run in runs]
+        # All runs at the decisions of the first one.
+        x = points[0][0]
+        y = np.stack([np.interp(x, *run) for run in points])
+        axes.fill_between(x, y.min(axis=0), y.max(axis=0), color=colour, alpha=0.2, lw=0)
+        axes.plot(x, np.median(y, axis=0), color=colour)
+        if len(points) > 1:
+            for run in points:
+                axes.plot(*run, color=colour, lw=0.5, alpha=0.6)
+    switch = curves.filter(pl.col("phase") == "first")["decisions"].to_numpy().max()
+    axes.axvline(switch, color=FAINT, ls=":")
+    for row in rows_of(rows, ["gan"], ["agent_idm"]):
+        rewards = [training["mean_reward"] for training in row["each"]]
+        axes.plot([switch] * len(rewards), rewards, "x", color=COLOURS[1])
+    names = ("on idm_mobil", "on gan (x: before any training there)")
+    add_legend(figure, dict(zip(names, COLOURS)))
+    return figure
+
+
+# The matrix
 
 
 @rc_context(STYLE)
@@ -289,107 +330,41 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
 
     The interval over trainings and episodes, a dot for each training.
     """
-    drawn = [row for row in rows if row["minus_mobil"] is not None]
-    drivers = list(dict.fromkeys(row["driver"] for row in drawn))
-    traffics = list(dict.fromkeys(row["traffic"] for row in drawn))
     mobil = {row["traffic"]: row["mean_reward"] for row in rows if row["driver"] == "mobil"}
-    bounds = [bound for row in drawn for bound in row["minus_mobil_ci"] or (row["minus_mobil"],)]
+    shown = [row for row in rows if row["minus_mobil"] is not None]
+    drivers = list(dict.fromkeys(row["driver"] for row in shown))
+    traffics = list(dict.fromkeys(row["traffic"] for row in shown))
+    # All panels have one scale, so that traffics can be compared.
+    bounds = [bound for row in shown for bound in _interval(row)]
     lowest, highest = min(-20.0, *bounds), max(20.0, *bounds)
     figure, grid = panel_grid(len(traffics), 3.4, 1.3 + 0.19 * len(drivers))
     for place, (axes, traffic) in enumerate(zip(grid, traffics)):
         axes.axvline(0.0, color=FAINT, lw=0.9)
         axes.set(title=traffic, xlabel="mean reward minus MOBIL's", ylim=(len(drivers) - 0.5, -0.5))
+        # Most leads lie within 20, those of random driving far below.
         axes.set_xscale("symlog", linthresh=20.0)
         axes.set_yticks(range(len(drivers)), drivers if place % 3 == 0 else [])
         axes.set_xticks([x for x in _LEADS if lowest <= x <= highest], minor=False)
         axes.set_xlim(1.15 * lowest, 1.15 * highest)
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_locator(NullLocator())
-        for row in drawn:
-            if row["traffic"] == traffic:
-                line, trained = drivers.index(row["driver"]), len(row["each"]) > 1
-                colour = COLOURS[0] if trained else INK
-                low, high = row["minus_mobil_ci"] or (row["minus_mobil"],) * 2
-                axes.plot([low, high], [line, line], color=colour, lw=2.2, solid_capstyle="butt")
-                axes.plot(row["minus_mobil"], line, "o", color=colour)
-                each = [training["mean_reward"] - mobil[traffic] for training in row["each"]]
-                if trained:
-                    axes.plot(each, [line] * len(each), "|", color=COLOURS[1], ms=6, mew=1)
+        for row in shown:
+            if row["traffic"] != traffic:
+                continue
+            line, trained = drivers.index(row["driver"]), len(row["each"]) > 1
+            colour = COLOURS[0] if trained else INK
+            axes.plot(_interval(row), [line] * 2, color=colour, lw=2.2, solid_capstyle="butt")
+            axes.plot(row["minus_mobil"], line, "o", color=colour)
+            if trained:
+                leads = [training["mean_reward"] - mobil[traffic] for training in row["each"]]
+                axes.plot(leads, [line] * len(leads), "|", color=COLOURS[1], ms=6, mew=1)
     one = Line2D([], [], color=COLOURS[1], marker="|", ls="", ms=6, label="one training")
     names = {"a recipe: mean, 95 % over trainings and episodes": COLOURS[0], "a single driver": INK}
     add_legend(figure, names, [one])
     return figure
 
 
-@dataclass(frozen=True)
-class Transfer:
-    """Learning curves over the decisions.
-
-    Both phases, one line per run, and what the agent earned at the switch.
-    """
-
-    runs: Mapping[str, pl.DataFrame]
-    switch: float
-    at_switch: Sequence[float]
-
-
-def read_transfers(folders: Sequence[str], rows: Sequence[Row]) -> Transfer | None:
-    """The evaluations of training runs with two phases; None without any run.
-
-    Raises:
-        UserError: a folder without evaluations of both phases.
-    """
-    runs: dict[str, pl.DataFrame] = {}
-    switch = 0.0
-    for folder in map(Path, folders):
-        first, second = (
-            read_metrics(part / "evaluation.csv").select("decisions", "mean_reward")
-            for part in (folder / "pretrain", folder)
-        )
-        switch = max(switch, float(first["decisions"][-1]))
-        later = second.with_columns(pl.col("decisions") + first["decisions"][-1])
-        phases = [
-            first.with_columns(phase=pl.lit("first")),
-            later.with_columns(phase=pl.lit("second")),
-        ]
-        runs[folder.name] = pl.concat(phases, how="vertical_relaxed")
-    ours = rows_of(rows, ["gan"], ["agent_idm"])
-    return (
-        Transfer(runs, switch, [each["mean_reward"] for row in ours for each in row["each"]])
-        if runs
-        else None
-    )
-
-
-@rc_context(STYLE)
-def draw_transfer(transfer: Transfer) -> Figure:
-    """Figure 4: every run, their median, and the range between them.
-
-    The switch of the traffic is marked.
-    """
-    figure = Figure(figsize=(7.0, 3.4))
-    axes = figure.subplots()
-    axes.set(title="evaluations during training", xlabel="decisions", ylabel="mean reward")
-    axes.xaxis.set_major_formatter(EngFormatter())
-    for phase, colour in zip(("first", "second"), COLOURS):
-        lines = [frame.filter(pl.col("phase") == phase) for frame in transfer.runs.values()]
-        x = lines[0]["decisions"].cast(pl.Float64).to_numpy()
-        y = np.stack(
-            [
-                np.interp(x, line["decisions"].to_numpy(), line["mean_reward"].to_numpy())
-                for line in lines
-            ]
-        )
-        axes.fill_between(x, y.min(axis=0), y.max(axis=0), color=colour, alpha=0.2, lw=0)
-        axes.plot(x, np.median(y, axis=0), color=colour)
-        for line in lines if len(lines) > 1 else []:
-            axes.plot(line["decisions"], line["mean_reward"], color=colour, lw=0.5, alpha=0.6)
-    axes.axvline(transfer.switch, color=FAINT, ls=":")
-    if transfer.at_switch:
-        axes.plot(
-            [transfer.switch] * len(transfer.at_switch), transfer.at_switch, "x", color=COLOURS[1]
-        )
-    add_legend(
-        figure, {"on idm_mobil": COLOURS[0], "on gan (x: before any training there)": COLOURS[1]}
-    )
-    return figure
+def _interval(row: Row) -> tuple[float, float]:
+    """That of the lead over MOBIL; the lead itself where there is none."""
+    low, high = row["minus_mobil_ci"] or (row["minus_mobil"],) * 2
+    return low, high

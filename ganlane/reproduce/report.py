@@ -1,14 +1,10 @@
-"""The report.
-
-A row for each recipe on each traffic, drivers compared, tables beside the paper's, and a page.
-"""
+"""The numbers of the matrix with the training as the unit, tables beside the paper's, a page."""
 
 from __future__ import annotations
 
 import html
-import io
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,8 +28,8 @@ from ganlane.evaluation.statistics import (
     probability_of_improvement,
     rate_over_trainings,
 )
-from ganlane.evaluation.table import NOTHING, Table, number, with_interval
-from ganlane.files import write_bytes
+from ganlane.evaluation.table import NOTHING, Cell, Table, number, number_of, text_of
+from ganlane.files import atomic_path, write_bytes
 from ganlane.view.figures import save_figure
 
 Row = dict[str, Any]
@@ -46,16 +42,21 @@ PAPER_VI = {"agent_idm": (19, 2), "agent_gan": (9, 0)}
 #: The paper's Table VII: % of MOBIL, mean reward and its standard deviation on Traffic_GAN, 1000
 #: runs.
 PAPER_VII = {"agent_idm": (5.21, -22.33, 100.66), "agent_gan": (114.82, 33.62, 95.19)}
-_CSS = (
-    "body{font:15px/1.5 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#262a30}"
-    "table{border-collapse:collapse;font-size:13px;margin:1em 0}td,th{padding:2px 9px;text-align:right}"
-    "th{border-bottom:1px solid #6e747c}td.name,th.name{text-align:left}svg{max-width:100%;height:auto}"
-    ".wide{overflow-x:auto}"
-)
+_CSS = """
+body { font: 15px/1.5 sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }
+body { color: #262a30 }
+table { border-collapse: collapse; font-size: 13px; margin: 1em 0 }
+td, th { padding: 2px 9px; text-align: right }
+th { border-bottom: 1px solid #6e747c }
+th[scope] { border: 0; font-weight: normal; text-align: left }
+svg { max-width: 100%; height: auto }
+.wide { overflow-x: auto }
+"""
 
 
 def recipe_of(driver: str) -> str:
     """``agent_idm+safe`` of ``agent_idm@3+safe`` and of ``FOLDER/agent_idm.safetensors@3+safe``."""
+    # Name, seed and mask: a folder and the file's ending do not belong to the recipe.
     packed = re.fullmatch(r"(?:.*/)?(.+?)(?:\.safetensors)?@\d+(\+.*)?", driver)
     return driver if packed is None else packed[1] + (packed[2] or "")
 
@@ -71,23 +72,21 @@ def by_recipe(episodes: pl.DataFrame) -> dict[tuple[str, str], dict[str, pl.Data
     cells: dict[tuple[str, str], dict[str, pl.DataFrame]] = {}
     for (driver, traffic), frame in episodes.group_by("agent", "traffic", maintain_order=True):
         recipe = recipe_of(str(driver))
-        there = cells.setdefault((recipe, str(traffic)), {})
-        there[str(driver)] = frame.sort("episode")
-        if len({seed_of(name) for name in there}) < len(there):
+        trainings = cells.setdefault((recipe, str(traffic)), {})
+        trainings[str(driver)] = frame.sort("episode")
+        # The same training twice would count as two.
+        if len(set(map(seed_of, trainings))) < len(trainings):
+            names = ", ".join(trainings)
             raise UserError(
-                f"agents: two of one seed are called {recipe} ({', '.join(there)}); leave one out."
+                f"agents: two of one seed are called {recipe} ({names}); leave one out."
             )
     return cells
 
 
 def column(trainings: Mapping[str, pl.DataFrame], value: str | pl.Expr) -> Array:
     """A column of each training as a table [S, E]."""
-    return np.stack(
-        [
-            frame.select(value).to_series().cast(pl.Float64).to_numpy()
-            for frame in trainings.values()
-        ]
-    )
+    columns = [frame.select(value).to_series() for frame in trainings.values()]
+    return np.stack([series.cast(pl.Float64).to_numpy() for series in columns])
 
 
 def _ended(reasons: Sequence[str]) -> pl.Expr:
@@ -116,51 +115,60 @@ def rows(cells: Cells) -> list[Row]:
 
 
 def _row(recipe: str, traffic: str, trainings: Mapping[str, pl.DataFrame], cells: Cells) -> Row:
+    # Both [S, E]: trainings by episodes.
     rewards, km = column(trainings, "reward"), column(trainings, pl.col("distance_m") / 1000.0)
-    mobil, random_legal = (cells.get((name, traffic)) for name in (SCALE_TOP, SCALE_BOTTOM))
-    above = None if mobil is None or recipe == SCALE_TOP else column(mobil, "reward")
+    mobil = _rewards(cells, SCALE_TOP, traffic)
+    random_legal = _rewards(cells, SCALE_BOTTOM, traffic)
+    score = lead = probability = None
+    if mobil is not None and random_legal is not None:
+        score = normalized_over_trainings(rewards, mobil, random_legal)
+    if recipe == SCALE_TOP:
+        mobil = None  # it is not compared with itself
+    if mobil is not None:
+        lead, probability = difference(rewards, mobil), _probability(rewards, mobil)
+    # Counts and plain rates are of the episodes of all trainings.
     together = pl.concat(trainings.values())
     crashes = together.filter(_ended(FAILURES[:1]))
     seconds, driven = float(together["duration_s"].sum()), float(km.sum())
-    score = None
-    if mobil is not None and random_legal is not None:
-        score = normalized_over_trainings(
-            rewards, column(mobil, "reward"), column(random_legal, "reward")
-        )
     row: Row = {
         "driver": recipe,
         "traffic": traffic,
         "trainings": len(rewards),
         "episodes": rewards.shape[1],
+        **entries("mean_reward", over_trainings(rewards)),
+        **entries("interquartile_mean", over_trainings(rewards, interquartile_mean)),
+        "reward_sd": float(rewards.std(ddof=1)),
+        **entries("minus_mobil", lead),
+        **entries("probability_above_mobil", probability),
+        **entries("normalized_percent", score),
+        **_failures(together),
+        "soft_crash": int(together["had_soft_crash"].sum()),
+        **entries("hard_crash_share", clopper_pearson(crashes.height, together.height)),
     }
-    row |= entries("mean_reward", over_trainings(rewards))
-    row |= entries("interquartile_mean", over_trainings(rewards, interquartile_mean))
-    row["reward_sd"] = float(rewards.std(ddof=1))
-    row |= entries("minus_mobil", None if above is None else difference(rewards, above))
-    row |= entries(
-        "probability_above_mobil", None if above is None else _probability(rewards, above)
-    )
-    row |= entries("normalized_percent", score)
-    row |= {end: together.filter(_ended([end])).height for end in FAILURES}
-    row["soft_crash"] = int(together["had_soft_crash"].sum())
-    row |= entries("hard_crash_share", clopper_pearson(crashes.height, together.height))
     for name, ends in _RATES.items():
         rate = rate_over_trainings(column(trainings, _ended(ends)), km)
         row |= entries(f"{name}_per_1000_km", None if rate is None else rate.scaled(1000.0))
+    changes = int(together["lane_changes"].sum())
     row["mean_speed_mps"] = 1000.0 * driven / seconds if seconds > 0.0 else None
-    row["lane_changes_per_km"] = (
-        int(together["lane_changes"].sum()) / driven if driven > 0.0 else None
-    )
+    row["lane_changes_per_km"] = changes / driven if driven > 0.0 else None
     row["soft_crash_behind_per_episode"] = together["soft_crash_behind"].mean()
-    row["at_fault_share"] = crashes["at_fault"].mean() if "at_fault" in crashes.columns else None
+    row["at_fault_share"] = crashes["at_fault"].mean()
     row["each"] = []
-    for (name, frame), own in zip(trainings.items(), rewards[:, None]):
-        counts = {end: frame.filter(_ended([end])).height for end in FAILURES}
-        lead = entries("minus_mobil", None if above is None else difference(own, above))
-        row["each"].append(
-            {"driver": name, **entries("mean_reward", over_trainings(own)), **lead, **counts}
-        )
+    for (name, frame), reward in zip(trainings.items(), rewards[:, None]):
+        lead = None if mobil is None else difference(reward, mobil)
+        training = {"driver": name, **entries("mean_reward", over_trainings(reward))}
+        row["each"].append({**training, **entries("minus_mobil", lead), **_failures(frame)})
     return row
+
+
+def _rewards(cells: Cells, recipe: str, traffic: str) -> Array | None:
+    """The rewards [S, E] of a recipe on a traffic, if it drove there."""
+    trainings = cells.get((recipe, traffic))
+    return None if trainings is None else column(trainings, "reward")
+
+
+def _failures(episodes: pl.DataFrame) -> dict[str, int]:
+    return {end: episodes.filter(_ended([end])).height for end in FAILURES}
 
 
 def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:
@@ -173,30 +181,38 @@ def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:
         has a namesake of the second (same seed, or the only one) the episodes in which one alone
         crashed, and the exact probability.
     """
-    found = []
+    compared = []
     traffics = dict.fromkeys(traffic for _, traffic in cells)
     for one, other in pairs:
         for traffic in traffics:
             first, second = cells.get((one, traffic)), cells.get((other, traffic))
-            if first is None or second is None:
-                continue
-            a, b = column(first, "reward"), column(second, "reward")
-            hit, struck = (column(each, _ended(FAILURES[:1])) for each in (first, second))
-            row: Row = {"driver": one, "over": other, "traffic": traffic}
-            row |= entries("lead", difference(a, b)) | entries("probability", _probability(a, b))
-            row |= entries(
-                "crash_difference_per_1000_episodes", _crash_difference(hit, struck).scaled(1000.0)
-            )
-            theirs = {seed_of(name): crashed > 0 for name, crashed in zip(second, struck)}
-            if len(theirs) == 1:
-                theirs = dict.fromkeys(map(seed_of, first), struck[0] > 0)
-            row["mcnemar"] = [
-                {"driver": name, **vars(mcnemar(crashed > 0, theirs[seed_of(name)]))}
-                for name, crashed in zip(first, hit)
-                if seed_of(name) in theirs
-            ]
-            found.append(row)
-    return found
+            if first is not None and second is not None:
+                names = {"driver": one, "over": other, "traffic": traffic}
+                compared.append({**names, **_compared(first, second)})
+    return compared
+
+
+def _compared(first: Mapping[str, pl.DataFrame], second: Mapping[str, pl.DataFrame]) -> Row:
+    """The numbers of a row of :func:`comparisons`."""
+    rewards, other_rewards = column(first, "reward"), column(second, "reward")
+    crashed, other_crashed = (column(cell, _ended(FAILURES[:1])) for cell in (first, second))
+    # Per 1000 episodes, which is easier to read than a share.
+    more_crashes = _crash_difference(crashed, other_crashed).scaled(1000.0)
+    namesakes = dict(zip(map(seed_of, second), other_crashed))
+    # A driver without trainings, say MOBIL, is held against every training of the first.
+    if len(namesakes) == 1:
+        namesakes = dict.fromkeys(map(seed_of, first), other_crashed[0])
+    tests = []
+    for name, crashes in zip(first, crashed):
+        if seed_of(name) in namesakes:
+            test = mcnemar(crashes > 0, namesakes[seed_of(name)] > 0)
+            tests.append({"driver": name, **vars(test)})
+    return {
+        **entries("lead", difference(rewards, other_rewards)),
+        **entries("probability", _probability(rewards, other_rewards)),
+        **entries("crash_difference_per_1000_episodes", more_crashes),
+        "mcnemar": tests,
+    }
 
 
 def _crash_difference(first: Array, second: Array) -> Estimate:
@@ -217,159 +233,179 @@ def _probability(first: Array, second: Array) -> Estimate | None:
 
 def rows_of(rows: Sequence[Row], traffics: Sequence[str], drivers: Sequence[str]) -> list[Row]:
     """The rows of ``drivers``, which may say that they have no mask, on ``traffics``."""
+    # The default command drives the agents without a mask, under names that say so.
     names = {name for driver in drivers for name in (driver, f"{driver}+none")}
     return [row for row in rows if row["traffic"] in traffics and row["driver"] in names]
 
 
-def _cell(key: str, digits: int) -> Callable[[Row], str]:
-    return lambda row: with_interval(row, key, digits)
+# Tables
 
 
-_MATRIX: Mapping[str, Callable[[Row], str]] = {
-    "driver": lambda row: str(row["driver"]),
-    "traffic": lambda row: str(row["traffic"]),
-    "episodes": lambda row: f"{row['trainings']} x {row['episodes']}",
-    "mean reward": _cell("mean_reward", 1),
-    "interquartile mean": _cell("interquartile_mean", 1),
-    "minus MOBIL": _cell("minus_mobil", 1),
-    "P(above MOBIL)": _cell("probability_above_mobil", 2),
-    "hard": lambda row: str(row["hard_crash"]),
-    "off road": lambda row: str(row["out_of_road"]),
-    "both per 1000 km": _cell("failures_per_1000_km", 1),
-    "at fault": lambda row: number(row["at_fault_share"], 2),
-    "m/s": lambda row: number(row["mean_speed_mps"], 1),
-    "changes/km": lambda row: number(row["lane_changes_per_km"], 2),
-    "close behind": lambda row: number(row["soft_crash_behind_per_episode"], 2),
-}
+def _trainings(row: Row) -> str:
+    return f"{row['trainings']} x {row['episodes']}"
+
+
+def matrix_table(rows: Sequence[Row]) -> Table:
+    """Every driver on every traffic."""
+    columns: Mapping[str, Cell] = {
+        "driver": text_of("driver"),
+        "traffic": text_of("traffic"),
+        "episodes": _trainings,
+        "mean reward": number_of("mean_reward", 1),
+        "interquartile mean": number_of("interquartile_mean", 1),
+        "minus MOBIL": number_of("minus_mobil", 1),
+        "P(above MOBIL)": number_of("probability_above_mobil", 2),
+        "hard": text_of("hard_crash"),
+        "off road": text_of("out_of_road"),
+        "both per 1000 km": number_of("failures_per_1000_km", 1),
+        "at fault": number_of("at_fault_share", 2),
+        "m/s": number_of("mean_speed_mps", 1),
+        "changes/km": number_of("lane_changes_per_km", 2),
+        "close behind": number_of("soft_crash_behind_per_episode", 2),
+    }
+    return Table.of("Every driver on every traffic", rows, columns, names=2)
 
 
 def table_vi(rows: Sequence[Row]) -> Table:
     """Crashes among rule-followers, beside the paper's."""
-    columns: Mapping[str, Callable[[Row], str]] = {
-        "source": lambda row: "here",
-        **{name: _MATRIX[name] for name in ("traffic", "driver", "episodes", "hard")},
-        "soft": lambda row: str(row["soft_crash"]),
-        "share of hard [95 %, exact]": _cell("hard_crash_share", 4),
-        "each training": lambda row: ", ".join(str(each["hard_crash"]) for each in row["each"]),
+    columns = {
+        "hard": text_of("hard_crash"),
+        "soft": text_of("soft_crash"),
+        "share of hard [95 %, exact]": number_of("hard_crash_share", 4),
+        "each training": _each("hard_crash", 0),
     }
-    ours = rows_of(rows, ["idm", "idm_mobil"], [*PAPER_VI, "mobil"])
-    here = Table.of("Table VI: crashes on rule-driven traffic", ours, columns, names=3)
     paper = [
         ["paper", "Traffic_IDM", name, "not stated", *map(str, counts), "", ""]
         for name, counts in PAPER_VI.items()
     ]
-    return replace(here, lines=[*paper, *here.lines])
+    ours = rows_of(rows, ["idm", "idm_mobil"], [*PAPER_VI, "mobil"])
+    return _beside("Table VI: crashes on rule-driven traffic", paper, ours, columns)
 
 
 def table_vii(rows: Sequence[Row]) -> Table:
     """The normalised score on generated traffic, beside the paper's."""
-    columns: Mapping[str, Callable[[Row], str]] = {
-        "source": lambda row: "here",
-        **{name: _MATRIX[name] for name in ("traffic", "driver", "episodes")},
-        "% of MOBIL": _cell("normalized_percent", 1),
-        "mean reward": _MATRIX["mean reward"],
-        "sd": lambda row: number(row["reward_sd"], 1),
-        "each training": lambda row: ", ".join(
-            number(each["mean_reward"], 1) for each in row["each"]
-        ),
+    columns = {
+        "% of MOBIL": number_of("normalized_percent", 1),
+        "mean reward": number_of("mean_reward", 1),
+        "sd": number_of("reward_sd", 1),
+        "each training": _each("mean_reward", 1),
     }
     note = (
-        "% of MOBIL is 100 (R - R_random) / (R_MOBIL - R_random): 0 for random legal driving, 100 for MOBIL; the "
-        "paper does not define its own."
-    )
-    ours = rows_of(rows, ["gan"], [*PAPER_VII, "mobil", "random_legal"])
-    here = Table.of(
-        "Table VII: performance on generated traffic", ours, columns, names=3, notes=[note]
+        "% of MOBIL is 100 (R - R_random) / (R_MOBIL - R_random): 0 for random legal driving, 100 "
+        "for MOBIL; the paper does not define its own."
     )
     paper = [
         ["paper", "Traffic_GAN", name, "1000", *(f"{value:.2f}" for value in numbers), ""]
         for name, numbers in PAPER_VII.items()
     ]
+    ours = rows_of(rows, ["gan"], [*PAPER_VII, "mobil", "random_legal"])
+    title = "Table VII: performance on generated traffic"
+    return replace(_beside(title, paper, ours, columns), notes=[note])
+
+
+def _each(key: str, digits: int) -> Cell:
+    """Makes the cell with a number of every training."""
+    return lambda row: ", ".join(number(training[key], digits) for training in row["each"])
+
+
+def _beside(
+    title: str, paper: list[list[str]], ours: list[Row], columns: Mapping[str, Cell]
+) -> Table:
+    """The paper's lines above our rows."""
+    names: Mapping[str, Cell] = {
+        "source": lambda row: "here",
+        "traffic": text_of("traffic"),
+        "driver": text_of("driver"),
+        "episodes": _trainings,
+    }
+    here = Table.of(title, ours, {**names, **columns}, names=3)
     return replace(here, lines=[*paper, *here.lines])
-
-
-def matrix_table(rows: Sequence[Row]) -> Table:
-    """Every driver on every traffic."""
-    return Table.of("Every driver on every traffic", rows, _MATRIX, names=2)
 
 
 def comparison_table(rows: Sequence[Row]) -> Table:
     """Pairs of drivers on the same episodes."""
-    columns: Mapping[str, Callable[[Row], str]] = {
-        "driver": _MATRIX["driver"],
-        "over": lambda row: str(row["over"]),
-        "traffic": _MATRIX["traffic"],
-        "lead in reward": _cell("lead", 1),
-        "P(improvement)": _cell("probability", 2),
-        "crashes per 1000 episodes, more": _cell("crash_difference_per_1000_episodes", 1),
-        "McNemar, each training: crashed alone, p": lambda row: "; ".join(
-            f"{each['only_first']}/{each['only_second']}, {each['p_value']:.2g}"
-            for each in row["mcnemar"]
-        ),
+
+    def tests(row: Row) -> str:
+        return "; ".join(
+            f"{test['only_first']}/{test['only_second']}, {test['p_value']:.2g}"
+            for test in row["mcnemar"]
+        )
+
+    columns: Mapping[str, Cell] = {
+        "driver": text_of("driver"),
+        "over": text_of("over"),
+        "traffic": text_of("traffic"),
+        "lead in reward": number_of("lead", 1),
+        "P(improvement)": number_of("probability", 2),
+        "crashes per 1000 episodes, more": number_of("crash_difference_per_1000_episodes", 1),
+        "McNemar, each training: crashed alone, p": tests,
     }
     return Table.of("Drivers compared on the same episodes", rows, columns, names=3)
+
+
+# Files
 
 
 def write_report(
     folder: Path, tables: Mapping[str, Table], figures: Mapping[str, Figure], intro: Sequence[str]
 ) -> Path:
-    """Write every figure as PNG and SVG, and ``report.html`` with tables and figures inline.
-
-    Its path.
-    """
+    """Write every figure as PNG and SVG, and ``report.html`` with tables and figures; its path."""
+    # Everything is within the page, so that it opens without a network.
     parts = [f"<p>{html.escape(line)}</p>" for line in intro]
     for name, figure in figures.items():
         for kind in ("png", "svg"):
             save_figure(figure, folder / f"{name}.{kind}")
         drawing = (folder / f"{name}.svg").read_text(encoding="utf-8")
-        parts.append(
-            f"<h2>{name.replace('_', ' ').capitalize()}</h2>{drawing[drawing.index('<svg') :]}"
-        )
+        # Without the XML declaration, the drawing may stand in a page.
+        drawing = drawing[drawing.index("<svg") :]
+        parts.append(f"<h2>{name.replace('_', ' ').capitalize()}</h2>{drawing}")
     parts += map(_html, tables.values())
     page = (
-        '<!doctype html><html lang="en"><meta charset="utf-8"><title>ganlane: the tables and figures</title>'
-        f"<style>{_CSS}</style><h1>The tables and figures</h1>{''.join(parts)}</html>\n"
+        '<!doctype html><html lang="en"><meta charset="utf-8">'
+        f"<title>ganlane: the tables and figures</title><style>{_CSS}</style>"
+        f"<h1>The tables and figures</h1>{''.join(parts)}</html>\n"
     )
     write_bytes(folder / "report.html", page.encode())
     return folder / "report.html"
 
 
 def _html(table: Table) -> str:
-    def line(cells: Sequence[str], tag: str) -> str:
-        kinds = ['class="name"' if place < table.names else "" for place in range(len(cells))]
-        return (
-            "<tr>"
-            + "".join(f"<{tag} {kind}>{html.escape(x)}</{tag}>" for kind, x in zip(kinds, cells))
-            + "</tr>"
-        )
-
-    body = "".join(line(cells, "td") for cells in table.lines)
+    # The columns with names are headings of their line.
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in table.headings)
+    lines = [f"<tr>{head}</tr>"]
+    for line in table.lines:
+        cells = [html.escape(cell) for cell in line]
+        names = "".join(f'<th scope="row">{cell}</th>' for cell in cells[: table.names])
+        numbers = "".join(f"<td>{cell}</td>" for cell in cells[table.names :])
+        lines.append(f"<tr>{names}{numbers}</tr>")
     notes = "".join(f"<p>{html.escape(note)}</p>" for note in table.notes)
-    table_itself = f"<table>{line(table.headings, 'th')}{body}</table>"
-    return f'<h2>{html.escape(table.title)}</h2><div class="wide">{table_itself}</div>{notes}'
+    body = f'<div class="wide"><table>{"".join(lines)}</table></div>'
+    return f"<h2>{html.escape(table.title)}</h2>{body}{notes}"
 
 
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]] | Table) -> None:
-    """A table as it is printed, or rows, as CSV.
+def write_csv(path: Path, content: pl.DataFrame | Table | Sequence[Row]) -> None:
+    """Numbers, a table as it is printed, or rows, as CSV, atomically.
 
-    An interval as two columns (``_low``, ``_high``), no lists.
+    Of rows, an interval becomes two columns (``_low``, ``_high``), and lists are left out.
     """
-    if isinstance(rows, Table):
-        shown = [["" if cell == NOTHING else cell for cell in line] for line in rows.lines]
-        rows = [dict(zip(rows.headings, line)) for line in shown]
-    flat = []
-    for row in rows:
-        cells: dict[str, Any] = {}
-        for key, value in row.items():
-            if key.endswith("_ci"):
-                low, high = value or (None, None)
-                cells |= {
-                    f"{key.removesuffix('_ci')}_low": low,
-                    f"{key.removesuffix('_ci')}_high": high,
-                }
-            elif not isinstance(value, list):
-                cells[key] = value
-        flat.append(cells)
-    buffer = io.BytesIO()
-    pl.DataFrame(flat, infer_schema_length=None).write_csv(buffer)
-    write_bytes(path, buffer.getvalue())
+    if isinstance(content, Table):
+        shown = [["" if cell == NOTHING else cell for cell in line] for line in content.lines]
+        frame = pl.DataFrame(shown, dict.fromkeys(content.headings, pl.String), orient="row")
+    elif isinstance(content, pl.DataFrame):
+        frame = content
+    else:
+        frame = pl.DataFrame(list(map(_flat, content)), infer_schema_length=None)
+    with atomic_path(path) as part:
+        frame.write_csv(part)
+
+
+def _flat(row: Row) -> Row:
+    # CSV has neither pairs nor lists in a cell.
+    flat: Row = {}
+    for key, value in row.items():
+        if key.endswith("_ci"):
+            name = key.removesuffix("_ci")
+            flat[f"{name}_low"], flat[f"{name}_high"] = value or (None, None)
+        elif not isinstance(value, list):
+            flat[key] = value
+    return flat

@@ -18,7 +18,6 @@ from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, exploration_type, step_mdp
 
 from ganlane import keys
-from ganlane.agents.drivers import KeepLaneDriver
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.traffic import (
@@ -30,8 +29,8 @@ from ganlane.settings.traffic import (
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
-from ganlane.evaluation import replay, roll_out, run_episodes
-from ganlane.evaluation.episodes import SIDES, contact_side, ego_at_fault
+from ganlane.evaluation import run_episodes
+from ganlane.evaluation.episodes import SIDES, ScriptedPolicy, contact_side, ego_at_fault
 from ganlane.settings.observation import ObservationConfig, SensorParameters
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
@@ -262,21 +261,14 @@ def test_no_episodes_and_an_environment_that_ignores_those_it_is_given_are_refus
         run_episodes(ToyEnv(2), always(0), [], seed=0)
 
 
-def test_a_rollout_is_the_evaluated_episode_and_comes_back_from_its_actions():
+def test_an_episode_comes_back_from_its_actions():
     config = EnvConfig(goal_m=90.0)
     env = make_env(make_traffic(IdmMobilTrafficConfig(), config), config, num_envs=2)
-    policy = KeepLaneDriver(env.base_env.road)
-    rollouts = roll_out(env, policy, [4, 1, 7], seed=3)
-    table = run_episodes(env, policy, [4, 1, 7], seed=3)
-    assert [each.end for each in rollouts] == table["reason"].to_list()
-    assert [len(each.actions) for each in rollouts] == table["decisions"].to_list()
-    assert [each.reward for each in rollouts] == pytest.approx(table["reward"].to_list(), rel=1e-5)
-    assert replay(env, {each.episode: each.actions for each in rollouts}, seed=3) == sorted(
-        rollouts, key=lambda each: each.episode
-    )
-    assert replay(env, {}, seed=3) == []
-    with pytest.raises(UserError, match="episodes: none were asked for"):
-        roll_out(env, policy, [], seed=3)
+    policy = make_driver("random_legal", config).policy
+    table = run_episodes(env, policy, [4, 1, 7], seed=3, actions=True)
+    assert table["actions"].str.len_chars().to_list() == table["decisions"].to_list()
+    script = ScriptedPolicy(dict(table.select("episode", "actions").iter_rows()))
+    assert_frame_equal(run_episodes(env, script, [4, 1, 7], seed=3, actions=True), table)
 
 
 @pytest.mark.parametrize(

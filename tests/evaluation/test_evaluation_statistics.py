@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy import stats
 
 from ganlane.evaluation.statistics import (
@@ -43,17 +41,13 @@ def test_the_interval_is_scipys_bca_and_repeats_with_its_seed():
     width = theirs.high - theirs.low
     assert ours.value == pytest.approx(skewed.mean())
     assert ours.interval == pytest.approx([theirs.low, theirs.high], abs=0.04 * width)
-    assert (
-        mean_interval(skewed, seed=4)
-        == mean_interval(skewed, seed=4)
-        != mean_interval(skewed, seed=5)
-    )
+    assert mean_interval(skewed) == ours
 
 
 def test_the_95_percent_interval_covers_the_mean_about_95_times_in_a_hundred():
     generator = np.random.default_rng(0)
     samples = generator.exponential(1.0, (300, 60))
-    intervals = [mean_interval(sample, resamples=1000, seed=i) for i, sample in enumerate(samples)]
+    intervals = [mean_interval(sample) for sample in samples]
     covered = np.mean([interval.low <= 1.0 <= interval.high for interval in intervals])
     assert 0.90 <= covered <= 0.98
 
@@ -70,11 +64,8 @@ def test_an_estimate_is_scaled_with_its_bounds_and_gives_a_rows_entries():
     assert rate.interval == pytest.approx([1.623 / 2.5, 11.668 / 2.5], abs=1e-3)
     assert Estimate(4.0).scaled(0.5) == Estimate(2.0)
     assert entries("rate", Estimate(2.0, 1.0, 3.0)) == {"rate": 2.0, "rate_ci": [1.0, 3.0]}
-    assert (
-        entries("rate", None)
-        == entries("rate", Estimate(float("nan")))
-        == {"rate": None, "rate_ci": None}
-    )
+    nothing = {"rate": None, "rate_ci": None}
+    assert entries("rate", None) == entries("rate", Estimate(float("nan"))) == nothing
 
 
 def test_pairing_removes_what_the_episodes_have_in_common():
@@ -89,43 +80,23 @@ def test_pairing_removes_what_the_episodes_have_in_common():
         paired_difference(common, common[1:])
 
 
-@settings(max_examples=60, deadline=None)
-@given(st.data())
-def test_the_binomial_interval_agrees_with_scipy(data):
-    trials = data.draw(st.integers(1, 2000))
-    count = data.draw(st.integers(0, trials))
+@pytest.mark.parametrize(
+    ("count", "trials"), [(0, 1), (0, 50), (1, 1), (3, 20), (50, 50), (700, 2000)]
+)
+def test_the_binomial_interval_agrees_with_scipy(count, trials):
     theirs = stats.binomtest(count, trials).proportion_ci(0.95, "exact")
-    assert clopper_pearson(count, trials).interval == pytest.approx(
-        [theirs.low, theirs.high], abs=1e-9
-    )
-
-
-@pytest.mark.parametrize(
-    ("count", "bounds"), [(0, [0.0, 1 - 0.025 ** (1 / 50)]), (50, [0.025 ** (1 / 50), 1.0])]
-)
-def test_none_and_all_of_fifty_have_bounds_in_closed_form(count, bounds):
-    assert clopper_pearson(count, 50).interval == pytest.approx(bounds)
-
-
-@pytest.mark.parametrize(
-    ("count", "low", "high"),
-    [(0, 0.0, 3.689), (1, 0.025, 5.572), (5, 1.623, 11.668), (10, 4.795, 18.390)],
-)
-def test_the_poisson_interval_is_garwoods_table(count, low, high):
-    assert poisson_interval(count).interval == pytest.approx([low, high], abs=1e-3)
+    assert clopper_pearson(count, trials).interval == pytest.approx([theirs.low, theirs.high])
 
 
 # Several trainings of one recipe
 
 
-def scores(trainings, episodes, between=0.0, shared=0.0, own=0.0, seed=0):
-    """Scores [S, E] that vary between trainings, between episodes (alike for all trainings), and
-    otherwise.
-    """
+def scores(trainings, episodes, between=0.0, shared=0.0, rest=0.0, seed=0):
+    """Scores [S, E] that vary between trainings, between episodes (shared), and otherwise."""
     generator = np.random.default_rng(seed)
     of_training = between * generator.normal(size=(trainings, 1))
     of_episode = shared * generator.normal(size=(1, episodes))
-    return of_training + of_episode + own * generator.normal(size=(trainings, episodes))
+    return of_training + of_episode + rest * generator.normal(size=(trainings, episodes))
 
 
 def width(estimate):
@@ -139,7 +110,7 @@ def test_the_interquartile_mean_is_that_of_the_middle_half():
 
 
 @pytest.mark.parametrize(
-    "table", [scores(1, 400, own=10.0), scores(200, 1, between=3.0)], ids=["one", "many"]
+    "table", [scores(1, 400, rest=10.0), scores(200, 1, between=3.0)], ids=["one", "many"]
 )
 def test_one_training_has_the_interval_of_its_episodes_and_one_episode_that_of_its_trainings(table):
     estimate = over_trainings(table)
@@ -154,7 +125,7 @@ def test_what_all_trainings_share_does_not_average_out_with_their_number():
 
 
 def test_a_recipe_whose_trainings_differ_has_a_wider_interval_than_its_episodes_alone():
-    table = scores(5, 200, between=10.0, own=10.0, seed=1)
+    table = scores(5, 200, between=10.0, rest=10.0, seed=1)
     assert width(over_trainings(table)) > 4 * width(over_trainings(table.reshape(1, -1)))
     of_means = stats.ttest_1samp(table.mean(axis=1), 0.0).confidence_interval()
     assert width(over_trainings(table)) == pytest.approx(of_means.high - of_means.low, rel=0.1)
@@ -164,7 +135,7 @@ def test_a_recipe_whose_trainings_differ_has_a_wider_interval_than_its_episodes_
 @pytest.mark.parametrize("trainings", [3, 5])
 def test_an_interval_holds_the_truth_in_95_of_100_recipes(trainings, between):
     tables = [
-        scores(trainings, 100, between=between, shared=10.0, own=10.0, seed=seed)
+        scores(trainings, 100, between=between, shared=10.0, rest=10.0, seed=seed)
         for seed in range(200)
     ]
     held = [estimate.low <= 0.0 <= estimate.high for estimate in map(over_trainings, tables)]
@@ -174,7 +145,7 @@ def test_an_interval_holds_the_truth_in_95_of_100_recipes(trainings, between):
 
 def test_a_difference_pairs_the_episodes_and_resamples_the_trainings_of_both():
     episodes = scores(1, 300, shared=50.0)
-    better = episodes + 5.0 + scores(4, 300, own=0.1)
+    better = episodes + 5.0 + scores(4, 300, rest=0.1)
     estimate = difference(better, episodes)
     assert estimate.value == pytest.approx(5.0, abs=0.02)
     assert width(estimate) < 0.1
@@ -187,16 +158,13 @@ def test_a_difference_pairs_the_episodes_and_resamples_the_trainings_of_both():
 
 
 def test_the_probability_of_improvement_is_the_share_of_pairs():
-    table = scores(5, 50, between=1.0, own=1.0)
+    table = scores(5, 50, between=1.0, rest=1.0)
     assert probability_of_improvement(table, table).value == 0.5
     assert probability_of_improvement(table + 100.0, table).interval == [1.0, 1.0]
     first, second = [[1.0], [3.0], [2.0]], [[2.0], [0.0]]
     # Above 2: the 3, and half of the tie; above 0: all three.
     assert probability_of_improvement(first, second).value == pytest.approx((1.5 + 3) / 6)
-    a, b = (
-        np.random.default_rng(0).normal(size=(7, 3)),
-        np.random.default_rng(1).normal(size=(9, 3)),
-    )
+    a, b = (np.random.default_rng(seed).normal(size=(7 + seed, 3)) for seed in (0, 2))
     u = stats.mannwhitneyu(a.mean(axis=1), b.mean(axis=1)).statistic
     assert probability_of_improvement(a, b).value == pytest.approx(u / 63)
 
@@ -218,9 +186,9 @@ def test_mcnemar_counts_the_episodes_in_which_the_drivers_differ():
     first = [True, False, False, False, False, False, True, False]
     second = [False, True, True, True, True, True, True, False]
     # Six coin tosses with at most one head, on either side: 2 (1 + 6) / 64.
-    found = mcnemar(first, second)
-    assert (found.only_first, found.only_second) == (1, 5)
-    assert found.p_value == pytest.approx(14 / 64)
+    test = mcnemar(first, second)
+    assert (test.only_first, test.only_second) == (1, 5)
+    assert test.p_value == pytest.approx(14 / 64)
     assert mcnemar([True, False], [True, False]).p_value == 1.0
 
 

@@ -13,9 +13,9 @@ import pytest
 from ganlane.settings.commands import EvaluateConfig
 from ganlane.settings.env import EnvConfig
 from ganlane.errors import UserError
+from ganlane.evaluation.rows import FAILURES
 from ganlane.render import main
 from ganlane.reproduce.crashes import (
-    ENDS,
     Crash,
     CrashList,
     find_crashes,
@@ -34,35 +34,35 @@ def shipped() -> CrashList:
 def earliest(listed: CrashList) -> dict[str, Crash]:
     """The earliest crash on each traffic."""
     return {
-        each.traffic: each for each in sorted(listed.crashes, key=lambda each: -len(each.actions))
+        crash.traffic: crash
+        for crash in sorted(listed.crashes, key=lambda crash: -len(crash.actions))
     }
 
 
 def check_they_happen_again(listed: CrashList) -> None:
-    assert [rollout.end for rollout in listed.drive_again()] == [
-        each.end for each in listed.crashes
-    ]
+    assert listed.drive_again() == [crash.end for crash in listed.crashes]
 
 
 @pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_crashes_of_the_shipped_agents_happen_again(every, shipped):
-    early = {traffic: each for traffic, each in earliest(shipped).items() if len(each.actions) < 20}
+    early = {
+        traffic: crash for traffic, crash in earliest(shipped).items() if len(crash.actions) < 20
+    }
     assert early.keys() >= {"idm_mobil", "idm_faults", "gan", "gan_calibrated"}
     check_they_happen_again(shipped if every else replace(shipped, crashes=list(early.values())))
 
 
 def test_the_list_holds_failures_of_the_published_evaluation(shipped):
     failures = json.loads((SHIPPED.parent / "results.json").read_text())["failures"]
-    known = {
-        (f["driver"], f["traffic"], number, end)
-        for f in failures
-        for end in ENDS
-        for number in f[end]
+    published = {
+        (row["driver"], row["traffic"], number, end)
+        for row in failures
+        for end in FAILURES
+        for number in row[end]
     }
-    assert {
-        (each.driver, each.traffic, each.episode, each.end) for each in shipped.crashes
-    } <= known
-    drivers = {each.driver.partition("+")[0] for each in shipped.crashes}
+    for crash in shipped.crashes:
+        assert (crash.driver, crash.traffic, crash.episode, crash.end) in published
+    drivers = {crash.driver.partition("+")[0] for crash in shipped.crashes}
     assert drivers >= {f"agent_{recipe}@{seed}" for recipe in ("idm", "gan") for seed in range(4)}
     assert SHIPPED.stat().st_size < 200_000
 
@@ -72,10 +72,10 @@ def test_episodes_that_end_otherwise_are_counted_and_not_listed(tmp_path):
     episodes = {"agent": "random", "traffic": "idm", "episode": [2, 3, 7], "decisions": [9, 1, 5]}
     rows = pl.DataFrame({**episodes, "reason": ["out_of_road", "out_of_road", "hard_crash"]})
     listed, others = find_crashes(rows, config, 3)
-    assert [each.episode for each in listed.crashes] == [2, 3]
+    assert [crash.episode for crash in listed.crashes] == [2, 3]
     assert others == 1
     # the earliest
-    assert [each.episode for each in find_crashes(rows, config, 1)[0].crashes] == [3]
+    assert [crash.episode for crash in find_crashes(rows, config, 1)[0].crashes] == [3]
     write_crashes(tmp_path / "crashes.json", listed)
     read = read_crashes(tmp_path / "crashes.json")
     assert read.crashes == listed.crashes
@@ -134,13 +134,10 @@ def test_one_page_plays_crashes_of_several_traffics(small_list, capsys):
     assert "listed:" not in out  # each ended as listed
     page = Path("player.html").read_text()
     data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.S)[1])["episodes"]
-    shown = [
-        (each["agent"], each["traffic"], each["seed"], each["episode"], each["outcome"])
-        for each in data
-    ]
-    assert shown == [
-        (each.driver, each.traffic, each.seed, each.episode, each.end) for each in crashes
-    ]
+    for shown, crash in zip(data, crashes, strict=True):
+        assert (shown["agent"], shown["traffic"]) == (crash.driver, crash.traffic)
+        assert (shown["seed"], shown["episode"]) == (crash.seed, crash.episode)
+        assert shown["outcome"] == crash.end
 
 
 @pytest.mark.usefixtures("hydra_from_memory")

@@ -6,6 +6,7 @@ Which vehicles and which seconds are drawn, and the numbers behind the lines.
 from __future__ import annotations
 
 import numpy as np
+import polars as pl
 import pytest
 
 from ganlane.errors import UserError
@@ -59,21 +60,16 @@ def episode(seconds=20.0, changes_at_s=10.0):
     time_s = np.arange(0.0, seconds, 0.1)
     across = np.clip((time_s - changes_at_s) / 3.0, 0.0, 1.0) * 4.0
     zero = np.zeros_like(time_s)
-    x = np.stack(
-        [
-            20.0 * time_s,
-            20.0 * time_s + 30.0,
-            20.0 * time_s - 20.0 + 300.0 * (time_s > changes_at_s + 1.0),
-        ],
-        1,
-    )
+    ego = 20.0 * time_s
+    x = np.stack([ego, ego + 30.0, ego - 20.0 + 300.0 * (time_s > changes_at_s + 1.0)], 1)
     full = np.ones((len(time_s), 3))
     return Trajectory(
         label=EpisodeLabel(),
         time_s=time_s,
         x=x,
         y=np.stack([zero, across, zero + 8.0], 1),
-        **{name: 0.0 * full for name in ("heading", "acceleration")},
+        heading=0.0 * full,
+        acceleration=0.0 * full,
         speed=20.0 * full,
         length=4.5 * full,
         width=2.0 * full,
@@ -109,15 +105,9 @@ def test_the_predictions_begin_where_the_observed_path_ends():
     now = paths.filter(paths["time_s"] == 0.0)
     assert now["ahead_m"].abs().max() == now["left_m"].abs().max() == 0.0
     assert paths["panel"].n_unique() == 8
-    assert set(paths["path"]) == {
-        "observed",
-        "recorded",
-        "mean",
-        *(f"sample {n + 1}" for n in range(SAMPLES)),
-    }
+    samples = {f"sample {number + 1}" for number in range(SAMPLES)}
+    assert set(paths["path"]) == samples | {"observed", "recorded", "mean"}
     at_end = paths.filter(paths["time_s"].is_between(0.75, 0.85) & (paths["kind"] == "goes steady"))
-    recorded = at_end.filter(at_end["path"] == "recorded")["ahead_m"].mean()
-    assert at_end.filter(at_end["path"] == "mean")["ahead_m"].mean() == pytest.approx(
-        recorded, rel=0.2
-    )
+    ahead = dict(at_end.group_by("path").agg(pl.col("ahead_m").mean()).iter_rows())
+    assert ahead["mean"] == pytest.approx(ahead["recorded"], rel=0.2)
     assert len(draw_forecasts(paths).axes) == 8

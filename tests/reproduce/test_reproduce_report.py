@@ -20,7 +20,7 @@ def driven(agent, rewards, reasons=None, traffic="gan", at_fault=None):
         {
             "agent": agent,
             "traffic": traffic,
-            "episode": list(range(len(rewards))),
+            "episode": range(len(rewards)),
             "reason": reasons,
             "reward": list(map(float, rewards)),
             "distance_m": 1000.0 * KM,
@@ -34,26 +34,24 @@ def driven(agent, rewards, reasons=None, traffic="gan", at_fault=None):
     )
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def matrix():
     """Two trainings of a recipe, MOBIL and the random driver.
 
     The first training crashes and leaves the road once.
     """
+    goal = ["goal"] * 2
     return by_recipe(
         pl.concat(
             [
                 driven("random_legal", [0, 0, 1, 0]),
                 driven(
-                    "mobil",
-                    [100, 100, 101, 100],
-                    ["goal", "goal", "goal", "hard_crash"],
-                    at_fault=False,
+                    "mobil", [100, 100, 101, 100], [*goal, "goal", "hard_crash"], at_fault=False
                 ),
                 driven(
                     "agent_idm@0",
                     [120, 120, 121, 120],
-                    ["hard_crash", "out_of_road", "goal", "goal"],
+                    ["hard_crash", "out_of_road", *goal],
                     at_fault=True,
                 ),
                 driven("agent_idm@1", [140, 140, 141, 140]),
@@ -67,11 +65,8 @@ def row_of(matrix, driver):
 
 
 def test_a_recipe_is_its_drivers_without_their_seeds():
-    assert (
-        recipe_of("agent_idm@3+safe")
-        == recipe_of("some/folder/agent_idm.safetensors@12+safe")
-        == "agent_idm+safe"
-    )
+    assert recipe_of("agent_idm@3+safe") == "agent_idm+safe"
+    assert recipe_of("some/folder/agent_idm.safetensors@12+safe") == "agent_idm+safe"
     assert recipe_of("agent_idm+none") == "agent_idm+none"
     assert recipe_of("outputs/a@b/mine.safetensors") == "outputs/a@b/mine.safetensors"
 
@@ -89,31 +84,19 @@ def test_a_row_holds_the_trainings_together_and_each_alone(matrix):
     assert row["normalized_percent"] == pytest.approx(130.0)
     assert [each["mean_reward"] for each in row["each"]] == pytest.approx([120.25, 140.25])
     assert [each["hard_crash"] for each in row["each"]] == [1, 0]
-    assert (row["mean_speed_mps"], row["lane_changes_per_km"]) == (
-        pytest.approx(25.0),
-        pytest.approx(2.0),
-    )
-    assert (
-        row["crashes_per_1000_km"]
-        == row["departures_per_1000_km"]
-        == pytest.approx(1000 / (8 * KM))
-    )
+    assert row["mean_speed_mps"] == pytest.approx(25.0)
+    assert row["lane_changes_per_km"] == pytest.approx(2.0)
+    assert row["crashes_per_1000_km"] == pytest.approx(1000 / (8 * KM))
+    assert row["departures_per_1000_km"] == pytest.approx(1000 / (8 * KM))
     assert row["failures_per_1000_km"] == pytest.approx(2000 / (8 * KM))
 
 
 def test_what_is_not_known_is_none(matrix):
-    row, mobil, random_legal = (
-        row_of(matrix, name) for name in ("agent_idm", "mobil", "random_legal")
-    )
-    # MOBIL is not compared with itself, a single training has no probability, and no crash has no
-    # fault.
-    assert (
-        mobil["minus_mobil"]
-        is random_legal["probability_above_mobil"]
-        is random_legal["at_fault_share"]
-        is None
-    )
-    assert (row["at_fault_share"], mobil["at_fault_share"]) == (1.0, 0.0)
+    mobil, random_legal = row_of(matrix, "mobil"), row_of(matrix, "random_legal")
+    assert mobil["minus_mobil"] is None
+    # A single training has no probability, and no crash has no fault.
+    assert random_legal["probability_above_mobil"] is random_legal["at_fault_share"] is None
+    assert (row_of(matrix, "agent_idm")["at_fault_share"], mobil["at_fault_share"]) == (1.0, 0.0)
 
 
 def test_drivers_are_compared_on_the_same_episodes_training_by_training(matrix):

@@ -34,10 +34,10 @@ LegalActions = Callable[[TensorDictBase], Tensor]
 
 
 class GreedyPolicy(TensorDictModuleBase):
-    """Writes the best ``action`` [N] int64 for ``observation`` [N, D]; never any noise, whatever
-    the context says.
+    """Writes the best ``action`` [N] int64 for ``observation`` [N, D].
 
-    Where the environment writes ``action_mask`` [N, A], it is the best of the allowed actions.
+    There is never any noise, whatever the context says. Where the environment writes
+    ``action_mask`` [N, A], it is the best of the allowed actions.
     """
 
     in_keys = [keys.OBSERVATION]  # noqa: RUF012
@@ -59,8 +59,7 @@ class GreedyPolicy(TensorDictModuleBase):
 
 
 class ExploringPolicy(TensorDictModuleBase):
-    """The policy that collects: network noise drawn anew at every step, mixed with random legal
-    actions.
+    """The policy that collects: network noise, new at every step, and random legal actions.
 
     It explores unless ``set_exploration_type`` says DETERMINISTIC, MODE or MEAN: outside any
     context, where TorchRL's noisy layers are silent, collecting would else be greedy by accident.
@@ -110,8 +109,7 @@ class ExploringPolicy(TensorDictModuleBase):
 
 
 class MaskedPolicy(TensorDictModuleBase):
-    """Any policy behind the environment's ``action_mask``: an action that is not allowed becomes
-    'keep the lane'.
+    """Any policy behind the environment's ``action_mask``: what it forbids becomes 'keep the lane'.
 
     Agents of this package choose among the allowed actions themselves; it does not change them.
 
@@ -131,8 +129,8 @@ class MaskedPolicy(TensorDictModuleBase):
         mask = tensordict.get(keys.ACTION_MASK, None)
         if mask is None:
             raise UserError(
-                "this driver chooses among allowed actions, but the environment has no action_mask; make it with "
-                "mask='safe' or 'legal'."
+                "this driver chooses among allowed actions, but the environment has no "
+                "action_mask; make it with mask='safe' or 'legal'."
             )
         action = self.policy(tensordict).get(keys.ACTION)
         allowed = mask.gather(1, action[:, None])[:, 0]
@@ -217,12 +215,11 @@ class MobilDriver(Driver):
         self.idm, self.mobil = idm, mobil
 
     def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
-        """MOBIL's wish as an action, in the decisions in which a second of simulated time is full."""
+        """MOBIL's wish as an action, in decisions in which a second of simulated time is full."""
         road = road_in(tensordict, self.road)
         wish = mobil_wishes(ego_scene(vehicles, road), road, self.idm, self.mobil)[:, 0]
         step, decisions = tensordict.get(keys.STEP), tensordict.get(keys.EGO).get("decisions")
-        # All decisions take the same number of steps, so the last one was at step - step /
-        # decisions.
+        # all decisions take equally many steps, so the last one was at step - step / decisions
         last = step - step // decisions.clamp_min(1)
         due = (decisions == 0) | (step // MOBIL_PERIOD_STEPS != last // MOBIL_PERIOD_STEPS)
         wish = torch.where(due, wish, 0)

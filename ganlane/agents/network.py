@@ -10,10 +10,9 @@ would cost half as much again for the same depth.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from math import isfinite
 from typing import Any
 
 import torch
@@ -26,6 +25,8 @@ from ganlane.parameters.agent import RainbowConfig
 
 #: Weight and bias of each layer.
 Weights = list[tuple[Tensor, Tensor]]
+#: Options of an agent that shape its network; the support is ignored unless it is distributional.
+SHAPE = ("hidden", "noisy", "dueling", "distributional", "atoms", "v_min", "v_max", "noisy_sigma")
 #: Largest width of a layer: a damaged file must not ask for all memory.
 LARGEST = 65536
 #: Whether there is oneDNN's linear layer, an operator that PyTorch's own compiler emits.
@@ -34,54 +35,54 @@ _ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_l
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Shape and options of a :class:`QNetwork`; defaults and meaning as in :class:`RainbowConfig`.
+    """A network for observations of size D and A actions; ``agent`` gives the rest (:data:`SHAPE`).
 
-    ``observation_size`` D and ``actions`` A come from the environment. Without ``distributional``
-    the support (``atoms`` points from ``v_min`` to ``v_max``) is ignored.
+    Raises:
+        UserError: a layer would be empty or too large.
     """
 
+    agent: RainbowConfig
     observation_size: int
     actions: int = 3
-    hidden: tuple[int, ...] = RainbowConfig.hidden
-    noisy: bool = RainbowConfig.noisy
-    dueling: bool = RainbowConfig.dueling
-    distributional: bool = RainbowConfig.distributional
-    atoms: int = RainbowConfig.atoms
-    v_min: float = RainbowConfig.v_min
-    v_max: float = RainbowConfig.v_max
-    noisy_sigma: float = RainbowConfig.noisy_sigma
-
-    @classmethod
-    def of(cls, config: RainbowConfig, observation_size: int, actions: int = 3) -> NetworkConfig:
-        """The network of an agent for observations of size D and A actions."""
-        shared = {
-            own.name: getattr(config, own.name) for own in fields(cls) if hasattr(config, own.name)
-        }
-        return cls(observation_size=observation_size, actions=actions, **shared)
 
     def __post_init__(self) -> None:
-        sizes = {name: getattr(self, name) for name in ("observation_size", "actions", "atoms")}
-        for name, size in (
-            sizes | {f"hidden[{i}]": width for i, width in enumerate(self.hidden)}
-        ).items():
-            if not isinstance(size, int) or not 1 <= size <= LARGEST:
+        sizes = {"observation_size": self.observation_size, "actions": self.actions}
+        sizes |= {f"hidden[{i}]": width for i, width in enumerate(self.agent.hidden)}
+        sizes["atoms"] = self.agent.atoms
+        for name, size in sizes.items():
+            if type(size) is not int or not 1 <= size <= LARGEST:
                 raise UserError(
                     f"network {name}={size!r}: expected a whole number from 1 to {LARGEST}."
                 )
-        for name in ("noisy", "dueling", "distributional"):
-            if not isinstance(getattr(self, name), bool):
-                raise UserError(f"network {name}={getattr(self, name)!r}: expected true or false.")
-        numbers = (self.v_min, self.v_max, self.noisy_sigma)
-        finite = all(isinstance(number, int | float) and isfinite(number) for number in numbers)
-        if not finite or self.v_min >= self.v_max:
-            raise UserError(
-                f"network v_min={self.v_min!r}, v_max={self.v_max!r}: expected finite numbers in order."
-            )
 
     @property
     def outputs(self) -> int:
         """Numbers per action: the atoms of the distribution, or one value."""
-        return self.atoms if self.distributional else 1
+        return self.agent.atoms if self.agent.distributional else 1
+
+    def description(self) -> dict[str, Any]:
+        """Plain data for a file, which :meth:`described` reads."""
+        options = {name: getattr(self.agent, name) for name in SHAPE}
+        return {"observation_size": self.observation_size, "actions": self.actions, **options}
+
+    @classmethod
+    def described(cls, description: Mapping[str, Any]) -> NetworkConfig:
+        """The network of a :meth:`description`.
+
+        Raises:
+            UserError: an entry is missing, unknown, or no such value.
+        """
+        sizes = {"observation_size", "actions"}
+        if description.keys() != sizes | set(SHAPE):
+            raise UserError(f"expected the entries {', '.join((*sorted(sizes), *SHAPE))}")
+        options = {name: description[name] for name in SHAPE}
+        for name, value in options.items():
+            expected: Any = type(getattr(RainbowConfig, name))
+            accepted = {tuple: (list, tuple), float: (int, float)}.get(expected, expected)
+            if not isinstance(value, accepted):
+                raise UserError(f"network {name}={value!r}: expected a {expected.__name__}.")
+        agent = RainbowConfig(**options)
+        return cls(agent, description["observation_size"], description["actions"])
 
 
 class QNetwork(nn.Module):
@@ -96,13 +97,14 @@ class QNetwork(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        layer = partial(NoisyLinear, std_init=config.noisy_sigma) if config.noisy else nn.Linear
-        widths = (config.observation_size, *config.hidden)
+        options = config.agent
+        layer = partial(NoisyLinear, std_init=options.noisy_sigma) if options.noisy else nn.Linear
+        widths = (config.observation_size, *options.hidden)
         self.trunk = nn.ModuleList(layer(*pair) for pair in pairwise(widths))
-        self.head = layer(widths[-1], (config.actions + config.dueling) * config.outputs)
-        self.register_buffer(
-            "support", torch.linspace(config.v_min, config.v_max, config.atoms), persistent=False
-        )
+        # a dueling head has one row more, the value
+        self.head = layer(widths[-1], (config.actions + options.dueling) * config.outputs)
+        support = torch.linspace(options.v_min, options.v_max, options.atoms)
+        self.register_buffer("support", support, persistent=False)
 
     def weights(self) -> Weights:
         """Weight and bias of every layer, the head last, with the present noise added."""
@@ -120,7 +122,7 @@ class QNetwork(nn.Module):
         for weight, bias in hidden_layers:
             hidden = linear(hidden, weight, bias, relu=True)
         rows = linear(hidden, *head).unflatten(-1, (-1, self.config.outputs))
-        return duel(rows) if self.config.dueling else rows
+        return duel(rows) if self.config.agent.dueling else rows
 
     def forward(self, observation: Tensor) -> Tensor:
         """What TorchRL's actors and losses expect.
@@ -128,17 +130,15 @@ class QNetwork(nn.Module):
         Log-probabilities [*, atoms, A], or values [*, A].
         """
         logits = self.logits(observation)
-        return (
-            logits.log_softmax(-1).transpose(-1, -2)
-            if self.config.distributional
-            else logits.squeeze(-1)
-        )
+        if self.config.agent.distributional:
+            return logits.log_softmax(-1).transpose(-1, -2)
+        return logits.squeeze(-1)
 
     def expected(self, logits: Tensor) -> Tensor:
         """Action values [*, A] of the ``logits`` [*, A, atoms]."""
-        return (
-            logits.softmax(-1) @ self.support if self.config.distributional else logits.squeeze(-1)
-        )
+        if self.config.agent.distributional:
+            return logits.softmax(-1) @ self.support
+        return logits.squeeze(-1)
 
     def values(self, observation: Tensor) -> Tensor:
         """Action values [*, A]: expected discounted returns."""
@@ -173,20 +173,18 @@ def load_parameters(network: QNetwork, weights: Mapping[str, Tensor]) -> None:
     Raises:
         UserError: names or shapes differ.
     """
-    own = dict(network.named_parameters())
-    shapes, given = (
-        {name: tuple(value.shape) for name, value in each.items()} for each in (own, weights)
-    )
-    if shapes != given:
-        name = min(
-            name for name in shapes.keys() | given.keys() if shapes.get(name) != given.get(name)
-        )
-        raise UserError(
-            f"the weights do not fit the network: {name} is {given.get(name, 'absent')} in the checkpoint and "
-            f"{shapes.get(name, 'absent')} in the network; use the observation and agent options it was trained with."
-        )
-    for name, value in own.items():
-        value.copy_(weights[name])
+    parameters = dict(network.named_parameters())
+    expected = {name: tuple(value.shape) for name, value in parameters.items()}
+    shapes = {name: tuple(value.shape) for name, value in weights.items()}
+    for name in sorted(expected.keys() | shapes.keys()):
+        if shapes.get(name) != expected.get(name):
+            raise UserError(
+                f"the weights do not fit the network: {name} is {shapes.get(name, 'absent')} in "
+                f"the checkpoint and {expected.get(name, 'absent')} in the network; use the "
+                "observation and agent options it was trained with."
+            )
+    for name, parameter in parameters.items():
+        parameter.copy_(weights[name])
 
 
 @torch.no_grad()
@@ -202,7 +200,7 @@ def redraw_noise(network: nn.Module, generator: torch.Generator) -> None:
 
 
 def noise_of(network: nn.Module, generator: torch.Generator) -> list[tuple[Tensor, Tensor]]:
-    """New noise of the inputs and of the outputs of every noisy layer; empty without such layers."""
+    """New noise of the inputs and outputs of every noisy layer; empty without such layers."""
     layers = noisy_layers(network)
     if not layers:
         return []

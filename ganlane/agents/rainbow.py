@@ -23,7 +23,7 @@ from ganlane.agents.network import (
 )
 from ganlane.agents.replay import draw, load_replay_state, make_replay, replay_state
 from ganlane.errors import ParameterError, UserError
-from ganlane.parameters.agent import RainbowConfig, without_removed
+from ganlane.parameters.agent import RainbowConfig
 
 
 class Rainbow:
@@ -56,8 +56,8 @@ class Rainbow:
     ) -> None:
         if config.learning_rate_end is not None and config.learning_rate_decisions == 0:
             raise ParameterError(
-                f"{{learning_rate_end}}={config.learning_rate_end:g}: within how many decisions? set "
-                "{learning_rate_decisions}, here or by for_phase(); give both or neither."
+                f"{{learning_rate_end}}={config.learning_rate_end:g}: within how many decisions? "
+                "set {learning_rate_decisions}, here or by for_phase(); give both or neither."
             )
         self.config, self.device = config, torch.device(device)
         self.generators = {
@@ -66,7 +66,7 @@ class Rainbow:
         }
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(seed)
-            network = QNetwork(NetworkConfig.of(config, observation_size, actions))
+            network = QNetwork(NetworkConfig(config, observation_size, actions))
         self.network = network.to(self.device)
         self.loss = (
             LeanDistributionalLoss(self.network, config.gamma, config.double, config.kl_priority)
@@ -105,31 +105,29 @@ class Rainbow:
             config.epsilon_start, config.epsilon, decisions, config.epsilon_decisions
         )
         if config.learning_rate_end is not None:
-            now = annealed(
+            (group,) = self.optimizer.param_groups
+            group["lr"] = annealed(
                 config.learning_rate,
                 config.learning_rate_end,
                 decisions,
                 config.learning_rate_decisions,
             )
-            for group in self.optimizer.param_groups:
-                group["lr"] = now
 
     def store(self, transition: TensorDict | None) -> None:
-        """Add transitions, batch [N], with the keys of :meth:`NStepWindow.push`; None adds nothing."""
+        """Add the transitions of :meth:`NStepWindow.push`, batch [N]; None adds nothing."""
         if transition is not None:
             self.replay.extend(transition, update_priority=False)
 
     def update(self) -> dict[str, Tensor]:
-        """One step of gradient descent; 0-dim tensors to log, read without a host synchronisation."""
+        """One step of gradient descent; gives 0-dim tensors to log, still on the device."""
         config = self.config
         if config.prioritised:
             self.replay.sampler.beta = annealed(
                 config.beta_start, 1.0, self.updates, config.beta_updates
             )
         batch = draw(self.replay)
-        learned = (self._descend if self.graph is None else self.graph)(
-            batch, self.generators["learn"]
-        )
+        descend = self._descend if self.graph is None else self.graph
+        learned = descend(batch, self.generators["learn"])
         if config.prioritised:
             self.replay.sampler.update_priority(batch.get("index"), learned.priority)
         self.updates += 1
@@ -171,6 +169,13 @@ class Rainbow:
         load_parameters(self.network, weights)
         self.loss.update_target()
 
+    def load_moments(self, moments: Mapping[int, Any]) -> None:
+        """Let Adam go on from ``moments``, the part ``state`` of an optimiser's state.
+
+        The learning rate and the other options are those of this agent.
+        """
+        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": moments})
+
     def state_dict(self, with_replay: bool = True) -> dict[str, Any]:
         """Tensors and plain data for a bit-exact resume; noise is redrawn before use, so it is not
         among them.
@@ -179,13 +184,10 @@ class Rainbow:
         """
         optimizer = self.optimizer.state_dict()
         if not with_replay:  # loading brings the moments back to the weights' type
-            optimizer["state"] = {
-                row: {
-                    name: value.bfloat16() if name.startswith("exp_avg") else value
-                    for name, value in own.items()
-                }
-                for row, own in optimizer["state"].items()
-            }
+            # new dictionaries: those of the optimiser are its own
+            for row, moments in optimizer["state"].items():
+                halves = {name: moments[name].bfloat16() for name in ("exp_avg", "exp_avg_sq")}
+                optimizer["state"][row] = {**moments, **halves}
         return {
             "config": asdict(self.config),
             "network": self.weights(),
@@ -206,19 +208,16 @@ class Rainbow:
             UserError: it is the state of an agent with other hyperparameters or another
                 observation.
         """
-        # An agent saved before there was an option has its default.
-        saved = {**asdict(RainbowConfig()), **without_removed(state["config"], "the saved agent")}
         for name, value in asdict(self.config).items():
-            if saved[name] != value:
+            saved = state["config"][name]
+            if saved != value:
                 raise UserError(
-                    f"agent.{name}={value}: the saved agent has {saved[name]}; give the same to go on from it."
+                    f"agent.{name}={value}: the saved agent has {saved}; give the same to go on "
+                    "from it."
                 )
         load_parameters(self.network, state["network"])
         load_parameters(self.loss.target_network, state["target"])
-        # The moments alone: the groups are those of the configuration.
-        self.optimizer.load_state_dict(
-            {**self.optimizer.state_dict(), "state": state["optimizer"]["state"]}
-        )
+        self.load_moments(state["optimizer"]["state"])
         for name, generator in self.generators.items():
             generator.set_state(state["generators"][name].cpu())
         self.updates = state["updates"]

@@ -21,7 +21,6 @@ from ganlane.config.command_line import leaves, of_hydra, parse, quoted, without
 from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError, as_typed
 from ganlane.files import remove_leftovers, write_bytes
-from ganlane.parameters.agent import without_removed_overrides
 
 try:
     import fcntl
@@ -42,8 +41,6 @@ _RUNS = Path("outputs")
 LAST = Path("checkpoints") / "last.pt"
 #: Last parts of the keys that name code to execute: import paths, and a Ray cluster's address.
 _IMPORTED_BY = ("_target_", "shares", "agents", "address")
-#: Keys whose defaults have changed since version 0.1.0.
-CHANGED_SINCE_0_1 = ("total_decisions", "collector.num_envs", "evaluation.episodes")
 
 
 @contextmanager
@@ -210,28 +207,10 @@ def with_resumed(command: str, overrides: Sequence[str], multirun: bool) -> list
             file=sys.stderr,
         )
         return without_repetitions([*overrides, "resume=null"])
-    stored = [*_old_defaults(run), *_stored(run / OVERRIDES)]
+    stored = _stored(run / OVERRIDES)
     return without_repetitions(
         [*stored, *overrides, f"resume={quoted(run)}", f"hydra.run.dir={quoted(run)}"]
     )
-
-
-def _old_defaults(run: Path) -> list[str]:
-    """Overrides with the old defaults, for a run that was started before train's defaults changed.
-
-    Such a run has no ``compile`` in its config.yaml, from which the numbers and the form of the
-    mask are taken.
-    """
-    try:
-        config: Any = OmegaConf.load(run / CONFIG)
-        if "compile" in config:
-            return []
-        kept = {key: OmegaConf.select(config, key) for key in CHANGED_SINCE_0_1}
-        mask = OmegaConf.select(config, "mask.form") or "none"
-    except Exception:  # missing, or not YAML; reading the checkpoint will report what is wrong
-        return []
-    numbers = [f"{key}={quoted(value)}" for key, value in kept.items()]
-    return [f"mask={mask}", "agent=rainbow", "compile=never", *numbers]
 
 
 def _stored(path: Path) -> list[str]:
@@ -248,13 +227,12 @@ def _stored(path: Path) -> list[str]:
         raise UserError(
             f"{path}: damaged, expected a list of key=value; write the run's command line there, or start a new run."
         )
-    kept = without_removed_overrides(map(str, found), str(path))
-    for override in OverridesParser.create().parse_overrides(kept):
+    for override in OverridesParser.create().parse_overrides(found):
         if of_hydra(override):
             raise UserError(
                 f"{path}: {override.input_line}: Hydra is not set by a run's files; remove that line."
             )
-    return kept
+    return found
 
 
 def refuse_stored_imports(config: TrainConfig, overrides: Sequence[str]) -> None:

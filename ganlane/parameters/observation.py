@@ -19,7 +19,6 @@ from ganlane.parameters import (
     one_of,
     part_of,
 )
-from ganlane.parameters.agent import refuse_removed_observation
 
 #: What the agent can see, see :data:`ganlane.transforms.OBSERVATIONS`.
 FORMS = (
@@ -96,9 +95,8 @@ class ObservationConfig(ObservationScale):
     sensors: SensorParameters | None = field(default_factory=SensorParameters)
 
     def __post_init__(self) -> None:
-        refuse_removed_observation(self.form)
         super().__post_init__()
-        # One way to say that there are no errors, which is also that of older runs.
+        # one way to say that there are no errors
         if self.sensors == SensorParameters():
             assign(self, sensors=None)
 

@@ -39,8 +39,8 @@ _OWN = (".", "checkpoints", "pretrain", "pretrain/checkpoints", "fits")
 _RUNS = Path("outputs")
 #: The checkpoint of a run, below its folder.
 LAST = Path("checkpoints") / "last.pt"
-#: Last parts of the keys that name code to execute: import paths, and a Ray cluster's address.
-_IMPORTED_BY = ("_target_", "shares", "agents", "address")
+#: Last parts of the keys that name code to execute, by import paths.
+_IMPORTED_BY = ("_target_", "shares", "agents")
 
 
 @contextmanager
@@ -240,7 +240,7 @@ def refuse_stored_imports(config: TrainConfig, overrides: Sequence[str]) -> None
     command line, do too.
 
     Raises:
-        UserError: the run's files name a class or function of another package, or a Ray cluster.
+        UserError: the run's files name a class or function of another package.
     """
     asked = [
         each for each in parse(overrides) if each.key_or_group.rpartition(".")[2] in _IMPORTED_BY
@@ -255,10 +255,7 @@ def refuse_stored_imports(config: TrainConfig, overrides: Sequence[str]) -> None
 
 
 def _imports(config: TrainConfig) -> Iterator[tuple[str, str]]:
-    """Every import path of a run, and Ray's address, each with the override that names it."""
-    address = getattr(config.collector, "address", None)
-    if address not in (None, "auto"):  # a cluster sends pickles
-        yield f"collector.address={address}", str(address)
+    """Every import path of a run, each with the override that names it."""
     traffics = {"pretrain.traffic": config.pretrain.traffic, "traffic": config.traffic}
     for key, traffic in {**traffics, "evaluation.traffic": config.evaluation.traffic}.items():
         if traffic is not None:

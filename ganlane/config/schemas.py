@@ -62,9 +62,6 @@ SCHEMAS: dict[str, dict[str, Any]] = {
     "reward": {"paper": RewardParameters},
     "collector": {
         "single": train.CollectorConfig,
-        "overlap": train.OverlapCollectorConfig,
-        "multi": train.MultiCollectorConfig,
-        "ray": train.RayCollectorConfig,
     },
     "data": {"scenes": DataConfig, "ngsim": NgsimDataConfig, "highd": HighdDataConfig},
     "generator": {"paper": PaperConfig, "calibrated": CalibratedConfig},

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
 from ganlane.config.commands import DrivingConfig, Environments, Episodes, EvaluateConfig, Names
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import ParameterError
-from ganlane.parameters import Count, CountOrZero, NotNegative, Record, Text, between, one_of
+from ganlane.parameters import Count, CountOrZero, NotNegative, Record, Text, one_of
 from ganlane.parameters.agent import RainbowConfig
 
-Workers: TypeAlias = Annotated[int, between(1, 1024)]
 #: Number of decisions above which compiling (one to two minutes) pays off.
 WORTH_COMPILING = 300_000
 
@@ -65,68 +64,6 @@ class CollectorConfig(Record):
     """
 
     num_envs: Environments = 512
-
-    @property
-    def environments(self) -> int:
-        """Decisions per step of the loop, over all processes."""
-        return self.num_envs
-
-
-@dataclass
-class OverlapCollectorConfig(CollectorConfig):
-    """``collector=overlap``: worker processes drive while this one learns.
-
-    Attributes:
-        num_envs: environments of all workers, which share them out evenly.
-        workers: processes, with one thread each.
-    """
-
-    workers: Workers = 2
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.num_envs % self.workers:
-            raise ParameterError(
-                f"{{num_envs}}={self.num_envs}: cannot be shared out evenly between {{workers}}={self.workers}; "
-                "give a multiple."
-            )
-
-
-@dataclass
-class MultiCollectorConfig(CollectorConfig):
-    """``collector=multi``: worker processes on this machine.
-
-    Attributes:
-        num_envs: environments of each worker; a step of the loop has workers * num_envs decisions.
-        workers: processes, with one thread each.
-        weights_every: decisions, over all workers, between two updates of the workers' weights.
-    """
-
-    num_envs: Environments = 64
-    workers: Workers = 2
-    weights_every: Count = 1024
-
-    @property
-    def environments(self) -> int:
-        """Decisions per step of the loop, over all workers."""
-        return self.workers * self.num_envs
-
-    @property
-    def steps(self) -> int:
-        """Steps of a worker with the same weights, at least one."""
-        return max(1, self.weights_every // self.environments)
-
-
-@dataclass
-class RayCollectorConfig(MultiCollectorConfig):
-    """``collector=ray``: the same on a Ray cluster.
-
-    Attributes:
-        address: of the cluster's head: HOST:6379, ray://HOST:10001 or auto; null: a Ray of its own
-            here.
-    """
-
-    address: Text | None = None
 
 
 @dataclass

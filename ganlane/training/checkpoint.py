@@ -19,21 +19,15 @@ from ganlane.agents.n_step import Step
 from ganlane.agents.replay import MASK_KEY, ROW
 from ganlane.config.runs import LAST
 from ganlane.errors import UserError
-from ganlane.files import atomic_path, has_checksum, note_without_checksum, seal_archive
-from ganlane.training.collectors import Collector, SingleCollector
+from ganlane.files import atomic_path, has_checksum, seal_archive
+from ganlane.training.collectors import Collector
 from ganlane.training.stats import EpisodeStats
 
 KIND = "ganlane training checkpoint"
 VERSION = 2
-#: Names in checkpoints of version 0.1, and their present names.
-RENAMED = {"carrier": "env_state", "meter": "stats", "owed": "pending_decisions"}
-#: Key of an identity that holds the defaults of its options.
-DEFAULTS = "defaults"
-#: Parts of an identity that may change when a run is resumed; the run is bit-exact only if they do
-#: not.
+#: Parts of an identity that may change at a resume; the run is bit-exact only if they do not.
 COMPUTED_BY = ("env.compile",)
-#: After a checkpoint that took t seconds to write, the next comes after 50 t at the earliest: 2 %
-#: of the time.
+#: After a checkpoint that took t seconds the next comes after 50 t or later: 2 % of the time.
 PATIENCE = 50.0
 #: Parts of a checkpoint in which every number must be finite.
 FINITE = ("network", "target", "optimizer", "replay", "window", "stats")
@@ -48,17 +42,14 @@ class TrainingState:
 
     ``pending_decisions`` counts decisions whose updates are still due; ``best`` is the best
     evaluation so far, ``evaluated_at`` the decisions at the last one. ``identity`` is plain data
-    that a resumed run must share: environment, traffic, reward, seed. Its entry :data:`DEFAULTS`,
-    which is not saved, holds the defaults of options by dotted name, for options that did not exist
-    when an older run was started.
+    that a resumed run must share: environment, traffic, reward, seed.
     """
 
     def __init__(
-        self, env: EnvBase | Collector, agent: Rainbow, identity: Mapping[str, Any] | None = None
+        self, env: EnvBase, agent: Rainbow, identity: Mapping[str, Any] | None = None
     ) -> None:
-        self.collector = env if isinstance(env, Collector) else SingleCollector(env)
+        self.collector = Collector(env)
         self.agent, self.identity = agent, dict(identity or {})
-        self.defaults = self.identity.pop(DEFAULTS, {})
         self.environments = self.collector.environments
         self.window = agent.window()
         self.stats = EpisodeStats(
@@ -81,17 +72,19 @@ class TrainingState:
         """Tensors and plain data.
 
         Without the replay buffer the state is small and holds only the episode numbers of the
-        environments: a resumed run starts the next episodes and is not bit-exact. The same holds
-        for collectors that are not exact.
+        environments: a resumed run starts the next episodes and is not bit-exact.
         """
-        exact = with_replay and self.collector.exact
-        counters = ("decisions", "pending_decisions", "wall_s", "best")
         return {
             "agent": self.agent.state_dict(with_replay),
-            "window": self.window.state_dict() if exact else None,
-            "env_state": self.collector.state_dict(exact),
-            "stats": self.stats.state_dict() if exact else None,
-            "counters": {name: getattr(self, name) for name in counters},
+            "window": self.window.state_dict() if with_replay else None,
+            "env_state": self.collector.state_dict(with_replay),
+            "stats": self.stats.state_dict() if with_replay else None,
+            "counters": {
+                "decisions": self.decisions,
+                "pending_decisions": self.pending_decisions,
+                "wall_s": self.wall_s,
+                "best": self.best,
+            },
             "identity": self.identity,
         }
 
@@ -114,33 +107,35 @@ class TrainingState:
             raise UserError(
                 f"resume={path}: it does not say what run it is of; give another checkpoint."
             )
-        before, now = (
-            flat({**self.defaults, **flat(each)}) for each in (state["identity"], self.identity)
-        )
+        before, now = flat(state["identity"]), flat(self.identity)
         for name in (*now, *before):
             if name not in COMPUTED_BY and before.get(name) != now.get(name):
                 raise UserError(
-                    f"resume={path}: {name}={now.get(name)}, but the run was started with {before.get(name)}; "
-                    "go on with that, or start a new run."
+                    f"resume={path}: {name}={now.get(name)}, but the run was started with "
+                    f"{before.get(name)}; go on with that, or start a new run."
                 )
         try:
-            return self._take_over(state, path)
+            self._take_over(state, path)
         except UserError:
             raise
         except Exception as error:  # damaged parts can fail in any way
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise UserError(
-                f"resume={path}: a part of the run is damaged in it ({reason}); give another checkpoint."
+                f"resume={path}: a part of the run is damaged in it ({reason}); give another "
+                "checkpoint."
             ) from error
+        if state["agent"]["replay"] is None:
+            return "the replay buffer: it is filled again before the next update"
+        return None
 
-    def _take_over(self, state: Mapping[str, Any], path: str | Path) -> str | None:
+    def _take_over(self, state: Mapping[str, Any], path: str | Path) -> None:
         """Restore everything from ``state``; see :meth:`restore`."""
         exact = state["window"] is not None
         fresh, shape = self.collector.state_dict(exact), state["env_state"]["batch_size"]
         if isinstance(shape, list) and shape != fresh["batch_size"]:
             raise UserError(
-                f"resume={path}: saved with environments of shape {shape}, this run has [{self.environments}]; use "
-                "the same number."
+                f"resume={path}: saved with environments of shape {shape}, this run has "
+                f"[{self.environments}]; use the same number."
             )
         self.agent.load_state_dict(state["agent"])
         check_parts(state, self.agent, fresh, self.stats)
@@ -149,21 +144,13 @@ class TrainingState:
             self.window.load_state_dict(state["window"])
             self.stats.load_state_dict(state["stats"])
         counters = state["counters"]
-        self.decisions, self.pending_decisions = (
-            counters["decisions"],
-            counters["pending_decisions"],
-        )
+        self.decisions = counters["decisions"]
+        self.pending_decisions = counters["pending_decisions"]
         self.best, self._before_s = counters["best"], counters["wall_s"]
-        if state["agent"]["replay"] is None:
-            return "the replay buffer: it is filled again before the next update"
-        return (
-            None if exact else "the episodes that were under way: the workers begin the next ones"
-        )
 
 
 class Checkpointer:
-    """Writes ``checkpoints/last.pt`` (to resume), ``last.safetensors`` and ``best.safetensors`` (to
-    drive).
+    """Writes ``checkpoints/last.pt`` (to resume), ``last`` and ``best.safetensors`` (to drive).
 
     ``every_s`` are the least seconds between two checkpoints. To the ``metadata`` of the agent's
     files the progress of the training is added, under ``training``.
@@ -212,58 +199,55 @@ class Checkpointer:
 def save_checkpoint(path: str | Path, state: Any) -> None:
     """Write ``state`` (tensors and plain data) atomically, with a checksum of the whole file."""
     with atomic_path(path) as part:
-        torch.save({"kind": KIND, "version": VERSION, "sealed": True, "state": state}, part)
+        torch.save({"kind": KIND, "version": VERSION, "state": state}, part)
         seal_archive(part)
 
 
 def load_checkpoint(
     path: str | Path, device: torch.device | str = "cpu", key: str = "resume"
 ) -> Any:
-    """Read a file of :func:`save_checkpoint`, with present names; never executes code.
+    """Read a file of :func:`save_checkpoint`; never executes code.
 
-    Files of versions that wrote no checksum are read too (:func:`note_without_checksum`). ``key``
-    is the configuration key of ``path``, for error messages.
+    ``key`` is the configuration key of ``path``, for error messages.
 
     Raises:
         UserError: the file is absent, damaged in any byte, holds weights that are not finite, or is
             no training checkpoint of this version.
     """
-    path, given = Path(path), f"{key}={path}"
+    path, option = Path(path), f"{key}={path}"
     if not path.is_file():
-        raise UserError(f"{given}: no such file; give a run's folder or its {LAST}.")
+        raise UserError(f"{option}: no such file; give a run's folder or its {LAST}.")
     with path.open("rb") as file:
-        empty = file.seek(0, 2) == 0
-        whole = not empty and has_checksum(
-            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), given
+        empty = file.seek(0, 2) == 0  # which cannot be mapped
+        sealed = not empty and has_checksum(
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), option
         )
     try:
         content = torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # arbitrary bytes can make the unpickler fail in any way
         raise UserError(
-            f"{given}: not a readable checkpoint (truncated, or not written by ganlane); give another one."
+            f"{option}: not a readable checkpoint (truncated, or not written by ganlane); give "
+            "another one."
         ) from error
     if (
         not isinstance(content, dict)
         or content.get("kind") != KIND
         or content.get("version") != VERSION
     ):
-        raise UserError(f"{given}: not a {KIND} of version {VERSION}; give a run's {LAST}.")
-    if not whole and "sealed" in content:
+        raise UserError(f"{option}: not a {KIND} of version {VERSION}; give a run's {LAST}.")
+    if not sealed:
         raise UserError(
-            f"{given}: damaged, the checksum that was written with it is missing; give another one."
+            f"{option}: damaged, the checksum that was written with it is missing; give another "
+            "one."
         )
-    state = _renamed(content.get("state"))  # :meth:`TrainingState.restore` checks the parts
-    if isinstance(state, dict) and "counters" in state:
-        state["counters"] = _renamed(state["counters"])
+    state = content.get("state")  # :meth:`TrainingState.restore` checks the parts
     agent = state.get("agent") if isinstance(state, dict) else None
     parts = {**state, **agent} if isinstance(agent, dict) else {}
     for name in FINITE:
         if not _finite(parts.get(name)):
             raise UserError(
-                f"{given}: numbers of its {name} are not finite; give a checkpoint of another run."
+                f"{option}: numbers of its {name} are not finite; give a checkpoint of another run."
             )
-    if not whole:
-        note_without_checksum(given)
     return state
 
 
@@ -274,14 +258,6 @@ def _finite(state: Any) -> bool:
     if isinstance(state, dict):
         return all(map(_finite, state.values()))
     return not isinstance(state, list | tuple) or all(map(_finite, state))
-
-
-def _renamed(names: Any) -> Any:
-    return (
-        {RENAMED.get(key, key): value for key, value in names.items()}
-        if isinstance(names, dict)
-        else names
-    )
 
 
 def flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
@@ -301,8 +277,7 @@ def flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
 def check_parts(
     state: Mapping[str, Any], agent: Rainbow, environments: Mapping[str, Any], stats: EpisodeStats
 ) -> None:
-    """Compare ``state`` (:meth:`TrainingState.state_dict`) with that of a new run, before it is
-    used.
+    """Compare ``state`` (:meth:`TrainingState.state_dict`) with that of a new run before its use.
 
     A damaged part would do harm later: Adam writes beyond moments that are too short, and a replay
     buffer that samples rows it does not hold returns arbitrary memory.
@@ -368,14 +343,11 @@ def _check_replay(replay: Mapping[str, Any], agent: Rainbow) -> None:
     if not (cursor == count < config.capacity or cursor < count == config.capacity):
         raise ValueError(f"replay: {count} rows of {config.capacity}, the next one is {cursor}")
     if config.prioritised:
-        own = torch.arange(-(-count // ROW) * ROW, device=agent.device).view(-1, ROW) < count
-        expected: dict[str, Any] = {
-            "priorities": own.float(),
-            "largest": torch.zeros(()),
-            "beta": 0.0,
-        }
-        check_like(replay["sampler"], expected, "replay.sampler")
-        if not torch.equal(replay["sampler"]["priorities"] > 0, own):
+        # of whole rows, in which the items that exist have a priority
+        in_use = torch.arange(-(-count // ROW) * ROW, device=agent.device).view(-1, ROW) < count
+        sampler = {"priorities": in_use.float(), "largest": torch.zeros(()), "beta": 0.0}
+        check_like(replay["sampler"], sampler, "replay.sampler")
+        if not torch.equal(replay["sampler"]["priorities"] > 0, in_use):
             raise ValueError("replay: priorities of rows that do not exist")
 
 
@@ -402,26 +374,25 @@ def transitions(rows: int, network: NetworkConfig) -> dict[str, Tensor]:
     }
 
 
-def check_like(found: Any, like: Any, name: str) -> None:
-    """Raise :class:`ValueError` unless ``found`` has at least the keys of ``like``, its lengths,
-    shapes and types.
+def check_like(value: Any, like: Any, name: str) -> None:
+    """Raise :class:`ValueError` unless ``value`` has the lengths, shapes and types of ``like``.
 
-    Numbers outside tensors must be finite, counts at least 0.
+    It may have more keys. Numbers outside tensors must be finite, counts at least 0.
     """
     if isinstance(like, Tensor):
-        fits = isinstance(found, Tensor) and (found.shape, found.dtype) == (like.shape, like.dtype)
+        fits = isinstance(value, Tensor) and (value.shape, value.dtype) == (like.shape, like.dtype)
     elif isinstance(like, dict):
-        fits = isinstance(found, dict) and found.keys() >= like.keys()
+        fits = isinstance(value, dict) and value.keys() >= like.keys()
     elif isinstance(like, list):
-        fits = isinstance(found, list) and len(found) == len(like)
+        fits = isinstance(value, list) and len(value) == len(like)
     elif isinstance(like, int):
-        fits = type(found) is int and 0 <= found < MOST
+        fits = type(value) is int and 0 <= value < MOST
     elif isinstance(like, float):
-        fits = type(found) in (int, float) and isfinite(found)
+        fits = type(value) in (int, float) and isfinite(value)
     else:
-        fits = found is like
+        fits = value is like
     if not fits:
         raise ValueError(f"{name} cannot be of this run")
     if isinstance(like, dict | list):
         for key in like if isinstance(like, dict) else range(len(like)):
-            check_like(found[key], like[key], f"{name}.{key}")
+            check_like(value[key], like[key], f"{name}.{key}")

@@ -1,13 +1,7 @@
-"""Collectors: each step is one decision of all environments, in order of time.
-
-The training loop is the same for every :class:`Collector`. :class:`SingleCollector` steps the
-environments in this process, and a run with it resumes bit for bit.
-:class:`~ganlane.training.ray_workers.ClusterCollector` has them on many machines.
-"""
+"""The collector: each step is one decision of all environments, in order of time."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
@@ -18,51 +12,12 @@ from ganlane.agents import Rainbow
 from ganlane.env.highway import threads_for
 
 
-class Collector(ABC):
-    """Steps of N environments, driven by the agent's exploring policy."""
-
-    #: N, over all processes.
-    environments: int
-    #: Whether a run resumes bit for bit.
-    exact: bool
-
-    def open(self, agent: Rainbow) -> None:  # noqa: B027 (optional)
-        """Start the workers, if there are any; else the first :meth:`step` starts them.
-
-        Raises:
-            UserError: they cannot be started.
-        """
-
-    @abstractmethod
-    def step(self, agent: Rainbow) -> TensorDictBase:
-        """One decision of every environment, batch [N], on the agent's device.
-
-        Row i of a step continues row i of the last one; ``next`` is the outcome before any reset.
-        """
-
-    @abstractmethod
-    def state_dict(self, exact: bool) -> dict[str, Any]:
-        """Tensors and plain data to continue from.
-
-        Bit for bit if ``exact``, else with the next episodes.
-        """
-
-    @abstractmethod
-    def load_state_dict(self, state: dict[str, Any], exact: bool) -> None:
-        """Continue from :meth:`state_dict` of environments of the same shape."""
-
-    def close(self) -> None:  # noqa: B027 (optional)
-        """Stop all workers; may be called again."""
-
-
-class SingleCollector(Collector):
-    """``collector=single``: steps ``env``, batch [N], in this process.
+class Collector:
+    """Steps ``env``, batch [N], in this process, driven by the agent's exploring policy.
 
     ``env_state`` is the TensorDict with the environments' state. TorchRL's ``Collector`` does not
     expose it; here it is saved, so that a resumed run is exact.
     """
-
-    exact = True
 
     def __init__(self, env: EnvBase) -> None:
         self.env, self.environments = env, env.batch_size.numel()
@@ -70,7 +25,11 @@ class SingleCollector(Collector):
             self.env_state: TensorDictBase = env.reset()
 
     def step(self, agent: Rainbow) -> TensorDictBase:
-        """One decision; ended environments are reset in ``env_state``, not in the returned step."""
+        """One decision of every environment, batch [N].
+
+        Row i continues row i of the last step. ``next`` is the outcome before any reset: ended
+        environments are reset in ``env_state``, not in the returned step.
+        """
         decided = agent.policy(self.env_state)
         with threads_for(self.env):
             step, self.env_state = self.env.step_and_maybe_reset(decided)
@@ -83,9 +42,9 @@ class SingleCollector(Collector):
         return pack(self.env_state.select(keys.SEED, keys.EPISODE, strict=False))
 
     def load_state_dict(self, state: dict[str, Any], exact: bool) -> None:
-        """Restore the state.
+        """Continue from :meth:`state_dict` of environments of the same shape.
 
-        Unless ``exact``, begin the episodes after those of ``state`` (or the first).
+        Bit for bit if ``exact``, else with the episodes after those of ``state``.
         """
         saved = unpack(state)
         if exact:
@@ -93,15 +52,12 @@ class SingleCollector(Collector):
         elif keys.EPISODE in saved:
             following = saved.get(keys.EPISODE) + self.environments
             self.env_state = self.env.reset(saved.set(keys.EPISODE, following))
-        else:
+        else:  # an environment without numbered episodes
             self.env_state = self.env.reset()
 
 
 def pack(tensordict: TensorDictBase) -> dict[str, Any]:
-    """A TensorDict as plain data, with its (nested) batch sizes.
-
-    Its own ``state_dict`` has no batch sizes of nested ones that torch.load reads safely.
-    """
+    """A TensorDict as plain data, with its (nested) batch sizes."""
     leaves = {
         key: pack(value) if isinstance(value, TensorDictBase) else value
         for key, value in tensordict.items()

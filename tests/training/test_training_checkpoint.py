@@ -1,8 +1,9 @@
-"""Checkpoint files: whole, truncated, foreign, and of version 0.1."""
+"""Checkpoint files: whole, truncated, foreign; parts that are not of the run."""
 
 import pytest
 import torch
-from training.test_training_loop import ToyRoad, agent, settings, train
+from training.test_training_loop import agent, settings, train
+from training.toy import ToyRoad
 
 from ganlane.errors import UserError
 from ganlane.files import PLACE
@@ -15,14 +16,6 @@ def test_a_checkpoint_comes_back_as_it_was(tmp_path):
     assert state["count"] == 4
     assert torch.equal(state["weights"], torch.arange(3))
     assert [path.name for path in tmp_path.iterdir()] == ["last.pt"]
-
-
-def test_names_of_version_0_1_are_read_as_those_of_today(tmp_path):
-    save_checkpoint(
-        tmp_path / "last.pt", {"carrier": 1, "meter": 2, "counters": {"owed": 3, "best": None}}
-    )
-    expected = {"env_state": 1, "stats": 2, "counters": {"pending_decisions": 3, "best": None}}
-    assert load_checkpoint(tmp_path / "last.pt") == expected
 
 
 def test_one_changed_byte_anywhere_is_refused(tmp_path):
@@ -40,16 +33,6 @@ def test_one_changed_byte_anywhere_is_refused(tmp_path):
     path.write_bytes(whole[: -len(PLACE)])  # the checksum cut off altogether
     with pytest.raises(UserError, match="damaged"):
         load_checkpoint(path)
-
-
-def test_a_checkpoint_of_a_version_without_checksums_is_read_with_a_note(tmp_path, capsys):
-    path = tmp_path / "last.pt"
-    torch.save({"kind": "ganlane training checkpoint", "version": 2, "state": {"count": 4}}, path)
-    assert load_checkpoint(path) == {"count": 4}
-    assert "wrote no checksum; damage to it would not be seen" in capsys.readouterr().err
-    save_checkpoint(path, {"count": 4})
-    load_checkpoint(path)
-    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])

@@ -22,7 +22,6 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.train import InitConfig, NoInitConfig
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
-from ganlane.parameters.agent import LAST_REVISION, without_removed_overrides
 from ganlane.parameters.observation import MaskParameters
 from ganlane.runtime import has_compiler
 from ganlane.training.checkpoint import LAST, load_checkpoint, save_checkpoint
@@ -159,7 +158,7 @@ def test_a_run_with_an_adopted_support_goes_on_without_what_it_started_from(tmp_
     run(parts, *options, "total_decisions=320", resume=parts / LAST)
     one, network, metadata = read_agent(parts / AGENT_FILE)
     assert equal(one, read_agent(whole / AGENT_FILE)[0])
-    assert (network.v_min, network.atoms) == (-120.0, 101)
+    assert (network.agent.v_min, network.agent.atoms) == (-120.0, 101)
     assert metadata["agent"]["v_min"] == -120.0
 
 
@@ -240,7 +239,7 @@ EXPERIMENTS = sorted(
 def test_every_experiment_composes_and_fits_the_agent_that_it_starts_from(overrides):
     config = check("train", overrides).config
     if config.init.path is not None:
-        check_observation(read_start(config.init.path), config)
+        check_observation(read_start(config.init.path), config.observation)
 
 
 def test_a_first_phase_that_is_over_must_be_the_one_asked_for(tmp_path):
@@ -307,75 +306,6 @@ def test_a_masked_run_stopped_and_resumed_ends_with_the_same_bits(masked, tmp_pa
 def test_a_run_is_not_resumed_behind_another_mask(masked, other):
     with pytest.raises(UserError, match="mask"):
         run(masked, *MASKED, other, resume=masked / LAST)
-
-
-def test_runs_without_a_mask_have_the_identity_that_they_always_had(tmp_path):
-    """Those of versions that knew no masks can be resumed."""
-    assert (
-        "mask"
-        not in load_checkpoint(run(tmp_path, "traffic=idm_mobil", "mask=none") / LAST)["identity"]
-    )
-
-
-@pytest.mark.parametrize(("now", "refused"), [([], False), (["env.truck_share=0.5"], True)])
-def test_a_run_begun_before_there_was_an_option_goes_on_with_its_default_alone(
-    now, refused, tmp_path
-):
-    half = run(tmp_path, "total_decisions=160")
-    state = load_checkpoint(half / LAST)
-    del state["identity"]["env"]["truck_share"]
-    save_checkpoint(half / LAST, state)
-    if refused:
-        with pytest.raises(UserError, match="truck_share"):
-            run(half, *now, resume=half / LAST)
-    else:
-        assert run(half, *now, resume=half / LAST)
-
-
-# --- what was removed
-
-
-@pytest.mark.parametrize(
-    "stored", ["agent.encoder=shared", "agent.decide_when_free=true", "observation=fixed_order"]
-)
-def test_a_command_line_with_a_removed_option_names_the_revision_that_had_it(stored):
-    with pytest.raises(
-        UserError, match=f"^run: {stored} was removed after revision {LAST_REVISION}"
-    ):
-        without_removed_overrides(["seed=1", stored], "run")
-    with pytest.raises(UserError, match=LAST_REVISION):
-        without_removed_overrides(["experiment=search/base"], "run")
-
-
-def test_removed_options_at_their_defaults_are_left_out_of_a_command_line():
-    stored = [
-        "agent.encoder=none",
-        "agent.encoder_width=32",
-        "agent.decide_when_free=false",
-        "agent.hidden=[8,8]",
-    ]
-    assert without_removed_overrides(stored, "run") == ["agent.hidden=[8,8]"]
-
-
-def test_a_checkpoint_with_a_removed_option_names_the_revision_that_had_it(trained, tmp_path):
-    state, path = load_checkpoint(trained / LAST), tmp_path / "last.pt"
-    state["agent"]["config"]["encoder"] = "shared"
-    save_checkpoint(path, state)
-    with pytest.raises(
-        UserError, match=f"^init.path=.*encoder=shared was removed after revision {LAST_REVISION}"
-    ):
-        read_start(str(path))
-    with pytest.raises(
-        UserError, match=f"encoder=shared was removed after revision {LAST_REVISION}"
-    ):
-        run(tmp_path / "next", "total_decisions=480", resume=path)
-    state["agent"]["config"]["encoder"] = "none"
-    state["identity"]["observation"]["form"] = "fixed_order"
-    save_checkpoint(path, state)
-    with pytest.raises(
-        UserError, match=f"fixed_order: it was removed after revision {LAST_REVISION}"
-    ):
-        read_start(str(path))
 
 
 # --- env.compile=true

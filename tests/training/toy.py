@@ -10,11 +10,7 @@ import torch
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from ganlane.agents import Rainbow, RainbowConfig
-from ganlane.build import make_env, make_traffic
 from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import IdmTrafficConfig
-from ganlane.parameters.observation import ObservationConfig
 from ganlane.sim.random import draw_keys, episode_key, to_uniform
 
 ACTIONS, LIMIT = 3, 8
@@ -113,39 +109,10 @@ class ToyRoad(EnvBase):
         self.seed_number = seed
 
 
-def road(rows, first_episode):
-    return make_env(
-        make_traffic(IdmTrafficConfig(), ROAD),
-        ROAD,
-        ObservationConfig(),
-        num_envs=rows,
-        first_episode=first_episode,
-    )
-
-
-def toy(rows, first_episode):
-    return ToyRoad(rows)
-
-
-def agent(size=29, seed=0, **options):
-    return Rainbow(RainbowConfig(**{**SMALL, **options}), size, seed=seed)
-
-
-def steps(source, learner, count):
-    return torch.stack([source.step(learner).clone() for _ in range(count)])
-
-
-def check_order(seen, first):
-    """Steps [T, N] on the road.
-
-    Observations follow on, rows begin with episodes ``first``, and no two share one.
-    """
-    going = ~seen["next", "done"][:-1, :, 0]
-    assert going.any()
-    assert torch.equal(seen["next", "observation"][:-1][going], seen["observation"][1:][going])
-    assert seen["episode"][0].tolist() == first
-    driven = [set(seen["episode"][:, row].tolist()) for row in range(len(first))]
-    assert len(set.union(*driven)) == sum(map(len, driven))
+def same(first, second):
+    """Whether two agents have the same weights, bit for bit."""
+    pairs = zip(first.weights().values(), second.weights().values(), strict=True)
+    return all(torch.equal(one, other) for one, other in pairs)
 
 
 def gone(group: int, within_s: float = 20.0) -> bool:

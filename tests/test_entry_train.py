@@ -51,7 +51,7 @@ def test_a_run_leaves_agent_metrics_config_and_table(finished):
     assert decisions(folder) == [160, 320]
     weights, config, metadata = read_agent(folder / "agent.safetensors")
     assert weights
-    assert config.hidden == (16, 16)
+    assert config.agent.hidden == (16, 16)
     assert metadata["observation"] == "table3_progress"
     assert metadata["training"]["decisions"] == 320
     assert (folder / "config.yaml").is_file()

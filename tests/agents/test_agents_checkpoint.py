@@ -16,7 +16,7 @@ from ganlane.agents import (
 )
 from ganlane.agents.checkpoint import load_moments
 from ganlane.errors import UserError
-from ganlane.parameters.agent import AGENT_OPTIONS, LAST_REVISION
+from ganlane.weights import load_weights, save_weights
 
 
 @pytest.fixture
@@ -61,18 +61,25 @@ def test_shipped_agents_are_found_by_name(saved, monkeypatch):
     assert load_agent("agent_idm")[1]["observation"] == "table3"
 
 
-def test_removed_options_at_their_defaults_load_and_others_name_the_revision_that_had_them(
-    tmp_path,
-):
-    assert load_agent(saved_in(tmp_path, agent=AGENT_OPTIONS))[1]["agent"] == {}
-    for option, shown in (
-        ({"encoder": "shared"}, "encoder=shared"),
-        ({"decide_when_free": True}, "decide_when_free=true"),
-    ):
-        with pytest.raises(
-            UserError, match=f"agent.{shown} was removed after revision {LAST_REVISION}; check out"
-        ):
-            load_agent(saved_in(tmp_path, agent={**AGENT_OPTIONS, **option}))
+#: What a file may say of a network that is none.
+DAMAGES = [
+    {"encoder": "none"},
+    {"noisy": "yes"},
+    {"hidden": 8},
+    {"hidden": [8, 10**9]},
+    {"actions": 0},
+    {"v_min": 200.0},
+    {"atoms": True},
+]
+
+
+@pytest.mark.parametrize("damage", DAMAGES, ids=str)
+def test_a_network_that_is_not_understood_is_refused(damage, saved):
+    tensors, metadata = load_weights(saved, "agent")
+    metadata["network"] |= damage
+    save_weights(saved, metadata.pop("kind"), tensors, metadata)
+    with pytest.raises(UserError, match="its description of the network is not understood"):
+        read_agent(saved)
 
 
 # --- starting from one

@@ -39,8 +39,8 @@ def batch(seed=0, rows=64, scale=3.0):
 
 def network(**options):
     torch.manual_seed(3)
-    given = {"hidden": (16, 16), "atoms": 11, "v_min": -5.0, "v_max": 5.0, **options}
-    return QNetwork(NetworkConfig(SIZE, 3, **given))
+    small = {"hidden": (16, 16), "atoms": 11, "v_min": -5.0, "v_max": 5.0}
+    return QNetwork(NetworkConfig(RainbowConfig(**{**small, **options}), SIZE))
 
 
 def unlike_target(loss):

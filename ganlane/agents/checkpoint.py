@@ -14,7 +14,12 @@ from torch import Tensor
 
 from ganlane._version import __version__
 from ganlane.agents.drivers import GreedyPolicy
-from ganlane.agents.network import SHAPE, NetworkConfig, QNetwork, load_parameters
+from ganlane.agents.network import (
+    SHAPE,
+    NetworkConfig,
+    QNetwork,
+    load_parameters,
+)
 from ganlane.agents.rainbow import Rainbow
 from ganlane.errors import UserError, as_typed
 from ganlane.files import CHECKPOINTS
@@ -40,7 +45,10 @@ def _place(name: str | Path) -> tuple[Path, int | None]:
             name = recipe  # training 0 is the shipped agent itself
         elif recipe.endswith(".safetensors"):
             return Path(recipe), seed
-    return CHECKPOINTS / f"{name}.safetensors" if name in SHIPPED else Path(name), None
+    return (
+        CHECKPOINTS / f"{name}.safetensors" if name in SHIPPED else Path(name),
+        None,
+    )
 
 
 def _seeds_file(recipe: str) -> Path:
@@ -85,7 +93,9 @@ def with_seeds(name: str) -> list[str]:
     return [f"{recipe}@{seed}{mask}" for seed in seeds]
 
 
-def _read_several(path: Path) -> tuple[dict[str, Tensor], dict[int, dict[str, Any]]]:
+def _read_several(
+    path: Path,
+) -> tuple[dict[str, Tensor], dict[int, dict[str, Any]]]:
     """Tensors and, by seed, metadata of a file of :func:`save_agents`."""
     tensors, metadata = load_weights(path, SEVERAL)
     agents = metadata.get("agents")
@@ -121,12 +131,17 @@ def save_agent(path: str | Path, agent: Rainbow, metadata: Mapping[str, Any]) ->
     added here.
     """
     network = agent.network.config.description()
-    header = {**metadata, "network": network, "code_version": __version__}
+    header = {
+        **metadata,
+        "network": network,
+        "code_version": __version__,
+    }
     save_weights(path, "agent", agent.weights(), header)
 
 
 def save_agents(
-    path: str | Path, agents: Mapping[int, tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]]
+    path: str | Path,
+    agents: Mapping[int, tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]],
 ) -> None:
     """Write several trainings of one recipe into one file; ``path@SEED`` names each of them.
 
@@ -145,13 +160,16 @@ def save_agents(
     save_weights(path, SEVERAL, tensors, {"agents": described})
 
 
-def read_agent(name: str | Path) -> tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]:
+def read_agent(
+    name: str | Path,
+) -> tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]:
     """Weights, network config and metadata of a shipped agent or an agent's file.
 
     Raises:
         UserError: no such file, or not an agent that this version of ganlane wrote.
     """
-    path, seed = agent_file(name), _place(name)[1]
+    path = agent_file(name)
+    seed = _place(name)[1]
     if seed is None:
         weights, metadata = load_weights(path, "agent")
     else:
@@ -161,7 +179,8 @@ def read_agent(name: str | Path) -> tuple[dict[str, Tensor], NetworkConfig, dict
             raise UserError(
                 f"{path}@{seed}: this file has no training with seed {seed}; choose one of {seeds}."
             )
-        metadata, prefix = agents[seed], f"{seed}/"
+        metadata = agents[seed]
+        prefix = f"{seed}/"
         weights = {
             key.removeprefix(prefix): value.float()  # the noise is stored in half precision
             for key, value in tensors.items()
@@ -169,7 +188,12 @@ def read_agent(name: str | Path) -> tuple[dict[str, Tensor], NetworkConfig, dict
         }
     try:
         config = NetworkConfig.described(metadata["network"])
-    except (AttributeError, KeyError, TypeError, UserError) as error:
+    except (
+        AttributeError,
+        KeyError,
+        TypeError,
+        UserError,
+    ) as error:
         raise UserError(
             f"{path}: its description of the network is not understood ({error}); train the agent "
             "anew with this version of ganlane."
@@ -178,7 +202,9 @@ def read_agent(name: str | Path) -> tuple[dict[str, Tensor], NetworkConfig, dict
 
 
 def load_agent(
-    name: str | Path, observation_size: int | None = None, device: torch.device | str = "cpu"
+    name: str | Path,
+    observation_size: int | None = None,
+    device: torch.device | str = "cpu",
 ) -> tuple[GreedyPolicy, dict[str, Any]]:
     """A trained agent, shipped or from a file, as a greedy policy on ``device``, with its metadata.
 
@@ -223,8 +249,12 @@ def warm_start(
             another network.
     """
     check_observation_size(name, network, agent.network.config.observation_size)
-    here, trained = agent.config, network.agent
-    ignored = {"noisy_sigma", *(() if here.distributional else SUPPORT)}
+    here = agent.config
+    trained = network.agent
+    ignored = {
+        "noisy_sigma",
+        *(() if here.distributional else SUPPORT),
+    }
     differing = [
         option
         for option in SHAPE

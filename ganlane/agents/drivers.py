@@ -14,13 +14,24 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
+from torchrl.envs.utils import (
+    ExplorationType,
+    exploration_type,
+    set_exploration_type,
+)
 
 from ganlane import keys
-from ganlane.agents.network import QNetwork, allowed_values, redraw_noise
+from ganlane.agents.network import (
+    QNetwork,
+    allowed_values,
+    redraw_noise,
+)
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, LEFT, RIGHT
-from ganlane.parameters.driving import IdmParameters, MobilParameters
+from ganlane.parameters.driving import (
+    IdmParameters,
+    MobilParameters,
+)
 from ganlane.sim.dynamics import ego_scene
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV, mobil_wishes
@@ -76,17 +87,25 @@ class ExploringPolicy(TensorDictModuleBase):
     out_keys = [keys.ACTION, keys.CHOSEN_VALUE]  # noqa: RUF012
 
     def __init__(
-        self, network: QNetwork, generator: torch.Generator, legal: LegalActions | None = None
+        self,
+        network: QNetwork,
+        generator: torch.Generator,
+        legal: LegalActions | None = None,
     ) -> None:
         super().__init__()
-        self.network, self.generator, self.legal = network, generator, legal
+        self.network = network
+        self.generator = generator
+        self.legal = legal
         #: Probability of a random action; the agent anneals it.
         self.epsilon = 0.0
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` and ``chosen_action_value``."""
-        explore = exploration_type() in (None, ExplorationType.RANDOM)
+        explore = exploration_type() in (
+            None,
+            ExplorationType.RANDOM,
+        )
         if explore:
             redraw_noise(self.network, self.generator)
         with set_exploration_type(
@@ -99,10 +118,15 @@ class ExploringPolicy(TensorDictModuleBase):
             if mask is None:
                 mask = torch.ones_like(values) if self.legal is None else self.legal(tensordict)
             # A fraction epsilon of the actions becomes a legal one, drawn uniformly.
-            draw: dict[str, Any] = {"generator": self.generator, "device": self.generator.device}
+            draw: dict[str, Any] = {
+                "generator": self.generator,
+                "device": self.generator.device,
+            }
             lottery = torch.rand(mask.shape, **draw) * mask
             action = torch.where(
-                torch.rand(action.shape, **draw) < self.epsilon, lottery.argmax(-1), action
+                torch.rand(action.shape, **draw) < self.epsilon,
+                lottery.argmax(-1),
+                action,
             )
         chosen = values.gather(-1, action[..., None])
         return tensordict.set(keys.ACTION, action).set(keys.CHOSEN_VALUE, chosen)
@@ -150,7 +174,8 @@ class Driver(TensorDictModuleBase):
 
     def __init__(self, road: Road, stream: int = Stream.TRAIN) -> None:
         super().__init__()
-        self.road, self.stream = road, int(stream)
+        self.road = road
+        self.stream = int(stream)
 
     def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
         """The action of every row."""
@@ -159,7 +184,11 @@ class Driver(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action``."""
         return tensordict.set(
-            keys.ACTION, self.act(Vehicles.of(tensordict.get(keys.VEHICLES)), tensordict)
+            keys.ACTION,
+            self.act(
+                Vehicles.of(tensordict.get(keys.VEHICLES)),
+                tensordict,
+            ),
         )
 
 
@@ -174,8 +203,17 @@ class RandomDriver(Driver):
     """Any of the three actions with equal probability; it soon drives off the road."""
 
     def _uniform(self, tensordict: TensorDictBase) -> Tensor:
-        key = episode_key(self.stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
-        return uniform(key, tensordict.get(keys.STEP), 1, [Purpose.RANDOM_ACTION])[:, 0, 0]
+        key = episode_key(
+            self.stream,
+            tensordict.get(keys.SEED),
+            tensordict.get(keys.EPISODE),
+        )
+        return uniform(
+            key,
+            tensordict.get(keys.STEP),
+            1,
+            [Purpose.RANDOM_ACTION],
+        )[:, 0, 0]
 
     def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
         """Floor of three times a uniform number."""
@@ -212,13 +250,15 @@ class MobilDriver(Driver):
         mobil: MobilParameters = TABLE_IV,
     ) -> None:
         super().__init__(road, stream)
-        self.idm, self.mobil = idm, mobil
+        self.idm = idm
+        self.mobil = mobil
 
     def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
         """MOBIL's wish as an action, in decisions in which a second of simulated time is full."""
         road = road_in(tensordict, self.road)
         wish = mobil_wishes(ego_scene(vehicles, road), road, self.idm, self.mobil)[:, 0]
-        step, decisions = tensordict.get(keys.STEP), tensordict.get(keys.EGO).get("decisions")
+        step = tensordict.get(keys.STEP)
+        decisions = tensordict.get(keys.EGO).get("decisions")
         # all decisions take equally many steps, so the last one was at step - step / decisions
         last = step - step // decisions.clamp_min(1)
         due = (decisions == 0) | (step // MOBIL_PERIOD_STEPS != last // MOBIL_PERIOD_STEPS)
@@ -229,7 +269,9 @@ class MobilDriver(Driver):
 def egoistic_mobil(road: Road, stream: int = Stream.TRAIN) -> MobilDriver:
     """MOBIL with politeness 0."""
     return MobilDriver(
-        road, stream, mobil=replace(TABLE_IV, politeness_rear=0.0, politeness_side=0.0)
+        road,
+        stream,
+        mobil=replace(TABLE_IV, politeness_rear=0.0, politeness_side=0.0),
     )
 
 

@@ -27,13 +27,20 @@ from torchrl.modules import DistributionalQValueActor, QValueActor
 from torchrl.objectives import DistributionalDQNLoss, DQNLoss
 
 from ganlane import keys
-from ganlane.agents.network import QNetwork, Weights, allowed_values, matrix_product, noise_of
+from ganlane.agents.network import (
+    QNetwork,
+    Weights,
+    allowed_values,
+    matrix_product,
+    noise_of,
+)
 from ganlane.parameters.agent import RainbowConfig
 from ganlane.torch_settings import compiled
 
 #: Parameters of a noisy layer.
 _PARAMETERS = ("weight_mu", "weight_sigma", "bias_mu", "bias_sigma")
-_BETA_1, _BETA_2 = 0.9, 0.999
+_BETA_1 = 0.9
+_BETA_2 = 0.999
 
 
 class _WithTarget:
@@ -56,7 +63,10 @@ class _WithTarget:
     @torch.no_grad()
     def update_target(self) -> None:
         """Copy the online parameters to the target network."""
-        for target, online in zip(self.target_network.parameters(), self.network.parameters()):
+        for target, online in zip(
+            self.target_network.parameters(),
+            self.network.parameters(),
+        ):
             target.copy_(online)
 
 
@@ -73,7 +83,11 @@ class LeanDistributionalLoss(_WithTarget, DistributionalDQNLoss):
     """
 
     def __init__(
-        self, network: QNetwork, gamma: float, double: bool = True, kl_priority: bool = True
+        self,
+        network: QNetwork,
+        gamma: float,
+        double: bool = True,
+        kl_priority: bool = True,
     ) -> None:
         actor = DistributionalQValueActor(
             network,
@@ -83,9 +97,14 @@ class LeanDistributionalLoss(_WithTarget, DistributionalDQNLoss):
             make_log_softmax=False,
         )
         super().__init__(
-            actor, gamma=gamma, delay_value=True, reduction="none", use_prioritized_weights=False
+            actor,
+            gamma=gamma,
+            delay_value=True,
+            reduction="none",
+            use_prioritized_weights=False,
         )
-        self.double, self.kl_priority = double, kl_priority
+        self.double = double
+        self.kl_priority = kl_priority
         self._attach(network, actor)
 
     def forward(self, batch: TensorDictBase) -> TensorDict:
@@ -107,11 +126,18 @@ class LeanDistributionalLoss(_WithTarget, DistributionalDQNLoss):
         if self.kl_priority:
             priority = (priority - torch.special.entr(target).sum(-1)).clamp_min(0.0)
         batch.set("td_error", priority[:, None])
-        return TensorDict({"loss": loss, "clamped_fraction": clamped, "mean_q": mean_q})
+        return TensorDict(
+            {
+                "loss": loss,
+                "clamped_fraction": clamped,
+                "mean_q": mean_q,
+            }
+        )
 
     def _target(self, batch: TensorDictBase, weights: Weights) -> tuple[Tensor, Tensor, Tensor]:
         """The Bellman targets: distribution [B, atoms], clamped mass, mean best value."""
-        following, support = batch.get(("next", "observation")), self.network.support
+        following = batch.get(("next", "observation"))
+        support = self.network.support
         target_logits = self.target_network.logits(following)
         choosing = self.network.logits(following, weights) if self.double else target_logits
         mask = batch.get(("next", keys.ACTION_MASK), None)
@@ -126,7 +152,11 @@ class LeanDQNLoss(_WithTarget, DQNLoss):
     """Plain DQN loss (Huber), double or not: Rainbow with ``distributional=False``."""
 
     def __init__(self, network: QNetwork, gamma: float, double: bool = True) -> None:
-        actor = QValueActor(network, in_keys=["observation"], action_space="categorical")
+        actor = QValueActor(
+            network,
+            in_keys=["observation"],
+            action_space="categorical",
+        )
         super().__init__(
             actor,
             loss_function="smooth_l1",
@@ -151,14 +181,24 @@ class LeanDQNLoss(_WithTarget, DQNLoss):
             values = self.network(following) if self.double_dqn else target_values
             mask = batch.get(("next", keys.ACTION_MASK), None)
             best, action = allowed_values(values, mask).max(-1)
-            target = bellman(batch, self.discount, target_values.gather(-1, action[:, None]))
+            target = bellman(
+                batch,
+                self.discount,
+                target_values.gather(-1, action[:, None]),
+            )
         values = self.network(batch.get("observation"))
         value = values.gather(-1, batch.get("action")[:, None])
         loss = nn.functional.smooth_l1_loss(value, target, reduction="none").squeeze(-1)
         batch.set("td_error", (target - value.detach()).abs())
         # without a support nothing is clamped
         clamped = torch.zeros((), device=loss.device)
-        return TensorDict({"loss": loss, "clamped_fraction": clamped, "mean_q": best.mean()})
+        return TensorDict(
+            {
+                "loss": loss,
+                "clamped_fraction": clamped,
+                "mean_q": best.mean(),
+            }
+        )
 
 
 def bellman(batch: TensorDictBase, gamma: float, value: Tensor) -> Tensor:
@@ -178,7 +218,9 @@ def project(values: Tensor, probabilities: Tensor, support: Tensor) -> Tensor:
     neighbours in proportion to the nearness of the other (Bellemare et al. 2017, equation 7); the
     mean is kept but for the clamping.
     """
-    low, high, atoms = support[0], support[-1], support.numel()
+    low = support[0]
+    high = support[-1]
+    atoms = support.numel()
     place = (values.clamp(low, high) - low) * ((atoms - 1) / (high - low))
     lower = place.floor().clamp_max(atoms - 2)
     share = (place - lower) * probabilities
@@ -243,12 +285,17 @@ def composed(parameters: Sequence[Tensor], noise: Sequence[Tensor]) -> tuple[Ten
 
 
 def composed_layers(
-    parameters: list[Tensor], noise: Sequence[Sequence[Tensor]], actions: int
+    parameters: list[Tensor],
+    noise: Sequence[Sequence[Tensor]],
+    actions: int,
 ) -> Weights:
     """Weight and bias of every layer of a network, the duel folded into the last."""
     layers = [composed(parameters[4 * i : 4 * i + 4], drawn) for i, drawn in enumerate(noise)]
     weight, bias = layers[-1]
-    return [*layers[:-1], (folded(weight, actions), folded(bias, actions))]
+    return [
+        *layers[:-1],
+        (folded(weight, actions), folded(bias, actions)),
+    ]
 
 
 def folded(part: Tensor, actions: int) -> Tensor:
@@ -260,14 +307,26 @@ def folded(part: Tensor, actions: int) -> Tensor:
 def unfolded(gradient: Tensor, actions: int) -> Tensor:
     """Gradient of the head from that of the folded head: the transpose of :func:`folded`."""
     rows = gradient.unflatten(0, (actions, -1))
-    return torch.cat((rows.sum(0, keepdim=True), rows - rows.mean(0, keepdim=True))).flatten(0, 1)
+    return torch.cat(
+        (
+            rows.sum(0, keepdim=True),
+            rows - rows.mean(0, keepdim=True),
+        )
+    ).flatten(0, 1)
 
 
 def forward(layers: Weights, x: Tensor) -> list[Tensor]:
     """The input of every layer, and the output of the last."""
     inputs = [x]
     for number, (weight, bias) in enumerate(layers):
-        inputs.append(matrix_product(inputs[-1], weight, bias, relu=number < len(layers) - 1))
+        inputs.append(
+            matrix_product(
+                inputs[-1],
+                weight,
+                bias,
+                relu=number < len(layers) - 1,
+            )
+        )
     return inputs
 
 
@@ -282,9 +341,11 @@ def gradients(
     all_gradients: list[Tensor] = []
     behind = of_logits
     for number in reversed(range(len(layers))):
-        of_weight, of_bias = matrix_product(behind.t(), inputs[number].t()), behind.sum(0)
+        of_weight = matrix_product(behind.t(), inputs[number].t())
+        of_bias = behind.sum(0)
         if number == len(layers) - 1:
-            of_weight, of_bias = unfolded(of_weight, actions), unfolded(of_bias, actions)
+            of_weight = unfolded(of_weight, actions)
+            of_bias = unfolded(of_bias, actions)
         noise_in, noise_out = noise[number]
         all_gradients = [
             of_weight,
@@ -324,7 +385,8 @@ def update(
         rate: learning rate, 0-dim.
         corrections: of Adam's two moments for their start at zero, [2].
     """
-    actions, atoms = settings.actions, settings.atoms
+    actions = settings.actions
+    atoms = settings.atoms
     layers = composed_layers(online, noise, actions)
     target_layers = composed_layers(target, target_noise, actions)
     rows = len(batch.action)
@@ -347,7 +409,13 @@ def update(
     of_taken = (log_p.exp() * wanted.sum(-1, keepdim=True) - wanted) * share
     is_taken = batch.action[:, None] == torch.arange(actions, device=support.device)
     of_logits = torch.where(is_taken[..., None], of_taken[:, None, :], 0.0).flatten(1)
-    by_parameter = gradients(layers, noise, [x[:rows] for x in inputs], of_logits, actions)
+    by_parameter = gradients(
+        layers,
+        noise,
+        [x[:rows] for x in inputs],
+        of_logits,
+        actions,
+    )
 
     # clipping as by clip_grad_norm_, then Adam
     norm = torch.stack([(gradient * gradient).sum() for gradient in by_parameter]).sum().sqrt()
@@ -358,7 +426,13 @@ def update(
         second.mul_(_BETA_2).addcmul_(clipped, clipped, value=1.0 - _BETA_2)
         step = first * corrections[0] / ((second * corrections[1]).sqrt() + settings.adam_eps)
         parameter.sub_(rate * step)
-    return Learned(priority, (batch.weight * loss).mean(), best.mean(), clamped, norm)
+    return Learned(
+        priority,
+        (batch.weight * loss).mean(),
+        best.mean(),
+        clamped,
+        norm,
+    )
 
 
 class UpdateGraph:
@@ -375,10 +449,16 @@ class UpdateGraph:
         config: RainbowConfig,
         compile: bool = True,
     ) -> None:
-        self.network, self.target, self.optimizer = network, loss.target_network, optimizer
+        self.network = network
+        self.target = loss.target_network
+        self.optimizer = optimizer
         (group,) = optimizer.param_groups
         self.settings = Settings(
-            network.config.actions, config.atoms, config.gamma, config.gradient_clip, group["eps"]
+            network.config.actions,
+            config.atoms,
+            config.gamma,
+            config.gradient_clip,
+            group["eps"],
         )
         self._update: Callable[..., Learned] = compiled(update) if compile else update
 
@@ -388,7 +468,8 @@ class UpdateGraph:
 
         Noise from ``generator``.
         """
-        online, target = _parameters_of(self.network), _parameters_of(self.target)
+        online = _parameters_of(self.network)
+        target = _parameters_of(self.target)
         moments = [self._moments(parameter) for parameter in online]
         step = float(moments[0]["step"]) + 1.0
         for state in moments:
@@ -405,15 +486,24 @@ class UpdateGraph:
             noise_of(self.target, generator),
             self._batch(batch),
             torch.tensor(float(group["lr"])),
-            torch.tensor([1.0 / (1.0 - _BETA_1**step), 1.0 / (1.0 - _BETA_2**step)]),
+            torch.tensor(
+                [
+                    1.0 / (1.0 - _BETA_1**step),
+                    1.0 / (1.0 - _BETA_2**step),
+                ]
+            ),
         )
 
     def _batch(self, batch: TensorDictBase) -> Batch:
         """The tensors of ``batch``; without a mask every next action is allowed."""
-        action, following = batch.get("action"), batch.get("next")
+        action = batch.get("action")
+        following = batch.get("next")
         allowed = following.get(keys.ACTION_MASK, None)
         if allowed is None:
-            allowed = torch.ones((len(action), self.settings.actions), dtype=torch.bool)
+            allowed = torch.ones(
+                (len(action), self.settings.actions),
+                dtype=torch.bool,
+            )
         return Batch(
             batch.get("observation"),
             action,

@@ -36,7 +36,13 @@ class Step(NamedTuple):
         after = step.get("next")
         observation, action = (step.get(name).clone() for name in ("observation", "action"))
         reward, following, terminated, done = (
-            after.get(name).clone() for name in ("reward", "observation", "terminated", "done")
+            after.get(name).clone()
+            for name in (
+                "reward",
+                "observation",
+                "terminated",
+                "done",
+            )
         )
         mask = after.get(keys.ACTION_MASK, None)
         return cls(
@@ -60,7 +66,8 @@ class NStepWindow:
     """
 
     def __init__(self, n: int, gamma: float) -> None:
-        self.n, self.gamma = n, gamma
+        self.n = n
+        self.gamma = gamma
         self.steps: list[Step] = []
 
     def push(self, step: TensorDictBase) -> TensorDict | None:
@@ -79,13 +86,12 @@ class NStepWindow:
         if len(self.steps) < self.n:
             return None
         first, *later = self.steps
-        reward, following, terminated, mask = (
-            first.reward,
-            first.following,
-            first.terminated,
-            first.following_mask,
-        )
-        length, running = torch.ones_like(reward), ~first.done
+        reward = first.reward
+        following = first.following
+        terminated = first.terminated
+        mask = first.following_mask
+        length = torch.ones_like(reward)
+        running = ~first.done
         for power, after in enumerate(later, start=1):
             reward = reward + running * (self.gamma**power * after.reward)
             following = torch.where(running, after.following, following)
@@ -95,7 +101,11 @@ class NStepWindow:
             length = length + running
             running = running & ~after.done
         del self.steps[0]
-        end = {"observation": following, "reward": reward, "terminated": terminated}
+        end = {
+            "observation": following,
+            "reward": reward,
+            "terminated": terminated,
+        }
         if mask is not None:
             end[keys.ACTION_MASK] = mask
         begin = {
@@ -103,7 +113,10 @@ class NStepWindow:
             "action": first.action,
             "steps_to_next_obs": length,
         }
-        return TensorDict({**begin, "next": TensorDict(end, reward.shape[:1])}, reward.shape[:1])
+        return TensorDict(
+            {**begin, "next": TensorDict(end, reward.shape[:1])},
+            reward.shape[:1],
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """The steps in the window, as plain dictionaries of tensors."""

@@ -26,7 +26,16 @@ from ganlane.parameters.agent import RainbowConfig
 #: Weight and bias of each layer.
 Weights = list[tuple[Tensor, Tensor]]
 #: Options of an agent that shape its network; the support is ignored unless it is distributional.
-SHAPE = ("hidden", "noisy", "dueling", "distributional", "atoms", "v_min", "v_max", "noisy_sigma")
+SHAPE = (
+    "hidden",
+    "noisy",
+    "dueling",
+    "distributional",
+    "atoms",
+    "v_min",
+    "v_max",
+    "noisy_sigma",
+)
 #: Largest width of a layer: a damaged file must not ask for all memory.
 LARGEST = 65536
 #: Whether there is oneDNN's linear layer, an operator that PyTorch's own compiler emits.
@@ -46,7 +55,10 @@ class NetworkConfig:
     actions: int = 3
 
     def __post_init__(self) -> None:
-        sizes = {"observation_size": self.observation_size, "actions": self.actions}
+        sizes = {
+            "observation_size": self.observation_size,
+            "actions": self.actions,
+        }
         sizes |= {f"hidden[{i}]": width for i, width in enumerate(self.agent.hidden)}
         sizes["atoms"] = self.agent.atoms
         for name, size in sizes.items():
@@ -63,7 +75,11 @@ class NetworkConfig:
     def description(self) -> dict[str, Any]:
         """Plain data for a file, which :meth:`described` reads."""
         options = {name: getattr(self.agent, name) for name in SHAPE}
-        return {"observation_size": self.observation_size, "actions": self.actions, **options}
+        return {
+            "observation_size": self.observation_size,
+            "actions": self.actions,
+            **options,
+        }
 
     @classmethod
     def described(cls, description: Mapping[str, Any]) -> NetworkConfig:
@@ -78,11 +94,18 @@ class NetworkConfig:
         options = {name: description[name] for name in SHAPE}
         for name, value in options.items():
             expected: Any = type(getattr(RainbowConfig, name))
-            accepted = {tuple: (list, tuple), float: (int, float)}.get(expected, expected)
+            accepted = {
+                tuple: (list, tuple),
+                float: (int, float),
+            }.get(expected, expected)
             if not isinstance(value, accepted):
                 raise UserError(f"network {name}={value!r}: expected a {expected.__name__}.")
         agent = RainbowConfig(**options)
-        return cls(agent, description["observation_size"], description["actions"])
+        return cls(
+            agent,
+            description["observation_size"],
+            description["actions"],
+        )
 
 
 class QNetwork(nn.Module):
@@ -102,7 +125,10 @@ class QNetwork(nn.Module):
         widths = (config.observation_size, *options.hidden)
         self.trunk = nn.ModuleList(layer(*pair) for pair in pairwise(widths))
         # a dueling head has one row more, the value
-        self.head = layer(widths[-1], (config.actions + options.dueling) * config.outputs)
+        self.head = layer(
+            widths[-1],
+            (config.actions + options.dueling) * config.outputs,
+        )
         support = torch.linspace(options.v_min, options.v_max, options.atoms)
         self.register_buffer("support", support, persistent=False)
 
@@ -157,7 +183,8 @@ def duel(rows: Tensor) -> Tensor:
     """Join value (row 0) and advantages (the rest) of [*, 1 + A, atoms] into [*, A, atoms] (Wang et
     al. 2016).
     """
-    value, advantage = rows[..., :1, :], rows[..., 1:, :]
+    value = rows[..., :1, :]
+    advantage = rows[..., 1:, :]
     return value + advantage - advantage.mean(-2, keepdim=True)
 
 
@@ -231,7 +258,10 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> Tenso
 
 
 def matrix_product(
-    x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    relu: bool = False,
 ) -> Tensor:
     """:func:`linear` in 2-d float32 without gradients, as an operator that a compiled graph calls
     as it is.
@@ -239,7 +269,12 @@ def matrix_product(
     return torch.ops.ganlane.linear(x, weight, bias, relu)
 
 
-def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False) -> Tensor:
+def _product(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    relu: bool = False,
+) -> Tensor:
     return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "relu" if relu else "none", [], "")
 
 

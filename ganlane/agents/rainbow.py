@@ -10,8 +10,17 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from ganlane.agents.drivers import ExploringPolicy, GreedyPolicy, LegalActions
-from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss, Learned, UpdateGraph
+from ganlane.agents.drivers import (
+    ExploringPolicy,
+    GreedyPolicy,
+    LegalActions,
+)
+from ganlane.agents.loss import (
+    LeanDistributionalLoss,
+    LeanDQNLoss,
+    Learned,
+    UpdateGraph,
+)
 from ganlane.agents.n_step import NStepWindow
 from ganlane.agents.network import (
     NetworkConfig,
@@ -21,7 +30,12 @@ from ganlane.agents.network import (
     parameters_of,
     redraw_noise,
 )
-from ganlane.agents.replay import draw, load_replay_state, make_replay, replay_state
+from ganlane.agents.replay import (
+    draw,
+    load_replay_state,
+    make_replay,
+    replay_state,
+)
 from ganlane.errors import ParameterError, UserError
 from ganlane.parameters.agent import RainbowConfig
 
@@ -59,7 +73,8 @@ class Rainbow:
                 f"{{learning_rate_end}}={config.learning_rate_end:g}: within how many decisions? "
                 "set {learning_rate_decisions}, here or by for_phase(); give both or neither."
             )
-        self.config, self.device = config, torch.device(device)
+        self.config = config
+        self.device = torch.device(device)
         self.generators = {
             name: torch.Generator(self.device).manual_seed(seed * 3 + i)
             for i, name in enumerate(("collect", "learn", "replay"))
@@ -69,13 +84,21 @@ class Rainbow:
             network = QNetwork(NetworkConfig(config, observation_size, actions))
         self.network = network.to(self.device)
         self.loss = (
-            LeanDistributionalLoss(self.network, config.gamma, config.double, config.kl_priority)
+            LeanDistributionalLoss(
+                self.network,
+                config.gamma,
+                config.double,
+                config.kl_priority,
+            )
             if config.distributional
             else LeanDQNLoss(self.network, config.gamma, config.double)
         )
         adam_eps = 0.005 / config.batch_size if config.adam_eps is None else config.adam_eps
         self.optimizer = torch.optim.Adam(
-            self.network.parameters(), lr=config.learning_rate, eps=adam_eps, fused=True
+            self.network.parameters(),
+            lr=config.learning_rate,
+            eps=adam_eps,
+            fused=True,
         )
         self.replay = make_replay(config, self.generators["replay"])
         self.policy = ExploringPolicy(self.network, self.generators["collect"], legal)
@@ -84,7 +107,14 @@ class Rainbow:
         self.graph: UpdateGraph | None = None
         # The graph is of the whole of Rainbow; with any part left out the update is computed step
         # by step.
-        parts = ("distributional", "double", "dueling", "noisy", "prioritised", "kl_priority")
+        parts = (
+            "distributional",
+            "double",
+            "dueling",
+            "noisy",
+            "prioritised",
+            "kl_priority",
+        )
         if compile and all(getattr(config, part) for part in parts) and self.device.type == "cpu":
             self.graph = UpdateGraph(self.network, self.loss, self.optimizer, config)
         self.anneal(0)
@@ -102,7 +132,10 @@ class Rainbow:
         """Set the share of random actions and the learning rate after ``decisions``."""
         config = self.config
         self.policy.epsilon = annealed(
-            config.epsilon_start, config.epsilon, decisions, config.epsilon_decisions
+            config.epsilon_start,
+            config.epsilon,
+            decisions,
+            config.epsilon_decisions,
         )
         if config.learning_rate_end is not None:
             (group,) = self.optimizer.param_groups
@@ -123,7 +156,10 @@ class Rainbow:
         config = self.config
         if config.prioritised:
             self.replay.sampler.beta = annealed(
-                config.beta_start, 1.0, self.updates, config.beta_updates
+                config.beta_start,
+                1.0,
+                self.updates,
+                config.beta_updates,
             )
         batch = draw(self.replay)
         descend = self._descend if self.graph is None else self.graph
@@ -133,7 +169,10 @@ class Rainbow:
         self.updates += 1
         if self.updates % config.target_period == 0:
             self.loss.update_target()
-        return {**learned._asdict(), "priority": learned.priority.mean()}
+        return {
+            **learned._asdict(),
+            "priority": learned.priority.mean(),
+        }
 
     def _descend(self, batch: TensorDict, generator: torch.Generator) -> Learned:
         """What :class:`~ganlane.agents.loss.UpdateGraph` does, for every ``config`` and device."""
@@ -149,7 +188,11 @@ class Rainbow:
         self.optimizer.step()
         priority = batch.get("td_error")[:, 0]
         return Learned(
-            priority, objective.detach(), terms["mean_q"], terms["clamped_fraction"], norm
+            priority,
+            objective.detach(),
+            terms["mean_q"],
+            terms["clamped_fraction"],
+            norm,
         )
 
     def sigma(self) -> Tensor:

@@ -40,7 +40,8 @@ ROW = 64
 
 def make_replay(config: RainbowConfig, generator: torch.Generator) -> TensorDictReplayBuffer:
     """The replay buffer that ``config`` asks for, on the generator's device."""
-    capacity, device = config.capacity, generator.device
+    capacity = config.capacity
+    device = generator.device
     sampler = RandomSampler()
     if config.prioritised:
         sampler = RowSampler(capacity, config.alpha, config.beta_start, device)
@@ -72,8 +73,15 @@ def replay_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
     # a view would be saved with all of the storage behind it
     if len(buffer) < buffer.storage.max_size:
         tensors = {name: tensor.clone() for name, tensor in tensors.items()}
-    writer = {"cursor": buffer.writer._cursor, "writes": buffer.write_count}
-    return {"rows": tensors, **writer, "sampler": buffer.sampler.state_dict()}
+    writer = {
+        "cursor": buffer.writer._cursor,
+        "writes": buffer.write_count,
+    }
+    return {
+        "rows": tensors,
+        **writer,
+        "sampler": buffer.sampler.state_dict(),
+    }
 
 
 def load_replay_state(buffer: TensorDictReplayBuffer, state: dict[str, Any]) -> None:
@@ -96,10 +104,21 @@ class RowSampler(PrioritizedSampler):
     construction) and from no other.
     """
 
-    def __init__(self, max_capacity: int, alpha: float, beta: float, device: torch.device) -> None:
+    def __init__(
+        self,
+        max_capacity: int,
+        alpha: float,
+        beta: float,
+        device: torch.device,
+    ) -> None:
         # not the parent's constructor: it warns of a missing C++ extension, not needed here
-        self._max_capacity, self._alpha, self._beta, self._eps = max_capacity, alpha, beta, 1e-8
-        self._device, self.dtype, self.reduction = device, torch.float32, "max"
+        self._max_capacity = max_capacity
+        self._alpha = alpha
+        self._beta = beta
+        self._eps = 1e-8
+        self._device = device
+        self.dtype = torch.float32
+        self.reduction = "max"
         self._max_priority_within_buffer = False
         self._init()
 
@@ -127,7 +146,11 @@ class RowSampler(PrioritizedSampler):
 
     @torch.no_grad()
     def update_priority(
-        self, index: Tensor | int, priority: Tensor | float, *, storage: Storage | None = None
+        self,
+        index: Tensor | int,
+        priority: Tensor | float,
+        *,
+        storage: Storage | None = None,
     ) -> None:
         """Give the items at ``index`` [B] raw priorities of at least 0: [B], [B, 1] or a number."""
         index = torch.as_tensor(index, device=self.device).reshape(-1)
@@ -152,7 +175,10 @@ class RowSampler(PrioritizedSampler):
                 "start again, or go on from an earlier checkpoint."
             )
         uniform = torch.rand(
-            batch_size, generator=self._rng, dtype=torch.float64, device=self.device
+            batch_size,
+            generator=self._rng,
+            dtype=torch.float64,
+            device=self.device,
         )
         # first the row in which the drawn mass lies, then the item within it
         mass = _below(uniform * cumulated[-1], cumulated[-1])

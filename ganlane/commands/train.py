@@ -14,7 +14,12 @@ from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError
 from ganlane.torch_settings import set_threads
 from ganlane.training.checkpoint import LAST
-from ganlane.training.phases import AGENT_FILE, length_if_finished, phases_of, run_phase
+from ganlane.training.phases import (
+    AGENT_FILE,
+    length_if_finished,
+    phases_of,
+    run_phase,
+)
 
 #: Name of the agent of this run in the table.
 TRAINED = "trained"
@@ -41,7 +46,10 @@ def train(config: TrainConfig, folder: Path) -> str:
         resume = last if config.resume is not None and last.is_file() else None
         result = run_phase(config.compiled(), phase, resume)
         if result.stopped_by is not None:
-            print(f"saved; go on with: ganlane train resume={folder}", file=sys.stderr)
+            print(
+                f"saved; go on with: ganlane train resume={folder}",
+                file=sys.stderr,
+            )
             raise Stopped(result.stopped_by)
         lengths[phase.name] = {
             "decisions": result.decisions,
@@ -49,7 +57,12 @@ def train(config: TrainConfig, folder: Path) -> str:
             "wall_s": result.wall_s,
         }
     trained = replace(
-        make_driver(str(folder / AGENT_FILE), config.env, device=config.device), name=TRAINED
+        make_driver(
+            str(folder / AGENT_FILE),
+            config.env,
+            device=config.device,
+        ),
+        name=TRAINED,
     )
     table = compare([trained, *others], config.final_evaluation())
     seeds = {
@@ -57,5 +70,9 @@ def train(config: TrainConfig, folder: Path) -> str:
         "stream": "report",
         "episodes": [0, config.evaluation.episodes - 1],
     }
-    numbers = {**lengths["train"], "phases": lengths, "agent": str(folder / AGENT_FILE)}
+    numbers = {
+        **lengths["train"],
+        "phases": lengths,
+        "agent": str(folder / AGENT_FILE),
+    }
     return publish(table, folder, asdict(config), seeds, numbers)

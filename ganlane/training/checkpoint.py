@@ -30,7 +30,14 @@ COMPUTED_BY = ("env.compile",)
 #: After a checkpoint that took t seconds the next comes after 50 t or later: 2 % of the time.
 PATIENCE = 50.0
 #: Parts of a checkpoint in which every number must be finite.
-FINITE = ("network", "target", "optimizer", "replay", "window", "stats")
+FINITE = (
+    "network",
+    "target",
+    "optimizer",
+    "replay",
+    "window",
+    "stats",
+)
 #: Upper bound of the decisions, updates and rows of a run.
 MOST = 2**53
 #: Name of the action masks in the rows of the replay buffer, if there are masks.
@@ -46,18 +53,28 @@ class TrainingState:
     """
 
     def __init__(
-        self, env: EnvBase, agent: Rainbow, identity: Mapping[str, Any] | None = None
+        self,
+        env: EnvBase,
+        agent: Rainbow,
+        identity: Mapping[str, Any] | None = None,
     ) -> None:
         self.collector = Collector(env)
-        self.agent, self.identity = agent, dict(identity or {})
+        self.agent = agent
+        self.identity = dict(identity or {})
         self.environments = self.collector.environments
         self.window = agent.window()
         self.stats = EpisodeStats(
-            self.environments, agent.network.config.actions, agent.config.gamma, agent.device
+            self.environments,
+            agent.network.config.actions,
+            agent.config.gamma,
+            agent.device,
         )
-        self.decisions, self.pending_decisions, self.evaluated_at = 0, 0, 0
+        self.decisions = 0
+        self.pending_decisions = 0
+        self.evaluated_at = 0
         self.best: float | None = None
-        self._before_s, self._started_s = 0.0, time.monotonic()
+        self._before_s = 0.0
+        self._started_s = time.monotonic()
 
     @property
     def wall_s(self) -> float:
@@ -98,7 +115,14 @@ class TrainingState:
             UserError: the checkpoint is unreadable, or of another run.
         """
         state = load_checkpoint(path, self.agent.device)
-        parts = {"agent", "window", "env_state", "stats", "counters", "identity"}
+        parts = {
+            "agent",
+            "window",
+            "env_state",
+            "stats",
+            "counters",
+            "identity",
+        }
         if not isinstance(state, dict) or not state.keys() >= parts:
             raise UserError(
                 f"resume={path}: parts of the run are missing in it; give another checkpoint."
@@ -107,7 +131,8 @@ class TrainingState:
             raise UserError(
                 f"resume={path}: it does not say what run it is of; give another checkpoint."
             )
-        before, now = flat(state["identity"]), flat(self.identity)
+        before = flat(state["identity"])
+        now = flat(self.identity)
         for name in (*now, *before):
             if name not in COMPUTED_BY and before.get(name) != now.get(name):
                 raise UserError(
@@ -131,7 +156,8 @@ class TrainingState:
     def _take_over(self, state: Mapping[str, Any], path: str | Path) -> None:
         """Restore everything from ``state``; see :meth:`restore`."""
         exact = state["window"] is not None
-        fresh, shape = self.collector.state_dict(exact), state["env_state"]["batch_size"]
+        fresh = self.collector.state_dict(exact)
+        shape = state["env_state"]["batch_size"]
         if isinstance(shape, list) and shape != fresh["batch_size"]:
             raise UserError(
                 f"resume={path}: saved with environments of shape {shape}, this run has "
@@ -146,7 +172,8 @@ class TrainingState:
         counters = state["counters"]
         self.decisions = counters["decisions"]
         self.pending_decisions = counters["pending_decisions"]
-        self.best, self._before_s = counters["best"], counters["wall_s"]
+        self.best = counters["best"]
+        self._before_s = counters["wall_s"]
 
 
 class Checkpointer:
@@ -164,9 +191,13 @@ class Checkpointer:
         with_replay: bool,
         metadata: Mapping[str, Any],
     ) -> None:
-        self.state, self.path, self.metadata = state, Path(folder) / LAST, metadata
-        self.every_s, self.with_replay = every_s, with_replay
-        self.saved_s, self.pause_s = time.monotonic(), every_s
+        self.state = state
+        self.path = Path(folder) / LAST
+        self.metadata = metadata
+        self.every_s = every_s
+        self.with_replay = with_replay
+        self.saved_s = time.monotonic()
+        self.pause_s = every_s
 
     def due(self) -> bool:
         """Whether the next checkpoint is due."""
@@ -188,7 +219,11 @@ class Checkpointer:
             "updates": state.agent.updates,
             "wall_s": state.wall_s,
         }
-        training = {**self.metadata.get("training", {}), **progress, **figures}
+        training = {
+            **self.metadata.get("training", {}),
+            **progress,
+            **figures,
+        }
         save_agent(
             self.path.with_name(f"{name}.safetensors"),
             state.agent,
@@ -204,7 +239,9 @@ def save_checkpoint(path: str | Path, state: Any) -> None:
 
 
 def load_checkpoint(
-    path: str | Path, device: torch.device | str = "cpu", key: str = "resume"
+    path: str | Path,
+    device: torch.device | str = "cpu",
+    key: str = "resume",
 ) -> Any:
     """Read a file of :func:`save_checkpoint`; never executes code.
 
@@ -220,7 +257,8 @@ def load_checkpoint(
     with path.open("rb") as file:
         empty = file.seek(0, 2) == 0  # which cannot be mapped
         sealed = not empty and has_checksum(
-            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), option
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ),
+            option,
         )
     try:
         content = torch.load(path, map_location=device, weights_only=True)
@@ -242,7 +280,7 @@ def load_checkpoint(
         )
     state = content.get("state")  # :meth:`TrainingState.restore` checks the parts
     agent = state.get("agent") if isinstance(state, dict) else None
-    parts = {**state, **agent} if isinstance(agent, dict) else {}
+    parts = {**state, **agent} if isinstance(state, dict) and isinstance(agent, dict) else {}
     for name in FINITE:
         if not _finite(parts.get(name)):
             raise UserError(
@@ -275,7 +313,10 @@ def flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
 
 
 def check_parts(
-    state: Mapping[str, Any], agent: Rainbow, environments: Mapping[str, Any], stats: EpisodeStats
+    state: Mapping[str, Any],
+    agent: Rainbow,
+    environments: Mapping[str, Any],
+    stats: EpisodeStats,
 ) -> None:
     """Compare ``state`` (:meth:`TrainingState.state_dict`) with that of a new run before its use.
 
@@ -289,17 +330,30 @@ def check_parts(
         ValueError: a part has another structure, shape or type, or impossible numbers.
         TypeError, KeyError, AttributeError: a part has another type altogether.
     """
-    network, counters, replay = agent.network.config, state["counters"], state["agent"]["replay"]
+    network = agent.network.config
+    counters = state["counters"]
+    replay = state["agent"]["replay"]
     moments = agent.optimizer.state_dict()["state"]
     adam = {
-        row: {"step": torch.zeros(()), "exp_avg": value, "exp_avg_sq": value}
+        row: {
+            "step": torch.zeros(()),
+            "exp_avg": value,
+            "exp_avg_sq": value,
+        }
         for row, value in enumerate(agent.network.parameters())
     }
     check_like(moments, adam if moments else {}, "optimizer")
     check_like(state["agent"]["updates"], 0, "updates")
     best = None if counters["best"] is None else 0.0
     check_like(
-        counters, {"decisions": 0, "pending_decisions": 0, "wall_s": 0.0, "best": best}, "counters"
+        counters,
+        {
+            "decisions": 0,
+            "pending_decisions": 0,
+            "wall_s": 0.0,
+            "best": best,
+        },
+        "counters",
     )
     if replay is not None:
         _check_replay(replay, agent)
@@ -309,32 +363,53 @@ def check_parts(
     mask = environments["items"].get(keys.ACTION_MASK)
     if replay["rows"] and (MASK in replay["rows"]) != (mask is not None):
         raise ValueError("replay: its masks are those of another run")
-    rows, steps = transitions(len(stats.returns), network), state["window"]["steps"]
-    observation, end = rows["observation"], rows["next.terminated"]
+    rows = transitions(len(stats.discount), network)
+    steps = state["window"]["steps"]
+    observation = rows["observation"]
+    end = rows["next.terminated"]
     step = Step(
-        observation, rows["action"], rows["next.reward"], observation, end, end, mask
+        observation,
+        rows["action"],
+        rows["next.reward"],
+        observation,
+        end,
+        end,
+        mask,
     )._asdict()
-    check_like(steps, [step] * min(len(steps), agent.config.n_step - 1), "window")
+    check_like(
+        steps,
+        [step] * min(len(steps), agent.config.n_step - 1),
+        "window",
+    )
     for step in steps:
         _check_actions(step["action"], network)
-    saved, one = state["stats"], torch.zeros((), dtype=torch.float64)
+    saved = state["stats"]
+    one = torch.zeros((), dtype=torch.float64)
     sums = {
         name: one.expand(len(stats.actions)) if name == "actions" else one for name in saved["sums"]
     }
     updates = dict.fromkeys(saved["updates"], torch.zeros(()))
-    check_like(saved, {**stats.state_dict(), "sums": sums, "updates": updates}, "stats")
+    check_like(
+        saved,
+        {**stats.state_dict(), "sums": sums, "updates": updates},
+        "stats",
+    )
     if updates and saved["update_count"] == 0:
         raise ValueError("stats: sums over no update")
 
 
 def _check_replay(replay: Mapping[str, Any], agent: Rainbow) -> None:
-    rows, cursor, config = replay["rows"], replay["cursor"], agent.config
+    rows = replay["rows"]
+    cursor = replay["cursor"]
+    config = agent.config
     count = len(rows["action"]) if rows else 0
     check_like(replay, {"cursor": 0, "writes": 0}, "replay")
     if rows:
         like = transitions(count, agent.network.config)
         check_like(
-            rows, {name: like[name] for name in like if name != MASK or MASK in rows}, "replay"
+            rows,
+            {name: like[name] for name in like if name != MASK or MASK in rows},
+            "replay",
         )
         _check_actions(rows["action"], agent.network.config)
         steps = rows["steps_to_next_obs"]
@@ -345,7 +420,11 @@ def _check_replay(replay: Mapping[str, Any], agent: Rainbow) -> None:
     if config.prioritised:
         # of whole rows, in which the items that exist have a priority
         in_use = torch.arange(-(-count // ROW) * ROW, device=agent.device).view(-1, ROW) < count
-        sampler = {"priorities": in_use.float(), "largest": torch.zeros(()), "beta": 0.0}
+        sampler = {
+            "priorities": in_use.float(),
+            "largest": torch.zeros(()),
+            "beta": 0.0,
+        }
         check_like(replay["sampler"], sampler, "replay.sampler")
         if not torch.equal(replay["sampler"]["priorities"] > 0, in_use):
             raise ValueError("replay: priorities of rows that do not exist")
@@ -380,7 +459,10 @@ def check_like(value: Any, like: Any, name: str) -> None:
     It may have more keys. Numbers outside tensors must be finite, counts at least 0.
     """
     if isinstance(like, Tensor):
-        fits = isinstance(value, Tensor) and (value.shape, value.dtype) == (like.shape, like.dtype)
+        fits = isinstance(value, Tensor) and (
+            value.shape,
+            value.dtype,
+        ) == (like.shape, like.dtype)
     elif isinstance(like, dict):
         fits = isinstance(value, dict) and value.keys() >= like.keys()
     elif isinstance(like, list):

@@ -20,7 +20,8 @@ class Collector:
     """
 
     def __init__(self, env: EnvBase) -> None:
-        self.env, self.environments = env, env.batch_size.numel()
+        self.env = env
+        self.environments = env.batch_size.numel()
         with threads_for(env):
             self.env_state: TensorDictBase = env.reset()
 
@@ -62,7 +63,10 @@ def pack(tensordict: TensorDictBase) -> dict[str, Any]:
         key: pack(value) if isinstance(value, TensorDictBase) else value
         for key, value in tensordict.items()
     }
-    return {"batch_size": list(tensordict.batch_size), "items": leaves}
+    return {
+        "batch_size": list(tensordict.batch_size),
+        "items": leaves,
+    }
 
 
 def unpack(packed: dict[str, Any]) -> TensorDict:

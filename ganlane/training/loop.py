@@ -105,7 +105,11 @@ def train(
     state = TrainingState(env, agent, identity)
     missing = None if resume is None else state.restore(resume)
     saver = Checkpointer(
-        state, run_folder, config.checkpoint_every_s, config.checkpoint_replay, metadata or {}
+        state,
+        run_folder,
+        config.checkpoint_every_s,
+        config.checkpoint_replay,
+        metadata or {},
     )
     actions = agent.network.config.actions
     shown = config.total_decisions if config.logger.progress else None
@@ -129,7 +133,12 @@ def train(
             saver.save()
     stopped_by = signals[-1] if signals else None
     return TrainingResult(
-        state.decisions, agent.updates, state.wall_s, state.best, stopped_by, saver.path
+        state.decisions,
+        agent.updates,
+        state.wall_s,
+        state.best,
+        stopped_by,
+        saver.path,
     )
 
 
@@ -174,10 +183,18 @@ def metrics(state: TrainingState) -> dict[str, float]:
         "wall_s": state.wall_s,
         **state.stats.read(),
     }
-    return row | {"sigma": float(agent.sigma()), "epsilon": agent.policy.epsilon}
+    return row | {
+        "sigma": float(agent.sigma()),
+        "epsilon": agent.policy.epsilon,
+    }
 
 
-def keep_best(state: TrainingState, evaluate: Evaluate, log: Logs, saver: Checkpointer) -> None:
+def keep_best(
+    state: TrainingState,
+    evaluate: Evaluate,
+    log: Logs,
+    saver: Checkpointer,
+) -> None:
     """Evaluate the greedy policy; save it if it is the best so far."""
     state.evaluated_at = state.decisions
     row = dict(evaluate(state.agent.greedy))

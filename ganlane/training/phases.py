@@ -19,11 +19,27 @@ import polars as pl
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ganlane.agents import GreedyPolicy, NetworkConfig, Rainbow, RainbowConfig
-from ganlane.agents.checkpoint import SHIPPED, SUPPORT, read_agent, save_agent, warm_start
+from ganlane.agents import (
+    GreedyPolicy,
+    NetworkConfig,
+    Rainbow,
+    RainbowConfig,
+)
+from ganlane.agents.checkpoint import (
+    SHIPPED,
+    SUPPORT,
+    read_agent,
+    save_agent,
+    warm_start,
+)
 from ganlane.agents.drivers import legal_actions
 from ganlane.agents.network import load_parameters
-from ganlane.build import make_env, make_road, make_traffic, observation_of
+from ganlane.build import (
+    make_env,
+    make_road,
+    make_traffic,
+    observation_of,
+)
 from ganlane.config.traffic import TrafficConfig
 from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError
@@ -61,14 +77,27 @@ class Phase:
 
 def phases_of(config: TrainConfig, folder: Path) -> list[Phase]:
     """The phases of ``config``, in order."""
-    main = Phase("train", folder, config.traffic, config.total_decisions, config.init.path)
+    main = Phase(
+        "train",
+        folder,
+        config.traffic,
+        config.total_decisions,
+        config.init.path,
+    )
     before = config.pretrain
     if before.total_decisions == 0 or before.traffic is None:
         return [main]
     first = Phase(
-        "pretrain", folder / "pretrain", before.traffic, before.total_decisions, config.init.path
+        "pretrain",
+        folder / "pretrain",
+        before.traffic,
+        before.total_decisions,
+        config.init.path,
     )
-    return [first, replace(main, init=str(first.folder / AGENT_FILE))]
+    return [
+        first,
+        replace(main, init=str(first.folder / AGENT_FILE)),
+    ]
 
 
 def length_if_finished(config: TrainConfig, phase: Phase) -> dict[str, float] | None:
@@ -81,7 +110,8 @@ def length_if_finished(config: TrainConfig, phase: Phase) -> dict[str, float] | 
     if phase.name != "pretrain" or not path.is_file():
         return None
     training = read_agent(path)[2]["training"]
-    done, wanted = training["decisions"], phase.total_decisions
+    done = training["decisions"]
+    wanted = phase.total_decisions
     # the last step of all environments may go beyond it
     if not wanted <= done < wanted + config.collector.num_envs:
         raise UserError(
@@ -96,7 +126,9 @@ def length_if_finished(config: TrainConfig, phase: Phase) -> dict[str, float] | 
 
 
 def run_phase(
-    config: TrainConfig, phase: Phase, resume: str | Path | None = None
+    config: TrainConfig,
+    phase: Phase,
+    resume: str | Path | None = None,
 ) -> TrainingResult:
     """Train the agent of one phase and write its :data:`AGENT_FILE`.
 
@@ -121,7 +153,13 @@ def run_phase(
         identity=identity(config, phase),
     )
     if result.stopped_by is None:
-        save_final_agent(agent, phase.folder, metadata, result, config.selection_episodes)
+        save_final_agent(
+            agent,
+            phase.folder,
+            metadata,
+            result,
+            config.selection_episodes,
+        )
     return result
 
 
@@ -148,12 +186,16 @@ def make_selection(config: TrainConfig, traffic: TrafficConfig) -> Evaluate:
     """A function that evaluates the greedy policy on episodes that are never trained on."""
     make = env_maker(config, traffic, Stream.SELECT)
     env = make(min(config.selection_episodes, config.evaluation.num_envs))
-    episodes, smaller = range(config.selection_episodes), None if config.env.compile else make
+    episodes = range(config.selection_episodes)
+    smaller = None if config.env.compile else make
 
     def evaluate(policy: GreedyPolicy) -> dict[str, float]:
         table = run_episodes(env, policy, episodes, config.seed, make_smaller=smaller)
         total = table.select(
-            "reward", "lane_changes", "distance_m", crashes=pl.col("reason") == "hard_crash"
+            "reward",
+            "lane_changes",
+            "distance_m",
+            crashes=pl.col("reason") == "hard_crash",
         ).sum()
         reward, changes, distance_m, crashes = (float(value) for value in total.row(0))
         spread = float(np.std(table["reward"].to_numpy()))
@@ -203,15 +245,28 @@ def read_start(name: str, key: str = "init.path") -> Start:
         )
     state = load_checkpoint(path, key=key)
     try:
-        agent, trained_on = state["agent"], state["identity"]["observation"]
+        agent = state["agent"]
+        trained_on = state["identity"]["observation"]
         observation = ObservationConfig(
             **{name: trained_on[name] for name in ("form", "range_m", "speed_mps")}
         )
         size = observation_size(observation.form, state["identity"]["env"]["vehicles"])
         network = NetworkConfig(RainbowConfig(**agent["config"]), size)
         weights = {name: value.detach() for name, value in agent["network"].items()}
-        return Start(str(path), weights, network, observation, agent["optimizer"]["state"])
-    except (AttributeError, KeyError, TypeError, ValueError, UserError) as error:
+        return Start(
+            str(path),
+            weights,
+            network,
+            observation,
+            agent["optimizer"]["state"],
+        )
+    except (
+        AttributeError,
+        KeyError,
+        TypeError,
+        ValueError,
+        UserError,
+    ) as error:
         raise UserError(
             f"{key}={path}: not a training checkpoint that this version of ganlane can read; give "
             f"a run's folder, its {LAST}, or an agent's .safetensors file."
@@ -225,7 +280,10 @@ def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
     """
     options = config.agent.for_phase(phase.total_decisions)
     if phase.init is not None:
-        options = replace(options, epsilon_start=min(options.epsilon_start, options.epsilon))
+        options = replace(
+            options,
+            epsilon_start=min(options.epsilon_start, options.epsilon),
+        )
     return Rainbow(
         options,
         observation_size(config.observation.form, config.env.vehicles),
@@ -247,7 +305,8 @@ def make_initial_agent(
     Raises:
         UserError: the agent to start from does not fit.
     """
-    adopts, resumed = config.init.support == "trained", resume is not None
+    adopts = config.init.support == "trained"
+    resumed = resume is not None
     if phase.init is None or (resumed and not adopts):
         return config, make_agent(config, phase)
     start = read_start(str(resume), "resume") if resumed else read_start(phase.init)
@@ -297,19 +356,28 @@ def save_final_agent(
     selection stream.
     """
     training = dict(metadata["training"])
-    best, further = folder / "checkpoints" / "best.safetensors", {}
+    best = folder / "checkpoints" / "best.safetensors"
+    further = {}
     if result.best is not None and best.is_file():
         weights, _, saved = read_agent(best)
         load_parameters(agent.network, weights)
         figures = {name: value for name, value in saved["training"].items() if name not in training}
-        selected = {**figures, "episodes": selection_episodes, "stream": "select"}
+        selected = {
+            **figures,
+            "episodes": selection_episodes,
+            "stream": "select",
+        }
         further = {"selected": selected}
     training |= {
         "decisions": result.decisions,
         "updates": result.updates,
         "wall_s": result.wall_s,
     }
-    save_agent(folder / AGENT_FILE, agent, {**metadata, "training": training, **further})
+    save_agent(
+        folder / AGENT_FILE,
+        agent,
+        {**metadata, "training": training, **further},
+    )
 
 
 # --- metadata
@@ -336,7 +404,10 @@ def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
         "observation_scale": asdict(config.observation.scale()),
         "mask": asdict(config.mask),
         "sensors": asdict(config.observation)["sensors"],
-        "environment": {"vehicles": config.env.vehicles, "lanes": config.env.lanes},
+        "environment": {
+            "vehicles": config.env.vehicles,
+            "lanes": config.env.lanes,
+        },
         "env": plain(config.env),
         "num_envs": config.collector.num_envs,
         "code": code_version(),

@@ -7,7 +7,12 @@ from tensordict import TensorDict
 
 from ganlane.agents import Rainbow, RainbowConfig, save_agent
 
-SMALL = {"hidden": (8, 8), "batch_size": 8, "warmup": 8, "capacity": 100}
+SMALL = {
+    "hidden": (8, 8),
+    "batch_size": 8,
+    "warmup": 8,
+    "capacity": 100,
+}
 
 
 def agent(size=5, seed=0, **options):
@@ -16,12 +21,20 @@ def agent(size=5, seed=0, **options):
 
 def saved_in(folder: Path, **more) -> Path:
     path = folder / "agent.safetensors"
-    save_agent(path, agent(), {"observation": "table3", "training": {"decisions": 7}, **more})
+    save_agent(
+        path,
+        agent(),
+        {
+            "observation": "table3",
+            "training": {"decisions": 7},
+            **more,
+        },
+    )
     return path
 
 
 def transitions(size, rows=64, seed=0):
-    """``rows`` single steps with observations of ``size`` numbers; every fifth or so is terminal."""
+    """``rows`` single steps, observations of ``size`` numbers; every fifth or so is terminal."""
     generator = torch.Generator().manual_seed(seed)
     after = {
         "observation": torch.randn(rows, size, generator=generator),

@@ -9,8 +9,18 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import DistributionalDQNLoss, DQNLoss
 
-from ganlane.agents import NetworkConfig, QNetwork, Rainbow, RainbowConfig
-from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss, UpdateGraph, project
+from ganlane.agents import (
+    NetworkConfig,
+    QNetwork,
+    Rainbow,
+    RainbowConfig,
+)
+from ganlane.agents.loss import (
+    LeanDistributionalLoss,
+    LeanDQNLoss,
+    UpdateGraph,
+    project,
+)
 from ganlane.agents.network import redraw_noise
 from ganlane.runtime import has_compiler
 
@@ -39,7 +49,12 @@ def batch(seed=0, rows=64, scale=3.0):
 
 def network(**options):
     torch.manual_seed(3)
-    small = {"hidden": (16, 16), "atoms": 11, "v_min": -5.0, "v_max": 5.0}
+    small = {
+        "hidden": (16, 16),
+        "atoms": 11,
+        "v_min": -5.0,
+        "v_max": 5.0,
+    }
     return QNetwork(NetworkConfig(RainbowConfig(**{**small, **options}), SIZE))
 
 
@@ -54,12 +69,15 @@ def unlike_target(loss):
 @pytest.mark.parametrize("rows", [64, 11])
 @pytest.mark.parametrize("noisy", [True, False])
 def test_the_distributional_loss_equals_torchrls(noisy, rows):
-    """Also when the batch has as many rows as there are atoms, where a wrong shape would broadcast."""
+    """Also with as many rows as there are atoms, where a wrong shape would broadcast."""
     loss = unlike_target(
         LeanDistributionalLoss(network(noisy=noisy), gamma=0.97, kl_priority=False)
     )
-    theirs, ours, parameters = batch(rows=rows), batch(rows=rows), list(loss.network.parameters())
-    expected, actual = DistributionalDQNLoss.forward(loss, theirs)["loss"], loss(ours)["loss"]
+    theirs = batch(rows=rows)
+    ours = batch(rows=rows)
+    parameters = list(loss.network.parameters())
+    expected = DistributionalDQNLoss.forward(loss, theirs)["loss"]
+    actual = loss(ours)["loss"]
     torch.testing.assert_close(actual, expected, atol=1e-6, rtol=1e-6)
     torch.testing.assert_close(ours["td_error"], theirs["td_error"], atol=1e-6, rtol=1e-6)
     gradients = [torch.autograd.grad(each.mean(), parameters) for each in (actual, expected)]
@@ -69,10 +87,16 @@ def test_the_distributional_loss_equals_torchrls(noisy, rows):
 @pytest.mark.parametrize("double", [True, False])
 def test_the_plain_loss_equals_torchrls(double):
     loss = unlike_target(LeanDQNLoss(network(distributional=False), gamma=0.97, double=double))
-    theirs, ours = batch(), batch()
+    theirs = batch()
+    ours = batch()
     expected = DQNLoss.forward(loss, theirs)["loss"]
     torch.testing.assert_close(loss(ours)["loss"], expected, atol=1e-6, rtol=1e-6)
-    torch.testing.assert_close(ours["td_error"] ** 2, theirs["td_error"], atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(
+        ours["td_error"] ** 2,
+        theirs["td_error"],
+        atol=1e-5,
+        rtol=1e-5,
+    )
 
 
 def test_without_double_the_target_network_chooses():
@@ -103,13 +127,17 @@ def test_the_projection_is_that_of_the_paper():
     values[0] = support  # exactly on the atoms: nothing may vanish
     probabilities = torch.randn(20, 9).softmax(-1)
     projected = project(values, probabilities, support)
-    torch.testing.assert_close(projected, reference_projection(values, probabilities, support))
+    torch.testing.assert_close(
+        projected,
+        reference_projection(values, probabilities, support),
+    )
     torch.testing.assert_close(projected[0], probabilities[0])
     torch.testing.assert_close(projected.sum(-1), torch.ones(20))
 
 
 def test_the_loss_reports_the_share_of_the_returns_that_its_support_does_not_cover():
-    loss, data = LeanDistributionalLoss(network(), gamma=1.0), batch()
+    loss = LeanDistributionalLoss(network(), gamma=1.0)
+    data = batch()
     data["next", "terminated"][:] = True
     data["next", "reward"] = torch.linspace(-9.0, 9.0, 64)[:, None]
     beyond = (data["next", "reward"].abs() > 5.0).float().mean()
@@ -125,13 +153,18 @@ def test_the_kl_priority_is_the_cross_entropy_less_the_targets_entropy():
     target = loss._target(data, loss.network.weights())[0].detach()
     entropy = -(target * target.clamp_min(1e-30).log()).sum(-1)
     torch.testing.assert_close(
-        data["td_error"].squeeze(-1), cross_entropy - entropy, atol=1e-5, rtol=1e-5
+        data["td_error"].squeeze(-1),
+        cross_entropy - entropy,
+        atol=1e-5,
+        rtol=1e-5,
     )
     assert (data["td_error"] >= 0).all()
 
 
 @pytest.mark.parametrize("distributional", [True, False])
-def test_every_parameter_gets_a_gradient_noise_included(distributional):
+def test_every_parameter_gets_a_gradient_noise_included(
+    distributional,
+):
     net = network(distributional=distributional)
     loss = (LeanDistributionalLoss if distributional else LeanDQNLoss)(net, gamma=0.97)
     redraw_noise(net, torch.Generator().manual_seed(0))
@@ -160,7 +193,11 @@ def test_the_next_action_is_one_that_the_mask_allows(distributional, double):
         (LeanDistributionalLoss, {}) if distributional else (LeanDQNLoss, {"distributional": False})
     )
     loss = unlike_target(
-        kind(network(noisy=False, dueling=False, **options), gamma=0.97, double=double)
+        kind(
+            network(noisy=False, dueling=False, **options),
+            gamma=0.97,
+            double=double,
+        )
     )
     data = batch()
     only = torch.randint(0, 3, (64,), generator=torch.Generator().manual_seed(1))
@@ -199,7 +236,13 @@ def agent(graph=None, masked=False, **options):
         data["next", "action_mask"][:, 0] = True
     made.store(data)
     if graph is not None:
-        made.graph = UpdateGraph(made.network, made.loss, made.optimizer, config, compile=graph)
+        made.graph = UpdateGraph(
+            made.network,
+            made.loss,
+            made.optimizer,
+            config,
+            compile=graph,
+        )
     return made
 
 
@@ -208,16 +251,30 @@ def assert_close(one, other):
         torch.testing.assert_close(value, twin, atol=2e-6, rtol=1e-5, msg=name)
     for mine, theirs in zip(one.optimizer.state.values(), other.optimizer.state.values()):
         for name in ("step", "exp_avg", "exp_avg_sq"):
-            torch.testing.assert_close(mine[name], theirs[name], atol=1e-7, rtol=1e-3, msg=name)
+            torch.testing.assert_close(
+                mine[name],
+                theirs[name],
+                atol=1e-7,
+                rtol=1e-3,
+                msg=name,
+            )
 
 
 def run_both(graph, masked=False, updates=8, **options):
-    plain, graphed = agent(masked=masked, **options), agent(graph, masked, **options)
+    plain = agent(masked=masked, **options)
+    graphed = agent(graph, masked, **options)
     for _ in range(updates):
-        expected, found = plain.update(), graphed.update()
+        expected = plain.update()
+        found = graphed.update()
         assert found.keys() == expected.keys()
         for name, value in expected.items():
-            torch.testing.assert_close(found[name], value.detach(), atol=1e-5, rtol=1e-4, msg=name)
+            torch.testing.assert_close(
+                found[name],
+                value.detach(),
+                atol=1e-5,
+                rtol=1e-4,
+                msg=name,
+            )
     assert_close(plain, graphed)
     assert plain.updates == graphed.updates == updates
     return plain, graphed
@@ -228,8 +285,18 @@ def run_both(graph, masked=False, updates=8, **options):
     [
         (False, {}),
         (True, {"gradient_clip": 0.01}),
-        (True, {"learning_rate_end": 1e-5, "learning_rate_decisions": 100, "hidden": (8,)}),
-        (False, {"hidden": (8, 8, 8), "gamma": 0.9, "adam_eps": 1e-3}),
+        (
+            True,
+            {
+                "learning_rate_end": 1e-5,
+                "learning_rate_decisions": 100,
+                "hidden": (8,),
+            },
+        ),
+        (
+            False,
+            {"hidden": (8, 8, 8), "gamma": 0.9, "adam_eps": 1e-3},
+        ),
     ],
 )
 def test_updates_are_those_of_the_loss_of_autograd_and_of_adam(masked, options):
@@ -251,9 +318,19 @@ def test_training_can_change_from_one_way_to_the_other_and_be_resumed():
 
 
 @pytest.mark.parametrize(
-    "part", ["distributional", "double", "dueling", "noisy", "prioritised", "kl_priority"]
+    "part",
+    [
+        "distributional",
+        "double",
+        "dueling",
+        "noisy",
+        "prioritised",
+        "kl_priority",
+    ],
 )
-def test_an_agent_without_one_of_the_components_keeps_the_other_way(part):
+def test_an_agent_without_one_of_the_components_keeps_the_other_way(
+    part,
+):
     config = RainbowConfig(**{part: False})
     assert Rainbow(config, SIZE, compile=True).graph is None
 

@@ -7,11 +7,19 @@ from training.toy import ToyRoad
 
 from ganlane.errors import UserError
 from ganlane.files import PLACE
-from ganlane.training.checkpoint import LAST, TrainingState, load_checkpoint, save_checkpoint
+from ganlane.training.checkpoint import (
+    LAST,
+    TrainingState,
+    load_checkpoint,
+    save_checkpoint,
+)
 
 
 def test_a_checkpoint_comes_back_as_it_was(tmp_path):
-    save_checkpoint(tmp_path / "last.pt", {"weights": torch.arange(3), "count": 4})
+    save_checkpoint(
+        tmp_path / "last.pt",
+        {"weights": torch.arange(3), "count": 4},
+    )
     state = load_checkpoint(tmp_path / "last.pt")
     assert state["count"] == 4
     assert torch.equal(state["weights"], torch.arange(3))
@@ -22,12 +30,16 @@ def test_one_changed_byte_anywhere_is_refused(tmp_path):
     path = tmp_path / "last.pt"
     save_checkpoint(path, {"weights": torch.arange(40), "count": 4})
     whole = path.read_bytes()
-    for place in (*range(0, len(whole), 13), *range(len(whole) - 110, len(whole))):
+    for place in (
+        *range(0, len(whole), 13),
+        *range(len(whole) - 110, len(whole)),
+    ):
         changed = bytearray(whole)
         changed[place] ^= 1 << place % 8
         path.write_bytes(changed)
         with pytest.raises(
-            UserError, match=r"^resume=.*last\.pt: (damaged|not a readable checkpoint)"
+            UserError,
+            match=r"^resume=.*last\.pt: (damaged|not a readable checkpoint)",
         ):
             load_checkpoint(path)
     path.write_bytes(whole[: -len(PLACE)])  # the checksum cut off altogether
@@ -70,7 +82,7 @@ DAMAGE = {
     "env_state.items.episode": ...,
     "env_state.items.events": None,
     "env_state.batch_size": "x",
-    "stats.values": torch.zeros(8, dtype=torch.int64),
+    "stats.running.values": torch.zeros(8, dtype=torch.int64),
     "stats.update_count": 0,
     "stats.sums": [],
     "counters.decisions": 2.5,
@@ -93,9 +105,13 @@ def with_damage(state, place, value):
 def test_a_part_of_a_run_that_is_something_else_is_refused_in_one_sentence(
     place, stopped, tmp_path
 ):
-    save_checkpoint(tmp_path / "last.pt", with_damage(stopped, place, DAMAGE[place]))
+    save_checkpoint(
+        tmp_path / "last.pt",
+        with_damage(stopped, place, DAMAGE[place]),
+    )
     with pytest.raises(
-        UserError, match=r"^resume=[^\n]*last\.pt: [^\n]*; give another checkpoint\.$"
+        UserError,
+        match=r"^resume=[^\n]*last\.pt: [^\n]*; give another checkpoint\.$",
     ):
         TrainingState(ToyRoad(8), agent()).restore(tmp_path / "last.pt")
 

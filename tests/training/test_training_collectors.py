@@ -16,7 +16,10 @@ from ganlane.agents import Rainbow, RainbowConfig
 from ganlane.build import make_env, make_traffic
 from ganlane.config.traffic import IdmTrafficConfig
 from ganlane.parameters.observation import ObservationConfig
-from ganlane.training.checkpoint import TrainingState, load_checkpoint
+from ganlane.training.checkpoint import (
+    TrainingState,
+    load_checkpoint,
+)
 from ganlane.training.collectors import Collector, pack, unpack
 from ganlane.training.loop import collect
 
@@ -25,7 +28,13 @@ NO_CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA devi
 
 def road(rows, device="cpu"):
     traffic = make_traffic(IdmTrafficConfig(), ROAD)
-    return make_env(traffic, ROAD, ObservationConfig(), num_envs=rows, device=device)
+    return make_env(
+        traffic,
+        ROAD,
+        ObservationConfig(),
+        num_envs=rows,
+        device=device,
+    )
 
 
 def test_a_tensordict_is_packed_with_its_nested_batch_sizes():
@@ -38,7 +47,8 @@ def test_a_tensordict_is_packed_with_its_nested_batch_sizes():
 
 def test_the_state_of_a_highway_is_taken_over_row_by_row_or_its_next_episodes_begun():
     learner = Rainbow(RainbowConfig(**SMALL), 29)
-    first, second = Collector(road(6)), Collector(road(6))
+    first = Collector(road(6))
+    second = Collector(road(6))
     for _ in range(3):
         first.step(learner)
     second.load_state_dict(first.state_dict(True), True)
@@ -46,7 +56,12 @@ def test_the_state_of_a_highway_is_taken_over_row_by_row_or_its_next_episodes_be
     expected = first.step(learner).clone()
     learner.generators["collect"].set_state(noise)
     step = second.step(learner)
-    for key in (keys.OBSERVATION, keys.ACTION, ("next", keys.OBSERVATION), ("next", "done")):
+    for key in (
+        keys.OBSERVATION,
+        keys.ACTION,
+        ("next", keys.OBSERVATION),
+        ("next", "done"),
+    ):
         assert torch.equal(step[key], expected[key])
     episodes = first.env_state[keys.EPISODE]
     second.load_state_dict(first.state_dict(False), False)
@@ -65,7 +80,11 @@ def test_on_a_gpu_nothing_of_a_run_is_elsewhere():
     learner.update()
     tensordicts = (run.collector.env_state, step, learner.replay[:])
     tensors = [value for tensordict in tensordicts for value in tensordict.values(True, True)]
-    tensors += [*learner.network.parameters(), *run.stats.sums.values(), run.stats.returns]
+    tensors += [
+        *learner.network.parameters(),
+        *run.stats.sums.values(),
+        *run.stats.running.values(),
+    ]
     assert {tensor.device.type for tensor in tensors} == {"cuda"}
 
 
@@ -83,14 +102,21 @@ train(ToyRoad(8), agent(), settings(10**9, checkpoint_every_s=0.0), {folder!r})
 
 @pytest.mark.parametrize(
     "after_s",
-    [0.11, pytest.param(0.0, marks=pytest.mark.slow), pytest.param(0.53, marks=pytest.mark.slow)],
+    [
+        0.11,
+        pytest.param(0.0, marks=pytest.mark.slow),
+        pytest.param(0.53, marks=pytest.mark.slow),
+    ],
 )
 def test_a_run_killed_at_any_moment_is_resumed_to_the_same_weights(after_s, tmp_path):
     """Killed so many seconds after its first checkpoint."""
-    folder, tests = tmp_path / "parts", Path(__file__).resolve().parent.parent
+    folder = tmp_path / "parts"
+    tests = Path(__file__).resolve().parent.parent
     script = KILLED.format(tests=str(tests), folder=str(folder))
     process = subprocess.Popen(
-        [sys.executable, "-c", script], cwd=tests.parent, start_new_session=True
+        [sys.executable, "-c", script],
+        cwd=tests.parent,
+        start_new_session=True,
     )
     last = folder / "checkpoints" / "last.pt"
     while not last.exists():
@@ -101,7 +127,8 @@ def test_a_run_killed_at_any_moment_is_resumed_to_the_same_weights(after_s, tmp_
     process.wait()
     assert gone(process.pid)
     more = settings(int(load_checkpoint(last)["counters"]["decisions"]) + 400)
-    resumed, whole = agent(seed=5), agent()
+    resumed = agent(seed=5)
+    whole = agent()
     train(ToyRoad(8), resumed, more, folder, resume=last)
     train(ToyRoad(8), whole, more, tmp_path / "whole")
     assert same(whole, resumed)

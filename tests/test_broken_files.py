@@ -168,7 +168,7 @@ def test_a_broken_resume_checkpoint_is_refused(damage, here, capsys):
 )
 def test_a_resume_checkpoint_with_other_things_in_it_is_refused(content, capsys, tmp_path):
     (tmp_path / "other.pt").write_bytes(saved(content))
-    seal_archive(tmp_path / "other.pt")  # without a checksum there is a note besides the sentence
+    seal_archive(tmp_path / "other.pt")  # else the missing checksum alone is refused
     run_folder(IDM, (tmp_path / "other.pt").read_bytes())
     assert "resume" in refusal(capsys, "train", "resume=run")
 

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from ganlane.errors import UserError
-from ganlane.files import has_checksum, note_without_checksum, sealed_archive, write_bytes
+from ganlane.files import has_checksum, refuse_without_checksum, sealed_archive, write_bytes
 from ganlane.generator.checkpoint import Metrics
 from ganlane.generator.closed_loop import driver_params, rollout
 from ganlane.generator.forecasts import (
@@ -402,7 +402,7 @@ class FitLoop:
         )
         self.task.random.set_state(state["random"])
         if not whole:
-            note_without_checksum(path)
+            refuse_without_checksum(path)
 
 
 def learning_rate(config: LoopConfig, number: int) -> float:

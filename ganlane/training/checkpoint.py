@@ -19,7 +19,7 @@ from ganlane.agents.n_step import Step
 from ganlane.agents.replay import MASK_KEY, ROW
 from ganlane.config.runs import LAST
 from ganlane.errors import UserError
-from ganlane.files import atomic_path, has_checksum, seal_archive
+from ganlane.files import atomic_path, has_checksum, refuse_without_checksum, seal_archive
 from ganlane.training.collectors import Collector
 from ganlane.training.stats import EpisodeStats
 
@@ -274,10 +274,7 @@ def load_checkpoint(
     ):
         raise UserError(f"{option}: not a {KIND} of version {VERSION}; give a run's {LAST}.")
     if not sealed:
-        raise UserError(
-            f"{option}: damaged, the checksum that was written with it is missing; give another "
-            "one."
-        )
+        refuse_without_checksum(option)
     state = content.get("state")  # :meth:`TrainingState.restore` checks the parts
     agent = state.get("agent") if isinstance(state, dict) else None
     parts = {**state, **agent} if isinstance(state, dict) and isinstance(agent, dict) else {}

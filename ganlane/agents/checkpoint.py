@@ -62,6 +62,7 @@ def names_agent(name: str) -> bool:
     ``@SEED`` may follow.
     """
     recipe, _, digits = name.rpartition("@")
+    # a file's own name may end in @ and digits
     places = (name, recipe) if digits.isdecimal() else (name,)
     return any(
         place in SHIPPED or place.endswith(".safetensors") or os.path.isfile(place)
@@ -82,6 +83,7 @@ def with_seeds(name: str) -> list[str]:
     if not every:
         return [name]
     if recipe not in SHIPPED:
+        # a file of one's own, with several trainings
         seeds = sorted(_read_several(Path(recipe))[1])
     elif _seeds_file(recipe).is_file():
         seeds = [0, *sorted(_read_several(_seeds_file(recipe))[1])]
@@ -148,6 +150,7 @@ def save_agents(
     ``agents`` holds by seed what :func:`read_agent` gives. The scales of the noise are kept in half
     precision, everything that a greedy agent computes with as it is.
     """
+    # the names of a training's tensors begin with its seed
     tensors = {
         f"{seed}/{name}": value.half() if name.endswith("_sigma") else value
         for seed, (weights, _, _) in agents.items()
@@ -217,6 +220,7 @@ def load_agent(
     if observation_size is not None:
         check_observation_size(name, config, observation_size)
     try:
+        # its parameters are drawn and at once replaced
         network = QNetwork(config)
         load_parameters(network, weights)
     except UserError as error:
@@ -286,6 +290,7 @@ def load_moments(agent: Rainbow, moments: Mapping[int, Mapping[str, Tensor]]) ->
     Raises:
         UserError: they are those of other parameters.
     """
+    # Adam would write beyond moments that are too short
     shapes = {row: value.shape for row, value in enumerate(agent.network.parameters())}
     try:
         fitting = moments.keys() == shapes.keys() and all(

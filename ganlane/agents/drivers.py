@@ -122,12 +122,14 @@ class ExploringPolicy(TensorDictModuleBase):
                 "generator": self.generator,
                 "device": self.generator.device,
             }
+            # the largest of uniform numbers, 0 where not allowed, is a uniform draw
             lottery = torch.rand(mask.shape, **draw) * mask
             action = torch.where(
                 torch.rand(action.shape, **draw) < self.epsilon,
                 lottery.argmax(-1),
                 action,
             )
+        # for the statistics: what the policy expects of its choice
         chosen = values.gather(-1, action[..., None])
         return tensordict.set(keys.ACTION, action).set(keys.CHOSEN_VALUE, chosen)
 
@@ -157,6 +159,7 @@ class MaskedPolicy(TensorDictModuleBase):
                 "action_mask; make it with mask='safe' or 'legal'."
             )
         action = self.policy(tensordict).get(keys.ACTION)
+        # whether the policy's own choice is among the allowed ones
         allowed = mask.gather(1, action[:, None])[:, 0]
         return tensordict.set(keys.ACTION, torch.where(allowed, action, keys.KEEP))
 
@@ -168,6 +171,7 @@ class Driver(TensorDictModuleBase):
     evaluation then never moves a running episode to another row, or into a smaller batch.
     """
 
+    # the simulator's raw state, without the observation's errors
     in_keys = [keys.VEHICLES, keys.EGO, keys.SEED, keys.EPISODE, keys.STEP]  # noqa: RUF012
     out_keys = [keys.ACTION]  # noqa: RUF012
     rows_must_stay = False
@@ -194,6 +198,7 @@ class Driver(TensorDictModuleBase):
 
 def legal_actions(tensordict: TensorDictBase, road: Road) -> Tensor:
     """Which of the three actions stay on the road, bool [N, 3]: keeping the lane always does."""
+    # of the lane that it is moving to, not of the one it is in
     target = tensordict.get(keys.VEHICLES).get("target_lane")[:, EGO_INDEX]
     lanes = road.lanes[:, 0] if isinstance(road.lanes, Tensor) else road.lanes
     return on_road_actions(target, lanes)
@@ -227,6 +232,7 @@ class RandomLegalDriver(RandomDriver):
         """The r-th legal action, r uniform."""
         legal = legal_actions(tensordict, road_in(tensordict, self.road))
         wanted = (self._uniform(tensordict) * legal.sum(1)).long()
+        # the r-th action that is legal has rank r
         rank = legal.cumsum(1) - 1
         return (legal & (rank == wanted[:, None])).long().argmax(1)
 
@@ -256,6 +262,7 @@ class MobilDriver(Driver):
     def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
         """MOBIL's wish as an action, in decisions in which a second of simulated time is full."""
         road = road_in(tensordict, self.road)
+        # -1 right, 0 stay, 1 left, of the ego alone
         wish = mobil_wishes(ego_scene(vehicles, road), road, self.idm, self.mobil)[:, 0]
         step = tensordict.get(keys.STEP)
         decisions = tensordict.get(keys.EGO).get("decisions")

@@ -89,6 +89,7 @@ class LeanDistributionalLoss(_WithTarget, DistributionalDQNLoss):
         double: bool = True,
         kl_priority: bool = True,
     ) -> None:
+        # TorchRL's actor gives its loss the parameters and keys; the forward below does not call it
         actor = DistributionalQValueActor(
             network,
             network.support,
@@ -118,11 +119,13 @@ class LeanDistributionalLoss(_WithTarget, DistributionalDQNLoss):
         """
         weights = self.network.weights()
         with torch.no_grad():
+            # the same noise for both observations: the weights are composed once
             target, clamped, mean_q = self._target(batch, weights)
         logits = self.network.logits(batch.get("observation"), weights)
         log_p = pick(logits, batch.get("action")).log_softmax(-1)
         loss = -(target * log_p).sum(-1)
         priority = loss.detach()
+        # the entropy of the target is not the network's fault
         if self.kl_priority:
             priority = (priority - torch.special.entr(target).sum(-1)).clamp_min(0.0)
         batch.set("td_error", priority[:, None])
@@ -139,6 +142,7 @@ class LeanDistributionalLoss(_WithTarget, DistributionalDQNLoss):
         following = batch.get(("next", "observation"))
         support = self.network.support
         target_logits = self.target_network.logits(following)
+        # double Q-learning: one network chooses, the other one values
         choosing = self.network.logits(following, weights) if self.double else target_logits
         mask = batch.get(("next", keys.ACTION_MASK), None)
         best, action = allowed_values(self.network.expected(choosing), mask).max(-1)
@@ -166,6 +170,7 @@ class LeanDQNLoss(_WithTarget, DQNLoss):
             reduction="none",
             use_prioritized_weights=False,
         )
+        # for TorchRL's own forward; the one below takes self.discount
         self.make_value_estimator(gamma=gamma)
         self.discount = gamma
         self._attach(network, actor)
@@ -206,6 +211,7 @@ def bellman(batch: TensorDictBase, gamma: float, value: Tensor) -> Tensor:
 
     Nothing follows where it terminated.
     """
+    # a truncated episode goes on behind its last observation, a terminated one does not
     alive = 1.0 - batch.get(("next", "terminated")).to(value.dtype)
     discount = gamma ** batch.get("steps_to_next_obs")
     return batch.get(("next", "reward")).to(value.dtype) + alive * discount * value
@@ -221,7 +227,9 @@ def project(values: Tensor, probabilities: Tensor, support: Tensor) -> Tensor:
     low = support[0]
     high = support[-1]
     atoms = support.numel()
+    # where each value falls on the support, in units of its spacing
     place = (values.clamp(low, high) - low) * ((atoms - 1) / (high - low))
+    # the last atom belongs to the interval before it, so that index + 1 exists
     lower = place.floor().clamp_max(atoms - 2)
     share = (place - lower) * probabilities
     index = lower.long()
@@ -232,6 +240,7 @@ def project(values: Tensor, probabilities: Tensor, support: Tensor) -> Tensor:
 
 def projected(values: Tensor, probabilities: Tensor, support: Tensor) -> tuple[Tensor, Tensor]:
     """What :func:`project` gives, and the mass that it clamps, a mean over the batch, 0-dim."""
+    # counted before the clamping, weighted by probability
     outside = (values < support[0]) | (values > support[-1])
     return project(values, probabilities, support), (probabilities * outside).sum(-1).mean()
 
@@ -279,6 +288,7 @@ class Settings(NamedTuple):
 
 def composed(parameters: Sequence[Tensor], noise: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """Weight [O, I], bias [O] of a noisy layer (Fortunato et al. 2017), ``noise`` [I] and [O]."""
+    # factorised noise: the outer product of one vector per side
     weight_mu, weight_sigma, bias_mu, bias_sigma = parameters
     inputs, outputs = noise
     return weight_mu + weight_sigma * torch.outer(outputs, inputs), bias_mu + bias_sigma * outputs
@@ -300,12 +310,14 @@ def composed_layers(
 
 def folded(part: Tensor, actions: int) -> Tensor:
     """The head's weight [(1 + A) K, H] or bias [(1 + A) K] with the duel in it: [A K, ...]."""
+    # Q_a = V + A_a - mean(A), row by row of the weights
     rows = part.unflatten(0, (1 + actions, -1))
     return (rows[:1] + rows[1:] - rows[1:].mean(0, keepdim=True)).flatten(0, 1)
 
 
 def unfolded(gradient: Tensor, actions: int) -> Tensor:
     """Gradient of the head from that of the folded head: the transpose of :func:`folded`."""
+    # V gets the sum of all, each A_a its own less the mean
     rows = gradient.unflatten(0, (actions, -1))
     return torch.cat(
         (
@@ -339,10 +351,13 @@ def gradients(
 ) -> list[Tensor]:
     """Of all parameters, in the layers' order, from that of the folded head's output [B, A K]."""
     all_gradients: list[Tensor] = []
+    # from the last layer to the first, by the chain rule
     behind = of_logits
     for number in reversed(range(len(layers))):
+        # for each layer: the gradient by its weights, then by its inputs
         of_weight = matrix_product(behind.t(), inputs[number].t())
         of_bias = behind.sum(0)
+        # of the folded head's rows, those of value and advantages
         if number == len(layers) - 1:
             of_weight = unfolded(of_weight, actions)
             of_bias = unfolded(of_bias, actions)
@@ -400,6 +415,7 @@ def update(
     discount = torch.pow(settings.gamma, batch.steps)
     values = batch.reward[:, None] + (batch.alive * discount)[:, None] * support
     wanted, clamped = projected(values, pick(target_logits, chosen).softmax(-1), support)
+    # the loss is the cross-entropy, the priority its excess over the target's entropy
     log_p = pick(logits[:rows], batch.action).log_softmax(-1)
     loss = -(wanted * log_p).sum(-1)
     priority = (loss - torch.special.entr(wanted).sum(-1)).clamp_min(0.0)
@@ -470,6 +486,7 @@ class UpdateGraph:
         """
         online = _parameters_of(self.network)
         target = _parameters_of(self.target)
+        # Adam's own state, so that a run can change to the other way and back
         moments = [self._moments(parameter) for parameter in online]
         step = float(moments[0]["step"]) + 1.0
         for state in moments:
@@ -485,6 +502,7 @@ class UpdateGraph:
             noise_of(self.network, generator),
             noise_of(self.target, generator),
             self._batch(batch),
+            # a tensor: a number would be a constant of the graph, compiled anew at each change
             torch.tensor(float(group["lr"])),
             torch.tensor(
                 [

@@ -82,6 +82,7 @@ class NStepWindow:
             discount), and ``next``'s ``observation``, ``reward`` (the n-step return),
             ``terminated``, and ``action_mask`` where there is one.
         """
+        # the oldest step is complete once there are n
         self.steps.append(Step.copied(step))
         if len(self.steps) < self.n:
             return None
@@ -93,7 +94,9 @@ class NStepWindow:
         length = torch.ones_like(reward)
         running = ~first.done
         for power, after in enumerate(later, start=1):
+            # ``running``: no episode has ended between the oldest step and this one
             reward = reward + running * (self.gamma**power * after.reward)
+            # what follows is the end of the last step that still belongs to it
             following = torch.where(running, after.following, following)
             if mask is not None and after.following_mask is not None:
                 mask = torch.where(running, after.following_mask, mask)

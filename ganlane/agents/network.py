@@ -91,6 +91,7 @@ class NetworkConfig:
         sizes = {"observation_size", "actions"}
         if description.keys() != sizes | set(SHAPE):
             raise UserError(f"expected the entries {', '.join((*sorted(sizes), *SHAPE))}")
+        # values come from a file, so their types are checked here
         options = {name: description[name] for name in SHAPE}
         for name, value in options.items():
             expected: Any = type(getattr(RainbowConfig, name))
@@ -143,10 +144,13 @@ class QNetwork(nn.Module):
         ``weights`` of :meth:`weights` save composing them again when several batches see the same
         noise.
         """
+        # each layer's weights are composed with the noise at this moment
         *hidden_layers, head = self.weights() if weights is None else weights
+        # observations may come in another precision
         hidden = observation.to(self.support.dtype)
         for weight, bias in hidden_layers:
             hidden = linear(hidden, weight, bias, relu=True)
+        # [*, (1 +) A, atoms]
         rows = linear(hidden, *head).unflatten(-1, (-1, self.config.outputs))
         return duel(rows) if self.config.agent.dueling else rows
 
@@ -201,6 +205,7 @@ def load_parameters(network: QNetwork, weights: Mapping[str, Tensor]) -> None:
         UserError: names or shapes differ.
     """
     parameters = dict(network.named_parameters())
+    # names and shapes first: nothing is copied where one of them differs
     expected = {name: tuple(value.shape) for name, value in parameters.items()}
     shapes = {name: tuple(value.shape) for name, value in weights.items()}
     for name in sorted(expected.keys() | shapes.keys()):
@@ -222,6 +227,7 @@ def redraw_noise(network: nn.Module, generator: torch.Generator) -> None:
     all layers.
     """
     for layer, (inputs, outputs) in zip(noisy_layers(network), noise_of(network, generator)):
+        # in place: the layer's buffers, which its forward adds
         torch.outer(outputs, inputs, out=layer.weight_epsilon)
         layer.bias_epsilon.copy_(outputs)
 
@@ -231,8 +237,10 @@ def noise_of(network: nn.Module, generator: torch.Generator) -> list[tuple[Tenso
     layers = noisy_layers(network)
     if not layers:
         return []
+    # one draw for all layers, which is faster than one for each
     sizes = [size for layer in layers for size in (layer.in_features, layer.out_features)]
     normal = torch.randn(sum(sizes), generator=generator, device=generator.device)
+    # f(x) = sgn(x) sqrt(|x|), equation 11 of Fortunato et al.
     noise = (normal.sign() * normal.abs().sqrt()).split(sizes)
     return list(zip(noise[::2], noise[1::2]))
 
@@ -250,6 +258,7 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> Tenso
     AMD processors; oneDNN computes the same in full precision in half the time there, and in no
     more time elsewhere.
     """
+    # oneDNN's operator takes 2-d float32 on a CPU, nothing else
     fast = _ONEDNN and x.device.type == "cpu" and x.dtype == torch.float32 and x.dim() == 2
     if fast and not torch.is_grad_enabled():
         return _product(x, weight, bias, relu)

@@ -79,6 +79,7 @@ class Rainbow:
             name: torch.Generator(self.device).manual_seed(seed * 3 + i)
             for i, name in enumerate(("collect", "learn", "replay"))
         }
+        # layers draw their initial weights from the global generator
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(seed)
             network = QNetwork(NetworkConfig(config, observation_size, actions))
@@ -93,6 +94,7 @@ class Rainbow:
             if config.distributional
             else LeanDQNLoss(self.network, config.gamma, config.double)
         )
+        # Rainbow's 1.5e-4 is 0.005 over its batch of 32
         adam_eps = 0.005 / config.batch_size if config.adam_eps is None else config.adam_eps
         self.optimizer = torch.optim.Adam(
             self.network.parameters(),
@@ -103,6 +105,7 @@ class Rainbow:
         self.replay = make_replay(config, self.generators["replay"])
         self.policy = ExploringPolicy(self.network, self.generators["collect"], legal)
         self.greedy = GreedyPolicy(self.network)
+        # since the start of the training
         self.updates = 0
         self.graph: UpdateGraph | None = None
         # The graph is of the whole of Rainbow; with any part left out the update is computed step
@@ -161,12 +164,14 @@ class Rainbow:
                 self.updates,
                 config.beta_updates,
             )
+        # one batch by priority
         batch = draw(self.replay)
         descend = self._descend if self.graph is None else self.graph
         learned = descend(batch, self.generators["learn"])
         if config.prioritised:
             self.replay.sampler.update_priority(batch.get("index"), learned.priority)
         self.updates += 1
+        # a hard copy, as in Rainbow
         if self.updates % config.target_period == 0:
             self.loss.update_target()
         return {
@@ -176,6 +181,7 @@ class Rainbow:
 
     def _descend(self, batch: TensorDict, generator: torch.Generator) -> Learned:
         """What :class:`~ganlane.agents.loss.UpdateGraph` does, for every ``config`` and device."""
+        # both networks get new noise for every update
         for module in (self.network, self.loss.target_network):
             redraw_noise(module, generator)
         terms = self.loss(batch)
@@ -264,6 +270,7 @@ class Rainbow:
         for name, generator in self.generators.items():
             generator.set_state(state["generators"][name].cpu())
         self.updates = state["updates"]
+        # without the buffer in the state it is filled again by the run
         self.replay.empty()
         if state["replay"] is not None:
             load_replay_state(self.replay, state["replay"])

@@ -68,6 +68,7 @@ def draw(buffer: TensorDictReplayBuffer) -> TensorDict:
 
 def replay_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
     """Plain data: the transitions in use (by dotted key), the place of the next, the sampler."""
+    # in the order of the storage, so that the indices of the sampler hold
     rows = buffer[:] if len(buffer) else TensorDict({}, [0])
     tensors = dict(rows.select(*TRANSITION_KEYS, MASK_KEY, strict=False).flatten_keys(".").items())
     # a view would be saved with all of the storage behind it
@@ -89,6 +90,7 @@ def load_replay_state(buffer: TensorDictReplayBuffer, state: dict[str, Any]) -> 
     buffer.empty()
     if state["rows"]:
         buffer.extend(TensorDict(state["rows"], [len(state["rows"]["action"])]).unflatten_keys("."))
+    # extend has moved the cursor; after a wrap it stands elsewhere
     buffer.writer._cursor = state["cursor"]
     buffer.writer._write_count = state["writes"]
     buffer.sampler.load_state_dict(state["sampler"])
@@ -123,6 +125,7 @@ class RowSampler(PrioritizedSampler):
         self._init()
 
     def _init(self) -> None:
+        # rounded up
         rows = -(-self._max_capacity // ROW)
         self.priorities = torch.zeros(rows, ROW, device=self._device)
         self.row_sums = torch.zeros(rows, dtype=torch.float64, device=self._device)
@@ -187,12 +190,14 @@ class RowSampler(PrioritizedSampler):
         within = self.priorities[row].double().cumsum(-1)
         column = (within <= _below(rest, within[:, -1])[:, None]).sum(-1)
         index = row * ROW + column
+        # the item with the smallest priority has the largest weight, which becomes 1
         chosen = self.priorities.view(-1)[index]
         weight = (chosen / chosen.amin()) ** -self._beta
         return index, {"priority_weight": weight}
 
     def state_dict(self) -> dict[str, Any]:
         """Priorities of the rows in use, the largest priority, and beta."""
+        # rows fill up from the first on
         used = int((self.row_sums > 0).sum())
         return {
             "priorities": self.priorities[:used].clone(),

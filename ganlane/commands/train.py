@@ -36,12 +36,15 @@ def train(config: TrainConfig, folder: Path) -> str:
     for traffic in config.all_traffic():
         make_traffic(traffic, config.env)
     others = make_drivers(config.evaluation.agents, config.env, config.device)
+    # decisions, updates and wall time by phase
     lengths: dict[str, dict[str, float]] = {}
     for phase in phases_of(config, folder):
+        # a resumed run does not repeat a first phase that is over
         finished = length_if_finished(config, phase)
         if finished is not None:
             lengths[phase.name] = finished
             continue
+        # stopped before its first checkpoint, a phase starts anew
         last = phase.folder / LAST
         resume = last if config.resume is not None and last.is_file() else None
         result = run_phase(config.compiled(), phase, resume)
@@ -50,6 +53,7 @@ def train(config: TrainConfig, folder: Path) -> str:
                 f"saved; go on with: ganlane train resume={folder}",
                 file=sys.stderr,
             )
+            # the exit status says by which signal
             raise Stopped(result.stopped_by)
         lengths[phase.name] = {
             "decisions": result.decisions,
@@ -64,6 +68,7 @@ def train(config: TrainConfig, folder: Path) -> str:
         ),
         name=TRAINED,
     )
+    # the trained agent and the others drive the same episodes
     table = compare([trained, *others], config.final_evaluation())
     seeds = {
         "training": config.seed,

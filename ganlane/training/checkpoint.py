@@ -58,6 +58,7 @@ class TrainingState:
         agent: Rainbow,
         identity: Mapping[str, Any] | None = None,
     ) -> None:
+        # what the run consists of, in the order of a decision
         self.collector = Collector(env)
         self.agent = agent
         self.identity = dict(identity or {})
@@ -93,6 +94,7 @@ class TrainingState:
         """
         return {
             "agent": self.agent.state_dict(with_replay),
+            # None marks what a light checkpoint leaves out
             "window": self.window.state_dict() if with_replay else None,
             "env_state": self.collector.state_dict(with_replay),
             "stats": self.stats.state_dict() if with_replay else None,
@@ -131,8 +133,10 @@ class TrainingState:
             raise UserError(
                 f"resume={path}: it does not say what run it is of; give another checkpoint."
             )
+        # by dotted name, as on the command line
         before = flat(state["identity"])
         now = flat(self.identity)
+        # the first difference is enough for a sentence
         for name in (*now, *before):
             if name not in COMPUTED_BY and before.get(name) != now.get(name):
                 raise UserError(
@@ -155,6 +159,7 @@ class TrainingState:
 
     def _take_over(self, state: Mapping[str, Any], path: str | Path) -> None:
         """Restore everything from ``state``; see :meth:`restore`."""
+        # with the window and the buffer everything goes on where it stopped
         exact = state["window"] is not None
         fresh = self.collector.state_dict(exact)
         shape = state["env_state"]["batch_size"]
@@ -163,6 +168,7 @@ class TrainingState:
                 f"resume={path}: saved with environments of shape {shape}, this run has "
                 f"[{self.environments}]; use the same number."
             )
+        # the agent first: the checks compare Adam's moments with its weights
         self.agent.load_state_dict(state["agent"])
         check_parts(state, self.agent, fresh, self.stats)
         self.collector.load_state_dict(state["env_state"], exact)
@@ -209,6 +215,7 @@ class Checkpointer:
         save_checkpoint(self.path, self.state.state_dict(self.with_replay))
         self.save_weights("last", {})
         self.saved_s = time.monotonic()
+        # a slow disk must not slow down the training
         self.pause_s = max(self.every_s, PATIENCE * (self.saved_s - begun))
 
     def save_weights(self, name: str, figures: Mapping[str, Any]) -> None:
@@ -233,6 +240,7 @@ class Checkpointer:
 
 def save_checkpoint(path: str | Path, state: Any) -> None:
     """Write ``state`` (tensors and plain data) atomically, with a checksum of the whole file."""
+    # a kill while writing leaves the checkpoint before it
     with atomic_path(path) as part:
         torch.save({"kind": KIND, "version": VERSION, "state": state}, part)
         seal_archive(part)
@@ -261,6 +269,7 @@ def load_checkpoint(
             option,
         )
     try:
+        # weights_only: no pickled object is made, no code runs
         content = torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # arbitrary bytes can make the unpickler fail in any way
         raise UserError(
@@ -330,6 +339,7 @@ def check_parts(
     network = agent.network.config
     counters = state["counters"]
     replay = state["agent"]["replay"]
+    # each moment has the shape of its parameter
     moments = agent.optimizer.state_dict()["state"]
     adam = {
         row: {
@@ -356,10 +366,13 @@ def check_parts(
         _check_replay(replay, agent)
     if state["window"] is None:  # the resumed run will not be exact
         return
+    # the environments, and whether their masks are in the buffer too
     check_like(state["env_state"], environments, "env_state")
+    # masks are there in both or in neither
     mask = environments["items"].get(keys.ACTION_MASK)
     if replay["rows"] and (MASK in replay["rows"]) != (mask is not None):
         raise ValueError("replay: its masks are those of another run")
+    # each step of the window is like a row of the buffer
     rows = transitions(len(stats.discount), network)
     steps = state["window"]["steps"]
     observation = rows["observation"]
@@ -380,6 +393,7 @@ def check_parts(
     )
     for step in steps:
         _check_actions(step["action"], network)
+    # sums may be absent (nothing happened yet), never of another shape
     saved = state["stats"]
     one = torch.zeros((), dtype=torch.float64)
     sums = {
@@ -399,6 +413,7 @@ def _check_replay(replay: Mapping[str, Any], agent: Rainbow) -> None:
     rows = replay["rows"]
     cursor = replay["cursor"]
     config = agent.config
+    # the buffer holds rows 0 to count - 1
     count = len(rows["action"]) if rows else 0
     check_like(replay, {"cursor": 0, "writes": 0}, "replay")
     if rows:
@@ -412,6 +427,7 @@ def _check_replay(replay: Mapping[str, Any], agent: Rainbow) -> None:
         steps = rows["steps_to_next_obs"]
         if ((steps < 1) | (steps > config.n_step)).any():
             raise ValueError("replay: transitions of more steps than the run's")
+    # until it is full the next row is the first free one, then any
     if not (cursor == count < config.capacity or cursor < count == config.capacity):
         raise ValueError(f"replay: {count} rows of {config.capacity}, the next one is {cursor}")
     if config.prioritised:
@@ -434,6 +450,7 @@ def _check_actions(taken: Tensor, network: NetworkConfig) -> None:
 
 def transitions(rows: int, network: NetworkConfig) -> dict[str, Tensor]:
     """Shapes and types of the rows of the replay buffer as meta tensors, by dotted key."""
+    # meta tensors have shape and type, and take no memory
     number = torch.empty(rows, 1, device="meta")
     observation = number.expand(rows, network.observation_size)
     after = {

@@ -31,6 +31,7 @@ class Collector:
         Row i continues row i of the last step. ``next`` is the outcome before any reset: ended
         environments are reset in ``env_state``, not in the returned step.
         """
+        # the policy writes its action into the state itself
         decided = agent.policy(self.env_state)
         with threads_for(self.env):
             step, self.env_state = self.env.step_and_maybe_reset(decided)

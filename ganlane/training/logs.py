@@ -104,6 +104,7 @@ class Logs:
 
     def write(self, row: Mapping[str, float]) -> None:
         """Write a row of metrics, with the decisions per second since the last one."""
+        # the rate since the last row, whatever the rows before the resume say
         now = monotonic()
         rate = (row["decisions"] - self._last) / max(now - self._last_s, 1e-9)
         self._last = int(row["decisions"])
@@ -163,6 +164,7 @@ class CsvLog:
         decisions: int = 0,
     ) -> None:
         self.path = Path(path)
+        # rows after the checkpoint are made again
         rows = [row for row in read_rows(self.path) if float(row["decisions"]) <= decisions]
         form: Any = {
             "fieldnames": columns,
@@ -173,6 +175,7 @@ class CsvLog:
             atomic_path(self.path) as part,
             part.open("w", newline="") as file,
         ):
+            # the columns of today, even if the old file had others
             writer = csv.DictWriter(file, **form)
             writer.writeheader()
             writer.writerows(rows)
@@ -181,6 +184,7 @@ class CsvLog:
 
     def write(self, row: Mapping[str, float]) -> None:
         """Append one line."""
+        # six digits are enough to plot, and a fraction of the size
         short = {
             name: format(value, ".6g") if isinstance(value, float) else value
             for name, value in row.items()
@@ -205,6 +209,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         return []
     try:
         with path.open(newline="", encoding="utf-8") as file:
+            # the last line may be cut off
             whole = [line for line in file if line.endswith("\n")]
         # DictReader gives missing entries of a short row as None, and surplus ones of a long row
         # under the key None.
@@ -261,6 +266,7 @@ class Progress:
 
     def write(self, row: Mapping[str, float]) -> None:
         """Show a row of figures."""
+        # a row without ended episodes lacks some of them
         self.figures |= {name: row[name] for name in SHOWN if name in row}
         shown = [
             form.format(self.figures[name]) for name, form in SHOWN.items() if name in self.figures
@@ -269,6 +275,7 @@ class Progress:
             self._bar.set_postfix_str(", ".join(shown))
             return
         rate = max(row.get("decisions_per_s", 0.0), 1e-9)
+        # remaining time at the rate of the last interval
         minutes, seconds = divmod(
             round(max(self.total - row["decisions"], 0.0) / rate),
             60,
@@ -351,6 +358,7 @@ class WandbLog:
         wandb = _module("wandb", "wandb")
         mode = os.environ.get("WANDB_MODE") or "offline"
         folder = Path(folder)
+        # else W&B falls back to a temporary folder
         folder.mkdir(parents=True, exist_ok=True)
         name = "/".join(folder.absolute().parts[-2:])
         options: dict[str, Any] = {

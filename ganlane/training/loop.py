@@ -53,10 +53,12 @@ def noted_signals() -> Iterator[list[int]]:
     noted: list[int] = []
 
     def note(number: int, frame: FrameType | None) -> None:
+        # the second Ctrl-C of someone who cannot wait
         if noted and number == signal.SIGINT:
             raise KeyboardInterrupt
         noted.append(number)
 
+    # signals can be handled in the main thread alone
     previous = {}
     if threading.current_thread() is threading.main_thread():
         previous = {number: signal.signal(number, note) for number in STOPPING}
@@ -103,6 +105,7 @@ def train(
         UserError: the checkpoint is unreadable or of another run.
     """
     state = TrainingState(env, agent, identity)
+    # None: everything could be restored
     missing = None if resume is None else state.restore(resume)
     saver = Checkpointer(
         state,
@@ -113,12 +116,14 @@ def train(
     )
     actions = agent.network.config.actions
     shown = config.total_decisions if config.logger.progress else None
+    # logs are closed, and their last rows written, whatever ends the run
     with closing(Logs(run_folder, actions, state.decisions, shown, logs)) as log:
         if missing is not None:
             log.say(f"resumed without {missing}; not bit-exact")
         if state.decisions == 0:
             saver.save()  # a run that is killed at any time can be resumed
         with noted_signals() as signals:
+            # a signal ends the run between two decisions
             while state.decisions < config.total_decisions and not signals:
                 advance(state)
                 log.advance(state.decisions)
@@ -128,6 +133,7 @@ def train(
                     keep_best(state, evaluate, log, saver)
                 if saver.due():
                     saver.save()
+            # the last agent is evaluated too, unless that has just been done
             if evaluate is not None and not signals and state.evaluated_at < state.decisions:
                 keep_best(state, evaluate, log, saver)
             saver.save()
@@ -168,6 +174,7 @@ def learn(state: TrainingState) -> None:
     agent = state.agent
     if not agent.ready:
         return
+    # decisions that do not fill an update are kept for the next step
     state.pending_decisions += state.environments
     while state.pending_decisions >= agent.config.decisions_per_update:
         state.stats.update(agent.update())
@@ -196,6 +203,7 @@ def keep_best(
     saver: Checkpointer,
 ) -> None:
     """Evaluate the greedy policy; save it if it is the best so far."""
+    # noted first: an evaluation is not repeated at the end
     state.evaluated_at = state.decisions
     row = dict(evaluate(state.agent.greedy))
     log.write_evaluation({"decisions": state.decisions, **row})

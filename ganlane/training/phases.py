@@ -87,6 +87,7 @@ def phases_of(config: TrainConfig, folder: Path) -> list[Phase]:
     before = config.pretrain
     if before.total_decisions == 0 or before.traffic is None:
         return [main]
+    # the second phase starts from the agent that the first one leaves
     first = Phase(
         "pretrain",
         folder / "pretrain",
@@ -109,6 +110,7 @@ def length_if_finished(config: TrainConfig, phase: Phase) -> dict[str, float] | 
     path = phase.folder / AGENT_FILE
     if phase.name != "pretrain" or not path.is_file():
         return None
+    # the file is written at the end of the phase, with its length
     training = read_agent(path)[2]["training"]
     done = training["decisions"]
     wanted = phase.total_decisions
@@ -186,6 +188,7 @@ def make_selection(config: TrainConfig, traffic: TrafficConfig) -> Evaluate:
     """A function that evaluates the greedy policy on episodes that are never trained on."""
     make = env_maker(config, traffic, Stream.SELECT)
     env = make(min(config.selection_episodes, config.evaluation.num_envs))
+    # the same episodes in every call, so that figures can be compared
     episodes = range(config.selection_episodes)
     smaller = None if config.env.compile else make
 
@@ -198,6 +201,7 @@ def make_selection(config: TrainConfig, traffic: TrafficConfig) -> Evaluate:
             crashes=pl.col("reason") == "hard_crash",
         ).sum()
         reward, changes, distance_m, crashes = (float(value) for value in total.row(0))
+        # of the mean reward over the episodes
         spread = float(np.std(table["reward"].to_numpy()))
         return {
             "mean_reward": reward / table.height,
@@ -243,6 +247,7 @@ def read_start(name: str, key: str = "init.path") -> Start:
             f"{key}={path}: no such file; give a training run's folder, its {LAST}, or an agent's "
             "file."
         )
+    # a run's checkpoint also has the moments, and the observation in its identity
     state = load_checkpoint(path, key=key)
     try:
         agent = state["agent"]
@@ -278,6 +283,7 @@ def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
 
     One that will get trained weights explores little.
     """
+    # a falling learning rate reaches its end with the phase
     options = config.agent.for_phase(phase.total_decisions)
     if phase.init is not None:
         options = replace(
@@ -306,6 +312,7 @@ def make_initial_agent(
         UserError: the agent to start from does not fit.
     """
     adopts = config.init.support == "trained"
+    # a resumed agent gets its weights from the checkpoint, later
     resumed = resume is not None
     if phase.init is None or (resumed and not adopts):
         return config, make_agent(config, phase)
@@ -313,6 +320,7 @@ def make_initial_agent(
     if not resumed:
         check_observation(start, config.observation)
     if adopts:
+        # what the outputs of the trained network stand for
         support = {name: getattr(start.network.agent, name) for name in SUPPORT}
         config = replace(config, agent=replace(config.agent, **support))
     agent = make_agent(config, phase)
@@ -361,6 +369,7 @@ def save_final_agent(
     if result.best is not None and best.is_file():
         weights, _, saved = read_agent(best)
         load_parameters(agent.network, weights)
+        # what the evaluation added to the metadata of the best agent
         figures = {name: value for name, value in saved["training"].items() if name not in training}
         selected = {
             **figures,

@@ -1,12 +1,10 @@
-"""The lean losses equal TorchRL's, the projection a reference, and the whole update autograd and
-Adam.
-"""
+"""The lean losses equal TorchRL's, the whole update autograd and Adam."""
 
 from copy import deepcopy
 
 import pytest
 import torch
-from tensordict import TensorDict
+from agents_small import transitions
 from torchrl.objectives import DistributionalDQNLoss, DQNLoss
 
 from ganlane.agents import (
@@ -27,24 +25,8 @@ from ganlane.runtime import has_compiler
 SIZE = 5
 
 
-def batch(seed=0, rows=64, scale=3.0):
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape):
-        return torch.randn(shape, generator=generator)
-
-    content = {
-        "observation": normal(rows, SIZE),
-        "action": torch.randint(0, 3, (rows,), generator=generator),
-        "steps_to_next_obs": torch.randint(1, 4, (rows, 1), generator=generator).float(),
-    }
-    after = {
-        "observation": normal(rows, SIZE),
-        "reward": scale * normal(rows, 1),
-        "terminated": torch.rand(rows, 1, generator=generator) < 0.3,
-        "done": torch.rand(rows, 1, generator=generator) < 0.3,
-    }
-    return TensorDict({**content, "next": after}, [rows])
+def batch(rows=64, scale=3.0):
+    return transitions(SIZE, rows, scale=scale, most_steps=3)
 
 
 def network(**options):
@@ -186,9 +168,7 @@ def test_the_target_network_is_torchrls_target_parameters():
 @pytest.mark.parametrize("double", [True, False])
 @pytest.mark.parametrize("distributional", [True, False])
 def test_the_next_action_is_one_that_the_mask_allows(distributional, double):
-    """Where one next action alone is allowed, the target is that of a network to which it is the
-    best.
-    """
+    """Where one next action alone is allowed, it counts as the best."""
     kind, options = (
         (LeanDistributionalLoss, {}) if distributional else (LeanDQNLoss, {"distributional": False})
     )
@@ -199,7 +179,7 @@ def test_the_next_action_is_one_that_the_mask_allows(distributional, double):
             double=double,
         )
     )
-    data = batch()
+    data = batch(scale=1.0)  # no target may lie wholly outside the support
     only = torch.randint(0, 3, (64,), generator=torch.Generator().manual_seed(1))
     data["next", "action_mask"] = torch.nn.functional.one_hot(only, 3).bool()
     masked = loss(data.clone())["loss"]
@@ -227,23 +207,23 @@ def agent(graph=None, masked=False, **options):
         "target_period": 3,
     }
     config = RainbowConfig(**{**usual, "v_min": -20.0, "v_max": 20.0, **options})
-    made = Rainbow(config, SIZE, seed=0)
+    learner = Rainbow(config, SIZE, seed=0)
     data = batch(rows=600, scale=30.0)  # some targets lie outside the support
     if masked:
         data["next", "action_mask"] = (
             torch.rand(600, 3, generator=torch.Generator().manual_seed(1)) < 0.6
         )
         data["next", "action_mask"][:, 0] = True
-    made.store(data)
+    learner.store(data)
     if graph is not None:
-        made.graph = UpdateGraph(
-            made.network,
-            made.loss,
-            made.optimizer,
+        learner.graph = UpdateGraph(
+            learner.network,
+            learner.loss,
+            learner.optimizer,
             config,
             compile=graph,
         )
-    return made
+    return learner
 
 
 def assert_close(one, other):
@@ -265,11 +245,11 @@ def run_both(graph, masked=False, updates=8, **options):
     graphed = agent(graph, masked, **options)
     for _ in range(updates):
         expected = plain.update()
-        found = graphed.update()
-        assert found.keys() == expected.keys()
+        actual = graphed.update()
+        assert actual.keys() == expected.keys()
         for name, value in expected.items():
             torch.testing.assert_close(
-                found[name],
+                actual[name],
                 value.detach(),
                 atol=1e-5,
                 rtol=1e-4,
@@ -307,13 +287,14 @@ def test_training_can_change_from_one_way_to_the_other_and_be_resumed():
     plain, graphed = run_both(False)
     resumed = agent(False)
     resumed.load_state_dict(deepcopy(plain.state_dict()))
-    for each in (plain, graphed, resumed):
-        each.update()
+    for learner in (plain, graphed, resumed):
+        learner.update()
     assert_close(plain, graphed)
     assert_close(plain, resumed)
     back = agent()
     back.load_state_dict(deepcopy(graphed.state_dict()))
-    back.update(), plain.update()
+    back.update()
+    plain.update()
     assert_close(plain, back)
 
 

@@ -27,8 +27,9 @@ from torchrl.envs import EnvBase, GymEnv, SerialEnv
 
 from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.agents import GreedyPolicy, Rainbow, RainbowConfig
+from ganlane.settings.train import LoggerConfig, TrainConfig
 from ganlane.evaluation.table import Table
-from ganlane.training import TrainingConfig, train
+from ganlane.training.loop import train
 
 BEGIN, END = "<!-- cartpole: begin -->", "<!-- cartpole: end -->"
 #: CartPole ends after 500 steps; with a discount of 0.99 a perfect policy's return is 99.3. Noise
@@ -114,7 +115,13 @@ def run(seed: int, frames: int) -> Outcome:
     """Train one seed."""
     outcome, begun = Outcome(seed), time.monotonic()
     agent = Rainbow(CONFIG, observation_size=4, actions=2, seed=seed)
-    config = TrainingConfig(frames, log_every=EVERY, evaluate_every=EVERY, checkpoint_every_s=1e9)
+    config = TrainConfig(
+        total_decisions=frames,
+        log_every=EVERY,
+        evaluate_every=EVERY,
+        checkpoint_every_s=1e9,
+        logger=LoggerConfig(),
+    )
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(Solved):
         result = train(make_env(seed), agent, config, folder, evaluate, logs=[outcome])
         if result.stopped_by is not None:

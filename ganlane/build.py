@@ -264,8 +264,8 @@ def mask_of(metadata: dict[str, Any]) -> MaskParameters | None:
         UserError: an unknown mask.
     """
     try:
-        mask = MaskParameters(**metadata.get("mask", {}))
-    except TypeError as error:
+        mask = MaskParameters(**metadata["mask"])
+    except (KeyError, TypeError) as error:
         raise UserError(
             f"the agent's metadata name no mask that is known here ({error}); train it again."
         ) from error

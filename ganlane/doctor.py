@@ -69,7 +69,6 @@ EXTRAS: Final = {
     "native": ("env.kernel=native without a compiler", ("ziglang>=0.13",)),
     "sumo": ("traffic=sumo", ("eclipse-sumo>=1.20", "libsumo>=1.20")),
     "wandb": ("logger=wandb", ("wandb>=0.18",)),
-    "ray": ("distributed collection", ("ray>=2.40",)),
     "sweeps": ("sweeps in several processes", ("hydra-joblib-launcher>=1.2",)),
     "slurm": ("sweeps as Slurm jobs", ("hydra-submitit-launcher>=1.2",)),
     "ray-sweeps": ("sweeps on a Ray cluster", ("hydra-ray-launcher>=1.2.1",)),

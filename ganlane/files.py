@@ -13,11 +13,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
 from mmap import mmap
 from pathlib import Path
 from typing import Any
@@ -188,7 +186,7 @@ def seal_archive(path: Path) -> None:
 
 
 def has_checksum(content: bytes | mmap, path: str | Path) -> bool:
-    """Whether ``content`` has a checksum; files of ganlane 0.2 and before have none.
+    """Whether ``content`` has a checksum.
 
     Raises:
         UserError: it has one that does not match; ``path`` is named as the damaged file.
@@ -214,10 +212,9 @@ def _digits(content: bytes | mmap, begin: int) -> bytes:
     return digest.hexdigest().encode()
 
 
-@cache
-def note_without_checksum(path: str | Path) -> None:
-    """Warn once per file that a version without checksums wrote it."""
-    print(
-        f"{path}: of a version that wrote no checksum; damage to it would not be seen.",
-        file=sys.stderr,
+def refuse_without_checksum(path: str | Path) -> None:
+    """Raise :class:`UserError`: a file that ganlane writes with a checksum has lost it."""
+    raise UserError(
+        f"{path}: damaged, the checksum that was written with it is missing; take a copy that is "
+        "whole, or make it again."
     )

@@ -44,20 +44,27 @@ def decisions(folder):
 
 
 def test_a_run_leaves_agent_metrics_config_and_table(finished):
-    folder, results = finished, json.loads((finished / "results.json").read_text())
-    assert [row["agent"] for row in results["rows"]] == ["trained", "mobil", "random_legal"]
+    folder = finished
+    results = json.loads((finished / "results.json").read_text())
+    assert [row["agent"] for row in results["rows"]] == [
+        "trained",
+        "mobil",
+        "random_legal",
+    ]
     assert results["decisions"] == 320
     assert results["updates"] > 0
     assert decisions(folder) == [160, 320]
     weights, config, metadata = read_agent(folder / "agent.safetensors")
     assert weights
-    assert config.hidden == (16, 16)
+    assert config.agent.hidden == (16, 16)
     assert metadata["observation"] == "table3_progress"
     assert metadata["training"]["decisions"] == 320
     assert (folder / "config.yaml").is_file()
 
 
-def test_a_finished_run_goes_on_with_more_decisions_and_its_own_command_line(capsys):
+def test_a_finished_run_goes_on_with_more_decisions_and_its_own_command_line(
+    capsys,
+):
     folder, _ = train(capsys, "seed=5")
     assert main([f"resume={folder}", "total_decisions=480"]) == 0
     results = json.loads((folder / "results.json").read_text())
@@ -105,7 +112,10 @@ def test_a_signal_saves_and_the_run_can_be_resumed(number, capsys, tmp_path):
 
 
 def test_the_second_phase_starts_from_the_first_ones_agent(capsys):
-    phases = ["traffic@pretrain.traffic=idm_mobil", "pretrain.total_decisions=160"]
+    phases = [
+        "traffic@pretrain.traffic=idm_mobil",
+        "pretrain.total_decisions=160",
+    ]
     folder, results = train(capsys, *phases)
     assert results["phases"]["pretrain"]["decisions"] == 160
     assert (folder / "pretrain" / "agent.safetensors").is_file()
@@ -114,7 +124,11 @@ def test_the_second_phase_starts_from_the_first_ones_agent(capsys):
 
 
 def test_a_start_from_another_observation_is_refused(finished, capsys, tmp_path):
-    start = ["init=idm_ckpt", f"init.path={finished / 'agent.safetensors'}", "observation=table3"]
+    start = [
+        "init=idm_ckpt",
+        f"init.path={finished / 'agent.safetensors'}",
+        "observation=table3",
+    ]
     before = sorted(tmp_path.rglob("*"))
     assert main([*TINY, *start]) == 2
     assert "give observation=table3_progress" in capsys.readouterr().err
@@ -124,9 +138,25 @@ def test_a_start_from_another_observation_is_refused(finished, capsys, tmp_path)
 @pytest.mark.slow
 def test_a_sweep_gives_every_run_a_folder(capsys, tmp_path):
     short = [option for option in TINY if not option.startswith(("traffic=", "total_decisions="))]
-    assert main(["-m", *short, "total_decisions=16", "seed=0,1", "traffic=idm,idm_mobil"]) == 0
+    assert (
+        main(
+            [
+                "-m",
+                *short,
+                "total_decisions=16",
+                "seed=0,1",
+                "traffic=idm,idm_mobil",
+            ]
+        )
+        == 0
+    )
     results = sorted(tmp_path.glob("outputs/train_sweeps/*/*/results.json"))
-    assert [path.parent.name for path in results] == ["0", "1", "2", "3"]
+    assert [path.parent.name for path in results] == [
+        "0",
+        "1",
+        "2",
+        "3",
+    ]
     configs = [json.loads(path.read_text())["config"] for path in results]
     assert {(c["seed"], c["traffic"]["_target_"]) for c in configs} == {
         (seed, f"ganlane.traffic.{name}")
@@ -136,13 +166,22 @@ def test_a_sweep_gives_every_run_a_folder(capsys, tmp_path):
 
 
 def test_a_users_own_traffic_trains(capsys):
-    _, results = train(capsys, "traffic._target_=entry_own_parts.Cruise", "total_decisions=16")
+    _, results = train(
+        capsys,
+        "traffic._target_=entry_own_parts.Cruise",
+        "total_decisions=16",
+    )
     assert results["rows"][0]["traffic"] == "entry_own_parts.Cruise"
 
 
 @pytest.mark.parametrize(
     ("traffic", "init"),
-    [("idm", "idm_ckpt"), ("idm_mobil", "none"), ("gan", "idm_ckpt"), ("gan_calibrated", "none")],
+    [
+        ("idm", "idm_ckpt"),
+        ("idm_mobil", "none"),
+        ("gan", "idm_ckpt"),
+        ("gan_calibrated", "none"),
+    ],
 )
 def test_every_traffic_and_every_start_runs(traffic, init, capsys):
     budget = [
@@ -152,7 +191,11 @@ def test_every_traffic_and_every_start_runs(traffic, init, capsys):
         "agent.warmup=256",
         "log_every=64",
     ]
-    final = ["evaluation.agents=[keep_lane]", "evaluation.episodes=1", "agent.capacity=1000"]
+    final = [
+        "evaluation.agents=[keep_lane]",
+        "evaluation.episodes=1",
+        "agent.capacity=1000",
+    ]
     assert main([f"traffic={traffic}", f"init={init}", *budget, *final]) == 0
     results = last_path(capsys.readouterr().out)
     assert [row["traffic"] for row in json.loads(results.read_text())["rows"]] == [traffic, traffic]
@@ -173,7 +216,12 @@ def test_a_resume_with_other_settings_is_refused_and_leaves_the_run_as_it_was(
 ):
     folder = shutil.copytree(finished, tmp_path / "run")
     asked = (folder / "overrides.yaml").read_text()
-    for change in ("env.vehicles=5", "seed=5", "reward.goal=1000", "collector.num_envs=8"):
+    for change in (
+        "env.vehicles=5",
+        "seed=5",
+        "reward.goal=1000",
+        "collector.num_envs=8",
+    ):
         assert main([f"resume={folder}", "total_decisions=640", change]) == 2
         message = capsys.readouterr().err
         assert change.split("=")[0] in message

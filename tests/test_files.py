@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import polars as pl
@@ -35,6 +36,7 @@ from ganlane.files import (
     write_json,
 )
 from ganlane.generator import load_generator
+from ganlane.generator.checkpoint import cached, load_arrays, save_arrays
 from ganlane.generator.tasks import FitLoop
 from ganlane.settings.generator import LoopConfig, PaperConfig
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
@@ -114,7 +116,7 @@ def test_a_refusal_without_a_name_gets_that_of_the_file(number, tmp_path):
     with (
         pytest.raises(OSError, match=os.strerror(number)) as caught,
         atomic_path(tmp_path / "a") as part,
-    ):
+    ):  # noqa: PT012
         part.write_bytes(b"half")
         raise OSError(number, os.strerror(number))
     assert (caught.value.errno, caught.value.filename) == (number, str(tmp_path / "a"))
@@ -166,15 +168,14 @@ def test_a_folder_without_the_right_to_write_is_refused(tmp_path):
 # --- checksums
 
 
-class SmallFit(torch.nn.Module):
+class SmallFit:
     """The smallest model that a loop can fit."""
 
     config = PaperConfig(loop=LoopConfig(updates=1, evaluate_every=1))
 
     def __init__(self):
-        super().__init__()
-        self.net = torch.nn.Linear(2, 2)
-        self.optimisers = {"net": torch.optim.Adam(self.net.parameters())}
+        self.modules = {"net": torch.nn.Linear(2, 2)}
+        self.optimisers = {"net": torch.optim.Adam(self.modules["net"].parameters())}
         self.random = torch.Generator()
 
     def update(self, number: int) -> dict[str, float]:
@@ -251,13 +252,31 @@ def test_no_bit_of_a_content_can_change(seal):
                 has_checksum(flipped(content, place, bit), "file")
 
 
-def test_an_old_file_loads_with_one_note(tmp_path, capsys):
-    path = tmp_path / "old.safetensors"
+def test_a_damaged_cache_is_computed_again(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("GANLANE_CACHE", str(tmp_path))
+    compute = Mock(side_effect=lambda: {"labels": np.arange(3)})
+    for _ in range(2):
+        assert cached("groups", "key", compute)["labels"].tolist() == [0, 1, 2]
+    assert compute.call_count == 1
+    path = tmp_path / "groups_key.npz"
+    whole = path.read_bytes()
+    for place in range(len(whole)):
+        path.write_bytes(flipped(whole, place, place % 8))
+        assert load_arrays(path) is None
+    assert capsys.readouterr().err.count("computed again") == len(whole)
+    assert cached("groups", "key", compute)["labels"].tolist() == [0, 1, 2]
+    assert (compute.call_count, path.read_bytes()) == (2, whole)
+    np.savez_compressed(path, labels=np.arange(4))  # as older versions wrote it
+    assert cached("groups", "key", compute)["labels"].tolist() == [0, 1, 2]
+    save_arrays(path, {"labels": np.arange(5)})
+    assert cached("groups", "key", compute)["labels"].tolist() == [0, 1, 2, 3, 4]
+
+
+def test_a_file_that_lost_its_checksum_is_refused(tmp_path):
+    path = tmp_path / "agent.safetensors"
     save_file({"a": torch.ones(2)}, path, metadata={"ganlane": '{"kind": "agent"}'})
-    for _ in range(3):
+    with pytest.raises(UserError, match="the checksum that was written with it is missing"):
         load_weights(path, "agent")
-    note = f"{path}: of a version that wrote no checksum; damage to it would not be seen.\n"
-    assert capsys.readouterr().err == note
 
 
 def test_what_ships_has_checksums(capsys):

@@ -109,7 +109,6 @@ STORED = {
     "a launcher elsewhere": ["hydra/launcher=../../evil"],
     "Hydra's places to search": ["hydra.searchpath=['file://.']"],
     "Hydra's log": ["hydra.job_logging.handlers.x={(): evil.make}"],
-    "a cluster": ["collector=ray", "collector.address=evil.example:6379"],
 }
 
 

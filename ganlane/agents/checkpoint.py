@@ -5,8 +5,7 @@ from them.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,16 @@ from torch import Tensor
 
 from ganlane._version import __version__
 from ganlane.agents.drivers import GreedyPolicy
-from ganlane.agents.network import NetworkConfig, QNetwork, load_parameters
+from ganlane.agents.network import (
+    SHAPE,
+    NetworkConfig,
+    QNetwork,
+    load_parameters,
+)
 from ganlane.agents.rainbow import Rainbow
 from ganlane.errors import UserError, as_typed
 from ganlane.files import CHECKPOINTS
-from ganlane.settings.agent import without_removed
+from ganlane.settings.agent import RainbowConfig
 from ganlane.weights import load_weights, save_weights
 
 #: Agents that come with the package; others are given by their path.
@@ -33,13 +37,18 @@ SUPPORT = ("atoms", "v_min", "v_max")
 def _place(name: str | Path) -> tuple[Path, int | None]:
     """File of an agent, and its seed if the file holds several trainings."""
     recipe, _, digits = str(name).rpartition("@")
-    if digits.isdecimal() and (recipe in SHIPPED or recipe.endswith(".safetensors")):
-        if recipe not in SHIPPED:
-            return Path(recipe), int(digits)
-        if int(digits):
-            return _seeds_file(recipe), int(digits)
-        name = recipe
-    return CHECKPOINTS / f"{name}.safetensors" if name in SHIPPED else Path(name), None
+    if digits.isdecimal():
+        seed = int(digits)
+        if recipe in SHIPPED and seed > 0:
+            return _seeds_file(recipe), seed
+        if recipe in SHIPPED:
+            name = recipe  # training 0 is the shipped agent itself
+        elif recipe.endswith(".safetensors"):
+            return Path(recipe), seed
+    return (
+        CHECKPOINTS / f"{name}.safetensors" if name in SHIPPED else Path(name),
+        None,
+    )
 
 
 def _seeds_file(recipe: str) -> Path:
@@ -53,18 +62,19 @@ def names_agent(name: str) -> bool:
     ``@SEED`` may follow.
     """
     recipe, _, digits = name.rpartition("@")
+    # a file's own name may end in @ and digits
+    places = (name, recipe) if digits.isdecimal() else (name,)
     return any(
-        each in SHIPPED or each.endswith(".safetensors") or os.path.isfile(each)
-        for each in (name, recipe if digits.isdecimal() else name)
+        place in SHIPPED or place.endswith(".safetensors") or os.path.isfile(place)
+        for place in places
     )
 
 
 def with_seeds(name: str) -> list[str]:
-    """``agent_idm@all`` as ``agent_idm@0``, ``agent_idm@1`` ..., all trainings there are; other
-    names alone.
+    """``agent_idm@all`` as ``agent_idm@0``, ``agent_idm@1`` ..., all trainings there are.
 
-    ``FILE@all`` stands for all agents of a file of :func:`save_agents`. A mask (``+safe``) may
-    follow.
+    ``FILE@all`` stands for all agents of a file of :func:`save_agents`; a mask (``+safe``) may
+    follow. Other names stand alone.
 
     Raises:
         UserError: no such agent or file.
@@ -72,18 +82,22 @@ def with_seeds(name: str) -> list[str]:
     recipe, every, mask = name.partition("@all")
     if not every:
         return [name]
-    shipped = recipe in SHIPPED
-    packed = _seeds_file(recipe) if shipped else Path(recipe)
-    if shipped and not packed.is_file():
+    if recipe not in SHIPPED:
+        # a file of one's own, with several trainings
+        seeds = sorted(_read_several(Path(recipe))[1])
+    elif _seeds_file(recipe).is_file():
+        seeds = [0, *sorted(_read_several(_seeds_file(recipe))[1])]
+    else:
         raise UserError(
-            f"{name}: only the training {recipe}@0 is installed, since a wheel holds no further ones; "
-            "give that, or run pip install -e . in a clone."
+            f"{name}: only the training {recipe}@0 is installed (a light wheel); give that, or "
+            "install from a clone."
         )
-    seeds = sorted(_read_several(packed)[1])
-    return [f"{recipe}@{seed}{mask}" for seed in ([0, *seeds] if shipped else seeds)]
+    return [f"{recipe}@{seed}{mask}" for seed in seeds]
 
 
-def _read_several(path: Path) -> tuple[dict[str, Tensor], dict[int, dict[str, Any]]]:
+def _read_several(
+    path: Path,
+) -> tuple[dict[str, Tensor], dict[int, dict[str, Any]]]:
     """Tensors and, by seed, metadata of a file of :func:`save_agents`."""
     tensors, metadata = load_weights(path, SEVERAL)
     agents = metadata.get("agents")
@@ -91,20 +105,22 @@ def _read_several(path: Path) -> tuple[dict[str, Tensor], dict[int, dict[str, An
         seed.isdecimal() and type(agents[seed]) is dict for seed in agents
     ):
         raise UserError(f"{path}: its list of agents is not understood; pack the trainings anew.")
-    return tensors, {int(seed): known for seed, known in agents.items()}
+    return tensors, {int(seed): described for seed, described in agents.items()}
 
 
 def agent_file(name: str | Path) -> Path:
     """The file of a shipped agent (:data:`SHIPPED`; ``@SEED`` may follow) or of a path.
 
-    Else :class:`UserError`.
+    Raises:
+        UserError: there is no such file.
     """
     path, seed = _place(name)
     if not os.path.isfile(path):  # which takes names that are too long for a file
-        known = ", ".join(sorted(file.stem for file in CHECKPOINTS.glob("agent_*.safetensors")))
+        shipped = sorted(file.stem for file in CHECKPOINTS.glob("agent_*.safetensors"))
         which = "training" if seed and str(name).startswith(SHIPPED) else "file"
         raise UserError(
-            f"agent {name!s:.100}: no such {which} ({path!s:.200}); the agents that ship are {known}; or give a path."
+            f"agent {name!s:.100}: no such {which} ({path!s:.200}); the agents that ship are "
+            f"{', '.join(shipped)}; or give a path."
         )
     return path
 
@@ -116,38 +132,47 @@ def save_agent(path: str | Path, agent: Rainbow, metadata: Mapping[str, Any]) ->
     and ``training`` (traffic, decisions, results). The network's config and the code version are
     added here.
     """
-    header = {**metadata, "network": asdict(agent.network.config), "code_version": __version__}
+    network = agent.network.config.description()
+    header = {
+        **metadata,
+        "network": network,
+        "code_version": __version__,
+    }
     save_weights(path, "agent", agent.weights(), header)
 
 
 def save_agents(
-    path: str | Path, agents: Mapping[int, tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]]
+    path: str | Path,
+    agents: Mapping[int, tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]],
 ) -> None:
     """Write several trainings of one recipe into one file; ``path@SEED`` names each of them.
 
     ``agents`` holds by seed what :func:`read_agent` gives. The scales of the noise are kept in half
     precision, everything that a greedy agent computes with as it is.
     """
+    # the names of a training's tensors begin with its seed
     tensors = {
         f"{seed}/{name}": value.half() if name.endswith("_sigma") else value
         for seed, (weights, _, _) in agents.items()
         for name, value in weights.items()
     }
     described = {
-        str(seed): {**known, "network": asdict(network)}
-        for seed, (_, network, known) in agents.items()
+        str(seed): {**metadata, "network": network.description()}
+        for seed, (_, network, metadata) in agents.items()
     }
     save_weights(path, SEVERAL, tensors, {"agents": described})
 
 
-def read_agent(name: str | Path) -> tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]:
+def read_agent(
+    name: str | Path,
+) -> tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]:
     """Weights, network config and metadata of a shipped agent or an agent's file.
 
     Raises:
-        UserError: no such file, not an agent that ganlane wrote, or one that needs an option that
-            was removed.
+        UserError: no such file, or not an agent that this version of ganlane wrote.
     """
-    path, seed = agent_file(name), _place(name)[1]
+    path = agent_file(name)
+    seed = _place(name)[1]
     if seed is None:
         weights, metadata = load_weights(path, "agent")
     else:
@@ -157,28 +182,32 @@ def read_agent(name: str | Path) -> tuple[dict[str, Tensor], NetworkConfig, dict
             raise UserError(
                 f"{path}@{seed}: this file has no training with seed {seed}; choose one of {seeds}."
             )
-        own, metadata = f"{seed}/", agents[seed]
+        metadata = agents[seed]
+        prefix = f"{seed}/"
         weights = {
-            key.removeprefix(own): value.float()
+            key.removeprefix(prefix): value.float()  # the noise is stored in half precision
             for key, value in tensors.items()
-            if key.startswith(own)
+            if key.startswith(prefix)
         }
-    for part in ("network", "agent"):
-        if isinstance(metadata.get(part), dict):
-            metadata[part] = without_removed(metadata[part], str(path))
     try:
-        stored = metadata["network"]
-        config = NetworkConfig(**{**stored, "hidden": tuple(stored["hidden"])})
-    except (KeyError, TypeError, UserError) as error:
+        config = NetworkConfig.described(metadata["network"])
+    except (
+        AttributeError,
+        KeyError,
+        TypeError,
+        UserError,
+    ) as error:
         raise UserError(
-            f"{path}: its description of the network is not understood ({error}); train the agent anew with this "
-            "version of ganlane."
+            f"{path}: its description of the network is not understood ({error}); train the agent "
+            "anew with this version of ganlane."
         ) from error
     return weights, config, metadata
 
 
 def load_agent(
-    name: str | Path, observation_size: int | None = None, device: torch.device | str = "cpu"
+    name: str | Path,
+    observation_size: int | None = None,
+    device: torch.device | str = "cpu",
 ) -> tuple[GreedyPolicy, dict[str, Any]]:
     """A trained agent, shipped or from a file, as a greedy policy on ``device``, with its metadata.
 
@@ -191,6 +220,7 @@ def load_agent(
     if observation_size is not None:
         check_observation_size(name, config, observation_size)
     try:
+        # its parameters are drawn and at once replaced
         network = QNetwork(config)
         load_parameters(network, weights)
     except UserError as error:
@@ -202,9 +232,9 @@ def check_observation_size(name: str | Path, config: NetworkConfig, observation_
     """Refuse an agent whose network takes another number of inputs."""
     if config.observation_size != observation_size:
         raise UserError(
-            f"agent {name}: its network takes observations of shape [{config.observation_size}], but the environment "
-            f"gives [{observation_size}]; use the vehicles, lanes and observation it was trained with, or a "
-            "fixed-size observation."
+            f"agent {name}: its network takes observations of shape [{config.observation_size}], "
+            f"but the environment gives [{observation_size}]; use the vehicles, lanes and "
+            "observation it was trained with, or a fixed-size observation."
         )
 
 
@@ -222,29 +252,37 @@ def warm_start(
         UserError: the networks differ in what their weights mean, or the moments are those of
             another network.
     """
-    ours = agent.network.config
-    check_observation_size(name, network, ours.observation_size)
-    ignored = {"noisy_sigma", *(() if ours.distributional else SUPPORT)}
-    trained, here = asdict(network), asdict(ours)
-    differing = [key for key in here if here[key] != trained[key] and key not in ignored]
+    check_observation_size(name, network, agent.network.config.observation_size)
+    here = agent.config
+    trained = network.agent
+    ignored = {
+        "noisy_sigma",
+        *(() if here.distributional else SUPPORT),
+    }
+    differing = [
+        option
+        for option in SHAPE
+        if option not in ignored and getattr(here, option) != getattr(trained, option)
+    ]
     if differing:
         adopt = "give init.support=trained, " if set(differing) <= set(SUPPORT) else ""
-        own, theirs = (
-            " ".join(f"agent.{key}={as_typed(config[key])}" for key in differing)
-            for config in (here, trained)
-        )
         raise UserError(
-            f"agent {name}: it has another network than this run (here: {own}); {adopt}set {theirs}, or start with "
-            "init=none."
+            f"agent {name}: it has another network than this run (here: "
+            f"{as_options(here, differing)}); {adopt}set {as_options(trained, differing)}, or "
+            "start with init=none."
         )
     agent.load_weights(weights)
     if moments is not None:
         load_moments(agent, moments)
 
 
+def as_options(agent: RainbowConfig, names: Sequence[str]) -> str:
+    """Options of ``agent`` as they are typed on the command line."""
+    return " ".join(f"agent.{name}={as_typed(getattr(agent, name))}" for name in names)
+
+
 def load_moments(agent: Rainbow, moments: Mapping[int, Mapping[str, Tensor]]) -> None:
-    """Let ``agent``'s Adam go on from the ``moments`` of an agent with the same network, at its own
-    learning rate.
+    """Let ``agent``'s Adam go on from ``moments``, those of an agent with the same network.
 
     ``moments`` is the part ``state`` of an optimiser's state: ``step``, ``exp_avg`` and
     ``exp_avg_sq`` by the place of the parameter in the network.
@@ -252,6 +290,7 @@ def load_moments(agent: Rainbow, moments: Mapping[int, Mapping[str, Tensor]]) ->
     Raises:
         UserError: they are those of other parameters.
     """
+    # Adam would write beyond moments that are too short
     shapes = {row: value.shape for row, value in enumerate(agent.network.parameters())}
     try:
         fitting = moments.keys() == shapes.keys() and all(
@@ -263,9 +302,10 @@ def load_moments(agent: Rainbow, moments: Mapping[int, Mapping[str, Tensor]]) ->
         fitting = False
     if not fitting:
         raise UserError(
-            "init.optimizer=true: the moments in the checkpoint are not those of its network; give another one or "
-            "init.optimizer=false."
+            "init.optimizer=true: the moments in the checkpoint are not those of its network; "
+            "give another one or init.optimizer=false."
         )
-    # Copies: Adam works in place on what it is given.
-    own = {row: {name: value.clone() for name, value in moments[row].items()} for row in shapes}
-    agent.optimizer.load_state_dict({**agent.optimizer.state_dict(), "state": own})
+    # copies: Adam works in place on what it is given
+    agent.load_moments(
+        {row: {name: value.clone() for name, value in moments[row].items()} for row in shapes}
+    )

@@ -14,13 +14,24 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
+from torchrl.envs.utils import (
+    ExplorationType,
+    exploration_type,
+    set_exploration_type,
+)
 
 from ganlane import keys
-from ganlane.agents.network import QNetwork, allowed_values, redraw_noise
+from ganlane.agents.network import (
+    QNetwork,
+    allowed_values,
+    redraw_noise,
+)
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, LEFT, RIGHT
-from ganlane.settings.driving import IdmParameters, MobilParameters
+from ganlane.settings.driving import (
+    IdmParameters,
+    MobilParameters,
+)
 from ganlane.sim.dynamics import ego_scene
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV, mobil_wishes
@@ -34,10 +45,10 @@ LegalActions = Callable[[TensorDictBase], Tensor]
 
 
 class GreedyPolicy(TensorDictModuleBase):
-    """Writes the best ``action`` [N] int64 for ``observation`` [N, D]; never any noise, whatever
-    the context says.
+    """Writes the best ``action`` [N] int64 for ``observation`` [N, D].
 
-    Where the environment writes ``action_mask`` [N, A], it is the best of the allowed actions.
+    There is never any noise, whatever the context says. Where the environment writes
+    ``action_mask`` [N, A], it is the best of the allowed actions.
     """
 
     in_keys = [keys.OBSERVATION]  # noqa: RUF012
@@ -59,8 +70,7 @@ class GreedyPolicy(TensorDictModuleBase):
 
 
 class ExploringPolicy(TensorDictModuleBase):
-    """The policy that collects: network noise drawn anew at every step, mixed with random legal
-    actions.
+    """The policy that collects: network noise, new at every step, and random legal actions.
 
     It explores unless ``set_exploration_type`` says DETERMINISTIC, MODE or MEAN: outside any
     context, where TorchRL's noisy layers are silent, collecting would else be greedy by accident.
@@ -77,17 +87,25 @@ class ExploringPolicy(TensorDictModuleBase):
     out_keys = [keys.ACTION, keys.CHOSEN_VALUE]  # noqa: RUF012
 
     def __init__(
-        self, network: QNetwork, generator: torch.Generator, legal: LegalActions | None = None
+        self,
+        network: QNetwork,
+        generator: torch.Generator,
+        legal: LegalActions | None = None,
     ) -> None:
         super().__init__()
-        self.network, self.generator, self.legal = network, generator, legal
+        self.network = network
+        self.generator = generator
+        self.legal = legal
         #: Probability of a random action; the agent anneals it.
         self.epsilon = 0.0
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` and ``chosen_action_value``."""
-        explore = exploration_type() in (None, ExplorationType.RANDOM)
+        explore = exploration_type() in (
+            None,
+            ExplorationType.RANDOM,
+        )
         if explore:
             redraw_noise(self.network, self.generator)
         with set_exploration_type(
@@ -100,18 +118,24 @@ class ExploringPolicy(TensorDictModuleBase):
             if mask is None:
                 mask = torch.ones_like(values) if self.legal is None else self.legal(tensordict)
             # A fraction epsilon of the actions becomes a legal one, drawn uniformly.
-            draw: dict[str, Any] = {"generator": self.generator, "device": self.generator.device}
+            draw: dict[str, Any] = {
+                "generator": self.generator,
+                "device": self.generator.device,
+            }
+            # the largest of uniform numbers, 0 where not allowed, is a uniform draw
             lottery = torch.rand(mask.shape, **draw) * mask
             action = torch.where(
-                torch.rand(action.shape, **draw) < self.epsilon, lottery.argmax(-1), action
+                torch.rand(action.shape, **draw) < self.epsilon,
+                lottery.argmax(-1),
+                action,
             )
+        # for the statistics: what the policy expects of its choice
         chosen = values.gather(-1, action[..., None])
         return tensordict.set(keys.ACTION, action).set(keys.CHOSEN_VALUE, chosen)
 
 
 class MaskedPolicy(TensorDictModuleBase):
-    """Any policy behind the environment's ``action_mask``: an action that is not allowed becomes
-    'keep the lane'.
+    """Any policy behind the environment's ``action_mask``: what it forbids becomes 'keep the lane'.
 
     Agents of this package choose among the allowed actions themselves; it does not change them.
 
@@ -131,10 +155,11 @@ class MaskedPolicy(TensorDictModuleBase):
         mask = tensordict.get(keys.ACTION_MASK, None)
         if mask is None:
             raise UserError(
-                "this driver chooses among allowed actions, but the environment has no action_mask; make it with "
-                "mask='safe' or 'legal'."
+                "this driver chooses among allowed actions, but the environment has no "
+                "action_mask; make it with mask='safe' or 'legal'."
             )
         action = self.policy(tensordict).get(keys.ACTION)
+        # whether the policy's own choice is among the allowed ones
         allowed = mask.gather(1, action[:, None])[:, 0]
         return tensordict.set(keys.ACTION, torch.where(allowed, action, keys.KEEP))
 
@@ -146,13 +171,15 @@ class Driver(TensorDictModuleBase):
     evaluation then never moves a running episode to another row, or into a smaller batch.
     """
 
+    # the simulator's raw state, without the observation's errors
     in_keys = [keys.VEHICLES, keys.EGO, keys.SEED, keys.EPISODE, keys.STEP]  # noqa: RUF012
     out_keys = [keys.ACTION]  # noqa: RUF012
     rows_must_stay = False
 
     def __init__(self, road: Road, stream: int = Stream.TRAIN) -> None:
         super().__init__()
-        self.road, self.stream = road, int(stream)
+        self.road = road
+        self.stream = int(stream)
 
     def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
         """The action of every row."""
@@ -161,12 +188,17 @@ class Driver(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action``."""
         return tensordict.set(
-            keys.ACTION, self.act(Vehicles.of(tensordict.get(keys.VEHICLES)), tensordict)
+            keys.ACTION,
+            self.act(
+                Vehicles.of(tensordict.get(keys.VEHICLES)),
+                tensordict,
+            ),
         )
 
 
 def legal_actions(tensordict: TensorDictBase, road: Road) -> Tensor:
     """Which of the three actions stay on the road, bool [N, 3]: keeping the lane always does."""
+    # of the lane that it is moving to, not of the one it is in
     target = tensordict.get(keys.VEHICLES).get("target_lane")[:, EGO_INDEX]
     lanes = road.lanes[:, 0] if isinstance(road.lanes, Tensor) else road.lanes
     return on_road_actions(target, lanes)
@@ -176,8 +208,17 @@ class RandomDriver(Driver):
     """Any of the three actions with equal probability; it soon drives off the road."""
 
     def _uniform(self, tensordict: TensorDictBase) -> Tensor:
-        key = episode_key(self.stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
-        return uniform(key, tensordict.get(keys.STEP), 1, [Purpose.RANDOM_ACTION])[:, 0, 0]
+        key = episode_key(
+            self.stream,
+            tensordict.get(keys.SEED),
+            tensordict.get(keys.EPISODE),
+        )
+        return uniform(
+            key,
+            tensordict.get(keys.STEP),
+            1,
+            [Purpose.RANDOM_ACTION],
+        )[:, 0, 0]
 
     def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
         """Floor of three times a uniform number."""
@@ -191,6 +232,7 @@ class RandomLegalDriver(RandomDriver):
         """The r-th legal action, r uniform."""
         legal = legal_actions(tensordict, road_in(tensordict, self.road))
         wanted = (self._uniform(tensordict) * legal.sum(1)).long()
+        # the r-th action that is legal has rank r
         rank = legal.cumsum(1) - 1
         return (legal & (rank == wanted[:, None])).long().argmax(1)
 
@@ -214,15 +256,17 @@ class MobilDriver(Driver):
         mobil: MobilParameters = TABLE_IV,
     ) -> None:
         super().__init__(road, stream)
-        self.idm, self.mobil = idm, mobil
+        self.idm = idm
+        self.mobil = mobil
 
     def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
-        """MOBIL's wish as an action, in the decisions in which a second of simulated time is full."""
+        """MOBIL's wish as an action, in decisions in which a second of simulated time is full."""
         road = road_in(tensordict, self.road)
+        # -1 right, 0 stay, 1 left, of the ego alone
         wish = mobil_wishes(ego_scene(vehicles, road), road, self.idm, self.mobil)[:, 0]
-        step, decisions = tensordict.get(keys.STEP), tensordict.get(keys.EGO).get("decisions")
-        # All decisions take the same number of steps, so the last one was at step - step /
-        # decisions.
+        step = tensordict.get(keys.STEP)
+        decisions = tensordict.get(keys.EGO).get("decisions")
+        # all decisions take equally many steps, so the last one was at step - step / decisions
         last = step - step // decisions.clamp_min(1)
         due = (decisions == 0) | (step // MOBIL_PERIOD_STEPS != last // MOBIL_PERIOD_STEPS)
         wish = torch.where(due, wish, 0)
@@ -232,7 +276,9 @@ class MobilDriver(Driver):
 def egoistic_mobil(road: Road, stream: int = Stream.TRAIN) -> MobilDriver:
     """MOBIL with politeness 0."""
     return MobilDriver(
-        road, stream, mobil=replace(TABLE_IV, politeness_rear=0.0, politeness_side=0.0)
+        road,
+        stream,
+        mobil=replace(TABLE_IV, politeness_rear=0.0, politeness_side=0.0),
     )
 
 

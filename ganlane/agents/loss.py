@@ -1,4 +1,4 @@
-"""The loss of a batch of transitions, and a whole update of Rainbow as one function.
+"""The losses, from TorchRL's, and a whole update of Rainbow as one compiled function.
 
 :class:`LeanDistributionalLoss` equals :class:`torchrl.objectives.DistributionalDQNLoss` (Bellemare
 et al. 2017, double) to 1e-6 and takes half of its time, by a lean forward on plain tensors;
@@ -27,44 +27,46 @@ from torchrl.modules import DistributionalQValueActor, QValueActor
 from torchrl.objectives import DistributionalDQNLoss, DQNLoss
 
 from ganlane import keys
-from ganlane.agents.network import QNetwork, Weights, allowed_values, noise_of
-from ganlane.linear import matrix_product
+from ganlane.agents.network import (
+    QNetwork,
+    Weights,
+    allowed_values,
+    matrix_product,
+    noise_of,
+)
 from ganlane.settings.agent import RainbowConfig
 from ganlane.torch_settings import compiled
 
 #: Parameters of a noisy layer.
 _PARAMETERS = ("weight_mu", "weight_sigma", "bias_mu", "bias_sigma")
-_BETA_1, _BETA_2 = 0.9, 0.999
+_BETA_1 = 0.9
+_BETA_2 = 0.999
 
 
 class _WithTarget:
-    """Mixin.
-
-    A second module whose tensors are the loss's target parameters, so that its noise can be drawn
-    anew.
-    """
+    """Mixin: a second module with the loss's target parameters, whose noise can be drawn anew."""
 
     target_network: QNetwork
     network: QNetwork
 
     def _attach(self, network: QNetwork, actor: nn.Module) -> None:
-        # The target is updated here, by update_target: TorchRL need not warn that no updater is
-        # registered.
+        # update_target does it: TorchRL need not warn that no updater is registered
         self._has_update_associated["value_network"] = True  # type: ignore[attr-defined]
         actor_copy = deepcopy(actor)
         self.target_value_network_params.to_module(actor_copy)  # type: ignore[attr-defined]
-        # In __dict__, as TorchRL does with the online module, so that no parameter is listed twice.
-        self.__dict__["network"] = network
-        self.__dict__["target_network"] = next(
-            m for m in actor_copy.modules() if isinstance(m, QNetwork)
-        )
-        # Losses run deterministic by default; without noise the sigmas would never get a gradient.
+        networks = [module for module in actor_copy.modules() if isinstance(module, QNetwork)]
+        # in __dict__, as TorchRL does with the online module, so that no parameter is listed twice
+        self.__dict__.update(network=network, target_network=networks[0])
+        # losses run deterministic by default; without noise the sigmas would never get a gradient.
         self.deterministic_sampling_mode = ExplorationType.RANDOM
 
     @torch.no_grad()
     def update_target(self) -> None:
         """Copy the online parameters to the target network."""
-        for target, online in zip(self.target_network.parameters(), self.network.parameters()):
+        for target, online in zip(
+            self.target_network.parameters(),
+            self.network.parameters(),
+        ):
             target.copy_(online)
 
 
@@ -81,8 +83,13 @@ class LeanDistributionalLoss(_WithTarget, DistributionalDQNLoss):
     """
 
     def __init__(
-        self, network: QNetwork, gamma: float, double: bool = True, kl_priority: bool = True
+        self,
+        network: QNetwork,
+        gamma: float,
+        double: bool = True,
+        kl_priority: bool = True,
     ) -> None:
+        # TorchRL's actor gives its loss the parameters and keys; the forward below does not call it
         actor = DistributionalQValueActor(
             network,
             network.support,
@@ -91,9 +98,14 @@ class LeanDistributionalLoss(_WithTarget, DistributionalDQNLoss):
             make_log_softmax=False,
         )
         super().__init__(
-            actor, gamma=gamma, delay_value=True, reduction="none", use_prioritized_weights=False
+            actor,
+            gamma=gamma,
+            delay_value=True,
+            reduction="none",
+            use_prioritized_weights=False,
         )
-        self.double, self.kl_priority = double, kl_priority
+        self.double = double
+        self.kl_priority = kl_priority
         self._attach(network, actor)
 
     def forward(self, batch: TensorDictBase) -> TensorDict:
@@ -107,36 +119,48 @@ class LeanDistributionalLoss(_WithTarget, DistributionalDQNLoss):
         """
         weights = self.network.weights()
         with torch.no_grad():
+            # the same noise for both observations: the weights are composed once
             target, clamped, mean_q = self._target(batch, weights)
         logits = self.network.logits(batch.get("observation"), weights)
         log_p = pick(logits, batch.get("action")).log_softmax(-1)
         loss = -(target * log_p).sum(-1)
         priority = loss.detach()
+        # the entropy of the target is not the network's fault
         if self.kl_priority:
             priority = (priority - torch.special.entr(target).sum(-1)).clamp_min(0.0)
         batch.set("td_error", priority[:, None])
-        return TensorDict({"loss": loss, "clamped_fraction": clamped, "mean_q": mean_q})
+        return TensorDict(
+            {
+                "loss": loss,
+                "clamped_fraction": clamped,
+                "mean_q": mean_q,
+            }
+        )
 
     def _target(self, batch: TensorDictBase, weights: Weights) -> tuple[Tensor, Tensor, Tensor]:
-        """Projected distribution of the Bellman targets [B, atoms], its clamped mass, the mean best
-        value.
-        """
-        following, support = batch.get(("next", "observation")), self.network.support
+        """The Bellman targets: distribution [B, atoms], clamped mass, mean best value."""
+        following = batch.get(("next", "observation"))
+        support = self.network.support
         target_logits = self.target_network.logits(following)
+        # double Q-learning: one network chooses, the other one values
         choosing = self.network.logits(following, weights) if self.double else target_logits
-        values = allowed_values(
-            self.network.expected(choosing), batch.get(("next", keys.ACTION_MASK), None)
-        )
-        best, action = values.max(-1)
+        mask = batch.get(("next", keys.ACTION_MASK), None)
+        best, action = allowed_values(self.network.expected(choosing), mask).max(-1)
         returns = bellman(batch, self.gamma, support)
-        return *projected(returns, pick(target_logits, action).softmax(-1), support), best.mean()
+        probabilities = pick(target_logits, action).softmax(-1)
+        target, clamped = projected(returns, probabilities, support)
+        return target, clamped, best.mean()
 
 
 class LeanDQNLoss(_WithTarget, DQNLoss):
     """Plain DQN loss (Huber), double or not: Rainbow with ``distributional=False``."""
 
     def __init__(self, network: QNetwork, gamma: float, double: bool = True) -> None:
-        actor = QValueActor(network, in_keys=["observation"], action_space="categorical")
+        actor = QValueActor(
+            network,
+            in_keys=["observation"],
+            action_space="categorical",
+        )
         super().__init__(
             actor,
             loss_function="smooth_l1",
@@ -146,6 +170,7 @@ class LeanDQNLoss(_WithTarget, DQNLoss):
             reduction="none",
             use_prioritized_weights=False,
         )
+        # for TorchRL's own forward; the one below takes self.discount
         self.make_value_estimator(gamma=gamma)
         self.discount = gamma
         self._attach(network, actor)
@@ -159,41 +184,52 @@ class LeanDQNLoss(_WithTarget, DQNLoss):
         with torch.no_grad():
             target_values = self.target_network(following)
             values = self.network(following) if self.double_dqn else target_values
-            best, action = allowed_values(values, batch.get(("next", keys.ACTION_MASK), None)).max(
-                -1
-            )
+            mask = batch.get(("next", keys.ACTION_MASK), None)
+            best, action = allowed_values(values, mask).max(-1)
             target = bellman(
-                batch, self.discount, target_values.gather(-1, action[:, None])
-            ).squeeze(-1)
-            mean_q = best.mean()
+                batch,
+                self.discount,
+                target_values.gather(-1, action[:, None]),
+            )
         values = self.network(batch.get("observation"))
-        value = values.gather(-1, batch.get("action")[:, None]).squeeze(-1)
-        loss = nn.functional.smooth_l1_loss(value, target, reduction="none")
-        batch.set("td_error", (target - value.detach()).abs()[:, None])
+        value = values.gather(-1, batch.get("action")[:, None])
+        loss = nn.functional.smooth_l1_loss(value, target, reduction="none").squeeze(-1)
+        batch.set("td_error", (target - value.detach()).abs())
+        # without a support nothing is clamped
+        clamped = torch.zeros((), device=loss.device)
         return TensorDict(
-            {"loss": loss, "clamped_fraction": torch.zeros_like(mean_q), "mean_q": mean_q}
+            {
+                "loss": loss,
+                "clamped_fraction": clamped,
+                "mean_q": best.mean(),
+            }
         )
 
 
 def bellman(batch: TensorDictBase, gamma: float, value: Tensor) -> Tensor:
-    """Return of each transition plus the discounted ``value`` [B, K] or [K] of what follows, unless
-    it terminated.
+    """Return of each transition plus the discounted ``value`` [B, K] or [K] of what follows.
+
+    Nothing follows where it terminated.
     """
+    # a truncated episode goes on behind its last observation, a terminated one does not
     alive = 1.0 - batch.get(("next", "terminated")).to(value.dtype)
     discount = gamma ** batch.get("steps_to_next_obs")
     return batch.get(("next", "reward")).to(value.dtype) + alive * discount * value
 
 
 def project(values: Tensor, probabilities: Tensor, support: Tensor) -> Tensor:
-    """Project the distribution with ``probabilities`` [B, K] at ``values`` [B, K] onto ``support``
-    [K].
+    """Project the distribution with ``probabilities`` at ``values``, [B, K], onto ``support`` [K].
 
     Values outside the support are clamped to its ends. Each mass is split between its two
     neighbours in proportion to the nearness of the other (Bellemare et al. 2017, equation 7); the
     mean is kept but for the clamping.
     """
-    low, high, atoms = support[0], support[-1], support.numel()
+    low = support[0]
+    high = support[-1]
+    atoms = support.numel()
+    # where each value falls on the support, in units of its spacing
     place = (values.clamp(low, high) - low) * ((atoms - 1) / (high - low))
+    # the last atom belongs to the interval before it, so that index + 1 exists
     lower = place.floor().clamp_max(atoms - 2)
     share = (place - lower) * probabilities
     index = lower.long()
@@ -203,7 +239,8 @@ def project(values: Tensor, probabilities: Tensor, support: Tensor) -> Tensor:
 
 
 def projected(values: Tensor, probabilities: Tensor, support: Tensor) -> tuple[Tensor, Tensor]:
-    """What :func:`project` gives, and the mass that it clamps, averaged over the batch, 0-dim."""
+    """What :func:`project` gives, and the mass that it clamps, a mean over the batch, 0-dim."""
+    # counted before the clamping, weighted by probability
     outside = (values < support[0]) | (values > support[-1])
     return project(values, probabilities, support), (probabilities * outside).sum(-1).mean()
 
@@ -217,10 +254,7 @@ def pick(rows: Tensor, action: Tensor) -> Tensor:
 
 
 class Batch(NamedTuple):
-    """Transitions.
-
-    ``observation`` and ``following`` [B, D], ``allowed`` [B, A] bool (following), the rest [B].
-    """
+    """Transitions: ``observation``, ``following`` [B, D], ``allowed`` next [B, A], the rest [B]."""
 
     observation: Tensor
     action: Tensor
@@ -233,10 +267,7 @@ class Batch(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """``priority`` [B]; 0-dim.
-
-    The weighted ``loss``, ``mean_q``, ``clamped_fraction``, ``gradient_norm``.
-    """
+    """What an update gives: ``priority`` [B], the others 0-dim (``loss`` is weighted)."""
 
     priority: Tensor
     loss: Tensor
@@ -256,32 +287,58 @@ class Settings(NamedTuple):
 
 
 def composed(parameters: Sequence[Tensor], noise: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Weight [O, I] and bias [O] of a noisy layer (Fortunato et al. 2017).
-
-    ``noise`` of its inputs and outputs.
-    """
+    """Weight [O, I], bias [O] of a noisy layer (Fortunato et al. 2017), ``noise`` [I] and [O]."""
+    # factorised noise: the outer product of one vector per side
     weight_mu, weight_sigma, bias_mu, bias_sigma = parameters
     inputs, outputs = noise
     return weight_mu + weight_sigma * torch.outer(outputs, inputs), bias_mu + bias_sigma * outputs
 
 
+def composed_layers(
+    parameters: list[Tensor],
+    noise: Sequence[Sequence[Tensor]],
+    actions: int,
+) -> Weights:
+    """Weight and bias of every layer of a network, the duel folded into the last."""
+    layers = [composed(parameters[4 * i : 4 * i + 4], drawn) for i, drawn in enumerate(noise)]
+    weight, bias = layers[-1]
+    return [
+        *layers[:-1],
+        (folded(weight, actions), folded(bias, actions)),
+    ]
+
+
 def folded(part: Tensor, actions: int) -> Tensor:
-    """Weight [(1 + A) K, H] or bias [(1 + A) K] of the head with the duel in it, [A K, H] or [A K]."""
+    """The head's weight [(1 + A) K, H] or bias [(1 + A) K] with the duel in it: [A K, ...]."""
+    # Q_a = V + A_a - mean(A), row by row of the weights
     rows = part.unflatten(0, (1 + actions, -1))
     return (rows[:1] + rows[1:] - rows[1:].mean(0, keepdim=True)).flatten(0, 1)
 
 
 def unfolded(gradient: Tensor, actions: int) -> Tensor:
     """Gradient of the head from that of the folded head: the transpose of :func:`folded`."""
+    # V gets the sum of all, each A_a its own less the mean
     rows = gradient.unflatten(0, (actions, -1))
-    return torch.cat((rows.sum(0, keepdim=True), rows - rows.mean(0, keepdim=True))).flatten(0, 1)
+    return torch.cat(
+        (
+            rows.sum(0, keepdim=True),
+            rows - rows.mean(0, keepdim=True),
+        )
+    ).flatten(0, 1)
 
 
 def forward(layers: Weights, x: Tensor) -> list[Tensor]:
     """The input of every layer, and the output of the last."""
     inputs = [x]
     for number, (weight, bias) in enumerate(layers):
-        inputs.append(matrix_product(inputs[-1], weight, bias, relu=number < len(layers) - 1))
+        inputs.append(
+            matrix_product(
+                inputs[-1],
+                weight,
+                bias,
+                relu=number < len(layers) - 1,
+            )
+        )
     return inputs
 
 
@@ -293,25 +350,29 @@ def gradients(
     actions: int,
 ) -> list[Tensor]:
     """Of all parameters, in the layers' order, from that of the folded head's output [B, A K]."""
-    found: list[Tensor] = []
+    all_gradients: list[Tensor] = []
+    # from the last layer to the first, by the chain rule
     behind = of_logits
     for number in reversed(range(len(layers))):
-        of_weight, of_bias = matrix_product(behind.t(), inputs[number].t()), behind.sum(0)
+        # for each layer: the gradient by its weights, then by its inputs
+        of_weight = matrix_product(behind.t(), inputs[number].t())
+        of_bias = behind.sum(0)
+        # of the folded head's rows, those of value and advantages
         if number == len(layers) - 1:
-            of_weight, of_bias = unfolded(of_weight, actions), unfolded(of_bias, actions)
-        drawn_in, drawn_out = noise[number]
-        found = [
+            of_weight = unfolded(of_weight, actions)
+            of_bias = unfolded(of_bias, actions)
+        noise_in, noise_out = noise[number]
+        all_gradients = [
             of_weight,
-            of_weight * torch.outer(drawn_out, drawn_in),
+            of_weight * torch.outer(noise_out, noise_in),
             of_bias,
-            of_bias * drawn_out,
-            *found,
+            of_bias * noise_out,
+            *all_gradients,
         ]
-        if number:
-            behind = torch.where(
-                inputs[number] > 0, matrix_product(behind, layers[number][0].t()), 0.0
-            )
-    return found
+        if number:  # back through the layer's weight and the ReLU before it
+            product = matrix_product(behind, layers[number][0].t())
+            behind = torch.where(inputs[number] > 0, product, 0.0)
+    return all_gradients
 
 
 def update(
@@ -327,8 +388,7 @@ def update(
     rate: Tensor,
     corrections: Tensor,
 ) -> Learned:
-    """Change ``online`` and Adam's moments ``mean`` and ``square`` in place by one step on
-    ``batch``.
+    """Change ``online`` and Adam's moments ``mean`` and ``square`` in place by one step.
 
     Args:
         settings: fixed numbers.
@@ -340,40 +400,55 @@ def update(
         rate: learning rate, 0-dim.
         corrections: of Adam's two moments for their start at zero, [2].
     """
-    actions, atoms = settings.actions, settings.atoms
-    networks = []
-    for parameters, drawn in ((online, noise), (target, target_noise)):
-        layers = [composed(parameters[4 * i : 4 * i + 4], drawn[i]) for i in range(len(drawn))]
-        weight, bias = layers[-1]
-        networks.append([*layers[:-1], (folded(weight, actions), folded(bias, actions))])
-    layers, target_layers = networks
+    actions = settings.actions
+    atoms = settings.atoms
+    layers = composed_layers(online, noise, actions)
+    target_layers = composed_layers(target, target_noise, actions)
     rows = len(batch.action)
+    # the online network sees both observations in one product
     inputs = forward(layers, torch.cat((batch.observation, batch.following)))
     logits = inputs.pop().unflatten(-1, (actions, atoms))
+
+    # the targets: the online network chooses the next action, the target network values it
     best, chosen = allowed_values(logits[rows:].softmax(-1) @ support, batch.allowed).max(-1)
     target_logits = forward(target_layers, batch.following)[-1].unflatten(-1, (actions, atoms))
     discount = torch.pow(settings.gamma, batch.steps)
     values = batch.reward[:, None] + (batch.alive * discount)[:, None] * support
     wanted, clamped = projected(values, pick(target_logits, chosen).softmax(-1), support)
+    # the loss is the cross-entropy, the priority its excess over the target's entropy
     log_p = pick(logits[:rows], batch.action).log_softmax(-1)
     loss = -(wanted * log_p).sum(-1)
     priority = (loss - torch.special.entr(wanted).sum(-1)).clamp_min(0.0)
 
-    of_chosen = (log_p.exp() * wanted.sum(-1, keepdim=True) - wanted) * (batch.weight / rows)[
-        :, None
-    ]
-    is_chosen = batch.action[:, None] == torch.arange(actions, device=support.device)
-    of_logits = torch.where(is_chosen[..., None], of_chosen[:, None, :], 0.0).flatten(1)
-    found = gradients(layers, noise, [each[:rows] for each in inputs], of_logits, actions)
-    norm = torch.stack([(each * each).sum() for each in found]).sum().sqrt()
+    # the gradient of the weighted mean of the losses, first by the logits of the taken actions
+    share = (batch.weight / rows)[:, None]
+    of_taken = (log_p.exp() * wanted.sum(-1, keepdim=True) - wanted) * share
+    is_taken = batch.action[:, None] == torch.arange(actions, device=support.device)
+    of_logits = torch.where(is_taken[..., None], of_taken[:, None, :], 0.0).flatten(1)
+    by_parameter = gradients(
+        layers,
+        noise,
+        [x[:rows] for x in inputs],
+        of_logits,
+        actions,
+    )
+
+    # clipping as by clip_grad_norm_, then Adam
+    norm = torch.stack([(gradient * gradient).sum() for gradient in by_parameter]).sum().sqrt()
     scale = (settings.gradient_clip / (norm + 1e-6)).clamp_max(1.0)
-    for parameter, gradient, first, second in zip(online, found, mean, square):
+    for parameter, gradient, first, second in zip(online, by_parameter, mean, square):
         clipped = gradient * scale
         first.lerp_(clipped, 1.0 - _BETA_1)
         second.mul_(_BETA_2).addcmul_(clipped, clipped, value=1.0 - _BETA_2)
         step = first * corrections[0] / ((second * corrections[1]).sqrt() + settings.adam_eps)
         parameter.sub_(rate * step)
-    return Learned(priority, (batch.weight * loss).mean(), best.mean(), clamped, norm)
+    return Learned(
+        priority,
+        (batch.weight * loss).mean(),
+        best.mean(),
+        clamped,
+        norm,
+    )
 
 
 class UpdateGraph:
@@ -390,34 +465,64 @@ class UpdateGraph:
         config: RainbowConfig,
         compile: bool = True,
     ) -> None:
-        self.network, self.target, self.optimizer = network, loss.target_network, optimizer
-        own, eps = network.config, optimizer.param_groups[0]["eps"]
-        self.settings = Settings(own.actions, own.atoms, config.gamma, config.gradient_clip, eps)
+        self.network = network
+        self.target = loss.target_network
+        self.optimizer = optimizer
+        (group,) = optimizer.param_groups
+        self.settings = Settings(
+            network.config.actions,
+            config.atoms,
+            config.gamma,
+            config.gradient_clip,
+            group["eps"],
+        )
         self._update: Callable[..., Learned] = compiled(update) if compile else update
 
+    @torch.no_grad()
     def __call__(self, batch: TensorDictBase, generator: torch.Generator) -> Learned:
         """One update on ``batch`` (keys as in :class:`LeanDistributionalLoss`).
 
         Noise from ``generator``.
         """
-        online, target = (
-            [
-                getattr(layer, name)
-                for layer in (*network.trunk, network.head)
-                for name in _PARAMETERS
-            ]
-            for network in (self.network, self.target)
-        )
+        online = _parameters_of(self.network)
+        target = _parameters_of(self.target)
+        # Adam's own state, so that a run can change to the other way and back
         moments = [self._moments(parameter) for parameter in online]
-        torch._foreach_add_([each["step"] for each in moments], 1.0)
-        step, (group,) = float(moments[0]["step"]), self.optimizer.param_groups
-        corrections = torch.tensor([1.0 / (1.0 - _BETA_1**step), 1.0 / (1.0 - _BETA_2**step)])
-        noise, target_noise = (
-            noise_of(network, generator) for network in (self.network, self.target)
+        step = float(moments[0]["step"]) + 1.0
+        for state in moments:
+            state["step"].fill_(step)
+        (group,) = self.optimizer.param_groups
+        return self._update(
+            self.settings,
+            self.network.support,
+            [parameter.detach() for parameter in online],
+            [parameter.detach() for parameter in target],
+            [state["exp_avg"] for state in moments],
+            [state["exp_avg_sq"] for state in moments],
+            noise_of(self.network, generator),
+            noise_of(self.target, generator),
+            self._batch(batch),
+            # a tensor: a number would be a constant of the graph, compiled anew at each change
+            torch.tensor(float(group["lr"])),
+            torch.tensor(
+                [
+                    1.0 / (1.0 - _BETA_1**step),
+                    1.0 / (1.0 - _BETA_2**step),
+                ]
+            ),
         )
-        following, action = batch.get("next"), batch.get("action")
+
+    def _batch(self, batch: TensorDictBase) -> Batch:
+        """The tensors of ``batch``; without a mask every next action is allowed."""
+        action = batch.get("action")
+        following = batch.get("next")
         allowed = following.get(keys.ACTION_MASK, None)
-        given = Batch(
+        if allowed is None:
+            allowed = torch.ones(
+                (len(action), self.settings.actions),
+                dtype=torch.bool,
+            )
+        return Batch(
             batch.get("observation"),
             action,
             following.get("reward")[:, 0],
@@ -425,25 +530,20 @@ class UpdateGraph:
             (~following.get("terminated")[:, 0]).float(),
             batch.get("steps_to_next_obs")[:, 0].float(),
             batch.get("priority_weight"),
-            torch.ones((len(action), self.settings.actions), dtype=torch.bool)
-            if allowed is None
-            else allowed,
+            allowed,
         )
-        rate = torch.tensor(float(group["lr"]))
-        mean, square = ([each[name] for each in moments] for name in ("exp_avg", "exp_avg_sq"))
-        with torch.no_grad():
-            return self._update(
-                self.settings, self.network.support, [value.detach() for value in online],
-                [value.detach() for value in target], mean, square, noise, target_noise, given, rate, corrections,
-            )  # fmt: skip
 
     def _moments(self, parameter: Tensor) -> dict[str, Any]:
         """Adam's state of a parameter, made as Adam makes it at its first step."""
         state = self.optimizer.state[parameter]
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32)
-            state["exp_avg"], state["exp_avg_sq"] = (
-                torch.zeros_like(parameter),
-                torch.zeros_like(parameter),
-            )
+            state["exp_avg"] = torch.zeros_like(parameter)
+            state["exp_avg_sq"] = torch.zeros_like(parameter)
         return state
+
+
+def _parameters_of(network: QNetwork) -> list[Tensor]:
+    """Four of each layer, in the order in which :func:`update` takes them."""
+    layers = (*network.trunk, network.head)
+    return [getattr(layer, name) for layer in layers for name in _PARAMETERS]

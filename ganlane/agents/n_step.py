@@ -36,7 +36,13 @@ class Step(NamedTuple):
         after = step.get("next")
         observation, action = (step.get(name).clone() for name in ("observation", "action"))
         reward, following, terminated, done = (
-            after.get(name).clone() for name in ("reward", "observation", "terminated", "done")
+            after.get(name).clone()
+            for name in (
+                "reward",
+                "observation",
+                "terminated",
+                "done",
+            )
         )
         mask = after.get(keys.ACTION_MASK, None)
         return cls(
@@ -60,7 +66,8 @@ class NStepWindow:
     """
 
     def __init__(self, n: int, gamma: float) -> None:
-        self.n, self.gamma = n, gamma
+        self.n = n
+        self.gamma = gamma
         self.steps: list[Step] = []
 
     def push(self, step: TensorDictBase) -> TensorDict | None:
@@ -75,19 +82,21 @@ class NStepWindow:
             discount), and ``next``'s ``observation``, ``reward`` (the n-step return),
             ``terminated``, and ``action_mask`` where there is one.
         """
+        # the oldest step is complete once there are n
         self.steps.append(Step.copied(step))
         if len(self.steps) < self.n:
             return None
         first, *later = self.steps
-        reward, following, terminated, mask = (
-            first.reward,
-            first.following,
-            first.terminated,
-            first.following_mask,
-        )
-        length, running = torch.ones_like(reward), ~first.done
+        reward = first.reward
+        following = first.following
+        terminated = first.terminated
+        mask = first.following_mask
+        length = torch.ones_like(reward)
+        running = ~first.done
         for power, after in enumerate(later, start=1):
+            # ``running``: no episode has ended between the oldest step and this one
             reward = reward + running * (self.gamma**power * after.reward)
+            # what follows is the end of the last step that still belongs to it
             following = torch.where(running, after.following, following)
             if mask is not None and after.following_mask is not None:
                 mask = torch.where(running, after.following_mask, mask)
@@ -95,7 +104,11 @@ class NStepWindow:
             length = length + running
             running = running & ~after.done
         del self.steps[0]
-        end = {"observation": following, "reward": reward, "terminated": terminated}
+        end = {
+            "observation": following,
+            "reward": reward,
+            "terminated": terminated,
+        }
         if mask is not None:
             end[keys.ACTION_MASK] = mask
         begin = {
@@ -103,7 +116,10 @@ class NStepWindow:
             "action": first.action,
             "steps_to_next_obs": length,
         }
-        return TensorDict({**begin, "next": TensorDict(end, reward.shape[:1])}, reward.shape[:1])
+        return TensorDict(
+            {**begin, "next": TensorDict(end, reward.shape[:1])},
+            reward.shape[:1],
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """The steps in the window, as plain dictionaries of tensors."""

@@ -10,76 +10,103 @@ would cost half as much again for the same depth.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from math import isfinite
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 from torchrl.modules import NoisyLinear
 
 from ganlane.errors import UserError
-from ganlane.linear import linear
 from ganlane.settings.agent import RainbowConfig
 
 #: Weight and bias of each layer.
 Weights = list[tuple[Tensor, Tensor]]
+#: Options of an agent that shape its network; the support is ignored unless it is distributional.
+SHAPE = (
+    "hidden",
+    "noisy",
+    "dueling",
+    "distributional",
+    "atoms",
+    "v_min",
+    "v_max",
+    "noisy_sigma",
+)
 #: Largest width of a layer: a damaged file must not ask for all memory.
 LARGEST = 65536
+#: Whether there is oneDNN's linear layer, an operator that PyTorch's own compiler emits.
+_ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Shape and options of a :class:`QNetwork`; defaults and meaning as in :class:`RainbowConfig`.
+    """A network for observations of size D and A actions; ``agent`` gives the rest (:data:`SHAPE`).
 
-    ``observation_size`` D and ``actions`` A come from the environment. Without ``distributional``
-    the support (``atoms`` points from ``v_min`` to ``v_max``) is ignored.
+    Raises:
+        UserError: a layer would be empty or too large.
     """
 
+    agent: RainbowConfig
     observation_size: int
     actions: int = 3
-    hidden: tuple[int, ...] = RainbowConfig.hidden
-    noisy: bool = RainbowConfig.noisy
-    dueling: bool = RainbowConfig.dueling
-    distributional: bool = RainbowConfig.distributional
-    atoms: int = RainbowConfig.atoms
-    v_min: float = RainbowConfig.v_min
-    v_max: float = RainbowConfig.v_max
-    noisy_sigma: float = RainbowConfig.noisy_sigma
-
-    @classmethod
-    def of(cls, config: RainbowConfig, observation_size: int, actions: int = 3) -> NetworkConfig:
-        """The network of an agent for observations of size D and A actions."""
-        shared = {
-            own.name: getattr(config, own.name) for own in fields(cls) if hasattr(config, own.name)
-        }
-        return cls(observation_size=observation_size, actions=actions, **shared)
 
     def __post_init__(self) -> None:
-        sizes = {name: getattr(self, name) for name in ("observation_size", "actions", "atoms")}
-        for name, size in (
-            sizes | {f"hidden[{i}]": width for i, width in enumerate(self.hidden)}
-        ).items():
-            if not isinstance(size, int) or not 1 <= size <= LARGEST:
+        sizes = {
+            "observation_size": self.observation_size,
+            "actions": self.actions,
+        }
+        sizes |= {f"hidden[{i}]": width for i, width in enumerate(self.agent.hidden)}
+        sizes["atoms"] = self.agent.atoms
+        for name, size in sizes.items():
+            if type(size) is not int or not 1 <= size <= LARGEST:
                 raise UserError(
                     f"network {name}={size!r}: expected a whole number from 1 to {LARGEST}."
                 )
-        for name in ("noisy", "dueling", "distributional"):
-            if not isinstance(getattr(self, name), bool):
-                raise UserError(f"network {name}={getattr(self, name)!r}: expected true or false.")
-        numbers = (self.v_min, self.v_max, self.noisy_sigma)
-        finite = all(isinstance(number, int | float) and isfinite(number) for number in numbers)
-        if not finite or self.v_min >= self.v_max:
-            raise UserError(
-                f"network v_min={self.v_min!r}, v_max={self.v_max!r}: expected finite numbers in order."
-            )
 
     @property
     def outputs(self) -> int:
         """Numbers per action: the atoms of the distribution, or one value."""
-        return self.atoms if self.distributional else 1
+        return self.agent.atoms if self.agent.distributional else 1
+
+    def description(self) -> dict[str, Any]:
+        """Plain data for a file, which :meth:`described` reads."""
+        options = {name: getattr(self.agent, name) for name in SHAPE}
+        return {
+            "observation_size": self.observation_size,
+            "actions": self.actions,
+            **options,
+        }
+
+    @classmethod
+    def described(cls, description: Mapping[str, Any]) -> NetworkConfig:
+        """The network of a :meth:`description`.
+
+        Raises:
+            UserError: an entry is missing, unknown, or no such value.
+        """
+        sizes = {"observation_size", "actions"}
+        if description.keys() != sizes | set(SHAPE):
+            raise UserError(f"expected the entries {', '.join((*sorted(sizes), *SHAPE))}")
+        # values come from a file, so their types are checked here
+        options = {name: description[name] for name in SHAPE}
+        for name, value in options.items():
+            expected: Any = type(getattr(RainbowConfig, name))
+            accepted = {
+                tuple: (list, tuple),
+                float: (int, float),
+            }.get(expected, expected)
+            if not isinstance(value, accepted):
+                raise UserError(f"network {name}={value!r}: expected a {expected.__name__}.")
+        agent = RainbowConfig(**options)
+        return cls(
+            agent,
+            description["observation_size"],
+            description["actions"],
+        )
 
 
 class QNetwork(nn.Module):
@@ -94,13 +121,17 @@ class QNetwork(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        layer = partial(NoisyLinear, std_init=config.noisy_sigma) if config.noisy else nn.Linear
-        widths = (config.observation_size, *config.hidden)
+        options = config.agent
+        layer = partial(NoisyLinear, std_init=options.noisy_sigma) if options.noisy else nn.Linear
+        widths = (config.observation_size, *options.hidden)
         self.trunk = nn.ModuleList(layer(*pair) for pair in pairwise(widths))
-        self.head = layer(widths[-1], (config.actions + config.dueling) * config.outputs)
-        self.register_buffer(
-            "support", torch.linspace(config.v_min, config.v_max, config.atoms), persistent=False
+        # a dueling head has one row more, the value
+        self.head = layer(
+            widths[-1],
+            (config.actions + options.dueling) * config.outputs,
         )
+        support = torch.linspace(options.v_min, options.v_max, options.atoms)
+        self.register_buffer("support", support, persistent=False)
 
     def weights(self) -> Weights:
         """Weight and bias of every layer, the head last, with the present noise added."""
@@ -113,12 +144,15 @@ class QNetwork(nn.Module):
         ``weights`` of :meth:`weights` save composing them again when several batches see the same
         noise.
         """
+        # each layer's weights are composed with the noise at this moment
         *hidden_layers, head = self.weights() if weights is None else weights
+        # observations may come in another precision
         hidden = observation.to(self.support.dtype)
         for weight, bias in hidden_layers:
             hidden = linear(hidden, weight, bias, relu=True)
+        # [*, (1 +) A, atoms]
         rows = linear(hidden, *head).unflatten(-1, (-1, self.config.outputs))
-        return duel(rows) if self.config.dueling else rows
+        return duel(rows) if self.config.agent.dueling else rows
 
     def forward(self, observation: Tensor) -> Tensor:
         """What TorchRL's actors and losses expect.
@@ -126,17 +160,15 @@ class QNetwork(nn.Module):
         Log-probabilities [*, atoms, A], or values [*, A].
         """
         logits = self.logits(observation)
-        return (
-            logits.log_softmax(-1).transpose(-1, -2)
-            if self.config.distributional
-            else logits.squeeze(-1)
-        )
+        if self.config.agent.distributional:
+            return logits.log_softmax(-1).transpose(-1, -2)
+        return logits.squeeze(-1)
 
     def expected(self, logits: Tensor) -> Tensor:
         """Action values [*, A] of the ``logits`` [*, A, atoms]."""
-        return (
-            logits.softmax(-1) @ self.support if self.config.distributional else logits.squeeze(-1)
-        )
+        if self.config.agent.distributional:
+            return logits.softmax(-1) @ self.support
+        return logits.squeeze(-1)
 
     def values(self, observation: Tensor) -> Tensor:
         """Action values [*, A]: expected discounted returns."""
@@ -155,7 +187,8 @@ def duel(rows: Tensor) -> Tensor:
     """Join value (row 0) and advantages (the rest) of [*, 1 + A, atoms] into [*, A, atoms] (Wang et
     al. 2016).
     """
-    value, advantage = rows[..., :1, :], rows[..., 1:, :]
+    value = rows[..., :1, :]
+    advantage = rows[..., 1:, :]
     return value + advantage - advantage.mean(-2, keepdim=True)
 
 
@@ -171,20 +204,19 @@ def load_parameters(network: QNetwork, weights: Mapping[str, Tensor]) -> None:
     Raises:
         UserError: names or shapes differ.
     """
-    own = dict(network.named_parameters())
-    shapes, given = (
-        {name: tuple(value.shape) for name, value in each.items()} for each in (own, weights)
-    )
-    if shapes != given:
-        name = min(
-            name for name in shapes.keys() | given.keys() if shapes.get(name) != given.get(name)
-        )
-        raise UserError(
-            f"the weights do not fit the network: {name} is {given.get(name, 'absent')} in the checkpoint and "
-            f"{shapes.get(name, 'absent')} in the network; use the observation and agent options it was trained with."
-        )
-    for name, value in own.items():
-        value.copy_(weights[name])
+    parameters = dict(network.named_parameters())
+    # names and shapes first: nothing is copied where one of them differs
+    expected = {name: tuple(value.shape) for name, value in parameters.items()}
+    shapes = {name: tuple(value.shape) for name, value in weights.items()}
+    for name in sorted(expected.keys() | shapes.keys()):
+        if shapes.get(name) != expected.get(name):
+            raise UserError(
+                f"the weights do not fit the network: {name} is {shapes.get(name, 'absent')} in "
+                f"the checkpoint and {expected.get(name, 'absent')} in the network; use the "
+                "observation and agent options it was trained with."
+            )
+    for name, parameter in parameters.items():
+        parameter.copy_(weights[name])
 
 
 @torch.no_grad()
@@ -195,17 +227,20 @@ def redraw_noise(network: nn.Module, generator: torch.Generator) -> None:
     all layers.
     """
     for layer, (inputs, outputs) in zip(noisy_layers(network), noise_of(network, generator)):
+        # in place: the layer's buffers, which its forward adds
         torch.outer(outputs, inputs, out=layer.weight_epsilon)
         layer.bias_epsilon.copy_(outputs)
 
 
 def noise_of(network: nn.Module, generator: torch.Generator) -> list[tuple[Tensor, Tensor]]:
-    """New noise of the inputs and of the outputs of every noisy layer; empty without such layers."""
+    """New noise of the inputs and outputs of every noisy layer; empty without such layers."""
     layers = noisy_layers(network)
     if not layers:
         return []
+    # one draw for all layers, which is faster than one for each
     sizes = [size for layer in layers for size in (layer.in_features, layer.out_features)]
     normal = torch.randn(sum(sizes), generator=generator, device=generator.device)
+    # f(x) = sgn(x) sqrt(|x|), equation 11 of Fortunato et al.
     noise = (normal.sign() * normal.abs().sqrt()).split(sizes)
     return list(zip(noise[::2], noise[1::2]))
 
@@ -213,3 +248,72 @@ def noise_of(network: nn.Module, generator: torch.Generator) -> list[tuple[Tenso
 def noisy_layers(network: nn.Module) -> list[NoisyLinear]:
     """All of them, in the order of the modules."""
     return [layer for layer in network.modules() if isinstance(layer, NoisyLinear)]
+
+
+def linear(x: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> Tensor:
+    """``x @ weight.T + bias`` for ``x`` [*, I], ``weight`` [O, I] and ``bias`` [O]; then a ReLU, if
+    asked for.
+
+    By oneDNN on a CPU: PyTorch sends float32 products to MKL, which uses half the vector width on
+    AMD processors; oneDNN computes the same in full precision in half the time there, and in no
+    more time elsewhere.
+    """
+    # oneDNN's operator takes 2-d float32 on a CPU, nothing else
+    fast = _ONEDNN and x.device.type == "cpu" and x.dtype == torch.float32 and x.dim() == 2
+    if fast and not torch.is_grad_enabled():
+        return _product(x, weight, bias, relu)
+    product = _OneDnnLinear.apply(x, weight, bias) if fast else functional.linear(x, weight, bias)
+    return torch.relu(product) if relu else product
+
+
+def matrix_product(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    relu: bool = False,
+) -> Tensor:
+    """:func:`linear` in 2-d float32 without gradients, as an operator that a compiled graph calls
+    as it is.
+    """
+    return torch.ops.ganlane.linear(x, weight, bias, relu)
+
+
+def _product(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    relu: bool = False,
+) -> Tensor:
+    return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "relu" if relu else "none", [], "")
+
+
+class _OneDnnLinear(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        ctx.save_for_backward(x, weight)
+        return _product(x, weight, bias)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
+        (gradient,), (x, weight) = gradients, ctx.saved_tensors
+        to_x = _product(gradient, weight.t()) if ctx.needs_input_grad[0] else None
+        return to_x, _product(gradient.t(), x.t()), gradient.sum(0)
+
+
+# Compiled, oneDNN's own operator is replaced by a slower product or, with transposed weights, not
+# understood.
+_LIBRARY = torch.library.Library("ganlane", "FRAGMENT")
+_LIBRARY.define("linear(Tensor x, Tensor weight, Tensor? bias, bool relu) -> Tensor")
+
+
+@torch.library.impl(_LIBRARY, "linear", "CPU")
+def _operator(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
+    if _ONEDNN:
+        return _product(x, weight, bias, relu)
+    product = functional.linear(x, weight, bias)
+    return torch.relu(product) if relu else product
+
+
+@torch.library.register_fake("ganlane::linear")
+def _shape(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
+    return x.new_empty((x.shape[0], weight.shape[0]))

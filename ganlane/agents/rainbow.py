@@ -10,8 +10,17 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from ganlane.agents.drivers import ExploringPolicy, GreedyPolicy, LegalActions
-from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss, Learned, UpdateGraph
+from ganlane.agents.drivers import (
+    ExploringPolicy,
+    GreedyPolicy,
+    LegalActions,
+)
+from ganlane.agents.loss import (
+    LeanDistributionalLoss,
+    LeanDQNLoss,
+    Learned,
+    UpdateGraph,
+)
 from ganlane.agents.n_step import NStepWindow
 from ganlane.agents.network import (
     NetworkConfig,
@@ -21,9 +30,14 @@ from ganlane.agents.network import (
     parameters_of,
     redraw_noise,
 )
-from ganlane.agents.replay import draw, load_replay_state, make_replay, replay_state
+from ganlane.agents.replay import (
+    draw,
+    load_replay_state,
+    make_replay,
+    replay_state,
+)
 from ganlane.errors import ParameterError, UserError
-from ganlane.settings.agent import RainbowConfig, without_removed
+from ganlane.settings.agent import RainbowConfig
 
 
 class Rainbow:
@@ -56,35 +70,54 @@ class Rainbow:
     ) -> None:
         if config.learning_rate_end is not None and config.learning_rate_decisions == 0:
             raise ParameterError(
-                f"{{learning_rate_end}}={config.learning_rate_end:g}: within how many decisions? set "
-                "{learning_rate_decisions}, here or by for_phase(); give both or neither."
+                f"{{learning_rate_end}}={config.learning_rate_end:g}: within how many decisions? "
+                "set {learning_rate_decisions}, here or by for_phase(); give both or neither."
             )
-        self.config, self.device = config, torch.device(device)
+        self.config = config
+        self.device = torch.device(device)
         self.generators = {
             name: torch.Generator(self.device).manual_seed(seed * 3 + i)
             for i, name in enumerate(("collect", "learn", "replay"))
         }
+        # layers draw their initial weights from the global generator
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(seed)
-            network = QNetwork(NetworkConfig.of(config, observation_size, actions))
+            network = QNetwork(NetworkConfig(config, observation_size, actions))
         self.network = network.to(self.device)
         self.loss = (
-            LeanDistributionalLoss(self.network, config.gamma, config.double, config.kl_priority)
+            LeanDistributionalLoss(
+                self.network,
+                config.gamma,
+                config.double,
+                config.kl_priority,
+            )
             if config.distributional
             else LeanDQNLoss(self.network, config.gamma, config.double)
         )
+        # Rainbow's 1.5e-4 is 0.005 over its batch of 32
         adam_eps = 0.005 / config.batch_size if config.adam_eps is None else config.adam_eps
         self.optimizer = torch.optim.Adam(
-            self.network.parameters(), lr=config.learning_rate, eps=adam_eps, fused=True
+            self.network.parameters(),
+            lr=config.learning_rate,
+            eps=adam_eps,
+            fused=True,
         )
         self.replay = make_replay(config, self.generators["replay"])
         self.policy = ExploringPolicy(self.network, self.generators["collect"], legal)
         self.greedy = GreedyPolicy(self.network)
+        # since the start of the training
         self.updates = 0
         self.graph: UpdateGraph | None = None
         # The graph is of the whole of Rainbow; with any part left out the update is computed step
         # by step.
-        parts = ("distributional", "double", "dueling", "noisy", "prioritised", "kl_priority")
+        parts = (
+            "distributional",
+            "double",
+            "dueling",
+            "noisy",
+            "prioritised",
+            "kl_priority",
+        )
         if compile and all(getattr(config, part) for part in parts) and self.device.type == "cpu":
             self.graph = UpdateGraph(self.network, self.loss, self.optimizer, config)
         self.anneal(0)
@@ -102,43 +135,53 @@ class Rainbow:
         """Set the share of random actions and the learning rate after ``decisions``."""
         config = self.config
         self.policy.epsilon = annealed(
-            config.epsilon_start, config.epsilon, decisions, config.epsilon_decisions
+            config.epsilon_start,
+            config.epsilon,
+            decisions,
+            config.epsilon_decisions,
         )
         if config.learning_rate_end is not None:
-            now = annealed(
+            (group,) = self.optimizer.param_groups
+            group["lr"] = annealed(
                 config.learning_rate,
                 config.learning_rate_end,
                 decisions,
                 config.learning_rate_decisions,
             )
-            for group in self.optimizer.param_groups:
-                group["lr"] = now
 
     def store(self, transition: TensorDict | None) -> None:
-        """Add transitions, batch [N], with the keys of :meth:`NStepWindow.push`; None adds nothing."""
+        """Add the transitions of :meth:`NStepWindow.push`, batch [N]; None adds nothing."""
         if transition is not None:
             self.replay.extend(transition, update_priority=False)
 
     def update(self) -> dict[str, Tensor]:
-        """One step of gradient descent; 0-dim tensors to log, read without a host synchronisation."""
+        """One step of gradient descent; gives 0-dim tensors to log, still on the device."""
         config = self.config
         if config.prioritised:
             self.replay.sampler.beta = annealed(
-                config.beta_start, 1.0, self.updates, config.beta_updates
+                config.beta_start,
+                1.0,
+                self.updates,
+                config.beta_updates,
             )
+        # one batch by priority
         batch = draw(self.replay)
-        learned = (self._descend if self.graph is None else self.graph)(
-            batch, self.generators["learn"]
-        )
+        descend = self._descend if self.graph is None else self.graph
+        learned = descend(batch, self.generators["learn"])
         if config.prioritised:
             self.replay.sampler.update_priority(batch.get("index"), learned.priority)
         self.updates += 1
+        # a hard copy, as in Rainbow
         if self.updates % config.target_period == 0:
             self.loss.update_target()
-        return {**learned._asdict(), "priority": learned.priority.mean()}
+        return {
+            **learned._asdict(),
+            "priority": learned.priority.mean(),
+        }
 
     def _descend(self, batch: TensorDict, generator: torch.Generator) -> Learned:
         """What :class:`~ganlane.agents.loss.UpdateGraph` does, for every ``config`` and device."""
+        # both networks get new noise for every update
         for module in (self.network, self.loss.target_network):
             redraw_noise(module, generator)
         terms = self.loss(batch)
@@ -151,7 +194,11 @@ class Rainbow:
         self.optimizer.step()
         priority = batch.get("td_error")[:, 0]
         return Learned(
-            priority, objective.detach(), terms["mean_q"], terms["clamped_fraction"], norm
+            priority,
+            objective.detach(),
+            terms["mean_q"],
+            terms["clamped_fraction"],
+            norm,
         )
 
     def sigma(self) -> Tensor:
@@ -171,6 +218,13 @@ class Rainbow:
         load_parameters(self.network, weights)
         self.loss.update_target()
 
+    def load_moments(self, moments: Mapping[int, Any]) -> None:
+        """Let Adam go on from ``moments``, the part ``state`` of an optimiser's state.
+
+        The learning rate and the other options are those of this agent.
+        """
+        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": moments})
+
     def state_dict(self, with_replay: bool = True) -> dict[str, Any]:
         """Tensors and plain data for a bit-exact resume; noise is redrawn before use, so it is not
         among them.
@@ -179,13 +233,10 @@ class Rainbow:
         """
         optimizer = self.optimizer.state_dict()
         if not with_replay:  # loading brings the moments back to the weights' type
-            optimizer["state"] = {
-                row: {
-                    name: value.bfloat16() if name.startswith("exp_avg") else value
-                    for name, value in own.items()
-                }
-                for row, own in optimizer["state"].items()
-            }
+            # new dictionaries: those of the optimiser are its own
+            for row, moments in optimizer["state"].items():
+                halves = {name: moments[name].bfloat16() for name in ("exp_avg", "exp_avg_sq")}
+                optimizer["state"][row] = {**moments, **halves}
         return {
             "config": asdict(self.config),
             "network": self.weights(),
@@ -206,22 +257,20 @@ class Rainbow:
             UserError: it is the state of an agent with other hyperparameters or another
                 observation.
         """
-        # An agent saved before there was an option has its default.
-        saved = {**asdict(RainbowConfig()), **without_removed(state["config"], "the saved agent")}
         for name, value in asdict(self.config).items():
-            if saved[name] != value:
+            saved = state["config"][name]
+            if saved != value:
                 raise UserError(
-                    f"agent.{name}={value}: the saved agent has {saved[name]}; give the same to go on from it."
+                    f"agent.{name}={value}: the saved agent has {saved}; give the same to go on "
+                    "from it."
                 )
         load_parameters(self.network, state["network"])
         load_parameters(self.loss.target_network, state["target"])
-        # The moments alone: the groups are those of the configuration.
-        self.optimizer.load_state_dict(
-            {**self.optimizer.state_dict(), "state": state["optimizer"]["state"]}
-        )
+        self.load_moments(state["optimizer"]["state"])
         for name, generator in self.generators.items():
             generator.set_state(state["generators"][name].cpu())
         self.updates = state["updates"]
+        # without the buffer in the state it is filled again by the run
         self.replay.empty()
         if state["replay"] is not None:
             load_replay_state(self.replay, state["replay"])

@@ -39,17 +39,15 @@ ROW = 64
 
 
 def make_replay(config: RainbowConfig, generator: torch.Generator) -> TensorDictReplayBuffer:
-    """The replay buffer that ``config`` asks for, on the generator's device.
-
-    ``sample()`` draws a batch.
-    """
-    capacity, device = config.capacity, generator.device
-    prioritised = config.prioritised
+    """The replay buffer that ``config`` asks for, on the generator's device."""
+    capacity = config.capacity
+    device = generator.device
+    sampler = RandomSampler()
+    if config.prioritised:
+        sampler = RowSampler(capacity, config.alpha, config.beta_start, device)
     return TensorDictReplayBuffer(
         storage=LazyTensorStorage(capacity, device=device),
-        sampler=RowSampler(capacity, config.alpha, config.beta_start, device)
-        if prioritised
-        else RandomSampler(),
+        sampler=sampler,
         batch_size=config.batch_size,
         generator=generator,
         priority_key="td_error",
@@ -69,17 +67,22 @@ def draw(buffer: TensorDictReplayBuffer) -> TensorDict:
 
 
 def replay_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
-    """The transitions in use (tensors by dotted key), the place of the next one, the sampler.
-
-    Plain data.
-    """
+    """Plain data: the transitions in use (by dotted key), the place of the next, the sampler."""
+    # in the order of the storage, so that the indices of the sampler hold
     rows = buffer[:] if len(buffer) else TensorDict({}, [0])
     tensors = dict(rows.select(*TRANSITION_KEYS, MASK_KEY, strict=False).flatten_keys(".").items())
     # a view would be saved with all of the storage behind it
     if len(buffer) < buffer.storage.max_size:
         tensors = {name: tensor.clone() for name, tensor in tensors.items()}
-    writer = {"cursor": buffer.writer._cursor, "writes": buffer.write_count}
-    return {"rows": tensors, **writer, "sampler": buffer.sampler.state_dict()}
+    writer = {
+        "cursor": buffer.writer._cursor,
+        "writes": buffer.write_count,
+    }
+    return {
+        "rows": tensors,
+        **writer,
+        "sampler": buffer.sampler.state_dict(),
+    }
 
 
 def load_replay_state(buffer: TensorDictReplayBuffer, state: dict[str, Any]) -> None:
@@ -87,30 +90,42 @@ def load_replay_state(buffer: TensorDictReplayBuffer, state: dict[str, Any]) -> 
     buffer.empty()
     if state["rows"]:
         buffer.extend(TensorDict(state["rows"], [len(state["rows"]["action"])]).unflatten_keys("."))
+    # extend has moved the cursor; after a wrap it stands elsewhere
     buffer.writer._cursor = state["cursor"]
     buffer.writer._write_count = state["writes"]
     buffer.sampler.load_state_dict(state["sampler"])
 
 
 class RowSampler(PrioritizedSampler):
-    """Draws item i with probability ``(p_i + 1e-8)^alpha / sum``; weights ``(P_i N)^-beta`` over
-    the batch's largest.
+    """Draws item i with probability ``(p_i + 1e-8)^alpha / sum``.
 
+    Its weight is ``(P_i N)^-beta`` over the batch's largest.
     As in Dopamine, the largest weight is the batch's: the one of the whole buffer belongs to an
     outlier that is hardly ever drawn, and would shrink every step. New items get the largest
     priority seen. Draws come from the generator of the replay buffer (``generator=`` at its
     construction) and from no other.
     """
 
-    def __init__(self, max_capacity: int, alpha: float, beta: float, device: torch.device) -> None:
-        # Not the parent's constructor: it warns of the missing C++ extension, which is not needed
-        # here.
-        self._max_capacity, self._alpha, self._beta, self._eps = max_capacity, alpha, beta, 1e-8
-        self._device, self.dtype, self.reduction = device, torch.float32, "max"
+    def __init__(
+        self,
+        max_capacity: int,
+        alpha: float,
+        beta: float,
+        device: torch.device,
+    ) -> None:
+        # not the parent's constructor: it warns of a missing C++ extension, not needed here
+        self._max_capacity = max_capacity
+        self._alpha = alpha
+        self._beta = beta
+        self._eps = 1e-8
+        self._device = device
+        self.dtype = torch.float32
+        self.reduction = "max"
         self._max_priority_within_buffer = False
         self._init()
 
     def _init(self) -> None:
+        # rounded up
         rows = -(-self._max_capacity // ROW)
         self.priorities = torch.zeros(rows, ROW, device=self._device)
         self.row_sums = torch.zeros(rows, dtype=torch.float64, device=self._device)
@@ -134,17 +149,19 @@ class RowSampler(PrioritizedSampler):
 
     @torch.no_grad()
     def update_priority(
-        self, index: Tensor | int, priority: Tensor | float, *, storage: Storage | None = None
+        self,
+        index: Tensor | int,
+        priority: Tensor | float,
+        *,
+        storage: Storage | None = None,
     ) -> None:
-        """Give the items at ``index`` [B] the raw priorities ``priority`` ([B], [B, 1] or one
-        number), at least 0.
-        """
+        """Give the items at ``index`` [B] raw priorities of at least 0: [B], [B, 1] or a number."""
         index = torch.as_tensor(index, device=self.device).reshape(-1)
         priority = torch.as_tensor(priority, dtype=torch.float32, device=self.device).reshape(-1)
         self.largest = torch.maximum(self.largest, priority.amax())
-        self.priorities.view(-1)[index] = ((priority + self._eps) ** self._alpha).expand(
-            index.shape
-        )
+        raised = (priority + self._eps) ** self._alpha
+        self.priorities.view(-1)[index] = raised.expand(index.shape)
+        # whole rows are summed anew, so that rounding errors do not add up
         row = index // ROW
         self.row_sums[row] = self.priorities[row].sum(-1, dtype=torch.float64)
 
@@ -157,24 +174,30 @@ class RowSampler(PrioritizedSampler):
         # reading it would make a GPU wait
         if cumulated.device.type == "cpu" and not cumulated[-1].isfinite():
             raise UserError(
-                "training has diverged: its errors are not finite; lower agent.learning_rate and start again, or go "
-                "on from an earlier checkpoint."
+                "training has diverged: its errors are not finite; lower agent.learning_rate and "
+                "start again, or go on from an earlier checkpoint."
             )
         uniform = torch.rand(
-            batch_size, generator=self._rng, dtype=torch.float64, device=self.device
+            batch_size,
+            generator=self._rng,
+            dtype=torch.float64,
+            device=self.device,
         )
+        # first the row in which the drawn mass lies, then the item within it
         mass = _below(uniform * cumulated[-1], cumulated[-1])
         row = torch.searchsorted(cumulated, mass, right=True)
         rest = mass - (cumulated[row] - self.row_sums[row])
         within = self.priorities[row].double().cumsum(-1)
         column = (within <= _below(rest, within[:, -1])[:, None]).sum(-1)
         index = row * ROW + column
+        # the item with the smallest priority has the largest weight, which becomes 1
         chosen = self.priorities.view(-1)[index]
         weight = (chosen / chosen.amin()) ** -self._beta
         return index, {"priority_weight": weight}
 
     def state_dict(self) -> dict[str, Any]:
         """Priorities of the rows in use, the largest priority, and beta."""
+        # rows fill up from the first on
         used = int((self.row_sums > 0).sum())
         return {
             "priorities": self.priorities[:used].clone(),

@@ -14,7 +14,12 @@ from ganlane.settings.train import TrainConfig
 from ganlane.errors import UserError
 from ganlane.torch_settings import set_threads
 from ganlane.training.checkpoint import LAST
-from ganlane.training.phases import AGENT_FILE, length_if_finished, phases_of, run_phase
+from ganlane.training.phases import (
+    AGENT_FILE,
+    length_if_finished,
+    phases_of,
+    run_phase,
+)
 
 #: Name of the agent of this run in the table.
 TRAINED = "trained"
@@ -31,17 +36,24 @@ def train(config: TrainConfig, folder: Path) -> str:
     for traffic in config.all_traffic():
         make_traffic(traffic, config.env)
     others = make_drivers(config.evaluation.agents, config.env, config.device)
+    # decisions, updates and wall time by phase
     lengths: dict[str, dict[str, float]] = {}
     for phase in phases_of(config, folder):
+        # a resumed run does not repeat a first phase that is over
         finished = length_if_finished(config, phase)
         if finished is not None:
             lengths[phase.name] = finished
             continue
+        # stopped before its first checkpoint, a phase starts anew
         last = phase.folder / LAST
         resume = last if config.resume is not None and last.is_file() else None
         result = run_phase(config.compiled(), phase, resume)
         if result.stopped_by is not None:
-            print(f"saved; go on with: ganlane train resume={folder}", file=sys.stderr)
+            print(
+                f"saved; go on with: ganlane train resume={folder}",
+                file=sys.stderr,
+            )
+            # the exit status says by which signal
             raise Stopped(result.stopped_by)
         lengths[phase.name] = {
             "decisions": result.decisions,
@@ -49,13 +61,23 @@ def train(config: TrainConfig, folder: Path) -> str:
             "wall_s": result.wall_s,
         }
     trained = replace(
-        make_driver(str(folder / AGENT_FILE), config.env, device=config.device), name=TRAINED
+        make_driver(
+            str(folder / AGENT_FILE),
+            config.env,
+            device=config.device,
+        ),
+        name=TRAINED,
     )
+    # the trained agent and the others drive the same episodes
     table = compare([trained, *others], config.final_evaluation())
     seeds = {
         "training": config.seed,
         "stream": "report",
         "episodes": [0, config.evaluation.episodes - 1],
     }
-    numbers = {**lengths["train"], "phases": lengths, "agent": str(folder / AGENT_FILE)}
+    numbers = {
+        **lengths["train"],
+        "phases": lengths,
+        "agent": str(folder / AGENT_FILE),
+    }
     return publish(table, folder, asdict(config), seeds, numbers)

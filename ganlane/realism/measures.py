@@ -28,7 +28,7 @@ from ganlane.evaluation.statistics import (
     poisson_interval,
     resample_counts,
 )
-from ganlane.files import CHECKPOINTS, PLACE, has_checksum, note_without_checksum, write_json
+from ganlane.files import CHECKPOINTS, PLACE, has_checksum, refuse_without_checksum, write_json
 from ganlane.realism.recordings import Recording, recorded_frame, units_of
 
 #: Recorded driving as histograms, which ships; it holds derived numbers, never an excerpt of a
@@ -418,7 +418,7 @@ class Reference:
                 "recordings with data.path=FILE."
             ) from error
         if not whole:
-            note_without_checksum(path)
+            refuse_without_checksum(path)
         return reference
 
 

@@ -19,24 +19,25 @@ from ganlane.agents.n_step import Step
 from ganlane.agents.replay import MASK_KEY, ROW
 from ganlane.config.run import LAST
 from ganlane.errors import UserError
-from ganlane.files import atomic_path, has_checksum, note_without_checksum, seal_archive
-from ganlane.training.collectors import Collector, SingleCollector
+from ganlane.files import atomic_path, has_checksum, refuse_without_checksum, seal_archive
+from ganlane.training.collectors import Collector
 from ganlane.training.stats import EpisodeStats
 
 KIND = "ganlane training checkpoint"
 VERSION = 2
-#: Names in checkpoints of version 0.1, and their present names.
-RENAMED = {"carrier": "env_state", "meter": "stats", "owed": "pending_decisions"}
-#: Key of an identity that holds the defaults of its options.
-DEFAULTS = "defaults"
-#: Parts of an identity that may change when a run is resumed; the run is bit-exact only if they do
-#: not.
+#: Parts of an identity that may change at a resume; the run is bit-exact only if they do not.
 COMPUTED_BY = ("env.compile",)
-#: After a checkpoint that took t seconds to write, the next comes after 50 t at the earliest: 2 %
-#: of the time.
+#: After a checkpoint that took t seconds the next comes after 50 t or later: 2 % of the time.
 PATIENCE = 50.0
 #: Parts of a checkpoint in which every number must be finite.
-FINITE = ("network", "target", "optimizer", "replay", "window", "stats")
+FINITE = (
+    "network",
+    "target",
+    "optimizer",
+    "replay",
+    "window",
+    "stats",
+)
 #: Upper bound of the decisions, updates and rows of a run.
 MOST = 2**53
 #: Name of the action masks in the rows of the replay buffer, if there are masks.
@@ -48,25 +49,33 @@ class TrainingState:
 
     ``pending_decisions`` counts decisions whose updates are still due; ``best`` is the best
     evaluation so far, ``evaluated_at`` the decisions at the last one. ``identity`` is plain data
-    that a resumed run must share: environment, traffic, reward, seed. Its entry :data:`DEFAULTS`,
-    which is not saved, holds the defaults of options by dotted name, for options that did not exist
-    when an older run was started.
+    that a resumed run must share: environment, traffic, reward, seed.
     """
 
     def __init__(
-        self, env: EnvBase | Collector, agent: Rainbow, identity: Mapping[str, Any] | None = None
+        self,
+        env: EnvBase,
+        agent: Rainbow,
+        identity: Mapping[str, Any] | None = None,
     ) -> None:
-        self.collector = env if isinstance(env, Collector) else SingleCollector(env)
-        self.agent, self.identity = agent, dict(identity or {})
-        self.defaults = self.identity.pop(DEFAULTS, {})
+        # what the run consists of, in the order of a decision
+        self.collector = Collector(env)
+        self.agent = agent
+        self.identity = dict(identity or {})
         self.environments = self.collector.environments
         self.window = agent.window()
         self.stats = EpisodeStats(
-            self.environments, agent.network.config.actions, agent.config.gamma, agent.device
+            self.environments,
+            agent.network.config.actions,
+            agent.config.gamma,
+            agent.device,
         )
-        self.decisions, self.pending_decisions, self.evaluated_at = 0, 0, 0
+        self.decisions = 0
+        self.pending_decisions = 0
+        self.evaluated_at = 0
         self.best: float | None = None
-        self._before_s, self._started_s = 0.0, time.monotonic()
+        self._before_s = 0.0
+        self._started_s = time.monotonic()
 
     @property
     def wall_s(self) -> float:
@@ -81,17 +90,20 @@ class TrainingState:
         """Tensors and plain data.
 
         Without the replay buffer the state is small and holds only the episode numbers of the
-        environments: a resumed run starts the next episodes and is not bit-exact. The same holds
-        for collectors that are not exact.
+        environments: a resumed run starts the next episodes and is not bit-exact.
         """
-        exact = with_replay and self.collector.exact
-        counters = ("decisions", "pending_decisions", "wall_s", "best")
         return {
             "agent": self.agent.state_dict(with_replay),
-            "window": self.window.state_dict() if exact else None,
-            "env_state": self.collector.state_dict(exact),
-            "stats": self.stats.state_dict() if exact else None,
-            "counters": {name: getattr(self, name) for name in counters},
+            # None marks what a light checkpoint leaves out
+            "window": self.window.state_dict() if with_replay else None,
+            "env_state": self.collector.state_dict(with_replay),
+            "stats": self.stats.state_dict() if with_replay else None,
+            "counters": {
+                "decisions": self.decisions,
+                "pending_decisions": self.pending_decisions,
+                "wall_s": self.wall_s,
+                "best": self.best,
+            },
             "identity": self.identity,
         }
 
@@ -105,7 +117,14 @@ class TrainingState:
             UserError: the checkpoint is unreadable, or of another run.
         """
         state = load_checkpoint(path, self.agent.device)
-        parts = {"agent", "window", "env_state", "stats", "counters", "identity"}
+        parts = {
+            "agent",
+            "window",
+            "env_state",
+            "stats",
+            "counters",
+            "identity",
+        }
         if not isinstance(state, dict) or not state.keys() >= parts:
             raise UserError(
                 f"resume={path}: parts of the run are missing in it; give another checkpoint."
@@ -114,34 +133,42 @@ class TrainingState:
             raise UserError(
                 f"resume={path}: it does not say what run it is of; give another checkpoint."
             )
-        before, now = (
-            flat({**self.defaults, **flat(each)}) for each in (state["identity"], self.identity)
-        )
+        # by dotted name, as on the command line
+        before = flat(state["identity"])
+        now = flat(self.identity)
+        # the first difference is enough for a sentence
         for name in (*now, *before):
             if name not in COMPUTED_BY and before.get(name) != now.get(name):
                 raise UserError(
-                    f"resume={path}: {name}={now.get(name)}, but the run was started with {before.get(name)}; "
-                    "go on with that, or start a new run."
+                    f"resume={path}: {name}={now.get(name)}, but the run was started with "
+                    f"{before.get(name)}; go on with that, or start a new run."
                 )
         try:
-            return self._take_over(state, path)
+            self._take_over(state, path)
         except UserError:
             raise
         except Exception as error:  # damaged parts can fail in any way
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise UserError(
-                f"resume={path}: a part of the run is damaged in it ({reason}); give another checkpoint."
+                f"resume={path}: a part of the run is damaged in it ({reason}); give another "
+                "checkpoint."
             ) from error
+        if state["agent"]["replay"] is None:
+            return "the replay buffer: it is filled again before the next update"
+        return None
 
-    def _take_over(self, state: Mapping[str, Any], path: str | Path) -> str | None:
+    def _take_over(self, state: Mapping[str, Any], path: str | Path) -> None:
         """Restore everything from ``state``; see :meth:`restore`."""
+        # with the window and the buffer everything goes on where it stopped
         exact = state["window"] is not None
-        fresh, shape = self.collector.state_dict(exact), state["env_state"]["batch_size"]
+        fresh = self.collector.state_dict(exact)
+        shape = state["env_state"]["batch_size"]
         if isinstance(shape, list) and shape != fresh["batch_size"]:
             raise UserError(
-                f"resume={path}: saved with environments of shape {shape}, this run has [{self.environments}]; use "
-                "the same number."
+                f"resume={path}: saved with environments of shape {shape}, this run has "
+                f"[{self.environments}]; use the same number."
             )
+        # the agent first: the checks compare Adam's moments with its weights
         self.agent.load_state_dict(state["agent"])
         check_parts(state, self.agent, fresh, self.stats)
         self.collector.load_state_dict(state["env_state"], exact)
@@ -149,21 +176,14 @@ class TrainingState:
             self.window.load_state_dict(state["window"])
             self.stats.load_state_dict(state["stats"])
         counters = state["counters"]
-        self.decisions, self.pending_decisions = (
-            counters["decisions"],
-            counters["pending_decisions"],
-        )
-        self.best, self._before_s = counters["best"], counters["wall_s"]
-        if state["agent"]["replay"] is None:
-            return "the replay buffer: it is filled again before the next update"
-        return (
-            None if exact else "the episodes that were under way: the workers begin the next ones"
-        )
+        self.decisions = counters["decisions"]
+        self.pending_decisions = counters["pending_decisions"]
+        self.best = counters["best"]
+        self._before_s = counters["wall_s"]
 
 
 class Checkpointer:
-    """Writes ``checkpoints/last.pt`` (to resume), ``last.safetensors`` and ``best.safetensors`` (to
-    drive).
+    """Writes ``checkpoints/last.pt`` (to resume), ``last`` and ``best.safetensors`` (to drive).
 
     ``every_s`` are the least seconds between two checkpoints. To the ``metadata`` of the agent's
     files the progress of the training is added, under ``training``.
@@ -177,9 +197,13 @@ class Checkpointer:
         with_replay: bool,
         metadata: Mapping[str, Any],
     ) -> None:
-        self.state, self.path, self.metadata = state, Path(folder) / LAST, metadata
-        self.every_s, self.with_replay = every_s, with_replay
-        self.saved_s, self.pause_s = time.monotonic(), every_s
+        self.state = state
+        self.path = Path(folder) / LAST
+        self.metadata = metadata
+        self.every_s = every_s
+        self.with_replay = with_replay
+        self.saved_s = time.monotonic()
+        self.pause_s = every_s
 
     def due(self) -> bool:
         """Whether the next checkpoint is due."""
@@ -191,6 +215,7 @@ class Checkpointer:
         save_checkpoint(self.path, self.state.state_dict(self.with_replay))
         self.save_weights("last", {})
         self.saved_s = time.monotonic()
+        # a slow disk must not slow down the training
         self.pause_s = max(self.every_s, PATIENCE * (self.saved_s - begun))
 
     def save_weights(self, name: str, figures: Mapping[str, Any]) -> None:
@@ -201,7 +226,11 @@ class Checkpointer:
             "updates": state.agent.updates,
             "wall_s": state.wall_s,
         }
-        training = {**self.metadata.get("training", {}), **progress, **figures}
+        training = {
+            **self.metadata.get("training", {}),
+            **progress,
+            **figures,
+        }
         save_agent(
             self.path.with_name(f"{name}.safetensors"),
             state.agent,
@@ -211,59 +240,58 @@ class Checkpointer:
 
 def save_checkpoint(path: str | Path, state: Any) -> None:
     """Write ``state`` (tensors and plain data) atomically, with a checksum of the whole file."""
+    # a kill while writing leaves the checkpoint before it
     with atomic_path(path) as part:
-        torch.save({"kind": KIND, "version": VERSION, "sealed": True, "state": state}, part)
+        torch.save({"kind": KIND, "version": VERSION, "state": state}, part)
         seal_archive(part)
 
 
 def load_checkpoint(
-    path: str | Path, device: torch.device | str = "cpu", key: str = "resume"
+    path: str | Path,
+    device: torch.device | str = "cpu",
+    key: str = "resume",
 ) -> Any:
-    """Read a file of :func:`save_checkpoint`, with present names; never executes code.
+    """Read a file of :func:`save_checkpoint`; never executes code.
 
-    Files of versions that wrote no checksum are read too (:func:`note_without_checksum`). ``key``
-    is the configuration key of ``path``, for error messages.
+    ``key`` is the configuration key of ``path``, for error messages.
 
     Raises:
         UserError: the file is absent, damaged in any byte, holds weights that are not finite, or is
             no training checkpoint of this version.
     """
-    path, given = Path(path), f"{key}={path}"
+    path, option = Path(path), f"{key}={path}"
     if not path.is_file():
-        raise UserError(f"{given}: no such file; give a run's folder or its {LAST}.")
+        raise UserError(f"{option}: no such file; give a run's folder or its {LAST}.")
     with path.open("rb") as file:
-        empty = file.seek(0, 2) == 0
-        whole = not empty and has_checksum(
-            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), given
+        empty = file.seek(0, 2) == 0  # which cannot be mapped
+        sealed = not empty and has_checksum(
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ),
+            option,
         )
     try:
+        # weights_only: no pickled object is made, no code runs
         content = torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # arbitrary bytes can make the unpickler fail in any way
         raise UserError(
-            f"{given}: not a readable checkpoint (truncated, or not written by ganlane); give another one."
+            f"{option}: not a readable checkpoint (truncated, or not written by ganlane); give "
+            "another one."
         ) from error
     if (
         not isinstance(content, dict)
         or content.get("kind") != KIND
         or content.get("version") != VERSION
     ):
-        raise UserError(f"{given}: not a {KIND} of version {VERSION}; give a run's {LAST}.")
-    if not whole and "sealed" in content:
-        raise UserError(
-            f"{given}: damaged, the checksum that was written with it is missing; give another one."
-        )
-    state = _renamed(content.get("state"))  # :meth:`TrainingState.restore` checks the parts
-    if isinstance(state, dict) and "counters" in state:
-        state["counters"] = _renamed(state["counters"])
+        raise UserError(f"{option}: not a {KIND} of version {VERSION}; give a run's {LAST}.")
+    if not sealed:
+        refuse_without_checksum(option)
+    state = content.get("state")  # :meth:`TrainingState.restore` checks the parts
     agent = state.get("agent") if isinstance(state, dict) else None
-    parts = {**state, **agent} if isinstance(agent, dict) else {}
+    parts = {**state, **agent} if isinstance(state, dict) and isinstance(agent, dict) else {}
     for name in FINITE:
         if not _finite(parts.get(name)):
             raise UserError(
-                f"{given}: numbers of its {name} are not finite; give a checkpoint of another run."
+                f"{option}: numbers of its {name} are not finite; give a checkpoint of another run."
             )
-    if not whole:
-        note_without_checksum(given)
     return state
 
 
@@ -274,14 +302,6 @@ def _finite(state: Any) -> bool:
     if isinstance(state, dict):
         return all(map(_finite, state.values()))
     return not isinstance(state, list | tuple) or all(map(_finite, state))
-
-
-def _renamed(names: Any) -> Any:
-    return (
-        {RENAMED.get(key, key): value for key, value in names.items()}
-        if isinstance(names, dict)
-        else names
-    )
 
 
 def flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
@@ -299,10 +319,12 @@ def flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
 
 
 def check_parts(
-    state: Mapping[str, Any], agent: Rainbow, environments: Mapping[str, Any], stats: EpisodeStats
+    state: Mapping[str, Any],
+    agent: Rainbow,
+    environments: Mapping[str, Any],
+    stats: EpisodeStats,
 ) -> None:
-    """Compare ``state`` (:meth:`TrainingState.state_dict`) with that of a new run, before it is
-    used.
+    """Compare ``state`` (:meth:`TrainingState.state_dict`) with that of a new run before its use.
 
     A damaged part would do harm later: Adam writes beyond moments that are too short, and a replay
     buffer that samples rows it does not hold returns arbitrary memory.
@@ -314,68 +336,110 @@ def check_parts(
         ValueError: a part has another structure, shape or type, or impossible numbers.
         TypeError, KeyError, AttributeError: a part has another type altogether.
     """
-    network, counters, replay = agent.network.config, state["counters"], state["agent"]["replay"]
+    network = agent.network.config
+    counters = state["counters"]
+    replay = state["agent"]["replay"]
+    # each moment has the shape of its parameter
     moments = agent.optimizer.state_dict()["state"]
     adam = {
-        row: {"step": torch.zeros(()), "exp_avg": value, "exp_avg_sq": value}
+        row: {
+            "step": torch.zeros(()),
+            "exp_avg": value,
+            "exp_avg_sq": value,
+        }
         for row, value in enumerate(agent.network.parameters())
     }
     check_like(moments, adam if moments else {}, "optimizer")
     check_like(state["agent"]["updates"], 0, "updates")
     best = None if counters["best"] is None else 0.0
     check_like(
-        counters, {"decisions": 0, "pending_decisions": 0, "wall_s": 0.0, "best": best}, "counters"
+        counters,
+        {
+            "decisions": 0,
+            "pending_decisions": 0,
+            "wall_s": 0.0,
+            "best": best,
+        },
+        "counters",
     )
     if replay is not None:
         _check_replay(replay, agent)
     if state["window"] is None:  # the resumed run will not be exact
         return
+    # the environments, and whether their masks are in the buffer too
     check_like(state["env_state"], environments, "env_state")
+    # masks are there in both or in neither
     mask = environments["items"].get(keys.ACTION_MASK)
     if replay["rows"] and (MASK in replay["rows"]) != (mask is not None):
         raise ValueError("replay: its masks are those of another run")
-    rows, steps = transitions(len(stats.returns), network), state["window"]["steps"]
-    observation, end = rows["observation"], rows["next.terminated"]
+    # each step of the window is like a row of the buffer
+    rows = transitions(len(stats.discount), network)
+    steps = state["window"]["steps"]
+    observation = rows["observation"]
+    end = rows["next.terminated"]
     step = Step(
-        observation, rows["action"], rows["next.reward"], observation, end, end, mask
+        observation,
+        rows["action"],
+        rows["next.reward"],
+        observation,
+        end,
+        end,
+        mask,
     )._asdict()
-    check_like(steps, [step] * min(len(steps), agent.config.n_step - 1), "window")
+    check_like(
+        steps,
+        [step] * min(len(steps), agent.config.n_step - 1),
+        "window",
+    )
     for step in steps:
         _check_actions(step["action"], network)
-    saved, one = state["stats"], torch.zeros((), dtype=torch.float64)
+    # sums may be absent (nothing happened yet), never of another shape
+    saved = state["stats"]
+    one = torch.zeros((), dtype=torch.float64)
     sums = {
         name: one.expand(len(stats.actions)) if name == "actions" else one for name in saved["sums"]
     }
     updates = dict.fromkeys(saved["updates"], torch.zeros(()))
-    check_like(saved, {**stats.state_dict(), "sums": sums, "updates": updates}, "stats")
+    check_like(
+        saved,
+        {**stats.state_dict(), "sums": sums, "updates": updates},
+        "stats",
+    )
     if updates and saved["update_count"] == 0:
         raise ValueError("stats: sums over no update")
 
 
 def _check_replay(replay: Mapping[str, Any], agent: Rainbow) -> None:
-    rows, cursor, config = replay["rows"], replay["cursor"], agent.config
+    rows = replay["rows"]
+    cursor = replay["cursor"]
+    config = agent.config
+    # the buffer holds rows 0 to count - 1
     count = len(rows["action"]) if rows else 0
     check_like(replay, {"cursor": 0, "writes": 0}, "replay")
     if rows:
         like = transitions(count, agent.network.config)
         check_like(
-            rows, {name: like[name] for name in like if name != MASK or MASK in rows}, "replay"
+            rows,
+            {name: like[name] for name in like if name != MASK or MASK in rows},
+            "replay",
         )
         _check_actions(rows["action"], agent.network.config)
         steps = rows["steps_to_next_obs"]
         if ((steps < 1) | (steps > config.n_step)).any():
             raise ValueError("replay: transitions of more steps than the run's")
+    # until it is full the next row is the first free one, then any
     if not (cursor == count < config.capacity or cursor < count == config.capacity):
         raise ValueError(f"replay: {count} rows of {config.capacity}, the next one is {cursor}")
     if config.prioritised:
-        own = torch.arange(-(-count // ROW) * ROW, device=agent.device).view(-1, ROW) < count
-        expected: dict[str, Any] = {
-            "priorities": own.float(),
+        # of whole rows, in which the items that exist have a priority
+        in_use = torch.arange(-(-count // ROW) * ROW, device=agent.device).view(-1, ROW) < count
+        sampler = {
+            "priorities": in_use.float(),
             "largest": torch.zeros(()),
             "beta": 0.0,
         }
-        check_like(replay["sampler"], expected, "replay.sampler")
-        if not torch.equal(replay["sampler"]["priorities"] > 0, own):
+        check_like(replay["sampler"], sampler, "replay.sampler")
+        if not torch.equal(replay["sampler"]["priorities"] > 0, in_use):
             raise ValueError("replay: priorities of rows that do not exist")
 
 
@@ -386,6 +450,7 @@ def _check_actions(taken: Tensor, network: NetworkConfig) -> None:
 
 def transitions(rows: int, network: NetworkConfig) -> dict[str, Tensor]:
     """Shapes and types of the rows of the replay buffer as meta tensors, by dotted key."""
+    # meta tensors have shape and type, and take no memory
     number = torch.empty(rows, 1, device="meta")
     observation = number.expand(rows, network.observation_size)
     after = {
@@ -402,26 +467,28 @@ def transitions(rows: int, network: NetworkConfig) -> dict[str, Tensor]:
     }
 
 
-def check_like(found: Any, like: Any, name: str) -> None:
-    """Raise :class:`ValueError` unless ``found`` has at least the keys of ``like``, its lengths,
-    shapes and types.
+def check_like(value: Any, like: Any, name: str) -> None:
+    """Raise :class:`ValueError` unless ``value`` has the lengths, shapes and types of ``like``.
 
-    Numbers outside tensors must be finite, counts at least 0.
+    It may have more keys. Numbers outside tensors must be finite, counts at least 0.
     """
     if isinstance(like, Tensor):
-        fits = isinstance(found, Tensor) and (found.shape, found.dtype) == (like.shape, like.dtype)
+        fits = isinstance(value, Tensor) and (
+            value.shape,
+            value.dtype,
+        ) == (like.shape, like.dtype)
     elif isinstance(like, dict):
-        fits = isinstance(found, dict) and found.keys() >= like.keys()
+        fits = isinstance(value, dict) and value.keys() >= like.keys()
     elif isinstance(like, list):
-        fits = isinstance(found, list) and len(found) == len(like)
+        fits = isinstance(value, list) and len(value) == len(like)
     elif isinstance(like, int):
-        fits = type(found) is int and 0 <= found < MOST
+        fits = type(value) is int and 0 <= value < MOST
     elif isinstance(like, float):
-        fits = type(found) in (int, float) and isfinite(found)
+        fits = type(value) in (int, float) and isfinite(value)
     else:
-        fits = found is like
+        fits = value is like
     if not fits:
         raise ValueError(f"{name} cannot be of this run")
     if isinstance(like, dict | list):
         for key in like if isinstance(like, dict) else range(len(like)):
-            check_like(found[key], like[key], f"{name}.{key}")
+            check_like(value[key], like[key], f"{name}.{key}")

@@ -19,10 +19,30 @@ from ganlane.files import atomic_path
 
 #: Columns of ``metrics.csv``; the share of each action follows.
 COLUMNS = (
-    *("decisions", "updates", "wall_s", "decisions_per_s", "episodes"),
-    *("mean_return", "mean_discounted_return", "mean_return_to_go", "mean_value"),
-    *("goal_rate", "crash_rate", "out_of_road_rate", "timeout_rate", "lane_changes_per_km"),
-    *("loss", "mean_q", "clamped_fraction", "priority", "gradient_norm", "sigma", "epsilon"),
+    "decisions",
+    "updates",
+    "wall_s",
+    "decisions_per_s",
+    # of the episodes that ended since the last row
+    "episodes",
+    "mean_return",
+    "mean_discounted_return",
+    "mean_return_to_go",
+    "mean_value",
+    "goal_rate",
+    "crash_rate",
+    "out_of_road_rate",
+    "timeout_rate",
+    "lane_changes_per_km",
+    # of the updates since the last row
+    "loss",
+    "mean_q",
+    "clamped_fraction",
+    "priority",
+    "gradient_norm",
+    # at present
+    "sigma",
+    "epsilon",
 )
 #: Figures of the progress, and their formats.
 SHOWN = {
@@ -46,8 +66,7 @@ class Log(Protocol):
 
 
 class Logs:
-    """All logs of a run: ``metrics.csv``, ``evaluation.csv``, the progress, and the ``further``
-    ones.
+    """All logs of a run: ``metrics.csv``, ``evaluation.csv``, the progress, and further ones.
 
     Args:
         folder: of the run.
@@ -67,32 +86,42 @@ class Logs:
     ) -> None:
         self.evaluation_file = Path(folder) / "evaluation.csv"
         shares = [f"action_{i}_share" for i in range(actions)]
-        metrics = CsvLog(Path(folder) / "metrics.csv", [*COLUMNS, *shares], decisions)
+        metrics = CsvLog(
+            Path(folder) / "metrics.csv",
+            [*COLUMNS, *shares],
+            decisions,
+        )
         self.progress = None if total is None else Progress(total, decisions)
         self.further = list(further)
-        self.of_metrics: list[Log] = [
-            metrics,
-            *([] if self.progress is None else [self.progress]),
-            *further,
-        ]
+        self.of_metrics: list[Log] = [metrics, *further]
+        if self.progress is not None:
+            self.of_metrics.append(self.progress)
         before = read_rows(self.evaluation_file)
         if before:  # a resumed run: remove rows beyond its checkpoint
             CsvLog(self.evaluation_file, list(before[0]), decisions).close()
-        self._last, self._last_s = decisions, monotonic()
+        self._last = decisions
+        self._last_s = monotonic()
 
     def write(self, row: Mapping[str, float]) -> None:
         """Write a row of metrics, with the decisions per second since the last one."""
+        # the rate since the last row, whatever the rows before the resume say
         now = monotonic()
         rate = (row["decisions"] - self._last) / max(now - self._last_s, 1e-9)
-        self._last, self._last_s = int(row["decisions"]), now
+        self._last = int(row["decisions"])
+        self._last_s = now
         for log in self.of_metrics:
             log.write({**row, "decisions_per_s": rate})
 
     def write_evaluation(self, row: Mapping[str, float]) -> None:
-        """Write a row of evaluation figures, replacing one at the same decisions from before the
-        run was resumed.
+        """Write a row of evaluation figures.
+
+        It replaces one at the same decisions from before the run was resumed.
         """
-        evaluation = CsvLog(self.evaluation_file, list(row), int(row["decisions"]) - 1)
+        evaluation = CsvLog(
+            self.evaluation_file,
+            list(row),
+            int(row["decisions"]) - 1,
+        )
         evaluation.write(row)
         evaluation.close()
         for log in self.further:
@@ -128,11 +157,25 @@ class CsvLog:
         decisions: already made.
     """
 
-    def __init__(self, path: str | Path, columns: Sequence[str], decisions: int = 0) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        columns: Sequence[str],
+        decisions: int = 0,
+    ) -> None:
         self.path = Path(path)
+        # rows after the checkpoint are made again
         rows = [row for row in read_rows(self.path) if float(row["decisions"]) <= decisions]
-        form: Any = {"fieldnames": columns, "extrasaction": "ignore", "lineterminator": "\n"}
-        with atomic_path(self.path) as part, part.open("w", newline="") as file:
+        form: Any = {
+            "fieldnames": columns,
+            "extrasaction": "ignore",
+            "lineterminator": "\n",
+        }
+        with (
+            atomic_path(self.path) as part,
+            part.open("w", newline="") as file,
+        ):
+            # the columns of today, even if the old file had others
             writer = csv.DictWriter(file, **form)
             writer.writeheader()
             writer.writerows(rows)
@@ -141,6 +184,7 @@ class CsvLog:
 
     def write(self, row: Mapping[str, float]) -> None:
         """Append one line."""
+        # six digits are enough to plot, and a fraction of the size
         short = {
             name: format(value, ".6g") if isinstance(value, float) else value
             for name, value in row.items()
@@ -165,6 +209,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         return []
     try:
         with path.open(newline="", encoding="utf-8") as file:
+            # the last line may be cut off
             whole = [line for line in file if line.endswith("\n")]
         # DictReader gives missing entries of a short row as None, and surplus ones of a long row
         # under the key None.
@@ -187,17 +232,22 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
 
 class Progress:
-    """Shows decisions per second, remaining time, mean return and ends of episodes: a bar, or a
-    line per row.
+    """Shows decisions per second, remaining time and the figures :data:`SHOWN`.
 
     Figures that a row lacks, because no episode ended in its interval, keep their last value. Of
     the ``total`` decisions of the run, ``done`` have been made before. A terminal as ``stream``
-    (default stderr) gets the bar.
+    (default stderr) gets a bar, anything else a line per row.
     """
 
-    def __init__(self, total: int, done: int = 0, stream: TextIO | None = None) -> None:
-        self.total, self.stream = total, sys.stderr if stream is None else stream
-        self.known: dict[str, float] = {}
+    def __init__(
+        self,
+        total: int,
+        done: int = 0,
+        stream: TextIO | None = None,
+    ) -> None:
+        self.total = total
+        self.stream = sys.stderr if stream is None else stream
+        self.figures: dict[str, float] = {}
         self._bar = None
         if self.stream.isatty():
             options = {
@@ -216,15 +266,20 @@ class Progress:
 
     def write(self, row: Mapping[str, float]) -> None:
         """Show a row of figures."""
-        self.known |= {name: row[name] for name in SHOWN if name in row}
+        # a row without ended episodes lacks some of them
+        self.figures |= {name: row[name] for name in SHOWN if name in row}
         shown = [
-            form.format(self.known[name]) for name, form in SHOWN.items() if name in self.known
+            form.format(self.figures[name]) for name, form in SHOWN.items() if name in self.figures
         ]
         if self._bar is not None:
             self._bar.set_postfix_str(", ".join(shown))
             return
         rate = max(row.get("decisions_per_s", 0.0), 1e-9)
-        minutes, seconds = divmod(round(max(self.total - row["decisions"], 0.0) / rate), 60)
+        # remaining time at the rate of the last interval
+        minutes, seconds = divmod(
+            round(max(self.total - row["decisions"], 0.0) / rate),
+            60,
+        )
         left = f"{minutes // 60}:{minutes % 60:02}:{seconds:02} left"
         head = f"{int(row['decisions']):,} of {self.total:,} decisions, {rate:,.0f}/s, {left}"
         print(", ".join([head, *shown]), file=self.stream, flush=True)
@@ -236,7 +291,9 @@ class Progress:
 
 
 def make_logs(
-    options: LoggerConfig, folder: str | Path, about: Mapping[str, Any] | None = None
+    options: LoggerConfig,
+    folder: str | Path,
+    about: Mapping[str, Any] | None = None,
 ) -> list[Log]:
     """The logs of ``logger=...`` beyond the CSV files; ``about``: JSON-serialisable settings of the
     run, for display.
@@ -257,7 +314,8 @@ def _module(name: str, extra: str) -> Any:
         return import_module(name)
     except ImportError as error:
         raise UserError(
-            f"logger={extra}: {extra} is not installed; run `pip install 'ganlane[{extra}]'` or use logger=csv."
+            f"logger={extra}: {extra} is not installed; run `pip install 'ganlane[{extra}]'` or "
+            "use logger=csv."
         ) from error
 
 
@@ -292,11 +350,15 @@ class WandbLog:
     """
 
     def __init__(
-        self, folder: str | Path, project: str = "ganlane", about: Mapping[str, Any] | None = None
+        self,
+        folder: str | Path,
+        project: str = "ganlane",
+        about: Mapping[str, Any] | None = None,
     ) -> None:
         wandb = _module("wandb", "wandb")
         mode = os.environ.get("WANDB_MODE") or "offline"
         folder = Path(folder)
+        # else W&B falls back to a temporary folder
         folder.mkdir(parents=True, exist_ok=True)
         name = "/".join(folder.absolute().parts[-2:])
         options: dict[str, Any] = {
@@ -308,11 +370,15 @@ class WandbLog:
         try:
             # W&B's console would capture the stream of the progress bar.
             settings = wandb.Settings(console="off")
-            self._run = wandb.init(config=dict(about or {}), settings=settings, **options)
+            self._run = wandb.init(
+                config=dict(about or {}),
+                settings=settings,
+                **options,
+            )
         except (wandb.Error, ValueError) as error:
             raise UserError(
-                f"logger=wandb with WANDB_MODE={mode}: W&B did not start ({error}); use WANDB_MODE=offline or "
-                "logger=csv."
+                f"logger=wandb with WANDB_MODE={mode}: W&B did not start ({error}); use "
+                "WANDB_MODE=offline or logger=csv."
             ) from error
 
     def write(self, row: Mapping[str, float]) -> None:

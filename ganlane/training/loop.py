@@ -17,44 +17,22 @@ from torchrl.envs import EnvBase
 
 from ganlane.agents import GreedyPolicy, Rainbow
 from ganlane.settings.train import TrainConfig
-from ganlane.errors import UserError
-from ganlane.settings.record import Count, CountOrZero, NotNegative, Record
 from ganlane.training.checkpoint import Checkpointer, TrainingState
-from ganlane.training.collectors import STOPPING, Collector
 from ganlane.training.logs import Log, Logs
 
-#: Evaluates the greedy policy on fixed episodes and returns its figures by name.
+#: Evaluates the greedy policy on fixed episodes and returns its figures by name, with
+#: ``mean_reward``, by which the best agent is chosen.
 Evaluate = Callable[[GreedyPolicy], Mapping[str, float]]
-
-
-@dataclass(frozen=True)
-class TrainingConfig(Record):
-    """Length and schedule of a run. ``*_every`` count decisions over all environments; 0 means
-    never.
-
-    A checkpoint is written ``checkpoint_every_s`` seconds after the last one, later if writing is
-    slow, so that it takes at most 2 % of the time. ``checkpoint_replay`` includes the replay
-    buffer; without it a resumed run fills the buffer again and is not bit-exact. ``best_metric`` is
-    the figure of the evaluation that selects the best agent. ``progress`` shows a bar on a terminal
-    and lines elsewhere.
-    """
-
-    total_decisions: Count
-    log_every: Count = TrainConfig.log_every
-    evaluate_every: CountOrZero = TrainConfig.evaluate_every
-    best_metric: str = "mean_reward"
-    checkpoint_every_s: NotNegative = TrainConfig.checkpoint_every_s
-    checkpoint_replay: bool = TrainConfig.checkpoint_replay
-    progress: bool = True
+#: Signals that end a run.
+STOPPING = (signal.SIGINT, signal.SIGTERM)
 
 
 @dataclass(frozen=True)
 class TrainingResult:
     """Result of a run.
 
-    ``stopped_by`` is the number of the signal that stopped it early, or None (an entry point raises
-    :class:`~ganlane.config.run.Stopped` with it). ``best`` is the ``best_metric`` of the best
-    evaluation. ``checkpoint`` is the file to resume from.
+    ``stopped_by`` is the number of the signal that stopped it early, or None. ``best`` is the mean
+    reward of the best evaluation. ``checkpoint`` is the file to resume from.
     """
 
     decisions: int
@@ -67,8 +45,7 @@ class TrainingResult:
 
 @contextmanager
 def noted_signals() -> Iterator[list[int]]:
-    """Context in which SIGINT and SIGTERM are noted in the list that it gives, instead of ending
-    the process.
+    """Context in which SIGINT and SIGTERM do not end the process but are noted in a list.
 
     A second Ctrl-C raises KeyboardInterrupt as usual. Outside the main thread, where Python allows
     no handlers, the context does nothing.
@@ -76,12 +53,15 @@ def noted_signals() -> Iterator[list[int]]:
     noted: list[int] = []
 
     def note(number: int, frame: FrameType | None) -> None:
+        # the second Ctrl-C of someone who cannot wait
         if noted and number == signal.SIGINT:
             raise KeyboardInterrupt
         noted.append(number)
 
-    here = threading.current_thread() is threading.main_thread()
-    previous = {number: signal.signal(number, note) for number in STOPPING} if here else {}
+    # signals can be handled in the main thread alone
+    previous = {}
+    if threading.current_thread() is threading.main_thread():
+        previous = {number: signal.signal(number, note) for number in STOPPING}
     try:
         yield noted
     finally:
@@ -90,9 +70,9 @@ def noted_signals() -> Iterator[list[int]]:
 
 
 def train(
-    env: EnvBase | Collector,
+    env: EnvBase,
     agent: Rainbow,
-    config: TrainingConfig,
+    config: TrainConfig,
     run_folder: str | Path,
     evaluate: Evaluate | None = None,
     logs: Sequence[Log] = (),
@@ -100,15 +80,16 @@ def train(
     resume: str | Path | None = None,
     identity: Mapping[str, Any] | None = None,
 ) -> TrainingResult:
-    """Train ``agent`` in ``env`` until all decisions are made or a signal stops it; write a
-    checkpoint at the end.
+    """Train ``agent`` in ``env`` until all decisions are made or a signal stops it.
+
+    A checkpoint is written at the end, and on the way ``checkpoint_every_s`` seconds after the last
+    one; later if writing is slow, so that it takes at most 2 % of the time.
 
     Args:
         env: batch [N], writes ``observation`` and ``reward``; a resumed run is exact only if all of
-            its state is in the TensorDict. Or a collector (:mod:`ganlane.training.collectors`),
-            which the caller closes.
+            its state is in the TensorDict.
         agent: trained in place.
-        config: length and schedule.
+        config: length and schedule are read; the ``*_every`` count decisions over all environments.
         run_folder: gets ``metrics.csv``, ``evaluation.csv`` and
             ``checkpoints/{last.pt, last, best.safetensors}``.
         evaluate: called with the greedy policy every ``config.evaluate_every`` decisions.
@@ -121,38 +102,49 @@ def train(
             (:class:`~ganlane.training.checkpoint.TrainingState`).
 
     Raises:
-        UserError: the checkpoint is unreadable or of another run, or ``config.best_metric`` is not
-            evaluated.
+        UserError: the checkpoint is unreadable or of another run.
     """
     state = TrainingState(env, agent, identity)
+    # None: everything could be restored
     missing = None if resume is None else state.restore(resume)
     saver = Checkpointer(
-        state, run_folder, config.checkpoint_every_s, config.checkpoint_replay, metadata or {}
+        state,
+        run_folder,
+        config.checkpoint_every_s,
+        config.checkpoint_replay,
+        metadata or {},
     )
     actions = agent.network.config.actions
-    shown = config.total_decisions if config.progress else None
+    shown = config.total_decisions if config.logger.progress else None
+    # logs are closed, and their last rows written, whatever ends the run
     with closing(Logs(run_folder, actions, state.decisions, shown, logs)) as log:
         if missing is not None:
             log.say(f"resumed without {missing}; not bit-exact")
-        state.collector.open(agent)
         if state.decisions == 0:
             saver.save()  # a run that is killed at any time can be resumed
         with noted_signals() as signals:
+            # a signal ends the run between two decisions
             while state.decisions < config.total_decisions and not signals:
                 advance(state)
                 log.advance(state.decisions)
                 if state.passed(config.log_every):
                     log.write(metrics(state))
                 if evaluate is not None and state.passed(config.evaluate_every):
-                    keep_best(state, evaluate, config.best_metric, log, saver)
+                    keep_best(state, evaluate, log, saver)
                 if saver.due():
                     saver.save()
+            # the last agent is evaluated too, unless that has just been done
             if evaluate is not None and not signals and state.evaluated_at < state.decisions:
-                keep_best(state, evaluate, config.best_metric, log, saver)
+                keep_best(state, evaluate, log, saver)
             saver.save()
     stopped_by = signals[-1] if signals else None
     return TrainingResult(
-        state.decisions, agent.updates, state.wall_s, state.best, stopped_by, saver.path
+        state.decisions,
+        agent.updates,
+        state.wall_s,
+        state.best,
+        stopped_by,
+        saver.path,
     )
 
 
@@ -160,23 +152,15 @@ def advance(state: TrainingState) -> TensorDictBase:
     """Make one decision of every environment, [N], store it, and make the updates that are due."""
     step = collect(state)
     state.agent.store(state.window.push(step))
-    if not state.collector.overlaps:
-        learn(state)
+    learn(state)
     return step
 
 
 def collect(state: TrainingState) -> TensorDictBase:
-    """One decision of every environment, batch [N].
-
-    With an overlapping collector the updates due from the decisions before are made meanwhile.
-    """
-    agent, collector = state.agent, state.collector
-    agent.anneal(state.decisions)
-    collector.begin(agent)
-    if collector.overlaps:
-        learn(state)
+    """One decision of every environment, batch [N]."""
+    state.agent.anneal(state.decisions)
     with torch.no_grad():
-        step = collector.step(agent)
+        step = state.collector.step(state.agent)
         state.decisions += state.environments
         state.stats.step(step)
     return step
@@ -190,6 +174,7 @@ def learn(state: TrainingState) -> None:
     agent = state.agent
     if not agent.ready:
         return
+    # decisions that do not fill an update are kept for the next step
     state.pending_decisions += state.environments
     while state.pending_decisions >= agent.config.decisions_per_update:
         state.stats.update(agent.update())
@@ -205,22 +190,25 @@ def metrics(state: TrainingState) -> dict[str, float]:
         "wall_s": state.wall_s,
         **state.stats.read(),
     }
-    return row | {"sigma": float(agent.sigma()), "epsilon": agent.policy.epsilon}
+    return row | {
+        "sigma": float(agent.sigma()),
+        "epsilon": agent.policy.epsilon,
+    }
 
 
 def keep_best(
-    state: TrainingState, evaluate: Evaluate, best_metric: str, log: Logs, saver: Checkpointer
+    state: TrainingState,
+    evaluate: Evaluate,
+    log: Logs,
+    saver: Checkpointer,
 ) -> None:
     """Evaluate the greedy policy; save it if it is the best so far."""
+    # noted first: an evaluation is not repeated at the end
     state.evaluated_at = state.decisions
     row = dict(evaluate(state.agent.greedy))
     log.write_evaluation({"decisions": state.decisions, **row})
-    if best_metric not in row:
-        known = ", ".join(row)
-        raise UserError(
-            f"best_metric={best_metric}: not among the evaluation's figures; choose one of {known}."
-        )
-    if state.best is None or row[best_metric] > state.best:
-        state.best = row[best_metric]
+    reward = row["mean_reward"]
+    if state.best is None or reward > state.best:
+        state.best = reward
         saver.save_weights("best", row)
         saver.save()  # else a resumed run could replace the best agent by a worse one

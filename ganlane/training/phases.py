@@ -1,15 +1,14 @@
-"""The phases of ``ganlane train``: one or two runs of the training loop, the second from the agent
-of the first.
+"""The phases of ``ganlane train``: one or two runs of the training loop.
 
-:func:`phases_of` lists the phases of a config; :func:`run_phase` makes collector and agent, trains,
-and writes the agent into the folder of the phase.
+The second starts from the agent of the first. :func:`phases_of` lists the phases of a config;
+:func:`run_phase` makes environments and agent, trains, and writes the agent into the phase's
+folder.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from contextlib import closing
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,34 +24,32 @@ from ganlane.agents import (
     NetworkConfig,
     Rainbow,
     RainbowConfig,
+)
+from ganlane.agents.checkpoint import (
+    SHIPPED,
+    SUPPORT,
     read_agent,
     save_agent,
     warm_start,
 )
-from ganlane.agents.checkpoint import SHIPPED, SUPPORT
 from ganlane.agents.drivers import legal_actions
 from ganlane.agents.network import load_parameters
-from ganlane.build import make_env, make_road, make_traffic, observation_of
-from ganlane.settings.traffic import TrafficConfig
-from ganlane.settings.train import (
-    MultiCollectorConfig,
-    OverlapCollectorConfig,
-    RayCollectorConfig,
-    TrainConfig,
+from ganlane.build import (
+    make_env,
+    make_road,
+    make_traffic,
+    observation_of,
 )
+from ganlane.settings.traffic import TrafficConfig
+from ganlane.settings.train import TrainConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version, run_episodes
 from ganlane.evaluation.results import plain
-from ganlane.settings.agent import RemovedOption, without_removed
 from ganlane.settings.observation import ObservationConfig
-from ganlane.runtime import keep_freed_memory
 from ganlane.sim.random import Stream
-from ganlane.torch_settings import set_threads
-from ganlane.training.checkpoint import DEFAULTS, LAST, flat, load_checkpoint
-from ganlane.training.collectors import Collector, OverlapCollector, SingleCollector
+from ganlane.training.checkpoint import LAST, flat, load_checkpoint
 from ganlane.training.logs import make_logs
-from ganlane.training.loop import Evaluate, TrainingConfig, TrainingResult, train
-from ganlane.training.workers import ClusterCollector, ProcessCollector
+from ganlane.training.loop import Evaluate, TrainingResult, train
 from ganlane.transforms import observation_size
 
 #: File of the trained agent in the folder of its phase; it exists once the phase is finished.
@@ -61,9 +58,14 @@ AGENT_FILE = "agent.safetensors"
 
 @dataclass(frozen=True)
 class Phase:
-    """Training on one traffic: ``folder`` of its files, ``init`` the agent to start from (None.
+    """Training on one traffic.
 
-    Random weights).
+    Attributes:
+        name: ``pretrain`` or ``train``.
+        folder: of its files.
+        traffic: of the other vehicles.
+        total_decisions: its length.
+        init: the agent to start from; None: random weights.
     """
 
     name: str
@@ -75,14 +77,28 @@ class Phase:
 
 def phases_of(config: TrainConfig, folder: Path) -> list[Phase]:
     """The phases of ``config``, in order."""
-    main = Phase("train", folder, config.traffic, config.total_decisions, config.init.path)
+    main = Phase(
+        "train",
+        folder,
+        config.traffic,
+        config.total_decisions,
+        config.init.path,
+    )
     before = config.pretrain
     if before.total_decisions == 0 or before.traffic is None:
         return [main]
+    # the second phase starts from the agent that the first one leaves
     first = Phase(
-        "pretrain", folder / "pretrain", before.traffic, before.total_decisions, config.init.path
+        "pretrain",
+        folder / "pretrain",
+        before.traffic,
+        before.total_decisions,
+        config.init.path,
     )
-    return [first, replace(main, init=str(first.folder / AGENT_FILE))]
+    return [
+        first,
+        replace(main, init=str(first.folder / AGENT_FILE)),
+    ]
 
 
 def length_if_finished(config: TrainConfig, phase: Phase) -> dict[str, float] | None:
@@ -94,12 +110,15 @@ def length_if_finished(config: TrainConfig, phase: Phase) -> dict[str, float] | 
     path = phase.folder / AGENT_FILE
     if phase.name != "pretrain" or not path.is_file():
         return None
+    # the file is written at the end of the phase, with its length
     training = read_agent(path)[2]["training"]
-    done, wanted = training["decisions"], phase.total_decisions
-    if not wanted <= done < wanted + config.collector.environments:
+    done = training["decisions"]
+    wanted = phase.total_decisions
+    # the last step of all environments may go beyond it
+    if not wanted <= done < wanted + config.collector.num_envs:
         raise UserError(
-            f"pretrain.total_decisions={wanted}: this phase is over, after {done} decisions; resume with the value "
-            "that the run was started with."
+            f"pretrain.total_decisions={wanted}: this phase is over, after {done} decisions; "
+            "resume with the value that the run was started with."
         )
     if flat(training["traffic"]) != flat(phase.traffic.description()):
         raise UserError(
@@ -109,111 +128,80 @@ def length_if_finished(config: TrainConfig, phase: Phase) -> dict[str, float] | 
 
 
 def run_phase(
-    config: TrainConfig, phase: Phase, resume: str | Path | None = None
+    config: TrainConfig,
+    phase: Phase,
+    resume: str | Path | None = None,
 ) -> TrainingResult:
-    """Train the agent of one phase and write its :data:`AGENT_FILE`, unless a signal stopped it
-    early.
+    """Train the agent of one phase and write its :data:`AGENT_FILE`.
 
-    ``config`` is that of the whole run, ``resume`` a checkpoint to continue from.
+    Nothing is written if a signal stopped it early. ``config`` is that of the whole run, ``resume``
+    a checkpoint to continue from.
 
     Raises:
         UserError: the agent to start from, the weights of the traffic or the checkpoint do not fit.
     """
     config, agent = make_initial_agent(config, phase, resume)
     metadata = describe(config, phase)
-    schedule = TrainingConfig(
-        phase.total_decisions,
-        config.log_every,
-        config.evaluate_every,
-        checkpoint_every_s=config.checkpoint_every_s,
-        checkpoint_replay=config.checkpoint_replay,
-        progress=config.logger.progress,
+    env = env_maker(config, phase.traffic, Stream.TRAIN)(config.collector.num_envs)
+    result = train(
+        env,
+        agent,
+        replace(config, total_decisions=phase.total_decisions),
+        phase.folder,
+        evaluate=make_selection(config, phase.traffic) if config.evaluate_every else None,
+        logs=make_logs(config.logger, phase.folder, metadata),
+        metadata=metadata,
+        resume=resume,
+        identity=identity(config, phase),
     )
-    with closing(make_collector(config, phase)) as collector:
-        result = train(
-            collector,
-            agent,
-            schedule,
-            phase.folder,
-            evaluate=make_selection(config, phase) if config.evaluate_every else None,
-            logs=make_logs(config.logger, phase.folder, metadata),
-            metadata=metadata,
-            resume=resume,
-            identity=identity(config, phase),
-        )
     if result.stopped_by is None:
-        save_final_agent(agent, config, phase, result)
+        save_final_agent(
+            agent,
+            phase.folder,
+            metadata,
+            result,
+            config.selection_episodes,
+        )
     return result
 
 
 # --- the environments
 
 
-def make_collector(config: TrainConfig, phase: Phase) -> Collector:
-    """The collector of a phase: ``collector=single``, ``overlap``, ``multi`` or ``ray``.
-
-    Raises:
-        UserError: the environments cannot be made, or Ray is not installed.
-    """
-    collector = config.collector
-    if not isinstance(collector, MultiCollectorConfig | OverlapCollectorConfig):
-        return SingleCollector(
-            training_env(config, phase, collector.num_envs, device=config.device)
-        )
-    training_env(config, phase, 1)  # raises the user's mistakes before any worker is started
-    make_worker_env = partial(worker_env, config, phase)
-    if isinstance(collector, OverlapCollectorConfig):
-        return OverlapCollector(make_worker_env, collector.workers, collector.num_envs)
-    if isinstance(collector, RayCollectorConfig):
-        return ClusterCollector(make_worker_env, collector)
-    return ProcessCollector(make_worker_env, collector)
-
-
-def training_env(
-    config: TrainConfig, phase: Phase, rows: int, first_episode: int = 0, device: str = "cpu"
-) -> EnvBase:
-    """``rows`` environments of the training stream.
-
-    Row i begins with episode ``first_episode + i``.
-    """
-    parts = (
-        make_traffic(phase.traffic, config.env, Stream.TRAIN),
+def env_maker(
+    config: TrainConfig, traffic: TrafficConfig, stream: Stream
+) -> Callable[..., EnvBase]:
+    """What makes any number of environments with ``traffic``, on the episodes of ``stream``."""
+    return partial(
+        make_env,
+        make_traffic(traffic, config.env, stream),
         config.env,
         config.observation,
         config.reward,
+        seed=config.seed,
+        device=config.device,
+        mask=config.mask,
     )
-    return make_env(*parts, rows, config.seed, device, first_episode, config.mask)
 
 
-def worker_env(config: TrainConfig, phase: Phase, rows: int, first_episode: int) -> EnvBase:
-    """Environments of a worker process, on its CPU."""
-    set_threads(config.threads)
-    keep_freed_memory()
-    return training_env(config, phase, rows, first_episode)
-
-
-def make_selection(config: TrainConfig, phase: Phase) -> Evaluate:
-    """A function that evaluates the greedy policy on the selection stream, whose episodes are never
-    trained on.
-    """
-    parts = (
-        make_traffic(phase.traffic, config.env, Stream.SELECT),
-        config.env,
-        config.observation,
-        config.reward,
-    )
-    make = partial(make_env, *parts, seed=config.seed, device=config.device, mask=config.mask)
+def make_selection(config: TrainConfig, traffic: TrafficConfig) -> Evaluate:
+    """A function that evaluates the greedy policy on episodes that are never trained on."""
+    make = env_maker(config, traffic, Stream.SELECT)
     env = make(min(config.selection_episodes, config.evaluation.num_envs))
+    # the same episodes in every call, so that figures can be compared
+    episodes = range(config.selection_episodes)
     smaller = None if config.env.compile else make
 
     def evaluate(policy: GreedyPolicy) -> dict[str, float]:
-        table = run_episodes(
-            env, policy, range(config.selection_episodes), config.seed, make_smaller=smaller
-        )
+        table = run_episodes(env, policy, episodes, config.seed, make_smaller=smaller)
         total = table.select(
-            "reward", "lane_changes", "distance_m", crashes=pl.col("reason") == "hard_crash"
+            "reward",
+            "lane_changes",
+            "distance_m",
+            crashes=pl.col("reason") == "hard_crash",
         ).sum()
         reward, changes, distance_m, crashes = (float(value) for value in total.row(0))
+        # of the mean reward over the episodes
         spread = float(np.std(table["reward"].to_numpy()))
         return {
             "mean_reward": reward / table.height,
@@ -230,10 +218,7 @@ def make_selection(config: TrainConfig, phase: Phase) -> Evaluate:
 
 @dataclass(frozen=True)
 class Start:
-    """A trained agent to start from; ``moments`` are Adam's, by parameter (None.
-
-    The file holds weights only).
-    """
+    """A trained agent to start from; ``moments`` are Adam's (None: the file has weights only)."""
 
     name: str
     weights: Mapping[str, Tensor]
@@ -259,30 +244,37 @@ def read_start(name: str, key: str = "init.path") -> Start:
     path = path / LAST if path.is_dir() else path
     if not path.is_file():
         raise UserError(
-            f"{key}={path}: no such file; give a training run's folder, its {LAST}, or an agent's file."
+            f"{key}={path}: no such file; give a training run's folder, its {LAST}, or an agent's "
+            "file."
         )
+    # a run's checkpoint also has the moments, and the observation in its identity
     state = load_checkpoint(path, key=key)
     try:
-        agent, trained_on = state["agent"], state["identity"]["observation"]
+        agent = state["agent"]
+        trained_on = state["identity"]["observation"]
         observation = ObservationConfig(
             **{name: trained_on[name] for name in ("form", "range_m", "speed_mps")}
         )
         size = observation_size(observation.form, state["identity"]["env"]["vehicles"])
-        rainbow = RainbowConfig(**without_removed(agent["config"], f"{key}={path}"))
+        network = NetworkConfig(RainbowConfig(**agent["config"]), size)
         weights = {name: value.detach() for name, value in agent["network"].items()}
         return Start(
             str(path),
             weights,
-            NetworkConfig.of(rainbow, size),
+            network,
             observation,
             agent["optimizer"]["state"],
         )
-    except RemovedOption:
-        raise
-    except (AttributeError, KeyError, TypeError, ValueError, UserError) as error:
+    except (
+        AttributeError,
+        KeyError,
+        TypeError,
+        ValueError,
+        UserError,
+    ) as error:
         raise UserError(
-            f"{key}={path}: not a training checkpoint that this version of ganlane can read; give a run's folder, "
-            f"its {LAST}, or an agent's .safetensors file."
+            f"{key}={path}: not a training checkpoint that this version of ganlane can read; give "
+            f"a run's folder, its {LAST}, or an agent's .safetensors file."
         ) from error
 
 
@@ -291,14 +283,20 @@ def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
 
     One that will get trained weights explores little.
     """
-    rainbow = config.agent.for_phase(phase.total_decisions)
+    # a falling learning rate reaches its end with the phase
+    options = config.agent.for_phase(phase.total_decisions)
     if phase.init is not None:
-        rainbow = replace(rainbow, epsilon_start=min(rainbow.epsilon_start, rainbow.epsilon))
-    size = observation_size(config.observation.form, config.env.vehicles)
-    legal = partial(legal_actions, road=make_road(config.env))
-    compile = config.env.compile
+        options = replace(
+            options,
+            epsilon_start=min(options.epsilon_start, options.epsilon),
+        )
     return Rainbow(
-        rainbow, size, seed=config.seed, device=config.device, legal=legal, compile=compile
+        options,
+        observation_size(config.observation.form, config.env.vehicles),
+        seed=config.seed,
+        device=config.device,
+        legal=partial(legal_actions, road=make_road(config.env)),
+        compile=config.env.compile,
     )
 
 
@@ -313,69 +311,82 @@ def make_initial_agent(
     Raises:
         UserError: the agent to start from does not fit.
     """
-    adopts, resumed = config.init.support == "trained", resume is not None
+    adopts = config.init.support == "trained"
+    # a resumed agent gets its weights from the checkpoint, later
+    resumed = resume is not None
     if phase.init is None or (resumed and not adopts):
         return config, make_agent(config, phase)
     start = read_start(str(resume), "resume") if resumed else read_start(phase.init)
     if not resumed:
-        check_observation(start, config)
+        check_observation(start, config.observation)
     if adopts:
-        support = {name: getattr(start.network, name) for name in SUPPORT}
+        # what the outputs of the trained network stand for
+        support = {name: getattr(start.network.agent, name) for name in SUPPORT}
         config = replace(config, agent=replace(config.agent, **support))
     agent = make_agent(config, phase)
     if resumed:
         return config, agent
-    # A second phase starts from the best agent of the first, of which Adam's moments are not saved.
+    # a second phase starts from the best agent of the first, whose moments are not saved
     with_moments = config.init.optimizer and phase.init == config.init.path
     if with_moments and not start.moments:
         raise UserError(
-            f"init.optimizer=true: {start.name} holds no moments of the optimiser; give init.path a training run's "
-            f"folder or its {LAST}, saved after its first update, or init.optimizer=false."
+            f"init.optimizer=true: {start.name} holds no moments of the optimiser; give init.path "
+            f"a training run's folder or its {LAST}, saved after its first update, or "
+            "init.optimizer=false."
         )
-    warm_start(
-        agent, start.name, start.weights, start.network, start.moments if with_moments else None
-    )
+    moments = start.moments if with_moments else None
+    warm_start(agent, start.name, start.weights, start.network, moments)
     return config, agent
 
 
-def check_observation(start: Start, config: TrainConfig) -> None:
+def check_observation(start: Start, observation: ObservationConfig) -> None:
     """Raise :class:`UserError` if the agent was trained on another observation."""
-    trained_on = asdict(config.observation.read_by(start.observation))
-    configured = asdict(config.observation)
-    for key, value in trained_on.items():
+    configured = asdict(observation)
+    for key, value in asdict(observation.read_by(start.observation)).items():
         if value != configured[key]:
             option = f"observation={value}" if key == "form" else f"observation.{key}={value}"
             raise UserError(
-                f"init.path={start.name}: this agent was trained with {option}, the run has {configured[key]}; "
-                f"give {option} or start with init=none."
+                f"init.path={start.name}: this agent was trained with {option}, the run has "
+                f"{configured[key]}; give {option} or start with init=none."
             )
 
 
 def save_final_agent(
-    agent: Rainbow, config: TrainConfig, phase: Phase, result: TrainingResult
+    agent: Rainbow,
+    folder: Path,
+    metadata: Mapping[str, Any],
+    result: TrainingResult,
+    selection_episodes: int,
 ) -> None:
-    """Write the agent of the phase: the best one by evaluation, if there were evaluations, else the
-    last.
+    """Write the agent of the phase: the best one by evaluation, or the last without evaluations.
 
     The metadata also hold the length of the run and, for the best agent, its figures on the
     selection stream.
     """
-    best, metadata = phase.folder / "checkpoints" / "best.safetensors", describe(config, phase)
+    training = dict(metadata["training"])
+    best = folder / "checkpoints" / "best.safetensors"
+    further = {}
     if result.best is not None and best.is_file():
-        weights, _, known = read_agent(best)
+        weights, _, saved = read_agent(best)
         load_parameters(agent.network, weights)
-        chosen = {
-            name: value
-            for name, value in known["training"].items()
-            if name not in metadata["training"]
+        # what the evaluation added to the metadata of the best agent
+        figures = {name: value for name, value in saved["training"].items() if name not in training}
+        selected = {
+            **figures,
+            "episodes": selection_episodes,
+            "stream": "select",
         }
-        metadata["selected"] = {**chosen, "episodes": config.selection_episodes, "stream": "select"}
-    metadata["training"] |= {
+        further = {"selected": selected}
+    training |= {
         "decisions": result.decisions,
         "updates": result.updates,
         "wall_s": result.wall_s,
     }
-    save_agent(phase.folder / AGENT_FILE, agent, metadata)
+    save_agent(
+        folder / AGENT_FILE,
+        agent,
+        {**metadata, "training": training, **further},
+    )
 
 
 # --- metadata
@@ -383,28 +394,14 @@ def save_final_agent(
 
 def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
     """The settings that a resumed run must share with the run that was stopped."""
-    parts: dict[str, Any] = {
-        "env": config.env,
-        "reward": config.reward,
-        "collector": config.collector,
-    }
-    defaults = flat({name: asdict(type(part)()) for name, part in parts.items()})
-    collector = {
-        name: value for name, value in asdict(config.collector).items() if name != "address"
-    }
-    if isinstance(config.collector, OverlapCollectorConfig):
-        collector["overlaps"] = True  # ``multi`` has the same options but updates at other times
     return {
-        # For options that did not exist when the run was started.
-        DEFAULTS: {**defaults, "collector.overlaps": False},
         "env": plain(config.env),
         "traffic": phase.traffic.description(),
         "observation": asdict(config.observation),
         "reward": asdict(config.reward),
-        # Absent without a mask, as in runs of versions before masks.
-        **({"mask": asdict(config.mask)} if config.mask.form != "none" else {}),
+        "mask": asdict(config.mask),
         "init": config.init.path,
-        "collector": collector,
+        "collector": asdict(config.collector),
         "seed": config.seed,
     }
 
@@ -416,9 +413,12 @@ def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
         "observation_scale": asdict(config.observation.scale()),
         "mask": asdict(config.mask),
         "sensors": asdict(config.observation)["sensors"],
-        "environment": {"vehicles": config.env.vehicles, "lanes": config.env.lanes},
+        "environment": {
+            "vehicles": config.env.vehicles,
+            "lanes": config.env.lanes,
+        },
         "env": plain(config.env),
-        "num_envs": config.collector.environments,
+        "num_envs": config.collector.num_envs,
         "code": code_version(),
         "agent": plain(config.agent),
         "reward": asdict(config.reward),

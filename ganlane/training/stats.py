@@ -19,7 +19,8 @@ RATES = {
     "out_of_road": "out_of_road_rate",
     "timeout": "timeout_rate",
 }
-#: Sums over the running episode of each environment.
+#: Sums over the running episode of each environment; ``to_go`` sums the discounted returns from
+#: each of its decisions on, ``values`` what the policy expected of them.
 RUNNING = ("returns", "discounted", "to_go", "lengths", "values")
 
 
@@ -42,15 +43,17 @@ class EpisodeStats:
     """
 
     def __init__(
-        self, environments: int, actions: int, gamma: float, device: torch.device | str = "cpu"
+        self,
+        environments: int,
+        actions: int,
+        gamma: float,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.gamma = gamma
-        self.returns, self.discounted, self.to_go, self.lengths, self.values = (
-            torch.zeros(environments, device=device) for _ in RUNNING
-        )
+        self.running = {name: torch.zeros(environments, device=device) for name in RUNNING}
+        #: Discount of the next reward, seen from the start of the episode.
         self.discount = torch.ones(environments, device=device)
-        #: Discounted weight of the next reward in the returns to go of all decisions of the episode
-        #: so far.
+        #: Its weight in the returns to go of all decisions of the episode so far together.
         self.weight = torch.ones(environments, device=device)
         self.actions = torch.arange(actions, device=device)
         self.sums: dict[str, Tensor] = {}
@@ -61,32 +64,39 @@ class EpisodeStats:
     def step(self, step: TensorDictBase) -> None:
         """Add one step of the environments, batch [N]; the episodes that end are summed up."""
         after = step.get("next")
-        reward, done = after.get("reward").squeeze(-1), after.get("done").squeeze(-1)
-        self.returns += reward
-        self.discounted += self.discount * reward
-        self.discount *= self.gamma
-        self.to_go += self.weight * reward
-        self.weight = 1.0 + self.gamma * self.weight
-        self.lengths += 1.0
+        reward = after.get("reward").squeeze(-1)
+        done = after.get("done").squeeze(-1)
+        running = self.running
+        running["returns"] += reward
+        running["discounted"] += self.discount * reward
+        running["to_go"] += self.weight * reward
+        running["lengths"] += 1.0
         chosen = step.get(keys.CHOSEN_VALUE, None)
         if chosen is not None:
-            self.values += chosen.reshape(-1)
-        self._add("actions", (step.get(keys.ACTION)[:, None] == self.actions).sum(0))
+            running["values"] += chosen.reshape(-1)
+        self.discount *= self.gamma
+        self.weight = 1.0 + self.gamma * self.weight
+
+        taken = step.get(keys.ACTION)[:, None] == self.actions
+        self._add("actions", taken.sum(0))
         self._add("episodes", done.sum())
-        for name in RUNNING if chosen is not None else RUNNING[:-1]:
-            self._add(name, (getattr(self, name) * done).sum())
-        events, ego = after.get(keys.EVENTS, {}), after.get(keys.EGO, None)
+        for name, value in running.items():
+            if name != "values" or chosen is not None:
+                self._add(name, (value * done).sum())
+        events = after.get(keys.EVENTS, {})
         for name in RATES.keys() & events.keys():
             self._add(name, (events.get(name).squeeze(-1) & done).sum())
+        ego = after.get(keys.EGO, None)
         if ego is not None:
             for name in ("distance", "lane_changes"):
                 self._add(name, (ego.get(name) * done).sum())
+
+        # episodes that have ended begin anew
         going = ~done
-        for name in RUNNING:
-            setattr(self, name, getattr(self, name) * going)
-        self.discount, self.weight = (
-            torch.where(done, 1.0, value) for value in (self.discount, self.weight)
-        )
+        for name, value in running.items():
+            running[name] = value * going
+        self.discount = torch.where(done, 1.0, self.discount)
+        self.weight = torch.where(done, 1.0, self.weight)
 
     def update(self, metrics: Mapping[str, Tensor]) -> None:
         """Add the 0-dim ``metrics`` of one update."""
@@ -98,32 +108,38 @@ class EpisodeStats:
         self.sums[name] = self.sums.get(name, 0.0) + value.double()
 
     def read(self) -> dict[str, float]:
-        """Means since the last call, without those over no episode or no update; resets the sums."""
+        """Means since the last call; resets the sums.
+
+        What would be a mean over no episode or no update is left out.
+        """
+        # one copy from the device for each sum, and none between two calls
         sums: dict[str, Any] = {name: value.tolist() for name, value in self.sums.items()}
         row = {name: float(value) / self.update_count for name, value in self.updates.items()}
-        shares = sums.pop("actions", [])
-        row |= {f"action_{i}_share": share / max(sum(shares), 1) for i, share in enumerate(shares)}
-        self.sums, self.updates, self.update_count = {}, {}, 0
-        episodes = sums.get("episodes", 0.0)
-        row["episodes"] = episodes
+        taken = sums.pop("actions", [])
+        for i, count in enumerate(taken):
+            row[f"action_{i}_share"] = count / max(sum(taken), 1)
+        self.sums = {}
+        self.updates = {}
+        self.update_count = 0
+        episodes = row["episodes"] = sums.get("episodes", 0.0)
         if episodes == 0.0:
             return row
-        row |= {
-            "mean_return": sums["returns"] / episodes,
-            "mean_discounted_return": sums["discounted"] / episodes,
-        }
+        row["mean_return"] = sums["returns"] / episodes
+        row["mean_discounted_return"] = sums["discounted"] / episodes
         decisions = max(sums["lengths"], 1.0)
         row["mean_return_to_go"] = sums["to_go"] / decisions
         if "values" in sums:
             row["mean_value"] = sums["values"] / decisions
-        row |= {column: sums[name] / episodes for name, column in RATES.items() if name in sums}
+        for name, column in RATES.items():
+            if name in sums:
+                row[column] = sums[name] / episodes
         if sums.get("distance", 0.0) > 0.0:
             row["lane_changes_per_km"] = 1000.0 * sums["lane_changes"] / sums["distance"]
         return row
 
     def state_dict(self) -> dict[str, Any]:
         """Sums of the running episodes and of the current interval."""
-        names = (*RUNNING, "discount", "weight", "sums", "updates", "update_count")
+        names = ("running", "discount", "weight", "sums", "updates", "update_count")
         return {name: deepcopy(getattr(self, name)) for name in names}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

@@ -7,7 +7,12 @@ from tensordict import TensorDict
 
 from ganlane.agents import Rainbow, RainbowConfig, save_agent
 
-SMALL = {"hidden": (8, 8), "batch_size": 8, "warmup": 8, "capacity": 100}
+SMALL = {
+    "hidden": (8, 8),
+    "batch_size": 8,
+    "warmup": 8,
+    "capacity": 100,
+}
 
 
 def agent(size=5, seed=0, **options):
@@ -16,22 +21,40 @@ def agent(size=5, seed=0, **options):
 
 def saved_in(folder: Path, **more) -> Path:
     path = folder / "agent.safetensors"
-    save_agent(path, agent(), {"observation": "table3", "training": {"decisions": 7}, **more})
+    save_agent(
+        path,
+        agent(),
+        {
+            "observation": "table3",
+            "training": {"decisions": 7},
+            **more,
+        },
+    )
     return path
 
 
-def transitions(size, rows=64, seed=0):
-    """``rows`` single steps with observations of ``size`` numbers; every fifth or so is terminal."""
+def transitions(size, rows=64, seed=0, scale=1.0, most_steps=1):
+    """``rows`` transitions with observations of ``size`` numbers; one of five or so is terminal.
+
+    Rewards have a standard deviation of ``scale``; a transition is of 1 to ``most_steps`` steps.
+    """
     generator = torch.Generator().manual_seed(seed)
+
+    def normal(columns):
+        return torch.randn(rows, columns, generator=generator)
+
     after = {
-        "observation": torch.randn(rows, size, generator=generator),
-        "reward": torch.randn(rows, 1, generator=generator),
+        "observation": normal(size),
+        "reward": scale * normal(1),
         "terminated": torch.rand(rows, 1, generator=generator) < 0.2,
+        # which no loss may read: a truncated episode goes on
+        "done": torch.rand(rows, 1, generator=generator) < 0.5,
     }
+    steps = torch.randint(1, most_steps + 1, (rows, 1), generator=generator)
     content = {
-        "observation": torch.randn(rows, size, generator=generator),
+        "observation": normal(size),
         "action": torch.randint(0, 3, (rows,), generator=generator),
-        "steps_to_next_obs": torch.ones(rows, 1),
+        "steps_to_next_obs": steps.float(),
         "next": after,
     }
     return TensorDict(content, [rows])

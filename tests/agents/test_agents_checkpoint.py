@@ -16,7 +16,7 @@ from ganlane.agents import (
 )
 from ganlane.agents.checkpoint import load_moments
 from ganlane.errors import UserError
-from ganlane.settings.agent import AGENT_OPTIONS, LAST_REVISION
+from ganlane.weights import load_weights, save_weights
 
 
 @pytest.fixture
@@ -35,7 +35,10 @@ def start_from(learner, path):
 def test_a_loaded_agent_drives_like_the_saved_one(saved):
     policy, metadata = load_agent(saved, observation_size=5)
     data = TensorDict({"observation": torch.randn(100, 5)}, [100])
-    assert torch.equal(policy(data.clone())["action"], agent().greedy(data.clone())["action"])
+    assert torch.equal(
+        policy(data.clone())["action"],
+        agent().greedy(data.clone())["action"],
+    )
     assert metadata["observation"] == "table3"
     assert metadata["training"] == {"decisions": 7}
     assert metadata["network"]["v_max"] == RainbowConfig().v_max
@@ -50,7 +53,10 @@ def test_another_observation_size_is_refused_naming_both(saved):
 
 
 def test_an_unknown_agent_is_refused_with_the_names_there_are():
-    with pytest.raises(UserError, match="agents that ship are agent_gan, agent_general, agent_idm"):
+    with pytest.raises(
+        UserError,
+        match="agents that ship are agent_gan, agent_general, agent_idm",
+    ):
         load_agent("agent_xyz")
 
 
@@ -61,18 +67,28 @@ def test_shipped_agents_are_found_by_name(saved, monkeypatch):
     assert load_agent("agent_idm")[1]["observation"] == "table3"
 
 
-def test_removed_options_at_their_defaults_load_and_others_name_the_revision_that_had_them(
-    tmp_path,
-):
-    assert load_agent(saved_in(tmp_path, agent=AGENT_OPTIONS))[1]["agent"] == {}
-    for option, shown in (
-        ({"encoder": "shared"}, "encoder=shared"),
-        ({"decide_when_free": True}, "decide_when_free=true"),
+#: What a file may say of a network that is none.
+DAMAGES = [
+    {"encoder": "none"},
+    {"noisy": "yes"},
+    {"hidden": 8},
+    {"hidden": [8, 10**9]},
+    {"actions": 0},
+    {"v_min": 200.0},
+    {"atoms": True},
+]
+
+
+@pytest.mark.parametrize("damage", DAMAGES, ids=str)
+def test_a_network_that_is_not_understood_is_refused(damage, saved):
+    tensors, metadata = load_weights(saved, "agent")
+    metadata["network"] |= damage
+    save_weights(saved, metadata.pop("kind"), tensors, metadata)
+    with pytest.raises(
+        UserError,
+        match="its description of the network is not understood",
     ):
-        with pytest.raises(
-            UserError, match=f"agent.{shown} was removed after revision {LAST_REVISION}; check out"
-        ):
-            load_agent(saved_in(tmp_path, agent={**AGENT_OPTIONS, **option}))
+        read_agent(saved)
 
 
 # --- starting from one
@@ -82,14 +98,20 @@ def test_a_warm_start_takes_the_saved_weights(saved):
     fresh = agent(seed=3)
     start_from(fresh, saved)
     assert same_weights(fresh, agent())
-    pairs = zip(fresh.network.parameters(), fresh.loss.target_network.parameters())
+    pairs = zip(
+        fresh.network.parameters(),
+        fresh.loss.target_network.parameters(),
+    )
     assert all(torch.equal(online, target) for online, target in pairs)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"v_min": -10.0}, r"here: agent.v_min=-10\).*init.support=trained, set agent.v_min=-120,"),
+        (
+            {"v_min": -10.0},
+            r"here: agent.v_min=-10\).*init.support=trained, set agent.v_min=-120,",
+        ),
         (
             {"hidden": (8,), "atoms": 51},
             r"atoms=51\); set agent.hidden=\[8,8\] agent.atoms=101, or start",
@@ -102,7 +124,8 @@ def test_another_network_or_support_is_refused_naming_the_ways_out(options, mess
 
 
 def test_without_a_distribution_the_support_means_nothing(tmp_path):
-    path, plain = tmp_path / "agent.safetensors", {"distributional": False}
+    path = tmp_path / "agent.safetensors"
+    plain = {"distributional": False}
     save_agent(path, agent(**plain), {})
     start_from(agent(seed=1, v_min=-10.0, atoms=51, **plain), path)
 
@@ -116,13 +139,19 @@ def descend(learner, seed):
 
 
 def test_adam_goes_on_from_the_moments_that_it_is_given():
-    trained, warm, cold = agent(), agent(seed=1), agent(seed=2)
+    trained = agent()
+    warm = agent(seed=1)
+    cold = agent(seed=2)
     for seed in (1, 2, 3):
         descend(trained, seed)
     for fresh in (warm, cold):
         fresh.load_weights(trained.weights())
     load_moments(warm, trained.optimizer.state_dict()["state"])
-    for learner in (trained, warm, cold):  # in this order: the two must not share what they change
+    for learner in (
+        trained,
+        warm,
+        cold,
+    ):  # in this order: the two must not share what they change
         descend(learner, 4)
     assert same_weights(trained, warm)
     assert not same_weights(trained, cold)
@@ -132,10 +161,8 @@ def test_adam_goes_on_from_the_moments_that_it_is_given():
 
 
 def test_only_moments_are_taken_over_the_rate_is_ones_own():
-    trained, fresh = (
-        agent(learning_rate=1e-2, adam_eps=1e-3),
-        agent(learning_rate=1e-4, adam_eps=1e-8),
-    )
+    trained = agent(learning_rate=1e-2, adam_eps=1e-3)
+    fresh = agent(learning_rate=1e-4, adam_eps=1e-8)
     descend(trained, 1)
     load_moments(fresh, trained.optimizer.state_dict()["state"])
     (group,) = fresh.optimizer.param_groups
@@ -143,20 +170,31 @@ def test_only_moments_are_taken_over_the_rate_is_ones_own():
 
 
 def test_moments_kept_in_half_precision_come_back_as_floats():
-    trained, fresh = agent(), agent()
+    trained = agent()
+    fresh = agent()
     descend(trained, 1)
-    load_moments(fresh, trained.state_dict(with_replay=False)["optimizer"]["state"])
+    load_moments(
+        fresh,
+        trained.state_dict(with_replay=False)["optimizer"]["state"],
+    )
     exact, rounded = (learner.optimizer.state_dict()["state"] for learner in (trained, fresh))
     for row in exact:
         assert rounded[row]["exp_avg_sq"].dtype == torch.float32
         torch.testing.assert_close(
-            rounded[row]["exp_avg"], exact[row]["exp_avg"], rtol=2**-8, atol=0.0
+            rounded[row]["exp_avg"],
+            exact[row]["exp_avg"],
+            rtol=2**-8,
+            atol=0.0,
         )
 
 
-@pytest.mark.parametrize("damage", ["absent", "fewer", "another shape", "no step", "text"])
+@pytest.mark.parametrize(
+    "damage",
+    ["absent", "fewer", "another shape", "no step", "text"],
+)
 def test_moments_of_another_network_are_refused(damage):
-    trained, fresh = agent(), agent()
+    trained = agent()
+    fresh = agent()
     descend(trained, 1)
     moments = {row: dict(state) for row, state in trained.optimizer.state_dict()["state"].items()}
     if damage == "absent":

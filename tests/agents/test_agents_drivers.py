@@ -40,19 +40,22 @@ def test_random_drivers_use_all_actions_equally():
 
 def test_the_legal_random_driver_never_asks_for_a_lane_that_is_not_there():
     state = states(6000)
-    lane, action = (
-        state["vehicles", "target_lane"][:, 0],
-        RandomLegalDriver(Road())(state)["action"],
-    )
+    lane = state["vehicles", "target_lane"][:, 0]
+    action = RandomLegalDriver(Road())(state)["action"]
     assert not ((lane == 2) & (action == LEFT)).any()
     assert not ((lane == 0) & (action == RIGHT)).any()
-    for own, legal in ((0, (KEEP, LEFT)), (1, (KEEP, LEFT, RIGHT)), (2, (KEEP, RIGHT))):
+    for own, legal in (
+        (0, (KEEP, LEFT)),
+        (1, (KEEP, LEFT, RIGHT)),
+        (2, (KEEP, RIGHT)),
+    ):
         shares = torch.bincount(action[lane == own], minlength=3) / (lane == own).sum()
         assert all(abs(shares[a] - 1 / len(legal)) < 0.06 for a in legal)
 
 
 def test_random_actions_depend_on_the_episode_and_not_on_the_batch():
-    few, many = states(4), states(64)
+    few = states(4)
+    many = states(64)
     driver = RandomDriver(Road())
     assert torch.equal(driver(few)["action"], driver(many)["action"][:4])
 

@@ -1,46 +1,43 @@
-"""The lean losses equal TorchRL's, the projection a reference, and the whole update autograd and
-Adam.
-"""
+"""The lean losses equal TorchRL's, the whole update autograd and Adam."""
 
 from copy import deepcopy
 
 import pytest
 import torch
-from tensordict import TensorDict
+from agents_small import transitions
 from torchrl.objectives import DistributionalDQNLoss, DQNLoss
 
-from ganlane.agents import NetworkConfig, QNetwork, Rainbow, RainbowConfig
-from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss, UpdateGraph, project
+from ganlane.agents import (
+    NetworkConfig,
+    QNetwork,
+    Rainbow,
+    RainbowConfig,
+)
+from ganlane.agents.loss import (
+    LeanDistributionalLoss,
+    LeanDQNLoss,
+    UpdateGraph,
+    project,
+)
 from ganlane.agents.network import redraw_noise
 from ganlane.runtime import has_compiler
 
 SIZE = 5
 
 
-def batch(seed=0, rows=64, scale=3.0):
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape):
-        return torch.randn(shape, generator=generator)
-
-    content = {
-        "observation": normal(rows, SIZE),
-        "action": torch.randint(0, 3, (rows,), generator=generator),
-        "steps_to_next_obs": torch.randint(1, 4, (rows, 1), generator=generator).float(),
-    }
-    after = {
-        "observation": normal(rows, SIZE),
-        "reward": scale * normal(rows, 1),
-        "terminated": torch.rand(rows, 1, generator=generator) < 0.3,
-        "done": torch.rand(rows, 1, generator=generator) < 0.3,
-    }
-    return TensorDict({**content, "next": after}, [rows])
+def batch(rows=64, scale=3.0):
+    return transitions(SIZE, rows, scale=scale, most_steps=3)
 
 
 def network(**options):
     torch.manual_seed(3)
-    given = {"hidden": (16, 16), "atoms": 11, "v_min": -5.0, "v_max": 5.0, **options}
-    return QNetwork(NetworkConfig(SIZE, 3, **given))
+    small = {
+        "hidden": (16, 16),
+        "atoms": 11,
+        "v_min": -5.0,
+        "v_max": 5.0,
+    }
+    return QNetwork(NetworkConfig(RainbowConfig(**{**small, **options}), SIZE))
 
 
 def unlike_target(loss):
@@ -54,12 +51,15 @@ def unlike_target(loss):
 @pytest.mark.parametrize("rows", [64, 11])
 @pytest.mark.parametrize("noisy", [True, False])
 def test_the_distributional_loss_equals_torchrls(noisy, rows):
-    """Also when the batch has as many rows as there are atoms, where a wrong shape would broadcast."""
+    """Also with as many rows as there are atoms, where a wrong shape would broadcast."""
     loss = unlike_target(
         LeanDistributionalLoss(network(noisy=noisy), gamma=0.97, kl_priority=False)
     )
-    theirs, ours, parameters = batch(rows=rows), batch(rows=rows), list(loss.network.parameters())
-    expected, actual = DistributionalDQNLoss.forward(loss, theirs)["loss"], loss(ours)["loss"]
+    theirs = batch(rows=rows)
+    ours = batch(rows=rows)
+    parameters = list(loss.network.parameters())
+    expected = DistributionalDQNLoss.forward(loss, theirs)["loss"]
+    actual = loss(ours)["loss"]
     torch.testing.assert_close(actual, expected, atol=1e-6, rtol=1e-6)
     torch.testing.assert_close(ours["td_error"], theirs["td_error"], atol=1e-6, rtol=1e-6)
     gradients = [torch.autograd.grad(each.mean(), parameters) for each in (actual, expected)]
@@ -69,10 +69,16 @@ def test_the_distributional_loss_equals_torchrls(noisy, rows):
 @pytest.mark.parametrize("double", [True, False])
 def test_the_plain_loss_equals_torchrls(double):
     loss = unlike_target(LeanDQNLoss(network(distributional=False), gamma=0.97, double=double))
-    theirs, ours = batch(), batch()
+    theirs = batch()
+    ours = batch()
     expected = DQNLoss.forward(loss, theirs)["loss"]
     torch.testing.assert_close(loss(ours)["loss"], expected, atol=1e-6, rtol=1e-6)
-    torch.testing.assert_close(ours["td_error"] ** 2, theirs["td_error"], atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(
+        ours["td_error"] ** 2,
+        theirs["td_error"],
+        atol=1e-5,
+        rtol=1e-5,
+    )
 
 
 def test_without_double_the_target_network_chooses():
@@ -103,13 +109,17 @@ def test_the_projection_is_that_of_the_paper():
     values[0] = support  # exactly on the atoms: nothing may vanish
     probabilities = torch.randn(20, 9).softmax(-1)
     projected = project(values, probabilities, support)
-    torch.testing.assert_close(projected, reference_projection(values, probabilities, support))
+    torch.testing.assert_close(
+        projected,
+        reference_projection(values, probabilities, support),
+    )
     torch.testing.assert_close(projected[0], probabilities[0])
     torch.testing.assert_close(projected.sum(-1), torch.ones(20))
 
 
 def test_the_loss_reports_the_share_of_the_returns_that_its_support_does_not_cover():
-    loss, data = LeanDistributionalLoss(network(), gamma=1.0), batch()
+    loss = LeanDistributionalLoss(network(), gamma=1.0)
+    data = batch()
     data["next", "terminated"][:] = True
     data["next", "reward"] = torch.linspace(-9.0, 9.0, 64)[:, None]
     beyond = (data["next", "reward"].abs() > 5.0).float().mean()
@@ -125,13 +135,18 @@ def test_the_kl_priority_is_the_cross_entropy_less_the_targets_entropy():
     target = loss._target(data, loss.network.weights())[0].detach()
     entropy = -(target * target.clamp_min(1e-30).log()).sum(-1)
     torch.testing.assert_close(
-        data["td_error"].squeeze(-1), cross_entropy - entropy, atol=1e-5, rtol=1e-5
+        data["td_error"].squeeze(-1),
+        cross_entropy - entropy,
+        atol=1e-5,
+        rtol=1e-5,
     )
     assert (data["td_error"] >= 0).all()
 
 
 @pytest.mark.parametrize("distributional", [True, False])
-def test_every_parameter_gets_a_gradient_noise_included(distributional):
+def test_every_parameter_gets_a_gradient_noise_included(
+    distributional,
+):
     net = network(distributional=distributional)
     loss = (LeanDistributionalLoss if distributional else LeanDQNLoss)(net, gamma=0.97)
     redraw_noise(net, torch.Generator().manual_seed(0))
@@ -153,16 +168,18 @@ def test_the_target_network_is_torchrls_target_parameters():
 @pytest.mark.parametrize("double", [True, False])
 @pytest.mark.parametrize("distributional", [True, False])
 def test_the_next_action_is_one_that_the_mask_allows(distributional, double):
-    """Where one next action alone is allowed, the target is that of a network to which it is the
-    best.
-    """
+    """Where one next action alone is allowed, it counts as the best."""
     kind, options = (
         (LeanDistributionalLoss, {}) if distributional else (LeanDQNLoss, {"distributional": False})
     )
     loss = unlike_target(
-        kind(network(noisy=False, dueling=False, **options), gamma=0.97, double=double)
+        kind(
+            network(noisy=False, dueling=False, **options),
+            gamma=0.97,
+            double=double,
+        )
     )
-    data = batch()
+    data = batch(scale=1.0)  # no target may lie wholly outside the support
     only = torch.randint(0, 3, (64,), generator=torch.Generator().manual_seed(1))
     data["next", "action_mask"] = torch.nn.functional.one_hot(only, 3).bool()
     masked = loss(data.clone())["loss"]
@@ -190,17 +207,23 @@ def agent(graph=None, masked=False, **options):
         "target_period": 3,
     }
     config = RainbowConfig(**{**usual, "v_min": -20.0, "v_max": 20.0, **options})
-    made = Rainbow(config, SIZE, seed=0)
+    learner = Rainbow(config, SIZE, seed=0)
     data = batch(rows=600, scale=30.0)  # some targets lie outside the support
     if masked:
         data["next", "action_mask"] = (
             torch.rand(600, 3, generator=torch.Generator().manual_seed(1)) < 0.6
         )
         data["next", "action_mask"][:, 0] = True
-    made.store(data)
+    learner.store(data)
     if graph is not None:
-        made.graph = UpdateGraph(made.network, made.loss, made.optimizer, config, compile=graph)
-    return made
+        learner.graph = UpdateGraph(
+            learner.network,
+            learner.loss,
+            learner.optimizer,
+            config,
+            compile=graph,
+        )
+    return learner
 
 
 def assert_close(one, other):
@@ -208,16 +231,30 @@ def assert_close(one, other):
         torch.testing.assert_close(value, twin, atol=2e-6, rtol=1e-5, msg=name)
     for mine, theirs in zip(one.optimizer.state.values(), other.optimizer.state.values()):
         for name in ("step", "exp_avg", "exp_avg_sq"):
-            torch.testing.assert_close(mine[name], theirs[name], atol=1e-7, rtol=1e-3, msg=name)
+            torch.testing.assert_close(
+                mine[name],
+                theirs[name],
+                atol=1e-7,
+                rtol=1e-3,
+                msg=name,
+            )
 
 
 def run_both(graph, masked=False, updates=8, **options):
-    plain, graphed = agent(masked=masked, **options), agent(graph, masked, **options)
+    plain = agent(masked=masked, **options)
+    graphed = agent(graph, masked, **options)
     for _ in range(updates):
-        expected, found = plain.update(), graphed.update()
-        assert found.keys() == expected.keys()
+        expected = plain.update()
+        actual = graphed.update()
+        assert actual.keys() == expected.keys()
         for name, value in expected.items():
-            torch.testing.assert_close(found[name], value.detach(), atol=1e-5, rtol=1e-4, msg=name)
+            torch.testing.assert_close(
+                actual[name],
+                value.detach(),
+                atol=1e-5,
+                rtol=1e-4,
+                msg=name,
+            )
     assert_close(plain, graphed)
     assert plain.updates == graphed.updates == updates
     return plain, graphed
@@ -228,8 +265,18 @@ def run_both(graph, masked=False, updates=8, **options):
     [
         (False, {}),
         (True, {"gradient_clip": 0.01}),
-        (True, {"learning_rate_end": 1e-5, "learning_rate_decisions": 100, "hidden": (8,)}),
-        (False, {"hidden": (8, 8, 8), "gamma": 0.9, "adam_eps": 1e-3}),
+        (
+            True,
+            {
+                "learning_rate_end": 1e-5,
+                "learning_rate_decisions": 100,
+                "hidden": (8,),
+            },
+        ),
+        (
+            False,
+            {"hidden": (8, 8, 8), "gamma": 0.9, "adam_eps": 1e-3},
+        ),
     ],
 )
 def test_updates_are_those_of_the_loss_of_autograd_and_of_adam(masked, options):
@@ -240,20 +287,31 @@ def test_training_can_change_from_one_way_to_the_other_and_be_resumed():
     plain, graphed = run_both(False)
     resumed = agent(False)
     resumed.load_state_dict(deepcopy(plain.state_dict()))
-    for each in (plain, graphed, resumed):
-        each.update()
+    for learner in (plain, graphed, resumed):
+        learner.update()
     assert_close(plain, graphed)
     assert_close(plain, resumed)
     back = agent()
     back.load_state_dict(deepcopy(graphed.state_dict()))
-    back.update(), plain.update()
+    back.update()
+    plain.update()
     assert_close(plain, back)
 
 
 @pytest.mark.parametrize(
-    "part", ["distributional", "double", "dueling", "noisy", "prioritised", "kl_priority"]
+    "part",
+    [
+        "distributional",
+        "double",
+        "dueling",
+        "noisy",
+        "prioritised",
+        "kl_priority",
+    ],
 )
-def test_an_agent_without_one_of_the_components_keeps_the_other_way(part):
+def test_an_agent_without_one_of_the_components_keeps_the_other_way(
+    part,
+):
     config = RainbowConfig(**{part: False})
     assert Rainbow(config, SIZE, compile=True).graph is None
 

@@ -14,7 +14,9 @@ def recorded(steps, environments, seed):
     The observation is a serial number, and the one after a reset is another.
     """
     generator = torch.Generator().manual_seed(seed)
-    serial, current, result = 0.0, torch.zeros(environments, 1), []
+    serial = 0.0
+    current = torch.zeros(environments, 1)
+    result = []
     for _ in range(steps):
         terminated = torch.rand(environments, 1, generator=generator) < 0.2
         truncated = torch.rand(environments, 1, generator=generator) < 0.2
@@ -29,38 +31,61 @@ def recorded(steps, environments, seed):
             "done": done,
         }
         action = torch.randint(0, 3, (environments,), generator=generator)
-        step = TensorDict({"observation": current, "action": action, "next": after}, [environments])
+        step = TensorDict(
+            {
+                "observation": current,
+                "action": action,
+                "next": after,
+            },
+            [environments],
+        )
         result.append(step)
         current = torch.where(done, following + 0.5, following)
     return result
 
 
 def brute_force(steps, start, row, n, gamma):
-    reward, length = 0.0, 0
+    reward = 0.0
+    length = 0
     for step in steps[start : start + n]:
         after = step["next"]
         reward += gamma**length * float(after["reward"][row])
         length += 1
         if after["done"][row]:
             break
-    return reward, length, after["observation"][row], after["terminated"][row]
+    return (
+        reward,
+        length,
+        after["observation"][row],
+        after["terminated"][row],
+    )
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(1, 5), st.integers(1, 4), st.integers(0, 10_000))
 def test_each_transition_equals_the_loop_over_its_own_steps(n, environments, seed):
-    gamma, steps = 0.9, recorded(20, environments, seed)
+    gamma = 0.9
+    steps = recorded(20, environments, seed)
     window = NStepWindow(n, gamma)
     transitions = [window.push(step) for step in steps]
     assert all(t is None for t in transitions[: n - 1])
     for start, transition in enumerate(transitions[n - 1 :]):
-        assert transition["steps_to_next_obs"].shape == (environments, 1)
+        assert transition["steps_to_next_obs"].shape == (
+            environments,
+            1,
+        )
         for row in range(environments):
             reward, length, following, terminated = brute_force(steps, start, row, n, gamma)
-            assert torch.equal(transition["observation"][row], steps[start]["observation"][row])
+            assert torch.equal(
+                transition["observation"][row],
+                steps[start]["observation"][row],
+            )
             assert transition["action"][row] == steps[start]["action"][row]
             torch.testing.assert_close(
-                float(transition["next", "reward"][row]), reward, atol=1e-5, rtol=1e-5
+                float(transition["next", "reward"][row]),
+                reward,
+                atol=1e-5,
+                rtol=1e-5,
             )
             assert transition["steps_to_next_obs"][row] == length
             assert torch.equal(transition["next", "observation"][row], following)
@@ -69,7 +94,9 @@ def test_each_transition_equals_the_loop_over_its_own_steps(n, environments, see
 
 def test_a_saved_window_goes_on_as_if_nothing_had_happened():
     steps = recorded(8, 3, 1)
-    whole, first, second = NStepWindow(3, 0.9), NStepWindow(3, 0.9), NStepWindow(3, 0.9)
+    whole = NStepWindow(3, 0.9)
+    first = NStepWindow(3, 0.9)
+    second = NStepWindow(3, 0.9)
     expected = [whole.push(step) for step in steps][-1]
     for step in steps[:4]:
         first.push(step)

@@ -3,19 +3,36 @@
 import numpy as np
 import pytest
 import torch
-from scipy import stats  # scikit-learn, a dependency, brings it along
+from scipy import (
+    stats,
+)  # scikit-learn, a dependency, brings it along
 from tensordict import TensorDict
 
 from ganlane.agents import RainbowConfig
-from ganlane.agents.replay import draw, load_replay_state, make_replay, replay_state
+from ganlane.agents.replay import (
+    draw,
+    load_replay_state,
+    make_replay,
+    replay_state,
+)
 
 
 def transitions(rows, first=0):
     number = torch.arange(first, first + rows)
-    after = {"observation": number[:, None] + 0.5, "reward": torch.zeros(rows, 1)}
+    after = {
+        "observation": number[:, None] + 0.5,
+        "reward": torch.zeros(rows, 1),
+    }
     after["terminated"] = torch.zeros(rows, 1, dtype=torch.bool)
-    content = {"observation": number[:, None].float(), "action": number % 3, "next": after}
-    return TensorDict({**content, "steps_to_next_obs": torch.ones(rows, 1)}, [rows])
+    content = {
+        "observation": number[:, None].float(),
+        "action": number % 3,
+        "next": after,
+    }
+    return TensorDict(
+        {**content, "steps_to_next_obs": torch.ones(rows, 1)},
+        [rows],
+    )
 
 
 def config(capacity=256, **options):
@@ -61,7 +78,10 @@ def test_importance_weights_are_those_of_schaul_over_the_largest_of_the_batch():
     weight = (200 * share / share.sum()) ** -0.7
     weight = weight[drawn["index"]]
     torch.testing.assert_close(
-        drawn["priority_weight"], weight / weight.max(), atol=1e-5, rtol=1e-5
+        drawn["priority_weight"],
+        weight / weight.max(),
+        atol=1e-5,
+        rtol=1e-5,
     )
 
 
@@ -92,11 +112,13 @@ def test_the_item_of_an_index_is_the_one_stored_there_after_the_buffer_wraps():
 
 @pytest.mark.parametrize("prioritised", [True, False])
 def test_draws_come_from_the_buffers_own_generator(prioritised):
-    before, numpy_before = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
+    before = torch.get_rng_state()
+    numpy_before = np.random.get_state()[1].copy()  # noqa: NPY002
     first, second = (buffer(prioritised=prioritised, seed=4) for _ in range(2))
     assert torch.equal(first.sample()["index"], second.sample()["index"])
     assert not torch.equal(
-        first.sample()["index"], buffer(prioritised=prioritised, seed=5).sample()["index"]
+        first.sample()["index"],
+        buffer(prioritised=prioritised, seed=5).sample()["index"],
     )
     assert torch.equal(torch.get_rng_state(), before)
     assert (np.random.get_state()[1] == numpy_before).all()  # noqa: NPY002
@@ -112,11 +134,15 @@ def test_a_restored_buffer_draws_what_the_saved_one_would_have(prioritised, tmp_
     generator = torch.Generator()
     generator.set_state(saved._rng.get_state())
     restored = make_replay(config(prioritised=prioritised), generator)
-    load_replay_state(restored, torch.load(tmp_path / "replay.pt", weights_only=True))
+    load_replay_state(
+        restored,
+        torch.load(tmp_path / "replay.pt", weights_only=True),
+    )
     saved.extend(transitions(10, first=500))
     restored.extend(transitions(10, first=500))
     for _ in range(3):
-        ours, theirs = restored.sample(), saved.sample()
+        ours = restored.sample()
+        theirs = saved.sample()
         assert (ours.select(*theirs.keys()) == theirs).all()
 
 
@@ -124,6 +150,7 @@ def test_a_restored_buffer_draws_what_the_saved_one_would_have(prioritised, tmp_
 def test_drawing_gives_the_batch_of_torchrls_own_way(prioritised):
     first, second = (buffer(prioritised=prioritised, seed=4) for _ in range(2))
     for _ in range(3):
-        ours, theirs = draw(first), second.sample()
+        ours = draw(first)
+        theirs = second.sample()
         assert ours.keys() == theirs.keys()
         assert all(torch.equal(ours[key], theirs[key]) for key in theirs.keys(True, True))

@@ -21,11 +21,19 @@ from ganlane.training.logs import (
 # --- CSV
 
 
-def test_a_resumed_log_forgets_the_rows_after_the_checkpoint(tmp_path):
+def test_a_resumed_log_forgets_the_rows_after_the_checkpoint(
+    tmp_path,
+):
     path = tmp_path / "metrics.csv"
     first = CsvLog(path, ["decisions", "loss"])
     for decisions in (100, 200, 300):
-        first.write({"decisions": decisions, "loss": 1.0 / 3.0, "unknown": 5.0})
+        first.write(
+            {
+                "decisions": decisions,
+                "loss": 1.0 / 3.0,
+                "unknown": 5.0,
+            }
+        )
     first.close()
     second = CsvLog(path, ["decisions", "loss"], decisions=200)
     second.write({"decisions": 260})
@@ -33,7 +41,9 @@ def test_a_resumed_log_forgets_the_rows_after_the_checkpoint(tmp_path):
     assert path.read_text() == "decisions,loss\n100,0.333333\n200,0.333333\n260,\n"
 
 
-def test_a_log_torn_at_any_byte_holds_its_whole_rows_and_no_other(tmp_path):
+def test_a_log_torn_at_any_byte_holds_its_whole_rows_and_no_other(
+    tmp_path,
+):
     path = tmp_path / "metrics.csv"
     log = CsvLog(path, ["loss", "decisions"])  # the last column is the one that can be cut unseen
     rows = [
@@ -55,7 +65,10 @@ def test_a_log_torn_at_any_byte_holds_its_whole_rows_and_no_other(tmp_path):
 def test_a_row_of_too_few_or_too_many_columns_is_left_out(tmp_path, torn):
     path = tmp_path / "metrics.csv"
     path.write_text(f"decisions,loss,sigma\n10,0.5,1\n{torn}\n40,0.5,\n")
-    assert [row["decisions"] for row in read_rows(path)] == ["10", "40"]
+    assert [row["decisions"] for row in read_rows(path)] == [
+        "10",
+        "40",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -76,13 +89,16 @@ def test_a_log_that_is_none_is_refused_in_one_sentence(content, tmp_path):
     path = tmp_path / "metrics.csv"
     path.write_bytes(content)
     with pytest.raises(
-        UserError, match=r"metrics\.csv: damaged \(.*\); repair it, or move it away"
+        UserError,
+        match=r"metrics\.csv: damaged \(.*\); repair it, or move it away",
     ):
         CsvLog(path, ["decisions", "loss"])
     assert path.read_bytes() == content
 
 
-def test_an_evaluation_that_a_resumed_run_repeats_stands_once(tmp_path):
+def test_an_evaluation_that_a_resumed_run_repeats_stands_once(
+    tmp_path,
+):
     for _ in range(2):
         logs = Logs(tmp_path, 3, 160, None)
         for decisions in (80, 160):
@@ -99,7 +115,12 @@ def test_progress_off_a_terminal_is_a_line_per_row_with_the_last_known_figures()
     progress = Progress(1_000_000, stream=stream)
     progress.advance(5)
     progress.write(
-        {"decisions": 100_000, "decisions_per_s": 5000.0, "mean_return": 12.34, "crash_rate": 0.125}
+        {
+            "decisions": 100_000,
+            "decisions_per_s": 5000.0,
+            "mean_return": 12.34,
+            "crash_rate": 0.125,
+        }
     )
     progress.write({"decisions": 200_000, "decisions_per_s": 10_000.0})
     progress.write({"decisions": 962_766, "decisions_per_s": 10.0})
@@ -115,7 +136,13 @@ def test_progress_on_a_terminal_is_a_bar_with_rate_time_left_return_and_crashes(
     stream.isatty = lambda: True
     progress = Progress(100_000, stream=stream)
     progress.advance(10_000)
-    progress.write({"decisions": 10_000, "mean_return": 3.0, "crash_rate": 0.25})
+    progress.write(
+        {
+            "decisions": 10_000,
+            "mean_return": 3.0,
+            "crash_rate": 0.25,
+        }
+    )
     progress.close()
     last = stream.getvalue().splitlines()[-1].rpartition("\r")[2]
     assert "10.0k/100k decisions" in last
@@ -138,7 +165,12 @@ def fake(monkeypatch):
 def test_wandb_writes_below_the_run_folder_and_is_named_after_it(fake, tmp_path):
     folder = tmp_path / "sweep" / "3"
     WandbLog(folder, "mine", {"seed": 7})
-    options = {"dir": str(folder), "project": "mine", "name": "sweep/3", "config": {"seed": 7}}
+    options = {
+        "dir": str(folder),
+        "project": "mine",
+        "name": "sweep/3",
+        "config": {"seed": 7},
+    }
     assert fake.init.call_args.kwargs.items() >= options.items()
     assert folder.is_dir()  # wandb falls back to a temporary folder otherwise
 
@@ -159,13 +191,19 @@ def test_wandb_is_offline_unless_told_gets_every_figure_over_the_decisions_and_i
 
 @pytest.mark.parametrize(
     ("log", "module", "extra"),
-    [(WandbLog, "wandb", "wandb"), (TensorBoardLog, "torch.utils.tensorboard", "tensorboard")],
+    [
+        (WandbLog, "wandb", "wandb"),
+        (TensorBoardLog, "torch.utils.tensorboard", "tensorboard"),
+    ],
 )
 def test_a_missing_package_is_named_with_the_command_that_mends_it(
     log, module, extra, tmp_path, monkeypatch
 ):
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(UserError, match=rf"pip install 'ganlane\[{extra}\]'.*logger=csv\.$"):
+    with pytest.raises(
+        UserError,
+        match=rf"pip install 'ganlane\[{extra}\]'.*logger=csv\.$",
+    ):
         log(tmp_path)
 
 
@@ -173,7 +211,8 @@ def test_a_wandb_that_does_not_start_is_one_sentence(fake, tmp_path, monkeypatch
     fake.init.side_effect = fake.Error("api_key not configured")
     monkeypatch.setenv("WANDB_MODE", "online")
     with pytest.raises(
-        UserError, match=r"WANDB_MODE=online.*api_key not configured.*WANDB_MODE=offline"
+        UserError,
+        match=r"WANDB_MODE=online.*api_key not configured.*WANDB_MODE=offline",
     ):
         WandbLog(tmp_path)
 
@@ -191,13 +230,20 @@ def test_the_real_wandb_keeps_an_offline_run(tmp_path, monkeypatch):
 
 
 def test_the_option_chooses_the_logs(fake, tmp_path):
-    pytest.importorskip("tensorboard", reason="the extra tensorboard is not installed")
+    pytest.importorskip(
+        "tensorboard",
+        reason="the extra tensorboard is not installed",
+    )
     assert make_logs(LoggerConfig(), tmp_path) == []
     (board,) = make_logs(LoggerConfig(kind="tensorboard"), tmp_path)
     assert isinstance(board, TensorBoardLog)
     board.write({"decisions": 100, "loss": 0.5})
     board.close()
     assert any(path.name.startswith("events") for path in (tmp_path / "tensorboard").iterdir())
-    (wandb,) = make_logs(LoggerConfig(kind="wandb", project="mine"), tmp_path, {"seed": 1})
+    (wandb,) = make_logs(
+        LoggerConfig(kind="wandb", project="mine"),
+        tmp_path,
+        {"seed": 1},
+    )
     assert isinstance(wandb, WandbLog)
     assert fake.init.call_args.kwargs.items() >= {"project": "mine", "config": {"seed": 1}}.items()

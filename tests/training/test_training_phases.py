@@ -22,10 +22,13 @@ from ganlane.settings.env import EnvConfig
 from ganlane.settings.train import InitConfig, NoInitConfig
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
-from ganlane.settings.agent import LAST_REVISION, without_removed_overrides
 from ganlane.settings.observation import MaskParameters
 from ganlane.runtime import has_compiler
-from ganlane.training.checkpoint import LAST, load_checkpoint, save_checkpoint
+from ganlane.training.checkpoint import (
+    LAST,
+    load_checkpoint,
+    save_checkpoint,
+)
 from ganlane.training.phases import (
     AGENT_FILE,
     check_observation,
@@ -51,8 +54,13 @@ def run(folder, *options, resume=None):
 
 
 def start(folder, path, *options, resume=None):
-    """Config and agent of a run in ``folder`` that is about to begin, from the agent at ``path``."""
-    given = [*WITHOUT_INIT, "init=idm_ckpt", f"init.path={path}", *options]
+    """Config and agent of a run in ``folder`` that is to begin from the agent at ``path``."""
+    given = [
+        *WITHOUT_INIT,
+        "init=idm_ckpt",
+        f"init.path={path}",
+        *options,
+    ]
     config = check("train", given).config
     return make_initial_agent(config, phases_of(config, folder)[0], resume)
 
@@ -92,20 +100,29 @@ def test_a_run_starts_from_a_folder_a_checkpoint_or_an_agents_file(place, traine
 
 def test_moments_are_taken_over_where_asked(trained, last, tmp_path):
     _, agent = start(tmp_path, trained, "init.optimizer=true")
-    theirs, ours = last["optimizer"]["state"], agent.optimizer.state_dict()["state"]
+    theirs = last["optimizer"]["state"]
+    ours = agent.optimizer.state_dict()["state"]
     assert theirs.keys() == ours.keys()
     assert all(equal(theirs[row], ours[row]) for row in theirs)
     assert ours[0]["step"] == last["updates"] > 0
     assert agent.updates == 0
 
 
-def test_a_run_whose_rate_has_fallen_is_prolonged_at_its_end(tmp_path):
+def test_a_run_whose_rate_has_fallen_is_prolonged_at_its_end(
+    tmp_path,
+):
     fall = ["agent.learning_rate_end=1e-5"]
     folder = run(tmp_path, *fall, "total_decisions=160")
     with pytest.raises(
-        UserError, match=r"agent\.learning_rate_decisions=320: the saved agent has 160"
+        UserError,
+        match=r"agent\.learning_rate_decisions=320: the saved agent has 160",
     ):
-        run(folder, *fall, "total_decisions=320", resume=folder / LAST)
+        run(
+            folder,
+            *fall,
+            "total_decisions=320",
+            resume=folder / LAST,
+        )
     run(
         folder,
         *fall,
@@ -120,12 +137,17 @@ def test_a_run_whose_rate_has_fallen_is_prolonged_at_its_end(tmp_path):
 
 def test_a_file_of_weights_has_no_moments_to_take_over(trained, tmp_path):
     with pytest.raises(
-        UserError, match=r"agent\.safetensors holds no moments.*last\.pt.*init\.optimizer=false"
+        UserError,
+        match=r"agent\.safetensors holds no moments.*last\.pt.*init\.optimizer=false",
     ):
         start(tmp_path, trained / AGENT_FILE, "init.optimizer=true")
 
 
-OTHER_SUPPORT = ["agent.v_min=-50", "agent.v_max=60", "agent.atoms=21"]
+OTHER_SUPPORT = [
+    "agent.v_min=-50",
+    "agent.v_max=60",
+    "agent.atoms=21",
+]
 
 
 @pytest.mark.parametrize("place", ["", AGENT_FILE])
@@ -133,17 +155,33 @@ def test_another_support_is_refused_unless_the_trained_one_is_asked_for(
     place, trained, last, tmp_path
 ):
     with pytest.raises(
-        UserError, match=r"give init\.support=trained, set agent\.atoms=101 agent\.v_min=-120"
+        UserError,
+        match=r"give init\.support=trained, set agent\.atoms=101 agent\.v_min=-120",
     ):
         start(tmp_path, trained / place, *OTHER_SUPPORT)
-    config, agent = start(tmp_path, trained / place, "init.support=trained", *OTHER_SUPPORT)
-    assert (agent.config.atoms, agent.config.v_min, agent.config.v_max) == (101, -120.0, 100.0)
-    assert (config.agent.atoms, config.agent.v_min, config.agent.v_max) == (101, -120.0, 100.0)
+    config, agent = start(
+        tmp_path,
+        trained / place,
+        "init.support=trained",
+        *OTHER_SUPPORT,
+    )
+    assert (
+        agent.config.atoms,
+        agent.config.v_min,
+        agent.config.v_max,
+    ) == (101, -120.0, 100.0)
+    assert (
+        config.agent.atoms,
+        config.agent.v_min,
+        config.agent.v_max,
+    ) == (101, -120.0, 100.0)
     assert torch.equal(agent.network.support, torch.linspace(-120.0, 100.0, 101))
     assert equal(agent.weights(), last["network"])
 
 
-def test_a_run_with_an_adopted_support_goes_on_without_what_it_started_from(tmp_path):
+def test_a_run_with_an_adopted_support_goes_on_without_what_it_started_from(
+    tmp_path,
+):
     """And ends as it would have in a piece: here the start lies in a file that is then gone."""
     first = run(tmp_path / "first", "total_decisions=160")
     options = [
@@ -159,13 +197,24 @@ def test_a_run_with_an_adopted_support_goes_on_without_what_it_started_from(tmp_
     run(parts, *options, "total_decisions=320", resume=parts / LAST)
     one, network, metadata = read_agent(parts / AGENT_FILE)
     assert equal(one, read_agent(whole / AGENT_FILE)[0])
-    assert (network.v_min, network.atoms) == (-120.0, 101)
+    assert (network.agent.v_min, network.agent.atoms) == (
+        -120.0,
+        101,
+    )
     assert metadata["agent"]["v_min"] == -120.0
 
 
 def test_a_second_phase_begins_with_a_fresh_optimiser(trained, tmp_path):
-    given = [*WITHOUT_INIT, "init=idm_ckpt", f"init.path={trained}", "init.optimizer=true"]
-    given += ["traffic@pretrain.traffic=idm_mobil", "pretrain.total_decisions=16"]
+    given = [
+        *WITHOUT_INIT,
+        "init=idm_ckpt",
+        f"init.path={trained}",
+        "init.optimizer=true",
+    ]
+    given += [
+        "traffic@pretrain.traffic=idm_mobil",
+        "pretrain.total_decisions=16",
+    ]
     config = check("train", given).config
     first, second = phases_of(config, tmp_path)
     assert make_initial_agent(config, first, None)[1].optimizer.state_dict()["state"]
@@ -186,21 +235,34 @@ def test_another_observation_is_refused_from_a_checkpoint_too(trained, tmp_path)
 DAMAGES = {
     "no state": lambda state: None,
     "no agent": lambda state: {**state, "agent": None},
-    "unknown option": lambda state: {**state, "agent": {**state["agent"], "config": {"wheels": 4}}},
+    "unknown option": lambda state: {
+        **state,
+        "agent": {**state["agent"], "config": {"wheels": 4}},
+    },
     "no observation": lambda state: {**state, "identity": {}},
-    "numbers": lambda state: {**state, "agent": {**state["agent"], "network": {"head.weight": 3}}},
+    "numbers": lambda state: {
+        **state,
+        "agent": {**state["agent"], "network": {"head.weight": 3}},
+    },
 }
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_checkpoint_without_an_agent_is_refused_in_one_sentence(damage, trained, tmp_path):
-    save_checkpoint(tmp_path / "last.pt", DAMAGES[damage](load_checkpoint(trained / LAST)))
-    with pytest.raises(UserError, match=r"^init\.path=.*last\.pt: not a .*checkpoint .*; give "):
+    save_checkpoint(
+        tmp_path / "last.pt",
+        DAMAGES[damage](load_checkpoint(trained / LAST)),
+    )
+    with pytest.raises(
+        UserError,
+        match=r"^init\.path=.*last\.pt: not a .*checkpoint .*; give ",
+    ):
         read_start(str(tmp_path / "last.pt"))
 
 
 def test_weights_that_are_not_those_of_the_network_are_refused(trained, tmp_path):
-    state, path = load_checkpoint(trained / LAST), tmp_path / "last.pt"
+    state = load_checkpoint(trained / LAST)
+    path = tmp_path / "last.pt"
     state["agent"]["network"].popitem()
     save_checkpoint(path, state)
     with pytest.raises(UserError, match="the weights do not fit the network"):
@@ -209,7 +271,10 @@ def test_weights_that_are_not_those_of_the_network_are_refused(trained, tmp_path
 
 @pytest.mark.parametrize("name", ["", "gone.pt"])
 def test_a_folder_without_a_checkpoint_is_refused(name, tmp_path):
-    with pytest.raises(UserError, match=r"last\.pt: no such file|gone\.pt: no such file"):
+    with pytest.raises(
+        UserError,
+        match=r"last\.pt: no such file|gone\.pt: no such file",
+    ):
         read_start(str(tmp_path / name))
 
 
@@ -219,7 +284,10 @@ def test_a_shipped_name_means_the_shipped_agent_beside_a_folder_of_that_name(tmp
     assert read_start("agent_idm").moments is None
 
 
-@pytest.mark.parametrize("kind", [NoInitConfig, lambda **given: InitConfig(path=None, **given)])
+@pytest.mark.parametrize(
+    "kind",
+    [NoInitConfig, lambda **given: InitConfig(path=None, **given)],
+)
 @pytest.mark.parametrize("given", [{"optimizer": True}, {"support": "trained"}])
 def test_who_starts_afresh_has_nothing_to_take_over(kind, given):
     with pytest.raises(UserError, match=r"of which agent\? give init=idm_ckpt"):
@@ -235,20 +303,37 @@ EXPERIMENTS = sorted(
 
 
 @pytest.mark.parametrize(
-    "overrides", [[], *([f"experiment={name}"] for name in EXPERIMENTS)], ids=str
+    "overrides",
+    [[], *([f"experiment={name}"] for name in EXPERIMENTS)],
+    ids=str,
 )
-def test_every_experiment_composes_and_fits_the_agent_that_it_starts_from(overrides):
+def test_every_experiment_composes_and_fits_the_agent_that_it_starts_from(
+    overrides,
+):
     config = check("train", overrides).config
     if config.init.path is not None:
-        check_observation(read_start(config.init.path), config)
+        check_observation(read_start(config.init.path), config.observation)
 
 
-def test_a_first_phase_that_is_over_must_be_the_one_asked_for(tmp_path):
-    config = check("train", ["experiment=paper", "pretrain.total_decisions=5000"]).config
+def test_a_first_phase_that_is_over_must_be_the_one_asked_for(
+    tmp_path,
+):
+    config = check(
+        "train",
+        ["experiment=paper", "pretrain.total_decisions=5000"],
+    ).config
     phase = phases_of(config, tmp_path)[0]
     metadata = describe(config, phase)
-    metadata["training"] |= {"decisions": 5120, "updates": 3, "wall_s": 1.0}
-    save_agent(phase.folder / AGENT_FILE, make_agent(config, phase), metadata)
+    metadata["training"] |= {
+        "decisions": 5120,
+        "updates": 3,
+        "wall_s": 1.0,
+    }
+    save_agent(
+        phase.folder / AGENT_FILE,
+        make_agent(config, phase),
+        metadata,
+    )
     assert length_if_finished(config, phase)["decisions"] == 5120
     with pytest.raises(UserError, match="after 5120 decisions"):
         length_if_finished(config, replace(phase, total_decisions=9000))
@@ -256,7 +341,9 @@ def test_a_first_phase_that_is_over_must_be_the_one_asked_for(tmp_path):
         length_if_finished(config, replace(phase, traffic=config.traffic))
 
 
-def test_a_falling_learning_rate_has_reached_its_end_when_its_phase_is_over(tmp_path):
+def test_a_falling_learning_rate_has_reached_its_end_when_its_phase_is_over(
+    tmp_path,
+):
     told = [
         "experiment=paper",
         "agent.learning_rate_end=1e-5",
@@ -275,7 +362,11 @@ def test_a_falling_learning_rate_has_reached_its_end_when_its_phase_is_over(tmp_
 
 # --- masks
 
-MASKED = ["traffic=idm_mobil", "mask=safe", "mask.safe_deceleration=3"]
+MASKED = [
+    "traffic=idm_mobil",
+    "mask=safe",
+    "mask.safe_deceleration=3",
+]
 
 
 @pytest.fixture(scope="module")
@@ -283,14 +374,18 @@ def masked(tmp_path_factory):
     return run(tmp_path_factory.mktemp("masked"), *MASKED)
 
 
-def test_an_agent_drives_behind_the_mask_that_it_was_trained_with(masked):
+def test_an_agent_drives_behind_the_mask_that_it_was_trained_with(
+    masked,
+):
     driver = make_driver(str(masked / AGENT_FILE), EnvConfig())
     assert driver.mask == MaskParameters("safe", 3.0)
     assert make_driver(f"{masked / AGENT_FILE}+safe", EnvConfig()).mask == driver.mask
     assert make_driver(f"{masked / AGENT_FILE}+legal", EnvConfig()).mask == MaskParameters("legal")
 
 
-def test_the_mask_of_the_next_state_is_kept_with_every_transition(masked):
+def test_the_mask_of_the_next_state_is_kept_with_every_transition(
+    masked,
+):
     rows = load_checkpoint(masked / LAST)["agent"]["replay"]["rows"]
     mask = rows["next.action_mask"]
     assert mask.shape == (len(rows["action"]), 3)
@@ -307,75 +402,6 @@ def test_a_masked_run_stopped_and_resumed_ends_with_the_same_bits(masked, tmp_pa
 def test_a_run_is_not_resumed_behind_another_mask(masked, other):
     with pytest.raises(UserError, match="mask"):
         run(masked, *MASKED, other, resume=masked / LAST)
-
-
-def test_runs_without_a_mask_have_the_identity_that_they_always_had(tmp_path):
-    """Those of versions that knew no masks can be resumed."""
-    assert (
-        "mask"
-        not in load_checkpoint(run(tmp_path, "traffic=idm_mobil", "mask=none") / LAST)["identity"]
-    )
-
-
-@pytest.mark.parametrize(("now", "refused"), [([], False), (["env.truck_share=0.5"], True)])
-def test_a_run_begun_before_there_was_an_option_goes_on_with_its_default_alone(
-    now, refused, tmp_path
-):
-    half = run(tmp_path, "total_decisions=160")
-    state = load_checkpoint(half / LAST)
-    del state["identity"]["env"]["truck_share"]
-    save_checkpoint(half / LAST, state)
-    if refused:
-        with pytest.raises(UserError, match="truck_share"):
-            run(half, *now, resume=half / LAST)
-    else:
-        assert run(half, *now, resume=half / LAST)
-
-
-# --- what was removed
-
-
-@pytest.mark.parametrize(
-    "stored", ["agent.encoder=shared", "agent.decide_when_free=true", "observation=fixed_order"]
-)
-def test_a_command_line_with_a_removed_option_names_the_revision_that_had_it(stored):
-    with pytest.raises(
-        UserError, match=f"^run: {stored} was removed after revision {LAST_REVISION}"
-    ):
-        without_removed_overrides(["seed=1", stored], "run")
-    with pytest.raises(UserError, match=LAST_REVISION):
-        without_removed_overrides(["experiment=search/base"], "run")
-
-
-def test_removed_options_at_their_defaults_are_left_out_of_a_command_line():
-    stored = [
-        "agent.encoder=none",
-        "agent.encoder_width=32",
-        "agent.decide_when_free=false",
-        "agent.hidden=[8,8]",
-    ]
-    assert without_removed_overrides(stored, "run") == ["agent.hidden=[8,8]"]
-
-
-def test_a_checkpoint_with_a_removed_option_names_the_revision_that_had_it(trained, tmp_path):
-    state, path = load_checkpoint(trained / LAST), tmp_path / "last.pt"
-    state["agent"]["config"]["encoder"] = "shared"
-    save_checkpoint(path, state)
-    with pytest.raises(
-        UserError, match=f"^init.path=.*encoder=shared was removed after revision {LAST_REVISION}"
-    ):
-        read_start(str(path))
-    with pytest.raises(
-        UserError, match=f"encoder=shared was removed after revision {LAST_REVISION}"
-    ):
-        run(tmp_path / "next", "total_decisions=480", resume=path)
-    state["agent"]["config"]["encoder"] = "none"
-    state["identity"]["observation"]["form"] = "fixed_order"
-    save_checkpoint(path, state)
-    with pytest.raises(
-        UserError, match=f"fixed_order: it was removed after revision {LAST_REVISION}"
-    ):
-        read_start(str(path))
 
 
 # --- env.compile=true
@@ -407,8 +433,17 @@ def begin(folder, total, resume=""):
         "TORCHINDUCTOR_CACHE_DIR": str(folder.parent / "cache"),
         "OMP_NUM_THREADS": "1",
     }
-    given = [str(folder), str(resume), *TINY, "env.compile=true", f"total_decisions={total}"]
-    return subprocess.Popen([sys.executable, "-c", SCRIPT, *given], env={**os.environ, **own})
+    given = [
+        str(folder),
+        str(resume),
+        *TINY,
+        "env.compile=true",
+        f"total_decisions={total}",
+    ]
+    return subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, *given],
+        env={**os.environ, **own},
+    )
 
 
 @pytest.mark.slow
@@ -416,8 +451,10 @@ def begin(folder, total, resume=""):
 def test_a_compiled_run_stopped_and_resumed_in_a_process_of_its_own_ends_with_the_same_bits(
     tmp_path,
 ):
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    first, metrics = begin(parts, TOO_LONG), parts / "metrics.csv"
+    whole = tmp_path / "whole"
+    parts = tmp_path / "parts"
+    first = begin(parts, TOO_LONG)
+    metrics = parts / "metrics.csv"
     while first.poll() is None and not (
         metrics.is_file() and len(metrics.read_text().splitlines()) > 1
     ):

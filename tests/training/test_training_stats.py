@@ -7,7 +7,16 @@ from tensordict import TensorDict
 from ganlane.training.stats import EpisodeStats
 
 
-def step(reward, done, crash=None, goal=None, distance=0.0, lane_changes=0, action=0, value=None):
+def step(
+    reward,
+    done,
+    crash=None,
+    goal=None,
+    distance=0.0,
+    lane_changes=0,
+    action=0,
+    value=None,
+):
     rows = len(reward)
 
     def column(flags):
@@ -16,14 +25,24 @@ def step(reward, done, crash=None, goal=None, distance=0.0, lane_changes=0, acti
     after = {
         "reward": torch.tensor(reward)[:, None],
         "done": column(done),
-        "events": {"goal": column(goal), "hard_crash": column(crash)},
+        "events": {
+            "goal": column(goal),
+            "hard_crash": column(crash),
+        },
         "ego": {
             "distance": torch.full((rows,), distance),
             "lane_changes": torch.full((rows,), lane_changes),
         },
     }
     known = {} if value is None else {"chosen_action_value": torch.tensor(value)[:, None]}
-    return TensorDict({"action": torch.full((rows,), action), "next": after, **known}, [rows])
+    return TensorDict(
+        {
+            "action": torch.full((rows,), action),
+            "next": after,
+            **known,
+        },
+        [rows],
+    )
 
 
 def test_returns_and_rates_are_those_of_the_finished_episodes():
@@ -39,7 +58,15 @@ def test_returns_and_rates_are_those_of_the_finished_episodes():
             action=2,
         )
     )
-    stats.step(step([4.0, 40.0], [True, True], goal=[False, True], distance=1000.0, lane_changes=1))
+    stats.step(
+        step(
+            [4.0, 40.0],
+            [True, True],
+            goal=[False, True],
+            distance=1000.0,
+            lane_changes=1,
+        )
+    )
     row = stats.read()
     assert row["episodes"] == 3
     assert row["mean_return"] == pytest.approx((3 + 4 + 70) / 3)
@@ -66,16 +93,42 @@ def test_update_figures_are_averaged():
 
 def test_what_an_environment_or_a_policy_does_not_write_has_no_column():
     stats = EpisodeStats(1, 2, gamma=1.0)
-    after = {"reward": torch.ones(1, 1), "done": torch.ones(1, 1, dtype=torch.bool)}
-    stats.step(TensorDict({"action": torch.zeros(1, dtype=torch.int64), "next": after}, [1]))
-    means = {"mean_return", "mean_discounted_return", "mean_return_to_go"}
-    assert set(stats.read()) == {"episodes", "action_0_share", "action_1_share", *means}
+    after = {
+        "reward": torch.ones(1, 1),
+        "done": torch.ones(1, 1, dtype=torch.bool),
+    }
+    stats.step(
+        TensorDict(
+            {
+                "action": torch.zeros(1, dtype=torch.int64),
+                "next": after,
+            },
+            [1],
+        )
+    )
+    means = {
+        "mean_return",
+        "mean_discounted_return",
+        "mean_return_to_go",
+    }
+    assert set(stats.read()) == {
+        "episodes",
+        "action_0_share",
+        "action_1_share",
+        *means,
+    }
 
 
 def test_returns_to_go_and_values_are_averaged_over_the_decisions_of_finished_episodes():
     stats = EpisodeStats(2, 2, gamma=0.5)
     for reward, value in ((1.0, 2.0), (2.0, 4.0), (4.0, 6.0)):
-        stats.step(step([reward, 9.0], [reward == 4.0, False], value=[value, 0.0]))
+        stats.step(
+            step(
+                [reward, 9.0],
+                [reward == 4.0, False],
+                value=[value, 0.0],
+            )
+        )
     row = stats.read()
     # From the three decisions: 1 + 2/2 + 4/4, 2 + 4/2, 4.
     assert row["mean_return_to_go"] == pytest.approx((3.0 + 4.0 + 4.0) / 3.0)
@@ -83,10 +136,14 @@ def test_returns_to_go_and_values_are_averaged_over_the_decisions_of_finished_ep
 
 
 def test_the_return_to_go_agrees_with_a_sum_over_every_decision():
-    generator, gamma, rows = torch.Generator().manual_seed(0), 0.9, 5
+    generator = torch.Generator().manual_seed(0)
+    gamma = 0.9
+    rows = 5
     rewards = torch.randn(60, rows, generator=generator)
     ends = torch.rand(60, rows, generator=generator) < 0.15
-    stats, total, count = EpisodeStats(rows, 2, gamma), 0.0, 0
+    stats = EpisodeStats(rows, 2, gamma)
+    total = 0.0
+    count = 0
     for reward, done in zip(rewards, ends):
         stats.step(step(reward.tolist(), done.tolist()))
     for row in range(rows):
@@ -96,5 +153,6 @@ def test_the_return_to_go_agrees_with_a_sum_over_every_decision():
             total += sum(
                 gamma**i * r for start in range(len(episode)) for i, r in enumerate(episode[start:])
             )
-            count, begin = count + len(episode), end + 1
+            count = count + len(episode)
+            begin = end + 1
     assert stats.read()["mean_return_to_go"] == pytest.approx(total / count, rel=1e-5)

@@ -7,17 +7,20 @@ import os
 import time
 
 import torch
-from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Categorical,
+    Composite,
+    Unbounded,
+)
 from torchrl.envs import EnvBase
 
-from ganlane.agents import Rainbow, RainbowConfig
-from ganlane.build import make_env, make_traffic
 from ganlane.settings.env import EnvConfig
-from ganlane.settings.traffic import IdmTrafficConfig
-from ganlane.settings.observation import ObservationConfig
 from ganlane.sim.random import draw_keys, episode_key, to_uniform
 
-ACTIONS, LIMIT = 3, 8
+ACTIONS = 3
+LIMIT = 8
 ROAD = EnvConfig(vehicles=4, goal_m=60.0)
 SMALL = {
     "hidden": (16, 16),
@@ -39,14 +42,24 @@ class ToyRoad(EnvBase):
 
     def __init__(self, environments=8, seed=0):
         super().__init__(batch_size=[environments])
-        self.seed_number, shape = seed, (environments,)
+        self.seed_number = seed
+        shape = (environments,)
         flag = Binary(shape=(*shape, 1), dtype=torch.bool)
         count = Unbounded(shape=shape, dtype=torch.int64)
         events = {
             name: flag.clone()
-            for name in ("goal", "hard_crash", "out_of_road", "timeout", "scene_end")
+            for name in (
+                "goal",
+                "hard_crash",
+                "out_of_road",
+                "timeout",
+                "scene_end",
+            )
         }
-        ego = {"distance": Unbounded(shape=shape), "lane_changes": count.clone()}
+        ego = {
+            "distance": Unbounded(shape=shape),
+            "lane_changes": count.clone(),
+        }
         counters = {name: count.clone() for name in ("seed", "episode", "step")}
         self.observation_spec = Composite(
             {
@@ -60,7 +73,8 @@ class ToyRoad(EnvBase):
         self.action_spec = Categorical(ACTIONS, shape=shape)
         self.reward_spec = Unbounded(shape=(*shape, 1))
         self.done_spec = Composite(
-            {n: flag.clone() for n in ("done", "terminated", "truncated")}, shape=shape
+            {n: flag.clone() for n in ("done", "terminated", "truncated")},
+            shape=shape,
         )
 
     def _observe(self, seed, episode, step):
@@ -72,7 +86,8 @@ class ToyRoad(EnvBase):
         rows = self.batch_size[0]
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
-            seed, episode = torch.full((rows,), self.seed_number), torch.arange(rows)
+            seed = torch.full((rows,), self.seed_number)
+            episode = torch.arange(rows)
         else:
             # TorchRL hides everything but the mask from an automatic reset: the last step knows the
             # episodes.
@@ -80,22 +95,34 @@ class ToyRoad(EnvBase):
             episode = torch.where(mask.squeeze(-1), episode + rows, episode)
         begin = self.observation_spec.zero().update(self.full_done_spec.zero())
         begin.update({"seed": seed, "episode": episode})
-        return begin.set("observation", self._observe(seed, episode, begin["step"]))
+        return begin.set(
+            "observation",
+            self._observe(seed, episode, begin["step"]),
+        )
 
     def _step(self, tensordict):
-        observation, action = tensordict["observation"], tensordict["action"]
-        right, wrong = observation[:, :3].argmax(-1), observation[:, :3].argmin(-1)
+        observation = tensordict["observation"]
+        action = tensordict["action"]
+        right = observation[:, :3].argmax(-1)
+        wrong = observation[:, :3].argmin(-1)
         step = tensordict["step"] + 1
         crash = action == wrong
         over = (step >= LIMIT) & ~crash
         goal = over & (tensordict["seed"] % 2 == 0)
         timeout = over & ~goal
         reward = (action == right).float() - 5.0 * crash + 2.0 * goal
-        seed, episode = self.last = tensordict["seed"], tensordict["episode"]
+        seed, episode = self.last = (
+            tensordict["seed"],
+            tensordict["episode"],
+        )
         after = self.observation_spec.zero().update(
             {"seed": seed, "episode": episode, "step": step}
         )
-        flags = {"terminated": crash | goal, "truncated": timeout, "done": crash | over}
+        flags = {
+            "terminated": crash | goal,
+            "truncated": timeout,
+            "done": crash | over,
+        }
         flags |= {
             ("events", "goal"): goal,
             ("events", "hard_crash"): crash,
@@ -103,8 +130,14 @@ class ToyRoad(EnvBase):
         }
         for name, flag in flags.items():
             after.set(name, flag[:, None])
-        after.set(("ego", "distance"), tensordict["ego", "distance"] + 100.0)
-        after.set(("ego", "lane_changes"), tensordict["ego", "lane_changes"] + (action > 0))
+        after.set(
+            ("ego", "distance"),
+            tensordict["ego", "distance"] + 100.0,
+        )
+        after.set(
+            ("ego", "lane_changes"),
+            tensordict["ego", "lane_changes"] + (action > 0),
+        )
         return after.set("reward", reward[:, None]).set(
             "observation", self._observe(seed, episode, step)
         )
@@ -113,39 +146,14 @@ class ToyRoad(EnvBase):
         self.seed_number = seed
 
 
-def road(rows, first_episode):
-    return make_env(
-        make_traffic(IdmTrafficConfig(), ROAD),
-        ROAD,
-        ObservationConfig(),
-        num_envs=rows,
-        first_episode=first_episode,
+def same(first, second):
+    """Whether two agents have the same weights, bit for bit."""
+    pairs = zip(
+        first.weights().values(),
+        second.weights().values(),
+        strict=True,
     )
-
-
-def toy(rows, first_episode):
-    return ToyRoad(rows)
-
-
-def agent(size=29, seed=0, **options):
-    return Rainbow(RainbowConfig(**{**SMALL, **options}), size, seed=seed)
-
-
-def steps(source, learner, count):
-    return torch.stack([source.step(learner).clone() for _ in range(count)])
-
-
-def check_order(seen, first):
-    """Steps [T, N] on the road.
-
-    Observations follow on, rows begin with episodes ``first``, and no two share one.
-    """
-    going = ~seen["next", "done"][:-1, :, 0]
-    assert going.any()
-    assert torch.equal(seen["next", "observation"][:-1][going], seen["observation"][1:][going])
-    assert seen["episode"][0].tolist() == first
-    driven = [set(seen["episode"][:, row].tolist()) for row in range(len(first))]
-    assert len(set.union(*driven)) == sum(map(len, driven))
+    return all(torch.equal(one, other) for one, other in pairs)
 
 
 def gone(group: int, within_s: float = 20.0) -> bool:

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from ganlane.errors import UserError
-from ganlane.files import has_checksum, refuse_without_checksum, sealed_archive, write_bytes
+from ganlane.files import has_checksum, sealed_archive, write_bytes
 from ganlane.generator.checkpoint import Metrics
 from ganlane.generator.closed_loop import driver_params, rollout
 from ganlane.generator.forecasts import (
@@ -64,62 +64,54 @@ def distances(predicted: Tensor, recorded: Tensor) -> Tensor:
     return distance(apart, torch.zeros_like(apart))
 
 
-def variety_loss(errors: Tensor) -> Tensor:
-    """Mean error of each vehicle's best sample; ``errors`` is [K, n] in m."""
-    return errors.amin(dim=0).mean()
-
-
 def cross_entropy(logits: Tensor, recorded: float) -> Tensor:
-    """Cross-entropy of classifying trajectories as recorded (1) or generated (0) by their logits.
+    """Mean cross-entropy of classifying trajectories by their logits; ln 2 is chance.
 
-    Ln 2 is chance.
+    They are recorded (1) or generated (0).
     """
-    return binary_cross_entropy_with_logits(
-        logits, torch.full_like(logits, recorded), reduction="none"
-    ).mean()
+    labels = torch.full_like(logits, recorded)
+    return binary_cross_entropy_with_logits(logits, labels, reduction="none").mean()
 
 
 def discriminator_accuracy(recorded: Tensor, generated: Tensor) -> Tensor:
     """Share of logits with the right sign, both classes with equal weight; 0.5 is chance."""
-    return 0.5 * (
-        (recorded > 0).to(recorded.dtype).mean() + (generated <= 0).to(generated.dtype).mean()
-    )
+    return 0.5 * ((recorded > 0).float().mean() + (generated <= 0).float().mean())
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     """Mean of ``values`` where ``mask`` (broadcast) is true; 0 if it is nowhere."""
-    kept = mask.expand_as(values).to(values.dtype)
-    return (values * kept).sum() / kept.sum().clamp_min(1.0)
+    weight = mask.expand_as(values).to(values.dtype)
+    return (values * weight).sum() / weight.sum().clamp_min(1.0)
 
 
-class _Networks:
-    """A generator with its optimiser and random numbers, to which a task adds other networks."""
+class _Task(nn.Module):
+    """A generator and its random numbers, to which a task adds other networks and the data.
+
+    Every network has an optimiser of its own.
+    """
 
     def __init__(self, config: Config):
+        super().__init__()
         torch.manual_seed(config.seed)
         self.generator = Generator(config.sizes)
-        self.modules: dict[str, nn.Module] = {}
-        self.optimisers: dict[str, torch.optim.Optimizer] = {}
-        self.add("generator", self.generator)
+        self.optimisers = {"generator": torch.optim.Adam(self.generator.parameters())}
         self.random = torch.Generator().manual_seed(config.seed)
         self.largest_gradient = config.loop.largest_gradient
 
-    def add(self, name: str, module: nn.Module) -> None:
-        """One more network to fit, with an optimiser of its own."""
-        self.modules[name], self.optimisers[name] = module, torch.optim.Adam(module.parameters())
+    def descend(self, network: str, loss: Tensor) -> float:
+        """One step of a network down its ``loss``, whose value is returned.
 
-    def descend(self, name: str, loss: Tensor) -> float:
-        """One step of a network down its ``loss``, whose value is returned, with the gradient's
-        norm clipped.
+        The gradient's norm is clipped.
         """
-        self.optimisers[name].zero_grad(set_to_none=True)
+        optimiser = self.optimisers[network]
+        optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        nn.utils.clip_grad_norm_(self.modules[name].parameters(), self.largest_gradient)
-        self.optimisers[name].step()
+        nn.utils.clip_grad_norm_(optimiser.param_groups[0]["params"], self.largest_gradient)
+        optimiser.step()
         return float(loss.detach())
 
 
-class PaperTask(_Networks):
+class PaperTask(_Task):
     """The Social-GAN on windows."""
 
     def __init__(
@@ -128,29 +120,34 @@ class PaperTask(_Networks):
         super().__init__(config)
         self.config = config
         self.discriminator = Discriminator(config.sizes.embedding, config.sizes.hidden)
-        self.add("discriminator", self.discriminator)
+        self.optimisers["discriminator"] = torch.optim.Adam(self.discriminator.parameters())
         _, self.groups = self._grouped_windows(fitted, config.stride)
         self.validation = self._grouped_windows(validation, config.held_out_stride)
 
     def update(self, number: int) -> dict[str, float]:
-        """One step of the discriminator, if the adversarial term is on, and one of the generator."""
+        """One step of the generator, and of the discriminator if the adversarial term is on."""
         config = self.config
-        groups = self.groups.select(
-            torch.randint(len(self.groups), (config.batch,), generator=self.random)
-        )
+        rows = torch.randint(len(self.groups), (config.batch,), generator=self.random)
+        groups = self.groups.select(rows)
         if config.mirror:
             groups = groups.mirrored(torch.rand(len(groups), generator=self.random) < 0.5)
         recorded = groups.displacements[groups.mask]
         generated = self._samples(groups, config.history_noise)
+
+        # The discriminator learns from one sample, which carries no gradient to the generator.
         losses = {}
         if config.weights.adversarial > 0:
-            real, fake = self.discriminator(recorded), self.discriminator(generated[0].detach())
+            real = self.discriminator(recorded)
+            fake = self.discriminator(generated[0].detach())
             loss = 0.5 * (cross_entropy(real, 1.0) + cross_entropy(fake, 0.0))
             losses["discriminator"] = self.descend("discriminator", loss)
+
+        # The generator: what it predicted, in all samples and for z = 0 (the last).
         observed = config.sizes.observed
         errors = distances(generated[..., observed:, :], recorded[..., observed:, :]).mean(-1)
         terms = {
-            "variety": variety_loss(errors[:-1]),
+            # Only the best of each vehicle's samples counts.
+            "variety": errors[:-1].amin(dim=0).mean(),
             "single": errors[:-1].mean(),
             "mean": errors[-1].mean(),
         }
@@ -168,17 +165,16 @@ class PaperTask(_Networks):
 
     @torch.no_grad()
     def metrics(self, scenes: list[SceneTracks]) -> Metrics:
-        """ADE and FDE of the generator on ``scenes``, all and each, and the discriminator's
-        accuracy on them.
+        """ADE and FDE of the generator on ``scenes``, all and each.
+
+        The discriminator's accuracy on them is added.
         """
         windows, groups = self._grouped_windows(scenes, self.config.held_out_stride)
         forecasts = paper_forecasts(self.generator, windows, groups, self.config.seed)
         forecasts[BASELINE] = repeated(windows.past[:, -1], self.config.sizes.predicted)
-        logits = (
-            self.discriminator(groups.displacements[groups.mask]),
-            self.discriminator(self._samples(groups)[0]),
-        )
-        accuracy = {"held_out_accuracy": float(discriminator_accuracy(*logits))}
+        recorded = self.discriminator(groups.displacements[groups.mask])
+        generated = self.discriminator(self._samples(groups)[0])
+        accuracy = {"held_out_accuracy": float(discriminator_accuracy(recorded, generated))}
         return scene_metrics(windows, forecasts) | {"discriminator": accuracy}
 
     def _grouped_windows(self, scenes: list[SceneTracks], stride: int) -> tuple[Windows, Groups]:
@@ -188,75 +184,79 @@ class PaperTask(_Networks):
         return windows, group_windows(windows, self.config.group_size, self.config.seed)
 
     def _samples(self, groups: Groups, history_noise: float = 0.0) -> Tensor:
-        """Recorded past and generated future [K + 1, n, T, 2] of n vehicles: the samples, the mean
-        prediction last.
+        """Recorded past and generated future [K + 1, n, T, 2] of n vehicles.
 
-        Only the pooling needs the padded groups; the decoder runs without padding.
+        The samples come first, the mean prediction last. Only the pooling needs the padded groups;
+        the decoder runs without padding.
         """
-        sizes, mask = self.config.sizes, groups.mask
+        sizes = self.config.sizes
+        mask = groups.mask
         past = observed = groups.displacements[..., : sizes.observed, :]
         if history_noise > 0:
             scale = past.new_tensor(DIFFERENCE_SCALE_M)
             observed = past + history_noise * scale * torch.randn(past.shape, generator=self.random)
         observation = self.generator.observe(observed, groups.position, mask)
         context = self.generator.summarise(observation)[mask]
+
+        # [B, G, ...] -> [n, ...]: from here on without padding.
         vehicles = observation._replace(
             displacement=observation.displacement[mask], difference=observation.difference[mask]
         )
-        noise = torch.randn(
-            self.config.samples + 1, len(context), sizes.noise, generator=self.random
-        )
+        shape = (self.config.samples + 1, len(context), sizes.noise)
+        noise = torch.randn(shape, generator=self.random)
         noise[-1] = 0.0
         outputs = self.generator.decode(context, noise, vehicles, sizes.predicted)
         future = displacements_of(outputs, vehicles.displacement)
         return torch.cat([past[mask].expand(len(future), -1, -1, -1), future], dim=-2)
 
 
-class CalibratedTask(_Networks):
+class CalibratedTask(_Task):
     """The anchored generator on whole scenes."""
 
     def __init__(
         self, fitted: list[SceneTracks], validation: list[SceneTracks], config: CalibratedConfig
     ):
         super().__init__(config)
-        self.config, self.validation = config, validation
+        self.config = config
+        self.validation = validation
         longest = max(config.horizons)
         cuts = [(scene, row) for scene in fitted for row in segment_starts(scene, longest)]
         #: All possible segments, sorted by their vehicles, so that neighbours need little padding.
         self.cuts = sorted(cuts, key=lambda cut: int(cut[0].present[cut[1]].sum()))
+        # Some 64 of them, evenly spread, measure constant velocity well enough.
         segments = cut_segments(self.cuts[:: max(1, len(self.cuts) // 64)], longest)
         #: Mean error [H] in m of constant velocity on the fitted scenes.
-        self.scale = mean_by_step(
-            [(distance(segments.constant_velocity, segments.future), segments.scored)]
-        )
+        errors = distance(segments.constant_velocity, segments.future)
+        self.scale = mean_by_step([(errors, segments.scored)])
 
     def update(self, number: int) -> dict[str, float]:
         """One rollout of a batch of segments and one step.
 
-        Alternately of the mean driver and of two samples.
+        Even updates fit the mean driver (z = 0), odd ones two samples.
         """
         config = self.config
         segments = self._batch()
         drivers = driver_params(segments, config.traits, self.random)
         sampled = number % 2 == 1
-        shape = (
-            1 + segments.future.shape[1],
-            2 if sampled else 1,
-            *segments.length.shape,
-            config.sizes.noise,
-        )
+        samples = 2 if sampled else 1
+        steps = 1 + segments.future.shape[1]
+        shape = (steps, samples, *segments.length.shape, config.sizes.noise)
         noise = torch.randn(shape, generator=self.random) if sampled else torch.zeros(shape)
         positions = rollout(self.generator, segments, drivers, noise, config)
         if sampled:
-            name, losses = "energy", energy_score(positions[0], positions[1], segments.future)
+            name = "energy"
+            losses = energy_score(positions[0], positions[1], segments.future)
         else:
-            name, losses = "mean", distance(positions[0], segments.future)
+            name = "mean"
+            losses = distance(positions[0], segments.future)
+        # Late steps err most, so each is measured by what constant velocity errs there.
         loss = masked_mean(losses / self.scale[: losses.shape[1], None], segments.scored)
         return {name: self.descend("generator", loss)}
 
     def evaluate(self) -> float:
-        """Mean of the error for z = 0 and the energy score on validation scenes, relative to
-        constant velocity.
+        """Mean of the error for z = 0 and the energy score on the validation scenes.
+
+        Both are relative to constant velocity's.
         """
         metrics = self.metrics(self.validation)["all"]
         return 0.5 * (metrics["relative_mean"] + metrics["relative_energy"])
@@ -266,31 +266,32 @@ class CalibratedTask(_Networks):
         return rollout_errors(self.generator, scenes, self.config)
 
     def _batch(self) -> Segments:
-        """Segments with similar numbers of vehicles over a random horizon, mirrored in half of the
-        updates.
+        """Segments with similar numbers of vehicles over a random horizon.
+
+        They are mirrored in half of the updates.
         """
         shares = torch.tensor(self.config.shares, dtype=torch.float32)
         horizon = self.config.horizons[int(torch.multinomial(shares, 1, generator=self.random))]
+
+        # Random ones among neighbours in the order of their size.
         span = min(len(self.cuts), 8 * self.config.batch)
         begin = int(torch.randint(len(self.cuts) - span + 1, (), generator=self.random))
         rows = torch.randperm(span, generator=self.random)[: self.config.batch] + begin
         segments = cut_segments([self.cuts[row] for row in rows.tolist()], horizon)
+
         flip = self.config.mirror and float(torch.rand((), generator=self.random)) < 0.5
         return segments.mirrored() if flip else segments
 
 
-Task = PaperTask | CalibratedTask
-
-
 @dataclass(frozen=True)
 class Progress:
-    """State of a fit after ``update`` of at most ``updates``, ``seconds`` after the start of this
-    run.
+    """State of the fit ``name`` after ``update`` of at most ``updates``.
 
     ``losses`` are the last update's; ``score`` is the last evaluation's (lower is better), ``best``
-    the lowest.
+    the lowest; ``seconds`` have passed since the start of this run.
     """
 
+    name: str
     update: int
     updates: int
     losses: dict[str, float]
@@ -303,25 +304,33 @@ OnProgress = Callable[[Progress], None]
 
 
 class FitLoop:
-    """Runs a task until it stops improving: updates, evaluations on validation scenes, early
-    stopping.
+    """Runs a task until it stops improving: updates, evaluations, early stopping.
 
-    ``path`` keeps the state after every evaluation; the fit resumes from it if it exists.
-    ``seconds`` is the time of the updates, those in earlier runs of the same fit too.
+    ``path`` keeps the state after every evaluation on the validation scenes; the fit resumes from
+    it if it exists. ``seconds`` is the time of the updates, those in earlier runs of the same fit
+    too. ``name`` is for the display.
     """
 
-    def __init__(self, task: Task, path: str | Path | None = None):
-        self.task, self.config = task, task.config.loop
-        self.path = None if path is None else Path(path)
-        self.done, self.waited, self.best_update, self.best = 0, 0, 0, math.inf
+    def __init__(
+        self, task: PaperTask | CalibratedTask, path: Path | None = None, name: str = "fit"
+    ):
+        self.task = task
+        self.config = task.config.loop
+        self.path = path
+        self.name = name
+        #: Updates so far, evaluations since the best one, updates until the best one.
+        self.done, self.waited, self.best_update = 0, 0, 0
+        self.best = math.inf
         self.seconds = 0.0
-        self.best_weights: dict[str, dict[str, Tensor]] = {}
-        if self.path is not None and self.path.exists():
-            self._resume(self.path)
+        self.best_weights: dict[str, Tensor] = {}
+        if path is not None and path.exists():
+            self._resume(path)
 
     def run(self, on_progress: OnProgress | None = None) -> None:
         """Fit, then put the best weights into the task's networks."""
-        begun, earlier, score = time.monotonic(), self.seconds, None
+        begun = time.monotonic()
+        earlier = self.seconds
+        score = None
         while self.done < self.config.updates and self.waited < self.config.patience:
             for optimiser in self.task.optimisers.values():
                 optimiser.param_groups[0]["lr"] = learning_rate(self.config, self.done)
@@ -330,79 +339,78 @@ class FitLoop:
             seconds = time.monotonic() - begun
             self.seconds = earlier + seconds
             late = self.config.max_seconds is not None and seconds > self.config.max_seconds
-            if (
-                self.done % self.config.evaluate_every == 0
-                or self.done == self.config.updates
-                or late
-            ):
+            due = self.done % self.config.evaluate_every == 0
+            if due or late or self.done == self.config.updates:
                 score = self._evaluate()
             if on_progress is not None:
-                on_progress(
-                    Progress(self.done, self.config.updates, losses, score, self.best, seconds)
+                progress = Progress(
+                    name=self.name,
+                    update=self.done,
+                    updates=self.config.updates,
+                    losses=losses,
+                    score=score,
+                    best=self.best,
+                    seconds=seconds,
                 )
+                on_progress(progress)
             if late:
                 break
-        for name, weights in self.best_weights.items():
-            self.task.modules[name].load_state_dict(weights)
+        if self.best_weights:
+            self.task.load_state_dict(self.best_weights)
 
     def _evaluate(self) -> float:
         score = self.task.evaluate()
         self.waited += 1
         if score < self.best:
             self.best, self.best_update, self.waited = score, self.done, 0
-            self.best_weights = {
-                name: deepcopy(module.state_dict()) for name, module in self.task.modules.items()
-            }
+            self.best_weights = deepcopy(self.task.state_dict())
         if self.path is not None:
-            # Tensors and plain data only.
-            state = {
-                "counters": [self.done, self.waited, self.best_update],
-                "best": self.best,
-                "seconds": self.seconds,
-                "best_weights": self.best_weights,
-                "modules": {
-                    name: module.state_dict() for name, module in self.task.modules.items()
-                },
-                "optimisers": {
-                    name: optimiser.state_dict() for name, optimiser in self.task.optimisers.items()
-                },
-                "random": self.task.random.get_state(),
-            }
-            file = io.BytesIO()
-            torch.save(state, file)
-            write_bytes(self.path, sealed_archive(file.getvalue()))
+            self._keep(self.path)
         return score
+
+    def _keep(self, path: Path) -> None:
+        """Write the state: tensors and plain data only."""
+        task = self.task
+        state = {
+            "counters": [self.done, self.waited, self.best_update],
+            "best": self.best,
+            "seconds": self.seconds,
+            "best_weights": self.best_weights,
+            "weights": task.state_dict(),
+            "optimisers": {
+                name: optimiser.state_dict() for name, optimiser in task.optimisers.items()
+            },
+            "random": task.random.get_state(),
+        }
+        file = io.BytesIO()
+        torch.save(state, file)
+        write_bytes(path, sealed_archive(file.getvalue()))
 
     def _resume(self, path: Path) -> None:
         """Continue from a stored state; reading it never executes code."""
         content = path.read_bytes()
-        whole = has_checksum(content, path)
+        has_checksum(content, path)
         try:
             state = torch.load(io.BytesIO(content), weights_only=True)
-            if "counters" not in state:
-                raise ValueError("no counters")
+            counters = state["counters"]
         except Exception as error:
             raise UserError(
                 f"{path}: not the state of a fit; give the file that a fit keeps, or remove it."
             ) from error
+        # A state that was written whole, but for other settings.
         try:
-            for name, module in self.task.modules.items():
-                module.load_state_dict(state["modules"][name])
+            self.task.load_state_dict(state["weights"])
             for name, optimiser in self.task.optimisers.items():
                 optimiser.load_state_dict(state["optimisers"][name])
         except (KeyError, RuntimeError, ValueError) as error:
             raise UserError(
-                f"{path}: holds another fit than the one asked for; give the same preset and sizes or remove it."
+                f"{path}: holds another fit than the one asked for; "
+                "give the same preset and sizes or remove it."
             ) from error
-        self.done, self.waited, self.best_update = state["counters"]
-        self.best, self.best_weights, self.seconds = (
-            state["best"],
-            state["best_weights"],
-            state["seconds"],
-        )
+        self.done, self.waited, self.best_update = counters
+        self.best, self.seconds = state["best"], state["seconds"]
+        self.best_weights = state["best_weights"]
         self.task.random.set_state(state["random"])
-        if not whole:
-            refuse_without_checksum(path)
 
 
 def learning_rate(config: LoopConfig, number: int) -> float:

@@ -110,12 +110,9 @@ class RealismConfig(RunConfig):
         resamples: of the bootstrap over scenes.
         quick: true: a check that it runs, in seconds.
         publish: true (maintainers): write the histograms that ship from these recordings.
-        report: write the tables into this document, between the markers of this card.
-        figures: write the figures into this folder too, as realism_NAME.png.
         generator: weights of generated traffic.
         fold_weights: generators of k folds: every scene is driven by the one that was fitted
             without it.
-        traffic_options: the keys of the traffics of against.
     """
 
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
@@ -131,15 +128,10 @@ class RealismConfig(RunConfig):
     resamples: Annotated[int, between(100, 100_000)] = 2000
     quick: bool = False
     publish: bool = False
-    report: str | None = None
-    figures: str | None = None
     env: EnvConfig = field(default_factory=EnvConfig)
     data: DataConfig = field(default_factory=DataConfig)
     generator: GeneratorFile = field(default_factory=GeneratorFile)
     fold_weights: list[str] = field(default_factory=list)
-    traffic_options: dict[str, TrafficConfig] = field(
-        default_factory=lambda: {name: kind() for name, kind in REACTING.items()}
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -162,17 +154,14 @@ class RealismConfig(RunConfig):
             )
         self.rivals()
 
-    def card(self) -> str:
-        """The card's name in a document: traffic and kind of starts."""
-        return f"{self.traffic.label()} {'folds' if self.fold_weights else self.scenes}"
-
     def rivals(self) -> dict[str, TrafficConfig]:
         """The traffics to compare with, by name; the traffic itself is left out."""
         names = [name for name in self.against if name != self.traffic.label()]
         for name in [*names, self.traffic.label()]:
             if name in _REFERENCES:
                 raise UserError(f"against={name}: every card holds it anyway; leave it out.")
-        return chosen_traffics("against", names, self.traffic_options)
+        options = {name: kind() for name, kind in REACTING.items()}
+        return chosen_traffics("against", names, options)
 
     def shortened(self) -> RealismConfig:
         """With ``quick``, a check that it runs.

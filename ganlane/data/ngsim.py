@@ -23,20 +23,16 @@ from typing import Final
 import polars as pl
 
 from ganlane.data.lanes import lane_grid
-from ganlane.data.schema import (
+from ganlane.data.schema import SCHEMA, RowCount, Scene, number_tracks, sort
+from ganlane.data.tables import (
     LINE,
-    SCHEMA,
     OnProgress,
-    RowCount,
-    Scene,
     TextTable,
     convert,
     csv_table,
     first_line,
-    number_tracks,
     raise_where,
     read_blocks,
-    sort,
 )
 from ganlane.errors import UserError
 from ganlane.parameters.generator import MOTORWAYS, NgsimParameters
@@ -138,9 +134,7 @@ def _read_rows(
             text = _keep_locations(text, path, parameters.locations, count)
         else:
             text = text.with_columns(pl.lit(path.stem).alias(LOCATION))
-        columns = [
-            convert(text, name, kind, path, thousands=True) for name, kind in COLUMNS.items()
-        ]
+        columns = [convert(text, name, kind, path) for name, kind in COLUMNS.items()]
         rows = pl.DataFrame([*columns, text[LOCATION], text[LINE]])
         for name in ("v_length", "v_width"):
             raise_where(rows[name] <= 0.0, rows, name, path, "is not above 0")

@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference.recordings import write_highd
 
-from ganlane.data import SCHEMA, RowCount, highd_scenes, read_recordings
-from ganlane.data.highd import resample
+from ganlane.data import SCHEMA, read_recordings
+from ganlane.data.highd import highd_scenes, resample
+from ganlane.data.schema import RowCount
 from ganlane.errors import UserError
 
 
@@ -134,17 +135,17 @@ def test_the_metadata_files_are_required_and_checked(recording):
     length=st.integers(1, 120),
     rate=st.sampled_from([10.0, 25.0, 30.0, 50.0]),
 )
-def test_resampling_agrees_with_interpolation_over_time(first, length, rate):
-    frame = np.concatenate((np.arange(length) + first, np.arange(7)))
-    begins = np.r_[True, np.zeros(length - 1, bool), True, np.zeros(6, bool)]
-    values = np.sin(0.3 * frame) + frame
-    new = resample(begins, frame, rate)
-    one = slice(0, int(np.searchsorted(new.before, length)))
-    inside = [
-        k
-        for k in range(2000)
-        if first / rate - 1e-9 <= k * 0.1 <= (first + length - 1) / rate + 1e-9
-    ]
-    assert new.frame[one].tolist() == inside
-    expected = np.interp(0.1 * new.frame[one], frame[:length] / rate, values[:length])
-    np.testing.assert_allclose(new.linear(values)[one], expected, atol=1e-9)
+def test_a_resampled_track_has_the_frames_within_it_and_lies_on_the_recorded_line(
+    first, length, rate
+):
+    old = np.arange(length) + first
+    numbers = {name: 2.0 * old for name in ("x", "y", "speed", "length", "width")}
+    lanes = (np.arange(length) >= 3).astype(int)
+    new = resample(pl.DataFrame({"frame": old, "lane": lanes, **numbers}), rate)
+    ends = first / rate - 1e-9, (first + length - 1) / rate + 1e-9
+    inside = [k for k in range(2000) if ends[0] <= k * 0.1 <= ends[1]]
+    assert new["frame"].to_list() == inside
+    at = 0.1 * rate * np.array(inside)
+    np.testing.assert_allclose(new["x"], 2.0 * at, atol=1e-9)
+    # The lane of the nearest old frame changes half a frame before the fourth one.
+    assert new["lane"].to_list() == (at - first > 2.5 + 1e-6).astype(int).tolist()

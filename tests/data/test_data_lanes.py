@@ -5,13 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ganlane.data import (
-    find_lane_changes,
-    lane_changes_of_arrays,
-    synthetic_scenes,
-    tracks_of_frame,
-)
-from ganlane.data.lanes import Tracks, lane_width
+from ganlane.data import Tracks, synthetic_scenes, tracks_of_frame
+from ganlane.data.lanes import find_lane_changes, lane_changes_of_arrays, lane_width
 
 
 @given(width=st.floats(3.0, 4.0), seed=st.integers(0, 10_000))

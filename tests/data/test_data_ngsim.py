@@ -9,8 +9,11 @@ import polars as pl
 import pytest
 from reference.recordings import LANE_M, START_MS, ngsim_rows, portal_csv, raw_text, traffic
 
-from ganlane.data import SCHEMA, NgsimParameters, RowCount, ngsim_scenes, read_recordings, validate
+from ganlane.data import SCHEMA, read_recordings
+from ganlane.data.ngsim import ngsim_scenes
+from ganlane.data.schema import RowCount, validate
 from ganlane.errors import UserError
+from ganlane.parameters.generator import NgsimParameters
 
 LATER_MS = START_MS + 900_000
 #: Two periods of one place: the same vehicle and frame numbers again.

@@ -12,9 +12,23 @@ import polars as pl
 import pytest
 from reference.recordings import ngsim_rows, portal_csv, traffic, write_highd
 
-from ganlane import data
 from ganlane.commands.prepare import long_report, short_report
-from ganlane.data.recordings import cut_into_scenes, whole_folder
+from ganlane.data import (
+    SCHEMA,
+    PooledStatistics,
+    SyntheticTraffic,
+    driving_statistics,
+    read_recordings,
+    read_scenes,
+    scene_lane_counts,
+    scene_lane_widths,
+    synthetic_scenes,
+    write_prepared,
+    write_scene_csv,
+)
+from ganlane.data.prepared import prepare_recordings, whole_folder
+from ganlane.data.recordings import cut_into_scenes
+from ganlane.data.schema import Scene
 from ganlane.errors import UserError
 from ganlane.files import write_bytes
 
@@ -44,20 +58,20 @@ def changed(column: str, change, only: int | None = None) -> list[str]:
 def test_lanes_are_counted_from_the_right_y_from_the_right_lanes_centre_and_rows_are_sorted(
     tmp_path,
 ):
-    frame = data.read_scenes(written(tmp_path, ROWS))
-    assert frame.schema == data.SCHEMA
+    frame = read_scenes(written(tmp_path, ROWS))
+    assert frame.schema == SCHEMA
     assert frame["lane"].to_list() == [1] * 6 + [0] * 6
     assert frame["y"].to_list() == pytest.approx([3.5] * 6 + [0.0] * 6)
-    assert data.scene_lane_counts(frame) == {"s": 2}
+    assert scene_lane_counts(frame) == {"s": 2}
     by_frame = sorted(ROWS, key=lambda row: int(row.split(",")[2]))
-    assert data.read_scenes(written(tmp_path, by_frame)).equals(frame)
+    assert read_scenes(written(tmp_path, by_frame)).equals(frame)
 
 
 def test_a_synthetic_recording_survives_the_file(tmp_path):
-    made = data.synthetic_scenes(seed=3)
+    made = synthetic_scenes(seed=3)
     path = tmp_path / "made.csv"
-    data.write_scene_csv(made, path)
-    read = data.read_scenes(path)
+    write_scene_csv(made, path)
+    read = read_scenes(path)
     exact = ["scene", "vehicle", "frame", "lane"]
     assert read.select(exact).equals(made.select(exact))
     # The lane width is estimated anew, to 4 cm; two lanes to the left that makes 8 cm.
@@ -84,7 +98,7 @@ def test_a_synthetic_recording_survives_the_file(tmp_path):
 def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column, value, message):
     path = written(tmp_path, changed(column, lambda _: value, row))
     with pytest.raises(UserError, match=message) as caught:
-        data.read_scenes(path)
+        read_scenes(path)
     assert str(path) in str(caught.value)
 
 
@@ -106,7 +120,7 @@ def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column,
 )
 def test_units_and_directions_that_cannot_be_are_refused(tmp_path, column, factor, message):
     with pytest.raises(UserError, match=message):
-        data.read_scenes(
+        read_scenes(
             written(tmp_path, changed(column, lambda field: str(float(field) * factor)))
         )
 
@@ -125,66 +139,66 @@ def test_units_and_directions_that_cannot_be_are_refused(tmp_path, column, facto
 def test_files_without_columns_rows_or_text_are_refused(content, message, tmp_path):
     (tmp_path / "scenes.csv").write_bytes(content)
     with pytest.raises(UserError, match=message):
-        data.read_scenes(tmp_path / "scenes.csv")
+        read_scenes(tmp_path / "scenes.csv")
 
 
 @pytest.mark.parametrize("name", ["", "scenes.csv", "x.parquet"])
 def test_absent_files_are_refused(name, tmp_path):
     (tmp_path / "other.csv").write_text("scene")
     with pytest.raises(UserError, match="no such file"):
-        data.read_scenes(tmp_path / name)
+        read_scenes(tmp_path / name)
 
 
 def test_a_scene_in_two_files_is_refused(tmp_path):
-    data.write_prepared(data.synthetic_scenes(), tmp_path / "a.parquet")
-    data.write_prepared(
-        data.synthetic_scenes(data.SyntheticTraffic(scenes=1)), tmp_path / "b.parquet"
+    write_prepared(synthetic_scenes(), tmp_path / "a.parquet")
+    write_prepared(
+        synthetic_scenes(SyntheticTraffic(scenes=1)), tmp_path / "b.parquet"
     )
     with pytest.raises(
         UserError, match=r"b.parquet: scene synthetic-0 is in .*a.parquet too; remove one"
     ):
-        data.read_scenes(tmp_path)
+        read_scenes(tmp_path)
 
 
 def test_damaged_parquet_is_refused(tmp_path):
     path = tmp_path / "x.parquet"
     path.write_bytes(b"PAR1 not really")
     with pytest.raises(UserError, match="not a readable Parquet file"):
-        data.read_scenes(path)
-    made = data.synthetic_scenes()
-    data.write_prepared(made.drop("speed"), path)
+        read_scenes(path)
+    made = synthetic_scenes()
+    write_prepared(made.drop("speed"), path)
     with pytest.raises(UserError, match=r"x.parquet: no column speed"):
-        data.read_scenes(path)
-    data.write_prepared(made.with_columns(x=pl.lit(float("nan"))), path)
+        read_scenes(path)
+    write_prepared(made.with_columns(x=pl.lit(float("nan"))), path)
     with pytest.raises(UserError, match=r"x.parquet, row 0, column x: nan is not a finite number"):
-        data.read_scenes(path)
+        read_scenes(path)
 
 
 @pytest.mark.parametrize(("kept", "renumbered"), [(2, False), (5, False), (2, True), (3, True)])
 def test_recordings_with_frames_missing_throughout_are_refused(kept, renumbered, tmp_path):
-    frame = data.synthetic_scenes(data.SyntheticTraffic(scenes=2, vehicles=6, seconds=8.0))
+    frame = synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=6, seconds=8.0))
     # One scene is whole; the other one has every second frame alone, or so.
     sparse = (pl.col("scene") == frame["scene"].max()) | renumbered
     frame = frame.filter(~sparse | (pl.col("frame") % kept == 0))
     if renumbered:
         frame = frame.with_columns(frame=pl.col("frame") // kept)
-    data.write_scene_csv(frame, tmp_path / "sparse.csv")
+    write_scene_csv(frame, tmp_path / "sparse.csv")
     with pytest.raises(UserError, match=r"sparse.csv, line \d+, .*10 frames a second"):
-        data.read_scenes(tmp_path / "sparse.csv")
+        read_scenes(tmp_path / "sparse.csv")
 
 
-def pooled(frame: pl.DataFrame) -> data.PooledStatistics:
-    statistics = data.PooledStatistics()
-    widths = data.scene_lane_widths(frame)
+def pooled(frame: pl.DataFrame) -> PooledStatistics:
+    statistics = PooledStatistics()
+    widths = scene_lane_widths(frame)
     for (name,), rows in frame.group_by("scene", maintain_order=True):
-        statistics.add(data.Scene(name, rows, widths[name]))
+        statistics.add(Scene(name, rows, widths[name]))
     return statistics
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_scenes_one_by_one_say_what_they_say_together(seed):
-    frame = data.synthetic_scenes(seed=seed)
-    together, apart = data.driving_statistics(frame), pooled(frame)
+    frame = synthetic_scenes(seed=seed)
+    together, apart = driving_statistics(frame), pooled(frame)
     assert vars(apart.exposure) == pytest.approx(vars(together.exposure))
     assert apart.lane_changes.duration == together.lane_changes.duration
     for name in ("count", "per_vehicle_km", "srlc"):
@@ -202,27 +216,27 @@ def test_scenes_one_by_one_say_what_they_say_together(seed):
 @pytest.fixture
 def csv(tmp_path):
     """A scene CSV of two scenes."""
-    data.write_scene_csv(data.synthetic_scenes(seed=5), tmp_path / "mine.csv")
+    write_scene_csv(synthetic_scenes(seed=5), tmp_path / "mine.csv")
     return tmp_path / "mine.csv"
 
 
 def test_what_is_written_reads_back_the_same(csv, tmp_path):
-    prepared = data.prepare_recordings("scenes", csv, tmp_path / "out")
+    prepared = prepare_recordings("scenes", csv, tmp_path / "out")
     assert prepared.files == ("synthetic-0.parquet", "synthetic-1.parquet")
-    assert data.read_scenes(tmp_path / "out").equals(data.read_scenes(csv))
-    assert data.read_scenes(tmp_path / "out" / prepared.files[1])["scene"].unique().to_list() == [
+    assert read_scenes(tmp_path / "out").equals(read_scenes(csv))
+    assert read_scenes(tmp_path / "out" / prepared.files[1])["scene"].unique().to_list() == [
         "synthetic-1"
     ]
-    assert prepared.written == prepared.count.kept == data.synthetic_scenes(seed=5).height
-    again = data.prepare_recordings("scenes", tmp_path / "out", tmp_path / "again")
+    assert prepared.written == prepared.count.kept == synthetic_scenes(seed=5).height
+    again = prepare_recordings("scenes", tmp_path / "out", tmp_path / "again")
     assert again.to_dict()["rows"] == prepared.to_dict()["rows"]
 
 
 def test_long_recordings_are_cut_into_scenes_when_written_and_measured_whole(csv, tmp_path):
-    whole = data.prepare_recordings("scenes", csv, tmp_path / "whole").statistics.lane_changes
-    cut = data.prepare_recordings("scenes", csv, tmp_path / "cut", scene_s=4.0)
+    whole = prepare_recordings("scenes", csv, tmp_path / "whole").statistics.lane_changes
+    cut = prepare_recordings("scenes", csv, tmp_path / "cut", scene_s=4.0)
     assert cut.statistics.lane_changes == whole
-    scenes = data.read_scenes(tmp_path / "cut")
+    scenes = read_scenes(tmp_path / "cut")
     per_scene = scenes.group_by("scene", maintain_order=True).agg(pl.col("frame").n_unique())
     assert per_scene["scene"].to_list() == [
         f"synthetic-{k}-00{part}" for k in range(2) for part in range(3)
@@ -240,7 +254,7 @@ def ngsim_lines(thousands: bool = True) -> list[str]:
 def test_reports_state_rows_rates_and_durations(tmp_path):
     path, lines = tmp_path / "portal.csv", ngsim_lines()
     path.write_text("\n".join([*lines, lines[5], ""]))
-    prepared = data.prepare_recordings("ngsim", path, tmp_path / "out")
+    prepared = prepare_recordings("ngsim", path, tmp_path / "out")
     for report in (short_report(prepared), long_report(prepared, "portal.csv", "report.png")):
         assert "541 read, 540 kept, 540 written" in report
         assert "dropped: 1 (duplicate)" in report
@@ -252,31 +266,31 @@ def test_the_output_folder_appears_only_when_everything_was_written(tmp_path):
     lines = ngsim_lines(thousands=False)
     (tmp_path / "bad.csv").write_text("\n".join([*lines, lines[-1].replace(",", ",x", 1)]))
     with pytest.raises(UserError, match="line 542"):
-        data.prepare_recordings("ngsim", tmp_path / "bad.csv", tmp_path / "out")
+        prepare_recordings("ngsim", tmp_path / "bad.csv", tmp_path / "out")
     assert [path.name for path in tmp_path.iterdir()] == ["bad.csv"]
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "precious").write_text("")
     with pytest.raises(
         UserError, match=r"out: there already; choose another folder with out=FOLDER"
     ):
-        data.prepare_recordings("ngsim", tmp_path / "bad.csv", tmp_path / "out")
+        prepare_recordings("ngsim", tmp_path / "bad.csv", tmp_path / "out")
     assert (tmp_path / "out" / "precious").exists()
 
 
 def refused(frame: pl.DataFrame, folder: Path, message: str) -> None:
-    data.write_prepared(frame, folder / "a.parquet")
+    write_prepared(frame, folder / "a.parquet")
     with pytest.raises(UserError, match=message):
-        data.prepare_recordings("scenes", folder / "a.parquet", folder / "out")
+        prepare_recordings("scenes", folder / "a.parquet", folder / "out")
 
 
 def test_parked_cars_and_names_that_differ_in_a_blank_alone_are_refused(tmp_path):
-    parked = data.synthetic_scenes().with_columns(
+    parked = synthetic_scenes().with_columns(
         speed=pl.lit(0.0), x=pl.col("x").first().over("scene", "vehicle")
     )
     refused(parked, tmp_path, "no scene in which anybody drives")
     names = pl.col("scene").replace({"synthetic-0": "my road", "synthetic-1": "my_road"})
     message = r"a second scene that my_road.parquet is the file of"
-    refused(data.synthetic_scenes().with_columns(names), tmp_path, message)
+    refused(synthetic_scenes().with_columns(names), tmp_path, message)
 
 
 def test_recordings_without_vehicles_on_the_lanes_are_refused(tmp_path):
@@ -284,7 +298,7 @@ def test_recordings_without_vehicles_on_the_lanes_are_refused(tmp_path):
     tracks = tmp_path / "01_tracks.csv"
     pl.read_csv(tracks).with_columns(laneId=pl.lit(9)).write_csv(tracks)
     with pytest.raises(UserError, match="no vehicle on any of the lanes kept"):
-        data.read_recordings("highd", tmp_path)
+        read_recordings("highd", tmp_path)
 
 
 @pytest.mark.parametrize("absolute", [True, False])

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ganlane.data import SyntheticTraffic, synthetic_scenes, validate
-from ganlane.data.schema import LINE, TextTable, convert, csv_table, read_blocks
+from ganlane.data import SyntheticTraffic, synthetic_scenes
+from ganlane.data.schema import validate
+from ganlane.data.tables import LINE, TextTable, convert, csv_table, read_blocks
 from ganlane.errors import UserError
 
 
@@ -81,7 +82,7 @@ def test_empty_lines_at_the_end_are_no_rows(tmp_path):
 
 def test_quoted_fields_may_hold_commas(tmp_path):
     found = read(tmp_path / "t.csv", b'a,b,c\n"1,234",2,"5,678.25"\n7,8,9\n')
-    assert convert(found, "c", pl.Float64, tmp_path, thousands=True).to_list() == [5678.25, 9.0]
+    assert convert(found, "c", pl.Float64, tmp_path).to_list() == [5678.25, 9.0]
 
 
 @pytest.mark.parametrize(
@@ -100,7 +101,7 @@ def test_quoted_fields_may_hold_commas(tmp_path):
 def test_a_wrong_field_is_named_by_file_line_and_column(tmp_path, text, kind, message):
     rows = pl.DataFrame({"x": ["1", text], LINE: [2, 3]})
     with pytest.raises(UserError, match=f"t.csv, line 3, column x: .*{message}"):
-        convert(rows, "x", kind, tmp_path / "t.csv", thousands=True)
+        convert(rows, "x", kind, tmp_path / "t.csv")
 
 
 def test_a_header_is_read_in_any_case_with_quotes_and_a_byte_order_mark(tmp_path):

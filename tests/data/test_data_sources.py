@@ -12,14 +12,26 @@ import polars as pl
 import pytest
 from reference.file_server import CONTENT, SHA256, Server
 
-from ganlane import data
+from ganlane.data import (
+    SyntheticTraffic,
+    byte_progress,
+    default_scenes,
+    scene_lane_counts,
+    synthetic_scenes,
+    tracks_of_frame,
+)
+from ganlane.data.download import download
+from ganlane.data.lanes import find_lane_changes
+from ganlane.data.schema import validate
+from ganlane.data.sources import data_folder
+from ganlane.data.statistics import leader_gaps
 from ganlane.errors import UserError
 
 QUICK = {"timeout_s": 5.0, "attempts": 3, "wait_s": 0.01}
 
 
 def fetch(server, path, sha256=None, **settings):
-    return data.download(server.url, path, sha256, **QUICK, **settings)
+    return download(server.url, path, sha256, **QUICK, **settings)
 
 
 def names(folder):
@@ -29,7 +41,7 @@ def names(folder):
 def test_a_file_arrives_whole_with_progress(tmp_path):
     steps = []
     with Server() as server:
-        path = data.download(
+        path = download(
             server.url, tmp_path / "new" / "f", SHA256, lambda *step: steps.append(step), **QUICK
         )
     assert path.read_bytes() == CONTENT
@@ -104,7 +116,7 @@ def test_a_refused_request_is_reported_at_once(tmp_path):
             fetch(server, tmp_path / "f")
         assert len(server.asked) == 1
     with pytest.raises(UserError, match="not an address"):
-        data.download("file:///etc/hostname", tmp_path / "f")
+        download("file:///etc/hostname", tmp_path / "f")
     assert names(tmp_path) == []
 
 
@@ -145,7 +157,7 @@ def test_progress_shows_bytes_on_a_terminal_and_nothing_of_short_work_elsewhere(
     terminal, capsys, monkeypatch
 ):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
-    with data.byte_progress("read") as show:
+    with byte_progress("read") as show:
         show(2_000_000, 4_000_000)
     err = capsys.readouterr().err
     assert ("read:  50%" in err and "2.00M/4.00M" in err) if terminal else err == ""
@@ -153,18 +165,18 @@ def test_progress_shows_bytes_on_a_terminal_and_nothing_of_short_work_elsewhere(
 
 def test_the_recordings_are_found_through_the_variable(tmp_path, monkeypatch):
     monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
-    assert data.data_folder() == tmp_path
+    assert data_folder() == tmp_path
     with pytest.raises(
         UserError, match=r"set GANLANE_DATA to a folder that holds ngsim/us101_scenes\.csv"
     ):
-        data.default_scenes()
+        default_scenes()
     (tmp_path / "ngsim").mkdir()
     deep = tmp_path / "ngsim" / "us101_scenes.csv"
     deep.write_text("scene,vehicle")
-    assert data.default_scenes() == deep
+    assert default_scenes() == deep
     monkeypatch.setenv("GANLANE_DATA", str(tmp_path / "nowhere"))
     with pytest.raises(UserError, match="no such folder"):
-        data.data_folder()
+        data_folder()
 
 
 def test_the_recordings_are_found_beside_the_current_folder(tmp_path, monkeypatch):
@@ -176,9 +188,9 @@ def test_the_recordings_are_found_beside_the_current_folder(tmp_path, monkeypatc
     work = tmp_path / "work"
     work.mkdir()
     monkeypatch.chdir(work)
-    assert data.data_folder() is None
+    assert data_folder() is None
     (tmp_path / "shared" / "data").mkdir(parents=True)
-    assert data.data_folder() == tmp_path / "shared" / "data"
+    assert data_folder() == tmp_path / "shared" / "data"
 
 
 @pytest.mark.parametrize("length", [True, False, "9" * 5000])
@@ -209,30 +221,30 @@ def test_a_redirection_on_http_is_followed(tmp_path):
 
 
 def test_a_seed_makes_one_recording_and_another_seed_another():
-    assert data.synthetic_scenes(seed=1).equals(data.synthetic_scenes(seed=1))
-    assert not data.synthetic_scenes(seed=1).equals(data.synthetic_scenes(seed=2))
-    one, other = data.synthetic_scenes(seed=1).partition_by("scene", include_key=False)
+    assert synthetic_scenes(seed=1).equals(synthetic_scenes(seed=1))
+    assert not synthetic_scenes(seed=1).equals(synthetic_scenes(seed=2))
+    one, other = synthetic_scenes(seed=1).partition_by("scene", include_key=False)
     assert not one.equals(other)
 
 
 @pytest.mark.parametrize("lanes", [1, 2, 5])
 def test_it_fits_the_schema_and_uses_every_lane(lanes):
-    made = data.synthetic_scenes(data.SyntheticTraffic(lanes=lanes))
-    assert data.validate(made, "made").equals(made)
-    assert set(data.scene_lane_counts(made).values()) == {lanes}
+    made = synthetic_scenes(SyntheticTraffic(lanes=lanes))
+    assert validate(made, "made").equals(made)
+    assert set(scene_lane_counts(made).values()) == {lanes}
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_nobody_comes_near_another_along_the_road(seed):
     # All put into one lane, the smallest gap is still that between slots less the sway of both.
-    one_lane = data.synthetic_scenes(seed=seed).with_columns(lane=pl.lit(0, pl.Int64))
-    assert data.leader_gaps(one_lane)["gap"].min() > 2.0
+    one_lane = synthetic_scenes(seed=seed).with_columns(lane=pl.lit(0, pl.Int64))
+    assert leader_gaps(one_lane)["gap"].min() > 2.0
 
 
 def test_the_share_of_changing_vehicles_is_found_by_the_detector():
-    for changing, wander_m in ((40, 0.0), (0, data.SyntheticTraffic.wander_m)):
-        traffic = data.SyntheticTraffic(
+    for changing, wander_m in ((40, 0.0), (0, SyntheticTraffic.wander_m)):
+        traffic = SyntheticTraffic(
             scenes=1, vehicles=40, changing_share=changing / 40, wander_m=wander_m
         )
-        tracks = data.tracks_of_frame(data.synthetic_scenes(traffic), {"synthetic-0": 3.5})
-        assert len(data.find_lane_changes(tracks)) == changing
+        tracks = tracks_of_frame(synthetic_scenes(traffic), {"synthetic-0": 3.5})
+        assert len(find_lane_changes(tracks)) == changing

@@ -14,12 +14,12 @@ from ganlane.data import (
     SCHEMA,
     SyntheticTraffic,
     default_scenes,
-    find_lane_changes,
     read_scenes,
     scene_lane_widths,
     synthetic_scenes,
     tracks_of_frame,
 )
+from ganlane.data.lanes import find_lane_changes
 from ganlane.data.statistics import (
     Bins,
     DrivingStatistics,

@@ -5,19 +5,17 @@ import pytest
 from matplotlib.colors import to_hex
 from reference.recordings import recorded_cars
 
-from ganlane.realism.card import (
-    CLOSER_IN,
-    card_checks,
+from ganlane.realism.card import CLOSER_IN, card_checks, quantity_rows
+from ganlane.realism.driving import ConstantVelocity, RandomDriving, StartOptions
+from ganlane.realism.long_runs import LongRunParameters, long_run, totals
+from ganlane.realism.measures import QUANTITIES, ceiling, measure_recordings
+from ganlane.realism.sheets import (
     checks_text,
     draw_distances,
     draw_distributions,
     draw_speeds_over_time,
     long_table,
-    quantity_rows,
 )
-from ganlane.realism.driving import ConstantVelocity, RandomDriving, StartOptions
-from ganlane.realism.long_runs import LongRunParameters, long_run, totals
-from ganlane.realism.measures import QUANTITIES, ceiling, measure_recordings
 from ganlane.realism.starts import simulate
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic

@@ -5,7 +5,6 @@ Distances of histograms with their intervals; what ships.
 
 import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from scipy.spatial.distance import jensenshannon
 from scipy.stats import binom
 
 from ganlane.data import default_scenes, read_scenes, scene_lane_widths
+from ganlane.data.dense import recorded_frame, recordings_of
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Estimate
 from ganlane.realism.card import verdict
@@ -28,28 +28,26 @@ from ganlane.realism.measures import (
     distance,
     distance_difference,
     jensen_shannon,
-    measure,
     measure_recordings,
+    samples_of,
+    with_motion,
 )
-from ganlane.realism.recordings import recorded_frame, recordings_of, segments
 
 
-def measured(*recordings):
-    return measure(recorded_frame(recordings), sorted(each.name for each in recordings))
-
-
-def values(result, quantity):
-    return result.samples[quantity]["value"].to_numpy()
+def values(recording, quantity):
+    """The samples of a quantity."""
+    motion = with_motion(recorded_frame([recording]))
+    return samples_of(motion)[quantity]["value"].to_numpy()
 
 
 TIME = np.arange(100)[:, None] * 0.1
 
 
 def test_constant_acceleration_has_no_jerk_and_a_cubic_path_its_own_and_the_speed_of_the_second():
-    result = measured(made_by_hand(10.0 * TIME + 0.5 * 0.8 * TIME**2))
+    result = made_by_hand(10.0 * TIME + 0.5 * 0.8 * TIME**2)
     assert values(result, "acceleration") == pytest.approx(0.8)
     assert values(result, "jerk") == pytest.approx(0.0, abs=1e-9)
-    result = measured(made_by_hand(10.0 * TIME + 0.3 * TIME**3 / 6.0))
+    result = made_by_hand(10.0 * TIME + 0.3 * TIME**3 / 6.0)
     assert values(result, "jerk") == pytest.approx(0.3)
     # Mean over the second about t: 10 + 0.3 t^2 / 2 + 0.3 / 24.
     t = TIME[30:95, 0]
@@ -59,10 +57,10 @@ def test_constant_acceleration_has_no_jerk_and_a_cubic_path_its_own_and_the_spee
 def test_the_first_three_seconds_of_a_vehicle_do_not_count():
     present = np.ones((100, 2), bool)
     present[:50, 1] = False
-    result = measured(made_by_hand(np.hstack([20.0 * TIME, 20.0 * TIME + 30.0]), present=present))
+    result = made_by_hand(np.hstack([20.0 * TIME, 20.0 * TIME + 30.0]), present=present)
     # The first: samples 30 to 94. The second appears at 50: samples 80 to 94.
     assert len(values(result, "speed")) == 65 + 15
-    assert result.vehicle_km == pytest.approx((70 + 20) * 2.0 / 1000.0)
+    assert measure_recordings([result]).vehicle_km == pytest.approx((70 + 20) * 2.0 / 1000.0)
 
 
 CLOSING_IN = np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME])
@@ -70,45 +68,41 @@ CLOSING_IN = np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME])
 
 def test_gap_headway_and_time_to_collision_of_two_cars_in_one_lane_whether_or_not_the_leader_is_replayed():
     for driven in (True, False):
-        result = measured(made_by_hand(CLOSING_IN, driven=np.array([True, driven])))
+        result = made_by_hand(CLOSING_IN, driven=np.array([True, driven]))
         gap = 60.0 - 2.0 * TIME[30:95, 0]
         assert values(result, "gap") == pytest.approx(gap)
         assert values(result, "time_headway") == pytest.approx(gap / 12.0)
         assert values(result, "time_to_collision") == pytest.approx(gap / 2.0)
         assert len(values(result, "speed")) == 65 * (1 + driven)
-    result = measured(
-        made_by_hand(CLOSING_IN, np.hstack([np.zeros_like(TIME), np.full_like(TIME, 3.5)]))
-    )
-    assert len(values(result, "gap")) == 0
-    assert result.quantile("gap", 0.5) is None
+    beside = made_by_hand(CLOSING_IN, np.hstack([0.0 * TIME, 0.0 * TIME + 3.5]))
+    assert measure_recordings([beside]).quantiles["gap"]["0.5"] is None
 
 
 def test_spread_of_speeds_is_that_within_a_frame():
     x = np.hstack([(10.0 + 2.0 * k) * TIME + 40.0 * k for k in range(3)])
-    assert values(measured(made_by_hand(x)), "speed_spread") == pytest.approx(2.0)
-    assert len(values(measured(made_by_hand(x[:, :2])), "speed_spread")) == 0
+    assert values(made_by_hand(x), "speed_spread") == pytest.approx(2.0)
+    assert len(values(made_by_hand(x[:, :2]), "speed_spread")) == 0
 
 
 def test_a_lane_change_counts_once_with_its_duration_unless_it_comes_too_early():
     for start, expected in ((4.0, 1), (0.2, 0)):
         part = np.clip((TIME - start) / 4.0, 0.0, 1.0)
         y = 3.5 * 0.5 * (1.0 - np.cos(np.pi * part))
-        result = measured(made_by_hand(20.0 * TIME, y))
-        assert result.lane_changes == expected
-        if expected:
-            assert 2.0 < values(result, "lane_change_duration")[0] < 4.0
+        result = made_by_hand(20.0 * TIME, y)
+        assert measure_recordings([result]).lane_changes == expected
+        assert all(2.0 < duration < 4.0 for duration in values(result, "lane_change_duration"))
 
 
 def test_histograms_keep_scenes_apart_and_everything_in_the_outermost_bins():
     slow, fast = made_by_hand(10.5 * TIME, name="slow"), made_by_hand(55.0 * TIME, name="fast")
-    counts = measured(slow, fast).counts["speed"]
+    counts = measure_recordings([slow, fast]).counts["speed"]
     assert counts.shape == (2, QUANTITIES["speed"].number)
-    assert counts[0, -1] == counts[0].sum() == 65
-    assert counts[1, 10] == counts[1].sum() == 65
+    assert counts[0, 10] == counts[0].sum() == 65
+    assert counts[1, -1] == counts[1].sum() == 65
 
 
 def test_segments_keep_their_unit_and_leave_out_what_was_to_be_skipped():
-    pieces = segments(made_by_hand(10.0 * TIME), 3.0, skip_s=3.5)
+    pieces = made_by_hand(10.0 * TIME).segments(3.0, skip_s=3.5)
     assert [piece.name for piece in pieces] == ["scene@35", "scene@65"]
     assert {piece.unit for piece in pieces} == {"scene"}
     assert pieces[1].x[0, 0] == pytest.approx(65.0)
@@ -253,9 +247,12 @@ def reference():
     recordings = recorded_cars(scenes=3)
     whole = {"lane_changes": 3, "vehicle_km": 2.0, "speed_spread_mps": 1.0}
     floors = {"random": {"speed": 0.5}, "constant_velocity": {"speed": 0.2}}
-    names = [each.name for each in recordings]
-    return replace(
-        Reference.of(measure_recordings(recordings), names, whole, "made up"), floors=floors
+    return Reference(
+        **vars(measure_recordings(recordings)),
+        source="made up",
+        units=[recording.name for recording in recordings],
+        whole=whole,
+        floors=floors,
     )
 
 

@@ -6,7 +6,7 @@ from reference.recordings import following_file
 
 from ganlane.errors import UserError
 from ganlane.realism.measures import measure_recordings
-from ganlane.realism.recordings import I80_FILES, read_i80
+from ganlane.realism.i80 import I80_FILES, read_i80
 
 
 def lane_file(path):
@@ -39,9 +39,9 @@ def test_pairs_have_a_driven_follower_at_the_recorded_gap(tmp_path):
         assert len(recordings) == {"pairs": 2, "following": 1}[name]
         assert {each.lanes for each in recordings} == {1}
         assert all(each.driven.sum() == 1 for each in recordings)
-        measured = measure_recordings(recordings)
-        assert measured.quantile("gap", 0.5) == pytest.approx(gap, abs=1e-6)
-        assert measured.quantile("speed", 0.5) == pytest.approx(speed, abs=1e-6)
+        quantiles = measure_recordings(recordings).quantiles
+        assert quantiles["gap"]["0.5"] == pytest.approx(gap, abs=1e-6)
+        assert quantiles["speed"]["0.5"] == pytest.approx(speed, abs=1e-6)
         assert recordings[0].speed[recordings[0].present] == pytest.approx(speed)
 
 
@@ -51,7 +51,7 @@ def test_a_lane_is_driven_as_a_whole_in_stretches_of_their_own(tmp_path):
     assert len({each.unit for each in recordings}) == len(recordings) == 2
     assert all(each.driven.all() for each in recordings)
     # 2 s apart at 18 m/s, cars of 4.5 m.
-    assert measure_recordings(recordings).quantile("gap", 0.5) == pytest.approx(31.5, abs=1e-6)
+    assert measure_recordings(recordings).quantiles["gap"]["0.5"] == pytest.approx(31.5, abs=1e-6)
 
 
 def test_damaged_files_are_named(tmp_path):

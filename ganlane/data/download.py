@@ -114,8 +114,9 @@ class _Part:
         if size > self.most_bytes:
             self.remove()
             raise UserError(
-                f"{self.url}: the file has {size / 1e9:.3g} GB or more, more than {self.most_bytes / 1e9:.3g}; check "
-                "data.url, or fetch it yourself and give data.path."
+                f"{self.url}: the file has {size / 1e9:.3g} GB or more, more than "
+                f"{self.most_bytes / 1e9:.3g}; check data.url, or fetch it yourself and give "
+                "data.path."
             )
 
     def remove(self) -> None:
@@ -149,8 +150,8 @@ def _fetch(
         failures = 0 if part.size > before else failures + 1
         if failures >= attempts:
             raise UserError(
-                f"{part.url}: cannot be fetched, {part.size} bytes came ({reason}); check the network and run the "
-                "command again, it continues from there."
+                f"{part.url}: cannot be fetched, {part.size} bytes came ({reason}); check the "
+                "network and run the command again, it continues from there."
             )
         if failures:
             time.sleep(wait_s)
@@ -165,7 +166,8 @@ class _HttpOnly(urllib.request.HTTPRedirectHandler):
     ) -> Any:
         if urllib.parse.urlsplit(newurl).scheme not in _SCHEMES:
             raise UserError(
-                f"{req.full_url}: the server sends to {newurl[:200]}; expected http:// or https://, check data.url."
+                f"{req.full_url}: the server sends to {newurl[:200]}; expected http:// or "
+                "https://, check data.url."
             )
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 

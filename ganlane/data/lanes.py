@@ -1,5 +1,4 @@
-"""Lane widths of recordings, and the lane changes of recordings and simulations with their
-durations (equation 11).
+"""Lane widths of recordings, and lane changes with their durations (equation 11).
 
 Recordings and simulations are measured in the same form, :class:`Tracks`: flat arrays, vectorised
 over all samples.
@@ -63,8 +62,7 @@ def scene_lane_counts(frame: pl.DataFrame) -> dict[str, int]:
 
 
 def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
-    """Lane width, m, at which the nearest lane of each row agrees best with its recorded lane
-    number [R].
+    """Lane width, m, at which the nearest lanes agree best with the recorded ones ``lane`` [R].
 
     The first estimate is the median slope between the median positions of each pair of lanes (Theil
     and Sen), which is robust to outliers. It is kept if no other width within 10 % of it puts more
@@ -80,8 +78,8 @@ def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
         return STANDARD_LANE_WIDTH_M
     if not 2.0 <= guess <= 6.0:
         raise UserError(
-            f"{scene}: its lanes are {guess:.2f} m apart, expected 2 to 6 m; check that y is in metres, grows to the "
-            "left, and that lanes are numbered in order."
+            f"{scene}: its lanes are {guess:.2f} m apart, expected 2 to 6 m; check that y is in "
+            "metres, grows to the left, and that lanes are numbered in order."
         )
     low, high = _best_range(y, lane, guess)
     return guess if low <= guess <= high else 0.5 * (low + high)
@@ -229,14 +227,13 @@ def find_lane_changes(tracks: Tracks) -> LaneChanges:
     side = np.sign(new - old)
     boundary = (old + 0.5 * side) * tracks.lane_width[sample]
     part = (boundary - tracks.y[sample]) / (tracks.y[sample + 1] - tracks.y[sample])
-    start, start_found = _find_end(tracks, sample, side, old, -1)
-    end, end_found = _find_end(tracks, sample + 1, side, new, 1)
+    start, start_seen = _find_end(tracks, sample, side, old, -1)
+    end, end_seen = _find_end(tracks, sample + 1, side, new, 1)
     tau_s = (sample - start + part) * FRAME_S
     tau_e = (end - sample - part) * FRAME_S
     moved = side * (tracks.y[end] - tracks.y[start])
-    return LaneChanges(
-        sample, old, new, tau_s, tau_e, ~start_found, ~end_found, moved / (tau_s + tau_e)
-    )
+    speed = moved / (tau_s + tau_e)
+    return LaneChanges(sample, old, new, tau_s, tau_e, ~start_seen, ~end_seen, speed)
 
 
 def lane_changes_of_arrays(y: ArrayLike, lane_width: float) -> LaneChanges:
@@ -266,9 +263,9 @@ def _crossings(lane: Integers, tracks: Tracks) -> Integers:
 def _find_end(
     tracks: Tracks, sample: Integers, side: Integers, lane: Integers, direction: int
 ) -> tuple[Integers, Flags]:
-    """Start (``direction`` -1) or end (1) of lane changes: first sample that is centred or without
-    lateral movement.
+    """Start (``direction`` -1) or end (1) of lane changes.
 
+    It is the first sample that is centred or without lateral movement.
     Returns [C] the samples, or the first or last ones of their tracks, and [C] whether the end lies
     within the track.
     """
@@ -277,13 +274,11 @@ def _find_end(
     inside = (path <= limit[:, None]) if direction > 0 else (path >= limit[:, None])
     path = np.where(inside, path, limit[:, None])
     offset = tracks.y[path] - (lane * tracks.lane_width[sample])[:, None]
-    done = (np.abs(offset) < _CENTRED_M) | (
-        side[:, None] * _lateral_speed(tracks, path) < _STILL_MPS
-    )
-    done &= inside
-    found = done.any(axis=1)
-    at = np.where(found, done.argmax(axis=1), inside.sum(axis=1) - 1)
-    return sample + direction * at, found
+    pace = side[:, None] * _lateral_speed(tracks, path)
+    done = inside & ((np.abs(offset) < _CENTRED_M) | (pace < _STILL_MPS))
+    within = done.any(axis=1)
+    at = np.where(within, done.argmax(axis=1), inside.sum(axis=1) - 1)
+    return sample + direction * at, within
 
 
 def _lateral_speed(tracks: Tracks, at: Integers) -> Floats:

@@ -41,19 +41,10 @@ FOOT_M: Final = 0.3048
 FRAME_MS: Final = 100
 #: The 18 columns of the raw text files, which have no header.
 RAW_NAMES: Final = (
-    *(
-        "vehicle_id",
-        "frame_id",
-        "total_frames",
-        "global_time",
-        "local_x",
-        "local_y",
-        "global_x",
-        "global_y",
-    ),
-    *("v_length", "v_width", "v_class", "v_vel", "v_acc", "lane_id", "preceding", "following"),
-    *("space_headway", "time_headway"),
-)
+    "vehicle_id frame_id total_frames global_time local_x local_y global_x global_y "
+    "v_length v_width v_class v_vel v_acc lane_id preceding following "
+    "space_headway time_headway"
+).split()
 #: Columns that are read; ``location`` too, where it exists.
 COLUMNS: Final = {
     **dict.fromkeys(("vehicle_id", "frame_id", "global_time"), pl.Int64),
@@ -109,17 +100,17 @@ def ngsim_scenes(
 
 
 def _layout(path: Path) -> TextTable:
-    """Raw text if the first line begins with a number and has no comma, else a CSV with a header."""
+    """Raw text if the first line begins with a number and has no comma, else a CSV."""
     first = first_line(path)
     fields = first.split()
     if "," in first or not fields[0].replace(".", "", 1).isdecimal():
         return csv_table(path, COLUMNS)
     if len(fields) != len(RAW_NAMES):
         raise UserError(
-            f"{path}, line 1: {len(fields)} columns; expected the {len(RAW_NAMES)} of NGSIM's text files, or a "
-            "header line."
+            f"{path}, line 1: {len(fields)} columns; expected the {len(RAW_NAMES)} of NGSIM's text "
+            "files, or a header line."
         )
-    return TextTable(path, RAW_NAMES, has_header=False, blanks=True)
+    return TextTable(path, tuple(RAW_NAMES), has_header=False, blanks=True)
 
 
 def _read_rows(
@@ -147,36 +138,38 @@ def _keep_locations(
 ) -> pl.DataFrame:
     """Rows of the wanted locations; rows of others are dropped and counted."""
     text = text.with_columns(convert(text, LOCATION, pl.String, path).str.to_lowercase())
-    known = sorted({*MOTORWAYS, *STREETS, *locations})
-    what = f"is no known place, expected {', '.join(known)}, or name it in data.locations"
-    raise_where(~text[LOCATION].is_in(known), text, LOCATION, path, what)
-    kept = text[LOCATION].is_in(list(locations))
-    for location, rows in text[LOCATION].filter(~kept).value_counts().iter_rows():
+    places = sorted({*MOTORWAYS, *STREETS, *locations})
+    what = f"is no known place, expected {', '.join(places)}, or name it in data.locations"
+    raise_where(~text[LOCATION].is_in(places), text, LOCATION, path, what)
+    wanted = text[LOCATION].is_in(list(locations))
+    for location, rows in text[LOCATION].filter(~wanted).value_counts().iter_rows():
         count.drop(f"location {location}", rows)
-    return text.filter(kept)
+    return text.filter(wanted)
 
 
 def _store_by_period(
     blocks: Iterable[pl.DataFrame], folder: Path, source: str
 ) -> dict[str, list[Path]]:
-    """Store the rows of all blocks under ``folder``; the files of each period, by its name.
+    """Store the rows of all blocks under ``folder``.
 
-    ``us-101-1``.
+    Returns the files of each period by its name, as ``us-101-1``.
     """
     parts: dict[tuple[str, int], list[Path]] = {}
-    start = (pl.col("global_time") - FRAME_MS * pl.col("frame_id")) // 60_000
+    start_ms = pl.col("global_time") - FRAME_MS * pl.col("frame_id")
     for number, block in enumerate(blocks):
-        for (location, minute), rows in block.group_by(
-            LOCATION, start.alias("minute"), maintain_order=True
-        ):
+        block = block.with_columns(minute=start_ms // 60_000)
+        for rows in block.partition_by(LOCATION, "minute", maintain_order=True):
+            location, minute = rows[LOCATION][0], rows["minute"][0]
             part = folder / f"{len(parts):04d}-{number:05d}-{minute}.arrow"
-            rows.drop(LOCATION).write_ipc(part, compression="lz4")
-            parts.setdefault((str(location), int(minute)), []).append(part)  # type: ignore[call-overload]
+            rows.drop(LOCATION, "minute").write_ipc(part, compression="lz4")
+            parts.setdefault((location, minute), []).append(part)
         if len(parts) > MAX_PERIODS:
             raise UserError(
-                f"{source}, columns global_time and frame_id: they hold {len(parts)} recording periods or more; "
-                "expected global_time in milliseconds and frame_id in steps of 100 ms."
+                f"{source}, columns global_time and frame_id: they hold {len(parts)} recording "
+                "periods or more; expected global_time in milliseconds and frame_id in steps of "
+                "100 ms."
             )
+    # Adjacent minutes are one period.
     periods: dict[str, list[Path]] = {}
     numbers = Counter[str]()
     for location, minute in sorted(parts):
@@ -184,13 +177,16 @@ def _store_by_period(
         periods.setdefault(f"{location}-{numbers[location]}", []).extend(parts[location, minute])
     for name, files in periods.items():
         location = name.rpartition("-")[0]
+        if numbers[location] == 1 or len(files) > 1:
+            continue
         # A few rows that make a period of their own have a wrong time or frame.
-        if numbers[location] > 1 and len(files) == 1 and (rows := _read(files)).height < MIN_ROWS:
+        rows = _read(files)
+        if rows.height < MIN_ROWS:
             first = rows.sort(LINE).row(0, named=True)
             raise UserError(
-                f"{source}, line {first[LINE]}, columns frame_id and global_time: frame {first['frame_id']} at "
-                f"{first['global_time']} ms fits no recording period of {location} ({rows.height} rows alone); "
-                "correct or remove the row."
+                f"{source}, line {first[LINE]}, columns frame_id and global_time: frame "
+                f"{first['frame_id']} at {first['global_time']} ms fits no recording period of "
+                f"{location} ({rows.height} rows alone); correct or remove the row."
             )
     return periods
 
@@ -237,29 +233,23 @@ def _drop_duplicates(rows: pl.DataFrame, count: RowCount) -> pl.DataFrame:
     Of several rows of one vehicle at one time the first in the file is kept.
     """
     rows = rows.sort("vehicle_id", "global_time", LINE)
-    again = (pl.col("vehicle_id").diff() == 0) & (pl.col("global_time").diff() == 0)
-    values = [name for name in COLUMNS if name not in ("vehicle_id", "global_time")]
-    equal = pl.all_horizontal(pl.col(name) == pl.col(name).shift(1) for name in values)
-    repeated, same = rows.select(
-        again.fill_null(False).alias("again"), equal.fill_null(False)
-    ).get_columns()
-    count.drop("duplicate", (repeated & same).sum())
-    count.drop("same vehicle and time, other values", (repeated & ~same).sum())
-    return rows.filter(~repeated)
+    unequal = rows.unique(list(COLUMNS), keep="first", maintain_order=True)
+    first = unequal.unique(["vehicle_id", "global_time"], keep="first", maintain_order=True)
+    count.drop("duplicate", rows.height - unequal.height)
+    count.drop("same vehicle and time, other values", unequal.height - first.height)
+    return first
 
 
 def _check_order(rows: pl.DataFrame, path: Path) -> None:
     """Frames must grow with time, and be 100 ms apart."""
-    same_vehicle, frames = pl.col("vehicle_id").diff() == 0, pl.col("frame_id").diff()
-    flags = rows.select(
-        backwards=same_vehicle & (frames <= 0),
-        apart=same_vehicle & (pl.col("global_time").diff() != FRAME_MS * frames),
+    steps = rows.select(
+        frames=pl.col("frame_id").diff().over("vehicle_id"),
+        ms=pl.col("global_time").diff().over("vehicle_id"),
     )
     what = "does not grow with global_time within its vehicle"
-    raise_where(flags["backwards"], rows, "frame_id", path, what)
-    raise_where(
-        flags["apart"], rows, "global_time", path, "is not 100 ms a frame after the row before"
-    )
+    raise_where(steps["frames"] <= 0, rows, "frame_id", path, what)
+    apart = steps["ms"] != FRAME_MS * steps["frames"]
+    raise_where(apart, rows, "global_time", path, "is not 100 ms a frame after the row before")
 
 
 def _check_units(rows: pl.DataFrame, source: str) -> None:
@@ -269,8 +259,8 @@ def _check_units(rows: pl.DataFrame, source: str) -> None:
     if not LENGTHS_FT[0] <= length <= LENGTHS_FT[1]:
         guess = "metres" if length < LENGTHS_FT[0] else "centimetres or inches"
         raise UserError(
-            f"{source}, from line {line}, column v_length: the median is {length:.1f}, expected feet, about 15; "
-            f"they look like {guess}, convert all columns to feet."
+            f"{source}, from line {line}, column v_length: the median is {length:.1f}, expected "
+            f"feet, about 15; they look like {guess}, convert all columns to feet."
         )
     distance = pl.col("local_y").last() - pl.col("local_y").first()
     seconds = (pl.col("global_time").last() - pl.col("global_time").first()) / 1000.0
@@ -282,7 +272,7 @@ def _check_units(rows: pl.DataFrame, source: str) -> None:
     pace = moving["pace"].median()
     if isinstance(pace, float) and not PACE[0] <= pace <= PACE[1]:
         raise UserError(
-            f"{source}, from line {line}, columns local_y and v_vel: vehicles cover {pace:.2f} times the distance "
-            "that their speed makes; expected feet and feet per second (0.91 would be km/h, 1.47 miles per hour, "
-            "3.28 m/s), convert v_vel."
+            f"{source}, from line {line}, columns local_y and v_vel: vehicles cover {pace:.2f} "
+            "times the distance that their speed makes; expected feet and feet per second (0.91 "
+            "would be km/h, 1.47 miles per hour, 3.28 m/s), convert v_vel."
         )

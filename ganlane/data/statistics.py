@@ -30,8 +30,7 @@ _FOLLOWING_GAP_M, _MIN_FOLLOWER_MPS, _STANDSTILL_GAP_M = 70.0, 2.0, 2.0
 
 @dataclass(frozen=True)
 class Distribution:
-    """Number, mean, standard deviation and quantiles (at :data:`LEVELS`) of a sample, in its own
-    unit.
+    """Number, mean, standard deviation and quantiles (at :data:`LEVELS`) of a sample.
 
     An empty sample has ``mean`` None and no quantiles; fewer than two samples have ``sd`` None.
     """
@@ -92,8 +91,9 @@ def describe_durations(duration_s: ArrayLike, complete: ArrayLike) -> Durations:
 
 
 def survival_curve(duration_s: ArrayLike, complete: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Kaplan and Meier's (1958) survival curve of durations [C], of which those not ``complete``
-    are lower bounds.
+    """Kaplan and Meier's (1958) survival curve of durations [C].
+
+    Those not ``complete`` are lower bounds.
 
     Returns [E] the distinct complete durations, growing, and [E] the shares of longer durations,
     falling.
@@ -122,9 +122,7 @@ class Bins:
 
 
 class Histogram:
-    """Counts per bin, and exact number, mean and standard deviation, of samples that are added part
-    by part.
-    """
+    """Counts per bin of samples that are added part by part, and their exact mean and spread."""
 
     def __init__(self, bins: Bins) -> None:
         self.bins = bins
@@ -140,10 +138,9 @@ class Histogram:
     def add(self, values: ArrayLike) -> None:
         """Count more samples, without NaN."""
         sample = np.asarray(values, dtype=np.float64)
-        bins = self.bins
-        self.counts += np.histogram(
-            np.clip(sample, bins.low, bins.high), bins.number, (bins.low, bins.high)
-        )[0]
+        low, high = self.bins.low, self.bins.high
+        inside = sample.clip(low, high)
+        self.counts += np.histogram(inside, self.bins.number, (low, high))[0]
         self._sum += float(sample.sum())
         self._squares += float(np.square(sample).sum())
 
@@ -158,18 +155,14 @@ class Histogram:
 
     def quantile(self, level: float) -> float:
         """Value at ``level``, linear within its bin, so accurate to a bin's width."""
+        place = level * self.total
         below = np.concatenate(([0], np.cumsum(self.counts)))
         occupied = np.flatnonzero(self.counts)
-        k = int(
-            occupied[
-                min(
-                    int(np.searchsorted(below[occupied + 1], level * self.total)), len(occupied) - 1
-                )
-            ]
-        )
-        share = (level * self.total - below[k]) / self.counts[k]
+        index = np.searchsorted(below[occupied + 1], place).clip(max=len(occupied) - 1)
+        k = occupied[index]
+        share = ((place - below[k]) / self.counts[k]).clip(0.0, 1.0)
         edges = self.bins.edges
-        return float(edges[k] + min(max(share, 0.0), 1.0) * (edges[k + 1] - edges[k]))
+        return float(edges[k] + share * (edges[k + 1] - edges[k]))
 
     def density(self) -> np.ndarray:
         """[number] probability density per unit of the quantity."""
@@ -327,8 +320,9 @@ def lane_change_statistics(
 
 @dataclass(frozen=True)
 class DrivingStatistics:
-    """Statistics of a recording in SI units; :meth:`to_dict` and :meth:`from_dict` are exact
-    inverses.
+    """Statistics of a recording in SI units.
+
+    :meth:`to_dict` and :meth:`from_dict` are exact inverses.
 
     ``speed_sd_in_frame`` and ``speed_sd_in_lane`` are standard deviations of the speeds within a
     frame, and within a frame and lane, m/s: the mean over those with two vehicles or more, None

@@ -106,13 +106,6 @@ def test_a_change_of_vehicle_is_no_lane_change():
     assert len(found(y, new_track_at=[20])) == 0
 
 
-def test_vehicles_of_a_simulation_are_measured_one_by_one():
-    changes = lane_changes_of_arrays(np.stack((np.zeros(80), RAMP, WIDTH - RAMP), axis=1), WIDTH)
-    assert changes.sample.tolist() == [80 + 38, 160 + 38]
-    assert changes.new_lane.tolist() == [1, 0]
-    assert changes.tau_s == pytest.approx([1.55, 1.55])
-
-
 @settings(max_examples=20)
 @given(seed=st.integers(0, 500))
 def test_recordings_and_arrays_are_measured_alike_and_mirroring_changes_nothing_but_the_side(seed):

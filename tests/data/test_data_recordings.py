@@ -5,7 +5,6 @@ The error for each kind of damage.
 
 from __future__ import annotations
 
-import errno
 from pathlib import Path
 
 import polars as pl
@@ -120,9 +119,7 @@ def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column,
 )
 def test_units_and_directions_that_cannot_be_are_refused(tmp_path, column, factor, message):
     with pytest.raises(UserError, match=message):
-        read_scenes(
-            written(tmp_path, changed(column, lambda field: str(float(field) * factor)))
-        )
+        read_scenes(written(tmp_path, changed(column, lambda field: str(float(field) * factor))))
 
 
 @pytest.mark.parametrize(
@@ -151,9 +148,7 @@ def test_absent_files_are_refused(name, tmp_path):
 
 def test_a_scene_in_two_files_is_refused(tmp_path):
     write_prepared(synthetic_scenes(), tmp_path / "a.parquet")
-    write_prepared(
-        synthetic_scenes(SyntheticTraffic(scenes=1)), tmp_path / "b.parquet"
-    )
+    write_prepared(synthetic_scenes(SyntheticTraffic(scenes=1)), tmp_path / "b.parquet")
     with pytest.raises(
         UserError, match=r"b.parquet: scene synthetic-0 is in .*a.parquet too; remove one"
     ):
@@ -174,14 +169,14 @@ def test_damaged_parquet_is_refused(tmp_path):
         read_scenes(path)
 
 
-@pytest.mark.parametrize(("kept", "renumbered"), [(2, False), (5, False), (2, True), (3, True)])
-def test_recordings_with_frames_missing_throughout_are_refused(kept, renumbered, tmp_path):
+@pytest.mark.parametrize(("every", "renumbered"), [(2, False), (5, False), (2, True), (3, True)])
+def test_recordings_with_frames_missing_throughout_are_refused(every, renumbered, tmp_path):
     frame = synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=6, seconds=8.0))
     # One scene is whole; the other one has every second frame alone, or so.
     sparse = (pl.col("scene") == frame["scene"].max()) | renumbered
-    frame = frame.filter(~sparse | (pl.col("frame") % kept == 0))
+    frame = frame.filter(~sparse | (pl.col("frame") % every == 0))
     if renumbered:
-        frame = frame.with_columns(frame=pl.col("frame") // kept)
+        frame = frame.with_columns(frame=pl.col("frame") // every)
     write_scene_csv(frame, tmp_path / "sparse.csv")
     with pytest.raises(UserError, match=r"sparse.csv, line \d+, .*10 frames a second"):
         read_scenes(tmp_path / "sparse.csv")
@@ -301,31 +296,13 @@ def test_recordings_without_vehicles_on_the_lanes_are_refused(tmp_path):
         read_recordings("highd", tmp_path)
 
 
-@pytest.mark.parametrize("absolute", [True, False])
-def test_an_error_names_the_folder_to_be_and_other_files_as_they_are(
-    absolute, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    out = (tmp_path if absolute else Path()) / "scenes"
-    long = out.with_name("s" * 250)  # the hidden one beside it has a longer name
-
-    def absent(name):
-        raise FileNotFoundError(errno.ENOENT, "No such file or directory", name)
-
-    cases = [
-        (
-            out,
-            lambda folder: write_bytes(folder / ("s" * 300), b""),
-            errno.ENAMETOOLONG,
-            str(out / ("s" * 300)),
-        ),
-        (out, Path.mkdir, errno.EEXIST, str(out)),
-        (long, absent, errno.ENAMETOOLONG, str(long)),
-    ]
-    for name in ("scenes.csv", ".hidden/scenes.csv", None):
-        cases.append((out, lambda folder, name=name: absent(name), errno.ENOENT, name))
-    for path, fill, number, named in cases:
-        with pytest.raises(OSError) as caught, whole_folder(path) as folder:  # noqa: PT011
-            fill(folder)
-        assert (caught.value.errno, caught.value.filename) == (number, named)
+def test_an_error_names_the_folder_to_be_and_other_files_as_they_are(tmp_path):
+    out = tmp_path / "scenes"
+    too_long = "s" * 300
+    with pytest.raises(OSError, match="too long") as caught, whole_folder(out) as folder:
+        write_bytes(folder / too_long, b"")
+    assert caught.value.filename == str(out / too_long)
+    with pytest.raises(FileNotFoundError) as caught, whole_folder(out):
+        (tmp_path / "absent").read_bytes()
+    assert caught.value.filename == str(tmp_path / "absent")
     assert list(tmp_path.iterdir()) == []

@@ -20,7 +20,6 @@ from ganlane.realism.driving import (
     drive_recordings,
     with_recorded_headways,
 )
-from ganlane.realism.measures import measure_recordings, pooled_distance
 from ganlane.realism.starts import simulate
 from ganlane.sim.idm import following_acceleration
 from ganlane.sim.neighbours import perceive
@@ -55,20 +54,6 @@ def test_constant_velocity_repeats_a_recording_of_constant_velocity_from_the_fir
         pl.col("frame").min().alias("first"), pl.col("frame").max().alias("last")
     )
     assert frames.sort("vehicle").rows() == [(0, 0, 99), (1, 0, 99), (2, 40, 79)]
-
-
-def test_its_distance_is_then_0_in_every_quantity():
-    driven, recorded = (
-        simulate(ConstantVelocity, [steady()], StartOptions()),
-        measure_recordings([steady()]),
-    )
-    for name in ("speed", "gap", "time_headway"):
-        # Speeds of 10 m/s lie on an edge of the bins, which rounding may cross; compare at the
-        # middle.
-        assert driven.quantiles[name]["0.5"] == pytest.approx(
-            recorded.quantiles[name]["0.5"], abs=1e-2
-        )
-    assert pooled_distance(driven.counts["gap"], recorded.counts["gap"]) < 0.15
 
 
 def test_a_vehicle_waits_while_another_stands_in_its_place():

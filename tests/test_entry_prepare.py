@@ -12,10 +12,21 @@ import polars as pl
 import pytest
 from PIL import Image
 from reference.file_server import SHA256, Server
-from reference.recordings import START_MS, ngsim_rows, portal_csv, traffic, write_highd
+from reference.recordings import (
+    START_MS,
+    ngsim_rows,
+    portal_csv,
+    traffic,
+    write_highd,
+)
 from reference.refusals import last_path
 
-from ganlane.data import SyntheticTraffic, read_scenes, synthetic_scenes, write_scene_csv
+from ganlane.data import (
+    SyntheticTraffic,
+    read_scenes,
+    synthetic_scenes,
+    write_scene_csv,
+)
 from ganlane.evaluate import main as evaluate
 from ganlane.prepare import main
 from ganlane.train_generator import main as train_generator
@@ -29,7 +40,10 @@ def here(empty_folder, monkeypatch):
 
 def results(out: str) -> dict:
     path = last_path(out)
-    assert Image.open(path.with_name("report.png")).size == (1440, 588)
+    assert Image.open(path.with_name("report.png")).size == (
+        1440,
+        588,
+    )
     assert path.with_name("report.md").read_text().startswith("# Recordings: ")
     return json.loads(path.read_text())
 
@@ -43,10 +57,26 @@ def test_a_scene_csv_becomes_parquet_and_figures(here, capsys):
     write_csv(here / "mine.csv", seconds=8.0)
     assert main(["data.path=mine.csv", "out=mine"]) == 0
     numbers = results(capsys.readouterr().out)
-    assert numbers["rows"] == {"read": 1920, "kept": 1920, "dropped": {}, "written": 1920}
-    assert numbers["files"] == ["synthetic-0.parquet", "synthetic-1.parquet"]
+    assert numbers["rows"] == {
+        "read": 1920,
+        "kept": 1920,
+        "dropped": {},
+        "written": 1920,
+    }
+    assert numbers["files"] == [
+        "synthetic-0.parquet",
+        "synthetic-1.parquet",
+    ]
     assert numbers["acceleration_raw"]["count"] > numbers["acceleration_smoothed"]["count"] > 0
-    names = {"speed", "headway", "time_headway", "gap", "lane_changes", "wall_s", "code"}
+    names = {
+        "speed",
+        "headway",
+        "time_headway",
+        "gap",
+        "lane_changes",
+        "wall_s",
+        "code",
+    }
     assert names <= numbers.keys()
     assert read_scenes("mine").equals(read_scenes("mine.csv"))
 
@@ -60,7 +90,10 @@ def test_ngsim_portal_with_two_periods(here, capsys):
     assert main(["data=ngsim", "data.path=portal.csv", "scene_s=3"]) == 0
     numbers = results(capsys.readouterr().out)
     assert numbers["rows"]["dropped"] == {"location peachtree": 3}
-    assert [scene["name"] for scene in numbers["scenes"]] == ["us-101-1", "us-101-2"]
+    assert [scene["name"] for scene in numbers["scenes"]] == [
+        "us-101-1",
+        "us-101-2",
+    ]
     assert read_scenes(numbers["out"])["scene"].unique().sort().to_list() == [
         f"us-101-{period}-00{part}" for period in (1, 2) for part in (0, 1)
     ]
@@ -98,7 +131,16 @@ def test_download_then_prepare(here, capsys):
             "data.download=true",
             f"data.url={server.url}",
         ]
-        assert main([*fetched, f"data.sha256={SHA256}", "data.path=other.csv"]) == 2
+        assert (
+            main(
+                [
+                    *fetched,
+                    f"data.sha256={SHA256}",
+                    "data.path=other.csv",
+                ]
+            )
+            == 2
+        )
         assert "its SHA-256 is" in capsys.readouterr().err
         assert list(here.iterdir()) == []
         assert main(fetched) == 0

@@ -10,7 +10,11 @@ from pathlib import Path
 from typing import Final
 
 from ganlane.config.recordings import PrepareConfig
-from ganlane.data.prepared import Preparation, SceneSummary, prepare_recordings
+from ganlane.data.prepared import (
+    Preparation,
+    SceneSummary,
+    prepare_recordings,
+)
 from ganlane.data.sources import byte_progress, recordings_path
 from ganlane.evaluation import write_results
 from ganlane.evaluation.table import Table
@@ -33,11 +37,14 @@ _SHOWN_LEVELS: Final = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 def prepare(config: PrepareConfig, folder: Path) -> str:
     """Download where asked to, read, write, measure and report; the line that names the results."""
+    # The report says what reading and measuring cost.
     begun = time.perf_counter()
     source = recordings_path(config.data)
     out = Path(config.out) if config.out else folder / "scenes"
 
-    def show(scene: SceneSummary) -> None:  # while the others are still read
+    def show(
+        scene: SceneSummary,
+    ) -> None:  # while the others are still read
         line = f"{scene.name}: {scene.rows:,} rows, {scene.vehicle_km:.1f} vehicle-km"
         print(line, file=sys.stderr, flush=True)
 
@@ -51,10 +58,18 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
             on_progress=progress,
             on_scene=show,
         )
-    sheet = save_figure(draw_recordings(prepared.statistics), folder / "report.png")
+    # The report embeds the figure by its name, so both can be moved together.
+    sheet = save_figure(
+        draw_recordings(prepared.statistics),
+        folder / "report.png",
+    )
     report = folder / "report.md"
-    write_bytes(report, long_report(prepared, str(source), sheet.name).encode())
+    write_bytes(
+        report,
+        long_report(prepared, str(source), sheet.name).encode(),
+    )
     print(f"{short_report(prepared)}\nscenes: {out}\nreport: {report}")
+    # Some platforms do not tell it.
     peak = peak_resident_bytes()
     numbers = {
         "format": config.data.format,
@@ -75,7 +90,10 @@ def short_report(prepared: Preparation) -> str:
         f"driving: {exposure.scenes} scenes, {exposure.cars} cars, {exposure.tracks} tracks, "
         f"{exposure.vehicle_km:.1f} vehicle-km"
     )
-    lines += [*_lane_change_lines(prepared), *_acceleration_lines(prepared)]
+    lines += [
+        *_lane_change_lines(prepared),
+        *_acceleration_lines(prepared),
+    ]
     return "\n".join(lines)
 
 
@@ -112,7 +130,8 @@ def _row_lines(prepared: Preparation) -> list[str]:
 
 def _lane_change_lines(prepared: Preparation) -> list[str]:
     changes = prepared.statistics.lane_changes
-    complete, duration = changes.duration.complete, changes.duration
+    complete = changes.duration.complete
+    duration = changes.duration
     lines = [
         f"lane changes: {changes.count:,}; {changes.srlc:.3f} per vehicle and km of road "
         f"(equation 9), {changes.per_vehicle_km:.3f} per driven vehicle-km (95 % interval "
@@ -124,6 +143,7 @@ def _lane_change_lines(prepared: Preparation) -> list[str]:
             f"Meier over {complete.count:,} complete and {duration.censored:,} censored ones; "
             f"{complete.mean:.2f} s over the complete ones alone"
         )
+    # A mean needs one change that was seen from start to end.
     elif changes.count:
         unknown = f"unknown, all {duration.censored:,} are censored"
         lines.append(f"their duration (equation 11): {unknown}")
@@ -132,7 +152,10 @@ def _lane_change_lines(prepared: Preparation) -> list[str]:
 
 def _acceleration_lines(prepared: Preparation) -> list[str]:
     parts = []
-    for name, title in (("raw", "as recorded"), ("smoothed", "over 1 s")):
+    for name, title in (
+        ("raw", "as recorded"),
+        ("smoothed", "over 1 s"),
+    ):
         share = prepared.statistics.strong_share(f"acceleration_{name}")
         if share is not None:
             parts.append(f"{100.0 * share:.1f} % {title}")
@@ -144,12 +167,25 @@ def _bullets(lines: Iterable[str]) -> str:
 
 
 def _scene_table(scenes: Sequence[SceneSummary]) -> str:
-    head = ["scene", "rows", "tracks", "s", "lanes", "lane width, m"]
-    head += ["rows in the nearest lane, %", "vehicle-km", "mean speed, m/s"]
+    # One line per scene.
+    head = [
+        "scene",
+        "rows",
+        "tracks",
+        "s",
+        "lanes",
+        "lane width, m",
+    ]
+    head += [
+        "rows in the nearest lane, %",
+        "vehicle-km",
+        "mean speed, m/s",
+    ]
     head += ["lane changes", "per vehicle-km (95 %)"]
     rows = []
     for scene in scenes[:_MOST_SCENES]:
-        low, high = scene.per_vehicle_km_low, scene.per_vehicle_km_high
+        low = scene.per_vehicle_km_low
+        high = scene.per_vehicle_km_high
         cells = [
             scene.name,
             f"{scene.rows:,}",
@@ -164,6 +200,7 @@ def _scene_table(scenes: Sequence[SceneSummary]) -> str:
             f"{scene.per_vehicle_km:.3f} ({low:.3f} to {high:.3f})",
         ]
         rows.append(cells)
+    # A folder of highD has more than a page holds.
     more = len(scenes) - _MOST_SCENES
     note = f"\n\n{more} more scenes are in results.json." if more > 0 else ""
     return Table("", head, rows, len(head)).markdown(heading=False) + note
@@ -174,6 +211,7 @@ def _distribution_table(prepared: Preparation) -> str:
     rows = []
     for name, title in _QUANTITIES.items():
         sample = prepared.statistics.describe(name)
+        # An empty sample leaves its cells empty.
         values = [sample.mean, sample.sd]
         values += [sample.quantile(level) if sample.count else None for level in _SHOWN_LEVELS]
         cells = ["" if value is None else f"{value:.2f}" for value in values]

@@ -21,11 +21,19 @@ from ganlane.evaluation import write_results
 from ganlane.evaluation.table import show
 from ganlane.generator import HELD_OUT, Preset, shipped_generator
 from ganlane.parameters import assign
-from ganlane.realism.card import card_numbers, floors_of, quantity_rows
+from ganlane.realism.card import (
+    card_numbers,
+    floors_of,
+    quantity_rows,
+)
 from ganlane.realism.driving import Factory, StartOptions
 from ganlane.realism.i80 import I80_FILES, read_i80
 from ganlane.realism.long_runs import LongRunParameters, long_run
-from ganlane.realism.measures import SHIPPED_REFERENCE, measure, measure_recordings
+from ganlane.realism.measures import (
+    SHIPPED_REFERENCE,
+    measure,
+    measure_recordings,
+)
 from ganlane.realism.sheets import card_text, draw
 from ganlane.realism.starts import (
     Fold,
@@ -44,7 +52,10 @@ from ganlane.traffic import TrafficModule
 from ganlane.weights import load_weights
 
 #: Preset of the weights that a traffic drives with.
-PRESETS: Final[Mapping[str, Preset]] = {"gan": "paper", "gan_calibrated": "calibrated"}
+PRESETS: Final[Mapping[str, Preset]] = {
+    "gan": "paper",
+    "gan_calibrated": "calibrated",
+}
 #: Quantities that one lane shows.
 I80_QUANTITIES: Final = ("speed", "acceleration", "time_headway")
 
@@ -63,9 +74,12 @@ def realism(config: RealismConfig, folder: Path) -> str:
         raise UserError(
             "publish=true: the file that ships is made from recordings; give data.path=FILE."
         )
-    factories, files = traffic_factories(config), i80_files_wanted(config, path)
+    # Everything that can be refused is refused before hours of driving.
+    factories = traffic_factories(config)
+    files = i80_files_wanted(config, path)
     starts = drive_from_starts(config, factories, path)
     site = {name: i80_rows(config, factories, starts, name, files[name]) for name in files}
+    # Long runs of the rivals take as long again, so they are made on request.
     runs = {}
     for name, make in factories.items():
         if name == config.traffic.label() or config.long_against:
@@ -91,14 +105,19 @@ def scenes_path(config: RealismConfig) -> Path | None:
 
 
 def traffic_factories(
-    config: RealismConfig, weights: Mapping[str, Path] | None = None
+    config: RealismConfig,
+    weights: Mapping[str, Path] | None = None,
 ) -> dict[str, Factory]:
     """Factories by name: the card's traffic first, then its rivals.
 
     ``weights`` of a fold, by preset, replace those that generated traffics name themselves;
     :class:`UserError` where there are none of a preset.
     """
-    traffics = {config.traffic.label(): config.traffic, **config.rivals()}
+    # The card's own traffic first.
+    traffics = {
+        config.traffic.label(): config.traffic,
+        **config.rivals(),
+    }
     for name, preset in PRESETS.items():
         if weights is None or name not in traffics:
             continue
@@ -108,6 +127,7 @@ def traffic_factories(
                 f"fold_weights: traffic {name} needs the preset {preset}, and a fold has no such "
                 "file; give one for every fold."
             )
+        # A fold's weights take the place of those that ship.
         traffics[name] = replace(traffics[name], path=str(path))  # type: ignore[call-arg]
     return {name: partial(_make, traffic, config.env) for name, traffic in traffics.items()}
 
@@ -116,17 +136,26 @@ def _make(traffic: TrafficConfig, env: EnvConfig, road: Road) -> TrafficModule:
     """The traffic on a road."""
     # A copy that is not checked again: a recorded road need not fit Table II's vehicles.
     env = copy(env)
-    assign(env, lanes=int(road.lanes), lane_width_m=float(road.lane_width_m))
+    assign(
+        env,
+        lanes=int(road.lanes),
+        lane_width_m=float(road.lane_width_m),
+    )
     return make_traffic(traffic, env, Stream.REPORT)
 
 
 def folds_of(config: RealismConfig, scenes: Sequence[str]) -> list[Fold]:
     """The scenes that traffics start from: the held-out ones, all, or all by folds."""
     if config.fold_weights:
+        # Every scene is driven by weights that never saw it.
         folds = fold_weights([Path(path) for path in config.fold_weights])
         check_folds_cover(list(folds), scenes)
         return [
-            Fold(traffic_factories(config, weights), held_out, held_out)
+            Fold(
+                traffic_factories(config, weights),
+                held_out,
+                held_out,
+            )
             for held_out, weights in folds.items()
         ]
     # Nothing is held out of recordings that nothing is fitted to.
@@ -149,28 +178,50 @@ def _fits(config: RealismConfig, scenes: Sequence[str]) -> bool:
     """
     if config.data.held_out is not None or config.desired_above_mps is None:
         return True
-    used = {**config.rivals(), config.traffic.label(): config.traffic}
+    used = {
+        **config.rivals(),
+        config.traffic.label(): config.traffic,
+    }
     for name in PRESETS.keys() & used.keys():
+        # The file of weights tells what it was fitted to.
         path = getattr(used[name], "path", None) or shipped_generator(PRESETS[name])
         data = load_weights(path, "generator")[1].get("data", {})
-        if set(scenes) & {*data.get("fitted", ()), *data.get("validation", ())}:
+        if set(scenes) & {
+            *data.get("fitted", ()),
+            *data.get("validation", ()),
+        }:
             return True
     return False
 
 
 def drive_from_starts(
-    config: RealismConfig, factories: Mapping[str, Factory], path: Path | None
+    config: RealismConfig,
+    factories: Mapping[str, Factory],
+    path: Path | None,
 ) -> Starts:
     """Drive every traffic from recorded scenes, or from spawned ones where there are none."""
     if path is None:
         spawn = config.env.spawn_parameters()
-        return spawned_starts(factories, make_road(config.env), spawn, config.repeats, config.seed)
+        return spawned_starts(
+            factories,
+            make_road(config.env),
+            spawn,
+            config.repeats,
+            config.seed,
+        )
     frame = read_scenes(path)
     folds = folds_of(config, sorted(frame["scene"].unique().to_list()))
+    # Desired speeds are fitted unless the user gives them.
     options = StartOptions(repeats=config.repeats, seed=config.seed)
     if config.desired_above_mps is not None:
         options = replace(options, desired_above_mps=config.desired_above_mps)
-    return recorded_starts(folds, frame, options, config.desired_above_mps is None, str(path))
+    return recorded_starts(
+        folds,
+        frame,
+        options,
+        config.desired_above_mps is None,
+        str(path),
+    )
 
 
 def i80_files_wanted(config: RealismConfig, path: Path | None) -> dict[str, Path]:
@@ -188,15 +239,21 @@ def i80_files_wanted(config: RealismConfig, path: Path | None) -> dict[str, Path
 
 
 def i80_rows(
-    config: RealismConfig, factories: Mapping[str, Factory], starts: Starts, name: str, path: Path
+    config: RealismConfig,
+    factories: Mapping[str, Factory],
+    starts: Starts,
+    name: str,
+    path: Path,
 ) -> dict[str, Any]:
     """The card's rows on an I-80 file; nothing is fitted to the site."""
+    # Once each: the site has many more segments than scenes.
     recordings = read_i80(name, path)
     options = StartOptions(seed=config.seed)
     if config.desired_above_mps is not None:
         options = replace(options, desired_above_mps=config.desired_above_mps)
     frames = drive_all(factories, recordings, options, starts.desired_above_mps)
-    units, recorded = units_of(recordings), measure_recordings(recordings).counts
+    units = units_of(recordings)
+    recorded = measure_recordings(recordings).counts
     return quantity_rows(
         next(iter(factories)),
         {driver: measure(frame, units) for driver, frame in frames.items()},
@@ -212,6 +269,7 @@ def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str,
     if config.vehicle_km <= 0:
         return runs
     for vehicles in config.long_vehicles:
+        # Each number of vehicles is a density of its own, at the paper's spacing.
         parameters = LongRunParameters(
             vehicles,
             config.vehicle_km,
@@ -230,6 +288,7 @@ def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str,
 
 def publish(starts: Starts) -> None:
     """Write the file that ships, with the distances of the reference drivers of this run."""
+    # The file's name without its folder, which is nobody's business.
     source = Path(starts.reference.source).name
     floors = floors_of(starts.driven, starts.recorded.counts)
     replace(starts.reference, floors=floors, source=source).save(SHIPPED_REFERENCE)

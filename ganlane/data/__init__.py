@@ -11,7 +11,12 @@
 - ``dense`` holds scenes as arrays [frames, tracks], for simulations.
 """
 
-from ganlane.data.lanes import Tracks, scene_lane_counts, scene_lane_widths, tracks_of_frame
+from ganlane.data.lanes import (
+    Tracks,
+    scene_lane_counts,
+    scene_lane_widths,
+    tracks_of_frame,
+)
 from ganlane.data.prepared import PooledStatistics
 from ganlane.data.recordings import (
     read_recordings,
@@ -19,12 +24,25 @@ from ganlane.data.recordings import (
     write_prepared,
     write_scene_csv,
 )
-from ganlane.data.schema import FRAME_S, SCHEMA, TRACK, Scene, sort
-from ganlane.data.sources import byte_progress, default_scenes, recordings_path
+from ganlane.data.schema import (
+    FRAME_S,
+    SCHEMA,
+    TRACK,
+    Scene,
+    sort,
+)
+from ganlane.data.sources import (
+    byte_progress,
+    default_scenes,
+    recordings_path,
+)
 from ganlane.data.statistics import (
     DrivingStatistics,
     Histogram,
     driving_statistics,
     survival_curve,
 )
-from ganlane.data.synthetic import SyntheticTraffic, synthetic_scenes
+from ganlane.data.synthetic import (
+    SyntheticTraffic,
+    synthetic_scenes,
+)

@@ -54,22 +54,34 @@ class Recording:
         """
         if "driven" not in rows.columns:
             rows = rows.with_columns(driven=True)
+        # Frames of the scene count from its first one, tracks by their number.
         frame = rows["frame"].to_numpy()
         time = frame - frame.min()
         track = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)[1]
         shape = (int(time.max()) + 1, int(track.max()) + 1)
+        # Values per frame and track; 0 where the track is absent.
         arrays: dict[str, Any] = {}
         for name in ("x", "y", "speed"):
             arrays[name] = np.zeros(shape)
             arrays[name][time, track] = rows[name].to_numpy()
+        # Values per track, the same in all of its rows.
         for name in ("length", "width", "driven"):
             column = rows[name].to_numpy()
             arrays[name] = np.zeros(shape[1], column.dtype)
             arrays[name][track] = column
         present = np.zeros(shape, bool)
         present[time, track] = True
-        name, lanes = str(rows["scene"][0]), int(rows["lane"].to_numpy().max()) + 1
-        return cls(name, name, lanes, lane_width_m, present=present, **arrays)
+        name = str(rows["scene"][0])
+        # Lane 0 is the rightmost; lanes beyond the leftmost one in use are not known.
+        lanes = int(rows["lane"].to_numpy().max()) + 1
+        return cls(
+            name,
+            name,
+            lanes,
+            lane_width_m,
+            present=present,
+            **arrays,
+        )
 
     @property
     def end_m(self) -> float:
@@ -82,7 +94,9 @@ class Recording:
         The lane is the one whose centre is nearest, and the speed is 0: everything is measured from
         positions. Further columns are ``unit``, ``driven`` and ``lane_width``.
         """
+        # Transposed, so that the rows come track by track.
         vehicle, time = np.nonzero(self.present.T)
+        # Simulated positions are float32; sums over them are taken in float64.
         y = self.y[time, vehicle].astype(np.float64)
         columns = {
             "scene": np.full(len(vehicle), self.name),
@@ -103,9 +117,11 @@ class Recording:
 
     def segments(self, seconds: float, skip_s: float = 0.0) -> list[Recording]:
         """Pieces of ``seconds`` from ``skip_s`` on, each with the vehicles present in it."""
-        length, first = round(seconds / FRAME_S), round(skip_s / FRAME_S)
+        length = round(seconds / FRAME_S)
+        first = round(skip_s / FRAME_S)
         pieces = []
         for start in range(first, len(self.x) - length + 1, length):
+            # Vehicles that are absent all the time are left out.
             rows = slice(start, start + length)
             who = self.present[rows].any(0)
             arrays = {
@@ -118,11 +134,14 @@ class Recording:
 
 def recordings_of(frame: pl.DataFrame, lane_widths: Mapping[str, float]) -> list[Recording]:
     """The scenes of a frame in the schema, by name; ``lane_widths`` are in m."""
+    # Sorted by name, so that the order of the file has no effect.
     scenes = frame.partition_by("scene", as_dict=True)
     return [Recording.of(scenes[key], lane_widths[str(key[0])]) for key in sorted(scenes)]
 
 
-def recorded_frame(recordings: Sequence[Recording]) -> pl.DataFrame:
+def recorded_frame(
+    recordings: Sequence[Recording],
+) -> pl.DataFrame:
     """The recordings in the form in which simulations are measured."""
     return pl.concat([recording.frame() for recording in recordings])
 

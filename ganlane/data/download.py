@@ -62,10 +62,12 @@ def download(
     path = Path(path)
     if url.partition("://")[0].lower() not in _SCHEMES:
         raise UserError(f"{url}: not an address of a file; expected http:// or https://.")
+    # A file that is there is never replaced: it may be the user's own.
     if path.is_file():
         _check_sha256(path, sha256, "remove it, or correct data.sha256")
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
+    # The path appears only when everything has come and the checksum is right.
     part = _Part(url, path, most_bytes)
     try:
         _fetch(part, on_progress, timeout_s, attempts, wait_s)
@@ -74,10 +76,15 @@ def download(
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
     try:
-        _check_sha256(part.file, sha256, "it was removed; download again, or correct data.sha256")
+        _check_sha256(
+            part.file,
+            sha256,
+            "it was removed; download again, or correct data.sha256",
+        )
     except UserError:
         part.remove()
         raise
+    # Atomic, on one file system.
     part.file.replace(path)
     part.remove()
     return path
@@ -88,6 +95,7 @@ class _Part:
 
     def __init__(self, url: str, path: Path, most_bytes: int) -> None:
         self.url, self.most_bytes = url, most_bytes
+        # Hidden, beside the file, so that the last step is a rename.
         self.file = path.with_name(f".{path.name}.part")
         self._note = path.with_name(f".{path.name}.part.json")
 
@@ -103,6 +111,7 @@ class _Part:
             version = json.loads(self._note.read_text())["version"]
         except (OSError, ValueError, KeyError, TypeError):
             return None
+        # A weak ETag does not promise equal bytes, so it cannot guard a range.
         return version if isinstance(version, str) and not version.startswith("W/") else None
 
     @version.setter
@@ -126,12 +135,17 @@ class _Part:
 
 
 def _fetch(
-    part: _Part, on_progress: OnProgress | None, timeout_s: float, attempts: int, wait_s: float
+    part: _Part,
+    on_progress: OnProgress | None,
+    timeout_s: float,
+    attempts: int,
+    wait_s: float,
 ) -> None:
     """Connect until the file is complete.
 
     Give up after ``attempts`` connections in a row that bring nothing.
     """
+    # Only connections in a row without any progress count.
     failures = 0
     while True:
         before = part.size
@@ -141,6 +155,7 @@ def _fetch(
         except urllib.error.HTTPError as error:
             if error.code == http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and before:
                 part.remove()  # It is longer than the file, so it is of another version.
+            # Client errors stay; server errors may pass.
             elif error.code < 500:
                 what = f"{error.code} {' '.join(str(error.reason).split())}"
                 raise UserError(f"{part.url}: the server says {what}; check data.url.") from error
@@ -153,6 +168,7 @@ def _fetch(
                 f"{part.url}: cannot be fetched, {part.size} bytes came ({reason}); check the "
                 "network and run the command again, it continues from there."
             )
+        # Longer each time, to spare a server in trouble.
         if failures:
             time.sleep(wait_s)
             wait_s *= 2.0
@@ -162,7 +178,13 @@ class _HttpOnly(urllib.request.HTTPRedirectHandler):
     """Follows no redirection to another protocol."""
 
     def redirect_request(
-        self, req: Any, fp: Any, code: Any, msg: Any, headers: Any, newurl: str
+        self,
+        req: Any,
+        fp: Any,
+        code: Any,
+        msg: Any,
+        headers: Any,
+        newurl: str,
     ) -> Any:
         if urllib.parse.urlsplit(newurl).scheme not in _SCHEMES:
             raise UserError(
@@ -174,9 +196,17 @@ class _HttpOnly(urllib.request.HTTPRedirectHandler):
 
 def _connect(part: _Part, on_progress: OnProgress | None, timeout_s: float) -> None:
     """One connection: the rest of the file, or all of it."""
-    received, headers = part.size, {"User-Agent": "ganlane", "Accept-Encoding": "identity"}
+    received = part.size
+    headers = {
+        "User-Agent": "ganlane",
+        "Accept-Encoding": "identity",
+    }
+    # Without a version the server may send the rest of another file.
     if received and (version := part.version):
-        headers |= {"Range": f"bytes={received}-", "If-Range": version}
+        headers |= {
+            "Range": f"bytes={received}-",
+            "If-Range": version,
+        }
     with _network_errors():
         request = urllib.request.Request(part.url, headers=headers)
         answer = urllib.request.build_opener(_HttpOnly).open(request, timeout=timeout_s)
@@ -192,9 +222,11 @@ def _connect(part: _Part, on_progress: OnProgress | None, timeout_s: float) -> N
         length = (answer.headers.get("Content-Length") or "").strip()
         # A length that is no number tells nothing; 19 digits are more bytes than there are.
         total = received + int(length[:19]) if length.isdecimal() else None
+        # Refused before anything is written, if the server tells the size.
         part.check_size(max(received, total or 0))
         if not resumes:
             part.version = answer.headers.get("ETag") or answer.headers.get("Last-Modified")
+        # An answer to the whole request begins the file anew.
         with part.file.open("ab" if received else "wb") as file:
             while True:
                 with _network_errors():
@@ -206,6 +238,7 @@ def _connect(part: _Part, on_progress: OnProgress | None, timeout_s: float) -> N
                 file.write(piece)
                 if on_progress is not None:
                     on_progress(received, total)
+    # An early end looks like a complete answer otherwise.
     if total is not None and received < total:
         raise _BrokenConnection(f"{received} of {total} bytes came")
 
@@ -218,7 +251,11 @@ def _network_errors() -> Iterator[None]:
     except urllib.error.HTTPError:
         raise
     # A ValueError comes from an address that is none.
-    except (OSError, http.client.HTTPException, ValueError) as error:
+    except (
+        OSError,
+        http.client.HTTPException,
+        ValueError,
+    ) as error:
         raise _BrokenConnection(
             str(getattr(error, "reason", None) or error) or type(error).__name__
         ) from error
@@ -228,6 +265,7 @@ def _check_sha256(path: Path, sha256: str | None, advice: str) -> None:
     """Compare with the checksum, if one is given."""
     if sha256 is None:
         return
+    # In pieces: the file may be larger than the memory.
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while piece := file.read(2**20):

@@ -18,7 +18,15 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from ganlane.data.schema import FRAME_S, SCHEMA, RowCount, Scene, number_tracks, sort, validate
+from ganlane.data.schema import (
+    FRAME_S,
+    SCHEMA,
+    RowCount,
+    Scene,
+    number_tracks,
+    sort,
+    validate,
+)
 from ganlane.data.tables import raise_where, read_table
 from ganlane.errors import UserError
 
@@ -61,7 +69,9 @@ def highd_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Sc
     Raises:
         UserError: a missing or damaged file; the message names file, line and column.
     """
-    path, count = Path(path), count if count is not None else RowCount()
+    path = Path(path)
+    count = count if count is not None else RowCount()
+    # A folder holds up to 60 recordings; one file is one of them.
     recordings = sorted(path.glob(f"*{_TRACKS}")) if path.is_dir() else [path]
     if not recordings:
         raise UserError(
@@ -72,30 +82,57 @@ def highd_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Sc
             raise UserError(f"{path}: expected highD's XX{_TRACKS} or a folder of recordings.")
         stem = tracks.name.removesuffix(_TRACKS)
         rate_hz, directions = _read_recording_meta(tracks.with_name(f"{stem}_recordingMeta.csv"))
-        rows = _read_rows(tracks, tracks.with_name(f"{stem}_tracksMeta.csv"), count)
+        # Both directions are in one file.
+        rows = _read_rows(
+            tracks,
+            tracks.with_name(f"{stem}_tracksMeta.csv"),
+            count,
+        )
         for direction in directions:
             side = "upper" if direction.number == UPPER else "lower"
-            scene = _scene(rows, direction, rate_hz, f"highd-{stem}-{side}", tracks, count)
+            scene = _scene(
+                rows,
+                direction,
+                rate_hz,
+                f"highd-{stem}-{side}",
+                tracks,
+                count,
+            )
             if scene is not None:
                 yield scene
 
 
-def _read_recording_meta(path: Path) -> tuple[float, tuple[_Direction, _Direction]]:
+def _read_recording_meta(
+    path: Path,
+) -> tuple[float, tuple[_Direction, _Direction]]:
     """Frame rate in Hz, and both directions.
 
     Lane ids grow downwards from 2; the id between the directions is unused.
     """
     rate_hz, upper_text, lower_text = read_table(path, _META).select(_META.keys()).row(0)
+    # Frames are dropped or interpolated, never invented.
     if rate_hz < 10.0:
         raise UserError(f"{path}, line 2, column framerate: {rate_hz}, expected 10 Hz or more.")
     upper = _markings(upper_text, path, "upperlanemarkings")
     lower = _markings(lower_text, path, "lowerlanemarkings")
-    n_upper, n_lower = len(upper) - 1, len(lower) - 1
+    n_upper = len(upper) - 1
+    n_lower = len(lower) - 1
+    # Upper lanes: the rightmost one, seen by its drivers, is at the top of the image.
     upper_ids = tuple(range(2, 2 + n_upper))
     lower_ids = tuple(range(n_upper + 2 + n_lower, n_upper + 2, -1))
     return rate_hz, (
-        _Direction(UPPER, upper_ids, upper[0], (upper[-1] - upper[0]) / n_upper),
-        _Direction(LOWER, lower_ids, lower[-1], (lower[-1] - lower[0]) / n_lower),
+        _Direction(
+            UPPER,
+            upper_ids,
+            upper[0],
+            (upper[-1] - upper[0]) / n_upper,
+        ),
+        _Direction(
+            LOWER,
+            lower_ids,
+            lower[-1],
+            (lower[-1] - lower[0]) / n_lower,
+        ),
     )
 
 
@@ -121,18 +158,32 @@ def _read_rows(path: Path, meta: Path, count: RowCount) -> pl.DataFrame:
     cars = read_table(meta, {"id": pl.Int64, "drivingdirection": pl.Int64})
     direction = cars["drivingdirection"]
     what = "is neither 1 (upper lanes) nor 2 (lower lanes)"
-    raise_where(~direction.is_in([UPPER, LOWER]), cars, "drivingdirection", meta, what)
+    raise_where(
+        ~direction.is_in([UPPER, LOWER]),
+        cars,
+        "drivingdirection",
+        meta,
+        what,
+    )
     rows = read_table(path, COLUMNS)
     count.read += rows.height
     for name in ("width", "height"):
         raise_where(rows[name] <= 0.0, rows, name, path, "is not above 0")
+    # Sorting would hide a damaged frame number.
     step = rows.select(pl.col("frame").diff().over("id")).to_series()
     what = "is not after the last frame of its vehicle; frames must grow"
     raise_where(step <= 0, rows, "frame", path, what)
+    # Each row gets the direction of its vehicle.
     directions = rows["id"].replace_strict(
         cars["id"], direction, default=None, return_dtype=pl.Int64
     )
-    raise_where(directions.is_null(), rows, "id", path, "is not in the tracksMeta file")
+    raise_where(
+        directions.is_null(),
+        rows,
+        "id",
+        path,
+        "is not in the tracksMeta file",
+    )
     return rows.with_columns(directions.alias("direction")).sort("id", "frame")
 
 
@@ -146,11 +197,13 @@ def _scene(
 ) -> Scene | None:
     """One direction in the schema, with a frame every 0.1 s; None where it has no vehicles."""
     rows = rows.filter(pl.col("direction") == direction.number)
+    # A lane id of the other direction, or none, is an error of the tracking.
     on_road = rows["laneid"].is_in(list(direction.lane_ids))
     count.drop("off the lanes of its direction", (~on_road).sum())
     rows = rows.filter(on_road)
     if rows.is_empty():
         return None
+    # Distances grow in the direction of travel.
     forward = -1.0 if direction.number == UPPER else 1.0
     along = forward * (pl.col("x") + 0.5 * pl.col("width"))
     # Upper lanes: left is down in the image, where y grows; lower lanes: left is up.
@@ -167,11 +220,16 @@ def _scene(
         length="width",
         width="height",
     )
+    # Rows that were dropped split a track: nothing is interpolated across a gap.
     tracks = number_tracks(turned, str(path)).partition_by("vehicle", maintain_order=True)
     frame = pl.concat([resample(track, rate_hz) for track in tracks])
     if frame.is_empty():
         return None
-    frame = validate(frame.select(SCHEMA.names()), f"{path}, {name}", first_line=None)
+    frame = validate(
+        frame.select(SCHEMA.names()),
+        f"{path}, {name}",
+        first_line=None,
+    )
     return Scene(name, sort(frame), direction.lane_width)
 
 
@@ -183,10 +241,13 @@ def resample(track: pl.DataFrame, rate_hz: float) -> pl.DataFrame:
     per_step = rate_hz * FRAME_S
     old = track["frame"].to_numpy()
     # A small tolerance, so that a new frame at the time of an old one stays in spite of rounding.
-    first, last = np.ceil(old[0] / per_step - 1e-9), np.floor(old[-1] / per_step + 1e-9)
+    first = np.ceil(old[0] / per_step - 1e-9)
+    last = np.floor(old[-1] / per_step + 1e-9)
     frame = np.arange(first, last + 1.0)
+    # Places of the new frames among the old samples.
     place = (frame * per_step - old[0]).clip(0.0, len(old) - 1)
     nearest = np.ceil(place - 0.5 - 1e-9).astype(np.int64)
+    # Numbers are interpolated; lane and names are those of the nearest sample.
     columns = {
         name: np.interp(place, np.arange(len(old)), track[name].to_numpy())
         for name in ("x", "y", "speed", "length", "width")

@@ -23,7 +23,13 @@ from typing import Final
 import polars as pl
 
 from ganlane.data.lanes import lane_grid
-from ganlane.data.schema import SCHEMA, RowCount, Scene, number_tracks, sort
+from ganlane.data.schema import (
+    SCHEMA,
+    RowCount,
+    Scene,
+    number_tracks,
+    sort,
+)
 from ganlane.data.tables import (
     LINE,
     OnProgress,
@@ -35,20 +41,41 @@ from ganlane.data.tables import (
     read_blocks,
 )
 from ganlane.errors import UserError
-from ganlane.parameters.generator import MOTORWAYS, NgsimParameters
+from ganlane.parameters.generator import (
+    MOTORWAYS,
+    NgsimParameters,
+)
 
 FOOT_M: Final = 0.3048
 FRAME_MS: Final = 100
 #: The 18 columns of the raw text files, which have no header.
 RAW_NAMES: Final = (
-    "vehicle_id frame_id total_frames global_time local_x local_y global_x global_y "
-    "v_length v_width v_class v_vel v_acc lane_id preceding following "
-    "space_headway time_headway"
-).split()
+    "vehicle_id",
+    "frame_id",
+    "total_frames",
+    "global_time",
+    "local_x",
+    "local_y",
+    "global_x",
+    "global_y",
+    "v_length",
+    "v_width",
+    "v_class",
+    "v_vel",
+    "v_acc",
+    "lane_id",
+    "preceding",
+    "following",
+    "space_headway",
+    "time_headway",
+)
 #: Columns that are read; ``location`` too, where it exists.
 COLUMNS: Final = {
     **dict.fromkeys(("vehicle_id", "frame_id", "global_time"), pl.Int64),
-    **dict.fromkeys(("local_x", "local_y", "v_length", "v_width", "v_vel"), pl.Float64),
+    **dict.fromkeys(
+        ("local_x", "local_y", "v_length", "v_width", "v_vel"),
+        pl.Float64,
+    ),
     "lane_id": pl.Int64,
 }
 LOCATION: Final = "location"
@@ -85,8 +112,10 @@ def ngsim_scenes(
     Raises:
         UserError: a missing or damaged file; the message names file, line and column.
     """
-    path, parameters = Path(path), parameters or NgsimParameters()
+    path = Path(path)
+    parameters = parameters or NgsimParameters()
     count = count if count is not None else RowCount()
+    # Nothing is read before the first period is asked for.
     rows = _read_rows(_layout(path), parameters, count, on_progress)
     with tempfile.TemporaryDirectory(dir=scratch, prefix="rows-") as folder:
         periods = _store_by_period(rows, Path(folder), str(path))
@@ -110,36 +139,52 @@ def _layout(path: Path) -> TextTable:
             f"{path}, line 1: {len(fields)} columns; expected the {len(RAW_NAMES)} of NGSIM's text "
             "files, or a header line."
         )
-    return TextTable(path, tuple(RAW_NAMES), has_header=False, blanks=True)
+    return TextTable(path, RAW_NAMES, has_header=False, blanks=True)
 
 
 def _read_rows(
-    table: TextTable, parameters: NgsimParameters, count: RowCount, on_progress: OnProgress | None
+    table: TextTable,
+    parameters: NgsimParameters,
+    count: RowCount,
+    on_progress: OnProgress | None,
 ) -> Iterator[pl.DataFrame]:
     """Blocks with :data:`COLUMNS`, ``location`` and ``line``, in feet, in the order of the file."""
-    path, has_location = table.path, LOCATION in table.names
+    path = table.path
+    has_location = LOCATION in table.names
     wanted = [*COLUMNS, LOCATION] if has_location else list(COLUMNS)
     for text in read_blocks(table, wanted, parameters.block_bytes, on_progress):
         count.read += text.height
+        # A raw text file is of one place, which its name tells.
         if has_location:
             text = _keep_locations(text, path, parameters.locations, count)
         else:
             text = text.with_columns(pl.lit(path.stem).alias(LOCATION))
+        # Only the wanted rows are converted: others may be damaged.
         columns = [convert(text, name, kind, path) for name, kind in COLUMNS.items()]
         rows = pl.DataFrame([*columns, text[LOCATION], text[LINE]])
         for name in ("v_length", "v_width"):
-            raise_where(rows[name] <= 0.0, rows, name, path, "is not above 0")
+            raise_where(
+                rows[name] <= 0.0,
+                rows,
+                name,
+                path,
+                "is not above 0",
+            )
         raise_where(rows["v_vel"] < 0.0, rows, "v_vel", path, "is below 0")
         yield rows
 
 
 def _keep_locations(
-    text: pl.DataFrame, path: Path, locations: tuple[str, ...], count: RowCount
+    text: pl.DataFrame,
+    path: Path,
+    locations: tuple[str, ...],
+    count: RowCount,
 ) -> pl.DataFrame:
     """Rows of the wanted locations; rows of others are dropped and counted."""
     text = text.with_columns(convert(text, LOCATION, pl.String, path).str.to_lowercase())
     places = sorted({*MOTORWAYS, *STREETS, *locations})
     what = f"is no known place, expected {', '.join(places)}, or name it in data.locations"
+    # A mistyped place would drop a whole recording in silence.
     raise_where(~text[LOCATION].is_in(places), text, LOCATION, path, what)
     wanted = text[LOCATION].is_in(list(locations))
     for location, rows in text[LOCATION].filter(~wanted).value_counts().iter_rows():
@@ -159,10 +204,13 @@ def _store_by_period(
     for number, block in enumerate(blocks):
         block = block.with_columns(minute=start_ms // 60_000)
         for rows in block.partition_by(LOCATION, "minute", maintain_order=True):
-            location, minute = rows[LOCATION][0], rows["minute"][0]
+            location = rows[LOCATION][0]
+            minute = rows["minute"][0]
+            # Numbered by block: the rows of a period keep the order of the file.
             part = folder / f"{len(parts):04d}-{number:05d}-{minute}.arrow"
             rows.drop(LOCATION, "minute").write_ipc(part, compression="lz4")
             parts.setdefault((location, minute), []).append(part)
+        # Checked at each block, before a damaged file fills the disk.
         if len(parts) > MAX_PERIODS:
             raise UserError(
                 f"{source}, columns global_time and frame_id: they hold {len(parts)} recording "
@@ -196,23 +244,32 @@ def _read(parts: list[Path]) -> pl.DataFrame:
     return pl.concat([pl.read_ipc(part) for part in parts])
 
 
-def _scene(name: str, rows: pl.DataFrame, path: Path, lanes: int, count: RowCount) -> Scene | None:
+def _scene(
+    name: str,
+    rows: pl.DataFrame,
+    path: Path,
+    lanes: int,
+    count: RowCount,
+) -> Scene | None:
     """The ``rows`` of one period in the schema; None where none of them is on a lane."""
     source = f"{path}, {name}"
     rows = _drop_duplicates(rows, count)
     _check_order(rows, path)
     _check_units(rows, source)
+    # Rows beyond the lanes that are kept end a track.
     count.drop("lane below 1", (rows["lane_id"] < 1).sum())
     count.drop("ramp", (rows["lane_id"] > lanes).sum())
     rows = rows.filter(rows["lane_id"].is_between(1, lanes))
     if rows.is_empty():
         return None
+    # NGSIM counts lanes from the left, from 1.
     from_left = rows["lane_id"].to_numpy() - 1
     right_m = FOOT_M * rows["local_x"].to_numpy()
     # Every n-th row is enough to estimate the lanes, and bounds the memory.
     part = slice(None, None, -(-len(right_m) // ROWS_FOR_LANES))
     width, first_centre = lane_grid(right_m[part], from_left[part], source)
     last = int(from_left.max())
+    # Front centres in feet become centres of the body in metres.
     frame = rows.select(
         pl.lit(name).alias("scene"),
         pl.col("vehicle_id").alias("vehicle"),
@@ -224,7 +281,11 @@ def _scene(name: str, rows: pl.DataFrame, path: Path, lanes: int, count: RowCoun
         length=FOOT_M * pl.col("v_length"),
         width=FOOT_M * pl.col("v_width"),
     )
-    return Scene(name, sort(number_tracks(frame, str(path))).select(SCHEMA.names()), width)
+    return Scene(
+        name,
+        sort(number_tracks(frame, str(path))).select(SCHEMA.names()),
+        width,
+    )
 
 
 def _drop_duplicates(rows: pl.DataFrame, count: RowCount) -> pl.DataFrame:
@@ -232,16 +293,25 @@ def _drop_duplicates(rows: pl.DataFrame, count: RowCount) -> pl.DataFrame:
 
     Of several rows of one vehicle at one time the first in the file is kept.
     """
+    # The file's own order decides which of several rows is the first.
     rows = rows.sort("vehicle_id", "global_time", LINE)
     unequal = rows.unique(list(COLUMNS), keep="first", maintain_order=True)
-    first = unequal.unique(["vehicle_id", "global_time"], keep="first", maintain_order=True)
+    first = unequal.unique(
+        ["vehicle_id", "global_time"],
+        keep="first",
+        maintain_order=True,
+    )
     count.drop("duplicate", rows.height - unequal.height)
-    count.drop("same vehicle and time, other values", unequal.height - first.height)
+    count.drop(
+        "same vehicle and time, other values",
+        unequal.height - first.height,
+    )
     return first
 
 
 def _check_order(rows: pl.DataFrame, path: Path) -> None:
     """Frames must grow with time, and be 100 ms apart."""
+    # Differences within each vehicle.
     steps = rows.select(
         frames=pl.col("frame_id").diff().over("vehicle_id"),
         ms=pl.col("global_time").diff().over("vehicle_id"),
@@ -249,11 +319,18 @@ def _check_order(rows: pl.DataFrame, path: Path) -> None:
     what = "does not grow with global_time within its vehicle"
     raise_where(steps["frames"] <= 0, rows, "frame_id", path, what)
     apart = steps["ms"] != FRAME_MS * steps["frames"]
-    raise_where(apart, rows, "global_time", path, "is not 100 ms a frame after the row before")
+    raise_where(
+        apart,
+        rows,
+        "global_time",
+        path,
+        "is not 100 ms a frame after the row before",
+    )
 
 
 def _check_units(rows: pl.DataFrame, source: str) -> None:
     """Lengths, positions or speeds that cannot be in feet and seconds."""
+    # Any line of the period will do: the unit is that of the whole column.
     line = int(rows[LINE].min())  # type: ignore[arg-type]
     length = float(rows["v_length"].median())  # type: ignore[arg-type]
     if not LENGTHS_FT[0] <= length <= LENGTHS_FT[1]:
@@ -262,11 +339,14 @@ def _check_units(rows: pl.DataFrame, source: str) -> None:
             f"{source}, from line {line}, column v_length: the median is {length:.1f}, expected "
             f"feet, about 15; they look like {guess}, convert all columns to feet."
         )
+    # The pace is distance over speed times time, 1 in consistent units.
     distance = pl.col("local_y").last() - pl.col("local_y").first()
     seconds = (pl.col("global_time").last() - pl.col("global_time").first()) / 1000.0
     speed = pl.col("v_vel").mean()
     per_vehicle = rows.group_by("vehicle_id", maintain_order=True).agg(
-        pace=distance / (seconds * speed), rows=pl.len(), speed=speed
+        pace=distance / (seconds * speed),
+        rows=pl.len(),
+        speed=speed,
     )
     moving = per_vehicle.filter((pl.col("rows") >= _PACE_FRAMES) & (pl.col("speed") >= _PACE_FT_S))
     pace = moving["pace"].median()

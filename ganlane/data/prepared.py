@@ -13,8 +13,17 @@ from typing import Any, Final
 
 import numpy as np
 
-from ganlane.data.lanes import LaneChanges, find_lane_changes, tracks_of_frame
-from ganlane.data.recordings import PARQUET, cut_into_scenes, open_scenes, write_prepared
+from ganlane.data.lanes import (
+    LaneChanges,
+    find_lane_changes,
+    tracks_of_frame,
+)
+from ganlane.data.recordings import (
+    PARQUET,
+    cut_into_scenes,
+    open_scenes,
+    write_prepared,
+)
 from ganlane.data.schema import FRAME_S, RowCount, Scene
 from ganlane.data.statistics import (
     Bins,
@@ -81,24 +90,31 @@ class PooledStatistics:
 
     def add(self, scene: Scene) -> SceneSummary:
         """Measure one more scene."""
-        frame, exposure = scene.frame, measure_exposure(scene.frame)
+        frame = scene.frame
+        exposure = measure_exposure(scene.frame)
         tracks = tracks_of_frame(frame, {scene.name: scene.lane_width_m})
         changes = find_lane_changes(tracks)
         self._exposures.append(exposure)
         self._changes.append(changes)
+        # Histograms, so that memory does not grow with the recordings.
         for name, values in quantities(frame).items():
             self.histograms[name].add(values)
             if name == "headway":
                 self._headways.append(values)
+            # The bins do not end at 3 m/s2, so these are counted apart.
             if name in self._strong:
                 self._strong[name] += int(np.count_nonzero(np.abs(values) > 3.0))
         speed = float(frame["speed"].mean())  # type: ignore[arg-type]
+        # A scene's own rates, for the table.
         rates = lane_change_statistics(changes, exposure, speed)
         summary = SceneSummary(
             name=scene.name,
             rows=frame.height,
             tracks=exposure.tracks,
-            seconds=round(FRAME_S * int(np.ptp(frame["frame"].to_numpy()) + 1), 1),
+            seconds=round(
+                FRAME_S * int(np.ptp(frame["frame"].to_numpy()) + 1),
+                1,
+            ),
             lanes=scene.lanes,
             lane_width_m=scene.lane_width_m,
             nearest_lane_share=float(np.mean(tracks.lane == frame["lane"].to_numpy())),
@@ -117,8 +133,12 @@ class PooledStatistics:
     def exposure(self) -> Exposure:
         """Total amount of driving; the road's length is the mean over the cars."""
         parts = _columns(self._exposures)
+        # Weighted by cars, as equation 9 counts them.
         road_m = float(np.average(parts.pop("road_m"), weights=parts["cars"]))
-        return Exposure(road_m=road_m, **{name: sum(values) for name, values in parts.items()})
+        return Exposure(
+            road_m=road_m,
+            **{name: sum(values) for name, values in parts.items()},
+        )
 
     @property
     def changes(self) -> LaneChanges:
@@ -130,7 +150,9 @@ class PooledStatistics:
     def lane_changes(self) -> LaneChangeStatistics:
         """Rates, durations and lateral speeds over all scenes."""
         return lane_change_statistics(
-            self.changes, self.exposure, float(self.describe("speed").mean or 0.0)
+            self.changes,
+            self.exposure,
+            float(self.describe("speed").mean or 0.0),
         )
 
     def describe(self, quantity: str) -> Distribution:
@@ -208,11 +230,19 @@ def prepare_recordings(
     Raises:
         UserError: a damaged or missing file, no moving vehicle in it, or ``out`` exists already.
     """
-    count, statistics, files, written = RowCount(), PooledStatistics(), [], 0
+    # Everything is written into a hidden folder first.
+    count = RowCount()
+    statistics = PooledStatistics()
+    files = []
+    written = 0
     with whole_folder(out) as folder:
         for scene in open_scenes(kind, path, count, parameters, folder, on_progress):
+            # A lot of parked cars has no driving to measure.
             if scene.frame["speed"].max() == 0.0 or scene.frame["frame"].n_unique() < 2:
-                count.drop("scene in which nobody drives", scene.frame.height)
+                count.drop(
+                    "scene in which nobody drives",
+                    scene.frame.height,
+                )
                 continue
             summary = statistics.add(scene)
             # Letters, digits, dots and dashes.
@@ -220,6 +250,7 @@ def prepare_recordings(
             if file in files:
                 raise UserError(f"{path}: a second scene that {file} is the file of; rename one.")
             files.append(file)
+            # Measured whole: cutting would censor lane changes.
             frame = cut_into_scenes(scene.frame, scene_s) if scene_s else scene.frame
             write_prepared(frame, folder / file)
             written += frame.height
@@ -242,11 +273,13 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
         OSError: it names ``path``, or the file in it that was to be written.
     """
     path = Path(path)
+    # Never into a folder that holds something: it may be another recording.
     if path.is_file() or (path.is_dir() and any(path.iterdir())):
         raise UserError(
             f"{path}: there already; choose another folder with out=FOLDER, or remove it."
         )
     path.parent.mkdir(parents=True, exist_ok=True)
+    # Beside the folder, so that the last step is a rename.
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         shutil.rmtree(part, ignore_errors=True)  # of a killed process that had the same number
@@ -256,11 +289,14 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
             path.rmdir()
         part.replace(path)
     except OSError as error:
+        # The hidden folder means nothing to the user.
         name = str(error.filename)
         if not name.startswith(str(part)):
             raise
         raise OSError(
-            error.errno, error.strerror, str(path) + name.removeprefix(str(part))
+            error.errno,
+            error.strerror,
+            str(path) + name.removeprefix(str(part)),
         ) from error
     finally:
         shutil.rmtree(part, ignore_errors=True)

@@ -16,10 +16,28 @@ import polars as pl
 from ganlane.data.highd import highd_scenes
 from ganlane.data.lanes import lane_width, scene_lane_widths
 from ganlane.data.ngsim import ngsim_scenes
-from ganlane.data.schema import FRAME_S, SCHEMA, RowCount, Scene, sort, validate
-from ganlane.data.tables import OnProgress, raise_where, read_table, reason
+from ganlane.data.schema import (
+    FRAME_S,
+    SCHEMA,
+    RowCount,
+    Scene,
+    sort,
+    validate,
+)
+from ganlane.data.tables import (
+    OnProgress,
+    raise_where,
+    read_table,
+    reason,
+)
 from ganlane.errors import UserError
-from ganlane.files import PLACE, atomic_path, has_checksum, sealed, write_bytes
+from ganlane.files import (
+    PLACE,
+    atomic_path,
+    has_checksum,
+    sealed,
+    write_bytes,
+)
 from ganlane.parameters.generator import NgsimParameters
 
 #: Columns of a scene CSV: the schema's, but the speed is ``v``; ``y`` is positive to the left and 0
@@ -46,6 +64,7 @@ def read_scenes(path: str | Path) -> pl.DataFrame:
 
 def write_prepared(frame: pl.DataFrame, path: str | Path) -> None:
     """Write a frame in the schema as Parquet with a checksum, atomically."""
+    # In memory first, since the checksum covers the whole content.
     file = io.BytesIO()
     frame.write_parquet(file, compression="zstd", metadata={"checksum": PLACE})
     write_bytes(path, sealed(file.getvalue()))
@@ -79,6 +98,7 @@ def cut_into_scenes(frame: pl.DataFrame, seconds: float) -> pl.DataFrame:
     ``us-101-1`` becomes ``us-101-1-000``, ``us-101-1-001`` and so on; frame numbers do not change.
     """
     frames = max(1, round(seconds / FRAME_S))
+    # Frames are numbered from any number on.
     first = pl.col("frame").min().over("scene")
     number = ((pl.col("frame") - first) // frames).cast(pl.String).str.zfill(3)
     return sort(frame.with_columns(scene=pl.col("scene") + "-" + number))
@@ -91,6 +111,7 @@ def _read_files(path: Path) -> Iterator[pl.DataFrame]:
         raise UserError(
             f"{path}: no such file as *{PARQUET} in this folder; give what ganlane prepare wrote."
         )
+    # Two files that hold one scene would mix its vehicles.
     file_of: dict[str, Path] = {}
     for file in files:
         frame = _read_parquet(file) if file.suffix == PARQUET else _read_csv(file)
@@ -104,14 +125,28 @@ def _read_files(path: Path) -> Iterator[pl.DataFrame]:
 
 def _read_csv(path: Path) -> pl.DataFrame:
     table = read_table(path, COLUMNS).rename({"v": "speed"})
-    raise_where(table["lane"] < 1, table, "lane", path, "is below 1, the leftmost lane")
+    raise_where(
+        table["lane"] < 1,
+        table,
+        "lane",
+        path,
+        "is below 1, the leftmost lane",
+    )
     scenes = []
     for (name,), scene in validate(table, str(path)).group_by("scene"):
         from_left = scene["lane"].to_numpy() - 1
-        width = lane_width(-scene["y"].to_numpy(), from_left, f"{path}, scene {name}")
+        width = lane_width(
+            -scene["y"].to_numpy(),
+            from_left,
+            f"{path}, scene {name}",
+        )
+        # The rightmost lane in use becomes 0.
         last = int(from_left.max())
         scenes.append(
-            scene.with_columns(y=pl.col("y") + last * width, lane=last + 1 - pl.col("lane"))
+            scene.with_columns(
+                y=pl.col("y") + last * width,
+                lane=last + 1 - pl.col("lane"),
+            )
         )
     return pl.concat(scenes)
 
@@ -121,6 +156,7 @@ def _read_parquet(path: Path) -> pl.DataFrame:
         raise UserError(
             f"{path}: no such file; give a Parquet file that ganlane prepare wrote, or its folder."
         )
+    # The checksum is that of the whole file.
     content = path.read_bytes()
     has_checksum(content, path)  # tables of other programs have none
     try:
@@ -129,6 +165,7 @@ def _read_parquet(path: Path) -> pl.DataFrame:
         raise UserError(
             f"{path}: not a readable Parquet file ({reason(error)}); prepare it again."
         ) from error
+    # Rows of Parquet are no lines of text.
     return validate(frame, str(path), first_line=None)
 
 
@@ -148,6 +185,7 @@ def open_scenes(
     Raises:
         UserError: a damaged or missing file, or an unknown kind.
     """
+    # Each reader yields one scene after the other.
     if kind == "ngsim":
         yield from ngsim_scenes(path, parameters, count, scratch, on_progress)
     elif kind == "highd":
@@ -175,7 +213,13 @@ def read_recordings(
     """
     if kind == "scenes":
         return read_scenes(path)
-    scenes = open_scenes(kind, path, RowCount(), parameters, on_progress=on_progress)
+    scenes = open_scenes(
+        kind,
+        path,
+        RowCount(),
+        parameters,
+        on_progress=on_progress,
+    )
     frames = [scene.frame for scene in scenes]
     if not frames:
         raise UserError(

@@ -90,18 +90,24 @@ def number_tracks(frame: pl.DataFrame, source: str) -> pl.DataFrame:
     Raises:
         UserError: a vehicle number is negative or not below :data:`TRACK_STRIDE`.
     """
+    # Numbers at or above the stride would look like later tracks.
     low, high = frame.select(low=pl.col("vehicle").min(), high=pl.col("vehicle").max()).row(0)
     if low < 0 or high >= TRACK_STRIDE:
         raise UserError(
             f"{source}: vehicle numbers from {low} to {high}; expected 0 to {TRACK_STRIDE - 1}, "
             "number them anew."
         )
+    # A new track begins after each missing frame of the same car.
     gap = (pl.col("frame").diff() != 1) & (pl.col("vehicle").diff() == 0)
     track = gap.fill_null(False).cast(pl.Int64).cum_sum().over("vehicle")
     return frame.with_columns(vehicle=pl.col("vehicle") + TRACK_STRIDE * track)
 
 
-def validate(frame: pl.DataFrame, source: str, first_line: int | None = FIRST_LINE) -> pl.DataFrame:
+def validate(
+    frame: pl.DataFrame,
+    source: str,
+    first_line: int | None = FIRST_LINE,
+) -> pl.DataFrame:
     """Check a frame against the schema and return its columns in order; rows are unchanged.
 
     Args:
@@ -114,6 +120,7 @@ def validate(frame: pl.DataFrame, source: str, first_line: int | None = FIRST_LI
         UserError: a missing column, no rows, NaN or null, a frame number that does not grow within
             its track, a size of 0 or less, or units that cannot be metres and metres per second.
     """
+    # Columns beyond the schema are ignored.
     missing = [name for name in SCHEMA if name not in frame.columns]
     if missing:
         raise UserError(f"{source}: no column {', '.join(missing)}; expected {', '.join(SCHEMA)}.")
@@ -126,6 +133,7 @@ def validate(frame: pl.DataFrame, source: str, first_line: int | None = FIRST_LI
             raise UserError(
                 f"{source}, column {name}: {frame[name].dtype} found, {kind} expected."
             ) from error
+    # From the plainest damage to units that are plausible alone only.
     checked = _Checked(frame.select(SCHEMA.names()), source, first_line)
     checked.check_rows()
     checked.check_frame_rate()
@@ -149,6 +157,7 @@ class _Checked:
     def check_rows(self) -> None:
         """What one row, or one row and its predecessor in the track, are enough to show."""
         step = pl.col("frame").diff().over(TRACK)
+        # What is wrong, by column, in the order in which it is reported.
         bad: list[tuple[str, str, pl.Expr]] = []
         for name in ("x", "y", "speed"):
             is_number = pl.col(name).is_finite().fill_null(False)
@@ -156,9 +165,21 @@ class _Checked:
         for name in ("scene", "vehicle", "frame", "lane"):
             bad.append((name, "is missing", pl.col(name).is_null()))
         for name in ("length", "width"):
-            bad.append((name, "is not above 0", ~(pl.col(name) > 0.0).fill_null(False)))
+            bad.append(
+                (
+                    name,
+                    "is not above 0",
+                    ~(pl.col(name) > 0.0).fill_null(False),
+                )
+            )
         bad.append(("frame", "comes twice in its track", step == 0))
-        bad.append(("frame", "is before its track's last frame; frames must grow", step < 0))
+        bad.append(
+            (
+                "frame",
+                "is before its track's last frame; frames must grow",
+                step < 0,
+            )
+        )
         for column, what, is_bad in bad:
             rows = self.frame.select(is_bad.arg_true()).to_series()
             if len(rows):
@@ -180,25 +201,41 @@ class _Checked:
 
     def check_units(self) -> None:
         """Positions, speeds or sizes that cannot be in metres and seconds."""
+        # Distance per time, from one row to the next of a track.
         moved, frames = (pl.col(name).diff().over(TRACK) for name in ("x", "frame"))
         rates = moved / (frames * FRAME_S)
+        # Medians, which a few damaged rows do not move.
         speed, length, rate = self.frame.select(
-            pl.col("speed", "length").median(), rate=rates.median()
+            pl.col("speed", "length").median(),
+            rate=rates.median(),
         ).row(0)
         for column, median, bound, unit in (
-            ("speed", speed, MAX_MEDIAN_SPEED_MPS, "m/s; convert to m/s"),
-            ("length", length, MAX_MEDIAN_LENGTH_M, "m; convert feet to m"),
+            (
+                "speed",
+                speed,
+                MAX_MEDIAN_SPEED_MPS,
+                "m/s; convert to m/s",
+            ),
+            (
+                "length",
+                length,
+                MAX_MEDIAN_LENGTH_M,
+                "m; convert feet to m",
+            ),
         ):
             if median > bound:
                 row = int((self.frame[column] > bound).arg_max() or 0)
                 self.refuse(
-                    row, f"column {column}: the median is {median:.1f}, which cannot be {unit}"
+                    row,
+                    f"column {column}: the median is {median:.1f}, which cannot be {unit}",
                 )
         # Standing traffic shows no ratio.
         if rate is None or max(abs(rate), abs(speed)) < 1.0:
             return
+        # Not even rounded positions give another ratio than about 1.
         if not speed / MAX_SPEED_RATIO < rate < speed * MAX_SPEED_RATIO:
-            low, high = pl.col("speed") / MAX_SPEED_RATIO, pl.col("speed") * MAX_SPEED_RATIO
+            low = pl.col("speed") / MAX_SPEED_RATIO
+            high = pl.col("speed") * MAX_SPEED_RATIO
             differs = (~rates.is_between(low, high)).fill_null(False)
             row = self.frame.select(differs.arg_true().first()).item()
             self.refuse(

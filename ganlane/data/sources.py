@@ -14,7 +14,10 @@ from tqdm import tqdm
 from ganlane.data.download import download
 from ganlane.data.tables import OnProgress
 from ganlane.errors import UserError
-from ganlane.parameters.generator import DataConfig, NgsimDataConfig
+from ganlane.parameters.generator import (
+    DataConfig,
+    NgsimDataConfig,
+)
 
 #: Environment variable with the folder of the recordings.
 DATA_VARIABLE: Final = "GANLANE_DATA"
@@ -30,6 +33,7 @@ def data_folder() -> Path | None:
     Raises:
         UserError: the folder in ``GANLANE_DATA`` does not exist.
     """
+    # A folder that was named must be there; the others may be.
     named = os.environ.get(DATA_VARIABLE)
     if named:
         if not Path(named).is_dir():
@@ -38,8 +42,12 @@ def data_folder() -> Path | None:
                 "or unset it."
             )
         return Path(named)
+    # An installed package has no checkout around it, which does no harm.
     checkout = Path(__file__).resolve().parents[2]
-    candidates = (checkout.parent / _FOLDER, Path.cwd().parent / _FOLDER)
+    candidates = (
+        checkout.parent / _FOLDER,
+        Path.cwd().parent / _FOLDER,
+    )
     return next((folder for folder in candidates if folder.is_dir()), None)
 
 
@@ -54,6 +62,7 @@ def default_scenes() -> Path:
     for path in candidates:
         if path.is_file():
             return path
+    # The message names what was looked for.
     looked = ", ".join(map(str, candidates)) or f"../{_FOLDER}"
     raise UserError(
         f"no recordings found (looked for {looked}); give data.path=FILE with a scene CSV, or set "
@@ -82,6 +91,7 @@ def byte_progress(what: str) -> Iterator[OnProgress]:
 
     Without a terminal every 10 s, and nothing of shorter work.
     """
+    # Log files get a line every ten seconds at most.
     quiet_s = 0.0 if sys.stderr.isatty() else 10.0
     with tqdm(
         desc=what,

@@ -44,9 +44,12 @@ def synthetic_scenes(traffic: SyntheticTraffic | None = None, seed: int = 0) -> 
 
 def _scene(traffic: SyntheticTraffic, number: int, seed: int) -> pl.DataFrame:
     """One scene; every vehicle is present in every frame."""
+    # Each scene has a seed of its own: their number changes none of them.
     random = np.random.default_rng((seed, number))
-    n, frames = traffic.vehicles, round(traffic.seconds / FRAME_S)
+    n = traffic.vehicles
+    frames = round(traffic.seconds / FRAME_S)
     time = np.arange(frames) * FRAME_S
+    # All lanes are used equally.
     home = random.permutation(np.arange(n) % traffic.lanes)
     # Along the road: a slot each, and a sine around one speed.
     swing = random.uniform(0.3, 1.0, (n, 1)) * traffic.speed_swing_mps
@@ -56,6 +59,7 @@ def _scene(traffic: SyntheticTraffic, number: int, seed: int) -> pl.DataFrame:
     slots = (np.arange(n) * traffic.slot_m)[:, None]
     x = slots + traffic.speed_mps * time + swing / omega * np.sin(omega * time + phase)
     y = home[:, None] * traffic.lane_width_m + _across(traffic, time, home, random)
+    # The nearest lane, as recordings have it.
     lane = np.rint(y / traffic.lane_width_m).clip(0, traffic.lanes - 1).astype(np.int64)
     columns = {
         "scene": np.full(n * frames, f"synthetic-{number}"),
@@ -72,21 +76,29 @@ def _scene(traffic: SyntheticTraffic, number: int, seed: int) -> pl.DataFrame:
 
 
 def _across(
-    traffic: SyntheticTraffic, time: np.ndarray, home: np.ndarray, random: np.random.Generator
+    traffic: SyntheticTraffic,
+    time: np.ndarray,
+    home: np.ndarray,
+    random: np.random.Generator,
 ) -> np.ndarray:
     """Offsets from the first lane's centre, [vehicles, frames].
 
     A slow wander, and for some a lane change.
     """
-    n, end = traffic.vehicles, time[-1]
-    pace, phase = random.uniform(0.3, 0.8, (n, 1)), random.uniform(0.0, 6.28, (n, 1))
+    n = traffic.vehicles
+    end = time[-1]
+    pace = random.uniform(0.3, 0.8, (n, 1))
+    phase = random.uniform(0.0, 6.28, (n, 1))
     wander = traffic.wander_m * np.sin(pace * time + phase)
+    # To a random side, away from the edges of the road.
     side = random.choice([-1, 1], n)
     side = np.where(home == traffic.lanes - 1, -1, side)
     side = np.where(home == 0, 1, side)
+    # A change takes up to 5 s and must fit into the recording.
     changes = (random.uniform(size=n) < traffic.changing_share) & (traffic.lanes > 1) & (end > 6.0)
     lasts = random.uniform(3.0, 5.0, n)
     begins = random.uniform(0.5, np.maximum(end - lasts - 0.5, 0.6))
+    # Share of the change that is done, eased by half a cosine.
     done = np.clip((time - begins[:, None]) / lasts[:, None], 0.0, 1.0)
     moved = (changes * side * traffic.lane_width_m)[:, None]
     return wander + moved * 0.5 * (1.0 - np.cos(math.pi * done))

@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import (
+    Callable,
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -56,6 +62,7 @@ def read_table(path: str | Path, columns: Mapping[str, Kind]) -> pl.DataFrame:
 
 def csv_table(path: Path, wanted: Iterable[str]) -> TextTable:
     """Layout of a CSV file from its header, which must hold the ``wanted`` columns in any case."""
+    # Names in any case, with blanks around them.
     header = _fields(first_line(path), f"{path}, line 1")
     names = tuple(name.strip().lower() for name in header)
     missing = [name for name in wanted if name not in names]
@@ -72,6 +79,7 @@ def first_line(path: Path) -> str:
     if not path.is_file():
         raise UserError(f"{path}: no such file; give the path of a text table.")
     with path.open("rb") as file:
+        # A binary file may have no line break at all.
         raw = file.readline(2**16)
     try:
         text = raw.decode("utf-8-sig").strip()
@@ -104,12 +112,16 @@ def convert(text: pl.DataFrame, column: str, kind: Kind, path: Path) -> pl.Serie
     def refuse(bad: pl.Series, what: str) -> None:
         raise_where(bad, text, column, path, what)
 
-    refuse(field.is_null() | (field == ""), "is empty; the row is incomplete")
+    refuse(
+        field.is_null() | (field == ""),
+        "is empty; the row is incomplete",
+    )
     if kind == pl.String:
         return field
     # Any other comma stays, so that the field is reported as no number.
     without = field.str.replace_all(",", "", literal=True)
     field = without.zip_with(field.str.contains(_THOUSANDS), field)
+    # Through floats, since whole numbers may be written as 3.0.
     numbers = field.cast(pl.Float64, strict=False)
     refuse(numbers.is_null(), "is not a number")
     refuse(~numbers.is_finite(), "is not a finite number")
@@ -119,7 +131,13 @@ def convert(text: pl.DataFrame, column: str, kind: Kind, path: Path) -> pl.Serie
     return numbers.cast(kind)
 
 
-def raise_where(bad: pl.Series, rows: pl.DataFrame, column: str, path: Path, what: str) -> None:
+def raise_where(
+    bad: pl.Series,
+    rows: pl.DataFrame,
+    column: str,
+    path: Path,
+    what: str,
+) -> None:
     """Raise a UserError that names the first of the ``rows`` that is ``bad``; null is not bad."""
     if bad.any():
         row = rows.row(bad.fill_null(False).arg_max(), named=True)  # type: ignore[arg-type]
@@ -142,11 +160,13 @@ def read_blocks(
             and line.
     """
     number = FIRST_LINE if table.has_header else 1
-    done, total = 0, table.path.stat().st_size
+    done = 0
+    total = table.path.stat().st_size
     for block, has_no_end in _whole_lines(table, block_bytes):
         # A last line without a line break is a row only if it has all its fields.
         if has_no_end:
             _check_lines(table, block, number, cut_off=True)
+        # A last line without a line break counts.
         rows = block.count(b"\n") + (not block.endswith(b"\n"))
         lines = pl.int_range(number, number + rows, dtype=pl.Int64).alias(LINE)
         yield _parse(table, block, number, rows, wanted).with_columns(lines)
@@ -166,6 +186,7 @@ def _whole_lines(table: TextTable, block_bytes: int) -> Iterator[tuple[bytes, bo
             file.readline()
         rest = b""
         while read := file.read(block_bytes):
+            # Blocks end anywhere; lines do not.
             together = rest + read
             # The last non-empty line is held back: it may be the file's last.
             cut = together.rstrip().rfind(b"\n") + 1
@@ -186,13 +207,18 @@ def _fields(line: str, place: str, blanks: bool = False) -> list[str]:
 
 
 def _parse(
-    table: TextTable, block: bytes, number: int, rows: int, wanted: Sequence[str]
+    table: TextTable,
+    block: bytes,
+    number: int,
+    rows: int,
+    wanted: Sequence[str],
 ) -> pl.DataFrame:
     """The ``wanted`` columns of a block of ``rows`` lines, the first of which is ``number``."""
     separator = " " if table.blanks else ","
     if table.blanks:
         block = b"\n".join(b" ".join(line.split()) for line in block.split(b"\n"))
     # The parser fills short rows with nulls, so they are found by counting separators.
+    # Quoted fields may hold separators, so the count says nothing there.
     expected = rows * (len(table.names) - 1)
     if b'"' not in block and block.count(separator.encode()) != expected:
         _check_lines(table, block, number)
@@ -205,18 +231,27 @@ def _parse(
             has_header=False,
             schema=dict.fromkeys(places, pl.String()),
         )
-    except (pl.exceptions.PolarsError, UnicodeDecodeError) as error:
+    except (
+        pl.exceptions.PolarsError,
+        UnicodeDecodeError,
+    ) as error:
         _check_lines(table, block, number)
         raise UserError(
             f"{table.path}, from line {number}: not a readable table ({error})."
         ) from error
+    # A quoted line break would shift all line numbers below it.
     if frame.height != rows:
         _check_lines(table, block, number)
         raise UserError(f"{table.path}, from line {number}: a row stretches over several lines.")
     return frame.select(pl.col(places[table.names.index(name)]).alias(name) for name in wanted)
 
 
-def _check_lines(table: TextTable, block: bytes, number: int, cut_off: bool = False) -> None:
+def _check_lines(
+    table: TextTable,
+    block: bytes,
+    number: int,
+    cut_off: bool = False,
+) -> None:
     """Raise a UserError that names the first line of a block that does not fit the table.
 
     ``cut_off``: the block is the file's last line and has no line break.
@@ -233,6 +268,7 @@ def _check_lines(table: TextTable, block: bytes, number: int, cut_off: bool = Fa
                 f"{place}: the line is not text; copy or download the file again."
             ) from error
         fields = len(_fields(text, place, table.blanks))
+        # The last column that the row still has.
         column = table.names[max(min(fields, expected) - 1, 0)]
         if fields < expected and cut_off:
             raise UserError(

@@ -44,16 +44,22 @@ def card_numbers(
         long_runs: by traffic, a run per number of vehicles; at least the card's.
         resamples: of the bootstrap.
     """
+    # The card's own traffic comes first everywhere.
     traffic = next(iter(starts.driven))
-    rows, held_out = card_rows(starts, traffic, resamples), None
+    rows = card_rows(starts, traffic, resamples)
+    held_out = None
     if starts.separately_held_out:
+        # What was fitted to the other scenes cannot help here.
         alone = starts.restricted_to(starts.separately_held_out)
         held_out = card_rows(alone, traffic, resamples)
+    # The recordings are the first line of the table.
     driving = {"recorded": starts.recorded.summary()}
     for name, measured in starts.driven.items():
         driving[name] = measured.summary()
-    runs, rate = long_runs[traffic], starts.reference.rate()["per_vehicle_km_ci"]
-    ours, recorded = driving[traffic]["quantiles"], driving["recorded"]["quantiles"]
+    runs = long_runs[traffic]
+    rate = starts.reference.rate()["per_vehicle_km_ci"]
+    ours = driving[traffic]["quantiles"]
+    recorded = driving["recorded"]["quantiles"]
     return {
         "traffic": traffic,
         **starts.description(),
@@ -65,14 +71,29 @@ def card_numbers(
         **totals(runs),
         "long_runs": runs,
         "long_runs_against": {name: long_runs[name] for name in long_runs if name != traffic},
-        "checks": card_checks(rows, ours, recorded, rate, starts.reference.spread_mps, runs),
+        "checks": card_checks(
+            rows,
+            ours,
+            recorded,
+            rate,
+            starts.reference.spread_mps,
+            runs,
+        ),
     }
 
 
 def card_rows(starts: Starts, traffic: str, resamples: int) -> dict[str, Any]:
     """The rows of a traffic's card, compared with every other traffic from the same starts."""
-    floors, recorded = starts.reference.floors, starts.recorded.counts
-    return quantity_rows(traffic, starts.driven, recorded, floors, starts.paired, resamples)
+    floors = starts.reference.floors
+    recorded = starts.recorded.counts
+    return quantity_rows(
+        traffic,
+        starts.driven,
+        recorded,
+        floors,
+        starts.paired,
+        resamples,
+    )
 
 
 def quantity_rows(
@@ -93,22 +114,31 @@ def quantity_rows(
         floors: by driver and quantity, where ``driven`` does not hold the driver.
         paired: whether the recorded units are those that were driven.
     """
+    # The reference drivers are the scale, not rivals.
     rivals = [name for name in driven if name != traffic and name not in FLOORS]
+    # What was driven now comes before what ships.
     ends = {**floors, **floors_of(driven, recorded)}
     rows = {}
     for name, counts in recorded.items():
-        ours, against = driven[traffic].counts[name], {}
+        ours = driven[traffic].counts[name]
+        against = {}
         for rival in rivals:
             theirs = driven[rival].counts[name]
             difference = distance_difference(ours, theirs, counts, paired, resamples)
             against[rival] = {
-                **entries("distance", distance(theirs, counts, paired, resamples)),
+                **entries(
+                    "distance",
+                    distance(theirs, counts, paired, resamples),
+                ),
                 **entries("difference", difference),
                 "verdict": verdict(difference),
             }
         rows[name] = {
             "unit": UNITS[name],
-            **entries("distance", distance(ours, counts, paired, resamples)),
+            **entries(
+                "distance",
+                distance(ours, counts, paired, resamples),
+            ),
             "ceiling": ceiling(counts),
             "floor": ends.get("random", {}).get(name),
             "constant_velocity": ends.get("constant_velocity", {}).get(name),
@@ -130,6 +160,7 @@ def floors_of(
     for driver in (name for name in FLOORS if name in driven):
         floors[driver] = {}
         for name, counts in recorded.items():
+            # A quantity without samples has no distance, and JSON no NaN.
             value = pooled_distance(driven[driver].counts[name], counts)
             if math.isfinite(value):
                 floors[driver][name] = value
@@ -163,13 +194,16 @@ def card_checks(
         spread_mps: recorded mean spread of speeds within a frame.
         runs: the long runs.
     """
+    # Verdicts by rival, of the quantities that matter most.
     rivals: dict[str, dict[str, str]] = {}
     for name in CLOSER_IN:
         for rival, row in quantities[name]["against"].items():
             rivals.setdefault(rival, {})[name] = row["verdict"]
+    # Both tails of the accelerations.
     near: bool | None = True
     for level in ("0.05", "0.95"):
-        value, target = ours["acceleration"][level], recorded["acceleration"][level]
+        value = ours["acceleration"][level]
+        target = recorded["acceleration"][level]
         if value is None or target is None:
             near = None
             break
@@ -182,13 +216,18 @@ def card_checks(
 
 
 def _run_checks(
-    run: Mapping[str, Any], recorded_rate: Sequence[float] | None, spread_mps: float
+    run: Mapping[str, Any],
+    recorded_rate: Sequence[float] | None,
+    spread_mps: float,
 ) -> dict[str, Any]:
     """The checks of one long run."""
-    changes, overlaps = run["lane_changes_per_vehicle_km"], run["overlaps_per_1000_vehicle_km"]
+    changes = run["lane_changes_per_vehicle_km"]
+    overlaps = run["overlaps_per_1000_vehicle_km"]
+    # Unknown until there is something to compare.
     inside = wide = None
     if changes is not None and recorded_rate:
         inside = recorded_rate[0] <= changes <= recorded_rate[1]
+    # Speeds must not converge during minutes of driving.
     spreads = [at["spread_mps"] for at in run["speeds"].values() if at["spread_mps"] is not None]
     if spreads:
         wide = min(spreads) >= 0.5 * spread_mps

@@ -33,12 +33,20 @@ from torch.nn.functional import pad
 
 from ganlane import keys
 from ganlane.data.dense import Recording
-from ganlane.generator.closed_loop import balanced_headway, headway_from_uniform
+from ganlane.generator.closed_loop import (
+    balanced_headway,
+    headway_from_uniform,
+)
 from ganlane.sim.idm import following_acceleration
 from ganlane.sim.neighbours import perceive
-from ganlane.sim.random import Purpose, absorb, episode_key, uniform
+from ganlane.sim.random import (
+    Purpose,
+    absorb,
+    episode_key,
+    uniform,
+)
 from ganlane.sim.state import ENTRY_M, Road, Vehicles
-from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.base import Memory, Moved, TrafficModule
 from ganlane.traffic.overlays import random_side
 
 #: Makes a traffic model for a road.
@@ -71,12 +79,15 @@ class StartOptions:
 
 
 def drive_recordings(
-    make: Factory, recordings: Sequence[Recording], options: StartOptions
+    make: Factory,
+    recordings: Sequence[Recording],
+    options: StartOptions,
 ) -> pl.DataFrame:
     """Drive every recording ``options.repeats`` times, as :meth:`Recording.frame` has it.
 
     Those on equal roads go side by side.
     """
+    # A traffic is made for one road.
     roads: dict[tuple[int, float], list[Recording]] = {}
     for recording in recordings:
         same_road = roads.setdefault((recording.lanes, recording.lane_width_m), [])
@@ -84,7 +95,13 @@ def drive_recordings(
     frames: list[pl.DataFrame] = []
     for road, rows in roads.items():
         for batch in _batches(rows):
-            driven = _drive(make(Road(*road)), batch, options, first=len(frames))
+            # Each row has an episode number of its own, whatever the batches are.
+            driven = _drive(
+                make(Road(*road)),
+                batch,
+                options,
+                first=len(frames),
+            )
             frames += [recording.frame() for recording in driven]
     return pl.concat(frames)
 
@@ -92,8 +109,10 @@ def drive_recordings(
 def _batches(rows: list[Recording]) -> list[list[Recording]]:
     """Rows of similar shapes together, at most :data:`_MOST_PAIRS` pairs of vehicles in a batch."""
     batches: list[list[Recording]] = []
+    # Sorted by shape, so that little is padded.
     for row in sorted(rows, key=lambda row: row.x.shape):
         last = batches[-1] if batches else []
+        # Every vehicle looks at every other, so memory grows with the square.
         most = max(len(other.length) for other in [row, *last])
         if batches and (len(last) + 1) * most * most <= _MOST_PAIRS:
             last.append(row)
@@ -103,20 +122,30 @@ def _batches(rows: list[Recording]) -> list[list[Recording]]:
 
 
 def _drive(
-    traffic: TrafficModule, rows: list[Recording], options: StartOptions, first: int
+    traffic: TrafficModule,
+    rows: list[Recording],
+    options: StartOptions,
+    first: int,
 ) -> list[Recording]:
     """Drives a batch of recordings on one road; ``first`` numbers the first of them."""
-    recorded, n = StackedRecordings(rows), len(rows)
-    counters = {keys.SEED: torch.full((n,), options.seed), keys.EPISODE: first + torch.arange(n)}
+    recorded = StackedRecordings(rows)
+    n = len(rows)
+    counters = {
+        keys.SEED: torch.full((n,), options.seed),
+        keys.EPISODE: first + torch.arange(n),
+    }
     key = episode_key(traffic.stream, *counters.values())
+    # A uniform number with the wanted mean.
     u = uniform(key, 0, recorded.x.shape[2], [Purpose.SPAWN_DESIRED_SPEED])[..., 0]
     excess = 2.0 * options.desired_above_mps * u
     state = recorded.nobody(int(traffic.visibility))
     memory: TensorDictBase | None = None
     waiting = torch.ones_like(state.valid)
+    # Positions of every step, before the step is driven.
     course = []
     for step in range(len(recorded.x)):
         state = recorded.without_finished(state, step)
+        # Who has entered once does not enter again.
         enters = recorded.may_enter(state, waiting, traffic.road, step)
         waiting = waiting & ~enters
         state = recorded.entering(step, excess, traffic.road, state).where(enters, state)
@@ -127,9 +156,18 @@ def _drive(
     driven = []
     for index, row in enumerate(rows):
         steps, vehicles = row.x.shape
+        # Without what was padded.
         part = (slice(steps), index, slice(vehicles))
         name = f"{row.name}#{first + index}"
-        driven.append(replace(row, name=name, x=x[part], y=y[part], present=valid[part]))
+        driven.append(
+            replace(
+                row,
+                name=name,
+                x=x[part],
+                y=y[part],
+                present=valid[part],
+            )
+        )
     return driven
 
 
@@ -145,6 +183,7 @@ def step_traffic(
     Invalid vehicles stay as they are.
     """
     size = torch.Size([state.x.shape[0]])
+    # What an environment would hand to its traffic, without an ego.
     view = TensorDict._new_unsafe(
         {
             keys.VEHICLES: TensorDict._new_unsafe(state.as_dict(), batch_size=size),
@@ -168,10 +207,20 @@ def _updated_memory(
     """The traffic's memory, fresh for the vehicles that enter, with their recorded headways."""
     if memory is not None and not bool(enters.any()):
         return memory
-    fresh = with_recorded_headways(traffic.init_memory(state, key), state, traffic.road, enters)
+    # Drawn for all, and taken for those who enter.
+    fresh = with_recorded_headways(
+        traffic.init_memory(state, key),
+        state,
+        traffic.road,
+        enters,
+    )
 
     def merged(new: Tensor, old: Tensor) -> Tensor:
-        return torch.where(enters.reshape(*enters.shape, *[1] * (new.ndim - 2)), new, old)
+        return torch.where(
+            enters.reshape(*enters.shape, *[1] * (new.ndim - 2)),
+            new,
+            old,
+        )
 
     return fresh if memory is None else fresh.apply(merged, memory)
 
@@ -190,13 +239,17 @@ class StackedRecordings:
             padded = []
             for row in rows:
                 value = torch.from_numpy(getattr(row, name))
+                # Index 0 of the vehicles is the ego's; later frames are empty.
                 below = [0, steps - len(value)] if value.ndim == 2 else []
                 padded.append(pad(value, [1, most - value.shape[-1], *below]))
             tensor = torch.stack(padded, dim=-2)
             return tensor.float() if tensor.is_floating_point() else tensor
 
-        self.x, self.y, self.speed = stacked("x"), stacked("y"), stacked("speed")
-        self.present, self.driven = stacked("present"), stacked("driven")
+        self.x = stacked("x")
+        self.y = stacked("y")
+        self.speed = stacked("speed")
+        self.present = stacked("present")
+        self.driven = stacked("driven")
         self.length = stacked("length")
         self.end_m = torch.tensor([[row.end_m] for row in rows])
 
@@ -223,6 +276,7 @@ class StackedRecordings:
 
         Moves replayed ones on.
         """
+        # Replayed vehicles leave when their recording ends, no earlier.
         on_road = (state.x <= self.end_m + _ROUNDING_M) | ~self.driven
         stays = state.valid & self.present[step] & on_road
         replayed = stays & ~self.driven
@@ -234,7 +288,13 @@ class StackedRecordings:
             speed=torch.where(replayed, self.speed[step], state.speed),
         )
 
-    def may_enter(self, state: Vehicles, waiting: Tensor, road: Road, step: int) -> Tensor:
+    def may_enter(
+        self,
+        state: Vehicles,
+        waiting: Tensor,
+        road: Road,
+        step: int,
+    ) -> Tensor:
         """Vehicles that enter now, bool [N, M].
 
         Recorded in this frame, still waiting, and with room in their lane.
@@ -243,14 +303,22 @@ class StackedRecordings:
         # Mostly no vehicle waits, which saves the test of all pairs.
         if step == 0 or not bool(wants.any()):
             return wants
+        # Pairs [N, M, M] of who enters and who is there.
         same = road.lane_of(self.y[step])[:, :, None] == road.lane_of(state.y)[:, None]
         between = (self.x[step][:, :, None] - state.x[:, None]).abs()
         room = between - 0.5 * (self.length[:, :, None] + state.length[:, None])
         return wants & ~(same & state.valid[:, None] & (room < ENTRY_GAP_M)).any(-1)
 
-    def entering(self, step: int, excess: Tensor, road: Road, state: Vehicles) -> Vehicles:
+    def entering(
+        self,
+        step: int,
+        excess: Tensor,
+        road: Road,
+        state: Vehicles,
+    ) -> Vehicles:
         """All vehicles in their recorded state, heading along the road."""
-        y, speed = self.y[step], self.speed[step].clamp_min(0.0)
+        y = self.y[step]
+        speed = self.speed[step].clamp_min(0.0)
         return state.with_(
             x=self.x[step],
             y=y,
@@ -264,7 +332,10 @@ class StackedRecordings:
 
 
 def with_recorded_headways(
-    memory: TensorDictBase, vehicles: Vehicles, road: Road, who: Tensor
+    memory: TensorDictBase,
+    vehicles: Vehicles,
+    road: Road,
+    who: Tensor,
 ) -> TensorDictBase:
     """A traffic's ``memory`` with the headways that the drivers ``who`` [N, M] show as they enter.
 
@@ -279,10 +350,12 @@ def with_recorded_headways(
     return memory.named_apply(shown, nested_keys=True)
 
 
-Moved = tuple[Vehicles, dict[str, Tensor]]
-
-
-def _accelerated(vehicles: Vehicles, speed: Tensor, dt: float, **changed: Tensor) -> Vehicles:
+def _accelerated(
+    vehicles: Vehicles,
+    speed: Tensor,
+    dt: float,
+    **changed: Tensor,
+) -> Vehicles:
     """The vehicles after a step at constant acceleration to ``speed``, other fields changed."""
     return vehicles.with_(
         x=vehicles.x + 0.5 * (vehicles.speed + speed) * dt,
@@ -296,11 +369,18 @@ class ConstantVelocity(TrafficModule):
     """Every vehicle keeps its lane and the speed at which it entered."""
 
     def move(
-        self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """One step along the road."""
         v = vehicles
-        return v.with_(x=v.x + v.speed * self.dt, acceleration=torch.zeros_like(v.speed)), memory
+        return v.with_(
+            x=v.x + v.speed * self.dt,
+            acceleration=torch.zeros_like(v.speed),
+        ), memory
 
 
 class RandomDriving(TrafficModule):
@@ -314,16 +394,38 @@ class RandomDriving(TrafficModule):
     hardest, every_s, change_s = 3.0, 20.0, 4.0
 
     def move(
-        self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """One step: the second's acceleration, and towards the target lane."""
-        v, m, dtype = vehicles, vehicles.x.shape[1], vehicles.x.dtype
+        v = vehicles
+        m = vehicles.x.shape[1]
+        dtype = vehicles.x.dtype
+        # One acceleration for the ten steps of a second.
         second = torch.div(step, 10, rounding_mode="floor")
         pace = uniform(key, second, m, [Purpose.ACCELERATION], dtype)[..., 0]
-        drawn = uniform(key, step, m, [Purpose.LANE_CHANGE_HAZARD, Purpose.LANE_CHANGE_SIDE], dtype)
+        drawn = uniform(
+            key,
+            step,
+            m,
+            [
+                Purpose.LANE_CHANGE_HAZARD,
+                Purpose.LANE_CHANGE_SIDE,
+            ],
+            dtype,
+        )
         remaining = self.road.centre_of(v.target_lane, dtype) - v.y
+        # Nobody starts a change during another one.
         starts = (drawn[..., 0] < self.dt / self.every_s) & (remaining.abs() < 0.3)
-        side = torch.where(starts, random_side(drawn[..., 1], v.target_lane, self.road.lanes), 0)
+        side = torch.where(
+            starts,
+            random_side(drawn[..., 1], v.target_lane, self.road.lanes),
+            0,
+        )
+        # Sideways at a constant speed, and no further than the lane's centre.
         stride = self.road.lane_width_m * self.dt / self.change_s
         aside = (remaining / stride).clamp(-1.0, 1.0) * stride
         speed = (v.speed + self.hardest * (2.0 * pace - 1.0) * self.dt).clamp_min(0.0)
@@ -343,13 +445,24 @@ class HeadwayIdm(TrafficModule):
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
         """A random headway for each driver."""
-        u = uniform(key, -1, vehicles.x.shape[1], [Purpose.TRAIT_HEADWAY], vehicles.x.dtype)[..., 0]
+        u = uniform(
+            key,
+            -1,
+            vehicles.x.shape[1],
+            [Purpose.TRAIT_HEADWAY],
+            vehicles.x.dtype,
+        )[..., 0]
         return {"headway": headway_from_uniform(u)}
 
     def move(
-        self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """One step along the road."""
+        # The nearest vehicle ahead in the lane.
         perceived = perceive(vehicles, self.road)
         wanted = following_acceleration(perceived, headway_s=memory["headway"])
         speed = (vehicles.speed + wanted * self.dt).clamp_min(0.0)
@@ -357,4 +470,7 @@ class HeadwayIdm(TrafficModule):
 
 
 #: Reference drivers at the ends of the scale.
-FLOORS: dict[str, Factory] = {"random": RandomDriving, "constant_velocity": ConstantVelocity}
+FLOORS: dict[str, Factory] = {
+    "random": RandomDriving,
+    "constant_velocity": ConstantVelocity,
+}

@@ -32,7 +32,11 @@ SEGMENT_S: Final = 15.0
 EDGE_S: Final = 3.0
 _LENGTH_M: Final = 4.5
 _WIDTH_M: Final = 2.0
-_NUMBERS: Final = {"vehicle": pl.Int64, "frame": pl.Int64, "x": pl.Float64}
+_NUMBERS: Final = {
+    "vehicle": pl.Int64,
+    "frame": pl.Int64,
+    "x": pl.Float64,
+}
 
 
 def read_i80(name: str, path: Path) -> list[Recording]:
@@ -41,6 +45,7 @@ def read_i80(name: str, path: Path) -> list[Recording]:
     Raises:
         UserError: it is damaged, or no track in it lasts 15 s.
     """
+    # A scene is the lane, or a pair of cars.
     rows = _I80_READERS[name](path)
     pieces = []
     for scene in rows.partition_by("scene", maintain_order=True):
@@ -65,7 +70,12 @@ def _lane(path: Path) -> pl.DataFrame:
 
 
 def _pairs(path: Path) -> pl.DataFrame:
-    columns = {"pair": pl.String, "role": pl.String, "length": pl.Float64, **_NUMBERS}
+    columns = {
+        "pair": pl.String,
+        "role": pl.String,
+        "length": pl.Float64,
+        **_NUMBERS,
+    }
     return read_table(path, columns).with_columns(
         scene="pair-" + pl.col("pair"),
         x=pl.col("x") - 0.5 * pl.col("length"),
@@ -76,9 +86,13 @@ def _pairs(path: Path) -> pl.DataFrame:
 def _following(path: Path) -> pl.DataFrame:
     whole = dict.fromkeys(("follower", "leader", "frame"), pl.Int64)
     numbers = dict.fromkeys(("x_follower", "x_leader", "leader_length"), pl.Float64)
+    # Both cars of a pair are in one row.
     table = read_table(path, {"period": pl.String, **whole, **numbers})
     cars = []
-    for role, length in (("follower", pl.lit(_LENGTH_M)), ("leader", pl.col("leader_length"))):
+    for role, length in (
+        ("follower", pl.lit(_LENGTH_M)),
+        ("leader", pl.col("leader_length")),
+    ):
         car = table.select(
             "frame",
             scene=pl.concat_str("period", "follower", "leader", separator="-"),
@@ -91,7 +105,11 @@ def _following(path: Path) -> pl.DataFrame:
     return pl.concat(cars)
 
 
-_I80_READERS: Final = {"lane_1": _lane, "pairs": _pairs, "following": _following}
+_I80_READERS: Final = {
+    "lane_1": _lane,
+    "pairs": _pairs,
+    "following": _following,
+}
 
 
 def _one_lane(rows: pl.DataFrame) -> Recording:
@@ -99,20 +117,33 @@ def _one_lane(rows: pl.DataFrame) -> Recording:
 
     A speed is the mean over the second around its frame, cut off at the ends of the track.
     """
+    # The files are sorted by frame, or by pair.
     rows = rows.sort("vehicle", "frame")
     # A gap splits a track, since a recording's tracks have none.
     starts = (pl.col("frame").diff() != 1) | (pl.col("vehicle").diff() != 0)
     rows = rows.with_columns(
-        vehicle=starts.fill_null(False).cum_sum(), y=0.0, speed=0.0, width=_WIDTH_M, lane=0
+        vehicle=starts.fill_null(False).cum_sum(),
+        y=0.0,
+        speed=0.0,
+        width=_WIDTH_M,
+        lane=0,
     )
+    # Positions across the road are not given, and all lanes are alike.
     recording = Recording.of(rows, STANDARD_LANE_WIDTH_M)
     return replace(recording, speed=_speeds(recording.x, recording.present))
 
 
 def _speeds(x: Floats, present: Flags) -> Floats:
     """Speeds [T, V], m/s: over up to 0.5 s on either side, within the track."""
+    # Half a second before and after, or as far as the track reaches.
     index = np.arange(len(x))[:, None]
-    first, last = present.argmax(0), len(x) - 1 - present[::-1].argmax(0)
-    before, after = np.clip(index - 5, first, last), np.clip(index + 5, first, last)
+    first = present.argmax(0)
+    last = len(x) - 1 - present[::-1].argmax(0)
+    before = np.clip(index - 5, first, last)
+    after = np.clip(index + 5, first, last)
     moved = np.take_along_axis(x, after, 0) - np.take_along_axis(x, before, 0)
-    return np.where(present, moved / (np.maximum(after - before, 1) * FRAME_S), 0.0)
+    return np.where(
+        present,
+        moved / (np.maximum(after - before, 1) * FRAME_S),
+        0.0,
+    )

@@ -17,7 +17,10 @@ from torch import Tensor
 
 from ganlane import keys
 from ganlane.data.lanes import lane_changes_of_arrays
-from ganlane.evaluation.statistics import entries, poisson_interval
+from ganlane.evaluation.statistics import (
+    entries,
+    poisson_interval,
+)
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.realism.driving import Factory, step_traffic
 from ganlane.sim.collisions import pair_overlaps
@@ -93,15 +96,22 @@ class EventCounter:
 
     def count(self, vehicles: Vehicles, step: int) -> None:
         """Count the events of a physics step."""
+        # Everything is counted without the ego's empty place.
         others = vehicles.columns(slice(1, None))
         self.overlaps += self._onsets("overlap", pair_overlaps(others).triu(1))
+        # Half the width of a body, turned with its heading.
         half = lateral_half_extent(others) - EDGE_M
-        left, right = self.road.left_edge_m(), self.road.right_edge_m()
+        left = self.road.left_edge_m()
+        right = self.road.right_edge_m()
         outside = (others.y + half > left) | (others.y - half < right)
         self.off_road += self._onsets("off_road", outside & others.valid)
         if step % 10 == 9:  # once a second
             slow = (vehicles.speed < STANDING_MPS) & vehicles.valid
-            ahead = leader(perceive(vehicles, self.road), self.road.lane_of(vehicles.y))
+            # Standing behind somebody is queueing, no standstill.
+            ahead = leader(
+                perceive(vehicles, self.road),
+                self.road.lane_of(vehicles.y),
+            )
             self.standstills += self._onsets("standstill", (slow & (ahead.gap > FREE_M))[:, 1:])
 
     def _onsets(self, name: str, now: Tensor) -> int:
@@ -129,6 +139,7 @@ class GuardMeter:
         allowed = (guarded.speed - before.speed) / PHYSICS_STEP_S
         along = (allowed - wanted).abs() > ALTERED_ACCELERATION
         across = (guarded.y - moved.y).abs() > ALTERED_POSITION_M
+        # Shares are of the vehicles that drive.
         counts = before.valid.clone()
         counts[:, 0] = False
         self._altered = self._altered + ((along | across) & counts).sum()
@@ -152,10 +163,13 @@ def long_run(
     Rates are per vehicle-km with exact 95 % intervals, None where no vehicle moved. ``report`` is
     called with the vehicle-km driven so far.
     """
-    traffic, events, meter = make(road), EventCounter(road), GuardMeter()
+    traffic = make(road)
+    events = EventCounter(road)
+    meter = GuardMeter()
     meter.watch(traffic)
     parts: list[dict[str, Any]] = []
-    km, episodes = 0.0, 0
+    km = 0.0
+    episodes = 0
     # Ends early where nobody moves.
     while km < parameters.vehicle_km and not (parts and parts[-1]["vehicle_km"] <= 0.0):
         rows = _rows(parameters, parameters.vehicle_km - km)
@@ -165,9 +179,11 @@ def long_run(
         episodes += rows
         if report is not None:
             report(km)
+    # Added up over the batches.
     changes = sum(part["lane_changes"] for part in parts)
     durations = np.concatenate([part["durations"] for part in parts])
     acceleration = np.concatenate([part["acceleration"] for part in parts])
+    # By time, from the episodes that lasted so long.
     speeds = {}
     for time in parts[0]["speeds"]:
         speeds[time] = _mean_speeds([row for part in parts for row in part["speeds"][time]])
@@ -194,28 +210,48 @@ def _rows(parameters: LongRunParameters, km: float) -> int:
 
     Each vehicle is taken to cover a little less than 5000 m.
     """
+    # 14 m/s is a slow traffic's mean speed: rather too many than too few.
     expected = parameters.vehicles * min(4.8, 0.014 * parameters.most_s)
     steps = round(parameters.most_s / PHYSICS_STEP_S)
-    most = max(1, min(_MOST_ROWS, _MOST_SAMPLES // (steps * parameters.vehicles)))
+    most = max(
+        1,
+        min(
+            _MOST_ROWS,
+            _MOST_SAMPLES // (steps * parameters.vehicles),
+        ),
+    )
     return int(np.clip(np.ceil(km / expected), 1, most))
 
 
 def spawned_vehicles(
-    traffic: TrafficModule, parameters: LongRunParameters, key: Tensor
+    traffic: TrafficModule,
+    parameters: LongRunParameters,
+    key: Tensor,
 ) -> Vehicles:
     """The vehicles [N, M + 1] at the start of the episodes ``key`` [N].
 
     Index 0, an ego's, is not valid.
     """
-    lanes, width, seen = traffic.road.lanes, traffic.road.lane_width_m, int(traffic.visibility)
+    lanes = traffic.road.lanes
+    width = traffic.road.lane_width_m
+    seen = int(traffic.visibility)
     assert not isinstance(lanes, Tensor)
     assert not isinstance(width, Tensor)
     # Table II's density, for the vehicles and an empty place for the ego.
     spread = parameters.spawn.spread_m * (parameters.vehicles + 1) / 9.0
-    start = replace(parameters.spawn, spread_m=max(parameters.spawn.spread_m, spread))
-    vehicles = spawn(
-        key, parameters.vehicles + 1, lanes, float(width), start, others_visibility=seen
+    start = replace(
+        parameters.spawn,
+        spread_m=max(parameters.spawn.spread_m, spread),
     )
+    vehicles = spawn(
+        key,
+        parameters.vehicles + 1,
+        lanes,
+        float(width),
+        start,
+        others_visibility=seen,
+    )
+    # Spawned with an ego, since Table II has one, and driven without it.
     index = torch.arange(parameters.vehicles + 1)
     return vehicles.with_(valid=vehicles.valid & (index > 0))
 
@@ -235,7 +271,9 @@ def drive_spawned(
     key = episode_key(traffic.stream, *counters.values())
     state = spawned_vehicles(traffic, parameters, key)
     memory = traffic.init_memory(state, absorb(key, 0))
-    course, start = [(state.x, state.y, state.speed)], state.x
+    course = [(state.x, state.y, state.speed)]
+    start = state.x
+    # Onsets do not carry over from the batch before.
     events.before.clear()
     for step in range(round(parameters.most_s / PHYSICS_STEP_S)):
         state, memory = step_traffic(traffic, state, memory, counters, step)
@@ -246,11 +284,18 @@ def drive_spawned(
         if due and bool(((state.x - start)[:, 1:].mean(1) >= GOAL_M).all()):
             break
     x, y, speed = (torch.stack(values)[..., 1:].numpy() for values in zip(*course))
-    return Trajectories(x, y, speed, state.length[:, 1:].numpy(), state.width[:, 1:].numpy())
+    return Trajectories(
+        x,
+        y,
+        speed,
+        state.length[:, 1:].numpy(),
+        state.width[:, 1:].numpy(),
+    )
 
 
 def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
     """Counts, samples and speeds of one batch."""
+    # Every vehicle of every episode is a track of its own.
     y = trajectories.y.reshape(len(trajectories.y), -1)
     changes = lane_changes_of_arrays(y, float(road.lane_width_m))
     second = round(1.0 / PHYSICS_STEP_S)
@@ -265,6 +310,7 @@ def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
         speeds[f"{seconds:g} s"] = [_speeds(trajectories, row, time) for row in after]
     # The first time at which the episode's vehicles have covered 5000 m on average.
     driven_m = trajectories.x - trajectories.x[:1]
+    # [T, N].
     there = driven_m.mean(-1) >= GOAL_M
     at_goal = []
     for row in np.flatnonzero(there.any(0)).tolist():
@@ -285,12 +331,20 @@ def _speeds(trajectories: Trajectories, row: int, time: int) -> dict[str, float]
     """Mean and standard deviation of an episode's speeds, m/s."""
     speed = trajectories.speed[time, row].astype(np.float64)
     spread = float(speed.std(ddof=1)) if len(speed) > 1 else 0.0
-    return {"mean_speed_mps": float(speed.mean()), "spread_mps": spread}
+    return {
+        "mean_speed_mps": float(speed.mean()),
+        "spread_mps": spread,
+    }
 
 
-def _mean_speeds(rows: Sequence[Mapping[str, float]]) -> dict[str, float | int | None]:
+def _mean_speeds(
+    rows: Sequence[Mapping[str, float]],
+) -> dict[str, float | int | None]:
     """Means over the episodes that lasted so long, and their number."""
-    means: dict[str, float | int | None] = {"mean_speed_mps": None, "spread_mps": None}
+    means: dict[str, float | int | None] = {
+        "mean_speed_mps": None,
+        "spread_mps": None,
+    }
     if rows:
         means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     return {**means, "episodes": len(rows)}
@@ -311,10 +365,20 @@ def rates(lane_changes: int, overlaps: int, km: float) -> dict[str, Any]:
 
 def totals(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Event counts and rates over all long runs, with exact 95 % intervals; None without any."""
-    names = ("lane_changes", "overlaps", "vehicle_km", "off_road", "standstills_in_free_flow")
+    names = (
+        "lane_changes",
+        "overlaps",
+        "vehicle_km",
+        "off_road",
+        "standstills_in_free_flow",
+    )
     sums = {name: sum(run[name] for run in runs) for name in names}
     return {
         "off_road": sums["off_road"] if runs else None,
         "standstills_in_free_flow": sums["standstills_in_free_flow"] if runs else None,
-        **rates(sums["lane_changes"], sums["overlaps"], sums["vehicle_km"]),
+        **rates(
+            sums["lane_changes"],
+            sums["overlaps"],
+            sums["vehicle_km"],
+        ),
     }

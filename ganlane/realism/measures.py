@@ -30,7 +30,13 @@ from ganlane.evaluation.statistics import (
     poisson_interval,
     resample_counts,
 )
-from ganlane.files import CHECKPOINTS, PLACE, has_checksum, note_without_checksum, write_json
+from ganlane.files import (
+    CHECKPOINTS,
+    PLACE,
+    has_checksum,
+    note_without_checksum,
+    write_json,
+)
 
 #: Recorded driving as histograms, which ships; it holds derived numbers, never an excerpt of a
 #: recording.
@@ -79,10 +85,14 @@ def jensen_shannon(first: Array, second: Array) -> Array:
     with np.errstate(invalid="ignore", divide="ignore"):
         p = first / first.sum(-1, keepdims=True)
         q = second / second.sum(-1, keepdims=True)
+    # 0 log 0 is 0: tiny numbers stand in for empty bins.
     log_middle = np.log2(np.maximum(0.5 * (p + q), _TINY))
 
     def information(share: Array) -> Array:
-        return np.sum(share * (np.log2(np.maximum(share, _TINY)) - log_middle), axis=-1)
+        return np.sum(
+            share * (np.log2(np.maximum(share, _TINY)) - log_middle),
+            axis=-1,
+        )
 
     return np.sqrt(np.clip(0.5 * (information(p) + information(q)), 0.0, 1.0))
 
@@ -93,7 +103,10 @@ def pooled_distance(simulated: Array, recorded: Array) -> float:
 
 
 def distance(
-    simulated: Array, recorded: Array, paired: bool = True, resamples: int = RESAMPLES
+    simulated: Array,
+    recorded: Array,
+    paired: bool = True,
+    resamples: int = RESAMPLES,
 ) -> Estimate:
     """Distance with its 95 % bootstrap interval over units; both are [units, bins].
 
@@ -109,13 +122,22 @@ def distance(
     (drawn,) = _resampled([simulated], recorded, paired, resamples)
     if not np.isfinite(value) or len(drawn) < 2:
         return Estimate(value)
+    # Both tails are reflected about the estimate.
     tails = np.quantile(drawn**2, TAIL_LEVELS)
     low, high = np.sqrt(np.maximum(2.0 * value**2 - tails[::-1], 0.0))
-    return Estimate(value, min(value, float(low)), min(1.0, max(value, float(high))))
+    return Estimate(
+        value,
+        min(value, float(low)),
+        min(1.0, max(value, float(high))),
+    )
 
 
 def distance_difference(
-    first: Array, second: Array, recorded: Array, paired: bool = True, resamples: int = RESAMPLES
+    first: Array,
+    second: Array,
+    recorded: Array,
+    paired: bool = True,
+    resamples: int = RESAMPLES,
 ) -> Estimate:
     """Distance of ``first`` less that of ``second`` to ``recorded``, with its 95 % interval.
 
@@ -125,17 +147,25 @@ def distance_difference(
     four units the basic and the percentile interval find one of two equally good models closer too
     often.
     """
-    one, other = pooled_distance(first, recorded), pooled_distance(second, recorded)
+    one = pooled_distance(first, recorded)
+    other = pooled_distance(second, recorded)
     ours, theirs = _resampled([first, second], recorded, paired, resamples)
-    units, value = len(first), one - other
+    units = len(first)
+    value = one - other
     if not np.isfinite(value) or len(ours) < 2:
         return Estimate(value)
+    # S resampled units have (S - 1) / S of the variance that they should have.
     error = float((ours**2 - theirs**2).std()) * np.sqrt(units / (units - 1))
     reach = float(stdtrit(units - 1, TAIL_LEVELS[1])) * error / max(one + other, _TINY)
     return Estimate(value, max(-1.0, value - reach), min(1.0, value + reach))
 
 
-def _resampled(models: Sequence[Array], recorded: Array, paired: bool, resamples: int) -> Array:
+def _resampled(
+    models: Sequence[Array],
+    recorded: Array,
+    paired: bool,
+    resamples: int,
+) -> Array:
     """Distances [models, R] from the R resamples of the units in which all of them are known.
 
     None of a single unit.
@@ -143,6 +173,7 @@ def _resampled(models: Sequence[Array], recorded: Array, paired: bool, resamples
     units = len(recorded) if paired else len(models[0])
     if units < 2:
         return np.empty((len(models), 0))
+    # The same resamples for all models, so that differences are paired.
     counts = np.concatenate(list(resample_counts(units, resamples, seed=0)))
     against = counts @ recorded if paired else recorded.sum(0)
     distances = np.stack([jensen_shannon(counts @ model, against) for model in models])
@@ -160,6 +191,7 @@ def ceiling(recorded: Array) -> float | None:
     if units < 2:
         return None
     generator = np.random.default_rng(0)
+    # A row is a split: 1 for the units of its first half.
     half = np.zeros((SPLITS, units))
     for row in half:
         row[generator.permutation(units)[: units // 2]] = 1.0
@@ -192,16 +224,25 @@ class Measured:
 
     def restricted_to(self, rows: Sequence[int]) -> Measured:
         """The same with the counts of some units only; the rest remains that of all."""
-        return replace(self, counts={name: counts[rows] for name, counts in self.counts.items()})
+        return replace(
+            self,
+            counts={name: counts[rows] for name, counts in self.counts.items()},
+        )
 
 
 def lane_change_rate(changes: int, km: float) -> dict[str, Any]:
     """Lane changes, vehicle-km, and their ratio with its exact 95 % interval."""
     ratio = poisson_interval(changes).scaled(per=km) if km else None
-    return {"lane_changes": changes, "vehicle_km": km, **entries("per_vehicle_km", ratio)}
+    return {
+        "lane_changes": changes,
+        "vehicle_km": km,
+        **entries("per_vehicle_km", ratio),
+    }
 
 
-def measure_recordings(recordings: Sequence[Recording]) -> Measured:
+def measure_recordings(
+    recordings: Sequence[Recording],
+) -> Measured:
     """The recordings, measured as simulations are."""
     return measure(recorded_frame(recordings), units_of(recordings))
 
@@ -209,34 +250,52 @@ def measure_recordings(recordings: Sequence[Recording]) -> Measured:
 def measure(frame: pl.DataFrame, units: Sequence[str]) -> Measured:
     """Measure trajectories (:meth:`ganlane.data.dense.Recording.frame`) of the ``units``."""
     motion = with_motion(frame)
+    # Samples are dropped once they are counted.
     samples = samples_of(motion)
-    counts, quantiles = {}, {}
+    counts = {}
+    quantiles = {}
     for name, table in samples.items():
         counts[name] = _histograms(table, units, QUANTITIES[name])
         column = table["value"]
         quantiles[name] = {f"{level:g}": column.quantile(level, "linear") for level in LEVELS}
+    # In the order of the units, so that the sum is the same in every run.
     by_unit = motion.filter("counts").group_by("unit", maintain_order=True)
     km = by_unit.agg(km=pl.col("stride").sum() / 1000.0)["km"].to_list()
-    return Measured(counts, quantiles, samples["lane_change_duration"].height, sum(km))
+    return Measured(
+        counts,
+        quantiles,
+        samples["lane_change_duration"].height,
+        sum(km),
+    )
 
 
 def samples_of(motion: pl.DataFrame) -> dict[str, pl.DataFrame]:
     """By quantity, columns ``unit`` and ``value``, of a frame :func:`with_motion`."""
+    # Only rows that are driven and old enough.
     counted = motion.filter("counts")
+    # Leaders are also those that do not count themselves.
     near = pl.col("counts") & pl.col("gap").is_between(0.0, FOLLOWING_M)
     followers = leader_gaps(motion).filter(near).drop_nulls(["speed", "leader_speed"])
     closing = pl.col("speed") - pl.col("leader_speed")
+    # Two vehicles have hardly a spread.
     frames = counted.drop_nulls("speed").group_by("unit", "scene", "frame")
     crowded = frames.agg(pl.col("speed").std(), pl.len()).filter(pl.col("len") >= FEWEST_IN_FRAME)
+    # Near standstill the headway grows without bound.
     fast_enough = followers.filter(pl.col("speed") >= SLOWEST_FOLLOWER_MPS)
     values = {
         "speed": (counted, pl.col("speed")),
         "speed_spread": (crowded, pl.col("speed")),
         "acceleration": (counted, pl.col("acceleration")),
         "jerk": (counted, pl.col("jerk")),
-        "time_headway": (fast_enough, pl.col("gap") / pl.col("speed")),
+        "time_headway": (
+            fast_enough,
+            pl.col("gap") / pl.col("speed"),
+        ),
         "gap": (followers, pl.col("gap")),
-        "time_to_collision": (followers.filter(closing > CLOSING_MPS), pl.col("gap") / closing),
+        "time_to_collision": (
+            followers.filter(closing > CLOSING_MPS),
+            pl.col("gap") / closing,
+        ),
     }
     samples = {
         name: rows.select("unit", value=value).drop_nulls().filter(pl.col("value").is_finite())
@@ -255,10 +314,15 @@ def _histograms(table: pl.DataFrame, units: Sequence[str], bins: Bins) -> Array:
     """Samples per unit and bin, [units, bins]."""
     index = {unit: row for row, unit in enumerate(units)}
     table = table.filter(pl.col("unit").is_in(list(units)))
+    # Row and column of each sample in the table of counts.
     row = table["unit"].replace_strict(index, return_dtype=pl.Int64).to_numpy()
     share = (table["value"].to_numpy() - bins.low) / (bins.high - bins.low)
     column = np.clip(np.floor(share * bins.number), 0, bins.number - 1).astype(np.int64)
-    flat = np.bincount(row * bins.number + column, minlength=len(units) * bins.number)
+    # Two indices as one, counted at once.
+    flat = np.bincount(
+        row * bins.number + column,
+        minlength=len(units) * bins.number,
+    )
     return flat.reshape(len(units), bins.number).astype(np.float64)
 
 
@@ -272,9 +336,12 @@ def with_motion(frame: pl.DataFrame) -> pl.DataFrame:
         """The position ``frames`` later in the same track."""
         return pl.col("x").shift(-frames).over(TRACK)
 
-    late, later = _HALF, _HALF + _WHOLE
+    late = _HALF
+    later = _HALF + _WHOLE
+    # Central differences of positions one second apart.
     bend = x_at(_WHOLE) - 2.0 * pl.col("x") + x_at(-_WHOLE)
     swing = x_at(later) - 3.0 * x_at(late) + 3.0 * x_at(-late) - x_at(-later)
+    # Frames since the vehicle appeared.
     age = pl.col("frame") - pl.col("frame").first().over(TRACK)
     return frame.with_columns(
         speed=(x_at(_HALF) - x_at(-_HALF)) / (_WHOLE * FRAME_S),
@@ -309,7 +376,10 @@ class Reference(Measured):
 
     def rate(self) -> dict[str, Any]:
         """Lane changes per vehicle-km of the whole recording, with its exact interval."""
-        return lane_change_rate(int(self.whole["lane_changes"]), self.whole["vehicle_km"])
+        return lane_change_rate(
+            int(self.whole["lane_changes"]),
+            self.whole["vehicle_km"],
+        )
 
     def save(self, path: Path) -> None:
         """Write as JSON, atomically."""
@@ -339,9 +409,17 @@ class Reference(Measured):
             if numbers["bins"] != _bins():
                 raise ValueError("its histograms have other bins")
             counts = {name: np.array(rows, float) for name, rows in numbers["counts"].items()}
+            # Ceilings and checksum follow from the rest.
             values = {part.name: numbers[part.name] for part in fields(cls)}
             reference = cls(**{**values, "counts": counts})
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            TypeError,
+            AttributeError,
+            RecursionError,
+        ) as error:
             raise UserError(
                 f"{path}: not the histograms of recorded driving that the realism card needs "
                 f"({error}); give the recordings with data.path=FILE."

@@ -16,13 +16,27 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from ganlane.data.dense import Recording, recorded_frame, recordings_of, units_of
+from ganlane.data.dense import (
+    Recording,
+    recorded_frame,
+    recordings_of,
+    units_of,
+)
 from ganlane.data.lanes import scene_lane_widths
 from ganlane.data.schema import FRAME_S
 from ganlane.data.statistics import driving_statistics
 from ganlane.errors import UserError
-from ganlane.realism.driving import FLOORS, Factory, StartOptions, drive_recordings
-from ganlane.realism.long_runs import EventCounter, LongRunParameters, drive_spawned
+from ganlane.realism.driving import (
+    FLOORS,
+    Factory,
+    StartOptions,
+    drive_recordings,
+)
+from ganlane.realism.long_runs import (
+    EventCounter,
+    LongRunParameters,
+    drive_spawned,
+)
 from ganlane.realism.measures import (
     QUANTITIES,
     SHIPPED_REFERENCE,
@@ -49,9 +63,16 @@ def print_progress(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def simulate(make: Factory, recordings: Sequence[Recording], options: StartOptions) -> Measured:
+def simulate(
+    make: Factory,
+    recordings: Sequence[Recording],
+    options: StartOptions,
+) -> Measured:
     """Drive the recordings with a traffic and measure it."""
-    return measure(drive_recordings(make, recordings, options), units_of(recordings))
+    return measure(
+        drive_recordings(make, recordings, options),
+        units_of(recordings),
+    )
 
 
 def drive_all(
@@ -67,6 +88,7 @@ def drive_all(
     driven = {}
     for name, make in {**factories, **FLOORS}.items():
         print_progress(f"{name} from {len(recordings)} recorded starts")
+        # Reference drivers have no desired speed that matters.
         excess = desired_above_mps.get(name, options.desired_above_mps)
         wishes = replace(options, desired_above_mps=excess)
         driven[name] = drive_recordings(make, recordings, wishes)
@@ -87,7 +109,12 @@ def fit_excess(
     recorded = measure_recordings(recordings)
 
     def mean_distance(excess: float) -> float:
-        driven = simulate(make, recordings, replace(options, desired_above_mps=excess, repeats=1))
+        driven = simulate(
+            make,
+            recordings,
+            replace(options, desired_above_mps=excess, repeats=1),
+        )
+        # Lane changes are too few to fit anything to.
         distances = [
             pooled_distance(driven.counts[name], recorded.counts[name])
             for name in QUANTITIES
@@ -135,10 +162,16 @@ class Starts:
 
     def restricted_to(self, scenes: Sequence[str]) -> Starts:
         """The same driving from some of its recorded scenes, compared with these alone."""
+        # Units are the scenes, in this order.
         rows = [self.scenes.index(name) for name in scenes]
         driven = {name: measured.restricted_to(rows) for name, measured in self.driven.items()}
         recorded = self.recorded.restricted_to(rows)
-        return replace(self, scenes=list(scenes), driven=driven, recorded=recorded)
+        return replace(
+            self,
+            scenes=list(scenes),
+            driven=driven,
+            recorded=recorded,
+        )
 
     def description(self) -> dict[str, Any]:
         """The entries of ``results.json`` about starts and recordings."""
@@ -164,7 +197,9 @@ class Fold:
     held_out: Sequence[str]
 
 
-def fold_weights(paths: Sequence[Path]) -> dict[tuple[str, ...], dict[str, Path]]:
+def fold_weights(
+    paths: Sequence[Path],
+) -> dict[tuple[str, ...], dict[str, Path]]:
     """Weights of k folds: by held-out scenes, then by preset (``paper``, ``calibrated``).
 
     Raises:
@@ -174,6 +209,7 @@ def fold_weights(paths: Sequence[Path]) -> dict[tuple[str, ...], dict[str, Path]
     folds: dict[tuple[str, ...], dict[str, Path]] = {}
     for path in paths:
         metadata = load_weights(path, "generator")[1]
+        # The scenes without which a generator was fitted name its fold.
         held_out = tuple(sorted(metadata.get("data", {}).get("held_out", ())))
         preset = str(metadata.get("preset"))
         if not held_out or preset in folds.get(held_out, {}):
@@ -199,7 +235,11 @@ def check_folds_cover(folds: Sequence[Sequence[str]], scenes: Sequence[str]) -> 
 
 
 def recorded_starts(
-    folds: Sequence[Fold], frame: pl.DataFrame, options: StartOptions, fit: bool, source: str
+    folds: Sequence[Fold],
+    frame: pl.DataFrame,
+    options: StartOptions,
+    fit: bool,
+    source: str,
 ) -> Starts:
     """Drive every traffic from recorded scenes (``frame``, in the schema), but the shortest ones.
 
@@ -212,11 +252,13 @@ def recorded_starts(
     widths = scene_lane_widths(frame)
     recordings = recordings_of(frame, widths)
     names = [recording.name for recording in recordings]
+    # A mistyped scene would be fitted to in silence.
     for name in (name for fold in folds for name in fold.held_out):
         if name not in names:
             raise UserError(
                 f"data.held_out={name}: no such scene in {source}; choose among {', '.join(names)}."
             )
+    # Every measure leaves out the first 3 s.
     long = [recording for recording in recordings if len(recording.x) * FRAME_S >= SHORTEST_S]
     chosen: list[Recording] = []
     excesses: dict[str, list[float]] = {}
@@ -226,6 +268,7 @@ def recorded_starts(
         if not scenes:
             continue
         chosen += scenes
+        # Never on the scenes that are held out, even if they are not driven.
         others = [recording for recording in long if recording.name not in fold.held_out]
         for name, make in fold.factories.items():
             excess = options.desired_above_mps
@@ -241,6 +284,7 @@ def recorded_starts(
             f"{source}: no scene to start from lasts {SHORTEST_S:g} s; give longer ones or "
             "scenes=all."
         )
+    # Long runs are compared with all frames, not only with those that count.
     statistics = driving_statistics(frame, widths)
     reference = Reference(
         **vars(measure_recordings(recordings)),
@@ -253,6 +297,7 @@ def recorded_starts(
         },
         floors={},
     )
+    # Measured once over all folds, so that every traffic has the same units.
     units = units_of(chosen)
     return Starts(
         scenes=units,
@@ -265,19 +310,29 @@ def recorded_starts(
 
 
 def spawned_starts(
-    factories: Mapping[str, Factory], road: Road, spawn: SpawnParameters, repeats: int, seed: int
+    factories: Mapping[str, Factory],
+    road: Road,
+    spawn: SpawnParameters,
+    repeats: int,
+    seed: int,
 ) -> Starts:
     """Drive every traffic from the same spawned scenes: 8 episodes per repeat, 30 vehicles, 30 s.
 
     ``road`` and ``spawn`` say where and how vehicles start (Table II at the paper's density). They
     are compared with the histograms that ship.
     """
-    reference, rows = Reference.load(SHIPPED_REFERENCE), _SPAWNED_ROWS * repeats
+    reference = Reference.load(SHIPPED_REFERENCE)
+    rows = _SPAWNED_ROWS * repeats
     print_progress(
         f"no recordings here: spawned starts against {SHIPPED_REFERENCE.name}; give data.path=FILE "
         "for the fair comparison"
     )
-    parameters = LongRunParameters(_SPAWNED_VEHICLES, most_s=_SPAWNED_S, seed=seed, spawn=spawn)
+    parameters = LongRunParameters(
+        _SPAWNED_VEHICLES,
+        most_s=_SPAWNED_S,
+        seed=seed,
+        spawn=spawn,
+    )
     driven = {}
     for name, make in factories.items():
         print_progress(f"{name} from {rows} spawned starts")
@@ -287,10 +342,14 @@ def spawned_starts(
 
 
 def spawned_recordings(
-    make: Factory, road: Road, parameters: LongRunParameters, rows: int
+    make: Factory,
+    road: Road,
+    parameters: LongRunParameters,
+    rows: int,
 ) -> list[Recording]:
     """``rows`` spawned episodes of ``parameters.most_s`` s, in the form of recordings."""
     paths = drive_spawned(make(road), parameters, 0, rows, EventCounter(road))
+    # Nobody enters late or leaves.
     everywhere = np.ones(paths.x[:, 0].shape, dtype=bool)
     return [
         Recording(
@@ -311,7 +370,10 @@ def spawned_recordings(
 
 
 def spawned_frame(
-    make: Factory, road: Road, parameters: LongRunParameters, rows: int
+    make: Factory,
+    road: Road,
+    parameters: LongRunParameters,
+    rows: int,
 ) -> pl.DataFrame:
     """The trajectories of :func:`spawned_recordings`, in the form that is measured."""
     return recorded_frame(spawned_recordings(make, road, parameters, rows))

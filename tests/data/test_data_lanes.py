@@ -6,7 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ganlane.data import Tracks, synthetic_scenes, tracks_of_frame
-from ganlane.data.lanes import find_lane_changes, lane_changes_of_arrays, lane_width
+from ganlane.data.lanes import (
+    find_lane_changes,
+    lane_changes_of_arrays,
+    lane_width,
+)
 
 
 @given(width=st.floats(3.0, 4.0), seed=st.integers(0, 10_000))
@@ -50,14 +54,20 @@ def test_a_ramp_is_timed_from_and_to_three_tenths_off_the_centres():
     # The boundary, 1.8 m, is crossed at 3.85 s. Going back, 2.3 s is the first sample within 0.3 m
     # of the old centre (0.25 m); going on, 5.4 s is the first within 0.3 m of the new one (3.35 m).
     change = found(RAMP)
-    assert (change.old_lane.tolist(), change.new_lane.tolist(), change.sample.tolist()) == (
+    assert (
+        change.old_lane.tolist(),
+        change.new_lane.tolist(),
+        change.sample.tolist(),
+    ) == (
         [0],
         [1],
         [38],
     )
-    assert (change.tau_s[0], change.tau_e[0], change.duration_s[0]) == pytest.approx(
-        (1.55, 1.55, 3.1)
-    )
+    assert (
+        change.tau_s[0],
+        change.tau_e[0],
+        change.duration_s[0],
+    ) == pytest.approx((1.55, 1.55, 3.1))
     assert change.lateral_speed[0] == pytest.approx(1.0)
     assert change.complete[0]
 
@@ -71,7 +81,8 @@ def test_a_driver_who_stops_beside_the_centre_has_ended_the_change():
 
 
 def test_a_track_that_ends_in_the_middle_of_the_change_is_censored():
-    early, late = found(RAMP[:45]), found(RAMP[33:])
+    early = found(RAMP[:45])
+    late = found(RAMP[33:])
     assert [(each.start_censored[0], each.end_censored[0]) for each in (early, late)] == [
         (False, True),
         (True, False),
@@ -108,7 +119,9 @@ def test_a_change_of_vehicle_is_no_lane_change():
 
 @settings(max_examples=20)
 @given(seed=st.integers(0, 500))
-def test_recordings_and_arrays_are_measured_alike_and_mirroring_changes_nothing_but_the_side(seed):
+def test_recordings_and_arrays_are_measured_alike_and_mirroring_changes_nothing_but_the_side(
+    seed,
+):
     frame = synthetic_scenes(seed=seed)
     widths = {"synthetic-0": 3.5, "synthetic-1": 3.5}
     of_frame = find_lane_changes(tracks_of_frame(frame, widths))

@@ -9,7 +9,12 @@ from pathlib import Path
 
 import polars as pl
 import pytest
-from reference.recordings import ngsim_rows, portal_csv, traffic, write_highd
+from reference.recordings import (
+    ngsim_rows,
+    portal_csv,
+    traffic,
+    write_highd,
+)
 
 from ganlane.commands.prepare import long_report, short_report
 from ganlane.data import (
@@ -88,10 +93,25 @@ def test_a_synthetic_recording_survives_the_file(tmp_path):
     ("row", "column", "value", "message"),
     [
         (7, "lane", "0", r"line 9, column lane: 0 is below 1"),
-        (8, "frame", "1", r"line 10, column frame: 1 comes twice"),
+        (
+            8,
+            "frame",
+            "1",
+            r"line 10, column frame: 1 comes twice",
+        ),
         (9, "frame", "0", r"line 11, column frame: 0 is before"),
-        (10, "length", "0", r"line 12, column length: 0.0 is not above 0"),
-        (11, "x", "here", r"line 13, column x: 'here' is not a number"),
+        (
+            10,
+            "length",
+            "0",
+            r"line 12, column length: 0.0 is not above 0",
+        ),
+        (
+            11,
+            "x",
+            "here",
+            r"line 13, column x: 'here' is not a number",
+        ),
     ],
 )
 def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column, value, message):
@@ -110,16 +130,32 @@ def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column,
             3.6,
             "line 3, columns x and speed: x moves by 10.0 m per second where speed says 36.0",
         ),
-        ("x", 3.28, "x moves by 32.8 m per second where speed says 10.0"),
+        (
+            "x",
+            3.28,
+            "x moves by 32.8 m per second where speed says 10.0",
+        ),
         ("x", -1.0, "x moves by -10.0 m per second"),
-        ("length", 3.28, "line 2, column length: the median is 14.8"),
+        (
+            "length",
+            3.28,
+            "line 2, column length: the median is 14.8",
+        ),
         ("y", 3.28, "lanes are 11.48 m apart"),
         ("y", -1.0, "lanes are -3.50 m apart"),
     ],
 )
 def test_units_and_directions_that_cannot_be_are_refused(tmp_path, column, factor, message):
     with pytest.raises(UserError, match=message):
-        read_scenes(written(tmp_path, changed(column, lambda field: str(float(field) * factor))))
+        read_scenes(
+            written(
+                tmp_path,
+                changed(
+                    column,
+                    lambda field: str(float(field) * factor),
+                ),
+            )
+        )
 
 
 @pytest.mark.parametrize(
@@ -130,7 +166,10 @@ def test_units_and_directions_that_cannot_be_are_refused(tmp_path, column, facto
             r"line 1: no column v, lane.*found .*speed; expected",
         ),
         (HEADER.encode() + b"\n", "a header but no rows"),
-        (b"\x89PNG\r\n\x1a\n\x00\xff\xfe" * 50, r"line 1: not text"),
+        (
+            b"\x89PNG\r\n\x1a\n\x00\xff\xfe" * 50,
+            r"line 1: not text",
+        ),
     ],
 )
 def test_files_without_columns_rows_or_text_are_refused(content, message, tmp_path):
@@ -148,9 +187,13 @@ def test_absent_files_are_refused(name, tmp_path):
 
 def test_a_scene_in_two_files_is_refused(tmp_path):
     write_prepared(synthetic_scenes(), tmp_path / "a.parquet")
-    write_prepared(synthetic_scenes(SyntheticTraffic(scenes=1)), tmp_path / "b.parquet")
+    write_prepared(
+        synthetic_scenes(SyntheticTraffic(scenes=1)),
+        tmp_path / "b.parquet",
+    )
     with pytest.raises(
-        UserError, match=r"b.parquet: scene synthetic-0 is in .*a.parquet too; remove one"
+        UserError,
+        match=r"b.parquet: scene synthetic-0 is in .*a.parquet too; remove one",
     ):
         read_scenes(tmp_path)
 
@@ -165,11 +208,17 @@ def test_damaged_parquet_is_refused(tmp_path):
     with pytest.raises(UserError, match=r"x.parquet: no column speed"):
         read_scenes(path)
     write_prepared(made.with_columns(x=pl.lit(float("nan"))), path)
-    with pytest.raises(UserError, match=r"x.parquet, row 0, column x: nan is not a finite number"):
+    with pytest.raises(
+        UserError,
+        match=r"x.parquet, row 0, column x: nan is not a finite number",
+    ):
         read_scenes(path)
 
 
-@pytest.mark.parametrize(("every", "renumbered"), [(2, False), (5, False), (2, True), (3, True)])
+@pytest.mark.parametrize(
+    ("every", "renumbered"),
+    [(2, False), (5, False), (2, True), (3, True)],
+)
 def test_recordings_with_frames_missing_throughout_are_refused(every, renumbered, tmp_path):
     frame = synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=6, seconds=8.0))
     # One scene is whole; the other one has every second frame alone, or so.
@@ -178,7 +227,10 @@ def test_recordings_with_frames_missing_throughout_are_refused(every, renumbered
     if renumbered:
         frame = frame.with_columns(frame=pl.col("frame") // every)
     write_scene_csv(frame, tmp_path / "sparse.csv")
-    with pytest.raises(UserError, match=r"sparse.csv, line \d+, .*10 frames a second"):
+    with pytest.raises(
+        UserError,
+        match=r"sparse.csv, line \d+, .*10 frames a second",
+    ):
         read_scenes(tmp_path / "sparse.csv")
 
 
@@ -193,15 +245,22 @@ def pooled(frame: pl.DataFrame) -> PooledStatistics:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_scenes_one_by_one_say_what_they_say_together(seed):
     frame = synthetic_scenes(seed=seed)
-    together, apart = driving_statistics(frame), pooled(frame)
+    together = driving_statistics(frame)
+    apart = pooled(frame)
     assert vars(apart.exposure) == pytest.approx(vars(together.exposure))
     assert apart.lane_changes.duration == together.lane_changes.duration
     for name in ("count", "per_vehicle_km", "srlc"):
         assert getattr(apart.lane_changes, name) == pytest.approx(
             getattr(together.lane_changes, name)
         ), name
-    for name in ("speed", "acceleration_raw", "acceleration_smoothed", "headway"):
-        one, other = apart.describe(name), getattr(together, name)
+    for name in (
+        "speed",
+        "acceleration_raw",
+        "acceleration_smoothed",
+        "headway",
+    ):
+        one = apart.describe(name)
+        other = getattr(together, name)
         assert (one.count, one.mean, one.sd) == pytest.approx(
             (other.count, other.mean, other.sd)
         ), name
@@ -217,7 +276,10 @@ def csv(tmp_path):
 
 def test_what_is_written_reads_back_the_same(csv, tmp_path):
     prepared = prepare_recordings("scenes", csv, tmp_path / "out")
-    assert prepared.files == ("synthetic-0.parquet", "synthetic-1.parquet")
+    assert prepared.files == (
+        "synthetic-0.parquet",
+        "synthetic-1.parquet",
+    )
     assert read_scenes(tmp_path / "out").equals(read_scenes(csv))
     assert read_scenes(tmp_path / "out" / prepared.files[1])["scene"].unique().to_list() == [
         "synthetic-1"
@@ -247,17 +309,23 @@ def ngsim_lines(thousands: bool = True) -> list[str]:
 
 
 def test_reports_state_rows_rates_and_durations(tmp_path):
-    path, lines = tmp_path / "portal.csv", ngsim_lines()
+    path = tmp_path / "portal.csv"
+    lines = ngsim_lines()
     path.write_text("\n".join([*lines, lines[5], ""]))
     prepared = prepare_recordings("ngsim", path, tmp_path / "out")
-    for report in (short_report(prepared), long_report(prepared, "portal.csv", "report.png")):
+    for report in (
+        short_report(prepared),
+        long_report(prepared, "portal.csv", "report.png"),
+    ):
         assert "541 read, 540 kept, 540 written" in report
         assert "dropped: 1 (duplicate)" in report
         assert "lane changes: 0; 0.000 per vehicle and km of road (equation 9)" in report
     assert "| us-101-1 | 540 | 9 | 6 | 3 |" in long_report(prepared, "portal.csv", "report.png")
 
 
-def test_the_output_folder_appears_only_when_everything_was_written(tmp_path):
+def test_the_output_folder_appears_only_when_everything_was_written(
+    tmp_path,
+):
     lines = ngsim_lines(thousands=False)
     (tmp_path / "bad.csv").write_text("\n".join([*lines, lines[-1].replace(",", ",x", 1)]))
     with pytest.raises(UserError, match="line 542"):
@@ -266,7 +334,8 @@ def test_the_output_folder_appears_only_when_everything_was_written(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "precious").write_text("")
     with pytest.raises(
-        UserError, match=r"out: there already; choose another folder with out=FOLDER"
+        UserError,
+        match=r"out: there already; choose another folder with out=FOLDER",
     ):
         prepare_recordings("ngsim", tmp_path / "bad.csv", tmp_path / "out")
     assert (tmp_path / "out" / "precious").exists()
@@ -278,9 +347,12 @@ def refused(frame: pl.DataFrame, folder: Path, message: str) -> None:
         prepare_recordings("scenes", folder / "a.parquet", folder / "out")
 
 
-def test_parked_cars_and_names_that_differ_in_a_blank_alone_are_refused(tmp_path):
+def test_parked_cars_and_names_that_differ_in_a_blank_alone_are_refused(
+    tmp_path,
+):
     parked = synthetic_scenes().with_columns(
-        speed=pl.lit(0.0), x=pl.col("x").first().over("scene", "vehicle")
+        speed=pl.lit(0.0),
+        x=pl.col("x").first().over("scene", "vehicle"),
     )
     refused(parked, tmp_path, "no scene in which anybody drives")
     names = pl.col("scene").replace({"synthetic-0": "my road", "synthetic-1": "my_road"})
@@ -288,7 +360,9 @@ def test_parked_cars_and_names_that_differ_in_a_blank_alone_are_refused(tmp_path
     refused(synthetic_scenes().with_columns(names), tmp_path, message)
 
 
-def test_recordings_without_vehicles_on_the_lanes_are_refused(tmp_path):
+def test_recordings_without_vehicles_on_the_lanes_are_refused(
+    tmp_path,
+):
     write_highd(tmp_path)
     tracks = tmp_path / "01_tracks.csv"
     pl.read_csv(tracks).with_columns(laneId=pl.lit(9)).write_csv(tracks)
@@ -296,13 +370,21 @@ def test_recordings_without_vehicles_on_the_lanes_are_refused(tmp_path):
         read_recordings("highd", tmp_path)
 
 
-def test_an_error_names_the_folder_to_be_and_other_files_as_they_are(tmp_path):
+def test_an_error_names_the_folder_to_be_and_other_files_as_they_are(
+    tmp_path,
+):
     out = tmp_path / "scenes"
     too_long = "s" * 300
-    with pytest.raises(OSError, match="too long") as caught, whole_folder(out) as folder:
+    with (
+        pytest.raises(OSError, match="too long") as caught,
+        whole_folder(out) as folder,
+    ):
         write_bytes(folder / too_long, b"")
     assert caught.value.filename == str(out / too_long)
-    with pytest.raises(FileNotFoundError) as caught, whole_folder(out):
+    with (
+        pytest.raises(FileNotFoundError) as caught,
+        whole_folder(out),
+    ):
         (tmp_path / "absent").read_bytes()
     assert caught.value.filename == str(tmp_path / "absent")
     assert list(tmp_path.iterdir()) == []

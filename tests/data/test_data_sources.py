@@ -42,7 +42,11 @@ def test_a_file_arrives_whole_with_progress(tmp_path):
     steps = []
     with Server() as server:
         path = download(
-            server.url, tmp_path / "new" / "f", SHA256, lambda *step: steps.append(step), **QUICK
+            server.url,
+            tmp_path / "new" / "f",
+            SHA256,
+            lambda *step: steps.append(step),
+            **QUICK,
         )
     assert path.read_bytes() == CONTENT
     assert names(path.parent) == ["f"]
@@ -53,12 +57,23 @@ def test_a_file_arrives_whole_with_progress(tmp_path):
 @pytest.mark.parametrize(
     ("server", "ranges"),
     [
-        ({"breaks": [300_000, 500_000]}, [None, "bytes=300000-", "bytes=800000-"]),
-        ({"breaks": [300_000], "ranges": False}, [None, "bytes=300000-"]),
+        (
+            {"breaks": [300_000, 500_000]},
+            [None, "bytes=300000-", "bytes=800000-"],
+        ),
+        (
+            {"breaks": [300_000], "ranges": False},
+            [None, "bytes=300000-"],
+        ),
         ({"breaks": [300_000], "etag": None}, [None, None]),
         *(({"length": length}, [None]) for length in ("abc", "-5", "", "1e3")),
     ],
-    ids=["resumed", "server ignores Range", "no version", *(["invalid length"] * 4)],
+    ids=[
+        "resumed",
+        "server ignores Range",
+        "no version",
+        *(["invalid length"] * 4),
+    ],
 )
 def test_a_broken_transfer_resumes_only_where_server_and_version_allow(server, ranges, tmp_path):
     with Server(**server) as running:
@@ -69,7 +84,8 @@ def test_a_broken_transfer_resumes_only_where_server_and_version_allow(server, r
 def test_a_later_run_resumes_what_an_earlier_one_left(tmp_path):
     with Server(breaks=[400_000, 0, 0, 0]) as server:
         with pytest.raises(
-            UserError, match=r"cannot be fetched, 400000 bytes came .*continues from there"
+            UserError,
+            match=r"cannot be fetched, 400000 bytes came .*continues from there",
         ):
             fetch(server, tmp_path / "f", SHA256)
         assert "f" not in names(tmp_path)
@@ -80,12 +96,19 @@ def test_a_later_run_resumes_what_an_earlier_one_left(tmp_path):
     assert names(tmp_path) == ["f"]
 
 
-@pytest.mark.parametrize(("content", "etag"), [(CONTENT[::-1], '"two"'), (CONTENT[:1000], None)])
+@pytest.mark.parametrize(
+    ("content", "etag"),
+    [(CONTENT[::-1], '"two"'), (CONTENT[:1000], None)],
+)
 def test_a_part_of_another_version_or_longer_than_the_file_is_discarded(content, etag, tmp_path):
     with Server(breaks=[300_000, 0, 0, 0]) as server:
         with pytest.raises(UserError, match="cannot be fetched"):
             fetch(server, tmp_path / "f")
-        server.content, server.etag, server.breaks = content, etag or server.etag, []
+        server.content, server.etag, server.breaks = (
+            content,
+            etag or server.etag,
+            [],
+        )
         assert fetch(server, tmp_path / "f").read_bytes() == content
     assert names(tmp_path) == ["f"]
 
@@ -112,7 +135,10 @@ def test_a_file_that_is_there_is_kept_and_compared(tmp_path):
 
 def test_a_refused_request_is_reported_at_once(tmp_path):
     with Server(status=404) as server:
-        with pytest.raises(UserError, match=r"the server says 404 Not Found; check data.url"):
+        with pytest.raises(
+            UserError,
+            match=r"the server says 404 Not Found; check data.url",
+        ):
             fetch(server, tmp_path / "f")
         assert len(server.asked) == 1
     with pytest.raises(UserError, match="not an address"):
@@ -120,7 +146,9 @@ def test_a_refused_request_is_reported_at_once(tmp_path):
     assert names(tmp_path) == []
 
 
-def test_a_failing_server_is_tried_again_and_an_absent_one_is_named(tmp_path):
+def test_a_failing_server_is_tried_again_and_an_absent_one_is_named(
+    tmp_path,
+):
     with Server(status=503) as server:
         with pytest.raises(UserError, match=r"0 bytes came \(503"):
             fetch(server, tmp_path / "f")
@@ -136,7 +164,8 @@ def test_a_failing_server_is_tried_again_and_an_absent_one_is_named(tmp_path):
             lambda part: part.symlink_to("/dev/full"),
             errno.ENOSPC,
             marks=pytest.mark.skipif(
-                not Path("/dev/full").exists(), reason="there is no /dev/full"
+                not Path("/dev/full").exists(),
+                reason="there is no /dev/full",
             ),
         ),
         (Path.mkdir, errno.EISDIR),
@@ -148,7 +177,10 @@ def test_an_error_of_the_disk_is_reported_at_once_and_not_as_a_network_error(
     spoil(tmp_path / ".f.part")
     with Server() as server, pytest.raises(OSError) as caught:  # noqa: PT011
         fetch(server, tmp_path / "f", SHA256)
-    assert (caught.value.errno, caught.value.filename) == (number, str(tmp_path / "f"))
+    assert (caught.value.errno, caught.value.filename) == (
+        number,
+        str(tmp_path / "f"),
+    )
     assert len(server.asked) == 1
 
 
@@ -167,7 +199,8 @@ def test_the_recordings_are_found_through_the_variable(tmp_path, monkeypatch):
     monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
     assert data_folder() == tmp_path
     with pytest.raises(
-        UserError, match=r"set GANLANE_DATA to a folder that holds ngsim/us101_scenes\.csv"
+        UserError,
+        match=r"set GANLANE_DATA to a folder that holds ngsim/us101_scenes\.csv",
     ):
         default_scenes()
     (tmp_path / "ngsim").mkdir()
@@ -183,7 +216,9 @@ def test_the_recordings_are_found_beside_the_current_folder(tmp_path, monkeypatc
     monkeypatch.delenv("GANLANE_DATA", raising=False)
     module = sys.modules["ganlane.data.sources"]
     monkeypatch.setattr(
-        module, "__file__", str(tmp_path / "site" / "ganlane" / "data" / "sources.py")
+        module,
+        "__file__",
+        str(tmp_path / "site" / "ganlane" / "data" / "sources.py"),
     )
     work = tmp_path / "work"
     work.mkdir()
@@ -204,7 +239,13 @@ def test_a_file_larger_than_wanted_is_refused_and_leaves_nothing(length, tmp_pat
 
 
 @pytest.mark.parametrize(
-    "place", ["ftp://here/f", "file:///etc/hostname", "data:,f", "http://[::1"]
+    "place",
+    [
+        "ftp://here/f",
+        "file:///etc/hostname",
+        "data:,f",
+        "http://[::1",
+    ],
 )
 def test_no_redirection_leads_away_from_http(place, tmp_path):
     with (
@@ -242,9 +283,15 @@ def test_nobody_comes_near_another_along_the_road(seed):
 
 
 def test_the_share_of_changing_vehicles_is_found_by_the_detector():
-    for changing, wander_m in ((40, 0.0), (0, SyntheticTraffic.wander_m)):
+    for changing, wander_m in (
+        (40, 0.0),
+        (0, SyntheticTraffic.wander_m),
+    ):
         traffic = SyntheticTraffic(
-            scenes=1, vehicles=40, changing_share=changing / 40, wander_m=wander_m
+            scenes=1,
+            vehicles=40,
+            changing_share=changing / 40,
+            wander_m=wander_m,
         )
         tracks = tracks_of_frame(synthetic_scenes(traffic), {"synthetic-0": 3.5})
         assert len(find_lane_changes(tracks)) == changing

@@ -12,14 +12,27 @@ from reference.recordings import following_file
 
 from ganlane.commands import realism as command
 from ganlane.config.recordings import RealismConfig
-from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
+from ganlane.data import (
+    SyntheticTraffic,
+    synthetic_scenes,
+    write_scene_csv,
+)
 from ganlane.generator import shipped_generator
 from ganlane.realism import main
-from ganlane.realism.measures import QUANTITIES, SHIPPED_REFERENCE, Reference
+from ganlane.realism.measures import (
+    QUANTITIES,
+    SHIPPED_REFERENCE,
+    Reference,
+)
 from ganlane.realism.sheets import card_text
 from ganlane.weights import load_weights, save_weights
 
-QUICK = ["quick=true", "vehicle_km=0.5", "long_s=10", "long_vehicles=[4]"]
+QUICK = [
+    "quick=true",
+    "vehicle_km=0.5",
+    "long_s=10",
+    "long_vehicles=[4]",
+]
 
 
 @pytest.fixture(autouse=True)
@@ -35,7 +48,10 @@ def _in_an_empty_folder(tmp_path, monkeypatch):
 def recordings(tmp_path):
     path = tmp_path / "recordings" / "scenes.csv"
     path.parent.mkdir()
-    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=8, seconds=7.0)), path)
+    write_scene_csv(
+        synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=8, seconds=7.0)),
+        path,
+    )
     return path
 
 
@@ -47,16 +63,29 @@ def run(capsys, *arguments):
     path = Path(last.removeprefix("results: ")) if last.startswith("results: ") else None
     return (
         status,
-        None if path is None else {**json.loads(path.read_text()), "folder": path.parent},
+        None
+        if path is None
+        else {
+            **json.loads(path.read_text()),
+            "folder": path.parent,
+        },
         out,
         err,
     )
 
 
 def test_a_card_holds_every_quantity_in_numbers_tables_and_figures(recordings, capsys):
-    asked = ["scenes=all", "long_against=true", "data.held_out=[synthetic-1]"]
+    asked = [
+        "scenes=all",
+        "long_against=true",
+        "data.held_out=[synthetic-1]",
+    ]
     status, results, out, _ = run(capsys, "traffic=idm", f"data.path={recordings}", *asked)
-    assert (status, results["traffic"], results["quantities"].keys()) == (
+    assert (
+        status,
+        results["traffic"],
+        results["quantities"].keys(),
+    ) == (
         0,
         "idm",
         QUANTITIES.keys(),
@@ -64,7 +93,11 @@ def test_a_card_holds_every_quantity_in_numbers_tables_and_figures(recordings, c
     row = results["quantities"]["speed"]
     assert 0.0 <= row["distance_ci"][0] <= row["distance"] <= 1.0
     assert None not in (row["ceiling"], row["floor"])
-    assert row["against"]["idm_mobil"]["verdict"] in ("closer", "farther", "undecided")
+    assert row["against"]["idm_mobil"]["verdict"] in (
+        "closer",
+        "farther",
+        "undecided",
+    )
     assert results["quantities_held_out"]["speed"]["samples"] < row["samples"]
     for key in (
         "lane_changes_per_vehicle_km",
@@ -76,11 +109,19 @@ def test_a_card_holds_every_quantity_in_numbers_tables_and_figures(recordings, c
         assert results[key] is not None
     assert results["long_runs"][0]["vehicle_km"] >= 0.5
     assert results["long_runs_against"].keys() == {"idm_mobil"}
-    for part in ("changes per vehicle-km", "held-out scenes alone", "idm_mobil, long runs"):
+    for part in (
+        "changes per vehicle-km",
+        "held-out scenes alone",
+        "idm_mobil, long runs",
+    ):
         assert part in out
     # The tables can be made again from the file.
     assert "\n\n".join(card_text(results)) in out
-    for name in ("distributions.png", "distances.png", "drift.png"):
+    for name in (
+        "distributions.png",
+        "distances.png",
+        "drift.png",
+    ):
         assert Image.open(results["folder"] / name).width > 400
 
 
@@ -95,7 +136,13 @@ def test_desired_speeds_are_fitted_on_the_scenes_that_are_not_held_out(recording
         "against=[]",
     ]
     held_out = "data.held_out=[synthetic-1]"
-    _, results, _, err = run(capsys, "traffic=idm", f"data.path={recordings}", held_out, *arguments)
+    _, results, _, err = run(
+        capsys,
+        "traffic=idm",
+        f"data.path={recordings}",
+        held_out,
+        *arguments,
+    )
     assert "idm: fitting desired speeds on 3 scenes" in err
     assert results["desired_above_mps"].keys() == {"idm"}
     assert results["scenes"] == ["synthetic-1"]
@@ -103,9 +150,15 @@ def test_desired_speeds_are_fitted_on_the_scenes_that_are_not_held_out(recording
     assert results["overlaps_per_1000_vehicle_km"] is None
 
 
-def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(capsys):
+def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(
+    capsys,
+):
     status, results, _, err = run(capsys, "traffic=idm_mobil", "against=[]")
-    assert (status, results["starts"], results["i80"]) == (0, "spawned", {})
+    assert (status, results["starts"], results["i80"]) == (
+        0,
+        "spawned",
+        {},
+    )
     assert "no recordings here" in err
     assert None not in (
         results["quantities"]["speed"]["ceiling"],
@@ -115,14 +168,22 @@ def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(capsy
 
 def test_a_users_own_traffic_gets_a_card_and_one_of_i80_beside_the_scenes(recordings, capsys):
     following_file(recordings.parent / "i80_following.csv")
-    own = ["traffic=idm", "traffic._target_=entry_own_parts.Cruise", "against=[idm]"]
+    own = [
+        "traffic=idm",
+        "traffic._target_=entry_own_parts.Cruise",
+        "against=[idm]",
+    ]
     more = ["scenes=all", "i80=true", "vehicle_km=0"]
     status, results, out, _ = run(capsys, *own, f"data.path={recordings}", *more)
     assert status == 0
     assert results["traffic"] == "entry_own_parts.Cruise"
     assert results["quantities"]["speed"]["against"].keys() == {"idm"}
     assert len(results["scenes"]) == 4
-    assert results["i80"]["following"].keys() == {"speed", "acceleration", "time_headway"}
+    assert results["i80"]["following"].keys() == {
+        "speed",
+        "acceleration",
+        "time_headway",
+    }
     assert "I-80, following" in out
 
 
@@ -135,18 +196,33 @@ def fold(path, held_out):
 
 
 def test_by_folds_every_scene_is_driven_by_weights_that_never_saw_it(recordings, capsys, tmp_path):
-    pairs = (["synthetic-0", "synthetic-3"], ["synthetic-1", "synthetic-2"])
+    pairs = (
+        ["synthetic-0", "synthetic-3"],
+        ["synthetic-1", "synthetic-2"],
+    )
     files = [fold(tmp_path / f"fold{index}.safetensors", pair) for index, pair in enumerate(pairs)]
-    arguments = ["traffic=gan_calibrated", "vehicle_km=0", f"data.path={recordings}"]
-    status, results, _, _ = run(capsys, *arguments, f"fold_weights=[{files[0]},{files[1]}]")
+    arguments = [
+        "traffic=gan_calibrated",
+        "vehicle_km=0",
+        f"data.path={recordings}",
+    ]
+    status, results, _, _ = run(
+        capsys,
+        *arguments,
+        f"fold_weights=[{files[0]},{files[1]}]",
+    )
     assert status == 0
     assert results["scenes"] == [*pairs[0], *pairs[1]]
     assert results["held_out"] == list(pairs)
     assert results["driving"]["recorded"]["vehicle_km"] == pytest.approx(
-        results["driving"]["constant_velocity"]["vehicle_km"], rel=0.2
+        results["driving"]["constant_velocity"]["vehicle_km"],
+        rel=0.2,
     )
     mistakes = {
-        "synthetic-1 is held out 0 times": [*arguments, f"fold_weights=[{files[0]}]"],
+        "synthetic-1 is held out 0 times": [
+            *arguments,
+            f"fold_weights=[{files[0]}]",
+        ],
         "needs the preset paper": [
             "traffic=gan",
             *arguments[1:],
@@ -173,7 +249,10 @@ def test_by_folds_every_scene_is_driven_by_weights_that_never_saw_it(recordings,
         (["publish=true"], "scenes=all"),
         (["scenes=some"], "held_out, all"),
         (["device=cuda"], "device=cuda"),
-        (["traffic.path=gone.safetensors", "traffic=gan"], "gone.safetensors"),
+        (
+            ["traffic.path=gone.safetensors", "traffic=gan"],
+            "gone.safetensors",
+        ),
     ],
 )
 def test_mistakes_are_told_in_a_sentence_and_leave_nothing(
@@ -181,7 +260,11 @@ def test_mistakes_are_told_in_a_sentence_and_leave_nothing(
 ):
     before = sorted(path.name for path in tmp_path.iterdir())
     status, _, _, err = run(
-        capsys, "traffic=idm", f"data.path={recordings}", "vehicle_km=0", *arguments
+        capsys,
+        "traffic=idm",
+        f"data.path={recordings}",
+        "vehicle_km=0",
+        *arguments,
     )
     assert status == 2
     assert part in err
@@ -194,8 +277,18 @@ def test_the_file_that_ships_is_written_on_request_alone(recordings, capsys, mon
     there = tmp_path / "shipped.json"
     before = SHIPPED_REFERENCE.read_bytes()
     monkeypatch.setattr(command, "SHIPPED_REFERENCE", there)
-    arguments = ["against=[]", "vehicle_km=0", "scenes=all", "publish=true"]
-    status, _, _, _ = run(capsys, "traffic=idm", f"data.path={recordings}", *arguments)
+    arguments = [
+        "against=[]",
+        "vehicle_km=0",
+        "scenes=all",
+        "publish=true",
+    ]
+    status, _, _, _ = run(
+        capsys,
+        "traffic=idm",
+        f"data.path={recordings}",
+        *arguments,
+    )
     assert status == 0
     assert Reference.load(there).source == "scenes.csv"
     assert SHIPPED_REFERENCE.read_bytes() == before
@@ -205,8 +298,23 @@ def test_one_scene_is_refused_with_what_to_do_and_driven_whole_when_asked(record
     pl.read_csv(recordings).filter(pl.col("scene") == "synthetic-1").write_csv(recordings)
     status, _, _, err = run(capsys, "traffic=idm", f"data.path={recordings}")
     assert status == 2
-    assert all(part in err for part in ("one scene, synthetic-1", "scenes=all", "scene_s=30"))
-    assert run(capsys, "traffic=idm", f"data.path={recordings}", "scenes=all")[0] == 0
+    assert all(
+        part in err
+        for part in (
+            "one scene, synthetic-1",
+            "scenes=all",
+            "scene_s=30",
+        )
+    )
+    assert (
+        run(
+            capsys,
+            "traffic=idm",
+            f"data.path={recordings}",
+            "scenes=all",
+        )[0]
+        == 0
+    )
 
 
 @pytest.mark.slow

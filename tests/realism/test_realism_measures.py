@@ -15,7 +15,11 @@ from reference.recordings import made_by_hand, recorded_cars
 from scipy.spatial.distance import jensenshannon
 from scipy.stats import binom
 
-from ganlane.data import default_scenes, read_scenes, scene_lane_widths
+from ganlane.data import (
+    default_scenes,
+    read_scenes,
+    scene_lane_widths,
+)
 from ganlane.data.dense import recorded_frame, recordings_of
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Estimate
@@ -57,7 +61,10 @@ def test_constant_acceleration_has_no_jerk_and_a_cubic_path_its_own_and_the_spee
 def test_the_first_three_seconds_of_a_vehicle_do_not_count():
     present = np.ones((100, 2), bool)
     present[:50, 1] = False
-    result = made_by_hand(np.hstack([20.0 * TIME, 20.0 * TIME + 30.0]), present=present)
+    result = made_by_hand(
+        np.hstack([20.0 * TIME, 20.0 * TIME + 30.0]),
+        present=present,
+    )
     # The first: samples 30 to 94. The second appears at 50: samples 80 to 94.
     assert len(values(result, "speed")) == 65 + 15
     assert measure_recordings([result]).vehicle_km == pytest.approx((70 + 20) * 2.0 / 1000.0)
@@ -94,7 +101,8 @@ def test_a_lane_change_counts_once_with_its_duration_unless_it_comes_too_early()
 
 
 def test_histograms_keep_scenes_apart_and_everything_in_the_outermost_bins():
-    slow, fast = made_by_hand(10.5 * TIME, name="slow"), made_by_hand(55.0 * TIME, name="fast")
+    slow = made_by_hand(10.5 * TIME, name="slow")
+    fast = made_by_hand(55.0 * TIME, name="fast")
     counts = measure_recordings([slow, fast]).counts["speed"]
     assert counts.shape == (2, QUANTITIES["speed"].number)
     assert counts[0, 10] == counts[0].sum() == 65
@@ -103,7 +111,10 @@ def test_histograms_keep_scenes_apart_and_everything_in_the_outermost_bins():
 
 def test_segments_keep_their_unit_and_leave_out_what_was_to_be_skipped():
     pieces = made_by_hand(10.0 * TIME).segments(3.0, skip_s=3.5)
-    assert [piece.name for piece in pieces] == ["scene@35", "scene@65"]
+    assert [piece.name for piece in pieces] == [
+        "scene@35",
+        "scene@65",
+    ]
     assert {piece.unit for piece in pieces} == {"scene"}
     assert pieces[1].x[0, 0] == pytest.approx(65.0)
 
@@ -141,7 +152,9 @@ def histograms(shift, seed, number=12):
 
 
 def test_a_model_that_is_nearer_in_every_scene_is_found_to_be_closer():
-    recorded, near, far = histograms(0.0, 0), histograms(0.02, 1), histograms(0.2, 2)
+    recorded = histograms(0.0, 0)
+    near = histograms(0.02, 1)
+    far = histograms(0.2, 2)
     difference = distance_difference(near, far, recorded, resamples=200)
     assert difference.high < 0.0
     assert difference.value == pytest.approx(
@@ -171,11 +184,17 @@ def draws(shift, number, trials=40):
         means = random.normal(0.3, 0.05, number).clip(0.1, 0.6)
         size = random.integers(15, 60, number)
         model = means + shift
-        yield sampled(means, size), sampled(model, 4 * size), sampled(model, 4 * size)
+        yield (
+            sampled(means, size),
+            sampled(model, 4 * size),
+            sampled(model, 4 * size),
+        )
 
 
 @pytest.mark.parametrize("number", [4, 11])
-def test_the_interval_of_a_perfect_model_holds_0_and_its_own_estimate(number):
+def test_the_interval_of_a_perfect_model_holds_0_and_its_own_estimate(
+    number,
+):
     intervals = [
         distance(model, recorded, resamples=300) for recorded, model, _ in draws(0.0, number)
     ]
@@ -184,7 +203,9 @@ def test_the_interval_of_a_perfect_model_holds_0_and_its_own_estimate(number):
 
 
 @pytest.mark.parametrize("number", [4, 11])
-def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(number):
+def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(
+    number,
+):
     many = np.random.default_rng(1).normal(0.3, 0.05, 2000).clip(0.1, 0.6)
     true = float(
         jensen_shannon(
@@ -198,7 +219,10 @@ def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(number):
     assert sum(each.low > 0.0 for each in intervals) >= 0.9 * len(intervals)
 
 
-@pytest.mark.parametrize(("number", "shift"), [(4, 0.0), (11, 0.0), (4, 0.1), (11, 0.1)])
+@pytest.mark.parametrize(
+    ("number", "shift"),
+    [(4, 0.0), (11, 0.0), (4, 0.1), (11, 0.1)],
+)
 def test_two_equally_good_models_are_seldom_told_apart(number, shift):
     verdicts = [
         verdict(distance_difference(*models, recorded, resamples=300))
@@ -210,7 +234,10 @@ def test_two_equally_good_models_are_seldom_told_apart(number, shift):
 @given(COUNTS, COUNTS, COUNTS)
 def test_every_interval_holds_its_estimate(recorded, first, second):
     own = distance(first, recorded, resamples=20)
-    for estimate in (own, distance_difference(first, second, recorded, resamples=20)):
+    for estimate in (
+        own,
+        distance_difference(first, second, recorded, resamples=20),
+    ):
         assert estimate.low <= estimate.value <= estimate.high
     assert own.low >= 0.0
 
@@ -220,7 +247,8 @@ def test_a_model_does_not_differ_from_itself_and_unpaired_units_are_resampled_on
     assert distance_difference(model, model, histograms(0.0, 5), resamples=50) == Estimate(
         0.0, 0.0, 0.0
     )
-    model, recorded = histograms(0.1, 3, 5), histograms(0.0, 5, 8)
+    model = histograms(0.1, 3, 5)
+    recorded = histograms(0.0, 5, 8)
     estimate = distance(model, recorded, paired=False, resamples=100)
     assert estimate.low <= estimate.value <= estimate.high
     assert distance(model[:1], recorded, paired=False).interval is None
@@ -229,8 +257,15 @@ def test_a_model_does_not_differ_from_itself_and_unpaired_units_are_resampled_on
 @pytest.fixture
 def reference():
     recordings = recorded_cars(scenes=3)
-    whole = {"lane_changes": 3, "vehicle_km": 2.0, "speed_spread_mps": 1.0}
-    floors = {"random": {"speed": 0.5}, "constant_velocity": {"speed": 0.2}}
+    whole = {
+        "lane_changes": 3,
+        "vehicle_km": 2.0,
+        "speed_spread_mps": 1.0,
+    }
+    floors = {
+        "random": {"speed": 0.5},
+        "constant_velocity": {"speed": 0.2},
+    }
     return Reference(
         **vars(measure_recordings(recordings)),
         source="made up",
@@ -246,7 +281,10 @@ def test_a_reference_comes_back_from_its_file(reference, tmp_path):
     again = Reference.load(path)
     for name in QUANTITIES:
         assert np.array_equal(again.counts[name], reference.counts[name])
-    assert {**vars(again), "counts": 0} == {**vars(reference), "counts": 0}
+    assert {**vars(again), "counts": 0} == {
+        **vars(reference),
+        "counts": 0,
+    }
     assert json.loads(path.read_text())["ceilings"].keys() == QUANTITIES.keys()
 
 
@@ -257,7 +295,10 @@ def test_another_file_is_refused_in_a_sentence(damage, reference, tmp_path):
         reference.save(path)
         numbers = json.loads(path.read_text())
         del numbers["checksum"]  # that of another content
-        numbers |= {"kind": {"kind": "a recipe"}, "bins": {"bins": {}}}.get(damage, {})
+        numbers |= {
+            "kind": {"kind": "a recipe"},
+            "bins": {"bins": {}},
+        }.get(damage, {})
         path.write_text("{" if damage == "text" else json.dumps(numbers))
     with pytest.raises(UserError, match=r"reference\.json: not the histograms"):
         Reference.load(path)
@@ -272,7 +313,12 @@ def test_what_ships_is_small_and_holds_no_trajectories():
     assert rate["lane_changes"] == 57
     assert rate["per_vehicle_km_ci"] == pytest.approx([0.70, 1.20], abs=0.01)
     assert shipped.spread_mps == pytest.approx(2.8, abs=0.05)
-    for name in ("acceleration", "jerk", "time_headway", "time_to_collision"):
+    for name in (
+        "acceleration",
+        "jerk",
+        "time_headway",
+        "time_to_collision",
+    ):
         assert ceiling(shipped.counts[name]) < shipped.floors["random"][name]
     assert all(0.0 < ceiling(shipped.counts[name]) < 1.0 for name in QUANTITIES)
 
@@ -284,7 +330,8 @@ def test_what_ships_is_what_the_recordings_show():
         pytest.skip(str(missing))
     frame = read_scenes(path)
     recordings = recordings_of(frame, scene_lane_widths(frame))
-    measured, shipped = measure_recordings(recordings), Reference.load(SHIPPED_REFERENCE)
+    measured = measure_recordings(recordings)
+    shipped = Reference.load(SHIPPED_REFERENCE)
     assert shipped.units == [each.name for each in recordings]
     for name in QUANTITIES:
         assert np.array_equal(measured.counts[name], shipped.counts[name])

@@ -37,6 +37,7 @@ from ganlane.data.sources import (
     recordings_path,
 )
 from ganlane.data.statistics import (
+    Bins,
     DrivingStatistics,
     Histogram,
     driving_statistics,

@@ -39,16 +39,16 @@ def portal_file(folder, content):
     return path
 
 
-def same_driving(read: pl.DataFrame, made: pl.DataFrame) -> None:
-    made = made.sort("vehicle", "frame")
+def same_driving(read: pl.DataFrame, expected: pl.DataFrame) -> None:
+    expected = expected.sort("vehicle", "frame")
     same = ["vehicle", "frame", "lane"]
-    assert read.select(same).equals(made.select(same))
+    assert read.select(same).equals(expected.select(same))
     # Lane width and the first lane's centre are estimated from positions that wander by 0.15 m.
     for name, tolerance in {
         **dict.fromkeys(("x", "speed", "length", "width"), 1e-5),
         "y": 0.2,
     }.items():
-        assert (read[name] - made[name]).abs().max() < tolerance, name
+        assert (read[name] - expected[name]).abs().max() < tolerance, name
 
 
 def test_raw_text_gives_back_the_recording_in_metres_from_centres_and_from_the_right(
@@ -135,9 +135,9 @@ def test_ramps_are_left_out_and_end_a_track(tmp_path):
 
 def test_lanes_is_how_many_are_kept_from_the_left(tmp_path):
     path = text_file(tmp_path, ngsim_rows(FIRST))
-    kept = read_recordings("ngsim", path, NgsimParameters(lanes=2))
-    assert kept.height == FIRST.filter(pl.col("lane") >= 1).height
-    assert sorted(kept["lane"].unique()) == [0, 1]
+    left = read_recordings("ngsim", path, NgsimParameters(lanes=2))
+    assert left.height == FIRST.filter(pl.col("lane") >= 1).height
+    assert sorted(left["lane"].unique()) == [0, 1]
 
 
 def changed(folder, row: int, column: str, value: str):

@@ -39,7 +39,7 @@ from ganlane.files import write_bytes
 HEADER = "scene,vehicle,frame,x,y,heading,v,lane,length,width"
 #: Two cars, one in the left lane (1) and one in the right (2), 3.5 m apart, at 10 m/s.
 ROWS = [
-    f"s,{vehicle},{frame},{frame * 1.0 + 20 * vehicle},{-3.5 * (vehicle - 1)},0,10,{vehicle},4.5,2.0"
+    f"s,{vehicle},{frame},{frame * 1.0 + 20 * vehicle},{-3.5 * (vehicle - 1)},0,10,{vehicle},4.5,2"
     for vehicle in (1, 2)
     for frame in range(6)
 ]
@@ -72,12 +72,12 @@ def test_lanes_are_counted_from_the_right_y_from_the_right_lanes_centre_and_rows
 
 
 def test_a_synthetic_recording_survives_the_file(tmp_path):
-    made = synthetic_scenes(seed=3)
+    frame = synthetic_scenes(seed=3)
     path = tmp_path / "made.csv"
-    write_scene_csv(made, path)
+    write_scene_csv(frame, path)
     read = read_scenes(path)
     exact = ["scene", "vehicle", "frame", "lane"]
-    assert read.select(exact).equals(made.select(exact))
+    assert read.select(exact).equals(frame.select(exact))
     # The lane width is estimated anew, to 4 cm; two lanes to the left that makes 8 cm.
     for name, tolerance in {
         "x": 1e-4,
@@ -86,7 +86,7 @@ def test_a_synthetic_recording_survives_the_file(tmp_path):
         "width": 1e-9,
         "y": 0.08,
     }.items():
-        assert (read[name] - made[name]).abs().max() <= tolerance
+        assert (read[name] - frame[name]).abs().max() <= tolerance
 
 
 @pytest.mark.parametrize(
@@ -203,11 +203,11 @@ def test_damaged_parquet_is_refused(tmp_path):
     path.write_bytes(b"PAR1 not really")
     with pytest.raises(UserError, match="not a readable Parquet file"):
         read_scenes(path)
-    made = synthetic_scenes()
-    write_prepared(made.drop("speed"), path)
+    frame = synthetic_scenes()
+    write_prepared(frame.drop("speed"), path)
     with pytest.raises(UserError, match=r"x.parquet: no column speed"):
         read_scenes(path)
-    write_prepared(made.with_columns(x=pl.lit(float("nan"))), path)
+    write_prepared(frame.with_columns(x=pl.lit(float("nan"))), path)
     with pytest.raises(
         UserError,
         match=r"x.parquet, row 0, column x: nan is not a finite number",

@@ -55,16 +55,16 @@ def test_the_size_of_a_block_changes_nothing(
     lines = [("  {}   {}\t{} " if blanks else "{},{},{}").format(*row) for row in rows]
     end = "\r\n" if windows else "\n"
     content = end.join([*([] if blanks else ["a,b,c"]), *lines]) + (end if ended else "")
-    found = read(
+    parsed = read(
         tmp_path_factory.mktemp("blocks") / "t",
         content.encode(),
         blanks,
         block_bytes,
     )
     first = 1 if blanks else 2
-    numbers = [tuple(map(int, (c, a))) for c, a, _ in found.select("c", "a", LINE).iter_rows()]
+    numbers = [tuple(map(int, (c, a))) for c, a, _ in parsed.select("c", "a", LINE).iter_rows()]
     assert numbers == [(c, a) for a, _, c in rows]
-    assert found[LINE].to_list() == list(range(first, first + len(rows)))
+    assert parsed[LINE].to_list() == list(range(first, first + len(rows)))
 
 
 @pytest.mark.parametrize("block_bytes", [3, 2**20])
@@ -136,11 +136,11 @@ def test_empty_lines_at_the_end_are_no_rows(tmp_path):
 
 
 def test_quoted_fields_may_hold_commas(tmp_path):
-    found = read(
+    parsed = read(
         tmp_path / "t.csv",
         b'a,b,c\n"1,234",2,"5,678.25"\n7,8,9\n',
     )
-    assert convert(found, "c", pl.Float64, tmp_path).to_list() == [5678.25, 9.0]
+    assert convert(parsed, "c", pl.Float64, tmp_path).to_list() == [5678.25, 9.0]
 
 
 @pytest.mark.parametrize(
@@ -182,14 +182,14 @@ def test_a_header_is_read_in_any_case_with_quotes_and_a_byte_order_mark(
 
 
 def test_the_validator_checks_frames_that_come_from_nowhere():
-    made = synthetic_scenes(SyntheticTraffic(scenes=1))
-    assert validate(made, "made").equals(made)
-    holed = made.with_columns(x=pl.when(pl.int_range(pl.len()) == 7).then(None).otherwise("x"))
+    frame = synthetic_scenes(SyntheticTraffic(scenes=1))
+    assert validate(frame, "made").equals(frame)
+    holed = frame.with_columns(x=pl.when(pl.int_range(pl.len()) == 7).then(None).otherwise("x"))
     for wrong, message in (
-        (made.drop("speed"), "made: no column speed"),
-        (made.clear(), "made: no rows"),
+        (frame.drop("speed"), "made: no column speed"),
+        (frame.clear(), "made: no rows"),
         (
-            made.with_columns(x=pl.lit("here")),
+            frame.with_columns(x=pl.lit("here")),
             "made, column x: String found, Float64 expected",
         ),
         (

@@ -270,9 +270,9 @@ def test_a_seed_makes_one_recording_and_another_seed_another():
 
 @pytest.mark.parametrize("lanes", [1, 2, 5])
 def test_it_fits_the_schema_and_uses_every_lane(lanes):
-    made = synthetic_scenes(SyntheticTraffic(lanes=lanes))
-    assert validate(made, "made").equals(made)
-    assert set(scene_lane_counts(made).values()) == {lanes}
+    frame = synthetic_scenes(SyntheticTraffic(lanes=lanes))
+    assert validate(frame, "made").equals(frame)
+    assert set(scene_lane_counts(frame).values()) == {lanes}
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -214,20 +214,20 @@ def test_a_histogram_describes_a_sample_to_a_bins_width(values, parts):
     histogram = Histogram(Bins(-20.0, 20.0, 400))
     for part in np.array_split(np.array(values), parts):
         histogram.add(part)
-    found = histogram.describe()
+    described = histogram.describe()
     exact = describe(values)
-    assert (found.count, found.mean) == (
+    assert (described.count, described.mean) == (
         exact.count,
         pytest.approx(exact.mean, abs=1e-9),
     )
-    assert found.sd == pytest.approx(exact.sd, abs=1e-5)
+    assert described.sd == pytest.approx(exact.sd, abs=1e-5)
     ordered = np.clip(np.sort(values), -20.0, 20.0)
     for level in (0.25, 0.5, 0.95):
         # Between the neighbours of the exact place, and a bin's width more.
         at = level * len(ordered)
         low = ordered[max(int(np.floor(at)) - 1, 0)]
         high = ordered[min(int(np.ceil(at)), len(ordered) - 1)]
-        assert low - 0.1 - 1e-9 <= found.quantile(level) <= high + 0.1 + 1e-9
+        assert low - 0.1 - 1e-9 <= described.quantile(level) <= high + 0.1 + 1e-9
 
 
 def test_the_survival_curve_takes_censored_times_as_lower_bounds():
@@ -239,14 +239,14 @@ def test_the_survival_curve_takes_censored_times_as_lower_bounds():
     )
     assert times.tolist() == [1.0, 3.0, 5.0]
     assert shares == pytest.approx([0.8, 0.8 * 2 / 3, 0.0])
-    found = describe_durations(
+    described = describe_durations(
         [3.0, 1.0, 2.0, 5.0, 4.0],
         [True, True, False, True, False],
     )
-    assert found.survival_mean_s == pytest.approx(1.0 + 2 * 0.8 + 2 * 0.8 * 2 / 3)
-    assert found.survival_median_s == 5.0
-    assert (found.complete.count, found.censored) == (3, 2)
-    assert (found.complete.mean, found.complete.sd) == (3.0, 2.0)
+    assert described.survival_mean_s == pytest.approx(1.0 + 2 * 0.8 + 2 * 0.8 * 2 / 3)
+    assert described.survival_median_s == 5.0
+    assert (described.complete.count, described.censored) == (3, 2)
+    assert (described.complete.mean, described.complete.sd) == (3.0, 2.0)
 
 
 def test_durations_that_are_all_censored_have_no_mean():

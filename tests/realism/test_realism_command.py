@@ -168,13 +168,13 @@ def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(
 
 def test_a_users_own_traffic_gets_a_card_and_one_of_i80_beside_the_scenes(recordings, capsys):
     following_file(recordings.parent / "i80_following.csv")
-    own = [
+    mine = [
         "traffic=idm",
         "traffic._target_=entry_own_parts.Cruise",
         "against=[idm]",
     ]
     more = ["scenes=all", "i80=true", "vehicle_km=0"]
-    status, results, out, _ = run(capsys, *own, f"data.path={recordings}", *more)
+    status, results, out, _ = run(capsys, *mine, f"data.path={recordings}", *more)
     assert status == 0
     assert results["traffic"] == "entry_own_parts.Cruise"
     assert results["quantities"]["speed"]["against"].keys() == {"idm"}
@@ -229,8 +229,8 @@ def test_by_folds_every_scene_is_driven_by_weights_that_never_saw_it(recordings,
             f"fold_weights=[{files[0]},{files[1]}]",
         ],
     }
-    for said, given in mistakes.items():
-        status, _, _, err = run(capsys, *given)
+    for said, wrong in mistakes.items():
+        status, _, _, err = run(capsys, *wrong)
         assert status == 2
         assert said in err
 

@@ -50,7 +50,7 @@ def steady(**changed):
     return made_by_hand(**fields, lanes=2, name="steady")
 
 
-def test_constant_velocity_repeats_a_recording_of_constant_velocity_from_the_first_frame_of_a_vehicle_to_its_last():
+def test_constant_velocity_repeats_a_recording_of_it_from_a_vehicles_first_frame_to_its_last():
     there = drive_recordings(ConstantVelocity, [steady()], StartOptions())
     recorded = recorded_frame([steady()])
     joined = there.join(recorded, on=["vehicle", "frame"], suffix="_recorded")

@@ -5,8 +5,8 @@ import pytest
 from reference.recordings import following_file
 
 from ganlane.errors import UserError
-from ganlane.realism.measures import measure_recordings
 from ganlane.realism.i80 import I80_FILES, read_i80
+from ganlane.realism.measures import measure_recordings
 
 
 def lane_file(path):
@@ -68,8 +68,8 @@ def test_pairs_have_a_driven_follower_at_the_recorded_gap(
         recordings = read_i80(name, tmp_path / I80_FILES[name])
         # 40 s and 20 s, less the first 3, in pieces of 15.
         assert len(recordings) == {"pairs": 2, "following": 1}[name]
-        assert {each.lanes for each in recordings} == {1}
-        assert all(each.driven.sum() == 1 for each in recordings)
+        assert {piece.lanes for piece in recordings} == {1}
+        assert all(piece.driven.sum() == 1 for piece in recordings)
         quantiles = measure_recordings(recordings).quantiles
         assert quantiles["gap"]["0.5"] == pytest.approx(gap, abs=1e-6)
         assert quantiles["speed"]["0.5"] == pytest.approx(speed, abs=1e-6)
@@ -81,8 +81,8 @@ def test_a_lane_is_driven_as_a_whole_in_stretches_of_their_own(
 ):
     lane_file(tmp_path / I80_FILES["lane_1"])
     recordings = read_i80("lane_1", tmp_path / I80_FILES["lane_1"])
-    assert len({each.unit for each in recordings}) == len(recordings) == 2
-    assert all(each.driven.all() for each in recordings)
+    assert len({piece.unit for piece in recordings}) == len(recordings) == 2
+    assert all(piece.driven.all() for piece in recordings)
     # 2 s apart at 18 m/s, cars of 4.5 m.
     assert measure_recordings(recordings).quantiles["gap"]["0.5"] == pytest.approx(31.5, abs=1e-6)
 

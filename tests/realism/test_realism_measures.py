@@ -73,7 +73,7 @@ def test_the_first_three_seconds_of_a_vehicle_do_not_count():
 CLOSING_IN = np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME])
 
 
-def test_gap_headway_and_time_to_collision_of_two_cars_in_one_lane_whether_or_not_the_leader_is_replayed():
+def test_gap_headway_and_time_to_collision_of_two_cars_whether_or_not_the_leader_is_replayed():
     for driven in (True, False):
         result = made_by_hand(CLOSING_IN, driven=np.array([True, driven]))
         gap = 60.0 - 2.0 * TIME[30:95, 0]
@@ -198,8 +198,8 @@ def test_the_interval_of_a_perfect_model_holds_0_and_its_own_estimate(
     intervals = [
         distance(model, recorded, resamples=300) for recorded, model, _ in draws(0.0, number)
     ]
-    assert all(each.low <= each.value <= each.high for each in intervals)
-    assert sum(each.low == 0.0 for each in intervals) >= 0.9 * len(intervals)
+    assert all(interval.low <= interval.value <= interval.high for interval in intervals)
+    assert sum(interval.low == 0.0 for interval in intervals) >= 0.9 * len(intervals)
 
 
 @pytest.mark.parametrize("number", [4, 11])
@@ -215,8 +215,10 @@ def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(
     intervals = [
         distance(model, recorded, resamples=300) for recorded, model, _ in draws(0.1, number)
     ]
-    assert sum(each.low <= true <= each.high for each in intervals) >= 0.85 * len(intervals)
-    assert sum(each.low > 0.0 for each in intervals) >= 0.9 * len(intervals)
+    assert sum(interval.low <= true <= interval.high for interval in intervals) >= 0.85 * len(
+        intervals
+    )
+    assert sum(interval.low > 0.0 for interval in intervals) >= 0.9 * len(intervals)
 
 
 @pytest.mark.parametrize(
@@ -233,13 +235,13 @@ def test_two_equally_good_models_are_seldom_told_apart(number, shift):
 
 @given(COUNTS, COUNTS, COUNTS)
 def test_every_interval_holds_its_estimate(recorded, first, second):
-    own = distance(first, recorded, resamples=20)
+    single = distance(first, recorded, resamples=20)
     for estimate in (
-        own,
+        single,
         distance_difference(first, second, recorded, resamples=20),
     ):
         assert estimate.low <= estimate.value <= estimate.high
-    assert own.low >= 0.0
+    assert single.low >= 0.0
 
 
 def test_a_model_does_not_differ_from_itself_and_unpaired_units_are_resampled_on_its_side():
@@ -332,7 +334,7 @@ def test_what_ships_is_what_the_recordings_show():
     recordings = recordings_of(frame, scene_lane_widths(frame))
     measured = measure_recordings(recordings)
     shipped = Reference.load(SHIPPED_REFERENCE)
-    assert shipped.units == [each.name for each in recordings]
+    assert shipped.units == [recording.name for recording in recordings]
     for name in QUANTITIES:
         assert np.array_equal(measured.counts[name], shipped.counts[name])
     low, high = (shipped.quantiles["acceleration"][level] for level in ("0.05", "0.95"))

@@ -1,4 +1,4 @@
-"""Everybody from the same recorded scenes, from some of them alone, and with fitted desired speeds."""
+"""Everybody from the same recorded scenes, from some of them, and with fitted desired speeds."""
 
 import numpy as np
 import pytest

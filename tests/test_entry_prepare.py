@@ -83,11 +83,21 @@ def test_a_scene_csv_becomes_parquet_and_figures(here, capsys):
 
 def test_ngsim_portal_with_two_periods(here, capsys):
     parts = traffic().partition_by("scene")
+    # A quarter of an hour apart.
     rows = pl.concat(ngsim_rows(scene, START_MS + 900_000 * k) for k, scene in enumerate(parts))
     (here / "portal.csv").write_text(
         portal_csv(rows) + portal_csv(rows.head(3), "peachtree").partition("\n")[2]
     )
-    assert main(["data=ngsim", "data.path=portal.csv", "scene_s=3"]) == 0
+    assert (
+        main(
+            [
+                "data=ngsim",
+                "data.path=portal.csv",
+                "scene_s=3",
+            ]
+        )
+        == 0
+    )
     numbers = results(capsys.readouterr().out)
     assert numbers["rows"]["dropped"] == {"location peachtree": 3}
     assert [scene["name"] for scene in numbers["scenes"]] == [
@@ -109,6 +119,7 @@ def test_highd_folder(here, capsys):
 def test_from_a_users_csv_to_traffic_in_three_commands(here, capsys):
     write_csv(here / "mine.csv", scenes=3)
     assert main(["data.path=mine.csv", "out=mine"]) == 0
+    # Enough to write weights, not to be any good.
     few = [
         "generator.loop.updates=2",
         "generator.loop.evaluate_every=1",
@@ -116,7 +127,11 @@ def test_from_a_users_csv_to_traffic_in_three_commands(here, capsys):
         "hydra.run.dir=fit",
     ]
     assert train_generator(["data.path=mine", *few]) == 0
-    tiny = ["agents=[keep_lane]", "episodes=1", "env.goal_m=20"]
+    tiny = [
+        "agents=[keep_lane]",
+        "episodes=1",
+        "env.goal_m=20",
+    ]
     weights = "generator.path=fit/generator_paper.safetensors"
     assert evaluate(["traffics=[gan]", weights, *tiny]) == 0
     capsys.readouterr()
@@ -124,6 +139,7 @@ def test_from_a_users_csv_to_traffic_in_three_commands(here, capsys):
 
 def test_download_then_prepare(here, capsys):
     content = portal_csv(ngsim_rows(traffic().filter(pl.col("scene") == "synthetic-0"))).encode()
+    # The connection breaks once.
     with Server(content=content, breaks=[20_000]) as server:
         fetched = [
             "data=ngsim",

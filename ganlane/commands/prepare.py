@@ -15,12 +15,18 @@ from ganlane.data.prepared import (
     SceneSummary,
     prepare_recordings,
 )
-from ganlane.data.sources import byte_progress, recordings_path
+from ganlane.data.sources import (
+    byte_progress,
+    recordings_path,
+)
 from ganlane.evaluation import write_results
 from ganlane.evaluation.table import Table
 from ganlane.files import write_bytes
 from ganlane.runtime import peak_resident_bytes
-from ganlane.view.figures import draw_recordings, save_figure
+from ganlane.view.figures import (
+    draw_recordings,
+    save_figure,
+)
 
 #: Maximum number of scenes in the table.
 _MOST_SCENES: Final = 60

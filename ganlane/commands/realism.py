@@ -19,7 +19,11 @@ from ganlane.data.sources import data_folder, default_scenes
 from ganlane.errors import UserError
 from ganlane.evaluation import write_results
 from ganlane.evaluation.table import show
-from ganlane.generator import HELD_OUT, Preset, shipped_generator
+from ganlane.generator import (
+    HELD_OUT,
+    Preset,
+    shipped_generator,
+)
 from ganlane.parameters import assign
 from ganlane.realism.card import (
     card_numbers,
@@ -28,7 +32,10 @@ from ganlane.realism.card import (
 )
 from ganlane.realism.driving import Factory, StartOptions
 from ganlane.realism.i80 import I80_FILES, read_i80
-from ganlane.realism.long_runs import LongRunParameters, long_run
+from ganlane.realism.long_runs import (
+    LongRunParameters,
+    long_run,
+)
 from ganlane.realism.measures import (
     SHIPPED_REFERENCE,
     measure,
@@ -57,7 +64,11 @@ PRESETS: Final[Mapping[str, Preset]] = {
     "gan_calibrated": "calibrated",
 }
 #: Quantities that one lane shows.
-I80_QUANTITIES: Final = ("speed", "acceleration", "time_headway")
+I80_QUANTITIES: Final = (
+    "speed",
+    "acceleration",
+    "time_headway",
+)
 
 
 def realism(config: RealismConfig, folder: Path) -> str:
@@ -214,7 +225,10 @@ def drive_from_starts(
     # Desired speeds are fitted unless the user gives them.
     options = StartOptions(repeats=config.repeats, seed=config.seed)
     if config.desired_above_mps is not None:
-        options = replace(options, desired_above_mps=config.desired_above_mps)
+        options = replace(
+            options,
+            desired_above_mps=config.desired_above_mps,
+        )
     return recorded_starts(
         folds,
         frame,
@@ -249,9 +263,12 @@ def i80_rows(
     # Once each: the site has many more segments than scenes.
     recordings = read_i80(name, path)
     options = StartOptions(seed=config.seed)
-    if config.desired_above_mps is not None:
-        options = replace(options, desired_above_mps=config.desired_above_mps)
-    frames = drive_all(factories, recordings, options, starts.desired_above_mps)
+    frames = drive_all(
+        factories,
+        recordings,
+        options,
+        starts.desired_above_mps,
+    )
     units = units_of(recordings)
     recorded = measure_recordings(recordings).counts
     return quantity_rows(
@@ -282,7 +299,14 @@ def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str,
         def report(km: float, what: str = what) -> None:
             print_progress(f"{what}: {km:.0f} of {config.vehicle_km:g} vehicle-km")
 
-        runs.append(long_run(make, make_road(config.env), parameters, report))
+        runs.append(
+            long_run(
+                make,
+                make_road(config.env),
+                parameters,
+                report,
+            )
+        )
     return runs
 
 

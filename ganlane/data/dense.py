@@ -128,7 +128,13 @@ class Recording:
                 name: getattr(self, name)[rows, who] for name in ("x", "y", "speed", "present")
             }
             arrays |= {name: getattr(self, name)[who] for name in ("length", "width", "driven")}
-            pieces.append(replace(self, name=f"{self.name}@{start}", **arrays))
+            pieces.append(
+                replace(
+                    self,
+                    name=f"{self.name}@{start}",
+                    **arrays,
+                )
+            )
         return pieces
 
 

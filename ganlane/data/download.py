@@ -64,7 +64,11 @@ def download(
         raise UserError(f"{url}: not an address of a file; expected http:// or https://.")
     # A file that is there is never replaced: it may be the user's own.
     if path.is_file():
-        _check_sha256(path, sha256, "remove it, or correct data.sha256")
+        _check_sha256(
+            path,
+            sha256,
+            "remove it, or correct data.sha256",
+        )
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
     # The path appears only when everything has come and the checksum is right.
@@ -194,7 +198,11 @@ class _HttpOnly(urllib.request.HTTPRedirectHandler):
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 
-def _connect(part: _Part, on_progress: OnProgress | None, timeout_s: float) -> None:
+def _connect(
+    part: _Part,
+    on_progress: OnProgress | None,
+    timeout_s: float,
+) -> None:
     """One connection: the rest of the file, or all of it."""
     received = part.size
     headers = {

@@ -34,7 +34,10 @@ _TRACKS: Final = "_tracks.csv"
 #: Columns of ``XX_tracks.csv`` that are read.
 COLUMNS: Final = {
     **dict.fromkeys(("frame", "id", "laneid"), pl.Int64),
-    **dict.fromkeys(("x", "y", "width", "height", "xvelocity"), pl.Float64),
+    **dict.fromkeys(
+        ("x", "y", "width", "height", "xvelocity"),
+        pl.Float64,
+    ),
 }
 #: Columns of ``XX_recordingMeta.csv`` that are read.
 _META: Final = {
@@ -168,14 +171,23 @@ def _read_rows(path: Path, meta: Path, count: RowCount) -> pl.DataFrame:
     rows = read_table(path, COLUMNS)
     count.read += rows.height
     for name in ("width", "height"):
-        raise_where(rows[name] <= 0.0, rows, name, path, "is not above 0")
+        raise_where(
+            rows[name] <= 0.0,
+            rows,
+            name,
+            path,
+            "is not above 0",
+        )
     # Sorting would hide a damaged frame number.
     step = rows.select(pl.col("frame").diff().over("id")).to_series()
     what = "is not after the last frame of its vehicle; frames must grow"
     raise_where(step <= 0, rows, "frame", path, what)
     # Each row gets the direction of its vehicle.
     directions = rows["id"].replace_strict(
-        cars["id"], direction, default=None, return_dtype=pl.Int64
+        cars["id"],
+        direction,
+        default=None,
+        return_dtype=pl.Int64,
     )
     raise_where(
         directions.is_null(),
@@ -249,7 +261,11 @@ def resample(track: pl.DataFrame, rate_hz: float) -> pl.DataFrame:
     nearest = np.ceil(place - 0.5 - 1e-9).astype(np.int64)
     # Numbers are interpolated; lane and names are those of the nearest sample.
     columns = {
-        name: np.interp(place, np.arange(len(old)), track[name].to_numpy())
+        name: np.interp(
+            place,
+            np.arange(len(old)),
+            track[name].to_numpy(),
+        )
         for name in ("x", "y", "speed", "length", "width")
     }
     return track[nearest].with_columns(frame=frame.astype(np.int64), **columns)

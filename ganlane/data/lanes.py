@@ -43,7 +43,9 @@ _HOLD, _HALF_WINDOW, _REACH = 5, 5, 200
 _CENTRED_M, _STILL_MPS = 0.3, 0.1
 
 
-def scene_lane_widths(frame: pl.DataFrame) -> dict[str, float]:
+def scene_lane_widths(
+    frame: pl.DataFrame,
+) -> dict[str, float]:
     """Lane width in metres of every scene of a frame in the schema.
 
     Errors are :func:`lane_width`'s.
@@ -58,7 +60,9 @@ def scene_lane_widths(frame: pl.DataFrame) -> dict[str, float]:
     }
 
 
-def scene_lane_counts(frame: pl.DataFrame) -> dict[str, int]:
+def scene_lane_counts(
+    frame: pl.DataFrame,
+) -> dict[str, int]:
     """Number of lanes of every scene of a frame in the schema: its highest lane number plus one."""
     return dict(
         frame.group_by("scene", maintain_order=True).agg(pl.col("lane").max() + 1).iter_rows()

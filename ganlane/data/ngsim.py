@@ -73,7 +73,13 @@ RAW_NAMES: Final = (
 COLUMNS: Final = {
     **dict.fromkeys(("vehicle_id", "frame_id", "global_time"), pl.Int64),
     **dict.fromkeys(
-        ("local_x", "local_y", "v_length", "v_width", "v_vel"),
+        (
+            "local_x",
+            "local_y",
+            "v_length",
+            "v_width",
+            "v_vel",
+        ),
         pl.Float64,
     ),
     "lane_id": pl.Int64,
@@ -124,7 +130,13 @@ def ngsim_scenes(
                 f"{path}: no rows of {', '.join(parameters.locations)}; check data.locations."
             )
         for name, parts in periods.items():
-            if scene := _scene(name, _read(parts), path, parameters.lanes, count):
+            if scene := _scene(
+                name,
+                _read(parts),
+                path,
+                parameters.lanes,
+                count,
+            ):
                 yield scene
 
 
@@ -139,7 +151,7 @@ def _layout(path: Path) -> TextTable:
             f"{path}, line 1: {len(fields)} columns; expected the {len(RAW_NAMES)} of NGSIM's text "
             "files, or a header line."
         )
-    return TextTable(path, RAW_NAMES, has_header=False, blanks=True)
+    return TextTable(path, RAW_NAMES, blanks=True)
 
 
 def _read_rows(
@@ -170,7 +182,13 @@ def _read_rows(
                 path,
                 "is not above 0",
             )
-        raise_where(rows["v_vel"] < 0.0, rows, "v_vel", path, "is below 0")
+        raise_where(
+            rows["v_vel"] < 0.0,
+            rows,
+            "v_vel",
+            path,
+            "is below 0",
+        )
         yield rows
 
 
@@ -185,7 +203,13 @@ def _keep_locations(
     places = sorted({*MOTORWAYS, *STREETS, *locations})
     what = f"is no known place, expected {', '.join(places)}, or name it in data.locations"
     # A mistyped place would drop a whole recording in silence.
-    raise_where(~text[LOCATION].is_in(places), text, LOCATION, path, what)
+    raise_where(
+        ~text[LOCATION].is_in(places),
+        text,
+        LOCATION,
+        path,
+        what,
+    )
     wanted = text[LOCATION].is_in(list(locations))
     for location, rows in text[LOCATION].filter(~wanted).value_counts().iter_rows():
         count.drop(f"location {location}", rows)
@@ -193,7 +217,9 @@ def _keep_locations(
 
 
 def _store_by_period(
-    blocks: Iterable[pl.DataFrame], folder: Path, source: str
+    blocks: Iterable[pl.DataFrame],
+    folder: Path,
+    source: str,
 ) -> dict[str, list[Path]]:
     """Store the rows of all blocks under ``folder``.
 
@@ -221,7 +247,10 @@ def _store_by_period(
     periods: dict[str, list[Path]] = {}
     numbers = Counter[str]()
     for location, minute in sorted(parts):
-        numbers[location] += (location, minute - 1) not in parts
+        numbers[location] += (
+            location,
+            minute - 1,
+        ) not in parts
         periods.setdefault(f"{location}-{numbers[location]}", []).extend(parts[location, minute])
     for name, files in periods.items():
         location = name.rpartition("-")[0]

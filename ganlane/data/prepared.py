@@ -180,7 +180,9 @@ class PooledStatistics:
         }
 
 
-def _columns(records: Sequence[Any]) -> dict[str, list[Any]]:
+def _columns(
+    records: Sequence[Any],
+) -> dict[str, list[Any]]:
     """The values of each field of equal records."""
     return {name: [getattr(record, name) for record in records] for name in vars(records[0])}
 
@@ -236,7 +238,14 @@ def prepare_recordings(
     files = []
     written = 0
     with whole_folder(out) as folder:
-        for scene in open_scenes(kind, path, count, parameters, folder, on_progress):
+        for scene in open_scenes(
+            kind,
+            path,
+            count,
+            parameters,
+            folder,
+            on_progress,
+        ):
             # A lot of parked cars has no driving to measure.
             if scene.frame["speed"].max() == 0.0 or scene.frame["frame"].n_unique() < 2:
                 count.drop(

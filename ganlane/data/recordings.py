@@ -66,7 +66,11 @@ def write_prepared(frame: pl.DataFrame, path: str | Path) -> None:
     """Write a frame in the schema as Parquet with a checksum, atomically."""
     # In memory first, since the checksum covers the whole content.
     file = io.BytesIO()
-    frame.write_parquet(file, compression="zstd", metadata={"checksum": PLACE})
+    frame.write_parquet(
+        file,
+        compression="zstd",
+        metadata={"checksum": PLACE},
+    )
     write_bytes(path, sealed(file.getvalue()))
 
 
@@ -79,7 +83,11 @@ def write_scene_csv(frame: pl.DataFrame, path: str | Path) -> None:
         scene_csv(frame, pl.col("lane").max().over("scene"), 3.5).write_csv(part)
 
 
-def scene_csv(frame: pl.DataFrame, leftmost: pl.Expr, lane_width_m: float) -> pl.DataFrame:
+def scene_csv(
+    frame: pl.DataFrame,
+    leftmost: pl.Expr,
+    lane_width_m: float,
+) -> pl.DataFrame:
     """A frame in the schema as the columns of a scene CSV.
 
     ``leftmost`` is the number of the leftmost lane.

@@ -91,7 +91,10 @@ def number_tracks(frame: pl.DataFrame, source: str) -> pl.DataFrame:
         UserError: a vehicle number is negative or not below :data:`TRACK_STRIDE`.
     """
     # Numbers at or above the stride would look like later tracks.
-    low, high = frame.select(low=pl.col("vehicle").min(), high=pl.col("vehicle").max()).row(0)
+    low, high = frame.select(
+        low=pl.col("vehicle").min(),
+        high=pl.col("vehicle").max(),
+    ).row(0)
     if low < 0 or high >= TRACK_STRIDE:
         raise UserError(
             f"{source}: vehicle numbers from {low} to {high}; expected 0 to {TRACK_STRIDE - 1}, "
@@ -184,7 +187,10 @@ class _Checked:
             rows = self.frame.select(is_bad.arg_true()).to_series()
             if len(rows):
                 field = self.frame[column][rows[0]]
-                self.refuse(rows[0], f"column {column}: {field} {what}")
+                self.refuse(
+                    rows[0],
+                    f"column {column}: {field} {what}",
+                )
 
     def check_frame_rate(self) -> None:
         """With most rows further apart than a frame, nothing could be measured between them."""

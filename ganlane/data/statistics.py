@@ -259,7 +259,9 @@ def leader_gaps(frame: pl.DataFrame) -> pl.DataFrame:
     return ordered.with_columns(gap=gap, leader_speed=ahead["speed"]).drop_nulls("gap")
 
 
-def quantities(frame: pl.DataFrame) -> dict[str, np.ndarray]:
+def quantities(
+    frame: pl.DataFrame,
+) -> dict[str, np.ndarray]:
     """Samples of every quantity of a frame in the schema, sorted: ``speed`` and those below.
 
     ``acceleration_raw``: differences of the recorded speed between frames, m/s2; mostly noise in
@@ -352,7 +354,9 @@ class LaneChangeStatistics:
 
 
 def lane_change_statistics(
-    changes: LaneChanges, exposure: Exposure, speed_mps: float
+    changes: LaneChanges,
+    exposure: Exposure,
+    speed_mps: float,
 ) -> LaneChangeStatistics:
     """Statistics of lane changes found in that much driving at that mean speed, m/s."""
     # Two rates: per car and km of road, and per km driven.
@@ -445,7 +449,11 @@ def driving_statistics(
     )
     return DrivingStatistics(
         exposure=exposure,
-        lane_changes=lane_change_statistics(changes, exposure, float(samples["speed"].mean())),
+        lane_changes=lane_change_statistics(
+            changes,
+            exposure,
+            float(samples["speed"].mean()),
+        ),
         speed_sd_in_frame=_mean_spread(frame, ["scene", "frame"]),
         speed_sd_in_lane=_mean_spread(frame, ["scene", "frame", "lane"]),
         **{name: describe(samples[name]) for name in described},

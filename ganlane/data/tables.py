@@ -34,12 +34,11 @@ OnProgress = Callable[[int, int | None], None]
 class TextTable:
     """Layout of a text table; ``names`` are those of its columns, in lower case.
 
-    With ``blanks``, runs of blanks separate the columns, instead of a comma.
+    With ``blanks``, runs of blanks separate the columns, not commas, and there is no header.
     """
 
     path: Path
     names: tuple[str, ...]
-    has_header: bool = True
     blanks: bool = False
 
 
@@ -126,8 +125,14 @@ def convert(text: pl.DataFrame, column: str, kind: Kind, path: Path) -> pl.Serie
     refuse(numbers.is_null(), "is not a number")
     refuse(~numbers.is_finite(), "is not a finite number")
     if kind == pl.Int64:
-        refuse(numbers != numbers.round(), "is not a whole number")
-        refuse(numbers.abs() >= 2.0**63, "is too large a number")
+        refuse(
+            numbers != numbers.round(),
+            "is not a whole number",
+        )
+        refuse(
+            numbers.abs() >= 2.0**63,
+            "is too large a number",
+        )
     return numbers.cast(kind)
 
 
@@ -159,7 +164,7 @@ def read_blocks(
         UserError: a row that does not fit, is not text, empty or cut off; the message names file
             and line.
     """
-    number = FIRST_LINE if table.has_header else 1
+    number = 1 if table.blanks else FIRST_LINE
     done = 0
     total = table.path.stat().st_size
     for block, has_no_end in _whole_lines(table, block_bytes):
@@ -182,7 +187,7 @@ def _whole_lines(table: TextTable, block_bytes: int) -> Iterator[tuple[bytes, bo
     Empty lines at the end are left out.
     """
     with table.path.open("rb") as file:
-        if table.has_header:
+        if not table.blanks:
             file.readline()
         rest = b""
         while read := file.read(block_bytes):

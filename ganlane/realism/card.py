@@ -6,7 +6,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ganlane.evaluation.statistics import Array, Estimate, entries
+from ganlane.evaluation.statistics import (
+    Array,
+    Estimate,
+    entries,
+)
 from ganlane.realism.driving import FLOORS
 from ganlane.realism.long_runs import totals
 from ganlane.realism.measures import (
@@ -150,7 +154,8 @@ def quantity_rows(
 
 
 def floors_of(
-    driven: Mapping[str, Measured], recorded: Mapping[str, Array]
+    driven: Mapping[str, Measured],
+    recorded: Mapping[str, Array],
 ) -> dict[str, dict[str, float]]:
     """Finite distances of the reference drivers in ``driven`` to the recordings.
 

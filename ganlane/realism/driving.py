@@ -46,7 +46,11 @@ from ganlane.sim.random import (
     uniform,
 )
 from ganlane.sim.state import ENTRY_M, Road, Vehicles
-from ganlane.traffic.base import Memory, Moved, TrafficModule
+from ganlane.traffic.base import (
+    Memory,
+    Moved,
+    TrafficModule,
+)
 from ganlane.traffic.overlays import random_side
 
 #: Makes a traffic model for a road.
@@ -106,7 +110,9 @@ def drive_recordings(
     return pl.concat(frames)
 
 
-def _batches(rows: list[Recording]) -> list[list[Recording]]:
+def _batches(
+    rows: list[Recording],
+) -> list[list[Recording]]:
     """Rows of similar shapes together, at most :data:`_MOST_PAIRS` pairs of vehicles in a batch."""
     batches: list[list[Recording]] = []
     # Sorted by shape, so that little is padded.
@@ -136,7 +142,12 @@ def _drive(
     }
     key = episode_key(traffic.stream, *counters.values())
     # A uniform number with the wanted mean.
-    u = uniform(key, 0, recorded.x.shape[2], [Purpose.SPAWN_DESIRED_SPEED])[..., 0]
+    u = uniform(
+        key,
+        0,
+        recorded.x.shape[2],
+        [Purpose.SPAWN_DESIRED_SPEED],
+    )[..., 0]
     excess = 2.0 * options.desired_above_mps * u
     state = recorded.nobody(int(traffic.visibility))
     memory: TensorDictBase | None = None
@@ -241,7 +252,12 @@ class StackedRecordings:
                 value = torch.from_numpy(getattr(row, name))
                 # Index 0 of the vehicles is the ego's; later frames are empty.
                 below = [0, steps - len(value)] if value.ndim == 2 else []
-                padded.append(pad(value, [1, most - value.shape[-1], *below]))
+                padded.append(
+                    pad(
+                        value,
+                        [1, most - value.shape[-1], *below],
+                    )
+                )
             tensor = torch.stack(padded, dim=-2)
             return tensor.float() if tensor.is_floating_point() else tensor
 
@@ -345,7 +361,11 @@ def with_recorded_headways(
     def shown(name: str | tuple[str, ...], value: Tensor) -> Tensor:
         if name != "headway" and name[-1] != "headway":
             return value
-        return torch.where(who, balanced_headway(vehicles, road, value), value)
+        return torch.where(
+            who,
+            balanced_headway(vehicles, road, value),
+            value,
+        )
 
     return memory.named_apply(shown, nested_keys=True)
 
@@ -422,7 +442,11 @@ class RandomDriving(TrafficModule):
         starts = (drawn[..., 0] < self.dt / self.every_s) & (remaining.abs() < 0.3)
         side = torch.where(
             starts,
-            random_side(drawn[..., 1], v.target_lane, self.road.lanes),
+            random_side(
+                drawn[..., 1],
+                v.target_lane,
+                self.road.lanes,
+            ),
             0,
         )
         # Sideways at a constant speed, and no further than the lane's centre.
@@ -430,7 +454,13 @@ class RandomDriving(TrafficModule):
         aside = (remaining / stride).clamp(-1.0, 1.0) * stride
         speed = (v.speed + self.hardest * (2.0 * pace - 1.0) * self.dt).clamp_min(0.0)
         target = v.target_lane + side
-        return _accelerated(v, speed, self.dt, y=v.y + aside, target_lane=target), memory
+        return _accelerated(
+            v,
+            speed,
+            self.dt,
+            y=v.y + aside,
+            target_lane=target,
+        ), memory
 
 
 class HeadwayIdm(TrafficModule):

@@ -85,7 +85,10 @@ def _pairs(path: Path) -> pl.DataFrame:
 
 def _following(path: Path) -> pl.DataFrame:
     whole = dict.fromkeys(("follower", "leader", "frame"), pl.Int64)
-    numbers = dict.fromkeys(("x_follower", "x_leader", "leader_length"), pl.Float64)
+    numbers = dict.fromkeys(
+        ("x_follower", "x_leader", "leader_length"),
+        pl.Float64,
+    )
     # Both cars of a pair are in one row.
     table = read_table(path, {"period": pl.String, **whole, **numbers})
     cars = []
@@ -95,7 +98,12 @@ def _following(path: Path) -> pl.DataFrame:
     ):
         car = table.select(
             "frame",
-            scene=pl.concat_str("period", "follower", "leader", separator="-"),
+            scene=pl.concat_str(
+                "period",
+                "follower",
+                "leader",
+                separator="-",
+            ),
             vehicle=role,
             x=pl.col(f"x_{role}") - 0.5 * length,
             length=length,
@@ -130,7 +138,10 @@ def _one_lane(rows: pl.DataFrame) -> Recording:
     )
     # Positions across the road are not given, and all lanes are alike.
     recording = Recording.of(rows, STANDARD_LANE_WIDTH_M)
-    return replace(recording, speed=_speeds(recording.x, recording.present))
+    return replace(
+        recording,
+        speed=_speeds(recording.x, recording.present),
+    )
 
 
 def _speeds(x: Floats, present: Flags) -> Floats:

@@ -26,8 +26,16 @@ from ganlane.realism.driving import Factory, step_traffic
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.neighbours import leader, perceive
 from ganlane.sim.random import absorb, episode_key
-from ganlane.sim.spawn import TABLE_II, SpawnParameters, spawn
-from ganlane.sim.state import Road, Vehicles, lateral_half_extent
+from ganlane.sim.spawn import (
+    TABLE_II,
+    SpawnParameters,
+    spawn,
+)
+from ganlane.sim.state import (
+    Road,
+    Vehicles,
+    lateral_half_extent,
+)
 from ganlane.traffic import Guard, TrafficModule
 
 #: Times at which speeds are summarised, s; and the distance of the goal, m.
@@ -112,7 +120,10 @@ class EventCounter:
                 perceive(vehicles, self.road),
                 self.road.lane_of(vehicles.y),
             )
-            self.standstills += self._onsets("standstill", (slow & (ahead.gap > FREE_M))[:, 1:])
+            self.standstills += self._onsets(
+                "standstill",
+                (slow & (ahead.gap > FREE_M))[:, 1:],
+            )
 
     def _onsets(self, name: str, now: Tensor) -> int:
         """Number of entries that are true now and were not at the last count."""
@@ -133,7 +144,12 @@ class GuardMeter:
             if isinstance(part, Guard):
                 part.observer = self
 
-    def __call__(self, before: Vehicles, moved: Vehicles, guarded: Vehicles) -> None:
+    def __call__(
+        self,
+        before: Vehicles,
+        moved: Vehicles,
+        guarded: Vehicles,
+    ) -> None:
         """Called by the guard at every step; index 0 is the ego's and does not count."""
         wanted = (moved.speed - before.speed) / PHYSICS_STEP_S
         allowed = (guarded.speed - before.speed) / PHYSICS_STEP_S
@@ -363,7 +379,9 @@ def rates(lane_changes: int, overlaps: int, km: float) -> dict[str, Any]:
     }
 
 
-def totals(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def totals(
+    runs: Sequence[Mapping[str, Any]],
+) -> dict[str, Any]:
     """Event counts and rates over all long runs, with exact 95 % intervals; None without any."""
     names = (
         "lane_changes",

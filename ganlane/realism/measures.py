@@ -17,8 +17,15 @@ import numpy as np
 import polars as pl
 from scipy.special import stdtrit
 
-from ganlane.data.dense import Recording, recorded_frame, units_of
-from ganlane.data.lanes import find_lane_changes, tracks_of_frame
+from ganlane.data.dense import (
+    Recording,
+    recorded_frame,
+    units_of,
+)
+from ganlane.data.lanes import (
+    find_lane_changes,
+    tracks_of_frame,
+)
 from ganlane.data.schema import FRAME_S, TRACK
 from ganlane.data.statistics import Bins, leader_gaps
 from ganlane.errors import UserError
@@ -94,7 +101,13 @@ def jensen_shannon(first: Array, second: Array) -> Array:
             axis=-1,
         )
 
-    return np.sqrt(np.clip(0.5 * (information(p) + information(q)), 0.0, 1.0))
+    return np.sqrt(
+        np.clip(
+            0.5 * (information(p) + information(q)),
+            0.0,
+            1.0,
+        )
+    )
 
 
 def pooled_distance(simulated: Array, recorded: Array) -> float:
@@ -157,7 +170,11 @@ def distance_difference(
     # S resampled units have (S - 1) / S of the variance that they should have.
     error = float((ours**2 - theirs**2).std()) * np.sqrt(units / (units - 1))
     reach = float(stdtrit(units - 1, TAIL_LEVELS[1])) * error / max(one + other, _TINY)
-    return Estimate(value, max(-1.0, value - reach), min(1.0, value + reach))
+    return Estimate(
+        value,
+        max(-1.0, value - reach),
+        min(1.0, value + reach),
+    )
 
 
 def _resampled(
@@ -269,7 +286,9 @@ def measure(frame: pl.DataFrame, units: Sequence[str]) -> Measured:
     )
 
 
-def samples_of(motion: pl.DataFrame) -> dict[str, pl.DataFrame]:
+def samples_of(
+    motion: pl.DataFrame,
+) -> dict[str, pl.DataFrame]:
     """By quantity, columns ``unit`` and ``value``, of a frame :func:`with_motion`."""
     # Only rows that are driven and old enough.
     counted = motion.filter("counts")

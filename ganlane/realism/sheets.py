@@ -18,7 +18,11 @@ from ganlane.evaluation.table import (
     with_interval,
 )
 from ganlane.realism.driving import FLOORS
-from ganlane.realism.measures import QUANTITIES, UNITS, Measured
+from ganlane.realism.measures import (
+    QUANTITIES,
+    UNITS,
+    Measured,
+)
 from ganlane.realism.starts import Starts
 from ganlane.view.figures import (
     FAINT,
@@ -81,7 +85,14 @@ def quantities_table(quantities: Mapping[str, Any], traffic: str) -> str:
             with_interval(row, "distance"),
         ]
         # The scale: from the best that can be expected to random driving.
-        line += [number(row[end]) for end in ("ceiling", "constant_velocity", "floor")]
+        line += [
+            number(row[end])
+            for end in (
+                "ceiling",
+                "constant_velocity",
+                "floor",
+            )
+        ]
         for rival in rivals:
             theirs = row["against"][rival]
             line += [
@@ -173,7 +184,10 @@ def draw(numbers: Mapping[str, Any], starts: Starts, to: Path) -> None:
     distances = draw_distances(numbers["quantities"], numbers["traffic"])
     save_figure(distances, to / "distances.png")
     if numbers["long_runs"]:
-        drift = draw_speeds_over_time(numbers["long_runs"], numbers["recorded_spread_mps"])
+        drift = draw_speeds_over_time(
+            numbers["long_runs"],
+            numbers["recorded_spread_mps"],
+        )
         save_figure(drift, to / "drift.png")
 
 
@@ -244,7 +258,12 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
     ``quantities`` are the rows of :func:`ganlane.realism.card.quantity_rows`. Vertical lines are
     the ends of the scale: recordings against each other, and random driving.
     """
-    colours = palette([traffic, *next(iter(quantities.values()))["against"]])
+    colours = palette(
+        [
+            traffic,
+            *next(iter(quantities.values()))["against"],
+        ]
+    )
     # A line per traffic, and an empty one.
     block = len(colours) + 1
     figure = Figure(figsize=(7.5, 0.8 + 0.125 * block * len(quantities)))
@@ -259,7 +278,10 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
     for index, row in enumerate(quantities.values()):
         top = block * index
         axes.axhline(top, color=GRID, lw=0.8)
-        for mark, colour in (("ceiling", INK), ("floor", FAINT)):
+        for mark, colour in (
+            ("ceiling", INK),
+            ("floor", FAINT),
+        ):
             if row[mark] is not None:
                 axes.vlines(
                     row[mark],

@@ -18,7 +18,6 @@ import polars as pl
 
 from ganlane.data.dense import (
     Recording,
-    recorded_frame,
     recordings_of,
     units_of,
 )
@@ -367,13 +366,3 @@ def spawned_recordings(
         )
         for row in range(rows)
     ]
-
-
-def spawned_frame(
-    make: Factory,
-    road: Road,
-    parameters: LongRunParameters,
-    rows: int,
-) -> pl.DataFrame:
-    """The trajectories of :func:`spawned_recordings`, in the form that is measured."""
-    return recorded_frame(spawned_recordings(make, road, parameters, rows))

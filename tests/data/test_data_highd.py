@@ -33,7 +33,10 @@ def test_each_direction_is_a_scene_at_10_hz_with_x_forward_and_lane_0_rightmost(
         "highd-01-lower",
     )
     assert upper.frame.schema == lower.frame.schema == SCHEMA
-    assert (upper.lane_width_m, lower.lane_width_m) == (4.0, 4.0)
+    assert (upper.lane_width_m, lower.lane_width_m) == (
+        4.0,
+        4.0,
+    )
     # Upwards in the picture is to the right for those who drive to the left: lanes 2 (y 8 to 12)
     # and 3. Lower lanes: 5 (y 20 to 24) is the left one, 6 the right one; left is up.
     expected = {
@@ -42,6 +45,7 @@ def test_each_direction_is_a_scene_at_10_hz_with_x_forward_and_lane_0_rightmost(
         3: (0, 0.0, 25.0),
         4: (1, 4.0, 28.0),
     }
+    # The first row of each vehicle, to compare their places.
     begin = {}
     for scene in (upper, lower):
         assert 0.0 <= scene.frame["x"].min() < 4.0
@@ -68,6 +72,7 @@ def test_each_direction_is_a_scene_at_10_hz_with_x_forward_and_lane_0_rightmost(
 
 def test_a_folder_is_read_recording_by_recording(tmp_path):
     write_highd(tmp_path, "01")
+    # The second recording is half as long.
     write_highd(tmp_path, "02", seconds=4.0)
     count = RowCount()
     names = [scene.name for scene in highd_scenes(tmp_path, count)]
@@ -86,6 +91,7 @@ def test_rows_off_the_lanes_are_dropped_and_end_a_track(
     count = RowCount()
     _, lower = highd_scenes(recording, count)
     assert dict(count.dropped) == {"off the lanes of its direction": 11}
+    # Car 3 comes back as a track of its own.
     assert sorted(lower.frame["vehicle"].unique()) == [
         3,
         4,
@@ -94,6 +100,7 @@ def test_rows_off_the_lanes_are_dropped_and_end_a_track(
 
 
 def damaged(path, column, row, value):
+    # As text, so that all other fields stay as they are.
     table = pl.read_csv(path, infer_schema=False).with_row_index()
     field = pl.when(pl.col("index") == row).then(pl.lit(value)).otherwise(column).alias(column)
     table.with_columns(field).drop("index").write_csv(path)
@@ -136,6 +143,7 @@ def test_a_damaged_field_is_named(recording, column, row, value, message):
 
 def test_units_that_cannot_be_are_refused(recording):
     rows = pl.read_csv(recording)
+    # In km/h, and with the direction reversed.
     rows.with_columns(xVelocity=3.6 * pl.col("xVelocity")).write_csv(recording)
     with pytest.raises(
         UserError,
@@ -147,8 +155,11 @@ def test_units_that_cannot_be_are_refused(recording):
         read_recordings("highd", recording)
 
 
-def test_the_metadata_files_are_required_and_checked(recording):
+def test_the_metadata_files_are_required_and_checked(
+    recording,
+):
     meta = recording.with_name("01_recordingMeta.csv")
+    # First the markings, then files that are not there.
     damaged(meta, "upperLaneMarkings", 0, "8.0;moon")
     with pytest.raises(
         UserError,
@@ -156,7 +167,10 @@ def test_the_metadata_files_are_required_and_checked(recording):
     ):
         read_recordings("highd", recording)
     meta.unlink()
-    with pytest.raises(UserError, match=r"01_recordingMeta.csv: no such file"):
+    with pytest.raises(
+        UserError,
+        match=r"01_recordingMeta.csv: no such file",
+    ):
         read_recordings("highd", recording)
     write_highd(recording.parent)
     damaged(
@@ -191,7 +205,10 @@ def test_a_resampled_track_has_the_frames_within_it_and_lies_on_the_recorded_lin
         pl.DataFrame({"frame": old, "lane": lanes, **numbers}),
         rate,
     )
-    ends = first / rate - 1e-9, (first + length - 1) / rate + 1e-9
+    ends = (
+        first / rate - 1e-9,
+        (first + length - 1) / rate + 1e-9,
+    )
     inside = [k for k in range(2000) if ends[0] <= k * 0.1 <= ends[1]]
     assert new["frame"].to_list() == inside
     at = 0.1 * rate * np.array(inside)

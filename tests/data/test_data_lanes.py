@@ -5,7 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ganlane.data import Tracks, synthetic_scenes, tracks_of_frame
+from ganlane.data import (
+    Tracks,
+    synthetic_scenes,
+    tracks_of_frame,
+)
 from ganlane.data.lanes import (
     find_lane_changes,
     lane_changes_of_arrays,
@@ -26,14 +30,27 @@ def test_vehicles_on_the_boundary_tell_the_width_where_lane_keepers_sit_off_cent
     width = 3.5
     # All keep half a metre to the left but in lane 0, so the spacing of the medians says 3.75 m;
     # some cross over.
-    keepers = np.concatenate((np.full(50, 0.0), np.full(50, 4.0), np.full(50, 7.5)))
+    keepers = np.concatenate(
+        (
+            np.full(50, 0.0),
+            np.full(50, 4.0),
+            np.full(50, 7.5),
+        )
+    )
     crossing = np.linspace(0.0, 7.0, 71)
     y = np.concatenate((keepers, crossing))
     assert lane_width(y, np.rint(y / width).astype(np.int64)) == pytest.approx(width, abs=0.03)
 
 
 def test_a_single_lane_gets_the_standard_width_and_one_stray_row_does_not_make_a_lane():
-    assert lane_width(np.linspace(-0.3, 0.3, 20), np.zeros(20, np.int64)) == 3.66
+    assert (
+        lane_width(
+            np.linspace(-0.3, 0.3, 20),
+            np.zeros(20, np.int64),
+        )
+        == 3.66
+    )
+    # Fewer rows than half a second of one vehicle.
     y = np.concatenate((np.zeros(50), np.full(50, 3.5), [30.0]))
     lane = np.concatenate((np.zeros(50), np.ones(50), [5])).astype(np.int64)
     assert lane_width(y, lane) == pytest.approx(3.5)
@@ -93,6 +110,7 @@ def test_a_track_that_ends_in_the_middle_of_the_change_is_censored():
 
 @pytest.mark.parametrize(("samples", "changes"), [(4, 0), (5, 2)])
 def test_a_flicker_shorter_than_half_a_second_is_no_change(samples, changes):
+    # 0.1 m off the boundary, first on one side, then on the other.
     y = np.full(40, 1.7)
     y[20 : 20 + samples] = 1.9
     assert len(changes_of(y)) == changes
@@ -105,6 +123,7 @@ def test_the_new_lane_must_be_seen_for_half_a_second(after, changes):
 
 
 def test_two_lanes_in_one_go_are_two_changes():
+    # Without a stop in the lane between.
     y = np.clip(1.5 * (TIME - 1.0), 0.0, 2 * WIDTH)
     changes = changes_of(y)
     assert changes.old_lane.tolist() == [0, 1]
@@ -112,6 +131,7 @@ def test_two_lanes_in_one_go_are_two_changes():
 
 
 def test_a_change_of_vehicle_is_no_lane_change():
+    # The same positions as one track, and as two.
     y = np.r_[np.zeros(20), np.full(20, WIDTH)]
     assert len(changes_of(y)) == 1
     assert len(changes_of(y, new_track_at=[20])) == 0
@@ -125,15 +145,23 @@ def test_recordings_and_arrays_are_measured_alike_and_mirroring_changes_nothing_
     frame = synthetic_scenes(seed=seed)
     widths = {"synthetic-0": 3.5, "synthetic-1": 3.5}
     of_frame = find_lane_changes(tracks_of_frame(frame, widths))
+    # Every vehicle is present in all of the 100 frames.
     y = frame["y"].to_numpy().reshape(24, 100).T
     of_arrays, mirrored = (lane_changes_of_arrays(across, 3.5) for across in (y, 7.0 - y))
     np.testing.assert_array_equal(of_frame.sample, of_arrays.sample)
     np.testing.assert_array_equal(of_frame.duration_s, of_arrays.duration_s)
     np.testing.assert_array_equal(of_frame.new_lane, 2 - mirrored.new_lane)
-    np.testing.assert_allclose(of_frame.lateral_speed, mirrored.lateral_speed, atol=1e-9)
+    np.testing.assert_allclose(
+        of_frame.lateral_speed,
+        mirrored.lateral_speed,
+        atol=1e-9,
+    )
 
 
-@given(lateral_mps=st.floats(0.4, 2.0), begin_s=st.floats(1.5, 3.0))
+@given(
+    lateral_mps=st.floats(0.4, 2.0),
+    begin_s=st.floats(1.5, 3.0),
+)
 def test_the_time_of_a_steady_move_is_its_distance_over_its_speed(lateral_mps, begin_s):
     time = np.arange(200) * 0.1
     change = changes_of(np.clip(lateral_mps * (time - begin_s), 0.0, WIDTH))

@@ -56,7 +56,11 @@ def test_raw_text_gives_back_the_recording_in_metres_from_centres_and_from_the_r
 ):
     path = text_file(tmp_path, ngsim_rows(FIRST))
     (scene,) = ngsim_scenes(path)
-    assert (scene.name, scene.frame.schema, scene.lanes) == (
+    assert (
+        scene.name,
+        scene.frame.schema,
+        scene.lanes,
+    ) == (
         "trajectories-0750am-0805am-1",
         SCHEMA,
         3,
@@ -72,16 +76,26 @@ def test_raw_text_gives_back_the_recording_in_metres_from_centres_and_from_the_r
         read_recordings("moon", path)
 
 
-@pytest.mark.parametrize(("block_bytes", "thousands"), [(10_000, True), (2**25, False)])
+@pytest.mark.parametrize(
+    ("block_bytes", "thousands"),
+    [(10_000, True), (2**25, False)],
+)
 def test_the_portals_periods_are_separated_by_time_in_any_order_and_blocks(
     tmp_path, block_bytes, thousands
 ):
+    # In any order, since the portal does not promise one.
     rows = pl.concat((ngsim_rows(FIRST), ngsim_rows(SECOND, LATER_MS))).sample(
         fraction=1.0, shuffle=True, seed=1
     )
     path = portal_file(tmp_path, portal_csv(rows, thousands=thousands))
     count = RowCount()
-    scenes = list(ngsim_scenes(path, NgsimParameters(block_bytes=block_bytes), count))
+    scenes = list(
+        ngsim_scenes(
+            path,
+            NgsimParameters(block_bytes=block_bytes),
+            count,
+        )
+    )
     assert [scene.name for scene in scenes] == [
         "us-101-1",
         "us-101-2",
@@ -95,16 +109,25 @@ def test_duplicates_and_other_places_are_dropped_and_counted(
     tmp_path,
 ):
     rows = ngsim_rows(FIRST)
+    # The same vehicle and time, at another speed.
     other = rows.head(1).with_columns(v_Vel=pl.lit(9.0))
     parts = [
         portal_csv(pl.concat((rows, rows.head(30), other))),
         *(
             portal_csv(rows.head(n), place).partition("\n")[2]
-            for place, n in (("lankershim", 7), ("peachtree", 5))
+            for place, n in (
+                ("lankershim", 7),
+                ("peachtree", 5),
+            )
         ),
     ]
     count = RowCount()
-    scenes = list(ngsim_scenes(portal_file(tmp_path, "".join(parts)), count=count))
+    scenes = list(
+        ngsim_scenes(
+            portal_file(tmp_path, "".join(parts)),
+            count=count,
+        )
+    )
     same_driving(scenes[0].frame, FIRST)
     assert dict(count.dropped) == {
         "location lankershim": 7,
@@ -117,6 +140,7 @@ def test_duplicates_and_other_places_are_dropped_and_counted(
 
 def test_ramps_are_left_out_and_end_a_track(tmp_path):
     rows = ngsim_rows(FIRST)
+    # NGSIM numbers ramps from 7 on.
     on_ramp = (pl.col("Vehicle_ID") == 2) & pl.col("Frame_ID").is_between(20, 29)
     rows = rows.with_columns(Lane_ID=pl.when(on_ramp).then(7).otherwise("Lane_ID"))
     count = RowCount()
@@ -142,6 +166,7 @@ def test_lanes_is_how_many_are_kept_from_the_left(tmp_path):
 
 def changed(folder, row: int, column: str, value: str):
     """The portal's file with one field changed; ``row`` counts from 0 below the header."""
+    # Without quotes, so that fields can be split at commas.
     lines = portal_csv(ngsim_rows(FIRST), thousands=False).splitlines()
     fields = lines[row + 1].split(",")
     fields[lines[0].split(",").index(column)] = value
@@ -220,8 +245,15 @@ def test_a_truncated_file_is_refused_and_a_whole_one_read(
     tmp_path,
 ):
     rows = ngsim_rows(FIRST)
+    # A missing line break at the end does no harm, missing fields do.
     whole = portal_csv(rows, thousands=False)
-    assert read_recordings("ngsim", portal_file(tmp_path, whole.rstrip("\n"))).height == 540
+    assert (
+        read_recordings(
+            "ngsim",
+            portal_file(tmp_path, whole.rstrip("\n")),
+        ).height
+        == 540
+    )
     with pytest.raises(
         UserError,
         match=r"line 541, column lane_id: the file breaks off here, 14 of 19 columns",
@@ -280,14 +312,20 @@ def test_a_truncated_file_is_refused_and_a_whole_one_read(
     ],
 )
 def test_units_that_cannot_be_feet_and_seconds_are_refused(tmp_path, columns, factor, message):
+    # All else stays in feet.
     rows = ngsim_rows(FIRST).with_columns(pl.col(name) * factor for name in columns)
     with pytest.raises(UserError, match=message) as caught:
         read_recordings("ngsim", text_file(tmp_path, rows))
     assert "line 1" in str(caught.value)
 
 
-def test_files_of_other_columns_or_places_are_refused(tmp_path):
-    with pytest.raises(UserError, match=r"line 1: 17 columns; expected the 18"):
+def test_files_of_other_columns_or_places_are_refused(
+    tmp_path,
+):
+    with pytest.raises(
+        UserError,
+        match=r"line 1: 17 columns; expected the 18",
+    ):
         read_recordings(
             "ngsim",
             text_file(tmp_path, ngsim_rows(FIRST).drop("v_Class")),
@@ -305,9 +343,12 @@ def test_files_of_other_columns_or_places_are_refused(tmp_path):
         )
 
 
-def test_temporary_files_are_removed_after_an_error(tmp_path):
+def test_temporary_files_are_removed_after_an_error(
+    tmp_path,
+):
     path = changed(tmp_path, 500, "local_y", "far")
     scratch = tmp_path / "scratch"
+    # The damage is late in the file, when blocks are on the disk.
     scratch.mkdir()
     with pytest.raises(UserError):
         list(

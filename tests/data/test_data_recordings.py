@@ -16,7 +16,10 @@ from reference.recordings import (
     write_highd,
 )
 
-from ganlane.commands.prepare import long_report, short_report
+from ganlane.commands.prepare import (
+    long_report,
+    short_report,
+)
 from ganlane.data import (
     SCHEMA,
     PooledStatistics,
@@ -30,7 +33,10 @@ from ganlane.data import (
     write_prepared,
     write_scene_csv,
 )
-from ganlane.data.prepared import prepare_recordings, whole_folder
+from ganlane.data.prepared import (
+    prepare_recordings,
+    whole_folder,
+)
 from ganlane.data.recordings import cut_into_scenes
 from ganlane.data.schema import Scene
 from ganlane.errors import UserError
@@ -67,6 +73,7 @@ def test_lanes_are_counted_from_the_right_y_from_the_right_lanes_centre_and_rows
     assert frame["lane"].to_list() == [1] * 6 + [0] * 6
     assert frame["y"].to_list() == pytest.approx([3.5] * 6 + [0.0] * 6)
     assert scene_lane_counts(frame) == {"s": 2}
+    # The order of the file has no effect.
     by_frame = sorted(ROWS, key=lambda row: int(row.split(",")[2]))
     assert read_scenes(written(tmp_path, by_frame)).equals(frame)
 
@@ -92,14 +99,24 @@ def test_a_synthetic_recording_survives_the_file(tmp_path):
 @pytest.mark.parametrize(
     ("row", "column", "value", "message"),
     [
-        (7, "lane", "0", r"line 9, column lane: 0 is below 1"),
+        (
+            7,
+            "lane",
+            "0",
+            r"line 9, column lane: 0 is below 1",
+        ),
         (
             8,
             "frame",
             "1",
             r"line 10, column frame: 1 comes twice",
         ),
-        (9, "frame", "0", r"line 11, column frame: 0 is before"),
+        (
+            9,
+            "frame",
+            "0",
+            r"line 11, column frame: 0 is before",
+        ),
         (
             10,
             "length",
@@ -124,7 +141,11 @@ def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column,
 @pytest.mark.parametrize(
     ("column", "factor", "message"),
     [
-        ("v", 10.0, "line 2, column speed: the median is 100.0"),
+        (
+            "v",
+            10.0,
+            "line 2, column speed: the median is 100.0",
+        ),
         (
             "v",
             3.6,
@@ -180,12 +201,14 @@ def test_files_without_columns_rows_or_text_are_refused(content, message, tmp_pa
 
 @pytest.mark.parametrize("name", ["", "scenes.csv", "x.parquet"])
 def test_absent_files_are_refused(name, tmp_path):
+    # A folder without Parquet, a missing CSV, a missing Parquet file.
     (tmp_path / "other.csv").write_text("scene")
     with pytest.raises(UserError, match="no such file"):
         read_scenes(tmp_path / name)
 
 
 def test_a_scene_in_two_files_is_refused(tmp_path):
+    # Two scenes in one file, one of them in the other, too.
     write_prepared(synthetic_scenes(), tmp_path / "a.parquet")
     write_prepared(
         synthetic_scenes(SyntheticTraffic(scenes=1)),
@@ -200,6 +223,7 @@ def test_a_scene_in_two_files_is_refused(tmp_path):
 
 def test_damaged_parquet_is_refused(tmp_path):
     path = tmp_path / "x.parquet"
+    # From no table at all to a single wrong field.
     path.write_bytes(b"PAR1 not really")
     with pytest.raises(UserError, match="not a readable Parquet file"):
         read_scenes(path)
@@ -237,6 +261,7 @@ def test_recordings_with_frames_missing_throughout_are_refused(every, renumbered
 def pooled(frame: pl.DataFrame) -> PooledStatistics:
     statistics = PooledStatistics()
     widths = scene_lane_widths(frame)
+    # One by one, as prepare does.
     for (name,), rows in frame.group_by("scene", maintain_order=True):
         statistics.add(Scene(name, rows, widths[name]))
     return statistics
@@ -261,9 +286,11 @@ def test_scenes_one_by_one_say_what_they_say_together(seed):
     ):
         one = apart.describe(name)
         other = getattr(together, name)
-        assert (one.count, one.mean, one.sd) == pytest.approx(
-            (other.count, other.mean, other.sd)
-        ), name
+        assert (
+            one.count,
+            one.mean,
+            one.sd,
+        ) == pytest.approx((other.count, other.mean, other.sd)), name
         assert one.quantiles == pytest.approx(other.quantiles, abs=0.02), name
 
 
@@ -285,11 +312,13 @@ def test_what_is_written_reads_back_the_same(csv, tmp_path):
         "synthetic-1"
     ]
     assert prepared.written == prepared.count.kept == synthetic_scenes(seed=5).height
+    # What was prepared can be prepared again.
     again = prepare_recordings("scenes", tmp_path / "out", tmp_path / "again")
     assert again.to_dict()["rows"] == prepared.to_dict()["rows"]
 
 
 def test_long_recordings_are_cut_into_scenes_when_written_and_measured_whole(csv, tmp_path):
+    # Cutting would censor lane changes, so it comes after measuring.
     whole = prepare_recordings("scenes", csv, tmp_path / "whole").statistics.lane_changes
     cut = prepare_recordings("scenes", csv, tmp_path / "cut", scene_s=4.0)
     assert cut.statistics.lane_changes == whole
@@ -311,6 +340,7 @@ def ngsim_lines(thousands: bool = True) -> list[str]:
 def test_reports_state_rows_rates_and_durations(tmp_path):
     path = tmp_path / "portal.csv"
     lines = ngsim_lines()
+    # One row comes twice.
     path.write_text("\n".join([*lines, lines[5], ""]))
     prepared = prepare_recordings("ngsim", path, tmp_path / "out")
     for report in (
@@ -327,6 +357,7 @@ def test_the_output_folder_appears_only_when_everything_was_written(
     tmp_path,
 ):
     lines = ngsim_lines(thousands=False)
+    # The last row is damaged.
     (tmp_path / "bad.csv").write_text("\n".join([*lines, lines[-1].replace(",", ",x", 1)]))
     with pytest.raises(UserError, match="line 542"):
         prepare_recordings("ngsim", tmp_path / "bad.csv", tmp_path / "out")
@@ -350,6 +381,7 @@ def refused(frame: pl.DataFrame, folder: Path, message: str) -> None:
 def test_parked_cars_and_names_that_differ_in_a_blank_alone_are_refused(
     tmp_path,
 ):
+    # Nobody moves in any scene.
     parked = synthetic_scenes().with_columns(
         speed=pl.lit(0.0),
         x=pl.col("x").first().over("scene", "vehicle"),
@@ -357,16 +389,24 @@ def test_parked_cars_and_names_that_differ_in_a_blank_alone_are_refused(
     refused(parked, tmp_path, "no scene in which anybody drives")
     names = pl.col("scene").replace({"synthetic-0": "my road", "synthetic-1": "my_road"})
     message = r"a second scene that my_road.parquet is the file of"
-    refused(synthetic_scenes().with_columns(names), tmp_path, message)
+    refused(
+        synthetic_scenes().with_columns(names),
+        tmp_path,
+        message,
+    )
 
 
 def test_recordings_without_vehicles_on_the_lanes_are_refused(
     tmp_path,
 ):
     write_highd(tmp_path)
+    # A lane number that neither direction has.
     tracks = tmp_path / "01_tracks.csv"
     pl.read_csv(tracks).with_columns(laneId=pl.lit(9)).write_csv(tracks)
-    with pytest.raises(UserError, match="no vehicle on any of the lanes kept"):
+    with pytest.raises(
+        UserError,
+        match="no vehicle on any of the lanes kept",
+    ):
         read_recordings("highd", tmp_path)
 
 

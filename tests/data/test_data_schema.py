@@ -31,7 +31,6 @@ def read(
     table = TextTable(
         path,
         ("a", "b", "c"),
-        has_header=not blanks,
         blanks=blanks,
     )
     return pl.concat(read_blocks(table, ["c", "a"], block_bytes))
@@ -50,8 +49,14 @@ def read(
     ended=st.booleans(),
 )
 def test_the_size_of_a_block_changes_nothing(
-    tmp_path_factory, rows, block_bytes, blanks, windows, ended
+    tmp_path_factory,
+    rows,
+    block_bytes,
+    blanks,
+    windows,
+    ended,
 ):
+    # Blanks and tabs of any number, or commas.
     lines = [("  {}   {}\t{} " if blanks else "{},{},{}").format(*row) for row in rows]
     end = "\r\n" if windows else "\n"
     content = end.join([*([] if blanks else ["a,b,c"]), *lines]) + (end if ended else "")
@@ -83,7 +88,10 @@ def test_the_size_of_a_block_changes_nothing(
             ["1,2,3", "4,1,234.5,6", "7,8,9"],
             r"line 3: 4 fields, expected 3",
         ),
-        (["1,2,3", "", "7,8,9"], r"line 3: the line is empty"),
+        (
+            ["1,2,3", "", "7,8,9"],
+            r"line 3: the line is empty",
+        ),
         (
             ["1,2,3", '4,"5,6', "7,8,9"],
             r"line 3: a quotation mark without its counterpart",
@@ -99,9 +107,14 @@ def test_the_size_of_a_block_changes_nothing(
     ],
 )
 def test_a_row_that_does_not_fit_is_named_by_its_line(tmp_path, lines, message, block_bytes):
+    # Bytes that are no UTF-8 get through as latin-1.
     content = "\n".join(["a,b,c", *lines, ""]).encode("latin-1")
     with pytest.raises(UserError, match=message):
-        read(tmp_path / "t.csv", content, block_bytes=block_bytes)
+        read(
+            tmp_path / "t.csv",
+            content,
+            block_bytes=block_bytes,
+        )
 
 
 @pytest.mark.parametrize(
@@ -118,7 +131,11 @@ def test_foreign_line_breaks_are_refused_with_their_line(
     tmp_path,
 ):
     with pytest.raises(UserError, match=r"t.csv, line 3: not a line of CSV"):
-        read(tmp_path / "t.csv", b"a,b,c\n1,2,3\n4,5\r6,7,8\n")
+        read(
+            tmp_path / "t.csv",
+            b"a,b,c\n1,2,3\n4,5\r6,7,8\n",
+        )
+    # Line breaks of an old Macintosh make one line of the whole file.
     (tmp_path / "t.csv").write_bytes(b"a,b,c\r1,2,3\r4,5,6\r")
     with pytest.raises(UserError, match=r"t.csv, line 1: not a line of CSV"):
         csv_table(tmp_path / "t.csv", {"a": pl.Int64})
@@ -168,8 +185,12 @@ def test_quoted_fields_may_hold_commas(tmp_path):
     ],
 )
 def test_a_wrong_field_is_named_by_file_line_and_column(tmp_path, text, kind, message):
+    # The second row, line 3, is the wrong one.
     rows = pl.DataFrame({"x": ["1", text], LINE: [2, 3]})
-    with pytest.raises(UserError, match=f"t.csv, line 3, column x: .*{message}"):
+    with pytest.raises(
+        UserError,
+        match=f"t.csv, line 3, column x: .*{message}",
+    ):
         convert(rows, "x", kind, tmp_path / "t.csv")
 
 
@@ -184,6 +205,7 @@ def test_a_header_is_read_in_any_case_with_quotes_and_a_byte_order_mark(
 def test_the_validator_checks_frames_that_come_from_nowhere():
     frame = synthetic_scenes(SyntheticTraffic(scenes=1))
     assert validate(frame, "made").equals(frame)
+    # A row without a position.
     holed = frame.with_columns(x=pl.when(pl.int_range(pl.len()) == 7).then(None).otherwise("x"))
     for wrong, message in (
         (frame.drop("speed"), "made: no column speed"),

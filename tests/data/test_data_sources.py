@@ -39,6 +39,7 @@ def names(folder):
 
 
 def test_a_file_arrives_whole_with_progress(tmp_path):
+    # Bytes done and in total, at each piece.
     steps = []
     with Server() as server:
         path = download(
@@ -81,7 +82,9 @@ def test_a_broken_transfer_resumes_only_where_server_and_version_allow(server, r
     assert running.asked == ranges
 
 
-def test_a_later_run_resumes_what_an_earlier_one_left(tmp_path):
+def test_a_later_run_resumes_what_an_earlier_one_left(
+    tmp_path,
+):
     with Server(breaks=[400_000, 0, 0, 0]) as server:
         with pytest.raises(
             UserError,
@@ -89,6 +92,7 @@ def test_a_later_run_resumes_what_an_earlier_one_left(tmp_path):
         ):
             fetch(server, tmp_path / "f", SHA256)
         assert "f" not in names(tmp_path)
+        # The next run finds the server well.
         server.breaks = []
         fetch(server, tmp_path / "f", SHA256)
     assert server.asked[-1] == "bytes=400000-"
@@ -104,6 +108,7 @@ def test_a_part_of_another_version_or_longer_than_the_file_is_discarded(content,
     with Server(breaks=[300_000, 0, 0, 0]) as server:
         with pytest.raises(UserError, match="cannot be fetched"):
             fetch(server, tmp_path / "f")
+        # The file changes on the server between two runs.
         server.content, server.etag, server.breaks = (
             content,
             etag or server.etag,
@@ -122,18 +127,24 @@ def test_a_corrupt_transfer_leaves_nothing(tmp_path):
     assert names(tmp_path) == []
 
 
-def test_a_file_that_is_there_is_kept_and_compared(tmp_path):
+def test_a_file_that_is_there_is_kept_and_compared(
+    tmp_path,
+):
     path = tmp_path / "f"
     path.write_bytes(CONTENT)
     with Server() as server:
         assert fetch(server, path, SHA256) == path
         assert server.asked == []
-        with pytest.raises(UserError, match=r"remove it, or correct data\.sha256"):
+        with pytest.raises(
+            UserError,
+            match=r"remove it, or correct data\.sha256",
+        ):
             fetch(server, path, "0" * 64)
     assert path.read_bytes() == CONTENT
 
 
 def test_a_refused_request_is_reported_at_once(tmp_path):
+    # Asking again would not help.
     with Server(status=404) as server:
         with pytest.raises(
             UserError,
@@ -174,8 +185,12 @@ def test_a_failing_server_is_tried_again_and_an_absent_one_is_named(
 def test_an_error_of_the_disk_is_reported_at_once_and_not_as_a_network_error(
     spoil, number, tmp_path
 ):
+    # The incomplete file cannot be written.
     spoil(tmp_path / ".f.part")
-    with Server() as server, pytest.raises(OSError) as caught:  # noqa: PT011
+    with (
+        Server() as server,
+        pytest.raises(OSError) as caught,  # noqa: PT011
+    ):
         fetch(server, tmp_path / "f", SHA256)
     assert (caught.value.errno, caught.value.filename) == (
         number,
@@ -203,6 +218,7 @@ def test_the_recordings_are_found_through_the_variable(tmp_path, monkeypatch):
         match=r"set GANLANE_DATA to a folder that holds ngsim/us101_scenes\.csv",
     ):
         default_scenes()
+    # First nothing, then a file, then no folder.
     (tmp_path / "ngsim").mkdir()
     deep = tmp_path / "ngsim" / "us101_scenes.csv"
     deep.write_text("scene,vehicle")
@@ -215,6 +231,7 @@ def test_the_recordings_are_found_through_the_variable(tmp_path, monkeypatch):
 def test_the_recordings_are_found_beside_the_current_folder(tmp_path, monkeypatch):
     monkeypatch.delenv("GANLANE_DATA", raising=False)
     module = sys.modules["ganlane.data.sources"]
+    # As if the package were installed elsewhere.
     monkeypatch.setattr(
         module,
         "__file__",
@@ -234,7 +251,11 @@ def test_a_file_larger_than_wanted_is_refused_and_leaves_nothing(length, tmp_pat
         Server(length=length) as server,
         pytest.raises(UserError, match=r"the file has .* GB or more"),
     ):
-        fetch(server, tmp_path / "f", most_bytes=len(CONTENT) - 1)
+        fetch(
+            server,
+            tmp_path / "f",
+            most_bytes=len(CONTENT) - 1,
+        )
     assert names(tmp_path) == []
 
 
@@ -250,20 +271,27 @@ def test_a_file_larger_than_wanted_is_refused_and_leaves_nothing(length, tmp_pat
 def test_no_redirection_leads_away_from_http(place, tmp_path):
     with (
         Server(sends_to=place) as server,
-        pytest.raises(UserError, match=r"not allowed|expected http|Invalid"),
+        pytest.raises(
+            UserError,
+            match=r"not allowed|expected http|Invalid",
+        ),
     ):
         fetch(server, tmp_path / "f")
     assert "f" not in names(tmp_path)
 
 
 def test_a_redirection_on_http_is_followed(tmp_path):
-    with Server() as server, Server(sends_to=server.url) as first:
+    with (
+        Server() as server,
+        Server(sends_to=server.url) as first,
+    ):
         assert fetch(first, tmp_path / "f", SHA256).read_bytes() == CONTENT
 
 
 def test_a_seed_makes_one_recording_and_another_seed_another():
     assert synthetic_scenes(seed=1).equals(synthetic_scenes(seed=1))
     assert not synthetic_scenes(seed=1).equals(synthetic_scenes(seed=2))
+    # Scenes of one seed differ, too.
     one, other = synthetic_scenes(seed=1).partition_by("scene", include_key=False)
     assert not one.equals(other)
 

@@ -45,7 +45,12 @@ WITHOUT_CHANGES = [name for name in QUANTITIES if name != "lane_change_duration"
 
 
 def test_a_card_puts_the_model_between_its_ceiling_and_its_floors_driven_or_measured_before():
-    recordings = recorded_cars(scenes=4, vehicles=10, seconds=8.0, speed_swing_mps=0.2)
+    recordings = recorded_cars(
+        scenes=4,
+        vehicles=10,
+        seconds=8.0,
+        speed_swing_mps=0.2,
+    )
     recorded = measure_recordings(recordings).counts
     makers = {
         "cruise": ConstantVelocity,
@@ -65,6 +70,7 @@ def test_a_card_puts_the_model_between_its_ceiling_and_its_floors_driven_or_meas
     assert rows["speed"]["against"].keys() == {"rival"}
     assert all(rows[name]["samples"] > 0 for name in WITHOUT_CHANGES)
     assert all(rows[name]["ceiling"] == ceiling(recorded[name]) for name in WITHOUT_CHANGES)
+    # Without reference drivers in the run, what was measured before counts.
     alone = {"cruise": driven["cruise"]}
     speeds = {"speed": recorded["speed"]}
     rows = quantity_rows(
@@ -94,6 +100,7 @@ def test_checks_hold_runs_against_the_recordings():
     assert of_run["nobody_off_the_road"] is of_run["overlaps_under_1_per_1000_vehicle_km"] is True
     assert of_run["lane_changes_inside_recorded_interval"] is False
     assert of_run["guard_under_5_percent"] is None
+    # One tail is twice as far out.
     far = {"acceleration": {"0.05": -2.0, "0.95": 1.0}}
     checks = card_checks(quantities, quantiles[0], far, None, 2.8, [run])
     assert checks["acceleration_quantiles_within_30_percent"] is False
@@ -153,11 +160,15 @@ def test_traffic_that_stands_still_has_counts_and_no_rates():
 
 
 def test_a_traffic_without_a_guard_has_none_in_its_card():
+    # The paper's generated traffic is guarded, the calibrated one is not.
     short = LongRunParameters(vehicles=4, vehicle_km=0.1, most_s=10.0)
     without, with_guard = (
         long_run(make, Road(), short) for make in (gan_calibrated_traffic, gan_traffic)
     )
-    assert (without["guard_share"], without["overlaps"]) == (
+    assert (
+        without["guard_share"],
+        without["overlaps"],
+    ) == (
         None,
         0,
     )
@@ -171,7 +182,13 @@ def test_a_traffic_without_a_guard_has_none_in_its_card():
         is None
     )
     assert cells(long_table([without], "a"), "the guard's share") == ["none"]
-    assert cells(long_table([with_guard], "a"), "the guard's share")[1] == "%"
+    assert (
+        cells(
+            long_table([with_guard], "a"),
+            "the guard's share",
+        )[1]
+        == "%"
+    )
     assert "guard under 5 percent: no guard" in checks_text(checked(without))
     assert "no guard" not in checks_text(checked(with_guard))
 
@@ -182,11 +199,15 @@ def in_colour(axes, colour):
 
 def test_densities_have_area_one_and_the_quantitys_unit():
     counts = np.zeros(QUANTITIES["jerk"].number)
+    # Both outermost bins, and one more.
     counts[[0, 1, 49]] = 1, 2, 1
     rule = np.eye(len(counts))[0] * 4
     figure = draw_distributions(
         {"jerk": counts},
-        {"idm": {"jerk": rule}, "nobody": {"jerk": 0 * rule}},
+        {
+            "idm": {"jerk": rule},
+            "nobody": {"jerk": 0 * rule},
+        },
     )
     (axes,) = figure.axes
     assert (

@@ -41,6 +41,7 @@ def _in_an_empty_folder(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
     nothing = tmp_path / "nothing"
     nothing.mkdir()
+    # So that recordings of this machine have no effect.
     monkeypatch.setenv("GANLANE_DATA", str(nothing))
 
 
@@ -80,7 +81,12 @@ def test_a_card_holds_every_quantity_in_numbers_tables_and_figures(recordings, c
         "long_against=true",
         "data.held_out=[synthetic-1]",
     ]
-    status, results, out, _ = run(capsys, "traffic=idm", f"data.path={recordings}", *asked)
+    status, results, out, _ = run(
+        capsys,
+        "traffic=idm",
+        f"data.path={recordings}",
+        *asked,
+    )
     assert (
         status,
         results["traffic"],
@@ -90,6 +96,7 @@ def test_a_card_holds_every_quantity_in_numbers_tables_and_figures(recordings, c
         "idm",
         QUANTITIES.keys(),
     )
+    # A row holds distance, interval, scale and rivals.
     row = results["quantities"]["speed"]
     assert 0.0 <= row["distance_ci"][0] <= row["distance"] <= 1.0
     assert None not in (row["ceiling"], row["floor"])
@@ -167,6 +174,7 @@ def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(
 
 
 def test_a_users_own_traffic_gets_a_card_and_one_of_i80_beside_the_scenes(recordings, capsys):
+    # Found beside the scenes.
     following_file(recordings.parent / "i80_following.csv")
     mine = [
         "traffic=idm",
@@ -190,6 +198,7 @@ def test_a_users_own_traffic_gets_a_card_and_one_of_i80_beside_the_scenes(record
 def fold(path, held_out):
     """The shipped weights, as if they had been fitted without some scenes."""
     tensors, metadata = load_weights(shipped_generator("calibrated"), "generator")
+    # Everything else is that of the weights that ship.
     metadata["data"]["held_out"] = held_out
     save_weights(path, metadata.pop("kind"), tensors, metadata)
     return path
@@ -241,7 +250,10 @@ def test_by_folds_every_scene_is_driven_by_weights_that_never_saw_it(recordings,
     [
         (["data.path=gone.csv"], "gone.csv: no such file"),
         (["data.held_out=[moon]"], "moon"),
-        (["against=[idm_mobli]"], "did you mean 'idm_mobil'"),
+        (
+            ["against=[idm_mobli]"],
+            "did you mean 'idm_mobil'",
+        ),
         (["against=[random]"], "leave it out"),
         (["traffic=replay"], "recordings themselves"),
         (["data=ngsim"], "ganlane prepare"),
@@ -250,7 +262,10 @@ def test_by_folds_every_scene_is_driven_by_weights_that_never_saw_it(recordings,
         (["scenes=some"], "held_out, all"),
         (["device=cuda"], "device=cuda"),
         (
-            ["traffic.path=gone.safetensors", "traffic=gan"],
+            [
+                "traffic.path=gone.safetensors",
+                "traffic=gan",
+            ],
             "gone.safetensors",
         ),
     ],
@@ -258,6 +273,7 @@ def test_by_folds_every_scene_is_driven_by_weights_that_never_saw_it(recordings,
 def test_mistakes_are_told_in_a_sentence_and_leave_nothing(
     arguments, part, recordings, capsys, tmp_path
 ):
+    # Nothing may be left behind, not even a run folder.
     before = sorted(path.name for path in tmp_path.iterdir())
     status, _, _, err = run(
         capsys,
@@ -274,6 +290,7 @@ def test_mistakes_are_told_in_a_sentence_and_leave_nothing(
 
 def test_the_file_that_ships_is_written_on_request_alone(recordings, capsys, monkeypatch, tmp_path):
     assert not RealismConfig().publish
+    # The file in the package must not change in a test.
     there = tmp_path / "shipped.json"
     before = SHIPPED_REFERENCE.read_bytes()
     monkeypatch.setattr(command, "SHIPPED_REFERENCE", there)

@@ -36,6 +36,7 @@ def steady(**changed):
     after 8.
     """
     time = np.arange(100)[:, None] * 0.1
+    # The third car is in the lane beside the others.
     speed = np.array([10.0, 12.0, 15.0])
     present = np.ones((100, 3), bool)
     present[:40, 2] = present[80:, 2] = False
@@ -53,7 +54,11 @@ def steady(**changed):
 def test_constant_velocity_repeats_a_recording_of_it_from_a_vehicles_first_frame_to_its_last():
     there = drive_recordings(ConstantVelocity, [steady()], StartOptions())
     recorded = recorded_frame([steady()])
-    joined = there.join(recorded, on=["vehicle", "frame"], suffix="_recorded")
+    joined = there.join(
+        recorded,
+        on=["vehicle", "frame"],
+        suffix="_recorded",
+    )
     assert joined.height == there.height == recorded.height
     assert (joined["x"] - joined["x_recorded"]).abs().max() < 1e-3
     assert (joined["y"] - joined["y_recorded"]).abs().max() < 1e-5
@@ -108,6 +113,7 @@ def test_replayed_vehicles_drive_as_recorded_whatever_the_model_does():
 def test_index_0_is_nobody_and_models_see_desired_speeds_above_the_speed_at_entry():
     seen = []
 
+    # Keeps what a traffic is given at each step.
     class Watcher(TrafficModule):
         def move(self, vehicles: Vehicles, memory, key, step):
             seen.append(vehicles)
@@ -148,7 +154,9 @@ def test_repeats_differ_and_the_same_seed_repeats_them():
         RandomDriving,
     ],
 )
-def test_every_traffic_stays_finite_from_recorded_starts(make):
+def test_every_traffic_stays_finite_from_recorded_starts(
+    make,
+):
     there = drive_recordings(
         make,
         recorded_cars(scenes=1, vehicles=8, seconds=5.0),
@@ -159,6 +167,7 @@ def test_every_traffic_stays_finite_from_recorded_starts(make):
 
 
 def test_the_floor_drives_neither_backwards_nor_smoothly():
+    # Twenty repeats, for quantiles of ten seconds.
     there = simulate(RandomDriving, [steady()], StartOptions(repeats=20))
     assert there.quantiles["acceleration"]["0.95"] > 1.0
     assert there.quantiles["speed"]["0.05"] >= 0.0
@@ -179,7 +188,11 @@ def queue(x, speed=10.0, desired=20.0):
         }
         for at in x
     ]
-    return vehicles_of({"x": -500.0, "valid": False}, *cars, dtype=torch.float32)
+    return vehicles_of(
+        {"x": -500.0, "valid": False},
+        *cars,
+        dtype=torch.float32,
+    )
 
 
 def headways(vehicles):
@@ -189,12 +202,16 @@ def headways(vehicles):
 def test_a_follower_shows_its_headway_unless_it_is_far_behind_and_none_under_a_tenth_of_a_second():
     behind, ahead = headways(queue([0.0, 24.0]))
     # At 20 m and 10 m/s: (20 m sqrt(1 - (10 / 20)^4) - 2 m) / (10 m/s)
-    assert behind == pytest.approx((20.0 * math.sqrt(15.0 / 16.0) - 2.0) / 10.0, abs=1e-4)
+    assert behind == pytest.approx(
+        (20.0 * math.sqrt(15.0 / 16.0) - 2.0) / 10.0,
+        abs=1e-4,
+    )
     assert ahead == headways(queue([0.0, 64.0]))[0] == DRAWN
     assert headways(queue([0.0, 5.0]))[0] == pytest.approx(0.1)
 
 
 def test_with_the_headway_that_it_shows_idm_neither_speeds_up_nor_brakes():
+    # Gaps of 8, 24 and 16 m at one speed.
     vehicles = queue([0.0, 12.0, 40.0, 60.0])
     shown = balanced_headway(vehicles, ROAD, torch.ones_like(vehicles.x))
     acceleration = following_acceleration(perceive(vehicles, ROAD), headway_s=shown)
@@ -211,6 +228,7 @@ def test_only_those_who_enter_are_credited_and_other_memories_stay_as_they_are()
         },
         [1],
     )
+    # Only the first of the three enters.
     who = torch.tensor([[False, True, False, False]])
     after = with_recorded_headways(memory, vehicles, ROAD, who)
     assert after["driver", "headway"][0, 1] < 3.0
@@ -222,6 +240,7 @@ def test_only_those_who_enter_are_credited_and_other_memories_stay_as_they_are()
 
 def test_a_recorded_platoon_keeps_its_gaps_behind_a_leader_at_constant_speed():
     time = np.arange(60)[:, None] * 0.1
+    # The foremost is replayed.
     x = np.array([0.0, 12.0, 40.0, 55.0]) + 10.0 * time
     scene = made_by_hand(
         x,
@@ -229,6 +248,10 @@ def test_a_recorded_platoon_keeps_its_gaps_behind_a_leader_at_constant_speed():
         lanes=1,
         driven=np.array([True, True, True, False]),
     )
-    there = drive_recordings(HeadwayIdm, [scene], StartOptions(desired_above_mps=5.0))
+    there = drive_recordings(
+        HeadwayIdm,
+        [scene],
+        StartOptions(desired_above_mps=5.0),
+    )
     ends = there.filter(there["frame"] == 59).sort("vehicle")["x"].to_numpy()
     assert np.abs(ends - x[59]).max() < 0.01

@@ -60,6 +60,7 @@ def test_constant_acceleration_has_no_jerk_and_a_cubic_path_its_own_and_the_spee
 
 def test_the_first_three_seconds_of_a_vehicle_do_not_count():
     present = np.ones((100, 2), bool)
+    # The second appears after 5 s.
     present[:50, 1] = False
     result = made_by_hand(
         np.hstack([20.0 * TIME, 20.0 * TIME + 30.0]),
@@ -81,11 +82,16 @@ def test_gap_headway_and_time_to_collision_of_two_cars_whether_or_not_the_leader
         assert values(result, "time_headway") == pytest.approx(gap / 12.0)
         assert values(result, "time_to_collision") == pytest.approx(gap / 2.0)
         assert len(values(result, "speed")) == 65 * (1 + driven)
-    beside = made_by_hand(CLOSING_IN, np.hstack([0.0 * TIME, 0.0 * TIME + 3.5]))
+    # A leader in another lane is none.
+    beside = made_by_hand(
+        CLOSING_IN,
+        np.hstack([0.0 * TIME, 0.0 * TIME + 3.5]),
+    )
     assert measure_recordings([beside]).quantiles["gap"]["0.5"] is None
 
 
 def test_spread_of_speeds_is_that_within_a_frame():
+    # 10, 12 and 14 m/s; two vehicles are too few.
     x = np.hstack([(10.0 + 2.0 * k) * TIME + 40.0 * k for k in range(3)])
     assert values(made_by_hand(x), "speed_spread") == pytest.approx(2.0)
     assert len(values(made_by_hand(x[:, :2]), "speed_spread")) == 0
@@ -94,6 +100,7 @@ def test_spread_of_speeds_is_that_within_a_frame():
 def test_a_lane_change_counts_once_with_its_duration_unless_it_comes_too_early():
     for start, expected in ((4.0, 1), (0.2, 0)):
         part = np.clip((TIME - start) / 4.0, 0.0, 1.0)
+        # Along half a cosine, in 4 s.
         y = 3.5 * 0.5 * (1.0 - np.cos(np.pi * part))
         result = made_by_hand(20.0 * TIME, y)
         assert measure_recordings([result]).lane_changes == expected
@@ -138,6 +145,7 @@ def test_disjoint_histograms_are_at_1_and_an_empty_one_has_no_distance():
 
 
 def test_scenes_that_are_alike_have_a_low_ceiling_and_unlike_ones_a_high_one():
+    # Halves of equal units are equal, of disjoint ones disjoint.
     alike = np.tile([4.0, 8.0, 4.0], (6, 1))
     unlike = np.eye(6) * 10.0
     assert ceiling(alike) == pytest.approx(0.0, abs=1e-7)
@@ -206,6 +214,7 @@ def test_the_interval_of_a_perfect_model_holds_0_and_its_own_estimate(
 def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(
     number,
 ):
+    # The distance of the distributions that both are drawn from.
     many = np.random.default_rng(1).normal(0.3, 0.05, 2000).clip(0.1, 0.6)
     true = float(
         jensen_shannon(
@@ -302,7 +311,10 @@ def test_another_file_is_refused_in_a_sentence(damage, reference, tmp_path):
             "bins": {"bins": {}},
         }.get(damage, {})
         path.write_text("{" if damage == "text" else json.dumps(numbers))
-    with pytest.raises(UserError, match=r"reference\.json: not the histograms"):
+    with pytest.raises(
+        UserError,
+        match=r"reference\.json: not the histograms",
+    ):
         Reference.load(path)
 
 

@@ -5,16 +5,20 @@ import pytest
 from reference.recordings import made_by_hand
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
+from ganlane.data.dense import recorded_frame
 from ganlane.errors import UserError
 from ganlane.realism.card import card_rows
-from ganlane.realism.driving import ConstantVelocity, StartOptions
+from ganlane.realism.driving import (
+    ConstantVelocity,
+    StartOptions,
+)
 from ganlane.realism.long_runs import LongRunParameters
 from ganlane.realism.measures import ceiling
 from ganlane.realism.starts import (
     Fold,
     fit_excess,
     recorded_starts,
-    spawned_frame,
+    spawned_recordings,
 )
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
@@ -32,9 +36,12 @@ def starts_of(frame, *folds, fit=False):
     return recorded_starts(folds, frame, StartOptions(), fit, "made up")
 
 
-def test_scenes_alone_have_the_ceiling_of_their_own_halves(frame):
+def test_scenes_alone_have_the_ceiling_of_their_own_halves(
+    frame,
+):
     starts = starts_of(frame, Fold(MAKERS, NAMES, NAMES[1:3]))
     assert starts.separately_held_out == NAMES[1:3]
+    # The ceiling is that of two scenes, no longer of four.
     alone = card_rows(
         starts.restricted_to(starts.separately_held_out),
         "cruise",
@@ -64,7 +71,11 @@ def test_folds_are_driven_one_by_one_and_joined(frame):
 def test_a_fold_without_scenes_is_passed_over_and_none_at_all_is_refused(
     frame,
 ):
-    starts = starts_of(frame, Fold(MAKERS, [], []), Fold(MAKERS, NAMES[:2], []))
+    starts = starts_of(
+        frame,
+        Fold(MAKERS, [], []),
+        Fold(MAKERS, NAMES[:2], []),
+    )
     assert starts.scenes == NAMES[:2]
     with pytest.raises(UserError, match="no scene to start from"):
         starts_of(frame, Fold(MAKERS, [], []))
@@ -73,7 +84,14 @@ def test_a_fold_without_scenes_is_passed_over_and_none_at_all_is_refused(
 
 
 def test_spawned_trajectories_are_whole_tracks_in_the_schema():
-    frame = spawned_frame(IdmTraffic, Road(), LongRunParameters(5, most_s=10.0), 2)
+    frame = recorded_frame(
+        spawned_recordings(
+            IdmTraffic,
+            Road(),
+            LongRunParameters(5, most_s=10.0),
+            2,
+        )
+    )
     assert frame.height == 2 * 5 * 101
     assert frame["unit"].unique().sort().to_list() == [
         "spawned-0",
@@ -95,6 +113,7 @@ def test_the_excess_that_was_used_is_the_one_that_is_fitted():
 
     time = np.arange(80)[:, None] * 0.1
     random = np.random.default_rng(0)
+    # Everybody drives by 0 to 8 m/s faster than at the start.
     speed = 10.0 + 8.0 * random.uniform(size=30)
     x = 100.0 * np.arange(30) + speed * time
     shown = np.where(np.arange(80)[:, None] == 0, 10.0, speed)

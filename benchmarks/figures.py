@@ -28,9 +28,9 @@ from torch import Tensor, nn
 
 from benchmarks.script import make_parser, run_script
 from ganlane.data import FRAME_S, default_scenes, read_scenes, scene_lane_widths
+from ganlane.data.dense import recorded_frame, recordings_of
 from ganlane.generator import Discriminator, Generator, load_generator, shipped_generator
 from ganlane.realism.driving import StartOptions, drive_recordings
-from ganlane.realism.recordings import recorded_frame, recordings_of
 from ganlane.sim.random import Stream
 from ganlane.sim.state import Road
 from ganlane.traffic import TrafficModule
@@ -189,7 +189,7 @@ def draw_space_time(scene: str, lane: int, courses: Mapping[str, pl.DataFrame]) 
     Args:
         scene: its name.
         lane: whose vehicles are drawn.
-        courses: name to trajectories (:func:`ganlane.realism.recordings.frame_of`) of the same
+        courses: name to trajectories (:func:`ganlane.data.dense.Recording.frame`) of the same
             scene.
     """
     first, *others = courses

@@ -1,5 +1,4 @@
-"""highD recordings (Krajewski et al. 2018): three files each, 25 Hz, two directions of travel, into
-the schema.
+"""highD recordings (Krajewski et al. 2018): three files each, at 25 Hz, both directions of travel.
 
 Each direction becomes a scene of its own, in its drivers' view: ``x`` forward, ``y`` to the left,
 lane 0 rightmost. highD's images have ``y`` downwards and call the length of a vehicle its
@@ -13,32 +12,38 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import polars as pl
 
-from ganlane.data.lanes import Flags, Floats, Integers
 from ganlane.data.schema import (
     FRAME_S,
     SCHEMA,
     RowCount,
     Scene,
     number_tracks,
-    raise_where,
-    read_table,
     sort,
     validate,
 )
+from ganlane.data.tables import raise_where, read_table
 from ganlane.errors import UserError
 
 _TRACKS: Final = "_tracks.csv"
 #: Columns of ``XX_tracks.csv`` that are read.
 COLUMNS: Final = {
     **dict.fromkeys(("frame", "id", "laneid"), pl.Int64),
-    **dict.fromkeys(("x", "y", "width", "height", "xvelocity"), pl.Float64),
+    **dict.fromkeys(
+        ("x", "y", "width", "height", "xvelocity"),
+        pl.Float64,
+    ),
+}
+#: Columns of ``XX_recordingMeta.csv`` that are read.
+_META: Final = {
+    "framerate": pl.Float64,
+    "upperlanemarkings": pl.String,
+    "lowerlanemarkings": pl.String,
 }
 #: ``drivingDirection`` of the upper lanes, driven to the left in the image, and of the lower lanes.
 UPPER: Final = 1
@@ -67,61 +72,85 @@ def highd_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Sc
     Raises:
         UserError: a missing or damaged file; the message names file, line and column.
     """
-    path, count = Path(path), count if count is not None else RowCount()
-    if path.is_dir():
-        recordings = sorted(path.glob(f"*{_TRACKS}"))
-        if not recordings:
-            raise UserError(
-                f"{path}: no XX{_TRACKS} in this folder; give highD's data folder or one such file."
-            )
-    elif not path.name.endswith(_TRACKS):
-        raise UserError(f"{path}: expected highD's XX{_TRACKS} or a folder of recordings.")
-    else:
-        recordings = [path]
+    path = Path(path)
+    count = count if count is not None else RowCount()
+    # A folder holds up to 60 recordings; one file is one of them.
+    recordings = sorted(path.glob(f"*{_TRACKS}")) if path.is_dir() else [path]
+    if not recordings:
+        raise UserError(
+            f"{path}: no XX{_TRACKS} in this folder; give highD's data folder or one such file."
+        )
     for tracks in recordings:
+        if not tracks.name.endswith(_TRACKS):
+            raise UserError(f"{path}: expected highD's XX{_TRACKS} or a folder of recordings.")
         stem = tracks.name.removesuffix(_TRACKS)
         rate_hz, directions = _read_recording_meta(tracks.with_name(f"{stem}_recordingMeta.csv"))
-        rows = _read_rows(tracks, tracks.with_name(f"{stem}_tracksMeta.csv"), count)
+        # Both directions are in one file.
+        rows = _read_rows(
+            tracks,
+            tracks.with_name(f"{stem}_tracksMeta.csv"),
+            count,
+        )
         for direction in directions:
-            name = f"highd-{stem}-{'upper' if direction.number == UPPER else 'lower'}"
-            if scene := _scene(rows, direction, rate_hz, name, tracks, count):
+            side = "upper" if direction.number == UPPER else "lower"
+            scene = _scene(
+                rows,
+                direction,
+                rate_hz,
+                f"highd-{stem}-{side}",
+                tracks,
+                count,
+            )
+            if scene is not None:
                 yield scene
 
 
-def _read_recording_meta(path: Path) -> tuple[float, tuple[_Direction, _Direction]]:
-    """Frame rate in Hz, and both directions. Lane ids grow downwards.
+def _read_recording_meta(
+    path: Path,
+) -> tuple[float, tuple[_Direction, _Direction]]:
+    """Frame rate in Hz, and both directions.
 
-    The id between the directions is unused.
+    Lane ids grow downwards from 2; the id between the directions is unused.
     """
-    columns = {
-        "framerate": pl.Float64,
-        "upperlanemarkings": pl.String,
-        "lowerlanemarkings": pl.String,
-    }
-    rate_hz, *markings = read_table(path, columns).select(columns.keys()).row(0)
+    rate_hz, upper_text, lower_text = read_table(path, _META).select(_META.keys()).row(0)
+    # Frames are dropped or interpolated, never invented.
     if rate_hz < 10.0:
         raise UserError(f"{path}, line 2, column framerate: {rate_hz}, expected 10 Hz or more.")
-    upper, lower = (_markings(text, path, name) for text, name in zip(markings, list(columns)[1:]))
-    n_upper, n_lower = len(upper) - 1, len(lower) - 1
+    upper = _markings(upper_text, path, "upperlanemarkings")
+    lower = _markings(lower_text, path, "lowerlanemarkings")
+    n_upper = len(upper) - 1
+    n_lower = len(lower) - 1
+    # Upper lanes: the rightmost one, seen by its drivers, is at the top of the image.
     upper_ids = tuple(range(2, 2 + n_upper))
     lower_ids = tuple(range(n_upper + 2 + n_lower, n_upper + 2, -1))
     return rate_hz, (
-        _Direction(UPPER, upper_ids, upper[0], (upper[-1] - upper[0]) / n_upper),
-        _Direction(LOWER, lower_ids, lower[-1], (lower[-1] - lower[0]) / n_lower),
+        _Direction(
+            UPPER,
+            upper_ids,
+            upper[0],
+            (upper[-1] - upper[0]) / n_upper,
+        ),
+        _Direction(
+            LOWER,
+            lower_ids,
+            lower[-1],
+            (lower[-1] - lower[0]) / n_lower,
+        ),
     )
 
 
-def _markings(text: str, path: Path, column: str) -> tuple[float, ...]:
+def _markings(text: str, path: Path, column: str) -> list[float]:
     """``y`` of the lane markings in the image, m: ``8.51;12.59;16.43`` as numbers."""
     try:
-        found = tuple(float(part) for part in text.split(";") if part.strip())
+        markings = [float(part) for part in text.split(";") if part.strip()]
     except ValueError:
-        found = ()
-    if len(found) < 2 or any(b <= a for a, b in pairwise(found)):
+        markings = []
+    if len(markings) < 2 or not (np.diff(markings) > 0.0).all():
         raise UserError(
-            f"{path}, line 2, column {column}: {text!r}; expected two or more growing numbers separated by ;"
+            f"{path}, line 2, column {column}: {text!r}; expected two or more growing numbers "
+            "separated by ;"
         )
-    return found
+    return markings
 
 
 def _read_rows(path: Path, meta: Path, count: RowCount) -> pl.DataFrame:
@@ -132,23 +161,41 @@ def _read_rows(path: Path, meta: Path, count: RowCount) -> pl.DataFrame:
     cars = read_table(meta, {"id": pl.Int64, "drivingdirection": pl.Int64})
     direction = cars["drivingdirection"]
     what = "is neither 1 (upper lanes) nor 2 (lower lanes)"
-    raise_where(~direction.is_in([UPPER, LOWER]), cars, "drivingdirection", meta, what)
+    raise_where(
+        ~direction.is_in([UPPER, LOWER]),
+        cars,
+        "drivingdirection",
+        meta,
+        what,
+    )
     rows = read_table(path, COLUMNS)
     count.read += rows.height
     for name in ("width", "height"):
-        raise_where(rows[name] <= 0.0, rows, name, path, "is not above 0")
+        raise_where(
+            rows[name] <= 0.0,
+            rows,
+            name,
+            path,
+            "is not above 0",
+        )
+    # Sorting would hide a damaged frame number.
     step = rows.select(pl.col("frame").diff().over("id")).to_series()
-    raise_where(
-        step <= 0,
-        rows,
-        "frame",
-        path,
-        "is not after the last frame of its vehicle; frames must grow",
-    )
+    what = "is not after the last frame of its vehicle; frames must grow"
+    raise_where(step <= 0, rows, "frame", path, what)
+    # Each row gets the direction of its vehicle.
     directions = rows["id"].replace_strict(
-        cars["id"], direction, default=None, return_dtype=pl.Int64
+        cars["id"],
+        direction,
+        default=None,
+        return_dtype=pl.Int64,
     )
-    raise_where(directions.is_null(), rows, "id", path, "is not in the tracksMeta file")
+    raise_where(
+        directions.is_null(),
+        rows,
+        "id",
+        path,
+        "is not in the tracksMeta file",
+    )
     return rows.with_columns(directions.alias("direction")).sort("id", "frame")
 
 
@@ -162,20 +209,22 @@ def _scene(
 ) -> Scene | None:
     """One direction in the schema, with a frame every 0.1 s; None where it has no vehicles."""
     rows = rows.filter(pl.col("direction") == direction.number)
+    # A lane id of the other direction, or none, is an error of the tracking.
     on_road = rows["laneid"].is_in(list(direction.lane_ids))
     count.drop("off the lanes of its direction", (~on_road).sum())
     rows = rows.filter(on_road)
     if rows.is_empty():
         return None
+    # Distances grow in the direction of travel.
     forward = -1.0 if direction.number == UPPER else 1.0
     along = forward * (pl.col("x") + 0.5 * pl.col("width"))
     # Upper lanes: left is down in the image, where y grows; lower lanes: left is up.
     left = -forward * (pl.col("y") + 0.5 * pl.col("height") - direction.right_edge)
     numbers = {lane_id: lane for lane, lane_id in enumerate(direction.lane_ids)}
     turned = rows.select(
-        pl.lit(name).alias("scene"),
-        pl.col("id").alias("vehicle"),
         "frame",
+        scene=pl.lit(name),
+        vehicle="id",
         x=along - along.min(),
         y=left - 0.5 * direction.lane_width,
         speed=forward * pl.col("xvelocity"),
@@ -183,65 +232,40 @@ def _scene(
         length="width",
         width="height",
     )
-    tracks = number_tracks(turned, str(path))
-    begins = (tracks["vehicle"].diff() != 0).fill_null(True).to_numpy()
-    old = {name: tracks[name].to_numpy() for name in SCHEMA}
-    new = resample(begins, old["frame"], rate_hz)
-    nearest = np.where(new.share > 0.5, new.after, new.before)
-    columns = {
-        "scene": old["scene"][new.before],
-        "vehicle": old["vehicle"][new.before],
-        "frame": new.frame,
-    }
-    columns |= {name: new.linear(old[name]) for name in ("x", "y", "speed", "length", "width")}
-    frame = pl.DataFrame(columns | {"lane": old["lane"][nearest]}, schema_overrides=SCHEMA).select(
-        SCHEMA.names()
-    )
+    # Rows that were dropped split a track: nothing is interpolated across a gap.
+    tracks = number_tracks(turned, str(path)).partition_by("vehicle", maintain_order=True)
+    frame = pl.concat([resample(track, rate_hz) for track in tracks])
     if frame.is_empty():
         return None
-    return Scene(
-        name, sort(validate(frame, f"{path}, {name}", first_line=None)), direction.lane_width
+    frame = validate(
+        frame.select(SCHEMA.names()),
+        f"{path}, {name}",
+        first_line=None,
     )
+    return Scene(name, sort(frame), direction.lane_width)
 
 
-class Resampling(NamedTuple):
-    """R new samples among the old ones.
+def resample(track: pl.DataFrame, rate_hz: float) -> pl.DataFrame:
+    """A track without missing frames, which are ``1 / rate_hz`` s apart, at 10 Hz.
 
-    Attributes:
-        frame: [R] new frame numbers, 0.1 s each; frame 0 is the old frame 0.
-        before, after: [R] indices of the old samples around each; equal at the end of a track.
-        share: [R] position between the two, 0 to below 1.
+    Frame 0 is the old frame 0; no sample lies beyond the ends of the track.
     """
-
-    frame: Integers
-    before: Integers
-    after: Integers
-    share: Floats
-
-    def linear(self, values: Floats) -> Floats:
-        """[R] values, interpolated linearly."""
-        return values[self.before] + self.share * (values[self.after] - values[self.before])
-
-
-def resample(begins: Flags, frame: Integers, rate_hz: float) -> Resampling:
-    """Samples every 0.1 s within each track, none beyond its ends.
-
-    ``begins`` [S] is true at the first old sample of each track; within a track ``frame`` [S] grows
-    by one.
-    """
-    starts = np.flatnonzero(begins)
-    ends = np.append(starts[1:], len(frame)) - 1
     per_step = rate_hz * FRAME_S
-    # A small tolerance, so that a new frame at the time of an old one is kept in spite of rounding.
-    first = np.ceil(frame[starts] / per_step - 1e-9).astype(np.int64)
-    last = np.floor(frame[ends] / per_step + 1e-9).astype(np.int64)
-    samples = np.maximum(last - first + 1, 0)
-    track = np.repeat(np.arange(len(starts)), samples)
-    offset = np.arange(len(track)) - np.repeat(np.cumsum(samples) - samples, samples)
-    new = first[track] + offset
-    place = new * per_step - frame[starts][track]
-    whole = np.floor(place + 1e-9)
-    before = starts[track] + whole.astype(np.int64)
-    return Resampling(
-        new, before, np.minimum(before + 1, ends[track]), np.clip(place - whole, 0.0, 1.0)
-    )
+    old = track["frame"].to_numpy()
+    # A small tolerance, so that a new frame at the time of an old one stays in spite of rounding.
+    first = np.ceil(old[0] / per_step - 1e-9)
+    last = np.floor(old[-1] / per_step + 1e-9)
+    frame = np.arange(first, last + 1.0)
+    # Places of the new frames among the old samples.
+    place = (frame * per_step - old[0]).clip(0.0, len(old) - 1)
+    nearest = np.ceil(place - 0.5 - 1e-9).astype(np.int64)
+    # Numbers are interpolated; lane and names are those of the nearest sample.
+    columns = {
+        name: np.interp(
+            place,
+            np.arange(len(old)),
+            track[name].to_numpy(),
+        )
+        for name in ("x", "y", "speed", "length", "width")
+    }
+    return track[nearest].with_columns(frame=frame.astype(np.int64), **columns)

@@ -1,5 +1,4 @@
-"""Lane widths of recordings, and the lane changes of recordings and simulations with their
-durations (equation 11).
+"""Lane widths of recordings, and lane changes with their durations (equation 11).
 
 Recordings and simulations are measured in the same form, :class:`Tracks`: flat arrays, vectorised
 over all samples.
@@ -44,18 +43,26 @@ _HOLD, _HALF_WINDOW, _REACH = 5, 5, 200
 _CENTRED_M, _STILL_MPS = 0.3, 0.1
 
 
-def scene_lane_widths(frame: pl.DataFrame) -> dict[str, float]:
+def scene_lane_widths(
+    frame: pl.DataFrame,
+) -> dict[str, float]:
     """Lane width in metres of every scene of a frame in the schema.
 
     Errors are :func:`lane_width`'s.
     """
     return {
-        str(name): lane_width(rows["y"].to_numpy(), rows["lane"].to_numpy(), str(name))
+        str(name): lane_width(
+            rows["y"].to_numpy(),
+            rows["lane"].to_numpy(),
+            str(name),
+        )
         for (name,), rows in frame.group_by("scene", maintain_order=True)
     }
 
 
-def scene_lane_counts(frame: pl.DataFrame) -> dict[str, int]:
+def scene_lane_counts(
+    frame: pl.DataFrame,
+) -> dict[str, int]:
     """Number of lanes of every scene of a frame in the schema: its highest lane number plus one."""
     return dict(
         frame.group_by("scene", maintain_order=True).agg(pl.col("lane").max() + 1).iter_rows()
@@ -63,8 +70,7 @@ def scene_lane_counts(frame: pl.DataFrame) -> dict[str, int]:
 
 
 def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
-    """Lane width, m, at which the nearest lane of each row agrees best with its recorded lane
-    number [R].
+    """Lane width, m, at which the nearest lanes agree best with the recorded ones ``lane`` [R].
 
     The first estimate is the median slope between the median positions of each pair of lanes (Theil
     and Sen), which is robust to outliers. It is kept if no other width within 10 % of it puts more
@@ -75,14 +81,16 @@ def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
     Raises:
         UserError: the estimate is below 2 m or above 6 m.
     """
+    # Medians first: they are robust, but drivers off the centre shift them.
     guess = _median_spacing(*_centres(y, lane))
     if guess is None:
         return STANDARD_LANE_WIDTH_M
     if not 2.0 <= guess <= 6.0:
         raise UserError(
-            f"{scene}: its lanes are {guess:.2f} m apart, expected 2 to 6 m; check that y is in metres, grows to the "
-            "left, and that lanes are numbered in order."
+            f"{scene}: its lanes are {guess:.2f} m apart, expected 2 to 6 m; check that y is in "
+            "metres, grows to the left, and that lanes are numbered in order."
         )
+    # Then the range of widths that explains most recorded lane numbers.
     low, high = _best_range(y, lane, guess)
     return guess if low <= guess <= high else 0.5 * (low + high)
 
@@ -108,10 +116,17 @@ def _best_range(y: Floats, lane: Integers, guess: float) -> tuple[float, float]:
     # A row of lane k agrees with the widths from y / (k + 1/2) to y / (k - 1/2); lane 0 has no
     # upper end.
     begin = np.where(lane == 0, 2.0 * np.abs(y), y / (lane + 0.5))
-    end = np.where(lane == 0, np.inf, y / np.where(lane == 0, 1.0, lane - 0.5))
-    begin, end = np.clip(begin, 0.9 * guess, 1.1 * guess), np.clip(end, 0.9 * guess, 1.1 * guess)
+    end = np.where(
+        lane == 0,
+        np.inf,
+        y / np.where(lane == 0, 1.0, lane - 0.5),
+    )
+    begin = np.clip(begin, 0.9 * guess, 1.1 * guess)
+    end = np.clip(end, 0.9 * guess, 1.1 * guess)
+    # The number of agreeing rows changes at these widths only.
     edges = np.unique(np.concatenate((begin, end, [0.9 * guess, 1.1 * guess])))
     inside = 0.5 * (edges[1:] + edges[:-1])
+    # Rows whose range has begun, less those whose range has ended.
     agreeing = np.searchsorted(np.sort(begin), inside) - np.searchsorted(np.sort(end), inside)
     best = np.flatnonzero(agreeing == agreeing.max())
     nearest = best[np.argmin(np.abs(inside[best] - guess))]
@@ -122,6 +137,7 @@ def _median_spacing(numbers: Integers, centres: Floats) -> float | None:
     """Median slope between the lanes' median positions; None with fewer than two lanes."""
     if len(numbers) < 2:
         return None
+    # All pairs of lanes.
     one, other = np.triu_indices(len(numbers), 1)
     return float(np.median((centres[other] - centres[one]) / (numbers[other] - numbers[one])))
 
@@ -165,12 +181,16 @@ class Tracks:
         return ends[np.cumsum(self.begins) - 1]
 
 
-def tracks_of_frame(frame: pl.DataFrame, lane_widths: dict[str, float] | None = None) -> Tracks:
+def tracks_of_frame(
+    frame: pl.DataFrame,
+    lane_widths: dict[str, float] | None = None,
+) -> Tracks:
     """Tracks of a frame in the schema, sorted.
 
     Each scene's lane width in m is estimated where not given.
     """
     widths = scene_lane_widths(frame) if lane_widths is None else lane_widths
+    # A track goes on where frame and vehicle say so, within one scene.
     continues = (pl.col("frame").diff() == 1) & (pl.col("vehicle").diff() == 0)
     same_scene = pl.col("scene") == pl.col("scene").shift(1)
     columns = frame.select(
@@ -179,7 +199,9 @@ def tracks_of_frame(frame: pl.DataFrame, lane_widths: dict[str, float] | None = 
         begins=~(continues & same_scene).fill_null(False),
     )
     return Tracks(
-        columns["y"].to_numpy(), columns["width"].to_numpy(), columns["begins"].to_numpy()
+        columns["y"].to_numpy(),
+        columns["width"].to_numpy(),
+        columns["begins"].to_numpy(),
     )
 
 
@@ -225,17 +247,29 @@ def find_lane_changes(tracks: Tracks) -> LaneChanges:
     """
     lane = tracks.lane
     sample = _crossings(lane, tracks)
-    old, new = lane[sample], lane[sample + 1]
+    old = lane[sample]
+    new = lane[sample + 1]
+    # 1 to the left, -1 to the right.
     side = np.sign(new - old)
+    # The crossing lies between two samples; it is interpolated linearly.
     boundary = (old + 0.5 * side) * tracks.lane_width[sample]
     part = (boundary - tracks.y[sample]) / (tracks.y[sample + 1] - tracks.y[sample])
-    start, start_found = _find_end(tracks, sample, side, old, -1)
-    end, end_found = _find_end(tracks, sample + 1, side, new, 1)
+    start, start_seen = _find_end(tracks, sample, side, old, -1)
+    end, end_seen = _find_end(tracks, sample + 1, side, new, 1)
     tau_s = (sample - start + part) * FRAME_S
     tau_e = (end - sample - part) * FRAME_S
+    # Over the recorded part of the change, from start to end.
     moved = side * (tracks.y[end] - tracks.y[start])
+    speed = moved / (tau_s + tau_e)
     return LaneChanges(
-        sample, old, new, tau_s, tau_e, ~start_found, ~end_found, moved / (tau_s + tau_e)
+        sample,
+        old,
+        new,
+        tau_s,
+        tau_e,
+        ~start_seen,
+        ~end_seen,
+        speed,
     )
 
 
@@ -246,44 +280,55 @@ def lane_changes_of_arrays(y: ArrayLike, lane_width: float) -> LaneChanges:
     ``sample`` counts vehicle by vehicle.
     """
     columns = np.asarray(y, dtype=np.float64).T
+    # Every vehicle is a track of its own, present all the time.
     begins = np.zeros(columns.shape, bool)
     begins[:, 0] = True
     return find_lane_changes(
-        Tracks(columns.ravel(), np.full(columns.size, lane_width), begins.ravel())
+        Tracks(
+            columns.ravel(),
+            np.full(columns.size, lane_width),
+            begins.ravel(),
+        )
     )
 
 
 def _crossings(lane: Integers, tracks: Tracks) -> Integers:
     """[C] last samples in an old lane, where both the old and the new lane are kept long enough."""
+    # A run is a stretch of one lane within a track.
     starts_run = tracks.begins | (np.diff(lane, prepend=lane[:1]) != 0)
     lengths = np.diff(np.flatnonzero(starts_run), append=len(lane))
     long_enough = lengths >= _HOLD
     run = np.cumsum(starts_run) - 1
+    # Samples at which a new run begins within the same track.
     after = np.flatnonzero(starts_run & ~tracks.begins)
     return after[long_enough[run[after]] & long_enough[run[after - 1]]] - 1
 
 
 def _find_end(
-    tracks: Tracks, sample: Integers, side: Integers, lane: Integers, direction: int
+    tracks: Tracks,
+    sample: Integers,
+    side: Integers,
+    lane: Integers,
+    direction: int,
 ) -> tuple[Integers, Flags]:
-    """Start (``direction`` -1) or end (1) of lane changes: first sample that is centred or without
-    lateral movement.
+    """Start (``direction`` -1) or end (1) of lane changes.
 
+    It is the first sample that is centred or without lateral movement.
     Returns [C] the samples, or the first or last ones of their tracks, and [C] whether the end lies
     within the track.
     """
+    # Never beyond the track: there the change is censored.
     limit = (tracks.first if direction < 0 else tracks.last)[sample]
     path = sample[:, None] + direction * np.arange(_REACH + 1)
     inside = (path <= limit[:, None]) if direction > 0 else (path >= limit[:, None])
     path = np.where(inside, path, limit[:, None])
+    # Distance from the centre of the lane that is left or reached.
     offset = tracks.y[path] - (lane * tracks.lane_width[sample])[:, None]
-    done = (np.abs(offset) < _CENTRED_M) | (
-        side[:, None] * _lateral_speed(tracks, path) < _STILL_MPS
-    )
-    done &= inside
-    found = done.any(axis=1)
-    at = np.where(found, done.argmax(axis=1), inside.sum(axis=1) - 1)
-    return sample + direction * at, found
+    pace = side[:, None] * _lateral_speed(tracks, path)
+    done = inside & ((np.abs(offset) < _CENTRED_M) | (pace < _STILL_MPS))
+    within = done.any(axis=1)
+    at = np.where(within, done.argmax(axis=1), inside.sum(axis=1) - 1)
+    return sample + direction * at, within
 
 
 def _lateral_speed(tracks: Tracks, at: Integers) -> Floats:

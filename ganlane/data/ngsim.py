@@ -24,44 +24,64 @@ import polars as pl
 
 from ganlane.data.lanes import lane_grid
 from ganlane.data.schema import (
-    LINE,
     SCHEMA,
-    OnProgress,
     RowCount,
     Scene,
+    number_tracks,
+    sort,
+)
+from ganlane.data.tables import (
+    LINE,
+    OnProgress,
     TextTable,
     convert,
     csv_table,
     first_line,
-    number_tracks,
     raise_where,
     read_blocks,
-    sort,
 )
 from ganlane.errors import UserError
-from ganlane.settings.generator import MOTORWAYS, NgsimParameters
+from ganlane.settings.generator import (
+    MOTORWAYS,
+    NgsimParameters,
+)
 
 FOOT_M: Final = 0.3048
 FRAME_MS: Final = 100
 #: The 18 columns of the raw text files, which have no header.
 RAW_NAMES: Final = (
-    *(
-        "vehicle_id",
-        "frame_id",
-        "total_frames",
-        "global_time",
-        "local_x",
-        "local_y",
-        "global_x",
-        "global_y",
-    ),
-    *("v_length", "v_width", "v_class", "v_vel", "v_acc", "lane_id", "preceding", "following"),
-    *("space_headway", "time_headway"),
+    "vehicle_id",
+    "frame_id",
+    "total_frames",
+    "global_time",
+    "local_x",
+    "local_y",
+    "global_x",
+    "global_y",
+    "v_length",
+    "v_width",
+    "v_class",
+    "v_vel",
+    "v_acc",
+    "lane_id",
+    "preceding",
+    "following",
+    "space_headway",
+    "time_headway",
 )
 #: Columns that are read; ``location`` too, where it exists.
 COLUMNS: Final = {
     **dict.fromkeys(("vehicle_id", "frame_id", "global_time"), pl.Int64),
-    **dict.fromkeys(("local_x", "local_y", "v_length", "v_width", "v_vel"), pl.Float64),
+    **dict.fromkeys(
+        (
+            "local_x",
+            "local_y",
+            "v_length",
+            "v_width",
+            "v_vel",
+        ),
+        pl.Float64,
+    ),
     "lane_id": pl.Int64,
 }
 LOCATION: Final = "location"
@@ -98,8 +118,10 @@ def ngsim_scenes(
     Raises:
         UserError: a missing or damaged file; the message names file, line and column.
     """
-    path, parameters = Path(path), parameters or NgsimParameters()
+    path = Path(path)
+    parameters = parameters or NgsimParameters()
     count = count if count is not None else RowCount()
+    # Nothing is read before the first period is asked for.
     rows = _read_rows(_layout(path), parameters, count, on_progress)
     with tempfile.TemporaryDirectory(dir=scratch, prefix="rows-") as folder:
         periods = _store_by_period(rows, Path(folder), str(path))
@@ -108,95 +130,140 @@ def ngsim_scenes(
                 f"{path}: no rows of {', '.join(parameters.locations)}; check data.locations."
             )
         for name, parts in periods.items():
-            if scene := _scene(name, _read(parts), path, parameters.lanes, count):
+            if scene := _scene(
+                name,
+                _read(parts),
+                path,
+                parameters.lanes,
+                count,
+            ):
                 yield scene
 
 
 def _layout(path: Path) -> TextTable:
-    """Raw text if the first line begins with a number and has no comma, else a CSV with a header."""
+    """Raw text if the first line begins with a number and has no comma, else a CSV."""
     first = first_line(path)
     fields = first.split()
     if "," in first or not fields[0].replace(".", "", 1).isdecimal():
         return csv_table(path, COLUMNS)
     if len(fields) != len(RAW_NAMES):
         raise UserError(
-            f"{path}, line 1: {len(fields)} columns; expected the {len(RAW_NAMES)} of NGSIM's text files, or a "
-            "header line."
+            f"{path}, line 1: {len(fields)} columns; expected the {len(RAW_NAMES)} of NGSIM's text "
+            "files, or a header line."
         )
-    return TextTable(path, RAW_NAMES, has_header=False, blanks=True)
+    return TextTable(path, RAW_NAMES, blanks=True)
 
 
 def _read_rows(
-    table: TextTable, parameters: NgsimParameters, count: RowCount, on_progress: OnProgress | None
+    table: TextTable,
+    parameters: NgsimParameters,
+    count: RowCount,
+    on_progress: OnProgress | None,
 ) -> Iterator[pl.DataFrame]:
     """Blocks with :data:`COLUMNS`, ``location`` and ``line``, in feet, in the order of the file."""
-    path, has_location = table.path, LOCATION in table.names
+    path = table.path
+    has_location = LOCATION in table.names
     wanted = [*COLUMNS, LOCATION] if has_location else list(COLUMNS)
     for text in read_blocks(table, wanted, parameters.block_bytes, on_progress):
         count.read += text.height
+        # A raw text file is of one place, which its name tells.
         if has_location:
             text = _keep_locations(text, path, parameters.locations, count)
         else:
             text = text.with_columns(pl.lit(path.stem).alias(LOCATION))
-        columns = [
-            convert(text, name, kind, path, thousands=True) for name, kind in COLUMNS.items()
-        ]
+        # Only the wanted rows are converted: others may be damaged.
+        columns = [convert(text, name, kind, path) for name, kind in COLUMNS.items()]
         rows = pl.DataFrame([*columns, text[LOCATION], text[LINE]])
         for name in ("v_length", "v_width"):
-            raise_where(rows[name] <= 0.0, rows, name, path, "is not above 0")
-        raise_where(rows["v_vel"] < 0.0, rows, "v_vel", path, "is below 0")
+            raise_where(
+                rows[name] <= 0.0,
+                rows,
+                name,
+                path,
+                "is not above 0",
+            )
+        raise_where(
+            rows["v_vel"] < 0.0,
+            rows,
+            "v_vel",
+            path,
+            "is below 0",
+        )
         yield rows
 
 
 def _keep_locations(
-    text: pl.DataFrame, path: Path, locations: tuple[str, ...], count: RowCount
+    text: pl.DataFrame,
+    path: Path,
+    locations: tuple[str, ...],
+    count: RowCount,
 ) -> pl.DataFrame:
     """Rows of the wanted locations; rows of others are dropped and counted."""
     text = text.with_columns(convert(text, LOCATION, pl.String, path).str.to_lowercase())
-    known = sorted({*MOTORWAYS, *STREETS, *locations})
-    what = f"is no known place, expected {', '.join(known)}, or name it in data.locations"
-    raise_where(~text[LOCATION].is_in(known), text, LOCATION, path, what)
-    kept = text[LOCATION].is_in(list(locations))
-    for location, rows in text[LOCATION].filter(~kept).value_counts().iter_rows():
+    places = sorted({*MOTORWAYS, *STREETS, *locations})
+    what = f"is no known place, expected {', '.join(places)}, or name it in data.locations"
+    # A mistyped place would drop a whole recording in silence.
+    raise_where(
+        ~text[LOCATION].is_in(places),
+        text,
+        LOCATION,
+        path,
+        what,
+    )
+    wanted = text[LOCATION].is_in(list(locations))
+    for location, rows in text[LOCATION].filter(~wanted).value_counts().iter_rows():
         count.drop(f"location {location}", rows)
-    return text.filter(kept)
+    return text.filter(wanted)
 
 
 def _store_by_period(
-    blocks: Iterable[pl.DataFrame], folder: Path, source: str
+    blocks: Iterable[pl.DataFrame],
+    folder: Path,
+    source: str,
 ) -> dict[str, list[Path]]:
-    """Store the rows of all blocks under ``folder``; the files of each period, by its name.
+    """Store the rows of all blocks under ``folder``.
 
-    ``us-101-1``.
+    Returns the files of each period by its name, as ``us-101-1``.
     """
     parts: dict[tuple[str, int], list[Path]] = {}
-    start = (pl.col("global_time") - FRAME_MS * pl.col("frame_id")) // 60_000
+    start_ms = pl.col("global_time") - FRAME_MS * pl.col("frame_id")
     for number, block in enumerate(blocks):
-        for (location, minute), rows in block.group_by(
-            LOCATION, start.alias("minute"), maintain_order=True
-        ):
+        block = block.with_columns(minute=start_ms // 60_000)
+        for rows in block.partition_by(LOCATION, "minute", maintain_order=True):
+            location = rows[LOCATION][0]
+            minute = rows["minute"][0]
+            # Numbered by block: the rows of a period keep the order of the file.
             part = folder / f"{len(parts):04d}-{number:05d}-{minute}.arrow"
-            rows.drop(LOCATION).write_ipc(part, compression="lz4")
-            parts.setdefault((str(location), int(minute)), []).append(part)  # type: ignore[call-overload]
+            rows.drop(LOCATION, "minute").write_ipc(part, compression="lz4")
+            parts.setdefault((location, minute), []).append(part)
+        # Checked at each block, before a damaged file fills the disk.
         if len(parts) > MAX_PERIODS:
             raise UserError(
-                f"{source}, columns global_time and frame_id: they hold {len(parts)} recording periods or more; "
-                "expected global_time in milliseconds and frame_id in steps of 100 ms."
+                f"{source}, columns global_time and frame_id: they hold {len(parts)} recording "
+                "periods or more; expected global_time in milliseconds and frame_id in steps of "
+                "100 ms."
             )
+    # Adjacent minutes are one period.
     periods: dict[str, list[Path]] = {}
     numbers = Counter[str]()
     for location, minute in sorted(parts):
-        numbers[location] += (location, minute - 1) not in parts
+        numbers[location] += (
+            location,
+            minute - 1,
+        ) not in parts
         periods.setdefault(f"{location}-{numbers[location]}", []).extend(parts[location, minute])
     for name, files in periods.items():
         location = name.rpartition("-")[0]
+        if numbers[location] == 1 or len(files) > 1:
+            continue
         # A few rows that make a period of their own have a wrong time or frame.
-        if numbers[location] > 1 and len(files) == 1 and (rows := _read(files)).height < MIN_ROWS:
+        rows = _read(files)
+        if rows.height < MIN_ROWS:
             first = rows.sort(LINE).row(0, named=True)
             raise UserError(
-                f"{source}, line {first[LINE]}, columns frame_id and global_time: frame {first['frame_id']} at "
-                f"{first['global_time']} ms fits no recording period of {location} ({rows.height} rows alone); "
-                "correct or remove the row."
+                f"{source}, line {first[LINE]}, columns frame_id and global_time: frame "
+                f"{first['frame_id']} at {first['global_time']} ms fits no recording period of "
+                f"{location} ({rows.height} rows alone); correct or remove the row."
             )
     return periods
 
@@ -206,23 +273,32 @@ def _read(parts: list[Path]) -> pl.DataFrame:
     return pl.concat([pl.read_ipc(part) for part in parts])
 
 
-def _scene(name: str, rows: pl.DataFrame, path: Path, lanes: int, count: RowCount) -> Scene | None:
+def _scene(
+    name: str,
+    rows: pl.DataFrame,
+    path: Path,
+    lanes: int,
+    count: RowCount,
+) -> Scene | None:
     """The ``rows`` of one period in the schema; None where none of them is on a lane."""
     source = f"{path}, {name}"
     rows = _drop_duplicates(rows, count)
     _check_order(rows, path)
     _check_units(rows, source)
+    # Rows beyond the lanes that are kept end a track.
     count.drop("lane below 1", (rows["lane_id"] < 1).sum())
     count.drop("ramp", (rows["lane_id"] > lanes).sum())
     rows = rows.filter(rows["lane_id"].is_between(1, lanes))
     if rows.is_empty():
         return None
+    # NGSIM counts lanes from the left, from 1.
     from_left = rows["lane_id"].to_numpy() - 1
     right_m = FOOT_M * rows["local_x"].to_numpy()
     # Every n-th row is enough to estimate the lanes, and bounds the memory.
     part = slice(None, None, -(-len(right_m) // ROWS_FOR_LANES))
     width, first_centre = lane_grid(right_m[part], from_left[part], source)
     last = int(from_left.max())
+    # Front centres in feet become centres of the body in metres.
     frame = rows.select(
         pl.lit(name).alias("scene"),
         pl.col("vehicle_id").alias("vehicle"),
@@ -234,7 +310,11 @@ def _scene(name: str, rows: pl.DataFrame, path: Path, lanes: int, count: RowCoun
         length=FOOT_M * pl.col("v_length"),
         width=FOOT_M * pl.col("v_width"),
     )
-    return Scene(name, sort(number_tracks(frame, str(path))).select(SCHEMA.names()), width)
+    return Scene(
+        name,
+        sort(number_tracks(frame, str(path))).select(SCHEMA.names()),
+        width,
+    )
 
 
 def _drop_duplicates(rows: pl.DataFrame, count: RowCount) -> pl.DataFrame:
@@ -242,53 +322,66 @@ def _drop_duplicates(rows: pl.DataFrame, count: RowCount) -> pl.DataFrame:
 
     Of several rows of one vehicle at one time the first in the file is kept.
     """
+    # The file's own order decides which of several rows is the first.
     rows = rows.sort("vehicle_id", "global_time", LINE)
-    again = (pl.col("vehicle_id").diff() == 0) & (pl.col("global_time").diff() == 0)
-    values = [name for name in COLUMNS if name not in ("vehicle_id", "global_time")]
-    equal = pl.all_horizontal(pl.col(name) == pl.col(name).shift(1) for name in values)
-    repeated, same = rows.select(
-        again.fill_null(False).alias("again"), equal.fill_null(False)
-    ).get_columns()
-    count.drop("duplicate", (repeated & same).sum())
-    count.drop("same vehicle and time, other values", (repeated & ~same).sum())
-    return rows.filter(~repeated)
+    unequal = rows.unique(list(COLUMNS), keep="first", maintain_order=True)
+    first = unequal.unique(
+        ["vehicle_id", "global_time"],
+        keep="first",
+        maintain_order=True,
+    )
+    count.drop("duplicate", rows.height - unequal.height)
+    count.drop(
+        "same vehicle and time, other values",
+        unequal.height - first.height,
+    )
+    return first
 
 
 def _check_order(rows: pl.DataFrame, path: Path) -> None:
     """Frames must grow with time, and be 100 ms apart."""
-    same_vehicle, frames = pl.col("vehicle_id").diff() == 0, pl.col("frame_id").diff()
-    flags = rows.select(
-        backwards=same_vehicle & (frames <= 0),
-        apart=same_vehicle & (pl.col("global_time").diff() != FRAME_MS * frames),
+    # Differences within each vehicle.
+    steps = rows.select(
+        frames=pl.col("frame_id").diff().over("vehicle_id"),
+        ms=pl.col("global_time").diff().over("vehicle_id"),
     )
     what = "does not grow with global_time within its vehicle"
-    raise_where(flags["backwards"], rows, "frame_id", path, what)
+    raise_where(steps["frames"] <= 0, rows, "frame_id", path, what)
+    apart = steps["ms"] != FRAME_MS * steps["frames"]
     raise_where(
-        flags["apart"], rows, "global_time", path, "is not 100 ms a frame after the row before"
+        apart,
+        rows,
+        "global_time",
+        path,
+        "is not 100 ms a frame after the row before",
     )
 
 
 def _check_units(rows: pl.DataFrame, source: str) -> None:
     """Lengths, positions or speeds that cannot be in feet and seconds."""
+    # Any line of the period will do: the unit is that of the whole column.
     line = int(rows[LINE].min())  # type: ignore[arg-type]
     length = float(rows["v_length"].median())  # type: ignore[arg-type]
     if not LENGTHS_FT[0] <= length <= LENGTHS_FT[1]:
         guess = "metres" if length < LENGTHS_FT[0] else "centimetres or inches"
         raise UserError(
-            f"{source}, from line {line}, column v_length: the median is {length:.1f}, expected feet, about 15; "
-            f"they look like {guess}, convert all columns to feet."
+            f"{source}, from line {line}, column v_length: the median is {length:.1f}, expected "
+            f"feet, about 15; they look like {guess}, convert all columns to feet."
         )
+    # The pace is distance over speed times time, 1 in consistent units.
     distance = pl.col("local_y").last() - pl.col("local_y").first()
     seconds = (pl.col("global_time").last() - pl.col("global_time").first()) / 1000.0
     speed = pl.col("v_vel").mean()
     per_vehicle = rows.group_by("vehicle_id", maintain_order=True).agg(
-        pace=distance / (seconds * speed), rows=pl.len(), speed=speed
+        pace=distance / (seconds * speed),
+        rows=pl.len(),
+        speed=speed,
     )
     moving = per_vehicle.filter((pl.col("rows") >= _PACE_FRAMES) & (pl.col("speed") >= _PACE_FT_S))
     pace = moving["pace"].median()
     if isinstance(pace, float) and not PACE[0] <= pace <= PACE[1]:
         raise UserError(
-            f"{source}, from line {line}, columns local_y and v_vel: vehicles cover {pace:.2f} times the distance "
-            "that their speed makes; expected feet and feet per second (0.91 would be km/h, 1.47 miles per hour, "
-            "3.28 m/s), convert v_vel."
+            f"{source}, from line {line}, columns local_y and v_vel: vehicles cover {pace:.2f} "
+            "times the distance that their speed makes; expected feet and feet per second (0.91 "
+            "would be km/h, 1.47 miles per hour, 3.28 m/s), convert v_vel."
         )

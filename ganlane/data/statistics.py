@@ -14,24 +14,37 @@ from typing import Any, Final, TypeVar, get_type_hints
 import numpy as np
 import polars as pl
 from numpy.typing import ArrayLike
-from scipy.special import gammaincinv  # scipy.stats takes seconds to import
+from scipy.special import (
+    gammaincinv,
+)  # scipy.stats takes seconds to import
 
-from ganlane.data.lanes import LaneChanges, find_lane_changes, tracks_of_frame
+from ganlane.data.lanes import (
+    LaneChanges,
+    find_lane_changes,
+    tracks_of_frame,
+)
 from ganlane.data.schema import FRAME_S, TRACK, TRACK_STRIDE
 from ganlane.errors import UserError
 
 _Record = TypeVar("_Record")
 #: Levels of the stored quantiles: fine enough to sample from by linear interpolation.
-LEVELS: Final = (0.01, *(round(0.05 * k, 2) for k in range(1, 20)), 0.99)
+LEVELS: Final = (
+    0.01,
+    *(round(0.05 * k, 2) for k in range(1, 20)),
+    0.99,
+)
 #: A vehicle follows its leader up to this gap, m, and at this speed or faster, m/s. The gap of a
 #: standing car, m (Table V's ``s_0``), is not part of the headway.
-_FOLLOWING_GAP_M, _MIN_FOLLOWER_MPS, _STANDSTILL_GAP_M = 70.0, 2.0, 2.0
+_FOLLOWING_GAP_M, _MIN_FOLLOWER_MPS, _STANDSTILL_GAP_M = (
+    70.0,
+    2.0,
+    2.0,
+)
 
 
 @dataclass(frozen=True)
 class Distribution:
-    """Number, mean, standard deviation and quantiles (at :data:`LEVELS`) of a sample, in its own
-    unit.
+    """Number, mean, standard deviation and quantiles (at :data:`LEVELS`) of a sample.
 
     An empty sample has ``mean`` None and no quantiles; fewer than two samples have ``sd`` None.
     """
@@ -51,9 +64,13 @@ def describe(values: ArrayLike) -> Distribution:
     sample = np.asarray(values, dtype=np.float64)
     if not len(sample):
         return Distribution(0, None, None, ())
+    # One sample has no spread.
     sd = float(sample.std(ddof=1)) if len(sample) > 1 else None
     return Distribution(
-        len(sample), float(sample.mean()), sd, tuple(float(q) for q in np.quantile(sample, LEVELS))
+        len(sample),
+        float(sample.mean()),
+        sd,
+        tuple(float(q) for q in np.quantile(sample, LEVELS)),
     )
 
 
@@ -78,28 +95,38 @@ class Durations:
 
 def describe_durations(duration_s: ArrayLike, complete: ArrayLike) -> Durations:
     """Summarise durations [C], of which those not ``complete`` [C] are lower bounds."""
-    times, is_complete = np.asarray(duration_s, dtype=np.float64), np.asarray(complete, bool)
+    times = np.asarray(duration_s, dtype=np.float64)
+    is_complete = np.asarray(complete, bool)
     mean = median = None
+    # Without a complete duration the curve stays at 1.
     if is_complete.any():
         ends, survival = survival_curve(times, is_complete)
+        # The area under a step curve, up to the longest duration.
         edges = np.concatenate(([0.0], ends, [times.max()]))
         mean = float(np.sum(np.diff(edges) * np.concatenate(([1.0], survival))))
+        # The first time at which half of them have ended.
         halved = np.flatnonzero(survival <= 0.5)
         median = float(ends[halved[0]]) if len(halved) else None
     return Durations(
-        describe(times[is_complete]), int(np.count_nonzero(~is_complete)), mean, median
+        describe(times[is_complete]),
+        int(np.count_nonzero(~is_complete)),
+        mean,
+        median,
     )
 
 
 def survival_curve(duration_s: ArrayLike, complete: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Kaplan and Meier's (1958) survival curve of durations [C], of which those not ``complete``
-    are lower bounds.
+    """Kaplan and Meier's (1958) survival curve of durations [C].
+
+    Those not ``complete`` are lower bounds.
 
     Returns [E] the distinct complete durations, growing, and [E] the shares of longer durations,
     falling.
     """
-    times, is_complete = np.asarray(duration_s, dtype=np.float64), np.asarray(complete, bool)
+    times = np.asarray(duration_s, dtype=np.float64)
+    is_complete = np.asarray(complete, bool)
     ends, ending = np.unique(times[is_complete], return_counts=True)
+    # Those that last at least as long.
     at_risk = len(times) - np.searchsorted(np.sort(times), ends)
     return ends, np.cumprod(1.0 - ending / at_risk)
 
@@ -122,9 +149,7 @@ class Bins:
 
 
 class Histogram:
-    """Counts per bin, and exact number, mean and standard deviation, of samples that are added part
-    by part.
-    """
+    """Counts per bin of samples that are added part by part, and their exact mean and spread."""
 
     def __init__(self, bins: Bins) -> None:
         self.bins = bins
@@ -140,10 +165,10 @@ class Histogram:
     def add(self, values: ArrayLike) -> None:
         """Count more samples, without NaN."""
         sample = np.asarray(values, dtype=np.float64)
-        bins = self.bins
-        self.counts += np.histogram(
-            np.clip(sample, bins.low, bins.high), bins.number, (bins.low, bins.high)
-        )[0]
+        low = self.bins.low
+        high = self.bins.high
+        inside = sample.clip(low, high)
+        self.counts += np.histogram(inside, self.bins.number, (low, high))[0]
         self._sum += float(sample.sum())
         self._squares += float(np.square(sample).sum())
 
@@ -152,24 +177,27 @@ class Histogram:
         n = self.total
         if not n:
             return Distribution(0, None, None, ())
+        # Sums are exact where bins are not; rounding may make the variance negative.
         mean = self._sum / n
         spread = math.sqrt(max(self._squares - n * mean * mean, 0.0) / (n - 1)) if n > 1 else None
-        return Distribution(n, mean, spread, tuple(self.quantile(level) for level in LEVELS))
+        return Distribution(
+            n,
+            mean,
+            spread,
+            tuple(self.quantile(level) for level in LEVELS),
+        )
 
     def quantile(self, level: float) -> float:
         """Value at ``level``, linear within its bin, so accurate to a bin's width."""
+        # Samples are taken as evenly spread within their bin.
+        place = level * self.total
         below = np.concatenate(([0], np.cumsum(self.counts)))
         occupied = np.flatnonzero(self.counts)
-        k = int(
-            occupied[
-                min(
-                    int(np.searchsorted(below[occupied + 1], level * self.total)), len(occupied) - 1
-                )
-            ]
-        )
-        share = (level * self.total - below[k]) / self.counts[k]
+        index = np.searchsorted(below[occupied + 1], place).clip(max=len(occupied) - 1)
+        k = occupied[index]
+        share = ((place - below[k]) / self.counts[k]).clip(0.0, 1.0)
         edges = self.bins.edges
-        return float(edges[k] + min(max(share, 0.0), 1.0) * (edges[k + 1] - edges[k]))
+        return float(edges[k] + share * (edges[k + 1] - edges[k]))
 
     def density(self) -> np.ndarray:
         """[number] probability density per unit of the quantity."""
@@ -194,6 +222,7 @@ class Exposure:
 
 def measure_exposure(frame: pl.DataFrame) -> Exposure:
     """Scenes, tracks, cars, length of road and distance driven of a frame in the schema."""
+    # The road is as long as positions in the scene reach.
     roads = frame.group_by("scene").agg(
         road=pl.col("x").max() - pl.col("x").min(),
         cars=(pl.col("vehicle") % TRACK_STRIDE).n_unique(),
@@ -204,7 +233,12 @@ def measure_exposure(frame: pl.DataFrame) -> Exposure:
         tracks=frame.select(TRACK).n_unique(),
         cars=int(roads["cars"].sum()),
         samples=frame.height,
-        road_m=float(np.average(roads["road"].to_numpy(), weights=roads["cars"].to_numpy())),
+        road_m=float(
+            np.average(
+                roads["road"].to_numpy(),
+                weights=roads["cars"].to_numpy(),
+            )
+        ),
         vehicle_km=float(frame.select(pl.sum_horizontal(*driven).sqrt().sum()).item()) / 1000.0,
     )
 
@@ -215,6 +249,7 @@ def leader_gaps(frame: pl.DataFrame) -> pl.DataFrame:
     The leader is the next vehicle ahead in the same lane and frame, at any distance; ``gap`` is net
     (bumper to bumper), m, negative where two bodies overlap along the road.
     """
+    # Sorted along the road, the next row of the same lane and frame is the leader.
     ahead = {
         name: pl.col(name).shift(-1).over("scene", "frame", "lane")
         for name in ("x", "length", "speed")
@@ -224,7 +259,9 @@ def leader_gaps(frame: pl.DataFrame) -> pl.DataFrame:
     return ordered.with_columns(gap=gap, leader_speed=ahead["speed"]).drop_nulls("gap")
 
 
-def quantities(frame: pl.DataFrame) -> dict[str, np.ndarray]:
+def quantities(
+    frame: pl.DataFrame,
+) -> dict[str, np.ndarray]:
     """Samples of every quantity of a frame in the schema, sorted: ``speed`` and those below.
 
     ``acceleration_raw``: differences of the recorded speed between frames, m/s2; mostly noise in
@@ -234,6 +271,7 @@ def quantities(frame: pl.DataFrame) -> dict[str, np.ndarray]:
     ``gap / speed`` of followers, s: a gap of 0 to 70 m, at least 2 m/s. ``headway``: each
     follower's median of ``(gap - 2 m) / speed``, s, over at least 1 s; in the order of the tracks.
     """
+    # Frames in a second.
     lag = round(1.0 / FRAME_S)
 
     def earlier(column: str, frames: int) -> pl.Expr:
@@ -244,17 +282,28 @@ def quantities(frame: pl.DataFrame) -> dict[str, np.ndarray]:
         same = pl.col("frame").shift(frames).over(TRACK) == pl.col("frame") - frames
         return pl.when(same).then(pl.col(column).shift(frames).over(TRACK))
 
+    # Second differences over a second, which noise of a frame does not reach.
     accelerations = frame.select(
         raw=(pl.col("speed") - earlier("speed", 1)) / FRAME_S,
         smoothed=(pl.col("x") - 2.0 * earlier("x", lag) + earlier("x", 2 * lag))
         / (lag * FRAME_S) ** 2,
     )
     # Sorting needs most memory: only once, and with no more columns than needed.
-    columns = frame.select("scene", "vehicle", "frame", "x", "speed", "lane", "length")
+    columns = frame.select(
+        "scene",
+        "vehicle",
+        "frame",
+        "x",
+        "speed",
+        "lane",
+        "length",
+    )
     with_leader = leader_gaps(columns).select(*TRACK, "speed", "gap")
+    # Further away a leader has no influence.
     close = pl.col("gap").is_between(0.0, _FOLLOWING_GAP_M)
     following = with_leader.filter(close & (pl.col("speed") >= _MIN_FOLLOWER_MPS))
     headway = (pl.col("gap") - _STANDSTILL_GAP_M) / pl.col("speed")
+    # One number per driver: a long track counts no more than a short one.
     per_follower = following.group_by(TRACK).agg(headway.median().alias("headway"), pl.len())
     return {
         "speed": frame["speed"].to_numpy(),
@@ -305,12 +354,17 @@ class LaneChangeStatistics:
 
 
 def lane_change_statistics(
-    changes: LaneChanges, exposure: Exposure, speed_mps: float
+    changes: LaneChanges,
+    exposure: Exposure,
+    speed_mps: float,
 ) -> LaneChangeStatistics:
     """Statistics of lane changes found in that much driving at that mean speed, m/s."""
-    n, km = len(changes), exposure.vehicle_km
+    # Two rates: per car and km of road, and per km driven.
+    n = len(changes)
+    km = exposure.vehicle_km
     low, high = poisson_interval(n)
-    by_road, by_distance = n / exposure.cars * 1000.0 / exposure.road_m, n / km
+    by_road = n / exposure.cars * 1000.0 / exposure.road_m
+    by_distance = n / km
     return LaneChangeStatistics(
         count=n,
         srlc=by_road,
@@ -327,8 +381,9 @@ def lane_change_statistics(
 
 @dataclass(frozen=True)
 class DrivingStatistics:
-    """Statistics of a recording in SI units; :meth:`to_dict` and :meth:`from_dict` are exact
-    inverses.
+    """Statistics of a recording in SI units.
+
+    :meth:`to_dict` and :meth:`from_dict` are exact inverses.
 
     ``speed_sd_in_frame`` and ``speed_sd_in_lane`` are standard deviations of the speeds within a
     frame, and within a frame and lane, m/s: the mean over those with two vehicles or more, None
@@ -365,6 +420,7 @@ class DrivingStatistics:
 
 def _record(kind: type[_Record], numbers: Mapping[str, Any]) -> _Record:
     """A dataclass from nested dictionaries of its fields; lists become tuples."""
+    # Unknown names reach the constructor, which refuses them.
     values: dict[str, Any] = {**numbers}
     for name, hint in get_type_hints(kind).items():
         if isinstance(hint, type) and is_dataclass(hint):
@@ -375,18 +431,29 @@ def _record(kind: type[_Record], numbers: Mapping[str, Any]) -> _Record:
 
 
 def driving_statistics(
-    frame: pl.DataFrame, lane_widths: dict[str, float] | None = None
+    frame: pl.DataFrame,
+    lane_widths: dict[str, float] | None = None,
 ) -> DrivingStatistics:
     """Measure a frame in the schema, sorted.
 
     Each scene's lane width in m is estimated where not given.
     """
-    exposure, samples = measure_exposure(frame), quantities(frame)
+    exposure = measure_exposure(frame)
+    samples = quantities(frame)
     changes = find_lane_changes(tracks_of_frame(frame, lane_widths))
-    described = ("speed", "acceleration_raw", "acceleration_smoothed", "headway")
+    described = (
+        "speed",
+        "acceleration_raw",
+        "acceleration_smoothed",
+        "headway",
+    )
     return DrivingStatistics(
         exposure=exposure,
-        lane_changes=lane_change_statistics(changes, exposure, float(samples["speed"].mean())),
+        lane_changes=lane_change_statistics(
+            changes,
+            exposure,
+            float(samples["speed"].mean()),
+        ),
         speed_sd_in_frame=_mean_spread(frame, ["scene", "frame"]),
         speed_sd_in_lane=_mean_spread(frame, ["scene", "frame", "lane"]),
         **{name: describe(samples[name]) for name in described},

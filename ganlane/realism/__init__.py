@@ -3,7 +3,7 @@
     ganlane realism traffic=gan_calibrated
     ganlane realism traffic=gan data.path=recordings.csv 'against=[idm_mobil,gan_calibrated]'
     ganlane realism traffic=idm traffic._target_=my.module.MyTraffic vehicle_km=100
-    ganlane realism traffic=gan_calibrated scenes=all report=docs/realism.md figures=docs/figures
+    ganlane realism traffic=gan_calibrated scenes=all long_against=true
     ganlane realism traffic=idm quick=true
 
 Writes results.json, distributions.png, distances.png and drift.png into its run folder. Without
@@ -17,14 +17,15 @@ traffic does over minutes.
 
 Modules, from the bottom up:
 
-- :mod:`~ganlane.realism.recordings`: recorded scenes as arrays.
+- :mod:`~ganlane.realism.i80`: a site that no generator was fitted to.
 - :mod:`~ganlane.realism.measures`: what is measured of trajectories, the distance of two
   distributions, and the histograms that ship.
 - :mod:`~ganlane.realism.driving`: a traffic drives recorded scenes; reference drivers.
 - :mod:`~ganlane.realism.long_runs`: long runs, and the events in them.
 - :mod:`~ganlane.realism.starts`: every traffic from recorded or spawned starts, its desired speeds
   fitted, by folds where asked for.
-- :mod:`~ganlane.realism.card`: a card's numbers and checks, as tables and figures.
+- :mod:`~ganlane.realism.card`: a card's numbers and checks.
+- :mod:`~ganlane.realism.sheets`: the same as tables and figures.
 """
 
 from functools import partial

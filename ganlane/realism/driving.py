@@ -1,5 +1,4 @@
-"""Recorded scenes driven by a traffic: the same vehicles and road, for as long as recorded; and
-reference drivers.
+"""Recorded scenes driven by a traffic: the same vehicles and road, for as long as recorded.
 
 A vehicle is driven from the frame at which it was first recorded to the one at which it was last
 recorded, or until it passes the end of the recorded road. One that appears later waits while
@@ -24,22 +23,34 @@ control.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import numpy as np
 import polars as pl
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ganlane import keys
-from ganlane.generator.closed_loop import balanced_headway, headway_from_uniform
-from ganlane.realism.recordings import Recording, frame_of
+from ganlane.data.dense import Recording
+from ganlane.generator.closed_loop import (
+    balanced_headway,
+    headway_from_uniform,
+)
 from ganlane.sim.idm import following_acceleration
 from ganlane.sim.neighbours import perceive
-from ganlane.sim.random import Purpose, absorb, episode_key, uniform
+from ganlane.sim.random import (
+    Purpose,
+    absorb,
+    episode_key,
+    uniform,
+)
 from ganlane.sim.state import ENTRY_M, Road, Vehicles
-from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.base import (
+    Memory,
+    Moved,
+    TrafficModule,
+)
 from ganlane.traffic.overlays import random_side
 
 #: Makes a traffic model for a road.
@@ -72,64 +83,103 @@ class StartOptions:
 
 
 def drive_recordings(
-    make: Factory, recordings: Sequence[Recording], options: StartOptions
+    make: Factory,
+    recordings: Sequence[Recording],
+    options: StartOptions,
 ) -> pl.DataFrame:
-    """Drive every recording ``options.repeats`` times, those on equal roads side by side.
+    """Drive every recording ``options.repeats`` times, as :meth:`Recording.frame` has it.
 
-    See :func:`frame_of`.
+    Those on equal roads go side by side.
     """
+    # A traffic is made for one road.
     roads: dict[tuple[int, float], list[Recording]] = {}
-    for each in recordings:
-        roads.setdefault((each.lanes, each.lane_width_m), []).append(each)
+    for recording in recordings:
+        same_road = roads.setdefault((recording.lanes, recording.lane_width_m), [])
+        same_road += [recording] * options.repeats
     frames: list[pl.DataFrame] = []
-    for road, group in roads.items():
-        for rows in _batches([each for each in group for _ in range(options.repeats)]):
-            frames += _drive(make(Road(*road)), rows, options, first=len(frames))
+    for road, rows in roads.items():
+        for batch in _batches(rows):
+            # Each row has an episode number of its own, whatever the batches are.
+            driven = _drive(
+                make(Road(*road)),
+                batch,
+                options,
+                first=len(frames),
+            )
+            frames += [recording.frame() for recording in driven]
     return pl.concat(frames)
 
 
-def _batches(rows: list[Recording]) -> list[list[Recording]]:
-    """Rows of similar lengths together, at most :data:`_MOST_PAIRS` pairs of vehicles in a batch."""
-    ordered = sorted(rows, key=lambda each: (len(each.x), len(each.length)))
+def _batches(
+    rows: list[Recording],
+) -> list[list[Recording]]:
+    """Rows of similar shapes together, at most :data:`_MOST_PAIRS` pairs of vehicles in a batch."""
     batches: list[list[Recording]] = []
-    for row in ordered:
-        most = max(len(each.length) for each in [row, *(batches[-1] if batches else [])])
-        if batches and (len(batches[-1]) + 1) * most * most <= _MOST_PAIRS:
-            batches[-1].append(row)
+    # Sorted by shape, so that little is padded.
+    for row in sorted(rows, key=lambda row: row.x.shape):
+        last = batches[-1] if batches else []
+        # Every vehicle looks at every other, so memory grows with the square.
+        most = max(len(other.length) for other in [row, *last])
+        if batches and (len(last) + 1) * most * most <= _MOST_PAIRS:
+            last.append(row)
         else:
             batches.append([row])
     return batches
 
 
 def _drive(
-    traffic: TrafficModule, rows: list[Recording], options: StartOptions, first: int
-) -> list[pl.DataFrame]:
-    """Drives a batch of recordings on one road; one frame per row."""
-    batch, n = RecordingBatch.of(rows), len(rows)
-    counters = {keys.SEED: torch.full((n,), options.seed), keys.EPISODE: first + torch.arange(n)}
+    traffic: TrafficModule,
+    rows: list[Recording],
+    options: StartOptions,
+    first: int,
+) -> list[Recording]:
+    """Drives a batch of recordings on one road; ``first`` numbers the first of them."""
+    recorded = StackedRecordings(rows)
+    n = len(rows)
+    counters = {
+        keys.SEED: torch.full((n,), options.seed),
+        keys.EPISODE: first + torch.arange(n),
+    }
     key = episode_key(traffic.stream, *counters.values())
-    u = uniform(key, 0, batch.x.shape[2], [Purpose.SPAWN_DESIRED_SPEED])[..., 0]
+    # A uniform number with the wanted mean.
+    u = uniform(
+        key,
+        0,
+        recorded.x.shape[2],
+        [Purpose.SPAWN_DESIRED_SPEED],
+    )[..., 0]
     excess = 2.0 * options.desired_above_mps * u
-    state = no_vehicles(batch, traffic)
+    state = recorded.nobody(int(traffic.visibility))
     memory: TensorDictBase | None = None
-    course: dict[str, list[Tensor]] = {name: [] for name in ("x", "y", "valid")}
-    waiting = torch.ones_like(batch.present[0])
-    for step in range(len(batch.x)):
-        state = remove_finished(batch, state, step)
-        entering = may_enter(batch, state, waiting, traffic.road, step)
-        waiting = waiting & ~entering
-        state = insert_entering(batch, state, entering, excess, traffic, step)
-        memory = _updated_memory(traffic, state, memory, entering, absorb(key, 0))
-        for name, values in course.items():
-            values.append(getattr(state, name)[:, 1:])
+    waiting = torch.ones_like(state.valid)
+    # Positions of every step, before the step is driven.
+    course = []
+    for step in range(len(recorded.x)):
+        state = recorded.without_finished(state, step)
+        # Who has entered once does not enter again.
+        enters = recorded.may_enter(state, waiting, traffic.road, step)
+        waiting = waiting & ~enters
+        state = recorded.entering(step, excess, traffic.road, state).where(enters, state)
+        memory = _updated_memory(traffic, state, memory, enters, absorb(key, 0))
+        course.append((state.x, state.y, state.valid))
         state, memory = step_traffic(traffic, state, memory, counters, step)
-    arrays = [torch.stack(values).numpy() for values in course.values()]
-    frames = []
+    x, y, valid = (torch.stack(values)[..., 1:].numpy() for values in zip(*course))
+    driven = []
     for index, row in enumerate(rows):
         steps, vehicles = row.x.shape
-        x, y, valid = (array[:steps, index, :vehicles] for array in arrays)
-        frames.append(frame_of(row, x, y, valid, f"{row.name}#{first + index}"))
-    return frames
+        # Without what was padded.
+        part = (slice(steps), index, slice(vehicles))
+        name = f"{row.name}#{first + index}"
+        driven.append(
+            replace(
+                row,
+                name=name,
+                x=x[part],
+                y=y[part],
+                present=valid[part],
+            )
+        )
+    return driven
 
 
 def step_traffic(
@@ -144,6 +194,7 @@ def step_traffic(
     Invalid vehicles stay as they are.
     """
     size = torch.Size([state.x.shape[0]])
+    # What an environment would hand to its traffic, without an ego.
     view = TensorDict._new_unsafe(
         {
             keys.VEHICLES: TensorDict._new_unsafe(state.as_dict(), batch_size=size),
@@ -164,160 +215,192 @@ def _updated_memory(
     enters: Tensor,
     key: Tensor,
 ) -> TensorDictBase:
-    """The traffic's memory, initialised for the vehicles that enter, with their recorded headways."""
+    """The traffic's memory, fresh for the vehicles that enter, with their recorded headways."""
     if memory is not None and not bool(enters.any()):
         return memory
-    fresh = with_recorded_headways(traffic.init_memory(state, key), state, traffic.road, enters)
+    # Drawn for all, and taken for those who enter.
+    fresh = with_recorded_headways(
+        traffic.init_memory(state, key),
+        state,
+        traffic.road,
+        enters,
+    )
 
     def merged(new: Tensor, old: Tensor) -> Tensor:
-        return torch.where(enters.reshape(*enters.shape, *[1] * (new.ndim - 2)), new, old)
+        return torch.where(
+            enters.reshape(*enters.shape, *[1] * (new.ndim - 2)),
+            new,
+            old,
+        )
 
     return fresh if memory is None else fresh.apply(merged, memory)
 
 
-@dataclass(frozen=True)
-class RecordingBatch:
-    """Recordings side by side, padded with absent vehicles; index 0 is the ego's and absent.
+class StackedRecordings:
+    """N recordings as tensors, padded with absent vehicles; index 0 is the ego's and absent.
 
     ``x``, ``y``, ``speed`` and ``present`` are [T, N, M], ``length`` and ``driven`` [N, M];
     ``end_m`` [N, 1] is where each road ends, m.
     """
 
-    x: Tensor
-    y: Tensor
-    speed: Tensor
-    present: Tensor
-    length: Tensor
-    driven: Tensor
-    end_m: Tensor
+    def __init__(self, rows: Sequence[Recording]) -> None:
+        steps, most = (max(row.x.shape[dim] for row in rows) for dim in (0, 1))
 
-    @classmethod
-    def of(cls, rows: Sequence[Recording]) -> RecordingBatch:
-        """Pads and stacks recordings."""
-        steps, most = max(len(row.x) for row in rows), max(len(row.length) for row in rows)
-
-        def padded(name: str) -> Tensor:
-            values = [getattr(row, name) for row in rows]
-            whole = np.zeros(
-                (*([steps] if values[0].ndim == 2 else []), len(rows), most + 1),
-                dtype=values[0].dtype,
-            )
-            for index, value in enumerate(values):
-                where = (slice(len(value)), index) if value.ndim == 2 else (index,)
-                whole[(*where, slice(1, value.shape[-1] + 1))] = value
-            tensor = torch.from_numpy(whole)
+        def stacked(name: str) -> Tensor:
+            padded = []
+            for row in rows:
+                value = torch.from_numpy(getattr(row, name))
+                # Index 0 of the vehicles is the ego's; later frames are empty.
+                below = [0, steps - len(value)] if value.ndim == 2 else []
+                padded.append(
+                    pad(
+                        value,
+                        [1, most - value.shape[-1], *below],
+                    )
+                )
+            tensor = torch.stack(padded, dim=-2)
             return tensor.float() if tensor.is_floating_point() else tensor
 
-        made = {name: padded(name) for name in ("x", "y", "speed", "present", "length", "driven")}
-        return cls(**made, end_m=torch.tensor([[row.end_m] for row in rows]))
+        self.x = stacked("x")
+        self.y = stacked("y")
+        self.speed = stacked("speed")
+        self.present = stacked("present")
+        self.driven = stacked("driven")
+        self.length = stacked("length")
+        self.end_m = torch.tensor([[row.end_m] for row in rows])
 
+    def nobody(self, visibility: int) -> Vehicles:
+        """The state before any vehicle has entered."""
+        zero = torch.zeros_like(self.length)
+        lane = zero.long()
+        return Vehicles(
+            x=zero + _ABSENT_M,
+            y=zero,
+            heading=zero,
+            speed=zero + 10.0,
+            acceleration=zero,
+            length=self.length.clamp_min(1.0),
+            width=zero + 2.0 * ENTRY_M,
+            desired_speed=zero + 20.0,
+            target_lane=lane,
+            visibility=lane + visibility,
+            valid=zero > 0.0,
+        )
 
-def no_vehicles(batch: RecordingBatch, traffic: TrafficModule) -> Vehicles:
-    """The state before any vehicle has entered."""
-    zero = torch.zeros_like(batch.x[0])
-    lane = torch.zeros_like(batch.present[0], dtype=torch.int64)
-    return Vehicles(
-        x=zero + _ABSENT_M,
-        y=zero,
-        heading=zero,
-        speed=zero + 10.0,
-        acceleration=zero,
-        length=batch.length.clamp_min(1.0),
-        width=zero + 2.0 * ENTRY_M,
-        desired_speed=zero + 20.0,
-        target_lane=lane,
-        visibility=lane + int(traffic.visibility),
-        valid=torch.zeros_like(batch.present[0]),
-    )
+    def without_finished(self, state: Vehicles, step: int) -> Vehicles:
+        """Removes vehicles whose recording is over or that passed the end of the road.
 
+        Moves replayed ones on.
+        """
+        # Replayed vehicles leave when their recording ends, no earlier.
+        on_road = (state.x <= self.end_m + _ROUNDING_M) | ~self.driven
+        stays = state.valid & self.present[step] & on_road
+        replayed = stays & ~self.driven
+        x = torch.where(stays, state.x, _ABSENT_M)
+        return state.with_(
+            valid=stays,
+            x=torch.where(replayed, self.x[step], x),
+            y=torch.where(replayed, self.y[step], state.y),
+            speed=torch.where(replayed, self.speed[step], state.speed),
+        )
 
-def remove_finished(batch: RecordingBatch, state: Vehicles, step: int) -> Vehicles:
-    """Removes vehicles whose recording is over or that passed the end of the road.
+    def may_enter(
+        self,
+        state: Vehicles,
+        waiting: Tensor,
+        road: Road,
+        step: int,
+    ) -> Tensor:
+        """Vehicles that enter now, bool [N, M].
 
-    Moves replayed ones on.
-    """
-    on_road = (state.x <= batch.end_m + _ROUNDING_M) | ~batch.driven
-    stays = state.valid & batch.present[step] & on_road
-    state = state.with_(valid=stays, x=torch.where(stays, state.x, _ABSENT_M))
-    replayed = stays & ~batch.driven
-    fields = ("x", "y", "speed")
-    return state.with_(
-        **{f: torch.where(replayed, getattr(batch, f)[step], getattr(state, f)) for f in fields}
-    )
+        Recorded in this frame, still waiting, and with room in their lane.
+        """
+        wants = self.present[step] & waiting
+        # Mostly no vehicle waits, which saves the test of all pairs.
+        if step == 0 or not bool(wants.any()):
+            return wants
+        # Pairs [N, M, M] of who enters and who is there.
+        same = road.lane_of(self.y[step])[:, :, None] == road.lane_of(state.y)[:, None]
+        between = (self.x[step][:, :, None] - state.x[:, None]).abs()
+        room = between - 0.5 * (self.length[:, :, None] + state.length[:, None])
+        return wants & ~(same & state.valid[:, None] & (room < ENTRY_GAP_M)).any(-1)
 
-
-def may_enter(
-    batch: RecordingBatch, state: Vehicles, waiting: Tensor, road: Road, step: int
-) -> Tensor:
-    """Vehicles that enter now, bool [N, M].
-
-    Recorded in this frame, still waiting, and with room in their lane.
-    """
-    wants = batch.present[step] & waiting
-    # Mostly no vehicle waits, and on a CPU the test costs nothing.
-    if step == 0 or not bool(wants.any()):
-        return wants
-    same = road.lane_of(batch.y[step])[:, :, None] == road.lane_of(state.y)[:, None]
-    between = (batch.x[step][:, :, None] - state.x[:, None]).abs()
-    room = between - 0.5 * (batch.length[:, :, None] + state.length[:, None])
-    return wants & ~(same & state.valid[:, None] & (room < ENTRY_GAP_M)).any(-1)
-
-
-def insert_entering(
-    batch: RecordingBatch,
-    state: Vehicles,
-    enters: Tensor,
-    excess: Tensor,
-    traffic: TrafficModule,
-    step: int,
-) -> Vehicles:
-    """Puts the vehicles that enter into their recorded state, heading along the road.
-
-    The others are unchanged.
-    """
-    x, y, speed = batch.x[step], batch.y[step], batch.speed[step].clamp_min(0.0)
-    entered = state.with_(
-        x=x,
-        y=y,
-        speed=speed,
-        heading=torch.zeros_like(x),
-        acceleration=torch.zeros_like(x),
-        desired_speed=(speed + excess).clamp(SLOWEST_DESIRED_MPS, FASTEST_DESIRED_MPS),
-        target_lane=traffic.road.lane_of(y).long(),
-        valid=enters,
-    )
-    return entered.where(enters, state)
+    def entering(
+        self,
+        step: int,
+        excess: Tensor,
+        road: Road,
+        state: Vehicles,
+    ) -> Vehicles:
+        """All vehicles in their recorded state, heading along the road."""
+        y = self.y[step]
+        speed = self.speed[step].clamp_min(0.0)
+        return state.with_(
+            x=self.x[step],
+            y=y,
+            speed=speed,
+            heading=torch.zeros_like(y),
+            acceleration=torch.zeros_like(y),
+            desired_speed=(speed + excess).clamp(SLOWEST_DESIRED_MPS, FASTEST_DESIRED_MPS),
+            target_lane=road.lane_of(y).long(),
+            valid=torch.ones_like(state.valid),
+        )
 
 
 def with_recorded_headways(
-    memory: TensorDictBase, vehicles: Vehicles, road: Road, who: Tensor
+    memory: TensorDictBase,
+    vehicles: Vehicles,
+    road: Road,
+    who: Tensor,
 ) -> TensorDictBase:
-    """A traffic's ``memory`` with the headways that the entering drivers ``who`` [N, M] show in
-    their recorded state.
+    """A traffic's ``memory`` with the headways that the drivers ``who`` [N, M] show as they enter.
 
     The memory, nested or not, is not modified; one without headways comes back equal.
     """
 
     def shown(name: str | tuple[str, ...], value: Tensor) -> Tensor:
-        last = name if isinstance(name, str) else name[-1]
-        return (
-            torch.where(who, balanced_headway(vehicles, road, value), value)
-            if last == "headway"
-            else value
+        if name != "headway" and name[-1] != "headway":
+            return value
+        return torch.where(
+            who,
+            balanced_headway(vehicles, road, value),
+            value,
         )
 
     return memory.named_apply(shown, nested_keys=True)
+
+
+def _accelerated(
+    vehicles: Vehicles,
+    speed: Tensor,
+    dt: float,
+    **changed: Tensor,
+) -> Vehicles:
+    """The vehicles after a step at constant acceleration to ``speed``, other fields changed."""
+    return vehicles.with_(
+        x=vehicles.x + 0.5 * (vehicles.speed + speed) * dt,
+        speed=speed,
+        acceleration=(speed - vehicles.speed) / dt,
+        **changed,
+    )
 
 
 class ConstantVelocity(TrafficModule):
     """Every vehicle keeps its lane and the speed at which it entered."""
 
     def move(
-        self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
-    ) -> tuple[Vehicles, dict]:
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
+    ) -> Moved:
         """One step along the road."""
         v = vehicles
-        return v.with_(x=v.x + v.speed * self.dt, acceleration=torch.zeros_like(v.speed)), memory
+        return v.with_(
+            x=v.x + v.speed * self.dt,
+            acceleration=torch.zeros_like(v.speed),
+        ), memory
 
 
 class RandomDriving(TrafficModule):
@@ -331,56 +414,93 @@ class RandomDriving(TrafficModule):
     hardest, every_s, change_s = 3.0, 20.0, 4.0
 
     def move(
-        self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
-    ) -> tuple[Vehicles, dict]:
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
+    ) -> Moved:
         """One step: the second's acceleration, and towards the target lane."""
-        v, m, dtype = vehicles, vehicles.x.shape[1], vehicles.x.dtype
-        pace = uniform(
-            key, torch.div(step, 10, rounding_mode="floor"), m, [Purpose.ACCELERATION], dtype
-        )[..., 0]
-        drawn = uniform(key, step, m, [Purpose.LANE_CHANGE_HAZARD, Purpose.LANE_CHANGE_SIDE], dtype)
+        v = vehicles
+        m = vehicles.x.shape[1]
+        dtype = vehicles.x.dtype
+        # One acceleration for the ten steps of a second.
+        second = torch.div(step, 10, rounding_mode="floor")
+        pace = uniform(key, second, m, [Purpose.ACCELERATION], dtype)[..., 0]
+        drawn = uniform(
+            key,
+            step,
+            m,
+            [
+                Purpose.LANE_CHANGE_HAZARD,
+                Purpose.LANE_CHANGE_SIDE,
+            ],
+            dtype,
+        )
         remaining = self.road.centre_of(v.target_lane, dtype) - v.y
+        # Nobody starts a change during another one.
         starts = (drawn[..., 0] < self.dt / self.every_s) & (remaining.abs() < 0.3)
-        side = torch.where(starts, random_side(drawn[..., 1], v.target_lane, self.road.lanes), 0)
-        target = v.target_lane + side
+        side = torch.where(
+            starts,
+            random_side(
+                drawn[..., 1],
+                v.target_lane,
+                self.road.lanes,
+            ),
+            0,
+        )
+        # Sideways at a constant speed, and no further than the lane's centre.
         stride = self.road.lane_width_m * self.dt / self.change_s
         aside = (remaining / stride).clamp(-1.0, 1.0) * stride
         speed = (v.speed + self.hardest * (2.0 * pace - 1.0) * self.dt).clamp_min(0.0)
-        moved = v.with_(
-            x=v.x + 0.5 * (v.speed + speed) * self.dt,
+        target = v.target_lane + side
+        return _accelerated(
+            v,
+            speed,
+            self.dt,
             y=v.y + aside,
-            speed=speed,
-            acceleration=(speed - v.speed) / self.dt,
             target_lane=target,
-        )
-        return moved, memory
+        ), memory
 
 
 class HeadwayIdm(TrafficModule):
-    """IDM without lane changes, each driver with its own headway: generated traffic without its
-    network.
+    """IDM without lane changes, each driver with its own headway.
 
-    A control, none of the shipped traffics: Table V gives everybody the same headway. Here they are
-    drawn from the recorded distribution, or taken from a recorded start.
+    A control, none of the shipped traffics: generated traffic without its network. Table V gives
+    everybody the same headway. Here they are drawn from the recorded distribution, or taken from a
+    recorded start.
     """
 
     memory_fields = {"headway": ((), None)}  # noqa: RUF012
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
         """A random headway for each driver."""
-        u = uniform(key, -1, vehicles.x.shape[1], [Purpose.TRAIT_HEADWAY], vehicles.x.dtype)[..., 0]
+        u = uniform(
+            key,
+            -1,
+            vehicles.x.shape[1],
+            [Purpose.TRAIT_HEADWAY],
+            vehicles.x.dtype,
+        )[..., 0]
         return {"headway": headway_from_uniform(u)}
 
     def move(
-        self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
-    ) -> tuple[Vehicles, dict]:
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
+    ) -> Moved:
         """One step along the road."""
-        v = vehicles
-        wanted = following_acceleration(perceive(v, self.road), headway_s=memory["headway"])
-        speed = (v.speed + wanted * self.dt).clamp_min(0.0)
-        x = v.x + 0.5 * (v.speed + speed) * self.dt
-        return v.with_(x=x, speed=speed, acceleration=(speed - v.speed) / self.dt), memory
+        # The nearest vehicle ahead in the lane.
+        perceived = perceive(vehicles, self.road)
+        wanted = following_acceleration(perceived, headway_s=memory["headway"])
+        speed = (vehicles.speed + wanted * self.dt).clamp_min(0.0)
+        return _accelerated(vehicles, speed, self.dt), memory
 
 
 #: Reference drivers at the ends of the scale.
-FLOORS: dict[str, Factory] = {"random": RandomDriving, "constant_velocity": ConstantVelocity}
+FLOORS: dict[str, Factory] = {
+    "random": RandomDriving,
+    "constant_velocity": ConstantVelocity,
+}

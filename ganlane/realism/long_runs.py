@@ -16,22 +16,31 @@ import torch
 from torch import Tensor
 
 from ganlane import keys
-from ganlane.data import lane_changes_of_arrays
-from ganlane.evaluation.statistics import entries, poisson_interval
+from ganlane.data.lanes import lane_changes_of_arrays
+from ganlane.evaluation.statistics import (
+    entries,
+    poisson_interval,
+)
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.realism.driving import Factory, step_traffic
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.neighbours import leader, perceive
 from ganlane.sim.random import absorb, episode_key
-from ganlane.sim.spawn import TABLE_II, SpawnParameters, spawn
-from ganlane.sim.state import Road, Vehicles, lateral_half_extent
+from ganlane.sim.spawn import (
+    TABLE_II,
+    SpawnParameters,
+    spawn,
+)
+from ganlane.sim.state import (
+    Road,
+    Vehicles,
+    lateral_half_extent,
+)
 from ganlane.traffic import Guard, TrafficModule
 
 #: Times at which speeds are summarised, s; and the distance of the goal, m.
 SPEEDS_AT_S = (10.0, 60.0, 150.0, 300.0)
 GOAL_M = 5000.0
-#: Events that are reported as plain counts.
-_EVENTS = ("off_road", "standstills_in_free_flow")
 #: Samples of one batch (times, rows, vehicles); bounds the memory.
 _MOST_SAMPLES = 12_000_000
 _MOST_ROWS = 64
@@ -77,11 +86,6 @@ class Trajectories(NamedTuple):
     length: np.ndarray
     width: np.ndarray
 
-    @property
-    def driven_m(self) -> np.ndarray:
-        """[T, N, M] from the start."""
-        return self.x - self.x[:1]
-
 
 class EventCounter:
     """Counts onsets; index 0 (the ego's) and vehicles that are not valid do not count.
@@ -100,16 +104,26 @@ class EventCounter:
 
     def count(self, vehicles: Vehicles, step: int) -> None:
         """Count the events of a physics step."""
+        # Everything is counted without the ego's empty place.
         others = vehicles.columns(slice(1, None))
         self.overlaps += self._onsets("overlap", pair_overlaps(others).triu(1))
+        # Half the width of a body, turned with its heading.
         half = lateral_half_extent(others) - EDGE_M
-        left, right = self.road.left_edge_m(), self.road.right_edge_m()
+        left = self.road.left_edge_m()
+        right = self.road.right_edge_m()
         outside = (others.y + half > left) | (others.y - half < right)
         self.off_road += self._onsets("off_road", outside & others.valid)
         if step % 10 == 9:  # once a second
             slow = (vehicles.speed < STANDING_MPS) & vehicles.valid
-            ahead = leader(perceive(vehicles, self.road), self.road.lane_of(vehicles.y))
-            self.standstills += self._onsets("standstill", (slow & (ahead.gap > FREE_M))[:, 1:])
+            # Standing behind somebody is queueing, no standstill.
+            ahead = leader(
+                perceive(vehicles, self.road),
+                self.road.lane_of(vehicles.y),
+            )
+            self.standstills += self._onsets(
+                "standstill",
+                (slow & (ahead.gap > FREE_M))[:, 1:],
+            )
 
     def _onsets(self, name: str, now: Tensor) -> int:
         """Number of entries that are true now and were not at the last count."""
@@ -119,9 +133,7 @@ class EventCounter:
 
 
 class GuardMeter:
-    """Counts, on the device, the vehicle-steps in which a guard alters acceleration or lateral
-    position.
-    """
+    """Counts the vehicle-steps in which a guard alters acceleration or lateral position."""
 
     def __init__(self) -> None:
         self._altered, self._steps = torch.zeros(2, dtype=torch.int64)
@@ -132,13 +144,18 @@ class GuardMeter:
             if isinstance(part, Guard):
                 part.observer = self
 
-    def __call__(self, before: Vehicles, moved: Vehicles, guarded: Vehicles) -> None:
+    def __call__(
+        self,
+        before: Vehicles,
+        moved: Vehicles,
+        guarded: Vehicles,
+    ) -> None:
         """Called by the guard at every step; index 0 is the ego's and does not count."""
-        wanted, given = (
-            (after.speed - before.speed) / PHYSICS_STEP_S for after in (moved, guarded)
-        )
-        along = (given - wanted).abs() > ALTERED_ACCELERATION
+        wanted = (moved.speed - before.speed) / PHYSICS_STEP_S
+        allowed = (guarded.speed - before.speed) / PHYSICS_STEP_S
+        along = (allowed - wanted).abs() > ALTERED_ACCELERATION
         across = (guarded.y - moved.y).abs() > ALTERED_POSITION_M
+        # Shares are of the vehicles that drive.
         counts = before.valid.clone()
         counts[:, 0] = False
         self._altered = self._altered + ((along | across) & counts).sum()
@@ -151,108 +168,106 @@ class GuardMeter:
         return int(self._altered) / steps if steps else None
 
 
-class LongRun:
-    """The driving of a long run, added up batch by batch."""
-
-    def __init__(self, road: Road, parameters: LongRunParameters) -> None:
-        self.road, self.parameters, self.episodes = road, parameters, 0
-        self._events, self._meter, self._parts = (
-            EventCounter(road),
-            GuardMeter(),
-            list[dict[str, Any]](),
-        )
-
-    @property
-    def vehicle_km(self) -> float:
-        """Driven so far."""
-        return sum(part["vehicle_km"] for part in self._parts)
-
-    @property
-    def finished(self) -> bool:
-        """Whether enough was driven, or nobody moves."""
-        stuck = self._parts and self._parts[-1]["vehicle_km"] <= 0.0
-        return bool(stuck) or self.vehicle_km >= self.parameters.vehicle_km
-
-    def drive(self, traffic: TrafficModule, rows: int) -> Trajectories:
-        """One batch of ``rows`` further episodes."""
-        self._meter.watch(traffic)
-        trajectories = drive_spawned(traffic, self.parameters, self.episodes, rows, self._events)
-        self._parts.append(batch_statistics(trajectories, self.road))
-        self.episodes += rows
-        return trajectories
-
-    def numbers(self) -> dict[str, Any]:
-        """Counts, rates per vehicle-km with exact 95 % intervals (None where no vehicle moved),
-        speeds, quantiles.
-        """
-        parts, events, km = self._parts, self._events, self.vehicle_km
-        changes = sum(part["lane_changes"] for part in parts)
-        durations = np.concatenate([part["durations"] for part in parts])
-        acceleration = np.concatenate([part["acceleration"] for part in parts])
-        return {
-            "vehicles": self.parameters.vehicles,
-            "episodes": self.episodes,
-            "vehicle_km": km,
-            "lane_changes": changes,
-            "lane_change_duration_mean_s": float(durations.mean()) if len(durations) else None,
-            "overlaps": events.overlaps,
-            **rates(changes, events.overlaps, km),
-            "off_road": events.off_road,
-            "standstills_in_free_flow": events.standstills,
-            "acceleration_quantiles": {
-                f"{level:g}": float(np.quantile(acceleration, level)) for level in (0.05, 0.95)
-            },
-            "speeds": {
-                name: _mean_speeds(
-                    [row for part in parts for row in part["speeds"][name]], name.endswith(" m")
-                )
-                for name in parts[0]["speeds"]
-            },
-            "guard_share": self._meter.share,
-        }
-
-
 def long_run(
     make: Factory,
     road: Road,
     parameters: LongRunParameters,
     report: Callable[[float], None] | None = None,
 ) -> dict[str, Any]:
-    """Drive ``parameters.vehicle_km``; ``report`` is called with the vehicle-km driven so far."""
-    traffic, run = make(road), LongRun(road, parameters)
-    while not run.finished:
-        run.drive(traffic, _rows(parameters, parameters.vehicle_km - run.vehicle_km))
+    """Drive ``parameters.vehicle_km``: counts, rates, speeds over time and quantiles.
+
+    Rates are per vehicle-km with exact 95 % intervals, None where no vehicle moved. ``report`` is
+    called with the vehicle-km driven so far.
+    """
+    traffic = make(road)
+    events = EventCounter(road)
+    meter = GuardMeter()
+    meter.watch(traffic)
+    parts: list[dict[str, Any]] = []
+    km = 0.0
+    episodes = 0
+    # Ends early where nobody moves.
+    while km < parameters.vehicle_km and not (parts and parts[-1]["vehicle_km"] <= 0.0):
+        rows = _rows(parameters, parameters.vehicle_km - km)
+        driven = drive_spawned(traffic, parameters, episodes, rows, events)
+        parts.append(batch_statistics(driven, road))
+        km += parts[-1]["vehicle_km"]
+        episodes += rows
         if report is not None:
-            report(run.vehicle_km)
-    return run.numbers()
+            report(km)
+    # Added up over the batches.
+    changes = sum(part["lane_changes"] for part in parts)
+    durations = np.concatenate([part["durations"] for part in parts])
+    acceleration = np.concatenate([part["acceleration"] for part in parts])
+    # By time, from the episodes that lasted so long.
+    speeds = {}
+    for time in parts[0]["speeds"]:
+        speeds[time] = _mean_speeds([row for part in parts for row in part["speeds"][time]])
+    return {
+        "vehicles": parameters.vehicles,
+        "episodes": episodes,
+        "vehicle_km": km,
+        "lane_changes": changes,
+        "lane_change_duration_mean_s": float(durations.mean()) if len(durations) else None,
+        "overlaps": events.overlaps,
+        **rates(changes, events.overlaps, km),
+        "off_road": events.off_road,
+        "standstills_in_free_flow": events.standstills,
+        "acceleration_quantiles": {
+            f"{level:g}": float(np.quantile(acceleration, level)) for level in (0.05, 0.95)
+        },
+        "speeds": speeds,
+        "guard_share": meter.share,
+    }
 
 
 def _rows(parameters: LongRunParameters, km: float) -> int:
-    """Number of parallel episodes for ``km`` vehicle-km, if each vehicle covers a little less than
-    5000 m.
+    """Number of parallel episodes for ``km`` vehicle-km.
+
+    Each vehicle is taken to cover a little less than 5000 m.
     """
+    # 14 m/s is a slow traffic's mean speed: rather too many than too few.
     expected = parameters.vehicles * min(4.8, 0.014 * parameters.most_s)
     steps = round(parameters.most_s / PHYSICS_STEP_S)
-    most = max(1, min(_MOST_ROWS, _MOST_SAMPLES // (steps * parameters.vehicles)))
+    most = max(
+        1,
+        min(
+            _MOST_ROWS,
+            _MOST_SAMPLES // (steps * parameters.vehicles),
+        ),
+    )
     return int(np.clip(np.ceil(km / expected), 1, most))
 
 
 def spawned_vehicles(
-    traffic: TrafficModule, parameters: LongRunParameters, key: Tensor
+    traffic: TrafficModule,
+    parameters: LongRunParameters,
+    key: Tensor,
 ) -> Vehicles:
     """The vehicles [N, M + 1] at the start of the episodes ``key`` [N].
 
     Index 0, an ego's, is not valid.
     """
-    lanes, width, seen = traffic.road.lanes, traffic.road.lane_width_m, int(traffic.visibility)
+    lanes = traffic.road.lanes
+    width = traffic.road.lane_width_m
+    seen = int(traffic.visibility)
     assert not isinstance(lanes, Tensor)
     assert not isinstance(width, Tensor)
     # Table II's density, for the vehicles and an empty place for the ego.
     spread = parameters.spawn.spread_m * (parameters.vehicles + 1) / 9.0
-    start = replace(parameters.spawn, spread_m=max(parameters.spawn.spread_m, spread))
-    vehicles = spawn(
-        key, parameters.vehicles + 1, lanes, float(width), start, others_visibility=seen
+    start = replace(
+        parameters.spawn,
+        spread_m=max(parameters.spawn.spread_m, spread),
     )
+    vehicles = spawn(
+        key,
+        parameters.vehicles + 1,
+        lanes,
+        float(width),
+        start,
+        others_visibility=seen,
+    )
+    # Spawned with an ego, since Table II has one, and driven without it.
     index = torch.arange(parameters.vehicles + 1)
     return vehicles.with_(valid=vehicles.valid & (index > 0))
 
@@ -264,10 +279,7 @@ def drive_spawned(
     rows: int,
     events: EventCounter,
 ) -> Trajectories:
-    """One batch of ``rows`` episodes from number ``first`` on, from spawned starts.
-
-    ``events`` counts.
-    """
+    """One batch of ``rows`` spawned episodes from number ``first`` on; ``events`` counts."""
     counters = {
         keys.SEED: torch.full((rows,), parameters.seed),
         keys.EPISODE: first + torch.arange(rows),
@@ -275,49 +287,55 @@ def drive_spawned(
     key = episode_key(traffic.stream, *counters.values())
     state = spawned_vehicles(traffic, parameters, key)
     memory = traffic.init_memory(state, absorb(key, 0))
-    snapshots, start = [_snapshot(state)], state.x
-    sizes = (state.length[:, 1:].numpy(), state.width[:, 1:].numpy())
+    course = [(state.x, state.y, state.speed)]
+    start = state.x
+    # Onsets do not carry over from the batch before.
     events.before.clear()
     for step in range(round(parameters.most_s / PHYSICS_STEP_S)):
         state, memory = step_traffic(traffic, state, memory, counters, step)
         events.count(state, step)
-        snapshots.append(_snapshot(state))
+        course.append((state.x, state.y, state.speed))
         # Distances are tested once in ten seconds of driving: cheap, and exact enough.
         due = step % 100 == 99 and step * PHYSICS_STEP_S >= SPEEDS_AT_S[-1]
         if due and bool(((state.x - start)[:, 1:].mean(1) >= GOAL_M).all()):
             break
-    x, y, speed = (np.stack(values) for values in zip(*snapshots))
-    return Trajectories(x, y, speed, *sizes)
-
-
-def _snapshot(state: Vehicles) -> tuple[np.ndarray, ...]:
-    return tuple(getattr(state, name)[:, 1:].numpy() for name in ("x", "y", "speed"))
+    x, y, speed = (torch.stack(values)[..., 1:].numpy() for values in zip(*course))
+    return Trajectories(
+        x,
+        y,
+        speed,
+        state.length[:, 1:].numpy(),
+        state.width[:, 1:].numpy(),
+    )
 
 
 def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
     """Counts, samples and speeds of one batch."""
-    flat = trajectories.y.reshape(len(trajectories.y), -1)
-    changes = lane_changes_of_arrays(flat, float(road.lane_width_m))
+    # Every vehicle of every episode is a track of its own.
+    y = trajectories.y.reshape(len(trajectories.y), -1)
+    changes = lane_changes_of_arrays(y, float(road.lane_width_m))
     second = round(1.0 / PHYSICS_STEP_S)
     x = trajectories.x.astype(np.float64)
     # The same filter as for recordings; one sample a second is enough.
     bend = x[2 * second :: second] - 2.0 * x[second:-second:second] + x[: -2 * second : second]
     steps, rows = x.shape[:2]
-    times = {f"{seconds:g} s": round(seconds / PHYSICS_STEP_S) for seconds in SPEEDS_AT_S}
-    speeds = {
-        name: [_speeds(trajectories, row, time) for row in range(rows) if time < steps]
-        for name, time in times.items()
-    }
+    speeds: dict[str, list[dict[str, float]]] = {}
+    for seconds in SPEEDS_AT_S:
+        time = round(seconds / PHYSICS_STEP_S)
+        after = range(rows) if time < steps else ()
+        speeds[f"{seconds:g} s"] = [_speeds(trajectories, row, time) for row in after]
     # The first time at which the episode's vehicles have covered 5000 m on average.
-    reached = [
-        (row, np.flatnonzero(trajectories.driven_m[:, row].mean(-1) >= GOAL_M))
-        for row in range(rows)
-    ]
-    speeds[f"{GOAL_M:g} m"] = [
-        _speeds(trajectories, row, int(there[0])) for row, there in reached if len(there)
-    ]
+    driven_m = trajectories.x - trajectories.x[:1]
+    # [T, N].
+    there = driven_m.mean(-1) >= GOAL_M
+    at_goal = []
+    for row in np.flatnonzero(there.any(0)).tolist():
+        time = int(there[:, row].argmax())
+        spread = _speeds(trajectories, row, time)
+        at_goal.append({**spread, "after_s": time * PHYSICS_STEP_S})
+    speeds[f"{GOAL_M:g} m"] = at_goal
     return {
-        "vehicle_km": float(trajectories.driven_m[-1].sum(dtype=np.float64)) / 1000.0,
+        "vehicle_km": float(driven_m[-1].sum(dtype=np.float64)) / 1000.0,
         "lane_changes": len(changes),
         "durations": changes.duration_s[changes.complete],
         "acceleration": bend.ravel(),
@@ -325,14 +343,27 @@ def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
     }
 
 
-def _speeds(trajectories: Trajectories, row: int, time: int) -> tuple[float, float, float]:
-    """Mean and standard deviation of an episode's speeds, m/s, and the time, s."""
+def _speeds(trajectories: Trajectories, row: int, time: int) -> dict[str, float]:
+    """Mean and standard deviation of an episode's speeds, m/s."""
     speed = trajectories.speed[time, row].astype(np.float64)
-    return (
-        float(speed.mean()),
-        float(speed.std(ddof=1)) if len(speed) > 1 else 0.0,
-        time * PHYSICS_STEP_S,
-    )
+    spread = float(speed.std(ddof=1)) if len(speed) > 1 else 0.0
+    return {
+        "mean_speed_mps": float(speed.mean()),
+        "spread_mps": spread,
+    }
+
+
+def _mean_speeds(
+    rows: Sequence[Mapping[str, float]],
+) -> dict[str, float | int | None]:
+    """Means over the episodes that lasted so long, and their number."""
+    means: dict[str, float | int | None] = {
+        "mean_speed_mps": None,
+        "spread_mps": None,
+    }
+    if rows:
+        means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    return {**means, "episodes": len(rows)}
 
 
 def rates(lane_changes: int, overlaps: int, km: float) -> dict[str, Any]:
@@ -340,35 +371,32 @@ def rates(lane_changes: int, overlaps: int, km: float) -> dict[str, Any]:
 
     None where no vehicle moved.
     """
-    changes, pairs = poisson_interval(lane_changes), poisson_interval(overlaps)
+    changes = poisson_interval(lane_changes).scaled(per=km) if km > 0.0 else None
+    pairs = poisson_interval(overlaps).scaled(1000.0, per=km) if km > 0.0 else None
     return {
-        **entries("lane_changes_per_vehicle_km", changes.scaled(per=km) if km > 0.0 else None),
-        **entries(
-            "overlaps_per_1000_vehicle_km", pairs.scaled(1000.0, per=km) if km > 0.0 else None
+        **entries("lane_changes_per_vehicle_km", changes),
+        **entries("overlaps_per_1000_vehicle_km", pairs),
+    }
+
+
+def totals(
+    runs: Sequence[Mapping[str, Any]],
+) -> dict[str, Any]:
+    """Event counts and rates over all long runs, with exact 95 % intervals; None without any."""
+    names = (
+        "lane_changes",
+        "overlaps",
+        "vehicle_km",
+        "off_road",
+        "standstills_in_free_flow",
+    )
+    sums = {name: sum(run[name] for run in runs) for name in names}
+    return {
+        "off_road": sums["off_road"] if runs else None,
+        "standstills_in_free_flow": sums["standstills_in_free_flow"] if runs else None,
+        **rates(
+            sums["lane_changes"],
+            sums["overlaps"],
+            sums["vehicle_km"],
         ),
     }
-
-
-def _mean_speeds(
-    rows: Sequence[tuple[float, float, float]], with_time: bool
-) -> dict[str, float | int | None]:
-    """Means over the episodes that lasted so long, and their number."""
-    names = (
-        ("mean_speed_mps", "spread_mps", "after_s")
-        if with_time
-        else ("mean_speed_mps", "spread_mps")
-    )
-    means = (
-        {name: float(np.mean(values)) for name, values in zip(names, zip(*rows))} if rows else {}
-    )
-    return {"mean_speed_mps": None, "spread_mps": None, **means, "episodes": len(rows)}
-
-
-def totals(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Event counts and rates over all long runs, with exact 95 % intervals; None without any."""
-    sums = {
-        key: sum(run[key] for run in runs)
-        for key in ("lane_changes", "overlaps", "vehicle_km", *_EVENTS)
-    }
-    events = {name: sums[name] if runs else None for name in _EVENTS}
-    return {**events, **rates(sums["lane_changes"], sums["overlaps"], sums["vehicle_km"])}

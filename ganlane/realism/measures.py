@@ -1,5 +1,4 @@
-"""What is measured of driving, recorded or simulated, and how far two distributions are apart, with
-intervals.
+"""What is measured of driving, recorded or simulated, and the distance of two distributions.
 
 Everything is taken from positions, over one second and centred, so that recordings and simulations
 go through the same filter: raw recorded speeds and accelerations are mostly noise. A vehicle counts
@@ -10,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,7 +17,17 @@ import numpy as np
 import polars as pl
 from scipy.special import stdtrit
 
-from ganlane.data import FRAME_S, TRACK, Bins, find_lane_changes, leader_gaps, tracks_of_frame
+from ganlane.data.dense import (
+    Recording,
+    recorded_frame,
+    units_of,
+)
+from ganlane.data.lanes import (
+    find_lane_changes,
+    tracks_of_frame,
+)
+from ganlane.data.schema import FRAME_S, TRACK
+from ganlane.data.statistics import Bins, leader_gaps
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import (
     TAIL_LEVELS,
@@ -28,8 +37,13 @@ from ganlane.evaluation.statistics import (
     poisson_interval,
     resample_counts,
 )
-from ganlane.files import CHECKPOINTS, PLACE, has_checksum, refuse_without_checksum, write_json
-from ganlane.realism.recordings import Recording, recorded_frame, units_of
+from ganlane.files import (
+    CHECKPOINTS,
+    PLACE,
+    has_checksum,
+    note_without_checksum,
+    write_json,
+)
 
 #: Recorded driving as histograms, which ships; it holds derived numbers, never an excerpt of a
 #: recording.
@@ -69,23 +83,31 @@ QUANTITIES: Final = {name: bins for name, (_, bins) in _QUANTITIES.items()}
 
 
 def jensen_shannon(first: Array, second: Array) -> Array:
-    """Jensen-Shannon distance of histograms [..., bins]: 0 for equal ones, 1 for disjoint ones (Lin
-    1991).
+    """Jensen-Shannon distance of histograms [..., bins] (Lin 1991): 0 equal, 1 disjoint.
 
     The square root of the divergence to base 2, which is a metric (Endres and Schindelin 2003). NaN
-    where either histogram is empty.
+    where either histogram is empty. scipy's ``jensenshannon`` is NaN where rounding makes the
+    divergence of equal histograms negative.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
-        p, q = first / first.sum(-1, keepdims=True), second / second.sum(-1, keepdims=True)
-    middle = 0.5 * (p + q)
+        p = first / first.sum(-1, keepdims=True)
+        q = second / second.sum(-1, keepdims=True)
+    # 0 log 0 is 0: tiny numbers stand in for empty bins.
+    log_middle = np.log2(np.maximum(0.5 * (p + q), _TINY))
 
     def information(share: Array) -> Array:
         return np.sum(
-            share * (np.log2(np.maximum(share, _TINY)) - np.log2(np.maximum(middle, _TINY))),
+            share * (np.log2(np.maximum(share, _TINY)) - log_middle),
             axis=-1,
         )
 
-    return np.sqrt(np.clip(0.5 * (information(p) + information(q)), 0.0, 1.0))
+    return np.sqrt(
+        np.clip(
+            0.5 * (information(p) + information(q)),
+            0.0,
+            1.0,
+        )
+    )
 
 
 def pooled_distance(simulated: Array, recorded: Array) -> float:
@@ -94,87 +116,105 @@ def pooled_distance(simulated: Array, recorded: Array) -> float:
 
 
 def distance(
-    simulated: Array, recorded: Array, paired: bool = True, resamples: int = RESAMPLES
+    simulated: Array,
+    recorded: Array,
+    paired: bool = True,
+    resamples: int = RESAMPLES,
 ) -> Estimate:
-    """Distance with its 95 % bootstrap interval over units; both are [units, bins]. One unit gives
-    no interval.
+    """Distance with its 95 % bootstrap interval over units; both are [units, bins].
 
     A resample holds some units twice and others not at all, so its distance is biased upwards; near
     0 all of them lie above the estimate. Hence the basic (reverse percentile) interval, taken of
     the squared distance, in which that bias adds up, cut off at 0 and widened to hold the estimate.
     Percentile and BCa intervals consist of resamples, none of which is 0, so they miss a perfect
-    model's distance (docs/realism.md).
+    model's distance. One unit gives no interval.
 
     ``paired`` units are the same and are resampled together; else ``simulated`` alone is.
     """
     value = pooled_distance(simulated, recorded)
-    (drawn,) = _resampled((simulated,), recorded, paired, resamples)
-    known = drawn[np.isfinite(drawn)]
-    if not np.isfinite(value) or len(known) < 2:
+    (drawn,) = _resampled([simulated], recorded, paired, resamples)
+    if not np.isfinite(value) or len(drawn) < 2:
         return Estimate(value)
-    tails = np.quantile(known**2, TAIL_LEVELS)
+    # Both tails are reflected about the estimate.
+    tails = np.quantile(drawn**2, TAIL_LEVELS)
     low, high = np.sqrt(np.maximum(2.0 * value**2 - tails[::-1], 0.0))
-    return Estimate(value, min(value, float(low)), min(1.0, max(value, float(high))))
+    return Estimate(
+        value,
+        min(value, float(low)),
+        min(1.0, max(value, float(high))),
+    )
 
 
 def distance_difference(
-    first: Array, second: Array, recorded: Array, paired: bool = True, resamples: int = RESAMPLES
+    first: Array,
+    second: Array,
+    recorded: Array,
+    paired: bool = True,
+    resamples: int = RESAMPLES,
 ) -> Estimate:
-    """Distance of ``first`` less that of ``second`` to ``recorded``, with its 95 % interval; see
-    :func:`distance`.
+    """Distance of ``first`` less that of ``second`` to ``recorded``, with its 95 % interval.
 
-    Both are of the same units and resampled together. The interval is Student's, from the
-    bootstrap's standard error of the difference in squared distance, in which the bias of both
-    mostly cancels, divided by the sum of the distances: (a^2 - b^2) / (a + b) = a - b. With four
-    units the basic and the percentile interval find one of two equally good models closer too
+    Both are of the same units and resampled together (:func:`distance`). The interval is Student's,
+    from the bootstrap's standard error of the difference in squared distance, in which the bias of
+    both mostly cancels, divided by the sum of the distances: (a^2 - b^2) / (a + b) = a - b. With
+    four units the basic and the percentile interval find one of two equally good models closer too
     often.
     """
-    one, other = pooled_distance(first, recorded), pooled_distance(second, recorded)
-    ours, theirs = _resampled((first, second), recorded, paired, resamples)
-    known = (ours**2 - theirs**2)[np.isfinite(ours) & np.isfinite(theirs)]
-    units, value = len(first), one - other
-    if not np.isfinite(value) or len(known) < 2:
+    one = pooled_distance(first, recorded)
+    other = pooled_distance(second, recorded)
+    ours, theirs = _resampled([first, second], recorded, paired, resamples)
+    units = len(first)
+    value = one - other
+    if not np.isfinite(value) or len(ours) < 2:
         return Estimate(value)
-    error = float(known.std()) * np.sqrt(units / (units - 1))
+    # S resampled units have (S - 1) / S of the variance that they should have.
+    error = float((ours**2 - theirs**2).std()) * np.sqrt(units / (units - 1))
     reach = float(stdtrit(units - 1, TAIL_LEVELS[1])) * error / max(one + other, _TINY)
-    return Estimate(value, max(-1.0, value - reach), min(1.0, value + reach))
+    return Estimate(
+        value,
+        max(-1.0, value - reach),
+        min(1.0, value + reach),
+    )
 
 
 def _resampled(
-    models: Sequence[Array], recorded: Array, paired: bool, resamples: int
-) -> list[Array]:
-    """Distances [R] of each of ``models`` from resampled units, the same ones for all.
+    models: Sequence[Array],
+    recorded: Array,
+    paired: bool,
+    resamples: int,
+) -> Array:
+    """Distances [models, R] from the R resamples of the units in which all of them are known.
 
     None of a single unit.
     """
     units = len(recorded) if paired else len(models[0])
     if units < 2:
-        return [np.empty(0) for _ in models]
-    drawn: list[list[Array]] = [[] for _ in models]
-    for counts in resample_counts(units, resamples, seed=0):
-        against = counts @ recorded if paired else recorded.sum(0)
-        for values, model in zip(drawn, models):
-            values.append(jensen_shannon(counts @ model, against))
-    return [np.concatenate(values) for values in drawn]
+        return np.empty((len(models), 0))
+    # The same resamples for all models, so that differences are paired.
+    counts = np.concatenate(list(resample_counts(units, resamples, seed=0)))
+    against = counts @ recorded if paired else recorded.sum(0)
+    distances = np.stack([jensen_shannon(counts @ model, against) for model in models])
+    # A resample of units without samples has no distance.
+    return distances[:, np.isfinite(distances).all(0)]
 
 
 def ceiling(recorded: Array) -> float | None:
-    """Mean distance of one half of the units [units, bins] to the other, over random halves; None
-    for one unit.
+    """Mean distance of one half of the units [units, bins] to the other, over random halves.
 
     What no model can be expected to beat: halves hold half of the driving, so it errs on the high
-    side.
+    side. None for one unit.
     """
     units = len(recorded)
     if units < 2:
         return None
     generator = np.random.default_rng(0)
-    one = np.zeros((SPLITS, units))
-    for row in one:
+    # A row is a split: 1 for the units of its first half.
+    half = np.zeros((SPLITS, units))
+    for row in half:
         row[generator.permutation(units)[: units // 2]] = 1.0
-    values = jensen_shannon(one @ recorded, (1.0 - one) @ recorded)
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if len(known) else None
+    values = jensen_shannon(half @ recorded, (1.0 - half) @ recorded)
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else None
 
 
 @dataclass(frozen=True)
@@ -182,159 +222,162 @@ class Measured:
     """Driving, measured.
 
     Attributes:
-        samples: by quantity, columns ``unit`` and ``value``.
         counts: by quantity, samples per unit and bin, [units, bins].
-        lane_changes, vehicle_km: of all units.
+        quantiles: by quantity, by level as text; None without samples.
+        lane_changes, vehicle_km: of all units, from 3 s after each vehicle's first frame.
     """
 
-    samples: Mapping[str, pl.DataFrame]
     counts: Mapping[str, Array]
+    quantiles: Mapping[str, Mapping[str, float | None]]
     lane_changes: int
     vehicle_km: float
 
     def summary(self) -> dict[str, Any]:
-        """Lane changes per vehicle-km (:func:`lane_change_rate`) and the ``quantiles`` of every
-        quantity.
-        """
+        """Lane changes per vehicle-km (:func:`lane_change_rate`) and the ``quantiles``."""
         return {
             **lane_change_rate(self.lane_changes, self.vehicle_km),
-            "quantiles": self.quantiles(),
-        }
-
-    def quantile(self, quantity: str, level: float) -> float | None:
-        """Quantile of a quantity over all units; None without samples."""
-        return self.samples[quantity]["value"].quantile(level, "linear")
-
-    def quantiles(self) -> dict[str, dict[str, float | None]]:
-        """By quantity, the quantiles at :data:`LEVELS`."""
-        return {
-            name: {f"{level:g}": self.quantile(name, level) for level in LEVELS}
-            for name in QUANTITIES
+            "quantiles": self.quantiles,
         }
 
     def restricted_to(self, rows: Sequence[int]) -> Measured:
-        """The same with the counts of some units only; samples and totals remain those of all."""
-        return replace(self, counts={name: counts[rows] for name, counts in self.counts.items()})
-
-    @staticmethod
-    def joined(parts: Sequence[Measured]) -> Measured:
-        """Driving of different units, one below the other."""
-        samples = {name: pl.concat([part.samples[name] for part in parts]) for name in QUANTITIES}
-        counts = {
-            name: np.concatenate([part.counts[name] for part in parts]) for name in QUANTITIES
-        }
-        return Measured(
-            samples, counts, sum(p.lane_changes for p in parts), sum(p.vehicle_km for p in parts)
+        """The same with the counts of some units only; the rest remains that of all."""
+        return replace(
+            self,
+            counts={name: counts[rows] for name, counts in self.counts.items()},
         )
 
 
 def lane_change_rate(changes: int, km: float) -> dict[str, Any]:
     """Lane changes, vehicle-km, and their ratio with its exact 95 % interval."""
     ratio = poisson_interval(changes).scaled(per=km) if km else None
-    return {"lane_changes": changes, "vehicle_km": km, **entries("per_vehicle_km", ratio)}
+    return {
+        "lane_changes": changes,
+        "vehicle_km": km,
+        **entries("per_vehicle_km", ratio),
+    }
 
 
-def measure_recordings(recordings: Sequence[Recording]) -> Measured:
+def measure_recordings(
+    recordings: Sequence[Recording],
+) -> Measured:
     """The recordings, measured as simulations are."""
     return measure(recorded_frame(recordings), units_of(recordings))
 
 
 def measure(frame: pl.DataFrame, units: Sequence[str]) -> Measured:
-    """Measure trajectories, as :func:`ganlane.realism.recordings.frame_of` gives them.
+    """Measure trajectories (:meth:`ganlane.data.dense.Recording.frame`) of the ``units``."""
+    motion = with_motion(frame)
+    # Samples are dropped once they are counted.
+    samples = samples_of(motion)
+    counts = {}
+    quantiles = {}
+    for name, table in samples.items():
+        counts[name] = _histograms(table, units, QUANTITIES[name])
+        column = table["value"]
+        quantiles[name] = {f"{level:g}": column.quantile(level, "linear") for level in LEVELS}
+    # In the order of the units, so that the sum is the same in every run.
+    by_unit = motion.filter("counts").group_by("unit", maintain_order=True)
+    km = by_unit.agg(km=pl.col("stride").sum() / 1000.0)["km"].to_list()
+    return Measured(
+        counts,
+        quantiles,
+        samples["lane_change_duration"].height,
+        sum(km),
+    )
 
-    ``units`` are the rows.
-    """
-    motion = _motion(frame)
-    own = motion.filter(pl.col("counts"))
+
+def samples_of(
+    motion: pl.DataFrame,
+) -> dict[str, pl.DataFrame]:
+    """By quantity, columns ``unit`` and ``value``, of a frame :func:`with_motion`."""
+    # Only rows that are driven and old enough.
+    counted = motion.filter("counts")
+    # Leaders are also those that do not count themselves.
     near = pl.col("counts") & pl.col("gap").is_between(0.0, FOLLOWING_M)
     followers = leader_gaps(motion).filter(near).drop_nulls(["speed", "leader_speed"])
     closing = pl.col("speed") - pl.col("leader_speed")
-    crowded = (
-        own.drop_nulls("speed")
-        .group_by("unit", "scene", "frame")
-        .agg(pl.col("speed").std(), pl.len())
-    )
+    # Two vehicles have hardly a spread.
+    frames = counted.drop_nulls("speed").group_by("unit", "scene", "frame")
+    crowded = frames.agg(pl.col("speed").std(), pl.len()).filter(pl.col("len") >= FEWEST_IN_FRAME)
+    # Near standstill the headway grows without bound.
     fast_enough = followers.filter(pl.col("speed") >= SLOWEST_FOLLOWER_MPS)
-    changes = _lane_changes(motion)
     values = {
-        "speed": (own, pl.col("speed")),
-        "speed_spread": (crowded.filter(pl.col("len") >= FEWEST_IN_FRAME), pl.col("speed")),
-        "acceleration": (own, pl.col("acceleration")),
-        "jerk": (own, pl.col("jerk")),
-        "time_headway": (fast_enough, pl.col("gap") / pl.col("speed")),
+        "speed": (counted, pl.col("speed")),
+        "speed_spread": (crowded, pl.col("speed")),
+        "acceleration": (counted, pl.col("acceleration")),
+        "jerk": (counted, pl.col("jerk")),
+        "time_headway": (
+            fast_enough,
+            pl.col("gap") / pl.col("speed"),
+        ),
         "gap": (followers, pl.col("gap")),
-        "time_to_collision": (followers.filter(closing > CLOSING_MPS), pl.col("gap") / closing),
+        "time_to_collision": (
+            followers.filter(closing > CLOSING_MPS),
+            pl.col("gap") / closing,
+        ),
     }
     samples = {
         name: rows.select("unit", value=value).drop_nulls().filter(pl.col("value").is_finite())
         for name, (rows, value) in values.items()
     }
-    samples["lane_change_duration"] = changes
-    counts = {name: _histograms(table, units, QUANTITIES[name]) for name, table in samples.items()}
-    km = own.group_by("unit").agg((pl.col("stride").sum() / 1000.0).alias("km"))
-    return Measured(samples, counts, changes.height, sum(km["km"].to_list()))
+    # Changes count that cross in a row that counts, censored ones as far as seen: simulations run
+    # where and as long as the recordings do, so both are cut off alike.
+    widths = dict(motion.select("scene", "lane_width").unique().iter_rows())
+    changes = find_lane_changes(tracks_of_frame(motion, widths))
+    crossings = motion[changes.sample].with_columns(value=pl.Series(changes.duration_s))
+    samples["lane_change_duration"] = crossings.filter("counts").select("unit", "value")
+    return samples
 
 
 def _histograms(table: pl.DataFrame, units: Sequence[str], bins: Bins) -> Array:
     """Samples per unit and bin, [units, bins]."""
     index = {unit: row for row, unit in enumerate(units)}
     table = table.filter(pl.col("unit").is_in(list(units)))
+    # Row and column of each sample in the table of counts.
     row = table["unit"].replace_strict(index, return_dtype=pl.Int64).to_numpy()
     share = (table["value"].to_numpy() - bins.low) / (bins.high - bins.low)
     column = np.clip(np.floor(share * bins.number), 0, bins.number - 1).astype(np.int64)
-    flat = np.bincount(row * bins.number + column, minlength=len(units) * bins.number)
+    # Two indices as one, counted at once.
+    flat = np.bincount(
+        row * bins.number + column,
+        minlength=len(units) * bins.number,
+    )
     return flat.reshape(len(units), bins.number).astype(np.float64)
 
 
-def _at(column: str, frames: int) -> pl.Expr:
-    """The column's value ``frames`` later in the same track."""
-    return pl.col(column).shift(-frames).over(TRACK)
+def with_motion(frame: pl.DataFrame) -> pl.DataFrame:
+    """``frame`` with speed, acceleration and jerk over 1 s, and what counts.
 
-
-def _motion(frame: pl.DataFrame) -> pl.DataFrame:
-    """``frame`` with speed, acceleration and jerk over 1 s, the step driven, and whether the row
-    counts.
+    ``stride`` is the step driven, m; ``counts`` is whether the row is measured.
     """
-    speed = (_at("x", _HALF) - _at("x", -_HALF)) / (_WHOLE * FRAME_S)
-    bend = _at("x", _WHOLE) - 2.0 * pl.col("x") + _at("x", -_WHOLE)
-    late, later = _HALF, _HALF + _WHOLE
-    swing = _at("x", later) - 3.0 * _at("x", late) + 3.0 * _at("x", -late) - _at("x", -later)
+
+    def x_at(frames: int) -> pl.Expr:
+        """The position ``frames`` later in the same track."""
+        return pl.col("x").shift(-frames).over(TRACK)
+
+    late = _HALF
+    later = _HALF + _WHOLE
+    # Central differences of positions one second apart.
+    bend = x_at(_WHOLE) - 2.0 * pl.col("x") + x_at(-_WHOLE)
+    swing = x_at(later) - 3.0 * x_at(late) + 3.0 * x_at(-late) - x_at(-later)
+    # Frames since the vehicle appeared.
     age = pl.col("frame") - pl.col("frame").first().over(TRACK)
     return frame.with_columns(
-        speed=speed,
+        speed=(x_at(_HALF) - x_at(-_HALF)) / (_WHOLE * FRAME_S),
         acceleration=bend / (_WHOLE * FRAME_S) ** 2,
         jerk=swing / (_WHOLE * FRAME_S) ** 3,
-        stride=pl.col("x") - _at("x", -1),
+        stride=pl.col("x") - x_at(-1),
         counts=(age >= round(SETTLING_S / FRAME_S)) & pl.col("driven"),
     )
 
 
-def _lane_changes(motion: pl.DataFrame) -> pl.DataFrame:
-    """Unit and duration of the changes that cross in a row that counts, censored ones as far as
-    seen.
-
-    Simulations run where and as long as the recordings do, so both are cut off alike.
-    """
-    widths = dict(motion.select("scene", "lane_width").unique().iter_rows())
-    changes = find_lane_changes(tracks_of_frame(motion, widths))
-    rows = (
-        motion[changes.sample]
-        .select("unit", "counts")
-        .with_columns(value=pl.Series(changes.duration_s))
-    )
-    return rows.filter(pl.col("counts")).select("unit", "value")
-
-
 @dataclass(frozen=True)
-class Reference:
+class Reference(Measured):
     """Recorded driving as histograms and rates.
 
     Attributes:
         source: where it was recorded.
         units: names of the scenes.
-        counts: by quantity, [units, bins].
-        quantiles: by quantity, by level as text.
-        lane_changes, vehicle_km: from 3 s after each vehicle's first frame.
         whole: lane changes and vehicle-km of all frames, and ``speed_spread_mps``; long runs are
             compared with these.
         floors: by driver (``random``, ``constant_velocity``), by quantity: its distance from here.
@@ -342,33 +385,8 @@ class Reference:
 
     source: str
     units: list[str]
-    counts: Mapping[str, Array]
-    quantiles: Mapping[str, Mapping[str, float | None]]
-    lane_changes: int
-    vehicle_km: float
     whole: Mapping[str, float]
     floors: Mapping[str, Mapping[str, float]]
-
-    @classmethod
-    def of(
-        cls, measured: Measured, units: Sequence[str], whole: Mapping[str, float], source: str
-    ) -> Reference:
-        """The reference that measured recordings give, without floors."""
-        changes, km = measured.lane_changes, measured.vehicle_km
-        return cls(
-            source,
-            list(units),
-            measured.counts,
-            measured.quantiles(),
-            changes,
-            km,
-            whole,
-            floors={},
-        )
-
-    def summary(self) -> dict[str, Any]:
-        """As :meth:`Measured.summary`."""
-        return {**lane_change_rate(self.lane_changes, self.vehicle_km), "quantiles": self.quantiles}
 
     @property
     def spread_mps(self) -> float:
@@ -377,18 +395,22 @@ class Reference:
 
     def rate(self) -> dict[str, Any]:
         """Lane changes per vehicle-km of the whole recording, with its exact interval."""
-        return lane_change_rate(int(self.whole["lane_changes"]), self.whole["vehicle_km"])
+        return lane_change_rate(
+            int(self.whole["lane_changes"]),
+            self.whole["vehicle_km"],
+        )
 
     def save(self, path: Path) -> None:
         """Write as JSON, atomically."""
-        ceilings = {quantity: ceiling(counts) for quantity, counts in self.counts.items()}
-        plain = {
+        content = {
+            "kind": _KIND,
+            "checksum": PLACE,
+            "bins": _bins(),
+            "ceilings": {quantity: ceiling(counts) for quantity, counts in self.counts.items()},
             **vars(self),
             "counts": {name: value.astype(int).tolist() for name, value in self.counts.items()},
         }
-        write_json(
-            path, {"kind": _KIND, "checksum": PLACE, "bins": _bins(), "ceilings": ceilings, **plain}
-        )
+        write_json(path, content)
 
     @classmethod
     def load(cls, path: Path) -> Reference:
@@ -401,24 +423,28 @@ class Reference:
             content = path.read_bytes()
             whole = has_checksum(content, path)
             numbers = json.loads(content)
-            if numbers.pop("kind") != _KIND:
+            if numbers["kind"] != _KIND:
                 raise ValueError("another kind of file")
-            if numbers.pop("bins") != _bins():
+            if numbers["bins"] != _bins():
                 raise ValueError("its histograms have other bins")
-            for derived in ("ceilings", "checksum"):
-                numbers.pop(derived, None)
-            counts = {
-                name: np.asarray(value, dtype=np.float64)
-                for name, value in numbers.pop("counts").items()
-            }
-            reference = cls(counts=counts, **numbers)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            counts = {name: np.array(rows, float) for name, rows in numbers["counts"].items()}
+            # Ceilings and checksum follow from the rest.
+            values = {part.name: numbers[part.name] for part in fields(cls)}
+            reference = cls(**{**values, "counts": counts})
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            TypeError,
+            AttributeError,
+            RecursionError,
+        ) as error:
             raise UserError(
-                f"{path}: not the histograms of recorded driving that the realism card needs ({error}); give the "
-                "recordings with data.path=FILE."
+                f"{path}: not the histograms of recorded driving that the realism card needs "
+                f"({error}); give the recordings with data.path=FILE."
             ) from error
         if not whole:
-            refuse_without_checksum(path)
+            note_without_checksum(path)
         return reference
 
 

@@ -1,5 +1,4 @@
-"""Every traffic from the same starts: recorded scenes, or spawned ones where there are no
-recordings.
+"""Every traffic from the same starts: recorded scenes, or spawned ones where there are none.
 
 Recordings do not show how fast drivers would like to go, so the mean desired speed is fitted for
 every traffic. Generators may be split into folds, so that no scene is driven by weights that were
@@ -17,10 +16,26 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from ganlane.data import FRAME_S, driving_statistics, scene_lane_widths
+from ganlane.data.dense import (
+    Recording,
+    recordings_of,
+    units_of,
+)
+from ganlane.data.lanes import scene_lane_widths
+from ganlane.data.schema import FRAME_S
+from ganlane.data.statistics import driving_statistics
 from ganlane.errors import UserError
-from ganlane.realism.driving import FLOORS, Factory, StartOptions, drive_recordings
-from ganlane.realism.long_runs import EventCounter, LongRunParameters, drive_spawned
+from ganlane.realism.driving import (
+    FLOORS,
+    Factory,
+    StartOptions,
+    drive_recordings,
+)
+from ganlane.realism.long_runs import (
+    EventCounter,
+    LongRunParameters,
+    drive_spawned,
+)
 from ganlane.realism.measures import (
     QUANTITIES,
     SHIPPED_REFERENCE,
@@ -30,17 +45,12 @@ from ganlane.realism.measures import (
     measure_recordings,
     pooled_distance,
 )
-from ganlane.realism.recordings import (
-    SHORTEST_S,
-    Recording,
-    recorded_frame,
-    recordings_of,
-    units_of,
-)
 from ganlane.sim.spawn import SpawnParameters
 from ganlane.sim.state import Road
 from ganlane.weights import load_weights
 
+#: A scene must last longer than the seconds that every measure leaves out, s.
+SHORTEST_S = 4.0
 #: Candidates for the mean excess of desired speeds over the speed at entry, m/s.
 EXCESS_GRID = (2.0, 4.0, 6.0, 8.0, 11.0, 15.0, 20.0)
 #: Spawned starts: vehicles of an episode, its seconds, and episodes per repeat.
@@ -52,21 +62,35 @@ def print_progress(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def simulate(make: Factory, recordings: Sequence[Recording], options: StartOptions) -> Measured:
+def simulate(
+    make: Factory,
+    recordings: Sequence[Recording],
+    options: StartOptions,
+) -> Measured:
     """Drive the recordings with a traffic and measure it."""
-    return measure(drive_recordings(make, recordings, options), units_of(recordings))
+    return measure(
+        drive_recordings(make, recordings, options),
+        units_of(recordings),
+    )
 
 
-def simulate_all(
+def drive_all(
     factories: Mapping[str, Factory],
     recordings: Sequence[Recording],
-    options: Mapping[str, StartOptions],
-) -> dict[str, Measured]:
-    """Drive every traffic and both reference drivers from the same starts."""
+    options: StartOptions,
+    desired_above_mps: Mapping[str, float],
+) -> dict[str, pl.DataFrame]:
+    """Drive every traffic and both reference drivers from the same starts, not yet measured.
+
+    ``desired_above_mps`` by traffic takes the place of that of the ``options``.
+    """
     driven = {}
     for name, make in {**factories, **FLOORS}.items():
         print_progress(f"{name} from {len(recordings)} recorded starts")
-        driven[name] = simulate(make, recordings, options.get(name, StartOptions()))
+        # Reference drivers have no desired speed that matters.
+        excess = desired_above_mps.get(name, options.desired_above_mps)
+        wishes = replace(options, desired_above_mps=excess)
+        driven[name] = drive_recordings(make, recordings, wishes)
     return driven
 
 
@@ -76,37 +100,28 @@ def fit_excess(
     options: StartOptions,
     grid: Sequence[float] = EXCESS_GRID,
 ) -> float:
-    """The mean excess of desired speeds, of ``grid``, at which a traffic is nearest to
-    ``recordings``, m/s.
+    """The mean excess of desired speeds, of ``grid``, that brings a traffic nearest, m/s.
 
-    Nearest by the mean distance over all quantities that need no lane change. Every traffic is
-    fitted, so that none suffers from desired speeds chosen for another.
+    Nearest to the ``recordings`` by the mean distance over all quantities that need no lane change.
+    Every traffic is fitted, so that none suffers from desired speeds chosen for another.
     """
     recorded = measure_recordings(recordings)
 
     def mean_distance(excess: float) -> float:
-        driven = simulate(make, recordings, replace(options, desired_above_mps=excess, repeats=1))
-        fitted_by = [name for name in QUANTITIES if name != "lane_change_duration"]
-        values = [pooled_distance(driven.counts[name], recorded.counts[name]) for name in fitted_by]
-        return float(np.nanmean(values))
+        driven = simulate(
+            make,
+            recordings,
+            replace(options, desired_above_mps=excess, repeats=1),
+        )
+        # Lane changes are too few to fit anything to.
+        distances = [
+            pooled_distance(driven.counts[name], recorded.counts[name])
+            for name in QUANTITIES
+            if name != "lane_change_duration"
+        ]
+        return float(np.nanmean(distances))
 
     return min(grid, key=mean_distance)
-
-
-def desired_speeds(
-    factories: Mapping[str, Factory], fitted: Sequence[Recording], common: StartOptions
-) -> dict[str, StartOptions]:
-    """Options by traffic: desired speeds fitted to ``fitted``, if there are any.
-
-    Reference drivers as ``common``.
-    """
-    chosen = {name: common for name in FLOORS}
-    for name, make in factories.items():
-        chosen[name] = common
-        if fitted:
-            print_progress(f"{name}: fitting desired speeds on {len(fitted)} scenes")
-            chosen[name] = replace(common, desired_above_mps=fit_excess(make, fitted, common))
-    return chosen
 
 
 @dataclass(frozen=True)
@@ -114,28 +129,27 @@ class Starts:
     """Traffics driven from the same starts, and the recordings that they are compared with.
 
     Attributes:
-        kind: ``recorded`` or ``spawned``.
-        scenes: started from.
+        scenes: recorded scenes started from; empty where the starts were spawned.
         held_out: by fold, the scenes that desired speeds were not fitted on.
-        options: by traffic, how it was driven; over several folds the mean of what was fitted.
+        desired_above_mps: by traffic, mean excess of desired speeds; over several folds the mean of
+            what was fitted.
         driven: by name, the card's traffic first, then its rivals, then :data:`FLOORS` (recorded
             starts only).
         recorded: the same scenes (spawned starts: all recordings).
         reference: all recordings.
     """
 
-    kind: str
     scenes: list[str]
     held_out: list[list[str]]
-    options: Mapping[str, StartOptions]
+    desired_above_mps: Mapping[str, float]
     driven: Mapping[str, Measured]
-    recorded: Measured | Reference
+    recorded: Measured
     reference: Reference
 
     @property
     def paired(self) -> bool:
         """Whether the recorded units are those that were driven."""
-        return self.kind == "recorded"
+        return bool(self.scenes)
 
     @property
     def separately_held_out(self) -> list[str]:
@@ -146,26 +160,25 @@ class Starts:
         return held_out if len(held_out) < len(self.scenes) else []
 
     def restricted_to(self, scenes: Sequence[str]) -> Starts:
-        """The same driving from some of its scenes, compared with these alone."""
-        assert isinstance(self.recorded, Measured)  # spawned starts are of no scenes
+        """The same driving from some of its recorded scenes, compared with these alone."""
+        # Units are the scenes, in this order.
         rows = [self.scenes.index(name) for name in scenes]
-        driven = {name: each.restricted_to(rows) for name, each in self.driven.items()}
+        driven = {name: measured.restricted_to(rows) for name, measured in self.driven.items()}
+        recorded = self.recorded.restricted_to(rows)
         return replace(
-            self, scenes=list(scenes), driven=driven, recorded=self.recorded.restricted_to(rows)
+            self,
+            scenes=list(scenes),
+            driven=driven,
+            recorded=recorded,
         )
 
     def description(self) -> dict[str, Any]:
         """The entries of ``results.json`` about starts and recordings."""
-        excess = {
-            name: each.desired_above_mps
-            for name, each in self.options.items()
-            if name not in FLOORS
-        }
         return {
-            "starts": self.kind,
+            "starts": "recorded" if self.paired else "spawned",
             "scenes": self.scenes,
             "held_out": self.held_out,
-            "desired_above_mps": excess,
+            "desired_above_mps": dict(self.desired_above_mps),
             "recordings": self.reference.source,
             "recorded_lane_changes_per_vehicle_km": self.reference.rate(),
         }
@@ -173,10 +186,9 @@ class Starts:
 
 @dataclass(frozen=True)
 class Fold:
-    """Traffics by name, the card's own first and the same in every fold, and the scenes that they
-    start from.
+    """Traffics by name, the card's own first and the same in every fold, and where they start.
 
-    Desired speeds are not fitted on the ``held_out`` scenes.
+    ``starts`` are names of scenes. Desired speeds are not fitted on the ``held_out`` scenes.
     """
 
     factories: Mapping[str, Factory]
@@ -184,7 +196,9 @@ class Fold:
     held_out: Sequence[str]
 
 
-def fold_weights(paths: Sequence[Path]) -> dict[tuple[str, ...], dict[str, Path]]:
+def fold_weights(
+    paths: Sequence[Path],
+) -> dict[tuple[str, ...], dict[str, Path]]:
     """Weights of k folds: by held-out scenes, then by preset (``paper``, ``calibrated``).
 
     Raises:
@@ -194,12 +208,14 @@ def fold_weights(paths: Sequence[Path]) -> dict[tuple[str, ...], dict[str, Path]
     folds: dict[tuple[str, ...], dict[str, Path]] = {}
     for path in paths:
         metadata = load_weights(path, "generator")[1]
+        # The scenes without which a generator was fitted name its fold.
         held_out = tuple(sorted(metadata.get("data", {}).get("held_out", ())))
         preset = str(metadata.get("preset"))
         if not held_out or preset in folds.get(held_out, {}):
             raise UserError(
-                f"fold_weights={path}: expected one generator per preset and fold, each fitted without the scenes of "
-                f"its fold; this one is of the preset {preset}, left out: {', '.join(held_out) or 'none'}."
+                f"fold_weights={path}: expected one generator per preset and fold, each fitted "
+                f"without the scenes of its fold; this one is of the preset {preset}, left out: "
+                f"{', '.join(held_out) or 'none'}."
             )
         folds.setdefault(held_out, {})[preset] = path
     return folds
@@ -207,20 +223,24 @@ def fold_weights(paths: Sequence[Path]) -> dict[tuple[str, ...], dict[str, Path]
 
 def check_folds_cover(folds: Sequence[Sequence[str]], scenes: Sequence[str]) -> None:
     """Raise :class:`UserError` unless every scene is in exactly one fold."""
-    held = [name for fold in folds for name in fold]
-    for name in sorted({*held, *scenes}):
-        if held.count(name) != 1 or name not in scenes:
+    held_out = [name for fold in folds for name in fold]
+    for name in sorted({*held_out, *scenes}):
+        if held_out.count(name) != 1 or name not in scenes:
             raise UserError(
-                f"fold_weights: the scene {name} is held out {held.count(name)} times, expected once for every scene "
-                f"of the recordings ({', '.join(scenes)}); give one generator per fold."
+                f"fold_weights: the scene {name} is held out {held_out.count(name)} times, "
+                f"expected once for every scene of the recordings ({', '.join(scenes)}); give one "
+                "generator per fold."
             )
 
 
 def recorded_starts(
-    folds: Sequence[Fold], frame: pl.DataFrame, options: StartOptions, fit: bool, source: str
+    folds: Sequence[Fold],
+    frame: pl.DataFrame,
+    options: StartOptions,
+    fit: bool,
+    source: str,
 ) -> Starts:
-    """Drive every traffic from recorded scenes (``frame``, in the schema); those that are too short
-    are skipped.
+    """Drive every traffic from recorded scenes (``frame``, in the schema), but the shortest ones.
 
     ``fit``: every traffic's desired speeds, on a fold's other scenes; else they are those of
     ``options``.
@@ -229,86 +249,120 @@ def recorded_starts(
         UserError: a fold names an unknown scene, or no scene is long enough.
     """
     widths = scene_lane_widths(frame)
-    every = recordings_of(frame, widths)
-    names = [each.name for each in every]
+    recordings = recordings_of(frame, widths)
+    names = [recording.name for recording in recordings]
+    # A mistyped scene would be fitted to in silence.
     for name in (name for fold in folds for name in fold.held_out):
         if name not in names:
             raise UserError(
                 f"data.held_out={name}: no such scene in {source}; choose among {', '.join(names)}."
             )
-    long = [each for each in every if len(each.x) * FRAME_S >= SHORTEST_S]
+    # Every measure leaves out the first 3 s.
+    long = [recording for recording in recordings if len(recording.x) * FRAME_S >= SHORTEST_S]
     chosen: list[Recording] = []
-    fitted: list[dict[str, StartOptions]] = []
-    driven: list[dict[str, Measured]] = []
+    excesses: dict[str, list[float]] = {}
+    frames: dict[str, list[pl.DataFrame]] = {}
     for fold in folds:
-        scenes = [each for each in long if each.name in fold.starts]
-        if scenes:
-            others = [each for each in long if each.name not in fold.held_out] if fit else []
-            fitted.append(desired_speeds(fold.factories, others, options))
-            driven.append(simulate_all(fold.factories, scenes, fitted[-1]))
-            chosen += scenes
+        scenes = [recording for recording in long if recording.name in fold.starts]
+        if not scenes:
+            continue
+        chosen += scenes
+        # Never on the scenes that are held out, even if they are not driven.
+        others = [recording for recording in long if recording.name not in fold.held_out]
+        for name, make in fold.factories.items():
+            excess = options.desired_above_mps
+            if fit and others:
+                print_progress(f"{name}: fitting desired speeds on {len(others)} scenes")
+                excess = fit_excess(make, others, options)
+            excesses.setdefault(name, []).append(excess)
+        fitted = {name: values[-1] for name, values in excesses.items()}
+        for name, driven in drive_all(fold.factories, scenes, options, fitted).items():
+            frames.setdefault(name, []).append(driven)
     if not chosen:
         raise UserError(
-            f"{source}: no scene to start from lasts {SHORTEST_S:g} s; give longer ones or scenes=all."
+            f"{source}: no scene to start from lasts {SHORTEST_S:g} s; give longer ones or "
+            "scenes=all."
         )
+    # Long runs are compared with all frames, not only with those that count.
     statistics = driving_statistics(frame, widths)
-    whole = {
-        "lane_changes": statistics.lane_changes.count,
-        "vehicle_km": statistics.exposure.vehicle_km,
-        "speed_spread_mps": statistics.speed_sd_in_frame or 0.0,
-    }
-    # Sites that belong to no fold get the mean over folds of the fitted desired speeds.
-    means = {
-        name: float(np.mean([part[name].desired_above_mps for part in fitted]))
-        for name in fitted[0]
-    }
-    return Starts(
-        kind="recorded",
-        scenes=[each.name for each in chosen],
-        held_out=[list(fold.held_out) for fold in folds],
-        options={
-            name: replace(options, desired_above_mps=excess) for name, excess in means.items()
+    reference = Reference(
+        **vars(measure_recordings(recordings)),
+        source=source,
+        units=names,
+        whole={
+            "lane_changes": statistics.lane_changes.count,
+            "vehicle_km": statistics.exposure.vehicle_km,
+            "speed_spread_mps": statistics.speed_sd_in_frame or 0.0,
         },
-        driven={name: Measured.joined([part[name] for part in driven]) for name in driven[0]},
+        floors={},
+    )
+    # Measured once over all folds, so that every traffic has the same units.
+    units = units_of(chosen)
+    return Starts(
+        scenes=units,
+        held_out=[list(fold.held_out) for fold in folds],
+        desired_above_mps={name: float(np.mean(values)) for name, values in excesses.items()},
+        driven={name: measure(pl.concat(parts), units) for name, parts in frames.items()},
         recorded=measure_recordings(chosen),
-        reference=Reference.of(measure_recordings(every), names, whole, source),
+        reference=reference,
     )
 
 
 def spawned_starts(
-    factories: Mapping[str, Factory], road: Road, spawn: SpawnParameters, repeats: int, seed: int
+    factories: Mapping[str, Factory],
+    road: Road,
+    spawn: SpawnParameters,
+    repeats: int,
+    seed: int,
 ) -> Starts:
-    """Drive every traffic from the same spawned scenes: ``repeats`` times 8 episodes of 30 vehicles
-    and 30 s each.
+    """Drive every traffic from the same spawned scenes: 8 episodes per repeat, 30 vehicles, 30 s.
 
     ``road`` and ``spawn`` say where and how vehicles start (Table II at the paper's density). They
     are compared with the histograms that ship.
     """
-    reference, rows = Reference.load(SHIPPED_REFERENCE), _SPAWNED_ROWS * repeats
+    reference = Reference.load(SHIPPED_REFERENCE)
+    rows = _SPAWNED_ROWS * repeats
     print_progress(
-        f"no recordings here: spawned starts against {SHIPPED_REFERENCE.name}; give data.path=FILE for the fair "
-        "comparison"
+        f"no recordings here: spawned starts against {SHIPPED_REFERENCE.name}; give data.path=FILE "
+        "for the fair comparison"
     )
-    parameters = LongRunParameters(_SPAWNED_VEHICLES, most_s=_SPAWNED_S, seed=seed, spawn=spawn)
-    scenes, driven = [f"spawned-{row}" for row in range(rows)], {}
+    parameters = LongRunParameters(
+        _SPAWNED_VEHICLES,
+        most_s=_SPAWNED_S,
+        seed=seed,
+        spawn=spawn,
+    )
+    driven = {}
     for name, make in factories.items():
         print_progress(f"{name} from {rows} spawned starts")
-        driven[name] = measure(spawned_frame(make, road, parameters, rows), scenes)
-    return Starts("spawned", [], [], {}, driven, reference, reference)
+        recordings = spawned_recordings(make, road, parameters, rows)
+        driven[name] = measure_recordings(recordings)
+    return Starts([], [], {}, driven, reference, reference)
 
 
-def spawned_frame(
-    make: Factory, road: Road, parameters: LongRunParameters, rows: int
-) -> pl.DataFrame:
-    """Trajectories of ``rows`` spawned episodes of ``parameters.most_s`` s, in the form of measured
-    recordings.
-    """
+def spawned_recordings(
+    make: Factory,
+    road: Road,
+    parameters: LongRunParameters,
+    rows: int,
+) -> list[Recording]:
+    """``rows`` spawned episodes of ``parameters.most_s`` s, in the form of recordings."""
     paths = drive_spawned(make(road), parameters, 0, rows, EventCounter(road))
+    # Nobody enters late or leaves.
     everywhere = np.ones(paths.x[:, 0].shape, dtype=bool)
-    lanes, width = int(road.lanes), float(road.lane_width_m)
-    made = []
-    for row in range(rows):
-        dense = (paths.x[:, row], paths.y[:, row], paths.speed[:, row], everywhere)
-        name, sizes = f"spawned-{row}", (paths.length[row], paths.width[row])
-        made.append(Recording(name, name, lanes, width, *dense, *sizes, everywhere[0]))
-    return recorded_frame(made)
+    return [
+        Recording(
+            name=f"spawned-{row}",
+            unit=f"spawned-{row}",
+            lanes=int(road.lanes),
+            lane_width_m=float(road.lane_width_m),
+            x=paths.x[:, row],
+            y=paths.y[:, row],
+            speed=paths.speed[:, row],
+            present=everywhere,
+            length=paths.length[row],
+            width=paths.width[row],
+            driven=everywhere[0],
+        )
+        for row in range(rows)
+    ]

@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference.recordings import write_highd
 
-from ganlane.data import SCHEMA, RowCount, highd_scenes, read_recordings
-from ganlane.data.highd import resample
+from ganlane.data import SCHEMA, read_recordings
+from ganlane.data.highd import highd_scenes, resample
+from ganlane.data.schema import RowCount
 from ganlane.errors import UserError
 
 
@@ -23,14 +24,28 @@ def recording(tmp_path):
     return tmp_path / "01_tracks.csv"
 
 
-def test_each_direction_is_a_scene_at_10_hz_with_x_forward_and_lane_0_rightmost(recording):
+def test_each_direction_is_a_scene_at_10_hz_with_x_forward_and_lane_0_rightmost(
+    recording,
+):
     upper, lower = highd_scenes(recording)
-    assert (upper.name, lower.name) == ("highd-01-upper", "highd-01-lower")
+    assert (upper.name, lower.name) == (
+        "highd-01-upper",
+        "highd-01-lower",
+    )
     assert upper.frame.schema == lower.frame.schema == SCHEMA
-    assert (upper.lane_width_m, lower.lane_width_m) == (4.0, 4.0)
+    assert (upper.lane_width_m, lower.lane_width_m) == (
+        4.0,
+        4.0,
+    )
     # Upwards in the picture is to the right for those who drive to the left: lanes 2 (y 8 to 12)
     # and 3. Lower lanes: 5 (y 20 to 24) is the left one, 6 the right one; left is up.
-    expected = {1: (0, 0.0, 30.0), 2: (1, 4.5, 35.0), 3: (0, 0.0, 25.0), 4: (1, 4.0, 28.0)}
+    expected = {
+        1: (0, 0.0, 30.0),
+        2: (1, 4.5, 35.0),
+        3: (0, 0.0, 25.0),
+        4: (1, 4.0, 28.0),
+    }
+    # The first row of each vehicle, to compare their places.
     begin = {}
     for scene in (upper, lower):
         assert 0.0 <= scene.frame["x"].min() < 4.0
@@ -57,6 +72,7 @@ def test_each_direction_is_a_scene_at_10_hz_with_x_forward_and_lane_0_rightmost(
 
 def test_a_folder_is_read_recording_by_recording(tmp_path):
     write_highd(tmp_path, "01")
+    # The second recording is half as long.
     write_highd(tmp_path, "02", seconds=4.0)
     count = RowCount()
     names = [scene.name for scene in highd_scenes(tmp_path, count)]
@@ -66,17 +82,25 @@ def test_a_folder_is_read_recording_by_recording(tmp_path):
     assert (count.read, count.kept) == (4 * 300, 4 * 300)
 
 
-def test_rows_off_the_lanes_are_dropped_and_end_a_track(recording):
+def test_rows_off_the_lanes_are_dropped_and_end_a_track(
+    recording,
+):
     rows = pl.read_csv(recording)
     aside = (pl.col("id") == 3) & pl.col("frame").is_between(80, 90)
     rows.with_columns(laneId=pl.when(aside).then(7).otherwise("laneId")).write_csv(recording)
     count = RowCount()
     _, lower = highd_scenes(recording, count)
     assert dict(count.dropped) == {"off the lanes of its direction": 11}
-    assert sorted(lower.frame["vehicle"].unique()) == [3, 4, 10_003]
+    # Car 3 comes back as a track of its own.
+    assert sorted(lower.frame["vehicle"].unique()) == [
+        3,
+        4,
+        10_003,
+    ]
 
 
 def damaged(path, column, row, value):
+    # As text, so that all other fields stay as they are.
     table = pl.read_csv(path, infer_schema=False).with_row_index()
     field = pl.when(pl.col("index") == row).then(pl.lit(value)).otherwise(column).alias(column)
     table.with_columns(field).drop("index").write_csv(path)
@@ -85,10 +109,30 @@ def damaged(path, column, row, value):
 @pytest.mark.parametrize(
     ("column", "row", "value", "message"),
     [
-        ("x", 10, "left", r"01_tracks.csv, line 12, column x: 'left' is not a number"),
-        ("frame", 6, "4", r"01_tracks.csv, line 8, column frame: 4 is not after the last frame"),
-        ("id", 250, "77", r"01_tracks.csv, line 252, column id: 77 is not in the tracksMeta file"),
-        ("width", 0, "0", r"01_tracks.csv, line 2, column width: 0.0 is not above 0"),
+        (
+            "x",
+            10,
+            "left",
+            r"01_tracks.csv, line 12, column x: 'left' is not a number",
+        ),
+        (
+            "frame",
+            6,
+            "4",
+            r"01_tracks.csv, line 8, column frame: 4 is not after the last frame",
+        ),
+        (
+            "id",
+            250,
+            "77",
+            r"01_tracks.csv, line 252, column id: 77 is not in the tracksMeta file",
+        ),
+        (
+            "width",
+            0,
+            "0",
+            r"01_tracks.csv, line 2, column width: 0.0 is not above 0",
+        ),
     ],
 )
 def test_a_damaged_field_is_named(recording, column, row, value, message):
@@ -99,28 +143,45 @@ def test_a_damaged_field_is_named(recording, column, row, value, message):
 
 def test_units_that_cannot_be_are_refused(recording):
     rows = pl.read_csv(recording)
+    # In km/h, and with the direction reversed.
     rows.with_columns(xVelocity=3.6 * pl.col("xVelocity")).write_csv(recording)
-    with pytest.raises(UserError, match=r"highd-01-upper.*column speed: the median is 1\d\d"):
+    with pytest.raises(
+        UserError,
+        match=r"highd-01-upper.*column speed: the median is 1\d\d",
+    ):
         read_recordings("highd", recording)
     rows.with_columns(xVelocity=-pl.col("xVelocity")).write_csv(recording)
     with pytest.raises(UserError, match="columns x and speed"):
         read_recordings("highd", recording)
 
 
-def test_the_metadata_files_are_required_and_checked(recording):
+def test_the_metadata_files_are_required_and_checked(
+    recording,
+):
     meta = recording.with_name("01_recordingMeta.csv")
+    # First the markings, then files that are not there.
     damaged(meta, "upperLaneMarkings", 0, "8.0;moon")
     with pytest.raises(
-        UserError, match=r"recordingMeta.csv, line 2, column upperlanemarkings: '8.0;moon'"
+        UserError,
+        match=r"recordingMeta.csv, line 2, column upperlanemarkings: '8.0;moon'",
     ):
         read_recordings("highd", recording)
     meta.unlink()
-    with pytest.raises(UserError, match=r"01_recordingMeta.csv: no such file"):
+    with pytest.raises(
+        UserError,
+        match=r"01_recordingMeta.csv: no such file",
+    ):
         read_recordings("highd", recording)
     write_highd(recording.parent)
-    damaged(recording.with_name("01_tracksMeta.csv"), "drivingDirection", 1, "3")
+    damaged(
+        recording.with_name("01_tracksMeta.csv"),
+        "drivingDirection",
+        1,
+        "3",
+    )
     with pytest.raises(
-        UserError, match=r"01_tracksMeta.csv, line 3, column drivingdirection: 3 is neither"
+        UserError,
+        match=r"01_tracksMeta.csv, line 3, column drivingdirection: 3 is neither",
     ):
         read_recordings("highd", recording)
     with pytest.raises(UserError, match=r"no XX_tracks.csv in this folder"):
@@ -134,17 +195,23 @@ def test_the_metadata_files_are_required_and_checked(recording):
     length=st.integers(1, 120),
     rate=st.sampled_from([10.0, 25.0, 30.0, 50.0]),
 )
-def test_resampling_agrees_with_interpolation_over_time(first, length, rate):
-    frame = np.concatenate((np.arange(length) + first, np.arange(7)))
-    begins = np.r_[True, np.zeros(length - 1, bool), True, np.zeros(6, bool)]
-    values = np.sin(0.3 * frame) + frame
-    new = resample(begins, frame, rate)
-    one = slice(0, int(np.searchsorted(new.before, length)))
-    inside = [
-        k
-        for k in range(2000)
-        if first / rate - 1e-9 <= k * 0.1 <= (first + length - 1) / rate + 1e-9
-    ]
-    assert new.frame[one].tolist() == inside
-    expected = np.interp(0.1 * new.frame[one], frame[:length] / rate, values[:length])
-    np.testing.assert_allclose(new.linear(values)[one], expected, atol=1e-9)
+def test_a_resampled_track_has_the_frames_within_it_and_lies_on_the_recorded_line(
+    first, length, rate
+):
+    old = np.arange(length) + first
+    numbers = {name: 2.0 * old for name in ("x", "y", "speed", "length", "width")}
+    lanes = (np.arange(length) >= 3).astype(int)
+    new = resample(
+        pl.DataFrame({"frame": old, "lane": lanes, **numbers}),
+        rate,
+    )
+    ends = (
+        first / rate - 1e-9,
+        (first + length - 1) / rate + 1e-9,
+    )
+    inside = [k for k in range(2000) if ends[0] <= k * 0.1 <= ends[1]]
+    assert new["frame"].to_list() == inside
+    at = 0.1 * rate * np.array(inside)
+    np.testing.assert_allclose(new["x"], 2.0 * at, atol=1e-9)
+    # The lane of the nearest old frame changes half a frame before the fourth one.
+    assert new["lane"].to_list() == (at - first > 2.5 + 1e-6).astype(int).tolist()

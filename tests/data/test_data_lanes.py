@@ -6,12 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ganlane.data import (
-    find_lane_changes,
-    lane_changes_of_arrays,
+    Tracks,
     synthetic_scenes,
     tracks_of_frame,
 )
-from ganlane.data.lanes import Tracks, lane_width
+from ganlane.data.lanes import (
+    find_lane_changes,
+    lane_changes_of_arrays,
+    lane_width,
+)
 
 
 @given(width=st.floats(3.0, 4.0), seed=st.integers(0, 10_000))
@@ -27,14 +30,27 @@ def test_vehicles_on_the_boundary_tell_the_width_where_lane_keepers_sit_off_cent
     width = 3.5
     # All keep half a metre to the left but in lane 0, so the spacing of the medians says 3.75 m;
     # some cross over.
-    keepers = np.concatenate((np.full(50, 0.0), np.full(50, 4.0), np.full(50, 7.5)))
+    keepers = np.concatenate(
+        (
+            np.full(50, 0.0),
+            np.full(50, 4.0),
+            np.full(50, 7.5),
+        )
+    )
     crossing = np.linspace(0.0, 7.0, 71)
     y = np.concatenate((keepers, crossing))
     assert lane_width(y, np.rint(y / width).astype(np.int64)) == pytest.approx(width, abs=0.03)
 
 
 def test_a_single_lane_gets_the_standard_width_and_one_stray_row_does_not_make_a_lane():
-    assert lane_width(np.linspace(-0.3, 0.3, 20), np.zeros(20, np.int64)) == 3.66
+    assert (
+        lane_width(
+            np.linspace(-0.3, 0.3, 20),
+            np.zeros(20, np.int64),
+        )
+        == 3.66
+    )
+    # Fewer rows than half a second of one vehicle.
     y = np.concatenate((np.zeros(50), np.full(50, 3.5), [30.0]))
     lane = np.concatenate((np.zeros(50), np.ones(50), [5])).astype(np.int64)
     assert lane_width(y, lane) == pytest.approx(3.5)
@@ -46,7 +62,7 @@ TIME = np.arange(80) * 0.1
 RAMP = np.clip(TIME - 2.05, 0.0, WIDTH)
 
 
-def found(y, new_track_at=()):
+def changes_of(y, new_track_at=()):
     begins = np.isin(np.arange(len(y)), [0, *new_track_at])
     return find_lane_changes(Tracks(np.asarray(y), np.full(len(y), WIDTH), begins))
 
@@ -54,15 +70,21 @@ def found(y, new_track_at=()):
 def test_a_ramp_is_timed_from_and_to_three_tenths_off_the_centres():
     # The boundary, 1.8 m, is crossed at 3.85 s. Going back, 2.3 s is the first sample within 0.3 m
     # of the old centre (0.25 m); going on, 5.4 s is the first within 0.3 m of the new one (3.35 m).
-    change = found(RAMP)
-    assert (change.old_lane.tolist(), change.new_lane.tolist(), change.sample.tolist()) == (
+    change = changes_of(RAMP)
+    assert (
+        change.old_lane.tolist(),
+        change.new_lane.tolist(),
+        change.sample.tolist(),
+    ) == (
         [0],
         [1],
         [38],
     )
-    assert (change.tau_s[0], change.tau_e[0], change.duration_s[0]) == pytest.approx(
-        (1.55, 1.55, 3.1)
-    )
+    assert (
+        change.tau_s[0],
+        change.tau_e[0],
+        change.duration_s[0],
+    ) == pytest.approx((1.55, 1.55, 3.1))
     assert change.lateral_speed[0] == pytest.approx(1.0)
     assert change.complete[0]
 
@@ -70,14 +92,15 @@ def test_a_ramp_is_timed_from_and_to_three_tenths_off_the_centres():
 def test_a_driver_who_stops_beside_the_centre_has_ended_the_change():
     # Stops at 2.68 m. Over 1 s about 5.1 s it moves 0.13 m, about 5.2 s 0.03 m: the change ends at
     # 5.2 s.
-    change = found(np.minimum(RAMP, 2.68))
+    change = changes_of(np.minimum(RAMP, 2.68))
     assert change.tau_e[0] == pytest.approx(5.2 - 3.85)
     assert change.lateral_speed[0] == pytest.approx((2.68 - 0.25) / (5.2 - 2.3))
 
 
 def test_a_track_that_ends_in_the_middle_of_the_change_is_censored():
-    early, late = found(RAMP[:45]), found(RAMP[33:])
-    assert [(each.start_censored[0], each.end_censored[0]) for each in (early, late)] == [
+    early = changes_of(RAMP[:45])
+    late = changes_of(RAMP[33:])
+    assert [(change.start_censored[0], change.end_censored[0]) for change in (early, late)] == [
         (False, True),
         (True, False),
     ]
@@ -87,55 +110,61 @@ def test_a_track_that_ends_in_the_middle_of_the_change_is_censored():
 
 @pytest.mark.parametrize(("samples", "changes"), [(4, 0), (5, 2)])
 def test_a_flicker_shorter_than_half_a_second_is_no_change(samples, changes):
+    # 0.1 m off the boundary, first on one side, then on the other.
     y = np.full(40, 1.7)
     y[20 : 20 + samples] = 1.9
-    assert len(found(y)) == changes
+    assert len(changes_of(y)) == changes
 
 
 @pytest.mark.parametrize(("after", "changes"), [(4, 0), (5, 1)])
 def test_the_new_lane_must_be_seen_for_half_a_second(after, changes):
-    assert len(found(np.r_[np.full(20, 1.7), np.full(after, 1.9)])) == changes
-    assert len(found(np.r_[np.full(after, 1.7), np.full(20, 1.9)])) == changes
+    assert len(changes_of(np.r_[np.full(20, 1.7), np.full(after, 1.9)])) == changes
+    assert len(changes_of(np.r_[np.full(after, 1.7), np.full(20, 1.9)])) == changes
 
 
 def test_two_lanes_in_one_go_are_two_changes():
+    # Without a stop in the lane between.
     y = np.clip(1.5 * (TIME - 1.0), 0.0, 2 * WIDTH)
-    changes = found(y)
+    changes = changes_of(y)
     assert changes.old_lane.tolist() == [0, 1]
     assert changes.new_lane.tolist() == [1, 2]
 
 
 def test_a_change_of_vehicle_is_no_lane_change():
+    # The same positions as one track, and as two.
     y = np.r_[np.zeros(20), np.full(20, WIDTH)]
-    assert len(found(y)) == 1
-    assert len(found(y, new_track_at=[20])) == 0
-
-
-def test_vehicles_of_a_simulation_are_measured_one_by_one():
-    changes = lane_changes_of_arrays(np.stack((np.zeros(80), RAMP, WIDTH - RAMP), axis=1), WIDTH)
-    assert changes.sample.tolist() == [80 + 38, 160 + 38]
-    assert changes.new_lane.tolist() == [1, 0]
-    assert changes.tau_s == pytest.approx([1.55, 1.55])
+    assert len(changes_of(y)) == 1
+    assert len(changes_of(y, new_track_at=[20])) == 0
 
 
 @settings(max_examples=20)
 @given(seed=st.integers(0, 500))
-def test_recordings_and_arrays_are_measured_alike_and_mirroring_changes_nothing_but_the_side(seed):
+def test_recordings_and_arrays_are_measured_alike_and_mirroring_changes_nothing_but_the_side(
+    seed,
+):
     frame = synthetic_scenes(seed=seed)
     widths = {"synthetic-0": 3.5, "synthetic-1": 3.5}
     of_frame = find_lane_changes(tracks_of_frame(frame, widths))
+    # Every vehicle is present in all of the 100 frames.
     y = frame["y"].to_numpy().reshape(24, 100).T
-    of_arrays, mirrored = (lane_changes_of_arrays(each, 3.5) for each in (y, 7.0 - y))
+    of_arrays, mirrored = (lane_changes_of_arrays(across, 3.5) for across in (y, 7.0 - y))
     np.testing.assert_array_equal(of_frame.sample, of_arrays.sample)
     np.testing.assert_array_equal(of_frame.duration_s, of_arrays.duration_s)
     np.testing.assert_array_equal(of_frame.new_lane, 2 - mirrored.new_lane)
-    np.testing.assert_allclose(of_frame.lateral_speed, mirrored.lateral_speed, atol=1e-9)
+    np.testing.assert_allclose(
+        of_frame.lateral_speed,
+        mirrored.lateral_speed,
+        atol=1e-9,
+    )
 
 
-@given(lateral_mps=st.floats(0.4, 2.0), begin_s=st.floats(1.5, 3.0))
+@given(
+    lateral_mps=st.floats(0.4, 2.0),
+    begin_s=st.floats(1.5, 3.0),
+)
 def test_the_time_of_a_steady_move_is_its_distance_over_its_speed(lateral_mps, begin_s):
     time = np.arange(200) * 0.1
-    change = found(np.clip(lateral_mps * (time - begin_s), 0.0, WIDTH))
+    change = changes_of(np.clip(lateral_mps * (time - begin_s), 0.0, WIDTH))
     assert change.complete[0]
     # Between 0.3 m off either centre, and up to one sample more at either end.
     least = (WIDTH - 0.6) / lateral_mps

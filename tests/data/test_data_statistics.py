@@ -14,12 +14,12 @@ from ganlane.data import (
     SCHEMA,
     SyntheticTraffic,
     default_scenes,
-    find_lane_changes,
     read_scenes,
     scene_lane_widths,
     synthetic_scenes,
     tracks_of_frame,
 )
+from ganlane.data.lanes import find_lane_changes
 from ganlane.data.statistics import (
     Bins,
     DrivingStatistics,
@@ -51,12 +51,21 @@ def track(vehicle, x, lane=0, scene="s", y=None, length=4.0):
         [length] * n,
         [2.0] * n,
     ]
-    return pl.DataFrame(dict(zip(SCHEMA, columns)), schema=SCHEMA, strict=False)
+    return pl.DataFrame(
+        dict(zip(SCHEMA, columns)),
+        schema=SCHEMA,
+        strict=False,
+    )
 
 
 @pytest.mark.parametrize(
     ("count", "low", "high"),
-    [(0, 0.0, 3.689), (1, 0.0253, 5.572), (10, 4.795, 18.39), (57, 43.17, 73.85)],
+    [
+        (0, 0.0, 3.689),
+        (1, 0.0253, 5.572),
+        (10, 4.795, 18.39),
+        (57, 43.17, 73.85),
+    ],
 )
 def test_the_exact_interval_of_a_count_is_the_tabled_one(count, low, high):
     # Garwood's limits as tabled in textbooks of epidemiology.
@@ -83,6 +92,7 @@ def test_a_steady_acceleration_is_found_by_either_measure_and_a_lost_frame_split
 
 def test_noise_from_frame_to_frame_is_smoothed_away():
     time = np.arange(100) * 0.1
+    # 5 cm of noise in the position, 1 m/s in the speed.
     noisy = track(1, 10.0 * time + 0.05 * (-1.0) ** np.arange(100))
     raw, smoothed = accelerations(noisy.with_columns(speed=10.0 + pl.col("frame") % 2))
     assert np.abs(smoothed).max() == pytest.approx(0.0, abs=1e-9)
@@ -97,6 +107,7 @@ def test_the_headway_is_the_followers_own():
     assert quantities(pl.concat((leader, follower, beside)))["headway"].tolist() == pytest.approx(
         [2.0]
     )
+    # Neither a leader further away nor a meeting of less than a second counts.
     far = track(1, 100.0 + 10.0 * time)
     short = pl.concat((leader, follower)).filter(pl.col("frame") < 9)
     for without in (pl.concat((far, follower)), short):
@@ -106,19 +117,33 @@ def test_the_headway_is_the_followers_own():
 def recording():
     """Three cars of 20 m/s on 500 m; one changes lanes; one comes in two tracks of 100 m."""
     time = np.arange(251) * 0.1
+    # From lane 0 to lane 1 at 1 m/s.
     moves = np.clip(time - 10.05, 0.0, 3.5)
     one = track(1, 20.0 * time, y=moves)
     other = track(2, 20.0 * time, lane=1)
     early, late = (
         track(v, 20.0 * time[:51] + off, lane=2) for v, off in ((3, 0.0), (10_003, 400.0))
     )
-    return pl.concat((one, other, early, late.with_columns(pl.col("frame") + 200)))
+    return pl.concat(
+        (
+            one,
+            other,
+            early,
+            late.with_columns(pl.col("frame") + 200),
+        )
+    )
 
 
 def test_a_recording_is_measured_as_by_hand():
     measured = driving_statistics(recording(), {"s": 3.5})
-    exposure, changes = measured.exposure, measured.lane_changes
-    assert (exposure.scenes, exposure.tracks, exposure.cars, exposure.samples) == (1, 4, 3, 604)
+    exposure = measured.exposure
+    changes = measured.lane_changes
+    assert (
+        exposure.scenes,
+        exposure.tracks,
+        exposure.cars,
+        exposure.samples,
+    ) == (1, 4, 3, 604)
     assert exposure.road_m == pytest.approx(500.0)
     # Straight: 500 + 500 + 100 + 100 m; the change adds 3.5 s of sqrt(20^2 + 1) less 20 m/s, 0.09
     # m.
@@ -126,7 +151,10 @@ def test_a_recording_is_measured_as_by_hand():
     assert changes.count == 1
     assert changes.srlc == pytest.approx(1 / 3 * 1000 / 500)
     assert changes.per_vehicle_km == pytest.approx(1 / 1.2, rel=1e-3)
-    bounds = (changes.per_vehicle_km_low, changes.per_vehicle_km_high)
+    bounds = (
+        changes.per_vehicle_km_low,
+        changes.per_vehicle_km_high,
+    )
     assert bounds == pytest.approx((0.0253 / 1.2, 5.572 / 1.2), rel=1e-2)
     assert changes.t_m_srlc_steps == pytest.approx(750.0)
     assert changes.t_m_vehicle_km_steps == pytest.approx(600.0, rel=1e-3)
@@ -147,7 +175,11 @@ def test_speeds_differ_within_a_frame_but_not_within_a_lane():
 
 
 @pytest.mark.parametrize(
-    "frame", [recording(), synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=1))]
+    "frame",
+    [
+        recording(),
+        synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=1)),
+    ],
 )
 def test_statistics_survive_json(frame):
     measured = driving_statistics(frame)
@@ -157,6 +189,7 @@ def test_statistics_survive_json(frame):
 
 def test_foreign_statistics_are_refused():
     numbers = driving_statistics(recording()).to_dict()
+    # One name is missing, then nearly all.
     del numbers["lane_changes"]["srlc"]
     with pytest.raises(UserError, match="srlc"):
         DrivingStatistics.from_dict(numbers)
@@ -169,46 +202,75 @@ def test_a_lone_lane_keeper_leaves_the_rest_open():
         synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=1, changing_share=0.0))
     )
     changes = measured.lane_changes
-    assert (changes.count, changes.t_m_srlc_steps, changes.per_vehicle_km_low) == (0, None, 0.0)
+    assert (
+        changes.count,
+        changes.t_m_srlc_steps,
+        changes.per_vehicle_km_low,
+    ) == (0, None, 0.0)
     assert changes.per_vehicle_km_high > 0.0
-    assert (measured.headway.count, measured.speed_sd_in_frame) == (0, None)
+    assert (
+        measured.headway.count,
+        measured.speed_sd_in_frame,
+    ) == (0, None)
 
 
-@given(st.lists(st.floats(-30.0, 30.0), min_size=2, max_size=300), st.integers(1, 5))
+@given(
+    st.lists(st.floats(-30.0, 30.0), min_size=2, max_size=300),
+    st.integers(1, 5),
+)
 def test_a_histogram_describes_a_sample_to_a_bins_width(values, parts):
+    # Values beyond the bins count in the outermost ones.
     histogram = Histogram(Bins(-20.0, 20.0, 400))
     for part in np.array_split(np.array(values), parts):
         histogram.add(part)
-    found, exact = histogram.describe(), describe(values)
-    assert (found.count, found.mean) == (exact.count, pytest.approx(exact.mean, abs=1e-9))
-    assert found.sd == pytest.approx(exact.sd, abs=1e-5)
+    described = histogram.describe()
+    exact = describe(values)
+    assert (described.count, described.mean) == (
+        exact.count,
+        pytest.approx(exact.mean, abs=1e-9),
+    )
+    assert described.sd == pytest.approx(exact.sd, abs=1e-5)
     ordered = np.clip(np.sort(values), -20.0, 20.0)
     for level in (0.25, 0.5, 0.95):
         # Between the neighbours of the exact place, and a bin's width more.
         at = level * len(ordered)
-        low, high = (
-            ordered[max(int(np.floor(at)) - 1, 0)],
-            ordered[min(int(np.ceil(at)), len(ordered) - 1)],
-        )
-        assert low - 0.1 - 1e-9 <= found.quantile(level) <= high + 0.1 + 1e-9
+        low = ordered[max(int(np.floor(at)) - 1, 0)]
+        high = ordered[min(int(np.ceil(at)), len(ordered) - 1)]
+        assert low - 0.1 - 1e-9 <= described.quantile(level) <= high + 0.1 + 1e-9
 
 
 def test_the_survival_curve_takes_censored_times_as_lower_bounds():
     # Worked by hand: of 5, one ends at 1 (4/5 are left), one is cut off at 2, of the other 3 one
     # ends at 3 (2/3 of 4/5), one is cut off at 4, the last ends at 5.
-    times, shares = survival_curve([3.0, 1.0, 2.0, 5.0, 4.0], [True, True, False, True, False])
+    times, shares = survival_curve(
+        [3.0, 1.0, 2.0, 5.0, 4.0],
+        [True, True, False, True, False],
+    )
     assert times.tolist() == [1.0, 3.0, 5.0]
     assert shares == pytest.approx([0.8, 0.8 * 2 / 3, 0.0])
-    found = describe_durations([3.0, 1.0, 2.0, 5.0, 4.0], [True, True, False, True, False])
-    assert found.survival_mean_s == pytest.approx(1.0 + 2 * 0.8 + 2 * 0.8 * 2 / 3)
-    assert found.survival_median_s == 5.0
-    assert (found.complete.count, found.censored) == (3, 2)
-    assert (found.complete.mean, found.complete.sd) == (3.0, 2.0)
+    described = describe_durations(
+        [3.0, 1.0, 2.0, 5.0, 4.0],
+        [True, True, False, True, False],
+    )
+    assert described.survival_mean_s == pytest.approx(1.0 + 2 * 0.8 + 2 * 0.8 * 2 / 3)
+    assert described.survival_median_s == 5.0
+    assert (
+        described.complete.count,
+        described.censored,
+    ) == (3, 2)
+    assert (
+        described.complete.mean,
+        described.complete.sd,
+    ) == (3.0, 2.0)
 
 
 def test_durations_that_are_all_censored_have_no_mean():
     durations = describe_durations([1.0, 2.0], [False, False])
-    assert (durations.censored, durations.survival_mean_s, durations.complete.mean) == (
+    assert (
+        durations.censored,
+        durations.survival_mean_s,
+        durations.complete.mean,
+    ) == (
         2,
         None,
         None,
@@ -245,7 +307,12 @@ def measured(scenes):
 
 def test_the_amount_of_driving(measured):
     exposure = measured.exposure
-    assert (exposure.scenes, exposure.tracks, exposure.cars, exposure.samples) == (
+    assert (
+        exposure.scenes,
+        exposure.tracks,
+        exposure.cars,
+        exposure.samples,
+    ) == (
         11,
         645,
         539,
@@ -253,9 +320,10 @@ def test_the_amount_of_driving(measured):
     )
     assert exposure.vehicle_km == pytest.approx(61.7, abs=0.05)
     assert exposure.road_m == pytest.approx(309, abs=0.5)
-    assert (measured.speed.mean, measured.speed.quantile(0.5)) == pytest.approx(
-        (13.2, 13.7), abs=0.05
-    )
+    assert (
+        measured.speed.mean,
+        measured.speed.quantile(0.5),
+    ) == pytest.approx((13.2, 13.7), abs=0.05)
 
 
 def test_the_lane_changes(scenes, measured):
@@ -271,25 +339,27 @@ def test_the_lane_changes(scenes, measured):
     assert changes.count == changes.duration.complete.count + changes.duration.censored == 57
     assert changes.duration.complete.mean < changes.duration.survival_mean_s
     assert 2.5 < changes.duration.survival_mean_s < 4.5
+    # The scene of each change is that of its last row in the old lane.
     rows = find_lane_changes(tracks_of_frame(scenes)).sample
     counts = dict(scenes[rows]["scene"].value_counts().iter_rows())
-    assert [counts.get(f"us101-{letter}", 0) for letter in "abcdefghijk"] == [
-        16,
-        5,
-        3,
-        21,
-        2,
-        0,
-        3,
-        3,
-        0,
-        3,
-        1,
-    ]
+    per_scene = [counts.get(f"us101-{letter}", 0) for letter in "abcdefghijk"]
+    assert per_scene == [16, 5, 3, 21, 2, 0, 3, 3, 0, 3, 1]
 
 
 def test_the_lane_widths(scenes):
-    published = [3.50, 3.54, 3.44, 3.42, 3.58, 3.56, 3.52, 3.33, 3.53, 3.35, 3.39]
+    published = [
+        3.50,
+        3.54,
+        3.44,
+        3.42,
+        3.58,
+        3.56,
+        3.52,
+        3.33,
+        3.53,
+        3.35,
+        3.39,
+    ]
     widths = scene_lane_widths(scenes)
     assert [widths[f"us101-{letter}"] for letter in "abcdefghijk"] == pytest.approx(
         published, abs=0.035
@@ -299,10 +369,13 @@ def test_the_lane_widths(scenes):
     assert scenes.filter(pl.col("scene") == "us101-d")["lane"].max() == 6
 
 
-def test_the_spread_of_speeds_accelerations_and_headways(measured):
-    assert (measured.speed_sd_in_frame, measured.speed_sd_in_lane) == pytest.approx(
-        (2.8, 1.7), abs=0.05
-    )
+def test_the_spread_of_speeds_accelerations_and_headways(
+    measured,
+):
+    assert (
+        measured.speed_sd_in_frame,
+        measured.speed_sd_in_lane,
+    ) == pytest.approx((2.8, 1.7), abs=0.05)
     smooth = [measured.acceleration_smoothed.quantile(level) for level in (0.05, 0.95)]
     assert smooth == pytest.approx([-1.2, 1.4], abs=0.05)
     headways = [measured.headway.quantile(level) for level in (0.05, 0.25, 0.5, 0.75, 0.95)]

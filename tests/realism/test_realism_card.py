@@ -8,27 +8,49 @@ from reference.recordings import recorded_cars
 from ganlane.realism.card import (
     CLOSER_IN,
     card_checks,
+    quantity_rows,
+)
+from ganlane.realism.driving import (
+    ConstantVelocity,
+    RandomDriving,
+    StartOptions,
+)
+from ganlane.realism.long_runs import (
+    LongRunParameters,
+    long_run,
+    totals,
+)
+from ganlane.realism.measures import (
+    QUANTITIES,
+    ceiling,
+    measure_recordings,
+)
+from ganlane.realism.sheets import (
     checks_text,
     draw_distances,
     draw_distributions,
     draw_speeds_over_time,
     long_table,
-    quantity_rows,
 )
-from ganlane.realism.driving import ConstantVelocity, RandomDriving, StartOptions
-from ganlane.realism.long_runs import LongRunParameters, long_run, totals
-from ganlane.realism.measures import QUANTITIES, ceiling, measure_recordings
 from ganlane.realism.starts import simulate
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
-from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
+from ganlane.traffic.presets import (
+    gan_calibrated_traffic,
+    gan_traffic,
+)
 from ganlane.view.figures import COLOURS, INK
 
 WITHOUT_CHANGES = [name for name in QUANTITIES if name != "lane_change_duration"]
 
 
 def test_a_card_puts_the_model_between_its_ceiling_and_its_floors_driven_or_measured_before():
-    recordings = recorded_cars(scenes=4, vehicles=10, seconds=8.0, speed_swing_mps=0.2)
+    recordings = recorded_cars(
+        scenes=4,
+        vehicles=10,
+        seconds=8.0,
+        speed_swing_mps=0.2,
+    )
     recorded = measure_recordings(recordings).counts
     makers = {
         "cruise": ConstantVelocity,
@@ -37,22 +59,38 @@ def test_a_card_puts_the_model_between_its_ceiling_and_its_floors_driven_or_meas
     }
     driven = {name: simulate(make, recordings, StartOptions()) for name, make in makers.items()}
     rows = quantity_rows(
-        "cruise", {**driven, "rival": driven["random"]}, recorded, {}, resamples=100
+        "cruise",
+        {**driven, "rival": driven["random"]},
+        recorded,
+        {},
+        resamples=100,
     )
     assert rows["speed"]["distance"] == rows["speed"]["constant_velocity"] < rows["speed"]["floor"]
     assert rows["acceleration"]["against"]["rival"]["verdict"] == "closer"
     assert rows["speed"]["against"].keys() == {"rival"}
     assert all(rows[name]["samples"] > 0 for name in WITHOUT_CHANGES)
     assert all(rows[name]["ceiling"] == ceiling(recorded[name]) for name in WITHOUT_CHANGES)
-    alone, speeds = {"cruise": driven["cruise"]}, {"speed": recorded["speed"]}
-    rows = quantity_rows("cruise", alone, speeds, {"random": {"speed": 0.5}}, resamples=100)
+    # Without reference drivers in the run, what was measured before counts.
+    alone = {"cruise": driven["cruise"]}
+    speeds = {"speed": recorded["speed"]}
+    rows = quantity_rows(
+        "cruise",
+        alone,
+        speeds,
+        {"random": {"speed": 0.5}},
+        resamples=100,
+    )
     assert rows.keys() == {"speed"}
     assert rows["speed"]["floor"] == 0.5
     assert rows["speed"]["constant_velocity"] is None
 
 
 def test_checks_hold_runs_against_the_recordings():
-    run = long_run(IdmTraffic, Road(), LongRunParameters(vehicles=6, vehicle_km=1.0, most_s=20.0))
+    run = long_run(
+        IdmTraffic,
+        Road(),
+        LongRunParameters(vehicles=6, vehicle_km=1.0, most_s=20.0),
+    )
     quantities = {name: {"against": {"rival": {"verdict": "closer"}}} for name in CLOSER_IN}
     quantiles = [{"acceleration": {"0.05": low, "0.95": 1.0}} for low in (-1.0, -1.2)]
     checks = card_checks(quantities, *quantiles, [0.7, 1.2], 2.8, [run])
@@ -62,6 +100,7 @@ def test_checks_hold_runs_against_the_recordings():
     assert of_run["nobody_off_the_road"] is of_run["overlaps_under_1_per_1000_vehicle_km"] is True
     assert of_run["lane_changes_inside_recorded_interval"] is False
     assert of_run["guard_under_5_percent"] is None
+    # One tail is twice as far out.
     far = {"acceleration": {"0.05": -2.0, "0.95": 1.0}}
     checks = card_checks(quantities, quantiles[0], far, None, 2.8, [run])
     assert checks["acceleration_quantiles_within_30_percent"] is False
@@ -89,10 +128,17 @@ def checked(run, rate=(0.7, 1.2)):
 
 
 def test_traffic_that_stands_still_has_counts_and_no_rates():
-    run = long_run(Still, Road(), LongRunParameters(vehicles=4, vehicle_km=1.0, most_s=10.0))
+    run = long_run(
+        Still,
+        Road(),
+        LongRunParameters(vehicles=4, vehicle_km=1.0, most_s=10.0),
+    )
     assert run["vehicle_km"] == 0.0
     assert run["standstills_in_free_flow"] > 0
-    for name in ("lane_changes_per_vehicle_km", "overlaps_per_1000_vehicle_km"):
+    for name in (
+        "lane_changes_per_vehicle_km",
+        "overlaps_per_1000_vehicle_km",
+    ):
         assert (
             run[name]
             is run[f"{name}_ci"]
@@ -114,17 +160,35 @@ def test_traffic_that_stands_still_has_counts_and_no_rates():
 
 
 def test_a_traffic_without_a_guard_has_none_in_its_card():
+    # The paper's generated traffic is guarded, the calibrated one is not.
     short = LongRunParameters(vehicles=4, vehicle_km=0.1, most_s=10.0)
     without, with_guard = (
         long_run(make, Road(), short) for make in (gan_calibrated_traffic, gan_traffic)
     )
-    assert (without["guard_share"], without["overlaps"]) == (None, 0)
+    assert (
+        without["guard_share"],
+        without["overlaps"],
+    ) == (
+        None,
+        0,
+    )
     assert 0.0 < with_guard["guard_share"] < 1.0
     assert (
-        long_run(lambda road: gan_traffic(road, guard=False), Road(), short)["guard_share"] is None
+        long_run(
+            lambda road: gan_traffic(road, guard=False),
+            Road(),
+            short,
+        )["guard_share"]
+        is None
     )
     assert cells(long_table([without], "a"), "the guard's share") == ["none"]
-    assert cells(long_table([with_guard], "a"), "the guard's share")[1] == "%"
+    assert (
+        cells(
+            long_table([with_guard], "a"),
+            "the guard's share",
+        )[1]
+        == "%"
+    )
     assert "guard under 5 percent: no guard" in checks_text(checked(without))
     assert "no guard" not in checks_text(checked(with_guard))
 
@@ -135,20 +199,35 @@ def in_colour(axes, colour):
 
 def test_densities_have_area_one_and_the_quantitys_unit():
     counts = np.zeros(QUANTITIES["jerk"].number)
+    # Both outermost bins, and one more.
     counts[[0, 1, 49]] = 1, 2, 1
     rule = np.eye(len(counts))[0] * 4
     figure = draw_distributions(
-        {"jerk": counts}, {"idm": {"jerk": rule}, "nobody": {"jerk": 0 * rule}}
+        {"jerk": counts},
+        {
+            "idm": {"jerk": rule},
+            "nobody": {"jerk": 0 * rule},
+        },
     )
     (axes,) = figure.axes
-    assert (axes.get_title("left"), axes.get_xlabel(), axes.get_ylabel()) == (
+    assert (
+        axes.get_title("left"),
+        axes.get_xlabel(),
+        axes.get_ylabel(),
+    ) == (
         "jerk",
         "m/s³",
         "density, per m/s³",
     )
-    (recorded, *ends), (simulated, *left_end) = in_colour(axes, INK), in_colour(axes, COLOURS[0])
+    (recorded, *ends), (simulated, *left_end) = (
+        in_colour(axes, INK),
+        in_colour(axes, COLOURS[0]),
+    )
     # The bins at the ends hold what lies beyond them, too.
-    assert ([mark.get_marker() for mark in ends], [mark.get_marker() for mark in left_end]) == (
+    assert (
+        [mark.get_marker() for mark in ends],
+        [mark.get_marker() for mark in left_end],
+    ) == (
         ["<", ">"],
         ["<"],
     )
@@ -159,7 +238,12 @@ def test_densities_have_area_one_and_the_quantitys_unit():
     assert in_colour(axes, COLOURS[1]) == []
     assert axes.get_xlim() == (-5.0, 5.0)
     named = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert named == ["recorded", "idm", "nobody", "and all values beyond"]
+    assert named == [
+        "recorded",
+        "idm",
+        "nobody",
+        "and all values beyond",
+    ]
 
 
 def row(distance, **against):
@@ -175,7 +259,11 @@ def row(distance, **against):
 def test_every_traffic_has_its_dot_and_interval_at_its_distance():
     rival = {"distance": 0.75, "distance_ci": None}
     figure = draw_distances(
-        {"speed": row(0.25, rule=rival), "gap": row(0.4, rule=rival)}, "my.module.Mine"
+        {
+            "speed": row(0.25, rule=rival),
+            "gap": row(0.4, rule=rival),
+        },
+        "my.module.Mine",
     )
     (axes,) = figure.axes
     interval, dot, *below = in_colour(axes, COLOURS[0])
@@ -186,7 +274,12 @@ def test_every_traffic_has_its_dot_and_interval_at_its_distance():
     assert [label.get_text() for label in axes.get_yticklabels()] == ["speed", "gap"]
     assert axes.get_xlim() == (0.0, 1.0)
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert names == ["Mine", "rule", "half against half", "random"]
+    assert names == [
+        "Mine",
+        "rule",
+        "half against half",
+        "random",
+    ]
 
 
 def test_the_ends_of_the_scale_are_upright_lines_and_what_is_not_known_has_no_mark():
@@ -195,20 +288,35 @@ def test_the_ends_of_the_scale_are_upright_lines_and_what_is_not_known_has_no_ma
         [0.1, 0.1],
         [0.9, 0.9],
     ]
-    nothing = {**row(0.5), "distance": None, "distance_ci": None, "ceiling": None, "floor": None}
+    nothing = {
+        **row(0.5),
+        "distance": None,
+        "distance_ci": None,
+        "ceiling": None,
+        "floor": None,
+    }
     (axes,) = draw_distances({"lane_change_duration": nothing}, "mine").axes
     assert in_colour(axes, COLOURS[0]) == []
     assert len(axes.collections) == 0
 
 
 def test_drift_is_drawn_over_time_with_a_gap_where_nobody_was_left():
-    at = {"10 s": (20.0, 2.0), "60 s": (None, None), "300 s": (22.0, 3.0), "5000 m": (21.0, 2.5)}
+    at = {
+        "10 s": (20.0, 2.0),
+        "60 s": (None, None),
+        "300 s": (22.0, 3.0),
+        "5000 m": (21.0, 2.5),
+    }
     speeds = {
         time: dict(zip(("mean_speed_mps", "spread_mps"), values)) for time, values in at.items()
     }
     figure = draw_speeds_over_time([{"vehicles": 9, "speeds": speeds}], spread_mps=2.8)
     mean, spread = figure.axes
-    assert (mean.get_title("left"), mean.get_xlabel(), mean.get_ylabel()) == (
+    assert (
+        mean.get_title("left"),
+        mean.get_xlabel(),
+        mean.get_ylabel(),
+    ) == (
         "mean speed",
         "time, s",
         "m/s",

@@ -10,6 +10,7 @@ from reference.recordings import made_by_hand, recorded_cars
 from reference.worlds import vehicles as vehicles_of
 from tensordict import TensorDict
 
+from ganlane.data.dense import recorded_frame
 from ganlane.generator.closed_loop import balanced_headway
 from ganlane.realism.driving import (
     ConstantVelocity,
@@ -19,14 +20,15 @@ from ganlane.realism.driving import (
     drive_recordings,
     with_recorded_headways,
 )
-from ganlane.realism.measures import measure_recordings, pooled_distance
-from ganlane.realism.recordings import recorded_frame
 from ganlane.realism.starts import simulate
 from ganlane.sim.idm import following_acceleration
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import IdmMobilTraffic, TrafficModule
-from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
+from ganlane.traffic.presets import (
+    gan_calibrated_traffic,
+    gan_traffic,
+)
 
 
 def steady(**changed):
@@ -34,45 +36,48 @@ def steady(**changed):
     after 8.
     """
     time = np.arange(100)[:, None] * 0.1
+    # The third car is in the lane beside the others.
     speed = np.array([10.0, 12.0, 15.0])
     present = np.ones((100, 3), bool)
     present[:40, 2] = present[80:, 2] = False
     x = np.array([0.0, 40.0, 20.0]) + speed * time
-    fields = {"x": x, "y": np.array([0.0, 0.0, 3.5]), "speed": speed, "present": present, **changed}
+    fields = {
+        "x": x,
+        "y": np.array([0.0, 0.0, 3.5]),
+        "speed": speed,
+        "present": present,
+        **changed,
+    }
     return made_by_hand(**fields, lanes=2, name="steady")
 
 
-def test_constant_velocity_repeats_a_recording_of_constant_velocity_from_the_first_frame_of_a_vehicle_to_its_last():
-    there, recorded = (
-        drive_recordings(ConstantVelocity, [steady()], StartOptions()),
-        recorded_frame([steady()]),
+def test_constant_velocity_repeats_a_recording_of_it_from_a_vehicles_first_frame_to_its_last():
+    there = drive_recordings(ConstantVelocity, [steady()], StartOptions())
+    recorded = recorded_frame([steady()])
+    joined = there.join(
+        recorded,
+        on=["vehicle", "frame"],
+        suffix="_recorded",
     )
-    joined = there.join(recorded, on=["vehicle", "frame"], suffix="_recorded")
     assert joined.height == there.height == recorded.height
     assert (joined["x"] - joined["x_recorded"]).abs().max() < 1e-3
     assert (joined["y"] - joined["y_recorded"]).abs().max() < 1e-5
     frames = there.group_by("vehicle").agg(
-        pl.col("frame").min().alias("first"), pl.col("frame").max().alias("last")
+        pl.col("frame").min().alias("first"),
+        pl.col("frame").max().alias("last"),
     )
-    assert frames.sort("vehicle").rows() == [(0, 0, 99), (1, 0, 99), (2, 40, 79)]
-
-
-def test_its_distance_is_then_0_in_every_quantity():
-    driven, recorded = (
-        simulate(ConstantVelocity, [steady()], StartOptions()),
-        measure_recordings([steady()]),
-    )
-    for name in ("speed", "gap", "time_headway"):
-        # Speeds of 10 m/s lie on an edge of the bins, which rounding may cross; compare at the
-        # middle.
-        assert driven.quantile(name, 0.5) == pytest.approx(recorded.quantile(name, 0.5), abs=1e-2)
-    assert pooled_distance(driven.counts["gap"], recorded.counts["gap"]) < 0.15
+    assert frames.sort("vehicle").rows() == [
+        (0, 0, 99),
+        (1, 0, 99),
+        (2, 40, 79),
+    ]
 
 
 def test_a_vehicle_waits_while_another_stands_in_its_place():
     blocked = steady()
     # The third appears in the first lane, where a car driven at constant velocity is just then.
-    x, y = blocked.x.copy(), blocked.y.copy()
+    x = blocked.x.copy()
+    y = blocked.y.copy()
     y[:, 2] = 0.0
     x[:, 2] = x[:, 0] + 3.0 * (np.arange(100) * 0.1 - 4.0)
     there = drive_recordings(ConstantVelocity, [steady(x=x, y=y)], StartOptions())
@@ -84,7 +89,12 @@ def test_a_vehicle_waits_while_another_stands_in_its_place():
 def test_nobody_drives_beyond_the_end_of_the_recorded_road():
     class Fast(ConstantVelocity):
         def move(self, vehicles, memory, key, step):
-            return super().move(vehicles.with_(speed=vehicles.speed + 1.0), memory, key, step)
+            return super().move(
+                vehicles.with_(speed=vehicles.speed + 1.0),
+                memory,
+                key,
+                step,
+            )
 
     recording = steady()
     there = drive_recordings(Fast, [recording], StartOptions())
@@ -103,12 +113,17 @@ def test_replayed_vehicles_drive_as_recorded_whatever_the_model_does():
 def test_index_0_is_nobody_and_models_see_desired_speeds_above_the_speed_at_entry():
     seen = []
 
+    # Keeps what a traffic is given at each step.
     class Watcher(TrafficModule):
         def move(self, vehicles: Vehicles, memory, key, step):
             seen.append(vehicles)
             return vehicles, memory
 
-    drive_recordings(Watcher, [steady()], StartOptions(desired_above_mps=3.0, repeats=50))
+    drive_recordings(
+        Watcher,
+        [steady()],
+        StartOptions(desired_above_mps=3.0, repeats=50),
+    )
     assert not any(bool(vehicles.valid[:, 0].any()) for vehicles in seen)
     excess = (seen[0].desired_speed - seen[0].speed)[:, 1:3]
     assert 0.0 <= excess.min() <= excess.max() <= 6.0
@@ -117,7 +132,11 @@ def test_index_0_is_nobody_and_models_see_desired_speeds_above_the_speed_at_entr
 
 def test_repeats_differ_and_the_same_seed_repeats_them():
     runs = [
-        drive_recordings(RandomDriving, [steady()], StartOptions(repeats=2, seed=seed))
+        drive_recordings(
+            RandomDriving,
+            [steady()],
+            StartOptions(repeats=2, seed=seed),
+        )
         for seed in (0, 0, 1)
     ]
     assert runs[0].equals(runs[1])
@@ -127,18 +146,31 @@ def test_repeats_differ_and_the_same_seed_repeats_them():
 
 
 @pytest.mark.parametrize(
-    "make", [IdmMobilTraffic, gan_traffic, gan_calibrated_traffic, RandomDriving]
+    "make",
+    [
+        IdmMobilTraffic,
+        gan_traffic,
+        gan_calibrated_traffic,
+        RandomDriving,
+    ],
 )
-def test_every_traffic_stays_finite_from_recorded_starts(make):
-    there = drive_recordings(make, recorded_cars(scenes=1, vehicles=8, seconds=5.0), StartOptions())
+def test_every_traffic_stays_finite_from_recorded_starts(
+    make,
+):
+    there = drive_recordings(
+        make,
+        recorded_cars(scenes=1, vehicles=8, seconds=5.0),
+        StartOptions(),
+    )
     assert all(there[name].is_finite().all() for name in ("x", "y"))
     assert there["lane"].is_between(0, 2).all()
 
 
 def test_the_floor_drives_neither_backwards_nor_smoothly():
+    # Twenty repeats, for quantiles of ten seconds.
     there = simulate(RandomDriving, [steady()], StartOptions(repeats=20))
-    assert there.quantile("acceleration", 0.95) > 1.0
-    assert there.quantile("speed", 0.0) >= 0.0
+    assert there.quantiles["acceleration"]["0.95"] > 1.0
+    assert there.quantiles["speed"]["0.05"] >= 0.0
 
 
 ROAD = Road()
@@ -147,8 +179,20 @@ DRAWN = 9.0
 
 def queue(x, speed=10.0, desired=20.0):
     """One row of vehicles of 4 m in the first lane; index 0 is nobody."""
-    cars = [{"x": at, "speed": speed, "desired_speed": desired, "length": 4.0} for at in x]
-    return vehicles_of({"x": -500.0, "valid": False}, *cars, dtype=torch.float32)
+    cars = [
+        {
+            "x": at,
+            "speed": speed,
+            "desired_speed": desired,
+            "length": 4.0,
+        }
+        for at in x
+    ]
+    return vehicles_of(
+        {"x": -500.0, "valid": False},
+        *cars,
+        dtype=torch.float32,
+    )
 
 
 def headways(vehicles):
@@ -158,12 +202,16 @@ def headways(vehicles):
 def test_a_follower_shows_its_headway_unless_it_is_far_behind_and_none_under_a_tenth_of_a_second():
     behind, ahead = headways(queue([0.0, 24.0]))
     # At 20 m and 10 m/s: (20 m sqrt(1 - (10 / 20)^4) - 2 m) / (10 m/s)
-    assert behind == pytest.approx((20.0 * math.sqrt(15.0 / 16.0) - 2.0) / 10.0, abs=1e-4)
+    assert behind == pytest.approx(
+        (20.0 * math.sqrt(15.0 / 16.0) - 2.0) / 10.0,
+        abs=1e-4,
+    )
     assert ahead == headways(queue([0.0, 64.0]))[0] == DRAWN
     assert headways(queue([0.0, 5.0]))[0] == pytest.approx(0.1)
 
 
 def test_with_the_headway_that_it_shows_idm_neither_speeds_up_nor_brakes():
+    # Gaps of 8, 24 and 16 m at one speed.
     vehicles = queue([0.0, 12.0, 40.0, 60.0])
     shown = balanced_headway(vehicles, ROAD, torch.ones_like(vehicles.x))
     acceleration = following_acceleration(perceive(vehicles, ROAD), headway_s=shown)
@@ -174,8 +222,13 @@ def test_only_those_who_enter_are_credited_and_other_memories_stay_as_they_are()
     vehicles = queue([0.0, 24.0, 48.0])
     drawn = torch.full_like(vehicles.x, DRAWN)
     memory = TensorDict(
-        {"driver": TensorDict({"headway": drawn, "noise": drawn}, [1]), "wish": drawn}, [1]
+        {
+            "driver": TensorDict({"headway": drawn, "noise": drawn}, [1]),
+            "wish": drawn,
+        },
+        [1],
     )
+    # Only the first of the three enters.
     who = torch.tensor([[False, True, False, False]])
     after = with_recorded_headways(memory, vehicles, ROAD, who)
     assert after["driver", "headway"][0, 1] < 3.0
@@ -187,8 +240,18 @@ def test_only_those_who_enter_are_credited_and_other_memories_stay_as_they_are()
 
 def test_a_recorded_platoon_keeps_its_gaps_behind_a_leader_at_constant_speed():
     time = np.arange(60)[:, None] * 0.1
+    # The foremost is replayed.
     x = np.array([0.0, 12.0, 40.0, 55.0]) + 10.0 * time
-    scene = made_by_hand(x, speed=10.0, lanes=1, driven=np.array([True, True, True, False]))
-    there = drive_recordings(HeadwayIdm, [scene], StartOptions(desired_above_mps=5.0))
+    scene = made_by_hand(
+        x,
+        speed=10.0,
+        lanes=1,
+        driven=np.array([True, True, True, False]),
+    )
+    there = drive_recordings(
+        HeadwayIdm,
+        [scene],
+        StartOptions(desired_above_mps=5.0),
+    )
     ends = there.filter(there["frame"] == 59).sort("vehicle")["x"].to_numpy()
     assert np.abs(ends - x[59]).max() < 0.01

@@ -3,7 +3,10 @@
 import pytest
 import torch
 
-from ganlane.realism.driving import ConstantVelocity, RandomDriving
+from ganlane.realism.driving import (
+    ConstantVelocity,
+    RandomDriving,
+)
 from ganlane.realism.long_runs import (
     EventCounter,
     GuardMeter,
@@ -21,8 +24,16 @@ SHORT = LongRunParameters(vehicles=6, vehicle_km=1.0, most_s=20.0)
 
 def start(road, vehicles=9):
     """Three episodes; index 0 is nobody."""
-    key = episode_key(2, torch.zeros(3, dtype=torch.int64), torch.arange(3))
-    return spawned_vehicles(IdmTraffic(road), LongRunParameters(vehicles=vehicles), key)
+    key = episode_key(
+        2,
+        torch.zeros(3, dtype=torch.int64),
+        torch.arange(3),
+    )
+    return spawned_vehicles(
+        IdmTraffic(road),
+        LongRunParameters(vehicles=vehicles),
+        key,
+    )
 
 
 def test_all_but_the_ego_are_there_and_start_as_the_simulators_episodes_do():
@@ -37,29 +48,51 @@ def test_all_but_the_ego_are_there_and_start_as_the_simulators_episodes_do():
 
 
 def test_constant_velocity_keeps_every_speed_and_changes_no_lane():
+    # 20 s of six vehicles in each episode.
     run = long_run(ConstantVelocity, Road(), SHORT)
     assert run["vehicle_km"] >= 1.0
     assert run["lane_changes"] == run["off_road"] == run["standstills_in_free_flow"] == 0
     assert run["acceleration_quantiles"]["0.95"] == pytest.approx(0.0, abs=0.01)
     assert run["speeds"]["10 s"]["mean_speed_mps"] == pytest.approx(
-        1000 * run["vehicle_km"] / (20 * 6 * run["episodes"]), rel=1e-3
+        1000 * run["vehicle_km"] / (20 * 6 * run["episodes"]),
+        rel=1e-3,
     )
-    assert run["speeds"]["60 s"] == {"mean_speed_mps": None, "spread_mps": None, "episodes": 0}
+    assert run["speeds"]["60 s"] == {
+        "mean_speed_mps": None,
+        "spread_mps": None,
+        "episodes": 0,
+    }
     assert run["guard_share"] is None
 
 
 def test_blind_driving_overlaps_and_careful_driving_does_not():
-    random = long_run(RandomDriving, Road(), LongRunParameters(9, 5.0, 30.0))
+    # Nobody looks at anybody.
+    random = long_run(
+        RandomDriving,
+        Road(),
+        LongRunParameters(9, 5.0, 30.0),
+    )
     assert random["overlaps"] > 0
     assert random["lane_changes"] > 0
     low, high = random["overlaps_per_1000_vehicle_km_ci"]
     assert low < random["overlaps_per_1000_vehicle_km"] < high
-    assert long_run(IdmTraffic, Road(), LongRunParameters(9, 5.0, 30.0))["overlaps"] == 0
+    assert (
+        long_run(
+            IdmTraffic,
+            Road(),
+            LongRunParameters(9, 5.0, 30.0),
+        )["overlaps"]
+        == 0
+    )
 
 
 def test_the_same_numbers_come_out_again_and_others_of_another_seed():
     runs = [
-        long_run(RandomDriving, Road(), LongRunParameters(6, 1.0, 20.0, seed=seed))
+        long_run(
+            RandomDriving,
+            Road(),
+            LongRunParameters(6, 1.0, 20.0, seed=seed),
+        )
         for seed in (0, 0, 1)
     ]
     assert runs[0] == runs[1]
@@ -67,7 +100,14 @@ def test_the_same_numbers_come_out_again_and_others_of_another_seed():
 
 
 def test_totals_add_counts_up_and_know_nothing_of_nothing():
-    runs = [long_run(RandomDriving, Road(), LongRunParameters(n, 2.0, 20.0)) for n in (5, 9)]
+    runs = [
+        long_run(
+            RandomDriving,
+            Road(),
+            LongRunParameters(n, 2.0, 20.0),
+        )
+        for n in (5, 9)
+    ]
     km, overlaps, off_road = (
         sum(run[name] for run in runs) for name in ("vehicle_km", "overlaps", "off_road")
     )
@@ -78,18 +118,26 @@ def test_totals_add_counts_up_and_know_nothing_of_nothing():
 
 def in_line(spacing_m, speed_mps):
     """Three rows of ten vehicles in the first lane; index 0 is nobody."""
+    # From the rearmost to the foremost.
     x = spacing_m * torch.arange(10.0).expand(3, 10)
-    return start(Road()).with_(x=x, y=torch.zeros_like(x), speed=torch.full_like(x, speed_mps))
+    return start(Road()).with_(
+        x=x,
+        y=torch.zeros_like(x),
+        speed=torch.full_like(x, speed_mps),
+    )
 
 
 def test_events_are_counted_when_they_begin_and_the_ego_which_is_not_there_meets_nobody():
-    apart, counter, index = in_line(100.0, 20.0), EventCounter(Road()), torch.arange(10)
+    apart = in_line(100.0, 20.0)
+    counter = EventCounter(Road())
+    index = torch.arange(10)
     touching = apart.with_(x=torch.where(index == 2, apart.x - 98.0, apart.x))
     outside = apart.with_(y=torch.where(index == 3, -1.0, 0.0).expand(3, 10))
     for at in (apart, touching, touching, apart, touching):
         counter.count(at, 0)
     # In each of three rows the second and the first vehicle meet, twice.
     assert (counter.overlaps, counter.off_road) == (6, 0)
+    # The place of the ego, which is not there.
     on_top = apart.with_(x=torch.where(index == 0, apart.x[:, 1:2], apart.x))
     for at in (outside, outside, on_top):
         counter.count(at, 0)
@@ -97,8 +145,13 @@ def test_events_are_counted_when_they_begin_and_the_ego_which_is_not_there_meets
 
 
 def test_standing_in_a_queue_is_no_standstill_but_standing_alone_is():
-    queue, counter = in_line(20.0, 0.0), EventCounter(Road())
-    for step, expected in ((8, 0), (9, 3), (19, 3)):  # only the foremost has nobody ahead
+    queue = in_line(20.0, 0.0)
+    counter = EventCounter(Road())
+    for step, expected in (
+        (8, 0),
+        (9, 3),
+        (19, 3),
+    ):  # only the foremost has nobody ahead
         counter.count(queue, step)
         assert counter.standstills == expected
 
@@ -109,15 +162,17 @@ class Swerver(TrafficModule):
     def move(self, vehicles, memory, key, step):
         index = torch.arange(vehicles.x.shape[1])
         speed = vehicles.speed - torch.where(index == 1, 2.0, 0.0)
-        return vehicles.with_(speed=speed, y=vehicles.y + torch.where(index == 2, 0.5, 0.0)), memory
+        return vehicles.with_(
+            speed=speed,
+            y=vehicles.y + torch.where(index == 2, 0.5, 0.0),
+        ), memory
 
 
 def test_the_guard_meter_counts_what_the_guard_alters_and_changes_nothing():
-    guard, meter, vehicles = (
-        Guard(Road()),
-        GuardMeter(),
-        in_line(200.0, 15.0).with_(y=start(Road()).y),
-    )
+    guard = Guard(Road())
+    meter = GuardMeter()
+    vehicles = in_line(200.0, 15.0).with_(y=start(Road()).y)
+    # Moved by hand, then rewritten by the guard.
     moved, _ = Swerver().move(vehicles, {}, torch.zeros(3), torch.zeros(3))
     assert meter.share is None
     unwatched, _ = guard.rewrite(vehicles, moved, {}, torch.zeros(3), torch.zeros(3))

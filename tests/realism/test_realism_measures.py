@@ -5,7 +5,6 @@ Distances of histograms with their intervals; what ships.
 
 import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +15,12 @@ from reference.recordings import made_by_hand, recorded_cars
 from scipy.spatial.distance import jensenshannon
 from scipy.stats import binom
 
-from ganlane.data import default_scenes, read_scenes, scene_lane_widths
+from ganlane.data import (
+    default_scenes,
+    read_scenes,
+    scene_lane_widths,
+)
+from ganlane.data.dense import recorded_frame, recordings_of
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Estimate
 from ganlane.realism.card import verdict
@@ -28,28 +32,26 @@ from ganlane.realism.measures import (
     distance,
     distance_difference,
     jensen_shannon,
-    measure,
     measure_recordings,
+    samples_of,
+    with_motion,
 )
-from ganlane.realism.recordings import recorded_frame, recordings_of, segments
 
 
-def measured(*recordings):
-    return measure(recorded_frame(recordings), sorted(each.name for each in recordings))
-
-
-def values(result, quantity):
-    return result.samples[quantity]["value"].to_numpy()
+def values(recording, quantity):
+    """The samples of a quantity."""
+    motion = with_motion(recorded_frame([recording]))
+    return samples_of(motion)[quantity]["value"].to_numpy()
 
 
 TIME = np.arange(100)[:, None] * 0.1
 
 
 def test_constant_acceleration_has_no_jerk_and_a_cubic_path_its_own_and_the_speed_of_the_second():
-    result = measured(made_by_hand(10.0 * TIME + 0.5 * 0.8 * TIME**2))
+    result = made_by_hand(10.0 * TIME + 0.5 * 0.8 * TIME**2)
     assert values(result, "acceleration") == pytest.approx(0.8)
     assert values(result, "jerk") == pytest.approx(0.0, abs=1e-9)
-    result = measured(made_by_hand(10.0 * TIME + 0.3 * TIME**3 / 6.0))
+    result = made_by_hand(10.0 * TIME + 0.3 * TIME**3 / 6.0)
     assert values(result, "jerk") == pytest.approx(0.3)
     # Mean over the second about t: 10 + 0.3 t^2 / 2 + 0.3 / 24.
     t = TIME[30:95, 0]
@@ -58,58 +60,68 @@ def test_constant_acceleration_has_no_jerk_and_a_cubic_path_its_own_and_the_spee
 
 def test_the_first_three_seconds_of_a_vehicle_do_not_count():
     present = np.ones((100, 2), bool)
+    # The second appears after 5 s.
     present[:50, 1] = False
-    result = measured(made_by_hand(np.hstack([20.0 * TIME, 20.0 * TIME + 30.0]), present=present))
+    result = made_by_hand(
+        np.hstack([20.0 * TIME, 20.0 * TIME + 30.0]),
+        present=present,
+    )
     # The first: samples 30 to 94. The second appears at 50: samples 80 to 94.
     assert len(values(result, "speed")) == 65 + 15
-    assert result.vehicle_km == pytest.approx((70 + 20) * 2.0 / 1000.0)
+    assert measure_recordings([result]).vehicle_km == pytest.approx((70 + 20) * 2.0 / 1000.0)
 
 
 CLOSING_IN = np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME])
 
 
-def test_gap_headway_and_time_to_collision_of_two_cars_in_one_lane_whether_or_not_the_leader_is_replayed():
+def test_gap_headway_and_time_to_collision_of_two_cars_whether_or_not_the_leader_is_replayed():
     for driven in (True, False):
-        result = measured(made_by_hand(CLOSING_IN, driven=np.array([True, driven])))
+        result = made_by_hand(CLOSING_IN, driven=np.array([True, driven]))
         gap = 60.0 - 2.0 * TIME[30:95, 0]
         assert values(result, "gap") == pytest.approx(gap)
         assert values(result, "time_headway") == pytest.approx(gap / 12.0)
         assert values(result, "time_to_collision") == pytest.approx(gap / 2.0)
         assert len(values(result, "speed")) == 65 * (1 + driven)
-    result = measured(
-        made_by_hand(CLOSING_IN, np.hstack([np.zeros_like(TIME), np.full_like(TIME, 3.5)]))
+    # A leader in another lane is none.
+    beside = made_by_hand(
+        CLOSING_IN,
+        np.hstack([0.0 * TIME, 0.0 * TIME + 3.5]),
     )
-    assert len(values(result, "gap")) == 0
-    assert result.quantile("gap", 0.5) is None
+    assert measure_recordings([beside]).quantiles["gap"]["0.5"] is None
 
 
 def test_spread_of_speeds_is_that_within_a_frame():
+    # 10, 12 and 14 m/s; two vehicles are too few.
     x = np.hstack([(10.0 + 2.0 * k) * TIME + 40.0 * k for k in range(3)])
-    assert values(measured(made_by_hand(x)), "speed_spread") == pytest.approx(2.0)
-    assert len(values(measured(made_by_hand(x[:, :2])), "speed_spread")) == 0
+    assert values(made_by_hand(x), "speed_spread") == pytest.approx(2.0)
+    assert len(values(made_by_hand(x[:, :2]), "speed_spread")) == 0
 
 
 def test_a_lane_change_counts_once_with_its_duration_unless_it_comes_too_early():
     for start, expected in ((4.0, 1), (0.2, 0)):
         part = np.clip((TIME - start) / 4.0, 0.0, 1.0)
+        # Along half a cosine, in 4 s.
         y = 3.5 * 0.5 * (1.0 - np.cos(np.pi * part))
-        result = measured(made_by_hand(20.0 * TIME, y))
-        assert result.lane_changes == expected
-        if expected:
-            assert 2.0 < values(result, "lane_change_duration")[0] < 4.0
+        result = made_by_hand(20.0 * TIME, y)
+        assert measure_recordings([result]).lane_changes == expected
+        assert all(2.0 < duration < 4.0 for duration in values(result, "lane_change_duration"))
 
 
 def test_histograms_keep_scenes_apart_and_everything_in_the_outermost_bins():
-    slow, fast = made_by_hand(10.5 * TIME, name="slow"), made_by_hand(55.0 * TIME, name="fast")
-    counts = measured(slow, fast).counts["speed"]
+    slow = made_by_hand(10.5 * TIME, name="slow")
+    fast = made_by_hand(55.0 * TIME, name="fast")
+    counts = measure_recordings([slow, fast]).counts["speed"]
     assert counts.shape == (2, QUANTITIES["speed"].number)
-    assert counts[0, -1] == counts[0].sum() == 65
-    assert counts[1, 10] == counts[1].sum() == 65
+    assert counts[0, 10] == counts[0].sum() == 65
+    assert counts[1, -1] == counts[1].sum() == 65
 
 
 def test_segments_keep_their_unit_and_leave_out_what_was_to_be_skipped():
-    pieces = segments(made_by_hand(10.0 * TIME), 3.0, skip_s=3.5)
-    assert [piece.name for piece in pieces] == ["scene@35", "scene@65"]
+    pieces = made_by_hand(10.0 * TIME).segments(3.0, skip_s=3.5)
+    assert [piece.name for piece in pieces] == [
+        "scene@35",
+        "scene@65",
+    ]
     assert {piece.unit for piece in pieces} == {"scene"}
     assert pieces[1].x[0, 0] == pytest.approx(65.0)
 
@@ -127,15 +139,13 @@ def test_distance_is_that_of_scipy(rows):
     )
 
 
-def test_equal_shapes_are_at_0_and_disjoint_ones_at_1():
-    assert jensen_shannon(np.array([1.0, 3.0]), np.array([10.0, 30.0])) == pytest.approx(
-        0.0, abs=1e-7
-    )
+def test_disjoint_histograms_are_at_1_and_an_empty_one_has_no_distance():
     assert jensen_shannon(np.array([5.0, 0.0]), np.array([0.0, 2.0])) == pytest.approx(1.0)
     assert np.isnan(jensen_shannon(np.zeros(2), np.ones(2)))
 
 
 def test_scenes_that_are_alike_have_a_low_ceiling_and_unlike_ones_a_high_one():
+    # Halves of equal units are equal, of disjoint ones disjoint.
     alike = np.tile([4.0, 8.0, 4.0], (6, 1))
     unlike = np.eye(6) * 10.0
     assert ceiling(alike) == pytest.approx(0.0, abs=1e-7)
@@ -145,19 +155,14 @@ def test_scenes_that_are_alike_have_a_low_ceiling_and_unlike_ones_a_high_one():
 
 def histograms(shift, seed, number=12):
     random = np.random.default_rng(seed)
-    return (
-        np.stack(
-            [
-                np.bincount(random.binomial(20, 0.3 + shift, 200), minlength=21)
-                for _ in range(number)
-            ]
-        )
-        * 1.0
-    )
+    scenes = [random.binomial(20, 0.3 + shift, 200) for _ in range(number)]
+    return np.stack([np.bincount(scene, minlength=21) for scene in scenes]) * 1.0
 
 
 def test_a_model_that_is_nearer_in_every_scene_is_found_to_be_closer():
-    recorded, near, far = histograms(0.0, 0), histograms(0.02, 1), histograms(0.2, 2)
+    recorded = histograms(0.0, 0)
+    near = histograms(0.02, 1)
+    far = histograms(0.2, 2)
     difference = distance_difference(near, far, recorded, resamples=200)
     assert difference.high < 0.0
     assert difference.value == pytest.approx(
@@ -167,46 +172,49 @@ def test_a_model_that_is_nearer_in_every_scene_is_found_to_be_closer():
     assert verdict(distance_difference(far, near, recorded, resamples=200)) == "farther"
 
 
-def test_two_runs_of_one_model_are_undecided_and_one_scene_gives_no_interval_and_no_verdict():
-    difference = distance_difference(
-        histograms(0.1, 3), histograms(0.1, 4), histograms(0.0, 5), resamples=200
-    )
-    assert difference.low < 0.0 < difference.high
-    assert verdict(difference) == verdict(Estimate(-0.5, None, None)) == "undecided"
+def test_one_scene_gives_no_interval_and_no_verdict():
+    assert verdict(Estimate(-0.5, None, None)) == "undecided"
     assert distance(histograms(0.1, 0, 1), histograms(0.0, 1, 1)).interval is None
 
 
 def draws(shift, number, trials=40):
-    """Recordings and a model that lies by ``shift`` beside them, of histograms with means of their
-    own.
+    """Recordings, and two models that lie by ``shift`` beside them and are driven four times.
+
+    Each is ``number`` histograms with means of their own.
     """
     random = np.random.default_rng(number)
+
+    def sampled(means, sizes):
+        scenes = [random.binomial(20, p, size) for p, size in zip(means, sizes)]
+        return np.stack([np.bincount(scene, minlength=21) for scene in scenes]) * 1.0
+
     for _ in range(trials):
         means = random.normal(0.3, 0.05, number).clip(0.1, 0.6)
         size = random.integers(15, 60, number)
-        yield [
-            np.stack(
-                [
-                    np.bincount(random.binomial(20, p, times * n), minlength=21)
-                    for p, n in zip(at, size)
-                ]
-            )
-            * 1.0
-            for at, times in ((means, 1), (means + shift, 4), (means + shift, 4))
-        ]
+        model = means + shift
+        yield (
+            sampled(means, size),
+            sampled(model, 4 * size),
+            sampled(model, 4 * size),
+        )
 
 
 @pytest.mark.parametrize("number", [4, 11])
-def test_the_interval_of_a_perfect_model_holds_0_and_its_own_estimate(number):
+def test_the_interval_of_a_perfect_model_holds_0_and_its_own_estimate(
+    number,
+):
     intervals = [
         distance(model, recorded, resamples=300) for recorded, model, _ in draws(0.0, number)
     ]
-    assert all(each.low <= each.value <= each.high for each in intervals)
-    assert sum(each.low == 0.0 for each in intervals) >= 0.9 * len(intervals)
+    assert all(interval.low <= interval.value <= interval.high for interval in intervals)
+    assert sum(interval.low == 0.0 for interval in intervals) >= 0.9 * len(intervals)
 
 
 @pytest.mark.parametrize("number", [4, 11])
-def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(number):
+def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(
+    number,
+):
+    # The distance of the distributions that both are drawn from.
     many = np.random.default_rng(1).normal(0.3, 0.05, 2000).clip(0.1, 0.6)
     true = float(
         jensen_shannon(
@@ -216,11 +224,16 @@ def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(number):
     intervals = [
         distance(model, recorded, resamples=300) for recorded, model, _ in draws(0.1, number)
     ]
-    assert sum(each.low <= true <= each.high for each in intervals) >= 0.85 * len(intervals)
-    assert sum(each.low > 0.0 for each in intervals) >= 0.9 * len(intervals)
+    assert sum(interval.low <= true <= interval.high for interval in intervals) >= 0.85 * len(
+        intervals
+    )
+    assert sum(interval.low > 0.0 for interval in intervals) >= 0.9 * len(intervals)
 
 
-@pytest.mark.parametrize(("number", "shift"), [(4, 0.0), (11, 0.0), (4, 0.1), (11, 0.1)])
+@pytest.mark.parametrize(
+    ("number", "shift"),
+    [(4, 0.0), (11, 0.0), (4, 0.1), (11, 0.1)],
+)
 def test_two_equally_good_models_are_seldom_told_apart(number, shift):
     verdicts = [
         verdict(distance_difference(*models, recorded, resamples=300))
@@ -231,10 +244,13 @@ def test_two_equally_good_models_are_seldom_told_apart(number, shift):
 
 @given(COUNTS, COUNTS, COUNTS)
 def test_every_interval_holds_its_estimate(recorded, first, second):
-    own = distance(first, recorded, resamples=20)
-    for estimate in (own, distance_difference(first, second, recorded, resamples=20)):
+    single = distance(first, recorded, resamples=20)
+    for estimate in (
+        single,
+        distance_difference(first, second, recorded, resamples=20),
+    ):
         assert estimate.low <= estimate.value <= estimate.high
-    assert own.low >= 0.0
+    assert single.low >= 0.0
 
 
 def test_a_model_does_not_differ_from_itself_and_unpaired_units_are_resampled_on_its_side():
@@ -242,7 +258,8 @@ def test_a_model_does_not_differ_from_itself_and_unpaired_units_are_resampled_on
     assert distance_difference(model, model, histograms(0.0, 5), resamples=50) == Estimate(
         0.0, 0.0, 0.0
     )
-    model, recorded = histograms(0.1, 3, 5), histograms(0.0, 5, 8)
+    model = histograms(0.1, 3, 5)
+    recorded = histograms(0.0, 5, 8)
     estimate = distance(model, recorded, paired=False, resamples=100)
     assert estimate.low <= estimate.value <= estimate.high
     assert distance(model[:1], recorded, paired=False).interval is None
@@ -251,11 +268,21 @@ def test_a_model_does_not_differ_from_itself_and_unpaired_units_are_resampled_on
 @pytest.fixture
 def reference():
     recordings = recorded_cars(scenes=3)
-    whole = {"lane_changes": 3, "vehicle_km": 2.0, "speed_spread_mps": 1.0}
-    floors = {"random": {"speed": 0.5}, "constant_velocity": {"speed": 0.2}}
-    names = [each.name for each in recordings]
-    return replace(
-        Reference.of(measure_recordings(recordings), names, whole, "made up"), floors=floors
+    whole = {
+        "lane_changes": 3,
+        "vehicle_km": 2.0,
+        "speed_spread_mps": 1.0,
+    }
+    floors = {
+        "random": {"speed": 0.5},
+        "constant_velocity": {"speed": 0.2},
+    }
+    return Reference(
+        **vars(measure_recordings(recordings)),
+        source="made up",
+        units=[recording.name for recording in recordings],
+        whole=whole,
+        floors=floors,
     )
 
 
@@ -265,7 +292,10 @@ def test_a_reference_comes_back_from_its_file(reference, tmp_path):
     again = Reference.load(path)
     for name in QUANTITIES:
         assert np.array_equal(again.counts[name], reference.counts[name])
-    assert {**vars(again), "counts": 0} == {**vars(reference), "counts": 0}
+    assert {**vars(again), "counts": 0} == {
+        **vars(reference),
+        "counts": 0,
+    }
     assert json.loads(path.read_text())["ceilings"].keys() == QUANTITIES.keys()
 
 
@@ -276,9 +306,15 @@ def test_another_file_is_refused_in_a_sentence(damage, reference, tmp_path):
         reference.save(path)
         numbers = json.loads(path.read_text())
         del numbers["checksum"]  # that of another content
-        numbers |= {"kind": {"kind": "a recipe"}, "bins": {"bins": {}}}.get(damage, {})
+        numbers |= {
+            "kind": {"kind": "a recipe"},
+            "bins": {"bins": {}},
+        }.get(damage, {})
         path.write_text("{" if damage == "text" else json.dumps(numbers))
-    with pytest.raises(UserError, match=r"reference\.json: not the histograms"):
+    with pytest.raises(
+        UserError,
+        match=r"reference\.json: not the histograms",
+    ):
         Reference.load(path)
 
 
@@ -291,7 +327,12 @@ def test_what_ships_is_small_and_holds_no_trajectories():
     assert rate["lane_changes"] == 57
     assert rate["per_vehicle_km_ci"] == pytest.approx([0.70, 1.20], abs=0.01)
     assert shipped.spread_mps == pytest.approx(2.8, abs=0.05)
-    for name in ("acceleration", "jerk", "time_headway", "time_to_collision"):
+    for name in (
+        "acceleration",
+        "jerk",
+        "time_headway",
+        "time_to_collision",
+    ):
         assert ceiling(shipped.counts[name]) < shipped.floors["random"][name]
     assert all(0.0 < ceiling(shipped.counts[name]) < 1.0 for name in QUANTITIES)
 
@@ -303,8 +344,9 @@ def test_what_ships_is_what_the_recordings_show():
         pytest.skip(str(missing))
     frame = read_scenes(path)
     recordings = recordings_of(frame, scene_lane_widths(frame))
-    measured, shipped = measure_recordings(recordings), Reference.load(SHIPPED_REFERENCE)
-    assert shipped.units == [each.name for each in recordings]
+    measured = measure_recordings(recordings)
+    shipped = Reference.load(SHIPPED_REFERENCE)
+    assert shipped.units == [recording.name for recording in recordings]
     for name in QUANTITIES:
         assert np.array_equal(measured.counts[name], shipped.counts[name])
     low, high = (shipped.quantiles["acceleration"][level] for level in ("0.05", "0.95"))

@@ -1,16 +1,25 @@
-"""Everybody from the same recorded scenes, from some of them alone, and with fitted desired speeds."""
+"""Everybody from the same recorded scenes, from some of them, and with fitted desired speeds."""
 
 import numpy as np
 import pytest
 from reference.recordings import made_by_hand
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
+from ganlane.data.dense import recorded_frame
 from ganlane.errors import UserError
 from ganlane.realism.card import card_rows
-from ganlane.realism.driving import ConstantVelocity, StartOptions
+from ganlane.realism.driving import (
+    ConstantVelocity,
+    StartOptions,
+)
 from ganlane.realism.long_runs import LongRunParameters
 from ganlane.realism.measures import ceiling
-from ganlane.realism.starts import Fold, fit_excess, recorded_starts, spawned_frame
+from ganlane.realism.starts import (
+    Fold,
+    fit_excess,
+    recorded_starts,
+    spawned_recordings,
+)
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 
@@ -27,10 +36,17 @@ def starts_of(frame, *folds, fit=False):
     return recorded_starts(folds, frame, StartOptions(), fit, "made up")
 
 
-def test_scenes_alone_have_the_ceiling_of_their_own_halves(frame):
+def test_scenes_alone_have_the_ceiling_of_their_own_halves(
+    frame,
+):
     starts = starts_of(frame, Fold(MAKERS, NAMES, NAMES[1:3]))
     assert starts.separately_held_out == NAMES[1:3]
-    alone = card_rows(starts.restricted_to(starts.separately_held_out), "cruise", 100)
+    # The ceiling is that of two scenes, no longer of four.
+    alone = card_rows(
+        starts.restricted_to(starts.separately_held_out),
+        "cruise",
+        100,
+    )
     for name in ("speed", "gap"):
         assert alone[name]["ceiling"] == ceiling(starts.recorded.counts[name][1:3])
         assert alone[name]["ceiling"] != card_rows(starts, "cruise", 100)[name]["ceiling"]
@@ -38,18 +54,28 @@ def test_scenes_alone_have_the_ceiling_of_their_own_halves(frame):
 
 
 def test_folds_are_driven_one_by_one_and_joined(frame):
-    folds = Fold(MAKERS, NAMES[:2], NAMES[:2]), Fold(MAKERS, NAMES[2:], NAMES[2:])
+    folds = (
+        Fold(MAKERS, NAMES[:2], NAMES[:2]),
+        Fold(MAKERS, NAMES[2:], NAMES[2:]),
+    )
     apart = starts_of(frame, *folds)
     whole = starts_of(frame, Fold(MAKERS, NAMES, []))
     assert apart.scenes == whole.scenes == NAMES
     assert apart.separately_held_out == []
     assert np.array_equal(
-        apart.driven["cruise"].counts["speed"], whole.driven["cruise"].counts["speed"]
+        apart.driven["cruise"].counts["speed"],
+        whole.driven["cruise"].counts["speed"],
     )
 
 
-def test_a_fold_without_scenes_is_passed_over_and_none_at_all_is_refused(frame):
-    starts = starts_of(frame, Fold(MAKERS, [], []), Fold(MAKERS, NAMES[:2], []))
+def test_a_fold_without_scenes_is_passed_over_and_none_at_all_is_refused(
+    frame,
+):
+    starts = starts_of(
+        frame,
+        Fold(MAKERS, [], []),
+        Fold(MAKERS, NAMES[:2], []),
+    )
     assert starts.scenes == NAMES[:2]
     with pytest.raises(UserError, match="no scene to start from"):
         starts_of(frame, Fold(MAKERS, [], []))
@@ -58,9 +84,19 @@ def test_a_fold_without_scenes_is_passed_over_and_none_at_all_is_refused(frame):
 
 
 def test_spawned_trajectories_are_whole_tracks_in_the_schema():
-    frame = spawned_frame(IdmTraffic, Road(), LongRunParameters(5, most_s=10.0), 2)
+    frame = recorded_frame(
+        spawned_recordings(
+            IdmTraffic,
+            Road(),
+            LongRunParameters(5, most_s=10.0),
+            2,
+        )
+    )
     assert frame.height == 2 * 5 * 101
-    assert frame["unit"].unique().sort().to_list() == ["spawned-0", "spawned-1"]
+    assert frame["unit"].unique().sort().to_list() == [
+        "spawned-0",
+        "spawned-1",
+    ]
 
 
 def test_the_excess_that_was_used_is_the_one_that_is_fitted():
@@ -68,12 +104,26 @@ def test_the_excess_that_was_used_is_the_one_that_is_fitted():
         """Drives at its desired speed at once."""
 
         def move(self, vehicles, memory, key, step):
-            return super().move(vehicles.with_(speed=vehicles.desired_speed), memory, key, step)
+            return super().move(
+                vehicles.with_(speed=vehicles.desired_speed),
+                memory,
+                key,
+                step,
+            )
 
     time = np.arange(80)[:, None] * 0.1
     random = np.random.default_rng(0)
+    # Everybody drives by 0 to 8 m/s faster than at the start.
     speed = 10.0 + 8.0 * random.uniform(size=30)
     x = 100.0 * np.arange(30) + speed * time
     shown = np.where(np.arange(80)[:, None] == 0, 10.0, speed)
     scene = made_by_hand(x, speed=shown, lanes=1)
-    assert fit_excess(Eager, [scene], StartOptions(repeats=1), (1.0, 4.0, 8.0)) == 4.0
+    assert (
+        fit_excess(
+            Eager,
+            [scene],
+            StartOptions(repeats=1),
+            (1.0, 4.0, 8.0),
+        )
+        == 4.0
+    )

@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 
 from ganlane.data import SyntheticTraffic, scene_lane_widths, synthetic_scenes
-from ganlane.realism.recordings import Recording, recordings_of
+from ganlane.data.dense import Recording, recordings_of
 
 FOOT_M = 0.3048
 LANE_M = 3.5

@@ -19,10 +19,11 @@ from ganlane.settings.traffic import (
     IdmMobilTrafficConfig,
     IdmTrafficConfig,
 )
+from ganlane.data.dense import recorded_frame
 from ganlane.generator.closed_loop import extra_inputs
 from ganlane.settings.driving import Visibility
 from ganlane.realism.long_runs import LongRunParameters
-from ganlane.realism.starts import spawned_frame
+from ganlane.realism.starts import spawned_recordings
 from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps, perceive
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.spawn import RandomScenes
@@ -94,7 +95,7 @@ def test_the_generator_is_told_the_gap_behind_the_lorry():
 
 def test_the_realism_card_measures_spawned_lorries_by_their_own_length():
     parameters = LongRunParameters(9, most_s=2.0, spawn=SpawnParameters(truck_share=0.5))
-    frame = spawned_frame(IdmTraffic, Road(), parameters, rows=4)
+    frame = recorded_frame(spawned_recordings(IdmTraffic, Road(), parameters, rows=4))
     lengths = frame.group_by("scene", "vehicle").first()["length"].to_numpy()
     assert set(lengths) == {4.5, 12.0}
     assert 0.2 < np.mean(lengths == 12.0) < 0.8

@@ -1,0 +1,157 @@
+"""Recorded or simulated scenes as dense arrays [frames, tracks], and back as frames in the schema.
+
+The polars frame of :mod:`ganlane.data.schema` holds what was read; this form is for what goes frame
+by frame: the starts of simulations, and what they drove.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from ganlane.data.schema import FRAME_S, SCHEMA
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A scene of T frames (0.1 s apart) and V tracks; entries that are not ``present`` are 0.
+
+    Attributes:
+        name: the scene's; no other recording has it.
+        unit: what is resampled together: the scene, or the pair that several segments come from.
+        lanes, lane_width_m: its road.
+        x, y, speed: [T, V] centre of the body, m, and m/s.
+        present: [T, V] in the scene in this frame; a track has no gap.
+        length, width: [V] m.
+        driven: [V] simulated; the others are replayed as recorded and left out of every measure.
+    """
+
+    name: str
+    unit: str
+    lanes: int
+    lane_width_m: float
+    x: Floats
+    y: Floats
+    speed: Floats
+    present: Flags
+    length: Floats
+    width: Floats
+    driven: Flags
+
+    @classmethod
+    def of(cls, rows: pl.DataFrame, lane_width_m: float) -> Recording:
+        """From one scene in the schema whose tracks have no gaps.
+
+        With a column ``driven``, the other vehicles are replayed.
+        """
+        if "driven" not in rows.columns:
+            rows = rows.with_columns(driven=True)
+        # Frames of the scene count from its first one, tracks by their number.
+        frame = rows["frame"].to_numpy()
+        time = frame - frame.min()
+        track = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)[1]
+        shape = (int(time.max()) + 1, int(track.max()) + 1)
+        # Values per frame and track; 0 where the track is absent.
+        arrays: dict[str, Any] = {}
+        for name in ("x", "y", "speed"):
+            arrays[name] = np.zeros(shape)
+            arrays[name][time, track] = rows[name].to_numpy()
+        # Values per track, the same in all of its rows.
+        for name in ("length", "width", "driven"):
+            column = rows[name].to_numpy()
+            arrays[name] = np.zeros(shape[1], column.dtype)
+            arrays[name][track] = column
+        present = np.zeros(shape, bool)
+        present[time, track] = True
+        name = str(rows["scene"][0])
+        # Lane 0 is the rightmost; lanes beyond the leftmost one in use are not known.
+        lanes = int(rows["lane"].to_numpy().max()) + 1
+        return cls(
+            name,
+            name,
+            lanes,
+            lane_width_m,
+            present=present,
+            **arrays,
+        )
+
+    @property
+    def end_m(self) -> float:
+        """Where its road ends, as far as the recording shows, m."""
+        return float(self.x[self.present].max())
+
+    def frame(self) -> pl.DataFrame:
+        """Its trajectories in the schema, sorted by track, in the form that is measured.
+
+        The lane is the one whose centre is nearest, and the speed is 0: everything is measured from
+        positions. Further columns are ``unit``, ``driven`` and ``lane_width``.
+        """
+        # Transposed, so that the rows come track by track.
+        vehicle, time = np.nonzero(self.present.T)
+        # Simulated positions are float32; sums over them are taken in float64.
+        y = self.y[time, vehicle].astype(np.float64)
+        columns = {
+            "scene": np.full(len(vehicle), self.name),
+            "vehicle": vehicle,
+            "frame": time,
+            "x": self.x[time, vehicle].astype(np.float64),
+            "y": y,
+            "speed": np.zeros(len(vehicle)),
+            "lane": np.rint(y / self.lane_width_m).clip(0, self.lanes - 1).astype(np.int64),
+            "length": self.length[vehicle],
+            "width": self.width[vehicle],
+        }
+        return pl.DataFrame(columns, schema=SCHEMA).with_columns(
+            unit=pl.lit(self.unit),
+            driven=pl.Series(self.driven[vehicle]),
+            lane_width=pl.lit(self.lane_width_m),
+        )
+
+    def segments(self, seconds: float, skip_s: float = 0.0) -> list[Recording]:
+        """Pieces of ``seconds`` from ``skip_s`` on, each with the vehicles present in it."""
+        length = round(seconds / FRAME_S)
+        first = round(skip_s / FRAME_S)
+        pieces = []
+        for start in range(first, len(self.x) - length + 1, length):
+            # Vehicles that are absent all the time are left out.
+            rows = slice(start, start + length)
+            who = self.present[rows].any(0)
+            arrays = {
+                name: getattr(self, name)[rows, who] for name in ("x", "y", "speed", "present")
+            }
+            arrays |= {name: getattr(self, name)[who] for name in ("length", "width", "driven")}
+            pieces.append(
+                replace(
+                    self,
+                    name=f"{self.name}@{start}",
+                    **arrays,
+                )
+            )
+        return pieces
+
+
+def recordings_of(frame: pl.DataFrame, lane_widths: Mapping[str, float]) -> list[Recording]:
+    """The scenes of a frame in the schema, by name; ``lane_widths`` are in m."""
+    # Sorted by name, so that the order of the file has no effect.
+    scenes = frame.partition_by("scene", as_dict=True)
+    return [Recording.of(scenes[key], lane_widths[str(key[0])]) for key in sorted(scenes)]
+
+
+def recorded_frame(
+    recordings: Sequence[Recording],
+) -> pl.DataFrame:
+    """The recordings in the form in which simulations are measured."""
+    return pl.concat([recording.frame() for recording in recordings])
+
+
+def units_of(recordings: Sequence[Recording]) -> list[str]:
+    """Names of the units that the bootstrap resamples, in order."""
+    return list(dict.fromkeys(recording.unit for recording in recordings))

@@ -1,0 +1,295 @@
+"""Text tables, read block by block, with every error traced to its line and column."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import (
+    Callable,
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import polars as pl
+
+from ganlane.errors import UserError
+from ganlane.settings.generator import BLOCK_BYTES
+
+#: Column that holds each row's line number in the file.
+LINE: Final = "line"
+#: Line of the first row of data below a header, which is line 1.
+FIRST_LINE: Final = 2
+#: ``1,118,846,980,200``: commas that separate thousands, unlike a decimal comma.
+_THOUSANDS: Final = r"^[+-]?\d{1,3}(,\d{3})+(\.\d*)?$"
+Kind = pl.DataType | type[pl.DataType]
+#: Called with the bytes done so far and the total, None where the total is unknown.
+OnProgress = Callable[[int, int | None], None]
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """Layout of a text table; ``names`` are those of its columns, in lower case.
+
+    With ``blanks``, runs of blanks separate the columns, not commas, and there is no header.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    blanks: bool = False
+
+
+def read_table(path: str | Path, columns: Mapping[str, Kind]) -> pl.DataFrame:
+    """The named ``columns`` of a CSV file and ``line``, in the order of the file.
+
+    Raises:
+        UserError: no such file, no text table, no rows, a missing column or a wrong field; the
+            message names file, line and column.
+    """
+    path = Path(path)
+    blocks = []
+    for text in read_blocks(csv_table(path, columns), list(columns)):
+        converted = [convert(text, name, kind, path) for name, kind in columns.items()]
+        blocks.append(pl.DataFrame([*converted, text[LINE]]))
+    if not blocks:
+        raise UserError(f"{path}: a header but no rows; give a file with at least one row of data.")
+    return pl.concat(blocks)
+
+
+def csv_table(path: Path, wanted: Iterable[str]) -> TextTable:
+    """Layout of a CSV file from its header, which must hold the ``wanted`` columns in any case."""
+    # Names in any case, with blanks around them.
+    header = _fields(first_line(path), f"{path}, line 1")
+    names = tuple(name.strip().lower() for name in header)
+    missing = [name for name in wanted if name not in names]
+    if missing:
+        raise UserError(
+            f"{path}, line 1: no column {', '.join(missing)}; found {', '.join(names)}; "
+            f"expected {', '.join(wanted)}."
+        )
+    return TextTable(path, names)
+
+
+def first_line(path: Path) -> str:
+    """The first line of a text file, without a byte order mark."""
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; give the path of a text table.")
+    with path.open("rb") as file:
+        # A binary file may have no line break at all.
+        raw = file.readline(2**16)
+    try:
+        text = raw.decode("utf-8-sig").strip()
+    except UnicodeDecodeError as error:
+        raise UserError(
+            f"{path}, line 1: not text ({error.reason}); give an unpacked text or CSV file."
+        ) from error
+    if not text:
+        raise UserError(f"{path}: the file is empty; a table of text was expected.")
+    return text
+
+
+def reason(error: Exception) -> str:
+    """The first line of a library's error message, to be quoted inside one of ours."""
+    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(". ")
+
+
+def convert(text: pl.DataFrame, column: str, kind: Kind, path: Path) -> pl.Series:
+    """A ``column`` of text as ``String``, ``Int64`` (also of ``3.0``) or finite ``Float64``.
+
+    Commas may separate thousands, as in NGSIM's portal.
+
+    Raises:
+        UserError: a field is empty or not what was expected; the first one is named by file, line
+            and column.
+    """
+    text = text.select(pl.col(column).str.strip_chars(), LINE)
+    field = text[column]
+
+    def refuse(bad: pl.Series, what: str) -> None:
+        raise_where(bad, text, column, path, what)
+
+    refuse(
+        field.is_null() | (field == ""),
+        "is empty; the row is incomplete",
+    )
+    if kind == pl.String:
+        return field
+    # Any other comma stays, so that the field is reported as no number.
+    without = field.str.replace_all(",", "", literal=True)
+    field = without.zip_with(field.str.contains(_THOUSANDS), field)
+    # Through floats, since whole numbers may be written as 3.0.
+    numbers = field.cast(pl.Float64, strict=False)
+    refuse(numbers.is_null(), "is not a number")
+    refuse(~numbers.is_finite(), "is not a finite number")
+    if kind == pl.Int64:
+        refuse(
+            numbers != numbers.round(),
+            "is not a whole number",
+        )
+        refuse(
+            numbers.abs() >= 2.0**63,
+            "is too large a number",
+        )
+    return numbers.cast(kind)
+
+
+def raise_where(
+    bad: pl.Series,
+    rows: pl.DataFrame,
+    column: str,
+    path: Path,
+    what: str,
+) -> None:
+    """Raise a UserError that names the first of the ``rows`` that is ``bad``; null is not bad."""
+    if bad.any():
+        row = rows.row(bad.fill_null(False).arg_max(), named=True)  # type: ignore[arg-type]
+        field = "the field" if row[column] in (None, "") else repr(row[column])
+        raise UserError(
+            f"{path}, line {row[LINE]}, column {column}: {field} {what}; correct or remove the row."
+        )
+
+
+def read_blocks(
+    table: TextTable,
+    wanted: Sequence[str],
+    block_bytes: int = BLOCK_BYTES,
+    on_progress: OnProgress | None = None,
+) -> Iterator[pl.DataFrame]:
+    """The ``wanted`` columns as text, and ``line``, block by block in the order of the file.
+
+    Raises:
+        UserError: a row that does not fit, is not text, empty or cut off; the message names file
+            and line.
+    """
+    number = 1 if table.blanks else FIRST_LINE
+    done = 0
+    total = table.path.stat().st_size
+    for block, has_no_end in _whole_lines(table, block_bytes):
+        # A last line without a line break is a row only if it has all its fields.
+        if has_no_end:
+            _check_lines(table, block, number, cut_off=True)
+        # A last line without a line break counts.
+        rows = block.count(b"\n") + (not block.endswith(b"\n"))
+        lines = pl.int_range(number, number + rows, dtype=pl.Int64).alias(LINE)
+        yield _parse(table, block, number, rows, wanted).with_columns(lines)
+        number += rows
+        done += len(block)
+        if on_progress is not None:
+            on_progress(done, total)
+
+
+def _whole_lines(table: TextTable, block_bytes: int) -> Iterator[tuple[bytes, bool]]:
+    """Blocks of whole lines; true for a last line without a line break.
+
+    Empty lines at the end are left out.
+    """
+    with table.path.open("rb") as file:
+        if not table.blanks:
+            file.readline()
+        rest = b""
+        while read := file.read(block_bytes):
+            # Blocks end anywhere; lines do not.
+            together = rest + read
+            # The last non-empty line is held back: it may be the file's last.
+            cut = together.rstrip().rfind(b"\n") + 1
+            if cut:
+                yield together[:cut], False
+            rest = together[cut:]
+        if rest.strip():
+            yield rest.rstrip(), not rest.endswith(b"\n")
+
+
+def _fields(line: str, place: str, blanks: bool = False) -> list[str]:
+    """The fields of one line."""
+    try:
+        return line.split() if blanks else next(csv.reader([line]), [])
+    except csv.Error as error:
+        what = reason(error).partition(" - ")[0]
+        raise UserError(f"{place}: not a line of CSV ({what}); correct or remove it.") from error
+
+
+def _parse(
+    table: TextTable,
+    block: bytes,
+    number: int,
+    rows: int,
+    wanted: Sequence[str],
+) -> pl.DataFrame:
+    """The ``wanted`` columns of a block of ``rows`` lines, the first of which is ``number``."""
+    separator = " " if table.blanks else ","
+    if table.blanks:
+        block = b"\n".join(b" ".join(line.split()) for line in block.split(b"\n"))
+    # The parser fills short rows with nulls, so they are found by counting separators.
+    # Quoted fields may hold separators, so the count says nothing there.
+    expected = rows * (len(table.names) - 1)
+    if b'"' not in block and block.count(separator.encode()) != expected:
+        _check_lines(table, block, number)
+    # Columns are named by their position, since a file may use a name twice.
+    places = [f"column_{index}" for index in range(len(table.names))]
+    try:
+        frame = pl.read_csv(
+            block,
+            separator=separator,
+            has_header=False,
+            schema=dict.fromkeys(places, pl.String()),
+        )
+    except (
+        pl.exceptions.PolarsError,
+        UnicodeDecodeError,
+    ) as error:
+        _check_lines(table, block, number)
+        raise UserError(
+            f"{table.path}, from line {number}: not a readable table ({error})."
+        ) from error
+    # A quoted line break would shift all line numbers below it.
+    if frame.height != rows:
+        _check_lines(table, block, number)
+        raise UserError(f"{table.path}, from line {number}: a row stretches over several lines.")
+    return frame.select(pl.col(places[table.names.index(name)]).alias(name) for name in wanted)
+
+
+def _check_lines(
+    table: TextTable,
+    block: bytes,
+    number: int,
+    cut_off: bool = False,
+) -> None:
+    """Raise a UserError that names the first line of a block that does not fit the table.
+
+    ``cut_off``: the block is the file's last line and has no line break.
+    """
+    expected = len(table.names)
+    for line, raw in enumerate(block.removesuffix(b"\n").split(b"\n"), number):
+        place = f"{table.path}, line {line}"
+        if not raw.strip():
+            raise UserError(f"{place}: the line is empty; remove it.")
+        try:
+            text = raw.decode()
+        except UnicodeDecodeError as error:
+            raise UserError(
+                f"{place}: the line is not text; copy or download the file again."
+            ) from error
+        fields = len(_fields(text, place, table.blanks))
+        # The last column that the row still has.
+        column = table.names[max(min(fields, expected) - 1, 0)]
+        if fields < expected and cut_off:
+            raise UserError(
+                f"{place}, column {column}: the file breaks off here, {fields} of {expected} "
+                "columns into the row; copy or download it again."
+            )
+        if raw.count(b'"') % 2:
+            raise UserError(
+                f"{place}: a quotation mark without its counterpart; correct or remove the row."
+            )
+        if fields > expected:
+            raise UserError(
+                f"{place}: {fields} fields, expected {expected}; correct or remove the row."
+            )
+        if fields < expected:
+            raise UserError(
+                f"{place}, column {column}: the row ends after {fields} of {expected} fields; "
+                "correct or remove it."
+            )

@@ -1,0 +1,160 @@
+"""Three files of I-80, a site that no generator was fitted to, as scenes to drive.
+
+``i80_1600_lane1.csv`` holds every car of one lane, all of which are driven (no lengths are given:
+4.5 m). The two others hold pairs, in which the follower is driven behind its recorded leader. All
+three are cut into segments of 15 s, each of which starts as recorded, on a road of one lane.
+Positions in the files are of the front bumper; here they are of the centre, as everywhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import polars as pl
+
+from ganlane.data.dense import Flags, Floats, Recording
+from ganlane.data.lanes import STANDARD_LANE_WIDTH_M
+from ganlane.data.schema import FRAME_S
+from ganlane.data.tables import read_table
+from ganlane.errors import UserError
+
+#: Name to file.
+I80_FILES: Final = {
+    "lane_1": "i80_1600_lane1.csv",
+    "pairs": "i80_1600_pairs.csv",
+    "following": "i80_following.csv",
+}
+SEGMENT_S: Final = 15.0
+#: The first seconds of a pair, in which the published smoothing bends the follower's speed, s.
+EDGE_S: Final = 3.0
+_LENGTH_M: Final = 4.5
+_WIDTH_M: Final = 2.0
+_NUMBERS: Final = {
+    "vehicle": pl.Int64,
+    "frame": pl.Int64,
+    "x": pl.Float64,
+}
+
+
+def read_i80(name: str, path: Path) -> list[Recording]:
+    """Segments of 15 s from the file ``path``, the one of :data:`I80_FILES` called ``name``.
+
+    Raises:
+        UserError: it is damaged, or no track in it lasts 15 s.
+    """
+    # A scene is the lane, or a pair of cars.
+    rows = _I80_READERS[name](path)
+    pieces = []
+    for scene in rows.partition_by("scene", maintain_order=True):
+        for piece in _one_lane(scene).segments(SEGMENT_S, 0.0 if name == "lane_1" else EDGE_S):
+            # Each segment of the lane is a unit of its own: the whole lane would be a single unit,
+            # and gives no interval.
+            unit = piece.name if name == "lane_1" else piece.unit
+            if piece.driven.any():
+                pieces.append(replace(piece, unit=unit))
+    if not pieces:
+        raise UserError(f"{path}: nothing in it lasts {SEGMENT_S:g} s; give the whole file.")
+    return pieces
+
+
+def _lane(path: Path) -> pl.DataFrame:
+    return read_table(path, _NUMBERS).with_columns(
+        scene=pl.lit("lane_1"),
+        length=pl.lit(_LENGTH_M),
+        x=pl.col("x") - 0.5 * _LENGTH_M,
+        driven=True,
+    )
+
+
+def _pairs(path: Path) -> pl.DataFrame:
+    columns = {
+        "pair": pl.String,
+        "role": pl.String,
+        "length": pl.Float64,
+        **_NUMBERS,
+    }
+    return read_table(path, columns).with_columns(
+        scene="pair-" + pl.col("pair"),
+        x=pl.col("x") - 0.5 * pl.col("length"),
+        driven=pl.col("role") == "follower",
+    )
+
+
+def _following(path: Path) -> pl.DataFrame:
+    whole = dict.fromkeys(("follower", "leader", "frame"), pl.Int64)
+    numbers = dict.fromkeys(
+        ("x_follower", "x_leader", "leader_length"),
+        pl.Float64,
+    )
+    # Both cars of a pair are in one row.
+    table = read_table(path, {"period": pl.String, **whole, **numbers})
+    cars = []
+    for role, length in (
+        ("follower", pl.lit(_LENGTH_M)),
+        ("leader", pl.col("leader_length")),
+    ):
+        car = table.select(
+            "frame",
+            scene=pl.concat_str(
+                "period",
+                "follower",
+                "leader",
+                separator="-",
+            ),
+            vehicle=role,
+            x=pl.col(f"x_{role}") - 0.5 * length,
+            length=length,
+            driven=pl.lit(role == "follower"),
+        )
+        cars.append(car)
+    return pl.concat(cars)
+
+
+_I80_READERS: Final = {
+    "lane_1": _lane,
+    "pairs": _pairs,
+    "following": _following,
+}
+
+
+def _one_lane(rows: pl.DataFrame) -> Recording:
+    """Cars of one lane, each track of which has a number of its own.
+
+    A speed is the mean over the second around its frame, cut off at the ends of the track.
+    """
+    # The files are sorted by frame, or by pair.
+    rows = rows.sort("vehicle", "frame")
+    # A gap splits a track, since a recording's tracks have none.
+    starts = (pl.col("frame").diff() != 1) | (pl.col("vehicle").diff() != 0)
+    rows = rows.with_columns(
+        vehicle=starts.fill_null(False).cum_sum(),
+        y=0.0,
+        speed=0.0,
+        width=_WIDTH_M,
+        lane=0,
+    )
+    # Positions across the road are not given, and all lanes are alike.
+    recording = Recording.of(rows, STANDARD_LANE_WIDTH_M)
+    return replace(
+        recording,
+        speed=_speeds(recording.x, recording.present),
+    )
+
+
+def _speeds(x: Floats, present: Flags) -> Floats:
+    """Speeds [T, V], m/s: over up to 0.5 s on either side, within the track."""
+    # Half a second before and after, or as far as the track reaches.
+    index = np.arange(len(x))[:, None]
+    first = present.argmax(0)
+    last = len(x) - 1 - present[::-1].argmax(0)
+    before = np.clip(index - 5, first, last)
+    after = np.clip(index + 5, first, last)
+    moved = np.take_along_axis(x, after, 0) - np.take_along_axis(x, before, 0)
+    return np.where(
+        present,
+        moved / (np.maximum(after - before, 1) * FRAME_S),
+        0.0,
+    )

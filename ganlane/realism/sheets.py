@@ -1,0 +1,355 @@
+"""A card as tables and figures, from the numbers in its ``results.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from ganlane.evaluation.table import (
+    aligned,
+    number,
+    percent,
+    with_interval,
+)
+from ganlane.realism.driving import FLOORS
+from ganlane.realism.measures import (
+    QUANTITIES,
+    UNITS,
+    Measured,
+)
+from ganlane.realism.starts import Starts
+from ganlane.view.figures import (
+    FAINT,
+    GRID,
+    INK,
+    STYLE,
+    FloatArray,
+    add_legend,
+    palette,
+    panel_grid,
+    plot_line,
+    save_figure,
+)
+
+
+def card_text(numbers: Mapping[str, Any]) -> list[str]:
+    """The card's tables, of the ``numbers`` in ``results.json``."""
+    traffic = numbers["traffic"]
+    held_out = numbers["quantities_held_out"]
+    tables = [quantities_table(numbers["quantities"], traffic)]
+    if held_out is not None:
+        tables.append(f"held-out scenes alone\n{quantities_table(held_out, traffic)}")
+    tables.append(starts_table(numbers["driving"]))
+    for name, rows in numbers["i80"].items():
+        tables.append(f"I-80, {name}\n{quantities_table(rows, traffic)}")
+    for name, runs in {
+        traffic: numbers["long_runs"],
+        **numbers["long_runs_against"],
+    }.items():
+        if runs:
+            tables.append(long_table(runs, name))
+    return [*tables, checks_text(numbers["checks"])]
+
+
+def quantities_table(quantities: Mapping[str, Any], traffic: str) -> str:
+    """Distances, one quantity per line.
+
+    The traffic, the scale, and each rival with the difference to it.
+    """
+    # All rows have the same rivals.
+    rivals = list(next(iter(quantities.values()))["against"])
+    ours = f"{short_name(traffic)} [95 %]"
+    heading = [
+        "distance to recorded",
+        ours,
+        "ceiling",
+        "constant v",
+        "random",
+    ]
+    for rival in rivals:
+        heading += [
+            short_name(rival),
+            f"minus {short_name(rival)} [95 %]",
+            "",
+        ]
+    lines = [heading]
+    for name, row in quantities.items():
+        line = [
+            f"{name}, {row['unit']}",
+            with_interval(row, "distance"),
+        ]
+        # The scale: from the best that can be expected to random driving.
+        line += [
+            number(row[end])
+            for end in (
+                "ceiling",
+                "constant_velocity",
+                "floor",
+            )
+        ]
+        for rival in rivals:
+            theirs = row["against"][rival]
+            line += [
+                number(theirs["distance"]),
+                with_interval(theirs, "difference"),
+            ]
+            line.append(theirs["verdict"])
+        lines.append(line)
+    return aligned(lines)
+
+
+def starts_table(driving: Mapping[str, Any]) -> str:
+    """Lane changes and accelerations, one traffic per line, the recordings among them."""
+    rate = "changes per vehicle-km [95 %]"
+    tails = "acceleration 5 %, 95 %"
+    lines = [["from the same starts", rate, "vehicle-km", tails]]
+    for name, row in driving.items():
+        acceleration = row["quantiles"]["acceleration"]
+        line = [
+            short_name(name),
+            with_interval(row, "per_vehicle_km", 2),
+            number(row["vehicle_km"], 1),
+            f"{number(acceleration['0.05'], 2)}, {number(acceleration['0.95'], 2)}",
+        ]
+        lines.append(line)
+    return aligned(lines)
+
+
+def long_table(runs: Sequence[Mapping[str, Any]], traffic: str) -> str:
+    """The long runs of a traffic, one column each."""
+    # All runs have the same lines.
+    columns = [_run_cells(run, traffic) for run in runs]
+    return aligned([[name, *(column[name] for column in columns)] for name in columns[0]])
+
+
+def _run_cells(run: Mapping[str, Any], traffic: str) -> dict[str, str]:
+    """A column of :func:`long_table`, by the names of its lines."""
+    cells = {
+        f"{short_name(traffic)}, long runs": f"{run['vehicles']} vehicles",
+        "vehicle-km": number(run["vehicle_km"], 0),
+        "changes per vehicle-km": with_interval(run, "lane_changes_per_vehicle_km", 2),
+        "overlaps per 1000 vehicle-km": with_interval(run, "overlaps_per_1000_vehicle_km", 2),
+        "off road": str(run["off_road"]),
+        "standstills in free flow": str(run["standstills_in_free_flow"]),
+    }
+    for time, at in run["speeds"].items():
+        speeds = f"{number(at['mean_speed_mps'], 1)}, {number(at['spread_mps'], 2)}"
+        cells[f"mean speed, spread after {time}, m/s"] = speeds
+    for level, value in run["acceleration_quantiles"].items():
+        cells[f"acceleration, {100 * float(level):g} % quantile"] = number(value, 2)
+    share = run["guard_share"]
+    cells["the guard's share"] = "none" if share is None else percent(share, 1)
+    return cells
+
+
+def checks_text(checks: Mapping[str, Any]) -> str:
+    """The card's checks, a line each."""
+
+    def told(name: str, value: bool | None) -> str:
+        unknown = "no guard" if name == "guard_under_5_percent" else "unknown"
+        answer = {True: "yes", False: "no", None: unknown}[value]
+        return f"{name.replace('_', ' ')}: {answer}"
+
+    near = "acceleration_quantiles_within_30_percent"
+    lines = [told(near, checks[near])]
+    for rival, verdicts in checks["compared_with"].items():
+        lines.append(f"than {short_name(rival)}: " + ", ".join(map(" ".join, verdicts.items())))
+    for run in checks["long_runs"]:
+        results = ", ".join(told(name, value) for name, value in run.items() if name != "vehicles")
+        lines.append(f"{run['vehicles']} vehicles: {results}")
+    return "\n".join(lines)
+
+
+def short_name(traffic: str) -> str:
+    """A traffic's name without the path that it is imported from."""
+    return traffic.rpartition(".")[2]
+
+
+def draw(numbers: Mapping[str, Any], starts: Starts, to: Path) -> None:
+    """The figures of a card, into the folder ``to``.
+
+    Distributions, distances, and drift if there are long runs.
+    """
+    # The reference drivers would hide the others.
+    simulated = {name: starts.driven[name] for name in starts.driven if name not in FLOORS}
+    totals = {short_name(name): _pooled(measured) for name, measured in simulated.items()}
+    distributions = draw_distributions(_pooled(starts.recorded), totals)
+    save_figure(distributions, to / "distributions.png")
+    distances = draw_distances(numbers["quantities"], numbers["traffic"])
+    save_figure(distances, to / "distances.png")
+    if numbers["long_runs"]:
+        drift = draw_speeds_over_time(
+            numbers["long_runs"],
+            numbers["recorded_spread_mps"],
+        )
+        save_figure(drift, to / "drift.png")
+
+
+def _pooled(measured: Measured) -> dict[str, FloatArray]:
+    """By quantity, the counts [bins] over all units."""
+    return {name: counts.sum(0) for name, counts in measured.counts.items()}
+
+
+@rc_context(STYLE)
+def draw_distributions(
+    recorded: Mapping[str, FloatArray],
+    simulated: Mapping[str, Mapping[str, FloatArray]],
+) -> Figure:
+    """A panel per quantity.
+
+    The recorded density, and each traffic's, from counts [bins] (none where all are 0).
+    """
+    figure, grid = panel_grid(len(recorded))
+    # The recordings are black everywhere.
+    colours = {"recorded": INK, **palette(list(simulated))}
+    for axes, name in zip(grid, recorded):
+        edges = QUANTITIES[name].edges
+        unit = UNITS[name].replace("s2", "s²").replace("s3", "s³")
+        middle = 0.5 * (edges[1:] + edges[:-1])
+        axes.set(
+            title=name.replace("_", " "),
+            xlabel=unit,
+            ylabel=f"density, per {unit}",
+        )
+        axes.set_xlim(edges[0], edges[-1])
+        # The recordings come last, on top.
+        for driver, counts in {
+            **simulated,
+            "recorded": recorded,
+        }.items():
+            total = float(counts[name].sum())
+            colour = colours[driver]
+            if not total:
+                continue
+            density = counts[name] / total / np.diff(edges)
+            plot_line(axes, middle, density, color=colour)
+            # The bins at both ends hold all values beyond, too.
+            for end, mark in ((0, "<"), (-1, ">")):
+                if counts[name][end]:
+                    axes.plot(
+                        middle[end],
+                        density[end],
+                        mark,
+                        color=colour,
+                        clip_on=False,
+                    )
+    beyond = Line2D(
+        [],
+        [],
+        color=FAINT,
+        label="and all values beyond",
+        marker=">",
+        ls="",
+    )
+    add_legend(figure, colours, [beyond])
+    return figure
+
+
+@rc_context(STYLE)
+def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
+    """A block per quantity with a line per traffic: distances with their intervals.
+
+    ``quantities`` are the rows of :func:`ganlane.realism.card.quantity_rows`. Vertical lines are
+    the ends of the scale: recordings against each other, and random driving.
+    """
+    colours = palette(
+        [
+            traffic,
+            *next(iter(quantities.values()))["against"],
+        ]
+    )
+    # A line per traffic, and an empty one.
+    block = len(colours) + 1
+    figure = Figure(figsize=(7.5, 0.8 + 0.125 * block * len(quantities)))
+    axes = figure.subplots()
+    axes.set(xlim=(0, 1), ylim=(block * len(quantities), 0))
+    axes.set_xlabel("Jensen-Shannon distance to recorded driving")
+    names = [name.replace("_", " ") for name in quantities]
+    middles = [block * (index + 0.5) for index in range(len(names))]
+    axes.set_yticks(middles, names, color=INK, size=9)
+    axes.tick_params("y", length=0)
+    axes.grid(False, axis="y")
+    for index, row in enumerate(quantities.values()):
+        top = block * index
+        axes.axhline(top, color=GRID, lw=0.8)
+        for mark, colour in (
+            ("ceiling", INK),
+            ("floor", FAINT),
+        ):
+            if row[mark] is not None:
+                axes.vlines(
+                    row[mark],
+                    top + 0.3,
+                    top + block - 0.3,
+                    color=colour,
+                    lw=1.6,
+                )
+        for y, (driver, colour) in enumerate(colours.items(), top + 1):
+            shown = row if driver == traffic else row["against"][driver]
+            # A quantity without samples has no mark.
+            value = shown["distance"]
+            if value is not None:
+                axes.plot(
+                    shown["distance_ci"] or [value, value],
+                    [y, y],
+                    color=colour,
+                )
+                axes.plot(value, y, "o", color=colour, ms=5)
+    # Marks of the scale, which no traffic has.
+    marks = [
+        Line2D(
+            [],
+            [],
+            color=colour,
+            label=name,
+            marker="|",
+            ls="",
+            ms=10,
+        )
+        for name, colour in (
+            ("half against half", INK),
+            ("random", FAINT),
+        )
+    ]
+    add_legend(
+        figure,
+        {short_name(name): colour for name, colour in colours.items()},
+        marks,
+    )
+    return figure
+
+
+@rc_context(STYLE)
+def draw_speeds_over_time(runs: Sequence[Mapping[str, Any]], spread_mps: float) -> Figure:
+    """Mean and spread of the speeds of long runs over time.
+
+    The recorded mean spread within a frame as a level.
+    """
+    figure, grid = panel_grid(2)
+    colours = palette([f"{run['vehicles']} vehicles" for run in runs])
+    titles = {
+        "mean_speed_mps": "mean speed",
+        "spread_mps": "spread of speeds",
+    }
+    for axes, (key, title) in zip(grid, titles.items()):
+        axes.set(title=title, xlabel="time, s", ylabel="m/s")
+        for run, colour in zip(runs, colours.values()):
+            # The time at 5000 m differs from run to run, and is no point in time.
+            speeds = {time: at[key] for time, at in run["speeds"].items() if time.endswith(" s")}
+            x = [float(time.removesuffix(" s")) for time in speeds]
+            # None, where nobody was left to measure, becomes NaN.
+            plot_line(
+                axes,
+                x,
+                np.array(list(speeds.values()), np.float64),
+                color=colour,
+            )
+    grid[1].axhline(spread_mps, color=INK)
+    add_legend(figure, {"recorded": INK, **colours})
+    return figure

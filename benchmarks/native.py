@@ -34,11 +34,11 @@ from ganlane.build import make_env
 from ganlane.config.env import EnvConfig
 from ganlane.env import HighwayEnv
 from ganlane.native.library import VARIANTS, best_variant
-from ganlane.native.tensors import Kernel, empty_outcome
+from ganlane.native.tensors import Kernel
 from ganlane.parameters.episode import SpawnParameters
 from ganlane.parameters.observation import ObservationConfig
 from ganlane.sim import neighbours
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 
 STEPS = 10
@@ -72,18 +72,12 @@ def contenders(
     env: HighwayEnv, td: TensorDictBase, variants: list[str], tensor: bool, pairs: bool
 ) -> dict[str, Callable]:
     """Name to a decision of all rows from the same state."""
-    rows = td.batch_size[0]
-    ego, vehicles = td[keys.EGO], Vehicles.of(td[keys.VEHICLES])
-    steering, step = td[keys.TRAFFIC, "steering"], td[keys.STEP]
-    out = empty_outcome(rows, env.vehicles)
     made: dict[str, Callable] = {}
     for variant in variants:
         kernel = Kernel(
             env.road, env.vehicles, env.episode, env.ego, mobil=env.traffic.mobil, variant=variant
         )
-        made[variant] = lambda kernel=kernel: kernel.decide(
-            td[keys.ACTION], vehicles, steering, ego, step, out=out
-        )
+        made[variant] = lambda kernel=kernel: kernel.decide(td[keys.ACTION], td)
     if tensor:
         made["torch"] = lambda: env._step(td)
     if pairs:

@@ -29,7 +29,7 @@ from ganlane.config.commands import BenchConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
-from ganlane.env.highway import native_decision, threads_for
+from ganlane.env.highway import threads_for
 from ganlane.env.physics import run_decision
 from ganlane.parameters.observation import ObservationConfig, RewardParameters
 from ganlane.sim.random import episode_key
@@ -110,7 +110,7 @@ def _start_native_physics(scenario: Scenario, batch: int) -> Runner:
     def run(decisions: int) -> int:
         state = first
         for _ in range(decisions):
-            state = native_decision(env.base_env.kernel, state, keep, recycles)
+            state = env.base_env.kernel.decide(keep, state, recycles)
         return int((state.get(keys.STEP) - first.get(keys.STEP)).sum())
 
     return run

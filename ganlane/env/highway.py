@@ -24,14 +24,13 @@ from ganlane.env.state import (
     check_counter,
     done_spec,
     first_state,
-    outcome_state,
     pack,
     state_spec,
     usable_device,
 )
 from ganlane.errors import UserError
 from ganlane.native.library import torch_on_one_thread, why_not
-from ganlane.native.tensors import Kernel, NativeScenes, moved
+from ganlane.native.tensors import Kernel, NativeScenes
 from ganlane.parameters.driving import EgoParameters, IdmParameters, Visibility
 from ganlane.parameters.episode import KERNELS, EpisodeParameters, SpawnParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
@@ -249,7 +248,7 @@ class HighwayEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = None if mask is None else mask.reshape(-1)
         if self._native_scenes is not None:
-            return outcome_state(seed, episode, *self._native_scenes.start(seed, episode, mask))
+            return self._native_scenes.start(seed, episode, mask)
         if mask is None or self.device.type != "cpu" or self.traffic.rows_must_stay:
             return self._start(seed, episode)
         rows = mask.nonzero()[:, 0]
@@ -339,7 +338,7 @@ class HighwayEnv(EnvBase):
             seed, episode = tensordict.get(keys.SEED), tensordict.get(keys.EPISODE)
             recycles = self._recycling_rows(episode_key(self.stream, seed, episode))
         try:
-            after = native_decision(self.kernel, tensordict, action, recycles)
+            after = self.kernel.decide(action, tensordict, recycles)
         except ValueError:
             self._check_action.values(action)  # says which
             raise
@@ -423,18 +422,3 @@ def _why_not(
     if (traffic.idm, traffic.steering) != (rules.idm, rules.steering):
         return "has one set of parameters of car following and steering for the ego and the others"
     return None
-
-
-def native_decision(
-    kernel: Kernel, state: TensorDictBase, action: Tensor, recycles: Tensor | None
-) -> TensorDictBase:
-    """The state after the decision ``action`` [N] in ``state``, without a reward.
-
-    ``recycles`` [N] bool or None.
-    """
-    vehicles, memory = Vehicles.of(state.get(keys.VEHICLES)), state.get(keys.TRAFFIC)
-    ego = dict(state.get(keys.EGO).items())
-    out = kernel.decide(
-        action, vehicles, memory.get("steering"), ego, state.get(keys.STEP), recycles
-    )
-    return outcome_state(state.get(keys.SEED), state.get(keys.EPISODE), out, moved(vehicles, out))

@@ -40,7 +40,7 @@ def batch_of(env, mobil=True, rows=ROWS, **parts):
 
 def assert_equal(state, batch, masked):
     for name, value in state["vehicles"].items():
-        np.testing.assert_array_equal(value.numpy(), batch.state[name], name)
+        np.testing.assert_array_equal(value.numpy(), batch.state["vehicles", name], name)
     low, high = batch.bounds
     seen = (
         state["observation"]
@@ -137,7 +137,7 @@ def test_an_episode_is_the_same_bit_for_bit_in_every_variant_and_batch():
         batch.start(3, np.arange(rows))
         for decision in range(30):
             batch.step(np.full(rows, decision % 3 if decision % 5 == 0 else 0))
-        found.append(np.concatenate([batch.state["x"][0], batch.observation[0]]))
+        found.append(np.concatenate([batch.state["vehicles", "x"][0], batch.observation[0]]))
     for other in found[1:]:
         np.testing.assert_array_equal(other, found[0])
 

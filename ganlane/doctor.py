@@ -30,7 +30,7 @@ from typing import Final
 
 from ganlane._version import __version__
 from ganlane.errors import USER_ERROR, UserError
-from ganlane.files import CHECKPOINTS, conf_folder
+from ganlane.files import CACHE_VARIABLE, CHECKPOINTS, cache_folder, conf_folder
 from ganlane.runtime import check_process, find_compiler
 
 NEEDED_IS_MISSING = 1
@@ -324,8 +324,6 @@ def recordings() -> Finding:
 
 def cache() -> Finding:
     """The folder in which groups of windows are kept between fits."""
-    from ganlane.generator.checkpoint import CACHE_VARIABLE, cache_folder
-
     folder = cache_folder()
     if folder is None:
         return Finding("cache", State.OK, f"off ({CACHE_VARIABLE} is empty)")

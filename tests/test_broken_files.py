@@ -20,7 +20,7 @@ from safetensors.torch import save
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.files import CHECKPOINTS, seal_archive
-from ganlane.native.library import cache_folder
+from ganlane.native.library import libraries_folder
 from ganlane.weights import load_weights, save_weights
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -340,7 +340,8 @@ def test_a_whole_command_ends_with_status_2(line, here):
         "PATH": "/usr/bin:/bin",
         "HOME": str(here),
     }
-    environment["GANLANE_CACHE"] = str(cache_folder().parent)  # where the kernel is built already
+    # where the kernel is built already
+    environment["GANLANE_CACHE"] = str(libraries_folder().parent)
     start = [sys.executable, "-m", "ganlane", *line.split()]
     done = subprocess.run(
         start, cwd=here, env=environment, capture_output=True, text=True, timeout=120, check=False

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
 import sys
 import tokenize
 import zipfile
@@ -25,14 +24,12 @@ import torch
 
 from ganlane._version import __version__
 from ganlane.errors import UserError
-from ganlane.files import CHECKPOINTS, has_checksum, sealed_archive, write_bytes
+from ganlane.files import CHECKPOINTS, cache_folder, has_checksum, sealed_archive, write_bytes
 from ganlane.generator.networks import Generator
 from ganlane.parameters.generator import EXTRA_INPUTS, GeneratorSizes, Preset
 from ganlane.weights import load_weights, save_weights
 
 KIND = "generator"
-#: Environment variable with the cache folder; empty switches the cache off.
-CACHE_VARIABLE = "GANLANE_CACHE"
 #: ``{"all" or scene: {"ERROR/KIND": value}}``.
 Metrics = dict[str, dict[str, float]]
 
@@ -141,17 +138,6 @@ def load_generator(
     if not isinstance(metadata.get("driving_statistics"), dict):
         raise UserError(f"{path}: holds no driving statistics of its recordings; fit it again.")
     return generator.eval().requires_grad_(False), metadata
-
-
-def cache_folder() -> Path | None:
-    """Folder of the cache: ``GANLANE_CACHE``, else ``ganlane`` in the user's cache folder.
-
-    None if switched off.
-    """
-    named = os.environ.get(CACHE_VARIABLE)
-    if named is not None:
-        return Path(named) if named else None
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ganlane"
 
 
 def content_hash(settings: Any, *arrays: np.ndarray) -> str:

@@ -12,10 +12,9 @@ from reference.small_networks import SIZES, small_generator
 
 from ganlane.data import default_scenes, read_scenes
 from ganlane.errors import UserError
+from ganlane.files import CACHE_VARIABLE, cache_folder
 from ganlane.generator.checkpoint import (
-    CACHE_VARIABLE,
     FitResult,
-    cache_folder,
     cached,
     content_hash,
     load_generator,

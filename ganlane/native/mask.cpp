@@ -28,27 +28,35 @@ static inline void allow(const Settings& s, const MaskInputs& in, const MaskOutp
     };
     Float x = gather(in.x, 0), speed = gather(in.speed, 0), half_length = 0.5f * gather(in.length, 0);
     Float target = gather(in.target_lane, 0);
-    Around around[3] = {nobody_around(speed), nobody_around(speed), nobody_around(speed)};
+    Float gap[3], leader[3], gap_behind[3], follower[3], per_desired[3];
+    for (int side = 0; side < 3; side++) {
+        gap[side] = gap_behind[side] = filled(FREE_GAP);
+        leader[side] = follower[side] = speed, per_desired[side] = filled(1.0f);
+    }
     for (int i = 1; i < s.vehicles; i++) {
         Float other = gather(in.speed, i), half = 0.5f * gather(in.length, i), sine, cosine;
         sincos_of(gather(in.heading, i), sine, cosine);
         LanesOf l = lanes_of(s, gather(in.y, i), sine, cosine, half, 0.5f * gather(in.width, i),
                              gather(in.target_lane, i), gather(in.visibility, i), gather(in.valid, i) != 0.0f);
-        Float distance = gather(in.x, i) - x, gap = absolute(distance) - (half_length + half);
-        Float per_desired = 1.0f / gather(in.desired_speed, i);
+        Float d = gather(in.x, i) - x, g = absolute(d) - (half_length + half);
+        Float per_its_desired = 1.0f / gather(in.desired_speed, i);
         for (int side = 0; side < 3; side++) {
             Float lane = target + SIDES[side];
-            Mask here = (l.seen_low <= lane) & (lane <= l.seen_high);
-            look_at(around[side], here, distance, gap, other, per_desired, filled((float)i));
+            Mask here = (l.seen_low <= lane) & (lane <= l.seen_high), before = d > 0.0f;
+            Mask leads = here & before & ((g < gap[side]) | ((g == gap[side]) & (other < leader[side])));
+            Mask follows = here & ~before & (g < gap_behind[side]);
+            gap[side] = choose(leads, g, gap[side]), leader[side] = choose(leads, other, leader[side]);
+            gap_behind[side] = choose(follows, g, gap_behind[side]);
+            follower[side] = choose(follows, other, follower[side]);
+            per_desired[side] = choose(follows, per_its_desired, per_desired[side]);
         }
     }
     Float per_own_desired = 1.0f / gather(in.desired_speed, 0);
     Mask safe[3];
     for (int side = 0; side < 3; side++) {
-        const Around& a = around[side];
-        Float own = idm(s, speed, per_own_desired, a.gap, a.leader);
-        Float behind = idm(s, a.follower, a.per_desired, a.gap_behind, speed);
-        behind = choose(a.gap_behind < FREE_GAP, behind, filled(0.0f));
+        Float own = idm(s, speed, per_own_desired, gap[side], leader[side]);
+        Float behind = idm(s, follower[side], per_desired[side], gap_behind[side], speed);
+        behind = choose(gap_behind[side] < FREE_GAP, behind, filled(0.0f));
         safe[side] = smaller(own, behind) >= -s.safe_deceleration;
     }
     for (int lane = 0; lane < rows; lane++) {

@@ -75,27 +75,3 @@ INLINE LanesOf lanes_of(const Settings& s, Float y, Float sine, Float cosine, Fl
     l.seen_high = choose(valid, choose(signalled, l.high, choose(by_body, l.body_high, centre)), filled(-1e9f));
     return l;
 }
-
-// ---- Whom an ego has next to it in a lane: one look at everybody, in any order. (kernel.cpp finds the neighbours of
-// all vehicles at once, in the order of the road.)
-
-struct Around {
-    Float gap, leader;                                 // to the nearest ahead, and its speed
-    Float gap_behind, follower, per_desired, index;    // to the nearest behind, its speed, 1 / desired speed, and place
-};
-
-INLINE Around nobody_around(Float speed) {
-    Float free = filled(FREE_GAP);
-    return {free, speed, free, speed, filled(1.0f), filled(0.0f)};
-}
-
-// Looks at one more vehicle, where it is in the lane (`here`). One at the same x counts as behind: the ego has the
-// lowest index. Of two at the same gap ahead the slower one counts, behind the one with the lower index.
-INLINE void look_at(Around& a, Mask here, Float distance, Float gap, Float speed, Float per_desired, Float index) {
-    Mask ahead = distance > 0.0f;
-    Mask leads = here & ahead & ((gap < a.gap) | ((gap == a.gap) & (speed < a.leader)));
-    Mask follows = here & ~ahead & ((gap < a.gap_behind) | ((gap == a.gap_behind) & (index < a.index)));
-    a.gap = choose(leads, gap, a.gap), a.leader = choose(leads, speed, a.leader);
-    a.gap_behind = choose(follows, gap, a.gap_behind), a.follower = choose(follows, speed, a.follower);
-    a.per_desired = choose(follows, per_desired, a.per_desired), a.index = choose(follows, index, a.index);
-}

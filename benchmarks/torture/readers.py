@@ -31,7 +31,7 @@ from ganlane.files import CHECKPOINTS
 from ganlane.generator.checkpoint import CACHE_VARIABLE, cached, load_generator
 from ganlane.parameters.generator import NgsimParameters
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
-from ganlane.sim.scenarios import read_scene
+from ganlane.sim.scene_files import read_scene
 from ganlane.training.checkpoint import TrainingState
 from ganlane.training.logs import CsvLog, read_rows
 from ganlane.training.loop import collect

@@ -396,7 +396,7 @@ class FileSceneEnvConfig(SceneEnvConfig):
         super().__post_init__()
 
     def _read(self) -> FixedScene:
-        from ganlane.sim.scenarios import read_scene, with_ego_speed
+        from ganlane.sim.scene_files import read_scene, with_ego_speed
 
         if self.scene.path is None:
             raise ParameterError(

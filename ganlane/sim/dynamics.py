@@ -31,7 +31,7 @@ STEERING = SteeringParameters()
 
 
 class Pose(NamedTuple):
-    """Position x, y (m), heading (rad), speed (m/s) and realised acceleration (m/s2) of a vehicle."""
+    """Of a vehicle: x, y (m), heading (rad), speed (m/s) and realised acceleration (m/s2)."""
 
     x: Tensor
     y: Tensor
@@ -41,7 +41,7 @@ class Pose(NamedTuple):
 
 
 def slip_angle(steering: Tensor) -> Tensor:
-    """Angle between heading and motion at the centre, ``atan(l_r / (l_f + l_r) tan(delta))``, rad."""
+    """Angle from heading to motion at the centre, ``atan(l_r / (l_f + l_r) tan(delta))``, rad."""
     return torch.atan(0.5 * torch.tan(steering))
 
 
@@ -90,7 +90,7 @@ def steer(
     """
 
     def angle_rate(distance: Tensor) -> Tensor:
-        """Of the angle, rad/s, to a point ``distance`` m ahead that moves along with the vehicle."""
+        """Of the angle to a point ``distance`` m ahead that moves with the vehicle, rad/s."""
         slope = offset / distance
         return -lateral_speed / (distance * (1.0 + slope * slope)) - yaw_rate
 

@@ -137,7 +137,7 @@ def compare(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Pairs
 
 
 def perceive(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Scene:
-    """The :class:`Scene` of ``vehicles`` on ``road``, as seen by all of them or by a slice of them."""
+    """The :class:`Scene` of ``vehicles`` as seen by all of them or by a slice of them."""
     body = body_lanes(vehicles, road)
     attention, x = with_target(body, vehicles), vehicles.x
     sorts = (
@@ -233,7 +233,7 @@ def _candidates(scene: Scene, lanes: Tensor, side: int) -> Tensor:
 
 
 def _gap(scene: Scene, end: Tensor, side: int) -> Tensor:
-    """Gap from each observer's bumper to ``end`` [N, K, L], m; :data:`FREE_GAP_M` where nobody is."""
+    """Gap from each observer's bumper to ``end``, m; :data:`FREE_GAP_M` where nobody is."""
     o = scene.observers
     distance = end
     if scene.road.ring_m is None:

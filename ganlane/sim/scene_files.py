@@ -22,12 +22,13 @@ from typing import Any
 from ganlane.errors import UserError
 from ganlane.parameters.driving import Visibility
 from ganlane.sim.scenes import FixedScene, SceneVehicle, check_count
-from ganlane.sim.state import STRAIGHT, Road
+from ganlane.sim.state import Road
 
 #: Columns of a scene file.
 COLUMNS = tuple(field.name for field in fields(SceneVehicle) if field.name != "origin")
 ROAD = ("lanes", "lane_width_m")
 WHOLE_NUMBERS = ("lane", "target_lane", "lanes")
+LANE_WIDTH_M = 4.0
 #: Larger files hold no scene, bytes; and so many signs of a value are quoted in a message.
 _MOST_BYTES = 2**24
 _QUOTED = 60
@@ -62,11 +63,12 @@ def read_scene(
         raise UserError(
             f"{path}: not a text file in UTF-8 ({error.reason}); save the scene as one."
         ) from error
+    road: dict[str, Any] = {}
     if path.suffix.lower() == ".csv":
-        rows, road = _read_csv(path, text), {}
+        rows = _read_csv(path, text)
     else:
         rows, road = _read_json(path, text)
-    width = _agreed(path, "lane_width_m", road, lane_width_m) or STRAIGHT.lane_width_m
+    width = _agreed(path, "lane_width_m", road, lane_width_m) or LANE_WIDTH_M
     count = _agreed(path, "lanes", road, lanes) or _lanes_in(rows, width)
     return FixedScene(tuple(rows), Road(int(count), float(width)), name=str(path))
 

@@ -64,7 +64,7 @@ def braking_demand(vehicles: Vehicles, road: Road, idm: IdmParameters = TABLE_V)
     lane = scene.observers.target_lane.to(vehicles.x.dtype)
     lanes = torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1)
     accelerations = lane_accelerations(scene, lanes, idm)
-    return torch.minimum(accelerations.own, accelerations.with_it)[:, 0]
+    return torch.minimum(accelerations.observer, accelerations.with_it)[:, 0]
 
 
 class ActionMaskTransform(PerceptionTransform):

@@ -54,7 +54,7 @@ def change_to_the_left(scene) -> tuple[float, bool]:
     """Incentive for the first car to change from lane 0 to lane 1, and whether that is safe."""
     lanes = torch.tensor([0.0, 1.0]).expand(*scene.vehicles.x.shape, 2)
     both = lane_accelerations(scene, lanes, TABLE_V)
-    assert both.own[0, 0, 0].item() == pytest.approx(OWN, abs=1e-5)
+    assert both.observer[0, 0, 0].item() == pytest.approx(OWN, abs=1e-5)
     incentive, safe = mobil_criterion(both.of(slice(1, 2)), both.of(slice(0, 1)), TABLE_IV)
     return incentive[0, 0, 0].item(), safe[0, 0, 0].item()
 

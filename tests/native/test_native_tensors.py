@@ -235,8 +235,8 @@ def test_it_agrees_with_the_scalar_twin(seed):
         for row in range(4):
             state = scalar_state(td, row)
             outcome = scalar.decide(state, int(td["action"][row]), rules_of(env))
-            found = out[row]
-            cars, ego, events = found[keys.VEHICLES], found[keys.EGO], found[keys.EVENTS]
+            after = out[row]
+            cars, ego, events = after[keys.VEHICLES], after[keys.EGO], after[keys.EVENTS]
             for name in ("x", "y", "heading", "speed", "acceleration"):
                 expected = torch.tensor([getattr(car, name) for car in state.cars])
                 assert cars[name] == pytest.approx(expected, abs=1e-3), (name, row)
@@ -244,7 +244,7 @@ def test_it_agrees_with_the_scalar_twin(seed):
             assert [name for name in keys.END_EVENTS if events[name]] == outcome.reasons
             counts = [events[name].item() for name in keys.EVENT_COUNTS]
             assert counts == [outcome.soft_crash, outcome.soft_crash_behind]
-            assert found[keys.STEP] == state.step
+            assert after[keys.STEP] == state.step
             assert ego["mean_acceleration"].item() == pytest.approx(
                 outcome.mean_acceleration, abs=1e-3
             )

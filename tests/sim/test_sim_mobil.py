@@ -200,7 +200,7 @@ def test_at_its_decision_mobil_asks_no_more_than_b_safe_of_the_new_follower(
         fields = [
             dict(zip(scene._fields, car)) for car in zip(*(value[row].tolist() for value in scene))
         ]
-        view = scalar.View([scalar.Car(**given) for given in fields], scalar.Rules(lanes=lanes))
+        view = scalar.View([scalar.Car(**numbers) for numbers in fields], scalar.Rules(lanes=lanes))
         lane = view.cars[car].target_lane + change[row, car].item()
         follower = view.follower(car, lane)
         assert follower is None or view.acceleration(follower, car) >= -B_SAFE - 1e-9

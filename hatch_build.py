@@ -27,7 +27,7 @@ class KernelHook(BuildHookInterface):
 
     def dependencies(self) -> list[str]:
         """Clang from a wheel, where there is no compiler."""
-        here = sys.platform != "win32" and library.find_compiler() is not None
+        here = sys.platform != "win32" and library.compiler_command() is not None
         return [] if here or sys.platform == "win32" else ["ziglang>=0.13"]
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:

@@ -25,6 +25,8 @@ from ganlane.errors import UserError
 PACKAGE = Path(__file__).resolve().parent
 #: Weights that ship: ``agent_*.safetensors`` and ``generator_*.safetensors``.
 CHECKPOINTS = PACKAGE / "checkpoints"
+#: Environment variable with the cache folder; empty switches the cache off.
+CACHE_VARIABLE = "GANLANE_CACHE"
 #: Bytes that are written to test whether the disk is full; libraries fail with less than this left.
 _PROBE_BYTES = 2**20
 #: Ending of the temporary files, whose names begin with a dot.
@@ -35,6 +37,17 @@ _ZEROS = b"0" * 64
 PLACE = (_BEGIN + _ZEROS + _END).decode()
 #: The end of a zip archive: its comment's length, its comment.
 _COMMENT = len(PLACE).to_bytes(2, "little") + PLACE.encode()
+
+
+def cache_folder() -> Path | None:
+    """Folder of the cache: ``GANLANE_CACHE``, else ``ganlane`` in the user's cache folder.
+
+    None if switched off.
+    """
+    named = os.environ.get(CACHE_VARIABLE)
+    if named is not None:
+        return Path(named) if named else None
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ganlane"
 
 
 def conf_folder() -> Path:

@@ -78,6 +78,17 @@ TRUNCATING_EVENTS: Final = ("timeout", "scene_end")
 SOFT_CRASH: Final = "soft_crash"
 #: The same behind the ego: reported, and penalised by ``reward=considerate`` alone.
 SOFT_CRASH_BEHIND: Final = "soft_crash_behind"
+EVENT_COUNTS: Final = (SOFT_CRASH, SOFT_CRASH_BEHIND)
+DONE_FLAGS: Final = ("done", "terminated", "truncated")
+
+#: Of ``ego``: steering angle (rad), mean acceleration in the last decision (m/s2), lane change
+#: progress (0 to 1), distance (m).
+EGO_FLOATS: Final = ("steering", "mean_acceleration", "change_progress", "distance")
+#: Direction of the current lane change (-1, 0, 1), decisions and started lane changes in this
+#: episode.
+EGO_INTEGERS: Final = ("change_direction", "decisions", "lane_changes")
+#: Soft crash in the last physics step (ahead, behind), lane change started in the last decision.
+EGO_FLAGS: Final = ("soft_crash", "soft_crash_behind", "started_change")
 
 #: Terms of the paper's reward; one that charges for ``soft_crash_behind`` has a further one of that
 #: name.

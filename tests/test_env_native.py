@@ -145,7 +145,7 @@ def test_a_recorder_of_physics_steps_is_refused():
         env.rand_step(env.reset())
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))])
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 def test_an_environment_can_be_copied_and_sent_to_another_process(copied):
     env = make_env(
         IdmMobilTraffic(Road()),

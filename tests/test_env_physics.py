@@ -34,8 +34,8 @@ class Ageing(IdmTraffic):
         }
 
     def move(self, vehicles, memory, key, step):
-        moved, kept = super().move(vehicles, {"steering": memory["steering"]}, key, step)
-        return moved, {"age": memory["age"] + 1, **kept}
+        moved, rest = super().move(vehicles, {"steering": memory["steering"]}, key, step)
+        return moved, {"age": memory["age"] + 1, **rest}
 
 
 class Forgetful(Overlay):
@@ -149,7 +149,7 @@ def test_env_compile_reaches_the_environment_and_the_observation(asked, monkeypa
 
 def test_torchrls_keyword_calls_it_too(monkeypatch):
     seen = []
-    monkeypatch.setattr(HighwayEnv, "compile", lambda env, **given: seen.append(given) or env)
+    monkeypatch.setattr(HighwayEnv, "compile", lambda env, **options: seen.append(options) or env)
     HighwayEnv(environment(vehicles=3).traffic, vehicles=3, compile=True)
     assert seen == [{}]
 

@@ -27,7 +27,7 @@ MOTION = ("x", "y", "heading", "speed", "acceleration")
 
 
 def random_environment(rng: random.Random, rows: int) -> HighwayEnv:
-    """1 to 6 lanes, 2 to 20 vehicles, sparse to dense, with and without MOBIL, early and late ends."""
+    """1 to 6 lanes, 2 to 20 vehicles, sparse to dense, with and without MOBIL, all ends."""
     lanes = rng.randint(1, 6)
     vehicles = rng.randint(2, 20)
     spacing = rng.choice([8.0, 12.0, 25.0])
@@ -69,7 +69,7 @@ def stay_on_the_road(rng: random.Random, state: scalar.State, lanes: int) -> int
 
 
 def compare(env: HighwayEnv, td, duration_s: float, rng: random.Random, choose=any_action) -> None:
-    """Drive both simulators with the same random actions and compare every state, event and memory."""
+    """Drive both simulators with the same random actions; compare states, events and memories."""
     rules = rules_of(env)
     rows = env.batch_size[0]
     states = [scalar_state(td, row) for row in range(rows)]

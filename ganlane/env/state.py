@@ -16,20 +16,10 @@ from torchrl.data.tensor_specs import Binary
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.native.tensors import Outcome
+from ganlane.keys import DONE_FLAGS, EGO_FLAGS, EGO_FLOATS, EGO_INTEGERS, EVENT_COUNTS
 from ganlane.sim.state import Vehicles
 from ganlane.torch_settings import check_default_device
 
-#: Steering angle (rad), mean acceleration in the last decision (m/s2), lane change progress (0 to
-#: 1), distance (m).
-EGO_FLOATS = ("steering", "mean_acceleration", "change_progress", "distance")
-#: Direction of the current lane change (-1, 0, 1), decisions and started lane changes in this
-#: episode.
-EGO_INTEGERS = ("change_direction", "decisions", "lane_changes")
-#: Soft crash in the last physics step (ahead, behind), lane change started in the last decision.
-EGO_FLAGS = ("soft_crash", "soft_crash_behind", "started_change")
-EVENT_COUNTS = (keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND)
-DONE_FLAGS = ("done", "terminated", "truncated")
 COUNTERS = (keys.SEED, keys.EPISODE, keys.STEP)
 
 
@@ -122,28 +112,6 @@ def pack(
     return TensorDict._new_unsafe(
         {**made, keys.TRAFFIC: traffic, **rest}, batch_size=batch, device=device
     )
-
-
-def outcome_state(
-    seed: Tensor, episode: Tensor, out: Outcome, vehicles: Vehicles
-) -> TensorDictBase:
-    """The state of the episodes (``seed``, ``episode``) [N] after what the kernel did, without a
-    reward.
-    """
-    ego = {
-        name: out["ego_steering" if name == "steering" else name]
-        for name in EGO_FLOATS + EGO_INTEGERS + EGO_FLAGS
-    }
-    memory = TensorDict._new_unsafe({"steering": out["steering"]}, batch_size=out["step"].shape)
-    events = {name: out[name] for name in ("goal", "hard_crash", "out_of_road", "timeout")}
-    # of recorded scenes, which the kernel does not drive
-    events["scene_end"] = torch.zeros_like(out["timeout"])
-    events |= {
-        keys.SOFT_CRASH: out["soft_crashes"],
-        keys.SOFT_CRASH_BEHIND: out["soft_crashes_behind"],
-    }
-    rest = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: out["step"]}
-    return pack(vehicles, ego, memory, events, rest | {name: out[name] for name in DONE_FLAGS})
 
 
 # What is handed in

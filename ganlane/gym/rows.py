@@ -200,24 +200,21 @@ class NativeRows(Rows):
 
     def info(self) -> dict[str, Any]:
         batch, state = self.batch, self.batch.state
-        lane = np.rint(state["y"][:, 0] / np.float32(batch.lane_width_m)).astype(np.int64)
+        y = state[keys.VEHICLES, "y"][:, 0]
+        lane = np.rint(y / np.float32(batch.lane_width_m)).astype(np.int64)
+        events = ("goal", "hard_crash", "out_of_road", "timeout", *keys.EVENT_COUNTS)
         return {
-            "seed": state["seed"],
-            "episode_number": state["episode"],
-            "time_s": state["step"] * keys.PHYSICS_STEP_S,
-            "distance_m": state["distance"],
-            "speed_mps": state["speed"][:, 0],
+            "seed": state[keys.SEED],
+            "episode_number": state[keys.EPISODE],
+            "time_s": state[keys.STEP] * keys.PHYSICS_STEP_S,
+            "distance_m": state[keys.EGO, "distance"],
+            "speed_mps": state[keys.VEHICLES, "speed"][:, 0],
             "lane": np.minimum(np.maximum(lane, 0), batch.lanes - 1),
-            "decisions": state["decisions"],
-            "lane_changes": state["lane_changes"],
+            "decisions": state[keys.EGO, "decisions"],
+            "lane_changes": state[keys.EGO, "lane_changes"],
             "action_mask": batch.mask.view(np.int8),
-            "goal": state["goal"],
-            "hard_crash": state["hard_crash"],
-            "out_of_road": state["out_of_road"],
-            "timeout": state["timeout"],
+            **{name: state[keys.EVENTS, name] for name in events},
             "scene_end": self._never,
-            keys.SOFT_CRASH: state["soft_crashes"],
-            keys.SOFT_CRASH_BEHIND: state["soft_crashes_behind"],
             keys.REWARD_TERMS: batch.reward_terms(),
         }
 

@@ -5,6 +5,18 @@
 
 #include <stdint.h>
 
+// ---- The legal command, as is_heard and on_road of ganlane.sim.dynamics say it
+
+// Whether a wish to go to `side` (1 left, -1 right) is obeyed during a lane change in `direction`.
+static inline bool is_heard(int64_t side, int64_t direction, bool abort) {
+    return direction == 0 || (abort && side == -direction);
+}
+
+static inline bool on_road(int64_t lane, int64_t lanes) { return lane >= 0 && lane < lanes; }
+
+// ---- Arrays. The soft crashes of a decision are counted in the state's events; those of the ego's memory are whether
+// there is one at this instant.
+
 struct Inputs {
     const int64_t* action;
     const float *x, *y, *heading, *speed, *acceleration, *length, *width, *desired_speed;

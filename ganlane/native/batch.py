@@ -15,8 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from ganlane import keys
 from ganlane.native import settings
 from ganlane.native.library import addresses, in_threads, load
+from ganlane.native.settings import Key, fields
 from ganlane.settings.driving import EgoParameters, IdmParameters, MobilParameters, Visibility
 from ganlane.settings.episode import EpisodeParameters, SpawnParameters
 from ganlane.settings.observation import (
@@ -30,36 +32,45 @@ from ganlane.settings.observation import (
 #: Speed over desired speed beyond which the observation is cut off, for a space with bounds; IDM
 #: stays far below.
 SPEED_RATIO_LIMIT = 4.0
-# The structures of observation.cpp and mask.cpp, in their order.
-_VIEW = (
-    "speed",
-    "desired_speed",
-    "length",
-    "y",
-    "x",
-    "y",
-    "speed",
-    "valid",
-    "change_progress",
-    "change_direction",
-)
-_MASK = (
-    "x", "y", "heading", "speed", "length", "width", "desired_speed", "target_lane", "visibility", "valid",
-    "change_direction",
-)  # fmt: skip
+#: The arrays of a batch beside those of the state.
+_ROW_ARRAYS: dict[Key, str] = {
+    **dict.fromkeys((keys.SEED, keys.EPISODE, keys.STEP, keys.ACTION), "int64"),
+    keys.REWARD: "float32",
+    **dict.fromkeys(("recycles", "fresh"), "bool"),
+}
+
+
+def _vehicles(names: str) -> list[Key]:
+    return [(keys.VEHICLES, name) for name in names.split()]
+
+
+# What a function of the kernel reads, in the order of its structure in C++. The ego perceives all
+# vehicles as they are: of what it sees and of what there is the view reads the same arrays.
+_DECIDES = [keys.ACTION, *settings.INPUTS, "recycles"]
+_STARTS = [keys.SEED, keys.EPISODE, "fresh", *settings.SCENE, "recycles"]
+_VIEWS = [
+    *_vehicles("speed desired_speed length y x y speed valid"),
+    (keys.EGO, "change_progress"),
+    (keys.EGO, "change_direction"),
+]
+_MASKS = [
+    *_vehicles("x y heading speed length width desired_speed target_lane visibility valid"),
+    (keys.EGO, "change_direction"),
+]
 
 
 class _Batch(ctypes.Structure):
     """``Batch`` of step.cpp."""
 
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in (
-            "settings", "inputs", "outputs", "spawn", "scene", "reward_settings", "reward", "terms",
-            "view", "view_inputs", "observation", "mask_settings", "mask_inputs", "mask_outputs", "mask",
-        )),
-        *((name, ctypes.c_float) for name in ("lowest", "highest", "fastest")),
-        *((name, ctypes.c_int32) for name in ("vehicles", "lanes", "size", "mask_form", "abort_lane_change")),
-    )  # fmt: skip
+    _fields_ = [
+        *fields(
+            ctypes.c_void_p,
+            "settings inputs outputs spawn scene reward_settings reward terms view view_inputs"
+            " observation mask_settings mask_inputs mask_outputs mask",
+        ),
+        *fields(ctypes.c_float, "lowest highest fastest"),
+        *fields(ctypes.c_int32, "vehicles lanes size mask_form abort_lane_change"),
+    ]
 
 
 class Stepped(NamedTuple):
@@ -93,7 +104,8 @@ class NativeBatch:
         variant: one of :data:`ganlane.native.library.VARIANTS`; None: the best for this processor.
 
     Attributes:
-        state: name to array, [N, M] of the vehicles, [N] of the rest.
+        state: the environment's state (:mod:`ganlane.keys`) as arrays by key, ``("vehicles", "x")``
+            [N, M], ``("ego", "distance")`` and the rest [N].
 
     Raises:
         UserError: the kernel cannot be built here.
@@ -118,59 +130,45 @@ class NativeBatch:
         variant: str | None = None,
     ) -> None:
         self._arguments = {name: value for name, value in locals().items() if name != "self"}
-        spawn, ego, episode = (
-            spawn or SpawnParameters(),
-            ego or EgoParameters(),
-            episode or EpisodeParameters(),
-        )
+        spawn, ego = spawn or SpawnParameters(), ego or EgoParameters()
+        episode, idm = episode or EpisodeParameters(), idm or IdmParameters()
         observation, reward = observation or ObservationConfig(), reward or RewardParameters()
-        idm, mask = idm or IdmParameters(), mask or MaskParameters()
+        mask = mask or MaskParameters()
+        self.rows, self.lanes, self.lane_width_m = rows, lanes, lane_width_m
+        self.terms = reward.term_names
         road = (lanes, lane_width_m, vehicles)
-        self.rows, self.lanes, self.lane_width_m, self.terms = (
-            rows,
-            lanes,
-            lane_width_m,
-            reward.term_names,
-        )
         view = settings.view_of(*road, observation.scale(), observation.form)
         self.bounds = (-1.0, largest_number(observation.form, spawn.longest_m))
-        self.state: dict[str, npt.NDArray[Any]] = {
-            **{
-                name: np.zeros((rows, vehicles), kind)
-                for name, kind in settings.VEHICLE_ARRAYS.items()
-            },
-            **{
-                name: np.zeros(rows, kind)
-                for name, kind in (settings.ROW_ARRAYS | settings.EVENT_ARRAYS).items()
-            },
-        }
+        self.state: dict[Key, npt.NDArray[Any]] = {}
+        for name, kind in settings.VEHICLE_ARRAYS.items():
+            self.state[name] = np.zeros((rows, vehicles), kind)
+        for name, kind in (settings.EGO_ARRAYS | settings.EVENT_ARRAYS | _ROW_ARRAYS).items():
+            self.state[name] = np.zeros(rows, kind)
         self.observation = np.zeros((rows, view.numbers()), np.float32)
-        self.mask = np.ones((rows, 3), np.bool_)
+        self.mask = np.ones((rows, keys.ACTIONS), np.bool_)
         self._term_values = np.zeros((rows, len(self.terms)), np.float32)
         self._no_safe_action = np.zeros(rows, np.bool_)
         self._library = load(variant)
-        visible = Visibility.named(ego.visibility)
-        pointed = {
-            "settings": settings.settings_of(*road, episode, ego, idm, mobil=mobil),
-            "inputs": self._pointers(settings.INPUTS),
+        visible = (Visibility.named(ego.visibility), Visibility.SIGNALLED)
+        decision = settings.settings_of(*road, episode, ego, idm, mobil=mobil)
+        deceleration, abort = mask.safe_deceleration, ego.abort_lane_change
+        # Referred to by this object, since the structure holds no more than their addresses.
+        self._pointed = {
+            "settings": decision,
+            "inputs": self._pointers(_DECIDES),
             "outputs": self._pointers(settings.OUTPUTS),
-            "spawn": settings.spawn_of(
-                *road, spawn, stream, visible, Visibility.SIGNALLED, recycle_share
-            ),
-            "scene": self._pointers(settings.SCENE),
+            "spawn": settings.spawn_of(*road, spawn, stream, *visible, recycle_share),
+            "scene": self._pointers(_STARTS),
             "reward_settings": settings.reward_of(reward, episode.decision_period_s),
             "view": view,
-            "view_inputs": self._pointers(_VIEW),
-            "mask_settings": settings.safe_settings(
-                *road, idm, mask.safe_deceleration, ego.abort_lane_change
-            ),
-            "mask_inputs": self._pointers(_MASK),
+            "view_inputs": self._pointers(_VIEWS),
+            "mask_settings": settings.mask_of(*road, idm, deceleration, abort),
+            "mask_inputs": self._pointers(_MASKS),
             "mask_outputs": addresses([self.mask, self._no_safe_action]),
         }
-        self._pointed = pointed  # kept, since the structure holds no more than their addresses
         self._batch = _Batch(
-            **{name: ctypes.addressof(each) for name, each in pointed.items()},
-            reward=self.state["reward"].ctypes.data,
+            **{name: ctypes.addressof(part) for name, part in self._pointed.items()},
+            reward=self.state[keys.REWARD].ctypes.data,
             terms=self._term_values.ctypes.data,
             observation=self.observation.ctypes.data,
             mask=self.mask.ctypes.data,
@@ -181,12 +179,11 @@ class NativeBatch:
             lanes=lanes,
             size=view.numbers(),
             mask_form=MASKS.index(mask.form),
-            abort_lane_change=ego.abort_lane_change,
+            abort_lane_change=abort,
         )
         self._address = ctypes.byref(self._batch)
-        self._stepped = Stepped(
-            self.observation, *(self.state[name] for name in ("reward", "terminated", "truncated"))
-        )
+        ends = (self.state["terminated"], self.state["truncated"])
+        self._stepped = Stepped(self.observation, self.state[keys.REWARD], *ends)
 
     def __getstate__(self) -> dict[str, Any]:
         """What it was made of, and its numbers.
@@ -197,19 +194,14 @@ class NativeBatch:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state["arguments"])  # type: ignore[misc]  # anew, in place
-        for array, kept in zip(self._arrays(), state["arrays"]):
-            array[:] = kept
+        for array, numbers in zip(self._arrays(), state["arrays"]):
+            array[:] = numbers
 
     def _arrays(self) -> list[npt.NDArray[Any]]:
-        return [
-            *self.state.values(),
-            self.observation,
-            self.mask,
-            self._term_values,
-            self._no_safe_action,
-        ]
+        written = [self.observation, self.mask, self._term_values, self._no_safe_action]
+        return [*self.state.values(), *written]
 
-    def _pointers(self, names: Sequence[str]) -> ctypes.Array[ctypes.c_void_p]:
+    def _pointers(self, names: Sequence[Key]) -> ctypes.Array[ctypes.c_void_p]:
         return addresses([self.state[name] for name in names])
 
     def start(
@@ -221,13 +213,13 @@ class NativeBatch:
         state = self.state
         fresh = state["fresh"]
         fresh[:] = True if rows is None else rows
-        np.copyto(state["seed"], seed, where=fresh)
-        np.copyto(state["episode"], episode, where=fresh)
+        np.copyto(state[keys.SEED], seed, where=fresh)
+        np.copyto(state[keys.EPISODE], episode, where=fresh)
         self._in_threads(self._library.ganlane_start)
 
     def step(self, actions: npt.NDArray[np.int64]) -> Stepped:
         """One decision of every row, by the actions [N]; no row is reset."""
-        self.state["action"][:] = actions
+        self.state[keys.ACTION][:] = actions
         self._in_threads(self._library.ganlane_step)
         return self._stepped
 

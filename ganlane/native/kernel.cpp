@@ -10,6 +10,11 @@
 //
 // Within a row the vehicles are kept in the order of the road, foremost first. Then one pass from the front finds
 // everybody's leader in every lane, and one from the rear everybody's follower: linear in the number of vehicles.
+//
+// How to read it. `Float` and `Mask` (vectors.hpp) hold LANES numbers and answers, one of each row; there is no `if`
+// on them, so `choose(mask, yes, no)` computes both and keeps, row by row, the one that holds. Integers (lanes, target
+// lanes, steps, indices) are floats here, exact below 2^24, so that they mix with the others. Read from the bottom:
+// ganlane_decide, load, decide, store. Names of arrays are those of the state's keys (ganlane.keys).
 
 #include <stdint.h>
 #include <stdlib.h>
@@ -70,7 +75,8 @@ static void lay_out(Rows& rows, Float* scratch, const Settings& s) {
 
 INLINE Mask is_ego(const Rows& r, int i) { return r.index[i] == 0.0f; }
 
-// Exchange two vehicles where `mask` holds; what follows from the state is computed anew afterwards.
+// Exchange two vehicles where `mask` holds; what follows from the state is computed anew afterwards, but for the slip
+// angle and its sine: they follow from the steering alone, which `drive` has at hand and find_lanes does not need.
 static inline void exchange(Rows& r, int i, int j, Mask mask) {
     Float* fields[STATE_FIELDS + 2] = {r.x, r.y, r.heading, r.speed, r.acceleration, r.half_length, r.half_width,
                                        r.per_desired, r.target, r.visibility, r.valid, r.steering, r.index, r.slip, r.slip_sine};
@@ -81,7 +87,8 @@ static inline void exchange(Rows& r, int i, int j, Mask mask) {
     }
 }
 
-// Foremost first; of two at the same place the one with the lower index. Few overtake within 0.1 s.
+// Foremost first; of two at the same place the one with the lower index. A bubble sort, since few overtake within
+// 0.1 s: mostly one pass of comparisons, and what lies behind the last exchange is in order.
 static inline void put_in_order(Rows& r) {
     for (int last = r.vehicles - 1; last > 0;) {
         int exchanged = 0;
@@ -108,8 +115,10 @@ static inline void find_lanes(const Settings& s, Rows& r) {
 
 INLINE Mask seen_in(const Rows& r, int i, Float lane) { return (r.seen_low[i] <= lane) & (lane <= r.seen_high[i]); }
 
+INLINE Nearest nobody_at(float x, Float speed) { return {filled(x), filled(0.0f), speed, filled(1.0f), filled(0.0f)}; }
+
 static inline void nobody_met(const Settings& s, Rows& r, float x) {
-    for (int lane = 0; lane < s.lanes; lane++) r.nearest[lane] = {filled(x), filled(0.0f), filled(0.0f), filled(1.0f), filled(0.0f)};
+    for (int lane = 0; lane < s.lanes; lane++) r.nearest[lane] = nobody_at(x, filled(0.0f));
 }
 
 // On the way from the front: vehicle i is the nearest in the lanes it is seen in, unless the rear of a longer one
@@ -139,6 +148,20 @@ INLINE void meet_from_rear(const Settings& s, Rows& r, int i) {
     }
 }
 
+// The nearest met so far in the lane that each row has its own number of; `nobody` where the road has no such lane.
+// A vector's rows may ask for different lanes, so all lanes are looked at, and each row keeps its own.
+INLINE Nearest nearest_in(const Settings& s, const Rows& r, Float lane, Nearest nobody, int first = 0) {
+    Nearest n = nobody;
+    for (int k = first; k < s.lanes; k++) {
+        Mask here = lane == (float)k;
+        n.x = choose(here, r.nearest[k].x, n.x);
+        n.half_length = choose(here, r.nearest[k].half_length, n.half_length);
+        n.speed = choose(here, r.nearest[k].speed, n.speed);
+        n.per_desired = choose(here, r.nearest[k].per_desired, n.per_desired);
+    }
+    return n;
+}
+
 INLINE Float gap_ahead(const Rows& r, int i, Float x, Float half_length) {
     return smaller((x - r.x[i]) - (r.half_length[i] + half_length), filled(FREE_GAP));
 }
@@ -151,15 +174,10 @@ static inline void follow(const Settings& s, Rows& r) {
         Float speed = r.speed[i], low = r.low[i], high = r.high[i];
         Float strongest = filled(0.0f);
         if (!any(low != high)) {
-            Float x = r.nearest[0].x, half_length = r.nearest[0].half_length, leader = r.nearest[0].speed;
-            for (int lane = 1; lane < s.lanes; lane++) {
-                Mask here = low == (float)lane;
-                x = choose(here, r.nearest[lane].x, x);
-                half_length = choose(here, r.nearest[lane].half_length, half_length);
-                leader = choose(here, r.nearest[lane].speed, leader);
-            }
-            Float gap = gap_ahead(r, i, x, half_length);
-            strongest = interaction(s, speed, gap, choose(gap < FREE_GAP, leader, speed));
+            // Nobody in any row is in two lanes, as nearly always: one lane each.
+            Nearest n = nearest_in(s, r, low, r.nearest[0], 1);
+            Float gap = gap_ahead(r, i, n.x, n.half_length);
+            strongest = interaction(s, speed, gap, choose(gap < FREE_GAP, n.speed, speed));
         } else {
             Float middle = smaller(low + 1.0f, high);
             for (int lane = 0; lane < s.lanes; lane++) {
@@ -185,35 +203,21 @@ static inline void find_neighbours(const Settings& s, Rows& r) {
     nobody_met(s, r, NOBODY_M);
     for (int i = 0; i < r.vehicles; i++) {
         for (int side = 0; side < 3; side++) {
-            Float lane = r.target[i] + SIDES[side], x = filled(NOBODY_M), half_length = filled(0.0f), speed = r.speed[i];
-            for (int k = 0; k < s.lanes; k++) {
-                Mask here = lane == (float)k;
-                x = choose(here, r.nearest[k].x, x);
-                half_length = choose(here, r.nearest[k].half_length, half_length);
-                speed = choose(here, r.nearest[k].speed, speed);
-            }
-            Float gap = gap_ahead(r, i, x, half_length);
+            Nearest n = nearest_in(s, r, r.target[i] + SIDES[side], nobody_at(NOBODY_M, r.speed[i]));
+            Float gap = gap_ahead(r, i, n.x, n.half_length);
             r.gap_ahead[side * r.vehicles + i] = gap;
-            r.speed_ahead[side * r.vehicles + i] = choose(gap < FREE_GAP, speed, r.speed[i]);
+            r.speed_ahead[side * r.vehicles + i] = choose(gap < FREE_GAP, n.speed, r.speed[i]);
         }
         meet_from_front(s, r, i);
     }
     nobody_met(s, r, -NOBODY_M);
     for (int i = r.vehicles - 1; i >= 0; i--) {
         for (int side = 0; side < 3; side++) {
-            Float lane = r.target[i] + SIDES[side], x = filled(-NOBODY_M), half_length = filled(0.0f);
-            Float speed = r.speed[i], per_desired = filled(1.0f);
-            for (int k = 0; k < s.lanes; k++) {
-                Mask here = lane == (float)k;
-                x = choose(here, r.nearest[k].x, x);
-                half_length = choose(here, r.nearest[k].half_length, half_length);
-                speed = choose(here, r.nearest[k].speed, speed);
-                    per_desired = choose(here, r.nearest[k].per_desired, per_desired);
-            }
-            Float gap = (r.x[i] - x) - (r.half_length[i] + half_length);
+            Nearest n = nearest_in(s, r, r.target[i] + SIDES[side], nobody_at(-NOBODY_M, r.speed[i]));
+            Float gap = (r.x[i] - n.x) - (r.half_length[i] + n.half_length);
             r.gap_behind[side * r.vehicles + i] = smaller(gap, filled(FREE_GAP));
-            r.speed_behind[side * r.vehicles + i] = speed;
-            r.per_desired_behind[side * r.vehicles + i] = per_desired;
+            r.speed_behind[side * r.vehicles + i] = n.speed;
+            r.per_desired_behind[side * r.vehicles + i] = n.per_desired;
         }
         meet_from_rear(s, r, i);
     }
@@ -239,6 +243,7 @@ INLINE Prospect prospect(const Settings& s, const Rows& r, int i, int side) {
     };
 }
 
+// Below every incentive that can be.
 const float NEVER = -1e30f;
 
 // The incentive of a change, m/s2; NEVER where it does not pay, is unsafe or leaves the road.
@@ -298,7 +303,8 @@ static inline void change_lanes(const Settings& s, Rows& r, Mask due) {
 static inline void drive(const Settings& s, Rows& r) {
     for (int i = 0; i < r.vehicles; i++) {
         Float y = r.y[i], heading = r.heading[i], speed = r.speed[i], slip = r.slip[i];
-        // steering
+        // steering: ganlane.sim.dynamics.steer, with speed and distances inverted once, since a division takes as long
+        // as ten products. An invalid vehicle is driven as well: cheaper than to leave it out.
         Float per_pace = 1.0f / larger(speed, filled(s.slow)), offset = r.target[i] * s.lane_width - y;
         Float lateral_speed = speed * sine_of(heading + slip);
         Float yaw_rate = speed * r.slip_sine[i] * (2.0f / WHEELBASE);
@@ -312,14 +318,14 @@ static inline void drive(const Settings& s, Rows& r) {
         Float turn_wheel = s.gain_far * rate_far + s.gain_near * rate_near + s.gain_integral * theta_near * (speed * per_pace);
         Float steering = r.steering[i] + WHEELBASE * per_pace * turn_wheel * PHYSICS_STEP;
         steering = between(steering, -s.max_angle, s.max_angle);
-        // bicycle
+        // bicycle: ganlane.sim.dynamics.advance
         Float new_speed = larger(speed + r.following[i] * PHYSICS_STEP, filled(0.0f));
         Float distance = 0.5f * (speed + new_speed) * PHYSICS_STEP;
         Float new_slip = slip_of(steering), slip_sine = sine_of(new_slip);
         Float turn = distance * slip_sine * (2.0f / WHEELBASE);
         Float sine, cosine;
         sincos_of(heading + new_slip + 0.5f * turn, sine, cosine);
-        Mask on = r.running;
+        Mask on = r.running;  // rows that have ended stay as they ended
         r.x[i] = choose(on, r.x[i] + distance * cosine, r.x[i]);
         r.y[i] = choose(on, y + distance * sine, y);
         r.heading[i] = choose(on, heading + turn, heading);
@@ -379,7 +385,8 @@ static inline Mask crashed(const Ego& e, const Rows& r) {
     return hit;
 }
 
-// Soft crash ahead and behind: the nearest in a lane that the ego's body is in is dangerously close.
+// Soft crash ahead and behind: the nearest in a lane that the ego's body is in is dangerously close. One scan, in any
+// order; written out, since sharing it with the like one of mask.cpp made a decision of 1024 rows take 8 % longer.
 static inline void look_round(const Settings& s, const Rows& r, const Ego& e, Mask& ahead, Mask& behind) {
     ahead = none(), behind = none();
     Float lanes[3] = {e.low, e.high, smaller(e.low + 1.0f, e.high)};
@@ -429,7 +436,7 @@ INLINE Mask leaves_room(const Settings& s, const Rows& r, int i, Float x, int j,
 }
 
 static inline void recycle(const Settings& s, Rows& r, Mask rows) {
-    Float* moved = r.wish;
+    Float* moved = r.wish;  // free between decisions of MOBIL, as is `kept`
     Float ego_x = find_ego(r).x;
     Mask away = none();
     for (int i = 0; i < r.vehicles; i++) {
@@ -462,6 +469,7 @@ static inline void recycle(const Settings& s, Rows& r, Mask rows) {
 static inline void decide(const Settings& s, Rows& r) {
     find_lanes(s, r);
     for (int substep = 0; substep < s.substeps && any(r.running); substep++) {
+        // Everybody looks at the vehicles as they are before anybody moves: accelerations first, then lanes.
         follow(s, r);
         if (s.mobil) change_lanes(s, r, r.running & (r.phase == 0.0f));
         r.phase = choose(r.phase == (float)(MOBIL_PERIOD - 1), filled(0.0f), r.phase + 1.0f);
@@ -485,13 +493,13 @@ struct Command {  // of one row, what the action leads to
 static Command obey(const Settings& s, const Inputs& in, long row) {
     int64_t wish = in.action[row] == LEFT ? 1 : in.action[row] == RIGHT ? -1 : 0;
     int64_t direction = in.change_direction[row], target = in.target_lane[row * s.vehicles];
-    bool heard = direction == 0 || (s.abort_lane_change && wish == -direction);
-    if (!heard) wish = 0;
-    bool off_road = target + wish < 0 || target + wish > s.lanes - 1;
+    if (!is_heard(wish, direction, s.abort_lane_change)) wish = 0;
+    bool off_road = !on_road(target + wish, s.lanes);
     if (off_road) wish = 0;
     return {wish ? wish : direction, target + wish, wish != 0, off_road, in.speed[row * s.vehicles], in.step[row]};
 }
 
+// One row's number of a vehicle: a vector seen as the array that it is.
 INLINE float& at(Float* field, int i, int lane) { return ((float*)(field + i))[lane]; }
 
 static void load(const Settings& s, const Inputs& in, Rows& r, long first, long rows, Command* commands) {
@@ -531,7 +539,7 @@ static void load(const Settings& s, const Inputs& in, Rows& r, long first, long 
         r.running[lane] = lane < rows && !command.off_road ? -1 : 0;
         r.ahead[lane] = in.soft_crash[row] ? -1 : 0;
         r.behind[lane] = in.soft_crash_behind[row] ? -1 : 0;
-        r.phase[lane] = (float)(command.step % MOBIL_PERIOD);
+        r.phase[lane] = (float)(command.step % MOBIL_PERIOD);  // rows of a vector may be at different times
         r.step[lane] = (float)command.step;
     }
     for (int i = 0; i < s.vehicles; i++) r.slip[i] = slip_of(r.steering[i]), r.slip_sine[i] = sine_of(r.slip[i]);
@@ -590,6 +598,7 @@ extern "C" int ganlane_decide(const Settings* settings, const Inputs* in, const 
     const Settings& s = *settings;
     for (long row = first; row < last; row++)
         if ((uint64_t)in->action[row] > 2) return 2;
+    // One vector more than needed, to begin at a multiple of a vector's size, which its instructions ask for.
     size_t bytes = scratch_floats(s) * sizeof(Float) + sizeof(Float);
     void* memory = malloc(bytes);
     if (!memory) return 1;

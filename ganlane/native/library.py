@@ -27,7 +27,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ganlane import runtime
 from ganlane.errors import UserError
+from ganlane.files import CACHE_VARIABLE, cache_folder
 
 #: The sources to compile, and what they include.
 SOURCES = tuple(sorted(Path(__file__).parent.glob("*.[ch]pp")))
@@ -38,7 +40,14 @@ PREBUILT = Path(__file__).with_name("prebuilt")
 FLAGS = ("-O3", "-std=c++17", "-ffp-contract=off", "-fno-exceptions", "-fPIC", "-shared", "-s")
 #: The kernel needs no C++ library; zig would compile one first, which takes minutes.
 ZIG_FLAGS = ("-nostdinc++", "-nostdlib++")
-ADVICE = "install g++ or clang++ (Debian: apt install g++), or pip install 'ganlane[native]', which brings Clang."
+ADVICE = (
+    "install g++ or clang++ (Debian: apt install g++), "
+    "or pip install 'ganlane[native]', which brings Clang."
+)
+#: Functions of the library, and how many pointers they take before the first and the last row.
+FUNCTIONS = {"decide": 3, "lane_view": 3, "mask": 3, "spawn": 3, "step": 1, "start": 1}
+#: What Linux knows of the processor.
+CPU_INFO = Path("/proc/cpuinfo")
 
 
 class Variant(NamedTuple):
@@ -61,8 +70,6 @@ VARIANTS = {
     "AVX2": Variant(8, ("-march=x86-64-v3",), ("-mcpu=x86_64_v3",), _V3),
     "default": Variant(4, (), (), frozenset()),
 }
-#: What Linux knows of the processor.
-CPU_INFO = Path("/proc/cpuinfo")
 
 
 def best_variant() -> str:
@@ -71,38 +78,35 @@ def best_variant() -> str:
         return "default"
     try:
         lines = CPU_INFO.read_text().splitlines()
-        found = set(next(line for line in lines if line.startswith("flags")).split())
+        parts = set(next(line for line in lines if line.startswith("flags")).split())
     except (OSError, StopIteration):  # not Linux
         import torch  # seconds to import
 
         capability = torch.backends.cpu.get_cpu_capability()
         return capability if capability in VARIANTS else "default"
-    return next(name for name, variant in VARIANTS.items() if variant.needed <= found)
+    return next(name for name, variant in VARIANTS.items() if variant.needed <= parts)
 
 
-def find_compiler() -> tuple[str, ...] | None:
-    """The command of a C++ compiler: ``CXX``, g++, clang++ or the package ``ziglang``.
+def compiler_command() -> tuple[str, ...] | None:
+    """The command of a C++ compiler, that of the package ``ziglang`` if need be.
 
     None if there is none.
     """
-    for name in (os.environ.get("CXX"), "g++", "clang++"):
-        found = name and shutil.which(name)
-        if found:
-            return (found,)
-    return (sys.executable, "-m", "ziglang", "c++") if importlib.util.find_spec("ziglang") else None
+    path, _ = runtime.find_compiler()
+    if path is not None:
+        return (path,)
+    if importlib.util.find_spec("ziglang"):
+        return (sys.executable, "-m", "ziglang", "c++")
+    return None
 
 
-def cache_folder() -> Path:
-    """Where built libraries are kept: ``native`` in the folder ``GANLANE_CACHE``, by default the
-    user's.
+def libraries_folder() -> Path:
+    """Where built libraries are kept: ``native`` in the cache.
 
-    If that variable is empty, which switches caches off, a folder that goes when the process ends.
+    Where that is off, a folder that goes when the process ends.
     """
-    named = os.environ.get("GANLANE_CACHE")
-    if named == "":
-        return _passing_folder()
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ganlane"
-    return (Path(named) if named else cache) / "native"
+    cache = cache_folder()
+    return _passing_folder() if cache is None else cache / "native"
 
 
 @lru_cache(maxsize=1)
@@ -116,7 +120,7 @@ def why_not() -> str | None:
     """Why the kernel cannot be built or run here, as the end of a sentence; None if it can."""
     if sys.platform == "win32":
         return "is not built for Windows"
-    if find_compiler() or _prebuilt(best_variant()).is_file():
+    if compiler_command() or _prebuilt(best_variant()).is_file():
         return None
     return f"needs a C++ compiler, and there is none; {ADVICE}"
 
@@ -128,23 +132,27 @@ def load(variant: str | None = None) -> ctypes.CDLL:
     Raises:
         UserError: there is no compiler, it fails, or the cache folder cannot be written.
     """
-    return _load(variant or best_variant(), find_compiler(), cache_folder())
+    return _load(variant or best_variant(), compiler_command(), libraries_folder())
 
 
 @lru_cache(maxsize=8)
 def _load(variant: str, compiler: tuple[str, ...] | None, folder: Path) -> ctypes.CDLL:
-    prebuilt = _prebuilt(variant)
-    if prebuilt.is_file():
-        return _declared(ctypes.CDLL(str(prebuilt)))
-    reason = why_not()
-    if compiler is None or reason:
-        raise UserError(f"env.kernel=native {reason} Or set env.kernel=torch.")
-    command = _command(variant, compiler)
-    name = _digest(*_sources(), *command, _run((*compiler, "--version")).stdout)
-    library = folder / f"kernel-{variant.lower()}-{name}.so"
-    if not library.is_file():
-        _build(command, library)
-    return _declared(ctypes.CDLL(str(library)))
+    path = _prebuilt(variant)
+    if not path.is_file():
+        reason = why_not()
+        if compiler is None or reason:
+            raise UserError(f"env.kernel=native {reason} Or set env.kernel=torch.")
+        command = _command(variant, compiler)
+        version = _run((*compiler, "--version")).stdout
+        path = folder / _name(variant, *command, version)
+        if not path.is_file():
+            _build(command, path)
+    library = ctypes.CDLL(str(path))
+    for name, pointers in FUNCTIONS.items():
+        function = getattr(library, f"ganlane_{name}")
+        function.argtypes = [*[ctypes.c_void_p] * pointers, ctypes.c_long, ctypes.c_long]
+        function.restype = ctypes.c_int
+    return library
 
 
 def build_all(folder: Path) -> list[Path]:
@@ -153,20 +161,30 @@ def build_all(folder: Path) -> list[Path]:
     Raises:
         UserError: there is no compiler, or it fails.
     """
-    compiler = find_compiler()
+    compiler = compiler_command()
     if compiler is None:
         raise UserError(f"there is no C++ compiler; {ADVICE}")
-    made = []
+    paths = []
     for variant in VARIANTS if platform.machine() in ("x86_64", "AMD64") else ("default",):
-        made.append(folder / _prebuilt(variant).name)
-        _build(_command(variant, compiler), made[-1])
-    return made
+        path = folder / _prebuilt(variant).name
+        _build(_command(variant, compiler), path)
+        paths.append(path)
+    return paths
 
 
 def _prebuilt(variant: str) -> Path:
     """Where a wheel has the library of these sources."""
-    name = _digest(*_sources(), *_flags(variant), platform.machine())
-    return PREBUILT / f"kernel-{variant.lower()}-{name}.so"
+    return PREBUILT / _name(variant, *_flags(variant), platform.machine())
+
+
+def _name(variant: str, *parts: str) -> str:
+    """A file name that follows from the sources and from what else makes a library."""
+    digest = hashlib.sha256("\0".join((*_sources(), *parts)).encode()).hexdigest()
+    return f"kernel-{variant.lower()}-{digest[:20]}.so"
+
+
+def _sources() -> tuple[str, ...]:
+    return tuple(source.read_text() for source in SOURCES)
 
 
 def _flags(variant: str) -> tuple[str, ...]:
@@ -174,25 +192,11 @@ def _flags(variant: str) -> tuple[str, ...]:
 
 
 def _command(variant: str, compiler: tuple[str, ...]) -> tuple[str, ...]:
-    own = (
-        (*ZIG_FLAGS, *VARIANTS[variant].zig_flags)
-        if "ziglang" in compiler
-        else VARIANTS[variant].flags
-    )
-    return (
-        *compiler,
-        *_flags(variant),
-        *own,
-        *(str(source) for source in SOURCES if source.suffix == ".cpp"),
-    )
-
-
-def _sources() -> tuple[str, ...]:
-    return tuple(source.read_text() for source in SOURCES)
-
-
-def _digest(*parts: str) -> str:
-    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
+    machine = VARIANTS[variant].flags
+    if "ziglang" in compiler:
+        machine = (*ZIG_FLAGS, *VARIANTS[variant].zig_flags)
+    files = (str(source) for source in SOURCES if source.suffix == ".cpp")
+    return (*compiler, *_flags(variant), *machine, *files)
 
 
 def _run(command: tuple[str, ...]) -> subprocess.CompletedProcess[str]:
@@ -204,36 +208,20 @@ def _build(command: tuple[str, ...], library: Path) -> None:
     try:
         library.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=library.parent) as folder:
-            made = Path(folder) / library.name
-            done = _run((*command, "-o", str(made)))
+            built = Path(folder) / library.name
+            done = _run((*command, "-o", str(built)))
             if done.returncode != 0:
                 last = (done.stderr.strip().splitlines() or ["no message"])[-1]
                 raise UserError(
-                    f"env.kernel=native: {command[0]} failed ({last}); set env.kernel=torch or {ADVICE}"
+                    f"env.kernel=native: {command[0]} failed ({last}); "
+                    f"set env.kernel=torch or {ADVICE}"
                 )
-            made.replace(library)
+            built.replace(library)
     except OSError as error:
         raise UserError(
-            f"env.kernel=native: {library.parent} cannot be written ({error.strerror}); point GANLANE_CACHE at a "
-            "folder that can, or set env.kernel=torch."
+            f"env.kernel=native: {library.parent} cannot be written ({error.strerror}); "
+            f"point {CACHE_VARIABLE} at a folder that can, or set env.kernel=torch."
         ) from error
-
-
-def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
-    """With the types of its functions; a call through ctypes releases the interpreter's lock."""
-    pointer, number = ctypes.c_void_p, ctypes.c_long
-    for name, pointers in (
-        ("decide", 3),
-        ("lane_view", 3),
-        ("mask", 3),
-        ("spawn", 3),
-        ("step", 1),
-        ("start", 1),
-    ):
-        function = getattr(library, f"ganlane_{name}")
-        function.argtypes = [*[pointer] * pointers, number, number]
-        function.restype = ctypes.c_int
-    return library
 
 
 # Calls: arrays as pointers, rows shared between threads
@@ -248,17 +236,12 @@ BLOCK = 16
 
 def addresses(arrays: Sequence[Any]) -> ctypes.Array[ctypes.c_void_p]:
     """A struct of pointers to tensors or NumPy arrays; None: a null pointer."""
-
-    def address(array: Any) -> int | None:
-        return (
-            None
-            if array is None
-            else array.ctypes.data
-            if hasattr(array, "ctypes")
-            else array.data_ptr()
-        )
-
-    return (ctypes.c_void_p * len(arrays))(*map(address, arrays))
+    pointers = (ctypes.c_void_p * len(arrays))()
+    for index, array in enumerate(arrays):
+        if array is not None:
+            is_numpy = hasattr(array, "ctypes")
+            pointers[index] = array.ctypes.data if is_numpy else array.data_ptr()
+    return pointers
 
 
 #: Threads of the kernel while torch has but one (:func:`torch_on_one_thread`); None: as many as
@@ -294,9 +277,9 @@ def threads_allowed() -> int:
 
     Where torch is not loaded, ``OMP_NUM_THREADS`` or the processor's cores.
     """
-    own, torch = _threads.get(), sys.modules.get("torch")
-    if own is not None:
-        return own
+    set_aside, torch = _threads.get(), sys.modules.get("torch")
+    if set_aside is not None:
+        return set_aside
     if torch is not None:
         return int(torch.get_num_threads())
     named = os.environ.get("OMP_NUM_THREADS", "")
@@ -310,14 +293,15 @@ def in_threads(rows: int, call: Callable[[int, int], int]) -> None:
         ValueError: a call returned 2: an action is not 0, 1 or 2.
         MemoryError: a call returned 1.
     """
-    threads = 1 if rows < 2 * ROWS_PER_THREAD else min(threads_allowed(), rows // ROWS_PER_THREAD)
+    threads = min(threads_allowed(), rows // ROWS_PER_THREAD)
     if threads <= 1:
         codes = [call(0, rows)]
     else:
         share = -(-rows // (threads * BLOCK)) * BLOCK
-        starts = range(0, rows, share)
+        pool = _pool(threads - 1)
         others = [
-            _pool(threads - 1).submit(call, start, min(start + share, rows)) for start in starts[1:]
+            pool.submit(call, start, min(start + share, rows))
+            for start in range(share, rows, share)
         ]
         # this thread does not wait idle
         codes = [call(0, share), *(other.result() for other in others)]

@@ -3,6 +3,7 @@
 
 #include <stdint.h>
 
+#include "arrays.hpp"
 #include "model.hpp"
 
 struct MaskInputs {  // as the ego perceives them: [rows, vehicles], `direction` [rows]
@@ -18,7 +19,7 @@ struct MaskOutputs {
 };
 
 static inline void allow(const Settings& s, const MaskInputs& in, const MaskOutputs& out, long first, long rows) {
-    const float SIDES[3] = {0.0f, 1.0f, -1.0f};
+    const float SIDES[3] = {0.0f, 1.0f, -1.0f};  // of the three actions
     auto gather = [&](auto* field, int vehicle) {
         Float made;
         for (int lane = 0; lane < LANES; lane++)
@@ -61,8 +62,8 @@ static inline void allow(const Settings& s, const MaskInputs& in, const MaskOutp
     for (int lane = 0; lane < rows; lane++) {
         long row = first + lane;
         int64_t direction = in.direction[row], at = in.target_lane[row * s.vehicles];
-        bool left = at < s.lanes - 1 && (direction == 0 || (s.abort_lane_change && direction == -1));
-        bool right = at > 0 && (direction == 0 || (s.abort_lane_change && direction == 1));
+        bool left = on_road(at + 1, s.lanes) && is_heard(1, direction, s.abort_lane_change);
+        bool right = on_road(at - 1, s.lanes) && is_heard(-1, direction, s.abort_lane_change);
         uint8_t* mask = out.mask + 3 * row;
         mask[0] = 1, mask[1] = left && safe[1][lane], mask[2] = right && safe[2][lane];
         out.none[row] = !(safe[0][lane] || mask[1] || mask[2]);

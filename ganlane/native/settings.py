@@ -1,15 +1,18 @@
-"""What the kernel works on: its arrays by name, and its settings as C structures. Imports no torch.
+"""What the kernel works on: its arrays by the state's keys, and its settings as C structures.
 
-The settings' fields are named as those of the parameters that they come from.
+Imports no torch. Every list of names here is in the order of the C structure that it mirrors: a
+change in one is a change in both. The settings' fields are named as those of the parameters that
+they come from.
 """
 
 from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping
+from ctypes import c_double, c_float, c_int32, c_int64
 from typing import Any, Final, TypeVar
 
-from ganlane.keys import PHYSICS_STEP_S
+from ganlane import keys
 from ganlane.settings.driving import (
     EgoParameters,
     IdmParameters,
@@ -19,62 +22,54 @@ from ganlane.settings.driving import (
 from ganlane.settings.episode import EpisodeParameters, SpawnParameters
 from ganlane.settings.observation import NEARNESS_M, OVERLAP_M, ObservationScale, RewardParameters
 
-_FLOAT, _INTEGER, _FLAG = "float32", "int64", "bool"
+#: A key of the state as the environment's TensorDict has it: ``"step"``, ``("vehicles", "x")``.
+Key = str | tuple[str, str]
+
+
+def _within(group: str, *names: str) -> tuple[Key, ...]:
+    return tuple((group, name) for name in names)
+
+
+STEERING: Final = (keys.TRAFFIC, "steering")
 #: Arrays [rows, vehicles] and their types.
-VEHICLE_ARRAYS: Final = {
-    **dict.fromkeys(
-        ("x", "y", "heading", "speed", "acceleration", "length", "width", "desired_speed"), _FLOAT
-    ),
-    **dict.fromkeys(("target_lane", "visibility"), _INTEGER),
-    "valid": _FLAG,
-    "steering": _FLOAT,
+VEHICLE_ARRAYS: Final[dict[Key, str]] = {
+    **dict.fromkeys(_within(keys.VEHICLES, *keys.VEHICLE_FLOATS), "float32"),
+    **dict.fromkeys(_within(keys.VEHICLES, *keys.VEHICLE_INTEGERS), "int64"),
+    **dict.fromkeys(_within(keys.VEHICLES, *keys.VEHICLE_FLAGS), "bool"),
+    STEERING: "float32",
 }
-#: Events and done flags, [rows].
-EVENT_ARRAYS: Final = {
-    **dict.fromkeys(("goal", "hard_crash", "out_of_road", "timeout"), _FLAG),
-    **dict.fromkeys(("soft_crashes", "soft_crashes_behind"), _INTEGER),
-    **dict.fromkeys(("done", "terminated", "truncated"), _FLAG),
+#: Arrays that the state has as [rows, 1]: of the events, and whether the episode has ended.
+EVENT_ARRAYS: Final[dict[Key, str]] = {
+    # the end of a scene is one of recorded scenes, which the kernel does not drive
+    **dict.fromkeys(_within(keys.EVENTS, "goal", "hard_crash", "out_of_road", "timeout"), "bool"),
+    **dict.fromkeys(_within(keys.EVENTS, *keys.EVENT_COUNTS), "int64"),
+    **dict.fromkeys(keys.DONE_FLAGS, "bool"),
 }
-#: The other arrays [rows].
-ROW_ARRAYS: Final = {
-    **dict.fromkeys(
-        ("seed", "episode", "action", "change_direction", "decisions", "lane_changes", "step"),
-        _INTEGER,
-    ),
-    **dict.fromkeys(
-        ("ego_steering", "mean_acceleration", "change_progress", "distance", "reward"), _FLOAT
-    ),
-    **dict.fromkeys(
-        ("soft_crash", "soft_crash_behind", "started_change", "recycles", "fresh"), _FLAG
-    ),
+#: The ego's memory [rows].
+EGO_ARRAYS: Final[dict[Key, str]] = {
+    **dict.fromkeys(_within(keys.EGO, *keys.EGO_FLOATS), "float32"),
+    **dict.fromkeys(_within(keys.EGO, *keys.EGO_INTEGERS), "int64"),
+    **dict.fromkeys(_within(keys.EGO, *keys.EGO_FLAGS), "bool"),
 }
-# The structures of arrays.hpp, in their order.
-_EGO = (
-    "ego_steering",
-    "change_direction",
-    "decisions",
-    "lane_changes",
-    "soft_crash",
-    "soft_crash_behind",
+#: What goes into a decision besides the action before it and ``recycles`` after it.
+INPUTS: Final = (
+    *VEHICLE_ARRAYS,
+    (keys.EGO, "steering"),
+    *_within(keys.EGO, *keys.EGO_INTEGERS),
+    *_within(keys.EGO, keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND),
+    keys.STEP,
 )
-INPUTS: Final = ("action", *VEHICLE_ARRAYS, *_EGO, "step", "recycles")
+#: What comes out of it, and out of the start of an episode.
 OUTPUTS: Final = (
-    "x", "y", "heading", "speed", "acceleration", "target_lane", "steering",
-    "ego_steering", "mean_acceleration", "change_progress", "distance",
-    "change_direction", "decisions", "lane_changes", "soft_crash", "soft_crash_behind", "started_change",
-    "step", *EVENT_ARRAYS,
-)  # fmt: skip
-SCENE: Final = (
-    "seed",
-    "episode",
-    "fresh",
-    "length",
-    "width",
-    "desired_speed",
-    "visibility",
-    "valid",
-    "recycles",
+    *_within(keys.VEHICLES, "x", "y", "heading", "speed", "acceleration", "target_lane"),
+    STEERING,
+    *EGO_ARRAYS,
+    keys.STEP,
+    *EVENT_ARRAYS,
 )
+#: What the start of an episode sets besides; ``seed``, ``episode`` and ``fresh`` go before it, and
+#: ``recycles`` after it.
+SCENE: Final = _within(keys.VEHICLES, "length", "width", "desired_speed", "visibility", "valid")
 
 #: The observations that the kernel computes: whether with drift, and with overlap.
 NATIVE_FORMS: Final = {
@@ -84,32 +79,33 @@ NATIVE_FORMS: Final = {
 }
 
 
+def fields(kind: type, names: str) -> list[tuple[str, type]]:
+    """Members of a structure of one type."""
+    return [(name, kind) for name in names.split()]
+
+
 class Settings(ctypes.Structure):
     """``Settings`` of model.hpp."""
 
     _fields_ = [
-        *((name, ctypes.c_float) for name in (
-            "min_gap_m", "headway_s", "per_brake_scale", "min_acceleration", "max_acceleration",
-            "threshold", "politeness_rear", "politeness_side", "safe_deceleration", "exclusive_m",
-            "per_near_s", "per_far_s", "gain_far", "gain_near", "gain_integral", "slow_mps", "max_angle_rad",
-            "soft_crash_ttc_s", "soft_crash_gap_m", "goal_m", "lane_width_m", "per_lane_width",
-        )),
-        *((name, ctypes.c_int32) for name in (
-            "lanes", "vehicles", "substeps", "timeout_steps", "mobil", "abort_lane_change",
-        )),
-    ]  # fmt: skip
+        *fields(
+            c_float,
+            "min_gap_m headway_s per_brake_scale min_acceleration max_acceleration"
+            " threshold politeness_rear politeness_side safe_deceleration exclusive_m"
+            " per_near_s per_far_s gain_far gain_near gain_integral slow_mps max_angle_rad"
+            " soft_crash_ttc_s soft_crash_gap_m goal_m lane_width_m per_lane_width",
+        ),
+        *fields(c_int32, "lanes vehicles substeps timeout_steps mobil abort_lane_change"),
+    ]
 
 
 class View(ctypes.Structure):
     """``View`` of observation.cpp."""
 
-    _fields_ = (
-        *(
-            (name, ctypes.c_float)
-            for name in ("range_m", "speed_mps", "lane_width_m", "nearness_m", "overlap_m")
-        ),
-        *((name, ctypes.c_int32) for name in ("lanes", "vehicles", "drift", "overlap")),
-    )
+    _fields_ = [
+        *fields(c_float, "range_m speed_mps lane_width_m nearness_m overlap_m"),
+        *fields(c_int32, "lanes vehicles drift overlap"),
+    ]
 
     def numbers(self) -> int:
         """Length of the observation: own state, lane view, own lane change."""
@@ -119,46 +115,48 @@ class View(ctypes.Structure):
 class Range(ctypes.Structure):
     """``Range`` of arrays.hpp."""
 
-    _fields_ = (("low", ctypes.c_float), ("span", ctypes.c_float))
+    _fields_ = fields(c_float, "low span")
 
 
 class Spawn(ctypes.Structure):
     """``Spawn`` of arrays.hpp."""
 
     _fields_ = [
-        ("recycle_share", ctypes.c_double),
-        ("stream", ctypes.c_int64),
-        *((name, Range) for name in (
-            "front_speed_mps", "rear_speed_mps", "ego_speed_mps", "desired_speed_mps", "truck_desired_speed_mps",
-        )),
-        *((name, ctypes.c_float) for name in (
-            "spread_m", "spacing_m", "ego_desired_speed_mps", "truck_share", "length_m", "width_m", "truck_length_m",
-            "truck_width_m", "lane_width_m",
-        )),
-        *((name, ctypes.c_int32) for name in (
-            "vehicles", "lanes", "capacity", "ego_visibility", "others_visibility", "recycle",
-        )),
-    ]  # fmt: skip
+        *fields(c_double, "recycle_share"),
+        *fields(c_int64, "stream"),
+        *fields(
+            Range,
+            "front_speed_mps rear_speed_mps ego_speed_mps desired_speed_mps"
+            " truck_desired_speed_mps",
+        ),
+        *fields(
+            c_float,
+            "spread_m spacing_m ego_desired_speed_mps truck_share length_m width_m"
+            " truck_length_m truck_width_m lane_width_m",
+        ),
+        *fields(c_int32, "vehicles lanes capacity ego_visibility others_visibility recycle"),
+    ]
 
 
 class Reward(ctypes.Structure):
     """``Reward`` of step.cpp."""
 
-    _fields_ = (
-        *((name, ctypes.c_float) for name in (
-            "decision_period_s", "base_speed_mps", "low_acceleration",
-            "lane_change", "out_of_road", "hard_crash", "soft_crash", "goal", "soft_crash_behind",
-        )),
-        *((name, ctypes.c_int32) for name in ("literal_low_acceleration", "terms")),
-    )  # fmt: skip
+    _fields_ = [
+        *fields(
+            c_float,
+            "decision_period_s base_speed_mps low_acceleration"
+            " lane_change out_of_road hard_crash soft_crash goal soft_crash_behind",
+        ),
+        *fields(c_int32, "literal_low_acceleration terms"),
+    ]
 
 
 Structure = TypeVar("Structure", bound=ctypes.Structure)
 
 
-def _filled(kind: type[Structure], given: Mapping[str, Any]) -> Structure:
-    """A structure with those of the ``given`` numbers that it has."""
-    return kind(**{field[0]: given[field[0]] for field in kind._fields_})
+def _filled(kind: type[Structure], numbers: Mapping[str, Any]) -> Structure:
+    """A structure with those of the ``numbers`` that it has."""
+    return kind(**{member[0]: numbers[member[0]] for member in kind._fields_})
 
 
 def settings_of(
@@ -172,29 +170,27 @@ def settings_of(
     mobil: MobilParameters | None = None,
 ) -> Settings:
     """The numbers of road, driving and episode; ``mobil=None``: the others keep their lanes."""
-    episode, ego = episode or EpisodeParameters(), ego or EgoParameters()
-    idm, steering = idm or IdmParameters(), steering or SteeringParameters()
-    given = {
-        **(
-            vars(episode)
-            | vars(ego)
-            | vars(idm)
-            | vars(steering)
-            | vars(mobil or MobilParameters())
-        ),
-        **{"lanes": lanes, "lane_width_m": lane_width_m, "vehicles": vehicles},
+    episode, idm = episode or EpisodeParameters(), idm or IdmParameters()
+    steering = steering or SteeringParameters()
+    records = (episode, ego or EgoParameters(), idm, steering, mobil or MobilParameters())
+    numbers = {name: value for record in records for name, value in vars(record).items()}
+    numbers |= {
+        "lanes": lanes,
+        "lane_width_m": lane_width_m,
+        "vehicles": vehicles,
+        # The kernel multiplies where the model divides by a constant.
         "per_brake_scale": 1.0 / idm.brake_scale(),
         "per_near_s": 1.0 / steering.near_s,
         "per_far_s": 1.0 / steering.far_s,
         "per_lane_width": 1.0 / lane_width_m,
         "substeps": episode.substeps(),
-        "timeout_steps": round(episode.timeout_s / PHYSICS_STEP_S),
+        "timeout_steps": round(episode.timeout_s / keys.PHYSICS_STEP_S),
         "mobil": mobil is not None,
     }
-    return _filled(Settings, given)
+    return _filled(Settings, numbers)
 
 
-def safe_settings(
+def mask_of(
     lanes: int,
     lane_width_m: float,
     vehicles: int,
@@ -203,11 +199,9 @@ def safe_settings(
     abort: bool,
 ) -> Settings:
     """The numbers of the mask ``safe``; ``safe_deceleration`` in m/s2."""
-    settings = settings_of(
-        lanes, lane_width_m, vehicles, ego=EgoParameters(abort_lane_change=abort), idm=idm
-    )
-    settings.safe_deceleration = safe_deceleration
-    return settings
+    ego = EgoParameters(abort_lane_change=abort)
+    mobil = MobilParameters(safe_deceleration=safe_deceleration)
+    return settings_of(lanes, lane_width_m, vehicles, ego=ego, idm=idm, mobil=mobil)
 
 
 def view_of(
@@ -228,31 +222,26 @@ def spawn_of(
     others_visibility: int,
     recycle_share: float | None,
 ) -> Spawn:
-    """The numbers of Table II; ``recycle_share`` of the episodes recycle their vehicles, None.
-
-    No episode does.
-    """
-
-    def of_struct(value: Any) -> Any:
-        return value if isinstance(value, int | float) else Range(value[0], value[1] - value[0])
-
-    given = {
-        **{name: of_struct(value) for name, value in vars(spawn).items()},
-        **{"lanes": lanes, "lane_width_m": lane_width_m, "vehicles": vehicles, "stream": stream},
-        **{"ego_visibility": ego_visibility, "others_visibility": others_visibility},
+    """The numbers of Table II; ``recycle_share`` of the episodes recycle, None: none does."""
+    numbers = vars(spawn) | {
+        "lanes": lanes,
+        "lane_width_m": lane_width_m,
+        "vehicles": vehicles,
+        "stream": stream,
+        "ego_visibility": ego_visibility,
+        "others_visibility": others_visibility,
         "spacing_m": spawn.spacing_m,
         "capacity": spawn.lane_capacity(),
         "recycle": recycle_share is not None,
         "recycle_share": recycle_share or 0.0,
     }
-    return _filled(Spawn, given)
+    for name, value in numbers.items():
+        if isinstance(value, tuple | list):
+            numbers[name] = Range(value[0], value[1] - value[0])
+    return _filled(Spawn, numbers)
 
 
 def reward_of(reward: RewardParameters, decision_period_s: float) -> Reward:
     """The numbers of the reward, and of how many terms it is the sum."""
-    given = {
-        **vars(reward),
-        "decision_period_s": decision_period_s,
-        "terms": len(reward.term_names),
-    }
-    return _filled(Reward, given)
+    numbers = {"decision_period_s": decision_period_s, "terms": len(reward.term_names)}
+    return _filled(Reward, vars(reward) | numbers)

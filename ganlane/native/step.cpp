@@ -63,11 +63,13 @@ static void rate(const Batch& b, long row) {
 
 static void allow(const Batch& b, long row) {
     int64_t lane = b.out->target_lane[row * b.vehicles], direction = b.out->change_direction[row];
-    bool obeyed = b.mask_form == MASK_ROAD || direction == 0, turns = b.mask_form != MASK_ROAD && b.abort_lane_change;
+    const int SIDES[3] = {0, 1, -1};
     uint8_t* mask = b.mask + 3 * row;
     mask[0] = 1;
-    mask[1] = lane < b.lanes - 1 && (obeyed || (turns && direction == -1));
-    mask[2] = lane > 0 && (obeyed || (turns && direction == 1));
+    for (int action = 1; action < 3; action++) {
+        bool heard = b.mask_form == MASK_ROAD || is_heard(SIDES[action], direction, b.abort_lane_change);
+        mask[action] = heard && on_road(lane + SIDES[action], b.lanes);
+    }
 }
 
 // Mask and observation of the rows [first, last).

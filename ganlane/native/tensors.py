@@ -6,15 +6,18 @@ A decision, first scenes, the lane view and the mask ``safe``.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeAlias
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.native import settings
 from ganlane.native.library import addresses, in_threads, load
+from ganlane.native.settings import Key
 from ganlane.settings.driving import (
     EgoParameters,
     IdmParameters,
@@ -27,57 +30,54 @@ from ganlane.sim.dynamics import STEERING
 from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road, Vehicles
 
-#: What a decision led to, by the names of :data:`~ganlane.native.settings.OUTPUTS`: the vehicles'
-#: fields and the traffic's ``steering`` [N, M], ``step`` and the ego's memory [N], events and done
-#: flags [N, 1].
-Outcome: TypeAlias = dict[str, Tensor]
-#: What of the ego is remembered from one decision to the next (:mod:`ganlane.env.state`), in the
-#: kernel's order.
-EGO_MEMORY = (
-    "steering",
-    "change_direction",
-    "decisions",
-    "lane_changes",
-    "soft_crash",
-    "soft_crash_behind",
-)
-_TABLES = {
-    "vehicle": settings.VEHICLE_ARRAYS,
-    "row": settings.ROW_ARRAYS,
-    "event": settings.EVENT_ARRAYS,
-}
-#: Form and dtype of the kernel's arrays.
-_ARRAYS = {
-    name: (form, getattr(torch, dtype))
-    for form, table in _TABLES.items()
-    for name, dtype in table.items()
-}
-_INPUT_DTYPES = tuple(_ARRAYS[name][1] for name in settings.INPUTS)
+_TYPES = settings.VEHICLE_ARRAYS | settings.EGO_ARRAYS | settings.EVENT_ARRAYS
+_DTYPES = {key: getattr(torch, name) for key, name in _TYPES.items()} | {keys.STEP: torch.int64}
+#: Fields of ``vehicles`` that no decision changes.
+_LASTING = [
+    key for key in settings.INPUTS if key[0] == keys.VEHICLES and key not in settings.OUTPUTS
+]
 
 
-def empty_outcome(rows: int, vehicles: int, make: Callable[..., Tensor] = torch.empty) -> Outcome:
-    """Room for the outcome of ``rows`` environments; ``make=torch.zeros``: filled with zeros."""
-    shapes, arrays = {"vehicle": (rows, vehicles), "row": (rows,), "event": (rows, 1)}, _ARRAYS
-    return {name: make(shapes[arrays[name][0]], dtype=arrays[name][1]) for name in settings.OUTPUTS}
+def _room(
+    names: Iterable[Key], rows: int, vehicles: int, make: Callable[..., Tensor]
+) -> dict[Key, Tensor]:
+    """Tensors for the kernel to write to, by ``torch.empty`` or ``torch.zeros``."""
+    room = {}
+    for name in names:
+        shape: tuple[int, ...] = (rows,)
+        if name in settings.VEHICLE_ARRAYS:
+            shape = (rows, vehicles)
+        elif name in settings.EVENT_ARRAYS:
+            shape = (rows, 1)
+        room[name] = make(shape, dtype=_DTYPES[name])
+    return room
 
 
-def moved(before: Vehicles, out: Outcome) -> Vehicles:
-    """The vehicles after a decision; what does not change within one is that of ``before``."""
-    changed = ("x", "y", "heading", "speed", "acceleration", "target_lane")
-    return before.with_(**{name: out[name] for name in changed})
+def _state(tensors: Mapping[Key, Tensor]) -> TensorDict:
+    """The environment's state [N], without a reward; the kernel drives no scene to its end."""
+    size, device = tensors[keys.STEP].shape, torch.device("cpu")
+    groups: dict[str, dict[str, Tensor]] = {}
+    fields: dict[str, Any] = {}
+    for key, value in tensors.items():
+        if isinstance(key, str):
+            fields[key] = value
+        else:
+            groups.setdefault(key[0], {})[key[1]] = value
+    groups[keys.EVENTS]["scene_end"] = torch.zeros_like(groups[keys.EVENTS]["timeout"])
+    for name, group in groups.items():
+        fields[name] = TensorDict._new_unsafe(group, batch_size=size, device=device)
+    return TensorDict._new_unsafe(fields, batch_size=size, device=device)
 
 
 def _shape(road: Road, vehicles: int) -> tuple[int, float, int]:
     """Lanes, their width in m, and M."""
-    if (
-        road.ring_m is not None
-        or isinstance(road.lanes, Tensor)
-        or isinstance(road.lane_width_m, Tensor)
-    ):
+    of_rows = isinstance(road.lanes, Tensor) or isinstance(road.lane_width_m, Tensor)
+    if of_rows or road.ring_m is not None:
         raise UserError(
-            "env.kernel=native: the road must be straight and the same in all rows; set env.kernel=torch."
+            "env.kernel=native: the road must be straight and the same in all rows; "
+            "set env.kernel=torch."
         )
-    return road.lanes, road.lane_width_m, vehicles
+    return road.lanes, road.lane_width_m, vehicles  # type: ignore[return-value]
 
 
 class _Function:
@@ -102,16 +102,11 @@ class _Function:
         self.__dict__.update(state)
         self._call = getattr(load(self._variant), self._name)
 
-    def _run(self, rows: int, inputs: Sequence[Tensor | None], outputs: Sequence[Tensor]) -> None:
-        # Referred to until the call is over.
-        inputs = [each if each is None else each.contiguous() for each in inputs]
-        call, numbers, given, made = (
-            self._call,
-            ctypes.byref(self._numbers),
-            addresses(inputs),
-            addresses(outputs),
-        )
-        in_threads(rows, lambda first, last: call(numbers, given, made, first, last))
+    def _run(self, rows: int, inputs: Iterable[Tensor | None], outputs: Sequence[Tensor]) -> None:
+        # The contiguous copies have to live until the call is over.
+        read = [tensor if tensor is None else tensor.contiguous() for tensor in inputs]
+        pointers = (ctypes.byref(self._numbers), addresses(read), addresses(outputs))
+        in_threads(rows, lambda first, last: self._call(*pointers, first, last))
 
 
 class Kernel(_Function):
@@ -143,40 +138,36 @@ class Kernel(_Function):
         super().__init__("ganlane_decide", numbers, variant)
 
     def decide(
-        self,
-        action: Tensor,
-        vehicles: Vehicles,
-        steering: Tensor,
-        ego: Mapping[str, Tensor],
-        step: Tensor,
-        recycles: Tensor | None = None,
-        out: Outcome | None = None,
-    ) -> Outcome:
-        """One decision of every row.
+        self, action: Tensor, state: TensorDictBase, recycles: Tensor | None = None
+    ) -> TensorDict:
+        """The state after one decision of every row, without a reward.
 
         Args:
             action: 0 keep, 1 left, 2 right, [N] int64.
-            vehicles: fields [N, M], the ego first.
-            steering: of the vehicles, rad, [N, M]; the ego's is its own memory's.
-            ego: :data:`EGO_MEMORY` by name, each [N].
-            step: physics steps since the start of the episode, [N] int64.
+            state: of the environment (:mod:`ganlane.keys`); it stays as it is.
             recycles: rows that put vehicles left behind ahead of the ego again, [N] bool; None: no
                 row does.
-            out: written to; None: new tensors. It must not share memory with what goes in.
 
         Raises:
             ValueError: an action is not 0, 1 or 2.
+            TypeError: a part of the state is not as the kernel reads it.
         """
         rows = action.shape[0]
-        out = empty_outcome(rows, self.vehicles) if out is None else out
-        given = [action, *vehicles, steering, *(ego[name] for name in EGO_MEMORY), step, recycles]
-        for number, wanted in zip(given, _INPUT_DTYPES):
-            if number is not None and (number.dtype is not wanted or number.shape[0] != rows):
+        before: dict[Key, Tensor] = {}
+        for name in settings.INPUTS:
+            # by group: to look up a nested key takes three times as long
+            number = state.get(name) if isinstance(name, str) else state.get(name[0]).get(name[1])
+            if number.dtype is not _DTYPES[name] or number.shape[0] != rows:
                 raise TypeError(
-                    f"the kernel takes {rows} rows of {wanted} here, not {number.dtype} {number.shape}"
+                    f"the kernel takes {rows} rows of {_DTYPES[name]} as {name}, "
+                    f"not {number.dtype} {number.shape}"
                 )
-        self._run(rows, given, tuple(out.values()))
-        return out
+            before[name] = number
+        after = _room(settings.OUTPUTS, rows, self.vehicles, torch.empty)
+        self._run(rows, [action, *before.values(), recycles], list(after.values()))
+        after |= {name: before[name] for name in _LASTING}
+        after |= {name: state.get(name) for name in (keys.SEED, keys.EPISODE)}
+        return _state(after)
 
 
 class NativeScenes(_Function):
@@ -196,28 +187,19 @@ class NativeScenes(_Function):
         numbers = settings.spawn_of(*shape, scenes.parameters, stream, *seen, recycle_share=None)
         super().__init__("ganlane_spawn", numbers)
 
-    def start(
-        self, seed: Tensor, episode: Tensor, rows: Tensor | None = None
-    ) -> tuple[Outcome, Vehicles]:
+    def start(self, seed: Tensor, episode: Tensor, rows: Tensor | None = None) -> TensorDict:
         """The first states of the episodes (``seed``, ``episode``) [N] int64.
 
         ``rows`` [N] bool are those to be drawn; None: all. The others are zeros, without a vehicle.
         """
-        count = seed.shape[0]
-        rows = torch.ones(count, dtype=torch.bool) if rows is None else rows
-        out = empty_outcome(count, self.vehicles, torch.zeros)
-        length, width, desired_speed = (torch.zeros_like(out["x"]) for _ in range(3))
-        visibility, valid = (
-            torch.zeros_like(out["target_lane"]),
-            torch.zeros_like(out["x"], dtype=torch.bool),
-        )
-        recycles = torch.zeros(count, dtype=torch.bool)
-        scene = [seed, episode, rows, length, width, desired_speed, visibility, valid, recycles]
-        self._run(count, scene, tuple(out.values()))
-        moving = (out["x"], out["y"], out["heading"], out["speed"], out["acceleration"])
-        return out, Vehicles(
-            *moving, length, width, desired_speed, out["target_lane"], visibility, valid
-        )
+        rows = torch.ones_like(seed, dtype=torch.bool) if rows is None else rows
+        names = (*settings.OUTPUTS, *settings.SCENE)
+        state = _room(names, len(seed), self.vehicles, torch.zeros)
+        scene = [state[name] for name in settings.SCENE]
+        recycles = torch.zeros_like(rows)
+        outputs = [state[name] for name in settings.OUTPUTS]
+        self._run(len(seed), [seed, episode, rows, *scene, recycles], outputs)
+        return _state(state | {keys.SEED: seed, keys.EPISODE: episode})
 
 
 class LaneView(_Function):
@@ -244,20 +226,9 @@ class LaneView(_Function):
         Arguments as :meth:`ganlane.transforms.ObservationTransform.observe`.
         """
         v = vehicles
-        given = [
-            v.speed,
-            v.desired_speed,
-            v.length,
-            v.y,
-            seen.x,
-            seen.y,
-            seen.speed,
-            seen.valid,
-            progress,
-            direction,
-        ]
-        out = torch.empty((v.x.shape[0], self.size), dtype=torch.float32)
-        self._run(len(out), given, [out])
+        inputs = [v.speed, v.desired_speed, v.length, v.y, seen.x, seen.y, seen.speed, seen.valid]
+        out = torch.empty((len(v.x), self.size), dtype=torch.float32)
+        self._run(len(out), [*inputs, progress, direction], [out])
         return out
 
 
@@ -277,19 +248,18 @@ class SafeActions(_Function):
     def __init__(
         self, road: Road, vehicles: int, idm: IdmParameters, safe_deceleration: float, abort: bool
     ) -> None:
-        numbers = settings.safe_settings(*_shape(road, vehicles), idm, safe_deceleration, abort)
+        numbers = settings.mask_of(*_shape(road, vehicles), idm, safe_deceleration, abort)
         super().__init__("ganlane_mask", numbers)
 
     def allowed(self, seen: Vehicles, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """The mask [N, 3], and whether no action is safe [N], of vehicles as the ego perceives
-        them.
+        """The mask [N, 3], and whether no action is safe [N].
+
+        ``seen`` are the vehicles as the ego perceives them, ``direction`` [N] that of its current
+        lane change.
         """
         v, rows = seen, seen.x.shape[0]
-        given = [v.x, v.y, v.heading, v.speed, v.length, v.width, v.desired_speed]
-        given += [v.target_lane, v.visibility, v.valid, direction]
-        mask, none = (
-            torch.empty((rows, 3), dtype=torch.bool),
-            torch.empty((rows,), dtype=torch.bool),
-        )
-        self._run(rows, given, [mask, none])
+        inputs = [v.x, v.y, v.heading, v.speed, v.length, v.width, v.desired_speed]
+        inputs += [v.target_lane, v.visibility, v.valid, direction]
+        mask, none = torch.empty(rows, 3, dtype=torch.bool), torch.empty(rows, dtype=torch.bool)
+        self._run(rows, inputs, [mask, none])
         return mask, none

@@ -1,5 +1,6 @@
-"""Overlap of oriented boxes by the separating-axis theorem, and soft crashes (dangerously small
-gaps).
+"""Overlap of oriented boxes by the separating-axis theorem, and soft crashes.
+
+A soft crash is a dangerously small gap.
 """
 
 from __future__ import annotations
@@ -9,7 +10,8 @@ from torch import Tensor
 
 from ganlane.sim.state import STRAIGHT, Road, Vehicles, reads_are_cheap
 
-#: Pairs below which choosing the near ones takes longer than testing all of them.
+#: Pairs below which choosing the near ones takes longer than testing all of them. With 1024 rows
+#: a decision of idm_random takes 4 % longer if all are tested.
 FEW = 1000
 
 
@@ -36,11 +38,11 @@ def boxes_overlap(
     boxes = [(0.5 * length, 0.5 * width), (0.5 * other_length, 0.5 * other_width)]
 
     def separated(
-        along: Tensor, across: Tensor, own: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]
+        along: Tensor, across: Tensor, box: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]
     ) -> Tensor:
         """Whether an axis of a box separates it from the other; half lengths and widths."""
-        reach_along = own[0] + other[0] * cos + other[1] * sin
-        reach_across = own[1] + other[0] * sin + other[1] * cos
+        reach_along = box[0] + other[0] * cos + other[1] * sin
+        reach_across = box[1] + other[0] * sin + other[1] * cos
         return (along.abs() >= reach_along) | (across.abs() >= reach_across)
 
     by_own = separated(dx * c + dy * s, dy * c - dx * s, *boxes)
@@ -60,11 +62,10 @@ def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
         if len(row) == 0:
             return torch.zeros_like(both)
         if dx.numel() >= FEW:
-            ego, near = (Vehicles(*(field[row, which] for field in v)) for which in (0, column + 1))
-            return (
-                torch.zeros_like(both).index_put((row, column), _hits(dx[row, column], ego, near))
-                & both
-            )
+            ego = Vehicles(*(field[row, 0] for field in v))
+            near = Vehicles(*(field[row, column + 1] for field in v))
+            hits = _hits(dx[row, column], ego, near)
+            return torch.zeros_like(both).index_put((row, column), hits) & both
     return _hits(dx, v.columns(slice(0, 1)), v.columns(slice(1, None))) & both
 
 

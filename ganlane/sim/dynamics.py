@@ -18,7 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ganlane.keys import EGO_INDEX, LEFT, RIGHT
+from ganlane.keys import EGO_INDEX
 from ganlane.settings.driving import EgoParameters, IdmParameters, SteeringParameters
 from ganlane.sim.collisions import dangerously_close
 from ganlane.sim.idm import acceleration_behind
@@ -31,7 +31,7 @@ STEERING = SteeringParameters()
 
 
 class Pose(NamedTuple):
-    """Position x, y (m), heading (rad), speed (m/s) and realised acceleration (m/s2) of a vehicle."""
+    """Of a vehicle: x, y (m), heading (rad), speed (m/s) and realised acceleration (m/s2)."""
 
     x: Tensor
     y: Tensor
@@ -41,7 +41,7 @@ class Pose(NamedTuple):
 
 
 def slip_angle(steering: Tensor) -> Tensor:
-    """Angle between heading and motion at the centre, ``atan(l_r / (l_f + l_r) tan(delta))``, rad."""
+    """Angle from heading to motion at the centre, ``atan(l_r / (l_f + l_r) tan(delta))``, rad."""
     return torch.atan(0.5 * torch.tan(steering))
 
 
@@ -90,7 +90,7 @@ def steer(
     """
 
     def angle_rate(distance: Tensor) -> Tensor:
-        """Of the angle, rad/s, to a point ``distance`` m ahead that moves along with the vehicle."""
+        """Of the angle to a point ``distance`` m ahead that moves with the vehicle, rad/s."""
         slope = offset / distance
         return -lateral_speed / (distance * (1.0 + slope * slope)) - yaw_rate
 
@@ -111,6 +111,10 @@ def steer(
 # The ego: vehicle 0 of every environment
 
 
+#: The side to which each action wishes to go: keep, left, right.
+SIDES = (0, 1, -1)
+
+
 class Command(NamedTuple):
     """Effect of an action, each [N].
 
@@ -124,23 +128,36 @@ class Command(NamedTuple):
     off_road: Tensor
 
 
+def is_heard(side: Tensor, direction: Tensor, abort: bool) -> Tensor:
+    """Whether a wish to go to ``side`` is obeyed during a lane change in ``direction`` (each -1, 0
+    or 1).
+
+    During a lane change actions are ignored; with ``abort`` the opposite one turns back.
+    """
+    idle = direction == 0
+    return idle | (side == -direction) if abort else idle
+
+
+def on_road(lane: Tensor, lanes: int | Tensor) -> Tensor:
+    """Whether the road of ``lanes`` has the ``lane``."""
+    return (lane >= 0) & (lane < lanes)
+
+
 def apply_action(
     action: Tensor, target_lane: Tensor, direction: Tensor, lanes: int | Tensor, abort: bool
 ) -> Command:
     """Apply ``action`` (0 keep, 1 left, 2 right) to an ego whose current lane change has
     ``direction``; [N] int64.
 
-    During a lane change actions are ignored without penalty; with ``abort`` the opposite action
-    turns back. An action that would leave the road has no effect except ``off_road``.
+    An action that is not heard has no effect and no penalty (:func:`is_heard`); one that would
+    leave the road has no effect except ``off_road``.
     """
-    wish = torch.where(action == LEFT, 1, torch.where(action == RIGHT, -1, 0))
-    accepted = (direction == 0) | (wish == -direction) if abort else direction == 0
-    wish = torch.where(accepted, wish, 0)
-    target = target_lane + wish
-    off_road = (target < 0) | (target > lanes - 1)
-    wish = torch.where(off_road, 0, wish)
-    starts = wish != 0
-    return Command(target_lane + wish, torch.where(starts, wish, direction), starts, off_road)
+    side = action.new_tensor(SIDES)[action]
+    side = torch.where(is_heard(side, direction, abort), side, 0)
+    off_road = ~on_road(target_lane + side, lanes)
+    side = torch.where(off_road, 0, side)
+    starts = side != 0
+    return Command(target_lane + side, torch.where(starts, side, direction), starts, off_road)
 
 
 def ego_scene(vehicles: Vehicles, road: Road) -> Scene:
@@ -177,11 +194,11 @@ def ego_surroundings(
     its body is in.
     """
     attention, body = spanned(scene.attention), spanned(scene.body)
-    ahead, lanes = (
-        leader(scene, torch.cat((attention, body), dim=-1)),
-        (attention.shape[-1], body.shape[-1]),
-    )
-    followed, near = map(Neighbour, *(number.split(lanes, dim=-1) for number in ahead))
+    # One search for both kinds of lanes.
+    gap, speed = leader(scene, torch.cat((attention, body), dim=-1))
+    attended = attention.shape[-1]
+    followed = Neighbour(gap[..., :attended], speed[..., :attended])
+    near = Neighbour(gap[..., attended:], speed[..., attended:])
     behind, speed = follower(scene, body), scene.observers.speed[..., None]
     closing = torch.where(behind.exists, behind.speed - speed, 0.0)
     limits = (ego.soft_crash_ttc_s, ego.soft_crash_gap_m)
@@ -197,8 +214,8 @@ def change_progress(ego: Vehicles, direction: Tensor, road: Road) -> Tensor:
 
     0 without one.
     """
-    width = (
-        road.lane_width_m if not isinstance(road.lane_width_m, Tensor) else road.lane_width_m[:, 0]
-    )
+    width = road.lane_width_m
+    if isinstance(width, Tensor):
+        width = width[:, 0]
     remaining = (ego.y - ego.target_lane.to(ego.y.dtype) * width).abs() / width
     return torch.where(direction != 0, (1.0 - remaining).clamp(0.0, 1.0), 0.0)

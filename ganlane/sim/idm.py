@@ -52,8 +52,7 @@ def desired_gap(
     parameters: AnyIdm = TABLE_V,
     headway_s: Tensor | float | None = None,
 ) -> Tensor:
-    """Desired gap in metres at ``speed`` behind a leader that is approached at ``closing_speed``
-    (m/s).
+    """Desired gap, m, at ``speed`` behind a leader approached at ``closing_speed``, m/s.
 
     The dynamic part is never negative, so a faster leader does not reduce the desired gap below the
     minimum.
@@ -92,9 +91,7 @@ def idm_acceleration(
 def equilibrium_gap(
     speed: Tensor, desired_speed: Tensor | float, parameters: IdmParameters = TABLE_V
 ) -> Tensor:
-    """Gap in metres at which the IDM acceleration behind a leader of equal ``speed`` is 0 (below
-    desired speed).
-    """
+    """Gap, m, at which IDM keeps ``speed`` behind a leader of the same (below desired speed)."""
     ratio = speed / desired_speed
     square = ratio * ratio
     return (parameters.min_gap_m + speed * parameters.headway_s) / torch.sqrt(1.0 - square * square)
@@ -106,7 +103,7 @@ def acceleration_behind(
     parameters: AnyIdm = TABLE_V,
     headway_s: Tensor | float | None = None,
 ) -> Tensor:
-    """IDM acceleration of each observer behind ``ahead`` [N, K, L] in L lanes, m/s2, of that shape."""
+    """IDM acceleration of each observer behind ``ahead`` [N, K, L] in L lanes, m/s2."""
     speed, desired = scene.observers.speed[..., None], scene.observers.desired_speed[..., None]
     headway_s = headway_s[..., None] if isinstance(headway_s, Tensor) else headway_s
     return idm_acceleration(
@@ -145,9 +142,9 @@ def needed_deceleration(speed: Tensor, leader_speed: Tensor, gap: Tensor) -> Ten
 def _survives(
     gap: Tensor, speed: Tensor, leader_speed: float, desired_speed: float, idm: IdmParameters
 ) -> Tensor:
-    """Whether followers at ``speed`` (m/s) avoid a leader that from now on brakes at
-    ``idm.min_acceleration``.
+    """Whether followers at ``speed``, m/s, avoid a leader that from now on brakes at the limit.
 
+    The limit is ``idm.min_acceleration``.
     Two vehicles, IDM, steps of 0.1 s. This leader is the worst of all that brake no harder than
     ``idm.min_acceleration``: any other is always ahead of it and no slower. So a driver that avoids
     this one also avoids crashes in a queue, where each leader may have to brake for its own.
@@ -173,10 +170,9 @@ def can_brake(
     desired_speed_mps: float,
     idm: IdmParameters = TABLE_V,
 ) -> bool:
-    """Whether a follower at ``speed_mps`` avoids a leader that brakes at the limit, with 0.1 m for
-    rounding.
-    """
-    gap, speed = (torch.tensor([value], dtype=torch.float64) for value in (gap_m, speed_mps))
+    """Whether a follower avoids a leader that brakes at the limit, with 0.1 m for rounding."""
+    gap = torch.tensor([gap_m], dtype=torch.float64)
+    speed = torch.tensor([speed_mps], dtype=torch.float64)
     return bool(_survives(gap, speed, leader_speed_mps, desired_speed_mps, idm)[0])
 
 
@@ -186,26 +182,23 @@ def least_gap(
     desired_speed_mps: float,
     idm: IdmParameters = TABLE_V,
 ) -> float:
-    """Smallest gap (m, in steps of 0.1 m) for which :func:`can_brake` is true at this and every
-    larger gap.
-    """
+    """Smallest gap, m, in steps of 0.1 m, from which on :func:`can_brake` is true."""
     stopping_m = speed_mps * speed_mps / (-2.0 * idm.min_acceleration)
     gaps = torch.arange(1, int(10.0 * (1.2 * stopping_m + 10.0))).double() * 0.1
     speed = torch.full_like(gaps, speed_mps)
     crashes = ~_survives(gaps, speed, leader_speed_mps, desired_speed_mps, idm)
-    return 0.1 * (1 + int(crashes.nonzero().max()) + 1) if bool(crashes.any()) else 0.1
+    if not bool(crashes.any()):
+        return 0.1
+    return 0.1 * (1 + int(crashes.nonzero().max()) + 1)
 
 
 def highest_speed(
     gap_m: float, leader_speed_mps: float, desired_speed_mps: float, idm: IdmParameters = TABLE_V
 ) -> float:
-    """Highest speed (m/s, in steps of 0.1 m/s) for which :func:`can_brake` is true at this and
-    every lower speed.
-    """
+    """Highest speed, m/s, in steps of 0.1 m/s, up to which :func:`can_brake` is true."""
     speeds = torch.arange(0, 1000).double() * 0.1
-    crashes = ~_survives(
-        torch.full_like(speeds, gap_m), speeds, leader_speed_mps, desired_speed_mps, idm
-    )
-    return (
-        0.1 * max(0, int(crashes.nonzero().min()) - 1) if bool(crashes.any()) else float(speeds[-1])
-    )
+    gap = torch.full_like(speeds, gap_m)
+    crashes = ~_survives(gap, speeds, leader_speed_mps, desired_speed_mps, idm)
+    if not bool(crashes.any()):
+        return float(speeds[-1])
+    return 0.1 * max(0, int(crashes.nonzero().min()) - 1)

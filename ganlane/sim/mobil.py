@@ -29,13 +29,13 @@ TABLE_IV = MobilParameters()
 
 
 class LaneAccelerations(NamedTuple):
-    """Accelerations in the observer's lane and its neighbours, m/s2, [N, K, L].
+    """Accelerations in the observer's lane and those beside it, m/s2, [N, K, L].
 
-    ``own`` is the observer's; ``with_it`` and ``without`` are its follower's in that lane with and
-    without the observer in front of it, both 0 where there is no follower.
+    ``observer`` is the observer's; ``with_it`` and ``without`` are its follower's in that lane with
+    and without the observer in front of it, both 0 where there is no follower.
     """
 
-    own: Tensor
+    observer: Tensor
     with_it: Tensor
     without: Tensor
 
@@ -50,35 +50,34 @@ def lane_accelerations(scene: Scene, lanes: Tensor, idm: AnyIdm) -> LaneAccelera
     With per-driver parameters, each driver predicts the others with its own parameters.
     """
     ahead, behind = leader(scene, lanes), follower(scene, lanes)
-    speed, length = (
-        number[..., None] for number in (scene.observers.speed, scene.observers.length)
-    )
-    with_it = idm_acceleration(
-        behind.speed, behind.desired_speed, behind.gap, speed, idm.per_lane()
-    )
-    leader_speed = torch.where(ahead.gap >= FREE_GAP_M, behind.speed, ahead.speed)
-    gap = torch.where(ahead.gap < FREE_GAP_M, behind.gap + length + ahead.gap, FREE_GAP_M)
-    without = idm_acceleration(
-        behind.speed, behind.desired_speed, gap, leader_speed, idm.per_lane()
-    )
+    speed, length = scene.observers.speed[..., None], scene.observers.length[..., None]
+    driver = (behind.speed, behind.desired_speed)
+    with_it = idm_acceleration(*driver, behind.gap, speed, idm.per_lane())
+    # Without the observer its follower is behind its leader, or alone.
+    free = ahead.gap >= FREE_GAP_M
+    leader_speed = torch.where(free, behind.speed, ahead.speed)
+    gap = torch.where(free, FREE_GAP_M, behind.gap + length + ahead.gap)
+    without = idm_acceleration(*driver, gap, leader_speed, idm.per_lane())
     nobody = ~behind.exists
-    own = acceleration_behind(scene, ahead, idm)
     return LaneAccelerations(
-        own, with_it.masked_fill(nobody, 0.0), without.masked_fill(nobody, 0.0)
+        acceleration_behind(scene, ahead, idm),
+        with_it.masked_fill(nobody, 0.0),
+        without.masked_fill(nobody, 0.0),
     )
 
 
 def mobil_criterion(
     there: LaneAccelerations, here: LaneAccelerations, mobil: AnyMobil
 ) -> tuple[Tensor, Tensor]:
-    """MOBIL's incentive, m/s2, of a change from ``here`` [N, K, 1] to ``there`` [N, K, L], and
-    whether it is safe.
-    """
+    """Incentive of a change from ``here`` [N, K, 1] to ``there`` [N, K, L], m/s2; whether safe."""
     burden, relief = there.with_it - there.without, here.without - here.with_it
     incentive = (
-        there.own - here.own + mobil.politeness_side * burden + mobil.politeness_rear * relief
+        there.observer
+        - here.observer
+        + mobil.politeness_side * burden
+        + mobil.politeness_rear * relief
     )
-    return incentive, torch.minimum(there.with_it, there.own) >= -mobil.safe_deceleration
+    return incentive, torch.minimum(there.with_it, there.observer) >= -mobil.safe_deceleration
 
 
 def safe_change(
@@ -107,6 +106,7 @@ def one_at_a_time(
     wants, vehicles = wish != 0, scene.vehicles
     if not reads_are_cheap(wish):
         return torch.where(_gives_way(vehicles, scene.road, wish, idm, mobil), 0, wish)
+    # Rivals are rare: among all pairs a decision of idm_random takes 5 % longer with 1024 rows.
     rivals = wants & (wants.sum(1, keepdim=True) > 1)
     rows = rivals.any(1).nonzero()[:, 0]
     if len(rows) == 0:
@@ -114,11 +114,12 @@ def one_at_a_time(
     # Only their rows, and as many columns as hold all of them.
     rivals, most = rivals[rows], int(rivals.sum(1).max())
     columns = rivals.to(torch.uint8).sort(dim=1, descending=True, stable=True).indices[:, :most]
-    few, wishes = Vehicles(*(field[rows].gather(1, columns) for field in vehicles)), wish[rows]
+    few = Vehicles(*(field[rows].gather(1, columns) for field in vehicles))
     some = idm.of(rows, columns) if isinstance(idm, DriverIdm) else idm
+    wishes = wish[rows]
     asked = wishes.gather(1, columns)
-    kept = torch.where(_gives_way(few, scene.road, asked, some, mobil), 0, asked)
-    return wish.index_copy(0, rows, wishes.scatter(1, columns, kept))
+    granted = torch.where(_gives_way(few, scene.road, asked, some, mobil), 0, asked)
+    return wish.index_copy(0, rows, wishes.scatter(1, columns, granted))
 
 
 def _gives_way(
@@ -128,9 +129,8 @@ def _gives_way(
     pairs, wants, target = compare(vehicles, road), wish != 0, vehicles.target_lane + wish
     same = wants[:, None, :] & wants[:, :, None] & (target[:, None, :] == target[:, :, None])
     speed, desired = vehicles.speed[:, :, None], vehicles.desired_speed[:, :, None]
-    demand = idm_acceleration(
-        speed, desired, pairs.ahead, vehicles.speed[:, None, :], idm.per_lane()
-    )
+    leader_speed = vehicles.speed[:, None, :]
+    demand = idm_acceleration(speed, desired, pairs.ahead, leader_speed, idm.per_lane())
     near = (pairs.distance < mobil.exclusive_m) | (demand < -mobil.safe_deceleration)
     return (same & near & (pairs.order > 0)).any(-1)
 
@@ -147,13 +147,11 @@ def mobil_wishes(
     lane = vehicles.target_lane.to(vehicles.x.dtype)
     lanes = torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1)
     accelerations = lane_accelerations(scene, lanes, idm)
-    incentive, safe = mobil_criterion(
-        accelerations.of(slice(1, None)), accelerations.of(slice(0, 1)), mobil
-    )
+    here, there = accelerations.of(slice(0, 1)), accelerations.of(slice(1, None))
+    incentive, safe = mobil_criterion(there, here, mobil)
     exists = torch.stack((lane + 1.0 <= road.lanes - 1, lane - 1.0 >= 0), dim=-1)
-    left, right = torch.where(
-        exists & safe & (incentive > mobil.threshold), incentive, -torch.inf
-    ).unbind(-1)
+    pays = exists & safe & (incentive > mobil.threshold)
+    left, right = torch.where(pays, incentive, -torch.inf).unbind(-1)
     free = lane_change_done(vehicles, road) & vehicles.valid
     wish = torch.where(left >= right, 1, -1)
     return torch.where(free & torch.isfinite(torch.maximum(left, right)), wish, 0)

@@ -31,7 +31,8 @@ from ganlane.sim.state import (
 
 #: Gap in an empty lane, m (Table V's 'maximum gap for empty lane').
 FREE_GAP_M = 10_000.0
-#: Rows times pairs of vehicles from which on sorting is faster. Microseconds of :func:`perceive`
+#: Rows times pairs of vehicles from which on sorting is faster; the pairs stay for fewer, and where
+#: sorting is impossible (:func:`perceive`). Microseconds of :func:`perceive`
 #: and :func:`~ganlane.sim.idm.following_acceleration` on 3 lanes, one core, sorting and pairs, rows
 #: x vehicles: 1 x 9 265, 186; 64 x 9 310, 298; 128 x 9 413, 579; 16 x 30 427, 501; 64 x 100 926,
 #: 16917.
@@ -71,24 +72,24 @@ class Follower(NamedTuple):
 class Pairs(NamedTuple):
     """Every vehicle relative to every observer, [N, K, M].
 
-    ``distance`` is the signed distance between the centres, m, and ``bumpers`` the sum of the two
-    half lengths. ``order`` is the distance with ties broken: of two vehicles at the same x the one
-    with the lower index is ahead.
+    ``distance`` is the signed distance between the centres, m, and ``gap`` that between the
+    bumpers, whoever is ahead. ``order`` is the distance with ties broken: of two vehicles at the
+    same x the one with the lower index is ahead.
     """
 
     distance: Tensor
-    bumpers: Tensor
+    gap: Tensor
     order: Tensor
 
     @property
     def ahead(self) -> Tensor:
         """Gap to every vehicle ahead, m; :data:`FREE_GAP_M` for the others."""
-        return _only(self.distance - self.bumpers, self.order > 0)
+        return _beyond(self.gap, self.order <= 0).clamp_max(FREE_GAP_M)
 
     @property
     def behind(self) -> Tensor:
         """Gap to every vehicle behind, m; :data:`FREE_GAP_M` for the others."""
-        return _only(-self.distance - self.bumpers, self.order < 0)
+        return _beyond(self.gap, self.order >= 0).clamp_max(FREE_GAP_M)
 
 
 class Scene(NamedTuple):
@@ -97,7 +98,7 @@ class Scene(NamedTuple):
     ``observers`` and their lane ranges ``body`` and ``attention`` are [N, K]; ``presence`` [N, M]
     holds the lanes in which others see each vehicle. With a ``queue`` neighbours are found by
     sorting: int64 [N, M], the vehicles in the order of the road, the foremost first, and
-    everybody's place in that order.
+    everybody's place in that order. Without it they are found by ``compared`` pairs.
     """
 
     which: slice
@@ -108,12 +109,12 @@ class Scene(NamedTuple):
     attention: LaneRange
     presence: LaneRange
     queue: tuple[Tensor, Tensor] | None
-    known: Pairs | None
+    compared: Pairs | None
 
     @property
     def pairs(self) -> Pairs:
         """The :class:`Pairs` of observers and vehicles."""
-        return self.known or compare(self.vehicles, self.road, self.which)
+        return self.compared or compare(self.vehicles, self.road, self.which)
 
 
 def _beyond(number: Tensor, where: Tensor) -> Tensor:
@@ -125,32 +126,29 @@ def _beyond(number: Tensor, where: Tensor) -> Tensor:
     return torch.add(number, where, alpha=_BEYOND)
 
 
-def _only(gap: Tensor, counts: Tensor) -> Tensor:
-    """``gap`` where ``counts`` holds, :data:`FREE_GAP_M` elsewhere."""
-    return _beyond(gap, ~counts).clamp_max(FREE_GAP_M)
-
-
 def compare(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Pairs:
     """The :class:`Pairs` of all vehicles as observers, or of a slice of them."""
     distance = road.distance_ahead(vehicles.x[:, which, None], vehicles.x[:, None, :])
     half = 0.5 * vehicles.length
+    gap = distance.abs() - (half[:, which, None] + half[:, None, :])
     index = torch.arange(vehicles.x.shape[1], device=vehicles.x.device)
     tie = torch.sign(index[which, None] - index) * _TIE_M
-    return Pairs(distance, half[:, which, None] + half[:, None, :], distance + tie)
+    return Pairs(distance, gap, distance + tie)
 
 
 def perceive(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Scene:
-    """The :class:`Scene` of ``vehicles`` on ``road``, as seen by all of them or by a slice of them."""
+    """The :class:`Scene` of ``vehicles`` as seen by all of them or by a slice of them."""
     body = body_lanes(vehicles, road)
     attention, x = with_target(body, vehicles), vehicles.x
-    # Where sorting is faster, and possible: a ring has no first vehicle, a key holds two numbers of
-    # 32 bits.
     sorts = (
         which == slice(None)
         and x.shape[0] * x.shape[1] ** 2 >= SORTS_FROM
         and reads_are_cheap(x)
+        # a key holds two numbers of 32 bits
         and x.dtype == torch.float32
+        # a ring has no first vehicle
         and road.ring_m is None
+        # keys have no gradient
         and not (x.requires_grad or vehicles.speed.requires_grad)
     )
     return Scene(
@@ -162,7 +160,7 @@ def perceive(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Scen
         attention=attention.columns(which),
         presence=presence(vehicles, road, body, attention),
         queue=_queue(x) if sorts else None,
-        known=None if sorts else compare(vehicles, road, which),
+        compared=None if sorts else compare(vehicles, road, which),
     )
 
 
@@ -171,57 +169,55 @@ def in_lane(scene: Scene, lane: Tensor) -> Tensor:
 
     Bool [N, K, M], or [N, K, L, M] for L lanes [N, K, L].
     """
-    low, high = (
-        each[:, None, None, :] if lane.ndim == 3 else each[:, None, :] for each in scene.presence
-    )
+    low, high = scene.presence
+    for _ in range(lane.ndim - 1):
+        low, high = low.unsqueeze(1), high.unsqueeze(1)
     asked = lane[..., None]
     return (low <= asked) & (asked <= high)
 
 
 def leader(scene: Scene, lane: Tensor) -> Neighbour:
-    """The nearest vehicle ahead of each observer in its lane (float.
+    """The nearest vehicle ahead of each observer in its ``lane``.
 
-    [N, K], or [N, K, L] for L of them).
+    Float [N, K], or [N, K, L] for L of them; the result has that shape.
     """
-    if lane.ndim == 2:
-        return Neighbour(*(found[..., 0] for found in leader(scene, lane[..., None])))
+    lanes = lane[..., None] if lane.ndim == 2 else lane
     speed = scene.vehicles.speed
-    if scene.queue is not None:
-        key = _nearest_key(scene, scene.queue, lane, 1, _ordered(speed) - _INT32_MIN)
-        rear, found = _unordered(key >> 32), _unordered((key & 0xFFFFFFFF) + _INT32_MIN)
+    if scene.queue is None:
+        ends = _candidates(scene, lanes, 1)
+        rear = ends.amin(-1)
+        its_speed = _beyond(speed[:, None, None, :], ends > rear[..., None]).amin(-1)
     else:
-        candidates = _candidates(scene, lane, 1)
-        rear = candidates.amin(-1)
-        found = _beyond(speed[:, None, None, :], candidates > rear[..., None]).amin(-1)
+        key = _nearest_key(scene, scene.queue, lanes, 1, _ordered(speed) - _INT32_MIN)
+        rear = _unordered(key >> 32)
+        its_speed = _unordered((key & 0xFFFFFFFF) + _INT32_MIN)
     gap = _gap(scene, rear, 1)
-    return Neighbour(gap, torch.where(gap < FREE_GAP_M, found, scene.observers.speed[..., None]))
+    its_speed = torch.where(gap < FREE_GAP_M, its_speed, scene.observers.speed[..., None])
+    return Neighbour(gap.view(lane.shape), its_speed.view(lane.shape))
 
 
 def follower(scene: Scene, lane: Tensor) -> Follower:
-    """The nearest vehicle behind each observer in its lane (float.
+    """The nearest vehicle behind each observer in its ``lane``.
 
-    [N, K], or [N, K, L] for L of them).
+    Float [N, K], or [N, K, L] for L of them; the result has that shape.
     """
-    if lane.ndim == 2:
-        return Follower(*(found[..., 0] for found in follower(scene, lane[..., None])))
+    lanes = lane[..., None] if lane.ndim == 2 else lane
     vehicles = scene.vehicles
-    if scene.queue is not None:
-        key = _nearest_key(
-            scene, scene.queue, lane, -1, torch.arange(vehicles.x.shape[1], device=lane.device)
-        )
-        front, index = _unordered(key >> 32), key & 0xFFFFFFFF
+    if scene.queue is None:
+        front, index = _candidates(scene, lanes, -1).min(-1)
     else:
-        front, index = _candidates(scene, lane, -1).min(-1)
-    gap, flat = _gap(scene, front, -1), index.flatten(1)
-    speed, desired = (
-        number.gather(1, flat).view_as(gap) for number in (vehicles.speed, vehicles.desired_speed)
-    )
-    return Follower(gap, speed, desired, gap < FREE_GAP_M)
+        numbers = torch.arange(vehicles.x.shape[1], device=lane.device)
+        key = _nearest_key(scene, scene.queue, lanes, -1, numbers)
+        front, index = _unordered(key >> 32), key & 0xFFFFFFFF
+    gap, flat = _gap(scene, front, -1).view(lane.shape), index.flatten(1)
+    speed = vehicles.speed.gather(1, flat).view(lane.shape)
+    desired_speed = vehicles.desired_speed.gather(1, flat).view(lane.shape)
+    return Follower(gap, speed, desired_speed, gap < FREE_GAP_M)
 
 
-def _candidates(scene: Scene, lane: Tensor, side: int) -> Tensor:
-    """Where the near end of each vehicle ahead (``side`` 1) or behind (-1) in each lane is, m, [N,
-    K, L, M].
+def _candidates(scene: Scene, lanes: Tensor, side: int) -> Tensor:
+    """Where the near end of each vehicle ahead (``side`` 1) or behind (-1) in each lane is, m,
+    [N, K, L, M].
 
     Along ``side``: of vehicles ahead the rear, of vehicles behind the front with its sign changed.
     On a ring from the observer on; else on the road, so that it is one number per vehicle, whoever
@@ -229,25 +225,30 @@ def _candidates(scene: Scene, lane: Tensor, side: int) -> Tensor:
     """
     v, pairs = scene.vehicles, scene.pairs
     x = v.x[:, None, :] if scene.road.ring_m is None else pairs.distance
-    half = (0.5 * v.length)[:, None, :]
-    end, on_side = (x - half, pairs.order > 0) if side > 0 else (-x - half, pairs.order < 0)
+    end = side * x - (0.5 * v.length)[:, None, :]
+    elsewhere = pairs.order <= 0 if side > 0 else pairs.order >= 0
     # In two steps: leader and follower in several lanes then share the first, [N, K, M], which a
     # compiler keeps. In one step compiled idm_mobil took twice as long.
-    return _beyond(_beyond(end, ~on_side)[:, :, None, :], ~in_lane(scene, lane))
+    return _beyond(_beyond(end, elsewhere)[:, :, None, :], ~in_lane(scene, lanes))
 
 
 def _gap(scene: Scene, end: Tensor, side: int) -> Tensor:
-    """Gap from each observer's bumper to ``end`` [N, K, L], m; :data:`FREE_GAP_M` where nobody is."""
+    """Gap from each observer's bumper to ``end``, m; :data:`FREE_GAP_M` where nobody is."""
     o = scene.observers
-    distance = end if scene.road.ring_m is not None else torch.sub(end, o.x[..., None], alpha=side)
+    distance = end
+    if scene.road.ring_m is None:
+        distance = torch.sub(end, o.x[..., None], alpha=side)
     return torch.sub(distance, o.length[..., None], alpha=0.5).clamp_max(FREE_GAP_M)
+
+
+# Sorting
 
 
 def _queue(x: Tensor) -> tuple[Tensor, Tensor]:
     """Of vehicles at ``x`` [N, M]; of two at the same x the one with the lower index is ahead."""
     turn = x.sort(dim=1, descending=True, stable=True).indices
     numbers = torch.arange(x.shape[1], device=x.device).expand_as(turn)
-    return (turn, torch.empty_like(turn).scatter_(1, turn, numbers))
+    return turn, torch.empty_like(turn).scatter_(1, turn, numbers)
 
 
 def _nearest_key(
@@ -260,26 +261,29 @@ def _nearest_key(
     between level ends. So a minimum of keys finds the neighbour and holds what is to be known of
     it.
     """
-    v, m = scene.vehicles, lane.shape[1]
-    lanes = (
-        int(scene.road.lanes.max()) if isinstance(scene.road.lanes, Tensor) else scene.road.lanes
-    )
-    key = (_ordered(side * v.x - 0.5 * v.length) << 32) | second
-    turn, passed = queue if side > 0 else (queue[0].flip(1), m - 1 - queue[1])
-    low, high, key = (each.gather(1, turn) for each in (*scene.presence, key))
+    v, (turn, place), count = scene.vehicles, queue, lane.shape[1]
+    lanes = scene.road.lanes
+    if isinstance(lanes, Tensor):
+        lanes = int(lanes.max())
+    if side < 0:  # from the rear
+        turn, place = turn.flip(1), count - 1 - place
+    key = ((_ordered(side * v.x - 0.5 * v.length) << 32) | second).gather(1, turn)
+    low, high = (end.gather(1, turn) for end in scene.presence)
     number = torch.arange(lanes, device=v.x.device)[:, None, None]
+    # [lanes, N, M]: everybody's key in the lanes that it is seen in.
     key = torch.where((low <= number) & (number <= high), key, _NOBODY)
     # Entry k of a lane: the nearest among the first k in the queue; among none it is nobody.
     nearest = pad(key[..., :-1], (1, 0), value=_NOBODY).cummin(-1).values.transpose(0, 1).flatten(1)
-    entry = lane.clamp(0, lanes - 1).long() * m + passed[..., None]
-    found = nearest.gather(1, entry.flatten(1)).view(lane.shape)
-    return torch.where((lane >= 0) & (lane < lanes), found, _NOBODY)
+    entry = lane.clamp(0, lanes - 1).long() * count + place[..., None]
+    neighbour = nearest.gather(1, entry.flatten(1)).view(lane.shape)
+    return torch.where((lane >= 0) & (lane < lanes), neighbour, _NOBODY)
 
 
 def _ordered(number: Tensor) -> Tensor:
     """A whole number of 32 bits (as int64) that orders as ``number`` (float32) does.
 
-    :func:`_unordered` undoes it.
+    The bits of floats above 0 order as whole numbers do; those below 0 the other way round, so all
+    their bits but the sign are turned over. :func:`_unordered` undoes it.
     """
     bits = (number + 0.0).view(torch.int32)  # -0 becomes 0
     return (bits ^ ((bits >> 31) & 0x7FFFFFFF)).long()

@@ -77,15 +77,13 @@ def absorb(key: Tensor, field: Tensor | int) -> Tensor:
 
 
 def episode_key(stream: int, seed: Tensor, episode: Tensor) -> Tensor:
-    """Key of an episode, [N] int64, from the stream and the [N] int64 counters ``seed`` and
-    ``episode``.
-    """
+    """Key of an episode, [N] int64, from the stream and the counters [N] int64."""
     start = torch.full_like(seed, int(stream))
     return absorb(absorb(absorb(start, 0), seed), episode)
 
 
 def draw_keys(key: Tensor, step: Tensor | int, vehicles: int, purposes: list[int]) -> Tensor:
-    """Keys [N, vehicles, len(purposes)] from episode keys [N] and physics steps [N] (or one int)."""
+    """Keys [N, vehicles, len(purposes)] from episode keys [N] and physics steps [N] or one int."""
     at_step = absorb(key, step)
     vehicle = torch.arange(vehicles, device=key.device)
     purpose = torch.tensor(purposes, device=key.device)
@@ -105,7 +103,7 @@ def uniform(
     purposes: list[int],
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Uniform numbers in [0, 1), [N, vehicles, len(purposes)]: all purposes of a step in one call."""
+    """Uniform numbers in [0, 1), [N, vehicles, len(purposes)]: a step's purposes in one call."""
     return to_uniform(draw_keys(key, step, vehicles, purposes), dtype)
 
 

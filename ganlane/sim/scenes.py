@@ -1,5 +1,4 @@
-"""Hand-made initial scenes: the same vehicles in every episode, optionally with small random
-variations.
+"""Hand-made initial scenes: the same vehicles in every episode, or with small variations.
 
 :class:`Scenes` is the contract; :class:`~ganlane.sim.spawn.RandomScenes` draws scenes by Table II.
 Scenes set by hand are checked for impossible numbers, overlaps and unavoidable crashes; errors name
@@ -52,7 +51,7 @@ class Scenes(Protocol):
         ...
 
     def check(self, road: Road, idm: IdmParameters) -> None:
-        """Raise :class:`UserError` if the scene does not fit the road, or crashes are unavoidable."""
+        """Raise :class:`UserError` if it does not fit the road, or crashes are unavoidable."""
         ...
 
     def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:
@@ -104,8 +103,7 @@ class SceneVehicle:
 
 @dataclass(frozen=True)
 class FixedScene:
-    """The same initial scene in every episode, or with small random variations; the first vehicle
-    is the ego.
+    """The same scene in every episode, or with small variations; the first vehicle is the ego.
 
     Args:
         rows: the vehicles; the ego's x becomes 0, and the others keep their distance to it.
@@ -144,14 +142,14 @@ class FixedScene:
         return max(row.length_m for row in self.rows)
 
     def check(self, road: Road, idm: IdmParameters) -> None:
-        """Raise :class:`UserError` if ``road`` differs from the scene's, or a vehicle cannot brake
-        in time.
-        """
-        mine, other = ((r.lanes, r.lane_width_m) for r in (self.road, road))
-        if mine != other or road.ring_m is not None:
+        """Raise :class:`UserError` if ``road`` is another, or a vehicle cannot brake in time."""
+        lanes, width = self.road.lanes, self.road.lane_width_m
+        if (lanes, width) != (road.lanes, road.lane_width_m) or road.ring_m is not None:
+            ring = " and is a ring" if road.ring_m else ""
             raise UserError(
-                f"{self.name}: laid out for a straight road of {mine[0]} lanes of {mine[1]:g} m, the traffic's has "
-                f"{other[0]} of {other[1]} m{' and is a ring' if road.ring_m else ''}; give both the same road."
+                f"{self.name}: laid out for a straight road of {lanes} lanes of {width:g} m, the "
+                f"traffic's has {road.lanes} of {road.lane_width_m} m{ring}; give both the same "
+                "road."
             )
         check_braking(self, idm)
         check_drive(self, idm)
@@ -177,13 +175,11 @@ class FixedScene:
         def column(values: Sequence[float], kind: torch.dtype = dtype) -> Tensor:
             return torch.tensor([values], dtype=kind, device=device)
 
-        targets = [
-            row.lane_on(road) if row.target_lane is None else row.target_lane for row in rows
-        ]
+        targets, seen = [], []
         usual = [self.ego_visibility] + [self.others_visibility] * (len(rows) - 1)
-        seen = [
-            kind if row.visibility is None else row.visibility for row, kind in zip(rows, usual)
-        ]
+        for row, kind in zip(rows, usual):
+            targets.append(row.lane_on(road) if row.target_lane is None else row.target_lane)
+            seen.append(kind if row.visibility is None else row.visibility)
         zero = column([0.0] * len(rows))
         return Vehicles(
             x=column([row.x_m - rows[0].x_m for row in rows]),
@@ -218,13 +214,12 @@ def check_count(name: str, vehicles: int) -> None:
 
 
 def check_rows(scene: FixedScene) -> None:
-    """Raise :class:`UserError` for a scene of fewer than two vehicles, or a vehicle with an
-    impossible number.
-    """
+    """Raise :class:`UserError` for fewer than two vehicles, or one with an impossible number."""
     check_count(scene.name, len(scene.rows))
     if len(scene.rows) < 2:
         raise UserError(
-            f"{scene.name}: {len(scene.rows)} vehicles; a scene needs the ego and at least one other."
+            f"{scene.name}: {len(scene.rows)} vehicles; a scene needs the ego and at least one "
+            "other."
         )
     if not isinstance(scene.road.lanes, int) or isinstance(scene.road.lane_width_m, Tensor):
         raise UserError(
@@ -232,12 +227,13 @@ def check_rows(scene: FixedScene) -> None:
         )
     if not (1 <= scene.road.lanes <= MOST_LANES and SMALLEST <= scene.road.lane_width_m <= LARGEST):
         raise UserError(
-            f"{scene.name}: a road of {scene.road.lanes:g} lanes of {scene.road.lane_width_m:g} m; expected 1 to "
-            f"{MOST_LANES} of at most {LARGEST:g} m."
+            f"{scene.name}: a road of {scene.road.lanes:g} lanes of {scene.road.lane_width_m:g} m; "
+            f"expected 1 to {MOST_LANES} of at most {LARGEST:g} m."
         )
     if not all(0 <= jitter <= LARGEST for jitter in (scene.jitter_m, scene.jitter_mps)):
         raise UserError(
-            f"{scene.name}: jitter_m={scene.jitter_m:g}, jitter_mps={scene.jitter_mps:g}: expected at least 0."
+            f"{scene.name}: jitter_m={scene.jitter_m:g}, jitter_mps={scene.jitter_mps:g}: "
+            "expected at least 0."
         )
     for index, row in enumerate(scene.rows):
         fault = _fault(row, scene.road)
@@ -247,13 +243,8 @@ def check_rows(scene: FixedScene) -> None:
 
 def _fault(row: SceneVehicle, road: Road) -> str:
     """What is wrong with one vehicle; empty if nothing is."""
-    given = {
-        "x_m": row.x_m,
-        "y_m": row.y_m,
-        "speed_mps": row.speed_mps,
-        "desired_speed_mps": row.desired_speed_mps,
-    }
-    for name, value in (given | {"length_m": row.length_m, "width_m": row.width_m}).items():
+    for name in ("x_m", "y_m", "speed_mps", "desired_speed_mps", "length_m", "width_m"):
+        value = getattr(row, name)
         if value is not None and not -LARGEST <= value <= LARGEST:
             return f"{name}={value:g}: expected a number from {-LARGEST:g} to {LARGEST:g}"
     if row.speed_mps < 0:
@@ -269,13 +260,17 @@ def _fault(row: SceneVehicle, road: Road) -> str:
             return f"{name}={lane}: expected 0 to {lanes - 1}, the road has {lanes} lanes"
     right, left, y = float(road.right_edge_m()), float(road.left_edge_m()), row.y_on(road)
     if y - 0.5 * row.width_m < right - 1e-6 or y + 0.5 * row.width_m > left + 1e-6:
-        return f"y={y:g} m, width {row.width_m:g} m: expected on the road, which runs from {right:g} to {left:g} m"
-    if row.lane is not None and row.lane != row.lane_on(road):
-        return f"lane={row.lane} and y_m={y:g} contradict each other (that is lane {row.lane_on(road)}); give one"
-    if row.target_lane is not None and abs(row.target_lane - row.lane_on(road)) > 1:
         return (
-            f"target_lane={row.target_lane}: expected a lane next to its own, {row.lane_on(road)}"
+            f"y={y:g} m, width {row.width_m:g} m: expected on the road, which runs from "
+            f"{right:g} to {left:g} m"
         )
+    here = row.lane_on(road)
+    if row.lane is not None and row.lane != here:
+        return (
+            f"lane={row.lane} and y_m={y:g} contradict each other (that is lane {here}); give one"
+        )
+    if row.target_lane is not None and abs(row.target_lane - here) > 1:
+        return f"target_lane={row.target_lane}: expected a lane next to its own, {here}"
     return ""
 
 
@@ -284,22 +279,19 @@ def check_overlaps(scene: FixedScene) -> None:
     vehicles = scene.base()
     longer = torch.full_like(vehicles.x, 2.0 * scene.jitter_m)
     longer[:, 0] = 0.0
-    hits = (
-        pair_overlaps(vehicles.with_(length=vehicles.length + longer), scene.road)[0]
-        .nonzero()
-        .tolist()
-    )
+    longest = vehicles.with_(length=vehicles.length + longer)
+    hits = pair_overlaps(longest, scene.road)[0].nonzero().tolist()
     if hits:
         one, other = hits[0]
         worst = f" (with jitter_m={scene.jitter_m:g} at its worst)" if scene.jitter_m else ""
         raise UserError(
-            f"{scene.name}: {scene.label(one)} and {scene.label(other)} overlap{worst}; move one of them."
+            f"{scene.name}: {scene.label(one)} and {scene.label(other)} overlap{worst}; "
+            "move one of them."
         )
 
 
 def check_braking(scene: FixedScene, idm: IdmParameters) -> None:
-    """Raise :class:`UserError` if any follower would need to brake harder than
-    ``idm.min_acceleration``.
+    """Raise :class:`UserError` if a follower would have to brake harder than IDM can.
 
     Leaders are all vehicles ahead in a lane that the follower is in or moving to; they are taken to
     keep their speed. Jitter is taken at its worst.
@@ -312,26 +304,28 @@ def check_braking(scene: FixedScene, idm: IdmParameters) -> None:
     slack = scene.jitter_m * (2.0 - (torch.arange(scene.vehicles) == 0).double())
     gap = seen.pairs.ahead - torch.minimum(slack[:, None], slack[None, :])
     fastest, slowest = vehicles.speed + varied, (vehicles.speed - varied).clamp_min(0.0)
-    needed = torch.where(
-        ahead, needed_deceleration(fastest[:, :, None], slowest[:, None, :], gap), 0.0
-    )[0]
+    needed = needed_deceleration(fastest[:, :, None], slowest[:, None, :], gap)
+    needed = torch.where(ahead, needed, 0.0)[0]
     if bool((needed > -idm.min_acceleration).any()):
         one, other = divmod(int(needed.argmax()), scene.vehicles)
         raise UserError(
-            f"{scene.name}: {scene.label(one)} at {fastest[0, one]:g} m/s, {float(gap[0, one, other]):.3g} m behind "
-            f"{scene.label(other)} at {slowest[0, other]:g} m/s, would need {float(needed[one, other]):.3g} m/s2 to "
-            f"avoid it, and env.idm.min_acceleration={idm.min_acceleration:g}; move them apart or slow it down."
+            f"{scene.name}: {scene.label(one)} at {fastest[0, one]:g} m/s, "
+            f"{float(gap[0, one, other]):.3g} m behind {scene.label(other)} at "
+            f"{slowest[0, other]:g} m/s, would need {float(needed[one, other]):.3g} m/s2 to avoid "
+            f"it, and env.idm.min_acceleration={idm.min_acceleration:g}; move them apart or slow "
+            "it down."
         )
 
 
 def check_drive(scene: FixedScene, idm: IdmParameters) -> None:
-    """Raise :class:`UserError` if vehicles that only follow and finish their lane changes collide."""
+    """Raise :class:`UserError` if vehicles that follow and finish their lane changes collide."""
     hit = _first_overlap(scene, idm)
     if hit is not None:
         one, other, seconds = hit
         raise UserError(
-            f"{scene.name}: {scene.label(one)} and {scene.label(other)} crash after {seconds:.1f} s although all "
-            "brake as IDM says; move them apart, slow the rear one down, or let a lane change be seen (signalled)."
+            f"{scene.name}: {scene.label(one)} and {scene.label(other)} crash after "
+            f"{seconds:.1f} s although all brake as IDM says; move them apart, slow the rear one "
+            "down, or let a lane change be seen (signalled)."
         )
 
 

@@ -37,14 +37,12 @@ SIDE_M = 0.4
 def check_start(
     parameters: SpawnParameters, vehicles: int, lanes: int, idm: IdmParameters = TABLE_V
 ) -> None:
-    """Raise :class:`ParameterError` if ``vehicles`` do not fit on ``lanes``, overlap, or cannot
-    brake.
-    """
+    """Raise :class:`ParameterError` if ``vehicles`` do not fit, overlap, or cannot brake."""
     p = parameters
     if p.min_spacing_m <= p.length_m:
         raise ParameterError(
-            f"{{min_spacing_m}}={p.min_spacing_m:g} is not above the vehicles' length of {p.length_m:g} m: they "
-            "would overlap; choose a larger spacing."
+            f"{{min_spacing_m}}={p.min_spacing_m:g} is not above the vehicles' length of "
+            f"{p.length_m:g} m: they would overlap; choose a larger spacing."
         )
     capacity = p.lane_capacity()
     if vehicles > lanes * capacity:
@@ -62,17 +60,15 @@ def check_start(
             spacing = p.length_m + least_gap(speed, leader, desired, idm)
             slower = highest_speed(gap, leader, desired, idm)
             raise ParameterError(
-                f"{{min_spacing_m}}={p.min_spacing_m:g} is too little for {{{field}}} up to {speed:g} m/s: a gap "
-                f"of {gap:g} m is too short to avoid a leader of {leader:g} m/s that brakes at "
-                f"{{idm.min_acceleration}}={idm.min_acceleration:g} m/s2; raise {{min_spacing_m}} to {spacing:.1f} "
-                f"or lower {{{field}}} to {slower:.1f}."
+                f"{{min_spacing_m}}={p.min_spacing_m:g} is too little for {{{field}}} up to "
+                f"{speed:g} m/s: a gap of {gap:g} m is too short to avoid a leader of {leader:g} "
+                f"m/s that brakes at {{idm.min_acceleration}}={idm.min_acceleration:g} m/s2; raise "
+                f"{{min_spacing_m}} to {spacing:.1f} or lower {{{field}}} to {slower:.1f}."
             )
 
 
 def _rank(value: Tensor, same: Tensor | None = None) -> Tensor:
-    """Rank of each by ``value`` [N, M] and then index, among those where ``same`` [N, M, M] is
-    true.
-    """
+    """Rank of each by ``value`` [N, M] and then index, among the ``same`` [N, M, M]."""
     index = torch.arange(value.shape[1], device=value.device)
     mine, other = value[:, :, None], value[:, None, :]
     before = (other < mine) | ((other == mine) & (index[None, :] < index[:, None]))
@@ -178,23 +174,23 @@ class RandomScenes:
             return  # a road for each row: its vehicles come from recordings
         if road != self.road:
             raise UserError(
-                f"scenes: laid out on {_described(self.road)}, the traffic drives on {_described(road)}; give both "
-                "the same road."
+                f"scenes: laid out on {_described(self.road)}, the traffic drives on "
+                f"{_described(road)}; give both the same road."
             )
         check_start(p, self.vehicles, road.lanes, idm)
         if lane_width_m <= p.widest_m:
             wide = "width_m" if p.width_m == p.widest_m else "truck_width_m"
             raise UserError(
-                f"env.lane_width_m={lane_width_m:g}: expected more than env.{wide}={p.widest_m:g}, or vehicles in "
-                "neighbouring lanes touch; widen the lanes."
+                f"env.lane_width_m={lane_width_m:g}: expected more than env.{wide}="
+                f"{p.widest_m:g}, or vehicles in neighbouring lanes touch; widen the lanes."
             )
         # Where a ring closes, the last vehicle is the first one's leader.
         if ring_m is not None and p.spread_m + p.spacing_m > ring_m:
             more = f" ({p.spacing_m:g} with lorries)" if p.spacing_m > p.min_spacing_m else ""
             raise UserError(
-                f"ring_m={ring_m:g}: expected at least env.spread_m={p.spread_m:g} and env.min_spacing_m="
-                f"{p.min_spacing_m:g}{more} together, or the first vehicles overlap the last; lengthen the ring "
-                "or lower env.spread_m."
+                f"ring_m={ring_m:g}: expected at least env.spread_m={p.spread_m:g} and "
+                f"env.min_spacing_m={p.min_spacing_m:g}{more} together, or the first vehicles "
+                "overlap the last; lengthen the ring or lower env.spread_m."
             )
 
     @property
@@ -224,26 +220,23 @@ def out_of_range(vehicles: Vehicles, road: Road, range_m: float = RANGE_M) -> Te
 
 
 def _room(there: Scene, idm: IdmParameters, safe: float) -> Tensor:
-    """Whether each of the first M vehicles requires no deceleration above ``safe`` in any pair,
-    bool [N, M].
+    """Whether each of the first M vehicles asks nobody for more than ``safe`` m/s2, bool [N, M].
 
     ``there`` holds 2 M vehicles: all at their new positions, then all at their current ones. So the
     result holds whichever of the others move too.
     """
-    own, other, (low, high) = there.observers, there.vehicles, there.attention
-    shares = (low[..., None] <= high.repeat(1, 2)[:, None, :]) & (
-        low.repeat(1, 2)[:, None, :] <= high[..., None]
-    )
-    sides = 0.5 * own.width[..., None] + 0.5 * other.width[:, None, :] + SIDE_M
-    shares |= (own.y[..., None] - other.y[:, None, :]).abs() < sides
+    one, other, (low, high) = there.observers, there.vehicles, there.attention
+    their_low, their_high = low.repeat(1, 2)[:, None, :], high.repeat(1, 2)[:, None, :]
+    shares = (low[..., None] <= their_high) & (their_low <= high[..., None])
+    sides = 0.5 * one.width[..., None] + 0.5 * other.width[:, None, :] + SIDE_M
+    shares |= (one.y[..., None] - other.y[:, None, :]).abs() < sides
     pairs = there.pairs
-    itself = torch.eye(own.x.shape[1], dtype=torch.bool, device=own.x.device).repeat(1, 2)
+    itself = torch.eye(one.x.shape[1], dtype=torch.bool, device=one.x.device).repeat(1, 2)
     counts = shares & other.valid[:, None, :] & ~itself
-    speed, desired = own.speed[..., None], own.desired_speed[..., None]
-    behind = idm_acceleration(speed, desired, pairs.ahead, other.speed[:, None, :], idm)
-    before = idm_acceleration(
-        other.speed[:, None, :], other.desired_speed[:, None, :], pairs.behind, speed, idm
-    )
+    speed, desired = one.speed[..., None], one.desired_speed[..., None]
+    its_speed, its_desired = other.speed[:, None, :], other.desired_speed[:, None, :]
+    behind = idm_acceleration(speed, desired, pairs.ahead, its_speed, idm)
+    before = idm_acceleration(its_speed, its_desired, pairs.behind, speed, idm)
     asked = torch.where(pairs.order > 0, behind, before)
     return (~counts | (asked >= -safe)).all(-1)
 
@@ -260,12 +253,12 @@ def recycle(
     Room is tested against every other vehicle at its current *and* at its new position.
     """
     away = out_of_range(vehicles, road, range_m)
+    # Mostly nobody is: without this look a decision takes 2 % longer with 64 rows, 9 with 1024.
     if reads_are_cheap(away) and not bool(away.any()):
         return vehicles
     distance = road.distance_ahead(vehicles.x[:, EGO_INDEX, None], vehicles.x)
-    moved = vehicles.with_(
-        x=torch.where(away, vehicles.x - 2.0 * range_m * torch.sign(distance), vehicles.x)
-    )
+    across = vehicles.x - 2.0 * range_m * torch.sign(distance)
+    moved = vehicles.with_(x=torch.where(away, across, vehicles.x))
     both = Vehicles(*(torch.cat(pair, dim=1) for pair in zip(moved, vehicles)))
     room = _room(perceive(both, road, slice(0, vehicles.x.shape[1])), idm, safe_deceleration)
     return vehicles.with_(x=torch.where(away & room, moved.x, vehicles.x))

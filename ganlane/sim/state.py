@@ -1,5 +1,4 @@
-"""The state of the simulation: the vehicles as tensors, the road they drive on, and the lanes that
-they occupy.
+"""The state of the simulation: vehicles as tensors, their road, and the lanes that they occupy.
 
 When others see a lane change strongly affects the number of crashes, so it is a property of each
 vehicle:
@@ -31,16 +30,12 @@ ARRIVED_M = 0.3
 
 
 def reads_are_cheap(tensor: Tensor) -> bool:
-    """Whether a value can be read without breaking a graph that is being compiled, or stalling a
-    GPU's queue.
-    """
+    """Whether reading a value neither breaks a graph that is compiled nor stalls a GPU's queue."""
     return tensor.device.type == "cpu" and not torch.compiler.is_compiling()
 
 
 class Vehicles(NamedTuple):
-    """Fields of ``vehicles`` (:mod:`ganlane.keys`), each of shape [N, M] (or [N] for one vehicle
-    per row).
-    """
+    """Fields of ``vehicles`` (:mod:`ganlane.keys`), each [N, M], or [N] for one per row."""
 
     x: Tensor
     y: Tensor
@@ -84,9 +79,7 @@ class Vehicles(NamedTuple):
         )
 
     def with_finite_padding(self) -> Vehicles:
-        """The same vehicles with finite numbers in invalid entries, so that NaN does not spread
-        through sums.
-        """
+        """The same vehicles with finite numbers in invalid entries: NaN would spread in sums."""
 
         def finite(field: Tensor) -> Tensor:
             return torch.where(self.valid, field, torch.nan_to_num(field, 1.0, 1.0, 1.0))
@@ -119,9 +112,7 @@ class Road:
         return lane.clamp(0, self.lanes - 1)
 
     def lane_of(self, y: Tensor) -> Tensor:
-        """Lane whose centre is nearest to lateral position ``y`` (m), as a float tensor, on the
-        road.
-        """
+        """Lane of the road whose centre is nearest to lateral position ``y``, m; float."""
         return self.clamp_lane(torch.round(y / self.lane_width_m))
 
     def centre_of(self, lane: Tensor, dtype: torch.dtype | None = None) -> Tensor:
@@ -151,7 +142,7 @@ STRAIGHT = Road()
 
 
 def road_in(state: Any, default: Road) -> Road:
-    """The road of each row from ``state["road"]`` (a TensorDict), or ``default`` without that key."""
+    """The road of each row from ``state["road"]``, or ``default`` without that key."""
     rows = state.get("road", None)
     return default if rows is None else Road(rows.get("lanes"), rows.get("lane_width_m"))
 
@@ -171,14 +162,17 @@ class LaneRange(NamedTuple):
 
 
 def spanned(lanes: LaneRange) -> Tensor:
-    """The lanes of a range, [..., 3]: lowest, middle and highest; [..., 2] or [..., 1] where that
-    is seen to suffice.
+    """The lanes of a range, [..., 3]: lowest, middle and highest; fewer where those suffice.
 
     A vehicle at an angle can be in three lanes, if lanes are narrow, vehicles long or changes
     consecutive.
     """
-    if reads_are_cheap(lanes.low) and (most := int((lanes.high - lanes.low).amax())) < 2:
-        return torch.stack(lanes[: most + 1], dim=-1)
+    # Mostly one or two suffice: without this look a decision of idm_random takes 7 % longer with
+    # 64 rows and 20 % longer with 1024.
+    if reads_are_cheap(lanes.low):
+        most = int((lanes.high - lanes.low).amax())
+        if most < 2:
+            return torch.stack(lanes[: most + 1], dim=-1)
     return torch.stack((lanes.low, torch.minimum(lanes.low + 1, lanes.high), lanes.high), dim=-1)
 
 
@@ -213,9 +207,9 @@ def presence(vehicles: Vehicles, road: Road, body: LaneRange, attention: LaneRan
     by_body = vehicles.visibility == int(Visibility.BODY)
     low = torch.where(signalled, attention.low, torch.where(by_body, body.low, centre))
     high = torch.where(signalled, attention.high, torch.where(by_body, body.high, centre))
-    nowhere = torch.inf
     return LaneRange(
-        torch.where(vehicles.valid, low, nowhere), torch.where(vehicles.valid, high, -nowhere)
+        torch.where(vehicles.valid, low, torch.inf),
+        torch.where(vehicles.valid, high, -torch.inf),
     )
 
 

@@ -40,7 +40,7 @@ def batch_of(env, mobil=True, rows=ROWS, **parts):
 
 def assert_equal(state, batch, masked):
     for name, value in state["vehicles"].items():
-        np.testing.assert_array_equal(value.numpy(), batch.state[name], name)
+        np.testing.assert_array_equal(value.numpy(), batch.state["vehicles", name], name)
     low, high = batch.bounds
     seen = (
         state["observation"]
@@ -130,21 +130,22 @@ def test_a_batch_gives_the_torchrl_environments_numbers(
 
 
 def test_an_episode_is_the_same_bit_for_bit_in_every_variant_and_batch():
-    found = []
+    episodes = []
     runnable = list(VARIANTS)[list(VARIANTS).index(best_variant()) :]
     for rows, variant in [(1, None), (64, None), *((5, name) for name in runnable)]:
         batch = batch_of(EnvConfig(), rows=rows, variant=variant)
         batch.start(3, np.arange(rows))
         for decision in range(30):
             batch.step(np.full(rows, decision % 3 if decision % 5 == 0 else 0))
-        found.append(np.concatenate([batch.state["x"][0], batch.observation[0]]))
-    for other in found[1:]:
-        np.testing.assert_array_equal(other, found[0])
+        episodes.append(np.concatenate([batch.state["vehicles", "x"][0], batch.observation[0]]))
+    for other in episodes[1:]:
+        np.testing.assert_array_equal(other, episodes[0])
 
 
 def test_a_gymnasium_environment_with_rule_driven_traffic_needs_no_torch():
     code = (
-        "import sys, gymnasium, ganlane; env = gymnasium.make('ganlane/Highway-v0'); env.reset(seed=0); env.step(0); "
+        "import sys, gymnasium, ganlane; env = gymnasium.make('ganlane/Highway-v0'); "
+        "env.reset(seed=0); env.step(0); "
         "print('torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

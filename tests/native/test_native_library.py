@@ -28,7 +28,7 @@ def empty_cache(monkeypatch, tmp_path):
 
 
 def built() -> list[Path]:
-    return sorted(library.cache_folder().glob("*.so"))
+    return sorted(library.libraries_folder().glob("*.so"))
 
 
 @needs_compiler
@@ -64,11 +64,11 @@ def test_processes_that_build_at_once_do_not_disturb_each_other():
     ]
     assert [process.communicate()[0] for process in processes] == [b"loaded\n"] * 3
     assert len(built()) == 1
-    assert [path.name for path in library.cache_folder().iterdir()] == [built()[0].name]
+    assert [path.name for path in library.libraries_folder().iterdir()] == [built()[0].name]
 
 
 def test_without_a_compiler_one_sentence_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(library, "find_compiler", lambda: None)
+    monkeypatch.setattr(library, "compiler_command", lambda: None)
     with pytest.raises(
         UserError, match=r"needs a C\+\+ compiler.*g\+\+.*ganlane\[native\].*env\.kernel=torch"
     ):
@@ -96,7 +96,7 @@ def test_a_cache_folder_that_cannot_be_written_is_named(monkeypatch, tmp_path):
 def test_clang_of_the_package_ziglang_is_found_where_there_is_no_other(monkeypatch):
     monkeypatch.setattr(library.shutil, "which", lambda name: None)
     monkeypatch.setattr(library.importlib.util, "find_spec", lambda name: name)
-    assert library.find_compiler() == (sys.executable, "-m", "ziglang", "c++")
+    assert library.compiler_command() == (sys.executable, "-m", "ziglang", "c++")
 
 
 V3 = "avx2 bmi1 bmi2 f16c fma movbe"
@@ -127,12 +127,12 @@ def test_a_processor_gets_the_fastest_variant_that_it_runs(
 def test_the_library_of_a_wheel_is_taken_and_needs_no_compiler(monkeypatch, tmp_path):
     # the others take seconds
     monkeypatch.setattr(library, "VARIANTS", {"default": library.VARIANTS["default"]})
-    (made,) = library.build_all(tmp_path / "wheel")
-    monkeypatch.setattr(library, "PREBUILT", made.parent)
-    monkeypatch.setattr(library, "find_compiler", lambda: None)
+    (built_library,) = library.build_all(tmp_path / "wheel")
+    monkeypatch.setattr(library, "PREBUILT", built_library.parent)
+    monkeypatch.setattr(library, "compiler_command", lambda: None)
     monkeypatch.setattr(library, "best_variant", lambda: "default")
     assert library.why_not() is None
-    assert library.load()._name == str(made)
+    assert library.load()._name == str(built_library)
     assert not built()
 
 

@@ -1,4 +1,4 @@
-"""A file server on this machine that can break off, ignore Range, change its file or be in trouble."""
+"""A file server on this machine that can break off, ignore Range or change its file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs for tests of traffic: certain episodes with given commands, and every physics step of them."""
+"""Runs for tests of traffic: certain episodes, commands, and every physics step of them."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ def make_vec(rows, **options):
 
 def until_the_end(env):
     for _ in range(100):
-        found = env.step(KEEP)
-        if found[2] or found[3]:
-            return found
+        step = env.step(KEEP)
+        if step[2] or step[3]:
+            return step
     raise AssertionError("it never ended")

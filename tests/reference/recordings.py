@@ -59,7 +59,7 @@ def raw_text(rows: pl.DataFrame) -> str:
 
 
 def portal_csv(rows: pl.DataFrame, location: str = "us-101", thousands: bool = True) -> str:
-    """The portal's CSV: lower-case names, a location, quoted numbers with commas between thousands."""
+    """The portal's CSV: lower-case names, a location, numbers with commas between thousands."""
 
     def field(value) -> str:
         if thousands and not isinstance(value, str) and abs(value) >= 1000:
@@ -120,8 +120,8 @@ def made_by_hand(x, y=None, speed=0.0, lanes=3, name="scene", **changed) -> Reco
     x = np.asarray(x, dtype=np.float64)
     size = np.ones(x.shape[1])
     y, speed = (
-        np.broadcast_to(each, x.shape).astype(np.float64)
-        for each in (0.0 if y is None else y, speed)
+        np.broadcast_to(number, x.shape).astype(np.float64)
+        for number in (0.0 if y is None else y, speed)
     )
     fields = {
         "y": y,

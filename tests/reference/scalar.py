@@ -170,17 +170,17 @@ def incentive(view: View, i: int, lane: int) -> tuple[float, bool]:
     """``a~_c - a_c + p (a~_n - a_n) + q (a~_o - a_o)`` and whether nobody has to brake harder than
     4 m/s2.
     """
-    own = view.cars[i].target_lane
-    gain = view.acceleration(i, view.leader(i, lane)) - view.acceleration(i, view.leader(i, own))
+    here = view.cars[i].target_lane
+    gain = view.acceleration(i, view.leader(i, lane)) - view.acceleration(i, view.leader(i, here))
     safe = view.acceleration(i, view.leader(i, lane)) >= -4.0
     new = view.follower(i, lane)
     if new is not None:
         after, before = view.acceleration(new, i), view.acceleration(new, view.leader(i, lane))
         gain += 1.0 * (after - before)
         safe = safe and after >= -4.0
-    old = view.follower(i, own)
+    old = view.follower(i, here)
     if old is not None:
-        gain += 0.5 * (view.acceleration(old, view.leader(i, own)) - view.acceleration(old, i))
+        gain += 0.5 * (view.acceleration(old, view.leader(i, here)) - view.acceleration(old, i))
     return gain, safe
 
 

@@ -29,7 +29,7 @@ class Slopes(NamedTuple):
     """Partial derivatives of IDM's acceleration by gap, own speed and leader's speed."""
 
     gap: float
-    own: float
+    speed: float
     leader: float
 
 
@@ -42,14 +42,14 @@ def slopes(speed: float, desired: float) -> Slopes:
     """At the equilibrium: of ``a (1 - (v/v0)^4 - (s*/s)^2)``, ``s* = d0 + v T + v (v - l) / c``."""
     wanted, gap = MIN_GAP + speed * HEADWAY, equilibrium(speed, desired)
     pull = 2.0 * A * wanted / gap**2
-    own = -4.0 * A * speed**3 / desired**4 - pull * (HEADWAY + speed / C)
-    return Slopes(pull * wanted / gap, own, pull * speed / C)
+    by_speed = -4.0 * A * speed**3 / desired**4 - pull * (HEADWAY + speed / C)
+    return Slopes(pull * wanted / gap, by_speed, pull * speed / C)
 
 
 def instability(speed: float, desired: float) -> float:
     """Above 0 where long waves grow."""
     f = slopes(speed, desired)
-    return -f.gap / (f.own + f.leader) - 0.5 * (f.leader - f.own)
+    return -f.gap / (f.speed + f.leader) - 0.5 * (f.leader - f.speed)
 
 
 def zero_of(function: Callable[[float], float], low: float, high: float) -> float:
@@ -73,7 +73,7 @@ def wave(speed: float, desired: float, k: float, dt: float) -> tuple[complex, co
     ``2 (z - 1)^2 = dt^2 f_s (e - 1) (z + 1) + 2 dt (f_v + f_l e) (z - 1)``.
     """
     f, e = slopes(speed, desired), cmath.exp(-1j * k)
-    stiff, damp = f.gap * (e - 1.0) * dt * dt, (f.own + f.leader * e) * dt
+    stiff, damp = f.gap * (e - 1.0) * dt * dt, (f.speed + f.leader * e) * dt
     z = max((1.0 + root for root in np.roots([2.0, -2.0 * damp - stiff, -2.0 * stiff])), key=abs)
     return complex(z), complex(2.0 * (z - 1.0) / (dt * (z + 1.0)))
 
@@ -95,7 +95,7 @@ def step_matrix(speed: float, desired: float, cars: int, dt: float, ring: bool) 
     f, one = slopes(speed, desired), np.eye(cars)
     ahead = np.eye(cars, k=-1)
     ahead[0, -1] = float(ring)
-    by_x, by_v = f.gap * (ahead - one), f.own * one + f.leader * ahead
+    by_x, by_v = f.gap * (ahead - one), f.speed * one + f.leader * ahead
     return np.block(
         [[one + 0.5 * dt**2 * by_x, dt * one + 0.5 * dt**2 * by_v], [dt * by_x, one + dt * by_v]]
     )

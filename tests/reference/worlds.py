@@ -268,7 +268,7 @@ def tracks(
     td = env.reset()
     if episodes is not None:
         td = env.reset(td.select(keys.SEED, keys.EPISODE).set(keys.EPISODE, torch.tensor(episodes)))
-    found: dict[int, Track] = {}
+    episodes_of: dict[int, Track] = {}
     finished = set()
     for _ in range(decisions):
         stepped, td = env.step_and_maybe_reset(td.set("action", act(td)))
@@ -280,10 +280,10 @@ def tracks(
         ]
         states = torch.cat(numbers, dim=1)
         for row, episode in enumerate(after[keys.EPISODE].tolist()):
-            found.setdefault(episode, []).append(states[row])
+            episodes_of.setdefault(episode, []).append(states[row])
             if after["done"][row]:
                 finished.add(episode)
-    return {episode: found[episode] for episode in finished}
+    return {episode: episodes_of[episode] for episode in finished}
 
 
 def assert_same_tracks(some: dict[int, Track], others: dict[int, Track], at_least: int) -> None:

@@ -44,7 +44,7 @@ def test_boxes_overlap_where_a_sampler_finds_a_common_point():
     """
     pairs = random_pairs(600)
     dx, dy, heading, length, width, other_heading, other_length, other_width = pairs
-    found = torch.tensor(
+    sampled = torch.tensor(
         [a_point_in_both(*(value.item() for value in pair)) for pair in zip(*pairs)]
     )
     said = boxes_overlap(*pairs)
@@ -58,9 +58,9 @@ def test_boxes_overlap_where_a_sampler_finds_a_common_point():
         other_length - 0.3,
         other_width - 0.3,
     )
-    assert (found & ~said).sum() == 0
-    assert (shrunk & ~found).sum() == 0
-    assert 100 < found.sum() < 500
+    assert (sampled & ~said).sum() == 0
+    assert (shrunk & ~sampled).sum() == 0
+    assert 100 < sampled.sum() < 500
     assert (said != shrunk).sum() < 60  # few are too close to call
 
 

@@ -86,7 +86,7 @@ def test_in_the_middle_of_a_change_the_more_demanding_leader_counts():
 # Braking
 
 
-def test_a_stop_needs_speed_squared_over_twice_the_gap():
+def test_a_stop_needs_its_speedsquared_over_twice_the_gap():
     assert needed_deceleration(*doubles(20.0, 0.0, 10.0)).item() == pytest.approx(20.0)
     assert needed_deceleration(*doubles(10.0, 20.0, 0.5)).item() == 0.0
 
@@ -95,8 +95,8 @@ def test_a_stop_needs_speed_squared_over_twice_the_gap():
 def test_idm_stops_within_the_kinematic_distance_and_a_step(speed):
     """At a closer gap the hardest braking cannot help; IDM asks for it from the first step on."""
     kinematic = speed * speed / (-2.0 * TABLE_V.min_acceleration)
-    found = least_gap(speed, 0.0, 36.0)
-    assert kinematic <= found <= kinematic + 0.05 * speed + 0.2
+    gap = least_gap(speed, 0.0, 36.0)
+    assert kinematic <= gap <= kinematic + 0.05 * speed + 0.2
     assert not can_brake(0.95 * kinematic - 0.05, speed, 0.0, 36.0)
 
 
@@ -106,7 +106,7 @@ def test_a_leader_that_brakes_at_once_gives_away_its_own_braking_distance():
     )
 
 
-def test_highest_speed_and_least_gap_are_each_others_inverse():
+def test_highest_its_speedand_least_gap_are_each_others_inverse():
     for gap in (1.5, 7.5, 20.5):
         speed = highest_speed(gap, 0.0, 36.0)
         assert can_brake(gap, speed, 0.0, 36.0)
@@ -164,7 +164,7 @@ def settling_steps(speed: float) -> int:
 
 @pytest.fixture(scope="module")
 def settled() -> Vehicles:
-    """The platoons after the settling time of the slowest; before they are near, they get a minute."""
+    """The platoons after a minute, to come near, and the settling time of the slowest."""
     steps = 600 + max(settling_steps(speed) for speed in SPEEDS)
     return list(moves(IdmTraffic(Road(lanes=1)), platoons(), steps))[-1]
 
@@ -220,28 +220,30 @@ def disturbed_rings(displacement: np.ndarray, speed: np.ndarray) -> Vehicles:
 
 def deviations(cars: Vehicles, steps: int) -> list[np.ndarray]:
     """(displacement, speed) from the equilibrium after every one of the steps, [4, 2 CARS]."""
-    cruise, found = torch.tensor([[v] for _, v in CASES], dtype=DOUBLE), []
+    cruise, steps_away = torch.tensor([[v] for _, v in CASES], dtype=DOUBLE), []
     for step, after in enumerate(moves(RING, cars, steps), 1):
         there = -SPACING_M * torch.arange(CARS, dtype=DOUBLE) + cruise * (step * PHYSICS_STEP_S)
-        found.append(torch.cat((after.x - there, after.speed - cruise), dim=1).numpy())
-    return found
+        steps_away.append(torch.cat((after.x - there, after.speed - cruise), dim=1).numpy())
+    return steps_away
 
 
 @pytest.mark.parametrize(("desired", "speed"), CASES)
 def test_the_slopes_of_the_theory_are_those_of_the_package(desired, speed):
     values = (stability.equilibrium(speed, desired), speed, speed)
-    gap, own, leader = (torch.tensor(value, dtype=DOUBLE, requires_grad=True) for value in values)
-    idm_acceleration(own, desired, gap, leader).backward()
-    assert (gap.grad.item(), own.grad.item(), leader.grad.item()) == pytest.approx(
+    gap, its_speed, leader = (
+        torch.tensor(value, dtype=DOUBLE, requires_grad=True) for value in values
+    )
+    idm_acceleration(its_speed, desired, gap, leader).backward()
+    assert (gap.grad.item(), its_speed.grad.item(), leader.grad.item()) == pytest.approx(
         stability.slopes(speed, desired)
     )
 
 
 @pytest.mark.parametrize(("desired", "critical"), [(18.0, 12.1), (25.0, 17.3)])
-def test_the_critical_speed_of_linear_theory(desired, critical):
+def test_the_critical_its_speedof_linear_theory(desired, critical):
     """Neither the time step nor the size of the ring moves it by as much as is tested below."""
-    found = stability.critical_speed(desired)
-    assert found == pytest.approx(critical, abs=0.05)
+    threshold = stability.critical_speed(desired)
+    assert threshold == pytest.approx(critical, abs=0.05)
     # One change of sign: unstable all the way down.
     signs = [stability.instability(v, desired) > 0.0 for v in np.linspace(0.1, 0.99 * desired, 200)]
     assert sum(one != other for one, other in pairwise(signs)) == 1
@@ -252,8 +254,8 @@ def test_the_critical_speed_of_linear_theory(desired, critical):
         def growth(v: float, cars: int = cars) -> float:
             return stability.growth_rate(v, desired, cars, PHYSICS_STEP_S)[0]
 
-        assert stability.zero_of(growth, found - 1.5, found + 1.5) == pytest.approx(
-            found, abs=tolerance
+        assert stability.zero_of(growth, threshold - 1.5, threshold + 1.5) == pytest.approx(
+            threshold, abs=tolerance
         )
 
 
@@ -278,18 +280,18 @@ def test_every_ring_grows_or_decays_at_the_rate_of_the_linear_theory():
 
 
 @pytest.mark.slow
-def test_in_1500_s_a_small_disturbance_grows_below_the_critical_speed_and_dies_above_it():
+def test_in_1500_s_a_small_disturbance_grows_below_the_critical_its_speedand_dies_above_it():
     """Random displacements of all cars; the outcome is the linear theory's, car by car."""
     steps = 15_000
     displacement = 1e-4 * np.random.default_rng(0).standard_normal((4, CARS))
-    found = deviations(disturbed_rings(displacement, np.zeros_like(displacement)), steps)
+    away = deviations(disturbed_rings(displacement, np.zeros_like(displacement)), steps)
     for case, (desired, speed) in enumerate(CASES):
         matrix = stability.step_matrix(speed, desired, CARS, PHYSICS_STEP_S, ring=True)
         expected = np.linalg.matrix_power(matrix, steps) @ np.append(
             displacement[case], np.zeros(CARS)
         )
-        error = np.abs(found[-1][case] - expected).max()
+        error = np.abs(away[-1][case] - expected).max()
         assert error < 0.01 * np.abs(expected).max()
-    growth = found[-1][:, CARS:].std(axis=1) / found[2999][:, CARS:].std(axis=1)
+    growth = away[-1][:, CARS:].std(axis=1) / away[2999][:, CARS:].std(axis=1)
     assert (growth[[0, 2]] > 2.0).all()
     assert (growth[[1, 3]] < 0.5).all()

@@ -54,7 +54,7 @@ def change_to_the_left(scene) -> tuple[float, bool]:
     """Incentive for the first car to change from lane 0 to lane 1, and whether that is safe."""
     lanes = torch.tensor([0.0, 1.0]).expand(*scene.vehicles.x.shape, 2)
     both = lane_accelerations(scene, lanes, TABLE_V)
-    assert both.own[0, 0, 0].item() == pytest.approx(OWN, abs=1e-5)
+    assert both.observer[0, 0, 0].item() == pytest.approx(OWN, abs=1e-5)
     incentive, safe = mobil_criterion(both.of(slice(1, 2)), both.of(slice(0, 1)), TABLE_IV)
     return incentive[0, 0, 0].item(), safe[0, 0, 0].item()
 
@@ -200,7 +200,7 @@ def test_at_its_decision_mobil_asks_no_more_than_b_safe_of_the_new_follower(
         fields = [
             dict(zip(scene._fields, car)) for car in zip(*(value[row].tolist() for value in scene))
         ]
-        view = scalar.View([scalar.Car(**given) for given in fields], scalar.Rules(lanes=lanes))
+        view = scalar.View([scalar.Car(**numbers) for numbers in fields], scalar.Rules(lanes=lanes))
         lane = view.cars[car].target_lane + change[row, car].item()
         follower = view.follower(car, lane)
         assert follower is None or view.acceleration(follower, car) >= -B_SAFE - 1e-9

@@ -132,18 +132,18 @@ def test_both_ways_find_the_same_neighbours(cars, lanes, seed, grid_m, own_roads
         Road(torch.full((ROWS, 1), lanes), torch.full((ROWS, 1), 4.0)) if own_roads else Road(lanes)
     )
     asked = vehicles.target_lane[..., None] + torch.tensor([0.0, 1.0, -1.0])
-    found = {}
+    by_way = {}
     for way in (SORT, PAIRS):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(neighbours, "SORTS_FROM", way)
             scene = perceive(vehicles, road)
             assert (scene.queue is not None) == (way == SORT)
-            found[way] = leader(scene, asked), follower(scene, asked)
-    for ours, theirs in zip(*found.values()):
+            by_way[way] = leader(scene, asked), follower(scene, asked)
+    for ours, theirs in zip(*by_way.values()):
         exists = ours.gap < FREE_GAP_M
         assert torch.equal(ours.gap, theirs.gap)
         assert torch.equal(ours.speed[exists], theirs.speed[exists])
-    (_, behind), (_, others) = found.values()
+    (_, behind), (_, others) = by_way.values()
     assert torch.equal(behind.desired_speed[behind.exists], others.desired_speed[others.exists])
 
 
@@ -152,7 +152,7 @@ def test_the_leader_has_the_nearest_rear_and_is_the_slowest_of_those():
     vehicles = scenes(12, 3, seed=4, grid_m=2.5, dtype=DOUBLE)
     scene = perceive(vehicles, ROAD)
     number = vehicles.target_lane.double()
-    found, (low, high) = leader(scene, number), scene.presence
+    nearest, (low, high) = leader(scene, number), scene.presence
     for row in range(ROWS):
         for i in range(12):
             ahead = [
@@ -162,7 +162,7 @@ def test_the_leader_has_the_nearest_rear_and_is_the_slowest_of_those():
                 and low[row, j] <= number[row, i] <= high[row, j]
             ]
             expected = min(ahead, default=(FREE_GAP_M, vehicles.speed[row, i].item()))
-            assert (found.gap[row, i].item(), found.speed[row, i].item()) == expected
+            assert (nearest.gap[row, i].item(), nearest.speed[row, i].item()) == expected
 
 
 def test_on_a_ring_the_first_has_the_last_as_its_leader():
@@ -184,9 +184,9 @@ def test_among_the_few_who_wish_the_same_give_way_as_among_all(seed):
     wish = torch.randint(-1, 2, (ROWS, 20), generator=torch.Generator().manual_seed(seed)) * (
         vehicles.speed > 20
     )
-    kept = one_at_a_time(perceive(vehicles, ROAD), wish)
+    granted = one_at_a_time(perceive(vehicles, ROAD), wish)
     assert torch.equal(
-        kept, torch.where(_gives_way(vehicles, ROAD, wish, TABLE_V, TABLE_IV), 0, wish)
+        granted, torch.where(_gives_way(vehicles, ROAD, wish, TABLE_V, TABLE_IV), 0, wish)
     )
-    assert (kept != wish).any()
-    assert (kept != 0).any()
+    assert (granted != wish).any()
+    assert (granted != 0).any()

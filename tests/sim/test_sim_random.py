@@ -52,9 +52,9 @@ def test_fields_are_mixed_in_one_after_the_other():
             key = splitmix64(((key ^ value) + 0x9E3779B97F4A7C15) % 2**64)
         return key
 
-    made = draw_keys(episode_key(2, torch.tensor([5]), torch.tensor([2**40])), 17, 3, [4, 9])
+    drawn = draw_keys(episode_key(2, torch.tensor([5]), torch.tensor([2**40])), 17, 3, [4, 9])
     for vehicle, (column, purpose) in itertools.product(range(3), enumerate([4, 9])):
-        assert made[0, vehicle, column].item() % 2**64 == mixed(
+        assert drawn[0, vehicle, column].item() % 2**64 == mixed(
             2, 0, 5, 2**40, 17, vehicle, purpose
         )
 

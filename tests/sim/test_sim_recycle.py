@@ -213,7 +213,7 @@ def test_rows_that_ended_are_not_recycled(on):
 
 
 def driven(share: float, num_envs: int = 32, first_episode: int = 0) -> torch.Tensor:
-    """x [N, M] after 60 decisions at up to 35 m/s, where a ``share`` of the episodes is recycled."""
+    """x [N, M] after 60 decisions at up to 35 m/s; a ``share`` of the episodes is recycled."""
     spawn = SpawnParameters(ego_desired_speed_mps=35.0)
     env = environment(
         num_envs=num_envs,

@@ -298,12 +298,12 @@ def test_lorries_are_the_share_asked_for_and_want_80_to_90_km_an_hour():
     assert lorry.double().mean().item() == pytest.approx(0.3, abs=0.0145)
     assert (lorry | (others.length == 4.5)).all()
     assert torch.equal(others.width, torch.full_like(others.x, 2.5))
-    for found, low, high in (
+    for wishes, low, high in (
         (others.desired_speed[lorry], 22.0, 25.0),
         (others.desired_speed[~lorry], 18.0, 26.0),
     ):
-        assert low <= found.min() < low + 0.05
-        assert high - 0.05 < found.max() <= high
+        assert low <= wishes.min() < low + 0.05
+        assert high - 0.05 < wishes.max() <= high
 
 
 def test_the_ego_is_never_a_lorry():
@@ -344,7 +344,7 @@ def test_everybody_can_brake_whoever_is_a_lorry(share):
     assert (s.x.amax(1) - s.x.amin(1)).max() <= 200.0
 
 
-def test_a_lorry_as_wide_as_its_lane_and_lorries_in_a_scene_set_by_hand_are_refused_on_the_command_line():
+def test_too_wide_a_lorry_and_lorries_in_a_scene_set_by_hand_are_refused_on_the_command_line():
     with pytest.raises(UserError, match=r"more than truck_width_m=4"):
         EnvConfig(truck_share=0.1, truck_width_m=4.0)
     EnvConfig(truck_width_m=4.0)  # without lorries nobody is so wide

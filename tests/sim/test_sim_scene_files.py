@@ -8,7 +8,7 @@ import pytest
 
 from ganlane.errors import UserError
 from ganlane.settings.driving import Visibility
-from ganlane.sim.scenarios import read_scene
+from ganlane.sim.scene_files import read_scene
 from ganlane.sim.scenes import SceneVehicle
 from ganlane.sim.state import Road
 

@@ -1,0 +1,224 @@
+"""Scenes from files, CSV or JSON; m, m/s, and the ego comes first.
+
+CSV has a header, a line per vehicle and these columns, of which ``x_m`` and ``lane`` (or ``y_m``)
+are required; lines that start with ``#`` are skipped, and an empty cell means the default::
+
+    x_m, lane, y_m, speed_mps, desired_speed_mps, length_m, width_m, target_lane, visibility
+
+JSON is a list of objects with the same names, or
+``{"lanes": 3, "lane_width_m": 4.0, "vehicles": [...]}``. Every mistake is named by file, line (or
+entry) and column.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from ganlane.errors import UserError
+from ganlane.settings.driving import Visibility
+from ganlane.sim.scenes import FixedScene, SceneVehicle, check_count
+from ganlane.sim.state import Road
+
+#: Columns of a scene file.
+COLUMNS = tuple(field.name for field in fields(SceneVehicle) if field.name != "origin")
+ROAD = ("lanes", "lane_width_m")
+WHOLE_NUMBERS = ("lane", "target_lane", "lanes")
+LANE_WIDTH_M = 4.0
+#: Larger files hold no scene, bytes; and so many signs of a value are quoted in a message.
+_MOST_BYTES = 2**24
+_QUOTED = 60
+
+
+def read_scene(
+    path: str | Path, lanes: int | None = None, lane_width_m: float | None = None
+) -> FixedScene:
+    """The scene in a CSV or JSON file; ``replace`` sets its jitter and visibility.
+
+    Args:
+        path: the file; its ending gives the format.
+        lanes: number of lanes; None: as in the file, or just enough for its vehicles.
+        lane_width_m: m; None: as in the file, or 4.
+
+    Raises:
+        UserError: no such file, not CSV or JSON, a wrong column or value (named by file, line and
+            column), a road other than the file's, or an impossible scene.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; give a scene as .csv or .json.")
+    if path.suffix.lower() not in (".csv", ".json"):
+        raise UserError(f"{path}: expected a scene as .csv or .json; rename or convert the file.")
+    if path.stat().st_size > _MOST_BYTES:
+        raise UserError(
+            f"{path}: more than {_MOST_BYTES} bytes, which no scene has; give a smaller file."
+        )
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise UserError(
+            f"{path}: not a text file in UTF-8 ({error.reason}); save the scene as one."
+        ) from error
+    road: dict[str, Any] = {}
+    if path.suffix.lower() == ".csv":
+        rows = _read_csv(path, text)
+    else:
+        rows, road = _read_json(path, text)
+    width = _agreed(path, "lane_width_m", road, lane_width_m) or LANE_WIDTH_M
+    count = _agreed(path, "lanes", road, lanes) or _lanes_in(rows, width)
+    return FixedScene(tuple(rows), Road(int(count), float(width)), name=str(path))
+
+
+def with_ego_speed(scene: FixedScene, desired_speed_mps: float) -> FixedScene:
+    """The scene with another desired speed of the ego, m/s."""
+    ego, *others = scene.rows
+    return replace(scene, rows=(replace(ego, desired_speed_mps=desired_speed_mps), *others))
+
+
+def _agreed(path: Path, name: str, road: Mapping[str, Any], wanted: float | None) -> Any:
+    """The value of the file or of the caller; an error if they differ."""
+    in_file = road.get(name)
+    if in_file is not None and wanted is not None and in_file != wanted:
+        raise UserError(
+            f"{path}: {name} is {in_file:g} in the file and {wanted:g} was asked for; "
+            "leave one of them out."
+        )
+    return wanted if in_file is None else in_file
+
+
+def _lanes_in(rows: list[SceneVehicle], lane_width_m: float) -> int:
+    """Just enough lanes for all vehicles and their target lanes."""
+    highest = 0
+    for row in rows:
+        lane = row.lane
+        if lane is None:
+            lane = round((row.y_m or 0.0) / lane_width_m)
+        highest = max(highest, lane, row.target_lane or 0)
+    return 1 + highest
+
+
+def _read_csv(path: Path, text: str) -> list[SceneVehicle]:
+    lines = []
+    for number, line in enumerate(text.split("\n"), 1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            lines.append((f"{path}: line {number}", f"line {number}", line))
+    if not lines:
+        raise UserError(
+            f"{path}: empty; expected a header with {', '.join(COLUMNS)}, and a line per vehicle."
+        )
+    check_count(str(path), len(lines) - 1)
+    where, _, line = lines[0]
+    header = _cells(line, where)
+    _check_names(header, where)
+    if "x_m" not in header or not {"lane", "y_m"} & set(header):
+        raise UserError(
+            f"{where}: columns x_m and lane (or y_m) are needed; the header has "
+            f"{', '.join(header)}."
+        )
+    rows = []
+    for where, origin, line in lines[1:]:
+        cells = _cells(line, where)
+        if len(cells) != len(header):
+            raise UserError(
+                f"{where}: {len(cells)} cells, the header has {len(header)}; fix the line."
+            )
+        values = {name: cell for name, cell in zip(header, cells) if cell}
+        rows.append(_row(values, where, origin))
+    return rows
+
+
+def _cells(line: str, where: str) -> list[str]:
+    try:
+        return [cell.strip() for cell in next(csv.reader([line]))]
+    except csv.Error as error:
+        raise UserError(f"{where}: not a line of CSV ({error}); fix the line.") from error
+
+
+def _read_json(path: Path, text: str) -> tuple[list[SceneVehicle], dict[str, Any]]:
+    """The vehicles, and what the file says of the road."""
+    try:
+        content = json.loads(text)
+    # A ValueError without a place in the file: a whole number of thousands of digits.
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path}: not JSON ({error}); fix the file.") from error
+    if isinstance(content, list):
+        content = {"vehicles": content}
+    if not isinstance(content, dict) or not isinstance(content.get("vehicles"), list):
+        raise UserError(
+            f"{path}: expected a list of vehicles, or an object with 'vehicles'; "
+            "see docs/scenarios.md."
+        )
+    vehicles = content.pop("vehicles")
+    check_count(str(path), len(vehicles))
+    rows = []
+    for number, vehicle in enumerate(vehicles, 1):
+        where = f"{path}: vehicles entry {number}"
+        if not isinstance(vehicle, dict):
+            raise UserError(f"{where}: expected an object with {', '.join(COLUMNS)}.")
+        _check_names(list(vehicle), where)
+        values = {name: value for name, value in vehicle.items() if value is not None}
+        rows.append(_row(values, where, f"entry {number}"))
+    for name in sorted(content):
+        if name not in ROAD:
+            raise UserError(
+                f"{path}: unknown key {_quoted(name)}; expected lanes, lane_width_m and vehicles."
+            )
+    road = {}
+    for name in ROAD:
+        if content.get(name) is not None:
+            road[name] = value = _value(name, content[name], f"{path}: {name}")
+            if not 0 < value < float("inf"):
+                raise UserError(f"{path}: {name}={value}: expected a finite number above 0.")
+    return rows, road
+
+
+def _check_names(names: Sequence[str], where: str) -> None:
+    """Check that column names are known and unique."""
+    for name in names:
+        if name not in COLUMNS:
+            unknown = _quoted(name) if name else "(empty)"
+            raise UserError(
+                f"{where}: unknown column {unknown}; expected some of {', '.join(COLUMNS)}."
+            )
+        if names.count(name) > 1:
+            raise UserError(f"{where}: column {name} is given twice; remove one.")
+
+
+def _row(values: Mapping[str, Any], where: str, origin: str) -> SceneVehicle:
+    """A vehicle from its values in a file."""
+    if "x_m" not in values:
+        raise UserError(f"{where}: column x_m: no value; give the position along the road in m.")
+    numbers = {}
+    for name, value in values.items():
+        numbers[name] = _value(name, value, f"{where}: column {name}")
+    return SceneVehicle(**numbers, origin=origin)
+
+
+def _value(name: str, value: Any, where: str) -> Any:
+    """A number, or a :class:`Visibility`, from what stands in a file."""
+    if name == "visibility":
+        kinds = {kind.name.lower(): kind for kind in Visibility}
+        if not isinstance(value, str) or value not in kinds:
+            raise UserError(f"{where}: {_quoted(value)}: expected one of {', '.join(kinds)}.")
+        return kinds[value]
+    whole = name in WHOLE_NUMBERS
+    try:
+        if isinstance(value, bool):  # JSON's true, which Python takes for a 1
+            raise ValueError
+        number = float(value)
+        if whole and number != int(number):
+            raise ValueError
+    except (TypeError, ValueError, OverflowError):
+        kind = "a whole number" if whole else "a number"
+        raise UserError(f"{where}: {_quoted(value)}: expected {kind}.") from None
+    return int(number) if whole else number
+
+
+def _quoted(value: Any) -> str:
+    """The value in a message, cut where it is long."""
+    text = repr(value)
+    return text if len(text) <= _QUOTED else f"{text[:_QUOTED]}..."

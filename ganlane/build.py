@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import Compose
 
 from ganlane import keys
 from ganlane.agents import load_agent
@@ -22,7 +22,7 @@ from ganlane.agents.drivers import DRIVERS, MaskedPolicy
 from ganlane.arguments import call_with, import_target, is_import_path
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import TrafficConfig
-from ganlane.env import HighwayEnv
+from ganlane.env import HighwayEnv, TransformedHighway
 from ganlane.errors import ParameterError, UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.parameters.observation import (
@@ -95,7 +95,7 @@ def make_env(
     device: str = "cpu",
     first_episode: int = 0,
     mask: MaskParameters | None = None,
-) -> TransformedEnv:
+) -> TransformedHighway:
     """A batched environment with observation, reward and optionally action mask; its stream is that
     of the traffic.
 
@@ -143,7 +143,7 @@ def make_env(
         )
     except ParameterError as error:
         raise error.below("observation.sensors") from error
-    return TransformedEnv(
+    return TransformedHighway(
         base, Compose(*errors, *transforms, RewardTransform(env.decision_period_s, reward))
     )
 

@@ -16,7 +16,6 @@ from ganlane import keys
 from ganlane.build import make_traffic
 from ganlane.config.env import EnvConfig
 from ganlane.env import HighwayEnv
-from ganlane.env.state import ActionCheck
 from ganlane.errors import UserError
 from ganlane.native.library import why_not
 from ganlane.options import option
@@ -95,14 +94,6 @@ def test_actions_of_a_shorter_integer_type_are_taken(kernel):
         for t in (torch.int64, torch.int8)
     )
     assert torch.equal(long["next", keys.VEHICLES, "x"], short["next", keys.VEHICLES, "x"])
-
-
-def test_what_is_found_on_another_device_is_told_in_a_later_step():
-    check = ActionCheck(1, torch.device("cpu"))
-    check._arrived = torch.zeros((), dtype=torch.bool)  # as on a GPU, without one
-    check._look_later(torch.tensor([3]))
-    with pytest.raises(UserError, match="in an earlier step"):
-        check._look_later(torch.tensor([1]))
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from ganlane.config.commands import BenchConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
-from ganlane.env.highway import native_decision, threads_for
+from ganlane.env.highway import native_decision
 from ganlane.env.physics import run_decision
 from ganlane.parameters.observation import ObservationConfig, RewardParameters
 from ganlane.sim.random import episode_key
@@ -148,12 +148,11 @@ class EnvironmentRunner:
     def __call__(self, decisions: int) -> int:
         """Drive; the physics steps."""
         simulated = torch.zeros((), dtype=torch.int64, device=self.env.device)
-        with threads_for(self.env):
-            for _ in range(decisions):
-                self.decisions += 1
-                self.state.set(keys.ACTION, self.actions[self.decisions % len(self.actions)])
-                before, self.state = self.env.step_and_maybe_reset(self.state)
-                simulated += (before["next", keys.STEP] - before[keys.STEP]).sum()
+        for _ in range(decisions):
+            self.decisions += 1
+            self.state.set(keys.ACTION, self.actions[self.decisions % len(self.actions)])
+            before, self.state = self.env.step_and_maybe_reset(self.state)
+            simulated += (before["next", keys.STEP] - before[keys.STEP]).sum()
         return int(simulated)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -14,14 +15,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 
 from ganlane import keys
 from ganlane.arguments import checked_arguments, seed_number, whole_number
 from ganlane.env.physics import Physics, Recorder, Rules, known_false, outcome, run_decision
 from ganlane.env.state import (
-    ActionCheck,
     check_counter,
+    checked_action,
     done_spec,
     first_state,
     outcome_state,
@@ -41,7 +42,6 @@ from ganlane.sim.scenes import Scenes
 from ganlane.sim.spawn import RandomScenes, out_of_range
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.traffic.base import TrafficModule
-from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
 
 #: An automatic reset draws the scenes of the ended rows alone where they are at most one in so
 #: many.
@@ -71,7 +71,7 @@ class HighwayEnv(EnvBase):
             numbers: a mixture of roads that empty and roads that do not.
         kernel: what drives a decision: ``torch``, the tensor code; ``native``, the kernel
             (:mod:`ganlane.native`), which does the same up to rounding, for rule-driven traffic on
-            a CPU; ``auto``, the kernel where it can, and the tensor code while a recorder is set.
+            a CPU; ``auto``, the kernel where it can.
 
     An episode is (stream, seed, episode) and does not depend on the batch. ``reset(td)`` with
     ``seed`` and ``episode`` [N] in ``td`` and no ``_reset`` mask runs exactly those episodes. With
@@ -108,34 +108,23 @@ class HighwayEnv(EnvBase):
         recycle_share: float = 1.0,
         kernel: str = "torch",
     ) -> None:
-        # The configuration's bounds lie within.
+        # The bounds of the settings lie within.
         whole_number("num_envs", num_envs, 1, 2**20)
         whole_number("first_episode", first_episode, 0, 2**62)
         if vehicles is not None:
             whole_number("vehicles", vehicles, 1, 1000)
-        super().__init__(
-            device=usable_device(device, dtype), batch_size=torch.Size([int(num_envs)])
-        )
+        device = usable_device(device, dtype)
+        super().__init__(device=device, batch_size=torch.Size([int(num_envs)]))
         self.traffic = traffic.to(self.device)
         self.road: Road = traffic.road
         self.spawn_parameters = spawn_parameters or SpawnParameters()
         self.ego = ego or EgoParameters()
         self.episode = episode or EpisodeParameters()
         self.stream, self.dtype = traffic.stream, dtype
-        if scenes is None:
-            # The traffic's own scenes if it has any, else random ones.
-            count, spawn, seen = (
-                9 if vehicles is None else vehicles,
-                self.spawn_parameters,
-                self.ego.visibility,
-            )
-            own = traffic.scenes(count, Visibility.named(seen), spawn.ego_desired_speed_mps)
-            scenes = own or RandomScenes(
-                self.road, count, spawn, Visibility.named(seen), traffic.visibility
-            )
-        self.scenes = scenes
+        self.scenes = scenes or self._default_scenes(vehicles or 9)
         self.vehicles = self.scenes.vehicles
-        self.first_episode, self.recycle, self.recycle_share = first_episode, recycle, recycle_share
+        self.first_episode = first_episode
+        self.recycle, self.recycle_share = recycle, recycle_share
         self.recorder: Recorder | None = None
         self.rules = Rules(self.road, self.ego, self.episode, idm, steering)
         self.physics = Physics()
@@ -144,44 +133,54 @@ class HighwayEnv(EnvBase):
         self.last_episodes: tuple[Tensor, Tensor] | None = None
         self._check_parts(vehicles, stream)
         #: The native kernel; None: the tensor code drives.
-        self.kernel = make_kernel(kernel, traffic, self.rules, self.vehicles, self.device, dtype)
-        self._kernel_must = kernel == "native"
+        self.kernel = self._make_kernel(kernel)
+        self._must_be_native = kernel == "native"
         self._native_scenes: NativeScenes | None = None
         if self.kernel is not None and type(self.scenes) is RandomScenes:
             self._native_scenes = NativeScenes(self.scenes, self.stream)
-        self._check_action = ActionCheck(self.batch_size[0], self.device)
         self._make_specs()
+
+    def _default_scenes(self, vehicles: int) -> Scenes:
+        """The traffic's own scenes if it has any, else random ones."""
+        spawn, visibility = self.spawn_parameters, Visibility.named(self.ego.visibility)
+        scenes = self.traffic.scenes(vehicles, visibility, spawn.ego_desired_speed_mps)
+        if scenes is None:
+            others = self.traffic.visibility
+            scenes = RandomScenes(self.road, vehicles, spawn, visibility, others)
+        return scenes
 
     def _check_parts(self, vehicles: int | None, stream: int | None) -> None:
         """Raise :class:`UserError` for parts that do not fit.
 
-        ``vehicles`` and ``stream`` as the user gave them.
+        ``vehicles`` and ``stream`` are as the user gave them.
         """
         if stream is not None and stream != self.stream:
             raise UserError(
-                f"stream={stream}: the traffic was built for stream {self.stream}; give both the same one, "
-                "or an episode would depend on two of them."
+                f"stream={stream}: the traffic was built for stream {self.stream}; give both the "
+                "same one, or an episode would depend on two of them."
             )
         if self.recycle and self.traffic.own_roads:
             raise UserError(
-                "env.recycle=true with replayed traffic: recorded vehicles go where they went; leave it off."
+                "env.recycle=true with replayed traffic: recorded vehicles go where they went; "
+                "leave it off."
             )
         if not 0.0 <= self.recycle_share <= 1.0:
             raise UserError(
-                f"env.recycle_share={self.recycle_share:g}: expected a number from 0 to 1; give such a share."
+                f"env.recycle_share={self.recycle_share:g}: expected a number from 0 to 1; "
+                "give such a share."
             )
         if vehicles is not None and vehicles != self.vehicles:
             raise UserError(
-                f"vehicles={vehicles}: the scene has {self.vehicles}, the ego included; leave this number out."
+                f"vehicles={vehicles}: the scene has {self.vehicles}, the ego included; "
+                "leave this number out."
             )
         self.scenes.check(self.road, self.rules.idm)
 
     def _make_specs(self) -> None:
         n, device = self.batch_size[0], self.device
         memory = self.traffic.memory_spec(n, self.vehicles, self.dtype)
-        self.observation_spec = state_spec(
-            n, self.vehicles, self.dtype, memory, self.traffic.own_roads
-        ).to(device)
+        spec = state_spec(n, self.vehicles, self.dtype, memory, self.traffic.own_roads)
+        self.observation_spec = spec.to(device)
         # A TransformedEnv passes to a reset only the keys of the state spec; without the counters a
         # reset to certain episodes would run the first ones.
         counters = {name: self.observation_spec[name].clone() for name in (keys.SEED, keys.EPISODE)}
@@ -201,8 +200,9 @@ class HighwayEnv(EnvBase):
             UserError: there is no C++ compiler, or an argument of TorchRL's version is given.
         """
         if kwargs:
+            names = ", ".join(kwargs)
             raise UserError(
-                f"HighwayEnv.compile() takes no arguments, not {', '.join(kwargs)}; call it without."
+                f"HighwayEnv.compile() takes no arguments, not {names}; call it without."
             )
         self.physics.compile()
         self.traffic.compile_graphs()
@@ -221,10 +221,8 @@ class HighwayEnv(EnvBase):
         n = self.batch_size[0]
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if tensordict is not None and keys.EPISODE in tensordict:
-            seed, last = (
-                check_counter(name, tensordict.get(name, None), n)
-                for name in (keys.SEED, keys.EPISODE)
-            )
+            seed = check_counter(keys.SEED, tensordict.get(keys.SEED, None), n)
+            last = check_counter(keys.EPISODE, tensordict.get(keys.EPISODE), n)
         elif mask is not None and self.last_episodes is not None:
             # In an automatic reset TorchRL passes the mask without the counters.
             seed, last = self.last_episodes
@@ -233,9 +231,9 @@ class HighwayEnv(EnvBase):
             return seed, self.first_episode + torch.arange(n, device=self.device)
         if mask is None:
             return seed, last
-        following = (
-            last + n if next_episode is None else check_counter("next_episode", next_episode, n)
-        )
+        following = last + n
+        if next_episode is not None:
+            following = check_counter("next_episode", next_episode, n)
         return seed, torch.where(mask.reshape(n), following, last)
 
     def _reset(
@@ -244,7 +242,7 @@ class HighwayEnv(EnvBase):
         next_episode: Tensor | None = None,
         **kwargs: object,
     ) -> TensorDictBase:
-        """All rows at the start of their episodes; EnvBase keeps the rows that are not to be reset."""
+        """All rows at the start of their episodes; EnvBase keeps the rows that go on."""
         seed, episode = self.last_episodes = self._episodes(tensordict, next_episode)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = None if mask is None else mask.reshape(-1)
@@ -265,16 +263,13 @@ class HighwayEnv(EnvBase):
     def _start(self, seed: Tensor, episode: Tensor) -> TensorDictBase:
         """The first states of episodes [K]."""
         key = episode_key(self.stream, seed, episode)
-        vehicles, memory = self.traffic.enter(
-            self.scenes(key, self.dtype).with_finite_padding(), key, episode
-        )
+        vehicles = self.scenes(key, self.dtype).with_finite_padding()
+        vehicles, memory = self.traffic.enter(vehicles, key, episode)
         state = first_state(seed, episode, vehicles, memory)
         if self.traffic.own_roads:
             road = self.traffic.road_of(key, self.dtype)
-            state.set(
-                keys.ROAD,
-                TensorDict({"lanes": road.lanes, "lane_width_m": road.lane_width_m}, seed.shape),
-            )
+            fields = {"lanes": road.lanes, "lane_width_m": road.lane_width_m}
+            state.set(keys.ROAD, TensorDict(fields, seed.shape))
         return state
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -282,92 +277,153 @@ class HighwayEnv(EnvBase):
         seed, episode = tensordict.get(keys.SEED, None), tensordict.get(keys.EPISODE, None)
         if seed is None or episode is None:
             raise UserError(
-                "step(): the state of no episode was given; call reset() first and step what it returns."
+                "step(): the state of no episode was given; call reset() first and step what it "
+                "returns."
             )
         self.last_episodes = (seed, episode)
-        action = self._check_action.form(tensordict.get(keys.ACTION, None))
-        if self.kernel is not None and (self.recorder is None or self._kernel_must):
-            return self._native_step(tensordict, action)
-        self._check_action.values(action)
-        key = episode_key(self.stream, seed, episode)
+        step = self._tensor_step if self.kernel is None else self._native_step
+        after = step(tensordict)
+        # A transform writes the reward.
+        reward = torch.zeros_like(after.get(keys.EGO).get("distance"))[:, None]
+        return after.set(keys.REWARD, reward)
+
+    def _tensor_step(self, state: TensorDictBase) -> TensorDictBase:
+        """One decision by the tensor code."""
+        action = checked_action(state.get(keys.ACTION, None), self.batch_size[0])
+        key = episode_key(self.stream, state.get(keys.SEED), state.get(keys.EPISODE))
         rules = self.rules
         if self.traffic.own_roads:  # replayed scenes have their own roads and ends
-            rules = rules._replace(
-                road=road_in(tensordict, self.road), scene_steps=self.traffic.steps_of(key)
-            )
-        vehicles, ego = (
-            Vehicles.of(tensordict.get(keys.VEHICLES)),
-            dict(tensordict.get(keys.EGO).items()),
-        )
-        step = tensordict.get(keys.STEP)
-        start, command = self.physics.begin(rules, action, vehicles, ego, step)
+            road, steps = road_in(state, self.road), self.traffic.steps_of(key)
+            rules = rules._replace(road=road, scene_steps=steps)
+        vehicles = Vehicles.of(state.get(keys.VEHICLES))
+        ego = dict(state.get(keys.EGO).items())
+        start, command = self.physics.begin(rules, action, vehicles, ego, state.get(keys.STEP))
         end, memory = run_decision(
-            self.traffic, self.physics, rules, tensordict, start, key, self.recorder
+            self.traffic, self.physics, rules, state, start, key, self.recorder
         )
         ego = self.physics.remember(rules, ego, start, end, command)
-        events, flags = outcome(rules, end, command)
-        reward = torch.zeros_like(ego["distance"])[:, None]  # which a transform writes
-        rest = {
-            keys.SEED: seed,
-            keys.EPISODE: episode,
-            keys.STEP: end.step,
-            keys.REWARD: reward,
-            **flags,
-        }
+        events, rest = outcome(rules, end, command)
+        rest |= {name: state.get(name) for name in (keys.SEED, keys.EPISODE)}
+        rest[keys.STEP] = end.step
         if self.traffic.own_roads:
-            rest[keys.ROAD] = tensordict.get(keys.ROAD)
+            rest[keys.ROAD] = state.get(keys.ROAD)
         vehicles = end.vehicles
         if self.recycle and not known_false(out_of_range(vehicles, rules.road).any()):
             # In running rows with recycling those left behind are moved.
-            recycled = end.running & self._recycling_rows(key)
-            vehicles = self.physics.recycle(vehicles, rules.road, rules.idm).where(
-                recycled, vehicles
-            )
+            recycled = self.physics.recycle(vehicles, rules.road, rules.idm)
+            vehicles = recycled.where(end.running & self._recycling_rows(key), vehicles)
         return pack(vehicles, ego, memory, events, rest)
 
-    def _native_step(self, tensordict: TensorDictBase, action: Tensor) -> TensorDictBase:
+    def _native_step(self, state: TensorDictBase) -> TensorDictBase:
         """One decision by the kernel."""
         assert self.kernel is not None
-        if self.recorder is not None:
-            raise UserError(
-                "env.kernel=native shows no physics steps to a recorder; set env.kernel=torch."
-            )
-        if not self._kernel_must:
+        rows = self.batch_size[0]
+        action = checked_action(state.get(keys.ACTION, None), rows, values=False)
+        if not self._must_be_native:
             say_once("env.kernel=auto: the native kernel")
         recycles = None
         if self.recycle:
-            seed, episode = tensordict.get(keys.SEED), tensordict.get(keys.EPISODE)
-            recycles = self._recycling_rows(episode_key(self.stream, seed, episode))
+            key = episode_key(self.stream, state.get(keys.SEED), state.get(keys.EPISODE))
+            recycles = self._recycling_rows(key)
         try:
-            after = native_decision(self.kernel, tensordict, action, recycles)
+            after = native_decision(self.kernel, state, action, recycles)
         except ValueError:
-            self._check_action.values(action)  # says which
+            checked_action(action, rows)  # says which
             raise
-        return after.set(
-            keys.REWARD, torch.zeros_like(after.get(keys.EGO).get("distance"))[:, None]
-        )
+        if self.recorder is not None:
+            self._show_steps(self.recorder, state, action)
+        return after
+
+    def _show_steps(self, recorder: Recorder, state: TensorDictBase, action: Tensor) -> None:
+        """Show ``recorder`` the physics steps of the decision ``action`` [N] in ``state``.
+
+        The kernel drives it once more, in decisions of one physics step, which gives the same bits.
+        """
+        drivers = self.traffic.native_parameters()
+        assert drivers is not None
+        episode = replace(self.episode, decision_period_s=keys.PHYSICS_STEP_S)
+        kernel = Kernel(self.road, self.vehicles, episode, self.ego, *drivers)
+        vehicles = Vehicles.of(state.get(keys.VEHICLES))
+        running = torch.ones_like(action, dtype=torch.bool)
+        for _ in range(self.episode.substeps()):
+            state = native_decision(kernel, state, action, None)
+            # A command off the road ends an episode before anything moves.
+            running = running & ~state.get(keys.EVENTS).get("out_of_road")[:, 0]
+            if not running.any():
+                break
+            vehicles = Vehicles.of(state.get(keys.VEHICLES)).where(running, vehicles)
+            recorder(vehicles, running)
+            running = running & ~state.get("done")[:, 0]
+            action = torch.full_like(action, keys.KEEP)
+
+    def _make_kernel(self, wanted: str) -> Kernel | None:
+        """The kernel for ``wanted`` (``torch``, ``native`` or ``auto``); None: the tensor code.
+
+        Raises:
+            UserError: an unknown name, or ``native`` where the kernel cannot do what is asked or
+                cannot be built.
+        """
+        if wanted not in KERNELS:
+            raise UserError(
+                f"env.kernel={wanted}: expected one of {', '.join(KERNELS)}; choose one of them."
+            )
+        if wanted == "torch":
+            return None
+        drivers, reason = self.traffic.native_parameters(), None
+        if drivers is None:
+            name = type(self.traffic).__name__
+            reason = f"drives the traffics idm and idm_mobil alone, not {name}"
+        elif self.device.type != "cpu" or self.dtype != torch.float32:
+            reason = f"runs on a CPU in float32, not on {self.device} in {self.dtype}"
+        elif self.road.ring_m is not None:
+            reason = "has no ring"
+        elif (drivers.idm, drivers.steering) != (self.rules.idm, self.rules.steering):
+            reason = (
+                "has one set of parameters of car following and steering for the ego and the others"
+            )
+        missing = why_not()
+        if drivers is not None and reason is None and missing is None:
+            return Kernel(self.road, self.vehicles, self.episode, self.ego, *drivers)
+        if wanted == "native":
+            raise UserError(f"env.kernel=native {reason or missing}; set env.kernel=torch.")
+        if reason is None:
+            say_once(f"env.kernel=auto: the tensor code, since the native kernel {missing}")
+        return None
 
     def _recycling_rows(self, key: Tensor) -> Tensor:
         """The rows [N] bool whose episodes, with ``key`` [N], recycle."""
         if self.recycle_share >= 1.0:
             return torch.ones_like(key, dtype=torch.bool)
-        chosen = uniform(key, -1, 1, [Purpose.RECYCLED_EPISODE], torch.float64)[..., 0].reshape(
-            key.shape
-        )
-        return chosen < self.recycle_share
+        drawn = uniform(key, -1, 1, [Purpose.RECYCLED_EPISODE], torch.float64)
+        return drawn[..., 0].reshape(key.shape) < self.recycle_share
 
 
-# The native kernel
+class TransformedHighway(TransformedEnv):
+    """A :class:`HighwayEnv` behind transforms.
 
-
-def threads_for(env: EnvBase) -> AbstractContextManager[None]:
-    """:func:`~ganlane.native.library.torch_on_one_thread` for steps of an ``env`` that the kernel
-    drives.
+    Where the kernel drives, torch computes on one thread during a call, and the kernel on as many
+    as torch had (:func:`~ganlane.native.library.torch_on_one_thread`).
     """
-    base: Any = env
-    while hasattr(base, "base_env"):
-        base = base.base_env
-    return nullcontext() if getattr(base, "kernel", None) is None else torch_on_one_thread()
+
+    def _threads(self) -> AbstractContextManager[None]:
+        return nullcontext() if self.base_env.kernel is None else torch_on_one_thread()
+
+    def reset(self, *arguments: Any, **options: Any) -> TensorDictBase:
+        """As of every environment."""
+        with self._threads():
+            return super().reset(*arguments, **options)
+
+    def step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """As of every environment."""
+        with self._threads():
+            return super().step(tensordict)
+
+    def step_and_maybe_reset(
+        self, tensordict: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        """As of every environment."""
+        with self._threads():
+            return super().step_and_maybe_reset(tensordict)
 
 
 @lru_cache(maxsize=8)
@@ -376,65 +432,20 @@ def say_once(line: str) -> None:
     print(line, file=sys.stderr)
 
 
-def make_kernel(
-    wanted: str,
-    traffic: TrafficModule,
-    rules: Rules,
-    vehicles: int,
-    device: torch.device,
-    dtype: torch.dtype,
-) -> Kernel | None:
-    """The kernel for ``wanted`` (``torch``, ``native`` or ``auto``); None: the tensor code drives.
-
-    Raises:
-        UserError: an unknown name, or ``native`` where the kernel cannot do what is asked or cannot
-            be built.
-    """
-    if wanted not in KERNELS:
-        raise UserError(
-            f"env.kernel={wanted}: expected one of {', '.join(KERNELS)}; choose one of them."
-        )
-    if wanted == "torch":
-        return None
-    reason, missing = _why_not(traffic, rules, device, dtype), why_not()
-    if wanted == "native" and (reason or missing):
-        raise UserError(f"env.kernel=native {reason or missing}; set env.kernel=torch.")
-    if reason:
-        return None
-    if missing:
-        say_once(f"env.kernel=auto: the tensor code, since the native kernel {missing}")
-        return None
-    assert isinstance(traffic, IdmTraffic)
-    mobil = traffic.mobil if isinstance(traffic, IdmMobilTraffic) else None
-    return Kernel(rules.road, vehicles, rules.episode, rules.ego, rules.idm, rules.steering, mobil)
-
-
-def _why_not(
-    traffic: TrafficModule, rules: Rules, device: torch.device, dtype: torch.dtype
-) -> str | None:
-    """What the kernel cannot do of this, as the end of a sentence; None: it can do all."""
-    if type(traffic) not in (IdmTraffic, IdmMobilTraffic):
-        return f"drives the traffics idm and idm_mobil alone, not {type(traffic).__name__}"
-    assert isinstance(traffic, IdmTraffic)
-    if device.type != "cpu" or dtype != torch.float32:
-        return f"runs on a CPU in float32, not on {device} in {dtype}"
-    if rules.road.ring_m is not None:
-        return "has no ring"
-    if (traffic.idm, traffic.steering) != (rules.idm, rules.steering):
-        return "has one set of parameters of car following and steering for the ego and the others"
-    return None
-
-
 def native_decision(
     kernel: Kernel, state: TensorDictBase, action: Tensor, recycles: Tensor | None
 ) -> TensorDictBase:
     """The state after the decision ``action`` [N] in ``state``, without a reward.
 
-    ``recycles`` [N] bool or None.
+    ``recycles`` [N] bool are the rows that recycle vehicles; None: no row does.
     """
     vehicles, memory = Vehicles.of(state.get(keys.VEHICLES)), state.get(keys.TRAFFIC)
-    ego = dict(state.get(keys.EGO).items())
     out = kernel.decide(
-        action, vehicles, memory.get("steering"), ego, state.get(keys.STEP), recycles
+        action,
+        vehicles,
+        memory.get("steering"),
+        dict(state.get(keys.EGO).items()),
+        state.get(keys.STEP),
+        recycles,
     )
     return outcome_state(state.get(keys.SEED), state.get(keys.EPISODE), out, moved(vehicles, out))

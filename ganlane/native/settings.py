@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.driving import (
@@ -82,6 +82,14 @@ NATIVE_FORMS: Final = {
     "lane_view_drift": (True, False),
     "lane_view_overlap": (True, True),
 }
+
+
+class RuleDrivers(NamedTuple):
+    """Drivers that the kernel knows; ``mobil=None``: they keep their lanes."""
+
+    idm: IdmParameters
+    steering: SteeringParameters
+    mobil: MobilParameters | None
 
 
 class Settings(ctypes.Structure):

@@ -27,9 +27,8 @@ from torchrl.envs import EnvBase
 
 from ganlane import keys
 from ganlane.agents import Rainbow
-from ganlane.env.highway import threads_for
 from ganlane.errors import UserError
-from ganlane.transforms.observation import PERCEIVED, SENSORS
+from ganlane.transforms.sensors import PERCEIVED, SENSORS
 
 #: Makes the environments of a worker from their number and first episode. It is pickled: a
 #: module-level function or a ``functools.partial`` of one.
@@ -120,14 +119,12 @@ class SingleCollector(Collector):
 
     def __init__(self, env: EnvBase) -> None:
         self.env, self.environments = env, env.batch_size.numel()
-        with threads_for(env):
-            self.env_state: TensorDictBase = env.reset()
+        self.env_state: TensorDictBase = env.reset()
 
     def step(self, agent: Rainbow) -> TensorDictBase:
         """One decision; ended environments are reset in ``env_state``, not in the returned step."""
         decided = agent.policy(self.env_state)
-        with threads_for(self.env):
-            step, self.env_state = self.env.step_and_maybe_reset(decided)
+        step, self.env_state = self.env.step_and_maybe_reset(decided)
         return step
 
     def state_dict(self, exact: bool) -> dict[str, Any]:
@@ -335,8 +332,7 @@ def drive(source: SingleCollector, action: npt.NDArray[np.int64]) -> TensorDict:
     ``after``, before any reset.
     """
     given = source.env_state.set(keys.ACTION, torch.from_numpy(action))
-    with threads_for(source.env):
-        step, source.env_state = source.env.step_and_maybe_reset(given)
+    step, source.env_state = source.env.step_and_maybe_reset(given)
     after = step.get("next").exclude(*INNER)
     return TensorDict({"seen": visible(source.env_state), "after": after}, step.batch_size)
 

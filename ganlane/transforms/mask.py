@@ -31,7 +31,7 @@ from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import lane_accelerations
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.torch_settings import compiled
-from ganlane.transforms.observation import PerceptionTransform
+from ganlane.transforms.sensors import PerceptionTransform
 
 
 def on_road_actions(target_lane: Tensor, lanes: int | Tensor) -> Tensor:
@@ -43,23 +43,23 @@ def on_road_actions(target_lane: Tensor, lanes: int | Tensor) -> Tensor:
 
 
 def obeyed_actions(change_direction: Tensor, abort: bool) -> Tensor:
-    """Actions with an effect, bool [N, 3], during a lane change in ``change_direction`` (-1, 0, 1;
-    [N]).
+    """Actions with an effect, bool [N, 3].
 
-    During a lane change commands are ignored; with ``abort`` the opposite command turns back.
+    During a lane change in ``change_direction`` (-1 or 1, [N]; 0: none) commands are ignored; with
+    ``abort`` the opposite command turns back.
     """
-    left, right = (
-        (change_direction <= 0, change_direction >= 0) if abort else (change_direction == 0,) * 2
-    )
+    left = right = change_direction == 0
+    if abort:
+        left, right = change_direction <= 0, change_direction >= 0
     return torch.stack((torch.ones_like(left), left, right), dim=1)
 
 
 def braking_demand(vehicles: Vehicles, road: Road, idm: IdmParameters = TABLE_V) -> Tensor:
-    """Hardest braking that each action requires by IDM, as an acceleration in m/s2, [N, 3] (keep,
-    left, right).
+    """Hardest braking that each action requires by IDM, as an acceleration in m/s2, [N, 3].
 
-    The smaller of the ego's acceleration in that lane and its follower's there. A lane that does
-    not exist has no vehicles; :func:`on_road_actions` excludes it.
+    The actions are keep, left and right: of each the smaller of the ego's acceleration in that lane
+    and its follower's there. A lane that does not exist has no vehicles; :func:`on_road_actions`
+    excludes it.
     """
     scene = ego_scene(vehicles, road)
     lane = scene.observers.target_lane.to(vehicles.x.dtype)
@@ -108,7 +108,9 @@ class ActionMaskTransform(PerceptionTransform):
             raise UserError(
                 f"mask.safe_deceleration={safe_deceleration:g}: expected a number above 0, in m/s2."
             )
-        out_keys = [keys.ACTION_MASK, *([keys.NO_SAFE_ACTION] if form == "safe" else [])]
+        out_keys = [keys.ACTION_MASK]
+        if form == "safe":
+            out_keys.append(keys.NO_SAFE_ACTION)
         super().__init__(in_keys=[keys.VEHICLES, keys.EGO], out_keys=out_keys)
         self.road, self.form, self.idm, self.abort = road, form, idm, abort
         self.safe_deceleration = safe_deceleration
@@ -123,9 +125,8 @@ class ActionMaskTransform(PerceptionTransform):
         change.
         """
         lanes = road.lanes[:, 0] if isinstance(road.lanes, Tensor) else road.lanes
-        legal = on_road_actions(vehicles.target_lane[:, EGO_INDEX], lanes) & obeyed_actions(
-            direction, self.abort
-        )
+        on_road = on_road_actions(vehicles.target_lane[:, EGO_INDEX], lanes)
+        legal = on_road & obeyed_actions(direction, self.abort)
         if self.form == "legal":
             return legal, torch.zeros_like(legal[:, 0])
         safe = braking_demand(vehicles, road, self.idm) >= -self.safe_deceleration
@@ -150,10 +151,11 @@ class ActionMaskTransform(PerceptionTransform):
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the mask to the spec."""
         assert isinstance(observation_spec, Composite)
-        device, (rows, *_) = observation_spec.device, observation_spec.shape
-        sizes = {keys.ACTION_MASK: ACTIONS, keys.NO_SAFE_ACTION: 1}
         for name in self.out_keys:
+            size = ACTIONS if name == keys.ACTION_MASK else 1
             observation_spec[name] = Binary(
-                shape=(rows, sizes[name]), dtype=torch.bool, device=device
+                shape=(*observation_spec.shape, size),
+                dtype=torch.bool,
+                device=observation_spec.device,
             )
         return observation_spec

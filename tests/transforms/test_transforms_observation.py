@@ -26,7 +26,7 @@ from ganlane.transforms import (
     SensorParameters,
     observation_size,
 )
-from ganlane.transforms.observation import measure
+from ganlane.transforms.sensors import measure
 
 EGO = (0.0, 1, 20.0, 25.0)
 NOBODY = [1.0, 0.0, 0.0]
@@ -213,11 +213,11 @@ def test_lengths_are_known_without_error_whatever_the_sensors_measure():
     )
     errors = SensorParameters(position_noise_m=2.0, speed_noise_mps=1.0)
     seen = measure(scene, torch.tensor([5]), torch.tensor([0]), errors)
-    assert seen.x[0, 1] != 30.0
-    observation = observed(scene, "lane_view_overlap", seen=scene.with_(**seen._asdict()))
+    assert seen["x"][0, 1] != 30.0
+    observation = observed(scene, "lane_view_overlap", seen=scene.with_(**seen))
     gaps = 200.0 * observation[3:-2].reshape(6, 4)[:, 0]
-    assert gaps[0].item() == pytest.approx(seen.x[0, 1].item() - 8.25)
-    assert gaps[3].item() == pytest.approx(-seen.x[0, 2].item() - 4.5)
+    assert gaps[0].item() == pytest.approx(seen["x"][0, 1].item() - 8.25)
+    assert gaps[3].item() == pytest.approx(-seen["x"][0, 2].item() - 4.5)
 
 
 def test_the_largest_number_grows_with_the_longest_vehicle_where_overlap_counts():

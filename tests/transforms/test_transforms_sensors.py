@@ -30,7 +30,7 @@ from ganlane.traffic import IdmMobilTraffic
 from ganlane.train import main as train
 from ganlane.training.collectors import pack, unpack
 from ganlane.transforms import ObservationTransform, RewardTransform, SensorTransform
-from ganlane.transforms.observation import measure
+from ganlane.transforms.sensors import measure
 
 EVERYTHING = SensorParameters(1.0, 0.5, 2.0, dropout=0.2, delay_s=2.0)
 #: Own speed and lanes, which no sensor error touches.
@@ -75,7 +75,7 @@ def many(sensors, rows=5000, count=5):
     """
     true, numbers = scene(rows, count), torch.arange(rows)
     seen = measure(true, episode_key(Stream.TRAIN, numbers * 0, numbers), numbers % 10, sensors)
-    return (seen.x - true.x, seen.y - true.y, seen.speed - true.speed), seen.valid
+    return (seen["x"] - true.x, seen["y"] - true.y, seen["speed"] - true.speed), seen["valid"]
 
 
 NOISY = SensorParameters(position_noise_m=2.0, lateral_noise_m=0.5, speed_noise_mps=3.0)
@@ -101,7 +101,7 @@ def test_errors_of_position_lane_and_speed_and_of_two_vehicles_are_independent()
 def test_an_error_is_drawn_anew_at_every_measurement():
     true, zero = scene(1000, 2), torch.zeros(1000, dtype=torch.int64)
     key = episode_key(Stream.TRAIN, zero, zero)
-    seen = measure(true, key, 10 * torch.arange(1000), NOISY).x[:, 1] - true.x[:, 1]
+    seen = measure(true, key, 10 * torch.arange(1000), NOISY)["x"][:, 1] - true.x[:, 1]
     assert seen.unique().numel() > 990
     lagged = torch.corrcoef(torch.stack((seen[1:], seen[:-1])))[0, 1]
     assert abs(lagged.item()) < 4.5 / math.sqrt(1000)
@@ -134,7 +134,7 @@ def test_nobody_is_seen_at_a_dropout_of_one_and_a_vehicle_that_is_not_there_neve
     true = scene(4, 3)
     absent = true.with_(valid=torch.tensor([[True, False, True]]).expand(4, 3))
     noisy, lossy = (
-        measure(absent, torch.arange(4), torch.zeros(4, dtype=torch.int64), sensors).valid
+        measure(absent, torch.arange(4), torch.zeros(4, dtype=torch.int64), sensors)["valid"]
         for sensors in (NOISY, SensorParameters(dropout=0.5))
     )
     assert torch.equal(noisy, absent.valid)
@@ -260,7 +260,7 @@ def test_a_partial_reset_leaves_the_measurements_of_the_other_rows():
 def test_the_streams_of_training_and_report_have_errors_of_their_own():
     true, zero = scene(1, 3), torch.zeros(1, dtype=torch.int64)
     seen = [
-        measure(true, episode_key(stream, zero, zero), zero, NOISY).x
+        measure(true, episode_key(stream, zero, zero), zero, NOISY)["x"]
         for stream in (Stream.TRAIN, Stream.REPORT)
     ]
     assert not torch.equal(*seen)

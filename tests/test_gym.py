@@ -18,7 +18,8 @@ from reference.gym_env import ID, KEEP, LEFT, RIGHT, ROOT, make, make_vec, until
 import ganlane
 from ganlane.errors import UserError
 from ganlane.gym import ENV_IDS
-from ganlane.gym.rows import NativeRows, make_rows
+from ganlane.gym.base import make_rows
+from ganlane.gym.native_rows import NativeRows
 from ganlane.native.library import why_not
 
 
@@ -288,7 +289,7 @@ def begun(env):
         (lambda: make(seed=-1), "seed=-1: expected a whole number from 0"),
         (lambda: make(seed=np.array([1, 2])), "seed=array"),
         (lambda: make(render_mode="ansi"), "render_mode=ansi: expected one of human, rgb_array"),
-        (lambda: make_vec(2, render_mode=5), "render_mode=5: expected a text"),
+        (lambda: make_vec(2, render_mode=5), "render_mode=5: a batch has rgb_array only"),
         (lambda: make_vec(True), "num_envs=True: expected a whole number"),
         (lambda: make().unwrapped.step(KEEP), "call reset"),
         (lambda: make_vec(2).step(np.zeros(2, int)), "call reset"),
@@ -383,4 +384,4 @@ def test_a_copy_goes_on_as_the_environment_does_and_leaves_it_alone(twin, traffi
 @pytest.mark.skipif(why_not() is not None, reason=f"no native kernel here: {why_not()}")
 @pytest.mark.parametrize("count", [3, np.int64(3)])
 def test_numpys_numbers_of_environments_get_the_native_kernel_too(count):
-    assert isinstance(make_rows("idm_mobil", count, None, {}), NativeRows)
+    assert isinstance(make_rows("idm_mobil", count, False, {}), NativeRows)

@@ -19,6 +19,7 @@ from typing import Annotated, Any, TypeAlias
 
 from ganlane.arguments import is_import_path
 from ganlane.errors import ParameterError
+from ganlane.native.settings import RuleDrivers
 from ganlane.parameters import Record, Rule, Share, assign, did_you_mean, part_of
 from ganlane.parameters.driving import (
     CalibratedGanParameters,
@@ -76,6 +77,13 @@ class TrafficConfig(Record):
         }
         return {**own, **self.parameters}
 
+    def native_parameters(self, env: Any) -> RuleDrivers | None:
+        """What the module that this option makes in ``env`` answers, known without torch.
+
+        See :meth:`ganlane.traffic.TrafficModule.native_parameters`.
+        """
+        return None
+
     def parts(self) -> dict[str, TrafficConfig]:
         """Traffics that the target is made of, by name.
 
@@ -105,12 +113,20 @@ def _listed(value: Any) -> Any:
 class IdmTrafficConfig(TrafficConfig):
     """``traffic=idm``: IDM, everybody keeps its lane."""
 
+    def native_parameters(self, env: Any) -> RuleDrivers | None:
+        """The kernel's drivers, unless another target or blind drivers were named."""
+        return RuleDrivers(env.idm) if self == IdmTrafficConfig() else None
+
 
 @dataclass(frozen=True)
 class IdmMobilTrafficConfig(TrafficConfig):
     """``traffic=idm_mobil``: IDM with MOBIL's lane changes."""
 
     _target_: str = "ganlane.traffic.IdmMobilTraffic"
+
+    def native_parameters(self, env: Any) -> RuleDrivers | None:
+        """As of ``traffic=idm``, with lane changes."""
+        return RuleDrivers(env.idm, mobil=env.mobil) if self == IdmMobilTrafficConfig() else None
 
 
 @dataclass(frozen=True)

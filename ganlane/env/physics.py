@@ -55,11 +55,9 @@ class Rules(NamedTuple):
 
 def scene_over(rules: Rules, step: Tensor) -> Tensor:
     """Whether the recorded scene has ended at physics step ``step``, bool [N]."""
-    return (
-        torch.zeros_like(step, dtype=torch.bool)
-        if rules.scene_steps is None
-        else step >= rules.scene_steps
-    )
+    if rules.scene_steps is None:
+        return torch.zeros_like(step, dtype=torch.bool)
+    return step >= rules.scene_steps
 
 
 class Substep(NamedTuple):
@@ -190,9 +188,11 @@ def outcome(
         keys.SOFT_CRASH_BEHIND: end.onsets_behind,
     }
     flags = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
-    return {name: value[:, None] for name, value in events.items()}, {
-        k: v[:, None] for k, v in flags.items()
-    }
+    return _columns(events), _columns(flags)
+
+
+def _columns(values: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: value[:, None] for name, value in values.items()}
 
 
 class Physics:
@@ -223,10 +223,11 @@ def known_false(flag: Tensor) -> bool:
 
 
 class EndedRows:
-    """The traffic's memory of the rows that end within a decision, kept as it was when they ended.
+    """The traffic's memory of the rows that end within a decision, as it was when they ended.
 
     The traffic goes on computing them, in vain: restoring their memory in every physics step would
-    copy that of all rows each time, and generated traffic's is large.
+    copy that of all rows each time. With traffic=gan and 512 rows a step then took 1.1 times as
+    long.
     """
 
     def __init__(self) -> None:
@@ -252,13 +253,15 @@ class EndedRows:
 def _with_rows(memory: TensorDictBase, rows: Tensor, other: TensorDictBase) -> TensorDict:
     """``memory`` with its ``rows`` replaced by ``other`` [R], leaf by leaf."""
 
-    def replaced(name: str, value: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
-        if isinstance(value, TensorDictBase):
-            return value if value.is_empty() else _with_rows(value, rows, other.get(name))
-        return value.index_copy(0, rows, other.get(name))
-
-    kept = {name: replaced(name, value) for name, value in memory.items()}
-    return TensorDict._new_unsafe(kept, batch_size=memory.batch_size)
+    restored = {}
+    for name, value in memory.items():
+        if isinstance(value, Tensor):
+            restored[name] = value.index_copy(0, rows, other.get(name))
+        elif value.is_empty():
+            restored[name] = value
+        else:
+            restored[name] = _with_rows(value, rows, other.get(name))
+    return TensorDict._new_unsafe(restored, batch_size=memory.batch_size)
 
 
 def _where(rows: Tensor, new: Tensor, old: Tensor) -> Tensor:
@@ -287,11 +290,8 @@ def run_decision(
         substeps: number of physics steps; None: those of the decision period.
     """
     memory, now, ended = memory_of(state), start, EndedRows()
-    counters = {
-        keys.SEED: state.get(keys.SEED),
-        keys.EPISODE: state.get(keys.EPISODE),
-        keys.EPISODE_KEY: key,
-    }
+    counters = {name: state.get(name) for name in (keys.SEED, keys.EPISODE)}
+    counters[keys.EPISODE_KEY] = key
     size, can_read = memory.batch_size, reads_are_cheap(now.running)
     if can_read:
         ended.keep(~now.running, memory)
@@ -301,9 +301,8 @@ def run_decision(
             break
         # The traffic's clock continues in ended rows: stopped at a moment of decision it would make
         # these rows' drivers decide in all remaining steps, in vain.
-        vehicles = TensorDict._new_unsafe(before.vehicles.as_dict(), batch_size=size)
         fields = {
-            keys.VEHICLES: vehicles,
+            keys.VEHICLES: TensorDict._new_unsafe(before.vehicles.as_dict(), batch_size=size),
             keys.TRAFFIC: memory,
             **counters,
             keys.STEP: start.step + count,

@@ -88,8 +88,8 @@ class RuleDrivers(NamedTuple):
     """Drivers that the kernel knows; ``mobil=None``: they keep their lanes."""
 
     idm: IdmParameters
-    steering: SteeringParameters
-    mobil: MobilParameters | None
+    steering: SteeringParameters = SteeringParameters()
+    mobil: MobilParameters | None = None
 
 
 class Settings(ctypes.Structure):

@@ -64,7 +64,7 @@ class IdmTraffic(TrafficModule):
         """The kernel's drivers; None for a subclass, which may drive otherwise."""
         if type(self) is not IdmTraffic:
             return None
-        return RuleDrivers(self.idm, self.steering, None)
+        return RuleDrivers(self.idm, self.steering)
 
     def keep_lanes(self, vehicles: Vehicles, memory: Memory) -> Moved:
         """A step without decisions."""

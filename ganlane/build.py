@@ -111,7 +111,6 @@ def make_env(
         env.ego,
         env.episode_parameters(),
         env.idm,
-        stream=traffic.stream,
         seed=seed,
         first_episode=first_episode,
         device=device,

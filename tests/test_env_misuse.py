@@ -40,7 +40,6 @@ def made(**options):
         *({"seed": value} for value in (2**63, -1, 0.5, "one")),
         *({"first_episode": value} for value in (2**63, -1, 0.5)),
         *({"device": value} for value in ("meta", "nonsense")),
-        {"stream": "train"},
         {"scenes": 3},
     ],
     ids=str,
@@ -133,11 +132,11 @@ def test_a_default_device_without_numbers_is_refused_everywhere():
 
 def paths(env, actions):
     """x of all vehicles after each of the ``actions`` [T, N]."""
-    state, found = env.reset(), []
+    state, courses = env.reset(), []
     for action in actions:
         stepped, state = env.step_and_maybe_reset(state.set(keys.ACTION, action))
-        found.append(stepped["next", keys.VEHICLES, "x"])
-    return torch.stack(found)
+        courses.append(stepped["next", keys.VEHICLES, "x"])
+    return torch.stack(courses)
 
 
 @pytest.mark.parametrize(

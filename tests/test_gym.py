@@ -96,14 +96,14 @@ def test_neither_making_nor_running_a_batch_warns(traffic, mode):
     for _ in range(6):
         observation, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
         assert envs.observation_space.contains(observation)
-        kept = copy.deepcopy((observation, reward, info))
+        before = copy.deepcopy((observation, reward, info))
         ended = terminated | truncated
         if mode is AutoresetMode.DISABLED and ended.any():
             envs.reset(options={"reset_mask": ended})
         else:
             envs.step(np.zeros(3, int))
             envs.reset()
-        assert data_equivalence(kept, (observation, reward, info), exact=True)
+        assert data_equivalence(before, (observation, reward, info), exact=True)
     envs.close()
     envs.close()
     assert envs.metadata["autoreset_mode"] is mode
@@ -112,9 +112,9 @@ def test_neither_making_nor_running_a_batch_warns(traffic, mode):
 
 
 def test_the_id_imports_the_package_which_imports_neither_torch_nor_hydra():
-    made = "import gymnasium; print(gymnasium.make('ganlane:ganlane/Highway-v0').action_space)"
+    making = "import gymnasium; print(gymnasium.make('ganlane:ganlane/Highway-v0').action_space)"
     slow = "import sys, ganlane; print({'torch', 'hydra', 'polars', 'PIL'} & sys.modules.keys())"
-    for code, printed in ((made, "Discrete(3)\n"), (slow, "set()\n")):
+    for code, printed in ((making, "Discrete(3)\n"), (slow, "set()\n")):
         assert subprocess.check_output([sys.executable, "-c", code], text=True, cwd=ROOT) == printed
 
 
@@ -149,9 +149,9 @@ def test_a_row_of_a_batch_drives_as_one_alone_does():
     for step in actions:
         together, reward, terminated, truncated, info = envs.step(step)
         for row in np.flatnonzero(running):
-            own, own_reward, *ended, _ = alone[row].step(step[row])
+            seen, own_reward, *ended, _ = alone[row].step(step[row])
             last = info["final_obs"][row] if terminated[row] or truncated[row] else together[row]
-            np.testing.assert_array_equal(last, own)
+            np.testing.assert_array_equal(last, seen)
             assert reward[row] == own_reward
             assert [terminated[row], truncated[row]] == ended
         running &= ~(terminated | truncated)
@@ -374,11 +374,11 @@ def test_a_copy_goes_on_as_the_environment_does_and_leaves_it_alone(twin, traffi
     env.step(LEFT)
     other = twin(env)
     theirs = [other.step(action) for action in (KEEP, RIGHT)]
-    for (observation, *rest), (expected, *known) in zip(
+    for (observation, *rest), (expected, *expected_rest) in zip(
         [env.step(action) for action in (KEEP, RIGHT)], theirs
     ):
         assert np.array_equal(observation, expected)
-        assert str(rest) == str(known)
+        assert str(rest) == str(expected_rest)
 
 
 @pytest.mark.skipif(why_not() is not None, reason=f"no native kernel here: {why_not()}")

@@ -131,7 +131,6 @@ ACTIONS: tuple[Any, ...] = (
 OF_ENVIRONMENT = (
     "num_envs",
     "vehicles",
-    "stream",
     "seed",
     "first_episode",
     "device",

@@ -58,8 +58,6 @@ class HighwayEnv(EnvBase):
         spawn_parameters, episode: Table II; decision period, goal and time-out.
         ego, idm, steering: the ego's lane changes and visibility, car following (Table V) and
             steering.
-        stream: family of episodes (training, selection, report); by default, and at most, the
-            traffic's.
         seed: base of the random numbers; ``set_seed`` changes it for the next full reset.
         first_episode: row i starts with episode ``first_episode + i`` and continues in steps of N.
         scenes: initial vehicles of an episode and their visibility; None: at random, by
@@ -73,7 +71,7 @@ class HighwayEnv(EnvBase):
             (:mod:`ganlane.native`), which does the same up to rounding, for rule-driven traffic on
             a CPU; ``auto``, the kernel where it can.
 
-    An episode is (stream, seed, episode) and does not depend on the batch. ``reset(td)`` with
+    An episode is (the traffic's stream, seed, episode), whatever the batch. ``reset(td)`` with
     ``seed`` and ``episode`` [N] in ``td`` and no ``_reset`` mask runs exactly those episodes. With
     a mask the masked rows continue with their episode plus N, or ``next_episode`` [N] of
     ``reset(td, next_episode=...)``, on the seed in ``td``. :attr:`recorder`, if set, is called
@@ -81,8 +79,8 @@ class HighwayEnv(EnvBase):
 
     Raises:
         UserError: the vehicles do not fit on the road or could not brake in time, the decision
-            period is not a multiple of 0.1 s, the traffic belongs to another stream,
-            ``recycle_share`` is no share, or the native kernel cannot do what is asked.
+            period is not a multiple of 0.1 s, ``recycle_share`` is no share, or the native kernel
+            cannot do what is asked.
     """
 
     batch_locked = True
@@ -98,7 +96,6 @@ class HighwayEnv(EnvBase):
         episode: EpisodeParameters | None = None,
         idm: IdmParameters = TABLE_V,
         steering: SteeringParameters = STEERING,
-        stream: int | None = None,
         seed: int = 0,
         first_episode: int = 0,
         device: torch.device | str | None = None,
@@ -131,7 +128,7 @@ class HighwayEnv(EnvBase):
         self._seed = seed_number(seed)
         #: Seed and episode [N] of the rows in the last call; automatic resets continue from there.
         self.last_episodes: tuple[Tensor, Tensor] | None = None
-        self._check_parts(vehicles, stream)
+        self._check_parts(vehicles)
         #: The native kernel; None: the tensor code drives.
         self.kernel = self._make_kernel(kernel)
         self._must_be_native = kernel == "native"
@@ -149,16 +146,8 @@ class HighwayEnv(EnvBase):
             scenes = RandomScenes(self.road, vehicles, spawn, visibility, others)
         return scenes
 
-    def _check_parts(self, vehicles: int | None, stream: int | None) -> None:
-        """Raise :class:`UserError` for parts that do not fit.
-
-        ``vehicles`` and ``stream`` are as the user gave them.
-        """
-        if stream is not None and stream != self.stream:
-            raise UserError(
-                f"stream={stream}: the traffic was built for stream {self.stream}; give both the "
-                "same one, or an episode would depend on two of them."
-            )
+    def _check_parts(self, vehicles: int | None) -> None:
+        """Raise :class:`UserError` for parts that do not fit; ``vehicles`` is as given by users."""
         if self.recycle and self.traffic.own_roads:
             raise UserError(
                 "env.recycle=true with replayed traffic: recorded vehicles go where they went; "

@@ -30,11 +30,10 @@ class NativeRows(Rows):
     def __init__(self, batch: NativeBatch, episode: EpisodeParameters) -> None:
         self.batch, self.count, self.episode = batch, batch.rows, episode
         self.space = observation_space(batch.observation.shape[1], batch.bounds[1])
-        self._started = False
         self._never = np.zeros(batch.rows, np.bool_)
 
     def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
-        self._started = True
+        self.started = True
         self.batch.start(seed, episode)
 
     def restart(self, rows: Flags) -> None:
@@ -50,9 +49,8 @@ class NativeRows(Rows):
     def mask(self) -> Flags:
         return self.batch.mask
 
-    def numbers(self) -> tuple[Integers, Integers] | None:
-        state = self.batch.state
-        return (state["seed"], state["episode"]) if self._started else None
+    def numbers(self) -> tuple[Integers, Integers]:
+        return self.batch.state["seed"], self.batch.state["episode"]
 
     def state_arrays(self) -> Mapping[str, Any]:
         state = self.batch.state

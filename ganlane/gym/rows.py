@@ -47,8 +47,10 @@ class Rows(ABC):
         count: N.
         space: of one observation.
         episode: decision period and time limit.
+        started: whether an episode is under way.
     """
 
+    started = False
     count: int
     space: Box
     episode: EpisodeParameters
@@ -77,8 +79,8 @@ class Rows(ABC):
         """
 
     @abstractmethod
-    def numbers(self) -> tuple[Integers, Integers] | None:
-        """Present seeds and episodes [N]; None before the first :meth:`start`."""
+    def numbers(self) -> tuple[Integers, Integers]:
+        """Present seeds and episodes [N]."""
 
     @abstractmethod
     def state_arrays(self) -> Mapping[str, Any]:
@@ -90,7 +92,7 @@ class Rows(ABC):
 
     def check_started(self) -> None:
         """Raise :class:`UserError` before the first :meth:`start`."""
-        if self.numbers() is None:
+        if not self.started:
             raise UserError("no episode is under way; call reset() first.")
 
     def info(self) -> dict[str, Any]:

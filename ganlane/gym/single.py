@@ -135,7 +135,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         self._video, wrapper.frames_per_sec = wrapper, FPS
 
     def action_masks(self) -> npt.NDArray[np.bool_]:
-        """Which actions are allowed now, bool [3]; named as sb3-contrib's MaskablePPO asks for it."""
+        """Which actions are allowed now, bool [3]; sb3-contrib's MaskablePPO asks for them."""
         return self._rows.mask()[0].copy()
 
     def render(self) -> Any:

@@ -30,12 +30,11 @@ class TensorRows(Rows):
 
     Attributes:
         env: what :func:`ganlane.api.make_env` makes of the arguments.
-        state: of its rows; None before the first :meth:`start`.
+        state: of its rows, from the first :meth:`start` on.
     """
 
     def __init__(self, traffic: Option, count: int, options: Mapping[str, Any]) -> None:
         self.env: TransformedEnv = make_env(traffic, count, **options)
-        self.state: TensorDictBase | None = None
         base = self.env.base_env
         self.count, self.episode = count, base.episode
         parts = list(self.env.transform)
@@ -43,13 +42,15 @@ class TensorRows(Rows):
         size = self.env.observation_spec[keys.OBSERVATION].shape[-1]
         self.space = observation_space(size, largest_number(observed.form, base.scenes.longest_m))
 
+    state: TensorDictBase
+
     @torch.no_grad()
     def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
         counters = TensorDict({}, [self.count], device=self.env.device)
         for name, value in ((keys.SEED, seed), (keys.EPISODE, episode)):
             numbers = np.broadcast_to(value, self.count).astype(np.int64)
             counters[name] = torch.as_tensor(numbers, device=self.env.device)
-        self.state = self.env.reset(counters)
+        self.started, self.state = True, self.env.reset(counters)
 
     @torch.no_grad()
     def restart(self, rows: Flags) -> None:
@@ -71,7 +72,6 @@ class TensorRows(Rows):
     def now(self) -> TensorDictBase:
         """The state of all rows; raises :class:`UserError` before the first :meth:`start`."""
         self.check_started()
-        assert self.state is not None
         return self.state
 
     def observation(self) -> Floats:
@@ -85,15 +85,8 @@ class TensorRows(Rows):
             mask = legal_actions(state, road_in(state, self.env.base_env.road))
         return _array(mask)
 
-    def check_started(self) -> None:
-        # Without copying the numbers from the device, as numbers() does.
-        if self.state is None:
-            super().check_started()
-
-    def numbers(self) -> tuple[Integers, Integers] | None:
-        if self.state is None:
-            return None
-        return _array(self.state.get(keys.SEED)), _array(self.state.get(keys.EPISODE))
+    def numbers(self) -> tuple[Integers, Integers]:
+        return _array(self.now().get(keys.SEED)), _array(self.now().get(keys.EPISODE))
 
     def state_arrays(self) -> Mapping[str, Any]:
         state = self.now()

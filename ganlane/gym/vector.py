@@ -123,13 +123,13 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
     def _start(self, seed: int | Sequence[int] | None, episode: Any) -> None:
         """Begin the episodes that the arguments of a reset name, or the next ones, in all rows."""
         rows = np.arange(self.num_envs)
-        present = self._rows.numbers()
         seeds: Any
         if seed is not None:
             seeds, first = [seed_number(one) for one in array_of(seed).ravel().tolist()], rows
             super().reset(seed=seeds[0] if len(seeds) == 1 else None)
-        elif present is not None:
-            seeds, first = present[0].copy(), present[1] + self.num_envs
+        elif self._rows.started:
+            seeds, episodes = self._rows.numbers()
+            seeds, first = seeds.copy(), episodes + self.num_envs
         else:
             seeds, first = self._seed, rows
             if seeds is None:

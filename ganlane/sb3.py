@@ -87,8 +87,9 @@ class HighwayVecEnv(VecEnv):
         self._length += 1
         done = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        # SB3 bootstraps from the last observation of a row that was cut off, not of one that ended.
         for row in np.flatnonzero(done):
-            infos[row] = self._final_info(row, info)
+            infos[row] = self._final_info(int(row), info)
             infos[row]["TimeLimit.truncated"] = bool(truncated[row] and not terminated[row])
         self._return[done], self._length[done] = 0.0, 0
         return observation, reward.astype(np.float32), done, infos
@@ -194,6 +195,7 @@ class ModelPolicy(TensorDictModuleBase):
     def __init__(self, model: BaseAlgorithm) -> None:
         super().__init__()
         self.model = model
+        # sb3-contrib's MaskablePPO and its kin take masks; SB3's own algorithms do not.
         self._masked = type(model).__name__.startswith("Maskable")
         self.in_keys = [keys.OBSERVATION, keys.ACTION_MASK] if self._masked else [keys.OBSERVATION]
 

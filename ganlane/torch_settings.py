@@ -62,8 +62,8 @@ def check_default_device(device: str) -> None:
     if default not in ("cpu", device):
         raise UserError(
             f"torch's default device is {default}, and the highway's tensors would not meet those "
-            "that are made there; call torch.set_default_device('cpu') and choose the highway's own "
-            "with device=."
+            "that are made there; call torch.set_default_device('cpu') and choose the highway's "
+            "own with device=."
         )
 
 

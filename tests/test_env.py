@@ -150,6 +150,8 @@ def test_a_reset_with_seed_and_episode_runs_exactly_those():
     assert asked[keys.EPISODE].tolist() == [40, 2, 0]
     assert same_bits(asked[1:2], env.reset()[2:3]) == []
     assert same_bits(asked[2:3], environment(num_envs=1, seed=5).reset()) == []
+    through = TransformedEnv(env, StepCounter()).reset(td.clone())
+    assert same_bits(through.exclude("step_count"), asked) == []
 
 
 def test_a_copied_state_goes_on_alike_and_is_not_written():

@@ -16,11 +16,14 @@ from gymnasium.vector import AutoresetMode
 from reference.gym_env import ID, KEEP, LEFT, RIGHT, ROOT, make, make_vec, until_the_end
 
 import ganlane
+from ganlane.build import make_traffic
+from ganlane.config.env import EnvConfig
 from ganlane.errors import UserError
 from ganlane.gym import ENV_IDS
 from ganlane.gym.base import make_rows
 from ganlane.gym.native_rows import NativeRows
 from ganlane.native.library import why_not
+from ganlane.options import option
 
 
 @pytest.mark.parametrize("name", sorted(ENV_IDS.keys() - {ID}))
@@ -89,7 +92,7 @@ def test_gymnasiums_own_check_finds_nothing_to_say(options):
     [("gan", AutoresetMode.SAME_STEP), *(("idm", mode) for mode in AutoresetMode)],
 )
 def test_neither_making_nor_running_a_batch_warns(traffic, mode):
-    """gymnasium has no checker for batches: this is what its one for single environments looks at."""
+    """gymnasium has no checker for batches: this is what its one for one environment looks at."""
     envs = gymnasium.make_vec(ID, num_envs=3, traffic=traffic, goal_m=60.0, autoreset_mode=mode)
     first, info = envs.reset(seed=0)
     assert data_equivalence(envs.reset(seed=0), (first, info), exact=True)
@@ -157,6 +160,37 @@ def test_a_row_of_a_batch_drives_as_one_alone_does():
         running &= ~(terminated | truncated)
 
 
+@pytest.mark.parametrize(
+    "traffic",
+    [
+        "idm",
+        "idm_mobil",
+        "idm_random",
+        "idm_faults",
+        "gan",
+        {"name": "idm", "blind_share": 0.5},
+    ],
+)
+def test_option_and_module_give_one_answer_to_who_drives(traffic):
+    config, env = option("traffic", traffic), EnvConfig()
+    drivers = make_traffic(config, env).native_parameters()
+    assert config.native_parameters(env) == drivers
+    assert (drivers is not None) == (traffic in ("idm", "idm_mobil"))
+
+
+@pytest.mark.skipif(why_not() is not None, reason=f"no native kernel here: {why_not()}")
+def test_pictures_change_nobody():
+    """With a render mode the same kernel drives, behind the TorchRL environment."""
+    plain, drawn = make(), make(render_mode="rgb_array")
+    assert drawn.unwrapped._rows.env.base_env.kernel is not None
+    for env in (plain, drawn):
+        env.reset(seed=1)
+    for action in (LEFT, KEEP, RIGHT):
+        (observation, *rest), (expected, *expected_rest) = plain.step(action), drawn.step(action)
+        np.testing.assert_array_equal(observation, expected)
+        assert str(rest) == str(expected_rest)
+
+
 def test_the_facade_gives_what_the_torchrl_environment_gives():
     envs = make_vec(2, goal_m=400.0)
     observation, _ = envs.reset(seed=1)
@@ -197,7 +231,7 @@ def test_leaving_the_road_terminates_and_the_mask_says_so_beforehand():
 
 
 def returns_by_episode(mode, kernel):
-    """Return of every finished episode by its number, rows in ``mode``; all rows keep their lanes."""
+    """Return of every finished episode by its number; all rows keep their lanes."""
     envs = make_vec(3, kernel=kernel, autoreset_mode=mode, goal_m=120.0)
     assert envs.metadata["autoreset_mode"] is mode
     _, info = envs.reset(seed=4)

@@ -128,9 +128,15 @@ def test_tianshou_trains_on_it_unchanged():
     collector = Collector(algorithm, envs, VectorReplayBuffer(1000, 2))
     collector.reset()
     parameters = OffPolicyTrainerParams(
-        training_collector=collector, max_epochs=1, epoch_num_steps=200, collection_step_num_env_steps=20,
-        batch_size=32, update_step_num_gradient_steps_per_sample=0.1, show_progress=False, verbose=False,
-    )  # fmt: skip
+        training_collector=collector,
+        max_epochs=1,
+        epoch_num_steps=200,
+        collection_step_num_env_steps=20,
+        batch_size=32,
+        update_step_num_gradient_steps_per_sample=0.1,
+        show_progress=False,
+        verbose=False,
+    )
     result = algorithm.run_training(parameters)
     assert result.train_step == 200
     assert result.train_episode >= 10

@@ -110,6 +110,7 @@ class HighwayEnv(EnvBase):
         whole_number("first_episode", first_episode, 0, 2**62)
         if vehicles is not None:
             whole_number("vehicles", vehicles, 1, 1000)
+        # Checked before EnvBase allocates anything on it.
         device = usable_device(device, dtype)
         super().__init__(device=device, batch_size=torch.Size([int(num_envs)]))
         self.traffic = traffic.to(self.device)
@@ -218,8 +219,10 @@ class HighwayEnv(EnvBase):
         else:
             seed = torch.full((n,), self._seed, dtype=torch.int64, device=self.device)
             return seed, self.first_episode + torch.arange(n, device=self.device)
+        # Without a mask the counters name the episodes; with one they are those that have ended.
         if mask is None:
             return seed, last
+        # Row i of N drives the episodes i, i + N, i + 2N, ... unless the caller knows better.
         following = last + n
         if next_episode is not None:
             following = check_counter("next_episode", next_episode, n)
@@ -236,7 +239,10 @@ class HighwayEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = None if mask is None else mask.reshape(-1)
         if self._native_scenes is not None:
+            # The kernel draws the masked rows alone.
             return outcome_state(seed, episode, *self._native_scenes.start(seed, episode, mask))
+        # On a GPU counting the masked rows would wait for its queue; a foreign simulator knows its
+        # rows by their place.
         if mask is None or self.device.type != "cpu" or self.traffic.rows_must_stay:
             return self._start(seed, episode)
         rows = mask.nonzero()[:, 0]
@@ -269,6 +275,7 @@ class HighwayEnv(EnvBase):
                 "step(): the state of no episode was given; call reset() first and step what it "
                 "returns."
             )
+        # An automatic reset goes on from these.
         self.last_episodes = (seed, episode)
         step = self._tensor_step if self.kernel is None else self._native_step
         after = step(tensordict)
@@ -286,6 +293,7 @@ class HighwayEnv(EnvBase):
             rules = rules._replace(road=road, scene_steps=steps)
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         ego = dict(state.get(keys.EGO).items())
+        # The command, then traffic and ego step by step, then what the ego remembers of it.
         start, command = self.physics.begin(rules, action, vehicles, ego, state.get(keys.STEP))
         end, memory = run_decision(
             self.traffic, self.physics, rules, state, start, key, self.recorder
@@ -314,6 +322,7 @@ class HighwayEnv(EnvBase):
         if self.recycle:
             key = episode_key(self.stream, state.get(keys.SEED), state.get(keys.EPISODE))
             recycles = self._recycling_rows(key)
+        # The kernel looks at the actions' values itself: that costs nothing there.
         try:
             after = native_decision(self.kernel, state, action, recycles)
         except ValueError:
@@ -340,9 +349,11 @@ class HighwayEnv(EnvBase):
             running = running & ~state.get(keys.EVENTS).get("out_of_road")[:, 0]
             if not running.any():
                 break
+            # Ended rows stand still for the recorder; the kernel would drive them on.
             vehicles = Vehicles.of(state.get(keys.VEHICLES)).where(running, vehicles)
             recorder(vehicles, running)
             running = running & ~state.get("done")[:, 0]
+            # The command is given once; during a lane change keeping the lane continues it.
             action = torch.full_like(action, keys.KEEP)
 
     def _make_kernel(self, wanted: str) -> Kernel | None:
@@ -358,6 +369,7 @@ class HighwayEnv(EnvBase):
             )
         if wanted == "torch":
             return None
+        # What the kernel cannot do, as the end of a sentence.
         drivers, reason = self.traffic.native_parameters(), None
         if drivers is None:
             name = type(self.traffic).__name__

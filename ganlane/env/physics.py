@@ -89,6 +89,7 @@ def begin(
     """
     lanes = rules.road.lanes if isinstance(rules.road.lanes, int) else rules.road.lanes[:, 0]
     target, direction = vehicles.target_lane[:, EGO_INDEX], ego["change_direction"]
+    # The command sets the lane that the ego steers to; the motion itself takes several decisions.
     command = apply_action(action, target, direction, lanes, rules.ego.abort_lane_change)
     targets = torch.cat((command.target_lane[:, None], vehicles.target_lane[:, 1:]), dim=1)
     vehicles = vehicles.with_(target_lane=targets)
@@ -123,6 +124,7 @@ def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -
         rules.steering,
         PHYSICS_STEP_S,
     )
+    # The others moved while they saw the ego where it was: all move at once, from one state.
     running, vehicles = before.running, moved.with_first(ego)
     if not all_running:
         vehicles = vehicles.where(running, before.vehicles)
@@ -130,6 +132,7 @@ def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -
     acceleration, ahead, behind = ego_surroundings(
         ego_scene(vehicles, rules.road), rules.idm, rules.ego
     )
+    # Of the events of one step a crash comes first, then the goal, then the time-out.
     crash = ego_overlaps(vehicles, rules.road).any(-1) & running
     goal = (vehicles.x[:, EGO_INDEX] >= rules.episode.goal_m) & running & ~crash
     step = before.step + running
@@ -142,6 +145,7 @@ def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -
         behind=torch.where(running, behind, before.behind),
         step=step,
         running=running & ~(crash | goal | late),
+        # A soft crash counts when it begins, however long it lasts.
         onsets=before.onsets + (ahead & ~before.ahead & running),
         onsets_behind=before.onsets_behind + (behind & ~before.behind & running),
         hard_crash=before.hard_crash | crash,
@@ -156,6 +160,7 @@ def remember(
     ego, speed = end.vehicles.at(EGO_INDEX), start.vehicles.speed[:, EGO_INDEX]
     arrived = lane_change_done(end.vehicles.columns(slice(0, 1)), rules.road)[:, 0]
     direction = torch.where(arrived, 0, command.direction)
+    # A row that ended at once drove no step: its speed did not change either.
     seconds = (end.step - start.step).clamp_min(1).to(ego.speed.dtype) * PHYSICS_STEP_S
     return {
         "steering": end.steering,
@@ -176,6 +181,7 @@ def outcome(
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Events and done flags of a decision, each [N, 1]; every end has exactly one reason."""
     terminated = end.goal | end.hard_crash | command.off_road
+    # What has ended without an outcome was cut off: by the clock, or where its recording stops.
     truncated = ~end.running & ~terminated
     scene_end = truncated & scene_over(rules, end.step)
     events = {
@@ -297,6 +303,7 @@ def run_decision(
         ended.keep(~now.running, memory)
     for count in range(rules.episode.substeps() if substeps is None else substeps):
         before = now
+        # On a CPU the remaining steps are left out once every row has ended.
         if known_false(before.running.any()):
             break
         # The traffic's clock continues in ended rows: stopped at a moment of decision it would make
@@ -311,6 +318,7 @@ def run_decision(
         # In a graph the copies cost nothing, so one graph serves both cases.
         all_running = not physics.compiled and known_false((~before.running).any())
         now = physics.advance(rules, before, Vehicles.of(after.get(keys.MOVED)), all_running)
+        # The memory of ended rows: put aside when they end, or kept by a copy in every step.
         if can_read:
             memory = after.get(keys.TRAFFIC)
             ended.keep(before.running & ~now.running, memory)

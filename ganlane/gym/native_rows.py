@@ -49,9 +49,6 @@ class NativeRows(Rows):
     def mask(self) -> Flags:
         return self.batch.mask
 
-    def numbers(self) -> tuple[Integers, Integers]:
-        return self.batch.state["seed"], self.batch.state["episode"]
-
     def state_arrays(self) -> Mapping[str, Any]:
         state = self.batch.state
         return {
@@ -86,6 +83,7 @@ def native_rows(traffic: Option, count: int, options: Mapping[str, Any]) -> Nati
         stream = Stream.named(str(options.get("stream", "train")))
     except UserError:
         return None
+    # The traffic says who drives; the rest is what the kernel's observation and scenes can do.
     drivers = others.native_parameters(env)
     if (
         drivers is None

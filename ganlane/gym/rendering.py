@@ -55,6 +55,7 @@ class LiveView:
     def before_step(self, action: int) -> None:
         """Record the action of the next step."""
         self._recorder.current_action = action
+        # An episode may last for hours: what the trails no longer show is dropped.
         del self._recorder.frames[:-_TRAIL_STEPS]
         self._before = len(self._recorder.frames)
 
@@ -84,6 +85,7 @@ class LiveView:
         """Show the frames of the last decision in the window, in real time."""
         if self.window is None:
             return
+        # Drawing takes time of its own, which is taken off the wait.
         due = time.monotonic() + PHYSICS_STEP_S
         for picture in self.pictures():
             self.window.show(picture)

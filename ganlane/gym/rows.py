@@ -79,10 +79,6 @@ class Rows(ABC):
         """
 
     @abstractmethod
-    def numbers(self) -> tuple[Integers, Integers]:
-        """Present seeds and episodes [N]."""
-
-    @abstractmethod
     def state_arrays(self) -> Mapping[str, Any]:
         """What :meth:`info` is made of, arrays [N]; valid until the next call.
 

@@ -88,6 +88,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         chosen = reset_options(options, ("episode",))
         seed = None if seed is None else seed_number(seed)
         super().reset(seed=seed)
+        # A seed begins with its episode 0; without one the next episode of the same seed follows.
         if seed is not None:
             self._seed, self._episode = seed, -1
         elif self._seed is None:
@@ -96,6 +97,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         self._episode = whole_number("options: episode", episode, 0, 2**62)
         self._rows.start(self._seed, self._episode)
         self._running = True
+        # The first frame is the scene before anything moves.
         if self._view is not None:
             self._view.start()
             self._pictures.clear()
@@ -107,6 +109,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         if not self._running:
             raise UserError("step(): no episode is under way; call reset() first.")
         actions = actions_of(array_of(action).reshape(-1), 1)
+        # The view records the physics steps of the decision through the environment's recorder.
         if self._view is not None:
             self._view.before_step(int(actions[0]))
         stepped = self._rows.step(actions)

@@ -61,6 +61,7 @@ class TensorRows(Rows):
     def step(self, actions: Integers) -> Stepped:
         action = torch.as_tensor(actions, device=self.env.device)
         stepped = self.env.step(self.now().set(keys.ACTION, action))
+        # Rows are not reset here: the environments above decide when.
         self.state, after = self.env.step_mdp(stepped), stepped.get("next")
         return Stepped(
             self.observation(),
@@ -76,6 +77,7 @@ class TensorRows(Rows):
 
     def observation(self) -> Floats:
         observation = _array(self.now().get(keys.OBSERVATION))
+        # A speed far above the desired one would leave the space.
         return np.clip(observation, self.space.low, self.space.high)
 
     def mask(self) -> Flags:
@@ -85,22 +87,20 @@ class TensorRows(Rows):
             mask = legal_actions(state, road_in(state, self.env.base_env.road))
         return _array(mask)
 
-    def numbers(self) -> tuple[Integers, Integers]:
-        return _array(self.now().get(keys.SEED)), _array(self.now().get(keys.EPISODE))
-
     def state_arrays(self) -> Mapping[str, Any]:
         state = self.now()
         vehicles, road = state.get(keys.VEHICLES), road_in(state, self.env.base_env.road)
-        tensors = {
-            "y": vehicles.get("y")[:, EGO_INDEX],
-            "speed": vehicles.get("speed")[:, EGO_INDEX],
-            "lanes": torch.as_tensor(road.lanes).flatten(),
-            "lane_width_m": torch.as_tensor(road.lane_width_m).flatten(),
-            **{name: state.get(name) for name in (keys.SEED, keys.EPISODE, keys.STEP)},
-            **dict(state.get(keys.EGO).items()),
-            # Events have the shape [N, 1]. That of a soft crash replaces the ego's memory of it.
-            **{name: event[:, 0] for name, event in state.get(keys.EVENTS).items()},
-        }
+        tensors = dict(state.get(keys.EGO).items())
+        for name in (keys.SEED, keys.EPISODE, keys.STEP):
+            tensors[name] = state.get(name)
+        for name in ("y", "speed"):
+            tensors[name] = vehicles.get(name)[:, EGO_INDEX]
+        # Events have the shape [N, 1]. That of a soft crash replaces the ego's memory of it.
+        for name, event in state.get(keys.EVENTS).items():
+            tensors[name] = event[:, 0]
+        # One number for all rows, or [N, 1].
+        tensors["lanes"] = torch.as_tensor(road.lanes).flatten()
+        tensors["lane_width_m"] = torch.as_tensor(road.lane_width_m).flatten()
         arrays: dict[str, Any] = {name: _array(value) for name, value in tensors.items()}
         terms = state.get(keys.REWARD_TERMS)
         arrays[keys.REWARD_TERMS] = {name: _array(term[:, 0]) for name, term in terms.items()}

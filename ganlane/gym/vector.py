@@ -124,12 +124,13 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         """Begin the episodes that the arguments of a reset name, or the next ones, in all rows."""
         rows = np.arange(self.num_envs)
         seeds: Any
+        # A seed starts with its first episodes; without one every row goes on with its next.
         if seed is not None:
             seeds, first = [seed_number(one) for one in array_of(seed).ravel().tolist()], rows
             super().reset(seed=seeds[0] if len(seeds) == 1 else None)
         elif self._rows.started:
-            seeds, episodes = self._rows.numbers()
-            seeds, first = seeds.copy(), episodes + self.num_envs
+            state = self._rows.state_arrays()
+            seeds, first = state["seed"].copy(), state["episode"] + self.num_envs
         else:
             seeds, first = self._seed, rows
             if seeds is None:
@@ -144,6 +145,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
             first = first.astype(np.int64)
             if first.ndim == 0:
                 first = first + rows
+        # One seed for all rows, or one for each.
         if first.shape != (self.num_envs,) or np.size(seeds) not in (1, self.num_envs):
             raise UserError(
                 f"reset(): expected one seed and one episode, or {self.num_envs} of each."
@@ -164,12 +166,15 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         terminated, truncated = stepped.terminated.copy(), stepped.truncated.copy()
         if self._view is not None:
             self._view.after_step(actions, reward)
-        if waiting.any():  # discard the step of these rows after their ends
+        # NEXT_STEP: these rows ended one step ago. They were stepped with the others, which is
+        # discarded here.
+        if waiting.any():
             reward[waiting], terminated[waiting], truncated[waiting] = 0.0, False, False
             self._rows.restart(waiting)
             self._begun(waiting)
         ended = self._ended = terminated | truncated
         final: dict[str, Any] = {}
+        # SAME_STEP: the last observation and info go into the info, before the rows are reset.
         if self._mode is AutoresetMode.SAME_STEP and ended.any():
             final = {"final_obs": _where(ended, self._rows.observation()), "_final_obs": ended}
             final |= {"final_info": _copied(self._rows.info()), "_final_info": ended}

@@ -61,6 +61,7 @@ def braking_demand(vehicles: Vehicles, road: Road, idm: IdmParameters = TABLE_V)
     and its follower's there. A lane that does not exist has no vehicles; :func:`on_road_actions`
     excludes it.
     """
+    # IDM of the ego in each lane, and of who would follow it there.
     scene = ego_scene(vehicles, road)
     lane = scene.observers.target_lane.to(vehicles.x.dtype)
     lanes = torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1)
@@ -124,11 +125,13 @@ class ActionMaskTransform(PerceptionTransform):
         ``vehicles`` are as the ego perceives them; ``direction`` [N] is that of its current lane
         change.
         """
+        # Replayed scenes have a road of their own in every row.
         lanes = road.lanes[:, 0] if isinstance(road.lanes, Tensor) else road.lanes
         on_road = on_road_actions(vehicles.target_lane[:, EGO_INDEX], lanes)
         legal = on_road & obeyed_actions(direction, self.abort)
         if self.form == "legal":
             return legal, torch.zeros_like(legal[:, 0])
+        # Keeping the lane is always allowed: where nothing is safe, there is nothing better.
         safe = braking_demand(vehicles, road, self.idm) >= -self.safe_deceleration
         none = ~(safe & legal).any(1)
         keep, changes = torch.ones_like(safe[:, :1]), legal[:, 1:] & safe[:, 1:]

@@ -70,6 +70,7 @@ class View(NamedTuple):
 def other_vehicles(vehicles: Vehicles, road: Road, scale: ObservationScale) -> Others:
     """The others, ordered by the vehicles' indices; an invalid one is (1, 0, 0), far ahead."""
     ego, others = vehicles.columns(slice(0, 1)), vehicles.columns(slice(1, None))
+    # Relative numbers over their scale, clipped.
     position = (road.distance_ahead(ego.x, others.x) / scale.range_m).clamp(-1.0, 1.0)
     speed = ((others.speed - ego.speed) / scale.speed_mps).clamp(-1.0, 1.0)
     own_lane = road.lane_of(others.y)
@@ -110,6 +111,7 @@ def vehicle_list(view: View) -> Tensor:
 
     Position, speed and lane of each vehicle, nearest first, invalid last.
     """
+    # Sorted by distance, not by the clipped position, which is alike for all far ones.
     distance = view.road.distance_ahead(view.seen.x[:, :1], view.seen.x[:, 1:]).abs()
     order = torch.where(view.others.valid, distance, torch.inf).argsort(dim=1, stable=True)
     return torch.stack([field.gather(1, order) for field in view.others[:3]], dim=-1).flatten(1)
@@ -136,6 +138,7 @@ def lane_view(view: View, drift: bool = False, overlap: bool = False) -> Tensor:
     lanes_apart = torch.round(others.lane * _widest(view.road.lanes))[:, None, :]
     distance = torch.add(distance, ~(in_sight & on_that_end & (lanes_apart == side)), alpha=_MASKED)
     nearest = distance.amin(-1, keepdim=True)
+    # Several vehicles can be equally near: the minimum over all of them is taken below.
     farther, exists = distance > nearest, nearest <= 1.0
 
     def of_the_nearest(field: Tensor) -> Tensor:
@@ -255,6 +258,7 @@ class ObservationTransform(PerceptionTransform):
         """Write ``observation``."""
         ego = state.get(keys.EGO)
         progress, direction = ego.get("change_progress"), ego.get("change_direction")
+        # The kernel computes the same numbers up to the rounding of the exponential function.
         if self.native is not None:
             observation = self.native.observe(vehicles, progress, direction, seen)
         else:

@@ -27,6 +27,7 @@ def speed_reward(
     """
     p = parameters or RewardParameters()
     reward = (speed - p.base_speed_mps) / (desired_speed - p.base_speed_mps)
+    # The paper negates the reward, which below the base speed would pay for hard braking.
     punished = -reward if p.literal_low_acceleration else -reward.abs()
     return torch.where(mean_acceleration < p.low_acceleration, punished, reward)
 
@@ -56,6 +57,8 @@ class RewardTransform(Transform):
         speed = vehicles.get("speed")[:, EGO_INDEX, None]
         desired = vehicles.get("desired_speed")[:, EGO_INDEX, None]
         acceleration = ego.get("mean_acceleration")[:, None]
+        # Every other term is a price times how often its event happened in the decision. They are
+        # added up in the order of term_names, which floating-point sums depend on.
         counts = {"lane_change": ego.get("started_change")[:, None]}
         for name in self.parameters.term_names[2:]:
             counts[name] = events.get(name)

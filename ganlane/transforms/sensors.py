@@ -48,11 +48,17 @@ def measure(
     count = shape[1]
     other = torch.arange(count, device=vehicles.x.device) != keys.EGO_INDEX
     scales = (parameters.position_noise_m, parameters.lateral_noise_m, parameters.speed_noise_mps)
+    # The ego knows itself: errors reach the others alone.
     if any(scales):
-        purposes = [Purpose.SENSED_POSITION, Purpose.SENSED_LATERAL, Purpose.SENSED_SPEED]
+        purposes: list[int] = [
+            Purpose.SENSED_POSITION,
+            Purpose.SENSED_LATERAL,
+            Purpose.SENSED_SPEED,
+        ]
         noise = normal(key, step, count, purposes, dtype).unbind(-1)
         for (name, value), scale, error in zip(values.items(), scales, noise):
             values[name] = torch.where(other, value + scale * error, value)
+    # A vehicle that drops out is as one that is not there.
     if parameters.dropout > 0:
         drawn = uniform(key, step, count, [Purpose.SENSED_DROPOUT], dtype)[..., 0]
         valid = valid & ~((drawn < parameters.dropout) & other)
@@ -143,6 +149,7 @@ class SensorTransform(Transform):
     ) -> TensorDictBase:
         first = self._measured(tensordict_reset)
         if self.delay > 0:
+            # Until a measurement is old enough, the first one is delivered.
             queues = first.apply(lambda new: new[:, None].repeat(1, self.delay, 1))
             tensordict_reset.set(SENSORS, queues)
         return tensordict_reset.set(PERCEIVED, first)
@@ -156,7 +163,7 @@ class SensorTransform(Transform):
         assert isinstance(observation_spec, Composite)
         true = observation_spec[keys.VEHICLES, "x"]
         rows, count = true.shape
-        shapes = {PERCEIVED: (rows, count)}
+        shapes: dict[str, tuple[int, ...]] = {PERCEIVED: (rows, count)}
         if self.delay > 0:
             shapes[SENSORS] = (rows, self.delay, count)
         for name, shape in shapes.items():

@@ -12,7 +12,6 @@ from ganlane.sim.scenes import FixedScene, SceneVehicle
 from ganlane.traffic import IdmMobilTraffic, IdmTraffic
 from ganlane.transforms import RewardParameters, RewardTransform
 
-
 CONSIDERATE = RewardParameters(soft_crash_behind=-10.0)
 
 

@@ -402,8 +402,8 @@ class HighwayEnv(EnvBase):
 class TransformedHighway(TransformedEnv):
     """A :class:`HighwayEnv` behind transforms.
 
-    Where the kernel drives, torch computes on one thread during a call, and the kernel on as many
-    as torch had (:func:`~ganlane.native.library.torch_on_one_thread`).
+    Where the kernel drives, torch computes on one thread during a step or reset, and the kernel on
+    as many as torch had (:func:`~ganlane.native.library.torch_on_one_thread`).
     """
 
     def _threads(self) -> AbstractContextManager[None]:
@@ -418,13 +418,6 @@ class TransformedHighway(TransformedEnv):
         """As of every environment."""
         with self._threads():
             return super().step(tensordict)
-
-    def step_and_maybe_reset(
-        self, tensordict: TensorDictBase
-    ) -> tuple[TensorDictBase, TensorDictBase]:
-        """As of every environment."""
-        with self._threads():
-            return super().step_and_maybe_reset(tensordict)
 
 
 @lru_cache(maxsize=8)

@@ -137,12 +137,13 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
                 seeds = int(self.np_random.integers(SEEDS))
         if episode is not None:
             first = array_of(episode)
-            if first.dtype.kind not in "iu" or (first < 0).any():
+            # Cast first: an unsigned number too large for int64 is below 0 then.
+            first = first.astype(np.int64) if first.dtype.kind in "iu" else np.asarray(-1)
+            if (first < 0).any():
                 raise UserError(
                     f"options: episode={episode!r:.80}: expected whole numbers from 0; "
                     "give for instance 3."
                 )
-            first = first.astype(np.int64)
             if first.ndim == 0:
                 first = first + rows
         # One seed for all rows, or one for each.

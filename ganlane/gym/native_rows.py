@@ -30,7 +30,27 @@ class NativeRows(Rows):
     def __init__(self, batch: NativeBatch, episode: EpisodeParameters) -> None:
         self.batch, self.count, self.episode = batch, batch.rows, episode
         self.space = observation_space(batch.observation.shape[1], batch.bounds[1])
-        self._never = np.zeros(batch.rows, np.bool_)
+        # Made once, since they are views of arrays that the kernel writes to.
+        state = batch.state
+        self._arrays: dict[str, Any] = {
+            **state,
+            "y": state["y"][:, keys.EGO_INDEX],
+            "speed": state["speed"][:, keys.EGO_INDEX],
+            "scene_end": np.zeros(batch.rows, np.bool_),
+            keys.SOFT_CRASH: state["soft_crashes"],
+            keys.SOFT_CRASH_BEHIND: state["soft_crashes_behind"],
+            "lanes": batch.lanes,
+            "lane_width_m": batch.lane_width_m,
+            keys.REWARD_TERMS: batch.reward_terms(),
+        }
+
+    def __getstate__(self) -> tuple[NativeBatch, EpisodeParameters, bool]:
+        """Without the views, which a copy has of its own arrays."""
+        return self.batch, self.episode, self.started
+
+    def __setstate__(self, state: tuple[NativeBatch, EpisodeParameters, bool]) -> None:
+        self.__init__(*state[:2])  # type: ignore[misc]
+        self.started = state[2]
 
     def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
         self.started = True
@@ -50,18 +70,7 @@ class NativeRows(Rows):
         return self.batch.mask
 
     def state_arrays(self) -> Mapping[str, Any]:
-        state = self.batch.state
-        return {
-            **state,
-            "y": state["y"][:, keys.EGO_INDEX],
-            "speed": state["speed"][:, keys.EGO_INDEX],
-            "scene_end": self._never,
-            keys.SOFT_CRASH: state["soft_crashes"],
-            keys.SOFT_CRASH_BEHIND: state["soft_crashes_behind"],
-            "lanes": self.batch.lanes,
-            "lane_width_m": self.batch.lane_width_m,
-            keys.REWARD_TERMS: self.batch.reward_terms(),
-        }
+        return self._arrays
 
 
 def native_rows(traffic: Option, count: int, options: Mapping[str, Any]) -> NativeRows | None:

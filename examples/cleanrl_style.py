@@ -94,9 +94,8 @@ def main(decisions=16_384, num_envs=64):
             target.load_state_dict(network.state_dict())
     returns = list(envs.return_queue)
     print(f"{decisions} decisions, {envs.episode_count} episodes, loss {loss:.3f}")
-    print(
-        f"mean return of the last {len(returns)}: {np.mean(returns) if returns else float('nan'):.1f}"
-    )
+    mean = np.mean(returns) if returns else float("nan")
+    print(f"mean return of the last {len(returns)}: {mean:.1f}")
 
 
 if __name__ == "__main__":

@@ -43,13 +43,12 @@ def main():
         driver = DRIVERS[name](road, Stream.REPORT)
         for title, transforms in (("paper", []), ("courteous", [Courtesy()])):
             traffic = IdmMobilTraffic(road, Stream.REPORT)
-            env = HighwayEnv(traffic, num_envs=24, episode=short, stream=Stream.REPORT)
+            env = HighwayEnv(traffic, num_envs=24, episode=short)
             env = TransformedEnv(env, Compose(RewardTransform(), *transforms))
             episodes = run_episodes(env, driver, range(24), seed=0)
             behind = episodes["soft_crash_behind"].sum()
-            print(
-                f"{name:>12} {title:>9}: mean return {episodes['reward'].mean():7.1f}, {behind} onsets behind"
-            )
+            mean = episodes["reward"].mean()
+            print(f"{name:>12} {title:>9}: mean return {mean:7.1f}, {behind} onsets behind")
 
 
 if __name__ == "__main__":

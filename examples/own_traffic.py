@@ -48,9 +48,8 @@ def main():
     state = env.rollout(30, MobilDriver(road), auto_reset=True, break_when_any_done=False)["next"]
     others = state["vehicles"][..., 1:]
     looking_away = (state["traffic", "away"][..., 1:] > 0).double().mean()
-    print(
-        f"mean speed of the others {others['speed'].mean():.1f} m/s, {100 * looking_away:.0f} % look away"
-    )
+    speed = others["speed"].mean()
+    print(f"mean speed of the others {speed:.1f} m/s, {100 * looking_away:.0f} % look away")
     print(f"soft crashes of the ego: {int(state['events', 'soft_crash'].sum())} in 8 x 30 s")
 
 

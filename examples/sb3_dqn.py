@@ -37,7 +37,8 @@ def main(decisions=2_000, episodes=20, goal_m=1000.0):
     model.learn(decisions)
     finished = [episode["r"] for episode in model.ep_info_buffer]
     print(
-        f"{model.num_timesteps} decisions, mean return of the last {len(finished)} episodes {mean(finished):.1f}"
+        f"{model.num_timesteps} decisions, mean return of the last {len(finished)} episodes "
+        f"{mean(finished):.1f}"
     )
     policy = TensorDictModule(Greedy(model.q_net), in_keys=["observation"], out_keys=["action"])
     sb3 = ganlane.Driver("sb3_dqn", policy)

@@ -34,9 +34,18 @@ def main(
         # crashes make the rewards' scale large
         env = VecNormalize(env, norm_obs=False, gamma=0.98, clip_reward=1e9)
     model = {"PPO": PPO, "MaskablePPO": MaskablePPO}[algorithm](
-        "MlpPolicy", env, learning_rate=lambda left: 1e-3 * left, n_steps=64, batch_size=2048, n_epochs=5,
-        gamma=0.98, gae_lambda=0.9, ent_coef=0.01, policy_kwargs={"net_arch": [128, 128]}, seed=0,
-    )  # fmt: skip
+        "MlpPolicy",
+        env,
+        learning_rate=lambda left: 1e-3 * left,
+        n_steps=64,
+        batch_size=2048,
+        n_epochs=5,
+        gamma=0.98,
+        gae_lambda=0.9,
+        ent_coef=0.01,
+        policy_kwargs={"net_arch": [128, 128]},
+        seed=0,
+    )
     model.learn(int(decisions))
     drivers = [ganlane.sb3.driver(model), "mobil"]
     table = ganlane.api.evaluate(drivers, ["idm_mobil"], int(episodes), **options)

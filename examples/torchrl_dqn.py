@@ -55,9 +55,8 @@ def main(decisions="1000000", episodes="100", goal_m="5000", num_envs="64"):
             optimiser.step()
             optimiser.zero_grad()
             target.step()
-    print(
-        f"loss {losses['loss'].item():.3f}, reward per decision {batch['next', 'reward'].mean():.2f}"
-    )
+    paid = batch["next", "reward"].mean()
+    print(f"loss {losses['loss'].item():.3f}, reward per decision {paid:.2f}")
     drivers = [ganlane.Driver("torchrl_dqn", actor), "mobil"]
     table = ganlane.api.evaluate(drivers, ["idm_mobil"], int(episodes), **options)
     print(table.select("agent", "episodes", "goal", "hard_crash", "mean_reward"))

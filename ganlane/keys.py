@@ -2,26 +2,27 @@
 
 N environments, M vehicles, the ego at index 0; floats in the run's dtype, SI units.
 
-=========================================  ==========
-================================================== ``vehicles.x, y``                          [N, M]
-     centre of the body, m; x along the road, y to the left ``vehicles.heading``
-       [N, M]      rad, relative to the road, anticlockwise
-``vehicles.speed, acceleration``           [N, M]      m/s, m/s2
-``vehicles.length, width``                 [N, M]      m, fixed for an episode
-``vehicles.desired_speed``                 [N, M]      m/s, fixed for an episode
-``vehicles.target_lane``                   [N, M] i64  the lane it keeps or is moving to; 0 is the
-rightmost ``vehicles.visibility``                    [N, M] i64  0 centre, 1 body, 2 signalled
-(:mod:`ganlane.sim.state`) ``vehicles.valid``                         [N, M] b    false is padding:
-never seen, hit or counted ``ego.*``                                  [N]         the environment's
-memory of the ego ``traffic.*``                              free        the traffic module's memory
-``seed, episode, step``                    [N] i64     they determine every random number; step: 0.1
-s each ``road.lanes``                             [N, 1] i64  only where every row has its own road
-(replay) ``road.lane_width_m``                      [N, 1]      the same, m
-``events.*``                               [N, 1]      events of the last decision
-``action``                                 [N] i64     0 keep, 1 left, 2 right
-``action_mask``                            [N, 3] b    which of them are allowed, where there is a
-mask =========================================  ==========
-==================================================
+======================================  ==========  ==============================================
+``vehicles.x, y``                       [N, M]      centre of the body, m; x along the road, y to
+                                                    the left
+``vehicles.heading``                    [N, M]      rad, relative to the road, anticlockwise
+``vehicles.speed, acceleration``        [N, M]      m/s, m/s2
+``vehicles.length, width``              [N, M]      m, fixed for an episode
+``vehicles.desired_speed``              [N, M]      m/s, fixed for an episode
+``vehicles.target_lane``                [N, M] i64  the lane it keeps or is moving to; 0 is the
+                                                    rightmost
+``vehicles.visibility``                 [N, M] i64  0 centre, 1 body, 2 signalled
+                                                    (:mod:`ganlane.sim.state`)
+``vehicles.valid``                      [N, M] b    false is padding: never seen, hit or counted
+``ego.*``                               [N]         the environment's memory of the ego
+``traffic.*``                           free        the traffic module's memory
+``seed, episode, step``                 [N] i64     they determine every random number; step: 0.1 s
+``road.lanes``                          [N, 1] i64  only where every row has its own road (replay)
+``road.lane_width_m``                   [N, 1]      the same, m
+``events.*``                            [N, 1]      events of the last decision
+``action``                              [N] i64     0 keep, 1 left, 2 right
+``action_mask``                         [N, 3] b    which of them are allowed, where there is a mask
+======================================  ==========  ==============================================
 """
 
 from __future__ import annotations
@@ -38,8 +39,7 @@ REWARD_TERMS: Final = "reward_terms"
 SEED: Final = "seed"
 EPISODE: Final = "episode"
 STEP: Final = "step"
-#: The episodes' keys [N] int64 (:func:`ganlane.sim.random.episode_key`), given to the traffic once
-#: per decision.
+#: Keys of the episodes [N] int64 (:func:`ganlane.sim.random.episode_key`), for the traffic.
 EPISODE_KEY: Final = "episode_key"
 ACTION: Final = "action"
 #: Value of the chosen action by the policy, if it writes one, [N] or [N, 1]; named as in TorchRL.

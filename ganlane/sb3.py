@@ -1,5 +1,4 @@
-"""The batched highway for stable-baselines3: one ``VecEnv`` whose environments are stepped
-together.
+"""The batched highway for stable-baselines3: a ``VecEnv`` of highways stepped together.
 
 ::
 
@@ -88,26 +87,26 @@ class HighwayVecEnv(VecEnv):
         self._length += 1
         done = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        # SB3 bootstraps from the last observation of a row that was cut off, not of one that ended.
         for row in np.flatnonzero(done):
-            infos[row] = self._final_info(
-                int(row), info, bool(truncated[row] and not terminated[row])
-            )
+            infos[row] = self._final_info(int(row), info)
+            infos[row]["TimeLimit.truncated"] = bool(truncated[row] and not terminated[row])
         self._return[done], self._length[done] = 0.0, 0
         return observation, reward.astype(np.float32), done, infos
 
-    def _final_info(self, row: int, info: dict[str, Any], truncated: bool) -> dict[str, Any]:
-        final = {
-            name: values[row]
-            for name, values in info["final_info"].items()
-            if not isinstance(values, dict)
-        }
-        episode = {
+    def _final_info(self, row: int, info: dict[str, Any]) -> dict[str, Any]:
+        """What an ended row reports: gymnasium's info but for the terms of the reward."""
+        final = {}
+        for name, values in info["final_info"].items():
+            if not isinstance(values, dict):
+                final[name] = values[row]
+        final["terminal_observation"] = info["final_obs"][row]
+        final["episode"] = {
             "r": float(self._return[row]),
             "l": int(self._length[row]),
             "t": float(final["time_s"]),
         }
-        final |= {"terminal_observation": info["final_obs"][row], "TimeLimit.truncated": truncated}
-        return {**final, "episode": episode}
+        return final
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed of the next reset; one for all rows, which drive different episodes of it."""
@@ -135,16 +134,15 @@ class HighwayVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *args: Any, indices: Indices = None, **kwargs: Any
     ) -> list[Any]:
-        """The result of a method that gives one result per row (``action_masks``, ``render``), rows
-        ``indices``.
+        """The results of a method in the rows ``indices``: ``action_masks`` or ``render``.
 
         Raises:
             UserError: no such method.
         """
         if method_name not in _OF_ROWS:
+            names = " and ".join(_OF_ROWS)
             raise UserError(
-                f"env_method({method_name!r}): the rows have {' and '.join(_OF_ROWS)}; call one of "
-                "them."
+                f"env_method({method_name!r}): the rows have {names}; call one of them."
             )
         results = getattr(self.highways, method_name)(*args, **kwargs)
         return [results[row] for row in self._get_indices(indices)]
@@ -182,8 +180,9 @@ def make_vec_env(
 
 
 class ModelPolicy(TensorDictModuleBase):
-    """The deterministic policy of a stable-baselines3 model: writes ``action`` [N] for
-    ``observation`` [N, D].
+    """The deterministic policy of a stable-baselines3 model.
+
+    It writes ``action`` [N] for ``observation`` [N, D].
 
     Args:
         model: trained on :func:`make_vec_env`; one with masks (sb3-contrib's) is given
@@ -196,23 +195,23 @@ class ModelPolicy(TensorDictModuleBase):
     def __init__(self, model: BaseAlgorithm) -> None:
         super().__init__()
         self.model = model
+        # sb3-contrib's MaskablePPO and its kin take masks; SB3's own algorithms do not.
         self._masked = type(model).__name__.startswith("Maskable")
         self.in_keys = [keys.OBSERVATION, keys.ACTION_MASK] if self._masked else [keys.OBSERVATION]
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action``."""
-        masks = (
-            {"action_masks": tensordict.get(keys.ACTION_MASK).cpu().numpy()} if self._masked else {}
-        )
+        masks = {}
+        if self._masked:
+            masks["action_masks"] = tensordict.get(keys.ACTION_MASK).cpu().numpy()
         observation = tensordict.get(keys.OBSERVATION).cpu().numpy()
         action, _ = self.model.predict(observation, deterministic=True, **masks)
         return tensordict.set(keys.ACTION, torch.as_tensor(action, device=tensordict.device).long())
 
 
 def driver(model: BaseAlgorithm, name: str | None = None) -> Driver:
-    """A trained stable-baselines3 model as a driver for ``ganlane.api.evaluate`` and
-    ``ganlane.api.render``.
+    """A trained model as a driver for ``ganlane.api.evaluate`` and ``ganlane.api.render``.
 
     It reads the observation of the evaluation, by default the one that :func:`make_vec_env` uses by
     default.

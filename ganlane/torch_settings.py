@@ -30,8 +30,9 @@ def can_compile() -> bool:
 
 
 def compiled(function: F) -> F:
-    """Compile ``function``, pure and on tensors without branches on their values, to one graph per
-    shape.
+    """Compile ``function`` to one graph per shape.
+
+    It is pure, on tensors, and has no branches on their values.
     """
     torch._dynamo.config.cache_size_limit = max(
         torch._dynamo.config.cache_size_limit, GRAPHS_PER_FUNCTION
@@ -40,10 +41,7 @@ def compiled(function: F) -> F:
 
 
 def outside_autocast(function: F) -> F:
-    """Decorator.
-
-    ``function`` computes in the types of its arguments, even under the caller's autocast.
-    """
+    """Let ``function`` compute in the types of its arguments, even under a caller's autocast."""
 
     @wraps(function)
     def computed(*arguments: Any, **named: Any) -> Any:
@@ -59,18 +57,16 @@ def outside_autocast(function: F) -> F:
 
 
 def check_default_device(device: str) -> None:
-    """Raise :class:`UserError` if torch's default device is neither the CPU nor of the type
-    ``device``.
-    """
+    """Raise :class:`UserError` if torch's default device is not the CPU or of type ``device``."""
     default = torch.get_default_device().type
     if default not in ("cpu", device):
         raise UserError(
             f"torch's default device is {default}, and the highway's tensors would not meet those "
-            "that are made "
-            "there; call torch.set_default_device('cpu') and choose the highway's own with device=."
+            "that are made there; call torch.set_default_device('cpu') and choose the highway's "
+            "own with device=."
         )
 
 
 def set_threads(threads: int) -> None:
-    """Set torch's number of threads; 0 means one, which is fastest for the batch sizes used here."""
+    """Set torch's number of threads; 0 means one, the fastest for the batch sizes used here."""
     torch.set_num_threads(threads or 1)

@@ -98,8 +98,8 @@ def test_a_partial_reset_leaves_the_other_rows_as_they_are_bit_for_bit():
     asked = td.clone()
     asked["_reset"] = mask[:, None]
     after = env.reset(asked).exclude("_reset", "reward")
-    kept = (~mask).nonzero()[:, 0]
-    assert same_bits(after[kept], td.exclude("reward")[kept]) == []
+    going_on = (~mask).nonzero()[:, 0]
+    assert same_bits(after[going_on], td.exclude("reward")[going_on]) == []
     assert after[keys.EPISODE].tolist() == [0, 6, 2, 3, 9]
     whole = environment(num_envs=10, seed=9).reset()
     assert same_bits(after[mask], whole[torch.tensor([6, 9])]) == []
@@ -150,16 +150,18 @@ def test_a_reset_with_seed_and_episode_runs_exactly_those():
     assert asked[keys.EPISODE].tolist() == [40, 2, 0]
     assert same_bits(asked[1:2], env.reset()[2:3]) == []
     assert same_bits(asked[2:3], environment(num_envs=1, seed=5).reset()) == []
+    through = TransformedEnv(env, StepCounter()).reset(td.clone())
+    assert same_bits(through.exclude("step_count"), asked) == []
 
 
 def test_a_copied_state_goes_on_alike_and_is_not_written():
     env = environment(num_envs=4)
     td = step(env, env.reset(), LEFT)
-    kept = td.clone()
+    before = td.clone()
     td["action"] = torch.tensor([KEEP, LEFT, RIGHT, KEEP])
     twice = [env.step(td)["next"].clone() for _ in range(2)]
     assert same_bits(*twice) == []
-    assert same_bits(td.exclude("action", "next"), kept) == []
+    assert same_bits(td.exclude("action", "next"), before) == []
 
 
 # Commands

@@ -6,9 +6,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from reference.worlds import Track, assert_same_tracks, environment, leaves, same_bits, tracks
-from tensordict import TensorDict
-from torchrl.envs import Compose, TransformedEnv
+from reference.worlds import Track, assert_same_tracks, environment, tracks
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
@@ -16,7 +14,6 @@ from ganlane.settings.driving import Visibility
 from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmMobilTraffic
-from ganlane.transforms import ObservationTransform, RewardTransform
 
 
 def make(num_envs: int, mobil: bool) -> HighwayEnv:
@@ -82,34 +79,6 @@ def test_an_episode_is_the_same_in_a_batch_of_4096(mobil, in_64):
     in_4096 = tracks(make(4096, mobil), 11, action)
     assert_same_tracks(in_4096, in_64, at_least=60)
     assert_same_tracks(tracks(make(3, mobil), 11, action, [4095, 2048, 1000]), in_4096, at_least=3)
-
-
-def test_a_saved_state_goes_on_in_another_environment(tmp_path, mobil):
-    env = make(5, mobil)
-    td = env.reset()
-    for _ in range(3):
-        td = env.step(td.set("action", action(td)))["next"]
-    torch.save(dict(leaves(td)), tmp_path / "state.pt")
-    loaded = make(5, mobil).reset()
-    for name, value in torch.load(tmp_path / "state.pt", weights_only=True).items():
-        loaded[name] = value
-    td["action"] = action(td)
-    loaded["action"] = action(loaded)
-    assert same_bits(env.step(td)["next"], make(5, mobil).step(loaded)["next"]) == []
-
-
-def transformed(num_envs):
-    base = HighwayEnv(IdmMobilTraffic(), num_envs=num_envs)
-    return TransformedEnv(base, Compose(ObservationTransform(base.road), RewardTransform()))
-
-
-def test_a_reset_runs_the_episodes_that_are_asked_for_through_transforms():
-    asked = TensorDict({"seed": torch.full((3,), 5), "episode": torch.tensor([7, 2, 2**40])}, [3])
-    state = transformed(3).reset(asked.clone())
-    assert state["episode"].tolist() == [7, 2, 2**40]
-    assert state["seed"].tolist() == [5, 5, 5]
-    alone = transformed(1).reset(asked[1:2])
-    assert torch.equal(alone["observation"][0], state["observation"][1])
 
 
 def test_nonsense_in_the_padding_of_a_scene_reaches_nobody():

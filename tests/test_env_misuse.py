@@ -16,7 +16,6 @@ from ganlane import keys
 from ganlane.build import make_traffic
 from ganlane.settings.env import EnvConfig
 from ganlane.env import HighwayEnv
-from ganlane.env.state import ActionCheck
 from ganlane.errors import UserError
 from ganlane.native.library import why_not
 from ganlane.options import option
@@ -41,7 +40,6 @@ def made(**options):
         *({"seed": value} for value in (2**63, -1, 0.5, "one")),
         *({"first_episode": value} for value in (2**63, -1, 0.5)),
         *({"device": value} for value in ("meta", "nonsense")),
-        {"stream": "train"},
         {"scenes": 3},
     ],
     ids=str,
@@ -97,14 +95,6 @@ def test_actions_of_a_shorter_integer_type_are_taken(kernel):
     assert torch.equal(long["next", keys.VEHICLES, "x"], short["next", keys.VEHICLES, "x"])
 
 
-def test_what_is_found_on_another_device_is_told_in_a_later_step():
-    check = ActionCheck(1, torch.device("cpu"))
-    check._arrived = torch.zeros((), dtype=torch.bool)  # as on a GPU, without one
-    check._look_later(torch.tensor([3]))
-    with pytest.raises(UserError, match="in an earlier step"):
-        check._look_later(torch.tensor([1]))
-
-
 @pytest.mark.parametrize(
     "state", [{}, {keys.ACTION: torch.ones(1, dtype=torch.int64)}], ids=["nothing", "action"]
 )
@@ -142,11 +132,11 @@ def test_a_default_device_without_numbers_is_refused_everywhere():
 
 def paths(env, actions):
     """x of all vehicles after each of the ``actions`` [T, N]."""
-    state, found = env.reset(), []
+    state, courses = env.reset(), []
     for action in actions:
         stepped, state = env.step_and_maybe_reset(state.set(keys.ACTION, action))
-        found.append(stepped["next", keys.VEHICLES, "x"])
-    return torch.stack(found)
+        courses.append(stepped["next", keys.VEHICLES, "x"])
+    return torch.stack(courses)
 
 
 @pytest.mark.parametrize(

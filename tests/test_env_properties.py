@@ -167,9 +167,9 @@ def test_a_vehicle_that_is_not_valid_is_in_no_observation(data, form, lanes, oth
         any_vehicles(1 + others, lanes, data.draw(seeds)).with_(valid=valid) for _ in range(2)
     )
     haunted = scene.where(valid, ghosts)
-    road, own = Road(lanes), torch.zeros(1, dtype=torch.float64)
+    road, still = Road(lanes), torch.zeros(1, dtype=torch.float64)
     seen = [
-        ObservationTransform(road, 1 + others, form).observe(s, own, own.long(), road)
+        ObservationTransform(road, 1 + others, form).observe(s, still, still.long(), road)
         for s in (scene, haunted)
     ]
     assert torch.equal(*seen)

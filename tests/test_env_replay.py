@@ -30,9 +30,11 @@ def recordings() -> Recordings:
     """
     parts = []
     for k in range(3):
-        made = synthetic_scenes(SyntheticTraffic(scenes=1, lanes=2 + k, seconds=9.0 - k), seed=k)
-        made = made.filter((pl.col("vehicle") % 3 > 0) | (pl.col("frame") <= 45))
-        parts.append(made.with_columns(scene=pl.lit(f"scene-{k}")))
+        scene_rows = synthetic_scenes(
+            SyntheticTraffic(scenes=1, lanes=2 + k, seconds=9.0 - k), seed=k
+        )
+        scene_rows = scene_rows.filter((pl.col("vehicle") % 3 > 0) | (pl.col("frame") <= 45))
+        parts.append(scene_rows.with_columns(scene=pl.lit(f"scene-{k}")))
     return Recordings.of(sort(pl.concat(parts)), "synthetic", 5.0)
 
 

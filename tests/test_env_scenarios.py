@@ -96,7 +96,7 @@ def test_in_the_cut_in_the_ego_brakes_hard_but_nobody_crashes(driver, traffic):
     assert (ego.amin(0) < -4.0).all()
 
 
-def test_after_the_cut_in_a_keep_lane_ego_follows_at_the_others_speed_and_a_mobil_ego_leaves_the_lane():
+def test_after_the_cut_in_a_keep_lane_ego_follows_and_a_mobil_ego_leaves_the_lane():
     following = drive(SCENARIOS["cut_in"], "keep_lane", "idm", 45).frames[-1]
     assert (following.speed[:, 0] < 17.5).all()
     free = drive(SCENARIOS["cut_in"], "mobil", "idm", 45).frames[-1]

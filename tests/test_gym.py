@@ -16,10 +16,14 @@ from gymnasium.vector import AutoresetMode
 from reference.gym_env import ID, KEEP, LEFT, RIGHT, ROOT, make, make_vec, until_the_end
 
 import ganlane
+from ganlane.build import make_traffic
+from ganlane.settings.env import EnvConfig
 from ganlane.errors import UserError
 from ganlane.gym import ENV_IDS
-from ganlane.gym.rows import NativeRows, make_rows
+from ganlane.gym.base import make_rows
+from ganlane.gym.native_rows import NativeRows
 from ganlane.native.library import why_not
+from ganlane.options import option
 
 
 @pytest.mark.parametrize("name", sorted(ENV_IDS.keys() - {ID}))
@@ -88,21 +92,21 @@ def test_gymnasiums_own_check_finds_nothing_to_say(options):
     [("gan", AutoresetMode.SAME_STEP), *(("idm", mode) for mode in AutoresetMode)],
 )
 def test_neither_making_nor_running_a_batch_warns(traffic, mode):
-    """gymnasium has no checker for batches: this is what its one for single environments looks at."""
+    """gymnasium has no checker for batches: this is what its one for one environment looks at."""
     envs = gymnasium.make_vec(ID, num_envs=3, traffic=traffic, goal_m=60.0, autoreset_mode=mode)
     first, info = envs.reset(seed=0)
     assert data_equivalence(envs.reset(seed=0), (first, info), exact=True)
     for _ in range(6):
         observation, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
         assert envs.observation_space.contains(observation)
-        kept = copy.deepcopy((observation, reward, info))
+        before = copy.deepcopy((observation, reward, info))
         ended = terminated | truncated
         if mode is AutoresetMode.DISABLED and ended.any():
             envs.reset(options={"reset_mask": ended})
         else:
             envs.step(np.zeros(3, int))
             envs.reset()
-        assert data_equivalence(kept, (observation, reward, info), exact=True)
+        assert data_equivalence(before, (observation, reward, info), exact=True)
     envs.close()
     envs.close()
     assert envs.metadata["autoreset_mode"] is mode
@@ -111,9 +115,9 @@ def test_neither_making_nor_running_a_batch_warns(traffic, mode):
 
 
 def test_the_id_imports_the_package_which_imports_neither_torch_nor_hydra():
-    made = "import gymnasium; print(gymnasium.make('ganlane:ganlane/Highway-v0').action_space)"
+    making = "import gymnasium; print(gymnasium.make('ganlane:ganlane/Highway-v0').action_space)"
     slow = "import sys, ganlane; print({'torch', 'hydra', 'polars', 'PIL'} & sys.modules.keys())"
-    for code, printed in ((made, "Discrete(3)\n"), (slow, "set()\n")):
+    for code, printed in ((making, "Discrete(3)\n"), (slow, "set()\n")):
         assert subprocess.check_output([sys.executable, "-c", code], text=True, cwd=ROOT) == printed
 
 
@@ -148,12 +152,43 @@ def test_a_row_of_a_batch_drives_as_one_alone_does():
     for step in actions:
         together, reward, terminated, truncated, info = envs.step(step)
         for row in np.flatnonzero(running):
-            own, own_reward, *ended, _ = alone[row].step(step[row])
+            seen, own_reward, *ended, _ = alone[row].step(step[row])
             last = info["final_obs"][row] if terminated[row] or truncated[row] else together[row]
-            np.testing.assert_array_equal(last, own)
+            np.testing.assert_array_equal(last, seen)
             assert reward[row] == own_reward
             assert [terminated[row], truncated[row]] == ended
         running &= ~(terminated | truncated)
+
+
+@pytest.mark.parametrize(
+    "traffic",
+    [
+        "idm",
+        "idm_mobil",
+        "idm_random",
+        "idm_faults",
+        "gan",
+        {"name": "idm", "blind_share": 0.5},
+    ],
+)
+def test_option_and_module_give_one_answer_to_who_drives(traffic):
+    config, env = option("traffic", traffic), EnvConfig()
+    drivers = make_traffic(config, env).native_parameters()
+    assert config.native_parameters(env) == drivers
+    assert (drivers is not None) == (traffic in ("idm", "idm_mobil"))
+
+
+@pytest.mark.skipif(why_not() is not None, reason=f"no native kernel here: {why_not()}")
+def test_pictures_change_nobody():
+    """With a render mode the same kernel drives, behind the TorchRL environment."""
+    plain, drawn = make(), make(render_mode="rgb_array")
+    assert drawn.unwrapped._rows.env.base_env.kernel is not None
+    for env in (plain, drawn):
+        env.reset(seed=1)
+    for action in (LEFT, KEEP, RIGHT):
+        (observation, *rest), (expected, *expected_rest) = plain.step(action), drawn.step(action)
+        np.testing.assert_array_equal(observation, expected)
+        assert str(rest) == str(expected_rest)
 
 
 def test_the_facade_gives_what_the_torchrl_environment_gives():
@@ -196,7 +231,7 @@ def test_leaving_the_road_terminates_and_the_mask_says_so_beforehand():
 
 
 def returns_by_episode(mode, kernel):
-    """Return of every finished episode by its number, rows in ``mode``; all rows keep their lanes."""
+    """Return of every finished episode by its number; all rows keep their lanes."""
     envs = make_vec(3, kernel=kernel, autoreset_mode=mode, goal_m=120.0)
     assert envs.metadata["autoreset_mode"] is mode
     _, info = envs.reset(seed=4)
@@ -288,7 +323,7 @@ def begun(env):
         (lambda: make(seed=-1), "seed=-1: expected a whole number from 0"),
         (lambda: make(seed=np.array([1, 2])), "seed=array"),
         (lambda: make(render_mode="ansi"), "render_mode=ansi: expected one of human, rgb_array"),
-        (lambda: make_vec(2, render_mode=5), "render_mode=5: expected a text"),
+        (lambda: make_vec(2, render_mode=5), "render_mode=5: a batch has rgb_array only"),
         (lambda: make_vec(True), "num_envs=True: expected a whole number"),
         (lambda: make().unwrapped.step(KEEP), "call reset"),
         (lambda: make_vec(2).step(np.zeros(2, int)), "call reset"),
@@ -373,14 +408,14 @@ def test_a_copy_goes_on_as_the_environment_does_and_leaves_it_alone(twin, traffi
     env.step(LEFT)
     other = twin(env)
     theirs = [other.step(action) for action in (KEEP, RIGHT)]
-    for (observation, *rest), (expected, *known) in zip(
+    for (observation, *rest), (expected, *expected_rest) in zip(
         [env.step(action) for action in (KEEP, RIGHT)], theirs
     ):
         assert np.array_equal(observation, expected)
-        assert str(rest) == str(known)
+        assert str(rest) == str(expected_rest)
 
 
 @pytest.mark.skipif(why_not() is not None, reason=f"no native kernel here: {why_not()}")
 @pytest.mark.parametrize("count", [3, np.int64(3)])
 def test_numpys_numbers_of_environments_get_the_native_kernel_too(count):
-    assert isinstance(make_rows("idm_mobil", count, None, {}), NativeRows)
+    assert isinstance(make_rows("idm_mobil", count, False, {}), NativeRows)

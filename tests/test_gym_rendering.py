@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from reference.gym_env import ID, KEEP, make, make_vec, until_the_end
 
 from ganlane.errors import UserError
-from ganlane.gym.single import FilmWindow
+from ganlane.gym.window import FilmWindow
 
 
 def test_frames_show_the_road_and_change_as_the_ego_drives():

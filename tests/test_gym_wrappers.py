@@ -99,18 +99,6 @@ def test_the_check_of_stable_baselines3_finds_nothing():
         checker.check_env(make().unwrapped)
 
 
-def test_stable_baselines3s_dqn_learns_on_it_unchanged():
-    baselines = pytest.importorskip("stable_baselines3", reason="the extra sb3 is not installed")
-    env = gymnasium.make(ID, traffic="idm", goal_m=200.0)
-    model = baselines.DQN(
-        "MlpPolicy", env, learning_starts=50, seed=0, policy_kwargs={"net_arch": [16]}
-    )
-    before = [weight.clone() for weight in model.q_net.parameters()]
-    model.learn(200)
-    assert model.num_timesteps == 200
-    assert any(not torch.equal(old, new) for old, new in zip(before, model.q_net.parameters()))
-
-
 def test_tianshou_trains_on_it_unchanged():
     pytest.importorskip("tianshou", minversion="2.0", reason="tianshou is not installed")
     from tianshou.algorithm.modelfree.dqn import DQN, DiscreteQLearningPolicy
@@ -128,9 +116,15 @@ def test_tianshou_trains_on_it_unchanged():
     collector = Collector(algorithm, envs, VectorReplayBuffer(1000, 2))
     collector.reset()
     parameters = OffPolicyTrainerParams(
-        training_collector=collector, max_epochs=1, epoch_num_steps=200, collection_step_num_env_steps=20,
-        batch_size=32, update_step_num_gradient_steps_per_sample=0.1, show_progress=False, verbose=False,
-    )  # fmt: skip
+        training_collector=collector,
+        max_epochs=1,
+        epoch_num_steps=200,
+        collection_step_num_env_steps=20,
+        batch_size=32,
+        update_step_num_gradient_steps_per_sample=0.1,
+        show_progress=False,
+        verbose=False,
+    )
     result = algorithm.run_training(parameters)
     assert result.train_step == 200
     assert result.train_episode >= 10

@@ -130,7 +130,7 @@ def test_attributes_are_those_of_the_batch_and_cannot_be_set():
     env.close()
 
 
-@pytest.mark.parametrize("algorithm", QUICK, ids=lambda each: each.__name__)
+@pytest.mark.parametrize("algorithm", QUICK, ids=lambda kind: kind.__name__)
 def test_the_algorithm_trains_unchanged_and_its_policy_can_be_evaluated(algorithm):
     env = made(mask="safe")
     with warnings.catch_warnings():

@@ -55,11 +55,9 @@ class Rules(NamedTuple):
 
 def scene_over(rules: Rules, step: Tensor) -> Tensor:
     """Whether the recorded scene has ended at physics step ``step``, bool [N]."""
-    return (
-        torch.zeros_like(step, dtype=torch.bool)
-        if rules.scene_steps is None
-        else step >= rules.scene_steps
-    )
+    if rules.scene_steps is None:
+        return torch.zeros_like(step, dtype=torch.bool)
+    return step >= rules.scene_steps
 
 
 class Substep(NamedTuple):
@@ -91,6 +89,7 @@ def begin(
     """
     lanes = rules.road.lanes if isinstance(rules.road.lanes, int) else rules.road.lanes[:, 0]
     target, direction = vehicles.target_lane[:, EGO_INDEX], ego["change_direction"]
+    # The command sets the lane that the ego steers to; the motion itself takes several decisions.
     command = apply_action(action, target, direction, lanes, rules.ego.abort_lane_change)
     targets = torch.cat((command.target_lane[:, None], vehicles.target_lane[:, 1:]), dim=1)
     vehicles = vehicles.with_(target_lane=targets)
@@ -125,6 +124,7 @@ def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -
         rules.steering,
         PHYSICS_STEP_S,
     )
+    # The others moved while they saw the ego where it was: all move at once, from one state.
     running, vehicles = before.running, moved.with_first(ego)
     if not all_running:
         vehicles = vehicles.where(running, before.vehicles)
@@ -132,6 +132,7 @@ def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -
     acceleration, ahead, behind = ego_surroundings(
         ego_scene(vehicles, rules.road), rules.idm, rules.ego
     )
+    # Of the events of one step a crash comes first, then the goal, then the time-out.
     crash = ego_overlaps(vehicles, rules.road).any(-1) & running
     goal = (vehicles.x[:, EGO_INDEX] >= rules.episode.goal_m) & running & ~crash
     step = before.step + running
@@ -144,6 +145,7 @@ def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -
         behind=torch.where(running, behind, before.behind),
         step=step,
         running=running & ~(crash | goal | late),
+        # A soft crash counts when it begins, however long it lasts.
         onsets=before.onsets + (ahead & ~before.ahead & running),
         onsets_behind=before.onsets_behind + (behind & ~before.behind & running),
         hard_crash=before.hard_crash | crash,
@@ -158,6 +160,7 @@ def remember(
     ego, speed = end.vehicles.at(EGO_INDEX), start.vehicles.speed[:, EGO_INDEX]
     arrived = lane_change_done(end.vehicles.columns(slice(0, 1)), rules.road)[:, 0]
     direction = torch.where(arrived, 0, command.direction)
+    # A row that ended at once drove no step: its speed did not change either.
     seconds = (end.step - start.step).clamp_min(1).to(ego.speed.dtype) * PHYSICS_STEP_S
     return {
         "steering": end.steering,
@@ -178,6 +181,7 @@ def outcome(
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Events and done flags of a decision, each [N, 1]; every end has exactly one reason."""
     terminated = end.goal | end.hard_crash | command.off_road
+    # What has ended without an outcome was cut off: by the clock, or where its recording stops.
     truncated = ~end.running & ~terminated
     scene_end = truncated & scene_over(rules, end.step)
     events = {
@@ -190,9 +194,11 @@ def outcome(
         keys.SOFT_CRASH_BEHIND: end.onsets_behind,
     }
     flags = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
-    return {name: value[:, None] for name, value in events.items()}, {
-        k: v[:, None] for k, v in flags.items()
-    }
+    return _columns(events), _columns(flags)
+
+
+def _columns(values: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: value[:, None] for name, value in values.items()}
 
 
 class Physics:
@@ -223,10 +229,11 @@ def known_false(flag: Tensor) -> bool:
 
 
 class EndedRows:
-    """The traffic's memory of the rows that end within a decision, kept as it was when they ended.
+    """The traffic's memory of the rows that end within a decision, as it was when they ended.
 
     The traffic goes on computing them, in vain: restoring their memory in every physics step would
-    copy that of all rows each time, and generated traffic's is large.
+    copy that of all rows each time. With traffic=gan and 512 rows a step then took 1.1 times as
+    long.
     """
 
     def __init__(self) -> None:
@@ -252,13 +259,15 @@ class EndedRows:
 def _with_rows(memory: TensorDictBase, rows: Tensor, other: TensorDictBase) -> TensorDict:
     """``memory`` with its ``rows`` replaced by ``other`` [R], leaf by leaf."""
 
-    def replaced(name: str, value: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
-        if isinstance(value, TensorDictBase):
-            return value if value.is_empty() else _with_rows(value, rows, other.get(name))
-        return value.index_copy(0, rows, other.get(name))
-
-    kept = {name: replaced(name, value) for name, value in memory.items()}
-    return TensorDict._new_unsafe(kept, batch_size=memory.batch_size)
+    restored = {}
+    for name, value in memory.items():
+        if isinstance(value, Tensor):
+            restored[name] = value.index_copy(0, rows, other.get(name))
+        elif value.is_empty():
+            restored[name] = value
+        else:
+            restored[name] = _with_rows(value, rows, other.get(name))
+    return TensorDict._new_unsafe(restored, batch_size=memory.batch_size)
 
 
 def _where(rows: Tensor, new: Tensor, old: Tensor) -> Tensor:
@@ -287,23 +296,20 @@ def run_decision(
         substeps: number of physics steps; None: those of the decision period.
     """
     memory, now, ended = memory_of(state), start, EndedRows()
-    counters = {
-        keys.SEED: state.get(keys.SEED),
-        keys.EPISODE: state.get(keys.EPISODE),
-        keys.EPISODE_KEY: key,
-    }
+    counters = {name: state.get(name) for name in (keys.SEED, keys.EPISODE)}
+    counters[keys.EPISODE_KEY] = key
     size, can_read = memory.batch_size, reads_are_cheap(now.running)
     if can_read:
         ended.keep(~now.running, memory)
     for count in range(rules.episode.substeps() if substeps is None else substeps):
         before = now
+        # On a CPU the remaining steps are left out once every row has ended.
         if known_false(before.running.any()):
             break
         # The traffic's clock continues in ended rows: stopped at a moment of decision it would make
         # these rows' drivers decide in all remaining steps, in vain.
-        vehicles = TensorDict._new_unsafe(before.vehicles.as_dict(), batch_size=size)
         fields = {
-            keys.VEHICLES: vehicles,
+            keys.VEHICLES: TensorDict._new_unsafe(before.vehicles.as_dict(), batch_size=size),
             keys.TRAFFIC: memory,
             **counters,
             keys.STEP: start.step + count,
@@ -312,6 +318,7 @@ def run_decision(
         # In a graph the copies cost nothing, so one graph serves both cases.
         all_running = not physics.compiled and known_false((~before.running).any())
         now = physics.advance(rules, before, Vehicles.of(after.get(keys.MOVED)), all_running)
+        # The memory of ended rows: put aside when they end, or kept by a copy in every step.
         if can_read:
             memory = after.get(keys.TRAFFIC)
             ended.keep(before.running & ~now.running, memory)

@@ -1,11 +1,12 @@
-"""The environment's state: fields, specs, and the start of an episode.
+"""The environment's state: its fields, their specs, and the start of an episode.
 
-And what is handed in, checked.
+At the end: checks of what users hand in.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -16,11 +17,37 @@ from torchrl.data.tensor_specs import Binary
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.keys import DONE_FLAGS, EGO_FLAGS, EGO_FLOATS, EGO_INTEGERS, EVENT_COUNTS
+from ganlane.native.tensors import Outcome
 from ganlane.sim.state import Vehicles
 from ganlane.torch_settings import check_default_device
 
-COUNTERS = (keys.SEED, keys.EPISODE, keys.STEP)
+#: Name of a field to its type; None: the run's float type.
+Fields: TypeAlias = Mapping[str, torch.dtype | None]
+
+VEHICLES: Fields = {
+    **dict.fromkeys(keys.VEHICLE_FLOATS),
+    **dict.fromkeys(keys.VEHICLE_INTEGERS, torch.int64),
+    **dict.fromkeys(keys.VEHICLE_FLAGS, torch.bool),
+}
+#: What is remembered of the ego from one decision to the next.
+EGO: Fields = {
+    "steering": None,  # angle, rad
+    "mean_acceleration": None,  # in the last decision, m/s2
+    "change_progress": None,  # of the lane change, 0 to 1
+    "distance": None,  # m
+    "change_direction": torch.int64,  # of the lane change: -1, 0, 1
+    "decisions": torch.int64,  # in this episode
+    "lane_changes": torch.int64,  # started in this episode
+    "soft_crash": torch.bool,  # in the last physics step, with the vehicle ahead
+    "soft_crash_behind": torch.bool,  # and with the one behind
+    "started_change": torch.bool,  # in the last decision
+}
+EVENTS: Fields = {
+    **dict.fromkeys(keys.END_EVENTS, torch.bool),
+    **dict.fromkeys((keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND), torch.int64),
+}
+DONE: Fields = dict.fromkeys(("done", "terminated", "truncated"), torch.bool)
+COUNTERS: Fields = dict.fromkeys((keys.SEED, keys.EPISODE, keys.STEP), torch.int64)
 
 
 def state_spec(
@@ -28,71 +55,57 @@ def state_spec(
 ) -> Composite:
     """Spec of everything that a step writes except done flags and reward.
 
-    ``memory`` is the traffic's.
+    ``memory`` is the traffic's, nested name to (shape, dtype); ``own_roads``: each row has a road.
     """
-    vehicles = _fields(
-        (n, m), dtype, keys.VEHICLE_FLOATS, keys.VEHICLE_INTEGERS, keys.VEHICLE_FLAGS
-    )
     parts = {
-        keys.VEHICLES: Composite(vehicles, shape=(n,)),
-        keys.EGO: Composite(_fields((n,), dtype, EGO_FLOATS, EGO_INTEGERS, EGO_FLAGS), shape=(n,)),
-        keys.EVENTS: Composite(
-            _fields((n, 1), dtype, (), EVENT_COUNTS, keys.END_EVENTS), shape=(n,)
-        ),
+        keys.VEHICLES: Composite(_specs(VEHICLES, (n, m), dtype), shape=(n,)),
+        keys.EGO: Composite(_specs(EGO, (n,), dtype), shape=(n,)),
+        keys.EVENTS: Composite(_specs(EVENTS, (n, 1), dtype), shape=(n,)),
         keys.TRAFFIC: _memory_spec(memory, n),
-        **_fields((n,), dtype, (), COUNTERS, ()),
+        **_specs(COUNTERS, (n,), dtype),
     }
     if own_roads:
-        parts[keys.ROAD] = Composite(
-            _fields((n, 1), dtype, ("lane_width_m",), ("lanes",), ()), shape=(n,)
-        )
+        road = {"lane_width_m": None, "lanes": torch.int64}
+        parts[keys.ROAD] = Composite(_specs(road, (n, 1), dtype), shape=(n,))
     return Composite(parts, shape=(n,))
 
 
 def done_spec(n: int) -> Composite:
     """Spec of the done flags."""
-    return Composite(_fields((n, 1), torch.float32, (), (), DONE_FLAGS), shape=(n,))
+    return Composite(_specs(DONE, (n, 1), torch.float32), shape=(n,))
 
 
-def _fields(
-    shape: tuple[int, ...],
-    dtype: torch.dtype,
-    floats: tuple[str, ...],
-    integers: tuple[str, ...],
-    flags: tuple[str, ...],
-) -> dict[str, Any]:
-    specs: dict[str, Any] = {name: Unbounded(shape=shape, dtype=dtype) for name in floats}
-    specs |= {name: Unbounded(shape=shape, dtype=torch.int64) for name in integers}
-    return specs | {name: Binary(shape=shape, dtype=torch.bool) for name in flags}
+def _specs(fields: Fields, shape: tuple[int, ...], dtype: torch.dtype) -> dict[str, Any]:
+    specs = {}
+    for name, kind in fields.items():
+        spec = Binary if kind is torch.bool else Unbounded
+        specs[name] = spec(shape=shape, dtype=kind or dtype)
+    return specs
 
 
 def _memory_spec(memory: dict[str, Any], n: int) -> Composite:
     """Composite spec of a traffic module's memory, nested like the modules."""
-    specs = {
-        name: _memory_spec(value, n)
-        if isinstance(value, dict)
-        else Unbounded(shape=value[0], dtype=value[1])
-        for name, value in memory.items()
-    }
+    specs = {}
+    for name, value in memory.items():
+        if isinstance(value, dict):
+            specs[name] = _memory_spec(value, n)
+        else:
+            shape, dtype = value
+            specs[name] = Unbounded(shape=shape, dtype=dtype)
     return Composite(specs, shape=(n,))
 
 
 def first_state(
     seed: Tensor, episode: Tensor, vehicles: Vehicles, memory: TensorDictBase
 ) -> TensorDictBase:
-    """The state of episodes that begin, without roads of their own.
-
-    ``seed`` and ``episode`` are [N].
-    """
-    zero = torch.zeros(seed.shape, dtype=vehicles.x.dtype, device=seed.device)
-    integer, column = zero.long(), zero[:, None]
-    ego = {name: zero for name in EGO_FLOATS} | {name: integer for name in EGO_INTEGERS}
-    ego |= {name: zero.bool() for name in EGO_FLAGS}
-    events = {name: column.bool() for name in keys.END_EVENTS} | {
-        name: column.long() for name in EVENT_COUNTS
-    }
-    rest = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: torch.zeros_like(seed)}
-    return pack(vehicles, ego, memory, events, rest | {name: column.bool() for name in DONE_FLAGS})
+    """The state of the episodes (``seed``, ``episode``) [N] that begin, without roads."""
+    row = vehicles.x.new_zeros(seed.shape)
+    column = row[:, None]
+    ego = {name: row.to(kind or row.dtype) for name, kind in EGO.items()}
+    events = {name: column.to(kind) for name, kind in EVENTS.items()}
+    done = {name: column.to(kind) for name, kind in DONE.items()}
+    counters = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: torch.zeros_like(seed)}
+    return pack(vehicles, ego, memory, events, {**counters, **done})
 
 
 def pack(
@@ -100,43 +113,65 @@ def pack(
     ego: dict[str, Tensor],
     traffic: TensorDictBase,
     events: dict[str, Tensor],
-    rest: dict,
+    rest: dict[str, Any],
 ) -> TensorDictBase:
     """The state as one TensorDict [N]; ``rest`` is not nested."""
     batch, device = ego["distance"].shape, ego["distance"].device
     nested = {keys.VEHICLES: vehicles.as_dict(), keys.EGO: ego, keys.EVENTS: events}
-    made = {
-        name: TensorDict._new_unsafe(value, batch_size=batch, device=device)
-        for name, value in nested.items()
-    }
-    return TensorDict._new_unsafe(
-        {**made, keys.TRAFFIC: traffic, **rest}, batch_size=batch, device=device
-    )
+    parts: dict[str, Any] = {keys.TRAFFIC: traffic, **rest}
+    for name, fields in nested.items():
+        parts[name] = TensorDict._new_unsafe(fields, batch_size=batch, device=device)
+    return TensorDict._new_unsafe(parts, batch_size=batch, device=device)
 
 
-# What is handed in
+def outcome_state(
+    seed: Tensor, episode: Tensor, out: Outcome, vehicles: Vehicles
+) -> TensorDictBase:
+    """The state of the episodes (``seed``, ``episode``) [N] after what the kernel did.
+
+    It has no reward.
+    """
+    # The kernel's "steering" is that of all vehicles.
+    ego = {name: out["ego_steering" if name == "steering" else name] for name in EGO}
+    memory = TensorDict._new_unsafe({"steering": out["steering"]}, batch_size=out["step"].shape)
+    events = {name: out[name] for name in ("goal", "hard_crash", "out_of_road", "timeout")}
+    # The end of a recorded scene, which the kernel does not drive.
+    events["scene_end"] = torch.zeros_like(out["timeout"])
+    events[keys.SOFT_CRASH] = out["soft_crashes"]
+    events[keys.SOFT_CRASH_BEHIND] = out["soft_crashes_behind"]
+    counters = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: out["step"]}
+    return pack(vehicles, ego, memory, events, {**counters, **{name: out[name] for name in DONE}})
+
+
+# Checks of what is handed in
 
 
 def check_counter(name: str, counter: Tensor | None, rows: int) -> Tensor:
     """``counter`` [N] int64 of a reset.
 
-    :class:`UserError` if it is none, or of another shape or type.
+    Raises:
+        UserError: it is none, or of another shape or type.
     """
     if counter is None or counter.shape != (rows,) or counter.dtype != torch.int64:
-        found = "missing" if counter is None else f"{list(counter.shape)} in {counter.dtype}"
-        given = "next_episode" if name == "next_episode" else "'seed' and 'episode'"
+        what = "missing" if counter is None else f"{list(counter.shape)} in {counter.dtype}"
+        wanted = name if name == "next_episode" else "'seed' and 'episode'"
         raise UserError(
-            f"reset(): {name} is {found}; give {given} as int64 of shape [{rows}], or leave it out."
+            f"reset(): {name} is {what}; give {wanted} as int64 of shape [{rows}], or leave it out."
         )
     return counter
 
 
 def usable_device(device: Any, dtype: Any) -> torch.device:
-    """The device; :class:`UserError` where torch has no such device, or puts new tensors elsewhere,
-    or for a type other than float32 and float64."""
+    """The device of that name.
+
+    Raises:
+        UserError: torch has no such device or puts new tensors elsewhere, or ``dtype`` is neither
+            float32 nor float64.
+    """
     if dtype not in (torch.float32, torch.float64):
         raise UserError(
-            f"dtype={dtype}: the simulation runs in torch.float32 or torch.float64; give one of them."
+            f"dtype={dtype}: the simulation runs in torch.float32 or torch.float64; "
+            "give one of them."
         )
     try:
         chosen = torch.empty(0, device=device or "cpu").device
@@ -148,57 +183,32 @@ def usable_device(device: Any, dtype: Any) -> torch.device:
     return chosen
 
 
-class ActionCheck:
-    """Refuses actions other than 0, 1 and 2.
+def checked_action(action: Tensor | None, rows: int, values: bool = True) -> Tensor:
+    """``action`` [N] as int64.
 
-    The native kernel looks at their values itself, which costs nothing: there :meth:`form` is
-    enough. On a GPU a step does not wait for the answer: it is looked at in later steps, when it
-    has arrived.
+    ``values=False`` leaves out that of the values, which the native kernel looks at itself.
+
+    Raises:
+        UserError: there is none, or it has another shape, no whole numbers, or others than 0 to 2.
     """
-
-    def __init__(self, rows: int, device: torch.device) -> None:
-        self.rows, self._shape = rows, torch.Size([rows])
-        # Where a copy arrives by itself; elsewhere the answer is read at once.
-        self._arrived = (
-            torch.zeros((), dtype=torch.bool).pin_memory() if device.type == "cuda" else None
+    if action is None:
+        raise UserError(
+            f"step(): no action; give 'action' [{rows}], int64, from 0 to {keys.ACTIONS - 1}."
         )
-        self._wrong = torch.zeros((), dtype=torch.bool, device=device)
-
-    def form(self, action: Tensor | None) -> Tensor:
-        """``action`` [N] as int64; :class:`UserError` for none, another shape, or no whole numbers."""
-        if action is not None and action.dtype is torch.int64 and action.shape == self._shape:
-            return action
-        if action is None:
-            raise UserError(
-                f"step(): no action; give 'action' [{self.rows}], int64, from 0 to {keys.ACTIONS - 1}."
-            )
-        if action.shape != self._shape or action.is_floating_point() or action.dtype == torch.bool:
-            raise _refused(f"of shape {list(action.shape)} in {action.dtype}", self.rows)
-        return action.long()
-
-    def values(self, action: Tensor) -> None:
-        """Raise :class:`UserError` where ``action`` [N] int64 is not from 0 to 2."""
-        if action.device.type == "cpu":
-            # As unsigned numbers, in which those below 0 are large, and by NumPy: a few
-            # microseconds.
-            if action.numpy().view(np.uint64).max() >= keys.ACTIONS:
-                raise _refused(
-                    str(int(action[(action < 0) | (action >= keys.ACTIONS)][0])), self.rows
-                )
-        else:
-            self._look_later(action)
-
-    def _look_later(self, action: Tensor) -> None:
-        if self._arrived is None:
-            return
-        if self._arrived:
-            raise _refused("in an earlier step", self.rows)
-        self._wrong |= ((action < 0) | (action >= keys.ACTIONS)).any()
-        self._arrived.copy_(self._wrong, non_blocking=True)
+    if action.shape != (rows,) or action.is_floating_point() or action.dtype == torch.bool:
+        raise _refused(f"of shape {list(action.shape)} in {action.dtype}", rows)
+    action = action.long()
+    if values:
+        # As unsigned numbers, of which those below 0 are large, and by NumPy: some microseconds.
+        numbers = action.cpu().numpy()
+        wrong = numbers.view(np.uint64) >= keys.ACTIONS
+        if wrong.any():
+            raise _refused(str(numbers[wrong][0]), rows)
+    return action
 
 
-def _refused(found: str, rows: int) -> UserError:
+def _refused(what: str, rows: int) -> UserError:
     return UserError(
-        f"action {found}: expected {rows} whole numbers (int64, shape [{rows}]), each 0 (keep), 1 (left) or "
-        "2 (right); correct the policy."
+        f"action {what}: expected {rows} whole numbers (int64, shape [{rows}]), "
+        "each 0 (keep), 1 (left) or 2 (right); correct the policy."
     )

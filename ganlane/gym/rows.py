@@ -1,42 +1,43 @@
-"""Basis of the single and the vector environment: N highways behind NumPy arrays, and checks of
-arguments.
+"""N highways behind NumPy arrays: what both environments stand on, and checks of arguments.
 
-:class:`Rows` is the interface. :class:`NativeRows` implements it for rule-driven traffic, by the
-native kernel and without torch; :class:`ganlane.gym.tensor_rows.TensorRows` for everything else, by
-the TorchRL environment.
+:class:`Rows` is the interface, with one specification of gymnasium's info.
+:class:`ganlane.gym.native_rows.NativeRows` implements it for rule-driven traffic, by the native
+kernel and without torch; :class:`ganlane.gym.tensor_rows.TensorRows` for everything else, by the
+TorchRL environment.
 """
 
-# ruff: noqa: D102 - Rows has the docstrings of the methods
 from __future__ import annotations
 
-import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from numbers import Integral
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 
 from ganlane import keys
-from ganlane.settings.commands import RunConfig
-from ganlane.settings.env import EnvConfig, check_reward
-from ganlane.settings.traffic import TrafficConfig
 from ganlane.errors import UserError
-from ganlane.native.batch import SPEED_RATIO_LIMIT, NativeBatch, Stepped
-from ganlane.native.library import why_not
-from ganlane.native.settings import NATIVE_FORMS
-from ganlane.options import Option, option
-from ganlane.settings.episode import EpisodeParameters, Stream
+from ganlane.native.batch import SPEED_RATIO_LIMIT, Stepped
+from ganlane.settings.episode import EpisodeParameters
 
 Floats = npt.NDArray[np.float32]
+Integers = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 #: Exclusive upper bound of the seeds that unseeded environments draw.
 SEEDS: Final = 2**31
-#: Traffic that the kernel implements, and whether it changes lanes.
-_NATIVE_TRAFFICS = {"ganlane.traffic.IdmTraffic": False, "ganlane.traffic.IdmMobilTraffic": True}
+#: Gymnasium's names of those parts of the info that are arrays of the state as they are.
+INFO: Final = {
+    "seed": keys.SEED,
+    "episode_number": keys.EPISODE,
+    "distance_m": "distance",
+    "speed_mps": "speed",
+    "decisions": "decisions",
+    "lane_changes": "lane_changes",
+    **{event: event for event in keys.END_EVENTS},
+    keys.SOFT_CRASH: keys.SOFT_CRASH,
+    keys.SOFT_CRASH_BEHIND: keys.SOFT_CRASH_BEHIND,
+}
 
 
 class Rows(ABC):
@@ -46,14 +47,13 @@ class Rows(ABC):
         count: N.
         space: of one observation.
         episode: decision period and time limit.
-        env, state: the TorchRL environment and the state of its rows; None with the native kernel.
+        started: whether an episode is under way.
     """
 
+    started = False
     count: int
     space: Box
     episode: EpisodeParameters
-    env: Any = None
-    state: Any = None
 
     @abstractmethod
     def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
@@ -64,7 +64,7 @@ class Rows(ABC):
         """Begin the next episode, number n + N after n, in the rows where ``rows`` [N] is true."""
 
     @abstractmethod
-    def step(self, actions: npt.NDArray[np.int64]) -> Stepped:
+    def step(self, actions: Integers) -> Stepped:
         """One decision in every row; no row is reset. The arrays are valid until the next call."""
 
     @abstractmethod
@@ -79,17 +79,30 @@ class Rows(ABC):
         """
 
     @abstractmethod
-    def numbers(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
-        """Present seeds and episodes [N]; None before the first :meth:`start`."""
+    def state_arrays(self) -> Mapping[str, Any]:
+        """What :meth:`info` is made of, arrays [N]; valid until the next call.
+
+        The values of :data:`INFO`, the ego's ``y`` in m, ``step``, ``reward_terms`` by name, and
+        ``lanes`` and ``lane_width_m``, each perhaps one number for all rows.
+        """
 
     def check_started(self) -> None:
         """Raise :class:`UserError` before the first :meth:`start`."""
-        if self.numbers() is None:
+        if not self.started:
             raise UserError("no episode is under way; call reset() first.")
 
-    @abstractmethod
     def info(self) -> dict[str, Any]:
         """Gymnasium's info (docs/gymnasium.md) as arrays [N] by name; valid until the next call."""
+        state = self.state_arrays()
+        y, lanes = state["y"], state["lanes"]
+        # The road's own rounding, in the run's float type.
+        lane = np.rint(y / np.asarray(state["lane_width_m"], y.dtype)).astype(np.int64)
+        info = {name: state[field] for name, field in INFO.items()}
+        info["time_s"] = state[keys.STEP] * keys.PHYSICS_STEP_S
+        info["lane"] = np.minimum(np.maximum(lane, 0), lanes - 1)
+        info["action_mask"] = self.mask().view(np.int8)
+        info[keys.REWARD_TERMS] = state[keys.REWARD_TERMS]
+        return info
 
 
 def observation_space(size: int, largest: float) -> Box:
@@ -102,141 +115,6 @@ def observation_space(size: int, largest: float) -> Box:
     return Box(low, high, dtype=np.float32)
 
 
-def make_rows(
-    traffic: Option, count: int, render_mode: str | None, options: Mapping[str, Any]
-) -> Rows:
-    """N highways with ``traffic`` and the ``options`` of :func:`ganlane.api.make_env`.
-
-    The native kernel drives them where it can, unless the option ``kernel`` is ``torch`` or there
-    is a ``render_mode``, since the kernel shows no physics steps.
-
-    Raises:
-        UserError: a wrong value.
-    """
-    if render_mode is None and why_not() is None:
-        rows = native_rows(traffic, count, dict(options))
-        if rows is not None:
-            return rows
-    from ganlane.gym.tensor_rows import TensorRows  # torch takes seconds
-
-    return TensorRows(traffic, count, options)
-
-
-def native_rows(traffic: Option, count: int, options: dict[str, Any]) -> NativeRows | None:
-    """N highways by the kernel.
-
-    None where it does not implement these options, or one of them is wrong.
-    """
-    groups = ("env", "observation", "reward", "mask", "stream", "device", "transforms")
-    given = {name: options.pop(name) for name in groups if name in options}
-    try:
-        config: TrafficConfig = option("traffic", traffic)
-        env: EnvConfig = option("env", given.get("env"), options)
-        observation, reward, mask = (
-            option(group, given.get(group)) for group in ("observation", "reward", "mask")
-        )
-        check_reward(env, reward)
-        device = RunConfig(device=given.get("device", "cpu")).device
-        stream = Stream.named(str(given.get("stream", "train")))
-    except UserError:
-        return None  # TensorRows reports the mistake
-    implemented = (
-        config._target_ in _NATIVE_TRAFFICS and not config.blind_share and not config.parameters
-        and observation.form in NATIVE_FORMS and observation.sensors is None
-        and type(env).scenes is EnvConfig.scenes and env.kernel != "torch"
-        and isinstance(count, Integral) and 1 <= count <= 65536
-        and device == "cpu" and not len(given.get("transforms", ()))
-    )  # fmt: skip
-    if not implemented:
-        return None
-    batch = NativeBatch(
-        int(count),
-        env.lanes,
-        env.lane_width_m,
-        env.vehicles,
-        env.spawn_parameters(),
-        env.ego,
-        env.episode_parameters(),
-        env.idm,
-        env.mobil if _NATIVE_TRAFFICS[config._target_] else None,
-        env.recycle_share if env.recycle else None,
-        observation,
-        reward,
-        mask,
-        int(stream),
-    )
-    return NativeRows(batch, env.episode_parameters())
-
-
-class NativeRows(Rows):
-    """N highways by the native kernel."""
-
-    def __init__(self, batch: NativeBatch, episode: EpisodeParameters) -> None:
-        self.batch, self.count, self.episode = batch, batch.rows, episode
-        self.space = observation_space(batch.observation.shape[1], batch.bounds[1])
-        self._started = False
-        self._never = np.zeros(batch.rows, np.bool_)
-
-    def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
-        self._started = True
-        self.batch.start(seed, episode)
-
-    def restart(self, rows: Flags) -> None:
-        state = self.batch.state
-        self.batch.start(state["seed"], state["episode"] + self.count, rows)
-
-    def step(self, actions: npt.NDArray[np.int64]) -> Stepped:
-        return self.batch.step(actions)
-
-    def observation(self) -> Floats:
-        return self.batch.observation
-
-    def mask(self) -> Flags:
-        return self.batch.mask
-
-    def numbers(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
-        state = self.batch.state
-        return (state["seed"], state["episode"]) if self._started else None
-
-    def info(self) -> dict[str, Any]:
-        batch, state = self.batch, self.batch.state
-        y = state[keys.VEHICLES, "y"][:, 0]
-        lane = np.rint(y / np.float32(batch.lane_width_m)).astype(np.int64)
-        events = ("goal", "hard_crash", "out_of_road", "timeout", *keys.EVENT_COUNTS)
-        return {
-            "seed": state[keys.SEED],
-            "episode_number": state[keys.EPISODE],
-            "time_s": state[keys.STEP] * keys.PHYSICS_STEP_S,
-            "distance_m": state[keys.EGO, "distance"],
-            "speed_mps": state[keys.VEHICLES, "speed"][:, 0],
-            "lane": np.minimum(np.maximum(lane, 0), batch.lanes - 1),
-            "decisions": state[keys.EGO, "decisions"],
-            "lane_changes": state[keys.EGO, "lane_changes"],
-            "action_mask": batch.mask.view(np.int8),
-            **{name: state[keys.EVENTS, name] for name in events},
-            "scene_end": self._never,
-            keys.REWARD_TERMS: batch.reward_terms(),
-        }
-
-
-class OnRows:
-    """Base of the environments on :class:`Rows`."""
-
-    _rows: Rows
-    _spec: EnvSpec | None = None
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """gymnasium's specification; ``max_episode_steps`` follows from ``timeout_s``."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = copy.copy(spec)
-        if self._spec is not None:
-            self._spec.max_episode_steps = self._rows.episode.most_decisions()
-
-
 def row_of(info: Any, row: int) -> Any:
     """One row of :meth:`Rows.info`, or of one of its values, numbers as Python's."""
     if isinstance(info, dict):
@@ -244,34 +122,34 @@ def row_of(info: Any, row: int) -> Any:
     return info[row].copy() if info.ndim > 1 else info.item(row)
 
 
-def array_of(given: Any) -> npt.NDArray[Any]:
+def array_of(value: Any) -> npt.NDArray[Any]:
     """A user's value as an array.
 
     An array of None if it cannot be one, such as lists of different lengths.
     """
     try:
-        return np.asarray(given)
+        return np.asarray(value)
     except (TypeError, ValueError, RuntimeError):
         return np.asarray(None)
 
 
-def actions_of(given: Any, rows: int) -> npt.NDArray[np.int64]:
+def actions_of(actions: Any, rows: int) -> Integers:
     """A user's actions as an array [rows] int64.
 
     Raises:
         UserError: another shape, or no such action.
     """
-    array = array_of(given)
+    array = array_of(actions)
     whole = array.shape == (rows,) and array.dtype.kind in "iu"
     if not whole or not 0 <= array.min() <= array.max() < keys.ACTIONS:
         raise UserError(
-            f"action {given!r:.80}: expected {rows} whole number(s), 0 (keep), 1 (left) or 2 (right); give one "
-            "for every environment."
+            f"action {actions!r:.80}: expected {rows} whole number(s), 0 (keep), 1 (left) or "
+            "2 (right); give one for every environment."
         )
     return array.astype(np.int64, copy=False)
 
 
-def known_options(options: dict[str, Any] | None, names: tuple[str, ...]) -> dict[str, Any]:
+def reset_options(options: dict[str, Any] | None, names: tuple[str, ...]) -> dict[str, Any]:
     """The options of a reset, checked for unknown names."""
     if not isinstance(options, dict | None):
         raise UserError(

@@ -1,28 +1,18 @@
-"""One highway as a ``gymnasium.Env``, and the window that shows it."""
+"""One highway as a ``gymnasium.Env``."""
 
 from __future__ import annotations
 
-import os
-import time
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from ganlane.arguments import checked_arguments, seed_number, whole_number
+from ganlane.arguments import seed_number, whole_number
 from ganlane.errors import UserError
-from ganlane.gym import has_display
-from ganlane.gym.rows import (
-    SEEDS,
-    Floats,
-    OnRows,
-    actions_of,
-    array_of,
-    known_options,
-    make_rows,
-    row_of,
-)
+from ganlane.gym.base import OnRows, make_rows
+from ganlane.gym.rows import SEEDS, Floats, actions_of, array_of, reset_options, row_of
+from ganlane.gym.window import FilmWindow, has_display
 from ganlane.keys import ACTIONS, PHYSICS_STEP_S
 from ganlane.options import Option
 
@@ -58,7 +48,6 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": FPS}  # noqa: RUF012 - gymnasium's own form
 
-    @checked_arguments
     def __init__(
         self,
         traffic: Option = "idm_mobil",
@@ -69,48 +58,46 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
     ) -> None:
         if render_mode not in (None, *RENDER_MODES):
             raise UserError(
-                f"render_mode={render_mode}: expected one of {', '.join(RENDER_MODES)}; choose one of them."
+                f"render_mode={render_mode}: expected one of {', '.join(RENDER_MODES)}; "
+                "choose one of them."
             )
-        self._rows = make_rows(traffic, 1, render_mode, options)
+        self._seed = None if seed is None else seed_number(seed)
+        self._episode, self._running = -1, False
+        self._rows = make_rows(traffic, 1, render_mode is not None, options)
         self.observation_space: gymnasium.spaces.Box = self._rows.space  # type: ignore[assignment]
         self.action_space = gymnasium.spaces.Discrete(ACTIONS)
+        self.render_mode, fps = render_mode, FPS
+        if render_mode == "rgb_array":  # a picture per decision
+            fps = max(1, round(1.0 / self._rows.episode.decision_period_s))
         modes = [mode for mode in RENDER_MODES if mode != "human" or has_display()]
-        decisions = max(1, round(1.0 / self._rows.episode.decision_period_s))
-        self.metadata = {
-            "render_modes": modes,
-            "render_fps": decisions if render_mode == "rgb_array" else FPS,
-        }
-        self.render_mode = render_mode
+        self.metadata = {"render_modes": modes, "render_fps": fps}
         self._view: Any = None
         #: Pictures since the last ``render()``, with ``rgb_array_list``.
         self._pictures: list[Any] = []
         self._video: RecordVideo | None = None
         if render_mode is not None:
-            from ganlane.gym.tensor_rows import LiveView  # with torch, which takes seconds
+            from ganlane.gym.rendering import LiveView  # with torch, which takes seconds
 
-            self._view = LiveView(
-                self._rows, traffic, FilmWindow() if render_mode == "human" else None
-            )
-        self._seed = None if seed is None else seed_number(seed)
-        self._episode = -1
-        self._running = False
+            window = FilmWindow() if render_mode == "human" else None
+            self._view = LiveView(self._rows, traffic, window)  # type: ignore[arg-type]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
         """Begin an episode; see the class for which."""
-        given = known_options(options, ("episode",))
+        chosen = reset_options(options, ("episode",))
         seed = None if seed is None else seed_number(seed)
         super().reset(seed=seed)
+        # A seed begins with its episode 0; without one the next episode of the same seed follows.
         if seed is not None:
             self._seed, self._episode = seed, -1
         elif self._seed is None:
             self._seed = int(self.np_random.integers(SEEDS))
-        self._episode = whole_number(
-            "options: episode", given.get("episode", self._episode + 1), 0, 2**62
-        )
+        episode = chosen.get("episode", self._episode + 1)
+        self._episode = whole_number("options: episode", episode, 0, 2**62)
         self._rows.start(self._seed, self._episode)
         self._running = True
+        # The first frame is the scene before anything moves.
         if self._view is not None:
             self._view.start()
             self._pictures.clear()
@@ -122,6 +109,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         if not self._running:
             raise UserError("step(): no episode is under way; call reset() first.")
         actions = actions_of(array_of(action).reshape(-1), 1)
+        # The view records the physics steps of the decision through the environment's recorder.
         if self._view is not None:
             self._view.before_step(int(actions[0]))
         stepped = self._rows.step(actions)
@@ -131,13 +119,8 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         if self._view is not None:
             self._view.after_step(reward)
             self._collect()
-        return (
-            stepped.observation[0].copy(),
-            reward,
-            terminated,
-            truncated,
-            row_of(self._rows.info(), 0),
-        )
+        observation, info = stepped.observation[0].copy(), row_of(self._rows.info(), 0)
+        return observation, reward, terminated, truncated, info
 
     def _collect(self) -> None:
         """Store the pictures of the last decision for ``render()``, or pass them to the video."""
@@ -148,15 +131,14 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
             self._video.recorded_frames += between
 
     def set_record_video_wrapper(self, wrapper: RecordVideo) -> None:
-        """Let gymnasium's ``RecordVideo`` around this environment write ten frames per second of
-        driving.
+        """Let gymnasium's ``RecordVideo`` write ten frames per second of driving.
 
         By itself it gets one picture per decision. The name is HighwayEnv's.
         """
         self._video, wrapper.frames_per_sec = wrapper, FPS
 
     def action_masks(self) -> npt.NDArray[np.bool_]:
-        """Which actions are allowed now, bool [3]; the name is that of sb3-contrib's MaskablePPO."""
+        """Which actions are allowed now, bool [3]; sb3-contrib's MaskablePPO asks for them."""
         return self._rows.mask()[0].copy()
 
     def render(self) -> Any:
@@ -165,9 +147,8 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         None for ``human``, which draws itself.
         """
         if self._view is None:
-            raise UserError(
-                f"render(): made without render_mode; give one of {', '.join(RENDER_MODES)} to make()."
-            )
+            modes = ", ".join(RENDER_MODES)
+            raise UserError(f"render(): made without render_mode; give one of {modes} to make().")
         self._rows.check_started()
         if self.render_mode == "rgb_array_list":
             pictures, self._pictures = self._pictures, []
@@ -178,58 +159,3 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         """Close the window, if there is one."""
         if self._view is not None:
             self._view.close()
-
-
-class FilmWindow:
-    """A pygame window that shows pictures until the user closes it.
-
-    Raises:
-        UserError: pygame is missing, or there is no display.
-    """
-
-    def __init__(self) -> None:
-        if not has_display():
-            raise UserError(
-                "render_mode=human: needs pygame (pip install 'ganlane[human]') and a display, and one of them is "
-                "missing here; use render_mode=rgb_array, or ganlane render for a film."
-            )
-        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-        import pygame  # an extra
-
-        self._pygame: Any = pygame
-        self._screen: Any = None
-        try:
-            pygame.display.init()
-        except pygame.error as error:
-            raise UserError(
-                f"render_mode=human: no window can be opened ({error}); use render_mode=rgb_array."
-            ) from error
-        pygame.display.set_caption("ganlane")
-
-    def show(self, picture: npt.NDArray[np.uint8]) -> None:
-        """Put a picture [height, width, 3] uint8 into the window."""
-        pygame = self._pygame
-        if pygame is None:
-            return
-        size = picture.shape[1::-1]
-        try:
-            if self._screen is None:
-                self._screen = pygame.display.set_mode(size)
-            self._screen.blit(pygame.image.frombuffer(picture.tobytes(), size, "RGB"), (0, 0))
-            pygame.display.flip()
-            if pygame.event.get(pygame.QUIT):
-                self.close()
-            pygame.event.pump()
-        except pygame.error:  # closed by other code: pygame has one window per process
-            self._pygame = None
-
-    def wait(self, seconds: float) -> None:
-        """Wait, if the window is open."""
-        if self._pygame is not None:
-            time.sleep(seconds)
-
-    def close(self) -> None:
-        """Close the window; may be called again."""
-        pygame, self._pygame, self._screen = self._pygame, None, None
-        if pygame is not None:
-            pygame.display.quit()

@@ -11,18 +11,10 @@ from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ganlane.arguments import checked_arguments, seed_number
+from ganlane.arguments import seed_number, whole_number
 from ganlane.errors import UserError
-from ganlane.gym.rows import (
-    SEEDS,
-    Flags,
-    Floats,
-    OnRows,
-    actions_of,
-    array_of,
-    known_options,
-    make_rows,
-)
+from ganlane.gym.base import OnRows, make_rows
+from ganlane.gym.rows import SEEDS, Flags, Floats, actions_of, array_of, reset_options
 from ganlane.keys import ACTIONS
 from ganlane.options import Option
 
@@ -54,13 +46,12 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         UserError: a wrong value.
     """
 
-    metadata = {
+    metadata = {  # noqa: RUF012 - gymnasium's own form
         "autoreset_mode": AutoresetMode.SAME_STEP,
         "render_modes": ["rgb_array"],
         "render_fps": 1,
-    }  # noqa: RUF012
+    }
 
-    @checked_arguments
     def __init__(
         self,
         num_envs: int = 1,
@@ -74,23 +65,24 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise UserError(
-                f"render_mode={render_mode}: a batch has rgb_array only; use gymnasium.make for a window."
+                f"render_mode={render_mode}: a batch has rgb_array only; "
+                "use gymnasium.make for a window."
             )
         self._mode = _mode_of(autoreset_mode)
-        self._rows = make_rows(traffic, num_envs, render_mode, options)
+        self._rows = make_rows(traffic, num_envs, render_mode is not None, options)
         self.num_envs, self.render_mode = self._rows.count, render_mode
         episode = self._rows.episode
-        if max_episode_steps is not None and max_episode_steps < episode.most_decisions():
-            limit_s = max_episode_steps * episode.decision_period_s
-            raise UserError(
-                f"max_episode_steps={max_episode_steps}: a batch has its own time limit; give timeout_s={limit_s:g}."
-            )
+        if max_episode_steps is not None:
+            limit = whole_number("max_episode_steps", max_episode_steps, 1, 2**31)
+            if limit < episode.most_decisions():
+                raise UserError(
+                    f"max_episode_steps={limit}: a batch has its own time limit; "
+                    f"give timeout_s={limit * episode.decision_period_s:g}."
+                )
         fps = max(1, round(1.0 / episode.decision_period_s))
         self.metadata = {**self.metadata, "autoreset_mode": self._mode, "render_fps": fps}
-        self.single_observation_space, self.single_action_space = (
-            self._rows.space,
-            Discrete(ACTIONS),
-        )
+        self.single_observation_space = self._rows.space
+        self.single_action_space = Discrete(ACTIONS)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._seed = None if seed is None else seed_number(seed)
@@ -98,17 +90,17 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         self._ended = np.zeros(self.num_envs, dtype=np.bool_)
         self._view: Any = None
         if render_mode is not None:
-            from ganlane.gym.tensor_rows import BatchView  # with torch, which takes seconds
+            from ganlane.gym.rendering import BatchView  # with torch, which takes seconds
 
-            self._view = BatchView(self._rows, traffic)
+            self._view = BatchView(self._rows, traffic)  # type: ignore[arg-type]
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
         """Begin episodes in all rows, or with ``reset_mask`` in some; see the class for which."""
-        given = known_options(options, ("episode", "reset_mask"))
-        if "reset_mask" in given:
-            fresh = array_of(given["reset_mask"])
+        chosen = reset_options(options, ("episode", "reset_mask"))
+        if "reset_mask" in chosen:
+            fresh = array_of(chosen["reset_mask"])
             if fresh.shape != (self.num_envs,) or fresh.dtype != np.bool_:
                 raise UserError(
                     f"options: reset_mask: expected a boolean array of shape ({self.num_envs},); "
@@ -118,7 +110,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
             self._rows.restart(fresh)
         else:
             fresh = np.ones(self.num_envs, dtype=np.bool_)
-            self._start(seed, given.get("episode"))
+            self._start(seed, chosen.get("episode"))
         self._begun(fresh)
         return self._rows.observation().copy(), _copied(self._rows.info())
 
@@ -129,26 +121,32 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
             self._view.start(fresh)
 
     def _start(self, seed: int | Sequence[int] | None, episode: Any) -> None:
-        each = np.arange(self.num_envs)
+        """Begin the episodes that the arguments of a reset name, or the next ones, in all rows."""
+        rows = np.arange(self.num_envs)
         seeds: Any
+        # A seed starts with its first episodes; without one every row goes on with its next.
         if seed is not None:
-            seeds, first = [seed_number(one) for one in array_of(seed).ravel().tolist()], each
+            seeds, first = [seed_number(one) for one in array_of(seed).ravel().tolist()], rows
             super().reset(seed=seeds[0] if len(seeds) == 1 else None)
-        elif (present := self._rows.numbers()) is not None:
-            seeds, first = present[0].copy(), present[1] + self.num_envs
+        elif self._rows.started:
+            state = self._rows.state_arrays()
+            seeds, first = state["seed"].copy(), state["episode"] + self.num_envs
         else:
-            seeds, first = (
-                int(self.np_random.integers(SEEDS)) if self._seed is None else self._seed,
-                each,
-            )
+            seeds, first = self._seed, rows
+            if seeds is None:
+                seeds = int(self.np_random.integers(SEEDS))
         if episode is not None:
             first = array_of(episode)
+            # Cast first: an unsigned number too large for int64 is below 0 then.
             first = first.astype(np.int64) if first.dtype.kind in "iu" else np.asarray(-1)
             if (first < 0).any():
                 raise UserError(
-                    f"options: episode={episode!r:.80}: expected whole numbers from 0; give for instance 3."
+                    f"options: episode={episode!r:.80}: expected whole numbers from 0; "
+                    "give for instance 3."
                 )
-            first = first + each if first.ndim == 0 else first
+            if first.ndim == 0:
+                first = first + rows
+        # One seed for all rows, or one for each.
         if first.shape != (self.num_envs,) or np.size(seeds) not in (1, self.num_envs):
             raise UserError(
                 f"reset(): expected one seed and one episode, or {self.num_envs} of each."
@@ -156,7 +154,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         self._rows.start(seeds if np.size(seeds) > 1 else np.ravel(seeds)[0], first)
 
     def step(self, actions: Any) -> tuple[Floats, npt.NDArray[Any], Flags, Flags, dict[str, Any]]:
-        """One decision in every row: observations [N, D], rewards, terminated, truncated [N], info."""
+        """One decision in every row: observations [N, D], rewards and ends [N], info."""
         self._rows.check_started()
         waiting = self._ended
         if self._mode is AutoresetMode.DISABLED and waiting.any():
@@ -169,24 +167,22 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         terminated, truncated = stepped.terminated.copy(), stepped.truncated.copy()
         if self._view is not None:
             self._view.after_step(actions, reward)
-        if waiting.any():  # discard the step of these rows after their ends
+        # NEXT_STEP: these rows ended one step ago. They were stepped with the others, which is
+        # discarded here.
+        if waiting.any():
             reward[waiting], terminated[waiting], truncated[waiting] = 0.0, False, False
             self._rows.restart(waiting)
             self._begun(waiting)
         ended = self._ended = terminated | truncated
         final: dict[str, Any] = {}
+        # SAME_STEP: the last observation and info go into the info, before the rows are reset.
         if self._mode is AutoresetMode.SAME_STEP and ended.any():
             final = {"final_obs": _where(ended, self._rows.observation()), "_final_obs": ended}
             final |= {"final_info": _copied(self._rows.info()), "_final_info": ended}
             self._rows.restart(ended)
             self._begun(ended)
-        return (
-            self._rows.observation().copy(),
-            reward,
-            terminated,
-            truncated,
-            _copied(self._rows.info()) | final,
-        )
+        observation, info = self._rows.observation().copy(), _copied(self._rows.info())
+        return observation, reward, terminated, truncated, info | final
 
     def action_masks(self) -> Flags:
         """Which actions are allowed now, bool [N, 3]."""
@@ -204,11 +200,13 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
 
 def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
     """gymnasium's mode, given as such or by name."""
-    for known in AutoresetMode:
-        if mode is known or str(mode).lower() in (known.name.lower(), known.value.lower()):
-            return known
-    names = ", ".join(known.name.lower() for known in AutoresetMode)
-    raise UserError(f"autoreset_mode={mode}: expected one of {names}; choose one of them.")
+    names = [choice.name.lower() for choice in AutoresetMode]
+    for choice in AutoresetMode:
+        if mode is choice or str(mode).lower() in (choice.name.lower(), choice.value.lower()):
+            return choice
+    raise UserError(
+        f"autoreset_mode={mode}: expected one of {', '.join(names)}; choose one of them."
+    )
 
 
 def _where(rows: Flags, observations: Floats) -> npt.NDArray[np.object_]:

@@ -1,8 +1,8 @@
-"""TorchRL transforms of the environment: observation (Table III), reward (section V.C), sensor
-errors, action mask.
+"""TorchRL transforms of the environment.
 
-Each reads TensorDict keys that :class:`ganlane.env.HighwayEnv` writes and adds its own. A transform
-of your own is used in the same way::
+Observation (Table III), reward (section V.C), sensor errors and action mask. Each reads TensorDict
+keys that :class:`ganlane.env.HighwayEnv` writes and adds its own. A transform of your own is used
+in the same way::
 
     TransformedEnv(env, Compose(MyObservation(env), RewardTransform()))
 
@@ -14,11 +14,10 @@ from ganlane.transforms.mask import MASKS, ActionMaskTransform
 from ganlane.transforms.observation import (
     OBSERVATIONS,
     ObservationTransform,
-    SensorParameters,
-    SensorTransform,
     observation_size,
 )
 from ganlane.transforms.reward import RewardParameters, RewardTransform
+from ganlane.transforms.sensors import SensorParameters, SensorTransform
 
 __all__ = [
     "MASKS",

@@ -21,18 +21,19 @@ def speed_reward(
     mean_acceleration: Tensor,
     parameters: RewardParameters | None = None,
 ) -> Tensor:
-    """``(v - 15) / (v_des - 15)``, or its negation where the ego braked hard on average over the
-    decision.
+    """``(v - 15) / (v_des - 15)``, or its negation where the ego braked hard.
+
+    Hard is what is below ``low_acceleration`` on average over the decision.
     """
     p = parameters or RewardParameters()
     reward = (speed - p.base_speed_mps) / (desired_speed - p.base_speed_mps)
+    # The paper negates the reward, which below the base speed would pay for hard braking.
     punished = -reward if p.literal_low_acceleration else -reward.abs()
     return torch.where(mean_acceleration < p.low_acceleration, punished, reward)
 
 
 class RewardTransform(Transform):
-    """Write ``reward`` [N, 1] and ``reward_terms.*`` [N, 1] once per decision, on the speed at its
-    end.
+    """Write ``reward`` [N, 1] and ``reward_terms.*`` [N, 1], on the speed at a decision's end.
 
     Args:
         decision_period_s: factor of the terms that accrue with time, s.
@@ -53,47 +54,38 @@ class RewardTransform(Transform):
         """Name to reward term [N, 1] of the decision that led to the state in ``tensordict``."""
         p, vehicles = self.parameters, tensordict.get(keys.VEHICLES)
         ego, events = tensordict.get(keys.EGO), tensordict.get(keys.EVENTS)
-        speed, desired = (
-            vehicles.get(name)[:, EGO_INDEX, None] for name in ("speed", "desired_speed")
-        )
-        dtype = speed.dtype
-        terms = {
-            "speed": self.period
-            * speed_reward(speed, desired, ego.get("mean_acceleration")[:, None], p),
-            "lane_change": p.lane_change * ego.get("started_change")[:, None].to(dtype),
-            "out_of_road": p.out_of_road * events.get("out_of_road").to(dtype),
-            "hard_crash": p.hard_crash * events.get("hard_crash").to(dtype),
-            "soft_crash": p.soft_crash * events.get(keys.SOFT_CRASH).to(dtype),
-            "goal": p.goal * events.get("goal").to(dtype),
-        }
-        if p.soft_crash_behind:
-            terms[keys.SOFT_CRASH_BEHIND] = p.soft_crash_behind * events.get(
-                keys.SOFT_CRASH_BEHIND
-            ).to(dtype)
+        speed = vehicles.get("speed")[:, EGO_INDEX, None]
+        desired = vehicles.get("desired_speed")[:, EGO_INDEX, None]
+        acceleration = ego.get("mean_acceleration")[:, None]
+        # Every other term is a price times how often its event happened in the decision. They are
+        # added up in the order of term_names, which floating-point sums depend on.
+        counts = {"lane_change": ego.get("started_change")[:, None]}
+        for name in self.parameters.term_names[2:]:
+            counts[name] = events.get(name)
+        terms = {"speed": self.period * speed_reward(speed, desired, acceleration, p)}
+        for name, count in counts.items():
+            terms[name] = getattr(p, name) * count.to(speed.dtype)
         return terms
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         terms = self.terms(next_tensordict)
         nested = TensorDict._new_unsafe(terms, batch_size=next_tensordict.batch_size)
-        return next_tensordict.set(keys.REWARD_TERMS, nested).set(
-            keys.REWARD, reduce(torch.add, terms.values())
-        )
+        next_tensordict.set(keys.REWARD_TERMS, nested)
+        return next_tensordict.set(keys.REWARD, reduce(torch.add, terms.values()))
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         zero = torch.zeros_like(tensordict_reset.get(keys.VEHICLES).get("x")[:, :1])
-        terms = {name: zero for name in self.parameters.term_names}
+        terms = dict.fromkeys(self.parameters.term_names, zero)
         nested = TensorDict._new_unsafe(terms, batch_size=tensordict_reset.batch_size)
         return tensordict_reset.set(keys.REWARD_TERMS, nested)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the terms to the observation spec; they are zero after a reset."""
         assert isinstance(observation_spec, Composite)
-        device, shape = observation_spec.device, observation_spec.shape
-        term = Unbounded(
-            shape=(*shape, 1), dtype=observation_spec[keys.VEHICLES, "x"].dtype, device=device
-        )
-        terms = {name: term.clone() for name in self.parameters.term_names}
-        observation_spec[keys.REWARD_TERMS] = Composite(terms, shape=shape).to(device)
+        shape, true = observation_spec.shape, observation_spec[keys.VEHICLES, "x"]
+        term = Unbounded(shape=(*shape, 1), dtype=true.dtype, device=true.device)
+        terms = dict.fromkeys(self.parameters.term_names, term)
+        observation_spec[keys.REWARD_TERMS] = Composite(terms, shape=shape).to(true.device)
         return observation_spec

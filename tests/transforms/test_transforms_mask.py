@@ -12,7 +12,6 @@ from torchrl.envs.utils import check_env_specs
 import ganlane
 from ganlane import keys
 from ganlane.agents.drivers import ExploringPolicy, GreedyPolicy, MaskedPolicy, RandomDriver
-from ganlane.agents.n_step import NStepWindow
 from ganlane.build import make_driver
 from ganlane.settings.env import EnvConfig
 from ganlane.errors import UserError
@@ -167,7 +166,7 @@ def test_a_random_driver_behind_the_legal_mask_never_leaves_the_road():
 
 
 def test_no_follower_brakes_harder_than_the_limit_in_the_step_after_an_allowed_change():
-    """Measured in rule-driven traffic, where everybody drives by the IDM that the mask judges by."""
+    """In rule-driven traffic, where everybody drives by the IDM that the mask judges by."""
     env = masked(num_envs=32, stream=2)
     rollout = env.rollout(
         40, MaskedPolicy(RandomDriver(env.base_env.road, 2)), break_when_any_done=False
@@ -228,24 +227,6 @@ def test_any_other_driver_keeps_its_lane_where_its_action_is_not_allowed():
 def test_a_masked_driver_in_an_environment_without_a_mask_is_refused():
     with pytest.raises(UserError, match="no action_mask"):
         MaskedPolicy(RandomDriver(Road(), 2))(environment().reset())
-
-
-def test_the_next_state_brings_its_mask_to_the_transition_it_ends():
-    """n = 2; row 0 ends after the first step, so its mask is that step's."""
-    window, made, zero = NStepWindow(2, 0.9), None, torch.zeros(2, 1)
-    for mask, done in (([KEEP_ONLY, ALL], True), ([ALL, RIGHT_ONLY], False)):
-        flags = {
-            "terminated": zero > 0,
-            "done": torch.tensor([[done], [False]]),
-            "action_mask": torch.tensor(mask),
-        }
-        step = {
-            "observation": zero,
-            "action": zero[:, 0].long(),
-            "next": {"observation": zero, "reward": zero, **flags},
-        }
-        made = window.push(TensorDict(step, [2]))
-    assert made["next", "action_mask"].tolist() == [KEEP_ONLY, RIGHT_ONLY]
 
 
 # --- names on the command line

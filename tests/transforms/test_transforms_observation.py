@@ -26,7 +26,7 @@ from ganlane.transforms import (
     SensorParameters,
     observation_size,
 )
-from ganlane.transforms.observation import measure
+from ganlane.transforms.sensors import measure
 
 EGO = (0.0, 1, 20.0, 25.0)
 NOBODY = [1.0, 0.0, 0.0]
@@ -35,15 +35,13 @@ LORRY = {"length": 12.0}
 
 def observed(scene, form, lanes=3, progress=0.0, direction=0, seen=None):
     """The observation [D] of a scene of one row."""
-    transform, own = (
-        ObservationTransform(Road(lanes), scene.x.shape[1], form),
-        torch.tensor([progress], dtype=DOUBLE),
-    )
-    return transform.observe(scene, own, torch.tensor([direction]), transform.road, seen)[0]
+    transform = ObservationTransform(Road(lanes), scene.x.shape[1], form)
+    progress = torch.tensor([progress], dtype=DOUBLE)
+    return transform.observe(scene, progress, torch.tensor([direction]), transform.road, seen)[0]
 
 
 def observe(form, rows, valid=None, sideways=0.0, **options):
-    """The same of (x, lane, speed, desired speed, 25 m/s if left out) per vehicle, the ego first."""
+    """The same of (x, lane, speed, desired speed or 25 m/s) per vehicle, the ego first."""
     names = ("x", "lane", "speed", "desired_speed")
     cars = [
         {**dict(zip(names, row)), "valid": valid is None or valid[i]} for i, row in enumerate(rows)
@@ -144,11 +142,8 @@ def test_every_form_has_the_size_it_says_and_a_spec_that_holds(form):
     base = HighwayEnv(IdmMobilTraffic(), num_envs=3)
     env = TransformedEnv(base, Compose(ObservationTransform(base.road, 9, form), RewardTransform()))
     assert env.reset()["observation"].shape == (3, observation_size(form, 9))
+    assert observation_size("table3", 9) == 27  # the paper's
     check_env_specs(env, seed=0)
-
-
-def test_the_papers_form_has_27_numbers_for_nine_vehicles():
-    assert observation_size("table3", 9) == 27
 
 
 def test_an_unknown_form_is_refused_with_the_known_ones():
@@ -157,12 +152,17 @@ def test_an_unknown_form_is_refused_with_the_known_ones():
 
 
 @pytest.mark.parametrize("form", list(OBSERVATIONS))
-def test_no_number_but_the_first_exceeds_the_largest_of_its_form(form):
-    beside = [EGO, (0.0, 2, 26.0, 20.0), (0.5, 0, 26.0, 20.0), (-30.0, 1, 14.0, 20.0)]
-    values = observe(form, beside)
-    assert values[1:].max() <= largest_number(form)
-    assert values[1:].min() >= -1.0
-    assert largest_number(form) == (5.5 if form == "lane_view_overlap" else 1.0)
+@pytest.mark.parametrize("length_m", [4.5, 12.0])
+def test_no_number_but_the_first_exceeds_the_largest_of_its_form(form, length_m):
+    size = {"length": length_m}
+    beside = [{"x": x, "lane": lane, **size} for x, lane in ((0.0, 2), (0.5, 0), (-30.0, 1))]
+    values = observed(vehicles({"x": 0.0, "lane": 1, **size}, *beside), form)[1:]
+    largest = largest_number(form, length_m)
+    assert -1.0 <= values.min() <= values.max() <= largest
+    if form == "lane_view_overlap":  # bodies that overlap whole
+        assert values.max() == largest == 1.0 + length_m
+    else:
+        assert largest == 1.0
 
 
 # Lengths
@@ -213,19 +213,11 @@ def test_lengths_are_known_without_error_whatever_the_sensors_measure():
     )
     errors = SensorParameters(position_noise_m=2.0, speed_noise_mps=1.0)
     seen = measure(scene, torch.tensor([5]), torch.tensor([0]), errors)
-    assert seen.x[0, 1] != 30.0
-    observation = observed(scene, "lane_view_overlap", seen=scene.with_(**seen._asdict()))
+    assert seen["x"][0, 1] != 30.0
+    observation = observed(scene, "lane_view_overlap", seen=scene.with_(**seen))
     gaps = 200.0 * observation[3:-2].reshape(6, 4)[:, 0]
-    assert gaps[0].item() == pytest.approx(seen.x[0, 1].item() - 8.25)
-    assert gaps[3].item() == pytest.approx(-seen.x[0, 2].item() - 4.5)
-
-
-def test_the_largest_number_grows_with_the_longest_vehicle_where_overlap_counts():
-    assert largest_number("lane_view_overlap") == 5.5
-    assert largest_number("lane_view_overlap", 12.0) == 13.0
-    assert largest_number("lane_view_drift", 12.0) == 1.0
-    beside = view_of({"x": 0.0, "lane": 2, **LORRY}, form="lane_view_overlap", ego_length=12.0)
-    assert beside[:, 1].max().item() == largest_number("lane_view_overlap", 12.0)
+    assert gaps[0].item() == pytest.approx(seen["x"][0, 1].item() - 8.25)
+    assert gaps[3].item() == pytest.approx(-seen["x"][0, 2].item() - 4.5)
 
 
 @pytest.mark.parametrize(("share", "largest"), [(0.0, 5.5), (0.5, 13.0)])

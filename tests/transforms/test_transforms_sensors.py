@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -15,22 +13,20 @@ from reference.worlds import same_bits, vehicles
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+import ganlane
 from ganlane import keys
-from ganlane.agents import read_agent
-from ganlane.build import make_env, make_traffic, observation_of
+from ganlane.build import make_env, make_traffic
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.traffic import IdmTrafficConfig
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
-from ganlane.evaluate import main as evaluate
 from ganlane.settings.observation import ObservationConfig, SensorParameters
 from ganlane.sim import Vehicles
 from ganlane.sim.random import Stream, episode_key
 from ganlane.traffic import IdmMobilTraffic
-from ganlane.train import main as train
 from ganlane.training.collectors import pack, unpack
 from ganlane.transforms import ObservationTransform, RewardTransform, SensorTransform
-from ganlane.transforms.observation import measure
+from ganlane.transforms.sensors import measure
 
 EVERYTHING = SensorParameters(1.0, 0.5, 2.0, dropout=0.2, delay_s=2.0)
 #: Own speed and lanes, which no sensor error touches.
@@ -75,7 +71,7 @@ def many(sensors, rows=5000, count=5):
     """
     true, numbers = scene(rows, count), torch.arange(rows)
     seen = measure(true, episode_key(Stream.TRAIN, numbers * 0, numbers), numbers % 10, sensors)
-    return (seen.x - true.x, seen.y - true.y, seen.speed - true.speed), seen.valid
+    return (seen["x"] - true.x, seen["y"] - true.y, seen["speed"] - true.speed), seen["valid"]
 
 
 NOISY = SensorParameters(position_noise_m=2.0, lateral_noise_m=0.5, speed_noise_mps=3.0)
@@ -101,7 +97,7 @@ def test_errors_of_position_lane_and_speed_and_of_two_vehicles_are_independent()
 def test_an_error_is_drawn_anew_at_every_measurement():
     true, zero = scene(1000, 2), torch.zeros(1000, dtype=torch.int64)
     key = episode_key(Stream.TRAIN, zero, zero)
-    seen = measure(true, key, 10 * torch.arange(1000), NOISY).x[:, 1] - true.x[:, 1]
+    seen = measure(true, key, 10 * torch.arange(1000), NOISY)["x"][:, 1] - true.x[:, 1]
     assert seen.unique().numel() > 990
     lagged = torch.corrcoef(torch.stack((seen[1:], seen[:-1])))[0, 1]
     assert abs(lagged.item()) < 4.5 / math.sqrt(1000)
@@ -134,7 +130,7 @@ def test_nobody_is_seen_at_a_dropout_of_one_and_a_vehicle_that_is_not_there_neve
     true = scene(4, 3)
     absent = true.with_(valid=torch.tensor([[True, False, True]]).expand(4, 3))
     noisy, lossy = (
-        measure(absent, torch.arange(4), torch.zeros(4, dtype=torch.int64), sensors).valid
+        measure(absent, torch.arange(4), torch.zeros(4, dtype=torch.int64), sensors)["valid"]
         for sensors in (NOISY, SensorParameters(dropout=0.5))
     )
     assert torch.equal(noisy, absent.valid)
@@ -167,33 +163,26 @@ def test_the_true_state_reward_and_own_part_of_the_observation_are_untouched(
         assert (other["observation"][:, OWN:].abs() <= 1).all()
 
 
-@pytest.mark.parametrize(("form", "k"), [("table3", 1), ("lane_view", 3), ("table3_lane_view", 2)])
-def test_a_delay_of_k_decisions_shows_the_others_as_they_were_k_decisions_ago(form, k):
-    plain = [td["observation"] for td in drive(world(None, form=form), 8)]
-    late = [
-        td["observation"] for td in drive(world(SensorParameters(delay_s=float(k)), form=form), 8)
-    ]
+NOISE = {"position_noise_m": 1.0, "lateral_noise_m": 1.0, "speed_noise_mps": 1.0, "dropout": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("form", "k", "errors"),
+    [("table3", 1, {}), ("lane_view", 3, {}), ("table3_lane_view", 2, {}), ("table3", 2, NOISE)],
+)
+def test_a_delay_of_k_decisions_shows_the_others_as_they_were_measured_k_decisions_ago(
+    form, k, errors
+):
+    """The noise belongs to the measurement, and comes as late as it."""
+    prompt = [td["observation"] for td in drive(world(SensorParameters(**errors), form=form), 8)]
+    sensors = SensorParameters(**errors, delay_s=float(k))
+    late = [td["observation"] for td in drive(world(sensors, form=form), 8)]
     others = slice(OWN, None if form == "table3" else -2)
     for number, observation in enumerate(late):
         # Until a measurement is old enough, the first one is delivered.
-        assert torch.equal(observation[:, others], plain[max(number - k, 0)][:, others])
-        assert torch.equal(observation[:, :OWN], plain[number][:, :OWN])
-    assert not torch.equal(late[-1], plain[-1])
-
-
-def test_noise_belongs_to_the_measurement_and_comes_as_late_as_it():
-    noise = {
-        "position_noise_m": 1.0,
-        "speed_noise_mps": 1.0,
-        "lateral_noise_m": 1.0,
-        "dropout": 0.1,
-    }
-    prompt = [td["observation"][:, OWN:] for td in drive(world(SensorParameters(**noise)), 6)]
-    late = [
-        td["observation"][:, OWN:] for td in drive(world(SensorParameters(**noise, delay_s=2.0)), 6)
-    ]
-    for number in range(7):
-        assert torch.equal(late[number], prompt[max(number - 2, 0)])
+        assert torch.equal(observation[:, others], prompt[max(number - k, 0)][:, others])
+        assert torch.equal(observation[:, :OWN], prompt[number][:, :OWN])
+    assert not torch.equal(late[-1], prompt[-1])
 
 
 def test_a_delay_may_be_any_multiple_of_the_decision_period():
@@ -214,7 +203,7 @@ def test_a_state_without_the_delayed_measurements_is_refused():
 
 
 def episodes(env, decisions):
-    """Episode to what it saw, over a run with automatic resets; unfinished episodes are left out."""
+    """Finished episode to what it saw, over a run with automatic resets."""
     tracks, finished, td = {}, set(), env.reset()
     for _ in range(decisions):
         td["action"] = action(td)
@@ -260,13 +249,13 @@ def test_a_partial_reset_leaves_the_measurements_of_the_other_rows():
 def test_the_streams_of_training_and_report_have_errors_of_their_own():
     true, zero = scene(1, 3), torch.zeros(1, dtype=torch.int64)
     seen = [
-        measure(true, episode_key(stream, zero, zero), zero, NOISY).x
+        measure(true, episode_key(stream, zero, zero), zero, NOISY)["x"]
         for stream in (Stream.TRAIN, Stream.REPORT)
     ]
     assert not torch.equal(*seen)
 
 
-@pytest.mark.parametrize("sensors", [NOISY, SensorParameters(dropout=0.5), EVERYTHING])
+@pytest.mark.parametrize("sensors", [NOISY, EVERYTHING])
 def test_the_specs_hold(sensors):
     check_env_specs(world(sensors), seed=0)
 
@@ -295,12 +284,6 @@ def test_a_transform_with_the_traffics_stream_is_inserted_where_there_are_errors
         assert (env.transform[0].parameters, env.transform[0].stream) == (LATE, Stream.REPORT)
 
 
-def test_metadata_that_know_nothing_of_sensors_go_on_naming_an_observation():
-    known = {"observation": "table3", "observation_scale": {"range_m": 150.0, "speed_mps": 30.0}}
-    assert observation_of(known) == ObservationConfig(form="table3", range_m=150.0)
-    assert observation_of(known).sensors is None
-
-
 def test_an_agent_keeps_its_form_and_scale_and_gets_the_sensors_of_the_command():
     command = ObservationConfig(form="table3", sensors=SensorParameters(delay_s=1.0))
     assert command.read_by(None) == command
@@ -308,62 +291,22 @@ def test_an_agent_keeps_its_form_and_scale_and_gets_the_sensors_of_the_command()
     assert command.read_by(agents) == replace(agents, sensors=SensorParameters(delay_s=1.0))
 
 
-ERRORS = ["observation.sensors.delay_s=1", "observation.sensors.position_noise_m=0.5"]
-
-
-def in_process(tmp_path, monkeypatch, capsys, *arguments):
-    """Exit status, rows of the results, stderr."""
-    monkeypatch.chdir(tmp_path)
-    short = ["env.goal_m=60", "episodes=3", "traffics=[idm_mobil]"]
-    status = evaluate([*short, *arguments])
-    out, err = capsys.readouterr()
-    path = (out.splitlines() or [""])[-1].removeprefix("results: ")
-    return status, json.loads(Path(path).read_text()) if status == 0 else None, err
-
-
-def test_a_shipped_agent_drives_with_the_sensors_of_the_command_line(tmp_path, monkeypatch, capsys):
+def test_a_shipped_agent_drives_with_the_sensors_it_is_given():
     rewards = []
-    for errors in ([], ["observation.sensors.dropout=1"]):
-        _, results, _ = in_process(
-            tmp_path, monkeypatch, capsys, "agents=[agent_idm]", "env.goal_m=1000", *errors
+    for dropout in (0.0, 1.0):
+        table = ganlane.api.evaluate(
+            ["agent_idm"],
+            ["idm_mobil"],
+            episodes=3,
+            goal_m=1000.0,
+            observation={"sensors": {"dropout": dropout}},
         )
-        rewards.append(results["rows"][0]["mean_reward"])
+        rewards.append(table["mean_reward"][0])
     assert rewards[0] != rewards[1]
 
 
-def test_a_delay_between_two_decisions_is_a_users_mistake(tmp_path, monkeypatch, capsys):
-    wrong = ["agents=[keep_lane]", "observation.sensors.delay_s=0.5"]
-    status, _, err = in_process(tmp_path, monkeypatch, capsys, *wrong)
-    assert status == 2
-    assert "observation.sensors.delay_s=0.5: expected a multiple of the decision period" in err
-
-
-TINY = [
-    "agent=rainbow",
-    *(
-        "env.goal_m=40",
-        "traffic=idm",
-        "init=none",
-        "log_every=160",
-        "collector.num_envs=16",
-        "agent.hidden=[16,16]",
-    ),
-    *("agent.batch_size=32", "agent.warmup=64", "agent.capacity=1000"),
-    *("evaluation.agents=[keep_lane]", "evaluation.episodes=2", *ERRORS),
-]
-
-
-def test_training_with_sensor_errors_in_two_parts_ends_like_one_in_a_piece(
-    tmp_path, monkeypatch, capsys
-):
-    monkeypatch.chdir(tmp_path)
-    folders = []
-    for total in (240, 160):
-        assert train([*TINY, f"total_decisions={total}"]) == 0
-        folders.append(
-            Path(capsys.readouterr().out.splitlines()[-1].removeprefix("results: ")).parent
-        )
-    assert train([f"resume={folders[1]}", "total_decisions=240"]) == 0
-    one, other = (read_agent(folder / "agent.safetensors")[0] for folder in folders)
-    assert one.keys() == other.keys()
-    assert all(torch.equal(one[name], other[name]) for name in one)
+def test_a_delay_between_two_decisions_is_a_users_mistake():
+    with pytest.raises(
+        UserError, match=r"^observation\.sensors\.delay_s=0\.5: expected a multiple of the decision"
+    ):
+        ganlane.make_env(observation={"sensors": {"delay_s": 0.5}})

@@ -21,7 +21,6 @@ from ganlane.data import SyntheticTraffic, read_scenes, scene_lane_widths, sort,
 from ganlane.data.schema import SCHEMA, TRACK_STRIDE, validate
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
-from ganlane.sim.random import Stream
 from ganlane.sim.state import Road
 from ganlane.traffic import Recordings, ReplayTraffic
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
@@ -32,7 +31,7 @@ from ganlane.view.record import scene_names
 def highway(goal_m=150.0, rows=1, lanes=3, vehicles=5):
     episode = EpisodeParameters(goal_m=goal_m)
     traffic = IdmMobilTraffic(Road(lanes=lanes))
-    return HighwayEnv(traffic, rows, vehicles=vehicles, episode=episode, stream=Stream.TRAIN)
+    return HighwayEnv(traffic, rows, vehicles=vehicles, episode=episode)
 
 
 def recorded(env, action=0, **options):

@@ -1,0 +1,52 @@
+"""What the single environment and the batch have in common: their rows, and their specification."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+from gymnasium.envs.registration import EnvSpec
+
+from ganlane.arguments import whole_number
+from ganlane.gym.native_rows import native_rows
+from ganlane.gym.rows import Rows
+from ganlane.native.library import why_not
+from ganlane.options import Option
+
+
+def make_rows(traffic: Option, count: int, pictures: bool, options: Mapping[str, Any]) -> Rows:
+    """N highways with ``traffic`` and the ``options`` of :func:`ganlane.api.make_env`.
+
+    Without torch where the native kernel can drive them. With ``pictures`` the kernel drives them
+    behind the TorchRL environment, since drawing needs torch anyway.
+
+    Raises:
+        UserError: a wrong value.
+    """
+    whole_number("num_envs", count, 1, 65536)
+    if not pictures and why_not() is None:
+        rows = native_rows(traffic, int(count), options)
+        if rows is not None:
+            return rows
+    from ganlane.gym.tensor_rows import TensorRows  # torch takes seconds
+
+    return TensorRows(traffic, int(count), options)
+
+
+class OnRows:
+    """Base of the environments on :class:`~ganlane.gym.rows.Rows`."""
+
+    _rows: Rows
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """gymnasium's specification; ``max_episode_steps`` follows from ``timeout_s``."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = copy.copy(spec)
+        if self._spec is not None:
+            self._spec.max_episode_steps = self._rows.episode.most_decisions()

@@ -1,0 +1,122 @@
+"""Gymnasium's render modes: frames of :mod:`ganlane.view`, drawn while episodes run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+from ganlane import keys
+from ganlane.gym.rows import Flags
+from ganlane.gym.tensor_rows import TensorRows
+from ganlane.gym.window import FilmWindow
+from ganlane.keys import PHYSICS_STEP_S
+from ganlane.options import Option, option
+from ganlane.view import DrawingParameters, EpisodeLabel, FramePainter, Recorder
+from ganlane.view.frames import Picture
+from ganlane.view.record import outcome_of, road_of_row
+
+#: Recorded physics steps that are kept: as many as the trails show.
+_TRAIL_STEPS = round(DrawingParameters().trail_s / PHYSICS_STEP_S) + 1
+
+
+def _label(rows: TensorRows, row: int, traffic: str) -> EpisodeLabel:
+    """The header's text for a row."""
+    state = rows.now()
+    seed, episode = (int(state.get(name)[row]) for name in (keys.SEED, keys.EPISODE))
+    road = road_of_row(state, rows.env.base_env.road, row)
+    return EpisodeLabel("ego", traffic, seed, episode, *road)
+
+
+class LiveView:
+    """Records every physics step of one row.
+
+    Args:
+        rows: the row; the recorder of its environment is replaced.
+        traffic: as the rows have it, for the header.
+        window: shows every physics step in real time; None: pictures on request.
+    """
+
+    def __init__(self, rows: TensorRows, traffic: Option, window: FilmWindow | None = None) -> None:
+        self.rows, self.traffic, self.window = rows, option("traffic", traffic).label(), window
+
+    def start(self) -> None:
+        """A new episode has begun."""
+        self._recorder, self._outcome = Recorder(), ""
+        #: Frames recorded before the present decision.
+        self._before = 0
+        self._label = _label(self.rows, 0, self.traffic)
+        self._recorder.add(self.rows.now().get(keys.VEHICLES), 0.0)
+        self.rows.env.base_env.recorder = self._recorder
+        self._show()
+
+    def before_step(self, action: int) -> None:
+        """Record the action of the next step."""
+        self._recorder.current_action = action
+        # An episode may last for hours: what the trails no longer show is dropped.
+        del self._recorder.frames[:-_TRAIL_STEPS]
+        self._before = len(self._recorder.frames)
+
+    def after_step(self, reward: float) -> None:
+        """Record the outcome of the step, and show its frames."""
+        self._recorder.current_return += reward
+        self._outcome = outcome_of(self.rows.now())
+        self._show()
+
+    def picture(self) -> Picture:
+        """The last frame, [height, width, 3]."""
+        return self._painter().draw(len(self._recorder.frames) - 1)
+
+    def pictures(self) -> Iterator[Picture]:
+        """The frames of the last decision, ten per second; after a reset, the only one."""
+        return map(self._painter().draw, range(self._before, len(self._recorder.frames)))
+
+    def close(self) -> None:
+        """Close the window."""
+        if self.window is not None:
+            self.window.close()
+
+    def _painter(self) -> FramePainter:
+        return FramePainter(self._recorder.trajectory(self._label, self._outcome))
+
+    def _show(self) -> None:
+        """Show the frames of the last decision in the window, in real time."""
+        if self.window is None:
+            return
+        # Drawing takes time of its own, which is taken off the wait.
+        due = time.monotonic() + PHYSICS_STEP_S
+        for picture in self.pictures():
+            self.window.show(picture)
+            self.window.wait(max(0.0, due - time.monotonic()))
+            due = time.monotonic() + PHYSICS_STEP_S
+
+
+class BatchView:
+    """Draws the present state of every row, without trails; the header names the ``traffic``."""
+
+    def __init__(self, rows: TensorRows, traffic: Option) -> None:
+        self.rows, self.traffic = rows, option("traffic", traffic).label()
+        self._returns, self._actions = np.zeros(rows.count), np.full(rows.count, -1)
+
+    def start(self, fresh: Flags) -> None:
+        """New episodes begin in the rows where ``fresh`` [N] is true."""
+        self._returns[fresh], self._actions[fresh] = 0.0, -1
+
+    def after_step(self, actions: npt.ArrayLike, reward: npt.NDArray[np.float64]) -> None:
+        """Record actions and rewards [N] of a step."""
+        self._returns += reward
+        self._actions[:] = actions
+
+    def pictures(self) -> tuple[Picture, ...]:
+        """One of every row."""
+        return tuple(map(self._picture, range(self.rows.count)))
+
+    def _picture(self, row: int) -> Picture:
+        state = self.rows.now()
+        recorder = Recorder(
+            row, current_action=int(self._actions[row]), current_return=float(self._returns[row])
+        )
+        recorder.add(state.get(keys.VEHICLES), float(state.get(keys.STEP)[row]) * PHYSICS_STEP_S)
+        return FramePainter(recorder.trajectory(_label(self.rows, row, self.traffic))).draw(0)

@@ -45,7 +45,7 @@ from ganlane.config.run import (
 from ganlane.errors import UserError, did_you_mean
 from ganlane.evaluation import evaluation_rows, paired_rows, write_episodes, write_results
 from ganlane.evaluation.results import Run, TrainingRun, plain
-from ganlane.settings.commands import EvaluateConfig, HighwayConfig
+from ganlane.settings.commands import EvaluateConfig, highways
 from ganlane.settings.record import Record
 from ganlane.sim.random import Stream
 from ganlane.torch_settings import set_threads
@@ -81,7 +81,7 @@ def make_env(
     Raises:
         UserError: an unknown name or key, a value of the wrong type or out of range.
     """
-    config = call_settings("highways", {"traffic": traffic, "num_envs": num_envs, **keys})
+    config = highways(traffic=traffic, num_envs=num_envs, **keys)
     batch = build.make_highways(config)
     for transform in transforms:
         batch.append_transform(transform)
@@ -106,7 +106,7 @@ def load_agent(
     Raises:
         UserError: no such driver, or its network takes another observation.
     """
-    config: HighwayConfig = call_settings("highways", {"stream": stream, **keys})
+    config = highways(stream=stream, **keys)
     return build.make_driver(str(name), config.env, Stream.named(config.stream), config.device)
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import Compose
 
 from ganlane import keys
 from ganlane.agents import load_agent
@@ -23,7 +23,7 @@ from ganlane.arguments import call_with, import_target, is_import_path
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.traffic import TrafficConfig
-from ganlane.env import HighwayEnv
+from ganlane.env import HighwayEnv, TransformedHighway
 from ganlane.errors import ParameterError, UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.settings.observation import (
@@ -50,7 +50,7 @@ def make_road(env: EnvConfig) -> Road:
     return Road(env.lanes, env.lane_width_m)
 
 
-def make_highways(config: HighwayConfig) -> TransformedEnv:
+def make_highways(config: HighwayConfig) -> TransformedHighway:
     """The environments of a call: traffic, road, observation, reward and mask.
 
     Raises:
@@ -115,7 +115,7 @@ def make_env(
     device: str = "cpu",
     first_episode: int = 0,
     mask: MaskParameters | None = None,
-) -> TransformedEnv:
+) -> TransformedHighway:
     """A batched environment with observation, reward and optionally action mask; its stream is that
     of the traffic.
 
@@ -131,7 +131,6 @@ def make_env(
         env.ego,
         env.episode_parameters(),
         env.idm,
-        stream=traffic.stream,
         seed=seed,
         first_episode=first_episode,
         device=device,
@@ -163,7 +162,7 @@ def make_env(
         )
     except ParameterError as error:
         raise error.below("observation.sensors") from error
-    return TransformedEnv(
+    return TransformedHighway(
         base, Compose(*errors, *transforms, RewardTransform(env.decision_period_s, reward))
     )
 

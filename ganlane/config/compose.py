@@ -96,7 +96,7 @@ def _check(override: Override) -> None:
     names = option_names(key)
     for value in values:
         if value not in names:
-            shown = word.partition("=")[2] if len(values) == 1 else value
+            shown = str(word).partition("=")[2] if len(values) == 1 else value
             hint = did_you_mean(str(value), names)
             raise UserError(
                 f"{key}={shown}: no such option{hint}; choose one of {', '.join(names)}."
@@ -148,8 +148,6 @@ def _defaults(command: str, *words: str) -> dict[str, Any]:
 
 def called(command: str, keys: Mapping[str, Any]) -> dict[str, Any]:
     """Plain data of a Python call: the command's own defaults with ``keys`` on top."""
-    if not (conf_folder() / f"{command}.yaml").is_file():
-        return dict(keys)
     words = [f"experiment={keys['experiment']}"] if "experiment" in keys else []
     others = {name: value for name, value in keys.items() if name != "experiment"}
     return merged(deepcopy(_defaults(command, *words)), others)

@@ -48,11 +48,11 @@ from ganlane.runtime import (
 )
 from ganlane.settings.commands import (
     EvaluateConfig,
-    HighwayConfig,
     RecordConfig,
     ReproduceConfig,
+    with_env_keys,
 )
-from ganlane.settings.record import Record, key_names, make, merged, plain
+from ganlane.settings.record import Record, make, merged, plain
 from ganlane.settings.recordings import PrepareConfig, RealismConfig, TrainGeneratorConfig
 from ganlane.settings.render import RenderConfig
 from ganlane.settings.train import TrainConfig
@@ -208,17 +208,9 @@ def call_settings(command: str, keys: Mapping[str, Any]) -> Any:
     Raises:
         UserError: an unknown key or option, a value of the wrong type or out of range.
     """
-    kind = HighwayConfig if command == "highways" else COMMANDS[command][0]
-    names = {*key_names(kind), "experiment"}
+    kind = COMMANDS[command][0]
     aliases = ALIASES.get(command, {})
-    keys = {aliases.get(name, name): value for name, value in keys.items()}
-    of_env = {name: value for name, value in keys.items() if name not in names}
-    if of_env and "env" in names:
-        keys = {name: value for name, value in keys.items() if name in names}
-        base = keys.get("env", {})
-        if isinstance(base, str):
-            base = {"name": base}
-        keys["env"] = {**(plain(base) if isinstance(base, Record) else base), **of_env}
+    keys = with_env_keys(kind, {aliases.get(name, name): keys[name] for name in keys})
     if command == "train" and keys.get("resume") is not None:
         return make(kind, merged(saved_config(Path(keys["resume"]) / CONFIG), keys))
     return make(kind, called(command, keys))

@@ -25,14 +25,13 @@ from ganlane.env.state import (
     checked_action,
     done_spec,
     first_state,
-    outcome_state,
     pack,
     state_spec,
     usable_device,
 )
 from ganlane.errors import UserError
 from ganlane.native.library import torch_on_one_thread, why_not
-from ganlane.native.tensors import Kernel, NativeScenes, moved
+from ganlane.native.tensors import Kernel, NativeScenes
 from ganlane.settings.driving import EgoParameters, IdmParameters, Visibility
 from ganlane.settings.episode import KERNELS, EpisodeParameters, SpawnParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
@@ -240,7 +239,7 @@ class HighwayEnv(EnvBase):
         mask = None if mask is None else mask.reshape(-1)
         if self._native_scenes is not None:
             # The kernel draws the masked rows alone.
-            return outcome_state(seed, episode, *self._native_scenes.start(seed, episode, mask))
+            return self._native_scenes.start(seed, episode, mask)
         # On a GPU counting the masked rows would wait for its queue; a foreign simulator knows its
         # rows by their place.
         if mask is None or self.device.type != "cpu" or self.traffic.rows_must_stay:
@@ -324,7 +323,7 @@ class HighwayEnv(EnvBase):
             recycles = self._recycling_rows(key)
         # The kernel looks at the actions' values itself: that costs nothing there.
         try:
-            after = native_decision(self.kernel, state, action, recycles)
+            after = self.kernel.decide(action, state, recycles)
         except ValueError:
             checked_action(action, rows)  # says which
             raise
@@ -344,7 +343,7 @@ class HighwayEnv(EnvBase):
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         running = torch.ones_like(action, dtype=torch.bool)
         for _ in range(self.episode.substeps()):
-            state = native_decision(kernel, state, action, None)
+            state = kernel.decide(action, state, None)
             # A command off the road ends an episode before anything moves.
             running = running & ~state.get(keys.EVENTS).get("out_of_road")[:, 0]
             if not running.any():
@@ -424,22 +423,3 @@ class TransformedHighway(TransformedEnv):
 def say_once(line: str) -> None:
     """Print a line to the standard error stream, the first time that it is given."""
     print(line, file=sys.stderr)
-
-
-def native_decision(
-    kernel: Kernel, state: TensorDictBase, action: Tensor, recycles: Tensor | None
-) -> TensorDictBase:
-    """The state after the decision ``action`` [N] in ``state``, without a reward.
-
-    ``recycles`` [N] bool are the rows that recycle vehicles; None: no row does.
-    """
-    vehicles, memory = Vehicles.of(state.get(keys.VEHICLES)), state.get(keys.TRAFFIC)
-    out = kernel.decide(
-        action,
-        vehicles,
-        memory.get("steering"),
-        dict(state.get(keys.EGO).items()),
-        state.get(keys.STEP),
-        recycles,
-    )
-    return outcome_state(state.get(keys.SEED), state.get(keys.EPISODE), out, moved(vehicles, out))

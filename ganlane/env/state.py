@@ -17,7 +17,6 @@ from torchrl.data.tensor_specs import Binary
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.native.tensors import Outcome
 from ganlane.sim.state import Vehicles
 from ganlane.torch_settings import check_default_device
 
@@ -122,25 +121,6 @@ def pack(
     for name, fields in nested.items():
         parts[name] = TensorDict._new_unsafe(fields, batch_size=batch, device=device)
     return TensorDict._new_unsafe(parts, batch_size=batch, device=device)
-
-
-def outcome_state(
-    seed: Tensor, episode: Tensor, out: Outcome, vehicles: Vehicles
-) -> TensorDictBase:
-    """The state of the episodes (``seed``, ``episode``) [N] after what the kernel did.
-
-    It has no reward.
-    """
-    # The kernel's "steering" is that of all vehicles.
-    ego = {name: out["ego_steering" if name == "steering" else name] for name in EGO}
-    memory = TensorDict._new_unsafe({"steering": out["steering"]}, batch_size=out["step"].shape)
-    events = {name: out[name] for name in ("goal", "hard_crash", "out_of_road", "timeout")}
-    # The end of a recorded scene, which the kernel does not drive.
-    events["scene_end"] = torch.zeros_like(out["timeout"])
-    events[keys.SOFT_CRASH] = out["soft_crashes"]
-    events[keys.SOFT_CRASH_BEHIND] = out["soft_crashes_behind"]
-    counters = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: out["step"]}
-    return pack(vehicles, ego, memory, events, {**counters, **{name: out[name] for name in DONE}})
 
 
 # Checks of what is handed in

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gymnasium.envs.registration import EnvSpec
 
-from ganlane.arguments import whole_number
 from ganlane.gym.native_rows import native_rows
 from ganlane.gym.rows import Rows
 from ganlane.native.library import why_not
-from ganlane.options import Option
+from ganlane.settings.commands import highways
 
 
-def make_rows(traffic: Option, count: int, pictures: bool, options: Mapping[str, Any]) -> Rows:
-    """N highways with ``traffic`` and the ``options`` of :func:`ganlane.api.make_env`.
+def make_rows(
+    traffic: Any, count: int, pictures: bool, transforms: Sequence[Any], keys: Mapping[str, Any]
+) -> Rows:
+    """N highways with the arguments of :func:`ganlane.api.make_env`.
 
     Without torch where the native kernel can drive them. With ``pictures`` the kernel drives them
     behind the TorchRL environment, since drawing needs torch anyway.
@@ -24,14 +25,14 @@ def make_rows(traffic: Option, count: int, pictures: bool, options: Mapping[str,
     Raises:
         UserError: a wrong value.
     """
-    whole_number("num_envs", count, 1, 65536)
-    if not pictures and why_not() is None:
-        rows = native_rows(traffic, int(count), options)
+    config = highways(traffic=traffic, num_envs=count, **keys)
+    if not pictures and not len(transforms) and why_not() is None:
+        rows = native_rows(config)
         if rows is not None:
             return rows
     from ganlane.gym.tensor_rows import TensorRows  # torch takes seconds
 
-    return TensorRows(traffic, int(count), options)
+    return TensorRows(config, transforms)
 
 
 class OnRows:

@@ -10,18 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ganlane import keys
-from ganlane.settings.commands import RunConfig
-from ganlane.settings.env import EnvConfig, check_reward
-from ganlane.settings.traffic import TrafficConfig
-from ganlane.errors import UserError
 from ganlane.gym.rows import Flags, Floats, Integers, Rows, observation_space
 from ganlane.native.batch import NativeBatch, Stepped
 from ganlane.native.settings import NATIVE_FORMS
-from ganlane.options import Option, option
+from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.episode import EpisodeParameters, Stream
-
-#: Options of :func:`ganlane.api.make_env` that are no keys of the environment.
-_GROUPS = ("env", "observation", "reward", "mask", "stream", "device", "transforms")
 
 
 class NativeRows(Rows):
@@ -32,13 +25,13 @@ class NativeRows(Rows):
         self.space = observation_space(batch.observation.shape[1], batch.bounds[1])
         # Made once, since they are views of arrays that the kernel writes to.
         state = batch.state
+        events = [name for name in keys.END_EVENTS if name != "scene_end"]
         self._arrays: dict[str, Any] = {
-            **state,
-            "y": state["y"][:, keys.EGO_INDEX],
-            "speed": state["speed"][:, keys.EGO_INDEX],
+            **{name: state[name] for name in (keys.SEED, keys.EPISODE, keys.STEP)},
+            **{name: state[keys.VEHICLES, name][:, keys.EGO_INDEX] for name in ("y", "speed")},
+            **{name: state[keys.EGO, name] for name in (*keys.EGO_FLOATS, *keys.EGO_INTEGERS)},
+            **{name: state[keys.EVENTS, name] for name in (*events, *keys.EVENT_COUNTS)},
             "scene_end": np.zeros(batch.rows, np.bool_),
-            keys.SOFT_CRASH: state["soft_crashes"],
-            keys.SOFT_CRASH_BEHIND: state["soft_crashes_behind"],
             "lanes": batch.lanes,
             "lane_width_m": batch.lane_width_m,
             keys.REWARD_TERMS: batch.reward_terms(),
@@ -58,7 +51,7 @@ class NativeRows(Rows):
 
     def restart(self, rows: Flags) -> None:
         state = self.batch.state
-        self.batch.start(state["seed"], state["episode"] + self.count, rows)
+        self.batch.start(state[keys.SEED], state[keys.EPISODE] + self.count, rows)
 
     def step(self, actions: Integers) -> Stepped:
         return self.batch.step(actions)
@@ -73,52 +66,34 @@ class NativeRows(Rows):
         return self._arrays
 
 
-def native_rows(traffic: Option, count: int, options: Mapping[str, Any]) -> NativeRows | None:
-    """N highways with the ``options`` of :func:`ganlane.api.make_env`, by the kernel.
-
-    None where it does not implement them, or one of them is wrong, which is then reported by who
-    makes the TorchRL environment.
-    """
-    groups = {name: options.get(name) for name in _GROUPS}
-    of_env = {name: value for name, value in options.items() if name not in _GROUPS}
-    try:
-        others: TrafficConfig = option("traffic", traffic)
-        env: EnvConfig = option("env", groups["env"], of_env)
-        observation, reward, mask = (
-            option(name, groups[name]) for name in ("observation", "reward", "mask")
-        )
-        check_reward(env, reward)
-        device = RunConfig(device=options.get("device", "cpu")).device
-        stream = Stream.named(str(options.get("stream", "train")))
-    except UserError:
-        return None
+def native_rows(config: HighwayConfig) -> NativeRows | None:
+    """The highways of ``config`` by the kernel; None where it does not implement them."""
+    env, observation = config.env, config.observation
     # The traffic says who drives; the rest is what the kernel's observation and scenes can do.
-    drivers = others.native_parameters(env)
+    drivers = config.traffic.native_parameters(env.idm, env.mobil)
     if (
         drivers is None
         or env.kernel == "torch"
-        or type(env).scenes is not EnvConfig.scenes
+        or env.scene is not None
         or observation.form not in NATIVE_FORMS
         or observation.sensors is not None
-        or device != "cpu"
-        or len(options.get("transforms", ()))
+        or config.device != "cpu"
     ):
         return None
     episode = env.episode_parameters()
     batch = NativeBatch(
-        count,
+        config.num_envs,
         env.lanes,
         env.lane_width_m,
         env.vehicles,
         env.spawn_parameters(),
         env.ego,
         episode,
-        drivers.idm,
-        drivers.mobil,
+        *drivers,
         env.recycle_share if env.recycle else None,
         observation,
-        reward,
-        mask,
-        int(stream),
+        config.reward,
+        config.mask,
+        int(Stream.named(config.stream)),
     )
     return NativeRows(batch, episode)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -14,7 +15,6 @@ from ganlane.gym.base import OnRows, make_rows
 from ganlane.gym.rows import SEEDS, Floats, actions_of, array_of, reset_options, row_of
 from ganlane.gym.window import FilmWindow, has_display
 from ganlane.keys import ACTIONS, PHYSICS_STEP_S
-from ganlane.options import Option
 
 if TYPE_CHECKING:
     from gymnasium.wrappers import RecordVideo
@@ -50,10 +50,11 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
 
     def __init__(
         self,
-        traffic: Option = "idm_mobil",
+        traffic: Any = "idm_mobil",
         *,
         seed: int | None = None,
         render_mode: str | None = None,
+        transforms: Sequence[Any] = (),
         **options: Any,
     ) -> None:
         if render_mode not in (None, *RENDER_MODES):
@@ -63,7 +64,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
             )
         self._seed = None if seed is None else seed_number(seed)
         self._episode, self._running = -1, False
-        self._rows = make_rows(traffic, 1, render_mode is not None, options)
+        self._rows = make_rows(traffic, 1, render_mode is not None, transforms, options)
         self.observation_space: gymnasium.spaces.Box = self._rows.space  # type: ignore[assignment]
         self.action_space = gymnasium.spaces.Discrete(ACTIONS)
         self.render_mode, fps = render_mode, FPS

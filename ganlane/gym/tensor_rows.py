@@ -3,7 +3,7 @@
 # ruff: noqa: D102 - Rows has the docstrings of the methods
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,15 +11,15 @@ import numpy.typing as npt
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import TransformedEnv
+from torchrl.envs import Transform
 
 from ganlane import keys
 from ganlane.agents.drivers import legal_actions
-from ganlane.api import make_env
+from ganlane.build import make_highways
 from ganlane.gym.rows import Flags, Floats, Integers, Rows, observation_space
 from ganlane.keys import EGO_INDEX
 from ganlane.native.batch import Stepped
-from ganlane.options import Option
+from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.observation import largest_number
 from ganlane.sim.state import road_in
 from ganlane.transforms import ObservationTransform
@@ -29,12 +29,14 @@ class TensorRows(Rows):
     """N highways by the TorchRL environment.
 
     Attributes:
-        env: what :func:`ganlane.api.make_env` makes of the arguments.
+        env: the TorchRL environment of the settings, with a user's own transforms at the end.
         state: of its rows, from the first :meth:`start` on.
     """
 
-    def __init__(self, traffic: Option, count: int, options: Mapping[str, Any]) -> None:
-        self.env: TransformedEnv = make_env(traffic, count, **options)
+    def __init__(self, config: HighwayConfig, transforms: Sequence[Transform] = ()) -> None:
+        self.env = make_highways(config)
+        for transform in transforms:
+            self.env.append_transform(transform)
         base = self.env.base_env
         self.count, self.episode = count, base.episode
         parts = list(self.env.transform)

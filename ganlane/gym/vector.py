@@ -16,7 +16,6 @@ from ganlane.errors import UserError
 from ganlane.gym.base import OnRows, make_rows
 from ganlane.gym.rows import SEEDS, Flags, Floats, actions_of, array_of, reset_options
 from ganlane.keys import ACTIONS
-from ganlane.options import Option
 
 
 class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]]):
@@ -55,10 +54,11 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
     def __init__(
         self,
         num_envs: int = 1,
-        traffic: Option = "idm_mobil",
+        traffic: Any = "idm_mobil",
         *,
         seed: int | None = None,
         render_mode: str | None = None,
+        transforms: Sequence[Any] = (),
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         max_episode_steps: int | None = None,
         **options: Any,
@@ -69,7 +69,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
                 "use gymnasium.make for a window."
             )
         self._mode = _mode_of(autoreset_mode)
-        self._rows = make_rows(traffic, num_envs, render_mode is not None, options)
+        self._rows = make_rows(traffic, num_envs, render_mode is not None, transforms, options)
         self.num_envs, self.render_mode = self._rows.count, render_mode
         episode = self._rows.episode
         if max_episode_steps is not None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig, check_reward
@@ -19,7 +20,10 @@ from ganlane.settings.record import (
     assign,
     at_least,
     between,
+    key_names,
+    make,
     one_of,
+    plain,
 )
 from ganlane.settings.traffic import IdmMobilTrafficConfig, TrafficConfig, traffics_of
 
@@ -102,6 +106,29 @@ class HighwayConfig(DrivingConfig):
     traffic: TrafficConfig = field(default_factory=IdmMobilTrafficConfig)
     num_envs: Environments = 1
     stream: StreamName = "train"
+
+
+def with_env_keys(kind: type[Record], keys: Mapping[str, Any]) -> dict[str, Any]:
+    """``keys`` of a call, those that ``kind`` does not have moved into its ``env``: ``lanes=4``."""
+    names = {*key_names(kind), "experiment"}
+    of_env = {name: value for name, value in keys.items() if name not in names}
+    if not of_env or "env" not in names:
+        return dict(keys)
+    result = {name: value for name, value in keys.items() if name in names}
+    base = result.get("env", {})
+    if isinstance(base, str):
+        base = {"name": base}
+    result["env"] = {**(plain(base) if isinstance(base, Record) else base), **of_env}
+    return result
+
+
+def highways(**keys: Any) -> HighwayConfig:
+    """The settings of environments from the arguments of a call.
+
+    Raises:
+        UserError: an unknown key or option, a value of the wrong type or out of range.
+    """
+    return make(HighwayConfig, with_env_keys(HighwayConfig, keys))
 
 
 #: Episodes of ``ganlane reproduce`` on slow traffics, so that the whole takes half an hour.

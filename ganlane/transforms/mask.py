@@ -24,9 +24,9 @@ from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.keys import ACTIONS, EGO_INDEX
 from ganlane.native.tensors import SafeActions
-from ganlane.settings.driving import IdmParameters
-from ganlane.settings.observation import MASKS
-from ganlane.sim.dynamics import ego_scene
+from ganlane.parameters.driving import IdmParameters
+from ganlane.parameters.observation import MASKS
+from ganlane.sim.dynamics import SIDES, ego_scene, is_heard, on_road
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import lane_accelerations
 from ganlane.sim.state import Road, Vehicles, road_in
@@ -39,7 +39,8 @@ def on_road_actions(target_lane: Tensor, lanes: int | Tensor) -> Tensor:
 
     ``target_lane`` [N] of the ego, ``lanes`` one number or [N].
     """
-    return torch.stack((target_lane >= 0, target_lane < lanes - 1, target_lane > 0), dim=1)
+    of_row = lanes[:, None] if isinstance(lanes, Tensor) else lanes
+    return on_road(target_lane[:, None] + target_lane.new_tensor(SIDES), of_row)
 
 
 def obeyed_actions(change_direction: Tensor, abort: bool) -> Tensor:
@@ -48,10 +49,8 @@ def obeyed_actions(change_direction: Tensor, abort: bool) -> Tensor:
     During a lane change in ``change_direction`` (-1 or 1, [N]; 0: none) commands are ignored; with
     ``abort`` the opposite command turns back.
     """
-    left = right = change_direction == 0
-    if abort:
-        left, right = change_direction <= 0, change_direction >= 0
-    return torch.stack((torch.ones_like(left), left, right), dim=1)
+    side = change_direction.new_tensor(SIDES)
+    return (side == 0) | is_heard(side, change_direction[:, None], abort)
 
 
 def braking_demand(vehicles: Vehicles, road: Road, idm: IdmParameters = TABLE_V) -> Tensor:
@@ -66,7 +65,7 @@ def braking_demand(vehicles: Vehicles, road: Road, idm: IdmParameters = TABLE_V)
     lane = scene.observers.target_lane.to(vehicles.x.dtype)
     lanes = torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1)
     accelerations = lane_accelerations(scene, lanes, idm)
-    return torch.minimum(accelerations.own, accelerations.with_it)[:, 0]
+    return torch.minimum(accelerations.observer, accelerations.with_it)[:, 0]
 
 
 class ActionMaskTransform(PerceptionTransform):

@@ -269,7 +269,7 @@ def refuse_stored_imports(config: TrainConfig, overrides: Sequence[str]) -> None
     ]
     named = {name.partition("+")[0] for override in asked for name in leaves(override.value())}
     for key, path in _imports(config):
-        if not path.startswith("ganlane.") and path not in named:
+        if not path.startswith(("ganlane.", "ganlane_simulators.")) and path not in named:
             raise UserError(
                 f"resume={config.resume}: the run's files name {path}, and code from there would be executed; if you "
                 f"trust it, add {key} to the command line."

@@ -151,16 +151,16 @@ class IdmRandomTrafficConfig(TrafficConfig, RandomDrivers):
 
 @dataclass(frozen=True)
 class SumoTrafficConfig(TrafficConfig, SumoParameters):
-    """``traffic=sumo`` (:class:`ganlane.traffic.SumoTraffic`)."""
+    """``traffic=sumo`` (:class:`ganlane_simulators.SumoTraffic`)."""
 
-    _target_: str = "ganlane.traffic.SumoTraffic"
+    _target_: str = "ganlane_simulators.SumoTraffic"
 
 
 @dataclass(frozen=True)
 class HighwayEnvTrafficConfig(TrafficConfig):
-    """``traffic=highway_env`` (:class:`ganlane.traffic.HighwayEnvTraffic`)."""
+    """``traffic=highway_env`` (:class:`ganlane_simulators.HighwayEnvTraffic`)."""
 
-    _target_: str = "ganlane.traffic.HighwayEnvTraffic"
+    _target_: str = "ganlane_simulators.HighwayEnvTraffic"
 
 
 @dataclass(frozen=True)

@@ -168,7 +168,7 @@ class CalibratedGanParameters(Record):
 
 @dataclass(frozen=True)
 class SumoParameters(Record):
-    """What SUMO's drivers have in common (:class:`ganlane.traffic.SumoTraffic`).
+    """What SUMO's drivers have in common (:class:`ganlane_simulators.SumoTraffic`).
 
     Attributes:
         truck_share: lorries among the others, 0 to 1, where the first scene has none of its own.

@@ -6,10 +6,7 @@ recordings. :mod:`~ganlane.traffic.mixed` chooses a model per episode, or hides 
 (:mod:`~ganlane.traffic.overlays`, :mod:`~ganlane.traffic.faults`) follow a base model in a
 :class:`TrafficSequential`; :mod:`~ganlane.traffic.presets` builds the chains that ship.
 
-In :mod:`~ganlane.traffic.sumo` (Krauss and LC2013; its roads in :mod:`~ganlane.traffic.sumo_roads`)
-and :mod:`~ganlane.traffic.highway_env` foreign simulators drive, for tests with drivers that are
-not ours: the ego is moved by the environment as always, and there a stand-in drives in its place.
-Their packages are imported when a model is made, not before.
+Traffic of foreign simulators is the package :mod:`ganlane_simulators`.
 """
 
 from ganlane.parameters.driving import (
@@ -26,7 +23,6 @@ from ganlane.traffic.faults import (
     LateReaction,
     PhantomBraking,
 )
-from ganlane.traffic.highway_env import HighwayEnvTraffic
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmRandomTraffic, IdmTraffic
 from ganlane.traffic.mixed import BlindTraffic, MixedTraffic
 from ganlane.traffic.overlays import (
@@ -40,7 +36,6 @@ from ganlane.traffic.overlays import (
     SuddenAccelerations,
 )
 from ganlane.traffic.replay import RecordedScenes, Recordings, ReplayTraffic
-from ganlane.traffic.sumo import SumoTraffic
 
 __all__ = [
     "AbortFaults",
@@ -54,7 +49,6 @@ __all__ = [
     "GuardParameters",
     "HesitantLaneChange",
     "HesitationFaults",
-    "HighwayEnvTraffic",
     "IdmMobilTraffic",
     "IdmRandomTraffic",
     "IdmTraffic",
@@ -70,7 +64,6 @@ __all__ = [
     "Recordings",
     "ReplayTraffic",
     "SuddenAccelerations",
-    "SumoTraffic",
     "TrafficModule",
     "TrafficSequential",
 ]

@@ -27,7 +27,7 @@ from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps, perceive
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.spawn import RandomScenes
 from ganlane.traffic import IdmTraffic
-from ganlane.traffic.sumo import LorryScenes
+from ganlane_simulators.sumo import LorryScenes
 
 
 def drive(traffic, rows: int, decisions: int, recycle: bool) -> tuple[float, float, int, int]:

@@ -35,7 +35,7 @@ from ganlane.traffic.overlays import (
     LiteralLaneChange,
     SuddenAccelerations,
 )
-from ganlane.traffic.replay import RecordedScenes, Recordings, ReplayTraffic
+from ganlane.traffic.replay import RecordedScenes, ReplayTraffic
 
 __all__ = [
     "AbortFaults",
@@ -61,7 +61,6 @@ __all__ = [
     "RandomDrivers",
     "ReactionFaults",
     "RecordedScenes",
-    "Recordings",
     "ReplayTraffic",
     "SuddenAccelerations",
     "TrafficModule",

@@ -1,12 +1,8 @@
-"""The contract of traffic models, TensorDictModules that move the other vehicles by 0.1 s, and
-chains of them.
-"""
+"""The contract of traffic models, which move the other vehicles by 0.1 s, and chains of them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import import_module
-from importlib.util import find_spec
 from typing import Any, TypeAlias, cast
 
 import torch
@@ -31,6 +27,14 @@ Moved: TypeAlias = tuple[Vehicles, Memory]
 MemoryFields: TypeAlias = Mapping[str, tuple[tuple[int, ...], torch.dtype | None]]
 
 
+def new_tensordict(fields: Mapping[str, Any], n: int) -> TensorDict:
+    """A TensorDict [N] of tensors and TensorDicts of N = ``n`` rows.
+
+    Without TensorDict's checks, which cost as much as a step of a small batch.
+    """
+    return TensorDict._new_unsafe(dict(fields), batch_size=torch.Size([n]))
+
+
 def memory_of(tensordict: TensorDictBase, key: str = keys.TRAFFIC) -> TensorDictBase:
     """The memory under ``key``; empty if it is missing, since TorchRL drops empty TensorDicts."""
     memory = tensordict.get(key, None)
@@ -38,37 +42,11 @@ def memory_of(tensordict: TensorDictBase, key: str = keys.TRAFFIC) -> TensorDict
 
 
 def key_of(tensordict: TensorDictBase, stream: int) -> Tensor:
-    """The episodes' keys [N].
-
-    ``episode_key`` if the caller has computed it, else from ``seed`` and ``episode``.
-    """
+    """The episodes' keys [N]: those that the caller has computed, or from seed and episode."""
     key = tensordict.get(keys.EPISODE_KEY, None)
-    return (
-        episode_key(stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
-        if key is None
-        else key
-    )
-
-
-def _put(tensordict: TensorDictBase, key: str, fields: Memory) -> None:
-    """``tensordict[key] = fields`` without the checks, which cost as much as a step of a small
-    batch.
-    """
-    nested = TensorDict._new_unsafe(fields, batch_size=tensordict.batch_size)
-    tensordict._set_str(key, nested, validated=True, inplace=False, non_blocking=False)
-
-
-def require(module: str, traffic: str, package: str, extra: str) -> Any:
-    """The ``module`` of a foreign simulator, imported only now; :class:`UserError` if its
-    ``package`` is missing.
-
-    ``traffic`` is the option that needs it, ``extra`` the one of ours that brings it.
-    """
-    if find_spec(module.partition(".")[0]) is None:
-        raise UserError(
-            f"traffic {traffic}: {package} is not installed; pip install 'ganlane[{extra}]' brings it."
-        )
-    return import_module(module)
+    if key is None:
+        return episode_key(stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
+    return key
 
 
 class TrafficModule(TensorDictModuleBase):
@@ -131,8 +109,8 @@ class TrafficModule(TensorDictModuleBase):
         """
         (n, m), x = vehicles.x.shape, vehicles.x
         return {
-            name: x.new_zeros((n, m, *shape), dtype=kind)
-            for name, (shape, kind) in self.memory_fields.items()
+            name: x.new_zeros((n, m, *shape), dtype=dtype)
+            for name, (shape, dtype) in self.memory_fields.items()
         }
 
     def road_of(self, key: Tensor, dtype: torch.dtype) -> Road:
@@ -157,7 +135,8 @@ class TrafficModule(TensorDictModuleBase):
         """
         self.move = compiled(self.move)  # type: ignore[method-assign]
 
-    # Below: TensorDicts in and out, so that models can be chained and stored.
+    # Below: TensorDicts in and out, so that models can be chained and stored. A model of your own
+    # needs nothing of it.
 
     @outside_autocast
     def __call__(self, *arguments: Any, **named: Any) -> Any:
@@ -169,13 +148,12 @@ class TrafficModule(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``moved`` and ``traffic``."""
-        vehicles, memory = (
-            Vehicles.of(tensordict.get(keys.VEHICLES)),
-            dict(memory_of(tensordict).items()),
-        )
+        vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
+        memory = dict(memory_of(tensordict).items())
         moved, memory = self._call(tensordict, vehicles, memory, key_of(tensordict, self.stream))
-        _put(tensordict, keys.MOVED, moved.as_dict())
-        _put(tensordict, keys.TRAFFIC, memory)
+        n = tensordict.batch_size[0]
+        tensordict.set(keys.MOVED, new_tensordict(moved.as_dict(), n))
+        tensordict.set(keys.TRAFFIC, new_tensordict(memory, n))
         return tensordict
 
     def _call(
@@ -186,23 +164,26 @@ class TrafficModule(TensorDictModuleBase):
     @outside_autocast
     def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
         """:meth:`fresh_memory` as a TensorDict [N]."""
-        return TensorDict(self.fresh_memory(vehicles, key), batch_size=[vehicles.x.shape[0]])
+        return new_tensordict(self.fresh_memory(vehicles, key), len(vehicles.x))
 
     def enter(
         self, vehicles: Vehicles, key: Tensor, episode: Tensor
     ) -> tuple[Vehicles, TensorDictBase]:
-        """The start of the episodes of these keys and numbers [N] int64: the initial scene, and the
-        memory.
+        """The start of episodes: the initial scene and the memory.
 
         A traffic that sets visibilities or desired speeds itself overrides this method.
+
+        Args:
+            vehicles: the scene so far.
+            key, episode: the episodes' keys and numbers, [N] int64.
         """
         return vehicles, self.init_memory(vehicles, absorb(key, 0))
 
     def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
         """Nested name -> (shape, dtype) of the memory of ``n`` rows of ``m`` vehicles."""
         return {
-            name: ((n, m, *shape), kind or dtype)
-            for name, (shape, kind) in self.memory_fields.items()
+            name: ((n, m, *shape), own_dtype or dtype)
+            for name, (shape, own_dtype) in self.memory_fields.items()
         }
 
 
@@ -243,7 +224,7 @@ class TrafficParts(TrafficModule):
 
     def named_parts(self) -> list[tuple[str, TrafficModule]]:
         """Names and parts, in order."""
-        return [(name, cast(TrafficModule, part)) for name, part in self.parts.items()]
+        return cast("list[tuple[str, TrafficModule]]", list(self.parts.items()))
 
     def compile_graphs(self) -> None:
         """Compile every part."""
@@ -267,36 +248,35 @@ class TrafficSequential(TrafficParts):
     """
 
     def __init__(self, parts: dict[str, TrafficModule]) -> None:
-        base = next(iter(parts.values()))
+        super().__init__(parts)
+        _, base = self.named_parts()[0]
         if base.own_roads:
             raise UserError(
-                "overlays behind replayed traffic: they go where they went; lay faults over a model."
+                "overlays behind replayed traffic: they go where they went; lay faults over a "
+                "model."
             )
-        super().__init__(parts)
         self.visibility = base.visibility
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Run the parts in order."""
-        memories, kept = memory_of(tensordict), {}
+        memories, new_memories = memory_of(tensordict), {}
         for name, part in self.named_parts():
             tensordict.set(keys.TRAFFIC, memory_of(memories, name))
             part(tensordict)
-            kept[name] = tensordict.get(keys.TRAFFIC)
-        tensordict.set(keys.TRAFFIC, TensorDict._new_unsafe(kept, batch_size=tensordict.batch_size))
-        return tensordict
+            new_memories[name] = tensordict.get(keys.TRAFFIC)
+        n = tensordict.batch_size[0]
+        return tensordict.set(keys.TRAFFIC, new_tensordict(new_memories, n))
 
     def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
         """The parts' memories, by name."""
         memories = {name: part.init_memory(vehicles, key) for name, part in self.named_parts()}
-        return TensorDict(memories, batch_size=[vehicles.x.shape[0]])
+        return new_tensordict(memories, len(key))
 
     def enter(
         self, vehicles: Vehicles, key: Tensor, episode: Tensor
     ) -> tuple[Vehicles, TensorDictBase]:
-        """The vehicles after the parts' :meth:`TrafficModule.enter` in order, and the memories by
-        name.
-        """
+        """The vehicles after the parts' :meth:`TrafficModule.enter`, and the memories by name."""
         memories = {}
         for name, part in self.named_parts():
             vehicles, memories[name] = part.enter(vehicles, key, episode)
-        return vehicles, TensorDict(memories, batch_size=[vehicles.x.shape[0]])
+        return vehicles, new_tensordict(memories, len(key))

@@ -9,13 +9,6 @@ recordings. :mod:`~ganlane.traffic.mixed` chooses a model per episode, or hides 
 Traffic of foreign simulators is the package :mod:`ganlane_simulators`.
 """
 
-from ganlane.parameters.driving import (
-    AbortFaults,
-    BrakingFaults,
-    HesitationFaults,
-    RandomDrivers,
-    ReactionFaults,
-)
 from ganlane.traffic.base import Overlay, TrafficModule, TrafficSequential
 from ganlane.traffic.faults import (
     AbortedLaneChange,
@@ -35,20 +28,17 @@ from ganlane.traffic.overlays import (
     LiteralLaneChange,
     SuddenAccelerations,
 )
-from ganlane.traffic.replay import RecordedScenes, ReplayTraffic
+from ganlane.traffic.replay import ReplayTraffic
 
 __all__ = [
-    "AbortFaults",
     "AbortedLaneChange",
     "AccelerationOverlay",
     "BlindTraffic",
-    "BrakingFaults",
     "CalibratedChanges",
     "CalibratedLaneChange",
     "Guard",
     "GuardParameters",
     "HesitantLaneChange",
-    "HesitationFaults",
     "IdmMobilTraffic",
     "IdmRandomTraffic",
     "IdmTraffic",
@@ -58,9 +48,6 @@ __all__ = [
     "MixedTraffic",
     "Overlay",
     "PhantomBraking",
-    "RandomDrivers",
-    "ReactionFaults",
-    "RecordedScenes",
     "ReplayTraffic",
     "SuddenAccelerations",
     "TrafficModule",

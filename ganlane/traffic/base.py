@@ -14,7 +14,7 @@ from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.driving import Visibility
-from ganlane.sim.random import Stream, absorb, episode_key
+from ganlane.sim.random import Stream, absorb, episode_key, uniform
 from ganlane.sim.scenes import Scenes
 from ganlane.sim.state import Road, Vehicles
 from ganlane.torch_settings import compiled, outside_autocast
@@ -47,6 +47,14 @@ def key_of(tensordict: TensorDictBase, stream: int) -> Tensor:
     if key is None:
         return episode_key(stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
     return key
+
+
+def uniforms(
+    vehicles: Vehicles, key: Tensor, step: Tensor | int, *purposes: int
+) -> tuple[Tensor, ...]:
+    """A uniform number in [0, 1) for every vehicle, [N, M], of each of the ``purposes``."""
+    drawn = uniform(key, step, vehicles.x.shape[1], list(purposes), vehicles.x.dtype)
+    return drawn.unbind(-1)
 
 
 class TrafficModule(TensorDictModuleBase):

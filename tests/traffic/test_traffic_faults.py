@@ -18,16 +18,19 @@ from scipy.stats import binomtest
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
-from ganlane.parameters.driving import DriverFaults
+from ganlane.parameters.driving import (
+    AbortFaults,
+    BrakingFaults,
+    DriverFaults,
+    HesitationFaults,
+    ReactionFaults,
+)
 from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps, perceive
 from ganlane.traffic import (
     AbortedLaneChange,
-    AbortFaults,
-    BrakingFaults,
     CalibratedChanges,
     CalibratedLaneChange,
     HesitantLaneChange,
-    HesitationFaults,
     IdmMobilTraffic,
     IdmTraffic,
     LateReaction,
@@ -35,7 +38,6 @@ from ganlane.traffic import (
     LiteralLaneChange,
     Overlay,
     PhantomBraking,
-    ReactionFaults,
     TrafficModule,
     TrafficSequential,
 )

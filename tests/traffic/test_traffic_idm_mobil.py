@@ -16,13 +16,12 @@ from ganlane import keys
 from ganlane.config.traffic import IdmRandomTrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
-from ganlane.parameters.driving import MobilParameters
+from ganlane.parameters.driving import MobilParameters, RandomDrivers
 from ganlane.sim import Road, SpawnParameters, Vehicles
 from ganlane.traffic import (
     IdmMobilTraffic,
     IdmRandomTraffic,
     IdmTraffic,
-    RandomDrivers,
     TrafficModule,
 )
 from ganlane.traffic.idm_mobil import DriverParams, start_braking

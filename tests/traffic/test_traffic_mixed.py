@@ -175,11 +175,13 @@ def test_graphs_meet_few_numbers_of_rows(monkeypatch):
     traffic.compile_graphs()
     generator, sizes = torch.Generator().manual_seed(0), set()
     for _ in range(50):
-        rows = traffic.layout(torch.randint(0, 999, (64,), generator=generator)).rows
-        assert sum(each.number for each in rows) == 64
-        sizes |= {len(each.picked) for each in rows}
+        episodes = torch.randint(0, 999, (64,), generator=generator)
+        parts = traffic.rows_of_parts(episodes)
+        assert sum(len(rows) for _, _, rows, _ in parts) == 64
+        sizes |= {len(padded) for *_, padded in parts}
     assert len(sizes) <= 8
-    assert [len(each.picked) for each in traffic.layout(torch.arange(48)).rows] == [32, 16]
+    parts = traffic.rows_of_parts(torch.arange(48))
+    assert [len(padded) for *_, padded in parts] == [32, 16]
     for one, other in zip(plain, drive(traffic, 64)):
         assert same_bits(one, other) == []
 
@@ -201,7 +203,6 @@ def test_graphs_meet_few_numbers_of_rows(monkeypatch):
             "different roads or streams",
         ),
         (lambda: ReplayTrafficConfig(blind_share=0.5), "no ego anyway"),
-        (lambda: BlindTraffic(IdmTraffic(), 1.5), "from 0 to 1"),
         (lambda: IdmTrafficConfig(blind_share=-1.0), r"blind_share=-1"),
     ],
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -185,7 +185,7 @@ class SumoTraffic(TrafficModule):
             vehicles, acceleration, steering[:, 0], self.road, self.steering, self.dt
         )
         self._lead_egos(now.roads, driving, ego, before)
-        self._wander(now, driving, step.cpu().numpy())
+        self._wander(now.roads, driving, before, key.cpu(), step.cpu().numpy())
         now.roads.step()
         moved = self._moved(now.roads, driving, vehicles, before)
         now.before, now.after = before, _arrays(moved)
@@ -193,8 +193,8 @@ class SumoTraffic(TrafficModule):
 
     def _running(self, before: Any, fresh: Flags) -> _Simulation:
         """The running simulation, or a new one if all episodes begin."""
-        now, (n, m) = self._simulation, before.x.shape
-        if now is not None and now.roads.is_open and now.desired_speed.shape == (n, m):
+        now = self._simulation
+        if now is not None and now.roads.is_open and now.shape == before.x.shape:
             return now
         if not fresh.all():
             raise UserError(
@@ -203,9 +203,10 @@ class SumoTraffic(TrafficModule):
                 "next one starts."
             )
         assert isinstance(self.road.lanes, int)
-        width = float(self.road.lane_width_m)
+        n, width = len(before.x), float(self.road.lane_width_m)
         roads = SumoRoads(n, self.road.lanes, width, self.lane_change_s, self.keep_right)
-        self._simulation = _Simulation(roads, n, m)
+        no_keys, none_ended = np.zeros(n, np.int64), np.zeros(n, bool)
+        self._simulation = _Simulation(roads, before.x.shape, no_keys, none_ended)
         return self._simulation
 
     def _check(self, now: _Simulation, before: Any, fresh: Flags, key: NDArray[np.int64]) -> Flags:
@@ -247,7 +248,7 @@ class SumoTraffic(TrafficModule):
         """A new episode on a highway."""
         m = vehicles.x.shape[1]
         now.roads.clear(row)
-        purposes = list(range(Purpose.FOREIGN_DRIVER, Purpose.FOREIGN_DRIVER + _PACE_PHASE + 1))
+        purposes = [Purpose.FOREIGN_DRIVER + _TAU + k for k in range(len(CARS))]
         u = uniform(key[row : row + 1].cpu(), 0, m, purposes, torch.float64)[0].numpy()
         drivers = []
         for i in range(1, m):
@@ -255,9 +256,6 @@ class SumoTraffic(TrafficModule):
             drivers.append(_driver(u[i], vehicles, row, i) if there else None)
         now.roads.fill(row, drivers, [self._place(vehicles, row, i) for i in range(1, m)])
         now.keys[row], now.ended[row] = int(key[row]), False
-        now.desired_speed[row] = vehicles.desired_speed[row]
-        now.pace_turns[row] = 0.1 / (20.0 + 40.0 * u[:, _PACE_PERIOD])
-        now.pace_phase[row] = u[:, _PACE_PHASE]
 
     def _lead_egos(self, roads: SumoRoads, driving: Flags, ego: Vehicles, before: Any) -> None:
         """The stand-ins, ordinary cars for SUMO's drivers, follow the egos."""
@@ -273,17 +271,22 @@ class SumoTraffic(TrafficModule):
             there = range(int(low[row]), int(high[row]) + 1) if now.valid[row] else range(0)
             roads.lead_ego(row, there, driver, here, next_x[row])
 
-    def _wander(self, now: _Simulation, driving: Flags, step: NDArray[np.int64]) -> None:
+    def _wander(
+        self, roads: SumoRoads, driving: Flags, before: Any, key: Tensor, step: NDArray[np.int64]
+    ) -> None:
         """Once a second drivers change their desired speeds, each along its own sine."""
-        if self.speed_wander == 0.0:
+        rows = np.flatnonzero(driving & (step % _PACE_STEPS == 0)).tolist()
+        if self.speed_wander == 0.0 or not rows:
             return
-        for row in np.flatnonzero(driving & (step % _PACE_STEPS == 0)).tolist():
-            turns = step[row] * now.pace_turns[row] + now.pace_phase[row]
-            factor = 1.0 + self.speed_wander * np.sin(2.0 * np.pi * turns)
-            speeds = now.desired_speed[row] * factor
-            for name, speed in zip(now.roads.names[row], speeds[1:].tolist()):
+        purposes = [Purpose.FOREIGN_DRIVER + _PACE_PERIOD, Purpose.FOREIGN_DRIVER + _PACE_PHASE]
+        u = uniform(key, 0, before.x.shape[1], purposes, torch.float64).numpy()
+        turns = step[:, None] * (0.1 / (20.0 + 40.0 * u[..., 0])) + u[..., 1]
+        factor = 1.0 + self.speed_wander * np.sin(2.0 * np.pi * turns)
+        speeds = before.desired_speed * factor
+        for row in rows:
+            for name, speed in zip(roads.names[row], speeds[row, 1:].tolist()):
                 if name:
-                    now.roads.set_desired_speed(name, speed)
+                    roads.set_desired_speed(name, speed)
 
     def _moved(self, roads: SumoRoads, driving: Flags, vehicles: Vehicles, before: Any) -> Vehicles:
         """SUMO's state as our fields; the egos, and rows that do not drive, stay as they are."""
@@ -302,7 +305,7 @@ class SumoTraffic(TrafficModule):
             "y": new_y,
             "speed": new_speed,
             "heading": np.clip(angle, -_STEEPEST_RAD, _STEEPEST_RAD),
-            "acceleration": (new_speed - before.speed[at].astype(np.float64)) / self.dt,
+            "acceleration": (new_speed - before.speed[at]) / self.dt,
             "target_lane": np.clip(lane, 0, int(self.road.lanes) - 1),
             "valid": True,
         }
@@ -318,23 +321,22 @@ class SumoTraffic(TrafficModule):
 
 @dataclass
 class _Simulation:
-    """The roads in SUMO, and the state of their rows outside of it; arrays [N] or [N, M]."""
+    """The roads in SUMO, and what is remembered of their rows.
+
+    Attributes:
+        roads: N highways.
+        shape: N and M.
+        keys: [N] of the episodes under way.
+        ended: [N] whether a row has ended and is off the road.
+        before, after: the vehicles (:func:`_arrays`) before and after the last step.
+    """
 
     roads: SumoRoads
-    n: int
-    m: int
-    #: The vehicles (:func:`_arrays`) before and after the last step.
+    shape: tuple[int, int]
+    keys: NDArray[np.int64]
+    ended: Flags
     before: Any = None
     after: Any = None
-    keys: NDArray[np.int64] = field(init=False)
-    ended: Flags = field(init=False)
-    desired_speed: Array = field(init=False)
-    pace_turns: Array = field(init=False)
-    pace_phase: Array = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.keys, self.ended = np.zeros(self.n, np.int64), np.zeros(self.n, bool)
-        self.desired_speed, self.pace_turns, self.pace_phase = np.zeros((3, self.n, self.m))
 
 
 def _arrays(vehicles: Vehicles) -> Any:
@@ -354,9 +356,7 @@ def _driver(u: Array, vehicles: Any, row: int, i: int) -> SumoDriver:
     """The driver of vehicle ``i`` of a row by the uniforms ``u`` in [0, 1)."""
     is_lorry = vehicles.length[row, i] >= LORRY_M
     ranges, emergency_decel = (LORRIES, 7.0) if is_lorry else (CARS, 9.0)
-    drawn = [
-        low + float(u[_TAU + k]) * (high - low) for k, (low, high) in enumerate(ranges.values())
-    ]
+    drawn = [low + float(u[k]) * (high - low) for k, (low, high) in enumerate(ranges.values())]
     names = ("desired_speed", "length", "width")
     body = [float(getattr(vehicles, name)[row, i]) for name in names]
     return SumoDriver(*body, *drawn, emergency_decel)

@@ -195,11 +195,12 @@ class SumoRoads:
                 if name:
                     names.append(name)
                     places.append((row, index))
-        rows, index = np.array(places, dtype=np.int64).reshape(-1, 2).T
         vehicle = self.libsumo.vehicle
         xy = np.array([vehicle.getPosition(name) for name in names]).reshape(-1, 2)
         xy[:, 0] -= ORIGIN_M
-        return rows, index, xy, np.array([vehicle.getSpeed(name) for name in names])
+        speeds = np.array([vehicle.getSpeed(name) for name in names])
+        at = np.array(places, dtype=np.int64).reshape(-1, 2)
+        return at[:, 0], at[:, 1], xy, speeds
 
 
 def _edge(row: int) -> str:

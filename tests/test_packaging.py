@@ -92,6 +92,7 @@ def test_the_wheel_holds_configuration_weights_and_kernel(tmp_path, monkeypatch)
     }
     assert "ganlane/view/player_page/page.html" in page <= names
     assert "ganlane/py.typed" in names
+    assert "ganlane_simulators/sumo.py" in names
     kernels = [name for name in names if name.startswith("ganlane/native/prebuilt/kernel-default-")]
     assert len(kernels) == (1 if library.find_compiler() else 0)
     assert not [name for name in names if name.startswith(("tests/", "outputs/"))]

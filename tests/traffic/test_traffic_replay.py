@@ -84,13 +84,6 @@ def test_the_replaced_vehicle_is_recorded_long_enough():
     assert scene.speed[0, 0] == 12.0
 
 
-def test_its_neighbours_are_the_nearest_in_order():
-    scene = start(replay(*FIVE), keys_of([0]), vehicles=4)
-    assert scene.x[0].tolist() == [0.0, -10.0, 15.0, -30.0]
-    assert scene.y[0].tolist() == [WIDTH, 0.0, 2 * WIDTH, 0.0]
-    assert scene.valid.all()
-
-
 def test_places_without_a_recorded_vehicle_are_not_valid():
     scene = start(replay(*FIVE), keys_of([0]), vehicles=9)
     assert scene.valid[0].tolist() == [True] * 5 + [False] * 4

@@ -81,8 +81,9 @@ def test_an_unknown_driver_is_refused_with_the_known_ones():
 def test_where_the_package_is_missing_a_sentence_names_the_extra(
     monkeypatch, module, config, extra
 ):
-    monkeypatch.setattr("ganlane.traffic.base.find_spec", lambda name: None)
-    monkeypatch.delitem(sys.modules, module, raising=False)
+    for name in [name for name in sys.modules if name.startswith(f"{module}.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(UserError, match=rf"pip install 'ganlane\[{extra}\]'"):
         make_traffic(config, EnvConfig())
 

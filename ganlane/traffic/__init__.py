@@ -6,19 +6,9 @@ recordings. :mod:`~ganlane.traffic.mixed` chooses a model per episode, or hides 
 (:mod:`~ganlane.traffic.overlays`, :mod:`~ganlane.traffic.faults`) follow a base model in a
 :class:`TrafficSequential`; :mod:`~ganlane.traffic.presets` builds the chains that ship.
 
-In :mod:`~ganlane.traffic.sumo` (Krauss and LC2013; its roads in :mod:`~ganlane.traffic.sumo_roads`)
-and :mod:`~ganlane.traffic.highway_env` foreign simulators drive, for tests with drivers that are
-not ours: the ego is moved by the environment as always, and there a stand-in drives in its place.
-Their packages are imported when a model is made, not before.
+Traffic of foreign simulators is the package :mod:`ganlane_simulators`.
 """
 
-from ganlane.settings.driving import (
-    AbortFaults,
-    BrakingFaults,
-    HesitationFaults,
-    RandomDrivers,
-    ReactionFaults,
-)
 from ganlane.traffic.base import Overlay, TrafficModule, TrafficSequential
 from ganlane.traffic.faults import (
     AbortedLaneChange,
@@ -26,7 +16,6 @@ from ganlane.traffic.faults import (
     LateReaction,
     PhantomBraking,
 )
-from ganlane.traffic.highway_env import HighwayEnvTraffic
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmRandomTraffic, IdmTraffic
 from ganlane.traffic.mixed import BlindTraffic, MixedTraffic
 from ganlane.traffic.overlays import (
@@ -39,22 +28,17 @@ from ganlane.traffic.overlays import (
     LiteralLaneChange,
     SuddenAccelerations,
 )
-from ganlane.traffic.replay import RecordedScenes, Recordings, ReplayTraffic
-from ganlane.traffic.sumo import SumoTraffic
+from ganlane.traffic.replay import ReplayTraffic
 
 __all__ = [
-    "AbortFaults",
     "AbortedLaneChange",
     "AccelerationOverlay",
     "BlindTraffic",
-    "BrakingFaults",
     "CalibratedChanges",
     "CalibratedLaneChange",
     "Guard",
     "GuardParameters",
     "HesitantLaneChange",
-    "HesitationFaults",
-    "HighwayEnvTraffic",
     "IdmMobilTraffic",
     "IdmRandomTraffic",
     "IdmTraffic",
@@ -64,13 +48,8 @@ __all__ = [
     "MixedTraffic",
     "Overlay",
     "PhantomBraking",
-    "RandomDrivers",
-    "ReactionFaults",
-    "RecordedScenes",
-    "Recordings",
     "ReplayTraffic",
     "SuddenAccelerations",
-    "SumoTraffic",
     "TrafficModule",
     "TrafficSequential",
 ]

@@ -1,5 +1,4 @@
-"""Faults of drivers, as overlays on any traffic model: phantom braking, late reactions, faulty lane
-changes.
+"""Faults of drivers, as overlays: phantom braking, late reactions, faulty lane changes.
 
 Each fault is a module of its own, comes at random to single drivers (never to the ego), and leaves
 the others bitwise as they were moved. The faults of lane changes need a model below that moves
@@ -22,16 +21,16 @@ from ganlane.settings.driving import (
     HesitationFaults,
     ReactionFaults,
 )
-from ganlane.sim.random import Purpose, Stream, uniform
+from ganlane.sim.random import Purpose, Stream
 from ganlane.sim.state import Road, Vehicles, lane_change_done
-from ganlane.traffic.base import Memory, Moved, Overlay, TrafficModule, TrafficSequential
+from ganlane.traffic.base import Memory, Moved, Overlay, TrafficModule, TrafficSequential, uniforms
 
 #: A step shorter than this has no direction of its own, m: the vehicle then moves along its
 #: heading.
 _SHORTEST_M = 1e-3
 #: No lane to turn back to.
 _NO_LANE = -1
-Faults = TypeVar("Faults", BrakingFaults, ReactionFaults, HesitationFaults, AbortFaults)
+Faults = TypeVar("Faults")
 
 
 def other_drivers(vehicles: Vehicles) -> Tensor:
@@ -46,8 +45,7 @@ def starting(vehicles: Vehicles, moved: Vehicles) -> Tensor:
 
 
 def driven_at(vehicles: Vehicles, moved: Vehicles, acceleration: Tensor, dt: float) -> Vehicles:
-    """``moved`` with another ``acceleration`` (m/s2, [N, M]): the same path, driven more slowly or
-    faster.
+    """``moved`` with another ``acceleration`` (m/s2, [N, M]): the same path, slower or faster.
 
     Position and heading follow the path from ``vehicles`` to ``moved`` in proportion to the
     distance driven.
@@ -57,12 +55,12 @@ def driven_at(vehicles: Vehicles, moved: Vehicles, acceleration: Tensor, dt: flo
     distance = 0.5 * (vehicles.speed + speed) * dt
     share = distance / usual.clamp_min(_SHORTEST_M)
     path = usual > _SHORTEST_M
-    x = torch.where(path, share * (moved.x - vehicles.x), distance * torch.cos(vehicles.heading))
-    y = torch.where(path, share * (moved.y - vehicles.y), distance * torch.sin(vehicles.heading))
+    dx = torch.where(path, share * (moved.x - vehicles.x), distance * torch.cos(vehicles.heading))
+    dy = torch.where(path, share * (moved.y - vehicles.y), distance * torch.sin(vehicles.heading))
     turn = torch.where(path, share * (moved.heading - vehicles.heading), 0.0)
     return moved.with_(
-        x=vehicles.x + x,
-        y=vehicles.y + y,
+        x=vehicles.x + dx,
+        y=vehicles.y + dy,
         heading=vehicles.heading + turn,
         speed=speed,
         acceleration=(speed - vehicles.speed) / dt,
@@ -72,7 +70,7 @@ def driven_at(vehicles: Vehicles, moved: Vehicles, acceleration: Tensor, dt: flo
 class Fault(Overlay, Generic[Faults]):
     """A fault that comes at random, as often as its ``faults`` say.
 
-    ``purpose`` of its random numbers.
+    ``kind`` is the record of ``faults``, ``purpose`` that of its random numbers.
     """
 
     kind: type[Faults]
@@ -86,23 +84,24 @@ class Fault(Overlay, Generic[Faults]):
 
     def draw(self, vehicles: Vehicles, key: Tensor, step: Tensor) -> Tensor:
         """A uniform number per vehicle, [N, M]."""
-        return uniform(key, step, vehicles.x.shape[1], [self.purpose], vehicles.x.dtype)[..., 0]
+        return uniforms(vehicles, key, step, self.purpose)[0]
 
 
-def steps_left(
-    left: Tensor, u: Tensor, vehicles: Vehicles, faults: BrakingFaults | ReactionFaults, dt: float
-) -> Tensor:
-    """Remaining steps of a fault, [N, M] int64: ``left``, or all of them where a fault begins now.
+class TimedFault(Fault[Faults]):
+    """A fault that lasts. Memory: ``left``, its remaining steps."""
 
-    A fault begins where there is none, at a constant hazard, by the uniform numbers ``u`` [N, M].
-    """
-    begins = (
-        (left == 0) & other_drivers(vehicles) & (u < -math.expm1(-faults.per_hour * dt / 3600.0))
-    )
-    return torch.where(begins, round(faults.lasts_s / dt), left)
+    def steps_left(self, left: Tensor, vehicles: Vehicles, key: Tensor, step: Tensor) -> Tensor:
+        """``left`` [N, M] int64, or all steps of a fault that begins now.
+
+        A fault begins where there is none, at a constant hazard.
+        """
+        per_step = -math.expm1(-self.faults.per_hour * self.dt / 3600.0)
+        comes = self.draw(vehicles, key, step) < per_step
+        begins = (left == 0) & other_drivers(vehicles) & comes
+        return torch.where(begins, round(self.faults.lasts_s / self.dt), left)
 
 
-class PhantomBraking(Fault[BrakingFaults]):
+class PhantomBraking(TimedFault[BrakingFaults]):
     """At times a driver brakes without a reason. Memory: the remaining steps of braking."""
 
     memory_fields = {"left": ((), torch.int64)}  # noqa: RUF012
@@ -112,16 +111,15 @@ class PhantomBraking(Fault[BrakingFaults]):
         self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
     ) -> Moved:
         """Brake during a fault."""
-        f = self.faults
-        left = steps_left(memory["left"], self.draw(vehicles, key, step), vehicles, f, self.dt)
-        brakes = (left > 0) & (moved.acceleration > -f.deceleration)
-        braking = driven_at(
-            vehicles, moved, torch.full_like(moved.acceleration, -f.deceleration), self.dt
-        )
+        left = self.steps_left(memory["left"], vehicles, key, step)
+        wanted = torch.full_like(moved.acceleration, -self.faults.deceleration)
+        # A driver who brakes harder anyway goes on doing so.
+        brakes = (left > 0) & (moved.acceleration > wanted)
+        braking = driven_at(vehicles, moved, wanted, self.dt)
         return braking.where(brakes, moved), {"left": (left - 1).clamp_min(0)}
 
 
-class LateReaction(Fault[ReactionFaults]):
+class LateReaction(TimedFault[ReactionFaults]):
     """During a lapse a driver accelerates and brakes as it should have done ``delay_s`` before.
 
     What is delayed is the acceleration that the model below decides on,
@@ -154,9 +152,7 @@ class LateReaction(Fault[ReactionFaults]):
         self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
     ) -> Moved:
         """Drive at the acceleration of ``delay_s`` ago during a lapse."""
-        left = steps_left(
-            memory["left"], self.draw(vehicles, key, step), vehicles, self.faults, self.dt
-        )
+        left = self.steps_left(memory["left"], vehicles, key, step)
         late = driven_at(vehicles, moved, memory["past"][..., 0], self.dt)
         past = torch.cat((memory["past"][..., 1:], moved.acceleration[..., None]), dim=-1)
         return late.where(left > 0, moved), {"past": past, "left": (left - 1).clamp_min(0)}
@@ -204,9 +200,8 @@ class AbortedLaneChange(Fault[AbortFaults]):
         begins, u = starting(vehicles, moved), self.draw(vehicles, key, step)
         chosen = torch.where(u < self.faults.share, vehicles.target_lane, _NO_LANE)
         origin = torch.where(begins, chosen, memory["origin"])
-        start, end = (
-            self.road.centre_of(lane, moved.y.dtype) for lane in (origin, moved.target_lane)
-        )
+        start = self.road.centre_of(origin, moved.y.dtype)
+        end = self.road.centre_of(moved.target_lane, moved.y.dtype)
         far_enough = (moved.y - start).abs() >= self.faults.at * (end - start).abs()
         turns = (origin != _NO_LANE) & far_enough
         moved = moved.with_(target_lane=torch.where(turns, origin, moved.target_lane))
@@ -218,7 +213,7 @@ def with_faults(base: TrafficModule, faults: DriverFaults | None = None) -> Traf
 
     Phantom braking comes after the late reactions, since it is no reaction and must not be delayed.
     """
-    faults, (road, stream) = faults or DriverFaults(), (base.road, base.stream)
+    faults, road, stream = faults or DriverFaults(), base.road, base.stream
     parts: dict[str, TrafficModule] = {
         "base": base,
         "late_reaction": LateReaction(road, stream, faults.late_reaction),

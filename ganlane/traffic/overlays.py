@@ -1,5 +1,4 @@
-"""Laid over a traffic model: lane changes (literal and calibrated), sudden accelerations, and the
-guard.
+"""Laid over a traffic model: lane changes, sudden accelerations, and the guard.
 
 The first are what the paper adds to its generated traffic, and a calibrated form of it. The guard
 keeps generated vehicles on the road, in their lanes and off their leaders' bumpers: a network with
@@ -18,15 +17,18 @@ from ganlane.settings.driving import IdmParameters, MobilParameters
 from ganlane.sim.idm import TABLE_V, acceleration_behind
 from ganlane.sim.mobil import one_at_a_time, safe_change, without_ego
 from ganlane.sim.neighbours import Scene, leader, perceive
-from ganlane.sim.random import Purpose, Stream, normal, uniform
+from ganlane.sim.random import Purpose, Stream, normal
 from ganlane.sim.state import Road, Vehicles, lane_change_done, spanned
-from ganlane.traffic.base import Memory, Moved, Overlay
+from ganlane.traffic.base import Memory, Moved, Overlay, uniforms
+
+#: Random numbers of a lane change: whether it starts, and to which side.
+_CHANGE = (Purpose.LANE_CHANGE_HAZARD, Purpose.LANE_CHANGE_SIDE)
 
 
 def literal_hazard(clock: Tensor, mean_steps: float) -> Tensor:
-    """Equation 10: probability ``t / t_m`` per step of a change, ``clock`` steps after the last one
-    ended.
+    """Equation 10: probability ``t / t_m`` per step of a change.
 
+    ``clock`` is the number of steps since the last one ended.
     Read literally the probability grows until a change is certain at ``t = t_m``, so the mean
     waiting time is about ``sqrt(pi t_m / 2)`` steps, not ``t_m``.
     """
@@ -34,9 +36,7 @@ def literal_hazard(clock: Tensor, mean_steps: float) -> Tensor:
 
 
 def distance_hazard(speed: Tensor, changes_per_km: float, dt: float) -> Tensor:
-    """Probability per step of ``dt`` s of starting a change, at a constant rate per kilometre
-    driven.
-    """
+    """Probability per step of ``dt`` s of a change, at a constant rate per kilometre driven."""
     return 1.0 - torch.exp(-speed * (dt * changes_per_km / 1000.0))
 
 
@@ -48,12 +48,6 @@ def random_side(u: Tensor, lane: Tensor, lanes: int | Tensor) -> Tensor:
     left, right = lane < lanes - 1, lane > 0
     both = torch.where(u < 0.5, 1, -1)
     return torch.where(left & right, both, torch.where(left, 1, torch.where(right, -1, 0)))
-
-
-def _hazard_and_side(vehicles: Vehicles, key: Tensor, step: Tensor) -> tuple[Tensor, ...]:
-    """Uniform numbers [N, M] for whether a change starts, and to which side."""
-    purposes: list[int] = [Purpose.LANE_CHANGE_HAZARD, Purpose.LANE_CHANGE_SIDE]
-    return uniform(key, step, vehicles.x.shape[1], purposes, vehicles.x.dtype).unbind(-1)
 
 
 @dataclass(frozen=True)
@@ -101,28 +95,27 @@ class LiteralLaneChange(Overlay):
         returns at that speed.
         """
         c, dtype = self.changes, vehicles.x.dtype
-        u, u_side = _hazard_and_side(vehicles, key, step)
+        u, u_side = uniforms(vehicles, key, step, *_CHANGE)
         gauss = normal(key, step, vehicles.x.shape[1], [Purpose.LANE_CHANGE_SPEED], dtype)[..., 0]
-        idle = memory["lateral_speed"] == 0
-        starts = (
-            idle & vehicles.valid & (u < literal_hazard(memory["clock"].to(dtype), c.mean_steps))
-        )
+        comes = u < literal_hazard(memory["clock"].to(dtype), c.mean_steps)
+        starts = (memory["lateral_speed"] == 0) & vehicles.valid & comes
         side = torch.where(starts, random_side(u_side, vehicles.target_lane, self.road.lanes), 0)
-        drawn = (c.lateral_speed_mps + c.lateral_speed_sd_mps * gauss).clamp_min(c.slowest_mps)
         target = vehicles.target_lane + side
+        drawn = (c.lateral_speed_mps + c.lateral_speed_sd_mps * gauss).clamp_min(c.slowest_mps)
         pace = torch.where(side != 0, drawn, memory["lateral_speed"].abs())
         changing = pace != 0
+        # Towards the target lane, which may have been set back meanwhile.
         remaining = self.road.centre_of(target, vehicles.y.dtype) - vehicles.y
         lateral = torch.copysign(pace, remaining)
         stride = lateral * self.dt
         arrives = changing & (remaining.abs() <= stride.abs())
         y = vehicles.y + torch.where(arrives, remaining, stride)
         heading = torch.atan(lateral / vehicles.speed.clamp_min(1.0))
-        y, heading = (
-            torch.where(changing, y, moved.y),
-            torch.where(changing, heading, moved.heading),
+        moved = moved.with_(
+            target_lane=target,
+            y=torch.where(changing, y, moved.y),
+            heading=torch.where(changing, heading, moved.heading),
         )
-        moved = moved.with_(target_lane=target, y=y, heading=heading)
         clock = torch.where(changing, 0, memory["clock"] + 1)
         return moved, {"clock": clock, "lateral_speed": torch.where(arrives, 0.0, lateral)}
 
@@ -170,13 +163,12 @@ class CalibratedLaneChange(Overlay):
 
     def _wishes(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Tensor:
         """The current wish, or a new one."""
-        u, u_side = _hazard_and_side(vehicles, key, step)
+        u, u_side = uniforms(vehicles, key, step, *_CHANGE)
         comes = u < distance_hazard(vehicles.speed, self.changes.per_km, self.dt)
         side = random_side(u_side, vehicles.target_lane, self.road.lanes)
         free = lane_change_done(vehicles, self.road) & vehicles.valid
-        return without_ego(
-            torch.where(memory["wish"] != 0, memory["wish"], torch.where(comes & free, side, 0))
-        )
+        new = torch.where(comes & free, side, 0)
+        return without_ego(torch.where(memory["wish"] != 0, memory["wish"], new))
 
     def _contested(self, scene: Scene, lane: Tensor) -> Tensor:
         """Whether a near vehicle other than the ego is already moving into ``lane`` [N, M]."""
@@ -197,8 +189,8 @@ class CalibratedLaneChange(Overlay):
         wanted = torch.where(safe & ~self._contested(scene, lane), wish, 0)
         starts = one_at_a_time(scene, wanted, self.idm, self._limits)
         waited = torch.where(wish != 0, memory["waited"] + 1, 0)
-        given_up = waited >= round(self.changes.patience_s / self.dt)
-        rest = torch.where((starts != 0) | given_up, 0, wish)
+        gives_up = waited >= round(self.changes.patience_s / self.dt)
+        rest = torch.where((starts != 0) | gives_up, 0, wish)
         moved = moved.with_(target_lane=vehicles.target_lane + starts)
         return moved, {"wish": rest, "waited": torch.where(rest == 0, 0, waited)}
 
@@ -206,10 +198,7 @@ class CalibratedLaneChange(Overlay):
 def _accelerated(
     vehicles: Vehicles, moved: Vehicles, who: Tensor, acceleration: Tensor, dt: float
 ) -> Vehicles:
-    """``moved`` with another speed and position along the road for ``who`` [N, M].
-
-    At ``acceleration``, m/s2.
-    """
+    """``moved``, where ``who`` [N, M] drives along the road at ``acceleration``, m/s2."""
     speed = (vehicles.speed + acceleration * dt).clamp_min(0.0)
     return moved.with_(
         speed=torch.where(who, speed, moved.speed),
@@ -220,8 +209,12 @@ def _accelerated(
 
 @dataclass(frozen=True)
 class SuddenAccelerations:
-    """Mean time between two (s), duration (s), mean and standard deviation of their Gaussian
-    (m/s2).
+    """Sudden accelerations.
+
+    Attributes:
+        every_s: mean time between two, s.
+        lasts_s: how long one lasts, s.
+        mean, sd: of their Gaussian, m/s2.
     """
 
     every_s: float = 10.0
@@ -254,7 +247,7 @@ class AccelerationOverlay(Overlay):
     ) -> Moved:
         """Replace speed and position along the road during a sudden acceleration."""
         s, m, dtype = self.sudden, vehicles.x.shape[1], vehicles.x.dtype
-        u = uniform(key, step, m, [Purpose.ACCELERATION], dtype)[..., 0]
+        (u,) = uniforms(vehicles, key, step, Purpose.ACCELERATION)
         gauss = normal(key, step, m, [Purpose.ACCELERATION], dtype)[..., 0]
         starts = (memory["left"] == 0) & (u < self.dt / s.every_s) & vehicles.valid
         acceleration = torch.where(starts, s.mean + s.sd * gauss, memory["acceleration"])
@@ -314,31 +307,26 @@ class Guard(Overlay):
         """``moved`` with its acceleration between the bounds by IDM."""
         g, scene = self.guard, perceive(vehicles.with_(target_lane=moved.target_lane), self.road)
         ahead = leader(scene, spanned(scene.attention))
-        close = acceleration_behind(scene, ahead, self.idm, g.headway_s).amin(-1)
-        usual = acceleration_behind(scene, ahead, self.idm).amin(-1)
-        highest = close.clamp_min(g.hardest_braking)
-        lowest = (usual - g.slack * vehicles.speed / vehicles.desired_speed).clamp_min(
-            g.hardest_braking
-        )
+        highest = acceleration_behind(scene, ahead, self.idm, g.headway_s).amin(-1)
+        lowest = acceleration_behind(scene, ahead, self.idm).amin(-1)
+        lowest = lowest - g.slack * vehicles.speed / vehicles.desired_speed
+        highest, lowest = (bound.clamp_min(g.hardest_braking) for bound in (highest, lowest))
         wanted = (moved.speed - vehicles.speed) / self.dt
         acceleration = torch.minimum(torch.maximum(wanted, torch.minimum(lowest, highest)), highest)
         return _accelerated(vehicles, moved, acceleration != wanted, acceleration, self.dt)
 
     def across(self, vehicles: Vehicles, moved: Vehicles) -> Vehicles:
-        """``moved`` pulled towards its lane's centre where it keeps a lane, and inside the edges
-        everywhere.
+        """``moved`` pulled towards its lane's centre, and kept inside the edges of the road.
+
+        It is pulled only where it keeps a lane.
         """
-        g = self.guard
-        offset = self.road.centre_of(moved.target_lane, moved.y.dtype) - vehicles.y
-        pulled = (
-            vehicles.y + g.damping * (moved.y - vehicles.y) + g.centring_per_s * self.dt * offset
-        )
-        y = torch.where(offset.abs() < 0.5 * self.road.lane_width_m, pulled, moved.y)
+        g, road = self.guard, self.road
+        offset = road.centre_of(moved.target_lane, moved.y.dtype) - vehicles.y
+        damped = vehicles.y + g.damping * (moved.y - vehicles.y)
+        pulled = damped + g.centring_per_s * self.dt * offset
+        y = torch.where(offset.abs() < 0.5 * road.lane_width_m, pulled, moved.y)
         half = 0.5 * moved.width
-        left, right = (
-            self.road.left_edge_m() - g.edge_margin_m,
-            self.road.right_edge_m() + g.edge_margin_m,
-        )
+        left, right = road.left_edge_m() - g.edge_margin_m, road.right_edge_m() + g.edge_margin_m
         y = torch.minimum(torch.maximum(y, right + half), left - half)
         heading = torch.atan((y - vehicles.y) / ((moved.x - vehicles.x).clamp_min(0.1)))
         heading = torch.where(y == moved.y, moved.heading, heading)

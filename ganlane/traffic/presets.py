@@ -53,26 +53,25 @@ WISH_PER_CHANGE = 1.8
 
 
 def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralChanges:
-    """Equations 9 to 11 with the numbers of all recordings given to the fit, held-out scenes too."""
+    """Equations 9 to 11 with the numbers of all recordings given to the fit, held-out ones too."""
     changes = statistics.lane_changes
     numbers = (changes.t_m_srlc_steps, changes.lateral_speed.mean, changes.lateral_speed.sd)
     if None in numbers:
         raise UserError(
-            f"{source}: its recordings hold no complete lane change, so equations 9 to 11 have no numbers; "
-            "fit the generator to recordings with lane changes."
+            f"{source}: its recordings hold no complete lane change, so equations 9 to 11 have no "
+            "numbers; fit the generator to recordings with lane changes."
         )
     return LiteralChanges(*(float(number) for number in numbers if number is not None))
 
 
 def sudden_accelerations(statistics: DrivingStatistics) -> SuddenAccelerations:
     """Gaussian of the recorded accelerations over one second, of all scenes."""
-    recorded = statistics.acceleration_smoothed
-    known = {
-        name: getattr(recorded, name)
-        for name in ("mean", "sd")
-        if getattr(recorded, name) is not None
-    }
-    return SuddenAccelerations(**known)
+    recorded, default = statistics.acceleration_smoothed, SuddenAccelerations()
+    return SuddenAccelerations(
+        # Where no acceleration was recorded these are None; 0 is a number.
+        mean=default.mean if recorded.mean is None else recorded.mean,
+        sd=default.sd if recorded.sd is None else recorded.sd,
+    )
 
 
 def fitted_anchor(metadata: Mapping[str, Any], source: object) -> AnchorParameters:
@@ -92,14 +91,16 @@ def fitted_anchor(metadata: Mapping[str, Any], source: object) -> AnchorParamete
     further_inputs = config.get("further_inputs", ANCHOR.further_inputs)
     if config.get("traits", True) is not True:
         raise UserError(
-            f"{source}: fitted with traits={config['traits']}, but every driver of gan_calibrated has a headway "
-            "and a desired speed of its own; give weights fitted with generator.traits=true."
+            f"{source}: fitted with traits={config['traits']}, but every driver of gan_calibrated "
+            "has a headway and a desired speed of its own; give weights fitted with "
+            "generator.traits=true."
         )
     # `not washout_s > 0` since NaN has to fail; `type` since True is no number of seconds.
     if type(washout_s) not in (int, float) or not washout_s > 0 or type(further_inputs) is not bool:
         raise UserError(
-            f"{source}: its config says washout_s={washout_s!r} and further_inputs={further_inputs!r}, expected "
-            "seconds above 0 and true or false; fit it again."
+            f"{source}: its config says washout_s={washout_s!r} and "
+            f"further_inputs={further_inputs!r}, expected seconds above 0 and true or false; fit "
+            "it again."
         )
     return replace(SIMULATED_ANCHOR, washout_s=float(washout_s), further_inputs=further_inputs)
 
@@ -168,10 +169,8 @@ def gan_calibrated_traffic(
     statistics = DrivingStatistics.from_dict(metadata["driving_statistics"])
     recorded = statistics.lane_changes.per_vehicle_km or 0.0
     wishes = WISH_PER_CHANGE * recorded if changes_per_km is None else changes_per_km
-    headways_s, anchor = (
-        headway_quantiles(metadata["driving_statistics"]),
-        fitted_anchor(metadata, source),
-    )
+    headways_s = headway_quantiles(metadata["driving_statistics"])
+    anchor = fitted_anchor(metadata, source)
     return TrafficSequential(
         {
             "generator": AnchoredGanTraffic(

@@ -28,9 +28,9 @@ from ganlane.generator.networks import Generator
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.driving import Visibility
 from ganlane.settings.generator import EXTRA_INPUTS
-from ganlane.sim.random import Purpose, Stream, normal, uniform
+from ganlane.sim.random import Purpose, Stream, normal
 from ganlane.sim.state import Road, Vehicles
-from ganlane.traffic.base import Memory, MemoryFields, Moved, TrafficModule
+from ganlane.traffic.base import Memory, MemoryFields, Moved, TrafficModule, uniforms
 
 #: Latent dimensions that :class:`ganlane.sim.random.Purpose` has room for.
 _MOST_NOISE = int(Purpose.RECYCLE) - int(Purpose.NOISE)
@@ -67,8 +67,9 @@ class GeneratedTraffic(TrafficModule):
         sizes = generator.sizes
         if sizes.extra_inputs != self.extra_inputs or sizes.noise > _MOST_NOISE:
             raise UserError(
-                f"generator with {sizes.extra_inputs} further inputs and {sizes.noise} latent numbers: expected "
-                f"{self.extra_inputs} and at most {_MOST_NOISE}; give the weights of this traffic's own preset."
+                f"generator with {sizes.extra_inputs} further inputs and {sizes.noise} latent "
+                f"numbers: expected {self.extra_inputs} and at most {_MOST_NOISE}; give the "
+                "weights of this traffic's own preset."
             )
         self.generator = generator
         self.noise_period_s, self.noise_scale = noise_period_s, noise_scale
@@ -84,11 +85,10 @@ class GeneratedTraffic(TrafficModule):
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """Straight driving at the present speed, and latent vectors of this episode."""
         along = vehicles.speed * PHYSICS_STEP_S
-        history = start(
-            self.network(vehicles.x.dtype), torch.stack([along, torch.zeros_like(along)], dim=-1)
-        )
+        displacement = torch.stack([along, torch.zeros_like(along)], dim=-1)
+        history = start(self.network(vehicles.x.dtype), displacement)
         noise = normal(key, -1, vehicles.x.shape[1], self.purposes, vehicles.x.dtype)
-        return {**self.kept(history), "noise": noise}
+        return {**self.remember(history), "noise": noise}
 
     def network(self, dtype: torch.dtype) -> Generator:
         """The generator in the run's float type."""
@@ -96,14 +96,12 @@ class GeneratedTraffic(TrafficModule):
             self.generator.to(dtype)
         return self.generator
 
-    def kept(self, history: History) -> Memory:
+    def remember(self, history: History) -> Memory:
         """The history as memory; motions move on by name, without copies."""
         return {**dict(zip(self.motions, history.motions)), "displacement": history.displacement}
 
     def before(self, memory: Memory, key: Tensor, step: Tensor) -> tuple[History, Tensor]:
-        """The history of all drivers from the memory, and the latent vectors [N, M, Z] of this
-        step.
-        """
+        """The drivers' history from the memory, and the latent vectors [N, M, Z] of this step."""
         noise = memory["noise"]
         fresh = normal(key, step, noise.shape[1], self.purposes, noise.dtype)
         history = History(tuple(memory[name] for name in self.motions), memory["displacement"])
@@ -111,9 +109,9 @@ class GeneratedTraffic(TrafficModule):
 
 
 class SocialGanTraffic(GeneratedTraffic):
-    """``traffic=gan``: the paper's preset. Positions only; the first predicted displacement moves
-    the vehicle.
+    """``traffic=gan``: the paper's preset, positions only.
 
+    The first predicted displacement moves the vehicle.
     It knows neither lanes nor road: alone the closed loop drifts (design, section 4), so a guard
     belongs behind it. Lane changes and sudden accelerations are overlays.
 
@@ -138,8 +136,8 @@ class SocialGanTraffic(GeneratedTraffic):
         super().__init__(generator, road, stream, noise_period_s, noise_scale)
         if not 1 <= execute_k <= generator.sizes.predicted:
             raise UserError(
-                f"execute_k={execute_k}: the generator predicts {generator.sizes.predicted} steps; choose 1 to "
-                f"{generator.sizes.predicted}."
+                f"execute_k={execute_k}: the generator predicts {generator.sizes.predicted} steps; "
+                f"choose 1 to {generator.sizes.predicted}."
             )
         self.execute_k = execute_k
         if execute_k > 1:
@@ -157,18 +155,20 @@ class SocialGanTraffic(GeneratedTraffic):
     @torch.no_grad()
     def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """Predict, and drive the first displacement (or what is left of the plan)."""
-        (history, noise), network = self.before(memory, key, step), self.network(vehicles.x.dtype)
+        network = self.network(vehicles.x.dtype)
+        history, noise = self.before(memory, key, step)
         plan = Plan(memory["plan"], memory["plan_left"]) if self.execute_k > 1 else None
         moved, history, plan = paper_step(
             network, vehicles, history, self.noise_scale * noise, plan
         )
-        kept = {**self.kept(history), "noise": noise}
-        return moved, kept if plan is None else {**kept, "plan": plan.ahead, "plan_left": plan.left}
+        new_memory = {**self.remember(history), "noise": noise}
+        if plan is not None:
+            new_memory |= {"plan": plan.ahead, "plan_left": plan.left}
+        return moved, new_memory
 
 
 class AnchoredGanTraffic(GeneratedTraffic):
-    """``traffic=gan_calibrated``: the network's residual on an anchor of IDM and lane keeping,
-    per-driver headways.
+    """``traffic=gan_calibrated``: the network's residual on an anchor of IDM and lane keeping.
 
     It follows ``vehicles.target_lane``, which an overlay sets, and ``vehicles.desired_speed``.
     Additional memory: ``residual_mean`` [N, M, 2] in m/s2 (the washout), ``headway`` [N, M] in s.
@@ -201,7 +201,7 @@ class AnchoredGanTraffic(GeneratedTraffic):
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """See :class:`GeneratedTraffic`; a headway for every driver, residual mean 0."""
         memory = super().fresh_memory(vehicles, key)
-        u = uniform(key, -1, vehicles.x.shape[1], [Purpose.TRAIT_HEADWAY], vehicles.x.dtype)[..., 0]
+        (u,) = uniforms(vehicles, key, -1, Purpose.TRAIT_HEADWAY)
         memory["headway"] = headway_from_uniform(u, self.headway_quantiles_s)
         memory["residual_mean"] = torch.zeros_like(memory["displacement"])
         return memory
@@ -209,10 +209,11 @@ class AnchoredGanTraffic(GeneratedTraffic):
     @torch.no_grad()
     def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """One :func:`~ganlane.generator.closed_loop.anchored_step`."""
-        (history, noise), network = self.before(memory, key, step), self.network(vehicles.x.dtype)
+        network = self.network(vehicles.x.dtype)
+        history, noise = self.before(memory, key, step)
         driver = DriverMemory(history, memory["residual_mean"], memory["headway"])
         moved, driver = anchored_step(
             network, vehicles, self.road, driver, self.noise_scale * noise, self.anchor
         )
-        kept = {"noise": noise, "residual_mean": driver.mean, "headway": driver.headway}
-        return moved, {**self.kept(driver.history), **kept}
+        new_memory = {"noise": noise, "residual_mean": driver.mean, "headway": driver.headway}
+        return moved, {**self.remember(driver.history), **new_memory}

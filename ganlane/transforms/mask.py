@@ -24,8 +24,8 @@ from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.keys import ACTIONS, EGO_INDEX
 from ganlane.native.tensors import SafeActions
-from ganlane.parameters.driving import IdmParameters
-from ganlane.parameters.observation import MASKS
+from ganlane.settings.driving import IdmParameters
+from ganlane.settings.observation import MASKS
 from ganlane.sim.dynamics import SIDES, ego_scene, is_heard, on_road
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import lane_accelerations

@@ -17,7 +17,6 @@ from ganlane.traffic import (
     IdmRandomTraffic,
     IdmTraffic,
     MixedTraffic,
-    Recordings,
     ReplayTraffic,
     TrafficSequential,
 )
@@ -26,7 +25,7 @@ from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic, idm_fau
 
 def replay() -> ReplayTraffic:
     scenes = sort(synthetic_scenes(SyntheticTraffic(scenes=2, lanes=3, seconds=8.0)))
-    return ReplayTraffic(recordings=Recordings.of(scenes, "synthetic", 4.0))
+    return ReplayTraffic(recordings=scenes)
 
 
 MAKE = {

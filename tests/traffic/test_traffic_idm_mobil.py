@@ -16,13 +16,12 @@ from ganlane import keys
 from ganlane.settings.traffic import IdmRandomTrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
-from ganlane.settings.driving import MobilParameters
+from ganlane.settings.driving import MobilParameters, RandomDrivers
 from ganlane.sim import Road, SpawnParameters, Vehicles
 from ganlane.traffic import (
     IdmMobilTraffic,
     IdmRandomTraffic,
     IdmTraffic,
-    RandomDrivers,
     TrafficModule,
 )
 from ganlane.traffic.idm_mobil import DriverParams, start_braking
@@ -80,15 +79,6 @@ def test_an_unspoken_wish_of_the_ego_holds_nobody_back():
     assert move(traffic, vehicles(ego, ahead, other, ahead_of_it)).target_lane[0, 2] == 1
 
 
-def test_a_car_beside_a_slow_one_overtakes_it_in_the_end():
-    scene, zero = vehicles(*CARS), torch.zeros(1).long()
-    memory = SELFISH.fresh_memory(scene, zero)
-    for number in range(300):
-        scene, memory = SELFISH.move(scene, memory, zero, torch.tensor([number]))
-    assert scene.x[0, 1] > scene.x[0, 2] + 20.0
-    assert scene.speed[0, 1] > 20.0
-
-
 def test_traffic_is_the_same_whatever_the_decision_period_of_the_ego():
     """After 6 s of an ego that keeps its lane."""
     states = []
@@ -125,10 +115,6 @@ ALIKE = RandomDrivers(
 
 def params_of(td) -> DriverParams:
     return DriverParams(*td[keys.TRAFFIC, "traits"].unbind(-1))
-
-
-def test_the_defaults_of_the_command_line_are_those_of_the_traffic():
-    assert IdmRandomTrafficConfig().arguments() == {"drivers": RandomDrivers()}
 
 
 @pytest.mark.parametrize(

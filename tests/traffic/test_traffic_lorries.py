@@ -1,7 +1,4 @@
-"""Traffic with lorries does not run into itself, nor into an ego that keeps its lane.
-
-SUMO's scenes with lorries.
-"""
+"""Traffic with lorries does not run into itself, nor into an ego that keeps its lane."""
 
 from __future__ import annotations
 
@@ -19,16 +16,11 @@ from ganlane.settings.traffic import (
     IdmMobilTrafficConfig,
     IdmTrafficConfig,
 )
-from ganlane.data.dense import recorded_frame
 from ganlane.generator.closed_loop import extra_inputs
-from ganlane.settings.driving import Visibility
 from ganlane.realism.long_runs import LongRunParameters
-from ganlane.realism.starts import spawned_recordings
+from ganlane.realism.starts import spawned_frame
 from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps, perceive
-from ganlane.sim.random import Stream, episode_key
-from ganlane.sim.spawn import RandomScenes
 from ganlane.traffic import IdmTraffic
-from ganlane.traffic.sumo import LorryScenes
 
 
 def drive(traffic, rows: int, decisions: int, recycle: bool) -> tuple[float, float, int, int]:
@@ -95,56 +87,7 @@ def test_the_generator_is_told_the_gap_behind_the_lorry():
 
 def test_the_realism_card_measures_spawned_lorries_by_their_own_length():
     parameters = LongRunParameters(9, most_s=2.0, spawn=SpawnParameters(truck_share=0.5))
-    frame = recorded_frame(spawned_recordings(IdmTraffic, Road(), parameters, rows=4))
+    frame = spawned_frame(IdmTraffic, Road(), parameters, rows=4)
     lengths = frame.group_by("scene", "vehicle").first()["length"].to_numpy()
     assert set(lengths) == {4.5, 12.0}
     assert 0.2 < np.mean(lengths == 12.0) < 0.8
-
-
-# SUMO's own first scenes: the same net gaps as with cars
-
-
-CARS = RandomScenes(Road(), 9, others_visibility=Visibility.SIGNALLED)
-
-
-def keys_of(count):
-    episodes = torch.arange(count)
-    return episode_key(Stream.TRAIN, torch.zeros_like(episodes), episodes)
-
-
-def net_gaps(scene, row):
-    """Sorted gaps ahead within each lane of a row, m."""
-    x, half, gaps = scene.x[row], 0.5 * scene.length[row], []
-    for lane in range(3):
-        there = (scene.target_lane[row] == lane).nonzero()[:, 0]
-        order = there[x[there].argsort()]
-        gaps.append((x - half)[order[1:]] - (x + half)[order[:-1]])
-    return torch.cat(gaps)
-
-
-def test_so_many_of_the_others_are_lorries_of_twelve_metres_and_the_ego_never_is():
-    scene = LorryScenes(CARS, share=0.3)(keys_of(500), torch.float32)
-    lorry = scene.length == 12.0
-    assert not lorry[:, 0].any()
-    # 4000 draws with probability 0.3: a standard deviation of 0.0072.
-    assert abs(lorry[:, 1:].float().mean().item() - 0.3) < 0.03
-    assert ((scene.desired_speed[lorry] >= 22.0) & (scene.desired_speed[lorry] <= 25.0)).all()
-
-
-def test_net_gaps_are_those_of_the_scene_of_cars():
-    episodes = keys_of(50)
-    cars, lorries = (
-        CARS(episodes, torch.float64),
-        LorryScenes(CARS, share=0.5)(episodes, torch.float64),
-    )
-    assert (lorries.length > 4.5).any()
-    assert (lorries.x[:, 0] == 0.0).all()
-    for row in range(50):
-        torch.testing.assert_close(net_gaps(lorries, row), net_gaps(cars, row), rtol=0.0, atol=1e-9)
-
-
-def test_without_lorries_it_is_the_scene_of_cars():
-    one, other = (
-        scenes(keys_of(20), torch.float32) for scenes in (LorryScenes(CARS, share=0.0), CARS)
-    )
-    assert all(map(torch.equal, one, other))

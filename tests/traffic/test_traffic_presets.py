@@ -16,7 +16,6 @@ from ganlane.errors import UserError
 from ganlane.generator import shipped_generator
 from ganlane.sim import Road, Vehicles, pair_overlaps
 from ganlane.sim.state import lateral_half_extent
-from ganlane.traffic import Guard
 from ganlane.traffic.presets import (
     SIMULATED_ANCHOR,
     gan_calibrated_traffic,
@@ -96,9 +95,7 @@ def test_calibrated_traffic_changes_lanes_as_often_as_recorded_and_touches_nobod
     others = others_of(gan_calibrated_traffic(), 96, 200)
     km = others.speed[1:].sum().item() * 1e-4
     changes = (others.target_lane[1:].diff(dim=0) != 0).sum().item()
-    print(
-        f"{changes / km:.2f} changes per vehicle-km in {km:.0f} vehicle-km, {overlaps(others)} overlaps"
-    )
+    print(f"{changes / km:.2f} changes per vehicle-km in {km:.0f} km, {overlaps(others)} overlaps")
     assert overlaps(others) == 0
     # Recorded: 0.92 per vehicle-km, 95 % interval 0.70 to 1.20.
     assert 0.70 < changes / km < 1.20
@@ -121,11 +118,6 @@ def test_generated_traffic_is_the_same_in_every_batch_up_to_rounding(preset):
     )
     for name in ("x", "y", "speed"):
         torch.testing.assert_close(many[name][4], alone[name][0], atol=2e-3, rtol=1e-4)
-
-
-def test_the_paper_chain_has_a_guard_that_can_be_left_out():
-    assert isinstance(dict(gan_traffic().named_parts())["guard"], Guard)
-    assert "guard" not in dict(gan_traffic(guard=False).named_parts())
 
 
 def fitted_with(folder, *without, **settings):

@@ -17,7 +17,7 @@ from ganlane.settings.driving import Visibility
 from ganlane.sim import Vehicles
 from ganlane.sim.collisions import ego_overlaps
 from ganlane.sim.random import episode_key
-from ganlane.traffic import Recordings, ReplayTraffic
+from ganlane.traffic import ReplayTraffic
 
 WIDTH = 3.5
 
@@ -32,7 +32,7 @@ def track(vehicle, frames, x, speed, lane, scene="s", length=4.0, width=2.0) -> 
 
 
 def replay(*tracks: pl.DataFrame, least_s: float = 2.0, stream: int = 0) -> ReplayTraffic:
-    return ReplayTraffic(stream, recordings=Recordings.of(sort(pl.concat(tracks)), "test", least_s))
+    return ReplayTraffic(stream, recordings=sort(pl.concat(tracks)), least_s=least_s)
 
 
 def keys_of(episodes, stream: int = 0, seed: int = 0) -> torch.Tensor:
@@ -84,13 +84,6 @@ def test_the_replaced_vehicle_is_recorded_long_enough():
     assert scene.speed[0, 0] == 12.0
 
 
-def test_its_neighbours_are_the_nearest_in_order():
-    scene = start(replay(*FIVE), keys_of([0]), vehicles=4)
-    assert scene.x[0].tolist() == [0.0, -10.0, 15.0, -30.0]
-    assert scene.y[0].tolist() == [WIDTH, 0.0, 2 * WIDTH, 0.0]
-    assert scene.valid.all()
-
-
 def test_places_without_a_recorded_vehicle_are_not_valid():
     scene = start(replay(*FIVE), keys_of([0]), vehicles=9)
     assert scene.valid[0].tolist() == [True] * 5 + [False] * 4
@@ -134,7 +127,7 @@ def test_nobody_reacts_to_the_ego():
     assert all(map(torch.equal, other.at(0), elsewhere.at(0)))
 
 
-def recorded(scenes: int = 4, seconds: float = 8.0, **others) -> Recordings:
+def recorded(scenes: int = 4, seconds: float = 8.0, **others) -> pl.DataFrame:
     """Synthetic scenes of which the k-th has 2 + k % 3 lanes and loses its last k seconds."""
     parts = []
     for k in range(scenes):
@@ -143,7 +136,7 @@ def recorded(scenes: int = 4, seconds: float = 8.0, **others) -> Recordings:
         )
         cut = made.filter(pl.col("frame") < round((seconds - 0.5 * k) * 10))
         parts.append(cut.with_columns(scene=pl.lit(f"scene-{k}")))
-    return Recordings.of(sort(pl.concat(parts)), "synthetic", 4.0)
+    return sort(pl.concat(parts))
 
 
 def test_every_scene_is_equally_likely_and_every_start_within_it():
@@ -188,7 +181,7 @@ def test_every_step_is_what_a_search_through_the_rows_finds():
         (pl.col("frame") >= 2 * (pl.col("vehicle") % 4))
         & (pl.col("frame") < 70 - pl.col("vehicle"))
     )
-    traffic = ReplayTraffic(recordings=Recordings.of(made, "test", 3.0))
+    traffic = ReplayTraffic(recordings=made, least_s=3.0)
     key = keys_of(range(12))
     for row, (scene, steps) in enumerate(
         zip(traffic.scene_of(key).tolist(), traffic.steps_of(key).tolist())
@@ -229,9 +222,7 @@ def test_heading_and_acceleration_are_those_of_the_path():
     # Accelerating at 1 m/s2 along a line that rises by one in two hundred; beside it somebody
     # stands.
     moving = track(1, frame, 0.0, 10.0, 0).with_columns(x=path, y=path / 200.0, speed=10.0 + time)
-    samples = Recordings.of(
-        sort(pl.concat([moving, track(2, frame, 30.0, 0.0, 1)])), "test", 3.0
-    ).samples
+    samples = replay(moving, track(2, frame, 30.0, 0.0, 1), least_s=3.0).samples
     heading, acceleration = (
         samples[:, keys.VEHICLE_FLOATS.index(name)] for name in ("heading", "acceleration")
     )

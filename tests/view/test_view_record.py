@@ -22,7 +22,7 @@ from ganlane.data.schema import SCHEMA, TRACK_STRIDE, validate
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.sim.state import Road
-from ganlane.traffic import Recordings, ReplayTraffic
+from ganlane.traffic import ReplayTraffic
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 from ganlane.view import EpisodeLabel, record_episode, to_tracks, write_tracks
 from ganlane.view.record import scene_names
@@ -75,7 +75,7 @@ def test_the_label_has_the_road_of_the_replayed_scene():
         ).with_columns(scene=pl.lit(f"{lanes} lanes"))
         for lanes in (2, 3, 4)
     )
-    traffic = ReplayTraffic(recordings=Recordings.of(sort(scenes), "synthetic", 5.0))
+    traffic = ReplayTraffic(recordings=sort(scenes), least_s=5.0)
     names = traffic.scenes_of_episodes(0, range(10))
     for lanes in (2, 3, 4):
         episode = names.index(f"{lanes} lanes")

@@ -1,5 +1,4 @@
-"""N highways side by side in one SUMO simulation, through libsumo: roads, drivers, stand-ins for
-the egos.
+"""N highways side by side in one SUMO simulation: roads, drivers, stand-ins for the egos.
 
 libsumo holds one simulation per process. All highways are edges of the same network, each between
 dead ends of its own, at the same coordinates, so that a vehicle's numbers do not depend on which of
@@ -11,25 +10,34 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.traffic.base import require
 
 Array = NDArray[np.float64]
 
-#: Arguments of :func:`ganlane.traffic.base.require`.
-LIBSUMO = ("libsumo", "sumo", "libsumo", "sumo")
 #: Where x = 0 lies on SUMO's edges, m, and how far they go on from there: 1000 s at 35 m/s and
 #: more.
 ORIGIN_M, LENGTH_M = 2_000.0, 60_000.0
 #: Speed limit of every lane, m/s. Drivers have a speed factor: their desired speed is a multiple of
 #: it.
 LIMIT_MPS = 25.0
+
+
+def import_libsumo() -> Any:
+    """The module ``libsumo``; :class:`UserError` where it is not installed."""
+    try:
+        import libsumo
+    except ModuleNotFoundError as error:
+        raise UserError(
+            f"traffic sumo: libsumo is not installed ({error}); pip install 'ganlane[sumo]' "
+            "brings it."
+        ) from error
+    return libsumo
 
 
 class SumoDriver(NamedTuple):
@@ -41,8 +49,8 @@ class SumoDriver(NamedTuple):
     tau: float
     accel: float
     decel: float
-    emergency_decel: float
     min_gap: float
+    emergency_decel: float
 
 
 class Place(NamedTuple):
@@ -72,14 +80,14 @@ class SumoRoads:
     def __init__(
         self, rows: int, lanes: int, lane_width_m: float, change_s: float, keep_right: float
     ) -> None:
-        self.libsumo = require(*LIBSUMO)
+        self.libsumo = import_libsumo()
         if SumoRoads._current is not None:
             SumoRoads._current = None
             self.libsumo.close()
         elif self.libsumo.isLoaded():
             raise UserError(
-                "traffic sumo: libsumo already runs a simulation that is not ours, and a process has one; close it "
-                "(libsumo.close()) or start another process."
+                "traffic sumo: libsumo already runs a simulation that is not ours, and a process "
+                "has one; close it (libsumo.close()) or start another process."
             )
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
@@ -92,7 +100,6 @@ class SumoRoads:
         self.names: list[list[str]] = [[] for _ in range(rows)]
         self._drivers: list[list[SumoDriver | None]] = [[] for _ in range(rows)]
         self._stand_ins: list[dict[int, str]] = [{} for _ in range(rows)]
-        self._flat: tuple[list[str], NDArray[np.int64], NDArray[np.int64]] | None = None
 
     @property
     def is_open(self) -> bool:
@@ -104,16 +111,13 @@ class SumoRoads:
         for name in (*self.names[row], *self._stand_ins[row].values()):
             if name:
                 self.libsumo.vehicle.remove(name)
-        self.names[row], self._stand_ins[row], self._flat = [], {}, None
+        self.names[row], self._stand_ins[row] = [], {}
 
     def fill(self, row: int, drivers: Sequence[SumoDriver | None], places: Sequence[Place]) -> None:
-        """Put the others of a new episode onto an empty highway; None: no vehicle has this index."""
+        """Put the others of a new episode onto an empty highway; None: nobody has this index."""
         self._drivers[row] = list(drivers)
-        self.names[row] = [
-            self._add(row, driver, place) if driver else ""
-            for driver, place in zip(drivers, places)
-        ]
-        self._flat = None
+        for driver, place in zip(drivers, places):
+            self.names[row].append(self._add(row, driver, place) if driver else "")
 
     def _add(self, row: int, driver: SumoDriver, place: Place) -> str:
         """A new vehicle, on the road at once; its name."""
@@ -142,7 +146,6 @@ class SumoRoads:
         if driver and self.names[row][index]:
             self.libsumo.vehicle.remove(self.names[row][index])
             self.names[row][index] = self._add(row, driver, place)
-            self._flat = None
 
     def set_desired_speed(self, name: str, speed: float) -> None:
         """m/s."""
@@ -158,15 +161,16 @@ class SumoRoads:
         along, it would disturb the order of a lane. ``place`` is where the ego is now; its lane
         does not matter.
         """
-        mine, vehicle = self._stand_ins[row], self.libsumo.vehicle
-        for lane in [lane for lane in mine if lane not in lanes]:
-            vehicle.remove(mine.pop(lane))
+        stand_ins, vehicle = self._stand_ins[row], self.libsumo.vehicle
+        for lane in set(stand_ins) - set(lanes):
+            vehicle.remove(stand_ins.pop(lane))
         for lane in lanes:
-            if lane not in mine:
-                name = mine[lane] = self._add(row, ego, place._replace(lane=lane))
+            if lane not in stand_ins:
+                name = stand_ins[lane] = self._add(row, ego, place._replace(lane=lane))
+                # Neither safe speeds nor lane changes of its own.
                 vehicle.setSpeedMode(name, 0)
                 vehicle.setLaneChangeMode(name, 0)
-            name = mine[lane]
+            name = stand_ins[lane]
             # SUMO's ballistic step moves it by the mean of old and new speed.
             now = vehicle.getLanePosition(name) - 0.5 * ego.length - ORIGIN_M
             vehicle.setPreviousSpeed(name, place.speed)
@@ -179,27 +183,24 @@ class SumoRoads:
             row = int(name.split(".")[0])
             if name in self.names[row]:
                 self.names[row][self.names[row].index(name)] = ""
-                self._flat = None
 
     def read(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]:
         """Everybody who is there.
 
         Row, index among the others, (x of the front bumper, y) in m, speed in m/s.
         """
-        if self._flat is None:
-            there = [
-                (name, row, i)
-                for row, names in enumerate(self.names)
-                for i, name in enumerate(names)
-                if name
-            ]
-            where = np.array([(row, i) for _, row, i in there], dtype=np.int64).reshape(-1, 2)
-            self._flat = [name for name, _, _ in there], where[:, 0], where[:, 1]
-        names, rows, index = self._flat
-        position, speed = self.libsumo.vehicle.getPosition, self.libsumo.vehicle.getSpeed
-        xy = np.array([position(name) for name in names], dtype=np.float64).reshape(-1, 2)
+        names, places = [], []
+        for row, names_of_row in enumerate(self.names):
+            for index, name in enumerate(names_of_row):
+                if name:
+                    names.append(name)
+                    places.append((row, index))
+        vehicle = self.libsumo.vehicle
+        xy = np.array([vehicle.getPosition(name) for name in names]).reshape(-1, 2)
         xy[:, 0] -= ORIGIN_M
-        return rows, index, xy, np.array([speed(name) for name in names], dtype=np.float64)
+        speeds = np.array([vehicle.getSpeed(name) for name in names])
+        at = np.array(places, dtype=np.int64).reshape(-1, 2)
+        return at[:, 0], at[:, 1], xy, speeds
 
 
 def _edge(row: int) -> str:
@@ -209,52 +210,62 @@ def _edge(row: int) -> str:
 def _network(rows: int, lanes: int, width: float) -> str:
     """The net file: lane 0 on the right, its centre at y = 0, as ours."""
     end = ORIGIN_M + LENGTH_M
-    edges, junctions = [], []
+    parts = []
     for row in range(rows):
-        name = _edge(row)
-        shapes = "".join(
-            f'<lane id="{name}_{k}" index="{k}" speed="{LIMIT_MPS}" length="{end}" width="{width}" '
-            f'shape="0,{k * width} {end},{k * width}"/>'
-            for k in range(lanes)
-        )
-        inward = " ".join(f"{name}_{k}" for k in range(lanes))
-        edges.append(f'<edge id="{name}" from="{name}a" to="{name}b" priority="1">{shapes}</edge>')
-        for place, x, lanes_in in (("a", 0.0, ""), ("b", end, inward)):
-            junctions.append(
-                f'<junction id="{name}{place}" type="dead_end" x="{x}" y="0" incLanes="{lanes_in}" intLanes="" '
-                f'shape="{x},0"/>'
+        name, lane_names, shapes = _edge(row), [], []
+        for lane in range(lanes):
+            lane_name, y = f"{name}_{lane}", lane * width
+            lane_names.append(lane_name)
+            shapes.append(
+                f'<lane id="{lane_name}" index="{lane}" speed="{LIMIT_MPS}" length="{end}" '
+                f'width="{width}" shape="0,{y} {end},{y}"/>'
             )
+        parts.append(
+            f'<edge id="{name}" from="{name}a" to="{name}b" priority="1">{"".join(shapes)}</edge>'
+        )
+        for side, x, inward in (("a", 0.0, ""), ("b", end, " ".join(lane_names))):
+            parts.append(
+                f'<junction id="{name}{side}" type="dead_end" x="{x}" y="0" incLanes="{inward}" '
+                f'intLanes="" shape="{x},0"/>'
+            )
+    # SUMO wants all edges before the junctions.
+    parts.sort(key=lambda part: part.startswith("<junction"))
     box = f"0,0,{end},{lanes * width}"
-    place = (
-        f'<location netOffset="0,0" convBoundary="{box}" origBoundary="{box}" projParameter="!"/>'
+    return (
+        f'<net version="1.20"><location netOffset="0,0" convBoundary="{box}" origBoundary="{box}" '
+        f'projParameter="!"/>{"".join(parts)}</net>'
     )
-    return f'<net version="1.20">{place}{"".join(edges + junctions)}</net>'
 
 
 def _routes(rows: int, keep_right: float) -> str:
-    """The route file.
+    """The route file: one route per highway, and one type of driver.
 
-    One route per highway, one type of driver, whose numbers are set vehicle by vehicle.
+    The type's numbers are set vehicle by vehicle.
     """
     routes = "".join(f'<route id="{_edge(row)}" edges="{_edge(row)}"/>' for row in range(rows))
     return (
-        '<routes><vType id="driver" carFollowModel="Krauss" laneChangeModel="LC2013" sigma="0" speedDev="0" '
-        f'maxSpeed="70" lcKeepRight="{keep_right}"/>{routes}</routes>'
+        '<routes><vType id="driver" carFollowModel="Krauss" laneChangeModel="LC2013" sigma="0" '
+        f'speedDev="0" maxSpeed="70" lcKeepRight="{keep_right}"/>{routes}</routes>'
     )
 
 
 def _command(folder: Path, change_s: float) -> list[str]:
     """SUMO's command line. No vehicle is removed for standing still or for a crash."""
-    return [
-        *(
-            "sumo",
-            "--net-file",
-            str(folder / "net.xml"),
-            "--route-files",
-            str(folder / "routes.xml"),
-        ),
-        *("--step-length", str(PHYSICS_STEP_S), "--step-method.ballistic", "true"),
-        *("--lanechange.duration", str(change_s), "--default.speeddev", "0"),
-        *("--collision.action", "none", "--time-to-teleport", "-1", "--xml-validation", "never"),
-        *("--no-step-log", "true", "--duration-log.disable", "true", "--no-warnings", "true"),
-    ]
+    options = {
+        "net-file": folder / "net.xml",
+        "route-files": folder / "routes.xml",
+        "step-length": PHYSICS_STEP_S,
+        "step-method.ballistic": "true",
+        "lanechange.duration": change_s,
+        "default.speeddev": 0,
+        "collision.action": "none",
+        "time-to-teleport": -1,
+        "xml-validation": "never",
+        "no-step-log": "true",
+        "duration-log.disable": "true",
+        "no-warnings": "true",
+    }
+    command = ["sumo"]
+    for name, value in options.items():
+        command += [f"--{name}", str(value)]
+    return command

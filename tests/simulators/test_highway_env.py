@@ -18,7 +18,7 @@ from ganlane.errors import UserError
 from ganlane.settings.driving import Visibility
 from ganlane.sim.random import Purpose, episode_key, uniform
 from ganlane.sim.state import Road, Vehicles
-from ganlane.traffic import HighwayEnvTraffic
+from ganlane_simulators import HighwayEnvTraffic
 
 KEEP = torch.zeros(1, dtype=torch.int64)
 

@@ -17,8 +17,9 @@ from ganlane.errors import UserError
 from ganlane.evaluation import run_episodes
 from ganlane.settings.driving import Visibility
 from ganlane.sim.state import Road, Vehicles, body_lanes
-from ganlane.traffic import IdmTraffic, SumoTraffic
-from ganlane.traffic.sumo_roads import ORIGIN_M
+from ganlane.traffic import IdmTraffic
+from ganlane_simulators import SumoTraffic
+from ganlane_simulators.sumo_roads import ORIGIN_M
 
 LEFT, RIGHT = 1, 2
 KEEP = torch.zeros(1, dtype=torch.int64)

@@ -6,9 +6,6 @@ And on to a generator that drives.
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import polars as pl
@@ -136,21 +133,3 @@ def test_download_then_prepare(here, capsys):
         assert main(fetched) == 0
     assert results(capsys.readouterr().out)["rows"]["kept"] == 540
     assert (here / "ngsim.csv").read_bytes() == content
-
-
-@pytest.mark.slow
-def test_a_file_of_the_portals_size_takes_minutes_and_bounded_memory(here):
-    benchmark = Path(__file__).parents[1] / "benchmarks" / "prepare_ngsim.py"
-    environment = {**os.environ, "PYTHONPATH": str(benchmark.parents[1])}
-    done = subprocess.run(
-        [sys.executable, str(benchmark), "--folder", str(here / "big")],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=environment,
-    )
-    told = json.loads(done.stdout.splitlines()[-1])
-    assert told["rows"]["read"] > 11_700_000
-    assert told["peak_rss_gib"] < 4.0
-    assert told["wall_s"] < 600.0
-    assert list((here / "big").iterdir()) == []

@@ -55,7 +55,7 @@ class Block:
 
 
 def _count(*modules: nn.Module) -> int:
-    return sum(each.numel() for module in modules for each in module.parameters())
+    return sum(parameter.numel() for module in modules for parameter in module.parameters())
 
 
 @torch.no_grad()
@@ -78,19 +78,47 @@ def generator_blocks(generator: Generator, vehicles: int = 9) -> list[Block]:
     width = encoder.embed.out_features
     return [
         Block("observed displacements", ("of every vehicle,", "m per 0.1 s"), _shape(observed)),
-        Block("embedding", (f"{encoder.embed.in_features} to {width}, ReLU,", "to the LSTM's gates"),
-              _shape(projected), _count(encoder.embed, encoder.input)),
-        Block("LSTM encoder", (f"{projected.shape[2]} motions,", "last state"), _shape(hidden),
-              encoder.recurrent.numel()),
-        Block("pooling over pairs", (f"{pooling.neighbours} nearest, to {pooling.per_pair.out_features}, ReLU,",
-              f"to {pooling.second.out_features}, maximum"), _shape(pooled), _count(pooling)),
-        Block("context", ("of state and pooled", f"neighbours{extra}"), _shape(context), _count(generator.context)),
+        Block(
+            "embedding",
+            (f"{encoder.embed.in_features} to {width}, ReLU,", "to the LSTM's gates"),
+            _shape(projected),
+            _count(encoder.embed, encoder.input),
+        ),
+        Block(
+            "LSTM encoder",
+            (f"{projected.shape[2]} motions,", "last state"),
+            _shape(hidden),
+            encoder.recurrent.numel(),
+        ),
+        Block(
+            "pooling over pairs",
+            (
+                f"{pooling.neighbours} nearest, to {pooling.per_pair.out_features}, ReLU,",
+                f"to {pooling.second.out_features}, maximum",
+            ),
+            _shape(pooled),
+            _count(pooling),
+        ),
+        Block(
+            "context",
+            ("of state and pooled", f"neighbours{extra}"),
+            _shape(context),
+            _count(generator.context),
+        ),
         Block("noise", ("a latent vector z a driver,", "joined to the context"), _shape(noise)),
-        Block("LSTM decoder", (f"{sizes.predicted} steps from context", f"and noise ({decoder.hidden} numbers)"),
-              (vehicles, outputs.shape[-2], decoder.hidden), _count(decoder)),
-        Block("predicted displacements", ("a residual on the", "last displacement"), _shape(outputs),
-              _count(generator.head)),
-    ]  # fmt: skip
+        Block(
+            "LSTM decoder",
+            (f"{sizes.predicted} steps from context", f"and noise ({decoder.hidden} numbers)"),
+            (vehicles, outputs.shape[-2], decoder.hidden),
+            _count(decoder),
+        ),
+        Block(
+            "predicted displacements",
+            ("a residual on the", "last displacement"),
+            _shape(outputs),
+            _count(generator.head),
+        ),
+    ]
 
 
 @torch.no_grad()
@@ -103,12 +131,28 @@ def discriminator_blocks(
     projected = encoder.project(shown[..., 1:, :], shown.diff(dim=-2))
     return [
         Block("displacements", ("observed, then recorded", "or predicted"), _shape(shown)),
-        Block("embedding", (f"{encoder.embed.in_features} to {encoder.embed.out_features}, ReLU,",
-              "to the LSTM's gates"), _shape(projected), _count(encoder.embed, encoder.input)),
-        Block("LSTM encoder", (f"{projected.shape[2]} motions,", "last state"), _shape(encoder.encode(projected)),
-              encoder.recurrent.numel()),
-        Block("logit", ("recorded or", "predicted"), _shape(discriminator(shown)), _count(discriminator.head)),
-    ]  # fmt: skip
+        Block(
+            "embedding",
+            (
+                f"{encoder.embed.in_features} to {encoder.embed.out_features}, ReLU,",
+                "to the LSTM's gates",
+            ),
+            _shape(projected),
+            _count(encoder.embed, encoder.input),
+        ),
+        Block(
+            "LSTM encoder",
+            (f"{projected.shape[2]} motions,", "last state"),
+            _shape(encoder.encode(projected)),
+            encoder.recurrent.numel(),
+        ),
+        Block(
+            "logit",
+            ("recorded or", "predicted"),
+            _shape(discriminator(shown)),
+            _count(discriminator.head),
+        ),
+    ]
 
 
 def _shape(tensor: Tensor) -> tuple[int, ...]:

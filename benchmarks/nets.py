@@ -90,11 +90,11 @@ Group = dict[str, str]
 
 def digest(values: Tensor | list[Tensor]) -> str:
     """The sha256 of tensors, with their types and shapes."""
-    found = hashlib.sha256()
-    for each in values if isinstance(values, list) else [values]:
-        found.update(f"{each.dtype} {tuple(each.shape)}".encode())
-        found.update(each.detach().cpu().contiguous().numpy().tobytes())
-    return found.hexdigest()
+    sha = hashlib.sha256()
+    for tensor in values if isinstance(values, list) else [values]:
+        sha.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
+        sha.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return sha.hexdigest()
 
 
 def scripted_actions(decision: int, rows: int) -> Tensor:
@@ -106,18 +106,18 @@ def scripted_actions(decision: int, rows: int) -> Tensor:
 
 def leaves_of(state: TensorDictBase, names: tuple[str, ...]) -> dict[str, Tensor]:
     """The tensors under ``names`` in ``state``, by dotted name."""
-    found: dict[str, Tensor] = {}
+    leaves: dict[str, Tensor] = {}
     for name in names:
         value = state.get(name, None)
         if isinstance(value, Tensor):
-            found[name] = value
+            leaves[name] = value
         elif value is not None:
             inner = value.items(include_nested=True, leaves_only=True)
-            found |= {
+            leaves |= {
                 ".".join([name, *([key] if isinstance(key, str) else key)]): leaf
                 for key, leaf in inner
             }
-    return found
+    return leaves
 
 
 def roll_out(decisions: int, **options: Any) -> dict[str, Group]:
@@ -180,7 +180,7 @@ def rollouts(arguments: argparse.Namespace, work: Path) -> Iterator[tuple[str, G
 
 
 def run_command(command: str, folder: Path | None, *arguments: str) -> None:
-    """``python -m ganlane.COMMAND`` on one thread, into ``folder``; ends the script where it fails."""
+    """``python -m ganlane.COMMAND`` on one thread, into ``folder``; its failure ends the script."""
     home = [] if folder is None else [f"hydra.run.dir={folder}"]
     environment = {
         **os.environ,
@@ -208,7 +208,7 @@ def values_of(value: Any, name: str = "") -> Group:
     else:
         return {name.removeprefix("."): repr(value)}
     return {
-        path: text for key, each in inner for path, text in values_of(each, f"{name}.{key}").items()
+        path: text for key, item in inner for path, text in values_of(item, f"{name}.{key}").items()
     }
 
 
@@ -283,11 +283,11 @@ SECTIONS: dict[str, Callable[[argparse.Namespace, Path], Iterator[tuple[str, Gro
 def record(arguments: argparse.Namespace, section: str) -> dict[str, Group]:
     """The digests of a section, by name."""
     with tempfile.TemporaryDirectory() as work:
-        found = {}
+        groups = {}
         for name, group in SECTIONS[section](arguments, Path(work)):
             print(f"{section}: {name}", file=sys.stderr, flush=True)
-            found[name] = group
-        return found
+            groups[name] = group
+        return groups
 
 
 def verdict(before: Group | None, after: Group | None) -> str:
@@ -306,10 +306,10 @@ def verdict(before: Group | None, after: Group | None) -> str:
 
 def make(arguments: argparse.Namespace, section: str, path: Path) -> list[tuple[str, str]]:
     """Record a section into its file."""
-    found = record(arguments, section)
+    groups = record(arguments, section)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    return [(f"{section}: {name}", f"{len(group)} digests") for name, group in found.items()]
+    path.write_text(json.dumps(groups, indent=1) + "\n", encoding="utf-8")
+    return [(f"{section}: {name}", f"{len(group)} digests") for name, group in groups.items()]
 
 
 def compare(arguments: argparse.Namespace, section: str, path: Path) -> list[tuple[str, str]]:

@@ -77,9 +77,9 @@ def collect(folders: Sequence[str | Path]) -> dict[int, Agent]:
         UserError: a folder without an agent, an agent without a seed, a seed that comes twice, or
             two recipes.
     """
-    found: dict[int, Agent] = {}
+    agents: dict[int, Agent] = {}
     recipes: dict[str, dict[str, Any]] = {}
-    for path in (each for folder in folders for each in with_seeds(str(folder))):
+    for path in (name for folder in folders for name in with_seeds(str(folder))):
         if Path(path).is_dir():
             path = f"{path}/{AGENT_FILE}"
             if not Path(path).is_file():
@@ -93,18 +93,19 @@ def collect(folders: Sequence[str | Path]) -> dict[int, Agent]:
             raise UserError(
                 f"{path}: its metadata name no seed; give an agent that 'ganlane train' wrote."
             )
-        if seed in found:
+        if seed in agents:
             raise UserError(f"{path}: another run has seed {seed}, too; give each seed once.")
         recipes[path] = recipe_of(metadata)
         first, reference = next(iter(recipes.items()))
         differing = [name for name, value in recipes[path].items() if value != reference[name]]
         if differing:
             raise UserError(
-                f"{path}: another recipe than {first} ({', '.join(differing)}); give runs of one recipe."
+                f"{path}: another recipe than {first} ({', '.join(differing)}); "
+                "give runs of one recipe."
             )
         agent[2]["training"]["init"] = of_no_machine(metadata["training"].get("init"))
-        found[seed] = agent
-    return dict(sorted(found.items()))
+        agents[seed] = agent
+    return dict(sorted(agents.items()))
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -127,10 +128,12 @@ def pack(options: argparse.Namespace) -> str:
     )
     if size > MOST_BYTES:
         raise UserError(
-            f"--out {options.out}: {size / 1e6:.1f} MB, above {MOST_BYTES / 1e6:.0f}; give fewer runs."
+            f"--out {options.out}: {size / 1e6:.1f} MB, above {MOST_BYTES / 1e6:.0f}; "
+            "give fewer runs."
         )
     save_agents(options.out, agents)
-    return f"{options.out}: seeds {', '.join(map(str, agents))}; {options.out.stat().st_size / 1e6:.1f} MB"
+    written_mb = options.out.stat().st_size / 1e6
+    return f"{options.out}: seeds {', '.join(map(str, agents))}; {written_mb:.1f} MB"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -167,13 +167,13 @@ def _differences(results: Results, pairs: Sequence[tuple[str, str, str]]) -> lis
 
     Pairs that are not in the results are left out.
     """
-    found = {(row["driver"], row["over"], row["traffic"]): row for row in results["comparisons"]}
+    by_pair = {(row["driver"], row["over"], row["traffic"]): row for row in results["comparisons"]}
     lines = []
     for first, second, name in pairs:
         rows = [
-            found[first, second, each]
-            for each in _traffics(results)
-            if (first, second, each) in found
+            by_pair[first, second, traffic]
+            for traffic in _traffics(results)
+            if (first, second, traffic) in by_pair
         ]
         if rows:
             lines.append([name, *(_with_interval(row["lead"], row["lead_ci"]) for row in rows)])
@@ -190,10 +190,10 @@ def controls(results: Results) -> str:
 
     Lead over MOBIL and failures, then their differences from the paper's agents.
     """
-    own, lines = results["controls"], []
-    for driver in _drivers(own, list(CONTROLS)):
+    part, lines = results["controls"], []
+    for driver in _drivers(part, list(CONTROLS)):
         name, trained = CONTROLS[driver]
-        rows = [_at(own, driver, traffic) for traffic in _traffics(own)]
+        rows = [_at(part, driver, traffic) for traffic in _traffics(part)]
         lines.append(
             [
                 name,
@@ -203,22 +203,24 @@ def controls(results: Results) -> str:
                 ),
             ]
         )
-    return _by_traffic(own, "lead; crashes, departures", lines + _differences(own, CONTROL_CLAIMS))
+    return _by_traffic(
+        part, "lead; crashes, departures", lines + _differences(part, CONTROL_CLAIMS)
+    )
 
 
 def trainings(results: Results) -> str:
     """agent_general training by training, then all of them: lead over MOBIL, and failures."""
-    own = results["general"]
-    traffics = _traffics(own)
-    together = [_at(own, "agent_general+safe", traffic) for traffic in traffics]
+    part = results["general"]
+    traffics = _traffics(part)
+    together = [_at(part, "agent_general+safe", traffic) for traffic in traffics]
     lines = []
-    for place, each in enumerate(together[0]["each"]):
+    for place, training in enumerate(together[0]["each"]):
         cells = [_lead_and_failures(row["each"][place]) for row in together]
-        lines.append([f"`{each['driver'].removesuffix('+safe')}`", *cells])
+        lines.append([f"`{training['driver'].removesuffix('+safe')}`", *cells])
     lines.append(["together", *map(_lead_and_failures, together)])
-    mobil = [_mean_and_failures(_at(own, "mobil", traffic)) for traffic in traffics]
+    mobil = [_mean_and_failures(_at(part, "mobil", traffic)) for traffic in traffics]
     lines.append(["MOBIL (its mean reward)", *mobil])
-    return _by_traffic(own, "lead; crashes, departures", lines)
+    return _by_traffic(part, "lead; crashes, departures", lines)
 
 
 def readme(results: Results) -> str:
@@ -227,8 +229,8 @@ def readme(results: Results) -> str:
     def cell(driver: str, traffic: str) -> str:
         row, mobil = _at(results, driver, traffic), _at(results, "mobil", traffic)
         per_1000 = [
-            1000 * each["hard_crash"] / (each["trainings"] * each["episodes"])
-            for each in (row, mobil)
+            1000 * driven["hard_crash"] / (driven["trainings"] * driven["episodes"])
+            for driven in (row, mobil)
         ]
         return f"{_lead(row, DRIVERS[driver][1])}, {per_1000[0]:.0f} ({per_1000[1]:.0f})"
 
@@ -246,12 +248,12 @@ def roads(results: Results) -> str:
     """Drivers by roads, traffic by traffic: lead over MOBIL, and failures."""
     rows = results["roads"]["rows"]
     places = list(dict.fromkeys((row["vehicles"], row["lanes"]) for row in rows))
-    found = {(row["driver"], row["traffic"], row["vehicles"], row["lanes"]): row for row in rows}
+    by_place = {(row["driver"], row["traffic"], row["vehicles"], row["lanes"]): row for row in rows}
     lines = []
     for driver, traffic in dict.fromkeys(
         (row["driver"], row["traffic"]) for row in rows if row["driver"] != "mobil"
     ):
-        cells = [_lead_and_failures(found[(driver, traffic, *place)]) for place in places]
+        cells = [_lead_and_failures(by_place[(driver, traffic, *place)]) for place in places]
         lines.append([f"{DRIVERS[driver][0]}, `{traffic}`", *cells])
     headings = [
         "lead; crashes, departures",
@@ -262,17 +264,17 @@ def roads(results: Results) -> str:
 
 def elsewhere(results: Results) -> str:
     """Drivers by traffics that are not the project's own: lead over MOBIL, and failures."""
-    own = results["elsewhere"]
+    part = results["elsewhere"]
 
     def cell(driver: str, traffic: str) -> str:
-        row = _at(own, driver, traffic)
+        row = _at(part, driver, traffic)
         return _mean_and_failures(row) if driver == "mobil" else _lead_and_failures(row)
 
     names = {
         "mobil": "MOBIL (its mean reward)",
         **{driver: name for driver, (name, _) in DRIVERS.items()},
     }
-    there, traffics = {row["driver"] for row in own["rows"]}, _traffics(own)
+    there, traffics = {row["driver"] for row in part["rows"]}, _traffics(part)
     lines = [
         [names[driver], *(cell(driver, traffic) for traffic in traffics)]
         for driver in names
@@ -280,9 +282,9 @@ def elsewhere(results: Results) -> str:
     ]
     episodes = [
         "episodes of each training",
-        *(str(own["seeds"]["episodes"][traffic]) for traffic in traffics),
+        *(str(part["seeds"]["episodes"][traffic]) for traffic in traffics),
     ]
-    return _by_traffic(own, "lead; crashes, departures", [episodes, *lines])
+    return _by_traffic(part, "lead; crashes, departures", [episodes, *lines])
 
 
 def ablations(results: Results) -> str:
@@ -290,20 +292,20 @@ def ablations(results: Results) -> str:
 
     Lead over the one without a change, and failures.
     """
-    own = results["ablations"]
-    leads = {(row["driver"], row["traffic"]): row for row in own["comparisons"]}
+    part = results["ablations"]
+    leads = {(row["driver"], row["traffic"]): row for row in part["comparisons"]}
     lines = []
-    for name, changed in own["changed"].items():
+    for name, changed in part["changed"].items():
         cells = []
-        for traffic in _traffics(own):
-            row = _at(own, name, traffic)
+        for traffic in _traffics(part):
+            row = _at(part, name, traffic)
             cells.append(
                 _lead_and_failures({**row, **leads[name, traffic]}, "lead")
                 if changed
                 else _mean_and_failures(row)
             )
         lines.append([f"`{' '.join(changed)}`" if changed else "nothing (its mean reward)", *cells])
-    return _by_traffic(own, "changed: lead; crashes, departures", lines)
+    return _by_traffic(part, "changed: lead; crashes, departures", lines)
 
 
 #: Document and name of the markers to the table between them.
@@ -332,19 +334,19 @@ def section(text: str, heading: str) -> str:
         UserError: there is no such heading.
     """
     level = heading.split()[0]
-    found = re.search(
+    match = re.search(
         rf"^{re.escape(heading)}$(.*?)(?=^{level} |\Z)", text, re.MULTILINE | re.DOTALL
     )
-    if found is None:
+    if match is None:
         raise UserError(f"{heading}: no such section; expected it in the document.")
-    return found[1]
+    return match[1]
 
 
 def _values(node: Any) -> Iterator[tuple[float, float, float]]:
     """Every value of the results with its interval."""
     if isinstance(node, list):
-        for each in node:
-            yield from _values(each)
+        for item in node:
+            yield from _values(item)
     elif isinstance(node, dict):
         for key, value in node.items():
             interval = node.get(f"{key}_ci")
@@ -360,34 +362,34 @@ def unsourced(text: str, results: Results) -> list[str]:
     A lead may be told the other way round: ``12 [10, 14]`` below as ``-12 [-14, -10]``.
     """
     sources = [results, *(results[name] for name in FURTHER)]
-    values = list(_values([[each["rows"], each.get("comparisons", [])] for each in sources]))
+    values = list(_values([[source["rows"], source.get("comparisons", [])] for source in sources]))
     values += [(-value, -high, -low) for value, low, high in values]
     wrong = []
-    for found in _INTERVAL.finditer(text):
-        digits = len(found[1].partition(".")[2])
-        printed = tuple(float(x) for x in found.groups())
+    for match in _INTERVAL.finditer(text):
+        digits = len(match[1].partition(".")[2])
+        printed = tuple(float(x) for x in match.groups())
         if not any(tuple(float(f"{x:.{digits}f}") for x in value) == printed for value in values):
-            wrong.append(found[0])
+            wrong.append(match[0])
     return wrong
 
 
 def differences(results: Results, root: Path = ROOT) -> list[str]:
     """What in the documents is not as the results say, one line each."""
-    found = []
+    wrong = []
     for (document, name), table in SECTIONS.items():
         before, after = split_at_markers(root / document, *markers(name))
         whole = (root / document).read_text(encoding="utf-8")
         if whole[len(before) : -len(after)].strip() != table(results):
-            found.append(
+            wrong.append(
                 f"{document}: the table {name} differs; run `python -m benchmarks.printed --write`."
             )
     for document, heading in CHECKED:
         text = section((root / document).read_text(encoding="utf-8"), heading)
-        found += [
+        wrong += [
             f"{document}, {heading}: {figure} is not in the results."
             for figure in unsourced(text, results)
         ]
-    return found
+    return wrong
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -404,7 +406,7 @@ def load(path: Path = RESULTS) -> Results:
     """The results of the matrix, with those of :data:`FURTHER` by name."""
     further = {name: RESULTS.parent / name / RESULTS.name for name in FURTHER}
     matrix, *others = (
-        json.loads(each.read_text(encoding="utf-8")) for each in (path, *further.values())
+        json.loads(file.read_text(encoding="utf-8")) for file in (path, *further.values())
     )
     return {**matrix, **dict(zip(further, others))}
 

@@ -44,12 +44,17 @@ from ganlane.agents.drivers import KeepLaneDriver as Policy
 def make(road) -> Traffic: return Traffic(road)
 """
 #: YAML that names it, as an option of a group and as Hydra's own.
-OPTION = "# @package _global_\ntraffic:\n  _target_: evil.Traffic\nhydra:\n  callbacks: {x: {_target_: evil.make}}\n"
+OPTION = """# @package _global_
+traffic:
+  _target_: evil.Traffic
+hydra:
+  callbacks: {x: {_target_: evil.make}}
+"""
 
 
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):
-    """A folder that somebody else has filled, as working directory; a marker there fails the test."""
+    """A working directory that somebody else has filled; a marker there fails the test."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", ["", *sys.path])  # as python -m has it
     monkeypatch.delitem(sys.modules, "evil", raising=False)
@@ -285,9 +290,11 @@ def test_a_class_or_an_annotated_function_is_taken():
 
 
 def test_a_resumed_run_takes_what_this_command_line_repeats():
-    own = IdmTrafficConfig(_target_="evil.Traffic")
+    traffic = IdmTrafficConfig(_target_="evil.Traffic")
     agents = ["mobil", "random_legal", "evil.Policy+safe"]
-    config = TrainConfig(resume="run", traffic=own, evaluation=FinalEvaluationConfig(agents=agents))
+    config = TrainConfig(
+        resume="run", traffic=traffic, evaluation=FinalEvaluationConfig(agents=agents)
+    )
     told = [
         "traffic._target_=evil.Traffic",
         "evaluation.agents=[mobil,random_legal,evil.Policy+safe]",

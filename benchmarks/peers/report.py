@@ -32,8 +32,8 @@ def fill(text: str, figures: Figures) -> str:
     ``<!-- end -->``.
     """
 
-    def replaced(found: re.Match[str]) -> str:
-        return f"<!-- {found[1]} -->\n\n{PARTS[found[1]](figures)}\n\n<!-- end -->"
+    def replaced(match: re.Match[str]) -> str:
+        return f"<!-- {match[1]} -->\n\n{PARTS[match[1]](figures)}\n\n<!-- end -->"
 
     return re.sub(
         rf"<!-- ({'|'.join(PARTS)}) -->\n.*?<!-- end -->", replaced, text, flags=re.DOTALL

@@ -71,7 +71,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Trace:
-    """What a simulator made of a scene: speed (m/s) and position of the centre (m), [steps + 1, M]."""
+    """A driven scene: speed (m/s) and position of the centre (m), [steps + 1, M]."""
 
     speed: Array
     position: Array
@@ -160,7 +160,7 @@ def acceleration(speed: Array, gap: Array, leader_speed: Array, law: Law = LAW) 
 
 
 def equilibrium_gap(speed_mps: float, law: Law = LAW) -> float:
-    """Net gap in metres at which a platoon at ``speed_mps`` is at rest with itself under ``law``."""
+    """Net gap, m, at which a platoon at ``speed_mps`` is at rest with itself under ``law``."""
     p = TABLE_V
     wanted = p.min_gap_m + law.offset_m + speed_mps * p.headway_s
     return wanted / math.sqrt(1.0 - (speed_mps / DESIRED_SPEED_MPS) ** 4) - law.offset_m

@@ -204,12 +204,15 @@ def _positions(road: Any) -> list[float]:
 DEFAULT_STEPPING_S = 0.25
 #: One lane from a dead end to a dead end; its speed limit is out of everybody's way.
 NETWORK = f"""<net version="1.20">
-  <location netOffset="0,0" convBoundary="0,0,{ROAD_M},0" origBoundary="0,0,{ROAD_M},0" projParameter="!"/>
+  <location netOffset="0,0" convBoundary="0,0,{ROAD_M},0" origBoundary="0,0,{ROAD_M},0"
+    projParameter="!"/>
   <edge id="road" from="start" to="end">
-    <lane id="road_0" index="0" speed="{2 * DESIRED_SPEED_MPS}" length="{ROAD_M}" shape="0,0 {ROAD_M},0"/>
+    <lane id="road_0" index="0" speed="{2 * DESIRED_SPEED_MPS}" length="{ROAD_M}"
+      shape="0,0 {ROAD_M},0"/>
   </edge>
   <junction id="start" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0"/>
-  <junction id="end" type="dead_end" x="{ROAD_M}" y="0" incLanes="road_0" intLanes="" shape="{ROAD_M},0"/>
+  <junction id="end" type="dead_end" x="{ROAD_M}" y="0" incLanes="road_0" intLanes=""
+    shape="{ROAD_M},0"/>
 </net>
 """
 
@@ -217,8 +220,9 @@ NETWORK = f"""<net version="1.20">
 def vehicle_type(name: str, max_speed_mps: float, dt: float, p: IdmParameters) -> str:
     """A ``vType`` of drivers with the parameters ``p``."""
     return (
-        f'<vType id="{name}" carFollowModel="IDM" length="{LENGTH_M}" minGap="{p.min_gap_m}" tau="{p.headway_s}" '
-        f'accel="{p.max_acceleration}" decel="{p.comfortable_deceleration}" emergencyDecel="{-p.min_acceleration}" '
+        f'<vType id="{name}" carFollowModel="IDM" length="{LENGTH_M}" minGap="{p.min_gap_m}" '
+        f'tau="{p.headway_s}" accel="{p.max_acceleration}" decel="{p.comfortable_deceleration}" '
+        f'emergencyDecel="{-p.min_acceleration}" '
         f'delta="4" stepping="{min(dt, DEFAULT_STEPPING_S)}" '
         f'sigma="0" speedFactor="1" speedDev="0" maxSpeed="{max_speed_mps}"/>'
     )
@@ -235,8 +239,8 @@ def demand(scene: Scene, dt: float, idm: IdmParameters) -> str:
     for rank, (x, speed) in enumerate(zip(scene.positions_m().tolist(), scene.speeds_mps)):
         kind = "leader" if rank == 0 and scene.leader else "driver"
         lines.append(
-            f'<vehicle id="{rank}" type="{kind}" route="all" depart="0" departPos="{x + 0.5 * LENGTH_M!r}" '
-            f'departSpeed="{speed!r}" insertionChecks="none"/>'
+            f'<vehicle id="{rank}" type="{kind}" route="all" depart="0" '
+            f'departPos="{x + 0.5 * LENGTH_M!r}" departSpeed="{speed!r}" insertionChecks="none"/>'
         )
     return "<routes>\n" + "\n".join(lines) + "\n</routes>\n"
 
@@ -360,5 +364,5 @@ def require_peers() -> None:
 
 def versions() -> dict[str, str]:
     """Versions of everything that the figures depend on."""
-    own = {"ganlane": __version__, "python": platform.python_version()}
-    return {**own, **{name: importlib.metadata.version(name) for name in PACKAGES}}
+    ours = {"ganlane": __version__, "python": platform.python_version()}
+    return {**ours, **{name: importlib.metadata.version(name) for name in PACKAGES}}

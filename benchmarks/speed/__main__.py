@@ -143,8 +143,9 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
     for threads in options.threads:
         for batch in options.batches:
             cases = cases_of(options, road, threads, batch)
-            first, *others = peers_of(options, road, threads, batch) or [None]
-            rows += measure([*others, *cases], first, options.repetitions, options.seconds)
+            peers = peers_of(options, road, threads, batch)
+            first = peers[0] if peers else None
+            rows += measure([*peers[1:], *cases], first, options.repetitions, options.seconds)
             print(f"threads {threads}, batch {batch}: done", file=sys.stderr, flush=True)
     if options.suite == "sim" and len(options.vehicle_counts) > 1:
         for system in ("ganlane physics", "ganlane environment"):

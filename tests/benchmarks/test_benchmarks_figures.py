@@ -36,7 +36,7 @@ def test_the_architecture_shows_every_weight_and_the_shapes_of_the_loaded_genera
     assert blocks["predicted displacements"].shape == (5, sizes.predicted, 2)
 
 
-def test_the_discriminator_gives_one_logit_per_vehicle_and_every_block_has_its_box_and_an_arrow_to_the_next():
+def test_the_discriminator_gives_a_logit_per_vehicle_and_every_block_has_its_box_and_arrow():
     discriminator = Discriminator()
     blocks = discriminator_blocks(discriminator, 16, vehicles=5)
     assert blocks[-1].shape == (5,)
@@ -61,7 +61,7 @@ def course(lanes):
     return pl.DataFrame(rows, schema=["vehicle", "frame", "x", "lane"], orient="row")
 
 
-def test_a_lane_s_courses_are_its_vehicles_in_seconds_and_metres_all_in_one_plot_each_in_its_colour():
+def test_a_lane_s_courses_are_its_vehicles_in_seconds_and_metres_each_in_its_colour():
     (time_s, _), (_, x_m) = lane_courses(course([1, 0, 1]), 1)
     assert time_s.tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
     assert x_m.tolist() == [20.0, 21.0, 22.0, 23.0, 24.0]

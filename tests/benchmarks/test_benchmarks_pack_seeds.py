@@ -72,9 +72,12 @@ def test_each_seed_drives_as_it_did_alone(packed, tmp_path):
 
 
 def test_what_a_greedy_agent_computes_with_is_kept_to_the_last_bit(packed, tmp_path):
-    own, other = read_agent("agent_idm@2")[0], read_agent(tmp_path / "2" / "agent.safetensors")[0]
-    assert own.keys() == other.keys()
-    for name, value in own.items():
+    weights, other = (
+        read_agent("agent_idm@2")[0],
+        read_agent(tmp_path / "2" / "agent.safetensors")[0],
+    )
+    assert weights.keys() == other.keys()
+    for name, value in weights.items():
         assert value.dtype == torch.float32
         if name.endswith("_sigma"):
             torch.testing.assert_close(value, other[name], rtol=1e-3, atol=1e-6)

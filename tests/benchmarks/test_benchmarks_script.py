@@ -1,9 +1,8 @@
-"""What the scripts share: when a document is refused, what is written into it, and the exit status."""
+"""What the scripts share: a document is refused or written into, and the exit status."""
 
 import pytest
 import torch
 
-from benchmarks import crash_floor, drawing
 from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.errors import UserError
 
@@ -48,22 +47,3 @@ def test_the_result_is_printed_and_a_users_mistake_is_one_sentence_and_status_2(
     assert capsys.readouterr().out == "seed 3, 1 thread\n"
     assert run_script(measure, parser.parse_args(["--seed", "-1"])) == 2
     assert capsys.readouterr() == ("", "error: seed=-1: expected 0 or more.\n")
-
-
-@pytest.mark.parametrize(
-    "page", ["", "<!-- begin crash floor idm -->\n<!-- end crash floor idm -->\n", None]
-)
-def test_nothing_is_driven_for_a_document_without_the_markers(page, tmp_path, monkeypatch, capsys):
-    document, driven = tmp_path / "page.md", []
-    if page is not None:
-        document.write_text(page)
-    monkeypatch.setattr(crash_floor, "rides_of", lambda *given: driven.append(given))
-    assert crash_floor.main(["--traffic", "gan", "--report", str(document)]) == 2
-    assert f"report={document}" in capsys.readouterr().err
-    assert not driven
-
-
-def test_more_frames_than_the_episode_has_are_refused(monkeypatch, capsys):
-    monkeypatch.setattr(drawing, "episode", lambda length_s: range(400))
-    assert drawing.main(["--frames", "80", "--rounds", "5"]) == 2
-    assert "the episode has 400 frames" in capsys.readouterr().err

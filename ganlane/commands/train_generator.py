@@ -13,12 +13,12 @@ from typing import Any
 from tqdm import tqdm
 
 from ganlane import generator
-from ganlane.settings.recordings import TrainGeneratorConfig
 from ganlane.data import byte_progress, read_recordings, recordings_path
 from ganlane.evaluation import code_version, write_results
 from ganlane.evaluation.table import aligned, show
 from ganlane.generator import FitResult, Progress
 from ganlane.generator.forecasts import BASELINE, SAMPLES
+from ganlane.settings.recordings import TrainGeneratorConfig
 from ganlane.torch_settings import set_threads
 
 _ERRORS = ("ade_m", "fde_m", "end_m")
@@ -64,9 +64,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
                 path = weights.with_stem(f"{weights.stem}_fold_{number}")
                 fold.save(path, code=code_version())
             show(fold_tables(further["folds"]), columns=config.columns)
-        result = generator.fit_generator(
-            fit_config, frame, held_out, states, progress, str(source)
-        )
+        result = generator.fit_generator(fit_config, frame, held_out, states, progress, str(source))
     show(metrics_table(result.metrics), columns=config.columns)
     result.save(weights, further.get("folds"), code_version())
     print(f"weights: {weights}")

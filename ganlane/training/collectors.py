@@ -9,7 +9,6 @@ from torchrl.envs import EnvBase
 
 from ganlane import keys
 from ganlane.agents import Rainbow
-from ganlane.env.highway import threads_for
 
 
 class Collector:
@@ -22,8 +21,7 @@ class Collector:
     def __init__(self, env: EnvBase) -> None:
         self.env = env
         self.environments = env.batch_size.numel()
-        with threads_for(env):
-            self.env_state: TensorDictBase = env.reset()
+        self.env_state: TensorDictBase = env.reset()
 
     def step(self, agent: Rainbow) -> TensorDictBase:
         """One decision of every environment, batch [N].
@@ -33,8 +31,7 @@ class Collector:
         """
         # the policy writes its action into the state itself
         decided = agent.policy(self.env_state)
-        with threads_for(self.env):
-            step, self.env_state = self.env.step_and_maybe_reset(decided)
+        step, self.env_state = self.env.step_and_maybe_reset(decided)
         return step
 
     def state_dict(self, exact: bool) -> dict[str, Any]:

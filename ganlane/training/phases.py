@@ -40,12 +40,12 @@ from ganlane.build import (
     make_traffic,
     observation_of,
 )
-from ganlane.settings.traffic import TrafficConfig
-from ganlane.settings.train import TrainConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version, run_episodes
 from ganlane.evaluation.results import plain
 from ganlane.settings.observation import ObservationConfig
+from ganlane.settings.traffic import TrafficConfig
+from ganlane.settings.train import TrainConfig
 from ganlane.sim.random import Stream
 from ganlane.training.checkpoint import LAST, flat, load_checkpoint
 from ganlane.training.logs import make_logs

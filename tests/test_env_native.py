@@ -103,6 +103,27 @@ def test_episodes_that_are_no_whole_numbers_in_a_row_are_refused(wrong):
         env.reset(state, next_episode=wrong)
 
 
+@pytest.mark.parametrize(
+    ("kernel", "rows"),
+    [
+        ("native", 4096),
+        ("torch", 32),
+        pytest.param("torch", 4096, marks=pytest.mark.slow),
+    ],
+)
+def test_who_keeps_its_lane_comes_to_rest_and_not_to_denormal_numbers(kernel, rows):
+    """200 decisions; what decays by a factor a step would be denormal after some 60."""
+    env = native(rows, kernel=kernel, goal_m=1e6, timeout_s=1e5)
+    state, keep = env.reset(), torch.zeros(rows, dtype=torch.int64)
+    for _ in range(200):
+        state = env.step(state.set(keys.ACTION, keep))["next"]
+    smallest = torch.finfo(torch.float32).tiny
+    for name, value in leaves(state):
+        if value.is_floating_point():
+            assert not ((value != 0) & (value.abs() < smallest)).any(), name
+    assert (state[keys.VEHICLES, "heading"] == 0).float().mean() > 0.5
+
+
 class Cruise(TrafficModule):
     def move(self, vehicles, memory, key, step):
         return vehicles.with_(x=vehicles.x + vehicles.speed * self.dt), memory

@@ -246,20 +246,6 @@ def in_torch(rng: random.Random, whole: bytes) -> bytes:
     return made.getvalue()
 
 
-def in_arrays(rng: random.Random, whole: bytes) -> bytes:
-    """An array of an .npz with another name, type, shape or values."""
-    with np.load(io.BytesIO(whole)) as kept:
-        arrays = dict(kept)
-    chosen = rng.choice(list(arrays))
-    value = arrays.pop(chosen)
-    new = rng.choice(
-        (value[:0], value[:-1], value.astype(np.float64) * np.nan, value.astype(str), -value - 7)
-    )
-    made = io.BytesIO()
-    np.savez_compressed(made, **{rng.choice((chosen, "x", "a/b")): new}, **arrays)
-    return made.getvalue()
-
-
 def in_parquet(rng: random.Random, whole: bytes) -> bytes:
     """A column of a Parquet file with another name, type or values, or none."""
     frame = pl.read_parquet(io.BytesIO(whole))

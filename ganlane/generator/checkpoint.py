@@ -102,7 +102,9 @@ def load_generator(
         raise UserError(
             f"{path}: its weights do not have the shapes that its sizes ask for; fit it again."
         ) from error
-    inputs, needed = generator.sizes.extra_inputs, EXTRA_INPUTS if stored == "calibrated" else 0
+    # The presets differ in their inputs; weights of one would drive badly under the other's name.
+    inputs = generator.sizes.extra_inputs
+    needed = EXTRA_INPUTS if stored == "calibrated" else 0
     if inputs != needed:
         raise UserError(
             f"{path}: takes {inputs} further inputs, expected {needed} for the preset {stored}; "

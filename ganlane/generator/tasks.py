@@ -391,8 +391,10 @@ class FitLoop:
     def _resume(self, path: Path) -> None:
         """Continue from a stored state; reading it never executes code."""
         content = path.read_bytes()
-        has_checksum(content, path)
+        whole = has_checksum(content, path)
         try:
+            if not whole:
+                raise ValueError("no checksum")
             state = torch.load(io.BytesIO(content), weights_only=True)
             counters = state["counters"]
         except Exception as error:

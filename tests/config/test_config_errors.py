@@ -122,7 +122,7 @@ MISTAKES = {
     "train env.lane=3": "env.lane: no such key (did you mean 'lanes'?)",
     "train trafic=gan": "trafic: no such key (did you mean 'traffic'?); known are agent",
     "train agent.gama=0.9": "agent.gama: no such key (did you mean 'gamma'?); agent has adam_eps",
-    "train collector.wrkers=2": "collector.wrkers: no such key (did you mean 'workers'?); its options have",
+    "train collector.nm_envs=2": "collector.nm_envs: no such key (did you mean 'num_envs'?)",
     "train pretrain.traffic.guard=false": "pretrain.traffic.guard: a key below one that is null",
     "train traffic=ganny": "traffic=ganny: no such option (did you mean 'gan'?)",
     "train env=[a,b]": "choose one of blocked_lane",

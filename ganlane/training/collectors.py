@@ -49,6 +49,7 @@ class Collector:
         if exact:
             self.env_state = saved
         elif keys.EPISODE in saved:
+            # rows count on in steps of their number, so no episode is driven twice
             following = saved.get(keys.EPISODE) + self.environments
             self.env_state = self.env.reset(saved.set(keys.EPISODE, following))
         else:  # an environment without numbered episodes
@@ -57,6 +58,7 @@ class Collector:
 
 def pack(tensordict: TensorDictBase) -> dict[str, Any]:
     """A TensorDict as plain data, with its (nested) batch sizes."""
+    # plain dictionaries, which torch.load reads without executing anything
     leaves = {
         key: pack(value) if isinstance(value, TensorDictBase) else value
         for key, value in tensordict.items()

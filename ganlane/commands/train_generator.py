@@ -13,12 +13,12 @@ from typing import Any
 from tqdm import tqdm
 
 from ganlane import generator
-from ganlane.settings.recordings import TrainGeneratorConfig
 from ganlane.data import byte_progress, read_recordings, recordings_path
 from ganlane.evaluation import code_version, write_results
 from ganlane.evaluation.table import aligned, show
 from ganlane.generator import FitResult, Progress
 from ganlane.generator.forecasts import BASELINE, SAMPLES
+from ganlane.settings.recordings import TrainGeneratorConfig
 from ganlane.torch_settings import set_threads
 
 _ERRORS = ("ade_m", "fde_m", "end_m")

@@ -149,12 +149,17 @@ def called(command: str, keys: Mapping[str, Any]) -> dict[str, Any]:
     return merged(deepcopy(_defaults(command, *words)), others)
 
 
+def key_of(override: Override) -> str:
+    """The key that a word replaces; an option by its name replaces all keys below it."""
+    return str(override.key_or_group).removesuffix(".name")
+
+
 def resumed(saved: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
     """A saved run's data with what a command line names."""
     config = OmegaConf.create(dict(saved))
     now = OmegaConf.create(composed("train", overrides))
     for override in overrides:
-        key = override.key_or_group
+        key = key_of(override)
         if not key.startswith("hydra"):
             OmegaConf.update(config, key, OmegaConf.select(now, key), merge=False, force_add=True)
     return OmegaConf.to_container(config)  # type: ignore[return-value]

@@ -27,8 +27,8 @@ from torchrl.envs import EnvBase, GymEnv, SerialEnv
 
 from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.agents import GreedyPolicy, Rainbow, RainbowConfig
-from ganlane.settings.train import LoggerConfig, TrainConfig
 from ganlane.evaluation.table import Table
+from ganlane.settings.train import LoggerConfig, TrainConfig
 from ganlane.training.loop import train
 
 BEGIN, END = "<!-- cartpole: begin -->", "<!-- cartpole: end -->"

@@ -143,7 +143,3 @@ def call_with(
             f"it takes {', '.join(parameters) or 'nothing'}."
         ) from error
     return target(**arguments)
-
-
-def checked_arguments(f):
-    return f  # TEMP

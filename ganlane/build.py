@@ -20,18 +20,18 @@ from ganlane.agents import load_agent
 from ganlane.agents.checkpoint import SHIPPED, names_agent, with_seeds
 from ganlane.agents.drivers import DRIVERS, MaskedPolicy
 from ganlane.arguments import call_with, import_target, is_import_path
-from ganlane.settings.commands import HighwayConfig
-from ganlane.settings.env import EnvConfig
-from ganlane.settings.traffic import TrafficConfig
 from ganlane.env import HighwayEnv, TransformedHighway
 from ganlane.errors import ParameterError, UserError
 from ganlane.files import CHECKPOINTS
+from ganlane.settings.commands import HighwayConfig
+from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import (
     MASKS,
     MaskParameters,
     ObservationConfig,
     RewardParameters,
 )
+from ganlane.settings.traffic import TrafficConfig
 from ganlane.sim.dynamics import STEERING
 from ganlane.sim.random import Stream
 from ganlane.sim.state import Road

@@ -14,9 +14,9 @@ from tqdm import tqdm
 
 from ganlane import evaluation
 from ganlane.build import Driver, make_drivers, make_env, make_traffic
-from ganlane.settings.commands import EvaluateConfig
 from ganlane.evaluation.statistics import entries
 from ganlane.evaluation.table import show
+from ganlane.settings.commands import EvaluateConfig
 from ganlane.sim.random import Stream
 from ganlane.torch_settings import set_threads
 from ganlane.traffic import ReplayTraffic
@@ -48,9 +48,7 @@ def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = Fal
     env, seed, episodes = config.env, config.seed, config.episodes
     stream = Stream.named(config.stream)
     # All traffics are made first, so that one that cannot be made shows before any driving.
-    modules = {
-        name: make_traffic(option, env, stream) for name, option in config.traffics.items()
-    }
+    modules = {name: make_traffic(option, env, stream) for name, option in config.traffics.items()}
     total = len(modules) * len(drivers) * episodes
     tables = []
     current = None

@@ -63,7 +63,7 @@ def kernel() -> str:
 
     if library.why_not() is not None:
         raise UserError(f"env.kernel=native {library.why_not()}")
-    return " ".join(library.find_compiler() or ["in the wheel"])
+    return " ".join(library.compiler_command() or ["in the wheel"])
 
 
 def recordings() -> str:

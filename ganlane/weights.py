@@ -12,7 +12,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from ganlane.errors import UserError
-from ganlane.files import PLACE, has_checksum, note_without_checksum, sealed, write_bytes
+from ganlane.files import PLACE, has_checksum, refuse_without_checksum, sealed, write_bytes
 
 
 def save_weights(
@@ -70,5 +70,5 @@ def load_weights(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[s
                 f"{path}: {name} holds numbers that are not finite; train or fit it again."
             )
     if not whole:
-        note_without_checksum(path)
+        refuse_without_checksum(path)
     return tensors, metadata

@@ -13,8 +13,8 @@ from torch import Tensor
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
 from ganlane.settings.driving import IdmParameters, Visibility
-from ganlane.settings.traffic import SumoTrafficConfig
 from ganlane.settings.episode import SpawnParameters
+from ganlane.settings.traffic import SumoTrafficConfig
 from ganlane.sim.dynamics import STEERING, SteeringParameters, ego_scene, move_ego
 from ganlane.sim.idm import TABLE_V, following_acceleration
 from ganlane.sim.random import Purpose, Stream, uniform
@@ -360,4 +360,4 @@ def _driver(u: Array, vehicles: Any, row: int, i: int) -> SumoDriver:
     drawn = [low + float(u[k]) * (high - low) for k, (low, high) in enumerate(ranges.values())]
     names = ("desired_speed", "length", "width")
     body = [float(getattr(vehicles, name)[row, i]) for name in names]
-    return SumoDriver(*body, *drawn, emergency_decel)
+    return SumoDriver._make((*body, *drawn, emergency_decel))

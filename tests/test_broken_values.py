@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import pytest
+from ganlane.config.command_line import sentence, typed
+from ganlane.config.schemas import SCHEMAS, node_of
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from reference.hydra_memory import composed, own_part
 from reference.refusals import refusal
 
 from ganlane.__main__ import COMMANDS
-from ganlane.config.command_line import sentence, typed
-from ganlane.config.schemas import SCHEMAS, node_of
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
 from ganlane.settings.record import NO_KEY

@@ -11,7 +11,10 @@ from torchrl.envs.utils import check_env_specs
 
 from ganlane.agents.drivers import DRIVERS, MobilDriver
 from ganlane.build import make_driver, make_env, make_traffic
+from ganlane.errors import UserError
+from ganlane.settings.driving import IdmParameters, MobilParameters
 from ganlane.settings.env import EnvConfig
+from ganlane.settings.observation import FORMS, ObservationConfig
 from ganlane.settings.recordings import RealismConfig
 from ganlane.settings.traffic import (
     HighwayEnvTrafficConfig,
@@ -19,9 +22,6 @@ from ganlane.settings.traffic import (
     IdmTrafficConfig,
     SumoTrafficConfig,
 )
-from ganlane.errors import UserError
-from ganlane.settings.driving import IdmParameters, MobilParameters
-from ganlane.settings.observation import FORMS, ObservationConfig
 from ganlane.sim.random import Stream
 
 ROAD = EnvConfig(

@@ -9,12 +9,12 @@ import pytest
 
 from ganlane.build import make_driver
 from ganlane.compare import compare, publish
-from ganlane.settings.commands import EvaluateConfig
-from ganlane.settings.env import EnvConfig
-from ganlane.settings.traffic import IdmTrafficConfig, ReplayTrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.evaluation import crashes_by_scene, evaluation_rows, failed_episodes, paired_rows
 from ganlane.evaluation.results import plain
+from ganlane.settings.commands import EvaluateConfig
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.traffic import IdmTrafficConfig, ReplayTrafficConfig
 from ganlane.sim.random import Stream
 from ganlane.traffic import ReplayTraffic
 

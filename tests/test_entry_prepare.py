@@ -10,6 +10,9 @@ from pathlib import Path
 
 import polars as pl
 import pytest
+from ganlane.evaluate import main as evaluate
+from ganlane.prepare import main
+from ganlane.train_generator import main as train_generator
 from PIL import Image
 from reference.file_server import SHA256, Server
 from reference.recordings import (
@@ -27,9 +30,6 @@ from ganlane.data import (
     synthetic_scenes,
     write_scene_csv,
 )
-from ganlane.evaluate import main as evaluate
-from ganlane.prepare import main
-from ganlane.train_generator import main as train_generator
 
 
 @pytest.fixture(autouse=True)

@@ -7,9 +7,9 @@ import torch
 from reference.worlds import environment, step
 
 from ganlane import keys
-from ganlane.settings.env import EnvConfig, check_reward
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
+from ganlane.settings.env import EnvConfig, check_reward
 from ganlane.sim.random import Stream
 from ganlane.transforms import RewardParameters, RewardTransform
 from ganlane.transforms.reward import speed_reward

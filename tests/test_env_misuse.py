@@ -8,17 +8,17 @@ from __future__ import annotations
 import gymnasium
 import pytest
 import torch
+from ganlane.options import option
 from tensordict import TensorDict
 
 import ganlane
 import ganlane.gym
 from ganlane import keys
 from ganlane.build import make_traffic
-from ganlane.settings.env import EnvConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.native.library import why_not
-from ganlane.options import option
+from ganlane.settings.env import EnvConfig
 from ganlane.traffic import IdmTraffic
 
 KERNELS = [

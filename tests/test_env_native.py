@@ -13,12 +13,12 @@ from torchrl.envs.utils import check_env_specs
 import ganlane
 from ganlane import keys
 from ganlane.build import make_env
-from ganlane.settings.env import EnvConfig
 from ganlane.env.highway import say_once, threads_for
 from ganlane.errors import UserError
 from ganlane.native.library import ROWS_PER_THREAD, threads_allowed, why_not
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.settings.driving import EgoParameters, IdmParameters
+from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MaskParameters, ObservationConfig, SensorParameters
 from ganlane.sim.state import Road
 from ganlane.traffic.base import TrafficModule

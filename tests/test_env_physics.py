@@ -11,12 +11,12 @@ from tensordict import TensorDict, TensorDictBase
 
 from ganlane import build, keys, runtime
 from ganlane.agents.drivers import MobilDriver
-from ganlane.settings.env import EnvConfig
-from ganlane.settings.traffic import IdmTrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.env.physics import EndedRows, run_decision
 from ganlane.errors import UserError
 from ganlane.settings.driving import Visibility
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.traffic import IdmTrafficConfig
 from ganlane.traffic import IdmTraffic, Overlay, TrafficModule, TrafficSequential
 
 # What traffic remembers of a row that has ended is what it remembered when the row ended.

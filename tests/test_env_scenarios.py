@@ -9,10 +9,12 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 import torch
+from ganlane.config.command_line import check
 
 from ganlane import keys
 from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.config.command_line import check
+from ganlane.env import HighwayEnv
+from ganlane.errors import UserError
 from ganlane.settings.env import (
     BlockedLaneEnvConfig,
     CutInEnvConfig,
@@ -23,8 +25,6 @@ from ganlane.settings.env import (
     StopAndGoOptions,
 )
 from ganlane.settings.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
-from ganlane.env import HighwayEnv
-from ganlane.errors import UserError
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.scenes import FixedScene, SceneVehicle
 from ganlane.sim.spawn import RandomScenes

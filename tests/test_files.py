@@ -38,8 +38,8 @@ from ganlane.files import (
 from ganlane.generator import load_generator
 from ganlane.generator.checkpoint import cached, load_arrays, save_arrays
 from ganlane.generator.tasks import FitLoop
-from ganlane.settings.generator import LoopConfig, PaperConfig
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
+from ganlane.settings.generator import LoopConfig, PaperConfig
 from ganlane.weights import load_weights, save_weights
 
 BEGIN, END = "<!-- begin -->", "<!-- end -->"

@@ -11,19 +11,19 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from ganlane.options import option
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
 from reference.gym_env import ID, KEEP, LEFT, RIGHT, ROOT, make, make_vec, until_the_end
 
 import ganlane
 from ganlane.build import make_traffic
-from ganlane.settings.env import EnvConfig
 from ganlane.errors import UserError
 from ganlane.gym import ENV_IDS
 from ganlane.gym.base import make_rows
 from ganlane.gym.native_rows import NativeRows
 from ganlane.native.library import why_not
-from ganlane.options import option
+from ganlane.settings.env import EnvConfig
 
 
 @pytest.mark.parametrize("name", sorted(ENV_IDS.keys() - {ID}))

@@ -13,7 +13,17 @@ PACKAGE = Path(ganlane.__file__).parent
 #: From the bottom up; what stands in one line may import each other's neighbours to the left only
 #: within itself.
 ORDER = [
-    {"_version", "arguments", "keys", "errors", "files", "weights", "runtime", "torch_settings", "linear"},
+    {
+        "_version",
+        "arguments",
+        "keys",
+        "errors",
+        "files",
+        "weights",
+        "runtime",
+        "torch_settings",
+        "linear",
+    },
     {"parameters"},
     {"data", "sim"},
     {"generator"},

@@ -13,21 +13,21 @@ from pathlib import Path
 
 import pytest
 import torch
+from ganlane.config.command_line import parse
 from reference.refusals import Bomb, refusal, run_folder
 
 from ganlane.__main__ import dispatch
 from ganlane.agents import load_agent
 from ganlane.arguments import import_target
 from ganlane.build import make_driver
-from ganlane.config.command_line import parse
-from ganlane.settings.env import EnvConfig
 from ganlane.config.run import refuse_stored_imports
-from ganlane.settings.traffic import IdmTrafficConfig
-from ganlane.settings.train import FinalEvaluationConfig, TrainConfig
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator import load_generator
 from ganlane.realism.measures import Reference
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.traffic import IdmTrafficConfig
+from ganlane.settings.train import FinalEvaluationConfig, TrainConfig
 from ganlane.traffic import TrafficModule
 from ganlane.weights import load_weights, save_weights
 

@@ -160,6 +160,7 @@ def save_agents(
         str(seed): {**metadata, "network": network.description()}
         for seed, (_, network, metadata) in agents.items()
     }
+    # each agent's metadata by its seed, as text: JSON has no other keys
     save_weights(path, SEVERAL, tensors, {"agents": described})
 
 
@@ -172,11 +173,13 @@ def read_agent(
         UserError: no such file, or not an agent that this version of ganlane wrote.
     """
     path = agent_file(name)
+    # None: a file with one agent
     seed = _place(name)[1]
     if seed is None:
         weights, metadata = load_weights(path, "agent")
     else:
         tensors, agents = _read_several(path)
+        # the file says itself which trainings it holds
         if seed not in agents:
             seeds = ", ".join(map(str, sorted(agents)))
             raise UserError(
@@ -252,6 +255,7 @@ def warm_start(
         UserError: the networks differ in what their weights mean, or the moments are those of
             another network.
     """
+    # first the mistake that is made most often
     check_observation_size(name, network, agent.network.config.observation_size)
     here = agent.config
     trained = network.agent
@@ -259,6 +263,7 @@ def warm_start(
         "noisy_sigma",
         *(() if here.distributional else SUPPORT),
     }
+    # what the weights mean must agree, not how they were learned
     differing = [
         option
         for option in SHAPE

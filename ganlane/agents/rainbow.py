@@ -102,7 +102,9 @@ class Rainbow:
             eps=adam_eps,
             fused=True,
         )
+        # which draws from a generator of its own
         self.replay = make_replay(config, self.generators["replay"])
+        # one network, two ways to drive with it
         self.policy = ExploringPolicy(self.network, self.generators["collect"], legal)
         self.greedy = GreedyPolicy(self.network)
         # since the start of the training
@@ -167,6 +169,7 @@ class Rainbow:
         # one batch by priority
         batch = draw(self.replay)
         descend = self._descend if self.graph is None else self.graph
+        # both change the same parameters and the same state of Adam
         learned = descend(batch, self.generators["learn"])
         if config.prioritised:
             self.replay.sampler.update_priority(batch.get("index"), learned.priority)
@@ -206,6 +209,7 @@ class Rainbow:
 
         0 without noise.
         """
+        # of the weights alone: those of the biases are few
         sigmas = [layer.weight_sigma.detach().abs().mean() for layer in noisy_layers(self.network)]
         return torch.stack(sigmas).mean() if sigmas else torch.zeros(())
 
@@ -264,6 +268,7 @@ class Rainbow:
                     f"agent.{name}={value}: the saved agent has {saved}; give the same to go on "
                     "from it."
                 )
+        # in place: policies, losses and optimiser keep their references
         load_parameters(self.network, state["network"])
         load_parameters(self.loss.target_network, state["target"])
         self.load_moments(state["optimizer"]["state"])

@@ -9,7 +9,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
-from ganlane.settings.recordings import PrepareConfig
 from ganlane.data.prepared import (
     Preparation,
     SceneSummary,
@@ -23,6 +22,7 @@ from ganlane.evaluation import write_results
 from ganlane.evaluation.table import Table
 from ganlane.files import write_bytes
 from ganlane.runtime import peak_resident_bytes
+from ganlane.settings.recordings import PrepareConfig
 from ganlane.view.figures import (
     draw_recordings,
     save_figure,

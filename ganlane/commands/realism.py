@@ -10,9 +10,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from ganlane.build import make_road, make_traffic
-from ganlane.settings.env import EnvConfig
-from ganlane.settings.recordings import RealismConfig
-from ganlane.settings.traffic import TrafficConfig
 from ganlane.data.dense import units_of
 from ganlane.data.recordings import read_scenes
 from ganlane.data.sources import data_folder, default_scenes
@@ -24,7 +21,6 @@ from ganlane.generator import (
     Preset,
     shipped_generator,
 )
-from ganlane.settings.record import assign
 from ganlane.realism.card import (
     card_numbers,
     floors_of,
@@ -52,6 +48,10 @@ from ganlane.realism.starts import (
     recorded_starts,
     spawned_starts,
 )
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.record import assign
+from ganlane.settings.recordings import RealismConfig
+from ganlane.settings.traffic import TrafficConfig
 from ganlane.sim.random import Stream
 from ganlane.sim.state import Road
 from ganlane.torch_settings import set_threads

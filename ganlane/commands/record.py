@@ -20,7 +20,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from ganlane.build import make_driver
-from ganlane.settings.commands import RecordConfig
 from ganlane.config.run import cleared_after_mistakes
 from ganlane.config.schemas import SCHEMAS
 from ganlane.errors import UserError
@@ -29,6 +28,7 @@ from ganlane.gym import ENV_ID
 from ganlane.gym.rows import row_of
 from ganlane.gym.tensor_rows import TensorRows
 from ganlane.keys import ACTION, ACTIONS, END_EVENTS, EPISODE
+from ganlane.settings.commands import RecordConfig
 from ganlane.sim.random import Stream
 from ganlane.torch_settings import set_threads
 

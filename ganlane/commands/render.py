@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.settings.render import FILMS, MOST_EPISODES, RenderConfig
 from ganlane.errors import UserError
 from ganlane.evaluation.episodes import ScriptedPolicy
 from ganlane.reproduce.crashes import read_crashes
+from ganlane.settings.render import FILMS, MOST_EPISODES, RenderConfig
 from ganlane.sim.random import Stream
 from ganlane.torch_settings import set_threads
 from ganlane.view import (

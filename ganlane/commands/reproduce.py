@@ -14,14 +14,14 @@ from matplotlib.figure import Figure
 
 from ganlane.agents import read_agent
 from ganlane.agents.checkpoint import save_agents, with_seeds
-from ganlane.settings.commands import ReproduceConfig
-from ganlane.settings.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import failed_episodes, machine_sentence, write_results
 from ganlane.reproduce import figures as drawings
 from ganlane.reproduce import report
 from ganlane.reproduce.cells import available, cells_of, drive, read_cells
 from ganlane.reproduce.crashes import find_crashes, write_crashes
+from ganlane.settings.commands import ReproduceConfig
+from ganlane.settings.traffic import TrafficConfig
 from ganlane.torch_settings import set_threads
 
 #: Hours that one training of the paper's schedule took, on one core.

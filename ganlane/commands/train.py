@@ -8,10 +8,9 @@ from pathlib import Path
 
 from ganlane.build import make_driver, make_drivers, make_traffic
 from ganlane.compare import compare, publish
-from ganlane.config.run import Stopped
-from ganlane.config.run import earned
-from ganlane.settings.train import TrainConfig
+from ganlane.config.run import Stopped, earned
 from ganlane.errors import UserError
+from ganlane.settings.train import TrainConfig
 from ganlane.torch_settings import set_threads
 from ganlane.training.checkpoint import LAST
 from ganlane.training.phases import (

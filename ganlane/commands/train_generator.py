@@ -13,12 +13,12 @@ from typing import Any
 from tqdm import tqdm
 
 from ganlane import generator
-from ganlane.settings.recordings import TrainGeneratorConfig
 from ganlane.data import byte_progress, read_recordings, recordings_path
 from ganlane.evaluation import code_version, write_results
 from ganlane.evaluation.table import aligned, show
 from ganlane.generator import FitResult, Progress
 from ganlane.generator.forecasts import BASELINE, SAMPLES
+from ganlane.settings.recordings import TrainGeneratorConfig
 from ganlane.torch_settings import set_threads
 
 _ERRORS = ("ade_m", "fde_m", "end_m")
@@ -48,6 +48,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     generator.split_for_fit(scenes, held_out)
     if config.folds:
         generator.assign_folds(scenes, config.folds)
+
     states = Path(config.resume or folder) / "fits"
     weights = folder / f"generator_{fit_config.preset}.safetensors"
     further: dict[str, Any] = {}
@@ -60,13 +61,13 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
             further["folds"], results = generator.cross_validate(
                 fit_config, frame, config.folds, states, progress, str(source)
             )
+            # A realism card by folds drives every scene by the generator that never saw it.
             for number, fold in enumerate(results, start=1):
                 path = weights.with_stem(f"{weights.stem}_fold_{number}")
                 fold.save(path, code=code_version())
             show(fold_tables(further["folds"]), columns=config.columns)
-        result = generator.fit_generator(
-            fit_config, frame, held_out, states, progress, str(source)
-        )
+        result = generator.fit_generator(fit_config, frame, held_out, states, progress, str(source))
+
     show(metrics_table(result.metrics), columns=config.columns)
     result.save(weights, further.get("folds"), code_version())
     print(f"weights: {weights}")
@@ -100,6 +101,7 @@ class FitProgress(AbstractContextManager["FitProgress"]):
             self._bar.set_postfix_str(scores, refresh=False)
         elif progress.best < self._best or update == updates:
             self._best = progress.best
+            # Early stopping may end the fit sooner.
             left_s = progress.seconds / update * (updates - update)
             parts = [f"{update} of {updates} updates", f"at most {left_s:.0f} s left", scores]
             print(", ".join(filter(None, parts)), file=sys.stderr, flush=True)
@@ -180,6 +182,7 @@ def ablation_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
         for change in (row["ade_change_percent"], row["ade_change_percent_0.4_s"]):
             line += [_percent(change[kind]) for kind in kinds]
         lines.append(line)
+    # Only the calibrated preset is rolled out that far.
     if "rmse_5_s_ratio" in first:
         ratios = [f"{row['rmse_5_s_ratio']['mean']:.2f}" for row in rows.values()]
         lines = [[*line, ratio] for line, ratio in zip(lines, ["RMSE 5 s", *ratios])]

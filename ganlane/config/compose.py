@@ -10,10 +10,8 @@ import re
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from functools import cache
-from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -34,8 +32,6 @@ HYDRA_KEYS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
 _HYDRA_PLUGIN = re.compile(r"hydra(/|\.)(launcher|sweeper)\b")
 #: Keys that a command calls by another name, because ``agent=`` would choose an option of a group.
 ALIASES = {"render": {"agent": "driver"}, "record": {"agent": "driver"}}
-#: A saved configuration is a few kB; a larger file is none.
-_LARGEST_CONFIG_BYTES = 2**20
 
 
 def parsed(command: str, words: Sequence[str]) -> list[Override]:
@@ -153,29 +149,6 @@ def called(command: str, keys: Mapping[str, Any]) -> dict[str, Any]:
     return merged(deepcopy(_defaults(command, *words)), others)
 
 
-def saved_config(path: Path) -> dict[str, Any]:
-    """Plain data of a run's ``config.yaml``.
-
-    Raises:
-        UserError: the file is missing or damaged.
-    """
-    try:
-        if path.stat().st_size > _LARGEST_CONFIG_BYTES:
-            raise ValueError("too large")
-        text = path.read_text(encoding="utf-8")
-        # Aliases can make a short file endless; a saved configuration has none.
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
-            raise ValueError("aliases")
-        data = yaml.safe_load(text)
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        raise UserError(
-            f"{path}: missing or damaged, so the run cannot be resumed; start a new run."
-        ) from error
-    if not isinstance(data, dict):
-        raise UserError(f"{path}: damaged, expected key: value lines; start a new run.")
-    return data
-
-
 def resumed(saved: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
     """A saved run's data with what a command line names."""
     config = OmegaConf.create(dict(saved))
@@ -198,11 +171,11 @@ def sentence(error: BaseException) -> str:
             f"{_HELP}."
         )
     text = " ".join(str(error).split())
-    group = re.search(r"Could not override '([^'@]+)[^']*'", text)
-    if group:
-        plural = f" (did you mean {group[1]}s=[NAME,NAME]?)"
-        hint = plural if group[1] in ("agent", "traffic") else ""
-        return f"{group[1]}: not an option of this command{hint}; {_HELP}."
+    refused = re.search(r"Could not override '([^'@]+)[^']*'", text)
+    if refused:
+        plural = f" (did you mean {refused[1]}s=[NAME,NAME]?)"
+        hint = plural if refused[1] in ("agent", "traffic") else ""
+        return f"{refused[1]}: not an option of this command{hint}; {_HELP}."
     ambiguous = re.search(r"Ambiguous value for argument '\+*([^']+)'", text)
     if ambiguous:
         return f"{ambiguous[1]}: several values; write [a,b] for a list, or add -m for a sweep."

@@ -34,7 +34,6 @@ from ganlane.config.compose import (
     for_hydra,
     parsed,
     resumed,
-    saved_config,
 )
 from ganlane.config.help import help_text
 from ganlane.errors import USER_ERROR, UserError, numbered_refusals
@@ -52,7 +51,7 @@ from ganlane.settings.commands import (
     ReproduceConfig,
     with_env_keys,
 )
-from ganlane.settings.record import Record, make, merged, plain
+from ganlane.settings.record import Record, make, merged, plain, saved_config
 from ganlane.settings.recordings import PrepareConfig, RealismConfig, TrainGeneratorConfig
 from ganlane.settings.render import RenderConfig
 from ganlane.settings.train import TrainConfig

@@ -18,7 +18,7 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
 from ganlane import keys
-from ganlane.arguments import checked_arguments, seed_number, whole_number
+from ganlane.arguments import seed_number, whole_number
 from ganlane.env.physics import Physics, Recorder, Rules, known_false, outcome, run_decision
 from ganlane.env.state import (
     check_counter,
@@ -84,7 +84,6 @@ class HighwayEnv(EnvBase):
 
     batch_locked = True
 
-    @checked_arguments
     def __init__(
         self,
         traffic: TrafficModule,

@@ -17,9 +17,9 @@ from torch import Tensor
 
 from ganlane import keys
 from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
+from ganlane.runtime import check_compiler
 from ganlane.settings.driving import EgoParameters, IdmParameters, SteeringParameters
 from ganlane.settings.episode import EpisodeParameters
-from ganlane.runtime import check_compiler
 from ganlane.sim.collisions import ego_overlaps
 from ganlane.sim.dynamics import (
     Command,

@@ -8,7 +8,7 @@ import os
 import platform
 import re
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from datetime import datetime, timezone
 from html import escape
@@ -20,7 +20,10 @@ import polars as pl
 import torch
 
 from ganlane._version import __version__
+from ganlane.errors import UserError, as_typed
 from ganlane.files import PACKAGE, atomic_path, write_json
+from ganlane.settings.record import make, saved_config
+from ganlane.settings.traffic import TrafficConfig
 
 
 @dataclass(frozen=True, repr=False)
@@ -80,12 +83,12 @@ def write_results(
 
 
 def names_of_runs(folders: Sequence[Path]) -> list[str]:
-    """What tells runs apart: the options of their command lines in which they differ.
+    """What tells runs apart: the settings in which they differ.
 
-    ``seed=0`` comes last. Two runs of the same options, or one without its command line, are named
-    by the ends of their paths.
+    ``seed=0`` comes last. Two runs of the same settings, or one without its settings, are named by
+    the ends of their paths.
     """
-    runs = [_overrides(folder) for folder in folders]
+    runs = [_settings(folder) for folder in folders]
     keys = sorted(
         {key for options in runs for key in options}, key=lambda key: (key == "seed", key)
     )
@@ -103,15 +106,25 @@ def names_of_runs(folders: Sequence[Path]) -> list[str]:
     return names
 
 
-def _overrides(folder: Path) -> dict[str, str]:
-    """The command line of a run by key, the newest value of each."""
-    file = folder / "overrides.yaml"
-    text = file.read_text(encoding="utf-8") if file.is_file() else ""
-    options = {}
-    for line in re.findall(r"^- (.+)$", text, re.MULTILINE):
-        key, _, value = line.partition("=")
-        options[key.strip("'\" +")] = value.strip("'\"")
-    return options
+def _settings(folder: Path) -> dict[str, str]:
+    """The settings of a run by dotted key; its traffic by its name. Empty where it has none."""
+    try:
+        data = saved_config(folder / "config.yaml")
+        traffic = make(TrafficConfig, data.pop("traffic")).label()
+    except (KeyError, UserError):
+        return {}
+    # Which checkpoint a run went on from does not tell what it is.
+    data.pop("resume", None)
+    return {"traffic": traffic, **{key: as_typed(value) for key, value in _leaves(data)}}
+
+
+def _leaves(data: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Every value of nested mappings with its dotted key."""
+    for name, value in data.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{above}{name}.")
+        else:
+            yield f"{above}{name}", value
 
 
 def runs_below(folder: Path, file: str) -> list[Path]:

@@ -144,6 +144,7 @@ def fit_key(config: Config, split: Split) -> str:
     settings = {"preset": config.preset, "config": asdict(config), **split.names}
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for scene in (*split.fitted, *split.validation, *split.held_out):
+        # What is cut from a scene follows from its positions and lanes.
         for array in (scene.positions, scene.lane):
             digest.update(f"{array.dtype.str}{array.shape}".encode())
             digest.update(np.ascontiguousarray(array).data)

@@ -339,6 +339,7 @@ class FitLoop:
             seconds = time.monotonic() - begun
             self.seconds = earlier + seconds
             late = self.config.max_seconds is not None and seconds > self.config.max_seconds
+            # A run that is out of time is evaluated too, so that its last weights are kept.
             due = self.done % self.config.evaluate_every == 0
             if due or late or self.done == self.config.updates:
                 score = self._evaluate()
@@ -363,6 +364,7 @@ class FitLoop:
         self.waited += 1
         if score < self.best:
             self.best, self.best_update, self.waited = score, self.done, 0
+            # A copy, since the next updates change the networks' own tensors.
             self.best_weights = deepcopy(self.task.state_dict())
         if self.path is not None:
             self._keep(self.path)
@@ -389,8 +391,10 @@ class FitLoop:
     def _resume(self, path: Path) -> None:
         """Continue from a stored state; reading it never executes code."""
         content = path.read_bytes()
-        has_checksum(content, path)
+        whole = has_checksum(content, path)
         try:
+            if not whole:
+                raise ValueError("no checksum")
             state = torch.load(io.BytesIO(content), weights_only=True)
             counters = state["counters"]
         except Exception as error:

@@ -38,7 +38,7 @@ class TensorRows(Rows):
         for transform in transforms:
             self.env.append_transform(transform)
         base = self.env.base_env
-        self.count, self.episode = count, base.episode
+        self.count, self.episode = config.num_envs, base.episode
         parts = list(self.env.transform)
         observed = next(part for part in parts if isinstance(part, ObservationTransform))
         size = self.env.observation_spec[keys.OBSERVATION].shape[-1]

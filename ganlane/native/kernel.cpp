@@ -317,7 +317,7 @@ static inline void drive(const Settings& s, Rows& r) {
         Float theta_near = arctangent(slope_near) - heading;
         Float turn_wheel = s.gain_far * rate_far + s.gain_near * rate_near + s.gain_integral * theta_near * (speed * per_pace);
         Float steering = r.steering[i] + WHEELBASE * per_pace * turn_wheel * PHYSICS_STEP;
-        steering = between(steering, -s.max_angle, s.max_angle);
+        steering = at_rest(between(steering, -s.max_angle, s.max_angle));
         // bicycle: ganlane.sim.dynamics.advance
         Float new_speed = larger(speed + r.following[i] * PHYSICS_STEP, filled(0.0f));
         Float distance = 0.5f * (speed + new_speed) * PHYSICS_STEP;
@@ -327,8 +327,8 @@ static inline void drive(const Settings& s, Rows& r) {
         sincos_of(heading + new_slip + 0.5f * turn, sine, cosine);
         Mask on = r.running;  // rows that have ended stay as they ended
         r.x[i] = choose(on, r.x[i] + distance * cosine, r.x[i]);
-        r.y[i] = choose(on, y + distance * sine, y);
-        r.heading[i] = choose(on, heading + turn, heading);
+        r.y[i] = choose(on, at_rest(y + distance * sine), y);
+        r.heading[i] = choose(on, at_rest(heading + turn), heading);
         r.speed[i] = choose(on, new_speed, speed);
         r.acceleration[i] = choose(on, (new_speed - speed) * (1.0f / PHYSICS_STEP), r.acceleration[i]);
         r.steering[i] = choose(on, steering, r.steering[i]);

@@ -24,6 +24,7 @@ const float PHYSICS_STEP = 0.1f, WHEELBASE = 2.7f;
 const float NOBODY_M = 1e9f;  // stands for the position of nobody
 const float FREE_GAP = 10000.0f, SMALLEST_GAP = 0.1f;
 const float ENTRY = 0.1f, ARRIVED = 0.3f;
+const float REST = 1e-12f;  // at most this is 0: see at_rest
 enum { CENTRE, BODY, SIGNALLED };
 
 // ---- Equations
@@ -52,6 +53,10 @@ INLINE Float slip_of(Float steering) {
     sincos_of(steering, sine, cosine);
     return arctangent(0.5f * (sine / cosine));
 }
+
+// A heading, steering angle or lateral position, and 0 where it is next to nothing: they decay by a factor a step, and
+// would go on as denormal numbers, with which a product takes a hundred times as long (ganlane.sim.dynamics.at_rest).
+INLINE Float at_rest(Float number) { return choose(absolute(number) <= REST, filled(0.0f), number); }
 
 INLINE Float lane_of(const Settings& s, Float y) {
     return between(rounded(y * s.per_lane_width), 0.0f, (float)(s.lanes - 1));

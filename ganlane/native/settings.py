@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping
 from ctypes import c_double, c_float, c_int32, c_int64
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 from ganlane import keys
 from ganlane.settings.driving import (
@@ -82,6 +82,14 @@ NATIVE_FORMS: Final = {
 def fields(kind: type, names: str) -> list[tuple[str, type]]:
     """Members of a structure of one type."""
     return [(name, kind) for name in names.split()]
+
+
+class RuleDrivers(NamedTuple):
+    """Drivers that the kernel knows; ``mobil=None``: they keep their lanes."""
+
+    idm: IdmParameters
+    steering: SteeringParameters = SteeringParameters()
+    mobil: MobilParameters | None = None
 
 
 class Settings(ctypes.Structure):

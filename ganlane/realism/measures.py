@@ -41,7 +41,7 @@ from ganlane.files import (
     CHECKPOINTS,
     PLACE,
     has_checksum,
-    note_without_checksum,
+    refuse_without_checksum,
     write_json,
 )
 
@@ -444,7 +444,7 @@ class Reference(Measured):
                 f"({error}); give the recordings with data.path=FILE."
             ) from error
         if not whole:
-            note_without_checksum(path)
+            refuse_without_checksum(path)
         return reference
 
 

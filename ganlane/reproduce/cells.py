@@ -22,11 +22,11 @@ from tqdm import tqdm
 
 from ganlane.build import Driver, make_driver, make_drivers, make_traffic
 from ganlane.compare import compare
-from ganlane.settings.commands import ReproduceConfig
-from ganlane.settings.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version
 from ganlane.files import atomic_path
+from ganlane.settings.commands import ReproduceConfig
+from ganlane.settings.traffic import TrafficConfig
 from ganlane.torch_settings import set_threads
 
 #: Name in the metadata of a cell's file.
@@ -155,7 +155,8 @@ def drive_cell(cell: Cell, config: ReproduceConfig) -> None:
     set_threads(config.threads)
     begun = time.monotonic()
     # The same call as in ganlane evaluate, with one driver on one traffic.
-    alone = replace(config, traffics=[cell.traffic], episodes=cell.settings["episodes"])
+    traffics = {cell.traffic: config.traffics[cell.traffic]}
+    alone = replace(config, traffics=traffics, episodes=cell.settings["episodes"])
     driver = make_driver(cell.driver, config.env, device=config.device)
     table = compare([driver], alone, quiet=True)
     origin = {

@@ -9,30 +9,35 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any
 
 import polars as pl
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from torchrl.envs import EnvBase
 
 from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.settings.commands import EvaluateConfig
-from ganlane.settings.env import EnvConfig
-from ganlane.config.schemas import SCHEMAS, made, node_of
-from ganlane.settings.traffic import TRAFFICS, TrafficConfig
 from ganlane.errors import UserError
 from ganlane.evaluation.episodes import SIDES, ScriptedPolicy, run_episodes
-from ganlane.evaluation.results import plain
 from ganlane.evaluation.rows import FAILURES
 from ganlane.files import write_json
-from ganlane.settings.record import NotNegative, Record, Rule, Seed, Text, one_of
+from ganlane.settings.commands import EvaluateConfig
+from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MaskParameters, ObservationConfig, RewardParameters
+from ganlane.settings.record import (
+    NotNegative,
+    Record,
+    Rule,
+    Seed,
+    Text,
+    make,
+    one_of,
+    option_names,
+    plain,
+)
+from ganlane.settings.traffic import MixedTrafficConfig, OwnTraffic, TrafficConfig
 from ganlane.sim.random import Stream
 
 #: Rows of every batch in which a list is made and driven again.
@@ -42,20 +47,8 @@ _ACTIONS = Rule(
     lambda text: re.fullmatch("[012]{1,100000}", text) is not None,
     "a text of the digits 0, 1 and 2",
 )
-#: Keys of a traffic that name code. A list holds none, so traffics that need code of a user's own
-#: are not listed.
-_CODE = {"_target_", "parameters"}
-_LISTED = {name: kind for name, kind in TRAFFICS.items() if name != "mixed"}
 #: Errors raised by reading a broken list.
-_BROKEN = (
-    ValueError,
-    KeyError,
-    TypeError,
-    AttributeError,
-    RecursionError,
-    OmegaConfBaseException,
-    UserError,
-)
+_BROKEN = (ValueError, KeyError, TypeError, AttributeError, RecursionError, UserError)
 
 
 @dataclass(frozen=True)
@@ -71,7 +64,7 @@ class Crash(Record):
     """
 
     driver: Text = "mobil"
-    traffic: Annotated[str, one_of(_LISTED)] = "idm_mobil"
+    traffic: Text = "idm_mobil"
     seed: Seed = 0
     episode: Seed = 0
     end: Annotated[str, one_of(FAILURES)] = "hard_crash"
@@ -82,13 +75,13 @@ class Crash(Record):
 
 
 @dataclass(frozen=True)
-class CrashList:
+class CrashList(Record):
     """Crashes, and what their episodes depend on: environment, traffics, stream of randomness."""
 
     env: EnvConfig
-    traffics: Mapping[str, TrafficConfig]
-    stream: str
-    crashes: Sequence[Crash]
+    traffics: dict[str, TrafficConfig]
+    stream: Annotated[str, one_of(("report", "select"))]
+    crashes: list[Crash]
 
     def make_env(
         self,
@@ -130,10 +123,11 @@ def find_crashes(
         The list, and how many of the episodes ended otherwise: generated traffic rounds differently
         in batches of another size.
     """
+    # A list names no code, so traffics that need a user's own are not in it.
     traffics = {
-        name: option
-        for name, option in config.traffics.items()
-        if name in _LISTED and option._target_ == _LISTED[name]._target_ and not option.parameters
+        name: traffic
+        for name, traffic in config.traffics.items()
+        if name == traffic.label() and not isinstance(traffic, OwnTraffic | MixedTrafficConfig)
     }
     # A list without crashes makes the environment in which they are looked for.
     listed = CrashList(config.env, traffics, config.stream, [])
@@ -172,21 +166,19 @@ def find_crashes(
 
 
 def write_crashes(path: str | Path, listed: CrashList) -> None:
-    """Write a list as JSON, atomically."""
-    # A list names the option of its environment, so that reading knows the type of its values.
-    option = next(name for name, kind in SCHEMAS["env"].items() if kind is type(listed.env))
+    """Write a list as JSON, atomically; a traffic is named, and its import path left out."""
     traffics = {}
     for name in sorted({crash.traffic for crash in listed.crashes}):
-        keys = asdict(listed.traffics[name])
-        traffics[name] = {key: value for key, value in keys.items() if key not in _CODE}
+        traffics[name] = plain(listed.traffics[name])
+        del traffics[name]["_target_"]
     content = {
         "kind": _KIND,
         "stream": listed.stream,
-        "env": {"option": option, **asdict(listed.env)},
+        "env": plain(listed.env),
         "traffics": traffics,
-        "crashes": listed.crashes,
+        "crashes": plain(listed.crashes),
     }
-    write_json(path, plain(content))
+    write_json(path, content)
 
 
 def read_crashes(path: str | Path) -> CrashList:
@@ -214,22 +206,13 @@ def _checked(content: Any) -> CrashList:
     """The list of a file's content; one of :data:`_BROKEN` for what is not such a list."""
     if content["kind"] != _KIND:
         raise ValueError("another kind of file")
-    if content["stream"] not in ("report", "select"):
-        raise ValueError(f"stream {content['stream']!r}")
-    env, traffics = dict(content["env"]), dict(content["traffics"])
-    # OmegaConf would replace ${...}.
-    if "${" in json.dumps(content) or any(_CODE & options.keys() for options in traffics.values()):
-        raise ValueError("it names what is not plain data")
-    crashes = [_typed(Crash, crash) for crash in content["crashes"]]
-    used = {crash.traffic for crash in crashes}
-    return CrashList(
-        _typed(SCHEMAS["env"][env.pop("option")], env),
-        {name: _typed(_LISTED[name], traffics[name]) for name in used},
-        content["stream"],
-        crashes,
-    )
-
-
-def _typed(kind: Any, values: Any) -> Any:
-    """A dataclass of plain values, types and ranges checked."""
-    return made(OmegaConf.merge(node_of(kind), values))
+    crashes = content["crashes"]
+    traffics = {}
+    for name in {crash["traffic"] for crash in crashes}:
+        options = content["traffics"][name]
+        # Only this package's traffics: an import path in a file would be code to execute.
+        if name not in option_names("traffic") or {"_target_", "name"} & set(options):
+            raise ValueError(f"traffic {name!r:.80} is none of this package's")
+        traffics[name] = make(TrafficConfig, {"name": name, **options}, "traffics")
+    listed = {"stream": content["stream"], "env": content["env"], "crashes": crashes}
+    return make(CrashList, {**listed, "traffics": traffics})

@@ -19,8 +19,6 @@ from matplotlib.ticker import EngFormatter, NullLocator
 
 from ganlane.agents.checkpoint import with_seeds
 from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.settings.commands import ReproduceConfig
-from ganlane.settings.traffic import TrafficConfig
 from ganlane.data import FRAME_S, default_scenes, read_scenes
 from ganlane.errors import UserError
 from ganlane.generator import load_generator, shipped_generator
@@ -34,6 +32,8 @@ from ganlane.generator.windows import (
     scene_tracks,
 )
 from ganlane.reproduce.report import Row, rows_of
+from ganlane.settings.commands import ReproduceConfig
+from ganlane.settings.traffic import TrafficConfig
 from ganlane.sim.random import Stream
 from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, panel_grid, read_metrics
 from ganlane.view.record import EpisodeLabel, Trajectory, record_episode

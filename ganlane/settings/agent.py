@@ -116,11 +116,3 @@ class RainbowConfig(Record):
         if self.learning_rate_end is not None and self.learning_rate_decisions == 0:
             return replace(self, learning_rate_decisions=decisions)
         return self
-
-
-class RemovedOption(Exception):
-    pass  # TEMP
-
-
-def without_removed(options, where):
-    return dict(options)  # TEMP

@@ -164,7 +164,7 @@ class FileScene(SceneConfig):
 
     def read(self, env: EnvConfig) -> FixedScene:
         """The file's vehicles and road; the numbers of ``env`` replace the road's unless 0."""
-        from ganlane.sim.scenarios import read_scene, with_ego_speed
+        from ganlane.sim.scene_files import read_scene, with_ego_speed
 
         if self.path is None:
             raise ParameterError(
@@ -298,14 +298,15 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
         from ganlane.sim.scenes import FixedScene
         from ganlane.sim.state import Road
 
-        signalled = others_visibility is None
+        if others_visibility is None:
+            others_visibility = Visibility.SIGNALLED
         return FixedScene(
             self.scene.vehicles(self),
             Road(self.lanes, self.lane_width_m),
             jitter_m=self.scene.jitter_m,
             jitter_mps=self.scene.jitter_mps,
             ego_visibility=Visibility.named(self.ego.visibility),
-            others_visibility=Visibility.SIGNALLED if signalled else others_visibility,
+            others_visibility=others_visibility,
             name=self.scene.label(),
         )
 

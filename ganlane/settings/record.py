@@ -39,7 +39,7 @@ from typing import (
 
 import yaml
 
-from ganlane.errors import ParameterError, as_typed, did_you_mean
+from ganlane.errors import ParameterError, UserError, as_typed, did_you_mean
 from ganlane.files import conf_folder
 
 Part = TypeVar("Part")
@@ -173,7 +173,7 @@ class Record:
     chosen_by: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
-        hints = _hints(type(self))
+        hints = _hints(type(self))  # type: ignore[arg-type]
         for field in fields(self):  # type: ignore[arg-type]
             value = _fitted(hints[field.name], getattr(self, field.name), field.name, field)
             assign(self, **{field.name: value})
@@ -339,10 +339,40 @@ def _scalar(kind: Any, value: Any, key: str, field: Field[Any]) -> Any:
 
 
 def _refusal(key: str, value: Any, expected: str, field: Field[Any]) -> ParameterError:
-    has_value = field.default_factory is MISSING
-    default = field.default if has_value else field.default_factory()
+    default = field.default
+    if field.default_factory is not MISSING:
+        default = field.default_factory()
     example = ""
     if default not in (MISSING, None, "") and not isinstance(default, dict | Record):
         example = f"; give for instance {{{field.name}}}={as_typed(default)}"
     text = " ".join(as_typed(value).split())
     return ParameterError(f"{{{key}}}={text:.80}: expected {expected}{example}.")
+
+
+# --- saved settings
+
+#: A saved configuration is a few kB; a larger file is none.
+LARGEST_CONFIG_BYTES = 2**20
+
+
+def saved_config(path: Path) -> dict[str, Any]:
+    """Plain data of a run's ``config.yaml``.
+
+    Raises:
+        UserError: the file is missing or damaged.
+    """
+    try:
+        if path.stat().st_size > LARGEST_CONFIG_BYTES:
+            raise ValueError("too large")
+        text = path.read_text(encoding="utf-8")
+        # Aliases can make a short file endless; a saved configuration has none.
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
+            raise ValueError("aliases")
+        data = yaml.safe_load(text)
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        raise UserError(
+            f"{path}: missing or damaged, so the run cannot be resumed; start a new run."
+        ) from error
+    if not isinstance(data, dict):
+        raise UserError(f"{path}: damaged, expected key: value lines; start a new run.")
+    return data

@@ -12,7 +12,7 @@ from typing import Annotated
 from ganlane.errors import UserError
 from ganlane.settings.commands import RunConfig
 from ganlane.settings.env import EnvConfig
-from ganlane.settings.generator import DataConfig, FitConfig
+from ganlane.settings.generator import DataConfig, FitConfig, PaperConfig
 from ganlane.settings.record import CountOrZero, NotNegative, assign, at_least, between, one_of
 from ganlane.settings.traffic import IdmMobilTrafficConfig, TrafficConfig, traffics_of
 
@@ -70,7 +70,7 @@ class TrainGeneratorConfig(RunConfig):
     """
 
     data: DataConfig = field(default_factory=DataConfig)
-    generator: FitConfig = field(default_factory=FitConfig)
+    generator: FitConfig = field(default_factory=PaperConfig)
     folds: CountOrZero = 0
     ablations: bool = False
     resume: str | None = None
@@ -97,7 +97,7 @@ class RealismConfig(RunConfig):
     """A traffic, what it is compared with, the recordings, and how much is driven.
 
     Attributes:
-        against: further traffics from the same starts, as traffics of ganlane evaluate; [] for none.
+        against: further traffics from the same starts, as traffics of ganlane evaluate; []: none.
         scenes: starts: held_out (data.held_out) or all, those that the generator was fitted to too.
         repeats: times that every scene is driven, with other random numbers.
         desired_above_mps: mean excess of desired speeds over the speed at entry, m/s; null: fitted

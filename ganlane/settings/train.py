@@ -8,7 +8,7 @@ from typing import Annotated
 from ganlane.errors import ParameterError
 from ganlane.settings.agent import RainbowConfig
 from ganlane.settings.commands import DrivingConfig, Environments, Episodes, EvaluateConfig, Names
-from ganlane.settings.record import Count, CountOrZero, NotNegative, Record, Text, between, one_of
+from ganlane.settings.record import Count, CountOrZero, NotNegative, Record, Text, one_of
 from ganlane.settings.traffic import IdmMobilTrafficConfig, TrafficConfig
 
 #: Number of decisions above which compiling (one to two minutes) pays off.
@@ -49,55 +49,13 @@ class CollectorConfig(Record):
     """``collector=single``: one process steps all environments side by side.
 
     Attributes:
-        kind: chosen with the option.
         num_envs: environments of the process, 1 to 65536; a step of the loop has a decision of
             each.
     """
 
     group = "collector"
-    chosen_by = "kind"
 
-    kind: str = "single"
     num_envs: Environments = 512
-
-    @property
-    def environments(self) -> int:
-        """Decisions per step of the loop, over all processes."""
-        return self.num_envs
-
-    @classmethod
-    def kinds(cls) -> dict[str, type[Record]]:
-        """This class, and the one for a cluster."""
-        return {"single": CollectorConfig, "ray": RayCollectorConfig}
-
-
-@dataclass(frozen=True)
-class RayCollectorConfig(CollectorConfig):
-    """``collector=ray``: worker processes on this machine or on a Ray cluster.
-
-    Attributes:
-        num_envs: environments of each worker; a step of the loop has workers * num_envs decisions.
-        workers: processes, with one thread each.
-        weights_every: decisions, over all workers, between two updates of the workers' weights.
-        address: of the cluster's head: HOST:6379, ray://HOST:10001 or auto; null: a Ray of its own
-            here.
-    """
-
-    kind: str = "ray"
-    num_envs: Environments = 64
-    workers: Annotated[int, between(1, 1024)] = 2
-    weights_every: Count = 1024
-    address: Text | None = None
-
-    @property
-    def environments(self) -> int:
-        """Decisions per step of the loop, over all workers."""
-        return self.workers * self.num_envs
-
-    @property
-    def steps(self) -> int:
-        """Steps of a worker with the same weights, at least one."""
-        return max(1, self.weights_every // self.environments)
 
 
 @dataclass(frozen=True)
@@ -221,11 +179,3 @@ class TrainConfig(DrivingConfig):
             episodes=self.evaluation.episodes,
             num_envs=self.evaluation.num_envs,
         )
-
-
-class MultiCollectorConfig(CollectorConfig):
-    pass  # TEMP
-
-
-class OverlapCollectorConfig(CollectorConfig):
-    pass  # TEMP

@@ -27,6 +27,8 @@ from ganlane.sim.state import Road, Vehicles, spanned
 
 #: Distance between the axles, m.
 WHEELBASE_M = 2.7
+#: A heading, a steering angle (rad) and a lateral position (m) of at most this are 0.
+REST = 1e-12
 STEERING = SteeringParameters()
 
 
@@ -43,6 +45,18 @@ class Pose(NamedTuple):
 def slip_angle(steering: Tensor) -> Tensor:
     """Angle from heading to motion at the centre, ``atan(l_r / (l_f + l_r) tan(delta))``, rad."""
     return torch.atan(0.5 * torch.tan(steering))
+
+
+def at_rest(number: Tensor) -> Tensor:
+    """``number``, and 0 where it is at most :data:`REST`.
+
+    A driver that keeps its lane comes closer to its centre by a constant factor in every step, so
+    after a minute its numbers were denormal, with which many processors are slow: by processor the
+    kernel took 1.2 to 4.9 times as long. They are snapped to 0 here, in the model, and not flushed
+    by a mode of the processor: kernel, tensor code on any device and scalar twin stay the same, and
+    the caller's threads keep their mode.
+    """
+    return torch.nn.functional.hardshrink(number, REST)
 
 
 def advance(
@@ -68,8 +82,8 @@ def advance(
     direction = heading + slip + 0.5 * turn
     return Pose(
         x + distance * torch.cos(direction),
-        y + distance * torch.sin(direction),
-        heading + turn,
+        at_rest(y + distance * torch.sin(direction)),
+        at_rest(heading + turn),
         new_speed,
         (new_speed - speed) / dt,
     )
@@ -105,7 +119,7 @@ def steer(
     theta_near = torch.atan(offset / near) - heading
     turn = p.gain_far * angle_rate(far) + p.gain_near * angle_rate(near)
     turn = turn + p.gain_integral * theta_near * (speed / pace)
-    return (steering + gain * turn * dt).clamp(-p.max_angle_rad, p.max_angle_rad)
+    return at_rest((steering + gain * turn * dt).clamp(-p.max_angle_rad, p.max_angle_rad))
 
 
 # The ego: vehicle 0 of every environment

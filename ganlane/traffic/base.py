@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
+from ganlane.native.settings import RuleDrivers
 from ganlane.settings.driving import Visibility
 from ganlane.sim.random import Stream, absorb, episode_key, uniform
 from ganlane.sim.scenes import Scenes
@@ -133,6 +134,10 @@ class TrafficModule(TensorDictModuleBase):
         self, vehicles: int, ego_visibility: int, ego_desired_speed_mps: float
     ) -> Scenes | None:
         """The initial scenes of this traffic; None: those of the environment."""
+        return None
+
+    def native_parameters(self) -> RuleDrivers | None:
+        """What the native kernel needs to drive as this model does; None: it cannot."""
         return None
 
     def compile_graphs(self) -> None:

@@ -31,6 +31,7 @@ _SHORTEST_M = 1e-3
 #: No lane to turn back to.
 _NO_LANE = -1
 Faults = TypeVar("Faults")
+Timed = TypeVar("Timed", bound=BrakingFaults | ReactionFaults)
 
 
 def other_drivers(vehicles: Vehicles) -> Tensor:
@@ -87,7 +88,7 @@ class Fault(Overlay, Generic[Faults]):
         return uniforms(vehicles, key, step, self.purpose)[0]
 
 
-class TimedFault(Fault[Faults]):
+class TimedFault(Fault[Timed]):
     """A fault that lasts. Memory: ``left``, its remaining steps."""
 
     def steps_left(self, left: Tensor, vehicles: Vehicles, key: Tensor, step: Tensor) -> Tensor:

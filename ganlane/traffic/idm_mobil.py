@@ -10,8 +10,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
-from ganlane.settings.record import Range
+from ganlane.native.settings import RuleDrivers
 from ganlane.settings.driving import IdmParameters, MobilParameters, RandomDrivers
+from ganlane.settings.record import Range
 from ganlane.sim.dynamics import STEERING, SteeringParameters, advance, steer
 from ganlane.sim.idm import TABLE_V, DriverIdm, following_acceleration, needed_deceleration
 from ganlane.sim.mobil import TABLE_IV, DriverMobil, mobil_changes
@@ -56,6 +57,10 @@ class IdmTraffic(TrafficModule):
         """Accelerate, steer, advance."""
         return self.keep_lanes(vehicles, memory)
 
+    def native_parameters(self) -> RuleDrivers | None:
+        """The kernel's drivers; None for a subclass, which may drive otherwise."""
+        return RuleDrivers(self.idm, self.steering) if type(self) is IdmTraffic else None
+
     def keep_lanes(self, vehicles: Vehicles, memory: Memory) -> Moved:
         """A step without decisions."""
         return self.drive(perceive(vehicles, self.road), vehicles.target_lane, memory)
@@ -98,6 +103,12 @@ class IdmMobilTraffic(IdmTraffic):
         if due.device.type == "cpu" and not bool(due.any()):
             return self.keep_lanes(vehicles, memory)
         return self.decide(vehicles, memory, due)
+
+    def native_parameters(self) -> RuleDrivers | None:
+        """As of :class:`IdmTraffic`, with lane changes."""
+        if type(self) is not IdmMobilTraffic:
+            return None
+        return RuleDrivers(self.idm, self.steering, self.mobil)
 
     def decide(self, vehicles: Vehicles, memory: Memory, due: Tensor) -> Moved:
         """A step in which the drivers of the rows ``due`` [N] decide."""

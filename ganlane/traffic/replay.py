@@ -25,7 +25,8 @@ from ganlane.data import (
 )
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, VEHICLE_FLOATS
-from ganlane.settings.driving import IdmParameters, ReplayParameters, Visibility
+from ganlane.settings.driving import IdmParameters, Visibility
+from ganlane.settings.traffic import ReplayTrafficConfig
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import Memory, Moved, TrafficModule
@@ -134,7 +135,7 @@ class ReplayTraffic(TrafficModule):
 
     Args:
         stream: as for every traffic module.
-        path, least_s: see :class:`~ganlane.settings.driving.ReplayParameters`.
+        path, least_s: see :class:`~ganlane.settings.traffic.ReplayTrafficConfig`.
         recordings: in place of a file, tracks in the schema of :mod:`ganlane.data`, sorted by
             scene, vehicle and frame.
 
@@ -164,7 +165,7 @@ class ReplayTraffic(TrafficModule):
         self,
         stream: int = Stream.TRAIN,
         path: str | Path | None = None,
-        least_s: float = ReplayParameters.least_s,
+        least_s: float = ReplayTrafficConfig.least_s,
         recordings: pl.DataFrame | None = None,
     ) -> None:
         self.source = "recordings" if recordings is not None else str(path or _default_path())

@@ -9,7 +9,6 @@ from torchrl.envs import EnvBase
 
 from ganlane import keys
 from ganlane.agents import Rainbow
-from ganlane.env.highway import threads_for
 
 
 class Collector:
@@ -22,8 +21,7 @@ class Collector:
     def __init__(self, env: EnvBase) -> None:
         self.env = env
         self.environments = env.batch_size.numel()
-        with threads_for(env):
-            self.env_state: TensorDictBase = env.reset()
+        self.env_state: TensorDictBase = env.reset()
 
     def step(self, agent: Rainbow) -> TensorDictBase:
         """One decision of every environment, batch [N].
@@ -33,8 +31,7 @@ class Collector:
         """
         # the policy writes its action into the state itself
         decided = agent.policy(self.env_state)
-        with threads_for(self.env):
-            step, self.env_state = self.env.step_and_maybe_reset(decided)
+        step, self.env_state = self.env.step_and_maybe_reset(decided)
         return step
 
     def state_dict(self, exact: bool) -> dict[str, Any]:
@@ -52,6 +49,7 @@ class Collector:
         if exact:
             self.env_state = saved
         elif keys.EPISODE in saved:
+            # rows count on in steps of their number, so no episode is driven twice
             following = saved.get(keys.EPISODE) + self.environments
             self.env_state = self.env.reset(saved.set(keys.EPISODE, following))
         else:  # an environment without numbered episodes
@@ -60,6 +58,7 @@ class Collector:
 
 def pack(tensordict: TensorDictBase) -> dict[str, Any]:
     """A TensorDict as plain data, with its (nested) batch sizes."""
+    # plain dictionaries, which torch.load reads without executing anything
     leaves = {
         key: pack(value) if isinstance(value, TensorDictBase) else value
         for key, value in tensordict.items()

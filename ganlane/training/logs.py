@@ -13,9 +13,9 @@ from typing import Any, Protocol, TextIO
 
 from tqdm import tqdm
 
-from ganlane.settings.train import LoggerConfig
 from ganlane.errors import UserError
 from ganlane.files import atomic_path
+from ganlane.settings.train import LoggerConfig
 
 #: Columns of ``metrics.csv``; the share of each action follows.
 COLUMNS = (

@@ -40,12 +40,12 @@ from ganlane.build import (
     make_traffic,
     observation_of,
 )
-from ganlane.settings.traffic import TrafficConfig
-from ganlane.settings.train import TrainConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version, run_episodes
 from ganlane.evaluation.results import plain
 from ganlane.settings.observation import ObservationConfig
+from ganlane.settings.traffic import TrafficConfig
+from ganlane.settings.train import TrainConfig
 from ganlane.sim.random import Stream
 from ganlane.training.checkpoint import LAST, flat, load_checkpoint
 from ganlane.training.logs import make_logs
@@ -85,6 +85,7 @@ def phases_of(config: TrainConfig, folder: Path) -> list[Phase]:
         config.init.path,
     )
     before = config.pretrain
+    # one phase unless another is asked for
     if before.total_decisions == 0 or before.traffic is None:
         return [main]
     # the second phase starts from the agent that the first one leaves
@@ -154,6 +155,7 @@ def run_phase(
         resume=resume,
         identity=identity(config, phase),
     )
+    # a phase that was stopped is not over
     if result.stopped_by is None:
         save_final_agent(
             agent,
@@ -241,6 +243,7 @@ def read_start(name: str, key: str = "init.path") -> Start:
     if path.suffix != ".pt" and (not path.is_dir() or name in SHIPPED):
         weights, network, metadata = read_agent(name)
         return Start(name, weights, network, observation_of(metadata))
+    # a folder stands for its last checkpoint
     path = path / LAST if path.is_dir() else path
     if not path.is_file():
         raise UserError(
@@ -317,6 +320,7 @@ def make_initial_agent(
     if phase.init is None or (resumed and not adopts):
         return config, make_agent(config, phase)
     start = read_start(str(resume), "resume") if resumed else read_start(phase.init)
+    # a resumed run has been checked when it was started
     if not resumed:
         check_observation(start, config.observation)
     if adopts:
@@ -327,6 +331,7 @@ def make_initial_agent(
     if resumed:
         return config, agent
     # a second phase starts from the best agent of the first, whose moments are not saved
+    # only the agent of init.path brings its moments
     with_moments = config.init.optimizer and phase.init == config.init.path
     if with_moments and not start.moments:
         raise UserError(
@@ -341,6 +346,7 @@ def make_initial_agent(
 
 def check_observation(start: Start, observation: ObservationConfig) -> None:
     """Raise :class:`UserError` if the agent was trained on another observation."""
+    # what the trained agent reads of this observation, key by key
     configured = asdict(observation)
     for key, value in asdict(observation.read_by(start.observation)).items():
         if value != configured[key]:
@@ -366,6 +372,7 @@ def save_final_agent(
     training = dict(metadata["training"])
     best = folder / "checkpoints" / "best.safetensors"
     further = {}
+    # the best agent replaces the last one
     if result.best is not None and best.is_file():
         weights, _, saved = read_agent(best)
         load_parameters(agent.network, weights)

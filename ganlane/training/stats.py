@@ -100,6 +100,7 @@ class EpisodeStats:
 
     def update(self, metrics: Mapping[str, Tensor]) -> None:
         """Add the 0-dim ``metrics`` of one update."""
+        # summed on the device, without waiting for it
         self.update_count += 1
         for name, value in metrics.items():
             self.updates[name] = self.updates.get(name, 0.0) + value

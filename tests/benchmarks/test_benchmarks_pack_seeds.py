@@ -20,8 +20,8 @@ from ganlane.agents import (
 )
 from ganlane.agents.checkpoint import with_seeds
 from ganlane.build import make_drivers
-from ganlane.settings.env import EnvConfig
 from ganlane.errors import UserError
+from ganlane.settings.env import EnvConfig
 from ganlane.transforms import observation_size
 
 VEHICLES = 9

@@ -19,19 +19,19 @@ from torchrl.envs.utils import ExplorationType, exploration_type, step_mdp
 
 from ganlane import keys
 from ganlane.build import make_driver, make_env, make_traffic
+from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
+from ganlane.env import HighwayEnv
+from ganlane.errors import UserError
+from ganlane.evaluation import run_episodes
+from ganlane.evaluation.episodes import SIDES, ScriptedPolicy, contact_side, ego_at_fault
 from ganlane.settings.env import EnvConfig
+from ganlane.settings.observation import ObservationConfig, SensorParameters
 from ganlane.settings.traffic import (
     GanTrafficConfig,
     IdmMobilTrafficConfig,
     IdmTrafficConfig,
     ReplayTrafficConfig,
 )
-from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
-from ganlane.env import HighwayEnv
-from ganlane.errors import UserError
-from ganlane.evaluation import run_episodes
-from ganlane.evaluation.episodes import SIDES, ScriptedPolicy, contact_side, ego_at_fault
-from ganlane.settings.observation import ObservationConfig, SensorParameters
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import polars as pl
 import pytest
+from ganlane.prepare import main as prepare
+from ganlane.train_generator import main
 from reference.file_server import Server
 from reference.recordings import START_MS, ngsim_rows, portal_csv, raw_text, traffic
 
@@ -15,9 +17,7 @@ import ganlane.evaluation
 import ganlane.generator
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.generator.checkpoint import load_generator
-from ganlane.prepare import main as prepare
 from ganlane.realism.starts import check_folds_cover, fold_weights
-from ganlane.train_generator import main
 
 FEW = [
     "generator.loop.updates=2",

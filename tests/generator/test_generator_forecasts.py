@@ -67,12 +67,8 @@ def test_direction_counts_only_who_moves_sideways():
 def test_parts_are_lanes_and_classes_with_enough_windows():
     windows = windows_of(np.zeros((6, 8, 2)), [1, 1, 1, 2, 2, 3], [4, 4, 4, 7, 7, 4])
     parts = forecasts.parts_of(windows, 2)
-    assert {name: int(rows.sum()) for name, rows in parts.items()} == {
-        "lane 1": 3,
-        "lane 2": 2,
-        "car": 4,
-        "truck": 2,
-    }
+    windows_by_part = {name: int(rows.sum()) for name, rows in parts.items()}
+    assert windows_by_part == {"lane 1": 3, "lane 2": 2, "car": 4, "truck": 2}
 
 
 def test_every_part_is_held_against_the_baseline():
@@ -88,11 +84,6 @@ def test_every_part_is_held_against_the_baseline():
         "lane 1": pytest.approx(-90.0),
         "lane 2": pytest.approx(200.0),
         "car": pytest.approx(55.0),
-    }
-    assert {name: row["windows"] for name, row in scores["parts"].items()} == {
-        "lane 1": 2,
-        "lane 2": 2,
-        "car": 4,
     }
     assert scores["folds"]["0"]["ade_change_percent"]["mean"] == pytest.approx(-90.0)
     assert scores["scenes"].keys() == {"a", "b"}

@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from ganlane.api import make_env
-from ganlane.settings.env import EnvConfig
 from ganlane.native.batch import NativeBatch
 from ganlane.native.library import VARIANTS, best_variant, why_not
 from ganlane.settings.driving import EgoParameters
+from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MaskParameters, ObservationConfig, RewardParameters
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason="no C++ compiler")

@@ -11,7 +11,6 @@ from PIL import Image
 from reference.recordings import following_file
 
 from ganlane.commands import realism as command
-from ganlane.settings.recordings import RealismConfig
 from ganlane.data import (
     SyntheticTraffic,
     synthetic_scenes,
@@ -25,6 +24,7 @@ from ganlane.realism.measures import (
     Reference,
 )
 from ganlane.realism.sheets import card_text
+from ganlane.settings.recordings import RealismConfig
 from ganlane.weights import load_weights, save_weights
 
 QUICK = [

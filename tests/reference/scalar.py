@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 DT = 0.1
+REST = 1e-12  # a heading, steering angle or lateral position of at most this is 0
 WHEELBASE = 2.7
 NOBODY = 10_000.0  # Table V: the gap of an empty lane
 CENTRE, BODY, SIGNALLED = 0, 1, 2
@@ -217,6 +218,10 @@ def mobil_changes(view: View) -> dict[int, int]:
 # Motion
 
 
+def at_rest(number: float) -> float:
+    return 0.0 if abs(number) <= REST else number
+
+
 def steered(car: Car, centre: float) -> float:
     """Two points on the lane centre, 1 s and 4 s ahead; gains 1.5, 3 and 3.375 times L/v'."""
     pace = max(car.speed, 3.0)
@@ -233,7 +238,7 @@ def steered(car: Car, centre: float) -> float:
     near_angle = math.atan2(offset, near) - car.heading
     # Below 3 m/s the integral term is per distance: it fades with the speed.
     rate = 1.5 * angle_rate(far) + 3.0 * angle_rate(near) + 3.375 * near_angle * car.speed / pace
-    return min(0.5, max(-0.5, car.steering + WHEELBASE / pace * rate * DT))
+    return at_rest(min(0.5, max(-0.5, car.steering + WHEELBASE / pace * rate * DT)))
 
 
 def driven(car: Car, acceleration: float, steering: float) -> Car:
@@ -246,8 +251,8 @@ def driven(car: Car, acceleration: float, steering: float) -> Car:
     return replace(
         car,
         x=car.x + distance * math.cos(course),
-        y=car.y + distance * math.sin(course),
-        heading=car.heading + turn,
+        y=at_rest(car.y + distance * math.sin(course)),
+        heading=at_rest(car.heading + turn),
         speed=speed,
         acceleration=(speed - car.speed) / DT,
         steering=steering,

@@ -9,12 +9,10 @@ from pathlib import Path
 
 import polars as pl
 import pytest
+from ganlane.render import main
 
-from ganlane.settings.commands import EvaluateConfig
-from ganlane.settings.env import EnvConfig
 from ganlane.errors import UserError
 from ganlane.evaluation.rows import FAILURES
-from ganlane.render import main
 from ganlane.reproduce.crashes import (
     Crash,
     CrashList,
@@ -22,6 +20,8 @@ from ganlane.reproduce.crashes import (
     read_crashes,
     write_crashes,
 )
+from ganlane.settings.commands import EvaluateConfig
+from ganlane.settings.env import EnvConfig
 
 SHIPPED = Path(__file__).parents[2] / "docs" / "reproduce" / "crashes.json"
 

@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference.worlds import DOUBLE, packed
 
-from ganlane.settings.env import CutInEnvConfig, EnvConfig
 from ganlane.errors import UserError
 from ganlane.settings.driving import Visibility
+from ganlane.settings.env import CutInEnvConfig, EnvConfig
 from ganlane.settings.episode import SpawnParameters
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.idm import TABLE_V, can_brake

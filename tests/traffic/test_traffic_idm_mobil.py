@@ -13,10 +13,10 @@ from reference.foreign import overlaps_of_the_others
 from reference.worlds import DOUBLE, environment, placed, same_bits, step, vehicles
 
 from ganlane import keys
-from ganlane.settings.traffic import IdmRandomTrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.settings.driving import MobilParameters, RandomDrivers
+from ganlane.settings.traffic import IdmRandomTrafficConfig
 from ganlane.sim import Road, SpawnParameters, Vehicles
 from ganlane.traffic import (
     IdmMobilTraffic,

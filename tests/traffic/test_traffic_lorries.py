@@ -10,15 +10,15 @@ from reference.worlds import vehicles
 from ganlane import keys
 from ganlane.agents.drivers import KeepLaneDriver
 from ganlane.build import make_env, make_traffic
+from ganlane.generator.closed_loop import extra_inputs
+from ganlane.realism.long_runs import LongRunParameters
+from ganlane.realism.starts import spawned_frame
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.traffic import (
     GanCalibratedTrafficConfig,
     IdmMobilTrafficConfig,
     IdmTrafficConfig,
 )
-from ganlane.generator.closed_loop import extra_inputs
-from ganlane.realism.long_runs import LongRunParameters
-from ganlane.realism.starts import spawned_frame
 from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps, perceive
 from ganlane.traffic import IdmTraffic
 

@@ -13,14 +13,6 @@ from scipy.stats import binomtest
 
 from ganlane import keys
 from ganlane.build import make_env, make_traffic
-from ganlane.settings.env import CutInEnvConfig, EnvConfig
-from ganlane.settings.traffic import (
-    IdmMobilTrafficConfig,
-    IdmTrafficConfig,
-    MixedTrafficConfig,
-    ReplayTrafficConfig,
-    all_traffics,
-)
 from ganlane.errors import UserError
 from ganlane.settings.driving import (
     AbortFaults,
@@ -28,6 +20,14 @@ from ganlane.settings.driving import (
     DriverFaults,
     HesitationFaults,
     ReactionFaults,
+)
+from ganlane.settings.env import CutInEnvConfig, EnvConfig
+from ganlane.settings.traffic import (
+    IdmMobilTrafficConfig,
+    IdmTrafficConfig,
+    MixedTrafficConfig,
+    ReplayTrafficConfig,
+    all_traffics,
 )
 from ganlane.sim import Road, Visibility
 from ganlane.traffic import (

@@ -14,8 +14,8 @@ from training.toy import ROAD, SMALL, ToyRoad, gone, same
 from ganlane import keys
 from ganlane.agents import Rainbow, RainbowConfig
 from ganlane.build import make_env, make_traffic
-from ganlane.settings.traffic import IdmTrafficConfig
 from ganlane.settings.observation import ObservationConfig
+from ganlane.settings.traffic import IdmTrafficConfig
 from ganlane.training.checkpoint import (
     TrainingState,
     load_checkpoint,

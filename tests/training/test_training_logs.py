@@ -6,8 +6,8 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from ganlane.settings.train import LoggerConfig
 from ganlane.errors import UserError
+from ganlane.settings.train import LoggerConfig
 from ganlane.training.logs import (
     CsvLog,
     Logs,

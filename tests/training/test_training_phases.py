@@ -14,16 +14,16 @@ from pathlib import Path
 import entry_tiny
 import pytest
 import torch
+from ganlane.config.command_line import check
 
 from ganlane.agents import read_agent, save_agent
 from ganlane.build import make_driver
-from ganlane.config.command_line import check
-from ganlane.settings.env import EnvConfig
-from ganlane.settings.train import InitConfig, NoInitConfig
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
-from ganlane.settings.observation import MaskParameters
 from ganlane.runtime import has_compiler
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.observation import MaskParameters
+from ganlane.settings.train import InitConfig, NoInitConfig
 from ganlane.training.checkpoint import (
     LAST,
     load_checkpoint,

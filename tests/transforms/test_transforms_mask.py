@@ -13,8 +13,8 @@ import ganlane
 from ganlane import keys
 from ganlane.agents.drivers import ExploringPolicy, GreedyPolicy, MaskedPolicy, RandomDriver
 from ganlane.build import make_driver
-from ganlane.settings.env import EnvConfig
 from ganlane.errors import UserError
+from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MaskParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.state import Road

@@ -13,9 +13,9 @@ from reference.worlds import DOUBLE, vehicles
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from ganlane.settings.env import EnvConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
+from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import largest_number
 from ganlane.sim import Road
 from ganlane.traffic import IdmMobilTraffic

@@ -16,11 +16,11 @@ from torchrl.envs.utils import check_env_specs
 import ganlane
 from ganlane import keys
 from ganlane.build import make_env, make_traffic
-from ganlane.settings.env import EnvConfig
-from ganlane.settings.traffic import IdmTrafficConfig
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
+from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import ObservationConfig, SensorParameters
+from ganlane.settings.traffic import IdmTrafficConfig
 from ganlane.sim import Vehicles
 from ganlane.sim.random import Stream, episode_key
 from ganlane.traffic import IdmMobilTraffic

@@ -31,8 +31,8 @@ from ganlane.data import read_recordings, read_scenes, write_prepared, write_sce
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator.checkpoint import CACHE_VARIABLE, cached, load_generator
-from ganlane.settings.generator import NgsimParameters
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
+from ganlane.settings.generator import NgsimParameters
 from ganlane.sim.scenarios import read_scene
 from ganlane.train import main as train
 from ganlane.training.logs import read_rows

@@ -15,12 +15,12 @@ from torchrl.envs import GymEnv
 from view_scenes import straight
 
 from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.settings.env import EnvConfig
-from ganlane.settings.traffic import IdmMobilTrafficConfig
 from ganlane.data import SyntheticTraffic, read_scenes, scene_lane_widths, sort, synthetic_scenes
 from ganlane.data.schema import SCHEMA, TRACK_STRIDE, validate
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.traffic import IdmMobilTrafficConfig
 from ganlane.sim.state import Road
 from ganlane.traffic import ReplayTraffic
 from ganlane.traffic.idm_mobil import IdmMobilTraffic

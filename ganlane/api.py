@@ -144,6 +144,7 @@ def evaluate(
         UserError: an unknown name, a wrong value, or a policy that does not fit.
         OSError: a folder that cannot be written to.
     """
+    # Names are loaded once the settings are checked; agent_idm@all means several.
     drivers: list[str | Driver] = []
     for agent in agents:
         if isinstance(agent, Driver):
@@ -206,6 +207,7 @@ def train(
         raise UserError(
             "resume=True: which run? give its folder, for instance folder='outputs/train/RUN'."
         )
+    # None leaves the command's default, or what the resumed run has.
     named = {"traffic": traffic, "init": init}
     keys |= {name: value for name, value in named.items() if value is not None}
     if num_envs is not None:
@@ -247,6 +249,7 @@ def render(
         UserError: a wrong value.
         OSError: a file that cannot be written.
     """
+    # The command has two keys each, one for one and one for several.
     keys |= {"traffic": traffic, "out": out}
     if isinstance(agent, str | Path):
         keys["driver"] = agent
@@ -288,6 +291,7 @@ def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
         raise UserError(
             f"run({command!r}): no such command{hint}; choose one of {', '.join(names)}."
         )
+    # Going on with a run means its own folder.
     home = new_folder(command) if folder is None else Path(folder)
     if command == "train" and keys.get("resume") is not None:
         is_own = folder is not None and str(keys["resume"]) == str(folder)

@@ -144,6 +144,7 @@ def _one_line(error: BaseException) -> str:
 
 def _dispatch(command: str, words: list[str], task: Task | None) -> None:
     """Do what the words ask for: help, printing the configuration, a sweep or a run."""
+    # Hydra would have a score of flags; these three are all that is needed.
     flags = [word for word in words if word.startswith("-")]
     keys = [word for word in words if word not in flags]
     if {"-h", "--help"} & set(flags):
@@ -177,6 +178,7 @@ def settings(command: str, words: Sequence[str]) -> Any:
 
 def _settings_and_folder(command: str, overrides: list[Override]) -> tuple[Any, Path]:
     """The checked record, and the folder of its run: the resumed one, that given, or a new one."""
+    # A resumed run is its saved settings; the command line changes some of them.
     values = {str(word.key_or_group): word for word in overrides}
     resume = values.pop("resume", None) if command == "train" else None
     rest = [word for word in overrides if word.key_or_group != "resume"]
@@ -226,6 +228,7 @@ def _sweep(command: str, overrides: list[Override], task: Task | None) -> None:
     for words in single_runs(overrides):
         first = first or settings(command, words)
         settings(command, words)
+    # Every combination was checked above, so what fails now is a file or a disk.
     mistakes: list[Exception] = []
     here = os.getpid()
     sweep_folder: list[Path] = []
@@ -245,6 +248,7 @@ def _sweep(command: str, overrides: list[Override], task: Task | None) -> None:
             if os.getpid() != here:
                 raise
 
+    # Hydra's launchers (joblib, submitit, ray) run the jobs; it reads its arguments from sys.argv.
     application = hydra.main(
         version_base=VERSION_BASE, config_path=str(conf_folder()), config_name=command
     )
@@ -323,6 +327,7 @@ def cleared_after_mistakes(folder: Path) -> Iterator[None]:
     A folder with results, trained weights or a checkpoint is never removed, nor one that another
     process uses.
     """
+    # A folder that was there is the user's; only what this run made may go.
     existed = folder.is_dir() and any(folder.iterdir())
     new_parents = [parent for parent in folder.parents if not parent.exists()]
     try:
@@ -441,6 +446,7 @@ def _resumed_folder(asked: str) -> Path | None:
 
 def newest_unfinished(runs: Path) -> Path | None:
     """The run with the newest checkpoint among those without results; None if there is none."""
+    # The newest checkpoint first; a run's folder is the nearest one above with settings.
     checkpoints = sorted(runs.rglob(LAST.name), key=lambda path: -path.stat().st_mtime)
     for checkpoint in checkpoints:
         for folder in checkpoint.parents:
@@ -457,6 +463,7 @@ def _refuse_stored_imports(data: Mapping[str, Any], words: Sequence[str], run: s
     Raises:
         UserError: the file names a class or function of another package, or a Ray cluster.
     """
+    # Naming the code on the command line is the user's word that it may run.
     for key, value in _imports(data, ""):
         if not any(value in word for word in words if "=" in word):
             raise UserError(

@@ -118,13 +118,16 @@ class RealismConfig(RunConfig):
     against: dict[str, TrafficConfig] = field(
         default_factory=lambda: traffics_of(["idm_mobil"], "")
     )
+    # how much is driven from recorded starts
     scenes: Annotated[str, one_of(("held_out", "all"))] = "held_out"
     repeats: Annotated[int, between(1, 1000)] = 4
     desired_above_mps: NotNegative | None = None
+    # long runs without an ego
     long_vehicles: list[Annotated[int, between(1, 1000)]] = field(default_factory=lambda: [9, 30])
     vehicle_km: NotNegative = 3000.0
     long_s: Annotated[float, between(10, 3600)] = 600.0
     long_against: bool = False
+    # what else is measured, and what is written
     i80: bool | None = None
     resamples: Annotated[int, between(100, 100_000)] = 2000
     quick: bool = False

@@ -53,16 +53,19 @@ class FilmConfig(Record):
         max_bytes: gif: size and frame rate are lowered until it fits; html: the rate of samples.
     """
 
+    # which part of the episode, how fast
     fps: Annotated[float, between(1, 120)] = 20.0
     speedup: Positive = 1.0
     start_s: NotNegative = 0.0
     end_s: Positive | None = None
+    # the picture
     width: Annotated[int, between(600, 7680)] = 1280
     height: Annotated[int, between(160, 4320)] = 320
     road_m: Positive = 160.0
     trail_s: NotNegative = 3.0
     speeds: bool = True
     leader_line: bool = False
+    # the file
     scale: Annotated[float, between(0.05, 4)] = 1.0
     max_bytes: Annotated[int, at_least(10_000)] | None = None
 
@@ -109,6 +112,7 @@ class RenderConfig(DrivingConfig):
         curves: how learning curves look.
     """
 
+    # what is shown
     driver: str = "agent_general"
     episode: Seed = 0
     agents: Annotated[list[str], DIFFERENT] | None = None
@@ -116,6 +120,7 @@ class RenderConfig(DrivingConfig):
     run: list[Text] | None = None
     crashes: Text | None = None
     traffics: Names | None = None
+    # how, and where it goes
     format: Annotated[str, one_of(FORMATS)] | None = None
     out: str | None = None
     traffic: TrafficConfig = field(default_factory=IdmMobilTrafficConfig)

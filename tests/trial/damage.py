@@ -17,25 +17,24 @@ import traceback
 import warnings
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
 import torch
+from ganlane.parameters.generator import NgsimParameters
 from matplotlib import pyplot
 from reference.recordings import ngsim_rows, portal_csv, traffic, write_highd
 
 from ganlane.agents import read_agent
-from ganlane.config.run import run_command
 from ganlane.data import read_recordings, read_scenes, write_prepared, write_scene_csv
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator.checkpoint import CACHE_VARIABLE, cached, load_generator
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
-from ganlane.settings.generator import NgsimParameters
 from ganlane.sim.scenarios import read_scene
+from ganlane.train import main as train
 from ganlane.training.logs import read_rows
 from ganlane.view.figures import draw_runs, read_runs
 
@@ -43,8 +42,6 @@ from . import damages
 from .damages import BYTES, TEXT, Damage
 from .kill import TINY
 from .tally import Tally, forked
-
-train = partial(run_command, "train")
 
 #: Seconds and GiB that reading one small file may take.
 AT_MOST_S, MEMORY_GIB = 60.0, 12.0

@@ -72,11 +72,11 @@ def interesting(windows: Windows) -> list[tuple[str, int]]:
     }
     moves = along[:, -1] - along[:, 0] > LEAST_M
     chosen: list[tuple[str, int]] = []
-    seen: set[tuple[int, int]] = set()
+    seen: set[tuple[str, int]] = set()
     for kind, count in PANELS.items():
         wanted = len(chosen) + count
         for row in np.argsort(-scores[kind], kind="stable").tolist():
-            vehicle = int(windows.scene[row]), int(windows.vehicle[row])
+            vehicle = str(windows.scene[row]), int(windows.vehicle[row])
             if len(chosen) < wanted and moves[row] and vehicle not in seen:
                 seen.add(vehicle)
                 chosen.append((kind, row))

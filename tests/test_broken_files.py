@@ -21,8 +21,6 @@ from ganlane.weights import load_weights, save_weights
 AGENT, GENERATOR = "agent_idm", "generator_paper"
 KIND = "ganlane training checkpoint"
 
-pytestmark = pytest.mark.usefixtures("hydra_from_memory")
-
 
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):

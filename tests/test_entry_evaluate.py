@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import polars as pl
 import pytest
-from ganlane.evaluate import main
 from reference.refusals import last_path
+
+from ganlane.config.run import run_command
+
+main = partial(run_command, "evaluate")
 
 SHORT = ["env.goal_m=40", "episodes=4"]
 pytestmark = pytest.mark.usefixtures("empty_folder")

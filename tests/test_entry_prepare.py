@@ -6,13 +6,11 @@ And on to a generator that drives.
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import polars as pl
 import pytest
-from ganlane.evaluate import main as evaluate
-from ganlane.prepare import main
-from ganlane.train_generator import main as train_generator
 from PIL import Image
 from reference.file_server import SHA256, Server
 from reference.recordings import (
@@ -24,12 +22,17 @@ from reference.recordings import (
 )
 from reference.refusals import last_path
 
+from ganlane.config.run import run_command
 from ganlane.data import (
     SyntheticTraffic,
     read_scenes,
     synthetic_scenes,
     write_scene_csv,
 )
+
+evaluate = partial(run_command, "evaluate")
+main = partial(run_command, "prepare")
+train_generator = partial(run_command, "train_generator")
 
 
 @pytest.fixture(autouse=True)

@@ -9,13 +9,16 @@ import shutil
 import signal
 import threading
 import time
+from functools import partial
 
 import entry_tiny
 import pytest
 from reference.refusals import last_path
 
 from ganlane.agents import read_agent
-from ganlane.train import main
+from ganlane.config.run import run_command
+
+main = partial(run_command, "train")
 
 TINY = [*entry_tiny.TINY, "evaluation.agents=[mobil,random_legal]"]
 pytestmark = pytest.mark.usefixtures("empty_folder")

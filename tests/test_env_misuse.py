@@ -8,7 +8,6 @@ from __future__ import annotations
 import gymnasium
 import pytest
 import torch
-from ganlane.options import option
 from tensordict import TensorDict
 
 import ganlane
@@ -19,6 +18,8 @@ from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.native.library import why_not
 from ganlane.settings.env import EnvConfig
+from ganlane.settings.record import make
+from ganlane.settings.traffic import TrafficConfig
 from ganlane.traffic import IdmTraffic
 
 KERNELS = [
@@ -151,7 +152,7 @@ def paths(env, actions):
 )
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_autocast_changes_no_traffic(traffic, dtype):
-    model = make_traffic(option("traffic", traffic), EnvConfig())
+    model = make_traffic(make(TrafficConfig, traffic), EnvConfig())
     actions = torch.tensor([[1, 0], [0, 2], [0, 0], [2, 1]])
     plain = paths(HighwayEnv(model, 2, dtype=dtype), actions)
     with torch.autocast("cpu", dtype=torch.bfloat16):
@@ -162,7 +163,7 @@ def test_autocast_changes_no_traffic(traffic, dtype):
 
 def test_generated_traffic_in_float64_is_that_of_float32_up_to_rounding_even_side_by_side():
     model, actions = (
-        make_traffic(option("traffic", "gan_calibrated"), EnvConfig()),
+        make_traffic(make(TrafficConfig, "gan_calibrated"), EnvConfig()),
         torch.zeros(3, 2).long(),
     )
     before = paths(HighwayEnv(model, 2), actions)

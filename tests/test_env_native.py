@@ -8,12 +8,13 @@ import pickle
 import pytest
 import torch
 from reference.worlds import environment, leaves
+from torchrl.envs import Transform
 from torchrl.envs.utils import check_env_specs
 
 import ganlane
 from ganlane import keys
 from ganlane.build import make_env
-from ganlane.env.highway import say_once, threads_for
+from ganlane.env.highway import say_once
 from ganlane.errors import UserError
 from ganlane.native.library import ROWS_PER_THREAD, threads_allowed, why_not
 from ganlane.native.settings import NATIVE_FORMS
@@ -75,16 +76,23 @@ def test_episodes_with_automatic_resets_agree_with_the_tensor_code(mobil, share)
 def test_two_threads_are_the_kernels_alone_and_change_no_bit():
     """Around the kernel torch computes on one thread, and has both again afterwards."""
     driven, seen, before = [], [], torch.get_num_threads()
+
+    class Threads(Transform):
+        """Looks how many threads torch and the kernel have during a step."""
+
+        def _call(self, next_tensordict):
+            seen.append((torch.get_num_threads(), threads_allowed()))
+            return next_tensordict
+
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
             env = ganlane.make_env(traffic="idm_mobil", num_envs=2 * ROWS_PER_THREAD)
+            env.append_transform(Threads())
             state = env.reset()
             for step in range(3):
                 actions = (torch.arange(2 * ROWS_PER_THREAD) + step) % 3
-                with threads_for(env):
-                    stepped, state = env.step_and_maybe_reset(state.set("action", actions))
-                    seen.append((torch.get_num_threads(), threads_allowed()))
+                stepped, state = env.step_and_maybe_reset(state.set("action", actions))
             driven.append(stepped)
             assert torch.get_num_threads() == threads
     finally:
@@ -101,27 +109,6 @@ def test_episodes_that_are_no_whole_numbers_in_a_row_are_refused(wrong):
         UserError, match=r"next_episode is \[.*; give next_episode as int64 of shape \[2\]"
     ):
         env.reset(state, next_episode=wrong)
-
-
-@pytest.mark.parametrize(
-    ("kernel", "rows"),
-    [
-        ("native", 4096),
-        ("torch", 32),
-        pytest.param("torch", 4096, marks=pytest.mark.slow),
-    ],
-)
-def test_who_keeps_its_lane_comes_to_rest_and_not_to_denormal_numbers(kernel, rows):
-    """200 decisions; what decays by a factor a step would be denormal after some 60."""
-    env = native(rows, kernel=kernel, goal_m=1e6, timeout_s=1e5)
-    state, keep = env.reset(), torch.zeros(rows, dtype=torch.int64)
-    for _ in range(200):
-        state = env.step(state.set(keys.ACTION, keep))["next"]
-    smallest = torch.finfo(torch.float32).tiny
-    for name, value in leaves(state):
-        if value.is_floating_point():
-            assert not ((value != 0) & (value.abs() < smallest)).any(), name
-    assert (state[keys.VEHICLES, "heading"] == 0).float().mean() > 0.5
 
 
 class Cruise(TrafficModule):
@@ -159,14 +146,31 @@ def test_auto_takes_the_tensor_code_where_the_kernel_cannot_and_says_once_when_i
     assert said == ["env.kernel=auto: the native kernel"]
 
 
-def test_a_recorder_of_physics_steps_is_refused():
-    env = native()
-    env.recorder = lambda vehicles, running: None
-    with pytest.raises(UserError, match=r"env\.kernel=native shows no physics steps"):
-        env.rand_step(env.reset())
+@pytest.mark.parametrize("kernel", ["native", "torch"])
+@pytest.mark.parametrize("abort", [False, True])
+def test_a_recorder_sees_every_physics_step_and_ends_where_the_decision_does(kernel, abort):
+    """With ends and commands off the road in the middle, and without a bit of difference."""
+    env = native(32, kernel=kernel, abort=abort, goal_m=140.0, timeout_s=9.5, seed=3)
+    plain, steps = native(32, kernel=kernel, abort=abort, goal_m=140.0, timeout_s=9.5, seed=3), []
+    env.recorder = lambda vehicles, running: steps.append((vehicles, running))
+    state = env.reset()
+    for decision in range(12):
+        steps.clear()
+        state["action"] = (state[keys.EPISODE] * 7 + decision * 5) % 11 % 3 * (decision % 3 == 0)
+        stepped, following = env.step_and_maybe_reset(state)
+        after = stepped["next"]
+        assert (plain.step(state.clone())["next"] == after).all()
+        taken = torch.stack([running for _, running in steps]).sum(0)
+        assert torch.equal(taken, after[keys.STEP] - state[keys.STEP])
+        last = steps[-1][0]
+        for name in ("x", "y", "heading", "speed", "acceleration"):
+            drove = taken > 0
+            shown, reached = getattr(last, name)[drove], after[keys.VEHICLES, name][drove]
+            assert torch.equal(shown, reached), name
+        state = following
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))])
 def test_an_environment_can_be_copied_and_sent_to_another_process(copied):
     env = make_env(
         IdmMobilTraffic(Road()),

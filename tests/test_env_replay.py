@@ -18,28 +18,26 @@ from ganlane.agents.drivers import KeepLaneDriver, MobilDriver, RandomLegalDrive
 from ganlane.data import SyntheticTraffic, sort, synthetic_scenes
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.sim.random import episode_key
-from ganlane.traffic import Recordings, ReplayTraffic
+from ganlane.traffic import ReplayTraffic
 from ganlane.transforms import ObservationTransform, RewardTransform
 
 
 @pytest.fixture(scope="module")
-def recordings() -> Recordings:
+def recordings() -> pl.DataFrame:
     """Scenes of 2, 3 and 4 lanes, each a second shorter than the last.
 
     Every third driver leaves at 4.5 s.
     """
     parts = []
     for k in range(3):
-        scene_rows = synthetic_scenes(
-            SyntheticTraffic(scenes=1, lanes=2 + k, seconds=9.0 - k), seed=k
-        )
-        scene_rows = scene_rows.filter((pl.col("vehicle") % 3 > 0) | (pl.col("frame") <= 45))
-        parts.append(scene_rows.with_columns(scene=pl.lit(f"scene-{k}")))
-    return Recordings.of(sort(pl.concat(parts)), "synthetic", 5.0)
+        made = synthetic_scenes(SyntheticTraffic(scenes=1, lanes=2 + k, seconds=9.0 - k), seed=k)
+        made = made.filter((pl.col("vehicle") % 3 > 0) | (pl.col("frame") <= 45))
+        parts.append(made.with_columns(scene=pl.lit(f"scene-{k}")))
+    return sort(pl.concat(parts))
 
 
-def make(recordings: Recordings, rows: int, period_s: float = 1.0, **others) -> HighwayEnv:
-    traffic = ReplayTraffic(recordings=recordings)
+def make(recordings: pl.DataFrame, rows: int, period_s: float = 1.0, **others) -> HighwayEnv:
+    traffic = ReplayTraffic(recordings=recordings, least_s=5.0)
     return HighwayEnv(
         traffic, rows, episode=EpisodeParameters(decision_period_s=period_s), **others
     )
@@ -152,7 +150,7 @@ def test_an_episode_is_the_same_bits_in_every_batch_and_after_automatic_resets(r
 
 
 def test_scenes_given_by_hand_come_before_the_recorded_ones(recordings):
-    traffic = ReplayTraffic(recordings=recordings)
+    traffic = ReplayTraffic(recordings=recordings, least_s=5.0)
     env = HighwayEnv(traffic, 4, scenes=traffic.scenes(3))
     assert env.reset()[keys.VEHICLES, "x"].shape == (4, 3)
     assert np.isfinite(env.rollout(5)[keys.VEHICLES, "x"]).all()

@@ -9,21 +9,16 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 import torch
-from ganlane.config.command_line import check
 
 from ganlane import keys
 from ganlane.build import make_driver, make_env, make_traffic
+from ganlane.config.run import settings
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.settings.env import (
-    BlockedLaneEnvConfig,
-    CutInEnvConfig,
-    DenseEnvConfig,
     EnvConfig,
-    StalledCarEnvConfig,
-    StopAndGoEnvConfig,
-    StopAndGoOptions,
 )
+from ganlane.settings.record import make
 from ganlane.settings.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.scenes import FixedScene, SceneVehicle
@@ -35,10 +30,10 @@ ROWS = 16
 TRAFFICS = {"idm": IdmTrafficConfig(), "idm_mobil": IdmMobilTrafficConfig()}
 TRAFFIC = pytest.mark.parametrize("traffic", list(TRAFFICS))
 SCENARIOS = {
-    "cut_in": CutInEnvConfig(),
-    "stalled_car": StalledCarEnvConfig(),
-    "stop_and_go": StopAndGoEnvConfig(),
-    "blocked_lane": BlockedLaneEnvConfig(),
+    "cut_in": make(EnvConfig, "cut_in"),
+    "stalled_car": make(EnvConfig, "stalled_car"),
+    "stop_and_go": make(EnvConfig, "stop_and_go"),
+    "blocked_lane": make(EnvConfig, "blocked_lane"),
 }
 
 
@@ -169,7 +164,7 @@ def jam_m(vehicles: Vehicles, lane: int = 0) -> torch.Tensor:
 
 def test_the_wave_travels_backwards_while_everybody_drives_forwards():
     """One wave: cars leave it at its head and join at its tail."""
-    config = StopAndGoEnvConfig(scene=StopAndGoOptions(waves=1, per_wave=8))
+    config = make(EnvConfig, {"name": "stop_and_go", "scene": {"waves": 1, "per_wave": 8}})
     seen = drive(config, "keep_lane", "idm", 24)
     speed = (jam_m(seen.at(20.0)) - jam_m(seen.at(8.0))) / 12.0
     assert ((speed < -1.0) & (speed > -8.0)).all()
@@ -191,7 +186,7 @@ def test_the_ego_stops_for_the_wave_and_drives_on_and_the_scene_brakes_gently():
 
 @pytest.mark.slow
 def test_the_mobil_ego_gets_through_dense_traffic_and_faster_than_one_that_keeps_its_lane():
-    config = DenseEnvConfig()
+    config = make(EnvConfig, "dense")
     mobil, keeping = (drive(config, driver, "idm_mobil", 60) for driver in ("mobil", "keep_lane"))
     assert mobil.overlaps == keeping.overlaps == 0
     assert mobil.frames[-1].x[:, 0].mean() > keeping.frames[-1].x[:, 0].mean()
@@ -264,14 +259,14 @@ def test_a_scene_that_does_not_fit_or_is_hopeless_is_refused_when_the_environmen
 )
 def test_a_mistaken_scenario_is_told_in_a_sentence_before_anything_is_made(overrides, what):
     with pytest.raises(UserError) as refused:
-        check("evaluate", overrides)
+        settings("evaluate", overrides)
     assert what in str(refused.value)
 
 
 def test_a_file_gives_vehicles_lanes_and_the_egos_desired_speed(tmp_path):
     path = tmp_path / "mine.csv"
     path.write_text("x_m,lane,speed_mps,desired_speed_mps\n5,1,20,30\n60,2,20,22\n")
-    config = check("evaluate", ["env=scene", f"env.scene.path={path}"]).config.env
+    config = settings("evaluate", ["env=scene", f"env.scene.path={path}"]).env
     assert (config.vehicles, config.lanes, config.lane_width_m, config.ego_desired_speed_mps) == (
         2,
         3,
@@ -280,9 +275,9 @@ def test_a_file_gives_vehicles_lanes_and_the_egos_desired_speed(tmp_path):
     )
     td = make_env(make_traffic(TRAFFICS["idm"], config), config, num_envs=2).reset()
     assert td[keys.VEHICLES, "x"].tolist() == [[0.0, 55.0]] * 2
-    wider = check("evaluate", ["env=scene", f"env.scene.path={path}", "env.lanes=4"]).config.env
+    wider = settings("evaluate", ["env=scene", f"env.scene.path={path}", "env.lanes=4"]).env
     assert wider.lanes == 4
-    slower = check(
+    slower = settings(
         "evaluate", ["env=scene", f"env.scene.path={path}", "env.ego_desired_speed_mps=20"]
-    ).config.env
+    ).env
     assert slower.scenes().rows[0].desired_speed_mps == 20.0

@@ -11,7 +11,6 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from ganlane.options import option
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
 from reference.gym_env import ID, KEEP, LEFT, RIGHT, ROOT, make, make_vec, until_the_end
@@ -24,6 +23,8 @@ from ganlane.gym.base import make_rows
 from ganlane.gym.native_rows import NativeRows
 from ganlane.native.library import why_not
 from ganlane.settings.env import EnvConfig
+from ganlane.settings.record import make as make_record
+from ganlane.settings.traffic import TrafficConfig
 
 
 @pytest.mark.parametrize("name", sorted(ENV_IDS.keys() - {ID}))
@@ -172,7 +173,7 @@ def test_a_row_of_a_batch_drives_as_one_alone_does():
     ],
 )
 def test_option_and_module_give_one_answer_to_who_drives(traffic):
-    config, env = option("traffic", traffic), EnvConfig()
+    config, env = make_record(TrafficConfig, traffic), EnvConfig()
     drivers = make_traffic(config, env).native_parameters()
     assert config.native_parameters(env) == drivers
     assert (drivers is not None) == (traffic in ("idm", "idm_mobil"))

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from ganlane.config.command_line import parse
 from reference.refusals import Bomb, refusal, run_folder
 
 from ganlane.__main__ import dispatch
 from ganlane.agents import load_agent
 from ganlane.arguments import import_target
 from ganlane.build import make_driver
+from ganlane.config.compose import parsed
 from ganlane.config.run import refuse_stored_imports
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
@@ -30,8 +30,6 @@ from ganlane.settings.traffic import IdmTrafficConfig
 from ganlane.settings.train import FinalEvaluationConfig, TrainConfig
 from ganlane.traffic import TrafficModule
 from ganlane.weights import load_weights, save_weights
-
-pytestmark = pytest.mark.usefixtures("hydra_from_memory")
 
 MARKER = "executed"
 #: A module that a folder brings along; importing it is enough.
@@ -230,7 +228,7 @@ def test_hydra_imports_nothing_and_reads_no_other_configuration(arguments, here,
     ],
 )
 def test_what_sweeps_need_of_hydra_can_be_given(override):
-    assert parse([override])[0].input_line == override
+    assert parsed("train", [override])[0].input_line == override
 
 
 # --- what the user names

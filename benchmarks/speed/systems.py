@@ -23,7 +23,6 @@ from ganlane import keys
 from ganlane.agents import Rainbow, RainbowConfig
 from ganlane.agents.drivers import legal_actions
 from ganlane.agents.replay import TRANSITION_KEYS
-from ganlane.env.highway import threads_for
 from ganlane.training import loop
 from ganlane.training.checkpoint import TrainingState
 from ganlane.transforms import observation_size
@@ -103,7 +102,7 @@ def _stepping(env: Any, actions: Tensor) -> Runner:
     def run(decisions: int) -> int:
         nonlocal state, decision
         simulated = torch.zeros((), dtype=torch.int64, device=env.device)
-        with threads_for(env), torch.inference_mode():
+        with torch.inference_mode():
             for _ in range(decisions):
                 decision += 1
                 state.set(keys.ACTION, drawn[decision % len(drawn)])

@@ -27,13 +27,8 @@ from torchrl.modules import DistributionalQValueActor, QValueActor
 from torchrl.objectives import DistributionalDQNLoss, DQNLoss
 
 from ganlane import keys
-from ganlane.agents.network import (
-    QNetwork,
-    Weights,
-    allowed_values,
-    matrix_product,
-    noise_of,
-)
+from ganlane.agents.network import QNetwork, Weights, allowed_values, noise_of
+from ganlane.linear import matrix_product
 from ganlane.settings.agent import RainbowConfig
 from ganlane.torch_settings import compiled
 

@@ -31,6 +31,7 @@ Preset = Literal["paper", "calibrated"]
 #: Inputs of the calibrated preset in addition to the motion: IDM's acceleration, gap, closing
 #: speed, lane offset.
 EXTRA_INPUTS = 4
+_Width = Annotated[int, between(1, 4096)]
 _WASHOUT = Rule(lambda value: value > 0 and not math.isnan(value), "a number above 0, or inf")
 
 
@@ -54,15 +55,15 @@ class GeneratorSizes(Record):
             ablation.
     """
 
-    embedding: int = field(default=64, metadata=NO_KEY)
-    hidden: int = field(default=32, metadata=NO_KEY)
-    pooling: int = field(default=48, metadata=NO_KEY)
-    pooled: int = field(default=32, metadata=NO_KEY)
-    context: int = field(default=64, metadata=NO_KEY)
-    noise: int = field(default=8, metadata=NO_KEY)
+    embedding: _Width = field(default=64, metadata=NO_KEY)
+    hidden: _Width = field(default=32, metadata=NO_KEY)
+    pooling: _Width = field(default=48, metadata=NO_KEY)
+    pooled: _Width = field(default=32, metadata=NO_KEY)
+    context: _Width = field(default=64, metadata=NO_KEY)
+    noise: _Width = field(default=8, metadata=NO_KEY)
     neighbours: Annotated[int, between(0, 100)] = 8
-    extra_inputs: int = field(default=0, metadata=NO_KEY)
-    observed: int = field(default=8, metadata=NO_KEY)
+    extra_inputs: Annotated[int, between(0, 4096)] = field(default=0, metadata=NO_KEY)
+    observed: _Width = field(default=8, metadata=NO_KEY)
     predicted: Annotated[int, between(1, 50)] = 8
     differences: bool = True
 
@@ -127,7 +128,7 @@ class FitConfig(Record):
     group = "generator"
     chosen_by = "preset"
 
-    preset: str
+    preset: str = field(kw_only=True)
     seed: int = field(default=0, kw_only=True, metadata=NO_KEY)
 
 
@@ -149,7 +150,7 @@ class PaperConfig(FitConfig):
         mirror: swap left and right in half of the groups.
     """
 
-    preset: str = "paper"
+    preset: str = field(default="paper", kw_only=True)
     sizes: GeneratorSizes = field(default_factory=GeneratorSizes)
     weights: LossWeights = field(default_factory=LossWeights)
     loop: LoopConfig = field(default_factory=LoopConfig)
@@ -183,7 +184,7 @@ class CalibratedConfig(FitConfig):
         traits: whether every driver has its own headway and desired speed.
     """
 
-    preset: str = "calibrated"
+    preset: str = field(default="calibrated", kw_only=True)
     sizes: GeneratorSizes = field(
         default_factory=lambda: GeneratorSizes(extra_inputs=EXTRA_INPUTS), metadata=NO_KEY
     )

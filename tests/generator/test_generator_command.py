@@ -4,20 +4,23 @@ On recordings as they are published, with folds, resuming and ablations.
 """
 
 import json
+from functools import partial
 from pathlib import Path
 
 import polars as pl
 import pytest
-from ganlane.prepare import main as prepare
-from ganlane.train_generator import main
 from reference.file_server import Server
 from reference.recordings import START_MS, ngsim_rows, portal_csv, raw_text, traffic
 
 import ganlane.evaluation
 import ganlane.generator
+from ganlane.config.run import run_command
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.generator.checkpoint import load_generator
 from ganlane.realism.starts import check_folds_cover, fold_weights
+
+prepare = partial(run_command, "prepare")
+main = partial(run_command, "train_generator")
 
 FEW = [
     "generator.loop.updates=2",
@@ -124,7 +127,6 @@ def test_the_periods_of_an_ngsim_file_are_the_scenes_whether_fetched_or_prepared
         assert fetched[name] == prepared[name]
 
 
-@pytest.mark.usefixtures("hydra_from_memory")
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import polars as pl
@@ -11,13 +12,13 @@ from PIL import Image
 from reference.recordings import following_file
 
 from ganlane.commands import realism as command
+from ganlane.config.run import run_command
 from ganlane.data import (
     SyntheticTraffic,
     synthetic_scenes,
     write_scene_csv,
 )
 from ganlane.generator import shipped_generator
-from ganlane.realism import main
 from ganlane.realism.measures import (
     QUANTITIES,
     SHIPPED_REFERENCE,
@@ -26,6 +27,8 @@ from ganlane.realism.measures import (
 from ganlane.realism.sheets import card_text
 from ganlane.settings.recordings import RealismConfig
 from ganlane.weights import load_weights, save_weights
+
+main = partial(run_command, "realism")
 
 QUICK = [
     "quick=true",
@@ -244,7 +247,6 @@ def test_by_folds_every_scene_is_driven_by_weights_that_never_saw_it(recordings,
         assert said in err
 
 
-@pytest.mark.usefixtures("hydra_from_memory")
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import polars as pl
 import pytest
-from ganlane.render import main
 
+from ganlane.config.run import run_command
 from ganlane.errors import UserError
 from ganlane.evaluation.rows import FAILURES
 from ganlane.reproduce.crashes import (
@@ -22,6 +23,8 @@ from ganlane.reproduce.crashes import (
 )
 from ganlane.settings.commands import EvaluateConfig
 from ganlane.settings.env import EnvConfig
+
+main = partial(run_command, "render")
 
 SHIPPED = Path(__file__).parents[2] / "docs" / "reproduce" / "crashes.json"
 
@@ -140,7 +143,6 @@ def test_one_page_plays_crashes_of_several_traffics(small_list, capsys):
         assert shown["outcome"] == crash.end
 
 
-@pytest.mark.usefixtures("hydra_from_memory")
 @pytest.mark.parametrize(
     ("line", "message"),
     [

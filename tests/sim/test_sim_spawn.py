@@ -16,8 +16,9 @@ from reference.worlds import DOUBLE, packed
 
 from ganlane.errors import UserError
 from ganlane.settings.driving import Visibility
-from ganlane.settings.env import CutInEnvConfig, EnvConfig
+from ganlane.settings.env import EnvConfig
 from ganlane.settings.episode import SpawnParameters
+from ganlane.settings.record import make
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.idm import TABLE_V, can_brake
 from ganlane.sim.random import Purpose, episode_key, uniform
@@ -349,4 +350,4 @@ def test_too_wide_a_lorry_and_lorries_in_a_scene_set_by_hand_are_refused_on_the_
         EnvConfig(truck_share=0.1, truck_width_m=4.0)
     EnvConfig(truck_width_m=4.0)  # without lorries nobody is so wide
     with pytest.raises(UserError, match=r"truck_share=0\.2: has no effect on a scene set by hand"):
-        CutInEnvConfig(truck_share=0.2)
+        make(EnvConfig, {"name": "cut_in", "truck_share": 0.2})

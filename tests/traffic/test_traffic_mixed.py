@@ -21,7 +21,8 @@ from ganlane.settings.driving import (
     HesitationFaults,
     ReactionFaults,
 )
-from ganlane.settings.env import CutInEnvConfig, EnvConfig
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.record import make
 from ganlane.settings.traffic import (
     IdmMobilTrafficConfig,
     IdmTrafficConfig,
@@ -126,7 +127,7 @@ def test_vehicles_are_seen_as_their_episodes_traffic_has_it():
 
 
 def test_scenes_set_by_hand_and_faults_laid_over_a_mixture_see_it_too():
-    scene = CutInEnvConfig()
+    scene = make(EnvConfig, "cut_in")
     traffic = make_traffic(MixedTrafficConfig(shares={"gan": 1, "idm": 1}), scene)
     assert (make_env(traffic, scene, num_envs=4).reset()[keys.VEHICLES, "visibility"] >= 0).all()
     chain = drive(with_faults(mixture(idm=1, gan=1)), 4, 2)[-1]

@@ -14,16 +14,16 @@ from pathlib import Path
 import entry_tiny
 import pytest
 import torch
-from ganlane.config.command_line import check
 
 from ganlane.agents import read_agent, save_agent
 from ganlane.build import make_driver
+from ganlane.config.run import settings
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
 from ganlane.runtime import has_compiler
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MaskParameters
-from ganlane.settings.train import InitConfig, NoInitConfig
+from ganlane.settings.train import InitConfig
 from ganlane.training.checkpoint import (
     LAST,
     load_checkpoint,
@@ -48,7 +48,7 @@ WITHOUT_INIT = [option for option in entry_tiny.TINY if option != "init=none"]
 
 def run(folder, *options, resume=None):
     """A tiny training, the phase of it that ``folder`` gets."""
-    config = check("train", [*TINY, *options]).config
+    config = settings("train", [*TINY, *options])
     run_phase(config, phases_of(config, folder)[0], resume)
     return folder
 
@@ -61,7 +61,7 @@ def start(folder, path, *options, resume=None):
         f"init.path={path}",
         *options,
     ]
-    config = check("train", given).config
+    config = settings("train", given)
     return make_initial_agent(config, phases_of(config, folder)[0], resume)
 
 
@@ -215,7 +215,7 @@ def test_a_second_phase_begins_with_a_fresh_optimiser(trained, tmp_path):
         "traffic@pretrain.traffic=idm_mobil",
         "pretrain.total_decisions=16",
     ]
-    config = check("train", given).config
+    config = settings("train", given)
     first, second = phases_of(config, tmp_path)
     assert make_initial_agent(config, first, None)[1].optimizer.state_dict()["state"]
     run_phase(config, first)
@@ -284,14 +284,10 @@ def test_a_shipped_name_means_the_shipped_agent_beside_a_folder_of_that_name(tmp
     assert read_start("agent_idm").moments is None
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [NoInitConfig, lambda **given: InitConfig(path=None, **given)],
-)
-@pytest.mark.parametrize("given", [{"optimizer": True}, {"support": "trained"}])
-def test_who_starts_afresh_has_nothing_to_take_over(kind, given):
+@pytest.mark.parametrize("options", [{"optimizer": True}, {"support": "trained"}])
+def test_who_starts_afresh_has_nothing_to_take_over(options):
     with pytest.raises(UserError, match=r"of which agent\? give init=idm_ckpt"):
-        kind(**given)
+        InitConfig(path=None, **options)
 
 
 # --- experiments, lengths, learning rates
@@ -310,7 +306,7 @@ EXPERIMENTS = sorted(
 def test_every_experiment_composes_and_fits_the_agent_that_it_starts_from(
     overrides,
 ):
-    config = check("train", overrides).config
+    config = settings("train", overrides)
     if config.init.path is not None:
         check_observation(read_start(config.init.path), config.observation)
 
@@ -318,10 +314,10 @@ def test_every_experiment_composes_and_fits_the_agent_that_it_starts_from(
 def test_a_first_phase_that_is_over_must_be_the_one_asked_for(
     tmp_path,
 ):
-    config = check(
+    config = settings(
         "train",
         ["experiment=paper", "pretrain.total_decisions=5000"],
-    ).config
+    )
     phase = phases_of(config, tmp_path)[0]
     metadata = describe(config, phase)
     metadata["training"] |= {
@@ -350,7 +346,7 @@ def test_a_falling_learning_rate_has_reached_its_end_when_its_phase_is_over(
         "pretrain.total_decisions=5000",
         "total_decisions=90",
     ]
-    config = check("train", told).config
+    config = settings("train", told)
     lengths = [
         make_agent(config, phase).config.learning_rate_decisions
         for phase in phases_of(config, tmp_path)
@@ -411,12 +407,12 @@ def test_a_run_is_not_resumed_behind_another_mask(masked, other):
 SCRIPT = """
 import sys
 from pathlib import Path
-from ganlane.config.command_line import check
+from ganlane.config.run import settings
 from ganlane.training.phases import phases_of, run_phase
 
 if __name__ == "__main__":
     folder, resume, *told = sys.argv[1:]
-    config = check("train", told).config
+    config = settings("train", told)
     run_phase(config, phases_of(config, Path(folder))[0], resume or None)
 """
 #: Decisions that nobody waits for.

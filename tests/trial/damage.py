@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import polars as pl
 import torch
+from ganlane.parameters.generator import NgsimParameters
 from matplotlib import pyplot
 from reference.recordings import ngsim_rows, portal_csv, traffic, write_highd
 
@@ -32,7 +33,6 @@ from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator.checkpoint import CACHE_VARIABLE, cached, load_generator
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
-from ganlane.settings.generator import NgsimParameters
 from ganlane.sim.scenarios import read_scene
 from ganlane.train import main as train
 from ganlane.training.logs import read_rows

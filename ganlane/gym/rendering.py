@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,13 +14,15 @@ from ganlane.gym.rows import Flags
 from ganlane.gym.tensor_rows import TensorRows
 from ganlane.gym.window import FilmWindow
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.options import Option, option
-from ganlane.view import DrawingParameters, EpisodeLabel, FramePainter, Recorder
+from ganlane.settings.record import make
+from ganlane.settings.render import FilmConfig
+from ganlane.settings.traffic import TrafficConfig
+from ganlane.view import EpisodeLabel, FramePainter, Recorder
 from ganlane.view.frames import Picture
 from ganlane.view.record import outcome_of, road_of_row
 
 #: Recorded physics steps that are kept: as many as the trails show.
-_TRAIL_STEPS = round(DrawingParameters().trail_s / PHYSICS_STEP_S) + 1
+_TRAIL_STEPS = round(FilmConfig.trail_s / PHYSICS_STEP_S) + 1
 
 
 def _label(rows: TensorRows, row: int, traffic: str) -> EpisodeLabel:
@@ -39,8 +42,8 @@ class LiveView:
         window: shows every physics step in real time; None: pictures on request.
     """
 
-    def __init__(self, rows: TensorRows, traffic: Option, window: FilmWindow | None = None) -> None:
-        self.rows, self.traffic, self.window = rows, option("traffic", traffic).label(), window
+    def __init__(self, rows: TensorRows, traffic: Any, window: FilmWindow | None = None) -> None:
+        self.rows, self.traffic, self.window = rows, make(TrafficConfig, traffic).label(), window
 
     def start(self) -> None:
         """A new episode has begun."""
@@ -96,8 +99,8 @@ class LiveView:
 class BatchView:
     """Draws the present state of every row, without trails; the header names the ``traffic``."""
 
-    def __init__(self, rows: TensorRows, traffic: Option) -> None:
-        self.rows, self.traffic = rows, option("traffic", traffic).label()
+    def __init__(self, rows: TensorRows, traffic: Any) -> None:
+        self.rows, self.traffic = rows, make(TrafficConfig, traffic).label()
         self._returns, self._actions = np.zeros(rows.count), np.full(rows.count, -1)
 
     def start(self, fresh: Flags) -> None:

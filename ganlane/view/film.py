@@ -53,8 +53,8 @@ class Film:
         end = float(time[-1]) if look.end_s is None else min(look.end_s, float(time[-1]))
         if look.start_s > end:
             raise UserError(
-                f"film from {look.start_s:g} to {end:g} s: the episode lasts {time[-1]:g} s; choose "
-                "a part of it."
+                f"film from {look.start_s:g} to {end:g} s: the episode lasts {time[-1]:g} s; "
+                "choose a part of it."
             )
         last = int(np.searchsorted(time, end + 1e-9, side="right") - 1)
         wanted = np.arange(look.start_s, end + 1e-9, look.speedup / look.fps)

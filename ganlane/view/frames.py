@@ -167,7 +167,7 @@ class FramePainter:
                 fill(light if offset > 0 else light * _MIRROR, canvas.AMBER)
 
         smooth = patch.reduce(_BODY_OVERSAMPLING)
-        picture.paste(smooth, (int(corner[0]), int(corner[1])), smooth)
+        picture.paste(smooth, tuple(corner.tolist()), smooth)
         if self.look.speeds:
             place = (column - 0.09 * forward[0], middle[1] - _SMALL * 0.62)
             ink = canvas.readable_on(colour)
@@ -201,22 +201,21 @@ class FramePainter:
         cut off.
         """
         upper, lower = self.window.edges
-        (left, top), (right, bottom) = trail.min(axis=0).astype(int), trail.max(axis=0).astype(int)
-        left, right = max(0, left - _TRAIL_MARGIN), min(picture.width, right + _TRAIL_MARGIN)
-        top = max(int(upper) - 20, top - _TRAIL_MARGIN)
-        bottom = min(int(lower) + 20, bottom + _TRAIL_MARGIN)
-        if left >= right or top >= bottom:
+        corner = np.maximum(trail.min(0).astype(int) - _TRAIL_MARGIN, (0, int(upper) - 20))
+        far = (picture.width, int(lower) + 20)
+        size = np.minimum(trail.max(0).astype(int) + _TRAIL_MARGIN, far) - corner
+        if size.min() <= 0:
             return
-        size = ((right - left) * _TRAIL_OVERSAMPLING, (bottom - top) * _TRAIL_OVERSAMPLING)
-        mask = Image.new("L", size)
+        width, height = (size * _TRAIL_OVERSAMPLING).tolist()
+        mask = Image.new("L", (width, height))
         draw = ImageDraw.Draw(mask)
-        points = [(x, y) for x, y in ((trail - (left, top)) * _TRAIL_OVERSAMPLING).tolist()]
+        points = [(x, y) for x, y in ((trail - corner) * _TRAIL_OVERSAMPLING).tolist()]
         # A short trail has fewer than three parts, the fainter ones.
         cuts = np.linspace(0, len(points) - 1, 4).astype(int)
         parts = [points[start : end + 1] for start, end in pairwise(cuts) if end > start]
         for part, strength in zip(parts, coverage):
             draw.line(part, fill=strength, width=2 * _TRAIL_OVERSAMPLING)
-        picture.paste((255, 255, 255), (left, top), mask.reduce(_TRAIL_OVERSAMPLING))
+        picture.paste("white", tuple(corner.tolist()), mask.reduce(_TRAIL_OVERSAMPLING))
 
     def _draw_leader_line(self, picture: Image.Image, frame: int) -> None:
         """A line from the ego's front to the rear of the nearest vehicle ahead in its lane.

@@ -9,7 +9,7 @@ Charts are made with matplotlib, in the style of :mod:`ganlane.view.figures`:
 :mod:`ganlane.view.curves` draws learning curves, :mod:`ganlane.view.recordings` statistics.
 """
 
-from ganlane.view.film import Film, write_film
+from ganlane.view.film import write_film
 from ganlane.view.frames import FramePainter
 from ganlane.view.player import player_page, write_player
 from ganlane.view.record import EpisodeLabel, Recorder, Trajectory, record_episode
@@ -17,7 +17,6 @@ from ganlane.view.tracks import to_tracks, write_tracks
 
 __all__ = [
     "EpisodeLabel",
-    "Film",
     "FramePainter",
     "Recorder",
     "Trajectory",

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+import itertools
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from subprocess import PIPE, Popen
@@ -39,40 +40,23 @@ _GIF_SIZES = (
 )
 
 
-class Film:
-    """The frames of a film, each drawn when it is asked for, so that long films need no memory.
+def film_frames(trajectory: Trajectory, look: FilmConfig) -> list[int]:
+    """Frames of the trajectory, in the order in which a film shows them.
 
     Raises:
         UserError: the film begins after the episode's end.
     """
-
-    def __init__(self, trajectory: Trajectory, look: FilmConfig | None = None):
-        self.look = look = look or FilmConfig()
-        self.painter = FramePainter(trajectory, look)
-        time = trajectory.time_s
-        end = float(time[-1]) if look.end_s is None else min(look.end_s, float(time[-1]))
-        if look.start_s > end:
-            raise UserError(
-                f"film from {look.start_s:g} to {end:g} s: the episode lasts {time[-1]:g} s; "
-                "choose a part of it."
-            )
-        last = int(np.searchsorted(time, end + 1e-9, side="right") - 1)
-        wanted = np.arange(look.start_s, end + 1e-9, look.speedup / look.fps)
-        shown = np.searchsorted(time, wanted + 1e-9, side="right") - 1
-        held = [last] * max(1, round(HOLD_S * look.fps))
-        #: Frames of the trajectory, in the order in which they are shown.
-        self.frames: list[int] = shown.clip(0, last).tolist() + held
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, index: int) -> Picture:
-        return self.painter.draw(self.frames[index])
-
-    def spread(self, count: int) -> list[int]:
-        """At most ``count`` places, evenly from the first to the last."""
-        count = min(count, len(self))
-        return np.linspace(0, len(self) - 1, count).round().astype(int).tolist()
+    time = trajectory.time_s
+    end = float(time[-1]) if look.end_s is None else min(look.end_s, float(time[-1]))
+    if look.start_s > end:
+        raise UserError(
+            f"film from {look.start_s:g} to {end:g} s: the episode lasts {time[-1]:g} s; choose a "
+            "part of it."
+        )
+    times = np.arange(look.start_s, end + 1e-9, look.speedup / look.fps)
+    shown = np.searchsorted(time, [*times + 1e-9, end + 1e-9], side="right") - 1
+    *frames, last = shown.tolist()
+    return frames + [last] * max(1, round(HOLD_S * look.fps))
 
 
 def write_film(
@@ -98,25 +82,40 @@ def write_film(
     """
     path = Path(path)
     kind = kind or path.suffix.removeprefix(".").lower()
-    film = Film(trajectory, look)
+    look = look or FilmConfig()
+    painter, frames = FramePainter(trajectory, look), film_frames(trajectory, look)
     if kind == "gif":
-        write_bytes(path, _fitting_gif(film, path))
-    elif kind == "mp4":
-        _write_mp4(film, path)
+        for share, colours, every in _GIF_SIZES:
+            content = _gif(painter, frames, look.scale * share, colours, every)
+            if look.max_bytes is None or len(content) <= look.max_bytes:
+                write_bytes(path, content)
+                return path
+        raise UserError(
+            f"{path}: the smallest GIF has {len(content)} bytes, max_bytes={look.max_bytes} were "
+            "allowed; show a shorter part of the episode or allow more."
+        )
+    if kind == "mp4":
+        _write_mp4(painter, frames, path)
     elif kind == "png":
         with atomic_path(path) as part:
-            _scaled(film_strip(film), film.look.scale).save(part, format="PNG", optimize=True)
+            strip = film_strip([painter.draw(frame) for frame in spread(frames, STRIP_FRAMES)])
+            _scaled(strip, look.scale).save(part, format="PNG", optimize=True)
     else:
         raise UserError(f"format={kind or 'none'}: expected mp4, gif or png; choose one of them.")
     return path
 
 
-def film_strip(film: Film) -> Picture:
-    """Frames spread evenly from the first to the last, one below the other."""
-    pictures = [film[index] for index in film.spread(STRIP_FRAMES)]
-    gap = np.full((4, film.look.width, 3), 255, np.uint8)
+def film_strip(pictures: Sequence[Picture]) -> Picture:
+    """Pictures one below the other, with a white line between them."""
+    gap = np.full((4, pictures[0].shape[1], 3), 255, np.uint8)
     rows = [row for picture in pictures for row in (gap, picture)]
     return np.concatenate(rows[1:])
+
+
+def spread(frames: Sequence[int], count: int) -> list[int]:
+    """At most ``count`` of the frames, evenly from the first to the last."""
+    places = np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int)
+    return [frames[place] for place in places]
 
 
 def _scaled(picture: Picture, scale: float, multiple: int = 1) -> Image.Image:
@@ -130,28 +129,17 @@ def _scaled(picture: Picture, scale: float, multiple: int = 1) -> Image.Image:
     return image.resize((width, height), Image.Resampling.LANCZOS, reducing_gap=2.0)
 
 
-def _fitting_gif(film: Film, path: Path) -> bytes:
-    """The first GIF of :data:`_GIF_SIZES` within ``max_bytes``."""
-    most = film.look.max_bytes
-    for share, colours, every in _GIF_SIZES:
-        content = _gif(film, film.look.scale * share, colours, every)
-        if most is None or len(content) <= most:
-            return content
-    raise UserError(
-        f"{path}: the smallest GIF has {len(content)} bytes, max_bytes={most} were allowed; show a "
-        "shorter part of the episode or allow more."
-    )
-
-
-def _gif(film: Film, scale: float, colours: int, every: int) -> bytes:
+def _gif(
+    painter: FramePainter, frames: Sequence[int], scale: float, colours: int, every: int
+) -> bytes:
     """An endless GIF with one palette for the whole film."""
-    palette = _shared_palette(film, scale, colours)
+    palette = _shared_palette(painter, frames, scale, colours)
     pictures = [
-        _scaled(film[index], scale).quantize(palette=palette, dither=Image.Dither.NONE)
-        for index in range(0, len(film), every)
+        _scaled(painter.draw(frame), scale).quantize(palette=palette, dither=Image.Dither.NONE)
+        for frame in frames[::every]
     ]
     # Whole hundredths of a second that add up to the film's length.
-    ends = np.rint(np.arange(len(pictures) + 1) * 100.0 / (film.look.fps / every)).astype(int)
+    ends = np.rint(np.arange(len(pictures) + 1) * 100.0 / (painter.look.fps / every)).astype(int)
     durations_ms = (np.diff(ends).clip(min=2) * 10).tolist()
     file = io.BytesIO()
     pictures[0].save(
@@ -167,15 +155,16 @@ def _gif(film: Film, scale: float, colours: int, every: int) -> bytes:
     return file.getvalue()
 
 
-def _shared_palette(film: Film, scale: float, colours: int) -> Image.Image:
+def _shared_palette(
+    painter: FramePainter, frames: Sequence[int], scale: float, colours: int
+) -> Image.Image:
     """A palette for all frames, from some of them: the commonest colours, the others covered.
 
     Without the former, large flat areas would change their colour a little; without the latter,
     small bright things would lose theirs.
     """
-    stack = np.concatenate(
-        [np.asarray(_scaled(film[index], scale)) for index in film.spread(_PALETTE_FRAMES)]
-    )
+    chosen = spread(frames, _PALETTE_FRAMES)
+    stack = np.concatenate([np.asarray(_scaled(painter.draw(frame), scale)) for frame in chosen])
     # One number per colour, which sorts much faster than three.
     packed = stack.reshape(-1, 3).astype(np.int64) @ np.array([1 << 16, 1 << 8, 1])
     values, counts = np.unique(packed, return_counts=True)
@@ -189,7 +178,7 @@ def _shared_palette(film: Film, scale: float, colours: int) -> Image.Image:
     return palette
 
 
-def _write_mp4(film: Film, path: Path) -> None:
+def _write_mp4(painter: FramePainter, frames: Sequence[int], path: Path) -> None:
     """H.264 through the ffmpeg that imageio-ffmpeg brings along.
 
     imageio-ffmpeg's own writer ignores the exit status: on a full disk it takes half a film for a
@@ -206,12 +195,11 @@ def _write_mp4(film: Film, path: Path) -> None:
             "format=gif."
         ) from error
 
-    def pictures() -> Iterator[Image.Image]:
-        """All frames; H.264 takes even sides only."""
-        return (_scaled(picture, film.look.scale, multiple=2) for picture in film)
-
-    width, height = next(pictures()).size
-    rate = Fraction(film.look.fps).limit_denominator()
+    # H.264 takes even sides only.
+    pictures = (_scaled(painter.draw(frame), painter.look.scale, multiple=2) for frame in frames)
+    first = next(pictures)
+    width, height = first.size
+    rate = Fraction(painter.look.fps).limit_denominator()
     raw = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {rate} -i -"
     with atomic_path(path) as part:
         words = [ffmpeg, "-y", "-v", "error", *raw.split(), *_H264.split(), str(part)]
@@ -220,7 +208,7 @@ def _write_mp4(film: Film, path: Path) -> None:
         with Popen(words, stdin=PIPE, stderr=PIPE, start_new_session=True) as program:
             assert program.stdin is not None
             try:
-                for picture in pictures():
+                for picture in itertools.chain([first], pictures):
                     program.stdin.write(picture.tobytes())
             except BrokenPipeError:
                 pass  # It has ended early; its error message follows.

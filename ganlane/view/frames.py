@@ -93,7 +93,7 @@ class FramePainter:
         if has_tints:
             _draw_tints(self._header)
         self._overlapping = trajectory.overlapping()
-        self._jumped = trajectory.jumped()
+        self._jumps = np.cumsum(trajectory.jumped(), axis=0)
 
     def draw(self, frame: int) -> Picture:
         """The picture of one frame, [height, width, 3]."""
@@ -182,9 +182,8 @@ class FramePainter:
         steps = round(self.look.trail_s / t.frame_s)
         past = slice(max(0, frame - steps), frame + 1)
         # What came before a jump belongs to another place.
-        jumped = self._jumped[past]
-        jumps_to_come = np.cumsum(jumped[::-1], axis=0)[::-1] - jumped
-        shown = t.valid[past] & t.valid[frame] & (jumps_to_come == 0)
+        is_here = self._jumps[past] == self._jumps[frame]
+        shown = t.valid[past] & t.valid[frame] & is_here
         columns, rows = self.window.column(t.x[past], ego_x), self.window.row(t.y[past])
         places = np.stack((columns, rows), axis=-1)
         for vehicle in reversed(range(t.x.shape[1])):

@@ -35,7 +35,8 @@ from ganlane.reproduce.report import Row, rows_of
 from ganlane.settings.commands import ReproduceConfig
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.sim.random import Stream
-from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, panel_grid, read_metrics
+from ganlane.view.curves import read_metrics
+from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, panel_grid
 from ganlane.view.record import EpisodeLabel, Trajectory, record_episode
 
 #: Panels of Figure 2 by what the vehicle does, and samples drawn in each.

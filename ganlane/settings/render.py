@@ -103,7 +103,7 @@ class RenderConfig(DrivingConfig):
         agents: html, csv, parquet: several instead of driver, for instance
             agents=[mobil,agent_idm].
         episodes: html, csv, parquet: several instead of episode, for instance episodes=[0,1,2].
-        run: instead of an episode: learning curves of runs, run=FOLDER or run=FOLDER,FOLDER.
+        run: instead of an episode: learning curves of runs, run=FOLDER or 'run=[FOLDER,FOLDER]'.
         crashes: instead of an episode: the crashes.json of ganlane reproduce, whose episodes are
             driven again with their actions; agents, episodes and traffics choose among them.
         traffics: of crashes: on these traffics alone.

@@ -80,7 +80,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
             from ganlane.gym.rendering import LiveView  # with torch, which takes seconds
 
             window = FilmWindow() if render_mode == "human" else None
-            self._view = LiveView(self._rows, traffic, window)  # type: ignore[arg-type]
+            self._view = LiveView(self._rows, window)  # type: ignore[arg-type]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -30,6 +30,7 @@ class TensorRows(Rows):
 
     Attributes:
         env: the TorchRL environment of the settings, with a user's own transforms at the end.
+        traffic: its name, for pictures.
         state: of its rows, from the first :meth:`start` on.
     """
 
@@ -39,6 +40,7 @@ class TensorRows(Rows):
             self.env.append_transform(transform)
         base = self.env.base_env
         self.count, self.episode = config.num_envs, base.episode
+        self.traffic = config.traffic.label()
         parts = list(self.env.transform)
         observed = next(part for part in parts if isinstance(part, ObservationTransform))
         size = self.env.observation_spec[keys.OBSERVATION].shape[-1]

@@ -92,7 +92,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         if render_mode is not None:
             from ganlane.gym.rendering import BatchView  # with torch, which takes seconds
 
-            self._view = BatchView(self._rows, traffic)  # type: ignore[arg-type]
+            self._view = BatchView(self._rows)  # type: ignore[arg-type]
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None

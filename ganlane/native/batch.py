@@ -22,7 +22,6 @@ from ganlane.native.settings import Key, fields
 from ganlane.settings.driving import EgoParameters, IdmParameters, MobilParameters, Visibility
 from ganlane.settings.episode import EpisodeParameters, SpawnParameters
 from ganlane.settings.observation import (
-    MASKS,
     MaskParameters,
     ObservationConfig,
     RewardParameters,
@@ -178,7 +177,7 @@ class NativeBatch:
             vehicles=vehicles,
             lanes=lanes,
             size=view.numbers(),
-            mask_form=MASKS.index(mask.form),
+            mask_form=settings.MASK_FORMS.index(mask.form),
             abort_lane_change=abort,
         )
         self._address = ctypes.byref(self._batch)

@@ -77,6 +77,8 @@ NATIVE_FORMS: Final = {
     "lane_view_drift": (True, False),
     "lane_view_overlap": (True, True),
 }
+#: The action masks, in the order of step.cpp's numbers ``MASK_ROAD, MASK_LEGAL, MASK_SAFE``.
+MASK_FORMS: Final = ("none", "legal", "safe")
 
 
 def fields(kind: type, names: str) -> list[tuple[str, type]]:

@@ -25,13 +25,15 @@ from ganlane.errors import UserError
 from ganlane.keys import ACTIONS, EGO_INDEX
 from ganlane.native.tensors import SafeActions
 from ganlane.settings.driving import IdmParameters
-from ganlane.settings.observation import MASKS
 from ganlane.sim.dynamics import SIDES, ego_scene, is_heard, on_road
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import lane_accelerations
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.torch_settings import compiled
 from ganlane.transforms.sensors import PerceptionTransform
+
+#: What this transform computes; an environment without a mask (``none``) has no transform.
+FORMS = ("legal", "safe")
 
 
 def on_road_actions(target_lane: Tensor, lanes: int | Tensor) -> Tensor:
@@ -100,9 +102,9 @@ class ActionMaskTransform(PerceptionTransform):
         abort: bool = False,
         native_vehicles: int | None = None,
     ) -> None:
-        if form not in MASKS[1:]:
+        if form not in FORMS:
             raise UserError(
-                f"mask.form={form!r}: expected one of {', '.join(MASKS[1:])}; choose one of them."
+                f"mask.form={form!r}: expected one of {', '.join(FORMS)}; choose one of them."
             )
         if safe_deceleration <= 0:
             raise UserError(

@@ -57,13 +57,9 @@ def test_a_users_traffic_and_policy_stand_in_the_table(capsys):
 
 
 def test_a_users_traffic_takes_parameters_of_its_own(capsys):
-    target = [
-        "traffic_options.idm._target_=entry_own_parts.Cruise",
-        "+traffic_options.idm.parameters.share=0.5",
-    ]
-    run(capsys, "agents=[keep_lane]", "traffics=[idm]", *target)
-    wrong = [target[0], "+traffic_options.idm.parameters.pace=0.5"]
-    assert main(["agents=[keep_lane]", "traffics=[idm]", *wrong]) == 2
+    target = "traffics=[{{name: entry_own_parts.Cruise, {}: 0.5}}]"
+    run(capsys, "agents=[keep_lane]", target.format("share"))
+    assert main(["agents=[keep_lane]", target.format("pace")]) == 2
     err = capsys.readouterr().err
     assert "pace" in err
     assert "it takes road, stream, share" in err

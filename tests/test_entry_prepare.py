@@ -135,8 +135,8 @@ def test_from_a_users_csv_to_traffic_in_three_commands(here, capsys):
         "episodes=1",
         "env.goal_m=20",
     ]
-    weights = "generator.path=fit/generator_paper.safetensors"
-    assert evaluate(["traffics=[gan]", weights, *tiny]) == 0
+    fitted = "traffics=[{name: gan, path: fit/generator_paper.safetensors}]"
+    assert evaluate([fitted, *tiny]) == 0
     capsys.readouterr()
 
 

@@ -29,6 +29,7 @@ def test_the_version_stands_in_one_place():
     stated = ROOT / PROJECT["tool"]["hatch"]["version"]["path"]
     assert f'__version__ = "{ganlane.__version__}"' in stated.read_text()
     assert f"## [{ganlane.__version__}]" in (ROOT / "CHANGELOG.md").read_text()
+    assert f"\nversion: {ganlane.__version__}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 def test_the_console_script_is_the_dispatcher():

@@ -23,10 +23,8 @@ from ganlane.evaluation.table import Table
 from ganlane.files import write_bytes
 from ganlane.runtime import peak_resident_bytes
 from ganlane.settings.recordings import PrepareConfig
-from ganlane.view.figures import (
-    draw_recordings,
-    save_figure,
-)
+from ganlane.view.figures import save_figure
+from ganlane.view.recordings import draw_recordings
 
 #: Maximum number of scenes in the table.
 _MOST_SCENES: Final = 60

@@ -185,10 +185,13 @@ def settings(command: str, words: Sequence[str]) -> Any:
 
 def _settings_and_folder(command: str, overrides: list[Override]) -> tuple[Any, Path]:
     """The checked record, and the folder of its run: the resumed one, that given, or a new one."""
-    # A resumed run is its saved settings; the command line changes some of them.
+    # A resumed training is its saved settings; the command line changes some of them. For
+    # train_generator resume= is a key like any other.
     values = {str(word.key_or_group): word for word in overrides}
-    resume = values.pop("resume", None) if command == "train" else None
-    rest = [word for word in overrides if word.key_or_group != "resume"]
+    resume, rest = None, overrides
+    if command == "train":
+        resume = values.pop("resume", None)
+        rest = [word for word in overrides if word.key_or_group != "resume"]
     if resume is not None and resume.value() not in (None, ""):
         folder = _resumed_folder(str(resume.value()))
         if folder is not None:

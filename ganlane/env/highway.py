@@ -180,7 +180,7 @@ class HighwayEnv(EnvBase):
     def compile(self, **kwargs: Any) -> HighwayEnv:
         """Compile physics and traffic to several small graphs; returns the environment.
 
-        Compiling takes about a minute in the first steps; docs/performance.md has the speeds.
+        Compiling takes about a minute in the first steps; docs/speed.md has the speeds.
         Results are equal up to rounding, not bitwise. Overrides TorchRL's method, which compiles a
         whole step to one graph; ``HighwayEnv(compile=True)`` calls this one too.
 

@@ -34,9 +34,6 @@ CHECK_EVERY = 8
 SMALL_BATCH = 16
 #: The reason of an episode that something outside the environment ended (a user's own transform).
 OTHER = "other"
-#: Where the other vehicle of a crash was.
-SIDES = ("none", "ahead", "side", "behind")
-_AHEAD, _SIDE, _BEHIND = 1, 2, 3
 #: What is read from the last state of an episode.
 _LAST = (keys.EVENTS, keys.EGO, keys.STEP, keys.VEHICLES)
 
@@ -66,7 +63,7 @@ def run_episodes(
         make_smaller: makes ``env`` with fewer rows; the last episodes move there when at most half
             of the rows are still driving. Not used where something is held per row: by traffic with
             ``rows_must_stay``, and by every policy without ``rows_must_stay = False``.
-        actions: whether to return the columns ``actions``, ``contact`` and ``changing``, too.
+        actions: whether to return the column ``actions``, too.
 
     Returns:
         Columns ``episode, seed, reason`` (:data:`ganlane.keys.END_EVENTS`, or ``other``),
@@ -74,8 +71,7 @@ def run_episodes(
         (undiscounted return), ``reward_*`` (each term's sum), ``decisions``, ``duration_s``,
         ``distance_m``, ``mean_speed_mps`` (distance over time), ``lane_changes``, and ``at_fault``
         of a hard crash (:func:`ego_at_fault`; else null). If asked for: ``actions`` (text, a digit
-        per decision), ``contact`` (what a hard crash hit, of :data:`SIDES`) and ``changing``
-        (whether the ego was changing lanes in its last decision).
+        per decision).
 
     Raises:
         UserError: no episodes are asked for, the environment is not batched in one dimension, or
@@ -91,9 +87,15 @@ def run_episodes(
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         driven = _Evaluation(env, policy, numbers, seed, make_smaller, taken).run(on_progress)
     table = _episode_rows(driven, numbers, seed, getattr(env, "road", STRAIGHT))
-    if taken is not None:
-        return table.with_columns(*_how_it_ended(driven, taken, getattr(env, "road", STRAIGHT)))
-    return table
+    if taken is None:
+        return table
+    # A place is driven by one row at a time, so the order of the decisions is the order in time.
+    decisions = TensorDict.cat(taken).cpu()
+    texts = []
+    for place in range(len(numbers)):
+        digits = decisions["action"][decisions["place"] == place].tolist()
+        texts.append("".join(map(str, digits)))
+    return table.with_columns(pl.Series("actions", texts, pl.String))
 
 
 def start_of(env: EnvBase, numbers: Sequence[int], seed: int) -> TensorDict:
@@ -292,39 +294,6 @@ def _episode_rows(
     )
 
 
-def _how_it_ended(
-    driven: TensorDictBase, taken: Sequence[TensorDict], road: Road
-) -> list[pl.Series]:
-    """The columns ``actions``, ``contact`` and ``changing``."""
-    # A place is driven by one row at a time, so the order of the decisions is the order in time.
-    decisions = TensorDict.cat(taken).cpu()
-    actions = []
-    for place in range(len(driven)):
-        digits = decisions["action"][decisions["place"] == place].tolist()
-        actions.append("".join(map(str, digits)))
-    last = driven["last"]
-    crashed = last[keys.EVENTS, "hard_crash"].squeeze(-1)
-    sides = contact_side(Vehicles.of(last[keys.VEHICLES]), road).where(crashed, 0)
-    return [
-        pl.Series("actions", actions, pl.String),
-        pl.Series("contact", [SIDES[side] for side in sides.tolist()]),
-        pl.Series("changing", (last[keys.EGO, "change_direction"] != 0).tolist()),
-    ]
-
-
-def contact_side(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
-    """What the ego overlaps, [N] int64, as a place in :data:`SIDES`.
-
-    Two bodies meet along the axis on which their extents began to overlap last; the time since then
-    is the depth of the overlap over the closing speed. Headings are small, so the axes are those of
-    the road. Of several vehicles hit in one physics step the nearest to the front counts.
-    """
-    # Higher than all places, so that the lowest of a row is that of a vehicle that was hit.
-    nobody = len(SIDES)
-    first = torch.where(ego_overlaps(vehicles, road), _sides(vehicles, road), nobody).amin(-1)
-    return torch.where(first == nobody, 0, first)
-
-
 def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     """Whether the ego moved into somebody, [N] bool; false where it hit nobody.
 
@@ -332,26 +301,17 @@ def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     other: a rule of geometry, no law. A driver that cuts in and is struck from behind is not at
     fault by it.
     """
-    side = _sides(vehicles, road)
-    towards = torch.sign(vehicles.y[:, 1:] - vehicles.y[:, :1])
-    across = vehicles.speed * torch.sin(vehicles.heading)
-    pushes = towards * across[:, :1] > -towards * across[:, 1:]
-    at_fault = torch.where(side == _SIDE, pushes, side == _AHEAD)
-    return (at_fault & ego_overlaps(vehicles, road)).any(-1)
-
-
-def _sides(vehicles: Vehicles, road: Road) -> Tensor:
-    """On which side of the ego each of the others would have met it, [N, M - 1] int64."""
     ahead = road.distance_ahead(vehicles.x[:, :1], vehicles.x[:, 1:])
-    met_along = _time_since(
-        ahead, _gain(vehicles.speed * torch.cos(vehicles.heading)), _reach(vehicles.length)
-    )
-    met_across = _time_since(
-        _gain(vehicles.y),
-        _gain(vehicles.speed * torch.sin(vehicles.heading)),
-        _reach(vehicles.width),
-    )
-    return torch.where(met_along < met_across, torch.where(ahead > 0, _AHEAD, _BEHIND), _SIDE)
+    along = vehicles.speed * torch.cos(vehicles.heading)
+    across = vehicles.speed * torch.sin(vehicles.heading)
+    # Two bodies met along the axis on which their extents began to overlap last. Headings are
+    # small, so the axes are those of the road.
+    since_along = _time_since(ahead, _gain(along), _reach(vehicles.length))
+    since_across = _time_since(_gain(vehicles.y), _gain(across), _reach(vehicles.width))
+    towards = torch.sign(_gain(vehicles.y))
+    pushes = towards * across[:, :1] > -towards * across[:, 1:]
+    at_fault = torch.where(since_along < since_across, ahead > 0, pushes)
+    return (at_fault & ego_overlaps(vehicles, road)).any(-1)
 
 
 def _gain(values: Tensor) -> Tensor:

@@ -13,12 +13,13 @@ from ganlane.gym.rows import Flags
 from ganlane.gym.tensor_rows import TensorRows
 from ganlane.gym.window import FilmWindow
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.view import DrawingParameters, EpisodeLabel, FramePainter, Recorder
+from ganlane.settings.render import FilmConfig
+from ganlane.view import EpisodeLabel, FramePainter, Recorder
 from ganlane.view.frames import Picture
 from ganlane.view.record import outcome_of, road_of_row
 
 #: Recorded physics steps that are kept: as many as the trails show.
-_TRAIL_STEPS = round(DrawingParameters().trail_s / PHYSICS_STEP_S) + 1
+_TRAIL_STEPS = round(FilmConfig.trail_s / PHYSICS_STEP_S) + 1
 
 
 def _label(rows: TensorRows, row: int) -> EpisodeLabel:

@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase
 
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.errors import UserError
-from ganlane.evaluation.episodes import SIDES, ScriptedPolicy, run_episodes
+from ganlane.evaluation.episodes import ScriptedPolicy, run_episodes
 from ganlane.evaluation.rows import FAILURES
 from ganlane.files import write_json
 from ganlane.settings.commands import EvaluateConfig
@@ -58,8 +58,6 @@ class Crash(Record):
     Attributes:
         driver: its name in the tables, for instance ``agent_gan@2+none``.
         traffic: option of the group ``traffic``.
-        contact: what a hard crash hit (:data:`ganlane.evaluation.episodes.SIDES`).
-        changing: whether the ego was changing lanes at the end.
         actions: one digit per decision: 0 keep, 1 left, 2 right.
     """
 
@@ -69,8 +67,6 @@ class Crash(Record):
     episode: Seed = 0
     end: Annotated[str, one_of(FAILURES)] = "hard_crash"
     distance_m: NotNegative = 0.0
-    contact: Annotated[str, one_of(SIDES)] = SIDES[0]
-    changing: bool = False
     actions: Annotated[str, _ACTIONS] = "0"
 
 
@@ -156,8 +152,6 @@ def find_crashes(
                 episode=row["episode"],
                 end=row["reason"],
                 distance_m=round(max(row["distance_m"], 0.0), 1),
-                contact=row["contact"],
-                changing=row["changing"],
                 actions=row["actions"],
             )
             for row in same.to_dicts()

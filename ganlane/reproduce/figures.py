@@ -35,7 +35,8 @@ from ganlane.reproduce.report import Row, rows_of
 from ganlane.settings.commands import ReproduceConfig
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.sim.random import Stream
-from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, panel_grid, read_metrics
+from ganlane.view.curves import read_metrics
+from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, panel_grid
 from ganlane.view.record import EpisodeLabel, Trajectory, record_episode
 
 #: Panels of Figure 2 by what the vehicle does, and samples drawn in each.
@@ -72,11 +73,11 @@ def interesting(windows: Windows) -> list[tuple[str, int]]:
     }
     moves = along[:, -1] - along[:, 0] > LEAST_M
     chosen: list[tuple[str, int]] = []
-    seen: set[tuple[int, int]] = set()
+    seen: set[tuple[str, int]] = set()
     for kind, count in PANELS.items():
         wanted = len(chosen) + count
         for row in np.argsort(-scores[kind], kind="stable").tolist():
-            vehicle = int(windows.scene[row]), int(windows.vehicle[row])
+            vehicle = str(windows.scene[row]), int(windows.vehicle[row])
             if len(chosen) < wanted and moves[row] and vehicle not in seen:
                 seen.add(vehicle)
                 chosen.append((kind, row))

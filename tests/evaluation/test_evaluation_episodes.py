@@ -23,7 +23,7 @@ from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.evaluation import run_episodes
-from ganlane.evaluation.episodes import SIDES, ScriptedPolicy, contact_side, ego_at_fault
+from ganlane.evaluation.episodes import ScriptedPolicy, ego_at_fault
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import ObservationConfig, SensorParameters
 from ganlane.settings.traffic import (
@@ -32,7 +32,6 @@ from ganlane.settings.traffic import (
     IdmTrafficConfig,
     ReplayTrafficConfig,
 )
-from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 
 SEED = 4
@@ -272,29 +271,13 @@ def test_an_episode_comes_back_from_its_actions():
 
 
 @pytest.mark.parametrize(
-    ("other", "side"),
-    [
-        ({"x": 4.4, "speed": 10.0}, "ahead"),
-        ({"x": -4.4, "speed": 30.0}, "behind"),
-        ({"y": 2.4, "heading": -0.1}, "side"),
-        ({"x": 4.0, "y": 2.2, "heading": -0.1}, "side"),
-        ({"x": -4.2, "y": 1.0, "speed": 30.0, "heading": 0.1}, "behind"),
-        ({"x": 10.0}, "none"),
-    ],
-)
-def test_where_the_ego_was_hit(other, side):
-    scene = vehicles(
-        {"x": 0.0, "y": 0.0, "target_lane": 0}, {"x": 0.0, "y": 0.0, "target_lane": 0, **other}
-    )
-    assert SIDES[int(contact_side(scene, Road()))] == side
-
-
-@pytest.mark.parametrize(
     ("ego", "other", "at_fault"),
     [
         ({"speed": 20.0}, {"x": 4.4, "speed": 10.0}, True),  # into the one ahead
         ({}, {"x": -4.4, "speed": 30.0}, False),  # struck from behind
         ({}, {"y": 2.4, "heading": -0.1}, False),  # the other changes lanes into the ego
+        ({}, {"x": 4.0, "y": 2.2, "heading": -0.1}, False),  # and ahead of it, too
+        ({}, {"x": -4.2, "y": 1.0, "speed": 30.0, "heading": 0.1}, False),  # moving away, faster
         ({"heading": 0.1}, {"y": 2.4}, True),  # the ego into the other
         ({"heading": 0.1}, {"y": 2.4, "heading": -0.05}, True),  # both, the ego faster
         ({"heading": -0.05}, {"y": -2.4, "heading": 0.1}, False),  # both, the other faster

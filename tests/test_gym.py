@@ -29,7 +29,8 @@ from ganlane.settings.traffic import TrafficConfig
 
 @pytest.mark.parametrize("name", sorted(ENV_IDS.keys() - {ID}))
 def test_every_id_is_one_highway_and_a_batch(name):
-    env, envs = gymnasium.make(name), gymnasium.make_vec(name, num_envs=2)
+    env = gymnasium.make(name)
+    envs = gymnasium.make_vec(name, num_envs=2)
     assert env.spec.kwargs == ENV_IDS[name]
     np.testing.assert_array_equal(env.reset(seed=3)[0], envs.reset(seed=3)[0][0])
 
@@ -173,7 +174,8 @@ def test_a_row_of_a_batch_drives_as_one_alone_does():
     ],
 )
 def test_option_and_module_give_one_answer_to_who_drives(traffic):
-    config, env = make_record(TrafficConfig, traffic), EnvConfig()
+    config = make_record(TrafficConfig, traffic)
+    env = EnvConfig()
     drivers = make_traffic(config, env).native_parameters()
     expected = None if drivers is None else (drivers.idm, drivers.mobil)
     assert config.native_parameters(env.idm, env.mobil) == expected
@@ -183,7 +185,8 @@ def test_option_and_module_give_one_answer_to_who_drives(traffic):
 @pytest.mark.skipif(why_not() is not None, reason=f"no native kernel here: {why_not()}")
 def test_pictures_change_nobody():
     """With a render mode the same kernel drives, behind the TorchRL environment."""
-    plain, drawn = make(), make(render_mode="rgb_array")
+    plain = make()
+    drawn = make(render_mode="rgb_array")
     assert drawn.unwrapped._rows.env.base_env.kernel is not None
     for env in (plain, drawn):
         env.reset(seed=1)
@@ -237,7 +240,10 @@ def returns_by_episode(mode, kernel):
     envs = make_vec(3, kernel=kernel, autoreset_mode=mode, goal_m=120.0)
     assert envs.metadata["autoreset_mode"] is mode
     _, info = envs.reset(seed=4)
-    running, numbers, ended, returns = np.zeros(3), info["episode_number"], np.zeros(3, bool), {}
+    running = np.zeros(3)
+    numbers = info["episode_number"]
+    ended = np.zeros(3, bool)
+    returns = {}
     for _ in range(40):
         before = ended
         _, reward, terminated, truncated, info = envs.step(np.zeros(3, int))

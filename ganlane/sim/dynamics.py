@@ -115,7 +115,8 @@ def steer(
     lateral_speed = speed * torch.sin(heading + slip)
     yaw_rate = speed / (0.5 * WHEELBASE_M) * torch.sin(slip)
     offset = centre_y - y
-    near, far = pace * p.near_s, pace * p.far_s
+    near = pace * p.near_s
+    far = pace * p.far_s
     theta_near = torch.atan(offset / near) - heading
     turn = p.gain_far * angle_rate(far) + p.gain_near * angle_rate(near)
     turn = turn + p.gain_integral * theta_near * (speed / pace)
@@ -207,13 +208,15 @@ def ego_surroundings(
     IDM considers the leaders in all lanes that the ego attends to, soft crashes only the lanes that
     its body is in.
     """
-    attention, body = spanned(scene.attention), spanned(scene.body)
+    attention = spanned(scene.attention)
+    body = spanned(scene.body)
     # One search for both kinds of lanes.
     gap, speed = leader(scene, torch.cat((attention, body), dim=-1))
     attended = attention.shape[-1]
     followed = Neighbour(gap[..., :attended], speed[..., :attended])
     near = Neighbour(gap[..., attended:], speed[..., attended:])
-    behind, speed = follower(scene, body), scene.observers.speed[..., None]
+    behind = follower(scene, body)
+    speed = scene.observers.speed[..., None]
     closing = torch.where(behind.exists, behind.speed - speed, 0.0)
     limits = (ego.soft_crash_ttc_s, ego.soft_crash_gap_m)
     return (

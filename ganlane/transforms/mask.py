@@ -114,7 +114,10 @@ class ActionMaskTransform(PerceptionTransform):
         if form == "safe":
             out_keys.append(keys.NO_SAFE_ACTION)
         super().__init__(in_keys=[keys.VEHICLES, keys.EGO], out_keys=out_keys)
-        self.road, self.form, self.idm, self.abort = road, form, idm, abort
+        self.road = road
+        self.form = form
+        self.idm = idm
+        self.abort = abort
         self.safe_deceleration = safe_deceleration
         self.native: SafeActions | None = None
         if native_vehicles is not None and form == "safe":
@@ -135,7 +138,8 @@ class ActionMaskTransform(PerceptionTransform):
         # Keeping the lane is always allowed: where nothing is safe, there is nothing better.
         safe = braking_demand(vehicles, road, self.idm) >= -self.safe_deceleration
         none = ~(safe & legal).any(1)
-        keep, changes = torch.ones_like(safe[:, :1]), legal[:, 1:] & safe[:, 1:]
+        keep = torch.ones_like(safe[:, :1])
+        changes = legal[:, 1:] & safe[:, 1:]
         return torch.cat((keep, changes), dim=1), none
 
     def compile_graphs(self) -> None:

@@ -39,11 +39,13 @@ class LiveView:
     """
 
     def __init__(self, rows: TensorRows, window: FilmWindow | None = None) -> None:
-        self.rows, self.window = rows, window
+        self.rows = rows
+        self.window = window
 
     def start(self) -> None:
         """A new episode has begun."""
-        self._recorder, self._outcome = Recorder(), ""
+        self._recorder = Recorder()
+        self._outcome = ""
         #: Frames recorded before the present decision.
         self._before = 0
         self._label = _label(self.rows, 0)

@@ -22,8 +22,8 @@ import torch
 from ganlane._version import __version__
 from ganlane.errors import UserError, as_typed
 from ganlane.files import PACKAGE, atomic_path, write_json
-from ganlane.settings.record import make, saved_config
-from ganlane.settings.traffic import TrafficConfig
+from ganlane.settings.record import saved_config
+from ganlane.settings.traffic import OwnTraffic, TrafficConfig
 
 
 @dataclass(frozen=True, repr=False)
@@ -89,14 +89,14 @@ def names_of_runs(folders: Sequence[Path]) -> list[str]:
     the ends of their paths.
     """
     runs = [_settings(folder) for folder in folders]
-    keys = sorted(
-        {key for options in runs for key in options}, key=lambda key: (key == "seed", key)
-    )
-    # What all runs have in common tells none of them apart.
-    differing = [key for key in keys if len({options.get(key) for options in runs}) > 1]
+    keys = sorted({key for settings in runs for key in settings})
+    # A key that some lack belongs to a traffic or a scene that they do not have.
+    shared = [key for key in keys if all(key in settings for settings in runs)]
+    differing = [key for key in shared if len({settings[key] for settings in runs}) > 1]
+    differing.sort(key=lambda key: key == "seed")
     names = []
-    for options in runs:
-        names.append(", ".join(f"{key}={options[key]}" for key in differing if key in options))
+    for settings in runs:
+        names.append(", ".join(f"{key}={settings[key]}" for key in differing))
     # Paths from the right, as long as it takes to tell all of them apart.
     longest = max((len(folder.parts) for folder in folders), default=0)
     for depth in range(1, longest + 1):
@@ -107,24 +107,31 @@ def names_of_runs(folders: Sequence[Path]) -> list[str]:
 
 
 def _settings(folder: Path) -> dict[str, str]:
-    """The settings of a run by dotted key; its traffic by its name. Empty where it has none."""
+    """The settings of a run by dotted key, as they are typed; empty where it has none."""
     try:
         data = saved_config(folder / "config.yaml")
-        traffic = make(TrafficConfig, data.pop("traffic")).label()
-    except (KeyError, UserError):
+    except UserError:
         return {}
     # Which checkpoint a run went on from does not tell what it is.
     data.pop("resume", None)
-    return {"traffic": traffic, **{key: as_typed(value) for key, value in _leaves(data)}}
+    settings = dict(_leaves(data))
+    if isinstance(data.get("traffics"), Mapping):
+        settings["traffics"] = as_typed(list(data["traffics"]))
+    return settings
 
 
-def _leaves(data: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+def _leaves(data: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
     """Every value of nested mappings with its dotted key."""
     for name, value in data.items():
         if isinstance(value, Mapping):
             yield from _leaves(value, f"{above}{name}.")
+        elif name == "_target_":
+            # A traffic is known by its option, one of the user's own by its import path.
+            kind = TrafficConfig.kinds().get(str(value), OwnTraffic)
+            option = kind.option  # type: ignore[attr-defined]
+            yield above.rstrip("."), option or as_typed(value)
         else:
-            yield f"{above}{name}", value
+            yield f"{above}{name}", as_typed(value)
 
 
 def runs_below(folder: Path, file: str) -> list[Path]:

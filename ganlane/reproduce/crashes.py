@@ -34,7 +34,6 @@ from ganlane.settings.record import (
     Text,
     make,
     one_of,
-    option_names,
     plain,
 )
 from ganlane.settings.traffic import MixedTrafficConfig, OwnTraffic, TrafficConfig
@@ -47,6 +46,11 @@ _ACTIONS = Rule(
     lambda text: re.fullmatch("[012]{1,100000}", text) is not None,
     "a text of the digits 0, 1 and 2",
 )
+#: A list names no code: no traffic of the user's own, and none that may have such parts.
+_LISTED = {kind.option for kind in TrafficConfig.kinds().values()} - {  # type: ignore[attr-defined]
+    OwnTraffic.option,
+    MixedTrafficConfig.option,
+}
 #: Errors raised by reading a broken list.
 _BROKEN = (ValueError, KeyError, TypeError, AttributeError, RecursionError, UserError)
 
@@ -119,11 +123,10 @@ def find_crashes(
         The list, and how many of the episodes ended otherwise: generated traffic rounds differently
         in batches of another size.
     """
-    # A list names no code, so traffics that need a user's own are not in it.
     traffics = {
         name: traffic
         for name, traffic in config.traffics.items()
-        if name == traffic.label() and not isinstance(traffic, OwnTraffic | MixedTrafficConfig)
+        if name in _LISTED and name == traffic.label()
     }
     # A list without crashes makes the environment in which they are looked for.
     listed = CrashList(config.env, traffics, config.stream, [])
@@ -205,7 +208,7 @@ def _checked(content: Any) -> CrashList:
     for name in {crash["traffic"] for crash in crashes}:
         options = content["traffics"][name]
         # Only this package's traffics: an import path in a file would be code to execute.
-        if name not in option_names("traffic") or {"_target_", "name"} & set(options):
+        if name not in _LISTED or {"_target_", "name"} & set(options):
             raise ValueError(f"traffic {name!r:.80} is none of this package's")
         traffics[name] = make(TrafficConfig, {"name": name, **options}, "traffics")
     listed = {"stream": content["stream"], "env": content["env"], "crashes": crashes}

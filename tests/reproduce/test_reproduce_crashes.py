@@ -90,8 +90,7 @@ def test_episodes_that_end_otherwise_are_counted_and_not_listed(tmp_path):
     ("path", "value"),
     [
         ("traffics gan _target_", "os.getcwd"),
-        ("crashes 0 driver", "${oc.env:HOME}"),
-        ("crashes 0 traffic", "mixed"),
+        ("traffics mixed", {"shares": {"os.getcwd": 1}}),
         ("crashes 0 actions", "0123"),
         ("crashes 0 episode", 1.5),
         ("env lanes", 0),
@@ -103,6 +102,8 @@ def test_a_list_with_a_wrong_value_is_refused_in_one_sentence(path, value, small
     for name in parents:
         part = part[int(name) if name.isdigit() else name]
     part[last] = value
+    if last == "mixed":
+        content["crashes"][0]["traffic"] = "mixed"
     small_list.write_text(json.dumps(content))
     with pytest.raises(UserError, match="not a list of crashes") as refused:
         read_crashes(small_list)

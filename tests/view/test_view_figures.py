@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from view_scenes import run_folder
 
+from ganlane.config.run import as_yaml
 from ganlane.data import (
     Bins,
     Histogram,
@@ -26,6 +27,8 @@ from ganlane.data import (
     synthetic_scenes,
 )
 from ganlane.errors import UserError
+from ganlane.settings.record import make
+from ganlane.settings.train import TrainConfig
 from ganlane.view.figures import (
     COLOURS,
     add_legend,
@@ -222,27 +225,26 @@ def test_runs_are_called_by_the_shortest_ends_that_tell_them_apart(tmp_path):
         read_runs([one, one])
 
 
-def sweep_folder(folder, *lines):
-    for number, line in enumerate(lines):
+def sweep_folder(folder, *settings):
+    for number, data in enumerate(settings):
         run = run_folder(folder / str(number), slope=1.0 + number, evaluated=False)
-        (run / "overrides.yaml").write_text("".join(f"- {each}\n" for each in line.split()))
+        (run / "config.yaml").write_text(as_yaml(make(TrainConfig, data)))
     return folder
 
 
 def test_the_runs_of_a_sweep_are_named_by_the_options_in_which_they_differ(tmp_path):
-    folder = sweep_folder(
-        tmp_path, "traffic=gan agent.n_step=1", "traffic=gan agent.n_step=3", "traffic=idm"
-    )
+    gan = {"traffic": "gan"}
+    folder = sweep_folder(tmp_path, {**gan, "agent": {"n_step": 1}}, gan, {"traffic": "idm"})
     assert list(read_runs([folder])) == [
         "agent.n_step=1, traffic=gan",
         "agent.n_step=3, traffic=gan",
-        "traffic=idm",
+        "agent.n_step=3, traffic=idm",
     ]
 
 
 def test_seeds_are_drawn_as_their_mean_in_a_band(tmp_path):
-    lines = ["traffic=gan seed=0", "traffic=gan seed=1", "traffic=idm seed=0", "traffic=idm seed=1"]
-    runs = read_runs([sweep_folder(tmp_path, *lines)])
+    settings = [{"traffic": name, "seed": seed} for name in ("gan", "idm") for seed in (0, 1)]
+    runs = read_runs([sweep_folder(tmp_path, *settings)])
     assert {name: len(frames) for name, frames in runs.items()} == {
         "traffic=gan": 2,
         "traffic=idm": 2,
@@ -252,7 +254,8 @@ def test_seeds_are_drawn_as_their_mean_in_a_band(tmp_path):
     axes = panels(figure)["mean return"]
     assert axes.lines[0].get_ydata() == pytest.approx(1.5 * np.arange(1.0, 31.0))
     assert axes.collections[0].get_paths()[0].vertices[:, 1].max() == pytest.approx(60.0)
-    assert list(read_runs([sweep_folder(tmp_path / "same", "seed=0", "seed=1")])) == ["all seeds"]
+    same = sweep_folder(tmp_path / "same", *settings[:2])
+    assert list(read_runs([same])) == ["all seeds"]
 
 
 def test_no_panel_is_alone_in_its_row():

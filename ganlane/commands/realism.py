@@ -89,13 +89,27 @@ def realism(config: RealismConfig, folder: Path) -> str:
     factories = traffic_factories(config)
     files = i80_files_wanted(config, path)
     starts = drive_from_starts(config, factories, path)
-    site = {name: i80_rows(config, factories, starts, name, files[name]) for name in files}
+    site = {
+        name: i80_rows(
+            config,
+            factories,
+            starts,
+            name,
+            files[name],
+        )
+        for name in files
+    }
     # Long runs of the rivals take as long again, so they are made on request.
     runs = {}
     for name, make in factories.items():
         if name == config.traffic.label() or config.long_against:
             runs[name] = long_runs(config, name, make)
-    numbers = card_numbers(starts, site, runs, config.resamples)
+    numbers = card_numbers(
+        starts,
+        site,
+        runs,
+        config.resamples,
+    )
     draw(numbers, starts, folder)
     if config.publish:
         publish(starts)
@@ -143,7 +157,11 @@ def traffic_factories(
     return {name: partial(_make, traffic, config.env) for name, traffic in traffics.items()}
 
 
-def _make(traffic: TrafficConfig, env: EnvConfig, road: Road) -> TrafficModule:
+def _make(
+    traffic: TrafficConfig,
+    env: EnvConfig,
+    road: Road,
+) -> TrafficModule:
     """The traffic on a road."""
     # A copy that is not checked again: a recorded road need not fit Table II's vehicles.
     env = copy(env)
@@ -280,7 +298,11 @@ def i80_rows(
     )
 
 
-def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str, Any]]:
+def long_runs(
+    config: RealismConfig,
+    name: str,
+    make: Factory,
+) -> list[dict[str, Any]]:
     """One long run of a traffic per number of vehicles."""
     runs: list[dict[str, Any]] = []
     if config.vehicle_km <= 0:
@@ -315,5 +337,9 @@ def publish(starts: Starts) -> None:
     # The file's name without its folder, which is nobody's business.
     source = Path(starts.reference.source).name
     floors = floors_of(starts.driven, starts.recorded.counts)
-    replace(starts.reference, floors=floors, source=source).save(SHIPPED_REFERENCE)
+    replace(
+        starts.reference,
+        floors=floors,
+        source=source,
+    ).save(SHIPPED_REFERENCE)
     print_progress(f"wrote {SHIPPED_REFERENCE}")

@@ -47,7 +47,11 @@ class Recording:
     driven: Flags
 
     @classmethod
-    def of(cls, rows: pl.DataFrame, lane_width_m: float) -> Recording:
+    def of(
+        cls,
+        rows: pl.DataFrame,
+        lane_width_m: float,
+    ) -> Recording:
         """From one scene in the schema whose tracks have no gaps.
 
         With a column ``driven``, the other vehicles are replayed.
@@ -115,7 +119,11 @@ class Recording:
             lane_width=pl.lit(self.lane_width_m),
         )
 
-    def segments(self, seconds: float, skip_s: float = 0.0) -> list[Recording]:
+    def segments(
+        self,
+        seconds: float,
+        skip_s: float = 0.0,
+    ) -> list[Recording]:
         """Pieces of ``seconds`` from ``skip_s`` on, each with the vehicles present in it."""
         length = round(seconds / FRAME_S)
         first = round(skip_s / FRAME_S)

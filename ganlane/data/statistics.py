@@ -35,11 +35,9 @@ LEVELS: Final = (
 )
 #: A vehicle follows its leader up to this gap, m, and at this speed or faster, m/s. The gap of a
 #: standing car, m (Table V's ``s_0``), is not part of the headway.
-_FOLLOWING_GAP_M, _MIN_FOLLOWER_MPS, _STANDSTILL_GAP_M = (
-    70.0,
-    2.0,
-    2.0,
-)
+_FOLLOWING_GAP_M = 70.0
+_MIN_FOLLOWER_MPS = 2.0
+_STANDSTILL_GAP_M = 2.0
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,12 @@ def describe(values: ArrayLike) -> Distribution:
     """Summarise a sample without NaN."""
     sample = np.asarray(values, dtype=np.float64)
     if not len(sample):
-        return Distribution(0, None, None, ())
+        return Distribution(
+            0,
+            None,
+            None,
+            (),
+        )
     # One sample has no spread.
     sd = float(sample.std(ddof=1)) if len(sample) > 1 else None
     return Distribution(
@@ -176,7 +179,12 @@ class Histogram:
         """As :func:`describe` of all samples."""
         n = self.total
         if not n:
-            return Distribution(0, None, None, ())
+            return Distribution(
+                0,
+                None,
+                None,
+                (),
+            )
         # Sums are exact where bins are not; rounding may make the variance negative.
         mean = self._sum / n
         spread = math.sqrt(max(self._squares - n * mean * mean, 0.0) / (n - 1)) if n > 1 else None
@@ -255,7 +263,12 @@ def leader_gaps(frame: pl.DataFrame) -> pl.DataFrame:
         for name in ("x", "length", "speed")
     }
     gap = ahead["x"] - pl.col("x") - 0.5 * (ahead["length"] + pl.col("length"))
-    ordered = frame.sort("scene", "frame", "lane", "x")
+    ordered = frame.sort(
+        "scene",
+        "frame",
+        "lane",
+        "x",
+    )
     return ordered.with_columns(gap=gap, leader_speed=ahead["speed"]).drop_nulls("gap")
 
 

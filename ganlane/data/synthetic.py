@@ -42,7 +42,11 @@ def synthetic_scenes(traffic: SyntheticTraffic | None = None, seed: int = 0) -> 
     return sort(pl.concat(_scene(traffic, number, seed) for number in range(traffic.scenes)))
 
 
-def _scene(traffic: SyntheticTraffic, number: int, seed: int) -> pl.DataFrame:
+def _scene(
+    traffic: SyntheticTraffic,
+    number: int,
+    seed: int,
+) -> pl.DataFrame:
     """One scene; every vehicle is present in every frame."""
     # Each scene has a seed of its own: their number changes none of them.
     random = np.random.default_rng((seed, number))
@@ -58,7 +62,12 @@ def _scene(traffic: SyntheticTraffic, number: int, seed: int) -> pl.DataFrame:
     speed = traffic.speed_mps + swing * np.cos(omega * time + phase)
     slots = (np.arange(n) * traffic.slot_m)[:, None]
     x = slots + traffic.speed_mps * time + swing / omega * np.sin(omega * time + phase)
-    y = home[:, None] * traffic.lane_width_m + _across(traffic, time, home, random)
+    y = home[:, None] * traffic.lane_width_m + _across(
+        traffic,
+        time,
+        home,
+        random,
+    )
     # The nearest lane, as recordings have it.
     lane = np.rint(y / traffic.lane_width_m).clip(0, traffic.lanes - 1).astype(np.int64)
     columns = {

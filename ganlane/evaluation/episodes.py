@@ -85,8 +85,20 @@ def run_episodes(
     numbers = list(episodes)
     taken: list[TensorDict] | None = [] if actions else None
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        driven = _Evaluation(env, policy, numbers, seed, make_smaller, taken).run(on_progress)
-    table = _episode_rows(driven, numbers, seed, getattr(env, "road", STRAIGHT))
+        driven = _Evaluation(
+            env,
+            policy,
+            numbers,
+            seed,
+            make_smaller,
+            taken,
+        ).run(on_progress)
+    table = _episode_rows(
+        driven,
+        numbers,
+        seed,
+        getattr(env, "road", STRAIGHT),
+    )
     if taken is None:
         return table
     # A place is driven by one row at a time, so the order of the decisions is the order in time.
@@ -98,7 +110,11 @@ def run_episodes(
     return table.with_columns(pl.Series("actions", texts, pl.String))
 
 
-def start_of(env: EnvBase, numbers: Sequence[int], seed: int) -> TensorDict:
+def start_of(
+    env: EnvBase,
+    numbers: Sequence[int],
+    seed: int,
+) -> TensorDict:
     """The tensordict that makes ``env.reset`` start these episodes.
 
     The last one also fills the rows left over. :class:`UserError` for none.
@@ -109,7 +125,11 @@ def start_of(env: EnvBase, numbers: Sequence[int], seed: int) -> TensorDict:
         )
     rows = env.batch_size[0]
     padded = list(numbers) + [numbers[-1]] * (rows - len(numbers))
-    episode = torch.tensor(padded, dtype=torch.int64, device=env.device)
+    episode = torch.tensor(
+        padded,
+        dtype=torch.int64,
+        device=env.device,
+    )
     return TensorDict(
         {keys.SEED: torch.full_like(episode, seed), keys.EPISODE: episode},
         [rows],
@@ -133,15 +153,22 @@ class _Evaluation:
         make_smaller: Callable[[int], EnvBase] | None,
         taken: list[TensorDict] | None,
     ) -> None:
-        rows, self.total = env.batch_size[0], len(numbers)
+        rows = env.batch_size[0]
+        self.total = len(numbers)
         rows_stay = getattr(getattr(env, "traffic", None), "rows_must_stay", False)
         may_move = not rows_stay and not getattr(policy, "rows_must_stay", True)
-        self.env, self.policy, self.taken = env, policy, taken
+        self.env = env
+        self.policy = policy
+        self.taken = taken
         self.make_smaller = make_smaller if may_move else None
         # What holds something per row outside the tensordict might not stand being driven on after
         # an end.
         self.check_every = 1 if rows_stay else CHECK_EVERY
-        self.numbers = torch.tensor(numbers, dtype=torch.int64, device=env.device)
+        self.numbers = torch.tensor(
+            numbers,
+            dtype=torch.int64,
+            device=env.device,
+        )
         # Where the episode of a row stands in the list; the list's length in spare rows.
         self.place = torch.arange(rows, device=env.device).clamp_max(self.total)
         self.driving = self.place < self.total
@@ -183,7 +210,8 @@ class _Evaluation:
         added = _added(after["next"])
         state = after["next"].select(*_LAST, strict=False)
         if self.sums is None or self.last is None:
-            self.sums, self.last = added.apply(torch.zeros_like), state
+            self.sums = added.apply(torch.zeros_like)
+            self.last = state
         # Rows whose episode has ended keep what they had.
         self.sums = (self.sums + added).where(self.driving, self.sums)
         self.last = state.where(self.driving, self.last)
@@ -198,7 +226,11 @@ class _Evaluation:
         # A row is counted until its first end, even where it is driven on until the next look.
         ended = ((self.place < self.total) & ~self.driving).nonzero()[:, 0]
         if len(ended) > 0:
-            rows = {"place": self.place, "sums": self.sums, "last": self.last}
+            rows = {
+                "place": self.place,
+                "sums": self.sums,
+                "last": self.last,
+            }
             self.finished.append(TensorDict(rows, self.place.shape)[ended].cpu())
             self.place[ended] = self.total
         return len(ended)
@@ -258,10 +290,14 @@ def _added(state: TensorDictBase) -> TensorDict:
 
 
 def _episode_rows(
-    driven: TensorDictBase, numbers: list[int], seed: int, road: Road
+    driven: TensorDictBase,
+    numbers: list[int],
+    seed: int,
+    road: Road,
 ) -> pl.DataFrame:
     """What :func:`run_episodes` returns without being asked for more."""
-    last, ego = driven["last"], driven["last", keys.EGO]
+    last = driven["last"]
+    ego = driven["last", keys.EGO]
     # One column per count, each [E].
     columns = dict(driven["sums"].items())
     columns |= {name: last[keys.EVENTS, name].squeeze(-1) for name in keys.END_EVENTS}
@@ -274,7 +310,8 @@ def _episode_rows(
     # The reward's terms are the environment's own, so their names are not known here.
     terms = [name for name in columns if name.startswith("reward_")]
     ends = [pl.when(pl.col(event)).then(pl.lit(event)) for event in keys.END_EVENTS]
-    distance, duration = pl.col("distance").cast(pl.Float64), pl.col("duration_s")
+    distance = pl.col("distance").cast(pl.Float64)
+    duration = pl.col("duration_s")
     table = pl.DataFrame({name: value.numpy() for name, value in columns.items()})
     return table.select(
         pl.Series("episode", numbers, pl.Int64),
@@ -324,7 +361,11 @@ def _reach(sizes: Tensor) -> Tensor:
     return 0.5 * (sizes[:, 1:] + sizes[:, :1])
 
 
-def _time_since(distance: Tensor, speed: Tensor, reach: Tensor) -> Tensor:
+def _time_since(
+    distance: Tensor,
+    speed: Tensor,
+    reach: Tensor,
+) -> Tensor:
     """For how long (s) extents that touch at ``reach`` (m) overlap.
 
     Infinite where they do not close.

@@ -76,9 +76,23 @@ def write_results(
     """
     path = Path(folder) / "results.json"
     # Whoever finds the file later can tell where its numbers come from.
-    origin = {"seeds": seeds, "config": config, "code": code_version(), "machine": machine()}
+    origin = {
+        "seeds": seeds,
+        "config": config,
+        "code": code_version(),
+        "machine": machine(),
+    }
     written = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    write_json(path, plain({**numbers, **origin, "written": written}))
+    write_json(
+        path,
+        plain(
+            {
+                **numbers,
+                **origin,
+                "written": written,
+            }
+        ),
+    )
     return path
 
 
@@ -193,18 +207,41 @@ def code_version() -> dict[str, Any]:
     own file.
     """
     # None where git does not know: an installed package, or a machine without git.
-    version: dict[str, Any] = {"version": __version__, "revision": None, "modified": None}
+    version: dict[str, Any] = {
+        "version": __version__,
+        "revision": None,
+        "modified": None,
+    }
     if _git("ls-files", "--error-unmatch", "__init__.py") is not None:
         version["revision"] = _git("rev-parse", "HEAD")
-        version["modified"] = bool(_git("status", "--porcelain", "--untracked-files=no", "--", "."))
+        version["modified"] = bool(
+            _git(
+                "status",
+                "--porcelain",
+                "--untracked-files=no",
+                "--",
+                ".",
+            )
+        )
     return version
 
 
 def _git(*arguments: str) -> str | None:
     """Output of a git command in the package's folder; None where git is absent or fails."""
-    command = ["git", "-C", str(PACKAGE), *arguments]
+    command = [
+        "git",
+        "-C",
+        str(PACKAGE),
+        *arguments,
+    ]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()
@@ -212,7 +249,8 @@ def _git(*arguments: str) -> str | None:
 
 def machine() -> dict[str, Any]:
     """CPU, usable cores, torch's threads, system, accelerator (or None), versions that ran."""
-    cpu, cores = platform.processor() or platform.machine(), os.cpu_count() or 1
+    cpu = platform.processor() or platform.machine()
+    cores = os.cpu_count() or 1
     # Linux names the model of the CPU here, and may leave a process fewer cores than there are.
     info = Path("/proc/cpuinfo")
     if info.is_file():
@@ -236,7 +274,8 @@ def machine_sentence(threads: Sequence[int]) -> str:
 
     ``threads`` are torch's.
     """
-    here, code = machine(), code_version()
+    here = machine()
+    code = code_version()
     hardware = f"{here['cpu']}, {here['cores']} usable core{'s' if here['cores'] != 1 else ''}"
     if here["accelerator"]:
         hardware += f", {here['accelerator']}"

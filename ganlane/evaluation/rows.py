@@ -31,7 +31,8 @@ from ganlane.evaluation.statistics import (
 )
 
 #: The two drivers that give the normalised score its scale.
-SCALE_TOP, SCALE_BOTTOM = "mobil", "random_legal"
+SCALE_TOP = "mobil"
+SCALE_BOTTOM = "random_legal"
 #: What two drivers' episodes are matched by.
 _EPISODE = ["seed", "episode"]
 _CRASH = "hard_crash"
@@ -73,7 +74,8 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
     # Rates are of all episodes together, not means of the episodes' own rates: short episodes would
     # count as much as long ones.
     returns = pair["reward"].to_numpy()
-    distance_m, duration_s = float(pair["distance_m"].sum()), float(pair["duration_s"].sum())
+    distance_m = float(pair["distance_m"].sum())
+    duration_s = float(pair["duration_s"].sum())
     lane_changes_per_km = crashes = lead = None
     if distance_m > 0.0:
         lane_changes_per_km = int(pair["lane_changes"].sum()) / distance_m * 1000.0
@@ -145,7 +147,8 @@ def paired_rows(episodes: pl.DataFrame) -> list[Row]:
         ``above`` or ``below`` where the interval lies on one side of 0, else ``undecided``. Pairs
         that share fewer than two episodes are left out.
     """
-    first, rows = episodes["agent"][0], []
+    first = episodes["agent"][0]
+    rows = []
     for (traffic,), driven in episodes.group_by("traffic", maintain_order=True):
         ours = driven.filter(pl.col("agent") == first)
         others = driven.filter(pl.col("agent") != first)
@@ -157,8 +160,19 @@ def paired_rows(episodes: pl.DataFrame) -> list[Row]:
             verdict = "undecided"
             if lead.excludes_zero():
                 verdict = "above" if lead.value > 0.0 else "below"
-            row = {"agent": first, "over": other, "traffic": traffic, "episodes": shared}
-            rows.append({**row, **entries("lead", lead), "verdict": verdict})
+            row = {
+                "agent": first,
+                "over": other,
+                "traffic": traffic,
+                "episodes": shared,
+            }
+            rows.append(
+                {
+                    **row,
+                    **entries("lead", lead),
+                    "verdict": verdict,
+                }
+            )
     return rows
 
 
@@ -254,7 +268,8 @@ def crashes_by_scene(episodes: pl.DataFrame, scenes: Sequence[str]) -> tuple[Est
     )
     rows = []
     for row in by_scene.to_dicts():
-        rate, km = None, row["distance_km"]
+        rate = None
+        km = row["distance_km"]
         if km > 0.0:
             rate = poisson_interval(row[_CRASH]).scaled(per=km)
         rows.append({**row, **entries("crashes_per_km", rate)})
@@ -286,7 +301,12 @@ def failed_episodes(episodes: pl.DataFrame) -> list[Row]:
     """
     failed = episodes.filter(pl.col("reason").is_in(FAILURES))
     rows = []
-    for names, frame in failed.group_by("agent", "traffic", "seed", maintain_order=True):
+    for names, frame in failed.group_by(
+        "agent",
+        "traffic",
+        "seed",
+        maintain_order=True,
+    ):
         row: Row = dict(zip(("driver", "traffic", "seed"), names))
         for end in FAILURES:
             row[end] = frame.filter(pl.col("reason") == end)["episode"].sort().to_list()

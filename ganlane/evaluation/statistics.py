@@ -64,7 +64,11 @@ class Estimate:
         """Whether there is an interval and 0 lies outside it."""
         return self.low is not None and self.high is not None and not self.low <= 0.0 <= self.high
 
-    def scaled(self, factor: float = 1.0, per: float = 1.0) -> Estimate:
+    def scaled(
+        self,
+        factor: float = 1.0,
+        per: float = 1.0,
+    ) -> Estimate:
         """Value and bounds times ``factor``, divided by ``per``; both are positive."""
         low, high = (
             None if bound is None else bound * factor / per for bound in (self.low, self.high)
@@ -85,7 +89,11 @@ def entries(name: str, estimate: Estimate | None) -> dict[str, Any]:
     }
 
 
-def resample_counts(size: int, resamples: int, seed: int) -> Iterator[Array]:
+def resample_counts(
+    size: int,
+    resamples: int,
+    seed: int,
+) -> Iterator[Array]:
     """Chunks [R, size] of how often each of ``size`` episodes occurs in a resample of ``size`` with
     replacement.
     """
@@ -157,7 +165,8 @@ def mean_interval(values: npt.ArrayLike) -> Estimate:
 
 def paired_difference(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
     """Mean of ``first - second`` over the same episodes, in the same order, with its interval."""
-    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    a = np.asarray(first, dtype=np.float64)
+    b = np.asarray(second, dtype=np.float64)
     if a.shape != b.shape:
         raise ValueError(f"paired values must have one shape, found {a.shape} and {b.shape}")
     return mean_interval(a - b)
@@ -240,7 +249,9 @@ def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate |
 
 
 def normalized_over_trainings(
-    agent: npt.ArrayLike, mobil: npt.ArrayLike, random_legal: npt.ArrayLike
+    agent: npt.ArrayLike,
+    mobil: npt.ArrayLike,
+    random_legal: npt.ArrayLike,
 ) -> Estimate | None:
     """The normalised score (:func:`ganlane.evaluation.normalized_percent`) of several trainings,
     each [S, E].
@@ -254,7 +265,11 @@ def normalized_over_trainings(
     return _estimate(tables, lambda *rewards: percent_of_way(*map(_mean, rewards)))
 
 
-def percent_of_way(value: Array, top: Array, bottom: Array) -> Array:
+def percent_of_way(
+    value: Array,
+    top: Array,
+    bottom: Array,
+) -> Array:
     """How far ``value`` is on the way from ``bottom`` to ``top``, in per cent."""
     return np.asarray(100.0 * (value - bottom) / (top - bottom))
 
@@ -276,11 +291,13 @@ def mcnemar(first: npt.ArrayLike, second: npt.ArrayLike) -> McNemar:
 
     ``first`` and ``second`` [E] bool on the same episodes.
     """
-    a, b = np.asarray(first, dtype=bool), np.asarray(second, dtype=bool)
+    a = np.asarray(first, dtype=bool)
+    b = np.asarray(second, dtype=bool)
     if a.shape != b.shape:
         raise ValueError(f"paired episodes must have one shape, found {a.shape} and {b.shape}")
     # Episodes in which both failed, or neither, say nothing about a difference.
-    one, other = int((a & ~b).sum()), int((b & ~a).sum())
+    one = int((a & ~b).sum())
+    other = int((b & ~a).sum())
     return McNemar(
         one, other, float(scipy.stats.binomtest(one, one + other).pvalue) if one + other else 1.0
     )
@@ -294,7 +311,8 @@ def _table(values: npt.ArrayLike) -> Array:
 
 
 def _pair(first: npt.ArrayLike, second: npt.ArrayLike) -> tuple[Array, Array]:
-    a, b = _table(first), _table(second)
+    a = _table(first)
+    b = _table(second)
     if a.shape[1] != b.shape[1]:
         raise ValueError(f"expected the same episodes, found {a.shape[1]} and {b.shape[1]}")
     return a, b
@@ -319,7 +337,8 @@ def _estimate(
     if all(table.shape[-2:] == (1, 1) for table in tables):
         return Estimate(value)
     # One draw of the episodes serves all tables: all drivers drove the same ones.
-    generator, episodes = np.random.default_rng((0, 1)), tables[0].shape[-1]
+    generator = np.random.default_rng((0, 1))
+    episodes = tables[0].shape[-1]
     counts = np.concatenate(kept_counts(episodes, FEWER_RESAMPLES)).astype(np.float64).T
     parts = [
         statistic(*(np.moveaxis(table @ counts, -1, 0) / episodes for table in tables)) - value
@@ -347,5 +366,6 @@ def _estimate(
 def _share_above(first: Array, second: Array) -> Array:
     """Share of the pairs of [R, S] and [R, S'] in which the first is above; [R]."""
     # Every training of the first with every training of the second, [R, S, S'].
-    a, b = first[:, :, None], second[:, None, :]
+    a = first[:, :, None]
+    b = second[:, None, :]
     return np.asarray(((a > b) + 0.5 * (a == b)).mean(axis=(1, 2)))

@@ -85,9 +85,14 @@ def number(value: float | None, digits: int = 3) -> str:
     return NOTHING if value is None else f"{value:.{digits}f}"
 
 
-def with_interval(row: Row, key: str, digits: int = 3) -> str:
+def with_interval(
+    row: Row,
+    key: str,
+    digits: int = 3,
+) -> str:
     """A cell with ``row[key]``, and ``[low, high]`` where the row has its interval, ``key_ci``."""
-    text, interval = number(row.get(key), digits), row.get(f"{key}_ci")
+    text = number(row.get(key), digits)
+    interval = row.get(f"{key}_ci")
     if not interval:
         return text
     low, high = interval
@@ -129,7 +134,13 @@ class Table:
     ) -> Table:
         """One line per row; ``columns`` maps each heading to the maker of its cells."""
         lines = [[cell(row) for cell in columns.values()] for row in rows]
-        return cls(title, list(columns), lines, names, notes)
+        return cls(
+            title,
+            list(columns),
+            lines,
+            names,
+            notes,
+        )
 
     def text(self) -> str:
         """Aligned columns, with the title above and the notes below."""
@@ -227,14 +238,21 @@ def text_table(rows: Sequence[Row]) -> str:
     # Each reason with its traffics, once each.
     reasons: dict[str, list[str]] = {}
     for row in rows:
-        reason, traffic = row.get("normalized_percent_reason"), row.get("traffic")
+        reason = row.get("normalized_percent_reason")
+        traffic = row.get("traffic")
         if reason is not None and traffic not in reasons.setdefault(reason, []):
             reasons[reason].append(str(traffic))
     notes = [
         f"% of MOBIL on {', '.join(traffics)}: none, {reason}"
         for reason, traffics in reasons.items()
     ]
-    return Table.of("", rows, columns, 2 + ("run" in columns), notes).text()
+    return Table.of(
+        "",
+        rows,
+        columns,
+        2 + ("run" in columns),
+        notes,
+    ).text()
 
 
 def paired_table(rows: Sequence[Row]) -> str:
@@ -249,4 +267,9 @@ def paired_table(rows: Sequence[Row]) -> str:
         "reward [95 %]": lead,
         "verdict": text_of("verdict"),
     }
-    return Table.of("", rows, columns, names=2).text()
+    return Table.of(
+        "",
+        rows,
+        columns,
+        names=2,
+    ).text()

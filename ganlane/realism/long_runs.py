@@ -102,7 +102,11 @@ class EventCounter:
         #: The last state; empty where a new batch of episodes begins.
         self.before: dict[str, Tensor] = {}
 
-    def count(self, vehicles: Vehicles, step: int) -> None:
+    def count(
+        self,
+        vehicles: Vehicles,
+        step: int,
+    ) -> None:
         """Count the events of a physics step."""
         # Everything is counted without the ego's empty place.
         others = vehicles.columns(slice(1, None))
@@ -125,7 +129,11 @@ class EventCounter:
                 (slow & (ahead.gap > FREE_M))[:, 1:],
             )
 
-    def _onsets(self, name: str, now: Tensor) -> int:
+    def _onsets(
+        self,
+        name: str,
+        now: Tensor,
+    ) -> int:
         """Number of entries that are true now and were not at the last count."""
         before = self.before.get(name, torch.zeros_like(now))
         self.before[name] = now
@@ -189,7 +197,13 @@ def long_run(
     # Ends early where nobody moves.
     while km < parameters.vehicle_km and not (parts and parts[-1]["vehicle_km"] <= 0.0):
         rows = _rows(parameters, parameters.vehicle_km - km)
-        driven = drive_spawned(traffic, parameters, episodes, rows, events)
+        driven = drive_spawned(
+            traffic,
+            parameters,
+            episodes,
+            rows,
+            events,
+        )
         parts.append(batch_statistics(driven, road))
         km += parts[-1]["vehicle_km"]
         episodes += rows
@@ -292,7 +306,13 @@ def drive_spawned(
     # Onsets do not carry over from the batch before.
     events.before.clear()
     for step in range(round(parameters.most_s / PHYSICS_STEP_S)):
-        state, memory = step_traffic(traffic, state, memory, counters, step)
+        state, memory = step_traffic(
+            traffic,
+            state,
+            memory,
+            counters,
+            step,
+        )
         events.count(state, step)
         course.append((state.x, state.y, state.speed))
         # Distances are tested once in ten seconds of driving: cheap, and exact enough.
@@ -343,7 +363,11 @@ def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
     }
 
 
-def _speeds(trajectories: Trajectories, row: int, time: int) -> dict[str, float]:
+def _speeds(
+    trajectories: Trajectories,
+    row: int,
+    time: int,
+) -> dict[str, float]:
     """Mean and standard deviation of an episode's speeds, m/s."""
     speed = trajectories.speed[time, row].astype(np.float64)
     spread = float(speed.std(ddof=1)) if len(speed) > 1 else 0.0
@@ -366,7 +390,11 @@ def _mean_speeds(
     return {**means, "episodes": len(rows)}
 
 
-def rates(lane_changes: int, overlaps: int, km: float) -> dict[str, Any]:
+def rates(
+    lane_changes: int,
+    overlaps: int,
+    km: float,
+) -> dict[str, Any]:
     """Both counts per vehicle-km and per 1000 of them, with exact 95 % intervals.
 
     None where no vehicle moved.

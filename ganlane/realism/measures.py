@@ -56,7 +56,8 @@ _TINY = 1e-300
 #: A vehicle's first seconds do not count.
 SETTLING_S: Final = 3.0
 #: Half of the second that speeds are taken over, and all of it, in frames.
-_HALF, _WHOLE = 5, 10
+_HALF = 5
+_WHOLE = 10
 #: Leaders further ahead are ignored, m; slower than this a driver shows no headway, m/s.
 FOLLOWING_M: Final = 100.0
 SLOWEST_FOLLOWER_MPS: Final = 2.0
@@ -132,7 +133,12 @@ def distance(
     ``paired`` units are the same and are resampled together; else ``simulated`` alone is.
     """
     value = pooled_distance(simulated, recorded)
-    (drawn,) = _resampled([simulated], recorded, paired, resamples)
+    (drawn,) = _resampled(
+        [simulated],
+        recorded,
+        paired,
+        resamples,
+    )
     if not np.isfinite(value) or len(drawn) < 2:
         return Estimate(value)
     # Both tails are reflected about the estimate.
@@ -162,7 +168,12 @@ def distance_difference(
     """
     one = pooled_distance(first, recorded)
     other = pooled_distance(second, recorded)
-    ours, theirs = _resampled([first, second], recorded, paired, resamples)
+    ours, theirs = _resampled(
+        [first, second],
+        recorded,
+        paired,
+        resamples,
+    )
     units = len(first)
     value = one - other
     if not np.isfinite(value) or len(ours) < 2:
@@ -329,7 +340,11 @@ def samples_of(
     return samples
 
 
-def _histograms(table: pl.DataFrame, units: Sequence[str], bins: Bins) -> Array:
+def _histograms(
+    table: pl.DataFrame,
+    units: Sequence[str],
+    bins: Bins,
+) -> Array:
     """Samples per unit and bin, [units, bins]."""
     index = {unit: row for row, unit in enumerate(units)}
     table = table.filter(pl.col("unit").is_in(list(units)))

@@ -108,7 +108,14 @@ def starts_table(driving: Mapping[str, Any]) -> str:
     """Lane changes and accelerations, one traffic per line, the recordings among them."""
     rate = "changes per vehicle-km [95 %]"
     tails = "acceleration 5 %, 95 %"
-    lines = [["from the same starts", rate, "vehicle-km", tails]]
+    lines = [
+        [
+            "from the same starts",
+            rate,
+            "vehicle-km",
+            tails,
+        ]
+    ]
     for name, row in driving.items():
         acceleration = row["quantiles"]["acceleration"]
         line = [
@@ -153,7 +160,11 @@ def checks_text(checks: Mapping[str, Any]) -> str:
 
     def told(name: str, value: bool | None) -> str:
         unknown = "no guard" if name == "guard_under_5_percent" else "unknown"
-        answer = {True: "yes", False: "no", None: unknown}[value]
+        answer = {
+            True: "yes",
+            False: "no",
+            None: unknown,
+        }[value]
         return f"{name.replace('_', ' ')}: {answer}"
 
     near = "acceleration_quantiles_within_30_percent"
@@ -171,7 +182,11 @@ def short_name(traffic: str) -> str:
     return traffic.rpartition(".")[2]
 
 
-def draw(numbers: Mapping[str, Any], starts: Starts, to: Path) -> None:
+def draw(
+    numbers: Mapping[str, Any],
+    starts: Starts,
+    to: Path,
+) -> None:
     """The figures of a card, into the folder ``to``.
 
     Distributions, distances, and drift if there are long runs.
@@ -228,7 +243,12 @@ def draw_distributions(
             if not total:
                 continue
             density = counts[name] / total / np.diff(edges)
-            plot_line(axes, middle, density, color=colour)
+            plot_line(
+                axes,
+                middle,
+                density,
+                color=colour,
+            )
             # The bins at both ends hold all values beyond, too.
             for end, mark in ((0, "<"), (-1, ">")):
                 if counts[name][end]:
@@ -272,12 +292,21 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
     axes.set_xlabel("Jensen-Shannon distance to recorded driving")
     names = [name.replace("_", " ") for name in quantities]
     middles = [block * (index + 0.5) for index in range(len(names))]
-    axes.set_yticks(middles, names, color=INK, size=9)
+    axes.set_yticks(
+        middles,
+        names,
+        color=INK,
+        size=9,
+    )
     axes.tick_params("y", length=0)
     axes.grid(False, axis="y")
     for index, row in enumerate(quantities.values()):
         top = block * index
-        axes.axhline(top, color=GRID, lw=0.8)
+        axes.axhline(
+            top,
+            color=GRID,
+            lw=0.8,
+        )
         for mark, colour in (
             ("ceiling", INK),
             ("floor", FAINT),
@@ -300,7 +329,13 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
                     [y, y],
                     color=colour,
                 )
-                axes.plot(value, y, "o", color=colour, ms=5)
+                axes.plot(
+                    value,
+                    y,
+                    "o",
+                    color=colour,
+                    ms=5,
+                )
     # Marks of the scale, which no traffic has.
     marks = [
         Line2D(
@@ -338,7 +373,11 @@ def draw_speeds_over_time(runs: Sequence[Mapping[str, Any]], spread_mps: float) 
         "spread_mps": "spread of speeds",
     }
     for axes, (key, title) in zip(grid, titles.items()):
-        axes.set(title=title, xlabel="time, s", ylabel="m/s")
+        axes.set(
+            title=title,
+            xlabel="time, s",
+            ylabel="m/s",
+        )
         for run, colour in zip(runs, colours.values()):
             # The time at 5000 m differs from run to run, and is no point in time.
             speeds = {time: at[key] for time, at in run["speeds"].items() if time.endswith(" s")}

@@ -54,7 +54,9 @@ SHORTEST_S = 4.0
 #: Candidates for the mean excess of desired speeds over the speed at entry, m/s.
 EXCESS_GRID = (2.0, 4.0, 6.0, 8.0, 11.0, 15.0, 20.0)
 #: Spawned starts: vehicles of an episode, its seconds, and episodes per repeat.
-_SPAWNED_VEHICLES, _SPAWNED_S, _SPAWNED_ROWS = 30, 30.0, 8
+_SPAWNED_VEHICLES = 30
+_SPAWNED_S = 30.0
+_SPAWNED_ROWS = 8
 
 
 def print_progress(text: str) -> None:

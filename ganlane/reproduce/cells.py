@@ -78,15 +78,30 @@ def cells_of(config: ReproduceConfig, traffics: dict[str, TrafficConfig]) -> lis
     cells = []
     for traffic, option in traffics.items():
         for driver in drivers:
-            settings = _settings(driver, option, config, config.episodes_on(traffic))
+            settings = _settings(
+                driver,
+                option,
+                config,
+                config.episodes_on(traffic),
+            )
             digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
             path = Path(config.cells) / f"{digest[:32]}.parquet"
-            cells.append(Cell(driver.name, traffic, settings, path))
+            cells.append(
+                Cell(
+                    driver.name,
+                    traffic,
+                    settings,
+                    path,
+                )
+            )
     return cells
 
 
 def _settings(
-    driver: Driver, traffic: TrafficConfig, config: ReproduceConfig, episodes: int
+    driver: Driver,
+    traffic: TrafficConfig,
+    config: ReproduceConfig,
+    episodes: int,
 ) -> dict[str, Any]:
     """See :class:`Cell`."""
     # The weights themselves, not a file's name: a training under the same name is another driver.
@@ -121,7 +136,12 @@ def drive(cells: Sequence[Cell], config: ReproduceConfig) -> None:
     """Drive the cells that are not there yet, each into its file."""
     missing = [cell for cell in cells if not cell.path.is_file()]
     no_terminal = not sys.stderr.isatty()
-    with tqdm(total=len(missing), unit="cell", file=sys.stderr, disable=no_terminal) as bar:
+    with tqdm(
+        total=len(missing),
+        unit="cell",
+        file=sys.stderr,
+        disable=no_terminal,
+    ) as bar:
         for cell in _driven(missing, config):
             bar.update()
             if no_terminal:
@@ -156,7 +176,11 @@ def drive_cell(cell: Cell, config: ReproduceConfig) -> None:
     begun = time.monotonic()
     # The same call as in ganlane evaluate, with one driver on one traffic.
     traffics = {cell.traffic: config.traffics[cell.traffic]}
-    alone = replace(config, traffics=traffics, episodes=cell.settings["episodes"])
+    alone = replace(
+        config,
+        traffics=traffics,
+        episodes=cell.settings["episodes"],
+    )
     driver = make_driver(cell.driver, config.env, device=config.device)
     table = compare([driver], alone, quiet=True)
     origin = {
@@ -174,7 +198,8 @@ def read_cells(cells: Sequence[Cell]) -> tuple[pl.DataFrame, list[str], dict[str
     Raises:
         UserError: a file without the episodes of a cell; the message names it.
     """
-    tables, revisions = [], set()
+    tables = []
+    revisions = set()
     seconds = dict.fromkeys((cell.traffic for cell in cells), 0.0)
     for cell in cells:
         try:

@@ -92,9 +92,20 @@ class CrashList(Record):
     ) -> EnvBase:
         """The environment that repeats this list's episodes on a traffic."""
         # The tensor code, so that a list plays the same with and without the native kernel.
-        env = replace(self.env, kernel="torch", compile=False)
+        env = replace(
+            self.env,
+            kernel="torch",
+            compile=False,
+        )
         model = make_traffic(self.traffics[traffic], env, Stream.named(self.stream))
-        return make_env(model, env, observation, reward, ROWS, mask=mask)
+        return make_env(
+            model,
+            env,
+            observation,
+            reward,
+            ROWS,
+            mask=mask,
+        )
 
     def drive_again(self) -> list[str]:
         """Drive every crash with its actions; how each ends, in the order of the list."""
@@ -105,13 +116,20 @@ class CrashList(Record):
             # One script for all episodes of a driver on a traffic: they are driven side by side.
             actions = {crash.episode: crash.actions for crash in group}
             policy = ScriptedPolicy(actions)
-            table = run_episodes(self.make_env(traffic), policy, list(actions), seed)
+            table = run_episodes(
+                self.make_env(traffic),
+                policy,
+                list(actions),
+                seed,
+            )
             ends += table["reason"].to_list()
         return ends
 
 
 def find_crashes(
-    episodes: pl.DataFrame, config: EvaluateConfig, most: int
+    episodes: pl.DataFrame,
+    config: EvaluateConfig,
+    most: int,
 ) -> tuple[CrashList, int]:
     """Drive failed episodes again and list those that end in the same way.
 
@@ -129,7 +147,12 @@ def find_crashes(
         if name in _LISTED and name == traffic.label()
     }
     # A list without crashes makes the environment in which they are looked for.
-    listed = CrashList(config.env, traffics, config.stream, [])
+    listed = CrashList(
+        config.env,
+        traffics,
+        config.stream,
+        [],
+    )
     pair = ["traffic", "agent"]
     failed = (
         episodes.filter(pl.col("reason").is_in(FAILURES), pl.col("traffic").is_in(list(traffics)))
@@ -143,8 +166,19 @@ def find_crashes(
         driver = make_driver(str(name), config.env)
         mask, policy = driver.behind(config.mask)
         observation = config.observation.read_by(driver.observation)
-        env = listed.make_env(str(traffic), observation, config.reward, mask)
-        again = run_episodes(env, policy, frame["episode"].to_list(), config.seed, actions=True)
+        env = listed.make_env(
+            str(traffic),
+            observation,
+            config.reward,
+            mask,
+        )
+        again = run_episodes(
+            env,
+            policy,
+            frame["episode"].to_list(),
+            config.seed,
+            actions=True,
+        )
         # Both tables have the same episodes in the same order.
         same = again.filter(again["reason"] == frame["reason"])
         crashes += [
@@ -211,5 +245,9 @@ def _checked(content: Any) -> CrashList:
         if name not in _LISTED or {"_target_", "name"} & set(options):
             raise ValueError(f"traffic {name!r:.80} is none of this package's")
         traffics[name] = make(TrafficConfig, {"name": name, **options}, "traffics")
-    listed = {"stream": content["stream"], "env": content["env"], "crashes": crashes}
+    listed = {
+        "stream": content["stream"],
+        "env": content["env"],
+        "crashes": crashes,
+    }
     return make(CrashList, {**listed, "traffics": traffics})

@@ -36,7 +36,11 @@ Row = dict[str, Any]
 #: Recipe and traffic to the episodes of each training, by driver's name.
 Cells = Mapping[tuple[str, str], Mapping[str, pl.DataFrame]]
 #: Rates per 1000 km by name: the ends that they count.
-_RATES = {"crashes": FAILURES[:1], "departures": FAILURES[1:], "failures": FAILURES}
+_RATES = {
+    "crashes": FAILURES[:1],
+    "departures": FAILURES[1:],
+    "failures": FAILURES,
+}
 #: The paper's Table VI: hard and soft crashes on Traffic_IDM, of an unstated number of runs.
 PAPER_VI = {"agent_idm": (19, 2), "agent_gan": (9, 0)}
 #: The paper's Table VII: % of MOBIL, mean reward and its standard deviation on Traffic_GAN, 1000
@@ -110,13 +114,25 @@ def rows(cells: Cells) -> list[Row]:
         trainings and episodes.
     """
     return [
-        _row(recipe, traffic, trainings, cells) for (recipe, traffic), trainings in cells.items()
+        _row(
+            recipe,
+            traffic,
+            trainings,
+            cells,
+        )
+        for (recipe, traffic), trainings in cells.items()
     ]
 
 
-def _row(recipe: str, traffic: str, trainings: Mapping[str, pl.DataFrame], cells: Cells) -> Row:
+def _row(
+    recipe: str,
+    traffic: str,
+    trainings: Mapping[str, pl.DataFrame],
+    cells: Cells,
+) -> Row:
     # Both [S, E]: trainings by episodes.
-    rewards, km = column(trainings, "reward"), column(trainings, pl.col("distance_m") / 1000.0)
+    rewards = column(trainings, "reward")
+    km = column(trainings, pl.col("distance_m") / 1000.0)
     mobil = _rewards(cells, SCALE_TOP, traffic)
     random_legal = _rewards(cells, SCALE_BOTTOM, traffic)
     score = lead = probability = None
@@ -125,11 +141,13 @@ def _row(recipe: str, traffic: str, trainings: Mapping[str, pl.DataFrame], cells
     if recipe == SCALE_TOP:
         mobil = None  # it is not compared with itself
     if mobil is not None:
-        lead, probability = difference(rewards, mobil), _probability(rewards, mobil)
+        lead = difference(rewards, mobil)
+        probability = _probability(rewards, mobil)
     # Counts and plain rates are of the episodes of all trainings.
     together = pl.concat(trainings.values())
     crashes = together.filter(_ended(FAILURES[:1]))
-    seconds, driven = float(together["duration_s"].sum()), float(km.sum())
+    seconds = float(together["duration_s"].sum())
+    driven = float(km.sum())
     row: Row = {
         "driver": recipe,
         "traffic": traffic,
@@ -157,11 +175,21 @@ def _row(recipe: str, traffic: str, trainings: Mapping[str, pl.DataFrame], cells
     for (name, frame), reward in zip(trainings.items(), rewards[:, None]):
         lead = None if mobil is None else difference(reward, mobil)
         training = {"driver": name, **entries("mean_reward", over_trainings(reward))}
-        row["each"].append({**training, **entries("minus_mobil", lead), **_failures(frame)})
+        row["each"].append(
+            {
+                **training,
+                **entries("minus_mobil", lead),
+                **_failures(frame),
+            }
+        )
     return row
 
 
-def _rewards(cells: Cells, recipe: str, traffic: str) -> Array | None:
+def _rewards(
+    cells: Cells,
+    recipe: str,
+    traffic: str,
+) -> Array | None:
     """The rewards [S, E] of a recipe on a traffic, if it drove there."""
     trainings = cells.get((recipe, traffic))
     return None if trainings is None else column(trainings, "reward")
@@ -185,16 +213,22 @@ def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:
     traffics = dict.fromkeys(traffic for _, traffic in cells)
     for one, other in pairs:
         for traffic in traffics:
-            first, second = cells.get((one, traffic)), cells.get((other, traffic))
+            first = cells.get((one, traffic))
+            second = cells.get((other, traffic))
             if first is not None and second is not None:
-                names = {"driver": one, "over": other, "traffic": traffic}
+                names = {
+                    "driver": one,
+                    "over": other,
+                    "traffic": traffic,
+                }
                 compared.append({**names, **_compared(first, second)})
     return compared
 
 
 def _compared(first: Mapping[str, pl.DataFrame], second: Mapping[str, pl.DataFrame]) -> Row:
     """The numbers of a row of :func:`comparisons`."""
-    rewards, other_rewards = column(first, "reward"), column(second, "reward")
+    rewards = column(first, "reward")
+    other_rewards = column(second, "reward")
     crashed, other_crashed = (column(cell, _ended(FAILURES[:1])) for cell in (first, second))
     # Per 1000 episodes, which is easier to read than a share.
     more_crashes = _crash_difference(crashed, other_crashed).scaled(1000.0)
@@ -231,7 +265,11 @@ def _probability(first: Array, second: Array) -> Estimate | None:
     return probability_of_improvement(first, second) if len(first) + len(second) > 2 else None
 
 
-def rows_of(rows: Sequence[Row], traffics: Sequence[str], drivers: Sequence[str]) -> list[Row]:
+def rows_of(
+    rows: Sequence[Row],
+    traffics: Sequence[str],
+    drivers: Sequence[str],
+) -> list[Row]:
     """The rows of ``drivers``, which may say that they have no mask, on ``traffics``."""
     # The default command drives the agents without a mask, under names that say so.
     names = {name for driver in drivers for name in (driver, f"{driver}+none")}
@@ -263,7 +301,12 @@ def matrix_table(rows: Sequence[Row]) -> Table:
         "changes/km": number_of("lane_changes_per_km", 2),
         "close behind": number_of("soft_crash_behind_per_episode", 2),
     }
-    return Table.of("Every driver on every traffic", rows, columns, names=2)
+    return Table.of(
+        "Every driver on every traffic",
+        rows,
+        columns,
+        names=2,
+    )
 
 
 def table_vi(rows: Sequence[Row]) -> Table:
@@ -275,11 +318,24 @@ def table_vi(rows: Sequence[Row]) -> Table:
         "each training": _each("hard_crash", 0),
     }
     paper = [
-        ["paper", "Traffic_IDM", name, "not stated", *map(str, counts), "", ""]
+        [
+            "paper",
+            "Traffic_IDM",
+            name,
+            "not stated",
+            *map(str, counts),
+            "",
+            "",
+        ]
         for name, counts in PAPER_VI.items()
     ]
     ours = rows_of(rows, ["idm", "idm_mobil"], [*PAPER_VI, "mobil"])
-    return _beside("Table VI: crashes on rule-driven traffic", paper, ours, columns)
+    return _beside(
+        "Table VI: crashes on rule-driven traffic",
+        paper,
+        ours,
+        columns,
+    )
 
 
 def table_vii(rows: Sequence[Row]) -> Table:
@@ -295,12 +351,27 @@ def table_vii(rows: Sequence[Row]) -> Table:
         "for MOBIL; the paper does not define its own."
     )
     paper = [
-        ["paper", "Traffic_GAN", name, "1000", *(f"{value:.2f}" for value in numbers), ""]
+        [
+            "paper",
+            "Traffic_GAN",
+            name,
+            "1000",
+            *(f"{value:.2f}" for value in numbers),
+            "",
+        ]
         for name, numbers in PAPER_VII.items()
     ]
     ours = rows_of(rows, ["gan"], [*PAPER_VII, "mobil", "random_legal"])
     title = "Table VII: performance on generated traffic"
-    return replace(_beside(title, paper, ours, columns), notes=[note])
+    return replace(
+        _beside(
+            title,
+            paper,
+            ours,
+            columns,
+        ),
+        notes=[note],
+    )
 
 
 def _each(key: str, digits: int) -> Cell:
@@ -309,7 +380,10 @@ def _each(key: str, digits: int) -> Cell:
 
 
 def _beside(
-    title: str, paper: list[list[str]], ours: list[Row], columns: Mapping[str, Cell]
+    title: str,
+    paper: list[list[str]],
+    ours: list[Row],
+    columns: Mapping[str, Cell],
 ) -> Table:
     """The paper's lines above our rows."""
     names: Mapping[str, Cell] = {
@@ -318,7 +392,12 @@ def _beside(
         "driver": text_of("driver"),
         "episodes": _trainings,
     }
-    here = Table.of(title, ours, {**names, **columns}, names=3)
+    here = Table.of(
+        title,
+        ours,
+        {**names, **columns},
+        names=3,
+    )
     return replace(here, lines=[*paper, *here.lines])
 
 
@@ -340,14 +419,22 @@ def comparison_table(rows: Sequence[Row]) -> Table:
         "crashes per 1000 episodes, more": number_of("crash_difference_per_1000_episodes", 1),
         "McNemar, each training: crashed alone, p": tests,
     }
-    return Table.of("Drivers compared on the same episodes", rows, columns, names=3)
+    return Table.of(
+        "Drivers compared on the same episodes",
+        rows,
+        columns,
+        names=3,
+    )
 
 
 # Files
 
 
 def write_report(
-    folder: Path, tables: Mapping[str, Table], figures: Mapping[str, Figure], intro: Sequence[str]
+    folder: Path,
+    tables: Mapping[str, Table],
+    figures: Mapping[str, Figure],
+    intro: Sequence[str],
 ) -> Path:
     """Write every figure as PNG and SVG, and ``report.html`` with tables and figures; its path."""
     # Everything is within the page, so that it opens without a network.

@@ -203,7 +203,10 @@ class Histogram:
         occupied = np.flatnonzero(self.counts)
         index = np.searchsorted(below[occupied + 1], place).clip(max=len(occupied) - 1)
         k = occupied[index]
-        share = ((place - below[k]) / self.counts[k]).clip(0.0, 1.0)
+        share = ((place - below[k]) / self.counts[k]).clip(
+            0.0,
+            1.0,
+        )
         edges = self.bins.edges
         return float(edges[k] + share * (edges[k + 1] - edges[k]))
 

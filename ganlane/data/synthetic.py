@@ -108,6 +108,10 @@ def _across(
     lasts = random.uniform(3.0, 5.0, n)
     begins = random.uniform(0.5, np.maximum(end - lasts - 0.5, 0.6))
     # Share of the change that is done, eased by half a cosine.
-    done = np.clip((time - begins[:, None]) / lasts[:, None], 0.0, 1.0)
+    done = np.clip(
+        (time - begins[:, None]) / lasts[:, None],
+        0.0,
+        1.0,
+    )
     moved = (changes * side * traffic.lane_width_m)[:, None]
     return wander + moved * 0.5 * (1.0 - np.cos(math.pi * done))

@@ -174,7 +174,13 @@ class _Evaluation:
         self.driving = self.place < self.total
         self.handed_out = min(rows, self.total)
         self.finished: list[TensorDictBase] = []
-        self.state: TensorDictBase = env.reset(start_of(env, numbers[:rows], seed))
+        self.state: TensorDictBase = env.reset(
+            start_of(
+                env,
+                numbers[:rows],
+                seed,
+            )
+        )
         # Sums over the decisions of each row's episode, and the last state of it.
         self.sums: TensorDictBase | None = None
         self.last: TensorDictBase | None = None
@@ -213,7 +219,10 @@ class _Evaluation:
             self.sums = added.apply(torch.zeros_like)
             self.last = state
         # Rows whose episode has ended keep what they had.
-        self.sums = (self.sums + added).where(self.driving, self.sums)
+        self.sums = (self.sums + added).where(
+            self.driving,
+            self.sums,
+        )
         self.last = state.where(self.driving, self.last)
         self.driving = self.driving & ~after["next", "done"].squeeze(-1)
         self.state = step_mdp(after)
@@ -263,8 +272,15 @@ class _Evaluation:
         if not bool(mask.any()):
             return
         number = self.numbers[self.place.clamp_max(self.total - 1)]
-        wanted = torch.where(self.place < self.total, number, self.state[keys.EPISODE])
-        self.state = self.env.reset(self.state.set("_reset", mask), next_episode=wanted)
+        wanted = torch.where(
+            self.place < self.total,
+            number,
+            self.state[keys.EPISODE],
+        )
+        self.state = self.env.reset(
+            self.state.set("_reset", mask),
+            next_episode=wanted,
+        )
         if not torch.equal(self.state[keys.EPISODE], wanted):
             raise UserError(
                 "env: its reset did not start the episodes that it was given; take next_episode "
@@ -286,7 +302,10 @@ def _added(state: TensorDictBase) -> TensorDict:
     for name in (keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND):
         values[name] = state[keys.EVENTS, name]
     rows = state.batch_size
-    return TensorDict({name: value.reshape(rows).double() for name, value in values.items()}, rows)
+    return TensorDict(
+        {name: value.reshape(rows).double() for name, value in values.items()},
+        rows,
+    )
 
 
 def _episode_rows(
@@ -338,13 +357,20 @@ def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     other: a rule of geometry, no law. A driver that cuts in and is struck from behind is not at
     fault by it.
     """
-    ahead = road.distance_ahead(vehicles.x[:, :1], vehicles.x[:, 1:])
+    ahead = road.distance_ahead(
+        vehicles.x[:, :1],
+        vehicles.x[:, 1:],
+    )
     along = vehicles.speed * torch.cos(vehicles.heading)
     across = vehicles.speed * torch.sin(vehicles.heading)
     # Two bodies met along the axis on which their extents began to overlap last. Headings are
     # small, so the axes are those of the road.
     since_along = _time_since(ahead, _gain(along), _reach(vehicles.length))
-    since_across = _time_since(_gain(vehicles.y), _gain(across), _reach(vehicles.width))
+    since_across = _time_since(
+        _gain(vehicles.y),
+        _gain(across),
+        _reach(vehicles.width),
+    )
     towards = torch.sign(_gain(vehicles.y))
     pushes = towards * across[:, :1] > -towards * across[:, 1:]
     at_fault = torch.where(since_along < since_across, ahead > 0, pushes)
@@ -371,7 +397,11 @@ def _time_since(
     Infinite where they do not close.
     """
     closing = -torch.sign(distance) * speed
-    return torch.where(closing > 0, (reach - distance.abs()) / closing.clamp_min(1e-9), torch.inf)
+    return torch.where(
+        closing > 0,
+        (reach - distance.abs()) / closing.clamp_min(1e-9),
+        torch.inf,
+    )
 
 
 class ScriptedPolicy(TensorDictModuleBase):
@@ -400,4 +430,7 @@ class ScriptedPolicy(TensorDictModuleBase):
         row = torch.searchsorted(self.episodes, episode.cpu())
         last = self.table.shape[1] - 1
         decision = tensordict[keys.EGO, "decisions"].cpu().clamp_max(last)
-        return tensordict.set(keys.ACTION, self.table[row, decision].to(episode.device))
+        return tensordict.set(
+            keys.ACTION,
+            self.table[row, decision].to(episode.device),
+        )

@@ -214,7 +214,10 @@ def normalized_percent(
         MOBIL's lead over the random driver includes 0, so the scale would have no length.
     """
     drivers = (agent, mobil, random_legal)
-    returns = np.stack([np.asarray(values, dtype=np.float64) for values in drivers], axis=1)
+    returns = np.stack(
+        [np.asarray(values, dtype=np.float64) for values in drivers],
+        axis=1,
+    )
     lead = paired_difference(returns[:, 1], returns[:, 2])
     if lead.interval is None:
         return None, "fewer than two episodes"

@@ -122,7 +122,11 @@ def bootstrap_means(values: Array) -> Array:
     The K columns of an episode stay together.
     """
     size = len(values)
-    counts: Iterable[Array | npt.NDArray[np.uint16]] = resample_counts(size, RESAMPLES, seed=0)
+    counts: Iterable[Array | npt.NDArray[np.uint16]] = resample_counts(
+        size,
+        RESAMPLES,
+        seed=0,
+    )
     if size * RESAMPLES <= _MOST_KEPT:
         counts = kept_counts(size, RESAMPLES)
     return np.concatenate([chunk.astype(np.float64) @ values / size for chunk in counts])
@@ -141,7 +145,15 @@ def _bca_levels(values: Array, means: Array) -> Array:
     below = ((means < mean).mean() + (means <= mean).mean()) / 2.0
     # Half a resample away from 0 and 1, where the normal quantile is infinite.
     edge = 0.5 / len(means)
-    bias = _NORMAL.inv_cdf(float(np.clip(below, edge, 1.0 - edge)))
+    bias = _NORMAL.inv_cdf(
+        float(
+            np.clip(
+                below,
+                edge,
+                1.0 - edge,
+            )
+        )
+    )
     shifted = [bias + _NORMAL.inv_cdf(float(level)) for level in TAIL_LEVELS]
     return np.array([_NORMAL.cdf(bias + z / (1.0 - acceleration * z)) for z in shifted])
 
@@ -205,7 +217,13 @@ def no_events(amount: float) -> Estimate:
 
 def interquartile_mean(scores: npt.ArrayLike) -> Array:
     """Mean of the middle half of the last axis: without a quarter, rounded down, at both ends."""
-    return np.asarray(scipy.stats.trim_mean(np.asarray(scores, dtype=np.float64), 0.25, axis=-1))
+    return np.asarray(
+        scipy.stats.trim_mean(
+            np.asarray(scores, dtype=np.float64),
+            0.25,
+            axis=-1,
+        )
+    )
 
 
 def over_trainings(scores: npt.ArrayLike, statistic: Callable[[Array], Array] = _mean) -> Estimate:
@@ -218,7 +236,10 @@ def over_trainings(scores: npt.ArrayLike, statistic: Callable[[Array], Array] = 
 
 def difference(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
     """Mean of ``first`` [S, E] minus mean of ``second`` [S', E], on the same episodes."""
-    return _estimate(_pair(first, second), lambda a, b: _mean(a) - _mean(b))
+    return _estimate(
+        _pair(first, second),
+        lambda a, b: _mean(a) - _mean(b),
+    )
 
 
 def probability_of_improvement(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
@@ -245,7 +266,11 @@ def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate |
         return np.asarray(sums[:, 0] / np.maximum(sums[:, 1], np.finfo(np.float64).tiny))
 
     # One table, so that a draw of trainings is one for events and kilometres.
-    return _estimate([np.stack([happened, amount])], ratio, bounds=(0.0, np.inf))
+    return _estimate(
+        [np.stack([happened, amount])],
+        ratio,
+        bounds=(0.0, np.inf),
+    )
 
 
 def normalized_over_trainings(
@@ -351,7 +376,11 @@ def _estimate(
         # This table's trainings are drawn anew, the others' stay as they are.
         chosen = generator.integers(trainings, size=(FEWER_RESAMPLES, trainings))
         drawn = list(means)
-        drawn[index] = np.moveaxis(means[index][0][..., chosen], -2, 0)
+        drawn[index] = np.moveaxis(
+            means[index][0][..., chosen],
+            -2,
+            0,
+        )
         parts.append(np.sqrt(trainings / (trainings - 1)) * (statistic(*drawn) - value))
         freedom.append(trainings - 1)
     # Satterthwaite: the degrees of freedom of a sum of variances that are known unequally well.
@@ -359,7 +388,10 @@ def _estimate(
     uncertainty = float((variances**2 / freedom).sum())
     degrees = variances.sum() ** 2 / uncertainty if uncertainty > 0.0 else np.inf
     wider = scipy.stats.t.ppf(TAIL_LEVELS[1], degrees) / scipy.stats.norm.ppf(TAIL_LEVELS[1])
-    low, high = np.clip(value + wider * np.quantile(np.sum(parts, axis=0), TAIL_LEVELS), *bounds)
+    low, high = np.clip(
+        value + wider * np.quantile(np.sum(parts, axis=0), TAIL_LEVELS),
+        *bounds,
+    )
     return Estimate(value, float(low), float(high))
 
 

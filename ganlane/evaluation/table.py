@@ -146,7 +146,12 @@ class Table:
         """Aligned columns, with the title above and the notes below."""
         # The tables of an evaluation have no title: the command is one.
         lines = [self.title, ""] if self.title else []
-        lines.append(aligned([self.headings, *self.lines], self.names))
+        lines.append(
+            aligned(
+                [self.headings, *self.lines],
+                self.names,
+            )
+        )
         if self.notes:
             lines += ["", *self.notes]
         return "\n".join(lines)

@@ -143,7 +143,12 @@ def distance(
         return Estimate(value)
     # Both tails are reflected about the estimate.
     tails = np.quantile(drawn**2, TAIL_LEVELS)
-    low, high = np.sqrt(np.maximum(2.0 * value**2 - tails[::-1], 0.0))
+    low, high = np.sqrt(
+        np.maximum(
+            2.0 * value**2 - tails[::-1],
+            0.0,
+        )
+    )
     return Estimate(
         value,
         min(value, float(low)),

@@ -288,7 +288,10 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
     block = len(colours) + 1
     figure = Figure(figsize=(7.5, 0.8 + 0.125 * block * len(quantities)))
     axes = figure.subplots()
-    axes.set(xlim=(0, 1), ylim=(block * len(quantities), 0))
+    axes.set(
+        xlim=(0, 1),
+        ylim=(block * len(quantities), 0),
+    )
     axes.set_xlabel("Jensen-Shannon distance to recorded driving")
     names = [name.replace("_", " ") for name in quantities]
     middles = [block * (index + 0.5) for index in range(len(names))]

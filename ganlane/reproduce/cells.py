@@ -158,7 +158,10 @@ def _driven(cells: Sequence[Cell], config: ReproduceConfig) -> Iterator[Cell]:
         return
     # Fresh processes: torch does not survive a fork once it has computed something.
     # Ctrl-C reaches them too: they finish their cell.
-    quiet: Any = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
+    quiet: Any = {
+        "initializer": signal.signal,
+        "initargs": (signal.SIGINT, signal.SIG_IGN),
+    }
     with ProcessPoolExecutor(config.workers, multiprocessing.get_context("spawn"), **quiet) as pool:
         jobs = {pool.submit(drive_cell, cell, config): cell for cell in cells}
         try:

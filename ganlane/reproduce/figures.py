@@ -273,7 +273,10 @@ def draw_episode(label: EpisodeLabel, tracks: pl.DataFrame) -> Figure:
     axes.set_ylim(-0.75 * lane_m, (label.lanes - 0.25) * lane_m)
     axes.set_title(f"{label.agent} on {label.traffic}, {times[0]:.1f} to {times[-1]:.1f} s")
     for line in range(label.lanes + 1):
-        style: dict[str, Any] = {"color": FAINT, "ls": (0, (8, 8))}
+        style: dict[str, Any] = {
+            "color": FAINT,
+            "ls": (0, (8, 8)),
+        }
         if line in (0, label.lanes):
             style = {"color": INK, "ls": "-"}
         axes.axhline((line - 0.5) * lane_m, **style)
@@ -413,7 +416,11 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
     bounds = [bound for row in shown for bound in _interval(row)]
     lowest = min(-20.0, *bounds)
     highest = max(20.0, *bounds)
-    figure, grid = panel_grid(len(traffics), 3.4, 1.3 + 0.19 * len(drivers))
+    figure, grid = panel_grid(
+        len(traffics),
+        3.4,
+        1.3 + 0.19 * len(drivers),
+    )
     for place, (axes, traffic) in enumerate(zip(grid, traffics)):
         axes.axvline(
             0.0,
@@ -427,8 +434,14 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
         )
         # Most leads lie within 20, those of random driving far below.
         axes.set_xscale("symlog", linthresh=20.0)
-        axes.set_yticks(range(len(drivers)), drivers if place % 3 == 0 else [])
-        axes.set_xticks([x for x in _LEADS if lowest <= x <= highest], minor=False)
+        axes.set_yticks(
+            range(len(drivers)),
+            drivers if place % 3 == 0 else [],
+        )
+        axes.set_xticks(
+            [x for x in _LEADS if lowest <= x <= highest],
+            minor=False,
+        )
         axes.set_xlim(1.15 * lowest, 1.15 * highest)
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_locator(NullLocator())

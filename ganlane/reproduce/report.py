@@ -45,7 +45,10 @@ _RATES = {
 PAPER_VI = {"agent_idm": (19, 2), "agent_gan": (9, 0)}
 #: The paper's Table VII: % of MOBIL, mean reward and its standard deviation on Traffic_GAN, 1000
 #: runs.
-PAPER_VII = {"agent_idm": (5.21, -22.33, 100.66), "agent_gan": (114.82, 33.62, 95.19)}
+PAPER_VII = {
+    "agent_idm": (5.21, -22.33, 100.66),
+    "agent_gan": (114.82, 33.62, 95.19),
+}
 _CSS = """
 body { font: 15px/1.5 sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }
 body { color: #262a30 }
@@ -477,7 +480,11 @@ def write_csv(path: Path, content: pl.DataFrame | Table | Sequence[Row]) -> None
     """
     if isinstance(content, Table):
         shown = [["" if cell == NOTHING else cell for cell in line] for line in content.lines]
-        frame = pl.DataFrame(shown, dict.fromkeys(content.headings, pl.String), orient="row")
+        frame = pl.DataFrame(
+            shown,
+            dict.fromkeys(content.headings, pl.String),
+            orient="row",
+        )
     elif isinstance(content, pl.DataFrame):
         frame = content
     else:

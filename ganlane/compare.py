@@ -65,6 +65,8 @@ def compare(
     # All traffics are made first, so that one that cannot be made shows before any driving.
     modules = {name: make_traffic(option, env, stream) for name, option in config.traffics.items()}
     total = len(modules) * len(drivers) * episodes
+    # One table per driver and traffic, concatenated at the end; current is what the environment at
+    # hand was built for.
     tables = []
     current = None
     disabled = quiet or not sys.stderr.isatty()
@@ -78,6 +80,7 @@ def compare(
             for driver in drivers:
                 observation = config.observation.read_by(driver.observation)
                 mask, policy = driver.behind(config.mask)
+                # All but the number of rows, which shrinks towards the end.
                 make = partial(
                     make_env,
                     module,
@@ -144,6 +147,7 @@ def recorded_crashes(table: pl.DataFrame) -> list[dict[str, Any]]:
     if "scene" not in table.columns:
         return []
     rows = []
+    # Generated and rule-driven traffics have no scenes to resample.
     recorded = table.filter(pl.col("scene").is_not_null())
     for (agent, traffic), episodes in recorded.group_by("agent", "traffic", maintain_order=True):
         per_km, scenes = evaluation.crashes_by_scene(episodes, episodes["scene"].to_list())
@@ -175,6 +179,7 @@ def publish(
     rows = evaluation.evaluation_rows(table)
     paired = evaluation.paired_rows(table)
     tables = [evaluation.text_table(rows)]
+    # A driver alone has nobody to be paired with.
     if paired:
         tables.append(evaluation.paired_table(paired))
     show(*tables, columns=config.get("columns", "all"))

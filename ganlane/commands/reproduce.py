@@ -107,6 +107,7 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
         print(table.text(), end="\n\n")
     if config.crashes:
         _list_crashes(episodes, config, folder)
+    # Where the episodes of every pair lie, for whoever wants to look closer.
     names = {f"{cell.driver} on {cell.traffic}": cell.path.name for cell in cells}
     record = {
         "rows": rows,
@@ -131,6 +132,7 @@ def _figures(
     numbers = {}
     figures = {}
     missing = {}
+    # Without the recordings there is no figure 2, but everything else.
     try:
         numbers["figure_2"] = drawings.forecasts_to_draw()
         figures["figure_2"] = drawings.draw_forecasts(numbers["figure_2"])
@@ -190,6 +192,7 @@ def trained_from_scratch(config: ReproduceConfig) -> ReproduceConfig:
     """
     for name in config.agents:
         with_seeds(name)  # a training that is not installed shows before hours of training
+    # A finished training has results.json; it is not made again.
     folders = {seed: Path(config.trained) / f"seed_{seed}" for seed in config.training_seeds}
     to_train = [seed for seed, path in folders.items() if not (path / "results.json").is_file()]
     print(
@@ -222,6 +225,7 @@ def trained_from_scratch(config: ReproduceConfig) -> ReproduceConfig:
             seed: read_agent(path / phase / "agent.safetensors") for seed, path in folders.items()
         }
         save_agents(file, trained)
+        # The fresh files take the place of those that ship, under the same masks.
         agents = [name.replace(f"{recipe}@all", f"{file}@all") for name in agents]
     return replace(
         config,

@@ -84,6 +84,7 @@ def run_episodes(
         )
     numbers = list(episodes)
     taken: list[TensorDict] | None = [] if actions else None
+    # Noisy layers and epsilon-greedy stay off: a table is about the learnt policy.
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         driven = _Evaluation(
             env,
@@ -155,6 +156,8 @@ class _Evaluation:
     ) -> None:
         rows = env.batch_size[0]
         self.total = len(numbers)
+        # Who holds something per row outside the tensordict, a foreign simulator for instance,
+        # loses it when rows move; a policy has to say that it does not.
         rows_stay = getattr(getattr(env, "traffic", None), "rows_must_stay", False)
         may_move = not rows_stay and not getattr(policy, "rows_must_stay", True)
         self.env = env
@@ -190,6 +193,7 @@ class _Evaluation:
 
         Returns ``sums`` and ``last`` [E] in the order of the episodes, on the CPU.
         """
+        # Decisions are driven in stretches; between two of them rows are collected and handed out.
         done = 0
         while done < self.total:
             for _ in range(self.check_every):
@@ -207,6 +211,7 @@ class _Evaluation:
 
         Nothing is read back from the device, so this never waits.
         """
+        # The policy writes into the tensordict that it reads.
         after = self.env.step(self.policy(self.state))
         if self.taken is not None:
             place = torch.where(self.driving, self.place, self.total)
@@ -224,6 +229,7 @@ class _Evaluation:
             self.sums,
         )
         self.last = state.where(self.driving, self.last)
+        # From its first end on a row counts no more, whatever it drives.
         self.driving = self.driving & ~after["next", "done"].squeeze(-1)
         self.state = step_mdp(after)
 
@@ -257,6 +263,7 @@ class _Evaluation:
             self.env = self.make_smaller(len(driving))
             self._keep(driving)
             return
+        # Spare rows take the next numbers of the list, in order.
         new = (~self.driving).nonzero()[: self.total - self.handed_out, 0]
         self.place[new] = torch.arange(
             self.handed_out, self.handed_out + len(new), device=self.place.device
@@ -264,6 +271,7 @@ class _Evaluation:
         self.handed_out += len(new)
         self.driving[new] = True
         assert self.sums is not None  # a decision has been driven
+        # The sums of a row begin anew with its episode.
         for total in self.sums.values():
             total[new] = 0.0
         # Spare rows that have ended start theirs again, uncounted.
@@ -281,6 +289,8 @@ class _Evaluation:
             self.state.set("_reset", mask),
             next_episode=wanted,
         )
+        # An environment that goes on with numbers of its own would fill the table with episodes
+        # that nobody asked for.
         if not torch.equal(self.state[keys.EPISODE], wanted):
             raise UserError(
                 "env: its reset did not start the episodes that it was given; take next_episode "
@@ -297,6 +307,7 @@ class _Evaluation:
 def _added(state: TensorDictBase) -> TensorDict:
     """What one decision, which led to ``state``, adds to the sums of its episode; each [N]."""
     values = {"reward": state[keys.REWARD]}
+    # Double precision: thousands of small rewards are summed.
     for name, term in state.get(keys.REWARD_TERMS, {}).items():
         values[f"reward_{name}"] = term
     for name in (keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND):
@@ -320,8 +331,10 @@ def _episode_rows(
     # One column per count, each [E].
     columns = dict(driven["sums"].items())
     columns |= {name: last[keys.EVENTS, name].squeeze(-1) for name in keys.END_EVENTS}
+    # What the ego counts itself since its episode began.
     columns |= {name: ego[name] for name in ("distance", "lane_changes", "decisions")}
     columns["duration_s"] = last[keys.STEP].double() * keys.PHYSICS_STEP_S
+    # A state without vehicles tells nothing about a crash.
     at_fault = pl.lit(None, pl.Boolean)
     if keys.VEHICLES in last:
         columns["at_fault"] = ego_at_fault(Vehicles.of(last[keys.VEHICLES]), road)
@@ -337,6 +350,7 @@ def _episode_rows(
         pl.lit(seed, pl.Int64).alias("seed"),
         pl.coalesce(*ends, pl.lit(OTHER)).alias("reason"),
         pl.col(keys.SOFT_CRASH).cast(pl.Int64),
+        # Onsets are counted; the paper asks whether there was one.
         (pl.col(keys.SOFT_CRASH) > 0).alias("had_soft_crash"),
         pl.col(keys.SOFT_CRASH_BEHIND).cast(pl.Int64),
         pl.col("reward", *terms),
@@ -371,6 +385,7 @@ def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
         _gain(across),
         _reach(vehicles.width),
     )
+    # Signs as seen from the ego: who has the higher speed towards the other pushes.
     towards = torch.sign(_gain(vehicles.y))
     pushes = towards * across[:, :1] > -towards * across[:, 1:]
     at_fault = torch.where(since_along < since_across, ahead > 0, pushes)
@@ -396,6 +411,7 @@ def _time_since(
 
     Infinite where they do not close.
     """
+    # Both branches are computed, so the divisor is kept above 0.
     closing = -torch.sign(distance) * speed
     return torch.where(
         closing > 0,
@@ -421,6 +437,7 @@ class ScriptedPolicy(TensorDictModuleBase):
         # One more than the longest, so that every script ends with keeping its lane.
         longest = max(map(len, actions.values())) + 1
         padded = [actions[number].ljust(longest, str(keys.KEEP)) for number in numbers]
+        # Sorted numbers, so that a search finds the row of an episode.
         self.episodes = torch.tensor(numbers)
         self.table = torch.tensor([list(map(int, digits)) for digits in padded])
 
@@ -428,6 +445,7 @@ class ScriptedPolicy(TensorDictModuleBase):
         """Write ``action``."""
         episode = tensordict[keys.EPISODE]
         row = torch.searchsorted(self.episodes, episode.cpu())
+        # A row that is driven on after its script keeps reading the last column.
         last = self.table.shape[1] - 1
         decision = tensordict[keys.EGO, "decisions"].cpu().clamp_max(last)
         return tensordict.set(

@@ -42,6 +42,7 @@ class Run:
 
         The table of an evaluation, else the results that are single numbers or texts.
         """
+        # A table needs rows; other commands leave single numbers.
         rows = self.results.get("rows")
         if not isinstance(rows, list):
             single = int | float | str
@@ -103,6 +104,7 @@ def names_of_runs(folders: Sequence[Path]) -> list[str]:
     the ends of their paths.
     """
     runs = [_settings(folder) for folder in folders]
+    # Alphabetical, so that the order does not depend on which run comes first.
     keys = sorted({key for settings in runs for key in settings})
     # A key that some lack belongs to a traffic or a scene that they do not have.
     shared = [key for key in keys if all(key in settings for settings in runs)]
@@ -128,6 +130,7 @@ def _settings(folder: Path) -> dict[str, str]:
         return {}
     # Which checkpoint a run went on from does not tell what it is.
     data.pop("resume", None)
+    # One level of dotted keys, as they are typed on the command line.
     settings = dict(_leaves(data))
     if isinstance(data.get("traffics"), Mapping):
         settings["traffics"] = as_typed(list(data["traffics"]))
@@ -169,12 +172,14 @@ def sweep_rows(folder: Path) -> list[dict[str, Any]]:
     for name, run in zip(names_of_runs(runs), runs):
         record = json.loads((run / "results.json").read_text(encoding="utf-8"))
         rows += [{"run": name, **row} for row in record.get("rows") or []]
+    # Rows of other commands have other columns, so they make no common table.
     return rows if all("mean_reward" in row for row in rows) else []
 
 
 def write_episodes(folder: str | Path, episodes: pl.DataFrame) -> Path:
     """Write one row per episode as ``episodes.parquet`` into ``folder``, atomically; its path."""
     path = Path(folder) / "episodes.parquet"
+    # A reader never sees half a file.
     with atomic_path(path) as part:
         episodes.write_parquet(part)
     return path
@@ -185,6 +190,7 @@ def plain(value: Any) -> Any:
 
     NaN and infinity as None.
     """
+    # Records first: they hold everything below.
     if is_dataclass(value) and not isinstance(value, type):
         return plain(asdict(value))
     if isinstance(value, Mapping):
@@ -276,6 +282,7 @@ def machine_sentence(threads: Sequence[int]) -> str:
     """
     here = machine()
     code = code_version()
+    # The model of CPU and accelerator decides about speed, the versions about digits.
     hardware = f"{here['cpu']}, {here['cores']} usable core{'s' if here['cores'] != 1 else ''}"
     if here["accelerator"]:
         hardware += f", {here['accelerator']}"

@@ -60,6 +60,7 @@ def evaluation_rows(episodes: pl.DataFrame) -> list[Row]:
         ``normalized_percent``, with ``normalized_percent_reason`` where it is None. A key with
         ``_ci`` holds the 95 % interval of its namesake as ``[low, high]``, or None.
     """
+    # Partitions keep the order of the command line.
     pairs = episodes.partition_by(["agent", "traffic"], maintain_order=True)
     return [_row(pair, episodes.filter(pl.col("traffic") == pair["traffic"][0])) for pair in pairs]
 
@@ -84,6 +85,7 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
     mobil = same_traffic.filter(pl.col("agent") == SCALE_TOP)
     if pair["agent"][0] != SCALE_TOP and mobil.height > 0:
         lead, _ = paired_lead(pair, mobil)
+    # Someone close behind is no end of an episode, so it is counted by episode.
     behind = mean_interval(pair["soft_crash_behind"].to_numpy())
     score, reason = _score(pair, same_traffic)
     return {
@@ -123,6 +125,7 @@ def _paired_rewards(*drivers: pl.DataFrame) -> list[Array]:
         shared = shared.join(
             driver.select(*_EPISODE, pl.col("reward").alias(str(column))), on=_EPISODE
         )
+    # Joins keep no order.
     ordered = shared.sort(_EPISODE)
     return [ordered[str(column)].cast(pl.Float64).to_numpy() for column in range(len(drivers))]
 
@@ -150,6 +153,7 @@ def paired_rows(episodes: pl.DataFrame) -> list[Row]:
     first = episodes["agent"][0]
     rows = []
     for (traffic,), driven in episodes.group_by("traffic", maintain_order=True):
+        # The first agent of the command is held against all others.
         ours = driven.filter(pl.col("agent") == first)
         others = driven.filter(pl.col("agent") != first)
         for (other,), theirs in others.group_by("agent", maintain_order=True):
@@ -189,6 +193,7 @@ def _score(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> tuple[Estimate | N
             needed = f"needs {SCALE_TOP} and {SCALE_BOTTOM} among the agents"
             return None, f"{needed}; {name} is missing"
         drivers.append(driver)
+    # Episodes that one of the three did not drive would shift the scale.
     returns = _paired_rewards(*drivers)
     if len(returns[0]) < 2:
         return None, "fewer than two episodes are shared by the drivers"
@@ -218,6 +223,7 @@ def normalized_percent(
         [np.asarray(values, dtype=np.float64) for values in drivers],
         axis=1,
     )
+    # The scale has a length only if MOBIL is better than random driving beyond doubt.
     lead = paired_difference(returns[:, 1], returns[:, 2])
     if lead.interval is None:
         return None, "fewer than two episodes"
@@ -228,6 +234,7 @@ def normalized_percent(
     # A resample without MOBIL's lead would divide by zero.
     with_scale = means[means[:, 1] != means[:, 2]]
     low, high = np.quantile(percent_of_way(*with_scale.T), TAIL_LEVELS)
+    # The value itself is of all episodes, not of the resamples.
     value = percent_of_way(*returns.mean(axis=0))
     return Estimate(float(value), float(low), float(high)), None
 
@@ -283,6 +290,7 @@ def crashes_by_scene(episodes: pl.DataFrame, scenes: Sequence[str]) -> tuple[Est
         raise UserError(
             "crashes per km: nobody drove; give episodes that last at least one decision."
         )
+    # One scene has no spread to resample.
     if len(driven) < 2:
         return Estimate(float(crashes.sum() / total)), rows
     if crashes.sum() == 0:
@@ -304,6 +312,7 @@ def failed_episodes(episodes: pl.DataFrame) -> list[Row]:
     """
     failed = episodes.filter(pl.col("reason").is_in(FAILURES))
     rows = []
+    # A row per driver, traffic and seed, so that an episode can be driven again by its numbers.
     for names, frame in failed.group_by(
         "agent",
         "traffic",

@@ -122,6 +122,7 @@ def bootstrap_means(values: Array) -> Array:
     The K columns of an episode stay together.
     """
     size = len(values)
+    # All tables of one evaluation have the same number of episodes, so the draws are shared.
     counts: Iterable[Array | npt.NDArray[np.uint16]] = resample_counts(
         size,
         RESAMPLES,

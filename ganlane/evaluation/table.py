@@ -29,6 +29,7 @@ def aligned(lines: Sequence[Sequence[str]], names: int = 1) -> str:
         numbers = [cell.rjust(width) for cell, width in zip(cells[names:], widths[names:])]
         return "  ".join([*words, *numbers]).rstrip()
 
+    # Two spaces between columns, in the ruler too: fitting() finds the columns by it.
     ruler = "  ".join("-" * width for width in widths)
     return "\n".join([line(lines[0]), ruler, *map(line, lines[1:])])
 
@@ -40,6 +41,7 @@ def show(*texts: str, columns: str = "auto") -> None:
     no terminal, tables are whole.
     """
     text = "\n\n".join(texts)
+    # A file or a pipe gets all columns.
     if columns == "auto" and sys.stdout.isatty():
         text = fitting(text, shutil.get_terminal_size().columns)
     print(text)
@@ -72,10 +74,12 @@ def _narrowed(lines: Sequence[str], width: int) -> str:
         left = [span.stop - span.start + 2 for other, span in spans.items() if other not in gone]
         if name in spans and sum(left) > width + 2:
             gone.add(name)
+    # Every line is cut at the same places.
     rows = []
     for line in lines[head:]:
         cells = [line[span] for name, span in spans.items() if name not in gone]
         rows.append("  ".join(cells).rstrip())
+    # In the order of the table, so that a reader knows where they would be.
     hidden = ", ".join(name for name in spans if name in gone)
     return "\n".join([*lines[:head], *rows, f"(columns=all shows: {hidden})"])
 
@@ -173,6 +177,7 @@ def significant(value: float | None) -> str:
         return NOTHING
     # Rounded first: 9.996 has three digits as 10.0, not as 10.00.
     rounded = float(f"{value:.3g}")
+    # Digits before the point; below 1 the format counts them itself.
     whole = len(str(int(abs(rounded))))
     return f"{rounded:.{max(0, 3 - whole)}f}" if abs(rounded) >= 1 else f"{rounded:.3g}"
 
@@ -235,6 +240,7 @@ def text_table(rows: Sequence[Row]) -> str:
 
     Below them stands a line for each reason why a score is missing.
     """
+    # Columns that say nothing here make room for those that do.
     columns = {
         heading: cell
         for heading, cell in _COLUMNS.items()

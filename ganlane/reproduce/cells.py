@@ -77,6 +77,8 @@ def cells_of(config: ReproduceConfig, traffics: dict[str, TrafficConfig]) -> lis
     drivers = make_drivers(config.agents, config.env, config.device)
     cells = []
     for traffic, option in traffics.items():
+        # A changed setting gives another file name, so that old episodes are never taken for new
+        # ones.
         for driver in drivers:
             settings = _settings(
                 driver,
@@ -134,6 +136,7 @@ def _settings(
 
 def drive(cells: Sequence[Cell], config: ReproduceConfig) -> None:
     """Drive the cells that are not there yet, each into its file."""
+    # What an earlier command drove is taken as it is.
     missing = [cell for cell in cells if not cell.path.is_file()]
     no_terminal = not sys.stderr.isatty()
     with tqdm(
@@ -163,11 +166,13 @@ def _driven(cells: Sequence[Cell], config: ReproduceConfig) -> Iterator[Cell]:
         "initargs": (signal.SIGINT, signal.SIG_IGN),
     }
     with ProcessPoolExecutor(config.workers, multiprocessing.get_context("spawn"), **quiet) as pool:
+        # Traffic by traffic, as in the list; slow ones may end later.
         jobs = {pool.submit(drive_cell, cell, config): cell for cell in cells}
         try:
             for job in as_completed(jobs):
                 job.result()
                 yield jobs[job]
+        # Ctrl-C as well: what is running ends, what waits is dropped.
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
@@ -186,6 +191,7 @@ def drive_cell(cell: Cell, config: ReproduceConfig) -> None:
     )
     driver = make_driver(cell.driver, config.env, device=config.device)
     table = compare([driver], alone, quiet=True)
+    # The file tells what it holds, whoever finds it.
     origin = {
         "settings": cell.settings,
         "code": code_version(),

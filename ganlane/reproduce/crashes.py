@@ -97,6 +97,7 @@ class CrashList(Record):
             kernel="torch",
             compile=False,
         )
+        # The same stream of randomness, so that others start and act as they did.
         model = make_traffic(self.traffics[traffic], env, Stream.named(self.stream))
         return make_env(
             model,
@@ -115,6 +116,7 @@ class CrashList(Record):
         ):
             # One script for all episodes of a driver on a traffic: they are driven side by side.
             actions = {crash.episode: crash.actions for crash in group}
+            # Nobody decides: the actions of the list are taken as they are.
             policy = ScriptedPolicy(actions)
             table = run_episodes(
                 self.make_env(traffic),
@@ -154,6 +156,7 @@ def find_crashes(
         [],
     )
     pair = ["traffic", "agent"]
+    # The shortest of each pair: they show soonest what went wrong, and drive again fastest.
     failed = (
         episodes.filter(pl.col("reason").is_in(FAILURES), pl.col("traffic").is_in(list(traffics)))
         .sort("decisions", "episode")
@@ -163,6 +166,7 @@ def find_crashes(
     )
     crashes: list[Crash] = []
     for (traffic, name), frame in failed.group_by(pair, maintain_order=True):
+        # Drive with the policy itself once more, to write down its actions.
         driver = make_driver(str(name), config.env)
         mask, policy = driver.behind(config.mask)
         observation = config.observation.read_by(driver.observation)
@@ -188,6 +192,7 @@ def find_crashes(
                 seed=config.seed,
                 episode=row["episode"],
                 end=row["reason"],
+                # A crash in the first moments may leave a distance just below 0.
                 distance_m=round(max(row["distance_m"], 0.0), 1),
                 actions=row["actions"],
             )
@@ -199,6 +204,7 @@ def find_crashes(
 def write_crashes(path: str | Path, listed: CrashList) -> None:
     """Write a list as JSON, atomically; a traffic is named, and its import path left out."""
     traffics = {}
+    # Traffics without a crash need no settings in the list.
     for name in sorted({crash.traffic for crash in listed.crashes}):
         traffics[name] = plain(listed.traffics[name])
         del traffics[name]["_target_"]
@@ -235,6 +241,7 @@ def read_crashes(path: str | Path) -> CrashList:
 
 def _checked(content: Any) -> CrashList:
     """The list of a file's content; one of :data:`_BROKEN` for what is not such a list."""
+    # Other JSON files of a run are refused before their keys are looked at.
     if content["kind"] != _KIND:
         raise ValueError("another kind of file")
     crashes = content["crashes"]

@@ -81,6 +81,7 @@ def interesting(windows: Windows) -> list[tuple[str, int]]:
     moves = along[:, -1] - along[:, 0] > LEAST_M
     chosen: list[tuple[str, int]] = []
     seen: set[tuple[str, int]] = set()
+    # The best of each kind, as many as there are panels for it.
     for kind, count in PANELS.items():
         wanted = len(chosen) + count
         for row in np.argsort(-scores[kind], kind="stable").tolist():
@@ -103,6 +104,7 @@ def forecasts_to_draw() -> pl.DataFrame:
         UserError: the recordings are not at hand.
     """
     generator, metadata = load_generator(shipped_generator("paper"), "paper")
+    # Predictions of what the generator was fitted to would flatter it.
     held_out = set(metadata["data"]["held_out"])
     tracks = scene_tracks(read_scenes(default_scenes()))
     scenes = [scene for scene in tracks if scene.name in held_out]
@@ -130,6 +132,7 @@ def forecasts_to_draw() -> pl.DataFrame:
         # The observed path ends at the present, the others begin there.
         for name, path in {**paths, "observed": seen}.items():
             present = PRESENT if name == "observed" else 0
+            # Time 0 is the present, in both directions.
             columns = {
                 "time_s": (np.arange(len(path)) - present) * FRAME_S,
                 "ahead_m": path[:, 0],
@@ -198,6 +201,7 @@ def drive_beginning(config: ReproduceConfig, traffic: TrafficConfig) -> Trajecto
     name = with_seeds([*learnt, config.agents[-1]][0])[0]
     driver = make_driver(name, config.env, device=config.device)
     observation = config.observation.read_by(driver.observation)
+    # A trained agent brings the mask and the observation that it was trained with.
     mask, policy = driver.behind(config.mask)
     module = make_traffic(traffic, config.env, Stream.named(config.stream))
     env = make_env(
@@ -234,6 +238,7 @@ def busiest(episode: Trajectory) -> pl.DataFrame:
     near[:, 0] = False
     # How far each moves across within the seconds that start at a frame, [T - shown, M].
     across = np.abs(episode.y[shown:] - episode.y[: len(episode) - shown])
+    # The start whose seconds have the most movement across in them, over all near vehicles.
     first = int(np.argmax((across * near[: len(across)]).sum(axis=1)))
     part = slice(first, first + shown + 1)
     # A vehicle that is recycled would draw a line across the picture.
@@ -362,6 +367,7 @@ def draw_transfer(curves: pl.DataFrame, rows: Sequence[Row]) -> Figure:
         points = [run.select("decisions", "mean_reward").to_numpy().T for run in runs]
         # All runs at the decisions of the first one.
         x = points[0][0]
+        # Runs are evaluated at slightly different decisions, so they are interpolated.
         y = np.stack([np.interp(x, *run) for run in points])
         axes.fill_between(
             x,
@@ -380,6 +386,7 @@ def draw_transfer(curves: pl.DataFrame, rows: Sequence[Row]) -> Figure:
                     lw=0.5,
                     alpha=0.6,
                 )
+    # Where the second phase begins.
     switch = curves.filter(pl.col("phase") == "first")["decisions"].to_numpy().max()
     axes.axvline(
         switch,

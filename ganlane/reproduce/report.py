@@ -138,6 +138,7 @@ def _row(
     km = column(trainings, pl.col("distance_m") / 1000.0)
     mobil = _rewards(cells, SCALE_TOP, traffic)
     random_legal = _rewards(cells, SCALE_BOTTOM, traffic)
+    # What cannot be said stays None and is printed as a dash.
     score = lead = probability = None
     if mobil is not None and random_legal is not None:
         score = normalized_over_trainings(rewards, mobil, random_legal)
@@ -174,6 +175,7 @@ def _row(
     row["lane_changes_per_km"] = changes / driven if driven > 0.0 else None
     row["soft_crash_behind_per_episode"] = together["soft_crash_behind"].mean()
     row["at_fault_share"] = crashes["at_fault"].mean()
+    # Trainings one by one, so that a reader sees how far they lie apart.
     row["each"] = []
     for (name, frame), reward in zip(trainings.items(), rewards[:, None]):
         lead = None if mobil is None else difference(reward, mobil)
@@ -235,6 +237,7 @@ def _compared(first: Mapping[str, pl.DataFrame], second: Mapping[str, pl.DataFra
     crashed, other_crashed = (column(cell, _ended(FAILURES[:1])) for cell in (first, second))
     # Per 1000 episodes, which is easier to read than a share.
     more_crashes = _crash_difference(crashed, other_crashed).scaled(1000.0)
+    # Trainings of one seed started from the same random numbers.
     namesakes = dict(zip(map(seed_of, second), other_crashed))
     # A driver without trainings, say MOBIL, is held against every training of the first.
     if len(namesakes) == 1:
@@ -242,6 +245,7 @@ def _compared(first: Mapping[str, pl.DataFrame], second: Mapping[str, pl.DataFra
     tests = []
     for name, crashes in zip(first, crashed):
         if seed_of(name) in namesakes:
+            # On the same episodes only those count in which one of the two crashed.
             test = mcnemar(crashes > 0, namesakes[seed_of(name)] > 0)
             tests.append({"driver": name, **vars(test)})
     return {
@@ -259,6 +263,8 @@ def _crash_difference(first: Array, second: Array) -> Estimate:
     """
     if first.any() or second.any():
         return difference(first, second)
+    # Nobody crashed, which is no proof that nobody would: the exact bound of no crash in E
+    # episodes.
     most = clopper_pearson(0, first.shape[1]).high or 0.0
     return Estimate(0.0, -most, most)
 
@@ -449,6 +455,7 @@ def write_report(
         # Without the XML declaration, the drawing may stand in a page.
         drawing = drawing[drawing.index("<svg") :]
         parts.append(f"<h2>{name.replace('_', ' ').capitalize()}</h2>{drawing}")
+    # Figures first, tables below.
     parts += map(_html, tables.values())
     page = (
         '<!doctype html><html lang="en"><meta charset="utf-8">'
@@ -463,6 +470,7 @@ def _html(table: Table) -> str:
     # The columns with names are headings of their line.
     head = "".join(f"<th>{html.escape(name)}</th>" for name in table.headings)
     lines = [f"<tr>{head}</tr>"]
+    # Everything is escaped: names of drivers and traffics come from the user.
     for line in table.lines:
         cells = [html.escape(cell) for cell in line]
         names = "".join(f'<th scope="row">{cell}</th>' for cell in cells[: table.names])
@@ -479,6 +487,7 @@ def write_csv(path: Path, content: pl.DataFrame | Table | Sequence[Row]) -> None
     Of rows, an interval becomes two columns (``_low``, ``_high``), and lists are left out.
     """
     if isinstance(content, Table):
+        # An empty cell reads as null; a dash would make the column a text.
         shown = [["" if cell == NOTHING else cell for cell in line] for line in content.lines]
         frame = pl.DataFrame(
             shown,

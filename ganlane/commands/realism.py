@@ -104,6 +104,7 @@ def realism(config: RealismConfig, folder: Path) -> str:
     for name, make in factories.items():
         if name == config.traffic.label() or config.long_against:
             runs[name] = long_runs(config, name, make)
+    # Measured and compared here; drawing and printing only show it.
     numbers = card_numbers(
         starts,
         site,
@@ -170,6 +171,7 @@ def _make(
         lanes=int(road.lanes),
         lane_width_m=float(road.lane_width_m),
     )
+    # The stream of reported figures, never the one that recipes are chosen on.
     return make_traffic(traffic, env, Stream.REPORT)
 
 
@@ -191,6 +193,7 @@ def folds_of(config: RealismConfig, scenes: Sequence[str]) -> list[Fold]:
     held_out: Sequence[str] = ()
     if config.scenes != "all" or _fits(config, scenes):
         held_out = config.data.held_out_scenes(scenes, HELD_OUT)
+    # Starts may include scenes of the fit; the card then shows the held-out ones apart.
     starts = scenes if config.scenes == "all" else held_out
     if not starts:
         raise UserError(
@@ -205,6 +208,7 @@ def _fits(config: RealismConfig, scenes: Sequence[str]) -> bool:
 
     Also where the user says which were held out.
     """
+    # Desired speeds that are fitted need scenes of their own, too.
     if config.data.held_out is not None or config.desired_above_mps is None:
         return True
     used = {
@@ -238,6 +242,7 @@ def drive_from_starts(
             config.repeats,
             config.seed,
         )
+    # Recorded starts: every vehicle begins where and as fast as it was recorded.
     frame = read_scenes(path)
     folds = folds_of(config, sorted(frame["scene"].unique().to_list()))
     # Desired speeds are fitted unless the user gives them.
@@ -262,6 +267,7 @@ def i80_files_wanted(config: RealismConfig, path: Path | None) -> dict[str, Path
     if path is not None and config.i80 is not False:
         files = {name: path.parent / file for name, file in I80_FILES.items()}
         files = {name: file for name, file in files.items() if file.is_file()}
+    # Asked for in so many words, so leaving it out in silence would be wrong.
     if config.i80 and not files:
         raise UserError(
             f"i80=true: none of {', '.join(I80_FILES.values())} lies next to the scenes; use "

@@ -56,6 +56,7 @@ class Recording:
 
         With a column ``driven``, the other vehicles are replayed.
         """
+        # Without the column everybody is driven.
         if "driven" not in rows.columns:
             rows = rows.with_columns(driven=True)
         # Frames of the scene count from its first one, tracks by their number.
@@ -136,6 +137,7 @@ class Recording:
                 name: getattr(self, name)[rows, who] for name in ("x", "y", "speed", "present")
             }
             arrays |= {name: getattr(self, name)[who] for name in ("length", "width", "driven")}
+            # The unit stays that of the recording: pieces of one scene are not independent.
             pieces.append(
                 replace(
                     self,

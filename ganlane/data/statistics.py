@@ -170,6 +170,7 @@ class Histogram:
         sample = np.asarray(values, dtype=np.float64)
         low = self.bins.low
         high = self.bins.high
+        # numpy drops values beyond the bins; these are to count in the outermost ones.
         inside = sample.clip(low, high)
         self.counts += np.histogram(inside, self.bins.number, (low, high))[0]
         self._sum += float(sample.sum())
@@ -238,6 +239,7 @@ def measure_exposure(frame: pl.DataFrame) -> Exposure:
         road=pl.col("x").max() - pl.col("x").min(),
         cars=(pl.col("vehicle") % TRACK_STRIDE).n_unique(),
     )
+    # The length of each track as it was driven, lane changes included.
     driven = (pl.col(name).diff().over(TRACK) ** 2 for name in ("x", "y"))
     return Exposure(
         scenes=roads.height,
@@ -265,6 +267,7 @@ def leader_gaps(frame: pl.DataFrame) -> pl.DataFrame:
         name: pl.col(name).shift(-1).over("scene", "frame", "lane")
         for name in ("x", "length", "speed")
     }
+    # Positions are those of the bodies' centres, so half of both lengths lies between.
     gap = ahead["x"] - pl.col("x") - 0.5 * (ahead["length"] + pl.col("length"))
     ordered = frame.sort(
         "scene",
@@ -334,6 +337,7 @@ def quantities(
 def poisson_interval(count: int) -> tuple[float, float]:
     """Exact 95 % confidence interval of a Poisson mean after ``count`` events (Garwood 1936)."""
     tail = 0.5 * (1.0 - 0.95)
+    # Quantiles of gamma distributions; after no event the lower bound is 0.
     low = gammaincinv(count, tail) if count else 0.0
     return float(low), float(gammaincinv(count + 1, 1.0 - tail))
 
@@ -417,6 +421,7 @@ class DrivingStatistics:
 
     def to_dict(self) -> dict[str, Any]:
         """Nested dictionaries of numbers, None and lists, as in JSON."""
+        # Through JSON, so that tuples become the lists that a file gives back.
         return json.loads(json.dumps(asdict(self)))
 
     @classmethod

@@ -70,6 +70,7 @@ def _scene(
     )
     # The nearest lane, as recordings have it.
     lane = np.rint(y / traffic.lane_width_m).clip(0, traffic.lanes - 1).astype(np.int64)
+    # Rows vehicle by vehicle, each from its first frame to its last.
     columns = {
         "scene": np.full(n * frames, f"synthetic-{number}"),
         "vehicle": np.repeat(np.arange(1, n + 1), frames),

@@ -135,6 +135,7 @@ class EventCounter:
         now: Tensor,
     ) -> int:
         """Number of entries that are true now and were not at the last count."""
+        # An event counts when it begins, however long it lasts.
         before = self.before.get(name, torch.zeros_like(now))
         self.before[name] = now
         return int((now & ~before).sum())
@@ -250,6 +251,7 @@ def _rows(parameters: LongRunParameters, km: float) -> int:
             _MOST_SAMPLES // (steps * parameters.vehicles),
         ),
     )
+    # Not more rows than the remaining kilometres ask for.
     return int(np.clip(np.ceil(km / expected), 1, most))
 
 
@@ -298,6 +300,7 @@ def drive_spawned(
         keys.SEED: torch.full((rows,), parameters.seed),
         keys.EPISODE: first + torch.arange(rows),
     }
+    # Numbers go on from batch to batch, so that no episode is driven twice.
     key = episode_key(traffic.stream, *counters.values())
     state = spawned_vehicles(traffic, parameters, key)
     memory = traffic.init_memory(state, absorb(key, 0))
@@ -342,6 +345,7 @@ def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
     speeds: dict[str, list[dict[str, float]]] = {}
     for seconds in SPEEDS_AT_S:
         time = round(seconds / PHYSICS_STEP_S)
+        # An episode that ended earlier says nothing about this time.
         after = range(rows) if time < steps else ()
         speeds[f"{seconds:g} s"] = [_speeds(trajectories, row, time) for row in after]
     # The first time at which the episode's vehicles have covered 5000 m on average.

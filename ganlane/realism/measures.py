@@ -132,6 +132,7 @@ def distance(
 
     ``paired`` units are the same and are resampled together; else ``simulated`` alone is.
     """
+    # Units are pooled: a scene has too few samples of its own for a histogram.
     value = pooled_distance(simulated, recorded)
     (drawn,) = _resampled(
         [simulated],
@@ -228,6 +229,7 @@ def ceiling(recorded: Array) -> float | None:
     half = np.zeros((SPLITS, units))
     for row in half:
         row[generator.permutation(units)[: units // 2]] = 1.0
+    # All splits at once: [splits, units] times [units, bins].
     values = jensen_shannon(half @ recorded, (1.0 - half) @ recorded)
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else None

@@ -42,10 +42,12 @@ def card_text(numbers: Mapping[str, Any]) -> list[str]:
     """The card's tables, of the ``numbers`` in ``results.json``."""
     traffic = numbers["traffic"]
     held_out = numbers["quantities_held_out"]
+    # All scenes first; what was held out from the fit apart, where both were driven.
     tables = [quantities_table(numbers["quantities"], traffic)]
     if held_out is not None:
         tables.append(f"held-out scenes alone\n{quantities_table(held_out, traffic)}")
     tables.append(starts_table(numbers["driving"]))
+    # A second site, to which nothing was fitted.
     for name, rows in numbers["i80"].items():
         tables.append(f"I-80, {name}\n{quantities_table(rows, traffic)}")
     for name, runs in {
@@ -94,6 +96,7 @@ def quantities_table(quantities: Mapping[str, Any], traffic: str) -> str:
             )
         ]
         for rival in rivals:
+            # The difference is paired: both drove the same scenes.
             theirs = row["against"][rival]
             line += [
                 number(theirs["distance"]),
@@ -148,6 +151,7 @@ def _run_cells(run: Mapping[str, Any], traffic: str) -> dict[str, str]:
     for time, at in run["speeds"].items():
         speeds = f"{number(at['mean_speed_mps'], 1)}, {number(at['spread_mps'], 2)}"
         cells[f"mean speed, spread after {time}, m/s"] = speeds
+    # The tails show most: recorded drivers brake and accelerate harder than models.
     for level, value in run["acceleration_quantiles"].items():
         cells[f"acceleration, {100 * float(level):g} % quantile"] = number(value, 2)
     share = run["guard_share"]
@@ -160,6 +164,7 @@ def checks_text(checks: Mapping[str, Any]) -> str:
 
     def told(name: str, value: bool | None) -> str:
         unknown = "no guard" if name == "guard_under_5_percent" else "unknown"
+        # None: what the check looks at was not there.
         answer = {
             True: "yes",
             False: "no",
@@ -242,6 +247,7 @@ def draw_distributions(
             colour = colours[driver]
             if not total:
                 continue
+            # Densities, so that traffics with more samples are not higher.
             density = counts[name] / total / np.diff(edges)
             plot_line(
                 axes,
@@ -304,12 +310,14 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
     axes.tick_params("y", length=0)
     axes.grid(False, axis="y")
     for index, row in enumerate(quantities.values()):
+        # Quantities from top to bottom, traffics within each in the order of the legend.
         top = block * index
         axes.axhline(
             top,
             color=GRID,
             lw=0.8,
         )
+        # The best that can be expected, and the worst that makes sense.
         for mark, colour in (
             ("ceiling", INK),
             ("floor", FAINT),
@@ -392,6 +400,7 @@ def draw_speeds_over_time(runs: Sequence[Mapping[str, Any]], spread_mps: float) 
                 np.array(list(speeds.values()), np.float64),
                 color=colour,
             )
+    # A traffic that holds the recorded spread stays near this level.
     grid[1].axhline(spread_mps, color=INK)
     add_legend(figure, {"recorded": INK, **colours})
     return figure

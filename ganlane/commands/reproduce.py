@@ -141,7 +141,10 @@ def _figures(
     if "gan" in traffics:
         episode = drawings.drive_beginning(config, traffics["gan"])
         numbers["figure_3"] = drawings.busiest(episode)
-        figures["figure_3"] = drawings.draw_episode(episode.label, numbers["figure_3"])
+        figures["figure_3"] = drawings.draw_episode(
+            episode.label,
+            numbers["figure_3"],
+        )
     else:
         missing["figure 3"] = "the traffic gan is not among the traffics"
     return numbers, figures, missing

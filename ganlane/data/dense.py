@@ -72,7 +72,10 @@ class Recording:
         # Values per track, the same in all of its rows.
         for name in ("length", "width", "driven"):
             column = rows[name].to_numpy()
-            arrays[name] = np.zeros(shape[1], column.dtype)
+            arrays[name] = np.zeros(
+                shape[1],
+                column.dtype,
+            )
             arrays[name][track] = column
         present = np.zeros(shape, bool)
         present[time, track] = True

@@ -148,7 +148,11 @@ class Bins:
     @property
     def edges(self) -> np.ndarray:
         """The bins' limits [number + 1]."""
-        return np.linspace(self.low, self.high, self.number + 1)
+        return np.linspace(
+            self.low,
+            self.high,
+            self.number + 1,
+        )
 
 
 class Histogram:
@@ -156,7 +160,10 @@ class Histogram:
 
     def __init__(self, bins: Bins) -> None:
         self.bins = bins
-        self.counts = np.zeros(bins.number, dtype=np.int64)
+        self.counts = np.zeros(
+            bins.number,
+            dtype=np.int64,
+        )
         self._sum = 0.0
         self._squares = 0.0
 

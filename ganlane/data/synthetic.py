@@ -58,7 +58,11 @@ def _scene(
     # Along the road: a slot each, and a sine around one speed.
     swing = random.uniform(0.3, 1.0, (n, 1)) * traffic.speed_swing_mps
     omega = 2.0 * math.pi / random.uniform(6.0, 10.0, (n, 1))
-    phase = random.uniform(0.0, 2.0 * math.pi, (n, 1))
+    phase = random.uniform(
+        0.0,
+        2.0 * math.pi,
+        (n, 1),
+    )
     speed = traffic.speed_mps + swing * np.cos(omega * time + phase)
     slots = (np.arange(n) * traffic.slot_m)[:, None]
     x = slots + traffic.speed_mps * time + swing / omega * np.sin(omega * time + phase)
@@ -102,12 +106,19 @@ def _across(
     wander = traffic.wander_m * np.sin(pace * time + phase)
     # To a random side, away from the edges of the road.
     side = random.choice([-1, 1], n)
-    side = np.where(home == traffic.lanes - 1, -1, side)
+    side = np.where(
+        home == traffic.lanes - 1,
+        -1,
+        side,
+    )
     side = np.where(home == 0, 1, side)
     # A change takes up to 5 s and must fit into the recording.
     changes = (random.uniform(size=n) < traffic.changing_share) & (traffic.lanes > 1) & (end > 6.0)
     lasts = random.uniform(3.0, 5.0, n)
-    begins = random.uniform(0.5, np.maximum(end - lasts - 0.5, 0.6))
+    begins = random.uniform(
+        0.5,
+        np.maximum(end - lasts - 0.5, 0.6),
+    )
     # Share of the change that is done, eased by half a cosine.
     done = np.clip(
         (time - begins[:, None]) / lasts[:, None],

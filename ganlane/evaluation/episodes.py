@@ -108,7 +108,13 @@ def run_episodes(
     for place in range(len(numbers)):
         digits = decisions["action"][decisions["place"] == place].tolist()
         texts.append("".join(map(str, digits)))
-    return table.with_columns(pl.Series("actions", texts, pl.String))
+    return table.with_columns(
+        pl.Series(
+            "actions",
+            texts,
+            pl.String,
+        )
+    )
 
 
 def start_of(
@@ -214,7 +220,11 @@ class _Evaluation:
         # The policy writes into the tensordict that it reads.
         after = self.env.step(self.policy(self.state))
         if self.taken is not None:
-            place = torch.where(self.driving, self.place, self.total)
+            place = torch.where(
+                self.driving,
+                self.place,
+                self.total,
+            )
             self.taken.append(
                 TensorDict({"place": place, "action": after[keys.ACTION].clone()}, place.shape)
             )
@@ -337,7 +347,10 @@ def _episode_rows(
     # A state without vehicles tells nothing about a crash.
     at_fault = pl.lit(None, pl.Boolean)
     if keys.VEHICLES in last:
-        columns["at_fault"] = ego_at_fault(Vehicles.of(last[keys.VEHICLES]), road)
+        columns["at_fault"] = ego_at_fault(
+            Vehicles.of(last[keys.VEHICLES]),
+            road,
+        )
         at_fault = pl.col("at_fault")
     # The reward's terms are the environment's own, so their names are not known here.
     terms = [name for name in columns if name.startswith("reward_")]
@@ -379,7 +392,11 @@ def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     across = vehicles.speed * torch.sin(vehicles.heading)
     # Two bodies met along the axis on which their extents began to overlap last. Headings are
     # small, so the axes are those of the road.
-    since_along = _time_since(ahead, _gain(along), _reach(vehicles.length))
+    since_along = _time_since(
+        ahead,
+        _gain(along),
+        _reach(vehicles.length),
+    )
     since_across = _time_since(
         _gain(vehicles.y),
         _gain(across),

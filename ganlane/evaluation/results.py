@@ -114,7 +114,10 @@ def names_of_runs(folders: Sequence[Path]) -> list[str]:
     for settings in runs:
         names.append(", ".join(f"{key}={settings[key]}" for key in differing))
     # Paths from the right, as long as it takes to tell all of them apart.
-    longest = max((len(folder.parts) for folder in folders), default=0)
+    longest = max(
+        (len(folder.parts) for folder in folders),
+        default=0,
+    )
     for depth in range(1, longest + 1):
         if all(names) and len(set(names)) == len(names):
             break
@@ -260,7 +263,11 @@ def machine() -> dict[str, Any]:
     # Linux names the model of the CPU here, and may leave a process fewer cores than there are.
     info = Path("/proc/cpuinfo")
     if info.is_file():
-        model = re.search(r"^model name\s*:(.*)$", info.read_text(errors="replace"), re.MULTILINE)
+        model = re.search(
+            r"^model name\s*:(.*)$",
+            info.read_text(errors="replace"),
+            re.MULTILINE,
+        )
         cpu = model[1].strip() if model else cpu
     if hasattr(os, "sched_getaffinity"):
         cores = len(os.sched_getaffinity(0))

@@ -224,7 +224,10 @@ def normalized_percent(
         axis=1,
     )
     # The scale has a length only if MOBIL is better than random driving beyond doubt.
-    lead = paired_difference(returns[:, 1], returns[:, 2])
+    lead = paired_difference(
+        returns[:, 1],
+        returns[:, 2],
+    )
     if lead.interval is None:
         return None, "fewer than two episodes"
     if not lead.excludes_zero():
@@ -233,7 +236,10 @@ def normalized_percent(
     means = bootstrap_means(returns)
     # A resample without MOBIL's lead would divide by zero.
     with_scale = means[means[:, 1] != means[:, 2]]
-    low, high = np.quantile(percent_of_way(*with_scale.T), TAIL_LEVELS)
+    low, high = np.quantile(
+        percent_of_way(*with_scale.T),
+        TAIL_LEVELS,
+    )
     # The value itself is of all episodes, not of the resamples.
     value = percent_of_way(*returns.mean(axis=0))
     return Estimate(float(value), float(low), float(high)), None
@@ -319,7 +325,12 @@ def failed_episodes(episodes: pl.DataFrame) -> list[Row]:
         "seed",
         maintain_order=True,
     ):
-        row: Row = dict(zip(("driver", "traffic", "seed"), names))
+        row: Row = dict(
+            zip(
+                ("driver", "traffic", "seed"),
+                names,
+            )
+        )
         for end in FAILURES:
             row[end] = frame.filter(pl.col("reason") == end)["episode"].sort().to_list()
         rows.append(row)

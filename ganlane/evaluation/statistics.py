@@ -250,7 +250,11 @@ def probability_of_improvement(first: npt.ArrayLike, second: npt.ArrayLike) -> E
     Where all trainings at hand of one are above all of the other it is 1, from 1 to 1: it says
     nothing of others.
     """
-    return _estimate(_pair(first, second), _share_above, bounds=(0.0, 1.0))
+    return _estimate(
+        _pair(first, second),
+        _share_above,
+        bounds=(0.0, 1.0),
+    )
 
 
 def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate | None:
@@ -288,7 +292,10 @@ def normalized_over_trainings(
     tables = [_pair(rewards, mobil)[0] for rewards in (agent, mobil, random_legal)]
     if not difference(tables[1], tables[2]).excludes_zero():
         return None
-    return _estimate(tables, lambda *rewards: percent_of_way(*map(_mean, rewards)))
+    return _estimate(
+        tables,
+        lambda *rewards: percent_of_way(*map(_mean, rewards)),
+    )
 
 
 def percent_of_way(

@@ -110,7 +110,10 @@ class EventCounter:
         """Count the events of a physics step."""
         # Everything is counted without the ego's empty place.
         others = vehicles.columns(slice(1, None))
-        self.overlaps += self._onsets("overlap", pair_overlaps(others).triu(1))
+        self.overlaps += self._onsets(
+            "overlap",
+            pair_overlaps(others).triu(1),
+        )
         # Half the width of a body, turned with its heading.
         half = lateral_half_extent(others) - EDGE_M
         left = self.road.left_edge_m()
@@ -145,7 +148,10 @@ class GuardMeter:
     """Counts the vehicle-steps in which a guard alters acceleration or lateral position."""
 
     def __init__(self) -> None:
-        self._altered, self._steps = torch.zeros(2, dtype=torch.int64)
+        self._altered, self._steps = torch.zeros(
+            2,
+            dtype=torch.int64,
+        )
 
     def watch(self, traffic: TrafficModule) -> None:
         """Be called by every guard in ``traffic`` from now on."""
@@ -252,7 +258,13 @@ def _rows(parameters: LongRunParameters, km: float) -> int:
         ),
     )
     # Not more rows than the remaining kilometres ask for.
-    return int(np.clip(np.ceil(km / expected), 1, most))
+    return int(
+        np.clip(
+            np.ceil(km / expected),
+            1,
+            most,
+        )
+    )
 
 
 def spawned_vehicles(
@@ -335,7 +347,10 @@ def drive_spawned(
 def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
     """Counts, samples and speeds of one batch."""
     # Every vehicle of every episode is a track of its own.
-    y = trajectories.y.reshape(len(trajectories.y), -1)
+    y = trajectories.y.reshape(
+        len(trajectories.y),
+        -1,
+    )
     changes = lane_changes_of_arrays(y, float(road.lane_width_m))
     second = round(1.0 / PHYSICS_STEP_S)
     x = trajectories.x.astype(np.float64)

@@ -94,7 +94,12 @@ def jensen_shannon(first: Array, second: Array) -> Array:
         p = first / first.sum(-1, keepdims=True)
         q = second / second.sum(-1, keepdims=True)
     # 0 log 0 is 0: tiny numbers stand in for empty bins.
-    log_middle = np.log2(np.maximum(0.5 * (p + q), _TINY))
+    log_middle = np.log2(
+        np.maximum(
+            0.5 * (p + q),
+            _TINY,
+        )
+    )
 
     def information(share: Array) -> Array:
         return np.sum(
@@ -113,7 +118,12 @@ def jensen_shannon(first: Array, second: Array) -> Array:
 
 def pooled_distance(simulated: Array, recorded: Array) -> float:
     """Distance of two sets of histograms [units, bins], each added up over its units."""
-    return float(jensen_shannon(simulated.sum(0), recorded.sum(0)))
+    return float(
+        jensen_shannon(
+            simulated.sum(0),
+            recorded.sum(0),
+        )
+    )
 
 
 def distance(
@@ -208,7 +218,15 @@ def _resampled(
     if units < 2:
         return np.empty((len(models), 0))
     # The same resamples for all models, so that differences are paired.
-    counts = np.concatenate(list(resample_counts(units, resamples, seed=0)))
+    counts = np.concatenate(
+        list(
+            resample_counts(
+                units,
+                resamples,
+                seed=0,
+            )
+        )
+    )
     against = counts @ recorded if paired else recorded.sum(0)
     distances = np.stack([jensen_shannon(counts @ model, against) for model in models])
     # A resample of units without samples has no distance.

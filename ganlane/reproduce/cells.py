@@ -189,7 +189,11 @@ def drive_cell(cell: Cell, config: ReproduceConfig) -> None:
         traffics=traffics,
         episodes=cell.settings["episodes"],
     )
-    driver = make_driver(cell.driver, config.env, device=config.device)
+    driver = make_driver(
+        cell.driver,
+        config.env,
+        device=config.device,
+    )
     table = compare([driver], alone, quiet=True)
     # The file tells what it holds, whoever finds it.
     origin = {
@@ -198,7 +202,10 @@ def drive_cell(cell: Cell, config: ReproduceConfig) -> None:
         "seconds": round(time.monotonic() - begun, 3),
     }
     with atomic_path(cell.path) as part:
-        table.write_parquet(part, metadata={_ORIGIN: json.dumps(origin)})
+        table.write_parquet(
+            part,
+            metadata={_ORIGIN: json.dumps(origin)},
+        )
 
 
 def read_cells(cells: Sequence[Cell]) -> tuple[pl.DataFrame, list[str], dict[str, float]]:
@@ -209,7 +216,10 @@ def read_cells(cells: Sequence[Cell]) -> tuple[pl.DataFrame, list[str], dict[str
     """
     tables = []
     revisions = set()
-    seconds = dict.fromkeys((cell.traffic for cell in cells), 0.0)
+    seconds = dict.fromkeys(
+        (cell.traffic for cell in cells),
+        0.0,
+    )
     for cell in cells:
         try:
             origin = json.loads(pl.read_parquet_metadata(cell.path)[_ORIGIN])

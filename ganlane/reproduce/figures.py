@@ -203,7 +203,11 @@ def drive_beginning(config: ReproduceConfig, traffic: TrafficConfig) -> Trajecto
     observation = config.observation.read_by(driver.observation)
     # A trained agent brings the mask and the observation that it was trained with.
     mask, policy = driver.behind(config.mask)
-    module = make_traffic(traffic, config.env, Stream.named(config.stream))
+    module = make_traffic(
+        traffic,
+        config.env,
+        Stream.named(config.stream),
+    )
     env = make_env(
         module,
         config.env,
@@ -231,7 +235,10 @@ def busiest(episode: Trajectory) -> pl.DataFrame:
         ``y_m``, ``heading_rad``, ``length_m`` and ``width_m``; a vehicle that is placed elsewhere
         meanwhile is left out.
     """
-    shown = min(round(SHOWN_S / episode.frame_s), len(episode) - 1)
+    shown = min(
+        round(SHOWN_S / episode.frame_s),
+        len(episode) - 1,
+    )
     ahead = episode.x - episode.x[:, :1]
     # Vehicles in view, the ego left out.
     near = episode.valid & (ahead > AROUND_M[0]) & (ahead < AROUND_M[1] / 2.0)
@@ -275,7 +282,10 @@ def draw_episode(label: EpisodeLabel, tracks: pl.DataFrame) -> Figure:
         yticks=[],
         aspect="equal",
     )
-    axes.set_ylim(-0.75 * lane_m, (label.lanes - 0.25) * lane_m)
+    axes.set_ylim(
+        -0.75 * lane_m,
+        (label.lanes - 0.25) * lane_m,
+    )
     axes.set_title(f"{label.agent} on {label.traffic}, {times[0]:.1f} to {times[-1]:.1f} s")
     for line in range(label.lanes + 1):
         style: dict[str, Any] = {
@@ -377,7 +387,11 @@ def draw_transfer(curves: pl.DataFrame, rows: Sequence[Row]) -> Figure:
             alpha=0.2,
             lw=0,
         )
-        axes.plot(x, np.median(y, axis=0), color=colour)
+        axes.plot(
+            x,
+            np.median(y, axis=0),
+            color=colour,
+        )
         if len(points) > 1:
             for run in points:
                 axes.plot(

@@ -42,7 +42,10 @@ _RATES = {
     "failures": FAILURES,
 }
 #: The paper's Table VI: hard and soft crashes on Traffic_IDM, of an unstated number of runs.
-PAPER_VI = {"agent_idm": (19, 2), "agent_gan": (9, 0)}
+PAPER_VI = {
+    "agent_idm": (19, 2),
+    "agent_gan": (9, 0),
+}
 #: The paper's Table VII: % of MOBIL, mean reward and its standard deviation on Traffic_GAN, 1000
 #: runs.
 PAPER_VII = {
@@ -79,7 +82,10 @@ def by_recipe(episodes: pl.DataFrame) -> dict[tuple[str, str], dict[str, pl.Data
     cells: dict[tuple[str, str], dict[str, pl.DataFrame]] = {}
     for (driver, traffic), frame in episodes.group_by("agent", "traffic", maintain_order=True):
         recipe = recipe_of(str(driver))
-        trainings = cells.setdefault((recipe, str(traffic)), {})
+        trainings = cells.setdefault(
+            (recipe, str(traffic)),
+            {},
+        )
         trainings[str(driver)] = frame.sort("episode")
         # The same training twice would count as two.
         if len(set(map(seed_of, trainings))) < len(trainings):
@@ -169,7 +175,10 @@ def _row(
     }
     for name, ends in _RATES.items():
         rate = rate_over_trainings(column(trainings, _ended(ends)), km)
-        row |= entries(f"{name}_per_1000_km", None if rate is None else rate.scaled(1000.0))
+        row |= entries(
+            f"{name}_per_1000_km",
+            None if rate is None else rate.scaled(1000.0),
+        )
     changes = int(together["lane_changes"].sum())
     row["mean_speed_mps"] = 1000.0 * driven / seconds if seconds > 0.0 else None
     row["lane_changes_per_km"] = changes / driven if driven > 0.0 else None
@@ -179,7 +188,10 @@ def _row(
     row["each"] = []
     for (name, frame), reward in zip(trainings.items(), rewards[:, None]):
         lead = None if mobil is None else difference(reward, mobil)
-        training = {"driver": name, **entries("mean_reward", over_trainings(reward))}
+        training = {
+            "driver": name,
+            **entries("mean_reward", over_trainings(reward)),
+        }
         row["each"].append(
             {
                 **training,
@@ -241,12 +253,18 @@ def _compared(first: Mapping[str, pl.DataFrame], second: Mapping[str, pl.DataFra
     namesakes = dict(zip(map(seed_of, second), other_crashed))
     # A driver without trainings, say MOBIL, is held against every training of the first.
     if len(namesakes) == 1:
-        namesakes = dict.fromkeys(map(seed_of, first), other_crashed[0])
+        namesakes = dict.fromkeys(
+            map(seed_of, first),
+            other_crashed[0],
+        )
     tests = []
     for name, crashes in zip(first, crashed):
         if seed_of(name) in namesakes:
             # On the same episodes only those count in which one of the two crashed.
-            test = mcnemar(crashes > 0, namesakes[seed_of(name)] > 0)
+            test = mcnemar(
+                crashes > 0,
+                namesakes[seed_of(name)] > 0,
+            )
             tests.append({"driver": name, **vars(test)})
     return {
         **entries("lead", difference(rewards, other_rewards)),
@@ -338,7 +356,11 @@ def table_vi(rows: Sequence[Row]) -> Table:
         ]
         for name, counts in PAPER_VI.items()
     ]
-    ours = rows_of(rows, ["idm", "idm_mobil"], [*PAPER_VI, "mobil"])
+    ours = rows_of(
+        rows,
+        ["idm", "idm_mobil"],
+        [*PAPER_VI, "mobil"],
+    )
     return _beside(
         "Table VI: crashes on rule-driven traffic",
         paper,
@@ -370,7 +392,11 @@ def table_vii(rows: Sequence[Row]) -> Table:
         ]
         for name, numbers in PAPER_VII.items()
     ]
-    ours = rows_of(rows, ["gan"], [*PAPER_VII, "mobil", "random_legal"])
+    ours = rows_of(
+        rows,
+        ["gan"],
+        [*PAPER_VII, "mobil", "random_legal"],
+    )
     title = "Table VII: performance on generated traffic"
     return replace(
         _beside(
@@ -497,7 +523,10 @@ def write_csv(path: Path, content: pl.DataFrame | Table | Sequence[Row]) -> None
     elif isinstance(content, pl.DataFrame):
         frame = content
     else:
-        frame = pl.DataFrame(list(map(_flat, content)), infer_schema_length=None)
+        frame = pl.DataFrame(
+            list(map(_flat, content)),
+            infer_schema_length=None,
+        )
     with atomic_path(path) as part:
         frame.write_csv(part)
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import polars as pl
 import pytest
+from reference.refusals import user_error
 
 from ganlane.config.run import run_command
-from ganlane.errors import UserError
 from ganlane.evaluation.rows import FAILURES
 from ganlane.reproduce.crashes import (
     Crash,
@@ -105,7 +105,7 @@ def test_a_list_with_a_wrong_value_is_refused_in_one_sentence(path, value, small
     if last == "mixed":
         content["crashes"][0]["traffic"] = "mixed"
     small_list.write_text(json.dumps(content))
-    with pytest.raises(UserError, match="not a list of crashes") as refused:
+    with user_error("not a list of crashes") as refused:
         read_crashes(small_list)
     assert "\n" not in str(refused.value)
 
@@ -115,10 +115,10 @@ def test_a_list_with_a_wrong_value_is_refused_in_one_sentence(path, value, small
 )
 def test_other_files_are_refused_in_one_sentence(content, tmp_path):
     (tmp_path / "crashes.json").write_bytes(content)
-    with pytest.raises(UserError, match="not a list of crashes") as refused:
+    with user_error("not a list of crashes") as refused:
         read_crashes(tmp_path / "crashes.json")
     assert "\n" not in str(refused.value)
-    with pytest.raises(UserError, match="cannot be read"):
+    with user_error("cannot be read"):
         read_crashes(tmp_path / "nowhere.json")
 
 

@@ -40,7 +40,7 @@ from ganlane.config.run import (
     cleared_after_mistakes,
     function_of,
     new_folder,
-    run_in,
+    running,
 )
 from ganlane.errors import UserError, did_you_mean
 from ganlane.evaluation import evaluation_rows, paired_rows, write_episodes, write_results
@@ -144,6 +144,7 @@ def evaluate(
         UserError: an unknown name, a wrong value, or a policy that does not fit.
         OSError: a folder that cannot be written to.
     """
+    # Names are loaded once the settings are checked; agent_idm@all means several.
     drivers: list[str | Driver] = []
     for agent in agents:
         if isinstance(agent, Driver):
@@ -206,6 +207,7 @@ def train(
         raise UserError(
             "resume=True: which run? give its folder, for instance folder='outputs/train/RUN'."
         )
+    # None leaves the command's default, or what the resumed run has.
     named = {"traffic": traffic, "init": init}
     keys |= {name: value for name, value in named.items() if value is not None}
     if num_envs is not None:
@@ -247,6 +249,7 @@ def render(
         UserError: a wrong value.
         OSError: a file that cannot be written.
     """
+    # The command has two keys each, one for one and one for several.
     keys |= {"traffic": traffic, "out": out}
     if isinstance(agent, str | Path):
         keys["driver"] = agent
@@ -261,7 +264,9 @@ def render(
     config = call_settings("render", keys)
     with _torch_threads():
         if out is None:
-            line = run_in(new_folder("render"), "render", config)
+            folder = new_folder("render")
+            with running(folder, config):
+                line = function_of("render")(config, folder)
         else:
             line = function_of("render")(config, Path(out).parent)
     return Path(str(line).partition(": ")[2])
@@ -288,6 +293,7 @@ def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
         raise UserError(
             f"run({command!r}): no such command{hint}; choose one of {', '.join(names)}."
         )
+    # Going on with a run means its own folder.
     home = new_folder(command) if folder is None else Path(folder)
     if command == "train" and keys.get("resume") is not None:
         is_own = folder is not None and str(keys["resume"]) == str(folder)
@@ -297,8 +303,8 @@ def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
                 "api.train() the folder of one, and resume=True."
             )
     config = call_settings(command, keys)
-    with _torch_threads():
-        run_in(home, command, config)
+    with _torch_threads(), running(home, config):
+        function_of(command)(config, home)
     return Run(home, json.loads((home / "results.json").read_text(encoding="utf-8")))
 
 

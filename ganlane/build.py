@@ -91,6 +91,7 @@ def make_traffic(
         UserError: the target cannot be imported or called, or gives no
             :class:`ganlane.traffic.TrafficModule`.
     """
+    # Importing runs code: the path is this package's or was named by the user.
     key = "traffic._target_"
     target = import_target(traffic._target_, key, TrafficModule)
     arguments, parts = traffic.arguments(), traffic.parts()

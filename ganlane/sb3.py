@@ -73,7 +73,8 @@ class HighwayVecEnv(VecEnv):
         observation, _ = self.highways.reset(seed=self._seeds[0], options=self._options[0] or None)
         self._reset_seeds()
         self._reset_options()
-        self._return[:], self._length[:] = 0.0, 0
+        self._return[:] = 0.0
+        self._length[:] = 0
         return observation
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
@@ -91,7 +92,8 @@ class HighwayVecEnv(VecEnv):
         for row in np.flatnonzero(done):
             infos[row] = self._final_info(int(row), info)
             infos[row]["TimeLimit.truncated"] = bool(truncated[row] and not terminated[row])
-        self._return[done], self._length[done] = 0.0, 0
+        self._return[done] = 0.0
+        self._length[done] = 0
         return observation, reward.astype(np.float32), done, infos
 
     def _final_info(self, row: int, info: dict[str, Any]) -> dict[str, Any]:

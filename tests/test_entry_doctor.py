@@ -9,7 +9,7 @@ from unittest.mock import Mock
 import pytest
 
 from ganlane import doctor
-from ganlane.__main__ import ALL_COMMANDS, main
+from ganlane.__main__ import commands, main
 from ganlane.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -82,5 +82,5 @@ def test_recordings_and_a_compiler_are_found_or_asked_for(tmp_path, monkeypatch)
 
 def test_the_page_names_every_command():
     page = (ROOT / "docs" / "command_line.md").read_text()
-    for name in ALL_COMMANDS:
+    for name in commands():
         assert re.search(rf"^\| `{name}` \|", page, flags=re.MULTILINE), name

@@ -41,6 +41,7 @@ def parsed(command: str, words: Sequence[str]) -> list[Override]:
         UserError: a word is not of the form key=value, names no option, or would make Hydra import
             something.
     """
+    # Hydra's own grammar, so that quotes, lists and sweeps mean what its users expect.
     try:
         overrides = OverridesParser.create().parse_overrides([_as_meant(command, w) for w in words])
     except (ValueError, RecursionError) as error:  # limits of Python
@@ -61,6 +62,7 @@ def _as_meant(command: str, word: str) -> str:
     ``traffic@pretrain.traffic=gan``; both become ``pretrain.traffic.name=gan``, so that keys of
     that traffic can be set beside it.
     """
+    # Only the key is touched; Hydra reads the value.
     key, equals, value = word.partition("=")
     key = ALIASES.get(command, {}).get(key, key).removeprefix("traffic@")
     if key.endswith(".traffic") and re.fullmatch(r"[\w,]+", value) and value != "null":
@@ -104,6 +106,7 @@ def for_hydra(overrides: Sequence[Override]) -> list[str]:
 
     The last of several words with one key counts.
     """
+    # Hydra refuses a group chosen twice; here the last word counts, as in a shell.
     last = {override.key_or_group: override for override in overrides}
     words: list[str] = []
     for key, override in last.items():
@@ -156,6 +159,7 @@ def key_of(override: Override) -> str:
 
 def resumed(saved: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
     """A saved run's data with what a command line names."""
+    # Only what the command line names is taken from the new composition.
     config = OmegaConf.create(dict(saved))
     now = OmegaConf.create(composed("train", overrides))
     for override in overrides:
@@ -175,6 +179,7 @@ def sentence(error: BaseException) -> str:
             f"{error.override}: not of the form key=value; quote values with spaces or brackets, "
             f"{_HELP}."
         )
+    # Hydra's errors have many lines; the part that says what is wrong is kept.
     text = " ".join(str(error).split())
     refused = re.search(r"Could not override '([^'@]+)[^']*'", text)
     if refused:

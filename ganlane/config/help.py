@@ -27,6 +27,7 @@ exit status: 0 done, 2 a mistake in configuration, file or checkpoint or a disk 
 
 def help_text(command: str, kind: type[Record]) -> str:
     """What a command is for, its groups' options, and every key with default and meaning."""
+    # The defaults shown are those of the command's own YAML, not of the records.
     data = composed(command)
     folders = sorted(path.name for path in conf_folder().iterdir() if path.is_dir())
     keys = key_names(kind)
@@ -85,6 +86,7 @@ def _lines(key: str, text: str) -> Iterator[str]:
 
 def meaning(kind: type, name: str) -> str:
     """The first sentence on a field in the docstring of its class or of a base class."""
+    # A subclass may say something else about an inherited key.
     for base in kind.__mro__:
         if name in _attributes(base):
             return _attributes(base)[name]
@@ -95,6 +97,7 @@ def meaning(kind: type, name: str) -> str:
 def _attributes(kind: type) -> dict[str, str]:
     """First sentences of the section ``Attributes`` of a class's docstring, by field."""
     _, _, section = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")
+    # Google's docstring style: a name, a colon, lines that are indented further.
     items = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", section, flags=re.MULTILINE)
     meanings = {}
     for name, text in items:

@@ -24,6 +24,7 @@ import hydra
 import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
+from omegaconf import OmegaConf
 
 from ganlane.arguments import is_import_path
 from ganlane.config.compose import (
@@ -122,7 +123,13 @@ def run_command(
     keep_freed_memory()
     try:
         with _sigterm_as_exception():
-            _dispatch(command, words, task)
+            single = _single_run(command, words, task)
+            if single is not None:
+                config, folder = single
+                with running(folder, config):
+                    line = (task or function_of(command))(config, folder)
+                if line:
+                    print(line)
             sys.stdout.flush()
     except UserError as error:
         print(f"ganlane {command}: {_one_line(error)}", file=sys.stderr)
@@ -141,16 +148,21 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()).rstrip(".") + "."
 
 
-def _dispatch(command: str, words: list[str], task: Task | None) -> None:
-    """Do what the words ask for: help, printing the configuration, a sweep or a run."""
+def _single_run(command: str, words: list[str], task: Task | None) -> tuple[Any, Path] | None:
+    """The settings and folder of the run that the words ask for.
+
+    None where they ask for something else, which is done here: help, the configuration, a sweep.
+    """
+    # Hydra would have a score of flags; these three are all that is needed.
     flags = [word for word in words if word.startswith("-")]
     keys = [word for word in words if word not in flags]
     if {"-h", "--help"} & set(flags):
         print(help_text(command, COMMANDS[command][0]))
-        return
-    if flags == ["--cfg"] and keys[:1] == ["job"]:
-        print(as_yaml(settings(command, keys[1:])), end="")
-        return
+        return None
+    if flags == ["--cfg"] and "job" in keys:
+        keys.remove("job")
+        print(as_yaml(settings(command, keys)), end="")
+        return None
     unknown = [flag for flag in flags if flag not in ("-m", "--multirun")]
     if unknown:
         raise UserError(f"{unknown[0]}: no such flag; run the command with --help to see them.")
@@ -158,11 +170,9 @@ def _dispatch(command: str, words: list[str], task: Task | None) -> None:
     overrides = parsed(command, keys)
     if flags:
         _sweep(command, overrides, task)
-        return
+        return None
     config, folder = _settings_and_folder(command, overrides)
-    line = run_in(folder.absolute(), command, config, task)
-    if line:
-        print(line)
+    return config, folder.absolute()
 
 
 def settings(command: str, words: Sequence[str]) -> Any:
@@ -176,9 +186,13 @@ def settings(command: str, words: Sequence[str]) -> Any:
 
 def _settings_and_folder(command: str, overrides: list[Override]) -> tuple[Any, Path]:
     """The checked record, and the folder of its run: the resumed one, that given, or a new one."""
+    # A resumed training is its saved settings; the command line changes some of them. For
+    # train_generator resume= is a key like any other.
     values = {str(word.key_or_group): word for word in overrides}
-    resume = values.pop("resume", None) if command == "train" else None
-    rest = [word for word in overrides if word.key_or_group != "resume"]
+    resume, rest = None, overrides
+    if command == "train":
+        resume = values.pop("resume", None)
+        rest = [word for word in overrides if word.key_or_group != "resume"]
     if resume is not None and resume.value() not in (None, ""):
         folder = _resumed_folder(str(resume.value()))
         if folder is not None:
@@ -228,6 +242,7 @@ def _sweep(command: str, overrides: list[Override], task: Task | None) -> None:
     for words in single_runs(overrides):
         first = first or settings(command, words)
         settings(command, words)
+    # Every combination was checked above, so what fails now is a file or a disk.
     mistakes: list[Exception] = []
     here = os.getpid()
     sweep_folder: list[Path] = []
@@ -238,7 +253,9 @@ def _sweep(command: str, overrides: list[Override], task: Task | None) -> None:
         words = [str(word).lstrip("+") for word in state.overrides.task]
         try:
             folder = Path(state.runtime.output_dir)
-            line = run_in(folder, command, settings(command, words), task)
+            config = settings(command, words)
+            with running(folder, config):
+                line = (task or function_of(command))(config, folder)
             if line:
                 print(line, flush=True)
         except (UserError, OSError) as error:
@@ -247,9 +264,11 @@ def _sweep(command: str, overrides: list[Override], task: Task | None) -> None:
             if os.getpid() != here:
                 raise
 
+    # Hydra's launchers (joblib, submitit, ray) run the jobs; it reads its arguments from sys.argv.
     application = hydra.main(
         version_base=VERSION_BASE, config_path=str(conf_folder()), config_name=command
     )
+    OmegaConf.register_new_resolver("process_id", os.getpid, replace=True)
     before, full = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     sys.argv = [f"ganlane {command}", "-m", *for_hydra(overrides)]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # raise, rather than print and exit with status 1
@@ -300,17 +319,18 @@ def as_yaml(config: Record) -> str:
     return yaml.safe_dump(plain(config), sort_keys=False, allow_unicode=True)
 
 
-def run_in(folder: Path, command: str, config: Any, task: Task | None = None) -> str | None:
-    """Run a command in ``folder``; the line that names its results.
+@contextmanager
+def running(folder: Path, config: Any) -> Iterator[None]:
+    """The run folder for the time of a run: locked, with the settings in it.
 
     Raises:
-        UserError: another run uses the folder, or whatever the command refuses.
+        UserError: another run uses the folder.
     """
     register_envs()  # for a user's own driver or traffic
     with cleared_after_mistakes(folder), held(folder):
         write_bytes(folder / CONFIG, as_yaml(config).encode())
         with numbered_refusals():
-            return (task or function_of(command))(config, folder)
+            yield
 
 
 def function_of(command: str) -> Callable[[Any, Path], str]:
@@ -325,6 +345,7 @@ def cleared_after_mistakes(folder: Path) -> Iterator[None]:
     A folder with results, trained weights or a checkpoint is never removed, nor one that another
     process uses.
     """
+    # A folder that was there is the user's; only what this run made may go.
     existed = folder.is_dir() and any(folder.iterdir())
     new_parents = [parent for parent in folder.parents if not parent.exists()]
     try:
@@ -443,6 +464,7 @@ def _resumed_folder(asked: str) -> Path | None:
 
 def newest_unfinished(runs: Path) -> Path | None:
     """The run with the newest checkpoint among those without results; None if there is none."""
+    # The newest checkpoint first; a run's folder is the nearest one above with settings.
     checkpoints = sorted(runs.rglob(LAST.name), key=lambda path: -path.stat().st_mtime)
     for checkpoint in checkpoints:
         for folder in checkpoint.parents:
@@ -461,6 +483,7 @@ def refuse_stored_imports(config: TrainConfig, named: Collection[str]) -> None:
     Raises:
         UserError: the file names a class or function of another package.
     """
+    # Naming the code is the user's word that it may run.
     for key, value, path in _imports(config):
         # traffic=my.module.MyTraffic names all keys below it
         is_asked = any(f"{key}.".startswith(f"{name}.") for name in named)

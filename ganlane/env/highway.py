@@ -116,11 +116,13 @@ class HighwayEnv(EnvBase):
         self.spawn_parameters = spawn_parameters or SpawnParameters()
         self.ego = ego or EgoParameters()
         self.episode = episode or EpisodeParameters()
-        self.stream, self.dtype = traffic.stream, dtype
+        self.stream = traffic.stream
+        self.dtype = dtype
         self.scenes = scenes or self._default_scenes(vehicles or 9)
         self.vehicles = self.scenes.vehicles
         self.first_episode = first_episode
-        self.recycle, self.recycle_share = recycle, recycle_share
+        self.recycle = recycle
+        self.recycle_share = recycle_share
         self.recorder: Recorder | None = None
         self.rules = Rules(self.road, self.ego, self.episode, idm, steering)
         self.physics = Physics()
@@ -138,7 +140,8 @@ class HighwayEnv(EnvBase):
 
     def _default_scenes(self, vehicles: int) -> Scenes:
         """The traffic's own scenes if it has any, else random ones."""
-        spawn, visibility = self.spawn_parameters, Visibility.named(self.ego.visibility)
+        spawn = self.spawn_parameters
+        visibility = Visibility.named(self.ego.visibility)
         scenes = self.traffic.scenes(vehicles, visibility, spawn.ego_desired_speed_mps)
         if scenes is None:
             others = self.traffic.visibility
@@ -165,7 +168,8 @@ class HighwayEnv(EnvBase):
         self.scenes.check(self.road, self.rules.idm)
 
     def _make_specs(self) -> None:
-        n, device = self.batch_size[0], self.device
+        n = self.batch_size[0]
+        device = self.device
         memory = self.traffic.memory_spec(n, self.vehicles, self.dtype)
         spec = state_spec(n, self.vehicles, self.dtype, memory, self.traffic.own_roads)
         self.observation_spec = spec.to(device)
@@ -180,7 +184,7 @@ class HighwayEnv(EnvBase):
     def compile(self, **kwargs: Any) -> HighwayEnv:
         """Compile physics and traffic to several small graphs; returns the environment.
 
-        Compiling takes about a minute in the first steps; docs/performance.md has the speeds.
+        Compiling takes about a minute in the first steps; docs/speed.md has the speeds.
         Results are equal up to rounding, not bitwise. Overrides TorchRL's method, which compiles a
         whole step to one graph; ``HighwayEnv(compile=True)`` calls this one too.
 
@@ -267,7 +271,8 @@ class HighwayEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """One decision."""
-        seed, episode = tensordict.get(keys.SEED, None), tensordict.get(keys.EPISODE, None)
+        seed = tensordict.get(keys.SEED, None)
+        episode = tensordict.get(keys.EPISODE, None)
         if seed is None or episode is None:
             raise UserError(
                 "step(): the state of no episode was given; call reset() first and step what it "
@@ -287,7 +292,8 @@ class HighwayEnv(EnvBase):
         key = episode_key(self.stream, state.get(keys.SEED), state.get(keys.EPISODE))
         rules = self.rules
         if self.traffic.own_roads:  # replayed scenes have their own roads and ends
-            road, steps = road_in(state, self.road), self.traffic.steps_of(key)
+            road = road_in(state, self.road)
+            steps = self.traffic.steps_of(key)
             rules = rules._replace(road=road, scene_steps=steps)
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         ego = dict(state.get(keys.EGO).items())
@@ -368,7 +374,8 @@ class HighwayEnv(EnvBase):
         if wanted == "torch":
             return None
         # What the kernel cannot do, as the end of a sentence.
-        drivers, reason = self.traffic.native_parameters(), None
+        drivers = self.traffic.native_parameters()
+        reason = None
         if drivers is None:
             name = type(self.traffic).__name__
             reason = f"drives the traffics idm and idm_mobil alone, not {name}"

@@ -88,7 +88,8 @@ def begin(
     Rows whose command leaves the road have ended.
     """
     lanes = rules.road.lanes if isinstance(rules.road.lanes, int) else rules.road.lanes[:, 0]
-    target, direction = vehicles.target_lane[:, EGO_INDEX], ego["change_direction"]
+    target = vehicles.target_lane[:, EGO_INDEX]
+    direction = ego["change_direction"]
     # The command sets the lane that the ego steers to; the motion itself takes several decisions.
     command = apply_action(action, target, direction, lanes, rules.ego.abort_lane_change)
     targets = torch.cat((command.target_lane[:, None], vehicles.target_lane[:, 1:]), dim=1)
@@ -125,7 +126,8 @@ def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -
         PHYSICS_STEP_S,
     )
     # The others moved while they saw the ego where it was: all move at once, from one state.
-    running, vehicles = before.running, moved.with_first(ego)
+    running = before.running
+    vehicles = moved.with_first(ego)
     if not all_running:
         vehicles = vehicles.where(running, before.vehicles)
         steering = torch.where(running, steering, before.steering)
@@ -157,7 +159,8 @@ def remember(
     rules: Rules, before: EgoMemory, start: Substep, end: Substep, command: Command
 ) -> EgoMemory:
     """The ego's memory after a decision from ``start`` to ``end``."""
-    ego, speed = end.vehicles.at(EGO_INDEX), start.vehicles.speed[:, EGO_INDEX]
+    ego = end.vehicles.at(EGO_INDEX)
+    speed = start.vehicles.speed[:, EGO_INDEX]
     arrived = lane_change_done(end.vehicles.columns(slice(0, 1)), rules.road)[:, 0]
     direction = torch.where(arrived, 0, command.direction)
     # A row that ended at once drove no step: its speed did not change either.
@@ -206,7 +209,10 @@ class Physics:
 
     def __init__(self) -> None:
         self.compiled = False
-        self.begin, self.remember, self.recycle, self.advance = begin, remember, recycle, advance
+        self.begin = begin
+        self.remember = remember
+        self.recycle = recycle
+        self.advance = advance
 
     def compile(self) -> None:
         """Compile each function to a graph.
@@ -295,10 +301,13 @@ def run_decision(
         key: of the episodes, [N] int64.
         substeps: number of physics steps; None: those of the decision period.
     """
-    memory, now, ended = memory_of(state), start, EndedRows()
+    memory = memory_of(state)
+    now = start
+    ended = EndedRows()
     counters = {name: state.get(name) for name in (keys.SEED, keys.EPISODE)}
     counters[keys.EPISODE_KEY] = key
-    size, can_read = memory.batch_size, reads_are_cheap(now.running)
+    size = memory.batch_size
+    can_read = reads_are_cheap(now.running)
     if can_read:
         ended.keep(~now.running, memory)
     for count in range(rules.episode.substeps() if substeps is None else substeps):

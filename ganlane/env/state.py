@@ -115,7 +115,8 @@ def pack(
     rest: dict[str, Any],
 ) -> TensorDictBase:
     """The state as one TensorDict [N]; ``rest`` is not nested."""
-    batch, device = ego["distance"].shape, ego["distance"].device
+    batch = ego["distance"].shape
+    device = ego["distance"].device
     nested = {keys.VEHICLES: vehicles.as_dict(), keys.EGO: ego, keys.EVENTS: events}
     parts: dict[str, Any] = {keys.TRAFFIC: traffic, **rest}
     for name, fields in nested.items():

@@ -68,7 +68,8 @@ class NativeRows(Rows):
 
 def native_rows(config: HighwayConfig) -> NativeRows | None:
     """The highways of ``config`` by the kernel; None where it does not implement them."""
-    env, observation = config.env, config.observation
+    env = config.env
+    observation = config.observation
     # The traffic says who drives; the rest is what the kernel's observation and scenes can do.
     drivers = config.traffic.native_parameters(env.idm, env.mobil)
     if (

@@ -30,6 +30,7 @@ class TensorRows(Rows):
 
     Attributes:
         env: the TorchRL environment of the settings, with a user's own transforms at the end.
+        traffic: its name, for pictures.
         state: of its rows, from the first :meth:`start` on.
     """
 
@@ -38,7 +39,9 @@ class TensorRows(Rows):
         for transform in transforms:
             self.env.append_transform(transform)
         base = self.env.base_env
-        self.count, self.episode = config.num_envs, base.episode
+        self.count = config.num_envs
+        self.episode = base.episode
+        self.traffic = config.traffic.label()
         parts = list(self.env.transform)
         observed = next(part for part in parts if isinstance(part, ObservationTransform))
         size = self.env.observation_spec[keys.OBSERVATION].shape[-1]
@@ -91,7 +94,8 @@ class TensorRows(Rows):
 
     def state_arrays(self) -> Mapping[str, Any]:
         state = self.now()
-        vehicles, road = state.get(keys.VEHICLES), road_in(state, self.env.base_env.road)
+        vehicles = state.get(keys.VEHICLES)
+        road = road_in(state, self.env.base_env.road)
         tensors = dict(state.get(keys.EGO).items())
         for name in (keys.SEED, keys.EPISODE, keys.STEP):
             tensors[name] = state.get(name)

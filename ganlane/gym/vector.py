@@ -70,7 +70,8 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
             )
         self._mode = _mode_of(autoreset_mode)
         self._rows = make_rows(traffic, num_envs, render_mode is not None, transforms, options)
-        self.num_envs, self.render_mode = self._rows.count, render_mode
+        self.num_envs = self._rows.count
+        self.render_mode = render_mode
         episode = self._rows.episode
         if max_episode_steps is not None:
             limit = whole_number("max_episode_steps", max_episode_steps, 1, 2**31)
@@ -92,7 +93,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         if render_mode is not None:
             from ganlane.gym.rendering import BatchView  # with torch, which takes seconds
 
-            self._view = BatchView(self._rows, traffic)  # type: ignore[arg-type]
+            self._view = BatchView(self._rows)  # type: ignore[arg-type]
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
@@ -126,13 +127,16 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         seeds: Any
         # A seed starts with its first episodes; without one every row goes on with its next.
         if seed is not None:
-            seeds, first = [seed_number(one) for one in array_of(seed).ravel().tolist()], rows
+            seeds = [seed_number(one) for one in array_of(seed).ravel().tolist()]
+            first = rows
             super().reset(seed=seeds[0] if len(seeds) == 1 else None)
         elif self._rows.started:
             state = self._rows.state_arrays()
-            seeds, first = state["seed"].copy(), state["episode"] + self.num_envs
+            seeds = state["seed"].copy()
+            first = state["episode"] + self.num_envs
         else:
-            seeds, first = self._seed, rows
+            seeds = self._seed
+            first = rows
             if seeds is None:
                 seeds = int(self.np_random.integers(SEEDS))
         if episode is not None:
@@ -164,13 +168,16 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
             )
         stepped = self._rows.step(actions_of(actions, self.num_envs))
         reward = stepped.reward.astype(np.float64)
-        terminated, truncated = stepped.terminated.copy(), stepped.truncated.copy()
+        terminated = stepped.terminated.copy()
+        truncated = stepped.truncated.copy()
         if self._view is not None:
             self._view.after_step(actions, reward)
         # NEXT_STEP: these rows ended one step ago. They were stepped with the others, which is
         # discarded here.
         if waiting.any():
-            reward[waiting], terminated[waiting], truncated[waiting] = 0.0, False, False
+            reward[waiting] = 0.0
+            terminated[waiting] = False
+            truncated[waiting] = False
             self._rows.restart(waiting)
             self._begun(waiting)
         ended = self._ended = terminated | truncated
@@ -181,7 +188,8 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
             final |= {"final_info": _copied(self._rows.info()), "_final_info": ended}
             self._rows.restart(ended)
             self._begun(ended)
-        observation, info = self._rows.observation().copy(), _copied(self._rows.info())
+        observation = self._rows.observation().copy()
+        info = _copied(self._rows.info())
         return observation, reward, terminated, truncated, info | final
 
     def action_masks(self) -> Flags:

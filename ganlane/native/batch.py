@@ -22,7 +22,6 @@ from ganlane.native.settings import Key, fields
 from ganlane.settings.driving import EgoParameters, IdmParameters, MobilParameters, Visibility
 from ganlane.settings.episode import EpisodeParameters, SpawnParameters
 from ganlane.settings.observation import (
-    MASKS,
     MaskParameters,
     ObservationConfig,
     RewardParameters,
@@ -130,11 +129,16 @@ class NativeBatch:
         variant: str | None = None,
     ) -> None:
         self._arguments = {name: value for name, value in locals().items() if name != "self"}
-        spawn, ego = spawn or SpawnParameters(), ego or EgoParameters()
-        episode, idm = episode or EpisodeParameters(), idm or IdmParameters()
-        observation, reward = observation or ObservationConfig(), reward or RewardParameters()
+        spawn = spawn or SpawnParameters()
+        ego = ego or EgoParameters()
+        episode = episode or EpisodeParameters()
+        idm = idm or IdmParameters()
+        observation = observation or ObservationConfig()
+        reward = reward or RewardParameters()
         mask = mask or MaskParameters()
-        self.rows, self.lanes, self.lane_width_m = rows, lanes, lane_width_m
+        self.rows = rows
+        self.lanes = lanes
+        self.lane_width_m = lane_width_m
         self.terms = reward.term_names
         road = (lanes, lane_width_m, vehicles)
         view = settings.view_of(*road, observation.scale(), observation.form)
@@ -151,7 +155,8 @@ class NativeBatch:
         self._library = load(variant)
         visible = (Visibility.named(ego.visibility), Visibility.SIGNALLED)
         decision = settings.settings_of(*road, episode, ego, idm, mobil=mobil)
-        deceleration, abort = mask.safe_deceleration, ego.abort_lane_change
+        deceleration = mask.safe_deceleration
+        abort = ego.abort_lane_change
         # Referred to by this object, since the structure holds no more than their addresses.
         self._pointed = {
             "settings": decision,
@@ -178,7 +183,7 @@ class NativeBatch:
             vehicles=vehicles,
             lanes=lanes,
             size=view.numbers(),
-            mask_form=MASKS.index(mask.form),
+            mask_form=settings.MASK_FORMS.index(mask.form),
             abort_lane_change=abort,
         )
         self._address = ctypes.byref(self._batch)

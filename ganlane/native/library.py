@@ -277,7 +277,8 @@ def threads_allowed() -> int:
 
     Where torch is not loaded, ``OMP_NUM_THREADS`` or the processor's cores.
     """
-    set_aside, torch = _threads.get(), sys.modules.get("torch")
+    set_aside = _threads.get()
+    torch = sys.modules.get("torch")
     if set_aside is not None:
         return set_aside
     if torch is not None:

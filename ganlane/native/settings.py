@@ -77,6 +77,8 @@ NATIVE_FORMS: Final = {
     "lane_view_drift": (True, False),
     "lane_view_overlap": (True, True),
 }
+#: The action masks, in the order of step.cpp's numbers ``MASK_ROAD, MASK_LEGAL, MASK_SAFE``.
+MASK_FORMS: Final = ("none", "legal", "safe")
 
 
 def fields(kind: type, names: str) -> list[tuple[str, type]]:
@@ -178,7 +180,8 @@ def settings_of(
     mobil: MobilParameters | None = None,
 ) -> Settings:
     """The numbers of road, driving and episode; ``mobil=None``: the others keep their lanes."""
-    episode, idm = episode or EpisodeParameters(), idm or IdmParameters()
+    episode = episode or EpisodeParameters()
+    idm = idm or IdmParameters()
     steering = steering or SteeringParameters()
     records = (episode, ego or EgoParameters(), idm, steering, mobil or MobilParameters())
     numbers = {name: value for record in records for name, value in vars(record).items()}

@@ -55,7 +55,8 @@ def _room(
 
 def _state(tensors: Mapping[Key, Tensor]) -> TensorDict:
     """The environment's state [N], without a reward; the kernel drives no scene to its end."""
-    size, device = tensors[keys.STEP].shape, torch.device("cpu")
+    size = tensors[keys.STEP].shape
+    device = torch.device("cpu")
     groups: dict[str, dict[str, Tensor]] = {}
     fields: dict[str, Any] = {}
     for key, value in tensors.items():
@@ -91,7 +92,9 @@ class _Function:
     """
 
     def __init__(self, name: str, numbers: ctypes.Structure, variant: str | None = None) -> None:
-        self._name, self._numbers, self._variant = name, numbers, variant
+        self._name = name
+        self._numbers = numbers
+        self._variant = variant
         self._call = getattr(load(variant), name)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -182,7 +185,8 @@ class NativeScenes(_Function):
     """
 
     def __init__(self, scenes: RandomScenes, stream: int) -> None:
-        self.vehicles, seen = scenes.vehicles, (scenes.ego_visibility, scenes.others_visibility)
+        self.vehicles = scenes.vehicles
+        seen = (scenes.ego_visibility, scenes.others_visibility)
         shape = _shape(scenes.road, scenes.vehicles)
         numbers = settings.spawn_of(*shape, scenes.parameters, stream, *seen, recycle_share=None)
         super().__init__("ganlane_spawn", numbers)
@@ -257,9 +261,11 @@ class SafeActions(_Function):
         ``seen`` are the vehicles as the ego perceives them, ``direction`` [N] that of its current
         lane change.
         """
-        v, rows = seen, seen.x.shape[0]
+        v = seen
+        rows = seen.x.shape[0]
         inputs = [v.x, v.y, v.heading, v.speed, v.length, v.width, v.desired_speed]
         inputs += [v.target_lane, v.visibility, v.valid, direction]
-        mask, none = torch.empty(rows, 3, dtype=torch.bool), torch.empty(rows, dtype=torch.bool)
+        mask = torch.empty(rows, 3, dtype=torch.bool)
+        none = torch.empty(rows, dtype=torch.bool)
         self._run(rows, inputs, [mask, none])
         return mask, none

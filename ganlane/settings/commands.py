@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, TypeAlias
@@ -51,12 +52,18 @@ class RunConfig(Record):
         columns: of printed tables; auto: as many as the terminal has room for; all.
     """
 
+    # A run is the same on any machine but for rounding: threads and device change no episode.
     seed: Seed = 0
     threads: CountOrZero = 0
     device: Annotated[str, one_of(("cpu", "cuda"))] = "cpu"
     columns: Columns = "auto"
 
     def __post_init__(self) -> None:
+        # Scenes and networks make tensors, so this comes first; without torch there are none.
+        if "torch" in sys.modules:
+            from ganlane.torch_settings import check_default_device
+
+            check_default_device("cuda")  # no other one can be the environment's
         super().__post_init__()
         if self.device == "cuda" and not has_cuda():
             raise UserError(
@@ -111,6 +118,7 @@ class HighwayConfig(DrivingConfig):
 def with_env_keys(kind: type[Record], keys: Mapping[str, Any]) -> dict[str, Any]:
     """``keys`` of a call, those that ``kind`` does not have moved into its ``env``: ``lanes=4``."""
     names = {*key_names(kind), "experiment"}
+    # What the command does not know is left for the environment to take or to refuse by name.
     of_env = {name: value for name, value in keys.items() if name not in names}
     if not of_env or "env" not in names:
         return dict(keys)
@@ -168,17 +176,20 @@ class EvaluateConfig(DrivingConfig):
         stream: select: the episodes kept for choosing among recipes, never for a reported figure.
     """
 
+    # the matrix
     agents: Names = field(
         default_factory=lambda: ["mobil", "keep_lane", "random_legal", "agent_idm"]
     )
     traffics: dict[str, TrafficConfig] = field(
         default_factory=lambda: traffics_of(["idm", "idm_mobil", "gan", "gan_calibrated"], "")
     )
+    # the same episodes for every pair; how many are driven at a time changes no result
     episodes: Episodes = 100
     num_envs: Environments = 512
     stream: Annotated[str, one_of(("report", "select"))] = "report"
 
     def __post_init__(self) -> None:
+        # A list or a name becomes a mapping before its entries are checked.
         assign(self, traffics=traffics_of(self.traffics, "traffics"))
         super().__post_init__()
 
@@ -220,11 +231,13 @@ class ReproduceConfig(EvaluateConfig):
         trained: of source=scratch: folder of the trainings; those in it go on where they stopped.
     """
 
+    # what is compared
     source: Annotated[str, one_of(("shipped", "scratch"))] = "shipped"
     agents: Annotated[Names, _WITH_MOBIL] = field(default_factory=_paper_agents)
     traffics: dict[str, TrafficConfig] = field(default_factory=_all_traffics)
     episodes: Annotated[int, between(2, 10_000)] = 1000
     fewer: dict[str, Annotated[int, at_least(2)]] = field(default_factory=dict)
+    # how the matrix is driven, and where its cells stay
     workers: Annotated[int, between(1, 64)] = 2
     cells: str = "outputs/cells"
     crashes: Annotated[int, between(0, 100)] = 3
@@ -251,9 +264,11 @@ class RecordConfig(HighwayConfig):
         dataset: the dataset's name; null: ganlane/TRAFFIC/DRIVER-v0.
     """
 
+    # whose episodes
     driver: str = "mobil"
     episodes: Episodes = 100
     num_envs: Environments = 64
+    # where they go
     out: Text | None = None
     dataset: Annotated[str, _DATASET] | None = None
 

@@ -55,6 +55,7 @@ class IdmParameters(Record):
         max_acceleration: m/s2, above 0.
     """
 
+    # Table V
     min_gap_m: NotNegative = 2.0
     headway_s: NotNegative = 1.6
     comfortable_deceleration: Positive = 1.7
@@ -84,6 +85,7 @@ class MobilParameters(Record):
             foremost does, m.
     """
 
+    # Table IV
     threshold: NotNegative = 0.1
     politeness_rear: NotNegative = 0.5
     politeness_side: NotNegative = 1.0
@@ -102,8 +104,10 @@ class EgoParameters(Record):
         soft_crash_gap_m: and so is a gap below this, m, at least 0.
     """
 
+    # commands, and when others see them
     abort_lane_change: bool = False
     visibility: Annotated[str, one_of(kind.name.lower() for kind in Visibility)] = "body"
+    # what counts as dangerously close
     soft_crash_ttc_s: NotNegative = 1.5
     soft_crash_gap_m: NotNegative = 2.0
 
@@ -152,11 +156,13 @@ class RandomDrivers(Record):
         sway_period_s: periods of that wandering, s.
     """
 
+    # car following
     headway_s: Range = (0.8, 2.2)
     max_acceleration: PositiveRange = (0.6, 1.6)
     comfortable_deceleration: PositiveRange = (1.2, 2.5)
     strongest_braking: PositiveRange = (4.0, 9.0)
     desired_speed: PositiveRange = (0.9, 1.1)
+    # lane changes, and what a driver cannot do exactly
     politeness: Range = (0.0, 1.0)
     reaction_s: Annotated[
         Range, Rule(lambda value: value[1] <= 3, "two numbers [low, high], 0 <= low <= high <= 3")

@@ -63,6 +63,7 @@ class SceneConfig(Record):
 
     def vehicles(self, env: EnvConfig) -> tuple[SceneVehicle, ...]:
         """The vehicles, the ego first."""
+        # The scene function takes what its signature names: of the road, and its own numbers.
         from ganlane.sim import scenarios
 
         offered = {
@@ -211,15 +212,19 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
 
     group = "env"
 
+    # the road and who is on it
     vehicles: Annotated[int, _VEHICLES_OR_SCENE] = 9
     lanes: Annotated[int, between(0, 20)] = 3
     lane_width_m: NotNegative = 4.0
     ego_desired_speed_mps: NotNegative = 25.0
     metres_per_vehicle: Positive | None = None
+    # whether the road empties behind the ego
     recycle: bool = False
     recycle_share: Share = 1.0
+    # how a decision is computed; the course of an episode is the same
     compile: bool = False
     kernel: Annotated[str, one_of(KERNELS)] = "auto"
+    # what stands at the start, and how everybody drives
     scene: SceneConfig | None = None
     ego: EgoParameters = field(default_factory=EgoParameters)
     idm: IdmParameters = field(default_factory=IdmParameters)
@@ -227,10 +232,12 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # Idempotent, so that a saved run is made again with the same spread.
         if self.metres_per_vehicle is not None:
             assign(self, spread_m=max(self.spread_m, self.metres_per_vehicle * self.vehicles))
         if isinstance(self.scene, FileScene):
             self._take_road_of(self.scene)
+        # A file has given what was 0; the number of vehicles may still wait for its scene.
         for name in ("vehicles", "lanes", "ego_desired_speed_mps"):
             if getattr(self, name) == 0 and (self.scene is None or name != "vehicles"):
                 raise ParameterError(
@@ -243,6 +250,7 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
                     f"{getattr(self, name):g}, or vehicles in neighbouring lanes touch; widen the "
                     "lanes."
                 )
+        # An episode that ends before its first decision would have no action and no reward.
         if self.timeout_s < self.decision_period_s:
             raise ParameterError(
                 f"{{timeout_s}}={self.timeout_s:g}: expected at least {{decision_period_s}}="
@@ -274,6 +282,7 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
         check_start(*start)
 
     def _check_scene(self) -> None:
+        # Table II draws scenes at random; on one set by hand its keys would do nothing.
         for name in TABLE_II_KEYS:
             value = getattr(self, name)
             if value != getattr(SpawnParameters, name):

@@ -46,6 +46,7 @@ class EpisodeParameters(Record):
         timeout_s: time at which it is cut off, s, reported as time-out.
     """
 
+    # the ego decides once a second, the physics steps ten times
     decision_period_s: Positive = 1.0
     goal_m: Positive = 5000.0
     timeout_s: Positive = 1000.0
@@ -98,13 +99,16 @@ class SpawnParameters(Record):
             limiter of Directive 92/6/EEC.
     """
 
+    # where the first vehicles stand
     spread_m: Positive = 200.0
     min_spacing_m: Positive = 25.0
+    # how fast they are at first, and want to be
     front_speed_mps: Range = (10.0, 12.0)
     rear_speed_mps: Range = (15.0, 25.0)
     ego_speed_mps: Range = (10.0, 15.0)
     desired_speed_mps: PositiveRange = (18.0, 26.0)
     ego_desired_speed_mps: Positive = 25.0
+    # bodies; the paper has cars only
     length_m: Positive = 4.5
     width_m: Positive = 2.5
     truck_share: Share = 0.0

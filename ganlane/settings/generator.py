@@ -107,9 +107,11 @@ class LoopConfig(Record):
         max_seconds: stop after this long, s; null: never.
     """
 
+    # how long
     updates: Count = 1200
     evaluate_every: Count = 150
     patience: Count = 8
+    # how fast
     learning_rate: Positive = 4e-3
     warmup: CountOrZero = 100
     largest_gradient: Positive = 1.0
@@ -154,9 +156,11 @@ class PaperConfig(FitConfig):
     sizes: GeneratorSizes = field(default_factory=GeneratorSizes)
     weights: LossWeights = field(default_factory=LossWeights)
     loop: LoopConfig = field(default_factory=LoopConfig)
+    # how windows are cut from the recordings
     group_size: Count = 9
     stride: Count = 1
     held_out_stride: Count = 3
+    # one update
     samples: Annotated[int, between(1, 100)] = 6
     history_noise: NotNegative = 0.0
     batch: Count = 48
@@ -191,11 +195,13 @@ class CalibratedConfig(FitConfig):
     loop: LoopConfig = field(
         default_factory=lambda: LoopConfig(updates=800, evaluate_every=80, warmup=40)
     )
+    # how far scenes are rolled out
     horizons: tuple[Count, ...] = (8, 16, 29)
     shares: tuple[NotNegative, ...] = (3.0, 1.0, 1.0)
     held_out_horizon: Annotated[int, at_least(8)] = 29
     batch: Count = 6
     held_out_stride: Count = 3
+    # what makes drivers differ
     noise_period_s: NotNegative = 5.0
     mirror: bool = True
     washout_s: Annotated[float, _WASHOUT] = 3.0

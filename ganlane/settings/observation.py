@@ -17,24 +17,19 @@ from ganlane.settings.record import (
     Share,
     assign,
     one_of,
+    option_names,
     part_of,
 )
 
-#: What the agent can see, see :data:`ganlane.transforms.OBSERVATIONS`.
-FORMS = (
-    "table3",
-    "table3_progress",
-    "lane_view",
-    "lane_view_drift",
-    "lane_view_overlap",
-    "table3_lane_view",
-)
+#: What the agent can see, one option each; see :data:`ganlane.transforms.OBSERVATIONS`.
+FORMS = tuple(option_names("observation"))
 #: Scale of the nearness in the lane view, m.
 NEARNESS_M = 15.0
 #: Overlap along the road that adds 1 to the nearness, m: drivers at the side brake so hard that one
 #: metre decides.
 OVERLAP_M = 1.0
-#: The masks, see :class:`ganlane.transforms.ActionMaskTransform`.
+#: The masks, in the order of the kernel's numbers; see
+#: :class:`ganlane.transforms.ActionMaskTransform`.
 MASKS = ("none", "legal", "safe")
 
 
@@ -64,6 +59,7 @@ class SensorParameters(Record):
         delay_s: age of what is perceived, s, a multiple of env.decision_period_s.
     """
 
+    # what a measurement gets wrong, and how late it comes
     position_noise_m: NotNegative = 0.0
     lateral_noise_m: NotNegative = 0.0
     speed_noise_mps: NotNegative = 0.0
@@ -163,9 +159,11 @@ class RewardParameters(Record):
 
     group = "reward"
 
+    # what is paid for speed
     base_speed_mps: Number = 15.0
     low_acceleration: Negative = -2.0
     literal_low_acceleration: bool = False
+    # what an event costs or earns
     lane_change: Number = -1.0
     out_of_road: Number = -100.0
     hard_crash: Number = -100.0

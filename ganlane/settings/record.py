@@ -173,6 +173,7 @@ class Record:
     chosen_by: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
+        # A frozen dataclass is set through object's own setter, before anybody sees it.
         hints = _hints(type(self))  # type: ignore[arg-type]
         for field in fields(self):  # type: ignore[arg-type]
             value = _fitted(hints[field.name], getattr(self, field.name), field.name, field)
@@ -186,6 +187,7 @@ class Record:
     @classmethod
     def chosen(cls, data: Any) -> tuple[type[Record], Any]:
         """The class that ``data`` ask for, and the data of its constructor."""
+        # A name is the option of that name; a mapping with a name is that option with changes.
         if isinstance(data, str) and cls.group:
             data = {"name": data}
         if isinstance(data, Mapping) and cls.group and "name" in data:
@@ -219,6 +221,7 @@ def make(kind: type[Part], data: Any, key: str = "") -> Part:
             f"{{{key}}}={as_typed(values)}: it has keys of its own; give "
             f"{options}{{{key}}}.NAME=VALUE."
         )
+    # Unknown keys first: a mistyped key is the commonest mistake.
     names = key_names(chosen)
     for name in values:
         if name not in names:
@@ -284,6 +287,7 @@ _WORDS = {
 
 def _fitted(hint: Any, value: Any, key: str, field: Field[Any]) -> Any:
     """``value`` as the annotation ``hint`` wants it, its ranges checked."""
+    # Peel the annotation from the outside: optional, ranges, then what the value itself is.
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
         if value is None and NoneType in inner:
@@ -301,6 +305,7 @@ def _fitted(hint: Any, value: Any, key: str, field: Field[Any]) -> Any:
     if hasattr(value, "tolist"):  # NumPy's and torch's numbers and arrays
         value = value.tolist()
     if kind in (list, tuple):
+        # A set or an array is as good as a list; a mapping is a mistake.
         entries = [value] if isinstance(value, str) else value  # agents=mobil
         if not isinstance(entries, Collection) or isinstance(entries, Mapping):
             raise _refusal(key, value, "a list in brackets", field)
@@ -325,6 +330,7 @@ def _scalar(kind: Any, value: Any, key: str, field: Field[Any]) -> Any:
             return float(value)
         except OverflowError as error:
             raise _refusal(key, value, "a number of fewer digits", field) from error
+    # YAML reads 1e6 as a float.
     if kind is int and isinstance(value, float) and value.is_integer():
         return int(value)  # 1e6
     if kind is int and hasattr(value, "__index__") and not isinstance(value, bool):
@@ -339,6 +345,7 @@ def _scalar(kind: Any, value: Any, key: str, field: Field[Any]) -> Any:
 
 
 def _refusal(key: str, value: Any, expected: str, field: Field[Any]) -> ParameterError:
+    # The default is a value that works, so it serves as the example.
     default = field.default
     if field.default_factory is not MISSING:
         default = field.default_factory()

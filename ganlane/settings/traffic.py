@@ -1,11 +1,11 @@
 """``traffic=...``: who drives the other vehicles.
 
-``_target_`` names a :class:`ganlane.traffic.TrafficModule` or a function annotated to return one. It
-is called with those of ``road, stream, idm, mobil, steering, spawn`` that its signature asks for,
-and with the record's further keys. A model of your own needs no more than its import path::
+``_target_`` names a :class:`ganlane.traffic.TrafficModule` or a function annotated to return one.
+It is called with those of ``road, stream, idm, mobil, steering, spawn`` that its signature asks
+for, and with the record's further keys. A model of your own needs no more than its import path::
 
-    python -m ganlane.evaluate 'traffics=[my.module.MyTraffic]'
-    python -m ganlane.train traffic=idm traffic._target_=my.module.MyTraffic traffic.pace=0.9
+    ganlane evaluate 'traffics=[my.module.MyTraffic]'
+    ganlane train traffic=idm traffic._target_=my.module.MyTraffic traffic.pace=0.9
 """
 
 from __future__ import annotations
@@ -71,6 +71,7 @@ class TrafficConfig(Record):
 
         ``data`` may also be a class or an import path, alone or as the mapping's ``name``.
         """
+        # A class, its import path, an option's name: all become the mapping with _target_.
         if inspect.isclass(data) and not isinstance(data, cls):
             data = f"{data.__module__}.{data.__qualname__}"
         if isinstance(data, str):
@@ -89,6 +90,7 @@ class TrafficConfig(Record):
         if not isinstance(target, str) or target in cls.kinds():
             return super().chosen(data)
         # A model of your own: what is no key of every traffic is an argument of its constructor.
+        # The saved configuration of a run has them below arguments_ already.
         shared = {name: data[name] for name in key_names(TrafficConfig) if name in data}
         stored = data.get("arguments_")
         arguments = {name: value for name, value in data.items() if name not in shared}
@@ -252,6 +254,7 @@ class MixedTrafficConfig(TrafficConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # A mistyped name of a part would otherwise change nothing, and nobody would see it.
         for name in self.options:
             if name not in self.shares:
                 raise ParameterError(
@@ -339,6 +342,7 @@ def traffics_of(data: Any, key: str) -> dict[str, TrafficConfig]:
     """
     if isinstance(data, Mapping):
         return {str(name): make(TrafficConfig, value, key) for name, value in data.items()}
+    # One name stands for a list of one, as everywhere on the command line.
     entries = [data] if isinstance(data, str) or not isinstance(data, Iterable) else list(data)
     traffics = [make(TrafficConfig, entry, key) for entry in entries]
     by_label = {traffic.label(): traffic for traffic in traffics}

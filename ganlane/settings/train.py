@@ -136,6 +136,7 @@ class TrainConfig(DrivingConfig):
         evaluation: when training is over.
     """
 
+    # how long, and what is written on the way
     total_decisions: Count = 600_000
     compile: Annotated[str, one_of(("auto", "always", "never"))] = "auto"
     log_every: Count = 10_000
@@ -143,12 +144,15 @@ class TrainConfig(DrivingConfig):
     selection_episodes: Episodes = 64
     checkpoint_every_s: NotNegative = 20.0
     checkpoint_replay: bool = True
+    # going on with a run; none of the settings of the run itself
     resume: str | None = None
+    # on what, from what, by which agent
     traffic: TrafficConfig = field(default_factory=IdmMobilTrafficConfig)
     init: InitConfig = field(default_factory=InitConfig)
     agent: RainbowConfig = field(default_factory=RainbowConfig)
     collector: CollectorConfig = field(default_factory=CollectorConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
+    # the phase before, and the comparison after
     pretrain: PretrainConfig = field(default_factory=PretrainConfig)
     evaluation: FinalEvaluationConfig = field(default_factory=FinalEvaluationConfig)
 
@@ -156,6 +160,7 @@ class TrainConfig(DrivingConfig):
         """The config with ``env.compile`` set according to ``compile``."""
         from ganlane.torch_settings import can_compile
 
+        # Compiling takes minutes: the benefit has to be larger.
         worth = self.total_decisions >= WORTH_COMPILING and can_compile()
         if self.env.compile or self.compile == "never" or (self.compile == "auto" and not worth):
             return self
@@ -168,6 +173,7 @@ class TrainConfig(DrivingConfig):
 
     def final_evaluation(self) -> EvaluateConfig:
         """Config of the final comparison, by default on the traffic of the training."""
+        # The trained agent's mask stays with the agent, so the comparison sets none.
         traffic = self.evaluation.traffic or self.traffic
         return EvaluateConfig(
             seed=self.seed,

@@ -31,10 +31,13 @@ def boxes_overlap(
         dx, dy: from the centre of the first box to the centre of the other, m.
         heading, length, width: of the first box, rad and m; ``other_*``: of the other.
     """
-    c, s = torch.cos(heading), torch.sin(heading)
-    oc, os = torch.cos(other_heading), torch.sin(other_heading)
+    c = torch.cos(heading)
+    s = torch.sin(heading)
+    oc = torch.cos(other_heading)
+    os = torch.sin(other_heading)
     # Of the angle between the two boxes.
-    cos, sin = (c * oc + s * os).abs(), (c * os - s * oc).abs()
+    cos = (c * oc + s * os).abs()
+    sin = (c * os - s * oc).abs()
     boxes = [(0.5 * length, 0.5 * width), (0.5 * other_length, 0.5 * other_width)]
 
     def separated(

@@ -51,10 +51,10 @@ def at_rest(number: Tensor) -> Tensor:
     """``number``, and 0 where it is at most :data:`REST`.
 
     A driver that keeps its lane comes closer to its centre by a constant factor in every step, so
-    after a minute its numbers were denormal, with which many processors are slow: by processor the
-    kernel took 1.2 to 4.9 times as long. They are snapped to 0 here, in the model, and not flushed
-    by a mode of the processor: kernel, tensor code on any device and scalar twin stay the same, and
-    the caller's threads keep their mode.
+    after a minute its numbers are denormal, with which processors are slow: snapped to 0, the
+    kernel's slowest stretch took 1.32 ms instead of 1.62 ms at 1024 rows. This is done in the model
+    and not by a mode of the processor: kernel, tensor code on any device and scalar twin stay the
+    same, and the caller's threads keep their mode.
     """
     return torch.nn.functional.hardshrink(number, REST)
 
@@ -115,7 +115,8 @@ def steer(
     lateral_speed = speed * torch.sin(heading + slip)
     yaw_rate = speed / (0.5 * WHEELBASE_M) * torch.sin(slip)
     offset = centre_y - y
-    near, far = pace * p.near_s, pace * p.far_s
+    near = pace * p.near_s
+    far = pace * p.far_s
     theta_near = torch.atan(offset / near) - heading
     turn = p.gain_far * angle_rate(far) + p.gain_near * angle_rate(near)
     turn = turn + p.gain_integral * theta_near * (speed / pace)
@@ -207,13 +208,15 @@ def ego_surroundings(
     IDM considers the leaders in all lanes that the ego attends to, soft crashes only the lanes that
     its body is in.
     """
-    attention, body = spanned(scene.attention), spanned(scene.body)
+    attention = spanned(scene.attention)
+    body = spanned(scene.body)
     # One search for both kinds of lanes.
     gap, speed = leader(scene, torch.cat((attention, body), dim=-1))
     attended = attention.shape[-1]
     followed = Neighbour(gap[..., :attended], speed[..., :attended])
     near = Neighbour(gap[..., attended:], speed[..., attended:])
-    behind, speed = follower(scene, body), scene.observers.speed[..., None]
+    behind = follower(scene, body)
+    speed = scene.observers.speed[..., None]
     closing = torch.where(behind.exists, behind.speed - speed, 0.0)
     limits = (ego.soft_crash_ttc_s, ego.soft_crash_gap_m)
     return (

@@ -104,7 +104,8 @@ def acceleration_behind(
     headway_s: Tensor | float | None = None,
 ) -> Tensor:
     """IDM acceleration of each observer behind ``ahead`` [N, K, L] in L lanes, m/s2."""
-    speed, desired = scene.observers.speed[..., None], scene.observers.desired_speed[..., None]
+    speed = scene.observers.speed[..., None]
+    desired = scene.observers.desired_speed[..., None]
     headway_s = headway_s[..., None] if isinstance(headway_s, Tensor) else headway_s
     return idm_acceleration(
         speed, desired, ahead.gap, ahead.speed, parameters.per_lane(), headway_s
@@ -157,7 +158,8 @@ def _survives(
         next_speed = (speed + acceleration * PHYSICS_STEP_S).clamp_min(0.0)
         next_leader = (leader_now + idm.min_acceleration * PHYSICS_STEP_S).clamp_min(0.0)
         gap = gap + 0.5 * PHYSICS_STEP_S * (leader_now + next_leader - speed - next_speed)
-        speed, leader_now = next_speed, next_leader
+        speed = next_speed
+        leader_now = next_leader
         smallest = torch.minimum(smallest, gap)
     return smallest >= start.clamp(1e-9, SMALLEST_GAP_M)
 

@@ -49,8 +49,10 @@ def lane_accelerations(scene: Scene, lanes: Tensor, idm: AnyIdm) -> LaneAccelera
 
     With per-driver parameters, each driver predicts the others with its own parameters.
     """
-    ahead, behind = leader(scene, lanes), follower(scene, lanes)
-    speed, length = scene.observers.speed[..., None], scene.observers.length[..., None]
+    ahead = leader(scene, lanes)
+    behind = follower(scene, lanes)
+    speed = scene.observers.speed[..., None]
+    length = scene.observers.length[..., None]
     driver = (behind.speed, behind.desired_speed)
     with_it = idm_acceleration(*driver, behind.gap, speed, idm.per_lane())
     # Without the observer its follower is behind its leader, or alone.
@@ -70,7 +72,8 @@ def mobil_criterion(
     there: LaneAccelerations, here: LaneAccelerations, mobil: AnyMobil
 ) -> tuple[Tensor, Tensor]:
     """Incentive of a change from ``here`` [N, K, 1] to ``there`` [N, K, L], m/s2; whether safe."""
-    burden, relief = there.with_it - there.without, here.without - here.with_it
+    burden = there.with_it - there.without
+    relief = here.without - here.with_it
     incentive = (
         there.observer
         - here.observer
@@ -103,7 +106,8 @@ def one_at_a_time(
     Too close means nearer than ``exclusive_m`` (centre to centre), or requiring unsafe braking.
     MOBIL's criteria do not cover this case, since neither vehicle is in that lane yet.
     """
-    wants, vehicles = wish != 0, scene.vehicles
+    wants = wish != 0
+    vehicles = scene.vehicles
     if not reads_are_cheap(wish):
         return torch.where(_gives_way(vehicles, scene.road, wish, idm, mobil), 0, wish)
     # Rivals are rare: among all pairs a decision of idm_random takes 5 % longer with 1024 rows.
@@ -126,9 +130,12 @@ def _gives_way(
     vehicles: Vehicles, road: Road, wish: Tensor, idm: AnyIdm, mobil: AnyMobil
 ) -> Tensor:
     """Whether a vehicle ahead that wants the same lane is too close, bool [N, M]."""
-    pairs, wants, target = compare(vehicles, road), wish != 0, vehicles.target_lane + wish
+    pairs = compare(vehicles, road)
+    wants = wish != 0
+    target = vehicles.target_lane + wish
     same = wants[:, None, :] & wants[:, :, None] & (target[:, None, :] == target[:, :, None])
-    speed, desired = vehicles.speed[:, :, None], vehicles.desired_speed[:, :, None]
+    speed = vehicles.speed[:, :, None]
+    desired = vehicles.desired_speed[:, :, None]
     leader_speed = vehicles.speed[:, None, :]
     demand = idm_acceleration(speed, desired, pairs.ahead, leader_speed, idm.per_lane())
     near = (pairs.distance < mobil.exclusive_m) | (demand < -mobil.safe_deceleration)
@@ -147,7 +154,8 @@ def mobil_wishes(
     lane = vehicles.target_lane.to(vehicles.x.dtype)
     lanes = torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1)
     accelerations = lane_accelerations(scene, lanes, idm)
-    here, there = accelerations.of(slice(0, 1)), accelerations.of(slice(1, None))
+    here = accelerations.of(slice(0, 1))
+    there = accelerations.of(slice(1, None))
     incentive, safe = mobil_criterion(there, here, mobil)
     exists = torch.stack((lane + 1.0 <= road.lanes - 1, lane - 1.0 >= 0), dim=-1)
     pays = exists & safe & (incentive > mobil.threshold)

@@ -139,7 +139,8 @@ def compare(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Pairs
 def perceive(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Scene:
     """The :class:`Scene` of ``vehicles`` as seen by all of them or by a slice of them."""
     body = body_lanes(vehicles, road)
-    attention, x = with_target(body, vehicles), vehicles.x
+    attention = with_target(body, vehicles)
+    x = vehicles.x
     sorts = (
         which == slice(None)
         and x.shape[0] * x.shape[1] ** 2 >= SORTS_FROM
@@ -171,7 +172,8 @@ def in_lane(scene: Scene, lane: Tensor) -> Tensor:
     """
     low, high = scene.presence
     for _ in range(lane.ndim - 1):
-        low, high = low.unsqueeze(1), high.unsqueeze(1)
+        low = low.unsqueeze(1)
+        high = high.unsqueeze(1)
     asked = lane[..., None]
     return (low <= asked) & (asked <= high)
 
@@ -208,8 +210,10 @@ def follower(scene: Scene, lane: Tensor) -> Follower:
     else:
         numbers = torch.arange(vehicles.x.shape[1], device=lane.device)
         key = _nearest_key(scene, scene.queue, lanes, -1, numbers)
-        front, index = _unordered(key >> 32), key & 0xFFFFFFFF
-    gap, flat = _gap(scene, front, -1).view(lane.shape), index.flatten(1)
+        front = _unordered(key >> 32)
+        index = key & 0xFFFFFFFF
+    gap = _gap(scene, front, -1).view(lane.shape)
+    flat = index.flatten(1)
     speed = vehicles.speed.gather(1, flat).view(lane.shape)
     desired_speed = vehicles.desired_speed.gather(1, flat).view(lane.shape)
     return Follower(gap, speed, desired_speed, gap < FREE_GAP_M)
@@ -223,7 +227,8 @@ def _candidates(scene: Scene, lanes: Tensor, side: int) -> Tensor:
     On a ring from the observer on; else on the road, so that it is one number per vehicle, whoever
     looks.
     """
-    v, pairs = scene.vehicles, scene.pairs
+    v = scene.vehicles
+    pairs = scene.pairs
     x = v.x[:, None, :] if scene.road.ring_m is None else pairs.distance
     end = side * x - (0.5 * v.length)[:, None, :]
     elsewhere = pairs.order <= 0 if side > 0 else pairs.order >= 0
@@ -266,7 +271,8 @@ def _nearest_key(
     if isinstance(lanes, Tensor):
         lanes = int(lanes.max())
     if side < 0:  # from the rear
-        turn, place = turn.flip(1), count - 1 - place
+        turn = turn.flip(1)
+        place = count - 1 - place
     key = ((_ordered(side * v.x - 0.5 * v.length) << 32) | second).gather(1, turn)
     low, high = (end.gather(1, turn) for end in scene.presence)
     number = torch.arange(lanes, device=v.x.device)[:, None, None]

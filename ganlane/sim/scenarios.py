@@ -135,7 +135,8 @@ def stop_and_go(
     steady = LENGTH_M + 1.1 * (idm.min_gap_m + idm.headway_s * speed_mps)
     queue = LENGTH_M + idm.min_gap_m
     approach = 5.0 * speed_mps
-    speeds, spacings = [speed_mps] * 2, [0.0, steady]
+    speeds = [speed_mps] * 2
+    spacings = [0.0, steady]
     for _ in range(waves):
         speeds += [0.0] * per_wave + [speed_mps] * per_wave
         spacings += [steady] + [queue] * (per_wave - 1) + [approach] + [steady] * (per_wave - 1)

@@ -70,7 +70,8 @@ def check_start(
 def _rank(value: Tensor, same: Tensor | None = None) -> Tensor:
     """Rank of each by ``value`` [N, M] and then index, among the ``same`` [N, M, M]."""
     index = torch.arange(value.shape[1], device=value.device)
-    mine, other = value[:, :, None], value[:, None, :]
+    mine = value[:, :, None]
+    other = value[:, None, :]
     before = (other < mine) | ((other == mine) & (index[None, :] < index[:, None]))
     return (before if same is None else before & same).sum(-1)
 
@@ -102,7 +103,8 @@ def ego_first(x: Tensor, lane: Tensor) -> tuple[Tensor, Tensor]:
     """
     rank = _rank(x)
     order = torch.where(rank == (x.shape[1] - 1) // 2, -1, rank).argsort(dim=1)
-    x, lane = x.gather(1, order), lane.gather(1, order)
+    x = x.gather(1, order)
+    lane = lane.gather(1, order)
     return x - x[:, :1], lane
 
 
@@ -169,7 +171,9 @@ class RandomScenes:
 
         The road must be the scene's, wide enough, and as a ring long enough.
         """
-        p, lane_width_m, ring_m = self.parameters, road.lane_width_m, road.ring_m
+        p = self.parameters
+        lane_width_m = road.lane_width_m
+        ring_m = road.ring_m
         if isinstance(road.lanes, Tensor) or isinstance(lane_width_m, Tensor):
             return  # a road for each row: its vehicles come from recordings
         if road != self.road:
@@ -226,15 +230,18 @@ def _room(there: Scene, idm: IdmParameters, safe: float) -> Tensor:
     result holds whichever of the others move too.
     """
     one, other, (low, high) = there.observers, there.vehicles, there.attention
-    their_low, their_high = low.repeat(1, 2)[:, None, :], high.repeat(1, 2)[:, None, :]
+    their_low = low.repeat(1, 2)[:, None, :]
+    their_high = high.repeat(1, 2)[:, None, :]
     shares = (low[..., None] <= their_high) & (their_low <= high[..., None])
     sides = 0.5 * one.width[..., None] + 0.5 * other.width[:, None, :] + SIDE_M
     shares |= (one.y[..., None] - other.y[:, None, :]).abs() < sides
     pairs = there.pairs
     itself = torch.eye(one.x.shape[1], dtype=torch.bool, device=one.x.device).repeat(1, 2)
     counts = shares & other.valid[:, None, :] & ~itself
-    speed, desired = one.speed[..., None], one.desired_speed[..., None]
-    its_speed, its_desired = other.speed[:, None, :], other.desired_speed[:, None, :]
+    speed = one.speed[..., None]
+    desired = one.desired_speed[..., None]
+    its_speed = other.speed[:, None, :]
+    its_desired = other.desired_speed[:, None, :]
     behind = idm_acceleration(speed, desired, pairs.ahead, its_speed, idm)
     before = idm_acceleration(its_speed, its_desired, pairs.behind, speed, idm)
     asked = torch.where(pairs.order > 0, behind, before)

@@ -25,13 +25,15 @@ from ganlane.errors import UserError
 from ganlane.keys import ACTIONS, EGO_INDEX
 from ganlane.native.tensors import SafeActions
 from ganlane.settings.driving import IdmParameters
-from ganlane.settings.observation import MASKS
 from ganlane.sim.dynamics import SIDES, ego_scene, is_heard, on_road
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import lane_accelerations
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.torch_settings import compiled
 from ganlane.transforms.sensors import PerceptionTransform
+
+#: What this transform computes; an environment without a mask (``none``) has no transform.
+FORMS = ("legal", "safe")
 
 
 def on_road_actions(target_lane: Tensor, lanes: int | Tensor) -> Tensor:
@@ -100,9 +102,9 @@ class ActionMaskTransform(PerceptionTransform):
         abort: bool = False,
         native_vehicles: int | None = None,
     ) -> None:
-        if form not in MASKS[1:]:
+        if form not in FORMS:
             raise UserError(
-                f"mask.form={form!r}: expected one of {', '.join(MASKS[1:])}; choose one of them."
+                f"mask.form={form!r}: expected one of {', '.join(FORMS)}; choose one of them."
             )
         if safe_deceleration <= 0:
             raise UserError(
@@ -112,7 +114,10 @@ class ActionMaskTransform(PerceptionTransform):
         if form == "safe":
             out_keys.append(keys.NO_SAFE_ACTION)
         super().__init__(in_keys=[keys.VEHICLES, keys.EGO], out_keys=out_keys)
-        self.road, self.form, self.idm, self.abort = road, form, idm, abort
+        self.road = road
+        self.form = form
+        self.idm = idm
+        self.abort = abort
         self.safe_deceleration = safe_deceleration
         self.native: SafeActions | None = None
         if native_vehicles is not None and form == "safe":
@@ -133,7 +138,8 @@ class ActionMaskTransform(PerceptionTransform):
         # Keeping the lane is always allowed: where nothing is safe, there is nothing better.
         safe = braking_demand(vehicles, road, self.idm) >= -self.safe_deceleration
         none = ~(safe & legal).any(1)
-        keep, changes = torch.ones_like(safe[:, :1]), legal[:, 1:] & safe[:, 1:]
+        keep = torch.ones_like(safe[:, :1])
+        changes = legal[:, 1:] & safe[:, 1:]
         return torch.cat((keep, changes), dim=1), none
 
     def compile_graphs(self) -> None:

@@ -44,7 +44,9 @@ def measure(
     (:func:`ganlane.sim.random.episode_key`).
     """
     values = {"x": vehicles.x, "y": vehicles.y, "speed": vehicles.speed}
-    valid, shape, dtype = vehicles.valid, vehicles.x.shape, vehicles.x.dtype
+    valid = vehicles.valid
+    shape = vehicles.x.shape
+    dtype = vehicles.x.dtype
     count = shape[1]
     other = torch.arange(count, device=vehicles.x.device) != keys.EGO_INDEX
     scales = (parameters.position_noise_m, parameters.lateral_noise_m, parameters.speed_noise_mps)

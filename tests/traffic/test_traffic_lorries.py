@@ -12,7 +12,7 @@ from ganlane.agents.drivers import KeepLaneDriver
 from ganlane.build import make_env, make_traffic
 from ganlane.generator.closed_loop import extra_inputs
 from ganlane.realism.long_runs import LongRunParameters
-from ganlane.realism.starts import spawned_frame
+from ganlane.realism.starts import spawned_recordings
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.traffic import (
     GanCalibratedTrafficConfig,
@@ -87,7 +87,7 @@ def test_the_generator_is_told_the_gap_behind_the_lorry():
 
 def test_the_realism_card_measures_spawned_lorries_by_their_own_length():
     parameters = LongRunParameters(9, most_s=2.0, spawn=SpawnParameters(truck_share=0.5))
-    frame = spawned_frame(IdmTraffic, Road(), parameters, rows=4)
-    lengths = frame.group_by("scene", "vehicle").first()["length"].to_numpy()
+    recordings = spawned_recordings(IdmTraffic, Road(), parameters, rows=4)
+    lengths = np.concatenate([recording.length for recording in recordings])
     assert set(lengths) == {4.5, 12.0}
     assert 0.2 < np.mean(lengths == 12.0) < 0.8

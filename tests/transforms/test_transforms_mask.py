@@ -21,7 +21,8 @@ from ganlane.sim.state import Road
 from ganlane.transforms import ActionMaskTransform
 from ganlane.transforms.mask import obeyed_actions, on_road_actions
 
-KEEP_ONLY, ALL = [True, False, False], [True, True, True]
+KEEP_ONLY = [True, False, False]
+ALL = [True, True, True]
 
 
 def allowed(*cars, form="safe", direction=0, lanes=3, abort=False, limit=4.0):
@@ -44,7 +45,8 @@ def idm(speed, desired, gap, leader_speed):
 
 # --- what is allowed
 
-LEFT_ONLY, RIGHT_ONLY = [True, True, False], [True, False, True]
+LEFT_ONLY = [True, True, False]
+RIGHT_ONLY = [True, False, True]
 BESIDE = [{"x": 0.0, "lane": 1}, {"x": 1.0, "lane": 2}, {"x": -1.0, "lane": 0}]
 
 
@@ -116,7 +118,8 @@ def test_a_change_is_allowed_up_to_the_braking_that_it_asks_for(
 
 
 def test_a_lorry_reaches_farther_than_a_car():
-    ego, behind = {"x": 0.0, "lane": 0, "speed": 20.0}, {"x": -13.0, "lane": 1, "speed": 16.0}
+    ego = {"x": 0.0, "lane": 0, "speed": 20.0}
+    behind = {"x": -13.0, "lane": 1, "speed": 16.0}
     assert allowed(ego, behind)[0] == LEFT_ONLY
     assert allowed(ego, {**behind, "length": 25.0})[0] == KEEP_ONLY
 

@@ -15,7 +15,7 @@ import pytest
 import torch
 from reference.refusals import Bomb, refusal, run_folder
 
-from ganlane.__main__ import dispatch
+from ganlane.__main__ import main
 from ganlane.agents import load_agent
 from ganlane.api import train
 from ganlane.arguments import import_target
@@ -120,7 +120,9 @@ TEXTS = {
     "an endless alias": "&a {traffic: *a}",
     "a mapping merged into another": "a: &a {_target_: evil.Traffic}\ntraffic: {<<: *a}\n",
     "endless brackets": "[" * 100_000,
-    "a megabyte": f"seed: {'0' * 2**20}1",
+    "endless braces": "{a: " * 50_000,
+    "endless lists": "- " * 100_000,
+    "too large a file": f"seed: {'0' * 2**18}1",
 }
 CONFIGS = TEXTS | {way: json.dumps(stored) for way, stored in STORED.items()}
 
@@ -216,7 +218,7 @@ def test_hydra_imports_nothing_and_reads_no_other_configuration(arguments, here,
 @pytest.mark.parametrize(
     "override",
     [
-        *("hydra.run.dir=out", "hydra.sweep.dir=out", "hydra.job.num=3", "hydra/launcher=joblib"),
+        *("hydra.run.dir=out", "hydra.sweep.dir=out", "hydra/launcher=joblib"),
         *(
             "hydra.launcher.n_jobs=2",
             "hydra.sweeper.max_batch_size=4",
@@ -340,5 +342,5 @@ def test_another_traffic_takes_the_place_of_the_stored_one():
 
 def test_a_command_does_not_look_for_modules_where_it_is_started(monkeypatch):
     monkeypatch.setattr(sys, "path", [place for place in sys.path if place])
-    dispatch(["train", "resume=nowhere"])
+    main(["train", "resume=nowhere"])
     assert "" not in sys.path

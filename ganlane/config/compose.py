@@ -85,6 +85,9 @@ def _check(override: Override) -> None:
                 f"{key}: no such key here; of Hydra's configuration give {', '.join(HYDRA_KEYS)}, "
                 "hydra/launcher=NAME, hydra.launcher.PARAMETER=... or the same of the sweeper."
             )
+        # Hydra reads the file of this name, from another folder too
+        if "/" in key and not str(override.value()).isidentifier():
+            raise UserError(f"{word}: no such option; give a launcher's name, such as joblib.")
         return
     if not _is_group(key):
         return

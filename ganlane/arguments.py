@@ -133,7 +133,8 @@ def call_with(
     """Call ``target`` with all of ``required`` and those of ``offered`` that its signature names.
 
     Raises:
-    # a constructor is called with what it names, and no more
+        UserError: ``target`` does not accept an argument of ``required``, or needs one that is
+            missing.
     """
     signature = signature_of(target)
     parameters = signature.parameters

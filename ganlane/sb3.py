@@ -65,7 +65,9 @@ class HighwayVecEnv(VecEnv):
         self._return = np.zeros(highways.num_envs)
         self._length = np.zeros(highways.num_envs, dtype=np.int64)
         super().__init__(
-            highways.num_envs, highways.single_observation_space, highways.single_action_space
+            highways.num_envs,
+            highways.single_observation_space,
+            highways.single_action_space,
         )
 
     def reset(self) -> Floats:

@@ -103,6 +103,14 @@ class HighwayEnv(EnvBase):
         recycle_share: float = 1.0,
         kernel: str = "torch",
     ) -> None:
+        # Those who call this from Python meet no record that would check types.
+        if not isinstance(traffic, TrafficModule):
+            raise UserError(
+                f"traffic={traffic!r:.80}: expected a TrafficModule; give one, or a name to "
+                "ganlane.make_env()."
+            )
+        if scenes is not None and not callable(scenes):
+            raise UserError(f"scenes={scenes!r:.80}: expected scenes; give a FixedScene, say.")
         # The bounds of the settings lie within.
         whole_number("num_envs", num_envs, 1, 2**20)
         whole_number("first_episode", first_episode, 0, 2**62)
@@ -298,9 +306,21 @@ class HighwayEnv(EnvBase):
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         ego = dict(state.get(keys.EGO).items())
         # The command, then traffic and ego step by step, then what the ego remembers of it.
-        start, command = self.physics.begin(rules, action, vehicles, ego, state.get(keys.STEP))
+        start, command = self.physics.begin(
+            rules,
+            action,
+            vehicles,
+            ego,
+            state.get(keys.STEP),
+        )
         end, memory = run_decision(
-            self.traffic, self.physics, rules, state, start, key, self.recorder
+            self.traffic,
+            self.physics,
+            rules,
+            state,
+            start,
+            key,
+            self.recorder,
         )
         ego = self.physics.remember(rules, ego, start, end, command)
         events, rest = outcome(rules, end, command)

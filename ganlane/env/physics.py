@@ -91,7 +91,13 @@ def begin(
     target = vehicles.target_lane[:, EGO_INDEX]
     direction = ego["change_direction"]
     # The command sets the lane that the ego steers to; the motion itself takes several decisions.
-    command = apply_action(action, target, direction, lanes, rules.ego.abort_lane_change)
+    command = apply_action(
+        action,
+        target,
+        direction,
+        lanes,
+        rules.ego.abort_lane_change,
+    )
     targets = torch.cat((command.target_lane[:, None], vehicles.target_lane[:, 1:]), dim=1)
     vehicles = vehicles.with_(target_lane=targets)
     none = torch.zeros_like(command.off_road)
@@ -132,7 +138,9 @@ def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -
         vehicles = vehicles.where(running, before.vehicles)
         steering = torch.where(running, steering, before.steering)
     acceleration, ahead, behind = ego_surroundings(
-        ego_scene(vehicles, rules.road), rules.idm, rules.ego
+        ego_scene(vehicles, rules.road),
+        rules.idm,
+        rules.ego,
     )
     # Of the events of one step a crash comes first, then the goal, then the time-out.
     crash = ego_overlaps(vehicles, rules.road).any(-1) & running

@@ -117,7 +117,9 @@ class BatchView:
     def _picture(self, row: int) -> Picture:
         state = self.rows.now()
         recorder = Recorder(
-            row, current_action=int(self._actions[row]), current_return=float(self._returns[row])
+            row,
+            current_action=int(self._actions[row]),
+            current_return=float(self._returns[row]),
         )
         recorder.add(state.get(keys.VEHICLES), float(state.get(keys.STEP)[row]) * PHYSICS_STEP_S)
         return FramePainter(recorder.trajectory(_label(self.rows, row))).draw(0)

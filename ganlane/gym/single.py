@@ -65,7 +65,13 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         self._seed = None if seed is None else seed_number(seed)
         self._episode = -1
         self._running = False
-        self._rows = make_rows(traffic, 1, render_mode is not None, transforms, options)
+        self._rows = make_rows(
+            traffic,
+            1,
+            render_mode is not None,
+            transforms,
+            options,
+        )
         self.observation_space: gymnasium.spaces.Box = self._rows.space  # type: ignore[assignment]
         self.action_space = gymnasium.spaces.Discrete(ACTIONS)
         self.render_mode = render_mode

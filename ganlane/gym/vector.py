@@ -69,7 +69,13 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
                 "use gymnasium.make for a window."
             )
         self._mode = _mode_of(autoreset_mode)
-        self._rows = make_rows(traffic, num_envs, render_mode is not None, transforms, options)
+        self._rows = make_rows(
+            traffic,
+            num_envs,
+            render_mode is not None,
+            transforms,
+            options,
+        )
         self.num_envs = self._rows.count
         self.render_mode = render_mode
         episode = self._rows.episode

@@ -41,7 +41,16 @@ VEHICLE_ARRAYS: Final[dict[Key, str]] = {
 #: Arrays that the state has as [rows, 1]: of the events, and whether the episode has ended.
 EVENT_ARRAYS: Final[dict[Key, str]] = {
     # the end of a scene is one of recorded scenes, which the kernel does not drive
-    **dict.fromkeys(_within(keys.EVENTS, "goal", "hard_crash", "out_of_road", "timeout"), "bool"),
+    **dict.fromkeys(
+        _within(
+            keys.EVENTS,
+            "goal",
+            "hard_crash",
+            "out_of_road",
+            "timeout",
+        ),
+        "bool",
+    ),
     **dict.fromkeys(_within(keys.EVENTS, *keys.EVENT_COUNTS), "int64"),
     **dict.fromkeys(keys.DONE_FLAGS, "bool"),
 }
@@ -61,7 +70,15 @@ INPUTS: Final = (
 )
 #: What comes out of it, and out of the start of an episode.
 OUTPUTS: Final = (
-    *_within(keys.VEHICLES, "x", "y", "heading", "speed", "acceleration", "target_lane"),
+    *_within(
+        keys.VEHICLES,
+        "x",
+        "y",
+        "heading",
+        "speed",
+        "acceleration",
+        "target_lane",
+    ),
     STEERING,
     *EGO_ARRAYS,
     keys.STEP,
@@ -69,7 +86,14 @@ OUTPUTS: Final = (
 )
 #: What the start of an episode sets besides; ``seed``, ``episode`` and ``fresh`` go before it, and
 #: ``recycles`` after it.
-SCENE: Final = _within(keys.VEHICLES, "length", "width", "desired_speed", "visibility", "valid")
+SCENE: Final = _within(
+    keys.VEHICLES,
+    "length",
+    "width",
+    "desired_speed",
+    "visibility",
+    "valid",
+)
 
 #: The observations that the kernel computes: whether with drift, and with overlap.
 NATIVE_FORMS: Final = {

@@ -137,7 +137,14 @@ class Kernel(_Function):
         variant: str | None = None,
     ) -> None:
         self.vehicles = vehicles
-        numbers = settings.settings_of(*_shape(road, vehicles), episode, ego, idm, steering, mobil)
+        numbers = settings.settings_of(
+            *_shape(road, vehicles),
+            episode,
+            ego,
+            idm,
+            steering,
+            mobil,
+        )
         super().__init__("ganlane_decide", numbers, variant)
 
     def decide(
@@ -188,7 +195,13 @@ class NativeScenes(_Function):
         self.vehicles = scenes.vehicles
         seen = (scenes.ego_visibility, scenes.others_visibility)
         shape = _shape(scenes.road, scenes.vehicles)
-        numbers = settings.spawn_of(*shape, scenes.parameters, stream, *seen, recycle_share=None)
+        numbers = settings.spawn_of(
+            *shape,
+            scenes.parameters,
+            stream,
+            *seen,
+            recycle_share=None,
+        )
         super().__init__("ganlane_spawn", numbers)
 
     def start(self, seed: Tensor, episode: Tensor, rows: Tensor | None = None) -> TensorDict:
@@ -230,7 +243,16 @@ class LaneView(_Function):
         Arguments as :meth:`ganlane.transforms.ObservationTransform.observe`.
         """
         v = vehicles
-        inputs = [v.speed, v.desired_speed, v.length, v.y, seen.x, seen.y, seen.speed, seen.valid]
+        inputs = [
+            v.speed,
+            v.desired_speed,
+            v.length,
+            v.y,
+            seen.x,
+            seen.y,
+            seen.speed,
+            seen.valid,
+        ]
         out = torch.empty((len(v.x), self.size), dtype=torch.float32)
         self._run(len(out), [*inputs, progress, direction], [out])
         return out

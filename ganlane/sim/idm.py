@@ -108,7 +108,12 @@ def acceleration_behind(
     desired = scene.observers.desired_speed[..., None]
     headway_s = headway_s[..., None] if isinstance(headway_s, Tensor) else headway_s
     return idm_acceleration(
-        speed, desired, ahead.gap, ahead.speed, parameters.per_lane(), headway_s
+        speed,
+        desired,
+        ahead.gap,
+        ahead.speed,
+        parameters.per_lane(),
+        headway_s,
     )
 
 

@@ -137,7 +137,13 @@ def _gives_way(
     speed = vehicles.speed[:, :, None]
     desired = vehicles.desired_speed[:, :, None]
     leader_speed = vehicles.speed[:, None, :]
-    demand = idm_acceleration(speed, desired, pairs.ahead, leader_speed, idm.per_lane())
+    demand = idm_acceleration(
+        speed,
+        desired,
+        pairs.ahead,
+        leader_speed,
+        idm.per_lane(),
+    )
     near = (pairs.distance < mobil.exclusive_m) | (demand < -mobil.safe_deceleration)
     return (same & near & (pairs.order > 0)).any(-1)
 

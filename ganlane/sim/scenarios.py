@@ -43,7 +43,11 @@ def cut_in(
     _at_least(lanes, 2, "cut_in")
     lane = lanes - 2  # the ego's
     cutter = SceneVehicle(
-        gap_m + LENGTH_M, lane + 1, cutter_speed_mps, cutter_speed_mps, target_lane=lane
+        gap_m + LENGTH_M,
+        lane + 1,
+        cutter_speed_mps,
+        cutter_speed_mps,
+        target_lane=lane,
     )
     cars = [
         SceneVehicle(0.0, lane, speed_mps, desired_speed_mps),
@@ -70,7 +74,18 @@ def stalled_car(
     A vehicle follows the ego, and five vehicles ``spacing_m`` apart pass in the next lane, if there
     is one.
     """
-    beside = () if lanes == 1 else _column(1, 5, 0.5 * spacing_m, spacing_m, speed_mps, 22.0)
+    beside = (
+        ()
+        if lanes == 1
+        else _column(
+            1,
+            5,
+            0.5 * spacing_m,
+            spacing_m,
+            speed_mps,
+            22.0,
+        )
+    )
     return (
         SceneVehicle(0.0, 0, speed_mps, desired_speed_mps),
         stalled(distance_m, 0, lane_width_m),

@@ -162,7 +162,17 @@ class FixedScene:
         whole = Vehicles(*(value.expand(n, m).clone() for value in self.base(dtype, key.device)))
         if self.jitter_m == 0 and self.jitter_mps == 0:
             return whole
-        u = 2.0 * uniform(key, 0, m, [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED], dtype) - 1.0
+        u = (
+            2.0
+            * uniform(
+                key,
+                0,
+                m,
+                [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED],
+                dtype,
+            )
+            - 1.0
+        )
         is_ego = torch.arange(m, device=key.device) == 0
         x = torch.where(is_ego, whole.x, whole.x + self.jitter_m * u[..., 0])
         varied = (whole.speed + self.jitter_mps * u[..., 1]).clamp_min(0.0)
@@ -349,7 +359,15 @@ def _first_overlap(scene: FixedScene, idm: IdmParameters) -> tuple[int, int, flo
     for step in range(1, round(DRIVE_S / PHYSICS_STEP_S) + 1):
         acceleration = following_acceleration(perceive(v, scene.road), idm)
         steering = steer(steering, v.y, v.heading, v.speed, centre, PHYSICS_STEP_S)
-        pose = advance(v.x, v.y, v.heading, v.speed, acceleration, steering, PHYSICS_STEP_S)
+        pose = advance(
+            v.x,
+            v.y,
+            v.heading,
+            v.speed,
+            acceleration,
+            steering,
+            PHYSICS_STEP_S,
+        )
         v = v.with_(**pose._asdict())
         hits = pair_overlaps(v, scene.road)
         if bool(hits.any()):

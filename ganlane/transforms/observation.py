@@ -281,6 +281,8 @@ class ObservationTransform(PerceptionTransform):
         shape = (*observation_spec.shape, observation_size(self.form, self.vehicles))
         true = observation_spec[keys.VEHICLES, "x"]
         observation_spec[keys.OBSERVATION] = Unbounded(
-            shape=shape, dtype=true.dtype, device=true.device
+            shape=shape,
+            dtype=true.dtype,
+            device=true.device,
         )
         return observation_spec

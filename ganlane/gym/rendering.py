@@ -25,6 +25,7 @@ _TRAIL_STEPS = round(FilmConfig.trail_s / PHYSICS_STEP_S) + 1
 def _label(rows: TensorRows, row: int) -> EpisodeLabel:
     """The header's text for a row."""
     state = rows.now()
+    # Which episode this is, and on what road.
     seed, episode = (int(state.get(name)[row]) for name in (keys.SEED, keys.EPISODE))
     road = road_of_row(state, rows.env.base_env.road, row)
     return EpisodeLabel("ego", rows.traffic, seed, episode, *road)

@@ -53,6 +53,7 @@ class TensorRows(Rows):
     def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
         counters = TensorDict({}, [self.count], device=self.env.device)
         for name, value in ((keys.SEED, seed), (keys.EPISODE, episode)):
+            # One number for all rows, or one for each.
             numbers = np.broadcast_to(value, self.count).astype(np.int64)
             counters[name] = torch.as_tensor(numbers, device=self.env.device)
         self.started, self.state = True, self.env.reset(counters)

@@ -207,6 +207,7 @@ def settings_of(
     episode = episode or EpisodeParameters()
     idm = idm or IdmParameters()
     steering = steering or SteeringParameters()
+    # No two of these records have a field of one name.
     records = (episode, ego or EgoParameters(), idm, steering, mobil or MobilParameters())
     numbers = {name: value for record in records for name, value in vars(record).items()}
     numbers |= {
@@ -234,6 +235,7 @@ def mask_of(
     abort: bool,
 ) -> Settings:
     """The numbers of the mask ``safe``; ``safe_deceleration`` in m/s2."""
+    # The mask reads few of the decision's numbers; the others are defaults.
     ego = EgoParameters(abort_lane_change=abort)
     mobil = MobilParameters(safe_deceleration=safe_deceleration)
     return settings_of(lanes, lane_width_m, vehicles, ego=ego, idm=idm, mobil=mobil)
@@ -270,6 +272,7 @@ def spawn_of(
         "recycle": recycle_share is not None,
         "recycle_share": recycle_share or 0.0,
     }
+    # Ranges as their lower end and their span, as the draw needs them.
     for name, value in numbers.items():
         if isinstance(value, tuple | list):
             numbers[name] = Range(value[0], value[1] - value[0])

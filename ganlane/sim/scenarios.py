@@ -41,6 +41,7 @@ def cut_in(
     reaction.
     """
     _at_least(lanes, 2, "cut_in")
+    # Next to the leftmost, from which the other vehicle comes.
     lane = lanes - 2  # the ego's
     cutter = SceneVehicle(
         gap_m + LENGTH_M,
@@ -147,15 +148,19 @@ def stop_and_go(
     and a group that approaches it at ``speed_mps`` in steady following. The ego is the last but one
     of the rightmost lane. The desired speed of the others is 15 m/s.
     """
+    # Centre to centre; a tenth more than IDM's own gap, since speeds are jittered.
     steady = LENGTH_M + 1.1 * (idm.min_gap_m + idm.headway_s * speed_mps)
     queue = LENGTH_M + idm.min_gap_m
+    # Five seconds away, so that the group has time to brake.
     approach = 5.0 * speed_mps
     speeds = [speed_mps] * 2
     spacings = [0.0, steady]
     for _ in range(waves):
         speeds += [0.0] * per_wave + [speed_mps] * per_wave
         spacings += [steady] + [queue] * (per_wave - 1) + [approach] + [steady] * (per_wave - 1)
+    # From the head of the column backwards.
     column = [(-x, speed) for x, speed in zip(accumulate(spacings), speeds, strict=True)]
+    # The last but one: somebody behind it can run into it.
     ego_x, ego_speed = column[-2]
     cars = [SceneVehicle(ego_x, 0, ego_speed, desired_speed_mps)]
     for lane in range(lanes):

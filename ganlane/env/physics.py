@@ -87,8 +87,8 @@ def begin(
 
     Rows whose command leaves the road have ended.
     """
-    lanes = rules.road.lanes if isinstance(rules.road.lanes, int) else rules.road.lanes[:, 0]
     # Recorded roads have as many lanes as their row says.
+    lanes = rules.road.lanes if isinstance(rules.road.lanes, int) else rules.road.lanes[:, 0]
     target = vehicles.target_lane[:, EGO_INDEX]
     direction = ego["change_direction"]
     # The command sets the lane that the ego steers to; the motion itself takes several decisions.

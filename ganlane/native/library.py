@@ -184,12 +184,9 @@ def _prebuilt(variant: str) -> Path:
 def _name(variant: str, *parts: str) -> str:
     """A file name that follows from the sources and from what else makes a library."""
     # A file of that name is never out of date.
-    digest = hashlib.sha256("\0".join((*_sources(), *parts)).encode()).hexdigest()
+    sources = [source.read_text() for source in SOURCES]
+    digest = hashlib.sha256("\0".join((*sources, *parts)).encode()).hexdigest()
     return f"kernel-{variant.lower()}-{digest[:20]}.so"
-
-
-def _sources() -> tuple[str, ...]:
-    return tuple(source.read_text() for source in SOURCES)
 
 
 def _flags(variant: str) -> tuple[str, ...]:

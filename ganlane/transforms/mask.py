@@ -90,7 +90,7 @@ class ActionMaskTransform(PerceptionTransform):
             raise UserError(
                 f"mask.safe_deceleration={safe_deceleration:g}: expected a number above 0, in m/s2."
             )
-        # Legal is never without a legal action: keeping the lane is one.
+        # Behind legal there is nothing to report: keeping the lane is always legal.
         out_keys = [keys.ACTION_MASK]
         if form == "safe":
             out_keys.append(keys.NO_SAFE_ACTION)

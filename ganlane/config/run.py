@@ -24,6 +24,7 @@ import hydra
 import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
+from omegaconf import OmegaConf
 
 from ganlane.arguments import is_import_path
 from ganlane.config.compose import (
@@ -159,8 +160,9 @@ def _single_run(command: str, words: list[str], task: Task | None) -> tuple[Any,
     if {"-h", "--help"} & set(flags):
         print(help_text(command, COMMANDS[command][0]))
         return None
-    if flags == ["--cfg"] and keys[:1] == ["job"]:
-        print(as_yaml(settings(command, keys[1:])), end="")
+    if flags == ["--cfg"] and "job" in keys:
+        keys.remove("job")
+        print(as_yaml(settings(command, keys)), end="")
         return None
     unknown = [flag for flag in flags if flag not in ("-m", "--multirun")]
     if unknown:
@@ -264,6 +266,7 @@ def _sweep(command: str, overrides: list[Override], task: Task | None) -> None:
     application = hydra.main(
         version_base=VERSION_BASE, config_path=str(conf_folder()), config_name=command
     )
+    OmegaConf.register_new_resolver("process_id", os.getpid, replace=True)
     before, full = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     sys.argv = [f"ganlane {command}", "-m", *for_hydra(overrides)]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # raise, rather than print and exit with status 1

@@ -153,7 +153,7 @@ def test_a_command_that_there_is_not(capsys):
 
 
 def test_cfg_prints_what_a_run_would_be_made_of(capsys, empty_folder):
-    assert main(["evaluate", "--cfg", "job", "env.lanes=4"]) == 0
+    assert main(["evaluate", "env.lanes=4", "--cfg", "job"]) == 0
     shown = yaml.safe_load(capsys.readouterr().out)
     assert shown["env"]["lanes"] == 4
     assert make(EvaluateConfig, shown) == settings("evaluate", ["env.lanes=4"])

@@ -5,11 +5,18 @@ Or naming their results.
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
 
 from ganlane.__main__ import main
+from ganlane.errors import UserError
+
+
+def user_error(sentence: str) -> AbstractContextManager[pytest.ExceptionInfo[UserError]]:
+    """A user's mistake is refused within the block; ``sentence`` is a pattern of its message."""
+    return pytest.raises(UserError, match=sentence)
 
 
 def everything_below(folder: Path) -> dict[str, int]:

@@ -111,12 +111,15 @@ def test_a_full_disk_is_told_of_in_the_systems_words_and_leaves_the_old_file(
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EIO])
 def test_a_refusal_without_a_name_gets_that_of_the_file(number, tmp_path):
+    def fail_half_way(part: Path) -> None:
+        part.write_bytes(b"half")
+        raise OSError(number, os.strerror(number))
+
     with (
         pytest.raises(OSError, match=os.strerror(number)) as caught,
         atomic_path(tmp_path / "a") as part,
-    ):  # noqa: PT012
-        part.write_bytes(b"half")
-        raise OSError(number, os.strerror(number))
+    ):
+        fail_half_way(part)
     assert (caught.value.errno, caught.value.filename) == (number, str(tmp_path / "a"))
     assert list(tmp_path.iterdir()) == []
 

@@ -33,7 +33,7 @@ from ganlane.sim.idm import following_acceleration
 from ganlane.sim.spawn import recycle
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
 from ganlane.torch_settings import compiled
-from ganlane.traffic.base import TrafficModule, memory_of
+from ganlane.traffic.base import TrafficModule, memory_of, with_rows
 
 #: Name to tensor [N]: the ego's memory (:mod:`ganlane.env.state`).
 EgoMemory = dict[str, Tensor]
@@ -253,21 +253,8 @@ class EndedRows:
         """``memory`` with the kept rows as they were; its tensors are not written to."""
         if not self.rows or memory.is_empty():
             return memory
-        return _with_rows(memory, torch.cat(self.rows), torch.cat(self.memories))  # type: ignore[arg-type]
-
-
-def _with_rows(memory: TensorDictBase, rows: Tensor, other: TensorDictBase) -> TensorDict:
-    """``memory`` with its ``rows`` replaced by ``other`` [R], leaf by leaf."""
-
-    restored = {}
-    for name, value in memory.items():
-        if isinstance(value, Tensor):
-            restored[name] = value.index_copy(0, rows, other.get(name))
-        elif value.is_empty():
-            restored[name] = value
-        else:
-            restored[name] = _with_rows(value, rows, other.get(name))
-    return TensorDict._new_unsafe(restored, batch_size=memory.batch_size)
+        ended = torch.cat(self.memories)  # type: ignore[arg-type]
+        return with_rows(memory, torch.cat(self.rows), ended)
 
 
 def _where(rows: Tensor, new: Tensor, old: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, TypeAlias, cast
 
 import torch
@@ -40,6 +41,37 @@ def memory_of(tensordict: TensorDictBase, key: str = keys.TRAFFIC) -> TensorDict
     """The memory under ``key``; empty if it is missing, since TorchRL drops empty TensorDicts."""
     memory = tensordict.get(key, None)
     return TensorDict({}, batch_size=tensordict.batch_size) if memory is None else memory
+
+
+def with_rows(
+    whole: TensorDictBase,
+    rows: Tensor,
+    part: Mapping[str, Any],
+    origins: Mapping[Tensor, Tensor] = MappingProxyType({}),
+) -> TensorDict:
+    """``whole`` [N] with its ``rows`` [R] replaced by those of ``part``, leaf by leaf.
+
+    Nothing is written in place. Further rows of ``part`` are padding.
+
+    Args:
+        whole, rows: the batch, and the indices of the rows.
+        part: their new values; what it lacks stays.
+        origins: tensors of the whole batch by the leaves that were taken from them. Where ``part``
+            returns such a leaf, under any name, the tensor is used again instead of a copy.
+    """
+    fields = dict(whole.items())
+    for name, value in part.items():
+        if not isinstance(value, Tensor):
+            # TorchRL drops empty TensorDicts between decisions.
+            if name in fields:
+                fields[name] = with_rows(fields[name], rows, value, origins)
+        elif value in origins:
+            fields[name] = origins[value]
+        else:
+            if len(value) > len(rows):
+                value = value[: len(rows)]
+            fields[name] = fields[name].index_copy(0, rows, value)
+    return new_tensordict(fields, whole.batch_size[0])
 
 
 def key_of(tensordict: TensorDictBase, stream: int) -> Tensor:

@@ -17,7 +17,14 @@ from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
 from ganlane.sim.random import Purpose, absorb, uniform
 from ganlane.sim.state import VISIBILITY_OF_EPISODE, Vehicles
-from ganlane.traffic.base import TrafficModule, TrafficParts, key_of, memory_of, new_tensordict
+from ganlane.traffic.base import (
+    TrafficModule,
+    TrafficParts,
+    key_of,
+    memory_of,
+    new_tensordict,
+    with_rows,
+)
 
 
 def interleaved(shares: Mapping[str, int]) -> list[str]:
@@ -91,16 +98,16 @@ class MixedTraffic(TrafficParts):
 
         The rows come twice: as they are, and with repetitions of the first as padding. A graph is
         compiled for every number of rows, which takes a minute, so compiled parts get at most some
-        16 numbers. On a GPU this waits for the queue once a step.
+        16 numbers. On a GPU this waits for the queue once for every part.
         """
         part_of_row, batch = self.part_of(episode), len(episode)
-        counts = torch.bincount(part_of_row, minlength=len(self.parts)).tolist()
-        sorted_rows = part_of_row.argsort(stable=True).split(counts)
-        size = max(8, batch // 16) if self.compiled else 1
         chosen = []
-        for (name, part), rows in zip(self.named_parts(), sorted_rows):
-            if len(rows):
+        for number, (name, part) in enumerate(self.named_parts()):
+            rows = padded = (part_of_row == number).nonzero()[:, 0]
+            if self.compiled:
+                size = max(8, batch // 16)
                 padded = torch.cat((rows, rows[:1].expand(-len(rows) % size)))
+            if len(rows):
                 chosen.append((name, part, rows, padded))
         return chosen
 
@@ -113,9 +120,16 @@ class MixedTraffic(TrafficParts):
         inputs |= {keys.EPISODE_KEY: key_of(tensordict, self.stream), keys.VEHICLES: vehicles}
         for name, part, rows, padded in self.rows_of_parts(inputs[keys.EPISODE]):
             memory = memory_of(memories, name)
-            output = part(_take({**inputs, keys.TRAFFIC: memory}, padded))
-            moved = with_rows(moved, rows, output.get(keys.MOVED))
-            new_memories[name] = with_rows(memory, rows, memory_of(output))
+            origins: dict[Tensor, Tensor] = {}
+            taken = _take({**inputs, keys.TRAFFIC: memory}, padded, origins)
+            before = taken.get(keys.VEHICLES)
+            output = part(taken)
+            changed = {}
+            for field, value in output.get(keys.MOVED).items():
+                if value is not before.get(field):
+                    changed[field] = value
+            moved = with_rows(moved, rows, changed)
+            new_memories[name] = with_rows(memory, rows, memory_of(output), origins)
         tensordict.set(keys.MOVED, moved)
         tensordict.set(keys.TRAFFIC, new_tensordict(new_memories, tensordict.batch_size[0]))
         return tensordict
@@ -151,24 +165,19 @@ class MixedTraffic(TrafficParts):
         super().compile_graphs()
 
 
-def _take(fields: Mapping[str, Any], rows: Tensor) -> TensorDict:
-    """``rows`` of tensors, or of TensorDicts of them, by name."""
-    taken = {
-        name: field.index_select(0, rows) if isinstance(field, Tensor) else _take(field, rows)
-        for name, field in fields.items()
-    }
-    return new_tensordict(taken, len(rows))
+def _take(fields: Mapping[str, Any], rows: Tensor, origins: dict[Tensor, Tensor]) -> TensorDict:
+    """``rows`` of tensors, or of TensorDicts of them, by name.
 
-
-def with_rows(whole: Any, rows: Tensor, part: Any) -> Any:
-    """``whole`` with ``part`` in its ``rows`` [R], leaf by leaf; nothing is written in place.
-
-    Further rows of ``part`` are padding.
+    ``origins`` collects, by the tensor taken, the one that it was taken from.
     """
-    if isinstance(whole, Tensor):
-        return whole.index_copy(0, rows, part[: len(rows)])
-    fields = {name: with_rows(field, rows, part[name]) for name, field in whole.items()}
-    return new_tensordict(fields, whole.batch_size[0])
+    taken: dict[str, Any] = {}
+    for name, field in fields.items():
+        if isinstance(field, Tensor):
+            taken[name] = field.index_select(0, rows)
+            origins[taken[name]] = field
+        else:
+            taken[name] = _take(field, rows, origins)
+    return new_tensordict(taken, len(rows))
 
 
 def _zeros(spec: Mapping[str, Any], n: int, device: torch.device) -> TensorDict:

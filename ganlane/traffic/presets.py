@@ -119,7 +119,8 @@ def gan_traffic(
 
     Args:
         road, stream: as for every traffic module.
-        path, guard, noise_scale, execute_k: see :class:`~ganlane.settings.traffic.GanTrafficConfig`.
+        path, guard, noise_scale, execute_k: see
+            :class:`~ganlane.settings.traffic.GanTrafficConfig`.
         idm: of the guard's bounds on acceleration.
 
     Raises:

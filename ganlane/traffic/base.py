@@ -78,15 +78,28 @@ def key_of(tensordict: TensorDictBase, stream: int) -> Tensor:
     """The episodes' keys [N]: those that the caller has computed, or from seed and episode."""
     key = tensordict.get(keys.EPISODE_KEY, None)
     if key is None:
-        return episode_key(stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
+        return episode_key(
+            stream,
+            tensordict.get(keys.SEED),
+            tensordict.get(keys.EPISODE),
+        )
     return key
 
 
 def uniforms(
-    vehicles: Vehicles, key: Tensor, step: Tensor | int, *purposes: int
+    vehicles: Vehicles,
+    key: Tensor,
+    step: Tensor | int,
+    *purposes: int,
 ) -> tuple[Tensor, ...]:
     """A uniform number in [0, 1) for every vehicle, [N, M], of each of the ``purposes``."""
-    drawn = uniform(key, step, vehicles.x.shape[1], list(purposes), vehicles.x.dtype)
+    drawn = uniform(
+        key,
+        step,
+        vehicles.x.shape[1],
+        list(purposes),
+        vehicles.x.dtype,
+    )
     return drawn.unbind(-1)
 
 
@@ -111,7 +124,13 @@ class TrafficModule(TensorDictModuleBase):
         stream: family of episodes that the random numbers belong to.
     """
 
-    in_keys = [keys.VEHICLES, keys.TRAFFIC, keys.SEED, keys.EPISODE, keys.STEP]  # noqa: RUF012
+    in_keys = [  # noqa: RUF012
+        keys.VEHICLES,
+        keys.TRAFFIC,
+        keys.SEED,
+        keys.EPISODE,
+        keys.STEP,
+    ]
     out_keys = [keys.MOVED, keys.TRAFFIC]  # noqa: RUF012
 
     #: When others see the lane changes of this model's vehicles; ``VISIBILITY_OF_EPISODE`` if
@@ -132,7 +151,13 @@ class TrafficModule(TensorDictModuleBase):
         self.stream = int(stream)
         self.dt = PHYSICS_STEP_S
 
-    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def move(
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
+    ) -> Moved:
         """The vehicles at t + 0.1 s, and the memory to keep.
 
         Args:
@@ -163,7 +188,10 @@ class TrafficModule(TensorDictModuleBase):
         return None
 
     def scenes(
-        self, vehicles: int, ego_visibility: int, ego_desired_speed_mps: float
+        self,
+        vehicles: int,
+        ego_visibility: int,
+        ego_desired_speed_mps: float,
     ) -> Scenes | None:
         """The initial scenes of this traffic; None: those of the environment."""
         return None
@@ -195,14 +223,23 @@ class TrafficModule(TensorDictModuleBase):
         """Write ``moved`` and ``traffic``."""
         vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
         memory = dict(memory_of(tensordict).items())
-        moved, memory = self._call(tensordict, vehicles, memory, key_of(tensordict, self.stream))
+        moved, memory = self._call(
+            tensordict,
+            vehicles,
+            memory,
+            key_of(tensordict, self.stream),
+        )
         n = tensordict.batch_size[0]
         tensordict.set(keys.MOVED, new_tensordict(moved.as_dict(), n))
         tensordict.set(keys.TRAFFIC, new_tensordict(memory, n))
         return tensordict
 
     def _call(
-        self, tensordict: TensorDictBase, vehicles: Vehicles, memory: Memory, key: Tensor
+        self,
+        tensordict: TensorDictBase,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
     ) -> Moved:
         return self.move(vehicles, memory, key, tensordict.get(keys.STEP))
 
@@ -228,7 +265,10 @@ class TrafficModule(TensorDictModuleBase):
         """Nested name -> (shape, dtype) of the memory of ``n`` rows of ``m`` vehicles."""
         return {
             name: ((n, m, *shape), own_dtype or dtype)
-            for name, (shape, own_dtype) in self.memory_fields.items()
+            for name, (
+                shape,
+                own_dtype,
+            ) in self.memory_fields.items()
         }
 
 
@@ -239,13 +279,22 @@ class Overlay(TrafficModule):
     """
 
     def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        moved: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """The new ``moved``, and the memory to keep; arguments as in :meth:`TrafficModule.move`."""
         raise NotImplementedError
 
     def _call(
-        self, tensordict: TensorDictBase, vehicles: Vehicles, memory: Memory, key: Tensor
+        self,
+        tensordict: TensorDictBase,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
     ) -> Moved:
         moved = Vehicles.of(tensordict.get(keys.MOVED))
         return self.rewrite(vehicles, moved, memory, key, tensordict.get(keys.STEP))
@@ -269,7 +318,10 @@ class TrafficParts(TrafficModule):
 
     def named_parts(self) -> list[tuple[str, TrafficModule]]:
         """Names and parts, in order."""
-        return cast("list[tuple[str, TrafficModule]]", list(self.parts.items()))
+        return cast(
+            "list[tuple[str, TrafficModule]]",
+            list(self.parts.items()),
+        )
 
     def compile_graphs(self) -> None:
         """Compile every part."""
@@ -304,7 +356,8 @@ class TrafficSequential(TrafficParts):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Run the parts in order."""
-        memories, new_memories = memory_of(tensordict), {}
+        memories = memory_of(tensordict)
+        new_memories = {}
         for name, part in self.named_parts():
             tensordict.set(keys.TRAFFIC, memory_of(memories, name))
             part(tensordict)

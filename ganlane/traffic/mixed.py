@@ -33,7 +33,8 @@ def interleaved(shares: Mapping[str, int]) -> list[str]:
     ``{a: 2, b: 1}`` gives a, b, a: in every episode each part gains its share, the one with the
     most (the first of several) is chosen and pays the sum.
     """
-    credit, turns = dict.fromkeys(shares, 0), []
+    credit = dict.fromkeys(shares, 0)
+    turns = []
     for _ in range(sum(shares.values())):
         for name, share in shares.items():
             credit[name] += share
@@ -61,7 +62,11 @@ class MixedTraffic(TrafficParts):
         UserError: no parts, shares of other names, or a part that plays recordings.
     """
 
-    def __init__(self, parts: Mapping[str, TrafficModule], shares: Mapping[str, int]) -> None:
+    def __init__(
+        self,
+        parts: Mapping[str, TrafficModule],
+        shares: Mapping[str, int],
+    ) -> None:
         if not parts or set(parts) != set(shares) or min(shares.values()) < 1:
             raise UserError(
                 f"traffic.shares={dict(shares)}: expected a whole number of at least 1 for each of "
@@ -100,7 +105,8 @@ class MixedTraffic(TrafficParts):
         compiled for every number of rows, which takes a minute, so compiled parts get at most some
         16 numbers. On a GPU this waits for the queue once for every part.
         """
-        part_of_row, batch = self.part_of(episode), len(episode)
+        part_of_row = self.part_of(episode)
+        batch = len(episode)
         chosen = []
         for number, (name, part) in enumerate(self.named_parts()):
             rows = padded = (part_of_row == number).nonzero()[:, 0]
@@ -115,9 +121,13 @@ class MixedTraffic(TrafficParts):
         """Write ``moved`` and ``traffic``, each part its rows."""
         vehicles = tensordict.get(keys.VEHICLES)
         memories = memory_of(tensordict)
-        moved, new_memories = vehicles, dict(memories.items())
+        moved = vehicles
+        new_memories = dict(memories.items())
         inputs = {name: tensordict.get(name) for name in (keys.SEED, keys.EPISODE, keys.STEP)}
-        inputs |= {keys.EPISODE_KEY: key_of(tensordict, self.stream), keys.VEHICLES: vehicles}
+        inputs |= {
+            keys.EPISODE_KEY: key_of(tensordict, self.stream),
+            keys.VEHICLES: vehicles,
+        }
         for name, part, rows, padded in self.rows_of_parts(inputs[keys.EPISODE]):
             memory = memory_of(memories, name)
             origins: dict[Tensor, Tensor] = {}
@@ -131,7 +141,10 @@ class MixedTraffic(TrafficParts):
             moved = with_rows(moved, rows, changed)
             new_memories[name] = with_rows(memory, rows, memory_of(output), origins)
         tensordict.set(keys.MOVED, moved)
-        tensordict.set(keys.TRAFFIC, new_tensordict(new_memories, tensordict.batch_size[0]))
+        tensordict.set(
+            keys.TRAFFIC,
+            new_tensordict(new_memories, tensordict.batch_size[0]),
+        )
         return tensordict
 
     def enter(
@@ -146,7 +159,9 @@ class MixedTraffic(TrafficParts):
             of_episode = scene.visibility == VISIBILITY_OF_EPISODE
             visibility = torch.where(of_episode, int(part.visibility), scene.visibility)
             entered, memory = part.enter(
-                scene.with_(visibility=visibility), key[rows], episode[rows]
+                scene.with_(visibility=visibility),
+                key[rows],
+                episode[rows],
             )
             together = with_rows(together, rows, entered.as_dict())
             memories.set(name, with_rows(memories.get(name), rows, memory))
@@ -165,7 +180,11 @@ class MixedTraffic(TrafficParts):
         super().compile_graphs()
 
 
-def _take(fields: Mapping[str, Any], rows: Tensor, origins: dict[Tensor, Tensor]) -> TensorDict:
+def _take(
+    fields: Mapping[str, Any],
+    rows: Tensor,
+    origins: dict[Tensor, Tensor],
+) -> TensorDict:
     """``rows`` of tensors, or of TensorDicts of them, by name.
 
     ``origins`` collects, by the tensor taken, the one that it was taken from.
@@ -215,12 +234,15 @@ class BlindTraffic(TrafficModule):
                 "no ego anyway; leave it out."
             )
         super().__init__(model.road, model.stream)
-        self.model, self.blind_share = model, blind_share
-        self.visibility, self.rows_must_stay = model.visibility, model.rows_must_stay
+        self.model = model
+        self.blind_share = blind_share
+        self.visibility = model.visibility
+        self.rows_must_stay = model.rows_must_stay
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``moved`` and ``traffic`` of the model, which does not see hidden egos."""
-        memory, vehicles = memory_of(tensordict), tensordict.get(keys.VEHICLES)
+        memory = memory_of(tensordict)
+        vehicles = tensordict.get(keys.VEHICLES)
         unseen = memory.get("unseen")
         inputs = tensordict.copy()
         seen = vehicles.copy().set("valid", vehicles.get("valid") & ~unseen)
@@ -229,7 +251,10 @@ class BlindTraffic(TrafficModule):
         self.model(inputs)
         tensordict.set(keys.MOVED, inputs.get(keys.MOVED))
         new_memory = {"model": memory_of(inputs), "unseen": unseen}
-        tensordict.set(keys.TRAFFIC, new_tensordict(new_memory, tensordict.batch_size[0]))
+        tensordict.set(
+            keys.TRAFFIC,
+            new_tensordict(new_memory, tensordict.batch_size[0]),
+        )
         return tensordict
 
     def unseen(self, vehicles: Vehicles, key: Tensor) -> Tensor:
@@ -252,11 +277,17 @@ class BlindTraffic(TrafficModule):
     def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
         """As the model's, with ``unseen``."""
         memory = self.model.init_memory(vehicles, key)
-        return new_tensordict({"model": memory, "unseen": self.unseen(vehicles, key)}, len(key))
+        return new_tensordict(
+            {"model": memory, "unseen": self.unseen(vehicles, key)},
+            len(key),
+        )
 
     def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
         """As the model's, with ``unseen``."""
-        return {"model": self.model.memory_spec(n, m, dtype), "unseen": ((n, m), torch.bool)}
+        return {
+            "model": self.model.memory_spec(n, m, dtype),
+            "unseen": ((n, m), torch.bool),
+        }
 
     def compile_graphs(self) -> None:
         """Compile the model."""

@@ -302,7 +302,7 @@ def test_without_recordings_it_says_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
     with pytest.raises(
         UserError,
-        match=r"no recordings samples.*traffic.path=FILE.*GANLANE_DATA",
+        match=r"no recordings found.*traffic.path=FILE.*GANLANE_DATA",
     ):
         ReplayTraffic()
 

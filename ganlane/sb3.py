@@ -65,11 +65,14 @@ class HighwayVecEnv(VecEnv):
         self._return = np.zeros(highways.num_envs)
         self._length = np.zeros(highways.num_envs, dtype=np.int64)
         super().__init__(
-            highways.num_envs, highways.single_observation_space, highways.single_action_space
+            highways.num_envs,
+            highways.single_observation_space,
+            highways.single_action_space,
         )
 
     def reset(self) -> Floats:
         """First observations [N, D] of the next episodes."""
+        # SB3 keeps seeds and options for the next reset and clears them after it.
         observation, _ = self.highways.reset(seed=self._seeds[0], options=self._options[0] or None)
         self._reset_seeds()
         self._reset_options()
@@ -146,6 +149,7 @@ class HighwayVecEnv(VecEnv):
             raise UserError(
                 f"env_method({method_name!r}): the rows have {names}; call one of them."
             )
+        # For all rows at once, of which those asked for are picked.
         results = getattr(self.highways, method_name)(*args, **kwargs)
         return [results[row] for row in self._get_indices(indices)]
 

@@ -197,7 +197,7 @@ def _settings_and_folder(command: str, overrides: list[Override]) -> tuple[Any, 
         folder = _resumed_folder(str(resume.value()))
         if folder is not None:
             data = resumed(saved_config(folder / CONFIG), rest)
-            config = make(TrainConfig, {**data, "resume": str(folder)})
+            config: Any = make(TrainConfig, {**data, "resume": str(folder)})
             refuse_stored_imports(config, [key_of(word) for word in rest])
             return config, folder
     config = make(COMMANDS[command][0], composed(command, rest))
@@ -225,7 +225,7 @@ def call_settings(command: str, keys: Mapping[str, Any]) -> Any:
     aliases = ALIASES.get(command, {})
     keys = with_env_keys(kind, {aliases.get(name, name): keys[name] for name in keys})
     if command == "train" and keys.get("resume") is not None:
-        config = make(kind, merged(saved_config(Path(keys["resume"]) / CONFIG), keys))
+        config: Any = make(kind, merged(saved_config(Path(keys["resume"]) / CONFIG), keys))
         refuse_stored_imports(config, list(_whole_keys(keys)))
         return config
     return make(kind, called(command, keys))

@@ -103,6 +103,14 @@ class HighwayEnv(EnvBase):
         recycle_share: float = 1.0,
         kernel: str = "torch",
     ) -> None:
+        # Those who call this from Python meet no record that would check types.
+        if not isinstance(traffic, TrafficModule):
+            raise UserError(
+                f"traffic={traffic!r:.80}: expected a TrafficModule; give one, or a name to "
+                "ganlane.make_env()."
+            )
+        if scenes is not None and not callable(scenes):
+            raise UserError(f"scenes={scenes!r:.80}: expected scenes; give a FixedScene, say.")
         # The bounds of the settings lie within.
         whole_number("num_envs", num_envs, 1, 2**20)
         whole_number("first_episode", first_episode, 0, 2**62)
@@ -124,6 +132,7 @@ class HighwayEnv(EnvBase):
         self.recycle = recycle
         self.recycle_share = recycle_share
         self.recorder: Recorder | None = None
+        # Constants of every episode, handed to the pure functions of physics.
         self.rules = Rules(self.road, self.ego, self.episode, idm, steering)
         self.physics = Physics()
         self._seed = seed_number(seed)
@@ -170,6 +179,7 @@ class HighwayEnv(EnvBase):
     def _make_specs(self) -> None:
         n = self.batch_size[0]
         device = self.device
+        # The traffic's memory travels in the state, so its shapes belong to the spec.
         memory = self.traffic.memory_spec(n, self.vehicles, self.dtype)
         spec = state_spec(n, self.vehicles, self.dtype, memory, self.traffic.own_roads)
         self.observation_spec = spec.to(device)
@@ -210,6 +220,7 @@ class HighwayEnv(EnvBase):
 
         ``next_episode`` [N] applies to masked rows only.
         """
+        # What TorchRL hands in: nothing, a mask, counters, or counters and a mask.
         n = self.batch_size[0]
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if tensordict is not None and keys.EPISODE in tensordict:
@@ -259,6 +270,7 @@ class HighwayEnv(EnvBase):
 
     def _start(self, seed: Tensor, episode: Tensor) -> TensorDictBase:
         """The first states of episodes [K]."""
+        # Scene, drivers and road of an episode all follow from its key.
         key = episode_key(self.stream, seed, episode)
         vehicles = self.scenes(key, self.dtype).with_finite_padding()
         vehicles, memory = self.traffic.enter(vehicles, key, episode)
@@ -298,9 +310,21 @@ class HighwayEnv(EnvBase):
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         ego = dict(state.get(keys.EGO).items())
         # The command, then traffic and ego step by step, then what the ego remembers of it.
-        start, command = self.physics.begin(rules, action, vehicles, ego, state.get(keys.STEP))
+        start, command = self.physics.begin(
+            rules,
+            action,
+            vehicles,
+            ego,
+            state.get(keys.STEP),
+        )
         end, memory = run_decision(
-            self.traffic, self.physics, rules, state, start, key, self.recorder
+            self.traffic,
+            self.physics,
+            rules,
+            state,
+            start,
+            key,
+            self.recorder,
         )
         ego = self.physics.remember(rules, ego, start, end, command)
         events, rest = outcome(rules, end, command)
@@ -344,6 +368,7 @@ class HighwayEnv(EnvBase):
         drivers = self.traffic.native_parameters()
         assert drivers is not None
         episode = replace(self.episode, decision_period_s=keys.PHYSICS_STEP_S)
+        # Steps of 0.1 s instead of a decision period; nothing else differs.
         kernel = Kernel(self.road, self.vehicles, episode, self.ego, *drivers)
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         running = torch.ones_like(action, dtype=torch.bool)
@@ -387,6 +412,7 @@ class HighwayEnv(EnvBase):
             reason = (
                 "has one set of parameters of car following and steering for the ego and the others"
             )
+        # And whether there is a library at all.
         missing = why_not()
         if drivers is not None and reason is None and missing is None:
             return Kernel(self.road, self.vehicles, self.episode, self.ego, *drivers)
@@ -400,6 +426,7 @@ class HighwayEnv(EnvBase):
         """The rows [N] bool whose episodes, with ``key`` [N], recycle."""
         if self.recycle_share >= 1.0:
             return torch.ones_like(key, dtype=torch.bool)
+        # Step -1, before the first, so that no other number is the same draw.
         drawn = uniform(key, -1, 1, [Purpose.RECYCLED_EPISODE], torch.float64)
         return drawn[..., 0].reshape(key.shape) < self.recycle_share
 

@@ -87,11 +87,18 @@ def begin(
 
     Rows whose command leaves the road have ended.
     """
+    # Recorded roads have as many lanes as their row says.
     lanes = rules.road.lanes if isinstance(rules.road.lanes, int) else rules.road.lanes[:, 0]
     target = vehicles.target_lane[:, EGO_INDEX]
     direction = ego["change_direction"]
     # The command sets the lane that the ego steers to; the motion itself takes several decisions.
-    command = apply_action(action, target, direction, lanes, rules.ego.abort_lane_change)
+    command = apply_action(
+        action,
+        target,
+        direction,
+        lanes,
+        rules.ego.abort_lane_change,
+    )
     targets = torch.cat((command.target_lane[:, None], vehicles.target_lane[:, 1:]), dim=1)
     vehicles = vehicles.with_(target_lane=targets)
     none = torch.zeros_like(command.off_road)
@@ -132,7 +139,9 @@ def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -
         vehicles = vehicles.where(running, before.vehicles)
         steering = torch.where(running, steering, before.steering)
     acceleration, ahead, behind = ego_surroundings(
-        ego_scene(vehicles, rules.road), rules.idm, rules.ego
+        ego_scene(vehicles, rules.road),
+        rules.idm,
+        rules.ego,
     )
     # Of the events of one step a crash comes first, then the goal, then the time-out.
     crash = ego_overlaps(vehicles, rules.road).any(-1) & running
@@ -159,6 +168,7 @@ def remember(
     rules: Rules, before: EgoMemory, start: Substep, end: Substep, command: Command
 ) -> EgoMemory:
     """The ego's memory after a decision from ``start`` to ``end``."""
+    # Over the whole decision, which may have ended early.
     ego = end.vehicles.at(EGO_INDEX)
     speed = start.vehicles.speed[:, EGO_INDEX]
     arrived = lane_change_done(end.vehicles.columns(slice(0, 1)), rules.road)[:, 0]
@@ -183,6 +193,7 @@ def outcome(
     rules: Rules, end: Substep, command: Command
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Events and done flags of a decision, each [N, 1]; every end has exactly one reason."""
+    # Outcomes of the driving.
     terminated = end.goal | end.hard_crash | command.off_road
     # What has ended without an outcome was cut off: by the clock, or where its recording stops.
     truncated = ~end.running & ~terminated
@@ -265,6 +276,7 @@ class EndedRows:
 def _with_rows(memory: TensorDictBase, rows: Tensor, other: TensorDictBase) -> TensorDict:
     """``memory`` with its ``rows`` replaced by ``other`` [R], leaf by leaf."""
 
+    # Leaf by leaf, since the memory is nested like the traffic.
     restored = {}
     for name, value in memory.items():
         if isinstance(value, Tensor):

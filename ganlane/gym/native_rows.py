@@ -51,6 +51,7 @@ class NativeRows(Rows):
 
     def restart(self, rows: Flags) -> None:
         state = self.batch.state
+        # Row i drives the episodes i, i + N, i + 2N, ...
         self.batch.start(state[keys.SEED], state[keys.EPISODE] + self.count, rows)
 
     def step(self, actions: Integers) -> Stepped:

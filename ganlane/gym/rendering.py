@@ -25,6 +25,7 @@ _TRAIL_STEPS = round(FilmConfig.trail_s / PHYSICS_STEP_S) + 1
 def _label(rows: TensorRows, row: int) -> EpisodeLabel:
     """The header's text for a row."""
     state = rows.now()
+    # Which episode this is, and on what road.
     seed, episode = (int(state.get(name)[row]) for name in (keys.SEED, keys.EPISODE))
     road = road_of_row(state, rows.env.base_env.road, row)
     return EpisodeLabel("ego", rows.traffic, seed, episode, *road)
@@ -117,7 +118,9 @@ class BatchView:
     def _picture(self, row: int) -> Picture:
         state = self.rows.now()
         recorder = Recorder(
-            row, current_action=int(self._actions[row]), current_return=float(self._returns[row])
+            row,
+            current_action=int(self._actions[row]),
+            current_return=float(self._returns[row]),
         )
         recorder.add(state.get(keys.VEHICLES), float(state.get(keys.STEP)[row]) * PHYSICS_STEP_S)
         return FramePainter(recorder.trajectory(_label(self.rows, row))).draw(0)

@@ -111,6 +111,7 @@ def observation_space(size: int, largest: float) -> Box:
 
     Speed over desired speed, then numbers from -1 to the largest of its form.
     """
+    # float32, as the observations are; a wider type would not contain them.
     low = np.full(size, -1.0, np.float32)
     high = np.full(size, largest, np.float32)
     low[0], high[0] = 0.0, SPEED_RATIO_LIMIT
@@ -142,6 +143,7 @@ def actions_of(actions: Any, rows: int) -> Integers:
         UserError: another shape, or no such action.
     """
     array = array_of(actions)
+    # Before any cast, which would round and wrap.
     whole = array.shape == (rows,) and array.dtype.kind in "iu"
     if not whole or not 0 <= array.min() <= array.max() < keys.ACTIONS:
         raise UserError(

@@ -62,10 +62,17 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
                 f"render_mode={render_mode}: expected one of {', '.join(RENDER_MODES)}; "
                 "choose one of them."
             )
+        # Episodes count on from -1, so that the first reset begins episode 0.
         self._seed = None if seed is None else seed_number(seed)
         self._episode = -1
         self._running = False
-        self._rows = make_rows(traffic, 1, render_mode is not None, transforms, options)
+        self._rows = make_rows(
+            traffic,
+            1,
+            render_mode is not None,
+            transforms,
+            options,
+        )
         self.observation_space: gymnasium.spaces.Box = self._rows.space  # type: ignore[assignment]
         self.action_space = gymnasium.spaces.Discrete(ACTIONS)
         self.render_mode = render_mode
@@ -158,6 +165,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
             raise UserError(f"render(): made without render_mode; give one of {modes} to make().")
         self._rows.check_started()
         if self.render_mode == "rgb_array_list":
+            # gymnasium's contract: a call empties the list.
             pictures = self._pictures
             self._pictures = []
             return pictures

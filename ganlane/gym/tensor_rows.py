@@ -53,9 +53,11 @@ class TensorRows(Rows):
     def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
         counters = TensorDict({}, [self.count], device=self.env.device)
         for name, value in ((keys.SEED, seed), (keys.EPISODE, episode)):
+            # One number for all rows, or one for each.
             numbers = np.broadcast_to(value, self.count).astype(np.int64)
             counters[name] = torch.as_tensor(numbers, device=self.env.device)
-        self.started, self.state = True, self.env.reset(counters)
+        self.state = self.env.reset(counters)
+        self.started = True
 
     @torch.no_grad()
     def restart(self, rows: Flags) -> None:
@@ -67,7 +69,8 @@ class TensorRows(Rows):
         action = torch.as_tensor(actions, device=self.env.device)
         stepped = self.env.step(self.now().set(keys.ACTION, action))
         # Rows are not reset here: the environments above decide when.
-        self.state, after = self.env.step_mdp(stepped), stepped.get("next")
+        self.state = self.env.step_mdp(stepped)
+        after = stepped.get("next")
         return Stepped(
             self.observation(),
             _array(after.get(keys.REWARD)[:, 0]).astype(np.float32),

@@ -69,7 +69,13 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
                 "use gymnasium.make for a window."
             )
         self._mode = _mode_of(autoreset_mode)
-        self._rows = make_rows(traffic, num_envs, render_mode is not None, transforms, options)
+        self._rows = make_rows(
+            traffic,
+            num_envs,
+            render_mode is not None,
+            transforms,
+            options,
+        )
         self.num_envs = self._rows.count
         self.render_mode = render_mode
         episode = self._rows.episode
@@ -80,6 +86,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
                     f"max_episode_steps={limit}: a batch has its own time limit; "
                     f"give timeout_s={limit * episode.decision_period_s:g}."
                 )
+        # A picture per decision.
         fps = max(1, round(1.0 / episode.decision_period_s))
         self.metadata = {**self.metadata, "autoreset_mode": self._mode, "render_fps": fps}
         self.single_observation_space = self._rows.space
@@ -219,6 +226,7 @@ def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
 
 def _where(rows: Flags, observations: Floats) -> npt.NDArray[np.object_]:
     """Final observations in gymnasium's form: an object array [N], None outside ``rows``."""
+    # gymnasium's form: rows that go on have none.
     final = np.full(len(rows), None, dtype=object)
     for row in np.flatnonzero(rows):
         final[row] = observations[row].copy()

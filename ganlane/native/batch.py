@@ -128,6 +128,7 @@ class NativeBatch:
         stream: int = 0,
         variant: str | None = None,
     ) -> None:
+        # For copies and other processes, which make the batch anew.
         self._arguments = {name: value for name, value in locals().items() if name != "self"}
         spawn = spawn or SpawnParameters()
         ego = ego or EgoParameters()
@@ -143,6 +144,7 @@ class NativeBatch:
         road = (lanes, lane_width_m, vehicles)
         view = settings.view_of(*road, observation.scale(), observation.form)
         self.bounds = (-1.0, largest_number(observation.form, spawn.longest_m))
+        # All arrays of the state in place, written by the kernel and read by whoever asks.
         self.state: dict[Key, npt.NDArray[Any]] = {}
         for name, kind in settings.VEHICLE_ARRAYS.items():
             self.state[name] = np.zeros((rows, vehicles), kind)
@@ -153,7 +155,9 @@ class NativeBatch:
         self._term_values = np.zeros((rows, len(self.terms)), np.float32)
         self._no_safe_action = np.zeros(rows, np.bool_)
         self._library = load(variant)
+        # When others see the ego's lane changes, and the ego theirs.
         visible = (Visibility.named(ego.visibility), Visibility.SIGNALLED)
+        # The kernel's structures, filled once.
         decision = settings.settings_of(*road, episode, ego, idm, mobil=mobil)
         deceleration = mask.safe_deceleration
         abort = ego.abort_lane_change
@@ -186,6 +190,7 @@ class NativeBatch:
             mask_form=settings.MASK_FORMS.index(mask.form),
             abort_lane_change=abort,
         )
+        # One pointer is all that a call passes.
         self._address = ctypes.byref(self._batch)
         ends = (self.state["terminated"], self.state["truncated"])
         self._stepped = Stepped(self.observation, self.state[keys.REWARD], *ends)
@@ -217,6 +222,7 @@ class NativeBatch:
         """
         state = self.state
         fresh = state["fresh"]
+        # The kernel starts the rows whose flag is set and leaves the others alone.
         fresh[:] = True if rows is None else rows
         np.copyto(state[keys.SEED], seed, where=fresh)
         np.copyto(state[keys.EPISODE], episode, where=fresh)

@@ -55,6 +55,7 @@ def _room(
 
 def _state(tensors: Mapping[Key, Tensor]) -> TensorDict:
     """The environment's state [N], without a reward; the kernel drives no scene to its end."""
+    # Made without TensorDict's checks, since every shape is known.
     size = tensors[keys.STEP].shape
     device = torch.device("cpu")
     groups: dict[str, dict[str, Tensor]] = {}
@@ -72,6 +73,7 @@ def _state(tensors: Mapping[Key, Tensor]) -> TensorDict:
 
 def _shape(road: Road, vehicles: int) -> tuple[int, float, int]:
     """Lanes, their width in m, and M."""
+    # The settings have one number of lanes and one width for all rows.
     of_rows = isinstance(road.lanes, Tensor) or isinstance(road.lane_width_m, Tensor)
     if of_rows or road.ring_m is not None:
         raise UserError(
@@ -137,7 +139,14 @@ class Kernel(_Function):
         variant: str | None = None,
     ) -> None:
         self.vehicles = vehicles
-        numbers = settings.settings_of(*_shape(road, vehicles), episode, ego, idm, steering, mobil)
+        numbers = settings.settings_of(
+            *_shape(road, vehicles),
+            episode,
+            ego,
+            idm,
+            steering,
+            mobil,
+        )
         super().__init__("ganlane_decide", numbers, variant)
 
     def decide(
@@ -166,6 +175,7 @@ class Kernel(_Function):
                     f"not {number.dtype} {number.shape}"
                 )
             before[name] = number
+        # New tensors: the state before the decision belongs to the caller.
         after = _room(settings.OUTPUTS, rows, self.vehicles, torch.empty)
         self._run(rows, [action, *before.values(), recycles], list(after.values()))
         after |= {name: before[name] for name in _LASTING}
@@ -188,7 +198,13 @@ class NativeScenes(_Function):
         self.vehicles = scenes.vehicles
         seen = (scenes.ego_visibility, scenes.others_visibility)
         shape = _shape(scenes.road, scenes.vehicles)
-        numbers = settings.spawn_of(*shape, scenes.parameters, stream, *seen, recycle_share=None)
+        numbers = settings.spawn_of(
+            *shape,
+            scenes.parameters,
+            stream,
+            *seen,
+            recycle_share=None,
+        )
         super().__init__("ganlane_spawn", numbers)
 
     def start(self, seed: Tensor, episode: Tensor, rows: Tensor | None = None) -> TensorDict:
@@ -197,6 +213,7 @@ class NativeScenes(_Function):
         ``rows`` [N] bool are those to be drawn; None: all. The others are zeros, without a vehicle.
         """
         rows = torch.ones_like(seed, dtype=torch.bool) if rows is None else rows
+        # Zeros, since rows that are not drawn are not written.
         names = (*settings.OUTPUTS, *settings.SCENE)
         state = _room(names, len(seed), self.vehicles, torch.zeros)
         scene = [state[name] for name in settings.SCENE]
@@ -230,7 +247,16 @@ class LaneView(_Function):
         Arguments as :meth:`ganlane.transforms.ObservationTransform.observe`.
         """
         v = vehicles
-        inputs = [v.speed, v.desired_speed, v.length, v.y, seen.x, seen.y, seen.speed, seen.valid]
+        inputs = [
+            v.speed,
+            v.desired_speed,
+            v.length,
+            v.y,
+            seen.x,
+            seen.y,
+            seen.speed,
+            seen.valid,
+        ]
         out = torch.empty((len(v.x), self.size), dtype=torch.float32)
         self._run(len(out), [*inputs, progress, direction], [out])
         return out

@@ -162,7 +162,17 @@ class FixedScene:
         whole = Vehicles(*(value.expand(n, m).clone() for value in self.base(dtype, key.device)))
         if self.jitter_m == 0 and self.jitter_mps == 0:
             return whole
-        u = 2.0 * uniform(key, 0, m, [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED], dtype) - 1.0
+        u = (
+            2.0
+            * uniform(
+                key,
+                0,
+                m,
+                [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED],
+                dtype,
+            )
+            - 1.0
+        )
         is_ego = torch.arange(m, device=key.device) == 0
         x = torch.where(is_ego, whole.x, whole.x + self.jitter_m * u[..., 0])
         varied = (whole.speed + self.jitter_mps * u[..., 1]).clamp_min(0.0)
@@ -180,6 +190,7 @@ class FixedScene:
 
         targets = []
         seen = []
+        # What a row leaves out follows from the scene.
         usual = [self.ego_visibility] + [self.others_visibility] * (len(rows) - 1)
         for row, kind in zip(rows, usual):
             targets.append(row.lane_on(road) if row.target_lane is None else row.target_lane)
@@ -256,6 +267,7 @@ def _fault(row: SceneVehicle, road: Road) -> str:
     for name in ("desired_speed_mps", "length_m", "width_m"):
         if getattr(row, name) < SMALLEST:
             return f"{name}={getattr(row, name):g}: expected a number above 0"
+    # Then the place across the road: on it, in its lane, and next to its target lane.
     lanes = int(road.lanes)
     if row.lane is None and row.y_m is None:
         return "neither lane nor y_m is given; give one of them"
@@ -283,6 +295,8 @@ def _fault(row: SceneVehicle, road: Road) -> str:
 def check_overlaps(scene: FixedScene) -> None:
     """Raise :class:`UserError` if two vehicles overlap, or may do so with the largest jitter."""
     vehicles = scene.base()
+    # Two vehicles may both be shifted, towards each other: each counts as longer by twice the
+    # shift.
     longer = torch.full_like(vehicles.x, 2.0 * scene.jitter_m)
     longer[:, 0] = 0.0
     longest = vehicles.with_(length=vehicles.length + longer)
@@ -304,9 +318,11 @@ def check_braking(scene: FixedScene, idm: IdmParameters) -> None:
     """
     vehicles = scene.base()
     seen = perceive(vehicles, scene.road)
+    # Leaders in the lane that a vehicle is in, and in the one it is moving to.
     shares = in_lane(seen, seen.attention.low) | in_lane(seen, seen.attention.high)
     ahead = shares & (vehicles.x[:, None, :] > vehicles.x[:, :, None])
     varied = (vehicles.speed > 0) * scene.jitter_mps
+    # Two shifted vehicles come closer by twice the jitter, a shifted one and the ego by once.
     slack = scene.jitter_m * (2.0 - (torch.arange(scene.vehicles) == 0).double())
     gap = seen.pairs.ahead - torch.minimum(slack[:, None], slack[None, :])
     fastest = vehicles.speed + varied
@@ -341,6 +357,7 @@ def _first_overlap(scene: FixedScene, idm: IdmParameters) -> tuple[int, int, flo
     """The first two vehicles that overlap and the time, s; None without an overlap."""
     # Fewer of large scenes, for which every pair of vehicles is looked at.
     most = max(1, MOST_VEHICLES**2 // scene.vehicles**2)
+    # Without jitter all episodes are the same, and one drive tells.
     rows = min(DRIVES, most) if scene.jitter_m or scene.jitter_mps else 1
     numbers = torch.arange(rows)
     v = scene(episode_key(Stream.TRAIN, torch.zeros_like(numbers), numbers), torch.float64)
@@ -349,7 +366,15 @@ def _first_overlap(scene: FixedScene, idm: IdmParameters) -> tuple[int, int, flo
     for step in range(1, round(DRIVE_S / PHYSICS_STEP_S) + 1):
         acceleration = following_acceleration(perceive(v, scene.road), idm)
         steering = steer(steering, v.y, v.heading, v.speed, centre, PHYSICS_STEP_S)
-        pose = advance(v.x, v.y, v.heading, v.speed, acceleration, steering, PHYSICS_STEP_S)
+        pose = advance(
+            v.x,
+            v.y,
+            v.heading,
+            v.speed,
+            acceleration,
+            steering,
+            PHYSICS_STEP_S,
+        )
         v = v.with_(**pose._asdict())
         hits = pair_overlaps(v, scene.road)
         if bool(hits.any()):

@@ -36,31 +36,11 @@ from ganlane.transforms.sensors import PerceptionTransform
 FORMS = ("legal", "safe")
 
 
-def on_road_actions(target_lane: Tensor, lanes: int | Tensor) -> Tensor:
-    """Actions that stay on the road, bool [N, 3].
-
-    ``target_lane`` [N] of the ego, ``lanes`` one number or [N].
-    """
-    of_row = lanes[:, None] if isinstance(lanes, Tensor) else lanes
-    return on_road(target_lane[:, None] + target_lane.new_tensor(SIDES), of_row)
-
-
-def obeyed_actions(change_direction: Tensor, abort: bool) -> Tensor:
-    """Actions with an effect, bool [N, 3].
-
-    During a lane change in ``change_direction`` (-1 or 1, [N]; 0: none) commands are ignored; with
-    ``abort`` the opposite command turns back.
-    """
-    side = change_direction.new_tensor(SIDES)
-    return (side == 0) | is_heard(side, change_direction[:, None], abort)
-
-
 def braking_demand(vehicles: Vehicles, road: Road, idm: IdmParameters = TABLE_V) -> Tensor:
     """Hardest braking that each action requires by IDM, as an acceleration in m/s2, [N, 3].
 
     The actions are keep, left and right: of each the smaller of the ego's acceleration in that lane
-    and its follower's there. A lane that does not exist has no vehicles; :func:`on_road_actions`
-    excludes it.
+    and its follower's there. A lane that does not exist has no vehicles; the mask excludes it.
     """
     # IDM of the ego in each lane, and of who would follow it there.
     scene = ego_scene(vehicles, road)
@@ -110,6 +90,7 @@ class ActionMaskTransform(PerceptionTransform):
             raise UserError(
                 f"mask.safe_deceleration={safe_deceleration:g}: expected a number above 0, in m/s2."
             )
+        # Behind legal there is nothing to report: keeping the lane is always legal.
         out_keys = [keys.ACTION_MASK]
         if form == "safe":
             out_keys.append(keys.NO_SAFE_ACTION)
@@ -121,7 +102,13 @@ class ActionMaskTransform(PerceptionTransform):
         self.safe_deceleration = safe_deceleration
         self.native: SafeActions | None = None
         if native_vehicles is not None and form == "safe":
-            self.native = SafeActions(road, native_vehicles, idm, safe_deceleration, abort)
+            self.native = SafeActions(
+                road,
+                native_vehicles,
+                idm,
+                safe_deceleration,
+                abort,
+            )
 
     def allowed(self, vehicles: Vehicles, direction: Tensor, road: Road) -> tuple[Tensor, Tensor]:
         """The mask [N, 3], and whether no action is safe [N].
@@ -129,10 +116,11 @@ class ActionMaskTransform(PerceptionTransform):
         ``vehicles`` are as the ego perceives them; ``direction`` [N] is that of its current lane
         change.
         """
-        # Replayed scenes have a road of their own in every row.
-        lanes = road.lanes[:, 0] if isinstance(road.lanes, Tensor) else road.lanes
-        on_road = on_road_actions(vehicles.target_lane[:, EGO_INDEX], lanes)
-        legal = on_road & obeyed_actions(direction, self.abort)
+        side = direction.new_tensor(SIDES)
+        target = vehicles.target_lane[:, EGO_INDEX, None] + side
+        # Keeping the lane is no command that the ego could fail to hear.
+        obeyed = (side == 0) | is_heard(side, direction[:, None], self.abort)
+        legal = on_road(target, road.lanes) & obeyed
         if self.form == "legal":
             return legal, torch.zeros_like(legal[:, 0])
         # Keeping the lane is always allowed: where nothing is safe, there is nothing better.

@@ -105,6 +105,7 @@ def own_state(view: View) -> Tensor:
     road = view.road
     lane = road.lane_of(ego.y)
     dtype = ego.y.dtype
+    # Whether there is a lane to change to.
     left = (lane < road.lanes - 1).to(dtype)
     right = (lane > 0).to(dtype)
     return torch.cat((ego.speed / ego.desired_speed, left, right), dim=1)
@@ -133,6 +134,7 @@ def lane_view(view: View, drift: bool = False, overlap: bool = False) -> Tensor:
     the nearness above 1 by 1 per metre; otherwise the gap is 0 there.
     """
     others = view.others
+    # All six directions at once: each is a minimum over the vehicles there.
     range_m = view.scale.range_m
     side = others.position.new_tensor(_SIDES)[:, None]
     ahead = others.position.new_tensor(_AHEAD)[:, None]
@@ -264,6 +266,7 @@ class ObservationTransform(PerceptionTransform):
 
     def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
         """Write ``observation``."""
+        # Own state from the truth, the others as perceived.
         ego = state.get(keys.EGO)
         progress = ego.get("change_progress")
         direction = ego.get("change_direction")
@@ -281,6 +284,8 @@ class ObservationTransform(PerceptionTransform):
         shape = (*observation_spec.shape, observation_size(self.form, self.vehicles))
         true = observation_spec[keys.VEHICLES, "x"]
         observation_spec[keys.OBSERVATION] = Unbounded(
-            shape=shape, dtype=true.dtype, device=true.device
+            shape=shape,
+            dtype=true.dtype,
+            device=true.device,
         )
         return observation_spec

@@ -71,6 +71,7 @@ class RewardTransform(Transform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         terms = self.terms(next_tensordict)
+        # Terms for tables and logs, their sum for the agent.
         nested = TensorDict._new_unsafe(terms, batch_size=next_tensordict.batch_size)
         next_tensordict.set(keys.REWARD_TERMS, nested)
         return next_tensordict.set(keys.REWARD, reduce(torch.add, terms.values()))
@@ -78,6 +79,7 @@ class RewardTransform(Transform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
+        # A reset has driven nothing, yet its keys must be those of a step.
         zero = torch.zeros_like(tensordict_reset.get(keys.VEHICLES).get("x")[:, :1])
         terms = dict.fromkeys(self.parameters.term_names, zero)
         nested = TensorDict._new_unsafe(terms, batch_size=tensordict_reset.batch_size)

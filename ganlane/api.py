@@ -83,8 +83,11 @@ def make_env(
     """
     config = highways(traffic=traffic, num_envs=num_envs, **keys)
     batch = build.make_highways(config)
-    for transform in transforms:
-        batch.append_transform(transform)
+    try:
+        for transform in transforms:
+            batch.append_transform(transform)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"transforms: {error}; give a list of TorchRL's transforms.") from error
     return batch
 
 
@@ -145,8 +148,15 @@ def evaluate(
         OSError: a folder that cannot be written to.
     """
     # Names are loaded once the settings are checked; agent_idm@all means several.
+    try:
+        asked = list(agents)
+    except TypeError as error:
+        message = f"agents={agents!r:.80}: expected a list of drivers, such as ['mobil']."
+        raise UserError(message) from error
+    if not isinstance(per_episode, bool):
+        raise UserError(f"per_episode={per_episode!r:.80}: expected True or False.")
     drivers: list[str | Driver] = []
-    for agent in agents:
+    for agent in asked:
         if isinstance(agent, Driver):
             drivers.append(agent)
         elif isinstance(agent, TensorDictModuleBase):
@@ -157,7 +167,7 @@ def evaluate(
     config: EvaluateConfig = call_settings(
         "evaluate", {"agents": names, "traffics": traffics, "episodes": episodes, **keys}
     )
-    home = None if folder is None else Path(folder)
+    home = None if folder is None else _path(folder)
     with _torch_threads(config.threads), cleared_after_mistakes(home) if home else nullcontext():
         if home is not None:  # before hours of driving
             home.mkdir(parents=True, exist_ok=True)
@@ -203,6 +213,8 @@ def train(
         UserError: a wrong value, an agent or checkpoint that does not fit.
         KeyboardInterrupt: stopped by Ctrl-C; the run is saved, ``resume=True`` continues it.
     """
+    if not isinstance(resume, bool):
+        raise UserError(f"resume={resume!r:.80}: expected True or False, and the run as folder.")
     if resume and folder is None:
         raise UserError(
             "resume=True: which run? give its folder, for instance folder='outputs/train/RUN'."
@@ -294,7 +306,7 @@ def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
             f"run({command!r}): no such command{hint}; choose one of {', '.join(names)}."
         )
     # Going on with a run means its own folder.
-    home = new_folder(command) if folder is None else Path(folder)
+    home = new_folder(command) if folder is None else _path(folder)
     if command == "train" and keys.get("resume") is not None:
         is_own = folder is not None and str(keys["resume"]) == str(folder)
         if not is_own or not any(home.rglob(LAST.name)):
@@ -306,6 +318,18 @@ def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
     with _torch_threads(), running(home, config):
         function_of(command)(config, home)
     return Run(home, json.loads((home / "results.json").read_text(encoding="utf-8")))
+
+
+def _path(folder: str | Path) -> Path:
+    """The folder of a call.
+
+    Raises:
+        UserError: it is no path.
+    """
+    # Python refuses a zero byte only when the path is used
+    if not isinstance(folder, str | Path) or "\0" in str(folder):
+        raise UserError(f"folder={folder!r:.80}: expected a path, such as 'mine'.")
+    return Path(folder)
 
 
 @contextmanager

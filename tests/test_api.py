@@ -229,6 +229,12 @@ def test_the_short_blocks_in_the_docs_run(capsys):
             "traffics: expected a list of different traffics",
         ),
         (lambda: ganlane.api.evaluate([42], ["idm"]), "agent 42: unknown"),
+        (lambda: ganlane.api.evaluate(None, ["idm"]), "agents=None: expected a list of drivers"),
+        (lambda: ganlane.api.evaluate(["mobil"], {}), "a list of different traffics, not empty"),
+        (lambda: ganlane.api.evaluate(folder=3), "folder=3: expected a path"),
+        (lambda: ganlane.api.train("idm", folder=[]), "folder=[]: expected a path"),
+        (lambda: ganlane.make_env(transforms=["x"]), "give a list of TorchRL's transforms"),
+        (lambda: ganlane.make_env(transforms=None), "give a list of TorchRL's transforms"),
         (
             lambda: ganlane.api.evaluate(["mobil"], ["idm"], generator={"path": "x"}),
             "env.generator: no such key",

@@ -11,7 +11,7 @@ for, and with the record's further keys. A model of your own needs no more than 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, TypeAlias
 
@@ -340,10 +340,13 @@ def traffics_of(data: Any, key: str) -> dict[str, TrafficConfig]:
     Raises:
         ParameterError: one is not known or named twice; ``key`` is the field that lists them.
     """
-    if isinstance(data, Mapping):
+    if isinstance(data, Mapping) and data:
         return {str(name): make(TrafficConfig, value, key) for name, value in data.items()}
     # One name stands for a list of one, as everywhere on the command line.
-    entries = [data] if isinstance(data, str) or not isinstance(data, Iterable) else list(data)
+    try:
+        entries = [data] if isinstance(data, str) else list(data)
+    except TypeError:  # a number, a class or a record
+        entries = [data]
     traffics = [make(TrafficConfig, entry, key) for entry in entries]
     by_label = {traffic.label(): traffic for traffic in traffics}
     if not traffics or len(by_label) < len(traffics):

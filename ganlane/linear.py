@@ -43,7 +43,10 @@ def has_fast_product(x: Tensor) -> bool:
 
 
 def matrix_product(
-    x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    relu: bool = False,
 ) -> Tensor:
     """:func:`linear` in float32 on a CPU, without a gradient, in eager and in compiled graphs."""
     return torch.ops.ganlane.linear(x, weight, bias, relu)
@@ -73,4 +76,8 @@ class _OneDnnLinear(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
         (gradient,), (x, weight) = gradients, ctx.saved_tensors
         to_x = matrix_product(gradient, weight.t()) if ctx.needs_input_grad[0] else None
-        return to_x, matrix_product(gradient.t(), x.t()), gradient.sum(0)
+        return (
+            to_x,
+            matrix_product(gradient.t(), x.t()),
+            gradient.sum(0),
+        )

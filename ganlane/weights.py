@@ -12,11 +12,20 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from ganlane.errors import UserError
-from ganlane.files import PLACE, has_checksum, refuse_without_checksum, sealed, write_bytes
+from ganlane.files import (
+    PLACE,
+    has_checksum,
+    refuse_without_checksum,
+    sealed,
+    write_bytes,
+)
 
 
 def save_weights(
-    path: str | Path, kind: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]
+    path: str | Path,
+    kind: str,
+    tensors: Mapping[str, Tensor],
+    metadata: Mapping[str, Any],
 ) -> None:
     """Save ``tensors`` and plain ``metadata`` as safetensors, atomically.
 
@@ -27,7 +36,10 @@ def save_weights(
         metadata: JSON-serialisable description (config, data, metrics, code version).
     """
     flat = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    header = {"ganlane": json.dumps({"kind": kind, **metadata}), "checksum": PLACE}
+    header = {
+        "ganlane": json.dumps({"kind": kind, **metadata}),
+        "checksum": PLACE,
+    }
     write_bytes(path, sealed(save(flat, metadata=header)))
 
 
@@ -49,11 +61,17 @@ def load_weights(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[s
         tensors = load(content)
         # The format begins with the header's length and the header, JSON. The library's reader of
         # bytes leaves the metadata out.
-        begin, end = 8, 8 + int.from_bytes(content[:8], "little")
+        begin = 8
+        end = 8 + int.from_bytes(content[:8], "little")
         header = json.loads(content[begin:end]).get("__metadata__") or {}
         metadata = json.loads(header.get("ganlane", "{}"))
     # KeyError: a number type that torch lacks
-    except (SafetensorError, ValueError, KeyError, RecursionError) as error:
+    except (
+        SafetensorError,
+        ValueError,
+        KeyError,
+        RecursionError,
+    ) as error:
         raise UserError(
             f"{path}: not a readable safetensors file ({error}); "
             f"give a checkpoint of kind {kind} that ganlane wrote."

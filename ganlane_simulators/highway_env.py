@@ -20,9 +20,12 @@ from ganlane.traffic.base import Memory, Moved, TrafficModule
 _EXPONENT = 8
 #: HighwayEnv's own bounds for the exponent of a driver's free acceleration
 #: (``IDMVehicle.DELTA_RANGE``).
-_LOWEST_EXPONENT, _HIGHEST_EXPONENT = 3.5, 4.5
+_LOWEST_EXPONENT = 3.5
+_HIGHEST_EXPONENT = 4.5
 #: Start and end of HighwayEnv's lanes, m, and their speed limit, m/s, above all desired speeds.
-_FROM_M, _TO_M, _LIMIT_MPS = -10_000.0, 200_000.0, 70.0
+_FROM_M = -10_000.0
+_TO_M = 200_000.0
+_LIMIT_MPS = 70.0
 
 
 class HighwayEnvTraffic(TrafficModule):
@@ -71,18 +74,39 @@ class HighwayEnvTraffic(TrafficModule):
         """HighwayEnv's staggering of drivers by their initial positions."""
         return {"timer": torch.remainder((vehicles.x + vehicles.y) * torch.pi, 1.0)}
 
-    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def move(
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
+    ) -> Moved:
         """Row by row: write HighwayEnv's objects, let them act and step, read them."""
-        like, m = vehicles.x, vehicles.x.shape[1]
-        u = uniform(key, 0, m, [Purpose.FOREIGN_DRIVER + _EXPONENT], like.dtype)[..., 0]
+        like = vehicles.x
+        m = vehicles.x.shape[1]
+        u = uniform(
+            key,
+            0,
+            m,
+            [Purpose.FOREIGN_DRIVER + _EXPONENT],
+            like.dtype,
+        )[..., 0]
         exponent = _LOWEST_EXPONENT + (_HIGHEST_EXPONENT - _LOWEST_EXPONENT) * u
         body = _float64(vehicles.x, vehicles.y, vehicles.heading, vehicles.speed)
         size = _float64(vehicles.length, vehicles.width)
         driver = _float64(vehicles.desired_speed, exponent, memory["timer"])
-        target, valid = vehicles.target_lane.cpu().numpy().copy(), vehicles.valid.cpu().numpy()
+        target = vehicles.target_lane.cpu().numpy().copy()
+        valid = vehicles.valid.cpu().numpy()
         ego_signals = (vehicles.visibility[:, EGO_INDEX] == int(Visibility.SIGNALLED)).tolist()
         for row, signals in enumerate(ego_signals):
-            self._highway.put(valid[row], body[row], size[row], driver[row], target[row], signals)
+            self._highway.put(
+                valid[row],
+                body[row],
+                size[row],
+                driver[row],
+                target[row],
+                signals,
+            )
             self._highway.drive(self.dt, body[row], driver[row], target[row])
         x, y, heading, speed = torch.as_tensor(body).to(like.device, like.dtype).unbind(-1)
         moved = vehicles.with_(
@@ -111,7 +135,9 @@ class _Highway:
             from highway_env.road.road import Road as TheirRoad
             from highway_env.road.road import RoadNetwork
             from highway_env.vehicle.behavior import IDMVehicle
-            from highway_env.vehicle.controller import ControlledVehicle
+            from highway_env.vehicle.controller import (
+                ControlledVehicle,
+            )
         except ModuleNotFoundError as error:
             raise UserError(
                 f"traffic highway_env: highway-env is not installed ({error}); "
@@ -125,10 +151,16 @@ class _Highway:
             def local_coordinates(self, position: Any) -> tuple[float, float]:
                 return float(position[0]) - _FROM_M, float(position[1]) - self.start[1]
 
-        network, width = RoadNetwork(), float(ours.lane_width_m)
+        network = RoadNetwork()
+        width = float(ours.lane_width_m)
         for k in range(ours.lanes):
             y = k * width
-            lane = Lane([_FROM_M, y], [_TO_M, y], width=width, speed_limit=_LIMIT_MPS)
+            lane = Lane(
+                [_FROM_M, y],
+                [_TO_M, y],
+                width=width,
+                speed_limit=_LIMIT_MPS,
+            )
             network.add_lane("a", "b", lane)
         self.road = TheirRoad(network, np_random=np.random.RandomState(0))
         self._new_driver = IDMVehicle
@@ -138,7 +170,13 @@ class _Highway:
         self._there: list[int] = []
 
     def put(
-        self, valid: Any, body: Any, size: Any, driver: Any, target: Any, ego_signals: bool
+        self,
+        valid: Any,
+        body: Any,
+        size: Any,
+        driver: Any,
+        target: Any,
+        ego_signals: bool,
     ) -> None:
         """Write one row into HighwayEnv's objects.
 
@@ -172,6 +210,10 @@ class _Highway:
             if i != EGO_INDEX:
                 car = self._cars[i]
                 car.step(dt)
-                body[i] = (*car.position, car.heading, max(car.speed, 0.0))
+                body[i] = (
+                    *car.position,
+                    car.heading,
+                    max(car.speed, 0.0),
+                )
                 driver[i, 2] = car.timer
                 target[i] = car.target_lane_index[2]

@@ -15,14 +15,31 @@ from ganlane.keys import EGO_INDEX
 from ganlane.settings.driving import IdmParameters, Visibility
 from ganlane.settings.episode import SpawnParameters
 from ganlane.settings.traffic import SumoTrafficConfig
-from ganlane.sim.dynamics import STEERING, SteeringParameters, ego_scene, move_ego
+from ganlane.sim.dynamics import (
+    STEERING,
+    SteeringParameters,
+    ego_scene,
+    move_ego,
+)
 from ganlane.sim.idm import TABLE_V, following_acceleration
 from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.scenes import Scenes
 from ganlane.sim.spawn import TABLE_II, RandomScenes
-from ganlane.sim.state import Road, Vehicles, body_lanes, presence, with_target
+from ganlane.sim.state import (
+    Road,
+    Vehicles,
+    body_lanes,
+    presence,
+    with_target,
+)
 from ganlane.traffic.base import Memory, Moved, TrafficModule
-from ganlane_simulators.sumo_roads import Array, Place, SumoDriver, SumoRoads, import_libsumo
+from ganlane_simulators.sumo_roads import (
+    Array,
+    Place,
+    SumoDriver,
+    SumoRoads,
+    import_libsumo,
+)
 
 #: Vehicles of this length (m) and more are driven as lorries.
 LORRY_M = 7.0
@@ -35,7 +52,11 @@ _STEEPEST_RAD = 0.2
 _PACE_STEPS = 10
 #: Columns of :attr:`ganlane.sim.random.Purpose.FOREIGN_DRIVER`: the first two of the initial scene,
 #: then a driver's.
-_IS_LORRY, _DESIRED, _TAU, _PACE_PERIOD, _PACE_PHASE = 0, 1, 2, 6, 7
+_IS_LORRY = 0
+_DESIRED = 1
+_TAU = 2
+_PACE_PERIOD = 6
+_PACE_PHASE = 7
 
 
 Flags = NDArray[np.bool_]
@@ -74,7 +95,10 @@ class LorryScenes:
         The ego at index 0 and x = 0.
         """
         scene = self.cars(key, dtype)
-        columns = [Purpose.FOREIGN_DRIVER + _IS_LORRY, Purpose.FOREIGN_DRIVER + _DESIRED]
+        columns = [
+            Purpose.FOREIGN_DRIVER + _IS_LORRY,
+            Purpose.FOREIGN_DRIVER + _DESIRED,
+        ]
         chosen, desired = uniform(key, 0, self.vehicles, columns).unbind(-1)
         is_other = torch.arange(self.vehicles, device=key.device) != EGO_INDEX
         is_lorry = (chosen < self.share) & is_other
@@ -88,13 +112,27 @@ class LorryScenes:
         same = scene.target_lane[:, :, None] == scene.target_lane[:, None, :]
         behind = scene.x[:, None, :] < scene.x[:, :, None]
         x = scene.x + ((extra[:, None, :] * (same & behind)).sum(-1) + 0.5 * extra)
-        return scene.with_(x=x - x[:, EGO_INDEX, None], length=length, desired_speed=desired_speed)
+        return scene.with_(
+            x=x - x[:, EGO_INDEX, None],
+            length=length,
+            desired_speed=desired_speed,
+        )
 
 
 #: Ranges (low, high) of the drivers' parameters, s, m/s2, m, in the order of their columns. SUMO's
 #: own values lie within.
-CARS = {"tau": (0.9, 1.6), "accel": (1.5, 3.0), "decel": (3.5, 5.0), "min_gap": (1.5, 3.0)}
-LORRIES = {"tau": (1.2, 2.0), "accel": (0.8, 1.3), "decel": (3.0, 4.5), "min_gap": (2.0, 3.5)}
+CARS = {
+    "tau": (0.9, 1.6),
+    "accel": (1.5, 3.0),
+    "decel": (3.5, 5.0),
+    "min_gap": (1.5, 3.0),
+}
+LORRIES = {
+    "tau": (1.2, 2.0),
+    "accel": (0.8, 1.3),
+    "decel": (3.0, 4.5),
+    "min_gap": (2.0, 3.5),
+}
 
 
 class SumoTraffic(TrafficModule):
@@ -147,9 +185,13 @@ class SumoTraffic(TrafficModule):
             raise UserError(
                 f"traffic sumo: a ring of {self.road.ring_m:g} m; SUMO's roads here are straight."
             )
-        self.idm, self.steering, self.spawn = idm, steering, spawn
-        self.truck_share, self.truck_length_m = truck_share, truck_length_m
-        self.lane_change_s, self.keep_right = lane_change_s, keep_right
+        self.idm = idm
+        self.steering = steering
+        self.spawn = spawn
+        self.truck_share = truck_share
+        self.truck_length_m = truck_length_m
+        self.lane_change_s = lane_change_s
+        self.keep_right = keep_right
         self.speed_wander = speed_wander
         self._simulation: _Simulation | None = None
 
@@ -167,14 +209,27 @@ class SumoTraffic(TrafficModule):
         ego_desired_speed_mps: float = 25.0,
     ) -> Scenes:
         """Table II with lorries: as many as ``env.truck_share`` says, or else ``truck_share``."""
-        cars = RandomScenes(self.road, vehicles, self.spawn, ego_visibility, self.visibility)
+        cars = RandomScenes(
+            self.road,
+            vehicles,
+            self.spawn,
+            ego_visibility,
+            self.visibility,
+        )
         if self.spawn.truck_share > 0:
             return cars
         return LorryScenes(cars, self.truck_share, self.truck_length_m)
 
-    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def move(
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
+    ) -> Moved:
         """One step of SUMO; rows at step 0 are set up anew first. Only the ego is steered by us."""
-        fresh, before = (step == 0).cpu().numpy(), _arrays(vehicles)
+        fresh = (step == 0).cpu().numpy()
+        before = _arrays(vehicles)
         now = self._running(before, fresh)
         driving = self._check(now, before, fresh, key.cpu().numpy())
         for row in np.flatnonzero(fresh).tolist():
@@ -183,13 +238,25 @@ class SumoTraffic(TrafficModule):
         acceleration = following_acceleration(ego_scene(vehicles, self.road), self.idm)[:, 0]
         steering = memory["steering"]
         ego, wheels = move_ego(
-            vehicles, acceleration, steering[:, 0], self.road, self.steering, self.dt
+            vehicles,
+            acceleration,
+            steering[:, 0],
+            self.road,
+            self.steering,
+            self.dt,
         )
         self._lead_egos(now.roads, driving, ego, before)
-        self._wander(now.roads, driving, before, key.cpu(), step.cpu().numpy())
+        self._wander(
+            now.roads,
+            driving,
+            before,
+            key.cpu(),
+            step.cpu().numpy(),
+        )
         now.roads.step()
         moved = self._moved(now.roads, driving, vehicles, before)
-        now.before, now.after = before, _arrays(moved)
+        now.before = before
+        now.after = _arrays(moved)
         return moved, {"steering": torch.cat((wheels[:, None], steering[:, 1:]), dim=1)}
 
     def _running(self, before: Any, fresh: Flags) -> _Simulation:
@@ -204,13 +271,27 @@ class SumoTraffic(TrafficModule):
                 "next one starts."
             )
         assert isinstance(self.road.lanes, int)
-        n, width = len(before.x), float(self.road.lane_width_m)
-        roads = SumoRoads(n, self.road.lanes, width, self.lane_change_s, self.keep_right)
-        no_keys, none_ended = np.zeros(n, np.int64), np.zeros(n, bool)
+        n = len(before.x)
+        width = float(self.road.lane_width_m)
+        roads = SumoRoads(
+            n,
+            self.road.lanes,
+            width,
+            self.lane_change_s,
+            self.keep_right,
+        )
+        no_keys = np.zeros(n, np.int64)
+        none_ended = np.zeros(n, bool)
         self._simulation = _Simulation(roads, before.x.shape, no_keys, none_ended)
         return self._simulation
 
-    def _check(self, now: _Simulation, before: Any, fresh: Flags, key: NDArray[np.int64]) -> Flags:
+    def _check(
+        self,
+        now: _Simulation,
+        before: Any,
+        fresh: Flags,
+        key: NDArray[np.int64],
+    ) -> Flags:
         """Which rows drive in this step.
 
         A row that has ended comes again as it was, and is taken off the road. With ``env.recycle``
@@ -243,7 +324,11 @@ class SumoTraffic(TrafficModule):
         """Where vehicle ``i`` of a row is."""
         lane = round(float(vehicles.y[row, i]) / float(self.road.lane_width_m))
         lane = min(max(lane, 0), int(self.road.lanes) - 1)
-        return Place(lane, float(vehicles.x[row, i]), float(vehicles.speed[row, i]))
+        return Place(
+            lane,
+            float(vehicles.x[row, i]),
+            float(vehicles.speed[row, i]),
+        )
 
     def _start(self, now: _Simulation, row: int, vehicles: Any, key: Tensor) -> None:
         """A new episode on a highway."""
@@ -255,10 +340,20 @@ class SumoTraffic(TrafficModule):
         for i in range(1, m):
             there = vehicles.valid[row, i]
             drivers.append(_driver(u[i], vehicles, row, i) if there else None)
-        now.roads.fill(row, drivers, [self._place(vehicles, row, i) for i in range(1, m)])
+        now.roads.fill(
+            row,
+            drivers,
+            [self._place(vehicles, row, i) for i in range(1, m)],
+        )
         now.keys[row], now.ended[row] = int(key[row]), False
 
-    def _lead_egos(self, roads: SumoRoads, driving: Flags, ego: Vehicles, before: Any) -> None:
+    def _lead_egos(
+        self,
+        roads: SumoRoads,
+        driving: Flags,
+        ego: Vehicles,
+        before: Any,
+    ) -> None:
         """The stand-ins, ordinary cars for SUMO's drivers, follow the egos."""
         one = Vehicles(*(field[:, None] for field in ego))
         body = body_lanes(one, self.road)
@@ -267,19 +362,35 @@ class SumoTraffic(TrafficModule):
         now = before.at(EGO_INDEX)
         for row in np.flatnonzero(driving).tolist():
             size = float(now.length[row]), float(now.width[row])
-            driver = SumoDriver(float(now.desired_speed[row]), *size, 1.0, 2.6, 4.5, 2.5, 9.0)
+            driver = SumoDriver(
+                float(now.desired_speed[row]),
+                *size,
+                1.0,
+                2.6,
+                4.5,
+                2.5,
+                9.0,
+            )
             here = Place(0, float(now.x[row]), float(now.speed[row]))
             there = range(int(low[row]), int(high[row]) + 1) if now.valid[row] else range(0)
             roads.lead_ego(row, there, driver, here, next_x[row])
 
     def _wander(
-        self, roads: SumoRoads, driving: Flags, before: Any, key: Tensor, step: NDArray[np.int64]
+        self,
+        roads: SumoRoads,
+        driving: Flags,
+        before: Any,
+        key: Tensor,
+        step: NDArray[np.int64],
     ) -> None:
         """Once a second drivers change their desired speeds, each along its own sine."""
         rows = np.flatnonzero(driving & (step % _PACE_STEPS == 0)).tolist()
         if self.speed_wander == 0.0 or not rows:
             return
-        purposes = [Purpose.FOREIGN_DRIVER + _PACE_PERIOD, Purpose.FOREIGN_DRIVER + _PACE_PHASE]
+        purposes = [
+            Purpose.FOREIGN_DRIVER + _PACE_PERIOD,
+            Purpose.FOREIGN_DRIVER + _PACE_PHASE,
+        ]
         u = uniform(key, 0, before.x.shape[1], purposes, torch.float64).numpy()
         turns = step[:, None] * (0.1 / (20.0 + 40.0 * u[..., 0])) + u[..., 1]
         factor = 1.0 + self.speed_wander * np.sin(2.0 * np.pi * turns)
@@ -289,18 +400,32 @@ class SumoTraffic(TrafficModule):
                 if name:
                     roads.set_desired_speed(name, speed)
 
-    def _moved(self, roads: SumoRoads, driving: Flags, vehicles: Vehicles, before: Any) -> Vehicles:
+    def _moved(
+        self,
+        roads: SumoRoads,
+        driving: Flags,
+        vehicles: Vehicles,
+        before: Any,
+    ) -> Vehicles:
         """SUMO's state as our fields; the egos, and rows that do not drive, stay as they are."""
         row, other, front, new_speed = roads.read()
         at = row, other + 1
-        new_x, new_y = front[:, 0] - 0.5 * before.length[at], front[:, 1]
-        dx, dy = new_x - before.x[at], new_y - before.y[at]
+        new_x = front[:, 0] - 0.5 * before.length[at]
+        new_y = front[:, 1]
+        dx = new_x - before.x[at]
+        dy = new_y - before.y[at]
         angle = np.arctan2(dy, np.maximum(dx, 1e-6))
         # The lane that a vehicle keeps, or is moving to: the next centre in the direction in which
         # it moves.
-        lane, close = new_y / float(self.road.lane_width_m), 1e-3
-        left, right = np.ceil(lane - close), np.floor(lane + close)
-        lane = np.where(dy > _SIDEWAYS_M, left, np.where(dy < -_SIDEWAYS_M, right, np.round(lane)))
+        lane = new_y / float(self.road.lane_width_m)
+        close = 1e-3
+        left = np.ceil(lane - close)
+        right = np.floor(lane + close)
+        lane = np.where(
+            dy > _SIDEWAYS_M,
+            left,
+            np.where(dy < -_SIDEWAYS_M, right, np.round(lane)),
+        )
         new = {
             "x": new_x,
             "y": new_y,
@@ -313,7 +438,10 @@ class SumoTraffic(TrafficModule):
         fields = {}
         for name, values in new.items():
             field = getattr(before, name).copy()
-            if name in ("acceleration", "valid"):  # of who has come to the end of the road
+            if name in (
+                "acceleration",
+                "valid",
+            ):  # of who has come to the end of the road
                 field[driving, 1:] = 0
             field[at] = values
             fields[name] = torch.as_tensor(field).to(vehicles.x.device)

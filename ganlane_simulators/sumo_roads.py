@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 
 #: Where x = 0 lies on SUMO's edges, m, and how far they go on from there: 1000 s at 35 m/s and
 #: more.
-ORIGIN_M, LENGTH_M = 2_000.0, 60_000.0
+ORIGIN_M = 2_000.0
+LENGTH_M = 60_000.0
 #: Speed limit of every lane, m/s. Drivers have a speed factor: their desired speed is a multiple of
 #: it.
 LIMIT_MPS = 25.0
@@ -78,7 +79,12 @@ class SumoRoads:
     _current: SumoRoads | None = None
 
     def __init__(
-        self, rows: int, lanes: int, lane_width_m: float, change_s: float, keep_right: float
+        self,
+        rows: int,
+        lanes: int,
+        lane_width_m: float,
+        change_s: float,
+        keep_right: float,
     ) -> None:
         self.libsumo = import_libsumo()
         if SumoRoads._current is not None:
@@ -108,12 +114,20 @@ class SumoRoads:
 
     def clear(self, row: int) -> None:
         """Take everybody off a highway."""
-        for name in (*self.names[row], *self._stand_ins[row].values()):
+        for name in (
+            *self.names[row],
+            *self._stand_ins[row].values(),
+        ):
             if name:
                 self.libsumo.vehicle.remove(name)
         self.names[row], self._stand_ins[row] = [], {}
 
-    def fill(self, row: int, drivers: Sequence[SumoDriver | None], places: Sequence[Place]) -> None:
+    def fill(
+        self,
+        row: int,
+        drivers: Sequence[SumoDriver | None],
+        places: Sequence[Place],
+    ) -> None:
         """Put the others of a new episode onto an empty highway; None: nobody has this index."""
         self._drivers[row] = list(drivers)
         for driver, place in zip(drivers, places):
@@ -122,7 +136,8 @@ class SumoRoads:
     def _add(self, row: int, driver: SumoDriver, place: Place) -> str:
         """A new vehicle, on the road at once; its name."""
         self._serial += 1
-        name, vehicle = f"{row}.{self._serial}", self.libsumo.vehicle
+        name = f"{row}.{self._serial}"
+        vehicle = self.libsumo.vehicle
         vehicle.add(name, _edge(row), "driver", depart="now", departLane="0")
         vehicle.setLength(name, driver.length)
         vehicle.setWidth(name, driver.width)
@@ -133,7 +148,11 @@ class SumoRoads:
         vehicle.setEmergencyDecel(name, driver.emergency_decel)
         vehicle.setApparentDecel(name, driver.decel)
         vehicle.setMinGap(name, driver.min_gap)
-        vehicle.moveTo(name, f"{_edge(row)}_{place.lane}", place.x + 0.5 * driver.length + ORIGIN_M)
+        vehicle.moveTo(
+            name,
+            f"{_edge(row)}_{place.lane}",
+            place.x + 0.5 * driver.length + ORIGIN_M,
+        )
         vehicle.setPreviousSpeed(name, place.speed)
         return name
 
@@ -152,7 +171,12 @@ class SumoRoads:
         self.libsumo.vehicle.setSpeedFactor(name, speed / LIMIT_MPS)
 
     def lead_ego(
-        self, row: int, lanes: range, ego: SumoDriver, place: Place, next_x: float
+        self,
+        row: int,
+        lanes: range,
+        ego: SumoDriver,
+        place: Place,
+        next_x: float,
     ) -> None:
         """Have stand-ins in ``lanes`` that will be at ``next_x`` (m) at the end of the coming step.
 
@@ -161,7 +185,8 @@ class SumoRoads:
         along, it would disturb the order of a lane. ``place`` is where the ego is now; its lane
         does not matter.
         """
-        stand_ins, vehicle = self._stand_ins[row], self.libsumo.vehicle
+        stand_ins = self._stand_ins[row]
+        vehicle = self.libsumo.vehicle
         for lane in set(stand_ins) - set(lanes):
             vehicle.remove(stand_ins.pop(lane))
         for lane in lanes:
@@ -174,7 +199,13 @@ class SumoRoads:
             # SUMO's ballistic step moves it by the mean of old and new speed.
             now = vehicle.getLanePosition(name) - 0.5 * ego.length - ORIGIN_M
             vehicle.setPreviousSpeed(name, place.speed)
-            vehicle.setSpeed(name, max(2.0 * (next_x - now) / PHYSICS_STEP_S - place.speed, 0.0))
+            vehicle.setSpeed(
+                name,
+                max(
+                    2.0 * (next_x - now) / PHYSICS_STEP_S - place.speed,
+                    0.0,
+                ),
+            )
 
     def step(self) -> None:
         """Drive on by 0.1 s; who has come to the end of the road is gone."""
@@ -184,12 +215,15 @@ class SumoRoads:
             if name in self.names[row]:
                 self.names[row][self.names[row].index(name)] = ""
 
-    def read(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]:
+    def read(
+        self,
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]:
         """Everybody who is there.
 
         Row, index among the others, (x of the front bumper, y) in m, speed in m/s.
         """
-        names, places = [], []
+        names = []
+        places = []
         for row, names_of_row in enumerate(self.names):
             for index, name in enumerate(names_of_row):
                 if name:
@@ -212,9 +246,12 @@ def _network(rows: int, lanes: int, width: float) -> str:
     end = ORIGIN_M + LENGTH_M
     parts = []
     for row in range(rows):
-        name, lane_names, shapes = _edge(row), [], []
+        name = _edge(row)
+        lane_names = []
+        shapes = []
         for lane in range(lanes):
-            lane_name, y = f"{name}_{lane}", lane * width
+            lane_name = f"{name}_{lane}"
+            y = lane * width
             lane_names.append(lane_name)
             shapes.append(
                 f'<lane id="{lane_name}" index="{lane}" speed="{LIMIT_MPS}" length="{end}" '
@@ -223,7 +260,10 @@ def _network(rows: int, lanes: int, width: float) -> str:
         parts.append(
             f'<edge id="{name}" from="{name}a" to="{name}b" priority="1">{"".join(shapes)}</edge>'
         )
-        for side, x, inward in (("a", 0.0, ""), ("b", end, " ".join(lane_names))):
+        for side, x, inward in (
+            ("a", 0.0, ""),
+            ("b", end, " ".join(lane_names)),
+        ):
             parts.append(
                 f'<junction id="{name}{side}" type="dead_end" x="{x}" y="0" incLanes="{inward}" '
                 f'intLanes="" shape="{x},0"/>'

@@ -25,7 +25,9 @@ from ganlane.settings.traffic import (
 from ganlane.sim.random import Stream
 
 ROAD = EnvConfig(
-    lanes=2, idm=IdmParameters(headway_s=1.2), mobil=MobilParameters(politeness_side=0.0)
+    lanes=2,
+    idm=IdmParameters(headway_s=1.2),
+    mobil=MobilParameters(politeness_side=0.0),
 )
 
 
@@ -33,14 +35,23 @@ ROAD = EnvConfig(
 def test_built_environments_keep_their_specs(form):
     check_env_specs(
         make_env(
-            make_traffic(IdmTrafficConfig(), ROAD), ROAD, ObservationConfig(form=form), num_envs=2
+            make_traffic(IdmTrafficConfig(), ROAD),
+            ROAD,
+            ObservationConfig(form=form),
+            num_envs=2,
         )
     )
 
 
 def test_a_reset_runs_the_episodes_that_were_asked_for():
     env = make_env(make_traffic(IdmTrafficConfig(), ROAD), ROAD, num_envs=3)
-    wanted = TensorDict({"seed": torch.tensor([5, 5, 6]), "episode": torch.tensor([7, 8, 9])}, [3])
+    wanted = TensorDict(
+        {
+            "seed": torch.tensor([5, 5, 6]),
+            "episode": torch.tensor([7, 8, 9]),
+        },
+        [3],
+    )
     start = env.reset(wanted)
     assert start["episode"].tolist() == [7, 8, 9]
     assert start["seed"].tolist() == [5, 5, 6]
@@ -69,14 +80,18 @@ def test_every_driver_drives(name):
 
 def test_an_unknown_driver_is_refused_with_the_known_ones():
     with pytest.raises(
-        UserError, match=r"agent nobody: unknown; choose one of random, .*agent_idm"
+        UserError,
+        match=r"agent nobody: unknown; choose one of random, .*agent_idm",
     ):
         make_driver("nobody", ROAD)
 
 
 @pytest.mark.parametrize(
     ("module", "config", "extra"),
-    [("libsumo", SumoTrafficConfig(), "sumo"), ("highway_env", HighwayEnvTrafficConfig(), "bench")],
+    [
+        ("libsumo", SumoTrafficConfig(), "sumo"),
+        ("highway_env", HighwayEnvTrafficConfig(), "bench"),
+    ],
 )
 def test_where_the_package_is_missing_a_sentence_names_the_extra(
     monkeypatch, module, config, extra
@@ -95,7 +110,10 @@ def test_a_realism_card_has_no_ego_to_drive_around(config):
 
 
 def test_the_first_scene_is_that_of_the_environment():
-    pytest.importorskip("libsumo", reason="SUMO is not installed: pip install 'ganlane[sumo]'")
+    pytest.importorskip(
+        "libsumo",
+        reason="SUMO is not installed: pip install 'ganlane[sumo]'",
+    )
     env = EnvConfig(spread_m=300.0, rear_speed_mps=(12.0, 13.0))
     scenes = make_traffic(SumoTrafficConfig(truck_share=0.4), env).scenes(9)
     assert scenes.cars.parameters == env.spawn_parameters()

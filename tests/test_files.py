@@ -40,10 +40,13 @@ from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
 from ganlane.settings.generator import LoopConfig, PaperConfig
 from ganlane.weights import load_weights, save_weights
 
-BEGIN, END = "<!-- begin -->", "<!-- end -->"
+BEGIN = "<!-- begin -->"
+END = "<!-- end -->"
 
 
-def test_what_stands_between_the_markers_is_rewritten_and_the_rest_is_kept(tmp_path):
+def test_what_stands_between_the_markers_is_rewritten_and_the_rest_is_kept(
+    tmp_path,
+):
     document = tmp_path / "page.md"
     document.write_text(f"# Title\n{BEGIN}{END} tail é\n", encoding="utf-8")
     for content in ("one", "two\nlines"):
@@ -51,17 +54,29 @@ def test_what_stands_between_the_markers_is_rewritten_and_the_rest_is_kept(tmp_p
         assert (
             document.read_text(encoding="utf-8") == f"# Title\n{BEGIN}\n{content}\n{END} tail é\n"
         )
-    assert split_at_markers(document, BEGIN, END) == (f"# Title\n{BEGIN}", f"{END} tail é\n")
+    assert split_at_markers(document, BEGIN, END) == (
+        f"# Title\n{BEGIN}",
+        f"{END} tail é\n",
+    )
 
 
 @pytest.mark.parametrize(
-    "text", ["", BEGIN, END, f"{END}{BEGIN}", f"{BEGIN}{END}{END}", f"{BEGIN}{BEGIN}{END}"]
+    "text",
+    [
+        "",
+        BEGIN,
+        END,
+        f"{END}{BEGIN}",
+        f"{BEGIN}{END}{END}",
+        f"{BEGIN}{BEGIN}{END}",
+    ],
 )
 def test_a_document_without_both_markers_once_and_in_order_is_refused_and_kept(tmp_path, text):
     document = tmp_path / "page.md"
     document.write_text(text)
     with pytest.raises(
-        UserError, match=r"page\.md: expected the lines <!-- begin --> and <!-- end -->"
+        UserError,
+        match=r"page\.md: expected the lines <!-- begin --> and <!-- end -->",
     ):
         write_between_markers(document, BEGIN, END, "new")
     assert document.read_text() == text
@@ -102,22 +117,34 @@ def test_a_full_disk_is_told_of_in_the_systems_words_and_leaves_the_old_file(
 ):
     path = tmp_path / "kept"
     write_bytes(path, b"old")
-    with pytest.raises(OSError, match="File too large") as caught, atomic_path(path) as part:
+    with (
+        pytest.raises(OSError, match="File too large") as caught,
+        atomic_path(path) as part,
+    ):
         WRITERS[writer](part)
-    assert (caught.value.errno, caught.value.filename) == (errno.EFBIG, str(path))
+    assert (caught.value.errno, caught.value.filename) == (
+        errno.EFBIG,
+        str(path),
+    )
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EIO])
 def test_a_refusal_without_a_name_gets_that_of_the_file(number, tmp_path):
+    def fail_half_way(part: Path) -> None:
+        part.write_bytes(b"half")
+        raise OSError(number, os.strerror(number))
+
     with (
         pytest.raises(OSError, match=os.strerror(number)) as caught,
         atomic_path(tmp_path / "a") as part,
-    ):  # noqa: PT012
-        part.write_bytes(b"half")
-        raise OSError(number, os.strerror(number))
-    assert (caught.value.errno, caught.value.filename) == (number, str(tmp_path / "a"))
+    ):
+        fail_half_way(part)
+    assert (caught.value.errno, caught.value.filename) == (
+        number,
+        str(tmp_path / "a"),
+    )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -126,7 +153,10 @@ def test_an_error_about_something_else_is_passed_on_as_it_is(tmp_path):
         (ZeroDivisionError, lambda: 1 / 0),
         (FileNotFoundError, (tmp_path / "other").read_bytes),
     ):
-        with pytest.raises(error) as caught, atomic_path(tmp_path / "a"):
+        with (
+            pytest.raises(error) as caught,
+            atomic_path(tmp_path / "a"),
+        ):
             fail()
         assert getattr(caught.value, "filename", None) != str(tmp_path / "a")
     assert list(tmp_path.iterdir()) == []
@@ -141,7 +171,10 @@ def test_a_folder_that_is_a_file_is_refused(tmp_path):
 
 def test_what_is_no_file_is_not_replaced(tmp_path):
     (tmp_path / "folder").mkdir()
-    with pytest.raises(UserError, match="folder: a folder, where a file was to be written"):
+    with pytest.raises(
+        UserError,
+        match="folder: a folder, where a file was to be written",
+    ):
         write_bytes(tmp_path / "folder", b"new")
     if sys.platform != "win32":
         os.mkfifo(tmp_path / "pipe")
@@ -151,7 +184,8 @@ def test_what_is_no_file_is_not_replaced(tmp_path):
 
 
 @pytest.mark.skipif(
-    not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the administrator may write anywhere"
+    not hasattr(os, "geteuid") or os.geteuid() == 0,
+    reason="the administrator may write anywhere",
 )
 def test_a_folder_without_the_right_to_write_is_refused(tmp_path):
     tmp_path.chmod(0o555)
@@ -198,14 +232,26 @@ FILES: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
         lambda path: save_weights(path, "agent", {"a": torch.arange(4.0)}, {"name": "x"}),
         lambda path: load_weights(path, "agent"),
     ),
-    "shipped_agent.safetensors": (copied(CHECKPOINTS / "agent_idm.safetensors"), read_agent),
-    "generator.safetensors": (copied(CHECKPOINTS / "generator_paper.safetensors"), load_generator),
-    "reference.json": (lambda path: Reference.load(SHIPPED_REFERENCE).save(path), Reference.load),
+    "shipped_agent.safetensors": (
+        copied(CHECKPOINTS / "agent_idm.safetensors"),
+        read_agent,
+    ),
+    "generator.safetensors": (
+        copied(CHECKPOINTS / "generator_paper.safetensors"),
+        load_generator,
+    ),
+    "reference.json": (
+        lambda path: Reference.load(SHIPPED_REFERENCE).save(path),
+        Reference.load,
+    ),
     "fit.pt": (
         lambda path: FitLoop(SmallFit(), path).run(),
         lambda path: FitLoop(SmallFit(), path),
     ),
-    "scenes.parquet": (lambda path: write_prepared(synthetic_frame(), path), read_scenes),
+    "scenes.parquet": (
+        lambda path: write_prepared(synthetic_frame(), path),
+        read_scenes,
+    ),
 }
 
 
@@ -240,7 +286,9 @@ def test_any_flipped_byte_is_refused_in_one_sentence(name, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "seal", [lambda text: sealed(text + PLACE.encode() + text), sealed_archive], ids=["in", "at"]
+    "seal",
+    [lambda text: sealed(text + PLACE.encode() + text), sealed_archive],
+    ids=["in", "at"],
 )
 def test_no_bit_of_a_content_can_change(seal):
     content = seal(b"some content of a file, and two bytes\0\0")
@@ -253,8 +301,15 @@ def test_no_bit_of_a_content_can_change(seal):
 
 def test_a_file_that_lost_its_checksum_is_refused(tmp_path):
     path = tmp_path / "agent.safetensors"
-    save_file({"a": torch.ones(2)}, path, metadata={"ganlane": '{"kind": "agent"}'})
-    with pytest.raises(UserError, match="the checksum that was written with it is missing"):
+    save_file(
+        {"a": torch.ones(2)},
+        path,
+        metadata={"ganlane": '{"kind": "agent"}'},
+    )
+    with pytest.raises(
+        UserError,
+        match="the checksum that was written with it is missing",
+    ):
         load_weights(path, "agent")
 
 
@@ -278,10 +333,17 @@ def test_tables_of_other_programs_need_none(tmp_path, capsys):
 def test_weights_that_are_not_finite_are_refused(kind, value, tmp_path):
     path = tmp_path / "w.safetensors"
     save_weights(
-        path, kind, {"fine": torch.ones(3), "layer.weight": torch.tensor([0.0, value])}, {}
+        path,
+        kind,
+        {
+            "fine": torch.ones(3),
+            "layer.weight": torch.tensor([0.0, value]),
+        },
+        {},
     )
     with pytest.raises(
-        UserError, match=r"w\.safetensors: layer\.weight holds numbers that are not finite"
+        UserError,
+        match=r"w\.safetensors: layer\.weight holds numbers that are not finite",
     ):
         load_weights(path, kind)
 

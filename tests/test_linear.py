@@ -8,10 +8,17 @@ import ganlane.linear
 from ganlane.linear import linear, matrix_product
 
 
-@pytest.mark.parametrize(("rows", "inputs", "outputs"), [(1, 1, 1), (7, 29, 13), (256, 64, 51)])
+@pytest.mark.parametrize(
+    ("rows", "inputs", "outputs"),
+    [(1, 1, 1), (7, 29, 13), (256, 64, 51)],
+)
 def test_values_and_gradients_are_those_of_torch(rows, inputs, outputs):
     torch.manual_seed(0)
-    tensors = [torch.randn(rows, inputs), torch.randn(outputs, inputs), torch.randn(outputs)]
+    tensors = [
+        torch.randn(rows, inputs),
+        torch.randn(outputs, inputs),
+        torch.randn(outputs),
+    ]
     tensors = [tensor.requires_grad_() for tensor in tensors]
     gradient = torch.randn(rows, outputs)
     results = []
@@ -24,17 +31,26 @@ def test_values_and_gradients_are_those_of_torch(rows, inputs, outputs):
 @pytest.mark.parametrize("gradients", [True, False])
 def test_the_relu_is_that_of_torch(gradients):
     torch.manual_seed(0)
-    x, weight, bias = torch.randn(20, 8), torch.randn(6, 8), torch.randn(6)
+    x = torch.randn(20, 8)
+    weight = torch.randn(6, 8)
+    bias = torch.randn(6)
     with torch.set_grad_enabled(gradients):
         output = linear(x, weight, bias, relu=True)
     torch.testing.assert_close(
-        output, functional.linear(x, weight, bias).relu(), atol=1e-5, rtol=1e-5
+        output,
+        functional.linear(x, weight, bias).relu(),
+        atol=1e-5,
+        rtol=1e-5,
     )
 
 
-def test_other_types_shapes_and_builds_take_the_ordinary_way(monkeypatch):
+def test_other_types_shapes_and_builds_take_the_ordinary_way(
+    monkeypatch,
+):
     torch.manual_seed(0)
-    x, weight, bias = torch.randn(2, 3, 4), torch.randn(5, 4), torch.randn(5)
+    x = torch.randn(2, 3, 4)
+    weight = torch.randn(5, 4)
+    bias = torch.randn(5)
     assert torch.equal(linear(x, weight, bias), functional.linear(x, weight, bias))
     doubles = x[0].double(), weight.double(), bias.double()
     assert torch.equal(linear(*doubles), functional.linear(*doubles))

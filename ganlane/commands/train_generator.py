@@ -13,7 +13,11 @@ from typing import Any
 from tqdm import tqdm
 
 from ganlane import generator
-from ganlane.data import byte_progress, read_recordings, recordings_path
+from ganlane.data import (
+    byte_progress,
+    read_recordings,
+    recordings_path,
+)
 from ganlane.evaluation import code_version, write_results
 from ganlane.evaluation.table import aligned, show
 from ganlane.generator import FitResult, Progress
@@ -40,7 +44,12 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     set_threads(config.threads)
     source = recordings_path(config.data)
     with byte_progress("read") as read:
-        frame = read_recordings(config.data.format, source, config.data.parameters(), read)
+        frame = read_recordings(
+            config.data.format,
+            source,
+            config.data.parameters(),
+            read,
+        )
     fit_config: Any = replace(config.generator, seed=config.seed)
     scenes = generator.scene_tracks(frame)
     held_out = config.data.held_out_scenes([scene.name for scene in scenes], generator.HELD_OUT)
@@ -59,14 +68,29 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
             further["ablations"] = rows
         if config.folds:
             further["folds"], results = generator.cross_validate(
-                fit_config, frame, config.folds, states, progress, str(source)
+                fit_config,
+                frame,
+                config.folds,
+                states,
+                progress,
+                str(source),
             )
             # A realism card by folds drives every scene by the generator that never saw it.
             for number, fold in enumerate(results, start=1):
                 path = weights.with_stem(f"{weights.stem}_fold_{number}")
                 fold.save(path, code=code_version())
-            show(fold_tables(further["folds"]), columns=config.columns)
-        result = generator.fit_generator(fit_config, frame, held_out, states, progress, str(source))
+            show(
+                fold_tables(further["folds"]),
+                columns=config.columns,
+            )
+        result = generator.fit_generator(
+            fit_config,
+            frame,
+            held_out,
+            states,
+            progress,
+            str(source),
+        )
 
     show(metrics_table(result.metrics), columns=config.columns)
     result.save(weights, further.get("folds"), code_version())
@@ -92,7 +116,8 @@ class FitProgress(AbstractContextManager["FitProgress"]):
         """Called by the fit after every update."""
         if progress.name != self._name:
             self._start(progress)
-        update, updates = progress.update, progress.updates
+        update = progress.update
+        updates = progress.updates
         scores = ""
         if progress.score is not None:
             scores = f"validation score {progress.score:.4f}, best {progress.best:.4f}"
@@ -103,15 +128,28 @@ class FitProgress(AbstractContextManager["FitProgress"]):
             self._best = progress.best
             # Early stopping may end the fit sooner.
             left_s = progress.seconds / update * (updates - update)
-            parts = [f"{update} of {updates} updates", f"at most {left_s:.0f} s left", scores]
-            print(", ".join(filter(None, parts)), file=sys.stderr, flush=True)
+            parts = [
+                f"{update} of {updates} updates",
+                f"at most {left_s:.0f} s left",
+                scores,
+            ]
+            print(
+                ", ".join(filter(None, parts)),
+                file=sys.stderr,
+                flush=True,
+            )
 
     def _start(self, progress: Progress) -> None:
         """The first update of another fit."""
         self.__exit__()
-        self._name, self._best = progress.name, math.inf
+        self._name = progress.name
+        self._best = math.inf
         if sys.stderr.isatty():
-            self._bar = tqdm(total=progress.updates, desc=progress.name, unit="update")
+            self._bar = tqdm(
+                total=progress.updates,
+                desc=progress.name,
+                unit="update",
+            )
         else:
             print(progress.name, file=sys.stderr, flush=True)
 
@@ -156,11 +194,19 @@ def _percent(change: float) -> str:
     return f"{change:+.1f} %"
 
 
-def metrics_table(metrics: Mapping[str, Mapping[str, float]]) -> str:
+def metrics_table(
+    metrics: Mapping[str, Mapping[str, float]],
+) -> str:
     """ADE and FDE of the generator and of constant velocity on the held-out scenes, as text."""
     overall = _by_kind(metrics["all"])
     errors = [error for error in _ERRORS if error in overall]
-    lines = [["held-out scenes", *(error.replace("_m", ", m") for error in errors), "ADE to CV"]]
+    lines = [
+        [
+            "held-out scenes",
+            *(error.replace("_m", ", m") for error in errors),
+            "ADE to CV",
+        ]
+    ]
     for kind, ade in overall["ade_m"].items():
         cells = [f"{overall[error].get(kind, math.nan):.3f}" for error in errors]
         change = 100.0 * (ade / overall["ade_m"][BASELINE] - 1.0)
@@ -179,7 +225,10 @@ def ablation_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
     lines = [["ADE to CV, a quarter of the updates", *kinds, *early]]
     for name, row in rows.items():
         line = [name]
-        for change in (row["ade_change_percent"], row["ade_change_percent_0.4_s"]):
+        for change in (
+            row["ade_change_percent"],
+            row["ade_change_percent_0.4_s"],
+        ):
             line += [_percent(change[kind]) for kind in kinds]
         lines.append(line)
     # Only the calibrated preset is rolled out that far.
@@ -206,10 +255,24 @@ def fold_tables(folds: Mapping[str, Any]) -> str:
 
 def _pooled(scores: Mapping[str, Any]) -> Lines:
     """ADE and FDE of all forecasts over the windows of all folds."""
-    lines = [[f"{scores['windows']} windows of all folds", "ADE, m", "FDE, m", "ADE to CV"]]
+    lines = [
+        [
+            f"{scores['windows']} windows of all folds",
+            "ADE, m",
+            "FDE, m",
+            "ADE to CV",
+        ]
+    ]
     for kind, ade in scores["ade_m"].items():
         change = _percent(scores["ade_change_percent"][kind])
-        lines.append([kind, f"{ade:.3f}", f"{scores['fde_m'][kind]:.3f}", change])
+        lines.append(
+            [
+                kind,
+                f"{ade:.3f}",
+                f"{scores['fde_m'][kind]:.3f}",
+                change,
+            ]
+        )
     return lines
 
 
@@ -220,28 +283,60 @@ def _parts(title: str, parts: Mapping[str, Any]) -> Lines:
     lines = [[title, "windows", "CV, m", *kinds]]
     for name, part in parts.items():
         changes = [_percent(part["ade_change_percent"][kind]) for kind in kinds]
-        lines.append([name, str(part["windows"]), f"{part['ade_m'][BASELINE]:.3f}", *changes])
+        lines.append(
+            [
+                name,
+                str(part["windows"]),
+                f"{part['ade_m'][BASELINE]:.3f}",
+                *changes,
+            ]
+        )
     return lines
 
 
 def _direction(later: Mapping[str, Any], whole: Mapping[str, Any]) -> Lines:
     """Share of lateral moves of more than 0.1 m whose side is predicted correctly."""
     lines = [
-        ["lateral move to the right side", "after present", "whole window"],
-        ["windows that move", str(later["windows"]), str(whole["windows"])],
+        [
+            "lateral move to the right side",
+            "after present",
+            "whole window",
+        ],
+        [
+            "windows that move",
+            str(later["windows"]),
+            str(whole["windows"]),
+        ],
     ]
     for kind, share in later["share_right"].items():
         shares = (share, whole["share_right"].get(kind))
-        lines.append([kind, *("" if value is None else f"{100 * value:.1f} %" for value in shares)])
+        lines.append(
+            [
+                kind,
+                *("" if value is None else f"{100 * value:.1f} %" for value in shares),
+            ]
+        )
     return lines
 
 
 def _rollout(rollout: Mapping[str, Any]) -> Lines:
     """RMSE after 1 to 5 s, with published values."""
     rmse = rollout["rmse_m"]
-    lines = [[f"RMSE, m ({rollout['windows']} windows)", *rmse[BASELINE], "to CV"]]
+    lines = [
+        [
+            f"RMSE, m ({rollout['windows']} windows)",
+            *rmse[BASELINE],
+            "to CV",
+        ]
+    ]
     for kind, ratio in rollout["ratio_to_constant_velocity"].items():
-        lines.append([kind, *_two_digits(rmse[kind].values()), f"{ratio:.2f}"])
+        lines.append(
+            [
+                kind,
+                *_two_digits(rmse[kind].values()),
+                f"{ratio:.2f}",
+            ]
+        )
     for kind, published in _PUBLISHED_RMSE_M.items():
         ratio = published[-1] / _PUBLISHED_VELOCITY_M[-1]
         lines.append([kind, *_two_digits(published), f"{ratio:.2f}"])

@@ -14,7 +14,7 @@ import shutil
 import signal
 import socket
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -33,11 +33,12 @@ from ganlane.config.compose import (
     called,
     composed,
     for_hydra,
+    key_of,
     parsed,
     resumed,
 )
 from ganlane.config.help import help_text
-from ganlane.errors import USER_ERROR, UserError, numbered_refusals
+from ganlane.errors import USER_ERROR, UserError, as_typed, numbered_refusals
 from ganlane.files import conf_folder, remove_leftovers, write_bytes
 from ganlane.runtime import (
     check_process,
@@ -94,10 +95,8 @@ EARNED = (
 OUTPUTS = Path("outputs")
 #: Folders of a run that it writes to itself; others below it may be runs of their own.
 _OWN_FOLDERS = (".", "checkpoints", "pretrain", "pretrain/checkpoints", "fits")
-#: Keys that name code to execute: import paths, and the address of a Ray cluster, which sends
-#: pickles.
+#: Import paths below these are trusted wherever they stand.
 _OWN_PACKAGES = ("ganlane.", "ganlane_simulators.")
-_IMPORTING_KEYS = ("_target_", "name", "shares", "agents", "address")
 
 
 class Stopped(BaseException):
@@ -197,9 +196,10 @@ def _settings_and_folder(command: str, overrides: list[Override]) -> tuple[Any, 
     if resume is not None and resume.value() not in (None, ""):
         folder = _resumed_folder(str(resume.value()))
         if folder is not None:
-            saved = saved_config(folder / CONFIG)
-            _refuse_stored_imports(saved, [str(word.input_line) for word in rest], str(folder))
-            return make(TrainConfig, {**resumed(saved, rest), "resume": str(folder)}), folder
+            data = resumed(saved_config(folder / CONFIG), rest)
+            config: Any = make(TrainConfig, {**data, "resume": str(folder)})
+            refuse_stored_imports(config, [key_of(word) for word in rest])
+            return config, folder
     config = make(COMMANDS[command][0], composed(command, rest))
     where = values.get("hydra.run.dir")
     return config, new_folder(command) if where is None else Path(str(where.value()))
@@ -225,7 +225,9 @@ def call_settings(command: str, keys: Mapping[str, Any]) -> Any:
     aliases = ALIASES.get(command, {})
     keys = with_env_keys(kind, {aliases.get(name, name): keys[name] for name in keys})
     if command == "train" and keys.get("resume") is not None:
-        return make(kind, merged(saved_config(Path(keys["resume"]) / CONFIG), keys))
+        config: Any = make(kind, merged(saved_config(Path(keys["resume"]) / CONFIG), keys))
+        refuse_stored_imports(config, list(_whole_keys(keys)))
+        return config
     return make(kind, called(command, keys))
 
 
@@ -473,41 +475,56 @@ def newest_unfinished(runs: Path) -> Path | None:
     return None
 
 
-def _refuse_stored_imports(data: Mapping[str, Any], words: Sequence[str], run: str) -> None:
-    """Refuse code from outside the package that a run's file names, unless a word names it too.
+def refuse_stored_imports(config: TrainConfig, named: Collection[str]) -> None:
+    """Refuse code from outside the package that a run's file names, unless the user names it too.
+
+    ``named`` are the whole keys that stand on the command line or in the call.
 
     Raises:
-        UserError: the file names a class or function of another package, or a Ray cluster.
+        UserError: the file names a class or function of another package.
     """
-    # Naming the code on the command line is the user's word that it may run.
-    for key, value in _imports(data, ""):
-        if not any(value in word for word in words if "=" in word):
+    # Naming the code is the user's word that it may run.
+    for key, value, path in _imports(config):
+        # traffic=my.module.MyTraffic names all keys below it
+        is_asked = any(f"{key}.".startswith(f"{name}.") for name in named)
+        if not is_asked and not path.startswith(_OWN_PACKAGES):
             raise UserError(
-                f"resume={run}: the run's file names {value}, and code from there would be "
-                f"executed; if you trust it, add {key}={value} to the command line."
+                f"resume={config.resume}: the run's file names {path}, and code from there would "
+                f"be executed; if you trust it, add {key}={value} to the command line."
             )
 
 
-def _imports(data: Mapping[str, Any], above: str) -> Iterator[tuple[str, str]]:
-    """Every import path outside the package that ``data`` name, with its key."""
-    for name, value in data.items():
-        key = f"{above}{name}"
-        if isinstance(value, Mapping):
-            names = list(value) if name == "shares" else []
-            yield from _imports(value, f"{key}.")
-        else:
-            names = value if isinstance(value, list) else [value]
-        if name not in _IMPORTING_KEYS:
+def _imports(config: TrainConfig) -> Iterator[tuple[str, str, str]]:
+    """Every import path of a run, after the key that names it and the value of that key."""
+    traffics = {
+        "pretrain.traffic": config.pretrain.traffic,
+        "traffic": config.traffic,
+        "evaluation.traffic": config.evaluation.traffic,
+    }
+    for key, traffic in traffics.items():
+        if traffic is None:
             continue
-        for text in names:
-            path = str(text).partition("+")[0]
-            is_own = path.startswith(("ganlane.", "ganlane_simulators.")) or path.endswith(
-                ".safetensors"
-            )
-            if name == "address" and text not in (None, "auto"):
-                yield key, str(text)
-            elif is_import_path(path) and not is_own and not Path(path).is_file():
-                yield key, path
+        yield f"{key}._target_", traffic._target_, traffic._target_
+        for name, part in traffic.parts().items():
+            if name in getattr(traffic, "options", {}):
+                yield f"{key}.options.{name}._target_", part._target_, part._target_
+            else:
+                yield f"{key}.shares", f"{{{name}: ...}}", part._target_
+    agents = config.evaluation.agents
+    for name in agents:
+        path = name.partition("+")[0]
+        # weights, which execute nothing, may have a name of this form
+        if is_import_path(path) and not path.endswith(".safetensors") and not Path(path).is_file():
+            yield "evaluation.agents", as_typed(agents), path
+
+
+def _whole_keys(data: Mapping[str, Any], above: str = "") -> Iterator[str]:
+    """The keys of a call, down to the values; an option by its ``name`` is one value."""
+    for name, value in data.items():
+        if isinstance(value, Mapping) and "name" not in value:
+            yield from _whole_keys(value, f"{above}{name}.")
+        else:
+            yield f"{above}{name}"
 
 
 @contextmanager

@@ -12,8 +12,17 @@ Read in this order:
   ablations.
 """
 
-from ganlane.generator.checkpoint import FitResult, Preset, load_generator, shipped_generator
-from ganlane.generator.closed_loop import ANCHOR, AnchorParameters, headway_quantiles
+from ganlane.generator.checkpoint import (
+    FitResult,
+    Preset,
+    load_generator,
+    shipped_generator,
+)
+from ganlane.generator.closed_loop import (
+    ANCHOR,
+    AnchorParameters,
+    headway_quantiles,
+)
 from ganlane.generator.fit import (
     HELD_OUT,
     ablate,

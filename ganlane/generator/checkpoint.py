@@ -13,7 +13,12 @@ from ganlane._version import __version__
 from ganlane.errors import ParameterError, UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator.networks import Generator
-from ganlane.settings.generator import EXTRA_INPUTS, FitConfig, GeneratorSizes, Preset
+from ganlane.settings.generator import (
+    EXTRA_INPUTS,
+    FitConfig,
+    GeneratorSizes,
+    Preset,
+)
 from ganlane.weights import load_weights, save_weights
 
 KIND = "generator"
@@ -56,7 +61,10 @@ class FitResult:
         ``folds`` are the scores of :func:`ganlane.generator.cross_validate`, if it was called;
         ``code`` the code's version in more detail than the package's number.
         """
-        fit = {"updates": self.updates, "seconds": round(self.seconds, 1)}
+        fit = {
+            "updates": self.updates,
+            "seconds": round(self.seconds, 1),
+        }
         metadata = {
             "preset": self.config.preset,
             "sizes": asdict(self.module.sizes),
@@ -124,7 +132,12 @@ def _sized_generator(path: str | Path, sizes: Any) -> Generator:
         # A file that is read must not change the caller's random numbers.
         with torch.random.fork_rng(devices=[]):
             return Generator(GeneratorSizes(**sizes))
-    except (TypeError, ValueError, RuntimeError, ParameterError) as error:
+    except (
+        TypeError,
+        ValueError,
+        RuntimeError,
+        ParameterError,
+    ) as error:
         raise UserError(
             f"{path}: sizes {sizes} are not those of a generator ({sorted(types)}); fit it again."
         ) from error

@@ -33,11 +33,24 @@ from torch import Tensor
 
 from ganlane.data import DrivingStatistics
 from ganlane.generator.networks import Generator, Observation
-from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT, Segments
+from ganlane.generator.windows import (
+    OBSERVED_POSITIONS,
+    PRESENT,
+    Segments,
+)
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.generator import CalibratedConfig
-from ganlane.sim.idm import TABLE_V, IdmParameters, following_acceleration
-from ganlane.sim.neighbours import FREE_GAP_M, Scene, leader, perceive
+from ganlane.sim.idm import (
+    TABLE_V,
+    IdmParameters,
+    following_acceleration,
+)
+from ganlane.sim.neighbours import (
+    FREE_GAP_M,
+    Scene,
+    leader,
+    perceive,
+)
 from ganlane.sim.state import ENTRY_M, Road, Vehicles, Visibility
 
 #: Tangent of the largest heading.
@@ -80,7 +93,10 @@ def start(generator: Generator, displacement: Tensor) -> History:
     one = generator.encoder.project(displacement, torch.zeros_like(displacement))
     # Equal, but separate tensors: a compiled graph assumes that inputs which share memory always
     # do.
-    return History(tuple(one.clone() for _ in range(generator.sizes.observed - 1)), displacement)
+    return History(
+        tuple(one.clone() for _ in range(generator.sizes.observed - 1)),
+        displacement,
+    )
 
 
 def recorded(generator: Generator, displacements: Tensor) -> History:
@@ -100,11 +116,21 @@ def push(generator: Generator, history: History, displacement: Tensor) -> tuple[
     return History((*history.motions[1:], new), displacement), difference
 
 
-def observe(history: History, difference: Tensor, vehicles: Vehicles, extra: Tensor) -> Observation:
+def observe(
+    history: History,
+    difference: Tensor,
+    vehicles: Vehicles,
+    extra: Tensor,
+) -> Observation:
     """The generator's input after :func:`push`."""
     position = torch.stack([vehicles.x, vehicles.y], dim=-1)
     return Observation(
-        history.motions, history.displacement, difference, position, vehicles.valid, extra
+        history.motions,
+        history.displacement,
+        difference,
+        position,
+        vehicles.valid,
+        extra,
     )
 
 
@@ -185,7 +211,11 @@ def paper_step(
         left = torch.where(finished, steps, plan.left) - 1
         plan = Plan(torch.roll(predicted, -1, dims=-2), left)
     velocity = predicted[..., 0, :] / PHYSICS_STEP_S
-    return moved_by(vehicles, velocity[..., 0], velocity[..., 1]), history, plan
+    return (
+        moved_by(vehicles, velocity[..., 0], velocity[..., 1]),
+        history,
+        plan,
+    )
 
 
 @dataclass(frozen=True)
@@ -245,7 +275,11 @@ def extra_inputs(scene: Scene, anchor: Tensor, offset: Tensor) -> Tensor:
 
 
 def inside_lane(
-    residual: Tensor, offset: Tensor, velocity: Tensor, room: Tensor, damping: float
+    residual: Tensor,
+    offset: Tensor,
+    velocity: Tensor,
+    room: Tensor,
+    damping: float,
 ) -> Tensor:
     """Lateral ``residual`` [N, M] in m/s2 without what would move the body out of its lane.
 
@@ -298,7 +332,13 @@ def anchored_step(
     mean = memory.mean + (PHYSICS_STEP_S / p.washout_s) * (residual - memory.mean)
     residual = residual - mean
     room = 0.5 * (road.lane_width_m - vehicles.width) - _MARGIN_M
-    residual_y = inside_lane(residual[..., 1], offset, velocity[..., 1], room, p.lane_damping)
+    residual_y = inside_lane(
+        residual[..., 1],
+        offset,
+        velocity[..., 1],
+        room,
+        p.lane_damping,
+    )
 
     velocity_x = velocity[..., 0] + (anchor_x + residual[..., 0]) * PHYSICS_STEP_S
     velocity_y = velocity[..., 1] + (anchor_y + residual_y) * PHYSICS_STEP_S
@@ -312,7 +352,8 @@ def recorded_vehicles(segments: Segments, frame: int, desired_speed: Tensor) -> 
     a small width: recorded lanes are narrow and straightened to some decimetres, so by its body one
     vehicle in ten would occupy two lanes and make others brake.
     """
-    position, target = segments.positions[:, frame], segments.target_lane[:, frame]
+    position = segments.positions[:, frame]
+    target = segments.target_lane[:, frame]
     velocity = (position - segments.positions[:, frame - 1]) / PHYSICS_STEP_S
     x, y = position.unbind(-1)
     return Vehicles(
@@ -331,7 +372,9 @@ def recorded_vehicles(segments: Segments, frame: int, desired_speed: Tensor) -> 
 
 
 def driven_positions(
-    segments: Segments, desired_speed: Tensor, move: Callable[[Vehicles, int], Vehicles]
+    segments: Segments,
+    desired_speed: Tensor,
+    move: Callable[[Vehicles, int], Vehicles],
 ) -> Tensor:
     """Positions [B, H, V, 2] in m when ``move`` drives all vehicles of the segments jointly.
 
@@ -367,7 +410,11 @@ def rollout(
     V] each; ``noise`` [1 + H, K, B, V, Z] the latent vectors at the start, then the numbers that
     change them (:func:`wander`).
     """
-    parameters = replace(ANCHOR, washout_s=config.washout_s, further_inputs=config.further_inputs)
+    parameters = replace(
+        ANCHOR,
+        washout_s=config.washout_s,
+        further_inputs=config.further_inputs,
+    )
     # The samples are further rows of the batch.
     samples = noise.shape[1]
     segments = segments.repeated(samples)
@@ -389,7 +436,9 @@ def rollout(
     return driven_positions(segments, desired_speed, move).unflatten(0, (samples, -1))
 
 
-def headway_quantiles(statistics: Mapping[str, Any]) -> tuple[float, ...]:
+def headway_quantiles(
+    statistics: Mapping[str, Any],
+) -> tuple[float, ...]:
     """The 5, 25, 50, 75 and 95 % headways in s from a checkpoint's ``driving_statistics``."""
     headway = DrivingStatistics.from_dict(statistics).headway
     return tuple(headway.quantile(level) for level in QUANTILE_LEVELS)
@@ -400,9 +449,11 @@ def headway_from_uniform(u: Tensor, quantiles_s: tuple[float, ...] = HEADWAY_QUA
 
     Linear between the quantiles, flat beyond the outer ones.
     """
-    values, levels = u.new_tensor(quantiles_s), u.new_tensor(QUANTILE_LEVELS)
+    values = u.new_tensor(quantiles_s)
+    levels = u.new_tensor(QUANTILE_LEVELS)
     upper = torch.searchsorted(levels, u.contiguous()).clamp(1, len(QUANTILE_LEVELS) - 1)
-    low, high = levels[upper - 1], levels[upper]
+    low = levels[upper - 1]
+    high = levels[upper]
     part = ((u - low) / (high - low)).clamp(0.0, 1.0)
     return values[upper - 1] + part * (values[upper] - values[upper - 1])
 
@@ -413,7 +464,10 @@ def balanced_headway(vehicles: Vehicles, road: Road, otherwise: Tensor) -> Tenso
     It follows from gap, speed and desired speed. For vehicles without a leader, or further behind
     it than the largest quantile, it is unknown: ``otherwise``.
     """
-    ahead = leader(perceive(vehicles, road), vehicles.target_lane.to(vehicles.x.dtype))
+    ahead = leader(
+        perceive(vehicles, road),
+        vehicles.target_lane.to(vehicles.x.dtype),
+    )
     # IDM's equation for an acceleration of 0 at the leader's speed, solved for the headway.
     ratio = vehicles.speed / vehicles.desired_speed
     settled = ahead.gap * torch.sqrt((1.0 - ratio * ratio * ratio * ratio).clamp_min(0.0))
@@ -423,7 +477,9 @@ def balanced_headway(vehicles: Vehicles, road: Road, otherwise: Tensor) -> Tenso
 
 
 def driver_params(
-    segments: Segments, traits: bool = True, random: torch.Generator | None = None
+    segments: Segments,
+    traits: bool = True,
+    random: torch.Generator | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Headways in s and desired speeds in m/s of the drivers, [B, V] each.
 
@@ -440,7 +496,10 @@ def driver_params(
     now = recorded_vehicles(segments, PRESENT, torch.ones_like(segments.length))
     if random is None:
         scatter = torch.ones_like(segments.length)
-        otherwise = torch.full_like(scatter, HEADWAY_QUANTILES_S[len(HEADWAY_QUANTILES_S) // 2])
+        otherwise = torch.full_like(
+            scatter,
+            HEADWAY_QUANTILES_S[len(HEADWAY_QUANTILES_S) // 2],
+        )
         desired = now.speed + 0.5 * (low + high)
     else:
         excess, level = torch.rand(2, *shape, generator=random)

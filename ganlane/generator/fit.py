@@ -33,7 +33,13 @@ from ganlane.generator.forecasts import (
     open_loop_scores,
     paper_forecasts,
 )
-from ganlane.generator.tasks import CalibratedTask, Config, FitLoop, OnProgress, PaperTask
+from ganlane.generator.tasks import (
+    CalibratedTask,
+    Config,
+    FitLoop,
+    OnProgress,
+    PaperTask,
+)
 from ganlane.generator.windows import (
     OBSERVED_POSITIONS,
     SceneTracks,
@@ -141,9 +147,17 @@ def _validation_names(scenes: list[SceneTracks]) -> set[str]:
 
 def fit_key(config: Config, split: Split) -> str:
     """Hash of all that a fit depends on: its settings, and the recordings of each part."""
-    settings = {"preset": config.preset, "config": asdict(config), **split.names}
+    settings = {
+        "preset": config.preset,
+        "config": asdict(config),
+        **split.names,
+    }
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
-    for scene in (*split.fitted, *split.validation, *split.held_out):
+    for scene in (
+        *split.fitted,
+        *split.validation,
+        *split.held_out,
+    ):
         # What is cut from a scene follows from its positions and lanes.
         for array in (scene.positions, scene.lane):
             digest.update(f"{array.dtype.str}{array.shape}".encode())
@@ -161,9 +175,17 @@ def run_fit(
     """Fit to ``split`` until it stops improving; the state in ``folder`` is resumed from."""
     path = None if folder is None else folder / f"{config.preset}_{fit_key(config, split)}.pt"
     if isinstance(config, PaperConfig):
-        loop = FitLoop(PaperTask(split.fitted, split.validation, config), path, name)
+        loop = FitLoop(
+            PaperTask(split.fitted, split.validation, config),
+            path,
+            name,
+        )
     else:
-        loop = FitLoop(CalibratedTask(split.fitted, split.validation, config), path, name)
+        loop = FitLoop(
+            CalibratedTask(split.fitted, split.validation, config),
+            path,
+            name,
+        )
     loop.run(on_progress)
     return loop
 
@@ -196,7 +218,14 @@ def fit_generator(
     """
     split = split_for_fit(scene_tracks(frame), held_out)
     loop = run_fit(config, split, folder, on_progress)
-    return _fit_result(loop, split, frame, source, loop.task.metrics(split.held_out), frame)
+    return _fit_result(
+        loop,
+        split,
+        frame,
+        source,
+        loop.task.metrics(split.held_out),
+        frame,
+    )
 
 
 def _fit_result(
@@ -233,14 +262,24 @@ class HeldOut(NamedTuple):
     forecasts: Forecasts
 
 
-def _held_out(task: PaperTask | CalibratedTask, split: Split, steps: int, stride: int) -> HeldOut:
+def _held_out(
+    task: PaperTask | CalibratedTask,
+    split: Split,
+    steps: int,
+    stride: int,
+) -> HeldOut:
     """Forecasts of the held-out windows by the generator, IDM and all baselines."""
     windows = cut_windows(split.held_out, stride, OBSERVED_POSITIONS + steps)
     if isinstance(task, CalibratedTask):
         # The best of 20 is for short forecasts only.
         samples = 1 if steps == LONG_STEPS else SAMPLES
         forecasts = calibrated_forecasts(
-            task.generator, split.held_out, steps, stride, task.config, samples
+            task.generator,
+            split.held_out,
+            steps,
+            stride,
+            task.config,
+            samples,
         )
     else:
         groups = group_windows(windows, task.config.group_size, task.config.seed)
@@ -303,7 +342,13 @@ def cross_validate(
     short = []
     long = []
     for number, split in enumerate(splits, start=1):
-        loop = run_fit(config, split, folder, on_progress, f"fold {number} of {folds}")
+        loop = run_fit(
+            config,
+            split,
+            folder,
+            on_progress,
+            f"fold {number} of {folds}",
+        )
         others = frame.filter(~pl.col("scene").is_in(split.names["held_out"]))
         results.append(_fit_result(loop, split, frame, source, {}, others))
         short.append(short_forecasts(loop.task, split))
@@ -377,7 +422,10 @@ def ablate(
         task = run_fit(variant, split, folder, on_progress, name).task
         windows, forecasts = short_forecasts(task, split)
         kinds = ("mean", "single", f"best_of_{SAMPLES}", BASELINE)
-        errors = errors_of({kind: forecasts[kind] for kind in kinds}, windows.future)
+        errors = errors_of(
+            {kind: forecasts[kind] for kind in kinds},
+            windows.future,
+        )
         # Predictions of any length can be compared over 0.4 s.
         early = {kind: values[:, :4] for kind, values in errors.items()}
         scores = displacement_errors(errors)

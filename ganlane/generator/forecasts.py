@@ -82,7 +82,10 @@ def scene_metrics(windows: Windows, forecasts: Forecasts) -> Metrics:
     errors = errors_of(forecasts, windows.future)
     everywhere = np.ones(len(windows), dtype=bool)
     metrics: Metrics = {}
-    for name, rows in {"all": everywhere, **windows.by_scene}.items():
+    for name, rows in {
+        "all": everywhere,
+        **windows.by_scene,
+    }.items():
         row = displacement_errors(errors, rows)
         metrics[name] = {"windows": float(row["windows"])}
         for error in ("ade_m", "fde_m"):
@@ -129,7 +132,9 @@ def parts_of(windows: Windows, least: int) -> dict[str, np.ndarray]:
 
 
 def direction_scores(
-    forecasts: Forecasts, recorded: np.ndarray, observed: np.ndarray | float = 0.0
+    forecasts: Forecasts,
+    recorded: np.ndarray,
+    observed: np.ndarray | float = 0.0,
 ) -> Row:
     """Among vehicles that move more than 0.1 m sideways: share predicted to the right side.
 
@@ -158,10 +163,18 @@ def side_classifier_share(windows: Windows, fold: np.ndarray) -> float | None:
     # sideways since each of them; then the lane from both sides, and the length.
     past = windows.past
     moved = past[..., 1][:, ::-1].cumsum(axis=1)
-    others = np.stack([windows.lane, windows.lane_from_left, windows.length], axis=1)
+    others = np.stack(
+        [windows.lane, windows.lane_from_left, windows.length],
+        axis=1,
+    )
     differences = np.diff(past, axis=1)[..., 0]
-    features = np.concatenate([past.reshape(len(past), -1), differences, moved, others], axis=1)
-    features, left, fold = features[moving], lateral[moving] > 0, fold[moving]
+    features = np.concatenate(
+        [past.reshape(len(past), -1), differences, moved, others],
+        axis=1,
+    )
+    features = features[moving]
+    left = lateral[moving] > 0
+    fold = fold[moving]
 
     hits = []
     for number in np.unique(fold):
@@ -173,7 +186,9 @@ def side_classifier_share(windows: Windows, fold: np.ndarray) -> float | None:
     return float(np.concatenate(hits).mean()) if hits else None
 
 
-def rmse_by_second(errors: Forecasts) -> dict[str, dict[str, float]]:
+def rmse_by_second(
+    errors: Forecasts,
+) -> dict[str, dict[str, float]]:
     """Root mean square error in m after each whole second (10 steps), of every forecast."""
     rmse: dict[str, dict[str, float]] = {}
     for name, values in errors.items():
@@ -183,7 +198,10 @@ def rmse_by_second(errors: Forecasts) -> dict[str, dict[str, float]]:
 
 
 def open_loop_scores(
-    windows: Windows, forecasts: Forecasts, fold: np.ndarray, least_part: int = 100
+    windows: Windows,
+    forecasts: Forecasts,
+    fold: np.ndarray,
+    least_part: int = 100,
 ) -> Row:
     """All scores of the forecasts of ``windows``, each of which was held out in its ``fold`` [W].
 
@@ -241,7 +259,11 @@ def by_kind(samples: np.ndarray, recorded: np.ndarray) -> Forecasts:
 
 @torch.no_grad()
 def paper_forecasts(
-    generator: Generator, windows: Windows, groups: Groups, seed: int = 0, samples: int = SAMPLES
+    generator: Generator,
+    windows: Windows,
+    groups: Groups,
+    seed: int = 0,
+    samples: int = SAMPLES,
 ) -> Forecasts:
     """The paper's preset, open loop, on the windows in ``groups``."""
     random = torch.Generator().manual_seed(seed)
@@ -250,7 +272,12 @@ def paper_forecasts(
         chunk = groups.select(rows)
         past = chunk.displacements[..., : generator.sizes.observed, :]
         observation = generator.observe(past, chunk.position, chunk.mask)
-        noise = torch.randn(1 + samples, *chunk.mask.shape, generator.sizes.noise, generator=random)
+        noise = torch.randn(
+            1 + samples,
+            *chunk.mask.shape,
+            generator.sizes.noise,
+            generator=random,
+        )
         # The first sample is the mean prediction.
         noise[0] = 0.0
         predicted = generator(observation, noise).cumsum(dim=-2)
@@ -300,14 +327,24 @@ def calibrated_forecasts(
     random = torch.Generator().manual_seed(0)
 
     def driver(segments: Segments) -> Tensor:
-        shape = (1 + horizon, 1 + samples, *segments.length.shape, generator.sizes.noise)
+        shape = (
+            1 + horizon,
+            1 + samples,
+            *segments.length.shape,
+            generator.sizes.noise,
+        )
         noise = torch.randn(shape, generator=random)
         noise[:, 0] = 0.0
         drivers = driver_params(segments, config.traits)
         return rollout(generator, segments, drivers, noise, config)
 
     forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
-    recorded = driven_windows(lambda segments: segments.future[None], scenes, horizon, stride)[0]
+    recorded = driven_windows(
+        lambda segments: segments.future[None],
+        scenes,
+        horizon,
+        stride,
+    )[0]
     return by_kind(forecasts, recorded)
 
 
@@ -332,8 +369,16 @@ def idm_forecasts(scenes: list[SceneTracks], horizon: int, stride: int) -> Forec
         return driven_positions(segments, desired, move)[None]
 
     return {
-        name: driven_windows(partial(driver, own_headway=balanced), scenes, horizon, stride)[0]
-        for name, balanced in (("idm", False), ("idm_own_headway", True))
+        name: driven_windows(
+            partial(driver, own_headway=balanced),
+            scenes,
+            horizon,
+            stride,
+        )[0]
+        for name, balanced in (
+            ("idm", False),
+            ("idm_own_headway", True),
+        )
     }
 
 
@@ -400,7 +445,9 @@ def energy_score(one: Tensor, other: Tensor, recorded: Tensor) -> Tensor:
 
 @torch.no_grad()
 def rollout_errors(
-    generator: Generator, scenes: list[SceneTracks], config: CalibratedConfig
+    generator: Generator,
+    scenes: list[SceneTracks],
+    config: CalibratedConfig,
 ) -> Metrics:
     """Errors of the calibrated preset's rollouts through scenes, for all and for each scene.
 
@@ -421,7 +468,12 @@ def rollout_errors(
             future = segments.future
             drivers = driver_params(segments, config.traits)
             # Three rollouts at once: the mean prediction, and two samples.
-            shape = (1 + horizon, 2, *segments.length.shape, generator.sizes.noise)
+            shape = (
+                1 + horizon,
+                2,
+                *segments.length.shape,
+                generator.sizes.noise,
+            )
             fresh = torch.randn(shape, generator=random)
             noise = torch.cat([torch.zeros_like(fresh[:, :1]), fresh], dim=1)
             mean, one, other = rollout(generator, segments, drivers, noise, config)

@@ -38,7 +38,12 @@ RANGE_M = 100.0
 _MANY_ROWS = 512
 
 
-def dense(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False) -> Tensor:
+def dense(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    relu: bool = False,
+) -> Tensor:
     """Linear layer [..., O] of ``x`` [..., I], ``weight`` [O, I] and ``bias`` [O].
 
     A ReLU follows if ``relu``.
@@ -64,7 +69,13 @@ def motion_features(displacement: Tensor, difference: Tensor) -> Tensor:
     """
     scaled = displacement / displacement.new_tensor(DISPLACEMENT_SCALE_M)
     change = difference / difference.new_tensor(DIFFERENCE_SCALE_M)
-    return torch.cat([scaled, change.clamp(-LARGEST_DIFFERENCE, LARGEST_DIFFERENCE)], dim=-1)
+    return torch.cat(
+        [
+            scaled,
+            change.clamp(-LARGEST_DIFFERENCE, LARGEST_DIFFERENCE),
+        ],
+        dim=-1,
+    )
 
 
 class MotionLSTM(nn.Module):
@@ -92,7 +103,11 @@ class MotionLSTM(nn.Module):
         """Part of the gates [..., 4H] that depends on this motion alone, so it can be kept."""
         if not self.differences:
             difference = torch.zeros_like(difference)
-        embedded = apply(self.embed, motion_features(displacement, difference), relu=True)
+        embedded = apply(
+            self.embed,
+            motion_features(displacement, difference),
+            relu=True,
+        )
         return apply(self.input, embedded)
 
     def step(self, projected: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
@@ -173,7 +188,11 @@ class PairPooling(nn.Module):
         self.second = nn.Linear(inner, pooled)
 
     def forward(
-        self, hidden: Tensor, position: Tensor, displacement: Tensor, valid: Tensor
+        self,
+        hidden: Tensor,
+        position: Tensor,
+        displacement: Tensor,
+        valid: Tensor,
     ) -> Tensor:
         """Pooled states [B, G, P] of the vehicles.
 
@@ -229,7 +248,12 @@ class Generator(nn.Module):
         super().__init__()
         self.sizes = sizes
         self.encoder = MotionLSTM(sizes.embedding, sizes.hidden, sizes.differences)
-        self.pooling = PairPooling(sizes.hidden, sizes.pooling, sizes.pooled, sizes.neighbours)
+        self.pooling = PairPooling(
+            sizes.hidden,
+            sizes.pooling,
+            sizes.pooled,
+            sizes.neighbours,
+        )
         inputs = sizes.hidden + sizes.pooled + sizes.extra_inputs
         self.context = nn.Sequential(
             nn.Linear(inputs, sizes.context),
@@ -248,9 +272,17 @@ class Generator(nn.Module):
 
     def observe(self, displacements: Tensor, position: Tensor, valid: Tensor) -> Observation:
         """The input from observed displacements [B, G, observed, 2], without further inputs."""
-        last, before = displacements[..., -1, :], displacements[..., -2, :]
+        last = displacements[..., -1, :]
+        before = displacements[..., -2, :]
         extra = last.new_zeros((*last.shape[:-1], 0))
-        return Observation(self.project(displacements), last, last - before, position, valid, extra)
+        return Observation(
+            self.project(displacements),
+            last,
+            last - before,
+            position,
+            valid,
+            extra,
+        )
 
     def summarise(self, now: Observation) -> Tensor:
         """Context [B, G, H - Z] of every vehicle.
@@ -263,7 +295,13 @@ class Generator(nn.Module):
         first, second = (cast(nn.Linear, self.context[layer]) for layer in (0, 2))
         return apply(second, apply(first, inputs, relu=True))
 
-    def decode(self, context: Tensor, noise: Tensor, now: Observation, steps: int) -> Tensor:
+    def decode(
+        self,
+        context: Tensor,
+        noise: Tensor,
+        now: Observation,
+        steps: int,
+    ) -> Tensor:
         """Output [..., steps, 2] of the decoder's first steps, in units of ``DIFFERENCE_SCALE_M``.
 
         ``context`` is [..., H - Z] and ``noise`` [..., Z]; leading dimensions broadcast, so that
@@ -271,7 +309,13 @@ class Generator(nn.Module):
         next step continues.
         """
         leading = torch.broadcast_shapes(context.shape[:-1], noise.shape[:-1])
-        hidden = torch.cat([context.expand(*leading, -1), noise.expand(*leading, -1)], dim=-1)
+        hidden = torch.cat(
+            [
+                context.expand(*leading, -1),
+                noise.expand(*leading, -1),
+            ],
+            dim=-1,
+        )
         cell = torch.zeros_like(hidden)
         scale = hidden.new_tensor(DIFFERENCE_SCALE_M)
         displacement = now.displacement
@@ -286,7 +330,12 @@ class Generator(nn.Module):
             displacement = displacement + difference
         return torch.stack(outputs, dim=-2)
 
-    def forward(self, now: Observation, noise: Tensor, steps: int | None = None) -> Tensor:
+    def forward(
+        self,
+        now: Observation,
+        noise: Tensor,
+        steps: int | None = None,
+    ) -> Tensor:
         """Predicted displacements [..., steps, 2], m per 0.1 s, for ``noise`` [..., B, G, Z].
 
         All by default.
@@ -313,7 +362,11 @@ class Discriminator(nn.Module):
     def __init__(self, embedding: int = 64, hidden: int = 32):
         super().__init__()
         self.encoder = MotionLSTM(embedding, hidden)
-        self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 1))
+        self.head = nn.Sequential(
+            nn.Linear(hidden, hidden),
+            nn.ReLU(),
+            nn.Linear(hidden, 1),
+        )
 
     def forward(self, displacements: Tensor) -> Tensor:
         """Logits [...] that the observed and following displacements [..., T, 2] were recorded."""

@@ -53,7 +53,11 @@ from ganlane.generator.windows import (
     group_windows,
     segment_starts,
 )
-from ganlane.settings.generator import CalibratedConfig, LoopConfig, PaperConfig
+from ganlane.settings.generator import (
+    CalibratedConfig,
+    LoopConfig,
+    PaperConfig,
+)
 
 Config = PaperConfig | CalibratedConfig
 
@@ -106,7 +110,10 @@ class _Task(nn.Module):
         optimiser = self.optimisers[network]
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        nn.utils.clip_grad_norm_(optimiser.param_groups[0]["params"], self.largest_gradient)
+        nn.utils.clip_grad_norm_(
+            optimiser.param_groups[0]["params"],
+            self.largest_gradient,
+        )
         optimiser.step()
         return float(loss.detach())
 
@@ -115,7 +122,10 @@ class PaperTask(_Task):
     """The Social-GAN on windows."""
 
     def __init__(
-        self, fitted: list[SceneTracks], validation: list[SceneTracks], config: PaperConfig
+        self,
+        fitted: list[SceneTracks],
+        validation: list[SceneTracks],
+        config: PaperConfig,
     ):
         super().__init__(config)
         self.config = config
@@ -144,7 +154,10 @@ class PaperTask(_Task):
 
         # The generator: what it predicted, in all samples and for z = 0 (the last).
         observed = config.sizes.observed
-        errors = distances(generated[..., observed:, :], recorded[..., observed:, :]).mean(-1)
+        errors = distances(
+            generated[..., observed:, :],
+            recorded[..., observed:, :],
+        ).mean(-1)
         terms = {
             # Only the best of each vehicle's samples counts.
             "variety": errors[:-1].amin(dim=0).mean(),
@@ -200,21 +213,28 @@ class PaperTask(_Task):
 
         # [B, G, ...] -> [n, ...]: from here on without padding.
         vehicles = observation._replace(
-            displacement=observation.displacement[mask], difference=observation.difference[mask]
+            displacement=observation.displacement[mask],
+            difference=observation.difference[mask],
         )
         shape = (self.config.samples + 1, len(context), sizes.noise)
         noise = torch.randn(shape, generator=self.random)
         noise[-1] = 0.0
         outputs = self.generator.decode(context, noise, vehicles, sizes.predicted)
         future = displacements_of(outputs, vehicles.displacement)
-        return torch.cat([past[mask].expand(len(future), -1, -1, -1), future], dim=-2)
+        return torch.cat(
+            [past[mask].expand(len(future), -1, -1, -1), future],
+            dim=-2,
+        )
 
 
 class CalibratedTask(_Task):
     """The anchored generator on whole scenes."""
 
     def __init__(
-        self, fitted: list[SceneTracks], validation: list[SceneTracks], config: CalibratedConfig
+        self,
+        fitted: list[SceneTracks],
+        validation: list[SceneTracks],
+        config: CalibratedConfig,
     ):
         super().__init__(config)
         self.config = config
@@ -240,7 +260,12 @@ class CalibratedTask(_Task):
         sampled = number % 2 == 1
         samples = 2 if sampled else 1
         steps = 1 + segments.future.shape[1]
-        shape = (steps, samples, *segments.length.shape, config.sizes.noise)
+        shape = (
+            steps,
+            samples,
+            *segments.length.shape,
+            config.sizes.noise,
+        )
         noise = torch.randn(shape, generator=self.random) if sampled else torch.zeros(shape)
         positions = rollout(self.generator, segments, drivers, noise, config)
         if sampled:
@@ -250,7 +275,10 @@ class CalibratedTask(_Task):
             name = "mean"
             losses = distance(positions[0], segments.future)
         # Late steps err most, so each is measured by what constant velocity errs there.
-        loss = masked_mean(losses / self.scale[: losses.shape[1], None], segments.scored)
+        loss = masked_mean(
+            losses / self.scale[: losses.shape[1], None],
+            segments.scored,
+        )
         return {name: self.descend("generator", loss)}
 
     def evaluate(self) -> float:
@@ -312,14 +340,19 @@ class FitLoop:
     """
 
     def __init__(
-        self, task: PaperTask | CalibratedTask, path: Path | None = None, name: str = "fit"
+        self,
+        task: PaperTask | CalibratedTask,
+        path: Path | None = None,
+        name: str = "fit",
     ):
         self.task = task
         self.config = task.config.loop
         self.path = path
         self.name = name
         #: Updates so far, evaluations since the best one, updates until the best one.
-        self.done, self.waited, self.best_update = 0, 0, 0
+        self.done = 0
+        self.waited = 0
+        self.best_update = 0
         self.best = math.inf
         self.seconds = 0.0
         self.best_weights: dict[str, Tensor] = {}
@@ -363,7 +396,9 @@ class FitLoop:
         score = self.task.evaluate()
         self.waited += 1
         if score < self.best:
-            self.best, self.best_update, self.waited = score, self.done, 0
+            self.best = score
+            self.best_update = self.done
+            self.waited = 0
             # A copy, since the next updates change the networks' own tensors.
             self.best_weights = deepcopy(self.task.state_dict())
         if self.path is not None:
@@ -412,7 +447,8 @@ class FitLoop:
                 "give the same preset and sizes or remove it."
             ) from error
         self.done, self.waited, self.best_update = counters
-        self.best, self.seconds = state["best"], state["seconds"]
+        self.best = state["best"]
+        self.seconds = state["seconds"]
         self.best_weights = state["best_weights"]
         self.task.random.set_state(state["random"])
 

@@ -183,7 +183,11 @@ class Segments:
         positions = self.positions.clone()
         last = self.lanes - 1
         positions[..., 1] = (last * self.lane_width)[..., None] - positions[..., 1]
-        return replace(self, positions=positions, target_lane=last[..., None] - self.target_lane)
+        return replace(
+            self,
+            positions=positions,
+            target_lane=last[..., None] - self.target_lane,
+        )
 
     def without_intentions(self) -> Segments:
         """The segments with the present lanes as target lanes, for evaluation.
@@ -193,12 +197,19 @@ class Segments:
         y = self.positions[:, PRESENT : PRESENT + 1, :, 1]
         road = Road(self.lanes[..., None], self.lane_width[..., None])
         lane = road.lane_of(y).long()
-        return replace(self, target_lane=lane.expand_as(self.target_lane).contiguous())
+        return replace(
+            self,
+            target_lane=lane.expand_as(self.target_lane).contiguous(),
+        )
 
 
 def segment_starts(scene: SceneTracks, horizon: int, stride: int = 1) -> list[int]:
     """Rows where a segment of 9 + ``horizon`` frames with at least one driven vehicle starts."""
-    rows = range(0, len(scene.present) - OBSERVED_POSITIONS - horizon + 1, stride)
+    rows = range(
+        0,
+        len(scene.present) - OBSERVED_POSITIONS - horizon + 1,
+        stride,
+    )
     return [row for row in rows if scene.present[row : row + OBSERVED_POSITIONS].all(0).any()]
 
 
@@ -206,7 +217,10 @@ def segment_batches(scene: SceneTracks, horizon: int, stride: int, size: int) ->
     """All segments that start every ``stride`` frames, ``size`` at a time."""
     rows = segment_starts(scene, horizon, stride)
     for first in range(0, len(rows), size):
-        yield cut_segments([(scene, row) for row in rows[first : first + size]], horizon)
+        yield cut_segments(
+            [(scene, row) for row in rows[first : first + size]],
+            horizon,
+        )
 
 
 def cut_segments(cuts: list[tuple[SceneTracks, int]], horizon: int) -> Segments:
@@ -217,14 +231,18 @@ def cut_segments(cuts: list[tuple[SceneTracks, int]], horizon: int) -> Segments:
     frames = OBSERVED_POSITIONS + horizon
     # Who is recorded in any frame of a segment is in it.
     members = [np.flatnonzero(scene.present[row : row + frames].any(0)) for scene, row in cuts]
-    batch, most = len(cuts), max(map(len, members))
+    batch = len(cuts)
+    most = max(map(len, members))
     segments = Segments(
         positions=torch.zeros(batch, frames, most, 2),
         present=torch.zeros(batch, frames, most, dtype=torch.bool),
         target_lane=torch.zeros(batch, frames, most, dtype=torch.int64),
         length=torch.ones(batch, most),
         lanes=torch.tensor([[scene.lanes] for scene, _ in cuts]),
-        lane_width=torch.tensor([[scene.lane_width_m] for scene, _ in cuts], dtype=torch.float32),
+        lane_width=torch.tensor(
+            [[scene.lane_width_m] for scene, _ in cuts],
+            dtype=torch.float32,
+        ),
     )
     for number, ((scene, row), who) in enumerate(zip(cuts, members)):
         at = slice(row, row + frames), who
@@ -300,7 +318,11 @@ def count_windows(scene: SceneTracks) -> int:
     return int(_present_throughout(scene, WINDOW_FRAMES).sum())
 
 
-def cut_windows(scenes: list[SceneTracks], stride: int = 1, frames: int = WINDOW_FRAMES) -> Windows:
+def cut_windows(
+    scenes: list[SceneTracks],
+    stride: int = 1,
+    frames: int = WINDOW_FRAMES,
+) -> Windows:
     """All windows of ``scenes`` that start at every ``stride``-th frame.
 
     A window never spans two scenes.

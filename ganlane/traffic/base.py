@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, TypeAlias, cast
 
 import torch
@@ -42,19 +43,63 @@ def memory_of(tensordict: TensorDictBase, key: str = keys.TRAFFIC) -> TensorDict
     return TensorDict({}, batch_size=tensordict.batch_size) if memory is None else memory
 
 
+def with_rows(
+    whole: TensorDictBase,
+    rows: Tensor,
+    part: Mapping[str, Any],
+    origins: Mapping[Tensor, Tensor] = MappingProxyType({}),
+) -> TensorDict:
+    """``whole`` [N] with its ``rows`` [R] replaced by those of ``part``, leaf by leaf.
+
+    Nothing is written in place. Further rows of ``part`` are padding.
+
+    Args:
+        whole, rows: the batch, and the indices of the rows.
+        part: their new values; what it lacks stays.
+        origins: tensors of the whole batch by the leaves that were taken from them. Where ``part``
+            returns such a leaf, under any name, the tensor is used again instead of a copy.
+    """
+    fields = dict(whole.items())
+    for name, value in part.items():
+        if not isinstance(value, Tensor):
+            # TorchRL drops empty TensorDicts between decisions.
+            if name in fields:
+                fields[name] = with_rows(fields[name], rows, value, origins)
+        elif value in origins:
+            fields[name] = origins[value]
+        else:
+            if len(value) > len(rows):
+                value = value[: len(rows)]
+            fields[name] = fields[name].index_copy(0, rows, value)
+    return new_tensordict(fields, whole.batch_size[0])
+
+
 def key_of(tensordict: TensorDictBase, stream: int) -> Tensor:
     """The episodes' keys [N]: those that the caller has computed, or from seed and episode."""
     key = tensordict.get(keys.EPISODE_KEY, None)
     if key is None:
-        return episode_key(stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
+        return episode_key(
+            stream,
+            tensordict.get(keys.SEED),
+            tensordict.get(keys.EPISODE),
+        )
     return key
 
 
 def uniforms(
-    vehicles: Vehicles, key: Tensor, step: Tensor | int, *purposes: int
+    vehicles: Vehicles,
+    key: Tensor,
+    step: Tensor | int,
+    *purposes: int,
 ) -> tuple[Tensor, ...]:
     """A uniform number in [0, 1) for every vehicle, [N, M], of each of the ``purposes``."""
-    drawn = uniform(key, step, vehicles.x.shape[1], list(purposes), vehicles.x.dtype)
+    drawn = uniform(
+        key,
+        step,
+        vehicles.x.shape[1],
+        list(purposes),
+        vehicles.x.dtype,
+    )
     return drawn.unbind(-1)
 
 
@@ -79,7 +124,13 @@ class TrafficModule(TensorDictModuleBase):
         stream: family of episodes that the random numbers belong to.
     """
 
-    in_keys = [keys.VEHICLES, keys.TRAFFIC, keys.SEED, keys.EPISODE, keys.STEP]  # noqa: RUF012
+    in_keys = [  # noqa: RUF012
+        keys.VEHICLES,
+        keys.TRAFFIC,
+        keys.SEED,
+        keys.EPISODE,
+        keys.STEP,
+    ]
     out_keys = [keys.MOVED, keys.TRAFFIC]  # noqa: RUF012
 
     #: When others see the lane changes of this model's vehicles; ``VISIBILITY_OF_EPISODE`` if
@@ -100,7 +151,13 @@ class TrafficModule(TensorDictModuleBase):
         self.stream = int(stream)
         self.dt = PHYSICS_STEP_S
 
-    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def move(
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
+    ) -> Moved:
         """The vehicles at t + 0.1 s, and the memory to keep.
 
         Args:
@@ -131,7 +188,10 @@ class TrafficModule(TensorDictModuleBase):
         return None
 
     def scenes(
-        self, vehicles: int, ego_visibility: int, ego_desired_speed_mps: float
+        self,
+        vehicles: int,
+        ego_visibility: int,
+        ego_desired_speed_mps: float,
     ) -> Scenes | None:
         """The initial scenes of this traffic; None: those of the environment."""
         return None
@@ -163,14 +223,23 @@ class TrafficModule(TensorDictModuleBase):
         """Write ``moved`` and ``traffic``."""
         vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
         memory = dict(memory_of(tensordict).items())
-        moved, memory = self._call(tensordict, vehicles, memory, key_of(tensordict, self.stream))
+        moved, memory = self._call(
+            tensordict,
+            vehicles,
+            memory,
+            key_of(tensordict, self.stream),
+        )
         n = tensordict.batch_size[0]
         tensordict.set(keys.MOVED, new_tensordict(moved.as_dict(), n))
         tensordict.set(keys.TRAFFIC, new_tensordict(memory, n))
         return tensordict
 
     def _call(
-        self, tensordict: TensorDictBase, vehicles: Vehicles, memory: Memory, key: Tensor
+        self,
+        tensordict: TensorDictBase,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
     ) -> Moved:
         return self.move(vehicles, memory, key, tensordict.get(keys.STEP))
 
@@ -196,7 +265,10 @@ class TrafficModule(TensorDictModuleBase):
         """Nested name -> (shape, dtype) of the memory of ``n`` rows of ``m`` vehicles."""
         return {
             name: ((n, m, *shape), own_dtype or dtype)
-            for name, (shape, own_dtype) in self.memory_fields.items()
+            for name, (
+                shape,
+                own_dtype,
+            ) in self.memory_fields.items()
         }
 
 
@@ -207,13 +279,22 @@ class Overlay(TrafficModule):
     """
 
     def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        moved: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """The new ``moved``, and the memory to keep; arguments as in :meth:`TrafficModule.move`."""
         raise NotImplementedError
 
     def _call(
-        self, tensordict: TensorDictBase, vehicles: Vehicles, memory: Memory, key: Tensor
+        self,
+        tensordict: TensorDictBase,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
     ) -> Moved:
         moved = Vehicles.of(tensordict.get(keys.MOVED))
         return self.rewrite(vehicles, moved, memory, key, tensordict.get(keys.STEP))
@@ -237,7 +318,10 @@ class TrafficParts(TrafficModule):
 
     def named_parts(self) -> list[tuple[str, TrafficModule]]:
         """Names and parts, in order."""
-        return cast("list[tuple[str, TrafficModule]]", list(self.parts.items()))
+        return cast(
+            "list[tuple[str, TrafficModule]]",
+            list(self.parts.items()),
+        )
 
     def compile_graphs(self) -> None:
         """Compile every part."""
@@ -272,7 +356,8 @@ class TrafficSequential(TrafficParts):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Run the parts in order."""
-        memories, new_memories = memory_of(tensordict), {}
+        memories = memory_of(tensordict)
+        new_memories = {}
         for name, part in self.named_parts():
             tensordict.set(keys.TRAFFIC, memory_of(memories, name))
             part(tensordict)

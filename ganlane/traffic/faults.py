@@ -23,7 +23,14 @@ from ganlane.settings.driving import (
 )
 from ganlane.sim.random import Purpose, Stream
 from ganlane.sim.state import Road, Vehicles, lane_change_done
-from ganlane.traffic.base import Memory, Moved, Overlay, TrafficModule, TrafficSequential, uniforms
+from ganlane.traffic.base import (
+    Memory,
+    Moved,
+    Overlay,
+    TrafficModule,
+    TrafficSequential,
+    uniforms,
+)
 
 #: A step shorter than this has no direction of its own, m: the vehicle then moves along its
 #: heading.
@@ -45,7 +52,12 @@ def starting(vehicles: Vehicles, moved: Vehicles) -> Tensor:
     return (moved.target_lane != vehicles.target_lane) & other_drivers(vehicles)
 
 
-def driven_at(vehicles: Vehicles, moved: Vehicles, acceleration: Tensor, dt: float) -> Vehicles:
+def driven_at(
+    vehicles: Vehicles,
+    moved: Vehicles,
+    acceleration: Tensor,
+    dt: float,
+) -> Vehicles:
     """``moved`` with another ``acceleration`` (m/s2, [N, M]): the same path, slower or faster.
 
     Position and heading follow the path from ``vehicles`` to ``moved`` in proportion to the
@@ -56,8 +68,16 @@ def driven_at(vehicles: Vehicles, moved: Vehicles, acceleration: Tensor, dt: flo
     distance = 0.5 * (vehicles.speed + speed) * dt
     share = distance / usual.clamp_min(_SHORTEST_M)
     path = usual > _SHORTEST_M
-    dx = torch.where(path, share * (moved.x - vehicles.x), distance * torch.cos(vehicles.heading))
-    dy = torch.where(path, share * (moved.y - vehicles.y), distance * torch.sin(vehicles.heading))
+    dx = torch.where(
+        path,
+        share * (moved.x - vehicles.x),
+        distance * torch.cos(vehicles.heading),
+    )
+    dy = torch.where(
+        path,
+        share * (moved.y - vehicles.y),
+        distance * torch.sin(vehicles.heading),
+    )
     turn = torch.where(path, share * (moved.heading - vehicles.heading), 0.0)
     return moved.with_(
         x=vehicles.x + dx,
@@ -78,7 +98,10 @@ class Fault(Overlay, Generic[Faults]):
     purpose: Purpose
 
     def __init__(
-        self, road: Road | None = None, stream: int = Stream.TRAIN, faults: Faults | None = None
+        self,
+        road: Road | None = None,
+        stream: int = Stream.TRAIN,
+        faults: Faults | None = None,
     ) -> None:
         super().__init__(road, stream)
         self.faults: Faults = faults or self.kind()
@@ -91,7 +114,13 @@ class Fault(Overlay, Generic[Faults]):
 class TimedFault(Fault[Timed]):
     """A fault that lasts. Memory: ``left``, its remaining steps."""
 
-    def steps_left(self, left: Tensor, vehicles: Vehicles, key: Tensor, step: Tensor) -> Tensor:
+    def steps_left(
+        self,
+        left: Tensor,
+        vehicles: Vehicles,
+        key: Tensor,
+        step: Tensor,
+    ) -> Tensor:
         """``left`` [N, M] int64, or all steps of a fault that begins now.
 
         A fault begins where there is none, at a constant hazard.
@@ -106,10 +135,16 @@ class PhantomBraking(TimedFault[BrakingFaults]):
     """At times a driver brakes without a reason. Memory: the remaining steps of braking."""
 
     memory_fields = {"left": ((), torch.int64)}  # noqa: RUF012
-    kind, purpose = BrakingFaults, Purpose.FAULT
+    kind = BrakingFaults
+    purpose = Purpose.FAULT
 
     def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        moved: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """Brake during a fault."""
         left = self.steps_left(memory["left"], vehicles, key, step)
@@ -132,7 +167,8 @@ class LateReaction(TimedFault[ReactionFaults]):
     first (at the start the present one), and ``left``, the remaining steps of the lapse.
     """
 
-    kind, purpose = ReactionFaults, Purpose.LATE_REACTION
+    kind = ReactionFaults
+    purpose = Purpose.LATE_REACTION
 
     def __init__(
         self,
@@ -142,21 +178,41 @@ class LateReaction(TimedFault[ReactionFaults]):
     ) -> None:
         super().__init__(road, stream, faults)
         self.delay_steps = round(self.faults.delay_s / self.dt)
-        self.memory_fields = {"past": ((self.delay_steps,), None), "left": ((), torch.int64)}
+        self.memory_fields = {
+            "past": ((self.delay_steps,), None),
+            "left": ((), torch.int64),
+        }
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """No lapse, a constant past acceleration."""
         past = vehicles.acceleration[..., None].repeat(1, 1, self.delay_steps)
-        return {"past": past, "left": torch.zeros_like(vehicles.target_lane)}
+        return {
+            "past": past,
+            "left": torch.zeros_like(vehicles.target_lane),
+        }
 
     def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        moved: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """Drive at the acceleration of ``delay_s`` ago during a lapse."""
         left = self.steps_left(memory["left"], vehicles, key, step)
         late = driven_at(vehicles, moved, memory["past"][..., 0], self.dt)
-        past = torch.cat((memory["past"][..., 1:], moved.acceleration[..., None]), dim=-1)
-        return late.where(left > 0, moved), {"past": past, "left": (left - 1).clamp_min(0)}
+        past = torch.cat(
+            (
+                memory["past"][..., 1:],
+                moved.acceleration[..., None],
+            ),
+            dim=-1,
+        )
+        return late.where(left > 0, moved), {
+            "past": past,
+            "left": (left - 1).clamp_min(0),
+        }
 
 
 class HesitantLaneChange(Fault[HesitationFaults]):
@@ -167,13 +223,20 @@ class HesitantLaneChange(Fault[HesitationFaults]):
     """
 
     memory_fields = {"hesitant": ((), torch.bool)}  # noqa: RUF012
-    kind, purpose = HesitationFaults, Purpose.HESITANT_CHANGE
+    kind = HesitationFaults
+    purpose = Purpose.HESITANT_CHANGE
 
     def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        moved: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """Reduce the lateral motion of hesitant changes."""
-        begins, u = starting(vehicles, moved), self.draw(vehicles, key, step)
+        begins = starting(vehicles, moved)
+        u = self.draw(vehicles, key, step)
         hesitant = torch.where(begins, u < self.faults.share, memory["hesitant"])
         slowed = vehicles.y + self.faults.pace * (moved.y - vehicles.y)
         moved = moved.with_(y=torch.where(hesitant, slowed, moved.y))
@@ -188,17 +251,24 @@ class AbortedLaneChange(Fault[AbortFaults]):
     """
 
     memory_fields = {"origin": ((), torch.int64)}  # noqa: RUF012
-    kind, purpose = AbortFaults, Purpose.ABORTED_CHANGE
+    kind = AbortFaults
+    purpose = Purpose.ABORTED_CHANGE
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """No lane to turn back to."""
         return {"origin": torch.full_like(vehicles.target_lane, _NO_LANE)}
 
     def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        moved: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """Set the old lane as the target where the change has come far enough."""
-        begins, u = starting(vehicles, moved), self.draw(vehicles, key, step)
+        begins = starting(vehicles, moved)
+        u = self.draw(vehicles, key, step)
         chosen = torch.where(u < self.faults.share, vehicles.target_lane, _NO_LANE)
         origin = torch.where(begins, chosen, memory["origin"])
         start = self.road.centre_of(origin, moved.y.dtype)
@@ -214,7 +284,9 @@ def with_faults(base: TrafficModule, faults: DriverFaults | None = None) -> Traf
 
     Phantom braking comes after the late reactions, since it is no reaction and must not be delayed.
     """
-    faults, road, stream = faults or DriverFaults(), base.road, base.stream
+    faults = faults or DriverFaults()
+    road = base.road
+    stream = base.stream
     parts: dict[str, TrafficModule] = {
         "base": base,
         "late_reaction": LateReaction(road, stream, faults.late_reaction),

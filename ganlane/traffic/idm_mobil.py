@@ -11,16 +11,36 @@ from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
 from ganlane.native.settings import RuleDrivers
-from ganlane.settings.driving import IdmParameters, MobilParameters, RandomDrivers
+from ganlane.settings.driving import (
+    IdmParameters,
+    MobilParameters,
+    RandomDrivers,
+)
 from ganlane.settings.record import Range
-from ganlane.sim.dynamics import STEERING, SteeringParameters, advance, steer
-from ganlane.sim.idm import TABLE_V, DriverIdm, following_acceleration, needed_deceleration
+from ganlane.sim.dynamics import (
+    STEERING,
+    SteeringParameters,
+    advance,
+    steer,
+)
+from ganlane.sim.idm import (
+    TABLE_V,
+    DriverIdm,
+    following_acceleration,
+    needed_deceleration,
+)
 from ganlane.sim.mobil import TABLE_IV, DriverMobil, mobil_changes
 from ganlane.sim.neighbours import Scene, in_lane, perceive
 from ganlane.sim.random import Purpose, Stream, absorb
 from ganlane.sim.state import Road, Vehicles
 from ganlane.torch_settings import compiled
-from ganlane.traffic.base import Memory, MemoryFields, Moved, TrafficModule, uniforms
+from ganlane.traffic.base import (
+    Memory,
+    MemoryFields,
+    Moved,
+    TrafficModule,
+    uniforms,
+)
 
 #: MOBIL decides once a second of simulated time, whatever the ego's decision period.
 MOBIL_PERIOD_STEPS = 10
@@ -29,8 +49,10 @@ _LANE_MARGIN_M = 0.1
 #: A random driver's strongest braking is at least this many times what the initial scene requires
 #: of it.
 _START_MARGIN = 1.5
-#: Number of uniform numbers per random driver, and the column of the factor on the desired speed.
-_DRAWS, _DESIRED_SPEED = 12, 11
+#: Number of uniform numbers per random driver.
+_DRAWS = 12
+#: The column of the factor on the desired speed.
+_DESIRED_SPEED = 11
 #: Key of the random drivers' parameters in the memory, which stored training runs hold.
 _PARAMETERS = "traits"
 
@@ -51,9 +73,16 @@ class IdmTraffic(TrafficModule):
         steering: SteeringParameters = STEERING,
     ) -> None:
         super().__init__(road, stream)
-        self.idm, self.steering = idm, steering
+        self.idm = idm
+        self.steering = steering
 
-    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def move(
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
+    ) -> Moved:
         """Accelerate, steer, advance."""
         return self.keep_lanes(vehicles, memory)
 
@@ -63,7 +92,11 @@ class IdmTraffic(TrafficModule):
 
     def keep_lanes(self, vehicles: Vehicles, memory: Memory) -> Moved:
         """A step without decisions."""
-        return self.drive(perceive(vehicles, self.road), vehicles.target_lane, memory)
+        return self.drive(
+            perceive(vehicles, self.road),
+            vehicles.target_lane,
+            memory,
+        )
 
     def drive(self, scene: Scene, target: Tensor, memory: Memory) -> Moved:
         """The vehicles at t + 0.1 s, steered to the lanes ``target`` [N, M] int64."""
@@ -72,11 +105,32 @@ class IdmTraffic(TrafficModule):
         return self._advanced(scene.vehicles, acceleration, target, centre, memory)
 
     def _advanced(
-        self, v: Vehicles, acceleration: Tensor, target: Tensor, line: Tensor, memory: Memory
+        self,
+        v: Vehicles,
+        acceleration: Tensor,
+        target: Tensor,
+        line: Tensor,
+        memory: Memory,
     ) -> Moved:
         """Steered to the lines at ``line`` (m, [N, M])."""
-        steering = steer(memory["steering"], v.y, v.heading, v.speed, line, self.dt, self.steering)
-        pose = advance(v.x, v.y, v.heading, v.speed, acceleration, steering, self.dt)
+        steering = steer(
+            memory["steering"],
+            v.y,
+            v.heading,
+            v.speed,
+            line,
+            self.dt,
+            self.steering,
+        )
+        pose = advance(
+            v.x,
+            v.y,
+            v.heading,
+            v.speed,
+            acceleration,
+            steering,
+            self.dt,
+        )
         return v.with_(target_lane=target, **pose._asdict()), {"steering": steering}
 
 
@@ -94,7 +148,13 @@ class IdmMobilTraffic(IdmTraffic):
         super().__init__(road, stream, idm, steering)
         self.mobil = mobil
 
-    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def move(
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
+    ) -> Moved:
         """As IDM; rows at a full second decide first."""
         due = step % MOBIL_PERIOD_STEPS == 0
         # Reading a flag is cheap on a CPU and saves nine evaluations of MOBIL in ten: without it a
@@ -156,7 +216,11 @@ class DriverParams(NamedTuple):
         No driver brakes harder than ``braking`` (m/s2, [N, M]).
         """
         return DriverIdm(
-            min_gap_m, self.headway, self.comfortable_deceleration, -braking, self.max_acceleration
+            min_gap_m,
+            self.headway,
+            self.comfortable_deceleration,
+            -braking,
+            self.max_acceleration,
         )
 
     def sway_m(self, time_s: Tensor) -> Tensor:
@@ -167,7 +231,10 @@ class DriverParams(NamedTuple):
 
 
 def start_braking(
-    vehicles: Vehicles, road: Road, reaction_s: Tensor, min_gap_m: float = TABLE_V.min_gap_m
+    vehicles: Vehicles,
+    road: Road,
+    reaction_s: Tensor,
+    min_gap_m: float = TABLE_V.min_gap_m,
 ) -> Tensor:
     """Deceleration (m/s2, [N, M]) with which each driver stays behind all ahead in its lane.
 
@@ -181,7 +248,8 @@ def start_braking(
     distance = torch.where(ahead, pairs.distance, torch.inf)
     between = distance.argsort(-1).argsort(-1).to(vehicles.x.dtype)
     space = vehicles.length.amax(-1)[:, None, None] + min_gap_m
-    speed, leader_speed = vehicles.speed[:, :, None], vehicles.speed[:, None, :]
+    speed = vehicles.speed[:, :, None]
+    leader_speed = vehicles.speed[:, None, :]
     closing = (speed - leader_speed).clamp_min(0.0)
     gap = pairs.ahead - between * space - closing * reaction_s[..., None]
     needed = needed_deceleration(speed, leader_speed, gap.clamp_min(1.0))
@@ -230,11 +298,17 @@ class IdmRandomTraffic(IdmMobilTraffic):
 
     def _drawn(self, vehicles: Vehicles, key: Tensor) -> tuple[Tensor, ...]:
         """Uniform numbers [N, M] of every purpose."""
-        return uniforms(vehicles, key, -1, *(Purpose.DRIVER + index for index in range(_DRAWS)))
+        return uniforms(
+            vehicles,
+            key,
+            -1,
+            *(Purpose.DRIVER + index for index in range(_DRAWS)),
+        )
 
     def driver_params(self, vehicles: Vehicles, key: Tensor) -> DriverParams:
         """The drivers at the start of the episodes with ``key`` [N]."""
-        d, u = self.drivers, self._drawn(vehicles, key)
+        d = self.drivers
+        u = self._drawn(vehicles, key)
         reaction_s = in_range(u[5], d.reaction_s)
         required = start_braking(vehicles, self.road, reaction_s, self.idm.min_gap_m)
         least_braking = _START_MARGIN * required
@@ -260,7 +334,11 @@ class IdmRandomTraffic(IdmMobilTraffic):
         u = self._drawn(vehicles, absorb(key, 0))[_DESIRED_SPEED]
         factor = in_range(u, self.drivers.desired_speed)
         others = torch.arange(vehicles.x.shape[1], device=key.device) != EGO_INDEX
-        desired = torch.where(others, factor * vehicles.desired_speed, vehicles.desired_speed)
+        desired = torch.where(
+            others,
+            factor * vehicles.desired_speed,
+            vehicles.desired_speed,
+        )
         return super().enter(vehicles.with_(desired_speed=desired), key, episode)
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
@@ -271,22 +349,42 @@ class IdmRandomTraffic(IdmMobilTraffic):
             memory["past"] = vehicles.acceleration[..., None].repeat(1, 1, self.delay_steps)
         return memory
 
-    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def move(
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
+    ) -> Moved:
         """As :class:`IdmMobilTraffic`; the memory carries the step, for the sway."""
         return super().move(vehicles, {**memory, "step": step}, key, step)
 
     def changes(self, scene: Scene, memory: Memory) -> Tensor:
         """As :class:`IdmMobilTraffic`, with each driver's parameters."""
-        m, drivers = self.mobil, DriverParams.of(memory)
+        m = self.mobil
+        drivers = DriverParams.of(memory)
         politeness = drivers.politeness[..., None]
-        rear, side = politeness * m.politeness_rear, politeness * m.politeness_side
-        mobil = DriverMobil(m.threshold, rear, side, m.safe_deceleration, m.exclusive_m)
+        rear = politeness * m.politeness_rear
+        side = politeness * m.politeness_side
+        mobil = DriverMobil(
+            m.threshold,
+            rear,
+            side,
+            m.safe_deceleration,
+            m.exclusive_m,
+        )
         braking = torch.full_like(drivers.headway, -self.idm.min_acceleration)
-        return mobil_changes(scene, self.road, drivers.idm(self.idm.min_gap_m, braking), mobil)
+        return mobil_changes(
+            scene,
+            self.road,
+            drivers.idm(self.idm.min_gap_m, braking),
+            mobil,
+        )
 
     def drive(self, scene: Scene, target: Tensor, memory: Memory) -> Moved:
         """The vehicles at t + 0.1 s, with each driver's delay and sway."""
-        v, drivers = scene.vehicles, DriverParams.of(memory)
+        v = scene.vehicles
+        drivers = DriverParams.of(memory)
         idm = drivers.idm(self.idm.min_gap_m, drivers.strongest_braking)
         acceleration = following_acceleration(scene, idm)
         new_memory = {_PARAMETERS: memory[_PARAMETERS]}

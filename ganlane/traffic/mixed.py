@@ -17,7 +17,14 @@ from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
 from ganlane.sim.random import Purpose, absorb, uniform
 from ganlane.sim.state import VISIBILITY_OF_EPISODE, Vehicles
-from ganlane.traffic.base import TrafficModule, TrafficParts, key_of, memory_of, new_tensordict
+from ganlane.traffic.base import (
+    TrafficModule,
+    TrafficParts,
+    key_of,
+    memory_of,
+    new_tensordict,
+    with_rows,
+)
 
 
 def interleaved(shares: Mapping[str, int]) -> list[str]:
@@ -26,7 +33,8 @@ def interleaved(shares: Mapping[str, int]) -> list[str]:
     ``{a: 2, b: 1}`` gives a, b, a: in every episode each part gains its share, the one with the
     most (the first of several) is chosen and pays the sum.
     """
-    credit, turns = dict.fromkeys(shares, 0), []
+    credit = dict.fromkeys(shares, 0)
+    turns = []
     for _ in range(sum(shares.values())):
         for name, share in shares.items():
             credit[name] += share
@@ -54,7 +62,11 @@ class MixedTraffic(TrafficParts):
         UserError: no parts, shares of other names, or a part that plays recordings.
     """
 
-    def __init__(self, parts: Mapping[str, TrafficModule], shares: Mapping[str, int]) -> None:
+    def __init__(
+        self,
+        parts: Mapping[str, TrafficModule],
+        shares: Mapping[str, int],
+    ) -> None:
         if not parts or set(parts) != set(shares) or min(shares.values()) < 1:
             raise UserError(
                 f"traffic.shares={dict(shares)}: expected a whole number of at least 1 for each of "
@@ -91,16 +103,17 @@ class MixedTraffic(TrafficParts):
 
         The rows come twice: as they are, and with repetitions of the first as padding. A graph is
         compiled for every number of rows, which takes a minute, so compiled parts get at most some
-        16 numbers. On a GPU this waits for the queue once a step.
+        16 numbers. On a GPU this waits for the queue once for every part.
         """
-        part_of_row, batch = self.part_of(episode), len(episode)
-        counts = torch.bincount(part_of_row, minlength=len(self.parts)).tolist()
-        sorted_rows = part_of_row.argsort(stable=True).split(counts)
-        size = max(8, batch // 16) if self.compiled else 1
+        part_of_row = self.part_of(episode)
+        batch = len(episode)
         chosen = []
-        for (name, part), rows in zip(self.named_parts(), sorted_rows):
-            if len(rows):
+        for number, (name, part) in enumerate(self.named_parts()):
+            rows = padded = (part_of_row == number).nonzero()[:, 0]
+            if self.compiled:
+                size = max(8, batch // 16)
                 padded = torch.cat((rows, rows[:1].expand(-len(rows) % size)))
+            if len(rows):
                 chosen.append((name, part, rows, padded))
         return chosen
 
@@ -108,16 +121,30 @@ class MixedTraffic(TrafficParts):
         """Write ``moved`` and ``traffic``, each part its rows."""
         vehicles = tensordict.get(keys.VEHICLES)
         memories = memory_of(tensordict)
-        moved, new_memories = vehicles, dict(memories.items())
+        moved = vehicles
+        new_memories = dict(memories.items())
         inputs = {name: tensordict.get(name) for name in (keys.SEED, keys.EPISODE, keys.STEP)}
-        inputs |= {keys.EPISODE_KEY: key_of(tensordict, self.stream), keys.VEHICLES: vehicles}
+        inputs |= {
+            keys.EPISODE_KEY: key_of(tensordict, self.stream),
+            keys.VEHICLES: vehicles,
+        }
         for name, part, rows, padded in self.rows_of_parts(inputs[keys.EPISODE]):
             memory = memory_of(memories, name)
-            output = part(_take({**inputs, keys.TRAFFIC: memory}, padded))
-            moved = with_rows(moved, rows, output.get(keys.MOVED))
-            new_memories[name] = with_rows(memory, rows, memory_of(output))
+            origins: dict[Tensor, Tensor] = {}
+            taken = _take({**inputs, keys.TRAFFIC: memory}, padded, origins)
+            before = taken.get(keys.VEHICLES)
+            output = part(taken)
+            changed = {}
+            for field, value in output.get(keys.MOVED).items():
+                if value is not before.get(field):
+                    changed[field] = value
+            moved = with_rows(moved, rows, changed)
+            new_memories[name] = with_rows(memory, rows, memory_of(output), origins)
         tensordict.set(keys.MOVED, moved)
-        tensordict.set(keys.TRAFFIC, new_tensordict(new_memories, tensordict.batch_size[0]))
+        tensordict.set(
+            keys.TRAFFIC,
+            new_tensordict(new_memories, tensordict.batch_size[0]),
+        )
         return tensordict
 
     def enter(
@@ -132,7 +159,9 @@ class MixedTraffic(TrafficParts):
             of_episode = scene.visibility == VISIBILITY_OF_EPISODE
             visibility = torch.where(of_episode, int(part.visibility), scene.visibility)
             entered, memory = part.enter(
-                scene.with_(visibility=visibility), key[rows], episode[rows]
+                scene.with_(visibility=visibility),
+                key[rows],
+                episode[rows],
             )
             together = with_rows(together, rows, entered.as_dict())
             memories.set(name, with_rows(memories.get(name), rows, memory))
@@ -151,24 +180,23 @@ class MixedTraffic(TrafficParts):
         super().compile_graphs()
 
 
-def _take(fields: Mapping[str, Any], rows: Tensor) -> TensorDict:
-    """``rows`` of tensors, or of TensorDicts of them, by name."""
-    taken = {
-        name: field.index_select(0, rows) if isinstance(field, Tensor) else _take(field, rows)
-        for name, field in fields.items()
-    }
-    return new_tensordict(taken, len(rows))
+def _take(
+    fields: Mapping[str, Any],
+    rows: Tensor,
+    origins: dict[Tensor, Tensor],
+) -> TensorDict:
+    """``rows`` of tensors, or of TensorDicts of them, by name.
 
-
-def with_rows(whole: Any, rows: Tensor, part: Any) -> Any:
-    """``whole`` with ``part`` in its ``rows`` [R], leaf by leaf; nothing is written in place.
-
-    Further rows of ``part`` are padding.
+    ``origins`` collects, by the tensor taken, the one that it was taken from.
     """
-    if isinstance(whole, Tensor):
-        return whole.index_copy(0, rows, part[: len(rows)])
-    fields = {name: with_rows(field, rows, part[name]) for name, field in whole.items()}
-    return new_tensordict(fields, whole.batch_size[0])
+    taken: dict[str, Any] = {}
+    for name, field in fields.items():
+        if isinstance(field, Tensor):
+            taken[name] = field.index_select(0, rows)
+            origins[taken[name]] = field
+        else:
+            taken[name] = _take(field, rows, origins)
+    return new_tensordict(taken, len(rows))
 
 
 def _zeros(spec: Mapping[str, Any], n: int, device: torch.device) -> TensorDict:
@@ -206,12 +234,15 @@ class BlindTraffic(TrafficModule):
                 "no ego anyway; leave it out."
             )
         super().__init__(model.road, model.stream)
-        self.model, self.blind_share = model, blind_share
-        self.visibility, self.rows_must_stay = model.visibility, model.rows_must_stay
+        self.model = model
+        self.blind_share = blind_share
+        self.visibility = model.visibility
+        self.rows_must_stay = model.rows_must_stay
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``moved`` and ``traffic`` of the model, which does not see hidden egos."""
-        memory, vehicles = memory_of(tensordict), tensordict.get(keys.VEHICLES)
+        memory = memory_of(tensordict)
+        vehicles = tensordict.get(keys.VEHICLES)
         unseen = memory.get("unseen")
         inputs = tensordict.copy()
         seen = vehicles.copy().set("valid", vehicles.get("valid") & ~unseen)
@@ -220,7 +251,10 @@ class BlindTraffic(TrafficModule):
         self.model(inputs)
         tensordict.set(keys.MOVED, inputs.get(keys.MOVED))
         new_memory = {"model": memory_of(inputs), "unseen": unseen}
-        tensordict.set(keys.TRAFFIC, new_tensordict(new_memory, tensordict.batch_size[0]))
+        tensordict.set(
+            keys.TRAFFIC,
+            new_tensordict(new_memory, tensordict.batch_size[0]),
+        )
         return tensordict
 
     def unseen(self, vehicles: Vehicles, key: Tensor) -> Tensor:
@@ -243,11 +277,17 @@ class BlindTraffic(TrafficModule):
     def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
         """As the model's, with ``unseen``."""
         memory = self.model.init_memory(vehicles, key)
-        return new_tensordict({"model": memory, "unseen": self.unseen(vehicles, key)}, len(key))
+        return new_tensordict(
+            {"model": memory, "unseen": self.unseen(vehicles, key)},
+            len(key),
+        )
 
     def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
         """As the model's, with ``unseen``."""
-        return {"model": self.model.memory_spec(n, m, dtype), "unseen": ((n, m), torch.bool)}
+        return {
+            "model": self.model.memory_spec(n, m, dtype),
+            "unseen": ((n, m), torch.bool),
+        }
 
     def compile_graphs(self) -> None:
         """Compile the model."""

@@ -15,10 +15,19 @@ from torch import Tensor
 
 from ganlane.settings.driving import IdmParameters, MobilParameters
 from ganlane.sim.idm import TABLE_V, acceleration_behind
-from ganlane.sim.mobil import one_at_a_time, safe_change, without_ego
+from ganlane.sim.mobil import (
+    one_at_a_time,
+    safe_change,
+    without_ego,
+)
 from ganlane.sim.neighbours import Scene, leader, perceive
 from ganlane.sim.random import Purpose, Stream, normal
-from ganlane.sim.state import Road, Vehicles, lane_change_done, spanned
+from ganlane.sim.state import (
+    Road,
+    Vehicles,
+    lane_change_done,
+    spanned,
+)
 from ganlane.traffic.base import Memory, Moved, Overlay, uniforms
 
 #: Random numbers of a lane change: whether it starts, and to which side.
@@ -45,9 +54,14 @@ def random_side(u: Tensor, lane: Tensor, lanes: int | Tensor) -> Tensor:
 
     ``u`` uniform, ``lane`` int64.
     """
-    left, right = lane < lanes - 1, lane > 0
+    left = lane < lanes - 1
+    right = lane > 0
     both = torch.where(u < 0.5, 1, -1)
-    return torch.where(left & right, both, torch.where(left, 1, torch.where(right, -1, 0)))
+    return torch.where(
+        left & right,
+        both,
+        torch.where(left, 1, torch.where(right, -1, 0)),
+    )
 
 
 @dataclass(frozen=True)
@@ -75,7 +89,10 @@ class LiteralLaneChange(Overlay):
     ``lateral_speed`` of the current change (m/s, positive to the left, 0 without one).
     """
 
-    memory_fields = {"clock": ((), torch.int64), "lateral_speed": ((), None)}  # noqa: RUF012
+    memory_fields = {  # noqa: RUF012
+        "clock": ((), torch.int64),
+        "lateral_speed": ((), None),
+    }
 
     def __init__(
         self,
@@ -87,19 +104,35 @@ class LiteralLaneChange(Overlay):
         self.changes = changes or LiteralChanges()
 
     def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        moved: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """Start changes, and move current ones sideways at their own speed until they arrive.
 
         A vehicle whose target lane was set back (:class:`ganlane.traffic.AbortedLaneChange`)
         returns at that speed.
         """
-        c, dtype = self.changes, vehicles.x.dtype
+        c = self.changes
+        dtype = vehicles.x.dtype
         u, u_side = uniforms(vehicles, key, step, *_CHANGE)
-        gauss = normal(key, step, vehicles.x.shape[1], [Purpose.LANE_CHANGE_SPEED], dtype)[..., 0]
+        gauss = normal(
+            key,
+            step,
+            vehicles.x.shape[1],
+            [Purpose.LANE_CHANGE_SPEED],
+            dtype,
+        )[..., 0]
         comes = u < literal_hazard(memory["clock"].to(dtype), c.mean_steps)
         starts = (memory["lateral_speed"] == 0) & vehicles.valid & comes
-        side = torch.where(starts, random_side(u_side, vehicles.target_lane, self.road.lanes), 0)
+        side = torch.where(
+            starts,
+            random_side(u_side, vehicles.target_lane, self.road.lanes),
+            0,
+        )
         target = vehicles.target_lane + side
         drawn = (c.lateral_speed_mps + c.lateral_speed_sd_mps * gauss).clamp_min(c.slowest_mps)
         pace = torch.where(side != 0, drawn, memory["lateral_speed"].abs())
@@ -117,7 +150,10 @@ class LiteralLaneChange(Overlay):
             heading=torch.where(changing, heading, moved.heading),
         )
         clock = torch.where(changing, 0, memory["clock"] + 1)
-        return moved, {"clock": clock, "lateral_speed": torch.where(arrives, 0.0, lateral)}
+        return moved, {
+            "clock": clock,
+            "lateral_speed": torch.where(arrives, 0.0, lateral),
+        }
 
 
 @dataclass(frozen=True)
@@ -146,7 +182,10 @@ class CalibratedLaneChange(Overlay):
     (-1, 0, 1), and ``waited``, the number of steps since it began.
     """
 
-    memory_fields = {"wish": ((), torch.int64), "waited": ((), torch.int64)}  # noqa: RUF012
+    memory_fields = {  # noqa: RUF012
+        "wish": ((), torch.int64),
+        "waited": ((), torch.int64),
+    }
 
     def __init__(
         self,
@@ -156,12 +195,20 @@ class CalibratedLaneChange(Overlay):
         idm: IdmParameters = TABLE_V,
     ) -> None:
         super().__init__(road, stream)
-        self.changes, self.idm = changes or CalibratedChanges(), idm
+        self.changes = changes or CalibratedChanges()
+        self.idm = idm
         self._limits = MobilParameters(
-            safe_deceleration=self.changes.safe_deceleration, exclusive_m=self.changes.exclusive_m
+            safe_deceleration=self.changes.safe_deceleration,
+            exclusive_m=self.changes.exclusive_m,
         )
 
-    def _wishes(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Tensor:
+    def _wishes(
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
+    ) -> Tensor:
         """The current wish, or a new one."""
         u, u_side = uniforms(vehicles, key, step, *_CHANGE)
         comes = u < distance_hazard(vehicles.speed, self.changes.per_km, self.dt)
@@ -172,14 +219,20 @@ class CalibratedLaneChange(Overlay):
 
     def _contested(self, scene: Scene, lane: Tensor) -> Tensor:
         """Whether a near vehicle other than the ego is already moving into ``lane`` [N, M]."""
-        vehicles, pairs = scene.vehicles, scene.pairs
+        vehicles = scene.vehicles
+        pairs = scene.pairs
         target = vehicles.target_lane.to(lane.dtype)
         changing = without_ego((self.road.lane_of(vehicles.y) != target) & vehicles.valid)
         near = torch.minimum(pairs.ahead, pairs.behind) < self.changes.exclusive_m
         return (near & changing[:, None, :] & (target[:, None, :] == lane[:, :, None])).any(-1)
 
     def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        moved: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """Set the target lane of those whose wish finds a gap."""
         wish = self._wishes(vehicles, memory, key, step)
@@ -192,18 +245,29 @@ class CalibratedLaneChange(Overlay):
         gives_up = waited >= round(self.changes.patience_s / self.dt)
         rest = torch.where((starts != 0) | gives_up, 0, wish)
         moved = moved.with_(target_lane=vehicles.target_lane + starts)
-        return moved, {"wish": rest, "waited": torch.where(rest == 0, 0, waited)}
+        return moved, {
+            "wish": rest,
+            "waited": torch.where(rest == 0, 0, waited),
+        }
 
 
 def _accelerated(
-    vehicles: Vehicles, moved: Vehicles, who: Tensor, acceleration: Tensor, dt: float
+    vehicles: Vehicles,
+    moved: Vehicles,
+    who: Tensor,
+    acceleration: Tensor,
+    dt: float,
 ) -> Vehicles:
     """``moved``, where ``who`` [N, M] drives along the road at ``acceleration``, m/s2."""
     speed = (vehicles.speed + acceleration * dt).clamp_min(0.0)
     return moved.with_(
         speed=torch.where(who, speed, moved.speed),
         acceleration=torch.where(who, (speed - vehicles.speed) / dt, moved.acceleration),
-        x=torch.where(who, vehicles.x + 0.5 * (vehicles.speed + speed) * dt, moved.x),
+        x=torch.where(
+            who,
+            vehicles.x + 0.5 * (vehicles.speed + speed) * dt,
+            moved.x,
+        ),
     )
 
 
@@ -231,7 +295,10 @@ class AccelerationOverlay(Overlay):
     (m/s2) and its remaining steps.
     """
 
-    memory_fields = {"acceleration": ((), None), "left": ((), torch.int64)}  # noqa: RUF012
+    memory_fields = {  # noqa: RUF012
+        "acceleration": ((), None),
+        "left": ((), torch.int64),
+    }
 
     def __init__(
         self,
@@ -243,17 +310,27 @@ class AccelerationOverlay(Overlay):
         self.sudden = sudden or SuddenAccelerations()
 
     def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        moved: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """Replace speed and position along the road during a sudden acceleration."""
-        s, m, dtype = self.sudden, vehicles.x.shape[1], vehicles.x.dtype
+        s = self.sudden
+        m = vehicles.x.shape[1]
+        dtype = vehicles.x.dtype
         (u,) = uniforms(vehicles, key, step, Purpose.ACCELERATION)
         gauss = normal(key, step, m, [Purpose.ACCELERATION], dtype)[..., 0]
         starts = (memory["left"] == 0) & (u < self.dt / s.every_s) & vehicles.valid
         acceleration = torch.where(starts, s.mean + s.sd * gauss, memory["acceleration"])
         left = torch.where(starts, round(s.lasts_s / self.dt), memory["left"])
         moved = _accelerated(vehicles, moved, left > 0, acceleration, self.dt)
-        return moved, {"acceleration": acceleration, "left": (left - 1).clamp_min(0)}
+        return moved, {
+            "acceleration": acceleration,
+            "left": (left - 1).clamp_min(0),
+        }
 
 
 @dataclass(frozen=True)
@@ -300,43 +377,64 @@ class Guard(Overlay):
         idm: IdmParameters = TABLE_V,
     ) -> None:
         super().__init__(road, stream)
-        self.guard, self.idm = guard or GuardParameters(), idm
+        self.guard = guard or GuardParameters()
+        self.idm = idm
         self.observer: Observer | None = None
 
     def along(self, vehicles: Vehicles, moved: Vehicles) -> Vehicles:
         """``moved`` with its acceleration between the bounds by IDM."""
-        g, scene = self.guard, perceive(vehicles.with_(target_lane=moved.target_lane), self.road)
+        g = self.guard
+        scene = perceive(vehicles.with_(target_lane=moved.target_lane), self.road)
         ahead = leader(scene, spanned(scene.attention))
         highest = acceleration_behind(scene, ahead, self.idm, g.headway_s).amin(-1)
         lowest = acceleration_behind(scene, ahead, self.idm).amin(-1)
         lowest = lowest - g.slack * vehicles.speed / vehicles.desired_speed
         highest, lowest = (bound.clamp_min(g.hardest_braking) for bound in (highest, lowest))
         wanted = (moved.speed - vehicles.speed) / self.dt
-        acceleration = torch.minimum(torch.maximum(wanted, torch.minimum(lowest, highest)), highest)
-        return _accelerated(vehicles, moved, acceleration != wanted, acceleration, self.dt)
+        acceleration = torch.minimum(
+            torch.maximum(wanted, torch.minimum(lowest, highest)),
+            highest,
+        )
+        return _accelerated(
+            vehicles,
+            moved,
+            acceleration != wanted,
+            acceleration,
+            self.dt,
+        )
 
     def across(self, vehicles: Vehicles, moved: Vehicles) -> Vehicles:
         """``moved`` pulled towards its lane's centre, and kept inside the edges of the road.
 
         It is pulled only where it keeps a lane.
         """
-        g, road = self.guard, self.road
+        g = self.guard
+        road = self.road
         offset = road.centre_of(moved.target_lane, moved.y.dtype) - vehicles.y
         damped = vehicles.y + g.damping * (moved.y - vehicles.y)
         pulled = damped + g.centring_per_s * self.dt * offset
         y = torch.where(offset.abs() < 0.5 * road.lane_width_m, pulled, moved.y)
         half = 0.5 * moved.width
-        left, right = road.left_edge_m() - g.edge_margin_m, road.right_edge_m() + g.edge_margin_m
+        left = road.left_edge_m() - g.edge_margin_m
+        right = road.right_edge_m() + g.edge_margin_m
         y = torch.minimum(torch.maximum(y, right + half), left - half)
         heading = torch.atan((y - vehicles.y) / ((moved.x - vehicles.x).clamp_min(0.1)))
         heading = torch.where(y == moved.y, moved.heading, heading)
         # A turned body is wider by half its length times the sine, which the angle exceeds.
         room = torch.minimum(left - y, y - right) - half
         steepest = (room / (0.5 * moved.length)).clamp(0.0, g.steepest_rad)
-        return moved.with_(y=y, heading=torch.minimum(torch.maximum(heading, -steepest), steepest))
+        return moved.with_(
+            y=y,
+            heading=torch.minimum(torch.maximum(heading, -steepest), steepest),
+        )
 
     def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+        self,
+        vehicles: Vehicles,
+        moved: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
     ) -> Moved:
         """Along the road, then across it."""
         guarded = self.across(vehicles, self.along(vehicles, moved))

@@ -19,8 +19,15 @@ from ganlane.generator import (
     load_generator,
     shipped_generator,
 )
-from ganlane.settings.driving import DriverFaults, IdmParameters, MobilParameters
-from ganlane.settings.traffic import GanCalibratedTrafficConfig, GanTrafficConfig
+from ganlane.settings.driving import (
+    DriverFaults,
+    IdmParameters,
+    MobilParameters,
+)
+from ganlane.settings.traffic import (
+    GanCalibratedTrafficConfig,
+    GanTrafficConfig,
+)
 from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV
@@ -39,12 +46,18 @@ from ganlane.traffic.overlays import (
     LiteralLaneChange,
     SuddenAccelerations,
 )
-from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
+from ganlane.traffic.social_gan import (
+    AnchoredGanTraffic,
+    SocialGanTraffic,
+)
 
 #: Anchor of the calibrated traffic: the fitted one, with brisker acceleration and lane changes as
 #: fast as recorded ones.
 SIMULATED_ANCHOR: AnchorParameters = replace(
-    ANCHOR, idm=replace(ANCHOR.idm, max_acceleration=1.0), lane_stiffness=0.6, lane_damping=1.55
+    ANCHOR,
+    idm=replace(ANCHOR.idm, max_acceleration=1.0),
+    lane_stiffness=0.6,
+    lane_damping=1.55,
 )
 #: Wishes per executed lane change, measured in the simulation with 9 vehicles: a wish comes only
 #: while the driver is near its lane's centre, and waiting for a gap costs distance. A slow test
@@ -55,7 +68,11 @@ WISH_PER_CHANGE = 1.8
 def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralChanges:
     """Equations 9 to 11 with the numbers of all recordings given to the fit, held-out ones too."""
     changes = statistics.lane_changes
-    numbers = (changes.t_m_srlc_steps, changes.lateral_speed.mean, changes.lateral_speed.sd)
+    numbers = (
+        changes.t_m_srlc_steps,
+        changes.lateral_speed.mean,
+        changes.lateral_speed.sd,
+    )
     if None in numbers:
         raise UserError(
             f"{source}: its recordings hold no complete lane change, so equations 9 to 11 have no "
@@ -64,9 +81,12 @@ def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralCha
     return LiteralChanges(*(float(number) for number in numbers if number is not None))
 
 
-def sudden_accelerations(statistics: DrivingStatistics) -> SuddenAccelerations:
+def sudden_accelerations(
+    statistics: DrivingStatistics,
+) -> SuddenAccelerations:
     """Gaussian of the recorded accelerations over one second, of all scenes."""
-    recorded, default = statistics.acceleration_smoothed, SuddenAccelerations()
+    recorded = statistics.acceleration_smoothed
+    default = SuddenAccelerations()
     return SuddenAccelerations(
         # Where no acceleration was recorded these are None; 0 is a number.
         mean=default.mean if recorded.mean is None else recorded.mean,
@@ -102,7 +122,11 @@ def fitted_anchor(metadata: Mapping[str, Any], source: object) -> AnchorParamete
             f"further_inputs={further_inputs!r}, expected seconds above 0 and true or false; fit "
             "it again."
         )
-    return replace(SIMULATED_ANCHOR, washout_s=float(washout_s), further_inputs=further_inputs)
+    return replace(
+        SIMULATED_ANCHOR,
+        washout_s=float(washout_s),
+        further_inputs=further_inputs,
+    )
 
 
 def gan_traffic(
@@ -119,7 +143,8 @@ def gan_traffic(
 
     Args:
         road, stream: as for every traffic module.
-        path, guard, noise_scale, execute_k: see :class:`~ganlane.settings.traffic.GanTrafficConfig`.
+        path, guard, noise_scale, execute_k: see
+            :class:`~ganlane.settings.traffic.GanTrafficConfig`.
         idm: of the guard's bounds on acceleration.
 
     Raises:
@@ -130,7 +155,11 @@ def gan_traffic(
     statistics = DrivingStatistics.from_dict(metadata["driving_statistics"])
     parts: dict[str, TrafficModule] = {
         "generator": SocialGanTraffic(
-            generator, road, stream, noise_scale=noise_scale, execute_k=execute_k
+            generator,
+            road,
+            stream,
+            noise_scale=noise_scale,
+            execute_k=execute_k,
         ),
         "acceleration": AccelerationOverlay(road, stream, sudden_accelerations(statistics)),
         "lane_change": LiteralLaneChange(road, stream, literal_changes(statistics, source)),
@@ -174,7 +203,13 @@ def gan_calibrated_traffic(
     return TrafficSequential(
         {
             "generator": AnchoredGanTraffic(
-                generator, road, stream, noise_period_s, noise_scale, headways_s, anchor
+                generator,
+                road,
+                stream,
+                noise_period_s,
+                noise_scale,
+                headways_s,
+                anchor,
             ),
             "lane_change": CalibratedLaneChange(road, stream, CalibratedChanges(wishes), idm),
         }

@@ -53,7 +53,8 @@ def _with_tracks(frame: pl.DataFrame) -> pl.DataFrame:
     begins = ~(goes_on & same_scene).fill_null(False)
     index = pl.col("index")
     return frame.with_columns(
-        index=pl.int_range(pl.len(), dtype=pl.Int64), track=begins.cum_sum()
+        index=pl.int_range(pl.len(), dtype=pl.Int64),
+        track=begins.cum_sum(),
     ).with_columns(
         first=index.min().over("track"),
         last=index.max().over("track"),
@@ -92,7 +93,8 @@ def _starts(samples: pl.DataFrame, least: int) -> tuple[pl.DataFrame, Tensor]:
         [K, P] in their first frame: the vehicle that the ego replaces, then the others, nearest
         first, at most :data:`MOST_VEHICLES`; -1 where there are fewer.
     """
-    x, index = pl.col("x"), pl.col("index")
+    x = pl.col("x")
+    index = pl.col("index")
     moment = ["scene", "frame"]
     middle = x.quantile(0.5, "midpoint").over(moment)
     stays = pl.col("last") - index >= least
@@ -106,14 +108,19 @@ def _starts(samples: pl.DataFrame, least: int) -> tuple[pl.DataFrame, Tensor]:
         )
         .filter(pl.col("stays").any().over(moment))
     )
-    place, ego = there["index"].to_numpy(), there["ego"].to_numpy()
-    x_m, y_m = samples["x"].to_numpy(), samples["y"].to_numpy()
+    place = there["index"].to_numpy()
+    ego = there["ego"].to_numpy()
+    x_m = samples["x"].to_numpy()
+    y_m = samples["y"].to_numpy()
     distance = np.hypot(x_m[place] - x_m[ego], y_m[place] - y_m[ego])
     distance[place == ego] = -1.0
     there = (
         there.with_columns(distance=distance)
         .sort("scene", "frame", "distance", "index")
-        .with_columns(start=pl.struct(moment).rle_id(), rank=pl.int_range(pl.len()).over(moment))
+        .with_columns(
+            start=pl.struct(moment).rle_id(),
+            rank=pl.int_range(pl.len()).over(moment),
+        )
         .filter(pl.col("rank") < MOST_VEHICLES)
     )
     starts = there.filter(pl.col("rank") == 0)
@@ -184,9 +191,13 @@ class ReplayTraffic(TrafficModule):
             return_counts=True,
         )
         scene_names = tuple(names.tolist())
-        widths, counts = scene_lane_widths(frame), scene_lane_counts(frame)
+        widths = scene_lane_widths(frame)
+        counts = scene_lane_counts(frame)
         lanes = torch.tensor([counts[name] for name in scene_names])
-        width_m = torch.tensor([widths[name] for name in scene_names], dtype=torch.float64)
+        width_m = torch.tensor(
+            [widths[name] for name in scene_names],
+            dtype=torch.float64,
+        )
         # For sizes only; the road of a row is road_of's.
         super().__init__(Road(int(lanes.max()), float(width_m.mean())), stream)
         self.scene_names = scene_names
@@ -216,7 +227,11 @@ class ReplayTraffic(TrafficModule):
 
     def scenes_of_episodes(self, seed: int, episodes: Sequence[int]) -> list[str]:
         """Name of the scene of each of ``episodes``, for figures by scene."""
-        numbers = torch.tensor(list(episodes), dtype=torch.int64, device=self.scene.device)
+        numbers = torch.tensor(
+            list(episodes),
+            dtype=torch.int64,
+            device=self.scene.device,
+        )
         key = episode_key(self.stream, torch.full_like(numbers, seed), numbers)
         return [self.scene_names[number] for number in self.scene_of(key).tolist()]
 
@@ -232,7 +247,13 @@ class ReplayTraffic(TrafficModule):
         scene = self.scene_of(key)[:, None]
         return Road(self.lanes[scene], self.lane_width_m[scene].to(dtype))
 
-    def recorded(self, key: Tensor, step: Tensor, vehicles: int, dtype: torch.dtype) -> Vehicles:
+    def recorded(
+        self,
+        key: Tensor,
+        step: Tensor,
+        vehicles: int,
+        dtype: torch.dtype,
+    ) -> Vehicles:
         """The vehicles [N, ``vehicles``] as recorded ``step`` [N] steps after the start; x = 0 is
         the ego's start.
 
@@ -267,7 +288,13 @@ class ReplayTraffic(TrafficModule):
         """The initial scenes of this traffic."""
         return RecordedScenes(self, vehicles, ego_visibility, ego_desired_speed_mps)
 
-    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def move(
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
+    ) -> Moved:
         """The next recorded frame."""
         moved = self.recorded(key, step + 1, vehicles.x.shape[1], vehicles.x.dtype)
         return moved.with_first(vehicles.at(EGO_INDEX)), memory
@@ -302,7 +329,11 @@ class RecordedScenes:
         scene = self.traffic.recorded(key, torch.zeros_like(key), self.vehicles, dtype)
         is_ego = torch.arange(self.vehicles, device=key.device) == EGO_INDEX
         return scene.with_(
-            desired_speed=torch.where(is_ego, self.ego_desired_speed_mps, scene.desired_speed),
+            desired_speed=torch.where(
+                is_ego,
+                self.ego_desired_speed_mps,
+                scene.desired_speed,
+            ),
             visibility=torch.where(is_ego, int(self.ego_visibility), scene.visibility),
         )
 

@@ -30,7 +30,13 @@ from ganlane.settings.driving import Visibility
 from ganlane.settings.generator import EXTRA_INPUTS
 from ganlane.sim.random import Purpose, Stream, normal
 from ganlane.sim.state import Road, Vehicles
-from ganlane.traffic.base import Memory, MemoryFields, Moved, TrafficModule, uniforms
+from ganlane.traffic.base import (
+    Memory,
+    MemoryFields,
+    Moved,
+    TrafficModule,
+    uniforms,
+)
 
 #: Latent dimensions that :class:`ganlane.sim.random.Purpose` has room for.
 _MOST_NOISE = int(Purpose.RECYCLE) - int(Purpose.NOISE)
@@ -72,7 +78,8 @@ class GeneratedTraffic(TrafficModule):
                 "weights of this traffic's own preset."
             )
         self.generator = generator
-        self.noise_period_s, self.noise_scale = noise_period_s, noise_scale
+        self.noise_period_s = noise_period_s
+        self.noise_scale = noise_scale
         self.motions = [f"motion_{index}" for index in range(sizes.observed - 1)]
         self.purposes = [Purpose.NOISE + index for index in range(sizes.noise)]
         motions: MemoryFields = {name: ((4 * sizes.hidden,), None) for name in self.motions}
@@ -87,7 +94,13 @@ class GeneratedTraffic(TrafficModule):
         along = vehicles.speed * PHYSICS_STEP_S
         displacement = torch.stack([along, torch.zeros_like(along)], dim=-1)
         history = start(self.network(vehicles.x.dtype), displacement)
-        noise = normal(key, -1, vehicles.x.shape[1], self.purposes, vehicles.x.dtype)
+        noise = normal(
+            key,
+            -1,
+            vehicles.x.shape[1],
+            self.purposes,
+            vehicles.x.dtype,
+        )
         return {**self.remember(history), "noise": noise}
 
     def network(self, dtype: torch.dtype) -> Generator:
@@ -98,13 +111,19 @@ class GeneratedTraffic(TrafficModule):
 
     def remember(self, history: History) -> Memory:
         """The history as memory; motions move on by name, without copies."""
-        return {**dict(zip(self.motions, history.motions)), "displacement": history.displacement}
+        return {
+            **dict(zip(self.motions, history.motions)),
+            "displacement": history.displacement,
+        }
 
     def before(self, memory: Memory, key: Tensor, step: Tensor) -> tuple[History, Tensor]:
         """The drivers' history from the memory, and the latent vectors [N, M, Z] of this step."""
         noise = memory["noise"]
         fresh = normal(key, step, noise.shape[1], self.purposes, noise.dtype)
-        history = History(tuple(memory[name] for name in self.motions), memory["displacement"])
+        history = History(
+            tuple(memory[name] for name in self.motions),
+            memory["displacement"],
+        )
         return history, wander(noise, fresh, self.noise_period_s)
 
 
@@ -141,7 +160,10 @@ class SocialGanTraffic(GeneratedTraffic):
             )
         self.execute_k = execute_k
         if execute_k > 1:
-            plan: MemoryFields = {"plan": ((execute_k, 2), None), "plan_left": ((), torch.int64)}
+            plan: MemoryFields = {
+                "plan": ((execute_k, 2), None),
+                "plan_left": ((), torch.int64),
+            }
             self.memory_fields = {**self.memory_fields, **plan}
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
@@ -153,17 +175,30 @@ class SocialGanTraffic(GeneratedTraffic):
         return memory
 
     @torch.no_grad()
-    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def move(
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
+    ) -> Moved:
         """Predict, and drive the first displacement (or what is left of the plan)."""
         network = self.network(vehicles.x.dtype)
         history, noise = self.before(memory, key, step)
         plan = Plan(memory["plan"], memory["plan_left"]) if self.execute_k > 1 else None
         moved, history, plan = paper_step(
-            network, vehicles, history, self.noise_scale * noise, plan
+            network,
+            vehicles,
+            history,
+            self.noise_scale * noise,
+            plan,
         )
         new_memory = {**self.remember(history), "noise": noise}
         if plan is not None:
-            new_memory |= {"plan": plan.ahead, "plan_left": plan.left}
+            new_memory |= {
+                "plan": plan.ahead,
+                "plan_left": plan.left,
+            }
         return moved, new_memory
 
 
@@ -191,7 +226,8 @@ class AnchoredGanTraffic(GeneratedTraffic):
         anchor: AnchorParameters = ANCHOR,
     ) -> None:
         super().__init__(generator, road, stream, noise_period_s, noise_scale)
-        self.headway_quantiles_s, self.anchor = headway_quantiles_s, anchor
+        self.headway_quantiles_s = headway_quantiles_s
+        self.anchor = anchor
         self.memory_fields = {
             **self.memory_fields,
             "residual_mean": ((2,), None),
@@ -207,13 +243,31 @@ class AnchoredGanTraffic(GeneratedTraffic):
         return memory
 
     @torch.no_grad()
-    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def move(
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
+    ) -> Moved:
         """One :func:`~ganlane.generator.closed_loop.anchored_step`."""
         network = self.network(vehicles.x.dtype)
         history, noise = self.before(memory, key, step)
         driver = DriverMemory(history, memory["residual_mean"], memory["headway"])
         moved, driver = anchored_step(
-            network, vehicles, self.road, driver, self.noise_scale * noise, self.anchor
+            network,
+            vehicles,
+            self.road,
+            driver,
+            self.noise_scale * noise,
+            self.anchor,
         )
-        new_memory = {"noise": noise, "residual_mean": driver.mean, "headway": driver.headway}
-        return moved, {**self.remember(driver.history), **new_memory}
+        new_memory = {
+            "noise": noise,
+            "residual_mean": driver.mean,
+            "headway": driver.headway,
+        }
+        return moved, {
+            **self.remember(driver.history),
+            **new_memory,
+        }

@@ -10,7 +10,11 @@ from reference.small_networks import SIZES, small_generator
 
 from ganlane.data import default_scenes, read_scenes
 from ganlane.errors import UserError
-from ganlane.generator.checkpoint import FitResult, load_generator, shipped_generator
+from ganlane.generator.checkpoint import (
+    FitResult,
+    load_generator,
+    shipped_generator,
+)
 from ganlane.generator.fit import split_for_fit
 from ganlane.generator.forecasts import rollout_errors
 from ganlane.generator.tasks import PaperTask
@@ -26,17 +30,33 @@ def plain(record) -> dict:
     return json.loads(json.dumps(asdict(record)))
 
 
-def test_save_and_load_give_the_same_network_and_its_description(tmp_path):
-    path, config = tmp_path / "generator.safetensors", PaperConfig()
-    described = {"data": {"file": "a.csv"}, "statistics": {"headway": {}}}
+def test_save_and_load_give_the_same_network_and_its_description(
+    tmp_path,
+):
+    path = tmp_path / "generator.safetensors"
+    config = PaperConfig()
+    described = {
+        "data": {"file": "a.csv"},
+        "statistics": {"headway": {}},
+    }
     metrics = {"all": {"ade_m/mean": 0.5}}
-    fitted = FitResult(config, small_generator(), metrics, updates=7, seconds=1.25, **described)
+    fitted = FitResult(
+        config,
+        small_generator(),
+        metrics,
+        updates=7,
+        seconds=1.25,
+        **described,
+    )
     fitted.save(path, folds={"splits": []})
     generator, metadata = load_generator(path, "paper")
     for name, tensor in fitted.module.state_dict().items():
         assert (generator.state_dict()[name] == tensor).all(), name
     assert not any(parameter.requires_grad for parameter in generator.parameters())
-    assert metadata["metrics"] == {**metrics, "fit": {"updates": 7, "seconds": 1.2}}
+    assert metadata["metrics"] == {
+        **metrics,
+        "fit": {"updates": 7, "seconds": 1.2},
+    }
     assert metadata["config"] == plain(config)
     assert metadata["data"] == described["data"]
     assert metadata["driving_statistics"] == described["statistics"]
@@ -58,14 +78,30 @@ PLAIN_SIZES = asdict(SIZES)
 @pytest.mark.parametrize(
     ("wrong", "preset", "message"),
     [
-        ({"kind": "agent"}, None, "expected a ganlane checkpoint of kind generator"),
+        (
+            {"kind": "agent"},
+            None,
+            "expected a ganlane checkpoint of kind generator",
+        ),
         ({}, "calibrated", "expected 'calibrated'"),
         ({"preset": "own"}, None, "preset 'own'"),
         ({"sizes": None}, None, "not those of a generator"),
         ({"sizes": {"hidden": 3}}, None, "not those of a generator"),
-        ({"sizes": PLAIN_SIZES | {"hidden": 10**9}}, None, "not those of a generator"),
-        ({"sizes": PLAIN_SIZES | {"neighbours": True}}, None, "not those of a generator"),
-        ({"sizes": PLAIN_SIZES | {"noise": 20}}, None, "not those of a generator"),
+        (
+            {"sizes": PLAIN_SIZES | {"hidden": 10**9}},
+            None,
+            "not those of a generator",
+        ),
+        (
+            {"sizes": PLAIN_SIZES | {"neighbours": True}},
+            None,
+            "not those of a generator",
+        ),
+        (
+            {"sizes": PLAIN_SIZES | {"noise": 20}},
+            None,
+            "not those of a generator",
+        ),
         ({"sizes": PLAIN_SIZES | {"hidden": 20}}, None, "shapes"),
         ({"tensors": {"x": torch.zeros(2)}}, None, "shapes"),
         ({"preset": "calibrated"}, "calibrated", "further inputs"),
@@ -89,7 +125,14 @@ def test_wrong_checkpoints_are_refused_in_one_sentence(wrong, preset, message, t
 @pytest.mark.parametrize(
     ("preset", "most"),
     [
-        ("paper", {"ade_m/mean": 0.85, "ade_m/single": 0.95, "ade_m/best_of_20": 0.65}),
+        (
+            "paper",
+            {
+                "ade_m/mean": 0.85,
+                "ade_m/single": 0.95,
+                "ade_m/best_of_20": 0.65,
+            },
+        ),
         ("calibrated", {"ade_m/mean": 0.91, "end_m/mean": 0.75}),
     ],
 )
@@ -97,7 +140,10 @@ def test_the_shipped_weights_are_of_the_default_settings_and_beat_constant_veloc
     path = shipped_generator(preset)
     _, metadata = load_generator(path, preset)
     # The shipped files name their preset beside the settings.
-    assert {"preset": metadata["preset"], **metadata["config"]} == plain(CONFIGS[preset])
+    assert {
+        "preset": metadata["preset"],
+        **metadata["config"],
+    } == plain(CONFIGS[preset])
     assert path.stat().st_size < 5_000_000
     assert 0 < metadata["metrics"]["fit"]["seconds"] < 1800
     errors = metadata["metrics"]["all"]
@@ -108,7 +154,10 @@ def test_the_shipped_weights_are_of_the_default_settings_and_beat_constant_veloc
 
 @pytest.mark.parametrize(
     ("preset", "least"),
-    [("paper", {"mean": 15, "single": 5, "best_of_20": 35}), ("calibrated", {"mean": 9})],
+    [
+        ("paper", {"mean": 15, "single": 5, "best_of_20": 35}),
+        ("calibrated", {"mean": 9}),
+    ],
 )
 def test_pooled_over_folds_the_errors_stay_under_constant_velocitys_and_stand_in_the_docs(
     preset, least
@@ -125,8 +174,12 @@ def test_pooled_over_folds_the_errors_stay_under_constant_velocitys_and_stand_in
     if preset == "calibrated":
         assert folds["rollout"]["tracks"] > 400
         assert folds["rollout"]["ratio_to_constant_velocity"]["mean"] <= 0.75
-    page = (Path(__file__).parents[2] / "docs" / "generators.md").read_text()
-    texts = {"mean": "mean prediction", "single": "a single sample", "best_of_20": "best of 20"}
+    page = (Path(__file__).parents[2] / "docs" / "generator_results.md").read_text()
+    texts = {
+        "mean": "mean prediction",
+        "single": "a single sample",
+        "best_of_20": "best of 20",
+    }
     for kind, text in texts.items():
         begin = f"| `generator_{preset}`, {text}"
         row = next(line for line in page.splitlines() if line.startswith(begin))

@@ -5,14 +5,22 @@ from dataclasses import replace
 
 import pytest
 import torch
-from reference.small_networks import recorded_scenes, silenced, small_generator
+from reference.small_networks import (
+    recorded_scenes,
+    silenced,
+    small_generator,
+)
 from reference.worlds import vehicles as placed
 
 from ganlane.generator import closed_loop
 from ganlane.generator.networks import Generator
 from ganlane.generator.windows import cut_segments
 from ganlane.settings.generator import EXTRA_INPUTS, CalibratedConfig
-from ganlane.sim.idm import IdmParameters, equilibrium_gap, idm_acceleration
+from ganlane.sim.idm import (
+    IdmParameters,
+    equilibrium_gap,
+    idm_acceleration,
+)
 from ganlane.sim.state import Road, Visibility
 
 ROAD = Road(3, 4.0)
@@ -59,7 +67,9 @@ def test_without_a_residual_a_follower_settles_at_its_own_equilibrium_gap():
 
 
 def test_without_a_residual_a_lane_change_arrives_and_does_not_overshoot():
-    state, generator, course = vehicles([0.0], y=[0.0], target=[1]), silent_generator(), []
+    state = vehicles([0.0], y=[0.0], target=[1])
+    generator = silent_generator()
+    course = []
     for _ in range(20):
         state, _ = drive(generator, state, 0.5)
         course.append(state.y.item())
@@ -94,11 +104,9 @@ def test_a_network_that_always_pushes_sideways_does_not_push_the_body_out_of_its
 
 
 def test_only_what_pushes_outwards_is_left_out():
-    offset, still, room = (
-        torch.tensor([-1.0, -1.0, 0.0, 0.0]),
-        torch.tensor([0.0, 0.0, 0.0, 2.0]),
-        torch.tensor(0.8),
-    )
+    offset = torch.tensor([-1.0, -1.0, 0.0, 0.0])
+    still = torch.tensor([0.0, 0.0, 0.0, 2.0])
+    room = torch.tensor(0.8)
     push = torch.tensor([0.5, -0.5, 0.5, 0.5])
     allowed = closed_loop.inside_lane(push, offset, still, room, damping=1.1)
     torch.testing.assert_close(allowed, torch.tensor([0.0, -0.5, 0.5, 0.0]))
@@ -107,18 +115,23 @@ def test_only_what_pushes_outwards_is_left_out():
 def test_nobody_rolls_back_or_slides_sideways():
     state = vehicles([0.0, 0.0], speed=0.0)
     after = closed_loop.moved_by(
-        state, torch.tensor([[-3.0, 10.0]]).double(), torch.tensor([[2.0, 9.0]]).double()
+        state,
+        torch.tensor([[-3.0, 10.0]]).double(),
+        torch.tensor([[2.0, 9.0]]).double(),
     )
     assert (after.x[0, 0].item(), after.y[0, 0].item()) == (0.0, 0.0)
-    assert (after.y[0, 1].item(), after.heading[0, 1].item()) == pytest.approx(
-        (closed_loop.STEEPEST, math.atan(closed_loop.STEEPEST))
-    )
+    assert (
+        after.y[0, 1].item(),
+        after.heading[0, 1].item(),
+    ) == pytest.approx((closed_loop.STEEPEST, math.atan(closed_loop.STEEPEST)))
 
 
 def test_speed_and_heading_carry_the_whole_displacement():
     state = vehicles([100.0, 200.0])
     after = closed_loop.moved_by(
-        state, torch.tensor([[20.0, 7.0]]).double(), torch.tensor([[0.4, -1.0]]).double()
+        state,
+        torch.tensor([[20.0, 7.0]]).double(),
+        torch.tensor([[0.4, -1.0]]).double(),
     )
     step = torch.stack([after.x - state.x, after.y - state.y], dim=-1)
     torch.testing.assert_close(closed_loop.displacement_of(after), step, atol=1e-8, rtol=1e-8)
@@ -139,26 +152,31 @@ def test_headways_have_the_quantiles_asked_for():
     headways = closed_loop.headway_from_uniform((torch.arange(100000) + 0.5) / 100000)
     quantiles = headways.quantile(torch.tensor([0.05, 0.25, 0.5, 0.75, 0.95]))
     torch.testing.assert_close(
-        quantiles, torch.tensor(closed_loop.HEADWAY_QUANTILES_S), atol=1e-3, rtol=0
+        quantiles,
+        torch.tensor(closed_loop.HEADWAY_QUANTILES_S),
+        atol=1e-3,
+        rtol=0,
     )
 
 
 @pytest.mark.parametrize("execute_k", [1, 3])
-def test_the_paper_drives_the_first_k_predictions_before_planning_anew(execute_k):
-    generator, state = (
-        small_generator().double().requires_grad_(False),
-        vehicles([0.0, 25.0], y=[0.0, 4.0]),
-    )
-    history, noise = (
-        closed_loop.start(generator, closed_loop.displacement_of(state)),
-        torch.randn(1, 2, 4).double(),
-    )
+def test_the_paper_drives_the_first_k_predictions_before_planning_anew(
+    execute_k,
+):
+    generator = small_generator().double().requires_grad_(False)
+    state = vehicles([0.0, 25.0], y=[0.0, 4.0])
+    history = closed_loop.start(generator, closed_loop.displacement_of(state))
+    noise = torch.randn(1, 2, 4).double()
     past = closed_loop.displacement_of(state)[..., None, :].expand(1, 2, 8, 2)
     predicted = generator(
-        generator.observe(past, torch.stack([state.x, state.y], -1), state.valid), noise
+        generator.observe(past, torch.stack([state.x, state.y], -1), state.valid),
+        noise,
     )
     plan = (
-        closed_loop.Plan(torch.zeros(1, 2, 3, 2).double(), torch.zeros(1, 2, dtype=torch.long))
+        closed_loop.Plan(
+            torch.zeros(1, 2, 3, 2).double(),
+            torch.zeros(1, 2, dtype=torch.long),
+        )
         if execute_k > 1
         else None
     )
@@ -203,7 +221,8 @@ def test_a_rollout_is_the_same_with_more_padding(segments, generator):
         length=pad(segments.length, (0, 4), value=1.0),
     )
     torch.testing.assert_close(
-        typical_rollout(generator, wide)[:, :, :7], typical_rollout(generator, segments)
+        typical_rollout(generator, wide)[:, :, :7],
+        typical_rollout(generator, segments),
     )
 
 
@@ -223,7 +242,11 @@ def test_gradient_of_a_rollout_is_finite_and_reaches_every_parameter(scenes, gen
     segments = cut_segments([(scenes[0], 0), (scenes[1], 9)], horizon=6)
     noise = torch.randn(7, 3, 2, 7, 4)
     positions = closed_loop.rollout(
-        generator, segments, closed_loop.driver_params(segments), noise, CalibratedConfig()
+        generator,
+        segments,
+        closed_loop.driver_params(segments),
+        noise,
+        CalibratedConfig(),
     )
     (positions - segments.future).abs()[:, segments.scored].sum().backward()
     for name, parameter in generator.named_parameters():
@@ -236,10 +259,15 @@ def test_nothing_of_the_future_enters_an_evaluation(segments, generator):
     before = typical_rollout(generator, segments.without_intentions())
     segments.positions[:, 9:] += 7.0
     segments.target_lane[:, 9:] = 0
-    torch.testing.assert_close(typical_rollout(generator, segments.without_intentions()), before)
+    torch.testing.assert_close(
+        typical_rollout(generator, segments.without_intentions()),
+        before,
+    )
 
 
-def test_sampled_driver_params_are_above_the_present_speed_and_repeatable(segments):
+def test_sampled_driver_params_are_above_the_present_speed_and_repeatable(
+    segments,
+):
     one, other = (
         closed_loop.driver_params(segments, random=torch.Generator().manual_seed(4))
         for _ in range(2)

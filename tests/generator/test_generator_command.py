@@ -10,12 +10,22 @@ from pathlib import Path
 import polars as pl
 import pytest
 from reference.file_server import Server
-from reference.recordings import START_MS, ngsim_rows, portal_csv, raw_text, traffic
+from reference.recordings import (
+    START_MS,
+    ngsim_rows,
+    portal_csv,
+    raw_text,
+    traffic,
+)
 
 import ganlane.evaluation
 import ganlane.generator
 from ganlane.config.run import run_command
-from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
+from ganlane.data import (
+    SyntheticTraffic,
+    synthetic_scenes,
+    write_scene_csv,
+)
 from ganlane.generator.checkpoint import load_generator
 from ganlane.realism.starts import check_folds_cover, fold_weights
 
@@ -41,7 +51,10 @@ def here(tmp_path, monkeypatch):
 def recordings(here):
     """A scene CSV in the current folder."""
     path = here / "recordings.csv"
-    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=5, seconds=4.0)), path)
+    write_scene_csv(
+        synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=5, seconds=4.0)),
+        path,
+    )
     return f"data.path={path}"
 
 
@@ -101,18 +114,27 @@ def test_what_was_fitted_stays_where_a_later_step_fails(recordings, capsys, monk
 
 def test_too_many_folds_are_refused_before_ablations_are_fitted(recordings, capsys, monkeypatch):
     fitted = []
-    monkeypatch.setattr(ganlane.generator, "ablate", lambda *arguments: fitted.append(arguments))
+    monkeypatch.setattr(
+        ganlane.generator,
+        "ablate",
+        lambda *arguments: fitted.append(arguments),
+    )
     assert main([recordings, "ablations=true", "folds=9", *FEW]) == 2
     assert "folds=9" in capsys.readouterr().err
     assert not fitted
 
 
-def test_the_periods_of_an_ngsim_file_are_the_scenes_whether_fetched_or_prepared(here):
+def test_the_periods_of_an_ngsim_file_are_the_scenes_whether_fetched_or_prepared(
+    here,
+):
     scenes = traffic(scenes=3).partition_by("scene", maintain_order=True)
     rows = pl.concat(ngsim_rows(scene, START_MS + 900_000 * k) for k, scene in enumerate(scenes))
     with Server(content=portal_csv(rows).encode()) as server:
         fetched = run(
-            "data=ngsim", "data.path=got.csv", "data.download=true", f"data.url={server.url}"
+            "data=ngsim",
+            "data.path=got.csv",
+            "data.download=true",
+            f"data.url={server.url}",
         )
     data = fetched["data"]
     assert (data["fitted"], data["validation"], data["held_out"]) == (
@@ -120,7 +142,11 @@ def test_the_periods_of_an_ngsim_file_are_the_scenes_whether_fetched_or_prepared
         ["us-101-1"],
         ["us-101-2"],
     )
-    assert (data["file"], data["rows"], data["tracks"]) == ("got.csv", 3 * 9 * 60, 27)
+    assert (data["file"], data["rows"], data["tracks"]) == (
+        "got.csv",
+        3 * 9 * 60,
+        27,
+    )
     assert prepare(["data=ngsim", "data.path=got.csv", "out=prepared"]) == 0
     prepared = run("data.path=prepared")
     for name in ("ade_m", "fde_m", "scenes"):
@@ -130,7 +156,10 @@ def test_the_periods_of_an_ngsim_file_are_the_scenes_whether_fetched_or_prepared
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
-        (["data=ngsim"], "data=ngsim: which file is missing; give data.path=FILE."),
+        (
+            ["data=ngsim"],
+            "data=ngsim: which file is missing; give data.path=FILE.",
+        ),
         (
             ["data=ngsim", "data.path=one.txt"],
             "recordings of one scene, one-1: one has to be fitted to and another",
@@ -149,4 +178,8 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing(arguments, part, here, rec
     err = capsys.readouterr().err
     assert part in err
     assert err.count("\n") == 1
-    assert sorted(path.name for path in here.iterdir()) == ["cut.txt", "one.txt", "recordings.csv"]
+    assert sorted(path.name for path in here.iterdir()) == [
+        "cut.txt",
+        "one.txt",
+        "recordings.csv",
+    ]

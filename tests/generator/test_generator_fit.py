@@ -22,14 +22,21 @@ from ganlane.generator.fit import (
     variants,
 )
 from ganlane.generator.windows import count_windows, scene_tracks
-from ganlane.settings.generator import CalibratedConfig, LoopConfig, PaperConfig
+from ganlane.settings.generator import (
+    CalibratedConfig,
+    LoopConfig,
+    PaperConfig,
+)
 
 
 @pytest.fixture(scope="module")
 def scenes():
     """Seven scenes of 2.5 to 8.5 s, so that they differ in their windows."""
     frames = [
-        synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=6, seconds=2.5 + number), seed=number)
+        synthetic_scenes(
+            SyntheticTraffic(scenes=1, vehicles=6, seconds=2.5 + number),
+            seed=number,
+        )
         for number in range(7)
     ]
     return [
@@ -61,7 +68,9 @@ def test_reported_scenes_have_no_say_in_when_to_stop(scenes):
         assert total / 12 <= held < total / 2
 
 
-def test_a_single_other_scene_is_fitted_to_and_chooses_when_to_stop(scenes):
+def test_a_single_other_scene_is_fitted_to_and_chooses_when_to_stop(
+    scenes,
+):
     split = split_for_fit(scenes[:2], ("scene-1",))
     assert split.names == {
         "fitted": ["scene-0"],
@@ -70,12 +79,18 @@ def test_a_single_other_scene_is_fitted_to_and_chooses_when_to_stop(scenes):
     }
 
 
-def test_more_folds_than_scenes_and_splits_without_two_parts_are_refused(scenes):
+def test_more_folds_than_scenes_and_splits_without_two_parts_are_refused(
+    scenes,
+):
     with pytest.raises(UserError, match="folds=8"):
         assign_folds(scenes, 8)
     with pytest.raises(UserError, match="at least 3 scenes"):
         assign_folds(scenes[:2], 2)
-    for held_out in (("nowhere",), (), tuple(scene.name for scene in scenes)):
+    for held_out in (
+        ("nowhere",),
+        (),
+        tuple(scene.name for scene in scenes),
+    ):
         with pytest.raises(UserError, match=r"data\.held_out="):
             split_for_fit(scenes, held_out)
 
@@ -88,8 +103,14 @@ def frame():
 def test_a_fit_reports_the_held_out_scenes(frame):
     result = fit_generator(CALIBRATED, frame, ("synthetic-1",), source="folder/made.csv")
     assert set(result.metrics) == {"all", "synthetic-1"}
-    assert {*result.data["fitted"], *result.data["validation"]} == {"synthetic-0", "synthetic-2"}
-    assert (result.data["held_out"], result.data["file"]) == (["synthetic-1"], "made.csv")
+    assert {*result.data["fitted"], *result.data["validation"]} == {
+        "synthetic-0",
+        "synthetic-2",
+    }
+    assert (result.data["held_out"], result.data["file"]) == (
+        ["synthetic-1"],
+        "made.csv",
+    )
     assert result.updates in (2, 4)
     assert {"headway", "lane_changes"} <= set(result.statistics)
 
@@ -111,15 +132,28 @@ def calibrated(frame, folder):
     return cross_validate(CALIBRATED, frame, 3, folder, source="folder/made.csv")
 
 
-def test_every_scene_is_forecast_once_by_a_generator_that_never_saw_it(paper):
+def test_every_scene_is_forecast_once_by_a_generator_that_never_saw_it(
+    paper,
+):
     scores, _ = paper
-    splits, open_loop = scores["splits"], scores["open_loop"]
+    splits = scores["splits"]
+    open_loop = scores["open_loop"]
     held_out = {name for split in splits for name in split["held_out"]}
     assert held_out == set(open_loop["scenes"])
     for split in splits:
-        assert not set(split["held_out"]) & {*split["fitted"], *split["validation"]}
+        assert not set(split["held_out"]) & {
+            *split["fitted"],
+            *split["validation"],
+        }
     assert open_loop["windows"] == sum(row["windows"] for row in open_loop["folds"].values()) > 0
-    kinds = {"mean", "single", "best_of_20", "constant_velocity", "ridge", "idm"}
+    kinds = {
+        "mean",
+        "single",
+        "best_of_20",
+        "constant_velocity",
+        "ridge",
+        "idm",
+    }
     assert kinds | {"constant_acceleration"} <= set(open_loop["ade_m"])
     assert "best_of_20" in fold_tables(scores)
 
@@ -136,11 +170,19 @@ def test_what_is_fitted_is_not_fitted_again_and_gives_the_same(frame, folder, pa
     assert len(updates) == 3 * LOOP.updates
 
 
-def test_the_calibrated_preset_is_also_rolled_out_for_five_seconds(calibrated):
+def test_the_calibrated_preset_is_also_rolled_out_for_five_seconds(
+    calibrated,
+):
     scores, _ = calibrated
     rollout = scores["rollout"]
     assert rollout["tracks"] == 15
-    assert list(rollout["rmse_m"]["mean"]) == ["1 s", "2 s", "3 s", "4 s", "5 s"]
+    assert list(rollout["rmse_m"]["mean"]) == [
+        "1 s",
+        "2 s",
+        "3 s",
+        "4 s",
+        "5 s",
+    ]
     assert rollout["ratio_to_constant_velocity"]["constant_velocity"] == 1.0
     assert scores["open_loop"]["windows"] > rollout["windows"]
     assert "Social-GAN (published)" in fold_tables(scores)
@@ -170,7 +212,9 @@ def flat(config) -> dict:
 
 
 @pytest.mark.parametrize("config", [PaperConfig(), CalibratedConfig()])
-def test_every_variant_has_a_quarter_of_the_updates_and_differs_in_its_part_alone(config):
+def test_every_variant_has_a_quarter_of_the_updates_and_differs_in_its_part_alone(
+    config,
+):
     first, *others = ((name, flat(variant)) for name, variant in variants(config).items())
     assert first[1]["loop.updates"] == config.loop.updates // 4
     for name, variant in others:

@@ -7,7 +7,12 @@ from reference.small_networks import silenced, small_generator
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.generator import forecasts
-from ganlane.generator.windows import Windows, cut_windows, group_windows, scene_tracks
+from ganlane.generator.windows import (
+    Windows,
+    cut_windows,
+    group_windows,
+    scene_tracks,
+)
 from ganlane.settings.generator import EXTRA_INPUTS, CalibratedConfig
 
 
@@ -39,14 +44,20 @@ def test_errors_by_hand():
     row = forecasts.displacement_errors(errors)
     assert row["ade_m"] == {"own": 2.25, "constant_velocity": 4.5}
     assert row["fde_m"]["own"] == 2.0
-    assert row["ade_change_percent"] == {"own": -50.0, "constant_velocity": 0.0}
+    assert row["ade_change_percent"] == {
+        "own": -50.0,
+        "constant_velocity": 0.0,
+    }
     assert forecasts.displacement_errors(errors, np.array([False, True]))["ade_m"]["own"] == 1.5
 
 
 def test_root_mean_square_after_whole_seconds():
     errors = np.zeros((2, 25))
     errors[:, 9], errors[:, 19] = [3.0, 4.0], [6.0, 8.0]
-    expected = {"1 s": pytest.approx(np.sqrt(12.5)), "2 s": pytest.approx(np.sqrt(50.0))}
+    expected = {
+        "1 s": pytest.approx(np.sqrt(12.5)),
+        "2 s": pytest.approx(np.sqrt(50.0)),
+    }
     assert forecasts.rmse_by_second({"own": errors}) == {"own": expected}
 
 
@@ -58,17 +69,26 @@ def sideways(*moves_m: float) -> np.ndarray:
 
 
 def test_direction_counts_only_who_moves_sideways():
-    recorded, course = sideways(0.2, -0.2, 0.05, -0.3), sideways(0.01, 0.4, -1.0, -0.1)
+    recorded = sideways(0.2, -0.2, 0.05, -0.3)
+    course = sideways(0.01, 0.4, -1.0, -0.1)
     scores = forecasts.direction_scores({"own": course, "still": 0 * course}, recorded)
     assert scores["windows"] == 3
-    assert scores["share_right"] == {"own": pytest.approx(2 / 3), "still": 0.0}
+    assert scores["share_right"] == {
+        "own": pytest.approx(2 / 3),
+        "still": 0.0,
+    }
 
 
 def test_parts_are_lanes_and_classes_with_enough_windows():
     windows = windows_of(np.zeros((6, 8, 2)), [1, 1, 1, 2, 2, 3], [4, 4, 4, 7, 7, 4])
     parts = forecasts.parts_of(windows, 2)
     windows_by_part = {name: int(rows.sum()) for name, rows in parts.items()}
-    assert windows_by_part == {"lane 1": 3, "lane 2": 2, "car": 4, "truck": 2}
+    assert windows_by_part == {
+        "lane 1": 3,
+        "lane 2": 2,
+        "car": 4,
+        "truck": 2,
+    }
 
 
 def test_every_part_is_held_against_the_baseline():
@@ -91,7 +111,8 @@ def test_every_part_is_held_against_the_baseline():
 
 
 def test_over_the_whole_window_the_observed_move_counts_too():
-    recorded, course = sideways(-0.05, 0.3), sideways(0.0, -0.1)
+    recorded = sideways(-0.05, 0.3)
+    course = sideways(0.0, -0.1)
     scores = forecasts.direction_scores({"own": course}, recorded, observed=np.array([0.4, 0.02]))
     assert scores == {"windows": 2, "share_right": {"own": 0.5}}
     assert forecasts.direction_scores({"own": course}, recorded) == {
@@ -103,7 +124,8 @@ def test_over_the_whole_window_the_observed_move_counts_too():
 def test_the_side_classifier_finds_what_the_history_tells_and_no_more():
     random = np.random.default_rng(0)
     count = 600
-    past, luck = random.normal(size=count), random.normal(size=count)
+    past = random.normal(size=count)
+    luck = random.normal(size=count)
     fold = np.arange(count) % 2
     shares = []
     for source in (past, luck):
@@ -151,11 +173,17 @@ def test_the_best_of_the_samples_is_the_nearest_on_average():
     kinds = forecasts.by_kind(samples, recorded)
     np.testing.assert_array_equal(kinds["best_of_20"], np.stack([samples[4, 0], samples[9, 1]]))
     assert forecasts.by_kind(samples[:1], recorded).keys() == {"mean"}
-    assert forecasts.by_kind(samples[:2], recorded).keys() == {"mean", "single"}
+    assert forecasts.by_kind(samples[:2], recorded).keys() == {
+        "mean",
+        "single",
+    }
 
 
-def test_forecasts_of_the_papers_preset_score_alike_in_a_fit_and_over_folds(scenes):
-    generator, windows = small_generator(0), cut_windows(scenes, STRIDE)
+def test_forecasts_of_the_papers_preset_score_alike_in_a_fit_and_over_folds(
+    scenes,
+):
+    generator = small_generator(0)
+    windows = cut_windows(scenes, STRIDE)
     predicted = forecasts.paper_forecasts(generator, windows, group_windows(windows, 4))
     predicted["constant_velocity"] = forecasts.repeated(windows.past[:, -1], 8)
     row = forecasts.displacement_errors(forecasts.errors_of(predicted, windows.future))
@@ -172,7 +200,9 @@ def test_forecasts_of_the_papers_preset_score_alike_in_a_fit_and_over_folds(scen
     assert row["ade_m"]["best_of_20"] < row["ade_m"]["mean"] < 1.5 * row["ade_m"]["single"]
 
 
-def test_without_noise_in_the_weights_all_samples_of_a_rollout_agree(scenes):
+def test_without_noise_in_the_weights_all_samples_of_a_rollout_agree(
+    scenes,
+):
     generator = silenced(small_generator(EXTRA_INPUTS))
     driven = forecasts.calibrated_forecasts(
         generator, scenes, 8, STRIDE, CalibratedConfig(), samples=3
@@ -216,7 +246,9 @@ def test_steady_driving_is_foreseen_by_all():
 def test_steady_acceleration_is_foreseen_by_constant_acceleration_alone():
     windows = windows_of(course(10.0, 1.5))
     np.testing.assert_allclose(
-        forecasts.constant_acceleration(windows.past, 8), windows.future, atol=1e-9
+        forecasts.constant_acceleration(windows.past, 8),
+        windows.future,
+        atol=1e-9,
     )
     # the displacement grows by 0.015 m a step, so after 8 steps 0.015 * (1 + 2 + ... + 8) m are
     # missing
@@ -245,15 +277,20 @@ def noisy_followers(count: int) -> np.ndarray:
 
 
 def test_ridge_regression_finds_a_linear_law_and_keeps_left_and_right_alike():
-    fitted, fresh = windows_of(noisy_followers(400)), windows_of(noisy_followers(50))
+    fitted = windows_of(noisy_followers(400))
+    fresh = windows_of(noisy_followers(50))
     predicted = forecasts.ridge_forecast(fitted, fresh.past)
     assert np.abs(predicted - fresh.future).mean() < 0.02 * np.abs(fresh.future).mean()
     np.testing.assert_allclose(
-        forecasts.ridge_forecast(fitted, fresh.past * (1, -1)), predicted * (1, -1), atol=1e-8
+        forecasts.ridge_forecast(fitted, fresh.past * (1, -1)),
+        predicted * (1, -1),
+        atol=1e-8,
     )
 
 
-def test_metrics_of_rollouts_name_every_scene_and_count_its_vehicles(scenes):
+def test_metrics_of_rollouts_name_every_scene_and_count_its_vehicles(
+    scenes,
+):
     config = CalibratedConfig(held_out_horizon=9, held_out_stride=20)
     metrics = forecasts.rollout_errors(small_generator(EXTRA_INPUTS), scenes, config)
     assert set(metrics) == {"all", "synthetic-0", "synthetic-1"}
@@ -270,7 +307,9 @@ def test_the_energy_score_is_least_for_the_right_spread():
     recorded = torch.randn(20000, 2)
     scores = {
         spread: forecasts.energy_score(
-            spread * torch.randn(20000, 2), spread * torch.randn(20000, 2), recorded
+            spread * torch.randn(20000, 2),
+            spread * torch.randn(20000, 2),
+            recorded,
         )
         .mean()
         .item()

@@ -47,13 +47,15 @@ def now(scene, generator):
 @pytest.mark.parametrize("shape", [(3, 5), (700, 5), (80, 9, 5)])
 def test_it_is_a_linear_layer_for_few_rows_and_for_many(shape, relu):
     torch.manual_seed(0)
-    layer, x = nn.Linear(5, 7), torch.randn(*shape)
+    layer = nn.Linear(5, 7)
+    x = torch.randn(*shape)
     expected = layer(x).relu() if relu else layer(x)
     with torch.no_grad():
         torch.testing.assert_close(networks.apply(layer, x, relu), expected)
         torch.testing.assert_close(networks.dense(x, layer.weight), x @ layer.weight.T)
         torch.testing.assert_close(
-            networks.apply(layer.double(), x.double(), relu).float(), expected
+            networks.apply(layer.double(), x.double(), relu).float(),
+            expected,
         )
 
 
@@ -81,10 +83,12 @@ def test_the_recurrence_is_torchs_own_lstm():
         reference.bias_ih_l0.copy_(lstm.input.bias[order])
         reference.weight_hh_l0.copy_(lstm.recurrent[order])
         reference.bias_hh_l0.zero_()
-    displacement, difference = torch.randn(4, 6, 2), 0.05 * torch.randn(4, 6, 2)
+    displacement = torch.randn(4, 6, 2)
+    difference = 0.05 * torch.randn(4, 6, 2)
     embedded = torch.relu(lstm.embed(networks.motion_features(displacement, difference)))
     torch.testing.assert_close(
-        lstm.encode(lstm.project(displacement, difference)), reference(embedded)[1][0][0]
+        lstm.encode(lstm.project(displacement, difference)),
+        reference(embedded)[1][0][0],
     )
 
 
@@ -99,24 +103,40 @@ def test_pooling_does_not_depend_on_the_order_of_vehicles(pooled):
 def test_pooling_ignores_padding(pooled, count):
     pooling, whole = pooled
     hidden, position, motion, mask = arguments = [part[:, :count] for part in whole]
-    expected, real = pooling(*arguments), mask[..., None]
+    expected = pooling(*arguments)
+    real = mask[..., None]
     noisy = pooling(
-        torch.where(real, hidden, 99.0), torch.where(real, position, -3.0), motion, mask
+        torch.where(real, hidden, 99.0),
+        torch.where(real, position, -3.0),
+        motion,
+        mask,
     )
     torch.testing.assert_close(noisy[mask], expected[mask])
-    torch.testing.assert_close(pooling(*(part[1:2, :7] for part in arguments)), expected[1:2, :7])
+    torch.testing.assert_close(
+        pooling(*(part[1:2, :7] for part in arguments)),
+        expected[1:2, :7],
+    )
 
 
 def test_the_split_first_layer_equals_the_whole_one(pooled):
     pooling, (hidden, position, motion, mask) = pooled
     index, seen = networks.nearest(position, mask, 8)
     state = torch.cat(
-        [position / torch.tensor([20.0, 4.0]), motion / torch.tensor([0.4, 0.05])], dim=-1
+        [
+            position / torch.tensor([20.0, 4.0]),
+            motion / torch.tensor([0.4, 0.05]),
+        ],
+        dim=-1,
     )
     pairs = networks.gather_vehicles(state, index) - state[..., None, :]
     whole = nn.Linear(4 + 12, 10)
     with torch.no_grad():
-        whole.weight.copy_(torch.cat([pooling.per_pair.weight, pooling.per_vehicle.weight], dim=1))
+        whole.weight.copy_(
+            torch.cat(
+                [pooling.per_pair.weight, pooling.per_vehicle.weight],
+                dim=1,
+            )
+        )
         whole.bias.copy_(pooling.per_pair.bias)
     first = torch.relu(whole(torch.cat([pairs, networks.gather_vehicles(hidden, index)], dim=-1)))
     expected = torch.relu(pooling.second(first)).masked_fill(~seen[..., None], 0.0).amax(-2)
@@ -143,17 +163,25 @@ def test_a_few_vehicles_are_all_each_others_neighbours(scene):
 
 def test_vehicles_out_of_range_have_no_influence():
     position = torch.tensor(
-        [[[0.0, 0.0], [networks.RANGE_M + 1.0, 0.0], [networks.RANGE_M - 1.0, 0.0]]]
+        [
+            [
+                [0.0, 0.0],
+                [networks.RANGE_M + 1.0, 0.0],
+                [networks.RANGE_M - 1.0, 0.0],
+            ]
+        ]
     )
     _, seen = networks.nearest(position, torch.ones(1, 3, dtype=torch.bool), 8)
     assert seen[0, 0].tolist() == [False, False, True]
 
 
 def test_a_recorded_jump_is_cut_off_before_it_reaches_the_network():
-    jump, cut = torch.tensor([1.5, 0.0]), torch.tensor([5.0 * networks.DIFFERENCE_SCALE_M[0], 0.0])
+    jump = torch.tensor([1.5, 0.0])
+    cut = torch.tensor([5.0 * networks.DIFFERENCE_SCALE_M[0], 0.0])
     same = torch.zeros(2)
     torch.testing.assert_close(
-        networks.motion_features(same, jump), networks.motion_features(same, cut)
+        networks.motion_features(same, jump),
+        networks.motion_features(same, cut),
     )
 
 
@@ -167,7 +195,8 @@ def test_with_a_head_of_zeros_the_prediction_is_constant_velocity(scene, generat
 def test_the_first_k_decoder_steps_are_those_of_the_whole(generator, now, execute_k):
     noise = torch.randn(3, 13, 4)
     torch.testing.assert_close(
-        generator(now, noise, execute_k), generator(now, noise)[..., :execute_k, :]
+        generator(now, noise, execute_k),
+        generator(now, noise)[..., :execute_k, :],
     )
 
 
@@ -184,7 +213,8 @@ def test_kept_projections_equal_those_computed_anew(generator):
         anew = generator.project(displacements[..., step - 7 : step + 1, :])
         torch.testing.assert_close(torch.stack(history.motions, -2), anew)
         torch.testing.assert_close(
-            difference, displacements[..., step, :] - displacements[..., step - 1, :]
+            difference,
+            displacements[..., step, :] - displacements[..., step - 1, :],
         )
 
 
@@ -192,7 +222,8 @@ def test_a_fresh_history_is_that_of_constant_velocity(generator):
     displacement = torch.tensor([[[1.7, 0.0], [0.9, 0.0]]])
     always = displacement[..., None, :].expand(1, 2, 8, 2)
     torch.testing.assert_close(
-        torch.stack(start(generator, displacement).motions, -2), generator.project(always)
+        torch.stack(start(generator, displacement).motions, -2),
+        generator.project(always),
     )
 
 

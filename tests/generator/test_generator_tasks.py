@@ -8,7 +8,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from reference.small_networks import CALIBRATED, PAPER, SIZES, recorded_scenes
+from reference.small_networks import (
+    CALIBRATED,
+    PAPER,
+    SIZES,
+    recorded_scenes,
+)
 
 from ganlane.errors import UserError
 from ganlane.generator import tasks
@@ -24,7 +29,9 @@ def paper_task(scenes, **changes) -> tasks.PaperTask:
     loop = LoopConfig(evaluate_every=10, learning_rate=5e-3, warmup=1, **changes)
     fitted, validation = scenes
     return tasks.PaperTask(
-        [fitted], [validation], replace(PAPER, loop=loop, stride=4, samples=3, batch=8)
+        [fitted],
+        [validation],
+        replace(PAPER, loop=loop, stride=4, samples=3, batch=8),
     )
 
 
@@ -33,13 +40,21 @@ def test_fitting_the_papers_preset_lowers_its_error(scenes):
     tasks.FitLoop(paper_task(scenes, updates=40)).run(seen.append)
     losses = [progress.losses["mean"] for progress in seen]
     assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
-    assert set(seen[-1].losses) == {"variety", "single", "mean", "adversarial", "discriminator"}
+    assert set(seen[-1].losses) == {
+        "variety",
+        "single",
+        "mean",
+        "adversarial",
+        "discriminator",
+    }
 
 
 def test_the_calibrated_loss_falls(scenes):
     fitted, validation = scenes
     task = tasks.CalibratedTask(
-        [fitted], [validation], replace(CALIBRATED, horizons=(4, 6), shares=(1.0, 1.0), batch=3)
+        [fitted],
+        [validation],
+        replace(CALIBRATED, horizons=(4, 6), shares=(1.0, 1.0), batch=3),
     )
     task.optimisers["generator"].param_groups[0]["lr"] = 5e-3
     losses = [task.update(0)["mean"] for _ in range(16)]
@@ -72,7 +87,8 @@ def test_foreign_states_are_refused(scenes, tmp_path):
     path.unlink()
     tasks.FitLoop(task, path).run()
     other = tasks.PaperTask(
-        *([scene] for scene in scenes), replace(task.config, sizes=replace(SIZES, hidden=20))
+        *([scene] for scene in scenes),
+        replace(task.config, sizes=replace(SIZES, hidden=20)),
     )
     with pytest.raises(UserError, match="another fit"):
         tasks.FitLoop(other, path)
@@ -89,7 +105,8 @@ def test_the_learning_rate_rises_and_then_falls_to_nothing():
 def test_distances_are_euclidean_accumulate_and_have_a_finite_gradient_at_0():
     predicted = torch.tensor([[[3.0, 4.0], [0.0, 0.0], [3.0, 4.0]]])
     torch.testing.assert_close(
-        tasks.distances(predicted, torch.zeros(1, 3, 2)), torch.tensor([[5.0, 5.0, 10.0]])
+        tasks.distances(predicted, torch.zeros(1, 3, 2)),
+        torch.tensor([[5.0, 5.0, 10.0]]),
     )
     perfect = torch.zeros(1, 8, 2, requires_grad=True)
     tasks.distances(perfect, torch.zeros(1, 8, 2)).sum().backward()
@@ -102,7 +119,8 @@ def test_losses_by_hand():
     assert tasks.masked_mean(values, torch.tensor([[True, False]])).item() == 1.0
     assert tasks.masked_mean(values, torch.zeros(1, 2, dtype=torch.bool)).item() == 0.0
     # An undecided discriminator loses ln 2; accuracy counts both kinds alike.
-    zeros, ones = torch.zeros(1, 2), torch.ones(1, 2)
+    zeros = torch.zeros(1, 2)
+    ones = torch.ones(1, 2)
     for recorded in (0.0, 1.0):
         assert tasks.cross_entropy(zeros, recorded).item() == pytest.approx(math.log(2))
     assert [

@@ -31,12 +31,16 @@ def recording(seed: int = 0, scenes: int = 3, vehicles: int = 14) -> pl.DataFram
     rows = []
     for scene in range(scenes):
         for vehicle in range(vehicles):
-            first, last = random.integers(0, 12), random.integers(20, 40)
-            gap, lane = random.integers(0, 60), vehicle % 3
-            x, y = random.uniform(0, 200), 3.5 * lane
+            first = random.integers(0, 12)
+            last = random.integers(20, 40)
+            gap = random.integers(0, 60)
+            lane = vehicle % 3
+            x = random.uniform(0, 200)
+            y = 3.5 * lane
             for frame in range(100 + first, 100 + last):
                 if frame != 100 + gap:
-                    x, y = x + random.uniform(0.5, 2.0), y + random.normal(0, 0.05)
+                    x = x + random.uniform(0.5, 2.0)
+                    y = y + random.normal(0, 0.05)
                     rows.append(
                         (
                             f"scene-{scene}",
@@ -71,7 +75,9 @@ def test_tracks_go_on_at_constant_velocity_beyond_their_ends(scenes):
     np.testing.assert_allclose(endless[:, 0, 0], [8, 9, 10, 11, 13, 15])
 
 
-def test_a_changer_intends_its_new_lane_two_seconds_before_it_is_there(scenes):
+def test_a_changer_intends_its_new_lane_two_seconds_before_it_is_there(
+    scenes,
+):
     lanes = scenes[0].lane
     changer = next(v for v in range(lanes.shape[1]) if len(set(lanes[:, v])) == 2)
     crossed = int((lanes[:, changer] != lanes[0, changer]).argmax())
@@ -82,12 +88,15 @@ def test_a_changer_intends_its_new_lane_two_seconds_before_it_is_there(scenes):
 def test_cut_segments_show_the_recorded_positions(scenes):
     segments = cut_segments([(scenes[0], 3), (scenes[1], 5)], horizon=6)
     assert segments.positions.shape == (2, 15, 7, 2)
-    recorded, shown = scenes[1].positions[5:20], segments.positions[1].numpy()
+    recorded = scenes[1].positions[5:20]
+    shown = segments.positions[1].numpy()
     np.testing.assert_allclose(np.diff(shown, axis=0), np.diff(recorded, axis=0), atol=1e-4)
     np.testing.assert_allclose(shown[..., 1], recorded[..., 1], atol=1e-5)
 
 
-def test_mirroring_twice_changes_nothing_and_once_swaps_the_lanes(scenes):
+def test_mirroring_twice_changes_nothing_and_once_swaps_the_lanes(
+    scenes,
+):
     segments = cut_segments([(scenes[0], 0)], horizon=4)
     once = segments.mirrored()
     torch.testing.assert_close(once.mirrored().positions, segments.positions, atol=1e-5, rtol=0)
@@ -108,7 +117,8 @@ def brute_force_windows(frame: pl.DataFrame, stride: int) -> dict[tuple[str, int
     in a dictionary.
     """
     columns = ("scene", "vehicle", "frame", "x", "y", "lane", "length")
-    windows, rows = {}, {row[:3]: row[3:] for row in frame.select(columns).iter_rows()}
+    windows = {}
+    rows = {row[:3]: row[3:] for row in frame.select(columns).iter_rows()}
     begins = dict(frame.group_by("scene").agg(pl.col("frame").min()).iter_rows())
     for scene, vehicle, first in rows:
         course = [rows.get((scene, vehicle, first + step)) for step in range(WINDOW_FRAMES)]
@@ -125,7 +135,8 @@ def brute_force_windows(frame: pl.DataFrame, stride: int) -> dict[tuple[str, int
 def test_windows_are_those_of_a_brute_force_search(stride):
     frame = recording()
     scenes = scene_tracks(frame)
-    windows, expected = cut_windows(scenes, stride), brute_force_windows(frame, stride)
+    windows = cut_windows(scenes, stride)
+    expected = brute_force_windows(frame, stride)
     # Columns of a scene are its vehicles in the order of their numbers, which begin at 1000.
     keys = list(zip(windows.scene, windows.start, 1000 + windows.vehicle))
     assert sorted(keys) == sorted(expected)
@@ -155,10 +166,13 @@ def test_groups_never_mix_scenes_or_frames_lose_nobody_and_hold_the_displacement
     for row, mask in enumerate(groups.mask):
         inside = groups.window[row][mask].numpy()
         assert len(set(zip(windows.scene[inside], windows.start[inside]))) == 1
-        moves, place = groups.displacements[row][mask].numpy(), windows.positions[inside, PRESENT]
+        moves = groups.displacements[row][mask].numpy()
+        place = windows.positions[inside, PRESENT]
         np.testing.assert_allclose(moves, np.diff(windows.positions[inside], axis=1), atol=1e-6)
         np.testing.assert_allclose(
-            groups.position[row][mask].numpy(), place - place.mean(0), atol=1e-4
+            groups.position[row][mask].numpy(),
+            place - place.mean(0),
+            atol=1e-4,
         )
 
 

@@ -57,10 +57,9 @@ class Bomb:
         return open, ("executed", "w")
 
 
-def run_folder(overrides: str, checkpoint: bytes = b"", config: str = "compile: auto\n") -> None:
+def run_folder(config: str, checkpoint: bytes = b"") -> None:
     """What a stopped training run leaves in the folder ``run``, as far as resuming reads it."""
     folder = Path("run")
     (folder / "checkpoints").mkdir(parents=True)
     (folder / "checkpoints" / "last.pt").write_bytes(checkpoint)
-    (folder / "overrides.yaml").write_text(overrides)
     (folder / "config.yaml").write_text(config)

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 pytest.importorskip(
-    "highway_env", reason="HighwayEnv is not installed: pip install 'ganlane[bench]'"
+    "highway_env",
+    reason="HighwayEnv is not installed: pip install 'ganlane[bench]'",
 )
 
 from reference.foreign import assert_same_alone, drive, overlaps, start
@@ -36,7 +37,9 @@ def driven(traffic):
     return vehicles, state
 
 
-def test_an_ego_that_keeps_its_lane_crashes_with_nobody_and_nobody_with_another(driven):
+def test_an_ego_that_keeps_its_lane_crashes_with_nobody_and_nobody_with_another(
+    driven,
+):
     vehicles, state = driven
     assert not state[keys.EVENTS]["hard_crash"].any()
     assert overlaps(vehicles) == 0
@@ -75,16 +78,18 @@ def test_a_step_is_that_of_highway_envs_own_road(traffic):
             vehicle = ControlledVehicle(road, place, **rest)
         else:
             vehicle = IDMVehicle(
-                road, place, timer=state[keys.TRAFFIC, "timer"][0, i].item(), **rest
+                road,
+                place,
+                timer=state[keys.TRAFFIC, "timer"][0, i].item(),
+                **rest,
             )
-            vehicle.LENGTH, vehicle.WIDTH = 4.5, 2.5
+            vehicle.LENGTH = 4.5
+            vehicle.WIDTH = 2.5
         road.vehicles.append(vehicle)
     for count, after in enumerate(seen[:8]):
         road.vehicles[0].position = np.array([before.x[0, 0].item(), before.y[0, 0].item()])
-        road.vehicles[0].heading, road.vehicles[0].speed = (
-            before.heading[0, 0].item(),
-            before.speed[0, 0].item(),
-        )
+        road.vehicles[0].heading = before.heading[0, 0].item()
+        road.vehicles[0].speed = before.speed[0, 0].item()
         for vehicle in road.vehicles[1:]:
             vehicle.DELTA = exponent[road.vehicles.index(vehicle)]
         road.act()
@@ -95,7 +100,11 @@ def test_a_step_is_that_of_highway_envs_own_road(traffic):
         )
         ours = torch.stack((after.x, after.y, after.heading, after.speed), dim=-1)[0, 1:]
         torch.testing.assert_close(
-            ours.float(), theirs.float(), rtol=1e-6, atol=1e-4, msg=f"step {count}"
+            ours.float(),
+            theirs.float(),
+            rtol=1e-6,
+            atol=1e-4,
+            msg=f"step {count}",
         )
         before = after
 
@@ -113,11 +122,13 @@ def test_nobody_jumps_and_speeds_are_differences_of_positions(driven):
 
 def test_a_target_lane_is_where_a_change_ends(driven):
     vehicles, _ = driven
-    y, target = vehicles.y[..., 1:], vehicles.target_lane[..., 1:]
+    y = vehicles.y[..., 1:]
+    target = vehicles.target_lane[..., 1:]
     assert (target[1:] != target[:-1]).any(), "nobody changed lanes"
     # Within 6 s of a new target the vehicle is there, or has thought again.
     begins = target[1:-60] != target[:-61]
-    said, came = target[1:-60][begins], (y[61:][begins] / 4.0).round().long()
+    said = target[1:-60][begins]
+    came = (y[61:][begins] / 4.0).round().long()
     assert (said == came).float().mean() > 0.8
 
 
@@ -138,8 +149,18 @@ def two(x_ego, ego=None, slow=None):
     """A fast driver in lane 0 at x = 0 behind a slow one, and an ego in lane 1 that is beside or
     behind it.
     """
-    first = {"x": x_ego, "lane": 1, "desired_speed": 20.0, **(ego or {})}
-    last = {"x": 30.0, "speed": 10.0, "desired_speed": 10.0, **(slow or {})}
+    first = {
+        "x": x_ego,
+        "lane": 1,
+        "desired_speed": 20.0,
+        **(ego or {}),
+    }
+    last = {
+        "x": 30.0,
+        "speed": 10.0,
+        "desired_speed": 10.0,
+        **(slow or {}),
+    }
     cars = ({"visibility": int(Visibility.BODY), **car} for car in (first, {"x": 0.0}, last))
     return scene_of(*cars, dtype=torch.float32)
 
@@ -178,7 +199,13 @@ def test_who_is_not_valid_is_nobodys_leader(traffic):
 
 def test_a_copy_drives_on(traffic):
     copy = pickle.loads(pickle.dumps(traffic))
-    assert all(map(torch.equal, moved(traffic, two(-60.0)), moved(copy, two(-60.0))))
+    assert all(
+        map(
+            torch.equal,
+            moved(traffic, two(-60.0)),
+            moved(copy, two(-60.0)),
+        )
+    )
 
 
 def test_a_ring_is_refused():

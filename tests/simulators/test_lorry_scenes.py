@@ -20,7 +20,9 @@ def keys_of(count):
 
 def net_gaps(scene, row):
     """Sorted gaps ahead within each lane of a row, m."""
-    x, half, gaps = scene.x[row], 0.5 * scene.length[row], []
+    x = scene.x[row]
+    half = 0.5 * scene.length[row]
+    gaps = []
     for lane in range(3):
         there = (scene.target_lane[row] == lane).nonzero()[:, 0]
         order = there[x[there].argsort()]
@@ -39,14 +41,17 @@ def test_so_many_of_the_others_are_lorries_of_twelve_metres_and_the_ego_never_is
 
 def test_net_gaps_are_those_of_the_scene_of_cars():
     episodes = keys_of(50)
-    cars, lorries = (
-        CARS(episodes, torch.float64),
-        LorryScenes(CARS, share=0.5)(episodes, torch.float64),
-    )
+    cars = CARS(episodes, torch.float64)
+    lorries = LorryScenes(CARS, share=0.5)(episodes, torch.float64)
     assert (lorries.length > 4.5).any()
     assert (lorries.x[:, 0] == 0.0).all()
     for row in range(50):
-        torch.testing.assert_close(net_gaps(lorries, row), net_gaps(cars, row), rtol=0.0, atol=1e-9)
+        torch.testing.assert_close(
+            net_gaps(lorries, row),
+            net_gaps(cars, row),
+            rtol=0.0,
+            atol=1e-9,
+        )
 
 
 def test_without_lorries_it_is_the_scene_of_cars():

@@ -5,9 +5,18 @@ import pickle
 import pytest
 import torch
 
-pytest.importorskip("libsumo", reason="SUMO is not installed: pip install 'ganlane[sumo]'")
+pytest.importorskip(
+    "libsumo",
+    reason="SUMO is not installed: pip install 'ganlane[sumo]'",
+)
 
-from reference.foreign import assert_same_alone, drive, overlaps, start, turns
+from reference.foreign import (
+    assert_same_alone,
+    drive,
+    overlaps,
+    start,
+    turns,
+)
 from reference.worlds import vehicles as scene_of
 
 from ganlane import keys
@@ -21,7 +30,8 @@ from ganlane.traffic import IdmTraffic
 from ganlane_simulators import SumoTraffic
 from ganlane_simulators.sumo_roads import ORIGIN_M
 
-LEFT, RIGHT = 1, 2
+LEFT = 1
+RIGHT = 2
 KEEP = torch.zeros(1, dtype=torch.int64)
 
 
@@ -48,7 +58,8 @@ class Scene:
         names = ("x", "lane", "speed", "desired_speed", "length")
         body = {"visibility": int(Visibility.BODY)}
         self.scene = scene_of(
-            *({**body, **dict(zip(names, car))} for car in cars), dtype=torch.float32
+            *({**body, **dict(zip(names, car))} for car in cars),
+            dtype=torch.float32,
         )
         self.vehicles = len(cars)
 
@@ -59,7 +70,9 @@ class Scene:
         return Vehicles(*(field.expand(len(key), -1).clone() for field in self.scene))
 
 
-def test_an_ego_that_keeps_its_lane_crashes_with_nobody_and_nobody_with_another(driven):
+def test_an_ego_that_keeps_its_lane_crashes_with_nobody_and_nobody_with_another(
+    driven,
+):
     vehicles, state = driven
     assert not state[keys.EVENTS]["hard_crash"].any()
     assert overlaps(vehicles) == 0
@@ -67,7 +80,8 @@ def test_an_ego_that_keeps_its_lane_crashes_with_nobody_and_nobody_with_another(
 
 def test_the_goal_is_reached_without_a_crash(traffic):
     env = HighwayEnv(traffic, 20, episode=EpisodeParameters(goal_m=1500.0))
-    state, goals = start(env, range(100, 120)), 0
+    state = start(env, range(100, 120))
+    goals = 0
     for _ in range(150):
         state[keys.ACTION] = torch.zeros(20, dtype=torch.int64)
         stepped, state = env.step_and_maybe_reset(state)
@@ -87,15 +101,21 @@ def test_nobody_jumps_and_speeds_are_differences_of_positions(driven):
     assert dy[..., 1:].abs().max() < 0.11, "4 m in 4 s"
     acceleration = (vehicles.speed[1:] - vehicles.speed[:-1]) / 0.1
     torch.testing.assert_close(
-        vehicles.acceleration[1:, :, 1:], acceleration[..., 1:], rtol=0.0, atol=1e-3
+        vehicles.acceleration[1:, :, 1:],
+        acceleration[..., 1:],
+        rtol=0.0,
+        atol=1e-3,
     )
     assert vehicles.acceleration.amin() > -9.1
     assert vehicles.heading.abs().max() <= 0.2
 
 
-def test_a_target_lane_is_where_a_change_ends_or_turns_back_from(driven):
+def test_a_target_lane_is_where_a_change_ends_or_turns_back_from(
+    driven,
+):
     vehicles, _ = driven
-    y, target = vehicles.y[..., 1:], vehicles.target_lane[..., 1:]
+    y = vehicles.y[..., 1:]
+    target = vehicles.target_lane[..., 1:]
     centre = 4.0 * target
     moving = (y - centre).abs() > 1e-3
     assert moving.any(), "nobody changed lanes"
@@ -103,12 +123,15 @@ def test_a_target_lane_is_where_a_change_ends_or_turns_back_from(driven):
     # 4 s later a change is over; it has ended where it was said to go unless the driver has thought
     # again meanwhile.
     begins = moving[1:-40] & ~moving[:-41]
-    said, came = target[1:-40][begins], (y[41:][begins] / 4.0).round().long()
+    said = target[1:-40][begins]
+    came = (y[41:][begins] / 4.0).round().long()
     assert (said == came).float().mean() > 0.9
     assert (target[1:-40][begins] != target[:-41][begins]).all()
 
 
-def test_the_others_signal_and_are_all_there_and_some_are_lorries_who_keep_their_length(driven):
+def test_the_others_signal_and_are_all_there_and_some_are_lorries_who_keep_their_length(
+    driven,
+):
     vehicles, _ = driven
     assert vehicles.valid.all()
     assert (vehicles.visibility[..., 1:] == int(Visibility.SIGNALLED)).all()
@@ -116,7 +139,9 @@ def test_the_others_signal_and_are_all_there_and_some_are_lorries_who_keep_their
     assert (vehicles.length == vehicles.length[0]).all()
 
 
-def test_an_episode_is_the_same_alone_and_beside_others_whatever_was_driven_before(traffic):
+def test_an_episode_is_the_same_alone_and_beside_others_whatever_was_driven_before(
+    traffic,
+):
     # In the middle of this the same roads have to be cleared, vehicles on their way across lanes
     # among them.
     drive(HighwayEnv(traffic, 4), [11, 12, 13, 14], 17, turns)
@@ -125,7 +150,8 @@ def test_an_episode_is_the_same_alone_and_beside_others_whatever_was_driven_befo
 
 def test_stand_ins_are_where_the_ego_is(traffic):
     env = HighwayEnv(traffic, 1)
-    wrong, lanes_seen = [], set()
+    wrong = []
+    lanes_seen = set()
 
     def compare(vehicles, running):
         x = float(vehicles.x[0, 0] + 0.5 * vehicles.length[0, 0])
@@ -152,7 +178,11 @@ def test_stand_ins_are_where_the_ego_is(traffic):
 def follower_of(traffic, lane_of_ego, action):
     """Speeds of a fast driver 30 m behind a slow ego's place in lane 1, over 6 s."""
     # Somebody slow ahead keeps the ego slow, far enough away for the driver behind not to mind.
-    scene = Scene((0.0, lane_of_ego, 12.0, 12.0), (-32.0, 1, 20.0, 20.0), (2000.0, 2, 20.0, 20.0))
+    scene = Scene(
+        (0.0, lane_of_ego, 12.0, 12.0),
+        (-32.0, 1, 20.0, 20.0),
+        (2000.0, 2, 20.0, 20.0),
+    )
     driven, running, _ = drive(
         HighwayEnv(traffic, 1, scenes=scene),
         [0],
@@ -179,7 +209,11 @@ def test_a_follower_brakes_for_an_ego_that_moves_in_front_and_only_then():
 def test_the_ego_is_followed_when_it_brakes_to_a_stand():
     # A parked lorry ahead of the ego; the driver behind has nowhere to go on a road of one lane.
     one_lane = SumoTraffic(Road(1), speed_wander=0.0)
-    scene = Scene((0.0, 0, 15.0, 20.0), (-25.0, 0, 15.0, 20.0), (120.0, 0, 0.0, 0.1, 12.0))
+    scene = Scene(
+        (0.0, 0, 15.0, 20.0),
+        (-25.0, 0, 15.0, 20.0),
+        (120.0, 0, 0.0, 0.1, 12.0),
+    )
     driven, running, _ = drive(HighwayEnv(one_lane, 1, scenes=scene), [0], 40)
     assert running.all()
     assert driven.speed[-1, 0, 0] < 0.5
@@ -195,7 +229,8 @@ def test_our_driver_does_here_what_it_does_in_our_own_traffic(traffic):
     ours = HighwayEnv(IdmTraffic(), 20)
     mobil = DRIVERS["mobil"](Road())
     env = HighwayEnv(traffic, 20)
-    state, changes = mobil(start(env, list(range(20)))), 0
+    state = mobil(start(env, list(range(20))))
+    changes = 0
     for _ in range(40):
         copy = start(ours, list(range(20)))
         for key in (keys.VEHICLES, keys.EGO, keys.STEP):
@@ -235,7 +270,8 @@ def test_a_state_that_sumo_did_not_leave_is_refused(traffic):
 
 
 def test_two_environments_cannot_take_turns_but_may_follow_each_other():
-    one, other = HighwayEnv(SumoTraffic(), 1), HighwayEnv(SumoTraffic(), 1)
+    one = HighwayEnv(SumoTraffic(), 1)
+    other = HighwayEnv(SumoTraffic(), 1)
     first = one.step(start(one, [0]).set(keys.ACTION, KEEP))["next"]
     other.step(start(other, [0]).set(keys.ACTION, KEEP))
     with pytest.raises(UserError, match="a process has one SUMO"):
@@ -255,11 +291,16 @@ def test_a_ring_is_refused():
         SumoTraffic(Road(ring_m=500.0))
 
 
-def test_episodes_that_take_the_rows_of_others_are_evaluated_as_in_a_batch_of_their_own(traffic):
+def test_episodes_that_take_the_rows_of_others_are_evaluated_as_in_a_batch_of_their_own(
+    traffic,
+):
     keep = DRIVERS["keep_lane"](Road())
     tables = [
         run_episodes(
-            HighwayEnv(traffic, rows, episode=EpisodeParameters(goal_m=600.0)), keep, range(6), 0
+            HighwayEnv(traffic, rows, episode=EpisodeParameters(goal_m=600.0)),
+            keep,
+            range(6),
+            0,
         )
         for rows in (6, 2)
     ]

@@ -20,7 +20,11 @@ from ganlane.traffic import (
     ReplayTraffic,
     TrafficSequential,
 )
-from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic, idm_faults_traffic
+from ganlane.traffic.presets import (
+    gan_calibrated_traffic,
+    gan_traffic,
+    idm_faults_traffic,
+)
 
 
 def replay() -> ReplayTraffic:
@@ -37,7 +41,8 @@ MAKE = {
     "gan_planning": lambda: gan_traffic(execute_k=3),
     "gan_calibrated": gan_calibrated_traffic,
     "mixed": lambda: MixedTraffic(
-        {"idm": IdmTraffic(), "faults": idm_faults_traffic()}, {"idm": 1, "faults": 1}
+        {"idm": IdmTraffic(), "faults": idm_faults_traffic()},
+        {"idm": 1, "faults": 1},
     ),
     "blind": lambda: BlindTraffic(IdmMobilTraffic(), 0.5),
     "replay": replay,
@@ -53,25 +58,31 @@ def shapes(memory: TensorDict) -> dict:
 
 
 @pytest.mark.parametrize("name", MAKE)
-def test_memory_and_moved_are_as_declared_and_the_state_at_t_is_never_written(name):
+def test_memory_and_moved_are_as_declared_and_the_state_at_t_is_never_written(
+    name,
+):
     traffic = MAKE[name]()
     state = environment(num_envs=4, traffic=traffic, dtype=torch.float32).reset()
     for step in range(2):
-        kept = state.clone()
+        before = state.clone()
         assert shapes(state.get(keys.TRAFFIC, TensorDict({}))) == traffic.memory_spec(4, 9)
         after = traffic(state.clone(recurse=False))
         assert (
             same_bits(
-                state.select(keys.VEHICLES, keys.TRAFFIC), kept.select(keys.VEHICLES, keys.TRAFFIC)
+                state.select(keys.VEHICLES, keys.TRAFFIC),
+                before.select(keys.VEHICLES, keys.TRAFFIC),
             )
             == []
         )
         moved = after[keys.MOVED]
-        assert shapes(moved) == shapes(kept[keys.VEHICLES])
+        assert shapes(moved) == shapes(before[keys.VEHICLES])
         assert tuple(Vehicles.of(moved)._fields) == keys.VEHICLE_FIELDS
-        others = kept[keys.VEHICLES, "valid"] & (torch.arange(9) > 0)
-        assert (moved["x"] > kept[keys.VEHICLES, "x"])[others].all()
-        state[keys.VEHICLES], state[keys.STEP] = moved, torch.full((4,), step + 1)
+        others = before[keys.VEHICLES, "valid"] & (torch.arange(9) > 0)
+        assert (moved["x"] > before[keys.VEHICLES, "x"])[others].all()
+        state[keys.VEHICLES], state[keys.STEP] = (
+            moved,
+            torch.full((4,), step + 1),
+        )
         state[keys.TRAFFIC] = after.get(keys.TRAFFIC, TensorDict({}, [4]))
 
 

@@ -12,7 +12,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from reference.foreign import overlaps_of_the_others
-from reference.worlds import DOUBLE, environment, placed, same_bits, step, vehicles
+from reference.worlds import (
+    DOUBLE,
+    environment,
+    placed,
+    same_bits,
+    step,
+    vehicles,
+)
 from scipy.stats import binomtest
 
 from ganlane import keys
@@ -25,7 +32,13 @@ from ganlane.settings.driving import (
     HesitationFaults,
     ReactionFaults,
 )
-from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps, perceive
+from ganlane.sim import (
+    Road,
+    SpawnParameters,
+    Vehicles,
+    pair_overlaps,
+    perceive,
+)
 from ganlane.traffic import (
     AbortedLaneChange,
     CalibratedChanges,
@@ -49,7 +62,10 @@ from ganlane.traffic.presets import (
 )
 
 NONE = DriverFaults(
-    BrakingFaults(0.0), ReactionFaults(0.0), HesitationFaults(0.0), AbortFaults(0.0)
+    BrakingFaults(0.0),
+    ReactionFaults(0.0),
+    HesitationFaults(0.0),
+    AbortFaults(0.0),
 )
 EGO = {"x": -1000.0, "lane": 0}
 
@@ -66,10 +82,19 @@ class OneChange(IdmTraffic):
         return self.drive(perceive(vehicles, self.road), changed, memory)
 
 
-def play(base: TrafficModule, scene: Vehicles, steps: int, **overlays: Overlay) -> list[Vehicles]:
+def play(
+    base: TrafficModule,
+    scene: Vehicles,
+    steps: int,
+    **overlays: Overlay,
+) -> list[Vehicles]:
     """The scene after each physics step; the ego is one of the traffic."""
-    traffic, rows = TrafficSequential({"base": base, **overlays}), scene.x.shape[0]
-    td = placed(environment(num_envs=rows, vehicles=scene.x.shape[1], traffic=traffic), scene)
+    traffic = TrafficSequential({"base": base, **overlays})
+    rows = scene.x.shape[0]
+    td = placed(
+        environment(num_envs=rows, vehicles=scene.x.shape[1], traffic=traffic),
+        scene,
+    )
     seen = []
     for number in range(steps):
         td[keys.STEP] = torch.full((rows,), number)
@@ -79,9 +104,22 @@ def play(base: TrafficModule, scene: Vehicles, steps: int, **overlays: Overlay) 
     return seen
 
 
-def in_simulation(traffic: TrafficModule, rows: int, seconds: int, part: str, field: str, **others):
+def in_simulation(
+    traffic: TrafficModule,
+    rows: int,
+    seconds: int,
+    part: str,
+    field: str,
+    **others,
+):
     """Memory and vehicles before and after every physics step, the ego left out."""
-    env = environment(num_envs=rows, traffic=traffic, period_s=0.1, dtype=torch.float32, **others)
+    env = environment(
+        num_envs=rows,
+        traffic=traffic,
+        period_s=0.1,
+        dtype=torch.float32,
+        **others,
+    )
     td = env.reset()
     for _ in range(seconds * 10):
         after = step(env, td)
@@ -96,32 +134,55 @@ def in_simulation(traffic: TrafficModule, rows: int, seconds: int, part: str, fi
 def assert_share(count: int, trials: int, share: float) -> None:
     """The exact binomial interval (99.9 %) of what was counted holds the share asked for."""
     interval = binomtest(count, trials).proportion_ci(0.999, "exact")
-    assert interval.low <= share <= interval.high, (count, trials, share)
+    assert interval.low <= share <= interval.high, (
+        count,
+        trials,
+        share,
+    )
 
 
 @pytest.mark.parametrize(
     ("part", "faults", "at_first", "least"),
     [
-        ("phantom_braking", BrakingFaults(per_hour=300.0, lasts_s=1.0), 9, 500),
-        ("late_reaction", ReactionFaults(per_hour=300.0, lasts_s=2.0), 19, 400),
+        (
+            "phantom_braking",
+            BrakingFaults(per_hour=300.0, lasts_s=1.0),
+            9,
+            500,
+        ),
+        (
+            "late_reaction",
+            ReactionFaults(per_hour=300.0, lasts_s=2.0),
+            19,
+            400,
+        ),
     ],
 )
 def test_a_driver_brakes_for_nothing_or_does_not_attend_as_often_as_asked_for(
     part, faults, at_first, least
 ):
-    traffic, begun, driven = idm_faults_traffic(faults=replace(NONE, **{part: faults})), 0, 0
+    traffic = idm_faults_traffic(faults=replace(NONE, **{part: faults}))
+    begun = 0
+    driven = 0
     for before, after, _, _ in in_simulation(traffic, 32, 60, part, "left"):
         begun += ((before == 0) & (after == at_first)).sum().item()
         driven += (before == 0).sum().item()
     assert begun > least
     # A constant hazard: 1 - exp(-rate dt) per step of 0.1 s.
-    assert_share(begun, driven, 1.0 - torch.tensor(-300.0 / 36_000.0, dtype=DOUBLE).exp().item())
+    assert_share(
+        begun,
+        driven,
+        1.0 - torch.tensor(-300.0 / 36_000.0, dtype=DOUBLE).exp().item(),
+    )
 
 
 @pytest.mark.parametrize(
     ("fault", "field"),
     [
-        (HesitantLaneChange(faults=HesitationFaults(share=0.3)), "hesitant"),
+        (
+            HesitantLaneChange(faults=HesitationFaults(share=0.3)),
+            "hesitant",
+        ),
         # Some changes are under way when the run ends.
         (AbortedLaneChange(faults=AbortFaults(share=0.3)), "origin"),
     ],
@@ -143,18 +204,29 @@ def test_the_share_of_changes_asked_for_is_hesitant_or_broken_off(fault, field):
 def test_with_everything_off_the_base_is_left_bitwise_as_it_is(base):
     plain = environment(num_envs=16, traffic=base())
     faulty = environment(num_envs=16, traffic=with_faults(base(), NONE))
-    one, other = plain.reset(), faulty.reset()
+    one = plain.reset()
+    other = faulty.reset()
     for decision in range(40):
         action = torch.full((16,), decision % 7 % 3)
-        one, other = step(plain, one, action), step(faulty, other, action)
+        one = step(plain, one, action)
+        other = step(faulty, other, action)
         assert same_bits(one.exclude(keys.TRAFFIC), other.exclude(keys.TRAFFIC)) == []
         assert same_bits(one[keys.TRAFFIC], other[keys.TRAFFIC, "base"]) == []
 
 
 @pytest.mark.parametrize(("share", "target"), [(1.0, [1, 0]), (0.0, [2, 1])])
 def test_an_aborted_change_returns_to_the_centre_of_the_lane_it_left(share, target):
-    scene = vehicles(EGO, {"x": 0.0, "lane": 1}, {"x": 100.0, "lane": 0, "speed": 10.0})
-    track = play(OneChange(), scene, 160, fault=AbortedLaneChange(faults=AbortFaults(share)))
+    scene = vehicles(
+        EGO,
+        {"x": 0.0, "lane": 1},
+        {"x": 100.0, "lane": 0, "speed": 10.0},
+    )
+    track = play(
+        OneChange(),
+        scene,
+        160,
+        fault=AbortedLaneChange(faults=AbortFaults(share)),
+    )
     assert track[-1].target_lane[0, 1:].tolist() == target
     if share == 1.0:
         way = torch.stack([now.y[0] for now in track])[:, 1:] - torch.tensor(
@@ -172,7 +244,11 @@ def test_a_literal_change_that_is_broken_off_goes_back_as_fast_as_it_came():
         changes=LiteralChanges(10.0, lateral_speed_mps=0.8, lateral_speed_sd_mps=0.0)
     )
     track = play(
-        IdmTraffic(), scene, 90, change=changes, fault=AbortedLaneChange(faults=AbortFaults(1.0))
+        IdmTraffic(),
+        scene,
+        90,
+        change=changes,
+        fault=AbortedLaneChange(faults=AbortFaults(1.0)),
     )
     y = torch.stack([scene.y[0], *(now.y[0] for now in track)])[:, 1:]
     assert y.diff(dim=0).abs().max() < 0.09
@@ -217,7 +293,8 @@ def test_a_late_driver_drives_what_he_should_have_driven_before():
 
     scene = vehicles(EGO, {"x": 60.0, "speed": 20.0})
     always = LateReaction(faults=ReactionFaults(per_hour=1e9, delay_s=0.5, lasts_s=60.0))
-    prompt, late = play(Wave(), scene, 50), play(Wave(), scene, 50, late=always)
+    prompt = play(Wave(), scene, 50)
+    late = play(Wave(), scene, 50, late=always)
     for now, before in zip(late[5:], prompt):
         torch.testing.assert_close(now.acceleration[:, 1], before.acceleration[:, 1])
     assert [round(now.acceleration[0, 1].item(), 9) for now in late[:5]] == [0.0] * 5
@@ -238,7 +315,10 @@ def test_a_phantom_braker_loses_the_speed_it_says_and_goes_on_as_before():
 def test_a_driver_who_brakes_harder_anyway_goes_on_doing_so():
     scene = vehicles(EGO, {"x": 0.0, "speed": 25.0}, {"x": 20.0, "speed": 5.0})
     always = PhantomBraking(faults=BrakingFaults(per_hour=1e9))
-    (faulty,), (plain,) = play(IdmTraffic(), scene, 1, fault=always), play(IdmTraffic(), scene, 1)
+    (faulty,), (plain,) = (
+        play(IdmTraffic(), scene, 1, fault=always),
+        play(IdmTraffic(), scene, 1),
+    )
     assert plain.acceleration[0, 1] < -4.0
     assert faulty.acceleration[0, 1] == plain.acceleration[0, 1]
 
@@ -246,7 +326,10 @@ def test_a_driver_who_brakes_harder_anyway_goes_on_doing_so():
 def test_faults_come_to_nobody_who_is_not_there_and_never_to_the_ego():
     scene = vehicles(EGO, {"x": 0.0, "valid": False}, {"x": 100.0})
     always = DriverFaults(
-        BrakingFaults(1e9), ReactionFaults(1e9), HesitationFaults(1.0), AbortFaults(1.0)
+        BrakingFaults(1e9),
+        ReactionFaults(1e9),
+        HesitationFaults(1.0),
+        AbortFaults(1.0),
     )
     traffic = with_faults(OneChange(), always)
     td = placed(environment(num_envs=1, vehicles=3, traffic=traffic), scene)
@@ -254,9 +337,21 @@ def test_faults_come_to_nobody_who_is_not_there_and_never_to_the_ego():
     traffic(td)
     memory = td[keys.TRAFFIC]
     for part in ("phantom_braking", "late_reaction"):
-        assert (memory[part, "left"][0] > 0).tolist() == [False, False, True]
-    assert memory["hesitant_change", "hesitant"][0].tolist() == [False, False, True]
-    assert (memory["aborted_change", "origin"][0] >= 0).tolist() == [False, False, True]
+        assert (memory[part, "left"][0] > 0).tolist() == [
+            False,
+            False,
+            True,
+        ]
+    assert memory["hesitant_change", "hesitant"][0].tolist() == [
+        False,
+        False,
+        True,
+    ]
+    assert (memory["aborted_change", "origin"][0] >= 0).tolist() == [
+        False,
+        False,
+        True,
+    ]
 
 
 @given(
@@ -268,7 +363,15 @@ def test_faults_come_to_nobody_who_is_not_there_and_never_to_the_ego():
 def test_driving_a_path_at_another_speed_stays_on_it_and_never_goes_back(
     speed, usual, wanted, heading
 ):
-    start = vehicles({"x": 10.0, "y": 1.0, "speed": speed, "heading": heading, "target_lane": 0})
+    start = vehicles(
+        {
+            "x": 10.0,
+            "y": 1.0,
+            "speed": speed,
+            "heading": heading,
+            "target_lane": 0,
+        }
+    )
     gone = 0.5 * (speed + max(speed + usual * 0.1, 0.0)) * 0.1
     angle = torch.tensor(heading, dtype=DOUBLE)
     moved = start.with_(
@@ -277,7 +380,8 @@ def test_driving_a_path_at_another_speed_stays_on_it_and_never_goes_back(
         speed=(start.speed + usual * 0.1).clamp_min(0.0),
     )
     other = driven_at(start, moved, torch.full_like(start.x, wanted), 0.1)
-    dx, dy = (other.x - start.x).item(), (other.y - start.y).item()
+    dx = (other.x - start.x).item()
+    dy = (other.y - start.y).item()
     distance = 0.5 * (speed + max(speed + wanted * 0.1, 0.0)) * 0.1
     assert other.speed.item() == pytest.approx(max(speed + wanted * 0.1, 0.0))
     assert (dx * dx + dy * dy) ** 0.5 == pytest.approx(distance, abs=1e-9)
@@ -292,17 +396,26 @@ def test_a_delay_shorter_than_a_step_is_refused():
 
 #: Ten times the default rates.
 TENFOLD = DriverFaults(
-    BrakingFaults(60.0), ReactionFaults(120.0), HesitationFaults(0.5), AbortFaults(0.5)
+    BrakingFaults(60.0),
+    ReactionFaults(120.0),
+    HesitationFaults(0.5),
+    AbortFaults(0.5),
 )
 
 
 @pytest.mark.parametrize(
     ("faults", "vehicle_km", "rows", "seconds"),
-    [(TENFOLD, 100.0, 24, 60), pytest.param(None, 5000.0, 128, 100, marks=pytest.mark.slow)],
+    [
+        (TENFOLD, 100.0, 24, 60),
+        pytest.param(None, 5000.0, 128, 100, marks=pytest.mark.slow),
+    ],
 )
 def test_faults_make_no_overlaps(faults, vehicle_km, rows, seconds):
     env = HighwayEnv(
-        idm_faults_traffic(Road(), 2, faults=faults), rows, 14, SpawnParameters(spread_m=300.0)
+        idm_faults_traffic(Road(), 2, faults=faults),
+        rows,
+        14,
+        SpawnParameters(spread_m=300.0),
     )
     assert overlaps_of_the_others(env, vehicle_km, seconds) == 0
 
@@ -310,7 +423,9 @@ def test_faults_make_no_overlaps(faults, vehicle_km, rows, seconds):
 def test_faults_lie_over_generated_traffic_too():
     # At a hundred times the default rates generated drivers, who keep less distance, do overlap.
     env = HighwayEnv(with_faults(gan_calibrated_traffic(), TENFOLD), 16)
-    td, overlaps, braked = env.reset(), 0, 0
+    td = env.reset()
+    overlaps = 0
+    braked = 0
     for _ in range(20):
         td = step(env, td)
         overlaps += pair_overlaps(Vehicles.of(td[keys.VEHICLES]))[:, 1:, 1:].sum().item()

@@ -10,7 +10,14 @@ from dataclasses import replace
 import pytest
 import torch
 from reference.foreign import overlaps_of_the_others
-from reference.worlds import DOUBLE, environment, placed, same_bits, step, vehicles
+from reference.worlds import (
+    DOUBLE,
+    environment,
+    placed,
+    same_bits,
+    step,
+    vehicles,
+)
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
@@ -29,7 +36,10 @@ from ganlane.traffic.idm_mobil import DriverParams, start_braking
 ROAD = Road(lanes=2)
 EGO = {"x": -1000.0, "lane": 0}
 # The second car wants to overtake the third. (With Table IV the third would politely move aside.)
-SELFISH = IdmMobilTraffic(ROAD, mobil=MobilParameters(politeness_rear=0.0, politeness_side=0.0))
+SELFISH = IdmMobilTraffic(
+    ROAD,
+    mobil=MobilParameters(politeness_rear=0.0, politeness_side=0.0),
+)
 CARS = (
     EGO,
     {"x": 0.0, "lane": 0, "speed": 20.0},
@@ -41,7 +51,10 @@ def move(traffic: TrafficModule, scene: Vehicles, step: int | list[int] = 0) -> 
     rows = scene.x.shape[0]
     zero = torch.zeros(rows, dtype=torch.int64)
     return traffic.move(
-        scene, traffic.fresh_memory(scene, zero), zero, torch.as_tensor(step).expand(rows)
+        scene,
+        traffic.fresh_memory(scene, zero),
+        zero,
+        torch.as_tensor(step).expand(rows),
     )[0]
 
 
@@ -63,7 +76,10 @@ def test_mobil_changes_lanes_at_full_seconds_and_idm_alone_does_not(traffic, ste
 
 def test_each_row_has_a_clock_of_its_own():
     rows = Vehicles(*(value.repeat(2, 1) for value in vehicles(*CARS)))
-    assert move(SELFISH, rows, [3, 10]).target_lane[:, 1].tolist() == [0, 1]
+    assert move(SELFISH, rows, [3, 10]).target_lane[:, 1].tolist() == [
+        0,
+        1,
+    ]
 
 
 def test_an_unspoken_wish_of_the_ego_holds_nobody_back():
@@ -73,8 +89,10 @@ def test_an_unspoken_wish_of_the_ego_holds_nobody_back():
     same lane.
     """
     slow = {"speed": 15.0, "desired_speed": 15.0}
-    ego, ahead = {"x": 0.0, "lane": 0}, {"x": 54.5, "lane": 0, **slow}
-    other, ahead_of_it = {"x": -10.0, "lane": 2}, {"x": 44.5, "lane": 2, **slow}
+    ego = {"x": 0.0, "lane": 0}
+    ahead = {"x": 54.5, "lane": 0, **slow}
+    other = {"x": -10.0, "lane": 2}
+    ahead_of_it = {"x": 44.5, "lane": 2, **slow}
     traffic = IdmMobilTraffic(Road(lanes=3), mobil=SELFISH.mobil)
     assert move(traffic, vehicles(ego, ahead, other, ahead_of_it)).target_lane[0, 2] == 1
 
@@ -91,12 +109,19 @@ def test_traffic_is_the_same_whatever_the_decision_period_of_the_ego():
     assert torch.any(
         states[0][keys.VEHICLES, "target_lane"] != env.reset()[keys.VEHICLES, "target_lane"]
     )
-    assert [same_bits(states[0], other) for other in states[1:]] == [[], []]
+    assert [same_bits(states[0], other) for other in states[1:]] == [
+        [],
+        [],
+    ]
 
 
 def test_everybody_reacts_to_the_state_at_t_and_to_nothing_later():
     """The leader brakes hard in this step; its follower's acceleration does not know yet."""
-    cars = EGO, {"x": 0.0, "lane": 0}, {"x": 50.0, "lane": 0, "speed": 20.0}
+    cars = (
+        EGO,
+        {"x": 0.0, "lane": 0},
+        {"x": 50.0, "lane": 0, "speed": 20.0},
+    )
     wall = {"x": 65.0, "lane": 0, "speed": 0.0}
     calm, braking = (
         move(IdmTraffic(ROAD), scene) for scene in (vehicles(*cars), vehicles(*cars, wall))
@@ -109,7 +134,15 @@ def test_everybody_reacts_to_the_state_at_t_and_to_nothing_later():
 
 #: Everybody drives by Tables IV and V.
 ALIKE = RandomDrivers(
-    (1.6, 1.6), (0.7, 0.7), (1.7, 1.7), (20.0, 20.0), (1, 1), (1, 1), (0, 0), (0, 0), (10, 10)
+    (1.6, 1.6),
+    (0.7, 0.7),
+    (1.7, 1.7),
+    (20.0, 20.0),
+    (1, 1),
+    (1, 1),
+    (0, 0),
+    (0, 0),
+    (10, 10),
 )
 
 
@@ -119,7 +152,11 @@ def params_of(td) -> DriverParams:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("headway_s", [2.0, 1.0]), ("strongest_braking", [0.0, 5.0]), ("reaction_s", [0.0, 9.0])],
+    [
+        ("headway_s", [2.0, 1.0]),
+        ("strongest_braking", [0.0, 5.0]),
+        ("reaction_s", [0.0, 9.0]),
+    ],
 )
 def test_impossible_ranges_are_refused(name, value):
     with pytest.raises(UserError, match=f"^{name}"):
@@ -127,10 +164,8 @@ def test_impossible_ranges_are_refused(name, value):
 
 
 def test_drivers_differ_and_lie_within_the_ranges():
-    own, d = (
-        params_of(environment(num_envs=500, traffic=IdmRandomTraffic()).reset()),
-        RandomDrivers(),
-    )
+    own = params_of(environment(num_envs=500, traffic=IdmRandomTraffic()).reset())
+    d = RandomDrivers()
     for value, (low, high) in (
         (own.headway, d.headway_s),
         (own.max_acceleration, d.max_acceleration),
@@ -144,7 +179,13 @@ def test_drivers_differ_and_lie_within_the_ranges():
     assert sorted(own.delay.unique().tolist()) == [0, 1, 2, 3, 4, 5, 6]
     # Independent of each other.
     drawn = torch.stack(
-        [own.headway, own.max_acceleration, own.politeness, own.sway, own.delay]
+        [
+            own.headway,
+            own.max_acceleration,
+            own.politeness,
+            own.sway,
+            own.delay,
+        ]
     ).flatten(1)
     assert (torch.corrcoef(drawn) - torch.eye(5)).abs().max() < 0.08
 
@@ -178,24 +219,34 @@ def test_drivers_who_are_all_alike_drive_as_idm_mobil():
         environment(num_envs=8, traffic=t)
         for t in (IdmMobilTraffic(), IdmRandomTraffic(drivers=ALIKE))
     )
-    first, second = one.reset(), other.reset()
+    first = one.reset()
+    second = other.reset()
     for _ in range(20):
-        first, second = step(one, first), step(other, second)
+        first = step(one, first)
+        second = step(other, second)
     for name in ("x", "y", "speed", "target_lane"):
         torch.testing.assert_close(
-            first[keys.VEHICLES, name], second[keys.VEHICLES, name], atol=1e-9, rtol=1e-9
+            first[keys.VEHICLES, name],
+            second[keys.VEHICLES, name],
+            atol=1e-9,
+            rtol=1e-9,
         )
 
 
 def test_nobody_brakes_harder_than_it_can():
     env = environment(num_envs=64, traffic=IdmRandomTraffic())
-    td, margins = env.reset(), []
+    td = env.reset()
+    margins = []
     limit = params_of(td).strongest_braking
     env.recorder = lambda now, running: margins.append(
         (now.acceleration + limit)[:, 1:].amin().item()
     )
     for _ in range(40):
-        td = step(env, td, (td[keys.EPISODE] + td[keys.EGO, "decisions"]) % 4 % 3)
+        td = step(
+            env,
+            td,
+            (td[keys.EPISODE] + td[keys.EGO, "decisions"]) % 4 % 3,
+        )
     # Some came to their limit.
     assert -1e-9 <= min(margins) < 1e-6
 
@@ -207,16 +258,23 @@ def test_the_first_scene_asks_for_what_is_worked_out_by_hand():
         {"x": 30.0, "speed": 15.0},
         {"x": 0.0, "lane": 1},
     )
-    found = start_braking(scene, Road(), torch.tensor([[0.0, 0.5, 0.0, 0.0]], dtype=DOUBLE))[0]
+    braking = start_braking(
+        scene,
+        Road(),
+        torch.tensor([[0.0, 0.5, 0.0, 0.0]], dtype=DOUBLE),
+    )[0]
     # 35.5 m less 5 m of reaction; two ahead: 65.5 m less the 6.5 m of the one between.
-    assert found.tolist() == pytest.approx([0.0, 100.0 / (2 * 30.5), 25.0 / (2 * 59.0), 0.0])
+    assert braking.tolist() == pytest.approx([0.0, 100.0 / (2 * 30.5), 25.0 / (2 * 59.0), 0.0])
 
 
 def test_a_reaction_time_delays_the_acceleration_by_as_much():
     scene = vehicles(
-        {"x": -500.0, "lane": 2}, {"x": 60.0, "speed": 10.0}, {"x": 0.0, "speed": 20.0}
+        {"x": -500.0, "lane": 2},
+        {"x": 60.0, "speed": 10.0},
+        {"x": 0.0, "speed": 20.0},
     )
-    prompt, late = [], []
+    prompt = []
+    late = []
     for track, delay in ((prompt, 0.0), (late, 0.4)):
         traffic = IdmRandomTraffic(drivers=replace(ALIKE, reaction_s=(delay, delay)))
         env = environment(vehicles=3, traffic=traffic, period_s=0.1)
@@ -234,7 +292,8 @@ def test_a_driver_sways_within_its_lane(lane_width_m, bound):
     road = Road(lanes=3, lane_width_m=lane_width_m)
     widest = replace(RandomDrivers(), sway_m=(0.3, 0.3))
     env = HighwayEnv(IdmRandomTraffic(road, drivers=widest), 32, dtype=torch.float64)
-    td, ways = env.reset(), []
+    td = env.reset()
+    ways = []
     for _ in range(60):
         td = step(env, td)
         v = Vehicles.of(td[keys.VEHICLES])

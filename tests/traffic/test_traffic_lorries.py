@@ -19,7 +19,13 @@ from ganlane.settings.traffic import (
     IdmMobilTrafficConfig,
     IdmTrafficConfig,
 )
-from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps, perceive
+from ganlane.sim import (
+    Road,
+    SpawnParameters,
+    Vehicles,
+    pair_overlaps,
+    perceive,
+)
 from ganlane.traffic import IdmTraffic
 
 
@@ -28,7 +34,7 @@ def drive(traffic, rows: int, decisions: int, recycle: bool) -> tuple[float, flo
     keep-lane ego.
     """
     config = EnvConfig(truck_share=0.4, recycle=recycle)
-    made = make_env(make_traffic(traffic, config), config, num_envs=rows)
+    env = make_env(make_traffic(traffic, config), config, num_envs=rows)
     km = lorries = 0.0
     overlaps = crashes = 0
 
@@ -39,18 +45,23 @@ def drive(traffic, rows: int, decisions: int, recycle: bool) -> tuple[float, flo
         lorries += driven[vehicles.length == 12.0].sum().item()
         overlaps += int(pair_overlaps(vehicles)[running].sum()) // 2
 
-    made.base_env.recorder = record
-    state, driver = made.reset(), KeepLaneDriver(made.base_env.road)
+    env.base_env.recorder = record
+    state = env.reset()
+    driver = KeepLaneDriver(env.base_env.road)
     with torch.no_grad():
         for _ in range(decisions):
-            step, state = made.step_and_maybe_reset(driver(state))
+            step, state = env.step_and_maybe_reset(driver(state))
             crashes += int(step["next", keys.EVENTS, "hard_crash"].sum())
     return km, lorries, overlaps, crashes
 
 
 @pytest.mark.parametrize(
     ("traffic", "rows"),
-    [(IdmTrafficConfig(), 32), (IdmMobilTrafficConfig(), 32), (GanCalibratedTrafficConfig(), 8)],
+    [
+        (IdmTrafficConfig(), 32),
+        (IdmMobilTrafficConfig(), 32),
+        (GanCalibratedTrafficConfig(), 8),
+    ],
     ids=["idm", "idm_mobil", "gan_calibrated"],
 )
 @pytest.mark.parametrize("recycle", [False, True], ids=["", "recycle"])
@@ -80,7 +91,8 @@ def test_nobody_overlaps_a_lorry_on_a_road_that_stays_full(traffic, rows, second
 
 def test_the_generator_is_told_the_gap_behind_the_lorry():
     """Centres 30 m apart, 21.75 m free; the input is gap / (gap + 20)."""
-    scene, zero = vehicles({"x": 0.0}, {"x": 30.0, "length": 12.0}), torch.zeros(1, 2)
+    scene = vehicles({"x": 0.0}, {"x": 30.0, "length": 12.0})
+    zero = torch.zeros(1, 2)
     seen = extra_inputs(perceive(scene, Road()), zero, zero)
     assert seen[0, 0, 1].item() == pytest.approx(21.75 / 41.75)
 

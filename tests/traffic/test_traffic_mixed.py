@@ -8,7 +8,13 @@ import copy
 
 import pytest
 import torch
-from reference.worlds import environment, placed, same_bits, step, vehicles
+from reference.worlds import (
+    environment,
+    placed,
+    same_bits,
+    step,
+    vehicles,
+)
 from scipy.stats import binomtest
 
 from ganlane import keys
@@ -39,7 +45,11 @@ from ganlane.traffic import (
     TrafficModule,
 )
 from ganlane.traffic.mixed import interleaved
-from ganlane.traffic.presets import gan_traffic, idm_faults_traffic, with_faults
+from ganlane.traffic.presets import (
+    gan_traffic,
+    idm_faults_traffic,
+    with_faults,
+)
 
 #: So many faults that a few decisions hold some.
 OFTEN = DriverFaults(
@@ -64,9 +74,14 @@ def mixture(**shares: int) -> MixedTraffic:
 
 def drive(traffic: TrafficModule, rows: int, decisions: int = 12) -> list:
     env = environment(num_envs=rows, traffic=traffic, dtype=torch.float32)
-    td, seen = env.reset(), []
+    td = env.reset()
+    seen = []
     for _ in range(decisions):
-        td = step(env, td, (td[keys.EPISODE] + td[keys.EGO, "decisions"]) % 5 % 3)
+        td = step(
+            env,
+            td,
+            (td[keys.EPISODE] + td[keys.EGO, "decisions"]) % 5 % 3,
+        )
         seen.append(td)
     return seen
 
@@ -86,8 +101,11 @@ def test_the_turns_of_a_period_are_spread(shares, turns):
 
 
 @pytest.mark.parametrize("rows", [1, 6, pytest.param(64, marks=pytest.mark.slow)])
-def test_an_episode_is_the_same_bits_in_every_batch_and_in_every_rule_driven_traffic(rows):
-    wide, narrow = drive(mixture(**RULES), 64), drive(mixture(**RULES), rows)
+def test_an_episode_is_the_same_bits_in_every_batch_and_in_every_rule_driven_traffic(
+    rows,
+):
+    wide = drive(mixture(**RULES), 64)
+    narrow = drive(mixture(**RULES), rows)
     for all_rows, some in zip(wide, narrow):
         assert same_bits(all_rows[:rows], some) == []
     faulty = wide[-1][keys.TRAFFIC, "idm_faults"]
@@ -98,7 +116,13 @@ def test_an_episode_is_the_same_bits_in_every_batch_and_in_every_rule_driven_tra
 def test_a_part_drives_its_episodes_to_the_bit_as_it_does_alone(name):
     rows = [row for row in range(20) if interleaved(RULES)[row % 5] == name]
     for one, other in zip(drive(mixture(**RULES), 20), drive(MAKE[name](), 20)):
-        assert same_bits(one[rows].exclude(keys.TRAFFIC), other[rows].exclude(keys.TRAFFIC)) == []
+        assert (
+            same_bits(
+                one[rows].exclude(keys.TRAFFIC),
+                other[rows].exclude(keys.TRAFFIC),
+            )
+            == []
+        )
         assert same_bits(one[rows][keys.TRAFFIC, name], other[rows][keys.TRAFFIC]) == []
 
 
@@ -112,17 +136,29 @@ def test_where_a_part_has_no_row_its_memory_stays_zero():
 
 
 def test_the_generator_drives_its_rows_as_it_does_alone_to_rounding():
-    mixed, alone = drive(mixture(idm_mobil=1, gan=1), 8, 3)[-1], drive(gan_traffic(), 8, 3)[-1]
+    mixed = drive(mixture(idm_mobil=1, gan=1), 8, 3)[-1]
+    alone = drive(gan_traffic(), 8, 3)[-1]
     for name in ("x", "y", "speed"):
         one, other = (td[1::2][keys.VEHICLES, name] for td in (mixed, alone))
         torch.testing.assert_close(one, other, atol=2e-3, rtol=1e-4)
 
 
 def test_vehicles_are_seen_as_their_episodes_traffic_has_it():
-    td = environment(num_envs=6, traffic=mixture(idm_mobil=2, gan=1), dtype=torch.float32).reset()
+    td = environment(
+        num_envs=6,
+        traffic=mixture(idm_mobil=2, gan=1),
+        dtype=torch.float32,
+    ).reset()
     seen = td[keys.VEHICLES, "visibility"]
     assert (seen[:, 0] == Visibility.BODY).all()
-    assert seen[:, 1:].float().mean(1).tolist() == [2.0, 1.0, 2.0, 2.0, 1.0, 2.0]
+    assert seen[:, 1:].float().mean(1).tolist() == [
+        2.0,
+        1.0,
+        2.0,
+        2.0,
+        1.0,
+        2.0,
+    ]
 
 
 def test_scenes_set_by_hand_and_faults_laid_over_a_mixture_see_it_too():
@@ -130,13 +166,20 @@ def test_scenes_set_by_hand_and_faults_laid_over_a_mixture_see_it_too():
     traffic = make_traffic(MixedTrafficConfig(shares={"gan": 1, "idm": 1}), scene)
     assert (make_env(traffic, scene, num_envs=4).reset()[keys.VEHICLES, "visibility"] >= 0).all()
     chain = drive(with_faults(mixture(idm=1, gan=1)), 4, 2)[-1]
-    assert chain[keys.VEHICLES, "visibility"][:, 1].tolist() == [2, 1, 2, 1]
+    assert chain[keys.VEHICLES, "visibility"][:, 1].tolist() == [
+        2,
+        1,
+        2,
+        1,
+    ]
 
 
 def test_rows_keep_their_part_over_automatic_resets_where_the_batch_is_a_multiple_of_the_period():
     traffic = mixture(**RULES)
     env = environment(num_envs=10, traffic=traffic, goal_m=60.0, dtype=torch.float32)
-    td, first, numbers = env.reset(), None, set()
+    td = env.reset()
+    first = None
+    numbers = set()
     for _ in range(12):
         td[keys.ACTION] = torch.zeros(10, dtype=torch.int64)
         _, td = env.step_and_maybe_reset(td)
@@ -153,7 +196,8 @@ def test_graphs_meet_few_numbers_of_rows(monkeypatch):
         monkeypatch.setattr(part, "compile_graphs", lambda: None)
     plain = drive(copy.deepcopy(traffic), 64)
     traffic.compile_graphs()
-    generator, sizes = torch.Generator().manual_seed(0), set()
+    generator = torch.Generator().manual_seed(0)
+    sizes = set()
     for _ in range(50):
         episodes = torch.randint(0, 999, (64,), generator=generator)
         parts = traffic.rows_of_parts(episodes)
@@ -169,17 +213,42 @@ def test_graphs_meet_few_numbers_of_rows(monkeypatch):
 @pytest.mark.parametrize(
     ("make", "told"),
     [
-        (lambda: MixedTrafficConfig(shares={"replay": 1}), "replay: it plays recordings"),
-        (lambda: MixedTrafficConfig(shares={"idm_mobli": 1}), "did you mean 'idm_mobil'"),
-        (lambda: MixedTrafficConfig(shares={}), "whole numbers of at least 1"),
-        (lambda: MixedTrafficConfig(shares={"idm": 2000}), "whole numbers of at least 1"),
-        (lambda: MixedTrafficConfig(shares={"idm": 0}), "expected at least 1"),
-        (lambda: MixedTrafficConfig(shares={"idm": 0.5}), "expected a whole number"),
-        (lambda: MixedTrafficConfig(shares=3), "expected names with values"),
-        (lambda: MixedTrafficConfig(shares={"mixed": 1}), "is a mixture itself"),
+        (
+            lambda: MixedTrafficConfig(shares={"replay": 1}),
+            "replay: it plays recordings",
+        ),
+        (
+            lambda: MixedTrafficConfig(shares={"idm_mobli": 1}),
+            "did you mean 'idm_mobil'",
+        ),
+        (
+            lambda: MixedTrafficConfig(shares={}),
+            "whole numbers of at least 1",
+        ),
+        (
+            lambda: MixedTrafficConfig(shares={"idm": 2000}),
+            "whole numbers of at least 1",
+        ),
+        (
+            lambda: MixedTrafficConfig(shares={"idm": 0}),
+            "expected at least 1",
+        ),
+        (
+            lambda: MixedTrafficConfig(shares={"idm": 0.5}),
+            "expected a whole number",
+        ),
+        (
+            lambda: MixedTrafficConfig(shares=3),
+            "expected names with values",
+        ),
+        (
+            lambda: MixedTrafficConfig(shares={"mixed": 1}),
+            "is a mixture itself",
+        ),
         (
             lambda: MixedTraffic(
-                {"a": IdmTraffic(), "b": IdmTraffic(Road(lanes=2))}, {"a": 1, "b": 1}
+                {"a": IdmTraffic(), "b": IdmTraffic(Road(lanes=2))},
+                {"a": 1, "b": 1},
             ),
             "different roads or streams",
         ),
@@ -194,7 +263,8 @@ def test_what_cannot_be_is_refused_in_one_sentence(make, told):
 
 def test_a_model_of_ones_own_is_mixed_by_its_import_path():
     traffic = make_traffic(
-        MixedTrafficConfig(shares={"ganlane.traffic.IdmTraffic": 1, "idm_mobil": 1}), EnvConfig()
+        MixedTrafficConfig(shares={"ganlane.traffic.IdmTraffic": 1, "idm_mobil": 1}),
+        EnvConfig(),
     )
     assert isinstance(traffic, MixedTraffic)
     assert [name for name, _ in traffic.named_parts()] == [
@@ -202,7 +272,8 @@ def test_a_model_of_ones_own_is_mixed_by_its_import_path():
         "idm_mobil",
     ]
     one, other = (
-        drive(each, 4)[-1].exclude(keys.TRAFFIC) for each in (traffic, mixture(idm=1, idm_mobil=1))
+        drive(model, 4)[-1].exclude(keys.TRAFFIC)
+        for model in (traffic, mixture(idm=1, idm_mobil=1))
     )
     assert same_bits(one, other) == []
 
@@ -217,10 +288,14 @@ CHASE = vehicles(
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
-def test_a_follower_brakes_for_an_ego_unless_it_does_not_see_it_and_the_environment_says_so(share):
+def test_a_follower_brakes_for_an_ego_unless_it_does_not_see_it_and_the_environment_says_so(
+    share,
+):
     """A fast driver behind a slow ego, second by second."""
     env = environment(vehicles=2, traffic=BlindTraffic(IdmTraffic(), share))
-    td, speeds, crashes = placed(env, CHASE), [], []
+    td = placed(env, CHASE)
+    speeds = []
+    crashes = []
     for _ in range(8):
         td = step(env, td)
         speeds.append(td[keys.VEHICLES, "speed"][0, 1].item())
@@ -232,19 +307,32 @@ def test_a_follower_brakes_for_an_ego_unless_it_does_not_see_it_and_the_environm
 @pytest.mark.parametrize("traffic", [IdmMobilTraffic, idm_faults_traffic])
 def test_nobody_is_blind_at_a_share_of_0_and_nothing_is_built(traffic):
     plain, blind = (
-        environment(num_envs=16, traffic=made) for made in (traffic(), BlindTraffic(traffic(), 0.0))
+        environment(num_envs=16, traffic=model)
+        for model in (traffic(), BlindTraffic(traffic(), 0.0))
     )
-    one, other = plain.reset(), blind.reset()
+    one = plain.reset()
+    other = blind.reset()
     for _ in range(10):
-        one, other = step(plain, one), step(blind, other)
+        one = step(plain, one)
+        other = step(blind, other)
         assert same_bits(one.exclude(keys.TRAFFIC), other.exclude(keys.TRAFFIC)) == []
         assert same_bits(one[keys.TRAFFIC], other[keys.TRAFFIC, "model"]) == []
-    assert isinstance(make_traffic(IdmMobilTrafficConfig(), EnvConfig()), IdmMobilTraffic)
-    assert isinstance(make_traffic(IdmTrafficConfig(blind_share=0.5), EnvConfig()), BlindTraffic)
+    assert isinstance(
+        make_traffic(IdmMobilTrafficConfig(), EnvConfig()),
+        IdmMobilTraffic,
+    )
+    assert isinstance(
+        make_traffic(IdmTrafficConfig(blind_share=0.5), EnvConfig()),
+        BlindTraffic,
+    )
 
 
 def test_the_ego_stays_where_the_environment_has_it():
-    env = environment(num_envs=8, traffic=BlindTraffic(IdmMobilTraffic(), 1.0), dtype=torch.float32)
+    env = environment(
+        num_envs=8,
+        traffic=BlindTraffic(IdmMobilTraffic(), 1.0),
+        dtype=torch.float32,
+    )
     td = env.reset()
     for _ in range(5):
         td = step(env, td)

@@ -23,7 +23,11 @@ from ganlane.traffic import (
     TrafficModule,
     TrafficSequential,
 )
-from ganlane.traffic.overlays import distance_hazard, literal_hazard, random_side
+from ganlane.traffic.overlays import (
+    distance_hazard,
+    literal_hazard,
+    random_side,
+)
 
 
 class Drift(TrafficModule):
@@ -31,7 +35,8 @@ class Drift(TrafficModule):
 
     def __init__(self, road=None, lateral=1.0, acceleration=2.0):
         super().__init__(road)
-        self.lateral, self.acceleration = lateral, acceleration
+        self.lateral = lateral
+        self.acceleration = acceleration
 
     def move(self, vehicles, memory, key, step):
         speed = vehicles.speed + self.acceleration * self.dt
@@ -43,7 +48,11 @@ def run(n, m, seconds, base, **overlays):
     """The others [T + 1, N, M - 1] after every physics step beside a keep-lane ego, and the last
     state.
     """
-    env = HighwayEnv(TrafficSequential({"base": base, **overlays}), num_envs=n, vehicles=m)
+    env = HighwayEnv(
+        TrafficSequential({"base": base, **overlays}),
+        num_envs=n,
+        vehicles=m,
+    )
     all_vehicles, _, state = drive(env, range(n), seconds)
     return Vehicles(*(field[..., 1:] for field in all_vehicles)), state
 
@@ -53,8 +62,10 @@ def changes_started(others):
 
 
 def test_the_mean_wait_of_equation_10_is_the_root_of_half_pi_t_m_and_not_t_m():
-    t_m, draws = 2218.0, torch.Generator().manual_seed(0)
-    waiting, wait = torch.ones(20_000, dtype=torch.bool), torch.zeros(20_000)
+    t_m = 2218.0
+    draws = torch.Generator().manual_seed(0)
+    waiting = torch.ones(20_000, dtype=torch.bool)
+    wait = torch.zeros(20_000)
     for clock in range(400):
         starts = torch.rand(20_000, generator=draws) < literal_hazard(
             torch.tensor(float(clock)), t_m
@@ -81,7 +92,8 @@ def test_a_rate_per_kilometre_gives_that_many_changes_per_kilometre():
 
 
 @pytest.mark.parametrize(
-    ("lane", "lanes", "sides"), [(0, 3, {1}), (1, 3, {-1, 1}), (2, 3, {-1}), (0, 1, {0})]
+    ("lane", "lanes", "sides"),
+    [(0, 3, {1}), (1, 3, {-1, 1}), (2, 3, {-1}), (0, 1, {0})],
 )
 def test_a_side_always_has_a_lane_on_it(lane, lanes, sides):
     u = torch.rand(1000, generator=torch.Generator().manual_seed(1))
@@ -90,7 +102,13 @@ def test_a_side_always_has_a_lane_on_it(lane, lanes, sides):
 
 def test_literal_changes_end_on_a_lane_centre_at_their_own_lateral_speed_and_restart_the_clock():
     changes = LiteralChanges(mean_steps=60.0, lateral_speed_mps=1.0, lateral_speed_sd_mps=0.0)
-    others, state = run(16, 6, 40, IdmTraffic(), change=LiteralLaneChange(changes=changes))
+    others, state = run(
+        16,
+        6,
+        40,
+        IdmTraffic(),
+        change=LiteralLaneChange(changes=changes),
+    )
     moved = others.y.diff(dim=0).abs()
     fast = moved[moved > 0.05]
     assert len(fast) > 1000
@@ -121,11 +139,17 @@ def test_sudden_accelerations_fill_a_third_of_the_time_with_the_spread_of_the_da
     vehicles = HighwayEnv(IdmTraffic(), num_envs=200).reset()["vehicles"].clone()
     vehicles["speed"][:] = 20.0
     view = TensorDict({"vehicles": vehicles, "moved": vehicles.clone()}, [200])
-    view["seed"], view["episode"] = torch.zeros(200, dtype=torch.int64), torch.arange(200)
+    view["seed"], view["episode"] = (
+        torch.zeros(200, dtype=torch.int64),
+        torch.arange(200),
+    )
     view["traffic"] = overlay.init_memory(Vehicles.of(vehicles), view["episode"])
     record = []
     for step in range(300):
-        view["step"], view["moved"] = torch.full((200,), step), vehicles.clone()
+        view["step"], view["moved"] = (
+            torch.full((200,), step),
+            vehicles.clone(),
+        )
         record.append(overlay(view)["moved", "acceleration"])
     acceleration = torch.stack(record)
     active = acceleration.abs() > 1e-4
@@ -140,7 +164,8 @@ def test_the_guard_keeps_a_drifting_network_on_the_road_and_at_a_speed_people_dr
     others, state = run(16, 9, 90, Drift(road), guard=Guard(road))
     half = lateral_half_extent(others)
     outside = torch.maximum(
-        others.y + half - road.left_edge_m(), road.right_edge_m() - (others.y - half)
+        others.y + half - road.left_edge_m(),
+        road.right_edge_m() - (others.y - half),
     )
     assert outside[1:].max() <= 1e-4
     vehicles = state["vehicles"]
@@ -154,7 +179,8 @@ def test_the_guard_does_not_let_a_network_that_always_brakes_stand_still():
 
 
 def test_the_guard_leaves_sensible_driving_alone():
-    guard, base = Guard(), IdmTraffic()
+    guard = Guard()
+    base = IdmTraffic()
     _, _, state = drive(HighwayEnv(base, num_envs=8), range(8), 30)
     view = base(TensorDict({k: state[k] for k in base.in_keys}, [8]))
     before = Vehicles.of(view["moved"])
@@ -165,10 +191,17 @@ def test_the_guard_leaves_sensible_driving_alone():
 
 
 @pytest.mark.parametrize("overlays", [{}, {"guard": Guard()}])
-def test_a_model_without_memory_drives_through_rollouts_and_resets(overlays):
+def test_a_model_without_memory_drives_through_rollouts_and_resets(
+    overlays,
+):
     model = Drift(lateral=0.0)
     traffic = TrafficSequential({"base": model, **overlays}) if overlays else model
     env = HighwayEnv(traffic, num_envs=3, episode=EpisodeParameters(goal_m=60.0))
     assert env.rollout(12, break_when_any_done=False)["next", "done"].any()
-    again = env.rollout(3, tensordict=env.reset(), auto_reset=False, break_when_any_done=False)
+    again = env.rollout(
+        3,
+        tensordict=env.reset(),
+        auto_reset=False,
+        break_when_any_done=False,
+    )
     assert again.shape == (3, 3)

@@ -37,9 +37,13 @@ def others_of(traffic, n, decisions):
 
 def beyond_the_edge(others: Vehicles) -> float:
     """How far the outermost body reaches past the edge of the road, m; negative inside."""
-    road, half = Road(), lateral_half_extent(others)
+    road = Road()
+    half = lateral_half_extent(others)
     return (
-        torch.maximum(others.y + half - road.left_edge_m(), road.right_edge_m() - (others.y - half))
+        torch.maximum(
+            others.y + half - road.left_edge_m(),
+            road.right_edge_m() - (others.y - half),
+        )
         .max()
         .item()
     )
@@ -56,7 +60,8 @@ def test_with_its_guard_gan_traffic_stays_on_the_road_and_without_it_leaves_it()
 
 @pytest.mark.slow
 def test_no_vehicle_leaves_the_road_in_1000_episodes_of_gan_traffic():
-    worst, ended = -9.0, 0
+    worst = -9.0
+    ended = 0
     for chunk in range(4):
         env = HighwayEnv(gan_traffic(), num_envs=250)
         state = start(env, range(250 * chunk, 250 * (chunk + 1)))
@@ -103,16 +108,26 @@ def test_calibrated_traffic_changes_lanes_as_often_as_recorded_and_touches_nobod
 
 def test_calibrated_drivers_keep_different_headways_and_their_own():
     env = HighwayEnv(gan_calibrated_traffic(), num_envs=64)
-    before, (_, _, after) = start(env, range(64)), drive(env, range(64), 1)
+    before, (_, _, after) = (
+        start(env, range(64)),
+        drive(env, range(64), 1),
+    )
     headway = before["traffic", "generator", "headway"]
     assert headway.std() > 0.3
     assert torch.equal(after["traffic", "generator", "headway"], headway)
 
 
 @pytest.mark.parametrize(
-    "preset", [gan_traffic, lambda: gan_traffic(execute_k=3), gan_calibrated_traffic]
+    "preset",
+    [
+        gan_traffic,
+        lambda: gan_traffic(execute_k=3),
+        gan_calibrated_traffic,
+    ],
 )
-def test_generated_traffic_is_the_same_in_every_batch_up_to_rounding(preset):
+def test_generated_traffic_is_the_same_in_every_batch_up_to_rounding(
+    preset,
+):
     many, alone = (
         drive(HighwayEnv(preset(), len(rows)), rows, 5)[2]["vehicles"] for rows in (range(6), [4])
     )
@@ -129,7 +144,12 @@ def fitted_with(folder, *without, **settings):
     config = {name: value for name, value in metadata["config"].items() if name not in without}
     path = folder / "generator.safetensors"
     rest = {name: value for name, value in metadata.items() if name not in ("kind", "config")}
-    save_weights(path, "generator", tensors, {**rest, "config": {**config, **settings}})
+    save_weights(
+        path,
+        "generator",
+        tensors,
+        {**rest, "config": {**config, **settings}},
+    )
     return path
 
 
@@ -139,7 +159,10 @@ def anchor_of(path):
 
 @pytest.mark.parametrize(
     "settings",
-    [{"washout_s": 6.0, "further_inputs": False}, {"washout_s": math.inf, "further_inputs": True}],
+    [
+        {"washout_s": 6.0, "further_inputs": False},
+        {"washout_s": math.inf, "further_inputs": True},
+    ],
 )
 def test_calibrated_weights_drive_with_the_washout_and_the_further_inputs_they_were_fitted_with(
     tmp_path, settings
@@ -155,9 +178,12 @@ def test_the_shipped_weights_and_older_ones_that_name_no_washout_drive_with_the_
     assert anchor_of(None) == anchor_of(older) == SIMULATED_ANCHOR
 
 
-def test_weights_that_see_no_further_inputs_drive_otherwise_than_those_that_do(tmp_path):
+def test_weights_that_see_no_further_inputs_drive_otherwise_than_those_that_do(
+    tmp_path,
+):
     blind = gan_calibrated_traffic(
-        path=fitted_with(tmp_path, further_inputs=False), noise_scale=0.0
+        path=fitted_with(tmp_path, further_inputs=False),
+        noise_scale=0.0,
     )
     seeing = gan_calibrated_traffic(noise_scale=0.0)
     ends = [others_of(traffic, 4, 3).speed[-1] for traffic in (blind, seeing)]
@@ -167,7 +193,10 @@ def test_weights_that_see_no_further_inputs_drive_otherwise_than_those_that_do(t
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
-        ({"traits": False}, r"generator\.safetensors: fitted with traits=False"),
+        (
+            {"traits": False},
+            r"generator\.safetensors: fitted with traits=False",
+        ),
         ({"washout_s": 0.0}, "fit it again"),
         ({"washout_s": math.nan}, "fit it again"),
         ({"washout_s": "3"}, "fit it again"),
@@ -188,11 +217,19 @@ def test_weights_of_the_other_preset_are_refused():
 
 @pytest.mark.parametrize(
     ("recorded", "driven"),
-    [((0.0, 0.0), (0.0, 0.0)), ((0.3, 0.5), (0.3, 0.5)), ((None, None), (0.0, 0.8))],
+    [
+        ((0.0, 0.0), (0.0, 0.0)),
+        ((0.3, 0.5), (0.3, 0.5)),
+        ((None, None), (0.0, 0.8)),
+    ],
 )
 def test_recorded_accelerations_of_zero_are_not_missing_ones(recorded, driven):
     _, metadata = load_weights(shipped_generator("paper"), "generator")
     statistics = DrivingStatistics.from_dict(metadata["driving_statistics"])
-    smoothed = replace(statistics.acceleration_smoothed, mean=recorded[0], sd=recorded[1])
+    smoothed = replace(
+        statistics.acceleration_smoothed,
+        mean=recorded[0],
+        sd=recorded[1],
+    )
     sudden = sudden_accelerations(replace(statistics, acceleration_smoothed=smoothed))
     assert (sudden.mean, sudden.sd) == driven

@@ -11,7 +11,13 @@ import torch
 from scipy.stats import chisquare
 
 from ganlane import keys
-from ganlane.data import SyntheticTraffic, default_scenes, sort, synthetic_scenes, write_scene_csv
+from ganlane.data import (
+    SyntheticTraffic,
+    default_scenes,
+    sort,
+    synthetic_scenes,
+    write_scene_csv,
+)
 from ganlane.errors import UserError
 from ganlane.settings.driving import Visibility
 from ganlane.sim import Vehicles
@@ -25,7 +31,12 @@ WIDTH = 3.5
 def track(vehicle, frames, x, speed, lane, scene="s", length=4.0, width=2.0) -> pl.DataFrame:
     """A vehicle at a steady speed on a lane's centre."""
     frame = pl.DataFrame({"frame": list(frames)})
-    same = {"vehicle": vehicle, "y": lane * WIDTH, "speed": float(speed), "lane": lane}
+    same = {
+        "vehicle": vehicle,
+        "y": lane * WIDTH,
+        "speed": float(speed),
+        "lane": lane,
+    }
     same |= {"length": length, "width": width, "scene": scene}
     constants = (pl.lit(value).alias(name) for name, value in same.items())
     return frame.select("frame", *constants, x=x + speed * 0.1 * pl.col("frame"))
@@ -44,7 +55,12 @@ def start(traffic: ReplayTraffic, key: torch.Tensor, vehicles: int = 9) -> Vehic
     return traffic.scenes(vehicles)(key, torch.float64)
 
 
-def play(traffic: ReplayTraffic, key: torch.Tensor, step: int, vehicles: int = 9) -> Vehicles:
+def play(
+    traffic: ReplayTraffic,
+    key: torch.Tensor,
+    step: int,
+    vehicles: int = 9,
+) -> Vehicles:
     """The vehicles that ``move`` gives ``step`` steps after the start."""
     scene = start(traffic, key, vehicles)
     return traffic.move(scene, {}, key, torch.full_like(key, step - 1))[0]
@@ -63,7 +79,15 @@ FIVE = (
 def test_the_ego_takes_the_place_of_the_vehicle_nearest_the_middle():
     scene = start(replay(*FIVE), keys_of([0]))
     # Positions 0, 20, 30, 45, 100: their median is 30.
-    names = ("x", "y", "speed", "length", "width", "target_lane", "desired_speed")
+    names = (
+        "x",
+        "y",
+        "speed",
+        "length",
+        "width",
+        "target_lane",
+        "desired_speed",
+    )
     assert [getattr(scene, name)[0, 0].item() for name in names] == [
         0.0,
         WIDTH,
@@ -91,22 +115,35 @@ def test_places_without_a_recorded_vehicle_are_not_valid():
 
 
 def test_vehicles_go_where_they_went_and_one_that_leaves_is_no_longer_valid():
-    traffic, key = replay(*FIVE), keys_of([0])
+    traffic = replay(*FIVE)
+    key = keys_of([0])
     for step in range(1, 21):
         now = play(traffic, key, step)
         assert now.x[0, 1:5].tolist() == pytest.approx(
-            [-10.0 + step, 15.0 + 1.5 * min(step, 7), -30.0 + 2.0 * step, 70.0 + 1.5 * step]
+            [
+                -10.0 + step,
+                15.0 + 1.5 * min(step, 7),
+                -30.0 + 2.0 * step,
+                70.0 + 1.5 * step,
+            ]
         )
         assert now.valid[0].tolist() == [True, True, step <= 7, True, True] + [False] * 4
 
 
 def test_the_episode_lasts_as_long_as_the_scene():
-    assert replay(*FIVE).steps_of(keys_of([0, 1, 2])).tolist() == [20, 20, 20]
+    assert replay(*FIVE).steps_of(keys_of([0, 1, 2])).tolist() == [
+        20,
+        20,
+        20,
+    ]
     longer = replay(*FIVE, track(7, range(10, 41), 0.0, 10.0, 0))
     # Whoever the ego replaces, and whenever: the scene ends at frame 40.
     key = keys_of(range(50))
     first_frame = 40 - longer.steps_of(key)
-    assert first_frame.unique().tolist() == [*range(0, 1), *range(10, 21)]
+    assert first_frame.unique().tolist() == [
+        *range(0, 1),
+        *range(10, 21),
+    ]
 
 
 def test_a_track_with_a_missing_frame_ends_there():
@@ -117,13 +154,20 @@ def test_a_track_with_a_missing_frame_ends_there():
 
 
 def test_nobody_reacts_to_the_ego():
-    traffic, key = ReplayTraffic(recordings=recorded(3)), keys_of(range(16))
+    traffic = ReplayTraffic(recordings=recorded(3))
+    key = keys_of(range(16))
     scene = start(traffic, key)
     elsewhere = scene.with_(x=scene.x + 5.0, y=scene.y + 1.0, speed=scene.speed * 0.0)
     one, other = (
         traffic.move(at, {}, key, torch.full_like(key, 7))[0] for at in (scene, elsewhere)
     )
-    assert all(map(torch.equal, one.columns(slice(1, None)), other.columns(slice(1, None))))
+    assert all(
+        map(
+            torch.equal,
+            one.columns(slice(1, None)),
+            other.columns(slice(1, None)),
+        )
+    )
     assert all(map(torch.equal, other.at(0), elsewhere.at(0)))
 
 
@@ -131,16 +175,18 @@ def recorded(scenes: int = 4, seconds: float = 8.0, **others) -> pl.DataFrame:
     """Synthetic scenes of which the k-th has 2 + k % 3 lanes and loses its last k seconds."""
     parts = []
     for k in range(scenes):
-        made = synthetic_scenes(
-            SyntheticTraffic(scenes=1, lanes=2 + k % 3, seconds=seconds, **others), seed=k
+        frame = synthetic_scenes(
+            SyntheticTraffic(scenes=1, lanes=2 + k % 3, seconds=seconds, **others),
+            seed=k,
         )
-        cut = made.filter(pl.col("frame") < round((seconds - 0.5 * k) * 10))
+        cut = frame.filter(pl.col("frame") < round((seconds - 0.5 * k) * 10))
         parts.append(cut.with_columns(scene=pl.lit(f"scene-{k}")))
     return sort(pl.concat(parts))
 
 
 def test_every_scene_is_equally_likely_and_every_start_within_it():
-    traffic, episodes = ReplayTraffic(recordings=recorded()), range(20_000)
+    traffic = ReplayTraffic(recordings=recorded())
+    episodes = range(20_000)
     starts = traffic.start_of(keys_of(episodes))
     scenes = np.bincount(traffic.scene_of(keys_of(episodes)).numpy(), minlength=4)
     assert chisquare(scenes).pvalue > 1e-3
@@ -157,8 +203,10 @@ def test_streams_and_seeds_take_other_starts():
 
 
 def test_lanes_and_their_width_are_the_scenes_own():
-    traffic, key = ReplayTraffic(recordings=recorded()), keys_of(range(100))
-    road, scene = traffic.road_of(key, torch.float64), traffic.scene_of(key)
+    traffic = ReplayTraffic(recordings=recorded())
+    key = keys_of(range(100))
+    road = traffic.road_of(key, torch.float64)
+    scene = traffic.scene_of(key)
     assert road.lanes.shape == road.lane_width_m.shape == (100, 1)
     assert torch.equal(road.lanes[:, 0], 2 + scene % 3)
     assert (road.lane_width_m - 3.5).abs().max() < 0.2
@@ -171,47 +219,57 @@ def test_lanes_and_their_width_are_the_scenes_own():
 
 
 def test_every_step_is_what_a_search_through_the_rows_finds():
-    made = sort(
+    frame = sort(
         synthetic_scenes(
-            SyntheticTraffic(scenes=2, vehicles=14, seconds=7.0, changing_share=0.6), seed=3
+            SyntheticTraffic(scenes=2, vehicles=14, seconds=7.0, changing_share=0.6),
+            seed=3,
         )
     )
     # Some come later and some leave early.
-    made = made.filter(
+    frame = frame.filter(
         (pl.col("frame") >= 2 * (pl.col("vehicle") % 4))
         & (pl.col("frame") < 70 - pl.col("vehicle"))
     )
-    traffic = ReplayTraffic(recordings=made, least_s=3.0)
+    traffic = ReplayTraffic(recordings=frame, least_s=3.0)
     key = keys_of(range(12))
     for row, (scene, steps) in enumerate(
-        zip(traffic.scene_of(key).tolist(), traffic.steps_of(key).tolist())
+        zip(
+            traffic.scene_of(key).tolist(),
+            traffic.steps_of(key).tolist(),
+        )
     ):
-        rows = made.filter(pl.col("scene") == traffic.scene_names[scene])
+        rows = frame.filter(pl.col("scene") == traffic.scene_names[scene])
         first = rows["frame"].max() - steps
         here = rows.filter(pl.col("frame") == first)
         ending = rows.group_by("vehicle").agg(pl.col("frame").max().alias("end"))
         middle = here["x"].median()
         stays = here.join(ending, on="vehicle").filter(pl.col("end") >= first + 30)
-        ego = min(stays.to_dicts(), key=lambda car: (abs(car["x"] - middle), car["vehicle"]))
+        ego = min(
+            stays.to_dicts(),
+            key=lambda car: (abs(car["x"] - middle), car["vehicle"]),
+        )
         others = [car for car in here.to_dicts() if car["vehicle"] != ego["vehicle"]]
         others.sort(
-            key=lambda car: (np.hypot(car["x"] - ego["x"], car["y"] - ego["y"]), car["vehicle"])
+            key=lambda car: (
+                np.hypot(car["x"] - ego["x"], car["y"] - ego["y"]),
+                car["vehicle"],
+            )
         )
         for step in (1, 17, steps):
             now = play(traffic, key[row : row + 1], step)
             for slot, car in enumerate(others[:8], start=1):
-                found = rows.filter(
+                samples = rows.filter(
                     (pl.col("vehicle") == car["vehicle"]) & (pl.col("frame") == first + step)
                 ).to_dicts()
-                assert now.valid[0, slot].item() == bool(found)
-                if found:
+                assert now.valid[0, slot].item() == bool(samples)
+                if samples:
                     seen = (
                         now.x[0, slot] + ego["x"],
                         now.y[0, slot],
                         now.speed[0, slot],
                         now.length[0, slot],
                     )
-                    expected = [found[0][name] for name in ("x", "y", "speed", "length")]
+                    expected = [samples[0][name] for name in ("x", "y", "speed", "length")]
                     assert [value.item() for value in seen] == pytest.approx(expected)
 
 
@@ -232,14 +290,20 @@ def test_heading_and_acceleration_are_those_of_the_path():
 
 
 def test_a_scene_file_is_read(tmp_path):
-    made = synthetic_scenes(SyntheticTraffic(scenes=2, seconds=6.0))
-    write_scene_csv(made, tmp_path / "mine.csv")
-    assert ReplayTraffic(path=tmp_path / "mine.csv").scene_names == ("synthetic-0", "synthetic-1")
+    frame = synthetic_scenes(SyntheticTraffic(scenes=2, seconds=6.0))
+    write_scene_csv(frame, tmp_path / "mine.csv")
+    assert ReplayTraffic(path=tmp_path / "mine.csv").scene_names == (
+        "synthetic-0",
+        "synthetic-1",
+    )
 
 
 def test_without_recordings_it_says_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
-    with pytest.raises(UserError, match=r"no recordings found.*traffic.path=FILE.*GANLANE_DATA"):
+    with pytest.raises(
+        UserError,
+        match=r"no recordings found.*traffic.path=FILE.*GANLANE_DATA",
+    ):
         ReplayTraffic()
 
 
@@ -269,7 +333,8 @@ def test_the_us101_scenes_can_all_be_replayed(us101):
 
 def test_how_long_the_us101_scenes_last_and_how_soon_they_empty(us101):
     key = keys_of(range(2000), stream=2)
-    steps, scene = us101.steps_of(key), us101.scenes(9)(key, torch.float32)
+    steps = us101.steps_of(key)
+    scene = us101.scenes(9)(key, torch.float32)
     assert steps.min() == 40
     assert 290 <= steps.max() <= 300
     assert steps.double().mean().item() == pytest.approx(80, abs=3)
@@ -281,5 +346,6 @@ def test_how_long_the_us101_scenes_last_and_how_soon_they_empty(us101):
         empty = ~us101.recorded(key, torch.full_like(key, number), 9, torch.float32).valid[
             :, 1:
         ].any(1)
-        driven, alone = driven + running.sum().item(), alone + (running & empty).sum().item()
+        driven = driven + running.sum().item()
+        alone = alone + (running & empty).sum().item()
     assert alone / driven == pytest.approx(0.18, abs=0.01)

@@ -14,9 +14,19 @@ from ganlane.settings.generator import EXTRA_INPUTS, GeneratorSizes
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.spawn import spawn
 from ganlane.sim.state import Road, Vehicles
-from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
+from ganlane.traffic.social_gan import (
+    AnchoredGanTraffic,
+    SocialGanTraffic,
+)
 
-SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
+SMALL = {
+    "embedding": 16,
+    "hidden": 12,
+    "pooling": 10,
+    "pooled": 6,
+    "context": 14,
+    "noise": 4,
+}
 ROAD = Road(3, 4.0)
 
 
@@ -34,7 +44,8 @@ def calibrated(**options):
 
 
 @pytest.fixture(
-    params=[paper, calibrated, lambda: paper(execute_k=3)], ids=["paper", "calibrated", "planning"]
+    params=[paper, calibrated, lambda: paper(execute_k=3)],
+    ids=["paper", "calibrated", "planning"],
 )
 def module(request):
     return request.param()
@@ -42,13 +53,23 @@ def module(request):
 
 def begin(module, rows=4, vehicles=9, seed=5):
     """The first state of the episodes 0 to ``rows`` - 1."""
-    seed, episode = torch.full((rows,), seed), torch.arange(rows)
+    seed = torch.full((rows,), seed)
+    episode = torch.arange(rows)
     key = episode_key(module.stream, seed, episode)
     state = spawn(key, vehicles, 3, 4.0)
-    counters = {"seed": seed, "episode": episode, "step": torch.zeros_like(seed)}
+    counters = {
+        "seed": seed,
+        "episode": episode,
+        "step": torch.zeros_like(seed),
+    }
     memory = module.init_memory(state, key)
     return TensorDict(
-        {"vehicles": TensorDict(state.as_dict(), [rows]), "traffic": memory, **counters}, [rows]
+        {
+            "vehicles": TensorDict(state.as_dict(), [rows]),
+            "traffic": memory,
+            **counters,
+        },
+        [rows],
     )
 
 
@@ -68,13 +89,18 @@ def test_streams_seeds_and_episodes_give_other_drivers(module):
     assert (one != begin(module, rows=2)["traffic", "noise"]).all()
 
 
-def test_a_vehicle_that_enters_has_driven_straight_at_its_present_speed(module):
+def test_a_vehicle_that_enters_has_driven_straight_at_its_present_speed(
+    module,
+):
     td = drive(module, begin(module), 3)
     key = episode_key(module.stream, td["seed"], td["episode"])
     fresh = module.init_memory(Vehicles.of(td["vehicles"]), key)
     assert all(leaf.shape[:2] == (4, 9) for leaf in fresh.values())
     speed = td["vehicles", "speed"][1, 4]
-    torch.testing.assert_close(fresh["displacement"][1, 4], torch.stack([0.1 * speed, 0.0 * speed]))
+    torch.testing.assert_close(
+        fresh["displacement"][1, 4],
+        torch.stack([0.1 * speed, 0.0 * speed]),
+    )
 
 
 def test_who_is_not_valid_is_not_seen(module):
@@ -83,7 +109,8 @@ def test_who_is_not_valid_is_not_seen(module):
     other = td.clone()
     other["vehicles", "x"][:, 3] += 5.0
     other["vehicles", "speed"][:, 3] = 1.0
-    one, two = module(td)["moved"], module(other)["moved"]
+    one = module(td)["moved"]
+    two = module(other)["moved"]
     rest = [index for index in range(9) if index != 3]
     torch.testing.assert_close(one["x"][:, rest], two["x"][:, rest])
 
@@ -97,7 +124,10 @@ def test_the_ego_is_a_neighbour_of_the_calibrated_drivers():
 
 
 def test_z_of_zero_is_the_same_driving_for_every_stream():
-    modules = [paper(noise_scale=0.0), paper(noise_scale=0.0, stream=Stream.REPORT)]
+    modules = [
+        paper(noise_scale=0.0),
+        paper(noise_scale=0.0, stream=Stream.REPORT),
+    ]
     start = begin(modules[0])
     torch.testing.assert_close(
         *(drive(module, start.clone(), 5)["vehicles", "x"] for module in modules)
@@ -142,7 +172,8 @@ def test_the_past_is_moved_on_by_name_and_not_copied(module):
 
 @pytest.mark.slow
 @pytest.mark.skipif(
-    shutil.which("c++") is None and shutil.which("g++") is None, reason="needs a C++ compiler"
+    shutil.which("c++") is None and shutil.which("g++") is None,
+    reason="needs a C++ compiler",
 )
 def test_a_graph_drives_as_without_one(module):
     # So many rows that oneDNN multiplies.
@@ -151,5 +182,8 @@ def test_a_graph_drives_as_without_one(module):
     graph = drive(module, begin(module, rows=64), 12)
     for name in ("x", "y", "speed"):
         torch.testing.assert_close(
-            eager["vehicles", name], graph["vehicles", name], atol=1e-3, rtol=1e-5
+            eager["vehicles", name],
+            graph["vehicles", name],
+            atol=1e-3,
+            rtol=1e-5,
         )

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import polars as pl
 import torch
-from ganlane.parameters.generator import NgsimParameters
+from ganlane.settings.recordings import NgsimConfig
 from matplotlib import pyplot
 from reference.recordings import ngsim_rows, portal_csv, traffic, write_highd
 

@@ -1,8 +1,8 @@
 """The tables of README and docs that the matrix gives, and a check of the numbers printed around
 them.
 
-    python -m benchmarks.printed                                   # print what is not as the
-    results say python -m benchmarks.printed outputs/reproduce/RUN/results.json --write
+    python -m benchmarks.printed          # print what is not as the results say
+    python -m benchmarks.printed outputs/reproduce/RUN/results.json --write
 
 Tables stand between ``<!-- matrix NAME: begin -->`` and ``<!-- matrix NAME: end -->``. A test makes
 them again from ``docs/reproduce/results.json`` and from those of :data:`FURTHER`; it also looks up
@@ -23,6 +23,7 @@ from benchmarks.script import make_parser, run_script
 from ganlane.errors import UserError
 from ganlane.evaluation.table import Table
 from ganlane.files import split_at_markers, write_between_markers
+from ganlane.reproduce.report import PAPER_VI, PAPER_VII
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "reproduce" / "results.json"
@@ -73,13 +74,13 @@ CONTROL_CLAIMS = (
 #: Sections whose figures are looked up: document, and the heading of the section (None: all of it).
 CHECKED = (
     ("README.md", "## Results"),
-    ("docs/results.md", "## The matrix"),
-    ("docs/results.md", "## The paper's claims"),
-    ("docs/results.md", "## Controls"),
-    ("docs/results.md", "## Other roads"),
-    ("docs/results.md", "## Recordings, other simulators, individual drivers"),
-    ("docs/search.md", "## What each part is worth"),
-    ("docs/carry_over.md", "## agent_general over trainings"),
+    ("docs/drivers.md", "## The matrix"),
+    ("docs/drivers.md", "## The paper's claims"),
+    ("docs/drivers.md", "## Controls"),
+    ("docs/drivers.md", "## Other roads"),
+    ("docs/drivers.md", "## Recordings, other simulators, individual drivers"),
+    ("docs/drivers.md", "## What each part is worth"),
+    ("docs/drivers.md", "## agent_general over trainings"),
 )
 _INTERVAL = re.compile(r"([-+]?\d+(?:\.\d+)?) \[(-?\d+(?:\.\d+)?), (-?\d+(?:\.\d+)?)\]")
 
@@ -183,6 +184,39 @@ def _differences(results: Results, pairs: Sequence[tuple[str, str, str]]) -> lis
 def claims(results: Results) -> str:
     """Pairs of :data:`CLAIMS` by traffics."""
     return _by_traffic(results, "lead", _differences(results, CLAIMS))
+
+
+def paper(results: Results) -> str:
+    """The paper's Tables VI and VII, each number beside ours."""
+    lines = []
+    for agent, name in (("agent_idm", "Agent_IDM"), ("agent_gan", "Agent_GAN")):
+        percent, reward, spread = PAPER_VII[agent]
+        on_idm, on_mobil, on_gan = (
+            _at(results, f"{agent}+none", traffic) for traffic in ("idm", "idm_mobil", "gan")
+        )
+        crashes = [
+            f"{row['hard_crash']}, {row['soft_crash']} of {row['trainings'] * row['episodes']}"
+            for row in (on_idm, on_mobil)
+        ]
+        score = _with_interval(on_gan["normalized_percent"], on_gan["normalized_percent_ci"], "")
+        lines.append(
+            [
+                name,
+                "{}, {}".format(*PAPER_VI[agent]),
+                *crashes,
+                f"{percent} %; {reward} ({spread})",
+                f"{score} %; {on_gan['mean_reward']:.1f} ({on_gan['reward_sd']:.1f})",
+            ]
+        )
+    headings = [
+        "",
+        "VI, hard and soft crashes: the paper, Traffic_IDM",
+        "here, `idm`",
+        "here, `idm_mobil`",
+        "VII, % of MOBIL; reward (its standard deviation): the paper, Traffic_GAN",
+        "here, `gan`",
+    ]
+    return Table("", headings, lines).markdown(heading=False)
 
 
 def controls(results: Results) -> str:
@@ -311,14 +345,15 @@ def ablations(results: Results) -> str:
 #: Document and name of the markers to the table between them.
 SECTIONS: Mapping[tuple[str, str], Callable[[Results], str]] = {
     ("README.md", "readme"): readme,
-    ("docs/results.md", "leads"): leads,
-    ("docs/results.md", "failures"): failures,
-    ("docs/results.md", "claims"): claims,
-    ("docs/results.md", "controls"): controls,
-    ("docs/results.md", "roads"): roads,
-    ("docs/results.md", "elsewhere"): elsewhere,
-    ("docs/search.md", "ablations"): ablations,
-    ("docs/carry_over.md", "trainings"): trainings,
+    ("docs/drivers.md", "leads"): leads,
+    ("docs/drivers.md", "failures"): failures,
+    ("docs/drivers.md", "paper"): paper,
+    ("docs/drivers.md", "claims"): claims,
+    ("docs/drivers.md", "controls"): controls,
+    ("docs/drivers.md", "roads"): roads,
+    ("docs/drivers.md", "elsewhere"): elsewhere,
+    ("docs/drivers.md", "ablations"): ablations,
+    ("docs/drivers.md", "trainings"): trainings,
 }
 
 

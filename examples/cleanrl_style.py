@@ -16,7 +16,10 @@ from torch import nn
 
 import ganlane  # noqa: F401 - registers the environments
 
-BATCH, CAPACITY, GAMMA, TARGET_EVERY = 256, 50_000, 0.98, 100
+BATCH = 256
+CAPACITY = 50_000
+GAMMA = 0.98
+TARGET_EVERY = 100
 
 
 def next_observations(observation, ended, info):
@@ -51,7 +54,8 @@ def main(decisions=16_384, num_envs=64):
         "ganlane/Highway-v0", num_envs=num_envs, traffic="idm_mobil", goal_m=1000.0
     )
     envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(envs)
-    size, actions = envs.single_observation_space.shape[0], envs.single_action_space.n
+    size = envs.single_observation_space.shape[0]
+    actions = envs.single_action_space.n
     network, target = (
         nn.Sequential(
             nn.Linear(size, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU(), nn.Linear(128, actions)

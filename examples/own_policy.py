@@ -2,7 +2,7 @@
 
 A policy is anything that writes ``action``: a network that reads ``observation``, or, as here, a
 rule that reads the raw state. Run it with ``python examples/own_policy.py``. On the command line
-the same class is ``python -m ganlane.evaluate 'agents=[mobil,random_legal,own_policy.LargestGap]'``
+the same class is ``ganlane evaluate 'agents=[mobil,random_legal,own_policy.LargestGap]'``
 (with this folder on PYTHONPATH).
 """
 

@@ -38,7 +38,8 @@ def main():
     """Returns of two drivers under the paper's reward and under the courteous one, on the same
     episodes.
     """
-    road, short = Road(lanes=3), EpisodeParameters(goal_m=300.0)
+    road = Road(lanes=3)
+    short = EpisodeParameters(goal_m=300.0)
     for name in ("mobil", "random_legal"):
         driver = DRIVERS[name](road, Stream.REPORT)
         for title, transforms in (("paper", []), ("courteous", [Courtesy()])):

@@ -1,7 +1,7 @@
 """A traffic model of your own: IDM drivers who now and then look away and hold their speed.
 
 Run it with ``python examples/own_traffic.py``. On the command line the same class is
-``traffic._target_=own_traffic.Daydreamers +traffic.parameters.every_s=20.0`` (with this folder on
+``traffic._target_=own_traffic.Daydreamers traffic.every_s=20.0`` (with this folder on
 PYTHONPATH).
 """
 

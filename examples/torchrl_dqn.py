@@ -23,7 +23,8 @@ def main(decisions="1000000", episodes="100", goal_m="5000", num_envs="64"):
     torch.set_num_threads(1)  # small networks: a second thread only costs
     options = {"mask": "safe", "goal_m": float(goal_m)}
     env = ganlane.make_env("idm_mobil", int(num_envs), **options)
-    spec, masked = env.action_spec_unbatched, {"action_mask_key": "action_mask"}
+    spec = env.action_spec_unbatched
+    masked = {"action_mask_key": "action_mask"}
     network = MLP(env.observation_spec["observation"].shape[-1], 3, num_cells=[128, 128])
     actor = QValueActor(
         network, in_keys=["observation"], spec=spec, action_space="categorical", **masked

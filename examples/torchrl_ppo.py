@@ -16,7 +16,9 @@ from torchrl.objectives.value import GAE
 
 import ganlane
 
-STEPS, EPOCHS, MINIBATCH = 64, 4, 2048
+STEPS = 64
+EPOCHS = 4
+MINIBATCH = 2048
 
 
 def main(decisions="2000000", episodes="100", goal_m="5000", num_envs="256"):

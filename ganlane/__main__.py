@@ -37,33 +37,25 @@ def usage() -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the console script; the exit status."""
     open_closed_streams()
+    command, *rest = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     try:
-        status = dispatch(arguments)
+        if command in ("-h", "--help", "help"):
+            print(usage())
+        elif command == "--version":
+            print(__version__)
+        elif command == "doctor":
+            return importlib.import_module("ganlane.doctor").main(rest)
+        elif command in commands():
+            # Imported here: composing takes a third of a second, the list of commands none.
+            return importlib.import_module("ganlane.config.run").run_command(command, rest)
+        else:
+            names = ", ".join(commands())
+            print(f"ganlane: {command}: no such command; choose one of {names}.", file=sys.stderr)
+            return USER_ERROR
         sys.stdout.flush()
-        return status
     except OSError as error:
         return status_of(error, "ganlane")
-
-
-def dispatch(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status."""
-    command, *rest = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
-    if command in ("-h", "--help", "help"):
-        print(usage())
-        return 0
-    if command == "--version":
-        print(__version__)
-        return 0
-    if command not in commands():
-        print(
-            f"ganlane: {command}: no such command; choose one of {', '.join(commands())}.",
-            file=sys.stderr,
-        )
-        return USER_ERROR
-    # Imported here: composing takes a third of a second, the list of commands none.
-    if command == "doctor":
-        return importlib.import_module("ganlane.doctor").main(rest)
-    return importlib.import_module("ganlane.config.run").run_command(command, rest)
+    return 0
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ from ganlane.config.run import (
     cleared_after_mistakes,
     function_of,
     new_folder,
-    run_in,
+    running,
 )
 from ganlane.errors import UserError, did_you_mean
 from ganlane.evaluation import evaluation_rows, paired_rows, write_episodes, write_results
@@ -264,7 +264,9 @@ def render(
     config = call_settings("render", keys)
     with _torch_threads():
         if out is None:
-            line = run_in(new_folder("render"), "render", config)
+            folder = new_folder("render")
+            with running(folder, config):
+                line = function_of("render")(config, folder)
         else:
             line = function_of("render")(config, Path(out).parent)
     return Path(str(line).partition(": ")[2])
@@ -301,8 +303,8 @@ def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
                 "api.train() the folder of one, and resume=True."
             )
     config = call_settings(command, keys)
-    with _torch_threads():
-        run_in(home, command, config)
+    with _torch_threads(), running(home, config):
+        function_of(command)(config, home)
     return Run(home, json.loads((home / "results.json").read_text(encoding="utf-8")))
 
 

@@ -29,11 +29,24 @@ def evaluate(config: EvaluateConfig, folder: Path) -> str:
     """
     set_threads(config.threads)
     table = compare(make_drivers(config.agents, config.env, config.device), config)
-    seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
-    return publish(table, folder, asdict(config), seeds)
+    seeds = {
+        "stream": config.stream,
+        "seed": config.seed,
+        "episodes": [0, config.episodes - 1],
+    }
+    return publish(
+        table,
+        folder,
+        asdict(config),
+        seeds,
+    )
 
 
-def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = False) -> pl.DataFrame:
+def compare(
+    drivers: Sequence[Driver],
+    config: EvaluateConfig,
+    quiet: bool = False,
+) -> pl.DataFrame:
     """Run the episodes of ``config`` with each driver on each of its traffics.
 
     Each of ``drivers`` (:func:`ganlane.build.make_driver`) drives with its own observation and
@@ -45,19 +58,29 @@ def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = Fal
         below the other; and with ``scene``, the recorded scene of an episode, where one of the
         traffics replays (null for the others).
     """
-    env, seed, episodes = config.env, config.seed, config.episodes
+    env = config.env
+    seed = config.seed
+    episodes = config.episodes
     stream = Stream.named(config.stream)
     # All traffics are made first, so that one that cannot be made shows before any driving.
     modules = {name: make_traffic(option, env, stream) for name, option in config.traffics.items()}
     total = len(modules) * len(drivers) * episodes
+    # One table per driver and traffic, concatenated at the end; current is what the environment at
+    # hand was built for.
     tables = []
     current = None
     disabled = quiet or not sys.stderr.isatty()
-    with tqdm(total=total, unit="episode", file=sys.stderr, disable=disabled) as bar:
+    with tqdm(
+        total=total,
+        unit="episode",
+        file=sys.stderr,
+        disable=disabled,
+    ) as bar:
         for traffic, module in modules.items():
             for driver in drivers:
                 observation = config.observation.read_by(driver.observation)
                 mask, policy = driver.behind(config.mask)
+                # All but the number of rows, which shrinks towards the end.
                 make = partial(
                     make_env,
                     module,
@@ -77,7 +100,12 @@ def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = Fal
                 # A compiled environment would be compiled again for every size.
                 smaller = None if env.compile else make
                 table = evaluation.run_episodes(
-                    batch, policy, range(episodes), seed, report, smaller
+                    batch,
+                    policy,
+                    range(episodes),
+                    seed,
+                    report,
+                    smaller,
                 )
                 table = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
                 # Episodes of one recorded scene are no independent observations.
@@ -100,7 +128,11 @@ def _reporter(bar: tqdm, title: str) -> Callable[[int, int], None]:
     def report(finished: int, wanted: int) -> None:
         bar.update(before + finished - bar.n)
         if bar.disable and finished == wanted:
-            print(f"{title}: {wanted} episodes", file=sys.stderr, flush=True)
+            print(
+                f"{title}: {wanted} episodes",
+                file=sys.stderr,
+                flush=True,
+            )
 
     return report
 
@@ -115,10 +147,16 @@ def recorded_crashes(table: pl.DataFrame) -> list[dict[str, Any]]:
     if "scene" not in table.columns:
         return []
     rows = []
+    # Generated and rule-driven traffics have no scenes to resample.
     recorded = table.filter(pl.col("scene").is_not_null())
     for (agent, traffic), episodes in recorded.group_by("agent", "traffic", maintain_order=True):
         per_km, scenes = evaluation.crashes_by_scene(episodes, episodes["scene"].to_list())
-        row = {"agent": agent, "traffic": traffic, **entries("per_km", per_km), "scenes": scenes}
+        row = {
+            "agent": agent,
+            "traffic": traffic,
+            **entries("per_km", per_km),
+            "scenes": scenes,
+        }
         rows.append(row)
     return rows
 
@@ -138,8 +176,10 @@ def publish(
     further ``numbers``. Returns the line that names it.
     """
     # On the same episodes a difference shows long before two intervals part.
-    rows, paired = evaluation.evaluation_rows(table), evaluation.paired_rows(table)
+    rows = evaluation.evaluation_rows(table)
+    paired = evaluation.paired_rows(table)
     tables = [evaluation.text_table(rows)]
+    # A driver alone has nobody to be paired with.
     if paired:
         tables.append(evaluation.paired_table(paired))
     show(*tables, columns=config.get("columns", "all"))

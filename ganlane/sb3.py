@@ -65,15 +65,19 @@ class HighwayVecEnv(VecEnv):
         self._return = np.zeros(highways.num_envs)
         self._length = np.zeros(highways.num_envs, dtype=np.int64)
         super().__init__(
-            highways.num_envs, highways.single_observation_space, highways.single_action_space
+            highways.num_envs,
+            highways.single_observation_space,
+            highways.single_action_space,
         )
 
     def reset(self) -> Floats:
         """First observations [N, D] of the next episodes."""
+        # SB3 keeps seeds and options for the next reset and clears them after it.
         observation, _ = self.highways.reset(seed=self._seeds[0], options=self._options[0] or None)
         self._reset_seeds()
         self._reset_options()
-        self._return[:], self._length[:] = 0.0, 0
+        self._return[:] = 0.0
+        self._length[:] = 0
         return observation
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
@@ -91,7 +95,8 @@ class HighwayVecEnv(VecEnv):
         for row in np.flatnonzero(done):
             infos[row] = self._final_info(int(row), info)
             infos[row]["TimeLimit.truncated"] = bool(truncated[row] and not terminated[row])
-        self._return[done], self._length[done] = 0.0, 0
+        self._return[done] = 0.0
+        self._length[done] = 0
         return observation, reward.astype(np.float32), done, infos
 
     def _final_info(self, row: int, info: dict[str, Any]) -> dict[str, Any]:
@@ -144,6 +149,7 @@ class HighwayVecEnv(VecEnv):
             raise UserError(
                 f"env_method({method_name!r}): the rows have {names}; call one of them."
             )
+        # For all rows at once, of which those asked for are picked.
         results = getattr(self.highways, method_name)(*args, **kwargs)
         return [results[row] for row in self._get_indices(indices)]
 

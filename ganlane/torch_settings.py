@@ -34,6 +34,7 @@ def compiled(function: F) -> F:
 
     It is pure, on tensors, and has no branches on their values.
     """
+    # Beyond its limit torch falls back to uncompiled code without a word.
     torch._dynamo.config.cache_size_limit = max(
         torch._dynamo.config.cache_size_limit, GRAPHS_PER_FUNCTION
     )

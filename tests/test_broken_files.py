@@ -66,11 +66,11 @@ DAMAGES = (truncated, foreign, other_kind, no_description, other_weights, pickle
 #: Where an agent's or a generator's file can stand on a command line.
 PLACES = {
     "evaluate agents=[broken.safetensors]": AGENT,
-    "evaluate traffics=[gan] generator.path=broken.safetensors": GENERATOR,
+    "evaluate traffics={gan:{name:gan,path:broken.safetensors}}": GENERATOR,
     "evaluate agents=[broken.pt]": AGENT,
     "render agent=broken.safetensors": AGENT,
     "train traffic=idm init.path=broken.safetensors evaluation.agents=[mobil]": AGENT,
-    "train traffic=gan generator.path=broken.safetensors": GENERATOR,
+    "train traffic=gan traffic.path=broken.safetensors": GENERATOR,
 }
 #: Every damage once for an agent and once for a generator; elsewhere one.
 FIRST_TWO = [(line, damage) for line in list(PLACES)[:2] for damage in DAMAGES]
@@ -132,17 +132,17 @@ def test_a_broken_state_of_a_run_is_refused(content: Any, capsys, tmp_path):
     else:
         torch.save(content, file)
         seal_archive(file)  # without a checksum there is a note besides the sentence
-    run_folder("[traffic=idm]", file.read_bytes())
+    run_folder("traffic: idm", file.read_bytes())
     assert "resume" in refusal(capsys, "train", "resume=run")
 
 
 @pytest.mark.parametrize(
-    "overrides", ["", "a: b: c", "[env.lanes=many]", "[unclosed", "\x00", "[{a: 1}]"], ids=repr
+    "config", ["", "a: b: c", "env: {lanes: many}", "{unclosed", "\x00", "[{a: 1}]", "3"], ids=repr
 )
-def test_a_run_whose_command_line_is_damaged_is_not_resumed(overrides, capsys):
-    run_folder(overrides)
-    # The checkpoint would be refused as well: the sentence has to be about the command line.
-    named = "env.lanes=many" if "env.lanes" in overrides else "overrides.yaml"
+def test_a_run_whose_settings_are_damaged_is_not_resumed(config, capsys):
+    run_folder(config)
+    # The checkpoint would be refused as well: the sentence has to be about the settings.
+    named = "env.lanes=many" if "env" in config else "config.yaml"
     assert named in refusal(capsys, "train", "resume=run")
 
 
@@ -171,7 +171,7 @@ READERS = [
     "prepare data.path=broken.csv",
     "train_generator data.path=broken.csv",
     "realism data.path=broken.csv quick=true",
-    "evaluate traffics=[replay] traffic_options.replay.path=broken.csv",
+    "evaluate traffics={replay:{name:replay,path:broken.csv}}",
 ]
 
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 ENV_ID = "ganlane:ganlane/Highway-v0"
-ROWS, STEPS = 2, 128
+ROWS = 2
+STEPS = 128
 
 
 def make_env():
@@ -41,7 +42,9 @@ def ended_returns(infos):
 
 @pytest.mark.parametrize("make_envs", [one_by_one, as_a_batch])
 def test_its_ppo_finds_what_it_reads(make_envs):
-    envs, rng, returns = make_envs(), np.random.default_rng(0), []
+    envs = make_envs()
+    rng = np.random.default_rng(0)
+    returns = []
     assert isinstance(envs.single_action_space, gym.spaces.Discrete)
     shape = (ROWS, *envs.single_observation_space.shape)
     observation, _ = envs.reset(seed=1)

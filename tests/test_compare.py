@@ -35,8 +35,7 @@ def table(recordings):
     drivers = [make_driver(name, env) for name in ("keep_lane", "random_legal")]
     config = EvaluateConfig(
         env=env,
-        traffics=list(traffics),
-        traffic_options=traffics,
+        traffics=traffics,
         seed=5,
         episodes=EPISODES,
         num_envs=4,

@@ -38,32 +38,18 @@ def test_table_and_files_hold_every_agent_on_every_traffic(capsys):
     assert (path.parent / "config.yaml").is_file()
 
 
-def test_the_same_command_gives_the_same_numbers_whatever_the_batch(capsys):
-    rewards = []
-    for num_envs in (4, 3):
-        _, results = run(
-            capsys, "agents=[random_legal]", "traffics=[idm_mobil]", f"num_envs={num_envs}"
-        )
-        rewards.append(results["rows"][0]["mean_reward"])
-    assert rewards[0] == rewards[1]
-
-
 def test_a_users_traffic_and_policy_stand_in_the_table(capsys):
-    own = ["agents=[entry_own_parts.Stubborn,keep_lane]", "traffics=[entry_own_parts.Cruise]"]
-    rows = run(capsys, *own)[1]["rows"]
+    agents = "agents=[entry_own_parts.Stubborn,keep_lane]"
+    rows = run(capsys, agents, "traffics=[entry_own_parts.Cruise]")[1]["rows"]
     assert [row["agent"] for row in rows] == ["entry_own_parts.Stubborn", "keep_lane"]
     assert rows[0]["mean_reward"] == rows[1]["mean_reward"]
     assert rows[0]["traffic"] == "entry_own_parts.Cruise"
 
 
 def test_a_users_traffic_takes_parameters_of_its_own(capsys):
-    target = [
-        "traffic_options.idm._target_=entry_own_parts.Cruise",
-        "+traffic_options.idm.parameters.share=0.5",
-    ]
-    run(capsys, "agents=[keep_lane]", "traffics=[idm]", *target)
-    wrong = [target[0], "+traffic_options.idm.parameters.pace=0.5"]
-    assert main(["agents=[keep_lane]", "traffics=[idm]", *wrong]) == 2
+    target = "traffics=[{{name: entry_own_parts.Cruise, {}: 0.5}}]"
+    run(capsys, "agents=[keep_lane]", target.format("share"))
+    assert main(["agents=[keep_lane]", target.format("pace")]) == 2
     err = capsys.readouterr().err
     assert "pace" in err
     assert "it takes road, stream, share" in err

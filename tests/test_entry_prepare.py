@@ -14,7 +14,6 @@ import pytest
 from PIL import Image
 from reference.file_server import SHA256, Server
 from reference.recordings import (
-    START_MS,
     ngsim_rows,
     portal_csv,
     traffic,
@@ -66,10 +65,6 @@ def test_a_scene_csv_becomes_parquet_and_figures(here, capsys):
         "dropped": {},
         "written": 1920,
     }
-    assert numbers["files"] == [
-        "synthetic-0.parquet",
-        "synthetic-1.parquet",
-    ]
     assert numbers["acceleration_raw"]["count"] > numbers["acceleration_smoothed"]["count"] > 0
     names = {
         "speed",
@@ -84,39 +79,16 @@ def test_a_scene_csv_becomes_parquet_and_figures(here, capsys):
     assert read_scenes("mine").equals(read_scenes("mine.csv"))
 
 
-def test_ngsim_portal_with_two_periods(here, capsys):
-    parts = traffic().partition_by("scene")
-    # A quarter of an hour apart.
-    rows = pl.concat(ngsim_rows(scene, START_MS + 900_000 * k) for k, scene in enumerate(parts))
-    (here / "portal.csv").write_text(
-        portal_csv(rows) + portal_csv(rows.head(3), "peachtree").partition("\n")[2]
-    )
-    assert (
-        main(
-            [
-                "data=ngsim",
-                "data.path=portal.csv",
-                "scene_s=3",
-            ]
-        )
-        == 0
-    )
-    numbers = results(capsys.readouterr().out)
-    assert numbers["rows"]["dropped"] == {"location peachtree": 3}
-    assert [scene["name"] for scene in numbers["scenes"]] == [
-        "us-101-1",
-        "us-101-2",
-    ]
-    assert read_scenes(numbers["out"])["scene"].unique().sort().to_list() == [
-        f"us-101-{period}-00{part}" for period in (1, 2) for part in (0, 1)
-    ]
-
-
 def test_highd_folder(here, capsys):
     write_highd(here / "highd")
-    assert main(["data=highd", "data.path=highd"]) == 0
-    rows = results(capsys.readouterr().out)["rows"]
-    assert (rows["read"], rows["written"]) == (800, 4 * 80)
+    assert main(["data=highd", "data.path=highd", "scene_s=3"]) == 0
+    numbers = results(capsys.readouterr().out)
+    assert (numbers["rows"]["read"], numbers["rows"]["written"]) == (800, 4 * 80)
+    assert [scene["name"] for scene in numbers["scenes"]] == [
+        "highd-01-upper",
+        "highd-01-lower",
+    ]
+    assert read_scenes(numbers["out"])["scene"].n_unique() == 2 * 3
 
 
 def test_from_a_users_csv_to_traffic_in_three_commands(here, capsys):
@@ -135,8 +107,8 @@ def test_from_a_users_csv_to_traffic_in_three_commands(here, capsys):
         "episodes=1",
         "env.goal_m=20",
     ]
-    weights = "generator.path=fit/generator_paper.safetensors"
-    assert evaluate(["traffics=[gan]", weights, *tiny]) == 0
+    fitted = "traffics=[{name: gan, path: fit/generator_paper.safetensors}]"
+    assert evaluate([fitted, *tiny]) == 0
     capsys.readouterr()
 
 

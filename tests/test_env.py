@@ -15,7 +15,9 @@ from ganlane.env import EpisodeParameters
 from ganlane.errors import UserError
 from ganlane.sim.random import Stream
 
-KEEP, LEFT, RIGHT = keys.KEEP, keys.LEFT, keys.RIGHT
+KEEP = keys.KEEP
+LEFT = keys.LEFT
+RIGHT = keys.RIGHT
 FAR = {"x": 2000.0, "lane": 0}
 
 

@@ -17,7 +17,10 @@ from ganlane.transforms.reward import speed_reward
 MEANT_MPS = 25.0
 #: Rows of one batch, all of which keep their lane: normal; wanting 1 m/s; wanting 0.1 m/s; behind a
 #: column at 1 m/s.
-NORMAL, CRAWLING, PARKING, STUCK = slice(0, 4), slice(4, 6), slice(6, 8), slice(8, 11)
+NORMAL = slice(0, 4)
+CRAWLING = slice(4, 6)
+PARKING = slice(6, 8)
+STUCK = slice(8, 11)
 ROWS = 11
 
 
@@ -27,8 +30,10 @@ def slowed(env: HighwayEnv):
     """
     td = env.reset()
     cars = td[keys.VEHICLES]
-    cars["desired_speed"][CRAWLING, 0], cars["desired_speed"][PARKING, 0] = 1.0, 0.1
-    cars["desired_speed"][STUCK, 1:], cars["speed"][STUCK, 1:] = 1.0, 1.0
+    cars["desired_speed"][CRAWLING, 0] = 1.0
+    cars["desired_speed"][PARKING, 0] = 0.1
+    cars["desired_speed"][STUCK, 1:] = 1.0
+    cars["speed"][STUCK, 1:] = 1.0
     for name in ("y", "target_lane"):
         cars[name][STUCK, -1] = cars[name][STUCK, 0]
     cars["x"][STUCK, -1] = cars["x"][STUCK].amax(1) + 25.0
@@ -46,8 +51,10 @@ def drive(goal_m: float, timeout_s: float) -> tuple[torch.Tensor, torch.Tensor, 
     """What every row's episode paid, its seconds, and whether it reached the goal, each [ROWS]."""
     others = {"mobil": False, "dtype": torch.float32, "stream": Stream.REPORT}
     env = environment(num_envs=ROWS, goal_m=goal_m, timeout_s=timeout_s, **others)
-    td, driving = slowed(env), torch.ones(ROWS, dtype=torch.bool)
-    paid, seconds = torch.zeros(ROWS), torch.zeros(ROWS)
+    td = slowed(env)
+    driving = torch.ones(ROWS, dtype=torch.bool)
+    paid = torch.zeros(ROWS)
+    seconds = torch.zeros(ROWS)
     goal = torch.zeros(ROWS, dtype=torch.bool)
     while driving.any():
         td = step(env, td)

@@ -133,7 +133,8 @@ def test_a_default_device_without_numbers_is_refused_everywhere():
 
 def paths(env, actions):
     """x of all vehicles after each of the ``actions`` [T, N]."""
-    state, courses = env.reset(), []
+    state = env.reset()
+    courses = []
     for action in actions:
         stepped, state = env.step_and_maybe_reset(state.set(keys.ACTION, action))
         courses.append(stepped["next", keys.VEHICLES, "x"])
@@ -162,10 +163,8 @@ def test_autocast_changes_no_traffic(traffic, dtype):
 
 
 def test_generated_traffic_in_float64_is_that_of_float32_up_to_rounding_even_side_by_side():
-    model, actions = (
-        make_traffic(make(TrafficConfig, "gan_calibrated"), EnvConfig()),
-        torch.zeros(3, 2).long(),
-    )
+    model = make_traffic(make(TrafficConfig, "gan_calibrated"), EnvConfig())
+    actions = torch.zeros(3, 2).long()
     before = paths(HighwayEnv(model, 2), actions)
     double = paths(HighwayEnv(model, 2, dtype=torch.float64), actions)
     assert torch.allclose(before.double(), double, atol=1e-3)

@@ -38,7 +38,8 @@ def test_it_meets_the_specs():
 
 
 def test_its_keys_specs_and_first_states_are_those_of_the_tensor_code():
-    ours, theirs = native(), native(kernel="torch")
+    ours = native()
+    theirs = native(kernel="torch")
     for name in ("observation_spec", "action_spec", "reward_spec", "done_spec", "state_spec"):
         assert getattr(ours, name) == getattr(theirs, name)
     assert (ours.reset() == theirs.reset()).all()
@@ -59,8 +60,10 @@ def test_episodes_with_automatic_resets_agree_with_the_tensor_code(mobil, share)
         recycle=True,
         recycle_share=share,
     )
-    ours, theirs = native(**settings), native(**settings, kernel="torch")
-    td, ended = theirs.reset(), 0
+    ours = native(**settings)
+    theirs = native(**settings, kernel="torch")
+    td = theirs.reset()
+    ended = 0
     for decision in range(30):
         td["action"] = (td[keys.EPISODE] * 7 + decision * 5) % 11 % 3 * (decision % 3 == 0)
         stepped, following = theirs.step_and_maybe_reset(td.clone())
@@ -75,7 +78,9 @@ def test_episodes_with_automatic_resets_agree_with_the_tensor_code(mobil, share)
 
 def test_two_threads_are_the_kernels_alone_and_change_no_bit():
     """Around the kernel torch computes on one thread, and has both again afterwards."""
-    driven, seen, before = [], [], torch.get_num_threads()
+    driven = []
+    seen = []
+    before = torch.get_num_threads()
 
     class Threads(Transform):
         """Looks how many threads torch and the kernel have during a step."""
@@ -151,7 +156,8 @@ def test_auto_takes_the_tensor_code_where_the_kernel_cannot_and_says_once_when_i
 def test_a_recorder_sees_every_physics_step_and_ends_where_the_decision_does(kernel, abort):
     """With ends and commands off the road in the middle, and without a bit of difference."""
     env = native(32, kernel=kernel, abort=abort, goal_m=140.0, timeout_s=9.5, seed=3)
-    plain, steps = native(32, kernel=kernel, abort=abort, goal_m=140.0, timeout_s=9.5, seed=3), []
+    plain = native(32, kernel=kernel, abort=abort, goal_m=140.0, timeout_s=9.5, seed=3)
+    steps = []
     env.recorder = lambda vehicles, running: steps.append((vehicles, running))
     state = env.reset()
     for decision in range(12):
@@ -165,7 +171,8 @@ def test_a_recorder_sees_every_physics_step_and_ends_where_the_decision_does(ker
         last = steps[-1][0]
         for name in ("x", "y", "heading", "speed", "acceleration"):
             drove = taken > 0
-            shown, reached = getattr(last, name)[drove], after[keys.VEHICLES, name][drove]
+            shown = getattr(last, name)[drove]
+            reached = after[keys.VEHICLES, name][drove]
             assert torch.equal(shown, reached), name
         state = following
 
@@ -189,7 +196,8 @@ SENSORS = pytest.mark.parametrize(
 
 def driven(env, decisions):
     """States of a drive with automatic resets and lane changes in a third of the rows."""
-    td, rows = env.reset(), torch.arange(env.batch_size[0])
+    td = env.reset()
+    rows = torch.arange(env.batch_size[0])
     for decision in range(decisions):
         yield td
         td["action"] = (rows + decision) % 20 % 3 * (rows % 3 == decision % 3)
@@ -215,7 +223,8 @@ def test_the_lane_view_is_that_of_the_tensor_code(form, sensors):
 
 
 def test_rows_that_are_reset_alone_start_as_all_do():
-    some, whole = native(64, kernel="torch", seed=4), native(128, kernel="torch", seed=4)
+    some = native(64, kernel="torch", seed=4)
+    whole = native(128, kernel="torch", seed=4)
     td = some.reset()
     mask = torch.zeros(64, dtype=torch.bool)
     mask[[3, 17, 40]] = True
@@ -236,7 +245,8 @@ def test_the_safe_actions_are_those_of_the_tensor_code(abort, sensors):
         IdmMobilTraffic(Road()), config, form, num_envs=128, mask=MaskParameters(form="safe")
     )
     plain = ActionMaskTransform(Road(), "safe", abort=abort)
-    refused, hopeless = 0, 0
+    refused = 0
+    hopeless = 0
     for td in driven(env, 40):
         expected = plain(td.clone())
         assert torch.equal(td[keys.ACTION_MASK], expected[keys.ACTION_MASK])

@@ -156,7 +156,9 @@ def test_torchrls_keyword_calls_it_too(monkeypatch):
 
 def drive(env: HighwayEnv, decisions: int) -> list[TensorDictBase]:
     """States of a drive with automatic resets."""
-    td, driver, states = env.reset(), MobilDriver(env.road), []
+    td = env.reset()
+    driver = MobilDriver(env.road)
+    states = []
     for _ in range(decisions):
         stepped, td = env.step_and_maybe_reset(driver(td))
         states.append(stepped["next"].clone())
@@ -168,7 +170,8 @@ def drive(env: HighwayEnv, decisions: int) -> list[TensorDictBase]:
 def test_a_compiled_environment_drives_as_the_eager_one_to_rounding():
     """In float64: 20 decisions of 4 rows, several episodes each, with vehicles that return."""
     settings = {"num_envs": 4, "vehicles": 4, "goal_m": 150.0, "recycle": True}
-    eager, compiled = environment(**settings), environment(**settings)
+    eager = environment(**settings)
+    compiled = environment(**settings)
     assert compiled.compile() is compiled
     pairs = list(zip(drive(eager, 20), drive(compiled, 20)))
     assert sum(int(one["done"].sum()) for one, _ in pairs) >= 4

@@ -131,11 +131,9 @@ def bounds(form: str, vehicles: int) -> tuple[torch.Tensor, torch.Tensor]:
     others = vehicles - 1
     # A gap, a nearness, a relative speed and a place in the lane; bodies overlap by 4.5 m at the
     # most.
-    gap, drift, overlap = (
-        [(0.0, 1.0), (0.0, 1.0), (-1.0, 1.0)],
-        (-1.0, 1.0),
-        [(-4.5 / 200.0, 1.0), (0.0, 5.5)],
-    )
+    gap = [(0.0, 1.0), (0.0, 1.0), (-1.0, 1.0)]
+    drift = (-1.0, 1.0)
+    overlap = [(-4.5 / 200.0, 1.0), (0.0, 5.5)]
     ranges = {
         # Speed over desired speed (at least 25 m/s; nobody drives twice that), a lane to the left,
         # to the right.
@@ -167,7 +165,8 @@ def test_a_vehicle_that_is_not_valid_is_in_no_observation(data, form, lanes, oth
         any_vehicles(1 + others, lanes, data.draw(seeds)).with_(valid=valid) for _ in range(2)
     )
     haunted = scene.where(valid, ghosts)
-    road, still = Road(lanes), torch.zeros(1, dtype=torch.float64)
+    road = Road(lanes)
+    still = torch.zeros(1, dtype=torch.float64)
     seen = [
         ObservationTransform(road, 1 + others, form).observe(s, still, still.long(), road)
         for s in (scene, haunted)
@@ -201,7 +200,8 @@ def any_vehicles(count: int, lanes: int, seed: int) -> Vehicles:
 def test_a_vehicle_that_is_not_valid_changes_nobodys_driving_and_no_event(env, plan, data):
     mask = data.draw(st.lists(st.booleans(), min_size=env.vehicles - 1, max_size=env.vehicles - 1))
     valid = torch.tensor([True, *mask]).expand(2, -1)
-    start, ends = env.reset(), []
+    start = env.reset()
+    ends = []
     seed = data.draw(st.integers(0, 2**31))
     ghosts = torch.cat(
         [any_vehicles(env.vehicles, env.road.lanes, seed + row).x for row in range(2)]

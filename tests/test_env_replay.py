@@ -51,11 +51,13 @@ def test_an_episode_is_truncated_at_the_step_where_its_scene_ends(recordings):
     env = make(recordings, 32)
     td = env.reset()
     key = episode_key(0, td[keys.SEED], td[keys.EPISODE])
-    steps, driver = env.traffic.steps_of(key), KeepLaneDriver(env.road)
+    steps = env.traffic.steps_of(key)
+    driver = KeepLaneDriver(env.road)
     ended = torch.zeros(32, dtype=torch.bool)
     for _ in range(10):
         td = env.step(driver(td))["next"]
-        events, now = td[keys.EVENTS], td["done"][:, 0]
+        events = td[keys.EVENTS]
+        now = td["done"][:, 0]
         first = now & ~ended
         scene_end = events["scene_end"][:, 0]
         assert torch.equal(td[keys.STEP][first & scene_end], steps[first & scene_end])
@@ -101,11 +103,13 @@ def test_every_row_has_the_lanes_of_its_scene(recordings):
     assert torch.equal(td[keys.ROAD, "lanes"][:, 0], lanes)
     width = td[keys.ROAD, "lane_width_m"][:, 0]
     for _ in range(2):
-        ego, free = td[keys.VEHICLES, "target_lane"][:, 0], td[keys.EGO, "change_direction"] == 0
+        ego = td[keys.VEHICLES, "target_lane"][:, 0]
+        free = td[keys.EGO, "change_direction"] == 0
         after = step(env, td, keys.LEFT)
         left = after[keys.EVENTS, "out_of_road"][:, 0]
         assert torch.equal(left, (ego == lanes - 1) & free)
-        vehicles, changing = after[keys.VEHICLES], after[keys.EGO, "change_direction"] == 1
+        vehicles = after[keys.VEHICLES]
+        changing = after[keys.EGO, "change_direction"] == 1
         # The change aims at the next lane's centre on this road.
         expected = 1.0 - (vehicles["target_lane"][:, 0] * width - vehicles["y"][:, 0]).abs() / width
         torch.testing.assert_close(
@@ -120,7 +124,8 @@ def test_every_row_has_the_lanes_of_its_scene(recordings):
 @pytest.mark.parametrize("driver", [MobilDriver, RandomLegalDriver])
 def test_drivers_stay_on_the_road_of_their_row(recordings, driver):
     env = make(recordings, 48)
-    td, driver = env.reset(), driver(env.road)
+    td = env.reset()
+    driver = driver(env.road)
     for _ in range(20):
         stepped, td = env.step_and_maybe_reset(driver(td))
         assert not stepped["next", keys.EVENTS, "out_of_road"].any()
@@ -131,7 +136,8 @@ def test_the_observation_knows_the_row_s_own_lanes(recordings):
     env = make(recordings, 64)
     seen = TransformedEnv(env, ObservationTransform(env.road, 9, "table3"))
     td = seen.reset()
-    lanes, ego = td[keys.ROAD, "lanes"][:, 0], td[keys.VEHICLES, "target_lane"][:, 0]
+    lanes = td[keys.ROAD, "lanes"][:, 0]
+    ego = td[keys.VEHICLES, "target_lane"][:, 0]
     assert torch.equal(td["observation"][:, 1] > 0, ego < lanes - 1)
     assert torch.equal(td["observation"][:, 2] > 0, ego > 0)
     lane = td["observation"][:, 3:].reshape(64, 8, 3)[..., 2] * (lanes - 1)[:, None]

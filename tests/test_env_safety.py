@@ -30,7 +30,8 @@ class Log:
     """
 
     def __init__(self) -> None:
-        self.vehicle_km, self.overlaps = 0.0, 0
+        self.vehicle_km = 0.0
+        self.overlaps = 0
 
     def watch(self, env: HighwayEnv) -> None:
         def record(vehicles: Vehicles, running: torch.Tensor) -> None:
@@ -73,7 +74,8 @@ def drive(rng: random.Random, log: Log, most_vehicles: int, duration_s: float) -
 
     In a third of them it is alone, with no ego.
     """
-    lanes, vehicles = rng.randint(1, 6), rng.randint(2, most_vehicles)
+    lanes = rng.randint(1, 6)
+    vehicles = rng.randint(2, most_vehicles)
     spawn = dense(rng, vehicles, lanes) if rng.random() < 0.5 else sparse(vehicles, lanes)
     spawn = crawling(spawn, rng) if rng.random() < 0.4 else spawn
     period_s = rng.choice([0.1, 0.2, 0.5, 1.0, 2.0])
@@ -104,7 +106,8 @@ def drive_for(
     vehicle_km: float, roads: int, most_vehicles: int, duration_s: float, seed: int
 ) -> None:
     """Until so many vehicle-km have been driven, on so many roads at least."""
-    rng, log = random.Random(seed), Log()
+    rng = random.Random(seed)
+    log = Log()
     while log.vehicle_km < vehicle_km or roads > 0:
         drive(rng, log, most_vehicles, duration_s)
         roads -= 1
@@ -122,7 +125,8 @@ def test_no_overlap_in_10_000_vehicle_km():
 
 def test_the_recorder_would_see_an_overlap():
     """A car that nobody sees coming: the ego changes lanes into one beside it."""
-    env, log = environment(vehicles=2, mobil=False), Log()
+    env = environment(vehicles=2, mobil=False)
+    log = Log()
     log.watch(env)
     td = placed(
         env,

@@ -63,7 +63,8 @@ def drive(config: EnvConfig, driver: str, traffic: str, seconds: int) -> Drive:
     """``ROWS`` episodes side by side, without a goal, until one of them ends."""
     config = replace(config, goal_m=1e6)
     env = make_env(make_traffic(TRAFFICS[traffic], config), config, num_envs=ROWS)
-    policy, seen = make_driver(driver, config).policy, Drive()
+    policy = make_driver(driver, config).policy
+    seen = Drive()
     env.base_env.recorder = seen.record
     td = env.reset()
     for _ in range(seconds):

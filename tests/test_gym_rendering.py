@@ -16,7 +16,8 @@ from ganlane.gym.window import FilmWindow
 
 
 def test_frames_show_the_road_and_change_as_the_ego_drives():
-    env, envs = make(render_mode="rgb_array"), make_vec(2, render_mode="rgb_array")
+    env = make(render_mode="rgb_array")
+    envs = make_vec(2, render_mode="rgb_array")
     env.reset(seed=0)
     first = env.render()
     assert first.dtype == np.uint8
@@ -96,7 +97,8 @@ def pygame(monkeypatch):
 
 
 def test_the_window_shows_the_picture_until_it_is_closed(pygame):
-    window, picture = FilmWindow(), np.zeros((40, 60, 3), np.uint8)
+    window = FilmWindow()
+    picture = np.zeros((40, 60, 3), np.uint8)
     picture[10, 20] = (1, 2, 3)
     window.show(picture)
     assert pygame.display.get_surface().get_size() == (60, 40)

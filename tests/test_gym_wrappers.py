@@ -19,7 +19,8 @@ MASKS_MAY_BE_ABSENT = tuple(map(int, re.findall(r"\d+", gymnasium.__version__)[:
 def test_a_users_transform_pays_what_it_says():
     from torchrl.envs import RewardScaling
 
-    plain, doubled = make(), make(transforms=[RewardScaling(loc=0.0, scale=2.0)])
+    plain = make()
+    doubled = make(transforms=[RewardScaling(loc=0.0, scale=2.0)])
     plain.reset(seed=0)
     doubled.reset(seed=0)
     assert doubled.step(KEEP)[1] == pytest.approx(2.0 * plain.step(KEEP)[1])
@@ -28,7 +29,8 @@ def test_a_users_transform_pays_what_it_says():
 def test_episode_statistics_are_recorded():
     env = gymnasium.wrappers.RecordEpisodeStatistics(make(goal_m=30.0))
     env.reset(seed=0)
-    total, info = 0.0, {}
+    total = 0.0
+    info = {}
     while "episode" not in info:
         _, reward, *_, info = env.step(KEEP)
         total += reward

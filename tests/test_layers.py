@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -24,7 +27,7 @@ ORDER = [
         "torch_settings",
         "linear",
     },
-    {"parameters"},
+    {"settings"},
     {"data", "sim"},
     {"generator"},
     {"native"},
@@ -39,15 +42,16 @@ ORDER = [
     {"training"},
     {"compare"},
     {"realism", "reproduce", "doctor"},
-    {"options"},
     # The typed calls run the commands' own functions.
     {"api"},
     {"gym"},
     {"sb3"},
     {"commands"},
-    {"train", "evaluate", "render", "record", "train_generator", "prepare"},
+    {"train"},
     {"__main__"},
 ]
+#: What the environment's record builds, scenes and vehicles, is imported where it is built.
+LATE = {("settings", "sim")}
 LEVEL = {part: level for level, parts in enumerate(ORDER) for part in parts}
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 
@@ -59,21 +63,21 @@ def part_of(path: Path) -> str:
 
 def imported(path: Path) -> set[str]:
     """Parts of the package that a module imports anywhere, in functions too."""
-    found = set()
+    parts = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             if node.module == "ganlane":
-                found |= {alias.name for alias in node.names}
+                parts |= {alias.name for alias in node.names}
             elif node.module and node.module.startswith("ganlane."):
-                found.add(node.module.split(".")[1])
+                parts.add(node.module.split(".")[1])
         elif isinstance(node, ast.Import):
-            found |= {
+            parts |= {
                 alias.name.split(".")[1]
                 for alias in node.names
                 if alias.name.startswith("ganlane.")
             }
-    return found - {"__version__"}
+    return parts - {"__version__"}
 
 
 def test_every_part_has_its_place():
@@ -82,26 +86,20 @@ def test_every_part_has_its_place():
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_imports_point_down(path):
-    own = part_of(path)
+    part = part_of(path)
     for other in imported(path) & LEVEL.keys():
-        assert other == own or LEVEL[other] < LEVEL[own] or (LEVEL[other] == LEVEL[own] == 0), (
-            f"{own} imports {other}"
-        )
+        is_below = LEVEL[other] < LEVEL[part] or LEVEL[other] == LEVEL[part] == 0
+        assert other == part or is_below or (part, other) in LATE, f"{part} imports {other}"
 
 
-BELOW_CONFIG = [
-    *(
-        "parameters",
-        "sim",
-        "data",
-        "generator",
-        "traffic",
-        "env",
-        "transforms",
-        "agents",
-        "evaluation",
-    ),
-]
+def test_the_settings_are_imported_without_the_simulator():
+    code = "import sys, ganlane.settings.train; assert not {'torch', 'ganlane.sim'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=PACKAGE.parent)
+
+
+BELOW_CONFIG = (
+    "settings sim data generator native traffic env transforms agents evaluation view".split()
+)
 
 
 @pytest.mark.parametrize("part", BELOW_CONFIG)
@@ -109,3 +107,28 @@ def test_nothing_below_config_knows_hydra(part):
     for path in MODULES:
         if part_of(path) == part:
             assert "hydra" not in path.read_text().lower().replace("hydra's", ""), path
+
+
+#: Names that say nothing of what they stand for.
+EMPTY_NAMES = {"each", "found", "kept", "made", "given", "known", "own"}
+PLACES = ("ganlane", "ganlane_simulators", "benchmarks", "tests")
+
+
+def names_in(path: Path) -> Iterator[tuple[int, str]]:
+    """Line and name of every assigned name and every argument of a module."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.lineno, node.id
+        elif isinstance(node, ast.arg):
+            yield node.lineno, node.arg
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_names_say_what_a_thing_is(place):
+    empty = [
+        f"{path.relative_to(PACKAGE.parent)}:{line}: {name}"
+        for path in sorted((PACKAGE.parent / place).rglob("*.py"))
+        for line, name in names_in(path)
+        if name in EMPTY_NAMES
+    ]
+    assert empty == []

@@ -15,12 +15,13 @@ import pytest
 import torch
 from reference.refusals import Bomb, refusal, run_folder
 
-from ganlane.__main__ import dispatch
+from ganlane.__main__ import main
 from ganlane.agents import load_agent
+from ganlane.api import train
 from ganlane.arguments import import_target
 from ganlane.build import make_driver
 from ganlane.config.compose import parsed
-from ganlane.config.run import refuse_stored_imports
+from ganlane.config.run import refuse_stored_imports, settings
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator import load_generator
@@ -63,77 +64,75 @@ def here(tmp_path, monkeypatch):
     assert "evil" not in sys.modules
 
 
-#: What a stored command line says, a line of overrides.yaml each.
+def traffic_of(target, **arguments):
+    """Settings of a run on the traffic that ``target`` makes."""
+    return {"traffic": {"_target_": target, "arguments_": arguments}}
+
+
+EVIL_TRAFFIC = {"_target_": "evil.Traffic"}
+#: Settings in the config.yaml of a run that is to be resumed.
 STORED = {
-    "a class of a module beside it": ["traffic=idm", "traffic._target_=evil.Traffic"],
-    "a function of it": ["traffic=idm", "traffic._target_=evil.make"],
-    "a shell": [
-        "traffic=idm",
-        "traffic._target_=os.system",
-        "+traffic.parameters.command='touch executed'",
-    ],
-    "a process": [
-        "traffic._target_=subprocess.getoutput",
-        "+traffic.parameters.cmd='touch executed'",
-    ],
-    "a script": ["traffic._target_=runpy.run_path", "+traffic.parameters.path_name=evil.py"],
-    "an import": ["traffic._target_=importlib.import_module", "+traffic.parameters.name=evil"],
-    "exec": ["traffic._target_=builtins.exec", "+traffic.parameters.source='import evil'"],
-    "a file": [
-        "traffic._target_=builtins.open",
-        "+traffic.parameters.file=executed",
-        "+traffic.parameters.mode=w",
-    ],
-    "the first phase's": ["traffic@pretrain.traffic=idm", "pretrain.traffic._target_=evil.Traffic"],
-    "the evaluation's": [
-        "traffic@evaluation.traffic=idm",
-        "evaluation.traffic._target_=evil.Traffic",
-    ],
-    "a share": ["traffic=mixed", "traffic.shares={evil.Traffic: 1, idm: 1}"],
-    "a share's option": ["traffic=mixed", "traffic.options.gan._target_=evil.Traffic"],
-    "a policy": ["traffic=idm", "evaluation.agents=[mobil,random_legal,evil.Policy]"],
-    "a masked policy": ["traffic=idm", "evaluation.agents=[mobil,random_legal,evil.Policy+safe]"],
-    "a shell as policy": ["traffic=idm", "evaluation.agents=[mobil,random_legal,os.system]"],
-    "a reference to a name": [
-        "init.path=evil.Traffic",
-        "traffic=idm",
-        "traffic._target_=${init.path}",
-    ],
-    "an option elsewhere": ["traffic=../../evil"],
-    "an absolute option": ["experiment=/tmp/evil"],
-    "an option of the phase's elsewhere": ["traffic@pretrain.traffic=../../evil"],
-    "Hydra's callbacks": ["hydra.callbacks.x._target_=evil.make"],
-    "Hydra's callbacks, added": ["+hydra.callbacks.x={_target_: evil.make}"],
-    "Hydra's callbacks, forced": ["++hydra.callbacks={x: {_target_: evil.make}}"],
-    "an option as callback": ["traffic@hydra.callbacks.x=idm"],
-    "all of Hydra": ["+hydra={callbacks: {x: {_target_: evil.make}}}"],
-    "Hydra's launcher": ["hydra.launcher._target_=evil.make"],
-    "Hydra's sweeper": ["hydra.sweeper._target_=evil.make"],
-    "a launcher elsewhere": ["hydra/launcher=../../evil"],
-    "Hydra's places to search": ["hydra.searchpath=['file://.']"],
-    "Hydra's log": ["hydra.job_logging.handlers.x={(): evil.make}"],
+    "a class of a module beside it": {"traffic": EVIL_TRAFFIC},
+    "a class by its name": {"traffic": "evil.Traffic"},
+    "a class by the key name": {"traffic": {"name": "evil.Traffic"}},
+    "a class called as weights are": {"traffic": {"_target_": "evil.safetensors"}},
+    "a function of it": {"traffic": {"_target_": "evil.make"}},
+    "a shell": traffic_of("os.system", command="touch executed"),
+    "a process": traffic_of("subprocess.getoutput", cmd="touch executed"),
+    "a script": traffic_of("runpy.run_path", path_name="evil.py"),
+    "an import": traffic_of("importlib.import_module", name="evil"),
+    "exec": traffic_of("builtins.exec", source="import evil"),
+    "a file": traffic_of("builtins.open", file="executed", mode="w"),
+    "an argument beside it": {"traffic": {"_target_": "os.system", "command": "touch executed"}},
+    "the first phase's": {"pretrain": {"total_decisions": 8, "traffic": EVIL_TRAFFIC}},
+    "the evaluation's": {"evaluation": {"traffic": EVIL_TRAFFIC}},
+    "a share": {"traffic": {"name": "mixed", "shares": {"evil.Traffic": 1, "idm": 1}}},
+    "a share's option": {"traffic": {"name": "mixed", "options": {"gan": EVIL_TRAFFIC}}},
+    "a policy": {"evaluation": {"agents": ["mobil", "random_legal", "evil.Policy"]}},
+    "a policy alone": {"evaluation": {"agents": "evil.Policy"}},
+    "a masked policy": {"evaluation": {"agents": ["mobil", "evil.Policy+safe"]}},
+    "a shell as policy": {"evaluation": {"agents": ["mobil", "os.system"]}},
+    "a reference to a name": {
+        "init": {"path": "evil.Traffic"},
+        "traffic": {"_target_": "${init.path}"},
+    },
+    "an option elsewhere": {"traffic": "../../evil"},
+    "an option elsewhere by the key name": {"traffic": {"name": "../../evil"}},
+    "an absolute option": {"traffic": "/tmp/evil"},
+    "an option of the phase's elsewhere": {"pretrain": {"traffic": "../../evil"}},
+    "another configuration": {"experiment": "../../evil"},
+    "another list of defaults": {"defaults": ["../../evil"]},
+    "another mask": {"mask": {"form": "../../evil"}},
+    "a class to instantiate": {"agent": {"_target_": "evil.make"}},
+    "Hydra's callbacks": {"hydra": {"callbacks": {"x": {"_target_": "evil.make"}}}},
+    "Hydra's launcher": {"hydra": {"launcher": {"_target_": "evil.make"}}},
+    "Hydra's places to search": {"hydra": {"searchpath": ["file://."]}},
+    "Hydra's log": {"hydra": {"job_logging": {"handlers": {"x": {"()": "evil.make"}}}}},
+    "a Ray cluster, which sends pickles": {"collector": {"address": "evil:6379"}},
 }
-
-
-@pytest.mark.parametrize("way", STORED)
-def test_a_stored_command_line_executes_nothing(way, capsys):
-    run_folder("".join(f"- {json.dumps(line)}\n" for line in STORED[way]))
-    refusal(capsys, "train", "resume=run")
-
-
-#: Other files of a run's folder, or others in their place.
-FILES = {
-    "a YAML tag": {"overrides": "!!python/object/apply:os.system ['touch executed']"},
-    "a YAML tag in the list": {"overrides": "- traffic=idm\n- !!python/name:evil.make\n"},
-    "a tag in the config": {"config": "mask: !!python/object/apply:os.system ['touch executed']"},
-    "a mask elsewhere in an old config": {"config": "mask: {form: ../../evil}"},
+#: Texts in its place that no such file has.
+TEXTS = {
+    "a YAML tag": "!!python/object/apply:os.system ['touch executed']",
+    "a YAML tag at a key": "mask: !!python/object/apply:os.system ['touch executed']",
+    "a YAML tag as a name": "traffic: {name: !!python/name:evil.make }",
+    "a list": "- traffic=idm\n- traffic._target_=evil.Traffic\n",
+    "aliases": "env: &a {lanes: 3}\nreward: *a\n",
+    "an endless alias": "&a {traffic: *a}",
+    "a mapping merged into another": "a: &a {_target_: evil.Traffic}\ntraffic: {<<: *a}\n",
+    "endless brackets": "[" * 100_000,
+    "endless braces": "{a: " * 50_000,
+    "endless lists": "- " * 100_000,
+    "too large a file": f"seed: {'0' * 2**18}1",
 }
+CONFIGS = TEXTS | {way: json.dumps(stored) for way, stored in STORED.items()}
 
 
-@pytest.mark.parametrize("way", FILES)
-def test_no_other_file_of_a_run_executes_anything(way, capsys):
-    run_folder(**{"overrides": "- traffic=idm\n", **FILES[way]})
+@pytest.mark.parametrize("way", CONFIGS)
+def test_the_settings_of_a_run_execute_nothing_when_it_is_resumed(way, capsys):
+    run_folder(CONFIGS[way])
     refusal(capsys, "train", "resume=run")
+    with pytest.raises(UserError):
+        train(folder="run", resume=True)
 
 
 @pytest.mark.parametrize(
@@ -219,7 +218,7 @@ def test_hydra_imports_nothing_and_reads_no_other_configuration(arguments, here,
 @pytest.mark.parametrize(
     "override",
     [
-        *("hydra.run.dir=out", "hydra.sweep.dir=out", "hydra.job.num=3", "hydra/launcher=joblib"),
+        *("hydra.run.dir=out", "hydra.sweep.dir=out", "hydra/launcher=joblib"),
         *(
             "hydra.launcher.n_jobs=2",
             "hydra.sweeper.max_batch_size=4",
@@ -287,27 +286,61 @@ def test_a_class_or_an_annotated_function_is_taken():
     )
 
 
-def test_a_resumed_run_takes_what_this_command_line_repeats():
-    traffic = IdmTrafficConfig(_target_="evil.Traffic")
+@pytest.fixture
+def foreign_run():
+    """The record of a run on somebody's traffic, beside somebody's policy."""
     agents = ["mobil", "random_legal", "evil.Policy+safe"]
-    config = TrainConfig(
-        resume="run", traffic=traffic, evaluation=FinalEvaluationConfig(agents=agents)
+    return TrainConfig(
+        resume="run",
+        traffic=IdmTrafficConfig(_target_="evil.Traffic"),
+        evaluation=FinalEvaluationConfig(agents=agents),
     )
-    told = [
-        "traffic._target_=evil.Traffic",
-        "evaluation.agents=[mobil,random_legal,evil.Policy+safe]",
-    ]
-    refuse_stored_imports(config, told)
-    for half, missing in ((told[:1], told[1]), (told[1:], told[0])):
-        with pytest.raises(UserError) as caught:
-            refuse_stored_imports(config, half)
-        assert f"add {missing} to the command line" in str(caught.value)
-    with pytest.raises(UserError, match=r"the run's files name evil\.Traffic"):
-        # names of files name no code
-        refuse_stored_imports(config, ["resume=evil.Traffic", "init.path=evil.Policy"])
+
+
+def test_a_resumed_run_takes_what_this_command_line_repeats(foreign_run):
+    for keys in (
+        ["traffic._target_", "evaluation.agents"],
+        ["traffic", "evaluation"],
+    ):
+        refuse_stored_imports(foreign_run, keys)
+
+
+@pytest.mark.parametrize(
+    ("keys", "missing"),
+    [
+        (["traffic"], "evaluation.agents=[mobil,random_legal,evil.Policy+safe]"),
+        (["evaluation.agents"], "traffic._target_=evil.Traffic"),
+        # Keys beside it, and those of files, name no code.
+        (["traffic.blind_share", "init.path", "resume"], "traffic._target_=evil.Traffic"),
+    ],
+)
+def test_a_resumed_run_takes_no_more_than_that(keys, missing, foreign_run):
+    with pytest.raises(UserError, match=r"the run's file names evil\.") as caught:
+        refuse_stored_imports(foreign_run, keys)
+    assert f"add {missing} to the command line" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["init.path=evil.Traffic"],
+        ["evaluation.agents=[mobil]"],
+        ["traffic.blind_share=0.5"],
+        ["evaluation.traffic=idm"],
+    ],
+    ids=" ".join,
+)
+def test_words_about_something_else_trust_nothing(words, capsys):
+    run_folder(CONFIGS["a class of a module beside it"])
+    assert "names evil.Traffic" in refusal(capsys, "train", "resume=run", *words)
+
+
+def test_another_traffic_takes_the_place_of_the_stored_one():
+    run_folder(CONFIGS["a class of a module beside it"])
+    assert settings("train", ["resume=run", "traffic=gan"]).traffic.option == "gan"
 
 
 def test_a_command_does_not_look_for_modules_where_it_is_started(monkeypatch):
     monkeypatch.setattr(sys, "path", [place for place in sys.path if place])
-    dispatch(["train", "resume=nowhere"])
+    main(["train", "resume=nowhere"])
     assert "" not in sys.path

@@ -29,6 +29,7 @@ def test_the_version_stands_in_one_place():
     stated = ROOT / PROJECT["tool"]["hatch"]["version"]["path"]
     assert f'__version__ = "{ganlane.__version__}"' in stated.read_text()
     assert f"## [{ganlane.__version__}]" in (ROOT / "CHANGELOG.md").read_text()
+    assert f"\nversion: {ganlane.__version__}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 def test_the_console_script_is_the_dispatcher():
@@ -85,7 +86,7 @@ def test_the_wheel_holds_configuration_weights_and_kernel_and_is_below_5_mb(whee
     further = {f"ganlane/checkpoints/seeds_of_{agent}.safetensors" for agent in SHIPPED}
     assert {*inside, "ganlane/py.typed"} - names == further
     kernels = [name for name in names if name.startswith("ganlane/native/prebuilt/kernel-default-")]
-    assert len(kernels) == (1 if library.find_compiler() else 0)
+    assert len(kernels) == (1 if library.compiler_command() else 0)
     assert not [name for name in names if name.startswith(("tests/", "outputs/"))]
     assert wheel.name.startswith(f"ganlane-{ganlane.__version__}-")
     assert wheel.stat().st_size < 5e6

@@ -73,7 +73,7 @@ def test_a_command_without_docstrings_is_refused_in_one_sentence():
 
 
 def test_without_docstrings_help_still_lists_the_keys():
-    finished = run(sys.executable, "-OO", "-m", "ganlane", "prepare", "--help-all")
+    finished = run(sys.executable, "-OO", "-m", "ganlane", "prepare", "--help")
     assert (finished.returncode, finished.stderr) == (0, "")
     assert "held_out" in finished.stdout
 

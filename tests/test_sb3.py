@@ -86,7 +86,8 @@ def test_the_info_of_a_time_out_says_so():
 def test_a_seed_gives_the_same_episodes_again_and_the_next_reset_new_ones():
     env = made(seed=None)
     env.seed(7)
-    first, second = env.reset(), env.reset()
+    first = env.reset()
+    second = env.reset()
     assert not np.array_equal(first, second)
     env.seed(7)
     assert np.array_equal(env.reset(), first)

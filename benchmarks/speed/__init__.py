@@ -1,4 +1,4 @@
-"""How fast the simulator and a training are, in turns with their peers (docs/performance.md).
+"""How fast the simulator and a training are, in turns with their peers (docs/speed.md).
 
 ``systems`` makes what is measured ready to run, ``measure`` times it, ``__main__`` is the command.
 """

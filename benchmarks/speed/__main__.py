@@ -1,6 +1,6 @@
 """How fast it is, compared with a peer in the same run.
 
-    python -m benchmarks.speed --suite sim --report docs/performance.md
+    python -m benchmarks.speed --suite sim --report docs/speed.md
     python -m benchmarks.speed --suite traffic --traffics gan gan_calibrated --modes eager compiled
     python -m benchmarks.speed --suite train --modes eager native --stored 100000 --seconds 2
     python -m benchmarks.speed --quick

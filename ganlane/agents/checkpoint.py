@@ -90,7 +90,7 @@ def with_seeds(name: str) -> list[str]:
     else:
         raise UserError(
             f"{name}: only the training {recipe}@0 is installed (a light wheel); give that, or "
-            "install from a clone."
+            "run pip install -e . in a clone."
         )
     return [f"{recipe}@{seed}{mask}" for seed in seeds]
 

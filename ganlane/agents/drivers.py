@@ -32,13 +32,12 @@ from ganlane.settings.driving import (
     IdmParameters,
     MobilParameters,
 )
-from ganlane.sim.dynamics import ego_scene
+from ganlane.sim.dynamics import SIDES, ego_scene, on_road
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV, mobil_wishes
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.traffic.idm_mobil import MOBIL_PERIOD_STEPS
-from ganlane.transforms.mask import on_road_actions
 
 #: Gives the legal actions, [N, A] bool, of what the environment wrote.
 LegalActions = Callable[[TensorDictBase], Tensor]
@@ -199,9 +198,8 @@ class Driver(TensorDictModuleBase):
 def legal_actions(tensordict: TensorDictBase, road: Road) -> Tensor:
     """Which of the three actions stay on the road, bool [N, 3]: keeping the lane always does."""
     # of the lane that it is moving to, not of the one it is in
-    target = tensordict.get(keys.VEHICLES).get("target_lane")[:, EGO_INDEX]
-    lanes = road.lanes[:, 0] if isinstance(road.lanes, Tensor) else road.lanes
-    return on_road_actions(target, lanes)
+    target = tensordict.get(keys.VEHICLES).get("target_lane")[:, EGO_INDEX, None]
+    return on_road(target + target.new_tensor(SIDES), road.lanes)
 
 
 class RandomDriver(Driver):

@@ -10,7 +10,7 @@ autograd, ``clip_grad_norm_`` and Adam, here without any of these, for the agent
 components: noise is part of the weights, the backward pass is written out, and the duel is folded
 into the head, since ``Q_a = V + A_a - mean(A)`` is linear in its weights. :class:`UpdateGraph`
 compiles it to one graph. Equal to the other way up to rounding (tests/agents/test_agents_loss.py),
-and faster on a CPU (docs/performance.md).
+and faster on a CPU (docs/speed.md).
 """
 
 from __future__ import annotations

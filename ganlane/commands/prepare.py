@@ -23,10 +23,8 @@ from ganlane.evaluation.table import Table
 from ganlane.files import write_bytes
 from ganlane.runtime import peak_resident_bytes
 from ganlane.settings.recordings import PrepareConfig
-from ganlane.view.figures import (
-    draw_recordings,
-    save_figure,
-)
+from ganlane.view.figures import save_figure
+from ganlane.view.recordings import draw_recordings
 
 #: Maximum number of scenes in the table.
 _MOST_SCENES: Final = 60
@@ -91,6 +89,7 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
 def short_report(prepared: Preparation) -> str:
     """Rows, exposure, lane-change rates and durations in a few lines."""
     exposure = prepared.statistics.exposure
+    # What was read and dropped first: a wrong format shows there.
     lines = _row_lines(prepared)
     lines.append(
         f"driving: {exposure.scenes} scenes, {exposure.cars} cars, {exposure.tracks} tracks, "
@@ -105,6 +104,7 @@ def short_report(prepared: Preparation) -> str:
 
 def long_report(prepared: Preparation, source: str, figure: str) -> str:
     """A page of Markdown about the recordings ``source``, with the image ``figure``."""
+    # Each table with what it needs to be read.
     parts = [
         f"# Recordings: {source}",
         "## Rows",
@@ -158,6 +158,7 @@ def _lane_change_lines(prepared: Preparation) -> list[str]:
 
 def _acceleration_lines(prepared: Preparation) -> list[str]:
     parts = []
+    # Raw ones are mostly noise of the measurement; both are shown, so that this shows.
     for name, title in (
         ("raw", "as recorded"),
         ("smoothed", "over 1 s"),
@@ -189,6 +190,7 @@ def _scene_table(scenes: Sequence[SceneSummary]) -> str:
     ]
     head += ["lane changes", "per vehicle-km (95 %)"]
     rows = []
+    # As many as fit on a page.
     for scene in scenes[:_MOST_SCENES]:
         low = scene.per_vehicle_km_low
         high = scene.per_vehicle_km_high
@@ -213,6 +215,7 @@ def _scene_table(scenes: Sequence[SceneSummary]) -> str:
 
 
 def _distribution_table(prepared: Preparation) -> str:
+    # A few of the stored levels.
     levels = [f"{100 * level:g} %" for level in _SHOWN_LEVELS]
     rows = []
     for name, title in _QUANTITIES.items():

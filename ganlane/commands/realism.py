@@ -89,13 +89,28 @@ def realism(config: RealismConfig, folder: Path) -> str:
     factories = traffic_factories(config)
     files = i80_files_wanted(config, path)
     starts = drive_from_starts(config, factories, path)
-    site = {name: i80_rows(config, factories, starts, name, files[name]) for name in files}
+    site = {
+        name: i80_rows(
+            config,
+            factories,
+            starts,
+            name,
+            files[name],
+        )
+        for name in files
+    }
     # Long runs of the rivals take as long again, so they are made on request.
     runs = {}
     for name, make in factories.items():
         if name == config.traffic.label() or config.long_against:
             runs[name] = long_runs(config, name, make)
-    numbers = card_numbers(starts, site, runs, config.resamples)
+    # Measured and compared here; drawing and printing only show it.
+    numbers = card_numbers(
+        starts,
+        site,
+        runs,
+        config.resamples,
+    )
     draw(numbers, starts, folder)
     if config.publish:
         publish(starts)
@@ -143,7 +158,11 @@ def traffic_factories(
     return {name: partial(_make, traffic, config.env) for name, traffic in traffics.items()}
 
 
-def _make(traffic: TrafficConfig, env: EnvConfig, road: Road) -> TrafficModule:
+def _make(
+    traffic: TrafficConfig,
+    env: EnvConfig,
+    road: Road,
+) -> TrafficModule:
     """The traffic on a road."""
     # A copy that is not checked again: a recorded road need not fit Table II's vehicles.
     env = copy(env)
@@ -152,6 +171,7 @@ def _make(traffic: TrafficConfig, env: EnvConfig, road: Road) -> TrafficModule:
         lanes=int(road.lanes),
         lane_width_m=float(road.lane_width_m),
     )
+    # The stream of reported figures, never the one that recipes are chosen on.
     return make_traffic(traffic, env, Stream.REPORT)
 
 
@@ -173,6 +193,7 @@ def folds_of(config: RealismConfig, scenes: Sequence[str]) -> list[Fold]:
     held_out: Sequence[str] = ()
     if config.scenes != "all" or _fits(config, scenes):
         held_out = config.data.held_out_scenes(scenes, HELD_OUT)
+    # Starts may include scenes of the fit; the card then shows the held-out ones apart.
     starts = scenes if config.scenes == "all" else held_out
     if not starts:
         raise UserError(
@@ -187,6 +208,7 @@ def _fits(config: RealismConfig, scenes: Sequence[str]) -> bool:
 
     Also where the user says which were held out.
     """
+    # Desired speeds that are fitted need scenes of their own, too.
     if config.data.held_out is not None or config.desired_above_mps is None:
         return True
     used = {
@@ -220,6 +242,7 @@ def drive_from_starts(
             config.repeats,
             config.seed,
         )
+    # Recorded starts: every vehicle begins where and as fast as it was recorded.
     frame = read_scenes(path)
     folds = folds_of(config, sorted(frame["scene"].unique().to_list()))
     # Desired speeds are fitted unless the user gives them.
@@ -244,6 +267,7 @@ def i80_files_wanted(config: RealismConfig, path: Path | None) -> dict[str, Path
     if path is not None and config.i80 is not False:
         files = {name: path.parent / file for name, file in I80_FILES.items()}
         files = {name: file for name, file in files.items() if file.is_file()}
+    # Asked for in so many words, so leaving it out in silence would be wrong.
     if config.i80 and not files:
         raise UserError(
             f"i80=true: none of {', '.join(I80_FILES.values())} lies next to the scenes; use "
@@ -280,7 +304,11 @@ def i80_rows(
     )
 
 
-def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str, Any]]:
+def long_runs(
+    config: RealismConfig,
+    name: str,
+    make: Factory,
+) -> list[dict[str, Any]]:
     """One long run of a traffic per number of vehicles."""
     runs: list[dict[str, Any]] = []
     if config.vehicle_km <= 0:
@@ -315,5 +343,9 @@ def publish(starts: Starts) -> None:
     # The file's name without its folder, which is nobody's business.
     source = Path(starts.reference.source).name
     floors = floors_of(starts.driven, starts.recorded.counts)
-    replace(starts.reference, floors=floors, source=source).save(SHIPPED_REFERENCE)
+    replace(
+        starts.reference,
+        floors=floors,
+        source=source,
+    ).save(SHIPPED_REFERENCE)
     print_progress(f"wrote {SHIPPED_REFERENCE}")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from shutil import rmtree
 from typing import Any
@@ -21,14 +22,14 @@ from tqdm import tqdm
 
 from ganlane.build import make_driver
 from ganlane.config.run import cleared_after_mistakes
-from ganlane.config.schemas import SCHEMAS
 from ganlane.errors import UserError
-from ganlane.evaluation.results import plain, write_results
+from ganlane.evaluation import write_results
 from ganlane.gym import ENV_ID
 from ganlane.gym.rows import row_of
 from ganlane.gym.tensor_rows import TensorRows
 from ganlane.keys import ACTION, ACTIONS, END_EVENTS, EPISODE
 from ganlane.settings.commands import RecordConfig
+from ganlane.settings.record import plain
 from ganlane.sim.random import Stream
 from ganlane.torch_settings import set_threads
 
@@ -41,8 +42,10 @@ except ImportError as error:
         "record: needs the extra 'minari'; run `pip install \"ganlane[minari]\"`."
     ) from error
 
-#: Episodes that are written at a time.
+#: Episodes that are written at a time: each time costs milliseconds.
 _AT_ONCE = 64
+#: Arguments of the environment that decide what its episodes are like.
+_ARGUMENTS = ("traffic", "env", "observation", "reward", "mask", "stream")
 
 
 def record(config: RecordConfig, folder: Path) -> str:
@@ -50,42 +53,35 @@ def record(config: RecordConfig, folder: Path) -> str:
     set_threads(config.threads)
     driver = make_driver(config.driver, config.env, Stream.named(config.stream), config.device)
     mask, policy = driver.behind(config.mask)
-    seen = config.observation.read_by(driver.observation)
-    options = {
-        "env": config.env,
-        "observation": seen,
-        "reward": config.reward,
-        "mask": mask,
-        "stream": config.stream,
-    }
-    count = min(config.num_envs, config.episodes)
-    rows = TensorRows(config.traffic, count, {**options, "device": config.device})
+    driven = replace(
+        config,
+        observation=config.observation.read_by(driver.observation),
+        mask=mask,
+        num_envs=min(config.num_envs, config.episodes),
+    )
+    rows = TensorRows(driven)
+    # What minari's recover_environment() makes.
     spec = deepcopy(gymnasium.spec(ENV_ID))
-    spec.kwargs, spec.max_episode_steps = (
-        plain({"traffic": config.traffic, **options}),
-        rows.episode.most_decisions(),
-    )
-    env = next(name for name, kind in SCHEMAS["env"].items() if kind is type(config.env))
-    spec.kwargs["traffic"]["name"] = config.traffic.label()
-    spec.kwargs["env"]["name"] = env
+    spec.kwargs = {name: plain(getattr(driven, name)) for name in _ARGUMENTS}
+    spec.max_episode_steps = rows.episode.most_decisions()
     name, root = config.dataset_name(), Path(config.out or folder).absolute()
-    about = {
-        "dataset_id": name,
-        "algorithm_name": driver.name,
-        "minari_version": minari.__version__,
-    }
-    about["description"] = (
-        f"{driver.name} among {config.traffic.label()}, env={env}, seed {config.seed}"
-    )
     with _new_folder(root / name) as part:
-        storage = MinariStorage.new(
-            part / "data", rows.space, gymnasium.spaces.Discrete(ACTIONS), spec
+        actions = gymnasium.spaces.Discrete(ACTIONS)
+        storage = MinariStorage.new(part / "data", rows.space, actions, spec)
+        storage.update_metadata(
+            {
+                "dataset_id": name,
+                "algorithm_name": driver.name,
+                "minari_version": minari.__version__,
+                "description": (
+                    f"{driver.name} among {config.traffic.label()}, seed {config.seed}"
+                ),
+            }
         )
-        storage.update_metadata(about)
-        found = _write(storage, _driven(rows, policy, config), config.episodes)
+        facts = _write(storage, _episodes(rows, policy, config), config.episodes)
     seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
-    write_results(folder, {"dataset": name, "root": str(root), **found}, asdict(config), seeds)
-    print(", ".join(f"{key.replace('_', ' ')} {value}" for key, value in found.items()))
+    write_results(folder, {"dataset": name, "root": str(root), **facts}, plain(config), seeds)
+    print(", ".join(f"{key.replace('_', ' ')} {value}" for key, value in facts.items()))
     return f"dataset: minari.load_dataset({name!r}) with MINARI_DATASETS_PATH={root}"
 
 
@@ -111,39 +107,41 @@ def _new_folder(place: Path) -> Iterator[Path]:
             rmtree(part, ignore_errors=True)
 
 
-def _driven(rows: TensorRows, policy: Any, config: RecordConfig) -> Iterator[EpisodeBuffer]:
+def _episodes(rows: TensorRows, policy: Any, config: RecordConfig) -> Iterator[EpisodeBuffer]:
     """The episodes as they end; row i of N drives i, i + N, i + 2N, ..."""
+    buffers: dict[int, Any] = {}
 
-    def seen(chosen: Iterable[int]) -> None:
+    def begin(chosen: Iterable[int]) -> None:
+        for row in chosen:
+            number = int(rows.now().get(EPISODE)[row])
+            buffers[row] = EpisodeBuffer(number, config.seed, {"episode": number}, [], [], infos={})
+        observe(chosen)
+
+    def observe(chosen: Iterable[int]) -> None:
         """Add what the rows ``chosen`` are in to their episodes."""
         observation, info = rows.observation().copy(), rows.info()
         for row in chosen:
             buffers[row].observations.append(observation[row])
             _append(buffers[row].infos, row_of(info, row))
 
-    def begin(chosen: Iterable[int]) -> None:
-        for row in chosen:
-            number = int(rows.now().get(EPISODE)[row])
-            buffers[row] = EpisodeBuffer(number, config.seed, {"episode": number}, [], [], infos={})
-        seen(chosen)
-
-    buffers: dict[int, Any] = {}
     rows.start(config.seed, np.arange(rows.count))
     begin(range(rows.count))
     while any(buffer.id < config.episodes for buffer in buffers.values()):
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             actions = policy(rows.now().clone(recurse=False)).get(ACTION).cpu().numpy()
         stepped = rows.step(actions)
-        seen(buffers)
+        observe(buffers)
         for row, buffer in buffers.items():
             buffer.actions.append(actions[row])
             buffer.rewards.append(stepped.reward[row])
             buffer.terminations.append(stepped.terminated[row])
             buffer.truncations.append(stepped.truncated[row])
-        ended = np.flatnonzero(stepped.terminated | stepped.truncated).tolist()
+        has_ended = stepped.terminated | stepped.truncated
+        ended = np.flatnonzero(has_ended).tolist()
+        # A row goes on with further episodes until all rows have driven theirs.
         yield from (buffers[row] for row in ended if buffers[row].id < config.episodes)
         if ended:
-            rows.restart(stepped.terminated | stepped.truncated)
+            rows.restart(has_ended)
             begin(ended)
 
 
@@ -157,24 +155,21 @@ def _append(lists: dict[str, Any], values: dict[str, Any]) -> None:
 
 
 def _write(storage: Any, episodes: Iterator[EpisodeBuffer], count: int) -> dict[str, Any]:
-    """Write the episodes in the order of their numbers; what they were like."""
+    """Write the episodes in the order of their numbers, as Minari wants; what they were like."""
     waiting: dict[int | None, EpisodeBuffer] = {}
-    written, decisions, returns, ends = 0, 0, 0.0, Counter[str]()
+    written, decisions, total, ends = 0, 0, 0.0, Counter[str]()
     for episode in tqdm(episodes, total=count, unit="episode", disable=not sys.stderr.isatty()):
-        decisions, returns = decisions + len(episode), returns + float(sum(episode.rewards))
+        decisions += len(episode)
+        total += float(sum(episode.rewards))
         ends.update(event for event in END_EVENTS if episode.infos[event][-1])
         waiting[episode.id] = episode
-        ready = 0
-        while written + ready in waiting:
-            ready += 1
-        if ready >= _AT_ONCE or written + ready == count:
-            storage.update_episodes(
-                [waiting.pop(number) for number in range(written, written + ready)]
-            )
-            written += ready
+        ready = list(itertools.takewhile(waiting.__contains__, itertools.count(written)))
+        if len(ready) >= _AT_ONCE or written + len(ready) == count:
+            storage.update_episodes([waiting.pop(number) for number in ready])
+            written += len(ready)
     return {
         "episodes": written,
         "decisions": decisions,
-        "mean_return": round(returns / count, 2),
+        "mean_return": round(total / count, 2),
         "ends": dict(ends),
     }

@@ -64,7 +64,8 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
     episodes, revisions, seconds = read_cells(cells)
     # From here on nothing is driven but the figure of an episode and the list of crashes.
     by_recipe = report.by_recipe(episodes)
-    rows, compared = report.rows(by_recipe), report.comparisons(by_recipe, _pairs(by_recipe))
+    rows = report.rows(by_recipe)
+    compared = report.comparisons(by_recipe, _pairs(by_recipe))
     tables = {
         "table_vi": report.table_vi(rows),
         "table_vii": report.table_vii(rows),
@@ -79,7 +80,12 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
     _print_left_out(not_drawn)
     missing |= not_drawn
     # The rows behind two of the tables say more than what is printed of them.
-    files: dict[str, Any] = {**tables, "comparisons": compared, "matrix": rows, **numbers}
+    files: dict[str, Any] = {
+        **tables,
+        "comparisons": compared,
+        "matrix": rows,
+        **numbers,
+    }
     for name, content in files.items():
         report.write_csv(folder / f"{name}.csv", content)
     driven = {name: config.episodes_on(name) for name in traffics}
@@ -91,11 +97,17 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
         f"Driving took {sum(seconds.values()) / 60:.1f} minutes of one process.",
         machine_sentence([config.threads or 1]),
     ]
-    page = report.write_report(folder, tables, figures, intro)
+    page = report.write_report(
+        folder,
+        tables,
+        figures,
+        intro,
+    )
     for table in tables.values():
         print(table.text(), end="\n\n")
     if config.crashes:
         _list_crashes(episodes, config, folder)
+    # Where the episodes of every pair lie, for whoever wants to look closer.
     names = {f"{cell.driver} on {cell.traffic}": cell.path.name for cell in cells}
     record = {
         "rows": rows,
@@ -105,7 +117,11 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
         "seconds": seconds,
         "cells": {"revisions": revisions, "files": names},
     }
-    seeds = {"stream": config.stream, "seed": config.seed, "episodes": driven}
+    seeds = {
+        "stream": config.stream,
+        "seed": config.seed,
+        "episodes": driven,
+    }
     return f"report: {page}; results: {write_results(folder, record, asdict(config), seeds)}"
 
 
@@ -113,7 +129,10 @@ def _figures(
     config: ReproduceConfig, traffics: Mapping[str, TrafficConfig]
 ) -> tuple[dict[str, pl.DataFrame], dict[str, Figure], dict[str, str]]:
     """Figures 2 and 3: the numbers behind them, themselves, and why one is missing; by name."""
-    numbers, figures, missing = {}, {}, {}
+    numbers = {}
+    figures = {}
+    missing = {}
+    # Without the recordings there is no figure 2, but everything else.
     try:
         numbers["figure_2"] = drawings.forecasts_to_draw()
         figures["figure_2"] = drawings.draw_forecasts(numbers["figure_2"])
@@ -122,7 +141,10 @@ def _figures(
     if "gan" in traffics:
         episode = drawings.drive_beginning(config, traffics["gan"])
         numbers["figure_3"] = drawings.busiest(episode)
-        figures["figure_3"] = drawings.draw_episode(episode.label, numbers["figure_3"])
+        figures["figure_3"] = drawings.draw_episode(
+            episode.label,
+            numbers["figure_3"],
+        )
     else:
         missing["figure 3"] = "the traffic gan is not among the traffics"
     return numbers, figures, missing
@@ -133,7 +155,11 @@ def _print_left_out(missing: Mapping[str, str]) -> None:
         print(f"left out, {name}: {reason}", file=sys.stderr)
 
 
-def _list_crashes(episodes: pl.DataFrame, config: ReproduceConfig, folder: Path) -> None:
+def _list_crashes(
+    episodes: pl.DataFrame,
+    config: ReproduceConfig,
+    folder: Path,
+) -> None:
     """Write the earliest crashes of every driver but the controls, as ``crashes.json``."""
     # Who drives at random crashes in most episodes, which shows nothing.
     controls = ["random", "random_legal", "keep_lane"]
@@ -169,6 +195,7 @@ def trained_from_scratch(config: ReproduceConfig) -> ReproduceConfig:
     """
     for name in config.agents:
         with_seeds(name)  # a training that is not installed shows before hours of training
+    # A finished training has results.json; it is not made again.
     folders = {seed: Path(config.trained) / f"seed_{seed}" for seed in config.training_seeds}
     to_train = [seed for seed, path in folders.items() if not (path / "results.json").is_file()]
     print(
@@ -183,7 +210,12 @@ def trained_from_scratch(config: ReproduceConfig) -> ReproduceConfig:
         if any(path.rglob("last.pt")):
             arguments = [f"resume={path}"]
         # A process of its own: a training sets threads and seeds for itself.
-        command = [sys.executable, "-m", "ganlane.train", *arguments]
+        command = [
+            sys.executable,
+            "-m",
+            "ganlane.train",
+            *arguments,
+        ]
         if subprocess.run(command, check=False).returncode:
             raise UserError(
                 f"source=scratch: the training in {path} stopped; the same command goes on with it."
@@ -196,5 +228,10 @@ def trained_from_scratch(config: ReproduceConfig) -> ReproduceConfig:
             seed: read_agent(path / phase / "agent.safetensors") for seed, path in folders.items()
         }
         save_agents(file, trained)
+        # The fresh files take the place of those that ship, under the same masks.
         agents = [name.replace(f"{recipe}@all", f"{file}@all") for name in agents]
-    return replace(config, agents=agents, runs=[str(path) for path in folders.values()])
+    return replace(
+        config,
+        agents=agents,
+        runs=[str(path) for path in folders.values()],
+    )

@@ -85,6 +85,9 @@ def _check(override: Override) -> None:
                 f"{key}: no such key here; of Hydra's configuration give {', '.join(HYDRA_KEYS)}, "
                 "hydra/launcher=NAME, hydra.launcher.PARAMETER=... or the same of the sweeper."
             )
+        # Hydra reads the file of this name, from another folder too
+        if "/" in key and not str(override.value()).isidentifier():
+            raise UserError(f"{word}: no such option; give a launcher's name, such as joblib.")
         return
     if not _is_group(key):
         return
@@ -152,13 +155,18 @@ def called(command: str, keys: Mapping[str, Any]) -> dict[str, Any]:
     return merged(deepcopy(_defaults(command, *words)), others)
 
 
+def key_of(override: Override) -> str:
+    """The key that a word replaces; an option by its name replaces all keys below it."""
+    return str(override.key_or_group).removesuffix(".name")
+
+
 def resumed(saved: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
     """A saved run's data with what a command line names."""
     # Only what the command line names is taken from the new composition.
     config = OmegaConf.create(dict(saved))
     now = OmegaConf.create(composed("train", overrides))
     for override in overrides:
-        key = override.key_or_group
+        key = key_of(override)
         if not key.startswith("hydra"):
             OmegaConf.update(config, key, OmegaConf.select(now, key), merge=False, force_add=True)
     return OmegaConf.to_container(config)  # type: ignore[return-value]

@@ -14,7 +14,7 @@ import shutil
 import signal
 import socket
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -24,6 +24,7 @@ import hydra
 import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
+from omegaconf import OmegaConf
 
 from ganlane.arguments import is_import_path
 from ganlane.config.compose import (
@@ -32,11 +33,12 @@ from ganlane.config.compose import (
     called,
     composed,
     for_hydra,
+    key_of,
     parsed,
     resumed,
 )
 from ganlane.config.help import help_text
-from ganlane.errors import USER_ERROR, UserError, numbered_refusals
+from ganlane.errors import USER_ERROR, UserError, as_typed, numbered_refusals
 from ganlane.files import conf_folder, remove_leftovers, write_bytes
 from ganlane.runtime import (
     check_process,
@@ -93,10 +95,8 @@ EARNED = (
 OUTPUTS = Path("outputs")
 #: Folders of a run that it writes to itself; others below it may be runs of their own.
 _OWN_FOLDERS = (".", "checkpoints", "pretrain", "pretrain/checkpoints", "fits")
-#: Keys that name code to execute: import paths, and the address of a Ray cluster, which sends
-#: pickles.
+#: Import paths below these are trusted wherever they stand.
 _OWN_PACKAGES = ("ganlane.", "ganlane_simulators.")
-_IMPORTING_KEYS = ("_target_", "name", "shares", "agents", "address")
 
 
 class Stopped(BaseException):
@@ -123,7 +123,13 @@ def run_command(
     keep_freed_memory()
     try:
         with _sigterm_as_exception():
-            _dispatch(command, words, task)
+            single = _single_run(command, words, task)
+            if single is not None:
+                config, folder = single
+                with running(folder, config):
+                    line = (task or function_of(command))(config, folder)
+                if line:
+                    print(line)
             sys.stdout.flush()
     except UserError as error:
         print(f"ganlane {command}: {_one_line(error)}", file=sys.stderr)
@@ -142,17 +148,21 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()).rstrip(".") + "."
 
 
-def _dispatch(command: str, words: list[str], task: Task | None) -> None:
-    """Do what the words ask for: help, printing the configuration, a sweep or a run."""
+def _single_run(command: str, words: list[str], task: Task | None) -> tuple[Any, Path] | None:
+    """The settings and folder of the run that the words ask for.
+
+    None where they ask for something else, which is done here: help, the configuration, a sweep.
+    """
     # Hydra would have a score of flags; these three are all that is needed.
     flags = [word for word in words if word.startswith("-")]
     keys = [word for word in words if word not in flags]
     if {"-h", "--help"} & set(flags):
         print(help_text(command, COMMANDS[command][0]))
-        return
-    if flags == ["--cfg"] and keys[:1] == ["job"]:
-        print(as_yaml(settings(command, keys[1:])), end="")
-        return
+        return None
+    if flags == ["--cfg"] and "job" in keys:
+        keys.remove("job")
+        print(as_yaml(settings(command, keys)), end="")
+        return None
     unknown = [flag for flag in flags if flag not in ("-m", "--multirun")]
     if unknown:
         raise UserError(f"{unknown[0]}: no such flag; run the command with --help to see them.")
@@ -160,11 +170,9 @@ def _dispatch(command: str, words: list[str], task: Task | None) -> None:
     overrides = parsed(command, keys)
     if flags:
         _sweep(command, overrides, task)
-        return
+        return None
     config, folder = _settings_and_folder(command, overrides)
-    line = run_in(folder.absolute(), command, config, task)
-    if line:
-        print(line)
+    return config, folder.absolute()
 
 
 def settings(command: str, words: Sequence[str]) -> Any:
@@ -188,9 +196,10 @@ def _settings_and_folder(command: str, overrides: list[Override]) -> tuple[Any, 
     if resume is not None and resume.value() not in (None, ""):
         folder = _resumed_folder(str(resume.value()))
         if folder is not None:
-            saved = saved_config(folder / CONFIG)
-            _refuse_stored_imports(saved, [str(word.input_line) for word in rest], str(folder))
-            return make(TrainConfig, {**resumed(saved, rest), "resume": str(folder)}), folder
+            data = resumed(saved_config(folder / CONFIG), rest)
+            config: Any = make(TrainConfig, {**data, "resume": str(folder)})
+            refuse_stored_imports(config, [key_of(word) for word in rest])
+            return config, folder
     config = make(COMMANDS[command][0], composed(command, rest))
     where = values.get("hydra.run.dir")
     return config, new_folder(command) if where is None else Path(str(where.value()))
@@ -216,7 +225,9 @@ def call_settings(command: str, keys: Mapping[str, Any]) -> Any:
     aliases = ALIASES.get(command, {})
     keys = with_env_keys(kind, {aliases.get(name, name): keys[name] for name in keys})
     if command == "train" and keys.get("resume") is not None:
-        return make(kind, merged(saved_config(Path(keys["resume"]) / CONFIG), keys))
+        config: Any = make(kind, merged(saved_config(Path(keys["resume"]) / CONFIG), keys))
+        refuse_stored_imports(config, list(_whole_keys(keys)))
+        return config
     return make(kind, called(command, keys))
 
 
@@ -242,7 +253,9 @@ def _sweep(command: str, overrides: list[Override], task: Task | None) -> None:
         words = [str(word).lstrip("+") for word in state.overrides.task]
         try:
             folder = Path(state.runtime.output_dir)
-            line = run_in(folder, command, settings(command, words), task)
+            config = settings(command, words)
+            with running(folder, config):
+                line = (task or function_of(command))(config, folder)
             if line:
                 print(line, flush=True)
         except (UserError, OSError) as error:
@@ -255,6 +268,7 @@ def _sweep(command: str, overrides: list[Override], task: Task | None) -> None:
     application = hydra.main(
         version_base=VERSION_BASE, config_path=str(conf_folder()), config_name=command
     )
+    OmegaConf.register_new_resolver("process_id", os.getpid, replace=True)
     before, full = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     sys.argv = [f"ganlane {command}", "-m", *for_hydra(overrides)]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # raise, rather than print and exit with status 1
@@ -305,17 +319,18 @@ def as_yaml(config: Record) -> str:
     return yaml.safe_dump(plain(config), sort_keys=False, allow_unicode=True)
 
 
-def run_in(folder: Path, command: str, config: Any, task: Task | None = None) -> str | None:
-    """Run a command in ``folder``; the line that names its results.
+@contextmanager
+def running(folder: Path, config: Any) -> Iterator[None]:
+    """The run folder for the time of a run: locked, with the settings in it.
 
     Raises:
-        UserError: another run uses the folder, or whatever the command refuses.
+        UserError: another run uses the folder.
     """
     register_envs()  # for a user's own driver or traffic
     with cleared_after_mistakes(folder), held(folder):
         write_bytes(folder / CONFIG, as_yaml(config).encode())
         with numbered_refusals():
-            return (task or function_of(command))(config, folder)
+            yield
 
 
 def function_of(command: str) -> Callable[[Any, Path], str]:
@@ -460,41 +475,56 @@ def newest_unfinished(runs: Path) -> Path | None:
     return None
 
 
-def _refuse_stored_imports(data: Mapping[str, Any], words: Sequence[str], run: str) -> None:
-    """Refuse code from outside the package that a run's file names, unless a word names it too.
+def refuse_stored_imports(config: TrainConfig, named: Collection[str]) -> None:
+    """Refuse code from outside the package that a run's file names, unless the user names it too.
+
+    ``named`` are the whole keys that stand on the command line or in the call.
 
     Raises:
-        UserError: the file names a class or function of another package, or a Ray cluster.
+        UserError: the file names a class or function of another package.
     """
-    # Naming the code on the command line is the user's word that it may run.
-    for key, value in _imports(data, ""):
-        if not any(value in word for word in words if "=" in word):
+    # Naming the code is the user's word that it may run.
+    for key, value, path in _imports(config):
+        # traffic=my.module.MyTraffic names all keys below it
+        is_asked = any(f"{key}.".startswith(f"{name}.") for name in named)
+        if not is_asked and not path.startswith(_OWN_PACKAGES):
             raise UserError(
-                f"resume={run}: the run's file names {value}, and code from there would be "
-                f"executed; if you trust it, add {key}={value} to the command line."
+                f"resume={config.resume}: the run's file names {path}, and code from there would "
+                f"be executed; if you trust it, add {key}={value} to the command line."
             )
 
 
-def _imports(data: Mapping[str, Any], above: str) -> Iterator[tuple[str, str]]:
-    """Every import path outside the package that ``data`` name, with its key."""
-    for name, value in data.items():
-        key = f"{above}{name}"
-        if isinstance(value, Mapping):
-            names = list(value) if name == "shares" else []
-            yield from _imports(value, f"{key}.")
-        else:
-            names = value if isinstance(value, list) else [value]
-        if name not in _IMPORTING_KEYS:
+def _imports(config: TrainConfig) -> Iterator[tuple[str, str, str]]:
+    """Every import path of a run, after the key that names it and the value of that key."""
+    traffics = {
+        "pretrain.traffic": config.pretrain.traffic,
+        "traffic": config.traffic,
+        "evaluation.traffic": config.evaluation.traffic,
+    }
+    for key, traffic in traffics.items():
+        if traffic is None:
             continue
-        for text in names:
-            path = str(text).partition("+")[0]
-            is_own = path.startswith(("ganlane.", "ganlane_simulators.")) or path.endswith(
-                ".safetensors"
-            )
-            if name == "address" and text not in (None, "auto"):
-                yield key, str(text)
-            elif is_import_path(path) and not is_own and not Path(path).is_file():
-                yield key, path
+        yield f"{key}._target_", traffic._target_, traffic._target_
+        for name, part in traffic.parts().items():
+            if name in getattr(traffic, "options", {}):
+                yield f"{key}.options.{name}._target_", part._target_, part._target_
+            else:
+                yield f"{key}.shares", f"{{{name}: ...}}", part._target_
+    agents = config.evaluation.agents
+    for name in agents:
+        path = name.partition("+")[0]
+        # weights, which execute nothing, may have a name of this form
+        if is_import_path(path) and not path.endswith(".safetensors") and not Path(path).is_file():
+            yield "evaluation.agents", as_typed(agents), path
+
+
+def _whole_keys(data: Mapping[str, Any], above: str = "") -> Iterator[str]:
+    """The keys of a call, down to the values; an option by its ``name`` is one value."""
+    for name, value in data.items():
+        if isinstance(value, Mapping) and "name" not in value:
+            yield from _whole_keys(value, f"{above}{name}.")
+        else:
+            yield f"{above}{name}"
 
 
 @contextmanager

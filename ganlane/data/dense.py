@@ -47,11 +47,16 @@ class Recording:
     driven: Flags
 
     @classmethod
-    def of(cls, rows: pl.DataFrame, lane_width_m: float) -> Recording:
+    def of(
+        cls,
+        rows: pl.DataFrame,
+        lane_width_m: float,
+    ) -> Recording:
         """From one scene in the schema whose tracks have no gaps.
 
         With a column ``driven``, the other vehicles are replayed.
         """
+        # Without the column everybody is driven.
         if "driven" not in rows.columns:
             rows = rows.with_columns(driven=True)
         # Frames of the scene count from its first one, tracks by their number.
@@ -67,7 +72,10 @@ class Recording:
         # Values per track, the same in all of its rows.
         for name in ("length", "width", "driven"):
             column = rows[name].to_numpy()
-            arrays[name] = np.zeros(shape[1], column.dtype)
+            arrays[name] = np.zeros(
+                shape[1],
+                column.dtype,
+            )
             arrays[name][track] = column
         present = np.zeros(shape, bool)
         present[time, track] = True
@@ -115,7 +123,11 @@ class Recording:
             lane_width=pl.lit(self.lane_width_m),
         )
 
-    def segments(self, seconds: float, skip_s: float = 0.0) -> list[Recording]:
+    def segments(
+        self,
+        seconds: float,
+        skip_s: float = 0.0,
+    ) -> list[Recording]:
         """Pieces of ``seconds`` from ``skip_s`` on, each with the vehicles present in it."""
         length = round(seconds / FRAME_S)
         first = round(skip_s / FRAME_S)
@@ -128,6 +140,7 @@ class Recording:
                 name: getattr(self, name)[rows, who] for name in ("x", "y", "speed", "present")
             }
             arrays |= {name: getattr(self, name)[who] for name in ("length", "width", "driven")}
+            # The unit stays that of the recording: pieces of one scene are not independent.
             pieces.append(
                 replace(
                     self,

@@ -98,7 +98,8 @@ class _Part:
     """The incomplete file ``.NAME.part`` of ``url`` next to ``path``, and a note of its version."""
 
     def __init__(self, url: str, path: Path, most_bytes: int) -> None:
-        self.url, self.most_bytes = url, most_bytes
+        self.url = url
+        self.most_bytes = most_bytes
         # Hidden, beside the file, so that the last step is a rename.
         self.file = path.with_name(f".{path.name}.part")
         self._note = path.with_name(f".{path.name}.part.json")

@@ -139,7 +139,11 @@ def _read_recording_meta(
     )
 
 
-def _markings(text: str, path: Path, column: str) -> list[float]:
+def _markings(
+    text: str,
+    path: Path,
+    column: str,
+) -> list[float]:
     """``y`` of the lane markings in the image, m: ``8.51;12.59;16.43`` as numbers."""
     try:
         markings = [float(part) for part in text.split(";") if part.strip()]
@@ -153,7 +157,11 @@ def _markings(text: str, path: Path, column: str) -> list[float]:
     return markings
 
 
-def _read_rows(path: Path, meta: Path, count: RowCount) -> pl.DataFrame:
+def _read_rows(
+    path: Path,
+    meta: Path,
+    count: RowCount,
+) -> pl.DataFrame:
     """Rows of a recording, sorted by vehicle and frame.
 
     ``direction`` is its vehicle's in the ``meta`` file.
@@ -181,7 +189,13 @@ def _read_rows(path: Path, meta: Path, count: RowCount) -> pl.DataFrame:
     # Sorting would hide a damaged frame number.
     step = rows.select(pl.col("frame").diff().over("id")).to_series()
     what = "is not after the last frame of its vehicle; frames must grow"
-    raise_where(step <= 0, rows, "frame", path, what)
+    raise_where(
+        step <= 0,
+        rows,
+        "frame",
+        path,
+        what,
+    )
     # Each row gets the direction of its vehicle.
     directions = rows["id"].replace_strict(
         cars["id"],

@@ -37,10 +37,13 @@ Flags = NDArray[np.bool_]
 #: Samples, 0.1 s each: least in the old lane before a change and in the new one after it; half the
 #: window of the mean lateral speed; longest search for start and end, before and after the
 #: crossing.
-_HOLD, _HALF_WINDOW, _REACH = 5, 5, 200
+_HOLD = 5
+_HALF_WINDOW = 5
+_REACH = 200
 #: Offset from the lane's centre and lateral speed below which the change has not begun or is over,
 #: m and m/s.
-_CENTRED_M, _STILL_MPS = 0.3, 0.1
+_CENTRED_M = 0.3
+_STILL_MPS = 0.1
 
 
 def scene_lane_widths(
@@ -69,7 +72,11 @@ def scene_lane_counts(
     )
 
 
-def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
+def lane_width(
+    y: Floats,
+    lane: Integers,
+    scene: str = "scene",
+) -> float:
     """Lane width, m, at which the nearest lanes agree best with the recorded ones ``lane`` [R].
 
     The first estimate is the median slope between the median positions of each pair of lanes (Theil
@@ -95,7 +102,11 @@ def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
     return guess if low <= guess <= high else 0.5 * (low + high)
 
 
-def lane_grid(y: Floats, lane: Integers, scene: str) -> tuple[float, float]:
+def lane_grid(
+    y: Floats,
+    lane: Integers,
+    scene: str,
+) -> tuple[float, float]:
     """Lane width (:func:`lane_width`) and position of lane 0's centre, both m, where ``y`` has any
     origin.
 
@@ -108,7 +119,11 @@ def lane_grid(y: Floats, lane: Integers, scene: str) -> tuple[float, float]:
     return lane_width(y - centre, lane, scene), centre
 
 
-def _best_range(y: Floats, lane: Integers, guess: float) -> tuple[float, float]:
+def _best_range(
+    y: Floats,
+    lane: Integers,
+    guess: float,
+) -> tuple[float, float]:
     """Widths within 10 % of the guess that most rows agree with.
 
     Of several ranges, the nearest to the guess.
@@ -254,8 +269,20 @@ def find_lane_changes(tracks: Tracks) -> LaneChanges:
     # The crossing lies between two samples; it is interpolated linearly.
     boundary = (old + 0.5 * side) * tracks.lane_width[sample]
     part = (boundary - tracks.y[sample]) / (tracks.y[sample + 1] - tracks.y[sample])
-    start, start_seen = _find_end(tracks, sample, side, old, -1)
-    end, end_seen = _find_end(tracks, sample + 1, side, new, 1)
+    start, start_seen = _find_end(
+        tracks,
+        sample,
+        side,
+        old,
+        -1,
+    )
+    end, end_seen = _find_end(
+        tracks,
+        sample + 1,
+        side,
+        new,
+        1,
+    )
     tau_s = (sample - start + part) * FRAME_S
     tau_e = (end - sample - part) * FRAME_S
     # Over the recorded part of the change, from start to end.

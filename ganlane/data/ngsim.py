@@ -89,7 +89,8 @@ LOCATION: Final = "location"
 STREETS: Final = ("lankershim", "peachtree")
 #: A file has about six periods; a damaged column of times or frames makes hundreds, or one of a few
 #: rows. The least number of rows, where there are several periods, are those of a vehicle for 5 s.
-MAX_PERIODS, MIN_ROWS = 500, 50
+MAX_PERIODS = 500
+MIN_ROWS = 50
 #: Maximum number of rows from which lane width and position are estimated.
 ROWS_FOR_LANES: Final = 500_000
 #: Medians of vehicle lengths that can be feet: 15 is usual, 4.5 would be metres, 450 centimetres.
@@ -98,7 +99,8 @@ LENGTHS_FT: Final = (8.0, 40.0)
 #: hour 1.47.
 PACE: Final = (0.94, 1.06)
 #: The pace is measured on tracks of at least 2 s at 10 ft/s or more.
-_PACE_FRAMES, _PACE_FT_S = 20, 10.0
+_PACE_FRAMES = 20
+_PACE_FT_S = 10.0
 
 
 def ngsim_scenes(
@@ -122,7 +124,12 @@ def ngsim_scenes(
     parameters = parameters or NgsimParameters()
     count = count if count is not None else RowCount()
     # Nothing is read before the first period is asked for.
-    rows = _read_rows(_layout(path), parameters, count, on_progress)
+    rows = _read_rows(
+        _layout(path),
+        parameters,
+        count,
+        on_progress,
+    )
     with tempfile.TemporaryDirectory(dir=scratch, prefix="rows-") as folder:
         periods = _store_by_period(rows, Path(folder), str(path))
         if not periods:
@@ -164,15 +171,33 @@ def _read_rows(
     path = table.path
     has_location = LOCATION in table.names
     wanted = [*COLUMNS, LOCATION] if has_location else list(COLUMNS)
-    for text in read_blocks(table, wanted, parameters.block_bytes, on_progress):
+    for text in read_blocks(
+        table,
+        wanted,
+        parameters.block_bytes,
+        on_progress,
+    ):
         count.read += text.height
         # A raw text file is of one place, which its name tells.
         if has_location:
-            text = _keep_locations(text, path, parameters.locations, count)
+            text = _keep_locations(
+                text,
+                path,
+                parameters.locations,
+                count,
+            )
         else:
             text = text.with_columns(pl.lit(path.stem).alias(LOCATION))
         # Only the wanted rows are converted: others may be damaged.
-        columns = [convert(text, name, kind, path) for name, kind in COLUMNS.items()]
+        columns = [
+            convert(
+                text,
+                name,
+                kind,
+                path,
+            )
+            for name, kind in COLUMNS.items()
+        ]
         rows = pl.DataFrame([*columns, text[LOCATION], text[LINE]])
         for name in ("v_length", "v_width"):
             raise_where(
@@ -199,7 +224,14 @@ def _keep_locations(
     count: RowCount,
 ) -> pl.DataFrame:
     """Rows of the wanted locations; rows of others are dropped and counted."""
-    text = text.with_columns(convert(text, LOCATION, pl.String, path).str.to_lowercase())
+    text = text.with_columns(
+        convert(
+            text,
+            LOCATION,
+            pl.String,
+            path,
+        ).str.to_lowercase()
+    )
     places = sorted({*MOTORWAYS, *STREETS, *locations})
     what = f"is no known place, expected {', '.join(places)}, or name it in data.locations"
     # A mistyped place would drop a whole recording in silence.
@@ -324,7 +356,11 @@ def _drop_duplicates(rows: pl.DataFrame, count: RowCount) -> pl.DataFrame:
     """
     # The file's own order decides which of several rows is the first.
     rows = rows.sort("vehicle_id", "global_time", LINE)
-    unequal = rows.unique(list(COLUMNS), keep="first", maintain_order=True)
+    unequal = rows.unique(
+        list(COLUMNS),
+        keep="first",
+        maintain_order=True,
+    )
     first = unequal.unique(
         ["vehicle_id", "global_time"],
         keep="first",
@@ -346,7 +382,13 @@ def _check_order(rows: pl.DataFrame, path: Path) -> None:
         ms=pl.col("global_time").diff().over("vehicle_id"),
     )
     what = "does not grow with global_time within its vehicle"
-    raise_where(steps["frames"] <= 0, rows, "frame_id", path, what)
+    raise_where(
+        steps["frames"] <= 0,
+        rows,
+        "frame_id",
+        path,
+        what,
+    )
     apart = steps["ms"] != FRAME_MS * steps["frames"]
     raise_where(
         apart,

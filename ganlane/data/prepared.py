@@ -160,6 +160,7 @@ class PooledStatistics:
 
         Exact for headways, for others with quantiles accurate to a bin's width.
         """
+        # One value per car fits into memory, so no bins are needed.
         if quantity == "headway":
             return describe(np.concatenate([np.empty(0), *self._headways]))
         return self.histograms[quantity].describe()
@@ -293,7 +294,9 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
     try:
         shutil.rmtree(part, ignore_errors=True)  # of a killed process that had the same number
         part.mkdir()
+        # Whatever goes wrong in between, the folder of the user stays as it was.
         yield part
+        # An empty folder may be there; it gives way.
         if path.is_dir():
             path.rmdir()
         part.replace(path)

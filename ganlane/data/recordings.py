@@ -93,6 +93,7 @@ def scene_csv(
     ``leftmost`` is the number of the leftmost lane.
     """
     columns = frame.with_columns(
+        # A scene CSV counts lanes from the left, from 1, and y from the leftmost lane.
         v=pl.col("speed"),
         lane=leftmost + 1 - pl.col("lane"),
         y=pl.col("y") - leftmost * lane_width_m,
@@ -115,6 +116,7 @@ def cut_into_scenes(frame: pl.DataFrame, seconds: float) -> pl.DataFrame:
 def _read_files(path: Path) -> Iterator[pl.DataFrame]:
     """The CSV, or the Parquet files one by one; a scene must not be in two of them."""
     files = sorted(path.glob(f"*{PARQUET}")) if path.is_dir() else [path]
+    # An empty folder would otherwise be an empty recording.
     if not files:
         raise UserError(
             f"{path}: no such file as *{PARQUET} in this folder; give what ganlane prepare wrote."
@@ -143,6 +145,7 @@ def _read_csv(path: Path) -> pl.DataFrame:
     scenes = []
     for (name,), scene in validate(table, str(path)).group_by("scene"):
         from_left = scene["lane"].to_numpy() - 1
+        # The file does not say how wide its lanes are; the positions do.
         width = lane_width(
             -scene["y"].to_numpy(),
             from_left,
@@ -219,6 +222,7 @@ def read_recordings(
     Arguments and errors are those of :func:`open_scenes`; a recording without any usable row is an
     error too.
     """
+    # Sorted over all files already.
     if kind == "scenes":
         return read_scenes(path)
     scenes = open_scenes(

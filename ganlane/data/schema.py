@@ -70,7 +70,11 @@ class RowCount:
         """Rows read and not dropped."""
         return self.read - self.dropped.total()
 
-    def drop(self, reason: str, rows: SupportsInt) -> None:
+    def drop(
+        self,
+        reason: str,
+        rows: SupportsInt,
+    ) -> None:
         """Count ``rows`` dropped for ``reason``."""
         if int(rows):
             self.dropped[reason] += int(rows)
@@ -152,7 +156,11 @@ class _Checked:
     source: str
     first_line: int | None
 
-    def refuse(self, row: int, what: str) -> NoReturn:
+    def refuse(
+        self,
+        row: int,
+        what: str,
+    ) -> NoReturn:
         """Raise a UserError that names a row."""
         line = f"row {row}" if self.first_line is None else f"line {row + self.first_line}"
         raise UserError(f"{self.source}, {line}, {what}.")

@@ -35,11 +35,9 @@ LEVELS: Final = (
 )
 #: A vehicle follows its leader up to this gap, m, and at this speed or faster, m/s. The gap of a
 #: standing car, m (Table V's ``s_0``), is not part of the headway.
-_FOLLOWING_GAP_M, _MIN_FOLLOWER_MPS, _STANDSTILL_GAP_M = (
-    70.0,
-    2.0,
-    2.0,
-)
+_FOLLOWING_GAP_M = 70.0
+_MIN_FOLLOWER_MPS = 2.0
+_STANDSTILL_GAP_M = 2.0
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,12 @@ def describe(values: ArrayLike) -> Distribution:
     """Summarise a sample without NaN."""
     sample = np.asarray(values, dtype=np.float64)
     if not len(sample):
-        return Distribution(0, None, None, ())
+        return Distribution(
+            0,
+            None,
+            None,
+            (),
+        )
     # One sample has no spread.
     sd = float(sample.std(ddof=1)) if len(sample) > 1 else None
     return Distribution(
@@ -145,7 +148,11 @@ class Bins:
     @property
     def edges(self) -> np.ndarray:
         """The bins' limits [number + 1]."""
-        return np.linspace(self.low, self.high, self.number + 1)
+        return np.linspace(
+            self.low,
+            self.high,
+            self.number + 1,
+        )
 
 
 class Histogram:
@@ -153,7 +160,10 @@ class Histogram:
 
     def __init__(self, bins: Bins) -> None:
         self.bins = bins
-        self.counts = np.zeros(bins.number, dtype=np.int64)
+        self.counts = np.zeros(
+            bins.number,
+            dtype=np.int64,
+        )
         self._sum = 0.0
         self._squares = 0.0
 
@@ -167,6 +177,7 @@ class Histogram:
         sample = np.asarray(values, dtype=np.float64)
         low = self.bins.low
         high = self.bins.high
+        # numpy drops values beyond the bins; these are to count in the outermost ones.
         inside = sample.clip(low, high)
         self.counts += np.histogram(inside, self.bins.number, (low, high))[0]
         self._sum += float(sample.sum())
@@ -176,7 +187,12 @@ class Histogram:
         """As :func:`describe` of all samples."""
         n = self.total
         if not n:
-            return Distribution(0, None, None, ())
+            return Distribution(
+                0,
+                None,
+                None,
+                (),
+            )
         # Sums are exact where bins are not; rounding may make the variance negative.
         mean = self._sum / n
         spread = math.sqrt(max(self._squares - n * mean * mean, 0.0) / (n - 1)) if n > 1 else None
@@ -195,7 +211,10 @@ class Histogram:
         occupied = np.flatnonzero(self.counts)
         index = np.searchsorted(below[occupied + 1], place).clip(max=len(occupied) - 1)
         k = occupied[index]
-        share = ((place - below[k]) / self.counts[k]).clip(0.0, 1.0)
+        share = ((place - below[k]) / self.counts[k]).clip(
+            0.0,
+            1.0,
+        )
         edges = self.bins.edges
         return float(edges[k] + share * (edges[k + 1] - edges[k]))
 
@@ -227,6 +246,7 @@ def measure_exposure(frame: pl.DataFrame) -> Exposure:
         road=pl.col("x").max() - pl.col("x").min(),
         cars=(pl.col("vehicle") % TRACK_STRIDE).n_unique(),
     )
+    # The length of each track as it was driven, lane changes included.
     driven = (pl.col(name).diff().over(TRACK) ** 2 for name in ("x", "y"))
     return Exposure(
         scenes=roads.height,
@@ -254,8 +274,14 @@ def leader_gaps(frame: pl.DataFrame) -> pl.DataFrame:
         name: pl.col(name).shift(-1).over("scene", "frame", "lane")
         for name in ("x", "length", "speed")
     }
+    # Positions are those of the bodies' centres, so half of both lengths lies between.
     gap = ahead["x"] - pl.col("x") - 0.5 * (ahead["length"] + pl.col("length"))
-    ordered = frame.sort("scene", "frame", "lane", "x")
+    ordered = frame.sort(
+        "scene",
+        "frame",
+        "lane",
+        "x",
+    )
     return ordered.with_columns(gap=gap, leader_speed=ahead["speed"]).drop_nulls("gap")
 
 
@@ -318,6 +344,7 @@ def quantities(
 def poisson_interval(count: int) -> tuple[float, float]:
     """Exact 95 % confidence interval of a Poisson mean after ``count`` events (Garwood 1936)."""
     tail = 0.5 * (1.0 - 0.95)
+    # Quantiles of gamma distributions; after no event the lower bound is 0.
     low = gammaincinv(count, tail) if count else 0.0
     return float(low), float(gammaincinv(count + 1, 1.0 - tail))
 
@@ -401,6 +428,7 @@ class DrivingStatistics:
 
     def to_dict(self) -> dict[str, Any]:
         """Nested dictionaries of numbers, None and lists, as in JSON."""
+        # Through JSON, so that tuples become the lists that a file gives back.
         return json.loads(json.dumps(asdict(self)))
 
     @classmethod

@@ -42,7 +42,11 @@ def synthetic_scenes(traffic: SyntheticTraffic | None = None, seed: int = 0) -> 
     return sort(pl.concat(_scene(traffic, number, seed) for number in range(traffic.scenes)))
 
 
-def _scene(traffic: SyntheticTraffic, number: int, seed: int) -> pl.DataFrame:
+def _scene(
+    traffic: SyntheticTraffic,
+    number: int,
+    seed: int,
+) -> pl.DataFrame:
     """One scene; every vehicle is present in every frame."""
     # Each scene has a seed of its own: their number changes none of them.
     random = np.random.default_rng((seed, number))
@@ -54,13 +58,23 @@ def _scene(traffic: SyntheticTraffic, number: int, seed: int) -> pl.DataFrame:
     # Along the road: a slot each, and a sine around one speed.
     swing = random.uniform(0.3, 1.0, (n, 1)) * traffic.speed_swing_mps
     omega = 2.0 * math.pi / random.uniform(6.0, 10.0, (n, 1))
-    phase = random.uniform(0.0, 2.0 * math.pi, (n, 1))
+    phase = random.uniform(
+        0.0,
+        2.0 * math.pi,
+        (n, 1),
+    )
     speed = traffic.speed_mps + swing * np.cos(omega * time + phase)
     slots = (np.arange(n) * traffic.slot_m)[:, None]
     x = slots + traffic.speed_mps * time + swing / omega * np.sin(omega * time + phase)
-    y = home[:, None] * traffic.lane_width_m + _across(traffic, time, home, random)
+    y = home[:, None] * traffic.lane_width_m + _across(
+        traffic,
+        time,
+        home,
+        random,
+    )
     # The nearest lane, as recordings have it.
     lane = np.rint(y / traffic.lane_width_m).clip(0, traffic.lanes - 1).astype(np.int64)
+    # Rows vehicle by vehicle, each from its first frame to its last.
     columns = {
         "scene": np.full(n * frames, f"synthetic-{number}"),
         "vehicle": np.repeat(np.arange(1, n + 1), frames),
@@ -92,13 +106,24 @@ def _across(
     wander = traffic.wander_m * np.sin(pace * time + phase)
     # To a random side, away from the edges of the road.
     side = random.choice([-1, 1], n)
-    side = np.where(home == traffic.lanes - 1, -1, side)
+    side = np.where(
+        home == traffic.lanes - 1,
+        -1,
+        side,
+    )
     side = np.where(home == 0, 1, side)
     # A change takes up to 5 s and must fit into the recording.
     changes = (random.uniform(size=n) < traffic.changing_share) & (traffic.lanes > 1) & (end > 6.0)
     lasts = random.uniform(3.0, 5.0, n)
-    begins = random.uniform(0.5, np.maximum(end - lasts - 0.5, 0.6))
+    begins = random.uniform(
+        0.5,
+        np.maximum(end - lasts - 0.5, 0.6),
+    )
     # Share of the change that is done, eased by half a cosine.
-    done = np.clip((time - begins[:, None]) / lasts[:, None], 0.0, 1.0)
+    done = np.clip(
+        (time - begins[:, None]) / lasts[:, None],
+        0.0,
+        1.0,
+    )
     moved = (changes * side * traffic.lane_width_m)[:, None]
     return wander + moved * 0.5 * (1.0 - np.cos(math.pi * done))

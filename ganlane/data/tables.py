@@ -52,7 +52,15 @@ def read_table(path: str | Path, columns: Mapping[str, Kind]) -> pl.DataFrame:
     path = Path(path)
     blocks = []
     for text in read_blocks(csv_table(path, columns), list(columns)):
-        converted = [convert(text, name, kind, path) for name, kind in columns.items()]
+        converted = [
+            convert(
+                text,
+                name,
+                kind,
+                path,
+            )
+            for name, kind in columns.items()
+        ]
         blocks.append(pl.DataFrame([*converted, text[LINE]]))
     if not blocks:
         raise UserError(f"{path}: a header but no rows; give a file with at least one row of data.")
@@ -96,7 +104,12 @@ def reason(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(". ")
 
 
-def convert(text: pl.DataFrame, column: str, kind: Kind, path: Path) -> pl.Series:
+def convert(
+    text: pl.DataFrame,
+    column: str,
+    kind: Kind,
+    path: Path,
+) -> pl.Series:
     """A ``column`` of text as ``String``, ``Int64`` (also of ``3.0``) or finite ``Float64``.
 
     Commas may separate thousands, as in NGSIM's portal.
@@ -109,7 +122,13 @@ def convert(text: pl.DataFrame, column: str, kind: Kind, path: Path) -> pl.Serie
     field = text[column]
 
     def refuse(bad: pl.Series, what: str) -> None:
-        raise_where(bad, text, column, path, what)
+        raise_where(
+            bad,
+            text,
+            column,
+            path,
+            what,
+        )
 
     refuse(
         field.is_null() | (field == ""),
@@ -170,11 +189,22 @@ def read_blocks(
     for block, has_no_end in _whole_lines(table, block_bytes):
         # A last line without a line break is a row only if it has all its fields.
         if has_no_end:
-            _check_lines(table, block, number, cut_off=True)
+            _check_lines(
+                table,
+                block,
+                number,
+                cut_off=True,
+            )
         # A last line without a line break counts.
         rows = block.count(b"\n") + (not block.endswith(b"\n"))
         lines = pl.int_range(number, number + rows, dtype=pl.Int64).alias(LINE)
-        yield _parse(table, block, number, rows, wanted).with_columns(lines)
+        yield _parse(
+            table,
+            block,
+            number,
+            rows,
+            wanted,
+        ).with_columns(lines)
         number += rows
         done += len(block)
         if on_progress is not None:
@@ -202,7 +232,11 @@ def _whole_lines(table: TextTable, block_bytes: int) -> Iterator[tuple[bytes, bo
             yield rest.rstrip(), not rest.endswith(b"\n")
 
 
-def _fields(line: str, place: str, blanks: bool = False) -> list[str]:
+def _fields(
+    line: str,
+    place: str,
+    blanks: bool = False,
+) -> list[str]:
     """The fields of one line."""
     try:
         return line.split() if blanks else next(csv.reader([line]), [])

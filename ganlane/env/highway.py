@@ -103,6 +103,14 @@ class HighwayEnv(EnvBase):
         recycle_share: float = 1.0,
         kernel: str = "torch",
     ) -> None:
+        # Those who call this from Python meet no record that would check types.
+        if not isinstance(traffic, TrafficModule):
+            raise UserError(
+                f"traffic={traffic!r:.80}: expected a TrafficModule; give one, or a name to "
+                "ganlane.make_env()."
+            )
+        if scenes is not None and not callable(scenes):
+            raise UserError(f"scenes={scenes!r:.80}: expected scenes; give a FixedScene, say.")
         # The bounds of the settings lie within.
         whole_number("num_envs", num_envs, 1, 2**20)
         whole_number("first_episode", first_episode, 0, 2**62)
@@ -116,12 +124,15 @@ class HighwayEnv(EnvBase):
         self.spawn_parameters = spawn_parameters or SpawnParameters()
         self.ego = ego or EgoParameters()
         self.episode = episode or EpisodeParameters()
-        self.stream, self.dtype = traffic.stream, dtype
+        self.stream = traffic.stream
+        self.dtype = dtype
         self.scenes = scenes or self._default_scenes(vehicles or 9)
         self.vehicles = self.scenes.vehicles
         self.first_episode = first_episode
-        self.recycle, self.recycle_share = recycle, recycle_share
+        self.recycle = recycle
+        self.recycle_share = recycle_share
         self.recorder: Recorder | None = None
+        # Constants of every episode, handed to the pure functions of physics.
         self.rules = Rules(self.road, self.ego, self.episode, idm, steering)
         self.physics = Physics()
         self._seed = seed_number(seed)
@@ -138,7 +149,8 @@ class HighwayEnv(EnvBase):
 
     def _default_scenes(self, vehicles: int) -> Scenes:
         """The traffic's own scenes if it has any, else random ones."""
-        spawn, visibility = self.spawn_parameters, Visibility.named(self.ego.visibility)
+        spawn = self.spawn_parameters
+        visibility = Visibility.named(self.ego.visibility)
         scenes = self.traffic.scenes(vehicles, visibility, spawn.ego_desired_speed_mps)
         if scenes is None:
             others = self.traffic.visibility
@@ -165,7 +177,9 @@ class HighwayEnv(EnvBase):
         self.scenes.check(self.road, self.rules.idm)
 
     def _make_specs(self) -> None:
-        n, device = self.batch_size[0], self.device
+        n = self.batch_size[0]
+        device = self.device
+        # The traffic's memory travels in the state, so its shapes belong to the spec.
         memory = self.traffic.memory_spec(n, self.vehicles, self.dtype)
         spec = state_spec(n, self.vehicles, self.dtype, memory, self.traffic.own_roads)
         self.observation_spec = spec.to(device)
@@ -180,7 +194,7 @@ class HighwayEnv(EnvBase):
     def compile(self, **kwargs: Any) -> HighwayEnv:
         """Compile physics and traffic to several small graphs; returns the environment.
 
-        Compiling takes about a minute in the first steps; docs/performance.md has the speeds.
+        Compiling takes about a minute in the first steps; docs/speed.md has the speeds.
         Results are equal up to rounding, not bitwise. Overrides TorchRL's method, which compiles a
         whole step to one graph; ``HighwayEnv(compile=True)`` calls this one too.
 
@@ -206,6 +220,7 @@ class HighwayEnv(EnvBase):
 
         ``next_episode`` [N] applies to masked rows only.
         """
+        # What TorchRL hands in: nothing, a mask, counters, or counters and a mask.
         n = self.batch_size[0]
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if tensordict is not None and keys.EPISODE in tensordict:
@@ -255,6 +270,7 @@ class HighwayEnv(EnvBase):
 
     def _start(self, seed: Tensor, episode: Tensor) -> TensorDictBase:
         """The first states of episodes [K]."""
+        # Scene, drivers and road of an episode all follow from its key.
         key = episode_key(self.stream, seed, episode)
         vehicles = self.scenes(key, self.dtype).with_finite_padding()
         vehicles, memory = self.traffic.enter(vehicles, key, episode)
@@ -267,7 +283,8 @@ class HighwayEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """One decision."""
-        seed, episode = tensordict.get(keys.SEED, None), tensordict.get(keys.EPISODE, None)
+        seed = tensordict.get(keys.SEED, None)
+        episode = tensordict.get(keys.EPISODE, None)
         if seed is None or episode is None:
             raise UserError(
                 "step(): the state of no episode was given; call reset() first and step what it "
@@ -287,14 +304,27 @@ class HighwayEnv(EnvBase):
         key = episode_key(self.stream, state.get(keys.SEED), state.get(keys.EPISODE))
         rules = self.rules
         if self.traffic.own_roads:  # replayed scenes have their own roads and ends
-            road, steps = road_in(state, self.road), self.traffic.steps_of(key)
+            road = road_in(state, self.road)
+            steps = self.traffic.steps_of(key)
             rules = rules._replace(road=road, scene_steps=steps)
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         ego = dict(state.get(keys.EGO).items())
         # The command, then traffic and ego step by step, then what the ego remembers of it.
-        start, command = self.physics.begin(rules, action, vehicles, ego, state.get(keys.STEP))
+        start, command = self.physics.begin(
+            rules,
+            action,
+            vehicles,
+            ego,
+            state.get(keys.STEP),
+        )
         end, memory = run_decision(
-            self.traffic, self.physics, rules, state, start, key, self.recorder
+            self.traffic,
+            self.physics,
+            rules,
+            state,
+            start,
+            key,
+            self.recorder,
         )
         ego = self.physics.remember(rules, ego, start, end, command)
         events, rest = outcome(rules, end, command)
@@ -338,6 +368,7 @@ class HighwayEnv(EnvBase):
         drivers = self.traffic.native_parameters()
         assert drivers is not None
         episode = replace(self.episode, decision_period_s=keys.PHYSICS_STEP_S)
+        # Steps of 0.1 s instead of a decision period; nothing else differs.
         kernel = Kernel(self.road, self.vehicles, episode, self.ego, *drivers)
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         running = torch.ones_like(action, dtype=torch.bool)
@@ -368,7 +399,8 @@ class HighwayEnv(EnvBase):
         if wanted == "torch":
             return None
         # What the kernel cannot do, as the end of a sentence.
-        drivers, reason = self.traffic.native_parameters(), None
+        drivers = self.traffic.native_parameters()
+        reason = None
         if drivers is None:
             name = type(self.traffic).__name__
             reason = f"drives the traffics idm and idm_mobil alone, not {name}"
@@ -380,6 +412,7 @@ class HighwayEnv(EnvBase):
             reason = (
                 "has one set of parameters of car following and steering for the ego and the others"
             )
+        # And whether there is a library at all.
         missing = why_not()
         if drivers is not None and reason is None and missing is None:
             return Kernel(self.road, self.vehicles, self.episode, self.ego, *drivers)
@@ -393,6 +426,7 @@ class HighwayEnv(EnvBase):
         """The rows [N] bool whose episodes, with ``key`` [N], recycle."""
         if self.recycle_share >= 1.0:
             return torch.ones_like(key, dtype=torch.bool)
+        # Step -1, before the first, so that no other number is the same draw.
         drawn = uniform(key, -1, 1, [Purpose.RECYCLED_EPISODE], torch.float64)
         return drawn[..., 0].reshape(key.shape) < self.recycle_share
 

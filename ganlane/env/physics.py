@@ -33,7 +33,7 @@ from ganlane.sim.idm import following_acceleration
 from ganlane.sim.spawn import recycle
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
 from ganlane.torch_settings import compiled
-from ganlane.traffic.base import TrafficModule, memory_of, with_rows
+from ganlane.traffic.base import TrafficModule, memory_of
 
 #: Name to tensor [N]: the ego's memory (:mod:`ganlane.env.state`).
 EgoMemory = dict[str, Tensor]
@@ -87,10 +87,18 @@ def begin(
 
     Rows whose command leaves the road have ended.
     """
+    # Recorded roads have as many lanes as their row says.
     lanes = rules.road.lanes if isinstance(rules.road.lanes, int) else rules.road.lanes[:, 0]
-    target, direction = vehicles.target_lane[:, EGO_INDEX], ego["change_direction"]
+    target = vehicles.target_lane[:, EGO_INDEX]
+    direction = ego["change_direction"]
     # The command sets the lane that the ego steers to; the motion itself takes several decisions.
-    command = apply_action(action, target, direction, lanes, rules.ego.abort_lane_change)
+    command = apply_action(
+        action,
+        target,
+        direction,
+        lanes,
+        rules.ego.abort_lane_change,
+    )
     targets = torch.cat((command.target_lane[:, None], vehicles.target_lane[:, 1:]), dim=1)
     vehicles = vehicles.with_(target_lane=targets)
     none = torch.zeros_like(command.off_road)
@@ -125,12 +133,15 @@ def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -
         PHYSICS_STEP_S,
     )
     # The others moved while they saw the ego where it was: all move at once, from one state.
-    running, vehicles = before.running, moved.with_first(ego)
+    running = before.running
+    vehicles = moved.with_first(ego)
     if not all_running:
         vehicles = vehicles.where(running, before.vehicles)
         steering = torch.where(running, steering, before.steering)
     acceleration, ahead, behind = ego_surroundings(
-        ego_scene(vehicles, rules.road), rules.idm, rules.ego
+        ego_scene(vehicles, rules.road),
+        rules.idm,
+        rules.ego,
     )
     # Of the events of one step a crash comes first, then the goal, then the time-out.
     crash = ego_overlaps(vehicles, rules.road).any(-1) & running
@@ -157,7 +168,9 @@ def remember(
     rules: Rules, before: EgoMemory, start: Substep, end: Substep, command: Command
 ) -> EgoMemory:
     """The ego's memory after a decision from ``start`` to ``end``."""
-    ego, speed = end.vehicles.at(EGO_INDEX), start.vehicles.speed[:, EGO_INDEX]
+    # Over the whole decision, which may have ended early.
+    ego = end.vehicles.at(EGO_INDEX)
+    speed = start.vehicles.speed[:, EGO_INDEX]
     arrived = lane_change_done(end.vehicles.columns(slice(0, 1)), rules.road)[:, 0]
     direction = torch.where(arrived, 0, command.direction)
     # A row that ended at once drove no step: its speed did not change either.
@@ -180,6 +193,7 @@ def outcome(
     rules: Rules, end: Substep, command: Command
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Events and done flags of a decision, each [N, 1]; every end has exactly one reason."""
+    # Outcomes of the driving.
     terminated = end.goal | end.hard_crash | command.off_road
     # What has ended without an outcome was cut off: by the clock, or where its recording stops.
     truncated = ~end.running & ~terminated
@@ -206,7 +220,10 @@ class Physics:
 
     def __init__(self) -> None:
         self.compiled = False
-        self.begin, self.remember, self.recycle, self.advance = begin, remember, recycle, advance
+        self.begin = begin
+        self.remember = remember
+        self.recycle = recycle
+        self.advance = advance
 
     def compile(self) -> None:
         """Compile each function to a graph.
@@ -253,8 +270,22 @@ class EndedRows:
         """``memory`` with the kept rows as they were; its tensors are not written to."""
         if not self.rows or memory.is_empty():
             return memory
-        ended = torch.cat(self.memories)  # type: ignore[arg-type]
-        return with_rows(memory, torch.cat(self.rows), ended)
+        return _with_rows(memory, torch.cat(self.rows), torch.cat(self.memories))  # type: ignore[arg-type]
+
+
+def _with_rows(memory: TensorDictBase, rows: Tensor, other: TensorDictBase) -> TensorDict:
+    """``memory`` with its ``rows`` replaced by ``other`` [R], leaf by leaf."""
+
+    # Leaf by leaf, since the memory is nested like the traffic.
+    restored = {}
+    for name, value in memory.items():
+        if isinstance(value, Tensor):
+            restored[name] = value.index_copy(0, rows, other.get(name))
+        elif value.is_empty():
+            restored[name] = value
+        else:
+            restored[name] = _with_rows(value, rows, other.get(name))
+    return TensorDict._new_unsafe(restored, batch_size=memory.batch_size)
 
 
 def _where(rows: Tensor, new: Tensor, old: Tensor) -> Tensor:
@@ -282,10 +313,13 @@ def run_decision(
         key: of the episodes, [N] int64.
         substeps: number of physics steps; None: those of the decision period.
     """
-    memory, now, ended = memory_of(state), start, EndedRows()
+    memory = memory_of(state)
+    now = start
+    ended = EndedRows()
     counters = {name: state.get(name) for name in (keys.SEED, keys.EPISODE)}
     counters[keys.EPISODE_KEY] = key
-    size, can_read = memory.batch_size, reads_are_cheap(now.running)
+    size = memory.batch_size
+    can_read = reads_are_cheap(now.running)
     if can_read:
         ended.keep(~now.running, memory)
     for count in range(rules.episode.substeps() if substeps is None else substeps):

@@ -77,6 +77,7 @@ def done_spec(n: int) -> Composite:
 def _specs(fields: Fields, shape: tuple[int, ...], dtype: torch.dtype) -> dict[str, Any]:
     specs = {}
     for name, kind in fields.items():
+        # TorchRL checks flags by a spec of their own.
         spec = Binary if kind is torch.bool else Unbounded
         specs[name] = spec(shape=shape, dtype=kind or dtype)
     return specs
@@ -98,6 +99,7 @@ def first_state(
     seed: Tensor, episode: Tensor, vehicles: Vehicles, memory: TensorDictBase
 ) -> TensorDictBase:
     """The state of the episodes (``seed``, ``episode``) [N] that begin, without roads."""
+    # Everything starts at 0, false, and no lane change.
     row = vehicles.x.new_zeros(seed.shape)
     column = row[:, None]
     ego = {name: row.to(kind or row.dtype) for name, kind in EGO.items()}
@@ -115,7 +117,8 @@ def pack(
     rest: dict[str, Any],
 ) -> TensorDictBase:
     """The state as one TensorDict [N]; ``rest`` is not nested."""
-    batch, device = ego["distance"].shape, ego["distance"].device
+    batch = ego["distance"].shape
+    device = ego["distance"].device
     nested = {keys.VEHICLES: vehicles.as_dict(), keys.EGO: ego, keys.EVENTS: events}
     parts: dict[str, Any] = {keys.TRAFFIC: traffic, **rest}
     for name, fields in nested.items():
@@ -154,6 +157,7 @@ def usable_device(device: Any, dtype: Any) -> torch.device:
             "give one of them."
         )
     try:
+        # torch itself knows which devices there are.
         chosen = torch.empty(0, device=device or "cpu").device
     except (RuntimeError, AssertionError, TypeError) as error:
         raise UserError(f"device={device}: no such device here; use device='cpu'.") from error

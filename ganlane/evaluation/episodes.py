@@ -34,9 +34,6 @@ CHECK_EVERY = 8
 SMALL_BATCH = 16
 #: The reason of an episode that something outside the environment ended (a user's own transform).
 OTHER = "other"
-#: Where the other vehicle of a crash was.
-SIDES = ("none", "ahead", "side", "behind")
-_AHEAD, _SIDE, _BEHIND = 1, 2, 3
 #: What is read from the last state of an episode.
 _LAST = (keys.EVENTS, keys.EGO, keys.STEP, keys.VEHICLES)
 
@@ -66,7 +63,7 @@ def run_episodes(
         make_smaller: makes ``env`` with fewer rows; the last episodes move there when at most half
             of the rows are still driving. Not used where something is held per row: by traffic with
             ``rows_must_stay``, and by every policy without ``rows_must_stay = False``.
-        actions: whether to return the columns ``actions``, ``contact`` and ``changing``, too.
+        actions: whether to return the column ``actions``, too.
 
     Returns:
         Columns ``episode, seed, reason`` (:data:`ganlane.keys.END_EVENTS`, or ``other``),
@@ -74,8 +71,7 @@ def run_episodes(
         (undiscounted return), ``reward_*`` (each term's sum), ``decisions``, ``duration_s``,
         ``distance_m``, ``mean_speed_mps`` (distance over time), ``lane_changes``, and ``at_fault``
         of a hard crash (:func:`ego_at_fault`; else null). If asked for: ``actions`` (text, a digit
-        per decision), ``contact`` (what a hard crash hit, of :data:`SIDES`) and ``changing``
-        (whether the ego was changing lanes in its last decision).
+        per decision).
 
     Raises:
         UserError: no episodes are asked for, the environment is not batched in one dimension, or
@@ -88,15 +84,44 @@ def run_episodes(
         )
     numbers = list(episodes)
     taken: list[TensorDict] | None = [] if actions else None
+    # Noisy layers and epsilon-greedy stay off: a table is about the learnt policy.
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        driven = _Evaluation(env, policy, numbers, seed, make_smaller, taken).run(on_progress)
-    table = _episode_rows(driven, numbers, seed, getattr(env, "road", STRAIGHT))
-    if taken is not None:
-        return table.with_columns(*_how_it_ended(driven, taken, getattr(env, "road", STRAIGHT)))
-    return table
+        driven = _Evaluation(
+            env,
+            policy,
+            numbers,
+            seed,
+            make_smaller,
+            taken,
+        ).run(on_progress)
+    table = _episode_rows(
+        driven,
+        numbers,
+        seed,
+        getattr(env, "road", STRAIGHT),
+    )
+    if taken is None:
+        return table
+    # A place is driven by one row at a time, so the order of the decisions is the order in time.
+    decisions = TensorDict.cat(taken).cpu()
+    texts = []
+    for place in range(len(numbers)):
+        digits = decisions["action"][decisions["place"] == place].tolist()
+        texts.append("".join(map(str, digits)))
+    return table.with_columns(
+        pl.Series(
+            "actions",
+            texts,
+            pl.String,
+        )
+    )
 
 
-def start_of(env: EnvBase, numbers: Sequence[int], seed: int) -> TensorDict:
+def start_of(
+    env: EnvBase,
+    numbers: Sequence[int],
+    seed: int,
+) -> TensorDict:
     """The tensordict that makes ``env.reset`` start these episodes.
 
     The last one also fills the rows left over. :class:`UserError` for none.
@@ -107,7 +132,11 @@ def start_of(env: EnvBase, numbers: Sequence[int], seed: int) -> TensorDict:
         )
     rows = env.batch_size[0]
     padded = list(numbers) + [numbers[-1]] * (rows - len(numbers))
-    episode = torch.tensor(padded, dtype=torch.int64, device=env.device)
+    episode = torch.tensor(
+        padded,
+        dtype=torch.int64,
+        device=env.device,
+    )
     return TensorDict(
         {keys.SEED: torch.full_like(episode, seed), keys.EPISODE: episode},
         [rows],
@@ -131,21 +160,36 @@ class _Evaluation:
         make_smaller: Callable[[int], EnvBase] | None,
         taken: list[TensorDict] | None,
     ) -> None:
-        rows, self.total = env.batch_size[0], len(numbers)
+        rows = env.batch_size[0]
+        self.total = len(numbers)
+        # Who holds something per row outside the tensordict, a foreign simulator for instance,
+        # loses it when rows move; a policy has to say that it does not.
         rows_stay = getattr(getattr(env, "traffic", None), "rows_must_stay", False)
         may_move = not rows_stay and not getattr(policy, "rows_must_stay", True)
-        self.env, self.policy, self.taken = env, policy, taken
+        self.env = env
+        self.policy = policy
+        self.taken = taken
         self.make_smaller = make_smaller if may_move else None
         # What holds something per row outside the tensordict might not stand being driven on after
         # an end.
         self.check_every = 1 if rows_stay else CHECK_EVERY
-        self.numbers = torch.tensor(numbers, dtype=torch.int64, device=env.device)
+        self.numbers = torch.tensor(
+            numbers,
+            dtype=torch.int64,
+            device=env.device,
+        )
         # Where the episode of a row stands in the list; the list's length in spare rows.
         self.place = torch.arange(rows, device=env.device).clamp_max(self.total)
         self.driving = self.place < self.total
         self.handed_out = min(rows, self.total)
         self.finished: list[TensorDictBase] = []
-        self.state: TensorDictBase = env.reset(start_of(env, numbers[:rows], seed))
+        self.state: TensorDictBase = env.reset(
+            start_of(
+                env,
+                numbers[:rows],
+                seed,
+            )
+        )
         # Sums over the decisions of each row's episode, and the last state of it.
         self.sums: TensorDictBase | None = None
         self.last: TensorDictBase | None = None
@@ -155,6 +199,7 @@ class _Evaluation:
 
         Returns ``sums`` and ``last`` [E] in the order of the episodes, on the CPU.
         """
+        # Decisions are driven in stretches; between two of them rows are collected and handed out.
         done = 0
         while done < self.total:
             for _ in range(self.check_every):
@@ -172,19 +217,29 @@ class _Evaluation:
 
         Nothing is read back from the device, so this never waits.
         """
+        # The policy writes into the tensordict that it reads.
         after = self.env.step(self.policy(self.state))
         if self.taken is not None:
-            place = torch.where(self.driving, self.place, self.total)
+            place = torch.where(
+                self.driving,
+                self.place,
+                self.total,
+            )
             self.taken.append(
                 TensorDict({"place": place, "action": after[keys.ACTION].clone()}, place.shape)
             )
         added = _added(after["next"])
         state = after["next"].select(*_LAST, strict=False)
         if self.sums is None or self.last is None:
-            self.sums, self.last = added.apply(torch.zeros_like), state
+            self.sums = added.apply(torch.zeros_like)
+            self.last = state
         # Rows whose episode has ended keep what they had.
-        self.sums = (self.sums + added).where(self.driving, self.sums)
+        self.sums = (self.sums + added).where(
+            self.driving,
+            self.sums,
+        )
         self.last = state.where(self.driving, self.last)
+        # From its first end on a row counts no more, whatever it drives.
         self.driving = self.driving & ~after["next", "done"].squeeze(-1)
         self.state = step_mdp(after)
 
@@ -196,7 +251,11 @@ class _Evaluation:
         # A row is counted until its first end, even where it is driven on until the next look.
         ended = ((self.place < self.total) & ~self.driving).nonzero()[:, 0]
         if len(ended) > 0:
-            rows = {"place": self.place, "sums": self.sums, "last": self.last}
+            rows = {
+                "place": self.place,
+                "sums": self.sums,
+                "last": self.last,
+            }
             self.finished.append(TensorDict(rows, self.place.shape)[ended].cpu())
             self.place[ended] = self.total
         return len(ended)
@@ -214,6 +273,7 @@ class _Evaluation:
             self.env = self.make_smaller(len(driving))
             self._keep(driving)
             return
+        # Spare rows take the next numbers of the list, in order.
         new = (~self.driving).nonzero()[: self.total - self.handed_out, 0]
         self.place[new] = torch.arange(
             self.handed_out, self.handed_out + len(new), device=self.place.device
@@ -221,6 +281,7 @@ class _Evaluation:
         self.handed_out += len(new)
         self.driving[new] = True
         assert self.sums is not None  # a decision has been driven
+        # The sums of a row begin anew with its episode.
         for total in self.sums.values():
             total[new] = 0.0
         # Spare rows that have ended start theirs again, uncounted.
@@ -229,8 +290,17 @@ class _Evaluation:
         if not bool(mask.any()):
             return
         number = self.numbers[self.place.clamp_max(self.total - 1)]
-        wanted = torch.where(self.place < self.total, number, self.state[keys.EPISODE])
-        self.state = self.env.reset(self.state.set("_reset", mask), next_episode=wanted)
+        wanted = torch.where(
+            self.place < self.total,
+            number,
+            self.state[keys.EPISODE],
+        )
+        self.state = self.env.reset(
+            self.state.set("_reset", mask),
+            next_episode=wanted,
+        )
+        # An environment that goes on with numbers of its own would fill the table with episodes
+        # that nobody asked for.
         if not torch.equal(self.state[keys.EPISODE], wanted):
             raise UserError(
                 "env: its reset did not start the episodes that it was given; take next_episode "
@@ -247,38 +317,53 @@ class _Evaluation:
 def _added(state: TensorDictBase) -> TensorDict:
     """What one decision, which led to ``state``, adds to the sums of its episode; each [N]."""
     values = {"reward": state[keys.REWARD]}
+    # Double precision: thousands of small rewards are summed.
     for name, term in state.get(keys.REWARD_TERMS, {}).items():
         values[f"reward_{name}"] = term
     for name in (keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND):
         values[name] = state[keys.EVENTS, name]
     rows = state.batch_size
-    return TensorDict({name: value.reshape(rows).double() for name, value in values.items()}, rows)
+    return TensorDict(
+        {name: value.reshape(rows).double() for name, value in values.items()},
+        rows,
+    )
 
 
 def _episode_rows(
-    driven: TensorDictBase, numbers: list[int], seed: int, road: Road
+    driven: TensorDictBase,
+    numbers: list[int],
+    seed: int,
+    road: Road,
 ) -> pl.DataFrame:
     """What :func:`run_episodes` returns without being asked for more."""
-    last, ego = driven["last"], driven["last", keys.EGO]
+    last = driven["last"]
+    ego = driven["last", keys.EGO]
     # One column per count, each [E].
     columns = dict(driven["sums"].items())
     columns |= {name: last[keys.EVENTS, name].squeeze(-1) for name in keys.END_EVENTS}
+    # What the ego counts itself since its episode began.
     columns |= {name: ego[name] for name in ("distance", "lane_changes", "decisions")}
     columns["duration_s"] = last[keys.STEP].double() * keys.PHYSICS_STEP_S
+    # A state without vehicles tells nothing about a crash.
     at_fault = pl.lit(None, pl.Boolean)
     if keys.VEHICLES in last:
-        columns["at_fault"] = ego_at_fault(Vehicles.of(last[keys.VEHICLES]), road)
+        columns["at_fault"] = ego_at_fault(
+            Vehicles.of(last[keys.VEHICLES]),
+            road,
+        )
         at_fault = pl.col("at_fault")
     # The reward's terms are the environment's own, so their names are not known here.
     terms = [name for name in columns if name.startswith("reward_")]
     ends = [pl.when(pl.col(event)).then(pl.lit(event)) for event in keys.END_EVENTS]
-    distance, duration = pl.col("distance").cast(pl.Float64), pl.col("duration_s")
+    distance = pl.col("distance").cast(pl.Float64)
+    duration = pl.col("duration_s")
     table = pl.DataFrame({name: value.numpy() for name, value in columns.items()})
     return table.select(
         pl.Series("episode", numbers, pl.Int64),
         pl.lit(seed, pl.Int64).alias("seed"),
         pl.coalesce(*ends, pl.lit(OTHER)).alias("reason"),
         pl.col(keys.SOFT_CRASH).cast(pl.Int64),
+        # Onsets are counted; the paper asks whether there was one.
         (pl.col(keys.SOFT_CRASH) > 0).alias("had_soft_crash"),
         pl.col(keys.SOFT_CRASH_BEHIND).cast(pl.Int64),
         pl.col("reward", *terms),
@@ -292,39 +377,6 @@ def _episode_rows(
     )
 
 
-def _how_it_ended(
-    driven: TensorDictBase, taken: Sequence[TensorDict], road: Road
-) -> list[pl.Series]:
-    """The columns ``actions``, ``contact`` and ``changing``."""
-    # A place is driven by one row at a time, so the order of the decisions is the order in time.
-    decisions = TensorDict.cat(taken).cpu()
-    actions = []
-    for place in range(len(driven)):
-        digits = decisions["action"][decisions["place"] == place].tolist()
-        actions.append("".join(map(str, digits)))
-    last = driven["last"]
-    crashed = last[keys.EVENTS, "hard_crash"].squeeze(-1)
-    sides = contact_side(Vehicles.of(last[keys.VEHICLES]), road).where(crashed, 0)
-    return [
-        pl.Series("actions", actions, pl.String),
-        pl.Series("contact", [SIDES[side] for side in sides.tolist()]),
-        pl.Series("changing", (last[keys.EGO, "change_direction"] != 0).tolist()),
-    ]
-
-
-def contact_side(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
-    """What the ego overlaps, [N] int64, as a place in :data:`SIDES`.
-
-    Two bodies meet along the axis on which their extents began to overlap last; the time since then
-    is the depth of the overlap over the closing speed. Headings are small, so the axes are those of
-    the road. Of several vehicles hit in one physics step the nearest to the front counts.
-    """
-    # Higher than all places, so that the lowest of a row is that of a vehicle that was hit.
-    nobody = len(SIDES)
-    first = torch.where(ego_overlaps(vehicles, road), _sides(vehicles, road), nobody).amin(-1)
-    return torch.where(first == nobody, 0, first)
-
-
 def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     """Whether the ego moved into somebody, [N] bool; false where it hit nobody.
 
@@ -332,26 +384,29 @@ def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     other: a rule of geometry, no law. A driver that cuts in and is struck from behind is not at
     fault by it.
     """
-    side = _sides(vehicles, road)
-    towards = torch.sign(vehicles.y[:, 1:] - vehicles.y[:, :1])
-    across = vehicles.speed * torch.sin(vehicles.heading)
-    pushes = towards * across[:, :1] > -towards * across[:, 1:]
-    at_fault = torch.where(side == _SIDE, pushes, side == _AHEAD)
-    return (at_fault & ego_overlaps(vehicles, road)).any(-1)
-
-
-def _sides(vehicles: Vehicles, road: Road) -> Tensor:
-    """On which side of the ego each of the others would have met it, [N, M - 1] int64."""
-    ahead = road.distance_ahead(vehicles.x[:, :1], vehicles.x[:, 1:])
-    met_along = _time_since(
-        ahead, _gain(vehicles.speed * torch.cos(vehicles.heading)), _reach(vehicles.length)
+    ahead = road.distance_ahead(
+        vehicles.x[:, :1],
+        vehicles.x[:, 1:],
     )
-    met_across = _time_since(
+    along = vehicles.speed * torch.cos(vehicles.heading)
+    across = vehicles.speed * torch.sin(vehicles.heading)
+    # Two bodies met along the axis on which their extents began to overlap last. Headings are
+    # small, so the axes are those of the road.
+    since_along = _time_since(
+        ahead,
+        _gain(along),
+        _reach(vehicles.length),
+    )
+    since_across = _time_since(
         _gain(vehicles.y),
-        _gain(vehicles.speed * torch.sin(vehicles.heading)),
+        _gain(across),
         _reach(vehicles.width),
     )
-    return torch.where(met_along < met_across, torch.where(ahead > 0, _AHEAD, _BEHIND), _SIDE)
+    # Signs as seen from the ego: who has the higher speed towards the other pushes.
+    towards = torch.sign(_gain(vehicles.y))
+    pushes = towards * across[:, :1] > -towards * across[:, 1:]
+    at_fault = torch.where(since_along < since_across, ahead > 0, pushes)
+    return (at_fault & ego_overlaps(vehicles, road)).any(-1)
 
 
 def _gain(values: Tensor) -> Tensor:
@@ -364,13 +419,22 @@ def _reach(sizes: Tensor) -> Tensor:
     return 0.5 * (sizes[:, 1:] + sizes[:, :1])
 
 
-def _time_since(distance: Tensor, speed: Tensor, reach: Tensor) -> Tensor:
+def _time_since(
+    distance: Tensor,
+    speed: Tensor,
+    reach: Tensor,
+) -> Tensor:
     """For how long (s) extents that touch at ``reach`` (m) overlap.
 
     Infinite where they do not close.
     """
+    # Both branches are computed, so the divisor is kept above 0.
     closing = -torch.sign(distance) * speed
-    return torch.where(closing > 0, (reach - distance.abs()) / closing.clamp_min(1e-9), torch.inf)
+    return torch.where(
+        closing > 0,
+        (reach - distance.abs()) / closing.clamp_min(1e-9),
+        torch.inf,
+    )
 
 
 class ScriptedPolicy(TensorDictModuleBase):
@@ -390,6 +454,7 @@ class ScriptedPolicy(TensorDictModuleBase):
         # One more than the longest, so that every script ends with keeping its lane.
         longest = max(map(len, actions.values())) + 1
         padded = [actions[number].ljust(longest, str(keys.KEEP)) for number in numbers]
+        # Sorted numbers, so that a search finds the row of an episode.
         self.episodes = torch.tensor(numbers)
         self.table = torch.tensor([list(map(int, digits)) for digits in padded])
 
@@ -397,6 +462,10 @@ class ScriptedPolicy(TensorDictModuleBase):
         """Write ``action``."""
         episode = tensordict[keys.EPISODE]
         row = torch.searchsorted(self.episodes, episode.cpu())
+        # A row that is driven on after its script keeps reading the last column.
         last = self.table.shape[1] - 1
         decision = tensordict[keys.EGO, "decisions"].cpu().clamp_max(last)
-        return tensordict.set(keys.ACTION, self.table[row, decision].to(episode.device))
+        return tensordict.set(
+            keys.ACTION,
+            self.table[row, decision].to(episode.device),
+        )

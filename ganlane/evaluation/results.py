@@ -22,8 +22,8 @@ import torch
 from ganlane._version import __version__
 from ganlane.errors import UserError, as_typed
 from ganlane.files import PACKAGE, atomic_path, write_json
-from ganlane.settings.record import make, saved_config
-from ganlane.settings.traffic import TrafficConfig
+from ganlane.settings.record import saved_config
+from ganlane.settings.traffic import OwnTraffic, TrafficConfig
 
 
 @dataclass(frozen=True, repr=False)
@@ -42,6 +42,7 @@ class Run:
 
         The table of an evaluation, else the results that are single numbers or texts.
         """
+        # A table needs rows; other commands leave single numbers.
         rows = self.results.get("rows")
         if not isinstance(rows, list):
             single = int | float | str
@@ -76,9 +77,23 @@ def write_results(
     """
     path = Path(folder) / "results.json"
     # Whoever finds the file later can tell where its numbers come from.
-    origin = {"seeds": seeds, "config": config, "code": code_version(), "machine": machine()}
+    origin = {
+        "seeds": seeds,
+        "config": config,
+        "code": code_version(),
+        "machine": machine(),
+    }
     written = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    write_json(path, plain({**numbers, **origin, "written": written}))
+    write_json(
+        path,
+        plain(
+            {
+                **numbers,
+                **origin,
+                "written": written,
+            }
+        ),
+    )
     return path
 
 
@@ -89,16 +104,20 @@ def names_of_runs(folders: Sequence[Path]) -> list[str]:
     the ends of their paths.
     """
     runs = [_settings(folder) for folder in folders]
-    keys = sorted(
-        {key for options in runs for key in options}, key=lambda key: (key == "seed", key)
-    )
-    # What all runs have in common tells none of them apart.
-    differing = [key for key in keys if len({options.get(key) for options in runs}) > 1]
+    # Alphabetical, so that the order does not depend on which run comes first.
+    keys = sorted({key for settings in runs for key in settings})
+    # A key that some lack belongs to a traffic or a scene that they do not have.
+    shared = [key for key in keys if all(key in settings for settings in runs)]
+    differing = [key for key in shared if len({settings[key] for settings in runs}) > 1]
+    differing.sort(key=lambda key: key == "seed")
     names = []
-    for options in runs:
-        names.append(", ".join(f"{key}={options[key]}" for key in differing if key in options))
+    for settings in runs:
+        names.append(", ".join(f"{key}={settings[key]}" for key in differing))
     # Paths from the right, as long as it takes to tell all of them apart.
-    longest = max((len(folder.parts) for folder in folders), default=0)
+    longest = max(
+        (len(folder.parts) for folder in folders),
+        default=0,
+    )
     for depth in range(1, longest + 1):
         if all(names) and len(set(names)) == len(names):
             break
@@ -107,24 +126,32 @@ def names_of_runs(folders: Sequence[Path]) -> list[str]:
 
 
 def _settings(folder: Path) -> dict[str, str]:
-    """The settings of a run by dotted key; its traffic by its name. Empty where it has none."""
+    """The settings of a run by dotted key, as they are typed; empty where it has none."""
     try:
         data = saved_config(folder / "config.yaml")
-        traffic = make(TrafficConfig, data.pop("traffic")).label()
-    except (KeyError, UserError):
+    except UserError:
         return {}
     # Which checkpoint a run went on from does not tell what it is.
     data.pop("resume", None)
-    return {"traffic": traffic, **{key: as_typed(value) for key, value in _leaves(data)}}
+    # One level of dotted keys, as they are typed on the command line.
+    settings = dict(_leaves(data))
+    if isinstance(data.get("traffics"), Mapping):
+        settings["traffics"] = as_typed(list(data["traffics"]))
+    return settings
 
 
-def _leaves(data: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+def _leaves(data: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
     """Every value of nested mappings with its dotted key."""
     for name, value in data.items():
         if isinstance(value, Mapping):
             yield from _leaves(value, f"{above}{name}.")
+        elif name == "_target_":
+            # A traffic is known by its option, one of the user's own by its import path.
+            kind = TrafficConfig.kinds().get(str(value), OwnTraffic)
+            option = kind.option  # type: ignore[attr-defined]
+            yield above.rstrip("."), option or as_typed(value)
         else:
-            yield f"{above}{name}", value
+            yield f"{above}{name}", as_typed(value)
 
 
 def runs_below(folder: Path, file: str) -> list[Path]:
@@ -148,12 +175,14 @@ def sweep_rows(folder: Path) -> list[dict[str, Any]]:
     for name, run in zip(names_of_runs(runs), runs):
         record = json.loads((run / "results.json").read_text(encoding="utf-8"))
         rows += [{"run": name, **row} for row in record.get("rows") or []]
+    # Rows of other commands have other columns, so they make no common table.
     return rows if all("mean_reward" in row for row in rows) else []
 
 
 def write_episodes(folder: str | Path, episodes: pl.DataFrame) -> Path:
     """Write one row per episode as ``episodes.parquet`` into ``folder``, atomically; its path."""
     path = Path(folder) / "episodes.parquet"
+    # A reader never sees half a file.
     with atomic_path(path) as part:
         episodes.write_parquet(part)
     return path
@@ -164,6 +193,7 @@ def plain(value: Any) -> Any:
 
     NaN and infinity as None.
     """
+    # Records first: they hold everything below.
     if is_dataclass(value) and not isinstance(value, type):
         return plain(asdict(value))
     if isinstance(value, Mapping):
@@ -186,18 +216,41 @@ def code_version() -> dict[str, Any]:
     own file.
     """
     # None where git does not know: an installed package, or a machine without git.
-    version: dict[str, Any] = {"version": __version__, "revision": None, "modified": None}
+    version: dict[str, Any] = {
+        "version": __version__,
+        "revision": None,
+        "modified": None,
+    }
     if _git("ls-files", "--error-unmatch", "__init__.py") is not None:
         version["revision"] = _git("rev-parse", "HEAD")
-        version["modified"] = bool(_git("status", "--porcelain", "--untracked-files=no", "--", "."))
+        version["modified"] = bool(
+            _git(
+                "status",
+                "--porcelain",
+                "--untracked-files=no",
+                "--",
+                ".",
+            )
+        )
     return version
 
 
 def _git(*arguments: str) -> str | None:
     """Output of a git command in the package's folder; None where git is absent or fails."""
-    command = ["git", "-C", str(PACKAGE), *arguments]
+    command = [
+        "git",
+        "-C",
+        str(PACKAGE),
+        *arguments,
+    ]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()
@@ -205,11 +258,16 @@ def _git(*arguments: str) -> str | None:
 
 def machine() -> dict[str, Any]:
     """CPU, usable cores, torch's threads, system, accelerator (or None), versions that ran."""
-    cpu, cores = platform.processor() or platform.machine(), os.cpu_count() or 1
+    cpu = platform.processor() or platform.machine()
+    cores = os.cpu_count() or 1
     # Linux names the model of the CPU here, and may leave a process fewer cores than there are.
     info = Path("/proc/cpuinfo")
     if info.is_file():
-        model = re.search(r"^model name\s*:(.*)$", info.read_text(errors="replace"), re.MULTILINE)
+        model = re.search(
+            r"^model name\s*:(.*)$",
+            info.read_text(errors="replace"),
+            re.MULTILINE,
+        )
         cpu = model[1].strip() if model else cpu
     if hasattr(os, "sched_getaffinity"):
         cores = len(os.sched_getaffinity(0))
@@ -229,7 +287,9 @@ def machine_sentence(threads: Sequence[int]) -> str:
 
     ``threads`` are torch's.
     """
-    here, code = machine(), code_version()
+    here = machine()
+    code = code_version()
+    # The model of CPU and accelerator decides about speed, the versions about digits.
     hardware = f"{here['cpu']}, {here['cores']} usable core{'s' if here['cores'] != 1 else ''}"
     if here["accelerator"]:
         hardware += f", {here['accelerator']}"

@@ -31,7 +31,8 @@ from ganlane.evaluation.statistics import (
 )
 
 #: The two drivers that give the normalised score its scale.
-SCALE_TOP, SCALE_BOTTOM = "mobil", "random_legal"
+SCALE_TOP = "mobil"
+SCALE_BOTTOM = "random_legal"
 #: What two drivers' episodes are matched by.
 _EPISODE = ["seed", "episode"]
 _CRASH = "hard_crash"
@@ -59,6 +60,7 @@ def evaluation_rows(episodes: pl.DataFrame) -> list[Row]:
         ``normalized_percent``, with ``normalized_percent_reason`` where it is None. A key with
         ``_ci`` holds the 95 % interval of its namesake as ``[low, high]``, or None.
     """
+    # Partitions keep the order of the command line.
     pairs = episodes.partition_by(["agent", "traffic"], maintain_order=True)
     return [_row(pair, episodes.filter(pl.col("traffic") == pair["traffic"][0])) for pair in pairs]
 
@@ -73,7 +75,8 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
     # Rates are of all episodes together, not means of the episodes' own rates: short episodes would
     # count as much as long ones.
     returns = pair["reward"].to_numpy()
-    distance_m, duration_s = float(pair["distance_m"].sum()), float(pair["duration_s"].sum())
+    distance_m = float(pair["distance_m"].sum())
+    duration_s = float(pair["duration_s"].sum())
     lane_changes_per_km = crashes = lead = None
     if distance_m > 0.0:
         lane_changes_per_km = int(pair["lane_changes"].sum()) / distance_m * 1000.0
@@ -82,6 +85,7 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
     mobil = same_traffic.filter(pl.col("agent") == SCALE_TOP)
     if pair["agent"][0] != SCALE_TOP and mobil.height > 0:
         lead, _ = paired_lead(pair, mobil)
+    # Someone close behind is no end of an episode, so it is counted by episode.
     behind = mean_interval(pair["soft_crash_behind"].to_numpy())
     score, reason = _score(pair, same_traffic)
     return {
@@ -121,6 +125,7 @@ def _paired_rewards(*drivers: pl.DataFrame) -> list[Array]:
         shared = shared.join(
             driver.select(*_EPISODE, pl.col("reward").alias(str(column))), on=_EPISODE
         )
+    # Joins keep no order.
     ordered = shared.sort(_EPISODE)
     return [ordered[str(column)].cast(pl.Float64).to_numpy() for column in range(len(drivers))]
 
@@ -145,8 +150,10 @@ def paired_rows(episodes: pl.DataFrame) -> list[Row]:
         ``above`` or ``below`` where the interval lies on one side of 0, else ``undecided``. Pairs
         that share fewer than two episodes are left out.
     """
-    first, rows = episodes["agent"][0], []
+    first = episodes["agent"][0]
+    rows = []
     for (traffic,), driven in episodes.group_by("traffic", maintain_order=True):
+        # The first agent of the command is held against all others.
         ours = driven.filter(pl.col("agent") == first)
         others = driven.filter(pl.col("agent") != first)
         for (other,), theirs in others.group_by("agent", maintain_order=True):
@@ -157,8 +164,19 @@ def paired_rows(episodes: pl.DataFrame) -> list[Row]:
             verdict = "undecided"
             if lead.excludes_zero():
                 verdict = "above" if lead.value > 0.0 else "below"
-            row = {"agent": first, "over": other, "traffic": traffic, "episodes": shared}
-            rows.append({**row, **entries("lead", lead), "verdict": verdict})
+            row = {
+                "agent": first,
+                "over": other,
+                "traffic": traffic,
+                "episodes": shared,
+            }
+            rows.append(
+                {
+                    **row,
+                    **entries("lead", lead),
+                    "verdict": verdict,
+                }
+            )
     return rows
 
 
@@ -175,6 +193,7 @@ def _score(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> tuple[Estimate | N
             needed = f"needs {SCALE_TOP} and {SCALE_BOTTOM} among the agents"
             return None, f"{needed}; {name} is missing"
         drivers.append(driver)
+    # Episodes that one of the three did not drive would shift the scale.
     returns = _paired_rewards(*drivers)
     if len(returns[0]) < 2:
         return None, "fewer than two episodes are shared by the drivers"
@@ -200,8 +219,15 @@ def normalized_percent(
         MOBIL's lead over the random driver includes 0, so the scale would have no length.
     """
     drivers = (agent, mobil, random_legal)
-    returns = np.stack([np.asarray(values, dtype=np.float64) for values in drivers], axis=1)
-    lead = paired_difference(returns[:, 1], returns[:, 2])
+    returns = np.stack(
+        [np.asarray(values, dtype=np.float64) for values in drivers],
+        axis=1,
+    )
+    # The scale has a length only if MOBIL is better than random driving beyond doubt.
+    lead = paired_difference(
+        returns[:, 1],
+        returns[:, 2],
+    )
     if lead.interval is None:
         return None, "fewer than two episodes"
     if not lead.excludes_zero():
@@ -210,7 +236,11 @@ def normalized_percent(
     means = bootstrap_means(returns)
     # A resample without MOBIL's lead would divide by zero.
     with_scale = means[means[:, 1] != means[:, 2]]
-    low, high = np.quantile(percent_of_way(*with_scale.T), TAIL_LEVELS)
+    low, high = np.quantile(
+        percent_of_way(*with_scale.T),
+        TAIL_LEVELS,
+    )
+    # The value itself is of all episodes, not of the resamples.
     value = percent_of_way(*returns.mean(axis=0))
     return Estimate(float(value), float(low), float(high)), None
 
@@ -254,7 +284,8 @@ def crashes_by_scene(episodes: pl.DataFrame, scenes: Sequence[str]) -> tuple[Est
     )
     rows = []
     for row in by_scene.to_dicts():
-        rate, km = None, row["distance_km"]
+        rate = None
+        km = row["distance_km"]
         if km > 0.0:
             rate = poisson_interval(row[_CRASH]).scaled(per=km)
         rows.append({**row, **entries("crashes_per_km", rate)})
@@ -265,6 +296,7 @@ def crashes_by_scene(episodes: pl.DataFrame, scenes: Sequence[str]) -> tuple[Est
         raise UserError(
             "crashes per km: nobody drove; give episodes that last at least one decision."
         )
+    # One scene has no spread to resample.
     if len(driven) < 2:
         return Estimate(float(crashes.sum() / total)), rows
     if crashes.sum() == 0:
@@ -286,8 +318,19 @@ def failed_episodes(episodes: pl.DataFrame) -> list[Row]:
     """
     failed = episodes.filter(pl.col("reason").is_in(FAILURES))
     rows = []
-    for names, frame in failed.group_by("agent", "traffic", "seed", maintain_order=True):
-        row: Row = dict(zip(("driver", "traffic", "seed"), names))
+    # A row per driver, traffic and seed, so that an episode can be driven again by its numbers.
+    for names, frame in failed.group_by(
+        "agent",
+        "traffic",
+        "seed",
+        maintain_order=True,
+    ):
+        row: Row = dict(
+            zip(
+                ("driver", "traffic", "seed"),
+                names,
+            )
+        )
         for end in FAILURES:
             row[end] = frame.filter(pl.col("reason") == end)["episode"].sort().to_list()
         rows.append(row)

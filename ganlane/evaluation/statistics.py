@@ -64,7 +64,11 @@ class Estimate:
         """Whether there is an interval and 0 lies outside it."""
         return self.low is not None and self.high is not None and not self.low <= 0.0 <= self.high
 
-    def scaled(self, factor: float = 1.0, per: float = 1.0) -> Estimate:
+    def scaled(
+        self,
+        factor: float = 1.0,
+        per: float = 1.0,
+    ) -> Estimate:
         """Value and bounds times ``factor``, divided by ``per``; both are positive."""
         low, high = (
             None if bound is None else bound * factor / per for bound in (self.low, self.high)
@@ -85,7 +89,11 @@ def entries(name: str, estimate: Estimate | None) -> dict[str, Any]:
     }
 
 
-def resample_counts(size: int, resamples: int, seed: int) -> Iterator[Array]:
+def resample_counts(
+    size: int,
+    resamples: int,
+    seed: int,
+) -> Iterator[Array]:
     """Chunks [R, size] of how often each of ``size`` episodes occurs in a resample of ``size`` with
     replacement.
     """
@@ -114,7 +122,12 @@ def bootstrap_means(values: Array) -> Array:
     The K columns of an episode stay together.
     """
     size = len(values)
-    counts: Iterable[Array | npt.NDArray[np.uint16]] = resample_counts(size, RESAMPLES, seed=0)
+    # All tables of one evaluation have the same number of episodes, so the draws are shared.
+    counts: Iterable[Array | npt.NDArray[np.uint16]] = resample_counts(
+        size,
+        RESAMPLES,
+        seed=0,
+    )
     if size * RESAMPLES <= _MOST_KEPT:
         counts = kept_counts(size, RESAMPLES)
     return np.concatenate([chunk.astype(np.float64) @ values / size for chunk in counts])
@@ -133,7 +146,15 @@ def _bca_levels(values: Array, means: Array) -> Array:
     below = ((means < mean).mean() + (means <= mean).mean()) / 2.0
     # Half a resample away from 0 and 1, where the normal quantile is infinite.
     edge = 0.5 / len(means)
-    bias = _NORMAL.inv_cdf(float(np.clip(below, edge, 1.0 - edge)))
+    bias = _NORMAL.inv_cdf(
+        float(
+            np.clip(
+                below,
+                edge,
+                1.0 - edge,
+            )
+        )
+    )
     shifted = [bias + _NORMAL.inv_cdf(float(level)) for level in TAIL_LEVELS]
     return np.array([_NORMAL.cdf(bias + z / (1.0 - acceleration * z)) for z in shifted])
 
@@ -157,7 +178,8 @@ def mean_interval(values: npt.ArrayLike) -> Estimate:
 
 def paired_difference(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
     """Mean of ``first - second`` over the same episodes, in the same order, with its interval."""
-    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    a = np.asarray(first, dtype=np.float64)
+    b = np.asarray(second, dtype=np.float64)
     if a.shape != b.shape:
         raise ValueError(f"paired values must have one shape, found {a.shape} and {b.shape}")
     return mean_interval(a - b)
@@ -196,7 +218,13 @@ def no_events(amount: float) -> Estimate:
 
 def interquartile_mean(scores: npt.ArrayLike) -> Array:
     """Mean of the middle half of the last axis: without a quarter, rounded down, at both ends."""
-    return np.asarray(scipy.stats.trim_mean(np.asarray(scores, dtype=np.float64), 0.25, axis=-1))
+    return np.asarray(
+        scipy.stats.trim_mean(
+            np.asarray(scores, dtype=np.float64),
+            0.25,
+            axis=-1,
+        )
+    )
 
 
 def over_trainings(scores: npt.ArrayLike, statistic: Callable[[Array], Array] = _mean) -> Estimate:
@@ -209,7 +237,10 @@ def over_trainings(scores: npt.ArrayLike, statistic: Callable[[Array], Array] = 
 
 def difference(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
     """Mean of ``first`` [S, E] minus mean of ``second`` [S', E], on the same episodes."""
-    return _estimate(_pair(first, second), lambda a, b: _mean(a) - _mean(b))
+    return _estimate(
+        _pair(first, second),
+        lambda a, b: _mean(a) - _mean(b),
+    )
 
 
 def probability_of_improvement(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
@@ -219,7 +250,11 @@ def probability_of_improvement(first: npt.ArrayLike, second: npt.ArrayLike) -> E
     Where all trainings at hand of one are above all of the other it is 1, from 1 to 1: it says
     nothing of others.
     """
-    return _estimate(_pair(first, second), _share_above, bounds=(0.0, 1.0))
+    return _estimate(
+        _pair(first, second),
+        _share_above,
+        bounds=(0.0, 1.0),
+    )
 
 
 def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate | None:
@@ -236,11 +271,17 @@ def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate |
         return np.asarray(sums[:, 0] / np.maximum(sums[:, 1], np.finfo(np.float64).tiny))
 
     # One table, so that a draw of trainings is one for events and kilometres.
-    return _estimate([np.stack([happened, amount])], ratio, bounds=(0.0, np.inf))
+    return _estimate(
+        [np.stack([happened, amount])],
+        ratio,
+        bounds=(0.0, np.inf),
+    )
 
 
 def normalized_over_trainings(
-    agent: npt.ArrayLike, mobil: npt.ArrayLike, random_legal: npt.ArrayLike
+    agent: npt.ArrayLike,
+    mobil: npt.ArrayLike,
+    random_legal: npt.ArrayLike,
 ) -> Estimate | None:
     """The normalised score (:func:`ganlane.evaluation.normalized_percent`) of several trainings,
     each [S, E].
@@ -251,10 +292,17 @@ def normalized_over_trainings(
     tables = [_pair(rewards, mobil)[0] for rewards in (agent, mobil, random_legal)]
     if not difference(tables[1], tables[2]).excludes_zero():
         return None
-    return _estimate(tables, lambda *rewards: percent_of_way(*map(_mean, rewards)))
+    return _estimate(
+        tables,
+        lambda *rewards: percent_of_way(*map(_mean, rewards)),
+    )
 
 
-def percent_of_way(value: Array, top: Array, bottom: Array) -> Array:
+def percent_of_way(
+    value: Array,
+    top: Array,
+    bottom: Array,
+) -> Array:
     """How far ``value`` is on the way from ``bottom`` to ``top``, in per cent."""
     return np.asarray(100.0 * (value - bottom) / (top - bottom))
 
@@ -276,11 +324,13 @@ def mcnemar(first: npt.ArrayLike, second: npt.ArrayLike) -> McNemar:
 
     ``first`` and ``second`` [E] bool on the same episodes.
     """
-    a, b = np.asarray(first, dtype=bool), np.asarray(second, dtype=bool)
+    a = np.asarray(first, dtype=bool)
+    b = np.asarray(second, dtype=bool)
     if a.shape != b.shape:
         raise ValueError(f"paired episodes must have one shape, found {a.shape} and {b.shape}")
     # Episodes in which both failed, or neither, say nothing about a difference.
-    one, other = int((a & ~b).sum()), int((b & ~a).sum())
+    one = int((a & ~b).sum())
+    other = int((b & ~a).sum())
     return McNemar(
         one, other, float(scipy.stats.binomtest(one, one + other).pvalue) if one + other else 1.0
     )
@@ -294,7 +344,8 @@ def _table(values: npt.ArrayLike) -> Array:
 
 
 def _pair(first: npt.ArrayLike, second: npt.ArrayLike) -> tuple[Array, Array]:
-    a, b = _table(first), _table(second)
+    a = _table(first)
+    b = _table(second)
     if a.shape[1] != b.shape[1]:
         raise ValueError(f"expected the same episodes, found {a.shape[1]} and {b.shape[1]}")
     return a, b
@@ -319,7 +370,8 @@ def _estimate(
     if all(table.shape[-2:] == (1, 1) for table in tables):
         return Estimate(value)
     # One draw of the episodes serves all tables: all drivers drove the same ones.
-    generator, episodes = np.random.default_rng((0, 1)), tables[0].shape[-1]
+    generator = np.random.default_rng((0, 1))
+    episodes = tables[0].shape[-1]
     counts = np.concatenate(kept_counts(episodes, FEWER_RESAMPLES)).astype(np.float64).T
     parts = [
         statistic(*(np.moveaxis(table @ counts, -1, 0) / episodes for table in tables)) - value
@@ -332,7 +384,11 @@ def _estimate(
         # This table's trainings are drawn anew, the others' stay as they are.
         chosen = generator.integers(trainings, size=(FEWER_RESAMPLES, trainings))
         drawn = list(means)
-        drawn[index] = np.moveaxis(means[index][0][..., chosen], -2, 0)
+        drawn[index] = np.moveaxis(
+            means[index][0][..., chosen],
+            -2,
+            0,
+        )
         parts.append(np.sqrt(trainings / (trainings - 1)) * (statistic(*drawn) - value))
         freedom.append(trainings - 1)
     # Satterthwaite: the degrees of freedom of a sum of variances that are known unequally well.
@@ -340,12 +396,16 @@ def _estimate(
     uncertainty = float((variances**2 / freedom).sum())
     degrees = variances.sum() ** 2 / uncertainty if uncertainty > 0.0 else np.inf
     wider = scipy.stats.t.ppf(TAIL_LEVELS[1], degrees) / scipy.stats.norm.ppf(TAIL_LEVELS[1])
-    low, high = np.clip(value + wider * np.quantile(np.sum(parts, axis=0), TAIL_LEVELS), *bounds)
+    low, high = np.clip(
+        value + wider * np.quantile(np.sum(parts, axis=0), TAIL_LEVELS),
+        *bounds,
+    )
     return Estimate(value, float(low), float(high))
 
 
 def _share_above(first: Array, second: Array) -> Array:
     """Share of the pairs of [R, S] and [R, S'] in which the first is above; [R]."""
     # Every training of the first with every training of the second, [R, S, S'].
-    a, b = first[:, :, None], second[:, None, :]
+    a = first[:, :, None]
+    b = second[:, None, :]
     return np.asarray(((a > b) + 0.5 * (a == b)).mean(axis=(1, 2)))

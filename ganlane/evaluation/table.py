@@ -29,6 +29,7 @@ def aligned(lines: Sequence[Sequence[str]], names: int = 1) -> str:
         numbers = [cell.rjust(width) for cell, width in zip(cells[names:], widths[names:])]
         return "  ".join([*words, *numbers]).rstrip()
 
+    # Two spaces between columns, in the ruler too: fitting() finds the columns by it.
     ruler = "  ".join("-" * width for width in widths)
     return "\n".join([line(lines[0]), ruler, *map(line, lines[1:])])
 
@@ -40,6 +41,7 @@ def show(*texts: str, columns: str = "auto") -> None:
     no terminal, tables are whole.
     """
     text = "\n\n".join(texts)
+    # A file or a pipe gets all columns.
     if columns == "auto" and sys.stdout.isatty():
         text = fitting(text, shutil.get_terminal_size().columns)
     print(text)
@@ -72,10 +74,12 @@ def _narrowed(lines: Sequence[str], width: int) -> str:
         left = [span.stop - span.start + 2 for other, span in spans.items() if other not in gone]
         if name in spans and sum(left) > width + 2:
             gone.add(name)
+    # Every line is cut at the same places.
     rows = []
     for line in lines[head:]:
         cells = [line[span] for name, span in spans.items() if name not in gone]
         rows.append("  ".join(cells).rstrip())
+    # In the order of the table, so that a reader knows where they would be.
     hidden = ", ".join(name for name in spans if name in gone)
     return "\n".join([*lines[:head], *rows, f"(columns=all shows: {hidden})"])
 
@@ -85,9 +89,14 @@ def number(value: float | None, digits: int = 3) -> str:
     return NOTHING if value is None else f"{value:.{digits}f}"
 
 
-def with_interval(row: Row, key: str, digits: int = 3) -> str:
+def with_interval(
+    row: Row,
+    key: str,
+    digits: int = 3,
+) -> str:
     """A cell with ``row[key]``, and ``[low, high]`` where the row has its interval, ``key_ci``."""
-    text, interval = number(row.get(key), digits), row.get(f"{key}_ci")
+    text = number(row.get(key), digits)
+    interval = row.get(f"{key}_ci")
     if not interval:
         return text
     low, high = interval
@@ -129,13 +138,24 @@ class Table:
     ) -> Table:
         """One line per row; ``columns`` maps each heading to the maker of its cells."""
         lines = [[cell(row) for cell in columns.values()] for row in rows]
-        return cls(title, list(columns), lines, names, notes)
+        return cls(
+            title,
+            list(columns),
+            lines,
+            names,
+            notes,
+        )
 
     def text(self) -> str:
         """Aligned columns, with the title above and the notes below."""
         # The tables of an evaluation have no title: the command is one.
         lines = [self.title, ""] if self.title else []
-        lines.append(aligned([self.headings, *self.lines], self.names))
+        lines.append(
+            aligned(
+                [self.headings, *self.lines],
+                self.names,
+            )
+        )
         if self.notes:
             lines += ["", *self.notes]
         return "\n".join(lines)
@@ -157,6 +177,7 @@ def significant(value: float | None) -> str:
         return NOTHING
     # Rounded first: 9.996 has three digits as 10.0, not as 10.00.
     rounded = float(f"{value:.3g}")
+    # Digits before the point; below 1 the format counts them itself.
     whole = len(str(int(abs(rounded))))
     return f"{rounded:.{max(0, 3 - whole)}f}" if abs(rounded) >= 1 else f"{rounded:.3g}"
 
@@ -219,6 +240,7 @@ def text_table(rows: Sequence[Row]) -> str:
 
     Below them stands a line for each reason why a score is missing.
     """
+    # Columns that say nothing here make room for those that do.
     columns = {
         heading: cell
         for heading, cell in _COLUMNS.items()
@@ -227,14 +249,21 @@ def text_table(rows: Sequence[Row]) -> str:
     # Each reason with its traffics, once each.
     reasons: dict[str, list[str]] = {}
     for row in rows:
-        reason, traffic = row.get("normalized_percent_reason"), row.get("traffic")
+        reason = row.get("normalized_percent_reason")
+        traffic = row.get("traffic")
         if reason is not None and traffic not in reasons.setdefault(reason, []):
             reasons[reason].append(str(traffic))
     notes = [
         f"% of MOBIL on {', '.join(traffics)}: none, {reason}"
         for reason, traffics in reasons.items()
     ]
-    return Table.of("", rows, columns, 2 + ("run" in columns), notes).text()
+    return Table.of(
+        "",
+        rows,
+        columns,
+        2 + ("run" in columns),
+        notes,
+    ).text()
 
 
 def paired_table(rows: Sequence[Row]) -> str:
@@ -249,4 +278,9 @@ def paired_table(rows: Sequence[Row]) -> str:
         "reward [95 %]": lead,
         "verdict": text_of("verdict"),
     }
-    return Table.of("", rows, columns, names=2).text()
+    return Table.of(
+        "",
+        rows,
+        columns,
+        names=2,
+    ).text()

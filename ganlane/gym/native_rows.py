@@ -51,6 +51,7 @@ class NativeRows(Rows):
 
     def restart(self, rows: Flags) -> None:
         state = self.batch.state
+        # Row i drives the episodes i, i + N, i + 2N, ...
         self.batch.start(state[keys.SEED], state[keys.EPISODE] + self.count, rows)
 
     def step(self, actions: Integers) -> Stepped:
@@ -68,7 +69,8 @@ class NativeRows(Rows):
 
 def native_rows(config: HighwayConfig) -> NativeRows | None:
     """The highways of ``config`` by the kernel; None where it does not implement them."""
-    env, observation = config.env, config.observation
+    env = config.env
+    observation = config.observation
     # The traffic says who drives; the rest is what the kernel's observation and scenes can do.
     drivers = config.traffic.native_parameters(env.idm, env.mobil)
     if (

@@ -13,21 +13,22 @@ from ganlane.gym.rows import Flags
 from ganlane.gym.tensor_rows import TensorRows
 from ganlane.gym.window import FilmWindow
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.options import Option, option
-from ganlane.view import DrawingParameters, EpisodeLabel, FramePainter, Recorder
+from ganlane.settings.render import FilmConfig
+from ganlane.view import EpisodeLabel, FramePainter, Recorder
 from ganlane.view.frames import Picture
 from ganlane.view.record import outcome_of, road_of_row
 
 #: Recorded physics steps that are kept: as many as the trails show.
-_TRAIL_STEPS = round(DrawingParameters().trail_s / PHYSICS_STEP_S) + 1
+_TRAIL_STEPS = round(FilmConfig.trail_s / PHYSICS_STEP_S) + 1
 
 
-def _label(rows: TensorRows, row: int, traffic: str) -> EpisodeLabel:
+def _label(rows: TensorRows, row: int) -> EpisodeLabel:
     """The header's text for a row."""
     state = rows.now()
+    # Which episode this is, and on what road.
     seed, episode = (int(state.get(name)[row]) for name in (keys.SEED, keys.EPISODE))
     road = road_of_row(state, rows.env.base_env.road, row)
-    return EpisodeLabel("ego", traffic, seed, episode, *road)
+    return EpisodeLabel("ego", rows.traffic, seed, episode, *road)
 
 
 class LiveView:
@@ -35,19 +36,20 @@ class LiveView:
 
     Args:
         rows: the row; the recorder of its environment is replaced.
-        traffic: as the rows have it, for the header.
         window: shows every physics step in real time; None: pictures on request.
     """
 
-    def __init__(self, rows: TensorRows, traffic: Option, window: FilmWindow | None = None) -> None:
-        self.rows, self.traffic, self.window = rows, option("traffic", traffic).label(), window
+    def __init__(self, rows: TensorRows, window: FilmWindow | None = None) -> None:
+        self.rows = rows
+        self.window = window
 
     def start(self) -> None:
         """A new episode has begun."""
-        self._recorder, self._outcome = Recorder(), ""
+        self._recorder = Recorder()
+        self._outcome = ""
         #: Frames recorded before the present decision.
         self._before = 0
-        self._label = _label(self.rows, 0, self.traffic)
+        self._label = _label(self.rows, 0)
         self._recorder.add(self.rows.now().get(keys.VEHICLES), 0.0)
         self.rows.env.base_env.recorder = self._recorder
         self._show()
@@ -94,10 +96,10 @@ class LiveView:
 
 
 class BatchView:
-    """Draws the present state of every row, without trails; the header names the ``traffic``."""
+    """Draws the present state of every row, without trails."""
 
-    def __init__(self, rows: TensorRows, traffic: Option) -> None:
-        self.rows, self.traffic = rows, option("traffic", traffic).label()
+    def __init__(self, rows: TensorRows) -> None:
+        self.rows = rows
         self._returns, self._actions = np.zeros(rows.count), np.full(rows.count, -1)
 
     def start(self, fresh: Flags) -> None:
@@ -116,7 +118,9 @@ class BatchView:
     def _picture(self, row: int) -> Picture:
         state = self.rows.now()
         recorder = Recorder(
-            row, current_action=int(self._actions[row]), current_return=float(self._returns[row])
+            row,
+            current_action=int(self._actions[row]),
+            current_return=float(self._returns[row]),
         )
         recorder.add(state.get(keys.VEHICLES), float(state.get(keys.STEP)[row]) * PHYSICS_STEP_S)
-        return FramePainter(recorder.trajectory(_label(self.rows, row, self.traffic))).draw(0)
+        return FramePainter(recorder.trajectory(_label(self.rows, row))).draw(0)

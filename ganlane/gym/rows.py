@@ -94,7 +94,8 @@ class Rows(ABC):
     def info(self) -> dict[str, Any]:
         """Gymnasium's info (docs/gymnasium.md) as arrays [N] by name; valid until the next call."""
         state = self.state_arrays()
-        y, lanes = state["y"], state["lanes"]
+        y = state["y"]
+        lanes = state["lanes"]
         # The road's own rounding, in the run's float type.
         lane = np.rint(y / np.asarray(state["lane_width_m"], y.dtype)).astype(np.int64)
         info = {name: state[field] for name, field in INFO.items()}
@@ -110,7 +111,9 @@ def observation_space(size: int, largest: float) -> Box:
 
     Speed over desired speed, then numbers from -1 to the largest of its form.
     """
-    low, high = np.full(size, -1.0, np.float32), np.full(size, largest, np.float32)
+    # float32, as the observations are; a wider type would not contain them.
+    low = np.full(size, -1.0, np.float32)
+    high = np.full(size, largest, np.float32)
     low[0], high[0] = 0.0, SPEED_RATIO_LIMIT
     return Box(low, high, dtype=np.float32)
 
@@ -140,6 +143,7 @@ def actions_of(actions: Any, rows: int) -> Integers:
         UserError: another shape, or no such action.
     """
     array = array_of(actions)
+    # Before any cast, which would round and wrap.
     whole = array.shape == (rows,) and array.dtype.kind in "iu"
     if not whole or not 0 <= array.min() <= array.max() < keys.ACTIONS:
         raise UserError(

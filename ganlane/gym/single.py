@@ -62,12 +62,21 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
                 f"render_mode={render_mode}: expected one of {', '.join(RENDER_MODES)}; "
                 "choose one of them."
             )
+        # Episodes count on from -1, so that the first reset begins episode 0.
         self._seed = None if seed is None else seed_number(seed)
-        self._episode, self._running = -1, False
-        self._rows = make_rows(traffic, 1, render_mode is not None, transforms, options)
+        self._episode = -1
+        self._running = False
+        self._rows = make_rows(
+            traffic,
+            1,
+            render_mode is not None,
+            transforms,
+            options,
+        )
         self.observation_space: gymnasium.spaces.Box = self._rows.space  # type: ignore[assignment]
         self.action_space = gymnasium.spaces.Discrete(ACTIONS)
-        self.render_mode, fps = render_mode, FPS
+        self.render_mode = render_mode
+        fps = FPS
         if render_mode == "rgb_array":  # a picture per decision
             fps = max(1, round(1.0 / self._rows.episode.decision_period_s))
         modes = [mode for mode in RENDER_MODES if mode != "human" or has_display()]
@@ -80,7 +89,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
             from ganlane.gym.rendering import LiveView  # with torch, which takes seconds
 
             window = FilmWindow() if render_mode == "human" else None
-            self._view = LiveView(self._rows, traffic, window)  # type: ignore[arg-type]
+            self._view = LiveView(self._rows, window)  # type: ignore[arg-type]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -91,7 +100,8 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         super().reset(seed=seed)
         # A seed begins with its episode 0; without one the next episode of the same seed follows.
         if seed is not None:
-            self._seed, self._episode = seed, -1
+            self._seed = seed
+            self._episode = -1
         elif self._seed is None:
             self._seed = int(self.np_random.integers(SEEDS))
         episode = chosen.get("episode", self._episode + 1)
@@ -115,12 +125,14 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
             self._view.before_step(int(actions[0]))
         stepped = self._rows.step(actions)
         reward = float(stepped.reward[0])
-        terminated, truncated = bool(stepped.terminated[0]), bool(stepped.truncated[0])
+        terminated = bool(stepped.terminated[0])
+        truncated = bool(stepped.truncated[0])
         self._running = not (terminated or truncated)
         if self._view is not None:
             self._view.after_step(reward)
             self._collect()
-        observation, info = stepped.observation[0].copy(), row_of(self._rows.info(), 0)
+        observation = stepped.observation[0].copy()
+        info = row_of(self._rows.info(), 0)
         return observation, reward, terminated, truncated, info
 
     def _collect(self) -> None:
@@ -136,7 +148,8 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
 
         By itself it gets one picture per decision. The name is HighwayEnv's.
         """
-        self._video, wrapper.frames_per_sec = wrapper, FPS
+        self._video = wrapper
+        wrapper.frames_per_sec = FPS
 
     def action_masks(self) -> npt.NDArray[np.bool_]:
         """Which actions are allowed now, bool [3]; sb3-contrib's MaskablePPO asks for them."""
@@ -152,7 +165,9 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
             raise UserError(f"render(): made without render_mode; give one of {modes} to make().")
         self._rows.check_started()
         if self.render_mode == "rgb_array_list":
-            pictures, self._pictures = self._pictures, []
+            # gymnasium's contract: a call empties the list.
+            pictures = self._pictures
+            self._pictures = []
             return pictures
         return self._view.picture() if self.render_mode == "rgb_array" else None
 

@@ -30,6 +30,7 @@ class TensorRows(Rows):
 
     Attributes:
         env: the TorchRL environment of the settings, with a user's own transforms at the end.
+        traffic: its name, for pictures.
         state: of its rows, from the first :meth:`start` on.
     """
 
@@ -38,7 +39,9 @@ class TensorRows(Rows):
         for transform in transforms:
             self.env.append_transform(transform)
         base = self.env.base_env
-        self.count, self.episode = config.num_envs, base.episode
+        self.count = config.num_envs
+        self.episode = base.episode
+        self.traffic = config.traffic.label()
         parts = list(self.env.transform)
         observed = next(part for part in parts if isinstance(part, ObservationTransform))
         size = self.env.observation_spec[keys.OBSERVATION].shape[-1]
@@ -50,9 +53,11 @@ class TensorRows(Rows):
     def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
         counters = TensorDict({}, [self.count], device=self.env.device)
         for name, value in ((keys.SEED, seed), (keys.EPISODE, episode)):
+            # One number for all rows, or one for each.
             numbers = np.broadcast_to(value, self.count).astype(np.int64)
             counters[name] = torch.as_tensor(numbers, device=self.env.device)
-        self.started, self.state = True, self.env.reset(counters)
+        self.state = self.env.reset(counters)
+        self.started = True
 
     @torch.no_grad()
     def restart(self, rows: Flags) -> None:
@@ -64,7 +69,8 @@ class TensorRows(Rows):
         action = torch.as_tensor(actions, device=self.env.device)
         stepped = self.env.step(self.now().set(keys.ACTION, action))
         # Rows are not reset here: the environments above decide when.
-        self.state, after = self.env.step_mdp(stepped), stepped.get("next")
+        self.state = self.env.step_mdp(stepped)
+        after = stepped.get("next")
         return Stepped(
             self.observation(),
             _array(after.get(keys.REWARD)[:, 0]).astype(np.float32),
@@ -91,7 +97,8 @@ class TensorRows(Rows):
 
     def state_arrays(self) -> Mapping[str, Any]:
         state = self.now()
-        vehicles, road = state.get(keys.VEHICLES), road_in(state, self.env.base_env.road)
+        vehicles = state.get(keys.VEHICLES)
+        road = road_in(state, self.env.base_env.road)
         tensors = dict(state.get(keys.EGO).items())
         for name in (keys.SEED, keys.EPISODE, keys.STEP):
             tensors[name] = state.get(name)

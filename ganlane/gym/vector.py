@@ -69,8 +69,15 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
                 "use gymnasium.make for a window."
             )
         self._mode = _mode_of(autoreset_mode)
-        self._rows = make_rows(traffic, num_envs, render_mode is not None, transforms, options)
-        self.num_envs, self.render_mode = self._rows.count, render_mode
+        self._rows = make_rows(
+            traffic,
+            num_envs,
+            render_mode is not None,
+            transforms,
+            options,
+        )
+        self.num_envs = self._rows.count
+        self.render_mode = render_mode
         episode = self._rows.episode
         if max_episode_steps is not None:
             limit = whole_number("max_episode_steps", max_episode_steps, 1, 2**31)
@@ -79,6 +86,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
                     f"max_episode_steps={limit}: a batch has its own time limit; "
                     f"give timeout_s={limit * episode.decision_period_s:g}."
                 )
+        # A picture per decision.
         fps = max(1, round(1.0 / episode.decision_period_s))
         self.metadata = {**self.metadata, "autoreset_mode": self._mode, "render_fps": fps}
         self.single_observation_space = self._rows.space
@@ -92,7 +100,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         if render_mode is not None:
             from ganlane.gym.rendering import BatchView  # with torch, which takes seconds
 
-            self._view = BatchView(self._rows, traffic)  # type: ignore[arg-type]
+            self._view = BatchView(self._rows)  # type: ignore[arg-type]
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
@@ -126,13 +134,16 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         seeds: Any
         # A seed starts with its first episodes; without one every row goes on with its next.
         if seed is not None:
-            seeds, first = [seed_number(one) for one in array_of(seed).ravel().tolist()], rows
+            seeds = [seed_number(one) for one in array_of(seed).ravel().tolist()]
+            first = rows
             super().reset(seed=seeds[0] if len(seeds) == 1 else None)
         elif self._rows.started:
             state = self._rows.state_arrays()
-            seeds, first = state["seed"].copy(), state["episode"] + self.num_envs
+            seeds = state["seed"].copy()
+            first = state["episode"] + self.num_envs
         else:
-            seeds, first = self._seed, rows
+            seeds = self._seed
+            first = rows
             if seeds is None:
                 seeds = int(self.np_random.integers(SEEDS))
         if episode is not None:
@@ -164,13 +175,16 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
             )
         stepped = self._rows.step(actions_of(actions, self.num_envs))
         reward = stepped.reward.astype(np.float64)
-        terminated, truncated = stepped.terminated.copy(), stepped.truncated.copy()
+        terminated = stepped.terminated.copy()
+        truncated = stepped.truncated.copy()
         if self._view is not None:
             self._view.after_step(actions, reward)
         # NEXT_STEP: these rows ended one step ago. They were stepped with the others, which is
         # discarded here.
         if waiting.any():
-            reward[waiting], terminated[waiting], truncated[waiting] = 0.0, False, False
+            reward[waiting] = 0.0
+            terminated[waiting] = False
+            truncated[waiting] = False
             self._rows.restart(waiting)
             self._begun(waiting)
         ended = self._ended = terminated | truncated
@@ -181,7 +195,8 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
             final |= {"final_info": _copied(self._rows.info()), "_final_info": ended}
             self._rows.restart(ended)
             self._begun(ended)
-        observation, info = self._rows.observation().copy(), _copied(self._rows.info())
+        observation = self._rows.observation().copy()
+        info = _copied(self._rows.info())
         return observation, reward, terminated, truncated, info | final
 
     def action_masks(self) -> Flags:
@@ -211,6 +226,7 @@ def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
 
 def _where(rows: Flags, observations: Floats) -> npt.NDArray[np.object_]:
     """Final observations in gymnasium's form: an object array [N], None outside ``rows``."""
+    # gymnasium's form: rows that go on have none.
     final = np.full(len(rows), None, dtype=object)
     for row in np.flatnonzero(rows):
         final[row] = observations[row].copy()

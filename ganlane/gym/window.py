@@ -21,6 +21,7 @@ def has_display() -> bool:
     """
     if importlib.util.find_spec("pygame") is None:
         return False
+    # X11, Wayland, or SDL's drivers without either.
     variables = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
     return sys.platform in ("win32", "darwin") or any(map(os.environ.get, variables))
 
@@ -64,6 +65,7 @@ class FilmWindow:
                 self._screen = pygame.display.set_mode(size)
             self._screen.blit(pygame.image.frombuffer(picture.tobytes(), size, "RGB"), (0, 0))
             pygame.display.flip()
+            # Without taking events the desktop takes the window for hung.
             if pygame.event.get(pygame.QUIT):
                 self.close()
             pygame.event.pump()

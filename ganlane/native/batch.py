@@ -22,7 +22,6 @@ from ganlane.native.settings import Key, fields
 from ganlane.settings.driving import EgoParameters, IdmParameters, MobilParameters, Visibility
 from ganlane.settings.episode import EpisodeParameters, SpawnParameters
 from ganlane.settings.observation import (
-    MASKS,
     MaskParameters,
     ObservationConfig,
     RewardParameters,
@@ -129,16 +128,23 @@ class NativeBatch:
         stream: int = 0,
         variant: str | None = None,
     ) -> None:
+        # For copies and other processes, which make the batch anew.
         self._arguments = {name: value for name, value in locals().items() if name != "self"}
-        spawn, ego = spawn or SpawnParameters(), ego or EgoParameters()
-        episode, idm = episode or EpisodeParameters(), idm or IdmParameters()
-        observation, reward = observation or ObservationConfig(), reward or RewardParameters()
+        spawn = spawn or SpawnParameters()
+        ego = ego or EgoParameters()
+        episode = episode or EpisodeParameters()
+        idm = idm or IdmParameters()
+        observation = observation or ObservationConfig()
+        reward = reward or RewardParameters()
         mask = mask or MaskParameters()
-        self.rows, self.lanes, self.lane_width_m = rows, lanes, lane_width_m
+        self.rows = rows
+        self.lanes = lanes
+        self.lane_width_m = lane_width_m
         self.terms = reward.term_names
         road = (lanes, lane_width_m, vehicles)
         view = settings.view_of(*road, observation.scale(), observation.form)
         self.bounds = (-1.0, largest_number(observation.form, spawn.longest_m))
+        # All arrays of the state in place, written by the kernel and read by whoever asks.
         self.state: dict[Key, npt.NDArray[Any]] = {}
         for name, kind in settings.VEHICLE_ARRAYS.items():
             self.state[name] = np.zeros((rows, vehicles), kind)
@@ -149,9 +155,12 @@ class NativeBatch:
         self._term_values = np.zeros((rows, len(self.terms)), np.float32)
         self._no_safe_action = np.zeros(rows, np.bool_)
         self._library = load(variant)
+        # When others see the ego's lane changes, and the ego theirs.
         visible = (Visibility.named(ego.visibility), Visibility.SIGNALLED)
+        # The kernel's structures, filled once.
         decision = settings.settings_of(*road, episode, ego, idm, mobil=mobil)
-        deceleration, abort = mask.safe_deceleration, ego.abort_lane_change
+        deceleration = mask.safe_deceleration
+        abort = ego.abort_lane_change
         # Referred to by this object, since the structure holds no more than their addresses.
         self._pointed = {
             "settings": decision,
@@ -178,9 +187,10 @@ class NativeBatch:
             vehicles=vehicles,
             lanes=lanes,
             size=view.numbers(),
-            mask_form=MASKS.index(mask.form),
+            mask_form=settings.MASK_FORMS.index(mask.form),
             abort_lane_change=abort,
         )
+        # One pointer is all that a call passes.
         self._address = ctypes.byref(self._batch)
         ends = (self.state["terminated"], self.state["truncated"])
         self._stepped = Stepped(self.observation, self.state[keys.REWARD], *ends)
@@ -212,6 +222,7 @@ class NativeBatch:
         """
         state = self.state
         fresh = state["fresh"]
+        # The kernel starts the rows whose flag is set and leaves the others alone.
         fresh[:] = True if rows is None else rows
         np.copyto(state[keys.SEED], seed, where=fresh)
         np.copyto(state[keys.EPISODE], episode, where=fresh)

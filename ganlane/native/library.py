@@ -77,6 +77,7 @@ def best_variant() -> str:
     if platform.machine() not in ("x86_64", "AMD64"):
         return "default"
     try:
+        # Asked of Linux, so that torch need not be imported.
         lines = CPU_INFO.read_text().splitlines()
         parts = set(next(line for line in lines if line.startswith("flags")).split())
     except (OSError, StopIteration):  # not Linux
@@ -92,6 +93,7 @@ def compiler_command() -> tuple[str, ...] | None:
 
     None if there is none.
     """
+    # A compiler of the system first, else that of zig.
     path, _ = runtime.find_compiler()
     if path is not None:
         return (path,)
@@ -137,12 +139,14 @@ def load(variant: str | None = None) -> ctypes.CDLL:
 
 @lru_cache(maxsize=8)
 def _load(variant: str, compiler: tuple[str, ...] | None, folder: Path) -> ctypes.CDLL:
+    # That of the wheel fits only if it was built from these very sources.
     path = _prebuilt(variant)
     if not path.is_file():
         reason = why_not()
         if compiler is None or reason:
             raise UserError(f"env.kernel=native {reason} Or set env.kernel=torch.")
         command = _command(variant, compiler)
+        # Another compiler, or another version of it, makes another library.
         version = _run((*compiler, "--version")).stdout
         path = folder / _name(variant, *command, version)
         if not path.is_file():
@@ -179,12 +183,10 @@ def _prebuilt(variant: str) -> Path:
 
 def _name(variant: str, *parts: str) -> str:
     """A file name that follows from the sources and from what else makes a library."""
-    digest = hashlib.sha256("\0".join((*_sources(), *parts)).encode()).hexdigest()
+    # A file of that name is never out of date.
+    sources = [source.read_text() for source in SOURCES]
+    digest = hashlib.sha256("\0".join((*sources, *parts)).encode()).hexdigest()
     return f"kernel-{variant.lower()}-{digest[:20]}.so"
-
-
-def _sources() -> tuple[str, ...]:
-    return tuple(source.read_text() for source in SOURCES)
 
 
 def _flags(variant: str) -> tuple[str, ...]:
@@ -263,6 +265,7 @@ def torch_on_one_thread() -> Iterator[None]:
     if before == 1:
         yield
         return
+    # A context variable: each thread that calls has its own.
     token = _threads.set(before)
     torch.set_num_threads(1)
     try:
@@ -277,7 +280,8 @@ def threads_allowed() -> int:
 
     Where torch is not loaded, ``OMP_NUM_THREADS`` or the processor's cores.
     """
-    set_aside, torch = _threads.get(), sys.modules.get("torch")
+    set_aside = _threads.get()
+    torch = sys.modules.get("torch")
     if set_aside is not None:
         return set_aside
     if torch is not None:
@@ -297,6 +301,7 @@ def in_threads(rows: int, call: Callable[[int, int], int]) -> None:
     if threads <= 1:
         codes = [call(0, rows)]
     else:
+        # Rounded up to whole vectors, so that no two threads share one.
         share = -(-rows // (threads * BLOCK)) * BLOCK
         pool = _pool(threads - 1)
         others = [

@@ -41,7 +41,16 @@ VEHICLE_ARRAYS: Final[dict[Key, str]] = {
 #: Arrays that the state has as [rows, 1]: of the events, and whether the episode has ended.
 EVENT_ARRAYS: Final[dict[Key, str]] = {
     # the end of a scene is one of recorded scenes, which the kernel does not drive
-    **dict.fromkeys(_within(keys.EVENTS, "goal", "hard_crash", "out_of_road", "timeout"), "bool"),
+    **dict.fromkeys(
+        _within(
+            keys.EVENTS,
+            "goal",
+            "hard_crash",
+            "out_of_road",
+            "timeout",
+        ),
+        "bool",
+    ),
     **dict.fromkeys(_within(keys.EVENTS, *keys.EVENT_COUNTS), "int64"),
     **dict.fromkeys(keys.DONE_FLAGS, "bool"),
 }
@@ -61,7 +70,15 @@ INPUTS: Final = (
 )
 #: What comes out of it, and out of the start of an episode.
 OUTPUTS: Final = (
-    *_within(keys.VEHICLES, "x", "y", "heading", "speed", "acceleration", "target_lane"),
+    *_within(
+        keys.VEHICLES,
+        "x",
+        "y",
+        "heading",
+        "speed",
+        "acceleration",
+        "target_lane",
+    ),
     STEERING,
     *EGO_ARRAYS,
     keys.STEP,
@@ -69,7 +86,14 @@ OUTPUTS: Final = (
 )
 #: What the start of an episode sets besides; ``seed``, ``episode`` and ``fresh`` go before it, and
 #: ``recycles`` after it.
-SCENE: Final = _within(keys.VEHICLES, "length", "width", "desired_speed", "visibility", "valid")
+SCENE: Final = _within(
+    keys.VEHICLES,
+    "length",
+    "width",
+    "desired_speed",
+    "visibility",
+    "valid",
+)
 
 #: The observations that the kernel computes: whether with drift, and with overlap.
 NATIVE_FORMS: Final = {
@@ -77,6 +101,8 @@ NATIVE_FORMS: Final = {
     "lane_view_drift": (True, False),
     "lane_view_overlap": (True, True),
 }
+#: The action masks, in the order of step.cpp's numbers ``MASK_ROAD, MASK_LEGAL, MASK_SAFE``.
+MASK_FORMS: Final = ("none", "legal", "safe")
 
 
 def fields(kind: type, names: str) -> list[tuple[str, type]]:
@@ -178,8 +204,10 @@ def settings_of(
     mobil: MobilParameters | None = None,
 ) -> Settings:
     """The numbers of road, driving and episode; ``mobil=None``: the others keep their lanes."""
-    episode, idm = episode or EpisodeParameters(), idm or IdmParameters()
+    episode = episode or EpisodeParameters()
+    idm = idm or IdmParameters()
     steering = steering or SteeringParameters()
+    # No two of these records have a field of one name.
     records = (episode, ego or EgoParameters(), idm, steering, mobil or MobilParameters())
     numbers = {name: value for record in records for name, value in vars(record).items()}
     numbers |= {
@@ -207,6 +235,7 @@ def mask_of(
     abort: bool,
 ) -> Settings:
     """The numbers of the mask ``safe``; ``safe_deceleration`` in m/s2."""
+    # The mask reads few of the decision's numbers; the others are defaults.
     ego = EgoParameters(abort_lane_change=abort)
     mobil = MobilParameters(safe_deceleration=safe_deceleration)
     return settings_of(lanes, lane_width_m, vehicles, ego=ego, idm=idm, mobil=mobil)
@@ -243,6 +272,7 @@ def spawn_of(
         "recycle": recycle_share is not None,
         "recycle_share": recycle_share or 0.0,
     }
+    # Ranges as their lower end and their span, as the draw needs them.
     for name, value in numbers.items():
         if isinstance(value, tuple | list):
             numbers[name] = Range(value[0], value[1] - value[0])

@@ -55,7 +55,9 @@ def _room(
 
 def _state(tensors: Mapping[Key, Tensor]) -> TensorDict:
     """The environment's state [N], without a reward; the kernel drives no scene to its end."""
-    size, device = tensors[keys.STEP].shape, torch.device("cpu")
+    # Made without TensorDict's checks, since every shape is known.
+    size = tensors[keys.STEP].shape
+    device = torch.device("cpu")
     groups: dict[str, dict[str, Tensor]] = {}
     fields: dict[str, Any] = {}
     for key, value in tensors.items():
@@ -71,6 +73,7 @@ def _state(tensors: Mapping[Key, Tensor]) -> TensorDict:
 
 def _shape(road: Road, vehicles: int) -> tuple[int, float, int]:
     """Lanes, their width in m, and M."""
+    # The settings have one number of lanes and one width for all rows.
     of_rows = isinstance(road.lanes, Tensor) or isinstance(road.lane_width_m, Tensor)
     if of_rows or road.ring_m is not None:
         raise UserError(
@@ -91,7 +94,9 @@ class _Function:
     """
 
     def __init__(self, name: str, numbers: ctypes.Structure, variant: str | None = None) -> None:
-        self._name, self._numbers, self._variant = name, numbers, variant
+        self._name = name
+        self._numbers = numbers
+        self._variant = variant
         self._call = getattr(load(variant), name)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -134,7 +139,14 @@ class Kernel(_Function):
         variant: str | None = None,
     ) -> None:
         self.vehicles = vehicles
-        numbers = settings.settings_of(*_shape(road, vehicles), episode, ego, idm, steering, mobil)
+        numbers = settings.settings_of(
+            *_shape(road, vehicles),
+            episode,
+            ego,
+            idm,
+            steering,
+            mobil,
+        )
         super().__init__("ganlane_decide", numbers, variant)
 
     def decide(
@@ -163,6 +175,7 @@ class Kernel(_Function):
                     f"not {number.dtype} {number.shape}"
                 )
             before[name] = number
+        # New tensors: the state before the decision belongs to the caller.
         after = _room(settings.OUTPUTS, rows, self.vehicles, torch.empty)
         self._run(rows, [action, *before.values(), recycles], list(after.values()))
         after |= {name: before[name] for name in _LASTING}
@@ -182,9 +195,16 @@ class NativeScenes(_Function):
     """
 
     def __init__(self, scenes: RandomScenes, stream: int) -> None:
-        self.vehicles, seen = scenes.vehicles, (scenes.ego_visibility, scenes.others_visibility)
+        self.vehicles = scenes.vehicles
+        seen = (scenes.ego_visibility, scenes.others_visibility)
         shape = _shape(scenes.road, scenes.vehicles)
-        numbers = settings.spawn_of(*shape, scenes.parameters, stream, *seen, recycle_share=None)
+        numbers = settings.spawn_of(
+            *shape,
+            scenes.parameters,
+            stream,
+            *seen,
+            recycle_share=None,
+        )
         super().__init__("ganlane_spawn", numbers)
 
     def start(self, seed: Tensor, episode: Tensor, rows: Tensor | None = None) -> TensorDict:
@@ -193,6 +213,7 @@ class NativeScenes(_Function):
         ``rows`` [N] bool are those to be drawn; None: all. The others are zeros, without a vehicle.
         """
         rows = torch.ones_like(seed, dtype=torch.bool) if rows is None else rows
+        # Zeros, since rows that are not drawn are not written.
         names = (*settings.OUTPUTS, *settings.SCENE)
         state = _room(names, len(seed), self.vehicles, torch.zeros)
         scene = [state[name] for name in settings.SCENE]
@@ -226,7 +247,16 @@ class LaneView(_Function):
         Arguments as :meth:`ganlane.transforms.ObservationTransform.observe`.
         """
         v = vehicles
-        inputs = [v.speed, v.desired_speed, v.length, v.y, seen.x, seen.y, seen.speed, seen.valid]
+        inputs = [
+            v.speed,
+            v.desired_speed,
+            v.length,
+            v.y,
+            seen.x,
+            seen.y,
+            seen.speed,
+            seen.valid,
+        ]
         out = torch.empty((len(v.x), self.size), dtype=torch.float32)
         self._run(len(out), [*inputs, progress, direction], [out])
         return out
@@ -257,9 +287,11 @@ class SafeActions(_Function):
         ``seen`` are the vehicles as the ego perceives them, ``direction`` [N] that of its current
         lane change.
         """
-        v, rows = seen, seen.x.shape[0]
+        v = seen
+        rows = seen.x.shape[0]
         inputs = [v.x, v.y, v.heading, v.speed, v.length, v.width, v.desired_speed]
         inputs += [v.target_lane, v.visibility, v.valid, direction]
-        mask, none = torch.empty(rows, 3, dtype=torch.bool), torch.empty(rows, dtype=torch.bool)
+        mask = torch.empty(rows, 3, dtype=torch.bool)
+        none = torch.empty(rows, dtype=torch.bool)
         self._run(rows, inputs, [mask, none])
         return mask, none

@@ -86,7 +86,11 @@ def card_numbers(
     }
 
 
-def card_rows(starts: Starts, traffic: str, resamples: int) -> dict[str, Any]:
+def card_rows(
+    starts: Starts,
+    traffic: str,
+    resamples: int,
+) -> dict[str, Any]:
     """The rows of a traffic's card, compared with every other traffic from the same starts."""
     floors = starts.reference.floors
     recorded = starts.recorded.counts
@@ -128,11 +132,22 @@ def quantity_rows(
         against = {}
         for rival in rivals:
             theirs = driven[rival].counts[name]
-            difference = distance_difference(ours, theirs, counts, paired, resamples)
+            difference = distance_difference(
+                ours,
+                theirs,
+                counts,
+                paired,
+                resamples,
+            )
             against[rival] = {
                 **entries(
                     "distance",
-                    distance(theirs, counts, paired, resamples),
+                    distance(
+                        theirs,
+                        counts,
+                        paired,
+                        resamples,
+                    ),
                 ),
                 **entries("difference", difference),
                 "verdict": verdict(difference),
@@ -141,7 +156,12 @@ def quantity_rows(
             "unit": UNITS[name],
             **entries(
                 "distance",
-                distance(ours, counts, paired, resamples),
+                distance(
+                    ours,
+                    counts,
+                    paired,
+                    resamples,
+                ),
             ),
             "ceiling": ceiling(counts),
             "floor": ends.get("random", {}).get(name),

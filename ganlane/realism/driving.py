@@ -58,7 +58,8 @@ Factory = Callable[[Road], TrafficModule]
 #: A vehicle enters only where the gaps to those ahead and behind in its lane are at least this, m.
 ENTRY_GAP_M = 2.0
 #: Desired speeds are kept within these bounds, m/s.
-SLOWEST_DESIRED_MPS, FASTEST_DESIRED_MPS = 5.0, 35.0
+SLOWEST_DESIRED_MPS = 5.0
+FASTEST_DESIRED_MPS = 35.0
 #: Rows times vehicles times vehicles simulated at once; bounds the memory.
 _MOST_PAIRS = 1_000_000
 #: Position of absent vehicles, m.
@@ -157,12 +158,34 @@ def _drive(
     for step in range(len(recorded.x)):
         state = recorded.without_finished(state, step)
         # Who has entered once does not enter again.
-        enters = recorded.may_enter(state, waiting, traffic.road, step)
+        enters = recorded.may_enter(
+            state,
+            waiting,
+            traffic.road,
+            step,
+        )
         waiting = waiting & ~enters
-        state = recorded.entering(step, excess, traffic.road, state).where(enters, state)
-        memory = _updated_memory(traffic, state, memory, enters, absorb(key, 0))
+        state = recorded.entering(
+            step,
+            excess,
+            traffic.road,
+            state,
+        ).where(enters, state)
+        memory = _updated_memory(
+            traffic,
+            state,
+            memory,
+            enters,
+            absorb(key, 0),
+        )
         course.append((state.x, state.y, state.valid))
-        state, memory = step_traffic(traffic, state, memory, counters, step)
+        state, memory = step_traffic(
+            traffic,
+            state,
+            memory,
+            counters,
+            step,
+        )
     x, y, valid = (torch.stack(values)[..., 1:].numpy() for values in zip(*course))
     driven = []
     for index, row in enumerate(rows):
@@ -287,7 +310,11 @@ class StackedRecordings:
             valid=zero > 0.0,
         )
 
-    def without_finished(self, state: Vehicles, step: int) -> Vehicles:
+    def without_finished(
+        self,
+        state: Vehicles,
+        step: int,
+    ) -> Vehicles:
         """Removes vehicles whose recording is over or that passed the end of the road.
 
         Moves replayed ones on.
@@ -411,7 +438,9 @@ class RandomDriving(TrafficModule):
     negative.
     """
 
-    hardest, every_s, change_s = 3.0, 20.0, 4.0
+    hardest = 3.0
+    every_s = 20.0
+    change_s = 4.0
 
     def move(
         self,
@@ -426,7 +455,13 @@ class RandomDriving(TrafficModule):
         dtype = vehicles.x.dtype
         # One acceleration for the ten steps of a second.
         second = torch.div(step, 10, rounding_mode="floor")
-        pace = uniform(key, second, m, [Purpose.ACCELERATION], dtype)[..., 0]
+        pace = uniform(
+            key,
+            second,
+            m,
+            [Purpose.ACCELERATION],
+            dtype,
+        )[..., 0]
         drawn = uniform(
             key,
             step,
@@ -473,7 +508,11 @@ class HeadwayIdm(TrafficModule):
 
     memory_fields = {"headway": ((), None)}  # noqa: RUF012
 
-    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
+    def fresh_memory(
+        self,
+        vehicles: Vehicles,
+        key: Tensor,
+    ) -> dict[str, Tensor]:
         """A random headway for each driver."""
         u = uniform(
             key,

@@ -90,7 +90,14 @@ def _following(path: Path) -> pl.DataFrame:
         pl.Float64,
     )
     # Both cars of a pair are in one row.
-    table = read_table(path, {"period": pl.String, **whole, **numbers})
+    table = read_table(
+        path,
+        {
+            "period": pl.String,
+            **whole,
+            **numbers,
+        },
+    )
     cars = []
     for role, length in (
         ("follower", pl.lit(_LENGTH_M)),

@@ -102,11 +102,18 @@ class EventCounter:
         #: The last state; empty where a new batch of episodes begins.
         self.before: dict[str, Tensor] = {}
 
-    def count(self, vehicles: Vehicles, step: int) -> None:
+    def count(
+        self,
+        vehicles: Vehicles,
+        step: int,
+    ) -> None:
         """Count the events of a physics step."""
         # Everything is counted without the ego's empty place.
         others = vehicles.columns(slice(1, None))
-        self.overlaps += self._onsets("overlap", pair_overlaps(others).triu(1))
+        self.overlaps += self._onsets(
+            "overlap",
+            pair_overlaps(others).triu(1),
+        )
         # Half the width of a body, turned with its heading.
         half = lateral_half_extent(others) - EDGE_M
         left = self.road.left_edge_m()
@@ -125,8 +132,13 @@ class EventCounter:
                 (slow & (ahead.gap > FREE_M))[:, 1:],
             )
 
-    def _onsets(self, name: str, now: Tensor) -> int:
+    def _onsets(
+        self,
+        name: str,
+        now: Tensor,
+    ) -> int:
         """Number of entries that are true now and were not at the last count."""
+        # An event counts when it begins, however long it lasts.
         before = self.before.get(name, torch.zeros_like(now))
         self.before[name] = now
         return int((now & ~before).sum())
@@ -136,7 +148,10 @@ class GuardMeter:
     """Counts the vehicle-steps in which a guard alters acceleration or lateral position."""
 
     def __init__(self) -> None:
-        self._altered, self._steps = torch.zeros(2, dtype=torch.int64)
+        self._altered, self._steps = torch.zeros(
+            2,
+            dtype=torch.int64,
+        )
 
     def watch(self, traffic: TrafficModule) -> None:
         """Be called by every guard in ``traffic`` from now on."""
@@ -189,7 +204,13 @@ def long_run(
     # Ends early where nobody moves.
     while km < parameters.vehicle_km and not (parts and parts[-1]["vehicle_km"] <= 0.0):
         rows = _rows(parameters, parameters.vehicle_km - km)
-        driven = drive_spawned(traffic, parameters, episodes, rows, events)
+        driven = drive_spawned(
+            traffic,
+            parameters,
+            episodes,
+            rows,
+            events,
+        )
         parts.append(batch_statistics(driven, road))
         km += parts[-1]["vehicle_km"]
         episodes += rows
@@ -236,7 +257,14 @@ def _rows(parameters: LongRunParameters, km: float) -> int:
             _MOST_SAMPLES // (steps * parameters.vehicles),
         ),
     )
-    return int(np.clip(np.ceil(km / expected), 1, most))
+    # Not more rows than the remaining kilometres ask for.
+    return int(
+        np.clip(
+            np.ceil(km / expected),
+            1,
+            most,
+        )
+    )
 
 
 def spawned_vehicles(
@@ -284,6 +312,7 @@ def drive_spawned(
         keys.SEED: torch.full((rows,), parameters.seed),
         keys.EPISODE: first + torch.arange(rows),
     }
+    # Numbers go on from batch to batch, so that no episode is driven twice.
     key = episode_key(traffic.stream, *counters.values())
     state = spawned_vehicles(traffic, parameters, key)
     memory = traffic.init_memory(state, absorb(key, 0))
@@ -292,7 +321,13 @@ def drive_spawned(
     # Onsets do not carry over from the batch before.
     events.before.clear()
     for step in range(round(parameters.most_s / PHYSICS_STEP_S)):
-        state, memory = step_traffic(traffic, state, memory, counters, step)
+        state, memory = step_traffic(
+            traffic,
+            state,
+            memory,
+            counters,
+            step,
+        )
         events.count(state, step)
         course.append((state.x, state.y, state.speed))
         # Distances are tested once in ten seconds of driving: cheap, and exact enough.
@@ -312,7 +347,10 @@ def drive_spawned(
 def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
     """Counts, samples and speeds of one batch."""
     # Every vehicle of every episode is a track of its own.
-    y = trajectories.y.reshape(len(trajectories.y), -1)
+    y = trajectories.y.reshape(
+        len(trajectories.y),
+        -1,
+    )
     changes = lane_changes_of_arrays(y, float(road.lane_width_m))
     second = round(1.0 / PHYSICS_STEP_S)
     x = trajectories.x.astype(np.float64)
@@ -322,6 +360,7 @@ def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
     speeds: dict[str, list[dict[str, float]]] = {}
     for seconds in SPEEDS_AT_S:
         time = round(seconds / PHYSICS_STEP_S)
+        # An episode that ended earlier says nothing about this time.
         after = range(rows) if time < steps else ()
         speeds[f"{seconds:g} s"] = [_speeds(trajectories, row, time) for row in after]
     # The first time at which the episode's vehicles have covered 5000 m on average.
@@ -343,7 +382,11 @@ def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
     }
 
 
-def _speeds(trajectories: Trajectories, row: int, time: int) -> dict[str, float]:
+def _speeds(
+    trajectories: Trajectories,
+    row: int,
+    time: int,
+) -> dict[str, float]:
     """Mean and standard deviation of an episode's speeds, m/s."""
     speed = trajectories.speed[time, row].astype(np.float64)
     spread = float(speed.std(ddof=1)) if len(speed) > 1 else 0.0
@@ -366,7 +409,11 @@ def _mean_speeds(
     return {**means, "episodes": len(rows)}
 
 
-def rates(lane_changes: int, overlaps: int, km: float) -> dict[str, Any]:
+def rates(
+    lane_changes: int,
+    overlaps: int,
+    km: float,
+) -> dict[str, Any]:
     """Both counts per vehicle-km and per 1000 of them, with exact 95 % intervals.
 
     None where no vehicle moved.

@@ -56,7 +56,8 @@ _TINY = 1e-300
 #: A vehicle's first seconds do not count.
 SETTLING_S: Final = 3.0
 #: Half of the second that speeds are taken over, and all of it, in frames.
-_HALF, _WHOLE = 5, 10
+_HALF = 5
+_WHOLE = 10
 #: Leaders further ahead are ignored, m; slower than this a driver shows no headway, m/s.
 FOLLOWING_M: Final = 100.0
 SLOWEST_FOLLOWER_MPS: Final = 2.0
@@ -93,7 +94,12 @@ def jensen_shannon(first: Array, second: Array) -> Array:
         p = first / first.sum(-1, keepdims=True)
         q = second / second.sum(-1, keepdims=True)
     # 0 log 0 is 0: tiny numbers stand in for empty bins.
-    log_middle = np.log2(np.maximum(0.5 * (p + q), _TINY))
+    log_middle = np.log2(
+        np.maximum(
+            0.5 * (p + q),
+            _TINY,
+        )
+    )
 
     def information(share: Array) -> Array:
         return np.sum(
@@ -112,7 +118,12 @@ def jensen_shannon(first: Array, second: Array) -> Array:
 
 def pooled_distance(simulated: Array, recorded: Array) -> float:
     """Distance of two sets of histograms [units, bins], each added up over its units."""
-    return float(jensen_shannon(simulated.sum(0), recorded.sum(0)))
+    return float(
+        jensen_shannon(
+            simulated.sum(0),
+            recorded.sum(0),
+        )
+    )
 
 
 def distance(
@@ -131,13 +142,24 @@ def distance(
 
     ``paired`` units are the same and are resampled together; else ``simulated`` alone is.
     """
+    # Units are pooled: a scene has too few samples of its own for a histogram.
     value = pooled_distance(simulated, recorded)
-    (drawn,) = _resampled([simulated], recorded, paired, resamples)
+    (drawn,) = _resampled(
+        [simulated],
+        recorded,
+        paired,
+        resamples,
+    )
     if not np.isfinite(value) or len(drawn) < 2:
         return Estimate(value)
     # Both tails are reflected about the estimate.
     tails = np.quantile(drawn**2, TAIL_LEVELS)
-    low, high = np.sqrt(np.maximum(2.0 * value**2 - tails[::-1], 0.0))
+    low, high = np.sqrt(
+        np.maximum(
+            2.0 * value**2 - tails[::-1],
+            0.0,
+        )
+    )
     return Estimate(
         value,
         min(value, float(low)),
@@ -162,7 +184,12 @@ def distance_difference(
     """
     one = pooled_distance(first, recorded)
     other = pooled_distance(second, recorded)
-    ours, theirs = _resampled([first, second], recorded, paired, resamples)
+    ours, theirs = _resampled(
+        [first, second],
+        recorded,
+        paired,
+        resamples,
+    )
     units = len(first)
     value = one - other
     if not np.isfinite(value) or len(ours) < 2:
@@ -191,7 +218,15 @@ def _resampled(
     if units < 2:
         return np.empty((len(models), 0))
     # The same resamples for all models, so that differences are paired.
-    counts = np.concatenate(list(resample_counts(units, resamples, seed=0)))
+    counts = np.concatenate(
+        list(
+            resample_counts(
+                units,
+                resamples,
+                seed=0,
+            )
+        )
+    )
     against = counts @ recorded if paired else recorded.sum(0)
     distances = np.stack([jensen_shannon(counts @ model, against) for model in models])
     # A resample of units without samples has no distance.
@@ -212,6 +247,7 @@ def ceiling(recorded: Array) -> float | None:
     half = np.zeros((SPLITS, units))
     for row in half:
         row[generator.permutation(units)[: units // 2]] = 1.0
+    # All splits at once: [splits, units] times [units, bins].
     values = jensen_shannon(half @ recorded, (1.0 - half) @ recorded)
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else None
@@ -329,7 +365,11 @@ def samples_of(
     return samples
 
 
-def _histograms(table: pl.DataFrame, units: Sequence[str], bins: Bins) -> Array:
+def _histograms(
+    table: pl.DataFrame,
+    units: Sequence[str],
+    bins: Bins,
+) -> Array:
     """Samples per unit and bin, [units, bins]."""
     index = {unit: row for row, unit in enumerate(units)}
     table = table.filter(pl.col("unit").is_in(list(units)))

@@ -42,10 +42,12 @@ def card_text(numbers: Mapping[str, Any]) -> list[str]:
     """The card's tables, of the ``numbers`` in ``results.json``."""
     traffic = numbers["traffic"]
     held_out = numbers["quantities_held_out"]
+    # All scenes first; what was held out from the fit apart, where both were driven.
     tables = [quantities_table(numbers["quantities"], traffic)]
     if held_out is not None:
         tables.append(f"held-out scenes alone\n{quantities_table(held_out, traffic)}")
     tables.append(starts_table(numbers["driving"]))
+    # A second site, to which nothing was fitted.
     for name, rows in numbers["i80"].items():
         tables.append(f"I-80, {name}\n{quantities_table(rows, traffic)}")
     for name, runs in {
@@ -94,6 +96,7 @@ def quantities_table(quantities: Mapping[str, Any], traffic: str) -> str:
             )
         ]
         for rival in rivals:
+            # The difference is paired: both drove the same scenes.
             theirs = row["against"][rival]
             line += [
                 number(theirs["distance"]),
@@ -108,7 +111,14 @@ def starts_table(driving: Mapping[str, Any]) -> str:
     """Lane changes and accelerations, one traffic per line, the recordings among them."""
     rate = "changes per vehicle-km [95 %]"
     tails = "acceleration 5 %, 95 %"
-    lines = [["from the same starts", rate, "vehicle-km", tails]]
+    lines = [
+        [
+            "from the same starts",
+            rate,
+            "vehicle-km",
+            tails,
+        ]
+    ]
     for name, row in driving.items():
         acceleration = row["quantiles"]["acceleration"]
         line = [
@@ -141,6 +151,7 @@ def _run_cells(run: Mapping[str, Any], traffic: str) -> dict[str, str]:
     for time, at in run["speeds"].items():
         speeds = f"{number(at['mean_speed_mps'], 1)}, {number(at['spread_mps'], 2)}"
         cells[f"mean speed, spread after {time}, m/s"] = speeds
+    # The tails show most: recorded drivers brake and accelerate harder than models.
     for level, value in run["acceleration_quantiles"].items():
         cells[f"acceleration, {100 * float(level):g} % quantile"] = number(value, 2)
     share = run["guard_share"]
@@ -153,7 +164,12 @@ def checks_text(checks: Mapping[str, Any]) -> str:
 
     def told(name: str, value: bool | None) -> str:
         unknown = "no guard" if name == "guard_under_5_percent" else "unknown"
-        answer = {True: "yes", False: "no", None: unknown}[value]
+        # None: what the check looks at was not there.
+        answer = {
+            True: "yes",
+            False: "no",
+            None: unknown,
+        }[value]
         return f"{name.replace('_', ' ')}: {answer}"
 
     near = "acceleration_quantiles_within_30_percent"
@@ -171,7 +187,11 @@ def short_name(traffic: str) -> str:
     return traffic.rpartition(".")[2]
 
 
-def draw(numbers: Mapping[str, Any], starts: Starts, to: Path) -> None:
+def draw(
+    numbers: Mapping[str, Any],
+    starts: Starts,
+    to: Path,
+) -> None:
     """The figures of a card, into the folder ``to``.
 
     Distributions, distances, and drift if there are long runs.
@@ -227,8 +247,14 @@ def draw_distributions(
             colour = colours[driver]
             if not total:
                 continue
+            # Densities, so that traffics with more samples are not higher.
             density = counts[name] / total / np.diff(edges)
-            plot_line(axes, middle, density, color=colour)
+            plot_line(
+                axes,
+                middle,
+                density,
+                color=colour,
+            )
             # The bins at both ends hold all values beyond, too.
             for end, mark in ((0, "<"), (-1, ">")):
                 if counts[name][end]:
@@ -268,16 +294,30 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
     block = len(colours) + 1
     figure = Figure(figsize=(7.5, 0.8 + 0.125 * block * len(quantities)))
     axes = figure.subplots()
-    axes.set(xlim=(0, 1), ylim=(block * len(quantities), 0))
+    axes.set(
+        xlim=(0, 1),
+        ylim=(block * len(quantities), 0),
+    )
     axes.set_xlabel("Jensen-Shannon distance to recorded driving")
     names = [name.replace("_", " ") for name in quantities]
     middles = [block * (index + 0.5) for index in range(len(names))]
-    axes.set_yticks(middles, names, color=INK, size=9)
+    axes.set_yticks(
+        middles,
+        names,
+        color=INK,
+        size=9,
+    )
     axes.tick_params("y", length=0)
     axes.grid(False, axis="y")
     for index, row in enumerate(quantities.values()):
+        # Quantities from top to bottom, traffics within each in the order of the legend.
         top = block * index
-        axes.axhline(top, color=GRID, lw=0.8)
+        axes.axhline(
+            top,
+            color=GRID,
+            lw=0.8,
+        )
+        # The best that can be expected, and the worst that makes sense.
         for mark, colour in (
             ("ceiling", INK),
             ("floor", FAINT),
@@ -300,7 +340,13 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
                     [y, y],
                     color=colour,
                 )
-                axes.plot(value, y, "o", color=colour, ms=5)
+                axes.plot(
+                    value,
+                    y,
+                    "o",
+                    color=colour,
+                    ms=5,
+                )
     # Marks of the scale, which no traffic has.
     marks = [
         Line2D(
@@ -338,7 +384,11 @@ def draw_speeds_over_time(runs: Sequence[Mapping[str, Any]], spread_mps: float) 
         "spread_mps": "spread of speeds",
     }
     for axes, (key, title) in zip(grid, titles.items()):
-        axes.set(title=title, xlabel="time, s", ylabel="m/s")
+        axes.set(
+            title=title,
+            xlabel="time, s",
+            ylabel="m/s",
+        )
         for run, colour in zip(runs, colours.values()):
             # The time at 5000 m differs from run to run, and is no point in time.
             speeds = {time: at[key] for time, at in run["speeds"].items() if time.endswith(" s")}
@@ -350,6 +400,7 @@ def draw_speeds_over_time(runs: Sequence[Mapping[str, Any]], spread_mps: float) 
                 np.array(list(speeds.values()), np.float64),
                 color=colour,
             )
+    # A traffic that holds the recorded spread stays near this level.
     grid[1].axhline(spread_mps, color=INK)
     add_legend(figure, {"recorded": INK, **colours})
     return figure

@@ -54,7 +54,9 @@ SHORTEST_S = 4.0
 #: Candidates for the mean excess of desired speeds over the speed at entry, m/s.
 EXCESS_GRID = (2.0, 4.0, 6.0, 8.0, 11.0, 15.0, 20.0)
 #: Spawned starts: vehicles of an episode, its seconds, and episodes per repeat.
-_SPAWNED_VEHICLES, _SPAWNED_S, _SPAWNED_ROWS = 30, 30.0, 8
+_SPAWNED_VEHICLES = 30
+_SPAWNED_S = 30.0
+_SPAWNED_ROWS = 8
 
 
 def print_progress(text: str) -> None:
@@ -108,6 +110,7 @@ def fit_excess(
     recorded = measure_recordings(recordings)
 
     def mean_distance(excess: float) -> float:
+        # Once per scene is enough to compare candidates with each other.
         driven = simulate(
             make,
             recordings,
@@ -154,6 +157,7 @@ class Starts:
     @property
     def separately_held_out(self) -> list[str]:
         """The held-out scenes, if other scenes were driven too; else empty."""
+        # With several folds every scene is held out once.
         if len(self.held_out) != 1:
             return []
         held_out = [name for name in self.scenes if name in self.held_out[0]]
@@ -224,6 +228,7 @@ def fold_weights(
 def check_folds_cover(folds: Sequence[Sequence[str]], scenes: Sequence[str]) -> None:
     """Raise :class:`UserError` unless every scene is in exactly one fold."""
     held_out = [name for fold in folds for name in fold]
+    # Scenes that no fold names, or that no recording has, are wrong as well.
     for name in sorted({*held_out, *scenes}):
         if held_out.count(name) != 1 or name not in scenes:
             raise UserError(
@@ -275,6 +280,7 @@ def recorded_starts(
                 print_progress(f"{name}: fitting desired speeds on {len(others)} scenes")
                 excess = fit_excess(make, others, options)
             excesses.setdefault(name, []).append(excess)
+        # Those of this fold.
         fitted = {name: values[-1] for name, values in excesses.items()}
         for name, driven in drive_all(fold.factories, scenes, options, fitted).items():
             frames.setdefault(name, []).append(driven)
@@ -320,6 +326,7 @@ def spawned_starts(
     ``road`` and ``spawn`` say where and how vehicles start (Table II at the paper's density). They
     are compared with the histograms that ship.
     """
+    # The recordings may not be passed on; their histograms may.
     reference = Reference.load(SHIPPED_REFERENCE)
     rows = _SPAWNED_ROWS * repeats
     print_progress(
@@ -347,6 +354,7 @@ def spawned_recordings(
     rows: int,
 ) -> list[Recording]:
     """``rows`` spawned episodes of ``parameters.most_s`` s, in the form of recordings."""
+    # Events are counted because driving counts them; nobody reads them here.
     paths = drive_spawned(make(road), parameters, 0, rows, EventCounter(road))
     # Nobody enters late or leaves.
     everywhere = np.ones(paths.x[:, 0].shape, dtype=bool)

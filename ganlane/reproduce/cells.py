@@ -77,16 +77,33 @@ def cells_of(config: ReproduceConfig, traffics: dict[str, TrafficConfig]) -> lis
     drivers = make_drivers(config.agents, config.env, config.device)
     cells = []
     for traffic, option in traffics.items():
+        # A changed setting gives another file name, so that old episodes are never taken for new
+        # ones.
         for driver in drivers:
-            settings = _settings(driver, option, config, config.episodes_on(traffic))
+            settings = _settings(
+                driver,
+                option,
+                config,
+                config.episodes_on(traffic),
+            )
             digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
             path = Path(config.cells) / f"{digest[:32]}.parquet"
-            cells.append(Cell(driver.name, traffic, settings, path))
+            cells.append(
+                Cell(
+                    driver.name,
+                    traffic,
+                    settings,
+                    path,
+                )
+            )
     return cells
 
 
 def _settings(
-    driver: Driver, traffic: TrafficConfig, config: ReproduceConfig, episodes: int
+    driver: Driver,
+    traffic: TrafficConfig,
+    config: ReproduceConfig,
+    episodes: int,
 ) -> dict[str, Any]:
     """See :class:`Cell`."""
     # The weights themselves, not a file's name: a training under the same name is another driver.
@@ -119,9 +136,15 @@ def _settings(
 
 def drive(cells: Sequence[Cell], config: ReproduceConfig) -> None:
     """Drive the cells that are not there yet, each into its file."""
+    # What an earlier command drove is taken as it is.
     missing = [cell for cell in cells if not cell.path.is_file()]
     no_terminal = not sys.stderr.isatty()
-    with tqdm(total=len(missing), unit="cell", file=sys.stderr, disable=no_terminal) as bar:
+    with tqdm(
+        total=len(missing),
+        unit="cell",
+        file=sys.stderr,
+        disable=no_terminal,
+    ) as bar:
         for cell in _driven(missing, config):
             bar.update()
             if no_terminal:
@@ -138,13 +161,18 @@ def _driven(cells: Sequence[Cell], config: ReproduceConfig) -> Iterator[Cell]:
         return
     # Fresh processes: torch does not survive a fork once it has computed something.
     # Ctrl-C reaches them too: they finish their cell.
-    quiet: Any = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
+    quiet: Any = {
+        "initializer": signal.signal,
+        "initargs": (signal.SIGINT, signal.SIG_IGN),
+    }
     with ProcessPoolExecutor(config.workers, multiprocessing.get_context("spawn"), **quiet) as pool:
+        # Traffic by traffic, as in the list; slow ones may end later.
         jobs = {pool.submit(drive_cell, cell, config): cell for cell in cells}
         try:
             for job in as_completed(jobs):
                 job.result()
                 yield jobs[job]
+        # Ctrl-C as well: what is running ends, what waits is dropped.
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
@@ -156,16 +184,28 @@ def drive_cell(cell: Cell, config: ReproduceConfig) -> None:
     begun = time.monotonic()
     # The same call as in ganlane evaluate, with one driver on one traffic.
     traffics = {cell.traffic: config.traffics[cell.traffic]}
-    alone = replace(config, traffics=traffics, episodes=cell.settings["episodes"])
-    driver = make_driver(cell.driver, config.env, device=config.device)
+    alone = replace(
+        config,
+        traffics=traffics,
+        episodes=cell.settings["episodes"],
+    )
+    driver = make_driver(
+        cell.driver,
+        config.env,
+        device=config.device,
+    )
     table = compare([driver], alone, quiet=True)
+    # The file tells what it holds, whoever finds it.
     origin = {
         "settings": cell.settings,
         "code": code_version(),
         "seconds": round(time.monotonic() - begun, 3),
     }
     with atomic_path(cell.path) as part:
-        table.write_parquet(part, metadata={_ORIGIN: json.dumps(origin)})
+        table.write_parquet(
+            part,
+            metadata={_ORIGIN: json.dumps(origin)},
+        )
 
 
 def read_cells(cells: Sequence[Cell]) -> tuple[pl.DataFrame, list[str], dict[str, float]]:
@@ -174,8 +214,12 @@ def read_cells(cells: Sequence[Cell]) -> tuple[pl.DataFrame, list[str], dict[str
     Raises:
         UserError: a file without the episodes of a cell; the message names it.
     """
-    tables, revisions = [], set()
-    seconds = dict.fromkeys((cell.traffic for cell in cells), 0.0)
+    tables = []
+    revisions = set()
+    seconds = dict.fromkeys(
+        (cell.traffic for cell in cells),
+        0.0,
+    )
     for cell in cells:
         try:
             origin = json.loads(pl.read_parquet_metadata(cell.path)[_ORIGIN])

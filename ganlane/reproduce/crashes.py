@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase
 
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.errors import UserError
-from ganlane.evaluation.episodes import SIDES, ScriptedPolicy, run_episodes
+from ganlane.evaluation.episodes import ScriptedPolicy, run_episodes
 from ganlane.evaluation.rows import FAILURES
 from ganlane.files import write_json
 from ganlane.settings.commands import EvaluateConfig
@@ -34,7 +34,6 @@ from ganlane.settings.record import (
     Text,
     make,
     one_of,
-    option_names,
     plain,
 )
 from ganlane.settings.traffic import MixedTrafficConfig, OwnTraffic, TrafficConfig
@@ -47,6 +46,11 @@ _ACTIONS = Rule(
     lambda text: re.fullmatch("[012]{1,100000}", text) is not None,
     "a text of the digits 0, 1 and 2",
 )
+#: A list names no code: no traffic of the user's own, and none that may have such parts.
+_LISTED = {kind.option for kind in TrafficConfig.kinds().values()} - {  # type: ignore[attr-defined]
+    OwnTraffic.option,
+    MixedTrafficConfig.option,
+}
 #: Errors raised by reading a broken list.
 _BROKEN = (ValueError, KeyError, TypeError, AttributeError, RecursionError, UserError)
 
@@ -58,8 +62,6 @@ class Crash(Record):
     Attributes:
         driver: its name in the tables, for instance ``agent_gan@2+none``.
         traffic: option of the group ``traffic``.
-        contact: what a hard crash hit (:data:`ganlane.evaluation.episodes.SIDES`).
-        changing: whether the ego was changing lanes at the end.
         actions: one digit per decision: 0 keep, 1 left, 2 right.
     """
 
@@ -69,8 +71,6 @@ class Crash(Record):
     episode: Seed = 0
     end: Annotated[str, one_of(FAILURES)] = "hard_crash"
     distance_m: NotNegative = 0.0
-    contact: Annotated[str, one_of(SIDES)] = SIDES[0]
-    changing: bool = False
     actions: Annotated[str, _ACTIONS] = "0"
 
 
@@ -92,9 +92,21 @@ class CrashList(Record):
     ) -> EnvBase:
         """The environment that repeats this list's episodes on a traffic."""
         # The tensor code, so that a list plays the same with and without the native kernel.
-        env = replace(self.env, kernel="torch", compile=False)
+        env = replace(
+            self.env,
+            kernel="torch",
+            compile=False,
+        )
+        # The same stream of randomness, so that others start and act as they did.
         model = make_traffic(self.traffics[traffic], env, Stream.named(self.stream))
-        return make_env(model, env, observation, reward, ROWS, mask=mask)
+        return make_env(
+            model,
+            env,
+            observation,
+            reward,
+            ROWS,
+            mask=mask,
+        )
 
     def drive_again(self) -> list[str]:
         """Drive every crash with its actions; how each ends, in the order of the list."""
@@ -104,14 +116,22 @@ class CrashList(Record):
         ):
             # One script for all episodes of a driver on a traffic: they are driven side by side.
             actions = {crash.episode: crash.actions for crash in group}
+            # Nobody decides: the actions of the list are taken as they are.
             policy = ScriptedPolicy(actions)
-            table = run_episodes(self.make_env(traffic), policy, list(actions), seed)
+            table = run_episodes(
+                self.make_env(traffic),
+                policy,
+                list(actions),
+                seed,
+            )
             ends += table["reason"].to_list()
         return ends
 
 
 def find_crashes(
-    episodes: pl.DataFrame, config: EvaluateConfig, most: int
+    episodes: pl.DataFrame,
+    config: EvaluateConfig,
+    most: int,
 ) -> tuple[CrashList, int]:
     """Drive failed episodes again and list those that end in the same way.
 
@@ -123,15 +143,20 @@ def find_crashes(
         The list, and how many of the episodes ended otherwise: generated traffic rounds differently
         in batches of another size.
     """
-    # A list names no code, so traffics that need a user's own are not in it.
     traffics = {
         name: traffic
         for name, traffic in config.traffics.items()
-        if name == traffic.label() and not isinstance(traffic, OwnTraffic | MixedTrafficConfig)
+        if name in _LISTED and name == traffic.label()
     }
     # A list without crashes makes the environment in which they are looked for.
-    listed = CrashList(config.env, traffics, config.stream, [])
+    listed = CrashList(
+        config.env,
+        traffics,
+        config.stream,
+        [],
+    )
     pair = ["traffic", "agent"]
+    # The shortest of each pair: they show soonest what went wrong, and drive again fastest.
     failed = (
         episodes.filter(pl.col("reason").is_in(FAILURES), pl.col("traffic").is_in(list(traffics)))
         .sort("decisions", "episode")
@@ -141,11 +166,23 @@ def find_crashes(
     )
     crashes: list[Crash] = []
     for (traffic, name), frame in failed.group_by(pair, maintain_order=True):
+        # Drive with the policy itself once more, to write down its actions.
         driver = make_driver(str(name), config.env)
         mask, policy = driver.behind(config.mask)
         observation = config.observation.read_by(driver.observation)
-        env = listed.make_env(str(traffic), observation, config.reward, mask)
-        again = run_episodes(env, policy, frame["episode"].to_list(), config.seed, actions=True)
+        env = listed.make_env(
+            str(traffic),
+            observation,
+            config.reward,
+            mask,
+        )
+        again = run_episodes(
+            env,
+            policy,
+            frame["episode"].to_list(),
+            config.seed,
+            actions=True,
+        )
         # Both tables have the same episodes in the same order.
         same = again.filter(again["reason"] == frame["reason"])
         crashes += [
@@ -155,9 +192,8 @@ def find_crashes(
                 seed=config.seed,
                 episode=row["episode"],
                 end=row["reason"],
+                # A crash in the first moments may leave a distance just below 0.
                 distance_m=round(max(row["distance_m"], 0.0), 1),
-                contact=row["contact"],
-                changing=row["changing"],
                 actions=row["actions"],
             )
             for row in same.to_dicts()
@@ -168,6 +204,7 @@ def find_crashes(
 def write_crashes(path: str | Path, listed: CrashList) -> None:
     """Write a list as JSON, atomically; a traffic is named, and its import path left out."""
     traffics = {}
+    # Traffics without a crash need no settings in the list.
     for name in sorted({crash.traffic for crash in listed.crashes}):
         traffics[name] = plain(listed.traffics[name])
         del traffics[name]["_target_"]
@@ -204,6 +241,7 @@ def read_crashes(path: str | Path) -> CrashList:
 
 def _checked(content: Any) -> CrashList:
     """The list of a file's content; one of :data:`_BROKEN` for what is not such a list."""
+    # Other JSON files of a run are refused before their keys are looked at.
     if content["kind"] != _KIND:
         raise ValueError("another kind of file")
     crashes = content["crashes"]
@@ -211,8 +249,12 @@ def _checked(content: Any) -> CrashList:
     for name in {crash["traffic"] for crash in crashes}:
         options = content["traffics"][name]
         # Only this package's traffics: an import path in a file would be code to execute.
-        if name not in option_names("traffic") or {"_target_", "name"} & set(options):
+        if name not in _LISTED or {"_target_", "name"} & set(options):
             raise ValueError(f"traffic {name!r:.80} is none of this package's")
         traffics[name] = make(TrafficConfig, {"name": name, **options}, "traffics")
-    listed = {"stream": content["stream"], "env": content["env"], "crashes": crashes}
+    listed = {
+        "stream": content["stream"],
+        "env": content["env"],
+        "crashes": crashes,
+    }
     return make(CrashList, {**listed, "traffics": traffics})

@@ -35,11 +35,16 @@ from ganlane.reproduce.report import Row, rows_of
 from ganlane.settings.commands import ReproduceConfig
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.sim.random import Stream
-from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, panel_grid, read_metrics
+from ganlane.view.curves import read_metrics
+from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, panel_grid
 from ganlane.view.record import EpisodeLabel, Trajectory, record_episode
 
 #: Panels of Figure 2 by what the vehicle does, and samples drawn in each.
-PANELS = {"starts a lane change": 3, "completes a lane change": 3, "goes steady": 2}
+PANELS = {
+    "starts a lane change": 3,
+    "completes a lane change": 3,
+    "goes steady": 2,
+}
 SAMPLES = 8
 #: Frames of every recording from one window to the next.
 _STRIDE = 5
@@ -47,7 +52,10 @@ _STRIDE = 5
 LEAST_M = 8.0
 #: Figure 3: frames over each other, s from the first to the last, s of the episode to choose from,
 #: m around the ego.
-FRAMES, SHOWN_S, LONGEST_S, AROUND_M = 4, 3.0, 30.0, (-70.0, 130.0)
+FRAMES = 4
+SHOWN_S = 3.0
+LONGEST_S = 30.0
+AROUND_M = (-70.0, 130.0)
 #: Ticks of the leads over MOBIL: linear up to 20, logarithmic beyond.
 _LEADS = (-300, -100, -20, -10, 0, 10, 20, 100)
 
@@ -62,7 +70,8 @@ def interesting(windows: Windows) -> list[tuple[str, int]]:
     one the other way round, and goes steady where it moves across least of all. No vehicle comes
     twice, and none that hardly moves.
     """
-    along, across = windows.positions[:, :, 0], windows.positions[:, :, 1]
+    along = windows.positions[:, :, 0]
+    across = windows.positions[:, :, 1]
     before = np.abs(across[:, PRESENT] - across[:, 0])
     after = np.abs(across[:, -1] - across[:, PRESENT])
     scores = {
@@ -72,11 +81,12 @@ def interesting(windows: Windows) -> list[tuple[str, int]]:
     }
     moves = along[:, -1] - along[:, 0] > LEAST_M
     chosen: list[tuple[str, int]] = []
-    seen: set[tuple[int, int]] = set()
+    seen: set[tuple[str, int]] = set()
+    # The best of each kind, as many as there are panels for it.
     for kind, count in PANELS.items():
         wanted = len(chosen) + count
         for row in np.argsort(-scores[kind], kind="stable").tolist():
-            vehicle = int(windows.scene[row]), int(windows.vehicle[row])
+            vehicle = str(windows.scene[row]), int(windows.vehicle[row])
             if len(chosen) < wanted and moves[row] and vehicle not in seen:
                 seen.add(vehicle)
                 chosen.append((kind, row))
@@ -95,6 +105,7 @@ def forecasts_to_draw() -> pl.DataFrame:
         UserError: the recordings are not at hand.
     """
     generator, metadata = load_generator(shipped_generator("paper"), "paper")
+    # Predictions of what the generator was fitted to would flatter it.
     held_out = set(metadata["data"]["held_out"])
     tracks = scene_tracks(read_scenes(default_scenes()))
     scenes = [scene for scene in tracks if scene.name in held_out]
@@ -106,7 +117,13 @@ def forecasts_to_draw() -> pl.DataFrame:
     # Paths after the present, each [W, frames, 2]. The mean is the same for every seed.
     later = {"recorded": windows.future}
     for seed in range(SAMPLES):
-        drawn = paper_forecasts(generator, windows, groups, seed, samples=1)
+        drawn = paper_forecasts(
+            generator,
+            windows,
+            groups,
+            seed,
+            samples=1,
+        )
         later |= {"mean": drawn["mean"], f"sample {seed + 1}": drawn["single"]}
     now = np.zeros((1, 2))
     parts = []
@@ -116,6 +133,7 @@ def forecasts_to_draw() -> pl.DataFrame:
         # The observed path ends at the present, the others begin there.
         for name, path in {**paths, "observed": seen}.items():
             present = PRESENT if name == "observed" else 0
+            # Time 0 is the present, in both directions.
             columns = {
                 "time_s": (np.arange(len(path)) - present) * FRAME_S,
                 "ahead_m": path[:, 0],
@@ -146,17 +164,26 @@ def draw_forecasts(paths: pl.DataFrame) -> Figure:
         styles[f"sample {number + 1}"] = {"color": colours["predicted"], "lw": 0.8}
     styles["mean"] = {"color": colours["predicted, z = 0"], "lw": 1.6}
     for name in ("observed", "recorded"):
-        styles[name] = {"color": colours[name], "marker": ".", "ms": 3}
+        styles[name] = {
+            "color": colours[name],
+            "marker": ".",
+            "ms": 3,
+        }
     panels = paths.partition_by("panel", maintain_order=True)
     figure, grid = panel_grid(len(panels), 2.5, 1.7)
     for axes, panel in zip(grid, panels):
-        axes.set(title=panel["kind"][0], xlabel="m ahead", ylabel="m to the left")
+        axes.set(
+            title=panel["kind"][0],
+            xlabel="m ahead",
+            ylabel="m to the left",
+        )
         for name, style in styles.items():
             path = panel.filter(pl.col("path") == name)
             axes.plot(path["ahead_m"], path["left_m"], **style)
         low, high = axes.get_ylim()
         # At least 1.6 m of height, so that steady driving does not look like a lane change.
-        middle, reach = (low + high) / 2.0, max(0.8, (high - low) / 2.0)
+        middle = (low + high) / 2.0
+        reach = max(0.8, (high - low) / 2.0)
         axes.set_ylim(middle - reach, middle + reach)
     add_legend(figure, colours)
     return figure
@@ -175,10 +202,30 @@ def drive_beginning(config: ReproduceConfig, traffic: TrafficConfig) -> Trajecto
     name = with_seeds([*learnt, config.agents[-1]][0])[0]
     driver = make_driver(name, config.env, device=config.device)
     observation = config.observation.read_by(driver.observation)
+    # A trained agent brings the mask and the observation that it was trained with.
     mask, policy = driver.behind(config.mask)
-    module = make_traffic(traffic, config.env, Stream.named(config.stream))
-    env = make_env(module, config.env, observation, config.reward, device=config.device, mask=mask)
-    return record_episode(env, policy, config.seed, 0, driver.name, traffic.label(), LONGEST_S)
+    module = make_traffic(
+        traffic,
+        config.env,
+        Stream.named(config.stream),
+    )
+    env = make_env(
+        module,
+        config.env,
+        observation,
+        config.reward,
+        device=config.device,
+        mask=mask,
+    )
+    return record_episode(
+        env,
+        policy,
+        config.seed,
+        0,
+        driver.name,
+        traffic.label(),
+        LONGEST_S,
+    )
 
 
 def busiest(episode: Trajectory) -> pl.DataFrame:
@@ -189,13 +236,17 @@ def busiest(episode: Trajectory) -> pl.DataFrame:
         ``y_m``, ``heading_rad``, ``length_m`` and ``width_m``; a vehicle that is placed elsewhere
         meanwhile is left out.
     """
-    shown = min(round(SHOWN_S / episode.frame_s), len(episode) - 1)
+    shown = min(
+        round(SHOWN_S / episode.frame_s),
+        len(episode) - 1,
+    )
     ahead = episode.x - episode.x[:, :1]
     # Vehicles in view, the ego left out.
     near = episode.valid & (ahead > AROUND_M[0]) & (ahead < AROUND_M[1] / 2.0)
     near[:, 0] = False
     # How far each moves across within the seconds that start at a frame, [T - shown, M].
     across = np.abs(episode.y[shown:] - episode.y[: len(episode) - shown])
+    # The start whose seconds have the most movement across in them, over all near vehicles.
     first = int(np.argmax((across * near[: len(across)]).sum(axis=1)))
     part = slice(first, first + shown + 1)
     # A vehicle that is recycled would draw a line across the picture.
@@ -224,12 +275,24 @@ def draw_episode(label: EpisodeLabel, tracks: pl.DataFrame) -> Figure:
     """
     figure = Figure(figsize=(9.0, 1.9))
     axes = figure.subplots()
-    lane_m, times = label.lane_width_m, tracks["time_s"].unique().sort().to_numpy()
-    axes.set(xlim=AROUND_M, xlabel="m", yticks=[], aspect="equal")
-    axes.set_ylim(-0.75 * lane_m, (label.lanes - 0.25) * lane_m)
+    lane_m = label.lane_width_m
+    times = tracks["time_s"].unique().sort().to_numpy()
+    axes.set(
+        xlim=AROUND_M,
+        xlabel="m",
+        yticks=[],
+        aspect="equal",
+    )
+    axes.set_ylim(
+        -0.75 * lane_m,
+        (label.lanes - 0.25) * lane_m,
+    )
     axes.set_title(f"{label.agent} on {label.traffic}, {times[0]:.1f} to {times[-1]:.1f} s")
     for line in range(label.lanes + 1):
-        style: dict[str, Any] = {"color": FAINT, "ls": (0, (8, 8))}
+        style: dict[str, Any] = {
+            "color": FAINT,
+            "ls": (0, (8, 8)),
+        }
         if line in (0, label.lanes):
             style = {"color": INK, "ls": "-"}
         axes.axhline((line - 0.5) * lane_m, **style)
@@ -238,10 +301,16 @@ def draw_episode(label: EpisodeLabel, tracks: pl.DataFrame) -> Figure:
     frames = np.linspace(0, len(times) - 1, FRAMES).round().astype(int)
     for track in tracks.partition_by("vehicle", maintain_order=True):
         colour = colours["ego" if track["vehicle"][0] == 0 else "others"]
-        axes.plot(track["x_m"], track["y_m"], color=colour, lw=0.8)
+        axes.plot(
+            track["x_m"],
+            track["y_m"],
+            color=colour,
+            lw=0.8,
+        )
         for place, frame in enumerate(frames.tolist()):
             body = track.row(frame, named=True)
-            length, width = body["length_m"], body["width_m"]
+            length = body["length_m"]
+            width = body["width_m"]
             axes.add_patch(
                 Rectangle(
                     (body["x_m"] - length / 2.0, body["y_m"] - width / 2.0),
@@ -298,24 +367,55 @@ def draw_transfer(curves: pl.DataFrame, rows: Sequence[Row]) -> Figure:
     """
     figure = Figure(figsize=(7.0, 3.4))
     axes = figure.subplots()
-    axes.set(title="evaluations during training", xlabel="decisions", ylabel="mean reward")
+    axes.set(
+        title="evaluations during training",
+        xlabel="decisions",
+        ylabel="mean reward",
+    )
     axes.xaxis.set_major_formatter(EngFormatter())
     for (_, phase), colour in zip(curves.group_by("phase", maintain_order=True), COLOURS):
         runs = phase.partition_by("run", maintain_order=True)
         points = [run.select("decisions", "mean_reward").to_numpy().T for run in runs]
         # All runs at the decisions of the first one.
         x = points[0][0]
+        # Runs are evaluated at slightly different decisions, so they are interpolated.
         y = np.stack([np.interp(x, *run) for run in points])
-        axes.fill_between(x, y.min(axis=0), y.max(axis=0), color=colour, alpha=0.2, lw=0)
-        axes.plot(x, np.median(y, axis=0), color=colour)
+        axes.fill_between(
+            x,
+            y.min(axis=0),
+            y.max(axis=0),
+            color=colour,
+            alpha=0.2,
+            lw=0,
+        )
+        axes.plot(
+            x,
+            np.median(y, axis=0),
+            color=colour,
+        )
         if len(points) > 1:
             for run in points:
-                axes.plot(*run, color=colour, lw=0.5, alpha=0.6)
+                axes.plot(
+                    *run,
+                    color=colour,
+                    lw=0.5,
+                    alpha=0.6,
+                )
+    # Where the second phase begins.
     switch = curves.filter(pl.col("phase") == "first")["decisions"].to_numpy().max()
-    axes.axvline(switch, color=FAINT, ls=":")
+    axes.axvline(
+        switch,
+        color=FAINT,
+        ls=":",
+    )
     for row in rows_of(rows, ["gan"], ["agent_idm"]):
         rewards = [training["mean_reward"] for training in row["each"]]
-        axes.plot([switch] * len(rewards), rewards, "x", color=COLOURS[1])
+        axes.plot(
+            [switch] * len(rewards),
+            rewards,
+            "x",
+            color=COLOURS[1],
+        )
     names = ("on idm_mobil", "on gan (x: before any training there)")
     add_legend(figure, dict(zip(names, COLOURS)))
     return figure
@@ -336,29 +436,75 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
     traffics = list(dict.fromkeys(row["traffic"] for row in shown))
     # All panels have one scale, so that traffics can be compared.
     bounds = [bound for row in shown for bound in _interval(row)]
-    lowest, highest = min(-20.0, *bounds), max(20.0, *bounds)
-    figure, grid = panel_grid(len(traffics), 3.4, 1.3 + 0.19 * len(drivers))
+    lowest = min(-20.0, *bounds)
+    highest = max(20.0, *bounds)
+    figure, grid = panel_grid(
+        len(traffics),
+        3.4,
+        1.3 + 0.19 * len(drivers),
+    )
     for place, (axes, traffic) in enumerate(zip(grid, traffics)):
-        axes.axvline(0.0, color=FAINT, lw=0.9)
-        axes.set(title=traffic, xlabel="mean reward minus MOBIL's", ylim=(len(drivers) - 0.5, -0.5))
+        axes.axvline(
+            0.0,
+            color=FAINT,
+            lw=0.9,
+        )
+        axes.set(
+            title=traffic,
+            xlabel="mean reward minus MOBIL's",
+            ylim=(len(drivers) - 0.5, -0.5),
+        )
         # Most leads lie within 20, those of random driving far below.
         axes.set_xscale("symlog", linthresh=20.0)
-        axes.set_yticks(range(len(drivers)), drivers if place % 3 == 0 else [])
-        axes.set_xticks([x for x in _LEADS if lowest <= x <= highest], minor=False)
+        axes.set_yticks(
+            range(len(drivers)),
+            drivers if place % 3 == 0 else [],
+        )
+        axes.set_xticks(
+            [x for x in _LEADS if lowest <= x <= highest],
+            minor=False,
+        )
         axes.set_xlim(1.15 * lowest, 1.15 * highest)
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_locator(NullLocator())
         for row in shown:
             if row["traffic"] != traffic:
                 continue
-            line, trained = drivers.index(row["driver"]), len(row["each"]) > 1
+            line = drivers.index(row["driver"])
+            trained = len(row["each"]) > 1
             colour = COLOURS[0] if trained else INK
-            axes.plot(_interval(row), [line] * 2, color=colour, lw=2.2, solid_capstyle="butt")
-            axes.plot(row["minus_mobil"], line, "o", color=colour)
+            axes.plot(
+                _interval(row),
+                [line] * 2,
+                color=colour,
+                lw=2.2,
+                solid_capstyle="butt",
+            )
+            axes.plot(
+                row["minus_mobil"],
+                line,
+                "o",
+                color=colour,
+            )
             if trained:
                 leads = [training["mean_reward"] - mobil[traffic] for training in row["each"]]
-                axes.plot(leads, [line] * len(leads), "|", color=COLOURS[1], ms=6, mew=1)
-    one = Line2D([], [], color=COLOURS[1], marker="|", ls="", ms=6, label="one training")
+                axes.plot(
+                    leads,
+                    [line] * len(leads),
+                    "|",
+                    color=COLOURS[1],
+                    ms=6,
+                    mew=1,
+                )
+    one = Line2D(
+        [],
+        [],
+        color=COLOURS[1],
+        marker="|",
+        ls="",
+        ms=6,
+        label="one training",
+    )
     names = {"a recipe: mean, 95 % over trainings and episodes": COLOURS[0], "a single driver": INK}
     add_legend(figure, names, [one])
     return figure

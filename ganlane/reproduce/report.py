@@ -36,12 +36,22 @@ Row = dict[str, Any]
 #: Recipe and traffic to the episodes of each training, by driver's name.
 Cells = Mapping[tuple[str, str], Mapping[str, pl.DataFrame]]
 #: Rates per 1000 km by name: the ends that they count.
-_RATES = {"crashes": FAILURES[:1], "departures": FAILURES[1:], "failures": FAILURES}
+_RATES = {
+    "crashes": FAILURES[:1],
+    "departures": FAILURES[1:],
+    "failures": FAILURES,
+}
 #: The paper's Table VI: hard and soft crashes on Traffic_IDM, of an unstated number of runs.
-PAPER_VI = {"agent_idm": (19, 2), "agent_gan": (9, 0)}
+PAPER_VI = {
+    "agent_idm": (19, 2),
+    "agent_gan": (9, 0),
+}
 #: The paper's Table VII: % of MOBIL, mean reward and its standard deviation on Traffic_GAN, 1000
 #: runs.
-PAPER_VII = {"agent_idm": (5.21, -22.33, 100.66), "agent_gan": (114.82, 33.62, 95.19)}
+PAPER_VII = {
+    "agent_idm": (5.21, -22.33, 100.66),
+    "agent_gan": (114.82, 33.62, 95.19),
+}
 _CSS = """
 body { font: 15px/1.5 sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }
 body { color: #262a30 }
@@ -72,7 +82,10 @@ def by_recipe(episodes: pl.DataFrame) -> dict[tuple[str, str], dict[str, pl.Data
     cells: dict[tuple[str, str], dict[str, pl.DataFrame]] = {}
     for (driver, traffic), frame in episodes.group_by("agent", "traffic", maintain_order=True):
         recipe = recipe_of(str(driver))
-        trainings = cells.setdefault((recipe, str(traffic)), {})
+        trainings = cells.setdefault(
+            (recipe, str(traffic)),
+            {},
+        )
         trainings[str(driver)] = frame.sort("episode")
         # The same training twice would count as two.
         if len(set(map(seed_of, trainings))) < len(trainings):
@@ -110,26 +123,41 @@ def rows(cells: Cells) -> list[Row]:
         trainings and episodes.
     """
     return [
-        _row(recipe, traffic, trainings, cells) for (recipe, traffic), trainings in cells.items()
+        _row(
+            recipe,
+            traffic,
+            trainings,
+            cells,
+        )
+        for (recipe, traffic), trainings in cells.items()
     ]
 
 
-def _row(recipe: str, traffic: str, trainings: Mapping[str, pl.DataFrame], cells: Cells) -> Row:
+def _row(
+    recipe: str,
+    traffic: str,
+    trainings: Mapping[str, pl.DataFrame],
+    cells: Cells,
+) -> Row:
     # Both [S, E]: trainings by episodes.
-    rewards, km = column(trainings, "reward"), column(trainings, pl.col("distance_m") / 1000.0)
+    rewards = column(trainings, "reward")
+    km = column(trainings, pl.col("distance_m") / 1000.0)
     mobil = _rewards(cells, SCALE_TOP, traffic)
     random_legal = _rewards(cells, SCALE_BOTTOM, traffic)
+    # What cannot be said stays None and is printed as a dash.
     score = lead = probability = None
     if mobil is not None and random_legal is not None:
         score = normalized_over_trainings(rewards, mobil, random_legal)
     if recipe == SCALE_TOP:
         mobil = None  # it is not compared with itself
     if mobil is not None:
-        lead, probability = difference(rewards, mobil), _probability(rewards, mobil)
+        lead = difference(rewards, mobil)
+        probability = _probability(rewards, mobil)
     # Counts and plain rates are of the episodes of all trainings.
     together = pl.concat(trainings.values())
     crashes = together.filter(_ended(FAILURES[:1]))
-    seconds, driven = float(together["duration_s"].sum()), float(km.sum())
+    seconds = float(together["duration_s"].sum())
+    driven = float(km.sum())
     row: Row = {
         "driver": recipe,
         "traffic": traffic,
@@ -147,21 +175,38 @@ def _row(recipe: str, traffic: str, trainings: Mapping[str, pl.DataFrame], cells
     }
     for name, ends in _RATES.items():
         rate = rate_over_trainings(column(trainings, _ended(ends)), km)
-        row |= entries(f"{name}_per_1000_km", None if rate is None else rate.scaled(1000.0))
+        row |= entries(
+            f"{name}_per_1000_km",
+            None if rate is None else rate.scaled(1000.0),
+        )
     changes = int(together["lane_changes"].sum())
     row["mean_speed_mps"] = 1000.0 * driven / seconds if seconds > 0.0 else None
     row["lane_changes_per_km"] = changes / driven if driven > 0.0 else None
     row["soft_crash_behind_per_episode"] = together["soft_crash_behind"].mean()
     row["at_fault_share"] = crashes["at_fault"].mean()
+    # Trainings one by one, so that a reader sees how far they lie apart.
     row["each"] = []
     for (name, frame), reward in zip(trainings.items(), rewards[:, None]):
         lead = None if mobil is None else difference(reward, mobil)
-        training = {"driver": name, **entries("mean_reward", over_trainings(reward))}
-        row["each"].append({**training, **entries("minus_mobil", lead), **_failures(frame)})
+        training = {
+            "driver": name,
+            **entries("mean_reward", over_trainings(reward)),
+        }
+        row["each"].append(
+            {
+                **training,
+                **entries("minus_mobil", lead),
+                **_failures(frame),
+            }
+        )
     return row
 
 
-def _rewards(cells: Cells, recipe: str, traffic: str) -> Array | None:
+def _rewards(
+    cells: Cells,
+    recipe: str,
+    traffic: str,
+) -> Array | None:
     """The rewards [S, E] of a recipe on a traffic, if it drove there."""
     trainings = cells.get((recipe, traffic))
     return None if trainings is None else column(trainings, "reward")
@@ -185,27 +230,41 @@ def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:
     traffics = dict.fromkeys(traffic for _, traffic in cells)
     for one, other in pairs:
         for traffic in traffics:
-            first, second = cells.get((one, traffic)), cells.get((other, traffic))
+            first = cells.get((one, traffic))
+            second = cells.get((other, traffic))
             if first is not None and second is not None:
-                names = {"driver": one, "over": other, "traffic": traffic}
+                names = {
+                    "driver": one,
+                    "over": other,
+                    "traffic": traffic,
+                }
                 compared.append({**names, **_compared(first, second)})
     return compared
 
 
 def _compared(first: Mapping[str, pl.DataFrame], second: Mapping[str, pl.DataFrame]) -> Row:
     """The numbers of a row of :func:`comparisons`."""
-    rewards, other_rewards = column(first, "reward"), column(second, "reward")
+    rewards = column(first, "reward")
+    other_rewards = column(second, "reward")
     crashed, other_crashed = (column(cell, _ended(FAILURES[:1])) for cell in (first, second))
     # Per 1000 episodes, which is easier to read than a share.
     more_crashes = _crash_difference(crashed, other_crashed).scaled(1000.0)
+    # Trainings of one seed started from the same random numbers.
     namesakes = dict(zip(map(seed_of, second), other_crashed))
     # A driver without trainings, say MOBIL, is held against every training of the first.
     if len(namesakes) == 1:
-        namesakes = dict.fromkeys(map(seed_of, first), other_crashed[0])
+        namesakes = dict.fromkeys(
+            map(seed_of, first),
+            other_crashed[0],
+        )
     tests = []
     for name, crashes in zip(first, crashed):
         if seed_of(name) in namesakes:
-            test = mcnemar(crashes > 0, namesakes[seed_of(name)] > 0)
+            # On the same episodes only those count in which one of the two crashed.
+            test = mcnemar(
+                crashes > 0,
+                namesakes[seed_of(name)] > 0,
+            )
             tests.append({"driver": name, **vars(test)})
     return {
         **entries("lead", difference(rewards, other_rewards)),
@@ -222,6 +281,8 @@ def _crash_difference(first: Array, second: Array) -> Estimate:
     """
     if first.any() or second.any():
         return difference(first, second)
+    # Nobody crashed, which is no proof that nobody would: the exact bound of no crash in E
+    # episodes.
     most = clopper_pearson(0, first.shape[1]).high or 0.0
     return Estimate(0.0, -most, most)
 
@@ -231,7 +292,11 @@ def _probability(first: Array, second: Array) -> Estimate | None:
     return probability_of_improvement(first, second) if len(first) + len(second) > 2 else None
 
 
-def rows_of(rows: Sequence[Row], traffics: Sequence[str], drivers: Sequence[str]) -> list[Row]:
+def rows_of(
+    rows: Sequence[Row],
+    traffics: Sequence[str],
+    drivers: Sequence[str],
+) -> list[Row]:
     """The rows of ``drivers``, which may say that they have no mask, on ``traffics``."""
     # The default command drives the agents without a mask, under names that say so.
     names = {name for driver in drivers for name in (driver, f"{driver}+none")}
@@ -263,7 +328,12 @@ def matrix_table(rows: Sequence[Row]) -> Table:
         "changes/km": number_of("lane_changes_per_km", 2),
         "close behind": number_of("soft_crash_behind_per_episode", 2),
     }
-    return Table.of("Every driver on every traffic", rows, columns, names=2)
+    return Table.of(
+        "Every driver on every traffic",
+        rows,
+        columns,
+        names=2,
+    )
 
 
 def table_vi(rows: Sequence[Row]) -> Table:
@@ -275,11 +345,28 @@ def table_vi(rows: Sequence[Row]) -> Table:
         "each training": _each("hard_crash", 0),
     }
     paper = [
-        ["paper", "Traffic_IDM", name, "not stated", *map(str, counts), "", ""]
+        [
+            "paper",
+            "Traffic_IDM",
+            name,
+            "not stated",
+            *map(str, counts),
+            "",
+            "",
+        ]
         for name, counts in PAPER_VI.items()
     ]
-    ours = rows_of(rows, ["idm", "idm_mobil"], [*PAPER_VI, "mobil"])
-    return _beside("Table VI: crashes on rule-driven traffic", paper, ours, columns)
+    ours = rows_of(
+        rows,
+        ["idm", "idm_mobil"],
+        [*PAPER_VI, "mobil"],
+    )
+    return _beside(
+        "Table VI: crashes on rule-driven traffic",
+        paper,
+        ours,
+        columns,
+    )
 
 
 def table_vii(rows: Sequence[Row]) -> Table:
@@ -295,12 +382,31 @@ def table_vii(rows: Sequence[Row]) -> Table:
         "for MOBIL; the paper does not define its own."
     )
     paper = [
-        ["paper", "Traffic_GAN", name, "1000", *(f"{value:.2f}" for value in numbers), ""]
+        [
+            "paper",
+            "Traffic_GAN",
+            name,
+            "1000",
+            *(f"{value:.2f}" for value in numbers),
+            "",
+        ]
         for name, numbers in PAPER_VII.items()
     ]
-    ours = rows_of(rows, ["gan"], [*PAPER_VII, "mobil", "random_legal"])
+    ours = rows_of(
+        rows,
+        ["gan"],
+        [*PAPER_VII, "mobil", "random_legal"],
+    )
     title = "Table VII: performance on generated traffic"
-    return replace(_beside(title, paper, ours, columns), notes=[note])
+    return replace(
+        _beside(
+            title,
+            paper,
+            ours,
+            columns,
+        ),
+        notes=[note],
+    )
 
 
 def _each(key: str, digits: int) -> Cell:
@@ -309,7 +415,10 @@ def _each(key: str, digits: int) -> Cell:
 
 
 def _beside(
-    title: str, paper: list[list[str]], ours: list[Row], columns: Mapping[str, Cell]
+    title: str,
+    paper: list[list[str]],
+    ours: list[Row],
+    columns: Mapping[str, Cell],
 ) -> Table:
     """The paper's lines above our rows."""
     names: Mapping[str, Cell] = {
@@ -318,7 +427,12 @@ def _beside(
         "driver": text_of("driver"),
         "episodes": _trainings,
     }
-    here = Table.of(title, ours, {**names, **columns}, names=3)
+    here = Table.of(
+        title,
+        ours,
+        {**names, **columns},
+        names=3,
+    )
     return replace(here, lines=[*paper, *here.lines])
 
 
@@ -340,14 +454,22 @@ def comparison_table(rows: Sequence[Row]) -> Table:
         "crashes per 1000 episodes, more": number_of("crash_difference_per_1000_episodes", 1),
         "McNemar, each training: crashed alone, p": tests,
     }
-    return Table.of("Drivers compared on the same episodes", rows, columns, names=3)
+    return Table.of(
+        "Drivers compared on the same episodes",
+        rows,
+        columns,
+        names=3,
+    )
 
 
 # Files
 
 
 def write_report(
-    folder: Path, tables: Mapping[str, Table], figures: Mapping[str, Figure], intro: Sequence[str]
+    folder: Path,
+    tables: Mapping[str, Table],
+    figures: Mapping[str, Figure],
+    intro: Sequence[str],
 ) -> Path:
     """Write every figure as PNG and SVG, and ``report.html`` with tables and figures; its path."""
     # Everything is within the page, so that it opens without a network.
@@ -359,6 +481,7 @@ def write_report(
         # Without the XML declaration, the drawing may stand in a page.
         drawing = drawing[drawing.index("<svg") :]
         parts.append(f"<h2>{name.replace('_', ' ').capitalize()}</h2>{drawing}")
+    # Figures first, tables below.
     parts += map(_html, tables.values())
     page = (
         '<!doctype html><html lang="en"><meta charset="utf-8">'
@@ -373,6 +496,7 @@ def _html(table: Table) -> str:
     # The columns with names are headings of their line.
     head = "".join(f"<th>{html.escape(name)}</th>" for name in table.headings)
     lines = [f"<tr>{head}</tr>"]
+    # Everything is escaped: names of drivers and traffics come from the user.
     for line in table.lines:
         cells = [html.escape(cell) for cell in line]
         names = "".join(f'<th scope="row">{cell}</th>' for cell in cells[: table.names])
@@ -389,12 +513,20 @@ def write_csv(path: Path, content: pl.DataFrame | Table | Sequence[Row]) -> None
     Of rows, an interval becomes two columns (``_low``, ``_high``), and lists are left out.
     """
     if isinstance(content, Table):
+        # An empty cell reads as null; a dash would make the column a text.
         shown = [["" if cell == NOTHING else cell for cell in line] for line in content.lines]
-        frame = pl.DataFrame(shown, dict.fromkeys(content.headings, pl.String), orient="row")
+        frame = pl.DataFrame(
+            shown,
+            dict.fromkeys(content.headings, pl.String),
+            orient="row",
+        )
     elif isinstance(content, pl.DataFrame):
         frame = content
     else:
-        frame = pl.DataFrame(list(map(_flat, content)), infer_schema_length=None)
+        frame = pl.DataFrame(
+            list(map(_flat, content)),
+            infer_schema_length=None,
+        )
     with atomic_path(path) as part:
         frame.write_csv(part)
 

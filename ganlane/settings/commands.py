@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, TypeAlias
@@ -58,6 +59,11 @@ class RunConfig(Record):
     columns: Columns = "auto"
 
     def __post_init__(self) -> None:
+        # Scenes and networks make tensors, so this comes first; without torch there are none.
+        if "torch" in sys.modules:
+            from ganlane.torch_settings import check_default_device
+
+            check_default_device("cuda")  # no other one can be the environment's
         super().__post_init__()
         if self.device == "cuda" and not has_cuda():
             raise UserError(

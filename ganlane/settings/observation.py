@@ -28,8 +28,9 @@ NEARNESS_M = 15.0
 #: Overlap along the road that adds 1 to the nearness, m: drivers at the side brake so hard that one
 #: metre decides.
 OVERLAP_M = 1.0
-#: The masks, one option each; see :class:`ganlane.transforms.ActionMaskTransform`.
-MASKS = tuple(option_names("mask"))
+#: The masks, in the order of the kernel's numbers; see
+#: :class:`ganlane.transforms.ActionMaskTransform`.
+MASKS = ("none", "legal", "safe")
 
 
 @dataclass(frozen=True)

@@ -358,8 +358,9 @@ def _refusal(key: str, value: Any, expected: str, field: Field[Any]) -> Paramete
 
 # --- saved settings
 
-#: A saved configuration is a few kB; a larger file is none.
-LARGEST_CONFIG_BYTES = 2**20
+#: A saved configuration is a few kB and five levels deep; PyYAML's time grows with the square of
+#: the depth, so a file of brackets would keep it busy for hours.
+LARGEST_CONFIG_BYTES, DEEPEST_CONFIG = 2**18, 50
 
 
 def saved_config(path: Path) -> dict[str, Any]:
@@ -372,9 +373,15 @@ def saved_config(path: Path) -> dict[str, Any]:
         if path.stat().st_size > LARGEST_CONFIG_BYTES:
             raise ValueError("too large")
         text = path.read_text(encoding="utf-8")
-        # Aliases can make a short file endless; a saved configuration has none.
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
-            raise ValueError("aliases")
+        depth = 0
+        for event in yaml.parse(text, yaml.SafeLoader):
+            # Aliases can make a short file endless; a saved configuration has none.
+            if isinstance(event, yaml.AliasEvent):
+                raise ValueError("aliases")
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            if depth > DEEPEST_CONFIG:
+                raise ValueError("too deep")
         data = yaml.safe_load(text)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         raise UserError(

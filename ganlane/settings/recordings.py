@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from ganlane.errors import UserError
 from ganlane.settings.commands import RunConfig
@@ -137,10 +138,11 @@ class RealismConfig(RunConfig):
     fold_weights: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        if self.against:
-            assign(self, against=traffics_of(self.against, "against"))
-        else:
-            assign(self, against={})
+        against: Any = [self.against] if isinstance(self.against, str) else self.against
+        for name in _REFERENCES:
+            if isinstance(against, Collection) and name in against:
+                raise UserError(f"against={name}: every card holds it anyway; leave it out.")
+        assign(self, against=traffics_of(against, "against") if against else {})
         super().__post_init__()
         if self.device != "cpu":
             raise UserError(
@@ -161,9 +163,6 @@ class RealismConfig(RunConfig):
                 "publish=true: the file that ships is made from all recorded scenes; give "
                 "scenes=all."
             )
-        for name in [*self.rivals(), self.traffic.label()]:
-            if name in _REFERENCES:
-                raise UserError(f"against={name}: every card holds it anyway; leave it out.")
 
     def rivals(self) -> dict[str, TrafficConfig]:
         """The traffics to compare with, by name; the traffic itself is left out."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
@@ -24,11 +24,13 @@ from ganlane.settings.record import (
 )
 from ganlane.settings.traffic import IdmMobilTrafficConfig, TrafficConfig
 
-#: Films of one episode; pages and tables of any number of episodes.
-FILMS = ("gif", "mp4", "png")
 #: Learning curves.
 CHARTS = ("png", "svg", "pdf")
-FORMATS = (*FILMS, "html", "csv", "parquet", "svg", "pdf")
+#: Any number of episodes.
+PAGES = ("html", "csv", "parquet")
+#: One episode.
+FILMS = ("gif", "mp4", "png")
+FORMATS = tuple(dict.fromkeys((*FILMS, *PAGES, *CHARTS)))
 MOST_EPISODES = 12
 #: A GIF of a whole episode takes minutes to draw, and tens of MB.
 GIF_S = 30.0
@@ -101,7 +103,7 @@ class RenderConfig(DrivingConfig):
         agents: html, csv, parquet: several instead of driver, for instance
             agents=[mobil,agent_idm].
         episodes: html, csv, parquet: several instead of episode, for instance episodes=[0,1,2].
-        run: instead of an episode: learning curves of runs, run=FOLDER or run=FOLDER,FOLDER.
+        run: instead of an episode: learning curves of runs, run=FOLDER or 'run=[FOLDER,FOLDER]'.
         crashes: instead of an episode: the crashes.json of ganlane reproduce, whose episodes are
             driven again with their actions; agents, episodes and traffics choose among them.
         traffics: of crashes: on these traffics alone.
@@ -117,7 +119,7 @@ class RenderConfig(DrivingConfig):
     episode: Seed = 0
     agents: Annotated[list[str], DIFFERENT] | None = None
     episodes: Annotated[list[Seed], DIFFERENT] | None = None
-    run: list[Text] | None = None
+    run: Annotated[list[Text], DIFFERENT] | None = None
     crashes: Text | None = None
     traffics: Names | None = None
     # how, and where it goes
@@ -129,87 +131,83 @@ class RenderConfig(DrivingConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.out is not None:
-            path = Path(self.out)
-            if path.is_dir() or not os.access(path.parent, os.W_OK):
-                raise UserError(
-                    f"out={path}: expected a file in a folder that exists and can be written to; "
-                    "make it first."
-                )
-        ending = self._ending()
-        if ending and ending not in FORMATS:
-            raise UserError(
-                f"out={self.out}: expected one of {', '.join(FORMATS)}; give the file one of these "
-                "endings."
-            )
-        if ending and ending != self.kind:
-            raise UserError(
-                f"out={self.out}: the ending says {ending} and format {self.kind}; give one of "
-                "them."
-            )
-        if self.run is not None and self.kind not in CHARTS:
-            raise UserError(
-                f"format={self.kind}: learning curves are one of {', '.join(CHARTS)}; choose one "
-                "of these."
-            )
-        if self.run is None and self.kind in ("svg", "pdf"):
-            raise UserError(
-                f"format={self.kind}: for learning curves only; episodes are gif, mp4, png, html, "
-                "csv or parquet."
-            )
-        if self.kind == "mp4" and find_spec("imageio_ffmpeg") is None:
-            raise UserError(
-                "format=mp4: needs the extra 'video'; run `pip install \"ganlane[video]\"` or "
-                "choose format=gif."
-            )
-        if self.crashes is not None:
-            if self.run is not None:
-                raise UserError(
-                    "crashes and run: either crashes or learning curves are drawn; leave one of "
-                    "them out."
-                )
-            if self.kind in FILMS:
-                raise UserError(
-                    f"format={self.kind}: shows one episode; crashes are html, csv or parquet."
-                )
-            return
-        if self.traffics is not None:
-            raise UserError(
+        kind, ending, count = self.kind, self._ending, len(self.pairs())
+        path = Path(self.out or "")
+        is_film = kind in FILMS
+        episodes, charts = ", ".join(FILMS + PAGES), ", ".join(CHARTS)
+        # Whether something is wrong, and the sentence about it.
+        checks = [
+            (
+                path.name and (path.is_dir() or not os.access(path.parent, os.W_OK)),
+                f"out={path}: expected a file in a folder that exists and can be written to; make "
+                "it first.",
+            ),
+            (
+                ending not in ("", kind),
+                f"out={path}: the ending says {ending} and format {kind}; give one of them.",
+            ),
+            (
+                self.run and self.crashes,
+                "crashes and run: either crashes or learning curves are drawn; leave one of them "
+                "out.",
+            ),
+            (
+                self.run and kind not in CHARTS,
+                f"format={kind}: learning curves are one of {charts}; choose one of these.",
+            ),
+            (
+                not self.run and kind not in FILMS + PAGES,
+                f"format={kind}: for learning curves only, or unknown; episodes are one of "
+                f"{episodes}.",
+            ),
+            (
+                self.crashes and is_film,
+                f"format={kind}: shows one episode; crashes are one of {', '.join(PAGES)}.",
+            ),
+            (
+                not self.run and is_film and count > 1,
+                f"format={kind}: a film shows one episode, not {count}; use format=html for "
+                "several.",
+            ),
+            (
+                not self.crashes and count > MOST_EPISODES,
+                f"agents x episodes: {count} episodes; choose at most {MOST_EPISODES}.",
+            ),
+            (
+                self.traffics and not self.crashes,
                 f"traffics={as_typed(self.traffics)}: goes with crashes=FILE; else give "
-                "traffic=NAME."
-            )
-        count = len(self.pairs())
-        if self.kind in FILMS and count > 1:
-            raise UserError(
-                f"format={self.kind}: a film shows one episode, not {count}; use format=html for "
-                "several."
-            )
-        if count > MOST_EPISODES:
-            raise UserError(f"agents x episodes: {count} episodes; choose at most {MOST_EPISODES}.")
+                "traffic=NAME.",
+            ),
+            (
+                kind == "mp4" and find_spec("imageio_ffmpeg") is None,
+                "format=mp4: needs the extra 'video'; run `pip install \"ganlane[video]\"` or "
+                "choose format=gif.",
+            ),
+        ]
+        for is_wrong, sentence in checks:
+            if is_wrong:
+                raise UserError(sentence)
 
+    @property
     def _ending(self) -> str:
         """The ending of ``out``, without the dot; empty: none."""
         return Path(self.out or "").suffix.removeprefix(".").lower()
 
     @property
     def kind(self) -> str:
-        """``format``, else the ending of ``out``, else png for ``run``, html for ``crashes``, gif
-        for episodes.
-        """
+        """``format``, else the ending of ``out``, else what suits what is drawn."""
         default = "png" if self.run is not None else "gif" if self.crashes is None else "html"
-        return self.format or self._ending() or default
+        return self.format or self._ending or default
 
     @property
-    def end_s(self) -> float | None:
-        """``film.end_s``, or the default end of a GIF; None: the end of the episode."""
+    def look(self) -> FilmConfig:
+        """``film``, with the default end of a GIF where none is given."""
         if self.film.end_s is not None or self.kind != "gif":
-            return self.film.end_s
-        return self.film.start_s + GIF_S
+            return self.film
+        return replace(self.film, end_s=self.film.start_s + GIF_S)
 
     def pairs(self) -> list[tuple[str, int]]:
         """The episodes to record: agent and number of each."""
-        return [
-            (agent, episode)
-            for episode in (self.episodes if self.episodes is not None else [self.episode])
-            for agent in (self.agents if self.agents is not None else [self.driver])
-        ]
+        agents = [self.driver] if self.agents is None else self.agents
+        episodes = [self.episode] if self.episodes is None else self.episodes
+        return [(agent, episode) for episode in episodes for agent in agents]

@@ -4,8 +4,8 @@
 It is called with those of ``road, stream, idm, mobil, steering, spawn`` that its signature asks
 for, and with the record's further keys. A model of your own needs no more than its import path::
 
-    python -m ganlane.evaluate 'traffics=[my.module.MyTraffic]'
-    python -m ganlane.train traffic=idm traffic._target_=my.module.MyTraffic traffic.pace=0.9
+    ganlane evaluate 'traffics=[my.module.MyTraffic]'
+    ganlane train traffic=idm traffic._target_=my.module.MyTraffic traffic.pace=0.9
 """
 
 from __future__ import annotations

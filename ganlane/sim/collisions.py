@@ -31,10 +31,14 @@ def boxes_overlap(
         dx, dy: from the centre of the first box to the centre of the other, m.
         heading, length, width: of the first box, rad and m; ``other_*``: of the other.
     """
-    c, s = torch.cos(heading), torch.sin(heading)
-    oc, os = torch.cos(other_heading), torch.sin(other_heading)
+    c = torch.cos(heading)
+    s = torch.sin(heading)
+    oc = torch.cos(other_heading)
+    os = torch.sin(other_heading)
     # Of the angle between the two boxes.
-    cos, sin = (c * oc + s * os).abs(), (c * os - s * oc).abs()
+    cos = (c * oc + s * os).abs()
+    sin = (c * os - s * oc).abs()
+    # Separating axes: two rectangles are apart where the axis along or across one of them says so.
     boxes = [(0.5 * length, 0.5 * width), (0.5 * other_length, 0.5 * other_width)]
 
     def separated(
@@ -64,6 +68,7 @@ def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
         if dx.numel() >= FEW:
             ego = Vehicles(*(field[row, 0] for field in v))
             near = Vehicles(*(field[row, column + 1] for field in v))
+            # Only the near pairs are tested; all others are apart.
             hits = _hits(dx[row, column], ego, near)
             return torch.zeros_like(both).index_put((row, column), hits) & both
     return _hits(dx, v.columns(slice(0, 1)), v.columns(slice(1, None))) & both
@@ -71,6 +76,7 @@ def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
 
 def pair_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     """Whether vehicles i and j overlap, bool [N, M, M], false on the diagonal."""
+    # [N, M, 1] against [N, 1, M]: every vehicle with every other.
     one, other = (Vehicles(*(field.unsqueeze(axis) for field in vehicles)) for axis in (2, 1))
     hit = _hits(road.distance_ahead(one.x, other.x), one, other) & other.valid & one.valid
     return hit & ~torch.eye(vehicles.x.shape[1], dtype=torch.bool, device=vehicles.x.device)
@@ -97,4 +103,5 @@ def dangerously_close(
 
     Gap in m, closing speed in m/s.
     """
+    # A product, since the time to collision divides by a closing speed that may be 0.
     return (gap < gap_m) | (gap < ttc_s * closing_speed)

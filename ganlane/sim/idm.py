@@ -80,11 +80,13 @@ def idm_acceleration(
         parameters: common to all drivers, or per driver (:class:`DriverIdm`).
         headway_s: time headway per vehicle, s, instead of Table V's.
     """
+    # The exponent 4 of the free-road term, without a power.
     ratio = speed / desired_speed
     square = ratio * ratio
     wanted = desired_gap(speed, speed - leader_speed, parameters, headway_s)
     interaction = wanted / gap.clamp_min(SMALLEST_GAP_M)
     acceleration = parameters.max_acceleration * (1.0 - square * square - interaction * interaction)
+    # Where they overlap the interaction term is huge: the bound makes it the hardest braking.
     return acceleration.clamp(parameters.min_acceleration, parameters.max_acceleration)  # type: ignore[arg-type]
 
 
@@ -104,10 +106,17 @@ def acceleration_behind(
     headway_s: Tensor | float | None = None,
 ) -> Tensor:
     """IDM acceleration of each observer behind ``ahead`` [N, K, L] in L lanes, m/s2."""
-    speed, desired = scene.observers.speed[..., None], scene.observers.desired_speed[..., None]
+    # [N, K, 1], to broadcast over the L lanes.
+    speed = scene.observers.speed[..., None]
+    desired = scene.observers.desired_speed[..., None]
     headway_s = headway_s[..., None] if isinstance(headway_s, Tensor) else headway_s
     return idm_acceleration(
-        speed, desired, ahead.gap, ahead.speed, parameters.per_lane(), headway_s
+        speed,
+        desired,
+        ahead.gap,
+        ahead.speed,
+        parameters.per_lane(),
+        headway_s,
     )
 
 
@@ -152,13 +161,16 @@ def _survives(
     leader_now = torch.tensor(leader_speed, dtype=torch.float64)
     gap, speed, leader_now = torch.broadcast_tensors(gap, speed, leader_now)
     smallest = start = gap
+    # Trapezoids, as vehicles move in the simulation (dynamics.advance).
     for _ in range(round(HORIZON_S / PHYSICS_STEP_S)):
         acceleration = idm_acceleration(speed, desired_speed, gap, leader_now, idm)
         next_speed = (speed + acceleration * PHYSICS_STEP_S).clamp_min(0.0)
         next_leader = (leader_now + idm.min_acceleration * PHYSICS_STEP_S).clamp_min(0.0)
         gap = gap + 0.5 * PHYSICS_STEP_S * (leader_now + next_leader - speed - next_speed)
-        speed, leader_now = next_speed, next_leader
+        speed = next_speed
+        leader_now = next_leader
         smallest = torch.minimum(smallest, gap)
+    # Where IDM's gap is cut off already at the start, it must only not shrink.
     return smallest >= start.clamp(1e-9, SMALLEST_GAP_M)
 
 
@@ -183,12 +195,14 @@ def least_gap(
     idm: IdmParameters = TABLE_V,
 ) -> float:
     """Smallest gap, m, in steps of 0.1 m, from which on :func:`can_brake` is true."""
+    # From full speed to a stop; a fifth and 10 m more is surely enough.
     stopping_m = speed_mps * speed_mps / (-2.0 * idm.min_acceleration)
     gaps = torch.arange(1, int(10.0 * (1.2 * stopping_m + 10.0))).double() * 0.1
     speed = torch.full_like(gaps, speed_mps)
     crashes = ~_survives(gaps, speed, leader_speed_mps, desired_speed_mps, idm)
     if not bool(crashes.any()):
         return 0.1
+    # One step beyond the largest gap that is too small.
     return 0.1 * (1 + int(crashes.nonzero().max()) + 1)
 
 

@@ -49,8 +49,11 @@ def lane_accelerations(scene: Scene, lanes: Tensor, idm: AnyIdm) -> LaneAccelera
 
     With per-driver parameters, each driver predicts the others with its own parameters.
     """
-    ahead, behind = leader(scene, lanes), follower(scene, lanes)
-    speed, length = scene.observers.speed[..., None], scene.observers.length[..., None]
+    ahead = leader(scene, lanes)
+    behind = follower(scene, lanes)
+    speed = scene.observers.speed[..., None]
+    length = scene.observers.length[..., None]
+    # The new follower with the observer in front of it ...
     driver = (behind.speed, behind.desired_speed)
     with_it = idm_acceleration(*driver, behind.gap, speed, idm.per_lane())
     # Without the observer its follower is behind its leader, or alone.
@@ -58,6 +61,7 @@ def lane_accelerations(scene: Scene, lanes: Tensor, idm: AnyIdm) -> LaneAccelera
     leader_speed = torch.where(free, behind.speed, ahead.speed)
     gap = torch.where(free, FREE_GAP_M, behind.gap + length + ahead.gap)
     without = idm_acceleration(*driver, gap, leader_speed, idm.per_lane())
+    # Nobody behind: nobody is hindered or relieved.
     nobody = ~behind.exists
     return LaneAccelerations(
         acceleration_behind(scene, ahead, idm),
@@ -70,7 +74,9 @@ def mobil_criterion(
     there: LaneAccelerations, here: LaneAccelerations, mobil: AnyMobil
 ) -> tuple[Tensor, Tensor]:
     """Incentive of a change from ``here`` [N, K, 1] to ``there`` [N, K, L], m/s2; whether safe."""
-    burden, relief = there.with_it - there.without, here.without - here.with_it
+    # What the new follower loses, and what the old one gains.
+    burden = there.with_it - there.without
+    relief = here.without - here.with_it
     incentive = (
         there.observer
         - here.observer
@@ -84,6 +90,7 @@ def safe_change(
     scene: Scene, lane: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV
 ) -> Tensor:
     """MOBIL's safety criterion for a change into ``lane`` [N, K] (float), bool."""
+    # Safety does not depend on where the vehicle is now: that lane stands in for it.
     there = lane_accelerations(scene, lane[..., None], idm)
     _, safe = mobil_criterion(there, there, mobil)
     return safe[..., 0]
@@ -103,7 +110,8 @@ def one_at_a_time(
     Too close means nearer than ``exclusive_m`` (centre to centre), or requiring unsafe braking.
     MOBIL's criteria do not cover this case, since neither vehicle is in that lane yet.
     """
-    wants, vehicles = wish != 0, scene.vehicles
+    wants = wish != 0
+    vehicles = scene.vehicles
     if not reads_are_cheap(wish):
         return torch.where(_gives_way(vehicles, scene.road, wish, idm, mobil), 0, wish)
     # Rivals are rare: among all pairs a decision of idm_random takes 5 % longer with 1024 rows.
@@ -126,11 +134,22 @@ def _gives_way(
     vehicles: Vehicles, road: Road, wish: Tensor, idm: AnyIdm, mobil: AnyMobil
 ) -> Tensor:
     """Whether a vehicle ahead that wants the same lane is too close, bool [N, M]."""
-    pairs, wants, target = compare(vehicles, road), wish != 0, vehicles.target_lane + wish
+    # Two that want the same lane from its two sides do not see each other in it yet.
+    pairs = compare(vehicles, road)
+    wants = wish != 0
+    target = vehicles.target_lane + wish
+    # [N, i, j]: i and j want the same lane, and j is ahead.
     same = wants[:, None, :] & wants[:, :, None] & (target[:, None, :] == target[:, :, None])
-    speed, desired = vehicles.speed[:, :, None], vehicles.desired_speed[:, :, None]
+    speed = vehicles.speed[:, :, None]
+    desired = vehicles.desired_speed[:, :, None]
     leader_speed = vehicles.speed[:, None, :]
-    demand = idm_acceleration(speed, desired, pairs.ahead, leader_speed, idm.per_lane())
+    demand = idm_acceleration(
+        speed,
+        desired,
+        pairs.ahead,
+        leader_speed,
+        idm.per_lane(),
+    )
     near = (pairs.distance < mobil.exclusive_m) | (demand < -mobil.safe_deceleration)
     return (same & near & (pairs.order > 0)).any(-1)
 
@@ -145,13 +164,17 @@ def mobil_wishes(
     """
     vehicles = scene.observers
     lane = vehicles.target_lane.to(vehicles.x.dtype)
+    # Own lane first, then left and right; all three in one search.
     lanes = torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1)
     accelerations = lane_accelerations(scene, lanes, idm)
-    here, there = accelerations.of(slice(0, 1)), accelerations.of(slice(1, None))
+    here = accelerations.of(slice(0, 1))
+    there = accelerations.of(slice(1, None))
     incentive, safe = mobil_criterion(there, here, mobil)
+    # The road may have no such lane.
     exists = torch.stack((lane + 1.0 <= road.lanes - 1, lane - 1.0 >= 0), dim=-1)
     pays = exists & safe & (incentive > mobil.threshold)
     left, right = torch.where(pays, incentive, -torch.inf).unbind(-1)
+    # A driver decides anew only when its last change is complete.
     free = lane_change_done(vehicles, road) & vehicles.valid
     wish = torch.where(left >= right, 1, -1)
     return torch.where(free & torch.isfinite(torch.maximum(left, right)), wish, 0)

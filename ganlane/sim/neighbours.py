@@ -129,6 +129,7 @@ def _beyond(number: Tensor, where: Tensor) -> Tensor:
 def compare(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Pairs:
     """The :class:`Pairs` of all vehicles as observers, or of a slice of them."""
     distance = road.distance_ahead(vehicles.x[:, which, None], vehicles.x[:, None, :])
+    # Between the bumpers: the distance of the centres less half of both lengths.
     half = 0.5 * vehicles.length
     gap = distance.abs() - (half[:, which, None] + half[:, None, :])
     index = torch.arange(vehicles.x.shape[1], device=vehicles.x.device)
@@ -139,7 +140,8 @@ def compare(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Pairs
 def perceive(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Scene:
     """The :class:`Scene` of ``vehicles`` as seen by all of them or by a slice of them."""
     body = body_lanes(vehicles, road)
-    attention, x = with_target(body, vehicles), vehicles.x
+    attention = with_target(body, vehicles)
+    x = vehicles.x
     sorts = (
         which == slice(None)
         and x.shape[0] * x.shape[1] ** 2 >= SORTS_FROM
@@ -169,9 +171,11 @@ def in_lane(scene: Scene, lane: Tensor) -> Tensor:
 
     Bool [N, K, M], or [N, K, L, M] for L lanes [N, K, L].
     """
+    # [N, 1, ..., M], against lanes of one or two more axes.
     low, high = scene.presence
     for _ in range(lane.ndim - 1):
-        low, high = low.unsqueeze(1), high.unsqueeze(1)
+        low = low.unsqueeze(1)
+        high = high.unsqueeze(1)
     asked = lane[..., None]
     return (low <= asked) & (asked <= high)
 
@@ -186,6 +190,7 @@ def leader(scene: Scene, lane: Tensor) -> Neighbour:
     if scene.queue is None:
         ends = _candidates(scene, lanes, 1)
         rear = ends.amin(-1)
+        # Of level vehicles the lowest speed, so that their order does not matter.
         its_speed = _beyond(speed[:, None, None, :], ends > rear[..., None]).amin(-1)
     else:
         key = _nearest_key(scene, scene.queue, lanes, 1, _ordered(speed) - _INT32_MIN)
@@ -208,8 +213,11 @@ def follower(scene: Scene, lane: Tensor) -> Follower:
     else:
         numbers = torch.arange(vehicles.x.shape[1], device=lane.device)
         key = _nearest_key(scene, scene.queue, lanes, -1, numbers)
-        front, index = _unordered(key >> 32), key & 0xFFFFFFFF
-    gap, flat = _gap(scene, front, -1).view(lane.shape), index.flatten(1)
+        front = _unordered(key >> 32)
+        index = key & 0xFFFFFFFF
+    gap = _gap(scene, front, -1).view(lane.shape)
+    # What else is known of the vehicle that was found.
+    flat = index.flatten(1)
     speed = vehicles.speed.gather(1, flat).view(lane.shape)
     desired_speed = vehicles.desired_speed.gather(1, flat).view(lane.shape)
     return Follower(gap, speed, desired_speed, gap < FREE_GAP_M)
@@ -223,7 +231,9 @@ def _candidates(scene: Scene, lanes: Tensor, side: int) -> Tensor:
     On a ring from the observer on; else on the road, so that it is one number per vehicle, whoever
     looks.
     """
-    v, pairs = scene.vehicles, scene.pairs
+    # On a ring nobody is first, so ends are seen from each observer.
+    v = scene.vehicles
+    pairs = scene.pairs
     x = v.x[:, None, :] if scene.road.ring_m is None else pairs.distance
     end = side * x - (0.5 * v.length)[:, None, :]
     elsewhere = pairs.order <= 0 if side > 0 else pairs.order >= 0
@@ -266,7 +276,9 @@ def _nearest_key(
     if isinstance(lanes, Tensor):
         lanes = int(lanes.max())
     if side < 0:  # from the rear
-        turn, place = turn.flip(1), count - 1 - place
+        turn = turn.flip(1)
+        place = count - 1 - place
+    # Everybody's near end, in the order of the road.
     key = ((_ordered(side * v.x - 0.5 * v.length) << 32) | second).gather(1, turn)
     low, high = (end.gather(1, turn) for end in scene.presence)
     number = torch.arange(lanes, device=v.x.device)[:, None, None]
@@ -274,6 +286,7 @@ def _nearest_key(
     key = torch.where((low <= number) & (number <= high), key, _NOBODY)
     # Entry k of a lane: the nearest among the first k in the queue; among none it is nobody.
     nearest = pad(key[..., :-1], (1, 0), value=_NOBODY).cummin(-1).values.transpose(0, 1).flatten(1)
+    # Place of the observer's entry: lane by lane, as many entries as vehicles.
     entry = lane.clamp(0, lanes - 1).long() * count + place[..., None]
     neighbour = nearest.gather(1, entry.flatten(1)).view(lane.shape)
     return torch.where((lane >= 0) & (lane < lanes), neighbour, _NOBODY)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ganlane.settings.episode import Stream as Stream  # also known as ganlane.sim.Stream
 
+# Constants of splitmix64; torch computes in signed integers.
 _GOLDEN = -7046029254386353131  # 0x9E3779B97F4A7C15 as a signed 64-bit integer
 _MIX_A = -4658895280553007687  # 0xBF58476D1CE4E5B9
 _MIX_B = -7723592293110705685  # 0x94D049BB133111EB
@@ -58,6 +59,7 @@ class Purpose(IntEnum):
 
 def _shift(h: Tensor, bits: int) -> Tensor:
     """Logical right shift of int64."""
+    # torch shifts the sign in from the left; it is masked away.
     return (h >> bits) & ((1 << (64 - bits)) - 1)
 
 
@@ -78,12 +80,14 @@ def absorb(key: Tensor, field: Tensor | int) -> Tensor:
 
 def episode_key(stream: int, seed: Tensor, episode: Tensor) -> Tensor:
     """Key of an episode, [N] int64, from the stream and the counters [N] int64."""
+    # The 0 after the stream stays: without it all episodes so far would change.
     start = torch.full_like(seed, int(stream))
     return absorb(absorb(absorb(start, 0), seed), episode)
 
 
 def draw_keys(key: Tensor, step: Tensor | int, vehicles: int, purposes: list[int]) -> Tensor:
     """Keys [N, vehicles, len(purposes)] from episode keys [N] and physics steps [N] or one int."""
+    # Field by field, from what all share to what is one number's own.
     at_step = absorb(key, step)
     vehicle = torch.arange(vehicles, device=key.device)
     purpose = torch.tensor(purposes, device=key.device)
@@ -92,6 +96,7 @@ def draw_keys(key: Tensor, step: Tensor | int, vehicles: int, purposes: list[int
 
 def to_uniform(keys: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
     """Uniform numbers in [0, 1), of the same shape as ``keys``, from their highest bits."""
+    # As many bits as the mantissa holds: every number is exact, and 1 is never reached.
     bits = 53 if dtype == torch.float64 else 24
     return _shift(keys, 64 - bits).to(dtype) * 2.0**-bits
 
@@ -119,5 +124,6 @@ def normal(
     Independent of :func:`uniform` at the same place.
     """
     keys = draw_keys(key, step, vehicles, purposes)
+    # 1 - u lies in (0, 1], so the logarithm is finite; a second key per number for the angle.
     radius = torch.sqrt(-2.0 * torch.log(1.0 - to_uniform(absorb(keys, 1), dtype)))
     return radius * torch.cos(2.0 * math.pi * to_uniform(absorb(keys, 2), dtype))

@@ -41,9 +41,14 @@ def cut_in(
     reaction.
     """
     _at_least(lanes, 2, "cut_in")
+    # Next to the leftmost, from which the other vehicle comes.
     lane = lanes - 2  # the ego's
     cutter = SceneVehicle(
-        gap_m + LENGTH_M, lane + 1, cutter_speed_mps, cutter_speed_mps, target_lane=lane
+        gap_m + LENGTH_M,
+        lane + 1,
+        cutter_speed_mps,
+        cutter_speed_mps,
+        target_lane=lane,
     )
     cars = [
         SceneVehicle(0.0, lane, speed_mps, desired_speed_mps),
@@ -70,7 +75,18 @@ def stalled_car(
     A vehicle follows the ego, and five vehicles ``spacing_m`` apart pass in the next lane, if there
     is one.
     """
-    beside = () if lanes == 1 else _column(1, 5, 0.5 * spacing_m, spacing_m, speed_mps, 22.0)
+    beside = (
+        ()
+        if lanes == 1
+        else _column(
+            1,
+            5,
+            0.5 * spacing_m,
+            spacing_m,
+            speed_mps,
+            22.0,
+        )
+    )
     return (
         SceneVehicle(0.0, 0, speed_mps, desired_speed_mps),
         stalled(distance_m, 0, lane_width_m),
@@ -132,14 +148,19 @@ def stop_and_go(
     and a group that approaches it at ``speed_mps`` in steady following. The ego is the last but one
     of the rightmost lane. The desired speed of the others is 15 m/s.
     """
+    # Centre to centre; a tenth more than IDM's own gap, since speeds are jittered.
     steady = LENGTH_M + 1.1 * (idm.min_gap_m + idm.headway_s * speed_mps)
     queue = LENGTH_M + idm.min_gap_m
+    # Five seconds away, so that the group has time to brake.
     approach = 5.0 * speed_mps
-    speeds, spacings = [speed_mps] * 2, [0.0, steady]
+    speeds = [speed_mps] * 2
+    spacings = [0.0, steady]
     for _ in range(waves):
         speeds += [0.0] * per_wave + [speed_mps] * per_wave
         spacings += [steady] + [queue] * (per_wave - 1) + [approach] + [steady] * (per_wave - 1)
+    # From the head of the column backwards.
     column = [(-x, speed) for x, speed in zip(accumulate(spacings), speeds, strict=True)]
+    # The last but one: somebody behind it can run into it.
     ego_x, ego_speed = column[-2]
     cars = [SceneVehicle(ego_x, 0, ego_speed, desired_speed_mps)]
     for lane in range(lanes):

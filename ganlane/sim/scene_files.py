@@ -51,6 +51,7 @@ def read_scene(
     path = Path(path)
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a scene as .csv or .json.")
+    # Endings are checked before anything is read.
     if path.suffix.lower() not in (".csv", ".json"):
         raise UserError(f"{path}: expected a scene as .csv or .json; rename or convert the file.")
     if path.stat().st_size > _MOST_BYTES:
@@ -68,6 +69,7 @@ def read_scene(
         rows = _read_csv(path, text)
     else:
         rows, road = _read_json(path, text)
+    # The file's numbers hold unless it gives none.
     width = _agreed(path, "lane_width_m", road, lane_width_m) or LANE_WIDTH_M
     count = _agreed(path, "lanes", road, lanes) or _lanes_in(rows, width)
     return FixedScene(tuple(rows), Road(int(count), float(width)), name=str(path))
@@ -112,6 +114,7 @@ def _read_csv(path: Path, text: str) -> list[SceneVehicle]:
         )
     check_count(str(path), len(lines) - 1)
     where, _, line = lines[0]
+    # The first line that is no comment.
     header = _cells(line, where)
     _check_names(header, where)
     if "x_m" not in header or not {"lane", "y_m"} & set(header):
@@ -126,6 +129,7 @@ def _read_csv(path: Path, text: str) -> list[SceneVehicle]:
             raise UserError(
                 f"{where}: {len(cells)} cells, the header has {len(header)}; fix the line."
             )
+        # An empty cell is as a column that is not there: the default.
         values = {name: cell for name, cell in zip(header, cells) if cell}
         rows.append(_row(values, where, origin))
     return rows
@@ -145,6 +149,7 @@ def _read_json(path: Path, text: str) -> tuple[list[SceneVehicle], dict[str, Any
     # A ValueError without a place in the file: a whole number of thousands of digits.
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: not JSON ({error}); fix the file.") from error
+    # A bare list of vehicles is short for an object without a road.
     if isinstance(content, list):
         content = {"vehicles": content}
     if not isinstance(content, dict) or not isinstance(content.get("vehicles"), list):

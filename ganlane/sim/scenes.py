@@ -143,7 +143,8 @@ class FixedScene:
 
     def check(self, road: Road, idm: IdmParameters) -> None:
         """Raise :class:`UserError` if ``road`` is another, or a vehicle cannot brake in time."""
-        lanes, width = self.road.lanes, self.road.lane_width_m
+        lanes = self.road.lanes
+        width = self.road.lane_width_m
         if (lanes, width) != (road.lanes, road.lane_width_m) or road.ring_m is not None:
             ring = " and is a ring" if road.ring_m else ""
             raise UserError(
@@ -156,11 +157,22 @@ class FixedScene:
 
     def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:
         """The scene once per key [N], varied by the jitter."""
-        n, m = key.shape[0], self.vehicles
+        n = key.shape[0]
+        m = self.vehicles
         whole = Vehicles(*(value.expand(n, m).clone() for value in self.base(dtype, key.device)))
         if self.jitter_m == 0 and self.jitter_mps == 0:
             return whole
-        u = 2.0 * uniform(key, 0, m, [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED], dtype) - 1.0
+        u = (
+            2.0
+            * uniform(
+                key,
+                0,
+                m,
+                [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED],
+                dtype,
+            )
+            - 1.0
+        )
         is_ego = torch.arange(m, device=key.device) == 0
         x = torch.where(is_ego, whole.x, whole.x + self.jitter_m * u[..., 0])
         varied = (whole.speed + self.jitter_mps * u[..., 1]).clamp_min(0.0)
@@ -170,12 +182,15 @@ class FixedScene:
         self, dtype: torch.dtype = torch.float64, device: torch.device | None = None
     ) -> Vehicles:
         """The scene without jitter, fields [1, M]."""
-        rows, road = self.rows, self.road
+        rows = self.rows
+        road = self.road
 
         def column(values: Sequence[float], kind: torch.dtype = dtype) -> Tensor:
             return torch.tensor([values], dtype=kind, device=device)
 
-        targets, seen = [], []
+        targets = []
+        seen = []
+        # What a row leaves out follows from the scene.
         usual = [self.ego_visibility] + [self.others_visibility] * (len(rows) - 1)
         for row, kind in zip(rows, usual):
             targets.append(row.lane_on(road) if row.target_lane is None else row.target_lane)
@@ -252,13 +267,16 @@ def _fault(row: SceneVehicle, road: Road) -> str:
     for name in ("desired_speed_mps", "length_m", "width_m"):
         if getattr(row, name) < SMALLEST:
             return f"{name}={getattr(row, name):g}: expected a number above 0"
+    # Then the place across the road: on it, in its lane, and next to its target lane.
     lanes = int(road.lanes)
     if row.lane is None and row.y_m is None:
         return "neither lane nor y_m is given; give one of them"
     for name, lane in (("lane", row.lane), ("target_lane", row.target_lane)):
         if lane is not None and not 0 <= lane < lanes:
             return f"{name}={lane}: expected 0 to {lanes - 1}, the road has {lanes} lanes"
-    right, left, y = float(road.right_edge_m()), float(road.left_edge_m()), row.y_on(road)
+    right = float(road.right_edge_m())
+    left = float(road.left_edge_m())
+    y = row.y_on(road)
     if y - 0.5 * row.width_m < right - 1e-6 or y + 0.5 * row.width_m > left + 1e-6:
         return (
             f"y={y:g} m, width {row.width_m:g} m: expected on the road, which runs from "
@@ -277,6 +295,8 @@ def _fault(row: SceneVehicle, road: Road) -> str:
 def check_overlaps(scene: FixedScene) -> None:
     """Raise :class:`UserError` if two vehicles overlap, or may do so with the largest jitter."""
     vehicles = scene.base()
+    # Two vehicles may both be shifted, towards each other: each counts as longer by twice the
+    # shift.
     longer = torch.full_like(vehicles.x, 2.0 * scene.jitter_m)
     longer[:, 0] = 0.0
     longest = vehicles.with_(length=vehicles.length + longer)
@@ -298,12 +318,15 @@ def check_braking(scene: FixedScene, idm: IdmParameters) -> None:
     """
     vehicles = scene.base()
     seen = perceive(vehicles, scene.road)
+    # Leaders in the lane that a vehicle is in, and in the one it is moving to.
     shares = in_lane(seen, seen.attention.low) | in_lane(seen, seen.attention.high)
     ahead = shares & (vehicles.x[:, None, :] > vehicles.x[:, :, None])
     varied = (vehicles.speed > 0) * scene.jitter_mps
+    # Two shifted vehicles come closer by twice the jitter, a shifted one and the ego by once.
     slack = scene.jitter_m * (2.0 - (torch.arange(scene.vehicles) == 0).double())
     gap = seen.pairs.ahead - torch.minimum(slack[:, None], slack[None, :])
-    fastest, slowest = vehicles.speed + varied, (vehicles.speed - varied).clamp_min(0.0)
+    fastest = vehicles.speed + varied
+    slowest = (vehicles.speed - varied).clamp_min(0.0)
     needed = needed_deceleration(fastest[:, :, None], slowest[:, None, :], gap)
     needed = torch.where(ahead, needed, 0.0)[0]
     if bool((needed > -idm.min_acceleration).any()):
@@ -334,14 +357,24 @@ def _first_overlap(scene: FixedScene, idm: IdmParameters) -> tuple[int, int, flo
     """The first two vehicles that overlap and the time, s; None without an overlap."""
     # Fewer of large scenes, for which every pair of vehicles is looked at.
     most = max(1, MOST_VEHICLES**2 // scene.vehicles**2)
+    # Without jitter all episodes are the same, and one drive tells.
     rows = min(DRIVES, most) if scene.jitter_m or scene.jitter_mps else 1
     numbers = torch.arange(rows)
     v = scene(episode_key(Stream.TRAIN, torch.zeros_like(numbers), numbers), torch.float64)
-    steering, centre = torch.zeros_like(v.x), scene.road.centre_of(v.target_lane, v.y.dtype)
+    steering = torch.zeros_like(v.x)
+    centre = scene.road.centre_of(v.target_lane, v.y.dtype)
     for step in range(1, round(DRIVE_S / PHYSICS_STEP_S) + 1):
         acceleration = following_acceleration(perceive(v, scene.road), idm)
         steering = steer(steering, v.y, v.heading, v.speed, centre, PHYSICS_STEP_S)
-        pose = advance(v.x, v.y, v.heading, v.speed, acceleration, steering, PHYSICS_STEP_S)
+        pose = advance(
+            v.x,
+            v.y,
+            v.heading,
+            v.speed,
+            acceleration,
+            steering,
+            PHYSICS_STEP_S,
+        )
         v = v.with_(**pose._asdict())
         hits = pair_overlaps(v, scene.road)
         if bool(hits.any()):

@@ -70,7 +70,9 @@ def check_start(
 def _rank(value: Tensor, same: Tensor | None = None) -> Tensor:
     """Rank of each by ``value`` [N, M] and then index, among the ``same`` [N, M, M]."""
     index = torch.arange(value.shape[1], device=value.device)
-    mine, other = value[:, :, None], value[:, None, :]
+    # By counting, not by sorting: a few vehicles, and a fixed order for equal values.
+    mine = value[:, :, None]
+    other = value[:, None, :]
     before = (other < mine) | ((other == mine) & (index[None, :] < index[:, None]))
     return (before if same is None else before & same).sum(-1)
 
@@ -80,6 +82,7 @@ def draw_lanes(key: Tensor, vehicles: int, lanes: int, capacity: int) -> Tensor:
 
     All places of all lanes are shuffled and the first ``vehicles`` of them taken.
     """
+    # A random key for every place; the lowest ones are taken.
     places = draw_keys(key, 0, lanes * capacity, [int(Purpose.SPAWN_LANE)])[..., 0]
     return places.argsort(dim=1, stable=True)[:, :vehicles] // capacity
 
@@ -89,6 +92,7 @@ def place_in_lanes(lane: Tensor, u: Tensor, spread_m: float, spacing_m: float) -
 
     In a lane of k sorted uniforms on [0, spread - spacing (k - 1)] plus spacing * rank.
     """
+    # Sorted uniforms plus spacings: uniform among all placings that keep the spacing.
     same = lane[:, :, None] == lane[:, None, :]
     count = same.sum(-1)
     room = spread_m - spacing_m * (count - 1)
@@ -100,9 +104,11 @@ def ego_first(x: Tensor, lane: Tensor) -> tuple[Tensor, Tensor]:
 
     Shift the ego to x = 0.
     """
+    # The vehicle in the middle becomes the ego, with as many ahead as behind.
     rank = _rank(x)
     order = torch.where(rank == (x.shape[1] - 1) // 2, -1, rank).argsort(dim=1)
-    x, lane = x.gather(1, order), lane.gather(1, order)
+    x = x.gather(1, order)
+    lane = lane.gather(1, order)
     return x - x[:, :1], lane
 
 
@@ -169,7 +175,9 @@ class RandomScenes:
 
         The road must be the scene's, wide enough, and as a ring long enough.
         """
-        p, lane_width_m, ring_m = self.parameters, road.lane_width_m, road.ring_m
+        p = self.parameters
+        lane_width_m = road.lane_width_m
+        ring_m = road.ring_m
         if isinstance(road.lanes, Tensor) or isinstance(lane_width_m, Tensor):
             return  # a road for each row: its vehicles come from recordings
         if road != self.road:
@@ -226,15 +234,20 @@ def _room(there: Scene, idm: IdmParameters, safe: float) -> Tensor:
     result holds whichever of the others move too.
     """
     one, other, (low, high) = there.observers, there.vehicles, there.attention
-    their_low, their_high = low.repeat(1, 2)[:, None, :], high.repeat(1, 2)[:, None, :]
+    their_low = low.repeat(1, 2)[:, None, :]
+    their_high = high.repeat(1, 2)[:, None, :]
     shares = (low[..., None] <= their_high) & (their_low <= high[..., None])
+    # Sharing a lane, or nearly touching sides.
     sides = 0.5 * one.width[..., None] + 0.5 * other.width[:, None, :] + SIDE_M
     shares |= (one.y[..., None] - other.y[:, None, :]).abs() < sides
     pairs = there.pairs
     itself = torch.eye(one.x.shape[1], dtype=torch.bool, device=one.x.device).repeat(1, 2)
     counts = shares & other.valid[:, None, :] & ~itself
-    speed, desired = one.speed[..., None], one.desired_speed[..., None]
-    its_speed, its_desired = other.speed[:, None, :], other.desired_speed[:, None, :]
+    # Braking of the moved one behind the other, and of the other behind the moved one.
+    speed = one.speed[..., None]
+    desired = one.desired_speed[..., None]
+    its_speed = other.speed[:, None, :]
+    its_desired = other.desired_speed[:, None, :]
     behind = idm_acceleration(speed, desired, pairs.ahead, its_speed, idm)
     before = idm_acceleration(its_speed, its_desired, pairs.behind, speed, idm)
     asked = torch.where(pairs.order > 0, behind, before)
@@ -256,6 +269,7 @@ def recycle(
     # Mostly nobody is: without this look a decision takes 2 % longer with 64 rows, 9 with 1024.
     if reads_are_cheap(away) and not bool(away.any()):
         return vehicles
+    # By twice the range, so that the distance to the ego only changes its sign.
     distance = road.distance_ahead(vehicles.x[:, EGO_INDEX, None], vehicles.x)
     across = vehicles.x - 2.0 * range_m * torch.sign(distance)
     moved = vehicles.with_(x=torch.where(away, across, vehicles.x))

@@ -52,6 +52,7 @@ class Vehicles(NamedTuple):
     @classmethod
     def of(cls, mapping: Any) -> Vehicles:
         """From a mapping of names to tensors, for example a TensorDict."""
+        # All items in one pass: every look-up in a TensorDict has its price.
         named = dict(mapping.items())
         return cls(*(named[name] for name in VEHICLE_FIELDS))
 
@@ -73,6 +74,7 @@ class Vehicles(NamedTuple):
 
     def with_first(self, first: Vehicles) -> Vehicles:
         """The same rows with vehicle 0 replaced by ``first`` (fields [N])."""
+        # By where, not by writing in place: the tensors may belong to the caller.
         is_first = torch.arange(self.x.shape[1], device=self.x.device) == 0
         return Vehicles(
             *(torch.where(is_first, one[:, None], all_) for one, all_ in zip(first, self))
@@ -133,6 +135,7 @@ class Road:
         distance = end - start
         if self.ring_m is None:
             return distance
+        # Into [-half, half): the shorter way round.
         half = 0.5 * self.ring_m
         return torch.remainder(distance + half, self.ring_m) - half
 
@@ -186,6 +189,7 @@ def lateral_half_extent(vehicles: Vehicles) -> Tensor:
 
 def body_lanes(vehicles: Vehicles, road: Road) -> LaneRange:
     """Lanes that each body enters by more than :data:`ENTRY_M`."""
+    # A corner that just touches the next lane does not count.
     reach = lateral_half_extent(vehicles) - ENTRY_M
     edges = torch.stack((vehicles.y - reach, vehicles.y + reach))
     return LaneRange(*road.lane_of(edges).unbind())
@@ -202,6 +206,7 @@ def presence(vehicles: Vehicles, road: Road, body: LaneRange, attention: LaneRan
 
     An empty range for invalid vehicles.
     """
+    # From the least to the most that others see: centre, body, body and target lane.
     centre = road.lane_of(vehicles.y)
     signalled = vehicles.visibility == int(Visibility.SIGNALLED)
     by_body = vehicles.visibility == int(Visibility.BODY)

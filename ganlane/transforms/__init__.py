@@ -10,7 +10,7 @@ in the same way::
 :class:`ActionMaskTransform` computes the allowed actions.
 """
 
-from ganlane.transforms.mask import MASKS, ActionMaskTransform
+from ganlane.transforms.mask import ActionMaskTransform
 from ganlane.transforms.observation import (
     OBSERVATIONS,
     ObservationTransform,
@@ -20,7 +20,6 @@ from ganlane.transforms.reward import RewardParameters, RewardTransform
 from ganlane.transforms.sensors import SensorParameters, SensorTransform
 
 __all__ = [
-    "MASKS",
     "OBSERVATIONS",
     "ActionMaskTransform",
     "ObservationTransform",

@@ -25,7 +25,6 @@ from ganlane.errors import UserError
 from ganlane.keys import ACTIONS, EGO_INDEX
 from ganlane.native.tensors import SafeActions
 from ganlane.settings.driving import IdmParameters
-from ganlane.settings.observation import MASKS
 from ganlane.sim.dynamics import SIDES, ego_scene, is_heard, on_road
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import lane_accelerations
@@ -33,32 +32,15 @@ from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.torch_settings import compiled
 from ganlane.transforms.sensors import PerceptionTransform
 
-
-def on_road_actions(target_lane: Tensor, lanes: int | Tensor) -> Tensor:
-    """Actions that stay on the road, bool [N, 3].
-
-    ``target_lane`` [N] of the ego, ``lanes`` one number or [N].
-    """
-    of_row = lanes[:, None] if isinstance(lanes, Tensor) else lanes
-    return on_road(target_lane[:, None] + target_lane.new_tensor(SIDES), of_row)
-
-
-def obeyed_actions(change_direction: Tensor, abort: bool) -> Tensor:
-    """Actions with an effect, bool [N, 3].
-
-    During a lane change in ``change_direction`` (-1 or 1, [N]; 0: none) commands are ignored; with
-    ``abort`` the opposite command turns back.
-    """
-    side = change_direction.new_tensor(SIDES)
-    return (side == 0) | is_heard(side, change_direction[:, None], abort)
+#: What this transform computes; an environment without a mask (``none``) has no transform.
+FORMS = ("legal", "safe")
 
 
 def braking_demand(vehicles: Vehicles, road: Road, idm: IdmParameters = TABLE_V) -> Tensor:
     """Hardest braking that each action requires by IDM, as an acceleration in m/s2, [N, 3].
 
     The actions are keep, left and right: of each the smaller of the ego's acceleration in that lane
-    and its follower's there. A lane that does not exist has no vehicles; :func:`on_road_actions`
-    excludes it.
+    and its follower's there. A lane that does not exist has no vehicles; the mask excludes it.
     """
     # IDM of the ego in each lane, and of who would follow it there.
     scene = ego_scene(vehicles, road)
@@ -100,23 +82,33 @@ class ActionMaskTransform(PerceptionTransform):
         abort: bool = False,
         native_vehicles: int | None = None,
     ) -> None:
-        if form not in MASKS[1:]:
+        if form not in FORMS:
             raise UserError(
-                f"mask.form={form!r}: expected one of {', '.join(MASKS[1:])}; choose one of them."
+                f"mask.form={form!r}: expected one of {', '.join(FORMS)}; choose one of them."
             )
         if safe_deceleration <= 0:
             raise UserError(
                 f"mask.safe_deceleration={safe_deceleration:g}: expected a number above 0, in m/s2."
             )
+        # Behind legal there is nothing to report: keeping the lane is always legal.
         out_keys = [keys.ACTION_MASK]
         if form == "safe":
             out_keys.append(keys.NO_SAFE_ACTION)
         super().__init__(in_keys=[keys.VEHICLES, keys.EGO], out_keys=out_keys)
-        self.road, self.form, self.idm, self.abort = road, form, idm, abort
+        self.road = road
+        self.form = form
+        self.idm = idm
+        self.abort = abort
         self.safe_deceleration = safe_deceleration
         self.native: SafeActions | None = None
         if native_vehicles is not None and form == "safe":
-            self.native = SafeActions(road, native_vehicles, idm, safe_deceleration, abort)
+            self.native = SafeActions(
+                road,
+                native_vehicles,
+                idm,
+                safe_deceleration,
+                abort,
+            )
 
     def allowed(self, vehicles: Vehicles, direction: Tensor, road: Road) -> tuple[Tensor, Tensor]:
         """The mask [N, 3], and whether no action is safe [N].
@@ -124,16 +116,18 @@ class ActionMaskTransform(PerceptionTransform):
         ``vehicles`` are as the ego perceives them; ``direction`` [N] is that of its current lane
         change.
         """
-        # Replayed scenes have a road of their own in every row.
-        lanes = road.lanes[:, 0] if isinstance(road.lanes, Tensor) else road.lanes
-        on_road = on_road_actions(vehicles.target_lane[:, EGO_INDEX], lanes)
-        legal = on_road & obeyed_actions(direction, self.abort)
+        side = direction.new_tensor(SIDES)
+        target = vehicles.target_lane[:, EGO_INDEX, None] + side
+        # Keeping the lane is no command that the ego could fail to hear.
+        obeyed = (side == 0) | is_heard(side, direction[:, None], self.abort)
+        legal = on_road(target, road.lanes) & obeyed
         if self.form == "legal":
             return legal, torch.zeros_like(legal[:, 0])
         # Keeping the lane is always allowed: where nothing is safe, there is nothing better.
         safe = braking_demand(vehicles, road, self.idm) >= -self.safe_deceleration
         none = ~(safe & legal).any(1)
-        keep, changes = torch.ones_like(safe[:, :1]), legal[:, 1:] & safe[:, 1:]
+        keep = torch.ones_like(safe[:, :1])
+        changes = legal[:, 1:] & safe[:, 1:]
         return torch.cat((keep, changes), dim=1), none
 
     def compile_graphs(self) -> None:

@@ -69,7 +69,8 @@ class View(NamedTuple):
 
 def other_vehicles(vehicles: Vehicles, road: Road, scale: ObservationScale) -> Others:
     """The others, ordered by the vehicles' indices; an invalid one is (1, 0, 0), far ahead."""
-    ego, others = vehicles.columns(slice(0, 1)), vehicles.columns(slice(1, None))
+    ego = vehicles.columns(slice(0, 1))
+    others = vehicles.columns(slice(1, None))
     # Relative numbers over their scale, clipped.
     position = (road.distance_ahead(ego.x, others.x) / scale.range_m).clamp(-1.0, 1.0)
     speed = ((others.speed - ego.speed) / scale.speed_mps).clamp(-1.0, 1.0)
@@ -100,9 +101,13 @@ def own_state(view: View) -> Tensor:
 
     Speed over desired speed (not clipped), a lane to the left, a lane to the right.
     """
-    ego, road = view.vehicles.columns(slice(0, 1)), view.road
-    lane, dtype = road.lane_of(ego.y), ego.y.dtype
-    left, right = (lane < road.lanes - 1).to(dtype), (lane > 0).to(dtype)
+    ego = view.vehicles.columns(slice(0, 1))
+    road = view.road
+    lane = road.lane_of(ego.y)
+    dtype = ego.y.dtype
+    # Whether there is a lane to change to.
+    left = (lane < road.lanes - 1).to(dtype)
+    right = (lane > 0).to(dtype)
     return torch.cat((ego.speed / ego.desired_speed, left, right), dim=1)
 
 
@@ -128,7 +133,9 @@ def lane_view(view: View, drift: bool = False, overlap: bool = False) -> Tensor:
     its middle. With ``overlap``, where two bodies overlap along the road the gap is below 0, and
     the nearness above 1 by 1 per metre; otherwise the gap is 0 there.
     """
-    others, range_m = view.others, view.scale.range_m
+    others = view.others
+    # All six directions at once: each is a minimum over the vehicles there.
+    range_m = view.scale.range_m
     side = others.position.new_tensor(_SIDES)[:, None]
     ahead = others.position.new_tensor(_AHEAD)[:, None]
     # Distances [N, 6, M - 1] in the six directions, out of reach for who is not there.
@@ -139,7 +146,8 @@ def lane_view(view: View, drift: bool = False, overlap: bool = False) -> Tensor:
     distance = torch.add(distance, ~(in_sight & on_that_end & (lanes_apart == side)), alpha=_MASKED)
     nearest = distance.amin(-1, keepdim=True)
     # Several vehicles can be equally near: the minimum over all of them is taken below.
-    farther, exists = distance > nearest, nearest <= 1.0
+    farther = distance > nearest
+    exists = nearest <= 1.0
 
     def of_the_nearest(field: Tensor) -> Tensor:
         value = torch.add(field[:, None, :], farther, alpha=_MASKED).amin(-1, keepdim=True)
@@ -227,7 +235,9 @@ class ObservationTransform(PerceptionTransform):
                 f"vehicles={vehicles}: an observation is of at least one other vehicle; "
                 "give 2 or more."
             )
-        self.road, self.vehicles, self.form = road, vehicles, form
+        self.road = road
+        self.vehicles = vehicles
+        self.form = form
         self.scale = scale or ObservationScale()
         self.native: LaneView | None = None
         if native and form in NATIVE_FORMS:
@@ -256,8 +266,10 @@ class ObservationTransform(PerceptionTransform):
 
     def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
         """Write ``observation``."""
+        # Own state from the truth, the others as perceived.
         ego = state.get(keys.EGO)
-        progress, direction = ego.get("change_progress"), ego.get("change_direction")
+        progress = ego.get("change_progress")
+        direction = ego.get("change_direction")
         # The kernel computes the same numbers up to the rounding of the exponential function.
         if self.native is not None:
             observation = self.native.observe(vehicles, progress, direction, seen)
@@ -272,6 +284,8 @@ class ObservationTransform(PerceptionTransform):
         shape = (*observation_spec.shape, observation_size(self.form, self.vehicles))
         true = observation_spec[keys.VEHICLES, "x"]
         observation_spec[keys.OBSERVATION] = Unbounded(
-            shape=shape, dtype=true.dtype, device=true.device
+            shape=shape,
+            dtype=true.dtype,
+            device=true.device,
         )
         return observation_spec

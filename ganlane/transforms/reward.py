@@ -52,8 +52,10 @@ class RewardTransform(Transform):
 
     def terms(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """Name to reward term [N, 1] of the decision that led to the state in ``tensordict``."""
-        p, vehicles = self.parameters, tensordict.get(keys.VEHICLES)
-        ego, events = tensordict.get(keys.EGO), tensordict.get(keys.EVENTS)
+        p = self.parameters
+        vehicles = tensordict.get(keys.VEHICLES)
+        ego = tensordict.get(keys.EGO)
+        events = tensordict.get(keys.EVENTS)
         speed = vehicles.get("speed")[:, EGO_INDEX, None]
         desired = vehicles.get("desired_speed")[:, EGO_INDEX, None]
         acceleration = ego.get("mean_acceleration")[:, None]
@@ -69,6 +71,7 @@ class RewardTransform(Transform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         terms = self.terms(next_tensordict)
+        # Terms for tables and logs, their sum for the agent.
         nested = TensorDict._new_unsafe(terms, batch_size=next_tensordict.batch_size)
         next_tensordict.set(keys.REWARD_TERMS, nested)
         return next_tensordict.set(keys.REWARD, reduce(torch.add, terms.values()))
@@ -76,6 +79,7 @@ class RewardTransform(Transform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
+        # A reset has driven nothing, yet its keys must be those of a step.
         zero = torch.zeros_like(tensordict_reset.get(keys.VEHICLES).get("x")[:, :1])
         terms = dict.fromkeys(self.parameters.term_names, zero)
         nested = TensorDict._new_unsafe(terms, batch_size=tensordict_reset.batch_size)
@@ -84,7 +88,8 @@ class RewardTransform(Transform):
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the terms to the observation spec; they are zero after a reset."""
         assert isinstance(observation_spec, Composite)
-        shape, true = observation_spec.shape, observation_spec[keys.VEHICLES, "x"]
+        shape = observation_spec.shape
+        true = observation_spec[keys.VEHICLES, "x"]
         term = Unbounded(shape=(*shape, 1), dtype=true.dtype, device=true.device)
         terms = dict.fromkeys(self.parameters.term_names, term)
         observation_spec[keys.REWARD_TERMS] = Composite(terms, shape=shape).to(true.device)

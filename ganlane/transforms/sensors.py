@@ -44,7 +44,10 @@ def measure(
     (:func:`ganlane.sim.random.episode_key`).
     """
     values = {"x": vehicles.x, "y": vehicles.y, "speed": vehicles.speed}
-    valid, shape, dtype = vehicles.valid, vehicles.x.shape, vehicles.x.dtype
+    valid = vehicles.valid
+    shape = vehicles.x.shape
+    dtype = vehicles.x.dtype
+    # Column 0 stays exact.
     count = shape[1]
     other = torch.arange(count, device=vehicles.x.device) != keys.EGO_INDEX
     scales = (parameters.position_noise_m, parameters.lateral_noise_m, parameters.speed_noise_mps)
@@ -128,6 +131,7 @@ class SensorTransform(Transform):
         return measure(vehicles, key, state.get(keys.STEP), self.parameters)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        # One measurement in per decision, one out: the queue keeps its length.
         newest = self._measured(next_tensordict)
         if self.delay == 0:
             return next_tensordict.set(PERCEIVED, newest)
@@ -161,6 +165,7 @@ class SensorTransform(Transform):
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add ``perceived``, and with a delay ``sensors``, to the spec."""
         assert isinstance(observation_spec, Composite)
+        # Shapes and device as of the true positions.
         true = observation_spec[keys.VEHICLES, "x"]
         rows, count = true.shape
         shapes: dict[str, tuple[int, ...]] = {PERCEIVED: (rows, count)}

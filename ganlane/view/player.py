@@ -26,6 +26,7 @@ import numpy.typing as npt
 
 from ganlane.errors import UserError
 from ganlane.files import write_bytes
+from ganlane.settings.render import FilmConfig
 from ganlane.view.record import ACTION_NAMES, Trajectory
 
 #: Three episodes stay under 2 MB.
@@ -35,39 +36,37 @@ UNITS = dict(time=0.01, x=0.01, y=0.01, heading=0.001, speed=0.01, acceleration=
 
 
 def write_player(
-    trajectories: Sequence[Trajectory], path: str | Path, max_bytes: int | None = None
+    trajectories: Sequence[Trajectory], path: str | Path, look: FilmConfig | None = None
 ) -> Path:
     """Write :func:`player_page` to ``path``, atomically, and return it."""
-    write_bytes(path, player_page(trajectories, max_bytes).encode())
+    write_bytes(path, player_page(trajectories, look).encode())
     return Path(path)
 
 
-def player_page(trajectories: Sequence[Trajectory], max_bytes: int | None = None) -> str:
-    """A whole HTML page that plays ``trajectories`` side by side.
+def player_page(trajectories: Sequence[Trajectory], look: FilmConfig | None = None) -> str:
+    """A whole HTML page that plays ``trajectories`` side by side, from ``look.start_s`` on.
 
-    Where the page is larger than ``max_bytes`` (None: 660 kB an episode), samples are taken 0.2,
-    0.3, 0.5 or 1 s apart instead of 0.1 s; the player interpolates.
+    Where the page is larger than ``look.max_bytes`` (None: 660 kB an episode), samples are taken
+    0.2, 0.3, 0.5 or 1 s apart instead of 0.1 s; the player interpolates.
 
     Raises:
-        UserError: there is no episode, or the page is too large even so.
+        UserError: there is no episode, one is over by then, or the page is too large even so.
     """
     if not trajectories:
         raise UserError("format=html: no episode to play; record at least one.")
-    limit = max_bytes or MAX_BYTES_PER_EPISODE * len(trajectories)
-    title = ", ".join(
-        dict.fromkeys(f"{each.label.agent} on {each.label.traffic}" for each in trajectories)
-    )
+    look = look or FilmConfig()
+    limit = look.max_bytes or MAX_BYTES_PER_EPISODE * len(trajectories)
+    labels = [trajectory.label for trajectory in trajectories]
+    title = ", ".join(dict.fromkeys(f"{label.agent} on {label.traffic}" for label in labels))
     for stride in (1, 2, 3, 5, 10):
-        page = _fill(
-            title,
-            {"units": UNITS, "episodes": [episode_data(each, stride) for each in trajectories]},
-        )
+        episodes = [episode_data(trajectory, stride, look.start_s) for trajectory in trajectories]
+        page = _fill(title, {"units": UNITS, "episodes": episodes})
         size = len(page.encode())
         if size <= limit:
             return page
     raise UserError(
-        f"format=html: the page takes {size} bytes, {limit} are allowed; choose fewer episodes, an earlier "
-        "film.end_s or a larger film.max_bytes."
+        f"format=html: the page takes {size} bytes, {limit} are allowed; choose fewer episodes, an "
+        "earlier film.end_s or a larger film.max_bytes."
     )
 
 
@@ -80,11 +79,12 @@ def _fill(title: str, data: dict[str, Any]) -> str:
 
     style = text("style.css")
     # in this order
-    scripts = ("episode.js", "road.js", "chart.js", "events.js", "panel.js", "player.js")
-    script = "(() => {\n'use strict';\n" + "\n".join(map(text, scripts)) + "})();\n"
+    names = ("episode.js", "road.js", "chart.js", "events.js", "panel.js", "player.js")
+    script = "(() => {\n'use strict';\n" + "\n".join(map(text, names)) + "})();\n"
+    allowed = f"style-src {_hash(style)}; script-src {_hash(script)}"
     parts = {
         "title": html.escape(title),
-        "policy": f"default-src 'none'; img-src data:; style-src {_hash(style)}; script-src {_hash(script)}",
+        "policy": f"default-src 'none'; img-src data:; {allowed}",
         "style": style,
         "script": script,
         "data": script_safe_json(data),
@@ -114,62 +114,74 @@ def series(values: npt.NDArray[np.float64], unit: float) -> list[int]:
 
 def steps(values: npt.NDArray[Any]) -> list[Any]:
     """[T] values as their changes, with two decimals; what is not finite becomes null."""
-
-    def plain(value: float | int | bool) -> float | int | None:
-        if isinstance(value, float):
-            return round(value, 2) if np.isfinite(value) else None
-        return int(value)
-
-    rounded = [plain(value) for value in values.tolist()]
-    changed = [
-        index for index, value in enumerate(rounded) if index == 0 or value != rounded[index - 1]
-    ]
-    return [entry for index in changed for entry in (index, rounded[index])]
+    is_whole = values.dtype.kind != "f"
+    changes: list[Any] = []
+    for sample, value in enumerate(values.tolist()):
+        shown = int(value) if is_whole else round(value, 2) if np.isfinite(value) else None
+        if not changes or shown != changes[-1]:
+            changes += (sample, shown)
+    return changes
 
 
-def episode_data(trajectory: Trajectory, stride: int = 1) -> dict[str, Any]:
+def episode_data(trajectory: Trajectory, stride: int = 1, start_s: float = 0.0) -> dict[str, Any]:
     """A trajectory as JSON-serialisable data.
 
     Args:
         trajectory: a recorded episode.
         stride: frames from one sample to the next; the last frame is always a sample.
+        start_s: time of the first sample.
 
     Returns:
         The label's fields; ``outcome``; ``time`` (series); ``x, y, heading, speed`` (a series per
         vehicle); ``length, width, target_lane, valid`` (steps per vehicle); ``acceleration`` and
         ``jerk`` of the ego (series); ``action, reward, return`` (steps, of the decision that is
-        carried out from a sample on); ``action_values`` (steps per action; empty if unknown) with
-        ``action_names``; ``comfort`` (:meth:`Trajectory.comfort`); ``soft_crash``, the ends of the
-        decisions with any, s.
+        carried out from a sample on); ``action_values`` (steps per action) with ``action_names``;
+        ``comfort``: the ego's ``rms_acceleration`` and ``hardest_braking`` (0 or below), m/s2, and
+        ``rms_jerk``, m/s3; ``soft_crash``, the ends of the decisions with any, s. Rewards and
+        action values are empty if unknown.
     """
-    t = trajectory
-    kept = np.union1d(np.arange(0, len(t), stride), len(t) - 1)
-    under_way = np.minimum(kept + 1, len(t) - 1)
-
-    def per_vehicle(name: str) -> npt.NDArray[Any]:
-        return getattr(t, name)[kept].T
-
-    return {
+    t = trajectory.since(start_s)
+    samples = np.union1d(np.arange(0, len(t), stride), len(t) - 1)
+    under_way = np.minimum(samples + 1, len(t) - 1)
+    acceleration = t.acceleration[:, 0]
+    jerk = ego_jerk(trajectory)[-len(t) :]
+    data: dict[str, Any] = {
         **asdict(t.label),
         "outcome": t.outcome,
-        "time": series(t.time_s[kept], UNITS["time"]),
-        **{
-            name: [series(row, UNITS[name]) for row in per_vehicle(name)]
-            for name in ("x", "y", "heading", "speed")
-        },
-        **{
-            name: [steps(row) for row in per_vehicle(name)]
-            for name in ("length", "width", "target_lane", "valid")
-        },
-        "acceleration": series(t.acceleration[kept, 0], UNITS["acceleration"]),
-        "jerk": series(t.jerk()[kept, 0], UNITS["jerk"]),
-        "action": steps(t.action[under_way]),
-        "reward": steps(t.reward[under_way]) if len(t.reward) else [],
-        "return": steps(t.returns[kept]),
-        "action_values": [steps(row) for row in t.action_values[under_way].T]
-        if t.action_values.size
-        else [],
-        "action_names": list(ACTION_NAMES),
-        "comfort": t.comfort(),
-        "soft_crash": [round(float(time), 2) for time in t.soft_crash_s if time >= t.time_s[0]],
+        "time": series(t.time_s[samples], UNITS["time"]),
     }
+    for name in ("x", "y", "heading", "speed"):
+        data[name] = [series(row, UNITS[name]) for row in getattr(t, name)[samples].T]
+    for name in ("length", "width", "target_lane", "valid"):
+        data[name] = [steps(row) for row in getattr(t, name)[samples].T]
+    knows_values = np.isfinite(t.action_values).any()
+    knows_reward = np.isfinite(t.reward).any()
+    return data | {
+        "acceleration": series(acceleration[samples], UNITS["acceleration"]),
+        "jerk": series(jerk[samples], UNITS["jerk"]),
+        "action": steps(t.action[under_way]),
+        "reward": steps(t.reward[under_way]) if knows_reward else [],
+        "return": steps(t.returns[samples]),
+        "action_values": (
+            [steps(row) for row in t.action_values[under_way].T] if knows_values else []
+        ),
+        "action_names": list(ACTION_NAMES),
+        "comfort": {
+            "rms_acceleration": round(float(np.sqrt(np.mean(acceleration**2))), 3),
+            "rms_jerk": round(float(np.sqrt(np.mean(jerk**2))), 3),
+            "hardest_braking": round(min(0.0, float(acceleration.min())), 3),
+        },
+        "soft_crash": t.soft_crash_s[t.soft_crash_s >= t.time_s[0]].round(2).tolist(),
+    }
+
+
+def ego_jerk(trajectory: Trajectory) -> npt.NDArray[np.float64]:
+    """Change of the ego's acceleration since the frame before, m/s3, [T].
+
+    0 in the first two frames, since the reset begins with no acceleration, and after a jump.
+    """
+    acceleration = trajectory.acceleration[:, 0]
+    jerk = np.diff(acceleration, prepend=acceleration[0]) / trajectory.frame_s
+    jerk[:2] = 0.0
+    jerk[trajectory.jumped()[:, 0]] = 0.0
+    return jerk

@@ -1,18 +1,13 @@
-"""Episodes recorded at every physics step.
-
-As plain arrays, while they run, and as tracks of recorded traffic.
-"""
+"""Episodes recorded at every physics step, as plain arrays, while they run."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
-from typing import Any, Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import polars as pl
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -22,11 +17,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ganlane import keys
 from ganlane.agents.drivers import GreedyPolicy
-from ganlane.data.recordings import scene_csv, write_prepared
-from ganlane.data.schema import SCHEMA, TRACK_STRIDE, sort
 from ganlane.errors import UserError
 from ganlane.evaluation.episodes import start_of
-from ganlane.files import atomic_path
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.state import Road, Vehicles, road_in
 
@@ -85,22 +77,15 @@ class Trajectory:
     returns: FloatArray
     #: End event, one of :data:`ganlane.keys.END_EVENTS`; empty where the episode was cut off.
     outcome: str = ""
-    #: Action values of the policy, [T, A]; NaN before the first decision, empty if unknown.
+    #: Action values of the policy, [T, A]; NaN before the first decision and where unknown.
     action_values: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    #: Reward of the decision that a frame belongs to, [T]; NaN before the first, empty if unknown.
+    #: Reward of the decision that a frame belongs to, [T]; NaN before the first and where unknown.
     reward: FloatArray = field(default_factory=lambda: np.empty(0))
-    #: Jerk, m/s3, [T, M], where frames before these were left out (:meth:`since`); empty otherwise.
-    driven_jerk: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     #: Ends of the decisions with a soft crash, s; empty if unknown.
     soft_crash_s: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __len__(self) -> int:
         return len(self.time_s)
-
-    @property
-    def vehicles(self) -> int:
-        """Number of vehicles M, the ego included."""
-        return self.x.shape[1]
 
     @property
     def frame_s(self) -> float:
@@ -117,27 +102,12 @@ class Trajectory:
         moved = np.abs(np.diff(self.x, axis=0, prepend=self.x[:1]))
         return moved > JUMP_M * max(1.0, self.frame_s / keys.PHYSICS_STEP_S)
 
-    def jerk(self) -> FloatArray:
-        """Change of the acceleration since the frame before, m/s3, [T, M].
-
-        0 in the episode's first two frames and after a jump.
-        """
-        if self.driven_jerk.size:
-            return self.driven_jerk
-        change = np.diff(self.acceleration, axis=0, prepend=self.acceleration[:1]) / self.frame_s
-        begins = np.arange(len(self))[:, None] < 2
-        return np.where(begins | self.jumped(), 0.0, change)
-
-    def comfort(self) -> dict[str, float]:
-        """The ego's ``rms_acceleration`` and ``hardest_braking`` (0 or below), m/s2, and
-        ``rms_jerk``, m/s3.
-        """
-        acceleration, jerk = self.acceleration[:, 0], self.jerk()[:, 0]
-        return {
-            "rms_acceleration": round(float(np.sqrt(np.mean(acceleration**2))), 3),
-            "rms_jerk": round(float(np.sqrt(np.mean(jerk**2))), 3),
-            "hardest_braking": round(min(0.0, float(acceleration.min())), 3),
-        }
+    def overlapping(self) -> BoolArray:
+        """Whether a vehicle's box overlaps another's, [T, M]."""
+        fields: dict[str, Any] = dict.fromkeys(keys.VEHICLE_FIELDS, torch.zeros(self.x.shape))
+        for name in ("x", "y", "heading", "length", "width", "valid"):
+            fields[name] = torch.as_tensor(getattr(self, name))
+        return pair_overlaps(Vehicles(**fields)).any(-1).numpy()
 
     def since(self, start_s: float) -> Trajectory:
         """The frames from ``start_s`` on.
@@ -148,26 +118,15 @@ class Trajectory:
         first = int(np.searchsorted(self.time_s, start_s - 1e-9))
         if first == len(self):
             raise UserError(
-                f"start at {start_s:g} s: the episode lasts {self.time_s[-1]:g} s; choose a part of it."
+                f"start at {start_s:g} s: the episode lasts {self.time_s[-1]:g} s; choose a part "
+                "of it."
             )
-        whole = replace(self, driven_jerk=self.jerk())
-        frames = [
-            each.name
-            for each in fields(self)
-            if each.name not in ("label", "outcome", "soft_crash_s")
-        ]
-        later: dict[str, Any] = {name: getattr(whole, name)[first:] for name in frames}
-        return replace(whole, **later)
-
-    def overlapping(self) -> BoolArray:
-        """Whether a vehicle's box overlaps another's, [T, M]."""
-        unused = dict.fromkeys(keys.VEHICLE_FIELDS, torch.zeros(self.x.shape, dtype=torch.float64))
-        boxes = ("x", "y", "heading", "length", "width", "valid")
-        used = {name: torch.as_tensor(getattr(self, name)) for name in boxes}
-        return pair_overlaps(Vehicles(**(unused | used))).any(-1).numpy()
-
-
-# Recording
+        later: dict[str, Any] = {
+            name: value[first:]
+            for name, value in vars(self).items()
+            if name not in ("label", "outcome", "soft_crash_s")
+        }
+        return replace(self, **later)
 
 
 @dataclass
@@ -177,14 +136,11 @@ class Recorder:
     row: int = 0
     #: What a trajectory keeps of a frame, by its name there.
     frames: list[dict[str, Any]] = field(default_factory=list)
-    #: Frames recorded by the end of each decision, and its reward; empty if rewards are not
-    #: recorded.
-    decisions: list[tuple[int, float]] = field(default_factory=list)
     #: Ends of the decisions with a soft crash, s.
     soft_crash_s: list[float] = field(default_factory=list)
     current_action: int = -1
     current_return: float = 0.0
-    current_values: FloatArray = field(default_factory=lambda: np.empty(0))
+    current_values: FloatArray = field(default_factory=lambda: np.full(keys.ACTIONS, np.nan))
 
     @property
     def time_s(self) -> float:
@@ -205,34 +161,23 @@ class Recorder:
             "time_s": time_s,
             "action": self.current_action,
             "returns": self.current_return,
+            "action_values": self.current_values,
+            "reward": np.nan,  # known after the decision
         }
         for name, kind in _FIELDS.items():
             frame[name] = vehicles[name][self.row].detach().cpu().numpy().astype(kind)
-        self.frames.append({**frame, "action_values": self.current_values})
+        self.frames.append(frame)
 
     def trajectory(self, label: EpisodeLabel, outcome: str = "") -> Trajectory:
         """The frames so far; the last one shows the return after the last decision."""
-        reward = np.full(len(self.frames) if self.decisions else 0, np.nan)
-        begin = 1
-        for end, paid in self.decisions:
-            reward[begin:end], begin = paid, end
-        arrays = {
-            name: np.stack([frame[name] for frame in self.frames])
-            for name in (*_FIELDS, "action", "returns")
+        arrays: dict[str, Any] = {
+            name: np.stack([frame[name] for frame in self.frames]) for name in self.frames[0]
         }
+        # Sums of 0.1 s are off by rounding.
+        arrays["time_s"] = arrays["time_s"].round(6)
         arrays["returns"][-1] = self.current_return
-        values = [frame["action_values"] for frame in self.frames]
-        width = max(map(len, values))
-        values = [each if len(each) else np.full(width, np.nan) for each in values]
-        return Trajectory(
-            label=label,
-            time_s=np.array([frame["time_s"] for frame in self.frames]).round(6),
-            **arrays,
-            outcome=outcome,
-            action_values=np.stack(values) if width else np.empty((0, 0)),
-            reward=reward,
-            soft_crash_s=np.array(self.soft_crash_s),
-        )
+        soft_crash_s = np.array(self.soft_crash_s)
+        return Trajectory(label, outcome=outcome, soft_crash_s=soft_crash_s, **arrays)
 
 
 def road_of_row(state: TensorDictBase, road: Road, row: int) -> tuple[int, float]:
@@ -240,8 +185,10 @@ def road_of_row(state: TensorDictBase, road: Road, row: int) -> tuple[int, float
 
     Of its replayed scene if ``state`` has one, else of ``road``.
     """
-    found = road_in(state, road)
-    lanes, width = (torch.as_tensor(value).flatten() for value in (found.lanes, found.lane_width_m))
+    scene = road_in(state, road)
+    # One number for all rows, or [N, 1].
+    lanes = torch.as_tensor(scene.lanes).flatten()
+    width = torch.as_tensor(scene.lane_width_m).flatten()
     return int(lanes[min(row, len(lanes) - 1)]), float(width[min(row, len(width) - 1)])
 
 
@@ -258,7 +205,7 @@ def record_episode(
     episode: int,
     agent: str = "ego",
     traffic: str = "traffic",
-    max_time_s: float = float("inf"),
+    max_time_s: float | None = None,
 ) -> Trajectory:
     """Drive one episode to its end and record it at every physics step.
 
@@ -277,16 +224,19 @@ def record_episode(
         base = base.base_env
     if not hasattr(base, "recorder"):
         raise UserError(
-            f"env={type(base).__name__}: it cannot be recorded; expected a HighwayEnv of this process."
+            f"env={type(base).__name__}: it cannot be recorded; expected a HighwayEnv of this "
+            "process."
         )
-    before, base.recorder = base.recorder, (recorder := Recorder())
+    recorder = Recorder()
+    end_s = np.inf if max_time_s is None else max_time_s - 1e-6
+    before, base.recorder = base.recorder, recorder
     try:
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             state = env.reset(start_of(env, [episode], seed))
             label = EpisodeLabel(agent, traffic, seed, episode, *road_of_row(state, base.road, 0))
             recorder.add(state[keys.VEHICLES], 0.0)
-            while not state["done"][0] and recorder.time_s < max_time_s - 1e-6:
-                state = _decide(env, policy, policy(state), recorder)
+            while not state["done"][0] and recorder.time_s < end_s:
+                state = _decide(env, policy, state, recorder)
     finally:
         base.recorder = before
     return recorder.trajectory(label, outcome_of(state))
@@ -296,90 +246,23 @@ def _decide(
     env: EnvBase, policy: TensorDictModuleBase, state: TensorDictBase, recorder: Recorder
 ) -> TensorDictBase:
     """One decision; the state after it."""
+    state = policy(state)
     recorder.current_action = int(state[keys.ACTION][0])
-    # Action values [N, A]: from the policy's network, or its output; None if it has none.
-    is_greedy = isinstance(policy, GreedyPolicy)
-    values = (
-        policy.network.values(state[keys.OBSERVATION])
-        if is_greedy
-        else state.get("action_value", None)
-    )
-    if values is not None and values.ndim == 2:
+    # A network's policy writes no action values [N, A]; others may.
+    if isinstance(policy, GreedyPolicy):
+        values = policy.network.values(state[keys.OBSERVATION])
+    else:
+        values = state.get("action_value", None)
+    if values is not None and values.shape[1:] == (keys.ACTIONS,):
         recorder.current_values = values[0].double().cpu().numpy()
+
+    first = len(recorder.frames)
     stepped = env.step(state)
-    reward = float(stepped["next", keys.REWARD][0])
+    after = stepped["next"]
+    reward = float(after[keys.REWARD][0])
+    for frame in recorder.frames[first:]:
+        frame["reward"] = reward
     recorder.current_return += reward
-    recorder.decisions.append((len(recorder.frames), reward))
-    if int(stepped["next", keys.EVENTS, keys.SOFT_CRASH][0]) > 0:
+    if int(after[keys.EVENTS, keys.SOFT_CRASH][0]) > 0:
         recorder.soft_crash_s.append(recorder.time_s)
     return env.step_mdp(stepped)
-
-
-# Tracks
-
-
-def write_tracks(
-    trajectories: Sequence[Trajectory], path: str | Path, format: Literal["csv", "parquet"]
-) -> Path:
-    """Write episodes, a scene each, atomically, as a file that :func:`ganlane.data.read_scenes`
-    reads back.
-
-    Parquet holds the schema (:mod:`ganlane.data.schema`) itself. In CSV, the form of recordings
-    from elsewhere, the speed is called ``v``, lanes are counted from the left, from 1, and ``y`` is
-    0 at the centre of lane 1. It has no lane width, and a rightmost lane without vehicles is lost.
-
-    Raises:
-        UserError: there is no episode, or one whose frames are not 0.1 s apart.
-    """
-    if not trajectories:
-        raise UserError(f"format={format}: no episode to write; record at least one.")
-    labels = [each.label for each in trajectories]
-    tables = [to_tracks(each, name) for each, name in zip(trajectories, scene_names(labels))]
-    if format == "parquet":
-        write_prepared(sort(pl.concat(tables)), path)
-        return Path(path)
-    for number, label in enumerate(labels):
-        tables[number] = scene_csv(tables[number], pl.lit(label.lanes - 1), label.lane_width_m)
-    with atomic_path(path) as part:
-        pl.concat(tables).write_csv(part)
-    return Path(path)
-
-
-def to_tracks(trajectory: Trajectory, scene: str = "simulated") -> pl.DataFrame:
-    """The trajectory as a table in the schema of recordings; a recycled vehicle begins a new track.
-
-    Raises:
-        UserError: the frames are not 0.1 s apart.
-    """
-    if len(trajectory) > 1 and abs(trajectory.frame_s - keys.PHYSICS_STEP_S) > 1e-6:
-        raise UserError(
-            f"trajectory: its frames are {trajectory.frame_s:g} s apart, tracks need {keys.PHYSICS_STEP_S} s; "
-            "record it at every physics step."
-        )
-    frames, vehicles = trajectory.x.shape
-    columns = {
-        "vehicle": np.arange(vehicles) + TRACK_STRIDE * np.cumsum(trajectory.jumped(), axis=0),
-        "frame": np.broadcast_to(np.arange(frames)[:, None], (frames, vehicles)),
-        **{name: getattr(trajectory, name) for name in ("x", "y", "speed", "length", "width")},
-        "lane": trajectory.lane(),
-    }
-    shown = trajectory.valid
-    table = pl.DataFrame(
-        {"scene": [scene] * int(shown.sum()), **{k: v[shown] for k, v in columns.items()}}
-    )
-    return table.select(pl.col(name).cast(kind) for name, kind in SCHEMA.items()).sort(
-        "scene", "vehicle", "frame"
-    )
-
-
-def scene_names(labels: Sequence[EpisodeLabel]) -> list[str]:
-    """A name for each episode's scene, ``AGENT_TRAFFIC_SEED_EPISODE``.
-
-    A number follows where two would be alike.
-    """
-    names: list[str] = []
-    for label in labels:
-        name = f"{Path(label.agent).stem}_{label.traffic}_{label.seed}_{label.episode}"
-        again = sum(other == name or other.startswith(f"{name}-") for other in names)
-        names.append(f"{name}-{again + 1}" if again else name)
-    return names

@@ -1,71 +1,10 @@
-"""The network: the duel, and the fast linear layer, which is the ordinary one."""
+"""The network: the duel."""
 
-import pytest
 import torch
-from torch.nn import functional
 
-from ganlane.agents import network as module
-from ganlane.agents.network import duel, linear
+from ganlane.agents.network import duel
 
 
 def test_dueling_takes_the_mean_advantage_off():
     rows = torch.tensor([[10.0], [1.0], [2.0], [6.0]])
     assert duel(rows).flatten().tolist() == [8.0, 9.0, 13.0]
-
-
-@pytest.mark.parametrize(
-    ("rows", "inputs", "outputs"),
-    [(1, 1, 1), (7, 29, 13), (256, 64, 51)],
-)
-def test_values_and_gradients_are_those_of_torch(rows, inputs, outputs):
-    torch.manual_seed(0)
-    tensors = [
-        torch.randn(rows, inputs),
-        torch.randn(outputs, inputs),
-        torch.randn(outputs),
-    ]
-    tensors = [tensor.requires_grad_() for tensor in tensors]
-    gradient = torch.randn(rows, outputs)
-    results = []
-    for function in (linear, functional.linear):
-        output = function(*tensors)
-        results.append(
-            [
-                output,
-                *torch.autograd.grad(output, tensors, gradient),
-            ]
-        )
-    torch.testing.assert_close(*results, atol=1e-4, rtol=1e-5)
-
-
-@pytest.mark.parametrize("gradients", [True, False])
-def test_the_relu_is_that_of_torch(gradients):
-    torch.manual_seed(0)
-    x = torch.randn(20, 8)
-    weight = torch.randn(6, 8)
-    bias = torch.randn(6)
-    with torch.set_grad_enabled(gradients):
-        output = linear(x, weight, bias, relu=True)
-    torch.testing.assert_close(
-        output,
-        functional.linear(x, weight, bias).relu(),
-        atol=1e-5,
-        rtol=1e-5,
-    )
-
-
-def test_other_types_shapes_and_builds_take_the_ordinary_way(
-    monkeypatch,
-):
-    torch.manual_seed(0)
-    x = torch.randn(2, 3, 4)
-    weight = torch.randn(5, 4)
-    bias = torch.randn(5)
-    assert torch.equal(linear(x, weight, bias), functional.linear(x, weight, bias))
-    doubles = x[0].double(), weight.double(), bias.double()
-    assert torch.equal(linear(*doubles), functional.linear(*doubles))
-    monkeypatch.setattr(module, "_ONEDNN", False)
-    assert torch.equal(
-        linear(x[0], weight, bias),
-        functional.linear(x[0], weight, bias),
-    )

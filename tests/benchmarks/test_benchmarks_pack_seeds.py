@@ -29,6 +29,7 @@ START = str(Path.home() / "outputs" / "paper_1" / "pretrain" / "agent.safetensor
 RECIPE = {
     "observation": "lane_view_overlap",
     "observation_scale": {"range_m": 200.0, "speed_mps": 30.0},
+    "mask": {"form": "none"},
     "env": {"lanes": 3, "compile": False},
 }
 

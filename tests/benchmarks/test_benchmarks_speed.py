@@ -158,6 +158,6 @@ def test_every_traffic_is_measured_and_what_the_kernel_does_not_drive_is_left_ou
 
 @pytest.mark.parametrize("suite", speed.SUITES)
 def test_the_document_of_the_project_can_be_written(suite):
-    text = (speed.Path(__file__).parents[2] / "docs/performance.md").read_text()
+    text = (speed.Path(__file__).parents[2] / "docs/speed.md").read_text()
     assert text.count(f"<!-- begin bench {suite} -->") == 1
     assert text.count(f"<!-- end bench {suite} -->") == 1

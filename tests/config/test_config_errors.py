@@ -32,7 +32,6 @@ MISTAKES = {
     "train env.lane=3": "env.lane: no such key (did you mean 'lanes'?)",
     "train trafic=gan": "trafic: no such key (did you mean 'traffic'?); known are agent",
     "train agent.gama=0.9": "agent.gama: no such key (did you mean 'gamma'?); agent has adam_eps",
-    "train collector=ray collector.wrkers=2": "collector.wrkers: no such key (did you mean 'worker",
     "train env.idm.gap=2": "env.idm.gap: no such key; env.idm has comfortable_deceleration",
     "train pretrain.traffic.guard=false": "pretrain.traffic._target_: of which traffic? name it",
     "train traffic=mixed traffic.options.idm.blind_share=1": "traffic.options.idm: it has no share",
@@ -154,7 +153,7 @@ def test_a_command_that_there_is_not(capsys):
 
 
 def test_cfg_prints_what_a_run_would_be_made_of(capsys, empty_folder):
-    assert main(["evaluate", "--cfg", "job", "env.lanes=4"]) == 0
+    assert main(["evaluate", "env.lanes=4", "--cfg", "job"]) == 0
     shown = yaml.safe_load(capsys.readouterr().out)
     assert shown["env"]["lanes"] == 4
     assert make(EvaluateConfig, shown) == settings("evaluate", ["env.lanes=4"])

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from reference.recordings import write_highd
+from reference.refusals import user_error
 
 from ganlane.data import SCHEMA, read_recordings
 from ganlane.data.highd import highd_scenes, resample
 from ganlane.data.schema import RowCount
-from ganlane.errors import UserError
 
 
 @pytest.fixture
@@ -137,7 +137,7 @@ def damaged(path, column, row, value):
 )
 def test_a_damaged_field_is_named(recording, column, row, value, message):
     damaged(recording, column, row, value)
-    with pytest.raises(UserError, match=message):
+    with user_error(message):
         read_recordings("highd", recording)
 
 
@@ -145,13 +145,10 @@ def test_units_that_cannot_be_are_refused(recording):
     rows = pl.read_csv(recording)
     # In km/h, and with the direction reversed.
     rows.with_columns(xVelocity=3.6 * pl.col("xVelocity")).write_csv(recording)
-    with pytest.raises(
-        UserError,
-        match=r"highd-01-upper.*column speed: the median is 1\d\d",
-    ):
+    with user_error(r"highd-01-upper.*column speed: the median is 1\d\d"):
         read_recordings("highd", recording)
     rows.with_columns(xVelocity=-pl.col("xVelocity")).write_csv(recording)
-    with pytest.raises(UserError, match="columns x and speed"):
+    with user_error("columns x and speed"):
         read_recordings("highd", recording)
 
 
@@ -161,16 +158,10 @@ def test_the_metadata_files_are_required_and_checked(
     meta = recording.with_name("01_recordingMeta.csv")
     # First the markings, then files that are not there.
     damaged(meta, "upperLaneMarkings", 0, "8.0;moon")
-    with pytest.raises(
-        UserError,
-        match=r"recordingMeta.csv, line 2, column upperlanemarkings: '8.0;moon'",
-    ):
+    with user_error(r"recordingMeta.csv, line 2, column upperlanemarkings: '8.0;moon'"):
         read_recordings("highd", recording)
     meta.unlink()
-    with pytest.raises(
-        UserError,
-        match=r"01_recordingMeta.csv: no such file",
-    ):
+    with user_error(r"01_recordingMeta.csv: no such file"):
         read_recordings("highd", recording)
     write_highd(recording.parent)
     damaged(
@@ -179,14 +170,11 @@ def test_the_metadata_files_are_required_and_checked(
         1,
         "3",
     )
-    with pytest.raises(
-        UserError,
-        match=r"01_tracksMeta.csv, line 3, column drivingdirection: 3 is neither",
-    ):
+    with user_error(r"01_tracksMeta.csv, line 3, column drivingdirection: 3 is neither"):
         read_recordings("highd", recording)
-    with pytest.raises(UserError, match=r"no XX_tracks.csv in this folder"):
+    with user_error(r"no XX_tracks.csv in this folder"):
         read_recordings("highd", recording.parent.parent)
-    with pytest.raises(UserError, match=r"expected highD's XX_tracks.csv"):
+    with user_error(r"expected highD's XX_tracks.csv"):
         read_recordings("highd", meta)
 
 

@@ -71,20 +71,9 @@ def test_a_ramp_is_timed_from_and_to_three_tenths_off_the_centres():
     # The boundary, 1.8 m, is crossed at 3.85 s. Going back, 2.3 s is the first sample within 0.3 m
     # of the old centre (0.25 m); going on, 5.4 s is the first within 0.3 m of the new one (3.35 m).
     change = changes_of(RAMP)
-    assert (
-        change.old_lane.tolist(),
-        change.new_lane.tolist(),
-        change.sample.tolist(),
-    ) == (
-        [0],
-        [1],
-        [38],
-    )
-    assert (
-        change.tau_s[0],
-        change.tau_e[0],
-        change.duration_s[0],
-    ) == pytest.approx((1.55, 1.55, 3.1))
+    assert (change.old_lane[0], change.new_lane[0], change.sample[0]) == (0, 1, 38)
+    times = change.tau_s[0], change.tau_e[0], change.duration_s[0]
+    assert times == pytest.approx((1.55, 1.55, 3.1))
     assert change.lateral_speed[0] == pytest.approx(1.0)
     assert change.complete[0]
 
@@ -156,17 +145,3 @@ def test_recordings_and_arrays_are_measured_alike_and_mirroring_changes_nothing_
         mirrored.lateral_speed,
         atol=1e-9,
     )
-
-
-@given(
-    lateral_mps=st.floats(0.4, 2.0),
-    begin_s=st.floats(1.5, 3.0),
-)
-def test_the_time_of_a_steady_move_is_its_distance_over_its_speed(lateral_mps, begin_s):
-    time = np.arange(200) * 0.1
-    change = changes_of(np.clip(lateral_mps * (time - begin_s), 0.0, WIDTH))
-    assert change.complete[0]
-    # Between 0.3 m off either centre, and up to one sample more at either end.
-    least = (WIDTH - 0.6) / lateral_mps
-    assert least - 1e-9 <= change.duration_s[0] <= least + 0.2 + 1e-9
-    assert change.lateral_speed[0] == pytest.approx(lateral_mps, rel=0.15)

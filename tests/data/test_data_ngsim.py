@@ -15,6 +15,7 @@ from reference.recordings import (
     raw_text,
     traffic,
 )
+from reference.refusals import user_error
 
 from ganlane.data import SCHEMA, read_recordings
 from ganlane.data.ngsim import ngsim_scenes
@@ -69,10 +70,7 @@ def test_raw_text_gives_back_the_recording_in_metres_from_centres_and_from_the_r
     same_driving(scene.frame, FIRST)
     validate(scene.frame, "read")
     assert read_recordings("ngsim", path).equals(scene.frame)
-    with pytest.raises(
-        UserError,
-        match="moon: no such kind of recordings; expected scenes, ngsim or highd",
-    ):
+    with user_error("moon: no such kind of recordings; expected scenes, ngsim or highd"):
         read_recordings("moon", path)
 
 
@@ -232,7 +230,7 @@ def test_a_damaged_field_is_named_by_file_line_and_column(
     tmp_path, row, column, value, message, block_bytes
 ):
     path = changed(tmp_path, row, column, value)
-    with pytest.raises(UserError, match=message) as caught:
+    with user_error(message) as caught:
         read_recordings(
             "ngsim",
             path,
@@ -254,10 +252,7 @@ def test_a_truncated_file_is_refused_and_a_whole_one_read(
         ).height
         == 540
     )
-    with pytest.raises(
-        UserError,
-        match=r"line 541, column lane_id: the file breaks off here, 14 of 19 columns",
-    ):
+    with user_error(r"line 541, column lane_id: the file breaks off here, 14 of 19 columns"):
         read_recordings(
             "ngsim",
             portal_file(
@@ -267,10 +262,7 @@ def test_a_truncated_file_is_refused_and_a_whole_one_read(
         )
     text = text_file(tmp_path, rows)
     text.write_bytes(text.read_bytes()[:-30])
-    with pytest.raises(
-        UserError,
-        match=r"line 540, column \w+: the file breaks off here",
-    ):
+    with user_error(r"line 540, column \w+: the file breaks off here"):
         read_recordings("ngsim", text)
 
 
@@ -314,7 +306,7 @@ def test_a_truncated_file_is_refused_and_a_whole_one_read(
 def test_units_that_cannot_be_feet_and_seconds_are_refused(tmp_path, columns, factor, message):
     # All else stays in feet.
     rows = ngsim_rows(FIRST).with_columns(pl.col(name) * factor for name in columns)
-    with pytest.raises(UserError, match=message) as caught:
+    with user_error(message) as caught:
         read_recordings("ngsim", text_file(tmp_path, rows))
     assert "line 1" in str(caught.value)
 
@@ -322,18 +314,12 @@ def test_units_that_cannot_be_feet_and_seconds_are_refused(tmp_path, columns, fa
 def test_files_of_other_columns_or_places_are_refused(
     tmp_path,
 ):
-    with pytest.raises(
-        UserError,
-        match=r"line 1: 17 columns; expected the 18",
-    ):
+    with user_error(r"line 1: 17 columns; expected the 18"):
         read_recordings(
             "ngsim",
             text_file(tmp_path, ngsim_rows(FIRST).drop("v_Class")),
         )
-    with pytest.raises(
-        UserError,
-        match=r"no rows of us-101, i-80; check data.locations",
-    ):
+    with user_error(r"no rows of us-101, i-80; check data.locations"):
         read_recordings(
             "ngsim",
             portal_file(

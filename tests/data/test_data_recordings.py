@@ -15,6 +15,7 @@ from reference.recordings import (
     traffic,
     write_highd,
 )
+from reference.refusals import user_error
 
 from ganlane.commands.prepare import (
     long_report,
@@ -39,7 +40,6 @@ from ganlane.data.prepared import (
 )
 from ganlane.data.recordings import cut_into_scenes
 from ganlane.data.schema import Scene
-from ganlane.errors import UserError
 from ganlane.files import write_bytes
 
 HEADER = "scene,vehicle,frame,x,y,heading,v,lane,length,width"
@@ -133,7 +133,7 @@ def test_a_synthetic_recording_survives_the_file(tmp_path):
 )
 def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column, value, message):
     path = written(tmp_path, changed(column, lambda _: value, row))
-    with pytest.raises(UserError, match=message) as caught:
+    with user_error(message) as caught:
         read_scenes(path)
     assert str(path) in str(caught.value)
 
@@ -167,7 +167,7 @@ def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column,
     ],
 )
 def test_units_and_directions_that_cannot_be_are_refused(tmp_path, column, factor, message):
-    with pytest.raises(UserError, match=message):
+    with user_error(message):
         read_scenes(
             written(
                 tmp_path,
@@ -195,7 +195,7 @@ def test_units_and_directions_that_cannot_be_are_refused(tmp_path, column, facto
 )
 def test_files_without_columns_rows_or_text_are_refused(content, message, tmp_path):
     (tmp_path / "scenes.csv").write_bytes(content)
-    with pytest.raises(UserError, match=message):
+    with user_error(message):
         read_scenes(tmp_path / "scenes.csv")
 
 
@@ -203,7 +203,7 @@ def test_files_without_columns_rows_or_text_are_refused(content, message, tmp_pa
 def test_absent_files_are_refused(name, tmp_path):
     # A folder without Parquet, a missing CSV, a missing Parquet file.
     (tmp_path / "other.csv").write_text("scene")
-    with pytest.raises(UserError, match="no such file"):
+    with user_error("no such file"):
         read_scenes(tmp_path / name)
 
 
@@ -214,10 +214,7 @@ def test_a_scene_in_two_files_is_refused(tmp_path):
         synthetic_scenes(SyntheticTraffic(scenes=1)),
         tmp_path / "b.parquet",
     )
-    with pytest.raises(
-        UserError,
-        match=r"b.parquet: scene synthetic-0 is in .*a.parquet too; remove one",
-    ):
+    with user_error(r"b.parquet: scene synthetic-0 is in .*a.parquet too; remove one"):
         read_scenes(tmp_path)
 
 
@@ -225,17 +222,14 @@ def test_damaged_parquet_is_refused(tmp_path):
     path = tmp_path / "x.parquet"
     # From no table at all to a single wrong field.
     path.write_bytes(b"PAR1 not really")
-    with pytest.raises(UserError, match="not a readable Parquet file"):
+    with user_error("not a readable Parquet file"):
         read_scenes(path)
     frame = synthetic_scenes()
     write_prepared(frame.drop("speed"), path)
-    with pytest.raises(UserError, match=r"x.parquet: no column speed"):
+    with user_error(r"x.parquet: no column speed"):
         read_scenes(path)
     write_prepared(frame.with_columns(x=pl.lit(float("nan"))), path)
-    with pytest.raises(
-        UserError,
-        match=r"x.parquet, row 0, column x: nan is not a finite number",
-    ):
+    with user_error(r"x.parquet, row 0, column x: nan is not a finite number"):
         read_scenes(path)
 
 
@@ -251,10 +245,7 @@ def test_recordings_with_frames_missing_throughout_are_refused(every, renumbered
     if renumbered:
         frame = frame.with_columns(frame=pl.col("frame") // every)
     write_scene_csv(frame, tmp_path / "sparse.csv")
-    with pytest.raises(
-        UserError,
-        match=r"sparse.csv, line \d+, .*10 frames a second",
-    ):
+    with user_error(r"sparse.csv, line \d+, .*10 frames a second"):
         read_scenes(tmp_path / "sparse.csv")
 
 
@@ -359,22 +350,19 @@ def test_the_output_folder_appears_only_when_everything_was_written(
     lines = ngsim_lines(thousands=False)
     # The last row is damaged.
     (tmp_path / "bad.csv").write_text("\n".join([*lines, lines[-1].replace(",", ",x", 1)]))
-    with pytest.raises(UserError, match="line 542"):
+    with user_error("line 542"):
         prepare_recordings("ngsim", tmp_path / "bad.csv", tmp_path / "out")
     assert [path.name for path in tmp_path.iterdir()] == ["bad.csv"]
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "precious").write_text("")
-    with pytest.raises(
-        UserError,
-        match=r"out: there already; choose another folder with out=FOLDER",
-    ):
+    with user_error(r"out: there already; choose another folder with out=FOLDER"):
         prepare_recordings("ngsim", tmp_path / "bad.csv", tmp_path / "out")
     assert (tmp_path / "out" / "precious").exists()
 
 
 def refused(frame: pl.DataFrame, folder: Path, message: str) -> None:
     write_prepared(frame, folder / "a.parquet")
-    with pytest.raises(UserError, match=message):
+    with user_error(message):
         prepare_recordings("scenes", folder / "a.parquet", folder / "out")
 
 
@@ -403,10 +391,7 @@ def test_recordings_without_vehicles_on_the_lanes_are_refused(
     # A lane number that neither direction has.
     tracks = tmp_path / "01_tracks.csv"
     pl.read_csv(tracks).with_columns(laneId=pl.lit(9)).write_csv(tracks)
-    with pytest.raises(
-        UserError,
-        match="no vehicle on any of the lanes kept",
-    ):
+    with user_error("no vehicle on any of the lanes kept"):
         read_recordings("highd", tmp_path)
 
 

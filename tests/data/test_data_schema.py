@@ -8,6 +8,7 @@ import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.refusals import user_error
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.data.schema import validate
@@ -18,7 +19,6 @@ from ganlane.data.tables import (
     csv_table,
     read_blocks,
 )
-from ganlane.errors import UserError
 
 
 def read(
@@ -109,7 +109,7 @@ def test_the_size_of_a_block_changes_nothing(
 def test_a_row_that_does_not_fit_is_named_by_its_line(tmp_path, lines, message, block_bytes):
     # Bytes that are no UTF-8 get through as latin-1.
     content = "\n".join(["a,b,c", *lines, ""]).encode("latin-1")
-    with pytest.raises(UserError, match=message):
+    with user_error(message):
         read(
             tmp_path / "t.csv",
             content,
@@ -123,21 +123,21 @@ def test_a_row_that_does_not_fit_is_named_by_its_line(tmp_path, lines, message, 
 )
 def test_a_first_line_of_invisible_characters_is_an_empty_file(tmp_path, content):
     (tmp_path / "t.csv").write_bytes(content)
-    with pytest.raises(UserError, match=r"t.csv: the file is empty"):
+    with user_error(r"t.csv: the file is empty"):
         csv_table(tmp_path / "t.csv", {"a": pl.Int64})
 
 
 def test_foreign_line_breaks_are_refused_with_their_line(
     tmp_path,
 ):
-    with pytest.raises(UserError, match=r"t.csv, line 3: not a line of CSV"):
+    with user_error(r"t.csv, line 3: not a line of CSV"):
         read(
             tmp_path / "t.csv",
             b"a,b,c\n1,2,3\n4,5\r6,7,8\n",
         )
     # Line breaks of an old Macintosh make one line of the whole file.
     (tmp_path / "t.csv").write_bytes(b"a,b,c\r1,2,3\r4,5,6\r")
-    with pytest.raises(UserError, match=r"t.csv, line 1: not a line of CSV"):
+    with user_error(r"t.csv, line 1: not a line of CSV"):
         csv_table(tmp_path / "t.csv", {"a": pl.Int64})
 
 
@@ -187,10 +187,7 @@ def test_quoted_fields_may_hold_commas(tmp_path):
 def test_a_wrong_field_is_named_by_file_line_and_column(tmp_path, text, kind, message):
     # The second row, line 3, is the wrong one.
     rows = pl.DataFrame({"x": ["1", text], LINE: [2, 3]})
-    with pytest.raises(
-        UserError,
-        match=f"t.csv, line 3, column x: .*{message}",
-    ):
+    with user_error(f"t.csv, line 3, column x: .*{message}"):
         convert(rows, "x", kind, tmp_path / "t.csv")
 
 
@@ -219,5 +216,5 @@ def test_the_validator_checks_frames_that_come_from_nowhere():
             "made, line 9, column x: None is not a finite number",
         ),
     ):
-        with pytest.raises(UserError, match=message):
+        with user_error(message):
             validate(wrong, "made")

@@ -11,6 +11,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 from reference.file_server import CONTENT, SHA256, Server
+from reference.refusals import user_error
 
 from ganlane.data import (
     SyntheticTraffic,
@@ -25,7 +26,6 @@ from ganlane.data.lanes import find_lane_changes
 from ganlane.data.schema import validate
 from ganlane.data.sources import data_folder
 from ganlane.data.statistics import leader_gaps
-from ganlane.errors import UserError
 
 QUICK = {"timeout_s": 5.0, "attempts": 3, "wait_s": 0.01}
 
@@ -86,10 +86,7 @@ def test_a_later_run_resumes_what_an_earlier_one_left(
     tmp_path,
 ):
     with Server(breaks=[400_000, 0, 0, 0]) as server:
-        with pytest.raises(
-            UserError,
-            match=r"cannot be fetched, 400000 bytes came .*continues from there",
-        ):
+        with user_error(r"cannot be fetched, 400000 bytes came .*continues from there"):
             fetch(server, tmp_path / "f", SHA256)
         assert "f" not in names(tmp_path)
         # The next run finds the server well.
@@ -106,7 +103,7 @@ def test_a_later_run_resumes_what_an_earlier_one_left(
 )
 def test_a_part_of_another_version_or_longer_than_the_file_is_discarded(content, etag, tmp_path):
     with Server(breaks=[300_000, 0, 0, 0]) as server:
-        with pytest.raises(UserError, match="cannot be fetched"):
+        with user_error("cannot be fetched"):
             fetch(server, tmp_path / "f")
         # The file changes on the server between two runs.
         server.content, server.etag, server.breaks = (
@@ -121,7 +118,7 @@ def test_a_part_of_another_version_or_longer_than_the_file_is_discarded(content,
 def test_a_corrupt_transfer_leaves_nothing(tmp_path):
     with (
         Server(content=CONTENT[:-1] + b"?") as server,
-        pytest.raises(UserError, match=f"its SHA-256 is .*{SHA256}"),
+        user_error(f"its SHA-256 is .*{SHA256}"),
     ):
         fetch(server, tmp_path / "f", SHA256.upper())
     assert names(tmp_path) == []
@@ -135,10 +132,7 @@ def test_a_file_that_is_there_is_kept_and_compared(
     with Server() as server:
         assert fetch(server, path, SHA256) == path
         assert server.asked == []
-        with pytest.raises(
-            UserError,
-            match=r"remove it, or correct data\.sha256",
-        ):
+        with user_error(r"remove it, or correct data\.sha256"):
             fetch(server, path, "0" * 64)
     assert path.read_bytes() == CONTENT
 
@@ -146,13 +140,10 @@ def test_a_file_that_is_there_is_kept_and_compared(
 def test_a_refused_request_is_reported_at_once(tmp_path):
     # Asking again would not help.
     with Server(status=404) as server:
-        with pytest.raises(
-            UserError,
-            match=r"the server says 404 Not Found; check data.url",
-        ):
+        with user_error(r"the server says 404 Not Found; check data.url"):
             fetch(server, tmp_path / "f")
         assert len(server.asked) == 1
-    with pytest.raises(UserError, match="not an address"):
+    with user_error("not an address"):
         download("file:///etc/hostname", tmp_path / "f")
     assert names(tmp_path) == []
 
@@ -161,10 +152,10 @@ def test_a_failing_server_is_tried_again_and_an_absent_one_is_named(
     tmp_path,
 ):
     with Server(status=503) as server:
-        with pytest.raises(UserError, match=r"0 bytes came \(503"):
+        with user_error(r"0 bytes came \(503"):
             fetch(server, tmp_path / "f")
         assert len(server.asked) == QUICK["attempts"]
-    with pytest.raises(UserError, match=r"0 bytes came \(.*refused"):
+    with user_error(r"0 bytes came \(.*refused"):
         fetch(server, tmp_path / "f")
 
 
@@ -213,10 +204,7 @@ def test_progress_shows_bytes_on_a_terminal_and_nothing_of_short_work_elsewhere(
 def test_the_recordings_are_found_through_the_variable(tmp_path, monkeypatch):
     monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
     assert data_folder() == tmp_path
-    with pytest.raises(
-        UserError,
-        match=r"set GANLANE_DATA to a folder that holds ngsim/us101_scenes\.csv",
-    ):
+    with user_error(r"set GANLANE_DATA to a folder that holds ngsim/us101_scenes\.csv"):
         default_scenes()
     # First nothing, then a file, then no folder.
     (tmp_path / "ngsim").mkdir()
@@ -224,7 +212,7 @@ def test_the_recordings_are_found_through_the_variable(tmp_path, monkeypatch):
     deep.write_text("scene,vehicle")
     assert default_scenes() == deep
     monkeypatch.setenv("GANLANE_DATA", str(tmp_path / "nowhere"))
-    with pytest.raises(UserError, match="no such folder"):
+    with user_error("no such folder"):
         data_folder()
 
 
@@ -249,7 +237,7 @@ def test_the_recordings_are_found_beside_the_current_folder(tmp_path, monkeypatc
 def test_a_file_larger_than_wanted_is_refused_and_leaves_nothing(length, tmp_path):
     with (
         Server(length=length) as server,
-        pytest.raises(UserError, match=r"the file has .* GB or more"),
+        user_error(r"the file has .* GB or more"),
     ):
         fetch(
             server,
@@ -271,10 +259,7 @@ def test_a_file_larger_than_wanted_is_refused_and_leaves_nothing(length, tmp_pat
 def test_no_redirection_leads_away_from_http(place, tmp_path):
     with (
         Server(sends_to=place) as server,
-        pytest.raises(
-            UserError,
-            match=r"not allowed|expected http|Invalid",
-        ),
+        user_error(r"not allowed|expected http|Invalid"),
     ):
         fetch(server, tmp_path / "f")
     assert "f" not in names(tmp_path)

@@ -9,6 +9,7 @@ import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from reference.refusals import user_error
 
 from ganlane.data import (
     SCHEMA,
@@ -191,9 +192,9 @@ def test_foreign_statistics_are_refused():
     numbers = driving_statistics(recording()).to_dict()
     # One name is missing, then nearly all.
     del numbers["lane_changes"]["srlc"]
-    with pytest.raises(UserError, match="srlc"):
+    with user_error("srlc"):
         DrivingStatistics.from_dict(numbers)
-    with pytest.raises(UserError, match="measure them again"):
+    with user_error("measure them again"):
         DrivingStatistics.from_dict({"speed": 3})
 
 
@@ -242,16 +243,11 @@ def test_a_histogram_describes_a_sample_to_a_bins_width(values, parts):
 def test_the_survival_curve_takes_censored_times_as_lower_bounds():
     # Worked by hand: of 5, one ends at 1 (4/5 are left), one is cut off at 2, of the other 3 one
     # ends at 3 (2/3 of 4/5), one is cut off at 4, the last ends at 5.
-    times, shares = survival_curve(
-        [3.0, 1.0, 2.0, 5.0, 4.0],
-        [True, True, False, True, False],
-    )
+    durations = [3.0, 1.0, 2.0, 5.0, 4.0], [True, True, False, True, False]
+    times, shares = survival_curve(*durations)
     assert times.tolist() == [1.0, 3.0, 5.0]
     assert shares == pytest.approx([0.8, 0.8 * 2 / 3, 0.0])
-    described = describe_durations(
-        [3.0, 1.0, 2.0, 5.0, 4.0],
-        [True, True, False, True, False],
-    )
+    described = describe_durations(*durations)
     assert described.survival_mean_s == pytest.approx(1.0 + 2 * 0.8 + 2 * 0.8 * 2 / 3)
     assert described.survival_median_s == 5.0
     assert (

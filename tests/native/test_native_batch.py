@@ -112,11 +112,13 @@ def test_a_batch_gives_the_torchrl_environments_numbers(
     state = env.reset()
     batch.start(5, np.arange(ROWS))
     assert_equal(state, batch, mask != "none")
-    draw, ended = np.random.default_rng(0), 0
+    draw = np.random.default_rng(0)
+    ended = 0
     for decision in range(60):
         actions = draw.integers(0, 3, ROWS) * (decision % 3 == 0)
         both, state = env.step_and_maybe_reset(state.set("action", torch.as_tensor(actions)))
-        after, stepped = both["next"], batch.step(actions)
+        after = both["next"]
+        stepped = batch.step(actions)
         assert_equal(after, batch, mask != "none")
         np.testing.assert_array_equal(after["reward"][:, 0].numpy(), stepped.reward)
         for name in ("done", "terminated", "truncated"):

@@ -138,5 +138,7 @@ def test_the_library_of_a_wheel_is_taken_and_needs_no_compiler(monkeypatch, tmp_
 
 def test_the_library_of_another_versions_sources_is_not_taken(monkeypatch, tmp_path):
     ours = library._prebuilt("default")
-    monkeypatch.setattr(library, "_sources", lambda: ("other",))
+    other = tmp_path / "other.cpp"
+    other.write_text("other")
+    monkeypatch.setattr(library, "SOURCES", (other,))
     assert library._prebuilt("default").name != ours.name

@@ -42,7 +42,8 @@ def random_highway(rng: random.Random, rows: int, most_vehicles: int) -> Highway
     """1 to 6 lanes, 2 to 60 vehicles, dense and sparse, with and without MOBIL, all periods and
     visibilities.
     """
-    lanes, vehicles = rng.randint(1, 6), rng.randint(2, most_vehicles)
+    lanes = rng.randint(1, 6)
+    vehicles = rng.randint(2, most_vehicles)
     spacing = rng.choice([8.0, 12.0, 25.0])
     return environment(
         lanes,
@@ -68,10 +69,8 @@ def disturbed_start(env: HighwayEnv, generator: torch.Generator) -> TensorDictBa
     """
     td = env.reset()
     scene = Vehicles.of(td[keys.VEHICLES])
-    off, between = (
-        disturbed(scene, env.road.lanes, generator),
-        drawing(scene.x.shape, generator, env.dtype),
-    )
+    off = disturbed(scene, env.road.lanes, generator)
+    between = drawing(scene.x.shape, generator, env.dtype)
     off = off.with_(
         x=off.x * (1 + 3 * (between(0, 1) < 0.05)),
         heading=off.heading * (1 + 20 * (between(0, 1) < 0.02)),
@@ -156,8 +155,10 @@ def compare_random_highways(
     highways: int, rows: int, decisions: int, seed: int, vehicles: int
 ) -> None:
     """Both decide from every state of the tensor code's episodes."""
-    rng, generator = random.Random(seed), torch.Generator().manual_seed(seed)
-    compared, at_threshold = 0, 0
+    rng = random.Random(seed)
+    generator = torch.Generator().manual_seed(seed)
+    compared = 0
+    at_threshold = 0
     for highway in range(highways):
         env = random_highway(rng, rows, vehicles)
         kernel = kernel_of(env)
@@ -171,7 +172,8 @@ def compare_random_highways(
                 assert within_rounding(env, td, row), (seed, highway, row)
             worst = errors(out, stepped["next"], ~differs)
             assert max(worst.values()) < 1e-3, worst
-            compared, at_threshold = compared + rows, at_threshold + int(differs.sum())
+            compared = compared + rows
+            at_threshold = at_threshold + int(differs.sum())
             td = following
     assert at_threshold <= max(1, compared // 100_000), (at_threshold, compared)
 
@@ -188,7 +190,8 @@ def test_it_decides_as_the_tensor_code_on_a_million_decisions():
 def test_it_recycles_as_the_tensor_code():
     """Over a minute slow vehicles fall behind and fast ones run away."""
     env = environment(num_envs=32, recycle=True, dtype=torch.float32)
-    kernel, td = kernel_of(env), env.reset()
+    kernel = kernel_of(env)
+    td = env.reset()
     jumped = 0
     for _ in range(60):
         td["action"] = torch.zeros(32, dtype=torch.int64)
@@ -207,7 +210,8 @@ def test_after_30_s_on_their_own_they_are_within_a_millimetre():
     generator = torch.Generator().manual_seed(5)
     td = disturbed_start(env, generator)
     chosen = [actions(env, generator, change=0.05) for _ in range(30)]
-    kernel, out = kernel_of(env), td
+    kernel = kernel_of(env)
+    out = td
     same = torch.ones(64, dtype=torch.bool)
     for action in chosen:
         # Each from its own state; the kernel drives rows that have ended on.
@@ -225,7 +229,8 @@ def test_after_30_s_on_their_own_they_are_within_a_millimetre():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_it_agrees_with_the_scalar_twin(seed):
-    rng, generator = random.Random(seed), torch.Generator().manual_seed(seed)
+    rng = random.Random(seed)
+    generator = torch.Generator().manual_seed(seed)
     for highway in range(6):
         env = random_highway(rng, 4, most_vehicles=15)
         env.recycle = False
@@ -236,7 +241,9 @@ def test_it_agrees_with_the_scalar_twin(seed):
             state = scalar_state(td, row)
             outcome = scalar.decide(state, int(td["action"][row]), rules_of(env))
             after = out[row]
-            cars, ego, events = after[keys.VEHICLES], after[keys.EGO], after[keys.EVENTS]
+            cars = after[keys.VEHICLES]
+            ego = after[keys.EGO]
+            events = after[keys.EVENTS]
             for name in ("x", "y", "heading", "speed", "acceleration"):
                 expected = torch.tensor([getattr(car, name) for car in state.cars])
                 assert cars[name] == pytest.approx(expected, abs=1e-3), (name, row)
@@ -311,7 +318,8 @@ def test_what_goes_in_stays_as_it_is_and_need_not_be_contiguous(crowd):
     ids=["the paper's", "lorries", "one lane", "a crowd"],
 )
 def test_every_number_of_a_first_scene_is_that_of_the_tensor_code(scenes):
-    seed, episode = torch.full((200,), 7), torch.arange(200) * 13 - 50
+    seed = torch.full((200,), 7)
+    episode = torch.arange(200) * 13 - 50
     state = NativeScenes(scenes, 2).start(seed, episode)
     expected = scenes(episode_key(2, seed, episode), torch.float32)
     assert same_bits(state[keys.VEHICLES], TensorDict(expected.as_dict(), [200])) == []
@@ -320,7 +328,8 @@ def test_every_number_of_a_first_scene_is_that_of_the_tensor_code(scenes):
 
 
 def test_rows_that_are_not_asked_for_stay_empty():
-    seed, episode = torch.zeros(600, dtype=torch.int64), torch.arange(600)
+    seed = torch.zeros(600, dtype=torch.int64)
+    episode = torch.arange(600)
     rows = torch.arange(600) % 7 == 3
     kernel = NativeScenes(RandomScenes(), 2)
     some, every = (kernel.start(seed, episode, drawn)[keys.VEHICLES] for drawn in (rows, None))

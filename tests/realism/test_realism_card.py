@@ -135,17 +135,8 @@ def test_traffic_that_stands_still_has_counts_and_no_rates():
     )
     assert run["vehicle_km"] == 0.0
     assert run["standstills_in_free_flow"] > 0
-    for name in (
-        "lane_changes_per_vehicle_km",
-        "overlaps_per_1000_vehicle_km",
-    ):
-        assert (
-            run[name]
-            is run[f"{name}_ci"]
-            is totals([run])[name]
-            is totals([run])[f"{name}_ci"]
-            is None
-        )
+    for rate in ("lane_changes_per_vehicle_km", "overlaps_per_1000_vehicle_km"):
+        assert run[rate] is run[f"{rate}_ci"] is totals([run])[rate] is None
     table = long_table([run], "still")
     assert (
         cells(table, "changes per vehicle-km")
@@ -165,30 +156,10 @@ def test_a_traffic_without_a_guard_has_none_in_its_card():
     without, with_guard = (
         long_run(make, Road(), short) for make in (gan_calibrated_traffic, gan_traffic)
     )
-    assert (
-        without["guard_share"],
-        without["overlaps"],
-    ) == (
-        None,
-        0,
-    )
+    assert without["guard_share"] is None
     assert 0.0 < with_guard["guard_share"] < 1.0
-    assert (
-        long_run(
-            lambda road: gan_traffic(road, guard=False),
-            Road(),
-            short,
-        )["guard_share"]
-        is None
-    )
     assert cells(long_table([without], "a"), "the guard's share") == ["none"]
-    assert (
-        cells(
-            long_table([with_guard], "a"),
-            "the guard's share",
-        )[1]
-        == "%"
-    )
+    assert cells(long_table([with_guard], "a"), "the guard's share")[1] == "%"
     assert "guard under 5 percent: no guard" in checks_text(checked(without))
     assert "no guard" not in checks_text(checked(with_guard))
 
@@ -210,15 +181,7 @@ def test_densities_have_area_one_and_the_quantitys_unit():
         },
     )
     (axes,) = figure.axes
-    assert (
-        axes.get_title("left"),
-        axes.get_xlabel(),
-        axes.get_ylabel(),
-    ) == (
-        "jerk",
-        "m/s³",
-        "density, per m/s³",
-    )
+    assert axes.get_ylabel() == "density, per m/s³"
     (recorded, *ends), (simulated, *left_end) = (
         in_colour(axes, INK),
         in_colour(axes, COLOURS[0]),
@@ -236,14 +199,6 @@ def test_densities_have_area_one_and_the_quantitys_unit():
     assert recorded.get_ydata()[[0, 1, 2, 49]] == pytest.approx([1.25, 2.5, 0.0, 1.25])
     assert simulated.get_ydata()[:2] == pytest.approx([5.0, 0.0])
     assert in_colour(axes, COLOURS[1]) == []
-    assert axes.get_xlim() == (-5.0, 5.0)
-    named = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert named == [
-        "recorded",
-        "idm",
-        "nobody",
-        "and all values beyond",
-    ]
 
 
 def row(distance, **against):
@@ -272,7 +227,6 @@ def test_every_traffic_has_its_dot_and_interval_at_its_distance():
     assert below[1].get_ydata()[0] > dot.get_ydata()[0]
     assert [line.get_xdata()[0] for line in in_colour(axes, COLOURS[1])] == [0.75] * 4
     assert [label.get_text() for label in axes.get_yticklabels()] == ["speed", "gap"]
-    assert axes.get_xlim() == (0.0, 1.0)
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert names == [
         "Mine",
@@ -312,18 +266,8 @@ def test_drift_is_drawn_over_time_with_a_gap_where_nobody_was_left():
     }
     figure = draw_speeds_over_time([{"vehicles": 9, "speeds": speeds}], spread_mps=2.8)
     mean, spread = figure.axes
-    assert (
-        mean.get_title("left"),
-        mean.get_xlabel(),
-        mean.get_ylabel(),
-    ) == (
-        "mean speed",
-        "time, s",
-        "m/s",
-    )
     (line,) = in_colour(mean, COLOURS[0])
     assert line.get_xdata().tolist() == [10.0, 60.0, 300.0]
     assert line.get_ydata() == pytest.approx([20.0, np.nan, 22.0], nan_ok=True)
     (level,) = in_colour(spread, INK)
     assert set(level.get_ydata()) == {2.8}
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["recorded", "9 vehicles"]

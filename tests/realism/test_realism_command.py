@@ -65,17 +65,10 @@ def run(capsys, *arguments):
     out, err = capsys.readouterr()
     last = (out.splitlines() or [""])[-1]
     path = Path(last.removeprefix("results: ")) if last.startswith("results: ") else None
-    return (
-        status,
-        None
-        if path is None
-        else {
-            **json.loads(path.read_text()),
-            "folder": path.parent,
-        },
-        out,
-        err,
-    )
+    results = None
+    if path is not None:
+        results = {**json.loads(path.read_text()), "folder": path.parent}
+    return status, results, out, err
 
 
 def test_a_card_holds_every_quantity_in_numbers_tables_and_figures(recordings, capsys):
@@ -90,15 +83,9 @@ def test_a_card_holds_every_quantity_in_numbers_tables_and_figures(recordings, c
         f"data.path={recordings}",
         *asked,
     )
-    assert (
-        status,
-        results["traffic"],
-        results["quantities"].keys(),
-    ) == (
-        0,
-        "idm",
-        QUANTITIES.keys(),
-    )
+    assert status == 0
+    assert results["traffic"] == "idm"
+    assert results["quantities"].keys() == QUANTITIES.keys()
     # A row holds distance, interval, scale and rivals.
     row = results["quantities"]["speed"]
     assert 0.0 <= row["distance_ci"][0] <= row["distance"] <= 1.0
@@ -164,16 +151,11 @@ def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(
     capsys,
 ):
     status, results, _, err = run(capsys, "traffic=idm_mobil", "against=[]")
-    assert (status, results["starts"], results["i80"]) == (
-        0,
-        "spawned",
-        {},
-    )
+    assert status == 0
+    assert (results["starts"], results["i80"]) == ("spawned", {})
     assert "no recordings here" in err
-    assert None not in (
-        results["quantities"]["speed"]["ceiling"],
-        results["quantities"]["speed"]["floor"],
-    )
+    speed = results["quantities"]["speed"]
+    assert None not in (speed["ceiling"], speed["floor"])
 
 
 def test_a_users_own_traffic_gets_a_card_and_one_of_i80_beside_the_scenes(recordings, capsys):
@@ -317,23 +299,9 @@ def test_one_scene_is_refused_with_what_to_do_and_driven_whole_when_asked(record
     pl.read_csv(recordings).filter(pl.col("scene") == "synthetic-1").write_csv(recordings)
     status, _, _, err = run(capsys, "traffic=idm", f"data.path={recordings}")
     assert status == 2
-    assert all(
-        part in err
-        for part in (
-            "one scene, synthetic-1",
-            "scenes=all",
-            "scene_s=30",
-        )
-    )
-    assert (
-        run(
-            capsys,
-            "traffic=idm",
-            f"data.path={recordings}",
-            "scenes=all",
-        )[0]
-        == 0
-    )
+    for part in ("one scene, synthetic-1", "scenes=all", "scene_s=30"):
+        assert part in err
+    assert run(capsys, "traffic=idm", f"data.path={recordings}", "scenes=all")[0] == 0
 
 
 @pytest.mark.slow

@@ -21,8 +21,6 @@ from ganlane.realism.driving import (
     with_recorded_headways,
 )
 from ganlane.realism.starts import simulate
-from ganlane.sim.idm import following_acceleration
-from ganlane.sim.neighbours import perceive
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import IdmMobilTraffic, TrafficModule
 from ganlane.traffic.presets import (
@@ -208,14 +206,6 @@ def test_a_follower_shows_its_headway_unless_it_is_far_behind_and_none_under_a_t
     )
     assert ahead == headways(queue([0.0, 64.0]))[0] == DRAWN
     assert headways(queue([0.0, 5.0]))[0] == pytest.approx(0.1)
-
-
-def test_with_the_headway_that_it_shows_idm_neither_speeds_up_nor_brakes():
-    # Gaps of 8, 24 and 16 m at one speed.
-    vehicles = queue([0.0, 12.0, 40.0, 60.0])
-    shown = balanced_headway(vehicles, ROAD, torch.ones_like(vehicles.x))
-    acceleration = following_acceleration(perceive(vehicles, ROAD), headway_s=shown)
-    assert acceleration[0, 1:4].abs().max() < 1e-4
 
 
 def test_only_those_who_enter_are_credited_and_other_memories_stay_as_they_are():

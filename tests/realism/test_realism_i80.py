@@ -3,8 +3,8 @@
 import polars as pl
 import pytest
 from reference.recordings import following_file
+from reference.refusals import user_error
 
-from ganlane.errors import UserError
 from ganlane.realism.i80 import I80_FILES, read_i80
 from ganlane.realism.measures import measure_recordings
 
@@ -90,8 +90,8 @@ def test_a_lane_is_driven_as_a_whole_in_stretches_of_their_own(
 def test_damaged_files_are_named(tmp_path):
     path = tmp_path / I80_FILES["lane_1"]
     path.write_text("vehicle,frame,x\n1,2,three\n")
-    with pytest.raises(UserError, match="line 2, column x"):
+    with user_error("line 2, column x"):
         read_i80("lane_1", path)
     path.write_text("vehicle,frame,x\n1,2,3.0\n1,3,4.0\n")
-    with pytest.raises(UserError, match="nothing in it lasts 15 s"):
+    with user_error("nothing in it lasts 15 s"):
         read_i80("lane_1", path)

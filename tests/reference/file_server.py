@@ -27,7 +27,9 @@ class Server:
         sends_to=None,
     ):
         self.content, self.breaks, self.ranges, self.etag = content, list(breaks), ranges, etag
-        self.length, self.status, self.sends_to = length, status, sends_to
+        self.length = length
+        self.status = status
+        self.sends_to = sends_to
         self.asked: list[str | None] = []
         server = self
 

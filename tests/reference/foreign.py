@@ -24,7 +24,9 @@ def drive(env, episodes, decisions, command=lambda decision, episode: 0):
     """The vehicles [T + 1, N, M] after each physics step, which rows ran in it [T, N], and the last
     state.
     """
-    state, steps, running = start(env, episodes), [], []
+    state = start(env, episodes)
+    steps = []
+    running = []
     steps.append(Vehicles.of(state[keys.VEHICLES]))
     done = state["done"][:, 0]
 
@@ -54,7 +56,10 @@ def overlaps_of_the_others(env, least_km, seconds=None, ego=False):
 
     ``ego``: its, too.
     """
-    km, count, first, decisions = 0.0, 0, 0 if ego else 1, 0
+    km = 0.0
+    count = 0
+    first = 0 if ego else 1
+    decisions = 0
 
     def record(now, running):
         nonlocal km, count

@@ -9,7 +9,9 @@ import gymnasium
 import ganlane  # noqa: F401 - registers the environments
 
 ID = "ganlane/Highway-v0"
-KEEP, LEFT, RIGHT = 0, 1, 2
+KEEP = 0
+LEFT = 1
+RIGHT = 2
 ROOT = Path(__file__).resolve().parents[2]
 
 

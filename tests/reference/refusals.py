@@ -5,11 +5,18 @@ Or naming their results.
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
 
 from ganlane.__main__ import main
+from ganlane.errors import UserError
+
+
+def user_error(sentence: str) -> AbstractContextManager[pytest.ExceptionInfo[UserError]]:
+    """A user's mistake is refused within the block; ``sentence`` is a pattern of its message."""
+    return pytest.raises(UserError, match=sentence)
 
 
 def everything_below(folder: Path) -> dict[str, int]:
@@ -50,10 +57,9 @@ class Bomb:
         return open, ("executed", "w")
 
 
-def run_folder(overrides: str, checkpoint: bytes = b"", config: str = "compile: auto\n") -> None:
+def run_folder(config: str, checkpoint: bytes = b"") -> None:
     """What a stopped training run leaves in the folder ``run``, as far as resuming reads it."""
     folder = Path("run")
     (folder / "checkpoints").mkdir(parents=True)
     (folder / "checkpoints" / "last.pt").write_bytes(checkpoint)
-    (folder / "overrides.yaml").write_text(overrides)
     (folder / "config.yaml").write_text(config)

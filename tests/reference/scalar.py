@@ -15,8 +15,12 @@ DT = 0.1
 REST = 1e-12  # a heading, steering angle or lateral position of at most this is 0
 WHEELBASE = 2.7
 NOBODY = 10_000.0  # Table V: the gap of an empty lane
-CENTRE, BODY, SIGNALLED = 0, 1, 2
-KEEP, LEFT, RIGHT = 0, 1, 2
+CENTRE = 0
+BODY = 1
+SIGNALLED = 2
+KEEP = 0
+LEFT = 1
+RIGHT = 2
 
 
 @dataclass
@@ -81,7 +85,10 @@ def idm(speed: float, desired_speed: float, gap: float, leader_speed: float) -> 
 
     Between -20 and 0.7 m/s2.
     """
-    a, b, headway, d0 = 0.7, 1.7, 1.6, 2.0
+    a = 0.7
+    b = 1.7
+    headway = 1.6
+    d0 = 2.0
     wanted = d0 + max(
         0.0, speed * headway + speed * (speed - leader_speed) / (2.0 * math.sqrt(a * b))
     )
@@ -95,7 +102,8 @@ def idm(speed: float, desired_speed: float, gap: float, leader_speed: float) -> 
 def lanes_entered(car: Car, rules: Rules) -> set[int]:
     """Lanes whose strip the body enters by more than 0.1 m."""
     half = 0.5 * (car.width * math.cos(car.heading) + car.length * abs(math.sin(car.heading)))
-    right, left = car.y - half + 0.1, car.y + half - 0.1
+    right = car.y - half + 0.1
+    left = car.y + half - 0.1
     w = rules.lane_width
     return {k for k in range(rules.lanes) if right < (k + 0.5) * w and left > (k - 0.5) * w}
 
@@ -114,7 +122,8 @@ class View:
     """The cars at one instant, and who stands in which lane."""
 
     def __init__(self, cars: list[Car], rules: Rules) -> None:
-        self.cars, self.rules = cars, rules
+        self.cars = cars
+        self.rules = rules
         self.in_lane: dict[int, list[int]] = {k: [] for k in range(rules.lanes)}
         for index, car in enumerate(cars):
             for lane in lanes_seen_in(car, rules):
@@ -176,7 +185,8 @@ def incentive(view: View, i: int, lane: int) -> tuple[float, bool]:
     safe = view.acceleration(i, view.leader(i, lane)) >= -4.0
     new = view.follower(i, lane)
     if new is not None:
-        after, before = view.acceleration(new, i), view.acceleration(new, view.leader(i, lane))
+        after = view.acceleration(new, i)
+        before = view.acceleration(new, view.leader(i, lane))
         gain += 1.0 * (after - before)
         safe = safe and after >= -4.0
     old = view.follower(i, here)
@@ -187,15 +197,18 @@ def incentive(view: View, i: int, lane: int) -> tuple[float, bool]:
 
 def mobil_wish(view: View, i: int) -> int:
     """-1, 0 or +1 lanes; the better side, left at a tie; nothing in the middle of a change."""
-    car, rules = view.cars[i], view.rules
+    car = view.cars[i]
+    rules = view.rules
     if not car.valid or not settled(car, rules):
         return 0
-    best, wish = -math.inf, 0
+    best = -math.inf
+    wish = 0
     for side in (1, -1):
         if 0 <= car.target_lane + side < rules.lanes:
             gain, safe = incentive(view, i, car.target_lane + side)
             if safe and gain > 0.1 and gain > best:
-                best, wish = gain, side
+                best = gain
+                wish = side
     return wish
 
 
@@ -234,7 +247,8 @@ def steered(car: Car, centre: float) -> float:
         # d/dt atan(offset / distance), the point moving along with the car
         return -sideways * distance / (distance**2 + offset**2) - yaw_rate
 
-    near, far = 1.0 * pace, 4.0 * pace
+    near = 1.0 * pace
+    far = 4.0 * pace
     near_angle = math.atan2(offset, near) - car.heading
     # Below 3 m/s the integral term is per distance: it fades with the speed.
     rate = 1.5 * angle_rate(far) + 3.0 * angle_rate(near) + 3.375 * near_angle * car.speed / pace
@@ -263,7 +277,8 @@ def driven(car: Car, acceleration: float, steering: float) -> Car:
 
 
 def corners(car: Car) -> list[tuple[float, float]]:
-    c, s = math.cos(car.heading), math.sin(car.heading)
+    c = math.cos(car.heading)
+    s = math.sin(car.heading)
     signs = ((1, 1), (1, -1), (-1, -1), (-1, 1))
     half = [(a * car.length / 2, b * car.width / 2) for a, b in signs]
     return [(car.x + c * a - s * b, car.y + s * a + c * b) for a, b in half]
@@ -278,7 +293,8 @@ def overlap(one: Car, other: Car) -> bool:
         other.heading,
         other.heading + math.pi / 2,
     ):
-        c, s = math.cos(angle), math.sin(angle)
+        c = math.cos(angle)
+        s = math.sin(angle)
         shadows = [[c * x + s * y for x, y in box] for box in boxes]
         if max(shadows[0]) <= min(shadows[1]) or max(shadows[1]) <= min(shadows[0]):
             return False
@@ -292,7 +308,8 @@ def close(gap: float, closing: float) -> bool:
 
 def ego_close(view: View) -> tuple[bool, bool]:
     """Whether the ego is dangerously close to somebody ahead, behind, in a lane its body is in."""
-    ego, cars = view.cars[0], view.cars
+    ego = view.cars[0]
+    cars = view.cars
     ahead = behind = False
     for lane in lanes_entered(ego, view.rules):
         j = view.leader(0, lane)
@@ -337,7 +354,8 @@ def obey(state: State, action: int, rules: Rules) -> tuple[bool, bool]:
 def decide(state: State, action: int, rules: Rules) -> Outcome:
     """One decision, in place; a state that has ended stays as it was at that instant."""
     outcome = Outcome()
-    start_speed, start_step = state.cars[0].speed, state.step
+    start_speed = state.cars[0].speed
+    start_step = state.step
     outcome.started_change, off_road = obey(state, action, rules)
     if off_road:
         outcome.reasons.append("out_of_road")
@@ -349,7 +367,8 @@ def decide(state: State, action: int, rules: Rules) -> Outcome:
         ahead, behind = ego_close(View(state.cars, rules))
         outcome.soft_crash += ahead and not state.close_ahead
         outcome.soft_crash_behind += behind and not state.close_behind
-        state.close_ahead, state.close_behind = ahead, behind
+        state.close_ahead = ahead
+        state.close_behind = behind
         if any(overlap(ego, other) for other in state.cars[1:] if other.valid):
             outcome.reasons.append("hard_crash")
         elif ego.x >= rules.goal:

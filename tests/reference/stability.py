@@ -40,7 +40,8 @@ def equilibrium(speed: float, desired: float) -> float:
 
 def slopes(speed: float, desired: float) -> Slopes:
     """At the equilibrium: of ``a (1 - (v/v0)^4 - (s*/s)^2)``, ``s* = d0 + v T + v (v - l) / c``."""
-    wanted, gap = MIN_GAP + speed * HEADWAY, equilibrium(speed, desired)
+    wanted = MIN_GAP + speed * HEADWAY
+    gap = equilibrium(speed, desired)
     pull = 2.0 * A * wanted / gap**2
     by_speed = -4.0 * A * speed**3 / desired**4 - pull * (HEADWAY + speed / C)
     return Slopes(pull * wanted / gap, by_speed, pull * speed / C)
@@ -72,8 +73,10 @@ def wave(speed: float, desired: float, k: float, dt: float) -> tuple[complex, co
     A step is ``v' = v + a dt``, ``x' = x + (v + v') dt / 2``; with ``x' = z x`` follows
     ``2 (z - 1)^2 = dt^2 f_s (e - 1) (z + 1) + 2 dt (f_v + f_l e) (z - 1)``.
     """
-    f, e = slopes(speed, desired), cmath.exp(-1j * k)
-    stiff, damp = f.gap * (e - 1.0) * dt * dt, (f.speed + f.leader * e) * dt
+    f = slopes(speed, desired)
+    e = cmath.exp(-1j * k)
+    stiff = f.gap * (e - 1.0) * dt * dt
+    damp = (f.speed + f.leader * e) * dt
     z = max((1.0 + root for root in np.roots([2.0, -2.0 * damp - stiff, -2.0 * stiff])), key=abs)
     return complex(z), complex(2.0 * (z - 1.0) / (dt * (z + 1.0)))
 
@@ -92,10 +95,12 @@ def step_matrix(speed: float, desired: float, cars: int, dt: float, ring: bool) 
 
     The first follows the last on a ring, else an undisturbed one.
     """
-    f, one = slopes(speed, desired), np.eye(cars)
+    f = slopes(speed, desired)
+    one = np.eye(cars)
     ahead = np.eye(cars, k=-1)
     ahead[0, -1] = float(ring)
-    by_x, by_v = f.gap * (ahead - one), f.speed * one + f.leader * ahead
+    by_x = f.gap * (ahead - one)
+    by_v = f.speed * one + f.leader * ahead
     return np.block(
         [[one + 0.5 * dt**2 * by_x, dt * one + 0.5 * dt**2 * by_v], [dt * by_x, one + dt * by_v]]
     )

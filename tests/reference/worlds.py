@@ -95,7 +95,8 @@ def random_scenes(rows: int, cars: int, lanes: int, seed: int) -> Vehicles:
     side = (between(0, 2).long() * 2 - 1) * (between(0, 1) < 0.2)
     target = (lane + side).clamp(0, lanes - 1)
     speed = between(0, 35)
-    x, y = between(0, 400), 4.0 * (lane + (target - lane) * between(0, 1))
+    x = between(0, 400)
+    y = 4.0 * (lane + (target - lane) * between(0, 1))
     desired = torch.maximum(between(10, 40), 0.9 * speed)
     return vehicles_at(x, target, y=y, speed=speed, desired_speed=desired)
 
@@ -243,7 +244,8 @@ def leaves(td: TensorDictBase) -> Iterator[tuple[str | tuple[str, ...], torch.Te
 
 def same_bits(one: TensorDictBase, other: TensorDictBase) -> list[str]:
     """Names of the entries that are missing in one or differ in any bit."""
-    a, b = dict(leaves(one)), dict(leaves(other))
+    a = dict(leaves(one))
+    b = dict(leaves(other))
     return [
         str(name)
         for name in {**a, **b}

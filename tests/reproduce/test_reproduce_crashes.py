@@ -10,9 +10,9 @@ from pathlib import Path
 
 import polars as pl
 import pytest
+from reference.refusals import user_error
 
 from ganlane.config.run import run_command
-from ganlane.errors import UserError
 from ganlane.evaluation.rows import FAILURES
 from ganlane.reproduce.crashes import (
     Crash,
@@ -90,8 +90,7 @@ def test_episodes_that_end_otherwise_are_counted_and_not_listed(tmp_path):
     ("path", "value"),
     [
         ("traffics gan _target_", "os.getcwd"),
-        ("crashes 0 driver", "${oc.env:HOME}"),
-        ("crashes 0 traffic", "mixed"),
+        ("traffics mixed", {"shares": {"os.getcwd": 1}}),
         ("crashes 0 actions", "0123"),
         ("crashes 0 episode", 1.5),
         ("env lanes", 0),
@@ -103,8 +102,10 @@ def test_a_list_with_a_wrong_value_is_refused_in_one_sentence(path, value, small
     for name in parents:
         part = part[int(name) if name.isdigit() else name]
     part[last] = value
+    if last == "mixed":
+        content["crashes"][0]["traffic"] = "mixed"
     small_list.write_text(json.dumps(content))
-    with pytest.raises(UserError, match="not a list of crashes") as refused:
+    with user_error("not a list of crashes") as refused:
         read_crashes(small_list)
     assert "\n" not in str(refused.value)
 
@@ -114,10 +115,10 @@ def test_a_list_with_a_wrong_value_is_refused_in_one_sentence(path, value, small
 )
 def test_other_files_are_refused_in_one_sentence(content, tmp_path):
     (tmp_path / "crashes.json").write_bytes(content)
-    with pytest.raises(UserError, match="not a list of crashes") as refused:
+    with user_error("not a list of crashes") as refused:
         read_crashes(tmp_path / "crashes.json")
     assert "\n" not in str(refused.value)
-    with pytest.raises(UserError, match="cannot be read"):
+    with user_error("cannot be read"):
         read_crashes(tmp_path / "nowhere.json")
 
 

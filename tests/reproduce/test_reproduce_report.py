@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 import pytest
+from reference.refusals import user_error
 from scipy import stats
 
-from ganlane.errors import UserError
 from ganlane.reproduce.report import by_recipe, comparisons, recipe_of, rows
 
 KM = 5.0
@@ -82,8 +82,8 @@ def test_a_row_holds_the_trainings_together_and_each_alone(matrix):
     assert row["minus_mobil_ci"] == pytest.approx([30.0 - width, 30.0 + width])
     assert row["probability_above_mobil"] == 1.0
     assert row["normalized_percent"] == pytest.approx(130.0)
-    assert [each["mean_reward"] for each in row["each"]] == pytest.approx([120.25, 140.25])
-    assert [each["hard_crash"] for each in row["each"]] == [1, 0]
+    assert [training["mean_reward"] for training in row["each"]] == pytest.approx([120.25, 140.25])
+    assert [training["hard_crash"] for training in row["each"]] == [1, 0]
     assert row["mean_speed_mps"] == pytest.approx(25.0)
     assert row["lane_changes_per_km"] == pytest.approx(2.0)
     assert row["crashes_per_1000_km"] == pytest.approx(1000 / (8 * KM))
@@ -131,5 +131,5 @@ def test_two_drivers_that_never_crashed_may_still_differ():
 @pytest.mark.parametrize("other", ["mine/agent_idm.safetensors@0", "agent_idm"])
 def test_two_agents_of_one_name_and_seed_are_not_mixed(other):
     both = pl.concat([driven("agent_idm@0", [0, 0]), driven(other, [0, 0])])
-    with pytest.raises(UserError, match="two of one seed are called agent_idm"):
+    with user_error("two of one seed are called agent_idm"):
         by_recipe(both)

@@ -17,7 +17,8 @@ GRID_M = 0.08
 def random_pairs(count: int) -> tuple[torch.Tensor, ...]:
     """dx, dy, heading, length, width, and the other's heading, length, width."""
     between = drawing((count,), 11)
-    angle, sizes = (-math.pi, math.pi), ((3.0, 6.0), (1.6, 2.6))
+    angle = (-math.pi, math.pi)
+    sizes = ((3.0, 6.0), (1.6, 2.6))
     one = between(*angle), *(between(*size) for size in sizes)
     other = between(*angle), *(between(*size) for size in sizes)
     return between(-6, 6), between(-6, 6), *one, *other
@@ -32,7 +33,8 @@ def a_point_in_both(
     a, b = torch.meshgrid(along, across, indexing="ij")
     x = a * math.cos(heading) - b * math.sin(heading) - dx
     y = a * math.sin(heading) + b * math.cos(heading) - dy
-    c, s = math.cos(other_heading), math.sin(other_heading)
+    c = math.cos(other_heading)
+    s = math.sin(other_heading)
     inside = ((x * c + y * s).abs() < other_length / 2) & ((y * c - x * s).abs() < other_width / 2)
     return bool(inside.any())
 

@@ -20,7 +20,10 @@ def number(value: float) -> torch.Tensor:
 
 
 def drive(speed: float, steering: float, duration_s: float, dt: float, acceleration: float = 0.0):
-    x, y, heading, v = ZERO, ZERO, ZERO, number(speed)
+    x = ZERO
+    y = ZERO
+    heading = ZERO
+    v = number(speed)
     for _ in range(round(duration_s / dt)):
         pose = x, y, heading, v, _ = advance(
             x, y, heading, v, number(acceleration), number(steering), dt
@@ -120,7 +123,8 @@ def test_a_lane_change_takes_two_to_five_seconds_at_every_speed_without_overshoo
 
 def test_a_crawling_car_changes_lanes_over_the_distance_of_one_at_3_mps():
     """Below 3 m/s the path is the same, only slower."""
-    slow, fast = lane_change(number(1.5), 4.0)[1::2], lane_change(number(3.0), 4.0)[:150]
+    slow = lane_change(number(1.5), 4.0)[1::2]
+    fast = lane_change(number(3.0), 4.0)[:150]
     assert (slow - fast).abs().max() < 0.1
 
 

@@ -75,7 +75,8 @@ def test_nobody_accelerates_at_the_equilibrium_gap():
 
 
 def test_in_the_middle_of_a_change_the_more_demanding_leader_counts():
-    near, far = {"x": 30.0, "lane": 1, "speed": 10.0}, {"x": 60.0, "lane": 0, "speed": 20.0}
+    near = {"x": 30.0, "lane": 1, "speed": 10.0}
+    far = {"x": 60.0, "lane": 0, "speed": 20.0}
     alone = idm_acceleration(*doubles(20.0, 25.0, 25.5, 10.0))
     changing = vehicles({"x": 0.0, "y": 0.0, "target_lane": 1}, near, far)
     assert following_acceleration(perceive(changing, Road(lanes=2)))[0, 0] == alone
@@ -117,11 +118,14 @@ def test_highest_its_speedand_least_gap_are_each_others_inverse():
 # Platoons behind a leader of constant speed settle at the analytic equilibrium gap, every one of
 # their cars. How long that takes follows from the linear theory, not from a look at the run.
 
-DESIRED, FOLLOWERS, LENGTH_M = 25.0, 9, 4.5
+DESIRED = 25.0
+FOLLOWERS = 9
+LENGTH_M = 4.5
 SPEEDS = (1.0, 3.0, 6.0, 10.0, 15.0, 18.0, 20.0)
 #: Start of every platoon: bumper to bumper gap, m, and speed, m/s (or the leader's, if that is
 #: lower).
-START_GAP_M, START_SPEED = 40.0, 12.0
+START_GAP_M = 40.0
+START_SPEED = 12.0
 TOLERANCE_M = 1e-6
 
 
@@ -152,10 +156,8 @@ def settling_steps(speed: float) -> int:
     away_m = np.arange(1, FOLLOWERS + 1) * (START_GAP_M - stability.equilibrium(speed, DESIRED))
     away_mps = np.full(FOLLOWERS, speed - min(speed, START_SPEED))
     start = float(np.linalg.norm(np.concatenate((away_m, away_mps))))
-    matrix, steps = (
-        stability.step_matrix(speed, DESIRED, FOLLOWERS, PHYSICS_STEP_S, ring=False),
-        100,
-    )
+    matrix = stability.step_matrix(speed, DESIRED, FOLLOWERS, PHYSICS_STEP_S, ring=False)
+    steps = 100
     # By how much so many steps multiply a platoon's deviations (m, m/s) from equilibrium, at most.
     while np.linalg.norm(np.linalg.matrix_power(matrix, steps), 2) * start > 0.1 * TOLERANCE_M:
         steps = round(1.2 * steps)
@@ -220,7 +222,8 @@ def disturbed_rings(displacement: np.ndarray, speed: np.ndarray) -> Vehicles:
 
 def deviations(cars: Vehicles, steps: int) -> list[np.ndarray]:
     """(displacement, speed) from the equilibrium after every one of the steps, [4, 2 CARS]."""
-    cruise, steps_away = torch.tensor([[v] for _, v in CASES], dtype=DOUBLE), []
+    cruise = torch.tensor([[v] for _, v in CASES], dtype=DOUBLE)
+    steps_away = []
     for step, after in enumerate(moves(RING, cars, steps), 1):
         there = -SPACING_M * torch.arange(CARS, dtype=DOUBLE) + cruise * (step * PHYSICS_STEP_S)
         steps_away.append(torch.cat((after.x - there, after.speed - cruise), dim=1).numpy())
@@ -264,8 +267,10 @@ def test_every_ring_grows_or_decays_at_the_rate_of_the_linear_theory():
 
     After 60 s its size and phase are those of its eigenvalue.
     """
-    steps, size = 600, 1e-4
-    numbers, waves = np.arange(CARS), []
+    steps = 600
+    size = 1e-4
+    numbers = np.arange(CARS)
+    waves = []
     for desired, speed in CASES:
         k = 2.0 * math.pi * stability.growth_rate(speed, desired, CARS, PHYSICS_STEP_S)[1] / CARS
         waves.append((np.exp(1j * k * numbers), *stability.wave(speed, desired, k, PHYSICS_STEP_S)))

@@ -116,7 +116,8 @@ def test_nobody_changes_into_a_car_alongside_or_off_the_road():
 
 
 def test_of_two_lanes_that_pay_the_better_is_taken_and_the_left_one_at_a_tie():
-    middle, slow = {**SUBJECT, "lane": 1}, {**SLOW, "lane": 1}
+    middle = {**SUBJECT, "lane": 1}
+    slow = {**SLOW, "lane": 1}
     assert wish(middle, slow, lanes=3) == 1
     assert wish(middle, slow, {"x": 90.0, "lane": 2, "speed": 18.0}, lanes=3) == -1
 
@@ -128,7 +129,8 @@ def test_in_the_middle_of_a_change_nobody_wishes_for_another():
 
 def test_a_signalled_change_keeps_others_out_of_the_gap_and_one_seen_by_its_body_does_not():
     coming = {"x": 3.0, "y": 8.0, "target_lane": 1}
-    middle, slow = {**SUBJECT, "lane": 0}, SLOW
+    middle = {**SUBJECT, "lane": 0}
+    slow = SLOW
     assert wish(middle, slow, {**coming, "visibility": 2}, lanes=3) == 0
     assert wish(middle, slow, {**coming, "visibility": 1}, lanes=3) == 1
 
@@ -189,7 +191,8 @@ def test_at_its_decision_mobil_asks_no_more_than_b_safe_of_the_new_follower(
 
     Seen in any way.
     """
-    road, scene = Road(lanes), random_scenes(20, cars, lanes, seed)
+    road = Road(lanes)
+    scene = random_scenes(20, cars, lanes, seed)
     generator = torch.Generator().manual_seed(seed)
     scene = scene.with_(
         visibility=torch.randint(0, 3, scene.x.shape, generator=generator),
@@ -255,7 +258,8 @@ def test_without_a_look_at_what_they_would_ask_of_each_other_hundreds_would_be_a
     monkeypatch,
 ):
     """So the test above can fail: with the 60 m alone both go, however fast the rear one is."""
-    road, vehicles_there = Road(lanes=3), random_scenes(rows=6000, cars=12, lanes=3, seed=1)
+    road = Road(lanes=3)
+    vehicles_there = random_scenes(rows=6000, cars=12, lanes=3, seed=1)
     scene = perceive(vehicles_there, road)
     wish = without_ego(mobil_wishes(scene, road))
     monkeypatch.setattr(mobil_module, "idm_acceleration", lambda speed, *_: torch.zeros_like(speed))
@@ -287,7 +291,8 @@ def test_an_ego_that_is_seen_by_its_body_alone_can_be_asked_for_more():
 # Afterwards
 
 # Columns: the ego is 0, a slow car 2.
-ENTERS, FOLLOWS = 1, 3
+ENTERS = 1
+FOLLOWS = 3
 
 
 def merges(rows: int, seed: int, mobil: MobilParameters = SELFISH) -> Vehicles:
@@ -312,7 +317,8 @@ def merges(rows: int, seed: int, mobil: MobilParameters = SELFISH) -> Vehicles:
 
 def demand(scene: Vehicles) -> torch.Tensor:
     """What the one that enters asks of its new follower, m/s2, [N]."""
-    v, gap = scene, scene.x[:, ENTERS] - scene.x[:, FOLLOWS] - 4.5
+    v = scene
+    gap = scene.x[:, ENTERS] - scene.x[:, FOLLOWS] - 4.5
     return idm_acceleration(
         v.speed[:, FOLLOWS], v.desired_speed[:, FOLLOWS], gap, v.speed[:, ENTERS]
     )

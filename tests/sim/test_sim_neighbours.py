@@ -20,7 +20,8 @@ from ganlane.sim.state import Road, Vehicles
 
 ROAD = Road(lanes=3)
 ROWS = 20
-SORT, PAIRS = 0, 10**12
+SORT = 0
+PAIRS = 10**12
 
 
 def lane(number: float, scene) -> torch.Tensor:
@@ -37,7 +38,8 @@ def test_leader_and_follower_are_the_nearest_in_the_lane_asked_for():
         {"x": -70.0, "lane": 1},
     )
     seen = perceive(scene, ROAD)
-    ahead, behind = leader(seen, lane(1.0, scene)), follower(seen, lane(1.0, scene))
+    ahead = leader(seen, lane(1.0, scene))
+    behind = follower(seen, lane(1.0, scene))
     assert (ahead.gap[0, 0], ahead.speed[0, 0]) == (30.0 - 4.5, 11.0)
     assert (behind.gap[0, 0], behind.speed[0, 0], behind.desired_speed[0, 0]) == (
         25.0 - 4.5,
@@ -66,7 +68,8 @@ def test_side_by_side_in_two_lanes_the_one_of_lower_index_is_ahead():
     """So that of two who would enter one gap exactly one gives way."""
     scene = vehicles({"x": 0.0, "lane": 0}, {"x": 0.0, "lane": 0})
     seen = perceive(scene, ROAD)
-    ahead, behind = leader(seen, lane(0.0, scene)), follower(seen, lane(0.0, scene))
+    ahead = leader(seen, lane(0.0, scene))
+    behind = follower(seen, lane(0.0, scene))
     assert ahead.gap[0].tolist() == [FREE_GAP_M, -4.5]
     assert behind.gap[0].tolist() == [-4.5, FREE_GAP_M]
 
@@ -84,12 +87,11 @@ def test_the_view_of_the_ego_alone_is_the_first_row_of_everybodys():
     generator = torch.Generator().manual_seed(3)
     scene = vehicles(*({"x": 10.0 * k, "lane": k % 3} for k in (3, 0, 1, 2, 4, 5)))
     scene = scene.with_(y=scene.y + torch.randn(scene.y.shape, generator=generator, dtype=DOUBLE))
-    all_of_them, ego = perceive(scene, ROAD), perceive(scene, ROAD, slice(0, 1))
+    all_of_them = perceive(scene, ROAD)
+    ego = perceive(scene, ROAD, slice(0, 1))
     for number in range(3):
-        whole, alone = (
-            leader(all_of_them, lane(number, scene)),
-            leader(ego, torch.full((1, 1), float(number))),
-        )
+        whole = leader(all_of_them, lane(number, scene))
+        alone = leader(ego, torch.full((1, 1), float(number)))
         assert torch.equal(whole.gap[:, :1], alone.gap)
         assert torch.equal(whole.speed[:, :1], alone.speed)
 

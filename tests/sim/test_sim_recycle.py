@@ -80,7 +80,8 @@ def test_only_the_position_changes():
 
 def scenes_around(rows: int, cars: int, lanes: int, seed: int) -> Vehicles:
     """On 1000 m around the ego, some in the middle of a change, some padding."""
-    scene, is_ego = random_scenes(rows, cars, lanes, seed), torch.arange(cars) == keys.EGO_INDEX
+    scene = random_scenes(rows, cars, lanes, seed)
+    is_ego = torch.arange(cars) == keys.EGO_INDEX
     between = drawing((rows, cars), seed + 1)
     x = torch.where(is_ego, 1000.0, between(500, 1500))
     return scene.with_(x=x, valid=is_ego | (between(0, 1) < 0.9))
@@ -130,7 +131,8 @@ def test_one_vehicle_that_returns_burdens_nobody(seed, lanes, cars):
 
 
 def test_several_that_return_at_once_burden_nobody():
-    road, before = Road(lanes=2), scenes_around(2000, 12, 2, seed=0)
+    road = Road(lanes=2)
+    before = scenes_around(2000, 12, 2, seed=0)
     after = recycle(before, road, TABLE_V)
     assert (after.x != before.x).sum() > 1000
     assert not burdened(before, after, road).any()
@@ -150,7 +152,9 @@ def in_range_by_km(
     """
     spread = SpawnParameters(spread_m=max(200.0, 22.3 * cars))
     env = environment(num_envs=rows, vehicles=cars, goal_m=goal_m, spawn=spread, recycle=on)
-    driver, td, moved = MobilDriver(env.road), env.reset(), 0
+    driver = MobilDriver(env.road)
+    td = env.reset()
+    moved = 0
 
     def spied(before: Vehicles, road: Road, idm: object) -> Vehicles:
         nonlocal moved
@@ -163,7 +167,8 @@ def in_range_by_km(
         assert not pair_overlaps(cars)[running].any()
 
     if on:
-        env.physics.recycle, env.recorder = spied, record
+        env.physics.recycle = spied
+        env.recorder = record
     seen: list[list[int]] = [[] for _ in range(round(goal_m / 1000.0) + 1)]
     running = torch.ones(rows, dtype=torch.bool)
     while running.any():

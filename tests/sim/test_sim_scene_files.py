@@ -35,7 +35,8 @@ def test_a_scene_is_read_from_csv_and_from_json_alike(tmp_path):
         {"x_m": -40, "lane": 0, "speed_mps": 20, "visibility": "signalled"},
     ]
     (tmp_path / "a.json").write_text(json.dumps({"lanes": 2, "vehicles": cars}))
-    from_csv, from_json = read_scene(tmp_path / "a.csv"), read_scene(tmp_path / "a.json")
+    from_csv = read_scene(tmp_path / "a.csv")
+    from_json = read_scene(tmp_path / "a.json")
     assert from_csv.rows == from_json.rows
     assert from_csv.road == from_json.road == Road(2)
     assert from_csv.rows[1] == SceneVehicle(

@@ -178,7 +178,8 @@ def test_a_scene_depends_on_its_key_alone(share):
 
 
 def test_float32_and_float64_give_the_same_scene_to_rounding():
-    single, double = spawn(episode_keys(50), 9, 3, 4.0, dtype=torch.float32), scenes(50)
+    single = spawn(episode_keys(50), 9, 3, 4.0, dtype=torch.float32)
+    double = scenes(50)
     assert torch.equal(single.target_lane, double.target_lane)
     for name in ("x", "speed", "desired_speed"):
         difference = getattr(single, name).double() - getattr(double, name)
@@ -315,7 +316,8 @@ def test_the_ego_is_never_a_lorry():
 
 
 def test_more_lorries_are_the_same_ones_and_some_more_at_the_same_places():
-    few, many = scenes(parameters=LORRIES), scenes(parameters=replace(LORRIES, truck_share=0.6))
+    few = scenes(parameters=LORRIES)
+    many = scenes(parameters=replace(LORRIES, truck_share=0.6))
     assert torch.equal(few.x, many.x)
     assert not ((few.length == 12.0) & (many.length == 4.5)).any()
 

@@ -91,7 +91,8 @@ def test_a_change_is_complete_within_0_3_m_of_the_centre():
 
 
 def test_the_lanes_of_a_range_are_its_ends_and_the_one_after_the_lowest():
-    low, high = torch.tensor([1.0, 1.0, 1.0]), torch.tensor([1.0, 2.0, 3.0])
+    low = torch.tensor([1.0, 1.0, 1.0])
+    high = torch.tensor([1.0, 2.0, 3.0])
     assert spanned(LaneRange(low, high)).tolist() == [[1, 1, 1], [1, 2, 2], [1, 2, 3]]
 
 
@@ -112,7 +113,8 @@ def test_every_row_may_have_a_road_of_its_own():
 
 def test_on_a_ring_distances_take_the_nearer_way_round():
     ring = Road(lanes=1, ring_m=100.0)
-    start, end = torch.tensor([95.0, 5.0, 0.0, 0.0]), torch.tensor([5.0, 95.0, 210.0, 40.0])
+    start = torch.tensor([95.0, 5.0, 0.0, 0.0])
+    end = torch.tensor([5.0, 95.0, 210.0, 40.0])
     assert ring.distance_ahead(start, end).tolist() == [10.0, -10.0, 10.0, 40.0]
 
 
@@ -120,7 +122,8 @@ def test_on_a_ring_distances_take_the_nearer_way_round():
 # of them: a second change right after a first one, the rear still in the lane that it comes from,
 # and a slow car in the lane between.
 
-CHANGES, SLOWER = 0, 1
+CHANGES = 0
+SLOWER = 1
 DESIRED_MPS = 25.0
 
 
@@ -134,7 +137,9 @@ def first_changes(lane_width_m: float, length_m: float, scenes: int = 20_000) ->
     slower = (speed - between(0.0, 6.0)).clamp_min(0.05)
     gap = 2.0 + between(0.0, 30.0)
     calm = idm_acceleration(speed, torch.full_like(speed, DESIRED_MPS), gap, slower) > -4.0
-    speed, slower, gap = speed[calm], slower[calm], gap[calm]
+    speed = speed[calm]
+    slower = slower[calm]
+    gap = gap[calm]
     lane = torch.tensor([0, 1]).expand(len(gap), 2)
     return vehicles_at(
         torch.stack((torch.zeros_like(gap), gap + length_m), dim=1),
@@ -158,7 +163,8 @@ def drive(lane_width_m: float, length_m: float = 4.5) -> tuple[int, int, int]:
         goes_on = arrived & (cars.target_lane == 1) & (torch.arange(2) == CHANGES)
         return cars.with_(target_lane=torch.where(goes_on, 2, cars.target_lane))
 
-    road, start = Road(lanes=3, lane_width_m=lane_width_m), first_changes(lane_width_m, length_m)
+    road = Road(lanes=3, lane_width_m=lane_width_m)
+    start = first_changes(lane_width_m, length_m)
     hit = three = torch.zeros(len(start.x), dtype=torch.bool)
     for cars in moves(IdmTraffic(road), start, 150, on_to_lane_2):
         hit = hit | pair_overlaps(cars)[:, CHANGES, SLOWER]

@@ -352,7 +352,7 @@ def test_a_falling_learning_rate_has_reached_its_end_when_its_phase_is_over(
         for phase in phases_of(config, tmp_path)
     ]
     assert lengths == [5000, 90]
-    config.agent = replace(config.agent, learning_rate_decisions=300)
+    config = replace(config, agent=replace(config.agent, learning_rate_decisions=300))
     assert make_agent(config, phases_of(config, tmp_path)[0]).config.learning_rate_decisions == 300
 
 

@@ -17,11 +17,11 @@ from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MaskParameters
 from ganlane.sim.idm import TABLE_V
-from ganlane.sim.state import Road
+from ganlane.sim.state import Road, Vehicles
 from ganlane.transforms import ActionMaskTransform
-from ganlane.transforms.mask import obeyed_actions, on_road_actions
 
-KEEP_ONLY, ALL = [True, False, False], [True, True, True]
+KEEP_ONLY = [True, False, False]
+ALL = [True, True, True]
 
 
 def allowed(*cars, form="safe", direction=0, lanes=3, abort=False, limit=4.0):
@@ -44,18 +44,22 @@ def idm(speed, desired, gap, leader_speed):
 
 # --- what is allowed
 
-LEFT_ONLY, RIGHT_ONLY = [True, True, False], [True, False, True]
+LEFT_ONLY = [True, True, False]
+RIGHT_ONLY = [True, False, True]
 BESIDE = [{"x": 0.0, "lane": 1}, {"x": 1.0, "lane": 2}, {"x": -1.0, "lane": 0}]
 
 
 @pytest.mark.parametrize(("lane", "expected"), [(0, LEFT_ONLY), (1, ALL), (2, RIGHT_ONLY)])
 def test_commands_off_the_road_are_never_allowed(lane, expected):
     assert allowed({"x": 0.0, "lane": lane}, {"x": 500.0, "lane": 0}, form="legal")[0] == expected
-    assert on_road_actions(torch.tensor([lane]), 3)[0].tolist() == expected
 
 
 def test_every_row_has_the_lanes_of_its_own_road():
-    assert on_road_actions(torch.tensor([1, 1]), torch.tensor([2, 3])).tolist() == [RIGHT_ONLY, ALL]
+    road = Road(lanes=torch.tensor([[2], [3]]), lane_width_m=torch.tensor([[4.0], [4.0]]))
+    middle = vehicles({"x": 0.0, "lane": 1})
+    both = Vehicles(*(field.repeat(2, 1) for field in middle))
+    mask, _ = ActionMaskTransform(road, "legal").allowed(both, torch.zeros(2).long(), road)
+    assert mask.tolist() == [RIGHT_ONLY, ALL]
 
 
 @pytest.mark.parametrize("form", ["legal", "safe"])
@@ -66,12 +70,10 @@ def test_during_a_lane_change_nothing_but_keeping_is_allowed(form):
     )
 
 
-def test_who_may_turn_back_may_give_the_opposite_command_alone():
-    assert obeyed_actions(torch.tensor([0, 1, -1]), abort=True).tolist() == [
-        ALL,
-        RIGHT_ONLY,
-        LEFT_ONLY,
-    ]
+@pytest.mark.parametrize(("direction", "expected"), [(0, ALL), (1, RIGHT_ONLY), (-1, LEFT_ONLY)])
+def test_who_may_turn_back_may_give_the_opposite_command_alone(direction, expected):
+    turning = {"form": "legal", "abort": True, "direction": direction}
+    assert allowed({"x": 0.0, "lane": 1}, {"x": 500.0, "lane": 0}, **turning)[0] == expected
 
 
 def test_turning_back_must_be_safe_too():
@@ -116,7 +118,8 @@ def test_a_change_is_allowed_up_to_the_braking_that_it_asks_for(
 
 
 def test_a_lorry_reaches_farther_than_a_car():
-    ego, behind = {"x": 0.0, "lane": 0, "speed": 20.0}, {"x": -13.0, "lane": 1, "speed": 16.0}
+    ego = {"x": 0.0, "lane": 0, "speed": 20.0}
+    behind = {"x": -13.0, "lane": 1, "speed": 16.0}
     assert allowed(ego, behind)[0] == LEFT_ONLY
     assert allowed(ego, {**behind, "length": 25.0})[0] == KEEP_ONLY
 

@@ -85,7 +85,9 @@ def test_terms_that_accrue_with_time_follow_the_decision_period():
 def test_the_reward_is_the_sum_of_its_terms_and_zero_after_a_reset(parameters):
     base = HighwayEnv(IdmMobilTraffic(), num_envs=32)
     env = TransformedEnv(base, Compose(RewardTransform(1.0, parameters)))
-    state, driver, ended = env.reset(), RandomDriver(base.road), 0
+    state = env.reset()
+    driver = RandomDriver(base.road)
+    ended = 0
     names = parameters.term_names
     assert env.observation_spec.contains(state.select(*env.observation_spec.keys()))
     assert all((state[keys.REWARD_TERMS, name] == 0).all() for name in names)
@@ -117,7 +119,8 @@ def changes_left(behind_m, parameters=None):
     """
     scene = FixedScene((SceneVehicle(0.0, 0, 15.0), SceneVehicle(-behind_m, 1, 25.0, 25.0)))
     env = TransformedEnv(HighwayEnv(IdmTraffic(), scenes=scene), RewardTransform(1.0, parameters))
-    state, rewards = env.reset(), []
+    state = env.reset()
+    rewards = []
     for action in (keys.LEFT, keys.KEEP, keys.KEEP, keys.KEEP):
         after = env.step(state.set("action", torch.full((1,), action)))["next"]
         rewards.append(after.select("reward", keys.REWARD_TERMS, keys.EVENTS))
@@ -140,7 +143,8 @@ def test_who_cuts_in_before_a_fast_driver_pays_and_who_leaves_room_does_not():
 
 
 def test_the_papers_reward_is_bit_for_bit_what_it_is_without_the_term():
-    paper, considerate = changes_left(20.0), changes_left(20.0, CONSIDERATE)
+    paper = changes_left(20.0)
+    considerate = changes_left(20.0, CONSIDERATE)
     assert set(paper[keys.REWARD_TERMS].keys()) == set(keys.REWARD_TERM_NAMES)
     for name in keys.REWARD_TERM_NAMES:
         assert torch.equal(paper[keys.REWARD_TERMS, name], considerate[keys.REWARD_TERMS, name])

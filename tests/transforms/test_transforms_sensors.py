@@ -69,7 +69,8 @@ def many(sensors, rows=5000, count=5):
 
     (along, across, speed) [rows, count], and who is seen.
     """
-    true, numbers = scene(rows, count), torch.arange(rows)
+    true = scene(rows, count)
+    numbers = torch.arange(rows)
     seen = measure(true, episode_key(Stream.TRAIN, numbers * 0, numbers), numbers % 10, sensors)
     return (seen["x"] - true.x, seen["y"] - true.y, seen["speed"] - true.speed), seen["valid"]
 
@@ -95,7 +96,8 @@ def test_errors_of_position_lane_and_speed_and_of_two_vehicles_are_independent()
 
 
 def test_an_error_is_drawn_anew_at_every_measurement():
-    true, zero = scene(1000, 2), torch.zeros(1000, dtype=torch.int64)
+    true = scene(1000, 2)
+    zero = torch.zeros(1000, dtype=torch.int64)
     key = episode_key(Stream.TRAIN, zero, zero)
     seen = measure(true, key, 10 * torch.arange(1000), NOISY)["x"][:, 1] - true.x[:, 1]
     assert seen.unique().numel() > 990
@@ -204,7 +206,9 @@ def test_a_state_without_the_delayed_measurements_is_refused():
 
 def episodes(env, decisions):
     """Finished episode to what it saw, over a run with automatic resets."""
-    tracks, finished, td = {}, set(), env.reset()
+    tracks = {}
+    finished = set()
+    td = env.reset()
     for _ in range(decisions):
         td["action"] = action(td)
         for row, episode in enumerate(td[keys.EPISODE].tolist()):
@@ -247,7 +251,8 @@ def test_a_partial_reset_leaves_the_measurements_of_the_other_rows():
 
 
 def test_the_streams_of_training_and_report_have_errors_of_their_own():
-    true, zero = scene(1, 3), torch.zeros(1, dtype=torch.int64)
+    true = scene(1, 3)
+    zero = torch.zeros(1, dtype=torch.int64)
     seen = [
         measure(true, episode_key(stream, zero, zero), zero, NOISY)["x"]
         for stream in (Stream.TRAIN, Stream.REPORT)

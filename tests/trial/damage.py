@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import polars as pl
 import torch
-from ganlane.parameters.generator import NgsimParameters
+from ganlane.settings.recordings import NgsimConfig
 from matplotlib import pyplot
 from reference.recordings import ngsim_rows, portal_csv, traffic, write_highd
 
@@ -36,7 +36,7 @@ from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
 from ganlane.sim.scenarios import read_scene
 from ganlane.train import main as train
 from ganlane.training.logs import read_rows
-from ganlane.view.figures import draw_runs, read_runs
+from ganlane.view.curves import draw_runs, read_runs
 
 from . import damages
 from .damages import BYTES, TEXT, Damage

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
@@ -11,97 +12,92 @@ from PIL import Image, ImageSequence
 from view_scenes import straight
 
 from ganlane.errors import UserError
-from ganlane.view import Film, FramePainter, film_strip, write_film
+from ganlane.settings.render import FilmConfig
+from ganlane.view import FramePainter, write_film
 from ganlane.view import film as film_module
+from ganlane.view.film import film_frames, spread
+
+#: A second of film, and its last frame for 1.5 s.
+SHORT = FilmConfig(fps=10, scale=0.5, end_s=0.9)
+needs_video = pytest.mark.skipif(
+    find_spec("imageio_ffmpeg") is None, reason="the extra video is not installed"
+)
 
 
 @pytest.fixture(scope="module")
-def film():
-    return Film(FramePainter(straight([0, 30, -20], [1, 2, 0], frames=41)), fps=10, hold_s=0.5)
+def episode():
+    return straight([0, 30, -20], [1, 2, 0], frames=41)
 
 
-def first(film, count):
-    return [film[index] for index in range(count)]
+def frame(episode, number, scale=1.0):
+    """A frame's pixels."""
+    picture = Image.fromarray(FramePainter(episode).draw(number))
+    size = (round(1280 * scale), round(320 * scale))
+    return np.asarray(picture.resize(size, Image.Resampling.LANCZOS)).astype(int)
 
 
-def at_half_size(picture):
-    return np.asarray(Image.fromarray(picture).resize((640, 160), Image.Resampling.LANCZOS)).astype(
-        int
-    )
+def test_speedup_and_part_choose_frames_by_time_and_the_last_one_is_held():
+    episode = straight([0], [1], frames=101)
+    fast = film_frames(episode, FilmConfig(fps=10, speedup=2.0, start_s=2.0, end_s=6.0))
+    assert fast == [*range(20, 61, 2)] + [60] * 15
+    assert film_frames(episode, FilmConfig(end_s=0.3)) == [0, 0, 1, 1, 2, 2, 3] + [3] * 30
+    assert film_frames(episode, FilmConfig(fps=10)) == [*range(101)] + [100] * 15
 
 
-def test_a_film_lasts_as_long_as_the_episode_and_holds_its_end(film):
-    assert len(film) == 41 + 5
-    assert np.array_equal(film[-1], film[40])
-    assert not np.array_equal(film[0], film[1])
-    assert len(list(film)) == len(film)
-
-
-def test_speedup_and_part_choose_frames_by_time():
-    painter = FramePainter(straight([0], [1], frames=101))
-    assert Film(painter, 10, 2.0, start_s=2.0, end_s=6.0, hold_s=0.1)._frames == [
-        *range(20, 61, 2),
-        60,
-    ]
-    assert Film(painter, 20, end_s=0.3, hold_s=0.05)._frames == [0, 0, 1, 1, 2, 2, 3, 3]
-
-
-def test_impossible_and_empty_films_and_unknown_formats_are_refused(tmp_path):
-    painter = FramePainter(straight([0], [1]))
-    for part in ({"start_s": 9.0}, {"start_s": 2.0, "end_s": 1.0}, {"fps": 0}, {"speedup": -1}):
-        with pytest.raises(UserError, match="film"):
-            Film(painter, **part)
+def test_films_of_nothing_and_unknown_formats_are_refused(episode, tmp_path):
+    with pytest.raises(UserError, match="film from 9 to 4 s: the episode lasts 4 s"):
+        write_film(episode, tmp_path / "a.gif", FilmConfig(start_s=9.0))
     with pytest.raises(UserError, match="avi"):
-        write_film(Film(painter), tmp_path / "a.avi")
-    with pytest.raises(UserError, match="no frames"):
-        write_film([], tmp_path / "a.gif")
+        write_film(episode, tmp_path / "a.avi")
 
 
-def test_a_gif_comes_back_frame_by_frame(film, tmp_path):
-    path = write_film(film, tmp_path / "a.gif", fps=10, scale=0.5)
+def test_a_gif_comes_back_frame_by_frame(episode, tmp_path):
+    path = write_film(episode, tmp_path / "a.gif", FilmConfig(fps=10, scale=0.5))
     with Image.open(path) as gif:
         assert gif.size == (640, 160)
         # Equal frames at the end are stored as one that lasts longer.
-        assert sum(frame.info["duration"] for frame in ImageSequence.Iterator(gif)) == 100 * len(
-            film
-        )
+        times = [picture.info["duration"] for picture in ImageSequence.Iterator(gif)]
+        assert sum(times) == 100 * (41 + 15)
         assert gif.info["loop"] == 0
         gif.seek(20)
         shown = np.asarray(gif.convert("RGB")).astype(int)
-    assert np.abs(shown - at_half_size(film[20])).mean() < 3.0
+    assert np.abs(shown - frame(episode, 20, 0.5)).mean() < 3.0
 
 
-def test_a_gif_is_made_to_fit(film, tmp_path):
-    part = first(film, 9)
-    free = write_film(part, tmp_path / "free.gif", fps=10, scale=0.5).stat().st_size
-    bound = write_film(part, tmp_path / "bound.gif", fps=10, scale=0.5, max_bytes=free // 3)
-    assert bound.stat().st_size <= free // 3
+def test_a_gif_is_made_to_fit(episode, tmp_path, monkeypatch):
+    look = FilmConfig(fps=10, width=600, height=160, end_s=0.9, max_bytes=40_000)
+    free = write_film(episode, tmp_path / "free.gif", replace(look, max_bytes=None))
+    bound = write_film(episode, tmp_path / "bound.gif", look)
+    assert bound.stat().st_size <= 40_000 < free.stat().st_size
+    monkeypatch.setattr(film_module, "_GIF_SIZES", [(1.0, 128, 1)])
     with pytest.raises(UserError, match="max_bytes"):
-        write_film(part, tmp_path / "none.gif", fps=10, scale=0.5, max_bytes=100)
+        write_film(episode, tmp_path / "none.gif", look)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["bound.gif", "free.gif"]
 
 
-def test_a_strip_stacks_four_frames(film, tmp_path):
-    path = write_film(film, tmp_path / "strip.png")
+def test_a_strip_stacks_four_frames(episode, tmp_path):
+    path = write_film(episode, tmp_path / "strip.png")
     with Image.open(path) as strip:
         assert strip.size == (1280, 4 * 320 + 3 * 4)
         pixels = np.asarray(strip.convert("RGB"))
-    assert np.array_equal(pixels[:320], film[0])
-    assert np.array_equal(pixels[-320:], film[-1])
-    assert film_strip(first(film, 2)).shape == (2 * 320 + 4, 1280, 3)
+    assert np.array_equal(pixels[:320], frame(episode, 0))
+    assert np.array_equal(pixels[-320:], frame(episode, 40))
+    assert spread([5, 6], 4) == [5, 6]
 
 
-def test_an_mp4_has_all_frames(film, tmp_path):
-    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
-    path = write_film(first(film, 10), tmp_path / "a.mp4", fps=10, scale=0.5)
+@needs_video
+def test_an_mp4_has_all_frames(episode, tmp_path):
+    import imageio_ffmpeg
+
+    path = write_film(episode, tmp_path / "a.mp4", SHORT)
     reader = imageio_ffmpeg.read_frames(str(path))
     meta = next(reader)
     assert meta["size"] == (640, 160)
     assert meta["fps"] == 10
     frames = list(reader)
-    assert len(frames) == 10
+    assert len(frames) == 10 + 15
     shown = np.frombuffer(frames[3], np.uint8).reshape(160, 640, 3).astype(int)
-    assert np.abs(shown - at_half_size(film[3])).mean() < 6.0
+    assert np.abs(shown - frame(episode, 3, 0.5)).mean() < 6.0
 
 
 @pytest.fixture
@@ -111,40 +107,42 @@ def empty(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_half_an_mp4_on_a_full_disk_is_none(film, empty):
+@needs_video
+def test_half_an_mp4_on_a_full_disk_is_none(episode, empty):
     """ffmpeg fails, and only its exit status says so."""
-    pytest.importorskip("imageio_ffmpeg")
     resource = pytest.importorskip("resource")
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2**12, before[1]))
     try:
         with pytest.raises(OSError, match="File too large") as caught:
-            write_film(first(film, 10), empty / "a.mp4", fps=10, scale=0.5)
+            write_film(episode, empty / "a.mp4", SHORT)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert caught.value.filename == str(empty / "a.mp4")
 
 
-def test_an_ffmpeg_that_refuses_is_quoted(film, empty, monkeypatch):
-    pytest.importorskip("imageio_ffmpeg")
+@needs_video
+def test_an_ffmpeg_that_refuses_is_quoted(episode, empty, monkeypatch):
     monkeypatch.setattr(film_module, "_H264", "-c:v no_such_codec -f mp4")
     with pytest.raises(UserError, match=r"a\.mp4: ffmpeg cannot write it \(.*choose format=gif"):
-        write_film(first(film, 2), empty / "a.mp4", fps=10)
+        write_film(episode, empty / "a.mp4", SHORT)
 
 
-def test_without_the_extra_video_the_message_names_it(film, empty, monkeypatch):
+def test_without_the_extra_video_the_message_names_it(episode, empty, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(UserError, match=r"ganlane\[video\]"):
-        write_film(film, empty / "a.mp4")
+        write_film(episode, empty / "a.mp4")
 
 
-def test_a_failure_half_way_leaves_nothing(film, empty):
-    class Broken(list):
-        def __getitem__(self, index):
-            if index == 3:
-                raise RuntimeError("no")
-            return film[0]
+@pytest.mark.parametrize("ending", ["gif", pytest.param("mp4", marks=needs_video)])
+def test_a_failure_half_way_leaves_nothing(episode, empty, ending, monkeypatch):
+    draw = FramePainter.draw
 
-    for name in ["a.gif", "a.mp4"] if find_spec("imageio_ffmpeg") else ["a.gif"]:
-        with pytest.raises(RuntimeError):
-            write_film(Broken([0] * 6), empty / name, scale=0.25)
+    def broken(painter, number):
+        if number == 3:
+            raise RuntimeError("no")
+        return draw(painter, number)
+
+    monkeypatch.setattr(FramePainter, "draw", broken)
+    with pytest.raises(RuntimeError):
+        write_film(episode, empty / f"a.{ending}", SHORT)

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from view_scenes import straight
 
 from ganlane.errors import UserError
+from ganlane.settings.render import FilmConfig
 from ganlane.view import EpisodeLabel, player_page, write_player
 from ganlane.view.player import UNITS, episode_data, series, steps
 
@@ -62,7 +63,8 @@ def test_reward_and_values_belong_to_the_decision_that_begins():
 def test_comfort_is_of_the_ego():
     time = np.arange(30) * 0.1
     acceleration = np.stack([-2.0 * time, 9.0 * np.ones(30)], axis=1)
-    comfort = straight([0, 50], [1, 1], frames=30, acceleration=acceleration).comfort()
+    episode = straight([0, 50], [1, 1], frames=30, acceleration=acceleration)
+    comfort = episode_data(episode)["comfort"]
     assert comfort["hardest_braking"] == pytest.approx(-5.8)
     assert comfort["rms_acceleration"] == pytest.approx(np.sqrt(np.mean((2 * time) ** 2)), abs=1e-3)
     # 28 of 30 frames have a jerk of -2 m/s3.
@@ -115,14 +117,14 @@ def test_three_episodes_of_four_minutes_stay_under_two_megabytes():
 def test_a_page_that_is_too_large_takes_fewer_samples_and_keeps_the_last():
     episode = noisy(600)
     whole = player_page([episode])
-    page = player_page([episode], max_bytes=len(whole) // 2)
+    page = player_page([episode], FilmConfig(max_bytes=len(whole) // 2))
     (shown,) = data_of(page)["episodes"]
     times = np.array(list(accumulate(shown["time"]))) * UNITS["time"]
     assert len(page) < len(whole) // 2
     assert np.diff(times)[:-1].min() > 0.1
     assert times[-1] == pytest.approx(59.9)
     with pytest.raises(UserError, match="max_bytes"):
-        player_page([episode], max_bytes=1000)
+        player_page([episode], FilmConfig(max_bytes=10_000))
 
 
 def test_a_page_is_written_whole(tmp_path):

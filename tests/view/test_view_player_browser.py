@@ -5,6 +5,8 @@ It plays, scrubs, follows and draws, without an error and without a request.
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from view_browser import browser_page, find_browser
@@ -52,12 +54,19 @@ def page(pages):
 
 def ink(page, selector, colour, tolerance=12):
     """How many pixels of a canvas have (nearly) this colour."""
-    return page.value(
-        f"(() => {{ const c = document.querySelector({selector!r});"
-        "const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let n = 0;"
-        f"const near = (k) => {list(colour)}.every((value, i) => Math.abs(d[k + i] - value) <= {tolerance});"
-        "for (let k = 0; k < d.length; k += 4) if (near(k)) n++; return n; })()"
-    )
+    script = """(() => {
+        const canvas = document.querySelector(SELECTOR);
+        const { width, height } = canvas;
+        const data = canvas.getContext('2d').getImageData(0, 0, width, height).data;
+        const near = (k) => COLOUR.every((value, i) => Math.abs(data[k + i] - value) <= TOLERANCE);
+        let count = 0;
+        for (let k = 0; k < data.length; k += 4) if (near(k)) count++;
+        return count;
+    })()"""
+    values = {"SELECTOR": selector, "COLOUR": list(colour), "TOLERANCE": tolerance}
+    for name, value in values.items():
+        script = script.replace(name, json.dumps(value))
+    return page.value(script)
 
 
 def scrub(page, time_s):
@@ -67,13 +76,11 @@ def scrub(page, time_s):
     )
 
 
-EGO, BLUE, ORANGE, GREEN, RED = (
-    (255, 150, 28),
-    (86, 160, 220),
-    (230, 120, 0),
-    (47, 192, 143),
-    (255, 62, 62),
-)
+EGO = (255, 150, 28)
+BLUE = (86, 160, 220)
+ORANGE = (230, 120, 0)
+GREEN = (47, 192, 143)
+RED = (255, 62, 62)
 FIRST, SECOND = ".episode:nth-child(1)", ".episode:nth-child(2)"
 
 
@@ -102,10 +109,11 @@ def test_play_goes_on_and_pause_stops(page):
 def test_speed_is_simulated_seconds_per_second(page):
     page.value("(() => { const s = document.getElementById('speed'); s.value = '0.25'; })()")
     page.click("#play")
-    passed = page.value(
-        f"new Promise((done) => {{ const from = [performance.now(), {CLOCK}];"
-        f"setTimeout(() => done(({CLOCK} - from[1]) / (performance.now() - from[0]) * 1000), 1000); }})"
-    )
+    passed = page.value(f"""new Promise((done) => {{
+        const begin = performance.now(), time = {CLOCK};
+        const speed = () => ({CLOCK} - time) / (performance.now() - begin) * 1000;
+        setTimeout(() => done(speed()), 1000);
+    }})""")
     assert passed == pytest.approx(0.25, abs=0.12)
 
 
@@ -164,7 +172,8 @@ def test_every_canvas_has_the_size_of_its_place_whatever_came_after_it(pages, tm
     opened.size(1920, 1080)
     opened.open(write_player([learned() for _ in range(6)], tmp_path / "six.html"))
     boxes = opened.value(
-        "[...document.querySelectorAll('canvas')].map((c) => [c.width, c.height, c.clientWidth, c.clientHeight])"
+        "[...document.querySelectorAll('canvas')]"
+        ".map((c) => [c.width, c.height, c.clientWidth, c.clientHeight])"
     )
     opened.value("document.getElementById('look').click()")
     opened.size(1200, 900)

@@ -14,22 +14,9 @@ import time
 from contextlib import contextmanager
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-FLAGS = (
-    *(
-        "--headless=new",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--disable-dev-shm-usage",
-        "--disable-extensions",
-    ),
-    *(
-        "--disable-background-networking",
-        "--no-first-run",
-        "--mute-audio",
-        "--remote-debugging-pipe",
-    ),
-    "--window-size=1200,900",
-)
+FLAGS = """--headless=new --no-sandbox --disable-gpu --disable-dev-shm-usage --disable-extensions
+--disable-background-networking --no-first-run --mute-audio --remote-debugging-pipe
+--window-size=1200,900""".split()
 _PATIENCE_S = 60.0
 
 
@@ -88,17 +75,12 @@ class Page:
 
     def click(self, selector, share=0.5):
         """A real click into an element, at this share of its width."""
-        box = self.value(
+        x, y, width, height = self.value(
             f"(() => {{ const e = document.querySelector({json.dumps(selector)});"
             "e.scrollIntoView({block: 'center'}); const b = e.getBoundingClientRect();"
             "return [b.x, b.y, b.width, b.height]; })()"
         )
-        at = {
-            "x": box[0] + share * box[2],
-            "y": box[1] + box[3] / 2,
-            "button": "left",
-            "clickCount": 1,
-        }
+        at = {"x": x + share * width, "y": y + height / 2, "button": "left", "clickCount": 1}
         for kind in ("mousePressed", "mouseReleased"):
             self._send("Input.dispatchMouseEvent", type=kind, **at)
 
@@ -150,10 +132,10 @@ class Page:
 def browser_page(browser, profile):
     """A page in a browser of its own, which ends with the block."""
     # The descriptors of the pipe are 3 and 4 in the browser; here they must be others.
-    kept = [os.open(os.devnull, os.O_RDONLY) for _ in range(3)]
+    placeholders = [os.open(os.devnull, os.O_RDONLY) for _ in range(3)]
     (read_commands, commands), (answers, write_answers) = os.pipe(), os.pipe()
-    for descriptor in (*kept, read_commands, write_answers):
-        assert descriptor >= 3
+    closed = (*placeholders, read_commands, write_answers)
+    assert min(closed) >= 3
 
     def as_three_and_four():
         os.dup2(read_commands, 103)
@@ -168,7 +150,7 @@ def browser_page(browser, profile):
         pass_fds=(3, 4),
         start_new_session=True,
     )
-    for descriptor in (*kept, read_commands, write_answers):
+    for descriptor in closed:
         os.close(descriptor)
     try:
         yield Page(commands, answers)

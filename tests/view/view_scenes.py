@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import polars as pl
+from PIL.ImageColor import getrgb
 
 from ganlane.view import EpisodeLabel, Trajectory
 
@@ -29,38 +30,53 @@ def straight(positions, lanes_of, frames=20, lanes=3, speed=20.0, outcome="", **
     return Trajectory(**{**fields, "outcome": outcome, **changed})
 
 
+def near(picture, colour, tolerance=6):
+    """Which pixels have (nearly) this colour."""
+    difference = picture.astype(int) - np.array(getrgb(colour))
+    return np.abs(difference).max(axis=-1) <= tolerance
+
+
 def area(picture, colour, tolerance=6):
     """Pixels of (nearly) this colour."""
-    return (np.abs(picture.astype(int) - np.array(colour)).max(axis=-1) <= tolerance).sum()
+    return near(picture, colour, tolerance).sum()
 
 
 def place(picture, colour, tolerance=6):
     """Middle (column, row) of the pixels of this colour."""
-    rows, columns = np.nonzero(
-        np.abs(picture.astype(int) - np.array(colour)).max(axis=-1) <= tolerance
-    )
+    rows, columns = np.nonzero(near(picture, colour, tolerance))
     return (columns.min() + columns.max()) / 2, (rows.min() + rows.max()) / 2
 
 
 def run_folder(folder, slope=1.0, evaluated=True):
     """The files that training leaves: some columns empty in the first rows."""
     folder.mkdir(parents=True)
-    x = np.arange(1, 31) * 10_000
-    learnt = [None if k < 3 else 0.1 * slope * k for k in range(30)]
-    columns = {"mean_return": slope * x / 1e4, "crash_rate": (0.5 - 0.01 * np.arange(30)) * slope}
-    more = {
-        "lane_changes_per_km": slope + 0.0 * x,
+    row = np.arange(30)
+    learnt = [None if number < 3 else 0.1 * slope * number for number in row]
+    metrics = {
+        "decisions": (row + 1) * 10_000,
+        "mean_return": slope * (row + 1.0),
+        "crash_rate": (0.5 - 0.01 * row) * slope,
+        "lane_changes_per_km": np.full(30, slope),
         "mean_q": learnt,
-        "mean_discounted_return": 2.0 * slope + 0.0 * x,
+        "mean_discounted_return": np.full(30, 2.0 * slope),
+        "loss": learnt,
     }
-    pl.DataFrame({"decisions": x, **columns, **more, "loss": learnt}).write_csv(
-        folder / "metrics.csv"
-    )
+    pl.DataFrame(metrics).write_csv(folder / "metrics.csv")
     if evaluated:
         rows = {
-            "decisions": x[9::10],
+            "decisions": [100_000, 200_000, 300_000],
             "mean_reward": [1.0, 3.0, 2.0],
             "crash_rate": [0.3, 0.2, 0.1],
         }
         pl.DataFrame(rows).write_csv(folder / "evaluation.csv")
     return folder
+
+
+def panels(figure):
+    """The panels of a figure by their titles."""
+    return {axes.get_title("left"): axes for axes in figure.axes}
+
+
+def words(texts):
+    """Texts of matplotlib as strings."""
+    return [text.get_text() for text in texts]

@@ -1,0 +1,99 @@
+"""Statistics of recorded driving as one sheet of six panels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ganlane.data import Histogram, PooledStatistics, survival_curve
+from ganlane.view.figures import COLOURS, FAINT, STYLE, FloatArray, panel_grid
+
+
+@rc_context(STYLE)
+def draw_recordings(statistics: PooledStatistics) -> Figure:
+    """Speeds, accelerations, lane-change times, headways and gaps of recorded driving."""
+    of = statistics.histograms
+    figure, (speed, acceleration, changes, headway, time_headway, gap) = panel_grid(6)
+    speed.set(
+        title="speed", xlabel="m/s", xlim=(0.0, min(60.0, 1.1 * of["speed"].quantile(1.0) + 1.0))
+    )
+    _draw_densities(speed, {"": of["speed"]})
+    acceleration.set(title="acceleration", xlabel="m/s²", xlim=(-5.0, 5.0))
+    _draw_densities(
+        acceleration,
+        {"as recorded": of["acceleration_raw"], "over 1 s": of["acceleration_smoothed"]},
+    )
+    acceleration.legend(loc="upper right", fontsize=8)
+    _draw_changes(changes, statistics)
+    title = "followers' headway: median (gap - 2 m) / speed"
+    headway.set(title=title, xlabel="s", xlim=(0.0, 6.0))
+    _draw_densities(headway, {"": of["headway"]})
+    time_headway.set(title="time headway: gap / speed", xlabel="s", xlim=(0.0, 8.0))
+    _draw_densities(time_headway, {"": of["time_headway"]})
+    gap.set(title="gap to the leader", xlabel="m", xlim=(0.0, 100.0))
+    _draw_densities(gap, {"": of["gap"]})
+    return figure
+
+
+def _draw_densities(axes: Axes, histograms: Mapping[str, Histogram]) -> None:
+    """Densities over the limits of the panel, and the share of the values beyond them."""
+    axes.set_ylabel(f"density, per {axes.get_xlabel()}")
+    for line, (label, histogram) in enumerate(histograms.items()):
+        middles, density = binned_density(histogram, *axes.get_xlim())
+        axes.plot(middles, density, color=COLOURS[line], label=label)
+        beyond = 100.0 * (1.0 - float(np.sum(density)) * float(middles[1] - middles[0]))
+        if histogram.total and beyond >= 0.05:
+            axes.text(
+                0.99,
+                0.6 - 0.1 * line,
+                f"{beyond:.1f} % beyond",
+                ha="right",
+                color=COLOURS[line],
+                size=8,
+                transform=axes.transAxes,
+            )
+
+
+def binned_density(histogram: Histogram, low: float, high: float) -> tuple[FloatArray, FloatArray]:
+    """Middles of about 80 bins from ``low`` to ``high``, and the density there."""
+    edges = histogram.bins.edges
+    first, last = np.searchsorted(edges, (low - 1e-9, high - 1e-9))
+    # The histogram's own bins are finer.
+    merged = max(1, int(last - first) // 80)
+    number = int(last - first) // merged
+    counts = histogram.counts[first : first + number * merged].reshape(number, merged).sum(axis=1)
+    width = merged * float(edges[1] - edges[0])
+    middles = edges[first] + width * (np.arange(number) + 0.5)
+    return middles, counts / (max(histogram.total, 1) * width)
+
+
+def _draw_changes(axes: Axes, statistics: PooledStatistics) -> None:
+    """Share of lane changes that last longer.
+
+    With unfinished ones, whose durations are lower bounds (censored), and without.
+    """
+    axes.set(title="time to change lanes", xlabel="s", ylabel="share that lasts longer")
+    changes = statistics.changes
+    if not changes.complete.any():
+        axes.text(
+            0.5,
+            0.5,
+            "none recorded from start to end",
+            ha="center",
+            transform=axes.transAxes,
+            color=FAINT,
+        )
+        return
+    lines = {
+        "unfinished ones included": np.ones(len(changes), bool),
+        "finished ones only": changes.complete,
+    }
+    for (label, those), colour in zip(lines.items(), COLOURS):
+        times, shares = survival_curve(changes.duration_s[those], changes.complete[those])
+        x, y = np.append(0.0, times), np.append(1.0, shares)
+        axes.step(x, y, where="post", color=colour, label=label)
+    axes.legend(loc="upper right", fontsize=8)

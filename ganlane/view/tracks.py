@@ -1,0 +1,76 @@
+"""Recorded episodes as tracks of recorded traffic."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import polars as pl
+
+from ganlane import keys
+from ganlane.data.recordings import scene_csv, write_prepared
+from ganlane.data.schema import SCHEMA, TRACK_STRIDE, sort
+from ganlane.errors import UserError
+from ganlane.files import atomic_path
+from ganlane.view.record import Trajectory
+
+
+def write_tracks(
+    trajectories: Sequence[Trajectory], path: str | Path, format: Literal["csv", "parquet"]
+) -> Path:
+    """Write episodes, atomically, as a file that :func:`ganlane.data.read_scenes` reads back.
+
+    Each is a scene, ``AGENT_TRAFFIC_SEED_EPISODE``; a number follows where two would be alike.
+    Parquet holds the schema (:mod:`ganlane.data.schema`) itself. In CSV, the form of recordings
+    from elsewhere, the speed is called ``v``, lanes are counted from the left, from 1, and ``y`` is
+    0 at the centre of lane 1. It has no lane width, and a rightmost lane without vehicles is lost.
+
+    Raises:
+        UserError: there is no episode, or one whose frames are not 0.1 s apart.
+    """
+    if not trajectories:
+        raise UserError(f"format={format}: no episode to write; record at least one.")
+    times = Counter[str]()
+    tables = []
+    for trajectory in trajectories:
+        label = trajectory.label
+        name = f"{Path(label.agent).stem}_{label.traffic}_{label.seed}_{label.episode}"
+        times[name] += 1
+        number = f"-{times[name]}" if times[name] > 1 else ""
+        table = to_tracks(trajectory, name + number)
+        if format == "csv":
+            table = scene_csv(table, pl.lit(label.lanes - 1), label.lane_width_m)
+        tables.append(table)
+    if format == "parquet":
+        write_prepared(sort(pl.concat(tables)), path)
+    else:
+        with atomic_path(path) as part:
+            pl.concat(tables).write_csv(part)
+    return Path(path)
+
+
+def to_tracks(trajectory: Trajectory, scene: str = "simulated") -> pl.DataFrame:
+    """The trajectory as a table in the schema of recordings; a recycled vehicle begins a new track.
+
+    Raises:
+        UserError: the frames are not 0.1 s apart.
+    """
+    if abs(trajectory.frame_s - keys.PHYSICS_STEP_S) > 1e-6:
+        raise UserError(
+            f"trajectory: its frames are {trajectory.frame_s:g} s apart, tracks need "
+            f"{keys.PHYSICS_STEP_S} s; record it at every physics step."
+        )
+    frame, vehicle = np.nonzero(trajectory.valid)
+    jumps = np.cumsum(trajectory.jumped(), axis=0)
+    columns = {
+        "scene": np.full(len(frame), scene),
+        "vehicle": vehicle + TRACK_STRIDE * jumps[frame, vehicle],
+        "frame": frame,
+        "lane": trajectory.lane()[frame, vehicle],
+    }
+    for name in ("x", "y", "speed", "length", "width"):
+        columns[name] = getattr(trajectory, name)[frame, vehicle]
+    return sort(pl.DataFrame({name: columns[name] for name in SCHEMA}, schema=SCHEMA))

@@ -1,0 +1,49 @@
+"""Every command in README and the pages is one that the records accept."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from ganlane.config.run import COMMANDS, parsed, settings, single_runs
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+#: Between backquotes, or a line of a block of code; a backslash at its end goes on.
+COMMAND = re.compile(
+    r"(?:`|^(?: {4})?)(?:python -m )?ganlane[ .](\w+)((?: [^`\n]+)?)", re.MULTILINE
+)
+#: Names in capitals, and files that a reader would have.
+PLACEHOLDER = re.compile(r"RUN\b|SWEEP|NAME|my_scene|\.\.\.|--help|--version|lanes=40|resume=auto")
+
+
+def commands_of(page):
+    """Command and words of every command line on a page."""
+    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    for match in COMMAND.finditer(text):
+        command, rest = match[1], match[2].partition(" #")[0]
+        if command in COMMANDS and "=" in rest and not PLACEHOLDER.search(rest):
+            yield command, shlex.split(rest)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_command_of_a_page_is_accepted(page):
+    for command, words in commands_of(page):
+        runs = [words]
+        if "-m" in words:
+            runs = single_runs(parsed(command, [word for word in words if word != "-m"]))
+        settings(command, runs[0])
+
+
+def test_the_commands_are_found():
+    assert sum(len(list(commands_of(page))) for page in PAGES) > 90
+
+
+def test_a_commands_module_is_run_in_one_way_alone():
+    old = re.compile(r"python -m ganlane\.(\w+)")
+    for page in PAGES:
+        names = set(old.findall(page.read_text(encoding="utf-8"))) & COMMANDS.keys()
+        assert names <= {"train"}, page.name

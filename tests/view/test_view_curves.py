@@ -1,0 +1,158 @@
+"""Learning curves: what is drawn is the data, with its names and units."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+from matplotlib.colors import to_hex
+from view_scenes import panels, run_folder, words
+
+from ganlane.errors import UserError
+from ganlane.view.curves import draw_runs, read_run, read_runs
+from ganlane.view.figures import COLOURS
+
+
+@pytest.fixture
+def runs(tmp_path):
+    folders = [run_folder(tmp_path / "a"), run_folder(tmp_path / "b", slope=2.0, evaluated=False)]
+    return read_runs(folders)
+
+
+def test_a_line_is_the_metric_over_the_decisions(runs):
+    (line,) = panels(draw_runs({"a": runs["a"]}))["crash rate"].lines
+    assert line.get_xdata().tolist() == [10_000 * k for k in range(1, 31)]
+    assert line.get_ydata() == pytest.approx(0.5 - 0.01 * np.arange(30))
+
+
+def test_every_panel_shows_every_run_that_has_its_numbers_in_the_run_s_colour(runs):
+    figure = draw_runs(runs)
+    drawn = {
+        title: [to_hex(line.get_color()) for line in axes.lines]
+        for title, axes in panels(figure).items()
+    }
+    assert words(figure.legends[0].get_texts()) == ["a", "b"]
+    a, b, *_ = COLOURS
+    assert drawn == {
+        **{title: [a, b] for title in ("mean return", "crash rate", "lane changes")},
+        "mean Q (replayed); dashed: discounted return": [a, a, b, b],
+        **{title: [a] for title in ("evaluation: mean return", "evaluation: crash rate")},
+    }
+    # Axes say what they measure.
+    drawn = panels(figure)
+    assert {axes.get_xlabel() for axes in drawn.values()} == {"decisions"}
+    assert drawn["lane changes"].get_ylabel() == "per km"
+    assert drawn["evaluation: crash rate"].get_ylabel() == "share of episodes"
+    assert drawn["crash rate"].xaxis.get_major_formatter()(250_000) == "250 k"
+
+
+def test_the_discounted_return_is_dashed_below_the_q_values(runs):
+    axes = panels(draw_runs({"a": runs["a"]}))["mean Q (replayed); dashed: discounted return"]
+    assert [line.get_linestyle() for line in axes.lines] == ["-", "--"]
+    # the first three rows have no Q-value
+    assert axes.lines[0].get_ydata()[0] == pytest.approx(0.3)
+    assert len(axes.lines[0].get_xdata()) == 27
+
+
+def test_a_smoothed_line_is_drawn_over_its_values(runs):
+    raw, smooth = panels(draw_runs({"a": runs["a"]}, smooth=5))["mean return"].lines
+    assert raw.get_ydata() == pytest.approx(np.arange(1.0, 31.0))
+    assert raw.get_alpha() < 1.0
+    assert smooth.get_ydata()[4:] == pytest.approx(np.arange(3.0, 29.0))
+
+
+def test_columns_of_ones_choice_take_the_place_of_the_panels_and_unknown_ones_are_named(runs):
+    assert list(panels(draw_runs(runs, ["loss", "evaluation_mean_reward"]))) == [
+        "loss",
+        "evaluation mean reward",
+    ]
+    with pytest.raises(UserError, match=r"column nothing: .* choose among mean_return, crash_rate"):
+        draw_runs(runs, ["nothing"])
+    with pytest.raises(UserError, match="foreign: no numbers"):
+        draw_runs({"foreign": [pl.DataFrame({"decisions": [1], "name": ["a"]})]})
+
+
+def test_a_runs_evaluations_are_merged_with_its_metrics(runs):
+    (frame,) = runs["a"]
+    assert frame.height == 33
+    evaluated = frame.drop_nulls("evaluation_crash_rate")
+    assert evaluated["decisions"].to_list() == [100_000, 200_000, 300_000]
+    assert evaluated["evaluation_mean_reward"].to_list() == [1.0, 3.0, 2.0]
+    assert runs["b"][0].height == 30
+
+
+def test_runs_are_called_by_the_shortest_ends_that_tell_them_apart(tmp_path):
+    one, two, other = (run_folder(tmp_path / name) for name in ("x/one", "x/two", "y/one"))
+    assert list(read_runs([one, two])) == list(read_runs([other, two])) == ["one", "two"]
+    assert list(read_runs([one, other])) == ["x/one", "y/one"]
+    assert list(read_runs([one / "metrics.csv"])) == ["one"]
+    with pytest.raises(UserError, match="twice"):
+        read_runs([one, one])
+
+
+def sweep_folder(folder, *lines):
+    for number, line in enumerate(lines):
+        run = run_folder(folder / str(number), slope=1.0 + number, evaluated=False)
+        (run / "config.yaml").write_text(line)
+    return folder
+
+
+def test_the_runs_of_a_sweep_are_named_by_the_settings_in_which_they_differ(tmp_path):
+    folder = sweep_folder(
+        tmp_path,
+        "{traffic: gan, agent: {n_step: 1}}",
+        "{traffic: gan, agent: {n_step: 3}}",
+        "{traffic: idm}",
+    )
+    assert list(read_runs([folder])) == [
+        "agent.n_step=1, traffic=gan",
+        "agent.n_step=3, traffic=gan",
+        "traffic=idm",
+    ]
+
+
+def test_seeds_are_drawn_as_their_mean_in_a_band(tmp_path):
+    settings = [f"{{traffic: {name}, seed: {seed}}}" for name in ("gan", "idm") for seed in (0, 1)]
+    runs = read_runs([sweep_folder(tmp_path, *settings)])
+    assert {name: len(frames) for name, frames in runs.items()} == {
+        "traffic=gan": 2,
+        "traffic=idm": 2,
+    }
+    figure = draw_runs(runs)
+    assert words(figure.legends[0].get_texts())[0] == "traffic=gan (2 seeds: mean, range)"
+    axes = panels(figure)["mean return"]
+    assert axes.lines[0].get_ydata() == pytest.approx(1.5 * np.arange(1.0, 31.0))
+    assert axes.collections[0].get_paths()[0].vertices[:, 1].max() == pytest.approx(60.0)
+    assert list(
+        read_runs(
+            [sweep_folder(tmp_path / "same", "{traffic: idm, seed: 0}", "{traffic: idm, seed: 1}")]
+        )
+    ) == ["all seeds"]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "no such file"),
+        (b"step,loss\n1,2\n", "decisions"),
+        (b"\xff\xfe\x00broken", r"metrics\.csv"),
+        *(
+            (
+                b"decisions,mean_return\n5,2\n" + row,
+                r"metrics\.csv: column '.*' holds .*; repair it\.",
+            )
+            for row in (b"many,1\n", b"10,text\n", b"10,1e300\n")
+        ),
+    ],
+)
+def test_what_is_no_metrics_file_is_named(content, message, tmp_path):
+    if content is not None:
+        (tmp_path / "metrics.csv").write_bytes(content)
+    with pytest.raises(UserError, match=message):
+        read_run(tmp_path)
+
+
+def test_the_running_mean_skips_gaps():
+    run = pl.DataFrame({"decisions": range(5), "loss": [1.0, 3.0, np.nan, 5.0, 9.0]})
+    _, smooth = draw_runs({"run": [run]}, ["loss"], smooth=2).axes[0].lines
+    assert smooth.get_ydata() == pytest.approx([1.0, 2.0, np.nan, 5.0, 7.0], nan_ok=True)

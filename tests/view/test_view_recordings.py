@@ -1,0 +1,70 @@
+"""The sheet of recorded driving has the data, with their names and units."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from view_scenes import panels, words
+
+from ganlane.data import (
+    Bins,
+    Histogram,
+    PooledStatistics,
+    Scene,
+    SyntheticTraffic,
+    synthetic_scenes,
+)
+from ganlane.view.recordings import binned_density, draw_recordings
+
+
+@settings(max_examples=30)
+@given(
+    st.lists(st.floats(0.0, 9.99), min_size=1, max_size=200), st.sampled_from([10, 80, 400, 8000])
+)
+def test_the_area_below_a_density_is_one(values, bins):
+    histogram = Histogram(Bins(0.0, 10.0, bins))
+    histogram.add(values)
+    middles, density = binned_density(histogram, 0.0, 10.0)
+    assert float(np.sum(density)) * float(middles[1] - middles[0]) == pytest.approx(1.0)
+    assert middles[0] > 0.0
+    assert middles[-1] < 10.0
+
+
+def measured(**traffic):
+    statistics = PooledStatistics()
+    for (name,), scene in synthetic_scenes(SyntheticTraffic(**traffic)).group_by("scene"):
+        statistics.add(Scene(name, scene, 3.5))
+    return statistics
+
+
+def test_recordings_are_drawn_in_six_panels_with_their_units():
+    drawn = panels(draw_recordings(measured(lanes=1, seconds=3.0)))
+    times = (
+        "time to change lanes",
+        "followers' headway: median (gap - 2 m) / speed",
+        "time headway: gap / speed",
+    )
+    units = {
+        "speed": "m/s",
+        "acceleration": "m/s²",
+        **dict.fromkeys(times, "s"),
+        "gap to the leader": "m",
+    }
+    assert {title: axes.get_xlabel() for title, axes in drawn.items()} == units
+    assert words(drawn.pop("time to change lanes").texts) == ["none recorded from start to end"]
+    assert all(line.get_ydata().sum() > 0 for axes in drawn.values() for line in axes.lines)
+    assert words(drawn["acceleration"].get_legend().get_texts()) == ["as recorded", "over 1 s"]
+
+
+def test_lane_changes_are_drawn_as_the_share_that_lasts_longer():
+    statistics = measured()
+    assert statistics.changes.complete.sum() == 3
+    for line in panels(draw_recordings(statistics))["time to change lanes"].lines:
+        times, shares = line.get_xdata(), line.get_ydata()
+        assert line.get_drawstyle() == "steps-post"
+        assert times.tolist() == [0.0, *np.unique(statistics.changes.duration_s)]
+        assert shares == pytest.approx(
+            [(statistics.changes.duration_s > time).mean() for time in times]
+        )

@@ -138,6 +138,8 @@ def test_a_sweep_of_evaluate_has_a_folder_for_each_run_and_ends_with_one_table(c
     assert seeds == [0, 1]
     table = capsys.readouterr().out.rpartition("results: ")[2]
     assert table.count("random_legal") == 2
+    assert "seed=0" in table
+    assert "seed=1" in table
     assert f"sweep: {folder.absolute()}" in table
 
 

@@ -19,10 +19,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.script import make_parser, run_script
+from benchmarks.script import ReportSection, make_parser, run_script, split_at_markers
 from ganlane.errors import UserError
 from ganlane.evaluation.table import Table
-from ganlane.files import split_at_markers, write_between_markers
 from ganlane.reproduce.report import PAPER_VI, PAPER_VII
 
 ROOT = Path(__file__).parents[1]
@@ -450,7 +449,7 @@ def compare_or_write(options: argparse.Namespace) -> str:
     """What differs, after writing the tables if that is asked for."""
     results = load(options.results)
     for (document, name), table in SECTIONS.items() if options.write else ():
-        write_between_markers(ROOT / document, *markers(name), f"\n{table(results)}\n")
+        ReportSection(ROOT / document, *markers(name)).write(f"\n{table(results)}\n")
     return "\n".join(differences(results)) or "everything printed is as the results say"
 
 

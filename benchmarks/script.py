@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from ganlane.errors import UserError
-from ganlane.files import split_at_markers, write_between_markers
+from ganlane.files import write_bytes
 
 
 def make_parser(description: str | None) -> argparse.ArgumentParser:
@@ -25,6 +25,26 @@ def add_report(parser: argparse.ArgumentParser, begin: str, end: str) -> None:
     parser.add_argument("--report", type=Path, help=f"a document with the lines {begin} and {end}")
 
 
+def split_at_markers(path: Path, begin: str, end: str) -> tuple[str, str]:
+    """The text of a document up to the marker ``begin`` and from ``end`` on, both included.
+
+    Raises:
+        UserError: there is no such file, or it does not hold the two markers once each and in
+            order.
+    """
+    if not path.is_file():
+        raise UserError(
+            f"report={path}: no such file; expected a document with the lines {begin} and {end} in "
+            "it."
+        )
+    text = path.read_text(encoding="utf-8")
+    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        raise UserError(
+            f"report={path}: expected the lines {begin} and {end} in it, once each; add them."
+        )
+    return text[: text.index(begin) + len(begin)], text[text.index(end) :]
+
+
 class ReportSection:
     """The part of a document that a script writes, between two markers.
 
@@ -36,18 +56,20 @@ class ReportSection:
         begin, end: the markers.
 
     Raises:
-        UserError: see :func:`ganlane.files.split_at_markers`.
+        UserError: see :func:`split_at_markers`.
     """
 
     def __init__(self, document: Path | None, begin: str, end: str) -> None:
-        self.document, self.markers = document, (begin, end)
+        self.document = document
+        self.markers = begin, end
         if document is not None:
             split_at_markers(document, begin, end)
 
     def write(self, content: str) -> None:
-        """Put ``content`` between the markers."""
+        """Put ``content`` between the markers, on lines of its own."""
         if self.document is not None:
-            write_between_markers(self.document, *self.markers, content)
+            before, after = split_at_markers(self.document, *self.markers)
+            write_bytes(self.document, f"{before}\n{content}\n{after}".encode())
 
 
 def run_script(measure: Callable[[argparse.Namespace], str], arguments: argparse.Namespace) -> int:

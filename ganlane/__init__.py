@@ -5,10 +5,12 @@
     import gymnasium
     import ganlane
 
-    env = gymnasium.make("ganlane/Highway-v0", traffic="gan")                   # one highway
-    envs = gymnasium.make_vec("ganlane/Highway-v0", num_envs=64, traffic="gan")  # a batch of them
-    env = ganlane.make_env(traffic="gan", num_envs=256)                          # the same for TorchRL
-    table = ganlane.api.evaluate(agents=["mobil", "agent_idm"], traffics=["gan"])  # a data frame
+    # one highway, a batch of them, and the same for TorchRL
+    env = gymnasium.make("ganlane/Highway-v0", traffic="gan")
+    envs = gymnasium.make_vec("ganlane/Highway-v0", num_envs=64, traffic="gan")
+    env = ganlane.make_env(traffic="gan", num_envs=256)
+    # agents on traffics, as a data frame
+    table = ganlane.api.evaluate(agents=["mobil", "agent_idm"], traffics=["gan"])
 
 Imports run one way: ``data``, ``sim`` <- ``generator`` <- ``traffic`` <- ``env`` <- ``transforms``
 <- ``agents`` <- ``evaluation`` <- ``view`` <- ``config`` <- ``build`` <- ``training`` <- ``api`` <-
@@ -51,7 +53,8 @@ _NAMES = {
     "errors": "UserError",
     "sim": "Road Stream",
     "traffic": "IdmMobilTraffic IdmTraffic TrafficModule",
-    "transforms": "ObservationTransform RewardParameters RewardTransform SensorParameters SensorTransform",
+    "transforms": "ObservationTransform RewardParameters RewardTransform SensorParameters "
+    "SensorTransform",
 }
 #: Module of each public name.
 _MODULES = {name: f"ganlane.{module}" for module, names in _NAMES.items() for name in names.split()}

@@ -38,13 +38,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the console script; the exit status."""
     open_closed_streams()
     command, *rest = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    status = 0
     try:
         if command in ("-h", "--help", "help"):
             print(usage())
         elif command == "--version":
             print(__version__)
         elif command == "doctor":
-            return importlib.import_module("ganlane.doctor").main(rest)
+            status = importlib.import_module("ganlane.doctor").main(rest)
         elif command in commands():
             # Imported here: composing takes a third of a second, the list of commands none.
             return importlib.import_module("ganlane.config.run").run_command(command, rest)
@@ -55,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
     except OSError as error:
         return status_of(error, "ganlane")
-    return 0
+    return status
 
 
 if __name__ == "__main__":

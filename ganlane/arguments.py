@@ -114,25 +114,33 @@ def signature_of(target: Callable[..., Any]) -> inspect.Signature:
     """
     if not inspect.isclass(target):
         return inspect.signature(target)
-    for each in target.__mro__[:-1]:
+    # the first class that has either, as Python from 3.11.4 on looks them up
+    for ancestor in target.__mro__[:-1]:
         for name in ("__init__", "__new__"):
-            if name in vars(each):
-                taken = inspect.signature(getattr(each, name))
-                return taken.replace(parameters=list(taken.parameters.values())[1:])
+            if name in vars(ancestor):
+                signature = inspect.signature(getattr(ancestor, name))
+                # without self or cls
+                return signature.replace(parameters=list(signature.parameters.values())[1:])
     return inspect.Signature()
 
 
 def call_with(
-    target: Callable[..., Any], offered: Mapping[str, Any], own: Mapping[str, Any], key: str
+    target: Callable[..., Any],
+    offered: Mapping[str, Any],
+    required: Mapping[str, Any],
+    key: str,
 ) -> Any:
-    """Call ``target`` with all of ``own`` and those of ``offered`` that its signature names.
+    """Call ``target`` with all of ``required`` and those of ``offered`` that its signature names.
 
     Raises:
-        UserError: ``target`` does not accept an argument of ``own``, or needs one that is missing.
+        UserError: ``target`` does not accept an argument of ``required``, or needs one that is
+            missing.
     """
     signature = signature_of(target)
     parameters = signature.parameters
-    arguments = {**{name: value for name, value in offered.items() if name in parameters}, **own}
+    # a constructor names what it wants to be told
+    accepted = {name: value for name, value in offered.items() if name in parameters}
+    arguments = {**accepted, **required}
     try:
         signature.bind(**arguments)
     except TypeError as error:

@@ -152,15 +152,14 @@ def make_env(
         transforms.append(ActionMaskTransform(base.road, *parameters))
     if env.compile:
         base.compile()
-        for each in transforms:
-            each.compile_graphs()
+        for transform in transforms:
+            transform.compile_graphs()
     sensors = observation.sensors
+    errors = []
     try:
-        errors = (
-            []
-            if sensors is None
-            else [SensorTransform(sensors, traffic.stream, env.decision_period_s)]
-        )
+        # what the ego's sensors get wrong comes before the observation that is made of it
+        if sensors is not None:
+            errors = [SensorTransform(sensors, traffic.stream, env.decision_period_s)]
     except ParameterError as error:
         raise error.below("observation.sensors") from error
     return TransformedHighway(
@@ -211,11 +210,10 @@ def make_driver(
     unmasked, plus, form = name.rpartition("+")
     if plus and form in MASKS:
         driver = make_driver(unmasked, env, stream, device)
-        mask = (
-            driver.mask
-            if driver.mask is not None and driver.mask.form == form
-            else MaskParameters(form)
-        )
+        mask = driver.mask
+        # the agent's own bounds stay where its form is asked for
+        if mask is None or mask.form != form:
+            mask = MaskParameters(form)
         return replace(driver, name=name, mask=mask)
     if name in DRIVERS:
         policy = call_with(DRIVERS[name], _constructor_arguments(env, stream), {}, "agents")
@@ -238,11 +236,10 @@ def make_driver(
                 "name it."
             )
         return Driver(name, policy.to(device))
-    known = ", ".join(
-        (*DRIVERS, *(name for name in SHIPPED if (CHECKPOINTS / f"{name}.safetensors").is_file()))
-    )
+    shipped = [name for name in SHIPPED if (CHECKPOINTS / f"{name}.safetensors").is_file()]
+    names = ", ".join([*DRIVERS, *shipped])
     raise UserError(
-        f"agent {name:.100}: unknown; choose one of {known}, or give a checkpoint's path "
+        f"agent {name:.100}: unknown; choose one of {names}, or give a checkpoint's path "
         "(.safetensors) or the "
         "import path of a policy."
     )

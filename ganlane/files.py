@@ -1,5 +1,4 @@
-"""Files: the package's own folders, atomic writes, checksums, and documents with a part that a
-command writes.
+"""Files: the package's own folders, atomic writes and checksums.
 
 Files that are written and read back hold a checksum of their own, so that damage to any byte is
 detected. :data:`PLACE` occurs once in the content, wherever the format has room for text: metadata,
@@ -133,38 +132,6 @@ def write_bytes(path: str | Path, content: bytes) -> None:
     """Write ``content`` to ``path`` atomically."""
     with atomic_path(path) as part:
         part.write_bytes(content)
-
-
-def split_at_markers(path: Path, begin: str, end: str) -> tuple[str, str]:
-    """The text of the document ``path`` up to the marker ``begin`` and from ``end`` on, both
-    markers included.
-
-    Raises:
-        UserError: there is no such file, or it does not hold the two markers once each and in
-            order. The sentence names the commands' key ``report``.
-    """
-    if not path.is_file():
-        raise UserError(
-            f"report={path}: no such file; expected a document with the lines {begin} and {end} in "
-            "it."
-        )
-    text = path.read_text(encoding="utf-8")
-    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
-        raise UserError(
-            f"report={path}: expected the lines {begin} and {end} in it, once each; add them."
-        )
-    return text[: text.index(begin) + len(begin)], text[text.index(end) :]
-
-
-def write_between_markers(path: Path, begin: str, end: str, content: str) -> None:
-    """Replace what is between two markers of a document by ``content`` on lines of its own,
-    atomically.
-
-    Raises:
-        UserError: see :func:`split_at_markers`.
-    """
-    before, after = split_at_markers(path, begin, end)
-    write_bytes(path, f"{before}\n{content}\n{after}".encode())
 
 
 def write_json(path: str | Path, content: Any) -> None:

@@ -111,17 +111,17 @@ def test_the_table_has_the_numbers_of_the_command(capsys):
 
 
 def test_own_drivers_and_own_names_stand_in_the_table():
-    own = DRIVERS["keep_lane"](ganlane.Road(3), 2)
+    driver = DRIVERS["keep_lane"](ganlane.Road(3), 2)
     traffics = {"quiet": {"name": "idm"}, "mine": IdmTraffic}
     episodes = ganlane.api.evaluate(
-        [own, ganlane.load_agent("keep_lane")], traffics, 2, goal_m=30, per_episode=True
+        [driver, ganlane.load_agent("keep_lane")], traffics, 2, goal_m=30, per_episode=True
     )
     assert episodes.height == 8
     totals = episodes.group_by("traffic", "agent", maintain_order=True).agg(pl.col("reward").sum())
     pairs = [
         (traffic, agent)
         for traffic in ("quiet", "mine")
-        for agent in (type(own).__name__, "keep_lane")
+        for agent in (type(driver).__name__, "keep_lane")
     ]
     assert totals.select("traffic", "agent").rows() == pairs
     assert totals["reward"].n_unique() == 1

@@ -131,7 +131,7 @@ MISTAKES = {
     "render episodes=[0,1]": "a film shows one episode, not 2; use format=html",
     "render format=html agents=[a,b,c,d] episodes=[0,1,2,3]": "16 episodes; choose at most 12",
     "render format=gif out=film.mp4": "the ending says mp4 and format gif",
-    "render out=film.avi": "expected one of gif, mp4, png, html, csv, parquet",
+    "render out=film.avi": "episodes are one of gif, mp4, png, html, csv, parquet",
     "render run=nowhere": "nowhere: no such file; expected the metrics.csv",
     "render out=film.svg": "for learning curves only",
     "render traffic=idm agent=keep_lane env.kernel=torch env.goal_m=40 film.start_s=500 film.end_s=501 format=csv": "choose a part",

@@ -218,7 +218,7 @@ def test_a_resume_with_other_settings_is_refused_and_leaves_the_run_as_it_was(
     finished, capsys, tmp_path
 ):
     folder = shutil.copytree(finished, tmp_path / "run")
-    asked = (folder / "overrides.yaml").read_text()
+    settings_before = (folder / "config.yaml").read_text()
     for change in (
         "env.vehicles=5",
         "seed=5",
@@ -229,5 +229,5 @@ def test_a_resume_with_other_settings_is_refused_and_leaves_the_run_as_it_was(
         message = capsys.readouterr().err
         assert change.split("=")[0] in message
         assert "Traceback" not in message
-    assert (folder / "overrides.yaml").read_text() == asked
+    assert (folder / "config.yaml").read_text() == settings_before
     assert main([f"resume={folder}", "total_decisions=640"]) == 0

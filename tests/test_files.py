@@ -1,4 +1,4 @@
-"""Writes are atomic, also on a full disk; documents are rewritten between markers.
+"""Writes are atomic, also on a full disk.
 
 Damage to any byte is refused.
 """
@@ -29,8 +29,6 @@ from ganlane.files import (
     has_checksum,
     sealed,
     sealed_archive,
-    split_at_markers,
-    write_between_markers,
     write_bytes,
     write_json,
 )
@@ -39,54 +37,6 @@ from ganlane.generator.tasks import FitLoop
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
 from ganlane.settings.generator import LoopConfig, PaperConfig
 from ganlane.weights import load_weights, save_weights
-
-BEGIN = "<!-- begin -->"
-END = "<!-- end -->"
-
-
-def test_what_stands_between_the_markers_is_rewritten_and_the_rest_is_kept(
-    tmp_path,
-):
-    document = tmp_path / "page.md"
-    document.write_text(f"# Title\n{BEGIN}{END} tail é\n", encoding="utf-8")
-    for content in ("one", "two\nlines"):
-        write_between_markers(document, BEGIN, END, content)
-        assert (
-            document.read_text(encoding="utf-8") == f"# Title\n{BEGIN}\n{content}\n{END} tail é\n"
-        )
-    assert split_at_markers(document, BEGIN, END) == (
-        f"# Title\n{BEGIN}",
-        f"{END} tail é\n",
-    )
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        BEGIN,
-        END,
-        f"{END}{BEGIN}",
-        f"{BEGIN}{END}{END}",
-        f"{BEGIN}{BEGIN}{END}",
-    ],
-)
-def test_a_document_without_both_markers_once_and_in_order_is_refused_and_kept(tmp_path, text):
-    document = tmp_path / "page.md"
-    document.write_text(text)
-    with pytest.raises(
-        UserError,
-        match=r"page\.md: expected the lines <!-- begin --> and <!-- end -->",
-    ):
-        write_between_markers(document, BEGIN, END, "new")
-    assert document.read_text() == text
-
-
-def test_a_missing_document_is_refused_and_not_made(tmp_path):
-    with pytest.raises(UserError, match=r"gone\.md: no such file"):
-        write_between_markers(tmp_path / "gone.md", BEGIN, END, "new")
-    assert list(tmp_path.iterdir()) == []
-
 
 NOISE = np.random.default_rng(0).integers(0, 255, (200, 300, 3), dtype=np.uint8)
 TABLE = pl.DataFrame({"a": NOISE.ravel()})

@@ -93,13 +93,25 @@ def test_imports_point_down(path):
 
 
 def test_the_settings_are_imported_without_the_simulator():
-    code = "import sys, ganlane.settings.train; assert not {'torch', 'ganlane.sim'} & set(sys.modules)"
+    code = (
+        "import sys, ganlane.settings.train; assert not {'torch', 'ganlane.sim'} & set(sys.modules)"
+    )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=PACKAGE.parent)
 
 
-BELOW_CONFIG = (
-    "settings sim data generator native traffic env transforms agents evaluation view".split()
-)
+BELOW_CONFIG = [
+    "settings",
+    "sim",
+    "data",
+    "generator",
+    "native",
+    "traffic",
+    "env",
+    "transforms",
+    "agents",
+    "evaluation",
+    "view",
+]
 
 
 @pytest.mark.parametrize("part", BELOW_CONFIG)

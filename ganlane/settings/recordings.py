@@ -166,8 +166,8 @@ class RealismConfig(RunConfig):
 
     def rivals(self) -> dict[str, TrafficConfig]:
         """The traffics to compare with, by name; the traffic itself is left out."""
-        own = self.traffic.label()
-        return {name: traffic for name, traffic in self.against.items() if name != own}
+        label = self.traffic.label()
+        return {name: traffic for name, traffic in self.against.items() if name != label}
 
     def shortened(self) -> RealismConfig:
         """With ``quick``, a check that it runs.

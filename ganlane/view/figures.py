@@ -130,7 +130,7 @@ def add_legend(figure: Figure, colours: Mapping[str, str], others: Sequence[Line
 
 def plot_line(axes: Axes, x: npt.ArrayLike, y: npt.ArrayLike, **style: Any) -> None:
     """A line with gaps where ``y`` is NaN; a single value between two gaps is a dot."""
-    known = np.isfinite(np.asarray(y, dtype=np.float64))
-    padded = np.concatenate(([False], known, [False]))
-    single = known & ~padded[:-2] & ~padded[2:]
+    finite = np.isfinite(np.asarray(y, dtype=np.float64))
+    padded = np.concatenate(([False], finite, [False]))
+    single = finite & ~padded[:-2] & ~padded[2:]
     axes.plot(x, y, marker="o", markevery=single, **style)  # type: ignore[arg-type]

@@ -62,7 +62,7 @@ def test_the_distributional_loss_equals_torchrls(noisy, rows):
     actual = loss(ours)["loss"]
     torch.testing.assert_close(actual, expected, atol=1e-6, rtol=1e-6)
     torch.testing.assert_close(ours["td_error"], theirs["td_error"], atol=1e-6, rtol=1e-6)
-    gradients = [torch.autograd.grad(each.mean(), parameters) for each in (actual, expected)]
+    gradients = [torch.autograd.grad(value.mean(), parameters) for value in (actual, expected)]
     torch.testing.assert_close(*gradients, atol=1e-6, rtol=1e-5)
 
 

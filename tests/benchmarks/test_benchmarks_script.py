@@ -20,18 +20,31 @@ def test_the_help_is_the_description_unchanged_and_names_the_markers(capsys):
     assert END in shown
 
 
-def test_only_the_text_between_the_markers_is_replaced_and_a_document_without_them_refused_at_once(
-    tmp_path,
-):
+def test_what_stands_between_the_markers_is_rewritten_and_the_rest_stays(tmp_path):
     document = tmp_path / "page.md"
-    document.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
-    ReportSection(document, BEGIN, END).write("new")
-    ReportSection(None, BEGIN, END).write("nowhere")
-    assert document.read_text() == f"before\n{BEGIN}\nnew\n{END}\nafter\n"
-    document.write_text("nothing here\n")
-    with pytest.raises(UserError, match="once each"):
+    document.write_text(f"# Title\n{BEGIN}{END} tail é\n", encoding="utf-8")
+    for content in ("one", "two\nlines"):
+        ReportSection(document, BEGIN, END).write(content)
+        ReportSection(None, BEGIN, END).write("nowhere")
+        text = document.read_text(encoding="utf-8")
+        assert text == f"# Title\n{BEGIN}\n{content}\n{END} tail é\n"
+
+
+@pytest.mark.parametrize(
+    "text", ["", BEGIN, END, f"{END}{BEGIN}", f"{BEGIN}{END}{END}", f"{BEGIN}{BEGIN}{END}"]
+)
+def test_a_document_without_both_markers_once_and_in_order_is_refused_at_once(tmp_path, text):
+    document = tmp_path / "page.md"
+    document.write_text(text)
+    with pytest.raises(UserError, match=r"page\.md: expected the lines .* once each"):
         ReportSection(document, BEGIN, END)
-    assert document.read_text() == "nothing here\n"
+    assert document.read_text() == text
+
+
+def test_a_missing_document_is_refused_and_not_made(tmp_path):
+    with pytest.raises(UserError, match=r"gone\.md: no such file"):
+        ReportSection(tmp_path / "gone.md", BEGIN, END)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_result_is_printed_and_a_users_mistake_is_one_sentence_and_status_2(capsys):

@@ -186,9 +186,9 @@ def test_a_long_training_is_compiled_where_that_is_known_to_work(version, compil
     "shares", [{"idm": 1}, {"idm": 1, "gan_calibrated": 2}], ids=["fewer", "new"]
 )
 def test_shares_on_the_command_line_replace_those_of_an_experiment(shares):
-    given = ", ".join(f"{name}: {share}" for name, share in shares.items())
+    listed = ", ".join(f"{name}: {share}" for name, share in shares.items())
     assert (
-        config_of("train", "experiment=general", f"traffic.shares={{{given}}}").traffic.shares
+        config_of("train", "experiment=general", f"traffic.shares={{{listed}}}").traffic.shares
         == shares
     )
 

@@ -55,13 +55,13 @@ def run(folder, *options, resume=None):
 
 def start(folder, path, *options, resume=None):
     """Config and agent of a run in ``folder`` that is to begin from the agent at ``path``."""
-    given = [
+    words = [
         *WITHOUT_INIT,
         "init=idm_ckpt",
         f"init.path={path}",
         *options,
     ]
-    config = settings("train", given)
+    config = settings("train", words)
     return make_initial_agent(config, phases_of(config, folder)[0], resume)
 
 
@@ -205,17 +205,17 @@ def test_a_run_with_an_adopted_support_goes_on_without_what_it_started_from(
 
 
 def test_a_second_phase_begins_with_a_fresh_optimiser(trained, tmp_path):
-    given = [
+    words = [
         *WITHOUT_INIT,
         "init=idm_ckpt",
         f"init.path={trained}",
         "init.optimizer=true",
     ]
-    given += [
+    words += [
         "traffic@pretrain.traffic=idm_mobil",
         "pretrain.total_decisions=16",
     ]
-    config = settings("train", given)
+    config = settings("train", words)
     first, second = phases_of(config, tmp_path)
     assert make_initial_agent(config, first, None)[1].optimizer.state_dict()["state"]
     run_phase(config, first)
@@ -424,12 +424,12 @@ def begin(folder, total, resume=""):
 
     What the compiler leaves is shared by the runs beside it.
     """
-    own = {
+    variables = {
         "PYTHONPATH": str(ROOT),
         "TORCHINDUCTOR_CACHE_DIR": str(folder.parent / "cache"),
         "OMP_NUM_THREADS": "1",
     }
-    given = [
+    words = [
         str(folder),
         str(resume),
         *TINY,
@@ -437,8 +437,8 @@ def begin(folder, total, resume=""):
         f"total_decisions={total}",
     ]
     return subprocess.Popen(
-        [sys.executable, "-c", SCRIPT, *given],
-        env={**os.environ, **own},
+        [sys.executable, "-c", SCRIPT, *words],
+        env={**os.environ, **variables},
     )
 
 

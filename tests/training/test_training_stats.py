@@ -34,12 +34,12 @@ def step(
             "lane_changes": torch.full((rows,), lane_changes),
         },
     }
-    known = {} if value is None else {"chosen_action_value": torch.tensor(value)[:, None]}
+    values = {} if value is None else {"chosen_action_value": torch.tensor(value)[:, None]}
     return TensorDict(
         {
             "action": torch.full((rows,), action),
             "next": after,
-            **known,
+            **values,
         },
         [rows],
     )

@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import polars as pl
 import torch
-from ganlane.settings.recordings import NgsimConfig
 from matplotlib import pyplot
 from reference.recordings import ngsim_rows, portal_csv, traffic, write_highd
 
@@ -31,16 +30,16 @@ from ganlane.agents import read_agent
 from ganlane.data import read_recordings, read_scenes, write_prepared, write_scene_csv
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
-from ganlane.generator.checkpoint import CACHE_VARIABLE, cached, load_generator
+from ganlane.generator.checkpoint import load_generator
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
-from ganlane.sim.scenarios import read_scene
-from ganlane.train import main as train
+from ganlane.settings.generator import NgsimParameters
+from ganlane.sim.scene_files import read_scene
 from ganlane.training.logs import read_rows
 from ganlane.view.curves import draw_runs, read_runs
 
 from . import damages
 from .damages import BYTES, TEXT, Damage
-from .kill import TINY
+from .kill import TINY, train
 from .tally import Tally, forked
 
 #: Seconds and GiB that reading one small file may take.
@@ -86,8 +85,6 @@ def make_files(folder: Path) -> None:
     write_prepared(frame, folder / "recording.parquet")
     (folder / "ngsim.csv").write_text(portal_csv(ngsim_rows(frame)))
     write_highd(folder / "highd")
-    os.environ[CACHE_VARIABLE] = str(folder / "cache")
-    cached("groups", "key", lambda: {"labels": np.arange(500)})
     short = ["traffic=idm", "init=none", "total_decisions=192", f"hydra.run.dir={folder / 'run'}"]
     with redirect_stdout(io.StringIO()):
         assert train([*TINY, *short]) == 0
@@ -109,16 +106,6 @@ def _resumed(path: Path) -> Any:
     assert status == 0, said.getvalue()
     print(said.getvalue())  # what was told of
     return read_agent(run / "agent.safetensors")[0]
-
-
-def _cache(path: Path) -> Any:
-    """What is damaged is computed again."""
-    os.environ[CACHE_VARIABLE] = str(path.parent)
-
-    def again() -> dict[str, np.ndarray]:
-        raise UserError("computed again")
-
-    return cached("groups", "key", again)
 
 
 def _reference(path: Path) -> Any:
@@ -147,10 +134,8 @@ READERS = {
     "calibrated generator": Reader("generator_calibrated.safetensors", _generator, WEIGHTS, True),
     "last.pt": Reader("run/checkpoints/last.pt", _resumed, STATE, True, 1),
     "config.yaml": Reader("run/config.yaml", _resumed, TEXT, share=1),
-    "overrides.yaml": Reader("run/overrides.yaml", _resumed, TEXT, share=1),
     "metrics.csv, resumed": Reader("run/metrics.csv", read_rows, TEXT),
     "metrics.csv, drawn": Reader("run/metrics.csv", _curves, TEXT, share=1),
-    "cached windows": Reader("cache/groups_key.npz", _cache, BYTES, True),
     "histograms": Reader("reference.json", _reference, JSON, True),
     "scene CSV": Reader("scene.csv", read_scene, TEXT),
     "scene JSON": Reader("scene.json", read_scene, JSON),

@@ -16,6 +16,7 @@ import signal
 import time
 import traceback
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,10 +27,11 @@ from safetensors.torch import load_file
 import ganlane.commands.train
 import ganlane.generator.checkpoint
 import ganlane.training.phases  # noqa: F401
-from ganlane.train import main as train
+from ganlane.config.run import run_command
 
 from .tally import Tally
 
+train = partial(run_command, "train")
 #: Seconds that an attempt may take; then it hangs.
 AT_MOST_S = 300.0
 _TINY = """

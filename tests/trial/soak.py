@@ -14,7 +14,6 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from ganlane.parameters.observation import FORMS
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
@@ -22,6 +21,7 @@ import ganlane
 from ganlane import build, keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
+from ganlane.settings.observation import FORMS
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.state import Vehicles
 

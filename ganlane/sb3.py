@@ -101,6 +101,7 @@ class HighwayVecEnv(VecEnv):
 
     def _final_info(self, row: int, info: dict[str, Any]) -> dict[str, Any]:
         """What an ended row reports: gymnasium's info but for the terms of the reward."""
+        # Whatever is nested, the terms of the reward, is left out.
         final = {}
         for name, values in info["final_info"].items():
             if not isinstance(values, dict):
@@ -144,6 +145,7 @@ class HighwayVecEnv(VecEnv):
         Raises:
             UserError: no such method.
         """
+        # A method of the batch that gives no list of rows cannot be split by rows.
         if method_name not in _OF_ROWS:
             names = " and ".join(_OF_ROWS)
             raise UserError(
@@ -212,8 +214,9 @@ class ModelPolicy(TensorDictModuleBase):
         if self._masked:
             masks["action_masks"] = tensordict.get(keys.ACTION_MASK).cpu().numpy()
         observation = tensordict.get(keys.OBSERVATION).cpu().numpy()
-        action, _ = self.model.predict(observation, deterministic=True, **masks)
-        return tensordict.set(keys.ACTION, torch.as_tensor(action, device=tensordict.device).long())
+        chosen, _ = self.model.predict(observation, deterministic=True, **masks)
+        action = torch.as_tensor(chosen, device=tensordict.device)
+        return tensordict.set(keys.ACTION, action.long())
 
 
 def driver(model: BaseAlgorithm, name: str | None = None) -> Driver:

@@ -59,6 +59,7 @@ def outside_autocast(function: F) -> F:
 
 def check_default_device(device: str) -> None:
     """Raise :class:`UserError` if torch's default device is not the CPU or of type ``device``."""
+    # Constants are made without a device, so they would land there.
     default = torch.get_default_device().type
     if default not in ("cpu", device):
         raise UserError(

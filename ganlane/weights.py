@@ -35,6 +35,7 @@ def save_weights(
         tensors: flat name to tensor.
         metadata: JSON-serialisable description (config, data, metrics, code version).
     """
+    # On the CPU: a file from a GPU must load anywhere.
     flat = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     header = {
         "ganlane": json.dumps({"kind": kind, **metadata}),
@@ -82,6 +83,7 @@ def load_weights(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[s
             f"{path}: expected a ganlane checkpoint of kind {kind}, found "
             f"{stored or 'a file that ganlane did not write'}; give one that ganlane wrote."
         )
+    # NaN would drive without a word.
     for name, tensor in tensors.items():
         if not tensor.isfinite().all():
             raise UserError(

@@ -229,6 +229,7 @@ class SumoTraffic(TrafficModule):
     ) -> Moved:
         """One step of SUMO; rows at step 0 are set up anew first. Only the ego is steered by us."""
         fresh = (step == 0).cpu().numpy()
+        # libsumo is called vehicle by vehicle, so everything is NumPy or plain numbers from here.
         before = _arrays(vehicles)
         now = self._running(before, fresh)
         driving = self._check(now, before, fresh, key.cpu().numpy())
@@ -300,9 +301,11 @@ class SumoTraffic(TrafficModule):
         Raises:
             UserError: the state of a row is neither the one that SUMO left nor one that has ended.
         """
+        # What the last step left tells whether this state continues it.
         same_episode = key == now.keys
         in_lane = same_episode & ~now.ended & _same(before, now.after, "y", "speed", "valid")
         follows = fresh | (in_lane & _same(before, now.after, "x"))
+        # The environment goes on computing ended rows until the decision is over.
         again = same_episode & _same(before, now.before, "x", "y", "speed", "valid")
         waits = again & ~follows
         shifted = in_lane & ~follows & ~waits
@@ -313,6 +316,7 @@ class SumoTraffic(TrafficModule):
             )
         for row in np.flatnonzero(waits & ~now.ended).tolist():
             now.roads.clear(row)
+        # Recycled vehicles were put elsewhere along the road: SUMO follows.
         for row in np.flatnonzero(shifted).tolist():
             for i in np.flatnonzero(before.x[row] != now.after.x[row]).tolist():
                 if i != EGO_INDEX:
@@ -323,6 +327,7 @@ class SumoTraffic(TrafficModule):
     def _place(self, vehicles: Any, row: int, i: int) -> Place:
         """Where vehicle ``i`` of a row is."""
         lane = round(float(vehicles.y[row, i]) / float(self.road.lane_width_m))
+        # A body may lean over the edge of the road; SUMO knows only lanes.
         lane = min(max(lane, 0), int(self.road.lanes) - 1)
         return Place(
             lane,
@@ -335,6 +340,7 @@ class SumoTraffic(TrafficModule):
         m = vehicles.x.shape[1]
         now.roads.clear(row)
         purposes = [Purpose.FOREIGN_DRIVER + _TAU + k for k in range(len(CARS))]
+        # Every driver's parameters follow from the episode, not from when SUMO drew them.
         u = uniform(key[row : row + 1].cpu(), 0, m, purposes, torch.float64)[0].numpy()
         drivers = []
         for i in range(1, m):
@@ -355,6 +361,7 @@ class SumoTraffic(TrafficModule):
         before: Any,
     ) -> None:
         """The stand-ins, ordinary cars for SUMO's drivers, follow the egos."""
+        # [N, 1]: the environment's functions on a batch of single vehicles.
         one = Vehicles(*(field[:, None] for field in ego))
         body = body_lanes(one, self.road)
         lanes = presence(one, self.road, body, with_target(body, one))
@@ -392,6 +399,7 @@ class SumoTraffic(TrafficModule):
             Purpose.FOREIGN_DRIVER + _PACE_PHASE,
         ]
         u = uniform(key, 0, before.x.shape[1], purposes, torch.float64).numpy()
+        # Turns of the sine so far, with a period of 20 to 60 s and a random phase.
         turns = step[:, None] * (0.1 / (20.0 + 40.0 * u[..., 0])) + u[..., 1]
         factor = 1.0 + self.speed_wander * np.sin(2.0 * np.pi * turns)
         speeds = before.desired_speed * factor
@@ -410,6 +418,7 @@ class SumoTraffic(TrafficModule):
         """SUMO's state as our fields; the egos, and rows that do not drive, stay as they are."""
         row, other, front, new_speed = roads.read()
         at = row, other + 1
+        # SUMO tells where the front bumper is; ours is the centre.
         new_x = front[:, 0] - 0.5 * before.length[at]
         new_y = front[:, 1]
         dx = new_x - before.x[at]

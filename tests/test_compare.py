@@ -52,8 +52,17 @@ def test_every_replayed_episode_has_the_scene_that_it_ran_in(table, recordings):
     assert table.filter(pl.col("traffic") == "idm")["scene"].is_null().all()
 
 
-def test_the_record_holds_rows_paired_leads_failures_and_crashes_by_scene(table, tmp_path, capsys):
-    publish(table, tmp_path, {}, {})
+def test_the_record_holds_rows_paired_leads_failures_and_crashes_by_scene(
+    table,
+    tmp_path,
+    capsys,
+):
+    publish(
+        table,
+        tmp_path,
+        {},
+        {},
+    )
     record = json.loads((tmp_path / "results.json").read_text())
     assert record["rows"] == plain(evaluation_rows(table))
     assert record["paired"] == plain(paired_rows(table))
@@ -70,5 +79,10 @@ def test_the_record_holds_rows_paired_leads_failures_and_crashes_by_scene(table,
 
 
 def test_other_traffics_have_no_scenes(table, tmp_path):
-    publish(table.filter(pl.col("traffic") == "idm").drop("scene"), tmp_path, {}, {})
+    publish(
+        table.filter(pl.col("traffic") == "idm").drop("scene"),
+        tmp_path,
+        {},
+        {},
+    )
     assert "crashes_by_scene" not in json.loads((tmp_path / "results.json").read_text())

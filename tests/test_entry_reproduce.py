@@ -9,7 +9,12 @@ import pytest
 
 from ganlane.reproduce import cells, main
 
-SHORT = ["episodes=3", "workers=1", "env.goal_m=60", "hydra.run.dir=out"]
+SHORT = [
+    "episodes=3",
+    "workers=1",
+    "env.goal_m=60",
+    "hydra.run.dir=out",
+]
 SMALL = ["agents=[random_legal,mobil,agent_idm@all+none,agent_gan+none]", "traffics=[idm,gan]"]
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -37,7 +42,18 @@ def curves(folder: Path, start: float) -> str:
 
 def test_one_command_leaves_numbers_tables_and_figures_in_one_folder(cells_driven, capsys):
     runs = ",".join(curves(Path(f"runs/{seed}"), 100.0 * seed) for seed in (0, 1))
-    assert main([*SHORT, *SMALL, "fewer={gan: 2, idm: 2}", f"runs=[{runs}]", "from=shipped"]) == 0
+    assert (
+        main(
+            [
+                *SHORT,
+                *SMALL,
+                "fewer={gan: 2, idm: 2}",
+                f"runs=[{runs}]",
+                "from=shipped",
+            ]
+        )
+        == 0
+    )
     out, folder = capsys.readouterr().out, Path("out")
     assert "Table VI: crashes" in out
     # agent_idm has five trainings
@@ -74,7 +90,17 @@ def test_what_was_driven_is_not_driven_again_and_gives_the_same_numbers(cells_dr
     assert len(cells_driven) == 3
     assert json.loads(Path("out/results.json").read_text())["rows"] == first
     assert main([*SHORT, "agents=[random_legal,mobil,agent_idm,keep_lane]", "traffics=[idm]"]) == 0
-    assert main([*SHORT, agents, "traffics=[idm]", "seed=1"]) == 0
+    assert (
+        main(
+            [
+                *SHORT,
+                agents,
+                "traffics=[idm]",
+                "seed=1",
+            ]
+        )
+        == 0
+    )
     assert cells_driven[3:] == [
         (name, "idm") for name in ("keep_lane", "random_legal", "mobil", "agent_idm")
     ]
@@ -105,7 +131,17 @@ def test_a_training_from_scratch_that_fails_is_named_after_the_hours_were(monkey
     asked = []
     run = "ganlane.commands.reproduce.subprocess.run"
     monkeypatch.setattr(run, lambda command, **_: asked.append(command) or Failed)
-    assert main([*SHORT, *SMALL, "from=scratch", "training_seeds=[4,5]"]) == 2
+    assert (
+        main(
+            [
+                *SHORT,
+                *SMALL,
+                "from=scratch",
+                "training_seeds=[4,5]",
+            ]
+        )
+        == 2
+    )
     error = capsys.readouterr().err
     assert "2 trainings, one after the other: about 2.2 hours on one core." in error
     assert "the same command goes on with it" in error

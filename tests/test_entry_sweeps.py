@@ -28,11 +28,29 @@ LAUNCHERS = {
 
 def sweep(folder, *arguments):
     """Run a sweep over two seeds in a process of its own, in ``folder``."""
-    command = [sys.executable, "-m", "ganlane", "train", "-m", "seed=0,1", *TINY, *arguments]
+    command = [
+        sys.executable,
+        "-m",
+        "ganlane",
+        "train",
+        "-m",
+        "seed=0,1",
+        *TINY,
+        *arguments,
+    ]
     root = str(Path(__file__).parent.parent)
-    environment = {**os.environ, "PYTHONPATH": root, "OMP_NUM_THREADS": "1"}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": root,
+        "OMP_NUM_THREADS": "1",
+    }
     return subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=500
+        command,
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=500,
     )
 
 
@@ -81,7 +99,12 @@ def test_the_runs_of_a_sweep_share_no_file(launcher, tmp_path):
 def test_a_mistake_in_a_process_of_a_sweep_is_one_sentence(tmp_path):
     skip_without("joblib")
     joblib = ["hydra/launcher=joblib", *LAUNCHERS["joblib"][1]]
-    done = sweep(tmp_path, *joblib, "init=idm_ckpt", "init.path=nowhere.safetensors")
+    done = sweep(
+        tmp_path,
+        *joblib,
+        "init=idm_ckpt",
+        "init.path=nowhere.safetensors",
+    )
     assert done.returncode == 2
     assert "nowhere.safetensors" in done.stderr.splitlines()[-1]
     assert "Traceback" not in done.stderr
@@ -115,13 +138,24 @@ def test_a_sweep_of_evaluate_has_a_folder_for_each_run_and_ends_with_one_table(c
     assert seeds == [0, 1]
     table = capsys.readouterr().out.rpartition("results: ")[2]
     assert table.count("random_legal") == 2
+    assert "seed=0" in table
+    assert "seed=1" in table
     assert f"sweep: {folder.absolute()}" in table
 
 
 @pytest.mark.usefixtures("empty_folder", "own_logging")
 def test_a_run_of_a_sweep_that_is_refused_ends_it_with_one_sentence(capsys):
     assert (
-        main(["evaluate", "-m", "seed=0,1", "agents=[missing.safetensors]", "traffics=[idm]"]) == 2
+        main(
+            [
+                "evaluate",
+                "-m",
+                "seed=0,1",
+                "agents=[missing.safetensors]",
+                "traffics=[idm]",
+            ]
+        )
+        == 2
     )
     assert is_one_sentence(capsys.readouterr().err, "evaluate")
     assert not list(Path("outputs").rglob("config.yaml"))

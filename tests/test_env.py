@@ -25,6 +25,11 @@ def ends(td, row: int = 0) -> list[str]:
     return [name for name in keys.END_EVENTS if td[keys.EVENTS, name][row].item()]
 
 
+def remembered(td, name: str) -> float:
+    """What the environment remembers of the ego in a batch of one."""
+    return td[keys.EGO, name].item()
+
+
 def flags(td, row: int = 0) -> tuple[bool, bool, bool]:
     return tuple(td[name][row].item() for name in ("terminated", "truncated", "done"))
 
@@ -173,20 +178,20 @@ def test_a_command_moves_the_ego_one_lane_and_commands_meanwhile_are_ignored():
     env = environment(lanes=4, vehicles=2, mobil=False)
     td = placed(env, vehicles({"x": 0.0, "lane": 1}, FAR))
     td = step(env, td, LEFT)
-    assert td[keys.EGO, "started_change"].item()
-    assert td[keys.EGO, "change_direction"].item() == 1
-    assert 0.0 < td[keys.EGO, "change_progress"].item() < 1.0
+    assert remembered(td, "started_change")
+    assert remembered(td, "change_direction") == 1
+    assert 0.0 < remembered(td, "change_progress") < 1.0
     for action in (LEFT, RIGHT):
         td = step(env, td, action)
-        assert not td[keys.EGO, "started_change"].item()
+        assert not remembered(td, "started_change")
         assert td[keys.VEHICLES, "target_lane"][0, 0] == 2
         assert ends(td) == []
     td = step(env, step(env, td))
     assert td[keys.VEHICLES, "y"][0, 0].item() == pytest.approx(8.0, abs=0.1)
-    assert td[keys.EGO, "change_direction"].item() == 0
-    assert td[keys.EGO, "change_progress"].item() == 0.0
-    assert td[keys.EGO, "lane_changes"].item() == 1
-    assert td[keys.EGO, "decisions"].item() == 5
+    assert remembered(td, "change_direction") == 0
+    assert remembered(td, "change_progress") == 0.0
+    assert remembered(td, "lane_changes") == 1
+    assert remembered(td, "decisions") == 5
     assert step(env, td, RIGHT)[keys.EGO, "change_direction"].item() == -1
 
 
@@ -202,14 +207,14 @@ def test_with_abort_the_opposite_command_turns_back_and_the_same_one_does_nothin
     td = step(env, placed(env, vehicles({"x": 0.0, "lane": 0}, FAR)), LEFT)
     again = step(env, td, LEFT)
     assert again[keys.VEHICLES, "target_lane"][0, 0] == 1
-    assert again[keys.EGO, "lane_changes"].item() == 1
+    assert remembered(again, "lane_changes") == 1
     back = step(env, td, RIGHT)
     assert back[keys.VEHICLES, "target_lane"][0, 0] == 0
-    assert back[keys.EGO, "started_change"].item()
+    assert remembered(back, "started_change")
     for _ in range(6):
         back = step(env, back)
     assert back[keys.VEHICLES, "y"][0, 0].abs() < 0.1
-    assert back[keys.EGO, "change_direction"].item() == 0
+    assert remembered(back, "change_direction") == 0
 
 
 def test_the_mean_acceleration_is_the_change_of_speed_over_the_time_driven():
@@ -220,8 +225,8 @@ def test_the_mean_acceleration_is_the_change_of_speed_over_the_time_driven():
     after = step(env, td)
     change = after[keys.VEHICLES, "speed"][0, 0] - 20.0
     assert change < -2.0
-    assert after[keys.EGO, "mean_acceleration"].item() == pytest.approx(change.item() / 1.0)
-    assert after[keys.EGO, "distance"].item() == after[keys.VEHICLES, "x"][0, 0].item()
+    assert remembered(after, "mean_acceleration") == pytest.approx(change.item() / 1.0)
+    assert remembered(after, "distance") == after[keys.VEHICLES, "x"][0, 0].item()
 
 
 # Ends
@@ -263,7 +268,7 @@ def test_an_episode_ends_for_one_reason_at_the_step_of_it(ego, others, action, r
     assert ends(after) == reasons
     assert flags(after) == (bool(reasons), False, bool(reasons))
     assert after[keys.STEP].item() == steps
-    distance = after[keys.EGO, "distance"].item()
+    distance = remembered(after, "distance")
     assert (distance > 1000.0) == ("goal" in reasons or "hard_crash" in reasons)
     if reasons == ["goal"] and steps == 2:
         assert distance == pytest.approx(1000.1, abs=1e-3)
@@ -271,7 +276,7 @@ def test_an_episode_ends_for_one_reason_at_the_step_of_it(ego, others, action, r
         assert after[keys.EVENTS, keys.SOFT_CRASH].item() == 0
     if reasons == ["out_of_road"]:
         assert same_bits(after[keys.VEHICLES], td[keys.VEHICLES]) == []
-        assert not after[keys.EGO, "started_change"].item()
+        assert not remembered(after, "started_change")
 
 
 def test_the_time_limit_truncates_in_the_middle_of_a_decision():

@@ -28,7 +28,7 @@ KERNELS = [
 ]
 
 
-def made(**options):
+def idm_highways(**options):
     return HighwayEnv(IdmTraffic(), **options)
 
 
@@ -47,7 +47,7 @@ def made(**options):
 )
 def test_an_environment_that_cannot_be_is_refused(options):
     with pytest.raises(UserError, match=next(iter(options))):
-        made(**options)
+        idm_highways(**options)
 
 
 def test_a_name_is_no_traffic():
@@ -58,11 +58,11 @@ def test_a_name_is_no_traffic():
 @pytest.mark.parametrize("seed", [2**63, -1, -(2**63) - 1, 1.5, "one"])
 def test_a_seed_that_is_none_is_refused_where_it_is_set(seed):
     with pytest.raises(UserError, match="seed="):
-        made().set_seed(seed)
+        idm_highways().set_seed(seed)
 
 
 def test_the_largest_seed_drives():
-    env = made()
+    env = idm_highways()
     env.set_seed(2**63 - 1)
     assert env.rollout(2)[keys.SEED].eq(2**63 - 1).all()
 
@@ -70,7 +70,7 @@ def test_the_largest_seed_drives():
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("action", [[1, 3], [-1, 1], [2**62, 0], [-(2**63), 0]])
 def test_an_action_outside_0_to_2_is_refused(action, kernel):
-    env = made(num_envs=2, kernel=kernel)
+    env = idm_highways(num_envs=2, kernel=kernel)
     with pytest.raises(UserError, match=r"^action -?\d+: expected 2 whole numbers"):
         env.step(env.reset().set(keys.ACTION, torch.tensor(action)))
 
@@ -80,14 +80,14 @@ def test_an_action_outside_0_to_2_is_refused(action, kernel):
     "action", [torch.ones(2), torch.ones(2, 1).long(), torch.ones(2).bool()], ids=str
 )
 def test_an_action_of_another_form_is_refused(action, kernel):
-    env = made(num_envs=2, kernel=kernel)
+    env = idm_highways(num_envs=2, kernel=kernel)
     with pytest.raises(UserError, match=r"^action of shape"):
         env.step(env.reset().set(keys.ACTION, action))
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_actions_of_a_shorter_integer_type_are_taken(kernel):
-    env = made(num_envs=2, kernel=kernel)
+    env = idm_highways(num_envs=2, kernel=kernel)
     start = env.reset()
     long, short = (
         env.step(start.clone().set(keys.ACTION, torch.tensor([1, 2]).to(t)))
@@ -100,7 +100,7 @@ def test_actions_of_a_shorter_integer_type_are_taken(kernel):
     "state", [{}, {keys.ACTION: torch.ones(1, dtype=torch.int64)}], ids=["nothing", "action"]
 )
 def test_a_step_before_a_reset_is_refused(state):
-    for env in (made(), ganlane.make_env("idm").base_env):
+    for env in (idm_highways(), ganlane.make_env("idm").base_env):
         with pytest.raises(UserError, match="call reset"):
             env.step(TensorDict(state, [1]))
 
@@ -110,7 +110,7 @@ def test_a_step_before_a_reset_is_refused(state):
 )
 def test_a_reset_to_episodes_that_are_none_is_refused(counters):
     with pytest.raises(UserError, match="reset"):
-        made(num_envs=2).reset(TensorDict(counters, [2]))
+        idm_highways(num_envs=2).reset(TensorDict(counters, [2]))
 
 
 def test_a_default_device_without_numbers_is_refused_everywhere():

@@ -177,7 +177,7 @@ def test_a_recorder_sees_every_physics_step_and_ends_where_the_decision_does(ker
         state = following
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))])
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 def test_an_environment_can_be_copied_and_sent_to_another_process(copied):
     env = make_env(
         IdmMobilTraffic(Road()),

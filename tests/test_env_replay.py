@@ -30,9 +30,9 @@ def recordings() -> pl.DataFrame:
     """
     parts = []
     for k in range(3):
-        made = synthetic_scenes(SyntheticTraffic(scenes=1, lanes=2 + k, seconds=9.0 - k), seed=k)
-        made = made.filter((pl.col("vehicle") % 3 > 0) | (pl.col("frame") <= 45))
-        parts.append(made.with_columns(scene=pl.lit(f"scene-{k}")))
+        scene = synthetic_scenes(SyntheticTraffic(scenes=1, lanes=2 + k, seconds=9.0 - k), seed=k)
+        scene = scene.filter((pl.col("vehicle") % 3 > 0) | (pl.col("frame") <= 45))
+        parts.append(scene.with_columns(scene=pl.lit(f"scene-{k}")))
     return sort(pl.concat(parts))
 
 

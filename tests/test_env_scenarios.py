@@ -15,9 +15,7 @@ from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.config.run import settings
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
-from ganlane.settings.env import (
-    EnvConfig,
-)
+from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
 from ganlane.settings.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.sim.collisions import pair_overlaps
@@ -30,10 +28,7 @@ ROWS = 16
 TRAFFICS = {"idm": IdmTrafficConfig(), "idm_mobil": IdmMobilTrafficConfig()}
 TRAFFIC = pytest.mark.parametrize("traffic", list(TRAFFICS))
 SCENARIOS = {
-    "cut_in": make(EnvConfig, "cut_in"),
-    "stalled_car": make(EnvConfig, "stalled_car"),
-    "stop_and_go": make(EnvConfig, "stop_and_go"),
-    "blocked_lane": make(EnvConfig, "blocked_lane"),
+    name: make(EnvConfig, name) for name in ("cut_in", "stalled_car", "stop_and_go", "blocked_lane")
 }
 
 

@@ -21,9 +21,14 @@ EXAMPLES = {
     "own_policy.py": r"(?s)mobil .*agent_idm .*random_legal .*largest_gap ",
     "torchrl_dqn.py": r"(?s)loss \d+\.\d+, reward per decision -?\d+\.\d+.*torchrl_dqn .*mobil ",
     "torchrl_ppo.py": r"(?s)reward per decision -?\d+\.\d+.*torchrl_ppo .*mobil ",
-    "cleanrl_style.py": r"2048 decisions, \d+ episodes, loss \d+\.\d+\nmean return of the last \d+: -?\d+\.\d",
+    "cleanrl_style.py": (
+        r"2048 decisions, \d+ episodes, loss \d+\.\d+\nmean return of the last \d+: -?\d+\.\d"
+    ),
     "sb3_ppo.py": r"(?s)ppo .*mobil ",
-    "sb3_dqn.py": r"(?s)300 decisions, mean return of the last \d+ episodes -?\d+\.\d.*sb3_dqn.*mobil.*random_legal",
+    "sb3_dqn.py": (
+        r"(?s)300 decisions, mean return of the last \d+ episodes -?\d+\.\d.*sb3_dqn.*mobil"
+        ".*random_legal"
+    ),
 }
 #: Budgets that keep a run to seconds.
 SHORT = {

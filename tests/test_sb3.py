@@ -33,7 +33,7 @@ QUICK = {
 }
 
 
-def made(**options):
+def short_episodes(**options):
     return ganlane.sb3.make_vec_env("idm", num_envs=ROWS, **{"seed": 0, **SHORT, **options})
 
 
@@ -45,7 +45,7 @@ def drive(env, steps):
 
 def test_observations_and_rewards_are_those_of_the_gymnasium_batch():
     highways = HighwayVectorGym(num_envs=ROWS, traffic="idm", seed=0, **SHORT)
-    env = made()
+    env = short_episodes()
     assert np.array_equal(env.reset(), highways.reset()[0])
     for action in np.random.default_rng(0).integers(0, 3, (20, ROWS)):
         observation, reward, done, _ = env.step(action)
@@ -56,7 +56,7 @@ def test_observations_and_rewards_are_those_of_the_gymnasium_batch():
 
 
 def test_the_info_of_a_row_that_ends_holds_its_statistics_and_its_last_observation():
-    steps = drive(made(), 40)
+    steps = drive(short_episodes(), 40)
     ends = [
         (step, row) for step, (_, _, done, _) in enumerate(steps) for row in np.flatnonzero(done)
     ]
@@ -79,12 +79,12 @@ def test_the_info_of_a_row_that_ends_holds_its_statistics_and_its_last_observati
 
 
 def test_the_info_of_a_time_out_says_so():
-    steps = drive(made(goal_m=5000.0, timeout_s=3.0), 3)
+    steps = drive(short_episodes(goal_m=5000.0, timeout_s=3.0), 3)
     assert all(info["TimeLimit.truncated"] for info in steps[-1][3])
 
 
 def test_a_seed_gives_the_same_episodes_again_and_the_next_reset_new_ones():
-    env = made(seed=None)
+    env = short_episodes(seed=None)
     env.seed(7)
     first = env.reset()
     second = env.reset()
@@ -97,7 +97,7 @@ def test_a_seed_gives_the_same_episodes_again_and_the_next_reset_new_ones():
 
 
 def test_masks_are_given_to_sb3_contrib_by_row():
-    env = made(mask="safe")
+    env = short_episodes(mask="safe")
     env.reset()
     assert env.has_attr("action_masks")
     masks = np.stack(env.env_method("action_masks"))
@@ -108,16 +108,16 @@ def test_masks_are_given_to_sb3_contrib_by_row():
 
 
 def test_pictures_of_all_rows_are_tiled():
-    env = made(render_mode="rgb_array")
+    env = short_episodes(render_mode="rgb_array")
     env.reset()
     height, width, _ = env.get_images()[0].shape
     assert env.render().shape == (2 * height, 2 * width, 3)
     with pytest.raises(UserError, match="render_mode"):
-        made().get_images()
+        short_episodes().get_images()
 
 
 def test_attributes_are_those_of_the_batch_and_cannot_be_set():
-    env = made()
+    env = short_episodes()
     assert env.get_attr("num_envs") == [ROWS] * ROWS
     assert not env.has_attr("no_such_thing")
     assert env.env_is_wrapped(Monitor) == [True] * ROWS
@@ -133,13 +133,13 @@ def test_attributes_are_those_of_the_batch_and_cannot_be_set():
 
 @pytest.mark.parametrize("algorithm", QUICK, ids=lambda kind: kind.__name__)
 def test_the_algorithm_trains_unchanged_and_its_policy_can_be_evaluated(algorithm):
-    env = made(mask="safe")
+    env = short_episodes(mask="safe")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         model = algorithm("MlpPolicy", env, seed=0, device="cpu", **QUICK[algorithm]).learn(128)
         if algorithm is not sb3_contrib.MaskablePPO:
             returns, lengths = evaluate_policy(
-                model, made(), n_eval_episodes=4, return_episode_rewards=True
+                model, short_episodes(), n_eval_episodes=4, return_episode_rewards=True
             )
             assert len(returns) == len(lengths) == 4
     assert model.ep_info_buffer

@@ -185,7 +185,10 @@ class HighwayEnv(EnvBase):
         self.observation_spec = spec.to(device)
         # A TransformedEnv passes to a reset only the keys of the state spec; without the counters a
         # reset to certain episodes would run the first ones.
-        counters = {name: self.observation_spec[name].clone() for name in (keys.SEED, keys.EPISODE)}
+        counters = {
+            keys.SEED: self.observation_spec[keys.SEED].clone(),
+            keys.EPISODE: self.observation_spec[keys.EPISODE].clone(),
+        }
         self.state_spec = Composite(counters, shape=(n,), device=device)
         self.action_spec = Categorical(keys.ACTIONS, shape=(n,), dtype=torch.int64, device=device)
         self.reward_spec = Unbounded(shape=(n, 1), dtype=self.dtype, device=device)

@@ -88,7 +88,9 @@ def begin(
     Rows whose command leaves the road have ended.
     """
     # Recorded roads have as many lanes as their row says.
-    lanes = rules.road.lanes if isinstance(rules.road.lanes, int) else rules.road.lanes[:, 0]
+    lanes = rules.road.lanes
+    if isinstance(lanes, Tensor):
+        lanes = lanes[:, 0]
     target = vehicles.target_lane[:, EGO_INDEX]
     direction = ego["change_direction"]
     # The command sets the lane that the ego steers to; the motion itself takes several decisions.
@@ -99,7 +101,8 @@ def begin(
         lanes,
         rules.ego.abort_lane_change,
     )
-    targets = torch.cat((command.target_lane[:, None], vehicles.target_lane[:, 1:]), dim=1)
+    others = vehicles.target_lane[:, 1:]
+    targets = torch.cat((command.target_lane[:, None], others), dim=1)
     vehicles = vehicles.with_(target_lane=targets)
     none = torch.zeros_like(command.off_road)
     start = Substep(
@@ -174,7 +177,8 @@ def remember(
     arrived = lane_change_done(end.vehicles.columns(slice(0, 1)), rules.road)[:, 0]
     direction = torch.where(arrived, 0, command.direction)
     # A row that ended at once drove no step: its speed did not change either.
-    seconds = (end.step - start.step).clamp_min(1).to(ego.speed.dtype) * PHYSICS_STEP_S
+    steps = (end.step - start.step).clamp_min(1)
+    seconds = steps.to(ego.speed.dtype) * PHYSICS_STEP_S
     return {
         "steering": end.steering,
         "mean_acceleration": (ego.speed - speed) / seconds,
@@ -290,7 +294,8 @@ def _with_rows(memory: TensorDictBase, rows: Tensor, other: TensorDictBase) -> T
 
 def _where(rows: Tensor, new: Tensor, old: Tensor) -> Tensor:
     """``new`` where ``rows`` [N] is true, ``old`` elsewhere."""
-    return torch.where(rows.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+    further_axes = [1] * (new.ndim - 1)
+    return torch.where(rows.reshape(-1, *further_axes), new, old)
 
 
 def run_decision(
@@ -338,7 +343,8 @@ def run_decision(
         after = traffic(TensorDict._new_unsafe(fields, batch_size=size))
         # In a graph the copies cost nothing, so one graph serves both cases.
         all_running = not physics.compiled and known_false((~before.running).any())
-        now = physics.advance(rules, before, Vehicles.of(after.get(keys.MOVED)), all_running)
+        moved = Vehicles.of(after.get(keys.MOVED))
+        now = physics.advance(rules, before, moved, all_running)
         # The memory of ended rows: put aside when they end, or kept by a copy in every step.
         if can_read:
             memory = after.get(keys.TRAFFIC)

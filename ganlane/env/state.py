@@ -87,6 +87,7 @@ def _memory_spec(memory: dict[str, Any], n: int) -> Composite:
     """Composite spec of a traffic module's memory, nested like the modules."""
     specs = {}
     for name, value in memory.items():
+        # A traffic that is made of others has a group of each.
         if isinstance(value, dict):
             specs[name] = _memory_spec(value, n)
         else:
@@ -117,6 +118,7 @@ def pack(
     rest: dict[str, Any],
 ) -> TensorDictBase:
     """The state as one TensorDict [N]; ``rest`` is not nested."""
+    # The first axis of every field is the batch.
     batch = ego["distance"].shape
     device = ego["distance"].device
     nested = {keys.VEHICLES: vehicles.as_dict(), keys.EGO: ego, keys.EVENTS: events}
@@ -135,6 +137,7 @@ def check_counter(name: str, counter: Tensor | None, rows: int) -> Tensor:
     Raises:
         UserError: it is none, or of another shape or type.
     """
+    # float counters would be rounded from 2**24 episodes on.
     if counter is None or counter.shape != (rows,) or counter.dtype != torch.int64:
         what = "missing" if counter is None else f"{list(counter.shape)} in {counter.dtype}"
         wanted = name if name == "next_episode" else "'seed' and 'episode'"
@@ -179,6 +182,7 @@ def checked_action(action: Tensor | None, rows: int, values: bool = True) -> Ten
         raise UserError(
             f"step(): no action; give 'action' [{rows}], int64, from 0 to {keys.ACTIONS - 1}."
         )
+    # Flags and floats would be cast without a word.
     if action.shape != (rows,) or action.is_floating_point() or action.dtype == torch.bool:
         raise _refused(f"of shape {list(action.shape)} in {action.dtype}", rows)
     action = action.long()

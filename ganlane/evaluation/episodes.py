@@ -164,7 +164,11 @@ class _Evaluation:
         self.total = len(numbers)
         # Who holds something per row outside the tensordict, a foreign simulator for instance,
         # loses it when rows move; a policy has to say that it does not.
-        rows_stay = getattr(getattr(env, "traffic", None), "rows_must_stay", False)
+        rows_stay = getattr(
+            getattr(env, "traffic", None),
+            "rows_must_stay",
+            False,
+        )
         may_move = not rows_stay and not getattr(policy, "rows_must_stay", True)
         self.env = env
         self.policy = policy

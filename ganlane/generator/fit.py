@@ -105,6 +105,7 @@ def split_for_fit(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> Split
         UserError: there is only one scene, a held-out name is not among them, or one of the two
             parts is empty.
     """
+    # A held-out scene must be another one than those fitted to.
     names = [scene.name for scene in scenes]
     if len(names) < 2:
         raise UserError(
@@ -132,6 +133,7 @@ def split_for_fit(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> Split
 
 def _validation_names(scenes: list[SceneTracks]) -> set[str]:
     """The smallest of ``scenes`` that together hold a twelfth of the windows; never all of them."""
+    # The smallest scenes cost the fit least.
     sizes = {scene.name: count_windows(scene) for scene in scenes}
     wanted = VALIDATION_SHARE * sum(sizes.values())
     held = 0
@@ -173,6 +175,7 @@ def run_fit(
     name: str = "fit",
 ) -> FitLoop:
     """Fit to ``split`` until it stops improving; the state in ``folder`` is resumed from."""
+    # The key names the fit, so other settings or recordings never resume a foreign state.
     path = None if folder is None else folder / f"{config.preset}_{fit_key(config, split)}.pt"
     if isinstance(config, PaperConfig):
         loop = FitLoop(
@@ -269,6 +272,7 @@ def _held_out(
     stride: int,
 ) -> HeldOut:
     """Forecasts of the held-out windows by the generator, IDM and all baselines."""
+    # The same windows for every forecaster, in the same order.
     windows = cut_windows(split.held_out, stride, OBSERVED_POSITIONS + steps)
     if isinstance(task, CalibratedTask):
         # The best of 20 is for short forecasts only.
@@ -284,6 +288,7 @@ def _held_out(
     else:
         groups = group_windows(windows, task.config.group_size, task.config.seed)
         forecasts = paper_forecasts(task.generator, windows, groups, task.config.seed)
+    # Baselines may learn from all scenes but the held-out ones.
     forecasts |= baseline_forecasts(windows, split.fitted + split.validation, stride)
     forecasts |= idm_forecasts(split.held_out, steps, stride)
     # Half the memory: the windows of all folds are held at the same time.
@@ -349,6 +354,7 @@ def cross_validate(
             on_progress,
             f"fold {number} of {folds}",
         )
+        # A fold's statistics must not know its held-out scenes either.
         others = frame.filter(~pl.col("scene").is_in(split.names["held_out"]))
         results.append(_fit_result(loop, split, frame, source, {}, others))
         short.append(short_forecasts(loop.task, split))

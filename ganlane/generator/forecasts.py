@@ -86,6 +86,7 @@ def scene_metrics(windows: Windows, forecasts: Forecasts) -> Metrics:
         "all": everywhere,
         **windows.by_scene,
     }.items():
+        # Flat names, as metadata and tables want them.
         row = displacement_errors(errors, rows)
         metrics[name] = {"windows": float(row["windows"])}
         for error in ("ade_m", "fde_m"):
@@ -110,6 +111,7 @@ def displacement_errors(errors: Forecasts, rows: np.ndarray | None = None) -> Ro
         errors = {name: values[rows] for name, values in errors.items()}
     ade = {name: float(values.mean()) for name, values in errors.items()}
     fde = {name: float(values[:, -1].mean()) for name, values in errors.items()}
+    # Relative to constant velocity, since recordings differ in how hard they are to predict.
     change = {name: 100.0 * (value / ade[BASELINE] - 1.0) for name, value in ade.items()}
     return {
         "windows": len(errors[BASELINE]),
@@ -140,6 +142,7 @@ def direction_scores(
 
     ``observed`` are lateral moves [W] in m before the present, to be added to both.
     """
+    # Vehicles that hardly move sideways have no side to predict.
     lateral = observed + recorded[:, -1, 1]
     moving = np.abs(lateral) > SIDEWAYS_M
     shares: dict[str, float | None] = {}
@@ -178,6 +181,7 @@ def side_classifier_share(windows: Windows, fold: np.ndarray) -> float | None:
 
     hits = []
     for number in np.unique(fold):
+        # Fitted to the other folds only; both sides must occur there.
         tested = fold == number
         if len(np.unique(left[~tested])) == 2:
             model = HistGradientBoostingClassifier(max_iter=150, max_leaf_nodes=15, random_state=0)
@@ -217,6 +221,7 @@ def open_loop_scores(
 
     direction = direction_scores(forecasts, windows.future)
     direction["share_right"]["side classifier"] = side_classifier_share(windows, fold)
+    # The lateral move over the observed part, m.
     observed = windows.past[..., 1].sum(1)
     return {
         **displacement_errors(errors),
@@ -252,6 +257,7 @@ def by_kind(samples: np.ndarray, recorded: np.ndarray) -> Forecasts:
     """
     kinds = dict(zip(("mean", "single"), samples))
     if len(samples) > SAMPLES:
+        # The best one is chosen per window, by its mean over the steps.
         errors = np.linalg.norm(samples[1:] - recorded, axis=-1).mean(-1)
         kinds[f"best_of_{SAMPLES}"] = samples[1:][errors.argmin(0), np.arange(len(recorded))]
     return kinds

@@ -67,6 +67,7 @@ def motion_features(displacement: Tensor, difference: Tensor) -> Tensor:
     ``displacement`` [..., 2] is in m per 0.1 s, ``difference`` [..., 2] its change to the step
     before, in m.
     """
+    # Typical values become about 1.
     scaled = displacement / displacement.new_tensor(DISPLACEMENT_SCALE_M)
     change = difference / difference.new_tensor(DIFFERENCE_SCALE_M)
     return torch.cat(
@@ -134,6 +135,7 @@ class MotionLSTM(nn.Module):
     def _update(gates: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
         width = cell.shape[-1]
         write, forget, read = torch.sigmoid(gates[..., : 3 * width]).chunk(3, dim=-1)
+        # The LSTM's update: c = i * tanh(g) + f * c, h = o * tanh(c).
         cell = _times_tanh(write, gates[..., 3 * width :]) + forget * cell
         return _times_tanh(read, cell), cell
 
@@ -151,11 +153,13 @@ def nearest(position: Tensor, valid: Tensor, neighbours: int) -> tuple[Tensor | 
     vehicle itself and beyond :data:`RANGE_M`.
     """
     count = position.shape[-2]
+    # [B, G, G, 2], other minus self.
     offset = position[..., None, :, :] - position[..., :, None, :]
     itself = torch.eye(count, dtype=torch.bool, device=position.device)
     real = valid[..., None, :] & ~itself & (offset[..., 0].abs() <= RANGE_M)
     if count - 1 <= neighbours:
         return None, real
+    # Squared distances order vehicles as well as distances do.
     distance = (offset * offset).sum(-1).masked_fill(~real, torch.inf)
     index = distance.topk(neighbours, dim=-1, largest=False).indices
     return index, real.gather(-1, index)
@@ -292,6 +296,7 @@ class Generator(nn.Module):
         hidden = self.encoder.encode(now.projections)
         pooled = self.pooling(hidden, now.position, now.displacement, now.valid)
         inputs = torch.cat([hidden, pooled, now.extra], dim=-1)
+        # The layers are applied by hand, through the fast product.
         first, second = (cast(nn.Linear, self.context[layer]) for layer in (0, 2))
         return apply(second, apply(first, inputs, relu=True))
 
@@ -316,6 +321,7 @@ class Generator(nn.Module):
             ],
             dim=-1,
         )
+        # The decoder's first hidden state is context and noise side by side.
         cell = torch.zeros_like(hidden)
         scale = hidden.new_tensor(DIFFERENCE_SCALE_M)
         displacement = now.displacement

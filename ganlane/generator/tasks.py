@@ -64,6 +64,7 @@ Config = PaperConfig | CalibratedConfig
 
 def distances(predicted: Tensor, recorded: Tensor) -> Tensor:
     """Distances [..., T] in m between two trajectories given as displacements [..., T, 2]."""
+    # Positions are the sums of displacements.
     apart = (predicted - recorded).cumsum(dim=-2)
     return distance(apart, torch.zeros_like(apart))
 
@@ -84,6 +85,7 @@ def discriminator_accuracy(recorded: Tensor, generated: Tensor) -> Tensor:
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     """Mean of ``values`` where ``mask`` (broadcast) is true; 0 if it is nowhere."""
+    # At least one, so that an empty mask gives 0 instead of NaN.
     weight = mask.expand_as(values).to(values.dtype)
     return (values * weight).sum() / weight.sum().clamp_min(1.0)
 
@@ -96,6 +98,7 @@ class _Task(nn.Module):
 
     def __init__(self, config: Config):
         super().__init__()
+        # The networks' first weights come from torch's own generator, all else from ``random``.
         torch.manual_seed(config.seed)
         self.generator = Generator(config.sizes)
         self.optimisers = {"generator": torch.optim.Adam(self.generator.parameters())}
@@ -138,9 +141,11 @@ class PaperTask(_Task):
         """One step of the generator, and of the discriminator if the adversarial term is on."""
         config = self.config
         rows = torch.randint(len(self.groups), (config.batch,), generator=self.random)
+        # Left and right are alike on a motorway, so mirrored groups are as good as recorded ones.
         groups = self.groups.select(rows)
         if config.mirror:
             groups = groups.mirrored(torch.rand(len(groups), generator=self.random) < 0.5)
+        # [n, T, 2]: vehicles of all groups, without padding.
         recorded = groups.displacements[groups.mask]
         generated = self._samples(groups, config.history_noise)
 
@@ -166,6 +171,7 @@ class PaperTask(_Task):
         }
         if config.weights.adversarial > 0:
             terms["adversarial"] = cross_entropy(self.discriminator(generated[0]), 1.0)
+        # The terms' names are those of their weights.
         weighted = [getattr(config.weights, name) * term for name, term in terms.items()]
         self.descend("generator", torch.stack(weighted).sum())
         return losses | {name: float(term.detach()) for name, term in terms.items()}
@@ -218,6 +224,7 @@ class PaperTask(_Task):
         )
         shape = (self.config.samples + 1, len(context), sizes.noise)
         noise = torch.randn(shape, generator=self.random)
+        # The mean driver.
         noise[-1] = 0.0
         outputs = self.generator.decode(context, noise, vehicles, sizes.predicted)
         future = displacements_of(outputs, vehicles.displacement)
@@ -257,6 +264,7 @@ class CalibratedTask(_Task):
         config = self.config
         segments = self._batch()
         drivers = driver_params(segments, config.traits, self.random)
+        # The energy score needs two samples, the mean error one.
         sampled = number % 2 == 1
         samples = 2 if sampled else 1
         steps = 1 + segments.future.shape[1]
@@ -361,6 +369,7 @@ class FitLoop:
 
     def run(self, on_progress: OnProgress | None = None) -> None:
         """Fit, then put the best weights into the task's networks."""
+        # The limit on seconds is per run; the total counts earlier runs, too.
         begun = time.monotonic()
         earlier = self.seconds
         score = None

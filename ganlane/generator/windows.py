@@ -72,6 +72,7 @@ class SceneTracks:
         early = self.positions[np.minimum(first + 1, last), column] - self.positions[first, column]
         late = self.positions[last, column] - self.positions[np.maximum(last - 1, first), column]
         displacement = np.where((frames < first)[..., None], early, late)
+        # Frames since the last, or until the first, recorded one; negative before it.
         beyond = (frames - nearest)[..., None]
         return self.positions[nearest, column] + displacement * beyond
 
@@ -84,6 +85,7 @@ class SceneTracks:
     @property
     def _first_and_last(self) -> tuple[np.ndarray, np.ndarray]:
         """First and last present frame of each vehicle, [V] each."""
+        # argmax is the first true entry; the last one is the first of the reversed frames.
         return self.present.argmax(0), len(self.present) - 1 - self.present[::-1].argmax(0)
 
 
@@ -152,6 +154,7 @@ class Segments:
 
         The model drives those that are present in all of the first 9 frames.
         """
+        # A vehicle that enters later is shown to the others but not scored.
         observed = self.present[:, :OBSERVED_POSITIONS]
         after = self.present[:, OBSERVED_POSITIONS:]
         return observed.all(dim=1, keepdim=True) & after
@@ -181,6 +184,7 @@ class Segments:
     def mirrored(self) -> Segments:
         """The segments with left and right swapped."""
         positions = self.positions.clone()
+        # The leftmost lane becomes lane 0; its centre is then at y = 0.
         last = self.lanes - 1
         positions[..., 1] = (last * self.lane_width)[..., None] - positions[..., 1]
         return replace(
@@ -245,6 +249,7 @@ def cut_segments(cuts: list[tuple[SceneTracks, int]], horizon: int) -> Segments:
         ),
     )
     for number, ((scene, row), who) in enumerate(zip(cuts, members)):
+        # All frames of the segment, and the columns of its vehicles.
         at = slice(row, row + frames), who
         positions = scene.endless_positions[at]
         count = len(who)
@@ -332,6 +337,7 @@ def cut_windows(
     """
     parts = []
     for scene in scenes:
+        # Row-major order: sorted by start, then by vehicle, as the groups need it.
         start, vehicle = np.nonzero(_present_throughout(scene, frames)[::stride])
         start *= stride
         lane = scene.lane[start + PRESENT, vehicle]
@@ -381,6 +387,7 @@ class Groups:
 
     def mirrored(self, flip: Tensor) -> Groups:
         """The same groups, left and right swapped where ``flip`` [B] is true."""
+        # Displacements and positions are relative, so a sign mirrors them.
         sign = torch.ones(len(self), 1, 2)
         sign[..., 1] = torch.where(flip, -1.0, 1.0)[:, None]
         return replace(

@@ -25,6 +25,7 @@ def make_rows(
     Raises:
         UserError: a wrong value.
     """
+    # Checked here, so that both kinds of rows get values that will do.
     config = highways(traffic=traffic, num_envs=count, **keys)
     if not pictures and not len(transforms) and why_not() is None:
         rows = native_rows(config)
@@ -48,6 +49,7 @@ class OnRows:
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
+        # A copy: gymnasium's registry holds the original.
         self._spec = copy.copy(spec)
         if self._spec is not None:
             self._spec.max_episode_steps = self._rows.episode.most_decisions()

@@ -27,15 +27,20 @@ class NativeRows(Rows):
         state = batch.state
         events = [name for name in keys.END_EVENTS if name != "scene_end"]
         self._arrays: dict[str, Any] = {
-            **{name: state[name] for name in (keys.SEED, keys.EPISODE, keys.STEP)},
-            **{name: state[keys.VEHICLES, name][:, keys.EGO_INDEX] for name in ("y", "speed")},
-            **{name: state[keys.EGO, name] for name in (*keys.EGO_FLOATS, *keys.EGO_INTEGERS)},
-            **{name: state[keys.EVENTS, name] for name in (*events, *keys.EVENT_COUNTS)},
             "scene_end": np.zeros(batch.rows, np.bool_),
             "lanes": batch.lanes,
             "lane_width_m": batch.lane_width_m,
             keys.REWARD_TERMS: batch.reward_terms(),
         }
+        for name in (keys.SEED, keys.EPISODE, keys.STEP):
+            self._arrays[name] = state[name]
+        for name in ("y", "speed"):
+            self._arrays[name] = state[keys.VEHICLES, name][:, keys.EGO_INDEX]
+        for name in (*keys.EGO_FLOATS, *keys.EGO_INTEGERS):
+            self._arrays[name] = state[keys.EGO, name]
+        # Events with several beginnings are counted; the ego has a memory of the same names.
+        for name in (*events, *keys.EVENT_COUNTS):
+            self._arrays[name] = state[keys.EVENTS, name]
 
     def __getstate__(self) -> tuple[NativeBatch, EpisodeParameters, bool]:
         """Without the views, which a copy has of its own arrays."""
@@ -83,6 +88,7 @@ def native_rows(config: HighwayConfig) -> NativeRows | None:
     ):
         return None
     episode = env.episode_parameters()
+    # By position, in the order of NativeBatch's arguments.
     batch = NativeBatch(
         config.num_envs,
         env.lanes,

@@ -26,7 +26,8 @@ def _label(rows: TensorRows, row: int) -> EpisodeLabel:
     """The header's text for a row."""
     state = rows.now()
     # Which episode this is, and on what road.
-    seed, episode = (int(state.get(name)[row]) for name in (keys.SEED, keys.EPISODE))
+    seed = int(state.get(keys.SEED)[row])
+    episode = int(state.get(keys.EPISODE)[row])
     road = road_of_row(state, rows.env.base_env.road, row)
     return EpisodeLabel("ego", rows.traffic, seed, episode, *road)
 
@@ -100,7 +101,8 @@ class BatchView:
 
     def __init__(self, rows: TensorRows) -> None:
         self.rows = rows
-        self._returns, self._actions = np.zeros(rows.count), np.full(rows.count, -1)
+        self._returns = np.zeros(rows.count)
+        self._actions = np.full(rows.count, -1)
 
     def start(self, fresh: Flags) -> None:
         """New episodes begin in the rows where ``fresh`` [N] is true."""
@@ -116,11 +118,13 @@ class BatchView:
         return tuple(map(self._picture, range(self.rows.count)))
 
     def _picture(self, row: int) -> Picture:
+        # A film of one frame.
         state = self.rows.now()
         recorder = Recorder(
             row,
             current_action=int(self._actions[row]),
             current_return=float(self._returns[row]),
         )
-        recorder.add(state.get(keys.VEHICLES), float(state.get(keys.STEP)[row]) * PHYSICS_STEP_S)
+        seconds = float(state.get(keys.STEP)[row]) * PHYSICS_STEP_S
+        recorder.add(state.get(keys.VEHICLES), seconds)
         return FramePainter(recorder.trajectory(_label(self.rows, row))).draw(0)

@@ -97,7 +97,8 @@ class Rows(ABC):
         y = state["y"]
         lanes = state["lanes"]
         # The road's own rounding, in the run's float type.
-        lane = np.rint(y / np.asarray(state["lane_width_m"], y.dtype)).astype(np.int64)
+        width = np.asarray(state["lane_width_m"], y.dtype)
+        lane = np.rint(y / width).astype(np.int64)
         info = {name: state[field] for name, field in INFO.items()}
         info["time_s"] = state[keys.STEP] * keys.PHYSICS_STEP_S
         info["lane"] = np.minimum(np.maximum(lane, 0), lanes - 1)
@@ -122,6 +123,7 @@ def row_of(info: Any, row: int) -> Any:
     """One row of :meth:`Rows.info`, or of one of its values, numbers as Python's."""
     if isinstance(info, dict):
         return {name: row_of(value, row) for name, value in info.items()}
+    # Arrays are views of what the next step overwrites.
     return info[row].copy() if info.ndim > 1 else info.item(row)
 
 

@@ -79,6 +79,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         fps = FPS
         if render_mode == "rgb_array":  # a picture per decision
             fps = max(1, round(1.0 / self._rows.episode.decision_period_s))
+        # gymnasium's checker tries every mode that is listed, so a window only where there is one.
         modes = [mode for mode in RENDER_MODES if mode != "human" or has_display()]
         self.metadata = {"render_modes": modes, "render_fps": fps}
         self._view: Any = None

@@ -112,7 +112,9 @@ class TensorRows(Rows):
         tensors["lane_width_m"] = torch.as_tensor(road.lane_width_m).flatten()
         arrays: dict[str, Any] = {name: _array(value) for name, value in tensors.items()}
         terms = state.get(keys.REWARD_TERMS)
-        arrays[keys.REWARD_TERMS] = {name: _array(term[:, 0]) for name, term in terms.items()}
+        arrays[keys.REWARD_TERMS] = {}
+        for name, term in terms.items():
+            arrays[keys.REWARD_TERMS][name] = _array(term[:, 0])
         return arrays
 
 

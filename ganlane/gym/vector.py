@@ -162,7 +162,9 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
             raise UserError(
                 f"reset(): expected one seed and one episode, or {self.num_envs} of each."
             )
-        self._rows.start(seeds if np.size(seeds) > 1 else np.ravel(seeds)[0], first)
+        if np.size(seeds) == 1:
+            seeds = np.ravel(seeds)[0]
+        self._rows.start(seeds, first)
 
     def step(self, actions: Any) -> tuple[Floats, npt.NDArray[Any], Flags, Flags, dict[str, Any]]:
         """One decision in every row: observations [N, D], rewards and ends [N], info."""
@@ -173,6 +175,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
                 f"step(): the episodes of rows {np.flatnonzero(waiting).tolist()} are over; call "
                 "reset(options={'reset_mask': mask}) first, or choose another autoreset_mode."
             )
+        # The arrays of the rows are overwritten by their next call; what callers get are copies.
         stepped = self._rows.step(actions_of(actions, self.num_envs))
         reward = stepped.reward.astype(np.float64)
         terminated = stepped.terminated.copy()

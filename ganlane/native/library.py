@@ -287,7 +287,9 @@ def threads_allowed() -> int:
     if torch is not None:
         return int(torch.get_num_threads())
     named = os.environ.get("OMP_NUM_THREADS", "")
-    return int(named) if named.isdigit() and int(named) > 0 else os.cpu_count() or 1
+    if named.isdigit() and int(named) > 0:
+        return int(named)
+    return os.cpu_count() or 1
 
 
 def in_threads(rows: int, call: Callable[[int, int], int]) -> None:

@@ -31,7 +31,8 @@ from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road, Vehicles
 
 _TYPES = settings.VEHICLE_ARRAYS | settings.EGO_ARRAYS | settings.EVENT_ARRAYS
-_DTYPES = {key: getattr(torch, name) for key, name in _TYPES.items()} | {keys.STEP: torch.int64}
+_DTYPES = {key: getattr(torch, name) for key, name in _TYPES.items()}
+_DTYPES[keys.STEP] = torch.int64
 #: Fields of ``vehicles`` that no decision changes.
 _LASTING = [
     key for key in settings.INPUTS if key[0] == keys.VEHICLES and key not in settings.OUTPUTS
@@ -167,8 +168,10 @@ class Kernel(_Function):
         rows = action.shape[0]
         before: dict[Key, Tensor] = {}
         for name in settings.INPUTS:
-            # by group: to look up a nested key takes three times as long
-            number = state.get(name) if isinstance(name, str) else state.get(name[0]).get(name[1])
+            # Group by group: to look up a nested key takes three times as long.
+            number = state
+            for part in (name,) if isinstance(name, str) else name:
+                number = number.get(part)
             if number.dtype is not _DTYPES[name] or number.shape[0] != rows:
                 raise TypeError(
                     f"the kernel takes {rows} rows of {_DTYPES[name]} as {name}, "
@@ -178,6 +181,7 @@ class Kernel(_Function):
         # New tensors: the state before the decision belongs to the caller.
         after = _room(settings.OUTPUTS, rows, self.vehicles, torch.empty)
         self._run(rows, [action, *before.values(), recycles], list(after.values()))
+        # What no decision changes is shared with the state before, not copied.
         after |= {name: before[name] for name in _LASTING}
         after |= {name: state.get(name) for name in (keys.SEED, keys.EPISODE)}
         return _state(after)
@@ -217,6 +221,7 @@ class NativeScenes(_Function):
         names = (*settings.OUTPUTS, *settings.SCENE)
         state = _room(names, len(seed), self.vehicles, torch.zeros)
         scene = [state[name] for name in settings.SCENE]
+        # Drawn with the scene, but the environment draws it at every decision.
         recycles = torch.zeros_like(rows)
         outputs = [state[name] for name in settings.OUTPUTS]
         self._run(len(seed), [seed, episode, rows, *scene, recycles], outputs)
@@ -257,6 +262,7 @@ class LaneView(_Function):
             seen.speed,
             seen.valid,
         ]
+        # In the order of observation.cpp: the ego as it is, the others as they are seen.
         out = torch.empty((len(v.x), self.size), dtype=torch.float32)
         self._run(len(out), [*inputs, progress, direction], [out])
         return out

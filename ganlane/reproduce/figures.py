@@ -124,7 +124,10 @@ def forecasts_to_draw() -> pl.DataFrame:
             seed,
             samples=1,
         )
-        later |= {"mean": drawn["mean"], f"sample {seed + 1}": drawn["single"]}
+        later |= {
+            "mean": drawn["mean"],
+            f"sample {seed + 1}": drawn["single"],
+        }
     now = np.zeros((1, 2))
     parts = []
     for panel, (kind, row) in enumerate(interesting(windows)):
@@ -161,8 +164,14 @@ def draw_forecasts(paths: pl.DataFrame) -> Figure:
     # What is drawn last lies above.
     styles: dict[str, dict[str, Any]] = {}
     for number in range(SAMPLES):
-        styles[f"sample {number + 1}"] = {"color": colours["predicted"], "lw": 0.8}
-    styles["mean"] = {"color": colours["predicted, z = 0"], "lw": 1.6}
+        styles[f"sample {number + 1}"] = {
+            "color": colours["predicted"],
+            "lw": 0.8,
+        }
+    styles["mean"] = {
+        "color": colours["predicted, z = 0"],
+        "lw": 1.6,
+    }
     for name in ("observed", "recorded"):
         styles[name] = {
             "color": colours[name],
@@ -179,7 +188,11 @@ def draw_forecasts(paths: pl.DataFrame) -> Figure:
         )
         for name, style in styles.items():
             path = panel.filter(pl.col("path") == name)
-            axes.plot(path["ahead_m"], path["left_m"], **style)
+            axes.plot(
+                path["ahead_m"],
+                path["left_m"],
+                **style,
+            )
         low, high = axes.get_ylim()
         # At least 1.6 m of height, so that steady driving does not look like a lane change.
         middle = (low + high) / 2.0
@@ -296,7 +309,10 @@ def draw_episode(label: EpisodeLabel, tracks: pl.DataFrame) -> Figure:
         if line in (0, label.lanes):
             style = {"color": INK, "ls": "-"}
         axes.axhline((line - 0.5) * lane_m, **style)
-    colours = {"ego": COLOURS[1], "others": COLOURS[0]}
+    colours = {
+        "ego": COLOURS[1],
+        "others": COLOURS[0],
+    }
     # From the first to the last, at equal times.
     frames = np.linspace(0, len(times) - 1, FRAMES).round().astype(int)
     for track in tracks.partition_by("vehicle", maintain_order=True):

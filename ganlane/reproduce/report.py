@@ -433,7 +433,10 @@ def _beside(
         {**names, **columns},
         names=3,
     )
-    return replace(here, lines=[*paper, *here.lines])
+    return replace(
+        here,
+        lines=[*paper, *here.lines],
+    )
 
 
 def comparison_table(rows: Sequence[Row]) -> Table:

@@ -62,7 +62,8 @@ def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     if reads_are_cheap(dx):
         # Boxes overlap only within the sum of their half diagonals, each at most half of length
         # plus width.
-        row, column = (dx.abs() < v.length.amax() + v.width.amax()).nonzero().unbind(1)
+        reach = v.length.amax() + v.width.amax()
+        row, column = (dx.abs() < reach).nonzero().unbind(1)
         if len(row) == 0:
             return torch.zeros_like(both)
         if dx.numel() >= FEW:
@@ -71,15 +72,20 @@ def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
             # Only the near pairs are tested; all others are apart.
             hits = _hits(dx[row, column], ego, near)
             return torch.zeros_like(both).index_put((row, column), hits) & both
-    return _hits(dx, v.columns(slice(0, 1)), v.columns(slice(1, None))) & both
+    ego = v.columns(slice(0, 1))
+    others = v.columns(slice(1, None))
+    return _hits(dx, ego, others) & both
 
 
 def pair_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     """Whether vehicles i and j overlap, bool [N, M, M], false on the diagonal."""
     # [N, M, 1] against [N, 1, M]: every vehicle with every other.
-    one, other = (Vehicles(*(field.unsqueeze(axis) for field in vehicles)) for axis in (2, 1))
-    hit = _hits(road.distance_ahead(one.x, other.x), one, other) & other.valid & one.valid
-    return hit & ~torch.eye(vehicles.x.shape[1], dtype=torch.bool, device=vehicles.x.device)
+    one = Vehicles(*(field.unsqueeze(2) for field in vehicles))
+    other = Vehicles(*(field.unsqueeze(1) for field in vehicles))
+    hit = _hits(road.distance_ahead(one.x, other.x), one, other)
+    hit = hit & other.valid & one.valid
+    itself = torch.eye(vehicles.x.shape[1], dtype=torch.bool, device=vehicles.x.device)
+    return hit & ~itself
 
 
 def _hits(dx: Tensor, one: Vehicles, other: Vehicles) -> Tensor:

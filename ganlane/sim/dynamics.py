@@ -246,5 +246,6 @@ def change_progress(ego: Vehicles, direction: Tensor, road: Road) -> Tensor:
     if isinstance(width, Tensor):
         width = width[:, 0]
     # In lane widths: 1 at the start of a change by one lane, 0 at its end.
-    remaining = (ego.y - ego.target_lane.to(ego.y.dtype) * width).abs() / width
+    target_y = ego.target_lane.to(ego.y.dtype) * width
+    remaining = (ego.y - target_y).abs() / width
     return torch.where(direction != 0, (1.0 - remaining).clamp(0.0, 1.0), 0.0)

@@ -98,7 +98,9 @@ def safe_change(
 
 def without_ego(wish: Tensor) -> Tensor:
     """``wish`` [N, M] with the ego's column zeroed: others do not know its intention."""
-    return torch.cat((torch.zeros_like(wish[:, : EGO_INDEX + 1]), wish[:, EGO_INDEX + 1 :]), dim=1)
+    others = wish[:, EGO_INDEX + 1 :]
+    ego = torch.zeros_like(wish[:, : EGO_INDEX + 1])
+    return torch.cat((ego, others), dim=1)
 
 
 def one_at_a_time(
@@ -121,7 +123,8 @@ def one_at_a_time(
         return wish
     # Only their rows, and as many columns as hold all of them.
     rivals, most = rivals[rows], int(rivals.sum(1).max())
-    columns = rivals.to(torch.uint8).sort(dim=1, descending=True, stable=True).indices[:, :most]
+    rivals_first = rivals.to(torch.uint8).sort(dim=1, descending=True, stable=True)
+    columns = rivals_first.indices[:, :most]
     few = Vehicles(*(field[rows].gather(1, columns) for field in vehicles))
     some = idm.of(rows, columns) if isinstance(idm, DriverIdm) else idm
     wishes = wish[rows]
@@ -139,7 +142,8 @@ def _gives_way(
     wants = wish != 0
     target = vehicles.target_lane + wish
     # [N, i, j]: i and j want the same lane, and j is ahead.
-    same = wants[:, None, :] & wants[:, :, None] & (target[:, None, :] == target[:, :, None])
+    both = wants[:, None, :] & wants[:, :, None]
+    same = both & (target[:, None, :] == target[:, :, None])
     speed = vehicles.speed[:, :, None]
     desired = vehicles.desired_speed[:, :, None]
     leader_speed = vehicles.speed[:, None, :]
@@ -171,7 +175,9 @@ def mobil_wishes(
     there = accelerations.of(slice(1, None))
     incentive, safe = mobil_criterion(there, here, mobil)
     # The road may have no such lane.
-    exists = torch.stack((lane + 1.0 <= road.lanes - 1, lane - 1.0 >= 0), dim=-1)
+    to_the_left = lane + 1.0 <= road.lanes - 1
+    to_the_right = lane - 1.0 >= 0
+    exists = torch.stack((to_the_left, to_the_right), dim=-1)
     pays = exists & safe & (incentive > mobil.threshold)
     left, right = torch.where(pays, incentive, -torch.inf).unbind(-1)
     # A driver decides anew only when its last change is complete.

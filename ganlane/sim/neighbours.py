@@ -191,7 +191,8 @@ def leader(scene: Scene, lane: Tensor) -> Neighbour:
         ends = _candidates(scene, lanes, 1)
         rear = ends.amin(-1)
         # Of level vehicles the lowest speed, so that their order does not matter.
-        its_speed = _beyond(speed[:, None, None, :], ends > rear[..., None]).amin(-1)
+        farther = ends > rear[..., None]
+        its_speed = _beyond(speed[:, None, None, :], farther).amin(-1)
     else:
         key = _nearest_key(scene, scene.queue, lanes, 1, _ordered(speed) - _INT32_MIN)
         rear = _unordered(key >> 32)
@@ -239,7 +240,8 @@ def _candidates(scene: Scene, lanes: Tensor, side: int) -> Tensor:
     elsewhere = pairs.order <= 0 if side > 0 else pairs.order >= 0
     # In two steps: leader and follower in several lanes then share the first, [N, K, M], which a
     # compiler keeps. In one step compiled idm_mobil took twice as long.
-    return _beyond(_beyond(end, elsewhere)[:, :, None, :], ~in_lane(scene, lanes))
+    ends = _beyond(end, elsewhere)[:, :, None, :]
+    return _beyond(ends, ~in_lane(scene, lanes))
 
 
 def _gap(scene: Scene, end: Tensor, side: int) -> Tensor:
@@ -279,13 +281,15 @@ def _nearest_key(
         turn = turn.flip(1)
         place = count - 1 - place
     # Everybody's near end, in the order of the road.
-    key = ((_ordered(side * v.x - 0.5 * v.length) << 32) | second).gather(1, turn)
+    end = _ordered(side * v.x - 0.5 * v.length)
+    key = ((end << 32) | second).gather(1, turn)
     low, high = (end.gather(1, turn) for end in scene.presence)
     number = torch.arange(lanes, device=v.x.device)[:, None, None]
     # [lanes, N, M]: everybody's key in the lanes that it is seen in.
     key = torch.where((low <= number) & (number <= high), key, _NOBODY)
     # Entry k of a lane: the nearest among the first k in the queue; among none it is nobody.
-    nearest = pad(key[..., :-1], (1, 0), value=_NOBODY).cummin(-1).values.transpose(0, 1).flatten(1)
+    before = pad(key[..., :-1], (1, 0), value=_NOBODY)
+    nearest = before.cummin(-1).values.transpose(0, 1).flatten(1)
     # Place of the observer's entry: lane by lane, as many entries as vehicles.
     entry = lane.clamp(0, lanes - 1).long() * count + place[..., None]
     neighbour = nearest.gather(1, entry.flatten(1)).view(lane.shape)

@@ -157,7 +157,8 @@ def stop_and_go(
     spacings = [0.0, steady]
     for _ in range(waves):
         speeds += [0.0] * per_wave + [speed_mps] * per_wave
-        spacings += [steady] + [queue] * (per_wave - 1) + [approach] + [steady] * (per_wave - 1)
+        spacings += [steady] + [queue] * (per_wave - 1)
+        spacings += [approach] + [steady] * (per_wave - 1)
     # From the head of the column backwards.
     column = [(-x, speed) for x, speed in zip(accumulate(spacings), speeds, strict=True)]
     # The last but one: somebody behind it can run into it.

@@ -54,6 +54,7 @@ def read_scene(
     # Endings are checked before anything is read.
     if path.suffix.lower() not in (".csv", ".json"):
         raise UserError(f"{path}: expected a scene as .csv or .json; rename or convert the file.")
+    # A film given by mistake is not read into memory.
     if path.stat().st_size > _MOST_BYTES:
         raise UserError(
             f"{path}: more than {_MOST_BYTES} bytes, which no scene has; give a smaller file."
@@ -105,6 +106,7 @@ def _lanes_in(rows: list[SceneVehicle], lane_width_m: float) -> int:
 
 def _read_csv(path: Path, text: str) -> list[SceneVehicle]:
     lines = []
+    # Numbers of lines count comments and empty lines too, as an editor does.
     for number, line in enumerate(text.split("\n"), 1):
         if line.strip() and not line.lstrip().startswith("#"):
             lines.append((f"{path}: line {number}", f"line {number}", line))
@@ -167,6 +169,7 @@ def _read_json(path: Path, text: str) -> tuple[list[SceneVehicle], dict[str, Any
         _check_names(list(vehicle), where)
         values = {name: value for name, value in vehicle.items() if value is not None}
         rows.append(_row(values, where, f"entry {number}"))
+    # What is left are keys of the road.
     for name in sorted(content):
         if name not in ROAD:
             raise UserError(
@@ -210,6 +213,7 @@ def _value(name: str, value: Any, where: str) -> Any:
         if not isinstance(value, str) or value not in kinds:
             raise UserError(f"{where}: {_quoted(value)}: expected one of {', '.join(kinds)}.")
         return kinds[value]
+    # CSV has texts, JSON numbers: both go through float.
     whole = name in WHOLE_NUMBERS
     try:
         if isinstance(value, bool):  # JSON's true, which Python takes for a 1

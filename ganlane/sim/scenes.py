@@ -159,7 +159,8 @@ class FixedScene:
         """The scene once per key [N], varied by the jitter."""
         n = key.shape[0]
         m = self.vehicles
-        whole = Vehicles(*(value.expand(n, m).clone() for value in self.base(dtype, key.device)))
+        base = self.base(dtype, key.device)
+        whole = Vehicles(*(value.expand(n, m).clone() for value in base))
         if self.jitter_m == 0 and self.jitter_mps == 0:
             return whole
         u = (
@@ -176,7 +177,9 @@ class FixedScene:
         is_ego = torch.arange(m, device=key.device) == 0
         x = torch.where(is_ego, whole.x, whole.x + self.jitter_m * u[..., 0])
         varied = (whole.speed + self.jitter_mps * u[..., 1]).clamp_min(0.0)
-        return whole.with_(x=x, speed=torch.where(whole.speed > 0, varied, whole.speed))
+        # Who stands remains standing.
+        speed = torch.where(whole.speed > 0, varied, whole.speed)
+        return whole.with_(x=x, speed=speed)
 
     def base(
         self, dtype: torch.dtype = torch.float64, device: torch.device | None = None
@@ -195,6 +198,7 @@ class FixedScene:
         for row, kind in zip(rows, usual):
             targets.append(row.lane_on(road) if row.target_lane is None else row.target_lane)
             seen.append(kind if row.visibility is None else row.visibility)
+        # Vehicles of a scene start straight, at a constant speed.
         zero = column([0.0] * len(rows))
         return Vehicles(
             x=column([row.x_m - rows[0].x_m for row in rows]),
@@ -240,6 +244,7 @@ def check_rows(scene: FixedScene) -> None:
         raise UserError(
             f"{scene.name}: a scene set by hand needs one road for all episodes, not one per row."
         )
+    # Written so that NaN is refused: every comparison with it is false.
     if not (1 <= scene.road.lanes <= MOST_LANES and SMALLEST <= scene.road.lane_width_m <= LARGEST):
         raise UserError(
             f"{scene.name}: a road of {scene.road.lanes:g} lanes of {scene.road.lane_width_m:g} m; "
@@ -282,6 +287,7 @@ def _fault(row: SceneVehicle, road: Road) -> str:
             f"y={y:g} m, width {row.width_m:g} m: expected on the road, which runs from "
             f"{right:g} to {left:g} m"
         )
+    # A lane that contradicts the position would be a lane change nobody asked for.
     here = row.lane_on(road)
     if row.lane is not None and row.lane != here:
         return (
@@ -301,6 +307,7 @@ def check_overlaps(scene: FixedScene) -> None:
     longer[:, 0] = 0.0
     longest = vehicles.with_(length=vehicles.length + longer)
     hits = pair_overlaps(longest, scene.road)[0].nonzero().tolist()
+    # The first pair is named; users mend one after the other.
     if hits:
         one, other = hits[0]
         worst = f" (with jitter_m={scene.jitter_m:g} at its worst)" if scene.jitter_m else ""
@@ -327,6 +334,7 @@ def check_braking(scene: FixedScene, idm: IdmParameters) -> None:
     gap = seen.pairs.ahead - torch.minimum(slack[:, None], slack[None, :])
     fastest = vehicles.speed + varied
     slowest = (vehicles.speed - varied).clamp_min(0.0)
+    # The fastest follower behind the slowest leader at the smallest gap.
     needed = needed_deceleration(fastest[:, :, None], slowest[:, None, :], gap)
     needed = torch.where(ahead, needed, 0.0)[0]
     if bool((needed > -idm.min_acceleration).any()):
@@ -364,6 +372,7 @@ def _first_overlap(scene: FixedScene, idm: IdmParameters) -> tuple[int, int, flo
     steering = torch.zeros_like(v.x)
     centre = scene.road.centre_of(v.target_lane, v.y.dtype)
     for step in range(1, round(DRIVE_S / PHYSICS_STEP_S) + 1):
+        # Everybody follows and steers to its target lane; nobody decides anything.
         acceleration = following_acceleration(perceive(v, scene.road), idm)
         steering = steer(steering, v.y, v.heading, v.speed, centre, PHYSICS_STEP_S)
         pose = advance(

@@ -73,7 +73,8 @@ def _rank(value: Tensor, same: Tensor | None = None) -> Tensor:
     # By counting, not by sorting: a few vehicles, and a fixed order for equal values.
     mine = value[:, :, None]
     other = value[:, None, :]
-    before = (other < mine) | ((other == mine) & (index[None, :] < index[:, None]))
+    lower_index = index[None, :] < index[:, None]
+    before = (other < mine) | ((other == mine) & lower_index)
     return (before if same is None else before & same).sum(-1)
 
 
@@ -106,7 +107,8 @@ def ego_first(x: Tensor, lane: Tensor) -> tuple[Tensor, Tensor]:
     """
     # The vehicle in the middle becomes the ego, with as many ahead as behind.
     rank = _rank(x)
-    order = torch.where(rank == (x.shape[1] - 1) // 2, -1, rank).argsort(dim=1)
+    middle = (x.shape[1] - 1) // 2
+    order = torch.where(rank == middle, -1, rank).argsort(dim=1)
     x = x.gather(1, order)
     lane = lane.gather(1, order)
     return x - x[:, :1], lane
@@ -136,9 +138,13 @@ def spawn(
     ]
     u = uniform(key, 0, vehicles, [int(purpose) for purpose in drawn], dtype)
     lane = draw_lanes(key, vehicles, lanes, p.lane_capacity())
-    x, lane = ego_first(place_in_lanes(lane, u[..., 0], p.spread_m, p.spacing_m), lane)
+    x = place_in_lanes(lane, u[..., 0], p.spread_m, p.spacing_m)
+    x, lane = ego_first(x, lane)
     is_ego = torch.arange(vehicles, device=key.device) == 0
-    speed = torch.where(x > 0, between(1, p.front_speed_mps), between(1, p.rear_speed_mps))
+    # In Table II who is ahead of the ego is slower than who is behind it.
+    ahead = between(1, p.front_speed_mps)
+    behind = between(1, p.rear_speed_mps)
+    speed = torch.where(x > 0, ahead, behind)
     speed = torch.where(is_ego, between(1, p.ego_speed_mps), speed)
     is_truck = (u[..., 3] < p.truck_share) & ~is_ego
     desired = torch.where(is_ego, p.ego_desired_speed_mps, between(2, p.desired_speed_mps))
@@ -241,7 +247,9 @@ def _room(there: Scene, idm: IdmParameters, safe: float) -> Tensor:
     sides = 0.5 * one.width[..., None] + 0.5 * other.width[:, None, :] + SIDE_M
     shares |= (one.y[..., None] - other.y[:, None, :]).abs() < sides
     pairs = there.pairs
-    itself = torch.eye(one.x.shape[1], dtype=torch.bool, device=one.x.device).repeat(1, 2)
+    # Nobody is in its own way, at neither of its positions.
+    itself = torch.eye(one.x.shape[1], dtype=torch.bool, device=one.x.device)
+    itself = itself.repeat(1, 2)
     counts = shares & other.valid[:, None, :] & ~itself
     # Braking of the moved one behind the other, and of the other behind the moved one.
     speed = one.speed[..., None]
@@ -274,5 +282,6 @@ def recycle(
     across = vehicles.x - 2.0 * range_m * torch.sign(distance)
     moved = vehicles.with_(x=torch.where(away, across, vehicles.x))
     both = Vehicles(*(torch.cat(pair, dim=1) for pair in zip(moved, vehicles)))
-    room = _room(perceive(both, road, slice(0, vehicles.x.shape[1])), idm, safe_deceleration)
+    there = perceive(both, road, slice(0, vehicles.x.shape[1]))
+    room = _room(there, idm, safe_deceleration)
     return vehicles.with_(x=torch.where(away & room, moved.x, vehicles.x))

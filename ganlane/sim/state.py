@@ -70,7 +70,9 @@ class Vehicles(NamedTuple):
 
     def columns(self, which: slice) -> Vehicles:
         """A slice of the vehicles of every row, fields [N, K]."""
-        return self if which == slice(None) else Vehicles(*(field[:, which] for field in self))
+        if which == slice(None):
+            return self
+        return Vehicles(*(field[:, which] for field in self))
 
     def with_first(self, first: Vehicles) -> Vehicles:
         """The same rows with vehicle 0 replaced by ``first`` (fields [N])."""
@@ -110,7 +112,8 @@ class Road:
     def clamp_lane(self, lane: Tensor) -> Tensor:
         """``lane`` limited to the road."""
         if isinstance(self.lanes, Tensor):
-            return torch.minimum(lane.clamp_min(0), (self.lanes - 1).to(lane.dtype))
+            leftmost = (self.lanes - 1).to(lane.dtype)
+            return torch.minimum(lane.clamp_min(0), leftmost)
         return lane.clamp(0, self.lanes - 1)
 
     def lane_of(self, y: Tensor) -> Tensor:
@@ -161,7 +164,9 @@ class LaneRange(NamedTuple):
 
     def columns(self, which: slice) -> LaneRange:
         """The ranges of a slice of the vehicles."""
-        return self if which == slice(None) else LaneRange(self.low[:, which], self.high[:, which])
+        if which == slice(None):
+            return self
+        return LaneRange(self.low[:, which], self.high[:, which])
 
 
 def spanned(lanes: LaneRange) -> Tensor:
@@ -176,7 +181,8 @@ def spanned(lanes: LaneRange) -> Tensor:
         most = int((lanes.high - lanes.low).amax())
         if most < 2:
             return torch.stack(lanes[: most + 1], dim=-1)
-    return torch.stack((lanes.low, torch.minimum(lanes.low + 1, lanes.high), lanes.high), dim=-1)
+    middle = torch.minimum(lanes.low + 1, lanes.high)
+    return torch.stack((lanes.low, middle, lanes.high), dim=-1)
 
 
 def lateral_half_extent(vehicles: Vehicles) -> Tensor:

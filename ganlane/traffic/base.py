@@ -223,6 +223,7 @@ class TrafficModule(TensorDictModuleBase):
         """Write ``moved`` and ``traffic``."""
         vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
         memory = dict(memory_of(tensordict).items())
+        # Plain fields from here on, so that a model needs to know nothing of TensorDicts.
         moved, memory = self._call(
             tensordict,
             vehicles,
@@ -311,6 +312,7 @@ class TrafficParts(TrafficModule):
     """
 
     def __init__(self, parts: Mapping[str, TrafficModule]) -> None:
+        # All parts drive on one road with one family of random numbers.
         first = next(iter(parts.values()))
         super().__init__(first.road, first.stream)
         self.parts = nn.ModuleDict(parts)
@@ -359,6 +361,7 @@ class TrafficSequential(TrafficParts):
         memories = memory_of(tensordict)
         new_memories = {}
         for name, part in self.named_parts():
+            # Each part sees its own memory, and what the parts before it made of ``moved``.
             tensordict.set(keys.TRAFFIC, memory_of(memories, name))
             part(tensordict)
             new_memories[name] = tensordict.get(keys.TRAFFIC)

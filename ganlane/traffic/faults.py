@@ -66,7 +66,9 @@ def driven_at(
     speed = (vehicles.speed + acceleration * dt).clamp_min(0.0)
     usual = 0.5 * (vehicles.speed + moved.speed) * dt
     distance = 0.5 * (vehicles.speed + speed) * dt
+    # How much of the usual step is driven.
     share = distance / usual.clamp_min(_SHORTEST_M)
+    # A standing vehicle that moves off has no path to follow yet, and its share means nothing.
     path = usual > _SHORTEST_M
     dx = torch.where(
         path,
@@ -125,8 +127,10 @@ class TimedFault(Fault[Timed]):
 
         A fault begins where there is none, at a constant hazard.
         """
+        # Poisson process: the chance of at least one fault within a step.
         per_step = -math.expm1(-self.faults.per_hour * self.dt / 3600.0)
         comes = self.draw(vehicles, key, step) < per_step
+        # A fault that lasts is not prolonged by a second one.
         begins = (left == 0) & other_drivers(vehicles) & comes
         return torch.where(begins, round(self.faults.lasts_s / self.dt), left)
 
@@ -237,6 +241,7 @@ class HesitantLaneChange(Fault[HesitationFaults]):
         """Reduce the lateral motion of hesitant changes."""
         begins = starting(vehicles, moved)
         u = self.draw(vehicles, key, step)
+        # Decided once, when the change begins.
         hesitant = torch.where(begins, u < self.faults.share, memory["hesitant"])
         slowed = vehicles.y + self.faults.pace * (moved.y - vehicles.y)
         moved = moved.with_(y=torch.where(hesitant, slowed, moved.y))
@@ -269,10 +274,12 @@ class AbortedLaneChange(Fault[AbortFaults]):
         """Set the old lane as the target where the change has come far enough."""
         begins = starting(vehicles, moved)
         u = self.draw(vehicles, key, step)
+        # Where a change will be aborted, the lane to return to.
         chosen = torch.where(u < self.faults.share, vehicles.target_lane, _NO_LANE)
         origin = torch.where(begins, chosen, memory["origin"])
         start = self.road.centre_of(origin, moved.y.dtype)
         end = self.road.centre_of(moved.target_lane, moved.y.dtype)
+        # The share ``at`` of the way between the two centres is done.
         far_enough = (moved.y - start).abs() >= self.faults.at * (end - start).abs()
         turns = (origin != _NO_LANE) & far_enough
         moved = moved.with_(target_lane=torch.where(turns, origin, moved.target_lane))

@@ -173,6 +173,7 @@ class IdmMobilTraffic(IdmTraffic):
     def decide(self, vehicles: Vehicles, memory: Memory, due: Tensor) -> Moved:
         """A step in which the drivers of the rows ``due`` [N] decide."""
         scene = perceive(vehicles, self.road)
+        # Rows that are not at a full second keep their target lanes.
         change = torch.where(due[:, None], self.changes(scene, memory), 0)
         return self.drive(scene, vehicles.target_lane + change, memory)
 
@@ -244,12 +245,15 @@ def start_braking(
     scene = perceive(vehicles, road)
     pairs = scene.pairs
     shares = in_lane(scene, scene.attention.low) | in_lane(scene, scene.attention.high)
+    # Everybody ahead counts, not only the leader, who may not brake in time itself.
     ahead = shares & (pairs.order > 0)
+    # Rank of each vehicle ahead: so many bodies and gaps have to fit between.
     distance = torch.where(ahead, pairs.distance, torch.inf)
     between = distance.argsort(-1).argsort(-1).to(vehicles.x.dtype)
     space = vehicles.length.amax(-1)[:, None, None] + min_gap_m
     speed = vehicles.speed[:, :, None]
     leader_speed = vehicles.speed[:, None, :]
+    # What is left of the gap once the driver reacts.
     closing = (speed - leader_speed).clamp_min(0.0)
     gap = pairs.ahead - between * space - closing * reaction_s[..., None]
     needed = needed_deceleration(speed, leader_speed, gap.clamp_min(1.0))
@@ -309,9 +313,11 @@ class IdmRandomTraffic(IdmMobilTraffic):
         """The drivers at the start of the episodes with ``key`` [N]."""
         d = self.drivers
         u = self._drawn(vehicles, key)
+        # The scene may ask more of a driver than its range has: it then brakes as hard as that.
         reaction_s = in_range(u[5], d.reaction_s)
         required = start_braking(vehicles, self.road, reaction_s, self.idm.min_gap_m)
         least_braking = _START_MARGIN * required
+        # Even at its largest sway a body stays within its lane.
         room = 0.5 * (self.road.lane_width_m - vehicles.width) - _LANE_MARGIN_M
         return DriverParams(
             headway=in_range(u[0], d.headway_s),
@@ -332,6 +338,7 @@ class IdmRandomTraffic(IdmMobilTraffic):
     ) -> tuple[Vehicles, TensorDictBase]:
         """Gives every driver but the ego its own desired speed."""
         u = self._drawn(vehicles, absorb(key, 0))[_DESIRED_SPEED]
+        # The ego's is the environment's.
         factor = in_range(u, self.drivers.desired_speed)
         others = torch.arange(vehicles.x.shape[1], device=key.device) != EGO_INDEX
         desired = torch.where(
@@ -363,6 +370,7 @@ class IdmRandomTraffic(IdmMobilTraffic):
         """As :class:`IdmMobilTraffic`, with each driver's parameters."""
         m = self.mobil
         drivers = DriverParams.of(memory)
+        # [N, M, 1]: one weight for both sides that a driver looks at.
         politeness = drivers.politeness[..., None]
         rear = politeness * m.politeness_rear
         side = politeness * m.politeness_side
@@ -373,6 +381,7 @@ class IdmRandomTraffic(IdmMobilTraffic):
             m.safe_deceleration,
             m.exclusive_m,
         )
+        # Predictions are not limited by what this driver would brake itself.
         braking = torch.full_like(drivers.headway, -self.idm.min_acceleration)
         return mobil_changes(
             scene,

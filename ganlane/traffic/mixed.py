@@ -38,6 +38,7 @@ def interleaved(shares: Mapping[str, int]) -> list[str]:
     for _ in range(sum(shares.values())):
         for name, share in shares.items():
             credit[name] += share
+        # The first of several, so the order of the shares decides.
         chosen = max(credit, key=lambda name: credit[name])
         credit[chosen] -= sum(shares.values())
         turns.append(chosen)
@@ -86,9 +87,11 @@ class MixedTraffic(TrafficParts):
                     "traffic.shares: the parts have different roads or streams; build all with the "
                     "same."
                 )
+        # One visibility for all, or each episode has that of its part (:meth:`enter`).
         visibilities = {int(part.visibility) for part in parts.values()}
         self.visibility = visibilities.pop() if len(visibilities) == 1 else VISIBILITY_OF_EPISODE
         names = list(parts)
+        # Not saved: it follows from the shares.
         turns = torch.tensor([names.index(name) for name in interleaved(shares)])
         self.register_buffer("turns", turns, persistent=False)
         self.compiled = False
@@ -130,10 +133,13 @@ class MixedTraffic(TrafficParts):
         }
         for name, part, rows, padded in self.rows_of_parts(inputs[keys.EPISODE]):
             memory = memory_of(memories, name)
+            # A generator's memory is large, and most of it is only renamed in a step: what a part
+            # returns as it was given keeps its tensor of the whole batch.
             origins: dict[Tensor, Tensor] = {}
             taken = _take({**inputs, keys.TRAFFIC: memory}, padded, origins)
             before = taken.get(keys.VEHICLES)
             output = part(taken)
+            # Vehicles are compared by name, since other parts have written into the others' rows.
             changed = {}
             for field, value in output.get(keys.MOVED).items():
                 if value is not before.get(field):
@@ -155,6 +161,7 @@ class MixedTraffic(TrafficParts):
         together = new_tensordict(vehicles.as_dict(), n)
         memories = _zeros(self.memory_spec(n, m, x.dtype), n, x.device)
         for name, part, rows, _ in self.rows_of_parts(episode):
+            # A traffic sees only its own rows of the scene.
             scene = Vehicles(*(field[rows] for field in vehicles))
             of_episode = scene.visibility == VISIBILITY_OF_EPISODE
             visibility = torch.where(of_episode, int(part.visibility), scene.visibility)
@@ -245,6 +252,7 @@ class BlindTraffic(TrafficModule):
         vehicles = tensordict.get(keys.VEHICLES)
         unseen = memory.get("unseen")
         inputs = tensordict.copy()
+        # The copy is shallow: the state at t is not written to.
         seen = vehicles.copy().set("valid", vehicles.get("valid") & ~unseen)
         inputs.set(keys.VEHICLES, seen)
         inputs.set(keys.TRAFFIC, memory_of(memory, "model"))
@@ -262,6 +270,7 @@ class BlindTraffic(TrafficModule):
 
         ``key`` as for :meth:`TrafficModule.fresh_memory`.
         """
+        # In float64, so that the same episodes are blind in runs of either float type.
         u = uniform(key, -1, 1, [Purpose.BLIND_EPISODE], torch.float64)[..., 0]
         is_ego = torch.arange(vehicles.x.shape[1], device=key.device) == EGO_INDEX
         return (u < self.blind_share) & is_ego

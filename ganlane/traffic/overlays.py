@@ -126,6 +126,7 @@ class LiteralLaneChange(Overlay):
             [Purpose.LANE_CHANGE_SPEED],
             dtype,
         )[..., 0]
+        # Blind: nobody looks for a gap, as in the paper.
         comes = u < literal_hazard(memory["clock"].to(dtype), c.mean_steps)
         starts = (memory["lateral_speed"] == 0) & vehicles.valid & comes
         side = torch.where(
@@ -134,15 +135,18 @@ class LiteralLaneChange(Overlay):
             0,
         )
         target = vehicles.target_lane + side
+        # One lateral speed for the whole change.
         drawn = (c.lateral_speed_mps + c.lateral_speed_sd_mps * gauss).clamp_min(c.slowest_mps)
         pace = torch.where(side != 0, drawn, memory["lateral_speed"].abs())
         changing = pace != 0
         # Towards the target lane, which may have been set back meanwhile.
         remaining = self.road.centre_of(target, vehicles.y.dtype) - vehicles.y
         lateral = torch.copysign(pace, remaining)
+        # The last step ends at the lane's centre, not beyond it.
         stride = lateral * self.dt
         arrives = changing & (remaining.abs() <= stride.abs())
         y = vehicles.y + torch.where(arrives, remaining, stride)
+        # Below 1 m/s the angle would grow without bound.
         heading = torch.atan(lateral / vehicles.speed.clamp_min(1.0))
         moved = moved.with_(
             target_lane=target,
@@ -213,6 +217,7 @@ class CalibratedLaneChange(Overlay):
         u, u_side = uniforms(vehicles, key, step, *_CHANGE)
         comes = u < distance_hazard(vehicles.speed, self.changes.per_km, self.dt)
         side = random_side(u_side, vehicles.target_lane, self.road.lanes)
+        # Who is still changing does not wish for another change.
         free = lane_change_done(vehicles, self.road) & vehicles.valid
         new = torch.where(comes & free, side, 0)
         return without_ego(torch.where(memory["wish"] != 0, memory["wish"], new))
@@ -238,10 +243,13 @@ class CalibratedLaneChange(Overlay):
         wish = self._wishes(vehicles, memory, key, step)
         scene = perceive(vehicles, self.road)
         lane = (vehicles.target_lane + wish).to(vehicles.x.dtype)
+        # Neither the driver nor its new follower has to brake harder than the limit, by IDM.
         safe = safe_change(scene, lane, self.idm, self._limits)
         wanted = torch.where(safe & ~self._contested(scene, lane), wish, 0)
+        # Two that would start into the same gap at once cannot see each other's intention.
         starts = one_at_a_time(scene, wanted, self.idm, self._limits)
         waited = torch.where(wish != 0, memory["waited"] + 1, 0)
+        # Otherwise wishes pile up in dense traffic and all come true when it thins out.
         gives_up = waited >= round(self.changes.patience_s / self.dt)
         rest = torch.where((starts != 0) | gives_up, 0, wish)
         moved = moved.with_(target_lane=vehicles.target_lane + starts)
@@ -323,6 +331,7 @@ class AccelerationOverlay(Overlay):
         dtype = vehicles.x.dtype
         (u,) = uniforms(vehicles, key, step, Purpose.ACCELERATION)
         gauss = normal(key, step, m, [Purpose.ACCELERATION], dtype)[..., 0]
+        # A constant hazard while none is going on.
         starts = (memory["left"] == 0) & (u < self.dt / s.every_s) & vehicles.valid
         acceleration = torch.where(starts, s.mean + s.sd * gauss, memory["acceleration"])
         left = torch.where(starts, round(s.lasts_s / self.dt), memory["left"])
@@ -386,10 +395,12 @@ class Guard(Overlay):
         g = self.guard
         scene = perceive(vehicles.with_(target_lane=moved.target_lane), self.road)
         ahead = leader(scene, spanned(scene.attention))
+        # A shorter headway than IDM's: the network may follow more closely than the model would.
         highest = acceleration_behind(scene, ahead, self.idm, g.headway_s).amin(-1)
         lowest = acceleration_behind(scene, ahead, self.idm).amin(-1)
         lowest = lowest - g.slack * vehicles.speed / vehicles.desired_speed
         highest, lowest = (bound.clamp_min(g.hardest_braking) for bound in (highest, lowest))
+        # What the chain made of it, whichever part moved the vehicle.
         wanted = (moved.speed - vehicles.speed) / self.dt
         acceleration = torch.minimum(
             torch.maximum(wanted, torch.minimum(lowest, highest)),
@@ -411,6 +422,7 @@ class Guard(Overlay):
         g = self.guard
         road = self.road
         offset = road.centre_of(moved.target_lane, moved.y.dtype) - vehicles.y
+        # PD: keep a share of the lateral motion, and add a pull to the centre.
         damped = vehicles.y + g.damping * (moved.y - vehicles.y)
         pulled = damped + g.centring_per_s * self.dt * offset
         y = torch.where(offset.abs() < 0.5 * road.lane_width_m, pulled, moved.y)

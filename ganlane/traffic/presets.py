@@ -153,6 +153,8 @@ def gan_traffic(
     source = path or shipped_generator("paper")
     generator, metadata = load_generator(source, "paper")
     statistics = DrivingStatistics.from_dict(metadata["driving_statistics"])
+    # The order matters: a lane change moves sideways whatever the network did, and the guard bounds
+    # the sum of all.
     parts: dict[str, TrafficModule] = {
         "generator": SocialGanTraffic(
             generator,
@@ -196,6 +198,7 @@ def gan_calibrated_traffic(
     source = path or shipped_generator("calibrated")
     generator, metadata = load_generator(source, "calibrated")
     statistics = DrivingStatistics.from_dict(metadata["driving_statistics"])
+    # Without a recorded change nobody changes lanes.
     recorded = statistics.lane_changes.per_vehicle_km or 0.0
     wishes = WISH_PER_CHANGE * recorded if changes_per_km is None else changes_per_km
     headways_s = headway_quantiles(metadata["driving_statistics"])

@@ -48,6 +48,7 @@ def _with_tracks(frame: pl.DataFrame) -> pl.DataFrame:
 
     ``fastest`` is its highest speed. A missing frame ends a track.
     """
+    # Samples are sorted by scene, vehicle and frame.
     goes_on = (pl.col("frame").diff() == 1) & (pl.col("vehicle").diff() == 0)
     same_scene = pl.col("scene") == pl.col("scene").shift(1)
     begins = ~(goes_on & same_scene).fill_null(False)
@@ -66,6 +67,7 @@ def _motion(samples: pl.DataFrame) -> Tensor:
     """The float fields of every sample, [R, 8] float64, ordered as ``VEHICLE_FLOATS``."""
     column = {name: samples[name].to_numpy() for name in samples.columns if name != "scene"}
     x, y, speed, index = (column[name] for name in ("x", "y", "speed", "index"))
+    # Positions in the table, clipped to the vehicle's own track.
     early = np.maximum(index - _HALF_WINDOW, column["first"])
     late = np.minimum(index + _HALF_WINDOW, column["last"])
     fields = {
@@ -96,6 +98,7 @@ def _starts(samples: pl.DataFrame, least: int) -> tuple[pl.DataFrame, Tensor]:
     x = pl.col("x")
     index = pl.col("index")
     moment = ["scene", "frame"]
+    # Ego vehicles come from the middle, where others are recorded on both sides.
     middle = x.quantile(0.5, "midpoint").over(moment)
     stays = pl.col("last") - index >= least
     # Who does not stay comes last; of two equally near the one with the lower index is first.
@@ -110,6 +113,7 @@ def _starts(samples: pl.DataFrame, least: int) -> tuple[pl.DataFrame, Tensor]:
     )
     place = there["index"].to_numpy()
     ego = there["ego"].to_numpy()
+    # Distance from the vehicle that the ego replaces, which itself comes first.
     x_m = samples["x"].to_numpy()
     y_m = samples["y"].to_numpy()
     distance = np.hypot(x_m[place] - x_m[ego], y_m[place] - y_m[ego])
@@ -124,6 +128,7 @@ def _starts(samples: pl.DataFrame, least: int) -> tuple[pl.DataFrame, Tensor]:
         .filter(pl.col("rank") < MOST_VEHICLES)
     )
     starts = there.filter(pl.col("rank") == 0)
+    # One row per start, one column per rank.
     table = np.full((len(starts), there.n_unique("rank")), -1)
     table[there["start"], there["rank"]] = there["index"]
     return starts, torch.from_numpy(table)
@@ -217,6 +222,7 @@ class ReplayTraffic(TrafficModule):
 
     def start_of(self, key: Tensor) -> Tensor:
         """Number of the start, [N] int64, of the episodes with ``key`` [N]."""
+        # First the scene, then a start in it: long scenes are not driven more often.
         u = uniform(key, 0, 2, [Purpose.REPLAY_START], torch.float64)[..., 0]
         scene = _one_of(u[:, 0], torch.full_like(key, len(self.scene_names)))
         return self.first_start[scene] + _one_of(u[:, 1], self.starts_in[scene])
@@ -262,6 +268,7 @@ class ReplayTraffic(TrafficModule):
         """
         start = self.start_of(key)
         first = self.starts[start, :vehicles]
+        # Fewer vehicles than asked for: the rest of the row is invalid.
         lacking = first.new_full((len(key), vehicles - first.shape[1]), -1)
         first = torch.cat((first, lacking), dim=1)
         ego = self.starts[start, :1]
@@ -269,6 +276,7 @@ class ReplayTraffic(TrafficModule):
         last = self.last[begin]
         now = begin + step[:, None]
         fields = self.samples[torch.minimum(now, last)]
+        # In float64, as far down the road as recordings go; only then in the run's float type.
         fields[..., _X] -= self.samples[ego][..., _X]
         values = dict(zip(VEHICLE_FLOATS, fields.to(dtype).unbind(-1)))
         lane = self.road_of(key, dtype).lane_of(values["y"]).long()

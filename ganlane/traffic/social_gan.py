@@ -91,6 +91,7 @@ class GeneratedTraffic(TrafficModule):
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """Straight driving at the present speed, and latent vectors of this episode."""
+        # Metres per step along the lane, none across.
         along = vehicles.speed * PHYSICS_STEP_S
         displacement = torch.stack([along, torch.zeros_like(along)], dim=-1)
         history = start(self.network(vehicles.x.dtype), displacement)
@@ -118,6 +119,7 @@ class GeneratedTraffic(TrafficModule):
 
     def before(self, memory: Memory, key: Tensor, step: Tensor) -> tuple[History, Tensor]:
         """The drivers' history from the memory, and the latent vectors [N, M, Z] of this step."""
+        # An autoregressive process: the latent vector keeps its variance and forgets slowly.
         noise = memory["noise"]
         fresh = normal(key, step, noise.shape[1], self.purposes, noise.dtype)
         history = History(
@@ -159,6 +161,7 @@ class SocialGanTraffic(GeneratedTraffic):
                 f"choose 1 to {generator.sizes.predicted}."
             )
         self.execute_k = execute_k
+        # What is left of a prediction is driven before the next one is made.
         if execute_k > 1:
             plan: MemoryFields = {
                 "plan": ((execute_k, 2), None),
@@ -184,6 +187,7 @@ class SocialGanTraffic(GeneratedTraffic):
     ) -> Moved:
         """Predict, and drive the first displacement (or what is left of the plan)."""
         network = self.network(vehicles.x.dtype)
+        # With execute_k = 1 every step predicts anew.
         history, noise = self.before(memory, key, step)
         plan = Plan(memory["plan"], memory["plan_left"]) if self.execute_k > 1 else None
         moved, history, plan = paper_step(
@@ -253,6 +257,7 @@ class AnchoredGanTraffic(GeneratedTraffic):
         """One :func:`~ganlane.generator.closed_loop.anchored_step`."""
         network = self.network(vehicles.x.dtype)
         history, noise = self.before(memory, key, step)
+        # The washout's mean and the headway belong to the driver, as the history does.
         driver = DriverMemory(history, memory["residual_mean"], memory["headway"])
         moved, driver = anchored_step(
             network,

@@ -100,6 +100,7 @@ class ActionMaskTransform(PerceptionTransform):
         self.idm = idm
         self.abort = abort
         self.safe_deceleration = safe_deceleration
+        # The kernel has no function for ``legal``, which is a comparison or two.
         self.native: SafeActions | None = None
         if native_vehicles is not None and form == "safe":
             self.native = SafeActions(

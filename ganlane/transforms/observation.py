@@ -72,10 +72,12 @@ def other_vehicles(vehicles: Vehicles, road: Road, scale: ObservationScale) -> O
     ego = vehicles.columns(slice(0, 1))
     others = vehicles.columns(slice(1, None))
     # Relative numbers over their scale, clipped.
-    position = (road.distance_ahead(ego.x, others.x) / scale.range_m).clamp(-1.0, 1.0)
+    distance = road.distance_ahead(ego.x, others.x)
+    position = (distance / scale.range_m).clamp(-1.0, 1.0)
     speed = ((others.speed - ego.speed) / scale.speed_mps).clamp(-1.0, 1.0)
     own_lane = road.lane_of(others.y)
-    lane = ((own_lane - road.lane_of(ego.y)) / _widest(road.lanes)).clamp(-1.0, 1.0)
+    lanes_apart = own_lane - road.lane_of(ego.y)
+    lane = (lanes_apart / _widest(road.lanes)).clamp(-1.0, 1.0)
     # Offset to the left of the lane's centre over half of the lane's width.
     offset = others.y - road.centre_of(own_lane, others.y.dtype)
     drift = (2.0 * offset / road.lane_width_m).clamp(-1.0, 1.0)
@@ -93,7 +95,9 @@ def other_vehicles(vehicles: Vehicles, road: Road, scale: ObservationScale) -> O
 
 def _widest(lanes: int | Tensor) -> int | Tensor:
     """The largest lane difference, at least 1."""
-    return (lanes - 1).clamp_min(1) if isinstance(lanes, Tensor) else max(lanes - 1, 1)
+    if isinstance(lanes, Tensor):
+        return (lanes - 1).clamp_min(1)
+    return max(lanes - 1, 1)
 
 
 def own_state(view: View) -> Tensor:
@@ -117,9 +121,12 @@ def vehicle_list(view: View) -> Tensor:
     Position, speed and lane of each vehicle, nearest first, invalid last.
     """
     # Sorted by distance, not by the clipped position, which is alike for all far ones.
-    distance = view.road.distance_ahead(view.seen.x[:, :1], view.seen.x[:, 1:]).abs()
-    order = torch.where(view.others.valid, distance, torch.inf).argsort(dim=1, stable=True)
-    return torch.stack([field.gather(1, order) for field in view.others[:3]], dim=-1).flatten(1)
+    x = view.seen.x
+    distance = view.road.distance_ahead(x[:, :1], x[:, 1:]).abs()
+    distance = torch.where(view.others.valid, distance, torch.inf)
+    order = distance.argsort(dim=1, stable=True)
+    columns = [field.gather(1, order) for field in view.others[:3]]
+    return torch.stack(columns, dim=-1).flatten(1)
 
 
 def lane_view(view: View, drift: bool = False, overlap: bool = False) -> Tensor:
@@ -150,8 +157,8 @@ def lane_view(view: View, drift: bool = False, overlap: bool = False) -> Tensor:
     exists = nearest <= 1.0
 
     def of_the_nearest(field: Tensor) -> Tensor:
-        value = torch.add(field[:, None, :], farther, alpha=_MASKED).amin(-1, keepdim=True)
-        return torch.where(exists, value, 0.0)
+        value = torch.add(field[:, None, :], farther, alpha=_MASKED)
+        return torch.where(exists, value.amin(-1, keepdim=True), 0.0)
 
     # Of two equally near vehicles the longer one counts.
     gap_m = nearest * range_m + of_the_nearest(-others.bumpers_m)
@@ -258,7 +265,8 @@ class ObservationTransform(PerceptionTransform):
         seen = vehicles if seen is None else seen
         others = other_vehicles(seen, road, self.scale)
         view = View(vehicles, seen, others, road, self.scale, progress, direction)
-        return torch.cat([part.numbers(view) for part in OBSERVATIONS[self.form]], dim=1)
+        parts = [part.numbers(view) for part in OBSERVATIONS[self.form]]
+        return torch.cat(parts, dim=1)
 
     def compile_graphs(self) -> None:
         """Compile the observation to one graph (``env.compile=true``)."""

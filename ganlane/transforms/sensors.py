@@ -82,6 +82,7 @@ class PerceptionTransform(Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the out keys into any TensorDict that holds the raw state."""
         vehicles = seen = Vehicles.of(tensordict.get(keys.VEHICLES))
+        # Without sensors the ego sees what there is.
         perceived = tensordict.get(PERCEIVED, None)
         if perceived is not None:
             seen = vehicles.with_(**dict(perceived.items()))
@@ -127,6 +128,7 @@ class SensorTransform(Transform):
     def _measured(self, state: TensorDictBase) -> TensorDictBase:
         """The measurement of the true state in ``state``."""
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
+        # The traffic's key: purposes of their own keep the numbers apart.
         key = episode_key(self.stream, state.get(keys.SEED), state.get(keys.EPISODE))
         return measure(vehicles, key, state.get(keys.STEP), self.parameters)
 

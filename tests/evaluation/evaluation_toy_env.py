@@ -26,7 +26,12 @@ def reason(episode: int) -> str:
     return keys.END_EVENTS[episode % len(keys.END_EVENTS)]
 
 
-def _nested(n: int, names: list[str], shape: tuple[int, ...], dtype: torch.dtype) -> Composite:
+def _nested(
+    n: int,
+    names: list[str],
+    shape: tuple[int, ...],
+    dtype: torch.dtype,
+) -> Composite:
     return Composite({name: Unbounded((n, *shape), dtype=dtype) for name in names}, shape=(n,))
 
 
@@ -39,19 +44,58 @@ class ToyEnv(EnvBase):
     def __init__(self, n: int):
         super().__init__(batch_size=[n])
         self.reset_calls = 0
-        ego = _nested(n, ["distance"], (), torch.float32)
-        ego.update(_nested(n, ["lane_changes", "decisions"], (), torch.int64))
-        events = _nested(n, list(keys.END_EVENTS), (1,), torch.bool)
-        events.update(_nested(n, [keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND], (1,), torch.int64))
+        ego = _nested(
+            n,
+            ["distance"],
+            (),
+            torch.float32,
+        )
+        ego.update(
+            _nested(
+                n,
+                ["lane_changes", "decisions"],
+                (),
+                torch.int64,
+            )
+        )
+        events = _nested(
+            n,
+            list(keys.END_EVENTS),
+            (1,),
+            torch.bool,
+        )
+        events.update(
+            _nested(
+                n,
+                [keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND],
+                (1,),
+                torch.int64,
+            )
+        )
         counters = {
             name: Unbounded((n,), dtype=torch.int64)
             for name in (keys.SEED, keys.EPISODE, keys.STEP)
         }
-        terms = _nested(n, ["speed", "goal"], (1,), torch.float32)
-        self.observation_spec = Composite(
-            {**counters, "ego": ego, "events": events, "reward_terms": terms}, shape=(n,)
+        terms = _nested(
+            n,
+            ["speed", "goal"],
+            (1,),
+            torch.float32,
         )
-        self.action_spec = Categorical(3, shape=(n,), dtype=torch.int64)
+        self.observation_spec = Composite(
+            {
+                **counters,
+                "ego": ego,
+                "events": events,
+                "reward_terms": terms,
+            },
+            shape=(n,),
+        )
+        self.action_spec = Categorical(
+            3,
+            shape=(n,),
+            dtype=torch.int64,
+        )
         self.reward_spec = Unbounded((n, 1))
 
     def _set_seed(self, seed):
@@ -90,13 +134,26 @@ class ToyEnv(EnvBase):
         driven = {"distance": ego["distance"] + 20.0, "lane_changes": ego["lane_changes"] + chosen}
         return TensorDict(
             {
-                **{keys.SEED: seed, keys.EPISODE: episode, keys.STEP: step + 10},
+                **{
+                    keys.SEED: seed,
+                    keys.EPISODE: episode,
+                    keys.STEP: step + 10,
+                },
                 "ego": TensorDict({**driven, "decisions": decisions}, n),
                 "events": TensorDict(
-                    {**ends, "soft_crash": soft, "soft_crash_behind": 2 * soft}, n
+                    {
+                        **ends,
+                        "soft_crash": soft,
+                        "soft_crash_behind": 2 * soft,
+                    },
+                    n,
                 ),
                 "reward_terms": TensorDict({"speed": speed, "goal": goal}, n),
-                **{"reward": speed + goal, "done": done, "terminated": done.clone()},
+                **{
+                    "reward": speed + goal,
+                    "done": done,
+                    "terminated": done.clone(),
+                },
             },
             n,
         )
@@ -105,5 +162,7 @@ class ToyEnv(EnvBase):
 def always(action: int) -> TensorDictModule:
     """A policy that always takes ``action``."""
     return TensorDictModule(
-        lambda step: torch.full_like(step, action), in_keys=[keys.STEP], out_keys=["action"]
+        lambda step: torch.full_like(step, action),
+        in_keys=[keys.STEP],
+        out_keys=["action"],
     )

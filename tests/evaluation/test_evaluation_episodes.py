@@ -37,7 +37,12 @@ SHORT = EnvConfig(goal_m=60.0, kernel="torch")
 
 
 def test_each_row_tells_what_the_episode_was():
-    frame = run_episodes(ToyEnv(4), always(1), range(10), seed=5)
+    frame = run_episodes(
+        ToyEnv(4),
+        always(1),
+        range(10),
+        seed=5,
+    )
     assert frame["episode"].to_list() == list(range(10))
     assert frame["seed"].to_list() == [5] * 10
     for row in frame.iter_rows(named=True):
@@ -63,7 +68,11 @@ def test_the_policy_acts_deterministically_and_without_gradients_while_progress_
         modes.add((exploration_type(), torch.is_grad_enabled()))
         return torch.zeros_like(step)
 
-    policy = TensorDictModule(look, in_keys=["step"], out_keys=["action"])
+    policy = TensorDictModule(
+        look,
+        in_keys=["step"],
+        out_keys=["action"],
+    )
     run_episodes(
         ToyEnv(4),
         policy,
@@ -83,7 +92,12 @@ def test_an_end_that_the_environment_does_not_name_is_called_other():
             after["events", "goal"].zero_()
             return after
 
-    assert run_episodes(Nameless(1), always(0), [0, 1], seed=0)["reason"].to_list() == [
+    assert run_episodes(
+        Nameless(1),
+        always(0),
+        [0, 1],
+        seed=0,
+    )["reason"].to_list() == [
         "other",
         "hard_crash",
     ]
@@ -92,17 +106,34 @@ def test_an_end_that_the_environment_does_not_name_is_called_other():
 class Remade:
     """Makes an environment of any size, and remembers the sizes that were asked for."""
 
-    def __init__(self, traffic, env=SHORT, sensors=None, wrap=lambda env: env):
+    def __init__(
+        self,
+        traffic,
+        env=SHORT,
+        sensors=None,
+        wrap=lambda env: env,
+    ):
         self.traffic, self.env, self.wrap = make_traffic(traffic, env), env, wrap
         self.observation = ObservationConfig(sensors=sensors)
         self.sizes = []
 
     def __call__(self, rows):
         self.sizes.append(rows)
-        return self.wrap(make_env(self.traffic, self.env, self.observation, num_envs=rows))
+        return self.wrap(
+            make_env(
+                self.traffic,
+                self.env,
+                self.observation,
+                num_envs=rows,
+            )
+        )
 
 
-def alone(make, policy, episodes):
+def alone(
+    make,
+    policy,
+    episodes,
+):
     """Decisions, reward, distance and end of each episode, driven with nothing beside it and
     counted by hand.
     """
@@ -119,12 +150,26 @@ def alone(make, policy, episodes):
         distance = float(state["ego", "distance"])
         rows.append((episode, decisions, reward, distance, ends[0] if ends else "other"))
     return pl.DataFrame(
-        rows, schema=["episode", "decisions", "reward", "distance_m", "reason"], orient="row"
+        rows,
+        schema=[
+            "episode",
+            "decisions",
+            "reward",
+            "distance_m",
+            "reason",
+        ],
+        orient="row",
     )
 
 
 def compared(table):
-    return table.select("episode", "decisions", "reward", "distance_m", "reason")
+    return table.select(
+        "episode",
+        "decisions",
+        "reward",
+        "distance_m",
+        "reason",
+    )
 
 
 @pytest.fixture(scope="module")
@@ -147,17 +192,44 @@ def sources(recordings):
     }
 
 
-@pytest.mark.parametrize("name", ["recycled", "late sensors", "replayed", "cut short"])
-def test_every_episode_is_bit_for_bit_what_it_is_alone(name, recordings, monkeypatch):
+@pytest.mark.parametrize(
+    "name",
+    [
+        "recycled",
+        "late sensors",
+        "replayed",
+        "cut short",
+    ],
+)
+def test_every_episode_is_bit_for_bit_what_it_is_alone(
+    name,
+    recordings,
+    monkeypatch,
+):
     monkeypatch.setattr("ganlane.evaluation.episodes.CHECK_EVERY", 2)
     make, driver = sources(recordings)[name], "agent_idm" if name == "late sensors" else "random"
     policy, episodes = make_driver(driver, make.env).policy, [*range(30, 47), 7, 3]
     expected = alone(make, policy, episodes)
     assert_frame_equal(
-        compared(run_episodes(make(5), policy, episodes, SEED)), expected, check_exact=True
+        compared(
+            run_episodes(
+                make(5),
+                policy,
+                episodes,
+                SEED,
+            )
+        ),
+        expected,
+        check_exact=True,
     )
     make.sizes.clear()
-    wide = run_episodes(make(17), policy, episodes, SEED, make_smaller=make)
+    wide = run_episodes(
+        make(17),
+        policy,
+        episodes,
+        SEED,
+        make_smaller=make,
+    )
     assert_frame_equal(compared(wide), expected, check_exact=True)
     assert make.sizes[0] == 17
     assert (expected["reason"] == "other").any() == (name == "cut short")
@@ -166,9 +238,20 @@ def test_every_episode_is_bit_for_bit_what_it_is_alone(name, recordings, monkeyp
 def test_generated_traffic_is_the_same_up_to_rounding_when_rows_move():
     make = Remade(GanTrafficConfig(), EnvConfig(goal_m=90.0))
     policy, episodes = make_driver("random", make.env).policy, range(34)
-    one = run_episodes(make(34), policy, episodes, SEED)
+    one = run_episodes(
+        make(34),
+        policy,
+        episodes,
+        SEED,
+    )
     make.sizes.clear()
-    other = run_episodes(make(34), policy, episodes, SEED, make_smaller=make)
+    other = run_episodes(
+        make(34),
+        policy,
+        episodes,
+        SEED,
+        make_smaller=make,
+    )
     assert len(make.sizes) > 1
     assert one["reason"].to_list() == other["reason"].to_list()
     assert one["distance_m"].to_list() == pytest.approx(other["distance_m"].to_list(), rel=1e-3)
@@ -182,7 +265,11 @@ def test_the_last_episodes_move_to_ever_smaller_environments_if_the_policy_says_
     if may_move:
         policy.rows_must_stay = False
     frame = run_episodes(
-        ToyEnv(64), policy, range(64), 0, make_smaller=lambda n: sizes.append(n) or ToyEnv(n)
+        ToyEnv(64),
+        policy,
+        range(64),
+        0,
+        make_smaller=lambda n: sizes.append(n) or ToyEnv(n),
     )
     assert frame["decisions"].to_list() == [length(0, e) for e in range(64)]
     # Episodes last 3 to 13 decisions; after 8 of them those of 9 to 13 are left.
@@ -214,32 +301,75 @@ def test_rows_stay_and_are_never_driven_on_where_the_traffic_holds_something_per
     traffic, make = Watchful(), Remade(IdmTrafficConfig())
     env, policy = make_env(traffic, SHORT, num_envs=17), make_driver("random", SHORT).policy
     table = run_episodes(
-        env, policy, range(30), SEED, make_smaller=lambda rows: pytest.fail("moved")
+        env,
+        policy,
+        range(30),
+        SEED,
+        make_smaller=lambda rows: pytest.fail("moved"),
     )
     moved = table.filter(pl.col("duration_s") > 0)["episode"]
     assert set(moved) <= set(traffic.begun) <= set(range(30))
-    assert_frame_equal(table, run_episodes(make(17), policy, range(30), SEED), check_exact=True)
+    assert_frame_equal(
+        table,
+        run_episodes(
+            make(17),
+            policy,
+            range(30),
+            SEED,
+        ),
+        check_exact=True,
+    )
 
 
 def test_no_episodes_and_an_environment_that_ignores_those_it_is_given_are_refused():
     class Stubborn(ToyEnv):
-        def _reset(self, tensordict=None, next_episode=None, **kwargs):
+        def _reset(
+            self,
+            tensordict=None,
+            next_episode=None,
+            **kwargs,
+        ):
             return super()._reset(tensordict, **kwargs)
 
     with user_error("next_episode"):
-        run_episodes(Stubborn(2), always(0), [0, 1, 5, 9], seed=0)
+        run_episodes(
+            Stubborn(2),
+            always(0),
+            [0, 1, 5, 9],
+            seed=0,
+        )
     with user_error("episodes"):
-        run_episodes(ToyEnv(2), always(0), [], seed=0)
+        run_episodes(
+            ToyEnv(2),
+            always(0),
+            [],
+            seed=0,
+        )
 
 
 def test_an_episode_comes_back_from_its_actions():
     config = EnvConfig(goal_m=90.0)
     env = make_env(make_traffic(IdmMobilTrafficConfig(), config), config, num_envs=2)
     policy = make_driver("random_legal", config).policy
-    table = run_episodes(env, policy, [4, 1, 7], seed=3, actions=True)
+    table = run_episodes(
+        env,
+        policy,
+        [4, 1, 7],
+        seed=3,
+        actions=True,
+    )
     assert table["actions"].str.len_chars().to_list() == table["decisions"].to_list()
     script = ScriptedPolicy(dict(table.select("episode", "actions").iter_rows()))
-    assert_frame_equal(run_episodes(env, script, [4, 1, 7], seed=3, actions=True), table)
+    assert_frame_equal(
+        run_episodes(
+            env,
+            script,
+            [4, 1, 7],
+            seed=3,
+            actions=True,
+        ),
+        table,
+    )
 
 
 @pytest.mark.parametrize(
@@ -248,14 +378,39 @@ def test_an_episode_comes_back_from_its_actions():
         ({"speed": 20.0}, {"x": 4.4, "speed": 10.0}, True),  # into the one ahead
         ({}, {"x": -4.4, "speed": 30.0}, False),  # struck from behind
         ({}, {"y": 2.4, "heading": -0.1}, False),  # the other changes lanes into the ego
-        ({}, {"x": 4.0, "y": 2.2, "heading": -0.1}, False),  # and ahead of it, too
-        ({}, {"x": -4.2, "y": 1.0, "speed": 30.0, "heading": 0.1}, False),  # moving away, faster
+        (
+            {},
+            {
+                "x": 4.0,
+                "y": 2.2,
+                "heading": -0.1,
+            },
+            False,
+        ),  # and ahead of it, too
+        (
+            {},
+            {
+                "x": -4.2,
+                "y": 1.0,
+                "speed": 30.0,
+                "heading": 0.1,
+            },
+            False,
+        ),  # moving away, faster
         ({"heading": 0.1}, {"y": 2.4}, True),  # the ego into the other
         ({"heading": 0.1}, {"y": 2.4, "heading": -0.05}, True),  # both, the ego faster
         ({"heading": -0.05}, {"y": -2.4, "heading": 0.1}, False),  # both, the other faster
         ({"speed": 30.0}, {"x": 10.0}, False),  # nobody was hit
     ],
 )
-def test_who_moved_into_whom(ego, other, at_fault):
-    same = {"x": 0.0, "y": 0.0, "target_lane": 0}
+def test_who_moved_into_whom(
+    ego,
+    other,
+    at_fault,
+):
+    same = {
+        "x": 0.0,
+        "y": 0.0,
+        "target_lane": 0,
+    }
     assert bool(ego_at_fault(vehicles({**same, **ego}, {**same, **other}))) == at_fault

@@ -25,14 +25,29 @@ class Config:
 def test_numbers_and_their_origin_are_kept(tmp_path):
     numbers = {
         "rows": [
-            {"mean_reward": np.float32(1.5), "ci": np.array([1.0, 2.0]), "score": float("nan")}
+            {
+                "mean_reward": np.float32(1.5),
+                "ci": np.array([1.0, 2.0]),
+                "score": float("nan"),
+            }
         ]
     }
     config = {"evaluate": Config(("mobil",), Path("a/b")), "weight": torch.tensor(2)}
-    path = write_results(tmp_path / "run", numbers, config, {"seed": 3, "episodes": range(3)})
+    path = write_results(
+        tmp_path / "run",
+        numbers,
+        config,
+        {"seed": 3, "episodes": range(3)},
+    )
     read = json.loads(path.read_text())
     assert path.name == "results.json"
-    assert read["rows"] == [{"mean_reward": 1.5, "ci": [1.0, 2.0], "score": None}]
+    assert read["rows"] == [
+        {
+            "mean_reward": 1.5,
+            "ci": [1.0, 2.0],
+            "score": None,
+        }
+    ]
     assert read["config"] == {
         "evaluate": {"agents": ["mobil"], "folder": str(Path("a/b"))},
         "weight": 2,
@@ -45,14 +60,25 @@ def test_numbers_and_their_origin_are_kept(tmp_path):
 
 
 def test_episodes_come_back_as_they_were(tmp_path):
-    frame = pl.DataFrame({"episode": [0, 1], "reason": ["goal", "timeout"], "reward": [1.0, 2.0]})
+    frame = pl.DataFrame(
+        {
+            "episode": [0, 1],
+            "reason": ["goal", "timeout"],
+            "reward": [1.0, 2.0],
+        }
+    )
     path = write_episodes(tmp_path, frame)
     assert pl.read_parquet(path).equals(frame)
     assert [file.name for file in tmp_path.iterdir()] == ["episodes.parquet"]
 
 
 def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
-    path = write_results(tmp_path, {"rows": [1]}, {}, {})
+    path = write_results(
+        tmp_path,
+        {"rows": [1]},
+        {},
+        {},
+    )
     before = path.read_bytes()
 
     class Unwritable:
@@ -60,14 +86,23 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
             raise RuntimeError("no")
 
     with pytest.raises(RuntimeError):
-        write_results(tmp_path, {"rows": [Unwritable()]}, {}, {})
+        write_results(
+            tmp_path,
+            {"rows": [Unwritable()]},
+            {},
+            {},
+        )
     assert path.read_bytes() == before
     assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_a_copy_in_somebody_elses_checkout_has_no_revision(monkeypatch, tmp_path):
     monkeypatch.setattr(results, "PACKAGE", tmp_path)
-    assert code_version() == {"version": ganlane.__version__, "revision": None, "modified": None}
+    assert code_version() == {
+        "version": ganlane.__version__,
+        "revision": None,
+        "modified": None,
+    }
 
 
 def test_a_run_is_short_in_a_terminal_and_a_table_in_a_notebook(tmp_path):
@@ -75,5 +110,12 @@ def test_a_run_is_short_in_a_terminal_and_a_table_in_a_notebook(tmp_path):
     run = Run(tmp_path, {"rows": rows, "config": {"seed": 0}})
     assert repr(run) == f"Run(folder={str(tmp_path)!r}, results: rows, config)"
     assert "random" in run._repr_html_()
-    other = Run(tmp_path, {"dataset": "mine/first-v0", "decisions": 712, "config": {"seed": 0}})
+    other = Run(
+        tmp_path,
+        {
+            "dataset": "mine/first-v0",
+            "decisions": 712,
+            "config": {"seed": 0},
+        },
+    )
     assert "<td>712</td>" in other._repr_html_()

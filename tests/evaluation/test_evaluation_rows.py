@@ -21,7 +21,13 @@ from ganlane.evaluation import (
 )
 
 
-def episodes(agent, rewards, reasons=None, traffic="idm", first=0):
+def episodes(
+    agent,
+    rewards,
+    reasons=None,
+    traffic="idm",
+    first=0,
+):
     """Episodes of 5000 m in 200 s with two lane changes; three soft crashes in the first one."""
     n = len(rewards)
     return pl.DataFrame(
@@ -44,13 +50,35 @@ def episodes(agent, rewards, reasons=None, traffic="idm", first=0):
 
 @pytest.fixture(scope="module")
 def rows():
-    ends = ["goal", "timeout", "hard_crash", "out_of_road"]
+    ends = [
+        "goal",
+        "timeout",
+        "hard_crash",
+        "out_of_road",
+    ]
     return evaluation_rows(
         pl.concat(
             [
-                episodes("agent_idm", [20, 24, -80, 26], ends),
+                episodes(
+                    "agent_idm",
+                    [
+                        20,
+                        24,
+                        -80,
+                        26,
+                    ],
+                    ends,
+                ),
                 episodes("mobil", [30, 32, 34, 36]),
-                episodes("random_legal", [-10, -8, -6, -4]),
+                episodes(
+                    "random_legal",
+                    [
+                        -10,
+                        -8,
+                        -6,
+                        -4,
+                    ],
+                ),
             ]
         )
     )
@@ -106,7 +134,16 @@ def test_the_form_of_the_score_fits_both_rows_of_the_papers_table():
 
 
 def test_a_scale_without_a_length_gives_no_score():
-    score, reason = normalized_percent([5, 6, 7, 8], [1, -2, 3, -1], [0] * 4)
+    score, reason = normalized_percent(
+        [5, 6, 7, 8],
+        [
+            1,
+            -2,
+            3,
+            -1,
+        ],
+        [0] * 4,
+    )
     assert score is None
     assert "includes 0" in reason
 
@@ -175,12 +212,43 @@ def test_the_first_driver_is_held_against_every_other_on_every_traffic():
 def test_only_episodes_that_both_drove_count_whatever_their_order():
     # Shared are the episodes 2, 3 and 4: differences of 2, 4 and 6.
     other = episodes("mobil", [10, 20, 30, 99], first=2).reverse()
-    (row,) = paired_rows(pl.concat([episodes("a", [-50, -60, 12, 24, 36]), other]))
+    (row,) = paired_rows(
+        pl.concat(
+            [
+                episodes(
+                    "a",
+                    [
+                        -50,
+                        -60,
+                        12,
+                        24,
+                        36,
+                    ],
+                ),
+                other,
+            ]
+        )
+    )
     assert (row["episodes"], row["lead"]) == (3, pytest.approx(4.0))
 
 
 def test_an_interval_that_holds_zero_is_undecided():
-    (row,) = paired_rows(pl.concat([episodes("a", [1, -1, 2, -2]), episodes("b", [0, 0, 0, 0.1])]))
+    (row,) = paired_rows(
+        pl.concat(
+            [
+                episodes(
+                    "a",
+                    [
+                        1,
+                        -1,
+                        2,
+                        -2,
+                    ],
+                ),
+                episodes("b", [0, 0, 0, 0.1]),
+            ]
+        )
+    )
     assert row["lead_ci"][0] < 0.0 < row["lead_ci"][1]
     assert row["verdict"] == "undecided"
 
@@ -191,11 +259,33 @@ def test_a_single_driver_and_a_single_episode_give_no_pairs():
 
 
 def test_the_table_gives_the_sign_the_interval_and_the_verdict():
-    row = {"agent": "trained", "over": "mobil", "traffic": "gan"}
-    above = {**row, "lead": 12.34, "lead_ci": [4.51, 20.1], "verdict": "above"}
-    below = {**row, "lead": -3.0, "lead_ci": [-5.0, -1.0], "verdict": "below"}
+    row = {
+        "agent": "trained",
+        "over": "mobil",
+        "traffic": "gan",
+    }
+    above = {
+        **row,
+        "lead": 12.34,
+        "lead_ci": [4.51, 20.1],
+        "verdict": "above",
+    }
+    below = {
+        **row,
+        "lead": -3.0,
+        "lead_ci": [-5.0, -1.0],
+        "verdict": "below",
+    }
     heading, _, first, second = paired_table([above, below]).splitlines()
-    assert heading.split() == ["paired", "lead", "traffic", "reward", "[95", "%]", "verdict"]
+    assert heading.split() == [
+        "paired",
+        "lead",
+        "traffic",
+        "reward",
+        "[95",
+        "%]",
+        "verdict",
+    ]
     assert first.split(maxsplit=4)[-1] == "+12.3 [4.5, 20.1]    above"
     assert second.split(maxsplit=4)[-1] == "-3.0 [-5.0, -1.0]    below"
 
@@ -206,7 +296,11 @@ def by_scene(*scenes):
     for scene, count, crashes, metres in scenes:
         names += [scene] * count
         ends += [("hard_crash", metres)] * crashes + [("goal", metres)] * (count - crashes)
-    driven = pl.DataFrame(ends, schema=["reason", "distance_m"], orient="row")
+    driven = pl.DataFrame(
+        ends,
+        schema=["reason", "distance_m"],
+        orient="row",
+    )
     return crashes_by_scene(driven, names)
 
 
@@ -257,7 +351,12 @@ def test_what_does_not_fit_together_is_refused():
 
 
 def test_every_failure_is_listed_with_its_seed_and_episode():
-    table = episodes("mobil", [0, 0, 0], ["hard_crash", "goal", "out_of_road"], "gan")
+    table = episodes(
+        "mobil",
+        [0, 0, 0],
+        ["hard_crash", "goal", "out_of_road"],
+        "gan",
+    )
     (row,) = failed_episodes(table)
     assert (row["driver"], row["traffic"], row["seed"]) == ("mobil", "gan", 7)
     assert (row["hard_crash"], row["out_of_road"]) == ([0], [2])

@@ -36,7 +36,11 @@ def test_the_interval_is_scipys_bca_and_repeats_with_its_seed():
     skewed = np.where(generator.random(200) < 0.08, -20.0, 260.0) + generator.normal(0, 20, 200)
     ours = mean_interval(skewed)
     theirs = stats.bootstrap(
-        (skewed,), np.mean, n_resamples=10_000, method="BCa", random_state=5
+        (skewed,),
+        np.mean,
+        n_resamples=10_000,
+        method="BCa",
+        random_state=5,
     ).confidence_interval
     width = theirs.high - theirs.low
     assert ours.value == pytest.approx(skewed.mean())
@@ -73,7 +77,15 @@ def test_pairing_removes_what_the_episodes_have_in_common():
 
 
 @pytest.mark.parametrize(
-    ("count", "trials"), [(0, 1), (0, 50), (1, 1), (3, 20), (50, 50), (700, 2000)]
+    ("count", "trials"),
+    [
+        (0, 1),
+        (0, 50),
+        (1, 1),
+        (3, 20),
+        (50, 50),
+        (700, 2000),
+    ],
 )
 def test_the_binomial_interval_agrees_with_scipy(count, trials):
     theirs = stats.binomtest(count, trials).proportion_ci(0.95, "exact")
@@ -83,7 +95,14 @@ def test_the_binomial_interval_agrees_with_scipy(count, trials):
 # Several trainings of one recipe
 
 
-def scores(trainings, episodes, between=0.0, shared=0.0, rest=0.0, seed=0):
+def scores(
+    trainings,
+    episodes,
+    between=0.0,
+    shared=0.0,
+    rest=0.0,
+    seed=0,
+):
     """Scores [S, E] that vary between trainings, between episodes (shared), and otherwise."""
     generator = np.random.default_rng(seed)
     of_training = between * generator.normal(size=(trainings, 1))
@@ -96,7 +115,21 @@ def width(estimate):
 
 
 def test_the_interquartile_mean_is_that_of_the_middle_half():
-    assert interquartile_mean([100.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, -50.0]) == 4.5
+    assert (
+        interquartile_mean(
+            [
+                100.0,
+                2.0,
+                3.0,
+                4.0,
+                5.0,
+                6.0,
+                7.0,
+                -50.0,
+            ]
+        )
+        == 4.5
+    )
     assert interquartile_mean([9.0, 1.0, 2.0, 3.0, 100.0]) == pytest.approx((2 + 3 + 9) / 3)
     assert interquartile_mean([[1.0, 3.0], [5.0, 7.0]]) == pytest.approx([2.0, 6.0])
 
@@ -111,7 +144,13 @@ def test_one_training_has_the_interval_of_its_episodes_and_one_episode_that_of_i
 
 
 def test_a_recipe_whose_trainings_differ_has_a_wider_interval_than_its_episodes_alone():
-    table = scores(5, 200, between=10.0, rest=10.0, seed=1)
+    table = scores(
+        5,
+        200,
+        between=10.0,
+        rest=10.0,
+        seed=1,
+    )
     assert width(over_trainings(table)) > 4 * width(over_trainings(table.reshape(1, -1)))
     of_means = stats.ttest_1samp(table.mean(axis=1), 0.0).confidence_interval()
     assert width(over_trainings(table)) == pytest.approx(of_means.high - of_means.low, rel=0.1)
@@ -121,7 +160,14 @@ def test_a_recipe_whose_trainings_differ_has_a_wider_interval_than_its_episodes_
 @pytest.mark.parametrize("trainings", [3, 5])
 def test_an_interval_holds_the_truth_in_95_of_100_recipes(trainings, between):
     tables = [
-        scores(trainings, 100, between=between, shared=10.0, rest=10.0, seed=seed)
+        scores(
+            trainings,
+            100,
+            between=between,
+            shared=10.0,
+            rest=10.0,
+            seed=seed,
+        )
         for seed in range(200)
     ]
     held = [estimate.low <= 0.0 <= estimate.high for estimate in map(over_trainings, tables)]
@@ -135,7 +181,15 @@ def test_a_difference_pairs_the_episodes_and_resamples_the_trainings_of_both():
     estimate = difference(better, episodes)
     assert estimate.value == pytest.approx(5.0, abs=0.02)
     assert width(estimate) < 0.1
-    first, second = scores(6, 1, between=1.0), scores(6, 1, between=1.0, seed=2)
+    first, second = (
+        scores(6, 1, between=1.0),
+        scores(
+            6,
+            1,
+            between=1.0,
+            seed=2,
+        ),
+    )
     theirs = stats.ttest_ind(first[:, 0], second[:, 0], equal_var=False).confidence_interval()
     ours = difference(first, second)
     assert ours.interval == pytest.approx(
@@ -144,7 +198,12 @@ def test_a_difference_pairs_the_episodes_and_resamples_the_trainings_of_both():
 
 
 def test_the_probability_of_improvement_is_the_share_of_pairs():
-    table = scores(5, 50, between=1.0, rest=1.0)
+    table = scores(
+        5,
+        50,
+        between=1.0,
+        rest=1.0,
+    )
     assert probability_of_improvement(table, table).value == 0.5
     assert probability_of_improvement(table + 100.0, table).interval == [1.0, 1.0]
     first, second = [[1.0], [3.0], [2.0]], [[2.0], [0.0]]

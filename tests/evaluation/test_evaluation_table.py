@@ -22,7 +22,14 @@ def test_counts_have_three_digits_and_a_unit(value, shown):
 
 @pytest.mark.parametrize(
     ("value", "shown"),
-    [(1.0, "1.00"), (0.9134, "0.913"), (12.345, "12.3"), (1234.5, "1230"), (0.0, "0"), (None, "-")],
+    [
+        (1.0, "1.00"),
+        (0.9134, "0.913"),
+        (12.345, "12.3"),
+        (1234.5, "1230"),
+        (0.0, "0"),
+        (None, "-"),
+    ],
 )
 def test_numbers_have_three_digits(value, shown):
     assert significant(value) == shown
@@ -58,9 +65,24 @@ def test_a_table_aligns_words_left_and_numbers_right():
 def test_a_narrow_terminal_gets_fewer_columns_and_a_line_that_names_the_others():
     table = aligned(
         [
-            ["agent", "hard", "m/s", "last"],
-            ["mobil", "1", "22.5", "1234"],
-            ["a_long_name", "10", "3.0", "5"],
+            [
+                "agent",
+                "hard",
+                "m/s",
+                "last",
+            ],
+            [
+                "mobil",
+                "1",
+                "22.5",
+                "1234",
+            ],
+            [
+                "a_long_name",
+                "10",
+                "3.0",
+                "5",
+            ],
         ]
     )
     text = f"a title\n\n{table}\n\na note that is longer than what the terminal has room for"

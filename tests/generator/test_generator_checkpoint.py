@@ -174,7 +174,7 @@ def test_pooled_over_folds_the_errors_stay_under_constant_velocitys_and_stand_in
     if preset == "calibrated":
         assert folds["rollout"]["tracks"] > 400
         assert folds["rollout"]["ratio_to_constant_velocity"]["mean"] <= 0.75
-    page = (Path(__file__).parents[2] / "docs" / "generator_results.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "generators.md").read_text()
     texts = {
         "mean": "mean prediction",
         "single": "a single sample",

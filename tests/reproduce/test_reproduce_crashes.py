@@ -71,8 +71,17 @@ def test_the_list_holds_failures_of_the_published_evaluation(shipped):
 
 
 def test_episodes_that_end_otherwise_are_counted_and_not_listed(tmp_path):
-    config = EvaluateConfig(agents=["random"], traffics=["idm"], env=EnvConfig(goal_m=60.0))
-    episodes = {"agent": "random", "traffic": "idm", "episode": [2, 3, 7], "decisions": [9, 1, 5]}
+    config = EvaluateConfig(
+        agents=["random"],
+        traffics=["idm"],
+        env=EnvConfig(goal_m=60.0),
+    )
+    episodes = {
+        "agent": "random",
+        "traffic": "idm",
+        "episode": [2, 3, 7],
+        "decisions": [9, 1, 5],
+    }
     rows = pl.DataFrame({**episodes, "reason": ["out_of_road", "out_of_road", "hard_crash"]})
     listed, others = find_crashes(rows, config, 3)
     assert [crash.episode for crash in listed.crashes] == [2, 3]
@@ -96,7 +105,11 @@ def test_episodes_that_end_otherwise_are_counted_and_not_listed(tmp_path):
         ("env lanes", 0),
     ],
 )
-def test_a_list_with_a_wrong_value_is_refused_in_one_sentence(path, value, small_list):
+def test_a_list_with_a_wrong_value_is_refused_in_one_sentence(
+    path,
+    value,
+    small_list,
+):
     content = part = json.loads(small_list.read_text())
     *parents, last = path.split()
     for name in parents:
@@ -111,7 +124,15 @@ def test_a_list_with_a_wrong_value_is_refused_in_one_sentence(path, value, small
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"[]", b"{}", b"\xff\xfe", b"[" * 100_000, b'{"kind": 3}']
+    "content",
+    [
+        b"",
+        b"[]",
+        b"{}",
+        b"\xff\xfe",
+        b"[" * 100_000,
+        b'{"kind": 3}',
+    ],
 )
 def test_other_files_are_refused_in_one_sentence(content, tmp_path):
     (tmp_path / "crashes.json").write_bytes(content)
@@ -123,7 +144,11 @@ def test_other_files_are_refused_in_one_sentence(content, tmp_path):
 
 
 @pytest.fixture
-def small_list(shipped, tmp_path, monkeypatch) -> Path:
+def small_list(
+    shipped,
+    tmp_path,
+    monkeypatch,
+) -> Path:
     """Two early crashes on traffic of two kinds."""
     monkeypatch.chdir(tmp_path)
     crashes = [earliest(shipped)[traffic] for traffic in ("idm_faults", "gan")]
@@ -149,11 +174,16 @@ def test_one_page_plays_crashes_of_several_traffics(small_list, capsys):
     [
         ("crashes=nowhere.json", "nowhere.json: cannot be read"),
         ("crashes=crashes.json agents=[nobody]", "none of these agents"),
-        ("crashes=crashes.json format=gif", "crashes are html, csv or parquet"),
+        ("crashes=crashes.json format=gif", "crashes are one of html, csv, parquet"),
         ("crashes=crashes.json run=RUN", "leave one of them out"),
         ("traffics=[idm]", "goes with crashes=FILE"),
     ],
 )
-def test_a_mistake_is_one_sentence(line, message, small_list, capsys):
+def test_a_mistake_is_one_sentence(
+    line,
+    message,
+    small_list,
+    capsys,
+):
     assert main(line.split()) == 2
     assert message in capsys.readouterr().err

@@ -44,7 +44,17 @@ def windows(across):
 def test_those_who_start_complete_and_make_no_lane_change_are_told_apart():
     starts, completes = np.clip(FRAMES - 8, 0, None) / 10.0, np.clip(FRAMES, None, 8) / 10.0
     steady, always = 0.001 * FRAMES, FRAMES / 10.0
-    chosen = interesting(windows([*[starts] * 3, *[-completes] * 3, *[steady] * 2, always, always]))
+    chosen = interesting(
+        windows(
+            [
+                *[starts] * 3,
+                *[-completes] * 3,
+                *[steady] * 2,
+                always,
+                always,
+            ]
+        )
+    )
     kinds = [kind for kind, count in PANELS.items() for _ in range(count)]
     assert chosen == list(zip(kinds, range(8)))
 

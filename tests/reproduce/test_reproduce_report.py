@@ -13,7 +13,13 @@ from ganlane.reproduce.report import by_recipe, comparisons, recipe_of, rows
 KM = 5.0
 
 
-def driven(agent, rewards, reasons=None, traffic="gan", at_fault=None):
+def driven(
+    agent,
+    rewards,
+    reasons=None,
+    traffic="gan",
+    at_fault=None,
+):
     """Episodes of 5 km and 200 s with these rewards and ends."""
     reasons = reasons or ["goal"] * len(rewards)
     return pl.DataFrame(
@@ -46,7 +52,10 @@ def matrix():
             [
                 driven("random_legal", [0, 0, 1, 0]),
                 driven(
-                    "mobil", [100, 100, 101, 100], [*goal, "goal", "hard_crash"], at_fault=False
+                    "mobil",
+                    [100, 100, 101, 100],
+                    [*goal, "goal", "hard_crash"],
+                    at_fault=False,
                 ),
                 driven(
                     "agent_idm@0",
@@ -117,7 +126,12 @@ def test_trainings_are_matched_by_their_seed():
     theirs = [driven(f"agent_idm@{seed}", [0, 0], ends) for seed, ends in ((2, goal), (1, crash))]
     (row,) = comparisons(by_recipe(pl.concat([*ours, *theirs])), [("agent_gan", "agent_idm")])
     assert row["mcnemar"] == [
-        {"driver": "agent_gan@1", "only_first": 0, "only_second": 0, "p_value": 1.0}
+        {
+            "driver": "agent_gan@1",
+            "only_first": 0,
+            "only_second": 0,
+            "p_value": 1.0,
+        }
     ]
 
 

@@ -13,7 +13,6 @@ from ganlane.sim.random import (
     Purpose,
     Stream,
     _mix,
-    absorb,
     draw_keys,
     episode_key,
     normal,
@@ -153,8 +152,3 @@ def test_normal_numbers_have_the_moments_of_the_normal_distribution():
     assert abs((z**3).mean()) < 5 * math.sqrt(15.0) * error
     assert abs((z**4).mean() - 3.0) < 5 * math.sqrt(96.0) * error
     assert torch.isfinite(z).all()
-
-
-def test_absorbing_different_fields_gives_different_keys():
-    key = keys(1)
-    assert absorb(key, 1).item() != absorb(key, 2).item() != key.item()

@@ -208,13 +208,6 @@ def test_weights_of_a_fit_that_this_traffic_cannot_have_are_refused(tmp_path, se
         gan_calibrated_traffic(path=fitted_with(tmp_path, **settings))
 
 
-def test_weights_of_the_other_preset_are_refused():
-    with pytest.raises(UserError, match="paper"):
-        gan_traffic(path=shipped_generator("calibrated"))
-    with pytest.raises(UserError, match="no such file"):
-        gan_calibrated_traffic(path="nowhere.safetensors")
-
-
 @pytest.mark.parametrize(
     ("recorded", "driven"),
     [

@@ -100,34 +100,10 @@ def test_the_ego_takes_the_place_of_the_vehicle_nearest_the_middle():
     assert scene.visibility[0].tolist() == [Visibility.BODY] * 9
 
 
-def test_the_replaced_vehicle_is_recorded_long_enough():
-    """The vehicle in the middle leaves after 0.8 s, so the next nearest is taken."""
-    scene = start(replay(*FIVE, track(6, range(21), 47.0, 15.0, 1)), keys_of([0]))
-    # Positions 0, 20, 30, 45, 47, 100: the middle is 37.5, and of 30 and 45 the second is too
-    # short.
-    assert scene.speed[0, 0] == 12.0
-
-
 def test_places_without_a_recorded_vehicle_are_not_valid():
     scene = start(replay(*FIVE), keys_of([0]), vehicles=9)
     assert scene.valid[0].tolist() == [True] * 5 + [False] * 4
     assert all(torch.isfinite(value.double()).all() for value in scene)
-
-
-def test_vehicles_go_where_they_went_and_one_that_leaves_is_no_longer_valid():
-    traffic = replay(*FIVE)
-    key = keys_of([0])
-    for step in range(1, 21):
-        now = play(traffic, key, step)
-        assert now.x[0, 1:5].tolist() == pytest.approx(
-            [
-                -10.0 + step,
-                15.0 + 1.5 * min(step, 7),
-                -30.0 + 2.0 * step,
-                70.0 + 1.5 * step,
-            ]
-        )
-        assert now.valid[0].tolist() == [True, True, step <= 7, True, True] + [False] * 4
 
 
 def test_the_episode_lasts_as_long_as_the_scene():

@@ -1,4 +1,4 @@
-"""The notebook in examples/ runs from its first cell to its last, and the outputs that it is kept
+"""The notebook in examples/ runs from its first cell to its last, and the outputs that it is stored
 with are whole.
 """
 
@@ -25,7 +25,7 @@ def shown(notebook):
     assert not [output for output in outputs if output.output_type == "error"]
     data = [output.data for output in outputs if "data" in output]
     return {
-        kind: [each[kind] for each in data if kind in each]
+        kind: [output[kind] for output in data if kind in output]
         for kind in ("text/plain", "text/html", "image/png")
     }
 
@@ -34,16 +34,16 @@ def test_the_notebook_leads_to_tables_and_a_picture(tmp_path, monkeypatch):
     monkeypatch.setenv(
         "PYTHONPATH", os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     )
-    kept = nbformat.read(NOTEBOOK, as_version=4)
+    stored = nbformat.read(NOTEBOOK, as_version=4)
     notebook = nbformat.read(NOTEBOOK, as_version=4)
     resources = {"metadata": {"path": str(tmp_path)}}
     nbclient.NotebookClient(
         notebook, timeout=120, kernel_name="python3", resources=resources
     ).execute()
-    for found in (shown(notebook), shown(kept)):
-        assert found["text/plain"][0].startswith("'after 1 s: 4")
-        assert ["hurried" in table for table in found["text/html"]] == [False, True]
-        assert len(found["image/png"]) == 1
+    for outputs in (shown(notebook), shown(stored)):
+        assert outputs["text/plain"][0].startswith("'after 1 s: 4")
+        assert ["hurried" in table for table in outputs["text/html"]] == [False, True]
+        assert len(outputs["image/png"]) == 1
     assert (tmp_path / "strip.png").stat().st_size > 10_000
 
 

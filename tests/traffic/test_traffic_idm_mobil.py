@@ -164,38 +164,38 @@ def test_impossible_ranges_are_refused(name, value):
 
 
 def test_drivers_differ_and_lie_within_the_ranges():
-    own = params_of(environment(num_envs=500, traffic=IdmRandomTraffic()).reset())
+    drivers = params_of(environment(num_envs=500, traffic=IdmRandomTraffic()).reset())
     d = RandomDrivers()
     for value, (low, high) in (
-        (own.headway, d.headway_s),
-        (own.max_acceleration, d.max_acceleration),
-        (own.comfortable_deceleration, d.comfortable_deceleration),
-        (own.politeness, d.politeness),
-        (own.sway, d.sway_m),
+        (drivers.headway, d.headway_s),
+        (drivers.max_acceleration, d.max_acceleration),
+        (drivers.comfortable_deceleration, d.comfortable_deceleration),
+        (drivers.politeness, d.politeness),
+        (drivers.sway, d.sway_m),
     ):
         assert low <= value.min() < low + 0.02 * (high - low)
         assert high - 0.02 * (high - low) < value.max() <= high
         assert value.mean().item() == pytest.approx((low + high) / 2, rel=0.05)
-    assert sorted(own.delay.unique().tolist()) == [0, 1, 2, 3, 4, 5, 6]
+    assert sorted(drivers.delay.unique().tolist()) == [0, 1, 2, 3, 4, 5, 6]
     # Independent of each other.
     drawn = torch.stack(
         [
-            own.headway,
-            own.max_acceleration,
-            own.politeness,
-            own.sway,
-            own.delay,
+            drivers.headway,
+            drivers.max_acceleration,
+            drivers.politeness,
+            drivers.sway,
+            drivers.delay,
         ]
     ).flatten(1)
     assert (torch.corrcoef(drawn) - torch.eye(5)).abs().max() < 0.08
 
 
 def test_desired_speeds_are_the_drivers_own_and_the_egos_is_not_touched():
-    own, scene = (
+    theirs, scene = (
         environment(num_envs=200, traffic=traffic).reset()[keys.VEHICLES, "desired_speed"]
         for traffic in (IdmRandomTraffic(), IdmMobilTraffic())
     )
-    factor = own / scene
+    factor = theirs / scene
     assert (factor[:, 0] == 1.0).all()
     assert 0.9 <= factor.min() < 0.91
     assert 1.09 < factor.max() <= 1.1

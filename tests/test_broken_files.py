@@ -123,7 +123,7 @@ def test_an_agent_with_an_impossible_network_is_refused(name, value, capsys):
         {"kind": KIND, "version": 2, "state": {}},
         {"kind": KIND, "version": 2, "state": Bomb()},
     ],
-    ids=str,
+    ids=("empty", "text", "number", "old version", "no state", "pickle"),
 )
 def test_a_broken_state_of_a_run_is_refused(content: Any, capsys, tmp_path):
     file = tmp_path / "other.pt"

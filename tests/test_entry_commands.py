@@ -84,7 +84,10 @@ def test_cfg_shows_the_chosen_options_and_values(empty_folder, capsys):
 
 
 def test_help_does_not_wait_for_torch(tmp_path):
-    program = "import sys; from ganlane.__main__ import main; main(['train', '--help']); print('torch' in sys.modules)"
+    program = (
+        "import sys; from ganlane.__main__ import main; main(['train', '--help'])\n"
+        "print('torch' in sys.modules)"
+    )
     assert command("-c", program, cwd=tmp_path).stdout.splitlines()[-1] == "False"
 
 
@@ -100,15 +103,17 @@ def test_a_mistake_ends_the_process_with_status_2(tmp_path):
     done = command("-m", "ganlane", "train", "env.lanes=0", cwd=tmp_path)
     assert done.returncode == 2
     assert (
-        done.stderr
-        == "ganlane train: env.lanes=0: expected a number above 0; 0 means what a scene's file says.\n"
+        done.stderr == "ganlane train: env.lanes=0: expected a number above 0; "
+        "0 means what a scene's file says.\n"
     )
     assert list(tmp_path.iterdir()) == []
 
 
+#: Drives a short episode first; with the kernel a line would say so.
+RENDER = "render traffic=idm agent=keep_lane env.kernel=torch env.goal_m=40"
 #: Command line to a part of its sentence; what Hydra and the dataclasses refuse is in tests/config.
 MISTAKES = {
-    "evaluate agents=[nobody]": "agent nobody: unknown; choose one of random, random_legal, keep_lane, mobil",
+    "evaluate agents=[nobody]": "agent nobody: unknown; choose one of random, random_legal",
     "evaluate agents=[gone.safetensors]": "agent gone.safetensors: no such file",
     "evaluate agents=[no.such.Policy]": "agents=no.such.Policy: 'no.such' cannot be imported",
     "evaluate agents=[os.path]": "expected a subclass of tensordict",
@@ -134,8 +139,8 @@ MISTAKES = {
     "render out=film.avi": "episodes are one of gif, mp4, png, html, csv, parquet",
     "render run=nowhere": "nowhere: no such file; expected the metrics.csv",
     "render out=film.svg": "for learning curves only",
-    "render traffic=idm agent=keep_lane env.kernel=torch env.goal_m=40 film.start_s=500 film.end_s=501 format=csv": "choose a part",
-    "render traffic=idm agent=keep_lane env.kernel=torch env.goal_m=40 format=html film.max_bytes=10000": "film.max_bytes",
+    f"{RENDER} film.start_s=500 film.end_s=501 format=csv": "choose a part",
+    f"{RENDER} format=html film.max_bytes=10000": "film.max_bytes",
     "render run=nowhere format=gif": "learning curves are one of png, svg, pdf",
     "reproduce agents=[random_legal] traffics=[idm]": "expected mobil and others",
     "reproduce agents=[mobil,agent_idm@77] traffics=[idm]": "no training with seed 77",

@@ -284,7 +284,11 @@ def render(
     return Path(str(line).partition(": ")[2])
 
 
-def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
+def run(
+    command: str,
+    folder: str | Path | None = None,
+    **keys: Any,
+) -> Run:
     """Run any command that writes ``results.json``: ``record``, ``prepare``, ``realism`` ...
 
     ``run("prepare", data={"name": "ngsim", "path": "raw.txt"}, out="us101")`` is

@@ -16,7 +16,12 @@ F = TypeVar("F", bound=Callable)
 Made = TypeVar("Made")
 
 
-def whole_number(name: str, value: Any, low: int, high: int) -> int:
+def whole_number(
+    name: str,
+    value: Any,
+    low: int,
+    high: int,
+) -> int:
     """``value`` as an int; NumPy's integers are allowed.
 
     Raises:
@@ -55,7 +60,11 @@ def is_import_path(name: str) -> bool:
     return "." in name and all(part.isidentifier() for part in name.split("."))
 
 
-def import_target(path: str, key: str, base: type[Made]) -> Callable[..., Made]:
+def import_target(
+    path: str,
+    key: str,
+    base: type[Made],
+) -> Callable[..., Made]:
     """The subclass of ``base``, or the function annotated to return one, at import path ``path``.
 
     Importing a module executes it: ``path`` must come from the user's command line or call, or be

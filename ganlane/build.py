@@ -245,7 +245,11 @@ def make_driver(
     )
 
 
-def make_drivers(names: Sequence[str], env: EnvConfig, device: str = "cpu") -> list[Driver]:
+def make_drivers(
+    names: Sequence[str],
+    env: EnvConfig,
+    device: str = "cpu",
+) -> list[Driver]:
     """:func:`make_driver` for several names.
 
     ``agent_idm@all`` means every shipped training of its recipe.

@@ -73,7 +73,11 @@ def recordings() -> str:
     return str(default_scenes())
 
 
-def look(subject: str, check: Callable[[], str], needed: bool = False) -> bool:
+def look(
+    subject: str,
+    check: Callable[[], str],
+    needed: bool = False,
+) -> bool:
     """Print a line about ``subject``; whether nothing that is needed is missing."""
     try:
         print(f"ok       {subject:<32} {check()}")

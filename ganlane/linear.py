@@ -23,7 +23,12 @@ _LIBRARY.define("linear(Tensor x, Tensor weight, Tensor? bias, bool relu) -> Ten
 
 
 @torch.library.impl(_LIBRARY, "linear", "CPU")
-def _operator(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
+def _operator(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None,
+    relu: bool,
+) -> Tensor:
     if ONEDNN:
         return torch.ops.mkldnn._linear_pointwise(
             x, weight, bias, "relu" if relu else "none", [], ""
@@ -33,7 +38,12 @@ def _operator(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Ten
 
 
 @torch.library.register_fake("ganlane::linear")
-def _shape(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
+def _shape(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None,
+    relu: bool,
+) -> Tensor:
     return x.new_empty((*x.shape[:-1], weight.shape[0]))
 
 
@@ -52,7 +62,12 @@ def matrix_product(
     return torch.ops.ganlane.linear(x, weight, bias, relu)
 
 
-def linear(x: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> Tensor:
+def linear(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor,
+    relu: bool = False,
+) -> Tensor:
     """``x @ weight.T + bias``, then a ReLU if asked for, with gradients.
 
     ``x`` is [..., I], ``weight`` [O, I] and ``bias`` [O]; by oneDNN where ``x`` has two dimensions.
@@ -68,7 +83,12 @@ class _OneDnnLinear(torch.autograd.Function):
     """oneDNN's operator has no gradient of its own: it is two more products."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    def forward(
+        ctx: Any,
+        x: Tensor,
+        weight: Tensor,
+        bias: Tensor,
+    ) -> Tensor:
         ctx.save_for_backward(x, weight)
         return matrix_product(x, weight, bias)
 

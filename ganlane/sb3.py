@@ -127,7 +127,12 @@ class HighwayVecEnv(VecEnv):
         """An attribute of the batch, once per row."""
         return [getattr(self.highways, attr_name) for _ in self._get_indices(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+    def set_attr(
+        self,
+        attr_name: str,
+        value: Any,
+        indices: Indices = None,
+    ) -> None:
         """Refused: the rows are one batch and have no attributes of their own.
 
         Raises:

@@ -203,7 +203,13 @@ class _Highway:
         if not ego_signals:
             self._cars[EGO_INDEX].target_lane_index = self._cars[EGO_INDEX].lane_index
 
-    def drive(self, dt: float, body: Any, driver: Any, target: Any) -> None:
+    def drive(
+        self,
+        dt: float,
+        body: Any,
+        driver: Any,
+        target: Any,
+    ) -> None:
         """Move the others by ``dt`` seconds, and read them back into the arrays of :meth:`put`."""
         self.road.act()
         for i in self._there:

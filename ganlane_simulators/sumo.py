@@ -324,7 +324,12 @@ class SumoTraffic(TrafficModule):
         now.ended = waits
         return follows | shifted
 
-    def _place(self, vehicles: Any, row: int, i: int) -> Place:
+    def _place(
+        self,
+        vehicles: Any,
+        row: int,
+        i: int,
+    ) -> Place:
         """Where vehicle ``i`` of a row is."""
         lane = round(float(vehicles.y[row, i]) / float(self.road.lane_width_m))
         # A body may lean over the edge of the road; SUMO knows only lanes.
@@ -335,7 +340,13 @@ class SumoTraffic(TrafficModule):
             float(vehicles.speed[row, i]),
         )
 
-    def _start(self, now: _Simulation, row: int, vehicles: Any, key: Tensor) -> None:
+    def _start(
+        self,
+        now: _Simulation,
+        row: int,
+        vehicles: Any,
+        key: Tensor,
+    ) -> None:
         """A new episode on a highway."""
         m = vehicles.x.shape[1]
         now.roads.clear(row)
@@ -482,7 +493,11 @@ def _arrays(vehicles: Vehicles) -> Any:
     return Vehicles(*(field.detach().cpu().numpy() for field in vehicles))  # type: ignore[arg-type]
 
 
-def _same(vehicles: Any, other: Any, *names: str) -> Flags:
+def _same(
+    vehicles: Any,
+    other: Any,
+    *names: str,
+) -> Flags:
     """Rows [N] in which these fields of the others are as in ``other``; none without it."""
     same = np.full(len(vehicles.x), other is not None)
     for name in names if other is not None else ():
@@ -490,7 +505,12 @@ def _same(vehicles: Any, other: Any, *names: str) -> Flags:
     return same
 
 
-def _driver(u: Array, vehicles: Any, row: int, i: int) -> SumoDriver:
+def _driver(
+    u: Array,
+    vehicles: Any,
+    row: int,
+    i: int,
+) -> SumoDriver:
     """The driver of vehicle ``i`` of a row by the uniforms ``u`` in [0, 1)."""
     is_lorry = vehicles.length[row, i] >= LORRY_M
     ranges, emergency_decel = (LORRIES, 7.0) if is_lorry else (CARS, 9.0)

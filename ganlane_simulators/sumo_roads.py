@@ -133,7 +133,12 @@ class SumoRoads:
         for driver, place in zip(drivers, places):
             self.names[row].append(self._add(row, driver, place) if driver else "")
 
-    def _add(self, row: int, driver: SumoDriver, place: Place) -> str:
+    def _add(
+        self,
+        row: int,
+        driver: SumoDriver,
+        place: Place,
+    ) -> str:
         """A new vehicle, on the road at once; its name."""
         self._serial += 1
         name = f"{row}.{self._serial}"
@@ -156,7 +161,12 @@ class SumoRoads:
         vehicle.setPreviousSpeed(name, place.speed)
         return name
 
-    def replace(self, row: int, index: int, place: Place) -> None:
+    def replace(
+        self,
+        row: int,
+        index: int,
+        place: Place,
+    ) -> None:
         """Put one of the others somewhere else: a new vehicle of the same driver.
 
         SUMO's own move leaves traces.
@@ -241,7 +251,11 @@ def _edge(row: int) -> str:
     return f"h{row}"
 
 
-def _network(rows: int, lanes: int, width: float) -> str:
+def _network(
+    rows: int,
+    lanes: int,
+    width: float,
+) -> str:
     """The net file: lane 0 on the right, its centre at y = 0, as ours."""
     end = ORIGIN_M + LENGTH_M
     parts = []

@@ -109,7 +109,10 @@ def test_a_full_disk_ends_it_with_one_sentence(arguments):
     with open("/dev/full", "w") as full, started(arguments, stdout=full) as process:
         _, err = process.communicate(timeout=120)
     name = "ganlane train" if "train" in arguments else "ganlane"
-    told = "a file or standard output: No space left on device; make room there, or write to another disk.\n"
+    told = (
+        "a file or standard output: No space left on device; "
+        "make room there, or write to another disk.\n"
+    )
     assert err == f"{name}: {told}"
     assert process.returncode == 2
 

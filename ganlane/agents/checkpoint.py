@@ -125,7 +125,11 @@ def agent_file(name: str | Path) -> Path:
     return path
 
 
-def save_agent(path: str | Path, agent: Rainbow, metadata: Mapping[str, Any]) -> None:
+def save_agent(
+    path: str | Path,
+    agent: Rainbow,
+    metadata: Mapping[str, Any],
+) -> None:
     """Write the agent's online network atomically, as a ``.safetensors`` file.
 
     ``metadata`` is JSON-serialisable; by convention ``observation`` (the name of the observation)
@@ -231,7 +235,11 @@ def load_agent(
     return GreedyPolicy(network.to(device)), metadata
 
 
-def check_observation_size(name: str | Path, config: NetworkConfig, observation_size: int) -> None:
+def check_observation_size(
+    name: str | Path,
+    config: NetworkConfig,
+    observation_size: int,
+) -> None:
     """Refuse an agent whose network takes another number of inputs."""
     if config.observation_size != observation_size:
         raise UserError(

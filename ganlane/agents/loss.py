@@ -150,7 +150,12 @@ class LeanDistributionalLoss(_WithTarget, DistributionalDQNLoss):
 class LeanDQNLoss(_WithTarget, DQNLoss):
     """Plain DQN loss (Huber), double or not: Rainbow with ``distributional=False``."""
 
-    def __init__(self, network: QNetwork, gamma: float, double: bool = True) -> None:
+    def __init__(
+        self,
+        network: QNetwork,
+        gamma: float,
+        double: bool = True,
+    ) -> None:
         actor = QValueActor(
             network,
             in_keys=["observation"],
@@ -201,7 +206,11 @@ class LeanDQNLoss(_WithTarget, DQNLoss):
         )
 
 
-def bellman(batch: TensorDictBase, gamma: float, value: Tensor) -> Tensor:
+def bellman(
+    batch: TensorDictBase,
+    gamma: float,
+    value: Tensor,
+) -> Tensor:
     """Return of each transition plus the discounted ``value`` [B, K] or [K] of what follows.
 
     Nothing follows where it terminated.
@@ -212,7 +221,11 @@ def bellman(batch: TensorDictBase, gamma: float, value: Tensor) -> Tensor:
     return batch.get(("next", "reward")).to(value.dtype) + alive * discount * value
 
 
-def project(values: Tensor, probabilities: Tensor, support: Tensor) -> Tensor:
+def project(
+    values: Tensor,
+    probabilities: Tensor,
+    support: Tensor,
+) -> Tensor:
     """Project the distribution with ``probabilities`` at ``values``, [B, K], onto ``support`` [K].
 
     Values outside the support are clamped to its ends. Each mass is split between its two
@@ -233,7 +246,11 @@ def project(values: Tensor, probabilities: Tensor, support: Tensor) -> Tensor:
     return projected.scatter_add_(1, index + 1, share)
 
 
-def projected(values: Tensor, probabilities: Tensor, support: Tensor) -> tuple[Tensor, Tensor]:
+def projected(
+    values: Tensor,
+    probabilities: Tensor,
+    support: Tensor,
+) -> tuple[Tensor, Tensor]:
     """What :func:`project` gives, and the mass that it clamps, a mean over the batch, 0-dim."""
     # counted before the clamping, weighted by probability
     outside = (values < support[0]) | (values > support[-1])

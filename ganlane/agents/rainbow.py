@@ -281,6 +281,11 @@ class Rainbow:
             load_replay_state(self.replay, state["replay"])
 
 
-def annealed(start: float, end: float, done: int, total: int) -> float:
+def annealed(
+    start: float,
+    end: float,
+    done: int,
+    total: int,
+) -> float:
     """From ``start`` to ``end`` in a straight line over ``total``, then ``end``."""
     return end if done >= total else start + (end - start) * done / total

@@ -102,7 +102,11 @@ def short_report(prepared: Preparation) -> str:
     return "\n".join(lines)
 
 
-def long_report(prepared: Preparation, source: str, figure: str) -> str:
+def long_report(
+    prepared: Preparation,
+    source: str,
+    figure: str,
+) -> str:
     """A page of Markdown about the recordings ``source``, with the image ``figure``."""
     # Each table with what it needs to be read.
     parts = [

@@ -107,7 +107,11 @@ def _new_folder(place: Path) -> Iterator[Path]:
             rmtree(part, ignore_errors=True)
 
 
-def _episodes(rows: TensorRows, policy: Any, config: RecordConfig) -> Iterator[EpisodeBuffer]:
+def _episodes(
+    rows: TensorRows,
+    policy: Any,
+    config: RecordConfig,
+) -> Iterator[EpisodeBuffer]:
     """The episodes as they end; row i of N drives i, i + N, i + 2N, ..."""
     buffers: dict[int, Any] = {}
 
@@ -154,7 +158,11 @@ def _append(lists: dict[str, Any], values: dict[str, Any]) -> None:
             lists.setdefault(name, []).append(value)
 
 
-def _write(storage: Any, episodes: Iterator[EpisodeBuffer], count: int) -> dict[str, Any]:
+def _write(
+    storage: Any,
+    episodes: Iterator[EpisodeBuffer],
+    count: int,
+) -> dict[str, Any]:
     """Write the episodes in the order of their numbers, as Minari wants; what they were like."""
     waiting: dict[int | None, EpisodeBuffer] = {}
     written, decisions, total, ends = 0, 0, 0.0, Counter[str]()

@@ -44,7 +44,11 @@ def render(config: RenderConfig, folder: Path) -> str:
     return f"tracks: {write_tracks(shown, out, kind)}"
 
 
-def _record(config: RenderConfig, agent: str, number: int) -> Trajectory:
+def _record(
+    config: RenderConfig,
+    agent: str,
+    number: int,
+) -> Trajectory:
     """Drive an episode and print how it ended."""
     driver = make_driver(agent, config.env, device=config.device)
     traffic = make_traffic(config.traffic, config.env, Stream.REPORT)

@@ -148,7 +148,11 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()).rstrip(".") + "."
 
 
-def _single_run(command: str, words: list[str], task: Task | None) -> tuple[Any, Path] | None:
+def _single_run(
+    command: str,
+    words: list[str],
+    task: Task | None,
+) -> tuple[Any, Path] | None:
     """The settings and folder of the run that the words ask for.
 
     None where they ask for something else, which is done here: help, the configuration, a sweep.
@@ -234,7 +238,11 @@ def call_settings(command: str, keys: Mapping[str, Any]) -> Any:
 # --- sweeps
 
 
-def _sweep(command: str, overrides: list[Override], task: Task | None) -> None:
+def _sweep(
+    command: str,
+    overrides: list[Override],
+    task: Task | None,
+) -> None:
     """All combinations, each in its own folder, by Hydra's launcher; all are checked before."""
     if any(word.key_or_group == "resume" for word in overrides):
         raise UserError("resume: one run is resumed at a time; start without -m.")

@@ -97,7 +97,12 @@ def download(
 class _Part:
     """The incomplete file ``.NAME.part`` of ``url`` next to ``path``, and a note of its version."""
 
-    def __init__(self, url: str, path: Path, most_bytes: int) -> None:
+    def __init__(
+        self,
+        url: str,
+        path: Path,
+        most_bytes: int,
+    ) -> None:
         self.url = url
         self.most_bytes = most_bytes
         # Hidden, beside the file, so that the last step is a rename.
@@ -270,7 +275,11 @@ def _network_errors() -> Iterator[None]:
         ) from error
 
 
-def _check_sha256(path: Path, sha256: str | None, advice: str) -> None:
+def _check_sha256(
+    path: Path,
+    sha256: str | None,
+    advice: str,
+) -> None:
     """Compare with the checksum, if one is given."""
     if sha256 is None:
         return

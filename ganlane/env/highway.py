@@ -363,7 +363,12 @@ class HighwayEnv(EnvBase):
             self._show_steps(self.recorder, state, action)
         return after
 
-    def _show_steps(self, recorder: Recorder, state: TensorDictBase, action: Tensor) -> None:
+    def _show_steps(
+        self,
+        recorder: Recorder,
+        state: TensorDictBase,
+        action: Tensor,
+    ) -> None:
         """Show ``recorder`` the physics steps of the decision ``action`` [N] in ``state``.
 
         The kernel drives it once more, in decisions of one physics step, which gives the same bits.

@@ -121,7 +121,12 @@ def begin(
     return start, command
 
 
-def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -> Substep:
+def advance(
+    rules: Rules,
+    before: Substep,
+    moved: Vehicles,
+    all_running: bool,
+) -> Substep:
     """One physics step in which the others have ``moved``: moves the ego and finds the events.
 
     A hard crash has precedence over the goal, and both over the time-out. With ``all_running`` no
@@ -277,7 +282,11 @@ class EndedRows:
         return _with_rows(memory, torch.cat(self.rows), torch.cat(self.memories))  # type: ignore[arg-type]
 
 
-def _with_rows(memory: TensorDictBase, rows: Tensor, other: TensorDictBase) -> TensorDict:
+def _with_rows(
+    memory: TensorDictBase,
+    rows: Tensor,
+    other: TensorDictBase,
+) -> TensorDict:
     """``memory`` with its ``rows`` replaced by ``other`` [R], leaf by leaf."""
 
     # Leaf by leaf, since the memory is nested like the traffic.
@@ -292,7 +301,11 @@ def _with_rows(memory: TensorDictBase, rows: Tensor, other: TensorDictBase) -> T
     return TensorDict._new_unsafe(restored, batch_size=memory.batch_size)
 
 
-def _where(rows: Tensor, new: Tensor, old: Tensor) -> Tensor:
+def _where(
+    rows: Tensor,
+    new: Tensor,
+    old: Tensor,
+) -> Tensor:
     """``new`` where ``rows`` [N] is true, ``old`` elsewhere."""
     further_axes = [1] * (new.ndim - 1)
     return torch.where(rows.reshape(-1, *further_axes), new, old)

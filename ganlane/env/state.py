@@ -74,7 +74,11 @@ def done_spec(n: int) -> Composite:
     return Composite(_specs(DONE, (n, 1), torch.float32), shape=(n,))
 
 
-def _specs(fields: Fields, shape: tuple[int, ...], dtype: torch.dtype) -> dict[str, Any]:
+def _specs(
+    fields: Fields,
+    shape: tuple[int, ...],
+    dtype: torch.dtype,
+) -> dict[str, Any]:
     specs = {}
     for name, kind in fields.items():
         # TorchRL checks flags by a spec of their own.
@@ -131,7 +135,11 @@ def pack(
 # Checks of what is handed in
 
 
-def check_counter(name: str, counter: Tensor | None, rows: int) -> Tensor:
+def check_counter(
+    name: str,
+    counter: Tensor | None,
+    rows: int,
+) -> Tensor:
     """``counter`` [N] int64 of a reset.
 
     Raises:
@@ -170,7 +178,11 @@ def usable_device(device: Any, dtype: Any) -> torch.device:
     return chosen
 
 
-def checked_action(action: Tensor | None, rows: int, values: bool = True) -> Tensor:
+def checked_action(
+    action: Tensor | None,
+    rows: int,
+    values: bool = True,
+) -> Tensor:
     """``action`` [N] as int64.
 
     ``values=False`` leaves out that of the values, which the native kernel looks at itself.

@@ -108,7 +108,11 @@ def recorded(generator: Generator, displacements: Tensor) -> History:
     return History((motions[0], *motions), displacements[..., -1, :])
 
 
-def push(generator: Generator, history: History, displacement: Tensor) -> tuple[History, Tensor]:
+def push(
+    generator: Generator,
+    history: History,
+    displacement: Tensor,
+) -> tuple[History, Tensor]:
     """The history with the new motion, and its difference [N, M, 2] to the last one, m."""
     difference = displacement - history.displacement
     # Only the new motion is projected; those of the older ones are kept.
@@ -146,7 +150,11 @@ def displacement_of(vehicles: Vehicles) -> Tensor:
     return torch.stack([along, across], dim=-1)
 
 
-def moved_by(vehicles: Vehicles, velocity_x: Tensor, velocity_y: Tensor) -> Vehicles:
+def moved_by(
+    vehicles: Vehicles,
+    velocity_x: Tensor,
+    velocity_y: Tensor,
+) -> Vehicles:
     """The vehicles 0.1 s later at a new velocity (m/s, [N, M]).
 
     Nobody drives backwards or slides sideways: the lateral velocity is limited to :data:`STEEPEST`
@@ -166,7 +174,11 @@ def moved_by(vehicles: Vehicles, velocity_x: Tensor, velocity_y: Tensor) -> Vehi
     )
 
 
-def wander(noise: Tensor, fresh: Tensor, period_s: float) -> Tensor:
+def wander(
+    noise: Tensor,
+    fresh: Tensor,
+    period_s: float,
+) -> Tensor:
     """``noise`` 0.1 s later, of unit variance and with the time constant ``period_s``.
 
     ``fresh`` are independent standard normal numbers of the same shape. A period of 0 draws anew at
@@ -255,7 +267,11 @@ class DriverMemory(NamedTuple):
     headway: Tensor
 
 
-def extra_inputs(scene: Scene, anchor: Tensor, offset: Tensor) -> Tensor:
+def extra_inputs(
+    scene: Scene,
+    anchor: Tensor,
+    offset: Tensor,
+) -> Tensor:
     """The further inputs [N, M, 4], each bounded and of order 1.
 
     Without a leader the gap input is 1. ``anchor`` is IDM's acceleration, m/s2, ``offset`` the
@@ -345,7 +361,11 @@ def anchored_step(
     return moved_by(vehicles, velocity_x, velocity_y), DriverMemory(history, mean, memory.headway)
 
 
-def recorded_vehicles(segments: Segments, frame: int, desired_speed: Tensor) -> Vehicles:
+def recorded_vehicles(
+    segments: Segments,
+    frame: int,
+    desired_speed: Tensor,
+) -> Vehicles:
     """The recorded vehicles [B, V] at ``frame`` (1 or later).
 
     Their velocity is that of the last displacement. Each occupies the lane of its centre only, with
@@ -458,7 +478,11 @@ def headway_from_uniform(u: Tensor, quantiles_s: tuple[float, ...] = HEADWAY_QUA
     return values[upper - 1] + part * (values[upper] - values[upper - 1])
 
 
-def balanced_headway(vehicles: Vehicles, road: Road, otherwise: Tensor) -> Tensor:
+def balanced_headway(
+    vehicles: Vehicles,
+    road: Road,
+    otherwise: Tensor,
+) -> Tensor:
     """The headway [N, M] in s at which IDM neither speeds up nor brakes now.
 
     It follows from gap, speed and desired speed. For vehicles without a leader, or further behind

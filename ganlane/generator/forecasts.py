@@ -355,7 +355,11 @@ def calibrated_forecasts(
 
 
 @torch.no_grad()
-def idm_forecasts(scenes: list[SceneTracks], horizon: int, stride: int) -> Forecasts:
+def idm_forecasts(
+    scenes: list[SceneTracks],
+    horizon: int,
+    stride: int,
+) -> Forecasts:
     """IDM along the road in whole scenes, with constant lateral positions.
 
     ``idm``: all drivers with Table V's headway and a desired speed of 22 m/s. ``idm_own_headway``:
@@ -388,7 +392,11 @@ def idm_forecasts(scenes: list[SceneTracks], horizon: int, stride: int) -> Forec
     }
 
 
-def baseline_forecasts(windows: Windows, others: list[SceneTracks], stride: int) -> Forecasts:
+def baseline_forecasts(
+    windows: Windows,
+    others: list[SceneTracks],
+    stride: int,
+) -> Forecasts:
     """Forecasts without a network.
 
     ``mean_velocity`` repeats the mean observed displacement, which recorded noise disturbs less
@@ -439,7 +447,11 @@ def ridge_forecast(fitted: Windows, past: np.ndarray) -> np.ndarray:
     return repeated(past[:, -1], steps) + model.predict(features(past)).reshape(len(past), steps, 2)
 
 
-def energy_score(one: Tensor, other: Tensor, recorded: Tensor) -> Tensor:
+def energy_score(
+    one: Tensor,
+    other: Tensor,
+    recorded: Tensor,
+) -> Tensor:
     """Energy score [...] of two samples: mean error minus half their distance, in m.
 
     All are positions [..., 2]. A proper score: least in expectation when the samples are drawn from

@@ -56,7 +56,11 @@ def dense(
     return torch.relu(product) if relu else product
 
 
-def apply(layer: nn.Linear, x: Tensor, relu: bool = False) -> Tensor:
+def apply(
+    layer: nn.Linear,
+    x: Tensor,
+    relu: bool = False,
+) -> Tensor:
     """``layer(x)`` computed by :func:`dense`."""
     return dense(x, layer.weight, layer.bias, relu)
 
@@ -87,7 +91,12 @@ class MotionLSTM(nn.Module):
     the state; without ``differences`` the displacements' differences are 0 as inputs (an ablation).
     """
 
-    def __init__(self, embedding: int, hidden: int, differences: bool = True):
+    def __init__(
+        self,
+        embedding: int,
+        hidden: int,
+        differences: bool = True,
+    ):
         super().__init__()
         self.hidden = hidden
         self.differences = differences
@@ -111,7 +120,12 @@ class MotionLSTM(nn.Module):
         )
         return apply(self.input, embedded)
 
-    def step(self, projected: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
+    def step(
+        self,
+        projected: Tensor,
+        hidden: Tensor,
+        cell: Tensor,
+    ) -> tuple[Tensor, Tensor]:
         """One recurrence on a projection [..., 4H] and state ([..., H], [..., H]).
 
         Returns the new state.
@@ -145,7 +159,11 @@ def _times_tanh(factor: Tensor, x: Tensor) -> Tensor:
     return torch.addcmul(-factor, factor, torch.sigmoid(x + x), value=2.0)
 
 
-def nearest(position: Tensor, valid: Tensor, neighbours: int) -> tuple[Tensor | None, Tensor]:
+def nearest(
+    position: Tensor,
+    valid: Tensor,
+    neighbours: int,
+) -> tuple[Tensor | None, Tensor]:
     """Indices [B, G, K] of the ``neighbours`` nearest other vehicles of each, and a mask of them.
 
     ``position`` is [B, G, 2] in m, ``valid`` [B, G]. If there are not more vehicles than that, the
@@ -184,7 +202,13 @@ class PairPooling(nn.Module):
     ``neighbours`` is no pooling.
     """
 
-    def __init__(self, hidden: int, inner: int, pooled: int, neighbours: int):
+    def __init__(
+        self,
+        hidden: int,
+        inner: int,
+        pooled: int,
+        neighbours: int,
+    ):
         super().__init__()
         self.neighbours = neighbours
         self.per_pair = nn.Linear(len(_PAIR_SCALE), inner)
@@ -274,7 +298,12 @@ class Generator(nn.Module):
         """
         return self.encoder.project(displacements[..., 1:, :], displacements.diff(dim=-2))
 
-    def observe(self, displacements: Tensor, position: Tensor, valid: Tensor) -> Observation:
+    def observe(
+        self,
+        displacements: Tensor,
+        position: Tensor,
+        valid: Tensor,
+    ) -> Observation:
         """The input from observed displacements [B, G, observed, 2], without further inputs."""
         last = displacements[..., -1, :]
         before = displacements[..., -2, :]

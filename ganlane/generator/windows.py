@@ -207,7 +207,11 @@ class Segments:
         )
 
 
-def segment_starts(scene: SceneTracks, horizon: int, stride: int = 1) -> list[int]:
+def segment_starts(
+    scene: SceneTracks,
+    horizon: int,
+    stride: int = 1,
+) -> list[int]:
     """Rows where a segment of 9 + ``horizon`` frames with at least one driven vehicle starts."""
     rows = range(
         0,
@@ -217,7 +221,12 @@ def segment_starts(scene: SceneTracks, horizon: int, stride: int = 1) -> list[in
     return [row for row in rows if scene.present[row : row + OBSERVED_POSITIONS].all(0).any()]
 
 
-def segment_batches(scene: SceneTracks, horizon: int, stride: int, size: int) -> Iterator[Segments]:
+def segment_batches(
+    scene: SceneTracks,
+    horizon: int,
+    stride: int,
+    size: int,
+) -> Iterator[Segments]:
     """All segments that start every ``stride`` frames, ``size`` at a time."""
     rows = segment_starts(scene, horizon, stride)
     for first in range(0, len(rows), size):
@@ -397,7 +406,11 @@ class Groups:
         )
 
 
-def kmeans_labels(positions: np.ndarray, size: int, seed: int) -> np.ndarray:
+def kmeans_labels(
+    positions: np.ndarray,
+    size: int,
+    seed: int,
+) -> np.ndarray:
     """Group number [n] of each of n positions [n, 2] in m, by k-means.
 
     Groups have about ``size`` members.
@@ -408,7 +421,11 @@ def kmeans_labels(positions: np.ndarray, size: int, seed: int) -> np.ndarray:
     return KMeans(groups, n_init=1, random_state=seed).fit_predict(positions)
 
 
-def group_windows(windows: Windows, size: int = 9, seed: int = 0) -> Groups:
+def group_windows(
+    windows: Windows,
+    size: int = 9,
+    seed: int = 0,
+) -> Groups:
     """Split the vehicles of every (scene, start) into k-means groups of about ``size``, padded.
 
     Uses the last observed positions only.

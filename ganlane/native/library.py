@@ -138,7 +138,11 @@ def load(variant: str | None = None) -> ctypes.CDLL:
 
 
 @lru_cache(maxsize=8)
-def _load(variant: str, compiler: tuple[str, ...] | None, folder: Path) -> ctypes.CDLL:
+def _load(
+    variant: str,
+    compiler: tuple[str, ...] | None,
+    folder: Path,
+) -> ctypes.CDLL:
     # That of the wheel fits only if it was built from these very sources.
     path = _prebuilt(variant)
     if not path.is_file():

@@ -94,7 +94,12 @@ class _Function:
         UserError: the road is a ring or differs from row to row, or the kernel cannot be built.
     """
 
-    def __init__(self, name: str, numbers: ctypes.Structure, variant: str | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        numbers: ctypes.Structure,
+        variant: str | None = None,
+    ) -> None:
         self._name = name
         self._numbers = numbers
         self._variant = variant
@@ -108,7 +113,12 @@ class _Function:
         self.__dict__.update(state)
         self._call = getattr(load(self._variant), self._name)
 
-    def _run(self, rows: int, inputs: Iterable[Tensor | None], outputs: Sequence[Tensor]) -> None:
+    def _run(
+        self,
+        rows: int,
+        inputs: Iterable[Tensor | None],
+        outputs: Sequence[Tensor],
+    ) -> None:
         # The contiguous copies have to live until the call is over.
         read = [tensor if tensor is None else tensor.contiguous() for tensor in inputs]
         pointers = (ctypes.byref(self._numbers), addresses(read), addresses(outputs))
@@ -211,7 +221,12 @@ class NativeScenes(_Function):
         )
         super().__init__("ganlane_spawn", numbers)
 
-    def start(self, seed: Tensor, episode: Tensor, rows: Tensor | None = None) -> TensorDict:
+    def start(
+        self,
+        seed: Tensor,
+        episode: Tensor,
+        rows: Tensor | None = None,
+    ) -> TensorDict:
         """The first states of the episodes (``seed``, ``episode``) [N] int64.
 
         ``rows`` [N] bool are those to be drawn; None: all. The others are zeros, without a vehicle.
@@ -239,7 +254,13 @@ class LaneView(_Function):
         form: one of :data:`ganlane.native.settings.NATIVE_FORMS`.
     """
 
-    def __init__(self, road: Road, vehicles: int, scale: ObservationScale, form: str) -> None:
+    def __init__(
+        self,
+        road: Road,
+        vehicles: int,
+        scale: ObservationScale,
+        form: str,
+    ) -> None:
         view = settings.view_of(*_shape(road, vehicles), scale, form)
         self.size = view.numbers()
         super().__init__("ganlane_lane_view", view)

@@ -205,7 +205,11 @@ class Record:
         return kinds[choice], data
 
 
-def make(kind: type[Part], data: Any, key: str = "") -> Part:
+def make(
+    kind: type[Part],
+    data: Any,
+    key: str = "",
+) -> Part:
     """A record of ``kind`` from plain data; ``key`` is its own, for messages.
 
     Raises:
@@ -285,7 +289,12 @@ _WORDS = {
 }
 
 
-def _fitted(hint: Any, value: Any, key: str, field: Field[Any]) -> Any:
+def _fitted(
+    hint: Any,
+    value: Any,
+    key: str,
+    field: Field[Any],
+) -> Any:
     """``value`` as the annotation ``hint`` wants it, its ranges checked."""
     # Peel the annotation from the outside: optional, ranges, then what the value itself is.
     kind, inner = get_origin(hint) or hint, get_args(hint)
@@ -320,7 +329,12 @@ def _fitted(hint: Any, value: Any, key: str, field: Field[Any]) -> Any:
     return _scalar(kind, value, key, field)
 
 
-def _scalar(kind: Any, value: Any, key: str, field: Field[Any]) -> Any:
+def _scalar(
+    kind: Any,
+    value: Any,
+    key: str,
+    field: Field[Any],
+) -> Any:
     """A number, text or switch of the type ``kind``."""
     if kind is Any:
         return value
@@ -344,7 +358,12 @@ def _scalar(kind: Any, value: Any, key: str, field: Field[Any]) -> Any:
     raise _refusal(key, value, _WORDS.get(kind, kind.__name__), field)
 
 
-def _refusal(key: str, value: Any, expected: str, field: Field[Any]) -> ParameterError:
+def _refusal(
+    key: str,
+    value: Any,
+    expected: str,
+    field: Field[Any],
+) -> ParameterError:
     # The default is a value that works, so it serves as the example.
     default = field.default
     if field.default_factory is not MISSING:

@@ -149,7 +149,11 @@ class Command(NamedTuple):
     off_road: Tensor
 
 
-def is_heard(side: Tensor, direction: Tensor, abort: bool) -> Tensor:
+def is_heard(
+    side: Tensor,
+    direction: Tensor,
+    abort: bool,
+) -> Tensor:
     """Whether a wish to go to ``side`` is obeyed during a lane change in ``direction`` (each -1, 0
     or 1).
 
@@ -237,7 +241,11 @@ def ego_surroundings(
     )
 
 
-def change_progress(ego: Vehicles, direction: Tensor, road: Road) -> Tensor:
+def change_progress(
+    ego: Vehicles,
+    direction: Tensor,
+    road: Road,
+) -> Tensor:
     """Progress [N] of the current lane change, 0 at its start to 1 at the target lane's centre.
 
     0 without one.

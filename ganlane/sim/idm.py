@@ -138,7 +138,11 @@ def following_acceleration(
 HORIZON_S = 60.0
 
 
-def needed_deceleration(speed: Tensor, leader_speed: Tensor, gap: Tensor) -> Tensor:
+def needed_deceleration(
+    speed: Tensor,
+    leader_speed: Tensor,
+    gap: Tensor,
+) -> Tensor:
     """Constant deceleration, m/s2, that avoids a leader of constant speed ``gap`` m ahead.
 
     Infinite at 0 m.

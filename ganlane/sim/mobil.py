@@ -44,7 +44,11 @@ class LaneAccelerations(NamedTuple):
         return LaneAccelerations(*(number[..., lanes] for number in self))
 
 
-def lane_accelerations(scene: Scene, lanes: Tensor, idm: AnyIdm) -> LaneAccelerations:
+def lane_accelerations(
+    scene: Scene,
+    lanes: Tensor,
+    idm: AnyIdm,
+) -> LaneAccelerations:
     """The :class:`LaneAccelerations` of each observer in ``lanes`` [N, K, L] (float).
 
     With per-driver parameters, each driver predicts the others with its own parameters.

@@ -126,7 +126,11 @@ def _beyond(number: Tensor, where: Tensor) -> Tensor:
     return torch.add(number, where, alpha=_BEYOND)
 
 
-def compare(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Pairs:
+def compare(
+    vehicles: Vehicles,
+    road: Road,
+    which: slice = slice(None),
+) -> Pairs:
     """The :class:`Pairs` of all vehicles as observers, or of a slice of them."""
     distance = road.distance_ahead(vehicles.x[:, which, None], vehicles.x[:, None, :])
     # Between the bumpers: the distance of the centres less half of both lengths.
@@ -137,7 +141,11 @@ def compare(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Pairs
     return Pairs(distance, gap, distance + tie)
 
 
-def perceive(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Scene:
+def perceive(
+    vehicles: Vehicles,
+    road: Road,
+    which: slice = slice(None),
+) -> Scene:
     """The :class:`Scene` of ``vehicles`` as seen by all of them or by a slice of them."""
     body = body_lanes(vehicles, road)
     attention = with_target(body, vehicles)
@@ -224,7 +232,11 @@ def follower(scene: Scene, lane: Tensor) -> Follower:
     return Follower(gap, speed, desired_speed, gap < FREE_GAP_M)
 
 
-def _candidates(scene: Scene, lanes: Tensor, side: int) -> Tensor:
+def _candidates(
+    scene: Scene,
+    lanes: Tensor,
+    side: int,
+) -> Tensor:
     """Where the near end of each vehicle ahead (``side`` 1) or behind (-1) in each lane is, m,
     [N, K, L, M].
 
@@ -244,7 +256,11 @@ def _candidates(scene: Scene, lanes: Tensor, side: int) -> Tensor:
     return _beyond(ends, ~in_lane(scene, lanes))
 
 
-def _gap(scene: Scene, end: Tensor, side: int) -> Tensor:
+def _gap(
+    scene: Scene,
+    end: Tensor,
+    side: int,
+) -> Tensor:
     """Gap from each observer's bumper to ``end``, m; :data:`FREE_GAP_M` where nobody is."""
     o = scene.observers
     distance = end

@@ -78,14 +78,23 @@ def absorb(key: Tensor, field: Tensor | int) -> Tensor:
     return _mix((key ^ field) + _GOLDEN)
 
 
-def episode_key(stream: int, seed: Tensor, episode: Tensor) -> Tensor:
+def episode_key(
+    stream: int,
+    seed: Tensor,
+    episode: Tensor,
+) -> Tensor:
     """Key of an episode, [N] int64, from the stream and the counters [N] int64."""
     # The 0 after the stream stays: without it all episodes so far would change.
     start = torch.full_like(seed, int(stream))
     return absorb(absorb(absorb(start, 0), seed), episode)
 
 
-def draw_keys(key: Tensor, step: Tensor | int, vehicles: int, purposes: list[int]) -> Tensor:
+def draw_keys(
+    key: Tensor,
+    step: Tensor | int,
+    vehicles: int,
+    purposes: list[int],
+) -> Tensor:
     """Keys [N, vehicles, len(purposes)] from episode keys [N] and physics steps [N] or one int."""
     # Field by field, from what all share to what is one number's own.
     at_step = absorb(key, step)

@@ -21,7 +21,11 @@ STALLED_MPS = 0.001
 ASKEW_M = 0.6
 
 
-def stalled(x_m: float, lane: int, lane_width_m: float = 4.0) -> SceneVehicle:
+def stalled(
+    x_m: float,
+    lane: int,
+    lane_width_m: float = 4.0,
+) -> SceneVehicle:
     """A vehicle that has broken down in ``lane``."""
     return SceneVehicle(x_m, y_m=lane * lane_width_m - ASKEW_M, desired_speed_mps=STALLED_MPS)
 
@@ -172,7 +176,11 @@ def stop_and_go(
     return tuple(cars)
 
 
-def _at_least(lanes: int, needed: int, name: str) -> None:
+def _at_least(
+    lanes: int,
+    needed: int,
+    name: str,
+) -> None:
     if lanes < needed:
         raise UserError(
             f"env.lanes={lanes}: env={name} needs {needed} lanes or more; give env.lanes={needed}."

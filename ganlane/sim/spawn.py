@@ -78,7 +78,12 @@ def _rank(value: Tensor, same: Tensor | None = None) -> Tensor:
     return (before if same is None else before & same).sum(-1)
 
 
-def draw_lanes(key: Tensor, vehicles: int, lanes: int, capacity: int) -> Tensor:
+def draw_lanes(
+    key: Tensor,
+    vehicles: int,
+    lanes: int,
+    capacity: int,
+) -> Tensor:
     """A random lane for each vehicle, [N, vehicles] int64, at most ``capacity`` in each.
 
     All places of all lanes are shuffled and the first ``vehicles`` of them taken.
@@ -88,7 +93,12 @@ def draw_lanes(key: Tensor, vehicles: int, lanes: int, capacity: int) -> Tensor:
     return places.argsort(dim=1, stable=True)[:, :vehicles] // capacity
 
 
-def place_in_lanes(lane: Tensor, u: Tensor, spread_m: float, spacing_m: float) -> Tensor:
+def place_in_lanes(
+    lane: Tensor,
+    u: Tensor,
+    spread_m: float,
+    spacing_m: float,
+) -> Tensor:
     """Positions in m, [N, M].
 
     In a lane of k sorted uniforms on [0, spread - spacing (k - 1)] plus spacing * rank.
@@ -227,13 +237,21 @@ def _described(road: Road) -> str:
 # Recycling
 
 
-def out_of_range(vehicles: Vehicles, road: Road, range_m: float = RANGE_M) -> Tensor:
+def out_of_range(
+    vehicles: Vehicles,
+    road: Road,
+    range_m: float = RANGE_M,
+) -> Tensor:
     """Whether a vehicle is more than ``range_m`` ahead of the ego or behind it, bool [N, M]."""
     distance = road.distance_ahead(vehicles.x[:, EGO_INDEX, None], vehicles.x)
     return (distance.abs() > range_m) & vehicles.valid
 
 
-def _room(there: Scene, idm: IdmParameters, safe: float) -> Tensor:
+def _room(
+    there: Scene,
+    idm: IdmParameters,
+    safe: float,
+) -> Tensor:
     """Whether each of the first M vehicles asks nobody for more than ``safe`` m/s2, bool [N, M].
 
     ``there`` holds 2 M vehicles: all at their new positions, then all at their current ones. So the

@@ -262,7 +262,12 @@ class TrafficModule(TensorDictModuleBase):
         """
         return vehicles, self.init_memory(vehicles, absorb(key, 0))
 
-    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
+    def memory_spec(
+        self,
+        n: int,
+        m: int,
+        dtype: torch.dtype = torch.float32,
+    ) -> dict[str, Any]:
         """Nested name -> (shape, dtype) of the memory of ``n`` rows of ``m`` vehicles."""
         return {
             name: ((n, m, *shape), own_dtype or dtype)
@@ -330,7 +335,12 @@ class TrafficParts(TrafficModule):
         for _, part in self.named_parts():
             part.compile_graphs()
 
-    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
+    def memory_spec(
+        self,
+        n: int,
+        m: int,
+        dtype: torch.dtype = torch.float32,
+    ) -> dict[str, Any]:
         """The parts' specs, by name."""
         return {name: part.memory_spec(n, m, dtype) for name, part in self.named_parts()}
 

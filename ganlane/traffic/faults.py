@@ -108,7 +108,12 @@ class Fault(Overlay, Generic[Faults]):
         super().__init__(road, stream)
         self.faults: Faults = faults or self.kind()
 
-    def draw(self, vehicles: Vehicles, key: Tensor, step: Tensor) -> Tensor:
+    def draw(
+        self,
+        vehicles: Vehicles,
+        key: Tensor,
+        step: Tensor,
+    ) -> Tensor:
         """A uniform number per vehicle, [N, M]."""
         return uniforms(vehicles, key, step, self.purpose)[0]
 

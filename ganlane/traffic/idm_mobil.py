@@ -98,7 +98,12 @@ class IdmTraffic(TrafficModule):
             memory,
         )
 
-    def drive(self, scene: Scene, target: Tensor, memory: Memory) -> Moved:
+    def drive(
+        self,
+        scene: Scene,
+        target: Tensor,
+        memory: Memory,
+    ) -> Moved:
         """The vehicles at t + 0.1 s, steered to the lanes ``target`` [N, M] int64."""
         centre = self.road.centre_of(target, scene.vehicles.y.dtype)
         acceleration = following_acceleration(scene, self.idm)
@@ -170,7 +175,12 @@ class IdmMobilTraffic(IdmTraffic):
             return None
         return RuleDrivers(self.idm, self.steering, self.mobil)
 
-    def decide(self, vehicles: Vehicles, memory: Memory, due: Tensor) -> Moved:
+    def decide(
+        self,
+        vehicles: Vehicles,
+        memory: Memory,
+        due: Tensor,
+    ) -> Moved:
         """A step in which the drivers of the rows ``due`` [N] decide."""
         scene = perceive(vehicles, self.road)
         # Rows that are not at a full second keep their target lanes.
@@ -390,7 +400,12 @@ class IdmRandomTraffic(IdmMobilTraffic):
             mobil,
         )
 
-    def drive(self, scene: Scene, target: Tensor, memory: Memory) -> Moved:
+    def drive(
+        self,
+        scene: Scene,
+        target: Tensor,
+        memory: Memory,
+    ) -> Moved:
         """The vehicles at t + 0.1 s, with each driver's delay and sway."""
         v = scene.vehicles
         drivers = DriverParams.of(memory)

@@ -206,7 +206,11 @@ def _take(
     return new_tensordict(taken, len(rows))
 
 
-def _zeros(spec: Mapping[str, Any], n: int, device: torch.device) -> TensorDict:
+def _zeros(
+    spec: Mapping[str, Any],
+    n: int,
+    device: torch.device,
+) -> TensorDict:
     """A memory of zeros by :meth:`TrafficModule.memory_spec`."""
     fields: dict[str, Any] = {}
     for name, entry in spec.items():
@@ -291,7 +295,12 @@ class BlindTraffic(TrafficModule):
             len(key),
         )
 
-    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
+    def memory_spec(
+        self,
+        n: int,
+        m: int,
+        dtype: torch.dtype = torch.float32,
+    ) -> dict[str, Any]:
         """As the model's, with ``unseen``."""
         return {
             "model": self.model.memory_spec(n, m, dtype),

@@ -44,12 +44,20 @@ def literal_hazard(clock: Tensor, mean_steps: float) -> Tensor:
     return (clock / mean_steps).clamp(0.0, 1.0)
 
 
-def distance_hazard(speed: Tensor, changes_per_km: float, dt: float) -> Tensor:
+def distance_hazard(
+    speed: Tensor,
+    changes_per_km: float,
+    dt: float,
+) -> Tensor:
     """Probability per step of ``dt`` s of a change, at a constant rate per kilometre driven."""
     return 1.0 - torch.exp(-speed * (dt * changes_per_km / 1000.0))
 
 
-def random_side(u: Tensor, lane: Tensor, lanes: int | Tensor) -> Tensor:
+def random_side(
+    u: Tensor,
+    lane: Tensor,
+    lanes: int | Tensor,
+) -> Tensor:
     """A random side with a lane: -1 right, +1 left, 0 on a single-lane road.
 
     ``u`` uniform, ``lane`` int64.

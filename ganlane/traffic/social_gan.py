@@ -117,7 +117,12 @@ class GeneratedTraffic(TrafficModule):
             "displacement": history.displacement,
         }
 
-    def before(self, memory: Memory, key: Tensor, step: Tensor) -> tuple[History, Tensor]:
+    def before(
+        self,
+        memory: Memory,
+        key: Tensor,
+        step: Tensor,
+    ) -> tuple[History, Tensor]:
         """The drivers' history from the memory, and the latent vectors [N, M, Z] of this step."""
         # An autoregressive process: the latent vector keeps its variance and forgets slowly.
         noise = memory["noise"]

@@ -467,7 +467,11 @@ def transitions(rows: int, network: NetworkConfig) -> dict[str, Tensor]:
     }
 
 
-def check_like(value: Any, like: Any, name: str) -> None:
+def check_like(
+    value: Any,
+    like: Any,
+    name: str,
+) -> None:
     """Raise :class:`ValueError` unless ``value`` has the lengths, shapes and types of ``like``.
 
     It may have more keys. Numbers outside tensors must be finite, counts at least 0.

@@ -36,7 +36,11 @@ from ganlane.transforms.sensors import PerceptionTransform
 FORMS = ("legal", "safe")
 
 
-def braking_demand(vehicles: Vehicles, road: Road, idm: IdmParameters = TABLE_V) -> Tensor:
+def braking_demand(
+    vehicles: Vehicles,
+    road: Road,
+    idm: IdmParameters = TABLE_V,
+) -> Tensor:
     """Hardest braking that each action requires by IDM, as an acceleration in m/s2, [N, 3].
 
     The actions are keep, left and right: of each the smaller of the ego's acceleration in that lane
@@ -111,7 +115,12 @@ class ActionMaskTransform(PerceptionTransform):
                 abort,
             )
 
-    def allowed(self, vehicles: Vehicles, direction: Tensor, road: Road) -> tuple[Tensor, Tensor]:
+    def allowed(
+        self,
+        vehicles: Vehicles,
+        direction: Tensor,
+        road: Road,
+    ) -> tuple[Tensor, Tensor]:
         """The mask [N, 3], and whether no action is safe [N].
 
         ``vehicles`` are as the ego perceives them; ``direction`` [N] is that of its current lane
@@ -135,7 +144,12 @@ class ActionMaskTransform(PerceptionTransform):
         """Compile the mask to one graph (``env.compile=true``)."""
         self.allowed = compiled(self.allowed)  # type: ignore[method-assign]
 
-    def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
+    def write(
+        self,
+        state: TensorDictBase,
+        vehicles: Vehicles,
+        seen: Vehicles,
+    ) -> TensorDictBase:
         """Write ``action_mask``, and with ``safe`` ``no_safe_action``."""
         direction = state.get(keys.EGO).get("change_direction")
         if self.native is not None:

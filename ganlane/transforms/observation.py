@@ -67,7 +67,11 @@ class View(NamedTuple):
     direction: Tensor
 
 
-def other_vehicles(vehicles: Vehicles, road: Road, scale: ObservationScale) -> Others:
+def other_vehicles(
+    vehicles: Vehicles,
+    road: Road,
+    scale: ObservationScale,
+) -> Others:
     """The others, ordered by the vehicles' indices; an invalid one is (1, 0, 0), far ahead."""
     ego = vehicles.columns(slice(0, 1))
     others = vehicles.columns(slice(1, None))
@@ -129,7 +133,11 @@ def vehicle_list(view: View) -> Tensor:
     return torch.stack(columns, dim=-1).flatten(1)
 
 
-def lane_view(view: View, drift: bool = False, overlap: bool = False) -> Tensor:
+def lane_view(
+    view: View,
+    drift: bool = False,
+    overlap: bool = False,
+) -> Tensor:
     """The nearest vehicle in each lane and direction, [N, 18].
 
     Left, own and right lane x ahead and behind x (gap, nearness, relative speed); (1, 0, 0) if
@@ -272,7 +280,12 @@ class ObservationTransform(PerceptionTransform):
         """Compile the observation to one graph (``env.compile=true``)."""
         self.observe = compiled(self.observe)  # type: ignore[method-assign]
 
-    def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
+    def write(
+        self,
+        state: TensorDictBase,
+        vehicles: Vehicles,
+        seen: Vehicles,
+    ) -> TensorDictBase:
         """Write ``observation``."""
         # Own state from the truth, the others as perceived.
         ego = state.get(keys.EGO)

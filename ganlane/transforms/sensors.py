@@ -72,7 +72,12 @@ def measure(
 class PerceptionTransform(Transform):
     """Base of the transforms of what the ego perceives; subclasses implement :meth:`write`."""
 
-    def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
+    def write(
+        self,
+        state: TensorDictBase,
+        vehicles: Vehicles,
+        seen: Vehicles,
+    ) -> TensorDictBase:
         """Write the out keys into ``state``.
 
         ``vehicles`` are true, ``seen`` as the ego perceives them.

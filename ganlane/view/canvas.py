@@ -105,7 +105,12 @@ class Window:
         edges: rows of the left (upper) and right (lower) edge of the road.
     """
 
-    def __init__(self, look: FilmConfig, lanes: int, lane_width_m: float) -> None:
+    def __init__(
+        self,
+        look: FilmConfig,
+        lanes: int,
+        lane_width_m: float,
+    ) -> None:
         self.width, self.height, self.length_m = look.width, look.height, look.road_m
         self.lanes, self.lane_width_m = lanes, lane_width_m
         room = look.height - HEADER_HEIGHT - FOOTER_HEIGHT

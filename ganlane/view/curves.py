@@ -140,7 +140,11 @@ def read_runs(paths: Sequence[str | Path]) -> dict[str, list[pl.DataFrame]]:
 
 
 @rc_context(STYLE)
-def draw_runs(runs: Runs, columns: Sequence[str] | None = None, smooth: int = 1) -> Figure:
+def draw_runs(
+    runs: Runs,
+    columns: Sequence[str] | None = None,
+    smooth: int = 1,
+) -> Figure:
     """Training runs over the number of decisions, one colour per name.
 
     Args:

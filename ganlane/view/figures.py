@@ -73,7 +73,11 @@ def palette(names: Sequence[str]) -> dict[str, str]:
     return {name: COLOURS[index % len(COLOURS)] for index, name in enumerate(names)}
 
 
-def save_figure(figure: Figure, path: str | Path, kind: str | None = None) -> Path:
+def save_figure(
+    figure: Figure,
+    path: str | Path,
+    kind: str | None = None,
+) -> Path:
     """Write a figure, atomically, as ``kind`` (one of :data:`FORMATS`; by default the file's
     ending).
 
@@ -113,7 +117,11 @@ def panel_grid(
     return figure, list(grid[:count])
 
 
-def add_legend(figure: Figure, colours: Mapping[str, str], others: Sequence[Line2D] = ()) -> None:
+def add_legend(
+    figure: Figure,
+    colours: Mapping[str, str],
+    others: Sequence[Line2D] = (),
+) -> None:
     """Names in their colours along the top, in several rows if needed."""
     handles = [
         *(Line2D([], [], color=colour, label=name, lw=2) for name, colour in colours.items()),
@@ -128,7 +136,12 @@ def add_legend(figure: Figure, colours: Mapping[str, str], others: Sequence[Line
     figure.legend(handles=handles, loc="outside upper left", ncols=columns)
 
 
-def plot_line(axes: Axes, x: npt.ArrayLike, y: npt.ArrayLike, **style: Any) -> None:
+def plot_line(
+    axes: Axes,
+    x: npt.ArrayLike,
+    y: npt.ArrayLike,
+    **style: Any,
+) -> None:
     """A line with gaps where ``y`` is NaN; a single value between two gaps is a dot."""
     finite = np.isfinite(np.asarray(y, dtype=np.float64))
     padded = np.concatenate(([False], finite, [False]))

@@ -118,7 +118,11 @@ def spread(frames: Sequence[int], count: int) -> list[int]:
     return [frames[place] for place in places]
 
 
-def _scaled(picture: Picture, scale: float, multiple: int = 1) -> Image.Image:
+def _scaled(
+    picture: Picture,
+    scale: float,
+    multiple: int = 1,
+) -> Image.Image:
     """The picture at ``scale``, its sides a multiple of so many pixels."""
     image = Image.fromarray(picture)
     width, height = (
@@ -178,7 +182,11 @@ def _shared_palette(
     return palette
 
 
-def _write_mp4(painter: FramePainter, frames: Sequence[int], path: Path) -> None:
+def _write_mp4(
+    painter: FramePainter,
+    frames: Sequence[int],
+    path: Path,
+) -> None:
     """H.264 through the ffmpeg that imageio-ffmpeg brings along.
 
     imageio-ffmpeg's own writer ignores the exit status: on a full disk it takes half a film for a

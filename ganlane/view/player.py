@@ -123,7 +123,11 @@ def steps(values: npt.NDArray[Any]) -> list[Any]:
     return changes
 
 
-def episode_data(trajectory: Trajectory, stride: int = 1, start_s: float = 0.0) -> dict[str, Any]:
+def episode_data(
+    trajectory: Trajectory,
+    stride: int = 1,
+    start_s: float = 0.0,
+) -> dict[str, Any]:
     """A trajectory as JSON-serialisable data.
 
     Args:

@@ -180,7 +180,11 @@ class Recorder:
         return Trajectory(label, outcome=outcome, soft_crash_s=soft_crash_s, **arrays)
 
 
-def road_of_row(state: TensorDictBase, road: Road, row: int) -> tuple[int, float]:
+def road_of_row(
+    state: TensorDictBase,
+    road: Road,
+    row: int,
+) -> tuple[int, float]:
     """Lanes and lane width, m, of a row.
 
     Of its replayed scene if ``state`` has one, else of ``road``.

@@ -58,7 +58,11 @@ def _draw_densities(axes: Axes, histograms: Mapping[str, Histogram]) -> None:
             )
 
 
-def binned_density(histogram: Histogram, low: float, high: float) -> tuple[FloatArray, FloatArray]:
+def binned_density(
+    histogram: Histogram,
+    low: float,
+    high: float,
+) -> tuple[FloatArray, FloatArray]:
     """Middles of about 80 bins from ``low`` to ``high``, and the density there."""
     edges = histogram.bins.edges
     first, last = np.searchsorted(edges, (low - 1e-9, high - 1e-9))

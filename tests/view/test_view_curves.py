@@ -102,12 +102,12 @@ def test_the_runs_of_a_sweep_are_named_by_the_settings_in_which_they_differ(tmp_
         tmp_path,
         "{traffic: gan, agent: {n_step: 1}}",
         "{traffic: gan, agent: {n_step: 3}}",
-        "{traffic: idm}",
+        "{traffic: idm, agent: {n_step: 1}}",
     )
     assert list(read_runs([folder])) == [
         "agent.n_step=1, traffic=gan",
         "agent.n_step=3, traffic=gan",
-        "traffic=idm",
+        "agent.n_step=1, traffic=idm",
     ]
 
 

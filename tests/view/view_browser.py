@@ -14,9 +14,18 @@ import time
 from contextlib import contextmanager
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-FLAGS = """--headless=new --no-sandbox --disable-gpu --disable-dev-shm-usage --disable-extensions
---disable-background-networking --no-first-run --mute-audio --remote-debugging-pipe
---window-size=1200,900""".split()
+FLAGS = [
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-dev-shm-usage",
+    "--disable-extensions",
+    "--disable-background-networking",
+    "--no-first-run",
+    "--mute-audio",
+    "--remote-debugging-pipe",
+    "--window-size=1200,900",
+]
 _PATIENCE_S = 60.0
 
 

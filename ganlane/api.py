@@ -81,8 +81,10 @@ def make_env(
     Raises:
         UserError: an unknown name or key, a value of the wrong type or out of range.
     """
+    # Settings first: a mistake in them is reported before anything is built.
     config = highways(traffic=traffic, num_envs=num_envs, **keys)
     batch = build.make_highways(config)
+    # TorchRL refuses what is no transform by TypeError or ValueError.
     try:
         for transform in transforms:
             batch.append_transform(transform)
@@ -110,7 +112,13 @@ def load_agent(
         UserError: no such driver, or its network takes another observation.
     """
     config = highways(stream=stream, **keys)
-    return build.make_driver(str(name), config.env, Stream.named(config.stream), config.device)
+    # The random numbers of a driver come from the stream of the episodes that it drives.
+    return build.make_driver(
+        str(name),
+        config.env,
+        Stream.named(config.stream),
+        config.device,
+    )
 
 
 def evaluate(
@@ -155,6 +163,7 @@ def evaluate(
         raise UserError(message) from error
     if not isinstance(per_episode, bool):
         raise UserError(f"per_episode={per_episode!r:.80}: expected True or False.")
+    # One list of drivers: loaded ones as they are, policies under the name of their class.
     drivers: list[str | Driver] = []
     for agent in asked:
         if isinstance(agent, Driver):
@@ -163,14 +172,17 @@ def evaluate(
             drivers.append(Driver(type(agent).__name__, agent))
         else:
             drivers.extend(with_seeds(str(agent)))
+    # The settings of the command know drivers by name; loaded ones and policies go by theirs.
     names = [driver.name if isinstance(driver, Driver) else driver for driver in drivers]
     config: EvaluateConfig = call_settings(
         "evaluate", {"agents": names, "traffics": traffics, "episodes": episodes, **keys}
     )
     home = None if folder is None else _path(folder)
+    # A folder that this call made is removed again if a mistake ends it.
     with _torch_threads(config.threads), cleared_after_mistakes(home) if home else nullcontext():
         if home is not None:  # before hours of driving
             home.mkdir(parents=True, exist_ok=True)
+        # Loaded inside the block, so that an unknown name also leaves no folder behind.
         loaded = [
             build.make_driver(driver, config.env, device=config.device)
             if isinstance(driver, str)
@@ -178,11 +190,17 @@ def evaluate(
             for driver in drivers
         ]
         table = compare(loaded, config)
+    # Plain Python numbers: JSON and polars take no others.
     rows = plain(evaluation_rows(table))
     if home is not None:
         seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
         write_episodes(home, table)
-        write_results(home, {"rows": rows, "paired": paired_rows(table)}, plain(config), seeds)
+        write_results(
+            home,
+            {"rows": rows, "paired": paired_rows(table)},
+            plain(config),
+            seeds,
+        )
     return table if per_episode else pl.DataFrame(rows, infer_schema_length=None)
 
 
@@ -222,6 +240,7 @@ def train(
     # None leaves the command's default, or what the resumed run has.
     named = {"traffic": traffic, "init": init}
     keys |= {name: value for name, value in named.items() if value is not None}
+    # The number of environments is a key of the group collector on the command line.
     if num_envs is not None:
         keys["collector"] = {"num_envs": num_envs}
     if resume:
@@ -229,11 +248,17 @@ def train(
     try:
         finished = run("train", folder, **keys)
     except Stopped as stop:
+        # Stopped carries the signal for the exit status of the command; a notebook knows Ctrl-C.
         raise KeyboardInterrupt(
             "the run was saved; go on with its folder and resume=True"
         ) from stop
     table = pl.DataFrame(finished.results["rows"], infer_schema_length=None)
-    return TrainingRun(finished.folder, finished.results, Path(finished.results["agent"]), table)
+    return TrainingRun(
+        finished.folder,
+        finished.results,
+        Path(finished.results["agent"]),
+        table,
+    )
 
 
 def render(
@@ -275,12 +300,14 @@ def render(
         keys["run"] = [run] if isinstance(run, str | Path) else list(run)
     config = call_settings("render", keys)
     with _torch_threads():
+        # With no file to write named, the run gets a folder with its settings, as the command does.
         if out is None:
             folder = new_folder("render")
             with running(folder, config):
                 line = function_of("render")(config, folder)
         else:
             line = function_of("render")(config, Path(out).parent)
+    # The line is 'film: PATH' or alike; a path may itself hold ': ', so only the first one counts.
     return Path(str(line).partition(": ")[2])
 
 
@@ -311,6 +338,7 @@ def run(
         )
     # Going on with a run means its own folder.
     home = new_folder(command) if folder is None else _path(folder)
+    # Another run's checkpoint in a new folder would mix the results of two runs.
     if command == "train" and keys.get("resume") is not None:
         is_own = folder is not None and str(keys["resume"]) == str(folder)
         if not is_own or not any(home.rglob(LAST.name)):
@@ -321,6 +349,7 @@ def run(
     config = call_settings(command, keys)
     with _torch_threads(), running(home, config):
         function_of(command)(config, home)
+    # Commands write their results as a file; reading it back gives what a later reader would see.
     return Run(home, json.loads((home / "results.json").read_text(encoding="utf-8")))
 
 
@@ -339,6 +368,7 @@ def _path(folder: str | Path) -> Path:
 @contextmanager
 def _torch_threads(threads: int = 0) -> Iterator[None]:
     """Set torch's threads as the commands do, and restore the caller's number afterwards."""
+    # In a notebook the number is the caller's, and further cells rely on it.
     before = torch.get_num_threads()
     set_threads(threads)
     try:

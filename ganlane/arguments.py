@@ -28,6 +28,7 @@ def whole_number(
         UserError: not an integer, or not from ``low`` to ``high``.
     """
     if not _is_whole(value) or not low <= int(value) <= high:
+        # Written as a power, since nobody recognises 9223372036854775807.
         most = "2**63 - 1" if high == 2**63 - 1 else f"{high}"
         raise UserError(
             f"{name}={_shown(value)}: expected a whole number from {low} to {most}; give for "
@@ -38,10 +39,12 @@ def whole_number(
 
 def _is_whole(value: Any) -> bool:
     """Whether ``value`` counts as an int: NumPy's integers do, booleans and arrays do not."""
+    # operator.index() takes NumPy's integers, and refuses floats that happen to be whole.
     try:
         operator.index(value)
     except TypeError:
         return False
+    # Python counts True as 1; as a seed or a number it is a mistake.
     return not isinstance(value, bool)
 
 
@@ -52,7 +55,12 @@ def _shown(value: Any) -> str:
 
 def seed_number(seed: Any) -> int:
     """A seed, checked: the counters of the environment hold 63 bits."""
-    return whole_number("seed", seed, 0, 2**63 - 1)
+    return whole_number(
+        "seed",
+        seed,
+        0,
+        2**63 - 1,
+    )
 
 
 def is_import_path(name: str) -> bool:
@@ -107,6 +115,7 @@ def _makes(target: Any, base: type) -> bool:
     if not inspect.isclass(target):
         if not inspect.isfunction(target):
             return False
+        # Only the annotation of the result is resolved: others may name what is not imported.
         returned = SimpleNamespace(__annotations__={"return": target.__annotations__.get("return")})
         try:
             target = get_type_hints(returned, inspect.unwrap(target).__globals__)["return"]
@@ -130,6 +139,7 @@ def signature_of(target: Callable[..., Any]) -> inspect.Signature:
                 signature = inspect.signature(getattr(ancestor, name))
                 # without self or cls
                 return signature.replace(parameters=list(signature.parameters.values())[1:])
+    # Neither anywhere: the constructor is that of object, which takes nothing.
     return inspect.Signature()
 
 
@@ -150,6 +160,7 @@ def call_with(
     # a constructor names what it wants to be told
     accepted = {name: value for name, value in offered.items() if name in parameters}
     arguments = {**accepted, **required}
+    # Checked before the call, so that a TypeError from within the target is not taken for ours.
     try:
         signature.bind(**arguments)
     except TypeError as error:

@@ -56,6 +56,7 @@ def make_highways(config: HighwayConfig) -> TransformedHighway:
     Raises:
         UserError: see :func:`make_traffic` and :class:`ganlane.env.HighwayEnv`.
     """
+    # The random numbers of the traffic come from the same stream as those of the episodes.
     return make_env(
         make_traffic(config.traffic, config.env, Stream.named(config.stream)),
         config.env,
@@ -72,6 +73,8 @@ def _constructor_arguments(env: EnvConfig, stream: int) -> dict[str, Any]:
     """What the constructors of traffic models and drivers are given where they have an argument of
     that name.
     """
+    # Everything a constructor may ask for by the name of its argument; what it does not name
+    # is left out by call_with().
     return {
         "road": make_road(env),
         "stream": stream,
@@ -94,15 +97,22 @@ def make_traffic(
     # Importing runs code: the path is this package's or was named by the user.
     key = "traffic._target_"
     target = import_target(traffic._target_, key, TrafficModule)
+    # A mixed traffic has parts, each with a traffic model of its own, built the same way.
     arguments, parts = traffic.arguments(), traffic.parts()
     if parts:
         arguments["parts"] = {name: make_traffic(part, env, stream) for name, part in parts.items()}
-    module = call_with(target, _constructor_arguments(env, stream), arguments, key)
+    module = call_with(
+        target,
+        _constructor_arguments(env, stream),
+        arguments,
+        key,
+    )
     if not isinstance(module, TrafficModule):  # an annotation may be wrong
         raise UserError(
             f"{key}={traffic._target_}: returned a {type(module).__name__}, expected a "
             "TrafficModule."
         )
+    # Drivers that overlook the ego are a wrapper, so that they work with every traffic model.
     return BlindTraffic(module, traffic.blind_share) if traffic.blind_share else module
 
 
@@ -135,21 +145,25 @@ def make_env(
         seed=seed,
         first_episode=first_episode,
         device=device,
+        # By kind of traffic, others notice earlier or later who enters their lane.
         scenes=env.scenes(traffic.visibility),
         recycle=env.recycle,
         recycle_share=env.recycle_share,
         kernel=env.kernel,
     )
+    # None where the native kernel does not implement what is asked for.
     kernel = base.kernel
     transforms: list[ObservationTransform | ActionMaskTransform] = [
         ObservationTransform(
             base.road, env.vehicles, observation.form, observation.scale(), kernel is not None
         )
     ]
+    # The mask needs to know whether a lane change under way may be called off.
     if mask is not None and mask.form != "none":
         abort, vehicles = env.ego.abort_lane_change, None if kernel is None else kernel.vehicles
         parameters = (mask.form, mask.safe_deceleration, env.idm, abort, vehicles)
         transforms.append(ActionMaskTransform(base.road, *parameters))
+    # Simulator and transforms have graphs of their own, so each is compiled by itself.
     if env.compile:
         base.compile()
         for transform in transforms:
@@ -185,6 +199,7 @@ class Driver:
 
     def behind(self, mask: MaskParameters | None) -> tuple[MaskParameters, TensorDictModuleBase]:
         """The mask in force, where ``mask`` is the default, and the policy with that mask."""
+        # The driver's own mask goes before that of the command.
         chosen = self.mask or mask or MaskParameters()
         return chosen, self.policy if chosen.form == "none" else MaskedPolicy(self.policy)
 
@@ -207,27 +222,49 @@ def make_driver(
     Raises:
         UserError: no such driver, or a network of another shape than the environment's observation.
     """
+    # A name such as agent_idm+safe: the agent, behind another mask than its own.
     unmasked, plus, form = name.rpartition("+")
     if plus and form in MASKS:
-        driver = make_driver(unmasked, env, stream, device)
+        driver = make_driver(
+            unmasked,
+            env,
+            stream,
+            device,
+        )
         mask = driver.mask
         # the agent's own bounds stay where its form is asked for
         if mask is None or mask.form != form:
             mask = MaskParameters(form)
         return replace(driver, name=name, mask=mask)
     if name in DRIVERS:
-        policy = call_with(DRIVERS[name], _constructor_arguments(env, stream), {}, "agents")
+        policy = call_with(
+            DRIVERS[name],
+            _constructor_arguments(env, stream),
+            {},
+            "agents",
+        )
         return Driver(name, policy.to(device))
     if names_agent(name):
+        # Read first without a size: only the metadata tell which observation the agent needs.
         network, metadata = load_agent(name, device=device)
         observation = observation_of(metadata)
         # checks that the sizes fit
         load_agent(name, observation_size(observation.form, env.vehicles), device)
-        return Driver(name, network, observation, mask_of(metadata))
+        return Driver(
+            name,
+            network,
+            observation,
+            mask_of(metadata),
+        )
     # a user's own policy; it reads the raw state or the observation of the command
     if is_import_path(name):
         target = import_target(name, "agents", TensorDictModuleBase)
-        policy = call_with(target, _constructor_arguments(env, stream), {}, "agents")
+        policy = call_with(
+            target,
+            _constructor_arguments(env, stream),
+            {},
+            "agents",
+        )
         if not isinstance(policy, TensorDictModuleBase) or keys.ACTION not in getattr(
             policy, "out_keys", []
         ):
@@ -236,6 +273,7 @@ def make_driver(
                 "name it."
             )
         return Driver(name, policy.to(device))
+    # A light wheel lacks some of the files, so only those that are there are suggested.
     shipped = [name for name in SHIPPED if (CHECKPOINTS / f"{name}.safetensors").is_file()]
     names = ", ".join([*DRIVERS, *shipped])
     raise UserError(
@@ -254,6 +292,7 @@ def make_drivers(
 
     ``agent_idm@all`` means every shipped training of its recipe.
     """
+    # A dictionary drops repeated names and keeps their order.
     single_names = dict.fromkeys(single for name in names for single in with_seeds(name))
     return [make_driver(name, env, device=device) for name in single_names]
 

@@ -85,6 +85,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=_PART)
+    # In the same folder, since a file can be renamed atomically only within one file system.
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
     os.close(handle)
@@ -92,7 +93,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     try:
         yield part
         with part.open("rb+") as written:
+            # On the disk before the new name is: else a power cut could leave an empty file.
             os.fsync(written.fileno())
+        # mkstemp() lets only the owner read; results are for everyone.
         part.chmod(0o644)
         part.replace(path)
     except Exception as error:
@@ -106,6 +109,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 def remove_leftovers(folder: Path) -> None:
     """Remove the temporary files of killed writes from a folder to which nothing writes now."""
+    # mkstemp() adds eight random characters to the prefix.
     for part in folder.glob(f".*.????????{_PART}"):
         part.unlink(missing_ok=True)
 
@@ -118,6 +122,7 @@ def _file_system_error(error: Exception, part: Path) -> OSError | None:
     """
     if isinstance(error, OSError) and error.errno is not None:
         return error if error.filename in (None, str(part)) else None
+    # Libraries written in C report a full disk without an error number; a write tells.
     try:
         with part.open("ab") as file:
             file.write(bytes(_PROBE_BYTES))
@@ -145,6 +150,7 @@ def write_json(path: str | Path, content: Any) -> None:
 
 def sealed(content: bytes) -> bytes:
     """``content``, which holds :data:`PLACE`, with its checksum."""
+    # The digits are of the content with zeros in their place, so a reader can compute them too.
     begin = content.index(PLACE.encode()) + len(_BEGIN)
     return content[:begin] + _digits(content, begin) + content[begin + len(_ZEROS) :]
 
@@ -157,6 +163,7 @@ def sealed_archive(content: bytes) -> bytes:
 def seal_archive(path: Path) -> None:
     """:func:`sealed_archive` in place, for files too large to be held in memory."""
     with path.open("rb+") as file:
+        # The last two bytes of a zip archive without a comment are the comment's length, 0.
         file.seek(-2, 2)
         file.write(_COMMENT)
         file.flush()
@@ -174,6 +181,7 @@ def has_checksum(content: bytes | mmap, path: str | Path) -> bool:
     begin, end = content.find(_BEGIN), content.find(_END)
     if begin < 0 and end < 0:
         return False
+    # One mark without the other is damage, not a file without a checksum.
     begin += len(_BEGIN)
     if end != begin + len(_ZEROS) or content[begin:end] != _digits(content, begin):
         raise UserError(

@@ -59,7 +59,12 @@ def matrix_product(
     relu: bool = False,
 ) -> Tensor:
     """:func:`linear` in float32 on a CPU, without a gradient, in eager and in compiled graphs."""
-    return torch.ops.ganlane.linear(x, weight, bias, relu)
+    return torch.ops.ganlane.linear(
+        x,
+        weight,
+        bias,
+        relu,
+    )
 
 
 def linear(
@@ -74,7 +79,12 @@ def linear(
     """
     fast = has_fast_product(x) and x.dim() == 2
     if fast and not torch.is_grad_enabled():
-        return matrix_product(x, weight, bias, relu)
+        return matrix_product(
+            x,
+            weight,
+            bias,
+            relu,
+        )
     product = _OneDnnLinear.apply(x, weight, bias) if fast else functional.linear(x, weight, bias)
     return torch.relu(product) if relu else product
 

@@ -61,9 +61,13 @@ class HighwayVecEnv(VecEnv):
 
     def __init__(self, highways: HighwayVectorGym) -> None:
         self.highways = highways
+        # stable-baselines3 splits a step in two: step_async() only stores the actions.
         self._actions: Any = None
+        # Sums over the running episode of every row, for the infos that Monitor would give.
         self._return = np.zeros(highways.num_envs)
         self._length = np.zeros(highways.num_envs, dtype=np.int64)
+        # The constructor of VecEnv asks for render_mode through get_attr(), so highways is set
+        # first.
         super().__init__(
             highways.num_envs,
             highways.single_observation_space,
@@ -95,6 +99,7 @@ class HighwayVecEnv(VecEnv):
         for row in np.flatnonzero(done):
             infos[row] = self._final_info(int(row), info)
             infos[row]["TimeLimit.truncated"] = bool(truncated[row] and not terminated[row])
+        # The rows that ended are already in their next episode here.
         self._return[done] = 0.0
         self._length[done] = 0
         return observation, reward.astype(np.float32), done, infos
@@ -116,6 +121,7 @@ class HighwayVecEnv(VecEnv):
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed of the next reset; one for all rows, which drive different episodes of it."""
+        # VecEnv wants one seed per row; reset() reads the first only.
         self._seeds = [None if seed is None else seed_number(seed)] * self.num_envs
         return self._seeds
 
@@ -162,6 +168,7 @@ class HighwayVecEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Indices = None) -> list[bool]:
         """True only for ``Monitor``, whose episode statistics are in the infos."""
+        # evaluate_policy() of stable-baselines3 asks for it, and warns where Monitor is missing.
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[npt.NDArray[np.uint8] | None]:
@@ -203,6 +210,7 @@ class ModelPolicy(TensorDictModuleBase):
     """
 
     out_keys = [keys.ACTION]  # noqa: RUF012
+    # Nothing is held per row, so an evaluation may move running episodes to other rows.
     rows_must_stay = False
 
     def __init__(self, model: BaseAlgorithm) -> None:
@@ -218,6 +226,7 @@ class ModelPolicy(TensorDictModuleBase):
         masks = {}
         if self._masked:
             masks["action_masks"] = tensordict.get(keys.ACTION_MASK).cpu().numpy()
+        # stable-baselines3 takes NumPy arrays in main memory, whatever device the model is on.
         observation = tensordict.get(keys.OBSERVATION).cpu().numpy()
         chosen, _ = self.model.predict(observation, deterministic=True, **masks)
         action = torch.as_tensor(chosen, device=tensordict.device)

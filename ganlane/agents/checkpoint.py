@@ -39,6 +39,8 @@ def _place(name: str | Path) -> tuple[Path, int | None]:
     recipe, _, digits = str(name).rpartition("@")
     if digits.isdecimal():
         seed = int(digits)
+        # Further trainings of a shipped recipe lie in a file of their own, which a light wheel
+        # lacks.
         if recipe in SHIPPED and seed > 0:
             return _seeds_file(recipe), seed
         if recipe in SHIPPED:
@@ -86,6 +88,7 @@ def with_seeds(name: str) -> list[str]:
         # a file of one's own, with several trainings
         seeds = sorted(_read_several(Path(recipe))[1])
     elif _seeds_file(recipe).is_file():
+        # Training 0 is the shipped agent itself; the others are packed together.
         seeds = [0, *sorted(_read_several(_seeds_file(recipe))[1])]
     else:
         raise UserError(
@@ -136,13 +139,19 @@ def save_agent(
     and ``training`` (traffic, decisions, results). The network's config and the code version are
     added here.
     """
+    # Enough to build the network again without the run that trained it.
     network = agent.network.config.description()
     header = {
         **metadata,
         "network": network,
         "code_version": __version__,
     }
-    save_weights(path, "agent", agent.weights(), header)
+    save_weights(
+        path,
+        "agent",
+        agent.weights(),
+        header,
+    )
 
 
 def save_agents(
@@ -165,7 +174,12 @@ def save_agents(
         for seed, (_, network, metadata) in agents.items()
     }
     # each agent's metadata by its seed, as text: JSON has no other keys
-    save_weights(path, SEVERAL, tensors, {"agents": described})
+    save_weights(
+        path,
+        SEVERAL,
+        tensors,
+        {"agents": described},
+    )
 
 
 def read_agent(
@@ -196,6 +210,7 @@ def read_agent(
             for key, value in tensors.items()
             if key.startswith(prefix)
         }
+    # The description comes from a file, so any part of it may be missing or of a wrong type.
     try:
         config = NetworkConfig.described(metadata["network"])
     except (
@@ -224,6 +239,7 @@ def load_agent(
         UserError: no such agent, a foreign file, or another observation size.
     """
     weights, config, metadata = read_agent(name)
+    # What does not fit the environment is refused before the network is built.
     if observation_size is not None:
         check_observation_size(name, config, observation_size)
     try:
@@ -278,6 +294,7 @@ def warm_start(
         if option not in ignored and getattr(here, option) != getattr(trained, option)
     ]
     if differing:
+        # Only the support of returns can be adopted; other differences need other options.
         adopt = "give init.support=trained, " if set(differing) <= set(SUPPORT) else ""
         raise UserError(
             f"agent {name}: it has another network than this run (here: "
@@ -285,6 +302,7 @@ def warm_start(
             "start with init=none."
         )
     agent.load_weights(weights)
+    # Without moments Adam starts anew, as at the start of a training.
     if moments is not None:
         load_moments(agent, moments)
 

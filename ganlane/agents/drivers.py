@@ -62,6 +62,7 @@ class GreedyPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action``."""
+        # Without the noise of the layers: the same observation always gives the same action.
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             values = self.network.values(tensordict.get(keys.OBSERVATION))
         values = allowed_values(values, tensordict.get(keys.ACTION_MASK, None))
@@ -114,6 +115,7 @@ class ExploringPolicy(TensorDictModuleBase):
         mask = tensordict.get(keys.ACTION_MASK, None)
         action = allowed_values(values, mask).argmax(-1)
         if explore and self.epsilon > 0.0:
+            # Without a mask, too, random actions stay on the road where legal says how.
             if mask is None:
                 mask = torch.ones_like(values) if self.legal is None else self.legal(tensordict)
             # A fraction epsilon of the actions becomes a legal one, drawn uniformly.
@@ -145,6 +147,7 @@ class MaskedPolicy(TensorDictModuleBase):
     def __init__(self, policy: TensorDictModuleBase) -> None:
         super().__init__()
         self.policy = policy
+        # Unless a policy says otherwise, it may hold something per row.
         self.rows_must_stay = getattr(policy, "rows_must_stay", True)
         self.in_keys = list(dict.fromkeys([*policy.in_keys, keys.ACTION_MASK]))
         self.out_keys = list(policy.out_keys)
@@ -206,6 +209,7 @@ class RandomDriver(Driver):
     """Any of the three actions with equal probability; it soon drives off the road."""
 
     def _uniform(self, tensordict: TensorDictBase) -> Tensor:
+        # By counters, not by a generator: an episode draws the same actions in any batch.
         key = episode_key(
             self.stream,
             tensordict.get(keys.SEED),
@@ -262,6 +266,7 @@ class MobilDriver(Driver):
         road = road_in(tensordict, self.road)
         # -1 right, 0 stay, 1 left, of the ego alone
         wish = mobil_wishes(ego_scene(vehicles, road), road, self.idm, self.mobil)[:, 0]
+        # MOBIL decides once a second; the decisions of the ego may come more often.
         step = tensordict.get(keys.STEP)
         decisions = tensordict.get(keys.EGO).get("decisions")
         # all decisions take equally many steps, so the last one was at step - step / decisions

@@ -34,6 +34,7 @@ from ganlane.torch_settings import compiled
 
 #: Parameters of a noisy layer.
 _PARAMETERS = ("weight_mu", "weight_sigma", "bias_mu", "bias_sigma")
+# Adam's usual decay rates, of the first and of the second moment.
 _BETA_1 = 0.9
 _BETA_2 = 0.999
 
@@ -58,6 +59,7 @@ class _WithTarget:
     @torch.no_grad()
     def update_target(self) -> None:
         """Copy the online parameters to the target network."""
+        # Noise is not copied: it is drawn anew before each use.
         for target, online in zip(
             self.target_network.parameters(),
             self.network.parameters(),
@@ -118,6 +120,7 @@ class LeanDistributionalLoss(_WithTarget, DistributionalDQNLoss):
             target, clamped, mean_q = self._target(batch, weights)
         logits = self.network.logits(batch.get("observation"), weights)
         log_p = pick(logits, batch.get("action")).log_softmax(-1)
+        # The entropy of the target, the rest of the KL divergence, has no gradient.
         loss = -(target * log_p).sum(-1)
         priority = loss.detach()
         # the entropy of the target is not the network's fault
@@ -312,6 +315,7 @@ def composed_layers(
     actions: int,
 ) -> Weights:
     """Weight and bias of every layer of a network, the duel folded into the last."""
+    # Four parameters for each layer, in the order of _PARAMETERS.
     layers = [composed(parameters[4 * i : 4 * i + 4], drawn) for i, drawn in enumerate(noise)]
     weight, bias = layers[-1]
     return [
@@ -373,6 +377,7 @@ def gradients(
         if number == len(layers) - 1:
             of_weight = unfolded(of_weight, actions)
             of_bias = unfolded(of_bias, actions)
+        # A weight is mu + sigma * noise, so the gradient of sigma is the weight's times the noise.
         noise_in, noise_out = noise[number]
         all_gradients = [
             of_weight,
@@ -433,6 +438,7 @@ def update(
     priority = (loss - torch.special.entr(wanted).sum(-1)).clamp_min(0.0)
 
     # the gradient of the weighted mean of the losses, first by the logits of the taken actions
+    # Divided by the number of rows, as in Rainbow, not by the sum of the weights.
     share = (batch.weight / rows)[:, None]
     of_taken = (log_p.exp() * wanted.sum(-1, keepdim=True) - wanted) * share
     is_taken = batch.action[:, None] == torch.arange(actions, device=support.device)
@@ -500,6 +506,7 @@ class UpdateGraph:
         target = _parameters_of(self.target)
         # Adam's own state, so that a run can change to the other way and back
         moments = [self._moments(parameter) for parameter in online]
+        # All parameters have made equally many steps, so the first one's count is that of all.
         step = float(moments[0]["step"]) + 1.0
         for state in moments:
             state["step"].fill_(step)

@@ -28,6 +28,7 @@ class Step(NamedTuple):
     following: Tensor
     terminated: Tensor
     done: Tensor
+    # None where the environment has no mask.
     following_mask: Tensor | None = None
 
     @classmethod
@@ -68,6 +69,7 @@ class NStepWindow:
     def __init__(self, n: int, gamma: float) -> None:
         self.n = n
         self.gamma = gamma
+        # Between two calls of push() at most n - 1.
         self.steps: list[Step] = []
 
     def push(self, step: TensorDictBase) -> TensorDict | None:
@@ -86,11 +88,13 @@ class NStepWindow:
         self.steps.append(Step.copied(step))
         if len(self.steps) < self.n:
             return None
+        # Rewards of later steps are added as long as no episode has ended in between.
         first, *later = self.steps
         reward = first.reward
         following = first.following
         terminated = first.terminated
         mask = first.following_mask
+        # Number of decisions whose rewards are summed, [N, 1].
         length = torch.ones_like(reward)
         running = ~first.done
         for power, after in enumerate(later, start=1):
@@ -103,6 +107,7 @@ class NStepWindow:
             terminated = torch.where(running, after.terminated, terminated)
             length = length + running
             running = running & ~after.done
+        # The oldest step has its transition now and is not needed again.
         del self.steps[0]
         end = {
             "observation": following,
@@ -123,6 +128,7 @@ class NStepWindow:
 
     def state_dict(self) -> dict[str, Any]:
         """The steps in the window, as plain dictionaries of tensors."""
+        # Without them a resumed run would lose its last n - 1 steps.
         return {"steps": [step._asdict() for step in self.steps]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -93,6 +93,7 @@ class NetworkConfig:
         options = {name: description[name] for name in SHAPE}
         for name, value in options.items():
             expected: Any = type(getattr(RainbowConfig, name))
+            # JSON has lists for tuples, and whole numbers for some floats.
             accepted = {
                 tuple: (list, tuple),
                 float: (int, float),
@@ -129,6 +130,7 @@ class QNetwork(nn.Module):
             (config.actions + options.dueling) * config.outputs,
         )
         support = torch.linspace(options.v_min, options.v_max, options.atoms)
+        # Not persistent: an agent's file has the bounds of the support in its description.
         self.register_buffer("support", support, persistent=False)
 
     def weights(self) -> Weights:
@@ -147,7 +149,12 @@ class QNetwork(nn.Module):
         # observations may come in another precision
         hidden = observation.to(self.support.dtype)
         for weight, bias in hidden_layers:
-            hidden = linear(hidden, weight, bias, relu=True)
+            hidden = linear(
+                hidden,
+                weight,
+                bias,
+                relu=True,
+            )
         # [*, (1 +) A, atoms]
         rows = linear(hidden, *head).unflatten(-1, (-1, self.config.outputs))
         return duel(rows) if self.config.agent.dueling else rows
@@ -158,6 +165,7 @@ class QNetwork(nn.Module):
         Log-probabilities [*, atoms, A], or values [*, A].
         """
         logits = self.logits(observation)
+        # TorchRL wants log probabilities with the actions last.
         if self.config.agent.distributional:
             return logits.log_softmax(-1).transpose(-1, -2)
         return logits.squeeze(-1)
@@ -186,6 +194,7 @@ def duel(rows: Tensor) -> Tensor:
     al. 2016).
     """
     value = rows[..., :1, :]
+    # Without the mean taken off, value and advantages could shift against each other.
     advantage = rows[..., 1:, :]
     return value + advantage - advantage.mean(-2, keepdim=True)
 

@@ -75,6 +75,7 @@ class Rainbow:
             )
         self.config = config
         self.device = torch.device(device)
+        # One for each purpose: drawing more for one does not change the numbers of the others.
         self.generators = {
             name: torch.Generator(self.device).manual_seed(seed * 3 + i)
             for i, name in enumerate(("collect", "learn", "replay"))
@@ -121,7 +122,12 @@ class Rainbow:
             "kl_priority",
         )
         if compile and all(getattr(config, part) for part in parts) and self.device.type == "cpu":
-            self.graph = UpdateGraph(self.network, self.loss, self.optimizer, config)
+            self.graph = UpdateGraph(
+                self.network,
+                self.loss,
+                self.optimizer,
+                config,
+            )
         self.anneal(0)
 
     @property
@@ -171,6 +177,7 @@ class Rainbow:
         descend = self._descend if self.graph is None else self.graph
         # both change the same parameters and the same state of Adam
         learned = descend(batch, self.generators["learn"])
+        # Only what was drawn gets a new priority; the rest keeps its own until it is drawn.
         if config.prioritised:
             self.replay.sampler.update_priority(batch.get("index"), learned.priority)
         self.updates += 1
@@ -227,6 +234,7 @@ class Rainbow:
 
         The learning rate and the other options are those of this agent.
         """
+        # Learning rate and eps stay those of this run.
         self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": moments})
 
     def state_dict(self, with_replay: bool = True) -> dict[str, Any]:

@@ -44,7 +44,12 @@ def make_replay(config: RainbowConfig, generator: torch.Generator) -> TensorDict
     device = generator.device
     sampler = RandomSampler()
     if config.prioritised:
-        sampler = RowSampler(capacity, config.alpha, config.beta_start, device)
+        sampler = RowSampler(
+            capacity,
+            config.alpha,
+            config.beta_start,
+            device,
+        )
     return TensorDictReplayBuffer(
         storage=LazyTensorStorage(capacity, device=device),
         sampler=sampler,
@@ -170,6 +175,7 @@ class RowSampler(PrioritizedSampler):
         """Indices [B] and ``priority_weight`` [B], in (0, 1]."""
         if len(storage) == 0:
             raise RuntimeError("cannot sample from an empty replay buffer")
+        # In double precision, since the sums run over all priorities.
         cumulated = self.row_sums.cumsum(0)
         # reading it would make a GPU wait
         if cumulated.device.type == "cpu" and not cumulated[-1].isfinite():

@@ -44,6 +44,7 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
     # The report says what reading and measuring cost.
     begun = time.perf_counter()
     source = recordings_path(config.data)
+    # Without a place of their own the scenes lie in the run's folder.
     out = Path(config.out) if config.out else folder / "scenes"
 
     def show(

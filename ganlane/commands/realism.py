@@ -89,6 +89,7 @@ def realism(config: RealismConfig, folder: Path) -> str:
     factories = traffic_factories(config)
     files = i80_files_wanted(config, path)
     starts = drive_from_starts(config, factories, path)
+    # Empty without I-80 files; the card then leaves these rows out.
     site = {
         name: i80_rows(
             config,
@@ -219,6 +220,7 @@ def _fits(config: RealismConfig, scenes: Sequence[str]) -> bool:
         # The file of weights tells what it was fitted to.
         path = getattr(used[name], "path", None) or shipped_generator(PRESETS[name])
         data = load_weights(path, "generator")[1].get("data", {})
+        # Scenes that chose the weights (early stopping) count as seen, like those of the fit.
         if set(scenes) & {
             *data.get("fitted", ()),
             *data.get("validation", ()),

@@ -51,23 +51,37 @@ _ARGUMENTS = ("traffic", "env", "observation", "reward", "mask", "stream")
 def record(config: RecordConfig, folder: Path) -> str:
     """Drive the episodes and write them; the line that names the dataset."""
     set_threads(config.threads)
-    driver = make_driver(config.driver, config.env, Stream.named(config.stream), config.device)
+    # The stream decides which episodes are driven; a random driver draws from it, too.
+    driver = make_driver(
+        config.driver,
+        config.env,
+        Stream.named(config.stream),
+        config.device,
+    )
     mask, policy = driver.behind(config.mask)
     driven = replace(
         config,
+        # A trained agent reads the observation that it was trained with, whatever the command says.
         observation=config.observation.read_by(driver.observation),
         mask=mask,
+        # More rows than episodes would drive some that nobody asked for.
         num_envs=min(config.num_envs, config.episodes),
     )
     rows = TensorRows(driven)
     # What minari's recover_environment() makes.
+    # The specification is shared by the whole process, so a copy is changed.
     spec = deepcopy(gymnasium.spec(ENV_ID))
     spec.kwargs = {name: plain(getattr(driven, name)) for name in _ARGUMENTS}
     spec.max_episode_steps = rows.episode.most_decisions()
     name, root = config.dataset_name(), Path(config.out or folder).absolute()
     with _new_folder(root / name) as part:
         actions = gymnasium.spaces.Discrete(ACTIONS)
-        storage = MinariStorage.new(part / "data", rows.space, actions, spec)
+        storage = MinariStorage.new(
+            part / "data",
+            rows.space,
+            actions,
+            spec,
+        )
         storage.update_metadata(
             {
                 "dataset_id": name,
@@ -80,7 +94,12 @@ def record(config: RecordConfig, folder: Path) -> str:
         )
         facts = _write(storage, _episodes(rows, policy, config), config.episodes)
     seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
-    write_results(folder, {"dataset": name, "root": str(root), **facts}, plain(config), seeds)
+    write_results(
+        folder,
+        {"dataset": name, "root": str(root), **facts},
+        plain(config),
+        seeds,
+    )
     print(", ".join(f"{key.replace('_', ' ')} {value}" for key, value in facts.items()))
     return f"dataset: minari.load_dataset({name!r}) with MINARI_DATASETS_PATH={root}"
 
@@ -98,9 +117,11 @@ def _new_folder(place: Path) -> Iterator[Path]:
         )
     with cleared_after_mistakes(place.parent):
         place.parent.mkdir(parents=True, exist_ok=True)
+        # A hidden name next to the place: a dataset that is half written is not found by Minari.
         part = Path(tempfile.mkdtemp(dir=place.parent, prefix="."))
         try:
             yield part
+            # mkdtemp() lets only the owner in.
             part.chmod(0o755)
             part.replace(place)
         finally:
@@ -118,7 +139,14 @@ def _episodes(
     def begin(chosen: Iterable[int]) -> None:
         for row in chosen:
             number = int(rows.now().get(EPISODE)[row])
-            buffers[row] = EpisodeBuffer(number, config.seed, {"episode": number}, [], [], infos={})
+            buffers[row] = EpisodeBuffer(
+                number,
+                config.seed,
+                {"episode": number},
+                [],
+                [],
+                infos={},
+            )
         observe(chosen)
 
     def observe(chosen: Iterable[int]) -> None:
@@ -130,10 +158,13 @@ def _episodes(
 
     rows.start(config.seed, np.arange(rows.count))
     begin(range(rows.count))
+    # Numbers only grow: once all are beyond the last one asked for, every row is done.
     while any(buffer.id < config.episodes for buffer in buffers.values()):
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            # The policy may write into what it is given; the rows keep their own.
             actions = policy(rows.now().clone(recurse=False)).get(ACTION).cpu().numpy()
         stepped = rows.step(actions)
+        # The state after the last decision belongs to the episode, so observations are one more.
         observe(buffers)
         for row, buffer in buffers.items():
             buffer.actions.append(actions[row])

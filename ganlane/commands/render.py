@@ -21,6 +21,7 @@ from ganlane.view.figures import save_figure
 def render(config: RenderConfig, folder: Path) -> str:
     """Draw episodes or learning curves; the line that names the file."""
     kind: Any = config.kind
+    # Learning curves need no simulator.
     if config.run is not None:
         out = Path(config.out or folder / f"curves.{kind}")
         figure = draw_runs(read_runs(config.run), config.curves.columns, config.curves.smooth)
@@ -31,6 +32,7 @@ def render(config: RenderConfig, folder: Path) -> str:
         name = "crashes"
     else:
         episodes = [_record(config, agent, number) for agent, number in config.pairs()]
+        # A name of what is shown, so that several pictures can lie in one folder.
         labels = [episode.label for episode in episodes]
         agents = dict.fromkeys(Path(label.agent).stem for label in labels)
         numbers = dict.fromkeys(str(label.episode) for label in labels)
@@ -48,13 +50,23 @@ def _record(
     config: RenderConfig,
     agent: str,
     number: int,
+    # Films and pages cut off the beginning themselves; a table has it cut off here.
 ) -> Trajectory:
     """Drive an episode and print how it ended."""
     driver = make_driver(agent, config.env, device=config.device)
+    # The stream of reported figures: episode k here is episode k of an evaluation.
     traffic = make_traffic(config.traffic, config.env, Stream.REPORT)
+    # A trained agent reads what it was trained on, behind the mask that it was trained with.
     observation = config.observation.read_by(driver.observation)
     mask, policy = driver.behind(config.mask)
-    env = make_env(traffic, config.env, observation, config.reward, device=config.device, mask=mask)
+    env = make_env(
+        traffic,
+        config.env,
+        observation,
+        config.reward,
+        device=config.device,
+        mask=mask,
+    )
     label = config.traffic.label()
     episode = record_episode(
         env, policy, config.seed, number, driver.name, label, config.look.end_s
@@ -101,9 +113,16 @@ def _crashes(config: RenderConfig, path: str) -> list[Trajectory]:
     episodes = []
     for crash in chosen[:MOST_EPISODES]:
         env = listed.make_env(crash.traffic, reward=config.reward)
+        # The listed actions are repeated, so the driver itself need not be loaded.
         policy = ScriptedPolicy({crash.episode: crash.actions})
         which = (crash.seed, crash.episode, crash.driver, crash.traffic)
-        episode = record_episode(env, policy, *which, config.look.end_s)
+        episode = record_episode(
+            env,
+            policy,
+            *which,
+            config.look.end_s,
+        )
+        # Cut off by film.end_s is no difference. Another end is: the code has changed since.
         differs = episode.outcome not in (crash.end, "")
         print(_sentence(episode) + (f" (listed: {crash.end})" if differs else ""))
         episodes.append(episode)

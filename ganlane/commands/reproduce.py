@@ -74,6 +74,7 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
     }
     numbers, figures, not_drawn = _figures(config, traffics)
     figures = {"matrix": drawings.draw_matrix(rows), **figures}
+    # Figure 4 needs the metrics of training runs; without them it is left out.
     if curves is not None:
         numbers["figure_4"] = curves
         figures["figure_4"] = drawings.draw_transfer(curves, rows)
@@ -181,6 +182,7 @@ def _pairs(by_recipe: report.Cells) -> list[tuple[str, str]]:
     names = {recipe for recipe, _ in by_recipe}
 
     def here(name: str) -> str:
+        # The report may name a driver with its mask: safe for agent_general, none for others.
         mask = "safe" if name == "agent_general" else "none"
         return name if name in names else f"{name}+{mask}"
 

@@ -79,4 +79,10 @@ def train(config: TrainConfig, folder: Path) -> str:
         "phases": lengths,
         "agent": str(folder / AGENT_FILE),
     }
-    return publish(table, folder, asdict(config), seeds, numbers)
+    return publish(
+        table,
+        folder,
+        asdict(config),
+        seeds,
+        numbers,
+    )

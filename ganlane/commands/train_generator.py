@@ -25,6 +25,7 @@ from ganlane.generator.forecasts import BASELINE, SAMPLES
 from ganlane.settings.recordings import TrainGeneratorConfig
 from ganlane.torch_settings import set_threads
 
+# Average and final displacement error, and the error at the window's end, m.
 _ERRORS = ("ade_m", "fde_m", "end_m")
 _PUBLISHED_VELOCITY_M = (0.73, 1.78, 3.13, 4.78, 6.68)
 #: RMSE in m after 1 to 5 s on NGSIM, as published: on other test sets than ours, so only roughly
@@ -50,6 +51,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
             config.data.parameters(),
             read,
         )
+    # The seed of the command is that of the fit.
     fit_config: Any = replace(config.generator, seed=config.seed)
     scenes = generator.scene_tracks(frame)
     held_out = config.data.held_out_scenes([scene.name for scene in scenes], generator.HELD_OUT)
@@ -58,12 +60,20 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     if config.folds:
         generator.assign_folds(scenes, config.folds)
 
+    # A resumed command finds its finished fits here and does not repeat them.
     states = Path(config.resume or folder) / "fits"
     weights = folder / f"generator_{fit_config.preset}.safetensors"
     further: dict[str, Any] = {}
+    # What takes long is shown as soon as it is there; the last fit is the one that is saved.
     with FitProgress() as progress:
         if config.ablations:
-            rows = generator.ablate(fit_config, frame, held_out, states, progress)
+            rows = generator.ablate(
+                fit_config,
+                frame,
+                held_out,
+                states,
+                progress,
+            )
             show(ablation_table(rows), columns=config.columns)
             further["ablations"] = rows
         if config.folds:
@@ -83,6 +93,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
                 fold_tables(further["folds"]),
                 columns=config.columns,
             )
+        # The generator that is saved is fitted to everything but the held-out scenes.
         result = generator.fit_generator(
             fit_config,
             frame,
@@ -95,6 +106,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     show(metrics_table(result.metrics), columns=config.columns)
     result.save(weights, further.get("folds"), code_version())
     print(f"weights: {weights}")
+    # What the command line shows is also in results.json, in full.
     numbers = results_of(result) | further | {"weights": str(weights)}
     context = {"seed": config.seed, "held_out": held_out}
     used = asdict(replace(config, generator=fit_config))
@@ -124,6 +136,7 @@ class FitProgress(AbstractContextManager["FitProgress"]):
         if self._bar is not None:
             self._bar.update(update - self._bar.n)
             self._bar.set_postfix_str(scores, refresh=False)
+        # On no terminal a line per improvement is enough; logs would grow without end.
         elif progress.best < self._best or update == updates:
             self._best = progress.best
             # Early stopping may end the fit sooner.
@@ -141,6 +154,7 @@ class FitProgress(AbstractContextManager["FitProgress"]):
 
     def _start(self, progress: Progress) -> None:
         """The first update of another fit."""
+        # Closes the bar of the fit before, if there was one.
         self.__exit__()
         self._name = progress.name
         self._best = math.inf
@@ -172,8 +186,10 @@ def _by_kind(measured: Mapping[str, float]) -> dict[str, Any]:
 
 def results_of(result: FitResult) -> dict[str, Any]:
     """The numbers of ``results.json``: errors over all held-out scenes, and per scene."""
+    # A copy: parts are taken out below, and the result keeps its own.
     metrics = dict(result.metrics)
     overall = _by_kind(metrics.pop("all"))
+    # Held-out scenes without windows have no errors.
     scenes = {
         name: _by_kind(metrics.pop(name)) for name in result.data["held_out"] if name in metrics
     }
@@ -209,6 +225,7 @@ def metrics_table(
     ]
     for kind, ade in overall["ade_m"].items():
         cells = [f"{overall[error].get(kind, math.nan):.3f}" for error in errors]
+        # ADE relative to constant velocity, the baseline that any model has to beat.
         change = 100.0 * (ade / overall["ade_m"][BASELINE] - 1.0)
         lines.append([kind, *cells, _percent(change)])
     return aligned(lines)
@@ -219,6 +236,7 @@ def ablation_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
 
     Change of ADE over all predicted steps and over 0.4 s, ratio of the RMSE at 5 s.
     """
+    # All rows have the same kinds of forecasts, so the first one names the columns.
     first = next(iter(rows.values()))
     kinds = [kind for kind in first["ade_change_percent"] if kind != BASELINE]
     early = [f"{kind}, 0.4 s" for kind in kinds]
@@ -278,6 +296,7 @@ def _pooled(scores: Mapping[str, Any]) -> Lines:
 
 def _parts(title: str, parts: Mapping[str, Any]) -> Lines:
     """Windows, constant velocity's ADE and the generator's change relative to it, for each part."""
+    # The mean of the samples, one sample, and the best of several: different questions.
     generated = ("mean", "single", f"best_of_{SAMPLES}")
     kinds = [kind for kind in generated if kind in next(iter(parts.values()))["ade_m"]]
     lines = [[title, "windows", "CV, m", *kinds]]
@@ -321,6 +340,7 @@ def _direction(later: Mapping[str, Any], whole: Mapping[str, Any]) -> Lines:
 
 def _rollout(rollout: Mapping[str, Any]) -> Lines:
     """RMSE after 1 to 5 s, with published values."""
+    # Root mean squared errors, as the published ones; the other tables have mean errors.
     rmse = rollout["rmse_m"]
     lines = [
         [
@@ -338,6 +358,7 @@ def _rollout(rollout: Mapping[str, Any]) -> Lines:
             ]
         )
     for kind, published in _PUBLISHED_RMSE_M.items():
+        # Relative to the published constant velocity, since ours is on another test set.
         ratio = published[-1] / _PUBLISHED_VELOCITY_M[-1]
         lines.append([kind, *_two_digits(published), f"{ratio:.2f}"])
     return lines

@@ -24,6 +24,7 @@ from ganlane.errors import UserError, did_you_mean
 from ganlane.files import conf_folder
 from ganlane.settings.record import merged, option_names
 
+#: Hydra's defaults are those of this version, whichever is installed.
 VERSION_BASE = "1.3"
 _HELP = "run the command with --help to see all keys"
 #: The keys of Hydra's own configuration that a command line may set, besides launcher and sweeper
@@ -143,6 +144,7 @@ def composed(command: str, overrides: Sequence[Override] = ()) -> dict[str, Any]
         GlobalHydra.instance().hydra = outer
 
 
+# Cached, since the same files would be composed at every Python call.
 @cache
 def _defaults(command: str, *words: str) -> dict[str, Any]:
     return composed(command, parsed(command, words))
@@ -168,7 +170,13 @@ def resumed(saved: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str
     for override in overrides:
         key = key_of(override)
         if not key.startswith("hydra"):
-            OmegaConf.update(config, key, OmegaConf.select(now, key), merge=False, force_add=True)
+            OmegaConf.update(
+                config,
+                key,
+                OmegaConf.select(now, key),
+                merge=False,
+                force_add=True,
+            )
     return OmegaConf.to_container(config)  # type: ignore[return-value]
 
 

@@ -60,6 +60,7 @@ def _options(group: str) -> str:
 def _summary(file: str) -> str:
     """The first comment of a YAML file that is not a directive."""
     lines = (conf_folder() / file).read_text(encoding="utf-8").splitlines()
+    # Lines with @package are for Hydra, not for readers.
     comments = [line[1:].strip() for line in lines if line.startswith("#")]
     return next((comment for comment in comments if not comment.startswith("@package")), "")
 
@@ -68,9 +69,11 @@ def _keys(record: Record, indent: int) -> Iterator[str]:
     """A line for every key of a record: its value, and what it means."""
     for name in key_names(type(record)):
         value, key = getattr(record, name), f"{' ' * indent}{name}:"
+        # A record of its own: its line, then its keys below it.
         if is_dataclass(value):
             yield from _lines(key, meaning(type(record), name))
             yield from _keys(value, indent + 2)  # type: ignore[arg-type]
+        # Of a mapping of records the names alone, since their keys would fill pages.
         elif isinstance(value, dict) and any(map(is_dataclass, value.values())):
             yield from _lines(f"{key} {as_typed(list(value))}", meaning(type(record), name))
         else:

@@ -99,6 +99,7 @@ _OWN_FOLDERS = (".", "checkpoints", "pretrain", "pretrain/checkpoints", "fits")
 _OWN_PACKAGES = ("ganlane.", "ganlane_simulators.")
 
 
+# A BaseException, so that no `except Exception` on the way holds the process back.
 class Stopped(BaseException):
     """A signal ended the command after an orderly stop; the exit status is 128 plus its number."""
 
@@ -118,6 +119,7 @@ def run_command(
     A ``task`` takes the place of the command's function.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
+    # Before anything is opened: a file would get the number of a closed stream.
     open_closed_streams()
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL would log every replay buffer
     keep_freed_memory()
@@ -130,6 +132,7 @@ def run_command(
                     line = (task or function_of(command))(config, folder)
                 if line:
                     print(line)
+            # Here, so that a reader who has left is noticed while it can still be reported.
             sys.stdout.flush()
     except UserError as error:
         print(f"ganlane {command}: {_one_line(error)}", file=sys.stderr)
@@ -258,6 +261,7 @@ def _sweep(
     def job(_: Any) -> None:
         state = HydraConfig.get()
         sweep_folder[:] = [Path(state.sweep.dir)]
+        # Without the ++ that for_hydra has put before the key.
         words = [str(word).lstrip("+") for word in state.overrides.task]
         try:
             folder = Path(state.runtime.output_dir)
@@ -316,7 +320,12 @@ def _show_sweep(folder: Path, columns: str) -> None:
 
     rows = sweep_rows(folder)
     if rows:
-        show("", text_table(rows), f"sweep: {folder.absolute()}", columns=columns)
+        show(
+            "",
+            text_table(rows),
+            f"sweep: {folder.absolute()}",
+            columns=columns,
+        )
 
 
 # --- a run and its folder
@@ -355,6 +364,7 @@ def cleared_after_mistakes(folder: Path) -> Iterator[None]:
     """
     # A folder that was there is the user's; only what this run made may go.
     existed = folder.is_dir() and any(folder.iterdir())
+    # Noted before the folder is made, which makes its parents as well.
     new_parents = [parent for parent in folder.parents if not parent.exists()]
     try:
         yield
@@ -415,6 +425,7 @@ def _locked(folder: Path) -> Iterator[None]:
             ) from error
         except OSError:  # the file system has no locks
             pass
+        # The file may have been removed before it was locked; such a lock protects nothing.
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 break
@@ -461,6 +472,7 @@ def _resumed_folder(asked: str) -> Path | None:
         raise UserError(
             f"resume={path}: a run continues from its {LAST.name} only; give the run's folder."
         )
+    # From a checkpoint upwards: its folder, perhaps that of the first phase, the run.
     for folder in [path, *path.parents[:3]] if path.exists() else []:
         if (folder / CONFIG).is_file() and any(folder.rglob(LAST.name)):
             return folder

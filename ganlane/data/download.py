@@ -74,7 +74,13 @@ def download(
     # The path appears only when everything has come and the checksum is right.
     part = _Part(url, path, most_bytes)
     try:
-        _fetch(part, on_progress, timeout_s, attempts, wait_s)
+        _fetch(
+            part,
+            on_progress,
+            timeout_s,
+            attempts,
+            wait_s,
+        )
     except OSError as error:  # The disk's, for the network's are caught below.
         if error.errno is None:
             raise
@@ -201,7 +207,14 @@ class _HttpOnly(urllib.request.HTTPRedirectHandler):
                 f"{req.full_url}: the server sends to {newurl[:200]}; expected http:// or "
                 "https://, check data.url."
             )
-        return super().redirect_request(req, fp, code, msg, headers, newurl)
+        return super().redirect_request(
+            req,
+            fp,
+            code,
+            msg,
+            headers,
+            newurl,
+        )
 
 
 def _connect(

@@ -176,7 +176,13 @@ def _read_rows(
         meta,
         what,
     )
-    raise_where(cars["id"].is_duplicated(), cars, "id", meta, "stands there twice")
+    raise_where(
+        cars["id"].is_duplicated(),
+        cars,
+        "id",
+        meta,
+        "stands there twice",
+    )
     rows = read_table(path, COLUMNS)
     count.read += rows.height
     for name in ("width", "height"):

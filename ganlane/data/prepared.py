@@ -270,7 +270,12 @@ def prepare_recordings(
             raise UserError(
                 f"{path}: no scene in which anybody drives; give a recording of moving traffic."
             )
-    return Preparation(count, written, tuple(files), statistics)
+    return Preparation(
+        count,
+        written,
+        tuple(files),
+        statistics,
+    )
 
 
 @contextmanager

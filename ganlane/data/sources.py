@@ -84,7 +84,12 @@ def recordings_path(data: DataConfig) -> Path:
     path = Path(data.path) if data.path else default_scenes()
     if isinstance(data, NgsimDataConfig) and data.download:
         with byte_progress("download") as progress:
-            download(data.url, path, data.sha256, progress)
+            download(
+                data.url,
+                path,
+                data.sha256,
+                progress,
+            )
     return path
 
 

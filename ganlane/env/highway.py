@@ -112,10 +112,25 @@ class HighwayEnv(EnvBase):
         if scenes is not None and not callable(scenes):
             raise UserError(f"scenes={scenes!r:.80}: expected scenes; give a FixedScene, say.")
         # The bounds of the settings lie within.
-        whole_number("num_envs", num_envs, 1, 2**20)
-        whole_number("first_episode", first_episode, 0, 2**62)
+        whole_number(
+            "num_envs",
+            num_envs,
+            1,
+            2**20,
+        )
+        whole_number(
+            "first_episode",
+            first_episode,
+            0,
+            2**62,
+        )
         if vehicles is not None:
-            whole_number("vehicles", vehicles, 1, 1000)
+            whole_number(
+                "vehicles",
+                vehicles,
+                1,
+                1000,
+            )
         # Checked before EnvBase allocates anything on it.
         device = usable_device(device, dtype)
         super().__init__(device=device, batch_size=torch.Size([int(num_envs)]))
@@ -133,7 +148,13 @@ class HighwayEnv(EnvBase):
         self.recycle_share = recycle_share
         self.recorder: Recorder | None = None
         # Constants of every episode, handed to the pure functions of physics.
-        self.rules = Rules(self.road, self.ego, self.episode, idm, steering)
+        self.rules = Rules(
+            self.road,
+            self.ego,
+            self.episode,
+            idm,
+            steering,
+        )
         self.physics = Physics()
         self._seed = seed_number(seed)
         #: Seed and episode [N] of the rows in the last call; automatic resets continue from there.
@@ -154,7 +175,13 @@ class HighwayEnv(EnvBase):
         scenes = self.traffic.scenes(vehicles, visibility, spawn.ego_desired_speed_mps)
         if scenes is None:
             others = self.traffic.visibility
-            scenes = RandomScenes(self.road, vehicles, spawn, visibility, others)
+            scenes = RandomScenes(
+                self.road,
+                vehicles,
+                spawn,
+                visibility,
+                others,
+            )
         return scenes
 
     def _check_parts(self, vehicles: int | None) -> None:
@@ -181,7 +208,13 @@ class HighwayEnv(EnvBase):
         device = self.device
         # The traffic's memory travels in the state, so its shapes belong to the spec.
         memory = self.traffic.memory_spec(n, self.vehicles, self.dtype)
-        spec = state_spec(n, self.vehicles, self.dtype, memory, self.traffic.own_roads)
+        spec = state_spec(
+            n,
+            self.vehicles,
+            self.dtype,
+            memory,
+            self.traffic.own_roads,
+        )
         self.observation_spec = spec.to(device)
         # A TransformedEnv passes to a reset only the keys of the state spec; without the counters a
         # reset to certain episodes would run the first ones.
@@ -190,7 +223,12 @@ class HighwayEnv(EnvBase):
             keys.EPISODE: self.observation_spec[keys.EPISODE].clone(),
         }
         self.state_spec = Composite(counters, shape=(n,), device=device)
-        self.action_spec = Categorical(keys.ACTIONS, shape=(n,), dtype=torch.int64, device=device)
+        self.action_spec = Categorical(
+            keys.ACTIONS,
+            shape=(n,),
+            dtype=torch.int64,
+            device=device,
+        )
         self.reward_spec = Unbounded(shape=(n, 1), dtype=self.dtype, device=device)
         self.done_spec = done_spec(n).to(device)
 
@@ -233,7 +271,12 @@ class HighwayEnv(EnvBase):
             # In an automatic reset TorchRL passes the mask without the counters.
             seed, last = self.last_episodes
         else:
-            seed = torch.full((n,), self._seed, dtype=torch.int64, device=self.device)
+            seed = torch.full(
+                (n,),
+                self._seed,
+                dtype=torch.int64,
+                device=self.device,
+            )
             return seed, self.first_episode + torch.arange(n, device=self.device)
         # Without a mask the counters name the episodes; with one they are those that have ended.
         if mask is None:
@@ -277,7 +320,12 @@ class HighwayEnv(EnvBase):
         key = episode_key(self.stream, seed, episode)
         vehicles = self.scenes(key, self.dtype).with_finite_padding()
         vehicles, memory = self.traffic.enter(vehicles, key, episode)
-        state = first_state(seed, episode, vehicles, memory)
+        state = first_state(
+            seed,
+            episode,
+            vehicles,
+            memory,
+        )
         if self.traffic.own_roads:
             road = self.traffic.road_of(key, self.dtype)
             fields = {"lanes": road.lanes, "lane_width_m": road.lane_width_m}
@@ -329,7 +377,13 @@ class HighwayEnv(EnvBase):
             key,
             self.recorder,
         )
-        ego = self.physics.remember(rules, ego, start, end, command)
+        ego = self.physics.remember(
+            rules,
+            ego,
+            start,
+            end,
+            command,
+        )
         events, rest = outcome(rules, end, command)
         rest |= {name: state.get(name) for name in (keys.SEED, keys.EPISODE)}
         rest[keys.STEP] = end.step
@@ -340,7 +394,13 @@ class HighwayEnv(EnvBase):
             # In running rows with recycling those left behind are moved.
             recycled = self.physics.recycle(vehicles, rules.road, rules.idm)
             vehicles = recycled.where(end.running & self._recycling_rows(key), vehicles)
-        return pack(vehicles, ego, memory, events, rest)
+        return pack(
+            vehicles,
+            ego,
+            memory,
+            events,
+            rest,
+        )
 
     def _native_step(self, state: TensorDictBase) -> TensorDictBase:
         """One decision by the kernel."""
@@ -377,7 +437,13 @@ class HighwayEnv(EnvBase):
         assert drivers is not None
         episode = replace(self.episode, decision_period_s=keys.PHYSICS_STEP_S)
         # Steps of 0.1 s instead of a decision period; nothing else differs.
-        kernel = Kernel(self.road, self.vehicles, episode, self.ego, *drivers)
+        kernel = Kernel(
+            self.road,
+            self.vehicles,
+            episode,
+            self.ego,
+            *drivers,
+        )
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         running = torch.ones_like(action, dtype=torch.bool)
         for _ in range(self.episode.substeps()):
@@ -423,7 +489,13 @@ class HighwayEnv(EnvBase):
         # And whether there is a library at all.
         missing = why_not()
         if drivers is not None and reason is None and missing is None:
-            return Kernel(self.road, self.vehicles, self.episode, self.ego, *drivers)
+            return Kernel(
+                self.road,
+                self.vehicles,
+                self.episode,
+                self.ego,
+                *drivers,
+            )
         if wanted == "native":
             raise UserError(f"env.kernel=native {reason or missing}; set env.kernel=torch.")
         if reason is None:
@@ -435,7 +507,13 @@ class HighwayEnv(EnvBase):
         if self.recycle_share >= 1.0:
             return torch.ones_like(key, dtype=torch.bool)
         # Step -1, before the first, so that no other number is the same draw.
-        drawn = uniform(key, -1, 1, [Purpose.RECYCLED_EPISODE], torch.float64)
+        drawn = uniform(
+            key,
+            -1,
+            1,
+            [Purpose.RECYCLED_EPISODE],
+            torch.float64,
+        )
         return drawn[..., 0].reshape(key.shape) < self.recycle_share
 
 

@@ -357,7 +357,12 @@ def run_decision(
         # In a graph the copies cost nothing, so one graph serves both cases.
         all_running = not physics.compiled and known_false((~before.running).any())
         moved = Vehicles.of(after.get(keys.MOVED))
-        now = physics.advance(rules, before, moved, all_running)
+        now = physics.advance(
+            rules,
+            before,
+            moved,
+            all_running,
+        )
         # The memory of ended rows: put aside when they end, or kept by a copy in every step.
         if can_read:
             memory = after.get(keys.TRAFFIC)

@@ -111,7 +111,13 @@ def first_state(
     events = {name: column.to(kind) for name, kind in EVENTS.items()}
     done = {name: column.to(kind) for name, kind in DONE.items()}
     counters = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: torch.zeros_like(seed)}
-    return pack(vehicles, ego, memory, events, {**counters, **done})
+    return pack(
+        vehicles,
+        ego,
+        memory,
+        events,
+        {**counters, **done},
+    )
 
 
 def pack(

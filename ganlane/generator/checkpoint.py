@@ -21,6 +21,7 @@ from ganlane.settings.generator import (
 )
 from ganlane.weights import load_weights, save_weights
 
+#: Written into the file; weights of another kind, such as an agent's, are refused by it.
 KIND = "generator"
 #: ``{"all" or scene: {"ERROR/KIND": value}}``.
 Metrics = dict[str, dict[str, float]]
@@ -65,6 +66,7 @@ class FitResult:
             "updates": self.updates,
             "seconds": round(self.seconds, 1),
         }
+        # Plain data only: reading a file of weights never executes code.
         metadata = {
             "preset": self.config.preset,
             "sizes": asdict(self.module.sizes),
@@ -76,7 +78,12 @@ class FitResult:
             "code": code or {},
             "ganlane": __version__,
         }
-        save_weights(path, KIND, self.module.state_dict(), metadata)
+        save_weights(
+            path,
+            KIND,
+            self.module.state_dict(),
+            metadata,
+        )
 
 
 def shipped_generator(preset: Preset) -> Path:
@@ -97,6 +104,7 @@ def load_generator(
             the stored sizes.
     """
     tensors, metadata = load_weights(path, KIND)
+    # str, since a foreign file may hold anything under this name.
     stored = str(metadata.get("preset"))
     if stored not in get_args(Preset) or (preset is not None and stored != preset):
         expected = preset or "paper or calibrated"
@@ -104,6 +112,7 @@ def load_generator(
             f"{path}: a generator of preset {stored!r}, expected {expected!r}; give one."
         )
     generator = _sized_generator(path, metadata.get("sizes"))
+    # Strict: a missing tensor or one too many is an error, too.
     try:
         generator.load_state_dict(tensors)
     except RuntimeError as error:
@@ -118,13 +127,16 @@ def load_generator(
             f"{path}: takes {inputs} further inputs, expected {needed} for the preset {stored}; "
             "fit it again."
         )
+    # Traffic takes headways and lane changes from them, so weights alone cannot drive.
     if not isinstance(metadata.get("driving_statistics"), dict):
         raise UserError(f"{path}: holds no driving statistics of its recordings; fit it again.")
+    # A generator that drives is not fitted further, and gradients would cost memory.
     return generator.eval().requires_grad_(False), metadata
 
 
 def _sized_generator(path: str | Path, sizes: Any) -> Generator:
     """A generator of the stored ``sizes``; their ranges keep a file from requesting all memory."""
+    # The defaults tell the types, since a text or a float would fail only inside torch.
     types = {field.name: type(field.default) for field in fields(GeneratorSizes)}
     try:
         if {name: type(size) for name, size in dict(sizes).items()} != types:

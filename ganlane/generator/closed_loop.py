@@ -213,7 +213,13 @@ def paper_step(
     """
     history, difference = push(generator, history, displacement_of(vehicles))
     no_extra = difference[..., :0]
-    observation = observe(history, difference, vehicles, no_extra)
+    # The paper's preset has positions only: further inputs of width 0.
+    observation = observe(
+        history,
+        difference,
+        vehicles,
+        no_extra,
+    )
     steps = 1 if plan is None else plan.ahead.shape[-2]
     predicted = generator(observation, noise, steps)
     if plan is not None:
@@ -221,6 +227,7 @@ def paper_step(
         finished = plan.left <= 0
         predicted = torch.where(finished[..., None, None], predicted, plan.ahead)
         left = torch.where(finished, steps, plan.left) - 1
+        # The next displacement moves to the front; what wraps around to the end is never driven.
         plan = Plan(torch.roll(predicted, -1, dims=-2), left)
     velocity = predicted[..., 0, :] / PHYSICS_STEP_S
     return (
@@ -338,7 +345,12 @@ def anchored_step(
     extra = extra_inputs(scene, anchor_x, offset)
     if not p.further_inputs:
         extra = torch.zeros_like(extra)
-    observation = observe(history, difference, vehicles, extra)
+    observation = observe(
+        history,
+        difference,
+        vehicles,
+        extra,
+    )
     context = generator.summarise(observation)
     outputs = generator.decode(context, noise, observation, steps=1)[..., 0, :]
     limit = outputs.new_tensor(p.residual)
@@ -374,11 +386,13 @@ def recorded_vehicles(
     """
     position = segments.positions[:, frame]
     target = segments.target_lane[:, frame]
+    # Finite at a vehicle's first frame, too: before it, positions go on at constant velocity.
     velocity = (position - segments.positions[:, frame - 1]) / PHYSICS_STEP_S
     x, y = position.unbind(-1)
     return Vehicles(
         x=x,
         y=y,
+        # The bound keeps the angle of a standing vehicle small, where positions are noise.
         heading=torch.atan(velocity[..., 1] / velocity[..., 0].clamp_min(0.1)),
         speed=torch.sqrt((velocity * velocity).sum(-1)),
         acceleration=torch.zeros_like(x),
@@ -412,6 +426,7 @@ def driven_positions(
         # Who has not appeared yet goes on as recorded: at constant velocity, up to its first frame.
         entering = recorded_vehicles(segments, frame + 1, desired_speed)
         vehicles = moved.where(appeared[:, frame], entering)
+        # Who is recorded, and in which lane it wants to be, follows the recording at every step.
         vehicles = vehicles.with_(valid=entering.valid, target_lane=entering.target_lane)
         positions.append(torch.stack([vehicles.x, vehicles.y], dim=-1))
     return torch.stack(positions, dim=1)
@@ -449,7 +464,14 @@ def rollout(
 
     def move(vehicles: Vehicles, step: int) -> Vehicles:
         nonlocal memory, latent
-        moved, memory = anchored_step(generator, vehicles, road, memory, latent, parameters)
+        moved, memory = anchored_step(
+            generator,
+            vehicles,
+            road,
+            memory,
+            latent,
+            parameters,
+        )
         latent = wander(latent, fresh[step], config.noise_period_s)
         return moved
 
@@ -471,6 +493,7 @@ def headway_from_uniform(u: Tensor, quantiles_s: tuple[float, ...] = HEADWAY_QUA
     """
     values = u.new_tensor(quantiles_s)
     levels = u.new_tensor(QUANTILE_LEVELS)
+    # The pair of quantiles around u; the outer pairs serve for what is beyond them.
     upper = torch.searchsorted(levels, u.contiguous()).clamp(1, len(QUANTILE_LEVELS) - 1)
     low = levels[upper - 1]
     high = levels[upper]
@@ -494,6 +517,7 @@ def balanced_headway(
     )
     # IDM's equation for an acceleration of 0 at the leader's speed, solved for the headway.
     ratio = vehicles.speed / vehicles.desired_speed
+    # Products in place of a power, whose last bits may differ between batch sizes.
     settled = ahead.gap * torch.sqrt((1.0 - ratio * ratio * ratio * ratio).clamp_min(0.0))
     headway = (settled - TABLE_V.min_gap_m) / vehicles.speed.clamp_min(1.0)
     follows = (ahead.gap < FREE_GAP_M) & (headway <= HEADWAY_QUANTILES_S[-1])
@@ -517,6 +541,7 @@ def driver_params(
         return headway, torch.full_like(headway, COMMON_SPEED_MPS)
     low, high = DESIRED_EXCESS_MPS
     shape = segments.length.shape
+    # Desired speeds are not known yet: 1 m/s holds their place.
     now = recorded_vehicles(segments, PRESENT, torch.ones_like(segments.length))
     if random is None:
         scatter = torch.ones_like(segments.length)

@@ -83,6 +83,7 @@ def assign_folds(scenes: list[SceneTracks], folds: int) -> list[tuple[str, ...]]
         UserError: fewer than 2 folds, more folds than scenes with windows, or fewer than 3 such
             scenes.
     """
+    # A scene too short for one window has nothing to be scored on.
     sizes = {scene.name: count for scene in scenes if (count := count_windows(scene))}
     if not 2 <= folds <= len(sizes) or len(sizes) < 3:
         raise UserError(
@@ -91,6 +92,7 @@ def assign_folds(scenes: list[SceneTracks], folds: int) -> list[tuple[str, ...]]
         )
     # One entry per window, so that the folds get about as many windows each.
     scene_of = np.repeat(list(sizes), list(sizes.values()))
+    # GroupKFold draws nothing at random: the same recordings always get the same folds.
     splits = GroupKFold(folds).split(scene_of, groups=scene_of)
     return [tuple(np.unique(scene_of[tested]).tolist()) for _, tested in splits]
 
@@ -149,6 +151,7 @@ def _validation_names(scenes: list[SceneTracks]) -> set[str]:
 
 def fit_key(config: Config, split: Split) -> str:
     """Hash of all that a fit depends on: its settings, and the recordings of each part."""
+    # Folder and display change no weights, so they stay out of the hash.
     settings = {
         "preset": config.preset,
         "config": asdict(config),
@@ -164,6 +167,7 @@ def fit_key(config: Config, split: Split) -> str:
         for array in (scene.positions, scene.lane):
             digest.update(f"{array.dtype.str}{array.shape}".encode())
             digest.update(np.ascontiguousarray(array).data)
+    # 12 hexadecimal digits are 48 bits: enough to tell fits apart, short enough for a file name.
     return digest.hexdigest()[:12]
 
 
@@ -220,7 +224,12 @@ def fit_generator(
         UserError: unusable recordings or scene names.
     """
     split = split_for_fit(scene_tracks(frame), held_out)
-    loop = run_fit(config, split, folder, on_progress)
+    loop = run_fit(
+        config,
+        split,
+        folder,
+        on_progress,
+    )
     return _fit_result(
         loop,
         split,
@@ -249,6 +258,7 @@ def _fit_result(
     }
     return FitResult(
         config=task.config,
+        # In evaluation mode and without gradients, as load_generator returns it.
         module=task.generator.eval().requires_grad_(False),
         metrics=metrics,
         data=data,
@@ -287,7 +297,12 @@ def _held_out(
         )
     else:
         groups = group_windows(windows, task.config.group_size, task.config.seed)
-        forecasts = paper_forecasts(task.generator, windows, groups, task.config.seed)
+        forecasts = paper_forecasts(
+            task.generator,
+            windows,
+            groups,
+            task.config.seed,
+        )
     # Baselines may learn from all scenes but the held-out ones.
     forecasts |= baseline_forecasts(windows, split.fitted + split.validation, stride)
     forecasts |= idm_forecasts(split.held_out, steps, stride)
@@ -298,7 +313,12 @@ def _held_out(
 
 def short_forecasts(task: PaperTask | CalibratedTask, split: Split) -> HeldOut:
     """Forecasts of the held-out scenes as far as the preset predicts."""
-    return _held_out(task, split, task.config.sizes.predicted, STRIDE)
+    return _held_out(
+        task,
+        split,
+        task.config.sizes.predicted,
+        STRIDE,
+    )
 
 
 def long_forecasts(task: PaperTask | CalibratedTask, split: Split) -> HeldOut | None:
@@ -307,10 +327,16 @@ def long_forecasts(task: PaperTask | CalibratedTask, split: Split) -> HeldOut | 
     By the calibrated preset only, and only if a vehicle was recorded for long enough.
     """
     frames = OBSERVED_POSITIONS + LONG_STEPS
+    # A window of 5 s needs the observed positions before it as well.
     recorded = any((scene.present.sum(0) >= frames).any() for scene in split.held_out)
     if isinstance(task, PaperTask) or not recorded:
         return None
-    return _held_out(task, split, LONG_STEPS, LONG_STRIDE)
+    return _held_out(
+        task,
+        split,
+        LONG_STEPS,
+        LONG_STRIDE,
+    )
 
 
 def pooled(parts: list[HeldOut]) -> HeldOut:
@@ -343,6 +369,7 @@ def cross_validate(
     """
     scenes = scene_tracks(frame)
     splits = [split_for_fit(scenes, names) for names in assign_folds(scenes, folds)]
+    # short: as far as the preset predicts; long: 5 s, by the calibrated preset alone.
     results = []
     short = []
     long = []
@@ -377,6 +404,7 @@ def variants(config: Config) -> dict[str, Config]:
 
     The first is the preset itself.
     """
+    # All parts of the schedule shrink alike, so that warm-up and evaluations keep their share.
     loop = replace(
         config.loop,
         updates=max(1, config.loop.updates // 4),
@@ -393,7 +421,13 @@ def variants(config: Config) -> dict[str, Config]:
         }
     sizes = config.sizes
     weights = config.weights
-    alone = replace(weights, single=0.0, mean=0.0, adversarial=0.0)
+    # What remains is the variety term.
+    alone = replace(
+        weights,
+        single=0.0,
+        mean=0.0,
+        adversarial=0.0,
+    )
     return {
         "as it is (p_l = 8)": config,
         "p_l = 4": replace(config, sizes=replace(sizes, predicted=4)),
@@ -425,8 +459,10 @@ def ablate(
     split = split_for_fit(scene_tracks(frame), held_out)
     rows = {}
     for name, variant in variants(config).items():
+        # The name is for the display; every variant's state has a hash of its own.
         task = run_fit(variant, split, folder, on_progress, name).task
         windows, forecasts = short_forecasts(task, split)
+        # The generator's kinds, and what every change is relative to.
         kinds = ("mean", "single", f"best_of_{SAMPLES}", BASELINE)
         errors = errors_of(
             {kind: forecasts[kind] for kind in kinds},

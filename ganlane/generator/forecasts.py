@@ -59,6 +59,7 @@ SIDEWAYS_M = 0.1
 _SMALLEST_DISTANCE_M = 1e-4
 #: Name of a forecast to positions [W, T, 2] in m relative to the present, or to errors [W, T] in m.
 Forecasts = dict[str, np.ndarray]
+#: Scores as plain data, for JSON and tables.
 Row = dict[str, Any]
 # What goes through a network in one pass; bounds the memory.
 #: Groups of windows.
@@ -107,6 +108,7 @@ def displacement_errors(errors: Forecasts, rows: np.ndarray | None = None) -> Ro
 
     The ADE's change to the baseline's is added, in %.
     """
+    # The same windows for all kinds, so that their errors can be compared.
     if rows is not None:
         errors = {name: values[rows] for name, values in errors.items()}
     ade = {name: float(values.mean()) for name, values in errors.items()}
@@ -147,6 +149,7 @@ def direction_scores(
     moving = np.abs(lateral) > SIDEWAYS_M
     shares: dict[str, float | None] = {}
     for name, course in forecasts.items():
+        # A product above 0: both moves are to the same side.
         right = ((observed + course[:, -1, 1]) * lateral > 0)[moving]
         shares[name] = float(right.mean()) if len(right) else None
     return {"windows": int(moving.sum()), "share_right": shares}
@@ -165,6 +168,7 @@ def side_classifier_share(windows: Windows, fold: np.ndarray) -> float | None:
     # The observed displacements, their changes along the road, how far the vehicle has moved
     # sideways since each of them; then the lane from both sides, and the length.
     past = windows.past
+    # From the present backwards: entry k is the sum of the last k + 1 lateral displacements.
     moved = past[..., 1][:, ::-1].cumsum(axis=1)
     others = np.stack(
         [windows.lane, windows.lane_from_left, windows.length],
@@ -196,6 +200,7 @@ def rmse_by_second(
     """Root mean square error in m after each whole second (10 steps), of every forecast."""
     rmse: dict[str, dict[str, float]] = {}
     for name, values in errors.items():
+        # Steps are 0.1 s apart, so index 9 is the first whole second.
         seconds = enumerate(values.T[9::10], start=1)
         rmse[name] = {f"{k} s": float(np.sqrt((error**2).mean())) for k, error in seconds}
     return rmse
@@ -305,6 +310,7 @@ def driven_windows(
     These are of the vehicles recorded throughout a segment, whose vehicles ``driver`` drives all
     jointly: positions [K, B, H, V, 2] of K = ``samples``.
     """
+    # Samples multiply the rows, so fewer segments go through in one pass.
     size = max(1, _ROLLOUTS // samples)
     forecasts = []
     for scene in scenes:
@@ -342,9 +348,22 @@ def calibrated_forecasts(
         noise = torch.randn(shape, generator=random)
         noise[:, 0] = 0.0
         drivers = driver_params(segments, config.traits)
-        return rollout(generator, segments, drivers, noise, config)
+        return rollout(
+            generator,
+            segments,
+            drivers,
+            noise,
+            config,
+        )
 
-    forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
+    forecasts = driven_windows(
+        driver,
+        scenes,
+        horizon,
+        stride,
+        1 + samples,
+    )
+    # The recording takes the same way, so that its windows come in the same order.
     recorded = driven_windows(
         lambda segments: segments.future[None],
         scenes,
@@ -422,8 +441,10 @@ def constant_acceleration(past: np.ndarray, steps: int) -> np.ndarray:
     """Positions [W, T, 2] in m when the displacement keeps changing by its mean observed change per
     step.
     """
+    # Eight displacements have seven changes between them.
     change = ((past[:, -1] - past[:, 0]) / (past.shape[1] - 1))[:, None]
     ahead = np.arange(1.0, steps + 1.0)[:, None]
+    # After n steps the change has been added 1 + 2 + ... + n times: n (n + 1) / 2.
     return repeated(past[:, -1], steps) + 0.5 * change * ahead * (ahead + 1.0)
 
 
@@ -437,10 +458,12 @@ def ridge_forecast(fitted: Windows, past: np.ndarray) -> np.ndarray:
     def features(past: np.ndarray) -> np.ndarray:
         return np.concatenate([past[:, -1:], np.diff(past, axis=1)], axis=1).reshape(len(past), -1)
 
+    # Left and right are alike: the fit must not learn the side that was recorded more often.
     mirrored = (1.0, -1.0)
     observed = np.concatenate([fitted.past, fitted.past * mirrored])
     future = np.concatenate([fitted.future, fitted.future * mirrored])
     steps = future.shape[1]
+    # Fitted is what constant velocity misses, so the penalty pulls towards constant velocity.
     missing = future - repeated(observed[:, -1], steps)
     model = make_pipeline(StandardScaler(), RidgeCV(alphas=_PENALTIES))
     model.fit(features(observed), missing.reshape(len(missing), -1))
@@ -494,7 +517,13 @@ def rollout_errors(
             )
             fresh = torch.randn(shape, generator=random)
             noise = torch.cat([torch.zeros_like(fresh[:, :1]), fresh], dim=1)
-            mean, one, other = rollout(generator, segments, drivers, noise, config)
+            mean, one, other = rollout(
+                generator,
+                segments,
+                drivers,
+                noise,
+                config,
+            )
             errors = {
                 "mean": distance(mean, future),
                 "single": distance(one, future),
@@ -512,6 +541,7 @@ def _step_means(parts: list[tuple[dict[str, Tensor], Tensor]], horizon: int) -> 
         kind: mean_by_step([(errors[kind], scored) for errors, scored in parts])
         for kind in parts[0][0]
     }
+    # ADE and FDE are over 0.8 s at most, so that they compare with those of windows.
     short = min(PREDICTED_STEPS, horizon)
     windows = float(sum(scored[:, 0].sum() for _, scored in parts))
     metrics = {"end_s": 0.1 * horizon, "windows": max(1.0, windows)}
@@ -526,6 +556,7 @@ def _step_means(parts: list[tuple[dict[str, Tensor], Tensor]], horizon: int) -> 
 
 
 def mean_by_step(parts: list[tuple[Tensor, Tensor]]) -> Tensor:
+    # Sums and counts are pooled first, since batches differ in their number of vehicles.
     """Mean [H] of errors [B, H, V] where their mask [B, H, V] is true, over all parts."""
     count = torch.stack([scored.sum((0, 2)) for _, scored in parts]).sum(0).clamp_min(1)
     total = torch.stack([(errors * scored).sum((0, 2)) for errors, scored in parts]).sum(0)

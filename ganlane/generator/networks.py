@@ -51,7 +51,12 @@ def dense(
     many = x.numel() >= _MANY_ROWS * x.shape[-1]
     # A fit needs gradients, which the fast product does not have.
     if many and has_fast_product(x) and not torch.is_grad_enabled():
-        return matrix_product(x, weight, bias, relu)
+        return matrix_product(
+            x,
+            weight,
+            bias,
+            relu,
+        )
     product = nn.functional.linear(x, weight, bias)
     return torch.relu(product) if relu else product
 
@@ -62,7 +67,12 @@ def apply(
     relu: bool = False,
 ) -> Tensor:
     """``layer(x)`` computed by :func:`dense`."""
-    return dense(x, layer.weight, layer.bias, relu)
+    return dense(
+        x,
+        layer.weight,
+        layer.bias,
+        relu,
+    )
 
 
 def motion_features(displacement: Tensor, difference: Tensor) -> Tensor:
@@ -103,6 +113,7 @@ class MotionLSTM(nn.Module):
         self.embed = nn.Linear(4, embedding)
         self.input = nn.Linear(embedding, 4 * hidden)
         self.recurrent = nn.Parameter(torch.empty(4 * hidden, hidden))
+        # The bound that torch uses for its own LSTM.
         bound = 1.0 / math.sqrt(hidden)
         nn.init.uniform_(self.recurrent, -bound, bound)
         with torch.no_grad():
@@ -156,7 +167,12 @@ class MotionLSTM(nn.Module):
 
 def _times_tanh(factor: Tensor, x: Tensor) -> Tensor:
     """``factor * tanh(x)`` by the sigmoid: on a CPU a quarter of the time of ``torch.tanh``."""
-    return torch.addcmul(-factor, factor, torch.sigmoid(x + x), value=2.0)
+    return torch.addcmul(
+        -factor,
+        factor,
+        torch.sigmoid(x + x),
+        value=2.0,
+    )
 
 
 def nearest(
@@ -173,6 +189,7 @@ def nearest(
     count = position.shape[-2]
     # [B, G, G, 2], other minus self.
     offset = position[..., None, :, :] - position[..., :, None, :]
+    # A vehicle is not its own neighbour.
     itself = torch.eye(count, dtype=torch.bool, device=position.device)
     real = valid[..., None, :] & ~itself & (offset[..., 0].abs() <= RANGE_M)
     if count - 1 <= neighbours:
@@ -191,8 +208,14 @@ def gather_vehicles(values: Tensor, index: Tensor | None) -> Tensor:
     if index is None:
         return values[..., None, :, :]
     batch, count, chosen = index.shape
+    # gather needs an index as wide as the values.
     flat = index.reshape(batch, count * chosen, 1).expand(-1, -1, values.shape[-1])
-    return values.gather(1, flat).reshape(batch, count, chosen, values.shape[-1])
+    return values.gather(1, flat).reshape(
+        batch,
+        count,
+        chosen,
+        values.shape[-1],
+    )
 
 
 class PairPooling(nn.Module):
@@ -211,6 +234,7 @@ class PairPooling(nn.Module):
     ):
         super().__init__()
         self.neighbours = neighbours
+        # Only this layer has a bias, since the two terms are added.
         self.per_pair = nn.Linear(len(_PAIR_SCALE), inner)
         self.per_vehicle = nn.Linear(hidden, inner, bias=False)
         self.second = nn.Linear(inner, pooled)
@@ -307,6 +331,7 @@ class Generator(nn.Module):
         """The input from observed displacements [B, G, observed, 2], without further inputs."""
         last = displacements[..., -1, :]
         before = displacements[..., -2, :]
+        # Width 0: the paper's preset has no further inputs.
         extra = last.new_zeros((*last.shape[:-1], 0))
         return Observation(
             self.project(displacements),
@@ -323,7 +348,12 @@ class Generator(nn.Module):
         Its own motion, its neighbours, its further inputs.
         """
         hidden = self.encoder.encode(now.projections)
-        pooled = self.pooling(hidden, now.position, now.displacement, now.valid)
+        pooled = self.pooling(
+            hidden,
+            now.position,
+            now.displacement,
+            now.valid,
+        )
         inputs = torch.cat([hidden, pooled, now.extra], dim=-1)
         # The layers are applied by hand, through the fast product.
         first, second = (cast(nn.Linear, self.context[layer]) for layer in (0, 2))
@@ -376,7 +406,12 @@ class Generator(nn.Module):
         All by default.
         """
         steps = self.sizes.predicted if steps is None else steps
-        outputs = self.decode(self.summarise(now), noise, now, steps)
+        outputs = self.decode(
+            self.summarise(now),
+            noise,
+            now,
+            steps,
+        )
         return displacements_of(outputs, now.displacement)
 
 

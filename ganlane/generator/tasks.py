@@ -101,6 +101,7 @@ class _Task(nn.Module):
         # The networks' first weights come from torch's own generator, all else from ``random``.
         torch.manual_seed(config.seed)
         self.generator = Generator(config.sizes)
+        # Adam's default rate is a placeholder: the loop sets the rate before every update.
         self.optimisers = {"generator": torch.optim.Adam(self.generator.parameters())}
         self.random = torch.Generator().manual_seed(config.seed)
         self.largest_gradient = config.loop.largest_gradient
@@ -189,7 +190,13 @@ class PaperTask(_Task):
         The discriminator's accuracy on them is added.
         """
         windows, groups = self._grouped_windows(scenes, self.config.held_out_stride)
-        forecasts = paper_forecasts(self.generator, windows, groups, self.config.seed)
+        forecasts = paper_forecasts(
+            self.generator,
+            windows,
+            groups,
+            self.config.seed,
+        )
+        # Constant velocity on the same windows, for comparison.
         forecasts[BASELINE] = repeated(windows.past[:, -1], self.config.sizes.predicted)
         recorded = self.discriminator(groups.displacements[groups.mask])
         generated = self.discriminator(self._samples(groups)[0])
@@ -199,6 +206,7 @@ class PaperTask(_Task):
     def _grouped_windows(self, scenes: list[SceneTracks], stride: int) -> tuple[Windows, Groups]:
         """All windows of ``scenes`` and their k-means groups."""
         sizes = self.config.sizes
+        # n displacements need n + 1 positions.
         windows = cut_windows(scenes, stride, sizes.observed + 1 + sizes.predicted)
         return windows, group_windows(windows, self.config.group_size, self.config.seed)
 
@@ -212,6 +220,7 @@ class PaperTask(_Task):
         mask = groups.mask
         past = observed = groups.displacements[..., : sizes.observed, :]
         if history_noise > 0:
+            # In units of typical differences, so that noise weighs alike along and across the road.
             scale = past.new_tensor(DIFFERENCE_SCALE_M)
             observed = past + history_noise * scale * torch.randn(past.shape, generator=self.random)
         observation = self.generator.observe(observed, groups.position, mask)
@@ -226,7 +235,12 @@ class PaperTask(_Task):
         noise = torch.randn(shape, generator=self.random)
         # The mean driver.
         noise[-1] = 0.0
-        outputs = self.generator.decode(context, noise, vehicles, sizes.predicted)
+        outputs = self.generator.decode(
+            context,
+            noise,
+            vehicles,
+            sizes.predicted,
+        )
         future = displacements_of(outputs, vehicles.displacement)
         return torch.cat(
             [past[mask].expand(len(future), -1, -1, -1), future],
@@ -246,6 +260,7 @@ class CalibratedTask(_Task):
         super().__init__(config)
         self.config = config
         self.validation = validation
+        # Every segment has room for the longest horizon; a shorter one uses its beginning.
         longest = max(config.horizons)
         cuts = [(scene, row) for scene in fitted for row in segment_starts(scene, longest)]
         #: All possible segments, sorted by their vehicles, so that neighbours need little padding.
@@ -275,7 +290,13 @@ class CalibratedTask(_Task):
             config.sizes.noise,
         )
         noise = torch.randn(shape, generator=self.random) if sampled else torch.zeros(shape)
-        positions = rollout(self.generator, segments, drivers, noise, config)
+        positions = rollout(
+            self.generator,
+            segments,
+            drivers,
+            noise,
+            config,
+        )
         if sampled:
             name = "energy"
             losses = energy_score(positions[0], positions[1], segments.future)
@@ -398,6 +419,7 @@ class FitLoop:
                 on_progress(progress)
             if late:
                 break
+        # Empty if no evaluation gave a finite score.
         if self.best_weights:
             self.task.load_state_dict(self.best_weights)
 
@@ -428,6 +450,7 @@ class FitLoop:
             },
             "random": task.random.get_state(),
         }
+        # A checksum goes with it, so that a damaged state is refused and not resumed.
         file = io.BytesIO()
         torch.save(state, file)
         write_bytes(path, sealed_archive(file.getvalue()))
@@ -439,6 +462,7 @@ class FitLoop:
         try:
             if not whole:
                 raise ValueError("no checksum")
+            # weights_only: torch unpickles tensors and plain data, no other objects.
             state = torch.load(io.BytesIO(content), weights_only=True)
             counters = state["counters"]
         except Exception as error:

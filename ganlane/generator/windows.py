@@ -67,6 +67,7 @@ class SceneTracks:
         frames = np.arange(len(self.present))[:, None]
         column = np.arange(self.present.shape[1])
         first, last = self._first_and_last
+        # The frame to go on from: itself, or the first or last one of the track.
         nearest = np.clip(frames, first, last)
         # The first and the last displacement of each vehicle; 0 where it was seen only once.
         early = self.positions[np.minimum(first + 1, last), column] - self.positions[first, column]
@@ -79,6 +80,7 @@ class SceneTracks:
     @cached_property
     def target_lane(self) -> np.ndarray:
         """Lane [T, V] of each vehicle after :data:`INTENTION_S`, or at the end of its track."""
+        # The frame INTENTION_S later; clipped, since the track may end before.
         ahead = np.arange(len(self.present))[:, None] + round(INTENTION_S / PHYSICS_STEP_S)
         return np.take_along_axis(self.lane, np.clip(ahead, *self._first_and_last), axis=0)
 
@@ -169,6 +171,7 @@ class Segments:
         """Positions [B, H, V, 2] when the last observed displacement is repeated."""
         now = self.positions[:, PRESENT, None]
         before = self.positions[:, PRESENT - 1, None]
+        # 1 at the first step after the present.
         steps = torch.arange(1, self.positions.shape[1] - PRESENT, dtype=now.dtype)
         return now + (now - before) * steps[:, None, None]
 
@@ -213,11 +216,13 @@ def segment_starts(
     stride: int = 1,
 ) -> list[int]:
     """Rows where a segment of 9 + ``horizon`` frames with at least one driven vehicle starts."""
+    # Empty for a scene that is shorter than a segment.
     rows = range(
         0,
         len(scene.present) - OBSERVED_POSITIONS - horizon + 1,
         stride,
     )
+    # Driven are those that are recorded in all observed frames.
     return [row for row in rows if scene.present[row : row + OBSERVED_POSITIONS].all(0).any()]
 
 
@@ -245,6 +250,7 @@ def cut_segments(cuts: list[tuple[SceneTracks, int]], horizon: int) -> Segments:
     # Who is recorded in any frame of a segment is in it.
     members = [np.flatnonzero(scene.present[row : row + frames].any(0)) for scene, row in cuts]
     batch = len(cuts)
+    # The fullest segment sets the width; the others are padded.
     most = max(map(len, members))
     segments = Segments(
         positions=torch.zeros(batch, frames, most, 2),
@@ -322,6 +328,7 @@ def join_windows(parts: list[Windows]) -> Windows:
 
 def _present_throughout(scene: SceneTracks, frames: int) -> np.ndarray:
     """Whether each vehicle is present in all ``frames`` that start at a row; bool [rows, V]."""
+    # sliding_window_view refuses a window that is longer than the array.
     if len(scene.present) < frames:
         return np.zeros((0, scene.present.shape[1]), dtype=bool)
     return np.all(sliding_window_view(scene.present, frames, axis=0), axis=-1)
@@ -348,6 +355,7 @@ def cut_windows(
     for scene in scenes:
         # Row-major order: sorted by start, then by vehicle, as the groups need it.
         start, vehicle = np.nonzero(_present_throughout(scene, frames)[::stride])
+        # From rows of the thinned list back to rows of the scene.
         start *= stride
         lane = scene.lane[start + PRESENT, vehicle]
         part = Windows(
@@ -415,6 +423,7 @@ def kmeans_labels(
 
     Groups have about ``size`` members.
     """
+    # k-means takes the number of groups; their sizes vary about the wanted one.
     groups = max(1, round(len(positions) / size))
     if groups == 1:
         return np.zeros(len(positions), dtype=np.int64)
@@ -440,6 +449,7 @@ def group_windows(
     for rows in np.split(np.arange(len(windows)), begins):
         labels = kmeans_labels(now[rows], size, seed)
         groups += [torch.from_numpy(rows[labels == label]) for label in np.unique(labels)]
+    # -1 is no row of the windows, while 0 is the first one.
     window = pad_sequence(groups, batch_first=True, padding_value=-1)
     mask = window >= 0
 

@@ -27,6 +27,7 @@ def make_rows(
     """
     # Checked here, so that both kinds of rows get values that will do.
     config = highways(traffic=traffic, num_envs=count, **keys)
+    # The native kernel records no physics steps for pictures and knows no TorchRL transforms.
     if not pictures and not len(transforms) and why_not() is None:
         rows = native_rows(config)
         if rows is not None:
@@ -51,5 +52,6 @@ class OnRows:
     def spec(self, spec: EnvSpec | None) -> None:
         # A copy: gymnasium's registry holds the original.
         self._spec = copy.copy(spec)
+        # gymnasium.make() sets it after the constructor, so the rows are there already.
         if self._spec is not None:
             self._spec.max_episode_steps = self._rows.episode.most_decisions()

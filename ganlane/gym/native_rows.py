@@ -25,6 +25,7 @@ class NativeRows(Rows):
         self.space = observation_space(batch.observation.shape[1], batch.bounds[1])
         # Made once, since they are views of arrays that the kernel writes to.
         state = batch.state
+        # No recorded scene is driven by the kernel, so none can end.
         events = [name for name in keys.END_EVENTS if name != "scene_end"]
         self._arrays: dict[str, Any] = {
             "scene_end": np.zeros(batch.rows, np.bool_),

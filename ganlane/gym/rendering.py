@@ -29,7 +29,13 @@ def _label(rows: TensorRows, row: int) -> EpisodeLabel:
     seed = int(state.get(keys.SEED)[row])
     episode = int(state.get(keys.EPISODE)[row])
     road = road_of_row(state, rows.env.base_env.road, row)
-    return EpisodeLabel("ego", rows.traffic, seed, episode, *road)
+    return EpisodeLabel(
+        "ego",
+        rows.traffic,
+        seed,
+        episode,
+        *road,
+    )
 
 
 class LiveView:
@@ -70,6 +76,7 @@ class LiveView:
 
     def picture(self) -> Picture:
         """The last frame, [height, width, 3]."""
+        # Drawn only when asked for: the painter is made anew from what was recorded so far.
         return self._painter().draw(len(self._recorder.frames) - 1)
 
     def pictures(self) -> Iterator[Picture]:
@@ -101,6 +108,7 @@ class BatchView:
 
     def __init__(self, rows: TensorRows) -> None:
         self.rows = rows
+        # Return and last action are all that is kept: without trails no past state is needed.
         self._returns = np.zeros(rows.count)
         self._actions = np.full(rows.count, -1)
 

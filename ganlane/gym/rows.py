@@ -50,6 +50,7 @@ class Rows(ABC):
         started: whether an episode is under way.
     """
 
+    # Whether an episode was ever begun; gymnasium wants reset() before the first step().
     started = False
     count: int
     space: Box
@@ -100,8 +101,11 @@ class Rows(ABC):
         width = np.asarray(state["lane_width_m"], y.dtype)
         lane = np.rint(y / width).astype(np.int64)
         info = {name: state[field] for name, field in INFO.items()}
+        # Simulated time is counted in physics steps, so it has no sum of rounding errors.
         info["time_s"] = state[keys.STEP] * keys.PHYSICS_STEP_S
+        # An ego that has left the road is beyond the outer lanes.
         info["lane"] = np.minimum(np.maximum(lane, 0), lanes - 1)
+        # gymnasium's Discrete.sample() takes masks of int8; the bytes of booleans are the same.
         info["action_mask"] = self.mask().view(np.int8)
         info[keys.REWARD_TERMS] = state[keys.REWARD_TERMS]
         return info
@@ -115,6 +119,7 @@ def observation_space(size: int, largest: float) -> Box:
     # float32, as the observations are; a wider type would not contain them.
     low = np.full(size, -1.0, np.float32)
     high = np.full(size, largest, np.float32)
+    # The first number is the ego's speed as a ratio, which is never negative.
     low[0], high[0] = 0.0, SPEED_RATIO_LIMIT
     return Box(low, high, dtype=np.float32)
 
@@ -135,6 +140,7 @@ def array_of(value: Any) -> npt.NDArray[Any]:
     try:
         return np.asarray(value)
     except (TypeError, ValueError, RuntimeError):
+        # An array without numbers, which the caller's check of the type refuses.
         return np.asarray(None)
 
 

@@ -98,6 +98,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         """Begin an episode; see the class for which."""
         chosen = reset_options(options, ("episode",))
         seed = None if seed is None else seed_number(seed)
+        # gymnasium seeds np_random here, from which unseeded environments draw.
         super().reset(seed=seed)
         # A seed begins with its episode 0; without one the next episode of the same seed follows.
         if seed is not None:
@@ -106,7 +107,12 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         elif self._seed is None:
             self._seed = int(self.np_random.integers(SEEDS))
         episode = chosen.get("episode", self._episode + 1)
-        self._episode = whole_number("options: episode", episode, 0, 2**62)
+        self._episode = whole_number(
+            "options: episode",
+            episode,
+            0,
+            2**62,
+        )
         self._rows.start(self._seed, self._episode)
         self._running = True
         # The first frame is the scene before anything moves.
@@ -114,6 +120,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
             self._view.start()
             self._pictures.clear()
             self._collect()
+        # Copies: the arrays of the rows are overwritten by the next step.
         return self._rows.observation()[0].copy(), row_of(self._rows.info(), 0)
 
     def step(self, action: Any) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
@@ -128,6 +135,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         reward = float(stepped.reward[0])
         terminated = bool(stepped.terminated[0])
         truncated = bool(stepped.truncated[0])
+        # gymnasium leaves it open what a step after the end does; here it is refused.
         self._running = not (terminated or truncated)
         if self._view is not None:
             self._view.after_step(reward)

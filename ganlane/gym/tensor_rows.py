@@ -45,6 +45,7 @@ class TensorRows(Rows):
         parts = list(self.env.transform)
         observed = next(part for part in parts if isinstance(part, ObservationTransform))
         size = self.env.observation_spec[keys.OBSERVATION].shape[-1]
+        # One form counts metres of overlap, so its bound follows from the longest vehicle.
         self.space = observation_space(size, largest_number(observed.form, base.scenes.longest_m))
 
     state: TensorDictBase
@@ -90,6 +91,7 @@ class TensorRows(Rows):
 
     def mask(self) -> Flags:
         state = self.now()
+        # An environment with a mask has computed it; without one it is the actions on the road.
         mask = state.get(keys.ACTION_MASK, None)
         if mask is None:
             mask = legal_actions(state, road_in(state, self.env.base_env.road))

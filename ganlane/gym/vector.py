@@ -68,6 +68,8 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
                 f"render_mode={render_mode}: a batch has rgb_array only; "
                 "use gymnasium.make for a window."
             )
+        # What happens to a row whose episode is over: reset in this step, in the next, or by the
+        # caller.
         self._mode = _mode_of(autoreset_mode)
         self._rows = make_rows(
             traffic,
@@ -80,7 +82,13 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         self.render_mode = render_mode
         episode = self._rows.episode
         if max_episode_steps is not None:
-            limit = whole_number("max_episode_steps", max_episode_steps, 1, 2**31)
+            limit = whole_number(
+                "max_episode_steps",
+                max_episode_steps,
+                1,
+                2**31,
+            )
+            # make_vec() passes the limit of the specification; a batch cannot end episodes earlier.
             if limit < episode.most_decisions():
                 raise UserError(
                     f"max_episode_steps={limit}: a batch has its own time limit; "
@@ -135,10 +143,12 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         # A seed starts with its first episodes; without one every row goes on with its next.
         if seed is not None:
             seeds = [seed_number(one) for one in array_of(seed).ravel().tolist()]
+            # Row i begins with episode i and adds N each time, so no two rows drive the same one.
             first = rows
             super().reset(seed=seeds[0] if len(seeds) == 1 else None)
         elif self._rows.started:
             state = self._rows.state_arrays()
+            # A copy: the state's own array is overwritten by the start.
             seeds = state["seed"].copy()
             first = state["episode"] + self.num_envs
         else:
@@ -155,6 +165,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
                     f"options: episode={episode!r:.80}: expected whole numbers from 0; "
                     "give for instance 3."
                 )
+            # One number k for all means the episodes k, k + 1, ...
             if first.ndim == 0:
                 first = first + rows
         # One seed for all rows, or one for each.

@@ -19,6 +19,7 @@ def has_display() -> bool:
 
     Pygame is installed and, except on Windows and macOS, a display is set.
     """
+    # Only searched for: importing pygame takes time and prints a greeting.
     if importlib.util.find_spec("pygame") is None:
         return False
     # X11, Wayland, or SDL's drivers without either.
@@ -59,8 +60,10 @@ class FilmWindow:
         pygame = self._pygame
         if pygame is None:
             return
+        # Arrays have rows first, pygame has the width first.
         size = picture.shape[1::-1]
         try:
+            # Opened with the first picture, whose size is known only then.
             if self._screen is None:
                 self._screen = pygame.display.set_mode(size)
             self._screen.blit(pygame.image.frombuffer(picture.tobytes(), size, "RGB"), (0, 0))

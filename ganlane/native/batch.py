@@ -158,7 +158,13 @@ class NativeBatch:
         # When others see the ego's lane changes, and the ego theirs.
         visible = (Visibility.named(ego.visibility), Visibility.SIGNALLED)
         # The kernel's structures, filled once.
-        decision = settings.settings_of(*road, episode, ego, idm, mobil=mobil)
+        decision = settings.settings_of(
+            *road,
+            episode,
+            ego,
+            idm,
+            mobil=mobil,
+        )
         deceleration = mask.safe_deceleration
         abort = ego.abort_lane_change
         # Referred to by this object, since the structure holds no more than their addresses.
@@ -204,6 +210,7 @@ class NativeBatch:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state["arguments"])  # type: ignore[misc]  # anew, in place
+        # Copied, since the kernel's structures hold the addresses of these arrays.
         for array, numbers in zip(self._arrays(), state["arrays"]):
             array[:] = numbers
 
@@ -230,12 +237,14 @@ class NativeBatch:
 
     def step(self, actions: npt.NDArray[np.int64]) -> Stepped:
         """One decision of every row, by the actions [N]; no row is reset."""
+        # Copied, since the kernel holds the address of this array.
         self.state[keys.ACTION][:] = actions
         self._in_threads(self._library.ganlane_step)
         return self._stepped
 
     def _in_threads(self, function: Callable[..., int]) -> None:
         batch = self._address
+        # Rows are independent, so any split between threads gives the same numbers.
         in_threads(self.rows, lambda first, last: function(batch, first, last))
 
     def reward_terms(self) -> dict[str, npt.NDArray[np.float32]]:

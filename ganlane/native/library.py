@@ -206,7 +206,12 @@ def _command(variant: str, compiler: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _run(command: tuple[str, ...]) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 def _build(command: tuple[str, ...], library: Path) -> None:

@@ -190,6 +190,7 @@ Structure = TypeVar("Structure", bound=ctypes.Structure)
 
 def _filled(kind: type[Structure], numbers: Mapping[str, Any]) -> Structure:
     """A structure with those of the ``numbers`` that it has."""
+    # A missing number is a KeyError here instead of a 0 in the kernel.
     return kind(**{member[0]: numbers[member[0]] for member in kind._fields_})
 
 
@@ -220,6 +221,7 @@ def settings_of(
         "per_far_s": 1.0 / steering.far_s,
         "per_lane_width": 1.0 / lane_width_m,
         "substeps": episode.substeps(),
+        # A number of steps, since sums of 0.1 s drift in floats.
         "timeout_steps": round(episode.timeout_s / keys.PHYSICS_STEP_S),
         "mobil": mobil is not None,
     }
@@ -238,7 +240,14 @@ def mask_of(
     # The mask reads few of the decision's numbers; the others are defaults.
     ego = EgoParameters(abort_lane_change=abort)
     mobil = MobilParameters(safe_deceleration=safe_deceleration)
-    return settings_of(lanes, lane_width_m, vehicles, ego=ego, idm=idm, mobil=mobil)
+    return settings_of(
+        lanes,
+        lane_width_m,
+        vehicles,
+        ego=ego,
+        idm=idm,
+        mobil=mobil,
+    )
 
 
 def view_of(
@@ -246,7 +255,13 @@ def view_of(
 ) -> View:
     """The numbers of an observation in :data:`NATIVE_FORMS`."""
     road = (lane_width_m, NEARNESS_M, OVERLAP_M, lanes, vehicles)
-    return View(scale.range_m, scale.speed_mps, *road, *NATIVE_FORMS[form])
+    # By position, in the order of the members of View.
+    return View(
+        scale.range_m,
+        scale.speed_mps,
+        *road,
+        *NATIVE_FORMS[form],
+    )
 
 
 def spawn_of(

@@ -30,6 +30,7 @@ from ganlane.sim.dynamics import STEERING
 from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road, Vehicles
 
+# The kernel reads memory as it lies, so types have to match exactly.
 _TYPES = settings.VEHICLE_ARRAYS | settings.EGO_ARRAYS | settings.EVENT_ARRAYS
 _DTYPES = {key: getattr(torch, name) for key, name in _TYPES.items()}
 _DTYPES[keys.STEP] = torch.int64
@@ -49,6 +50,7 @@ def _room(
         if name in settings.VEHICLE_ARRAYS:
             shape = (rows, vehicles)
         elif name in settings.EVENT_ARRAYS:
+            # As the environment has its events and flags.
             shape = (rows, 1)
         room[name] = make(shape, dtype=_DTYPES[name])
     return room
@@ -66,6 +68,8 @@ def _state(tensors: Mapping[Key, Tensor]) -> TensorDict:
             fields[key] = value
         else:
             groups.setdefault(key[0], {})[key[1]] = value
+    # Only recorded scenes end by themselves; the flag is there so that all states have the same
+    # keys.
     groups[keys.EVENTS]["scene_end"] = torch.zeros_like(groups[keys.EVENTS]["timeout"])
     for name, group in groups.items():
         fields[name] = TensorDict._new_unsafe(group, batch_size=size, device=device)
@@ -103,6 +107,7 @@ class _Function:
         self._name = name
         self._numbers = numbers
         self._variant = variant
+        # A function of ctypes cannot be pickled; __getstate__ leaves it out.
         self._call = getattr(load(variant), name)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -122,6 +127,7 @@ class _Function:
         # The contiguous copies have to live until the call is over.
         read = [tensor if tensor is None else tensor.contiguous() for tensor in inputs]
         pointers = (ctypes.byref(self._numbers), addresses(read), addresses(outputs))
+        # ctypes releases Python's lock during a call, so threads run side by side.
         in_threads(rows, lambda first, last: self._call(*pointers, first, last))
 
 
@@ -182,6 +188,7 @@ class Kernel(_Function):
             number = state
             for part in (name,) if isinstance(name, str) else name:
                 number = number.get(part)
+            # A wrong type would be read as other numbers, without an error.
             if number.dtype is not _DTYPES[name] or number.shape[0] != rows:
                 raise TypeError(
                     f"the kernel takes {rows} rows of {_DTYPES[name]} as {name}, "
@@ -189,7 +196,12 @@ class Kernel(_Function):
                 )
             before[name] = number
         # New tensors: the state before the decision belongs to the caller.
-        after = _room(settings.OUTPUTS, rows, self.vehicles, torch.empty)
+        after = _room(
+            settings.OUTPUTS,
+            rows,
+            self.vehicles,
+            torch.empty,
+        )
         self._run(rows, [action, *before.values(), recycles], list(after.values()))
         # What no decision changes is shared with the state before, not copied.
         after |= {name: before[name] for name in _LASTING}
@@ -234,7 +246,12 @@ class NativeScenes(_Function):
         rows = torch.ones_like(seed, dtype=torch.bool) if rows is None else rows
         # Zeros, since rows that are not drawn are not written.
         names = (*settings.OUTPUTS, *settings.SCENE)
-        state = _room(names, len(seed), self.vehicles, torch.zeros)
+        state = _room(
+            names,
+            len(seed),
+            self.vehicles,
+            torch.zeros,
+        )
         scene = [state[name] for name in settings.SCENE]
         # Drawn with the scene, but the environment draws it at every decision.
         recycles = torch.zeros_like(rows)
@@ -305,7 +322,12 @@ class SafeActions(_Function):
     def __init__(
         self, road: Road, vehicles: int, idm: IdmParameters, safe_deceleration: float, abort: bool
     ) -> None:
-        numbers = settings.mask_of(*_shape(road, vehicles), idm, safe_deceleration, abort)
+        numbers = settings.mask_of(
+            *_shape(road, vehicles),
+            idm,
+            safe_deceleration,
+            abort,
+        )
         super().__init__("ganlane_mask", numbers)
 
     def allowed(self, seen: Vehicles, direction: Tensor) -> tuple[Tensor, Tensor]:
@@ -317,6 +339,7 @@ class SafeActions(_Function):
         v = seen
         rows = seen.x.shape[0]
         inputs = [v.x, v.y, v.heading, v.speed, v.length, v.width, v.desired_speed]
+        # In the order of the structure in C++.
         inputs += [v.target_lane, v.visibility, v.valid, direction]
         mask = torch.empty(rows, 3, dtype=torch.bool)
         none = torch.empty(rows, dtype=torch.bool)

@@ -342,9 +342,21 @@ def spawned_starts(
     driven = {}
     for name, make in factories.items():
         print_progress(f"{name} from {rows} spawned starts")
-        recordings = spawned_recordings(make, road, parameters, rows)
+        recordings = spawned_recordings(
+            make,
+            road,
+            parameters,
+            rows,
+        )
         driven[name] = measure_recordings(recordings)
-    return Starts([], [], {}, driven, reference, reference)
+    return Starts(
+        [],
+        [],
+        {},
+        driven,
+        reference,
+        reference,
+    )
 
 
 def spawned_recordings(
@@ -355,7 +367,13 @@ def spawned_recordings(
 ) -> list[Recording]:
     """``rows`` spawned episodes of ``parameters.most_s`` s, in the form of recordings."""
     # Events are counted because driving counts them; nobody reads them here.
-    paths = drive_spawned(make(road), parameters, 0, rows, EventCounter(road))
+    paths = drive_spawned(
+        make(road),
+        parameters,
+        0,
+        rows,
+        EventCounter(road),
+    )
     # Nobody enters late or leaves.
     everywhere = np.ones(paths.x[:, 0].shape, dtype=bool)
     return [

@@ -124,6 +124,7 @@ def with_env_keys(kind: type[Record], keys: Mapping[str, Any]) -> dict[str, Any]
         return dict(keys)
     result = {name: value for name, value in keys.items() if name in names}
     base = result.get("env", {})
+    # The name of an option is short for a mapping.
     if isinstance(base, str):
         base = {"name": base}
     result["env"] = {**(plain(base) if isinstance(base, Record) else base), **of_env}
@@ -249,6 +250,7 @@ class ReproduceConfig(EvaluateConfig):
 
     def episodes_on(self, traffic: str) -> int:
         """Number of episodes on a traffic."""
+        # A slow traffic gets fewer episodes, never more than asked for.
         return min(self.episodes, {**FEWER, **self.fewer}.get(traffic, self.episodes))
 
 

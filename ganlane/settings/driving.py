@@ -30,6 +30,7 @@ from ganlane.settings.record import (
 class Visibility(IntEnum):
     """When others see a vehicle that enters their lane; see :mod:`ganlane.sim.state`."""
 
+    # in the order of how early others see a change; stored in states, so never renumbered
     CENTRE = 0
     BODY = 1
     SIGNALLED = 2
@@ -68,6 +69,7 @@ class IdmParameters(Record):
 
     def brake_scale(self) -> float:
         """``2 sqrt(a b)`` of the approach term, m/s2."""
+        # a: the largest acceleration, b: the comfortable deceleration
         return 2.0 * math.sqrt(self.max_acceleration * self.comfortable_deceleration)
 
 
@@ -114,10 +116,12 @@ class EgoParameters(Record):
 
 @dataclass(frozen=True)
 class SteeringParameters:
+    # seconds, not metres: both points move out with the speed
     """Look-ahead times (s), gains (each divided by speed, times the wheelbase) and limits."""
 
     near_s: float = 1.0
     far_s: float = 4.0
+    # stable in steps of 0.1 s, without overshoot (ganlane.sim.dynamics)
     gain_far: float = 1.5
     gain_near: float = 3.0
     gain_integral: float = 3.375

@@ -32,7 +32,9 @@ from ganlane.settings.record import (
 if TYPE_CHECKING:
     from ganlane.sim.scenes import FixedScene, SceneVehicle
 
+#: The ego and at least one other.
 Vehicles: TypeAlias = Annotated[int, between(2, 1000)]
+# 0 waits for the number of vehicles in the scene.
 _VEHICLES_OR_SCENE = Rule(lambda count: count == 0 or 2 <= count <= 1000, "a number from 2 to 1000")
 #: Keys of Table II, which do not apply to a given scene.
 TABLE_II_KEYS = tuple(
@@ -72,10 +74,16 @@ class SceneConfig(Record):
             "lane_width_m": env.lane_width_m,
             "idm": env.idm,
         }
+        # Kind and jitter belong to every scene; the rest are the function's own arguments.
         shared = key_names(SceneConfig)
         names = [name for name in key_names(type(self)) if name not in shared]
         numbers = {name: getattr(self, name) for name in names}
-        return call_with(getattr(scenarios, self.kind), offered, numbers, self.label())
+        return call_with(
+            getattr(scenarios, self.kind),
+            offered,
+            numbers,
+            self.label(),
+        )
 
     def label(self) -> str:
         """The scene, for messages."""
@@ -171,6 +179,7 @@ class FileScene(SceneConfig):
             raise ParameterError(
                 "{scene.path}: no file; give one, env=scene {scene.path}=my_scene.csv."
             )
+        # 0 is no possible value, so it can say: as in the file.
         scene = read_scene(self.path, env.lanes or None, env.lane_width_m or None)
         speed = env.ego_desired_speed_mps
         return with_ego_speed(scene, speed) if speed else scene
@@ -243,6 +252,7 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
                 raise ParameterError(
                     f"{{{name}}}=0: expected a number above 0; 0 means what a scene's file says."
                 )
+        # A lorry's width counts only where there may be lorries.
         for name in ("width_m", "truck_width_m") if self.truck_share > 0 else ("width_m",):
             if self.lane_width_m <= getattr(self, name):
                 raise ParameterError(
@@ -291,12 +301,14 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
                     "out, or take env=highway."
                 )
         scene = self.scenes()
+        # For type checkers: without a scene this check is not called.
         assert scene is not None
         if self.vehicles not in (0, scene.vehicles):
             raise ParameterError(
                 f"{{vehicles}}={self.vehicles}: the scene has {scene.vehicles}, the ego included; "
                 "leave this key out."
             )
+        # From here on the number is known, also where it was 0.
         assign(self, vehicles=scene.vehicles)
         scene.check(scene.road, self.idm)
 
@@ -304,9 +316,11 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
         """Initial scenes of episodes; None: Table II. ``others_visibility`` is the traffic's."""
         if self.scene is None:
             return None
+        # Imported here, since it imports torch, which takes seconds.
         from ganlane.sim.scenes import FixedScene
         from ganlane.sim.state import Road
 
+        # The check at the start knows no traffic yet.
         if others_visibility is None:
             others_visibility = Visibility.SIGNALLED
         return FixedScene(

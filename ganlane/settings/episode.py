@@ -19,6 +19,7 @@ class Stream(IntEnum):
     For training, for selection (validation), and for reported results (test).
     """
 
+    # the numbers enter the random keys: other ones would change every episode
     TRAIN = 0
     SELECT = 1
     REPORT = 2
@@ -53,6 +54,7 @@ class EpisodeParameters(Record):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # 0.3 / 0.1 is not exactly 3, so a whole number is tested with a tolerance.
         if (
             self.substeps() < 1
             or abs(self.substeps() * PHYSICS_STEP_S - self.decision_period_s) > 1e-9
@@ -69,6 +71,7 @@ class EpisodeParameters(Record):
 
     def most_decisions(self) -> int:
         """Decisions until the time limit."""
+        # Floor division of the negative rounds up: a shorter last decision counts.
         return -(-round(self.timeout_s / PHYSICS_STEP_S) // self.substeps())
 
 
@@ -136,6 +139,7 @@ class SpawnParameters(Record):
 
     def lane_capacity(self) -> int:
         """Vehicles that fit into one lane, whichever of them are lorries."""
+        # The first vehicle needs no spacing before it.
         return int(self.spread_m / self.spacing_m) + 1
 
     def worst_followers(self) -> tuple[tuple[str, float, float, float], ...]:
@@ -148,6 +152,7 @@ class SpawnParameters(Record):
             self.desired_speed_mps[1],
             self.truck_desired_speed_mps[1] if self.truck_share > 0 else 0.0,
         )
+        # By group of followers: the fastest one behind the slowest leader that Table II allows.
         return (
             ("rear_speed_mps", rear[1], min(rear[0], ego[0], front[0]), others),
             ("ego_speed_mps", ego[1], front[0], self.ego_desired_speed_mps),

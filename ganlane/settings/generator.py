@@ -31,7 +31,9 @@ Preset = Literal["paper", "calibrated"]
 #: Inputs of the calibrated preset in addition to the motion: IDM's acceleration, gap, closing
 #: speed, lane offset.
 EXTRA_INPUTS = 4
+#: The bound keeps a file of weights from requesting all memory.
 _Width = Annotated[int, between(1, 4096)]
+#: inf is allowed: a residual without washout, for an ablation.
 _WASHOUT = Rule(lambda value: value > 0 and not math.isnan(value), "a number above 0, or inf")
 
 
@@ -55,6 +57,7 @@ class GeneratorSizes(Record):
             ablation.
     """
 
+    # widths of layers: set from Python alone
     embedding: _Width = field(default=64, metadata=NO_KEY)
     hidden: _Width = field(default=32, metadata=NO_KEY)
     pooling: _Width = field(default=48, metadata=NO_KEY)
@@ -87,6 +90,7 @@ class LossWeights(Record):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # The adversarial term alone says nothing about where a vehicle goes.
         if self.variety == self.single == self.mean == 0:
             raise ParameterError(
                 "{variety}=0: {single} and {mean} are 0, too; give one of them a weight."
@@ -196,6 +200,7 @@ class CalibratedConfig(FitConfig):
         default_factory=lambda: LoopConfig(updates=800, evaluate_every=80, warmup=40)
     )
     # how far scenes are rolled out
+    # 0.8, 1.6 and 2.9 s; most updates take the shortest, which costs least
     horizons: tuple[Count, ...] = (8, 16, 29)
     shares: tuple[NotNegative, ...] = (3.0, 1.0, 1.0)
     held_out_horizon: Annotated[int, at_least(8)] = 29
@@ -251,6 +256,7 @@ class NgsimParameters(Record):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # Upper or lower case makes no difference.
         assign(self, locations=tuple(place.lower() for place in self.locations))
 
 
@@ -276,6 +282,7 @@ class DataConfig(Record):
     @classmethod
     def kinds(cls) -> dict[str, type[Record]]:
         """A class for each format."""
+        # This class is a format itself; its subclasses alone would miss it.
         return {kind.format: kind for kind in (DataConfig, NgsimDataConfig, HighdDataConfig)}
 
     def parameters(self) -> NgsimParameters | None:
@@ -289,6 +296,7 @@ class DataConfig(Record):
         """
         if self.held_out is not None:
             return self.held_out
+        # Every third by name, from the second on: a choice that no recording influences.
         return tuple(preferred) if set(preferred) <= set(scenes) else tuple(sorted(scenes)[1::3])
 
 
@@ -311,6 +319,7 @@ class NgsimDataConfig(NgsimParameters, DataConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # So large a file needs a place of the user's choice.
         if self.download and self.path is None:
             raise ParameterError(
                 "{download}=true: where to is missing; give {path}=FILE, for instance ngsim.csv."

@@ -69,6 +69,7 @@ class SensorParameters(Record):
     def delay_decisions(self, decision_period_s: float) -> int:
         """The delay in decisions; :class:`ParameterError` unless that is a whole number."""
         decisions = self.delay_s / decision_period_s
+        # 0.3 / 0.1 is not exactly 3, so a whole number is tested with a tolerance.
         if abs(decisions - round(decisions)) > 1e-6:
             raise ParameterError(
                 f"{{delay_s}}={self.delay_s:g}: expected a multiple of the decision period "

@@ -59,6 +59,7 @@ class Rule(NamedTuple):
 
 def _finite(value: float) -> bool:
     """Whether a number is finite, and fits into 64 bits if it is whole."""
+    # Larger whole numbers do not fit into an int64 of NumPy or torch.
     return abs(value) < (2**63 if isinstance(value, int) else math.inf)
 
 
@@ -105,6 +106,7 @@ Share: TypeAlias = Annotated[float, between(0, 1)]
 PositiveShare: TypeAlias = Annotated[float, _SHARE_ABOVE_0]
 Count: TypeAlias = Annotated[int, at_least(1)]
 CountOrZero: TypeAlias = Annotated[int, at_least(0)]
+#: Up to 2**53 a whole number survives as a float, as in JSON.
 Seed: TypeAlias = Annotated[int, between(0, 2**53)]
 Text: TypeAlias = Annotated[str, Rule(bool, "a text that is not empty")]
 #: Lowest and highest value, from 0 on; or above 0.
@@ -137,6 +139,7 @@ def option(group: str, name: str) -> dict[str, Any]:
             f"{group}={name!s:.80}: no such option{did_you_mean(str(name), names)}; choose one of "
             f"{', '.join(names)}."
         )
+    # A copy, since the mapping in the cache is shared by all callers.
     return deepcopy(_option_file(conf_folder() / group / f"{name}.yaml"))
 
 
@@ -175,13 +178,20 @@ class Record:
     def __post_init__(self) -> None:
         # A frozen dataclass is set through object's own setter, before anybody sees it.
         hints = _hints(type(self))  # type: ignore[arg-type]
+        # In the order of the fields, so that the first mistake is the one reported.
         for field in fields(self):  # type: ignore[arg-type]
-            value = _fitted(hints[field.name], getattr(self, field.name), field.name, field)
+            value = _fitted(
+                hints[field.name],
+                getattr(self, field.name),
+                field.name,
+                field,
+            )
             assign(self, **{field.name: value})
 
     @classmethod
     def kinds(cls) -> dict[str, type[Record]]:
         """The subclasses, or the class alone, by the default of the field ``chosen_by``."""
+        # A class without subclasses is the only kind of itself.
         return {getattr(kind, cls.chosen_by): kind for kind in (cls.__subclasses__() or [cls])}
 
     @classmethod
@@ -215,6 +225,7 @@ def make(
     Raises:
         ParameterError: for the first key or value that will not do, by its whole key.
     """
+    # A record was checked when it was made.
     if isinstance(data, kind):
         return data
     with _below(key):
@@ -245,6 +256,7 @@ def _below(key: str) -> Iterator[None]:
     try:
         yield
     except ParameterError as error:
+        # With the inner error's cause, so that a traceback does not show the same error twice.
         raise (error.below(key) if key else error) from error.__cause__
 
 
@@ -298,13 +310,24 @@ def _fitted(
     """``value`` as the annotation ``hint`` wants it, its ranges checked."""
     # Peel the annotation from the outside: optional, ranges, then what the value itself is.
     kind, inner = get_origin(hint) or hint, get_args(hint)
+    # Records have unions with None only.
     if kind in (Union, UnionType):
         if value is None and NoneType in inner:
             return None
         present = next(alternative for alternative in inner if alternative is not NoneType)
-        return _fitted(present, value, key, field)
+        return _fitted(
+            present,
+            value,
+            key,
+            field,
+        )
     if kind is Annotated:
-        value = _fitted(inner[0], value, key, field)
+        value = _fitted(
+            inner[0],
+            value,
+            key,
+            field,
+        )
         for rule in inner[1:]:
             if not rule.holds(value):
                 raise _refusal(key, value, rule.expected, field)
@@ -326,7 +349,12 @@ def _fitted(
             str(name): _fitted(inner[1], entry, f"{key}.{name}", field)
             for name, entry in value.items()
         }
-    return _scalar(kind, value, key, field)
+    return _scalar(
+        kind,
+        value,
+        key,
+        field,
+    )
 
 
 def _scalar(
@@ -338,6 +366,7 @@ def _scalar(
     """A number, text or switch of the type ``kind``."""
     if kind is Any:
         return value
+    # bool is a subclass of int, but true is no number.
     is_number = isinstance(value, Real) and not isinstance(value, bool)
     if kind is float and is_number:
         try:

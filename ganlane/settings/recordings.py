@@ -28,6 +28,7 @@ _WITHOUT_CARD = {
         "a foreign simulator drives around an ego only, and a card has none; choose one of our own",
     ),
 }
+#: What a quick card drives at most: a check that it runs, no measurement.
 _QUICK_KM = 5.0
 _QUICK_S = 30.0
 
@@ -54,6 +55,7 @@ class PrepareConfig(RunConfig):
             raise UserError(
                 f"device={self.device}: recordings are prepared on the CPU; use device=cpu."
             )
+        # Scenes have a default place; a raw recording is the user's own file.
         if self.data.format != "scenes" and self.data.path is None:
             raise UserError(f"data={self.data.format}: which file is missing; give data.path=FILE.")
 
@@ -82,6 +84,7 @@ class TrainGeneratorConfig(RunConfig):
             raise UserError(
                 "folds=1: one fold leaves nothing to fit to; use 2 or more, or 0 for none."
             )
+        # Found out now, not after minutes of fitting.
         if self.resume is not None and not Path(self.resume).is_dir():
             raise UserError(
                 f"resume={self.resume}: no such folder; give the folder of an earlier run."
@@ -138,6 +141,7 @@ class RealismConfig(RunConfig):
     fold_weights: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        # One name stands for a list of one.
         against: Any = [self.against] if isinstance(self.against, str) else self.against
         for name in _REFERENCES:
             if isinstance(against, Collection) and name in against:
@@ -158,6 +162,7 @@ class RealismConfig(RunConfig):
                 f"data={self.data.format} first, "
                 "and give data=scenes data.path=FOLDER with what it wrote."
             )
+        # Histograms of some scenes would not stand for the recordings.
         if self.publish and self.scenes != "all":
             raise UserError(
                 "publish=true: the file that ships is made from all recorded scenes; give "
@@ -179,6 +184,7 @@ class RealismConfig(RunConfig):
         return replace(
             self,
             repeats=1,
+            # A plausible number in place of the fit.
             desired_above_mps=4.5 if self.desired_above_mps is None else self.desired_above_mps,
             vehicle_km=min(self.vehicle_km, _QUICK_KM),
             long_s=min(self.long_s, _QUICK_S),

@@ -30,6 +30,7 @@ CHARTS = ("png", "svg", "pdf")
 PAGES = ("html", "csv", "parquet")
 #: One episode.
 FILMS = ("gif", "mp4", "png")
+# png is a film and a chart, listed once.
 FORMATS = tuple(dict.fromkeys((*FILMS, *PAGES, *CHARTS)))
 MOST_EPISODES = 12
 #: A GIF of a whole episode takes minutes to draw, and tens of MB.
@@ -196,6 +197,7 @@ class RenderConfig(DrivingConfig):
     @property
     def kind(self) -> str:
         """``format``, else the ending of ``out``, else what suits what is drawn."""
+        # Curves are a picture, crashes are many episodes, else one episode is a film.
         default = "png" if self.run is not None else "gif" if self.crashes is None else "html"
         return self.format or self._ending or default
 
@@ -210,4 +212,5 @@ class RenderConfig(DrivingConfig):
         """The episodes to record: agent and number of each."""
         agents = [self.driver] if self.agents is None else self.agents
         episodes = [self.episode] if self.episodes is None else self.episodes
+        # Episode by episode, so that the agents of one stand side by side.
         return [(agent, episode) for episode in episodes for agent in agents]

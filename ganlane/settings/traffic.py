@@ -86,6 +86,7 @@ class TrafficConfig(Record):
                 "{_target_}: of which traffic? name it first, as in traffic=gan or "
                 "pretrain.traffic=gan."
             )
+        # What is no mapping goes to the base class, which says what is wrong with it.
         target = data.get("_target_") if isinstance(data, Mapping) else None
         if not isinstance(target, str) or target in cls.kinds():
             return super().chosen(data)
@@ -102,6 +103,7 @@ class TrafficConfig(Record):
 
     def arguments(self) -> dict[str, Any]:
         """Keyword arguments of the target: the fields that not every traffic has."""
+        # Target and blind_share are for whoever makes the traffic, not for the target.
         shared = key_names(TrafficConfig)
         names = [name for name in key_names(type(self)) if name not in shared]
         return {name: getattr(self, name) for name in names}
@@ -133,7 +135,9 @@ class OwnTraffic(TrafficConfig):
         arguments_: keyword arguments of its constructor.
     """
 
+    # A default, since kinds() reads it from the class; no import path is empty.
     _target_: ImportPath = ""
+    # With an underscore, since arguments() is a method.
     arguments_: dict[str, Any] = field(default_factory=dict)
 
     def arguments(self) -> dict[str, Any]:
@@ -183,6 +187,7 @@ class GanTrafficConfig(TrafficConfig):
     option = "gan"
     _target_: ImportPath = "ganlane.traffic.presets.gan_traffic"
     path: str | None = None
+    # the network knows no lanes, so something else has to keep vehicles on the road
     guard: bool = True
     noise_scale: NotNegative = 1.0
     execute_k: Annotated[int, between(1, 8)] = 1
@@ -206,6 +211,7 @@ class GanCalibratedTrafficConfig(TrafficConfig):
     option = "gan_calibrated"
     _target_: ImportPath = "ganlane.traffic.presets.gan_calibrated_traffic"
     path: str | None = None
+    # chosen in simulation, not as fitted (see above)
     noise_scale: NotNegative = 1.4
     noise_period_s: NotNegative = 3.0
     changes_per_km: NotNegative | None = None
@@ -220,6 +226,7 @@ class IdmFaultsTrafficConfig(TrafficConfig, DriverFaults):
 
     def arguments(self) -> dict[str, Any]:
         """All faults as one argument."""
+        # The keys are flat for the command line; the function takes one record.
         return {"faults": part_of(self, DriverFaults)}
 
 
@@ -260,6 +267,7 @@ class MixedTrafficConfig(TrafficConfig):
                 raise ParameterError(
                     f"{{options.{name}}}: it has no share; give {{shares}} with {name}:1 in it."
                 )
+        # Only kinds known here can be refused; a model of your own may be anything.
         for name, part in self.parts().items():
             if isinstance(part, MixedTrafficConfig):
                 raise ParameterError(f"{{shares}}={name}: it is a mixture itself; leave it out.")
@@ -271,6 +279,7 @@ class MixedTrafficConfig(TrafficConfig):
     def parts(self) -> dict[str, TrafficConfig]:
         """The traffics of the mixture, by name."""
         return {
+            # By name, so that the part's YAML file applies below the options.
             name: make(TrafficConfig, {"name": name, **self.options.get(name, {})}, "shares")
             for name in self.shares
         }
@@ -349,6 +358,7 @@ def traffics_of(data: Any, key: str) -> dict[str, TrafficConfig]:
         entries = [data]
     traffics = [make(TrafficConfig, entry, key) for entry in entries]
     by_label = {traffic.label(): traffic for traffic in traffics}
+    # Two of one name would share a row of every table.
     if not traffics or len(by_label) < len(traffics):
         raise ParameterError(
             f"{{{key}}}: expected a list of different traffics, not empty; to drive one twice give "

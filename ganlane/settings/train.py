@@ -36,6 +36,7 @@ class InitConfig(Record):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # Both keys need an agent; the message names the one that was given.
         asked = "{optimizer}=true" if self.optimizer else "{support}=trained"
         if self.path is None and (self.optimizer or self.support == "trained"):
             raise ParameterError(
@@ -108,6 +109,7 @@ class FinalEvaluationConfig(Record):
         num_envs: episodes driven side by side, at most.
     """
 
+    # teacher, shipped agent, and a lower bound for the score
     agents: Names = field(default_factory=lambda: ["mobil", "agent_idm", "random_legal"])
     traffic: TrafficConfig | None = None
     episodes: Episodes = 500
@@ -142,6 +144,7 @@ class TrainConfig(DrivingConfig):
     log_every: Count = 10_000
     evaluate_every: CountOrZero = 0
     selection_episodes: Episodes = 64
+    # no more work than this is lost if the run is killed
     checkpoint_every_s: NotNegative = 20.0
     checkpoint_replay: bool = True
     # going on with a run; none of the settings of the run itself
@@ -158,6 +161,7 @@ class TrainConfig(DrivingConfig):
 
     def compiled(self) -> TrainConfig:
         """The config with ``env.compile`` set according to ``compile``."""
+        # Imported here, since it imports torch, which takes seconds.
         from ganlane.torch_settings import can_compile
 
         # Compiling takes minutes: the benefit has to be larger.

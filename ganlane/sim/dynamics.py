@@ -184,7 +184,12 @@ def apply_action(
     off_road = ~on_road(target_lane + side, lanes)
     side = torch.where(off_road, 0, side)
     starts = side != 0
-    return Command(target_lane + side, torch.where(starts, side, direction), starts, off_road)
+    return Command(
+        target_lane + side,
+        torch.where(starts, side, direction),
+        starts,
+        off_road,
+    )
 
 
 def ego_scene(vehicles: Vehicles, road: Road) -> Scene:
@@ -207,8 +212,24 @@ def move_ego(
     ego = vehicles.at(EGO_INDEX)
     # The kinematics know no lanes: a lane change is another centre to steer to.
     centre = road.centre_of(vehicles.target_lane[:, :1], ego.y.dtype)[:, 0]
-    steering = steer(steering, ego.y, ego.heading, ego.speed, centre, dt, wheel)
-    pose = advance(ego.x, ego.y, ego.heading, ego.speed, acceleration, steering, dt)
+    steering = steer(
+        steering,
+        ego.y,
+        ego.heading,
+        ego.speed,
+        centre,
+        dt,
+        wheel,
+    )
+    pose = advance(
+        ego.x,
+        ego.y,
+        ego.heading,
+        ego.speed,
+        acceleration,
+        steering,
+        dt,
+    )
     return ego.with_(**pose._asdict()), steering
 
 

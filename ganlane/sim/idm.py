@@ -58,6 +58,7 @@ def desired_gap(
     minimum.
     """
     headway = parameters.headway_s if headway_s is None else headway_s
+    # The last term is that of approaching a leader: v dv / (2 sqrt(a b)).
     dynamic = speed * headway + speed * closing_speed / parameters.brake_scale()
     return parameters.min_gap_m + dynamic.clamp_min(0.0)
 
@@ -83,7 +84,12 @@ def idm_acceleration(
     # The exponent 4 of the free-road term, without a power.
     ratio = speed / desired_speed
     square = ratio * ratio
-    wanted = desired_gap(speed, speed - leader_speed, parameters, headway_s)
+    wanted = desired_gap(
+        speed,
+        speed - leader_speed,
+        parameters,
+        headway_s,
+    )
     interaction = wanted / gap.clamp_min(SMALLEST_GAP_M)
     acceleration = parameters.max_acceleration * (1.0 - square * square - interaction * interaction)
     # Where they overlap the interaction term is huge: the bound makes it the hardest braking.
@@ -147,6 +153,7 @@ def needed_deceleration(
 
     Infinite at 0 m.
     """
+    # Relative to the leader: v^2 / (2 b) is the way to a stop.
     closing = (speed - leader_speed).clamp_min(0.0)
     needed = closing * closing / (2.0 * gap.clamp_min(1e-9))
     return torch.where((gap <= 0) & (closing > 0), torch.inf, needed)
@@ -162,12 +169,19 @@ def _survives(
     ``idm.min_acceleration``: any other is always ahead of it and no slower. So a driver that avoids
     this one also avoids crashes in a queue, where each leader may have to brake for its own.
     """
+    # In float64, since 600 steps add up and the result decides whether a scene is refused.
     leader_now = torch.tensor(leader_speed, dtype=torch.float64)
     gap, speed, leader_now = torch.broadcast_tensors(gap, speed, leader_now)
     smallest = start = gap
     # Trapezoids, as vehicles move in the simulation (dynamics.advance).
     for _ in range(round(HORIZON_S / PHYSICS_STEP_S)):
-        acceleration = idm_acceleration(speed, desired_speed, gap, leader_now, idm)
+        acceleration = idm_acceleration(
+            speed,
+            desired_speed,
+            gap,
+            leader_now,
+            idm,
+        )
         next_speed = (speed + acceleration * PHYSICS_STEP_S).clamp_min(0.0)
         next_leader = (leader_now + idm.min_acceleration * PHYSICS_STEP_S).clamp_min(0.0)
         gap = gap + 0.5 * PHYSICS_STEP_S * (leader_now + next_leader - speed - next_speed)
@@ -214,6 +228,7 @@ def highest_speed(
     gap_m: float, leader_speed_mps: float, desired_speed_mps: float, idm: IdmParameters = TABLE_V
 ) -> float:
     """Highest speed, m/s, in steps of 0.1 m/s, up to which :func:`can_brake` is true."""
+    # 0 to 99.9 m/s, all in one simulation.
     speeds = torch.arange(0, 1000).double() * 0.1
     gap = torch.full_like(speeds, gap_m)
     crashes = ~_survives(gap, speeds, leader_speed_mps, desired_speed_mps, idm)

@@ -59,12 +59,22 @@ def lane_accelerations(
     length = scene.observers.length[..., None]
     # The new follower with the observer in front of it ...
     driver = (behind.speed, behind.desired_speed)
-    with_it = idm_acceleration(*driver, behind.gap, speed, idm.per_lane())
+    with_it = idm_acceleration(
+        *driver,
+        behind.gap,
+        speed,
+        idm.per_lane(),
+    )
     # Without the observer its follower is behind its leader, or alone.
     free = ahead.gap >= FREE_GAP_M
     leader_speed = torch.where(free, behind.speed, ahead.speed)
     gap = torch.where(free, FREE_GAP_M, behind.gap + length + ahead.gap)
-    without = idm_acceleration(*driver, gap, leader_speed, idm.per_lane())
+    without = idm_acceleration(
+        *driver,
+        gap,
+        leader_speed,
+        idm.per_lane(),
+    )
     # Nobody behind: nobody is hindered or relieved.
     nobody = ~behind.exists
     return LaneAccelerations(
@@ -197,4 +207,9 @@ def mobil_changes(
 
     The ego (vehicle 0) is controlled by the agent: its column is 0, and it blocks no other change.
     """
-    return one_at_a_time(scene, without_ego(mobil_wishes(scene, road, idm, mobil)), idm, mobil)
+    return one_at_a_time(
+        scene,
+        without_ego(mobil_wishes(scene, road, idm, mobil)),
+        idm,
+        mobil,
+    )

@@ -202,7 +202,13 @@ def leader(scene: Scene, lane: Tensor) -> Neighbour:
         farther = ends > rear[..., None]
         its_speed = _beyond(speed[:, None, None, :], farther).amin(-1)
     else:
-        key = _nearest_key(scene, scene.queue, lanes, 1, _ordered(speed) - _INT32_MIN)
+        key = _nearest_key(
+            scene,
+            scene.queue,
+            lanes,
+            1,
+            _ordered(speed) - _INT32_MIN,
+        )
         rear = _unordered(key >> 32)
         its_speed = _unordered((key & 0xFFFFFFFF) + _INT32_MIN)
     gap = _gap(scene, rear, 1)
@@ -221,7 +227,13 @@ def follower(scene: Scene, lane: Tensor) -> Follower:
         front, index = _candidates(scene, lanes, -1).min(-1)
     else:
         numbers = torch.arange(vehicles.x.shape[1], device=lane.device)
-        key = _nearest_key(scene, scene.queue, lanes, -1, numbers)
+        key = _nearest_key(
+            scene,
+            scene.queue,
+            lanes,
+            -1,
+            numbers,
+        )
         front = _unordered(key >> 32)
         index = key & 0xFFFFFFFF
     gap = _gap(scene, front, -1).view(lane.shape)
@@ -229,7 +241,12 @@ def follower(scene: Scene, lane: Tensor) -> Follower:
     flat = index.flatten(1)
     speed = vehicles.speed.gather(1, flat).view(lane.shape)
     desired_speed = vehicles.desired_speed.gather(1, flat).view(lane.shape)
-    return Follower(gap, speed, desired_speed, gap < FREE_GAP_M)
+    return Follower(
+        gap,
+        speed,
+        desired_speed,
+        gap < FREE_GAP_M,
+    )
 
 
 def _candidates(

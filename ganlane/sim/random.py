@@ -75,6 +75,7 @@ def _mix(h: Tensor) -> Tensor:
 
 def absorb(key: Tensor, field: Tensor | int) -> Tensor:
     """Mix one more integer field into ``key`` (int64, broadcast)."""
+    # Without the constant, 0 would stay 0.
     return _mix((key ^ field) + _GOLDEN)
 
 
@@ -132,7 +133,12 @@ def normal(
 
     Independent of :func:`uniform` at the same place.
     """
-    keys = draw_keys(key, step, vehicles, purposes)
+    keys = draw_keys(
+        key,
+        step,
+        vehicles,
+        purposes,
+    )
     # 1 - u lies in (0, 1], so the logarithm is finite; a second key per number for the angle.
     radius = torch.sqrt(-2.0 * torch.log(1.0 - to_uniform(absorb(keys, 1), dtype)))
     return radius * torch.cos(2.0 * math.pi * to_uniform(absorb(keys, 2), dtype))

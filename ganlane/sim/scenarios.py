@@ -13,6 +13,7 @@ from ganlane.settings.driving import IdmParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.scenes import SceneVehicle
 
+#: Length of every vehicle here, m: that of a car in SpawnParameters.
 LENGTH_M = 4.5
 #: Desired speed of a broken-down vehicle; IDM requires more than 0.
 STALLED_MPS = 0.001
@@ -61,6 +62,7 @@ def cut_in(
         SceneVehicle(-35.0, lane, speed_mps, 22.0),
         SceneVehicle(-40.0, lane + 1, speed_mps, 24.0),
     ]
+    # On two lanes the ego is in the rightmost.
     if lane > 0:
         cars.append(SceneVehicle(-8.0, lane - 1, speed_mps, speed_mps))
     return tuple(cars)
@@ -116,6 +118,7 @@ def blocked_lane(
     _at_least(lanes, 2, "blocked_lane")
     cars = [SceneVehicle(0.0, 0, speed_mps, desired_speed_mps)]
     for number in range(standing):
+        # 1.5 m from bumper to bumper: no gap to slip into.
         cars.append(stalled(distance_m + (LENGTH_M + 1.5) * number, 0, lane_width_m))
     cars.append(SceneVehicle(-50.0, 0, speed_mps, 20.0))
     for lane in range(1, lanes):

@@ -60,6 +60,7 @@ def read_scene(
             f"{path}: more than {_MOST_BYTES} bytes, which no scene has; give a smaller file."
         )
     try:
+        # utf-8-sig, since spreadsheets write a byte order mark.
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise UserError(
@@ -104,6 +105,7 @@ def _lanes_in(rows: list[SceneVehicle], lane_width_m: float) -> int:
     for row in rows:
         lane = row.lane
         if lane is None:
+            # Off every centre: the nearest lane counts.
             lane = round((row.y_m or 0.0) / lane_width_m)
         highest = max(highest, lane, row.target_lane or 0)
     return 1 + highest
@@ -144,6 +146,7 @@ def _read_csv(path: Path, text: str) -> list[SceneVehicle]:
 
 def _cells(line: str, where: str) -> list[str]:
     try:
+        # Line by line, so that a mistake has a line number; no cell spans two lines.
         return [cell.strip() for cell in next(csv.reader([line]))]
     except csv.Error as error:
         raise UserError(f"{where}: not a line of CSV ({error}); fix the line.") from error

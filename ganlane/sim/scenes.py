@@ -160,9 +160,11 @@ class FixedScene:
         n = key.shape[0]
         m = self.vehicles
         base = self.base(dtype, key.device)
+        # Copied, since the rows of an expanded tensor share memory.
         whole = Vehicles(*(value.expand(n, m).clone() for value in base))
         if self.jitter_m == 0 and self.jitter_mps == 0:
             return whole
+        # From [0, 1) to [-1, 1).
         u = (
             2.0
             * uniform(
@@ -174,6 +176,7 @@ class FixedScene:
             )
             - 1.0
         )
+        # Only the others are shifted: the ego stays at x = 0.
         is_ego = torch.arange(m, device=key.device) == 0
         x = torch.where(is_ego, whole.x, whole.x + self.jitter_m * u[..., 0])
         varied = (whole.speed + self.jitter_mps * u[..., 1]).clamp_min(0.0)
@@ -282,6 +285,7 @@ def _fault(row: SceneVehicle, road: Road) -> str:
     right = float(road.right_edge_m())
     left = float(road.left_edge_m())
     y = row.y_on(road)
+    # 1e-6 m for rounding.
     if y - 0.5 * row.width_m < right - 1e-6 or y + 0.5 * row.width_m > left + 1e-6:
         return (
             f"y={y:g} m, width {row.width_m:g} m: expected on the road, which runs from "
@@ -304,6 +308,7 @@ def check_overlaps(scene: FixedScene) -> None:
     # Two vehicles may both be shifted, towards each other: each counts as longer by twice the
     # shift.
     longer = torch.full_like(vehicles.x, 2.0 * scene.jitter_m)
+    # The ego is never shifted.
     longer[:, 0] = 0.0
     longest = vehicles.with_(length=vehicles.length + longer)
     hits = pair_overlaps(longest, scene.road)[0].nonzero().tolist()
@@ -374,7 +379,14 @@ def _first_overlap(scene: FixedScene, idm: IdmParameters) -> tuple[int, int, flo
     for step in range(1, round(DRIVE_S / PHYSICS_STEP_S) + 1):
         # Everybody follows and steers to its target lane; nobody decides anything.
         acceleration = following_acceleration(perceive(v, scene.road), idm)
-        steering = steer(steering, v.y, v.heading, v.speed, centre, PHYSICS_STEP_S)
+        steering = steer(
+            steering,
+            v.y,
+            v.heading,
+            v.speed,
+            centre,
+            PHYSICS_STEP_S,
+        )
         pose = advance(
             v.x,
             v.y,

@@ -58,7 +58,12 @@ def check_start(
     for field, speed, leader, desired in p.worst_followers() if vehicles > 1 else ():
         if not can_brake(gap, speed, leader, desired, idm):
             spacing = p.length_m + least_gap(speed, leader, desired, idm)
-            slower = highest_speed(gap, leader, desired, idm)
+            slower = highest_speed(
+                gap,
+                leader,
+                desired,
+                idm,
+            )
             raise ParameterError(
                 f"{{min_spacing_m}}={p.min_spacing_m:g} is too little for {{{field}}} up to "
                 f"{speed:g} m/s: a gap of {gap:g} m is too short to avoid a leader of {leader:g} "
@@ -146,9 +151,25 @@ def spawn(
         Purpose.SPAWN_DESIRED_SPEED,
         Purpose.SPAWN_TRUCK,
     ]
-    u = uniform(key, 0, vehicles, [int(purpose) for purpose in drawn], dtype)
-    lane = draw_lanes(key, vehicles, lanes, p.lane_capacity())
-    x = place_in_lanes(lane, u[..., 0], p.spread_m, p.spacing_m)
+    u = uniform(
+        key,
+        0,
+        vehicles,
+        [int(purpose) for purpose in drawn],
+        dtype,
+    )
+    lane = draw_lanes(
+        key,
+        vehicles,
+        lanes,
+        p.lane_capacity(),
+    )
+    x = place_in_lanes(
+        lane,
+        u[..., 0],
+        p.spread_m,
+        p.spacing_m,
+    )
     x, lane = ego_first(x, lane)
     is_ego = torch.arange(vehicles, device=key.device) == 0
     # In Table II who is ahead of the ego is slower than who is behind it.
@@ -201,7 +222,12 @@ class RandomScenes:
                 f"scenes: laid out on {_described(self.road)}, the traffic drives on "
                 f"{_described(road)}; give both the same road."
             )
-        check_start(p, self.vehicles, road.lanes, idm)
+        check_start(
+            p,
+            self.vehicles,
+            road.lanes,
+            idm,
+        )
         if lane_width_m <= p.widest_m:
             wide = "width_m" if p.width_m == p.widest_m else "truck_width_m"
             raise UserError(
@@ -226,7 +252,14 @@ class RandomScenes:
         """One random scene per key."""
         road = (int(self.road.lanes), float(self.road.lane_width_m))
         visibility = (self.ego_visibility, self.others_visibility)
-        return spawn(key, self.vehicles, *road, self.parameters, dtype, *visibility)
+        return spawn(
+            key,
+            self.vehicles,
+            *road,
+            self.parameters,
+            dtype,
+            *visibility,
+        )
 
 
 def _described(road: Road) -> str:
@@ -274,8 +307,20 @@ def _room(
     desired = one.desired_speed[..., None]
     its_speed = other.speed[:, None, :]
     its_desired = other.desired_speed[:, None, :]
-    behind = idm_acceleration(speed, desired, pairs.ahead, its_speed, idm)
-    before = idm_acceleration(its_speed, its_desired, pairs.behind, speed, idm)
+    behind = idm_acceleration(
+        speed,
+        desired,
+        pairs.ahead,
+        its_speed,
+        idm,
+    )
+    before = idm_acceleration(
+        its_speed,
+        its_desired,
+        pairs.behind,
+        speed,
+        idm,
+    )
     asked = torch.where(pairs.order > 0, behind, before)
     return (~counts | (asked >= -safe)).all(-1)
 

@@ -21,6 +21,7 @@ from torch import Tensor
 from ganlane.keys import VEHICLE_FIELDS
 from ganlane.settings.driving import Visibility
 
+#: A body is in a lane that it reaches into by more than this, m.
 ENTRY_M = 0.1
 #: In an initial scene: the traffic sets a :class:`Visibility` per episode.
 VISIBILITY_OF_EPISODE = -1
@@ -187,6 +188,7 @@ def spanned(lanes: LaneRange) -> Tensor:
 
 def lateral_half_extent(vehicles: Vehicles) -> Tensor:
     """Half of the lateral space that each body takes at its heading, m."""
+    # A rectangle at an angle takes w cos + l sin across the road.
     return 0.5 * (
         vehicles.width * torch.cos(vehicles.heading)
         + vehicles.length * torch.sin(vehicles.heading).abs()
@@ -224,6 +226,7 @@ def presence(
     low = torch.where(signalled, attention.low, torch.where(by_body, body.low, centre))
     high = torch.where(signalled, attention.high, torch.where(by_body, body.high, centre))
     return LaneRange(
+        # Lowest above highest: in no lane at all.
         torch.where(vehicles.valid, low, torch.inf),
         torch.where(vehicles.valid, high, -torch.inf),
     )

@@ -34,6 +34,7 @@ def new_tensordict(fields: Mapping[str, Any], n: int) -> TensorDict:
 
     Without TensorDict's checks, which cost as much as a step of a small batch.
     """
+    # TensorDict's private constructor: the shapes are right by construction.
     return TensorDict._new_unsafe(dict(fields), batch_size=torch.Size([n]))
 
 
@@ -64,12 +65,19 @@ def with_rows(
         if not isinstance(value, Tensor):
             # TorchRL drops empty TensorDicts between decisions.
             if name in fields:
-                fields[name] = with_rows(fields[name], rows, value, origins)
+                fields[name] = with_rows(
+                    fields[name],
+                    rows,
+                    value,
+                    origins,
+                )
         elif value in origins:
             fields[name] = origins[value]
         else:
+            # Padding repeats rows; the first ones are real.
             if len(value) > len(rows):
                 value = value[: len(rows)]
+            # Not index_copy_, which would write into the caller's tensor.
             fields[name] = fields[name].index_copy(0, rows, value)
     return new_tensordict(fields, whole.batch_size[0])
 
@@ -93,6 +101,7 @@ def uniforms(
     *purposes: int,
 ) -> tuple[Tensor, ...]:
     """A uniform number in [0, 1) for every vehicle, [N, M], of each of the ``purposes``."""
+    # All purposes in one call, which shares the hashing of episode and step.
     drawn = uniform(
         key,
         step,
@@ -149,6 +158,7 @@ class TrafficModule(TensorDictModuleBase):
         super().__init__()
         self.road = road or Road()
         self.stream = int(stream)
+        # Under a short name, for models of your own.
         self.dt = PHYSICS_STEP_S
 
     def move(
@@ -242,7 +252,12 @@ class TrafficModule(TensorDictModuleBase):
         memory: Memory,
         key: Tensor,
     ) -> Moved:
-        return self.move(vehicles, memory, key, tensordict.get(keys.STEP))
+        return self.move(
+            vehicles,
+            memory,
+            key,
+            tensordict.get(keys.STEP),
+        )
 
     @outside_autocast
     def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
@@ -260,6 +275,7 @@ class TrafficModule(TensorDictModuleBase):
             vehicles: the scene so far.
             key, episode: the episodes' keys and numbers, [N] int64.
         """
+        # What is drawn at the start has a key of its own, apart from the draws of the steps.
         return vehicles, self.init_memory(vehicles, absorb(key, 0))
 
     def memory_spec(
@@ -269,6 +285,7 @@ class TrafficModule(TensorDictModuleBase):
         dtype: torch.dtype = torch.float32,
     ) -> dict[str, Any]:
         """Nested name -> (shape, dtype) of the memory of ``n`` rows of ``m`` vehicles."""
+        # The dtype None stands for the run's float type.
         return {
             name: ((n, m, *shape), own_dtype or dtype)
             for name, (
@@ -302,8 +319,15 @@ class Overlay(TrafficModule):
         memory: Memory,
         key: Tensor,
     ) -> Moved:
+        # What the model and the overlays before this one made of the step.
         moved = Vehicles.of(tensordict.get(keys.MOVED))
-        return self.rewrite(vehicles, moved, memory, key, tensordict.get(keys.STEP))
+        return self.rewrite(
+            vehicles,
+            moved,
+            memory,
+            key,
+            tensordict.get(keys.STEP),
+        )
 
     def compile_graphs(self) -> None:
         """Compile :meth:`rewrite`."""
@@ -320,6 +344,7 @@ class TrafficParts(TrafficModule):
         # All parts drive on one road with one family of random numbers.
         first = next(iter(parts.values()))
         super().__init__(first.road, first.stream)
+        # A ModuleDict, so that to(device) and state_dict() reach the parts.
         self.parts = nn.ModuleDict(parts)
         self.rows_must_stay = any(part.rows_must_stay for part in parts.values())
 
@@ -364,6 +389,7 @@ class TrafficSequential(TrafficParts):
                 "overlays behind replayed traffic: they go where they went; lay faults over a "
                 "model."
             )
+        # The base model alone says how its lane changes are seen.
         self.visibility = base.visibility
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -388,6 +414,7 @@ class TrafficSequential(TrafficParts):
     ) -> tuple[Vehicles, TensorDictBase]:
         """The vehicles after the parts' :meth:`TrafficModule.enter`, and the memories by name."""
         memories = {}
+        # In order: a part sees the desired speeds and visibilities that the parts before it set.
         for name, part in self.named_parts():
             vehicles, memories[name] = part.enter(vehicles, key, episode)
         return vehicles, new_tensordict(memories, len(key))

@@ -43,6 +43,7 @@ Timed = TypeVar("Timed", bound=BrakingFaults | ReactionFaults)
 
 def other_drivers(vehicles: Vehicles) -> Tensor:
     """Valid non-ego vehicles, bool [N, M]."""
+    # The ego's motion is the environment's, so a fault of it would have no effect.
     index = torch.arange(vehicles.x.shape[1], device=vehicles.x.device)
     return vehicles.valid & (index != EGO_INDEX)
 
@@ -64,6 +65,7 @@ def driven_at(
     distance driven.
     """
     speed = (vehicles.speed + acceleration * dt).clamp_min(0.0)
+    # Trapezoids, as in dynamics.advance: the distance that the model drives, then this one.
     usual = 0.5 * (vehicles.speed + moved.speed) * dt
     distance = 0.5 * (vehicles.speed + speed) * dt
     # How much of the usual step is driven.
@@ -156,11 +158,21 @@ class PhantomBraking(TimedFault[BrakingFaults]):
         step: Tensor,
     ) -> Moved:
         """Brake during a fault."""
-        left = self.steps_left(memory["left"], vehicles, key, step)
+        left = self.steps_left(
+            memory["left"],
+            vehicles,
+            key,
+            step,
+        )
         wanted = torch.full_like(moved.acceleration, -self.faults.deceleration)
         # A driver who brakes harder anyway goes on doing so.
         brakes = (left > 0) & (moved.acceleration > wanted)
-        braking = driven_at(vehicles, moved, wanted, self.dt)
+        braking = driven_at(
+            vehicles,
+            moved,
+            wanted,
+            self.dt,
+        )
         return braking.where(brakes, moved), {"left": (left - 1).clamp_min(0)}
 
 
@@ -186,6 +198,7 @@ class LateReaction(TimedFault[ReactionFaults]):
         faults: ReactionFaults | None = None,
     ) -> None:
         super().__init__(road, stream, faults)
+        # At least 1, since delay_s is a physics step or longer.
         self.delay_steps = round(self.faults.delay_s / self.dt)
         self.memory_fields = {
             "past": ((self.delay_steps,), None),
@@ -194,6 +207,7 @@ class LateReaction(TimedFault[ReactionFaults]):
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """No lapse, a constant past acceleration."""
+        # As if the driver had always accelerated as it does now.
         past = vehicles.acceleration[..., None].repeat(1, 1, self.delay_steps)
         return {
             "past": past,
@@ -209,8 +223,20 @@ class LateReaction(TimedFault[ReactionFaults]):
         step: Tensor,
     ) -> Moved:
         """Drive at the acceleration of ``delay_s`` ago during a lapse."""
-        left = self.steps_left(memory["left"], vehicles, key, step)
-        late = driven_at(vehicles, moved, memory["past"][..., 0], self.dt)
+        left = self.steps_left(
+            memory["left"],
+            vehicles,
+            key,
+            step,
+        )
+        # Entry 0 is the oldest: decided delay_s ago.
+        late = driven_at(
+            vehicles,
+            moved,
+            memory["past"][..., 0],
+            self.dt,
+        )
+        # The model's decision is stored during a lapse, too, so the queue never has a hole.
         past = torch.cat(
             (
                 memory["past"][..., 1:],
@@ -248,8 +274,10 @@ class HesitantLaneChange(Fault[HesitationFaults]):
         u = self.draw(vehicles, key, step)
         # Decided once, when the change begins.
         hesitant = torch.where(begins, u < self.faults.share, memory["hesitant"])
+        # From the position at t: only the step's lateral part shrinks.
         slowed = vehicles.y + self.faults.pace * (moved.y - vehicles.y)
         moved = moved.with_(y=torch.where(hesitant, slowed, moved.y))
+        # The flag ends with the change; the next change draws anew.
         return moved, {"hesitant": hesitant & ~lane_change_done(moved, self.road)}
 
 
@@ -282,6 +310,7 @@ class AbortedLaneChange(Fault[AbortFaults]):
         # Where a change will be aborted, the lane to return to.
         chosen = torch.where(u < self.faults.share, vehicles.target_lane, _NO_LANE)
         origin = torch.where(begins, chosen, memory["origin"])
+        # Where nothing will be aborted, origin is -1 and start is not used.
         start = self.road.centre_of(origin, moved.y.dtype)
         end = self.road.centre_of(moved.target_lane, moved.y.dtype)
         # The share ``at`` of the way between the two centres is done.
@@ -299,6 +328,7 @@ def with_faults(base: TrafficModule, faults: DriverFaults | None = None) -> Traf
     faults = faults or DriverFaults()
     road = base.road
     stream = base.stream
+    # Memories are stored under these names.
     parts: dict[str, TrafficModule] = {
         "base": base,
         "late_reaction": LateReaction(road, stream, faults.late_reaction),

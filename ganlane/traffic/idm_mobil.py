@@ -88,6 +88,7 @@ class IdmTraffic(TrafficModule):
 
     def native_parameters(self) -> RuleDrivers | None:
         """The kernel's drivers; None for a subclass, which may drive otherwise."""
+        # Not isinstance: a subclass may override any part of a step.
         return RuleDrivers(self.idm, self.steering) if type(self) is IdmTraffic else None
 
     def keep_lanes(self, vehicles: Vehicles, memory: Memory) -> Moved:
@@ -107,7 +108,13 @@ class IdmTraffic(TrafficModule):
         """The vehicles at t + 0.1 s, steered to the lanes ``target`` [N, M] int64."""
         centre = self.road.centre_of(target, scene.vehicles.y.dtype)
         acceleration = following_acceleration(scene, self.idm)
-        return self._advanced(scene.vehicles, acceleration, target, centre, memory)
+        return self._advanced(
+            scene.vehicles,
+            acceleration,
+            target,
+            centre,
+            memory,
+        )
 
     def _advanced(
         self,
@@ -150,7 +157,12 @@ class IdmMobilTraffic(IdmTraffic):
         steering: SteeringParameters = STEERING,
         mobil: MobilParameters = TABLE_IV,
     ) -> None:
-        super().__init__(road, stream, idm, steering)
+        super().__init__(
+            road,
+            stream,
+            idm,
+            steering,
+        )
         self.mobil = mobil
 
     def move(
@@ -189,7 +201,12 @@ class IdmMobilTraffic(IdmTraffic):
 
     def changes(self, scene: Scene, memory: Memory) -> Tensor:
         """The side that each driver changes to, -1, 0 or 1, [N, M]."""
-        return mobil_changes(scene, self.road, self.idm, self.mobil)
+        return mobil_changes(
+            scene,
+            self.road,
+            self.idm,
+            self.mobil,
+        )
 
     def compile_graphs(self) -> None:
         """One graph for a step with decisions, one for a step without."""
@@ -226,6 +243,7 @@ class DriverParams(NamedTuple):
 
         No driver brakes harder than ``braking`` (m/s2, [N, M]).
         """
+        # IDM's bound is an acceleration, so braking changes its sign.
         return DriverIdm(
             min_gap_m,
             self.headway,
@@ -238,6 +256,7 @@ class DriverParams(NamedTuple):
         """How far each driver aims to the left of its lane's centre at ``time_s`` [N, 1], m."""
         one = torch.sin(self.frequency_one * time_s + self.phase_one)
         two = torch.sin(self.frequency_two * time_s + self.phase_two)
+        # Two sines add up to at most 2, so the sway stays within its bound.
         return 0.5 * self.sway * (one + two)
 
 
@@ -300,8 +319,15 @@ class IdmRandomTraffic(IdmMobilTraffic):
         mobil: MobilParameters = TABLE_IV,
         drivers: RandomDrivers | None = None,
     ) -> None:
-        super().__init__(road, stream, idm, steering, mobil)
+        super().__init__(
+            road,
+            stream,
+            idm,
+            steering,
+            mobil,
+        )
         self.drivers = drivers or RandomDrivers()
+        # The queue is as long as the slowest driver's reaction.
         self.delay_steps = round(self.drivers.reaction_s[1] / self.dt)
         past: MemoryFields = {"past": ((self.delay_steps,), None)} if self.delay_steps else {}
         self.memory_fields = {
@@ -312,6 +338,7 @@ class IdmRandomTraffic(IdmMobilTraffic):
 
     def _drawn(self, vehicles: Vehicles, key: Tensor) -> tuple[Tensor, ...]:
         """Uniform numbers [N, M] of every purpose."""
+        # Step -1 is no step of an episode, so nothing else draws these numbers.
         return uniforms(
             vehicles,
             key,
@@ -322,10 +349,16 @@ class IdmRandomTraffic(IdmMobilTraffic):
     def driver_params(self, vehicles: Vehicles, key: Tensor) -> DriverParams:
         """The drivers at the start of the episodes with ``key`` [N]."""
         d = self.drivers
+        # Each column has a fixed use: another order would change every episode.
         u = self._drawn(vehicles, key)
         # The scene may ask more of a driver than its range has: it then brakes as hard as that.
         reaction_s = in_range(u[5], d.reaction_s)
-        required = start_braking(vehicles, self.road, reaction_s, self.idm.min_gap_m)
+        required = start_braking(
+            vehicles,
+            self.road,
+            reaction_s,
+            self.idm.min_gap_m,
+        )
         least_braking = _START_MARGIN * required
         # Even at its largest sway a body stays within its lane.
         room = 0.5 * (self.road.lane_width_m - vehicles.width) - _LANE_MARGIN_M
@@ -374,7 +407,12 @@ class IdmRandomTraffic(IdmMobilTraffic):
         step: Tensor,
     ) -> Moved:
         """As :class:`IdmMobilTraffic`; the memory carries the step, for the sway."""
-        return super().move(vehicles, {**memory, "step": step}, key, step)
+        return super().move(
+            vehicles,
+            {**memory, "step": step},
+            key,
+            step,
+        )
 
     def changes(self, scene: Scene, memory: Memory) -> Tensor:
         """As :class:`IdmMobilTraffic`, with each driver's parameters."""
@@ -414,11 +452,18 @@ class IdmRandomTraffic(IdmMobilTraffic):
         new_memory = {_PARAMETERS: memory[_PARAMETERS]}
         if self.delay_steps:
             # What was decided ``delay`` steps ago is driven now.
+            # The last entry is the present decision, which a delay of 0 takes.
             recent = torch.cat((memory["past"], acceleration[..., None]), dim=-1)
             index = self.delay_steps - drivers.delay.long()
             acceleration = recent.gather(-1, index[..., None])[..., 0]
             new_memory["past"] = recent[..., 1:].contiguous()
         time_s = (memory["step"].to(drivers.sway.dtype) * self.dt)[:, None]
         line = self.road.centre_of(target, v.y.dtype) + drivers.sway_m(time_s)
-        moved, steering = self._advanced(v, acceleration, target, line, memory)
+        moved, steering = self._advanced(
+            v,
+            acceleration,
+            target,
+            line,
+            memory,
+        )
         return moved, {**steering, **new_memory}

@@ -33,6 +33,7 @@ def interleaved(shares: Mapping[str, int]) -> list[str]:
     ``{a: 2, b: 1}`` gives a, b, a: in every episode each part gains its share, the one with the
     most (the first of several) is chosen and pays the sum.
     """
+    # Smooth weighted round robin, as load balancers use it.
     credit = dict.fromkeys(shares, 0)
     turns = []
     for _ in range(sum(shares.values())):
@@ -115,6 +116,7 @@ class MixedTraffic(TrafficParts):
             rows = padded = (part_of_row == number).nonzero()[:, 0]
             if self.compiled:
                 size = max(8, batch // 16)
+                # -n % size rows fill n up to the next multiple of size.
                 padded = torch.cat((rows, rows[:1].expand(-len(rows) % size)))
             if len(rows):
                 chosen.append((name, part, rows, padded))
@@ -142,10 +144,16 @@ class MixedTraffic(TrafficParts):
             # Vehicles are compared by name, since other parts have written into the others' rows.
             changed = {}
             for field, value in output.get(keys.MOVED).items():
+                # `is`, not ==: a field that was only passed on needs no write.
                 if value is not before.get(field):
                     changed[field] = value
             moved = with_rows(moved, rows, changed)
-            new_memories[name] = with_rows(memory, rows, memory_of(output), origins)
+            new_memories[name] = with_rows(
+                memory,
+                rows,
+                memory_of(output),
+                origins,
+            )
         tensordict.set(keys.MOVED, moved)
         tensordict.set(
             keys.TRAFFIC,
@@ -163,6 +171,7 @@ class MixedTraffic(TrafficParts):
         for name, part, rows, _ in self.rows_of_parts(episode):
             # A traffic sees only its own rows of the scene.
             scene = Vehicles(*(field[rows] for field in vehicles))
+            # Here the part is known, so the placeholder becomes its visibility.
             of_episode = scene.visibility == VISIBILITY_OF_EPISODE
             visibility = torch.where(of_episode, int(part.visibility), scene.visibility)
             entered, memory = part.enter(
@@ -200,6 +209,7 @@ def _take(
     for name, field in fields.items():
         if isinstance(field, Tensor):
             taken[name] = field.index_select(0, rows)
+            # Tensors hash by identity, so they can be keys.
             origins[taken[name]] = field
         else:
             taken[name] = _take(field, rows, origins)
@@ -261,6 +271,7 @@ class BlindTraffic(TrafficModule):
         inputs.set(keys.VEHICLES, seen)
         inputs.set(keys.TRAFFIC, memory_of(memory, "model"))
         self.model(inputs)
+        # What becomes of a hidden ego here does not matter: the environment overwrites it.
         tensordict.set(keys.MOVED, inputs.get(keys.MOVED))
         new_memory = {"model": memory_of(inputs), "unseen": unseen}
         tensordict.set(
@@ -284,6 +295,7 @@ class BlindTraffic(TrafficModule):
     ) -> tuple[Vehicles, TensorDictBase]:
         """As the model, with ``unseen``."""
         vehicles, memory = self.model.enter(vehicles, key, episode)
+        # The key that init_memory gets, so that both hide the same egos.
         unseen = self.unseen(vehicles, absorb(key, 0))
         return vehicles, new_tensordict({"model": memory, "unseen": unseen}, len(key))
 

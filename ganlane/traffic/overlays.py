@@ -50,6 +50,7 @@ def distance_hazard(
     dt: float,
 ) -> Tensor:
     """Probability per step of ``dt`` s of a change, at a constant rate per kilometre driven."""
+    # The probability of at least one event of a Poisson process within the step.
     return 1.0 - torch.exp(-speed * (dt * changes_per_km / 1000.0))
 
 
@@ -64,6 +65,7 @@ def random_side(
     """
     left = lane < lanes - 1
     right = lane > 0
+    # Drawn for everybody, used where there is a lane on both sides.
     both = torch.where(u < 0.5, 1, -1)
     return torch.where(
         left & right,
@@ -126,7 +128,12 @@ class LiteralLaneChange(Overlay):
         """
         c = self.changes
         dtype = vehicles.x.dtype
-        u, u_side = uniforms(vehicles, key, step, *_CHANGE)
+        u, u_side = uniforms(
+            vehicles,
+            key,
+            step,
+            *_CHANGE,
+        )
         gauss = normal(
             key,
             step,
@@ -161,9 +168,11 @@ class LiteralLaneChange(Overlay):
             y=torch.where(changing, y, moved.y),
             heading=torch.where(changing, heading, moved.heading),
         )
+        # 0 during a change; it counts from the end of the change.
         clock = torch.where(changing, 0, memory["clock"] + 1)
         return moved, {
             "clock": clock,
+            # 0 means that no change is going on.
             "lateral_speed": torch.where(arrives, 0.0, lateral),
         }
 
@@ -222,7 +231,12 @@ class CalibratedLaneChange(Overlay):
         step: Tensor,
     ) -> Tensor:
         """The current wish, or a new one."""
-        u, u_side = uniforms(vehicles, key, step, *_CHANGE)
+        u, u_side = uniforms(
+            vehicles,
+            key,
+            step,
+            *_CHANGE,
+        )
         comes = u < distance_hazard(vehicles.speed, self.changes.per_km, self.dt)
         side = random_side(u_side, vehicles.target_lane, self.road.lanes)
         # Who is still changing does not wish for another change.
@@ -235,6 +249,7 @@ class CalibratedLaneChange(Overlay):
         vehicles = scene.vehicles
         pairs = scene.pairs
         target = vehicles.target_lane.to(lane.dtype)
+        # Without the ego, whose intention the others do not know.
         changing = without_ego((self.road.lane_of(vehicles.y) != target) & vehicles.valid)
         near = torch.minimum(pairs.ahead, pairs.behind) < self.changes.exclusive_m
         return (near & changing[:, None, :] & (target[:, None, :] == lane[:, :, None])).any(-1)
@@ -248,14 +263,30 @@ class CalibratedLaneChange(Overlay):
         step: Tensor,
     ) -> Moved:
         """Set the target lane of those whose wish finds a gap."""
-        wish = self._wishes(vehicles, memory, key, step)
+        wish = self._wishes(
+            vehicles,
+            memory,
+            key,
+            step,
+        )
         scene = perceive(vehicles, self.road)
+        # As floats, since the lanes of an absent vehicle are infinite.
         lane = (vehicles.target_lane + wish).to(vehicles.x.dtype)
         # Neither the driver nor its new follower has to brake harder than the limit, by IDM.
-        safe = safe_change(scene, lane, self.idm, self._limits)
+        safe = safe_change(
+            scene,
+            lane,
+            self.idm,
+            self._limits,
+        )
         wanted = torch.where(safe & ~self._contested(scene, lane), wish, 0)
         # Two that would start into the same gap at once cannot see each other's intention.
-        starts = one_at_a_time(scene, wanted, self.idm, self._limits)
+        starts = one_at_a_time(
+            scene,
+            wanted,
+            self.idm,
+            self._limits,
+        )
         waited = torch.where(wish != 0, memory["waited"] + 1, 0)
         # Otherwise wishes pile up in dense traffic and all come true when it thins out.
         gives_up = waited >= round(self.changes.patience_s / self.dt)
@@ -278,6 +309,7 @@ def _accelerated(
     speed = (vehicles.speed + acceleration * dt).clamp_min(0.0)
     return moved.with_(
         speed=torch.where(who, speed, moved.speed),
+        # As realised, not as asked for: braking ends at a standstill.
         acceleration=torch.where(who, (speed - vehicles.speed) / dt, moved.acceleration),
         x=torch.where(
             who,
@@ -337,13 +369,25 @@ class AccelerationOverlay(Overlay):
         s = self.sudden
         m = vehicles.x.shape[1]
         dtype = vehicles.x.dtype
-        (u,) = uniforms(vehicles, key, step, Purpose.ACCELERATION)
+        (u,) = uniforms(
+            vehicles,
+            key,
+            step,
+            Purpose.ACCELERATION,
+        )
         gauss = normal(key, step, m, [Purpose.ACCELERATION], dtype)[..., 0]
         # A constant hazard while none is going on.
+        # For short steps dt / every_s is the probability within one.
         starts = (memory["left"] == 0) & (u < self.dt / s.every_s) & vehicles.valid
         acceleration = torch.where(starts, s.mean + s.sd * gauss, memory["acceleration"])
         left = torch.where(starts, round(s.lasts_s / self.dt), memory["left"])
-        moved = _accelerated(vehicles, moved, left > 0, acceleration, self.dt)
+        moved = _accelerated(
+            vehicles,
+            moved,
+            left > 0,
+            acceleration,
+            self.dt,
+        )
         return moved, {
             "acceleration": acceleration,
             "left": (left - 1).clamp_min(0),
@@ -401,6 +445,7 @@ class Guard(Overlay):
     def along(self, vehicles: Vehicles, moved: Vehicles) -> Vehicles:
         """``moved`` with its acceleration between the bounds by IDM."""
         g = self.guard
+        # With the new target lane: the guard also looks where the change goes.
         scene = perceive(vehicles.with_(target_lane=moved.target_lane), self.road)
         ahead = leader(scene, spanned(scene.attention))
         # A shorter headway than IDM's: the network may follow more closely than the model would.
@@ -410,6 +455,7 @@ class Guard(Overlay):
         highest, lowest = (bound.clamp_min(g.hardest_braking) for bound in (highest, lowest))
         # What the chain made of it, whichever part moved the vehicle.
         wanted = (moved.speed - vehicles.speed) / self.dt
+        # Where the bounds cross, the upper one holds: keeping off the leader comes first.
         acceleration = torch.minimum(
             torch.maximum(wanted, torch.minimum(lowest, highest)),
             highest,
@@ -417,6 +463,7 @@ class Guard(Overlay):
         return _accelerated(
             vehicles,
             moved,
+            # Who is within the bounds moves bit for bit as the chain says.
             acceleration != wanted,
             acceleration,
             self.dt,
@@ -434,10 +481,12 @@ class Guard(Overlay):
         damped = vehicles.y + g.damping * (moved.y - vehicles.y)
         pulled = damped + g.centring_per_s * self.dt * offset
         y = torch.where(offset.abs() < 0.5 * road.lane_width_m, pulled, moved.y)
+        # First the edges for a straight body; the heading of a turned one is bounded below.
         half = 0.5 * moved.width
         left = road.left_edge_m() - g.edge_margin_m
         right = road.right_edge_m() + g.edge_margin_m
         y = torch.minimum(torch.maximum(y, right + half), left - half)
+        # A standing vehicle has no direction of its own, so the divisor is bounded.
         heading = torch.atan((y - vehicles.y) / ((moved.x - vehicles.x).clamp_min(0.1)))
         heading = torch.where(y == moved.y, moved.heading, heading)
         # A turned body is wider by half its length times the sine, which the angle exceeds.

@@ -73,11 +73,13 @@ def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralCha
         changes.lateral_speed.mean,
         changes.lateral_speed.sd,
     )
+    # A number is missing if no change was recorded from beginning to end.
     if None in numbers:
         raise UserError(
             f"{source}: its recordings hold no complete lane change, so equations 9 to 11 have no "
             "numbers; fit the generator to recordings with lane changes."
         )
+    # The condition is for type checkers; no number is None here.
     return LiteralChanges(*(float(number) for number in numbers if number is not None))
 
 
@@ -106,6 +108,7 @@ def fitted_anchor(metadata: Mapping[str, Any], source: object) -> AnchorParamete
         UserError: fitted without per-driver parameters, which this traffic always draws; or
             impossible values.
     """
+    # A file may lack these entries: then the defaults of the fit hold.
     config = metadata["config"] if isinstance(metadata.get("config"), Mapping) else {}
     washout_s = config.get("washout_s", ANCHOR.washout_s)
     further_inputs = config.get("further_inputs", ANCHOR.further_inputs)
@@ -166,8 +169,14 @@ def gan_traffic(
         "acceleration": AccelerationOverlay(road, stream, sudden_accelerations(statistics)),
         "lane_change": LiteralLaneChange(road, stream, literal_changes(statistics, source)),
     }
+    # Last, so that nothing moves a vehicle after it.
     if guard:
-        parts["guard"] = Guard(road, stream, GuardParameters(), idm)
+        parts["guard"] = Guard(
+            road,
+            stream,
+            GuardParameters(),
+            idm,
+        )
     return TrafficSequential(parts)
 
 
@@ -200,6 +209,7 @@ def gan_calibrated_traffic(
     statistics = DrivingStatistics.from_dict(metadata["driving_statistics"])
     # Without a recorded change nobody changes lanes.
     recorded = statistics.lane_changes.per_vehicle_km or 0.0
+    # Only None asks for the recorded rate; 0 is a rate.
     wishes = WISH_PER_CHANGE * recorded if changes_per_km is None else changes_per_km
     headways_s = headway_quantiles(metadata["driving_statistics"])
     anchor = fitted_anchor(metadata, source)

@@ -51,6 +51,7 @@ def _with_tracks(frame: pl.DataFrame) -> pl.DataFrame:
     # Samples are sorted by scene, vehicle and frame.
     goes_on = (pl.col("frame").diff() == 1) & (pl.col("vehicle").diff() == 0)
     same_scene = pl.col("scene") == pl.col("scene").shift(1)
+    # The first row has none before it and is null: a beginning, too.
     begins = ~(goes_on & same_scene).fill_null(False)
     index = pl.col("index")
     return frame.with_columns(
@@ -75,6 +76,7 @@ def _motion(samples: pl.DataFrame) -> Tensor:
         "y": y,
         "heading": np.arctan((y[late] - y[early]) / np.maximum(x[late] - x[early], _LEAST_PATH_M)),
         "speed": speed,
+        # The window is shorter at a track's ends, and a single sample has none.
         "acceleration": (speed[late] - speed[early])
         / np.maximum((late - early) * FRAME_S, FRAME_S),
         "length": column["length"],
@@ -117,6 +119,7 @@ def _starts(samples: pl.DataFrame, least: int) -> tuple[pl.DataFrame, Tensor]:
     x_m = samples["x"].to_numpy()
     y_m = samples["y"].to_numpy()
     distance = np.hypot(x_m[place] - x_m[ego], y_m[place] - y_m[ego])
+    # Below every distance, so that it comes first.
     distance[place == ego] = -1.0
     there = (
         there.with_columns(distance=distance)
@@ -223,6 +226,7 @@ class ReplayTraffic(TrafficModule):
     def start_of(self, key: Tensor) -> Tensor:
         """Number of the start, [N] int64, of the episodes with ``key`` [N]."""
         # First the scene, then a start in it: long scenes are not driven more often.
+        # Two vehicles' numbers serve as two independent ones.
         u = uniform(key, 0, 2, [Purpose.REPLAY_START], torch.float64)[..., 0]
         scene = _one_of(u[:, 0], torch.full_like(key, len(self.scene_names)))
         return self.first_start[scene] + _one_of(u[:, 1], self.starts_in[scene])
@@ -294,7 +298,12 @@ class ReplayTraffic(TrafficModule):
         ego_desired_speed_mps: float = 25.0,
     ) -> RecordedScenes:
         """The initial scenes of this traffic."""
-        return RecordedScenes(self, vehicles, ego_visibility, ego_desired_speed_mps)
+        return RecordedScenes(
+            self,
+            vehicles,
+            ego_visibility,
+            ego_desired_speed_mps,
+        )
 
     def move(
         self,
@@ -304,7 +313,13 @@ class ReplayTraffic(TrafficModule):
         step: Tensor,
     ) -> Moved:
         """The next recorded frame."""
-        moved = self.recorded(key, step + 1, vehicles.x.shape[1], vehicles.x.dtype)
+        moved = self.recorded(
+            key,
+            step + 1,
+            vehicles.x.shape[1],
+            vehicles.x.dtype,
+        )
+        # The ego is driven by the environment, not by the recording.
         return moved.with_first(vehicles.at(EGO_INDEX)), memory
 
 
@@ -334,7 +349,12 @@ class RecordedScenes:
 
         The ego at index 0 and x = 0.
         """
-        scene = self.traffic.recorded(key, torch.zeros_like(key), self.vehicles, dtype)
+        scene = self.traffic.recorded(
+            key,
+            torch.zeros_like(key),
+            self.vehicles,
+            dtype,
+        )
         is_ego = torch.arange(self.vehicles, device=key.device) == EGO_INDEX
         return scene.with_(
             desired_speed=torch.where(
@@ -348,6 +368,7 @@ class RecordedScenes:
 
 def _one_of(u: Tensor, count: Tensor) -> Tensor:
     """A number from 0 to ``count`` - 1, int64, from a uniform ``u`` in [0, 1)."""
+    # The product may round up to count.
     return torch.minimum((u * count).long(), count - 1)
 
 

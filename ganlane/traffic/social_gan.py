@@ -59,6 +59,7 @@ class GeneratedTraffic(TrafficModule):
     """
 
     visibility = Visibility.BODY
+    #: Inputs besides the motion; another number means weights of the other preset.
     extra_inputs = 0
 
     def __init__(
@@ -71,6 +72,7 @@ class GeneratedTraffic(TrafficModule):
     ) -> None:
         super().__init__(road, stream)
         sizes = generator.sizes
+        # Purposes of the latent vector end where those of recycling begin.
         if sizes.extra_inputs != self.extra_inputs or sizes.noise > _MOST_NOISE:
             raise UserError(
                 f"generator with {sizes.extra_inputs} further inputs and {sizes.noise} latent "
@@ -80,7 +82,9 @@ class GeneratedTraffic(TrafficModule):
         self.generator = generator
         self.noise_period_s = noise_period_s
         self.noise_scale = noise_scale
+        # A tensor per motion, so that a step renames them instead of moving numbers.
         self.motions = [f"motion_{index}" for index in range(sizes.observed - 1)]
+        # A purpose per latent dimension keeps them independent.
         self.purposes = [Purpose.NOISE + index for index in range(sizes.noise)]
         motions: MemoryFields = {name: ((4 * sizes.hidden,), None) for name in self.motions}
         self.memory_fields = {
@@ -97,6 +101,7 @@ class GeneratedTraffic(TrafficModule):
         history = start(self.network(vehicles.x.dtype), displacement)
         noise = normal(
             key,
+            # Step -1: before the first step of the episode.
             -1,
             vehicles.x.shape[1],
             self.purposes,
@@ -106,6 +111,7 @@ class GeneratedTraffic(TrafficModule):
 
     def network(self, dtype: torch.dtype) -> Generator:
         """The generator in the run's float type."""
+        # Weights are stored in float32, a run may be in float64; converted once.
         if self.generator.encoder.recurrent.dtype != dtype:
             self.generator.to(dtype)
         return self.generator
@@ -126,7 +132,13 @@ class GeneratedTraffic(TrafficModule):
         """The drivers' history from the memory, and the latent vectors [N, M, Z] of this step."""
         # An autoregressive process: the latent vector keeps its variance and forgets slowly.
         noise = memory["noise"]
-        fresh = normal(key, step, noise.shape[1], self.purposes, noise.dtype)
+        fresh = normal(
+            key,
+            step,
+            noise.shape[1],
+            self.purposes,
+            noise.dtype,
+        )
         history = History(
             tuple(memory[name] for name in self.motions),
             memory["displacement"],
@@ -159,7 +171,13 @@ class SocialGanTraffic(GeneratedTraffic):
         noise_scale: float = 1.0,
         execute_k: int = 1,
     ) -> None:
-        super().__init__(generator, road, stream, noise_period_s, noise_scale)
+        super().__init__(
+            generator,
+            road,
+            stream,
+            noise_period_s,
+            noise_scale,
+        )
         if not 1 <= execute_k <= generator.sizes.predicted:
             raise UserError(
                 f"execute_k={execute_k}: the generator predicts {generator.sizes.predicted} steps; "
@@ -178,7 +196,13 @@ class SocialGanTraffic(GeneratedTraffic):
         """See :class:`GeneratedTraffic`; no plan is left."""
         memory = super().fresh_memory(vehicles, key)
         if self.execute_k > 1:
-            memory["plan"] = memory["displacement"][..., None, :].repeat(1, 1, self.execute_k, 1)
+            # For its shape only: no plan is left, so none of it is driven.
+            memory["plan"] = memory["displacement"][..., None, :].repeat(
+                1,
+                1,
+                self.execute_k,
+                1,
+            )
             memory["plan_left"] = torch.zeros_like(vehicles.target_lane)
         return memory
 
@@ -199,6 +223,7 @@ class SocialGanTraffic(GeneratedTraffic):
             network,
             vehicles,
             history,
+            # Scaled for the network alone: the memory keeps unit variance.
             self.noise_scale * noise,
             plan,
         )
@@ -234,7 +259,13 @@ class AnchoredGanTraffic(GeneratedTraffic):
         headway_quantiles_s: tuple[float, ...] = HEADWAY_QUANTILES_S,
         anchor: AnchorParameters = ANCHOR,
     ) -> None:
-        super().__init__(generator, road, stream, noise_period_s, noise_scale)
+        super().__init__(
+            generator,
+            road,
+            stream,
+            noise_period_s,
+            noise_scale,
+        )
         self.headway_quantiles_s = headway_quantiles_s
         self.anchor = anchor
         self.memory_fields = {
@@ -246,7 +277,13 @@ class AnchoredGanTraffic(GeneratedTraffic):
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """See :class:`GeneratedTraffic`; a headway for every driver, residual mean 0."""
         memory = super().fresh_memory(vehicles, key)
-        (u,) = uniforms(vehicles, key, -1, Purpose.TRAIT_HEADWAY)
+        (u,) = uniforms(
+            vehicles,
+            key,
+            -1,
+            Purpose.TRAIT_HEADWAY,
+        )
+        # Headways as recorded, so that drivers differ as recorded ones do.
         memory["headway"] = headway_from_uniform(u, self.headway_quantiles_s)
         memory["residual_mean"] = torch.zeros_like(memory["displacement"])
         return memory
@@ -269,6 +306,7 @@ class AnchoredGanTraffic(GeneratedTraffic):
             vehicles,
             self.road,
             driver,
+            # Scaled for the network alone: the memory keeps unit variance.
             self.noise_scale * noise,
             self.anchor,
         )

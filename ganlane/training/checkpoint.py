@@ -74,6 +74,7 @@ class TrainingState:
         self.pending_decisions = 0
         self.evaluated_at = 0
         self.best: float | None = None
+        # Wall time of the run before it was resumed.
         self._before_s = 0.0
         self._started_s = time.monotonic()
 
@@ -84,6 +85,7 @@ class TrainingState:
 
     def passed(self, every: int) -> bool:
         """Whether the last step passed a multiple of ``every`` decisions; never, for 0."""
+        # A step makes N decisions at once, so multiples are passed rather than met.
         return every > 0 and self.decisions // every > (self.decisions - self.environments) // every
 
     def state_dict(self, with_replay: bool = True) -> dict[str, Any]:
@@ -170,7 +172,12 @@ class TrainingState:
             )
         # the agent first: the checks compare Adam's moments with its weights
         self.agent.load_state_dict(state["agent"])
-        check_parts(state, self.agent, fresh, self.stats)
+        check_parts(
+            state,
+            self.agent,
+            fresh,
+            self.stats,
+        )
         self.collector.load_state_dict(state["env_state"], exact)
         if exact:
             self.window.load_state_dict(state["window"])
@@ -203,6 +210,7 @@ class Checkpointer:
         self.every_s = every_s
         self.with_replay = with_replay
         self.saved_s = time.monotonic()
+        # Longer than every_s where writing takes long.
         self.pause_s = every_s
 
     def due(self) -> bool:
@@ -213,6 +221,7 @@ class Checkpointer:
         """Write the checkpoint and the current weights."""
         begun = time.monotonic()
         save_checkpoint(self.path, self.state.state_dict(self.with_replay))
+        # Weights alone, as an agent's file: it can be driven while the training goes on.
         self.save_weights("last", {})
         self.saved_s = time.monotonic()
         # a slow disk must not slow down the training
@@ -243,6 +252,7 @@ def save_checkpoint(path: str | Path, state: Any) -> None:
     # a kill while writing leaves the checkpoint before it
     with atomic_path(path) as part:
         torch.save({"kind": KIND, "version": VERSION, "state": state}, part)
+        # The checksum goes into the comment of the archive, which torch does not read.
         seal_archive(part)
 
 
@@ -276,6 +286,7 @@ def load_checkpoint(
             f"{option}: not a readable checkpoint (truncated, or not written by ganlane); give "
             "another one."
         ) from error
+    # First the kind: a file of another program has no checksum of ours either.
     if (
         not isinstance(content, dict)
         or content.get("kind") != KIND
@@ -352,6 +363,7 @@ def check_parts(
     check_like(moments, adam if moments else {}, "optimizer")
     check_like(state["agent"]["updates"], 0, "updates")
     best = None if counters["best"] is None else 0.0
+    # The numbers stand for their types; see check_like().
     check_like(
         counters,
         {

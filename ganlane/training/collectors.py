@@ -21,6 +21,7 @@ class Collector:
     def __init__(self, env: EnvBase) -> None:
         self.env = env
         self.environments = env.batch_size.numel()
+        # The state before the next decision; what has ended is begun anew within a step.
         self.env_state: TensorDictBase = env.reset()
 
     def step(self, agent: Rainbow) -> TensorDictBase:
@@ -31,6 +32,7 @@ class Collector:
         """
         # the policy writes its action into the state itself
         decided = agent.policy(self.env_state)
+        # The step holds each row as it ended; in env_state such rows are reset already.
         step, self.env_state = self.env.step_and_maybe_reset(decided)
         return step
 

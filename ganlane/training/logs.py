@@ -117,13 +117,16 @@ class Logs:
 
         It replaces one at the same decisions from before the run was resumed.
         """
+        # Opened for one row: the columns are known only with the first evaluation.
         evaluation = CsvLog(
             self.evaluation_file,
             list(row),
+            # Less 1: a row at the same decisions, from before a resume, is replaced.
             int(row["decisions"]) - 1,
         )
         evaluation.write(row)
         evaluation.close()
+        # With a prefix, so that these figures are not mixed with those of the training.
         for log in self.further:
             log.write(
                 {
@@ -139,6 +142,7 @@ class Logs:
 
     def say(self, text: str) -> None:
         """Print a line, above the bar if there is one."""
+        # A plain print would break the bar.
         tqdm.write(text, file=sys.stderr)
 
     def close(self) -> None:
@@ -179,6 +183,7 @@ class CsvLog:
             writer = csv.DictWriter(file, **form)
             writer.writeheader()
             writer.writerows(rows)
+        # Opened anew, since the rewritten file has taken the place of the old one.
         self._file = self.path.open("a", newline="")
         self._writer = csv.DictWriter(self._file, **form)
 
@@ -190,6 +195,7 @@ class CsvLog:
             for name, value in row.items()
         }
         self._writer.writerow(short)
+        # At once, so that a killed run keeps its rows and the file can be watched.
         self._file.flush()
 
     def close(self) -> None:
@@ -257,7 +263,12 @@ class Progress:
                 "bar_format": BAR,
                 "file": self.stream,
             }
-            self._bar = tqdm(total=total, initial=done, desc="train", **options)
+            self._bar = tqdm(
+                total=total,
+                initial=done,
+                desc="train",
+                **options,
+            )
 
     def advance(self, decisions: int) -> None:
         """Move the bar to ``decisions``."""
@@ -274,6 +285,7 @@ class Progress:
         if self._bar is not None:
             self._bar.set_postfix_str(", ".join(shown))
             return
+        # The bound avoids a division by 0 where there is no rate yet.
         rate = max(row.get("decisions_per_s", 0.0), 1e-9)
         # remaining time at the rate of the last interval
         minutes, seconds = divmod(
@@ -310,6 +322,7 @@ def make_logs(
 
 def _module(name: str, extra: str) -> Any:
     """The module that a log needs, from the extra of that name."""
+    # Imported only when asked for: these logs are optional.
     try:
         return import_module(name)
     except ImportError as error:

@@ -130,12 +130,22 @@ def train(
                 if state.passed(config.log_every):
                     log.write(metrics(state))
                 if evaluate is not None and state.passed(config.evaluate_every):
-                    keep_best(state, evaluate, log, saver)
+                    keep_best(
+                        state,
+                        evaluate,
+                        log,
+                        saver,
+                    )
                 if saver.due():
                     saver.save()
             # the last agent is evaluated too, unless that has just been done
             if evaluate is not None and not signals and state.evaluated_at < state.decisions:
-                keep_best(state, evaluate, log, saver)
+                keep_best(
+                    state,
+                    evaluate,
+                    log,
+                    saver,
+                )
             saver.save()
     stopped_by = signals[-1] if signals else None
     return TrainingResult(
@@ -158,6 +168,7 @@ def advance(state: TrainingState) -> TensorDictBase:
 
 def collect(state: TrainingState) -> TensorDictBase:
     """One decision of every environment, batch [N]."""
+    # Exploration and learning rate follow the decisions made so far.
     state.agent.anneal(state.decisions)
     with torch.no_grad():
         step = state.collector.step(state.agent)
@@ -172,6 +183,7 @@ def learn(state: TrainingState) -> None:
     None until the agent is ready (``warmup``).
     """
     agent = state.agent
+    # Nothing is learned, and nothing becomes due, until the buffer holds enough.
     if not agent.ready:
         return
     # decisions that do not fill an update are kept for the next step

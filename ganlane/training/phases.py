@@ -147,6 +147,7 @@ def run_phase(
     result = train(
         env,
         agent,
+        # The loop knows the decisions of its own phase only.
         replace(config, total_decisions=phase.total_decisions),
         phase.folder,
         evaluate=make_selection(config, phase.traffic) if config.evaluate_every else None,
@@ -192,10 +193,17 @@ def make_selection(config: TrainConfig, traffic: TrafficConfig) -> Evaluate:
     env = make(min(config.selection_episodes, config.evaluation.num_envs))
     # the same episodes in every call, so that figures can be compared
     episodes = range(config.selection_episodes)
+    # A compiled graph is of one batch size, so compiled environments are not made smaller.
     smaller = None if config.env.compile else make
 
     def evaluate(policy: GreedyPolicy) -> dict[str, float]:
-        table = run_episodes(env, policy, episodes, config.seed, make_smaller=smaller)
+        table = run_episodes(
+            env,
+            policy,
+            episodes,
+            config.seed,
+            make_smaller=smaller,
+        )
         total = table.select(
             "reward",
             "lane_changes",
@@ -209,6 +217,7 @@ def make_selection(config: TrainConfig, traffic: TrafficConfig) -> Evaluate:
             "mean_reward": reward / table.height,
             "standard_error": spread / math.sqrt(table.height),
             "crash_rate": crashes / table.height,
+            # At least 1 m: all episodes may end at once.
             "lane_changes_per_km": 1000.0 * changes / max(distance_m, 1.0),
         }
 
@@ -242,7 +251,12 @@ def read_start(name: str, key: str = "init.path") -> Start:
     path = Path(name)
     if path.suffix != ".pt" and (not path.is_dir() or name in SHIPPED):
         weights, network, metadata = read_agent(name)
-        return Start(name, weights, network, observation_of(metadata))
+        return Start(
+            name,
+            weights,
+            network,
+            observation_of(metadata),
+        )
     # a folder stands for its last checkpoint
     path = path / LAST if path.is_dir() else path
     if not path.is_file():
@@ -258,6 +272,7 @@ def read_start(name: str, key: str = "init.path") -> Start:
         observation = ObservationConfig(
             **{name: trained_on[name] for name in ("form", "range_m", "speed_mps")}
         )
+        # The input size is not in the checkpoint; it follows from observation and vehicles.
         size = observation_size(observation.form, state["identity"]["env"]["vehicles"])
         network = NetworkConfig(RainbowConfig(**agent["config"]), size)
         weights = {name: value.detach() for name, value in agent["network"].items()}
@@ -288,6 +303,7 @@ def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
     """
     # a falling learning rate reaches its end with the phase
     options = config.agent.for_phase(phase.total_decisions)
+    # Trained weights need no long phase of random actions.
     if phase.init is not None:
         options = replace(
             options,
@@ -340,7 +356,13 @@ def make_initial_agent(
             "init.optimizer=false."
         )
     moments = start.moments if with_moments else None
-    warm_start(agent, start.name, start.weights, start.network, moments)
+    warm_start(
+        agent,
+        start.name,
+        start.weights,
+        start.network,
+        moments,
+    )
     return config, agent
 
 

@@ -75,6 +75,7 @@ class EpisodeStats:
         if chosen is not None:
             running["values"] += chosen.reshape(-1)
         self.discount *= self.gamma
+        # The next reward counts fully for the next decision, gamma times as much for those before.
         self.weight = 1.0 + self.gamma * self.weight
 
         taken = step.get(keys.ACTION)[:, None] == self.actions

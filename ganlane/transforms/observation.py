@@ -256,7 +256,12 @@ class ObservationTransform(PerceptionTransform):
         self.scale = scale or ObservationScale()
         self.native: LaneView | None = None
         if native and form in NATIVE_FORMS:
-            self.native = LaneView(road, vehicles, self.scale, form)
+            self.native = LaneView(
+                road,
+                vehicles,
+                self.scale,
+                form,
+            )
 
     def observe(
         self,
@@ -272,7 +277,15 @@ class ObservationTransform(PerceptionTransform):
         """
         seen = vehicles if seen is None else seen
         others = other_vehicles(seen, road, self.scale)
-        view = View(vehicles, seen, others, road, self.scale, progress, direction)
+        view = View(
+            vehicles,
+            seen,
+            others,
+            road,
+            self.scale,
+            progress,
+            direction,
+        )
         parts = [part.numbers(view) for part in OBSERVATIONS[self.form]]
         return torch.cat(parts, dim=1)
 
@@ -293,10 +306,21 @@ class ObservationTransform(PerceptionTransform):
         direction = ego.get("change_direction")
         # The kernel computes the same numbers up to the rounding of the exponential function.
         if self.native is not None:
-            observation = self.native.observe(vehicles, progress, direction, seen)
+            observation = self.native.observe(
+                vehicles,
+                progress,
+                direction,
+                seen,
+            )
         else:
             road = road_in(state, self.road)
-            observation = self.observe(vehicles, progress, direction, road, seen)
+            observation = self.observe(
+                vehicles,
+                progress,
+                direction,
+                road,
+                seen,
+            )
         return state.set(keys.OBSERVATION, observation)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:

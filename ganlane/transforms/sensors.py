@@ -135,7 +135,12 @@ class SensorTransform(Transform):
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         # The traffic's key: purposes of their own keep the numbers apart.
         key = episode_key(self.stream, state.get(keys.SEED), state.get(keys.EPISODE))
-        return measure(vehicles, key, state.get(keys.STEP), self.parameters)
+        return measure(
+            vehicles,
+            key,
+            state.get(keys.STEP),
+            self.parameters,
+        )
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         # One measurement in per decision, one out: the queue keeps its length.

@@ -64,6 +64,7 @@ def darker(colour: str) -> str:
 
 def readable_on(colour: str) -> str:
     """Black or white, whichever reads better on ``colour``."""
+    # Luma of ITU-R BT.601, from 0 to 255.
     is_bright = np.dot((0.299, 0.587, 0.114), getrgb(colour)) > 130
     return "#101216" if is_bright else "white"
 
@@ -92,7 +93,12 @@ def put_text(
     """
     left, width = ink(text, size)
     place = round(position[0] - anchor * width) - left, round(position[1])
-    ImageDraw.Draw(image).text(place, text, colour, _font(size))
+    ImageDraw.Draw(image).text(
+        place,
+        text,
+        colour,
+        _font(size),
+    )
 
 
 class Window:
@@ -116,6 +122,8 @@ class Window:
         room = look.height - HEADER_HEIGHT - FOOTER_HEIGHT
         self._middle = HEADER_HEIGHT + room / 2
         self.along = look.width / look.road_m
+        # The road may not be higher than what header and footer leave, with 1 m of verge at each
+        # side.
         self.across = min(self.along * EXAGGERATION, room / (lanes * lane_width_m + 2.0))
         upper, lower = self.row([(lanes - 0.5) * lane_width_m, -0.5 * lane_width_m])
         self.edges = float(upper), float(lower)
@@ -142,6 +150,7 @@ class Backdrop:
 
     def __init__(self, window: Window):
         self.window = window
+        # Two periods of lane marks, after which the verge's stripes repeat, too.
         self.period = round(2 * PERIOD_M * window.along)
         size = (window.width + self.period, window.height)
         self.strip = strip = Image.new("RGB", size, VERGE)
@@ -174,5 +183,11 @@ class Backdrop:
         posts = np.arange(first, start + window.length_m + 10.0, POST_EVERY_M)
         for metres, column in zip(posts, window.column(posts, ego_x_m)):
             draw.line((column, lower + 7, column, lower + 20), fill=FAINT, width=2)
-            put_text(picture, (column + 7, lower + 8), f"{int(metres)} m", 12, FAINT)
+            put_text(
+                picture,
+                (column + 7, lower + 8),
+                f"{int(metres)} m",
+                12,
+                FAINT,
+            )
         return picture

@@ -41,6 +41,7 @@ class Panel:
 
 
 PANELS = [
+    # Reward per episode, undiscounted; the agent itself maximises the discounted return.
     Panel("mean return", "mean_return", "reward per episode"),
     Panel("crash rate", "crash_rate", "share of episodes"),
     Panel("lane changes", "lane_changes_per_km", "per km"),
@@ -71,17 +72,20 @@ def read_metrics(path: str | Path) -> pl.DataFrame:
             "folder."
         )
     try:
+        # Types are inferred from all rows: a column may be empty for the first thousands.
         frame = pl.read_csv(file, infer_schema_length=None)
     except (PolarsError, UnicodeDecodeError) as error:
         reason = str(error).splitlines()[0]
         raise UserError(
             f"{file}: not a readable CSV file ({reason}); give a run's metrics.csv."
         ) from error
+    # The two files of a run have this column in common; without it nothing can be drawn.
     if X_COLUMN not in frame.columns or frame.is_empty():
         raise UserError(
             f"{file}: expected a column '{X_COLUMN}' and at least one row; give a run's "
             "metrics.csv."
         )
+    # Text, or numbers beyond what can be drawn, is refused by its column. NaN is a gap.
     for column in frame.iter_columns():
         wrong = column.drop_nulls()
         if column.dtype.is_numeric():
@@ -111,6 +115,7 @@ def read_run(path: str | Path) -> pl.DataFrame:
     evaluated = read_metrics(evaluation).select(
         X_COLUMN, pl.exclude(X_COLUMN).name.prefix(EVALUATION)
     )
+    # Rows of both files, in order of decisions; columns of the other file are null there.
     return pl.concat([metrics, evaluated], how="diagonal_relaxed").sort(X_COLUMN)
 
 
@@ -127,6 +132,7 @@ def read_runs(paths: Sequence[str | Path]) -> dict[str, list[pl.DataFrame]]:
     for path in map(Path, paths):
         # A folder without runs is refused when it is read.
         files += (path.is_dir() and runs_below(path.resolve(), "metrics.csv")) or [path.resolve()]
+    # Twice the same run would be drawn as two seeds that agree perfectly.
     if len(set(files)) < len(files):
         raise UserError(
             f"run={','.join(map(str, paths))}: a folder comes twice; give each run once."
@@ -134,6 +140,7 @@ def read_runs(paths: Sequence[str | Path]) -> dict[str, list[pl.DataFrame]]:
     folders = [file.parent if file.suffix == ".csv" else file for file in files]
     runs: dict[str, list[pl.DataFrame]] = {}
     for name, file in zip(names_of_runs(folders), files):
+        # Runs that differ only in their seed share a name, and so become one line.
         without_seed = re.sub(r"(^|, )seed=[^,]*$", "", name) or "all seeds"
         runs.setdefault(without_seed, []).append(read_run(file))
     return runs
@@ -169,6 +176,7 @@ def draw_runs(
             )
     panels = PANELS
     if columns is not None:
+        # Columns the caller names are drawn under their own names.
         panels = [Panel(name.replace("_", " "), name, name.replace("_", " ")) for name in columns]
     drawn = [panel for panel in panels if panel.column in with_numbers]
     if not drawn:
@@ -184,11 +192,30 @@ def draw_runs(
         axes.xaxis.set_major_formatter(EngFormatter())
         for name, frames in runs.items():
             style: dict[str, Any] = {"color": colours[name]}
+            # Smoothing hides the spread, so a single run is also drawn unsmoothed, faintly.
             if smooth > 1 and len(frames) == 1:
                 for x, y in _lines(frames, panel.column):
-                    plot_line(axes, x, y, **style, alpha=0.3, lw=0.8)
-            _plot_mean(axes, _lines(frames, panel.column, smooth), with_range=True, **style)
-            _plot_mean(axes, _lines(frames, panel.dashed, smooth), **style, ls="--", lw=1.2)
+                    plot_line(
+                        axes,
+                        x,
+                        y,
+                        **style,
+                        alpha=0.3,
+                        lw=0.8,
+                    )
+            _plot_mean(
+                axes,
+                _lines(frames, panel.column, smooth),
+                with_range=True,
+                **style,
+            )
+            _plot_mean(
+                axes,
+                _lines(frames, panel.dashed, smooth),
+                **style,
+                ls="--",
+                lw=1.2,
+            )
     legend = {}
     for name, frames in runs.items():
         count = f" ({len(frames)} seeds: mean, range)" if len(frames) > 1 else ""
@@ -205,6 +232,7 @@ def _lines(
     Means ignore NaN, and are NaN where the value itself is.
     """
     lines = []
+    # NaN counts as missing; gaps stay gaps, instead of being filled by the rolling mean.
     number = pl.col(column).fill_nan(None)
     mean = pl.when(number.is_not_null()).then(number.rolling_mean(smooth, min_samples=1))
     for frame in frames:
@@ -228,10 +256,24 @@ def _plot_mean(
         plot_line(axes, *lines[0], **style)
     if len(lines) < 2:
         return
+    # Seeds are logged at different decisions: values in between are interpolated.
     x = np.unique(np.concatenate([x for x, _ in lines]))
+    # Only where all have values, else the mean would jump where a run begins or ends.
     first, last = max(x[0] for x, _ in lines), min(x[-1] for x, _ in lines)
     shared = x[(x >= first) & (x <= last)]
     values = np.stack([np.interp(shared, *line) for line in lines])
-    plot_line(axes, shared, values.mean(0), **style)
+    plot_line(
+        axes,
+        shared,
+        values.mean(0),
+        **style,
+    )
     if with_range:
-        axes.fill_between(shared, values.min(0), values.max(0), **style, alpha=0.18, lw=0)
+        axes.fill_between(
+            shared,
+            values.min(0),
+            values.max(0),
+            **style,
+            alpha=0.18,
+            lw=0,
+        )

@@ -109,6 +109,7 @@ def panel_grid(
     across = next(
         (number for number in (3, 2, 4, 5) if count > number and count % number != 1), min(3, count)
     )
+    # -(-a // b) is a / b rounded up.
     down = -(-count // across)
     figure = Figure(figsize=(across * width_in, down * height_in + 0.3))
     grid = figure.subplots(down, across, squeeze=False).ravel()
@@ -144,6 +145,13 @@ def plot_line(
 ) -> None:
     """A line with gaps where ``y`` is NaN; a single value between two gaps is a dot."""
     finite = np.isfinite(np.asarray(y, dtype=np.float64))
+    # A value is single if it is finite and neither neighbour is; the ends count as gaps.
     padded = np.concatenate(([False], finite, [False]))
     single = finite & ~padded[:-2] & ~padded[2:]
-    axes.plot(x, y, marker="o", markevery=single, **style)  # type: ignore[arg-type]
+    axes.plot(
+        x,
+        y,
+        marker="o",
+        markevery=single,
+        **style,
+    )  # type: ignore[arg-type]

@@ -53,7 +53,9 @@ def film_frames(trajectory: Trajectory, look: FilmConfig) -> list[int]:
             f"film from {look.start_s:g} to {end:g} s: the episode lasts {time[-1]:g} s; choose a "
             "part of it."
         )
+    # 1e-9 s, so that rounding does not lose the last frame.
     times = np.arange(look.start_s, end + 1e-9, look.speedup / look.fps)
+    # At every time of the film the last recorded frame is shown.
     shown = np.searchsorted(time, [*times + 1e-9, end + 1e-9], side="right") - 1
     *frames, last = shown.tolist()
     return frames + [last] * max(1, round(HOLD_S * look.fps))
@@ -86,7 +88,13 @@ def write_film(
     painter, frames = FramePainter(trajectory, look), film_frames(trajectory, look)
     if kind == "gif":
         for share, colours, every in _GIF_SIZES:
-            content = _gif(painter, frames, look.scale * share, colours, every)
+            content = _gif(
+                painter,
+                frames,
+                look.scale * share,
+                colours,
+                every,
+            )
             if look.max_bytes is None or len(content) <= look.max_bytes:
                 write_bytes(path, content)
                 return path
@@ -109,6 +117,7 @@ def film_strip(pictures: Sequence[Picture]) -> Picture:
     """Pictures one below the other, with a white line between them."""
     gap = np.full((4, pictures[0].shape[1], 3), 255, np.uint8)
     rows = [row for picture in pictures for row in (gap, picture)]
+    # Without the line above the first picture.
     return np.concatenate(rows[1:])
 
 
@@ -137,7 +146,12 @@ def _gif(
     painter: FramePainter, frames: Sequence[int], scale: float, colours: int, every: int
 ) -> bytes:
     """An endless GIF with one palette for the whole film."""
-    palette = _shared_palette(painter, frames, scale, colours)
+    palette = _shared_palette(
+        painter,
+        frames,
+        scale,
+        colours,
+    )
     pictures = [
         _scaled(painter.draw(frame), scale).quantize(palette=palette, dither=Image.Dither.NONE)
         for frame in frames[::every]

@@ -46,7 +46,12 @@ def _symmetric(*left: tuple[float, float]) -> FloatArray:
     return np.concatenate((half, half[::-1] * _MIRROR))
 
 
-_BODY = _symmetric((-0.5, 0.42), (-0.46, 0.5), (0.38, 0.5), (0.5, 0.34))
+_BODY = _symmetric(
+    (-0.5, 0.42),
+    (-0.46, 0.5),
+    (0.38, 0.5),
+    (0.5, 0.34),
+)
 _EGO = _symmetric((-0.5, 0.5), (0.2, 0.5), (0.5, 0.08))
 _WINDSCREEN = _symmetric((0.14, 0.42), (0.27, 0.34))
 _REAR_WINDOW = _symmetric((-0.38, 0.36), (-0.31, 0.40))
@@ -93,6 +98,7 @@ class FramePainter:
         if has_tints:
             _draw_tints(self._header)
         self._overlapping = trajectory.overlapping()
+        # How often a vehicle has jumped so far; trails are cut where this number changes.
         self._jumps = np.cumsum(trajectory.jumped(), axis=0)
 
     def draw(self, frame: int) -> Picture:
@@ -108,15 +114,33 @@ class FramePainter:
         in_picture = (columns > -lengths) & (columns < width + lengths) & t.valid[frame]
         # The ego comes last, on top of the others.
         for vehicle in np.flatnonzero(in_picture)[::-1].tolist():
-            self._draw_vehicle(picture, frame, vehicle, float(columns[vehicle]))
+            self._draw_vehicle(
+                picture,
+                frame,
+                vehicle,
+                float(columns[vehicle]),
+            )
         behind = int((t.valid[frame] & (columns < 0)).sum())
         ahead = int((t.valid[frame] & (columns > width)).sum())
         room_above = self.window.edges[0] - HEADER_HEIGHT > 2 * _SMALL
         top = HEADER_HEIGHT + 6 if room_above else self.window.height - _SMALL - 6
         if behind:
-            put_text(picture, (12, top), f"{behind} behind", _SMALL, canvas.FAINT)
+            put_text(
+                picture,
+                (12, top),
+                f"{behind} behind",
+                _SMALL,
+                canvas.FAINT,
+            )
         if ahead:
-            put_text(picture, (width - 12, top), f"{ahead} ahead", _SMALL, canvas.FAINT, 1.0)
+            put_text(
+                picture,
+                (width - 12, top),
+                f"{ahead} ahead",
+                _SMALL,
+                canvas.FAINT,
+                1.0,
+            )
         if frame == len(t) - 1:
             self._draw_outcome(picture, float(columns[0]))
         self._draw_header(picture, frame)
@@ -134,6 +158,7 @@ class FramePainter:
         middle = np.array([column, float(window.row(t.y[at]))])
         # Pixels (column, row) from end to end and from side to side.
         cos, sin = np.cos(t.heading[at]), np.sin(t.heading[at])
+        # Rows of the picture count downwards, so what points to the left has a negative row.
         forward = np.array([cos * window.along, -sin * window.across]) * t.length[at]
         left = np.array([-sin * window.along, -cos * window.across]) * t.width[at]
         # The vehicle is drawn on a patch around its middle.
@@ -167,6 +192,7 @@ class FramePainter:
         if t.acceleration[at] < _BRAKE_LIGHT:
             fill(_BRAKE, canvas.BRAKE)
             fill(_BRAKE * _MIRROR, canvas.BRAKE)
+        # Positive: the target lane lies to the left.
         offset = float(t.target_lane[at] * t.label.lane_width_m - t.y[at])
         if abs(offset) > _SIGNAL_M and t.time_s[frame] % _BLINK_S < _LIT_S:
             for light in _INDICATORS:
@@ -177,7 +203,14 @@ class FramePainter:
         if self.look.speeds:
             place = (column - 0.09 * forward[0], middle[1] - _SMALL * 0.62)
             ink = canvas.readable_on(colour)
-            put_text(picture, place, f"{t.speed[at]:.0f}", _SMALL, ink, 0.5)
+            put_text(
+                picture,
+                place,
+                f"{t.speed[at]:.0f}",
+                _SMALL,
+                ink,
+                0.5,
+            )
 
     def _draw_trails(
         self,
@@ -243,7 +276,14 @@ class FramePainter:
         row = float(self.window.row(t.y[frame, 0]))
         ImageDraw.Draw(picture).line((start, row, end, row), fill=canvas.LEADER, width=1)
         place = (start + min(end, self.window.width)) / 2, row - 17
-        put_text(picture, place, f"{rear - front:.0f} m", _SMALL, canvas.LEADER, 0.5)
+        put_text(
+            picture,
+            place,
+            f"{rear - front:.0f} m",
+            _SMALL,
+            canvas.LEADER,
+            0.5,
+        )
 
     def _draw_header(self, picture: Image.Image, frame: int) -> None:
         """Put the header of one frame on the picture."""
@@ -259,7 +299,13 @@ class FramePainter:
         column = self._values_at
         for value, width in zip(values, _VALUES.values()):
             colour = canvas.EGO if value in ("left", "right") else canvas.TEXT
-            put_text(picture, (column, 25), value, 18, colour)
+            put_text(
+                picture,
+                (column, 25),
+                value,
+                18,
+                colour,
+            )
             column += width
 
     def _draw_outcome(self, picture: Image.Image, ego_column: float) -> None:
@@ -276,8 +322,21 @@ class FramePainter:
         width = canvas.ink(text, 24)[1] + 40
         left = (picture.width - width) // 2
         plate = (left, HEADER_HEIGHT + 6, left + width, HEADER_HEIGHT + 44)
-        draw.rounded_rectangle(plate, 8, fill=canvas.HEADER, outline=colour, width=2)
-        put_text(picture, (picture.width / 2, HEADER_HEIGHT + 11), text, 24, colour, 0.5)
+        draw.rounded_rectangle(
+            plate,
+            8,
+            fill=canvas.HEADER,
+            outline=colour,
+            width=2,
+        )
+        put_text(
+            picture,
+            (picture.width / 2, HEADER_HEIGHT + 11),
+            text,
+            24,
+            colour,
+            0.5,
+        )
 
 
 def _header(
@@ -291,15 +350,33 @@ def _header(
     for size in _TITLE_SIZES:
         if canvas.ink(title, size)[1] < values_at - 24:
             break
-    put_text(picture, (16, 8), title, size, canvas.TEXT)
+    put_text(
+        picture,
+        (16, 8),
+        title,
+        size,
+        canvas.TEXT,
+    )
     lanes = f"{label.lanes} lane{'s' if label.lanes > 1 else ''}"
     facts = f"episode {label.episode}, seed {label.seed}, {lanes}"
     factor = window.across / window.along
     if factor > 1.05:
         facts += f"; drawn {factor:.1f} times as wide as it is"
-    put_text(picture, (16, 34), facts, _SMALL, canvas.FAINT)
+    put_text(
+        picture,
+        (16, 34),
+        facts,
+        _SMALL,
+        canvas.FAINT,
+    )
     for name, width in _VALUES.items():
-        put_text(picture, (values_at, 9), name, _SMALL, canvas.FAINT)
+        put_text(
+            picture,
+            (values_at, 9),
+            name,
+            _SMALL,
+            canvas.FAINT,
+        )
         values_at += width
     return picture
 
@@ -311,8 +388,27 @@ def _draw_tints(header: Image.Image) -> None:
     for column in range(left, right):
         speed = (column - left) / (right - left) * canvas.FAST_MPS
         draw.line((column, 26, column, 35), fill=canvas.speed_tint(speed))
-    put_text(header, (left, 9), "others' speed, m/s", _SMALL, canvas.FAINT)
-    put_text(header, (left, 38), "0", 11, canvas.FAINT)
+    put_text(
+        header,
+        (left, 9),
+        "others' speed, m/s",
+        _SMALL,
+        canvas.FAINT,
+    )
+    put_text(
+        header,
+        (left, 38),
+        "0",
+        11,
+        canvas.FAINT,
+    )
     for speed in (10, 20, 30):
         place = left + speed / canvas.FAST_MPS * (right - left), 38
-        put_text(header, place, f"{speed}", 11, canvas.FAINT, 0.5)
+        put_text(
+            header,
+            place,
+            f"{speed}",
+            11,
+            canvas.FAINT,
+            0.5,
+        )

@@ -32,7 +32,15 @@ from ganlane.view.record import ACTION_NAMES, Trajectory
 #: Three episodes stay under 2 MB.
 MAX_BYTES_PER_EPISODE = 660_000
 #: Units of series: s, m, m, rad, m/s, m/s2, m/s3.
-UNITS = dict(time=0.01, x=0.01, y=0.01, heading=0.001, speed=0.01, acceleration=0.01, jerk=0.1)
+UNITS = dict(
+    time=0.01,
+    x=0.01,
+    y=0.01,
+    heading=0.001,
+    speed=0.01,
+    acceleration=0.01,
+    jerk=0.1,
+)
 
 
 def write_player(
@@ -58,6 +66,7 @@ def player_page(trajectories: Sequence[Trajectory], look: FilmConfig | None = No
     limit = look.max_bytes or MAX_BYTES_PER_EPISODE * len(trajectories)
     labels = [trajectory.label for trajectory in trajectories]
     title = ", ".join(dict.fromkeys(f"{label.agent} on {label.traffic}" for label in labels))
+    # Every so many frames, until the page is small enough; the road moves less smoothly then.
     for stride in (1, 2, 3, 5, 10):
         episodes = [episode_data(trajectory, stride, look.start_s) for trajectory in trajectories]
         page = _fill(title, {"units": UNITS, "episodes": episodes})
@@ -81,6 +90,7 @@ def _fill(title: str, data: dict[str, Any]) -> str:
     # in this order
     names = ("episode.js", "road.js", "chart.js", "events.js", "panel.js", "player.js")
     script = "(() => {\n'use strict';\n" + "\n".join(map(text, names)) + "})();\n"
+    # Only these two texts may run: nothing that is put into the page as data can.
     allowed = f"style-src {_hash(style)}; script-src {_hash(script)}"
     parts = {
         "title": html.escape(title),
@@ -89,12 +99,14 @@ def _fill(title: str, data: dict[str, Any]) -> str:
         "script": script,
         "data": script_safe_json(data),
     }
+    # A function, since backslashes in a replacement text would be escapes.
     return re.sub(r"\{\{(\w+)\}\}", lambda place: parts[place[1]], text("page.html"))
 
 
 def script_safe_json(data: Any) -> str:
     """JSON that neither ends nor comments out the script element around it."""
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
+    # As escapes within JSON's strings these characters mean the same, and HTML does not see them.
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
@@ -108,7 +120,9 @@ def series(values: npt.NDArray[np.float64], unit: float) -> list[int]:
 
     Rounding errors do not add up.
     """
+    # Differences of the rounded values, not rounded differences: errors do not add up.
     whole = np.rint(np.nan_to_num(values) / unit).astype(np.int64)
+    # The first difference is to 0, so it is the first value itself.
     return np.diff(whole, prepend=np.int64(0)).tolist()
 
 
@@ -144,8 +158,11 @@ def episode_data(
         ``rms_jerk``, m/s3; ``soft_crash``, the ends of the decisions with any, s. Rewards and
         action values are empty if unknown.
     """
+    # The last frame always, since it shows how the episode ended.
     t = trajectory.since(start_s)
     samples = np.union1d(np.arange(0, len(t), stride), len(t) - 1)
+    # A frame has the action and reward of the decision that led to it; the player shows those of
+    # the decision that begins there, so they are taken from the next frame.
     under_way = np.minimum(samples + 1, len(t) - 1)
     acceleration = t.acceleration[:, 0]
     jerk = ego_jerk(trajectory)[-len(t) :]
@@ -158,6 +175,7 @@ def episode_data(
         data[name] = [series(row, UNITS[name]) for row in getattr(t, name)[samples].T]
     for name in ("length", "width", "target_lane", "valid"):
         data[name] = [steps(row) for row in getattr(t, name)[samples].T]
+    # Rule-based drivers have no action values; the page gets an empty list for them.
     knows_values = np.isfinite(t.action_values).any()
     knows_reward = np.isfinite(t.reward).any()
     return data | {
@@ -186,6 +204,8 @@ def ego_jerk(trajectory: Trajectory) -> npt.NDArray[np.float64]:
     """
     acceleration = trajectory.acceleration[:, 0]
     jerk = np.diff(acceleration, prepend=acceleration[0]) / trajectory.frame_s
+    # The episode begins without a past: no change of acceleration is known there.
     jerk[:2] = 0.0
+    # A vehicle that was placed elsewhere has another acceleration, not a jerk.
     jerk[trajectory.jumped()[:, 0]] = 0.0
     return jerk

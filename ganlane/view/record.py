@@ -177,7 +177,12 @@ class Recorder:
         arrays["time_s"] = arrays["time_s"].round(6)
         arrays["returns"][-1] = self.current_return
         soft_crash_s = np.array(self.soft_crash_s)
-        return Trajectory(label, outcome=outcome, soft_crash_s=soft_crash_s, **arrays)
+        return Trajectory(
+            label,
+            outcome=outcome,
+            soft_crash_s=soft_crash_s,
+            **arrays,
+        )
 
 
 def road_of_row(
@@ -223,6 +228,7 @@ def record_episode(
     Raises:
         UserError: the environment, below its transforms, is no ``HighwayEnv``.
     """
+    # Transforms wrap the environment; the recorder hooks into the innermost one.
     base: Any = env
     while hasattr(base, "base_env"):
         base = base.base_env
@@ -237,10 +243,21 @@ def record_episode(
     try:
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             state = env.reset(start_of(env, [episode], seed))
-            label = EpisodeLabel(agent, traffic, seed, episode, *road_of_row(state, base.road, 0))
+            label = EpisodeLabel(
+                agent,
+                traffic,
+                seed,
+                episode,
+                *road_of_row(state, base.road, 0),
+            )
             recorder.add(state[keys.VEHICLES], 0.0)
             while not state["done"][0] and recorder.time_s < end_s:
-                state = _decide(env, policy, state, recorder)
+                state = _decide(
+                    env,
+                    policy,
+                    state,
+                    recorder,
+                )
     finally:
         base.recorder = before
     return recorder.trajectory(label, outcome_of(state))

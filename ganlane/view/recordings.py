@@ -18,11 +18,13 @@ def draw_recordings(statistics: PooledStatistics) -> Figure:
     """Speeds, accelerations, lane-change times, headways and gaps of recorded driving."""
     of = statistics.histograms
     figure, (speed, acceleration, changes, headway, time_headway, gap) = panel_grid(6)
+    # The limit follows the data; a few outliers must not squeeze the rest.
     speed.set(
         title="speed", xlabel="m/s", xlim=(0.0, min(60.0, 1.1 * of["speed"].quantile(1.0) + 1.0))
     )
     _draw_densities(speed, {"": of["speed"]})
     acceleration.set(title="acceleration", xlabel="m/s²", xlim=(-5.0, 5.0))
+    # Differences of measured positions are noisy; over 1 s the noise averages out.
     _draw_densities(
         acceleration,
         {"as recorded": of["acceleration_raw"], "over 1 s": of["acceleration_smoothed"]},
@@ -44,7 +46,13 @@ def _draw_densities(axes: Axes, histograms: Mapping[str, Histogram]) -> None:
     axes.set_ylabel(f"density, per {axes.get_xlabel()}")
     for line, (label, histogram) in enumerate(histograms.items()):
         middles, density = binned_density(histogram, *axes.get_xlim())
-        axes.plot(middles, density, color=COLOURS[line], label=label)
+        axes.plot(
+            middles,
+            density,
+            color=COLOURS[line],
+            label=label,
+        )
+        # What the panel cuts off is said in words, so that the curve is not taken for all of it.
         beyond = 100.0 * (1.0 - float(np.sum(density)) * float(middles[1] - middles[0]))
         if histogram.total and beyond >= 0.05:
             axes.text(
@@ -65,6 +73,7 @@ def binned_density(
 ) -> tuple[FloatArray, FloatArray]:
     """Middles of about 80 bins from ``low`` to ``high``, and the density there."""
     edges = histogram.bins.edges
+    # Limits of the panel fall on edges of bins, except for rounding.
     first, last = np.searchsorted(edges, (low - 1e-9, high - 1e-9))
     # The histogram's own bins are finer.
     merged = max(1, int(last - first) // 80)
@@ -72,6 +81,7 @@ def binned_density(
     counts = histogram.counts[first : first + number * merged].reshape(number, merged).sum(axis=1)
     width = merged * float(edges[1] - edges[0])
     middles = edges[first] + width * (np.arange(number) + 0.5)
+    # By all values, those beyond the limits too, so densities of panels can be compared.
     return middles, counts / (max(histogram.total, 1) * width)
 
 
@@ -92,12 +102,20 @@ def _draw_changes(axes: Axes, statistics: PooledStatistics) -> None:
             color=FAINT,
         )
         return
+    # Changes cut off by a track's end are censored: without them the times come out too short.
     lines = {
         "unfinished ones included": np.ones(len(changes), bool),
         "finished ones only": changes.complete,
     }
     for (label, those), colour in zip(lines.items(), COLOURS):
         times, shares = survival_curve(changes.duration_s[those], changes.complete[those])
+        # The curve begins at 1, before the first change ends.
         x, y = np.append(0.0, times), np.append(1.0, shares)
-        axes.step(x, y, where="post", color=colour, label=label)
+        axes.step(
+            x,
+            y,
+            where="post",
+            color=colour,
+            label=label,
+        )
     axes.legend(loc="upper right", fontsize=8)

@@ -33,6 +33,7 @@ def write_tracks(
     """
     if not trajectories:
         raise UserError(f"format={format}: no episode to write; record at least one.")
+    # The same driver, traffic, seed and episode may come twice; scenes need names of their own.
     times = Counter[str]()
     tables = []
     for trajectory in trajectories:
@@ -42,6 +43,7 @@ def write_tracks(
         number = f"-{times[name]}" if times[name] > 1 else ""
         table = to_tracks(trajectory, name + number)
         if format == "csv":
+            # A scene CSV counts lanes from the left, so it needs the number of the leftmost one.
             table = scene_csv(table, pl.lit(label.lanes - 1), label.lane_width_m)
         tables.append(table)
     if format == "parquet":
@@ -58,15 +60,18 @@ def to_tracks(trajectory: Trajectory, scene: str = "simulated") -> pl.DataFrame:
     Raises:
         UserError: the frames are not 0.1 s apart.
     """
+    # Recordings have rows this far apart, and what reads them relies on it.
     if abs(trajectory.frame_s - keys.PHYSICS_STEP_S) > 1e-6:
         raise UserError(
             f"trajectory: its frames are {trajectory.frame_s:g} s apart, tracks need "
             f"{keys.PHYSICS_STEP_S} s; record it at every physics step."
         )
+    # A row for each vehicle that is on the road, frame by frame.
     frame, vehicle = np.nonzero(trajectory.valid)
     jumps = np.cumsum(trajectory.jumped(), axis=0)
     columns = {
         "scene": np.full(len(frame), scene),
+        # Numbers of later tracks lie a whole stride higher, so none is used twice.
         "vehicle": vehicle + TRACK_STRIDE * jumps[frame, vehicle],
         "frame": frame,
         "lane": trajectory.lane()[frame, vehicle],

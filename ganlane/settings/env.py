@@ -320,7 +320,6 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
         from ganlane.sim.scenes import FixedScene
         from ganlane.sim.state import Road
 
-        # The check at the start knows no traffic yet.
         if others_visibility is None:
             others_visibility = Visibility.SIGNALLED
         return FixedScene(

@@ -109,7 +109,7 @@ class FinalEvaluationConfig(Record):
         num_envs: episodes driven side by side, at most.
     """
 
-    # teacher, shipped agent, and a lower bound for the score
+    # a rule-driven driver, the shipped agent, and a random driver for the normalised score
     agents: Names = field(default_factory=lambda: ["mobil", "agent_idm", "random_legal"])
     traffic: TrafficConfig | None = None
     episodes: Episodes = 500

@@ -84,8 +84,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise UserError(f"{path}: {kind}, where a file was to be written; give the name of a file.")
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
+        # In the same folder, since a file can be renamed atomically only within one file system.
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=_PART)
-    # In the same folder, since a file can be renamed atomically only within one file system.
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
     os.close(handle)

@@ -42,6 +42,7 @@ def render(config: RenderConfig, folder: Path) -> str:
         return f"film: {write_film(episodes[0], out, config.look, kind)}"
     if kind == "html":
         return f"player: {write_player(episodes, out, config.look)}"
+    # Films and pages cut off the beginning themselves; a table has it cut off here.
     shown = [episode.since(config.look.start_s) for episode in episodes]
     return f"tracks: {write_tracks(shown, out, kind)}"
 
@@ -50,7 +51,6 @@ def _record(
     config: RenderConfig,
     agent: str,
     number: int,
-    # Films and pages cut off the beginning themselves; a table has it cut off here.
 ) -> Trajectory:
     """Drive an episode and print how it ended."""
     driver = make_driver(agent, config.env, device=config.device)

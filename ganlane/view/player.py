@@ -158,8 +158,8 @@ def episode_data(
         ``rms_jerk``, m/s3; ``soft_crash``, the ends of the decisions with any, s. Rewards and
         action values are empty if unknown.
     """
-    # The last frame always, since it shows how the episode ended.
     t = trajectory.since(start_s)
+    # The last frame always, since it shows how the episode ended.
     samples = np.union1d(np.arange(0, len(t), stride), len(t) - 1)
     # A frame has the action and reward of the decision that led to it; the player shows those of
     # the decision that begins there, so they are taken from the next frame.

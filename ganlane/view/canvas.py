@@ -73,10 +73,16 @@ def readable_on(colour: str) -> str:
 _font = lru_cache(maxsize=16)(ImageFont.load_default)
 
 
-def ink(text: str, size: int) -> tuple[int, int]:
-    """Where a text's ink begins, and its width, pixels."""
-    left, _, right, _ = _font(size).getbbox(text)
-    return round(left), round(right - left) + 1
+# A film writes the same numbers and headings in frame after frame: without the cache it is drawn at
+# two thirds of the speed.
+@lru_cache(maxsize=4096)
+def text_mask(text: str, size: int) -> Image.Image:
+    """The text as a coverage mask (mode L), cut to its ink across, and as high as a line."""
+    letters = _font(size)
+    left, _, right, _ = letters.getbbox(text)
+    mask = Image.new("L", (max(1, round(right - left) + 1), round(size * 1.25)))
+    ImageDraw.Draw(mask).text((-left, 0), text, fill=255, font=letters)
+    return mask
 
 
 def put_text(
@@ -91,14 +97,9 @@ def put_text(
 
     ``anchor`` 0 starts there, 0.5 centres, 1 ends there.
     """
-    left, width = ink(text, size)
-    place = round(position[0] - anchor * width) - left, round(position[1])
-    ImageDraw.Draw(image).text(
-        place,
-        text,
-        colour,
-        _font(size),
-    )
+    mask = text_mask(text, size)
+    place = round(position[0] - anchor * mask.width), round(position[1])
+    image.paste(colour, place, mask)
 
 
 class Window:

@@ -319,7 +319,7 @@ class FramePainter:
             box = (ego_column - radius, row - radius, ego_column + radius, row + radius)
             draw.ellipse(box, outline=canvas.CRASH, width=3)
         text, colour = _OUTCOMES[outcome]
-        width = canvas.ink(text, 24)[1] + 40
+        width = canvas.text_mask(text, 24).width + 40
         left = (picture.width - width) // 2
         plate = (left, HEADER_HEIGHT + 6, left + width, HEADER_HEIGHT + 44)
         draw.rounded_rectangle(
@@ -348,7 +348,7 @@ def _header(
     picture = Image.new("RGB", (window.width, HEADER_HEIGHT), canvas.HEADER)
     title = f"{label.agent}  on  {label.traffic}"
     for size in _TITLE_SIZES:
-        if canvas.ink(title, size)[1] < values_at - 24:
+        if canvas.text_mask(title, size).width < values_at - 24:
             break
     put_text(
         picture,

@@ -249,10 +249,7 @@ def _sweep(
     """All combinations, each in its own folder, by Hydra's launcher; all are checked before."""
     if any(word.key_or_group == "resume" for word in overrides):
         raise UserError("resume: one run is resumed at a time; start without -m.")
-    first = None
-    for words in single_runs(overrides):
-        first = first or settings(command, words)
-        settings(command, words)
+    checked = [settings(command, words) for words in single_runs(overrides)]
     # Every combination was checked above, so what fails now is a file or a disk.
     mistakes: list[Exception] = []
     here = os.getpid()
@@ -295,7 +292,7 @@ def _sweep(
     if mistakes:
         raise mistakes[0]
     if sweep_folder:
-        _show_sweep(sweep_folder[0], getattr(first, "columns", "auto"))
+        _show_sweep(sweep_folder[0], checked[0].columns)
 
 
 def single_runs(overrides: Sequence[Override]) -> list[list[str]]:

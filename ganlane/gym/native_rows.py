@@ -1,4 +1,4 @@
-"""Rule-driven traffic for gymnasium, by the native kernel and without torch."""
+"""Highways for gymnasium by the native kernel, without torch."""
 
 # ruff: noqa: D102 - Rows has the docstrings of the methods
 from __future__ import annotations
@@ -12,6 +12,7 @@ import numpy.typing as npt
 from ganlane import keys
 from ganlane.gym.rows import Flags, Floats, Integers, Rows, observation_space
 from ganlane.native.batch import NativeBatch, Stepped
+from ganlane.native.drivers import drivers_of, pays
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.episode import EpisodeParameters, Stream
@@ -77,10 +78,12 @@ def native_rows(config: HighwayConfig) -> NativeRows | None:
     """The highways of ``config`` by the kernel; None where it does not implement them."""
     env = config.env
     observation = config.observation
+    stream = int(Stream.named(config.stream))
     # The traffic says who drives; the rest is what the kernel's observation and scenes can do.
-    drivers = config.traffic.native_parameters(env.idm, env.mobil)
+    drivers = drivers_of(config.traffic, env.idm, env.mobil, stream)
     if (
         drivers is None
+        or (env.kernel == "auto" and not pays(drivers))
         or env.kernel == "torch"
         or env.scene is not None
         or observation.form not in NATIVE_FORMS
@@ -98,11 +101,11 @@ def native_rows(config: HighwayConfig) -> NativeRows | None:
         env.spawn_parameters(),
         env.ego,
         episode,
-        *drivers,
+        drivers,
         env.recycle_share if env.recycle else None,
         observation,
         config.reward,
         config.mask,
-        int(Stream.named(config.stream)),
+        stream,
     )
     return NativeRows(batch, episode)

@@ -429,7 +429,7 @@ static inline bool find_calibrated_wishes(const Settings& s, Rows& r, const Crow
     Mask anybody = none();
     for (int i = 0; i < r.vehicles; i++) {
         Keys keys = keys_of(c, r, i);
-        Float zero = filled(0.0f), chance = 1.0f - decay(r.speed[i] * c.g->changes_per_m);
+        Float zero = filled(0.0f), chance = 1.0f - decay<1>(r.speed[i] * c.g->changes_per_m);
         Mask free = (absolute(r.y[i] - r.target[i] * s.lane_width) < ARRIVED) & (r.valid[i] != 0.0f);
         Mask comes = free & (uniform_of(keys, CHANGE_HAZARD) < chance);
         Float wish = r.memory[WISH][i];
@@ -490,7 +490,7 @@ INLINE Float inside_lane(const Settings& s, const Generated& g, const Rows& r, i
 }
 
 INLINE Float tanh_of(Float x) {
-    Float tail = decay(2.0f * x);
+    Float tail = decay<2>(x);
     return (1.0f - tail) / (1.0f + tail);
 }
 

@@ -13,7 +13,6 @@ Read in this order:
 """
 
 from ganlane.generator.checkpoint import FitResult, load_generator
-from ganlane.generator.closed_loop import headway_quantiles
 from ganlane.generator.fit import (
     HELD_OUT,
     ablate,
@@ -54,7 +53,6 @@ __all__ = [
     "assign_folds",
     "cross_validate",
     "fit_generator",
-    "headway_quantiles",
     "load_generator",
     "scene_tracks",
     "shipped_generator",

@@ -24,14 +24,13 @@ recorded scenes the headway at which IDM is in balance, where it is known
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ganlane.data import DrivingStatistics
 from ganlane.generator.networks import Generator, Observation
 from ganlane.generator.windows import (
     OBSERVED_POSITIONS,
@@ -450,14 +449,6 @@ def rollout(
         return moved
 
     return driven_positions(segments, desired_speed, move).unflatten(0, (samples, -1))
-
-
-def headway_quantiles(
-    statistics: Mapping[str, Any],
-) -> tuple[float, ...]:
-    """The 5, 25, 50, 75 and 95 % headways in s from a checkpoint's ``driving_statistics``."""
-    headway = DrivingStatistics.from_dict(statistics).headway
-    return tuple(headway.quantile(level) for level in QUANTILE_LEVELS)
 
 
 def headway_from_uniform(u: Tensor, quantiles_s: tuple[float, ...] = HEADWAY_QUANTILES_S) -> Tensor:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -90,6 +91,8 @@ class _Function:
         UserError: the road is a ring or differs from row to row, or the kernel cannot be built.
     """
 
+    _arguments: partial[_Function]
+
     def __init__(
         self,
         name: str,
@@ -98,17 +101,16 @@ class _Function:
     ) -> None:
         self._name = name
         self._numbers = numbers
-        self._variant = variant
-        # A function of ctypes cannot be pickled; __getstate__ leaves it out.
         self._call = getattr(load(variant), name)
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Without the library, which another process loads for itself."""
-        return {name: value for name, value in self.__dict__.items() if name != "_call"}
+    def __new__(cls, *arguments: Any, **named: Any) -> _Function:
+        function = super().__new__(cls)
+        function._arguments = partial(cls, *arguments, **named)
+        return function
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._call = getattr(load(self._variant), self._name)
+    def __reduce__(self) -> tuple[partial[_Function], tuple[()]]:
+        """For copies and other processes: made anew, since addresses hold in this process alone."""
+        return self._arguments, ()
 
     def _run(
         self,

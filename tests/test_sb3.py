@@ -207,7 +207,7 @@ def returns_in_the_own_loop(model, env):
 
 
 def returns_in_the_evaluation(driver, **options):
-    keys = {**BUSY, **options, "num_envs": ROWS}
+    keys = {**BUSY, "num_envs": ROWS, **options}
     table = ganlane.api.evaluate([driver], ["idm_mobil"], EPISODES, per_episode=True, **keys)
     return table.sort("episode")["reward"].to_list()
 
@@ -248,7 +248,10 @@ def test_an_evaluation_prints_the_reward_of_the_users_own_loop(
     expected = returns_in_the_own_loop(model, env)
     assert np.ptp(expected) > 1.0
     driver = ganlane.sb3.driver(model)
-    assert returns_in_the_evaluation(driver) == pytest.approx(expected, abs=1e-3)
+    # In as many rows as the loop has, and in another number of them.
+    for rows in (ROWS, 3):
+        printed = returns_in_the_evaluation(driver, num_envs=rows)
+        assert printed == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_single_environment_of_gymnasium_says_what_the_model_reads():

@@ -299,13 +299,11 @@ class ModelPolicy(TensorDictModuleBase):
         super().__init__()
         self.model = model
         self.normaliser = normaliser
-        # sb3-contrib's MaskablePPO and its kin take masks; SB3's own algorithms do not.
-        self.masked = type(model).__name__.startswith("Maskable")
         # An evaluation may move running episodes to other rows where nothing is held per row.
         self.rows_must_stay = hasattr(model.policy, "lstm_hidden_state_shape")
         self._memory: tuple[Floats, ...] | None = None
         self.in_keys = [keys.OBSERVATION]
-        if self.masked:
+        if _is_masked(model):
             self.in_keys.append(keys.ACTION_MASK)
         if self.rows_must_stay:
             self.in_keys.append(keys.EGO)
@@ -325,7 +323,7 @@ class ModelPolicy(TensorDictModuleBase):
         if self.normaliser is not None:
             observation = self.normaliser.normalize_obs(observation)
         more: dict[str, Any] = {}
-        if self.masked:
+        if _is_masked(self.model):
             more["action_masks"] = mask_in(tensordict).cpu().numpy()
         if self.rows_must_stay:
             # The ego counts its decisions, so an episode that begins is seen without its reset.
@@ -402,13 +400,7 @@ def driver(
     else:
         observation, mask, normaliser = _of_file(stored)
     policy = ModelPolicy(model, normaliser)
-    # Other algorithms drive without a mask, whatever mask their environment shows.
-    return ModelDriver(
-        name or type(model).__name__.lower(),
-        policy,
-        observation,
-        mask if policy.masked else None,
-    )
+    return ModelDriver(name or type(model).__name__.lower(), policy, observation, mask)
 
 
 def _of_environment(model: BaseAlgorithm) -> _Read:
@@ -436,10 +428,25 @@ def _of_environment(model: BaseAlgorithm) -> _Read:
             normaliser = layer
         elif not isinstance(layer, _TRANSPARENT):
             raise _not_repeatable(layer)
-    # Without a mask the environment shows which actions stay on the road. Commands during a lane
-    # change, which `legal` excludes as well, have no effect.
-    mask = settings.mask if settings.mask.form != "none" else MaskParameters("legal")
+    # Other algorithms drive without a mask, whatever mask their environment shows.
+    if not _is_masked(model):
+        return settings.observation, None, normaliser
+    mask = settings.mask
+    if mask.form == "none":
+        # The environment showed which actions stay on the road. `legal` excludes more: commands
+        # during a lane change, all of which have no effect unless a change can be turned back.
+        if settings.env.ego.abort_lane_change:
+            raise UserError(
+                f"driver(): this {type(model).__name__} was trained without a mask on lane changes "
+                "that can be turned back; train it with mask='legal' or 'safe'."
+            )
+        mask = MaskParameters("legal")
     return settings.observation, mask, normaliser
+
+
+def _is_masked(model: BaseAlgorithm) -> bool:
+    """Whether the algorithm takes masks: sb3-contrib's MaskablePPO and its kin do."""
+    return type(model).__name__.startswith("Maskable")
 
 
 def _layers(env: Any) -> Iterator[Any]:

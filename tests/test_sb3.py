@@ -279,6 +279,12 @@ def test_what_a_driver_cannot_repeat_is_refused_by_name(name, make):
         ganlane.sb3.driver(model)
 
 
+def test_a_masked_model_that_could_turn_back_without_a_mask_is_refused():
+    env = short_episodes(env={"ego": {"abort_lane_change": True}})
+    with pytest.raises(UserError, match="train it with mask='legal'"):
+        ganlane.sb3.driver(untrained(sb3_contrib.MaskablePPO, env))
+
+
 def halved():
     return ObservationNorm(0.0, 0.5, in_keys=["observation"])
 

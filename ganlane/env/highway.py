@@ -235,6 +235,10 @@ class HighwayEnv(EnvBase):
         self.reward_spec = Unbounded(shape=(n, 1), dtype=self.dtype, device=device)
         self.done_spec = done_spec(n).to(device)
 
+    def to(self, device: torch.device | str) -> HighwayEnv:
+        """On another device; raises :class:`UserError` where there is none such."""
+        return super().to(usable_device(device, self.dtype))
+
     def compile(self, **kwargs: Any) -> HighwayEnv:
         """Compile physics and traffic to several small graphs; returns the environment.
 

@@ -15,14 +15,15 @@ from ganlane.native.batch import NativeBatch, Stepped
 from ganlane.native.drivers import drivers_of, pays
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.settings.commands import HighwayConfig
-from ganlane.settings.episode import EpisodeParameters, Stream
+from ganlane.settings.episode import Stream
 
 
 class NativeRows(Rows):
     """N highways by the native kernel."""
 
-    def __init__(self, batch: NativeBatch, episode: EpisodeParameters) -> None:
-        self.batch, self.count, self.episode = batch, batch.rows, episode
+    def __init__(self, batch: NativeBatch, config: HighwayConfig) -> None:
+        self.batch, self.count, self.config = batch, batch.rows, config
+        self.episode = config.env.episode_parameters()
         self.space = observation_space(batch.observation.shape[1], batch.bounds[1])
         # Made once, since they are views of arrays that the kernel writes to.
         state = batch.state
@@ -44,11 +45,11 @@ class NativeRows(Rows):
         for name in (*events, *keys.EVENT_COUNTS):
             self._arrays[name] = state[keys.EVENTS, name]
 
-    def __getstate__(self) -> tuple[NativeBatch, EpisodeParameters, bool]:
+    def __getstate__(self) -> tuple[NativeBatch, HighwayConfig, bool]:
         """Without the views, which a copy has of its own arrays."""
-        return self.batch, self.episode, self.started
+        return self.batch, self.config, self.started
 
-    def __setstate__(self, state: tuple[NativeBatch, EpisodeParameters, bool]) -> None:
+    def __setstate__(self, state: tuple[NativeBatch, HighwayConfig, bool]) -> None:
         self.__init__(*state[:2])  # type: ignore[misc]
         self.started = state[2]
 
@@ -91,7 +92,6 @@ def native_rows(config: HighwayConfig) -> NativeRows | None:
         or config.device != "cpu"
     ):
         return None
-    episode = env.episode_parameters()
     # By position, in the order of NativeBatch's arguments.
     batch = NativeBatch(
         config.num_envs,
@@ -100,7 +100,7 @@ def native_rows(config: HighwayConfig) -> NativeRows | None:
         env.vehicles,
         env.spawn_parameters(),
         env.ego,
-        episode,
+        env.episode_parameters(),
         drivers,
         env.recycle_share if env.recycle else None,
         observation,
@@ -108,4 +108,4 @@ def native_rows(config: HighwayConfig) -> NativeRows | None:
         config.mask,
         stream,
     )
-    return NativeRows(batch, episode)
+    return NativeRows(batch, config)

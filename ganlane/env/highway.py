@@ -258,6 +258,11 @@ class HighwayEnv(EnvBase):
         self.traffic.compile_graphs()
         return self
 
+    @property
+    def runs_graphs(self) -> bool:
+        """Whether a step runs compiled graphs: not where the kernel drives."""
+        return self.physics.compiled and self.kernel is None
+
     def _set_seed(self, seed: int | None) -> None:
         self._seed = 0 if seed is None else seed_number(seed)
 

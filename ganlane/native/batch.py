@@ -18,7 +18,7 @@ import numpy.typing as npt
 from ganlane import keys
 from ganlane.native import settings
 from ganlane.native.drivers import Drivers, RuleDrivers, generated_of
-from ganlane.native.library import addresses, in_threads, load
+from ganlane.native.library import BLOCK, ROWS_PER_THREAD, addresses, in_threads, load
 from ganlane.native.settings import Key, Layout, fields
 from ganlane.settings.driving import EgoParameters, Visibility
 from ganlane.settings.episode import EpisodeParameters, SpawnParameters
@@ -246,7 +246,8 @@ class NativeBatch:
     def _in_threads(self, function: Callable[..., int]) -> None:
         batch = self._address
         # Rows are independent, so any split between threads gives the same numbers.
-        in_threads(self.rows, lambda first, last: function(batch, first, last))
+        rows_per_thread = ROWS_PER_THREAD if self._generated is None else BLOCK
+        in_threads(self.rows, lambda first, last: function(batch, first, last), rows_per_thread)
 
     def reward_terms(self) -> dict[str, npt.NDArray[np.float32]]:
         """The terms of the last reward by name, each [N]."""

@@ -18,7 +18,7 @@ from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.native import settings
 from ganlane.native.drivers import Drivers, RuleDrivers, generated_of
-from ganlane.native.library import addresses, in_threads, load
+from ganlane.native.library import BLOCK, ROWS_PER_THREAD, addresses, in_threads, load
 from ganlane.native.settings import Key, Layout
 from ganlane.settings.driving import (
     EgoParameters,
@@ -92,6 +92,8 @@ class _Function:
     """
 
     _arguments: partial[_Function]
+    #: Rows from which on a further thread pays.
+    rows_per_thread = ROWS_PER_THREAD
 
     def __init__(
         self,
@@ -122,7 +124,9 @@ class _Function:
         read = [tensor if tensor is None else tensor.contiguous() for tensor in inputs]
         pointers = (ctypes.byref(self._numbers), addresses(read), addresses(outputs))
         # ctypes releases Python's lock during a call, so threads run side by side.
-        in_threads(rows, lambda first, last: self._call(*pointers, first, last))
+        in_threads(
+            rows, lambda first, last: self._call(*pointers, first, last), self.rows_per_thread
+        )
 
 
 class Kernel(_Function):
@@ -151,6 +155,8 @@ class Kernel(_Function):
         self.layout = Layout(drivers.memory())
         # Held here, since the settings have its address alone.
         self._generated = generated_of(drivers)
+        if self._generated is not None:
+            self.rows_per_thread = BLOCK
         self._dtypes = {name: getattr(torch, kind) for name, kind in self.layout.kinds.items()}
         numbers = settings.settings_of(
             *_shape(road, vehicles),

@@ -64,8 +64,8 @@ def run_episodes(
         episodes: their numbers.
         on_progress: called now and then with (episodes finished, episodes in all).
         make_smaller: makes ``env`` with fewer rows; the last episodes move there when at most
-            :data:`LARGEST_SHARE` of the rows are still driving. Not used where physics are compiled
-            graphs, which are of one batch size, nor where something is held per row: by traffic with
+            :data:`LARGEST_SHARE` of the rows are still driving. Not used where physics are graphs,
+            which are of one batch size, nor where something is held per row: by traffic with
             ``rows_must_stay``, and by every policy without ``rows_must_stay = False``.
         actions: whether to return the column ``actions``, too.
 

@@ -489,7 +489,7 @@ class HighwayEnv(EnvBase):
         reason = None
         if drivers is None:
             name = type(self.traffic).__name__
-            reason = f"drives idm, idm_mobil, gan and gan_calibrated alone, not {name}"
+            reason = f"drives the shipped traffics that are one model, not {name}"
         elif wanted == "auto" and not pays(drivers):
             reason = "is slow with generated traffic on a processor without FMA"
         elif self.device.type != "cpu" or self.dtype != torch.float32:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from ganlane import keys
 from ganlane.native import settings
-from ganlane.native.drivers import Drivers, RuleDrivers, generated_of
+from ganlane.native.drivers import Drivers, GeneratedDrivers, RuleDrivers, decision_settings
 from ganlane.native.library import BLOCK, ROWS_PER_THREAD, addresses, in_threads, load
 from ganlane.native.settings import Key, Layout, fields
 from ganlane.settings.driving import EgoParameters, Visibility
@@ -155,17 +155,9 @@ class NativeBatch:
         self._library = load(variant)
         # When others see the ego's lane changes, and the ego theirs.
         visible = (Visibility.named(ego.visibility), drivers.visibility)
-        self._generated = generated_of(drivers)
+        self._rows_per_thread = BLOCK if isinstance(drivers, GeneratedDrivers) else ROWS_PER_THREAD
         # The kernel's structures, filled once.
-        decision = settings.settings_of(
-            *road,
-            episode,
-            ego,
-            drivers.idm,
-            drivers.steering,
-            drivers.mobil,
-            self._generated,
-        )
+        decision = decision_settings(road, episode, ego, drivers)
         deceleration = mask.safe_deceleration
         abort = ego.abort_lane_change
         # Referred to by this object, since the structure holds no more than their addresses.
@@ -246,8 +238,9 @@ class NativeBatch:
     def _in_threads(self, function: Callable[..., int]) -> None:
         batch = self._address
         # Rows are independent, so any split between threads gives the same numbers.
-        rows_per_thread = ROWS_PER_THREAD if self._generated is None else BLOCK
-        in_threads(self.rows, lambda first, last: function(batch, first, last), rows_per_thread)
+        in_threads(
+            self.rows, lambda first, last: function(batch, first, last), self._rows_per_thread
+        )
 
     def reward_terms(self) -> dict[str, npt.NDArray[np.float32]]:
         """The terms of the last reward by name, each [N]."""

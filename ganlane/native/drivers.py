@@ -9,7 +9,7 @@ import ctypes
 import math
 import platform
 from collections.abc import Mapping
-from ctypes import c_float, c_int32, c_int64, c_void_p
+from ctypes import c_float, c_int32, c_void_p
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, TypeAlias
@@ -20,13 +20,25 @@ import numpy.typing as npt
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.native.library import best_variant
-from ganlane.native.settings import STEERING, Key, MemoryArrays, fields
+from ganlane.native.settings import (
+    STEERING,
+    Key,
+    MemoryArrays,
+    Range,
+    Settings,
+    fields,
+    settings_of,
+)
 from ganlane.settings.driving import (
+    DriverFaults,
+    EgoParameters,
     IdmParameters,
     MobilParameters,
+    RandomDrivers,
     SteeringParameters,
     Visibility,
 )
+from ganlane.settings.episode import EpisodeParameters
 from ganlane.settings.generated import (
     ANCHOR,
     QUANTILE_LEVELS,
@@ -42,10 +54,13 @@ from ganlane.settings.generator import (
     shipped_generator,
     stored_sizes,
 )
+from ganlane.settings.record import part_of
 from ganlane.settings.traffic import (
     GanCalibratedTrafficConfig,
     GanTrafficConfig,
+    IdmFaultsTrafficConfig,
     IdmMobilTrafficConfig,
+    IdmRandomTrafficConfig,
     IdmTrafficConfig,
     TrafficConfig,
 )
@@ -55,6 +70,10 @@ if TYPE_CHECKING:
     from ganlane.data.statistics import DrivingStatistics
 
 Weights: TypeAlias = Mapping[str, npt.NDArray[np.float32]]
+#: Parameters of a random driver in its memory.
+_TRAITS: Final = 11
+#: The kernel's drivers carry at most so many numbers each, those of the delay included.
+_MOST_STEPS: Final = 36
 #: Layers of the kernel have a multiple of this many outputs.
 _WIDEST: Final = 16
 #: Correlation time of a driver's latent vector in the paper's traffic, s.
@@ -74,17 +93,46 @@ WISH_PER_CHANGE = 1.8
 
 
 class RuleDrivers(NamedTuple):
-    """Rule-driven drivers; ``mobil=None``: they keep their lanes."""
+    """Rule-driven drivers.
+
+    ``mobil=None``: they keep their lanes. With ``faults`` they make mistakes; with ``random``
+    ranges no two are alike.
+    """
 
     idm: IdmParameters = IdmParameters()
     steering: SteeringParameters = SteeringParameters()
     mobil: MobilParameters | None = None
+    faults: DriverFaults | None = None
+    random: RandomDrivers | None = None
+    stream: int = 0
     #: When others see a lane change.
     visibility: Visibility = Visibility.SIGNALLED
 
     def memory(self) -> MemoryArrays:
-        """Their steering angles."""
-        return {STEERING: ("float32", ())}
+        """Their memory in the order of faults.hpp or random_drivers.hpp, after the steering."""
+        if self.faults is not None:
+            delay = _steps(self.faults.late_reaction.delay_s)
+            return {
+                _memory("base", "steering"): ("float32", ()),
+                _memory("late_reaction", "past"): ("float32", (delay,)),
+                _memory("late_reaction", "left"): ("int64", ()),
+                _memory("phantom_braking", "left"): ("int64", ()),
+                _memory("hesitant_change", "hesitant"): ("bool", ()),
+                _memory("aborted_change", "origin"): ("int64", ()),
+            }
+        arrays: MemoryArrays = {STEERING: ("float32", ())}
+        if self.random is not None:
+            arrays[_memory("traits")] = ("float32", (_TRAITS,))
+            delay = _steps(self.random.reaction_s[1])
+            if delay:
+                arrays[_memory("past")] = ("float32", (delay,))
+        return arrays
+
+    def structures(self) -> dict[str, ctypes.Structure]:
+        """Further structures, by their names in :class:`~ganlane.native.settings.Settings`."""
+        if self.faults is not None:
+            return {"faults": _faults_of(self.faults)}
+        return {} if self.random is None else {"random": _random_of(self.random)}
 
 
 @dataclass(frozen=True)
@@ -130,10 +178,7 @@ class GeneratedDrivers:
     def memory(self) -> MemoryArrays:
         """Their memory in the order of generated.hpp."""
         sizes = self.sizes
-        arrays: MemoryArrays = {
-            _memory("generator", "displacement"): ("float32", (2,)),
-            _memory("generator", "noise"): ("float32", (sizes.noise,)),
-        }
+        arrays: MemoryArrays = {}
         if self.anchor is None:
             arrays[_memory("acceleration", "acceleration")] = ("float32", ())
             arrays[_memory("acceleration", "left")] = ("int64", ())
@@ -144,16 +189,97 @@ class GeneratedDrivers:
             arrays[_memory("generator", "headway")] = ("float32", ())
             arrays[_memory("lane_change", "wish")] = ("int64", ())
             arrays[_memory("lane_change", "waited")] = ("int64", ())
+        arrays[_memory("generator", "displacement")] = ("float32", (2,))
+        arrays[_memory("generator", "noise")] = ("float32", (sizes.noise,))
         for index in range(sizes.observed - 1):
             arrays[_memory("generator", f"motion_{index}")] = ("float32", (4 * sizes.hidden,))
         return arrays
+
+    def structures(self) -> dict[str, ctypes.Structure]:
+        """As of :class:`RuleDrivers`."""
+        return {"generated": _generated_of(self)}
 
 
 Drivers: TypeAlias = RuleDrivers | GeneratedDrivers
 
 
-def _memory(part: str, name: str) -> Key:
-    return (keys.TRAFFIC, part, name)
+def _memory(*names: str) -> Key:
+    return (keys.TRAFFIC, *names)
+
+
+def _steps(seconds: float) -> int:
+    return round(seconds / keys.PHYSICS_STEP_S)
+
+
+def decision_settings(
+    shape: tuple[int, float, int],
+    episode: EpisodeParameters | None,
+    ego: EgoParameters | None,
+    drivers: Drivers,
+) -> Settings:
+    """The numbers of a decision; ``shape`` is lanes, their width in m, and M."""
+    return settings_of(
+        *shape,
+        episode,
+        ego,
+        drivers.idm,
+        drivers.steering,
+        drivers.mobil,
+        drivers.stream,
+        drivers.structures(),
+    )
+
+
+class _Faults(ctypes.Structure):
+    """``Faults`` of faults.hpp."""
+
+    _fields_ = [
+        *fields(
+            c_float,
+            "braking_chance braking_steps deceleration lapse_chance lapse_steps"
+            " hesitation_share pace abort_share abort_at",
+        ),
+        *fields(c_int32, "delay_steps"),
+    ]
+
+
+def _faults_of(faults: DriverFaults) -> _Faults:
+    braking, late = faults.phantom_braking, faults.late_reaction
+    return _Faults(
+        braking_chance=_chance(braking.per_hour),
+        braking_steps=_steps(braking.lasts_s),
+        deceleration=braking.deceleration,
+        lapse_chance=_chance(late.per_hour),
+        lapse_steps=_steps(late.lasts_s),
+        hesitation_share=faults.hesitant_change.share,
+        pace=faults.hesitant_change.pace,
+        abort_share=faults.aborted_change.share,
+        abort_at=faults.aborted_change.at,
+        delay_steps=_steps(late.delay_s),
+    )
+
+
+def _chance(per_hour: float) -> float:
+    """Of at least one event of a Poisson process within a step."""
+    return -math.expm1(-per_hour * keys.PHYSICS_STEP_S / 3600.0)
+
+
+class _Random(ctypes.Structure):
+    """``Random`` of random_drivers.hpp."""
+
+    _fields_ = [
+        *fields(
+            Range,
+            "headway_s max_acceleration comfortable_deceleration strongest_braking politeness"
+            " reaction_s sway_m sway_period_s desired_speed",
+        ),
+        *fields(c_int32, "delay_steps"),
+    ]
+
+
+def _random_of(drivers: RandomDrivers) -> _Random:
+    ranges = {name: Range(low, high - low) for name, (low, high) in vars(drivers).items()}
+    return _Random(**ranges, delay_steps=_steps(drivers.reaction_s[1]))
 
 
 class Network(ctypes.Structure):
@@ -174,7 +300,6 @@ class Generated(ctypes.Structure):
 
     _fields_ = [
         *fields(Network, "network"),
-        *fields(c_int64, "stream"),
         *fields(c_float, "noise_share noise_fresh noise_scale"),
         *fields(c_int32, "calibrated guard"),
         *fields(
@@ -194,10 +319,7 @@ class Generated(ctypes.Structure):
     packed: npt.NDArray[np.float32]
 
 
-def generated_of(drivers: Drivers) -> Generated | None:
-    """The numbers of generated drivers; None for others."""
-    if not isinstance(drivers, GeneratedDrivers):
-        return None
+def _generated_of(drivers: GeneratedDrivers) -> Generated:
     dt = keys.PHYSICS_STEP_S
     guard = drivers.guard or GuardParameters()
     anchor = drivers.anchor or ANCHOR
@@ -209,7 +331,6 @@ def generated_of(drivers: Drivers) -> Generated | None:
     numbers |= vars(guard)
     numbers |= {
         "network": _network_of(drivers),
-        "stream": drivers.stream,
         "noise_share": share,
         "noise_fresh": math.sqrt(1.0 - share * share),
         "noise_scale": drivers.noise_scale,
@@ -437,6 +558,13 @@ def pays(drivers: Drivers) -> bool:
     return isinstance(drivers, RuleDrivers) or not x86 or best_variant() != "default"
 
 
+def faulty_drivers(drivers: RuleDrivers, faults: DriverFaults, stream: int) -> RuleDrivers | None:
+    """``drivers`` with ``faults``; None where they react later than the kernel can remember."""
+    if _steps(faults.late_reaction.delay_s) > _MOST_STEPS:
+        return None
+    return drivers._replace(faults=faults, stream=stream)
+
+
 def drivers_of(
     traffic: TrafficConfig, idm: IdmParameters, mobil: MobilParameters, stream: int
 ) -> Drivers | None:
@@ -453,6 +581,11 @@ def drivers_of(
         return RuleDrivers(idm)
     if type(traffic) is IdmMobilTrafficConfig:
         return RuleDrivers(idm, mobil=mobil)
+    if type(traffic) is IdmFaultsTrafficConfig:
+        return faulty_drivers(RuleDrivers(idm, mobil=mobil), part_of(traffic, DriverFaults), stream)
+    if type(traffic) is IdmRandomTrafficConfig:
+        random = part_of(traffic, RandomDrivers)
+        return RuleDrivers(idm, mobil=mobil, random=random, stream=stream)
     if type(traffic) is GanTrafficConfig and traffic.execute_k == 1:
         return paper_drivers(*_weights(traffic.path, "paper"), traffic, idm, stream)
     if type(traffic) is GanCalibratedTrafficConfig:

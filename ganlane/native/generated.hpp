@@ -10,12 +10,10 @@
 
 #include "arrays.hpp"
 #include "network.hpp"
-#include "random.hpp"
-#include "rows.hpp"
+#include "memory.hpp"
 
 struct Generated {
     Network network;
-    int64_t stream;
     float noise_share, noise_fresh, noise_scale;
     int32_t calibrated, guard;
     // paper's: sudden accelerations, lane changes, the guard
@@ -32,23 +30,18 @@ struct Generated {
 
 const float HEADWAY_LEVELS[5] = {0.05f, 0.25f, 0.5f, 0.75f, 0.95f};
 const float STEEPEST = 0.3f, MARGIN = 0.1f, FADE = 0.3f;
-// Places in the memory of a row's driver, and which of them are integers in the state.
+// Places in the memory of a row's driver.
 enum { SUDDEN, SUDDEN_LEFT, CLOCK, LATERAL_SPEED };
 enum { MEAN_ALONG, MEAN_ACROSS, HEADWAY, WISH, WAITED };
-const int ARRAYS = 4;
-struct Field {
-    int first, numbers;
-    bool integer;
-};
-const Field PAPER_FIELDS[ARRAYS] = {{SUDDEN, 1, false}, {SUDDEN_LEFT, 1, true}, {CLOCK, 1, true}, {LATERAL_SPEED, 1, false}};
-const Field CALIBRATED_FIELDS[ARRAYS] = {{MEAN_ALONG, 2, false}, {HEADWAY, 1, false}, {WISH, 1, true}, {WAITED, 1, true}};
 
-// The drivers' memory in the state, [rows, vehicles, ...]: behind Inputs and Outputs in the list of arrays.
+// The network's memory in the state, [rows, vehicles, ...]: behind the arrays of the drivers' other numbers.
 struct Memory {
     float *displacement, *noise;
-    void* fields[ARRAYS];
     float* motions[1];  // as many as the network has
 };
+
+const Fields PAPER = {4, {{SUDDEN, 1, FLOAT}, {SUDDEN_LEFT, 1, INTEGER}, {CLOCK, 1, INTEGER}, {LATERAL_SPEED, 1, FLOAT}}};
+const Fields CALIBRATED = {4, {{MEAN_ALONG, 2, FLOAT}, {HEADWAY, 1, FLOAT}, {WISH, 1, INTEGER}, {WAITED, 1, INTEGER}}};
 
 // ---- The drivers of a block of environments
 
@@ -56,14 +49,12 @@ struct Crowd {
     const Generated* g;
     Layers layers;
     Activations work;
-    const Field* fields;
     int environments, vehicles;
     // [vehicles, environments] each with its numbers; `displacement` is that of the step before until `look`.
     float *position, *displacement, *difference, *extra, *noise, *scaled, *first_uniform, *second_uniform;
     float** motions;  // oldest first
     uint8_t* valid;
-    uint64_t episode_key[LANES], step_key[LANES];
-    int64_t start_step[LANES];  // physics steps at the start of the decision
+    uint64_t* step_key;  // of the rows
 };
 
 static inline size_t room_for(size_t floats) { return (floats + WIDEST - 1) / WIDEST * WIDEST; }
@@ -86,7 +77,6 @@ static Crowd crowd_in(float* memory, const Generated* g, int vehicles) {
     };
     Crowd c;
     c.g = g, c.layers = layers_of(n), c.vehicles = vehicles;
-    c.fields = g->calibrated ? CALIBRATED_FIELDS : PAPER_FIELDS;
     c.position = room(2 * rows), c.displacement = room(2 * rows), c.difference = room(2 * rows);
     c.extra = room(n.extra_inputs * rows), c.noise = room(n.noise * rows), c.scaled = room(n.noise * rows);
     c.first_uniform = room(n.noise * rows), c.second_uniform = room(n.noise * rows);
@@ -96,8 +86,6 @@ static Crowd crowd_in(float* memory, const Generated* g, int vehicles) {
     return c;
 }
 
-// One row's number of a vehicle: a vector seen as the array that it is.
-INLINE float& at(Float* field, int i, int lane) { return ((float*)(field + i))[lane]; }
 // Of vehicle i of the road's order, the row of the network.
 INLINE int row_of(const Crowd& c, const Rows& r, int i, int lane) { return (int)at(r.index, i, lane) * c.environments + lane; }
 
@@ -107,49 +95,24 @@ INLINE void copy_gates(int hidden, float* to, int to_width, const float* from, i
         __builtin_memcpy(to + gate * to_width, from + gate * from_width, hidden * sizeof(float));
 }
 
-static void load_memory(Crowd& c, Rows& r, const Memory& m, long first) {
+static void load_memory(Crowd& c, const Memory& m, long first) {
     const Network& n = c.g->network;
     int width = padded(n.hidden);
-    for (int lane = 0; lane < LANES; lane++) {
-        int environment = lane < c.environments ? lane : c.environments - 1;
-        long start = (first + environment) * c.vehicles;
-        for (int i = 0; i < c.vehicles; i++) {
-            long from = start + (long)at(r.index, i, lane);
-            for (int k = 0; k < ARRAYS; k++) {
-                const Field& f = c.fields[k];
-                for (int j = 0; j < f.numbers; j++)
-                    at(r.memory[f.first + j], i, lane) = f.integer ? (float)((const int64_t*)m.fields[k])[from]
-                                                                   : ((const float*)m.fields[k])[from * f.numbers + j];
-            }
-        }
-        if (lane >= c.environments) continue;
+    for (int environment = 0; environment < c.environments; environment++)
         for (int v = 0; v < c.vehicles; v++) {
-            long from = start + v, to = (long)v * c.environments + lane;
+            long from = (first + environment) * c.vehicles + v, to = (long)v * c.environments + environment;
             for (int k = 0; k < 2; k++) c.displacement[2 * to + k] = m.displacement[2 * from + k];
             for (int k = 0; k < n.noise; k++) c.noise[to * n.noise + k] = m.noise[from * n.noise + k];
             for (int t = 0; t < n.motions; t++)
                 copy_gates(n.hidden, c.motions[t] + to * 4 * width, width, m.motions[t] + from * 4 * n.hidden, n.hidden);
         }
-    }
 }
 
-static void store_memory(const Crowd& c, Rows& r, const Memory& m, long row, int lane) {
+static void store_memory(const Crowd& c, const Memory& m, long row, int environment) {
     const Network& n = c.g->network;
     int width = padded(n.hidden);
-    long start = row * c.vehicles;
-    for (int i = 0; i < c.vehicles; i++) {
-        long to = start + (long)at(r.index, i, lane);
-        for (int k = 0; k < ARRAYS; k++) {
-            const Field& f = c.fields[k];
-            for (int j = 0; j < f.numbers; j++) {
-                float number = at(r.memory[f.first + j], i, lane);
-                if (f.integer) ((int64_t*)m.fields[k])[to] = (int64_t)number;
-                else ((float*)m.fields[k])[to * f.numbers + j] = number;
-            }
-        }
-    }
     for (int v = 0; v < c.vehicles; v++) {
-        long to = start + v, from = (long)v * c.environments + lane;
+        long to = row * c.vehicles + v, from = (long)v * c.environments + environment;
         for (int k = 0; k < 2; k++) m.displacement[2 * to + k] = c.displacement[2 * from + k];
         for (int k = 0; k < n.noise; k++) m.noise[to * n.noise + k] = c.noise[from * n.noise + k];
         for (int t = 0; t < n.motions; t++)
@@ -158,39 +121,6 @@ static void store_memory(const Crowd& c, Rows& r, const Memory& m, long row, int
 }
 
 // ---- Random numbers
-
-// The key of vehicle i (in the order of the road) at this step, of every row.
-struct Keys {
-    uint64_t key[LANES];
-};
-
-INLINE Keys keys_of(const Crowd& c, const Rows& r, int i) {
-    Keys k;
-    for (int lane = 0; lane < LANES; lane++) k.key[lane] = absorb(c.step_key[lane], (int64_t)at(r.index, i, lane));
-    return k;
-}
-
-INLINE Float uniform_of(const Keys& keys, int purpose) {
-    Float u;
-    for (int lane = 0; lane < LANES; lane++) u[lane] = uniform_of(absorb(keys.key[lane], purpose));
-    return u;
-}
-
-// Box and Muller's transform of two uniform numbers.
-INLINE Float normal_of(Float u, Float angle) {
-    Float sine, cosine;
-    sincos_of(6.283185307179586f * angle, sine, cosine);
-    return root(-2.0f * logarithm(1.0f - u)) * cosine;
-}
-
-static Float normal_of(const Keys& keys, int purpose) {
-    Float u, angle;
-    for (int lane = 0; lane < LANES; lane++) {
-        uint64_t key = absorb(keys.key[lane], purpose);
-        u[lane] = uniform_of(absorb(key, 1)), angle[lane] = uniform_of(absorb(key, 2));
-    }
-    return normal_of(u, angle);
-}
 
 // Standard normal numbers [rows, noise] of the step keys into `noise`: noise = share * noise + fresh * number.
 static void draw_noise(Crowd& c, float share, float fresh) {
@@ -283,12 +213,8 @@ INLINE void place(const Settings& s, Rows& r, int i, const Moved& moved) {
     r.acceleration[i] = choose(on, moved.acceleration, r.acceleration[i]);
     if (!any(r.running & ~on)) return;
     Mover ego = mover(r, i);
-    steer_and_move(s, ego, r.target[i], r.following[i], r.running & ~on);
+    steer_and_move(s, ego, r.target[i] * s.lane_width, r.following[i], r.running & ~on);
     put(r, i, ego);
-}
-
-INLINE void remember(Rows& r, int i, int field, Float number) {
-    r.memory[field][i] = choose(r.running, number, r.memory[field][i]);
 }
 
 // A random side with a lane: both where there are two, by the uniform number (overlays.random_side).
@@ -305,7 +231,7 @@ static inline bool change_lanes_blindly(const Settings& s, Rows& r, const Crowd&
     const Generated& g = *c.g;
     Mask anybody = none();
     for (int i = 0; i < r.vehicles; i++) {
-        Keys keys = keys_of(c, r, i);
+        Keys keys = keys_of(r, i);
         Float hazard = between(r.memory[CLOCK][i] / filled(g.mean_steps), 0.0f, 1.0f), zero = filled(0.0f);
         Mask starts = (r.memory[LATERAL_SPEED][i] == 0.0f) & (r.valid[i] != 0.0f) & (uniform_of(keys, CHANGE_HAZARD) < hazard);
         r.wish[i] = zero, r.kept[i] = absolute(r.memory[LATERAL_SPEED][i]);
@@ -321,18 +247,14 @@ static inline bool change_lanes_blindly(const Settings& s, Rows& r, const Crowd&
 // The guard's bounds: IDM at a short headway, and IDM less some slack, both behind whoever is in the lanes that are
 // attended to, with the lane changed to.
 static inline void find_bounds(const Settings& s, const Generated& g, Rows& r) {
-    Settings close = s;
-    close.headway = g.guard_headway_s;
+    Idm usual = common(s), close = usual;
+    close.headway = filled(g.guard_headway_s);
     nobody_met(s, r, NOBODY_M);
     for (int i = 0; i < r.vehicles; i++) {
-        Float speed = r.speed[i], strongest = filled(0.0f), strongest_close = filled(0.0f);
-        look_ahead(s, r, i, [&](Float gap, Float leader, Mask here) __attribute__((always_inline)) {
-            strongest = choose(here, larger(strongest, interaction(s, speed, gap, leader)), strongest);
-            strongest_close = choose(here, larger(strongest_close, interaction(close, speed, gap, leader)), strongest_close);
-        });
-        Float free = free_road(speed, r.per_desired[i]), hardest = filled(g.hardest_braking);
-        r.highest[i] = larger(limited(close, free, strongest_close), hardest);
-        r.lowest[i] = larger(limited(s, free, strongest) - g.slack * speed * r.per_desired[i], hardest);
+        Float speed = r.speed[i], free = free_road(speed, r.per_desired[i]), hardest = filled(g.hardest_braking);
+        r.highest[i] = larger(limited(close, free, strongest_ahead(s, r, i, close)), hardest);
+        Float lowest = limited(usual, free, strongest_ahead(s, r, i, usual)) - g.slack * speed * r.per_desired[i];
+        r.lowest[i] = larger(lowest, hardest);
         meet_from_front(s, r, i);
     }
 }
@@ -366,7 +288,7 @@ static inline void drive_paper(const Settings& s, Rows& r, Crowd& c) {
     }
     if (g.guard) find_bounds(s, g, r);
     for (int i = 0; i < r.vehicles; i++) {
-        Keys keys = keys_of(c, r, i);
+        Keys keys = keys_of(r, i);
         Float zero = filled(0.0f), length = r.speed[i] * PHYSICS_STEP;
         Float along = length * r.cosine[i] + DIFFERENCE_ALONG * r.along[i];
         Float across = length * r.sine[i] + DIFFERENCE_ACROSS * r.across[i];
@@ -404,13 +326,12 @@ static inline void find_anchor(const Settings& s, Rows& r, Crowd& c) {
     Settings own = s;
     own.min_gap = g.min_gap_m, own.per_brake_scale = g.per_brake_scale;
     own.min_acceleration = g.min_acceleration, own.max_acceleration = g.max_acceleration;
+    Idm p = common(own);
     nobody_met(s, r, NOBODY_M);
     for (int i = 0; i < r.vehicles; i++) {
-        Float speed = r.speed[i], strongest = filled(0.0f), headway = r.memory[HEADWAY][i];
-        look_ahead(s, r, i, [&](Float gap, Float leader, Mask here) __attribute__((always_inline)) {
-            strongest = choose(here, larger(strongest, interaction(own, speed, gap, leader, headway)), strongest);
-        });
-        r.lowest[i] = limited(own, free_road(speed, r.per_desired[i]), strongest);
+        Float speed = r.speed[i];
+        p.headway = r.memory[HEADWAY][i];
+        r.lowest[i] = limited(p, free_road(speed, r.per_desired[i]), strongest_ahead(own, r, i, p));
         Nearest n = nearest_in(s, r, r.target[i], nobody_at(NOBODY_M, speed));
         Float ahead = gap_ahead(r, i, n.x, n.half_length), gap = larger(ahead, filled(0.0f));
         Float closing = (speed - choose(ahead < FREE_GAP, n.speed, speed)) / 5.0f;
@@ -428,7 +349,7 @@ static inline void find_anchor(const Settings& s, Rows& r, Crowd& c) {
 static inline bool find_calibrated_wishes(const Settings& s, Rows& r, const Crowd& c) {
     Mask anybody = none();
     for (int i = 0; i < r.vehicles; i++) {
-        Keys keys = keys_of(c, r, i);
+        Keys keys = keys_of(r, i);
         Float zero = filled(0.0f), chance = 1.0f - decay<1>(r.speed[i] * c.g->changes_per_m);
         Mask free = (absolute(r.y[i] - r.target[i] * s.lane_width) < ARRIVED) & (r.valid[i] != 0.0f);
         Mask comes = free & (uniform_of(keys, CHANGE_HAZARD) < chance);
@@ -458,19 +379,20 @@ INLINE Mask contested(const Settings& s, const Rows& r, int i, Float lane) {
 // The side that each driver changes to now, in r.kept, and what is left of its wish.
 static inline void begin_calibrated_changes(const Settings& s, Rows& r, const Crowd& c) {
     Float zero = filled(0.0f);
+    Alike alike = {common(s)};
     if (find_calibrated_wishes(s, r, c)) {
         for (int i = 0; i < r.vehicles; i++) r.along[i] = r.wish[i];  // the network has been heard
         find_neighbours(s, r);
         for (int i = 0; i < r.vehicles; i++) {
             Float wish = r.wish[i];
             if (!any(wish != 0.0f)) continue;
-            Prospect left = prospect(s, r, i, 1), right = prospect(s, r, i, 2);
+            Prospect left = prospect(s, r, i, 1, alike.idm), right = prospect(s, r, i, 2, alike.idm);
             Float own = choose(wish > 0.0f, left.own, right.own);
             Float behind = choose(wish > 0.0f, left.with_it, right.with_it);
             Mask safe = smaller(behind, own) >= -s.safe_deceleration;
             r.wish[i] = choose(safe & ~contested(s, r, i, r.target[i] + wish), wish, zero);
         }
-        one_at_a_time(s, r);
+        one_at_a_time(s, r, alike);
     } else {
         for (int i = 0; i < r.vehicles; i++) r.along[i] = r.kept[i] = zero;
     }
@@ -521,8 +443,8 @@ static inline void drive_calibrated(const Settings& s, Rows& r, Crowd& c) {
 }
 
 // One physics step of everybody.
-static inline void drive_generated(const Settings& s, Rows& r, Crowd& c, int substep) {
-    for (int lane = 0; lane < LANES; lane++) c.step_key[lane] = absorb(c.episode_key[lane], c.start_step[lane] + substep);
+static inline void drive_generated(const Settings& s, Rows& r, Crowd& c) {
+    c.step_key = r.step_key;
     look(r, c);
     if (c.g->calibrated) drive_calibrated(s, r, c);
     else drive_paper(s, r, c);
@@ -530,11 +452,11 @@ static inline void drive_generated(const Settings& s, Rows& r, Crowd& c, int sub
 
 // ---- The memory of drivers that enter: they have always driven straight on at their present speed
 
-static void enter(Crowd& c, const Memory& m, long row, uint64_t key, const float* speed) {
+static void enter(Crowd& c, void* const* arrays, long row, uint64_t before_first_step, const float* speed) {
     const Network& n = c.g->network;
+    const Memory& m = *(const Memory*)(arrays + (c.g->calibrated ? CALIBRATED.arrays : PAPER.arrays));
     c.environments = 1;
-    uint64_t at_start = absorb(key, 0);
-    for (int lane = 0; lane < LANES; lane++) c.step_key[lane] = absorb(at_start, -1);
+    c.step_key = &before_first_step;
     for (int v = 0; v < c.vehicles; v++) {
         c.displacement[2 * v] = speed[row * c.vehicles + v] * PHYSICS_STEP, c.displacement[2 * v + 1] = 0.0f;
         c.difference[2 * v] = c.difference[2 * v + 1] = 0.0f;
@@ -550,20 +472,21 @@ static void enter(Crowd& c, const Memory& m, long row, uint64_t key, const float
         for (int k = 0; k < n.noise; k++) m.noise[to * n.noise + k] = c.noise[v * n.noise + k];
         for (int t = 0; t < n.motions; t++)
             copy_gates(n.hidden, m.motions[t] + to * 4 * n.hidden, n.hidden, c.motions[0] + (size_t)v * 4 * width, width);
-        for (int k = 0; k < ARRAYS; k++) {
-            const Field& f = c.fields[k];
-            if (f.integer) ((int64_t*)m.fields[k])[to] = 0;
+        const Fields& fields = c.g->calibrated ? CALIBRATED : PAPER;
+        for (int k = 0; k < fields.arrays; k++) {
+            const Field& f = fields.field[k];
+            if (f.kind == INTEGER) ((int64_t*)arrays[k])[to] = 0;
             else
-                for (int j = 0; j < f.numbers; j++) ((float*)m.fields[k])[to * f.numbers + j] = 0.0f;
+                for (int j = 0; j < f.numbers; j++) ((float*)arrays[k])[to * f.numbers + j] = 0.0f;
         }
         if (!c.g->calibrated) continue;
         // Linear between the recorded quantiles of headways, flat beyond the outer ones.
-        float u = uniform_of(absorb(absorb(c.step_key[0], v), OWN_HEADWAY));
+        float u = uniform_of(absorb(absorb(before_first_step, v), OWN_HEADWAY));
         int upper = 1;
         while (upper < 4 && HEADWAY_LEVELS[upper] < u) upper++;
         float low = HEADWAY_LEVELS[upper - 1], part = (u - low) / (HEADWAY_LEVELS[upper] - low);
         part = part < 0.0f ? 0.0f : part > 1.0f ? 1.0f : part;
         float from = c.g->headways_s[upper - 1];
-        ((float*)m.fields[1])[to] = from + part * (c.g->headways_s[upper] - from);
+        ((float*)arrays[1])[to] = from + part * (c.g->headways_s[upper] - from);
     }
 }

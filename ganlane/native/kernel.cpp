@@ -17,7 +17,9 @@
 #include <stdlib.h>
 
 #include "arrays.hpp"
+#include "faults.hpp"
 #include "generated.hpp"
+#include "random_drivers.hpp"
 
 const float RECYCLE_RANGE = 200.0f, RECYCLE_DECELERATION = 4.0f, RECYCLE_SIDE = 0.4f;
 enum { KEEP, LEFT, RIGHT };
@@ -151,25 +153,42 @@ static inline void recycle(const Settings& s, Rows& r, Mask rows) {
 
 // ---- A decision
 
-// `drivers`, if any, are generated; `ended(rows)` is called when rows end, before anything of them changes.
+// Rule-driven drivers. Everybody looks at the vehicles as they are before anybody moves: accelerations first, then lanes.
+template <class Drivers>
+static inline void drive_by_rules(const Settings& s, Rows& r, const Drivers& drivers, int substep) {
+    follow(s, r, drivers);
+    Float* target = r.along;
+    if (s.faults)
+        for (int i = 0; i < r.vehicles; i++) target[i] = r.target[i];
+    if (s.mobil) change_lanes(s, r, r.running & (r.phase == 0.0f), drivers);
+    r.phase = choose(r.phase == (float)(MOBIL_PERIOD - 1), filled(0.0f), r.phase + 1.0f);
+    if (s.faults) drive_with_faults(s, r, target);
+    else if (s.random) drive_with_traits(s, r, substep);
+    else drive(s, r);
+}
+
+// `crowd`: the network of generated drivers; `ended(rows)` is called when rows end, before anything of them changes.
 template <class Ended>
-static inline void decide(const Settings& s, Rows& r, Crowd* drivers, Ended ended) {
+static inline void decide(const Settings& s, Rows& r, Crowd& crowd, Ended ended) {
+    Alike alike = {common(s)};
+    Different different = {common(s)};
     find_lanes(s, r);
     for (int substep = 0; substep < s.substeps && any(r.running); substep++) {
         Mask running = r.running;
-        // Everybody looks at the vehicles as they are before anybody moves: accelerations first, then lanes.
-        follow(s, r);
-        if (drivers) {
-            drive_generated(s, r, *drivers, substep);
+        if (r.memory_fields)  // drivers with a memory draw random numbers
+            for (int lane = 0; lane < LANES; lane++) r.step_key[lane] = absorb(r.episode_key[lane], r.start_step[lane] + substep);
+        if (s.generated) {
+            follow(s, r, alike);
+            drive_generated(s, r, crowd);
+        } else if (s.random) {
+            drive_by_rules(s, r, different, substep);
         } else {
-            if (s.mobil) change_lanes(s, r, r.running & (r.phase == 0.0f));
-            r.phase = choose(r.phase == (float)(MOBIL_PERIOD - 1), filled(0.0f), r.phase + 1.0f);
-            drive(s, r);
+            drive_by_rules(s, r, alike, substep);
         }
         put_in_order(r);
         find_lanes(s, r);
         note_events(s, r);
-        if (drivers) ended(running & ~r.running);
+        if (s.generated) ended(running & ~r.running);
     }
 }
 
@@ -231,6 +250,8 @@ static void load(const Settings& s, const Inputs& in, Rows& r, long first, long 
         r.behind[lane] = in.soft_crash_behind[row] ? -1 : 0;
         r.phase[lane] = (float)(command.step % MOBIL_PERIOD);  // rows of a vector may be at different times
         r.step[lane] = (float)command.step;
+        r.start_step[lane] = command.step;
+        r.episode_key[lane] = episode_key(s.stream, in.seed[row], in.episode[row]);
     }
     for (int i = 0; i < s.vehicles; i++) r.slip[i] = slip_of(r.steering[i]), r.slip_sine[i] = sine_of(r.slip[i]);
     r.crash = r.goal = none();
@@ -288,20 +309,10 @@ static void* scratch(size_t bytes) {
     return posix_memalign(&memory, 64, bytes) ? nullptr : memory;
 }
 
-template <class Arrays>
-static const Memory& memory_of(const Arrays* arrays) {
-    return *(const Memory*)(arrays + 1);
-}
-
-// Generated drivers as the rows from `first` on have them in the state.
-static void gather(Crowd& c, Rows& r, const Inputs& in, int64_t stream, long first, long rows) {
-    c.environments = (int)rows;
-    for (int lane = 0; lane < LANES; lane++) {
-        long row = first + (lane < rows ? lane : rows - 1);
-        c.episode_key[lane] = episode_key(stream, in.seed[row], in.episode[row]);
-        c.start_step[lane] = in.step[row];
-    }
-    load_memory(c, r, memory_of(&in), first);
+static Fields fields_of(const Settings& s) {
+    if (s.generated) return s.generated->calibrated ? CALIBRATED : PAPER;
+    if (s.faults) return fields_of(*s.faults);
+    return s.random ? fields_of(*s.random) : Fields{0, {}};
 }
 
 // Drives the rows [first, last) through one decision. Returns 0, or 1 without memory, or 2 and drives none of them
@@ -314,46 +325,64 @@ extern "C" int ganlane_decide(const Settings* settings, const Inputs* in, const 
     size_t more = s.generated ? crowd_floats(s.generated->network, s.vehicles) : 0;
     float* memory = (float*)scratch((floats + more) * sizeof(float));
     if (!memory) return 1;
+    Fields fields = fields_of(s);
     Rows r;
+    r.memory_fields = count_of(fields);
     lay_out(r, (Float*)memory, s);
-    r.memory_fields = !s.generated ? 0 : s.generated->calibrated ? 5 : 4;
     Crowd crowd = {};
     if (s.generated) crowd = crowd_in(memory + floats, s.generated, s.vehicles);
+    // Behind the fields, the network's memory.
+    const Memory& network_before = *(const Memory*)(memory_of(in) + fields.arrays);
+    const Memory& network_after = *(const Memory*)(memory_of(out) + fields.arrays);
     Command commands[LANES];
     for (long row = first; row < last; row += LANES) {
         long rows = last - row < LANES ? last - row : LANES;
         load(s, *in, r, row, rows, commands);
-        if (s.generated) gather(crowd, r, *in, s.generated->stream, row, rows);
-        // The drivers of a row that ends remember nothing of what comes after.
+        load_fields(fields, r, memory_of(in), row, rows);
+        crowd.environments = (int)rows;
+        if (s.generated) load_memory(crowd, network_before, row);
+        // The network of a row that ends remembers nothing of what comes after.
         auto keep = [&](Mask ended) {
             for (int lane = 0; any(ended) && lane < rows; lane++)
-                if (ended[lane]) store_memory(crowd, r, memory_of(out), row + lane, lane);
+                if (ended[lane]) store_memory(crowd, network_after, row + lane, lane);
         };
         if (s.generated) keep(~r.running);
-        decide(s, r, s.generated ? &crowd : nullptr, keep);
+        decide(s, r, crowd, keep);
         if (s.generated) keep(r.running);
         if (in->recycles) {
             Mask recycles = none();
             for (int lane = 0; lane < rows; lane++) recycles[lane] = in->recycles[row + lane] ? -1 : 0;
             recycle(s, r, recycles & r.running);
         }
+        store_fields(fields, r, memory_of(out), row, rows);
         store(s, *in, r, *out, row, rows, commands);
     }
     free(memory);
     return 0;
 }
 
-// Gives the generated drivers of those of the rows [first, last) that are `fresh` their first memory: after
-// ganlane_spawn. Returns 0, or 1 without memory.
+// Gives the drivers of those of the rows [first, last) that are `fresh` their first memory, and random ones their
+// desired speed: after ganlane_spawn. Returns 0, or 1 without memory.
 extern "C" int ganlane_enter(const Settings* settings, const Scene* scene, const Outputs* out, long first, long last) {
-    const Generated* g = settings->generated;
-    if (!g) return 0;
-    float* memory = (float*)scratch(crowd_floats(g->network, settings->vehicles) * sizeof(float));
-    if (!memory) return 1;
-    Crowd crowd = crowd_in(memory, g, settings->vehicles);
-    for (long row = first; row < last; row++)
-        if (scene->fresh[row])
-            enter(crowd, memory_of(out), row, episode_key(g->stream, scene->seed[row], scene->episode[row]), out->speed);
+    const Settings& s = *settings;
+    Fields fields = fields_of(s);
+    if (!fields.arrays) return 0;
+    Crowd crowd = {};
+    float* memory = nullptr;
+    if (s.generated) {
+        memory = (float*)scratch(crowd_floats(s.generated->network, s.vehicles) * sizeof(float));
+        if (!memory) return 1;
+        crowd = crowd_in(memory, s.generated, s.vehicles);
+    }
+    void* const* arrays = memory_of(out);
+    for (long row = first; row < last; row++) {
+        if (!scene->fresh[row]) continue;
+        // Step -1 of a key of its own: apart from the draws of the steps.
+        uint64_t before_first_step = absorb(absorb(episode_key(s.stream, scene->seed[row], scene->episode[row]), 0), -1);
+        if (s.generated) enter(crowd, arrays, row, before_first_step, out->speed);
+        else if (s.faults) enter_with_faults(*s.faults, arrays, row * s.vehicles, (row + 1) * s.vehicles, out->acceleration);
+        else enter_with_traits(s, arrays, row, before_first_step, *scene, *out);
+    }
     free(memory);
     return 0;
 }

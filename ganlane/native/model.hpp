@@ -16,7 +16,10 @@ struct Settings {
     // road
     float lane_width, per_lane_width;
     int32_t lanes, vehicles, substeps, timeout_steps, mobil, abort_lane_change;
+    int64_t stream;  // family of episodes that random numbers belong to
     const struct Generated* generated;  // generated.hpp; null: the others are rule-driven
+    const struct Faults* faults;        // faults.hpp; null: drivers make none
+    const struct Random* random;        // random_drivers.hpp; null: all drivers are alike
 };
 
 // ---- Constants of the model (ganlane.sim)
@@ -30,14 +33,19 @@ enum { CENTRE, BODY, SIGNALLED };
 
 // ---- Equations
 
-// IDM: a (1 - (v/v0)^4 - (s*/s)^2) with s* = s0 + max(0, v T + v dv / (2 sqrt(a b))).
-INLINE Float interaction(const Settings& s, Float speed, Float gap, Float leader_speed, Float headway) {
-    Float dynamic = speed * headway + speed * (speed - leader_speed) * s.per_brake_scale;
-    return (s.min_gap + larger(dynamic, filled(0.0f))) / larger(gap, filled(SMALLEST_GAP));
+// The parameters of car following that may differ between drivers.
+struct Idm {
+    Float headway, per_brake_scale, min_acceleration, max_acceleration;
+};
+
+INLINE Idm common(const Settings& s) {
+    return {filled(s.headway), filled(s.per_brake_scale), filled(s.min_acceleration), filled(s.max_acceleration)};
 }
 
-INLINE Float interaction(const Settings& s, Float speed, Float gap, Float leader_speed) {
-    return interaction(s, speed, gap, leader_speed, filled(s.headway));
+// IDM: a (1 - (v/v0)^4 - (s*/s)^2) with s* = s0 + max(0, v T + v dv / (2 sqrt(a b))).
+INLINE Float interaction(const Idm& p, float min_gap, Float speed, Float gap, Float leader_speed) {
+    Float dynamic = speed * p.headway + speed * (speed - leader_speed) * p.per_brake_scale;
+    return (min_gap + larger(dynamic, filled(0.0f))) / larger(gap, filled(SMALLEST_GAP));
 }
 
 INLINE Float free_road(Float speed, Float per_desired) {
@@ -45,12 +53,16 @@ INLINE Float free_road(Float speed, Float per_desired) {
     return 1.0f - square * square;
 }
 
-INLINE Float limited(const Settings& s, Float free, Float interaction) {
-    return between(s.max_acceleration * (free - interaction * interaction), s.min_acceleration, s.max_acceleration);
+INLINE Float limited(const Idm& p, Float free, Float interaction) {
+    return smaller(larger(p.max_acceleration * (free - interaction * interaction), p.min_acceleration), p.max_acceleration);
+}
+
+INLINE Float idm(const Idm& p, float min_gap, Float speed, Float per_desired, Float gap, Float leader_speed) {
+    return limited(p, free_road(speed, per_desired), interaction(p, min_gap, speed, gap, leader_speed));
 }
 
 INLINE Float idm(const Settings& s, Float speed, Float per_desired, Float gap, Float leader_speed) {
-    return limited(s, free_road(speed, per_desired), interaction(s, speed, gap, leader_speed));
+    return idm(common(s), s.min_gap, speed, per_desired, gap, leader_speed);
 }
 
 INLINE Float slip_of(Float steering) {

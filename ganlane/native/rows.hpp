@@ -10,11 +10,12 @@
 #include "model.hpp"
 
 const int MOBIL_PERIOD = 10;
+#define INLINE_METHOD inline __attribute__((always_inline))
 
 // ---- The vehicles of LANES rows, foremost first
 
-// Numbers that a generated driver carries from step to step, besides those of its network.
-const int MEMORY_FIELDS = 5;
+// Numbers that a driver carries from step to step: at most so many, in the order of Field below.
+const int MOST_FIELDS = 48;
 
 // The nearest vehicle met so far in a lane.
 struct Nearest {
@@ -31,20 +32,24 @@ struct Rows {
     Float *slip, *slip_sine, *sine, *cosine, *extent, *body_low, *body_high, *low, *high, *seen_low, *seen_high;
     // Of one physics step: acceleration by IDM; the lane change that is wished, and that is begun.
     Float *following, *wish, *kept;
-    // Of generated drivers (generated.hpp): what the network says, bounds of the acceleration, and their memory.
-    Float *along, *across, *lowest, *highest, *memory[MEMORY_FIELDS];
+    // Of generated drivers (generated.hpp): what the network says, and bounds of the acceleration.
+    Float *along, *across, *lowest, *highest;
+    Float* memory[MOST_FIELDS];
     // MOBIL's neighbours in the own, left and right lane: [3][vehicles].
     Float *gap_ahead, *speed_ahead, *gap_behind, *speed_behind, *per_desired_behind;
     Nearest* nearest;  // [lanes]
     // Of the rows: whether they go on, physics steps since MOBIL's last decision and in all, and the ego's events.
     Mask running, ahead, behind, crash, goal;
     Float phase, step, onsets, onsets_behind;
+    // Keys of the random numbers: of the episode, and of this step; physics steps at the start of the decision.
+    uint64_t episode_key[LANES], step_key[LANES];
+    int64_t start_step[LANES];
 };
 
-const int STATE_FIELDS = 13, VEHICLE_FIELDS = 31 + MEMORY_FIELDS, MOBIL_FIELDS = 5;
+const int STATE_FIELDS = 13, VEHICLE_FIELDS = 31, MOBIL_FIELDS = 5;
 
 static size_t scratch_floats(const Settings& s) {
-    return (size_t)s.vehicles * (VEHICLE_FIELDS + 3 * MOBIL_FIELDS) + 5 * (size_t)s.lanes;
+    return (size_t)s.vehicles * (VEHICLE_FIELDS + 3 * MOBIL_FIELDS + MOST_FIELDS) + 5 * (size_t)s.lanes;
 }
 
 static void lay_out(Rows& rows, Float* scratch, const Settings& s) {
@@ -55,13 +60,13 @@ static void lay_out(Rows& rows, Float* scratch, const Settings& s) {
         &rows.slip, &rows.slip_sine, &rows.sine, &rows.cosine, &rows.extent, &rows.body_low, &rows.body_high, &rows.low, &rows.high,
         &rows.seen_low, &rows.seen_high, &rows.following, &rows.wish, &rows.kept,
         &rows.along, &rows.across, &rows.lowest, &rows.highest,
-        &rows.memory[0], &rows.memory[1], &rows.memory[2], &rows.memory[3], &rows.memory[4],
     };
     for (Float** field : fields) *field = scratch, scratch += s.vehicles;
     Float** neighbours[MOBIL_FIELDS] = {
         &rows.gap_ahead, &rows.speed_ahead, &rows.gap_behind, &rows.speed_behind, &rows.per_desired_behind,
     };
     for (Float** field : neighbours) *field = scratch, scratch += 3 * s.vehicles;
+    for (int k = 0; k < rows.memory_fields; k++) rows.memory[k] = scratch, scratch += s.vehicles;
     rows.nearest = (Nearest*)scratch;
 }
 
@@ -163,6 +168,15 @@ INLINE Float gap_ahead(const Rows& r, int i, Float x, Float half_length) {
     return smaller((x - r.x[i]) - (r.half_length[i] + half_length), filled(FREE_GAP));
 }
 
+// ---- Drivers: of each the parameters of car following, those by which it predicts the others, and its politeness
+
+struct Alike {  // all have those of the settings
+    Idm idm;
+    INLINE_METHOD Idm following(const Rows&, int) const { return idm; }
+    INLINE_METHOD Idm predicting(const Rows&, int) const { return idm; }
+    INLINE_METHOD Float politeness(const Rows&, int) const { return filled(1.0f); }
+};
+
 // ---- Car following: the smallest IDM acceleration over the lanes that the driver attends to
 
 // look(gap, leader's speed, rows) for each lane that vehicle i attends to, in the rows that attend to it.
@@ -186,15 +200,21 @@ INLINE void look_ahead(const Settings& s, const Rows& r, int i, Look look) {
     }
 }
 
-static inline void follow(const Settings& s, Rows& r) {
+// The strongest interaction of IDM with the parameters `p` over the lanes that vehicle i attends to.
+INLINE Float strongest_ahead(const Settings& s, const Rows& r, int i, const Idm& p) {
+    Float strongest = filled(0.0f);
+    look_ahead(s, r, i, [&](Float gap, Float leader, Mask here) __attribute__((always_inline)) {
+        strongest = choose(here, larger(strongest, interaction(p, s.min_gap, r.speed[i], gap, leader)), strongest);
+    });
+    return strongest;
+}
+
+template <class Drivers>
+static inline void follow(const Settings& s, Rows& r, const Drivers& drivers) {
     nobody_met(s, r, NOBODY_M);
     for (int i = 0; i < r.vehicles; i++) {
-        Float speed = r.speed[i], strongest = filled(0.0f);
-        look_ahead(s, r, i, [&](Float gap, Float leader, Mask here) __attribute__((always_inline)) {
-            Float force = interaction(s, speed, gap, leader);
-            strongest = choose(here, larger(strongest, force), strongest);
-        });
-        r.following[i] = limited(s, free_road(speed, r.per_desired[i]), strongest);
+        Idm p = drivers.following(r, i);
+        r.following[i] = limited(p, free_road(r.speed[i], r.per_desired[i]), strongest_ahead(s, r, i, p));
         meet_from_front(s, r, i);
     }
 }
@@ -232,16 +252,16 @@ struct Prospect {
     Float own, with_it, without;
 };
 
-INLINE Prospect prospect(const Settings& s, const Rows& r, int i, int side) {
+INLINE Prospect prospect(const Settings& s, const Rows& r, int i, int side, const Idm& p) {
     int at = side * r.vehicles + i;
     Float ahead = r.gap_ahead[at], behind = r.gap_behind[at], follower = r.speed_behind[at];
     Float free = free_road(follower, r.per_desired_behind[at]);
-    Float with_it = limited(s, free, interaction(s, follower, behind, r.speed[i]));
+    Float with_it = limited(p, free, interaction(p, s.min_gap, follower, behind, r.speed[i]));
     Mask leads = ahead < FREE_GAP, follows = behind < FREE_GAP;
     Float gap = choose(leads, behind + 2.0f * r.half_length[i] + ahead, filled(FREE_GAP));
-    Float without = limited(s, free, interaction(s, follower, gap, choose(leads, r.speed_ahead[at], follower)));
+    Float without = limited(p, free, interaction(p, s.min_gap, follower, gap, choose(leads, r.speed_ahead[at], follower)));
     return {
-        idm(s, r.speed[i], r.per_desired[i], ahead, r.speed_ahead[at]),
+        idm(p, s.min_gap, r.speed[i], r.per_desired[i], ahead, r.speed_ahead[at]),
         choose(follows, with_it, filled(0.0f)),
         choose(follows, without, filled(0.0f)),
     };
@@ -251,15 +271,16 @@ INLINE Prospect prospect(const Settings& s, const Rows& r, int i, int side) {
 const float NEVER = -1e30f;
 
 // The incentive of a change, m/s2; NEVER where it does not pay, is unsafe or leaves the road.
-INLINE Float incentive(const Settings& s, const Prospect& here, const Prospect& there, Mask exists) {
-    Float gain = there.own - here.own + s.politeness_side * (there.with_it - there.without) +
-                 s.politeness_rear * (here.without - here.with_it);
+INLINE Float incentive(const Settings& s, const Prospect& here, const Prospect& there, Mask exists, Float politeness) {
+    Float gain = there.own - here.own + politeness * s.politeness_side * (there.with_it - there.without) +
+                 politeness * s.politeness_rear * (here.without - here.with_it);
     Mask safe = smaller(there.with_it, there.own) >= -s.safe_deceleration;
     return choose(exists & safe & (gain > s.threshold), gain, filled(NEVER));
 }
 
 // The change that MOBIL proposes to everybody but the ego: +1 left, -1 right, 0 none. Returns whether anybody wants.
-static inline bool find_wishes(const Settings& s, Rows& r, Mask due) {
+template <class Drivers>
+static inline bool find_wishes(const Settings& s, Rows& r, Mask due, const Drivers& drivers) {
     find_neighbours(s, r);
     Mask wanted = none();
     for (int i = 0; i < r.vehicles; i++) {
@@ -267,9 +288,11 @@ static inline bool find_wishes(const Settings& s, Rows& r, Mask due) {
                     (absolute(r.y[i] - r.target[i] * s.lane_width) < ARRIVED);
         r.wish[i] = filled(0.0f);
         if (!any(free)) continue;
-        Prospect here = prospect(s, r, i, 0);
-        Float left = incentive(s, here, prospect(s, r, i, 1), r.target[i] + 1.0f <= (float)(s.lanes - 1));
-        Float right = incentive(s, here, prospect(s, r, i, 2), r.target[i] - 1.0f >= 0.0f);
+        Idm p = drivers.predicting(r, i);
+        Float politeness = drivers.politeness(r, i);
+        Prospect here = prospect(s, r, i, 0, p);
+        Float left = incentive(s, here, prospect(s, r, i, 1, p), r.target[i] + 1.0f <= (float)(s.lanes - 1), politeness);
+        Float right = incentive(s, here, prospect(s, r, i, 2, p), r.target[i] - 1.0f >= 0.0f, politeness);
         Float side = choose(left >= right, filled(1.0f), filled(-1.0f));
         Mask pays = free & (larger(left, right) > NEVER);
         r.wish[i] = choose(pays, side, filled(0.0f));
@@ -279,26 +302,30 @@ static inline bool find_wishes(const Settings& s, Rows& r, Mask due) {
 }
 
 // Of several that want into one lane, only the foremost within `exclusive` m goes, or whom no other makes brake hard.
-static inline void one_at_a_time(const Settings& s, Rows& r) {
+template <class Drivers>
+static inline void one_at_a_time(const Settings& s, Rows& r, const Drivers& drivers) {
     for (int i = 0; i < r.vehicles; i++) {
         r.kept[i] = r.wish[i];
         Mask wants = r.wish[i] != 0.0f, waits = none();
         if (!any(wants)) continue;
         Float lane = r.target[i] + r.wish[i];
+        Idm p = drivers.predicting(r, i);
         for (int j = 0; j < i; j++) {
             Mask rival = wants & (r.wish[j] != 0.0f) & (r.target[j] + r.wish[j] == lane);
             if (!any(rival)) continue;
             Float distance = r.x[j] - r.x[i];
-            Float demand = idm(s, r.speed[i], r.per_desired[i], gap_ahead(r, i, r.x[j], r.half_length[j]), r.speed[j]);
+            Float gap = gap_ahead(r, i, r.x[j], r.half_length[j]);
+            Float demand = idm(p, s.min_gap, r.speed[i], r.per_desired[i], gap, r.speed[j]);
             waits |= rival & ((distance < s.exclusive) | (demand < -s.safe_deceleration));
         }
         r.kept[i] = choose(waits, filled(0.0f), r.wish[i]);
     }
 }
 
-static inline void change_lanes(const Settings& s, Rows& r, Mask due) {
-    if (!any(due) || !find_wishes(s, r, due)) return;
-    one_at_a_time(s, r);
+template <class Drivers>
+static inline void change_lanes(const Settings& s, Rows& r, Mask due, const Drivers& drivers) {
+    if (!any(due) || !find_wishes(s, r, due, drivers)) return;
+    one_at_a_time(s, r, drivers);
     for (int i = 0; i < r.vehicles; i++) r.target[i] = r.target[i] + r.kept[i];
 }
 
@@ -308,12 +335,12 @@ struct Mover {
     Float x, y, heading, speed, acceleration, steering, slip, slip_sine;
 };
 
-// One step of a vehicle at `acceleration`, steered to the lane `target`; rows that have ended stay as they ended.
-INLINE void steer_and_move(const Settings& s, Mover& m, Float target, Float acceleration, Mask on) {
+// One step of a vehicle at `acceleration`, steered to the line at y = `line`; rows that have ended stay as they ended.
+INLINE void steer_and_move(const Settings& s, Mover& m, Float line, Float acceleration, Mask on) {
     Float y = m.y, heading = m.heading, speed = m.speed, slip = m.slip;
     // steering: ganlane.sim.dynamics.steer, with speed and distances inverted once, since a division takes as long
     // as ten products. An invalid vehicle is driven as well: cheaper than to leave it out.
-    Float per_pace = 1.0f / larger(speed, filled(s.slow)), offset = target * s.lane_width - y;
+    Float per_pace = 1.0f / larger(speed, filled(s.slow)), offset = line - y;
     Float lateral_speed = speed * sine_of(heading + slip);
     Float yaw_rate = speed * m.slip_sine * (2.0f / WHEELBASE);
     Float per_near = per_pace * s.per_near_s, per_far = per_pace * s.per_far_s;
@@ -355,7 +382,7 @@ INLINE void put(Rows& r, int i, const Mover& m) {
 static inline void drive(const Settings& s, Rows& r) {
     for (int i = 0; i < r.vehicles; i++) {
         Mover m = mover(r, i);
-        steer_and_move(s, m, r.target[i], r.following[i], r.running);
+        steer_and_move(s, m, r.target[i] * s.lane_width, r.following[i], r.running);
         put(r, i, m);
     }
 }

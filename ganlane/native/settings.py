@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping
 from ctypes import c_double, c_float, c_int32, c_int64, c_void_p
+from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
 from ganlane import keys
@@ -30,6 +31,7 @@ def _within(group: str, *names: str) -> tuple[Key, ...]:
     return tuple((group, name) for name in names)
 
 
+#: Stands for the steering angles of rule-driven drivers, wherever their memory has them.
 STEERING: Final = (keys.TRAFFIC, "steering")
 #: Of the drivers' memory, by key: type, and shape behind [rows, vehicles].
 MemoryArrays = dict[Key, tuple[str, tuple[int, ...]]]
@@ -132,10 +134,13 @@ class Layout:
         self.kinds: dict[Key, str] = {**VEHICLE_ARRAYS, **EGO_ARRAYS, **EVENT_ARRAYS, **COUNTERS}
         self.kinds |= {name: kind for name, (kind, _) in memory.items()}
         self._memory = memory
-        # Rule-driven drivers' one array has its place among the others.
-        further = [name for name in memory if name != STEERING]
-        self.inputs: list[Key] = [*INPUTS, *further]
-        self.outputs: list[Key] = [*OUTPUTS, *further]
+        # Rule-driven drivers' steering angles have their place among the others.
+        steering = next((name for name in memory if name[-1] == "steering"), STEERING)
+        further = [name for name in memory if name != steering]
+        self.inputs: list[Key] = [steering if name == STEERING else name for name in INPUTS]
+        self.outputs: list[Key] = [steering if name == STEERING else name for name in OUTPUTS]
+        self.inputs += further
+        self.outputs += further
 
     def shape(self, name: Key, rows: int, vehicles: int) -> tuple[int, ...]:
         """Shape of an array of ``kinds``."""
@@ -156,8 +161,12 @@ class Settings(ctypes.Structure):
             " soft_crash_ttc_s soft_crash_gap_m goal_m lane_width_m per_lane_width",
         ),
         *fields(c_int32, "lanes vehicles substeps timeout_steps mobil abort_lane_change"),
-        *fields(c_void_p, "generated"),
+        *fields(c_int64, "stream"),
+        *fields(c_void_p, "generated faults random"),
     ]
+
+    #: The structures that the last members point to, which have to live as long.
+    pointed: list[Any]
 
 
 class View(ctypes.Structure):
@@ -230,12 +239,13 @@ def settings_of(
     idm: IdmParameters | None = None,
     steering: SteeringParameters | None = None,
     mobil: MobilParameters | None = None,
-    generated: ctypes.Structure | None = None,
+    stream: int = 0,
+    pointed: Mapping[str, ctypes.Structure] = MappingProxyType({}),
 ) -> Settings:
     """The numbers of road, driving and episode.
 
-    ``mobil=None``: the others keep their lanes. ``generated``: they are the generator's, and of
-    ``mobil`` only the limits of a lane change count; this structure has to live as long.
+    ``mobil=None``: the others keep their lanes. ``pointed``: further structures of the drivers, by
+    their names in ``Settings``; of generated ones only MOBIL's limits of a lane change count.
     """
     episode = episode or EpisodeParameters()
     idm = idm or IdmParameters()
@@ -255,10 +265,15 @@ def settings_of(
         "substeps": episode.substeps(),
         # A number of steps, since sums of 0.1 s drift in floats.
         "timeout_steps": round(episode.timeout_s / keys.PHYSICS_STEP_S),
-        "mobil": mobil is not None and generated is None,
-        "generated": None if generated is None else ctypes.addressof(generated),
+        "mobil": mobil is not None and "generated" not in pointed,
+        "stream": stream,
     }
-    return _filled(Settings, numbers)
+    # ctypes has the addresses alone, so the structures are held beside them.
+    for name in ("generated", "faults", "random"):
+        numbers[name] = ctypes.addressof(pointed[name]) if name in pointed else None
+    settings = _filled(Settings, numbers)
+    settings.pointed = list(pointed.values())
+    return settings
 
 
 def mask_of(

@@ -17,7 +17,7 @@ from torch import Tensor
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.native import settings
-from ganlane.native.drivers import Drivers, RuleDrivers, generated_of
+from ganlane.native.drivers import Drivers, GeneratedDrivers, RuleDrivers, decision_settings
 from ganlane.native.library import BLOCK, ROWS_PER_THREAD, addresses, in_threads, load
 from ganlane.native.settings import Key, Layout
 from ganlane.settings.driving import (
@@ -153,20 +153,10 @@ class Kernel(_Function):
         drivers = drivers or RuleDrivers()
         self.vehicles = vehicles
         self.layout = Layout(drivers.memory())
-        # Held here, since the settings have its address alone.
-        self._generated = generated_of(drivers)
-        if self._generated is not None:
+        if isinstance(drivers, GeneratedDrivers):
             self.rows_per_thread = BLOCK
         self._dtypes = {name: getattr(torch, kind) for name, kind in self.layout.kinds.items()}
-        numbers = settings.settings_of(
-            *_shape(road, vehicles),
-            episode,
-            ego,
-            drivers.idm,
-            drivers.steering,
-            drivers.mobil,
-            self._generated,
-        )
+        numbers = decision_settings(_shape(road, vehicles), episode, ego, drivers)
         super().__init__("ganlane_decide", numbers, variant)
 
     def decide(
@@ -227,7 +217,6 @@ class NativeScenes(_Function):
         self.vehicles = scenes.vehicles
         drivers = drivers or RuleDrivers()
         self.layout = Layout(drivers.memory())
-        self._generated = generated_of(drivers)
         seen = (scenes.ego_visibility, scenes.others_visibility)
         shape = _shape(scenes.road, scenes.vehicles)
         numbers = settings.spawn_of(
@@ -238,7 +227,7 @@ class NativeScenes(_Function):
             recycle_share=None,
         )
         super().__init__("ganlane_spawn", numbers)
-        self._enter = Enter(settings.settings_of(*shape, generated=self._generated))
+        self._enter = Enter(decision_settings(shape, None, None, drivers))
 
     def start(
         self,
@@ -261,13 +250,12 @@ class NativeScenes(_Function):
         inputs = [(state | flags)[name] for name in settings.STARTS]
         outputs = [state.get(name) for name in layout.outputs]
         self._run(len(seed), inputs, outputs)
-        if self._generated is not None:
-            self._enter._run(len(seed), inputs, outputs)
+        self._enter._run(len(seed), inputs, outputs)
         return _state(state)
 
 
 class Enter(_Function):
-    """The first memory of generated drivers, after their scene."""
+    """The first memory of the drivers, after their scene."""
 
     def __init__(self, numbers: ctypes.Structure) -> None:
         super().__init__("ganlane_enter", numbers)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
+from ganlane.native.drivers import RuleDrivers, faulty_drivers
 from ganlane.settings.driving import (
     AbortFaults,
     BrakingFaults,
@@ -31,6 +32,7 @@ from ganlane.traffic.base import (
     TrafficSequential,
     uniforms,
 )
+from ganlane.traffic.idm_mobil import IdmMobilTraffic
 
 #: A step shorter than this has no direction of its own, m: the vehicle then moves along its
 #: heading.
@@ -336,4 +338,7 @@ def with_faults(base: TrafficModule, faults: DriverFaults | None = None) -> Traf
         "hesitant_change": HesitantLaneChange(road, stream, faults.hesitant_change),
         "aborted_change": AbortedLaneChange(road, stream, faults.aborted_change),
     }
+    drivers = base.native_drivers()
+    if type(base) is IdmMobilTraffic and isinstance(drivers, RuleDrivers):
+        return TrafficSequential(parts, faulty_drivers(drivers, faults, stream))
     return TrafficSequential(parts)

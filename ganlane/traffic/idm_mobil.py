@@ -336,6 +336,13 @@ class IdmRandomTraffic(IdmMobilTraffic):
             **past,
         }
 
+    def native_drivers(self) -> RuleDrivers | None:
+        """As of :class:`IdmTraffic`, no two alike."""
+        if type(self) is not IdmRandomTraffic:
+            return None
+        rules = (self.idm, self.steering, self.mobil)
+        return RuleDrivers(*rules, random=self.drivers, stream=self.stream)
+
     def _drawn(self, vehicles: Vehicles, key: Tensor) -> tuple[Tensor, ...]:
         """Uniform numbers [N, M] of every purpose."""
         # Step -1 is no step of an episode, so nothing else draws these numbers.

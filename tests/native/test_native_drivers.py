@@ -1,4 +1,4 @@
-"""Generated traffic by the kernel: as the tensor code drives it, and the same bits everywhere."""
+"""All drivers by the kernel: as the tensor code drives them, and the same bits everywhere."""
 
 from __future__ import annotations
 
@@ -23,13 +23,20 @@ from ganlane.settings.env import EnvConfig
 from ganlane.settings.generator import EXTRA_INPUTS, GENERATOR, GeneratorSizes
 from ganlane.settings.record import make
 from ganlane.settings.traffic import TrafficConfig
-from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road
 from ganlane.weights import load_weights, save_weights
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason="no C++ compiler")
 RUNNABLE = list(VARIANTS)[list(VARIANTS).index(best_variant()) :]
 PRESETS = {"gan": "paper", "gan_calibrated": "calibrated"}
+TRAFFICS = ["idm", "idm_mobil", "idm_faults", "idm_random", *PRESETS]
+#: Faults so often that a few decisions meet all of them.
+OFTEN = {
+    "phantom_braking": {"per_hour": 400.0},
+    "late_reaction": {"per_hour": 400.0, "delay_s": 1.3},
+    "hesitant_change": {"share": 0.6},
+    "aborted_change": {"share": 0.6, "at": 0.3},
+}
 #: No width is a whole number of vectors, and not everybody in sight is pooled.
 ODD = {
     "embedding": 21,
@@ -85,12 +92,12 @@ def kernel_of(env, variant=None):
 
 def differing(out, after):
     """Rows in which an event, a flag, a counter or a lane differs, or a number by more than
-    rounding; the network's memory of the ego, which it does not drive, does not count.
+    rounding; the traffic's memory of the ego, which it does not drive, does not count.
     """
     differs = torch.zeros(len(out), dtype=torch.bool)
     for name, value in leaves(out):
         other = after[name]
-        if name[-1] == "residual_mean":
+        if name[0] == keys.TRAFFIC:
             value, other = value[:, 1:], other[:, 1:]
         error = (value.double() - other.double()).abs()
         # Sums in another order differ by 1e-7; within a second the network makes millimetres of
@@ -122,17 +129,21 @@ def compare(traffic, highways, rows, decisions, seed):
 
 
 @pytest.mark.parametrize(
-    "options",
-    [{}, {"noise_scale": 0.5}, {"guard": False}, {"changes_per_km": 30.0}, {"noise_period_s": 0.0}],
-    ids=lambda options: next(iter(options), "as shipped"),
+    "traffic",
+    [
+        *TRAFFICS,
+        {"name": "idm_faults"} | OFTEN,
+        {"name": "idm_random", "reaction_s": (0.5, 1.5), "desired_speed": (0.7, 1.3)},
+        {"name": "idm_random", "reaction_s": (0.0, 0.0), "sway_m": (0.3, 0.9)},
+        {"name": "gan", "noise_scale": 0.5},
+        {"name": "gan", "guard": False},
+        {"name": "gan_calibrated", "changes_per_km": 30.0},
+        {"name": "gan_calibrated", "noise_period_s": 0.0},
+    ],
+    ids=lambda traffic: "-".join(traffic) if isinstance(traffic, dict) else traffic,
 )
-@pytest.mark.parametrize("traffic", PRESETS)
-def test_it_decides_as_the_tensor_code(traffic, options):
-    if traffic == "gan" and {"changes_per_km", "noise_period_s"} & set(options):
-        pytest.skip("an option of gan_calibrated")
-    if traffic == "gan_calibrated" and "guard" in options:
-        pytest.skip("an option of gan")
-    differ, _ = compare({"name": traffic} | options, highways=4, rows=12, decisions=4, seed=1)
+def test_it_decides_as_the_tensor_code(traffic):
+    differ, _ = compare(traffic, highways=4, rows=12, decisions=4, seed=1)
     # A random number at a threshold may fall on its other side.
     assert differ <= 1
 
@@ -145,13 +156,13 @@ def test_networks_of_any_sizes_drive(traffic, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("traffic", PRESETS)
+@pytest.mark.parametrize("traffic", [*TRAFFICS, {"name": "idm_faults"} | OFTEN], ids=str)
 def test_it_decides_as_the_tensor_code_in_a_hundred_thousand_decisions(traffic):
     differ, compared = compare(traffic, highways=80, rows=128, decisions=10, seed=4)
     assert differ <= compared // 10_000, (differ, compared)
 
 
-@pytest.fixture(scope="module", params=PRESETS)
+@pytest.fixture(scope="module", params=TRAFFICS[2:])
 def episodes(request):
     """Drivers, and the states of 37 episodes after every decision, and the actions."""
     traffic = make(TrafficConfig, request.param)
@@ -193,7 +204,7 @@ def test_every_instruction_set_gives_the_same_bits(episodes, variant):
     assert_same(drive(drivers, actions[:4], few, variant), whole[:4], np.array(few))
 
 
-@pytest.mark.parametrize("traffic", PRESETS)
+@pytest.mark.parametrize("traffic", TRAFFICS)
 def test_torchrl_and_gymnasium_drive_the_same_episodes(traffic):
     rows = 5
     env = make_env(traffic, num_envs=rows, kernel="native", seed=3)
@@ -211,20 +222,21 @@ def test_torchrl_and_gymnasium_drive_the_same_episodes(traffic):
                 np.testing.assert_array_equal(array, expected, str(name))
 
 
-@pytest.mark.parametrize("traffic", PRESETS)
+@pytest.mark.parametrize("traffic", TRAFFICS)
 def test_the_first_memory_is_that_of_the_tensor_code(traffic):
     module = make_traffic(make(TrafficConfig, traffic), EnvConfig())
-    scenes = RandomScenes(others_visibility=Visibility.BODY)
-    seed = torch.full((20,), 7)
-    state = NativeScenes(scenes, 0, module.native_drivers()).start(seed, torch.arange(20))
     env = environment(num_envs=20, traffic=module, seed=7, dtype=torch.float32, kernel="torch")
     expected = env.reset()
+    seed = torch.full((20,), 7)
+    state = NativeScenes(env.scenes, 0, module.native_drivers()).start(seed, torch.arange(20))
     memory = state[keys.TRAFFIC]
     assert {name for name, _ in leaves(memory)} == {
         name for name, _ in leaves(expected[keys.TRAFFIC])
     }
     for name, value in leaves(memory):
         torch.testing.assert_close(value, expected[keys.TRAFFIC][name], atol=2e-5, rtol=1e-5)
+    desired = state[keys.VEHICLES, "desired_speed"]
+    torch.testing.assert_close(desired, expected[keys.VEHICLES, "desired_speed"])
 
 
 def test_a_row_that_ends_leaves_its_drivers_memory_alone():
@@ -238,7 +250,7 @@ def test_a_row_that_ends_leaves_its_drivers_memory_alone():
     assert same_bits(after[keys.TRAFFIC][~right_lane], td[keys.TRAFFIC][~right_lane]) != []
 
 
-@pytest.mark.parametrize("traffic", ["idm_mobil", *PRESETS])
+@pytest.mark.parametrize("traffic", TRAFFICS)
 def test_numbers_never_become_denormal(traffic):
     """They decay by a factor a step; a product with a denormal takes a hundred times as long."""
     drivers = drivers_of(make(TrafficConfig, traffic), IdmParameters(), MobilParameters(), 0)

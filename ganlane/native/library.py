@@ -13,13 +13,11 @@ and a cache that cannot be used is passed over.
 
 from __future__ import annotations
 
-import atexit
 import ctypes
 import hashlib
 import importlib.util
 import os
 import platform
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -117,14 +115,6 @@ def libraries_folder() -> Path | None:
     """Where built libraries are stored: ``native`` in the cache; None: that is off."""
     cache = cache_folder()
     return None if cache is None else cache / "native"
-
-
-@lru_cache(maxsize=1)
-def _passing_folder() -> Path:
-    """A folder that goes when the process ends."""
-    folder = tempfile.mkdtemp(prefix="ganlane-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return Path(folder)
 
 
 def find(variant: str | None = None) -> Loaded | str:
@@ -256,7 +246,8 @@ def _built(
 ) -> ctypes.CDLL:
     """The library in ``folder``, compiled if it is not whole there.
 
-    Where the folder cannot be used, which joins the ``troubles``, it is in a temporary one.
+    Where the folder cannot be used, which joins the ``troubles``, it is loaded from a temporary
+    one.
 
     Raises:
         UserError: the compiler fails.
@@ -276,7 +267,9 @@ def _built(
         except (OSError, UserError) as error:
             why = getattr(error, "strerror", None) or error
             trouble = f"{folder} cannot be used ({why}); point {CACHE_VARIABLE} at another"
-    library = _opened(_passing_folder() / name, content)
+    # Once loaded, the file may go.
+    with tempfile.TemporaryDirectory(prefix="ganlane-") as temporary:
+        library = _opened(Path(temporary) / name, content)
     if trouble:
         # The folder's, then, and not the library's.
         troubles["cache"] = trouble

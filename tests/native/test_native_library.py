@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -48,6 +49,7 @@ def compiler(monkeypatch, tmp_path):
         program.write_text(f'#!/bin/sh\nlibrary="{path}"\n{lines}\n')
         program.chmod(0o755)
         monkeypatch.setenv("CXX", str(program))
+        monkeypatch.setitem(sys.modules, "ziglang", None)  # not there
         monkeypatch.setattr(library, "best_variant", lambda: "AVX512")
         return program
 
@@ -176,7 +178,8 @@ def test_a_cache_that_cannot_be_used_is_passed_over(
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("GANLANE_CACHE", str(tmp_path / place))
     assert library.find().variant == "AVX512"
-    assert library.load()._name.startswith(str(library._passing_folder()))
+    # Loaded from a temporary folder that is gone.
+    assert not Path(library.load()._name).exists()
     told = capsys.readouterr().err
     assert f"{place}/native cannot be used" in told
     assert told.endswith("point GANLANE_CACHE at another.\n")
@@ -191,7 +194,7 @@ def test_a_library_that_cannot_be_loaded_from_the_cache_is_loaded_from_elsewhere
     load = library.ctypes.CDLL
 
     def refuse(path):
-        if str(library.libraries_folder()) in path:
+        if path.startswith(str(library.libraries_folder())):
             raise OSError(f"{path}: failed to map segment from shared object")
         return load(path)
 
@@ -251,13 +254,13 @@ def test_a_program_that_cannot_be_run_is_no_compiler(compiler):
 
 
 def test_clang_of_the_package_ziglang_comes_after_the_systems(monkeypatch):
-    monkeypatch.setattr(library.shutil, "which", lambda name: None)
+    monkeypatch.setattr(shutil, "which", lambda name: None)
     monkeypatch.setattr(library.importlib.util, "find_spec", lambda name: name)
     zig = (sys.executable, "-m", "ziglang", "c++")
     assert library.compilers() == (zig,)
     # Else it would compile for the processor that it runs on, and a wheel is for others too.
     assert "-mcpu=baseline" in library._command("default", zig)
-    monkeypatch.setattr(library.shutil, "which", lambda name: f"/bin/{name}")
+    monkeypatch.setattr(shutil, "which", lambda name: f"/bin/{name}")
     assert [command[0] for command in library.compilers()][1:] == [sys.executable]
 
 

@@ -12,21 +12,9 @@ import sys
 import gymnasium
 import torch
 from stable_baselines3 import DQN
-from tensordict.nn import TensorDictModule
 
 import ganlane
-
-
-class Greedy(torch.nn.Module):
-    """The best action of a Q-network [N], from observations [N, D]."""
-
-    def __init__(self, q_net):
-        super().__init__()
-        self.q_net = q_net
-
-    def forward(self, observation):
-        """The action [N] int64."""
-        return self.q_net(observation).argmax(dim=1)
+import ganlane.sb3
 
 
 def main(decisions=2_000, episodes=20, goal_m=1000.0):
@@ -40,11 +28,8 @@ def main(decisions=2_000, episodes=20, goal_m=1000.0):
         f"{model.num_timesteps} decisions, mean return of the last {len(finished)} episodes "
         f"{mean(finished):.1f}"
     )
-    policy = TensorDictModule(Greedy(model.q_net), in_keys=["observation"], out_keys=["action"])
-    sb3 = ganlane.Driver("sb3_dqn", policy)
-    table = ganlane.api.evaluate(
-        [sb3, "mobil", "random_legal"], ["idm_mobil"], episodes, goal_m=goal_m
-    )
+    drivers = [ganlane.sb3.driver(model, "sb3_dqn"), "mobil", "random_legal"]
+    table = ganlane.api.evaluate(drivers, ["idm_mobil"], episodes, goal_m=goal_m)
     print(table.select("agent", "episodes", "goal", "hard_crash", "mean_reward"))
 
 

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from ganlane._version import __version__
-from ganlane.errors import USER_ERROR
+from ganlane.errors import USER_ERROR, printable
 from ganlane.files import conf_folder
 from ganlane.runtime import open_closed_streams, status_of
 
@@ -51,7 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return importlib.import_module("ganlane.config.run").run_command(command, rest)
         else:
             names = ", ".join(commands())
-            print(f"ganlane: {command}: no such command; choose one of {names}.", file=sys.stderr)
+            line = f"ganlane: {command}: no such command; choose one of {names}."
+            print(printable(line), file=sys.stderr)
             return USER_ERROR
         sys.stdout.flush()
     except OSError as error:

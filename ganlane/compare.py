@@ -97,15 +97,13 @@ def compare(
                     current = (traffic, observation, mask)
                     batch = make(min(config.num_envs, episodes))
                 report = None if quiet else _reporter(bar, f"{driver.name} on {traffic}")
-                # A compiled environment would be compiled again for every size.
-                smaller = None if env.compile else make
                 table = evaluation.run_episodes(
                     batch,
                     policy,
                     range(episodes),
                     seed,
                     report,
-                    smaller,
+                    make,
                 )
                 table = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
                 # Episodes of one recorded scene are no independent observations.

@@ -37,12 +37,28 @@ ADVICE = {
 }
 
 
+#: Characters that a terminal obeys instead of showing them.
+CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
+
+
+def printable(text: str) -> str:
+    r"""``text`` with control characters but tabs and line ends as escapes (``\x1b``)."""
+
+    def escaped(match: re.Match[str]) -> str:
+        return match[0] if match[0] in "\t\n" else repr(match[0])[1:-1]
+
+    return CONTROL.sub(escaped, text)
+
+
 class UserError(Exception):
     """Something the user can correct: a config value, a file, a column, a shape or a checkpoint.
 
     The message names the value, what was expected and what to do. Entry points print it without a
     traceback and exit with status 2.
     """
+
+    def __str__(self) -> str:
+        return printable(super().__str__())
 
 
 class ParameterError(UserError):
@@ -54,7 +70,7 @@ class ParameterError(UserError):
     """
 
     def __str__(self) -> str:
-        return _FIELD.sub(r"\1", self.args[0])
+        return printable(_FIELD.sub(r"\1", self.args[0]))
 
     def below(self, where: str) -> ParameterError:
         """The same error, of the record at the key ``where``."""
@@ -91,7 +107,8 @@ def file_sentence(error: OSError) -> str:
     """The path, what is wrong, and what to do."""
     number = error.errno or 0
     where = error.filename2 or error.filename or "a file or standard output"
-    return f"{where}: {error.strerror or os.strerror(number)}; {ADVICE.get(number, _PATH)}."
+    reason = error.strerror or os.strerror(number)
+    return printable(f"{where}: {reason}; {ADVICE.get(number, _PATH)}.")
 
 
 @contextmanager

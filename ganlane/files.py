@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tempfile
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from mmap import mmap
@@ -86,20 +86,18 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         kind = "a folder" if path.is_dir() else "a device or a pipe"
         raise UserError(f"{path}: {kind}, where a file was to be written; give the name of a file.")
     path.parent.mkdir(parents=True, exist_ok=True)
+    # In the same folder, since a file can be renamed atomically only within one file system.
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{_PART}")
     try:
-        # In the same folder, since a file can be renamed atomically only within one file system.
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=_PART)
+        # With the permissions that the user's umask leaves; mkstemp() lets only the owner read.
+        part.touch(exist_ok=False)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
-    os.close(handle)
-    part = Path(name)
     try:
         yield part
         with part.open("rb+") as written:
             # On the disk before the new name is: else a power cut could leave an empty file.
             os.fsync(written.fileno())
-        # mkstemp() lets only the owner read; results are for everyone.
-        part.chmod(0o644)
         part.replace(path)
     except Exception as error:
         cause = _file_system_error(error, part)
@@ -112,7 +110,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 def remove_leftovers(folder: Path) -> None:
     """Remove the temporary files of killed writes from a folder to which nothing writes now."""
-    # mkstemp() adds eight random characters to the prefix.
+    # The eight characters are random.
     for part in folder.glob(f".*.????????{_PART}"):
         part.unlink(missing_ok=True)
 

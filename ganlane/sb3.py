@@ -16,9 +16,14 @@ Needs the extra ``sb3``.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
 
+import gymnasium
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -26,15 +31,34 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from ganlane import keys
+from ganlane.agents.drivers import mask_in
 from ganlane.arguments import seed_number
 from ganlane.build import Driver
 from ganlane.errors import UserError
+from ganlane.files import (
+    PLACE,
+    atomic_path,
+    has_checksum,
+    refuse_without_checksum,
+    write_json,
+)
+from ganlane.gym.base import OnRows
 from ganlane.gym.vector import HighwayVectorGym
+from ganlane.settings.observation import MaskParameters, ObservationConfig
+from ganlane.settings.record import NotNegative, Number, Positive, Record, make, plain
 
 try:
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.monitor import Monitor
-    from stable_baselines3.common.vec_env import VecEnv
+    from stable_baselines3.common.vec_env import (
+        DummyVecEnv,
+        VecCheckNan,
+        VecEnv,
+        VecEnvWrapper,
+        VecMonitor,
+        VecNormalize,
+        VecVideoRecorder,
+    )
 except ModuleNotFoundError as error:
     raise UserError("ganlane.sb3 needs stable-baselines3: pip install 'ganlane[sb3]'.") from error
 
@@ -199,49 +223,289 @@ def make_vec_env(
     return HighwayVecEnv(HighwayVectorGym(num_envs=num_envs, traffic=traffic, seed=seed, **options))
 
 
+#: Observation, mask and normaliser.
+_Read: TypeAlias = tuple[
+    ObservationConfig, MaskParameters | None, "VecNormalize | Normaliser | None"
+]
+#: What may stand between a model and the highway, since it changes neither observation nor action.
+_TRANSPARENT = (
+    HighwayVecEnv,
+    DummyVecEnv,
+    VecCheckNan,
+    VecMonitor,
+    VecVideoRecorder,
+    Monitor,
+    gymnasium.RewardWrapper,
+    gymnasium.wrappers.HumanRendering,
+    gymnasium.wrappers.NormalizeReward,
+    gymnasium.wrappers.OrderEnforcing,
+    gymnasium.wrappers.PassiveEnvChecker,
+    gymnasium.wrappers.RecordEpisodeStatistics,
+    gymnasium.wrappers.RecordVideo,
+    gymnasium.wrappers.RenderCollection,
+    gymnasium.wrappers.TimeLimit,
+)
+
+
+@dataclass(frozen=True)
+class Normaliser(Record):
+    """The statistics of observations of a ``VecNormalize``, as a file has them.
+
+    Attributes:
+        mean, variance: of each number of the observation, [D].
+        epsilon: is added to the variance.
+        clip_obs: bound of what results.
+    """
+
+    mean: list[Number]
+    variance: list[NotNegative]
+    epsilon: NotNegative
+    clip_obs: Positive
+
+    def normalize_obs(self, observation: Floats) -> Floats:
+        """What a ``VecNormalize`` makes of observations [N, D]."""
+        deviation = np.sqrt(np.asarray(self.variance) + self.epsilon)
+        scaled = (observation - np.asarray(self.mean)) / deviation
+        return np.clip(scaled, -self.clip_obs, self.clip_obs).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Reading(Record):
+    """What a model reads and which actions it may choose, as the JSON beside its file says."""
+
+    observation: ObservationConfig
+    mask: MaskParameters | None
+    normaliser: Normaliser | None
+
+
 class ModelPolicy(TensorDictModuleBase):
-    """The deterministic policy of a stable-baselines3 model.
+    """The deterministic policy of a stable-baselines3 model, for one environment at a time.
 
     It writes ``action`` [N] for ``observation`` [N, D].
 
     Args:
-        model: trained on :func:`make_vec_env`; one with masks (sb3-contrib's) is given
-            ``action_mask`` [N, 3].
+        model: one with masks (sb3-contrib's) is given ``action_mask`` [N, 3]; one with a memory
+            (``RecurrentPPO``) keeps it for every row until the row's episode is over.
+        normaliser: of the observations; its statistics are not updated.
     """
 
     out_keys = [keys.ACTION]  # noqa: RUF012
-    # Nothing is held per row, so an evaluation may move running episodes to other rows.
-    rows_must_stay = False
 
-    def __init__(self, model: BaseAlgorithm) -> None:
+    def __init__(
+        self,
+        model: BaseAlgorithm,
+        normaliser: VecNormalize | Normaliser | None = None,
+    ) -> None:
         super().__init__()
         self.model = model
-        # sb3-contrib's MaskablePPO and its kin take masks; SB3's own algorithms do not.
-        self._masked = type(model).__name__.startswith("Maskable")
-        self.in_keys = [keys.OBSERVATION, keys.ACTION_MASK] if self._masked else [keys.OBSERVATION]
+        self.normaliser = normaliser
+        # An evaluation may move running episodes to other rows where nothing is held per row.
+        self.rows_must_stay = hasattr(model.policy, "lstm_hidden_state_shape")
+        self._memory: tuple[Floats, ...] | None = None
+        self.in_keys = [keys.OBSERVATION]
+        if _is_masked(model):
+            self.in_keys.append(keys.ACTION_MASK)
+        if self.rows_must_stay:
+            self.in_keys.append(keys.EGO)
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action``."""
-        masks = {}
-        if self._masked:
-            masks["action_masks"] = tensordict.get(keys.ACTION_MASK).cpu().numpy()
         # stable-baselines3 takes NumPy arrays in main memory, whatever device the model is on.
         observation = tensordict.get(keys.OBSERVATION).cpu().numpy()
-        chosen, _ = self.model.predict(observation, deterministic=True, **masks)
+        shape = self.model.observation_space.shape
+        if observation.shape[1:] != shape:
+            raise UserError(
+                f"{type(self.model).__name__}: it reads observations of shape {list(shape or ())}, "
+                f"but the environment gives {list(observation.shape[1:])}; use the observation, "
+                "vehicles and lanes of its training."
+            )
+        if self.normaliser is not None:
+            observation = self.normaliser.normalize_obs(observation)
+        more: dict[str, Any] = {}
+        if _is_masked(self.model):
+            more["action_masks"] = mask_in(tensordict).cpu().numpy()
+        if self.rows_must_stay:
+            # The ego counts its decisions, so an episode that begins is seen without its reset.
+            start = tensordict.get(keys.EGO).get("decisions") == 0
+            more["episode_start"] = start.cpu().numpy()
+            # [layers, N, size]; another environment may have another N.
+            if self._memory is not None and self._memory[0].shape[1] == len(observation):
+                more["state"] = self._memory
+        chosen, self._memory = self.model.predict(observation, deterministic=True, **more)
         action = torch.as_tensor(chosen, device=tensordict.device)
         return tensordict.set(keys.ACTION, action.long())
 
 
-def driver(model: BaseAlgorithm, name: str | None = None) -> Driver:
-    """A trained model as a driver for ``ganlane.api.evaluate`` and ``ganlane.api.render``.
+class ModelDriver(Driver):
+    """A stable-baselines3 model as a driver; made by :func:`driver`."""
 
-    It reads the observation of the evaluation, by default the one that :func:`make_vec_env` uses by
-    default.
+    policy: ModelPolicy
+    observation: ObservationConfig
+
+    def save(self, path: str | Path) -> None:
+        """Store the model as ``model.save(path)`` does, and beside it what it reads, as JSON.
+
+        ``ppo.zip.json`` has observation, mask and normaliser for ``driver(model, stored="ppo")``.
+
+        Raises:
+            OSError: the files cannot be written.
+        """
+        file = _model_file(path)
+        with atomic_path(file) as part:
+            self.policy.model.save(part)
+        normaliser = self.policy.normaliser
+        if isinstance(normaliser, VecNormalize):
+            statistics: Any = normaliser.obs_rms
+            normaliser = Normaliser(
+                statistics.mean,
+                statistics.var,
+                normaliser.epsilon,
+                normaliser.clip_obs,
+            )
+        content = {
+            "checksum": PLACE,
+            "model_sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+            "reads": plain(Reading(self.observation, self.mask, normaliser)),
+        }
+        write_json(_description(file), content)
+
+
+def driver(
+    model: BaseAlgorithm,
+    name: str | None = None,
+    stored: str | Path | None = None,
+) -> ModelDriver:
+    """A trained model as a driver for ``ganlane.api.evaluate``.
+
+    It drives as in your own loop with ``model.predict(..., deterministic=True)``: on the form and
+    scale of the observation that its environment was made with, normalised by its ``VecNormalize``,
+    a ``MaskablePPO`` behind its mask (without one behind ``legal``, since it is told then which
+    actions stay on the road). Sensor errors, traffic and road are those of the evaluation.
 
     Args:
-        model: PPO, DQN, MaskablePPO, ...; behind a mask, give ``mask="safe"`` to the evaluation,
-            too.
+        model: PPO, DQN, MaskablePPO, RecurrentPPO, ..., with the environment that it was trained
+            on (:func:`make_vec_env`, or ``gymnasium.make("ganlane/Highway-v0")``).
         name: in tables; None: the algorithm's, in lower case.
+        stored: the file that :meth:`ModelDriver.save` wrote, for a ``model`` loaded from it without
+            an environment.
+
+    Raises:
+        UserError: the model has no environment, there is a wrapper that a driver cannot repeat
+            (``VecFrameStack``, an ``ObservationWrapper``, ...), or the file beside ``stored`` is
+            missing, damaged, or that of another model.
     """
-    return Driver(name or type(model).__name__.lower(), ModelPolicy(model))
+    if stored is None:
+        observation, mask, normaliser = _of_environment(model)
+    else:
+        observation, mask, normaliser = _of_file(stored)
+    policy = ModelPolicy(model, normaliser)
+    return ModelDriver(name or type(model).__name__.lower(), policy, observation, mask)
+
+
+def _of_environment(model: BaseAlgorithm) -> _Read:
+    """Observation, mask and normaliser that the environment of a model has."""
+    env = model.get_env()
+    if env is None:
+        kind = type(model).__name__
+        raise UserError(
+            f"driver(): this {kind} has no environment, which says what it reads; load it with "
+            f"{kind}.load(path, env=make_vec_env(...)), or give stored=path if driver(...).save() "
+            "wrote it."
+        )
+    normaliser = None
+    for layer in _layers(env):
+        if isinstance(layer, OnRows):
+            settings = layer.settings
+            for transform in layer.transforms:
+                # A transform of the reward alone is none of the driver's business.
+                writes = transform.out_keys
+                if not writes or keys.OBSERVATION in writes or transform.in_keys_inv:
+                    raise _not_repeatable(transform)
+        elif isinstance(layer, VecNormalize) and not layer.norm_obs:
+            continue
+        elif isinstance(layer, VecNormalize) and normaliser is None:
+            normaliser = layer
+        elif not isinstance(layer, _TRANSPARENT):
+            raise _not_repeatable(layer)
+    # Other algorithms drive without a mask, whatever mask their environment shows.
+    if not _is_masked(model):
+        return settings.observation, None, normaliser
+    mask = settings.mask
+    if mask.form == "none":
+        # The environment showed which actions stay on the road. `legal` excludes more: commands
+        # during a lane change, all of which have no effect unless a change can be turned back.
+        if settings.env.ego.abort_lane_change:
+            raise UserError(
+                f"driver(): this {type(model).__name__} was trained without a mask on lane changes "
+                "that can be turned back; train it with mask='legal' or 'safe'."
+            )
+        mask = MaskParameters("legal")
+    return settings.observation, mask, normaliser
+
+
+def _is_masked(model: BaseAlgorithm) -> bool:
+    """Whether the algorithm takes masks: sb3-contrib's MaskablePPO and its kin do."""
+    return type(model).__name__.startswith("Maskable")
+
+
+def _layers(env: Any) -> Iterator[Any]:
+    """An environment, what it wraps, what that wraps, ..."""
+    while env is not None:
+        yield env
+        if isinstance(env, VecEnvWrapper):
+            env = env.venv
+        elif isinstance(env, HighwayVecEnv):
+            env = env.highways
+        elif isinstance(env, DummyVecEnv):
+            env = env.envs[0]
+        else:
+            env = env.env if isinstance(env, gymnasium.Wrapper) else None
+
+
+def _not_repeatable(layer: Any) -> UserError:
+    return UserError(
+        f"driver(): {type(layer).__name__} stands between the model and the highway, and a driver "
+        "cannot repeat what it does; train without it, or evaluate in your own loop."
+    )
+
+
+def _model_file(path: str | Path) -> Path:
+    """The file that stable-baselines3 makes of ``path``: with the ending .zip, if it has none."""
+    file = Path(path)
+    return file if file.suffix else file.with_suffix(".zip")
+
+
+def _description(file: Path) -> Path:
+    """The JSON file beside that of a model."""
+    return file.with_name(f"{file.name}.json")
+
+
+def _of_file(stored: str | Path) -> _Read:
+    """What :meth:`ModelDriver.save` wrote beside a model.
+
+    Raises:
+        UserError: it is missing, damaged, or that of another model.
+    """
+    file = _model_file(stored)
+    description = _description(file)
+    try:
+        content = description.read_bytes()
+        whole = has_checksum(content, description)
+        described = json.loads(content)
+        reading = make(Reading, described["reads"])
+        digest = described["model_sha256"]
+        is_same = digest == hashlib.sha256(file.read_bytes()).hexdigest()
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise UserError(
+            f"{description}: it does not say what the model reads ({error}); store the model with "
+            "driver(model).save(path), or load it with env=make_vec_env(...)."
+        ) from error
+    if not whole:
+        refuse_without_checksum(description)
+    if not is_same:
+        raise UserError(
+            f"{description}: it was written for another model than {file.name} is now; store the "
+            "model with driver(model).save(path)."
+        )
+    return reading.observation, reading.mask, reading.normaliser

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
 from safetensors import SafetensorError
-from safetensors.torch import load, save
-from torch import Tensor
+from safetensors.numpy import load
 
 from ganlane.errors import UserError
 from ganlane.files import (
@@ -19,6 +20,9 @@ from ganlane.files import (
     sealed,
     write_bytes,
 )
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def save_weights(
@@ -35,6 +39,8 @@ def save_weights(
         tensors: flat name to tensor.
         metadata: JSON-serialisable description (config, data, metrics, code version).
     """
+    from safetensors.torch import save  # torch takes seconds, and the kernel needs none
+
     # On the CPU: a file from a GPU must load anywhere.
     flat = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     header = {
@@ -45,7 +51,15 @@ def save_weights(
 
 
 def load_weights(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Load what :func:`save_weights` wrote: ``(tensors, metadata)``.
+    """What :func:`load_arrays` reads, as tensors."""
+    import torch  # takes seconds
+
+    arrays, metadata = load_arrays(path, kind)
+    return {name: torch.from_numpy(array) for name, array in arrays.items()}, metadata
+
+
+def load_arrays(path: str | Path, kind: str) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+    """Load what :func:`save_weights` wrote: ``(arrays, metadata)``, without torch.
 
     Raises:
         UserError: the file is absent, damaged, not safetensors, not written by ganlane, of another
@@ -59,14 +73,14 @@ def load_weights(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[s
     content = path.read_bytes()
     whole = has_checksum(content, path)
     try:
-        tensors = load(content)
+        arrays = load(content)
         # The format begins with the header's length and the header, JSON. The library's reader of
         # bytes leaves the metadata out.
         begin = 8
         end = 8 + int.from_bytes(content[:8], "little")
         header = json.loads(content[begin:end]).get("__metadata__") or {}
         metadata = json.loads(header.get("ganlane", "{}"))
-    # KeyError: a number type that torch lacks
+    # KeyError: a number type that NumPy lacks
     except (
         SafetensorError,
         ValueError,
@@ -84,11 +98,11 @@ def load_weights(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[s
             f"{stored or 'a file that ganlane did not write'}; give one that ganlane wrote."
         )
     # NaN would drive without a word.
-    for name, tensor in tensors.items():
-        if not tensor.isfinite().all():
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
             raise UserError(
                 f"{path}: {name} holds numbers that are not finite; train or fit it again."
             )
     if not whole:
         refuse_without_checksum(path)
-    return tensors, metadata
+    return arrays, metadata

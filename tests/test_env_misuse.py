@@ -50,6 +50,12 @@ def test_an_environment_that_cannot_be_is_refused(options):
         idm_highways(**options)
 
 
+@pytest.mark.parametrize("make", [idm_highways, ganlane.make_env])
+def test_an_environment_moves_to_no_device_without_numbers(make):
+    with pytest.raises(UserError, match="device=meta"):
+        make().to("meta")
+
+
 def test_a_name_is_no_traffic():
     with pytest.raises(UserError, match="expected a TrafficModule"):
         HighwayEnv("idm")

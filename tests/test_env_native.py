@@ -124,7 +124,10 @@ class Cruise(TrafficModule):
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        ({"traffic": Cruise(Road())}, "drives the traffics idm and idm_mobil alone, not Cruise"),
+        (
+            {"traffic": Cruise(Road())},
+            "drives idm, idm_mobil, gan and gan_calibrated alone, not Cruise",
+        ),
         ({"dtype": torch.float64}, "in float32"),
         ({"ring_m": 500.0}, "has no ring"),
         (

@@ -80,6 +80,16 @@ def test_a_full_disk_is_told_of_in_the_systems_words_and_leaves_the_old_file(
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("mask", [0o022, 0o077, 0o002])
+def test_a_file_has_the_permissions_that_the_users_umask_leaves(mask, tmp_path):
+    before = os.umask(mask)
+    try:
+        write_bytes(tmp_path / "a", b"")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "a").stat().st_mode & 0o777 == 0o666 & ~mask
+
+
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EIO])
 def test_a_refusal_without_a_name_gets_that_of_the_file(number, tmp_path):
     def fail_half_way(part: Path) -> None:

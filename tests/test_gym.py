@@ -6,6 +6,7 @@ import copy
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -21,8 +22,10 @@ from ganlane.errors import UserError
 from ganlane.gym import ENV_IDS
 from ganlane.gym.base import make_rows
 from ganlane.gym.native_rows import NativeRows
+from ganlane.native.drivers import GeneratedDrivers, drivers_of
 from ganlane.native.library import why_not
 from ganlane.settings.env import EnvConfig
+from ganlane.settings.episode import Stream
 from ganlane.settings.record import make as make_record
 from ganlane.settings.traffic import TrafficConfig
 
@@ -170,16 +173,24 @@ def test_a_row_of_a_batch_drives_as_one_alone_does():
         "idm_random",
         "idm_faults",
         "gan",
+        "gan_calibrated",
+        {"name": "gan", "execute_k": 2},
+        {"name": "gan", "blind_share": 0.5},
         {"name": "idm", "blind_share": 0.5},
     ],
 )
 def test_option_and_module_give_one_answer_to_who_drives(traffic):
     config = make_record(TrafficConfig, traffic)
     env = EnvConfig()
-    drivers = make_traffic(config, env).native_parameters()
-    expected = None if drivers is None else (drivers.idm, drivers.mobil)
-    assert config.native_parameters(env.idm, env.mobil) == expected
-    assert (drivers is not None) == (traffic in ("idm", "idm_mobil"))
+    of_module = make_traffic(config, env).native_drivers()
+    of_option = drivers_of(config, env.idm, env.mobil, Stream.TRAIN)
+    assert type(of_module) is type(of_option)
+    if isinstance(of_option, GeneratedDrivers):
+        for name, weights in of_option.weights.items():
+            np.testing.assert_array_equal(weights, of_module.weights[name])
+        of_module, of_option = (replace(drivers, weights={}) for drivers in (of_module, of_option))
+    assert of_module == of_option
+    assert (of_option is not None) == (traffic in ("idm", "idm_mobil", "gan", "gan_calibrated"))
 
 
 @pytest.mark.skipif(why_not() is not None, reason=f"no native kernel here: {why_not()}")

@@ -5,22 +5,31 @@ Algorithms train on it unchanged, and their policies are evaluated.
 
 from __future__ import annotations
 
+import json
 import warnings
 
 import numpy as np
 import pytest
+import torch
 
 sb3_contrib = pytest.importorskip("sb3_contrib", reason="the extra sb3 is not installed")
 
 # ruff: noqa: E402 - behind the skip
+import gymnasium
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import (
+    VecCheckNan,
+    VecFrameStack,
+    VecNormalize,
+)
+from torchrl.envs.transforms import ObservationNorm, RewardScaling
 
 import ganlane
 import ganlane.sb3
 from ganlane.errors import UserError
+from ganlane.evaluation import episodes as evaluation_of_episodes
 from ganlane.gym.vector import HighwayVectorGym
 
 ROWS = 4
@@ -29,12 +38,26 @@ SHORT = {"goal_m": 150.0}
 QUICK = {
     PPO: {"n_steps": 16, "batch_size": 32},
     sb3_contrib.MaskablePPO: {"n_steps": 16, "batch_size": 32},
+    sb3_contrib.RecurrentPPO: {
+        "n_steps": 16,
+        "batch_size": 32,
+        "policy_kwargs": {"lstm_hidden_size": 8},
+    },
     DQN: {"learning_starts": 32, "batch_size": 16, "buffer_size": 500},
 }
+#: Episodes of a comparison, one or two in each row.
+EPISODES = 7
+#: Dense traffic and a desired speed far above it, so that drivers differ in what they earn.
+BUSY = {"goal_m": 400.0, "stream": "report", "seed": 3}
 
 
 def short_episodes(**options):
     return ganlane.sb3.make_vec_env("idm", num_envs=ROWS, **{"seed": 0, **SHORT, **options})
+
+
+def untrained(algorithm, env):
+    policy = "MlpLstmPolicy" if algorithm is sb3_contrib.RecurrentPPO else "MlpPolicy"
+    return algorithm(policy, env, seed=0, device="cpu", **QUICK[algorithm])
 
 
 def drive(env, steps):
@@ -136,7 +159,7 @@ def test_the_algorithm_trains_unchanged_and_its_policy_can_be_evaluated(algorith
     env = short_episodes(mask="safe")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        model = algorithm("MlpPolicy", env, seed=0, device="cpu", **QUICK[algorithm]).learn(128)
+        model = untrained(algorithm, env).learn(128)
         if algorithm is not sb3_contrib.MaskablePPO:
             returns, lengths = evaluate_policy(
                 model, short_episodes(), n_eval_episodes=4, return_episode_rewards=True
@@ -148,3 +171,185 @@ def test_the_algorithm_trains_unchanged_and_its_policy_can_be_evaluated(algorith
     assert table["agent"].to_list() == [algorithm.__name__.lower(), "mobil"]
     assert table["episodes"].to_list() == [3, 3]
     assert table["out_of_road"].to_list() == [0, 0]
+
+
+def busy_highways(**options):
+    return ganlane.sb3.make_vec_env("idm_mobil", num_envs=ROWS, **{**BUSY, **options})
+
+
+def sharp(model):
+    """``model`` with large random weights: it takes all actions, by what it reads."""
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator))
+    return model
+
+
+def returns_in_the_own_loop(model, env):
+    """Returns of the episodes 0 to EPISODES - 1, as stable-baselines3's documentation drives."""
+    if isinstance(env, VecNormalize):
+        env.training = False
+    env.seed(BUSY["seed"])
+    observation = env.reset()
+    state, start = None, np.ones(ROWS, dtype=bool)
+    returns = {}
+    while not set(range(EPISODES)) <= returns.keys():
+        masks = {}
+        if isinstance(model, sb3_contrib.MaskablePPO):
+            masks["action_masks"] = np.stack(env.env_method("action_masks"))
+        action, state = model.predict(observation, state, start, deterministic=True, **masks)
+        observation, _, start, infos = env.step(action)
+        for info in infos:
+            if info:
+                returns[info["episode_number"]] = info["episode"]["r"]
+    return [returns[number] for number in range(EPISODES)]
+
+
+def returns_in_the_evaluation(driver, **options):
+    keys = {**BUSY, "num_envs": ROWS, **options}
+    table = ganlane.api.evaluate([driver], ["idm_mobil"], EPISODES, per_episode=True, **keys)
+    return table.sort("episode")["reward"].to_list()
+
+
+def normalised(env):
+    """Behind statistics that are far from 0 and 1."""
+    env = VecNormalize(env, clip_obs=2.0)
+    env.reset()
+    for action in np.random.default_rng(0).integers(0, 3, (50, ROWS)):
+        env.step(action)
+    return env
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "options", "wrap"),
+    [
+        (PPO, {}, None),
+        (PPO, {"observation": "table3_progress"}, None),
+        (PPO, {"observation": {"name": "table3_progress", "range_m": 60.0}}, VecCheckNan),
+        (PPO, {}, normalised),
+        (PPO, {"mask": "safe"}, None),
+        (sb3_contrib.RecurrentPPO, {"observation": "table3_progress"}, normalised),
+        (sb3_contrib.MaskablePPO, {}, None),
+        (sb3_contrib.MaskablePPO, {"mask": "safe"}, None),
+    ],
+    ids=lambda part: getattr(part, "__name__", None),
+)
+def test_an_evaluation_prints_the_reward_of_the_users_own_loop(
+    algorithm, options, wrap, monkeypatch
+):
+    # Running episodes move to smaller batches as early as they may.
+    monkeypatch.setattr(evaluation_of_episodes, "SMALL_BATCH", 1)
+    env = busy_highways(**options)
+    env = wrap(env) if wrap else env
+    model = sharp(untrained(algorithm, env))
+    expected = returns_in_the_own_loop(model, env)
+    assert np.ptp(expected) > 1.0
+    driver = ganlane.sb3.driver(model)
+    # In as many rows as the loop has, and in another number of them.
+    for rows in (ROWS, 3):
+        printed = returns_in_the_evaluation(driver, num_envs=rows)
+        assert printed == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_single_environment_of_gymnasium_says_what_the_model_reads():
+    options = {"observation": "table3_progress", **SHORT}
+    model = untrained(DQN, gymnasium.make("ganlane/Highway-v0", **options))
+    assert ganlane.sb3.driver(model).observation.form == "table3_progress"
+
+
+@pytest.mark.parametrize(
+    ("name", "make"),
+    [
+        ("VecFrameStack", lambda: VecFrameStack(short_episodes(), 2)),
+        ("VecNormalize", lambda: VecNormalize(VecNormalize(short_episodes()))),
+        ("ObservationNorm", lambda: short_episodes(transforms=[halved()])),
+        (
+            "FlattenObservation",
+            lambda: gymnasium.wrappers.FlattenObservation(gymnasium.make("ganlane/Highway-v0")),
+        ),
+        ("CartPoleEnv", lambda: gymnasium.make("CartPole-v1")),
+    ],
+)
+def test_what_a_driver_cannot_repeat_is_refused_by_name(name, make):
+    model = DQN("MlpPolicy", make(), device="cpu", **QUICK[DQN])
+    with pytest.raises(UserError, match=f"{name} stands between"):
+        ganlane.sb3.driver(model)
+
+
+def test_a_masked_model_that_could_turn_back_without_a_mask_is_refused():
+    env = short_episodes(env={"ego": {"abort_lane_change": True}})
+    with pytest.raises(UserError, match="train it with mask='legal'"):
+        ganlane.sb3.driver(untrained(sb3_contrib.MaskablePPO, env))
+
+
+def halved():
+    return ObservationNorm(0.0, 0.5, in_keys=["observation"])
+
+
+def test_a_transform_of_the_reward_alone_is_none_of_the_drivers_business():
+    env = short_episodes(transforms=[RewardScaling(0.0, 0.1)])
+    assert ganlane.sb3.driver(untrained(PPO, env)).observation.form == "lane_view_overlap"
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "options", "wrap"),
+    [
+        (PPO, {"observation": "table3_progress"}, normalised),
+        (sb3_contrib.MaskablePPO, {"mask": {"name": "safe", "safe_deceleration": 3.0}}, None),
+    ],
+    ids=lambda part: getattr(part, "__name__", None),
+)
+def test_a_stored_driver_drives_as_before(algorithm, options, wrap, tmp_path):
+    env = busy_highways(**options)
+    env = wrap(env) if wrap else env
+    driver = ganlane.sb3.driver(sharp(untrained(algorithm, env)))
+    driver.save(tmp_path / "ppo")
+    assert {path.name for path in tmp_path.iterdir()} == {"ppo.zip", "ppo.zip.json"}
+    model = algorithm.load(tmp_path / "ppo")
+    again = ganlane.sb3.driver(model, "again", stored=tmp_path / "ppo")
+    assert (again.name, again.observation, again.mask) == ("again", driver.observation, driver.mask)
+    expected = returns_in_the_evaluation(driver)
+    assert returns_in_the_evaluation(again) == expected
+    # And once more from what was loaded.
+    again.save(tmp_path / "copy.zip")
+    text = (tmp_path / "ppo.zip.json").read_text()
+    reads = json.loads(text)["reads"]
+    assert json.loads((tmp_path / "copy.zip.json").read_text())["reads"] == reads
+
+
+def test_a_model_of_which_nothing_says_what_it_reads_is_refused(tmp_path):
+    model = untrained(PPO, short_episodes())
+    ganlane.sb3.driver(model).save(tmp_path / "ppo.zip")
+    loaded = PPO.load(tmp_path / "ppo.zip")
+    with pytest.raises(UserError, match=r"PPO has no environment.*PPO\.load\(path, env="):
+        ganlane.sb3.driver(loaded)
+    description = tmp_path / "ppo.zip.json"
+    text = description.read_text()
+    for damaged in (
+        text.replace("200.0", "100.0"),
+        text.replace("ganlane sha256", "nothing"),
+        text[:50],
+        "[" * 100_000,
+        "3",
+    ):
+        description.write_text(damaged)
+        with pytest.raises(UserError, match=r"ppo\.zip\.json: "):
+            ganlane.sb3.driver(loaded, stored=tmp_path / "ppo")
+    description.write_text(text)
+    model.learn(64)
+    model.save(tmp_path / "ppo.zip")
+    with pytest.raises(UserError, match=r"for another model than ppo\.zip is now"):
+        ganlane.sb3.driver(loaded, stored=tmp_path / "ppo")
+    with pytest.raises(UserError, match=r"none\.zip\.json: .*No such file"):
+        ganlane.sb3.driver(loaded, stored=tmp_path / "none")
+
+
+def test_an_environment_that_does_not_fit_the_model_is_refused_in_one_sentence():
+    table = {"observation": "table3"}
+    driver = ganlane.sb3.driver(untrained(PPO, short_episodes(**table)))
+    with pytest.raises(UserError, match=r"PPO: it reads observations of shape \[\d+\], but"):
+        ganlane.api.evaluate([driver], ["idm"], 2, vehicles=5, **SHORT)
+    masked = ganlane.sb3.driver(untrained(sb3_contrib.MaskablePPO, short_episodes()))
+    with pytest.raises(UserError, match="no action_mask"):
+        ganlane.make_env("idm").rollout(2, masked.policy)

@@ -154,16 +154,22 @@ class MaskedPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action``."""
-        mask = tensordict.get(keys.ACTION_MASK, None)
-        if mask is None:
-            raise UserError(
-                "this driver chooses among allowed actions, but the environment has no "
-                "action_mask; make it with mask='safe' or 'legal'."
-            )
+        mask = mask_in(tensordict)
         action = self.policy(tensordict).get(keys.ACTION)
         # whether the policy's own choice is among the allowed ones
         allowed = mask.gather(1, action[:, None])[:, 0]
         return tensordict.set(keys.ACTION, torch.where(allowed, action, keys.KEEP))
+
+
+def mask_in(tensordict: TensorDictBase) -> Tensor:
+    """The environment's ``action_mask`` [N, 3] bool; raises :class:`UserError` if it has none."""
+    mask = tensordict.get(keys.ACTION_MASK, None)
+    if mask is None:
+        raise UserError(
+            "this driver chooses among allowed actions, but the environment has no "
+            "action_mask; make it with mask='safe' or 'legal'."
+        )
+    return mask
 
 
 class Driver(TensorDictModuleBase):

@@ -30,6 +30,7 @@ from ganlane.env.state import (
     usable_device,
 )
 from ganlane.errors import UserError
+from ganlane.native.drivers import pays
 from ganlane.native.library import torch_on_one_thread, why_not
 from ganlane.native.tensors import Kernel, NativeScenes
 from ganlane.settings.driving import EgoParameters, IdmParameters, Visibility
@@ -165,7 +166,9 @@ class HighwayEnv(EnvBase):
         self._must_be_native = kernel == "native"
         self._native_scenes: NativeScenes | None = None
         if self.kernel is not None and type(self.scenes) is RandomScenes:
-            self._native_scenes = NativeScenes(self.scenes, self.stream)
+            self._native_scenes = NativeScenes(
+                self.scenes, self.stream, self.traffic.native_drivers()
+            )
         self._make_specs()
 
     def _default_scenes(self, vehicles: int) -> Scenes:
@@ -232,6 +235,10 @@ class HighwayEnv(EnvBase):
         self.reward_spec = Unbounded(shape=(n, 1), dtype=self.dtype, device=device)
         self.done_spec = done_spec(n).to(device)
 
+    def to(self, device: torch.device | str) -> HighwayEnv:
+        """On another device; raises :class:`UserError` where there is none such."""
+        return super().to(usable_device(device, self.dtype))
+
     def compile(self, **kwargs: Any) -> HighwayEnv:
         """Compile physics and traffic to several small graphs; returns the environment.
 
@@ -250,6 +257,11 @@ class HighwayEnv(EnvBase):
         self.physics.compile()
         self.traffic.compile_graphs()
         return self
+
+    @property
+    def runs_graphs(self) -> bool:
+        """Whether a step runs compiled graphs: not where the kernel drives."""
+        return self.physics.compiled and self.kernel is None
 
     def _set_seed(self, seed: int | None) -> None:
         self._seed = 0 if seed is None else seed_number(seed)
@@ -433,7 +445,7 @@ class HighwayEnv(EnvBase):
 
         The kernel drives it once more, in decisions of one physics step, which gives the same bits.
         """
-        drivers = self.traffic.native_parameters()
+        drivers = self.traffic.native_drivers()
         assert drivers is not None
         episode = replace(self.episode, decision_period_s=keys.PHYSICS_STEP_S)
         # Steps of 0.1 s instead of a decision period; nothing else differs.
@@ -442,7 +454,7 @@ class HighwayEnv(EnvBase):
             self.vehicles,
             episode,
             self.ego,
-            *drivers,
+            drivers,
         )
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         running = torch.ones_like(action, dtype=torch.bool)
@@ -473,11 +485,13 @@ class HighwayEnv(EnvBase):
         if wanted == "torch":
             return None
         # What the kernel cannot do, as the end of a sentence.
-        drivers = self.traffic.native_parameters()
+        drivers = self.traffic.native_drivers()
         reason = None
         if drivers is None:
             name = type(self.traffic).__name__
-            reason = f"drives the traffics idm and idm_mobil alone, not {name}"
+            reason = f"drives idm, idm_mobil, gan and gan_calibrated alone, not {name}"
+        elif wanted == "auto" and not pays(drivers):
+            reason = "is slow with generated traffic on a processor without FMA"
         elif self.device.type != "cpu" or self.dtype != torch.float32:
             reason = f"runs on a CPU in float32, not on {self.device} in {self.dtype}"
         elif self.road.ring_m is not None:
@@ -494,7 +508,7 @@ class HighwayEnv(EnvBase):
                 self.vehicles,
                 self.episode,
                 self.ego,
-                *drivers,
+                drivers,
             )
         if wanted == "native":
             raise UserError(f"env.kernel=native {reason or missing}; set env.kernel=torch.")

@@ -32,6 +32,9 @@ from ganlane.sim.state import STRAIGHT, Road, Vehicles
 CHECK_EVERY = 8
 #: A batch of at most so many rows is not made smaller: fewer are hardly faster.
 SMALL_BATCH = 16
+#: A batch is made smaller when at most this share of its rows still drives. To make one takes about
+#: as long as 20 rows of generated traffic drive a decision.
+LARGEST_SHARE = 0.9
 #: The reason of an episode that something outside the environment ended (a user's own transform).
 OTHER = "other"
 #: What is read from the last state of an episode.
@@ -60,8 +63,9 @@ def run_episodes(
         policy: writes ``action``; reads the observation or the raw state.
         episodes: their numbers.
         on_progress: called now and then with (episodes finished, episodes in all).
-        make_smaller: makes ``env`` with fewer rows; the last episodes move there when at most half
-            of the rows are still driving. Not used where something is held per row: by traffic with
+        make_smaller: makes ``env`` with fewer rows; the last episodes move there when at most
+            :data:`LARGEST_SHARE` of the rows are still driving. Not used where physics are graphs,
+            which are of one batch size, nor where something is held per row: by traffic with
             ``rows_must_stay``, and by every policy without ``rows_must_stay = False``.
         actions: whether to return the column ``actions``, too.
 
@@ -170,6 +174,8 @@ class _Evaluation:
             False,
         )
         may_move = not rows_stay and not getattr(policy, "rows_must_stay", True)
+        # TorchRL's environments hand attributes on to what they wrap.
+        may_move = may_move and not getattr(env, "runs_graphs", False)
         self.env = env
         self.policy = policy
         self.taken = taken
@@ -271,8 +277,8 @@ class _Evaluation:
         """
         driving = self.driving.nonzero()[:, 0]
         rows = self.env.batch_size[0]
-        # Nothing is left to hand out, and most rows are spare: a smaller batch is faster.
-        wide = rows > SMALL_BATCH and 2 * len(driving) <= rows
+        # Nothing is left to hand out, and rows are spare: a smaller batch is faster.
+        wide = rows > SMALL_BATCH and len(driving) <= LARGEST_SHARE * rows
         if wide and self.handed_out == self.total and self.make_smaller is not None:
             self.env = self.make_smaller(len(driving))
             self._keep(driving)

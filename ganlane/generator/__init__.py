@@ -12,17 +12,7 @@ Read in this order:
   ablations.
 """
 
-from ganlane.generator.checkpoint import (
-    FitResult,
-    Preset,
-    load_generator,
-    shipped_generator,
-)
-from ganlane.generator.closed_loop import (
-    ANCHOR,
-    AnchorParameters,
-    headway_quantiles,
-)
+from ganlane.generator.checkpoint import FitResult, load_generator
 from ganlane.generator.fit import (
     HELD_OUT,
     ablate,
@@ -34,12 +24,15 @@ from ganlane.generator.fit import (
 from ganlane.generator.networks import Discriminator, Generator
 from ganlane.generator.tasks import Progress
 from ganlane.generator.windows import scene_tracks
+from ganlane.settings.generated import ANCHOR, AnchorParameters
 from ganlane.settings.generator import (
     CalibratedConfig,
     GeneratorSizes,
     LoopConfig,
     LossWeights,
     PaperConfig,
+    Preset,
+    shipped_generator,
 )
 
 __all__ = [
@@ -60,7 +53,6 @@ __all__ = [
     "assign_folds",
     "cross_validate",
     "fit_generator",
-    "headway_quantiles",
     "load_generator",
     "scene_tracks",
     "shipped_generator",

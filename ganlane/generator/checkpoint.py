@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import torch
 
 from ganlane._version import __version__
-from ganlane.errors import ParameterError, UserError
-from ganlane.files import CHECKPOINTS
+from ganlane.errors import UserError
 from ganlane.generator.networks import Generator
 from ganlane.settings.generator import (
-    EXTRA_INPUTS,
+    GENERATOR,
     FitConfig,
-    GeneratorSizes,
     Preset,
+    stored_sizes,
 )
 from ganlane.weights import load_weights, save_weights
 
-#: Written into the file; weights of another kind, such as an agent's, are refused by it.
-KIND = "generator"
 #: ``{"all" or scene: {"ERROR/KIND": value}}``.
 Metrics = dict[str, dict[str, float]]
 
@@ -80,15 +77,10 @@ class FitResult:
         }
         save_weights(
             path,
-            KIND,
+            GENERATOR,
             self.module.state_dict(),
             metadata,
         )
-
-
-def shipped_generator(preset: Preset) -> Path:
-    """Path of the weights that come with the package."""
-    return CHECKPOINTS / f"generator_{preset}.safetensors"
 
 
 def load_generator(
@@ -103,15 +95,11 @@ def load_generator(
         UserError: no such file, another kind of file, another preset, or weights that do not fit
             the stored sizes.
     """
-    tensors, metadata = load_weights(path, KIND)
-    # str, since a foreign file may hold anything under this name.
-    stored = str(metadata.get("preset"))
-    if stored not in get_args(Preset) or (preset is not None and stored != preset):
-        expected = preset or "paper or calibrated"
-        raise UserError(
-            f"{path}: a generator of preset {stored!r}, expected {expected!r}; give one."
-        )
-    generator = _sized_generator(path, metadata.get("sizes"))
+    tensors, metadata = load_weights(path, GENERATOR)
+    sizes = stored_sizes(path, metadata, preset)
+    # A file that is read must not change the caller's random numbers.
+    with torch.random.fork_rng(devices=[]):
+        generator = Generator(sizes)
     # Strict: a missing tensor or one too many is an error, too.
     try:
         generator.load_state_dict(tensors)
@@ -119,37 +107,5 @@ def load_generator(
         raise UserError(
             f"{path}: its weights do not have the shapes that its sizes ask for; fit it again."
         ) from error
-    # The presets differ in their inputs; weights of one would drive badly under the other's name.
-    inputs = generator.sizes.extra_inputs
-    needed = EXTRA_INPUTS if stored == "calibrated" else 0
-    if inputs != needed:
-        raise UserError(
-            f"{path}: takes {inputs} further inputs, expected {needed} for the preset {stored}; "
-            "fit it again."
-        )
-    # Traffic takes headways and lane changes from them, so weights alone cannot drive.
-    if not isinstance(metadata.get("driving_statistics"), dict):
-        raise UserError(f"{path}: holds no driving statistics of its recordings; fit it again.")
     # A generator that drives is not fitted further, and gradients would cost memory.
     return generator.eval().requires_grad_(False), metadata
-
-
-def _sized_generator(path: str | Path, sizes: Any) -> Generator:
-    """A generator of the stored ``sizes``; their ranges keep a file from requesting all memory."""
-    # The defaults tell the types, since a text or a float would fail only inside torch.
-    types = {field.name: type(field.default) for field in fields(GeneratorSizes)}
-    try:
-        if {name: type(size) for name, size in dict(sizes).items()} != types:
-            raise ValueError("other names or types")
-        # A file that is read must not change the caller's random numbers.
-        with torch.random.fork_rng(devices=[]):
-            return Generator(GeneratorSizes(**sizes))
-    except (
-        TypeError,
-        ValueError,
-        RuntimeError,
-        ParameterError,
-    ) as error:
-        raise UserError(
-            f"{path}: sizes {sizes} are not those of a generator ({sorted(types)}); fit it again."
-        ) from error

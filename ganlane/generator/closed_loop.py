@@ -24,14 +24,13 @@ recorded scenes the headway at which IDM is in balance, where it is known
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ganlane.data import DrivingStatistics
 from ganlane.generator.networks import Generator, Observation
 from ganlane.generator.windows import (
     OBSERVED_POSITIONS,
@@ -39,10 +38,15 @@ from ganlane.generator.windows import (
     Segments,
 )
 from ganlane.keys import PHYSICS_STEP_S
+from ganlane.settings.generated import (
+    ANCHOR,
+    HEADWAY_QUANTILES_S,
+    QUANTILE_LEVELS,
+    AnchorParameters,
+)
 from ganlane.settings.generator import CalibratedConfig
 from ganlane.sim.idm import (
     TABLE_V,
-    IdmParameters,
     following_acceleration,
 )
 from ganlane.sim.neighbours import (
@@ -59,11 +63,6 @@ STEEPEST = 0.3
 _MARGIN_M = 0.1
 #: Outward residuals fade over this distance before it, m.
 _FADE_M = 0.3
-#: Levels of the headway quantiles.
-QUANTILE_LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
-#: Quantiles of (gap - 2 m) / speed of recorded followers on US-101, s: the default where no
-#: statistics are given.
-HEADWAY_QUANTILES_S = (0.50, 0.93, 1.27, 1.93, 3.27)
 #: Lower bound of a recorded driver's headway, s.
 SHORTEST_HEADWAY_S = 0.1
 #: Desired speed above the present one, m/s: range drawn from in fitting, and the middle used in
@@ -235,32 +234,6 @@ def paper_step(
         history,
         plan,
     )
-
-
-@dataclass(frozen=True)
-class AnchorParameters:
-    """The anchor and the bounds of the residual; accelerations in m/s2.
-
-    Attributes:
-        idm: Table V; braking is limited to 8 m/s2, the grip of a dry road.
-        lane_stiffness: pull to the target lane's centre, 1/s2.
-        lane_damping: of the lateral velocity, 1/s; with the stiffness critically damped.
-        residual: largest residual along and across the road.
-        washout_s: time constant of the residual's mean, which is subtracted; infinite never does
-            (an ablation).
-        further_inputs: whether the network gets :func:`extra_inputs`; if not, they are 0 (an
-            ablation).
-    """
-
-    idm: IdmParameters = field(default_factory=lambda: IdmParameters(min_acceleration=-8.0))
-    lane_stiffness: float = 0.3
-    lane_damping: float = 1.1
-    residual: tuple[float, float] = (4.0, 2.0)
-    washout_s: float = CalibratedConfig.washout_s
-    further_inputs: bool = CalibratedConfig.further_inputs
-
-
-ANCHOR = AnchorParameters()
 
 
 class DriverMemory(NamedTuple):
@@ -476,14 +449,6 @@ def rollout(
         return moved
 
     return driven_positions(segments, desired_speed, move).unflatten(0, (samples, -1))
-
-
-def headway_quantiles(
-    statistics: Mapping[str, Any],
-) -> tuple[float, ...]:
-    """The 5, 25, 50, 75 and 95 % headways in s from a checkpoint's ``driving_statistics``."""
-    headway = DrivingStatistics.from_dict(statistics).headway
-    return tuple(headway.quantile(level) for level in QUANTILE_LEVELS)
 
 
 def headway_from_uniform(u: Tensor, quantiles_s: tuple[float, ...] = HEADWAY_QUANTILES_S) -> Tensor:

@@ -10,7 +10,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from ganlane.gym.native_rows import native_rows
 from ganlane.gym.rows import Rows
-from ganlane.settings.commands import highways
+from ganlane.settings.commands import HighwayConfig, highways
 
 
 def make_rows(
@@ -41,6 +41,16 @@ class OnRows:
 
     _rows: Rows
     _spec: EnvSpec | None = None
+
+    @property
+    def settings(self) -> HighwayConfig:
+        """What the highways were made with: traffic, observation, mask, ..."""
+        return self._rows.config
+
+    @property
+    def transforms(self) -> Sequence[Any]:
+        """TorchRL transforms of the user's own."""
+        return self._rows.transforms
 
     @property
     def spec(self) -> EnvSpec | None:

@@ -1,4 +1,4 @@
-"""Rule-driven traffic for gymnasium, by the native kernel and without torch."""
+"""Highways for gymnasium by the native kernel, without torch."""
 
 # ruff: noqa: D102 - Rows has the docstrings of the methods
 from __future__ import annotations
@@ -12,17 +12,19 @@ import numpy.typing as npt
 from ganlane import keys
 from ganlane.gym.rows import Flags, Floats, Integers, Rows, observation_space
 from ganlane.native.batch import NativeBatch, Stepped
+from ganlane.native.drivers import drivers_of, pays
 from ganlane.native.library import why_not
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.settings.commands import HighwayConfig
-from ganlane.settings.episode import EpisodeParameters, Stream
+from ganlane.settings.episode import Stream
 
 
 class NativeRows(Rows):
     """N highways by the native kernel."""
 
-    def __init__(self, batch: NativeBatch, episode: EpisodeParameters) -> None:
-        self.batch, self.count, self.episode = batch, batch.rows, episode
+    def __init__(self, batch: NativeBatch, config: HighwayConfig) -> None:
+        self.batch, self.count, self.config = batch, batch.rows, config
+        self.episode = config.env.episode_parameters()
         self.space = observation_space(batch.observation.shape[1], batch.bounds[1])
         # Made once, since they are views of arrays that the kernel writes to.
         state = batch.state
@@ -44,11 +46,11 @@ class NativeRows(Rows):
         for name in (*events, *keys.EVENT_COUNTS):
             self._arrays[name] = state[keys.EVENTS, name]
 
-    def __getstate__(self) -> tuple[NativeBatch, EpisodeParameters, bool]:
+    def __getstate__(self) -> tuple[NativeBatch, HighwayConfig, bool]:
         """Without the views, which a copy has of its own arrays."""
-        return self.batch, self.episode, self.started
+        return self.batch, self.config, self.started
 
-    def __setstate__(self, state: tuple[NativeBatch, EpisodeParameters, bool]) -> None:
+    def __setstate__(self, state: tuple[NativeBatch, HighwayConfig, bool]) -> None:
         self.__init__(*state[:2])  # type: ignore[misc]
         self.started = state[2]
 
@@ -78,10 +80,12 @@ def native_rows(config: HighwayConfig) -> NativeRows | None:
     """The highways of ``config`` by the kernel; None where it cannot drive them."""
     env = config.env
     observation = config.observation
+    stream = int(Stream.named(config.stream))
     # The traffic says who drives; the rest is what the kernel's observation and scenes can do.
-    drivers = config.traffic.native_parameters(env.idm, env.mobil)
+    drivers = drivers_of(config.traffic, env.idm, env.mobil, stream)
     if (
         drivers is None
+        or (env.kernel == "auto" and not pays(drivers))
         or env.kernel == "torch"
         or env.scene is not None
         or observation.form not in NATIVE_FORMS
@@ -91,7 +95,6 @@ def native_rows(config: HighwayConfig) -> NativeRows | None:
         or why_not() is not None
     ):
         return None
-    episode = env.episode_parameters()
     # By position, in the order of NativeBatch's arguments.
     batch = NativeBatch(
         config.num_envs,
@@ -100,12 +103,12 @@ def native_rows(config: HighwayConfig) -> NativeRows | None:
         env.vehicles,
         env.spawn_parameters(),
         env.ego,
-        episode,
-        *drivers,
+        env.episode_parameters(),
+        drivers,
         env.recycle_share if env.recycle else None,
         observation,
         config.reward,
         config.mask,
-        int(Stream.named(config.stream)),
+        stream,
     )
-    return NativeRows(batch, episode)
+    return NativeRows(batch, config)

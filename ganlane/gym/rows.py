@@ -9,7 +9,7 @@ TorchRL environment.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -19,6 +19,7 @@ from gymnasium.spaces import Box
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.native.batch import SPEED_RATIO_LIMIT, Stepped
+from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.episode import EpisodeParameters
 
 Floats = npt.NDArray[np.float32]
@@ -46,6 +47,8 @@ class Rows(ABC):
     Attributes:
         count: N.
         space: of one observation.
+        config: the settings of the highways.
+        transforms: a user's own, after observation and reward.
         episode: decision period and time limit.
         started: whether an episode is under way.
     """
@@ -54,6 +57,8 @@ class Rows(ABC):
     started = False
     count: int
     space: Box
+    config: HighwayConfig
+    transforms: Sequence[Any] = ()
     episode: EpisodeParameters
 
     @abstractmethod

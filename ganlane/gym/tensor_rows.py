@@ -35,6 +35,7 @@ class TensorRows(Rows):
     """
 
     def __init__(self, config: HighwayConfig, transforms: Sequence[Transform] = ()) -> None:
+        self.config, self.transforms = config, transforms
         self.env = make_highways(config)
         for transform in transforms:
             self.env.append_transform(transform)

@@ -22,12 +22,14 @@ struct Inputs {
     const float *x, *y, *heading, *speed, *acceleration, *length, *width, *desired_speed;
     const int64_t *target_lane, *visibility;
     const uint8_t* valid;
-    const float* steering;
+    const float* steering;  // null where the others are generated
     const float* ego_steering;
     const int64_t *change_direction, *decisions, *lane_changes;
     const uint8_t *soft_crash, *soft_crash_behind;
     const int64_t* step;
     const uint8_t* recycles;  // whether the row recycles its vehicles; null: none does
+    const int64_t *seed, *episode;
+    // and the memory of generated drivers (Memory of generated.hpp), here and in Outputs
 };
 
 struct Outputs {  // may be the same memory as the inputs

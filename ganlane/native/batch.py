@@ -17,9 +17,10 @@ import numpy.typing as npt
 
 from ganlane import keys
 from ganlane.native import settings
-from ganlane.native.library import addresses, in_threads, load
-from ganlane.native.settings import Key, fields
-from ganlane.settings.driving import EgoParameters, IdmParameters, MobilParameters, Visibility
+from ganlane.native.drivers import Drivers, RuleDrivers, generated_of
+from ganlane.native.library import BLOCK, ROWS_PER_THREAD, addresses, in_threads, load
+from ganlane.native.settings import Key, Layout, fields
+from ganlane.settings.driving import EgoParameters, Visibility
 from ganlane.settings.episode import EpisodeParameters, SpawnParameters
 from ganlane.settings.observation import (
     MaskParameters,
@@ -33,7 +34,7 @@ from ganlane.settings.observation import (
 SPEED_RATIO_LIMIT = 4.0
 #: The arrays of a batch beside those of the state.
 _ROW_ARRAYS: dict[Key, str] = {
-    **dict.fromkeys((keys.SEED, keys.EPISODE, keys.STEP, keys.ACTION), "int64"),
+    keys.ACTION: "int64",
     keys.REWARD: "float32",
     **dict.fromkeys(("recycles", "fresh"), "bool"),
 }
@@ -45,8 +46,6 @@ def _vehicles(names: str) -> list[Key]:
 
 # What a function of the kernel reads, in the order of its structure in C++. The ego perceives all
 # vehicles as they are: of what it sees and of what there is the view reads the same arrays.
-_DECIDES = [keys.ACTION, *settings.INPUTS, "recycles"]
-_STARTS = [keys.SEED, keys.EPISODE, "fresh", *settings.SCENE, "recycles"]
 _VIEWS = [
     *_vehicles("speed desired_speed length y x y speed valid"),
     (keys.EGO, "change_progress"),
@@ -85,15 +84,14 @@ class Stepped(NamedTuple):
 
 
 class NativeBatch:
-    """N highways with rule-driven traffic, from the random first scenes of Table II.
+    """N highways, from the random first scenes of Table II.
 
     Args:
         rows: N.
         lanes, lane_width_m: of the road.
         vehicles: M, the ego included.
         spawn, ego, episode: the first scene, what is special about the ego, and the episode's end.
-        idm: car following of all.
-        mobil: lane changes of the others; None: they keep their lanes.
+        drivers: the others, and how the ego follows; by default they keep their lanes.
         recycle_share: share of the episodes in which vehicles left behind return ahead; None: of
             none.
         observation: one of :data:`ganlane.native.settings.NATIVE_FORMS`, without sensor errors.
@@ -119,8 +117,7 @@ class NativeBatch:
         spawn: SpawnParameters | None = None,
         ego: EgoParameters | None = None,
         episode: EpisodeParameters | None = None,
-        idm: IdmParameters | None = None,
-        mobil: MobilParameters | None = None,
+        drivers: Drivers | None = None,
         recycle_share: float | None = None,
         observation: ObservationConfig | None = None,
         reward: RewardParameters | None = None,
@@ -133,7 +130,7 @@ class NativeBatch:
         spawn = spawn or SpawnParameters()
         ego = ego or EgoParameters()
         episode = episode or EpisodeParameters()
-        idm = idm or IdmParameters()
+        drivers = drivers or RuleDrivers()
         observation = observation or ObservationConfig()
         reward = reward or RewardParameters()
         mask = mask or MaskParameters()
@@ -146,9 +143,10 @@ class NativeBatch:
         self.bounds = (-1.0, largest_number(observation.form, spawn.longest_m))
         # All arrays of the state in place, written by the kernel and read by whoever asks.
         self.state: dict[Key, npt.NDArray[Any]] = {}
-        for name, kind in settings.VEHICLE_ARRAYS.items():
-            self.state[name] = np.zeros((rows, vehicles), kind)
-        for name, kind in (settings.EGO_ARRAYS | settings.EVENT_ARRAYS | _ROW_ARRAYS).items():
+        layout = Layout(drivers.memory())
+        for name, kind in layout.kinds.items():
+            self.state[name] = np.zeros(layout.shape(name, rows, vehicles), kind)
+        for name, kind in _ROW_ARRAYS.items():
             self.state[name] = np.zeros(rows, kind)
         self.observation = np.zeros((rows, view.numbers()), np.float32)
         self.mask = np.ones((rows, keys.ACTIONS), np.bool_)
@@ -156,28 +154,31 @@ class NativeBatch:
         self._no_safe_action = np.zeros(rows, np.bool_)
         self._library = load(variant)
         # When others see the ego's lane changes, and the ego theirs.
-        visible = (Visibility.named(ego.visibility), Visibility.SIGNALLED)
+        visible = (Visibility.named(ego.visibility), drivers.visibility)
+        self._generated = generated_of(drivers)
         # The kernel's structures, filled once.
         decision = settings.settings_of(
             *road,
             episode,
             ego,
-            idm,
-            mobil=mobil,
+            drivers.idm,
+            drivers.steering,
+            drivers.mobil,
+            self._generated,
         )
         deceleration = mask.safe_deceleration
         abort = ego.abort_lane_change
         # Referred to by this object, since the structure holds no more than their addresses.
         self._pointed = {
             "settings": decision,
-            "inputs": self._pointers(_DECIDES),
-            "outputs": self._pointers(settings.OUTPUTS),
+            "inputs": self._pointers(layout.inputs),
+            "outputs": self._pointers(layout.outputs),
             "spawn": settings.spawn_of(*road, spawn, stream, *visible, recycle_share),
-            "scene": self._pointers(_STARTS),
+            "scene": self._pointers(settings.STARTS),
             "reward_settings": settings.reward_of(reward, episode.decision_period_s),
             "view": view,
             "view_inputs": self._pointers(_VIEWS),
-            "mask_settings": settings.mask_of(*road, idm, deceleration, abort),
+            "mask_settings": settings.mask_of(*road, drivers.idm, deceleration, abort),
             "mask_inputs": self._pointers(_MASKS),
             "mask_outputs": addresses([self.mask, self._no_safe_action]),
         }
@@ -219,7 +220,7 @@ class NativeBatch:
         return [*self.state.values(), *written]
 
     def _pointers(self, names: Sequence[Key]) -> ctypes.Array[ctypes.c_void_p]:
-        return addresses([self.state[name] for name in names])
+        return addresses([self.state.get(name) for name in names])
 
     def start(
         self, seed: npt.ArrayLike, episode: npt.ArrayLike, rows: npt.NDArray[np.bool_] | None = None
@@ -245,7 +246,8 @@ class NativeBatch:
     def _in_threads(self, function: Callable[..., int]) -> None:
         batch = self._address
         # Rows are independent, so any split between threads gives the same numbers.
-        in_threads(self.rows, lambda first, last: function(batch, first, last))
+        rows_per_thread = ROWS_PER_THREAD if self._generated is None else BLOCK
+        in_threads(self.rows, lambda first, last: function(batch, first, last), rows_per_thread)
 
     def reward_terms(self) -> dict[str, npt.NDArray[np.float32]]:
         """The terms of the last reward by name, each [N]."""

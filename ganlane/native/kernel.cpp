@@ -8,9 +8,6 @@
 // nothing but + - * / and comparisons besides, an episode is the same bit for bit in any batch, with any LANES, on any
 // instruction set.
 //
-// Within a row the vehicles are kept in the order of the road, foremost first. Then one pass from the front finds
-// everybody's leader in every lane, and one from the rear everybody's follower: linear in the number of vehicles.
-//
 // How to read it. `Float` and `Mask` (vectors.hpp) hold LANES numbers and answers, one of each row; there is no `if`
 // on them, so `choose(mask, yes, no)` computes both and keeps, row by row, the one that holds. Integers (lanes, target
 // lanes, steps, indices) are floats here, exact below 2^24, so that they mix with the others. Read from the bottom:
@@ -20,322 +17,10 @@
 #include <stdlib.h>
 
 #include "arrays.hpp"
-#include "model.hpp"
+#include "generated.hpp"
 
 const float RECYCLE_RANGE = 200.0f, RECYCLE_DECELERATION = 4.0f, RECYCLE_SIDE = 0.4f;
-const int MOBIL_PERIOD = 10;
 enum { KEEP, LEFT, RIGHT };
-
-// ---- The vehicles of LANES rows, foremost first
-
-// The nearest vehicle met so far in a lane.
-struct Nearest {
-    Float x, half_length, speed, per_desired, index;
-};
-
-struct Rows {
-    int vehicles;
-    // State, [vehicles]; `index` is the place in the arrays, the ego's is 0. Visibility, lanes and flags as floats.
-    Float *x, *y, *heading, *speed, *acceleration, *half_length, *half_width, *per_desired, *target, *visibility;
-    Float *valid, *steering, *index;
-    // Follows from the state: slip angle, heading's sine and cosine, lateral half extent; the lowest and highest lane
-    // that the body is in, that the driver attends to, and in which others see the vehicle.
-    Float *slip, *slip_sine, *sine, *cosine, *extent, *body_low, *body_high, *low, *high, *seen_low, *seen_high;
-    // Of one physics step: acceleration by IDM; the lane change that MOBIL wishes.
-    Float *following, *wish, *kept;
-    // MOBIL's neighbours in the own, left and right lane: [3][vehicles].
-    Float *gap_ahead, *speed_ahead, *gap_behind, *speed_behind, *per_desired_behind;
-    Nearest* nearest;  // [lanes]
-    // Of the rows: whether they go on, physics steps since MOBIL's last decision and in all, and the ego's events.
-    Mask running, ahead, behind, crash, goal;
-    Float phase, step, onsets, onsets_behind;
-};
-
-const int STATE_FIELDS = 13, VEHICLE_FIELDS = 27, MOBIL_FIELDS = 5;
-
-static size_t scratch_floats(const Settings& s) {
-    return (size_t)s.vehicles * (VEHICLE_FIELDS + 3 * MOBIL_FIELDS) + 5 * (size_t)s.lanes;
-}
-
-static void lay_out(Rows& rows, Float* scratch, const Settings& s) {
-    rows.vehicles = s.vehicles;
-    Float** fields[VEHICLE_FIELDS] = {
-        &rows.x, &rows.y, &rows.heading, &rows.speed, &rows.acceleration, &rows.half_length, &rows.half_width,
-        &rows.per_desired, &rows.target, &rows.visibility, &rows.valid, &rows.steering, &rows.index,
-        &rows.slip, &rows.slip_sine, &rows.sine, &rows.cosine, &rows.extent, &rows.body_low, &rows.body_high, &rows.low, &rows.high,
-        &rows.seen_low, &rows.seen_high, &rows.following, &rows.wish, &rows.kept,
-    };
-    for (Float** field : fields) *field = scratch, scratch += s.vehicles;
-    Float** neighbours[MOBIL_FIELDS] = {
-        &rows.gap_ahead, &rows.speed_ahead, &rows.gap_behind, &rows.speed_behind, &rows.per_desired_behind,
-    };
-    for (Float** field : neighbours) *field = scratch, scratch += 3 * s.vehicles;
-    rows.nearest = (Nearest*)scratch;
-}
-
-INLINE Mask is_ego(const Rows& r, int i) { return r.index[i] == 0.0f; }
-
-// Exchange two vehicles where `mask` holds; what follows from the state is computed anew afterwards, but for the slip
-// angle and its sine: they follow from the steering alone, which `drive` has at hand and find_lanes does not need.
-static inline void exchange(Rows& r, int i, int j, Mask mask) {
-    Float* fields[STATE_FIELDS + 2] = {r.x, r.y, r.heading, r.speed, r.acceleration, r.half_length, r.half_width,
-                                       r.per_desired, r.target, r.visibility, r.valid, r.steering, r.index, r.slip, r.slip_sine};
-    for (Float* field : fields) {
-        Float first = field[i], second = field[j];
-        field[i] = choose(mask, second, first);
-        field[j] = choose(mask, first, second);
-    }
-}
-
-// Foremost first; of two at the same place the one with the lower index. A bubble sort, since few overtake within
-// 0.1 s: mostly one pass of comparisons, and what lies behind the last exchange is in order.
-static inline void put_in_order(Rows& r) {
-    for (int last = r.vehicles - 1; last > 0;) {
-        int exchanged = 0;
-        for (int i = 0; i < last; i++) {
-            Mask wrong = (r.x[i] < r.x[i + 1]) | ((r.x[i] == r.x[i + 1]) & (r.index[i] > r.index[i + 1]));
-            if (any(wrong)) exchange(r, i, i + 1, wrong), exchanged = i;
-        }
-        last = exchanged;
-    }
-}
-
-// ---- Who is in which lane
-
-static inline void find_lanes(const Settings& s, Rows& r) {
-    for (int i = 0; i < r.vehicles; i++) {
-        sincos_of(r.heading[i], r.sine[i], r.cosine[i]);
-        LanesOf l = lanes_of(s, r.y[i], r.sine[i], r.cosine[i], r.half_length[i], r.half_width[i], r.target[i],
-                             r.visibility[i], r.valid[i] != 0.0f);
-        r.extent[i] = l.extent;
-        r.body_low[i] = l.body_low, r.body_high[i] = l.body_high, r.low[i] = l.low, r.high[i] = l.high;
-        r.seen_low[i] = l.seen_low, r.seen_high[i] = l.seen_high;
-    }
-}
-
-INLINE Mask seen_in(const Rows& r, int i, Float lane) { return (r.seen_low[i] <= lane) & (lane <= r.seen_high[i]); }
-
-INLINE Nearest nobody_at(float x, Float speed) { return {filled(x), filled(0.0f), speed, filled(1.0f), filled(0.0f)}; }
-
-static inline void nobody_met(const Settings& s, Rows& r, float x) {
-    for (int lane = 0; lane < s.lanes; lane++) r.nearest[lane] = nobody_at(x, filled(0.0f));
-}
-
-// On the way from the front: vehicle i is the nearest in the lanes it is seen in, unless the rear of a longer one
-// ahead reaches further back. Of two at the same gap the slower one counts.
-INLINE void meet_from_front(const Settings& s, Rows& r, int i) {
-    for (int lane = 0; lane < s.lanes; lane++) {
-        Nearest& n = r.nearest[lane];
-        Float nearer = (n.x - r.x[i]) + (r.half_length[i] - n.half_length);
-        Mask here = seen_in(r, i, filled((float)lane)) & ((nearer > 0.0f) | ((nearer == 0.0f) & (r.speed[i] < n.speed)));
-        n.x = choose(here, r.x[i], n.x);
-        n.half_length = choose(here, r.half_length[i], n.half_length);
-        n.speed = choose(here, r.speed[i], n.speed);
-    }
-}
-
-// On the way from the rear; of two at the same gap the one with the lower index counts.
-INLINE void meet_from_rear(const Settings& s, Rows& r, int i) {
-    for (int lane = 0; lane < s.lanes; lane++) {
-        Nearest& n = r.nearest[lane];
-        Float nearer = (r.x[i] - n.x) + (r.half_length[i] - n.half_length);
-        Mask here = seen_in(r, i, filled((float)lane)) & ((nearer > 0.0f) | ((nearer == 0.0f) & (r.index[i] < n.index)));
-        n.x = choose(here, r.x[i], n.x);
-        n.half_length = choose(here, r.half_length[i], n.half_length);
-        n.speed = choose(here, r.speed[i], n.speed);
-        n.per_desired = choose(here, r.per_desired[i], n.per_desired);
-        n.index = choose(here, r.index[i], n.index);
-    }
-}
-
-// The nearest met so far in the lane that each row has its own number of; `nobody` where the road has no such lane.
-// A vector's rows may ask for different lanes, so all lanes are looked at, and each row keeps its own.
-INLINE Nearest nearest_in(const Settings& s, const Rows& r, Float lane, Nearest nobody, int first = 0) {
-    Nearest n = nobody;
-    for (int k = first; k < s.lanes; k++) {
-        Mask here = lane == (float)k;
-        n.x = choose(here, r.nearest[k].x, n.x);
-        n.half_length = choose(here, r.nearest[k].half_length, n.half_length);
-        n.speed = choose(here, r.nearest[k].speed, n.speed);
-        n.per_desired = choose(here, r.nearest[k].per_desired, n.per_desired);
-    }
-    return n;
-}
-
-INLINE Float gap_ahead(const Rows& r, int i, Float x, Float half_length) {
-    return smaller((x - r.x[i]) - (r.half_length[i] + half_length), filled(FREE_GAP));
-}
-
-// ---- Car following: the smallest IDM acceleration over the lanes that the driver attends to
-
-static inline void follow(const Settings& s, Rows& r) {
-    nobody_met(s, r, NOBODY_M);
-    for (int i = 0; i < r.vehicles; i++) {
-        Float speed = r.speed[i], low = r.low[i], high = r.high[i];
-        Float strongest = filled(0.0f);
-        if (!any(low != high)) {
-            // Nobody in any row is in two lanes, as nearly always: one lane each.
-            Nearest n = nearest_in(s, r, low, r.nearest[0], 1);
-            Float gap = gap_ahead(r, i, n.x, n.half_length);
-            strongest = interaction(s, speed, gap, choose(gap < FREE_GAP, n.speed, speed));
-        } else {
-            Float middle = smaller(low + 1.0f, high);
-            for (int lane = 0; lane < s.lanes; lane++) {
-                float number = (float)lane;
-                Mask here = (low == number) | (middle == number) | (high == number);
-                if (!any(here)) continue;
-                const Nearest& n = r.nearest[lane];
-                Float gap = gap_ahead(r, i, n.x, n.half_length);
-                Float force = interaction(s, speed, gap, choose(gap < FREE_GAP, n.speed, speed));
-                strongest = choose(here, larger(strongest, force), strongest);
-            }
-        }
-        r.following[i] = limited(s, free_road(speed, r.per_desired[i]), strongest);
-        meet_from_front(s, r, i);
-    }
-}
-
-// ---- MOBIL
-
-// Leader and follower of everybody in the own lane, to the left and to the right.
-static inline void find_neighbours(const Settings& s, Rows& r) {
-    const float SIDES[3] = {0.0f, 1.0f, -1.0f};
-    nobody_met(s, r, NOBODY_M);
-    for (int i = 0; i < r.vehicles; i++) {
-        for (int side = 0; side < 3; side++) {
-            Nearest n = nearest_in(s, r, r.target[i] + SIDES[side], nobody_at(NOBODY_M, r.speed[i]));
-            Float gap = gap_ahead(r, i, n.x, n.half_length);
-            r.gap_ahead[side * r.vehicles + i] = gap;
-            r.speed_ahead[side * r.vehicles + i] = choose(gap < FREE_GAP, n.speed, r.speed[i]);
-        }
-        meet_from_front(s, r, i);
-    }
-    nobody_met(s, r, -NOBODY_M);
-    for (int i = r.vehicles - 1; i >= 0; i--) {
-        for (int side = 0; side < 3; side++) {
-            Nearest n = nearest_in(s, r, r.target[i] + SIDES[side], nobody_at(-NOBODY_M, r.speed[i]));
-            Float gap = (r.x[i] - n.x) - (r.half_length[i] + n.half_length);
-            r.gap_behind[side * r.vehicles + i] = smaller(gap, filled(FREE_GAP));
-            r.speed_behind[side * r.vehicles + i] = n.speed;
-            r.per_desired_behind[side * r.vehicles + i] = n.per_desired;
-        }
-        meet_from_rear(s, r, i);
-    }
-}
-
-// Accelerations in a lane: the driver's own there; its follower's there with and without it, 0 without a follower.
-struct Prospect {
-    Float own, with_it, without;
-};
-
-INLINE Prospect prospect(const Settings& s, const Rows& r, int i, int side) {
-    int at = side * r.vehicles + i;
-    Float ahead = r.gap_ahead[at], behind = r.gap_behind[at], follower = r.speed_behind[at];
-    Float free = free_road(follower, r.per_desired_behind[at]);
-    Float with_it = limited(s, free, interaction(s, follower, behind, r.speed[i]));
-    Mask leads = ahead < FREE_GAP, follows = behind < FREE_GAP;
-    Float gap = choose(leads, behind + 2.0f * r.half_length[i] + ahead, filled(FREE_GAP));
-    Float without = limited(s, free, interaction(s, follower, gap, choose(leads, r.speed_ahead[at], follower)));
-    return {
-        idm(s, r.speed[i], r.per_desired[i], ahead, r.speed_ahead[at]),
-        choose(follows, with_it, filled(0.0f)),
-        choose(follows, without, filled(0.0f)),
-    };
-}
-
-// Below every incentive that can be.
-const float NEVER = -1e30f;
-
-// The incentive of a change, m/s2; NEVER where it does not pay, is unsafe or leaves the road.
-INLINE Float incentive(const Settings& s, const Prospect& here, const Prospect& there, Mask exists) {
-    Float gain = there.own - here.own + s.politeness_side * (there.with_it - there.without) +
-                 s.politeness_rear * (here.without - here.with_it);
-    Mask safe = smaller(there.with_it, there.own) >= -s.safe_deceleration;
-    return choose(exists & safe & (gain > s.threshold), gain, filled(NEVER));
-}
-
-// The change that MOBIL proposes to everybody but the ego: +1 left, -1 right, 0 none. Returns whether anybody wants.
-static inline bool find_wishes(const Settings& s, Rows& r, Mask due) {
-    find_neighbours(s, r);
-    Mask wanted = none();
-    for (int i = 0; i < r.vehicles; i++) {
-        Mask free = due & ~is_ego(r, i) & (r.valid[i] != 0.0f) &
-                    (absolute(r.y[i] - r.target[i] * s.lane_width) < ARRIVED);
-        r.wish[i] = filled(0.0f);
-        if (!any(free)) continue;
-        Prospect here = prospect(s, r, i, 0);
-        Float left = incentive(s, here, prospect(s, r, i, 1), r.target[i] + 1.0f <= (float)(s.lanes - 1));
-        Float right = incentive(s, here, prospect(s, r, i, 2), r.target[i] - 1.0f >= 0.0f);
-        Float side = choose(left >= right, filled(1.0f), filled(-1.0f));
-        Mask pays = free & (larger(left, right) > NEVER);
-        r.wish[i] = choose(pays, side, filled(0.0f));
-        wanted |= pays;
-    }
-    return any(wanted);
-}
-
-// Of several that want into one lane, only the foremost within `exclusive` m goes, or whom no other makes brake hard.
-static inline void one_at_a_time(const Settings& s, Rows& r) {
-    for (int i = 0; i < r.vehicles; i++) {
-        r.kept[i] = r.wish[i];
-        Mask wants = r.wish[i] != 0.0f, waits = none();
-        if (!any(wants)) continue;
-        Float lane = r.target[i] + r.wish[i];
-        for (int j = 0; j < i; j++) {
-            Mask rival = wants & (r.wish[j] != 0.0f) & (r.target[j] + r.wish[j] == lane);
-            if (!any(rival)) continue;
-            Float distance = r.x[j] - r.x[i];
-            Float demand = idm(s, r.speed[i], r.per_desired[i], gap_ahead(r, i, r.x[j], r.half_length[j]), r.speed[j]);
-            waits |= rival & ((distance < s.exclusive) | (demand < -s.safe_deceleration));
-        }
-        r.kept[i] = choose(waits, filled(0.0f), r.wish[i]);
-    }
-}
-
-static inline void change_lanes(const Settings& s, Rows& r, Mask due) {
-    if (!any(due) || !find_wishes(s, r, due)) return;
-    one_at_a_time(s, r);
-    for (int i = 0; i < r.vehicles; i++) r.target[i] = r.target[i] + r.kept[i];
-}
-
-// ---- Motion: two-point steering and the kinematic bicycle, in the rows that go on
-
-static inline void drive(const Settings& s, Rows& r) {
-    for (int i = 0; i < r.vehicles; i++) {
-        Float y = r.y[i], heading = r.heading[i], speed = r.speed[i], slip = r.slip[i];
-        // steering: ganlane.sim.dynamics.steer, with speed and distances inverted once, since a division takes as long
-        // as ten products. An invalid vehicle is driven as well: cheaper than to leave it out.
-        Float per_pace = 1.0f / larger(speed, filled(s.slow)), offset = r.target[i] * s.lane_width - y;
-        Float lateral_speed = speed * sine_of(heading + slip);
-        Float yaw_rate = speed * r.slip_sine[i] * (2.0f / WHEELBASE);
-        Float per_near = per_pace * s.per_near_s, per_far = per_pace * s.per_far_s;
-        Float slope_near = offset * per_near, slope_far = offset * per_far;
-        // d/dt atan(offset / distance) = -lateral_speed / (distance (1 + slope^2)), of both points over one divisor
-        Float near = 1.0f + slope_near * slope_near, far = 1.0f + slope_far * slope_far;
-        Float sideways = lateral_speed / (near * far);
-        Float rate_near = -(sideways * far * per_near) - yaw_rate, rate_far = -(sideways * near * per_far) - yaw_rate;
-        Float theta_near = arctangent(slope_near) - heading;
-        Float turn_wheel = s.gain_far * rate_far + s.gain_near * rate_near + s.gain_integral * theta_near * (speed * per_pace);
-        Float steering = r.steering[i] + WHEELBASE * per_pace * turn_wheel * PHYSICS_STEP;
-        steering = at_rest(between(steering, -s.max_angle, s.max_angle));
-        // bicycle: ganlane.sim.dynamics.advance
-        Float new_speed = larger(speed + r.following[i] * PHYSICS_STEP, filled(0.0f));
-        Float distance = 0.5f * (speed + new_speed) * PHYSICS_STEP;
-        Float new_slip = slip_of(steering), slip_sine = sine_of(new_slip);
-        Float turn = distance * slip_sine * (2.0f / WHEELBASE);
-        Float sine, cosine;
-        sincos_of(heading + new_slip + 0.5f * turn, sine, cosine);
-        Mask on = r.running;  // rows that have ended stay as they ended
-        r.x[i] = choose(on, r.x[i] + distance * cosine, r.x[i]);
-        r.y[i] = choose(on, at_rest(y + distance * sine), y);
-        r.heading[i] = choose(on, at_rest(heading + turn), heading);
-        r.speed[i] = choose(on, new_speed, speed);
-        r.acceleration[i] = choose(on, (new_speed - speed) * (1.0f / PHYSICS_STEP), r.acceleration[i]);
-        r.steering[i] = choose(on, steering, r.steering[i]);
-        r.slip[i] = choose(on, new_slip, slip);
-        r.slip_sine[i] = choose(on, slip_sine, r.slip_sine[i]);
-    }
-}
 
 // ---- The ego among the others
 
@@ -466,17 +151,25 @@ static inline void recycle(const Settings& s, Rows& r, Mask rows) {
 
 // ---- A decision
 
-static inline void decide(const Settings& s, Rows& r) {
+// `drivers`, if any, are generated; `ended(rows)` is called when rows end, before anything of them changes.
+template <class Ended>
+static inline void decide(const Settings& s, Rows& r, Crowd* drivers, Ended ended) {
     find_lanes(s, r);
     for (int substep = 0; substep < s.substeps && any(r.running); substep++) {
+        Mask running = r.running;
         // Everybody looks at the vehicles as they are before anybody moves: accelerations first, then lanes.
         follow(s, r);
-        if (s.mobil) change_lanes(s, r, r.running & (r.phase == 0.0f));
-        r.phase = choose(r.phase == (float)(MOBIL_PERIOD - 1), filled(0.0f), r.phase + 1.0f);
-        drive(s, r);
+        if (drivers) {
+            drive_generated(s, r, *drivers, substep);
+        } else {
+            if (s.mobil) change_lanes(s, r, r.running & (r.phase == 0.0f));
+            r.phase = choose(r.phase == (float)(MOBIL_PERIOD - 1), filled(0.0f), r.phase + 1.0f);
+            drive(s, r);
+        }
         put_in_order(r);
         find_lanes(s, r);
         note_events(s, r);
+        if (drivers) ended(running & ~r.running);
     }
 }
 
@@ -498,9 +191,6 @@ static Command obey(const Settings& s, const Inputs& in, long row) {
     if (off_road) wish = 0;
     return {wish ? wish : direction, target + wish, wish != 0, off_road, in.speed[row * s.vehicles], in.step[row]};
 }
-
-// One row's number of a vehicle: a vector seen as the array that it is.
-INLINE float& at(Float* field, int i, int lane) { return ((float*)(field + i))[lane]; }
 
 static void load(const Settings& s, const Inputs& in, Rows& r, long first, long rows, Command* commands) {
     for (int lane = 0; lane < LANES; lane++) {
@@ -534,7 +224,7 @@ static void load(const Settings& s, const Inputs& in, Rows& r, long first, long 
             at(r.target, i, lane) = (float)(index == 0 ? command.target : in.target_lane[from]);
             at(r.visibility, i, lane) = (float)in.visibility[from];
             at(r.valid, i, lane) = (float)(in.valid[from] != 0);
-            at(r.steering, i, lane) = index == 0 ? in.ego_steering[row] : in.steering[from];
+            at(r.steering, i, lane) = index == 0 ? in.ego_steering[row] : in.steering ? in.steering[from] : 0.0f;
         }
         r.running[lane] = lane < rows && !command.off_road ? -1 : 0;
         r.ahead[lane] = in.soft_crash[row] ? -1 : 0;
@@ -585,11 +275,33 @@ static void store(const Settings& s, const Inputs& in, Rows& r, const Outputs& o
             out.speed[to] = at(r.speed, i, lane);
             out.acceleration[to] = at(r.acceleration, i, lane);
             out.target_lane[to] = (int64_t)at(r.target, i, lane);
-            out.steering[to] = at(r.steering, i, lane);
+            if (out.steering) out.steering[to] = at(r.steering, i, lane);
+            if (index == 0) out.ego_steering[row] = at(r.steering, i, lane);
         }
-        out.ego_steering[row] = out.steering[start];
         store_ego(s, in, r, out, row, lane, commands[lane]);
     }
+}
+
+// Memory of one call, aligned to a vector's size, which its instructions ask for; null without memory.
+static void* scratch(size_t bytes) {
+    void* memory = nullptr;
+    return posix_memalign(&memory, 64, bytes) ? nullptr : memory;
+}
+
+template <class Arrays>
+static const Memory& memory_of(const Arrays* arrays) {
+    return *(const Memory*)(arrays + 1);
+}
+
+// Generated drivers as the rows from `first` on have them in the state.
+static void gather(Crowd& c, Rows& r, const Inputs& in, int64_t stream, long first, long rows) {
+    c.environments = (int)rows;
+    for (int lane = 0; lane < LANES; lane++) {
+        long row = first + (lane < rows ? lane : rows - 1);
+        c.episode_key[lane] = episode_key(stream, in.seed[row], in.episode[row]);
+        c.start_step[lane] = in.step[row];
+    }
+    load_memory(c, r, memory_of(&in), first);
 }
 
 // Drives the rows [first, last) through one decision. Returns 0, or 1 without memory, or 2 and drives none of them
@@ -598,17 +310,28 @@ extern "C" int ganlane_decide(const Settings* settings, const Inputs* in, const 
     const Settings& s = *settings;
     for (long row = first; row < last; row++)
         if ((uint64_t)in->action[row] > 2) return 2;
-    // One vector more than needed, to begin at a multiple of a vector's size, which its instructions ask for.
-    size_t bytes = scratch_floats(s) * sizeof(Float) + sizeof(Float);
-    void* memory = malloc(bytes);
+    size_t floats = scratch_floats(s) * LANES;
+    size_t more = s.generated ? crowd_floats(s.generated->network, s.vehicles) : 0;
+    float* memory = (float*)scratch((floats + more) * sizeof(float));
     if (!memory) return 1;
     Rows r;
-    lay_out(r, (Float*)(((uintptr_t)memory + sizeof(Float) - 1) / sizeof(Float) * sizeof(Float)), s);
+    lay_out(r, (Float*)memory, s);
+    r.memory_fields = !s.generated ? 0 : s.generated->calibrated ? 5 : 4;
+    Crowd crowd = {};
+    if (s.generated) crowd = crowd_in(memory + floats, s.generated, s.vehicles);
     Command commands[LANES];
     for (long row = first; row < last; row += LANES) {
         long rows = last - row < LANES ? last - row : LANES;
         load(s, *in, r, row, rows, commands);
-        decide(s, r);
+        if (s.generated) gather(crowd, r, *in, s.generated->stream, row, rows);
+        // The drivers of a row that ends remember nothing of what comes after.
+        auto keep = [&](Mask ended) {
+            for (int lane = 0; any(ended) && lane < rows; lane++)
+                if (ended[lane]) store_memory(crowd, r, memory_of(out), row + lane, lane);
+        };
+        if (s.generated) keep(~r.running);
+        decide(s, r, s.generated ? &crowd : nullptr, keep);
+        if (s.generated) keep(r.running);
         if (in->recycles) {
             Mask recycles = none();
             for (int lane = 0; lane < rows; lane++) recycles[lane] = in->recycles[row + lane] ? -1 : 0;
@@ -616,6 +339,21 @@ extern "C" int ganlane_decide(const Settings* settings, const Inputs* in, const 
         }
         store(s, *in, r, *out, row, rows, commands);
     }
+    free(memory);
+    return 0;
+}
+
+// Gives the generated drivers of those of the rows [first, last) that are `fresh` their first memory: after
+// ganlane_spawn. Returns 0, or 1 without memory.
+extern "C" int ganlane_enter(const Settings* settings, const Scene* scene, const Outputs* out, long first, long last) {
+    const Generated* g = settings->generated;
+    if (!g) return 0;
+    float* memory = (float*)scratch(crowd_floats(g->network, settings->vehicles) * sizeof(float));
+    if (!memory) return 1;
+    Crowd crowd = crowd_in(memory, g, settings->vehicles);
+    for (long row = first; row < last; row++)
+        if (scene->fresh[row])
+            enter(crowd, memory_of(out), row, episode_key(g->stream, scene->seed[row], scene->episode[row]), out->speed);
     free(memory);
     return 0;
 }

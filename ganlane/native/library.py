@@ -48,7 +48,7 @@ ADVICE = (
     "or pip install 'ganlane[native]', which brings Clang"
 )
 #: Functions of the library, and how many pointers they take before the first and the last row.
-FUNCTIONS = {"decide": 3, "lane_view": 3, "mask": 3, "spawn": 3, "step": 1, "start": 1}
+FUNCTIONS = {"decide": 3, "lane_view": 3, "mask": 3, "spawn": 3, "enter": 3, "step": 1, "start": 1}
 #: What Linux knows of the processor.
 CPU_INFO = Path("/proc/cpuinfo")
 
@@ -319,7 +319,8 @@ def _compiled(command: tuple[str, ...]) -> bytes:
 #: 1.3 times as long with two threads at 128 rows, 1.0 times at 256, 0.8 times at 512, 0.65 times at
 #: 1024 and 0.55 times at 4096.
 ROWS_PER_THREAD = 192
-#: The largest number of environments in a vector; threads take a multiple of it.
+#: The largest number of environments in a vector; threads take a multiple of it. A decision of so
+#: many rows of generated traffic takes 2 ms, so that is what a thread pays for there.
 BLOCK = 16
 
 
@@ -379,14 +380,16 @@ def threads_allowed() -> int:
     return os.cpu_count() or 1
 
 
-def in_threads(rows: int, call: Callable[[int, int], int]) -> None:
+def in_threads(
+    rows: int, call: Callable[[int, int], int], rows_per_thread: int = ROWS_PER_THREAD
+) -> None:
     """``call(first, last)`` for all ``rows``, in as many threads as pay and are allowed.
 
     Raises:
         ValueError: a call returned 2: an action is not 0, 1 or 2.
         MemoryError: a call returned 1.
     """
-    threads = min(threads_allowed(), rows // ROWS_PER_THREAD)
+    threads = min(threads_allowed(), rows // rows_per_thread)
     if threads <= 1:
         codes = [call(0, rows)]
     else:

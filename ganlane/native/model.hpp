@@ -16,6 +16,7 @@ struct Settings {
     // road
     float lane_width, per_lane_width;
     int32_t lanes, vehicles, substeps, timeout_steps, mobil, abort_lane_change;
+    const struct Generated* generated;  // generated.hpp; null: the others are rule-driven
 };
 
 // ---- Constants of the model (ganlane.sim)
@@ -30,9 +31,13 @@ enum { CENTRE, BODY, SIGNALLED };
 // ---- Equations
 
 // IDM: a (1 - (v/v0)^4 - (s*/s)^2) with s* = s0 + max(0, v T + v dv / (2 sqrt(a b))).
-INLINE Float interaction(const Settings& s, Float speed, Float gap, Float leader_speed) {
-    Float dynamic = speed * s.headway + speed * (speed - leader_speed) * s.per_brake_scale;
+INLINE Float interaction(const Settings& s, Float speed, Float gap, Float leader_speed, Float headway) {
+    Float dynamic = speed * headway + speed * (speed - leader_speed) * s.per_brake_scale;
     return (s.min_gap + larger(dynamic, filled(0.0f))) / larger(gap, filled(SMALLEST_GAP));
+}
+
+INLINE Float interaction(const Settings& s, Float speed, Float gap, Float leader_speed) {
+    return interaction(s, speed, gap, leader_speed, filled(s.headway));
 }
 
 INLINE Float free_road(Float speed, Float per_desired) {

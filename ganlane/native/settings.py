@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping
-from ctypes import c_double, c_float, c_int32, c_int64
-from typing import Any, Final, NamedTuple, TypeVar
+from ctypes import c_double, c_float, c_int32, c_int64, c_void_p
+from typing import Any, Final, TypeVar
 
 from ganlane import keys
 from ganlane.settings.driving import (
@@ -23,7 +23,7 @@ from ganlane.settings.episode import EpisodeParameters, SpawnParameters
 from ganlane.settings.observation import NEARNESS_M, OVERLAP_M, ObservationScale, RewardParameters
 
 #: A key of the state as the environment's TensorDict has it: ``"step"``, ``("vehicles", "x")``.
-Key = str | tuple[str, str]
+Key = str | tuple[str, ...]
 
 
 def _within(group: str, *names: str) -> tuple[Key, ...]:
@@ -31,12 +31,13 @@ def _within(group: str, *names: str) -> tuple[Key, ...]:
 
 
 STEERING: Final = (keys.TRAFFIC, "steering")
+#: Of the drivers' memory, by key: type, and shape behind [rows, vehicles].
+MemoryArrays = dict[Key, tuple[str, tuple[int, ...]]]
 #: Arrays [rows, vehicles] and their types.
 VEHICLE_ARRAYS: Final[dict[Key, str]] = {
     **dict.fromkeys(_within(keys.VEHICLES, *keys.VEHICLE_FLOATS), "float32"),
     **dict.fromkeys(_within(keys.VEHICLES, *keys.VEHICLE_INTEGERS), "int64"),
     **dict.fromkeys(_within(keys.VEHICLES, *keys.VEHICLE_FLAGS), "bool"),
-    STEERING: "float32",
 }
 #: Arrays that the state has as [rows, 1]: of the events, and whether the episode has ended.
 EVENT_ARRAYS: Final[dict[Key, str]] = {
@@ -60,13 +61,20 @@ EGO_ARRAYS: Final[dict[Key, str]] = {
     **dict.fromkeys(_within(keys.EGO, *keys.EGO_INTEGERS), "int64"),
     **dict.fromkeys(_within(keys.EGO, *keys.EGO_FLAGS), "bool"),
 }
-#: What goes into a decision besides the action before it and ``recycles`` after it.
+#: Counters [rows].
+COUNTERS: Final[dict[Key, str]] = dict.fromkeys((keys.SEED, keys.EPISODE, keys.STEP), "int64")
+#: What goes into a decision, before the memory of generated drivers.
 INPUTS: Final = (
+    keys.ACTION,
     *VEHICLE_ARRAYS,
+    STEERING,
     (keys.EGO, "steering"),
     *_within(keys.EGO, *keys.EGO_INTEGERS),
     *_within(keys.EGO, keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND),
     keys.STEP,
+    "recycles",
+    keys.SEED,
+    keys.EPISODE,
 )
 #: What comes out of it, and out of the start of an episode.
 OUTPUTS: Final = (
@@ -84,8 +92,7 @@ OUTPUTS: Final = (
     keys.STEP,
     *EVENT_ARRAYS,
 )
-#: What the start of an episode sets besides; ``seed``, ``episode`` and ``fresh`` go before it, and
-#: ``recycles`` after it.
+#: Fields of ``vehicles`` that no decision changes: the start of an episode sets them.
 SCENE: Final = _within(
     keys.VEHICLES,
     "length",
@@ -94,6 +101,8 @@ SCENE: Final = _within(
     "visibility",
     "valid",
 )
+#: What the start of an episode reads, and what it writes besides the outputs of a decision.
+STARTS: Final = (keys.SEED, keys.EPISODE, "fresh", *SCENE, "recycles")
 
 #: The observations that the kernel computes: whether with drift, and with overlap.
 NATIVE_FORMS: Final = {
@@ -110,12 +119,29 @@ def fields(kind: type, names: str) -> list[tuple[str, type]]:
     return [(name, kind) for name in names.split()]
 
 
-class RuleDrivers(NamedTuple):
-    """Drivers that the kernel knows; ``mobil=None``: they keep their lanes."""
+class Layout:
+    """The arrays of the state with drivers of this ``memory``.
 
-    idm: IdmParameters
-    steering: SteeringParameters = SteeringParameters()
-    mobil: MobilParameters | None = None
+    Attributes:
+        kinds: type of every array that the kernel reads or writes, by key.
+        inputs, outputs: of a decision, in the kernel's order. Those that are not in ``kinds`` are
+            null pointers: generated drivers have no steering angles.
+    """
+
+    def __init__(self, memory: MemoryArrays) -> None:
+        self.kinds: dict[Key, str] = {**VEHICLE_ARRAYS, **EGO_ARRAYS, **EVENT_ARRAYS, **COUNTERS}
+        self.kinds |= {name: kind for name, (kind, _) in memory.items()}
+        self._memory = memory
+        # Rule-driven drivers' one array has its place among the others.
+        further = [name for name in memory if name != STEERING]
+        self.inputs: list[Key] = [*INPUTS, *further]
+        self.outputs: list[Key] = [*OUTPUTS, *further]
+
+    def shape(self, name: Key, rows: int, vehicles: int) -> tuple[int, ...]:
+        """Shape of an array of ``kinds``."""
+        if name in self._memory:
+            return (rows, vehicles, *self._memory[name][1])
+        return (rows, vehicles) if name in VEHICLE_ARRAYS else (rows,)
 
 
 class Settings(ctypes.Structure):
@@ -130,6 +156,7 @@ class Settings(ctypes.Structure):
             " soft_crash_ttc_s soft_crash_gap_m goal_m lane_width_m per_lane_width",
         ),
         *fields(c_int32, "lanes vehicles substeps timeout_steps mobil abort_lane_change"),
+        *fields(c_void_p, "generated"),
     ]
 
 
@@ -203,8 +230,13 @@ def settings_of(
     idm: IdmParameters | None = None,
     steering: SteeringParameters | None = None,
     mobil: MobilParameters | None = None,
+    generated: ctypes.Structure | None = None,
 ) -> Settings:
-    """The numbers of road, driving and episode; ``mobil=None``: the others keep their lanes."""
+    """The numbers of road, driving and episode.
+
+    ``mobil=None``: the others keep their lanes. ``generated``: they are the generator's, and of
+    ``mobil`` only the limits of a lane change count; this structure has to live as long.
+    """
     episode = episode or EpisodeParameters()
     idm = idm or IdmParameters()
     steering = steering or SteeringParameters()
@@ -223,7 +255,8 @@ def settings_of(
         "substeps": episode.substeps(),
         # A number of steps, since sums of 0.1 s drift in floats.
         "timeout_steps": round(episode.timeout_s / keys.PHYSICS_STEP_S),
-        "mobil": mobil is not None,
+        "mobil": mobil is not None and generated is None,
+        "generated": None if generated is None else ctypes.addressof(generated),
     }
     return _filled(Settings, numbers)
 

@@ -4,23 +4,7 @@
 #include <stdlib.h>
 
 #include "arrays.hpp"
-
-// ---- Counter-based random numbers: splitmix64's finaliser, one field after the other
-
-static inline uint64_t absorb(uint64_t key, int64_t field) {
-    uint64_t h = (key ^ (uint64_t)field) + 0x9E3779B97F4A7C15u;
-    h = (h ^ (h >> 30)) * 0xBF58476D1CE4E5B9u;
-    h = (h ^ (h >> 27)) * 0x94D049BB133111EBu;
-    return h ^ (h >> 31);
-}
-
-static inline uint64_t episode_key(int64_t stream, int64_t seed, int64_t episode) {
-    return absorb(absorb(absorb((uint64_t)stream, 0), seed), episode);
-}
-
-static inline float uniform(uint64_t key) { return (float)(key >> 40) * (1.0f / 16777216.0f); }
-
-enum { SPAWN_LANE, SPAWN_POSITION, SPAWN_SPEED, SPAWN_DESIRED_SPEED, SPAWN_TRUCK = 90, RECYCLED_EPISODE = 91 };
+#include "random.hpp"
 
 // ---- A scene
 
@@ -80,18 +64,19 @@ static inline float from(const Range& range, float u) { return range.low + u * r
 
 static void begin(const Spawn& s, const Scene& scene, const Outputs& state, const Draft& d, long row) {
     uint64_t key = episode_key(s.stream, scene.seed[row], scene.episode[row]), at_start = absorb(key, 0);
-    for (int i = 0; i < s.vehicles; i++) d.u[i] = uniform(absorb(absorb(at_start, i), SPAWN_POSITION));
+    for (int i = 0; i < s.vehicles; i++) d.u[i] = uniform_of(absorb(absorb(at_start, i), SPAWN_POSITION));
     draw_lanes(s, at_start, d);
     place_in_lanes(s, d);
     put_ego_first(s, d);
     for (int i = 0; i < s.vehicles; i++) {
         long at = row * s.vehicles + i;
         uint64_t vehicle = absorb(at_start, i);
-        float speed = uniform(absorb(vehicle, SPAWN_SPEED)), desired = uniform(absorb(vehicle, SPAWN_DESIRED_SPEED));
-        bool ego = i == 0, lorry = !ego && uniform(absorb(vehicle, SPAWN_TRUCK)) < s.truck_share;
+        float speed = uniform_of(absorb(vehicle, SPAWN_SPEED)), desired = uniform_of(absorb(vehicle, SPAWN_DESIRED_SPEED));
+        bool ego = i == 0, lorry = !ego && uniform_of(absorb(vehicle, SPAWN_TRUCK)) < s.truck_share;
         state.x[at] = d.x[i];
         state.y[at] = (float)d.lane[i] * s.lane_width;
-        state.heading[at] = state.acceleration[at] = state.steering[at] = 0.0f;
+        state.heading[at] = state.acceleration[at] = 0.0f;
+        if (state.steering) state.steering[at] = 0.0f;
         state.speed[at] = from(ego ? s.ego_speed : d.x[i] > 0.0f ? s.front_speed : s.rear_speed, speed);
         state.target_lane[at] = d.lane[i];
         scene.desired_speed[at] = ego ? s.ego_desired_speed : from(lorry ? s.truck_desired_speed : s.desired_speed, desired);

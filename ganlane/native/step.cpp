@@ -13,6 +13,7 @@ struct MaskOutputs;
 extern "C" {
 int ganlane_decide(const Settings*, const Inputs*, const Outputs*, long first, long last);
 int ganlane_spawn(const Spawn*, const Scene*, const Outputs*, long first, long last);
+int ganlane_enter(const Settings*, const Scene*, const Outputs*, long first, long last);
 int ganlane_lane_view(const View*, const ViewInputs*, float* const*, long first, long last);
 int ganlane_mask(const Settings*, const MaskInputs*, const MaskOutputs*, long first, long last);
 }
@@ -98,6 +99,7 @@ extern "C" int ganlane_step(const Batch* batch, long first, long last) {
 extern "C" int ganlane_start(const Batch* batch, long first, long last) {
     const Batch& b = *batch;
     if (ganlane_spawn(b.spawn, b.scene, b.out, first, last)) return 1;
+    if (ganlane_enter(b.settings, b.scene, b.out, first, last)) return 1;
     for (long row = first; row < last; row++) {
         if (!b.scene->fresh[row]) continue;
         long end = row + 1;  // behind the last of the fresh rows beginning here

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -16,64 +17,56 @@ from torch import Tensor
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.native import settings
-from ganlane.native.library import addresses, in_threads, load
-from ganlane.native.settings import Key
+from ganlane.native.drivers import Drivers, RuleDrivers, generated_of
+from ganlane.native.library import BLOCK, ROWS_PER_THREAD, addresses, in_threads, load
+from ganlane.native.settings import Key, Layout
 from ganlane.settings.driving import (
     EgoParameters,
     IdmParameters,
-    MobilParameters,
-    SteeringParameters,
 )
 from ganlane.settings.episode import EpisodeParameters
 from ganlane.settings.observation import ObservationScale
-from ganlane.sim.dynamics import STEERING
 from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road, Vehicles
 
-# The kernel reads memory as it lies, so types have to match exactly.
-_TYPES = settings.VEHICLE_ARRAYS | settings.EGO_ARRAYS | settings.EVENT_ARRAYS
-_DTYPES = {key: getattr(torch, name) for key, name in _TYPES.items()}
-_DTYPES[keys.STEP] = torch.int64
-#: Fields of ``vehicles`` that no decision changes.
-_LASTING = [
-    key for key in settings.INPUTS if key[0] == keys.VEHICLES and key not in settings.OUTPUTS
-]
-
 
 def _room(
-    names: Iterable[Key], rows: int, vehicles: int, make: Callable[..., Tensor]
+    layout: Layout, names: Iterable[Key], rows: int, vehicles: int, make: Callable[..., Tensor]
 ) -> dict[Key, Tensor]:
     """Tensors for the kernel to write to, by ``torch.empty`` or ``torch.zeros``."""
     room = {}
     for name in names:
-        shape: tuple[int, ...] = (rows,)
-        if name in settings.VEHICLE_ARRAYS:
-            shape = (rows, vehicles)
-        elif name in settings.EVENT_ARRAYS:
-            # As the environment has its events and flags.
-            shape = (rows, 1)
-        room[name] = make(shape, dtype=_DTYPES[name])
+        # As the environment has its events and flags.
+        column = (1,) if name in settings.EVENT_ARRAYS else ()
+        shape = layout.shape(name, rows, vehicles) + column
+        room[name] = make(shape, dtype=getattr(torch, layout.kinds[name]))
     return room
 
 
 def _state(tensors: Mapping[Key, Tensor]) -> TensorDict:
     """The environment's state [N], without a reward; the kernel drives no scene to its end."""
-    # Made without TensorDict's checks, since every shape is known.
     size = tensors[keys.STEP].shape
-    device = torch.device("cpu")
-    groups: dict[str, dict[str, Tensor]] = {}
-    fields: dict[str, Any] = {}
-    for key, value in tensors.items():
-        if isinstance(key, str):
-            fields[key] = value
-        else:
-            groups.setdefault(key[0], {})[key[1]] = value
     # Only recorded scenes end by themselves; the flag is there so that all states have the same
     # keys.
-    groups[keys.EVENTS]["scene_end"] = torch.zeros_like(groups[keys.EVENTS]["timeout"])
-    for name, group in groups.items():
-        fields[name] = TensorDict._new_unsafe(group, batch_size=size, device=device)
-    return TensorDict._new_unsafe(fields, batch_size=size, device=device)
+    scene_end = torch.zeros_like(tensors[keys.EVENTS, "timeout"])
+    groups: dict[str, Any] = {}
+    for key, value in [*tensors.items(), ((keys.EVENTS, "scene_end"), scene_end)]:
+        *path, name = (key,) if isinstance(key, str) else key
+        group = groups
+        for part in path:
+            group = group.setdefault(part, {})
+        group[name] = value
+    return _tensordict(groups, size)
+
+
+def _tensordict(groups: Mapping[str, Any], size: torch.Size) -> TensorDict:
+    """Nested mappings as a TensorDict [N] on the CPU."""
+    fields = {
+        name: _tensordict(value, size) if isinstance(value, dict) else value
+        for name, value in groups.items()
+    }
+    # Made without TensorDict's checks, since every shape is known.
+    return TensorDict._new_unsafe(fields, batch_size=size, device=torch.device("cpu"))
 
 
 def _shape(road: Road, vehicles: int) -> tuple[int, float, int]:
@@ -98,6 +91,10 @@ class _Function:
         UserError: the road is a ring or differs from row to row, or the kernel cannot be built.
     """
 
+    _arguments: partial[_Function]
+    #: Rows from which on a further thread pays.
+    rows_per_thread = ROWS_PER_THREAD
+
     def __init__(
         self,
         name: str,
@@ -106,41 +103,41 @@ class _Function:
     ) -> None:
         self._name = name
         self._numbers = numbers
-        self._variant = variant
-        # A function of ctypes cannot be pickled; __getstate__ leaves it out.
         self._call = getattr(load(variant), name)
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Without the library, which another process loads for itself."""
-        return {name: value for name, value in self.__dict__.items() if name != "_call"}
+    def __new__(cls, *arguments: Any, **named: Any) -> _Function:
+        function = super().__new__(cls)
+        function._arguments = partial(cls, *arguments, **named)
+        return function
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._call = getattr(load(self._variant), self._name)
+    def __reduce__(self) -> tuple[partial[_Function], tuple[()]]:
+        """For copies and other processes: made anew, since addresses hold in this process alone."""
+        return self._arguments, ()
 
     def _run(
         self,
         rows: int,
         inputs: Iterable[Tensor | None],
-        outputs: Sequence[Tensor],
+        outputs: Sequence[Tensor | None],
     ) -> None:
         # The contiguous copies have to live until the call is over.
         read = [tensor if tensor is None else tensor.contiguous() for tensor in inputs]
         pointers = (ctypes.byref(self._numbers), addresses(read), addresses(outputs))
         # ctypes releases Python's lock during a call, so threads run side by side.
-        in_threads(rows, lambda first, last: self._call(*pointers, first, last))
+        in_threads(
+            rows, lambda first, last: self._call(*pointers, first, last), self.rows_per_thread
+        )
 
 
 class Kernel(_Function):
-    """Rule-driven traffic and its ego, a whole decision at a time.
+    """Traffic and its ego, a whole decision at a time.
 
     Args:
         road: one for all rows, and straight.
         vehicles: M, the ego included.
         episode: decision period, goal and time-out.
         ego: lane changes and soft crashes.
-        idm, steering: of everybody, the ego included.
-        mobil: of the others; None: they keep their lanes.
+        drivers: the others, and how the ego follows and steers; by default they keep their lanes.
         variant: see the base class.
     """
 
@@ -150,19 +147,25 @@ class Kernel(_Function):
         vehicles: int,
         episode: EpisodeParameters | None = None,
         ego: EgoParameters | None = None,
-        idm: IdmParameters | None = None,
-        steering: SteeringParameters = STEERING,
-        mobil: MobilParameters | None = None,
+        drivers: Drivers | None = None,
         variant: str | None = None,
     ) -> None:
+        drivers = drivers or RuleDrivers()
         self.vehicles = vehicles
+        self.layout = Layout(drivers.memory())
+        # Held here, since the settings have its address alone.
+        self._generated = generated_of(drivers)
+        if self._generated is not None:
+            self.rows_per_thread = BLOCK
+        self._dtypes = {name: getattr(torch, kind) for name, kind in self.layout.kinds.items()}
         numbers = settings.settings_of(
             *_shape(road, vehicles),
             episode,
             ego,
-            idm,
-            steering,
-            mobil,
+            drivers.idm,
+            drivers.steering,
+            drivers.mobil,
+            self._generated,
         )
         super().__init__("ganlane_decide", numbers, variant)
 
@@ -182,35 +185,34 @@ class Kernel(_Function):
             TypeError: a part of the state is not as the kernel reads it.
         """
         rows = action.shape[0]
-        before: dict[Key, Tensor] = {}
-        for name in settings.INPUTS:
+        layout = self.layout
+        arrays: dict[Key, Tensor | None] = {keys.ACTION: action, "recycles": recycles}
+        for name in layout.inputs:
+            if name in arrays or name not in layout.kinds:
+                continue
             # Group by group: to look up a nested key takes three times as long.
-            number = state
+            number: Any = state
             for part in (name,) if isinstance(name, str) else name:
                 number = number.get(part)
             # A wrong type would be read as other numbers, without an error.
-            if number.dtype is not _DTYPES[name] or number.shape[0] != rows:
+            if number.dtype is not self._dtypes[name] or number.shape[0] != rows:
                 raise TypeError(
-                    f"the kernel takes {rows} rows of {_DTYPES[name]} as {name}, "
+                    f"the kernel takes {rows} rows of {self._dtypes[name]} as {name}, "
                     f"not {number.dtype} {number.shape}"
                 )
-            before[name] = number
+            arrays[name] = number
         # New tensors: the state before the decision belongs to the caller.
-        after = _room(
-            settings.OUTPUTS,
-            rows,
-            self.vehicles,
-            torch.empty,
-        )
-        self._run(rows, [action, *before.values(), recycles], list(after.values()))
+        names = [name for name in layout.outputs if name in layout.kinds]
+        after = _room(layout, names, rows, self.vehicles, torch.empty)
+        inputs = [arrays.get(name) for name in layout.inputs]
+        self._run(rows, inputs, [after.get(name) for name in layout.outputs])
         # What no decision changes is shared with the state before, not copied.
-        after |= {name: before[name] for name in _LASTING}
-        after |= {name: state.get(name) for name in (keys.SEED, keys.EPISODE)}
-        return _state(after)
+        lasting = {name: arrays[name] for name in (*settings.SCENE, keys.SEED, keys.EPISODE)}
+        return _state(after | lasting)  # type: ignore[arg-type]
 
 
 class NativeScenes(_Function):
-    """What :class:`~ganlane.sim.spawn.RandomScenes` draws, bit for bit.
+    """What :class:`~ganlane.sim.spawn.RandomScenes` draws, bit for bit, and the drivers' memory.
 
     Drawn by tensor code, the rows that ended took 3 of the 10 ms of a step of 4096 environments
     through TorchRL.
@@ -218,10 +220,14 @@ class NativeScenes(_Function):
     Args:
         scenes: with a straight road, the same in all rows.
         stream: family of episodes.
+        drivers: of the others; None: rule-driven.
     """
 
-    def __init__(self, scenes: RandomScenes, stream: int) -> None:
+    def __init__(self, scenes: RandomScenes, stream: int, drivers: Drivers | None = None) -> None:
         self.vehicles = scenes.vehicles
+        drivers = drivers or RuleDrivers()
+        self.layout = Layout(drivers.memory())
+        self._generated = generated_of(drivers)
         seen = (scenes.ego_visibility, scenes.others_visibility)
         shape = _shape(scenes.road, scenes.vehicles)
         numbers = settings.spawn_of(
@@ -232,6 +238,7 @@ class NativeScenes(_Function):
             recycle_share=None,
         )
         super().__init__("ganlane_spawn", numbers)
+        self._enter = Enter(settings.settings_of(*shape, generated=self._generated))
 
     def start(
         self,
@@ -244,20 +251,26 @@ class NativeScenes(_Function):
         ``rows`` [N] bool are those to be drawn; None: all. The others are zeros, without a vehicle.
         """
         rows = torch.ones_like(seed, dtype=torch.bool) if rows is None else rows
+        layout = self.layout
+        written = [name for name in layout.outputs if name in layout.kinds]
         # Zeros, since rows that are not drawn are not written.
-        names = (*settings.OUTPUTS, *settings.SCENE)
-        state = _room(
-            names,
-            len(seed),
-            self.vehicles,
-            torch.zeros,
-        )
-        scene = [state[name] for name in settings.SCENE]
+        state = _room(layout, (*written, *settings.SCENE), len(seed), self.vehicles, torch.zeros)
+        state |= {keys.SEED: seed, keys.EPISODE: episode}
         # Drawn with the scene, but the environment draws it at every decision.
-        recycles = torch.zeros_like(rows)
-        outputs = [state[name] for name in settings.OUTPUTS]
-        self._run(len(seed), [seed, episode, rows, *scene, recycles], outputs)
-        return _state(state | {keys.SEED: seed, keys.EPISODE: episode})
+        flags = {"fresh": rows, "recycles": torch.zeros_like(rows)}
+        inputs = [(state | flags)[name] for name in settings.STARTS]
+        outputs = [state.get(name) for name in layout.outputs]
+        self._run(len(seed), inputs, outputs)
+        if self._generated is not None:
+            self._enter._run(len(seed), inputs, outputs)
+        return _state(state)
+
+
+class Enter(_Function):
+    """The first memory of generated drivers, after their scene."""
+
+    def __init__(self, numbers: ctypes.Structure) -> None:
+        super().__init__("ganlane_enter", numbers)
 
 
 class LaneView(_Function):

@@ -8,6 +8,8 @@
 
 #if defined(__x86_64__)
 #include <immintrin.h>
+#elif defined(__ARM_NEON)
+#include <arm_neon.h>
 #endif
 
 #ifndef LANES
@@ -26,6 +28,31 @@ INLINE Float smaller(Float a, Float b) { return a < b ? a : b; }
 INLINE Float larger(Float a, Float b) { return a > b ? a : b; }
 INLINE Float between(Float a, float low, float high) { return smaller(larger(a, filled(low)), filled(high)); }
 INLINE Float absolute(Float a) { return (Float)((Mask)a & 0x7fffffff); }
+
+// a b + c with one rounding, on every instruction set: where there is no such instruction, the product is exact in
+// double precision, and the sum is rounded to odd there, so that the second rounding is that of the exact number
+// (Boldo and Melquiond 2008).
+INLINE Float fused(Float a, Float b, Float c) {
+#if defined(__AVX512F__) && LANES == 16
+    return (Float)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c);
+#elif defined(__FMA__) && LANES == 8
+    return (Float)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c);
+#elif defined(__ARM_NEON) && LANES == 4
+    return (Float)vfmaq_f32((float32x4_t)c, (float32x4_t)a, (float32x4_t)b);
+#else
+    typedef double Wide __attribute__((vector_size(8 * LANES)));
+    typedef int64_t Bits __attribute__((vector_size(8 * LANES)));
+    Wide product = __builtin_convertvector(a, Wide) * __builtin_convertvector(b, Wide);
+    Wide addend = __builtin_convertvector(c, Wide), sum = product + addend;
+    Wide part = sum - product, error = (product - (sum - part)) + (addend - part);
+    // One unit in the last place towards the exact sum, where it is not exact and the last bit is even.
+    typedef uint64_t Unsigned __attribute__((vector_size(8 * LANES)));
+    Bits last = (Bits)sum & 1, away = (Bits)(((Unsigned)sum ^ (Unsigned)error) >> 63);
+    Bits rounded_to_odd = (Bits)sum + ((1 - 2 * away) & (error != 0.0) & (last - 1));
+    return __builtin_convertvector((Wide)rounded_to_odd, Float);
+#endif
+}
+
 // To the nearest integer, half to even, below 2^22: the sum has no bits left for a fraction.
 INLINE Float rounded(Float a) { return (a + 12582912.0f) - 12582912.0f; }
 
@@ -98,4 +125,34 @@ static __attribute__((noinline)) Float arctangent_of_large(Float number) {
 INLINE Float arctangent(Float number) {
     if (any(absolute(number) > 0.4142135623730950f)) return arctangent_of_large(number);
     return arctangent_series(number);
+}
+
+// Natural logarithm of a positive normal number (Cephes).
+INLINE Float logarithm(Float x) {
+    Mask bits = (Mask)x;
+    Float exponent = __builtin_convertvector((bits >> 23) - 126, Float);
+    Float m = (Float)((bits & 0x7fffff) | 0x3f000000);  // in [0.5, 1)
+    Mask low = m < 0.707106781186547524f;
+    exponent = choose(low, exponent - 1.0f, exponent);
+    m = choose(low, m + m, m) - 1.0f;
+    Float z = m * m;
+    Float p = (((7.0376836292e-2f * m - 1.1514610310e-1f) * m + 1.1676998740e-1f) * m - 1.2420140846e-1f) * m;
+    p = (((p + 1.4249322787e-1f) * m - 1.6668057665e-1f) * m + 2.0000714765e-1f) * m - 2.4999993993e-1f;
+    p = (p * m + 3.3333331174e-1f) * m * z + exponent * -2.12194440e-4f - 0.5f * z;
+    return m + p + exponent * 0.693359375f;
+}
+
+// Square root, rounded exactly.
+INLINE Float root(Float a) {
+#if defined(__AVX512F__) && LANES == 16
+    return (Float)_mm512_sqrt_ps((__m512)a);
+#elif defined(__AVX__) && LANES == 8
+    return (Float)_mm256_sqrt_ps((__m256)a);
+#elif defined(__SSE2__) && LANES == 4
+    return (Float)_mm_sqrt_ps((__m128)a);
+#else
+    Float roots;
+    for (int lane = 0; lane < LANES; lane++) roots[lane] = __builtin_sqrtf(a[lane]);
+    return roots;
+#endif
 }

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
 
-from ganlane.errors import ParameterError
+from ganlane.errors import ParameterError, UserError
+from ganlane.files import CHECKPOINTS
 from ganlane.settings.record import (
     NO_KEY,
     Count,
@@ -28,6 +30,8 @@ from ganlane.settings.record import (
 )
 
 Preset = Literal["paper", "calibrated"]
+#: Kind of their files; weights of another kind, such as an agent's, are refused by it.
+GENERATOR = "generator"
 #: Inputs of the calibrated preset in addition to the motion: IDM's acceleration, gap, closing
 #: speed, lane offset.
 EXTRA_INPUTS = 4
@@ -69,6 +73,52 @@ class GeneratorSizes(Record):
     observed: _Width = field(default=8, metadata=NO_KEY)
     predicted: Annotated[int, between(1, 50)] = 8
     differences: bool = True
+
+
+def shipped_generator(preset: Preset) -> Path:
+    """Path of the weights that come with the package."""
+    return CHECKPOINTS / f"generator_{preset}.safetensors"
+
+
+def stored_sizes(path: object, metadata: Mapping[str, Any], preset: str | None) -> GeneratorSizes:
+    """The sizes of a generator from the ``metadata`` of its file.
+
+    ``path`` is for messages, ``preset`` the required one; None accepts any.
+
+    Raises:
+        UserError: another preset, no sizes of a generator, or no driving statistics.
+    """
+    # str, since a foreign file may hold anything under this name.
+    stored = str(metadata.get("preset"))
+    if stored not in get_args(Preset) or (preset is not None and stored != preset):
+        expected = preset or "paper or calibrated"
+        raise UserError(
+            f"{path}: a generator of preset {stored!r}, expected {expected!r}; give one."
+        )
+    sizes = metadata.get("sizes")
+    # The defaults tell the types, since a text or a float would fail only where layers are made.
+    types = {field.name: type(field.default) for field in fields(GeneratorSizes)}
+    try:
+        if {name: type(size) for name, size in dict(sizes or {}).items()} != types:
+            raise ValueError("other names or types")
+        checked = GeneratorSizes(**sizes)  # type: ignore[arg-type]
+        if checked.noise >= checked.hidden:
+            raise ValueError("noise is not below hidden")
+    except (TypeError, ValueError, ParameterError) as error:
+        raise UserError(
+            f"{path}: sizes {sizes} are not those of a generator ({sorted(types)}); fit it again."
+        ) from error
+    # The presets differ in their inputs; weights of one would drive badly under the other's name.
+    needed = EXTRA_INPUTS if stored == "calibrated" else 0
+    if checked.extra_inputs != needed:
+        raise UserError(
+            f"{path}: takes {checked.extra_inputs} further inputs, expected {needed} for the "
+            f"preset {stored}; fit it again."
+        )
+    # Traffic takes headways and lane changes from them, so weights alone cannot drive.
+    if not isinstance(metadata.get("driving_statistics"), dict):
+        raise UserError(f"{path}: holds no driving statistics of its recordings; fit it again.")
+    return checked
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ from typing import (
 
 import yaml
 
-from ganlane.errors import ParameterError, UserError, as_typed, did_you_mean
+from ganlane.errors import CONTROL, ParameterError, UserError, as_typed, did_you_mean
 from ganlane.files import conf_folder
 
 Part = TypeVar("Part")
@@ -346,7 +346,7 @@ def _fitted(
         return kind(_fitted(inner[0], entry, key, field) for entry in entries)
     if kind is dict and isinstance(value, Mapping):
         return {
-            str(name): _fitted(inner[1], entry, f"{key}.{name}", field)
+            _scalar(str, str(name), key, field): _fitted(inner[1], entry, f"{key}.{name}", field)
             for name, entry in value.items()
         }
     return _scalar(
@@ -380,8 +380,8 @@ def _scalar(
         return operator.index(value)
     if kind is str and (is_number or isinstance(value, Path)):
         return str(value)
-    if kind is str and isinstance(value, str) and "\0" in value:
-        raise _refusal(key, value, "a text without a zero byte", field)
+    if kind is str and isinstance(value, str) and CONTROL.search(value):
+        raise _refusal(key, value, "a text without control characters", field)
     if isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
         return value
     raise _refusal(key, value, _WORDS.get(kind, kind.__name__), field)

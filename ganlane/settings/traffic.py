@@ -19,8 +19,6 @@ from ganlane.arguments import is_import_path
 from ganlane.errors import ParameterError
 from ganlane.settings.driving import (
     DriverFaults,
-    IdmParameters,
-    MobilParameters,
     RandomDrivers,
     Steps,
 )
@@ -108,16 +106,6 @@ class TrafficConfig(Record):
         names = [name for name in key_names(type(self)) if name not in shared]
         return {name: getattr(self, name) for name in names}
 
-    def native_parameters(
-        self, idm: IdmParameters, mobil: MobilParameters
-    ) -> tuple[IdmParameters, MobilParameters | None] | None:
-        """What the native kernel needs to drive as the target does; None: it cannot.
-
-        The same as :meth:`ganlane.traffic.TrafficModule.native_parameters` says, known without
-        torch. Without MOBIL's parameters everybody keeps its lane.
-        """
-        return None
-
     def parts(self) -> dict[str, TrafficConfig]:
         """Traffics that the target is made of, by name; it is given their models as ``parts``."""
         return {}
@@ -152,12 +140,6 @@ class IdmTrafficConfig(TrafficConfig):
     option = "idm"
     _target_: ImportPath = "ganlane.traffic.IdmTraffic"
 
-    def native_parameters(
-        self, idm: IdmParameters, mobil: MobilParameters
-    ) -> tuple[IdmParameters, MobilParameters | None] | None:
-        """The kernel's drivers, unless some episodes have blind ones."""
-        return None if self.blind_share else (idm, None)
-
 
 @dataclass(frozen=True)
 class IdmMobilTrafficConfig(TrafficConfig):
@@ -165,12 +147,6 @@ class IdmMobilTrafficConfig(TrafficConfig):
 
     option = "idm_mobil"
     _target_: ImportPath = "ganlane.traffic.IdmMobilTraffic"
-
-    def native_parameters(
-        self, idm: IdmParameters, mobil: MobilParameters
-    ) -> tuple[IdmParameters, MobilParameters | None] | None:
-        """As of ``traffic=idm``, with lane changes."""
-        return None if self.blind_share else (idm, mobil)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.native.settings import RuleDrivers
+from ganlane.native.drivers import Drivers
 from ganlane.settings.driving import Visibility
 from ganlane.sim.random import Stream, absorb, episode_key, uniform
 from ganlane.sim.scenes import Scenes
@@ -206,7 +206,7 @@ class TrafficModule(TensorDictModuleBase):
         """The initial scenes of this traffic; None: those of the environment."""
         return None
 
-    def native_parameters(self) -> RuleDrivers | None:
+    def native_drivers(self) -> Drivers | None:
         """What the native kernel needs to drive as this model does; None: it cannot."""
         return None
 
@@ -376,13 +376,15 @@ class TrafficSequential(TrafficParts):
     Args:
         parts: name to module, the base model first. Road, stream and visibility are the first
             one's.
+        drivers: with which the native kernel drives as these parts do; None: it cannot.
 
     Raises:
         UserError: the base model plays recordings.
     """
 
-    def __init__(self, parts: dict[str, TrafficModule]) -> None:
+    def __init__(self, parts: dict[str, TrafficModule], drivers: Drivers | None = None) -> None:
         super().__init__(parts)
+        self._drivers = drivers
         _, base = self.named_parts()[0]
         if base.own_roads:
             raise UserError(
@@ -391,6 +393,10 @@ class TrafficSequential(TrafficParts):
             )
         # The base model alone says how its lane changes are seen.
         self.visibility = base.visibility
+
+    def native_drivers(self) -> Drivers | None:
+        """Those that it was made with."""
+        return self._drivers
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Run the parts in order."""

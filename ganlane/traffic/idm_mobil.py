@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
-from ganlane.native.settings import RuleDrivers
+from ganlane.native.drivers import RuleDrivers
 from ganlane.settings.driving import (
     IdmParameters,
     MobilParameters,
@@ -86,7 +86,7 @@ class IdmTraffic(TrafficModule):
         """Accelerate, steer, advance."""
         return self.keep_lanes(vehicles, memory)
 
-    def native_parameters(self) -> RuleDrivers | None:
+    def native_drivers(self) -> RuleDrivers | None:
         """The kernel's drivers; None for a subclass, which may drive otherwise."""
         # Not isinstance: a subclass may override any part of a step.
         return RuleDrivers(self.idm, self.steering) if type(self) is IdmTraffic else None
@@ -181,7 +181,7 @@ class IdmMobilTraffic(IdmTraffic):
             return self.keep_lanes(vehicles, memory)
         return self.decide(vehicles, memory, due)
 
-    def native_parameters(self) -> RuleDrivers | None:
+    def native_drivers(self) -> RuleDrivers | None:
         """As of :class:`IdmTraffic`, with lane changes."""
         if type(self) is not IdmMobilTraffic:
             return None

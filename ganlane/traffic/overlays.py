@@ -8,12 +8,17 @@ relative positions as its only input drifts off the road within a minute, and to
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ganlane.settings.driving import IdmParameters, MobilParameters
+from ganlane.settings.generated import (
+    CalibratedChanges,
+    GuardParameters,
+    LiteralChanges,
+    SuddenAccelerations,
+)
 from ganlane.sim.idm import TABLE_V, acceleration_behind
 from ganlane.sim.mobil import (
     one_at_a_time,
@@ -72,23 +77,6 @@ def random_side(
         both,
         torch.where(left, 1, torch.where(right, -1, 0)),
     )
-
-
-@dataclass(frozen=True)
-class LiteralChanges:
-    """Equations 9 to 11 as printed.
-
-    Attributes:
-        mean_steps: ``t_m``, in steps of 0.1 s.
-        lateral_speed_mps, lateral_speed_sd_mps: mean and standard deviation of the Gaussian of
-            lateral speeds, m/s.
-        slowest_mps: lower bound of a drawn speed, so that every change ends, m/s.
-    """
-
-    mean_steps: float = 2218.0
-    lateral_speed_mps: float = 0.81
-    lateral_speed_sd_mps: float = 0.33
-    slowest_mps: float = 0.3
 
 
 class LiteralLaneChange(Overlay):
@@ -175,25 +163,6 @@ class LiteralLaneChange(Overlay):
             # 0 means that no change is going on.
             "lateral_speed": torch.where(arrives, 0.0, lateral),
         }
-
-
-@dataclass(frozen=True)
-class CalibratedChanges:
-    """A rate per kilometre driven, and what makes a gap good enough.
-
-    Attributes:
-        per_km: hazard of *wishing* for a change, set so that the rate *measured in the simulation*
-            is that of the data; waiting for a gap makes the two differ.
-        patience_s: a wish that finds no gap for this long is given up, s.
-        safe_deceleration: no vehicle has to brake harder, by IDM, m/s2.
-        exclusive_m: a change does not start while another vehicle is moving into the same lane
-            within this distance; of several that would start at once only the foremost does, m.
-    """
-
-    per_km: float = 0.92
-    patience_s: float = 20.0
-    safe_deceleration: float = 2.0
-    exclusive_m: float = 60.0
 
 
 class CalibratedLaneChange(Overlay):
@@ -319,22 +288,6 @@ def _accelerated(
     )
 
 
-@dataclass(frozen=True)
-class SuddenAccelerations:
-    """Sudden accelerations.
-
-    Attributes:
-        every_s: mean time between two, s.
-        lasts_s: how long one lasts, s.
-        mean, sd: of their Gaussian, m/s2.
-    """
-
-    every_s: float = 10.0
-    lasts_s: float = 1.0
-    mean: float = 0.0
-    sd: float = 0.8
-
-
 class AccelerationOverlay(Overlay):
     """The paper's 'instant-acceleration or instant-slowing', drawn from the recorded accelerations.
 
@@ -392,32 +345,6 @@ class AccelerationOverlay(Overlay):
             "acceleration": acceleration,
             "left": (left - 1).clamp_min(0),
         }
-
-
-@dataclass(frozen=True)
-class GuardParameters:
-    """Limits of the guard.
-
-    Attributes:
-        headway_s: time headway of the IDM acceleration that is the upper bound.
-        slack: the lower bound is IDM's acceleration minus this, m/s2, times speed over desired
-            speed, so that a network that always slows ends at a crawl instead of standing still on
-            a free road.
-        hardest_braking: lowest acceleration, m/s2.
-        centring_per_s: rate at which the offset from the target lane's centre is reduced (the P of
-            the PD).
-        damping: share of the network's lateral motion that is kept (the D).
-        edge_margin_m: minimum distance of the turned body from the edge of the road.
-        steepest_rad: largest angle to the road.
-    """
-
-    headway_s: float = 0.8
-    slack: float = 1.5
-    hardest_braking: float = -8.0
-    centring_per_s: float = 0.5
-    damping: float = 0.8
-    edge_margin_m: float = 0.1
-    steepest_rad: float = 0.2
 
 
 #: Called with the vehicles at t, as the chain moved them, and as the guard moves them.

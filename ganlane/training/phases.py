@@ -193,8 +193,6 @@ def make_selection(config: TrainConfig, traffic: TrafficConfig) -> Evaluate:
     env = make(min(config.selection_episodes, config.evaluation.num_envs))
     # the same episodes in every call, so that figures can be compared
     episodes = range(config.selection_episodes)
-    # A compiled graph is of one batch size, so compiled environments are not made smaller.
-    smaller = None if config.env.compile else make
 
     def evaluate(policy: GreedyPolicy) -> dict[str, float]:
         table = run_episodes(
@@ -202,7 +200,7 @@ def make_selection(config: TrainConfig, traffic: TrafficConfig) -> Evaluate:
             policy,
             episodes,
             config.seed,
-            make_smaller=smaller,
+            make_smaller=make,
         )
         total = table.select(
             "reward",

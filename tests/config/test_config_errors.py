@@ -152,6 +152,14 @@ def test_a_command_that_there_is_not(capsys):
     )
 
 
+@pytest.mark.parametrize("line", ["\x1b[31mfly", "evaluate agents=[mobil,'\x1b[31mred']"])
+def test_an_escape_sequence_reaches_no_terminal(line, empty_folder, capsys):
+    assert main(line.split()) == 2
+    told = capsys.readouterr().err
+    assert r"\x1b[31m" in told
+    assert "\x1b" not in told
+
+
 def test_cfg_prints_what_a_run_would_be_made_of(capsys, empty_folder):
     assert main(["evaluate", "env.lanes=4", "--cfg", "job"]) == 0
     shown = yaml.safe_load(capsys.readouterr().out)

@@ -10,16 +10,16 @@ from reference.small_networks import SIZES, small_generator
 
 from ganlane.data import default_scenes, read_scenes
 from ganlane.errors import UserError
-from ganlane.generator.checkpoint import (
-    FitResult,
-    load_generator,
-    shipped_generator,
-)
+from ganlane.generator.checkpoint import FitResult, load_generator
 from ganlane.generator.fit import split_for_fit
 from ganlane.generator.forecasts import rollout_errors
 from ganlane.generator.tasks import PaperTask
 from ganlane.generator.windows import scene_tracks
-from ganlane.settings.generator import CalibratedConfig, PaperConfig
+from ganlane.native.drivers import drivers_of
+from ganlane.settings.driving import IdmParameters, MobilParameters
+from ganlane.settings.episode import Stream
+from ganlane.settings.generator import CalibratedConfig, PaperConfig, shipped_generator
+from ganlane.settings.traffic import GanTrafficConfig
 from ganlane.weights import save_weights
 
 CONFIGS = {"paper": PaperConfig(), "calibrated": CalibratedConfig()}
@@ -105,7 +105,7 @@ PLAIN_SIZES = asdict(SIZES)
         ({"sizes": PLAIN_SIZES | {"hidden": 20}}, None, "shapes"),
         ({"tensors": {"x": torch.zeros(2)}}, None, "shapes"),
         ({"preset": "calibrated"}, "calibrated", "further inputs"),
-        ({}, "paper", "no driving statistics"),
+        ({"driving_statistics": None}, "paper", "no driving statistics"),
     ],
 )
 def test_wrong_checkpoints_are_refused_in_one_sentence(wrong, preset, message, tmp_path):
@@ -114,12 +114,18 @@ def test_wrong_checkpoints_are_refused_in_one_sentence(wrong, preset, message, t
         "preset": "paper",
         "sizes": PLAIN_SIZES,
         "tensors": small_generator().state_dict(),
+        "driving_statistics": {},
         **wrong,
     }
     path = tmp_path / "generator.safetensors"
     save_weights(path, content.pop("kind"), content.pop("tensors"), content)
     with pytest.raises(UserError, match=message):
         load_generator(path, preset)
+    # The kernel reads the same files without torch.
+    if preset != "calibrated":
+        traffic = GanTrafficConfig(path=str(path))
+        with pytest.raises(UserError, match=message):
+            drivers_of(traffic, IdmParameters(), MobilParameters(), Stream.TRAIN)
 
 
 @pytest.mark.parametrize(

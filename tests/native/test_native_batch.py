@@ -13,6 +13,7 @@ import torch
 
 from ganlane.api import make_env
 from ganlane.native.batch import NativeBatch
+from ganlane.native.drivers import RuleDrivers
 from ganlane.native.library import VARIANTS, best_variant, why_not
 from ganlane.settings.driving import EgoParameters
 from ganlane.settings.env import EnvConfig
@@ -31,8 +32,7 @@ def batch_of(env, mobil=True, rows=ROWS, **parts):
         env.spawn_parameters(),
         env.ego,
         env.episode_parameters(),
-        env.idm,
-        env.mobil if mobil else None,
+        RuleDrivers(env.idm, mobil=env.mobil if mobil else None),
         env.recycle_share if env.recycle else None,
         **parts,
     )

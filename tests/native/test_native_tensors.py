@@ -25,6 +25,7 @@ from tensordict import TensorDict, TensorDictBase
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
+from ganlane.native.drivers import RuleDrivers
 from ganlane.native.library import VARIANTS, best_variant, why_not
 from ganlane.native.tensors import Kernel, NativeScenes
 from ganlane.settings.driving import Visibility
@@ -87,7 +88,8 @@ def disturbed_start(env: HighwayEnv, generator: torch.Generator) -> TensorDictBa
 def kernel_of(env: HighwayEnv, variant: str | None = None) -> Kernel:
     """The kernel for the environment's road, rules and traffic."""
     mobil = env.traffic.mobil if isinstance(env.traffic, IdmMobilTraffic) else None
-    return Kernel(env.road, env.vehicles, env.episode, env.ego, mobil=mobil, variant=variant)
+    drivers = RuleDrivers(mobil=mobil)
+    return Kernel(env.road, env.vehicles, env.episode, env.ego, drivers, variant)
 
 
 def by_kernel(kernel: Kernel, td: TensorDictBase, recycle: bool = False) -> TensorDictBase:

@@ -14,14 +14,10 @@ from ganlane.data import DrivingStatistics
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.generator import shipped_generator
+from ganlane.native.drivers import SIMULATED_ANCHOR, sudden_accelerations
 from ganlane.sim import Road, Vehicles, pair_overlaps
 from ganlane.sim.state import lateral_half_extent
-from ganlane.traffic.presets import (
-    SIMULATED_ANCHOR,
-    gan_calibrated_traffic,
-    gan_traffic,
-    sudden_accelerations,
-)
+from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
 from ganlane.weights import load_weights, save_weights
 
 

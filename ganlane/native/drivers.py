@@ -1,0 +1,494 @@
+"""Who the kernel can drive: rule-driven drivers, and those of the shipped generated traffics.
+
+Imports no torch. The weights of a generator are packed as network.hpp reads them.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import platform
+from collections.abc import Mapping
+from ctypes import c_float, c_int32, c_int64, c_void_p
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from ganlane import keys
+from ganlane.errors import UserError
+from ganlane.native.library import best_variant
+from ganlane.native.settings import STEERING, Key, MemoryArrays, fields
+from ganlane.settings.driving import (
+    IdmParameters,
+    MobilParameters,
+    SteeringParameters,
+    Visibility,
+)
+from ganlane.settings.generated import (
+    ANCHOR,
+    QUANTILE_LEVELS,
+    AnchorParameters,
+    CalibratedChanges,
+    GuardParameters,
+    LiteralChanges,
+    SuddenAccelerations,
+)
+from ganlane.settings.generator import (
+    GENERATOR,
+    GeneratorSizes,
+    shipped_generator,
+    stored_sizes,
+)
+from ganlane.settings.traffic import (
+    GanCalibratedTrafficConfig,
+    GanTrafficConfig,
+    IdmMobilTrafficConfig,
+    IdmTrafficConfig,
+    TrafficConfig,
+)
+from ganlane.weights import load_arrays
+
+if TYPE_CHECKING:
+    from ganlane.data.statistics import DrivingStatistics
+
+Weights: TypeAlias = Mapping[str, npt.NDArray[np.float32]]
+#: Layers of the kernel have a multiple of this many outputs.
+_WIDEST: Final = 16
+#: Correlation time of a driver's latent vector in the paper's traffic, s.
+PAPER_NOISE_PERIOD_S = 5.0
+#: Anchor of the calibrated traffic: the fitted one, with brisker acceleration and lane changes as
+#: fast as recorded ones.
+SIMULATED_ANCHOR: AnchorParameters = replace(
+    ANCHOR,
+    idm=replace(ANCHOR.idm, max_acceleration=1.0),
+    lane_stiffness=0.6,
+    lane_damping=1.55,
+)
+#: Wishes per executed lane change, measured in the simulation with 9 vehicles: a wish comes only
+#: while the driver is near its lane's centre, and waiting for a gap costs distance. A slow test
+#: holds the resulting rate.
+WISH_PER_CHANGE = 1.8
+
+
+class RuleDrivers(NamedTuple):
+    """Rule-driven drivers; ``mobil=None``: they keep their lanes."""
+
+    idm: IdmParameters = IdmParameters()
+    steering: SteeringParameters = SteeringParameters()
+    mobil: MobilParameters | None = None
+    #: When others see a lane change.
+    visibility: Visibility = Visibility.SIGNALLED
+
+    def memory(self) -> MemoryArrays:
+        """Their steering angles."""
+        return {STEERING: ("float32", ())}
+
+
+@dataclass(frozen=True)
+class GeneratedDrivers:
+    """Drivers by a generator: ``gan``, or with an ``anchor`` ``gan_calibrated``.
+
+    Attributes:
+        idm: of the guard's bounds and of the gap check; the ego's own.
+        sizes, weights: of the network, by the names of its ``state_dict``.
+        stream: family of episodes that the random numbers belong to.
+        noise_scale, noise_period_s: of the latent vectors.
+        sudden, changes, guard: of the paper's; without a guard vehicles leave the road.
+        anchor, checked_changes, headways_s: of the calibrated ones; headways are the 5, 25, 50, 75
+            and 95 % quantiles.
+    """
+
+    idm: IdmParameters
+    sizes: GeneratorSizes
+    weights: Weights = field(repr=False)
+    stream: int
+    noise_scale: float
+    noise_period_s: float
+    sudden: SuddenAccelerations = field(default_factory=SuddenAccelerations)
+    changes: LiteralChanges = field(default_factory=LiteralChanges)
+    guard: GuardParameters | None = None
+    anchor: AnchorParameters | None = None
+    checked_changes: CalibratedChanges = field(default_factory=CalibratedChanges)
+    headways_s: tuple[float, ...] = ()
+
+    #: Of the ego: the others do not steer.
+    steering: ClassVar[SteeringParameters] = SteeringParameters()
+    #: When others see a lane change.
+    visibility: ClassVar[Visibility] = Visibility.BODY
+
+    @property
+    def mobil(self) -> MobilParameters:
+        """The limits of a lane change, as MOBIL has them."""
+        changes = self.checked_changes
+        return MobilParameters(
+            safe_deceleration=changes.safe_deceleration, exclusive_m=changes.exclusive_m
+        )
+
+    def memory(self) -> MemoryArrays:
+        """Their memory in the order of generated.hpp."""
+        sizes = self.sizes
+        arrays: MemoryArrays = {
+            _memory("generator", "displacement"): ("float32", (2,)),
+            _memory("generator", "noise"): ("float32", (sizes.noise,)),
+        }
+        if self.anchor is None:
+            arrays[_memory("acceleration", "acceleration")] = ("float32", ())
+            arrays[_memory("acceleration", "left")] = ("int64", ())
+            arrays[_memory("lane_change", "clock")] = ("int64", ())
+            arrays[_memory("lane_change", "lateral_speed")] = ("float32", ())
+        else:
+            arrays[_memory("generator", "residual_mean")] = ("float32", (2,))
+            arrays[_memory("generator", "headway")] = ("float32", ())
+            arrays[_memory("lane_change", "wish")] = ("int64", ())
+            arrays[_memory("lane_change", "waited")] = ("int64", ())
+        for index in range(sizes.observed - 1):
+            arrays[_memory("generator", f"motion_{index}")] = ("float32", (4 * sizes.hidden,))
+        return arrays
+
+
+Drivers: TypeAlias = RuleDrivers | GeneratedDrivers
+
+
+def _memory(part: str, name: str) -> Key:
+    return (keys.TRAFFIC, part, name)
+
+
+class Network(ctypes.Structure):
+    """``Network`` of network.hpp."""
+
+    _fields_ = [
+        *fields(c_void_p, "weights"),
+        *fields(
+            c_int32,
+            "embedding hidden pooling pooled context noise neighbours extra_inputs motions"
+            " differences",
+        ),
+    ]
+
+
+class Generated(ctypes.Structure):
+    """``Generated`` of generated.hpp."""
+
+    _fields_ = [
+        *fields(Network, "network"),
+        *fields(c_int64, "stream"),
+        *fields(c_float, "noise_share noise_fresh noise_scale"),
+        *fields(c_int32, "calibrated guard"),
+        *fields(
+            c_float,
+            "sudden_chance sudden_mean sudden_sd sudden_steps"
+            " mean_steps lateral_speed_mps lateral_speed_sd_mps slowest_mps"
+            " guard_headway_s slack hardest_braking centring damping edge_margin_m steepest_rad"
+            " min_gap_m per_brake_scale min_acceleration max_acceleration"
+            " lane_stiffness lane_damping residual_along residual_across washout_share"
+            " changes_per_m patience_steps",
+        ),
+        ("headways_s", c_float * len(QUANTILE_LEVELS)),
+        *fields(c_int32, "further_inputs"),
+    ]
+
+    #: The array that ``network.weights`` points to.
+    packed: npt.NDArray[np.float32]
+
+
+def generated_of(drivers: Drivers) -> Generated | None:
+    """The numbers of generated drivers; None for others."""
+    if not isinstance(drivers, GeneratedDrivers):
+        return None
+    dt = keys.PHYSICS_STEP_S
+    guard = drivers.guard or GuardParameters()
+    anchor = drivers.anchor or ANCHOR
+    sudden = drivers.sudden
+    period = drivers.noise_period_s
+    # As closed_loop.wander: what stays of a latent vector in a step.
+    share = math.exp(-dt / period) if period > 0 else 0.0
+    numbers: dict[str, Any] = {**vars(drivers.changes), **vars(anchor), **vars(anchor.idm)}
+    numbers |= vars(guard)
+    numbers |= {
+        "network": _network_of(drivers),
+        "stream": drivers.stream,
+        "noise_share": share,
+        "noise_fresh": math.sqrt(1.0 - share * share),
+        "noise_scale": drivers.noise_scale,
+        "calibrated": drivers.anchor is not None,
+        "guard": drivers.guard is not None,
+        "sudden_chance": dt / sudden.every_s,
+        "sudden_mean": sudden.mean,
+        "sudden_sd": sudden.sd,
+        "sudden_steps": round(sudden.lasts_s / dt),
+        "guard_headway_s": guard.headway_s,
+        # The guard's pull within a step.
+        "centring": guard.centring_per_s * dt,
+        "per_brake_scale": 1.0 / anchor.idm.brake_scale(),
+        "residual_along": anchor.residual[0],
+        "residual_across": anchor.residual[1],
+        "washout_share": dt / anchor.washout_s,
+        "changes_per_m": dt * drivers.checked_changes.per_km / 1000.0,
+        "patience_steps": round(drivers.checked_changes.patience_s / dt),
+        "headways_s": (drivers.headways_s or (0.0,) * len(QUANTILE_LEVELS)),
+    }
+    generated = Generated(**{name: numbers[name] for name, *_ in Generated._fields_})
+    # ctypes copies the address alone, so the numbers have to be held here.
+    generated.packed = _packed(drivers.sizes, drivers.weights)
+    generated.network.weights = generated.packed.ctypes.data
+    return generated
+
+
+def _network_of(drivers: GeneratedDrivers) -> Network:
+    sizes = vars(drivers.sizes)
+    numbers = {name: sizes[name] for name, *_ in Network._fields_ if name in sizes}
+    return Network(**numbers, motions=drivers.sizes.observed - 1)
+
+
+def _packed(sizes: GeneratorSizes, weights: Weights) -> npt.NDArray[np.float32]:
+    """All layers in the order of ``layers_of`` in network.hpp, aligned to a vector.
+
+    Of each the biases and the transposed weights, with zeros as further outputs. The gates of an
+    LSTM are filled up one by one; the decoder's cell begins at 0, so its forget gate is left out.
+    """
+    w = weights
+    every, three = (0, 1, 2, 3), (0, 2, 3)
+    layers = [
+        _layer(w["encoder.embed.weight"], w["encoder.embed.bias"]),
+        _layer(w["encoder.input.weight"], w["encoder.input.bias"], every),
+        _layer(w["encoder.recurrent"], None, every),
+        # The bias of a pair's first layer is added with the other vehicle's term.
+        _layer(w["pooling.per_pair.weight"], None),
+        _layer(w["pooling.per_vehicle.weight"], w["pooling.per_pair.bias"]),
+        _layer(w["pooling.second.weight"], w["pooling.second.bias"]),
+        _layer(w["context.0.weight"], w["context.0.bias"]),
+        _layer(w["context.2.weight"], w["context.2.bias"]),
+        _layer(w["decoder.embed.weight"], w["decoder.embed.bias"]),
+        _layer(w["decoder.input.weight"], w["decoder.input.bias"], three),
+        _layer(w["decoder.recurrent"], None, three),
+        _layer(w["head.weight"], w["head.bias"]),
+    ]
+    numbers = np.concatenate(layers)
+    room = np.empty(len(numbers) + _WIDEST, np.float32)
+    # NumPy aligns to 16 bytes, a vector has up to 64.
+    start = -room.ctypes.data % 64 // 4
+    aligned = room[start : start + len(numbers)]
+    aligned[:] = numbers
+    return aligned
+
+
+def _layer(
+    weight: npt.NDArray[np.float32],
+    bias: npt.NDArray[np.float32] | None,
+    gates: tuple[int, ...] = (0,),
+) -> npt.NDArray[np.float32]:
+    # [gates, outputs of a gate, inputs]; a layer without gates is one gate.
+    blocks = 1 if gates == (0,) else 4
+    parts = np.column_stack([np.zeros(len(weight)) if bias is None else bias, weight])
+    parts = parts.reshape(blocks, len(weight) // blocks, -1)[list(gates)]
+    missing = -parts.shape[1] % _WIDEST
+    filled = np.pad(parts, ((0, 0), (0, missing), (0, 0)))
+    return filled.reshape(-1, parts.shape[2]).T.astype(np.float32).ravel()
+
+
+# From weights and their metadata
+
+
+def paper_drivers(
+    weights: Weights,
+    sizes: GeneratorSizes,
+    metadata: Mapping[str, Any],
+    source: object,
+    config: GanTrafficConfig,
+    idm: IdmParameters,
+    stream: int,
+) -> GeneratedDrivers:
+    """Drivers of ``traffic=gan``; ``source`` names the weights in messages.
+
+    Raises:
+        UserError: the recordings hold no complete lane change.
+    """
+    statistics = _statistics(metadata)
+    return GeneratedDrivers(
+        idm,
+        sizes,
+        weights,
+        stream,
+        config.noise_scale,
+        PAPER_NOISE_PERIOD_S,
+        sudden=sudden_accelerations(statistics),
+        changes=literal_changes(statistics, source),
+        guard=GuardParameters() if config.guard else None,
+    )
+
+
+def calibrated_drivers(
+    weights: Weights,
+    sizes: GeneratorSizes,
+    metadata: Mapping[str, Any],
+    source: object,
+    config: GanCalibratedTrafficConfig,
+    idm: IdmParameters,
+    stream: int,
+) -> GeneratedDrivers:
+    """Drivers of ``traffic=gan_calibrated``.
+
+    Raises:
+        UserError: fitted without per-driver parameters.
+    """
+    statistics = _statistics(metadata)
+    # Without a recorded change nobody changes lanes.
+    recorded = statistics.lane_changes.per_vehicle_km or 0.0
+    # Only None asks for the recorded rate; 0 is a rate.
+    wishes = config.changes_per_km
+    wishes = WISH_PER_CHANGE * recorded if wishes is None else wishes
+    return GeneratedDrivers(
+        idm,
+        sizes,
+        weights,
+        stream,
+        config.noise_scale,
+        config.noise_period_s,
+        anchor=fitted_anchor(metadata, source),
+        checked_changes=CalibratedChanges(wishes),
+        headways_s=tuple(statistics.headway.quantile(level) for level in QUANTILE_LEVELS),
+    )
+
+
+def _statistics(metadata: Mapping[str, Any]) -> DrivingStatistics:
+    # Imports the readers of recordings, a third of a second that rule-driven traffic does without.
+    from ganlane.data.statistics import DrivingStatistics
+
+    return DrivingStatistics.from_dict(metadata["driving_statistics"])
+
+
+def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralChanges:
+    """Equations 9 to 11 with the numbers of all recordings given to the fit, held-out ones too."""
+    changes = statistics.lane_changes
+    numbers = (
+        changes.t_m_srlc_steps,
+        changes.lateral_speed.mean,
+        changes.lateral_speed.sd,
+    )
+    # A number is missing if no change was recorded from beginning to end.
+    if None in numbers:
+        raise UserError(
+            f"{source}: its recordings hold no complete lane change, so equations 9 to 11 have no "
+            "numbers; fit the generator to recordings with lane changes."
+        )
+    # The condition is for type checkers; no number is None here.
+    return LiteralChanges(*(float(number) for number in numbers if number is not None))
+
+
+def sudden_accelerations(
+    statistics: DrivingStatistics,
+) -> SuddenAccelerations:
+    """Gaussian of the recorded accelerations over one second, of all scenes."""
+    recorded = statistics.acceleration_smoothed
+    default = SuddenAccelerations()
+    return SuddenAccelerations(
+        # Where no acceleration was recorded these are None; 0 is a number.
+        mean=default.mean if recorded.mean is None else recorded.mean,
+        sd=default.sd if recorded.sd is None else recorded.sd,
+    )
+
+
+def fitted_anchor(metadata: Mapping[str, Any], source: object) -> AnchorParameters:
+    """:data:`SIMULATED_ANCHOR` with the washout and the further inputs of the fit (by default those
+    of ``ANCHOR``).
+
+    Args:
+        metadata, source: of the weights (:func:`ganlane.generator.load_generator`), and their file
+            for messages.
+
+    Raises:
+        UserError: fitted without per-driver parameters, which this traffic always draws; or
+            impossible values.
+    """
+    # A file may lack these entries: then the defaults of the fit hold.
+    config = metadata["config"] if isinstance(metadata.get("config"), Mapping) else {}
+    washout_s = config.get("washout_s", ANCHOR.washout_s)
+    further_inputs = config.get("further_inputs", ANCHOR.further_inputs)
+    if config.get("traits", True) is not True:
+        raise UserError(
+            f"{source}: fitted with traits={config['traits']}, but every driver of gan_calibrated "
+            "has a headway and a desired speed of its own; give weights fitted with "
+            "generator.traits=true."
+        )
+    # `not washout_s > 0` since NaN has to fail; `type` since True is no number of seconds.
+    if type(washout_s) not in (int, float) or not washout_s > 0 or type(further_inputs) is not bool:
+        raise UserError(
+            f"{source}: its config says washout_s={washout_s!r} and "
+            f"further_inputs={further_inputs!r}, expected seconds above 0 and true or false; fit "
+            "it again."
+        )
+    return replace(
+        SIMULATED_ANCHOR,
+        washout_s=float(washout_s),
+        further_inputs=further_inputs,
+    )
+
+
+def pays(drivers: Drivers) -> bool:
+    """Whether the kernel is faster than the tensor code on this processor.
+
+    Without an instruction for a product and a sum (x86 before 2013), a generator's network is a
+    hundred times slower.
+    """
+    x86 = platform.machine() in ("x86_64", "AMD64")
+    return isinstance(drivers, RuleDrivers) or not x86 or best_variant() != "default"
+
+
+def drivers_of(
+    traffic: TrafficConfig, idm: IdmParameters, mobil: MobilParameters, stream: int
+) -> Drivers | None:
+    """The drivers of a traffic's settings; None where the kernel cannot drive as they do.
+
+    The same as :meth:`ganlane.traffic.TrafficModule.native_drivers` says, known without torch.
+
+    Raises:
+        UserError: the weights are missing, foreign, of the other preset, or do not fit.
+    """
+    if traffic.blind_share:
+        return None
+    if type(traffic) is IdmTrafficConfig:
+        return RuleDrivers(idm)
+    if type(traffic) is IdmMobilTrafficConfig:
+        return RuleDrivers(idm, mobil=mobil)
+    if type(traffic) is GanTrafficConfig and traffic.execute_k == 1:
+        return paper_drivers(*_weights(traffic.path, "paper"), traffic, idm, stream)
+    if type(traffic) is GanCalibratedTrafficConfig:
+        return calibrated_drivers(*_weights(traffic.path, "calibrated"), traffic, idm, stream)
+    return None
+
+
+def _weights(
+    path: str | None, preset: Any
+) -> tuple[Weights, GeneratorSizes, Mapping[str, Any], Path]:
+    """Weights, their sizes and metadata, and their file."""
+    source = Path(path or shipped_generator(preset))
+    weights, metadata = load_arrays(source, GENERATOR)
+    sizes = stored_sizes(source, metadata, preset)
+    if {name: array.shape for name, array in weights.items()} != _shapes(sizes):
+        raise UserError(
+            f"{source}: its weights do not have the shapes that its sizes ask for; fit it again."
+        )
+    return weights, sizes, metadata, source
+
+
+def _shapes(sizes: GeneratorSizes) -> dict[str, tuple[int, ...]]:
+    """Shapes of the weights, by the names in the ``state_dict`` of a generator."""
+    s = sizes
+    linear = {
+        "pooling.per_pair": (4, s.pooling),
+        "pooling.second": (s.pooling, s.pooled),
+        "context.0": (s.hidden + s.pooled + s.extra_inputs, s.context),
+        "context.2": (s.context, s.hidden - s.noise),
+        "head": (s.hidden, 2),
+    }
+    shapes: dict[str, tuple[int, ...]] = {"pooling.per_vehicle.weight": (s.pooling, s.hidden)}
+    for part in ("encoder", "decoder"):
+        linear[f"{part}.embed"] = (4, s.embedding)
+        linear[f"{part}.input"] = (s.embedding, 4 * s.hidden)
+        shapes[f"{part}.recurrent"] = (4 * s.hidden, s.hidden)
+    for name, (inputs, outputs) in linear.items():
+        shapes |= {f"{name}.weight": (outputs, inputs), f"{name}.bias": (outputs,)}
+    return shapes

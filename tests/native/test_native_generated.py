@@ -1,0 +1,267 @@
+"""Generated traffic by the kernel: as the tensor code drives it, and the same bits everywhere."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+import torch
+from reference.worlds import environment, leaves, packed, same_bits
+
+from ganlane import keys
+from ganlane.api import make_env
+from ganlane.build import make_traffic
+from ganlane.generator import Generator, shipped_generator
+from ganlane.native.batch import NativeBatch
+from ganlane.native.drivers import GeneratedDrivers, drivers_of
+from ganlane.native.library import VARIANTS, best_variant, why_not
+from ganlane.native.tensors import Kernel, NativeScenes
+from ganlane.settings.driving import IdmParameters, MobilParameters, Visibility
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.generator import EXTRA_INPUTS, GENERATOR, GeneratorSizes
+from ganlane.settings.record import make
+from ganlane.settings.traffic import TrafficConfig
+from ganlane.sim.spawn import RandomScenes
+from ganlane.sim.state import Road
+from ganlane.weights import load_weights, save_weights
+
+pytestmark = pytest.mark.skipif(why_not() is not None, reason="no C++ compiler")
+RUNNABLE = list(VARIANTS)[list(VARIANTS).index(best_variant()) :]
+PRESETS = {"gan": "paper", "gan_calibrated": "calibrated"}
+#: No width is a whole number of vectors, and not everybody in sight is pooled.
+ODD = {
+    "embedding": 21,
+    "hidden": 12,
+    "pooling": 9,
+    "pooled": 7,
+    "context": 18,
+    "noise": 3,
+    "neighbours": 4,
+    "observed": 5,
+}
+
+
+def odd_weights(preset, folder):
+    """A generator of odd sizes and random weights, with the recordings of the shipped one."""
+    _, metadata = load_weights(shipped_generator(preset), GENERATOR)
+    extra_inputs = EXTRA_INPUTS if preset == "calibrated" else 0
+    sizes = GeneratorSizes(**ODD, extra_inputs=extra_inputs)
+    torch.manual_seed(3)
+    path = folder / f"{preset}.safetensors"
+    state = Generator(sizes).state_dict()
+    save_weights(path, GENERATOR, state, metadata | {"sizes": asdict(sizes)})
+    return str(path)
+
+
+def random_highway(rng, traffic, rows):
+    """1 to 5 lanes, 2 to 25 vehicles, dense and sparse, all periods and the ego's visibilities."""
+    env = EnvConfig(lanes=rng.randint(1, 5))
+    module = make_traffic(make(TrafficConfig, traffic), env)
+    vehicles = rng.randint(2, 25)
+    spacing = rng.choice([12.0, 25.0])
+    return environment(
+        env.lanes,
+        rows,
+        vehicles,
+        spawn=packed(max(60.0, 1.5 * spacing * vehicles / env.lanes + spacing), spacing),
+        period_s=rng.choice([0.1, 0.5, 1.0]),
+        goal_m=rng.choice([60.0, 5000.0]),
+        timeout_s=rng.choice([4.0, 1000.0]),
+        abort=rng.random() < 0.5,
+        visibility=rng.choice(list(Visibility)),
+        traffic=module,
+        dtype=torch.float32,
+        kernel="torch",
+    )
+
+
+def kernel_of(env, variant=None):
+    """The kernel for the environment's road, rules and traffic."""
+    drivers = env.traffic.native_drivers()
+    return Kernel(env.road, env.vehicles, env.episode, env.ego, drivers, variant)
+
+
+def differing(out, after):
+    """Rows in which an event, a flag, a counter or a lane differs, or a number by more than
+    rounding; the network's memory of the ego, which it does not drive, does not count.
+    """
+    differs = torch.zeros(len(out), dtype=torch.bool)
+    for name, value in leaves(out):
+        other = after[name]
+        if name[-1] == "residual_mean":
+            value, other = value[:, 1:], other[:, 1:]
+        error = (value.double() - other.double()).abs()
+        # Sums in another order differ by 1e-7; within a second the network makes millimetres of
+        # it, and accelerations are differences over 0.1 s.
+        amplified = name[:2] == (keys.TRAFFIC, "generator") or name[-1] == "acceleration"
+        limit = 0.0 if not value.is_floating_point() else 2e-2 if amplified else 2e-3
+        differs |= (error > limit).reshape(len(out), -1).any(1)
+    return differs
+
+
+def compare(traffic, highways, rows, decisions, seed):
+    """Both decide from every state of the tensor code's episodes; the share of rows that differ."""
+    rng = random.Random(seed)
+    generator = torch.Generator().manual_seed(seed)
+    compared = 0
+    differ = 0
+    for _ in range(highways):
+        env = random_highway(rng, traffic, rows)
+        kernel = kernel_of(env)
+        td = env.reset()
+        for _ in range(decisions):
+            td["action"] = torch.randint(0, 3, (rows,), generator=generator)
+            out = kernel.decide(td["action"], td)
+            stepped, following = env.step_and_maybe_reset(td.clone())
+            differ += int(differing(out, stepped["next"].exclude("reward")).sum())
+            compared += rows
+            td = following
+    return differ, compared
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"noise_scale": 0.5}, {"guard": False}, {"changes_per_km": 30.0}, {"noise_period_s": 0.0}],
+    ids=lambda options: next(iter(options), "as shipped"),
+)
+@pytest.mark.parametrize("traffic", PRESETS)
+def test_it_decides_as_the_tensor_code(traffic, options):
+    if traffic == "gan" and {"changes_per_km", "noise_period_s"} & set(options):
+        pytest.skip("an option of gan_calibrated")
+    if traffic == "gan_calibrated" and "guard" in options:
+        pytest.skip("an option of gan")
+    differ, _ = compare({"name": traffic} | options, highways=4, rows=12, decisions=4, seed=1)
+    # A random number at a threshold may fall on its other side.
+    assert differ <= 1
+
+
+@pytest.mark.parametrize("traffic", PRESETS)
+def test_networks_of_any_sizes_drive(traffic, tmp_path):
+    path = odd_weights(PRESETS[traffic], tmp_path)
+    differ, _ = compare({"name": traffic, "path": path}, highways=4, rows=12, decisions=3, seed=2)
+    assert differ <= 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("traffic", PRESETS)
+def test_it_decides_as_the_tensor_code_in_a_hundred_thousand_decisions(traffic):
+    differ, compared = compare(traffic, highways=80, rows=128, decisions=10, seed=4)
+    assert differ <= compared // 10_000, (differ, compared)
+
+
+@pytest.fixture(scope="module", params=PRESETS)
+def episodes(request):
+    """Drivers, and the states of 37 episodes after every decision, and the actions."""
+    traffic = make(TrafficConfig, request.param)
+    drivers = drivers_of(traffic, IdmParameters(), MobilParameters(), 0)
+    actions = np.random.default_rng(0).choice(3, (12, 37), p=[0.8, 0.1, 0.1])
+    return drivers, actions, drive(drivers, actions, range(37))
+
+
+def drive(drivers, actions, numbers, variant=None):
+    """The arrays of the state after every decision of the episodes ``numbers``."""
+    numbers = np.array(numbers)
+    batch = NativeBatch(len(numbers), drivers=drivers, variant=variant)
+    batch.start(3, numbers)
+    states = []
+    for action in actions[:, numbers]:
+        stepped = batch.step(action)
+        state = {name: array.copy() for name, array in batch.state.items()}
+        states.append(state | {"observation": stepped.observation.copy()})
+    return states
+
+
+def assert_same(states, whole, rows):
+    for state, expected in zip(states, whole):
+        for name, array in state.items():
+            np.testing.assert_array_equal(array, expected[name][rows], str(name))
+
+
+@pytest.mark.parametrize("numbers", [[0], [36], range(5, 12), range(1, 18)], ids=str)
+def test_an_episode_is_the_same_bit_for_bit_in_any_batch(episodes, numbers):
+    drivers, actions, whole = episodes
+    assert_same(drive(drivers, actions, numbers), whole, np.array(numbers))
+
+
+@pytest.mark.parametrize("variant", RUNNABLE)
+def test_every_instruction_set_gives_the_same_bits(episodes, variant):
+    drivers, actions, whole = episodes
+    # Without an instruction for it, a product and a sum take a hundred times as long.
+    few = range(3) if variant == "default" else range(37)
+    assert_same(drive(drivers, actions[:4], few, variant), whole[:4], np.array(few))
+
+
+@pytest.mark.parametrize("traffic", PRESETS)
+def test_torchrl_and_gymnasium_drive_the_same_episodes(traffic):
+    rows = 5
+    env = make_env(traffic, num_envs=rows, kernel="native", seed=3)
+    drivers = drivers_of(make(TrafficConfig, traffic), IdmParameters(), MobilParameters(), 0)
+    batch = NativeBatch(rows, drivers=drivers)
+    batch.start(3, np.arange(rows))
+    td = env.reset()
+    for _ in range(5):
+        action = np.array([0, 1, 2, 0, 0])
+        batch.step(action)
+        td = env.step(td.set("action", torch.from_numpy(action)))["next"]
+        for name, array in batch.state.items():
+            if isinstance(name, tuple):
+                expected = td[name].numpy().reshape(array.shape)
+                np.testing.assert_array_equal(array, expected, str(name))
+
+
+@pytest.mark.parametrize("traffic", PRESETS)
+def test_the_first_memory_is_that_of_the_tensor_code(traffic):
+    module = make_traffic(make(TrafficConfig, traffic), EnvConfig())
+    scenes = RandomScenes(others_visibility=Visibility.BODY)
+    seed = torch.full((20,), 7)
+    state = NativeScenes(scenes, 0, module.native_drivers()).start(seed, torch.arange(20))
+    env = environment(num_envs=20, traffic=module, seed=7, dtype=torch.float32, kernel="torch")
+    expected = env.reset()
+    memory = state[keys.TRAFFIC]
+    assert {name for name, _ in leaves(memory)} == {
+        name for name, _ in leaves(expected[keys.TRAFFIC])
+    }
+    for name, value in leaves(memory):
+        torch.testing.assert_close(value, expected[keys.TRAFFIC][name], atol=2e-5, rtol=1e-5)
+
+
+def test_a_row_that_ends_leaves_its_drivers_memory_alone():
+    """A command off the road ends an episode before anybody moves."""
+    env = make_env("gan", num_envs=3, kernel="native")
+    td = env.reset()
+    right_lane = td[keys.VEHICLES, "target_lane"][:, 0] == 0
+    assert right_lane.any()
+    after = env.step(td.set("action", torch.where(right_lane, keys.RIGHT, keys.KEEP)))["next"]
+    assert same_bits(after[keys.TRAFFIC][right_lane], td[keys.TRAFFIC][right_lane]) == []
+    assert same_bits(after[keys.TRAFFIC][~right_lane], td[keys.TRAFFIC][~right_lane]) != []
+
+
+@pytest.mark.parametrize("traffic", ["idm_mobil", *PRESETS])
+def test_numbers_never_become_denormal(traffic):
+    """They decay by a factor a step; a product with a denormal takes a hundred times as long."""
+    drivers = drivers_of(make(TrafficConfig, traffic), IdmParameters(), MobilParameters(), 0)
+    batch = NativeBatch(64, drivers=drivers)
+    batch.start(0, np.arange(64))
+    for _ in range(200):
+        batch.step(np.zeros(64, np.int64))
+    smallest = np.finfo(np.float32).tiny
+    for name, array in batch.state.items():
+        if array.dtype == np.float32:
+            denormal = (array != 0) & (np.abs(array) < smallest)
+            assert not denormal.any(), name
+
+
+def test_drivers_describe_themselves_without_their_weights():
+    drivers = drivers_of(make(TrafficConfig, "gan"), IdmParameters(), MobilParameters(), 0)
+    assert isinstance(drivers, GeneratedDrivers)
+    assert "weights" not in repr(drivers)
+
+
+def test_the_road_may_have_any_width():
+    env = random_highway(random.Random(0), "gan_calibrated", 4)
+    kernel = kernel_of(env)
+    assert kernel.decide(torch.zeros(4, dtype=torch.int64), env.reset()).batch_size == (4,)
+    wide = Kernel(Road(2, 5.0), env.vehicles, drivers=env.traffic.native_drivers())
+    assert wide.decide(torch.zeros(4, dtype=torch.int64), env.reset()).batch_size == (4,)

@@ -34,6 +34,7 @@ from ganlane.files import CHECKPOINTS
 from ganlane.generator.checkpoint import load_generator
 from ganlane.native import library
 from ganlane.native.batch import NativeBatch
+from ganlane.native.drivers import RuleDrivers
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
 from ganlane.runtime import has_compiler
 from ganlane.settings.driving import MobilParameters
@@ -130,7 +131,7 @@ def _driven(path: Path) -> Any:
         for named in (path.parent / "native").glob("*.so"):
             shutil.copy(path, named)
         library._find.cache_clear()
-        batch = NativeBatch(2, mobil=MobilParameters())
+        batch = NativeBatch(2, drivers=RuleDrivers(mobil=MobilParameters()))
         batch.start(0, [0, 1])
         for action in (0, 1, 2):
             batch.step(np.full(2, action))

@@ -2,9 +2,9 @@
 
     ganlane doctor
 
-Prints the versions of the dependencies and of what the extras bring, devices, threads, the compiler
-of the native kernel, and the recordings. Nothing is written. What is MISSING is needed; what is
-absent serves further purposes only.
+Prints the versions of the dependencies and of what the extras bring, devices, threads, whether the
+native kernel can be built and drives right, and the recordings. Nothing is written but the kernel,
+to its cache. What is MISSING is needed; what is absent serves further purposes only.
 
 exit status: 0 all that is needed is there, 1 something needed is missing, 2 a mistake on the
 command line
@@ -58,12 +58,31 @@ def devices() -> str:
 
 
 def kernel() -> str:
-    """The compiler of the native kernel, or the library that a wheel brings."""
+    """Instruction set and maker of the native kernel, which has driven as the tensor code does."""
+    from ganlane import keys
+    from ganlane.env import HighwayEnv
     from ganlane.native import library
+    from ganlane.traffic import IdmMobilTraffic
 
-    if library.why_not() is not None:
-        raise UserError(f"env.kernel=native {library.why_not()}")
-    return " ".join(library.compiler_command() or ["in the wheel"])
+    loaded = library.find()
+    if isinstance(loaded, str):
+        raise UserError(f"env.kernel=native {loaded}.")
+    positions = []
+    for name in ("native", "torch"):
+        env = HighwayEnv(IdmMobilTraffic(), num_envs=16, kernel=name)
+        state = env.reset()
+        for _ in range(5):
+            state[keys.ACTION] = env.action_spec.zeros()
+            state = env.step(state)["next"]
+        positions.append(state[keys.VEHICLES, "x"])
+    apart_m = float((positions[0] - positions[1]).abs().max())
+    if not apart_m < 0.1:
+        raise UserError(
+            f"{loaded.maker}: its kernel drives {apart_m:g} m away from the tensor code; set CXX "
+            "to another compiler, or env.kernel=torch."
+        )
+    about = f"{loaded.variant}, by {loaded.maker}, drives as the tensor code does"
+    return "; ".join((about, *loaded.troubles))
 
 
 def recordings() -> str:

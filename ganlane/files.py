@@ -41,12 +41,15 @@ _COMMENT = len(PLACE).to_bytes(2, "little") + PLACE.encode()
 def cache_folder() -> Path | None:
     """Folder of the cache: ``GANLANE_CACHE``, else ``ganlane`` in the user's cache folder.
 
-    None if switched off.
+    None if switched off, or for a user without a home.
     """
     named = os.environ.get(CACHE_VARIABLE)
     if named is not None:
         return Path(named) if named else None
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ganlane"
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ganlane"
+    except RuntimeError:  # as in a container that runs under any number
+        return None
 
 
 def conf_folder() -> Path:

@@ -10,7 +10,10 @@ import ctypes
 import os
 import select
 import shutil
+import subprocess
 import sys
+import tempfile
+from functools import lru_cache
 from pathlib import Path
 from typing import Final, TextIO
 
@@ -67,17 +70,31 @@ def find_compiler() -> tuple[str | None, str]:
 
 
 def has_compiler() -> bool:
-    """Whether torch would find a C++ compiler."""
-    return find_compiler()[0] is not None
+    """Whether torch would find a C++ compiler, and it works."""
+    path, _ = find_compiler()
+    return path is not None and _compiles(path)
+
+
+@lru_cache(maxsize=4)
+def _compiles(compiler: str) -> bool:
+    """Whether a file that needs a header of the system compiles."""
+    with tempfile.TemporaryDirectory(prefix="ganlane-") as folder:
+        (Path(folder) / "trial.cpp").write_text("#include <cmath>\n")
+        try:
+            command = [compiler, "-c", "trial.cpp"]
+            subprocess.run(command, cwd=folder, capture_output=True, check=True)
+        except (OSError, subprocess.CalledProcessError):
+            return False
+        return len(os.listdir(folder)) > 1
 
 
 def check_compiler() -> None:
-    """Raise :class:`UserError` where torch would find no C++ compiler."""
+    """Raise :class:`UserError` where torch would find no C++ compiler that works."""
     path, names = find_compiler()
-    if path is None:
+    if not has_compiler():
+        trouble = f"there is none (looked for {names})" if path is None else f"{path} fails"
         raise UserError(
-            f"compile=true needs a C++ compiler, and there is none (looked for {names}); install "
-            "one "
+            f"compile=true needs a C++ compiler, and {trouble}; install one "
             "(Debian: apt install g++) or set compile=false."
         )
 

@@ -11,6 +11,8 @@ import pytest
 from ganlane import doctor
 from ganlane.__main__ import commands, main
 from ganlane.errors import UserError
+from ganlane.native import library
+from ganlane.native.tensors import Kernel
 
 ROOT = Path(__file__).resolve().parents[1]
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -69,14 +71,27 @@ def test_a_package_that_cannot_be_imported_is_missing(monkeypatch, capsys):
     assert told.count("\n") == 1
 
 
-def test_recordings_and_a_compiler_are_found_or_asked_for(tmp_path, monkeypatch):
+def test_recordings_are_found_or_asked_for(tmp_path, monkeypatch):
     monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
     with pytest.raises(UserError, match="set GANLANE_DATA"):
         doctor.recordings()
     (tmp_path / "us101_scenes.csv").touch()
     assert doctor.recordings() == str(tmp_path / "us101_scenes.csv")
-    monkeypatch.setattr("ganlane.native.library.why_not", lambda: "needs a compiler; install g++.")
-    with pytest.raises(UserError, match="install g"):
+
+
+def test_the_kernel_is_driven_and_without_one_a_compiler_asked_for(monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr("ganlane.native.library.compilers", lambda: ())
+        with pytest.raises(UserError, match=r"there is no C\+\+ compiler; install g"):
+            doctor.kernel()
+    if library.why_not() is not None:
+        return
+    loaded = library.find()
+    told = f"{loaded.variant}, by {loaded.maker}, drives as the tensor code does"
+    assert doctor.kernel() == told
+    # As the library of a compiler that is broken would.
+    monkeypatch.setattr(Kernel, "decide", lambda self, action, state, recycles: state.clone())
+    with pytest.raises(UserError, match=r"its kernel drives .* m away from the tensor code"):
         doctor.kernel()
 
 

@@ -127,7 +127,19 @@ def test_the_compiler_that_cxx_names_is_the_one_that_is_looked_for(monkeypatch):
     with pytest.raises(UserError, match="looked for CXX=my-compiler"):
         runtime.check_compiler()
     monkeypatch.delenv("CXX")
+    monkeypatch.setattr(runtime, "_compiles", lambda path: path == "/bin/g++")
     runtime.check_compiler()
+
+
+@pytest.mark.parametrize("lines", ["exit 1", "exit 0"])
+def test_a_compiler_that_makes_nothing_is_none(lines, monkeypatch, tmp_path):
+    program = tmp_path / "compiler"
+    program.write_text(f"#!/bin/sh\n{lines}\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("CXX", str(program))
+    assert not runtime.has_compiler()
+    with pytest.raises(UserError, match=f"compiler, and {program} fails; install one"):
+        runtime.check_compiler()
 
 
 def test_arguments_of_torchrls_version_are_refused():

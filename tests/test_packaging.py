@@ -14,6 +14,7 @@ from ganlane.agents.checkpoint import SHIPPED, with_seeds
 from ganlane.errors import UserError
 from ganlane.files import PACKAGE, conf_folder
 from ganlane.native import library
+from ganlane.runtime import has_compiler
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -86,7 +87,7 @@ def test_the_wheel_holds_configuration_weights_and_kernel_and_is_below_5_mb(whee
     further = {f"ganlane/checkpoints/seeds_of_{agent}.safetensors" for agent in SHIPPED}
     assert {*inside, "ganlane/py.typed"} - names == further
     kernels = [name for name in names if name.startswith("ganlane/native/prebuilt/kernel-default-")]
-    assert len(kernels) == (1 if library.compiler_command() else 0)
+    assert len(kernels) == (1 if has_compiler() else 0)
     assert not [name for name in names if name.startswith(("tests/", "outputs/"))]
     assert wheel.name.startswith(f"ganlane-{ganlane.__version__}-")
     assert wheel.stat().st_size < 5e6

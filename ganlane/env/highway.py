@@ -500,8 +500,8 @@ class HighwayEnv(EnvBase):
             reason = (
                 "has one set of parameters of car following and steering for the ego and the others"
             )
-        # And whether there is a library at all.
-        missing = why_not()
+        # And whether there is a library at all, which may have to be built.
+        missing = why_not() if reason is None else None
         if drivers is not None and reason is None and missing is None:
             return Kernel(
                 self.road,
@@ -513,7 +513,7 @@ class HighwayEnv(EnvBase):
         if wanted == "native":
             raise UserError(f"env.kernel=native {reason or missing}; set env.kernel=torch.")
         if reason is None:
-            say_once(f"env.kernel=auto: the tensor code, since the native kernel {missing}")
+            say_once(f"env.kernel=auto: the tensor code, since the native kernel {missing}.")
         return None
 
     def _recycling_rows(self, key: Tensor) -> Tensor:

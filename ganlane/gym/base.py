@@ -10,7 +10,6 @@ from gymnasium.envs.registration import EnvSpec
 
 from ganlane.gym.native_rows import native_rows
 from ganlane.gym.rows import Rows
-from ganlane.native.library import why_not
 from ganlane.settings.commands import HighwayConfig, highways
 
 
@@ -28,7 +27,7 @@ def make_rows(
     # Checked here, so that both kinds of rows get values that will do.
     config = highways(traffic=traffic, num_envs=count, **keys)
     # The native kernel records no physics steps for pictures and knows no TorchRL transforms.
-    if not pictures and not len(transforms) and why_not() is None:
+    if not pictures and not len(transforms):
         rows = native_rows(config)
         if rows is not None:
             return rows

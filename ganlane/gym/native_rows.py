@@ -13,6 +13,7 @@ from ganlane import keys
 from ganlane.gym.rows import Flags, Floats, Integers, Rows, observation_space
 from ganlane.native.batch import NativeBatch, Stepped
 from ganlane.native.drivers import drivers_of, pays
+from ganlane.native.library import why_not
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.episode import Stream
@@ -76,7 +77,7 @@ class NativeRows(Rows):
 
 
 def native_rows(config: HighwayConfig) -> NativeRows | None:
-    """The highways of ``config`` by the kernel; None where it does not implement them."""
+    """The highways of ``config`` by the kernel; None where it cannot drive them."""
     env = config.env
     observation = config.observation
     stream = int(Stream.named(config.stream))
@@ -90,6 +91,8 @@ def native_rows(config: HighwayConfig) -> NativeRows | None:
         or observation.form not in NATIVE_FORMS
         or observation.sensors is not None
         or config.device != "cpu"
+        # Asked last, since it may build a library.
+        or why_not() is not None
     ):
         return None
     # By position, in the order of NativeBatch's arguments.

@@ -1,27 +1,29 @@
-"""Loads the library of the C++ sources and calls its functions, in threads; needs torch off Linux
-alone.
+"""Finds, builds and loads the library of the C++ sources, and calls it in threads; without torch
+on Linux.
 
 The library is the one that came with the wheel, else one built at first use. That one goes into the
 user's cache folder, under a name that follows from the source, the flags and the compiler, so that
 another version of any of them builds anew. Processes that build at once do so each for itself; the
 last one to finish puts its library in the place of the others', which is the same.
+
+Nothing is taken for granted: a library is loaded only if its checksum holds, a compiler that fails
+for the best instruction set is asked for the next one, after it that of the package ``ziglang`` is,
+and a cache that cannot be used is passed over.
 """
 
 from __future__ import annotations
 
-import atexit
 import ctypes
 import hashlib
 import importlib.util
 import os
 import platform
-import shutil
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import lru_cache
 from pathlib import Path
@@ -29,7 +31,7 @@ from typing import Any, NamedTuple
 
 from ganlane import runtime
 from ganlane.errors import UserError
-from ganlane.files import CACHE_VARIABLE, cache_folder
+from ganlane.files import CACHE_VARIABLE, PLACE, cache_folder, has_checksum, sealed, write_bytes
 
 #: The sources to compile, and what they include.
 SOURCES = tuple(sorted(Path(__file__).parent.glob("*.[ch]pp")))
@@ -38,11 +40,12 @@ PREBUILT = Path(__file__).with_name("prebuilt")
 #: -ffp-contract=off: a product and a sum stay two roundings, so that every instruction set gives
 #: the same bits.
 FLAGS = ("-O3", "-std=c++17", "-ffp-contract=off", "-fno-exceptions", "-fPIC", "-shared", "-s")
-#: The kernel needs no C++ library; zig would compile one first, which takes minutes.
-ZIG_FLAGS = ("-nostdinc++", "-nostdlib++")
+#: The kernel needs no C++ library; zig would compile one first, which takes minutes. Without
+#: ``-mcpu`` it would compile for the processor that it runs on.
+ZIG_FLAGS = ("-nostdinc++", "-nostdlib++", "-mcpu=baseline")
 ADVICE = (
     "install g++ or clang++ (Debian: apt install g++), "
-    "or pip install 'ganlane[native]', which brings Clang."
+    "or pip install 'ganlane[native]', which brings Clang"
 )
 #: Functions of the library, and how many pointers they take before the first and the last row.
 FUNCTIONS = {"decide": 3, "lane_view": 3, "mask": 3, "spawn": 3, "enter": 3, "step": 1, "start": 1}
@@ -51,25 +54,36 @@ CPU_INFO = Path("/proc/cpuinfo")
 
 
 class Variant(NamedTuple):
-    """An instruction set.
-
-    Environments per vector, what GCC and Clang, and zig, call it, and Linux its parts.
-    """
+    """An instruction set: environments per vector, compilers' names of its parts, and Linux's."""
 
     lanes: int
     flags: tuple[str, ...]
-    zig_flags: tuple[str, ...]
     needed: frozenset[str]
 
 
+# Part by part: GCC knows -march=x86-64-v4 and -v3, which stand for the same, from version 11 on.
+_V3_FLAGS = ("-mavx2", "-mbmi", "-mbmi2", "-mf16c", "-mfma", "-mlzcnt", "-mmovbe")
+_V4_FLAGS = ("-mavx512f", "-mavx512bw", "-mavx512cd", "-mavx512dq", "-mavx512vl")
 _V4 = frozenset({"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"})
 _V3 = frozenset({"avx2", "bmi1", "bmi2", "f16c", "fma", "movbe"})
 #: By the names that torch gives them, the fastest first; ``default`` runs everywhere.
 VARIANTS = {
-    "AVX512": Variant(16, ("-march=x86-64-v4",), ("-mcpu=x86_64_v4",), _V4),
-    "AVX2": Variant(8, ("-march=x86-64-v3",), ("-mcpu=x86_64_v3",), _V3),
-    "default": Variant(4, (), (), frozenset()),
+    "AVX512": Variant(16, (*_V3_FLAGS, *_V4_FLAGS), _V4),
+    "AVX2": Variant(8, _V3_FLAGS, _V3),
+    "default": Variant(4, (), frozenset()),
 }
+
+
+class Loaded(NamedTuple):
+    """A library in use, its name in :data:`VARIANTS`, and what made it.
+
+    ``troubles``: what was tried before, and why it failed, as sentences without a full stop.
+    """
+
+    library: ctypes.CDLL
+    variant: str
+    maker: str
+    troubles: tuple[str, ...]
 
 
 def best_variant() -> str:
@@ -88,96 +102,108 @@ def best_variant() -> str:
     return next(name for name, variant in VARIANTS.items() if variant.needed <= parts)
 
 
-def compiler_command() -> tuple[str, ...] | None:
-    """The command of a C++ compiler, that of the package ``ziglang`` if need be.
-
-    None if there is none.
-    """
-    # A compiler of the system first, else that of zig.
+def compilers() -> tuple[tuple[str, ...], ...]:
+    """Commands of the C++ compilers to try: that of the system, that of ``ziglang``."""
     path, _ = runtime.find_compiler()
-    if path is not None:
-        return (path,)
+    commands: list[tuple[str, ...]] = [] if path is None else [(path,)]
     if importlib.util.find_spec("ziglang"):
-        return (sys.executable, "-m", "ziglang", "c++")
-    return None
+        commands.append((sys.executable, "-m", "ziglang", "c++"))
+    return tuple(commands)
 
 
-def libraries_folder() -> Path:
-    """Where built libraries are kept: ``native`` in the cache.
-
-    Where that is off, a folder that goes when the process ends.
-    """
+def libraries_folder() -> Path | None:
+    """Where built libraries are stored: ``native`` in the cache; None: that is off."""
     cache = cache_folder()
-    return _passing_folder() if cache is None else cache / "native"
+    return None if cache is None else cache / "native"
 
 
-@lru_cache(maxsize=1)
-def _passing_folder() -> Path:
-    folder = tempfile.mkdtemp(prefix="ganlane-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return Path(folder)
+def find(variant: str | None = None) -> Loaded | str:
+    """The library for this processor, or for ``variant``; or why there is none, as the end of a
+    sentence.
+
+    That of the wheel, else one built by the first compiler that works. Once per process; a library
+    that is not the best of this processor, or is lost when the process ends, is told of.
+    """
+    return _find(variant, compilers(), libraries_folder())
 
 
 def why_not() -> str | None:
     """Why the kernel cannot be built or run here, as the end of a sentence; None if it can."""
-    if sys.platform == "win32":
-        return "is not built for Windows"
-    if compiler_command() or _prebuilt(best_variant()).is_file():
-        return None
-    return f"needs a C++ compiler, and there is none; {ADVICE}"
+    loaded = find()
+    return loaded if isinstance(loaded, str) else None
 
 
 def load(variant: str | None = None) -> ctypes.CDLL:
-    """The library for this processor, or for ``variant``: that of the wheel, else built if it is
-    not there yet.
+    """The library that :func:`find` finds.
 
     Raises:
-        UserError: there is no compiler, it fails, or the cache folder cannot be written.
+        UserError: there is none.
     """
-    return _load(variant or best_variant(), compiler_command(), libraries_folder())
+    loaded = find(variant)
+    if isinstance(loaded, str):
+        raise UserError(f"env.kernel=native {loaded}; or set env.kernel=torch.")
+    return loaded.library
 
 
 @lru_cache(maxsize=8)
-def _load(
-    variant: str,
-    compiler: tuple[str, ...] | None,
-    folder: Path,
-) -> ctypes.CDLL:
-    # That of the wheel fits only if it was built from these very sources.
-    path = _prebuilt(variant)
-    if not path.is_file():
-        reason = why_not()
-        if compiler is None or reason:
-            raise UserError(f"env.kernel=native {reason} Or set env.kernel=torch.")
-        command = _command(variant, compiler)
-        # Another compiler, or another version of it, makes another library.
-        version = _run((*compiler, "--version")).stdout
-        path = folder / _name(variant, *command, version)
-        if not path.is_file():
-            _build(command, path)
-    library = ctypes.CDLL(str(path))
-    for name, pointers in FUNCTIONS.items():
-        function = getattr(library, f"ganlane_{name}")
-        function.argtypes = [*[ctypes.c_void_p] * pointers, ctypes.c_long, ctypes.c_long]
-        function.restype = ctypes.c_int
-    return library
+def _find(
+    variant: str | None, commands: tuple[tuple[str, ...], ...], folder: Path | None
+) -> Loaded | str:
+    if sys.platform == "win32":
+        return "is not built for Windows"
+    names = list(VARIANTS)
+    variants = [variant] if variant else names[names.index(best_variant()) :]
+    for name in variants:
+        # That of the wheel fits only if it was built from these very sources.
+        content = _whole(_prebuilt(name))
+        if content is not None:
+            with suppress(OSError):
+                return Loaded(_opened(_prebuilt(name), content), name, "the wheel", ())
+    # Of each compiler the last failure: the simplest instruction set's says most.
+    troubles: dict[str, str] = {}
+    for command in commands:
+        maker = " ".join(command)
+        for name in variants:
+            try:
+                library = _built(name, command, folder, troubles)
+            except (AttributeError, UserError) as error:
+                troubles[maker] = f"{maker} failed for {name} ({error})"
+                continue
+            except OSError as error:  # of no instruction set's
+                troubles[maker] = (
+                    f"{maker} or what it made does not run ({error}; where a folder forbids it, "
+                    f"point {CACHE_VARIABLE} at another)"
+                )
+                break
+            loaded = Loaded(library, name, maker, tuple(troubles.values()))
+            if troubles:
+                line = f"env.kernel: the kernel for {name} by {maker} drives; "
+                print(f"{line}{'; '.join(loaded.troubles)}.", file=sys.stderr)
+            return loaded
+    reasons = "; ".join(troubles.values()) or "there is no C++ compiler"
+    return f"cannot be built: {reasons}; {ADVICE}"
 
 
-def build_all(folder: Path) -> list[Path]:
-    """Build the variants that this kind of machine may run, for a wheel; the files.
+def build_all(folder: Path) -> tuple[list[Path], list[str]]:
+    """Build the variants that this kind of machine may run, for a wheel.
 
-    Raises:
-        UserError: there is no compiler, or it fails.
+    Returns:
+        The files, none if no compiler works, and the failures.
     """
-    compiler = compiler_command()
-    if compiler is None:
-        raise UserError(f"there is no C++ compiler; {ADVICE}")
-    paths = []
-    for variant in VARIANTS if platform.machine() in ("x86_64", "AMD64") else ("default",):
-        path = folder / _prebuilt(variant).name
-        _build(_command(variant, compiler), path)
-        paths.append(path)
-    return paths
+    troubles = []
+    variants = VARIANTS if platform.machine() in ("x86_64", "AMD64") else ("default",)
+    for command in compilers():
+        paths = []
+        for variant in variants:
+            path = folder / _prebuilt(variant).name
+            try:
+                _opened(path, _compiled(_command(variant, command)))
+                paths.append(path)
+            except (AttributeError, OSError, UserError) as error:
+                troubles.append(f"{' '.join(command)} failed for {variant} ({error})")
+        if paths:
+            return paths, troubles
+    return [], troubles or [f"there is no C++ compiler; {ADVICE}"]
 
 
 def _prebuilt(variant: str) -> Path:
@@ -198,41 +224,93 @@ def _flags(variant: str) -> tuple[str, ...]:
 
 
 def _command(variant: str, compiler: tuple[str, ...]) -> tuple[str, ...]:
-    machine = VARIANTS[variant].flags
-    if "ziglang" in compiler:
-        machine = (*ZIG_FLAGS, *VARIANTS[variant].zig_flags)
+    zig = ZIG_FLAGS if "ziglang" in compiler else ()
     files = (str(source) for source in SOURCES if source.suffix == ".cpp")
-    return (*compiler, *_flags(variant), *machine, *files)
+    return (*compiler, *_flags(variant), *zig, *VARIANTS[variant].flags, *files)
 
 
 def _run(command: tuple[str, ...]) -> subprocess.CompletedProcess[str]:
+    # In English, so that neither the version nor a message depends on the language.
     return subprocess.run(
         command,
         capture_output=True,
         text=True,
+        errors="replace",
+        env={**os.environ, "LC_ALL": "C"},
         check=False,
     )
 
 
-def _build(command: tuple[str, ...], library: Path) -> None:
-    """Compile into a file of this process's own, then rename it, which is atomic."""
+def _built(
+    variant: str, compiler: tuple[str, ...], folder: Path | None, troubles: dict[str, str]
+) -> ctypes.CDLL:
+    """The library in ``folder``, compiled if it is not whole there.
+
+    Where the folder cannot be used, which joins the ``troubles``, it is loaded from a temporary
+    one.
+
+    Raises:
+        UserError: the compiler fails.
+        OSError: it cannot be run, or its library not be loaded from anywhere.
+        AttributeError: its library lacks a function.
+    """
+    command = _command(variant, compiler)
+    # Another compiler, or another version of it, makes another library.
+    name = _name(variant, *command, _run((*compiler, "--version")).stdout)
+    content = _whole(folder / name) if folder else None
+    if content is None:
+        content = _compiled(command)
+    trouble = ""
+    if folder:
+        try:
+            return _opened(folder / name, content)
+        except (OSError, UserError) as error:
+            why = getattr(error, "strerror", None) or error
+            trouble = f"{folder} cannot be used ({why}); point {CACHE_VARIABLE} at another"
+    # Once loaded, the file may go.
+    with tempfile.TemporaryDirectory(prefix="ganlane-") as temporary:
+        library = _opened(Path(temporary) / name, content)
+    if trouble:
+        # The folder's, then, and not the library's.
+        troubles["cache"] = trouble
+    return library
+
+
+def _whole(path: Path) -> bytes | None:
+    """The content of a library; None if there is none, or it is damaged."""
     try:
-        library.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=library.parent) as folder:
-            built = Path(folder) / library.name
-            done = _run((*command, "-o", str(built)))
-            if done.returncode != 0:
-                last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-                raise UserError(
-                    f"env.kernel=native: {command[0]} failed ({last}); "
-                    f"set env.kernel=torch or {ADVICE}"
-                )
-            built.replace(library)
-    except OSError as error:
-        raise UserError(
-            f"env.kernel=native: {library.parent} cannot be written ({error.strerror}); "
-            f"point {CACHE_VARIABLE} at a folder that can, or set env.kernel=torch."
-        ) from error
+        content = path.read_bytes()
+        return content if has_checksum(content, path) else None
+    except (OSError, UserError):
+        return None
+
+
+def _opened(path: Path, content: bytes) -> ctypes.CDLL:
+    """The library ``content``, loaded from ``path``, to which it is written if need be."""
+    if _whole(path) != content:
+        write_bytes(path, content)
+    library = ctypes.CDLL(str(path))
+    for name, pointers in FUNCTIONS.items():
+        function = getattr(library, f"ganlane_{name}")
+        function.argtypes = [*[ctypes.c_void_p] * pointers, ctypes.c_long, ctypes.c_long]
+        function.restype = ctypes.c_int
+    return library
+
+
+def _compiled(command: tuple[str, ...]) -> bytes:
+    """What the compiler makes, with a checksum behind it, which the loader does not look at.
+
+    Raises:
+        UserError: it fails; the message is its own.
+        OSError: it cannot be run.
+    """
+    with tempfile.TemporaryDirectory(prefix="ganlane-") as folder:
+        path = Path(folder) / "kernel.so"
+        done = _run((*command, "-o", str(path)))
+        if done.returncode == 0 and path.is_file():
+            return sealed(path.read_bytes() + PLACE.encode())
+    lines = done.stderr.strip().splitlines() or ["no message"]
+    raise UserError(next((line for line in lines if "error" in line), lines[-1])[:200])
 
 
 # Calls: arrays as pointers, rows shared between threads

@@ -1,57 +1,217 @@
-"""The kernel is built once, wherever a compiler is, and says in one sentence what is missing."""
+"""The kernel is built once, wherever a compiler works, and says in one sentence what fails."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
+from ganlane import make_env
 from ganlane.errors import UserError
+from ganlane.files import PLACE
 from ganlane.native import library
 
 needs_compiler = pytest.mark.skipif(library.why_not() is not None, reason="no C++ compiler")
 
 
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """A library for every processor, not optimised, since nothing is driven here."""
+    flags = tuple("-O0" if flag == "-O3" else flag for flag in library.FLAGS)
+    path = tmp_path_factory.mktemp("plain") / "kernel.so"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(library, "FLAGS", flags)
+        (command,) = library.compilers()[:1]
+        content = library._compiled(library._command("default", command))
+    path.write_bytes(content[: -len(PLACE)])
+    return path
+
+
 @pytest.fixture(autouse=True)
 def empty_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("GANLANE_CACHE", str(tmp_path / "cache"))
-    # Nothing is driven here: the compiler need not optimise.
-    monkeypatch.setattr(
-        library, "FLAGS", tuple("-O0" if flag == "-O3" else flag for flag in library.FLAGS)
-    )
-    library._load.cache_clear()
+    library._find.cache_clear()
     yield
-    library._load.cache_clear()
+    library._find.cache_clear()
+
+
+@pytest.fixture
+def compiler(monkeypatch, tmp_path):
+    """Makes a compiler of a shell script, and CXX name it; ``$library`` is :func:`plain`'s."""
+
+    def script(lines, path=None):
+        program = tmp_path / "compiler"
+        program.write_text(f'#!/bin/sh\nlibrary="{path}"\n{lines}\n')
+        program.chmod(0o755)
+        monkeypatch.setenv("CXX", str(program))
+        monkeypatch.setitem(sys.modules, "ziglang", None)  # not there
+        monkeypatch.setattr(library, "best_variant", lambda: "AVX512")
+        return program
+
+    return script
+
+
+#: Copies the library to its last argument, the output, and counts its calls.
+WORKS = """for last; do :; done
+[ "$last" = --version ] || cp "$library" "$last" && echo "$last" >> "$0.calls"
+"""
+FAILS = "echo the first line >&2; echo 'x.cpp:1: error: it is full of stars' >&2; exit 1"
 
 
 def built() -> list[Path]:
     return sorted(library.libraries_folder().glob("*.so"))
 
 
-@needs_compiler
-def test_it_is_built_once():
-    library.load("default")
-    first = [path.stat().st_mtime_ns for path in built()]
-    library._load.cache_clear()
-    library.load("default")
-    assert len(first) == 1
-    assert [path.stat().st_mtime_ns for path in built()] == first
+def calls(program: Path) -> int:
+    return Path(f"{program}.calls").read_text().count("kernel.so")
 
 
 @needs_compiler
-def test_another_source_is_another_library(monkeypatch, tmp_path):
-    library.load("default")
+def test_it_is_built_once(compiler, plain):
+    program = compiler(WORKS, plain)
+    library.load()
+    library._find.cache_clear()
+    library.load()
+    assert len(built()) == calls(program) == 1
+
+
+@needs_compiler
+def test_another_source_is_another_library(monkeypatch, tmp_path, compiler, plain):
+    compiler(WORKS, plain)
+    library.load()
     for source in library.SOURCES:
         (tmp_path / source.name).write_text(source.read_text() + "\n")
     monkeypatch.setattr(
         library, "SOURCES", tuple(tmp_path / source.name for source in library.SOURCES)
     )
-    library._load.cache_clear()
-    library.load("default")
+    library._find.cache_clear()
+    library.load()
     assert len(built()) == 2
+
+
+def damaged(content: bytes) -> list[bytes]:
+    """Shorter, without its checksum, with a bit flipped in the code or in the checksum, longer."""
+    middle, digit = len(content) // 2, len(content) - 30
+    return [
+        content[:middle],
+        content[: -len(PLACE)],
+        *(
+            content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
+            for place in (middle, digit)
+        ),
+        content + b"more",
+        b"",
+    ]
+
+
+@needs_compiler
+def test_a_damaged_library_is_built_anew_and_never_loaded(monkeypatch, compiler, plain):
+    program = compiler(WORKS, plain)
+    library.load()
+    (path,) = built()
+    whole = path.read_bytes()
+    for count, content in enumerate(damaged(whole), 2):
+        path.unlink()  # this process has it in its memory
+        path.write_bytes(content)
+        library._find.cache_clear()
+        library.load()
+        assert path.read_bytes() == whole
+        assert calls(program) == count
+
+
+@needs_compiler
+def test_a_damaged_library_of_a_wheel_is_passed_over(monkeypatch, tmp_path, compiler, plain):
+    compiler(WORKS, plain)
+    monkeypatch.setattr(library, "PREBUILT", tmp_path)
+    library._prebuilt("AVX512").write_bytes(plain.read_bytes()[:-1000])
+    assert library.find().maker == str(tmp_path / "compiler")
+
+
+@needs_compiler
+def test_a_compiler_that_lacks_an_instruction_set_makes_the_kernel_for_the_next(
+    compiler, plain, capsys
+):
+    refuses = 'case "$*" in *-mavx512f*) echo "error: unknown option" >&2; exit 1;; esac\n'
+    program = compiler(refuses + WORKS, plain)
+    loaded = library.find()
+    assert (loaded.variant, loaded.maker) == ("AVX2", str(program))
+    told = f"for AVX2 by {program} drives; {program} failed for AVX512 (error: unknown option).\n"
+    assert capsys.readouterr().err.endswith(told)
+    # A variant that was asked for is that one or none.
+    assert isinstance(library.find("AVX512"), str)
+
+
+@needs_compiler
+def test_old_names_of_instruction_sets_are_enough(compiler, plain):
+    compiler('case "$*" in *x86-64-v*) exit 1;; esac\n' + WORKS, plain)
+    assert library.find().variant == "AVX512"
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "lines", [FAILS, "exit 0", "kill -9 $$", WORKS.replace('cp "$library"', "echo no library >")]
+)
+def test_the_clang_of_ziglang_is_asked_after_a_compiler_that_fails(
+    lines, compiler, plain, monkeypatch, tmp_path, capsys
+):
+    ziglang = tmp_path / "ziglang"
+    compiler(WORKS, plain).rename(ziglang)
+    program = compiler(lines)
+    monkeypatch.setattr(library, "compilers", lambda: ((str(program),), (str(ziglang),)))
+    assert library.find().maker == str(ziglang)
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "cannot be used" not in told
+
+
+@needs_compiler
+@pytest.mark.parametrize("place", ["file", "/proc/nowhere"])
+def test_a_cache_that_cannot_be_used_is_passed_over(
+    place, monkeypatch, tmp_path, compiler, plain, capsys
+):
+    compiler(WORKS, plain)
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("GANLANE_CACHE", str(tmp_path / place))
+    assert library.find().variant == "AVX512"
+    # Loaded from a temporary folder that is gone.
+    assert not Path(library.load()._name).exists()
+    told = capsys.readouterr().err
+    assert f"{place}/native cannot be used" in told
+    assert told.endswith("point GANLANE_CACHE at another.\n")
+
+
+@needs_compiler
+def test_a_library_that_cannot_be_loaded_from_the_cache_is_loaded_from_elsewhere(
+    monkeypatch, compiler, plain
+):
+    """As where the cache is mounted with ``noexec``."""
+    program = compiler(WORKS, plain)
+    load = library.ctypes.CDLL
+
+    def refuse(path):
+        if path.startswith(str(library.libraries_folder())):
+            raise OSError(f"{path}: failed to map segment from shared object")
+        return load(path)
+
+    monkeypatch.setattr(library.ctypes, "CDLL", refuse)
+    for _ in range(2):
+        assert library.find().troubles[0].count("failed to map segment") == 1
+        library._find.cache_clear()
+    assert calls(program) == 1
+
+
+@needs_compiler
+def test_a_user_without_a_home_has_no_cache(monkeypatch, compiler, plain):
+    compiler(WORKS, plain)
+    for name in ("GANLANE_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", Mock(side_effect=RuntimeError("no home")))
+    assert library.find().troubles == ()
 
 
 @needs_compiler
@@ -68,35 +228,40 @@ def test_processes_that_build_at_once_do_not_disturb_each_other():
 
 
 def test_without_a_compiler_one_sentence_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(library, "compiler_command", lambda: None)
+    monkeypatch.setattr(library, "compilers", lambda: ())
     with pytest.raises(
-        UserError, match=r"needs a C\+\+ compiler.*g\+\+.*ganlane\[native\].*env\.kernel=torch"
+        UserError, match=r"there is no C\+\+ compiler.*g\+\+.*ganlane\[native\].*env\.kernel=torch"
     ):
         library.load()
 
 
-def test_a_compiler_that_fails_is_named(monkeypatch, tmp_path):
-    broken = tmp_path / "broken"
-    broken.write_text("#!/bin/sh\necho it is full of stars >&2; exit 1\n")
-    broken.chmod(0o755)
-    monkeypatch.setenv("CXX", str(broken))
-    with pytest.raises(UserError, match=r"broken failed \(it is full of stars\)"):
+def test_without_a_compiler_that_works_the_sentence_names_it_and_auto_drives(compiler, capsys):
+    program = compiler(FAILS)
+    with pytest.raises(UserError, match=r"compiler failed for default .x\.cpp:1: .* full of stars"):
         library.load()
     assert built() == []
+    env = make_env("idm", num_envs=2)
+    env.rand_step(env.reset())
+    told = capsys.readouterr().err
+    assert told.startswith("env.kernel=auto: the tensor code, since the native kernel cannot")
+    assert str(program) in told
+    assert told.count("\n") == 1
 
 
-@needs_compiler
-def test_a_cache_folder_that_cannot_be_written_is_named(monkeypatch, tmp_path):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("GANLANE_CACHE", str(tmp_path / "file"))
-    with pytest.raises(UserError, match=r"file/native cannot be written.*GANLANE_CACHE"):
-        library.load()
+def test_a_program_that_cannot_be_run_is_no_compiler(compiler):
+    compiler("").write_bytes(b"\0garbage")
+    assert "does not run ([Errno 8]" in library.why_not()
 
 
-def test_clang_of_the_package_ziglang_is_found_where_there_is_no_other(monkeypatch):
-    monkeypatch.setattr(library.shutil, "which", lambda name: None)
+def test_clang_of_the_package_ziglang_comes_after_the_systems(monkeypatch):
+    monkeypatch.setattr(shutil, "which", lambda name: None)
     monkeypatch.setattr(library.importlib.util, "find_spec", lambda name: name)
-    assert library.compiler_command() == (sys.executable, "-m", "ziglang", "c++")
+    zig = (sys.executable, "-m", "ziglang", "c++")
+    assert library.compilers() == (zig,)
+    # Else it would compile for the processor that it runs on, and a wheel is for others too.
+    assert "-mcpu=baseline" in library._command("default", zig)
+    monkeypatch.setattr(shutil, "which", lambda name: f"/bin/{name}")
+    assert [command[0] for command in library.compilers()][1:] == [sys.executable]
 
 
 V3 = "avx2 bmi1 bmi2 f16c fma movbe"
@@ -124,16 +289,27 @@ def test_a_processor_gets_the_fastest_variant_that_it_runs(
 
 
 @needs_compiler
-def test_the_library_of_a_wheel_is_taken_and_needs_no_compiler(monkeypatch, tmp_path):
-    # the others take seconds
-    monkeypatch.setattr(library, "VARIANTS", {"default": library.VARIANTS["default"]})
-    (built_library,) = library.build_all(tmp_path / "wheel")
-    monkeypatch.setattr(library, "PREBUILT", built_library.parent)
-    monkeypatch.setattr(library, "compiler_command", lambda: None)
-    monkeypatch.setattr(library, "best_variant", lambda: "default")
+def test_the_library_of_a_wheel_is_taken_and_needs_no_compiler(
+    monkeypatch, tmp_path, compiler, plain
+):
+    refuses = 'case "$*" in *-mavx512f*) echo "error: unknown option" >&2; exit 1;; esac\n'
+    compiler(refuses + WORKS, plain)
+    monkeypatch.setattr(library.platform, "machine", lambda: "x86_64")
+    paths, troubles = library.build_all(tmp_path / "wheel")
+    assert [path.name.split("-")[1] for path in paths] == ["avx2", "default"]
+    assert len(troubles) == 1
+    monkeypatch.setattr(library, "PREBUILT", tmp_path / "wheel")
+    monkeypatch.setattr(library, "compilers", lambda: ())
     assert library.why_not() is None
-    assert library.load()._name == str(built_library)
+    assert library.load()._name == str(paths[0])
     assert not built()
+
+
+def test_a_wheel_whose_compiler_fails_has_no_kernel(tmp_path, compiler):
+    compiler(FAILS)
+    paths, troubles = library.build_all(tmp_path / "wheel")
+    assert paths == []
+    assert "failed for default (x.cpp:1: error: it is full of stars)" in troubles[-1]
 
 
 def test_the_library_of_another_versions_sources_is_not_taken(monkeypatch, tmp_path):

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.native.library import best_variant
+from ganlane.native.library import Loaded, find
 from ganlane.native.settings import (
     STEERING,
     Key,
@@ -554,8 +554,10 @@ def pays(drivers: Drivers) -> bool:
     Without an instruction for a product and a sum (x86 before 2013), a generator's network is a
     hundred times slower.
     """
-    x86 = platform.machine() in ("x86_64", "AMD64")
-    return isinstance(drivers, RuleDrivers) or not x86 or best_variant() != "default"
+    if isinstance(drivers, RuleDrivers) or platform.machine() not in ("x86_64", "AMD64"):
+        return True
+    found = find()
+    return isinstance(found, Loaded) and found.variant != "default"
 
 
 def faulty_drivers(drivers: RuleDrivers, faults: DriverFaults, stream: int) -> RuleDrivers | None:

@@ -1,18 +1,21 @@
 """How fast it is, compared with a peer in the same run.
 
     python -m benchmarks.speed --suite sim --report docs/speed.md
+    python -m benchmarks.speed --suite gymnasium --report docs/speed.md
     python -m benchmarks.speed --suite traffic --traffics gan gan_calibrated --modes eager compiled
     python -m benchmarks.speed --suite train --modes eager native --stored 100000 --seconds 2
     python -m benchmarks.speed --quick
 
-sim: the simulator, bare, as a whole environment and through gymnasium, beside HighwayEnv and
-EnvPool; traffic: every traffic model; train: the training loop, beside stable-baselines3's DQN on
-HighwayEnv. Peers are measured where they are installed.
+sim: the simulator, bare and as a whole environment through TorchRL, beside HighwayEnv; gymnasium:
+every traffic through gymnasium, with random actions and with an ego that keeps its lane to the
+goal, beside EnvPool and HighwayEnv; traffic: every traffic model; train: the training loop, beside
+stable-baselines3's DQN on HighwayEnv. Peers are measured where they are installed.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -30,23 +33,26 @@ from ganlane.evaluation import machine_sentence
 from ganlane.evaluation.table import Table, count, percent, significant
 from ganlane.files import write_json
 
-SUITES = ("sim", "traffic", "train")
+SUITES = ("sim", "gymnasium", "traffic", "train")
 #: Defaults of each suite: batches and traffics.
 BATCHES = {
     "sim": [1, 16, 64, 256, 1024, 4096],
+    "gymnasium": [1, 16, 256, 1024, 4096],
     "traffic": [512, 2048],
     "train": [256, 512, 1024],
 }
 TRAFFICS = {
     "sim": ["idm_mobil"],
+    "gymnasium": ["idm", "idm_mobil", "idm_faults", "idm_random", "gan", "gan_calibrated"],
     "traffic": ["idm", "idm_mobil", "gan", "gan_calibrated"],
     "train": ["idm_mobil", "gan"],
 }
 SIMULATORS: dict[str, Callable[..., Any]] = {
     "ganlane physics": systems.start_physics,
     "ganlane environment": systems.start_environment,
-    "ganlane gymnasium": systems.start_gymnasium,
 }
+#: What the egos of the suite gymnasium do, and whether they keep their lanes.
+EGOS = {"random actions": False, "keeping its lane": True}
 TRAFFIC, TRAINING = "ganlane traffic", "ganlane training"
 #: What stands for the traffic of HighwayEnv.
 THEIR_TRAFFIC = "its IDM and MOBIL"
@@ -67,7 +73,9 @@ COLUMNS: dict[str, Callable[[Mapping[str, Any]], str]] = {
 }
 
 
-def cases_of(options: argparse.Namespace, road: Road, threads: int, batch: int) -> list[Case]:
+def cases_of(
+    options: argparse.Namespace, road: Road, threads: int, batch: int, ego: str
+) -> list[Case]:
     """What takes turns in one group: every system, traffic and mode of the suite."""
     cases = []
     for traffic in options.traffics:
@@ -75,6 +83,8 @@ def cases_of(options: argparse.Namespace, road: Road, threads: int, batch: int) 
         starts: dict[str, Callable[..., Any]]
         if options.suite == "sim":
             starts = SIMULATORS
+        elif options.suite == "gymnasium":
+            starts = {f"ganlane, {ego}": partial(systems.start_gymnasium, keep=EGOS[ego])}
         elif options.suite == "traffic":
             starts = {TRAFFIC: systems.start_traffic}
         else:
@@ -82,8 +92,6 @@ def cases_of(options: argparse.Namespace, road: Road, threads: int, batch: int) 
             starts = {TRAINING: partial(systems.start_training, **agent)}
         for system, start in starts.items():
             for mode in options.modes:
-                if start is systems.start_gymnasium and mode != "native":
-                    continue
                 labels = labels_of(here, "speed", system, mode, options.device, threads, batch)
                 cases.append(Case(labels, partial(start, here, mode, options.device, batch), batch))
     return cases
@@ -96,7 +104,9 @@ def labels_of(road: Road, part: str, system: str, *place: Any) -> Labels:
     return Labels(part, system, road.traffic, mode, device, threads, *size)
 
 
-def peers_of(options: argparse.Namespace, road: Road, threads: int, batch: int) -> list[Case]:
+def peers_of(
+    options: argparse.Namespace, road: Road, threads: int, batch: int, ego: str
+) -> list[Case]:
     """The peers of a group that are installed; ratios are to the first."""
     theirs = Road(THEIR_TRAFFIC, road.vehicles, road.lanes, road.seed)
     highway = installed_version("highway-env")
@@ -110,11 +120,17 @@ def peers_of(options: argparse.Namespace, road: Road, threads: int, batch: int) 
         name = f"HighwayEnv {highway}"
         labels = labels_of(theirs, "speed", name, "eager", "cpu", threads, 1)
         peers.append(Case(labels, partial(systems.start_highway, road), 1))
-        if envpool is not None and options.device == "cpu":
-            name = f"EnvPool {envpool}"
+    elif options.suite == "gymnasium":
+        keep = EGOS[ego]
+        if envpool is not None:
+            name = f"EnvPool {envpool}, {ego}"
             labels = labels_of(theirs, "speed", name, "native", "cpu", threads, batch)
-            start = partial(systems.start_envpool, road, batch, threads)
-            peers.append(Case(labels, start, batch))
+            peers.append(
+                Case(labels, partial(systems.start_envpool, road, batch, threads, keep), batch)
+            )
+        name = f"HighwayEnv {highway}, {ego}"
+        labels = labels_of(theirs, "speed", name, "eager", "cpu", threads, 1)
+        peers.append(Case(labels, partial(systems.start_highway, road, keep), 1))
     elif options.suite == "train" and learner is not None:
         agent = RainbowConfig()
         name = f"stable-baselines3 {learner} DQN on HighwayEnv {highway}"
@@ -140,13 +156,13 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
     """Rows of all groups, each group's peers first."""
     road = Road(options.traffics[0], options.vehicles, options.lanes, options.seed)
     rows = []
-    for threads in options.threads:
-        for batch in options.batches:
-            cases = cases_of(options, road, threads, batch)
-            peers = peers_of(options, road, threads, batch)
-            first = peers[0] if peers else None
-            rows += measure([*peers[1:], *cases], first, options.repetitions, options.seconds)
-            print(f"threads {threads}, batch {batch}: done", file=sys.stderr, flush=True)
+    egos = list(EGOS) if options.suite == "gymnasium" else [""]
+    for threads, batch, ego in itertools.product(options.threads, options.batches, egos):
+        cases = cases_of(options, road, threads, batch, ego)
+        peers = peers_of(options, road, threads, batch, ego)
+        first = peers[0] if peers else None
+        rows += measure([*peers[1:], *cases], first, options.repetitions, options.seconds)
+        print(f"threads {threads}, batch {batch} {ego}: done", file=sys.stderr, flush=True)
     if options.suite == "sim" and len(options.vehicle_counts) > 1:
         for system in ("ganlane physics", "ganlane environment"):
             cases = growth_cases(options, system, options.threads[0])
@@ -204,6 +220,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--report", type=Path, metavar="FILE", help="a document with <!-- begin bench SUITE -->")
     options = parser.parse_args(arguments)
     options.traffics = options.traffics or TRAFFICS[options.suite]
+    if options.suite == "gymnasium":
+        options.modes = ["native"]
     options.batches = options.batches or BATCHES[options.suite]
     if options.quick:
         options.batches = [min(*options.batches, 64)]

@@ -32,6 +32,8 @@ DRAWN = 64
 #: Physics steps in a decision of one second.
 STEPS = round(1 / keys.PHYSICS_STEP_S)
 OBSERVATION = "lane_view"
+#: HighwayEnv's action that keeps lane and speed.
+THEIR_KEEP = 1
 #: Its ``highway-v0`` ends an episode after so many seconds, as ours does.
 TIMEOUT_S = 1000.0
 
@@ -126,9 +128,15 @@ def start_traffic(road: Road, mode: str, device: str, batch: int) -> Runner:
     return _stepping(env, torch.full((1, batch), keys.KEEP))
 
 
-def start_gymnasium(road: Road, mode: str, device: str, batch: int) -> Runner:
-    """``gymnasium.make_vec`` (for one environment ``gymnasium.make``), random actions, resets."""
+def start_gymnasium(road: Road, mode: str, device: str, batch: int, keep: bool = False) -> Runner:
+    """``gymnasium.make_vec`` (for one environment ``gymnasium.make``), with resets.
+
+    Random actions, or with ``keep`` the lane is kept to the goal: episodes of 250 decisions in
+    place of a dozen.
+    """
     actions = np.random.default_rng(road.seed).integers(3, size=(DRAWN, batch))
+    if keep:
+        actions[:] = keys.KEEP
     chosen = road.keys_of(mode)
     env: Any
     if batch == 1:
@@ -237,13 +245,14 @@ def make_highway(road: Road) -> Any:
     return env.unwrapped
 
 
-def start_highway(road: Road) -> Runner:
-    """HighwayEnv: random actions, a reset after every end."""
+def start_highway(road: Road, keep: bool = False) -> Runner:
+    """HighwayEnv: random actions, or the lane is kept; a reset after every end."""
     env = make_highway(road)
     random = np.random.default_rng(road.seed)
 
     def run(decisions: int) -> int:
-        for action in random.integers(env.action_space.n, size=decisions):
+        drawn = random.integers(env.action_space.n, size=decisions)
+        for action in np.full_like(drawn, THEIR_KEEP) if keep else drawn:
             _, _, terminated, truncated, _ = env.step(int(action))
             if terminated or truncated:
                 env.reset()
@@ -252,8 +261,8 @@ def start_highway(road: Road) -> Runner:
     return run
 
 
-def start_envpool(road: Road, batch: int, threads: int) -> Runner:
-    """HighwayEnv in EnvPool's C++: random actions, resets in the step after an end."""
+def start_envpool(road: Road, batch: int, threads: int, keep: bool = False) -> Runner:
+    """HighwayEnv in EnvPool's C++: as :func:`start_highway`, resets in the step after an end."""
     import envpool
 
     env = envpool.make_gymnasium(
@@ -266,6 +275,8 @@ def start_envpool(road: Road, batch: int, threads: int) -> Runner:
     )
     env.reset()
     actions = np.random.default_rng(road.seed).integers(5, size=(DRAWN, batch)).astype(np.int32)
+    if keep:
+        actions[:] = THEIR_KEEP
 
     def run(decisions: int) -> int:
         for decision in range(decisions):

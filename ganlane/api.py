@@ -45,6 +45,7 @@ from ganlane.config.run import (
 from ganlane.errors import UserError, did_you_mean
 from ganlane.evaluation import evaluation_rows, paired_rows, write_episodes, write_results
 from ganlane.evaluation.results import Run, TrainingRun, plain
+from ganlane.runtime import kernel_threads
 from ganlane.settings.commands import EvaluateConfig, highways
 from ganlane.settings.record import Record
 from ganlane.sim.random import Stream
@@ -370,8 +371,10 @@ def _torch_threads(threads: int = 0) -> Iterator[None]:
     """Set torch's threads as the commands do, and restore the caller's number afterwards."""
     # In a notebook the number is the caller's, and further cells rely on it.
     before = torch.get_num_threads()
+    token = kernel_threads.set(None)
     set_threads(threads)
     try:
         yield
     finally:
         torch.set_num_threads(before)
+        kernel_threads.reset(token)

@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from contextvars import ContextVar
 from functools import lru_cache
 from pathlib import Path
 from typing import Final, TextIO
@@ -28,6 +29,8 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 #: Bytes; blocks up to this size come from the heap, and as much free memory is kept at its end.
 KEPT_BYTES = 2**28
 _STATUS = Path("/proc/self/status")
+#: Threads of the native kernel, where they are not as many as torch's.
+kernel_threads: ContextVar[int | None] = ContextVar("threads of the kernel", default=None)
 ENV_ID: Final = "ganlane/Highway-v0"
 #: Arguments that differ from the defaults, by id; reference scores are in docs/gymnasium.md. The
 #: registered specs have no ``max_episode_steps``: gymnasium would cut all episodes there, whatever
@@ -38,6 +41,19 @@ ENV_IDS: Final[dict[str, dict[str, str]]] = {
     "ganlane/HighwayGAN-v0": {"traffic": "gan"},
     "ganlane/HighwayGANCalibrated-v0": {"traffic": "gan_calibrated"},
 }
+
+
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def usable_threads() -> int:
+    """``OMP_NUM_THREADS``, else a thread for every usable core."""
+    named = os.environ.get("OMP_NUM_THREADS", "")
+    return int(named) if named.isdigit() and int(named) > 0 else usable_cores()
 
 
 def register_envs() -> None:

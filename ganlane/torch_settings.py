@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import torch
 
 from ganlane.errors import UserError
-from ganlane.runtime import has_compiler
+from ganlane.runtime import has_compiler, kernel_threads, usable_threads
 
 F = TypeVar("F", bound=Callable)
 #: Graphs that one function may have: one per batch size, road and set of parameters in a process.
@@ -70,5 +70,10 @@ def check_default_device(device: str) -> None:
 
 
 def set_threads(threads: int) -> None:
-    """Set torch's number of threads; 0 means one, the fastest for the batch sizes used here."""
+    """Set the threads of torch and of the native kernel.
+
+    0 means one for torch, the fastest for the batch sizes used here, and all usable cores for the
+    kernel, whose threads wait for each other without computing.
+    """
     torch.set_num_threads(threads or 1)
+    kernel_threads.set(threads or usable_threads())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import platform
 import re
 import subprocess
@@ -22,6 +21,7 @@ import torch
 from ganlane._version import __version__
 from ganlane.errors import UserError, as_typed
 from ganlane.files import PACKAGE, atomic_path, write_json
+from ganlane.runtime import usable_cores
 from ganlane.settings.record import saved_config
 from ganlane.settings.traffic import OwnTraffic, TrafficConfig
 
@@ -259,8 +259,7 @@ def _git(*arguments: str) -> str | None:
 def machine() -> dict[str, Any]:
     """CPU, usable cores, torch's threads, system, accelerator (or None), versions that ran."""
     cpu = platform.processor() or platform.machine()
-    cores = os.cpu_count() or 1
-    # Linux names the model of the CPU here, and may leave a process fewer cores than there are.
+    # Linux names the model of the CPU here.
     info = Path("/proc/cpuinfo")
     if info.is_file():
         model = re.search(
@@ -269,11 +268,9 @@ def machine() -> dict[str, Any]:
             re.MULTILINE,
         )
         cpu = model[1].strip() if model else cpu
-    if hasattr(os, "sched_getaffinity"):
-        cores = len(os.sched_getaffinity(0))
     return {
         "cpu": cpu,
-        "cores": cores,
+        "cores": usable_cores(),
         "threads": torch.get_num_threads(),
         "system": platform.platform(),
         "accelerator": torch.cuda.get_device_name() if torch.cuda.is_available() else None,

@@ -24,7 +24,6 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from contextvars import ContextVar
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,6 +31,7 @@ from typing import Any, NamedTuple
 from ganlane import runtime
 from ganlane.errors import UserError
 from ganlane.files import CACHE_VARIABLE, PLACE, cache_folder, has_checksum, sealed, write_bytes
+from ganlane.runtime import kernel_threads, usable_threads
 
 #: The sources to compile, and what they include.
 SOURCES = tuple(sorted(Path(__file__).parent.glob("*.[ch]pp")))
@@ -334,11 +334,6 @@ def addresses(arrays: Sequence[Any]) -> ctypes.Array[ctypes.c_void_p]:
     return pointers
 
 
-#: Threads of the kernel while torch has but one (:func:`torch_on_one_thread`); None: as many as
-#: torch.
-_threads: ContextVar[int | None] = ContextVar("threads of the kernel", default=None)
-
-
 @contextmanager
 def torch_on_one_thread() -> Iterator[None]:
     """Inside, torch computes on one thread, and the kernel on as many as torch had.
@@ -354,30 +349,25 @@ def torch_on_one_thread() -> Iterator[None]:
         yield
         return
     # A context variable: each thread that calls has its own.
-    token = _threads.set(before)
+    token = kernel_threads.set(before)
     torch.set_num_threads(1)
     try:
         yield
     finally:
         torch.set_num_threads(before)
-        _threads.reset(token)
+        kernel_threads.reset(token)
 
 
 def threads_allowed() -> int:
-    """As many threads as torch may use.
+    """Those that a command has set, else as many as torch may use.
 
-    Where torch is not loaded, ``OMP_NUM_THREADS`` or the processor's cores.
+    Where torch is not loaded, :func:`ganlane.runtime.usable_threads`.
     """
-    set_aside = _threads.get()
+    threads = kernel_threads.get()
     torch = sys.modules.get("torch")
-    if set_aside is not None:
-        return set_aside
-    if torch is not None:
-        return int(torch.get_num_threads())
-    named = os.environ.get("OMP_NUM_THREADS", "")
-    if named.isdigit() and int(named) > 0:
-        return int(named)
-    return os.cpu_count() or 1
+    if threads is not None:
+        return threads
+    return usable_threads() if torch is None else int(torch.get_num_threads())
 
 
 def in_threads(

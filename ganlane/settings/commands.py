@@ -46,8 +46,8 @@ class RunConfig(Record):
 
     Attributes:
         seed: of all random numbers.
-        threads: torch's threads; 0: one, which measured fastest (more are far slower where other
-            work runs).
+        threads: of torch and of the native kernel; 0: one for torch, which measured fastest (more
+            are far slower where other work runs), and every core for the kernel.
         device: cpu or cuda.
         columns: of printed tables; auto: as many as the terminal has room for; all.
     """

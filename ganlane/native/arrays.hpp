@@ -29,6 +29,7 @@ struct Inputs {
     const int64_t* step;
     const uint8_t* recycles;  // whether the row recycles its vehicles; null: none does
     const int64_t *seed, *episode;
+    const int64_t* rows;  // those to drive: a decision's rows [first, last) are places here; null: all
     // and the memory of generated drivers (Memory of generated.hpp), here and in Outputs
 };
 

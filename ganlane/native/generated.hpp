@@ -95,12 +95,12 @@ INLINE void copy_gates(int hidden, float* to, int to_width, const float* from, i
         __builtin_memcpy(to + gate * to_width, from + gate * from_width, hidden * sizeof(float));
 }
 
-static void load_memory(Crowd& c, const Memory& m, long first) {
+static void load_memory(Crowd& c, const Memory& m, const Block& block) {
     const Network& n = c.g->network;
     int width = padded(n.hidden);
     for (int environment = 0; environment < c.environments; environment++)
         for (int v = 0; v < c.vehicles; v++) {
-            long from = (first + environment) * c.vehicles + v, to = (long)v * c.environments + environment;
+            long from = block.row[environment] * c.vehicles + v, to = (long)v * c.environments + environment;
             for (int k = 0; k < 2; k++) c.displacement[2 * to + k] = m.displacement[2 * from + k];
             for (int k = 0; k < n.noise; k++) c.noise[to * n.noise + k] = m.noise[from * n.noise + k];
             for (int t = 0; t < n.motions; t++)

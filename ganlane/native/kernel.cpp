@@ -192,7 +192,7 @@ static inline void decide(const Settings& s, Rows& r, Crowd& crowd, Ended ended)
     }
 }
 
-// ---- Arrays in and out: LANES rows beginning at `first`; behind the last row its numbers are repeated
+// ---- Arrays in and out: the rows of a block
 
 struct Command {  // of one row, what the action leads to
     int64_t direction, target;
@@ -211,9 +211,9 @@ static Command obey(const Settings& s, const Inputs& in, long row) {
     return {wish ? wish : direction, target + wish, wish != 0, off_road, in.speed[row * s.vehicles], in.step[row]};
 }
 
-static void load(const Settings& s, const Inputs& in, Rows& r, long first, long rows, Command* commands) {
+static void load(const Settings& s, const Inputs& in, Rows& r, const Block& block, Command* commands) {
     for (int lane = 0; lane < LANES; lane++) {
-        long start = (first + (lane < rows ? lane : rows - 1)) * s.vehicles;
+        long start = block.row[lane] * s.vehicles;
         for (int i = 0; i < s.vehicles; i++) at(r.x, i, lane) = in.x[start + i], at(r.index, i, lane) = (float)i;
     }
     for (int last = s.vehicles - 1; last > 0;) {  // as put_in_order, of positions and indices alone
@@ -229,7 +229,7 @@ static void load(const Settings& s, const Inputs& in, Rows& r, long first, long 
         last = exchanged;
     }
     for (int lane = 0; lane < LANES; lane++) {
-        long row = first + (lane < rows ? lane : rows - 1), start = row * s.vehicles;
+        long row = block.row[lane], start = row * s.vehicles;
         Command command = commands[lane] = obey(s, in, row);
         for (int i = 0; i < s.vehicles; i++) {
             long index = (long)at(r.index, i, lane), from = start + index;
@@ -245,7 +245,7 @@ static void load(const Settings& s, const Inputs& in, Rows& r, long first, long 
             at(r.valid, i, lane) = (float)(in.valid[from] != 0);
             at(r.steering, i, lane) = index == 0 ? in.ego_steering[row] : in.steering ? in.steering[from] : 0.0f;
         }
-        r.running[lane] = lane < rows && !command.off_road ? -1 : 0;
+        r.running[lane] = lane < block.count && !command.off_road ? -1 : 0;
         r.ahead[lane] = in.soft_crash[row] ? -1 : 0;
         r.behind[lane] = in.soft_crash_behind[row] ? -1 : 0;
         r.phase[lane] = (float)(command.step % MOBIL_PERIOD);  // rows of a vector may be at different times
@@ -284,10 +284,10 @@ static void store_ego(const Settings& s, const Inputs& in, const Rows& r, const 
     out.terminated[row] = ended, out.done[row] = ended || truncated;
 }
 
-static void store(const Settings& s, const Inputs& in, Rows& r, const Outputs& out, long first, long rows,
+static void store(const Settings& s, const Inputs& in, Rows& r, const Outputs& out, const Block& block,
                   const Command* commands) {
-    for (int lane = 0; lane < rows; lane++) {
-        long row = first + lane, start = row * s.vehicles;
+    for (int lane = 0; lane < block.count; lane++) {
+        long row = block.row[lane], start = row * s.vehicles;
         for (int i = 0; i < s.vehicles; i++) {
             long index = (long)at(r.index, i, lane), to = start + index;
             out.x[to] = at(r.x, i, lane);
@@ -319,8 +319,8 @@ static Fields fields_of(const Settings& s) {
 // where an action is not 0, 1 or 2.
 extern "C" int ganlane_decide(const Settings* settings, const Inputs* in, const Outputs* out, long first, long last) {
     const Settings& s = *settings;
-    for (long row = first; row < last; row++)
-        if ((uint64_t)in->action[row] > 2) return 2;
+    for (long place = first; place < last; place++)
+        if ((uint64_t)in->action[in->rows ? in->rows[place] : place] > 2) return 2;
     size_t floats = scratch_floats(s) * LANES;
     size_t more = s.generated ? crowd_floats(s.generated->network, s.vehicles) : 0;
     float* memory = (float*)scratch((floats + more) * sizeof(float));
@@ -335,27 +335,31 @@ extern "C" int ganlane_decide(const Settings* settings, const Inputs* in, const 
     const Memory& network_before = *(const Memory*)(memory_of(in) + fields.arrays);
     const Memory& network_after = *(const Memory*)(memory_of(out) + fields.arrays);
     Command commands[LANES];
-    for (long row = first; row < last; row += LANES) {
-        long rows = last - row < LANES ? last - row : LANES;
-        load(s, *in, r, row, rows, commands);
-        load_fields(fields, r, memory_of(in), row, rows);
-        crowd.environments = (int)rows;
-        if (s.generated) load_memory(crowd, network_before, row);
+    for (long place = first; place < last; place += LANES) {
+        Block block = {last - place < LANES ? last - place : LANES, {}};
+        for (int lane = 0; lane < LANES; lane++) {
+            long at = place + (lane < block.count ? lane : block.count - 1);
+            block.row[lane] = in->rows ? (long)in->rows[at] : at;
+        }
+        load(s, *in, r, block, commands);
+        load_fields(fields, r, memory_of(in), block);
+        crowd.environments = (int)block.count;
+        if (s.generated) load_memory(crowd, network_before, block);
         // The network of a row that ends remembers nothing of what comes after.
         auto keep = [&](Mask ended) {
-            for (int lane = 0; any(ended) && lane < rows; lane++)
-                if (ended[lane]) store_memory(crowd, network_after, row + lane, lane);
+            for (int lane = 0; any(ended) && lane < block.count; lane++)
+                if (ended[lane]) store_memory(crowd, network_after, block.row[lane], lane);
         };
         if (s.generated) keep(~r.running);
         decide(s, r, crowd, keep);
         if (s.generated) keep(r.running);
         if (in->recycles) {
             Mask recycles = none();
-            for (int lane = 0; lane < rows; lane++) recycles[lane] = in->recycles[row + lane] ? -1 : 0;
+            for (int lane = 0; lane < block.count; lane++) recycles[lane] = in->recycles[block.row[lane]] ? -1 : 0;
             recycle(s, r, recycles & r.running);
         }
-        store_fields(fields, r, memory_of(out), row, rows);
-        store(s, *in, r, *out, row, rows, commands);
+        store_fields(fields, r, memory_of(out), block);
+        store(s, *in, r, *out, block, commands);
     }
     free(memory);
     return 0;

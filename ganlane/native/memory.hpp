@@ -33,11 +33,16 @@ static void* const* memory_of(const Arrays* arrays) {
 // One row's number of a vehicle: a vector seen as the array that it is.
 INLINE float& at(Float* field, int i, int lane) { return ((float*)(field + i))[lane]; }
 
-static void load_fields(const Fields& fields, Rows& r, void* const* arrays, long first, long rows) {
+// The rows of the state that a vector holds; behind the last of them it is repeated.
+struct Block {
+    long count, row[LANES];
+};
+
+static void load_fields(const Fields& fields, Rows& r, void* const* arrays, const Block& block) {
     for (int k = 0; k < fields.arrays; k++) {
         const Field& f = fields.field[k];
         for (int lane = 0; lane < LANES; lane++) {
-            long start = (first + (lane < rows ? lane : rows - 1)) * r.vehicles;
+            long start = block.row[lane] * r.vehicles;
             for (int i = 0; i < r.vehicles; i++) {
                 long from = start + (long)at(r.index, i, lane);
                 for (int j = 0; j < f.numbers; j++)
@@ -49,12 +54,12 @@ static void load_fields(const Fields& fields, Rows& r, void* const* arrays, long
     }
 }
 
-static void store_fields(const Fields& fields, Rows& r, void* const* arrays, long first, long rows) {
+static void store_fields(const Fields& fields, Rows& r, void* const* arrays, const Block& block) {
     for (int k = 0; k < fields.arrays; k++) {
         const Field& f = fields.field[k];
-        for (int lane = 0; lane < rows; lane++)
+        for (int lane = 0; lane < block.count; lane++)
             for (int i = 0; i < r.vehicles; i++) {
-                long to = (first + lane) * r.vehicles + (long)at(r.index, i, lane);
+                long to = block.row[lane] * r.vehicles + (long)at(r.index, i, lane);
                 for (int j = 0; j < f.numbers; j++) {
                     float number = at(r.memory[f.first + j], i, lane);
                     if (f.kind == FLOAT) ((float*)arrays[k])[to * f.numbers + j] = number;

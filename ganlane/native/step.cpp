@@ -87,12 +87,18 @@ static int look(const Batch& b, long first, long last) {
     return failed || (b.mask_form == MASK_SAFE && ganlane_mask(b.mask_settings, b.mask_inputs, b.mask_outputs, first, last));
 }
 
+// Reward, mask and observation of the rows [first, last), which have been driven. Returns 0, or 1 without memory.
+extern "C" int ganlane_judge(const Batch* batch, long first, long last) {
+    const Batch& b = *batch;
+    for (long row = first; row < last; row++) rate(b, row);
+    return look(b, first, last);
+}
+
 // Drives the rows [first, last) through one decision. Returns as ganlane_decide does.
 extern "C" int ganlane_step(const Batch* batch, long first, long last) {
     const Batch& b = *batch;
     if (int failed = ganlane_decide(b.settings, b.in, b.out, first, last)) return failed;
-    for (long row = first; row < last; row++) rate(b, row);
-    return look(b, first, last);
+    return ganlane_judge(batch, first, last);
 }
 
 // Begins the episodes of those of the rows [first, last) that are `fresh`. Returns 0, or 1 without memory.

@@ -133,7 +133,8 @@ def pack(
     """The state as one TensorDict [N]; ``rest`` is not nested."""
     # The first axis of every field is the batch.
     batch = ego["distance"].shape
-    device = ego["distance"].device
+    # In a graph, moving the traffic's part to its own device would be an error.
+    device = None if torch.compiler.is_compiling() else ego["distance"].device
     nested = {keys.VEHICLES: vehicles.as_dict(), keys.EGO: ego, keys.EVENTS: events}
     parts: dict[str, Any] = {keys.TRAFFIC: traffic, **rest}
     for name, fields in nested.items():
@@ -208,8 +209,11 @@ def checked_action(
     if action.shape != (rows,) or action.is_floating_point() or action.dtype == torch.bool:
         raise _refused(f"of shape {list(action.shape)} in {action.dtype}", rows)
     action = action.long()
-    # A graph that is compiled cannot look at values.
-    if values and not torch.compiler.is_compiling():
+    if torch.compiler.is_compiling():
+        # A graph cannot branch on values.
+        legal = (action >= 0) & (action < keys.ACTIONS)
+        torch._assert_async(legal.all(), f"action: each must be 0 to {keys.ACTIONS - 1}")
+    elif values:
         # As unsigned numbers, of which those below 0 are large, and by NumPy: some microseconds.
         numbers = action.cpu().numpy()
         wrong = numbers.view(np.uint64) >= keys.ACTIONS

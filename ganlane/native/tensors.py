@@ -40,6 +40,11 @@ _LASTING = [
 ]
 
 
+def wants_gradient(tensors: Iterable[Tensor]) -> bool:
+    """Whether autograd would record a function of ``tensors``; the kernel has no gradients."""
+    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+
+
 def _room(
     names: Iterable[Key], rows: int, vehicles: int, make: Callable[..., Tensor]
 ) -> dict[Key, Tensor]:

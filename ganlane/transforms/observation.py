@@ -23,7 +23,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.native.settings import NATIVE_FORMS
-from ganlane.native.tensors import LaneView
+from ganlane.native.tensors import LaneView, wants_gradient
 from ganlane.settings.observation import NEARNESS_M, OVERLAP_M, ObservationScale
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.torch_settings import compiled, constant
@@ -305,7 +305,7 @@ class ObservationTransform(PerceptionTransform):
         progress = ego.get("change_progress")
         direction = ego.get("change_direction")
         # The kernel computes the same numbers up to the rounding of the exponential function.
-        if self.native is not None:
+        if self.native is not None and not wants_gradient([*vehicles, *seen, progress]):
             observation = self.native.observe(
                 vehicles,
                 progress,

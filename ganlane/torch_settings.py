@@ -1,4 +1,4 @@
-"""Torch's settings: compiled functions, autocast, default device, threads; constants on a device."""
+"""Torch's settings: compiled functions, autocast, default device, threads; constant tensors."""
 
 from __future__ import annotations
 

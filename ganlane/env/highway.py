@@ -403,7 +403,7 @@ class HighwayEnv(EnvBase):
         )
 
     def _native_step(self, state: TensorDictBase) -> TensorDictBase:
-        """One decision by the kernel, or with ``auto`` by the tensor code where a gradient is due."""
+        """One decision by the kernel; where a gradient is due, with ``auto`` by the tensor code."""
         assert self.kernel is not None
         if wants_gradient([*state.get(keys.VEHICLES).values(), *state.get(keys.EGO).values()]):
             if self._must_be_native:

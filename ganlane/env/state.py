@@ -195,8 +195,8 @@ def checked_action(
 ) -> Tensor:
     """``action`` [N] as int64.
 
-    ``values=False`` leaves out that of the values, which the native kernel looks at itself. On a GPU
-    it waits for the queue.
+    ``values=False`` leaves out that of the values, which the native kernel looks at itself. It
+    waits for a GPU's queue.
 
     Raises:
         UserError: there is none, or it has another shape, no whole numbers, or others than 0 to 2.

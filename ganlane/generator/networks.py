@@ -19,8 +19,8 @@ import torch
 from torch import Tensor, nn
 
 from ganlane.linear import has_fast_product, matrix_product
-from ganlane.torch_settings import constant
 from ganlane.settings.generator import GeneratorSizes
+from ganlane.torch_settings import constant
 
 # The networks' units are typical values, so that inputs are of order 1.
 #: Displacement per 0.1 s, along and across the road, m.

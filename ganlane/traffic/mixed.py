@@ -47,7 +47,7 @@ def interleaved(shares: Mapping[str, int]) -> list[str]:
 
 
 class RowsOfPart(NamedTuple):
-    """A part that has rows in the batch: ``padded`` repeats the first of ``rows`` [R] at the end."""
+    """A part and its ``rows`` [R] of the batch; ``padded`` repeats the first of them at the end."""
 
     name: str
     part: TrafficModule

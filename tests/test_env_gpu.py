@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from torch.utils import backend_registration
 
 PROGRAM = Path(__file__).parent / "reference" / "pretend_gpu.py"
 #: TorchRL asks whether any row has ended.
@@ -31,6 +32,12 @@ TRAINING = {
     "update": {},
     "elsewhere": [],
 }
+
+#: Experimental in PyTorch.
+pytestmark = pytest.mark.skipif(
+    not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"),
+    reason="this PyTorch has no devices written in Python",
+)
 
 
 def on_a_pretended_gpu(*names: str) -> dict:

@@ -56,8 +56,8 @@ class Waits(TorchDispatchMode):
     ) -> Any:
         kwargs = kwargs or {}
         name = func._schema.name.removeprefix("aten::")
-        given = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
-        on_gpu = any(tensor.device == GPU for tensor in given)
+        tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+        on_gpu = any(tensor.device == GPU for tensor in tensors)
         if name in READS and (on_gpu or name == "_local_scalar_dense"):
             if on_gpu:
                 self.count(name)
@@ -71,14 +71,14 @@ class Waits(TorchDispatchMode):
             kinds = {index.dtype for index in args[1] if index is not None}
             if torch.bool in kinds:
                 self.count("indexing by flags")
-        if name == "_to_copy" and given:
+        if name == "_to_copy" and tensors:
             device = kwargs.get("device")
-            if device is not None and torch.device(device).type != given[0].device.type:
+            if device is not None and torch.device(device).type != tensors[0].device.type:
                 self.count("copy to the host" if on_gpu else "copy from the host")
                 if not on_gpu:
-                    dtype = kwargs.get("dtype") or given[0].dtype
-                    return torch.empty(given[0].shape, dtype=dtype, device=GPU)
-        if name == "copy_" and len({tensor.device.type for tensor in given}) > 1:
+                    dtype = kwargs.get("dtype") or tensors[0].dtype
+                    return torch.empty(tensors[0].shape, dtype=dtype, device=GPU)
+        if name == "copy_" and len({tensor.device.type for tensor in tensors}) > 1:
             self.count("copy between host and GPU")
             return args[0]
         return func(*args, **kwargs)

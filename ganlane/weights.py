@@ -15,6 +15,7 @@ from ganlane.errors import UserError
 from ganlane.files import (
     PLACE,
     has_checksum,
+    read_whole,
     refuse_without_checksum,
     sealed,
     write_bytes,
@@ -56,7 +57,7 @@ def load_weights(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[s
         raise UserError(
             f"{path}: no such file; a checkpoint of kind {kind} (.safetensors) was expected there."
         )
-    content = path.read_bytes()
+    content = read_whole(path)
     whole = has_checksum(content, path)
     try:
         tensors = load(content)

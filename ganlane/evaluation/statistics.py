@@ -300,10 +300,10 @@ def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate |
     # One table, so that a draw of trainings is one for events and kilometres.
     resampled = _estimate([np.stack([happened, amount])], ratio, bounds=(0.0, np.inf))
     rate = resampled.value
-    exact = poisson_interval(round(happened.sum())).scaled(per=total)
+    low, high = (bound / total for bound in poisson_bounds(round(happened.sum())))
+    # One episode of one training has no spread to resample.
     if resampled.low is None or resampled.high is None:
-        return exact
-    low, high = exact.low, exact.high
+        return Estimate(rate, low, high)
     above = resampled.high - rate
     trainings = len(happened)
     if trainings > 1:

@@ -45,7 +45,7 @@ from ganlane.config.run import (
 from ganlane.errors import UserError, did_you_mean
 from ganlane.evaluation import evaluation_rows, paired_rows, write_episodes, write_results
 from ganlane.evaluation.results import Run, TrainingRun, plain
-from ganlane.runtime import kernel_threads
+from ganlane.runtime import kernel_threads, worker_number
 from ganlane.settings.commands import EvaluateConfig, highways
 from ganlane.settings.record import Record
 from ganlane.sim.random import Stream
@@ -75,13 +75,16 @@ def make_env(
         num_envs: N, environments side by side, 1 to 65536.
         transforms: your own, after observation and reward.
         keys: the options ``env`` (``highway``, ``dense``, a scenario such as ``cut_in``),
-            ``observation``, ``reward`` and ``mask`` (``none``, ``legal``, ``safe``); ``seed``;
-            ``stream``, the family of the episodes (``train``, ``select``, ``report``); ``device``;
-            and keys of the environment (:class:`ganlane.settings.env.EnvConfig`).
+            ``observation``, ``reward`` and ``mask`` (``none``, ``legal``, ``safe``); ``seed``, by
+            default 0, and in a worker process of TorchRL the worker's number; ``stream``, the
+            family of the episodes (``train``, ``select``, ``report``); ``device``; and keys of the
+            environment (:class:`ganlane.settings.env.EnvConfig`).
 
     Raises:
         UserError: an unknown name or key, a value of the wrong type or out of range.
     """
+    # Workers of TorchRL share one call of this function, and must not share their episodes.
+    keys.setdefault("seed", worker_number())
     # Settings first: a mistake in them is reported before anything is built.
     config = highways(traffic=traffic, num_envs=num_envs, **keys)
     batch = build.make_highways(config)

@@ -28,6 +28,8 @@ CHECKPOINTS = PACKAGE / "checkpoints"
 CACHE_VARIABLE = "GANLANE_CACHE"
 #: Bytes that are written to test whether the disk is full; libraries fail with less than this left.
 _PROBE_BYTES = 2**20
+#: Weights that ship have up to 4.3 MB; a network of 100 M weights has 400 MB.
+LARGEST_BYTES = 2**30
 #: Ending of the temporary files, whose names begin with a dot.
 _PART = ".part"
 _BEGIN, _END = b"ganlane sha256 ", b" of this file"
@@ -147,6 +149,20 @@ def write_json(path: str | Path, content: Any) -> None:
     """
     text = (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()
     write_bytes(path, sealed(text) if PLACE.encode() in text else text)
+
+
+def read_whole(path: Path) -> bytes:
+    """Content of a file that is judged as a whole: weights, histograms, the state of a fit.
+
+    Raises:
+        UserError: it is larger than any of these, so it is not read into memory.
+    """
+    if path.stat().st_size > LARGEST_BYTES:
+        raise UserError(
+            f"{path}: more than {LARGEST_BYTES} bytes, which no file of this kind has; give "
+            "another file."
+        )
+    return path.read_bytes()
 
 
 def sealed(content: bytes) -> bytes:

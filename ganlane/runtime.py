@@ -7,6 +7,7 @@ Without torch, which the command line does not need at first; its settings are i
 from __future__ import annotations
 
 import ctypes
+import multiprocessing
 import os
 import select
 import shutil
@@ -204,6 +205,22 @@ def keep_freed_memory() -> bool:
     return bool(mallopt(_M_MMAP_THRESHOLD, KEPT_BYTES)) and bool(
         mallopt(_M_TRIM_THRESHOLD, KEPT_BYTES)
     )
+
+
+def worker_number() -> int:
+    """A number from 1 of this process among TorchRL's workers; 0 where it is none of them.
+
+    Counted by the process that started it, so a program that runs again has the same numbers.
+    """
+    process = multiprocessing.current_process()
+    module = getattr(getattr(process, "_target", None), "__module__", None) or ""
+    if not module.startswith("torchrl."):
+        return 0
+    number = 0
+    # A worker of a worker has one part for each of both.
+    for part in getattr(process, "_identity", ()):
+        number = 1000 * number + part
+    return number
 
 
 def peak_resident_bytes() -> int | None:

@@ -1,13 +1,14 @@
-"""Torch's settings: compiled functions, autocast, default device, threads."""
+"""Torch's settings: compiled functions, autocast, default device, threads; constant tensors."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from functools import wraps
+from functools import lru_cache, wraps
 from typing import Any, TypeVar
 
 import torch
+from torch import Tensor
 
 from ganlane.errors import UserError
 from ganlane.runtime import has_compiler, kernel_threads, usable_threads
@@ -39,6 +40,28 @@ def compiled(function: F) -> F:
         torch._dynamo.config.cache_size_limit, GRAPHS_PER_FUNCTION
     )
     return torch.compile(function, dynamic=False, fullgraph=True)  # type: ignore[return-value]
+
+
+def constant(values: Sequence[float], like: Tensor) -> Tensor:
+    """``values`` in the type and on the device of ``like``; shared, so never to be written to.
+
+    Made once: a GPU would wait for each copy from the host.
+    """
+    # A graph has its own constants.
+    if torch.compiler.is_compiling():
+        return like.new_tensor(values)
+    return _constant(tuple(values), like.dtype, like.device)
+
+
+@lru_cache(maxsize=256)
+def _constant(
+    values: tuple[float, ...],
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Tensor:
+    # A tensor made in inference mode could not be used outside of it.
+    with torch.inference_mode(False):
+        return torch.tensor(values, dtype=dtype, device=device)
 
 
 def outside_autocast(function: F) -> F:

@@ -16,6 +16,7 @@ from ganlane.errors import UserError
 from ganlane.files import (
     PLACE,
     has_checksum,
+    read_whole,
     refuse_without_checksum,
     sealed,
     write_bytes,
@@ -70,7 +71,7 @@ def load_arrays(path: str | Path, kind: str) -> tuple[dict[str, npt.NDArray[Any]
         raise UserError(
             f"{path}: no such file; a checkpoint of kind {kind} (.safetensors) was expected there."
         )
-    content = path.read_bytes()
+    content = read_whole(path)
     whole = has_checksum(content, path)
     try:
         arrays = load(content)

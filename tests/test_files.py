@@ -35,7 +35,9 @@ from ganlane.files import (
 from ganlane.generator import load_generator
 from ganlane.generator.tasks import FitLoop
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
+from ganlane.reproduce.crashes import read_crashes
 from ganlane.settings.generator import LoopConfig, PaperConfig
+from ganlane.training.checkpoint import load_checkpoint
 from ganlane.weights import load_weights, save_weights
 
 NOISE = np.random.default_rng(0).integers(0, 255, (200, 300, 3), dtype=np.uint8)
@@ -311,3 +313,19 @@ def test_weights_that_are_not_finite_are_refused(kind, value, tmp_path):
 def test_a_content_without_the_place_cannot_be_sealed():
     with pytest.raises(ValueError, match="not found"):
         sealed(b"nothing")
+
+
+@pytest.mark.parametrize("kind", ["weights", "histograms", "crashes", "recordings", "checkpoint"])
+def test_a_huge_file_is_refused_before_it_is_read(kind, tmp_path):
+    path = tmp_path / "huge.parquet"
+    with path.open("wb") as file:
+        file.truncate(20 * 10**9)  # sparse: no bytes on the disk
+    read = {
+        "weights": lambda: load_weights(path, "agent"),
+        "histograms": lambda: Reference.load(path),
+        "crashes": lambda: read_crashes(path),
+        "recordings": lambda: read_scenes(path),
+        "checkpoint": lambda: load_checkpoint(path),
+    }
+    with pytest.raises(UserError, match=r"huge\.parquet: (more than|not a readable)"):
+        read[kind]()

@@ -217,7 +217,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--no-peers", action="store_true")
     add("--seed", type=int, default=0)
     add("--json", type=Path, metavar="FILE", help="all rows as JSON")
-    add("--report", type=Path, metavar="FILE", help="a document with <!-- begin bench SUITE -->")
+    add("--report", type=Path, metavar="FILE",
+        help="a document with <!-- begin bench SUITE -->; on cuda, SUITE cuda")  # fmt: skip
     options = parser.parse_args(arguments)
     options.traffics = options.traffics or TRAFFICS[options.suite]
     if options.suite == "gymnasium":
@@ -234,7 +235,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 def compare(options: argparse.Namespace) -> str:
     """Measure all; the tables, in the document too where one is named."""
-    begin, end = f"<!-- begin bench {options.suite} -->", f"<!-- end bench {options.suite} -->"
+    name = options.suite if options.device == "cpu" else f"{options.suite} {options.device}"
+    begin, end = f"<!-- begin bench {name} -->", f"<!-- end bench {name} -->"
     section = ReportSection(options.report, begin, end)
     rows = rows_of(options)
     if options.json is not None:

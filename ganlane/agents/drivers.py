@@ -37,6 +37,7 @@ from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV, mobil_wishes
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
 from ganlane.sim.state import Road, Vehicles, road_in
+from ganlane.torch_settings import constant
 from ganlane.traffic.idm_mobil import MOBIL_PERIOD_STEPS
 
 #: Gives the legal actions, [N, A] bool, of what the environment wrote.
@@ -208,7 +209,7 @@ def legal_actions(tensordict: TensorDictBase, road: Road) -> Tensor:
     """Which of the three actions stay on the road, bool [N, 3]: keeping the lane always does."""
     # of the lane that it is moving to, not of the one it is in
     target = tensordict.get(keys.VEHICLES).get("target_lane")[:, EGO_INDEX, None]
-    return on_road(target + target.new_tensor(SIDES), road.lanes)
+    return on_road(target + constant(SIDES, target), road.lanes)
 
 
 class RandomDriver(Driver):

@@ -32,6 +32,7 @@ from ganlane.data.tables import (
 )
 from ganlane.errors import UserError
 from ganlane.files import (
+    LARGEST_BYTES,
     PLACE,
     atomic_path,
     has_checksum,
@@ -44,6 +45,8 @@ from ganlane.settings.generator import NgsimParameters
 #: at the centre of lane 1, which is the leftmost.
 COLUMNS: Final = {"v" if name == "speed" else name: kind for name, kind in SCHEMA.items()}
 PARQUET: Final = ".parquet"
+#: How a Parquet file begins.
+_PARQUET = b"PAR1"
 
 
 def read_scenes(path: str | Path) -> pl.DataFrame:
@@ -166,6 +169,13 @@ def _read_parquet(path: Path) -> pl.DataFrame:
     if not path.is_file():
         raise UserError(
             f"{path}: no such file; give a Parquet file that ganlane prepare wrote, or its folder."
+        )
+    # A recording may be large; another file so large is not read into memory.
+    with path.open("rb") as file:
+        begin = file.read(len(_PARQUET))
+    if begin != _PARQUET and path.stat().st_size > LARGEST_BYTES:
+        raise UserError(
+            f"{path}: not a readable Parquet file (it begins otherwise); prepare it again."
         )
     # The checksum is that of the whole file.
     content = path.read_bytes()

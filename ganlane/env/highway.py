@@ -32,7 +32,7 @@ from ganlane.env.state import (
 from ganlane.errors import UserError
 from ganlane.native.drivers import pays
 from ganlane.native.library import torch_on_one_thread, why_not
-from ganlane.native.tensors import Kernel, NativeScenes
+from ganlane.native.tensors import Kernel, NativeScenes, wants_gradient
 from ganlane.settings.driving import EgoParameters, IdmParameters, Visibility
 from ganlane.settings.episode import KERNELS, EpisodeParameters, SpawnParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
@@ -69,7 +69,7 @@ class HighwayEnv(EnvBase):
             numbers: a mixture of roads that empty and roads that do not.
         kernel: what drives a decision: ``torch``, the tensor code; ``native``, the kernel
             (:mod:`ganlane.native`), which does the same up to rounding, for rule-driven traffic on
-            a CPU; ``auto``, the kernel where it can.
+            a CPU and without gradients; ``auto``, the kernel where it can.
 
     An episode is (the traffic's stream, seed, episode), whatever the batch. ``reset(td)`` with
     ``seed`` and ``episode`` [N] in ``td`` and no ``_reset`` mask runs exactly those episodes. With
@@ -415,8 +415,15 @@ class HighwayEnv(EnvBase):
         )
 
     def _native_step(self, state: TensorDictBase) -> TensorDictBase:
-        """One decision by the kernel."""
+        """One decision by the kernel; where a gradient is due, with ``auto`` by the tensor code."""
         assert self.kernel is not None
+        if wants_gradient([*state.get(keys.VEHICLES).values(), *state.get(keys.EGO).values()]):
+            if self._must_be_native:
+                raise UserError(
+                    "env.kernel=native has no gradients, and the state requires one; set "
+                    "env.kernel=torch, or step under torch.no_grad()."
+                )
+            return self._tensor_step(state)
         rows = self.batch_size[0]
         action = checked_action(state.get(keys.ACTION, None), rows, values=False)
         if not self._must_be_native:

@@ -60,7 +60,7 @@ def state_spec(
         keys.VEHICLES: Composite(_specs(VEHICLES, (n, m), dtype), shape=(n,)),
         keys.EGO: Composite(_specs(EGO, (n,), dtype), shape=(n,)),
         keys.EVENTS: Composite(_specs(EVENTS, (n, 1), dtype), shape=(n,)),
-        keys.TRAFFIC: _memory_spec(memory, n),
+        **_memory_spec({keys.TRAFFIC: memory}, n),
         **_specs(COUNTERS, (n,), dtype),
     }
     if own_roads:
@@ -87,17 +87,20 @@ def _specs(
     return specs
 
 
-def _memory_spec(memory: dict[str, Any], n: int) -> Composite:
-    """Composite spec of a traffic module's memory, nested like the modules."""
-    specs = {}
+def _memory_spec(memory: dict[str, Any], n: int) -> dict[str, Any]:
+    """Specs of a traffic module's memory, nested like the modules."""
+    specs: dict[str, Any] = {}
     for name, value in memory.items():
         # A traffic that is made of others has a group of each.
         if isinstance(value, dict):
-            specs[name] = _memory_spec(value, n)
+            parts = _memory_spec(value, n)
+            # TorchRL's SerialEnv and ParallelEnv refuse empty groups.
+            if parts:
+                specs[name] = Composite(parts, shape=(n,))
         else:
             shape, dtype = value
             specs[name] = Unbounded(shape=shape, dtype=dtype)
-    return Composite(specs, shape=(n,))
+    return specs
 
 
 def first_state(
@@ -130,7 +133,8 @@ def pack(
     """The state as one TensorDict [N]; ``rest`` is not nested."""
     # The first axis of every field is the batch.
     batch = ego["distance"].shape
-    device = ego["distance"].device
+    # In a graph, moving the traffic's part to its own device would be an error.
+    device = None if torch.compiler.is_compiling() else ego["distance"].device
     nested = {keys.VEHICLES: vehicles.as_dict(), keys.EGO: ego, keys.EVENTS: events}
     parts: dict[str, Any] = {keys.TRAFFIC: traffic, **rest}
     for name, fields in nested.items():
@@ -191,7 +195,8 @@ def checked_action(
 ) -> Tensor:
     """``action`` [N] as int64.
 
-    ``values=False`` leaves out that of the values, which the native kernel looks at itself.
+    ``values=False`` leaves out that of the values, which the native kernel looks at itself. It
+    waits for a GPU's queue.
 
     Raises:
         UserError: there is none, or it has another shape, no whole numbers, or others than 0 to 2.
@@ -204,7 +209,11 @@ def checked_action(
     if action.shape != (rows,) or action.is_floating_point() or action.dtype == torch.bool:
         raise _refused(f"of shape {list(action.shape)} in {action.dtype}", rows)
     action = action.long()
-    if values:
+    if torch.compiler.is_compiling():
+        # A graph cannot branch on values.
+        legal = (action >= 0) & (action < keys.ACTIONS)
+        torch._assert_async(legal.all(), f"action: each must be 0 to {keys.ACTIONS - 1}")
+    elif values:
         # As unsigned numbers, of which those below 0 are large, and by NumPy: some microseconds.
         numbers = action.cpu().numpy()
         wrong = numbers.view(np.uint64) >= keys.ACTIONS

@@ -28,6 +28,7 @@ from ganlane.evaluation.statistics import (
     percent_of_way,
     poisson_interval,
     resample_counts,
+    sign_flip_p,
 )
 
 #: The two drivers that give the normalised score its scale.
@@ -38,6 +39,12 @@ _EPISODE = ["seed", "episode"]
 _CRASH = "hard_crash"
 #: The ends of an episode that are the driver's failures.
 FAILURES = (_CRASH, "out_of_road")
+#: Below so many shared episodes there is no verdict.
+FEWEST_EPISODES = 30
+#: A verdict may not hang on fewer failures than this.
+FEWEST_FAILURES = 5
+_SIGNIFICANT = 0.05
+_RETURN = pl.col("reward")
 
 Row = dict[str, Any]
 
@@ -115,16 +122,14 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
     }
 
 
-def _paired_rewards(*drivers: pl.DataFrame) -> list[Array]:
-    """The returns of each of ``drivers`` on the episodes that all of them drove, in one order, each
+def _paired(*drivers: pl.DataFrame, what: pl.Expr = _RETURN) -> list[Array]:
+    """``what`` of each of ``drivers`` on the episodes that all of them drove, in one order, each
     [E].
     """
     # Each join leaves the episodes that one more driver has driven, too.
     shared = drivers[0].select(_EPISODE)
     for column, driver in enumerate(drivers):
-        shared = shared.join(
-            driver.select(*_EPISODE, pl.col("reward").alias(str(column))), on=_EPISODE
-        )
+        shared = shared.join(driver.select(*_EPISODE, what.alias(str(column))), on=_EPISODE)
     # Joins keep no order.
     ordered = shared.sort(_EPISODE)
     return [ordered[str(column)].cast(pl.Float64).to_numpy() for column in range(len(drivers))]
@@ -136,8 +141,36 @@ def paired_lead(driver: pl.DataFrame, other: pl.DataFrame) -> tuple[Estimate | N
 
     No estimate for fewer than two episodes.
     """
-    first, second = _paired_rewards(driver, other)
+    first, second = _paired(driver, other)
     return (paired_difference(first, second) if len(first) > 1 else None), len(first)
+
+
+def verdict(lead: Estimate, differences: Array, one_failed: npt.NDArray[np.bool_]) -> str:
+    """``above``, ``below`` or ``undecided``: the sign of a ``lead``, where it is decided.
+
+    Decided is what at least 30 episodes say, whose interval and sign-flip test both exclude that
+    the drivers are equal. Where one driver alone failed in fewer than five episodes, the other
+    episodes must say the same.
+
+    Args:
+        lead: the mean of ``differences`` with its interval.
+        differences: of the returns, by episode, [E].
+        one_failed: whether exactly one of the drivers crashed or left the road, [E].
+    """
+    decided = (
+        len(differences) >= FEWEST_EPISODES
+        and lead.excludes_zero()
+        and sign_flip_p(differences) <= _SIGNIFICANT
+    )
+    if not decided:
+        return "undecided"
+    side = "above" if lead.value > 0.0 else "below"
+    if not 0 < one_failed.sum() < FEWEST_FAILURES:
+        return side
+    rest = differences[~one_failed]
+    # Without those episodes there are no few failures left, and so no third look.
+    same = verdict(mean_interval(rest), rest, np.zeros(len(rest), dtype=bool)) == side
+    return side if same else "undecided"
 
 
 def paired_rows(episodes: pl.DataFrame) -> list[Row]:
@@ -147,8 +180,8 @@ def paired_rows(episodes: pl.DataFrame) -> list[Row]:
     Returns:
         Per traffic and other driver ``agent, over, traffic, episodes`` (driven by both), ``lead``
         (mean return of ``agent`` minus that of ``over``), ``lead_ci`` (95 %) and ``verdict``:
-        ``above`` or ``below`` where the interval lies on one side of 0, else ``undecided``. Pairs
-        that share fewer than two episodes are left out.
+        ``above`` or ``below`` as :func:`verdict` decides, else ``undecided``. Pairs that share
+        fewer than two episodes are left out.
     """
     first = episodes["agent"][0]
     rows = []
@@ -160,10 +193,8 @@ def paired_rows(episodes: pl.DataFrame) -> list[Row]:
             lead, shared = paired_lead(ours, theirs)
             if lead is None:
                 continue
-            # A lead is decided only where its whole interval lies on one side of 0.
-            verdict = "undecided"
-            if lead.excludes_zero():
-                verdict = "above" if lead.value > 0.0 else "below"
+            returns = _paired(ours, theirs)
+            failed = _paired(ours, theirs, what=pl.col("reason").is_in(FAILURES))
             row = {
                 "agent": first,
                 "over": other,
@@ -174,7 +205,7 @@ def paired_rows(episodes: pl.DataFrame) -> list[Row]:
                 {
                     **row,
                     **entries("lead", lead),
-                    "verdict": verdict,
+                    "verdict": verdict(lead, returns[0] - returns[1], failed[0] != failed[1]),
                 }
             )
     return rows
@@ -194,7 +225,7 @@ def _score(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> tuple[Estimate | N
             return None, f"{needed}; {name} is missing"
         drivers.append(driver)
     # Episodes that one of the three did not drive would shift the scale.
-    returns = _paired_rewards(*drivers)
+    returns = _paired(*drivers)
     if len(returns[0]) < 2:
         return None, "fewer than two episodes are shared by the drivers"
     agent, mobil, random_legal = returns

@@ -8,7 +8,8 @@ together.
 Sources: Efron 1987 (BCa); Clopper and Pearson 1934 (binomial); Garwood 1936 (Poisson); Agarwal et
 al. 2021 (interquartile mean, bootstrap, probability of improvement); Owen 2007 (resampling both
 factors of a crossed table); Hesterberg 2015 (how much too narrow the bootstrap of few values is);
-Satterthwaite 1946 (degrees of freedom of a sum of variances); McNemar 1947, in its exact form.
+Satterthwaite 1946 (degrees of freedom of a sum of variances); McNemar 1947, in its exact form;
+Fisher 1935 (sign flips of paired differences); Cochran 1977 (standard error of a ratio of sums).
 """
 
 from __future__ import annotations
@@ -185,6 +186,26 @@ def paired_difference(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
     return mean_interval(a - b)
 
 
+def sign_flip_p(differences: npt.ArrayLike) -> float:
+    """Two-sided probability of a sum of ``differences`` [E] so far from 0 between equal drivers.
+
+    If two drivers are equal, each difference of their episodes could as well have the other sign,
+    whatever its distribution. So the test holds its level also where a few crashes make up the sum,
+    which a bootstrap cannot know. Monte Carlo over :data:`RESAMPLES` draws of signs.
+    """
+    data = np.asarray(differences, dtype=np.float64)
+    generator = np.random.default_rng((0, 2))
+    # Sums of equal numbers in another order differ in their last bits.
+    reached = (1.0 - 1e-9) * abs(float(data.sum()))
+    as_far = 1
+    for start in range(0, RESAMPLES, _CHUNK):
+        rows = min(_CHUNK, RESAMPLES - start)
+        signs = generator.integers(2, size=(rows, len(data)), dtype=np.int8) * 2.0 - 1.0
+        as_far += int((np.abs(signs @ data) >= reached).sum())
+    # The data's own signs count as a draw, so that the probability is never 0.
+    return as_far / (RESAMPLES + 1)
+
+
 def clopper_pearson(count: int, trials: int) -> Estimate:
     """Share ``count / trials`` (at least one trial) with its exact binomial interval."""
     # The bounds are quantiles of beta distributions; the function knows neither end.
@@ -258,7 +279,13 @@ def probability_of_improvement(first: npt.ArrayLike, second: npt.ArrayLike) -> E
 
 
 def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate | None:
-    """All events over all of ``per`` (km, say), both [S, E]; None where the latter is 0."""
+    """All events over all of ``per`` (km, say), both [S, E]; None where the latter is 0.
+
+    The interval is never narrower than Poisson's exact one for all events together. With several
+    trainings its lower bound is at most that of the resampled trainings, and its upper bound is at
+    least that of Student's interval on the logarithm's scale: rates of trainings are skewed, so a
+    symmetric interval misses high ones.
+    """
     happened, amount = _pair(events, per)
     total = float(amount.sum())
     if not total > 0.0:
@@ -271,11 +298,21 @@ def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate |
         return np.asarray(sums[:, 0] / np.maximum(sums[:, 1], np.finfo(np.float64).tiny))
 
     # One table, so that a draw of trainings is one for events and kilometres.
-    return _estimate(
-        [np.stack([happened, amount])],
-        ratio,
-        bounds=(0.0, np.inf),
-    )
+    resampled = _estimate([np.stack([happened, amount])], ratio, bounds=(0.0, np.inf))
+    rate = resampled.value
+    low, high = (bound / total for bound in poisson_bounds(round(happened.sum())))
+    # One episode of one training has no spread to resample.
+    if resampled.low is None or resampled.high is None:
+        return Estimate(rate, low, high)
+    above = resampled.high - rate
+    trainings = len(happened)
+    if trainings > 1:
+        # Cochran's standard error of a ratio, from the trainings' own deviations.
+        deviations = happened.sum(axis=-1) - rate * amount.sum(axis=-1)
+        error = math.sqrt(trainings / (trainings - 1) * float((deviations**2).sum())) / total
+        above = max(above, error * float(scipy.stats.t.ppf(TAIL_LEVELS[1], trainings - 1)))
+        high = max(high, rate * math.exp(above / rate))
+    return Estimate(rate, min(low, resampled.low), max(high, resampled.high))
 
 
 def normalized_over_trainings(

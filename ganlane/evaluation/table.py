@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ganlane.evaluation.rows import FEWEST_EPISODES
+
 Row = Mapping[str, Any]
 #: Makes a cell of a row.
 Cell = Callable[[Any], str]
@@ -278,9 +280,12 @@ def paired_table(rows: Sequence[Row]) -> str:
         "reward [95 %]": lead,
         "verdict": text_of("verdict"),
     }
+    few = any(row["episodes"] < FEWEST_EPISODES for row in rows)
+    notes = [f"no verdict below {FEWEST_EPISODES} episodes"] if few else []
     return Table.of(
         "",
         rows,
         columns,
-        names=2,
+        2,
+        notes,
     ).text()

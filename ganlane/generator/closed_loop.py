@@ -56,6 +56,7 @@ from ganlane.sim.neighbours import (
     perceive,
 )
 from ganlane.sim.state import ENTRY_M, Road, Vehicles, Visibility
+from ganlane.torch_settings import constant
 
 #: Tangent of the largest heading.
 STEEPEST = 0.3
@@ -326,7 +327,7 @@ def anchored_step(
     )
     context = generator.summarise(observation)
     outputs = generator.decode(context, noise, observation, steps=1)[..., 0, :]
-    limit = outputs.new_tensor(p.residual)
+    limit = constant(p.residual, outputs)
     residual = limit * torch.tanh(outputs / limit)
 
     # The washout: without its mean, the residual cannot hold a speed or an offset of its own.
@@ -456,8 +457,8 @@ def headway_from_uniform(u: Tensor, quantiles_s: tuple[float, ...] = HEADWAY_QUA
 
     Linear between the quantiles, flat beyond the outer ones.
     """
-    values = u.new_tensor(quantiles_s)
-    levels = u.new_tensor(QUANTILE_LEVELS)
+    values = constant(quantiles_s, u)
+    levels = constant(QUANTILE_LEVELS, u)
     # The pair of quantiles around u; the outer pairs serve for what is beyond them.
     upper = torch.searchsorted(levels, u.contiguous()).clamp(1, len(QUANTILE_LEVELS) - 1)
     low = levels[upper - 1]

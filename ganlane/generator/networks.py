@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from ganlane.linear import has_fast_product, matrix_product
 from ganlane.settings.generator import GeneratorSizes
+from ganlane.torch_settings import constant
 
 # The networks' units are typical values, so that inputs are of order 1.
 #: Displacement per 0.1 s, along and across the road, m.
@@ -82,8 +83,8 @@ def motion_features(displacement: Tensor, difference: Tensor) -> Tensor:
     before, in m.
     """
     # Typical values become about 1.
-    scaled = displacement / displacement.new_tensor(DISPLACEMENT_SCALE_M)
-    change = difference / difference.new_tensor(DIFFERENCE_SCALE_M)
+    scaled = displacement / constant(DISPLACEMENT_SCALE_M, displacement)
+    change = difference / constant(DIFFERENCE_SCALE_M, difference)
     return torch.cat(
         [
             scaled,
@@ -256,7 +257,7 @@ class PairPooling(nn.Module):
         # Relative to the first vehicle: far down the road, differences of float32 positions lose
         # digits.
         state = torch.cat([position - position[..., :1, :], displacement], dim=-1)
-        state = state / position.new_tensor(_PAIR_SCALE)
+        state = state / constant(_PAIR_SCALE, position)
 
         # The first layer is linear in (other - self), so it runs once per vehicle, not per pair.
         itself = nn.functional.linear(state, self.per_pair.weight)
@@ -382,7 +383,7 @@ class Generator(nn.Module):
         )
         # The decoder's first hidden state is context and noise side by side.
         cell = torch.zeros_like(hidden)
-        scale = hidden.new_tensor(DIFFERENCE_SCALE_M)
+        scale = constant(DIFFERENCE_SCALE_M, hidden)
         displacement = now.displacement
         difference = now.difference
         outputs = []
@@ -420,7 +421,7 @@ def displacements_of(outputs: Tensor, last: Tensor) -> Tensor:
 
     The outputs are changes, so an output of 0 repeats the last displacement.
     """
-    return last[..., None, :] + outputs.cumsum(dim=-2) * outputs.new_tensor(DIFFERENCE_SCALE_M)
+    return last[..., None, :] + outputs.cumsum(dim=-2) * constant(DIFFERENCE_SCALE_M, outputs)
 
 
 class Discriminator(nn.Module):

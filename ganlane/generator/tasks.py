@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from ganlane.errors import UserError
-from ganlane.files import has_checksum, sealed_archive, write_bytes
+from ganlane.files import has_checksum, read_whole, sealed_archive, write_bytes
 from ganlane.generator.checkpoint import Metrics
 from ganlane.generator.closed_loop import driver_params, rollout
 from ganlane.generator.forecasts import (
@@ -457,7 +457,7 @@ class FitLoop:
 
     def _resume(self, path: Path) -> None:
         """Continue from a stored state; reading it never executes code."""
-        content = path.read_bytes()
+        content = read_whole(path)
         whole = has_checksum(content, path)
         try:
             if not whole:

@@ -556,8 +556,8 @@ def pays(drivers: Drivers) -> bool:
     """
     if isinstance(drivers, RuleDrivers) or platform.machine() not in ("x86_64", "AMD64"):
         return True
-    found = find()
-    return isinstance(found, Loaded) and found.variant != "default"
+    library = find()
+    return isinstance(library, Loaded) and library.variant != "default"
 
 
 def faulty_drivers(drivers: RuleDrivers, faults: DriverFaults, stream: int) -> RuleDrivers | None:

@@ -30,6 +30,11 @@ from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road, Vehicles
 
 
+def wants_gradient(tensors: Iterable[Tensor]) -> bool:
+    """Whether autograd would record a function of ``tensors``; the kernel has no gradients."""
+    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+
+
 def _room(
     layout: Layout, names: Iterable[Key], rows: int, vehicles: int, make: Callable[..., Tensor]
 ) -> dict[Key, Tensor]:

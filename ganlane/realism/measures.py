@@ -41,6 +41,7 @@ from ganlane.files import (
     CHECKPOINTS,
     PLACE,
     has_checksum,
+    read_whole,
     refuse_without_checksum,
     write_json,
 )
@@ -460,7 +461,7 @@ class Reference(Measured):
             UserError: no such file, a damaged one, another file, or one with other bins.
         """
         try:
-            content = path.read_bytes()
+            content = read_whole(path)
             whole = has_checksum(content, path)
             numbers = json.loads(content)
             if numbers["kind"] != _KIND:

@@ -22,7 +22,7 @@ from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.errors import UserError
 from ganlane.evaluation.episodes import ScriptedPolicy, run_episodes
 from ganlane.evaluation.rows import FAILURES
-from ganlane.files import write_json
+from ganlane.files import read_whole, write_json
 from ganlane.settings.commands import EvaluateConfig
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MaskParameters, ObservationConfig, RewardParameters
@@ -225,7 +225,7 @@ def read_crashes(path: str | Path) -> CrashList:
         UserError: no such file, or not a list of crashes.
     """
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        content = json.loads(read_whole(Path(path)))
         return _checked(content)
     except OSError as error:
         raise UserError(

@@ -24,6 +24,7 @@ from ganlane.sim.collisions import dangerously_close
 from ganlane.sim.idm import acceleration_behind
 from ganlane.sim.neighbours import Neighbour, Scene, follower, leader, perceive
 from ganlane.sim.state import Road, Vehicles, spanned
+from ganlane.torch_settings import constant
 
 #: Distance between the axles, m.
 WHEELBASE_M = 2.7
@@ -177,7 +178,7 @@ def apply_action(
     An action that is not heard has no effect and no penalty (:func:`is_heard`); one that would
     leave the road has no effect except ``off_road``.
     """
-    side = action.new_tensor(SIDES)[action]
+    side = constant(SIDES, action)[action]
     # First what the ego ignores, then what the road does not have.
     side = torch.where(is_heard(side, direction, abort), side, 0)
     # The episode ends with this command; the target lane stays a lane of the road.

@@ -137,8 +137,9 @@ def compare(
     half = 0.5 * vehicles.length
     gap = distance.abs() - (half[:, which, None] + half[:, None, :])
     index = torch.arange(vehicles.x.shape[1], device=vehicles.x.device)
-    tie = torch.sign(index[which, None] - index) * _TIE_M
-    return Pairs(distance, gap, distance + tie)
+    # In the run's float type: whole numbers times a float would be in torch's default one.
+    order = torch.sign(index[which, None] - index).to(distance.dtype)
+    return Pairs(distance, gap, distance + order * _TIE_M)
 
 
 def perceive(

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ganlane.settings.episode import Stream as Stream  # also known as ganlane.sim.Stream
+from ganlane.torch_settings import constant
 
 # Constants of splitmix64; torch computes in signed integers.
 _GOLDEN = -7046029254386353131  # 0x9E3779B97F4A7C15 as a signed 64-bit integer
@@ -100,7 +101,7 @@ def draw_keys(
     # Field by field, from what all share to what is one number's own.
     at_step = absorb(key, step)
     vehicle = torch.arange(vehicles, device=key.device)
-    purpose = torch.tensor(purposes, device=key.device)
+    purpose = constant(purposes, key)
     return absorb(absorb(at_step[:, None], vehicle)[..., None], purpose)
 
 

@@ -110,9 +110,10 @@ def place_in_lanes(
     """
     # Sorted uniforms plus spacings: uniform among all placings that keep the spacing.
     same = lane[:, :, None] == lane[:, None, :]
-    count = same.sum(-1)
+    # In the run's float type: whole numbers times a float would be in torch's default one.
+    count = same.sum(-1).to(u.dtype)
     room = spread_m - spacing_m * (count - 1)
-    return u * room + spacing_m * _rank(u, same)
+    return u * room + spacing_m * _rank(u, same).to(u.dtype)
 
 
 def ego_first(x: Tensor, lane: Tensor) -> tuple[Tensor, Tensor]:

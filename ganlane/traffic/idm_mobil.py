@@ -32,7 +32,7 @@ from ganlane.sim.idm import (
 from ganlane.sim.mobil import TABLE_IV, DriverMobil, mobil_changes
 from ganlane.sim.neighbours import Scene, in_lane, perceive
 from ganlane.sim.random import Purpose, Stream, absorb
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road, Vehicles, reads_are_cheap
 from ganlane.torch_settings import compiled
 from ganlane.traffic.base import (
     Memory,
@@ -177,7 +177,7 @@ class IdmMobilTraffic(IdmTraffic):
         # Reading a flag is cheap on a CPU and saves nine evaluations of MOBIL in ten: without it a
         # decision of idm_mobil and idm_random takes half as long again (64 x 9 vehicles, one core).
         # On a GPU it would stall the queue.
-        if due.device.type == "cpu" and not bool(due.any()):
+        if reads_are_cheap(due) and not bool(due.any()):
             return self.keep_lanes(vehicles, memory)
         return self.decide(vehicles, memory, due)
 

@@ -6,7 +6,7 @@ Which one an episode gets follows from its number or key, so it is the same in e
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -44,6 +44,15 @@ def interleaved(shares: Mapping[str, int]) -> list[str]:
         credit[chosen] -= sum(shares.values())
         turns.append(chosen)
     return turns
+
+
+class RowsOfPart(NamedTuple):
+    """A part and its ``rows`` [R] of the batch; ``padded`` repeats the first of them at the end."""
+
+    name: str
+    part: TrafficModule
+    rows: Tensor
+    padded: Tensor
 
 
 class MixedTraffic(TrafficParts):
@@ -96,30 +105,34 @@ class MixedTraffic(TrafficParts):
         turns = torch.tensor([names.index(name) for name in interleaved(shares)])
         self.register_buffer("turns", turns, persistent=False)
         self.compiled = False
+        # Of the present decision: the keys of its episodes, and the rows of the parts.
+        self._rows: tuple[Tensor, list[RowsOfPart]] | None = None
 
     def part_of(self, episode: Tensor) -> Tensor:
         """Index of the part that each ``episode`` [N] belongs to."""
         turns = cast(Tensor, self.turns)
         return turns[episode % len(turns)]
 
-    def rows_of_parts(self, episode: Tensor) -> list[tuple[str, TrafficModule, Tensor, Tensor]]:
-        """Name, model and rows of every part that has rows in the batch of ``episode`` [N].
+    def rows_of_parts(self, episode: Tensor) -> list[RowsOfPart]:
+        """The parts that have rows in the batch of ``episode`` [N].
 
-        The rows come twice: as they are, and with repetitions of the first as padding. A graph is
-        compiled for every number of rows, which takes a minute, so compiled parts get at most some
-        16 numbers. On a GPU this waits for the queue once for every part.
+        A graph is compiled for every number of rows, which takes a minute, so compiled parts get at
+        most some 16 numbers, by padding. On a GPU this waits for the queue once.
         """
         part_of_row = self.part_of(episode)
         batch = len(episode)
+        numbers = torch.arange(len(self.parts), device=episode.device)
+        sizes = (part_of_row[:, None] == numbers).sum(0).tolist()
+        rows_of_part = part_of_row.argsort(stable=True).split(sizes)
         chosen = []
-        for number, (name, part) in enumerate(self.named_parts()):
-            rows = padded = (part_of_row == number).nonzero()[:, 0]
+        for (name, part), rows in zip(self.named_parts(), rows_of_part):
+            padded = rows
             if self.compiled:
                 size = max(8, batch // 16)
                 # -n % size rows fill n up to the next multiple of size.
                 padded = torch.cat((rows, rows[:1].expand(-len(rows) % size)))
             if len(rows):
-                chosen.append((name, part, rows, padded))
+                chosen.append(RowsOfPart(name, part, rows, padded))
         return chosen
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -133,7 +146,11 @@ class MixedTraffic(TrafficParts):
             keys.EPISODE_KEY: key_of(tensordict, self.stream),
             keys.VEHICLES: vehicles,
         }
-        for name, part, rows, padded in self.rows_of_parts(inputs[keys.EPISODE]):
+        # The steps of a decision share the tensor of the keys, which is made anew for the next.
+        key = inputs[keys.EPISODE_KEY]
+        if self._rows is None or self._rows[0] is not key:
+            self._rows = key, self.rows_of_parts(inputs[keys.EPISODE])
+        for name, part, rows, padded in self._rows[1]:
             memory = memory_of(memories, name)
             # A generator's memory is large, and most of it is only renamed in a step: what a part
             # returns as it was given keeps its tensor of the whole batch.

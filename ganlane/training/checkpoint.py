@@ -273,8 +273,9 @@ def load_checkpoint(
     if not path.is_file():
         raise UserError(f"{option}: no such file; give a run's folder or its {LAST}.")
     with path.open("rb") as file:
-        empty = file.seek(0, 2) == 0  # which cannot be mapped
-        sealed = not empty and has_checksum(
+        # Another file, however large, is not searched for a checksum; an empty one has no map.
+        archive = file.read(2) == b"PK"
+        sealed = archive and has_checksum(
             mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ),
             option,
         )

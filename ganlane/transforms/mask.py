@@ -29,7 +29,7 @@ from ganlane.sim.dynamics import SIDES, ego_scene, is_heard, on_road
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import lane_accelerations
 from ganlane.sim.state import Road, Vehicles, road_in
-from ganlane.torch_settings import compiled
+from ganlane.torch_settings import compiled, constant
 from ganlane.transforms.sensors import PerceptionTransform
 
 #: What this transform computes; an environment without a mask (``none``) has no transform.
@@ -126,7 +126,7 @@ class ActionMaskTransform(PerceptionTransform):
         ``vehicles`` are as the ego perceives them; ``direction`` [N] is that of its current lane
         change.
         """
-        side = direction.new_tensor(SIDES)
+        side = constant(SIDES, direction)
         target = vehicles.target_lane[:, EGO_INDEX, None] + side
         # Keeping the lane is no command that the ego could fail to hear.
         obeyed = (side == 0) | is_heard(side, direction[:, None], self.abort)

@@ -23,10 +23,10 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.native.settings import NATIVE_FORMS
-from ganlane.native.tensors import LaneView
+from ganlane.native.tensors import LaneView, wants_gradient
 from ganlane.settings.observation import NEARNESS_M, OVERLAP_M, ObservationScale
 from ganlane.sim.state import Road, Vehicles, road_in
-from ganlane.torch_settings import compiled
+from ganlane.torch_settings import compiled, constant
 from ganlane.transforms.sensors import PerceptionTransform
 
 #: Of the lane view: lane to the left, own, to the right, each ahead (+1) and behind (-1).
@@ -151,8 +151,8 @@ def lane_view(
     others = view.others
     # All six directions at once: each is a minimum over the vehicles there.
     range_m = view.scale.range_m
-    side = others.position.new_tensor(_SIDES)[:, None]
-    ahead = others.position.new_tensor(_AHEAD)[:, None]
+    side = constant(_SIDES, others.position)[:, None]
+    ahead = constant(_AHEAD, others.position)[:, None]
     # Distances [N, 6, M - 1] in the six directions, out of reach for who is not there.
     distance = others.position[:, None, :] * ahead
     in_sight = (others.valid & (others.position.abs() < 1.0))[:, None, :]
@@ -305,7 +305,7 @@ class ObservationTransform(PerceptionTransform):
         progress = ego.get("change_progress")
         direction = ego.get("change_direction")
         # The kernel computes the same numbers up to the rounding of the exponential function.
-        if self.native is not None:
+        if self.native is not None and not wants_gradient([*vehicles, *seen, progress]):
             observation = self.native.observe(
                 vehicles,
                 progress,

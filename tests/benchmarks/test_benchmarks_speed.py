@@ -156,7 +156,7 @@ def test_every_traffic_is_measured_and_what_the_kernel_does_not_drive_is_left_ou
     assert told.out.count("ganlane traffic") == 2 * 3 - 1
 
 
-@pytest.mark.parametrize("suite", speed.SUITES)
+@pytest.mark.parametrize("suite", [*speed.SUITES, "train cuda"])
 def test_the_document_of_the_project_can_be_written(suite):
     text = (speed.Path(__file__).parents[2] / "docs/speed.md").read_text()
     assert text.count(f"<!-- begin bench {suite} -->") == 1

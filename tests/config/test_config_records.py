@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from ganlane.errors import ParameterError, UserError
 from ganlane.settings.agent import RainbowConfig
 from ganlane.settings.env import EnvConfig
+from ganlane.settings.episode import EpisodeParameters
 from ganlane.settings.record import (
     DIFFERENT,
     NO_KEY,
@@ -155,3 +156,22 @@ def test_what_a_reader_of_an_option_changes_stays_its_own():
 def test_a_record_is_made_again_from_its_plain_data(scene):
     env = make(EnvConfig, scene)
     assert make(EnvConfig, plain(env)) == env
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        (
+            {"timeout_s": 1e18},
+            "timeout_s=1e+18: expected a number above 0, at most 1000000, ",
+        ),
+        ({"goal_m": 100_001.0}, "goal_m=100001: expected a number above 0, at most 100000, "),
+        ({"goal_m": 0.0}, "goal_m=0: expected a number above 0"),
+    ],
+)
+def test_an_episode_ends_where_float32_still_counts(values, told):
+    with pytest.raises(ParameterError) as caught:
+        EpisodeParameters(**values)
+    assert told in str(caught.value).replace("}", "")
+    longest = EpisodeParameters(timeout_s=1e6, goal_m=1e5)
+    assert longest.most_decisions() == 1_000_000

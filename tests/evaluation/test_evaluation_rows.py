@@ -19,6 +19,8 @@ from ganlane.evaluation import (
     paired_table,
     text_table,
 )
+from ganlane.evaluation.rows import verdict
+from ganlane.evaluation.statistics import mean_interval
 
 
 def episodes(
@@ -195,12 +197,12 @@ def test_resamples_without_a_lead_do_not_spoil_the_interval():
 
 def test_the_first_driver_is_held_against_every_other_on_every_traffic():
     driven = [
-        episodes(agent, [base, base + 1.0], traffic=traffic)
+        episodes(agent, [base, base + 1.0] * 15, traffic=traffic)
         for traffic in ("idm", "gan")
         for agent, base in (("trained", 5.0), ("mobil", 7.0), ("keep_lane", 1.0))
     ]
     rows = paired_rows(pl.concat(driven))
-    assert {(row["agent"], row["episodes"]) for row in rows} == {("trained", 2)}
+    assert {(row["agent"], row["episodes"]) for row in rows} == {("trained", 30)}
     assert [(row["traffic"], row["over"], row["lead"], row["verdict"]) for row in rows] == [
         ("idm", "mobil", -2.0, "below"),
         ("idm", "keep_lane", 4.0, "above"),
@@ -253,6 +255,60 @@ def test_an_interval_that_holds_zero_is_undecided():
     assert row["verdict"] == "undecided"
 
 
+def verdict_of(differences, failed=0):
+    """The verdict on ``differences`` over a driver of return 0; the first ``failed`` crashed."""
+    reasons = ["hard_crash"] * failed + ["goal"] * (len(differences) - failed)
+    ours = episodes("a", differences, reasons)
+    (row,) = paired_rows(pl.concat([ours, episodes("b", [0.0] * len(differences))]))
+    return row["verdict"]
+
+
+def test_there_is_no_verdict_below_30_episodes():
+    lead = [4.0, 5.0, 6.0]
+    assert verdict_of(lead * 10) == "above"
+    assert verdict_of(lead * 9 + lead[:2]) == "undecided"
+
+
+def test_a_verdict_does_not_hang_on_few_crashes():
+    rest = [3.0, -3.0] * 60
+    # Four crashes move the whole interval to one side, and are no evidence.
+    (row,) = paired_rows(
+        pl.concat([episodes("a", [-240.0] * 4 + rest), episodes("b", [0.0] * (4 + len(rest)))])
+    )
+    assert row["lead_ci"][1] < 0.0
+    assert verdict_of([-240.0] * 4 + rest, failed=4) == "undecided"
+    assert verdict_of([-240.0] * 9 + rest, failed=9) == "below"
+    # Nor do few crashes that say nothing new take a verdict away.
+    assert verdict_of([-10.0] * 3 + [-3.0, -4.0] * 60, failed=3) == "below"
+
+
+def simulated(generator, count, crash_rate, noise):
+    """Returns [E] of two equal drivers on the same episodes, and which of them crashed."""
+    shared = generator.normal(240.0, 15.0, count)
+    returns, crashed = [], []
+    for _ in range(2):
+        crash = generator.random(count) < crash_rate
+        safe = shared + generator.normal(0.0, noise, count)
+        returns.append(np.where(crash, generator.uniform(-40.0, 150.0, count), safe))
+        crashed.append(crash)
+    return returns, crashed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [3.0, 15.0])
+@pytest.mark.parametrize("crash_rate", [0.003, 0.01, 0.06, 0.2])
+@pytest.mark.parametrize("count", [30, 50, 100, 300])
+def test_equal_drivers_get_a_verdict_in_at_most_6_of_100_comparisons(count, crash_rate, noise):
+    generator = np.random.default_rng(1)
+    false = 0
+    for _ in range(1500):
+        (first, second), (one, other) = simulated(generator, count, crash_rate, noise)
+        lead = mean_interval(first - second)
+        false += verdict(lead, first - second, one != other) != "undecided"
+    # The interval alone gives up to 23 of 100.
+    assert false <= 0.06 * 1500
+
+
 def test_a_single_driver_and_a_single_episode_give_no_pairs():
     assert paired_rows(episodes("a", [1, 2])) == []
     assert paired_rows(pl.concat([episodes("a", [1]), episodes("b", [2])])) == []
@@ -263,6 +319,7 @@ def test_the_table_gives_the_sign_the_interval_and_the_verdict():
         "agent": "trained",
         "over": "mobil",
         "traffic": "gan",
+        "episodes": 200,
     }
     above = {
         **row,
@@ -288,6 +345,8 @@ def test_the_table_gives_the_sign_the_interval_and_the_verdict():
     ]
     assert first.split(maxsplit=4)[-1] == "+12.3 [4.5, 20.1]    above"
     assert second.split(maxsplit=4)[-1] == "-3.0 [-5.0, -1.0]    below"
+    few = {**below, "episodes": 29, "verdict": "undecided"}
+    assert paired_table([above, few]).splitlines()[-1] == "no verdict below 30 episodes"
 
 
 def by_scene(*scenes):

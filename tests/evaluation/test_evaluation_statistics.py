@@ -20,6 +20,7 @@ from ganlane.evaluation.statistics import (
     probability_of_improvement,
     rate_over_trainings,
     resample_counts,
+    sign_flip_p,
 )
 
 
@@ -214,6 +215,57 @@ def test_the_probability_of_improvement_is_the_share_of_pairs():
     assert probability_of_improvement(a, b).value == pytest.approx(u / 63)
 
 
+def test_the_sign_flip_test_counts_how_many_signs_are_as_far_from_zero():
+    # Of the 2^6 signs of six equal differences two are as far.
+    assert sign_flip_p([3.0] * 6) == pytest.approx(2 / 64, abs=0.006)
+    theirs = stats.permutation_test(
+        ([4.0, -1.0, 2.5, 3.0, 0.5, 6.0, -2.0, 1.0],), np.sum, permutation_type="samples"
+    )
+    ours = sign_flip_p([4.0, -1.0, 2.5, 3.0, 0.5, 6.0, -2.0, 1.0])
+    assert ours == pytest.approx(theirs.pvalue, abs=0.015)
+    assert sign_flip_p([0.0, 0.0]) == 1.0
+
+
+def test_a_rate_over_trainings_is_never_surer_than_its_count():
+    generator = np.random.default_rng(4)
+    for trainings in (1, 2, 3, 5):
+        crashes = (generator.random((trainings, 200)) < 0.02).astype(float)
+        km = np.full(crashes.shape, 5.0)
+        rate = rate_over_trainings(crashes, km)
+        exact = poisson_interval(int(crashes.sum())).scaled(per=float(km.sum()))
+        assert rate.low <= exact.low < exact.high <= rate.high
+
+
+def test_trainings_that_differ_leave_room_for_higher_rates():
+    crashes = np.zeros((3, 100))
+    for training, count in enumerate((2, 8, 20)):
+        crashes[training, :count] = 1
+    rate = rate_over_trainings(crashes, np.ones((3, 100)))
+    of_counts = stats.ttest_1samp([2, 8, 20], 0.0).confidence_interval()
+    assert rate.value == pytest.approx(0.1)
+    # Student's half-width, taken on the logarithm's scale.
+    assert rate.high >= 0.1 * np.exp(of_counts.high / 10 - 1) * (1 - 1e-9)
+    assert rate.low == 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spread", [0.0, 0.25, 0.5, 0.8])
+@pytest.mark.parametrize("crashes", [1, 3, 10, 30])
+@pytest.mark.parametrize("trainings", [3, 5])
+def test_a_rate_s_interval_holds_the_truth_where_trainings_differ(trainings, crashes, spread):
+    generator = np.random.default_rng(1)
+    held = 0
+    for _ in range(1000):
+        rates = np.full(trainings, float(crashes))
+        if spread > 0.0:
+            rates = generator.gamma(spread**-2, crashes * spread**2, trainings)
+        events = generator.poisson(rates[:, None] / 100, (trainings, 100))
+        estimate = rate_over_trainings(events, np.ones(events.shape))
+        held += estimate.low <= crashes / 100 <= estimate.high
+    # The resampled trainings alone hold it in 85 to 90 of 100 where rates differ by 0.8.
+    assert held >= 0.93 * 1000
+
+
 def test_a_rate_is_all_events_over_all_kilometres_and_no_crash_leaves_room_for_some():
     crashes = np.zeros((4, 100))
     crashes[:2, :3] = 1
@@ -221,7 +273,8 @@ def test_a_rate_is_all_events_over_all_kilometres_and_no_crash_leaves_room_for_s
     rate = rate_over_trainings(crashes, km)
     assert rate.value == pytest.approx(6 / 2000)
     assert rate.low == 0.0  # two of the four trainings never crash; a rate is not negative
-    assert 3 / 1000 < rate.high < 12 / 1000
+    # Trainings that differ so much leave room for several times the rate.
+    assert 12 / 1000 < rate.high < 20 / 1000
     rate = rate_over_trainings(np.zeros((1, 10)), np.full((1, 10), 5.0))
     assert rate.interval == pytest.approx([0.0, poisson_interval(0).high / 50])
     assert rate_over_trainings([[0.0]], [[0.0]]) is None

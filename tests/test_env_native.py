@@ -126,7 +126,7 @@ class Cruise(TrafficModule):
     [
         (
             {"traffic": Cruise(Road())},
-            "the shipped traffics that are one model, not Cruise",
+            "does not drive Cruise",
         ),
         ({"dtype": torch.float64}, "in float32"),
         ({"ring_m": 500.0}, "has no ring"),

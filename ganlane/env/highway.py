@@ -496,7 +496,7 @@ class HighwayEnv(EnvBase):
         reason = None
         if drivers is None:
             name = type(self.traffic).__name__
-            reason = f"drives the shipped traffics that are one model, not {name}"
+            reason = f"does not drive {name}"
         elif wanted == "auto" and not pays(drivers):
             reason = "is slow with generated traffic on a processor without FMA"
         elif self.device.type != "cpu" or self.dtype != torch.float32:

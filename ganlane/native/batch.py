@@ -17,8 +17,15 @@ import numpy.typing as npt
 
 from ganlane import keys
 from ganlane.native import settings
-from ganlane.native.drivers import Drivers, GeneratedDrivers, RuleDrivers, decision_settings
-from ganlane.native.library import BLOCK, ROWS_PER_THREAD, addresses, in_threads, load
+from ganlane.native.drivers import (
+    Drivers,
+    RuleDrivers,
+    decision_settings,
+    parts_of,
+    rows_per_thread,
+    turns_of,
+)
+from ganlane.native.library import addresses, in_threads, load
 from ganlane.native.settings import Key, Layout, fields
 from ganlane.settings.driving import EgoParameters, Visibility
 from ganlane.settings.episode import EpisodeParameters, SpawnParameters
@@ -81,6 +88,28 @@ class Stepped(NamedTuple):
     reward: npt.NDArray[np.float32]
     terminated: npt.NDArray[np.bool_]
     truncated: npt.NDArray[np.bool_]
+
+
+class _Part(NamedTuple):
+    """What drives the rows of one part of the drivers: its structures, and its rows in ``rows``."""
+
+    batch: _Batch
+    rows: npt.NDArray[np.int64] | None
+    rows_per_thread: int
+    pointed: dict[str, Any]
+
+    def call(self, function: Callable[..., int], count: int) -> None:
+        """A function of a whole batch, on ``count`` rows."""
+        # One pointer is all that it passes.
+        address = ctypes.byref(self.batch)
+        # Rows are independent, so any split between threads gives the same numbers.
+        in_threads(count, lambda first, last: function(address, first, last), self.rows_per_thread)
+
+    def drive(self, decide: Callable[..., int], count: int) -> None:
+        """The first ``count`` of ``rows``."""
+        pointers = [self.pointed[name] for name in ("settings", "inputs", "outputs")]
+        addresses = [ctypes.byref(structure) for structure in pointers]
+        in_threads(count, lambda first, last: decide(*addresses, first, last), self.rows_per_thread)
 
 
 class NativeBatch:
@@ -153,20 +182,11 @@ class NativeBatch:
         self._term_values = np.zeros((rows, len(self.terms)), np.float32)
         self._no_safe_action = np.zeros(rows, np.bool_)
         self._library = load(variant)
-        # When others see the ego's lane changes, and the ego theirs.
-        visible = (Visibility.named(ego.visibility), drivers.visibility)
-        self._rows_per_thread = BLOCK if isinstance(drivers, GeneratedDrivers) else ROWS_PER_THREAD
-        # The kernel's structures, filled once.
-        decision = decision_settings(road, episode, ego, drivers)
         deceleration = mask.safe_deceleration
         abort = ego.abort_lane_change
-        # Referred to by this object, since the structure holds no more than their addresses.
-        self._pointed = {
-            "settings": decision,
-            "inputs": self._pointers(layout.inputs),
-            "outputs": self._pointers(layout.outputs),
-            "spawn": settings.spawn_of(*road, spawn, stream, *visible, recycle_share),
-            "scene": self._pointers(settings.STARTS),
+        # The kernel's structures, filled once. Referred to by this object, since a structure holds
+        # no more than their addresses.
+        pointed: dict[str, Any] = {
             "reward_settings": settings.reward_of(reward, episode.decision_period_s),
             "view": view,
             "view_inputs": self._pointers(_VIEWS),
@@ -174,23 +194,40 @@ class NativeBatch:
             "mask_inputs": self._pointers(_MASKS),
             "mask_outputs": addresses([self.mask, self._no_safe_action]),
         }
-        self._batch = _Batch(
-            **{name: ctypes.addressof(part) for name, part in self._pointed.items()},
-            reward=self.state[keys.REWARD].ctypes.data,
-            terms=self._term_values.ctypes.data,
-            observation=self.observation.ctypes.data,
-            mask=self.mask.ctypes.data,
-            lowest=self.bounds[0],
-            highest=self.bounds[1],
-            fastest=SPEED_RATIO_LIMIT,
-            vehicles=vehicles,
-            lanes=lanes,
-            size=view.numbers(),
-            mask_form=settings.MASK_FORMS.index(mask.form),
-            abort_lane_change=abort,
-        )
-        # One pointer is all that a call passes.
-        self._address = ctypes.byref(self._batch)
+        numbers: dict[str, Any] = {
+            "reward": self.state[keys.REWARD].ctypes.data,
+            "terms": self._term_values.ctypes.data,
+            "observation": self.observation.ctypes.data,
+            "mask": self.mask.ctypes.data,
+            "lowest": self.bounds[0],
+            "highest": self.bounds[1],
+            "fastest": SPEED_RATIO_LIMIT,
+            "vehicles": vehicles,
+            "lanes": lanes,
+            "size": view.numbers(),
+            "mask_form": settings.MASK_FORMS.index(mask.form),
+            "abort_lane_change": abort,
+        }
+        self._turns = np.array(turns_of(drivers))
+        self._parts = []
+        for part in parts_of(drivers):
+            layout = Layout(part.memory)
+            # Of several parts each drives the rows that are its own.
+            own = np.zeros(rows, np.int64) if len(self._turns) > 1 else None
+            # When others see the ego's lane changes, and the ego theirs.
+            visible = (Visibility.named(ego.visibility), part.drivers.visibility)
+            of_part = pointed | {
+                "settings": decision_settings(road, episode, ego, part.drivers),
+                "inputs": self._pointers(layout.inputs, own),
+                "outputs": self._pointers(layout.outputs),
+                "spawn": settings.spawn_of(*road, spawn, stream, *visible, recycle_share),
+                "scene": self._pointers(settings.STARTS),
+            }
+            batch = _Batch(
+                **{name: ctypes.addressof(structure) for name, structure in of_part.items()},
+                **numbers,
+            )
+            self._parts.append(_Part(batch, own, rows_per_thread(part.drivers), of_part))
         ends = (self.state["terminated"], self.state["truncated"])
         self._stepped = Stepped(self.observation, self.state[keys.REWARD], *ends)
 
@@ -211,8 +248,11 @@ class NativeBatch:
         written = [self.observation, self.mask, self._term_values, self._no_safe_action]
         return [*self.state.values(), *written]
 
-    def _pointers(self, names: Sequence[Key]) -> ctypes.Array[ctypes.c_void_p]:
-        return addresses([self.state.get(name) for name in names])
+    def _pointers(
+        self, names: Sequence[Key], rows: npt.NDArray[np.int64] | None = None
+    ) -> ctypes.Array[ctypes.c_void_p]:
+        arrays: dict[Key, Any] = {**self.state, "rows": rows}
+        return addresses([arrays.get(name) for name in names])
 
     def start(
         self, seed: npt.ArrayLike, episode: npt.ArrayLike, rows: npt.NDArray[np.bool_] | None = None
@@ -226,21 +266,30 @@ class NativeBatch:
         fresh[:] = True if rows is None else rows
         np.copyto(state[keys.SEED], seed, where=fresh)
         np.copyto(state[keys.EPISODE], episode, where=fresh)
-        self._in_threads(self._library.ganlane_start)
+        starting = fresh.copy()
+        for number, part in enumerate(self._parts):
+            if part.rows is not None:
+                fresh[:] = starting & (self._part_of_row() == number)
+            part.call(self._library.ganlane_start, self.rows)
+
+    def _part_of_row(self) -> npt.NDArray[np.int64]:
+        return self._turns[self.state[keys.EPISODE] % len(self._turns)]
 
     def step(self, actions: npt.NDArray[np.int64]) -> Stepped:
         """One decision of every row, by the actions [N]; no row is reset."""
         # Copied, since the kernel holds the address of this array.
         self.state[keys.ACTION][:] = actions
-        self._in_threads(self._library.ganlane_step)
+        if len(self._parts) == 1:
+            self._parts[0].call(self._library.ganlane_step, self.rows)
+            return self._stepped
+        part_of_row = self._part_of_row()
+        for number, part in enumerate(self._parts):
+            own = np.flatnonzero(part_of_row == number)
+            assert part.rows is not None
+            part.rows[: len(own)] = own
+            part.drive(self._library.ganlane_decide, len(own))
+        self._parts[0].call(self._library.ganlane_judge, self.rows)
         return self._stepped
-
-    def _in_threads(self, function: Callable[..., int]) -> None:
-        batch = self._address
-        # Rows are independent, so any split between threads gives the same numbers.
-        in_threads(
-            self.rows, lambda first, last: function(batch, first, last), self._rows_per_thread
-        )
 
     def reward_terms(self) -> dict[str, npt.NDArray[np.float32]]:
         """The terms of the last reward by name, each [N]."""

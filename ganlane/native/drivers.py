@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.native.library import Loaded, find
+from ganlane.native.library import BLOCK, ROWS_PER_THREAD, Loaded, find
 from ganlane.native.settings import (
     STEERING,
     Key,
@@ -62,7 +62,9 @@ from ganlane.settings.traffic import (
     IdmMobilTrafficConfig,
     IdmRandomTrafficConfig,
     IdmTrafficConfig,
+    MixedTrafficConfig,
     TrafficConfig,
+    interleaved,
 )
 from ganlane.weights import load_arrays
 
@@ -200,7 +202,79 @@ class GeneratedDrivers:
         return {"generated": _generated_of(self)}
 
 
-Drivers: TypeAlias = RuleDrivers | GeneratedDrivers
+class MixedDrivers(NamedTuple):
+    """Drivers that differ from episode to episode, all with one model of the ego.
+
+    ``parts`` by name; episode ``e`` belongs to the part number ``turns[e % len(turns)]``.
+    """
+
+    parts: dict[str, RuleDrivers | GeneratedDrivers]
+    turns: tuple[int, ...]
+
+    @property
+    def idm(self) -> IdmParameters:
+        """The ego's."""
+        return next(iter(self.parts.values())).idm
+
+    @property
+    def steering(self) -> SteeringParameters:
+        """The ego's."""
+        return next(iter(self.parts.values())).steering
+
+    def memory(self) -> MemoryArrays:
+        """That of all parts."""
+        memory: MemoryArrays = {}
+        for part in parts_of(self):
+            memory |= part.memory
+        return memory
+
+
+Drivers: TypeAlias = RuleDrivers | GeneratedDrivers | MixedDrivers
+
+
+class Part(NamedTuple):
+    """Drivers of some episodes, and their memory in the state."""
+
+    drivers: RuleDrivers | GeneratedDrivers
+    memory: MemoryArrays
+
+
+def parts_of(drivers: Drivers) -> list[Part]:
+    """The parts of mixed drivers; others are one part."""
+    if not isinstance(drivers, MixedDrivers):
+        return [Part(drivers, drivers.memory())]
+    parts = []
+    for name, part in drivers.parts.items():
+        # The memory of a part is below its name.
+        memory: MemoryArrays = {}
+        for key, kind in part.memory().items():
+            memory[(keys.TRAFFIC, name, *key[1:])] = kind
+        parts.append(Part(part, memory))
+    return parts
+
+
+def rows_per_thread(drivers: RuleDrivers | GeneratedDrivers) -> int:
+    """Rows from which on a further thread pays."""
+    return BLOCK if isinstance(drivers, GeneratedDrivers) else ROWS_PER_THREAD
+
+
+def turns_of(drivers: Drivers) -> tuple[int, ...]:
+    """The part of successive episodes; of one part, 0."""
+    return drivers.turns if isinstance(drivers, MixedDrivers) else (0,)
+
+
+def mixed_drivers(parts: Mapping[str, Drivers | None], shares: Mapping[str, int]) -> Drivers | None:
+    """Drivers in turns, by their ``shares``; None where the kernel cannot drive one of them."""
+    known: dict[str, RuleDrivers | GeneratedDrivers] = {}
+    for name, part in parts.items():
+        if part is None or isinstance(part, MixedDrivers):
+            return None
+        known[name] = part
+    names = list(known)
+    mixed = MixedDrivers(known, tuple(names.index(name) for name in interleaved(shares)))
+    # One ego for all rows.
+    same = all((part.idm, part.steering) == (mixed.idm, mixed.steering) for part in known.values())
+    return mixed if same else None
 
 
 def _memory(*names: str) -> Key:
@@ -215,7 +289,7 @@ def decision_settings(
     shape: tuple[int, float, int],
     episode: EpisodeParameters | None,
     ego: EgoParameters | None,
-    drivers: Drivers,
+    drivers: RuleDrivers | GeneratedDrivers,
 ) -> Settings:
     """The numbers of a decision; ``shape`` is lanes, their width in m, and M."""
     return settings_of(
@@ -554,7 +628,8 @@ def pays(drivers: Drivers) -> bool:
     Without an instruction for a product and a sum (x86 before 2013), a generator's network is a
     hundred times slower.
     """
-    if isinstance(drivers, RuleDrivers) or platform.machine() not in ("x86_64", "AMD64"):
+    generated = any(isinstance(part.drivers, GeneratedDrivers) for part in parts_of(drivers))
+    if not generated or platform.machine() not in ("x86_64", "AMD64"):
         return True
     library = find()
     return isinstance(library, Loaded) and library.variant != "default"
@@ -592,6 +667,11 @@ def drivers_of(
         return paper_drivers(*_weights(traffic.path, "paper"), traffic, idm, stream)
     if type(traffic) is GanCalibratedTrafficConfig:
         return calibrated_drivers(*_weights(traffic.path, "calibrated"), traffic, idm, stream)
+    if type(traffic) is MixedTrafficConfig:
+        parts = {
+            name: drivers_of(part, idm, mobil, stream) for name, part in traffic.parts().items()
+        }
+        return mixed_drivers(parts, traffic.shares)
     return None
 
 

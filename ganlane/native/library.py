@@ -48,7 +48,16 @@ ADVICE = (
     "or pip install 'ganlane[native]', which brings Clang"
 )
 #: Functions of the library, and how many pointers they take before the first and the last row.
-FUNCTIONS = {"decide": 3, "lane_view": 3, "mask": 3, "spawn": 3, "enter": 3, "step": 1, "start": 1}
+FUNCTIONS = {
+    "decide": 3,
+    "lane_view": 3,
+    "mask": 3,
+    "spawn": 3,
+    "enter": 3,
+    "step": 1,
+    "judge": 1,
+    "start": 1,
+}
 #: What Linux knows of the processor.
 CPU_INFO = Path("/proc/cpuinfo")
 

@@ -77,6 +77,7 @@ INPUTS: Final = (
     "recycles",
     keys.SEED,
     keys.EPISODE,
+    "rows",
 )
 #: What comes out of it, and out of the start of an episode.
 OUTPUTS: Final = (

@@ -17,8 +17,15 @@ from torch import Tensor
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.native import settings
-from ganlane.native.drivers import Drivers, GeneratedDrivers, RuleDrivers, decision_settings
-from ganlane.native.library import BLOCK, ROWS_PER_THREAD, addresses, in_threads, load
+from ganlane.native.drivers import (
+    Drivers,
+    RuleDrivers,
+    decision_settings,
+    parts_of,
+    rows_per_thread,
+    turns_of,
+)
+from ganlane.native.library import ROWS_PER_THREAD, addresses, in_threads, load
 from ganlane.native.settings import Key, Layout
 from ganlane.settings.driving import (
     EgoParameters,
@@ -27,7 +34,7 @@ from ganlane.settings.driving import (
 from ganlane.settings.episode import EpisodeParameters
 from ganlane.settings.observation import ObservationScale
 from ganlane.sim.spawn import RandomScenes
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import VISIBILITY_OF_EPISODE, Road, Vehicles
 
 
 def wants_gradient(tensors: Iterable[Tensor]) -> bool:
@@ -86,55 +93,78 @@ def _shape(road: Road, vehicles: int) -> tuple[int, float, int]:
     return road.lanes, road.lane_width_m, vehicles  # type: ignore[return-value]
 
 
-class _Function:
+class _Remade:
+    """Made anew from its arguments for copies and other processes: addresses hold in this process
+    alone.
+    """
+
+    _arguments: partial[_Remade]
+
+    def __new__(cls, *arguments: Any, **named: Any) -> Any:
+        instance = super().__new__(cls)
+        instance._arguments = partial(cls, *arguments, **named)
+        return instance
+
+    def __reduce__(self) -> tuple[partial[_Remade], tuple[()]]:
+        return self._arguments, ()
+
+
+class _Function(_Remade):
     """A function of the kernel with its settings.
 
     ``variant`` is one of :data:`ganlane.native.library.VARIANTS`; None: the best for this
-    processor.
+    processor. ``rows_per_thread``: rows from which on a further thread pays.
 
     Raises:
         UserError: the road is a ring or differs from row to row, or the kernel cannot be built.
     """
-
-    _arguments: partial[_Function]
-    #: Rows from which on a further thread pays.
-    rows_per_thread = ROWS_PER_THREAD
 
     def __init__(
         self,
         name: str,
         numbers: ctypes.Structure,
         variant: str | None = None,
+        rows_per_thread: int = ROWS_PER_THREAD,
     ) -> None:
-        self._name = name
         self._numbers = numbers
+        self._rows_per_thread = rows_per_thread
         self._call = getattr(load(variant), name)
 
-    def __new__(cls, *arguments: Any, **named: Any) -> _Function:
-        function = super().__new__(cls)
-        function._arguments = partial(cls, *arguments, **named)
-        return function
-
-    def __reduce__(self) -> tuple[partial[_Function], tuple[()]]:
-        """For copies and other processes: made anew, since addresses hold in this process alone."""
-        return self._arguments, ()
-
-    def _run(
+    def run(
         self,
         rows: int,
         inputs: Iterable[Tensor | None],
         outputs: Sequence[Tensor | None],
     ) -> None:
+        """Call it on ``rows`` rows, with its arrays in the kernel's order."""
         # The contiguous copies have to live until the call is over.
         read = [tensor if tensor is None else tensor.contiguous() for tensor in inputs]
         pointers = (ctypes.byref(self._numbers), addresses(read), addresses(outputs))
         # ctypes releases Python's lock during a call, so threads run side by side.
         in_threads(
-            rows, lambda first, last: self._call(*pointers, first, last), self.rows_per_thread
+            rows, lambda first, last: self._call(*pointers, first, last), self._rows_per_thread
         )
 
 
-class Kernel(_Function):
+class _Parts(_Remade):
+    """What drives the rows of each part of the drivers.
+
+    ``layouts`` are those of the parts, ``layout`` is that of the whole state.
+    """
+
+    def __init__(self, drivers: Drivers, vehicles: int) -> None:
+        self.vehicles = vehicles
+        self.layout = Layout(drivers.memory())
+        self.parts = parts_of(drivers)
+        self.layouts = [Layout(part.memory) for part in self.parts]
+        self._turns = torch.tensor(turns_of(drivers))
+
+    def of_part(self, number: int, episode: Tensor) -> Tensor:
+        """Whether each episode [N] belongs to the part."""
+        return self._turns[episode % len(self._turns)] == number
+
+
+class Kernel(_Parts):
     """Traffic and its ego, a whole decision at a time.
 
     Args:
@@ -143,7 +173,7 @@ class Kernel(_Function):
         episode: decision period, goal and time-out.
         ego: lane changes and soft crashes.
         drivers: the others, and how the ego follows and steers; by default they keep their lanes.
-        variant: see the base class.
+        variant: see :class:`_Function`.
     """
 
     def __init__(
@@ -155,14 +185,14 @@ class Kernel(_Function):
         drivers: Drivers | None = None,
         variant: str | None = None,
     ) -> None:
-        drivers = drivers or RuleDrivers()
-        self.vehicles = vehicles
-        self.layout = Layout(drivers.memory())
-        if isinstance(drivers, GeneratedDrivers):
-            self.rows_per_thread = BLOCK
+        super().__init__(drivers or RuleDrivers(), vehicles)
         self._dtypes = {name: getattr(torch, kind) for name, kind in self.layout.kinds.items()}
-        numbers = decision_settings(_shape(road, vehicles), episode, ego, drivers)
-        super().__init__("ganlane_decide", numbers, variant)
+        shape = _shape(road, vehicles)
+        self._functions = []
+        for part in self.parts:
+            numbers = decision_settings(shape, episode, ego, part.drivers)
+            per_thread = rows_per_thread(part.drivers)
+            self._functions.append(_Function("ganlane_decide", numbers, variant, per_thread))
 
     def decide(
         self, action: Tensor, state: TensorDictBase, recycles: Tensor | None = None
@@ -199,14 +229,34 @@ class Kernel(_Function):
         # New tensors: the state before the decision belongs to the caller.
         names = [name for name in layout.outputs if name in layout.kinds]
         after = _room(layout, names, rows, self.vehicles, torch.empty)
-        inputs = [arrays.get(name) for name in layout.inputs]
-        self._run(rows, inputs, [after.get(name) for name in layout.outputs])
+        if len(self.parts) == 1:
+            self._run(0, rows, arrays, after)
+        else:
+            # What a part does not write is as it was.
+            for name in names:
+                if name[0] == keys.TRAFFIC:
+                    after[name] = arrays[name].clone()  # type: ignore[union-attr]
+            for number in range(len(self.parts)):
+                of_part = self.of_part(number, state.get(keys.EPISODE))
+                arrays["rows"] = chosen = of_part.nonzero()[:, 0]
+                self._run(number, len(chosen), arrays, after)
         # What no decision changes is shared with the state before, not copied.
         lasting = {name: arrays[name] for name in (*settings.SCENE, keys.SEED, keys.EPISODE)}
         return _state(after | lasting)  # type: ignore[arg-type]
 
+    def _run(
+        self,
+        number: int,
+        rows: int,
+        arrays: Mapping[Key, Tensor | None],
+        after: Mapping[Key, Tensor],
+    ) -> None:
+        layout = self.layouts[number]
+        inputs = [arrays.get(name) for name in layout.inputs]
+        self._functions[number].run(rows, inputs, [after.get(name) for name in layout.outputs])
 
-class NativeScenes(_Function):
+
+class NativeScenes(_Parts):
     """What :class:`~ganlane.sim.spawn.RandomScenes` draws, bit for bit, and the drivers' memory.
 
     Drawn by tensor code, the rows that ended took 3 of the 10 ms of a step of 4096 environments
@@ -219,20 +269,18 @@ class NativeScenes(_Function):
     """
 
     def __init__(self, scenes: RandomScenes, stream: int, drivers: Drivers | None = None) -> None:
-        self.vehicles = scenes.vehicles
-        drivers = drivers or RuleDrivers()
-        self.layout = Layout(drivers.memory())
-        seen = (scenes.ego_visibility, scenes.others_visibility)
+        super().__init__(drivers or RuleDrivers(), scenes.vehicles)
         shape = _shape(scenes.road, scenes.vehicles)
-        numbers = settings.spawn_of(
-            *shape,
-            scenes.parameters,
-            stream,
-            *seen,
-            recycle_share=None,
-        )
-        super().__init__("ganlane_spawn", numbers)
-        self._enter = Enter(decision_settings(shape, None, None, drivers))
+        self._functions = []
+        for part in self.parts:
+            others = scenes.others_visibility
+            others = part.drivers.visibility if others == VISIBILITY_OF_EPISODE else others
+            seen = (scenes.ego_visibility, others)
+            spawn = settings.spawn_of(*shape, scenes.parameters, stream, *seen, recycle_share=None)
+            enter = decision_settings(shape, None, None, part.drivers)
+            # The scene first, then the drivers' memory of it.
+            functions = (_Function("ganlane_spawn", spawn), _Function("ganlane_enter", enter))
+            self._functions.append(functions)
 
     def start(
         self,
@@ -250,20 +298,15 @@ class NativeScenes(_Function):
         # Zeros, since rows that are not drawn are not written.
         state = _room(layout, (*written, *settings.SCENE), len(seed), self.vehicles, torch.zeros)
         state |= {keys.SEED: seed, keys.EPISODE: episode}
-        # Drawn with the scene, but the environment draws it at every decision.
-        flags = {"fresh": rows, "recycles": torch.zeros_like(rows)}
-        inputs = [(state | flags)[name] for name in settings.STARTS]
-        outputs = [state.get(name) for name in layout.outputs]
-        self._run(len(seed), inputs, outputs)
-        self._enter._run(len(seed), inputs, outputs)
+        for number, functions in enumerate(self._functions):
+            # Whether it recycles is drawn with the scene, but the environment draws it, too.
+            flags = {"recycles": torch.zeros_like(rows)}
+            flags["fresh"] = rows & self.of_part(number, episode)
+            inputs = [(state | flags)[name] for name in settings.STARTS]
+            outputs = [state.get(name) for name in self.layouts[number].outputs]
+            for function in functions:
+                function.run(len(seed), inputs, outputs)
         return _state(state)
-
-
-class Enter(_Function):
-    """The first memory of the drivers, after their scene."""
-
-    def __init__(self, numbers: ctypes.Structure) -> None:
-        super().__init__("ganlane_enter", numbers)
 
 
 class LaneView(_Function):
@@ -308,7 +351,7 @@ class LaneView(_Function):
         ]
         # In the order of observation.cpp: the ego as it is, the others as they are seen.
         out = torch.empty((len(v.x), self.size), dtype=torch.float32)
-        self._run(len(out), [*inputs, progress, direction], [out])
+        self.run(len(out), [*inputs, progress, direction], [out])
         return out
 
 
@@ -349,5 +392,5 @@ class SafeActions(_Function):
         inputs += [v.target_lane, v.visibility, v.valid, direction]
         mask = torch.empty(rows, 3, dtype=torch.bool)
         none = torch.empty(rows, dtype=torch.bool)
-        self._run(rows, inputs, [mask, none])
+        self.run(rows, inputs, [mask, none])
         return mask, none

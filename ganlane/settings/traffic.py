@@ -218,6 +218,25 @@ class IdmRandomTrafficConfig(TrafficConfig, RandomDrivers):
         return {"drivers": part_of(self, RandomDrivers)}
 
 
+def interleaved(shares: Mapping[str, int]) -> list[str]:
+    """The part of each of ``sum(shares)`` successive episodes, spread as evenly as possible.
+
+    ``{a: 2, b: 1}`` gives a, b, a: in every episode each part gains its share, the one with the
+    most (the first of several) is chosen and pays the sum.
+    """
+    # Smooth weighted round robin, as load balancers use it.
+    credit = dict.fromkeys(shares, 0)
+    turns = []
+    for _ in range(sum(shares.values())):
+        for name, share in shares.items():
+            credit[name] += share
+        # The first of several, so the order of the shares decides.
+        chosen = max(credit, key=lambda name: credit[name])
+        credit[chosen] -= sum(shares.values())
+        turns.append(chosen)
+    return turns
+
+
 @dataclass(frozen=True)
 class MixedTrafficConfig(TrafficConfig):
     """``traffic=mixed``: every episode belongs to one of several traffics, in turns.

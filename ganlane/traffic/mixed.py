@@ -15,6 +15,8 @@ from torch import Tensor
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
+from ganlane.native.drivers import Drivers, mixed_drivers
+from ganlane.settings.traffic import interleaved
 from ganlane.sim.random import Purpose, absorb, uniform
 from ganlane.sim.state import VISIBILITY_OF_EPISODE, Vehicles
 from ganlane.traffic.base import (
@@ -25,25 +27,6 @@ from ganlane.traffic.base import (
     new_tensordict,
     with_rows,
 )
-
-
-def interleaved(shares: Mapping[str, int]) -> list[str]:
-    """The part of each of ``sum(shares)`` successive episodes, spread as evenly as possible.
-
-    ``{a: 2, b: 1}`` gives a, b, a: in every episode each part gains its share, the one with the
-    most (the first of several) is chosen and pays the sum.
-    """
-    # Smooth weighted round robin, as load balancers use it.
-    credit = dict.fromkeys(shares, 0)
-    turns = []
-    for _ in range(sum(shares.values())):
-        for name, share in shares.items():
-            credit[name] += share
-        # The first of several, so the order of the shares decides.
-        chosen = max(credit, key=lambda name: credit[name])
-        credit[chosen] -= sum(shares.values())
-        turns.append(chosen)
-    return turns
 
 
 class RowsOfPart(NamedTuple):
@@ -104,9 +87,15 @@ class MixedTraffic(TrafficParts):
         # Not saved: it follows from the shares.
         turns = torch.tensor([names.index(name) for name in interleaved(shares)])
         self.register_buffer("turns", turns, persistent=False)
+        self._shares = {name.replace(".", "_"): share for name, share in shares.items()}
         self.compiled = False
         # Of the present decision: the keys of its episodes, and the rows of the parts.
         self._rows: tuple[Tensor, list[RowsOfPart]] | None = None
+
+    def native_drivers(self) -> Drivers | None:
+        """Those of the parts, in turns."""
+        parts = {name: part.native_drivers() for name, part in self.named_parts()}
+        return mixed_drivers(parts, self._shares)
 
     def part_of(self, episode: Tensor) -> Tensor:
         """Index of the part that each ``episode`` [N] belongs to."""

@@ -174,6 +174,8 @@ def test_a_row_of_a_batch_drives_as_one_alone_does():
         "idm_faults",
         "gan",
         "gan_calibrated",
+        {"name": "mixed", "shares": {"idm_random": 2, "idm_faults": 1}},
+        {"name": "mixed", "shares": {"idm": 1, "gan": 1}, "options": {"gan": {"execute_k": 2}}},
         {"name": "gan", "execute_k": 2},
         {"name": "gan", "blind_share": 0.5},
         {"name": "idm", "blind_share": 0.5},
@@ -190,7 +192,8 @@ def test_option_and_module_give_one_answer_to_who_drives(traffic):
             np.testing.assert_array_equal(weights, of_module.weights[name])
         of_module, of_option = (replace(drivers, weights={}) for drivers in (of_module, of_option))
     assert of_module == of_option
-    assert (of_option is not None) == isinstance(traffic, str)
+    expected = isinstance(traffic, str) or (traffic["name"] == "mixed" and "options" not in traffic)
+    assert (of_option is not None) == expected
 
 
 @pytest.mark.skipif(why_not() is not None, reason=f"no native kernel here: {why_not()}")

@@ -5,8 +5,9 @@ not been driven yet, so none waits for the slowest. Once all have been handed ou
 move to smaller batches.
 
 The simulation is deterministic, so :class:`ScriptedPolicy` drives an episode again from its number
-and its actions: rule-driven traffic bit for bit in any batch, generated traffic in batches of the
-same size (its network's matrix products round differently in others).
+and its actions: by the kernel bit for bit in any batch, and so is rule-driven traffic by the tensor
+code; generated traffic is there in batches of the same size (its network's matrix products round
+differently in others).
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def run_episodes(
     """Drive exactly ``episodes`` of ``seed``, each to its own end; one row each, in that order.
 
     Which episodes are counted does not depend on how long any of them takes, so short ones are not
-    favoured. The numbers are the same in any batch, with generated traffic up to rounding. The
+    favoured. The numbers are the same in any batch, with generated traffic by the tensor code up to rounding. The
     policy acts deterministically.
 
     Args:

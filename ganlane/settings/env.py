@@ -211,8 +211,8 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
         compile: true: physics, traffic and the agent's update as compiled graphs (needs a C++
             compiler); faster, after a minute or so of compiling, and the same up to rounding.
         kernel: what drives a decision: the tensor code (torch), the native kernel (native), which
-            does the same up to rounding for traffic=idm and idm_mobil on a CPU, or the kernel where
-            it can (auto).
+            does the same up to rounding on a CPU (not for recordings, foreign simulators and
+            traffic of your own), or the kernel where it can (auto).
         scene: the first scene, set by hand; null: Table II.
         ego: how the ego drives.
         idm: how all follow, Table V.

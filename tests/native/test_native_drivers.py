@@ -30,6 +30,11 @@ pytestmark = pytest.mark.skipif(why_not() is not None, reason="no C++ compiler")
 RUNNABLE = list(VARIANTS)[list(VARIANTS).index(best_variant()) :]
 PRESETS = {"gan": "paper", "gan_calibrated": "calibrated"}
 TRAFFICS = ["idm", "idm_mobil", "idm_faults", "idm_random", *PRESETS]
+#: Parts of all kinds; no batch size here is a multiple of the sum of their shares.
+MIXED = {
+    "name": "mixed",
+    "shares": {"idm_mobil": 2, "gan": 1, "idm_faults": 1, "idm_random": 1, "gan_calibrated": 1},
+}
 #: Faults so often that a few decisions meet all of them.
 OFTEN = {
     "phantom_braking": {"per_hour": 400.0},
@@ -132,6 +137,7 @@ def compare(traffic, highways, rows, decisions, seed):
     "traffic",
     [
         *TRAFFICS,
+        MIXED,
         {"name": "idm_faults"} | OFTEN,
         {"name": "idm_random", "reaction_s": (0.5, 1.5), "desired_speed": (0.7, 1.3)},
         {"name": "idm_random", "reaction_s": (0.0, 0.0), "sway_m": (0.3, 0.9)},
@@ -156,13 +162,13 @@ def test_networks_of_any_sizes_drive(traffic, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("traffic", [*TRAFFICS, {"name": "idm_faults"} | OFTEN], ids=str)
+@pytest.mark.parametrize("traffic", [*TRAFFICS, MIXED, {"name": "idm_faults"} | OFTEN], ids=str)
 def test_it_decides_as_the_tensor_code_in_a_hundred_thousand_decisions(traffic):
     differ, compared = compare(traffic, highways=80, rows=128, decisions=10, seed=4)
     assert differ <= compared // 10_000, (differ, compared)
 
 
-@pytest.fixture(scope="module", params=TRAFFICS[2:])
+@pytest.fixture(scope="module", params=[*TRAFFICS[2:], MIXED], ids=str)
 def episodes(request):
     """Drivers, and the states of 37 episodes after every decision, and the actions."""
     traffic = make(TrafficConfig, request.param)
@@ -204,16 +210,16 @@ def test_every_instruction_set_gives_the_same_bits(episodes, variant):
     assert_same(drive(drivers, actions[:4], few, variant), whole[:4], np.array(few))
 
 
-@pytest.mark.parametrize("traffic", TRAFFICS)
+@pytest.mark.parametrize("traffic", [*TRAFFICS, MIXED], ids=str)
 def test_torchrl_and_gymnasium_drive_the_same_episodes(traffic):
-    rows = 5
+    rows = 8
     env = make_env(traffic, num_envs=rows, kernel="native", seed=3)
     drivers = drivers_of(make(TrafficConfig, traffic), IdmParameters(), MobilParameters(), 0)
     batch = NativeBatch(rows, drivers=drivers)
     batch.start(3, np.arange(rows))
     td = env.reset()
     for _ in range(5):
-        action = np.array([0, 1, 2, 0, 0])
+        action = np.array([0, 1, 2, 0, 0, 0, 0, 2])
         batch.step(action)
         td = env.step(td.set("action", torch.from_numpy(action)))["next"]
         for name, array in batch.state.items():
@@ -222,7 +228,7 @@ def test_torchrl_and_gymnasium_drive_the_same_episodes(traffic):
                 np.testing.assert_array_equal(array, expected, str(name))
 
 
-@pytest.mark.parametrize("traffic", TRAFFICS)
+@pytest.mark.parametrize("traffic", [*TRAFFICS, MIXED], ids=str)
 def test_the_first_memory_is_that_of_the_tensor_code(traffic):
     module = make_traffic(make(TrafficConfig, traffic), EnvConfig())
     env = environment(num_envs=20, traffic=module, seed=7, dtype=torch.float32, kernel="torch")

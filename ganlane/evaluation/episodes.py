@@ -54,8 +54,8 @@ def run_episodes(
     """Drive exactly ``episodes`` of ``seed``, each to its own end; one row each, in that order.
 
     Which episodes are counted does not depend on how long any of them takes, so short ones are not
-    favoured. The numbers are the same in any batch, with generated traffic by the tensor code up to rounding. The
-    policy acts deterministically.
+    favoured. The numbers are the same in any batch, by the tensor code with generated traffic up to
+    rounding. The policy acts deterministically.
 
     Args:
         env: batched environment, batch size ``[N]``, whose ``reset`` takes ``seed`` and ``episode``

@@ -213,12 +213,12 @@ class NativeBatch:
         for part in parts_of(drivers):
             layout = Layout(part.memory)
             # Of several parts each drives the rows that are its own.
-            own = np.zeros(rows, np.int64) if len(self._turns) > 1 else None
+            row_list = np.zeros(rows, np.int64) if len(self._turns) > 1 else None
             # When others see the ego's lane changes, and the ego theirs.
             visible = (Visibility.named(ego.visibility), part.drivers.visibility)
             of_part = pointed | {
                 "settings": decision_settings(road, episode, ego, part.drivers),
-                "inputs": self._pointers(layout.inputs, own),
+                "inputs": self._pointers(layout.inputs, row_list),
                 "outputs": self._pointers(layout.outputs),
                 "spawn": settings.spawn_of(*road, spawn, stream, *visible, recycle_share),
                 "scene": self._pointers(settings.STARTS),
@@ -227,7 +227,7 @@ class NativeBatch:
                 **{name: ctypes.addressof(structure) for name, structure in of_part.items()},
                 **numbers,
             )
-            self._parts.append(_Part(batch, own, rows_per_thread(part.drivers), of_part))
+            self._parts.append(_Part(batch, row_list, rows_per_thread(part.drivers), of_part))
         ends = (self.state["terminated"], self.state["truncated"])
         self._stepped = Stepped(self.observation, self.state[keys.REWARD], *ends)
 
@@ -284,10 +284,10 @@ class NativeBatch:
             return self._stepped
         part_of_row = self._part_of_row()
         for number, part in enumerate(self._parts):
-            own = np.flatnonzero(part_of_row == number)
+            chosen = np.flatnonzero(part_of_row == number)
             assert part.rows is not None
-            part.rows[: len(own)] = own
-            part.drive(self._library.ganlane_decide, len(own))
+            part.rows[: len(chosen)] = chosen
+            part.drive(self._library.ganlane_decide, len(chosen))
         self._parts[0].call(self._library.ganlane_judge, self.rows)
         return self._stepped
 

@@ -265,15 +265,17 @@ def turns_of(drivers: Drivers) -> tuple[int, ...]:
 
 def mixed_drivers(parts: Mapping[str, Drivers | None], shares: Mapping[str, int]) -> Drivers | None:
     """Drivers in turns, by their ``shares``; None where the kernel cannot drive one of them."""
-    known: dict[str, RuleDrivers | GeneratedDrivers] = {}
+    drivers: dict[str, RuleDrivers | GeneratedDrivers] = {}
     for name, part in parts.items():
         if part is None or isinstance(part, MixedDrivers):
             return None
-        known[name] = part
-    names = list(known)
-    mixed = MixedDrivers(known, tuple(names.index(name) for name in interleaved(shares)))
+        drivers[name] = part
+    names = list(drivers)
+    mixed = MixedDrivers(drivers, tuple(names.index(name) for name in interleaved(shares)))
     # One ego for all rows.
-    same = all((part.idm, part.steering) == (mixed.idm, mixed.steering) for part in known.values())
+    same = all(
+        (part.idm, part.steering) == (mixed.idm, mixed.steering) for part in drivers.values()
+    )
     return mixed if same else None
 
 

@@ -18,6 +18,7 @@ from ganlane.env.highway import say_once
 from ganlane.errors import UserError
 from ganlane.native.library import ROWS_PER_THREAD, threads_allowed, why_not
 from ganlane.native.settings import NATIVE_FORMS
+from ganlane.runtime import kernel_threads
 from ganlane.settings.driving import EgoParameters, IdmParameters
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MaskParameters, ObservationConfig, SensorParameters
@@ -89,6 +90,8 @@ def test_two_threads_are_the_kernels_alone_and_change_no_bit():
             seen.append((torch.get_num_threads(), threads_allowed()))
             return next_tensordict
 
+    # A command that ran in this process may have set the kernel's.
+    token = kernel_threads.set(None)
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
@@ -102,6 +105,7 @@ def test_two_threads_are_the_kernels_alone_and_change_no_bit():
             assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
+        kernel_threads.reset(token)
     assert seen == [(1, 1)] * 3 + [(1, 2)] * 3
     assert (driven[0] == driven[1]).all()
 

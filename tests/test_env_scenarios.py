@@ -56,7 +56,7 @@ class Drive:
 
 def drive(config: EnvConfig, driver: str, traffic: str, seconds: int) -> Drive:
     """``ROWS`` episodes side by side, without a goal, until one of them ends."""
-    config = replace(config, goal_m=1e6)
+    config = replace(config, goal_m=1e5)
     env = make_env(make_traffic(TRAFFICS[traffic], config), config, num_envs=ROWS)
     policy = make_driver(driver, config).policy
     seen = Drive()

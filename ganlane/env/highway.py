@@ -68,8 +68,8 @@ class HighwayEnv(EnvBase):
         recycle_share: share of the episodes in which ``recycle`` applies, 0 to 1, chosen by their
             numbers: a mixture of roads that empty and roads that do not.
         kernel: what drives a decision: ``torch``, the tensor code; ``native``, the kernel
-            (:mod:`ganlane.native`), which does the same up to rounding, for rule-driven traffic on
-            a CPU and without gradients; ``auto``, the kernel where it can.
+            (:mod:`ganlane.native`), which does the same up to rounding, for all shipped traffic
+            but recordings, on a CPU and without gradients; ``auto``, the kernel where it can.
 
     An episode is (the traffic's stream, seed, episode), whatever the batch. ``reset(td)`` with
     ``seed`` and ``episode`` [N] in ``td`` and no ``_reset`` mask runs exactly those episodes. With

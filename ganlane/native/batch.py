@@ -19,13 +19,14 @@ from ganlane import keys
 from ganlane.native import settings
 from ganlane.native.drivers import (
     Drivers,
+    GeneratedDrivers,
     RuleDrivers,
     decision_settings,
     parts_of,
     rows_per_thread,
     turns_of,
 )
-from ganlane.native.library import addresses, in_threads, load
+from ganlane.native.library import addresses, in_threads, load, load_for
 from ganlane.native.settings import Key, Layout, fields
 from ganlane.settings.driving import EgoParameters, Visibility
 from ganlane.settings.episode import EpisodeParameters, SpawnParameters
@@ -181,7 +182,9 @@ class NativeBatch:
         self.mask = np.ones((rows, keys.ACTIONS), np.bool_)
         self._term_values = np.zeros((rows, len(self.terms)), np.float32)
         self._no_safe_action = np.zeros(rows, np.bool_)
-        self._library = load(variant)
+        generated = any(isinstance(part.drivers, GeneratedDrivers) for part in parts_of(drivers))
+        # The network of generated drivers fills the widest vectors with its own numbers.
+        self._library = load(variant) if variant or generated else load_for(rows)
         deceleration = mask.safe_deceleration
         abort = ego.abort_lane_change
         # The kernel's structures, filled once. Referred to by this object, since a structure holds

@@ -74,7 +74,7 @@ if TYPE_CHECKING:
 Weights: TypeAlias = Mapping[str, npt.NDArray[np.float32]]
 #: Parameters of a random driver in its memory.
 _TRAITS: Final = 11
-#: The kernel's drivers carry at most so many numbers each, those of the delay included.
+#: The longest delay of a reaction, in steps: MOST_FIELDS of rows.hpp less 12 other numbers.
 _MOST_STEPS: Final = 36
 #: Layers of the kernel have a multiple of this many outputs.
 _WIDEST: Final = 16
@@ -489,39 +489,42 @@ def _layer(
 # From weights and their metadata
 
 
+class FittedGenerator(NamedTuple):
+    """A generator as its file has it: weights, their sizes, metadata, and the file for messages."""
+
+    weights: Weights
+    sizes: GeneratorSizes
+    metadata: Mapping[str, Any]
+    source: object
+
+
 def paper_drivers(
-    weights: Weights,
-    sizes: GeneratorSizes,
-    metadata: Mapping[str, Any],
-    source: object,
+    generator: FittedGenerator,
     config: GanTrafficConfig,
     idm: IdmParameters,
     stream: int,
 ) -> GeneratedDrivers:
-    """Drivers of ``traffic=gan``; ``source`` names the weights in messages.
+    """Drivers of ``traffic=gan``.
 
     Raises:
         UserError: the recordings hold no complete lane change.
     """
-    statistics = _statistics(metadata)
+    statistics = _statistics(generator.metadata)
     return GeneratedDrivers(
         idm,
-        sizes,
-        weights,
+        generator.sizes,
+        generator.weights,
         stream,
         config.noise_scale,
         PAPER_NOISE_PERIOD_S,
         sudden=sudden_accelerations(statistics),
-        changes=literal_changes(statistics, source),
+        changes=literal_changes(statistics, generator.source),
         guard=GuardParameters() if config.guard else None,
     )
 
 
 def calibrated_drivers(
-    weights: Weights,
-    sizes: GeneratorSizes,
-    metadata: Mapping[str, Any],
-    source: object,
+    generator: FittedGenerator,
     config: GanCalibratedTrafficConfig,
     idm: IdmParameters,
     stream: int,
@@ -531,7 +534,7 @@ def calibrated_drivers(
     Raises:
         UserError: fitted without per-driver parameters.
     """
-    statistics = _statistics(metadata)
+    statistics = _statistics(generator.metadata)
     # Without a recorded change nobody changes lanes.
     recorded = statistics.lane_changes.per_vehicle_km or 0.0
     # Only None asks for the recorded rate; 0 is a rate.
@@ -539,12 +542,12 @@ def calibrated_drivers(
     wishes = WISH_PER_CHANGE * recorded if wishes is None else wishes
     return GeneratedDrivers(
         idm,
-        sizes,
-        weights,
+        generator.sizes,
+        generator.weights,
         stream,
         config.noise_scale,
         config.noise_period_s,
-        anchor=fitted_anchor(metadata, source),
+        anchor=fitted_anchor(generator.metadata, generator.source),
         checked_changes=CalibratedChanges(wishes),
         headways_s=tuple(statistics.headway.quantile(level) for level in QUANTILE_LEVELS),
     )
@@ -666,9 +669,9 @@ def drivers_of(
         random = part_of(traffic, RandomDrivers)
         return RuleDrivers(idm, mobil=mobil, random=random, stream=stream)
     if type(traffic) is GanTrafficConfig and traffic.execute_k == 1:
-        return paper_drivers(*_weights(traffic.path, "paper"), traffic, idm, stream)
+        return paper_drivers(_fitted(traffic.path, "paper"), traffic, idm, stream)
     if type(traffic) is GanCalibratedTrafficConfig:
-        return calibrated_drivers(*_weights(traffic.path, "calibrated"), traffic, idm, stream)
+        return calibrated_drivers(_fitted(traffic.path, "calibrated"), traffic, idm, stream)
     if type(traffic) is MixedTrafficConfig:
         parts = {
             name: drivers_of(part, idm, mobil, stream) for name, part in traffic.parts().items()
@@ -677,10 +680,7 @@ def drivers_of(
     return None
 
 
-def _weights(
-    path: str | None, preset: Any
-) -> tuple[Weights, GeneratorSizes, Mapping[str, Any], Path]:
-    """Weights, their sizes and metadata, and their file."""
+def _fitted(path: str | None, preset: Any) -> FittedGenerator:
     source = Path(path or shipped_generator(preset))
     weights, metadata = load_arrays(source, GENERATOR)
     sizes = stored_sizes(source, metadata, preset)
@@ -688,7 +688,7 @@ def _weights(
         raise UserError(
             f"{source}: its weights do not have the shapes that its sizes ask for; fit it again."
         )
-    return weights, sizes, metadata, source
+    return FittedGenerator(weights, sizes, metadata, source)
 
 
 def _shapes(sizes: GeneratorSizes) -> dict[str, tuple[int, ...]]:

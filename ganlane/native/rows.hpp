@@ -14,7 +14,7 @@ const int MOBIL_PERIOD = 10;
 
 // ---- The vehicles of LANES rows, foremost first
 
-// Numbers that a driver carries from step to step: at most so many, in the order of Field below.
+// Numbers that a driver carries from step to step: at most so many, as Fields (memory.hpp) lays them out.
 const int MOST_FIELDS = 48;
 
 // The nearest vehicle met so far in a lane.

@@ -129,6 +129,7 @@ class Layout:
         kinds: type of every array that the kernel reads or writes, by key.
         inputs, outputs: of a decision, in the kernel's order. Those that are not in ``kinds`` are
             null pointers: generated drivers have no steering angles.
+        written: the outputs that are in ``kinds``.
     """
 
     def __init__(self, memory: MemoryArrays) -> None:
@@ -142,6 +143,7 @@ class Layout:
         self.outputs: list[Key] = [steering if name == STEERING else name for name in OUTPUTS]
         self.inputs += further
         self.outputs += further
+        self.written = [name for name in self.outputs if name in self.kinds]
 
     def shape(self, name: Key, rows: int, vehicles: int) -> tuple[int, ...]:
         """Shape of an array of ``kinds``."""

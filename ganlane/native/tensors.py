@@ -227,13 +227,12 @@ class Kernel(_Parts):
                 )
             arrays[name] = number
         # New tensors: the state before the decision belongs to the caller.
-        names = [name for name in layout.outputs if name in layout.kinds]
-        after = _room(layout, names, rows, self.vehicles, torch.empty)
+        after = _room(layout, layout.written, rows, self.vehicles, torch.empty)
         if len(self.parts) == 1:
             self._run(0, rows, arrays, after)
         else:
             # What a part does not write is as it was.
-            for name in names:
+            for name in layout.written:
                 if name[0] == keys.TRAFFIC:
                     after[name] = arrays[name].clone()  # type: ignore[union-attr]
             for number in range(len(self.parts)):
@@ -294,9 +293,9 @@ class NativeScenes(_Parts):
         """
         rows = torch.ones_like(seed, dtype=torch.bool) if rows is None else rows
         layout = self.layout
-        written = [name for name in layout.outputs if name in layout.kinds]
         # Zeros, since rows that are not drawn are not written.
-        state = _room(layout, (*written, *settings.SCENE), len(seed), self.vehicles, torch.zeros)
+        names = (*layout.written, *settings.SCENE)
+        state = _room(layout, names, len(seed), self.vehicles, torch.zeros)
         state |= {keys.SEED: seed, keys.EPISODE: episode}
         for number, functions in enumerate(self._functions):
             # Whether it recycles is drawn with the scene, but the environment draws it, too.

@@ -5,16 +5,17 @@ The paper's generated traffic, the calibrated one, and rule-driven drivers with 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from ganlane.generator import Generator, load_generator, shipped_generator
-from ganlane.native.drivers import Weights, calibrated_drivers, paper_drivers
+from ganlane.native.drivers import FittedGenerator, calibrated_drivers, paper_drivers
 from ganlane.settings.driving import (
     DriverFaults,
     IdmParameters,
     MobilParameters,
 )
-from ganlane.settings.generator import GeneratorSizes
 from ganlane.settings.traffic import (
     GanCalibratedTrafficConfig,
     GanTrafficConfig,
@@ -64,9 +65,7 @@ def gan_traffic(
     generator, metadata = load_generator(source, "paper")
     config = GanTrafficConfig(guard=guard, noise_scale=noise_scale, execute_k=execute_k)
     drivers = paper_drivers(
-        *_network(generator),
-        metadata,
-        source,
+        _fitted(generator, metadata, source),
         config,
         idm,
         stream,
@@ -129,9 +128,7 @@ def gan_calibrated_traffic(
         changes_per_km=changes_per_km,
     )
     drivers = calibrated_drivers(
-        *_network(generator),
-        metadata,
-        source,
+        _fitted(generator, metadata, source),
         config,
         idm,
         stream,
@@ -152,10 +149,10 @@ def gan_calibrated_traffic(
     return TrafficSequential(parts, drivers)
 
 
-def _network(generator: Generator) -> tuple[Weights, GeneratorSizes]:
-    """Weights and sizes, as the kernel takes them."""
+def _fitted(generator: Generator, metadata: Mapping[str, Any], source: object) -> FittedGenerator:
+    """The generator as the kernel takes it."""
     weights = {name: tensor.numpy() for name, tensor in generator.state_dict().items()}
-    return weights, generator.sizes
+    return FittedGenerator(weights, generator.sizes, metadata, source)
 
 
 def idm_faults_traffic(

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
+from functools import partial
 from typing import Any
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
@@ -23,18 +28,38 @@ class Collector:
         self.environments = env.batch_size.numel()
         # The state before the next decision; what has ended is begun anew within a step.
         self.env_state: TensorDictBase = env.reset()
+        # Torch's number of threads is each thread's own.
+        threads = torch.get_num_threads()
+        self._driver = ThreadPoolExecutor(1, "driving", torch.set_num_threads, (threads,))
 
-    def step(self, agent: Rainbow) -> TensorDictBase:
+    def step(self, agent: Rainbow, meanwhile: Callable[[], None] | None = None) -> TensorDictBase:
         """One decision of every environment, batch [N].
 
         Row i continues row i of the last step. ``next`` is the outcome before any reset: ended
-        environments are reset in ``env_state``, not in the returned step.
+        environments are reset in ``env_state``, not in the returned step. ``meanwhile`` is called
+        between the choice of the actions and their outcome; it may change the agent. On a CPU
+        another thread drives at the same time.
         """
-        # the policy writes its action into the state itself
-        decided = agent.policy(self.env_state)
+        with torch.no_grad():
+            # the policy writes its action into the state itself
+            decided = agent.policy(self.env_state)
+        # The kernel computes without Python's lock: 100,000 decisions on gan took 38 s instead of
+        # 48 s on two cores. In this context, since it holds the number of the kernel's threads.
+        if agent.device.type == "cpu":
+            driving = self._driver.submit(copy_context().run, self._drive, decided)
+            outcome = driving.result
+        else:
+            # A GPU computes on its own while the next calls are made.
+            outcome = partial(self._drive, decided)
+        if meanwhile is not None:
+            meanwhile()
         # The step holds each row as it ended; in env_state such rows are reset already.
-        step, self.env_state = self.env.step_and_maybe_reset(decided)
+        step, self.env_state = outcome()
         return step
+
+    @torch.no_grad()
+    def _drive(self, decided: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        return self.env.step_and_maybe_reset(decided)
 
     def state_dict(self, exact: bool) -> dict[str, Any]:
         """The state of the environments; unless ``exact``, only their episode numbers."""

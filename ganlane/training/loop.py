@@ -7,11 +7,11 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
@@ -159,36 +159,30 @@ def train(
 
 
 def advance(state: TrainingState) -> TensorDictBase:
-    """Make one decision of every environment, [N], store it, and make the updates that are due."""
-    step = collect(state)
-    state.agent.store(state.window.push(step))
-    learn(state)
-    return step
+    """Make one decision of every environment, [N], and store it.
 
-
-def collect(state: TrainingState) -> TensorDictBase:
-    """One decision of every environment, batch [N]."""
+    While it is driven, the updates are made that the decisions before it made due; those of a
+    run's last step are left to the run that goes on from it.
+    """
+    agent = state.agent
     # Exploration and learning rate follow the decisions made so far.
-    state.agent.anneal(state.decisions)
-    with torch.no_grad():
-        step = state.collector.step(state.agent)
-        state.decisions += state.environments
-        state.stats.step(step)
+    agent.anneal(state.decisions)
+    step = state.collector.step(agent, partial(learn, state))
+    state.decisions += state.environments
+    state.stats.step(step)
+    agent.store(state.window.push(step))
+    # Nothing becomes due until the buffer holds enough (``warmup``).
+    if agent.ready:
+        state.pending_decisions += state.environments
     return step
 
 
 def learn(state: TrainingState) -> None:
-    """Make the updates that are due, one per ``decisions_per_update``.
-
-    None until the agent is ready (``warmup``).
-    """
+    """Make the updates that are due, one per ``decisions_per_update``."""
     agent = state.agent
-    # Nothing is learned, and nothing becomes due, until the buffer holds enough.
-    if not agent.ready:
-        return
-    # decisions that do not fill an update are kept for the next step
-    state.pending_decisions += state.environments
-    while state.pending_decisions >= agent.config.decisions_per_update:
+    # A light checkpoint leaves decisions that are due and an empty buffer. Decisions that do not
+    # fill an update are kept for the next step.
+    while agent.ready and state.pending_decisions >= agent.config.decisions_per_update:
         state.stats.update(agent.update())
         state.pending_decisions -= agent.config.decisions_per_update
 

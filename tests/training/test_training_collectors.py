@@ -21,7 +21,7 @@ from ganlane.training.checkpoint import (
     load_checkpoint,
 )
 from ganlane.training.collectors import Collector, pack, unpack
-from ganlane.training.loop import collect
+from ganlane.training.loop import advance
 
 NO_CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 
@@ -75,8 +75,7 @@ def test_on_a_gpu_nothing_of_a_run_is_elsewhere():
     learner = Rainbow(RainbowConfig(**SMALL), 29, device="cuda")
     run = TrainingState(road(32, "cuda"), learner)
     for _ in range(4):
-        step = collect(run)
-        learner.store(run.window.push(step))
+        step = advance(run)
     learner.update()
     tensordicts = (run.collector.env_state, step, learner.replay[:])
     tensors = [value for tensordict in tensordicts for value in tensordict.values(True, True)]

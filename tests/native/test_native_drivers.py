@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from contextvars import copy_context
 from dataclasses import asdict
 
 import numpy as np
@@ -18,6 +19,7 @@ from ganlane.native.batch import NativeBatch
 from ganlane.native.drivers import GeneratedDrivers, drivers_of
 from ganlane.native.library import VARIANTS, best_variant, why_not
 from ganlane.native.tensors import Kernel, NativeScenes
+from ganlane.runtime import kernel_threads
 from ganlane.settings.driving import IdmParameters, MobilParameters, Visibility
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.generator import EXTRA_INPUTS, GENERATOR, GeneratorSizes
@@ -200,6 +202,24 @@ def assert_same(states, whole, rows):
 def test_an_episode_is_the_same_bit_for_bit_in_any_batch(episodes, numbers):
     drivers, actions, whole = episodes
     assert_same(drive(drivers, actions, numbers), whole, np.array(numbers))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("rows", [64, 1024])
+def test_an_episode_is_the_same_among_a_thousand_and_in_any_number_of_threads(
+    episodes, rows, threads
+):
+    drivers, actions, whole = episodes
+    context = copy_context()
+    context.run(kernel_threads.set, threads)
+    others = np.resize(actions, (len(actions), rows))
+    others[:, :37] = actions
+    states = context.run(drive, drivers, others, range(rows))
+    for state in states:
+        for name, array in state.items():
+            state[name] = array[:37]
+    assert_same(states, whole, np.arange(37))
 
 
 @pytest.mark.parametrize("variant", RUNNABLE)

@@ -110,7 +110,7 @@ class RealismConfig(RunConfig):
         vehicle_km: at least so many in every long run; 0 leaves them out.
         long_s: no episode of a long run lasts longer, s.
         long_against: true: long runs of the traffics of against, too.
-        i80: whether the I-80 files in the folder of the scenes are used; null: if they are there.
+        i80: whether the files of one lane (I-80, I-24) beside the scenes are used; null: if they are there.
         resamples: of the bootstrap over scenes.
         quick: true: a check that it runs, in seconds.
         publish: true (maintainers): write the histograms that ship from these recordings.

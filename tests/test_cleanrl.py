@@ -1,7 +1,7 @@
 """What CleanRL's ``ppo.py`` asks of an environment, on single environments and on the batch.
 
-The script is in CleanRL's repository, not in its package. Here is how its form since it uses
-gymnasium (commit b5fb801, for gymnasium 0.29) makes environments, acts, and reads ends and infos.
+The script is in CleanRL's repository, not in its package. Here is how it makes environments, acts,
+and reads ends and infos.
 """
 
 from __future__ import annotations
@@ -31,10 +31,7 @@ def as_a_batch():
 
 
 def ended_returns(infos):
-    """In the form of gymnasium 0.29, which the script reads, or of 1.x (arrays)."""
-    if "final_info" in infos:
-        ended = [info for info in infos["final_info"] if info and "episode" in info]
-        return [float(info["episode"]["r"]) for info in ended]
+    """In the form of gymnasium 1."""
     if "episode" in infos:
         return infos["episode"]["r"][infos["_episode"]].tolist()
     return []

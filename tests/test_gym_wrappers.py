@@ -26,17 +26,6 @@ def test_a_users_transform_pays_what_it_says():
     assert doubled.step(KEEP)[1] == pytest.approx(2.0 * plain.step(KEEP)[1])
 
 
-def test_episode_statistics_are_recorded():
-    env = gymnasium.wrappers.RecordEpisodeStatistics(make(goal_m=30.0))
-    env.reset(seed=0)
-    total = 0.0
-    info = {}
-    while "episode" not in info:
-        _, reward, *_, info = env.step(KEEP)
-        total += reward
-    assert info["episode"]["r"] == pytest.approx(total)
-
-
 @pytest.mark.parametrize("mode", ["same_step", "next_step"])
 def test_gymnasiums_own_vector_wrappers_take_the_batch(mode):
     envs = VECTOR.RecordEpisodeStatistics(make_vec(4, goal_m=40.0, autoreset_mode=mode))

@@ -76,29 +76,6 @@ def test_cfg_shows_the_config_and_leaves_nothing_behind(name, empty_folder, caps
     assert list(empty_folder.iterdir()) == []
 
 
-def test_cfg_shows_the_chosen_options_and_values(empty_folder, capsys):
-    assert main(["train", "--cfg", "job", "env=dense", "env.lanes=5"]) == 0
-    assert {"  vehicles: 30", "  lanes: 5"} <= set(capsys.readouterr().out.splitlines())
-    assert main(["render", "--cfg", "job", "agent=keep_lane"]) == 0
-    assert "driver: keep_lane" in capsys.readouterr().out.splitlines()
-
-
-def test_help_does_not_wait_for_torch(tmp_path):
-    program = (
-        "import sys; from ganlane.__main__ import main; main(['train', '--help'])\n"
-        "print('torch' in sys.modules)"
-    )
-    assert command("-c", program, cwd=tmp_path).stdout.splitlines()[-1] == "False"
-
-
-@pytest.mark.slow
-def test_a_whole_command_names_its_results(tmp_path):
-    tiny = ["agents=[keep_lane]", "traffics=[idm]", "episodes=1", "env.goal_m=20"]
-    done = command("-m", "ganlane", "evaluate", *tiny, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1].startswith(f"results: {tmp_path}")
-
-
 def test_a_mistake_ends_the_process_with_status_2(tmp_path):
     done = command("-m", "ganlane", "train", "env.lanes=0", cwd=tmp_path)
     assert done.returncode == 2

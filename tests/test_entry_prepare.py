@@ -29,9 +29,7 @@ from ganlane.data import (
     write_scene_csv,
 )
 
-evaluate = partial(run_command, "evaluate")
 main = partial(run_command, "prepare")
-train_generator = partial(run_command, "train_generator")
 
 
 @pytest.fixture(autouse=True)
@@ -89,27 +87,6 @@ def test_highd_folder(here, capsys):
         "highd-01-lower",
     ]
     assert read_scenes(numbers["out"])["scene"].n_unique() == 2 * 3
-
-
-def test_from_a_users_csv_to_traffic_in_three_commands(here, capsys):
-    write_csv(here / "mine.csv", scenes=3)
-    assert main(["data.path=mine.csv", "out=mine"]) == 0
-    # Enough to write weights, not to be any good.
-    few = [
-        "generator.loop.updates=2",
-        "generator.loop.evaluate_every=1",
-        "generator.batch=4",
-        "hydra.run.dir=fit",
-    ]
-    assert train_generator(["data.path=mine", *few]) == 0
-    tiny = [
-        "agents=[keep_lane]",
-        "episodes=1",
-        "env.goal_m=20",
-    ]
-    fitted = "traffics=[{name: gan, path: fit/generator_paper.safetensors}]"
-    assert evaluate([fitted, *tiny]) == 0
-    capsys.readouterr()
 
 
 def test_download_then_prepare(here, capsys):

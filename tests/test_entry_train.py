@@ -65,31 +65,12 @@ def test_a_run_leaves_agent_metrics_config_and_table(finished):
     assert (folder / "config.yaml").is_file()
 
 
-def test_a_finished_run_goes_on_with_more_decisions_and_its_own_command_line(
-    capsys,
-):
-    folder, _ = train(capsys, "seed=5")
-    assert main([f"resume={folder}", "total_decisions=480"]) == 0
-    results = json.loads((folder / "results.json").read_text())
-    assert results["decisions"] == 480
-    assert results["config"]["seed"] == 5
-    assert decisions(folder) == [160, 320, 480]
-
-
 def test_a_new_run_in_the_folder_of_another_is_refused(finished, capsys, tmp_path):
     folder = shutil.copytree(finished, tmp_path / "run")
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     assert main([*TINY, f"hydra.run.dir={folder}", "seed=9"]) == 2
     assert f"run: a run is there already; go on with resume={folder}, or" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
-
-
-def test_a_run_in_two_parts_ends_like_one_in_a_piece(finished, capsys, tmp_path):
-    whole, _ = train(capsys, "total_decisions=480")
-    parts = shutil.copytree(finished, tmp_path / "parts")
-    assert main([f"resume={parts}", "total_decisions=480"]) == 0
-    one, other = (read_agent(folder / "agent.safetensors")[0] for folder in (whole, parts))
-    assert all((one[name] == other[name]).all() for name in one)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -124,57 +105,6 @@ def test_the_second_phase_starts_from_the_first_ones_agent(capsys):
     assert (folder / "pretrain" / "agent.safetensors").is_file()
     metadata = read_agent(folder / "agent.safetensors")[2]
     assert metadata["training"]["init"] == str(folder / "pretrain" / "agent.safetensors")
-
-
-def test_a_start_from_another_observation_is_refused(finished, capsys, tmp_path):
-    start = [
-        "init=idm_ckpt",
-        f"init.path={finished / 'agent.safetensors'}",
-        "observation=table3",
-    ]
-    before = sorted(tmp_path.rglob("*"))
-    assert main([*TINY, *start]) == 2
-    assert "give observation=table3_progress" in capsys.readouterr().err
-    assert sorted(tmp_path.rglob("*")) == before
-
-
-@pytest.mark.slow
-def test_a_sweep_gives_every_run_a_folder(capsys, tmp_path):
-    short = [option for option in TINY if not option.startswith(("traffic=", "total_decisions="))]
-    assert (
-        main(
-            [
-                "-m",
-                *short,
-                "total_decisions=16",
-                "seed=0,1",
-                "traffic=idm,idm_mobil",
-            ]
-        )
-        == 0
-    )
-    results = sorted(tmp_path.glob("outputs/train_sweeps/*/*/results.json"))
-    assert [path.parent.name for path in results] == [
-        "0",
-        "1",
-        "2",
-        "3",
-    ]
-    configs = [json.loads(path.read_text())["config"] for path in results]
-    assert {(c["seed"], c["traffic"]["_target_"]) for c in configs} == {
-        (seed, f"ganlane.traffic.{name}")
-        for seed in (0, 1)
-        for name in ("IdmTraffic", "IdmMobilTraffic")
-    }
-
-
-def test_a_users_own_traffic_trains(capsys):
-    _, results = train(
-        capsys,
-        "traffic._target_=entry_own_parts.Cruise",
-        "total_decisions=16",
-    )
-    assert results["rows"][0]["traffic"] == "entry_own_parts.Cruise"
 
 
 @pytest.mark.parametrize(

@@ -229,18 +229,6 @@ def test_the_lane_view_is_that_of_the_tensor_code(form, sensors):
         assert torch.allclose(td["observation"], plain(td.clone())["observation"], atol=1e-6)
 
 
-def test_rows_that_are_reset_alone_start_as_all_do():
-    some = native(64, kernel="torch", seed=4)
-    whole = native(128, kernel="torch", seed=4)
-    td = some.reset()
-    mask = torch.zeros(64, dtype=torch.bool)
-    mask[[3, 17, 40]] = True
-    after = some.reset(td.clone().set("_reset", mask))
-    expected = whole.reset()
-    assert (after[mask] == expected[[67, 81, 104]]).all()
-    assert (after[~mask] == td[~mask]).all()
-
-
 @pytest.mark.parametrize("abort", [False, True])
 @SENSORS
 def test_the_safe_actions_are_those_of_the_tensor_code(abort, sensors):

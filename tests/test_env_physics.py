@@ -7,12 +7,12 @@ import shutil
 import pytest
 import torch
 from reference.worlds import environment, leaves, same_bits, step
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 
 from ganlane import build, keys, runtime
 from ganlane.agents.drivers import MobilDriver
 from ganlane.env import HighwayEnv
-from ganlane.env.physics import EndedRows, run_decision
+from ganlane.env.physics import EndedRows
 from ganlane.errors import UserError
 from ganlane.settings.driving import Visibility
 from ganlane.settings.env import EnvConfig
@@ -78,33 +78,6 @@ def test_where_a_look_would_stall_the_device_the_memory_is_the_same(monkeypatch)
     monkeypatch.setattr(EndedRows, "keep", None)
     for one, other in zip(looked, ages(Ageing())):
         assert torch.equal(one, other)
-
-
-def test_a_decision_without_steps_leaves_everything_as_it_is():
-    env = environment(num_envs=3)
-    td = env.reset()
-    start, _ = env.physics.begin(
-        env.rules,
-        torch.tensor([0, 2, 1]),
-        env.scenes(torch.arange(3), env.dtype),
-        dict(td[keys.EGO].items()),
-        td[keys.STEP],
-    )
-    _, memory = run_decision(
-        env.traffic, env.physics, env.rules, td, start, torch.arange(3), substeps=0
-    )
-    assert same_bits(memory, td[keys.TRAFFIC]) == []
-
-
-def test_a_row_that_never_ran_and_one_that_ended_may_differ_in_empty_parts():
-    # Between decisions TorchRL drops parts without a memory, which come back in the first step.
-    age = torch.arange(3)
-    before = TensorDict({"a": TensorDict({"age": age}, [3])}, [3])
-    after = TensorDict({"a": TensorDict({"age": age + 10}, [3]), "b": TensorDict({}, [3])}, [3])
-    ended = EndedRows()
-    ended.keep(torch.tensor([True, False, False]), before)
-    ended.keep(torch.tensor([False, True, False]), after)
-    assert ended.restore(after.clone())["a", "age"].tolist() == [0, 11, 12]
 
 
 # HighwayEnv.compile(): the same drive to rounding, and one sentence where it cannot be

@@ -9,8 +9,7 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
-import torch
-from reference.gym_env import ID, KEEP, LEFT, ROOT, make, make_vec
+from reference.gym_env import KEEP, LEFT, ROOT, make, make_vec
 
 VECTOR = gymnasium.wrappers.vector
 MASKS_MAY_BE_ABSENT = tuple(map(int, re.findall(r"\d+", gymnasium.__version__)[:3])) >= (1, 2, 2)
@@ -88,35 +87,3 @@ def test_the_check_of_stable_baselines3_finds_nothing():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         checker.check_env(make().unwrapped)
-
-
-def test_tianshou_trains_on_it_unchanged():
-    pytest.importorskip("tianshou", minversion="2.0", reason="tianshou is not installed")
-    from tianshou.algorithm.modelfree.dqn import DQN, DiscreteQLearningPolicy
-    from tianshou.algorithm.optim import AdamOptimizerFactory
-    from tianshou.data import Collector, VectorReplayBuffer
-    from tianshou.env import DummyVectorEnv
-    from tianshou.trainer import OffPolicyTrainerParams
-    from tianshou.utils.net.common import Net
-
-    envs = DummyVectorEnv([lambda: gymnasium.make(ID, goal_m=100.0) for _ in range(2)])
-    net = Net(state_shape=envs.observation_space[0].shape, action_shape=3, hidden_sizes=[16])
-    policy = DiscreteQLearningPolicy(model=net, action_space=envs.action_space[0], eps_training=0.5)
-    before = [weight.detach().clone() for weight in net.parameters()]
-    algorithm = DQN(policy=policy, optim=AdamOptimizerFactory(lr=1e-3), target_update_freq=50)
-    collector = Collector(algorithm, envs, VectorReplayBuffer(1000, 2))
-    collector.reset()
-    parameters = OffPolicyTrainerParams(
-        training_collector=collector,
-        max_epochs=1,
-        epoch_num_steps=200,
-        collection_step_num_env_steps=20,
-        batch_size=32,
-        update_step_num_gradient_steps_per_sample=0.1,
-        show_progress=False,
-        verbose=False,
-    )
-    result = algorithm.run_training(parameters)
-    assert result.train_step == 200
-    assert result.train_episode >= 10
-    assert any(not torch.equal(old, new) for old, new in zip(before, net.parameters()))

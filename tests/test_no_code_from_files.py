@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import json
 import pickle
+import re
 import sys
 from pathlib import Path
 
@@ -112,17 +113,24 @@ STORED = {
 }
 #: Texts in its place that no such file has.
 TEXTS = {
+    "nothing": "",
+    "a number": "3",
+    "a zero byte": "\x00",
+    "two colons": "a: b: c",
+    "an open brace": "{unclosed",
+    "a list of mappings": "[{a: 1}]",
     "a YAML tag": "!!python/object/apply:os.system ['touch executed']",
     "a YAML tag at a key": "mask: !!python/object/apply:os.system ['touch executed']",
     "a YAML tag as a name": "traffic: {name: !!python/name:evil.make }",
     "a list": "- traffic=idm\n- traffic._target_=evil.Traffic\n",
     "aliases": "env: &a {lanes: 3}\nreward: *a\n",
+    "aliases of aliases": "a: &a [x, x]\nb: &b [*a, *a]\nc: &c [*b, *b]\n",
     "an endless alias": "&a {traffic: *a}",
     "a mapping merged into another": "a: &a {_target_: evil.Traffic}\ntraffic: {<<: *a}\n",
     "endless brackets": "[" * 100_000,
     "endless braces": "{a: " * 50_000,
     "endless lists": "- " * 100_000,
-    "too large a file": f"seed: {'0' * 2**18}1",
+    "too large a file": "# " + "x" * 2**20,
 }
 CONFIGS = TEXTS | {way: json.dumps(stored) for way, stored in STORED.items()}
 
@@ -130,9 +138,16 @@ CONFIGS = TEXTS | {way: json.dumps(stored) for way, stored in STORED.items()}
 @pytest.mark.parametrize("way", CONFIGS)
 def test_the_settings_of_a_run_execute_nothing_when_it_is_resumed(way, capsys):
     run_folder(CONFIGS[way])
-    refusal(capsys, "train", "resume=run")
+    told = refusal(capsys, "train", "resume=run")
+    if way in TEXTS:
+        assert re.search(r"run/config\.yaml: (missing or )?damaged", told)
     with pytest.raises(UserError):
         train(folder="run", resume=True)
+
+
+def test_a_wrong_value_in_the_settings_of_a_run_is_named(capsys):
+    run_folder("env: {lanes: many}")
+    assert "env.lanes=many" in refusal(capsys, "train", "resume=run")
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ import torch
 from trial import damages
 from trial.damage import READERS, SCENE, Reader, Trial, bits
 from trial.kill import TINY, differences, refused_writes, torn_write, train
-from trial.misuse import outcome
 from trial.soak import actions, violations
 from trial.tally import Tally, forked
 
@@ -83,11 +82,6 @@ def test_damage_changes_a_file_and_is_the_same_for_the_same_number(way):
 
     assert damaged() == damaged()
     assert sum(text != SCENE.encode() for text in damaged()) > 15
-
-
-def test_a_call_is_judged_by_how_it_ends():
-    assert outcome(("make_env", "num_envs", 2)).startswith("REFUSED num_envs")  # -1
-    assert outcome(("make_env", "lanes", 4)) == "WORKED"  # 3
 
 
 def test_other_weights_figures_and_parts_of_files_are_seen(tmp_path):

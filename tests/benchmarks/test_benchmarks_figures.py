@@ -10,13 +10,11 @@ import pytest
 from matplotlib.colors import to_hex
 
 from benchmarks.figures import (
-    discriminator_blocks,
-    draw_architecture,
     draw_space_time,
     generator_blocks,
     lane_courses,
 )
-from ganlane.generator import Discriminator, load_generator, shipped_generator
+from ganlane.generator import load_generator, shipped_generator
 from ganlane.view.figures import COLOURS, INK
 
 
@@ -34,22 +32,6 @@ def test_the_architecture_shows_every_weight_and_the_shapes_of_the_loaded_genera
     assert blocks["embedding"].shape == (5, sizes.observed - 1, 4 * sizes.hidden)
     assert blocks["context"].shape == (5, sizes.hidden - sizes.noise)
     assert blocks["predicted displacements"].shape == (5, sizes.predicted, 2)
-
-
-def test_the_discriminator_gives_a_logit_per_vehicle_and_every_block_has_its_box_and_arrow():
-    discriminator = Discriminator()
-    blocks = discriminator_blocks(discriminator, 16, vehicles=5)
-    assert blocks[-1].shape == (5,)
-    assert sum(block.parameters for block in blocks) == sum(
-        p.numel() for p in discriminator.parameters()
-    )
-    (axes,) = draw_architecture({"discriminator": blocks}).axes
-    texts = [text.get_text() for text in axes.texts]
-    assert len(axes.patches) == 4
-    assert texts.count("") == 3  # an arrow is an annotation without words
-    for block in blocks:
-        assert {block.title, *block.does, str(list(block.shape))} <= set(texts)
-        assert not block.parameters or f"{block.parameters} weights" in texts
 
 
 def course(lanes):

@@ -30,8 +30,8 @@ def test_every_table_and_figure_in_the_documents_is_that_of_the_committed_result
     assert printed.differences(results) == []
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/drivers.md"])
-def test_another_digit_in_a_table_is_found(results, documents, document):
+def test_another_digit_in_a_table_is_found(results, documents):
+    document = "README.md"
     path = documents / document
     begin, end = printed.markers(
         next(name for place, name in printed.SECTIONS if place == document)

@@ -28,7 +28,6 @@ from ganlane.settings.driving import Visibility
 from ganlane.sim.state import Road, Vehicles, body_lanes
 from ganlane.traffic import IdmTraffic
 from ganlane_simulators import SumoTraffic
-from ganlane_simulators.sumo_roads import ORIGIN_M
 
 LEFT = 1
 RIGHT = 2
@@ -146,33 +145,6 @@ def test_an_episode_is_the_same_alone_and_beside_others_whatever_was_driven_befo
     # among them.
     drive(HighwayEnv(traffic, 4), [11, 12, 13, 14], 17, turns)
     assert_same_alone(HighwayEnv, traffic, [1, 3, 4, 6], 40)
-
-
-def test_stand_ins_are_where_the_ego_is(traffic):
-    env = HighwayEnv(traffic, 1)
-    wrong = []
-    lanes_seen = set()
-
-    def compare(vehicles, running):
-        x = float(vehicles.x[0, 0] + 0.5 * vehicles.length[0, 0])
-        roads = traffic._simulation.roads
-        place = roads.libsumo.vehicle.getLanePosition
-        stand_ins = {lane: place(name) - ORIGIN_M for lane, name in roads._stand_ins[0].items()}
-        lanes_seen.add(tuple(sorted(stand_ins)))
-        wrong.extend(abs(place - x) for place in stand_ins.values())
-        y = float(vehicles.y[0, 0])
-        assert round(y / 4.0) in stand_ins
-
-    state = start(env, [3])
-    env.recorder = compare
-    lane = int(state[keys.VEHICLES, "target_lane"][0, 0])
-    there, back = (LEFT, RIGHT) if lane < 2 else (RIGHT, LEFT)
-    for action in (0, there, 0, 0, 0, 0, 0, back, 0, 0, 0, 0, 0):
-        state[keys.ACTION] = torch.tensor([action])
-        state = env.step(state)["next"]
-    assert max(wrong) < 2e-3, "float32 and one step of the ego's car following"
-    # Half way it is in both lanes, before and afterwards in one.
-    assert {len(lanes) for lanes in lanes_seen} == {1, 2}
 
 
 def follower_of(traffic, lane_of_ego, action):

@@ -17,13 +17,9 @@ from ganlane.build import make_env, make_traffic
 from ganlane.settings.observation import ObservationConfig
 from ganlane.settings.traffic import IdmTrafficConfig
 from ganlane.training.checkpoint import (
-    TrainingState,
     load_checkpoint,
 )
 from ganlane.training.collectors import Collector, pack, unpack
-from ganlane.training.loop import advance
-
-NO_CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 
 
 def road(rows, device="cpu"):
@@ -68,23 +64,6 @@ def test_the_state_of_a_highway_is_taken_over_row_by_row_or_its_next_episodes_be
     step = second.step(learner)
     assert step[keys.STEP].eq(0).all()
     assert torch.equal(step[keys.EPISODE], episodes + 6)
-
-
-@NO_CUDA
-def test_on_a_gpu_nothing_of_a_run_is_elsewhere():
-    learner = Rainbow(RainbowConfig(**SMALL), 29, device="cuda")
-    run = TrainingState(road(32, "cuda"), learner)
-    for _ in range(4):
-        step = advance(run)
-    learner.update()
-    tensordicts = (run.collector.env_state, step, learner.replay[:])
-    tensors = [value for tensordict in tensordicts for value in tensordict.values(True, True)]
-    tensors += [
-        *learner.network.parameters(),
-        *run.stats.sums.values(),
-        *run.stats.running.values(),
-    ]
-    assert {tensor.device.type for tensor in tensors} == {"cuda"}
 
 
 KILLED = """

@@ -133,26 +133,3 @@ def test_returns_to_go_and_values_are_averaged_over_the_decisions_of_finished_ep
     # From the three decisions: 1 + 2/2 + 4/4, 2 + 4/2, 4.
     assert row["mean_return_to_go"] == pytest.approx((3.0 + 4.0 + 4.0) / 3.0)
     assert row["mean_value"] == pytest.approx(4.0)
-
-
-def test_the_return_to_go_agrees_with_a_sum_over_every_decision():
-    generator = torch.Generator().manual_seed(0)
-    gamma = 0.9
-    rows = 5
-    rewards = torch.randn(60, rows, generator=generator)
-    ends = torch.rand(60, rows, generator=generator) < 0.15
-    stats = EpisodeStats(rows, 2, gamma)
-    total = 0.0
-    count = 0
-    for reward, done in zip(rewards, ends):
-        stats.step(step(reward.tolist(), done.tolist()))
-    for row in range(rows):
-        begin = 0
-        for end in ends[:, row].nonzero().flatten().tolist():
-            episode = rewards[begin : end + 1, row].tolist()
-            total += sum(
-                gamma**i * r for start in range(len(episode)) for i, r in enumerate(episode[start:])
-            )
-            count = count + len(episode)
-            begin = end + 1
-    assert stats.read()["mean_return_to_go"] == pytest.approx(total / count, rel=1e-5)

@@ -8,7 +8,7 @@
     python -m tests.trial soak --configuration 12               a configuration again
 
 Parts: kill (kill -9, signals, refused writes, then resumed to the same bits), damage (damaged
-files), misuse (of the API), soak (random configurations). Without a part's name all of them run.
+files), soak (random configurations). Without a part's name all of them run.
 Exits with 1 after a failure. Needs Linux.
 """
 
@@ -25,13 +25,12 @@ from benchmarks.script import ReportSection, add_report, make_parser, run_script
 
 from .damage import Trial, damage, good_files
 from .kill import kill
-from .misuse import misuse
 from .soak import once, soak
 from .tally import Tally
 
 MARKERS = "<!-- begin trial -->", "<!-- end trial -->"
 #: Parts, and their shares of the minutes.
-SHARES = {"kill": 6, "damage": 4, "misuse": 2, "soak": 8}
+SHARES = {"kill": 6, "damage": 4, "soak": 8}
 HEAD = "| part | tried | failed | minutes |\n|---|---|---|---|"
 
 
@@ -43,8 +42,6 @@ def run(part: str, options: argparse.Namespace, minutes: float, scratch: Path) -
         kill(tally, options.runs, options.seed, minutes, scratch, options.only_kill)
     elif part == "damage":
         damage(tally, options.inputs, options.seed, minutes, scratch)
-    elif part == "misuse":
-        misuse(tally, options.seed, minutes)
     else:
         soak(tally, options.configurations, options.seed, minutes, options.compiled)
     tally.seconds = time.monotonic() - begun

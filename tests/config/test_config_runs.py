@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 import torch
 from hydra.core.override_parser.types import Quote, QuotedString
-from training.test_training_loop import ToyRoad, agent, train
-from training.test_training_loop import settings as schedule
+from training.small_runs import agent, road, train
+from training.small_runs import settings as schedule
 
 from ganlane.config.compose import parsed
 from ganlane.config.run import (
@@ -35,7 +35,7 @@ from ganlane.errors import UserError
 from ganlane.training.checkpoint import LAST, load_checkpoint
 
 ROOT = Path(__file__).resolve().parents[2]
-COLUMNS = ("decisions", "updates", "mean_return", "loss", "crash_rate")
+COLUMNS = ("decisions", "updates", "mean_return", "loss", "out_of_road_rate")
 
 
 @pytest.fixture(autouse=True)
@@ -43,8 +43,8 @@ def here(empty_folder):
     return empty_folder
 
 
-def toy_run(config, folder):
-    """A training run on the toy road in the folder of a ``ganlane train``, with evaluations."""
+def short_run(config, folder):
+    """A training run of seconds in the folder of a ``ganlane train``, with evaluations."""
     learner = agent()
     figures = {"mean_reward": 0.0}
 
@@ -54,10 +54,10 @@ def toy_run(config, folder):
 
     resume = folder / LAST if config.resume else None
     often = schedule(160, log_every=40, evaluate_every=80, checkpoint_every_s=0.0)
-    train(ToyRoad(8), learner, often, folder, evaluate, resume=resume)
+    train(road(8), learner, often, folder, evaluate, resume=resume)
 
 
-def command(*arguments, task=toy_run):
+def command(*arguments, task=short_run):
     return run_command("train", [*arguments, "seed=3"], task)
 
 
@@ -120,7 +120,7 @@ def test_a_run_ended_by_a_full_disk_goes_on_to_the_same_weights(
 )
 def test_a_run_that_ends_in_an_error_after_training_keeps_its_command_line(error, here, capsys):
     def task(config, folder):
-        toy_run(config, folder)
+        short_run(config, folder)
         raise error
 
     assert command("hydra.run.dir=run", "env.lanes=4", task=task) == 2

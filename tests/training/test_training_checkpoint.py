@@ -2,8 +2,7 @@
 
 import pytest
 import torch
-from training.test_training_loop import agent, settings, train
-from training.toy import ToyRoad
+from training.small_runs import agent, road, settings, train
 
 from ganlane.errors import UserError
 from ganlane.files import PLACE
@@ -58,9 +57,9 @@ def test_weights_that_are_not_finite_are_refused(part, value, tmp_path):
 
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory):
-    """The state of a run on the toy road that has learned."""
+    """The state of a run that has learned."""
     folder = tmp_path_factory.mktemp("stopped")
-    train(ToyRoad(8), agent(), settings(160, log_every=72), folder)
+    train(road(8), agent(), settings(160, log_every=72), folder)
     return load_checkpoint(folder / LAST)
 
 
@@ -113,9 +112,9 @@ def test_a_part_of_a_run_that_is_something_else_is_refused_in_one_sentence(
         UserError,
         match=r"^resume=[^\n]*last\.pt: [^\n]*; give another checkpoint\.$",
     ):
-        TrainingState(ToyRoad(8), agent()).restore(tmp_path / "last.pt")
+        TrainingState(road(8), agent()).restore(tmp_path / "last.pt")
 
 
 def test_the_parts_of_a_run_are_those_of_this_run(stopped, tmp_path):
     save_checkpoint(tmp_path / "last.pt", stopped)
-    assert TrainingState(ToyRoad(8), agent()).restore(tmp_path / "last.pt") is None
+    assert TrainingState(road(8), agent()).restore(tmp_path / "last.pt") is None

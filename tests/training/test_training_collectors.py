@@ -5,32 +5,15 @@ import sys
 import time
 from pathlib import Path
 
-import pytest
 import torch
 from tensordict import TensorDict
-from training.test_training_loop import agent, settings, train
-from training.toy import ROAD, SMALL, ToyRoad, gone, same
+from training.small_runs import agent, gone, road, same, settings, train
 
 from ganlane import keys
-from ganlane.agents import Rainbow, RainbowConfig
-from ganlane.build import make_env, make_traffic
-from ganlane.settings.observation import ObservationConfig
-from ganlane.settings.traffic import IdmTrafficConfig
 from ganlane.training.checkpoint import (
     load_checkpoint,
 )
 from ganlane.training.collectors import Collector, pack, unpack
-
-
-def road(rows, device="cpu"):
-    traffic = make_traffic(IdmTrafficConfig(), ROAD)
-    return make_env(
-        traffic,
-        ROAD,
-        ObservationConfig(),
-        num_envs=rows,
-        device=device,
-    )
 
 
 def test_a_tensordict_is_packed_with_its_nested_batch_sizes():
@@ -42,7 +25,7 @@ def test_a_tensordict_is_packed_with_its_nested_batch_sizes():
 
 
 def test_the_state_of_a_highway_is_taken_over_row_by_row_or_its_next_episodes_begun():
-    learner = Rainbow(RainbowConfig(**SMALL), 29)
+    learner = agent()
     first = Collector(road(6))
     second = Collector(road(6))
     for _ in range(3):
@@ -71,23 +54,15 @@ import sys
 import torch
 torch.set_num_threads(1)
 sys.path[:0] = [{tests!r}]
-from training.test_training_loop import ToyRoad, agent, settings, train
+from training.small_runs import agent, road, settings, train
 import ganlane.training.checkpoint as checkpoint
 checkpoint.PATIENCE = 0.0
-train(ToyRoad(8), agent(), settings(10**9, checkpoint_every_s=0.0), {folder!r})
+train(road(8), agent(), settings(10**9, checkpoint_every_s=0.0), {folder!r})
 """
 
 
-@pytest.mark.parametrize(
-    "after_s",
-    [
-        0.11,
-        pytest.param(0.0, marks=pytest.mark.slow),
-        pytest.param(0.53, marks=pytest.mark.slow),
-    ],
-)
-def test_a_run_killed_at_any_moment_is_resumed_to_the_same_weights(after_s, tmp_path):
-    """Killed so many seconds after its first checkpoint."""
+def test_a_run_killed_at_any_moment_is_resumed_to_the_same_weights(tmp_path):
+    """Killed a tenth of a second after its first checkpoint; other moments are in tests/trial."""
     folder = tmp_path / "parts"
     tests = Path(__file__).resolve().parent.parent
     script = KILLED.format(tests=str(tests), folder=str(folder))
@@ -100,13 +75,13 @@ def test_a_run_killed_at_any_moment_is_resumed_to_the_same_weights(after_s, tmp_
     while not last.exists():
         assert process.poll() is None
         time.sleep(0.01)
-    time.sleep(after_s)
+    time.sleep(0.11)
     process.kill()
     process.wait()
     assert gone(process.pid)
     more = settings(int(load_checkpoint(last)["counters"]["decisions"]) + 400)
     resumed = agent(seed=5)
     whole = agent()
-    train(ToyRoad(8), resumed, more, folder, resume=last)
-    train(ToyRoad(8), whole, more, tmp_path / "whole")
+    train(road(8), resumed, more, folder, resume=last)
+    train(road(8), whole, more, tmp_path / "whole")
     assert same(whole, resumed)

@@ -191,17 +191,6 @@ def test_the_mobil_ego_gets_through_dense_traffic_and_faster_than_one_that_keeps
 # The seam
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_episodes_differ_and_do_not_depend_on_the_batch(name):
-    config = SCENARIOS[name]
-    traffic = make_traffic(TRAFFICS["idm_mobil"], config)
-    many, one = (make_env(traffic, config, num_envs=count).reset() for count in (50, 1))
-    speed = many[keys.VEHICLES, "speed"]
-    assert len(set(speed[:, 0].tolist())) == 50
-    assert torch.equal(speed[0], one[keys.VEHICLES, "speed"][0])
-    assert torch.equal(many[keys.VEHICLES, "x"][0], one[keys.VEHICLES, "x"][0])
-
-
 def test_any_callable_with_a_check_makes_the_scene():
     class Mine:
         vehicles = 2

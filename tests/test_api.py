@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from pathlib import Path
@@ -10,8 +11,10 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from reference.refusals import last_path
 
 import ganlane
+from ganlane.__main__ import main
 from ganlane.agents.drivers import DRIVERS
 from ganlane.config.run import COMMANDS, function_of
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
@@ -92,22 +95,25 @@ def test_a_loaded_agent_drives_an_environment():
 
 
 def test_the_table_has_the_numbers_of_the_command(capsys):
-    from ganlane.__main__ import main
-
     line = "agents=[mobil,random_legal] traffics=[idm,idm_mobil] episodes=3 env.goal_m=40 seed=2"
     assert main(["evaluate", *line.split()]) == 0
-    written = Path(capsys.readouterr().out.splitlines()[-1].removeprefix("results: "))
-    rows = json.loads(written.read_text())["rows"]
+    written = last_path(capsys.readouterr().out)
+    results = json.loads(written.read_text())
     threads = torch.get_num_threads()
-    table = ganlane.api.evaluate(
-        ["mobil", "random_legal"], ["idm", "idm_mobil"], 3, seed=2, goal_m=40, folder="mine"
-    )
+    agents, traffics = ["mobil", "random_legal"], ["idm", "idm_mobil"]
+    table = ganlane.api.evaluate(agents, traffics, 3, seed=2, goal_m=40, folder="mine")
     assert torch.get_num_threads() == threads
-    assert json.loads(json.dumps(table.to_dicts())) == rows
-    assert json.loads(Path("mine/results.json").read_text())["rows"] == rows
-    assert pl.read_parquet("mine/episodes.parquet").equals(
-        pl.read_parquet(written.parent / "episodes.parquet")
-    )
+    assert json.loads(json.dumps(table.to_dicts())) == results["rows"]
+    assert json.loads(Path("mine/results.json").read_text())["rows"] == results["rows"]
+    pairs = [(row["traffic"], row["agent"]) for row in results["rows"]]
+    assert pairs == list(itertools.product(traffics, agents))
+    assert table["episodes"].to_list() == [3] * 4
+    assert table["normalized_percent"][0] == pytest.approx(100.0)
+    assert {"config", "code", "machine", "seeds"} <= results.keys()
+    assert (written.parent / "config.yaml").is_file()
+    episodes = pl.read_parquet("mine/episodes.parquet")
+    assert episodes.height == 12
+    assert episodes.equals(pl.read_parquet(written.parent / "episodes.parquet"))
 
 
 def test_own_drivers_and_own_names_stand_in_the_table():

@@ -95,22 +95,6 @@ def test_the_runs_of_a_sweep_share_no_file(launcher, tmp_path):
     assert weights[0] != weights[1]
 
 
-@pytest.mark.slow
-def test_a_mistake_in_a_process_of_a_sweep_is_one_sentence(tmp_path):
-    skip_without("joblib")
-    joblib = ["hydra/launcher=joblib", *LAUNCHERS["joblib"][1]]
-    done = sweep(
-        tmp_path,
-        *joblib,
-        "init=idm_ckpt",
-        "init.path=nowhere.safetensors",
-    )
-    assert done.returncode == 2
-    assert "nowhere.safetensors" in done.stderr.splitlines()[-1]
-    assert "Traceback" not in done.stderr
-    assert not (tmp_path / "outputs").exists()
-
-
 @pytest.fixture
 def own_logging(monkeypatch):
     """Hydra's log handlers, which write to this test's captured output, end with the test."""

@@ -60,18 +60,6 @@ def test_random_actions_depend_on_the_episode_and_not_on_the_batch():
     assert torch.equal(driver(few)["action"], driver(many)["action"][:4])
 
 
-def test_mobil_overtakes_a_slow_leader_where_the_left_lane_is_free():
-    state = states(1, m=2)
-    vehicles = state["vehicles"]
-    vehicles["x"][:] = torch.tensor([[0.0, 30.0]])
-    vehicles["y"][:] = 0.0
-    vehicles["target_lane"][:] = 0
-    vehicles["speed"][:] = torch.tensor([[20.0, 12.0]])
-    assert MobilDriver(Road())(state)["action"].item() == LEFT
-    vehicles["x"][:] = torch.tensor([[0.0, 900.0]])
-    assert MobilDriver(Road())(state)["action"].item() == KEEP
-
-
 def test_a_polite_mobil_yields_where_an_egoistic_one_cuts_in():
     state = states(1, m=3)
     vehicles = state["vehicles"]

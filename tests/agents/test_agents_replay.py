@@ -104,16 +104,15 @@ def test_the_item_of_an_index_is_the_one_stored_there_after_the_buffer_wraps():
 
 @pytest.mark.parametrize("prioritised", [True, False])
 def test_draws_come_from_the_buffers_own_generator(prioritised):
-    before = torch.get_rng_state()
-    numpy_before = np.random.get_state()[1].copy()  # noqa: NPY002
-    first, second = (buffer(prioritised=prioritised, seed=4) for _ in range(2))
-    assert torch.equal(first.sample()["index"], second.sample()["index"])
-    assert not torch.equal(
-        first.sample()["index"],
-        buffer(prioritised=prioritised, seed=5).sample()["index"],
+    state = torch.get_rng_state()
+    numpy_state = np.random.get_state()[1].copy()  # noqa: NPY002
+    first, second, other = (
+        buffer(prioritised=prioritised, seed=seed).sample()["index"] for seed in (4, 4, 5)
     )
-    assert torch.equal(torch.get_rng_state(), before)
-    assert (np.random.get_state()[1] == numpy_before).all()  # noqa: NPY002
+    assert torch.equal(first, second)
+    assert not torch.equal(first, other)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert (np.random.get_state()[1] == numpy_state).all()  # noqa: NPY002
 
 
 @pytest.mark.parametrize("prioritised", [True, False])

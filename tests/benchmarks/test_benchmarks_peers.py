@@ -39,7 +39,7 @@ from benchmarks.peers.tolerance import (
     slopes,
     tolerance,
 )
-from ganlane.sim.idm import TABLE_V, IdmParameters
+from ganlane.sim.idm import TABLE_V
 from ganlane.sim.neighbours import FREE_GAP_M
 
 ROOT = Path(__file__).parents[2]
@@ -177,25 +177,3 @@ def test_a_platoon_settles_at_the_equilibrium_gap(speed_mps, peer):
     assert platoon["away_m"] <= platoon["allowed_m"] <= 1e-5
     if not law.offset_m:
         assert platoon["gap_m"] == pytest.approx(equilibrium_gap(speed_mps), abs=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "peer", [peer for peer in simulators.PEERS if not peer.law.offset_m], ids=title
-)
-@pytest.mark.parametrize(
-    "other",
-    [
-        IdmParameters(headway_s=1.58),
-        IdmParameters(comfortable_deceleration=2.0),
-        IdmParameters(max_acceleration=0.72),
-    ],
-    ids=["headway", "deceleration", "acceleration"],
-)
-def test_a_peer_with_another_driver_is_found_out(other, peer):
-    """A headway 0.02 s shorter is more than the scheme may account for, and so are small changes of
-    the others.
-    """
-    need(peer.module)
-    sizes = between(peer.drive(CONSTANT, idm=other), mine(CONSTANT))
-    assert not within(sizes, tolerance(mine(CONSTANT), CONSTANT, peer.scheme))

@@ -13,9 +13,7 @@ from benchmarks.speed.measure import (
     Case,
     Labels,
     Sample,
-    best_rows,
     calls_per_turn,
-    exponent,
     make_row,
     take_turn,
     take_turns,
@@ -68,13 +66,6 @@ def test_a_ratio_compares_turns_of_the_same_round():
     peer = [Sample(wall_s, 0.5, 1, 10) for wall_s in (1.0, 10.0, 1.0)]
     row = make_row(LABELS, mine, peer)
     assert (row["ratio"], row["ratio_cpu"]) == pytest.approx((30, 15))
-
-
-def test_the_best_row_is_that_of_each_system_and_traffic_and_a_power_is_found():
-    rows = [{"system": "a", "traffic": traffic, "n": n} for traffic, n in (("x", 1), ("x", 3))]
-    rows.append({"system": "b", "traffic": "x", "n": 0})
-    assert [row["n"] for row in best_rows(rows, "n")] == [3, 0]
-    assert exponent([9, 15, 30], [0.3 * n**1.7 for n in (9, 15, 30)]) == pytest.approx(1.7)
 
 
 @pytest.mark.parametrize("mode", ["eager", "native"])

@@ -77,19 +77,6 @@ def test_an_ego_that_keeps_its_lane_crashes_with_nobody_and_nobody_with_another(
     assert overlaps(vehicles) == 0
 
 
-def test_the_goal_is_reached_without_a_crash(traffic):
-    env = HighwayEnv(traffic, 20, episode=EpisodeParameters(goal_m=1500.0))
-    state = start(env, range(100, 120))
-    goals = 0
-    for _ in range(150):
-        state[keys.ACTION] = torch.zeros(20, dtype=torch.int64)
-        stepped, state = env.step_and_maybe_reset(state)
-        assert not stepped["next", keys.EVENTS, "hard_crash"].any()
-        goals += int(stepped["next", keys.EVENTS, "goal"].sum())
-    # The rows that arrive go on with new episodes beside those that are still driving.
-    assert goals >= 20
-
-
 def test_nobody_jumps_and_speeds_are_differences_of_positions(driven):
     vehicles, _ = driven
     dx, dy = (field[1:] - field[:-1] for field in (vehicles.x, vehicles.y))

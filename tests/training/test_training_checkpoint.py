@@ -5,7 +5,6 @@ import torch
 from training.small_runs import agent, road, settings, train
 
 from ganlane.errors import UserError
-from ganlane.files import PLACE
 from ganlane.training.checkpoint import (
     LAST,
     TrainingState,
@@ -23,27 +22,6 @@ def test_a_checkpoint_comes_back_as_it_was(tmp_path):
     assert state["count"] == 4
     assert torch.equal(state["weights"], torch.arange(3))
     assert [path.name for path in tmp_path.iterdir()] == ["last.pt"]
-
-
-def test_one_changed_byte_anywhere_is_refused(tmp_path):
-    path = tmp_path / "last.pt"
-    save_checkpoint(path, {"weights": torch.arange(40), "count": 4})
-    whole = path.read_bytes()
-    for place in (
-        *range(0, len(whole), 13),
-        *range(len(whole) - 110, len(whole)),
-    ):
-        changed = bytearray(whole)
-        changed[place] ^= 1 << place % 8
-        path.write_bytes(changed)
-        with pytest.raises(
-            UserError,
-            match=r"^resume=.*last\.pt: (damaged|not a readable checkpoint)",
-        ):
-            load_checkpoint(path)
-    path.write_bytes(whole[: -len(PLACE)])  # the checksum cut off altogether
-    with pytest.raises(UserError, match="damaged"):
-        load_checkpoint(path)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])

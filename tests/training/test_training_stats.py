@@ -7,42 +7,20 @@ from tensordict import TensorDict
 from ganlane.training.stats import EpisodeStats
 
 
-def step(
-    reward,
-    done,
-    crash=None,
-    goal=None,
-    distance=0.0,
-    lane_changes=0,
-    action=0,
-    value=None,
-):
+def step(reward, done, distance=0.0, lane_changes=0, action=0, value=None, **events):
     rows = len(reward)
-
-    def column(flags):
-        return torch.tensor(flags or [False] * rows)[:, None]
-
-    after = {
-        "reward": torch.tensor(reward)[:, None],
-        "done": column(done),
-        "events": {
-            "goal": column(goal),
-            "hard_crash": column(crash),
-        },
-        "ego": {
-            "distance": torch.full((rows,), distance),
-            "lane_changes": torch.full((rows,), lane_changes),
-        },
-    }
-    values = {} if value is None else {"chosen_action_value": torch.tensor(value)[:, None]}
-    return TensorDict(
-        {
-            "action": torch.full((rows,), action),
-            "next": after,
-            **values,
-        },
-        [rows],
-    )
+    no = [False] * rows
+    td = TensorDict(batch_size=[rows])
+    td["action"] = torch.full((rows,), action)
+    td["next", "reward"] = torch.tensor(reward)[:, None]
+    td["next", "done"] = torch.tensor(done)[:, None]
+    for name in ("hard_crash", "goal"):
+        td["next", "events", name] = torch.tensor(events.get(name, no))[:, None]
+    td["next", "ego", "distance"] = torch.full((rows,), distance)
+    td["next", "ego", "lane_changes"] = torch.full((rows,), lane_changes)
+    if value is not None:
+        td["chosen_action_value"] = torch.tensor(value)[:, None]
+    return td
 
 
 def test_returns_and_rates_are_those_of_the_finished_episodes():
@@ -52,7 +30,7 @@ def test_returns_and_rates_are_those_of_the_finished_episodes():
         step(
             [2.0, 20.0],
             [True, False],
-            crash=[True, False],
+            hard_crash=[True, False],
             distance=1000.0,
             lane_changes=3,
             action=2,
@@ -93,30 +71,10 @@ def test_update_figures_are_averaged():
 
 def test_what_an_environment_or_a_policy_does_not_write_has_no_column():
     stats = EpisodeStats(1, 2, gamma=1.0)
-    after = {
-        "reward": torch.ones(1, 1),
-        "done": torch.ones(1, 1, dtype=torch.bool),
-    }
-    stats.step(
-        TensorDict(
-            {
-                "action": torch.zeros(1, dtype=torch.int64),
-                "next": after,
-            },
-            [1],
-        )
-    )
-    means = {
-        "mean_return",
-        "mean_discounted_return",
-        "mean_return_to_go",
-    }
-    assert set(stats.read()) == {
-        "episodes",
-        "action_0_share",
-        "action_1_share",
-        *means,
-    }
+    written = step([1.0], [True]).select("action", ("next", "reward"), ("next", "done"))
+    stats.step(written)
+    means = {"mean_return", "mean_discounted_return", "mean_return_to_go"}
+    assert set(stats.read()) == {"episodes", "action_0_share", "action_1_share", *means}
 
 
 def test_returns_to_go_and_values_are_averaged_over_the_decisions_of_finished_episodes():

@@ -76,14 +76,6 @@ def test_options_come_as_names_mappings_configs_and_classes():
     assert ganlane.make_env("idm", env="dense", vehicles=40).base_env.vehicles == 40
 
 
-def test_a_mixture_takes_options_of_its_parts_and_models_of_your_own():
-    shares = {"gan": 1, "ganlane.traffic.IdmTraffic": 2}
-    mixed = {"name": "mixed", "shares": shares, "options": {"gan": {"noise_scale": 0.5}}}
-    traffic = ganlane.make_env(mixed, 3).base_env.traffic
-    assert ganlane.make_env(mixed, 3).reset().shape == (3,)
-    assert traffic is not None
-
-
 def test_a_loaded_agent_drives_an_environment():
     agent = ganlane.load_agent("agent_idm")
     env = ganlane.make_env("idm", 2, observation=agent.observation, goal_m=50.0)

@@ -36,14 +36,6 @@ def command(*arguments, cwd):
     )
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_help_names_the_command_its_keys_and_how_it_ends(name, capsys):
-    assert main([name, "--help"]) == 0
-    shown = capsys.readouterr().out
-    assert all(part in shown for part in (f"ganlane {name} ", "seed: 0", "exit status"))
-    assert shown == help_text(name, COMMANDS[name][0]) + "\n"
-
-
 def test_help_of_train_explains_every_traffic_and_start():
     text = help_text("train", TrainConfig)
     for group in (

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import shutil
 import signal
-import threading
-import time
 from functools import partial
 
 import entry_tiny
 import pytest
 from reference.refusals import last_path
+from training.small_runs import signal_at
 
 from ganlane.agents import read_agent
 from ganlane.config.run import run_command
@@ -75,24 +73,12 @@ def test_a_new_run_in_the_folder_of_another_is_refused(finished, capsys, tmp_pat
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_saves_and_the_run_can_be_resumed(number, capsys, tmp_path):
-    def stop_when_training():
-        # A moment after the first figures stand in the file, the run is in its loop.
-        while not any(
-            len(path.read_text().splitlines()) > 1 for path in tmp_path.rglob("metrics.csv")
-        ):
-            time.sleep(0.01)
-        os.kill(os.getpid(), number)
-
-    watcher = threading.Thread(target=stop_when_training, daemon=True)
-    watcher.start()
-    assert main([*TINY, "total_decisions=10000000"]) == 128 + number
-    watcher.join()
-    err = capsys.readouterr().err
-    assert "go on with: ganlane train resume=" in err
+    with signal_at(320, number):
+        assert main([*TINY, "total_decisions=10000000"]) == 128 + number
+    assert "go on with: ganlane train resume=" in capsys.readouterr().err
     (checkpoint,) = tmp_path.rglob("last.pt")
-    reached = decisions(checkpoint.parents[1])[-1]
-    assert main(["resume=auto", f"total_decisions={reached + 320}"]) == 0
-    assert decisions(checkpoint.parents[1])[-1] == reached + 320
+    assert main(["resume=auto", "total_decisions=640"]) == 0
+    assert decisions(checkpoint.parents[1])[-1] == 640
 
 
 def test_the_second_phase_starts_from_the_first_ones_agent(capsys):
@@ -117,21 +103,13 @@ def test_the_second_phase_starts_from_the_first_ones_agent(capsys):
     ],
 )
 def test_every_traffic_and_every_start_runs(traffic, init, capsys):
-    budget = [
-        "total_decisions=64",
-        "collector.num_envs=16",
-        "env.goal_m=40",
-        "agent.warmup=256",
-        "log_every=64",
-    ]
-    final = [
-        "evaluation.agents=[keep_lane]",
-        "evaluation.episodes=1",
-        "agent.capacity=1000",
-    ]
-    assert main([f"traffic={traffic}", f"init={init}", *budget, *final]) == 0
-    results = last_path(capsys.readouterr().out)
-    assert [row["traffic"] for row in json.loads(results.read_text())["rows"]] == [traffic, traffic]
+    words = (
+        "total_decisions=64 collector.num_envs=16 env.goal_m=40 agent.warmup=256 log_every=64 "
+        "evaluation.agents=[keep_lane] evaluation.episodes=1 agent.capacity=1000"
+    )
+    assert main([f"traffic={traffic}", f"init={init}", *words.split()]) == 0
+    results = json.loads(last_path(capsys.readouterr().out).read_text())
+    assert [row["traffic"] for row in results["rows"]] == [traffic, traffic]
 
 
 def test_a_trained_agent_survives_an_error_after_training(tmp_path, capsys, monkeypatch):

@@ -243,10 +243,7 @@ def test_an_episode_ends_for_one_reason_at_the_step_of_it(ego, others, action, r
     assert ends(after) == reasons
     assert flags(after) == (bool(reasons), False, bool(reasons))
     assert after[keys.STEP].item() == steps
-    distance = remembered(after, "distance")
-    assert (distance > 1000.0) == ("goal" in reasons or "hard_crash" in reasons)
-    if reasons == ["goal"] and steps == 2:
-        assert distance == pytest.approx(1000.1, abs=1e-3)
+    assert (remembered(after, "distance") > 1000.0) == bool({"goal", "hard_crash"} & set(reasons))
     if not reasons:
         assert after[keys.EVENTS, keys.SOFT_CRASH].item() == 0
     if reasons == ["out_of_road"]:
@@ -276,21 +273,20 @@ def standing(gap: float, behind: bool = False) -> list[dict]:
     return [ego, {**ego, "x": near}, {**ego, "x": third}]
 
 
-@pytest.mark.parametrize("behind", [False, True])
-def test_a_soft_crash_counts_once_until_it_is_over(behind):
+@pytest.mark.parametrize(
+    ("behind", "counted", "silent"),
+    [
+        (False, keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND),
+        (True, keys.SOFT_CRASH_BEHIND, keys.SOFT_CRASH),
+    ],
+    ids=["ahead", "behind"],
+)
+def test_a_soft_crash_counts_once_until_it_is_over(behind, counted, silent):
     env = environment(vehicles=3, mobil=False)
     td = env.reset()
-    counts = {keys.SOFT_CRASH: [], keys.SOFT_CRASH_BEHIND: []}
-    for gap in (1.5, 1.5, 3.0, 1.5, 1.5):
-        for name, value in vehicles(*standing(gap, behind)).as_dict().items():
-            td[keys.VEHICLES, name] = value
+    for gap, count in ((1.5, 1), (1.5, 0), (3.0, 0), (1.5, 1), (1.5, 0)):
+        td[keys.VEHICLES].update(vehicles(*standing(gap, behind)).as_dict())
         td = step(env, td)
         assert flags(td) == (False, False, False)  # it is no end
-        for name, count in counts.items():
-            count.append(td[keys.EVENTS, name].item())
-    here, there = (
-        (keys.SOFT_CRASH_BEHIND, keys.SOFT_CRASH)
-        if behind
-        else (keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND)
-    )
-    assert counts == {here: [1, 0, 0, 1, 0], there: [0, 0, 0, 0, 0]}
+        assert td[keys.EVENTS, counted].item() == count
+        assert td[keys.EVENTS, silent].item() == 0

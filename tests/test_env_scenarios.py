@@ -231,23 +231,6 @@ def test_a_scene_that_does_not_fit_or_is_hopeless_is_refused_when_the_environmen
         HighwayEnv(IdmTraffic(Road(2)), vehicles=vehicles, scenes=scenes)
 
 
-@pytest.mark.parametrize(
-    ("overrides", "what"),
-    [
-        (["env=cut_in", "env.vehicles=5"], "env.vehicles=5: the scene has 6"),
-        (["env=cut_in", "env.lanes=1"], "env=cut_in needs 2 lanes or more"),
-        (["env=stalled_car", "env.spread_m=300"], "env.spread_m=300"),
-        (["env=cut_in", "env.scene.gap_m=3", "env.scene.speed_mps=36"], "would need 100 m/s2"),
-        (["env=scene"], "env.scene.path: no file"),
-        (["env.min_spacing_m=12"], "raise env.min_spacing_m to 17.8"),
-    ],
-)
-def test_a_mistaken_scenario_is_told_in_a_sentence_before_anything_is_made(overrides, what):
-    with pytest.raises(UserError) as refused:
-        settings("evaluate", overrides)
-    assert what in str(refused.value)
-
-
 def test_a_file_gives_vehicles_lanes_and_the_egos_desired_speed(tmp_path):
     path = tmp_path / "mine.csv"
     path.write_text("x_m,lane,speed_mps,desired_speed_mps\n5,1,20,30\n60,2,20,22\n")

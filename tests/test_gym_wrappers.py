@@ -40,14 +40,6 @@ def test_gymnasiums_own_vector_wrappers_take_the_batch(mode):
     assert all(1 <= length <= 6 for length in lengths)
 
 
-def test_gymnasiums_own_vectorisation_works_too():
-    envs = make_vec(2, vectorization_mode="sync")
-    observation, info = envs.reset(seed=4)
-    assert info["seed"].tolist() == [4, 5]
-    np.testing.assert_array_equal(observation[1], make().reset(seed=5)[0])
-    assert envs.step(np.zeros(2, int))[0].shape == (2, 29)
-
-
 @pytest.mark.skipif(not MASKS_MAY_BE_ABSENT, reason="DictInfoToList needs gymnasium 1.2.2 or newer")
 def test_infos_of_a_batch_can_be_had_row_by_row():
     envs = VECTOR.DictInfoToList(make_vec(2, lanes=1, goal_m=500.0))

@@ -154,6 +154,11 @@ def test_a_wrong_value_in_the_settings_of_a_run_is_named(capsys):
     "arguments",
     [
         ["train", "traffic=idm", "init.path=bomb/last.pt"],
+        ["train", "traffic=gan", "traffic.path=bomb/agent.safetensors"],
+        ["evaluate", "agents=[bomb/agent.safetensors]"],
+        ["evaluate", "agents=[bomb/last.pt]"],
+        ["evaluate", "traffics={gan:{name:gan,path:bomb/agent.safetensors}}"],
+        ["render", "agent=bomb/agent.safetensors"],
         ["render", "run=bomb"],
         ["evaluate", "env=scene", "env.scene.path=bomb.json"],
         ["prepare", "data=scenes", "data.path=bomb.parquet"],
@@ -165,7 +170,8 @@ def test_a_pickle_in_the_place_of_another_file_is_refused(arguments, here, capsy
     file = io.BytesIO()
     torch.save({"kind": "ganlane training checkpoint", "version": 2, "state": Bomb()}, file)
     (here / "bomb").mkdir()
-    for name in ("bomb/last.pt", "bomb/metrics.csv", "bomb.json", "bomb.parquet", "bomb.csv"):
+    names = "bomb/last.pt bomb/agent.safetensors bomb/metrics.csv bomb.json bomb.parquet bomb.csv"
+    for name in names.split():
         (here / name).write_bytes(file.getvalue())
     assert "bomb" in refusal(capsys, *arguments)
 

@@ -10,10 +10,10 @@ import time
 import pytest
 import torch
 from trial import damages
-from trial.damage import READERS, SCENE, Reader, Trial, bits
+from trial.damage import READERS, SCENE, Reader, Trial
 from trial.kill import TINY, differences, refused_writes, torn_write, train
 from trial.soak import actions, violations
-from trial.tally import Tally, forked
+from trial.tally import forked
 
 import ganlane
 from ganlane import keys
@@ -68,11 +68,6 @@ def test_a_reader_is_judged_by_how_it_ends(read, sealed, result, tmp_path, monke
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(READERS, "file", Reader("scene.csv", read, (damages.flip,), sealed))
     assert Trial(good, tmp_path / "damaged")(("file", 3)).startswith(result)
-
-
-def test_contents_are_compared_by_their_bits():
-    assert bits({"a": torch.zeros(2)}) != bits({"a": torch.tensor([0.0, -0.0])})
-    assert bits([{"a": (1, "b")}]) == bits([{"a": (1, "b")}])
 
 
 @pytest.mark.parametrize("way", list(dict.fromkeys(damages.TEXT)), ids=lambda way: way.__name__)
@@ -155,11 +150,3 @@ def test_a_mask_without_any_action_is_seen(decision):
     env, before, after, following = decision
     none = following.clone().set(keys.ACTION_MASK, torch.zeros(8, 3, dtype=torch.bool))
     assert list(violations(env.base_env, CHOICE, before, after, none)) == ["no action allowed"]
-
-
-def test_a_part_has_a_row_of_its_counts(capsys):
-    tally = Tally("part")
-    tally.fail("this")
-    tally.what["files"] += 1000
-    assert tally.row() == "| part | 1,000 files | 1 | 0.0 |"
-    assert capsys.readouterr().out == "part: this\n"

@@ -101,17 +101,6 @@ def test_a_network_that_is_not_understood_is_refused(damage, saved):
 # --- starting from one
 
 
-def test_a_warm_start_takes_the_saved_weights(saved):
-    fresh = agent(seed=3)
-    start_from(fresh, saved)
-    assert same_weights(fresh, agent())
-    pairs = zip(
-        fresh.network.parameters(),
-        fresh.loss.target_network.parameters(),
-    )
-    assert all(torch.equal(online, target) for online, target in pairs)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -203,3 +192,21 @@ def test_moments_of_another_network_are_refused(damage):
     with pytest.raises(UserError, match="not those of its network"):
         load_moments(fresh, moments)
     assert fresh.optimizer.state_dict()["state"] == {}
+
+
+#: What is saved in the place of an agent: the kind of the weights, and how they are described.
+NO_AGENTS = {
+    "another kind": ("something else", lambda described: {}),
+    "no description": ("agent", lambda described: {}),
+    "other weights": ("agent", lambda described: described),
+}
+
+
+@pytest.mark.parametrize("name", NO_AGENTS)
+def test_weights_that_are_no_agents_are_refused(name, saved):
+    kind, description = NO_AGENTS[name]
+    described = load_weights(saved, "agent")[1]
+    del described["kind"]
+    save_weights(saved, kind, {"weight": torch.zeros(3)}, description(described))
+    with pytest.raises(UserError, match=saved.name):
+        load_agent(saved)

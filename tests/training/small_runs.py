@@ -3,6 +3,7 @@
 import csv
 import os
 import time
+from contextlib import contextmanager
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from ganlane.build import make_env, make_traffic
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.traffic import IdmTrafficConfig
 from ganlane.settings.train import LoggerConfig, TrainConfig
-from ganlane.training.loop import train as train_until_stopped
+from ganlane.training import loop
 
 #: With one lane: any command to change leaves the road, and who keeps the lane reaches the goal.
 ROAD = EnvConfig(lanes=1, vehicles=2, goal_m=60.0)
@@ -54,11 +55,27 @@ def train(*arguments, **options):
 
     One that a signal stops, say the SIGTERM of `timeout`, would fail here as other weights.
     """
-    result = train_until_stopped(*arguments, **options)
+    result = loop.train(*arguments, **options)
     if result.stopped_by is not None:
         number = result.stopped_by
         pytest.exit(f"a run was stopped by signal {number}", returncode=128 + number)
     return result
+
+
+@contextmanager
+def signal_at(decisions, number):
+    """A run in this block gets the signal after so many decisions."""
+    advance = loop.advance
+
+    def interrupted(state):
+        step = advance(state)
+        if state.decisions == decisions:
+            os.kill(os.getpid(), number)
+        return step
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "advance", interrupted)
+        yield
 
 
 def rows(path):

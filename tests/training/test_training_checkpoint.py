@@ -2,9 +2,11 @@
 
 import pytest
 import torch
+from reference.refusals import Bomb
 from training.small_runs import agent, road, settings, train
 
 from ganlane.errors import UserError
+from ganlane.files import seal_archive
 from ganlane.training.checkpoint import (
     LAST,
     TrainingState,
@@ -96,3 +98,31 @@ def test_a_part_of_a_run_that_is_something_else_is_refused_in_one_sentence(
 def test_the_parts_of_a_run_are_those_of_this_run(stopped, tmp_path):
     save_checkpoint(tmp_path / "last.pt", stopped)
     assert TrainingState(road(8), agent()).restore(tmp_path / "last.pt") is None
+
+
+KIND = "ganlane training checkpoint"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"weights: none\n",
+        3,
+        {"kind": KIND, "version": 1, "state": {}},
+        {"kind": KIND, "version": 2, "state": {}},
+        {"kind": KIND, "version": 2, "state": Bomb()},
+    ],
+    ids=("empty", "text", "number", "old version", "no state", "pickle"),
+)
+def test_what_is_no_state_of_a_run_is_refused(content, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "last.pt"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        torch.save(content, path)
+        seal_archive(path)
+    with pytest.raises(UserError, match=r"^resume=[^\n]*last\.pt"):
+        TrainingState(road(8), agent()).restore(path)
+    assert not (tmp_path / "executed").exists()

@@ -1,13 +1,21 @@
 """The loop on a small highway: it learns, logs, stops, and resumes to the same weights."""
 
-import os
 import signal
 import time
 
 import pytest
 import torch
 from agents.agents_small import transitions
-from training.small_runs import OBSERVATION_SIZE, agent, road, rows, same, settings, train
+from training.small_runs import (
+    OBSERVATION_SIZE,
+    agent,
+    road,
+    rows,
+    same,
+    settings,
+    signal_at,
+    train,
+)
 
 from ganlane.agents import Rainbow, RainbowConfig, load_agent
 from ganlane.training import loop
@@ -102,20 +110,9 @@ def test_a_light_checkpoint_of_the_full_sized_network_is_under_5_mb(tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_run_after_its_step_with_a_checkpoint(
-    number, whole, tmp_path, monkeypatch
-):
-    advance = loop.advance
-
-    def interrupted(state):
-        step = advance(state)
-        if state.decisions == 160:
-            os.kill(os.getpid(), number)
-        return step
-
+def test_a_signal_ends_the_run_after_its_step_with_a_checkpoint(number, whole, tmp_path):
     handler = signal.getsignal(number)
-    with monkeypatch.context() as patch:
-        patch.setattr(loop, "advance", interrupted)
+    with signal_at(160, number):
         stopped = loop.train(road(8), agent(), settings(1600), tmp_path)
     assert stopped.stopped_by == number
     assert stopped.decisions == 160

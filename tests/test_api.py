@@ -39,23 +39,11 @@ def test_every_name_at_the_top_is_there():
 
 
 def test_an_environment_takes_what_the_command_line_takes():
-    env = ganlane.make_env(
-        "idm",
-        3,
-        lanes=4,
-        vehicles=15,
-        recycle=True,
-        idm={"headway_s": 1.2},
-        observation="table3",
-        seed=4,
-    )
+    road = {"lanes": 4, "vehicles": 15, "recycle": True, "idm": {"headway_s": 1.2}}
+    env = ganlane.make_env("idm", 3, **road, observation="table3", seed=4)
     base = env.base_env
-    assert (base.road.lanes, base.vehicles, base.recycle, base.rules.idm.headway_s) == (
-        4,
-        15,
-        True,
-        1.2,
-    )
+    assert (base.road.lanes, base.vehicles, base.recycle) == (4, 15, True)
+    assert base.rules.idm.headway_s == 1.2
     state = env.reset()
     assert state["observation"].shape == (3, 3 + 3 * 14)
     assert state["seed"].tolist() == [4, 4, 4]
@@ -126,23 +114,22 @@ def test_own_drivers_and_own_names_stand_in_the_table():
 
 
 def test_a_run_is_trained_resumed_and_evaluated():
-    small = {"name": "rainbow", "warmup": 64, "capacity": 1000, "hidden": [16], "batch_size": 16}
-    tiny = {
-        "agent": small,
-        "num_envs": 8,
-        "goal_m": 40.0,
-        "evaluation": {"agents": ["mobil"], "episodes": 2},
-    }
     run = ganlane.api.train(
-        "idm", "none", total_decisions=256, folder="run", logger={"progress": False}, **tiny
+        "idm",
+        "none",
+        agent={"name": "rainbow", "warmup": 64, "capacity": 1000, "hidden": [16], "batch_size": 16},
+        total_decisions=256,
+        folder="run",
+        logger={"progress": False},
+        num_envs=8,
+        goal_m=40.0,
+        evaluation={"agents": ["mobil"], "episodes": 2},
     )
-    assert run.folder == Path("run")
-    assert run.agent == Path("run/agent.safetensors")
+    assert (run.folder, run.agent) == (Path("run"), Path("run/agent.safetensors"))
     assert run.table["agent"].to_list() == ["trained", "mobil"]
     assert run.results["decisions"] >= 256
-    assert {"config.yaml", "results.json", "episodes.parquet"} <= {
-        path.name for path in run.folder.iterdir()
-    }
+    files = {path.name for path in run.folder.iterdir()}
+    assert files >= {"config.yaml", "results.json", "episodes.parquet"}
     table = ganlane.api.evaluate([str(run.agent)], ["idm"], 2, goal_m=40.0)
     assert table["mean_reward"][0] == run.table["mean_reward"][0]
     more = ganlane.api.train(total_decisions=512, folder="run", resume=True)

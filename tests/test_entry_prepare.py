@@ -17,7 +17,6 @@ from reference.recordings import (
     ngsim_rows,
     portal_csv,
     traffic,
-    write_highd,
 )
 from reference.refusals import last_path
 
@@ -75,18 +74,6 @@ def test_a_scene_csv_becomes_parquet_and_figures(here, capsys):
     }
     assert names <= numbers.keys()
     assert read_scenes("mine").equals(read_scenes("mine.csv"))
-
-
-def test_highd_folder(here, capsys):
-    write_highd(here / "highd")
-    assert main(["data=highd", "data.path=highd", "scene_s=3"]) == 0
-    numbers = results(capsys.readouterr().out)
-    assert (numbers["rows"]["read"], numbers["rows"]["written"]) == (800, 4 * 80)
-    assert [scene["name"] for scene in numbers["scenes"]] == [
-        "highd-01-upper",
-        "highd-01-lower",
-    ]
-    assert read_scenes(numbers["out"])["scene"].n_unique() == 2 * 3
 
 
 def test_download_then_prepare(here, capsys):

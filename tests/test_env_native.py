@@ -48,27 +48,32 @@ def test_its_keys_specs_and_first_states_are_those_of_the_tensor_code():
     assert after[0] == after[1]
 
 
+def action(state, decision):
+    """Now and then a change of lanes, in no order."""
+    return (state[keys.EPISODE] * 7 + decision * 5) % 11 % 3 * (decision % 3 == 0)
+
+
 @pytest.mark.parametrize("share", [0.5, 1.0])
 @pytest.mark.parametrize("mobil", [True, False])
 def test_episodes_with_automatic_resets_agree_with_the_tensor_code(mobil, share):
     """From every state of the tensor code's run the kernel reaches the same, up to rounding."""
-    settings = dict(
-        num_envs=16,
-        mobil=mobil,
-        goal_m=140.0,
-        timeout_s=9.5,
-        seed=3,
-        recycle=True,
-        recycle_share=share,
-    )
+    settings = {
+        "num_envs": 16,
+        "mobil": mobil,
+        "goal_m": 140.0,
+        "timeout_s": 9.5,
+        "seed": 3,
+        "recycle": True,
+        "recycle_share": share,
+    }
     ours = native(**settings)
     theirs = native(**settings, kernel="torch")
     td = theirs.reset()
     ended = 0
     for decision in range(30):
-        td["action"] = (td[keys.EPISODE] * 7 + decision * 5) % 11 % 3 * (decision % 3 == 0)
+        td["action"] = action(td, decision)
         stepped, following = theirs.step_and_maybe_reset(td.clone())
-        same, also_following = ours.step_and_maybe_reset(td.clone())
+        same, also_following = ours.step_and_maybe_reset(td)
         for name, value in leaves(stepped["next"]):
             assert torch.allclose(value.double(), same["next", name].double(), atol=1e-3), name
         assert torch.equal(following[keys.EPISODE], also_following[keys.EPISODE])
@@ -77,37 +82,35 @@ def test_episodes_with_automatic_resets_agree_with_the_tensor_code(mobil, share)
     assert ended > 16
 
 
-def test_two_threads_are_the_kernels_alone_and_change_no_bit():
+class Threads(Transform):
+    """Looks how many threads torch and the kernel have during a step."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen = set()
+
+    def _call(self, next_tensordict):
+        self.seen.add((torch.get_num_threads(), threads_allowed()))
+        return next_tensordict
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_two_threads_are_the_kernels_alone(threads):
     """Around the kernel torch computes on one thread, and has both again afterwards."""
-    driven = []
-    seen = []
     before = torch.get_num_threads()
-
-    class Threads(Transform):
-        """Looks how many threads torch and the kernel have during a step."""
-
-        def _call(self, next_tensordict):
-            seen.append((torch.get_num_threads(), threads_allowed()))
-            return next_tensordict
-
     # A command that ran in this process may have set the kernel's.
     token = kernel_threads.set(None)
     try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            env = ganlane.make_env(traffic="idm_mobil", num_envs=2 * ROWS_PER_THREAD)
-            env.append_transform(Threads())
-            state = env.reset()
-            for step in range(3):
-                actions = (torch.arange(2 * ROWS_PER_THREAD) + step) % 3
-                stepped, state = env.step_and_maybe_reset(state.set("action", actions))
-            driven.append(stepped)
-            assert torch.get_num_threads() == threads
+        torch.set_num_threads(threads)
+        env = ganlane.make_env(traffic="idm_mobil", num_envs=2 * ROWS_PER_THREAD)
+        looking = Threads()
+        env.append_transform(looking)
+        env.rand_step(env.reset())
+        assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
         kernel_threads.reset(token)
-    assert seen == [(1, 1)] * 3 + [(1, 2)] * 3
-    assert (driven[0] == driven[1]).all()
+    assert (1, threads) in looking.seen
 
 
 @pytest.mark.parametrize("wrong", [torch.tensor([7.0, 8.0]), torch.tensor([[7], [8]])])
@@ -162,25 +165,24 @@ def test_auto_takes_the_tensor_code_where_the_kernel_cannot_and_says_once_when_i
 @pytest.mark.parametrize("abort", [False, True])
 def test_a_recorder_sees_every_physics_step_and_ends_where_the_decision_does(kernel, abort):
     """With ends and commands off the road in the middle, and without a bit of difference."""
-    env = native(32, kernel=kernel, abort=abort, goal_m=140.0, timeout_s=9.5, seed=3)
-    plain = native(32, kernel=kernel, abort=abort, goal_m=140.0, timeout_s=9.5, seed=3)
+    config = {"kernel": kernel, "abort": abort, "goal_m": 140.0, "timeout_s": 9.5, "seed": 3}
+    env = native(32, **config)
+    plain = native(32, **config)
     steps = []
     env.recorder = lambda vehicles, running: steps.append((vehicles, running))
     state = env.reset()
     for decision in range(12):
         steps.clear()
-        state["action"] = (state[keys.EPISODE] * 7 + decision * 5) % 11 % 3 * (decision % 3 == 0)
+        state["action"] = action(state, decision)
         stepped, following = env.step_and_maybe_reset(state)
         after = stepped["next"]
         assert (plain.step(state.clone())["next"] == after).all()
-        taken = torch.stack([running for _, running in steps]).sum(0)
+        taken = sum(running.long() for _, running in steps)
         assert torch.equal(taken, after[keys.STEP] - state[keys.STEP])
-        last = steps[-1][0]
+        drove = taken > 0
         for name in ("x", "y", "heading", "speed", "acceleration"):
-            drove = taken > 0
-            shown = getattr(last, name)[drove]
-            reached = after[keys.VEHICLES, name][drove]
-            assert torch.equal(shown, reached), name
+            shown = getattr(steps[-1][0], name)
+            assert torch.equal(shown[drove], after[keys.VEHICLES, name][drove]), name
         state = following
 
 

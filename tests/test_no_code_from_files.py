@@ -22,7 +22,7 @@ from ganlane.api import train
 from ganlane.arguments import import_target
 from ganlane.build import make_driver
 from ganlane.config.compose import parsed
-from ganlane.config.run import refuse_stored_imports, settings
+from ganlane.config.run import refuse_stored_imports
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator import load_generator
@@ -354,11 +354,6 @@ def test_a_resumed_run_takes_no_more_than_that(keys, missing, foreign_run):
 def test_words_about_something_else_trust_nothing(words, capsys):
     run_folder(CONFIGS["a class of a module beside it"])
     assert "names evil.Traffic" in refusal(capsys, "train", "resume=run", *words)
-
-
-def test_another_traffic_takes_the_place_of_the_stored_one():
-    run_folder(CONFIGS["a class of a module beside it"])
-    assert settings("train", ["resume=run", "traffic=gan"]).traffic.option == "gan"
 
 
 def test_a_command_does_not_look_for_modules_where_it_is_started(monkeypatch):

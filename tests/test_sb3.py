@@ -30,7 +30,6 @@ import ganlane
 import ganlane.sb3
 from ganlane.errors import UserError
 from ganlane.evaluation import episodes as evaluation_of_episodes
-from ganlane.gym.vector import HighwayVectorGym
 
 ROWS = 4
 SHORT = {"goal_m": 150.0}
@@ -64,18 +63,6 @@ def drive(env, steps):
     """Observations, rewards, ends and infos of so many steps in which all rows keep their lanes."""
     env.reset()
     return [env.step(np.zeros(ROWS, dtype=np.int64)) for _ in range(steps)]
-
-
-def test_observations_and_rewards_are_those_of_the_gymnasium_batch():
-    highways = HighwayVectorGym(num_envs=ROWS, traffic="idm", seed=0, **SHORT)
-    env = short_episodes()
-    assert np.array_equal(env.reset(), highways.reset()[0])
-    for action in np.random.default_rng(0).integers(0, 3, (20, ROWS)):
-        observation, reward, done, _ = env.step(action)
-        expected, expected_reward, terminated, truncated, _ = highways.step(action)
-        assert np.array_equal(observation, expected)
-        assert np.allclose(reward, expected_reward)
-        assert np.array_equal(done, terminated | truncated)
 
 
 def test_the_info_of_a_row_that_ends_holds_its_statistics_and_its_last_observation():

@@ -5,10 +5,8 @@ import torch
 from ganlane.agents.drivers import (
     DRIVERS,
     KeepLaneDriver,
-    MobilDriver,
     RandomDriver,
     RandomLegalDriver,
-    egoistic_mobil,
 )
 from ganlane.env import HighwayEnv
 from ganlane.keys import KEEP, LEFT, RIGHT
@@ -58,15 +56,3 @@ def test_random_actions_depend_on_the_episode_and_not_on_the_batch():
     many = states(64)
     driver = RandomDriver(Road())
     assert torch.equal(driver(few)["action"], driver(many)["action"][:4])
-
-
-def test_a_polite_mobil_yields_where_an_egoistic_one_cuts_in():
-    state = states(1, m=3)
-    vehicles = state["vehicles"]
-    vehicles["x"][:] = torch.tensor([[0.0, 60.0, -25.0]])
-    vehicles["target_lane"][:] = torch.tensor([[0, 0, 1]])
-    vehicles["y"][:] = vehicles["target_lane"] * 4.0
-    vehicles["speed"][:] = torch.tensor([[20.0, 17.0, 21.0]])
-    vehicles["desired_speed"][:] = torch.tensor([[25.0, 20.0, 26.0]])
-    assert egoistic_mobil(Road())(state)["action"].item() == LEFT
-    assert MobilDriver(Road())(state)["action"].item() == KEEP

@@ -11,9 +11,7 @@ from tensordict import TensorDict
 from ganlane.agents import RainbowConfig
 from ganlane.agents.replay import (
     draw,
-    load_replay_state,
     make_replay,
-    replay_state,
 )
 
 
@@ -113,24 +111,6 @@ def test_draws_come_from_the_buffers_own_generator(prioritised):
     assert not torch.equal(first, other)
     assert torch.equal(torch.get_rng_state(), state)
     assert (np.random.get_state()[1] == numpy_state).all()  # noqa: NPY002
-
-
-@pytest.mark.parametrize("prioritised", [True, False])
-def test_a_restored_buffer_draws_what_the_saved_one_would_have(prioritised, tmp_path):
-    saved = buffer(prioritised=prioritised)
-    saved.extend(transitions(100, first=200))
-    if prioritised:
-        saved.update_priority(torch.arange(256), torch.rand(256))
-    torch.save(replay_state(saved), tmp_path / "replay.pt")
-    generator = torch.Generator()
-    generator.set_state(saved._rng.get_state())
-    restored = make_replay(config(prioritised=prioritised), generator)
-    load_replay_state(restored, torch.load(tmp_path / "replay.pt", weights_only=True))
-    for replay in (saved, restored):
-        replay.extend(transitions(10, first=500))
-    for _ in range(3):
-        theirs = saved.sample()
-        assert (restored.sample().select(*theirs.keys()) == theirs).all()
 
 
 @pytest.mark.parametrize("prioritised", [True, False])

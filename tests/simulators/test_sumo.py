@@ -26,7 +26,6 @@ from ganlane.errors import UserError
 from ganlane.evaluation import run_episodes
 from ganlane.settings.driving import Visibility
 from ganlane.sim.state import Road, Vehicles, body_lanes
-from ganlane.traffic import IdmTraffic
 from ganlane_simulators import SumoTraffic
 
 LEFT = 1
@@ -178,36 +177,6 @@ def test_the_ego_is_followed_when_it_brakes_to_a_stand():
     assert driven.speed[-1, 0, 0] < 0.5
     gap = driven.x[-1, 0, 0] - driven.x[-1, 0, 1] - 4.5
     assert 0.5 < gap < 8.0
-
-
-def test_our_driver_does_here_what_it_does_in_our_own_traffic(traffic):
-    """The same scene written into another environment.
-
-    The same command, and the ego's first step is the same.
-    """
-    ours = HighwayEnv(IdmTraffic(), 20)
-    mobil = DRIVERS["mobil"](Road())
-    env = HighwayEnv(traffic, 20)
-    state = mobil(start(env, list(range(20))))
-    changes = 0
-    for _ in range(40):
-        copy = start(ours, list(range(20)))
-        for key in (keys.VEHICLES, keys.EGO, keys.STEP):
-            copy[key] = state[key].clone()
-        copy = mobil(copy)
-        assert torch.equal(copy[keys.ACTION], state[keys.ACTION])
-        changes += int((copy[keys.ACTION] != 0).sum())
-        egos = []
-        for one, at in ((env, state), (ours, copy)):
-            seen = []
-            one.recorder = lambda vehicles, running, seen=seen: seen.append(vehicles.at(0))
-            _, after = one.step_and_maybe_reset(at)
-            egos.append(seen[0])
-            if one is env:
-                state = mobil(after)
-        for here, there in zip(*egos):
-            assert torch.equal(here, there)
-    assert changes > 5
 
 
 def test_vehicles_that_return_in_front_of_the_ego_are_followed(traffic):

@@ -2,7 +2,6 @@
 
 import csv
 import os
-import time
 from contextlib import contextmanager
 
 import pytest
@@ -87,18 +86,3 @@ def same(first, second):
     """Whether two agents have the same weights, bit for bit."""
     pairs = zip(first.weights().values(), second.weights().values(), strict=True)
     return all(torch.equal(one, other) for one, other in pairs)
-
-
-def gone(group: int, within_s: float = 20.0) -> bool:
-    """Whether a process group is empty soon.
-
-    Who has ended counts until the system has taken note of it.
-    """
-    end = time.monotonic() + within_s
-    while time.monotonic() < end:
-        try:
-            os.killpg(group, 0)
-        except ProcessLookupError:
-            return True
-        time.sleep(0.1)
-    return False

@@ -25,26 +25,11 @@ def step(reward, done, distance=0.0, lane_changes=0, action=0, value=None, **eve
 
 def test_returns_and_rates_are_those_of_the_finished_episodes():
     stats = EpisodeStats(2, 3, gamma=0.5)
+    crash = {"hard_crash": [True, False], "lane_changes": 3, "action": 2}
+    goal = {"goal": [False, True], "lane_changes": 1}
     stats.step(step([1.0, 10.0], [False, False], distance=500.0))
-    stats.step(
-        step(
-            [2.0, 20.0],
-            [True, False],
-            hard_crash=[True, False],
-            distance=1000.0,
-            lane_changes=3,
-            action=2,
-        )
-    )
-    stats.step(
-        step(
-            [4.0, 40.0],
-            [True, True],
-            goal=[False, True],
-            distance=1000.0,
-            lane_changes=1,
-        )
-    )
+    stats.step(step([2.0, 20.0], [True, False], distance=1000.0, **crash))
+    stats.step(step([4.0, 40.0], [True, True], distance=1000.0, **goal))
     row = stats.read()
     assert row["episodes"] == 3
     assert row["mean_return"] == pytest.approx((3 + 4 + 70) / 3)

@@ -5,12 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 from reference.worlds import environment, placed, same_bits, step, vehicles
-from torchrl.collectors import Collector
-from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from ganlane import keys
-from ganlane.agents.drivers import KeepLaneDriver
 from ganlane.sim.random import Stream
 
 KEEP = keys.KEEP
@@ -108,26 +105,6 @@ def test_an_automatic_reset_goes_on_with_episode_i_plus_n():
     others = torch.tensor([0, 2])
     after = stepped["next"].exclude("reward")[others]
     assert same_bits(following.exclude("action", "reward")[others], after) == []
-
-
-def test_under_a_transform_and_in_a_collector_every_episode_is_driven_once():
-    env = environment(num_envs=3, goal_m=40.0)
-    driver = KeepLaneDriver(env.road)
-    collector = Collector(
-        TransformedEnv(env, StepCounter()),
-        driver,
-        frames_per_batch=3 * 20,
-        total_frames=3 * 20,
-        auto_register_policy_transforms=False,
-    )
-    batch = next(iter(collector))
-    collector.shutdown()
-    done = batch["next", "done"][..., 0]
-    episodes = batch[keys.EPISODE]
-    for row in range(3):
-        finished = episodes[row][done[row]].tolist()
-        assert len(finished) > 2
-        assert finished == [row + 3 * k for k in range(len(finished))]
 
 
 def test_a_reset_with_seed_and_episode_runs_exactly_those():

@@ -7,6 +7,7 @@ from __future__ import annotations
 import pytest
 import torch
 from reference.worlds import Track, assert_same_tracks, environment, same_bits, tracks
+from torchrl.envs import TransformedEnv
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
@@ -14,6 +15,7 @@ from ganlane.settings.driving import Visibility
 from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmMobilTraffic
+from ganlane.transforms import OBSERVATIONS, ObservationTransform
 
 
 def make(num_envs: int, mobil: bool) -> HighwayEnv:
@@ -96,11 +98,12 @@ class Padded(RandomScenes):
         )
 
 
-def driven_with(nonsense: float):
+def driven_with(nonsense: float, form: str):
     """The last state of three decisions, with zeros where nobody is."""
     scenes = Padded(Road(3), 9)
     scenes.nonsense = nonsense
-    env = HighwayEnv(IdmMobilTraffic(Road(3)), 4, scenes=scenes)
+    base = HighwayEnv(IdmMobilTraffic(Road(3)), 4, scenes=scenes)
+    env = TransformedEnv(base, ObservationTransform(Road(3), 9, form))
     state = env.reset()
     for action in (keys.LEFT, keys.KEEP, keys.RIGHT):
         state["action"] = torch.full((4,), action)
@@ -111,9 +114,12 @@ def driven_with(nonsense: float):
     return state.exclude(keys.TRAFFIC)
 
 
-@pytest.mark.parametrize("nonsense", [5.0, torch.nan, torch.inf])
-def test_nonsense_in_the_padding_of_a_scene_reaches_nobody(nonsense):
-    """Scenes of one's own may leave anything where nobody is: not a bit of the others changes."""
-    expected = driven_with(0.0)
-    assert torch.isfinite(expected[keys.VEHICLES, "x"]).all()
-    assert same_bits(driven_with(nonsense), expected) == []
+@pytest.mark.parametrize("form", OBSERVATIONS)
+def test_nonsense_in_the_padding_of_a_scene_reaches_nobody(form):
+    """Scenes of one's own may leave anything where nobody is: not a bit of the others changes, and
+    none of what the agent reads.
+    """
+    expected = driven_with(0.0, form)
+    assert torch.isfinite(expected[keys.OBSERVATION]).all()
+    for nonsense in (5.0, torch.nan, torch.inf):
+        assert same_bits(driven_with(nonsense, form), expected) == []

@@ -7,6 +7,7 @@ import pickle
 
 import pytest
 import torch
+from entry_own_parts import Cruise
 from reference.worlds import environment, leaves
 from torchrl.envs import Transform
 from torchrl.envs.utils import check_env_specs
@@ -23,7 +24,6 @@ from ganlane.settings.driving import EgoParameters, IdmParameters
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MaskParameters, ObservationConfig, SensorParameters
 from ganlane.sim.state import Road
-from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 from ganlane.transforms import ActionMaskTransform, ObservationTransform
 
@@ -123,16 +123,11 @@ def test_episodes_that_are_no_whole_numbers_in_a_row_are_refused(wrong):
         env.reset(state, next_episode=wrong)
 
 
-class Cruise(TrafficModule):
-    def move(self, vehicles, memory, key, step):
-        return vehicles.with_(x=vehicles.x + vehicles.speed * self.dt), memory
-
-
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
         (
-            {"traffic": Cruise(Road())},
+            {"traffic": Cruise(Road(), 0)},
             "does not drive Cruise",
         ),
         ({"dtype": torch.float64}, "in float32"),

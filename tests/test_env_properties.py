@@ -8,15 +8,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from reference.worlds import drawing, vehicles_at
 from trial import soak
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
-from ganlane.sim.state import Road, Vehicles
-from ganlane.transforms import OBSERVATIONS, ObservationTransform, observation
+from ganlane.sim.state import Vehicles
+from ganlane.transforms import OBSERVATIONS, observation
 
 FIXED = ("length", "width", "desired_speed", "visibility", "valid")
 
@@ -95,44 +92,3 @@ def bounds(form: str, vehicles: int) -> tuple[torch.Tensor, torch.Tensor]:
     }
     low, high = zip(*(pair for part in OBSERVATIONS[form] for pair in ranges[part]))
     return torch.tensor(low), torch.tensor(high)
-
-
-@settings(max_examples=60)
-@given(
-    data=st.data(),
-    form=st.sampled_from(list(OBSERVATIONS)),
-    lanes=st.integers(1, 6),
-    others=st.integers(1, 19),
-)
-def test_a_vehicle_that_is_not_valid_is_in_no_observation(data, form, lanes, others):
-    """Whatever stands in its fields, not a bit of the observation depends on it."""
-    valid = torch.tensor(
-        [[True, *data.draw(st.lists(st.booleans(), min_size=others, max_size=others))]]
-    )
-    seeds = st.integers(0, 2**31)
-    scene, ghosts = (
-        any_vehicles(1 + others, lanes, data.draw(seeds)).with_(valid=valid) for _ in range(2)
-    )
-    haunted = scene.where(valid, ghosts)
-    road = Road(lanes)
-    still = torch.zeros(1, dtype=torch.float64)
-    seen = [
-        ObservationTransform(road, 1 + others, form).observe(s, still, still.long(), road)
-        for s in (scene, haunted)
-    ]
-    assert torch.equal(*seen)
-
-
-def any_vehicles(count: int, lanes: int, seed: int) -> Vehicles:
-    """One row of vehicles anywhere on 600 m of road, at any speed."""
-    between = drawing((1, count), seed)
-    lane = between(0, lanes).long()
-    return vehicles_at(
-        between(-300, 300),
-        lane,
-        y=4.0 * lane + between(-1, 1),
-        heading=between(-0.1, 0.1),
-        speed=between(0, 40),
-        desired_speed=between(15, 35),
-        visibility=lane % 3,
-    )

@@ -14,13 +14,11 @@ from ganlane import keys
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.config.run import settings
 from ganlane.env import HighwayEnv
-from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
 from ganlane.settings.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.scenes import FixedScene, SceneVehicle
-from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import IdmTraffic
 
@@ -206,29 +204,6 @@ def test_any_callable_with_a_check_makes_the_scene():
     env = HighwayEnv(IdmTraffic(Road(2)), 3, scenes=mine)
     assert mine.checked == Road(2)
     assert env.reset()[keys.VEHICLES, "x"].tolist() == [[0.0, 50.0]] * 3
-
-
-@pytest.mark.parametrize(
-    ("scenes", "vehicles", "sentence"),
-    [
-        (
-            FixedScene((SceneVehicle(0.0, 0), SceneVehicle(50.0, 1)), Road(2)),
-            9,
-            "vehicles=9: the scene has 2",
-        ),
-        (RandomScenes(Road(3)), None, "give both the same road"),
-        (
-            FixedScene((SceneVehicle(0.0, 0, 30.0), SceneVehicle(10.0, 0, 0.0)), Road(2)),
-            None,
-            r"the ego at 30 m/s, 5\.5 m behind vehicle 1",
-        ),
-    ],
-)
-def test_a_scene_that_does_not_fit_or_is_hopeless_is_refused_when_the_environment_is_made(
-    scenes, vehicles, sentence
-):
-    with pytest.raises(UserError, match=sentence):
-        HighwayEnv(IdmTraffic(Road(2)), vehicles=vehicles, scenes=scenes)
 
 
 def test_a_file_gives_vehicles_lanes_and_the_egos_desired_speed(tmp_path):

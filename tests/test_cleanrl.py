@@ -1,4 +1,4 @@
-"""What CleanRL's ``ppo.py`` asks of an environment, on single environments and on the batch.
+"""What CleanRL's ``ppo.py`` asks of an environment.
 
 The script is in CleanRL's repository, not in its package. Here is how it makes environments, acts,
 and reads ends and infos.

@@ -5,10 +5,6 @@ Dispatch, help, mistakes that the commands find, commands in a process of their 
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
 import entry_tiny
 import pytest
 from reference.refusals import refusal
@@ -18,22 +14,6 @@ from ganlane.config.help import help_text
 from ganlane.config.run import COMMANDS
 from ganlane.files import conf_folder
 from ganlane.settings.train import TrainConfig
-
-ROOT = Path(__file__).resolve().parents[1]
-
-
-def command(*arguments, cwd):
-    """A command as a user starts it, from a folder that is not the checkout."""
-    environment = {
-        "PYTHONPATH": str(ROOT),
-        "OMP_NUM_THREADS": "1",
-        "PATH": "/usr/bin:/bin",
-        "HOME": str(cwd),
-    }
-    line = [sys.executable, *arguments]
-    return subprocess.run(
-        line, cwd=cwd, capture_output=True, text=True, timeout=120, env=environment
-    )
 
 
 def test_help_of_train_explains_every_traffic_and_start():
@@ -66,16 +46,6 @@ def test_cfg_shows_the_config_and_leaves_nothing_behind(name, empty_folder, caps
     assert "seed: 0" in shown.out
     assert shown.err == ""
     assert list(empty_folder.iterdir()) == []
-
-
-def test_a_mistake_ends_the_process_with_status_2(tmp_path):
-    done = command("-m", "ganlane", "train", "env.lanes=0", cwd=tmp_path)
-    assert done.returncode == 2
-    assert (
-        done.stderr == "ganlane train: env.lanes=0: expected a number above 0; "
-        "0 means what a scene's file says.\n"
-    )
-    assert list(tmp_path.iterdir()) == []
 
 
 #: Drives a short episode first; with the kernel a line would say so.

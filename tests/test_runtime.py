@@ -134,3 +134,11 @@ def test_a_reader_who_leaves_ends_it_in_silence(arguments):
         os.close(writing)
         _, err = process.communicate(timeout=120)
     assert (process.returncode, err) == (141, "")
+
+
+def test_a_mistake_ends_it_with_status_2_and_leaves_nothing(tmp_path):
+    with started(["train", "env.lanes=0"], cwd=tmp_path) as process:
+        _, err = process.communicate(timeout=120)
+    told = "env.lanes=0: expected a number above 0; 0 means what a scene's file says."
+    assert (process.returncode, err) == (2, f"ganlane train: {told}\n")
+    assert list(tmp_path.iterdir()) == []

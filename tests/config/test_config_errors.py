@@ -54,6 +54,7 @@ MISTAKES = {
     "train env.decision_period_s=0.15": "not a multiple of 0.1 s",
     "train agent.warmup=5": "expected at least agent.batch_size=256",
     "train init=none init.support=trained": "of which agent? give init=idm_ckpt",
+    "train init=none init.optimizer=true": "of which agent? give init=idm_ckpt",
     "train pretrain.total_decisions=10": "give for instance pretrain.traffic=idm_mobil",
     "train traffic._target_=nonsense": "expected an import path",
     "train hydra.nonsense=1": "hydra.nonsense: no such key",

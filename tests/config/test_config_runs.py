@@ -249,11 +249,6 @@ def test_auto_starts_afresh_without_an_unfinished_run(capsys):
     assert "a new one is started" in capsys.readouterr().err
 
 
-def test_a_folder_without_a_checkpoint_is_refused(here):
-    with pytest.raises(UserError, match="no checkpoint there"):
-        settings("train", [f"resume={here}"])
-
-
 def test_a_sweep_is_every_combination():
     runs = single_runs(parsed("train", ["seed=0,1", "traffic=idm,gan", "threads=1"]))
     assert runs == [

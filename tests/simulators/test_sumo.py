@@ -17,7 +17,6 @@ from reference.foreign import (
     start,
     turns,
 )
-from reference.worlds import vehicles as scene_of
 
 from ganlane import keys
 from ganlane.agents.drivers import DRIVERS
@@ -25,6 +24,7 @@ from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.evaluation import run_episodes
 from ganlane.settings.driving import Visibility
+from ganlane.sim.scenes import FixedScene, SceneVehicle
 from ganlane.sim.state import Road, Vehicles, body_lanes
 from ganlane_simulators import SumoTraffic
 
@@ -46,26 +46,11 @@ def driven(traffic):
     return vehicles, state
 
 
-class Scene:
-    """Always the same first scene.
-
-    The first of ``cars`` (x, lane, speed, desired speed, length) is the ego.
-    """
-
-    def __init__(self, *cars):
-        names = ("x", "lane", "speed", "desired_speed", "length")
-        body = {"visibility": int(Visibility.BODY)}
-        self.scene = scene_of(
-            *({**body, **dict(zip(names, car))} for car in cars),
-            dtype=torch.float32,
-        )
-        self.vehicles = len(cars)
-
-    def check(self, road, idm):
-        pass
-
-    def __call__(self, key, dtype):
-        return Vehicles(*(field.expand(len(key), -1).clone() for field in self.scene))
+def scene(road, *cars):
+    """Always the same first scene of ``cars`` (x, lane, speed, desired speed, length)."""
+    names = ("x_m", "lane", "speed_mps", "desired_speed_mps", "length_m")
+    rows = tuple(SceneVehicle(**dict(zip(names, car))) for car in cars)
+    return FixedScene(rows, road, others_visibility=Visibility.BODY)
 
 
 def test_an_ego_that_keeps_its_lane_crashes_with_nobody_and_nobody_with_another(
@@ -136,13 +121,14 @@ def test_an_episode_is_the_same_alone_and_beside_others_whatever_was_driven_befo
 def follower_of(traffic, lane_of_ego, action):
     """Speeds of a fast driver 30 m behind a slow ego's place in lane 1, over 6 s."""
     # Somebody slow ahead keeps the ego slow, far enough away for the driver behind not to mind.
-    scene = Scene(
+    first = scene(
+        Road(),
         (0.0, lane_of_ego, 12.0, 12.0),
         (-32.0, 1, 20.0, 20.0),
         (2000.0, 2, 20.0, 20.0),
     )
     driven, running, _ = drive(
-        HighwayEnv(traffic, 1, scenes=scene),
+        HighwayEnv(traffic, 1, scenes=first),
         [0],
         6,
         lambda decision, _: action if decision == 0 else 0,
@@ -167,12 +153,13 @@ def test_a_follower_brakes_for_an_ego_that_moves_in_front_and_only_then():
 def test_the_ego_is_followed_when_it_brakes_to_a_stand():
     # A parked lorry ahead of the ego; the driver behind has nowhere to go on a road of one lane.
     one_lane = SumoTraffic(Road(1), speed_wander=0.0)
-    scene = Scene(
+    first = scene(
+        Road(1),
         (0.0, 0, 15.0, 20.0),
         (-25.0, 0, 15.0, 20.0),
         (120.0, 0, 0.0, 0.1, 12.0),
     )
-    driven, running, _ = drive(HighwayEnv(one_lane, 1, scenes=scene), [0], 40)
+    driven, running, _ = drive(HighwayEnv(one_lane, 1, scenes=first), [0], 40)
     assert running.all()
     assert driven.speed[-1, 0, 0] < 0.5
     gap = driven.x[-1, 0, 0] - driven.x[-1, 0, 1] - 4.5

@@ -21,7 +21,6 @@ from ganlane.files import conf_folder
 from ganlane.runtime import has_compiler
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MaskParameters
-from ganlane.settings.train import InitConfig
 from ganlane.training.checkpoint import (
     LAST,
     load_checkpoint,
@@ -251,12 +250,6 @@ def test_a_shipped_name_means_the_shipped_agent_beside_a_folder_of_that_name(tmp
     monkeypatch.chdir(tmp_path)
     Path("agent_idm").mkdir()
     assert read_start("agent_idm").moments is None
-
-
-@pytest.mark.parametrize("options", [{"optimizer": True}, {"support": "trained"}])
-def test_who_starts_afresh_has_nothing_to_take_over(options):
-    with pytest.raises(UserError, match=r"of which agent\? give init=idm_ckpt"):
-        InitConfig(path=None, **options)
 
 
 # --- experiments, lengths, learning rates

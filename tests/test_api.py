@@ -210,6 +210,7 @@ def api(name, *arguments, **keys):
         (api("train", "idm", resume=True), "resume=True: which run"),
         (api("train", "idm", resume=True, folder="gone"), "no run that can go on"),
         (api("run", "train", resume=5), "no run that can go on"),
+        (api("render", run="gone"), "gone: no such file"),
         (api("run", "realism", traffic="replay"), "traffic=replay: it is the recordings"),
         (api("run", "prepare", lanes=3), "lanes: no such key"),
         (api("run", "trian"), "no such command (did you mean 'train'"),

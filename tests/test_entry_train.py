@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import shutil
 import signal
@@ -11,7 +10,7 @@ from functools import partial
 import entry_tiny
 import pytest
 from reference.refusals import last_path
-from training.small_runs import signal_at
+from training.small_runs import rows, signal_at
 
 from ganlane.agents import read_agent
 from ganlane.config.run import run_command
@@ -28,7 +27,7 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("finished")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        assert main(TINY) == 0
+        assert main([*TINY, "evaluate_every=160", "selection_episodes=2"]) == 0
     (results,) = folder.rglob("results.json")
     return results.parent
 
@@ -40,8 +39,8 @@ def train(capsys, *arguments):
     return path.parent, json.loads(path.read_text())
 
 
-def decisions(folder):
-    return [int(row["decisions"]) for row in csv.DictReader((folder / "metrics.csv").open())]
+def decisions(folder, name="metrics.csv"):
+    return [int(row["decisions"]) for row in rows(folder / name)]
 
 
 def test_a_run_leaves_agent_metrics_config_and_table(finished):
@@ -55,6 +54,7 @@ def test_a_run_leaves_agent_metrics_config_and_table(finished):
     assert results["decisions"] == 320
     assert results["updates"] > 0
     assert decisions(folder) == [160, 320]
+    assert decisions(folder, "evaluation.csv") == [160, 320]
     weights, config, metadata = read_agent(folder / "agent.safetensors")
     assert weights
     assert config.agent.hidden == (16, 16)

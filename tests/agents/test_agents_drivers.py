@@ -1,5 +1,6 @@
 """Rule-based drivers of the ego."""
 
+import pytest
 import torch
 
 from ganlane.agents.drivers import (
@@ -18,12 +19,12 @@ def states(n=256, lanes=3, m=9):
     return HighwayEnv(IdmTraffic(Road(lanes)), num_envs=n, vehicles=m).reset()
 
 
-def test_every_driver_writes_one_of_three_actions_per_row():
-    for make in DRIVERS.values():
-        action = make(Road(), 0)(states(64))["action"]
-        assert action.shape == (64,)
-        assert action.dtype == torch.int64
-        assert set(action.tolist()) <= {KEEP, LEFT, RIGHT}
+@pytest.mark.parametrize("name", DRIVERS)
+def test_every_driver_writes_one_of_three_actions_per_row(name):
+    action = DRIVERS[name](Road(), 0)(states(64))["action"]
+    assert action.shape == (64,)
+    assert action.dtype == torch.int64
+    assert set(action.tolist()) <= {KEEP, LEFT, RIGHT}
 
 
 def test_keeping_the_lane_is_always_action_0():

@@ -63,19 +63,6 @@ def test_each_transition_equals_the_loop_over_its_own_steps(n, environments, see
             assert torch.equal(transition[name], steps[start][name])
 
 
-def test_a_saved_window_goes_on_as_if_nothing_had_happened():
-    steps = recorded(8, 3, 1)
-    whole = NStepWindow(3, 0.9)
-    first = NStepWindow(3, 0.9)
-    second = NStepWindow(3, 0.9)
-    expected = [whole.push(step) for step in steps][-1]
-    for step in steps[:4]:
-        first.push(step)
-    second.load_state_dict(first.state_dict())
-    actual = [second.push(step) for step in steps[4:]][-1]
-    assert (actual == expected).all()
-
-
 def test_the_window_keeps_its_own_copy():
     steps = recorded(2, 2, 2)
     window = NStepWindow(2, 0.9)

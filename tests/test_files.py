@@ -42,6 +42,13 @@ from ganlane.weights import load_weights, save_weights
 
 NOISE = np.random.default_rng(0).integers(0, 255, (200, 300, 3), dtype=np.uint8)
 TABLE = pl.DataFrame({"a": NOISE.ravel()})
+
+
+def savez(path: Path) -> None:
+    with path.open("wb") as file:
+        np.savez(file, a=NOISE)
+
+
 #: Every library that writes files here; each has its own message for a full disk.
 WRITERS = {
     "python": lambda path: path.write_bytes(NOISE.tobytes()),
@@ -49,7 +56,7 @@ WRITERS = {
     "polars, csv": lambda path: TABLE.write_csv(path),
     "torch": lambda path: torch.save({"a": torch.from_numpy(NOISE)}, path),
     "pillow": lambda path: Image.fromarray(NOISE).save(path, format="PNG"),
-    "numpy": lambda path: np.savez(path.open("wb"), a=NOISE),
+    "numpy": savez,
 }
 
 

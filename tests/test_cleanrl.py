@@ -11,11 +11,11 @@ import numpy as np
 
 ENV_ID = "ganlane:ganlane/Highway-v0"
 ROWS = 2
-STEPS = 128
+STEPS = 64
 
 
 def make_env():
-    return gym.wrappers.RecordEpisodeStatistics(gym.make(ENV_ID, goal_m=100.0))
+    return gym.wrappers.RecordEpisodeStatistics(gym.make(ENV_ID, goal_m=60.0))
 
 
 def test_its_ppo_finds_what_it_reads():

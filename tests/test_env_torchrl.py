@@ -8,7 +8,8 @@ from functools import partial
 import pytest
 import torch
 from reference.worlds import same_bits
-from torchrl.envs import ExcludeTransform, RemoveEmptySpecs, SerialEnv
+from torchrl.collectors import MultiSyncCollector
+from torchrl.envs import ExcludeTransform, ParallelEnv, RemoveEmptySpecs, SerialEnv
 from torchrl.envs.utils import check_env_specs
 
 import ganlane
@@ -61,6 +62,18 @@ def test_an_unseeded_worker_process_has_a_seed_of_its_own(monkeypatch):
     monkeypatch.setattr(multiprocessing, "current_process", lambda: worker)
     assert make().reset()[keys.SEED].tolist() == [2003]
     assert make(seed=0).reset()[keys.SEED].tolist() == [0]
+
+
+@pytest.mark.slow  # starts four processes
+def test_unseeded_workers_of_torchrl_drive_different_episodes():
+    make = partial(ganlane.make_env, "idm", 2)
+    env = ParallelEnv(2, make)
+    assert env.reset()[keys.SEED][:, 0].unique().numel() == 2
+    env.close()
+    collector = MultiSyncCollector([make] * 2, frames_per_batch=8, total_frames=8)
+    (batch,) = collector
+    assert batch[keys.SEED].unique().numel() == 2
+    collector.shutdown()
 
 
 def test_the_terms_of_the_reward_can_be_left_out():

@@ -33,6 +33,8 @@ _SLOW, _MIDDLE, _FAST = (38, 52, 128), (58, 122, 224), (158, 226, 255)
 FAST_MPS, _LEVELS = 35.0, 36
 
 HEADER_HEIGHT, FOOTER_HEIGHT = 56, 24
+#: Height of the small letters, pixels.
+SMALL = 12
 #: Share of the road in the picture that lies behind the ego.
 BEHIND = 0.38
 #: The scale across the road is up to so many times that along it: vehicles and lateral movements
@@ -89,8 +91,8 @@ def put_text(
     image: Image.Image,
     position: tuple[float, float],
     text: str,
-    size: int,
-    colour: str,
+    colour: str = FAINT,
+    size: int = SMALL,
     anchor: float = 0.0,
 ) -> None:
     """Write ``text`` with its top at ``position``.
@@ -184,11 +186,5 @@ class Backdrop:
         posts = np.arange(first, start + window.length_m + 10.0, POST_EVERY_M)
         for metres, column in zip(posts, window.column(posts, ego_x_m)):
             draw.line((column, lower + 7, column, lower + 20), fill=FAINT, width=2)
-            put_text(
-                picture,
-                (column + 7, lower + 8),
-                f"{int(metres)} m",
-                12,
-                FAINT,
-            )
+            put_text(picture, (column + 7, lower + 8), f"{int(metres)} m")
         return picture

@@ -206,9 +206,8 @@ class FramePainter:
         shown = t.valid[past] & t.valid[frame] & is_here
         columns, rows = self.window.column(t.x[past], ego_x), self.window.row(t.y[past])
         places = np.stack((columns, rows), axis=-1) * _TRAIL_OVERSAMPLING
-        mask = Image.new(
-            "L", (picture.width * _TRAIL_OVERSAMPLING, picture.height * _TRAIL_OVERSAMPLING)
-        )
+        width, height = picture.size
+        mask = Image.new("L", (width * _TRAIL_OVERSAMPLING, height * _TRAIL_OVERSAMPLING))
         draw = ImageDraw.Draw(mask)
         # The ego comes last, on top of the others.
         for vehicle in reversed(range(t.x.shape[1])):
@@ -307,4 +306,4 @@ def _draw_tints(header: Image.Image) -> None:
     put_text(header, (left, 9), "others' speed, m/s")
     for speed in (0, 10, 20, 30):
         place = left + speed / canvas.FAST_MPS * (right - left), 38
-        put_text(header, place, f"{speed}", size=11, anchor=0.5)
+        put_text(header, place, f"{speed}", size=11, anchor=0.5 if speed else 0.0)

@@ -18,7 +18,6 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, NullLocator
 
 from ganlane.agents.checkpoint import with_seeds
-from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.data import FRAME_S, default_scenes, read_scenes
 from ganlane.errors import UserError
 from ganlane.generator import load_generator, shipped_generator
@@ -31,13 +30,14 @@ from ganlane.generator.windows import (
     group_windows,
     scene_tracks,
 )
+from ganlane.reproduce.episodes import drive_episode
 from ganlane.reproduce.report import Row, rows_of
 from ganlane.settings.commands import ReproduceConfig
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.sim.random import Stream
 from ganlane.view.curves import read_metrics
 from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, panel_grid
-from ganlane.view.record import EpisodeLabel, Trajectory, record_episode
+from ganlane.view.record import EpisodeLabel, Trajectory
 
 #: Panels of Figure 2 by what the vehicle does, and samples drawn in each.
 PANELS = {
@@ -213,32 +213,8 @@ def drive_beginning(config: ReproduceConfig, traffic: TrafficConfig) -> Trajecto
     # The figure shows what generated traffic teaches.
     learnt = [name for name in config.agents if "agent_gan" in name]
     name = with_seeds([*learnt, config.agents[-1]][0])[0]
-    driver = make_driver(name, config.env, device=config.device)
-    observation = config.observation.read_by(driver.observation)
-    # A trained agent brings the mask and the observation that it was trained with.
-    mask, policy = driver.behind(config.mask)
-    module = make_traffic(
-        traffic,
-        config.env,
-        Stream.named(config.stream),
-    )
-    env = make_env(
-        module,
-        config.env,
-        observation,
-        config.reward,
-        device=config.device,
-        mask=mask,
-    )
-    return record_episode(
-        env,
-        policy,
-        config.seed,
-        0,
-        driver.name,
-        traffic.label(),
-        LONGEST_S,
-    )
+    stream = Stream.named(config.stream)
+    return drive_episode(name, traffic, config, 0, stream, LONGEST_S)
 
 
 def busiest(episode: Trajectory) -> pl.DataFrame:
@@ -454,17 +430,9 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
     bounds = [bound for row in shown for bound in _interval(row)]
     lowest = min(-20.0, *bounds)
     highest = max(20.0, *bounds)
-    figure, grid = panel_grid(
-        len(traffics),
-        3.4,
-        1.3 + 0.19 * len(drivers),
-    )
+    figure, grid = panel_grid(len(traffics), 3.4, 1.3 + 0.19 * len(drivers))
     for place, (axes, traffic) in enumerate(zip(grid, traffics)):
-        axes.axvline(
-            0.0,
-            color=FAINT,
-            lw=0.9,
-        )
+        axes.axvline(0.0, color=FAINT, lw=0.9)
         axes.set(
             title=traffic,
             xlabel="mean reward minus MOBIL's",
@@ -472,14 +440,8 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
         )
         # Most leads lie within 20, those of random driving far below.
         axes.set_xscale("symlog", linthresh=20.0)
-        axes.set_yticks(
-            range(len(drivers)),
-            drivers if place % 3 == 0 else [],
-        )
-        axes.set_xticks(
-            [x for x in _LEADS if lowest <= x <= highest],
-            minor=False,
-        )
+        axes.set_yticks(range(len(drivers)), drivers if place % 3 == 0 else [])
+        axes.set_xticks([x for x in _LEADS if lowest <= x <= highest])
         axes.set_xlim(1.15 * lowest, 1.15 * highest)
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_locator(NullLocator())
@@ -489,38 +451,12 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
             line = drivers.index(row["driver"])
             trained = len(row["each"]) > 1
             colour = COLOURS[0] if trained else INK
-            axes.plot(
-                _interval(row),
-                [line] * 2,
-                color=colour,
-                lw=2.2,
-                solid_capstyle="butt",
-            )
-            axes.plot(
-                row["minus_mobil"],
-                line,
-                "o",
-                color=colour,
-            )
+            axes.plot(_interval(row), [line] * 2, color=colour, lw=2.2, solid_capstyle="butt")
+            axes.plot(row["minus_mobil"], line, "o", color=colour)
             if trained:
                 leads = [training["mean_reward"] - mobil[traffic] for training in row["each"]]
-                axes.plot(
-                    leads,
-                    [line] * len(leads),
-                    "|",
-                    color=COLOURS[1],
-                    ms=6,
-                    mew=1,
-                )
-    one = Line2D(
-        [],
-        [],
-        color=COLOURS[1],
-        marker="|",
-        ls="",
-        ms=6,
-        label="one training",
-    )
+                axes.plot(leads, [line] * len(leads), "|", color=COLOURS[1], ms=6, mew=1)
+    one = Line2D([], [], color=COLOURS[1], marker="|", ls="", ms=6, label="one training")
     names = {"a recipe: mean, 95 % over trainings and episodes": COLOURS[0], "a single driver": INK}
     add_legend(figure, names, [one])
     return figure

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from subprocess import PIPE, Popen
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -88,13 +89,7 @@ def write_film(
     painter, frames = FramePainter(trajectory, look), film_frames(trajectory, look)
     if kind == "gif":
         for share, colours, every in _GIF_SIZES:
-            content = _gif(
-                painter,
-                frames,
-                look.scale * share,
-                colours,
-                every,
-            )
+            content = _gif(painter, frames, look.scale * share, colours, every)
             if look.max_bytes is None or len(content) <= look.max_bytes:
                 write_bytes(path, content)
                 return path
@@ -146,12 +141,7 @@ def _gif(
     painter: FramePainter, frames: Sequence[int], scale: float, colours: int, every: int
 ) -> bytes:
     """An endless GIF with one palette for the whole film."""
-    palette = _shared_palette(
-        painter,
-        frames,
-        scale,
-        colours,
-    )
+    palette = _shared_palette(painter, frames, scale, colours)
     pictures = [
         _scaled(painter.draw(frame), scale).quantize(palette=palette, dither=Image.Dither.NONE)
         for frame in frames[::every]
@@ -183,16 +173,12 @@ def _shared_palette(
     """
     chosen = spread(frames, _PALETTE_FRAMES)
     stack = np.concatenate([np.asarray(_scaled(painter.draw(frame), scale)) for frame in chosen])
-    # One number per colour, which sorts much faster than three.
-    packed = stack.reshape(-1, 3).astype(np.int64) @ np.array([1 << 16, 1 << 8, 1])
-    values, counts = np.unique(packed, return_counts=True)
-    top = values[np.argsort(-counts, kind="stable")[:_FLAT_COLOURS]]
-    exact = np.stack([top >> 16, (top >> 8) & 255, top & 255], axis=1)
-    covering = Image.fromarray(stack).quantize(
-        colours - len(exact), method=Image.Quantize.MAXCOVERAGE
-    )
+    together = Image.fromarray(stack)
+    counts: Any = together.getcolors(2**24)
+    exact = [colour for _, colour in sorted(counts, reverse=True)[:_FLAT_COLOURS]]
+    covering = together.quantize(colours - len(exact), method=Image.Quantize.MAXCOVERAGE)
     palette = Image.new("P", (1, 1))
-    palette.putpalette([*exact.ravel().tolist(), *(covering.getpalette() or [])])
+    palette.putpalette([*itertools.chain(*exact), *(covering.getpalette() or [])])
     return palette
 
 

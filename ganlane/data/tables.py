@@ -167,6 +167,12 @@ def raise_where(
         )
 
 
+def raise_unless_positive(rows: pl.DataFrame, columns: Sequence[str], path: Path) -> None:
+    """Raise a UserError that names the first of the ``rows`` with 0 or less in a column."""
+    for column in columns:
+        raise_where(rows[column] <= 0.0, rows, column, path, "is not above 0")
+
+
 def read_blocks(
     table: TextTable,
     wanted: Sequence[str],

@@ -12,12 +12,9 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
+from ganlane.data.lanes import Flags, Floats
 from ganlane.data.schema import FRAME_S, SCHEMA
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,10 @@ Exposure, lane changes, speeds, accelerations, headways.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, is_dataclass
-from typing import Any, Final, TypeVar, get_type_hints
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 import polars as pl
@@ -25,8 +24,8 @@ from ganlane.data.lanes import (
 )
 from ganlane.data.schema import FRAME_S, TRACK, TRACK_STRIDE
 from ganlane.errors import UserError
+from ganlane.settings.record import Record, make, plain
 
-_Record = TypeVar("_Record")
 #: Levels of the stored quantiles: fine enough to sample from by linear interpolation.
 LEVELS: Final = (
     0.01,
@@ -41,16 +40,16 @@ _STANDSTILL_GAP_M = 2.0
 
 
 @dataclass(frozen=True)
-class Distribution:
+class Distribution(Record):
     """Number, mean, standard deviation and quantiles (at :data:`LEVELS`) of a sample.
 
     An empty sample has ``mean`` None and no quantiles; fewer than two samples have ``sd`` None.
     """
 
     count: int
-    mean: float | None
-    sd: float | None
-    quantiles: tuple[float, ...]
+    mean: float | None = None
+    sd: float | None = None
+    quantiles: tuple[float, ...] = ()
 
     def quantile(self, level: float) -> float:
         """Value at ``level``, linear between :data:`LEVELS` and constant beyond them."""
@@ -61,24 +60,15 @@ def describe(values: ArrayLike) -> Distribution:
     """Summarise a sample without NaN."""
     sample = np.asarray(values, dtype=np.float64)
     if not len(sample):
-        return Distribution(
-            0,
-            None,
-            None,
-            (),
-        )
+        return Distribution(0)
     # One sample has no spread.
     sd = float(sample.std(ddof=1)) if len(sample) > 1 else None
-    return Distribution(
-        len(sample),
-        float(sample.mean()),
-        sd,
-        tuple(float(q) for q in np.quantile(sample, LEVELS)),
-    )
+    quantiles = tuple(np.quantile(sample, LEVELS).tolist())
+    return Distribution(len(sample), float(sample.mean()), sd, quantiles)
 
 
 @dataclass(frozen=True)
-class Durations:
+class Durations(Record):
     """Durations of which some are censored, s.
 
     Attributes:
@@ -187,21 +177,11 @@ class Histogram:
         """As :func:`describe` of all samples."""
         n = self.total
         if not n:
-            return Distribution(
-                0,
-                None,
-                None,
-                (),
-            )
+            return Distribution(0)
         # Sums are exact where bins are not; rounding may make the variance negative.
         mean = self._sum / n
         spread = math.sqrt(max(self._squares - n * mean * mean, 0.0) / (n - 1)) if n > 1 else None
-        return Distribution(
-            n,
-            mean,
-            spread,
-            tuple(self.quantile(level) for level in LEVELS),
-        )
+        return Distribution(n, mean, spread, tuple(map(self.quantile, LEVELS)))
 
     def quantile(self, level: float) -> float:
         """Value at ``level``, linear within its bin, so accurate to a bin's width."""
@@ -225,7 +205,7 @@ class Histogram:
 
 
 @dataclass(frozen=True)
-class Exposure:
+class Exposure(Record):
     """Amount of driving.
 
     ``cars`` are counted once per scene, ``road_m`` is the road's mean length over the cars.
@@ -350,7 +330,7 @@ def poisson_interval(count: int) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class LaneChangeStatistics:
+class LaneChangeStatistics(Record):
     """Rates, durations and lateral speeds of lane changes (equations 9, 10 and 11).
 
     Attributes:
@@ -407,7 +387,7 @@ def lane_change_statistics(
 
 
 @dataclass(frozen=True)
-class DrivingStatistics:
+class DrivingStatistics(Record):
     """Statistics of a recording in SI units.
 
     :meth:`to_dict` and :meth:`from_dict` are exact inverses.
@@ -428,34 +408,21 @@ class DrivingStatistics:
 
     def to_dict(self) -> dict[str, Any]:
         """Nested dictionaries of numbers, None and lists, as in JSON."""
-        # Through JSON, so that tuples become the lists that a file gives back.
-        return json.loads(json.dumps(asdict(self)))
+        return plain(self)
 
     @classmethod
     def from_dict(cls, numbers: Mapping[str, Any]) -> DrivingStatistics:
         """The statistics that :meth:`to_dict` wrote.
 
         Raises:
-            UserError: a name is missing or unknown.
+            UserError: a name is missing or unknown, or a value of another type.
         """
         try:
-            return _record(cls, numbers)
-        except (KeyError, TypeError) as error:
+            return make(cls, numbers)
+        except (UserError, TypeError) as error:
             raise UserError(
                 f"not the statistics of a recording ({error}); measure them again."
             ) from error
-
-
-def _record(kind: type[_Record], numbers: Mapping[str, Any]) -> _Record:
-    """A dataclass from nested dictionaries of its fields; lists become tuples."""
-    # Unknown names reach the constructor, which refuses them.
-    values: dict[str, Any] = {**numbers}
-    for name, hint in get_type_hints(kind).items():
-        if isinstance(hint, type) and is_dataclass(hint):
-            values[name] = _record(hint, values[name])
-        elif isinstance(values.get(name), list):
-            values[name] = tuple(values[name])
-    return kind(**values)
 
 
 def driving_statistics(

@@ -47,13 +47,9 @@ def film_frames(trajectory: Trajectory, look: FilmConfig) -> list[int]:
     Raises:
         UserError: the film begins after the episode's end.
     """
+    trajectory.since(look.start_s)
     time = trajectory.time_s
-    end = float(time[-1]) if look.end_s is None else min(look.end_s, float(time[-1]))
-    if look.start_s > end:
-        raise UserError(
-            f"film from {look.start_s:g} to {end:g} s: the episode lasts {time[-1]:g} s; choose a "
-            "part of it."
-        )
+    end = min(look.end_s or np.inf, float(time[-1]))
     # 1e-9 s, so that rounding does not lose the last frame.
     times = np.arange(look.start_s, end + 1e-9, look.speedup / look.fps)
     # At every time of the film the last recorded frame is shown.

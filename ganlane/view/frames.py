@@ -17,9 +17,8 @@ from PIL import Image, ImageDraw
 from ganlane.settings.render import FilmConfig
 from ganlane.view import canvas
 from ganlane.view.canvas import HEADER_HEIGHT, SMALL, Backdrop, Window, put_text
-from ganlane.view.record import ACTION_NAMES, EpisodeLabel, Trajectory
+from ganlane.view.record import ACTION_NAMES, EpisodeLabel, FloatArray, Trajectory
 
-FloatArray = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
 
 #: Braking harder than this lights the brake lights, m/s2.

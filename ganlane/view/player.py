@@ -58,10 +58,8 @@ def player_page(trajectories: Sequence[Trajectory], look: FilmConfig | None = No
     0.2, 0.3, 0.5 or 1 s apart instead of 0.1 s; the player interpolates.
 
     Raises:
-        UserError: there is no episode, one is over by then, or the page is too large even so.
+        UserError: an episode is over by then, or the page is too large even so.
     """
-    if not trajectories:
-        raise UserError("format=html: no episode to play; record at least one.")
     look = look or FilmConfig()
     limit = look.max_bytes or MAX_BYTES_PER_EPISODE * len(trajectories)
     labels = [trajectory.label for trajectory in trajectories]

@@ -45,7 +45,7 @@ def test_speedup_and_part_choose_frames_by_time_and_the_last_one_is_held():
 
 
 def test_films_of_nothing_and_unknown_formats_are_refused(episode, tmp_path):
-    with pytest.raises(UserError, match="film from 9 to 4 s: the episode lasts 4 s"):
+    with pytest.raises(UserError, match="start at 9 s: the episode lasts 4 s"):
         write_film(episode, tmp_path / "a.gif", FilmConfig(start_s=9.0))
     with pytest.raises(UserError, match="avi"):
         write_film(episode, tmp_path / "a.avi")

@@ -35,8 +35,8 @@ from ganlane.reproduce.report import Row, rows_of
 from ganlane.settings.commands import ReproduceConfig
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.sim.random import Stream
-from ganlane.view.curves import read_metrics
-from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, panel_grid
+from ganlane.view.curves import plot_middle, read_metrics
+from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, FloatArray, add_legend, panel_grid
 from ganlane.view.record import EpisodeLabel, Trajectory
 
 #: Panels of Figure 2 by what the vehicle does, and samples drawn in each.
@@ -117,17 +117,8 @@ def forecasts_to_draw() -> pl.DataFrame:
     # Paths after the present, each [W, frames, 2]. The mean is the same for every seed.
     later = {"recorded": windows.future}
     for seed in range(SAMPLES):
-        drawn = paper_forecasts(
-            generator,
-            windows,
-            groups,
-            seed,
-            samples=1,
-        )
-        later |= {
-            "mean": drawn["mean"],
-            f"sample {seed + 1}": drawn["single"],
-        }
+        drawn = paper_forecasts(generator, windows, groups, seed, samples=1)
+        later |= {"mean": drawn["mean"], f"sample {seed + 1}": drawn["single"]}
     now = np.zeros((1, 2))
     parts = []
     for panel, (kind, row) in enumerate(interesting(windows)):
@@ -138,14 +129,14 @@ def forecasts_to_draw() -> pl.DataFrame:
             present = PRESENT if name == "observed" else 0
             # Time 0 is the present, in both directions.
             columns = {
+                "panel": panel,
+                "kind": kind,
+                "path": name,
                 "time_s": (np.arange(len(path)) - present) * FRAME_S,
                 "ahead_m": path[:, 0],
                 "left_m": path[:, 1],
             }
-            labels = [pl.lit(panel).alias("panel"), pl.lit(kind).alias("kind")]
-            parts.append(
-                pl.DataFrame(columns).select(*labels, pl.lit(name).alias("path"), pl.all())
-            )
+            parts.append(pl.DataFrame(columns))
     return pl.concat(parts)
 
 
@@ -164,20 +155,10 @@ def draw_forecasts(paths: pl.DataFrame) -> Figure:
     # What is drawn last lies above.
     styles: dict[str, dict[str, Any]] = {}
     for number in range(SAMPLES):
-        styles[f"sample {number + 1}"] = {
-            "color": colours["predicted"],
-            "lw": 0.8,
-        }
-    styles["mean"] = {
-        "color": colours["predicted, z = 0"],
-        "lw": 1.6,
-    }
+        styles[f"sample {number + 1}"] = {"color": colours["predicted"], "lw": 0.8}
+    styles["mean"] = {"color": colours["predicted, z = 0"], "lw": 1.6}
     for name in ("observed", "recorded"):
-        styles[name] = {
-            "color": colours[name],
-            "marker": ".",
-            "ms": 3,
-        }
+        styles[name] = {"color": colours[name], "marker": ".", "ms": 3}
     panels = paths.partition_by("panel", maintain_order=True)
     figure, grid = panel_grid(len(panels), 2.5, 1.7)
     for axes, panel in zip(grid, panels):
@@ -240,20 +221,23 @@ def busiest(episode: Trajectory) -> pl.DataFrame:
     part = slice(first, first + shown + 1)
     # A vehicle that is recycled would draw a line across the picture.
     jumps = episode.jumped()[first + 1 : first + shown + 1].any(axis=0)
-    frames = []
-    for vehicle in np.flatnonzero(episode.valid[part].all(axis=0) & ~jumps).tolist():
-        at = part, vehicle
-        columns = {
-            "time_s": episode.time_s[part],
-            "vehicle": np.full(shown + 1, vehicle),
-            "x_m": episode.x[at] - episode.x[first, 0],
-            "y_m": episode.y[at],
-            "heading_rad": episode.heading[at],
-            "length_m": episode.length[at],
-            "width_m": episode.width[at],
+    chosen = np.flatnonzero(episode.valid[part].all(axis=0) & ~jumps)
+
+    def of_chosen(name: str) -> FloatArray:
+        """A field of the chosen vehicles, vehicle by vehicle."""
+        return getattr(episode, name)[part][:, chosen].T.ravel()
+
+    return pl.DataFrame(
+        {
+            "time_s": np.tile(episode.time_s[part], len(chosen)),
+            "vehicle": np.repeat(chosen, shown + 1),
+            "x_m": of_chosen("x") - episode.x[first, 0],
+            "y_m": of_chosen("y"),
+            "heading_rad": of_chosen("heading"),
+            "length_m": of_chosen("length"),
+            "width_m": of_chosen("width"),
         }
-        frames.append(pl.DataFrame(columns))
-    return pl.concat(frames)
+    )
 
 
 @rc_context(STYLE)
@@ -368,31 +352,10 @@ def draw_transfer(curves: pl.DataFrame, rows: Sequence[Row]) -> Figure:
     for (_, phase), colour in zip(curves.group_by("phase", maintain_order=True), COLOURS):
         runs = phase.partition_by("run", maintain_order=True)
         points = [run.select("decisions", "mean_reward").to_numpy().T for run in runs]
-        # All runs at the decisions of the first one.
-        x = points[0][0]
-        # Runs are evaluated at slightly different decisions, so they are interpolated.
-        y = np.stack([np.interp(x, *run) for run in points])
-        axes.fill_between(
-            x,
-            y.min(axis=0),
-            y.max(axis=0),
-            color=colour,
-            alpha=0.2,
-            lw=0,
-        )
-        axes.plot(
-            x,
-            np.median(y, axis=0),
-            color=colour,
-        )
+        plot_middle(axes, points, with_range=True, middle=np.median, color=colour)
         if len(points) > 1:
             for run in points:
-                axes.plot(
-                    *run,
-                    color=colour,
-                    lw=0.5,
-                    alpha=0.6,
-                )
+                axes.plot(*run, color=colour, lw=0.5, alpha=0.6)
     # Where the second phase begins.
     switch = curves.filter(pl.col("phase") == "first")["decisions"].to_numpy().max()
     axes.axvline(

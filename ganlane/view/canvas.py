@@ -27,7 +27,6 @@ GOOD = "#68d47e"
 AMBER = "#ffd640"
 BRAKE = "#ff3028"
 GLASS = "#181c24"
-LEADER = "#78e6be"
 #: Blue for the other vehicles, from standing to ``FAST_MPS``, in so many levels.
 _SLOW, _MIDDLE, _FAST = (38, 52, 128), (58, 122, 224), (158, 226, 255)
 FAST_MPS, _LEVELS = 35.0, 36

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -194,28 +194,10 @@ def draw_runs(
             style: dict[str, Any] = {"color": colours[name]}
             # Smoothing hides the spread, so a single run is also drawn unsmoothed, faintly.
             if smooth > 1 and len(frames) == 1:
-                for x, y in _lines(frames, panel.column):
-                    plot_line(
-                        axes,
-                        x,
-                        y,
-                        **style,
-                        alpha=0.3,
-                        lw=0.8,
-                    )
-            _plot_mean(
-                axes,
-                _lines(frames, panel.column, smooth),
-                with_range=True,
-                **style,
-            )
-            _plot_mean(
-                axes,
-                _lines(frames, panel.dashed, smooth),
-                **style,
-                ls="--",
-                lw=1.2,
-            )
+                plot_middle(axes, _lines(frames, panel.column), **style, alpha=0.3, lw=0.8)
+            lines = _lines(frames, panel.column, smooth)
+            plot_middle(axes, lines, with_range=True, **style)
+            plot_middle(axes, _lines(frames, panel.dashed, smooth), **style, ls="--", lw=1.2)
     legend = {}
     for name, frames in runs.items():
         count = f" ({len(frames)} seeds: mean, range)" if len(frames) > 1 else ""
@@ -245,35 +227,25 @@ def _lines(
     return lines
 
 
-def _plot_mean(
+def plot_middle(
     axes: Axes,
     lines: Sequence[tuple[FloatArray, FloatArray]],
     with_range: bool = False,
+    middle: Callable[..., FloatArray] = np.mean,
     **style: Any,
 ) -> None:
-    """One line as it is; of several, the mean and perhaps the range where all have values."""
+    """One line as it is; of several, the ``middle`` and perhaps the range where all have values."""
     if len(lines) == 1:
         plot_line(axes, *lines[0], **style)
     if len(lines) < 2:
         return
     # Seeds are logged at different decisions: values in between are interpolated.
     x = np.unique(np.concatenate([x for x, _ in lines]))
-    # Only where all have values, else the mean would jump where a run begins or ends.
+    # Only where all have values, else the middle would jump where a run begins or ends.
     first, last = max(x[0] for x, _ in lines), min(x[-1] for x, _ in lines)
     shared = x[(x >= first) & (x <= last)]
     values = np.stack([np.interp(shared, *line) for line in lines])
-    plot_line(
-        axes,
-        shared,
-        values.mean(0),
-        **style,
-    )
+    plot_line(axes, shared, middle(values, axis=0), **style)
     if with_range:
-        axes.fill_between(
-            shared,
-            values.min(0),
-            values.max(0),
-            **style,
-            alpha=0.18,
-            lw=0,
-        )
+        low, high = values.min(0), values.max(0)
+        axes.fill_between(shared, low, high, **style, alpha=0.18, lw=0)

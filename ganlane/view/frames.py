@@ -78,7 +78,7 @@ class FramePainter:
 
     Args:
         trajectory: the recorded episode.
-        look: size of the picture, road shown, trails, speeds, leader line.
+        look: size of the picture, road shown, trails, speeds.
     """
 
     def __init__(self, trajectory: Trajectory, look: FilmConfig | None = None):
@@ -105,8 +105,6 @@ class FramePainter:
         lengths = t.length[frame] * self.window.along
         picture = self._backdrop.at(ego_x)
         self._draw_trails(picture, frame, ego_x)
-        if self.look.leader_line:
-            self._draw_leader_line(picture, frame)
         in_picture = (columns > -lengths) & (columns < width + lengths) & t.valid[frame]
         # The ego comes last, on top of the others.
         for vehicle in np.flatnonzero(in_picture)[::-1].tolist():
@@ -217,24 +215,6 @@ class FramePainter:
             for part, strength in zip(parts, _OTHER_COVERAGE if vehicle else _EGO_COVERAGE):
                 draw.line(part, fill=strength, width=2 * _TRAIL_OVERSAMPLING)
         picture.paste("white", mask=mask.reduce(_TRAIL_OVERSAMPLING))
-
-    def _draw_leader_line(self, picture: Image.Image, frame: int) -> None:
-        """A line from the ego's front to the rear of the nearest vehicle ahead in its lane.
-
-        The number is the net gap, m.
-        """
-        t, lane, x = self.trajectory, self.trajectory.lane()[frame], self.trajectory.x[frame]
-        ahead = t.valid[frame] & (lane == lane[0]) & (x > x[0])
-        if not ahead.any():
-            return
-        leader = int(np.where(ahead, x, np.inf).argmin())
-        front = x[0] + t.length[frame, 0] / 2
-        rear = x[leader] - t.length[frame, leader] / 2
-        start, end = self.window.column([front, rear], x[0])
-        row = float(self.window.row(t.y[frame, 0]))
-        ImageDraw.Draw(picture).line((start, row, end, row), fill=canvas.LEADER, width=1)
-        place = (start + min(end, self.window.width)) / 2, row - 17
-        put_text(picture, place, f"{rear - front:.0f} m", canvas.LEADER, anchor=0.5)
 
     def _draw_header(self, picture: Image.Image, frame: int) -> None:
         """Put the header of one frame on the picture."""

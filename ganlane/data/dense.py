@@ -62,31 +62,20 @@ class Recording:
         track = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)[1]
         shape = (int(time.max()) + 1, int(track.max()) + 1)
         # Values per frame and track; 0 where the track is absent.
-        arrays: dict[str, Any] = {}
+        arrays: dict[str, Any] = {"present": np.zeros(shape, bool)}
+        arrays["present"][time, track] = True
         for name in ("x", "y", "speed"):
             arrays[name] = np.zeros(shape)
             arrays[name][time, track] = rows[name].to_numpy()
         # Values per track, the same in all of its rows.
         for name in ("length", "width", "driven"):
             column = rows[name].to_numpy()
-            arrays[name] = np.zeros(
-                shape[1],
-                column.dtype,
-            )
+            arrays[name] = np.zeros(shape[1], column.dtype)
             arrays[name][track] = column
-        present = np.zeros(shape, bool)
-        present[time, track] = True
-        name = str(rows["scene"][0])
+        scene = str(rows["scene"][0])
         # Lane 0 is the rightmost; lanes beyond the leftmost one in use are not known.
         lanes = int(rows["lane"].to_numpy().max()) + 1
-        return cls(
-            name,
-            name,
-            lanes,
-            lane_width_m,
-            present=present,
-            **arrays,
-        )
+        return cls(scene, scene, lanes, lane_width_m, **arrays)
 
     @property
     def end_m(self) -> float:
@@ -138,13 +127,7 @@ class Recording:
             }
             arrays |= {name: getattr(self, name)[who] for name in ("length", "width", "driven")}
             # The unit stays that of the recording: pieces of one scene are not independent.
-            pieces.append(
-                replace(
-                    self,
-                    name=f"{self.name}@{start}",
-                    **arrays,
-                )
-            )
+            pieces.append(replace(self, name=f"{self.name}@{start}", **arrays))
         return pieces
 
 

@@ -109,10 +109,7 @@ class PooledStatistics:
             name=scene.name,
             rows=frame.height,
             tracks=exposure.tracks,
-            seconds=round(
-                FRAME_S * int(np.ptp(frame["frame"].to_numpy()) + 1),
-                1,
-            ),
+            seconds=round(FRAME_S * int(np.ptp(frame["frame"].to_numpy()) + 1), 1),
             lanes=scene.lanes,
             lane_width_m=scene.lane_width_m,
             nearest_lane_share=float(np.mean(tracks.lane == frame["lane"].to_numpy())),
@@ -133,10 +130,7 @@ class PooledStatistics:
         parts = _columns(self._exposures)
         # Weighted by cars, as equation 9 counts them.
         road_m = float(np.average(parts.pop("road_m"), weights=parts["cars"]))
-        return Exposure(
-            road_m=road_m,
-            **{name: sum(values) for name, values in parts.items()},
-        )
+        return Exposure(road_m=road_m, **{name: sum(values) for name, values in parts.items()})
 
     @property
     def changes(self) -> LaneChanges:
@@ -147,11 +141,8 @@ class PooledStatistics:
     @property
     def lane_changes(self) -> LaneChangeStatistics:
         """Rates, durations and lateral speeds over all scenes."""
-        return lane_change_statistics(
-            self.changes,
-            self.exposure,
-            float(self.describe("speed").mean or 0.0),
-        )
+        speed = float(self.describe("speed").mean or 0.0)
+        return lane_change_statistics(self.changes, self.exposure, speed)
 
     def describe(self, quantity: str) -> Distribution:
         """Summary of a quantity.
@@ -179,9 +170,7 @@ class PooledStatistics:
         }
 
 
-def _columns(
-    records: Sequence[Any],
-) -> dict[str, list[Any]]:
+def _columns(records: Sequence[Any]) -> dict[str, list[Any]]:
     """The values of each field of equal records."""
     return {name: [getattr(record, name) for record in records] for name in vars(records[0])}
 
@@ -206,11 +195,7 @@ class Preparation:
             "dropped": dict(self.count.dropped),
             "written": self.written,
         }
-        return {
-            "rows": rows,
-            "files": list(self.files),
-            **self.statistics.to_dict(),
-        }
+        return {"rows": rows, "files": list(self.files), **self.statistics.to_dict()}
 
 
 def prepare_recordings(
@@ -237,20 +222,10 @@ def prepare_recordings(
     files = []
     written = 0
     with whole_folder(out) as folder:
-        for scene in open_scenes(
-            kind,
-            path,
-            count,
-            parameters,
-            folder,
-            on_progress,
-        ):
+        for scene in open_scenes(kind, path, count, parameters, folder, on_progress):
             # A lot of parked cars has no driving to measure.
             if scene.frame["speed"].max() == 0.0 or scene.frame["frame"].n_unique() < 2:
-                count.drop(
-                    "scene in which nobody drives",
-                    scene.frame.height,
-                )
+                count.drop("scene in which nobody drives", scene.frame.height)
                 continue
             summary = statistics.add(scene)
             # Letters, digits, dots and dashes.
@@ -268,9 +243,4 @@ def prepare_recordings(
             raise UserError(
                 f"{path}: no scene in which anybody drives; give a recording of moving traffic."
             )
-    return Preparation(
-        count,
-        written,
-        tuple(files),
-        statistics,
-    )
+    return Preparation(count, written, tuple(files), statistics)

@@ -13,9 +13,7 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 from numpy.typing import ArrayLike
-from scipy.special import (
-    gammaincinv,
-)  # scipy.stats takes seconds to import
+from scipy.special import gammaincinv  # scipy.stats takes seconds to import
 
 from ganlane.data.lanes import (
     LaneChanges,
@@ -138,11 +136,7 @@ class Bins:
     @property
     def edges(self) -> np.ndarray:
         """The bins' limits [number + 1]."""
-        return np.linspace(
-            self.low,
-            self.high,
-            self.number + 1,
-        )
+        return np.linspace(self.low, self.high, self.number + 1)
 
 
 class Histogram:
@@ -150,10 +144,7 @@ class Histogram:
 
     def __init__(self, bins: Bins) -> None:
         self.bins = bins
-        self.counts = np.zeros(
-            bins.number,
-            dtype=np.int64,
-        )
+        self.counts = np.zeros(bins.number, dtype=np.int64)
         self._sum = 0.0
         self._squares = 0.0
 
@@ -165,11 +156,9 @@ class Histogram:
     def add(self, values: ArrayLike) -> None:
         """Count more samples, without NaN."""
         sample = np.asarray(values, dtype=np.float64)
-        low = self.bins.low
-        high = self.bins.high
+        limits = (self.bins.low, self.bins.high)
         # numpy drops values beyond the bins; these are to count in the outermost ones.
-        inside = sample.clip(low, high)
-        self.counts += np.histogram(inside, self.bins.number, (low, high))[0]
+        self.counts += np.histogram(sample.clip(*limits), self.bins.number, limits)[0]
         self._sum += float(sample.sum())
         self._squares += float(np.square(sample).sum())
 
@@ -191,10 +180,7 @@ class Histogram:
         occupied = np.flatnonzero(self.counts)
         index = np.searchsorted(below[occupied + 1], place).clip(max=len(occupied) - 1)
         k = occupied[index]
-        share = ((place - below[k]) / self.counts[k]).clip(
-            0.0,
-            1.0,
-        )
+        share = ((place - below[k]) / self.counts[k]).clip(0.0, 1.0)
         edges = self.bins.edges
         return float(edges[k] + share * (edges[k + 1] - edges[k]))
 
@@ -233,12 +219,7 @@ def measure_exposure(frame: pl.DataFrame) -> Exposure:
         tracks=frame.select(TRACK).n_unique(),
         cars=int(roads["cars"].sum()),
         samples=frame.height,
-        road_m=float(
-            np.average(
-                roads["road"].to_numpy(),
-                weights=roads["cars"].to_numpy(),
-            )
-        ),
+        road_m=float(np.average(roads["road"].to_numpy(), weights=roads["cars"].to_numpy())),
         vehicle_km=float(frame.select(pl.sum_horizontal(*driven).sqrt().sum()).item()) / 1000.0,
     )
 
@@ -256,18 +237,11 @@ def leader_gaps(frame: pl.DataFrame) -> pl.DataFrame:
     }
     # Positions are those of the bodies' centres, so half of both lengths lies between.
     gap = ahead["x"] - pl.col("x") - 0.5 * (ahead["length"] + pl.col("length"))
-    ordered = frame.sort(
-        "scene",
-        "frame",
-        "lane",
-        "x",
-    )
+    ordered = frame.sort("scene", "frame", "lane", "x")
     return ordered.with_columns(gap=gap, leader_speed=ahead["speed"]).drop_nulls("gap")
 
 
-def quantities(
-    frame: pl.DataFrame,
-) -> dict[str, np.ndarray]:
+def quantities(frame: pl.DataFrame) -> dict[str, np.ndarray]:
     """Samples of every quantity of a frame in the schema, sorted: ``speed`` and those below.
 
     ``acceleration_raw``: differences of the recorded speed between frames, m/s2; mostly noise in
@@ -295,15 +269,7 @@ def quantities(
         / (lag * FRAME_S) ** 2,
     )
     # Sorting needs most memory: only once, and with no more columns than needed.
-    columns = frame.select(
-        "scene",
-        "vehicle",
-        "frame",
-        "x",
-        "speed",
-        "lane",
-        "length",
-    )
+    columns = frame.select(*TRACK, "frame", "x", "speed", "lane", "length")
     with_leader = leader_gaps(columns).select(*TRACK, "speed", "gap")
     # Further away a leader has no influence.
     close = pl.col("gap").is_between(0.0, _FOLLOWING_GAP_M)
@@ -436,19 +402,11 @@ def driving_statistics(
     exposure = measure_exposure(frame)
     samples = quantities(frame)
     changes = find_lane_changes(tracks_of_frame(frame, lane_widths))
-    described = (
-        "speed",
-        "acceleration_raw",
-        "acceleration_smoothed",
-        "headway",
-    )
+    speed = float(samples["speed"].mean())
+    described = ("speed", "acceleration_raw", "acceleration_smoothed", "headway")
     return DrivingStatistics(
         exposure=exposure,
-        lane_changes=lane_change_statistics(
-            changes,
-            exposure,
-            float(samples["speed"].mean()),
-        ),
+        lane_changes=lane_change_statistics(changes, exposure, speed),
         speed_sd_in_frame=_mean_spread(frame, ["scene", "frame"]),
         speed_sd_in_lane=_mean_spread(frame, ["scene", "frame", "lane"]),
         **{name: describe(samples[name]) for name in described},
@@ -457,7 +415,6 @@ def driving_statistics(
 
 def _mean_spread(frame: pl.DataFrame, groups: list[str]) -> float | None:
     # In the order of the rows, so that the mean is the same to the last bit in every run.
-    spread = (
-        frame.group_by(groups, maintain_order=True).agg(sd=pl.col("speed").std())["sd"].drop_nulls()
-    )
-    return float(spread.mean()) if len(spread) else None  # type: ignore[arg-type]
+    spreads = frame.group_by(groups, maintain_order=True).agg(pl.col("speed").std())
+    # One vehicle has no deviation; the mean of nothing is None.
+    return spreads["speed"].drop_nulls().mean()  # type: ignore[return-value]

@@ -351,7 +351,7 @@ def draw_transfer(curves: pl.DataFrame, rows: Sequence[Row]) -> Figure:
     axes.xaxis.set_major_formatter(EngFormatter())
     for (_, phase), colour in zip(curves.group_by("phase", maintain_order=True), COLOURS):
         runs = phase.partition_by("run", maintain_order=True)
-        points = [run.select("decisions", "mean_reward").to_numpy().T for run in runs]
+        points = [(run["decisions"].to_numpy(), run["mean_reward"].to_numpy()) for run in runs]
         plot_middle(axes, points, with_range=True, middle=np.median, color=colour)
         if len(points) > 1:
             for run in points:

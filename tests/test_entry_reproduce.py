@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import pytest
 
-from ganlane.reproduce import cells, main
+from ganlane.config.run import run_command
+from ganlane.reproduce import cells
 
+main = partial(run_command, "reproduce")
 SHORT = [
     "episodes=3",
     "workers=1",
@@ -49,7 +52,7 @@ def test_one_command_leaves_numbers_tables_and_figures_in_one_folder(cells_drive
                 *SMALL,
                 "fewer={gan: 2, idm: 2}",
                 f"runs=[{runs}]",
-                "from=shipped",
+                "source=shipped",
             ]
         )
         == 0
@@ -136,7 +139,7 @@ def test_a_training_from_scratch_that_fails_is_named_after_the_hours_were(monkey
             [
                 *SHORT,
                 *SMALL,
-                "from=scratch",
+                "source=scratch",
                 "training_seeds=[4,5]",
             ]
         )

@@ -7,17 +7,11 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from ganlane.data.prepared import (
-    Preparation,
-    SceneSummary,
-    prepare_recordings,
-)
-from ganlane.data.sources import (
-    byte_progress,
-    recordings_path,
-)
+from ganlane.data.prepared import Preparation, prepare_recordings
+from ganlane.data.sources import byte_progress, recordings_path
+from ganlane.data.statistics import describe
 from ganlane.evaluation import write_results
 from ganlane.evaluation.table import Table
 from ganlane.files import write_bytes
@@ -47,10 +41,8 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
     # Without a place of their own the scenes lie in the run's folder.
     out = Path(config.out) if config.out else folder / "scenes"
 
-    def show(
-        scene: SceneSummary,
-    ) -> None:  # while the others are still read
-        line = f"{scene.name}: {scene.rows:,} rows, {scene.vehicle_km:.1f} vehicle-km"
+    def show(scene: dict[str, Any]) -> None:  # while the others are still read
+        line = f"{scene['name']}: {scene['rows']:,} rows, {scene['vehicle_km']:.1f} vehicle-km"
         print(line, file=sys.stderr, flush=True)
 
     with byte_progress("read") as progress:
@@ -178,7 +170,7 @@ def _bullets(lines: Iterable[str]) -> str:
     return "\n".join(f"- {line}" for line in lines)
 
 
-def _scene_table(scenes: Sequence[SceneSummary]) -> str:
+def _scene_table(scenes: Sequence[dict[str, Any]]) -> str:
     # One line per scene.
     head = [
         "scene",
@@ -187,30 +179,28 @@ def _scene_table(scenes: Sequence[SceneSummary]) -> str:
         "s",
         "lanes",
         "lane width, m",
-    ]
-    head += [
         "rows in the nearest lane, %",
         "vehicle-km",
         "mean speed, m/s",
+        "lane changes",
+        "per vehicle-km (95 %)",
     ]
-    head += ["lane changes", "per vehicle-km (95 %)"]
     rows = []
     # As many as fit on a page.
     for scene in scenes[:_MOST_SCENES]:
-        low = scene.per_vehicle_km_low
-        high = scene.per_vehicle_km_high
+        low, high = scene["per_vehicle_km_low"], scene["per_vehicle_km_high"]
         cells = [
-            scene.name,
-            f"{scene.rows:,}",
-            f"{scene.tracks:,}",
-            f"{scene.seconds:g}",
-            f"{scene.lanes}",
-            f"{scene.lane_width_m:.2f}",
-            f"{100.0 * scene.nearest_lane_share:.1f}",
-            f"{scene.vehicle_km:.1f}",
-            f"{scene.mean_speed_mps:.1f}",
-            f"{scene.lane_changes:,}",
-            f"{scene.per_vehicle_km:.3f} ({low:.3f} to {high:.3f})",
+            scene["name"],
+            f"{scene['rows']:,}",
+            f"{scene['tracks']:,}",
+            f"{scene['seconds']:g}",
+            f"{scene['lanes']}",
+            f"{scene['lane_width_m']:.2f}",
+            f"{100.0 * scene['nearest_lane_share']:.1f}",
+            f"{scene['vehicle_km']:.1f}",
+            f"{scene['mean_speed_mps']:.1f}",
+            f"{scene['lane_changes']:,}",
+            f"{scene['per_vehicle_km']:.3f} ({low:.3f} to {high:.3f})",
         ]
         rows.append(cells)
     # A folder of highD has more than a page holds.
@@ -224,7 +214,7 @@ def _distribution_table(prepared: Preparation) -> str:
     levels = [f"{100 * level:g} %" for level in _SHOWN_LEVELS]
     rows = []
     for name, title in _QUANTITIES.items():
-        sample = prepared.statistics.describe(name)
+        sample = describe(prepared.statistics.sample(name))
         # An empty sample leaves its cells empty.
         values = [sample.mean, sample.sd]
         values += [sample.quantile(level) if sample.count else None for level in _SHOWN_LEVELS]

@@ -23,10 +23,7 @@ from ganlane.data.recordings import (
 )
 from ganlane.data.schema import FRAME_S, RowCount, Scene
 from ganlane.data.statistics import (
-    Bins,
-    Distribution,
     Exposure,
-    Histogram,
     LaneChangeStatistics,
     describe,
     lane_change_statistics,
@@ -38,89 +35,56 @@ from ganlane.errors import UserError
 from ganlane.files import whole_folder
 from ganlane.settings.generator import NgsimParameters
 
-#: Bins of each quantity in m/s, m/s2, s or m; quantiles are accurate to a bin's width.
-QUANTITIES: Final = {
-    "speed": Bins(0.0, 60.0, 6000),
-    "acceleration_raw": Bins(-20.0, 20.0, 8000),
-    "acceleration_smoothed": Bins(-20.0, 20.0, 8000),
-    "headway": Bins(-2.0, 30.0, 6400),
-    "time_headway": Bins(0.0, 40.0, 8000),
-    "gap": Bins(0.0, 300.0, 6000),
-}
-
-
-@dataclass(frozen=True)
-class SceneSummary:
-    """One scene in numbers; rates as in :class:`LaneChangeStatistics`.
-
-    ``nearest_lane_share`` is the share of rows whose recorded lane is the one whose centre is
-    nearest: near 1 where the road is straight in the recording's coordinates.
-    """
-
-    name: str
-    rows: int
-    tracks: int
-    seconds: float
-    lanes: int
-    lane_width_m: float
-    nearest_lane_share: float
-    vehicle_km: float
-    mean_speed_mps: float
-    lane_changes: int
-    srlc: float
-    per_vehicle_km: float
-    per_vehicle_km_low: float
-    per_vehicle_km_high: float
+#: Accelerations beyond it, which few cars reach, are strong, m/s2.
+_STRONG_MPS2: Final = 3.0
+_ACCELERATIONS: Final = ("acceleration_raw", "acceleration_smoothed")
 
 
 class PooledStatistics:
-    """Statistics over scenes: :meth:`add` each one, then read the attributes."""
+    """Statistics over scenes: :meth:`add` each one, then read the attributes.
+
+    Attributes:
+        scenes: numbers of each scene; rates as in :class:`LaneChangeStatistics`.
+            ``nearest_lane_share`` is the share of rows whose recorded lane is the one whose centre
+            is nearest: near 1 where the road is straight in the recording's coordinates.
+    """
 
     def __init__(self) -> None:
-        self.histograms = {name: Histogram(bins) for name, bins in QUANTITIES.items()}
-        self.scenes: list[SceneSummary] = []
+        self.scenes: list[dict[str, Any]] = []
         self._exposures: list[Exposure] = []
         self._changes: list[LaneChanges] = []
-        #: One number per car: few enough to be stored.
-        self._headways: list[np.ndarray] = []
-        #: Numbers of accelerations beyond 3 m/s2, which few cars reach.
-        self._strong = dict.fromkeys(("acceleration_raw", "acceleration_smoothed"), 0)
+        self._samples: list[dict[str, np.ndarray]] = []
 
-    def add(self, scene: Scene) -> SceneSummary:
+    def add(self, scene: Scene) -> dict[str, Any]:
         """Measure one more scene."""
         frame = scene.frame
-        exposure = measure_exposure(scene.frame)
+        exposure = measure_exposure(frame)
         tracks = tracks_of_frame(frame, {scene.name: scene.lane_width_m})
         changes = find_lane_changes(tracks)
         self._exposures.append(exposure)
         self._changes.append(changes)
-        # Histograms, so that memory does not grow with the recordings.
-        for name, values in quantities(frame).items():
-            self.histograms[name].add(values)
-            if name == "headway":
-                self._headways.append(values)
-            # The bins do not end at 3 m/s2, so these are counted apart.
-            if name in self._strong:
-                self._strong[name] += int(np.count_nonzero(np.abs(values) > 3.0))
-        speed = float(frame["speed"].mean())  # type: ignore[arg-type]
+        # Numbers of their own, which do not hold on to the frame.
+        samples = {name: values.copy() for name, values in quantities(frame).items()}
+        self._samples.append(samples)
+        speed = float(samples["speed"].mean())
         # A scene's own rates, for the table.
         rates = lane_change_statistics(changes, exposure, speed)
-        summary = SceneSummary(
-            name=scene.name,
-            rows=frame.height,
-            tracks=exposure.tracks,
-            seconds=round(FRAME_S * int(np.ptp(frame["frame"].to_numpy()) + 1), 1),
-            lanes=scene.lanes,
-            lane_width_m=scene.lane_width_m,
-            nearest_lane_share=float(np.mean(tracks.lane == frame["lane"].to_numpy())),
-            vehicle_km=exposure.vehicle_km,
-            mean_speed_mps=speed,
-            lane_changes=rates.count,
-            srlc=rates.srlc,
-            per_vehicle_km=rates.per_vehicle_km,
-            per_vehicle_km_low=rates.per_vehicle_km_low,
-            per_vehicle_km_high=rates.per_vehicle_km_high,
-        )
+        summary = {
+            "name": scene.name,
+            "rows": frame.height,
+            "tracks": exposure.tracks,
+            "seconds": round(FRAME_S * int(np.ptp(frame["frame"].to_numpy()) + 1), 1),
+            "lanes": scene.lanes,
+            "lane_width_m": scene.lane_width_m,
+            "nearest_lane_share": float(np.mean(tracks.lane == frame["lane"].to_numpy())),
+            "vehicle_km": exposure.vehicle_km,
+            "mean_speed_mps": speed,
+            "lane_changes": rates.count,
+            "srlc": rates.srlc,
+            "per_vehicle_km": rates.per_vehicle_km,
+            "per_vehicle_km_low": rates.per_vehicle_km_low,
+            "per_vehicle_km_high": rates.per_vehicle_km_high,
+        }
         self.scenes.append(summary)
         return summary
 
@@ -141,31 +105,27 @@ class PooledStatistics:
     @property
     def lane_changes(self) -> LaneChangeStatistics:
         """Rates, durations and lateral speeds over all scenes."""
-        speed = float(self.describe("speed").mean or 0.0)
+        speed = float(self.sample("speed").mean())
         return lane_change_statistics(self.changes, self.exposure, speed)
 
-    def describe(self, quantity: str) -> Distribution:
-        """Summary of a quantity.
-
-        Exact for headways, for others with quantiles accurate to a bin's width.
-        """
-        # One value per car fits into memory, so no bins are needed.
-        if quantity == "headway":
-            return describe(np.concatenate([np.empty(0), *self._headways]))
-        return self.histograms[quantity].describe()
+    def sample(self, quantity: str) -> np.ndarray:
+        """All values of one of the :func:`quantities`."""
+        return np.concatenate([samples[quantity] for samples in self._samples])
 
     def strong_share(self, quantity: str) -> float | None:
         """Share of the accelerations beyond 3 m/s2; None without any."""
-        total = self.histograms[quantity].total
-        return self._strong[quantity] / total if total else None
+        strong = np.abs(self.sample(quantity)) > _STRONG_MPS2
+        return float(strong.mean()) if len(strong) else None
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain numbers and dataclasses."""
+        described = {name: describe(self.sample(name)) for name in self._samples[0]}
+        shares = {f"{name}_beyond_3_mps2": self.strong_share(name) for name in _ACCELERATIONS}
         return {
             "exposure": self.exposure,
             "lane_changes": self.lane_changes,
-            **{name: self.describe(name) for name in self.histograms},
-            **{f"{name}_beyond_3_mps2": self.strong_share(name) for name in self._strong},
+            **described,
+            **shares,
             "scenes": self.scenes,
         }
 
@@ -205,7 +165,7 @@ def prepare_recordings(
     parameters: NgsimParameters | None = None,
     scene_s: float | None = None,
     on_progress: OnProgress | None = None,
-    on_scene: Callable[[SceneSummary], None] | None = None,
+    on_scene: Callable[[dict[str, Any]], None] | None = None,
 ) -> Preparation:
     """Read recordings, write each as a Parquet file into the new folder ``out``, and measure them.
 

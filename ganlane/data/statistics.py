@@ -5,7 +5,6 @@ Exposure, lane changes, speeds, accelerations, headways.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -137,57 +136,6 @@ class Bins:
     def edges(self) -> np.ndarray:
         """The bins' limits [number + 1]."""
         return np.linspace(self.low, self.high, self.number + 1)
-
-
-class Histogram:
-    """Counts per bin of samples that are added part by part, and their exact mean and spread."""
-
-    def __init__(self, bins: Bins) -> None:
-        self.bins = bins
-        self.counts = np.zeros(bins.number, dtype=np.int64)
-        self._sum = 0.0
-        self._squares = 0.0
-
-    @property
-    def total(self) -> int:
-        """Number of samples."""
-        return int(self.counts.sum())
-
-    def add(self, values: ArrayLike) -> None:
-        """Count more samples, without NaN."""
-        sample = np.asarray(values, dtype=np.float64)
-        limits = (self.bins.low, self.bins.high)
-        # numpy drops values beyond the bins; these are to count in the outermost ones.
-        self.counts += np.histogram(sample.clip(*limits), self.bins.number, limits)[0]
-        self._sum += float(sample.sum())
-        self._squares += float(np.square(sample).sum())
-
-    def describe(self) -> Distribution:
-        """As :func:`describe` of all samples."""
-        n = self.total
-        if not n:
-            return Distribution(0)
-        # Sums are exact where bins are not; rounding may make the variance negative.
-        mean = self._sum / n
-        spread = math.sqrt(max(self._squares - n * mean * mean, 0.0) / (n - 1)) if n > 1 else None
-        return Distribution(n, mean, spread, tuple(map(self.quantile, LEVELS)))
-
-    def quantile(self, level: float) -> float:
-        """Value at ``level``, linear within its bin, so accurate to a bin's width."""
-        # Samples are taken as evenly spread within their bin.
-        place = level * self.total
-        below = np.concatenate(([0], np.cumsum(self.counts)))
-        occupied = np.flatnonzero(self.counts)
-        index = np.searchsorted(below[occupied + 1], place).clip(max=len(occupied) - 1)
-        k = occupied[index]
-        share = ((place - below[k]) / self.counts[k]).clip(0.0, 1.0)
-        edges = self.bins.edges
-        return float(edges[k] + share * (edges[k + 1] - edges[k]))
-
-    def density(self) -> np.ndarray:
-        """[number] probability density per unit of the quantity."""
-        width = (self.bins.high - self.bins.low) / self.bins.number
-        return self.counts / max(self.total, 1) / width
 
 
 @dataclass(frozen=True)

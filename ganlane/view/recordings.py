@@ -9,8 +9,11 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ganlane.data import Histogram, PooledStatistics, survival_curve
+from ganlane.data import PooledStatistics, survival_curve
 from ganlane.view.figures import COLOURS, FAINT, STYLE, FloatArray, panel_grid
+
+#: Of each density.
+_BINS = 80
 
 
 @rc_context(STYLE)
@@ -19,7 +22,7 @@ def draw_recordings(statistics: PooledStatistics) -> Figure:
     figure, (speed, acceleration, changes, headway, time_headway, gap) = panel_grid(6)
     _draw_changes(changes, statistics)
     # The limit follows the data; a few outliers must not squeeze the rest.
-    fastest = min(60.0, 1.1 * statistics.histograms["speed"].quantile(1.0) + 1.0)
+    fastest = min(60.0, 1.1 * statistics.sample("speed").max() + 1.0)
     # Differences of measured positions are noisy; over 1 s the noise averages out.
     accelerations = {"acceleration_raw": "as recorded", "acceleration_smoothed": "over 1 s"}
     followers = "followers' headway: median (gap - 2 m) / speed"
@@ -31,19 +34,21 @@ def draw_recordings(statistics: PooledStatistics) -> Figure:
         (gap, "gap to the leader", "m", (0.0, 100.0), {"gap": ""}),
     ):
         axes.set(title=title, xlabel=unit, ylabel=f"density, per {unit}", xlim=limits)
-        _draw_densities(axes, {names[name]: statistics.histograms[name] for name in names})
+        _draw_densities(axes, {names[name]: statistics.sample(name) for name in names})
     acceleration.legend(loc="upper right", fontsize=8)
     return figure
 
 
-def _draw_densities(axes: Axes, histograms: Mapping[str, Histogram]) -> None:
+def _draw_densities(axes: Axes, samples: Mapping[str, FloatArray]) -> None:
     """Densities over the limits of the panel, and the share of the values beyond them."""
-    for line, (label, histogram) in enumerate(histograms.items()):
-        middles, density = binned_density(histogram, *axes.get_xlim())
-        axes.plot(middles, density, color=COLOURS[line], label=label)
+    for line, (label, sample) in enumerate(samples.items()):
+        counts, edges = np.histogram(sample, _BINS, axes.get_xlim())
+        # By all values, those beyond the limits too, so densities of panels can be compared.
+        density = counts / (max(len(sample), 1) * (edges[1] - edges[0]))
+        axes.plot((edges[1:] + edges[:-1]) / 2, density, color=COLOURS[line], label=label)
         # What the panel cuts off is said in words, so that the curve is not taken for all of it.
-        beyond = 100.0 * (1.0 - float(np.sum(density)) * float(middles[1] - middles[0]))
-        if histogram.total and beyond >= 0.05:
+        beyond = 100.0 * (1.0 - counts.sum() / max(len(sample), 1))
+        if len(sample) and beyond >= 0.05:
             axes.text(
                 0.99,
                 0.6 - 0.1 * line,
@@ -53,25 +58,6 @@ def _draw_densities(axes: Axes, histograms: Mapping[str, Histogram]) -> None:
                 size=8,
                 transform=axes.transAxes,
             )
-
-
-def binned_density(
-    histogram: Histogram,
-    low: float,
-    high: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Middles of about 80 bins from ``low`` to ``high``, and the density there."""
-    edges = histogram.bins.edges
-    # Limits of the panel fall on edges of bins, except for rounding.
-    first, last = np.searchsorted(edges, (low - 1e-9, high - 1e-9))
-    # The histogram's own bins are finer.
-    merged = max(1, int(last - first) // 80)
-    number = int(last - first) // merged
-    counts = histogram.counts[first : first + number * merged].reshape(number, merged).sum(axis=1)
-    width = merged * float(edges[1] - edges[0])
-    middles = edges[first] + width * (np.arange(number) + 0.5)
-    # By all values, those beyond the limits too, so densities of panels can be compared.
-    return middles, counts / (max(histogram.total, 1) * width)
 
 
 def _draw_changes(axes: Axes, statistics: PooledStatistics) -> None:

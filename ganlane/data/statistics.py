@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike
 from scipy.special import gammaincinv  # scipy.stats takes seconds to import
 
 from ganlane.data.lanes import (
+    Flags,
+    Floats,
     LaneChanges,
     find_lane_changes,
     tracks_of_frame,
@@ -83,29 +85,23 @@ class Durations(Record):
     survival_median_s: float | None
 
 
-def describe_durations(duration_s: ArrayLike, complete: ArrayLike) -> Durations:
+def describe_durations(duration_s: Floats, complete: Flags) -> Durations:
     """Summarise durations [C], of which those not ``complete`` [C] are lower bounds."""
-    times = np.asarray(duration_s, dtype=np.float64)
-    is_complete = np.asarray(complete, bool)
     mean = median = None
     # Without a complete duration the curve stays at 1.
-    if is_complete.any():
-        ends, survival = survival_curve(times, is_complete)
+    if complete.any():
+        ends, survival = survival_curve(duration_s, complete)
         # The area under a step curve, up to the longest duration.
-        edges = np.concatenate(([0.0], ends, [times.max()]))
+        edges = np.concatenate(([0.0], ends, [duration_s.max()]))
         mean = float(np.sum(np.diff(edges) * np.concatenate(([1.0], survival))))
         # The first time at which half of them have ended.
         halved = np.flatnonzero(survival <= 0.5)
         median = float(ends[halved[0]]) if len(halved) else None
-    return Durations(
-        describe(times[is_complete]),
-        int(np.count_nonzero(~is_complete)),
-        mean,
-        median,
-    )
+    censored = int(np.count_nonzero(~complete))
+    return Durations(describe(duration_s[complete]), censored, mean, median)
 
 
-def survival_curve(duration_s: ArrayLike, complete: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def survival_curve(duration_s: Floats, complete: Flags) -> tuple[np.ndarray, np.ndarray]:
     """Kaplan and Meier's (1958) survival curve of durations [C].
 
     Those not ``complete`` are lower bounds.
@@ -113,11 +109,9 @@ def survival_curve(duration_s: ArrayLike, complete: ArrayLike) -> tuple[np.ndarr
     Returns [E] the distinct complete durations, growing, and [E] the shares of longer durations,
     falling.
     """
-    times = np.asarray(duration_s, dtype=np.float64)
-    is_complete = np.asarray(complete, bool)
-    ends, ending = np.unique(times[is_complete], return_counts=True)
+    ends, ending = np.unique(duration_s[complete], return_counts=True)
     # Those that last at least as long.
-    at_risk = len(times) - np.searchsorted(np.sort(times), ends)
+    at_risk = len(duration_s) - np.searchsorted(np.sort(duration_s), ends)
     return ends, np.cumprod(1.0 - ending / at_risk)
 
 

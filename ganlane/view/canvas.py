@@ -28,7 +28,7 @@ AMBER = "#ffd640"
 BRAKE = "#ff3028"
 GLASS = "#181c24"
 #: Blue for the other vehicles, from standing to ``FAST_MPS``, in so many levels.
-_SLOW, _MIDDLE, _FAST = (38, 52, 128), (58, 122, 224), (158, 226, 255)
+_BLUES = (38, 52, 128), (58, 122, 224), (158, 226, 255)
 FAST_MPS, _LEVELS = 35.0, 36
 
 HEADER_HEIGHT, FOOTER_HEIGHT = 56, 24
@@ -44,18 +44,12 @@ PERIOD_M, DASH_M = 18.0, 6.0
 POST_EVERY_M = 50.0
 
 
-# Red, green and blue of every level.
-_CHANNELS = [
-    np.interp(np.arange(_LEVELS + 1), (0, _LEVELS / 2, _LEVELS), channel)
-    for channel in zip(_SLOW, _MIDDLE, _FAST)
-]
-_TINTS = np.rint(np.transpose(_CHANNELS)).astype(np.uint8)
-
-
 def speed_tint(speed_mps: float) -> str:
     """Blue of a vehicle at this speed: dark at 0, pale at :data:`FAST_MPS` and above."""
     share = min(max(speed_mps / FAST_MPS, 0.0), 1.0)
-    return f"#{_TINTS[round(share * _LEVELS)].tobytes().hex()}"
+    place = 2.0 * round(share * _LEVELS) / _LEVELS
+    channels = [np.interp(place, (0.0, 1.0, 2.0), channel) for channel in zip(*_BLUES)]
+    return f"#{bytes(map(round, channels)).hex()}"
 
 
 def darker(colour: str) -> str:

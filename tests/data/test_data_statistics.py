@@ -214,7 +214,7 @@ def test_a_lone_lane_keeper_leaves_the_rest_open():
 def test_the_survival_curve_takes_censored_times_as_lower_bounds():
     # Worked by hand: of 5, one ends at 1 (4/5 are left), one is cut off at 2, of the other 3 one
     # ends at 3 (2/3 of 4/5), one is cut off at 4, the last ends at 5.
-    durations = [3.0, 1.0, 2.0, 5.0, 4.0], [True, True, False, True, False]
+    durations = np.array([3.0, 1.0, 2.0, 5.0, 4.0]), np.array([True, True, False, True, False])
     times, shares = survival_curve(*durations)
     assert times.tolist() == [1.0, 3.0, 5.0]
     assert shares == pytest.approx([0.8, 0.8 * 2 / 3, 0.0])
@@ -232,7 +232,7 @@ def test_the_survival_curve_takes_censored_times_as_lower_bounds():
 
 
 def test_durations_that_are_all_censored_have_no_mean():
-    durations = describe_durations([1.0, 2.0], [False, False])
+    durations = describe_durations(np.array([1.0, 2.0]), np.array([False, False]))
     assert (
         durations.censored,
         durations.survival_mean_s,
@@ -243,7 +243,8 @@ def test_durations_that_are_all_censored_have_no_mean():
         None,
     )
     # One seen and a longer one cut off: the curve stays at one half or above after the last end.
-    open_ended = describe_durations([1.0, 2.0, 2.5], [True, False, False])
+    times, complete = np.array([1.0, 2.0, 2.5]), np.array([True, False, False])
+    open_ended = describe_durations(times, complete)
     assert open_ended.survival_median_s is None
     assert open_ended.survival_mean_s == pytest.approx(1.0 + 1.5 * 2.0 / 3.0)
 

@@ -20,8 +20,6 @@ from ganlane.settings.recordings import PrepareConfig
 from ganlane.view.figures import save_figure
 from ganlane.view.recordings import draw_recordings
 
-#: Maximum number of scenes in the table.
-_MOST_SCENES: Final = 60
 _QUANTITIES: Final = {
     "speed": "speed, m/s",
     "acceleration_raw": "acceleration as recorded, m/s2",
@@ -186,8 +184,7 @@ def _scene_table(scenes: Sequence[dict[str, Any]]) -> str:
         "per vehicle-km (95 %)",
     ]
     rows = []
-    # As many as fit on a page.
-    for scene in scenes[:_MOST_SCENES]:
+    for scene in scenes:
         low, high = scene["per_vehicle_km_low"], scene["per_vehicle_km_high"]
         cells = [
             scene["name"],
@@ -203,10 +200,7 @@ def _scene_table(scenes: Sequence[dict[str, Any]]) -> str:
             f"{scene['per_vehicle_km']:.3f} ({low:.3f} to {high:.3f})",
         ]
         rows.append(cells)
-    # A folder of highD has more than a page holds.
-    more = len(scenes) - _MOST_SCENES
-    note = f"\n\n{more} more scenes are in results.json." if more > 0 else ""
-    return Table("", head, rows, len(head)).markdown(heading=False) + note
+    return Table("", head, rows, len(head)).markdown(heading=False)
 
 
 def _distribution_table(prepared: Preparation) -> str:

@@ -203,8 +203,6 @@ def _scene(
     # Rows that were dropped split a track: nothing is interpolated across a gap.
     tracks = number_tracks(turned, str(path)).partition_by("vehicle", maintain_order=True)
     frame = pl.concat([resample(track, rate_hz) for track in tracks])
-    if frame.is_empty():
-        return None
     frame = validate(frame, f"{path}, {name}", first_line=None)
     return Scene(name, sort(frame), direction.lane_width)
 

@@ -206,10 +206,7 @@ def busiest(episode: Trajectory) -> pl.DataFrame:
         ``y_m``, ``heading_rad``, ``length_m`` and ``width_m``; a vehicle that is placed elsewhere
         meanwhile is left out.
     """
-    shown = min(
-        round(SHOWN_S / episode.frame_s),
-        len(episode) - 1,
-    )
+    shown = min(round(SHOWN_S / FRAME_S), len(episode) - 1)
     ahead = episode.x - episode.x[:, :1]
     # Vehicles in view, the ego left out.
     near = episode.valid & (ahead > AROUND_M[0]) & (ahead < AROUND_M[1] / 2.0)

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
+from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.render import FilmConfig
 from ganlane.view import canvas
 from ganlane.view.canvas import HEADER_HEIGHT, SMALL, Backdrop, Window, put_text
@@ -108,12 +109,7 @@ class FramePainter:
         in_picture = (columns > -lengths) & (columns < width + lengths) & t.valid[frame]
         # The ego comes last, on top of the others.
         for vehicle in np.flatnonzero(in_picture)[::-1].tolist():
-            self._draw_vehicle(
-                picture,
-                frame,
-                vehicle,
-                float(columns[vehicle]),
-            )
+            self._draw_vehicle(picture, frame, vehicle, float(columns[vehicle]))
         behind = int((t.valid[frame] & (columns < 0)).sum())
         ahead = int((t.valid[frame] & (columns > width)).sum())
         room_above = self.window.edges[0] - HEADER_HEIGHT > 2 * SMALL
@@ -196,7 +192,7 @@ class FramePainter:
         ends.
         """
         t = self.trajectory
-        steps = round(self.look.trail_s / t.frame_s)
+        steps = round(self.look.trail_s / PHYSICS_STEP_S)
         past = slice(max(0, frame - steps), frame + 1)
         # What came before a jump belongs to another place.
         is_here = self._jumps[past] == self._jumps[frame]

@@ -58,7 +58,7 @@ class EpisodeLabel:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """T frames of M vehicles; the ego has index 0.
+    """T frames of M vehicles, a physics step (0.1 s) apart; the ego has index 0.
 
     Frame 0 is the state after the reset. SI units: positions of the bodies' centres in m, ``x``
     along the road, ``y`` to the left; ``heading`` in rad, anticlockwise.
@@ -93,11 +93,6 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.time_s)
 
-    @property
-    def frame_s(self) -> float:
-        """Time between two frames, s."""
-        return float(np.median(np.diff(self.time_s))) if len(self) > 1 else keys.PHYSICS_STEP_S
-
     def lane(self) -> IntArray:
         """Lane whose centre is nearest, [T, M]."""
         nearest = np.rint(self.y / self.label.lane_width_m).astype(np.int64)
@@ -105,8 +100,7 @@ class Trajectory:
 
     def jumped(self) -> BoolArray:
         """Whether a vehicle was recycled (placed elsewhere) since the frame before, [T, M]."""
-        moved = np.abs(np.diff(self.x, axis=0, prepend=self.x[:1]))
-        return moved > JUMP_M * max(1.0, self.frame_s / keys.PHYSICS_STEP_S)
+        return np.abs(np.diff(self.x, axis=0, prepend=self.x[:1])) > JUMP_M
 
     def overlapping(self) -> BoolArray:
         """Whether a vehicle's box overlaps another's, [T, M]."""

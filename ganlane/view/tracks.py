@@ -10,10 +10,8 @@ from typing import Literal
 import numpy as np
 import polars as pl
 
-from ganlane import keys
 from ganlane.data.recordings import scene_csv, write_prepared
 from ganlane.data.schema import SCHEMA, TRACK_STRIDE, sort
-from ganlane.errors import UserError
 from ganlane.files import atomic_path
 from ganlane.view.record import Trajectory
 
@@ -27,9 +25,6 @@ def write_tracks(
     Parquet holds the schema (:mod:`ganlane.data.schema`) itself. In CSV, the form of recordings
     from elsewhere, the speed is called ``v``, lanes are counted from the left, from 1, and ``y`` is
     0 at the centre of lane 1. It has no lane width, and a rightmost lane without vehicles is lost.
-
-    Raises:
-        UserError: the frames of an episode are not 0.1 s apart.
     """
     # The same driver, traffic, seed and episode may come twice; scenes need names of their own.
     times = Counter[str]()
@@ -53,17 +48,7 @@ def write_tracks(
 
 
 def to_tracks(trajectory: Trajectory, scene: str = "simulated") -> pl.DataFrame:
-    """The trajectory as a table in the schema of recordings; a recycled vehicle begins a new track.
-
-    Raises:
-        UserError: the frames are not 0.1 s apart.
-    """
-    # Recordings have rows this far apart, and what reads them relies on it.
-    if abs(trajectory.frame_s - keys.PHYSICS_STEP_S) > 1e-6:
-        raise UserError(
-            f"trajectory: its frames are {trajectory.frame_s:g} s apart, tracks need "
-            f"{keys.PHYSICS_STEP_S} s; record it at every physics step."
-        )
+    """The trajectory as a table in the schema of recordings; a recycled vehicle begins a new track."""
     # A row for each vehicle that is on the road, frame by frame.
     frame, vehicle = np.nonzero(trajectory.valid)
     jumps = np.cumsum(trajectory.jumped(), axis=0)

@@ -387,7 +387,7 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
     drivers = list(dict.fromkeys(row["driver"] for row in shown))
     traffics = list(dict.fromkeys(row["traffic"] for row in shown))
     # All panels have one scale, so that traffics can be compared.
-    bounds = [bound for row in shown for bound in _interval(row)]
+    bounds = [bound for row in shown for bound in row["minus_mobil_ci"]]
     lowest = min(-20.0, *bounds)
     highest = max(20.0, *bounds)
     figure, grid = panel_grid(len(traffics), 3.4, 1.3 + 0.19 * len(drivers))
@@ -411,7 +411,9 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
             line = drivers.index(row["driver"])
             trained = len(row["each"]) > 1
             colour = COLOURS[0] if trained else INK
-            axes.plot(_interval(row), [line] * 2, color=colour, lw=2.2, solid_capstyle="butt")
+            axes.plot(
+                row["minus_mobil_ci"], [line] * 2, color=colour, lw=2.2, solid_capstyle="butt"
+            )
             axes.plot(row["minus_mobil"], line, "o", color=colour)
             if trained:
                 leads = [training["mean_reward"] - mobil[traffic] for training in row["each"]]
@@ -420,9 +422,3 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
     names = {"a recipe: mean, 95 % over trainings and episodes": COLOURS[0], "a single driver": INK}
     add_legend(figure, names, [one])
     return figure
-
-
-def _interval(row: Row) -> tuple[float, float]:
-    """That of the lead over MOBIL; the lead itself where there is none."""
-    low, high = row["minus_mobil_ci"] or (row["minus_mobil"],) * 2
-    return low, high

@@ -127,17 +127,16 @@ def _row(recipe: str, traffic: str, cells: Cells) -> Row:
     # Both [S, E]: trainings by episodes.
     rewards = column(trainings, "reward")
     km = column(trainings, pl.col("distance_m") / 1000.0)
-    mobil = _rewards(cells, SCALE_TOP, traffic)
-    random_legal = _rewards(cells, SCALE_BOTTOM, traffic)
+    # MOBIL drives on every traffic; it is not compared with itself.
+    mobil = column(cells[SCALE_TOP, traffic], "reward")
+    is_mobil = recipe == SCALE_TOP
     # What cannot be said stays None and is printed as a dash.
-    score = lead = probability = None
-    if mobil is not None and random_legal is not None:
+    score = None
+    if (SCALE_BOTTOM, traffic) in cells:
+        random_legal = column(cells[SCALE_BOTTOM, traffic], "reward")
         score = normalized_over_trainings(rewards, mobil, random_legal)
-    if recipe == SCALE_TOP:
-        mobil = None  # it is not compared with itself
-    if mobil is not None:
-        lead = difference(rewards, mobil)
-        probability = _probability(rewards, mobil)
+    lead = None if is_mobil else difference(rewards, mobil)
+    probability = None if is_mobil else _probability(rewards, mobil)
     # Counts and plain rates are of the episodes of all trainings.
     together = pl.concat(trainings.values())
     crashes = together.filter(_ended(FAILURES[:1]))
@@ -169,17 +168,11 @@ def _row(recipe: str, traffic: str, cells: Cells) -> Row:
     # Trainings one by one, so that a reader sees how far they lie apart.
     row["each"] = []
     for (name, frame), reward in zip(trainings.items(), rewards[:, None]):
-        lead = None if mobil is None else difference(reward, mobil)
+        lead = None if is_mobil else difference(reward, mobil)
         training = {"driver": name, **entries("mean_reward", over_trainings(reward))}
         training |= {**entries("minus_mobil", lead), **_failures(frame)}
         row["each"].append(training)
     return row
-
-
-def _rewards(cells: Cells, recipe: str, traffic: str) -> Array | None:
-    """The rewards [S, E] of a recipe on a traffic, if it drove there."""
-    trainings = cells.get((recipe, traffic))
-    return None if trainings is None else column(trainings, "reward")
 
 
 def _failures(episodes: pl.DataFrame) -> dict[str, int]:

@@ -48,7 +48,7 @@ def write_tracks(
 
 
 def to_tracks(trajectory: Trajectory, scene: str = "simulated") -> pl.DataFrame:
-    """The trajectory as a table in the schema of recordings; a recycled vehicle begins a new track."""
+    """The trajectory in the schema of recordings; a recycled vehicle begins a new track."""
     # A row for each vehicle that is on the road, frame by frame.
     frame, vehicle = np.nonzero(trajectory.valid)
     jumps = np.cumsum(trajectory.jumped(), axis=0)

@@ -51,7 +51,6 @@ class FilmConfig(Record):
         road_m: length of road in the picture, m.
         trail_s: length of the trails, s; 0: none.
         speeds: numbers on the roofs.
-        scale: size of the film, as a share of the picture's.
         max_bytes: gif: size and frame rate are lowered until it fits; html: the rate of samples.
     """
 
@@ -67,7 +66,6 @@ class FilmConfig(Record):
     trail_s: NotNegative = 3.0
     speeds: bool = True
     # the file
-    scale: Annotated[float, between(0.05, 4)] = 1.0
     max_bytes: Annotated[int, at_least(10_000)] | None = None
 
     def __post_init__(self) -> None:

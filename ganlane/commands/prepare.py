@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
-from ganlane.data.prepared import Preparation, prepare_recordings
+from ganlane.data.prepared import PooledStatistics, prepare_recordings
 from ganlane.data.sources import byte_progress, recordings_path
 from ganlane.data.statistics import describe
 from ganlane.evaluation import write_results
@@ -55,7 +55,7 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
         )
     # The report embeds the figure by its name, so both can be moved together.
     sheet = save_figure(
-        draw_recordings(prepared.statistics),
+        draw_recordings(prepared),
         folder / "report.png",
     )
     report = folder / "report.md"
@@ -77,9 +77,9 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
     return f"results: {write_results(folder, numbers, asdict(config), {})}"
 
 
-def short_report(prepared: Preparation) -> str:
+def short_report(prepared: PooledStatistics) -> str:
     """Rows, exposure, lane-change rates and durations in a few lines."""
-    exposure = prepared.statistics.exposure
+    exposure = prepared.exposure
     # What was read and dropped first: a wrong format shows there.
     lines = _row_lines(prepared)
     lines.append(
@@ -94,7 +94,7 @@ def short_report(prepared: Preparation) -> str:
 
 
 def long_report(
-    prepared: Preparation,
+    prepared: PooledStatistics,
     source: str,
     figure: str,
 ) -> str:
@@ -105,7 +105,7 @@ def long_report(
         "## Rows",
         _bullets(_row_lines(prepared)),
         "## Scenes",
-        _scene_table(prepared.statistics.scenes),
+        _scene_table(prepared.scenes),
         "## Lane changes",
         _bullets(_lane_change_lines(prepared)),
         "Equation 9 takes every car to have driven the whole road; where tracks cover only part of "
@@ -123,14 +123,14 @@ def long_report(
     return "\n\n".join(parts) + "\n"
 
 
-def _row_lines(prepared: Preparation) -> list[str]:
+def _row_lines(prepared: PooledStatistics) -> list[str]:
     count = prepared.count
     lines = [f"rows: {count.read:,} read, {count.kept:,} kept, {prepared.written:,} written"]
     return lines + [f"dropped: {rows:,} ({reason})" for reason, rows in count.dropped.most_common()]
 
 
-def _lane_change_lines(prepared: Preparation) -> list[str]:
-    changes = prepared.statistics.lane_changes
+def _lane_change_lines(prepared: PooledStatistics) -> list[str]:
+    changes = prepared.lane_changes
     complete = changes.duration.complete
     duration = changes.duration
     lines = [
@@ -151,14 +151,14 @@ def _lane_change_lines(prepared: Preparation) -> list[str]:
     return lines
 
 
-def _acceleration_lines(prepared: Preparation) -> list[str]:
+def _acceleration_lines(prepared: PooledStatistics) -> list[str]:
     parts = []
     # Raw ones are mostly noise of the measurement; both are shown, so that this shows.
     for name, title in (
         ("raw", "as recorded"),
         ("smoothed", "over 1 s"),
     ):
-        share = prepared.statistics.strong_share(f"acceleration_{name}")
+        share = prepared.strong_share(f"acceleration_{name}")
         if share is not None:
             parts.append(f"{100.0 * share:.1f} % {title}")
     return [f"accelerations beyond 3 m/s2: {', '.join(parts)}"] if parts else []
@@ -203,12 +203,12 @@ def _scene_table(scenes: Sequence[dict[str, Any]]) -> str:
     return Table("", head, rows, len(head)).markdown(heading=False)
 
 
-def _distribution_table(prepared: Preparation) -> str:
+def _distribution_table(prepared: PooledStatistics) -> str:
     # A few of the stored levels.
     levels = [f"{100 * level:g} %" for level in _SHOWN_LEVELS]
     rows = []
     for name, title in _QUANTITIES.items():
-        sample = describe(prepared.statistics.sample(name))
+        sample = describe(prepared.sample(name))
         # An empty sample leaves its cells empty.
         values = [sample.mean, sample.sd]
         values += [sample.quantile(level) if sample.count else None for level in _SHOWN_LEVELS]

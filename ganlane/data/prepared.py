@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -47,9 +46,15 @@ class PooledStatistics:
         scenes: numbers of each scene; rates as in :class:`LaneChangeStatistics`.
             ``nearest_lane_share`` is the share of rows whose recorded lane is the one whose centre
             is nearest: near 1 where the road is straight in the recording's coordinates.
+        count: rows read and dropped.
+        written: rows written.
+        files: names of the files that they were written to.
     """
 
     def __init__(self) -> None:
+        self.count = RowCount()
+        self.written = 0
+        self.files: list[str] = []
         self.scenes: list[dict[str, Any]] = []
         self._exposures: list[Exposure] = []
         self._changes: list[LaneChanges] = []
@@ -118,10 +123,18 @@ class PooledStatistics:
         return float(strong.mean()) if len(strong) else None
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain numbers and dataclasses."""
+        """Everything as plain numbers and dataclasses, for ``results.json``."""
+        rows = {
+            "read": self.count.read,
+            "kept": self.count.kept,
+            "dropped": dict(self.count.dropped),
+            "written": self.written,
+        }
         described = {name: describe(self.sample(name)) for name in self._samples[0]}
         shares = {f"{name}_beyond_3_mps2": self.strong_share(name) for name in _ACCELERATIONS}
         return {
+            "rows": rows,
+            "files": self.files,
             "exposure": self.exposure,
             "lane_changes": self.lane_changes,
             **described,
@@ -135,29 +148,6 @@ def _columns(records: Sequence[Any]) -> dict[str, list[Any]]:
     return {name: [getattr(record, name) for record in records] for name in vars(records[0])}
 
 
-@dataclass(frozen=True)
-class Preparation:
-    """Result of :func:`prepare_recordings`.
-
-    Rows read, dropped and written, files, and statistics of all scenes.
-    """
-
-    count: RowCount
-    written: int
-    files: tuple[str, ...]
-    statistics: PooledStatistics
-
-    def to_dict(self) -> dict[str, Any]:
-        """Numbers for ``results.json``."""
-        rows = {
-            "read": self.count.read,
-            "kept": self.count.kept,
-            "dropped": dict(self.count.dropped),
-            "written": self.written,
-        }
-        return {"rows": rows, "files": list(self.files), **self.statistics.to_dict()}
-
-
 def prepare_recordings(
     kind: str,
     path: str | Path,
@@ -166,7 +156,7 @@ def prepare_recordings(
     scene_s: float | None = None,
     on_progress: OnProgress | None = None,
     on_scene: Callable[[dict[str, Any]], None] | None = None,
-) -> Preparation:
+) -> PooledStatistics:
     """Read recordings, write each as a Parquet file into the new folder ``out``, and measure them.
 
     The folder appears only when everything is written. Recordings are measured first, then cut into
@@ -177,30 +167,27 @@ def prepare_recordings(
         UserError: a damaged or missing file, no moving vehicle in it, or ``out`` exists already.
     """
     # Everything is written into a hidden folder first.
-    count = RowCount()
-    statistics = PooledStatistics()
-    files = []
-    written = 0
+    pooled = PooledStatistics()
     with whole_folder(out) as folder:
-        for scene in open_scenes(kind, path, count, parameters, folder, on_progress):
+        for scene in open_scenes(kind, path, pooled.count, parameters, folder, on_progress):
             # A lot of parked cars has no driving to measure.
             if scene.frame["speed"].max() == 0.0 or scene.frame["frame"].n_unique() < 2:
-                count.drop("scene in which nobody drives", scene.frame.height)
+                pooled.count.drop("scene in which nobody drives", scene.frame.height)
                 continue
-            summary = statistics.add(scene)
+            summary = pooled.add(scene)
             # Letters, digits, dots and dashes.
             file = re.sub(r"[^\w.-]+", "_", scene.name).lstrip(".") + PARQUET
-            if file in files:
+            if file in pooled.files:
                 raise UserError(f"{path}: a second scene that {file} is the file of; rename one.")
-            files.append(file)
+            pooled.files.append(file)
             # Measured whole: cutting would censor lane changes.
             frame = cut_into_scenes(scene.frame, scene_s) if scene_s else scene.frame
             write_prepared(frame, folder / file)
-            written += frame.height
+            pooled.written += frame.height
             if on_scene is not None:
                 on_scene(summary)
-        if not files:
+        if not pooled.files:
             raise UserError(
                 f"{path}: no scene in which anybody drives; give a recording of moving traffic."
             )
-    return Preparation(count, written, tuple(files), statistics)
+    return pooled

@@ -292,10 +292,7 @@ def csv(tmp_path):
 
 def test_what_is_written_reads_back_the_same(csv, tmp_path):
     prepared = prepare_recordings("scenes", csv, tmp_path / "out")
-    assert prepared.files == (
-        "synthetic-0.parquet",
-        "synthetic-1.parquet",
-    )
+    assert prepared.files == ["synthetic-0.parquet", "synthetic-1.parquet"]
     assert read_scenes(tmp_path / "out").equals(read_scenes(csv))
     assert read_scenes(tmp_path / "out" / prepared.files[1])["scene"].unique().to_list() == [
         "synthetic-1"
@@ -308,9 +305,9 @@ def test_what_is_written_reads_back_the_same(csv, tmp_path):
 
 def test_long_recordings_are_cut_into_scenes_when_written_and_measured_whole(csv, tmp_path):
     # Cutting would censor lane changes, so it comes after measuring.
-    whole = prepare_recordings("scenes", csv, tmp_path / "whole").statistics.lane_changes
+    whole = prepare_recordings("scenes", csv, tmp_path / "whole").lane_changes
     cut = prepare_recordings("scenes", csv, tmp_path / "cut", scene_s=4.0)
-    assert cut.statistics.lane_changes == whole
+    assert cut.lane_changes == whole
     scenes = read_scenes(tmp_path / "cut")
     per_scene = scenes.group_by("scene", maintain_order=True).agg(pl.col("frame").n_unique())
     assert per_scene["scene"].to_list() == [

@@ -197,10 +197,12 @@ class FramePainter:
         # What came before a jump belongs to another place.
         is_here = self._jumps[past] == self._jumps[frame]
         shown = t.valid[past] & t.valid[frame] & is_here
-        columns, rows = self.window.column(t.x[past], ego_x), self.window.row(t.y[past])
+        # The mask is as high as the road, which takes less time than the whole picture.
+        top, bottom = (int(edge) + beyond for edge, beyond in zip(self.window.edges, (-20, 20)))
+        columns, rows = self.window.column(t.x[past], ego_x), self.window.row(t.y[past]) - top
         places = np.stack((columns, rows), axis=-1) * _TRAIL_OVERSAMPLING
-        width, height = picture.size
-        mask = Image.new("L", (width * _TRAIL_OVERSAMPLING, height * _TRAIL_OVERSAMPLING))
+        size = np.array([picture.width, bottom - top]) * _TRAIL_OVERSAMPLING
+        mask = Image.new("L", tuple(size.tolist()))
         draw = ImageDraw.Draw(mask)
         # The ego comes last, on top of the others.
         for vehicle in reversed(range(t.x.shape[1])):
@@ -210,7 +212,7 @@ class FramePainter:
             parts = [trail[start : end + 1] for start, end in pairwise(cuts) if end > start]
             for part, strength in zip(parts, _OTHER_COVERAGE if vehicle else _EGO_COVERAGE):
                 draw.line(part, fill=strength, width=2 * _TRAIL_OVERSAMPLING)
-        picture.paste("white", mask=mask.reduce(_TRAIL_OVERSAMPLING))
+        picture.paste("white", (0, top), mask.reduce(_TRAIL_OVERSAMPLING))
 
     def _draw_header(self, picture: Image.Image, frame: int) -> None:
         """Put the header of one frame on the picture."""

@@ -18,7 +18,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import polars as pl
 
@@ -204,17 +204,16 @@ def _store_by_period(
 
     Returns the files of each period by its name, as ``us-101-1``.
     """
-    parts: dict[tuple[str, int], list[Path]] = {}
+    parts: dict[tuple[Any, ...], list[Path]] = {}
     start_ms = pl.col("global_time") - FRAME_MS * pl.col("frame_id")
     for number, block in enumerate(blocks):
         block = block.with_columns(minute=start_ms // 60_000)
-        for rows in block.partition_by(LOCATION, "minute", maintain_order=True):
-            location = rows[LOCATION][0]
-            minute = rows["minute"][0]
+        minutes = block.partition_by(LOCATION, "minute", as_dict=True, include_key=False)
+        for period, rows in minutes.items():
             # Numbered by block: the rows of a period keep the order of the file.
-            part = folder / f"{len(parts):04d}-{number:05d}-{minute}.arrow"
-            rows.drop(LOCATION, "minute").write_ipc(part, compression="lz4")
-            parts.setdefault((location, minute), []).append(part)
+            part = folder / f"{len(parts):04d}-{number:05d}-{period[1]}.arrow"
+            rows.write_ipc(part, compression="lz4")
+            parts.setdefault(period, []).append(part)
         # Checked at each block, before a damaged file fills the disk.
         if len(parts) > MAX_PERIODS:
             raise UserError(

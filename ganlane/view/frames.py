@@ -198,11 +198,12 @@ class FramePainter:
         is_here = self._jumps[past] == self._jumps[frame]
         shown = t.valid[past] & t.valid[frame] & is_here
         # The mask is as high as the road, which takes less time than the whole picture.
-        top, bottom = (int(edge) + beyond for edge, beyond in zip(self.window.edges, (-20, 20)))
+        upper, lower = self.window.edges
+        top = int(upper) - 20
+        height = int(lower) + 20 - top
+        mask = Image.new("L", (picture.width * _TRAIL_OVERSAMPLING, height * _TRAIL_OVERSAMPLING))
         columns, rows = self.window.column(t.x[past], ego_x), self.window.row(t.y[past]) - top
         places = np.stack((columns, rows), axis=-1) * _TRAIL_OVERSAMPLING
-        size = np.array([picture.width, bottom - top]) * _TRAIL_OVERSAMPLING
-        mask = Image.new("L", tuple(size.tolist()))
         draw = ImageDraw.Draw(mask)
         # The ego comes last, on top of the others.
         for vehicle in reversed(range(t.x.shape[1])):

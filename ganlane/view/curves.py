@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -20,8 +20,6 @@ from ganlane.errors import UserError
 from ganlane.evaluation.results import names_of_runs, runs_below
 from ganlane.view.figures import STYLE, FloatArray, add_legend, palette, panel_grid, plot_line
 
-#: Metrics of the runs that share a name: one, or the same with several seeds.
-Runs: TypeAlias = Mapping[str, Sequence[pl.DataFrame]]
 #: Number of decisions so far: the horizontal axis of every learning curve.
 X_COLUMN = "decisions"
 #: Prefix of the columns of ``evaluation.csv``.
@@ -148,15 +146,15 @@ def read_runs(paths: Sequence[str | Path]) -> dict[str, list[pl.DataFrame]]:
 
 @rc_context(STYLE)
 def draw_runs(
-    runs: Runs,
+    runs: Mapping[str, Sequence[pl.DataFrame]],
     columns: Sequence[str] | None = None,
     smooth: int = 1,
 ) -> Figure:
     """Training runs over the number of decisions, one colour per name.
 
     Args:
-        runs: name to metrics (:func:`read_run`). Of several, the mean is drawn, in a band from the
-            lowest to the highest.
+        runs: name to metrics (:func:`read_run`): one, or the same with several seeds. Of several,
+            the mean is drawn, in a band from the lowest to the highest.
         columns: one panel for each of these; by default those of :data:`PANELS` that any run has
             numbers for.
         smooth: rows that the running mean takes in; above 1 the rows themselves are drawn faintly.

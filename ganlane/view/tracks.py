@@ -10,8 +10,9 @@ from typing import Literal
 import numpy as np
 import polars as pl
 
+from ganlane.data.dense import track_table
 from ganlane.data.recordings import scene_csv, write_prepared
-from ganlane.data.schema import SCHEMA, TRACK_STRIDE, sort
+from ganlane.data.schema import TRACK_STRIDE, sort
 from ganlane.files import atomic_path
 from ganlane.view.record import Trajectory
 
@@ -49,16 +50,9 @@ def write_tracks(
 
 def to_tracks(trajectory: Trajectory, scene: str = "simulated") -> pl.DataFrame:
     """The trajectory in the schema of recordings; a recycled vehicle begins a new track."""
-    # A row for each vehicle that is on the road, frame by frame.
-    frame, vehicle = np.nonzero(trajectory.valid)
+    # Numbers of later tracks lie a whole stride higher, so none is used twice.
     jumps = np.cumsum(trajectory.jumped(), axis=0)
-    columns = {
-        "scene": np.full(len(frame), scene),
-        # Numbers of later tracks lie a whole stride higher, so none is used twice.
-        "vehicle": vehicle + TRACK_STRIDE * jumps[frame, vehicle],
-        "frame": frame,
-        "lane": trajectory.lane()[frame, vehicle],
-    }
-    for name in ("x", "y", "speed", "length", "width"):
-        columns[name] = getattr(trajectory, name)[frame, vehicle]
-    return sort(pl.DataFrame({name: columns[name] for name in SCHEMA}, schema=SCHEMA))
+    numbers = np.arange(jumps.shape[1]) + TRACK_STRIDE * jumps
+    values = {name: getattr(trajectory, name) for name in ("x", "y", "speed", "length", "width")}
+    lane = trajectory.lane()
+    return sort(track_table(scene, trajectory.valid, vehicle=numbers, lane=lane, **values))

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 
-from ganlane.reproduce import cells, main
+from ganlane.config.run import run_command
+from ganlane.reproduce import cells
 
+main = partial(run_command, "reproduce")
 SHORT = [
     "episodes=3",
     "workers=1",
@@ -50,7 +53,7 @@ def test_one_command_leaves_numbers_tables_and_figures_in_one_folder(cells_drive
                 *SMALL,
                 "fewer={gan: 2, idm: 2}",
                 f"runs=[{runs}]",
-                "from=shipped",
+                "source=shipped",
             ]
         )
         == 0
@@ -117,7 +120,7 @@ def test_traffic_that_is_not_at_hand_is_left_out_and_said_so(monkeypatch, capsys
 def test_a_training_from_scratch_that_fails_is_named_after_the_hours_were(monkeypatch, capsys):
     run = Mock(return_value=Mock(returncode=2))
     monkeypatch.setattr("ganlane.commands.reproduce.subprocess.run", run)
-    assert main([*SHORT, *SMALL, "from=scratch", "training_seeds=[4,5]"]) == 2
+    assert main([*SHORT, *SMALL, "source=scratch", "training_seeds=[4,5]"]) == 2
     error = capsys.readouterr().err
     assert "2 trainings, one after the other: about 2.2 hours on one core." in error
     assert "the same command goes on with it" in error

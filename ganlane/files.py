@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from mmap import mmap
@@ -108,6 +109,47 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise OSError(cause.errno, cause.strerror, str(path)) from error
     finally:
         part.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary folder next to ``path`` to write into; on success it is renamed to
+    ``path``, else removed.
+
+    Raises:
+        UserError: there is something at ``path`` already.
+        OSError: it names ``path``, or the file in it that was to be written.
+    """
+    path = Path(path)
+    # Never into a folder that holds something: it may be another recording.
+    if path.is_file() or (path.is_dir() and any(path.iterdir())):
+        raise UserError(
+            f"{path}: there already; choose another folder with out=FOLDER, or remove it."
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Beside the folder, so that the last step is a rename.
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        shutil.rmtree(part, ignore_errors=True)  # of a killed process that had the same number
+        part.mkdir()
+        # Whatever goes wrong in between, the folder of the user stays as it was.
+        yield part
+        # An empty folder may be there; it gives way.
+        if path.is_dir():
+            path.rmdir()
+        part.replace(path)
+    except OSError as error:
+        # The hidden folder means nothing to the user.
+        name = str(error.filename)
+        if not name.startswith(str(part)):
+            raise
+        raise OSError(
+            error.errno,
+            error.strerror,
+            str(path) + name.removeprefix(str(part)),
+        ) from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
 
 
 def remove_leftovers(folder: Path) -> None:

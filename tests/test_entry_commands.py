@@ -5,10 +5,6 @@ Dispatch, help, mistakes that the commands find, commands in a process of their 
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
 import entry_tiny
 import pytest
 from reference.refusals import refusal
@@ -18,30 +14,6 @@ from ganlane.config.help import help_text
 from ganlane.config.run import COMMANDS
 from ganlane.files import conf_folder
 from ganlane.settings.train import TrainConfig
-
-ROOT = Path(__file__).resolve().parents[1]
-
-
-def command(*arguments, cwd):
-    """A command as a user starts it, from a folder that is not the checkout."""
-    environment = {
-        "PYTHONPATH": str(ROOT),
-        "OMP_NUM_THREADS": "1",
-        "PATH": "/usr/bin:/bin",
-        "HOME": str(cwd),
-    }
-    line = [sys.executable, *arguments]
-    return subprocess.run(
-        line, cwd=cwd, capture_output=True, text=True, timeout=120, env=environment
-    )
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_help_names_the_command_its_keys_and_how_it_ends(name, capsys):
-    assert main([name, "--help"]) == 0
-    shown = capsys.readouterr().out
-    assert all(part in shown for part in (f"ganlane {name} ", "seed: 0", "exit status"))
-    assert shown == help_text(name, COMMANDS[name][0]) + "\n"
 
 
 def test_help_of_train_explains_every_traffic_and_start():
@@ -74,39 +46,6 @@ def test_cfg_shows_the_config_and_leaves_nothing_behind(name, empty_folder, caps
     assert "seed: 0" in shown.out
     assert shown.err == ""
     assert list(empty_folder.iterdir()) == []
-
-
-def test_cfg_shows_the_chosen_options_and_values(empty_folder, capsys):
-    assert main(["train", "--cfg", "job", "env=dense", "env.lanes=5"]) == 0
-    assert {"  vehicles: 30", "  lanes: 5"} <= set(capsys.readouterr().out.splitlines())
-    assert main(["render", "--cfg", "job", "agent=keep_lane"]) == 0
-    assert "driver: keep_lane" in capsys.readouterr().out.splitlines()
-
-
-def test_help_does_not_wait_for_torch(tmp_path):
-    program = (
-        "import sys; from ganlane.__main__ import main; main(['train', '--help'])\n"
-        "print('torch' in sys.modules)"
-    )
-    assert command("-c", program, cwd=tmp_path).stdout.splitlines()[-1] == "False"
-
-
-@pytest.mark.slow
-def test_a_whole_command_names_its_results(tmp_path):
-    tiny = ["agents=[keep_lane]", "traffics=[idm]", "episodes=1", "env.goal_m=20"]
-    done = command("-m", "ganlane", "evaluate", *tiny, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1].startswith(f"results: {tmp_path}")
-
-
-def test_a_mistake_ends_the_process_with_status_2(tmp_path):
-    done = command("-m", "ganlane", "train", "env.lanes=0", cwd=tmp_path)
-    assert done.returncode == 2
-    assert (
-        done.stderr == "ganlane train: env.lanes=0: expected a number above 0; "
-        "0 means what a scene's file says.\n"
-    )
-    assert list(tmp_path.iterdir()) == []
 
 
 #: Drives a short episode first; with the kernel a line would say so.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from functools import partial
 
-import polars as pl
 import pytest
 from reference.refusals import last_path
 
@@ -22,20 +21,6 @@ def run(capsys, *arguments):
     assert main([*SHORT, *arguments]) == 0
     path = last_path(capsys.readouterr().out)
     return path, json.loads(path.read_text())
-
-
-def test_table_and_files_hold_every_agent_on_every_traffic(capsys):
-    path, results = run(capsys, "agents=[mobil,random_legal]", "traffics=[idm,idm_mobil]")
-    pairs = [(row["agent"], row["traffic"]) for row in results["rows"]]
-    assert pairs == [
-        (agent, traffic) for traffic in ("idm", "idm_mobil") for agent in ("mobil", "random_legal")
-    ]
-    assert all(row["episodes"] == 4 for row in results["rows"])
-    assert results["rows"][0]["normalized_percent"] == pytest.approx(100.0)
-    assert {"config", "code", "machine", "seeds"} <= results.keys()
-    episodes = pl.read_parquet(path.parent / "episodes.parquet")
-    assert episodes.height == 16
-    assert (path.parent / "config.yaml").is_file()
 
 
 def test_a_users_traffic_and_policy_stand_in_the_table(capsys):

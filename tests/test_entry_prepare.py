@@ -17,7 +17,6 @@ from reference.recordings import (
     ngsim_rows,
     portal_csv,
     traffic,
-    write_highd,
 )
 from reference.refusals import last_path
 
@@ -29,9 +28,7 @@ from ganlane.data import (
     write_scene_csv,
 )
 
-evaluate = partial(run_command, "evaluate")
 main = partial(run_command, "prepare")
-train_generator = partial(run_command, "train_generator")
 
 
 @pytest.fixture(autouse=True)
@@ -77,39 +74,6 @@ def test_a_scene_csv_becomes_parquet_and_figures(here, capsys):
     }
     assert names <= numbers.keys()
     assert read_scenes("mine").equals(read_scenes("mine.csv"))
-
-
-def test_highd_folder(here, capsys):
-    write_highd(here / "highd")
-    assert main(["data=highd", "data.path=highd", "scene_s=3"]) == 0
-    numbers = results(capsys.readouterr().out)
-    assert (numbers["rows"]["read"], numbers["rows"]["written"]) == (800, 4 * 80)
-    assert [scene["name"] for scene in numbers["scenes"]] == [
-        "highd-01-upper",
-        "highd-01-lower",
-    ]
-    assert read_scenes(numbers["out"])["scene"].n_unique() == 2 * 3
-
-
-def test_from_a_users_csv_to_traffic_in_three_commands(here, capsys):
-    write_csv(here / "mine.csv", scenes=3)
-    assert main(["data.path=mine.csv", "out=mine"]) == 0
-    # Enough to write weights, not to be any good.
-    few = [
-        "generator.loop.updates=2",
-        "generator.loop.evaluate_every=1",
-        "generator.batch=4",
-        "hydra.run.dir=fit",
-    ]
-    assert train_generator(["data.path=mine", *few]) == 0
-    tiny = [
-        "agents=[keep_lane]",
-        "episodes=1",
-        "env.goal_m=20",
-    ]
-    fitted = "traffics=[{name: gan, path: fit/generator_paper.safetensors}]"
-    assert evaluate([fitted, *tiny]) == 0
-    capsys.readouterr()
 
 
 def test_download_then_prepare(here, capsys):

@@ -6,7 +6,6 @@ import json
 import re
 from functools import partial
 
-import polars as pl
 import pytest
 from PIL import Image
 from reference.refusals import last_path
@@ -68,12 +67,6 @@ def test_simulated_traffic_is_replayed_like_recorded_traffic(ending, capsys):
     assert main([*replay, "agent=keep_lane"]) == 0
     assert "on replay" in capsys.readouterr().out
     assert read_scenes("again.parquet")["vehicle"].n_unique() > 1
-
-
-def test_only_a_part_of_the_episode_is_kept(tmp_path):
-    part = ["film.start_s=1", "film.end_s=3", "out=part.parquet"]
-    assert main(["traffic=idm", "agent=keep_lane", *part]) == 0
-    assert pl.read_parquet(tmp_path / "part.parquet")["frame"].n_unique() == 21
 
 
 @pytest.mark.parametrize(("asked", "file", "begins"), [

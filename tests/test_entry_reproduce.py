@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
-from ganlane.reproduce import cells, main
+from ganlane.config.run import run_command
+from ganlane.reproduce import cells
 
+main = partial(run_command, "reproduce")
 SHORT = [
     "episodes=3",
     "workers=1",
@@ -49,7 +53,7 @@ def test_one_command_leaves_numbers_tables_and_figures_in_one_folder(cells_drive
                 *SMALL,
                 "fewer={gan: 2, idm: 2}",
                 f"runs=[{runs}]",
-                "from=shipped",
+                "source=shipped",
             ]
         )
         == 0
@@ -82,28 +86,26 @@ def test_one_command_leaves_numbers_tables_and_figures_in_one_folder(cells_drive
     assert {"comparisons", "failures", "left_out", "cells", "code", "config"} <= results.keys()
 
 
-def test_what_was_driven_is_not_driven_again_and_gives_the_same_numbers(cells_driven, capsys):
-    agents = "agents=[random_legal,mobil,agent_idm]"
-    assert main([*SHORT, agents, "traffics=[idm]"]) == 0
-    first = json.loads(Path("out/results.json").read_text())["rows"]
-    assert main([*SHORT, agents, "traffics=[idm]"]) == 0
-    assert len(cells_driven) == 3
-    assert json.loads(Path("out/results.json").read_text())["rows"] == first
-    assert main([*SHORT, "agents=[random_legal,mobil,agent_idm,keep_lane]", "traffics=[idm]"]) == 0
-    assert (
-        main(
-            [
-                *SHORT,
-                agents,
-                "traffics=[idm]",
-                "seed=1",
-            ]
-        )
-        == 0
+def test_what_was_driven_is_not_driven_again_and_gives_the_same_numbers(
+    cells_driven, capsys, monkeypatch
+):
+    # Drawing takes longest, and is looked at in the test above.
+    monkeypatch.setattr(
+        "ganlane.reproduce.report.save_figure", lambda figure, path: path.write_text("<svg/>")
     )
-    assert cells_driven[3:] == [
-        (name, "idm") for name in ("keep_lane", "random_legal", "mobil", "agent_idm")
-    ]
+    line = [*SHORT, "agents=[random_legal,mobil]", "traffics=[idm]"]
+    results = []
+    for more in ([], [], ["agents=[random_legal,mobil,keep_lane]"], ["seed=1"]):
+        assert main([*line, *more]) == 0
+        results.append(json.loads(Path("out/results.json").read_text())["rows"])
+    assert results[0] == results[1]
+    drivers = ["random_legal", "mobil", "keep_lane", "random_legal", "mobil"]
+    assert cells_driven == [(driver, "idm") for driver in drivers]
+    for cell in Path("outputs/cells").glob("*.parquet"):
+        cell.write_bytes(cell.read_bytes()[:-50])
+    capsys.readouterr()
+    assert main(line) == 2
+    assert "not the episodes of a cell" in capsys.readouterr().err
 
 
 def test_traffic_that_is_not_at_hand_is_left_out_and_said_so(monkeypatch, capsys):
@@ -115,35 +117,12 @@ def test_traffic_that_is_not_at_hand_is_left_out_and_said_so(monkeypatch, capsys
     assert results["left_out"].keys() == {"replay", "figure 2", "figure 3"}
 
 
-def test_a_damaged_cell_is_named(capsys):
-    arguments = [*SHORT, "agents=[random_legal,mobil]", "traffics=[idm]"]
-    assert main(arguments) == 0
-    for cell in Path("outputs/cells").glob("*.parquet"):
-        cell.write_bytes(cell.read_bytes()[:-50])
-    assert main(arguments) == 2
-    assert "not the episodes of a cell" in capsys.readouterr().err
-
-
 def test_a_training_from_scratch_that_fails_is_named_after_the_hours_were(monkeypatch, capsys):
-    class Failed:
-        returncode = 2
-
-    asked = []
-    run = "ganlane.commands.reproduce.subprocess.run"
-    monkeypatch.setattr(run, lambda command, **_: asked.append(command) or Failed)
-    assert (
-        main(
-            [
-                *SHORT,
-                *SMALL,
-                "from=scratch",
-                "training_seeds=[4,5]",
-            ]
-        )
-        == 2
-    )
+    run = Mock(return_value=Mock(returncode=2))
+    monkeypatch.setattr("ganlane.commands.reproduce.subprocess.run", run)
+    assert main([*SHORT, *SMALL, "source=scratch", "training_seeds=[4,5]"]) == 2
     error = capsys.readouterr().err
     assert "2 trainings, one after the other: about 2.2 hours on one core." in error
     assert "the same command goes on with it" in error
     training = "-m ganlane.train experiment=paper seed=4 hydra.run.dir=outputs/scratch/seed_4"
-    assert asked[0][1:] == training.split()
+    assert run.call_args_list[0].args[0][1:] == training.split()

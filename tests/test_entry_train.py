@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import os
 import shutil
 import signal
-import threading
-import time
 from functools import partial
 
 import entry_tiny
 import pytest
 from reference.refusals import last_path
+from training.small_runs import rows, signal_at
 
 from ganlane.agents import read_agent
 from ganlane.config.run import run_command
@@ -30,7 +27,7 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("finished")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        assert main(TINY) == 0
+        assert main([*TINY, "evaluate_every=160", "selection_episodes=2"]) == 0
     (results,) = folder.rglob("results.json")
     return results.parent
 
@@ -42,8 +39,8 @@ def train(capsys, *arguments):
     return path.parent, json.loads(path.read_text())
 
 
-def decisions(folder):
-    return [int(row["decisions"]) for row in csv.DictReader((folder / "metrics.csv").open())]
+def decisions(folder, name="metrics.csv"):
+    return [int(row["decisions"]) for row in rows(folder / name)]
 
 
 def test_a_run_leaves_agent_metrics_config_and_table(finished):
@@ -57,23 +54,13 @@ def test_a_run_leaves_agent_metrics_config_and_table(finished):
     assert results["decisions"] == 320
     assert results["updates"] > 0
     assert decisions(folder) == [160, 320]
+    assert decisions(folder, "evaluation.csv") == [160, 320]
     weights, config, metadata = read_agent(folder / "agent.safetensors")
     assert weights
     assert config.agent.hidden == (16, 16)
     assert metadata["observation"] == "table3_progress"
     assert metadata["training"]["decisions"] == 320
     assert (folder / "config.yaml").is_file()
-
-
-def test_a_finished_run_goes_on_with_more_decisions_and_its_own_command_line(
-    capsys,
-):
-    folder, _ = train(capsys, "seed=5")
-    assert main([f"resume={folder}", "total_decisions=480"]) == 0
-    results = json.loads((folder / "results.json").read_text())
-    assert results["decisions"] == 480
-    assert results["config"]["seed"] == 5
-    assert decisions(folder) == [160, 320, 480]
 
 
 def test_a_new_run_in_the_folder_of_another_is_refused(finished, capsys, tmp_path):
@@ -84,34 +71,14 @@ def test_a_new_run_in_the_folder_of_another_is_refused(finished, capsys, tmp_pat
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
-def test_a_run_in_two_parts_ends_like_one_in_a_piece(finished, capsys, tmp_path):
-    whole, _ = train(capsys, "total_decisions=480")
-    parts = shutil.copytree(finished, tmp_path / "parts")
-    assert main([f"resume={parts}", "total_decisions=480"]) == 0
-    one, other = (read_agent(folder / "agent.safetensors")[0] for folder in (whole, parts))
-    assert all((one[name] == other[name]).all() for name in one)
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_saves_and_the_run_can_be_resumed(number, capsys, tmp_path):
-    def stop_when_training():
-        # A moment after the first figures stand in the file, the run is in its loop.
-        while not any(
-            len(path.read_text().splitlines()) > 1 for path in tmp_path.rglob("metrics.csv")
-        ):
-            time.sleep(0.01)
-        os.kill(os.getpid(), number)
-
-    watcher = threading.Thread(target=stop_when_training, daemon=True)
-    watcher.start()
-    assert main([*TINY, "total_decisions=10000000"]) == 128 + number
-    watcher.join()
-    err = capsys.readouterr().err
-    assert "go on with: ganlane train resume=" in err
+    with signal_at(320, number):
+        assert main([*TINY, "total_decisions=10000000"]) == 128 + number
+    assert "go on with: ganlane train resume=" in capsys.readouterr().err
     (checkpoint,) = tmp_path.rglob("last.pt")
-    reached = decisions(checkpoint.parents[1])[-1]
-    assert main(["resume=auto", f"total_decisions={reached + 320}"]) == 0
-    assert decisions(checkpoint.parents[1])[-1] == reached + 320
+    assert main(["resume=auto", "total_decisions=640"]) == 0
+    assert decisions(checkpoint.parents[1])[-1] == 640
 
 
 def test_the_second_phase_starts_from_the_first_ones_agent(capsys):
@@ -126,57 +93,6 @@ def test_the_second_phase_starts_from_the_first_ones_agent(capsys):
     assert metadata["training"]["init"] == str(folder / "pretrain" / "agent.safetensors")
 
 
-def test_a_start_from_another_observation_is_refused(finished, capsys, tmp_path):
-    start = [
-        "init=idm_ckpt",
-        f"init.path={finished / 'agent.safetensors'}",
-        "observation=table3",
-    ]
-    before = sorted(tmp_path.rglob("*"))
-    assert main([*TINY, *start]) == 2
-    assert "give observation=table3_progress" in capsys.readouterr().err
-    assert sorted(tmp_path.rglob("*")) == before
-
-
-@pytest.mark.slow
-def test_a_sweep_gives_every_run_a_folder(capsys, tmp_path):
-    short = [option for option in TINY if not option.startswith(("traffic=", "total_decisions="))]
-    assert (
-        main(
-            [
-                "-m",
-                *short,
-                "total_decisions=16",
-                "seed=0,1",
-                "traffic=idm,idm_mobil",
-            ]
-        )
-        == 0
-    )
-    results = sorted(tmp_path.glob("outputs/train_sweeps/*/*/results.json"))
-    assert [path.parent.name for path in results] == [
-        "0",
-        "1",
-        "2",
-        "3",
-    ]
-    configs = [json.loads(path.read_text())["config"] for path in results]
-    assert {(c["seed"], c["traffic"]["_target_"]) for c in configs} == {
-        (seed, f"ganlane.traffic.{name}")
-        for seed in (0, 1)
-        for name in ("IdmTraffic", "IdmMobilTraffic")
-    }
-
-
-def test_a_users_own_traffic_trains(capsys):
-    _, results = train(
-        capsys,
-        "traffic._target_=entry_own_parts.Cruise",
-        "total_decisions=16",
-    )
-    assert results["rows"][0]["traffic"] == "entry_own_parts.Cruise"
-
-
 @pytest.mark.parametrize(
     ("traffic", "init"),
     [
@@ -187,21 +103,13 @@ def test_a_users_own_traffic_trains(capsys):
     ],
 )
 def test_every_traffic_and_every_start_runs(traffic, init, capsys):
-    budget = [
-        "total_decisions=64",
-        "collector.num_envs=16",
-        "env.goal_m=40",
-        "agent.warmup=256",
-        "log_every=64",
-    ]
-    final = [
-        "evaluation.agents=[keep_lane]",
-        "evaluation.episodes=1",
-        "agent.capacity=1000",
-    ]
-    assert main([f"traffic={traffic}", f"init={init}", *budget, *final]) == 0
-    results = last_path(capsys.readouterr().out)
-    assert [row["traffic"] for row in json.loads(results.read_text())["rows"]] == [traffic, traffic]
+    words = (
+        "total_decisions=64 collector.num_envs=16 env.goal_m=40 agent.warmup=256 log_every=64 "
+        "evaluation.agents=[keep_lane] evaluation.episodes=1 agent.capacity=1000"
+    )
+    assert main([f"traffic={traffic}", f"init={init}", *words.split()]) == 0
+    results = json.loads(last_path(capsys.readouterr().out).read_text())
+    assert [row["traffic"] for row in results["rows"]] == [traffic, traffic]
 
 
 def test_a_trained_agent_survives_an_error_after_training(tmp_path, capsys, monkeypatch):

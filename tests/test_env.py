@@ -5,14 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 from reference.worlds import environment, placed, same_bits, step, vehicles
-from torchrl.collectors import Collector
-from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from ganlane import keys
-from ganlane.agents.drivers import KeepLaneDriver
-from ganlane.env import EpisodeParameters
-from ganlane.errors import UserError
 from ganlane.sim.random import Stream
 
 KEEP = keys.KEEP
@@ -41,14 +36,6 @@ def flags(td, row: int = 0) -> tuple[bool, bool, bool]:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_environment_keeps_its_specs(mobil, dtype):
     check_env_specs(environment(num_envs=3, mobil=mobil, dtype=dtype))
-
-
-def test_a_rollout_has_a_time_axis_and_resets_by_itself():
-    env = environment(num_envs=4, goal_m=40.0)
-    track = env.rollout(12, break_when_any_done=False)
-    assert track.batch_size == (4, 12)
-    assert track["next", "done"].sum() > 4
-    assert track[keys.EPISODE].max() >= 4
 
 
 def test_a_seed_gives_the_same_episodes_again_and_another_one_others():
@@ -86,9 +73,6 @@ def test_after_a_reset_nothing_has_happened_yet():
     ("period", "substeps"), [(0.1, 1), (0.3, 3), (0.7, 7), (1.0, 10), (2.0, 20)]
 )
 def test_a_decision_is_a_whole_number_of_physics_steps(period, substeps):
-    for wrong in (period + 0.05, period - 2.0):
-        with pytest.raises(UserError, match="decision_period_s"):
-            EpisodeParameters(decision_period_s=wrong)
     env = environment(period_s=period)
     assert step(env, env.reset())[keys.STEP].tolist() == [substeps]
 
@@ -102,11 +86,8 @@ def test_a_partial_reset_leaves_the_other_rows_as_they_are_bit_for_bit():
     for action in (LEFT, KEEP, RIGHT):
         td = step(env, td, action)
     mask = torch.tensor([False, True, False, False, True])
-    asked = td.clone()
-    asked["_reset"] = mask[:, None]
-    after = env.reset(asked).exclude("_reset", "reward")
-    going_on = (~mask).nonzero()[:, 0]
-    assert same_bits(after[going_on], td.exclude("reward")[going_on]) == []
+    after = env.reset(td.clone().set("_reset", mask[:, None])).exclude("_reset", "reward")
+    assert same_bits(after[~mask], td.exclude("reward")[~mask]) == []
     assert after[keys.EPISODE].tolist() == [0, 6, 2, 3, 9]
     whole = environment(num_envs=10, seed=9).reset()
     assert same_bits(after[mask], whole[torch.tensor([6, 9])]) == []
@@ -117,36 +98,13 @@ def test_an_automatic_reset_goes_on_with_episode_i_plus_n():
     td = env.reset()
     td["action"] = torch.tensor([KEEP, LEFT, KEEP])
     td[keys.VEHICLES, "target_lane"][1, 0] = 2  # so that its command leaves the road
-    stepped, going_on = env.step_and_maybe_reset(td)
+    stepped, following = env.step_and_maybe_reset(td)
     assert ends(stepped["next"], 1) == ["out_of_road"]
-    assert going_on[keys.EPISODE].tolist() == [0, 4, 2]
-    assert going_on[keys.STEP].tolist() == [10, 0, 10]
-    assert (
-        same_bits(
-            going_on[[0, 2]].exclude("action", "reward"), stepped["next"][[0, 2]].exclude("reward")
-        )
-        == []
-    )
-
-
-def test_under_a_transform_and_in_a_collector_every_episode_is_driven_once():
-    env = environment(num_envs=3, goal_m=40.0)
-    driver = KeepLaneDriver(env.road)
-    collector = Collector(
-        TransformedEnv(env, StepCounter()),
-        driver,
-        frames_per_batch=3 * 20,
-        total_frames=3 * 20,
-        auto_register_policy_transforms=False,
-    )
-    batch = next(iter(collector))
-    collector.shutdown()
-    done = batch["next", "done"][..., 0]
-    episodes = batch[keys.EPISODE]
-    for row in range(3):
-        finished = episodes[row][done[row]].tolist()
-        assert len(finished) > 2
-        assert finished == [row + 3 * k for k in range(len(finished))]
+    assert following[keys.EPISODE].tolist() == [0, 4, 2]
+    assert following[keys.STEP].tolist() == [10, 0, 10]
+    others = torch.tensor([0, 2])
+    after = stepped["next"].exclude("reward")[others]
+    assert same_bits(following.exclude("action", "reward")[others], after) == []
 
 
 def test_a_reset_with_seed_and_episode_runs_exactly_those():
@@ -157,18 +115,6 @@ def test_a_reset_with_seed_and_episode_runs_exactly_those():
     assert asked[keys.EPISODE].tolist() == [40, 2, 0]
     assert same_bits(asked[1:2], env.reset()[2:3]) == []
     assert same_bits(asked[2:3], environment(num_envs=1, seed=5).reset()) == []
-    through = TransformedEnv(env, StepCounter()).reset(td.clone())
-    assert same_bits(through.exclude("step_count"), asked) == []
-
-
-def test_a_copied_state_goes_on_alike_and_is_not_written():
-    env = environment(num_envs=4)
-    td = step(env, env.reset(), LEFT)
-    before = td.clone()
-    td["action"] = torch.tensor([KEEP, LEFT, RIGHT, KEEP])
-    twice = [env.step(td)["next"].clone() for _ in range(2)]
-    assert same_bits(*twice) == []
-    assert same_bits(td.exclude("action", "next"), before) == []
 
 
 # Commands
@@ -217,18 +163,6 @@ def test_with_abort_the_opposite_command_turns_back_and_the_same_one_does_nothin
     assert remembered(back, "change_direction") == 0
 
 
-def test_the_mean_acceleration_is_the_change_of_speed_over_the_time_driven():
-    env = environment(vehicles=2, mobil=False, lanes=1)
-    td = placed(
-        env, vehicles({"x": 0.0, "lane": 0, "speed": 20.0}, {"x": 40.0, "lane": 0, "speed": 5.0})
-    )
-    after = step(env, td)
-    change = after[keys.VEHICLES, "speed"][0, 0] - 20.0
-    assert change < -2.0
-    assert remembered(after, "mean_acceleration") == pytest.approx(change.item() / 1.0)
-    assert remembered(after, "distance") == after[keys.VEHICLES, "x"][0, 0].item()
-
-
 # Ends
 
 TO_GOAL = {"x": 999.0, "lane": 1, "speed": 20.0}
@@ -268,10 +202,7 @@ def test_an_episode_ends_for_one_reason_at_the_step_of_it(ego, others, action, r
     assert ends(after) == reasons
     assert flags(after) == (bool(reasons), False, bool(reasons))
     assert after[keys.STEP].item() == steps
-    distance = remembered(after, "distance")
-    assert (distance > 1000.0) == ("goal" in reasons or "hard_crash" in reasons)
-    if reasons == ["goal"] and steps == 2:
-        assert distance == pytest.approx(1000.1, abs=1e-3)
+    assert (remembered(after, "distance") > 1000.0) == bool({"goal", "hard_crash"} & set(reasons))
     if not reasons:
         assert after[keys.EVENTS, keys.SOFT_CRASH].item() == 0
     if reasons == ["out_of_road"]:
@@ -289,23 +220,6 @@ def test_the_time_limit_truncates_in_the_middle_of_a_decision():
     assert td[keys.STEP].item() == 30
 
 
-def test_a_row_that_has_ended_stays_as_it_was_while_the_others_drive_on():
-    """Row 0 reaches the goal in its second step, row 1 does not; row 0 keeps what it had then."""
-    goal = {"vehicles": 2, "mobil": True, "goal_m": 1000.0}
-    scene = vehicles({"x": 995.1, "lane": 1, "speed": 25.0}, {"x": 980.0, "lane": 0, "speed": 20.0})
-    env = environment(num_envs=2, **goal)
-    td = env.reset()
-    for name, value in scene.as_dict().items():
-        td[keys.VEHICLES, name] = value.repeat(2, 1)
-    td[keys.VEHICLES, "x"][1] -= 500.0
-    both = step(env, td, LEFT)
-    assert both[keys.STEP].tolist() == [2, 10]
-    short = environment(num_envs=1, period_s=0.2, **goal)
-    alone = step(short, placed(short, scene), LEFT)
-    for group in (keys.VEHICLES, keys.TRAFFIC):
-        assert same_bits(both[group][:1], alone[group]) == []
-
-
 # Soft crashes
 
 
@@ -318,29 +232,20 @@ def standing(gap: float, behind: bool = False) -> list[dict]:
     return [ego, {**ego, "x": near}, {**ego, "x": third}]
 
 
-@pytest.mark.parametrize("behind", [False, True])
-def test_a_soft_crash_counts_once_until_it_is_over(behind):
+@pytest.mark.parametrize(
+    ("behind", "counted", "silent"),
+    [
+        (False, keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND),
+        (True, keys.SOFT_CRASH_BEHIND, keys.SOFT_CRASH),
+    ],
+    ids=["ahead", "behind"],
+)
+def test_a_soft_crash_counts_once_until_it_is_over(behind, counted, silent):
     env = environment(vehicles=3, mobil=False)
     td = env.reset()
-    counts = {keys.SOFT_CRASH: [], keys.SOFT_CRASH_BEHIND: []}
-    for gap in (1.5, 1.5, 3.0, 1.5, 1.5):
-        for name, value in vehicles(*standing(gap, behind)).as_dict().items():
-            td[keys.VEHICLES, name] = value
+    for gap, count in ((1.5, 1), (1.5, 0), (3.0, 0), (1.5, 1), (1.5, 0)):
+        td[keys.VEHICLES].update(vehicles(*standing(gap, behind)).as_dict())
         td = step(env, td)
         assert flags(td) == (False, False, False)  # it is no end
-        for name, count in counts.items():
-            count.append(td[keys.EVENTS, name].item())
-    here, there = (
-        (keys.SOFT_CRASH_BEHIND, keys.SOFT_CRASH)
-        if behind
-        else (keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND)
-    )
-    assert counts == {here: [1, 0, 0, 1, 0], there: [0, 0, 0, 0, 0]}
-
-
-def test_closing_in_within_1_5_s_is_a_soft_crash_and_in_another_lane_it_is_none():
-    env = environment(vehicles=2, mobil=False)
-    for lane, expected in ((1, 1), (2, 0)):
-        slow = {"x": 4.5 + 18.0, "lane": lane, "speed": 5.0}  # 1.2 s at a closing speed of 15 m/s
-        td = step(env, placed(env, vehicles({"x": 0.0, "lane": 1, "speed": 20.0}, slow)))
-        assert td[keys.EVENTS, keys.SOFT_CRASH].item() == expected
+        assert td[keys.EVENTS, counted].item() == count
+        assert td[keys.EVENTS, silent].item() == 0

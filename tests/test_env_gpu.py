@@ -53,13 +53,3 @@ def test_a_decision_of_all_traffics_and_a_training_stay_on_the_gpu_and_wait_for_
     mixed = {"reset": RESET | ROWS, "decision": DECISION | ROWS, "elsewhere": []}
     assert report["mixed"] == mixed
     assert report["training"] == TRAINING
-
-
-@pytest.mark.slow  # some seconds each
-def test_every_traffic_alone_waits_for_the_check_of_the_action_only():
-    report = on_a_pretended_gpu(
-        "idm", "idm_mobil", "idm_random", "idm_faults", "gan", "gan_calibrated"
-    )
-    for traffic, counts in report.items():
-        alone = {"reset": RESET, "decision": DECISION, "elsewhere": []}
-        assert counts == alone, traffic

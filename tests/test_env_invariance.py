@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from reference.worlds import Track, assert_same_tracks, environment, tracks
+from reference.worlds import Track, assert_same_tracks, environment, same_bits, tracks
+from torchrl.envs import TransformedEnv
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
@@ -14,6 +15,7 @@ from ganlane.settings.driving import Visibility
 from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmMobilTraffic
+from ganlane.transforms import OBSERVATIONS, ObservationTransform
 
 
 def make(num_envs: int, mobil: bool) -> HighwayEnv:
@@ -81,24 +83,43 @@ def test_an_episode_is_the_same_in_a_batch_of_4096(mobil, in_64):
     assert_same_tracks(tracks(make(3, mobil), 11, action, [4095, 2048, 1000]), in_4096, at_least=3)
 
 
-def test_nonsense_in_the_padding_of_a_scene_reaches_nobody():
-    """Scenes of one's own may leave anything where nobody is, NaN for one."""
+class Padded(RandomScenes):
+    """With nobody at one place, and a number of one's choice in its fields."""
 
-    class Padded(RandomScenes):
-        def __call__(self, key, dtype):
-            scene = super().__call__(key, dtype)
-            there = torch.arange(self.vehicles) != 2
-            return scene.with_(
-                valid=scene.valid & there,
-                x=torch.where(there, scene.x, torch.nan),
-                speed=torch.where(there, scene.speed, torch.inf),
-            )
+    nonsense = 0.0
 
-    road = Road(3)
-    env = HighwayEnv(IdmMobilTraffic(road), 4, scenes=Padded(road, 9))
+    def __call__(self, key, dtype):
+        scene = super().__call__(key, dtype)
+        there = torch.arange(self.vehicles) != 2
+        return scene.with_(
+            valid=scene.valid & there,
+            x=torch.where(there, scene.x, self.nonsense),
+            speed=torch.where(there, scene.speed, self.nonsense),
+        )
+
+
+def driven_with(nonsense: float, form: str):
+    """The last state of three decisions, with zeros where nobody is."""
+    scenes = Padded(Road(3), 9)
+    scenes.nonsense = nonsense
+    base = HighwayEnv(IdmMobilTraffic(Road(3)), 4, scenes=scenes)
+    env = TransformedEnv(base, ObservationTransform(Road(3), 9, form))
     state = env.reset()
-    for _ in range(3):
-        state["action"] = torch.zeros(4, dtype=torch.int64)
+    for action in (keys.LEFT, keys.KEEP, keys.RIGHT):
+        state["action"] = torch.full((4,), action)
         _, state = env.step_and_maybe_reset(state)
-    assert torch.isfinite(state["vehicles", "x"]).all()
-    assert torch.isfinite(state["vehicles", "speed"]).all()
+    there = state[keys.VEHICLES, "valid"]
+    for name, field in state[keys.VEHICLES].items():
+        state[keys.VEHICLES, name] = torch.where(there, field, 0)
+    return state.exclude(keys.TRAFFIC)
+
+
+@pytest.mark.parametrize("form", OBSERVATIONS)
+def test_nonsense_in_the_padding_of_a_scene_reaches_nobody(form):
+    """Scenes of one's own may leave anything where nobody is: not a bit of the others changes, and
+    none of what the agent reads.
+    """
+    expected = driven_with(0.0, form)
+    assert torch.isfinite(expected[keys.OBSERVATION]).all()
+    for nonsense in (5.0, torch.nan, torch.inf):
+        assert same_bits(driven_with(nonsense, form), expected) == []

@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 import torch
-from reference.worlds import environment, same_bits
+from reference.worlds import same_bits
 from torchrl.collectors import MultiSyncCollector
 from torchrl.envs import ExcludeTransform, ParallelEnv, RemoveEmptySpecs, SerialEnv
 from torchrl.envs.utils import check_env_specs
@@ -18,17 +18,9 @@ from ganlane.env.state import checked_action
 from ganlane.errors import UserError
 from ganlane.sim.random import Purpose, uniform
 from ganlane.torch_settings import constant
-from ganlane.traffic.base import TrafficModule
 
 TRAFFICS = ("idm", "idm_mobil", "idm_random", "idm_faults", "gan", "gan_calibrated", "mixed")
 KEEP = torch.zeros(2, dtype=torch.int64)
-
-
-class Cruise(TrafficModule):
-    """A traffic of one's own without a memory."""
-
-    def move(self, vehicles, memory, key, step):
-        return vehicles.with_(x=vehicles.x + vehicles.speed * self.dt), memory
 
 
 @pytest.fixture
@@ -52,12 +44,6 @@ def decided(env, **state):
 def test_a_traffic_with_parts_that_remember_nothing_runs_in_a_serial_environment(traffic):
     make = partial(ganlane.make_env, traffic, 2, decision_period_s=0.1)
     assert SerialEnv(2, make).rollout(1).batch_size == (2, 2, 1)
-
-
-def test_a_traffic_that_remembers_nothing_runs_in_a_serial_environment():
-    env = environment(num_envs=2, traffic=Cruise())
-    check_env_specs(env)
-    assert SerialEnv(1, lambda: env).rollout(1).batch_size == (1, 2, 1)
 
 
 def test_workers_of_a_seeded_serial_environment_drive_different_episodes():

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import re
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 
@@ -46,8 +44,7 @@ def test_every_example_is_run_here():
     assert {path.name for path in (ROOT / "examples").glob("*.py")} == set(EXAMPLES)
 
 
-#: own_traffic.py runs in its own process, below; the others here, where torch is loaded already.
-@pytest.mark.parametrize("name", sorted(EXAMPLES.keys() - {"own_traffic.py"}))
+@pytest.mark.parametrize("name", EXAMPLES)
 def test_the_example_runs_and_prints_its_result(name, monkeypatch, capsys):
     if name in NEEDS and importlib.util.find_spec(NEEDS[name]) is None:
         pytest.skip(f"{NEEDS[name]} is not installed")
@@ -55,17 +52,6 @@ def test_the_example_runs_and_prints_its_result(name, monkeypatch, capsys):
     with torch.random.fork_rng():
         runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
     assert re.search(EXAMPLES[name], capsys.readouterr().out)
-
-
-def test_an_example_runs_as_a_user_would_run_it():
-    paths = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
-    env = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": paths}
-    command = [sys.executable, str(ROOT / "examples" / "own_traffic.py")]
-    finished = subprocess.run(
-        command, env=env, capture_output=True, text=True, timeout=120, check=False
-    )
-    assert finished.returncode == 0, finished.stderr
-    assert re.search(EXAMPLES["own_traffic.py"], finished.stdout)
 
 
 def test_the_traffic_model_in_the_docs_is_the_one_that_runs():

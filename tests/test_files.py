@@ -9,6 +9,7 @@ import errno
 import os
 import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import polars as pl
 import pytest
 import torch
 from PIL import Image
+from reference.small_networks import PAPER, recorded_scenes
 from safetensors.torch import save_file
 
 from ganlane.agents import read_agent
@@ -30,18 +32,23 @@ from ganlane.files import (
     sealed,
     sealed_archive,
     write_bytes,
-    write_json,
 )
 from ganlane.generator import load_generator
-from ganlane.generator.tasks import FitLoop
+from ganlane.generator.tasks import FitLoop, PaperTask
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
 from ganlane.reproduce.crashes import read_crashes
-from ganlane.settings.generator import LoopConfig, PaperConfig
-from ganlane.training.checkpoint import load_checkpoint
+from ganlane.training.checkpoint import load_checkpoint, save_checkpoint
 from ganlane.weights import load_weights, save_weights
 
 NOISE = np.random.default_rng(0).integers(0, 255, (200, 300, 3), dtype=np.uint8)
 TABLE = pl.DataFrame({"a": NOISE.ravel()})
+
+
+def savez(path: Path) -> None:
+    with path.open("wb") as file:
+        np.savez(file, a=NOISE)
+
+
 #: Every library that writes files here; each has its own message for a full disk.
 WRITERS = {
     "python": lambda path: path.write_bytes(NOISE.tobytes()),
@@ -49,7 +56,7 @@ WRITERS = {
     "polars, csv": lambda path: TABLE.write_csv(path),
     "torch": lambda path: torch.save({"a": torch.from_numpy(NOISE)}, path),
     "pillow": lambda path: Image.fromarray(NOISE).save(path, format="PNG"),
-    "numpy": lambda path: np.savez(path.open("wb"), a=NOISE),
+    "numpy": savez,
 }
 
 
@@ -92,24 +99,6 @@ def test_a_file_has_the_permissions_that_the_users_umask_leaves(mask, tmp_path):
     assert (tmp_path / "a").stat().st_mode & 0o777 == 0o666 & ~mask
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EIO])
-def test_a_refusal_without_a_name_gets_that_of_the_file(number, tmp_path):
-    def fail_half_way(part: Path) -> None:
-        part.write_bytes(b"half")
-        raise OSError(number, os.strerror(number))
-
-    with (
-        pytest.raises(OSError, match=os.strerror(number)) as caught,
-        atomic_path(tmp_path / "a") as part,
-    ):
-        fail_half_way(part)
-    assert (caught.value.errno, caught.value.filename) == (
-        number,
-        str(tmp_path / "a"),
-    )
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_an_error_about_something_else_is_passed_on_as_it_is(tmp_path):
     for error, fail in (
         (ZeroDivisionError, lambda: 1 / 0),
@@ -122,13 +111,6 @@ def test_an_error_about_something_else_is_passed_on_as_it_is(tmp_path):
             fail()
         assert getattr(caught.value, "filename", None) != str(tmp_path / "a")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_that_is_a_file_is_refused(tmp_path):
-    write_bytes(tmp_path / "file", b"here")
-    with pytest.raises((NotADirectoryError, FileExistsError)):
-        write_json(tmp_path / "file" / "a", 1)
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_what_is_no_file_is_not_replaced(tmp_path):
@@ -145,39 +127,12 @@ def test_what_is_no_file_is_not_replaced(tmp_path):
         assert (tmp_path / "pipe").is_fifo()
 
 
-@pytest.mark.skipif(
-    not hasattr(os, "geteuid") or os.geteuid() == 0,
-    reason="the administrator may write anywhere",
-)
-def test_a_folder_without_the_right_to_write_is_refused(tmp_path):
-    tmp_path.chmod(0o555)
-    try:
-        with pytest.raises(PermissionError) as caught:
-            write_bytes(tmp_path / "a", b"new")
-        assert caught.value.filename == str(tmp_path / "a")
-    finally:
-        tmp_path.chmod(0o755)
-
-
 # --- checksums
 
 
-class SmallFit(torch.nn.Module):
-    """The smallest model that a loop can fit."""
-
-    config = PaperConfig(loop=LoopConfig(updates=1, evaluate_every=1))
-
-    def __init__(self):
-        super().__init__()
-        self.net = torch.nn.Linear(2, 2)
-        self.optimisers = {"net": torch.optim.Adam(self.net.parameters())}
-        self.random = torch.Generator()
-
-    def update(self, number: int) -> dict[str, float]:
-        return {}
-
-    def evaluate(self) -> float:
-        return 0.0
+@cache
+def small_fit() -> PaperTask:
+    return PaperTask(*([scene] for scene in recorded_scenes()), PAPER)
 
 
 def copied(source: Path) -> Callable[[Path], object]:
@@ -207,8 +162,12 @@ FILES: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
         Reference.load,
     ),
     "fit.pt": (
-        lambda path: FitLoop(SmallFit(), path).run(),
-        lambda path: FitLoop(SmallFit(), path),
+        lambda path: FitLoop(small_fit(), path).run(),
+        lambda path: FitLoop(small_fit(), path),
+    ),
+    "last.pt": (
+        lambda path: save_checkpoint(path, {"weights": torch.arange(40), "count": 4}),
+        load_checkpoint,
     ),
     "scenes.parquet": (
         lambda path: write_prepared(synthetic_frame(), path),
@@ -221,9 +180,14 @@ def flipped(content: bytes, place: int, bit: int) -> bytes:
     return content[:place] + bytes([content[place] ^ (1 << bit)]) + content[place + 1 :]
 
 
+#: What is said where the damage is found before the checksum is compared.
+FOUND_EARLIER = {"last.pt": "|not a readable checkpoint"}
+
+
 @pytest.mark.parametrize("name", FILES)
 def test_any_flipped_byte_is_refused_in_one_sentence(name, tmp_path, capsys):
     write, read = FILES[name]
+    earlier = FOUND_EARLIER.get(name, "")
     path = tmp_path / name
     write(path)
     read(path)
@@ -237,10 +201,10 @@ def test_any_flipped_byte_is_refused_in_one_sentence(name, tmp_path, capsys):
     }
     for place in sorted(place for place in places if place < len(whole)):
         path.write_bytes(flipped(whole, place, place % 8))
-        with pytest.raises(UserError, match=f"{path.name}: damaged") as caught:
+        with pytest.raises(UserError, match=f"{name}: (damaged{earlier})") as caught:
             read(path)
         assert "\n" not in str(caught.value)
-    for length in (0, 1, len(whole) // 2, len(whole) - 1):
+    for length in (0, 1, len(whole) // 2, len(whole) - len(PLACE), len(whole) - 1):
         path.write_bytes(whole[:length])
         with pytest.raises(UserError):
             read(path)

@@ -11,12 +11,10 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
-import torch
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
 from reference.gym_env import ID, KEEP, LEFT, RIGHT, ROOT, make, make_vec, until_the_end
 
-import ganlane
 from ganlane.build import make_traffic
 from ganlane.errors import UserError
 from ganlane.gym import ENV_IDS
@@ -146,23 +144,20 @@ def test_without_a_seed_two_environments_differ():
 
 def test_a_row_of_a_batch_drives_as_one_alone_does():
     actions = np.array([[LEFT, KEEP, KEEP], [KEEP, KEEP, LEFT], [KEEP, RIGHT, KEEP]])
-    envs = make_vec(3, traffic="idm_mobil")
-    alone = [make(traffic="idm_mobil") for _ in range(3)]
-    together, _ = envs.reset(seed=2, options={"episode": 3})
-    for row, env in enumerate(alone):
-        np.testing.assert_array_equal(
-            together[row], env.reset(seed=2, options={"episode": 3 + row})[0]
-        )
-    running = np.ones(3, bool)
-    for step in actions:
-        together, reward, terminated, truncated, info = envs.step(step)
-        for row in np.flatnonzero(running):
-            seen, own_reward, *ended, _ = alone[row].step(step[row])
-            last = info["final_obs"][row] if terminated[row] or truncated[row] else together[row]
-            np.testing.assert_array_equal(last, seen)
-            assert reward[row] == own_reward
-            assert [terminated[row], truncated[row]] == ended
-        running &= ~(terminated | truncated)
+    envs = make_vec(3, traffic="idm_mobil", goal_m=300.0)
+    envs.reset(seed=2, options={"episode": 3})
+    steps = [envs.step(decision) for decision in actions]
+    for row in range(3):
+        alone = make(traffic="idm_mobil", goal_m=300.0)
+        alone.reset(seed=2, options={"episode": 3 + row})
+        for together, decision in zip(steps, actions):
+            seen, *rest, _ = alone.step(decision[row])
+            assert [part[row] for part in together[1:4]] == rest
+            ended = any(rest[1:])
+            observations = together[4]["final_obs"] if ended else together[0]
+            np.testing.assert_array_equal(observations[row], seen)
+            if ended:
+                break
 
 
 @pytest.mark.parametrize(
@@ -202,40 +197,20 @@ def test_pictures_change_nobody():
     plain = make()
     drawn = make(render_mode="rgb_array")
     assert drawn.unwrapped._rows.env.base_env.kernel is not None
-    for env in (plain, drawn):
-        env.reset(seed=1)
+    plain.reset(seed=1)
+    drawn.reset(seed=1)
     for action in (LEFT, KEEP, RIGHT):
         (observation, *rest), (expected, *expected_rest) = plain.step(action), drawn.step(action)
         np.testing.assert_array_equal(observation, expected)
         assert str(rest) == str(expected_rest)
 
 
-def test_the_facade_gives_what_the_torchrl_environment_gives():
-    envs = make_vec(2, goal_m=400.0)
-    observation, _ = envs.reset(seed=1)
-    env = ganlane.make_env("idm", 2, goal_m=400.0, seed=1, kernel="auto")
-    state = env.reset()
-    np.testing.assert_array_equal(observation, state["observation"].numpy())
-    for _ in range(3):
-        observation, reward, terminated, _, _ = envs.step(np.array([LEFT, KEEP]))
-        stepped, state = env.step_and_maybe_reset(state.set("action", torch.tensor([LEFT, KEEP])))
-        np.testing.assert_array_equal(observation, state["observation"].numpy())
-        np.testing.assert_array_equal(reward, stepped["next", "reward"][:, 0].double().numpy())
-        np.testing.assert_array_equal(terminated, stepped["next", "terminated"][:, 0].numpy())
-
-
 def test_the_goal_terminates_and_a_time_out_truncates():
-    for options, is_goal in (
-        ({"goal_m": 30.0}, True),
-        ({"goal_m": 5000.0, "timeout_s": 3.0}, False),
-    ):
-        *_, terminated, truncated, info = until_the_end(begun(make(**options)))
-        assert (terminated, truncated, info["goal"], info["timeout"]) == (
-            is_goal,
-            not is_goal,
-            is_goal,
-            not is_goal,
-        )
+    *_, terminated, truncated, info = until_the_end(begun(make(goal_m=30.0)))
+    assert (terminated, truncated, info["goal"], info["timeout"]) == (True, False, True, False)
+    late = begun(make(goal_m=5000.0, timeout_s=3.0))
+    *_, terminated, truncated, info = until_the_end(late)
+    assert (terminated, truncated, info["goal"], info["timeout"]) == (False, True, False, True)
     assert info["time_s"] == pytest.approx(3.0)
 
 
@@ -335,15 +310,8 @@ def begun(env):
     ("call", "message"),
     [
         (lambda: make(traffic="gann"), "traffic=gann: no such option .did you mean 'gan'.."),
-        (lambda: make(traffic=3), "traffic=3: it has keys of its own"),
-        (lambda: make(lanes="many"), "env.lanes=many: expected a whole number"),
         (lambda: make(lane=4), "env.lane: no such key .did you mean 'lanes'.."),
-        (lambda: make(reward={"crash": 1.0}), "reward.crash: no such key"),
-        (lambda: make(stream="test"), "stream=test: expected one of train, select, report"),
-        (lambda: make(stream={}), "stream=.*expected a text"),
-        (lambda: make(device=np.array([1, 2])), "device="),
         (lambda: make(seed=-1), "seed=-1: expected a whole number from 0"),
-        (lambda: make(seed=np.array([1, 2])), "seed=array"),
         (lambda: make(render_mode="ansi"), "render_mode=ansi: expected one of human, rgb_array"),
         (lambda: make_vec(2, render_mode=5), "render_mode=5: a batch has rgb_array only"),
         (lambda: make_vec(True), "num_envs=true: expected a whole number"),
@@ -377,11 +345,9 @@ def begun(env):
         ),
         (lambda: begun(make()).step(3), r"0 \(keep\), 1 \(left\) or 2 \(right\)"),
         (lambda: begun(make_vec(2)).step(np.zeros(3, int)), "expected 2 whole number"),
-        *(
-            (lambda env=env, action=action: begun(env()).step(action), r"expected \d whole number")
-            for env in (make, lambda: make_vec(2))
-            for action in ([[0, 1], [2]], ["x", None], None)
-        ),
+        (lambda: begun(make()).step(["x", None]), r"expected \d whole number"),
+        (lambda: begun(make()).step(None), r"expected \d whole number"),
+        (lambda: begun(make_vec(2)).step([[0, 1], [2]]), r"expected \d whole number"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*render_mode")
@@ -391,22 +357,18 @@ def test_a_wrong_argument_is_refused_in_a_sentence(call, message):
 
 
 def test_the_safe_mask_is_in_the_info_and_behind_maskable_ppos_method():
-    env = gymnasium.make("ganlane/Highway-v0", mask="safe", traffic="idm_mobil")
+    env = make(mask="safe", traffic="idm_mobil", goal_m=5000.0)
     _, info = env.reset(seed=0)
-    forbidden = 0
+    masks = [info["action_mask"]]
     for _ in range(15):
         mask = env.unwrapped.action_masks()
         assert mask.dtype == np.bool_
-        assert mask[0]
         np.testing.assert_array_equal(mask, info["action_mask"].astype(bool))
-        forbidden += int((~mask).sum())
-        _, _, terminated, truncated, info = env.step(
-            int(env.action_space.sample(info["action_mask"]))
-        )
-        assert not (terminated and info["out_of_road"])
-        if terminated or truncated:
-            break
-    assert forbidden > 0
+        *_, info = env.step(KEEP)
+        masks.append(info["action_mask"])
+    keep, *changes = np.stack(masks).T
+    assert keep.all()
+    assert not np.all(changes)
 
 
 def test_a_batch_has_a_mask_for_every_row():
@@ -414,10 +376,8 @@ def test_a_batch_has_a_mask_for_every_row():
     _, info = envs.reset(seed=0)
     mask = envs.action_masks()
     np.testing.assert_array_equal(mask, info["action_mask"].astype(bool))
-    drawn = np.stack([envs.action_space.sample(mask=tuple(info["action_mask"])) for _ in range(40)])
-    for row, allowed in enumerate(mask):
-        assert set(drawn[:, row]) == set(np.flatnonzero(allowed))
     assert (mask.sum(1) == 2).all()
+    assert not (mask == mask[0]).all()
 
 
 @pytest.mark.parametrize(
@@ -430,14 +390,10 @@ def test_a_copy_goes_on_as_the_environment_does_and_leaves_it_alone(twin, traffi
     env.step(LEFT)
     other = twin(env)
     theirs = [other.step(action) for action in (KEEP, RIGHT)]
-    for (observation, *rest), (expected, *expected_rest) in zip(
-        [env.step(action) for action in (KEEP, RIGHT)], theirs
-    ):
-        assert np.array_equal(observation, expected)
-        assert str(rest) == str(expected_rest)
+    ours = [env.step(action) for action in (KEEP, RIGHT)]
+    assert data_equivalence(ours, theirs, exact=True)
 
 
 @pytest.mark.skipif(why_not() is not None, reason=f"no native kernel here: {why_not()}")
-@pytest.mark.parametrize("count", [3, np.int64(3)])
-def test_numpys_numbers_of_environments_get_the_native_kernel_too(count):
-    assert isinstance(make_rows("idm_mobil", count, False, (), {}), NativeRows)
+def test_numpys_numbers_of_environments_get_the_native_kernel_too():
+    assert isinstance(make_rows("idm_mobil", np.int64(3), False, (), {}), NativeRows)

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 import ganlane
-from ganlane.agents.checkpoint import SHIPPED, with_seeds
-from ganlane.errors import UserError
+from ganlane.agents.checkpoint import SHIPPED
 from ganlane.files import PACKAGE, conf_folder
 from ganlane.native import library
 from ganlane.runtime import has_compiler
@@ -91,11 +90,3 @@ def test_the_wheel_holds_configuration_weights_and_kernel_and_is_below_5_mb(whee
     assert not [name for name in names if name.startswith(("tests/", "outputs/"))]
     assert wheel.name.startswith(f"ganlane-{ganlane.__version__}-")
     assert wheel.stat().st_size < 5e6
-
-
-def test_without_the_further_trainings_all_of_them_are_refused_in_a_sentence(tmp_path, monkeypatch):
-    monkeypatch.setattr("ganlane.agents.checkpoint.CHECKPOINTS", tmp_path)
-    with pytest.raises(
-        UserError, match=r"agent_idm@0 is installed.* run pip install -e \. in a clone"
-    ):
-        with_seeds("agent_idm@all")

@@ -194,7 +194,7 @@ def start_training(
     )
     state = TrainingState(env, agent)
     while not agent.ready:
-        agent.store(state.window.push(loop.collect(state)))
+        loop.advance(state)
     transitions = agent.replay[:].select(*TRANSITION_KEYS).clone()
     while (missing := stored - len(agent.replay)) > 0:
         agent.store(transitions[:missing])

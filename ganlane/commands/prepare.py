@@ -7,17 +7,11 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from ganlane.data.prepared import (
-    Preparation,
-    SceneSummary,
-    prepare_recordings,
-)
-from ganlane.data.sources import (
-    byte_progress,
-    recordings_path,
-)
+from ganlane.data.prepared import PooledStatistics, prepare_recordings
+from ganlane.data.sources import byte_progress, recordings_path
+from ganlane.data.statistics import describe
 from ganlane.evaluation import write_results
 from ganlane.evaluation.table import Table
 from ganlane.files import write_bytes
@@ -26,8 +20,6 @@ from ganlane.settings.recordings import PrepareConfig
 from ganlane.view.figures import save_figure
 from ganlane.view.recordings import draw_recordings
 
-#: Maximum number of scenes in the table.
-_MOST_SCENES: Final = 60
 _QUANTITIES: Final = {
     "speed": "speed, m/s",
     "acceleration_raw": "acceleration as recorded, m/s2",
@@ -47,10 +39,8 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
     # Without a place of their own the scenes lie in the run's folder.
     out = Path(config.out) if config.out else folder / "scenes"
 
-    def show(
-        scene: SceneSummary,
-    ) -> None:  # while the others are still read
-        line = f"{scene.name}: {scene.rows:,} rows, {scene.vehicle_km:.1f} vehicle-km"
+    def show(scene: dict[str, Any]) -> None:  # while the others are still read
+        line = f"{scene['name']}: {scene['rows']:,} rows, {scene['vehicle_km']:.1f} vehicle-km"
         print(line, file=sys.stderr, flush=True)
 
     with byte_progress("read") as progress:
@@ -65,7 +55,7 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
         )
     # The report embeds the figure by its name, so both can be moved together.
     sheet = save_figure(
-        draw_recordings(prepared.statistics),
+        draw_recordings(prepared),
         folder / "report.png",
     )
     report = folder / "report.md"
@@ -87,9 +77,9 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
     return f"results: {write_results(folder, numbers, asdict(config), {})}"
 
 
-def short_report(prepared: Preparation) -> str:
+def short_report(prepared: PooledStatistics) -> str:
     """Rows, exposure, lane-change rates and durations in a few lines."""
-    exposure = prepared.statistics.exposure
+    exposure = prepared.exposure
     # What was read and dropped first: a wrong format shows there.
     lines = _row_lines(prepared)
     lines.append(
@@ -104,7 +94,7 @@ def short_report(prepared: Preparation) -> str:
 
 
 def long_report(
-    prepared: Preparation,
+    prepared: PooledStatistics,
     source: str,
     figure: str,
 ) -> str:
@@ -115,7 +105,7 @@ def long_report(
         "## Rows",
         _bullets(_row_lines(prepared)),
         "## Scenes",
-        _scene_table(prepared.statistics.scenes),
+        _scene_table(prepared.scenes),
         "## Lane changes",
         _bullets(_lane_change_lines(prepared)),
         "Equation 9 takes every car to have driven the whole road; where tracks cover only part of "
@@ -133,14 +123,14 @@ def long_report(
     return "\n\n".join(parts) + "\n"
 
 
-def _row_lines(prepared: Preparation) -> list[str]:
+def _row_lines(prepared: PooledStatistics) -> list[str]:
     count = prepared.count
     lines = [f"rows: {count.read:,} read, {count.kept:,} kept, {prepared.written:,} written"]
     return lines + [f"dropped: {rows:,} ({reason})" for reason, rows in count.dropped.most_common()]
 
 
-def _lane_change_lines(prepared: Preparation) -> list[str]:
-    changes = prepared.statistics.lane_changes
+def _lane_change_lines(prepared: PooledStatistics) -> list[str]:
+    changes = prepared.lane_changes
     complete = changes.duration.complete
     duration = changes.duration
     lines = [
@@ -161,14 +151,14 @@ def _lane_change_lines(prepared: Preparation) -> list[str]:
     return lines
 
 
-def _acceleration_lines(prepared: Preparation) -> list[str]:
+def _acceleration_lines(prepared: PooledStatistics) -> list[str]:
     parts = []
     # Raw ones are mostly noise of the measurement; both are shown, so that this shows.
     for name, title in (
         ("raw", "as recorded"),
         ("smoothed", "over 1 s"),
     ):
-        share = prepared.statistics.strong_share(f"acceleration_{name}")
+        share = prepared.strong_share(f"acceleration_{name}")
         if share is not None:
             parts.append(f"{100.0 * share:.1f} % {title}")
     return [f"accelerations beyond 3 m/s2: {', '.join(parts)}"] if parts else []
@@ -178,7 +168,7 @@ def _bullets(lines: Iterable[str]) -> str:
     return "\n".join(f"- {line}" for line in lines)
 
 
-def _scene_table(scenes: Sequence[SceneSummary]) -> str:
+def _scene_table(scenes: Sequence[dict[str, Any]]) -> str:
     # One line per scene.
     head = [
         "scene",
@@ -187,44 +177,38 @@ def _scene_table(scenes: Sequence[SceneSummary]) -> str:
         "s",
         "lanes",
         "lane width, m",
-    ]
-    head += [
         "rows in the nearest lane, %",
         "vehicle-km",
         "mean speed, m/s",
+        "lane changes",
+        "per vehicle-km (95 %)",
     ]
-    head += ["lane changes", "per vehicle-km (95 %)"]
     rows = []
-    # As many as fit on a page.
-    for scene in scenes[:_MOST_SCENES]:
-        low = scene.per_vehicle_km_low
-        high = scene.per_vehicle_km_high
+    for scene in scenes:
+        low, high = scene["per_vehicle_km_low"], scene["per_vehicle_km_high"]
         cells = [
-            scene.name,
-            f"{scene.rows:,}",
-            f"{scene.tracks:,}",
-            f"{scene.seconds:g}",
-            f"{scene.lanes}",
-            f"{scene.lane_width_m:.2f}",
-            f"{100.0 * scene.nearest_lane_share:.1f}",
-            f"{scene.vehicle_km:.1f}",
-            f"{scene.mean_speed_mps:.1f}",
-            f"{scene.lane_changes:,}",
-            f"{scene.per_vehicle_km:.3f} ({low:.3f} to {high:.3f})",
+            scene["name"],
+            f"{scene['rows']:,}",
+            f"{scene['tracks']:,}",
+            f"{scene['seconds']:g}",
+            f"{scene['lanes']}",
+            f"{scene['lane_width_m']:.2f}",
+            f"{100.0 * scene['nearest_lane_share']:.1f}",
+            f"{scene['vehicle_km']:.1f}",
+            f"{scene['mean_speed_mps']:.1f}",
+            f"{scene['lane_changes']:,}",
+            f"{scene['per_vehicle_km']:.3f} ({low:.3f} to {high:.3f})",
         ]
         rows.append(cells)
-    # A folder of highD has more than a page holds.
-    more = len(scenes) - _MOST_SCENES
-    note = f"\n\n{more} more scenes are in results.json." if more > 0 else ""
-    return Table("", head, rows, len(head)).markdown(heading=False) + note
+    return Table("", head, rows, len(head)).markdown(heading=False)
 
 
-def _distribution_table(prepared: Preparation) -> str:
+def _distribution_table(prepared: PooledStatistics) -> str:
     # A few of the stored levels.
     levels = [f"{100 * level:g} %" for level in _SHOWN_LEVELS]
     rows = []
     for name, title in _QUANTITIES.items():
-        sample = prepared.statistics.describe(name)
+        sample = describe(prepared.sample(name))
         # An empty sample leaves its cells empty.
         values = [sample.mean, sample.sd]
         values += [sample.quantile(level) if sample.count else None for level in _SHOWN_LEVELS]

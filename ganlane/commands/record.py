@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import itertools
 import sys
-import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
-from shutil import rmtree
 from typing import Any
 
 import gymnasium
@@ -24,6 +21,7 @@ from ganlane.build import make_driver
 from ganlane.config.run import cleared_after_mistakes
 from ganlane.errors import UserError
 from ganlane.evaluation import write_results
+from ganlane.files import whole_folder
 from ganlane.gym import ENV_ID
 from ganlane.gym.rows import row_of
 from ganlane.gym.tensor_rows import TensorRows
@@ -74,7 +72,13 @@ def record(config: RecordConfig, folder: Path) -> str:
     spec.kwargs = {name: plain(getattr(driven, name)) for name in _ARGUMENTS}
     spec.max_episode_steps = rows.episode.most_decisions()
     name, root = config.dataset_name(), Path(config.out or folder).absolute()
-    with _new_folder(root / name) as part:
+    place = root / name
+    if place.exists():
+        raise UserError(
+            f"{place}: a dataset is there already; give another dataset=NAME or out=FOLDER."
+        )
+    # A dataset that is half written is not found by Minari.
+    with cleared_after_mistakes(place.parent), whole_folder(place) as part:
         actions = gymnasium.spaces.Discrete(ACTIONS)
         storage = MinariStorage.new(
             part / "data",
@@ -102,30 +106,6 @@ def record(config: RecordConfig, folder: Path) -> str:
     )
     print(", ".join(f"{key.replace('_', ' ')} {value}" for key, value in facts.items()))
     return f"dataset: minari.load_dataset({name!r}) with MINARI_DATASETS_PATH={root}"
-
-
-@contextmanager
-def _new_folder(place: Path) -> Iterator[Path]:
-    """A folder under another name, which becomes ``place`` once it is whole.
-
-    Raises:
-        UserError: there is one already.
-    """
-    if place.exists():
-        raise UserError(
-            f"{place}: a dataset is there already; give another dataset=NAME or out=FOLDER."
-        )
-    with cleared_after_mistakes(place.parent):
-        place.parent.mkdir(parents=True, exist_ok=True)
-        # A hidden name next to the place: a dataset that is half written is not found by Minari.
-        part = Path(tempfile.mkdtemp(dir=place.parent, prefix="."))
-        try:
-            yield part
-            # mkdtemp() lets only the owner in.
-            part.chmod(0o755)
-            part.replace(place)
-        finally:
-            rmtree(part, ignore_errors=True)
 
 
 def _episodes(

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.errors import UserError
 from ganlane.evaluation.episodes import ScriptedPolicy
 from ganlane.reproduce.crashes import read_crashes
+from ganlane.reproduce.episodes import drive_episode
 from ganlane.settings.render import FILMS, MOST_EPISODES, RenderConfig
-from ganlane.sim.random import Stream
 from ganlane.torch_settings import set_threads
 from ganlane.view import Trajectory, record_episode, write_film, write_player, write_tracks
 from ganlane.view.curves import draw_runs, read_runs
@@ -31,7 +30,13 @@ def render(config: RenderConfig, folder: Path) -> str:
         episodes = _crashes(config, config.crashes)
         name = "crashes"
     else:
-        episodes = [_record(config, agent, number) for agent, number in config.pairs()]
+        episodes = []
+        for agent, number in config.pairs():
+            end_s = config.look.end_s
+            # The stream of reported figures: episode k here is episode k of an evaluation.
+            episode = drive_episode(agent, config.traffic, config, number, end_s=end_s)
+            print(_sentence(episode))
+            episodes.append(episode)
         # A name of what is shown, so that several pictures can lie in one folder.
         labels = [episode.label for episode in episodes]
         agents = dict.fromkeys(Path(label.agent).stem for label in labels)
@@ -45,34 +50,6 @@ def render(config: RenderConfig, folder: Path) -> str:
     # Films and pages cut off the beginning themselves; a table has it cut off here.
     shown = [episode.since(config.look.start_s) for episode in episodes]
     return f"tracks: {write_tracks(shown, out, kind)}"
-
-
-def _record(
-    config: RenderConfig,
-    agent: str,
-    number: int,
-) -> Trajectory:
-    """Drive an episode and print how it ended."""
-    driver = make_driver(agent, config.env, device=config.device)
-    # The stream of reported figures: episode k here is episode k of an evaluation.
-    traffic = make_traffic(config.traffic, config.env, Stream.REPORT)
-    # A trained agent reads what it was trained on, behind the mask that it was trained with.
-    observation = config.observation.read_by(driver.observation)
-    mask, policy = driver.behind(config.mask)
-    env = make_env(
-        traffic,
-        config.env,
-        observation,
-        config.reward,
-        device=config.device,
-        mask=mask,
-    )
-    label = config.traffic.label()
-    episode = record_episode(
-        env, policy, config.seed, number, driver.name, label, config.look.end_s
-    )
-    print(_sentence(episode))
-    return episode
 
 
 def _sentence(episode: Trajectory) -> str:

@@ -39,7 +39,6 @@ from ganlane.data.sources import (
 from ganlane.data.statistics import (
     Bins,
     DrivingStatistics,
-    Histogram,
     driving_statistics,
     survival_curve,
 )

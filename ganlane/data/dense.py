@@ -12,12 +12,10 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
+from ganlane.data.lanes import Flags, Floats
 from ganlane.data.schema import FRAME_S, SCHEMA
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -65,31 +63,20 @@ class Recording:
         track = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)[1]
         shape = (int(time.max()) + 1, int(track.max()) + 1)
         # Values per frame and track; 0 where the track is absent.
-        arrays: dict[str, Any] = {}
+        arrays: dict[str, Any] = {"present": np.zeros(shape, bool)}
+        arrays["present"][time, track] = True
         for name in ("x", "y", "speed"):
             arrays[name] = np.zeros(shape)
             arrays[name][time, track] = rows[name].to_numpy()
         # Values per track, the same in all of its rows.
         for name in ("length", "width", "driven"):
             column = rows[name].to_numpy()
-            arrays[name] = np.zeros(
-                shape[1],
-                column.dtype,
-            )
+            arrays[name] = np.zeros(shape[1], column.dtype)
             arrays[name][track] = column
-        present = np.zeros(shape, bool)
-        present[time, track] = True
-        name = str(rows["scene"][0])
+        scene = str(rows["scene"][0])
         # Lane 0 is the rightmost; lanes beyond the leftmost one in use are not known.
         lanes = int(rows["lane"].to_numpy().max()) + 1
-        return cls(
-            name,
-            name,
-            lanes,
-            lane_width_m,
-            present=present,
-            **arrays,
-        )
+        return cls(scene, scene, lanes, lane_width_m, **arrays)
 
     @property
     def end_m(self) -> float:
@@ -102,24 +89,22 @@ class Recording:
         The lane is the one whose centre is nearest, and the speed is 0: everything is measured from
         positions. Further columns are ``unit``, ``driven`` and ``lane_width``.
         """
-        # Transposed, so that the rows come track by track.
-        vehicle, time = np.nonzero(self.present.T)
         # Simulated positions are float32; sums over them are taken in float64.
-        y = self.y[time, vehicle].astype(np.float64)
-        columns = {
-            "scene": np.full(len(vehicle), self.name),
-            "vehicle": vehicle,
-            "frame": time,
-            "x": self.x[time, vehicle].astype(np.float64),
-            "y": y,
-            "speed": np.zeros(len(vehicle)),
-            "lane": np.rint(y / self.lane_width_m).clip(0, self.lanes - 1).astype(np.int64),
-            "length": self.length[vehicle],
-            "width": self.width[vehicle],
-        }
-        return pl.DataFrame(columns, schema=SCHEMA).with_columns(
+        y = self.y.astype(np.float64)
+        table = track_table(
+            self.name,
+            self.present,
+            vehicle=np.arange(len(self.length)),
+            x=self.x,
+            y=y,
+            speed=0.0,
+            lane=np.rint(y / self.lane_width_m).clip(0, self.lanes - 1),
+            length=self.length,
+            width=self.width,
+        )
+        return table.with_columns(
             unit=pl.lit(self.unit),
-            driven=pl.Series(self.driven[vehicle]),
+            driven=pl.Series(self.driven[table["vehicle"].to_numpy()]),
             lane_width=pl.lit(self.lane_width_m),
         )
 
@@ -141,14 +126,23 @@ class Recording:
             }
             arrays |= {name: getattr(self, name)[who] for name in ("length", "width", "driven")}
             # The unit stays that of the recording: pieces of one scene are not independent.
-            pieces.append(
-                replace(
-                    self,
-                    name=f"{self.name}@{start}",
-                    **arrays,
-                )
-            )
+            pieces.append(replace(self, name=f"{self.name}@{start}", **arrays))
         return pieces
+
+
+def track_table(scene: str, present: Flags, **values: ArrayLike) -> pl.DataFrame:
+    """A frame in the schema of one ``scene``, track by track.
+
+    ``values`` are the other columns but ``frame``, each [T, V], [V] or one number; rows are made
+    where ``present`` [T, V].
+    """
+    # Transposed, so that the rows come track by track.
+    track, frame = np.nonzero(present.T)
+    columns: dict[str, Any] = {"scene": np.full(len(frame), scene), "frame": frame}
+    for name, value in values.items():
+        numbers = np.broadcast_to(value, present.shape)[frame, track]
+        columns[name] = numbers.astype(SCHEMA[name].to_python())
+    return pl.DataFrame({name: columns[name] for name in SCHEMA}, schema=SCHEMA)
 
 
 def recordings_of(frame: pl.DataFrame, lane_widths: Mapping[str, float]) -> list[Recording]:

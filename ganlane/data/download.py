@@ -1,29 +1,28 @@
 """A download that resumes.
 
 Bytes are written to ``.NAME.part`` next to the file, and the server's version of it to
-``.NAME.part.json``. After a broken connection, or an earlier run that was interrupted, the download
-resumes with HTTP's Range, guarded by If-Range, so that two versions of a file are never joined. If
-the server ignores Range, the download starts again. Errors of the disk are not retried. The file
-gets its name only when it is complete.
+``.NAME.part.version``. After a broken connection, or an earlier run that was interrupted, the
+download resumes with HTTP's Range, guarded by If-Range, so that two versions of a file are never
+joined. If the server ignores Range, the download starts again. Errors of the disk are not retried.
+The file gets its name only when it is complete.
 """
 
 from __future__ import annotations
 
 import hashlib
 import http.client
-import json
 import time
 import urllib.error
 import urllib.parse
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from ganlane.data.tables import OnProgress
 from ganlane.errors import UserError
-from ganlane.files import write_json
 
 _SCHEMES: Final = ("http", "https")
 #: Larger files are refused, bytes: NGSIM's largest has 2 GB.
@@ -64,33 +63,19 @@ def download(
         raise UserError(f"{url}: not an address of a file; expected http:// or https://.")
     # A file that is there is never replaced: it may be the user's own.
     if path.is_file():
-        _check_sha256(
-            path,
-            sha256,
-            "remove it, or correct data.sha256",
-        )
+        _check_sha256(path, sha256, "remove it, or correct data.sha256")
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
     # The path appears only when everything has come and the checksum is right.
-    part = _Part(url, path, most_bytes)
+    part = _Part(url, path, most_bytes, timeout_s, on_progress)
     try:
-        _fetch(
-            part,
-            on_progress,
-            timeout_s,
-            attempts,
-            wait_s,
-        )
+        part.fetch(attempts, wait_s)
     except OSError as error:  # The disk's, for the network's are caught below.
         if error.errno is None:
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
     try:
-        _check_sha256(
-            part.file,
-            sha256,
-            "it was removed; download again, or correct data.sha256",
-        )
+        _check_sha256(part.file, sha256, "it was removed; download again, or correct data.sha256")
     except UserError:
         part.remove()
         raise
@@ -100,39 +85,33 @@ def download(
     return path
 
 
+@dataclass(frozen=True)
 class _Part:
-    """The incomplete file ``.NAME.part`` of ``url`` next to ``path``, and a note of its version."""
+    """The incomplete file ``.NAME.part`` of ``url`` next to ``path``, and a note of its version.
 
-    def __init__(
-        self,
-        url: str,
-        path: Path,
-        most_bytes: int,
-    ) -> None:
-        self.url = url
-        self.most_bytes = most_bytes
-        # Hidden, beside the file, so that the last step is a rename.
-        self.file = path.with_name(f".{path.name}.part")
-        self._note = path.with_name(f".{path.name}.part.json")
+    The other attributes are arguments of :func:`download`.
+    """
+
+    url: str
+    path: Path
+    most_bytes: int
+    timeout_s: float
+    on_progress: OnProgress | None
+
+    @property
+    def file(self) -> Path:
+        """Hidden, beside the file, so that the last step is a rename."""
+        return self.path.with_name(f".{self.path.name}.part")
+
+    @property
+    def note(self) -> Path:
+        """Holds the server's identifier of the version; empty if it tells none."""
+        return self.path.with_name(f".{self.path.name}.part.version")
 
     @property
     def size(self) -> int:
         """Bytes received so far."""
         return self.file.stat().st_size if self.file.is_file() else 0
-
-    @property
-    def version(self) -> str | None:
-        """The server's identifier of the version; None where the download cannot be resumed."""
-        try:
-            version = json.loads(self._note.read_text())["version"]
-        except (OSError, ValueError, KeyError, TypeError):
-            return None
-        # A weak ETag does not promise equal bytes, so it cannot guard a range.
-        return version if isinstance(version, str) and not version.startswith("W/") else None
-
-    @version.setter
-    def version(self, version: str | None) -> None:
-        write_json(self._note, {"version": version})
 
     def check_size(self, size: int) -> None:
         """Refuse more bytes than wanted; what came of them is removed."""
@@ -147,47 +126,87 @@ class _Part:
     def remove(self) -> None:
         """Remove the incomplete file and its note."""
         self.file.unlink(missing_ok=True)
-        self._note.unlink(missing_ok=True)
+        self.note.unlink(missing_ok=True)
 
+    def fetch(self, attempts: int, wait_s: float) -> None:
+        """Connect until the file is complete.
 
-def _fetch(
-    part: _Part,
-    on_progress: OnProgress | None,
-    timeout_s: float,
-    attempts: int,
-    wait_s: float,
-) -> None:
-    """Connect until the file is complete.
+        Give up after ``attempts`` connections in a row that bring nothing.
+        """
+        # Only connections in a row without any progress count.
+        failures = 0
+        while True:
+            before = self.size
+            try:
+                self.connect()
+                return
+            except urllib.error.HTTPError as error:
+                if error.code == http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and before:
+                    self.remove()  # It is longer than the file, so it is of another version.
+                # Client errors stay; server errors may pass.
+                elif error.code < 500:
+                    what = f"{error.code} {' '.join(str(error.reason).split())}"
+                    raise UserError(
+                        f"{self.url}: the server says {what}; check data.url."
+                    ) from error
+                reason = f"{error.code} {error.reason}"
+            except _BrokenConnection as error:
+                reason = str(error)
+            failures = 0 if self.size > before else failures + 1
+            if failures >= attempts:
+                raise UserError(
+                    f"{self.url}: cannot be fetched, {self.size} bytes came ({reason}); check the "
+                    "network and run the command again, it continues from there."
+                )
+            # Longer each time, to spare a server in trouble.
+            if failures:
+                time.sleep(wait_s)
+                wait_s *= 2.0
 
-    Give up after ``attempts`` connections in a row that bring nothing.
-    """
-    # Only connections in a row without any progress count.
-    failures = 0
-    while True:
-        before = part.size
-        try:
-            _connect(part, on_progress, timeout_s)
-            return
-        except urllib.error.HTTPError as error:
-            if error.code == http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and before:
-                part.remove()  # It is longer than the file, so it is of another version.
-            # Client errors stay; server errors may pass.
-            elif error.code < 500:
-                what = f"{error.code} {' '.join(str(error.reason).split())}"
-                raise UserError(f"{part.url}: the server says {what}; check data.url.") from error
-            reason = f"{error.code} {error.reason}"
-        except _BrokenConnection as error:
-            reason = str(error)
-        failures = 0 if part.size > before else failures + 1
-        if failures >= attempts:
-            raise UserError(
-                f"{part.url}: cannot be fetched, {part.size} bytes came ({reason}); check the "
-                "network and run the command again, it continues from there."
-            )
-        # Longer each time, to spare a server in trouble.
-        if failures:
-            time.sleep(wait_s)
-            wait_s *= 2.0
+    def connect(self) -> None:
+        """One connection: the rest of the file, or all of it."""
+        received = self.size
+        headers = {"User-Agent": "ganlane", "Accept-Encoding": "identity"}
+        version = self.note.read_text("latin-1") if self.note.is_file() else ""
+        # Without a version the server may send the rest of another file. A weak ETag does not
+        # promise equal bytes.
+        if received and version and not version.startswith("W/"):
+            headers |= {"Range": f"bytes={received}-", "If-Range": version}
+        with _network_errors():
+            request = urllib.request.Request(self.url, headers=headers)
+            opener = urllib.request.build_opener(_HttpOnly)
+            answer = opener.open(request, timeout=self.timeout_s)
+        with answer:
+            resumes = answer.status == http.HTTPStatus.PARTIAL_CONTENT
+            # Content-Range is ``bytes 100-199/200``.
+            place = answer.headers.get("Content-Range") or ""
+            if resumes and not place.startswith(f"bytes {received}-"):
+                self.remove()
+                raise _BrokenConnection("the server sent another part than the one asked for")
+            received = received if resumes else 0
+            length = (answer.headers.get("Content-Length") or "").strip()
+            # A length that is no number tells nothing; 19 digits are more bytes than there are.
+            total = received + int(length[:19]) if length.isdecimal() else None
+            # Refused before anything is written, if the server tells the size.
+            self.check_size(max(received, total or 0))
+            if not resumes:
+                version = answer.headers.get("ETag") or answer.headers.get("Last-Modified") or ""
+                self.note.write_text(version, "latin-1")
+            # An answer to the whole request begins the file anew.
+            with self.file.open("ab" if received else "wb") as file:
+                while True:
+                    with _network_errors():
+                        piece = answer.read1(2**18)
+                    if not piece:
+                        break
+                    received += len(piece)
+                    self.check_size(received)
+                    file.write(piece)
+                    if self.on_progress is not None:
+                        self.on_progress(received, total)
+        # An early end looks like a complete answer otherwise.
+        if total is not None and received < total:
+            raise _BrokenConnection(f"{received} of {total} bytes came")
 
 
 class _HttpOnly(urllib.request.HTTPRedirectHandler):
@@ -207,67 +226,7 @@ class _HttpOnly(urllib.request.HTTPRedirectHandler):
                 f"{req.full_url}: the server sends to {newurl[:200]}; expected http:// or "
                 "https://, check data.url."
             )
-        return super().redirect_request(
-            req,
-            fp,
-            code,
-            msg,
-            headers,
-            newurl,
-        )
-
-
-def _connect(
-    part: _Part,
-    on_progress: OnProgress | None,
-    timeout_s: float,
-) -> None:
-    """One connection: the rest of the file, or all of it."""
-    received = part.size
-    headers = {
-        "User-Agent": "ganlane",
-        "Accept-Encoding": "identity",
-    }
-    # Without a version the server may send the rest of another file.
-    if received and (version := part.version):
-        headers |= {
-            "Range": f"bytes={received}-",
-            "If-Range": version,
-        }
-    with _network_errors():
-        request = urllib.request.Request(part.url, headers=headers)
-        answer = urllib.request.build_opener(_HttpOnly).open(request, timeout=timeout_s)
-    with answer:
-        resumes = answer.status == http.HTTPStatus.PARTIAL_CONTENT
-        # Content-Range is ``bytes 100-199/200``.
-        if resumes and not (answer.headers.get("Content-Range") or "").startswith(
-            f"bytes {received}-"
-        ):
-            part.remove()
-            raise _BrokenConnection("the server sent another part than the one asked for")
-        received = received if resumes else 0
-        length = (answer.headers.get("Content-Length") or "").strip()
-        # A length that is no number tells nothing; 19 digits are more bytes than there are.
-        total = received + int(length[:19]) if length.isdecimal() else None
-        # Refused before anything is written, if the server tells the size.
-        part.check_size(max(received, total or 0))
-        if not resumes:
-            part.version = answer.headers.get("ETag") or answer.headers.get("Last-Modified")
-        # An answer to the whole request begins the file anew.
-        with part.file.open("ab" if received else "wb") as file:
-            while True:
-                with _network_errors():
-                    piece = answer.read1(2**18)
-                if not piece:
-                    break
-                received += len(piece)
-                part.check_size(received)
-                file.write(piece)
-                if on_progress is not None:
-                    on_progress(received, total)
-    # An early end looks like a complete answer otherwise.
-    if total is not None and received < total:
-        raise _BrokenConnection(f"{received} of {total} bytes came")
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 
 @contextmanager
@@ -278,11 +237,7 @@ def _network_errors() -> Iterator[None]:
     except urllib.error.HTTPError:
         raise
     # A ValueError comes from an address that is none.
-    except (
-        OSError,
-        http.client.HTTPException,
-        ValueError,
-    ) as error:
+    except (OSError, http.client.HTTPException, ValueError) as error:
         raise _BrokenConnection(
             str(getattr(error, "reason", None) or error) or type(error).__name__
         ) from error

@@ -10,7 +10,7 @@ frame. Positions are not smoothed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -20,14 +20,13 @@ import polars as pl
 
 from ganlane.data.schema import (
     FRAME_S,
-    SCHEMA,
     RowCount,
     Scene,
     number_tracks,
     sort,
     validate,
 )
-from ganlane.data.tables import raise_where, read_table
+from ganlane.data.tables import LINE, raise_unless_positive, raise_where, read_table
 from ganlane.errors import UserError
 
 _TRACKS: Final = "_tracks.csv"
@@ -45,20 +44,22 @@ _META: Final = {
     "upperlanemarkings": pl.String,
     "lowerlanemarkings": pl.String,
 }
-#: ``drivingDirection`` of the upper lanes, driven to the left in the image, and of the lower lanes.
-UPPER: Final = 1
-LOWER: Final = 2
+#: Each direction's side of the image, its ``drivingDirection``, and whether ``x`` of the image
+#: grows (1) or falls (-1) along it.
+_SIDES: Final = (("upper", 1, -1.0), ("lower", 2, 1.0))
 
 
 @dataclass(frozen=True)
 class _Direction:
-    """One direction of travel.
+    """One direction of travel; the first three are those of :data:`_SIDES`.
 
     ``lane_ids`` from the rightmost, ``right_edge`` is the image's ``y`` in m.
     """
 
+    side: str
     number: int
-    lane_ids: tuple[int, ...]
+    forward: float
+    lane_ids: Sequence[int]
     right_edge: float
     lane_width: float
 
@@ -86,57 +87,38 @@ def highd_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Sc
         stem = tracks.name.removesuffix(_TRACKS)
         rate_hz, directions = _read_recording_meta(tracks.with_name(f"{stem}_recordingMeta.csv"))
         # Both directions are in one file.
-        rows = _read_rows(
-            tracks,
-            tracks.with_name(f"{stem}_tracksMeta.csv"),
-            count,
-        )
+        rows = _read_rows(tracks, tracks.with_name(f"{stem}_tracksMeta.csv"), count)
         for direction in directions:
-            side = "upper" if direction.number == UPPER else "lower"
-            scene = _scene(
-                rows,
-                direction,
-                rate_hz,
-                f"highd-{stem}-{side}",
-                tracks,
-                count,
-            )
+            name = f"highd-{stem}-{direction.side}"
+            scene = _scene(rows, direction, rate_hz, name, tracks, count)
             if scene is not None:
                 yield scene
 
 
-def _read_recording_meta(
-    path: Path,
-) -> tuple[float, tuple[_Direction, _Direction]]:
+def _read_recording_meta(path: Path) -> tuple[float, list[_Direction]]:
     """Frame rate in Hz, and both directions.
 
     Lane ids grow downwards from 2; the id between the directions is unused.
     """
-    rate_hz, upper_text, lower_text = read_table(path, _META).select(_META.keys()).row(0)
+    meta = read_table(path, _META).row(0, named=True)
+    rate_hz = meta["framerate"]
     # Frames are dropped or interpolated, never invented.
     if rate_hz < 10.0:
         raise UserError(f"{path}, line 2, column framerate: {rate_hz}, expected 10 Hz or more.")
-    upper = _markings(upper_text, path, "upperlanemarkings")
-    lower = _markings(lower_text, path, "lowerlanemarkings")
-    n_upper = len(upper) - 1
-    n_lower = len(lower) - 1
-    # Upper lanes: the rightmost one, seen by its drivers, is at the top of the image.
-    upper_ids = tuple(range(2, 2 + n_upper))
-    lower_ids = tuple(range(n_upper + 2 + n_lower, n_upper + 2, -1))
-    return rate_hz, (
-        _Direction(
-            UPPER,
-            upper_ids,
-            upper[0],
-            (upper[-1] - upper[0]) / n_upper,
-        ),
-        _Direction(
-            LOWER,
-            lower_ids,
-            lower[-1],
-            (lower[-1] - lower[0]) / n_lower,
-        ),
-    )
+    directions = []
+    first_id = 2
+    for side, number, forward in _SIDES:
+        column = f"{side}lanemarkings"
+        edges = _markings(meta[column], path, column)
+        lanes = len(edges) - 1
+        ids = range(first_id, first_id + lanes)
+        width = (edges[-1] - edges[0]) / lanes
+        # The rightmost of the upper lanes, seen by its drivers, is at the top of the image.
+        from_right = slice(None, None, -int(forward))
+        right_edge = edges[from_right][0]
+        directions.append(_Direction(side, number, forward, ids[from_right], right_edge, width))
+        first_id += lanes + 1
+    return rate_hz, directions
 
 
 def _markings(
@@ -164,60 +146,25 @@ def _read_rows(
 ) -> pl.DataFrame:
     """Rows of a recording, sorted by vehicle and frame.
 
-    ``direction`` is its vehicle's in the ``meta`` file.
+    ``drivingdirection`` is its vehicle's in the ``meta`` file.
     """
     cars = read_table(meta, {"id": pl.Int64, "drivingdirection": pl.Int64})
-    direction = cars["drivingdirection"]
+    unknown = ~cars["drivingdirection"].is_in([1, 2])
     what = "is neither 1 (upper lanes) nor 2 (lower lanes)"
-    raise_where(
-        ~direction.is_in([UPPER, LOWER]),
-        cars,
-        "drivingdirection",
-        meta,
-        what,
-    )
-    raise_where(
-        cars["id"].is_duplicated(),
-        cars,
-        "id",
-        meta,
-        "stands there twice",
-    )
+    raise_where(unknown, cars, "drivingdirection", meta, what)
+    raise_where(cars["id"].is_duplicated(), cars, "id", meta, "stands there twice")
     rows = read_table(path, COLUMNS)
     count.read += rows.height
-    for name in ("width", "height"):
-        raise_where(
-            rows[name] <= 0.0,
-            rows,
-            name,
-            path,
-            "is not above 0",
-        )
+    raise_unless_positive(rows, ("width", "height"), path)
     # Sorting would hide a damaged frame number.
     step = rows.select(pl.col("frame").diff().over("id")).to_series()
     what = "is not after the last frame of its vehicle; frames must grow"
-    raise_where(
-        step <= 0,
-        rows,
-        "frame",
-        path,
-        what,
-    )
+    raise_where(step <= 0, rows, "frame", path, what)
     # Each row gets the direction of its vehicle.
-    directions = rows["id"].replace_strict(
-        cars["id"],
-        direction,
-        default=None,
-        return_dtype=pl.Int64,
-    )
-    raise_where(
-        directions.is_null(),
-        rows,
-        "id",
-        path,
-        "is not in the tracksMeta file",
-    )
-    return rows.with_columns(directions.alias("direction")).sort("id", "frame")
+    rows = rows.join(cars.drop(LINE), on="id", how="left", maintain_order="left")
+    what = "is not in the tracksMeta file"
+    raise_where(rows["drivingdirection"].is_null(), rows, "id", path, what)
+    return rows.sort("id", "frame")
 
 
 def _scene(
@@ -229,7 +176,7 @@ def _scene(
     count: RowCount,
 ) -> Scene | None:
     """One direction in the schema, with a frame every 0.1 s; None where it has no vehicles."""
-    rows = rows.filter(pl.col("direction") == direction.number)
+    rows = rows.filter(pl.col("drivingdirection") == direction.number)
     # A lane id of the other direction, or none, is an error of the tracking.
     on_road = rows["laneid"].is_in(list(direction.lane_ids))
     count.drop("off the lanes of its direction", (~on_road).sum())
@@ -237,7 +184,7 @@ def _scene(
     if rows.is_empty():
         return None
     # Distances grow in the direction of travel.
-    forward = -1.0 if direction.number == UPPER else 1.0
+    forward = direction.forward
     along = forward * (pl.col("x") + 0.5 * pl.col("width"))
     # Upper lanes: left is down in the image, where y grows; lower lanes: left is up.
     left = -forward * (pl.col("y") + 0.5 * pl.col("height") - direction.right_edge)
@@ -256,13 +203,7 @@ def _scene(
     # Rows that were dropped split a track: nothing is interpolated across a gap.
     tracks = number_tracks(turned, str(path)).partition_by("vehicle", maintain_order=True)
     frame = pl.concat([resample(track, rate_hz) for track in tracks])
-    if frame.is_empty():
-        return None
-    frame = validate(
-        frame.select(SCHEMA.names()),
-        f"{path}, {name}",
-        first_line=None,
-    )
+    frame = validate(frame, f"{path}, {name}", first_line=None)
     return Scene(name, sort(frame), direction.lane_width)
 
 
@@ -282,11 +223,7 @@ def resample(track: pl.DataFrame, rate_hz: float) -> pl.DataFrame:
     nearest = np.ceil(place - 0.5 - 1e-9).astype(np.int64)
     # Numbers are interpolated; lane and names are those of the nearest sample.
     columns = {
-        name: np.interp(
-            place,
-            np.arange(len(old)),
-            track[name].to_numpy(),
-        )
+        name: np.interp(place, np.arange(len(old)), track[name].to_numpy())
         for name in ("x", "y", "speed", "length", "width")
     }
     return track[nearest].with_columns(frame=frame.astype(np.int64), **columns)

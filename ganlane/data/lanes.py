@@ -46,19 +46,13 @@ _CENTRED_M = 0.3
 _STILL_MPS = 0.1
 
 
-def scene_lane_widths(
-    frame: pl.DataFrame,
-) -> dict[str, float]:
+def scene_lane_widths(frame: pl.DataFrame) -> dict[str, float]:
     """Lane width in metres of every scene of a frame in the schema.
 
     Errors are :func:`lane_width`'s.
     """
     return {
-        str(name): lane_width(
-            rows["y"].to_numpy(),
-            rows["lane"].to_numpy(),
-            str(name),
-        )
+        str(name): lane_width(rows["y"].to_numpy(), rows["lane"].to_numpy(), str(name))
         for (name,), rows in frame.group_by("scene", maintain_order=True)
     }
 
@@ -131,15 +125,11 @@ def _best_range(
     # A row of lane k agrees with the widths from y / (k + 1/2) to y / (k - 1/2); lane 0 has no
     # upper end.
     begin = np.where(lane == 0, 2.0 * np.abs(y), y / (lane + 0.5))
-    end = np.where(
-        lane == 0,
-        np.inf,
-        y / np.where(lane == 0, 1.0, lane - 0.5),
-    )
-    begin = np.clip(begin, 0.9 * guess, 1.1 * guess)
-    end = np.clip(end, 0.9 * guess, 1.1 * guess)
+    end = np.where(lane == 0, np.inf, y / (lane - 0.5))
+    limits = (0.9 * guess, 1.1 * guess)
+    begin, end = np.clip(begin, *limits), np.clip(end, *limits)
     # The number of agreeing rows changes at these widths only.
-    edges = np.unique(np.concatenate((begin, end, [0.9 * guess, 1.1 * guess])))
+    edges = np.unique(np.concatenate((begin, end, limits)))
     inside = 0.5 * (edges[1:] + edges[:-1])
     # Rows whose range has begun, less those whose range has ended.
     agreeing = np.searchsorted(np.sort(begin), inside) - np.searchsorted(np.sort(end), inside)
@@ -269,35 +259,14 @@ def find_lane_changes(tracks: Tracks) -> LaneChanges:
     # The crossing lies between two samples; it is interpolated linearly.
     boundary = (old + 0.5 * side) * tracks.lane_width[sample]
     part = (boundary - tracks.y[sample]) / (tracks.y[sample + 1] - tracks.y[sample])
-    start, start_seen = _find_end(
-        tracks,
-        sample,
-        side,
-        old,
-        -1,
-    )
-    end, end_seen = _find_end(
-        tracks,
-        sample + 1,
-        side,
-        new,
-        1,
-    )
+    start, start_seen = _find_end(tracks, sample, side, old, -1)
+    end, end_seen = _find_end(tracks, sample + 1, side, new, 1)
     tau_s = (sample - start + part) * FRAME_S
     tau_e = (end - sample - part) * FRAME_S
     # Over the recorded part of the change, from start to end.
     moved = side * (tracks.y[end] - tracks.y[start])
     speed = moved / (tau_s + tau_e)
-    return LaneChanges(
-        sample,
-        old,
-        new,
-        tau_s,
-        tau_e,
-        ~start_seen,
-        ~end_seen,
-        speed,
-    )
+    return LaneChanges(sample, old, new, tau_s, tau_e, ~start_seen, ~end_seen, speed)
 
 
 def lane_changes_of_arrays(y: ArrayLike, lane_width: float) -> LaneChanges:
@@ -345,10 +314,10 @@ def _find_end(
     within the track.
     """
     # Never beyond the track: there the change is censored.
-    limit = (tracks.first if direction < 0 else tracks.last)[sample]
+    limit = (tracks.first if direction < 0 else tracks.last)[sample, None]
     path = sample[:, None] + direction * np.arange(_REACH + 1)
-    inside = (path <= limit[:, None]) if direction > 0 else (path >= limit[:, None])
-    path = np.where(inside, path, limit[:, None])
+    inside = direction * (limit - path) >= 0
+    path = np.where(inside, path, limit)
     # Distance from the centre of the lane that is left or reached.
     offset = tracks.y[path] - (lane * tracks.lane_width[sample])[:, None]
     pace = side[:, None] * _lateral_speed(tracks, path)

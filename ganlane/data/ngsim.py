@@ -18,7 +18,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import polars as pl
 
@@ -35,8 +35,10 @@ from ganlane.data.tables import (
     OnProgress,
     TextTable,
     convert,
+    converted,
     csv_table,
     first_line,
+    raise_unless_positive,
     raise_where,
     read_blocks,
 )
@@ -124,12 +126,7 @@ def ngsim_scenes(
     parameters = parameters or NgsimParameters()
     count = count if count is not None else RowCount()
     # Nothing is read before the first period is asked for.
-    rows = _read_rows(
-        _layout(path),
-        parameters,
-        count,
-        on_progress,
-    )
+    rows = _read_rows(_layout(path), parameters, count, on_progress)
     with tempfile.TemporaryDirectory(dir=scratch, prefix="rows-") as folder:
         periods = _store_by_period(rows, Path(folder), str(path))
         if not periods:
@@ -137,13 +134,8 @@ def ngsim_scenes(
                 f"{path}: no rows of {', '.join(parameters.locations)}; check data.locations."
             )
         for name, parts in periods.items():
-            if scene := _scene(
-                name,
-                _read(parts),
-                path,
-                parameters.lanes,
-                count,
-            ):
+            scene = _scene(name, _read(parts), path, parameters.lanes, count)
+            if scene is not None:
                 yield scene
 
 
@@ -171,49 +163,17 @@ def _read_rows(
     path = table.path
     has_location = LOCATION in table.names
     wanted = [*COLUMNS, LOCATION] if has_location else list(COLUMNS)
-    for text in read_blocks(
-        table,
-        wanted,
-        parameters.block_bytes,
-        on_progress,
-    ):
+    for text in read_blocks(table, wanted, parameters.block_bytes, on_progress):
         count.read += text.height
         # A raw text file is of one place, which its name tells.
         if has_location:
-            text = _keep_locations(
-                text,
-                path,
-                parameters.locations,
-                count,
-            )
+            text = _keep_locations(text, path, parameters.locations, count)
         else:
             text = text.with_columns(pl.lit(path.stem).alias(LOCATION))
         # Only the wanted rows are converted: others may be damaged.
-        columns = [
-            convert(
-                text,
-                name,
-                kind,
-                path,
-            )
-            for name, kind in COLUMNS.items()
-        ]
-        rows = pl.DataFrame([*columns, text[LOCATION], text[LINE]])
-        for name in ("v_length", "v_width"):
-            raise_where(
-                rows[name] <= 0.0,
-                rows,
-                name,
-                path,
-                "is not above 0",
-            )
-        raise_where(
-            rows["v_vel"] < 0.0,
-            rows,
-            "v_vel",
-            path,
-            "is below 0",
-        )
+        rows = converted(text, COLUMNS, path).with_columns(text[LOCATION])
+        raise_unless_positive(rows, ("v_length", "v_width"), path)
+        raise_where(rows["v_vel"] < 0.0, rows, "v_vel", path, "is below 0")
         yield rows
 
 
@@ -224,24 +184,11 @@ def _keep_locations(
     count: RowCount,
 ) -> pl.DataFrame:
     """Rows of the wanted locations; rows of others are dropped and counted."""
-    text = text.with_columns(
-        convert(
-            text,
-            LOCATION,
-            pl.String,
-            path,
-        ).str.to_lowercase()
-    )
+    text = text.with_columns(convert(text, LOCATION, pl.String, path).str.to_lowercase())
     places = sorted({*MOTORWAYS, *STREETS, *locations})
     what = f"is no known place, expected {', '.join(places)}, or name it in data.locations"
     # A mistyped place would drop a whole recording in silence.
-    raise_where(
-        ~text[LOCATION].is_in(places),
-        text,
-        LOCATION,
-        path,
-        what,
-    )
+    raise_where(~text[LOCATION].is_in(places), text, LOCATION, path, what)
     wanted = text[LOCATION].is_in(list(locations))
     for location, rows in text[LOCATION].filter(~wanted).value_counts().iter_rows():
         count.drop(f"location {location}", rows)
@@ -257,17 +204,16 @@ def _store_by_period(
 
     Returns the files of each period by its name, as ``us-101-1``.
     """
-    parts: dict[tuple[str, int], list[Path]] = {}
+    parts: dict[tuple[Any, ...], list[Path]] = {}
     start_ms = pl.col("global_time") - FRAME_MS * pl.col("frame_id")
     for number, block in enumerate(blocks):
         block = block.with_columns(minute=start_ms // 60_000)
-        for rows in block.partition_by(LOCATION, "minute", maintain_order=True):
-            location = rows[LOCATION][0]
-            minute = rows["minute"][0]
+        minutes = block.partition_by(LOCATION, "minute", as_dict=True, include_key=False)
+        for period, rows in minutes.items():
             # Numbered by block: the rows of a period keep the order of the file.
-            part = folder / f"{len(parts):04d}-{number:05d}-{minute}.arrow"
-            rows.drop(LOCATION, "minute").write_ipc(part, compression="lz4")
-            parts.setdefault((location, minute), []).append(part)
+            part = folder / f"{len(parts):04d}-{number:05d}-{period[1]}.arrow"
+            rows.write_ipc(part, compression="lz4")
+            parts.setdefault(period, []).append(part)
         # Checked at each block, before a damaged file fills the disk.
         if len(parts) > MAX_PERIODS:
             raise UserError(
@@ -356,47 +302,21 @@ def _drop_duplicates(rows: pl.DataFrame, count: RowCount) -> pl.DataFrame:
     """
     # The file's own order decides which of several rows is the first.
     rows = rows.sort("vehicle_id", "global_time", LINE)
-    unequal = rows.unique(
-        list(COLUMNS),
-        keep="first",
-        maintain_order=True,
-    )
-    first = unequal.unique(
-        ["vehicle_id", "global_time"],
-        keep="first",
-        maintain_order=True,
-    )
+    unequal = rows.unique(list(COLUMNS), keep="first", maintain_order=True)
+    first = unequal.unique(["vehicle_id", "global_time"], keep="first", maintain_order=True)
     count.drop("duplicate", rows.height - unequal.height)
-    count.drop(
-        "same vehicle and time, other values",
-        unequal.height - first.height,
-    )
+    count.drop("same vehicle and time, other values", unequal.height - first.height)
     return first
 
 
 def _check_order(rows: pl.DataFrame, path: Path) -> None:
     """Frames must grow with time, and be 100 ms apart."""
-    # Differences within each vehicle.
-    steps = rows.select(
-        frames=pl.col("frame_id").diff().over("vehicle_id"),
-        ms=pl.col("global_time").diff().over("vehicle_id"),
-    )
+    steps = rows.select(pl.col("frame_id", "global_time").diff().over("vehicle_id"))
     what = "does not grow with global_time within its vehicle"
-    raise_where(
-        steps["frames"] <= 0,
-        rows,
-        "frame_id",
-        path,
-        what,
-    )
-    apart = steps["ms"] != FRAME_MS * steps["frames"]
-    raise_where(
-        apart,
-        rows,
-        "global_time",
-        path,
-        "is not 100 ms a frame after the row before",
-    )
+    raise_where(steps["frame_id"] <= 0, rows, "frame_id", path, what)
+    apart = steps["global_time"] != FRAME_MS * steps["frame_id"]
+    what = "is not 100 ms a frame after the row before"
+    raise_where(apart, rows, "global_time", path, what)
 
 
 def _check_units(rows: pl.DataFrame, source: str) -> None:

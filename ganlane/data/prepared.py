@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,10 +22,7 @@ from ganlane.data.recordings import (
 )
 from ganlane.data.schema import FRAME_S, RowCount, Scene
 from ganlane.data.statistics import (
-    Bins,
-    Distribution,
     Exposure,
-    Histogram,
     LaneChangeStatistics,
     describe,
     lane_change_statistics,
@@ -38,94 +31,65 @@ from ganlane.data.statistics import (
 )
 from ganlane.data.tables import OnProgress
 from ganlane.errors import UserError
+from ganlane.files import whole_folder
 from ganlane.settings.generator import NgsimParameters
 
-#: Bins of each quantity in m/s, m/s2, s or m; quantiles are accurate to a bin's width.
-QUANTITIES: Final = {
-    "speed": Bins(0.0, 60.0, 6000),
-    "acceleration_raw": Bins(-20.0, 20.0, 8000),
-    "acceleration_smoothed": Bins(-20.0, 20.0, 8000),
-    "headway": Bins(-2.0, 30.0, 6400),
-    "time_headway": Bins(0.0, 40.0, 8000),
-    "gap": Bins(0.0, 300.0, 6000),
-}
-
-
-@dataclass(frozen=True)
-class SceneSummary:
-    """One scene in numbers; rates as in :class:`LaneChangeStatistics`.
-
-    ``nearest_lane_share`` is the share of rows whose recorded lane is the one whose centre is
-    nearest: near 1 where the road is straight in the recording's coordinates.
-    """
-
-    name: str
-    rows: int
-    tracks: int
-    seconds: float
-    lanes: int
-    lane_width_m: float
-    nearest_lane_share: float
-    vehicle_km: float
-    mean_speed_mps: float
-    lane_changes: int
-    srlc: float
-    per_vehicle_km: float
-    per_vehicle_km_low: float
-    per_vehicle_km_high: float
+#: Accelerations beyond it, which few cars reach, are strong, m/s2.
+_STRONG_MPS2: Final = 3.0
+_ACCELERATIONS: Final = ("acceleration_raw", "acceleration_smoothed")
 
 
 class PooledStatistics:
-    """Statistics over scenes: :meth:`add` each one, then read the attributes."""
+    """Statistics over scenes: :meth:`add` each one, then read the attributes.
+
+    Attributes:
+        scenes: numbers of each scene; rates as in :class:`LaneChangeStatistics`.
+            ``nearest_lane_share`` is the share of rows whose recorded lane is the one whose centre
+            is nearest: near 1 where the road is straight in the recording's coordinates.
+        count: rows read and dropped.
+        written: rows written.
+        files: names of the files that they were written to.
+    """
 
     def __init__(self) -> None:
-        self.histograms = {name: Histogram(bins) for name, bins in QUANTITIES.items()}
-        self.scenes: list[SceneSummary] = []
+        self.count = RowCount()
+        self.written = 0
+        self.files: list[str] = []
+        self.scenes: list[dict[str, Any]] = []
         self._exposures: list[Exposure] = []
         self._changes: list[LaneChanges] = []
-        #: One number per car: few enough to be stored.
-        self._headways: list[np.ndarray] = []
-        #: Numbers of accelerations beyond 3 m/s2, which few cars reach.
-        self._strong = dict.fromkeys(("acceleration_raw", "acceleration_smoothed"), 0)
+        self._samples: list[dict[str, np.ndarray]] = []
 
-    def add(self, scene: Scene) -> SceneSummary:
+    def add(self, scene: Scene) -> dict[str, Any]:
         """Measure one more scene."""
         frame = scene.frame
-        exposure = measure_exposure(scene.frame)
+        exposure = measure_exposure(frame)
         tracks = tracks_of_frame(frame, {scene.name: scene.lane_width_m})
         changes = find_lane_changes(tracks)
         self._exposures.append(exposure)
         self._changes.append(changes)
-        # Histograms, so that memory does not grow with the recordings.
-        for name, values in quantities(frame).items():
-            self.histograms[name].add(values)
-            if name == "headway":
-                self._headways.append(values)
-            # The bins do not end at 3 m/s2, so these are counted apart.
-            if name in self._strong:
-                self._strong[name] += int(np.count_nonzero(np.abs(values) > 3.0))
-        speed = float(frame["speed"].mean())  # type: ignore[arg-type]
+        # Numbers of their own, which do not hold on to the frame.
+        samples = {name: values.copy() for name, values in quantities(frame).items()}
+        self._samples.append(samples)
+        speed = float(samples["speed"].mean())
         # A scene's own rates, for the table.
         rates = lane_change_statistics(changes, exposure, speed)
-        summary = SceneSummary(
-            name=scene.name,
-            rows=frame.height,
-            tracks=exposure.tracks,
-            seconds=round(
-                FRAME_S * int(np.ptp(frame["frame"].to_numpy()) + 1),
-                1,
-            ),
-            lanes=scene.lanes,
-            lane_width_m=scene.lane_width_m,
-            nearest_lane_share=float(np.mean(tracks.lane == frame["lane"].to_numpy())),
-            vehicle_km=exposure.vehicle_km,
-            mean_speed_mps=speed,
-            lane_changes=rates.count,
-            srlc=rates.srlc,
-            per_vehicle_km=rates.per_vehicle_km,
-            per_vehicle_km_low=rates.per_vehicle_km_low,
-            per_vehicle_km_high=rates.per_vehicle_km_high,
-        )
+        summary = {
+            "name": scene.name,
+            "rows": frame.height,
+            "tracks": exposure.tracks,
+            "seconds": round(FRAME_S * int(np.ptp(frame["frame"].to_numpy()) + 1), 1),
+            "lanes": scene.lanes,
+            "lane_width_m": scene.lane_width_m,
+            "nearest_lane_share": float(np.mean(tracks.lane == frame["lane"].to_numpy())),
+            "vehicle_km": exposure.vehicle_km,
+            "mean_speed_mps": speed,
+            "lane_changes": rates.count,
+            "srlc": rates.srlc,
+            "per_vehicle_km": rates.per_vehicle_km,
+            "per_vehicle_km_low": rates.per_vehicle_km_low,
+            "per_vehicle_km_high": rates.per_vehicle_km_high,
+        }
         self.scenes.append(summary)
         return summary
 
@@ -135,10 +99,7 @@ class PooledStatistics:
         parts = _columns(self._exposures)
         # Weighted by cars, as equation 9 counts them.
         road_m = float(np.average(parts.pop("road_m"), weights=parts["cars"]))
-        return Exposure(
-            road_m=road_m,
-            **{name: sum(values) for name, values in parts.items()},
-        )
+        return Exposure(road_m=road_m, **{name: sum(values) for name, values in parts.items()})
 
     @property
     def changes(self) -> LaneChanges:
@@ -149,70 +110,42 @@ class PooledStatistics:
     @property
     def lane_changes(self) -> LaneChangeStatistics:
         """Rates, durations and lateral speeds over all scenes."""
-        return lane_change_statistics(
-            self.changes,
-            self.exposure,
-            float(self.describe("speed").mean or 0.0),
-        )
+        speed = float(self.sample("speed").mean())
+        return lane_change_statistics(self.changes, self.exposure, speed)
 
-    def describe(self, quantity: str) -> Distribution:
-        """Summary of a quantity.
-
-        Exact for headways, for others with quantiles accurate to a bin's width.
-        """
-        # One value per car fits into memory, so no bins are needed.
-        if quantity == "headway":
-            return describe(np.concatenate([np.empty(0), *self._headways]))
-        return self.histograms[quantity].describe()
+    def sample(self, quantity: str) -> np.ndarray:
+        """All values of one of the :func:`quantities`."""
+        return np.concatenate([samples[quantity] for samples in self._samples])
 
     def strong_share(self, quantity: str) -> float | None:
         """Share of the accelerations beyond 3 m/s2; None without any."""
-        total = self.histograms[quantity].total
-        return self._strong[quantity] / total if total else None
+        strong = np.abs(self.sample(quantity)) > _STRONG_MPS2
+        return float(strong.mean()) if len(strong) else None
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain numbers and dataclasses."""
-        return {
-            "exposure": self.exposure,
-            "lane_changes": self.lane_changes,
-            **{name: self.describe(name) for name in self.histograms},
-            **{f"{name}_beyond_3_mps2": self.strong_share(name) for name in self._strong},
-            "scenes": self.scenes,
-        }
-
-
-def _columns(
-    records: Sequence[Any],
-) -> dict[str, list[Any]]:
-    """The values of each field of equal records."""
-    return {name: [getattr(record, name) for record in records] for name in vars(records[0])}
-
-
-@dataclass(frozen=True)
-class Preparation:
-    """Result of :func:`prepare_recordings`.
-
-    Rows read, dropped and written, files, and statistics of all scenes.
-    """
-
-    count: RowCount
-    written: int
-    files: tuple[str, ...]
-    statistics: PooledStatistics
-
-    def to_dict(self) -> dict[str, Any]:
-        """Numbers for ``results.json``."""
+        """Everything as plain numbers and dataclasses, for ``results.json``."""
         rows = {
             "read": self.count.read,
             "kept": self.count.kept,
             "dropped": dict(self.count.dropped),
             "written": self.written,
         }
+        described = {name: describe(self.sample(name)) for name in self._samples[0]}
+        shares = {f"{name}_beyond_3_mps2": self.strong_share(name) for name in _ACCELERATIONS}
         return {
             "rows": rows,
-            "files": list(self.files),
-            **self.statistics.to_dict(),
+            "files": self.files,
+            "exposure": self.exposure,
+            "lane_changes": self.lane_changes,
+            **described,
+            **shares,
+            "scenes": self.scenes,
         }
+
+
+def _columns(records: Sequence[Any]) -> dict[str, list[Any]]:
+    """The values of each field of equal records."""
+    return {name: [getattr(record, name) for record in records] for name in vars(records[0])}
 
 
 def prepare_recordings(
@@ -222,8 +155,8 @@ def prepare_recordings(
     parameters: NgsimParameters | None = None,
     scene_s: float | None = None,
     on_progress: OnProgress | None = None,
-    on_scene: Callable[[SceneSummary], None] | None = None,
-) -> Preparation:
+    on_scene: Callable[[dict[str, Any]], None] | None = None,
+) -> PooledStatistics:
     """Read recordings, write each as a Parquet file into the new folder ``out``, and measure them.
 
     The folder appears only when everything is written. Recordings are measured first, then cut into
@@ -234,86 +167,27 @@ def prepare_recordings(
         UserError: a damaged or missing file, no moving vehicle in it, or ``out`` exists already.
     """
     # Everything is written into a hidden folder first.
-    count = RowCount()
-    statistics = PooledStatistics()
-    files = []
-    written = 0
+    pooled = PooledStatistics()
     with whole_folder(out) as folder:
-        for scene in open_scenes(
-            kind,
-            path,
-            count,
-            parameters,
-            folder,
-            on_progress,
-        ):
+        for scene in open_scenes(kind, path, pooled.count, parameters, folder, on_progress):
             # A lot of parked cars has no driving to measure.
             if scene.frame["speed"].max() == 0.0 or scene.frame["frame"].n_unique() < 2:
-                count.drop(
-                    "scene in which nobody drives",
-                    scene.frame.height,
-                )
+                pooled.count.drop("scene in which nobody drives", scene.frame.height)
                 continue
-            summary = statistics.add(scene)
+            summary = pooled.add(scene)
             # Letters, digits, dots and dashes.
             file = re.sub(r"[^\w.-]+", "_", scene.name).lstrip(".") + PARQUET
-            if file in files:
+            if file in pooled.files:
                 raise UserError(f"{path}: a second scene that {file} is the file of; rename one.")
-            files.append(file)
+            pooled.files.append(file)
             # Measured whole: cutting would censor lane changes.
             frame = cut_into_scenes(scene.frame, scene_s) if scene_s else scene.frame
             write_prepared(frame, folder / file)
-            written += frame.height
+            pooled.written += frame.height
             if on_scene is not None:
                 on_scene(summary)
-        if not files:
+        if not pooled.files:
             raise UserError(
                 f"{path}: no scene in which anybody drives; give a recording of moving traffic."
             )
-    return Preparation(
-        count,
-        written,
-        tuple(files),
-        statistics,
-    )
-
-
-@contextmanager
-def whole_folder(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary folder next to ``path`` to write into; on success it is renamed to
-    ``path``, else removed.
-
-    Raises:
-        UserError: there is something at ``path`` already.
-        OSError: it names ``path``, or the file in it that was to be written.
-    """
-    path = Path(path)
-    # Never into a folder that holds something: it may be another recording.
-    if path.is_file() or (path.is_dir() and any(path.iterdir())):
-        raise UserError(
-            f"{path}: there already; choose another folder with out=FOLDER, or remove it."
-        )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Beside the folder, so that the last step is a rename.
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        shutil.rmtree(part, ignore_errors=True)  # of a killed process that had the same number
-        part.mkdir()
-        # Whatever goes wrong in between, the folder of the user stays as it was.
-        yield part
-        # An empty folder may be there; it gives way.
-        if path.is_dir():
-            path.rmdir()
-        part.replace(path)
-    except OSError as error:
-        # The hidden folder means nothing to the user.
-        name = str(error.filename)
-        if not name.startswith(str(part)):
-            raise
-        raise OSError(
-            error.errno,
-            error.strerror,
-            str(path) + name.removeprefix(str(part)),
-        ) from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+    return pooled

@@ -8,8 +8,9 @@ tracks; their numbers differ by multiples of :data:`TRACK_STRIDE`.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Final, NoReturn, SupportsInt
+from typing import Final, SupportsInt
 
 import polars as pl
 
@@ -140,121 +141,66 @@ def validate(
             raise UserError(
                 f"{source}, column {name}: {frame[name].dtype} found, {kind} expected."
             ) from error
-    # From the plainest damage to units that are plausible alone only.
-    checked = _Checked(frame.select(SCHEMA.names()), source, first_line)
-    checked.check_rows()
-    checked.check_frame_rate()
-    checked.check_units()
-    return checked.frame
+    frame = frame.select(SCHEMA.names())
+    for row, what in _mistakes(frame):
+        line = f"row {row}" if first_line is None else f"line {row + first_line}"
+        raise UserError(f"{source}, {line}, {what}.")
+    return frame
 
 
-@dataclass(frozen=True)
-class _Checked:
-    """A frame with the schema's columns while it is checked; see :func:`validate`."""
+def _mistakes(frame: pl.DataFrame) -> Iterator[tuple[int, str]]:
+    """What is wrong with a frame of the schema's columns: the row, and a part of a sentence.
 
-    frame: pl.DataFrame
-    source: str
-    first_line: int | None
-
-    def refuse(
-        self,
-        row: int,
-        what: str,
-    ) -> NoReturn:
-        """Raise a UserError that names a row."""
-        line = f"row {row}" if self.first_line is None else f"line {row + self.first_line}"
-        raise UserError(f"{self.source}, {line}, {what}.")
-
-    def check_rows(self) -> None:
-        """What one row, or one row and its predecessor in the track, are enough to show."""
-        step = pl.col("frame").diff().over(TRACK)
-        # What is wrong, by column, in the order in which it is reported.
-        bad: list[tuple[str, str, pl.Expr]] = []
-        for name in ("x", "y", "speed"):
+    From the plainest damage to what single rows do not show. Later mistakes may come of earlier
+    ones, so only the first one counts.
+    """
+    step = pl.col("frame").diff().over(TRACK)
+    bad: list[tuple[str, str, pl.Expr]] = []
+    for name, kind in SCHEMA.items():
+        if kind == pl.Float64():
             is_number = pl.col(name).is_finite().fill_null(False)
             bad.append((name, "is not a finite number", ~is_number))
-        for name in ("scene", "vehicle", "frame", "lane"):
+        else:
             bad.append((name, "is missing", pl.col(name).is_null()))
-        for name in ("length", "width"):
-            bad.append(
-                (
-                    name,
-                    "is not above 0",
-                    ~(pl.col(name) > 0.0).fill_null(False),
-                )
-            )
-        bad.append(("frame", "comes twice in its track", step == 0))
-        bad.append(
-            (
-                "frame",
-                "is before its track's last frame; frames must grow",
-                step < 0,
-            )
+    bad += [(name, "is not above 0", pl.col(name) <= 0.0) for name in ("length", "width")]
+    bad.append(("frame", "comes twice in its track", step == 0))
+    bad.append(("frame", "is before its track's last frame; frames must grow", step < 0))
+    for column, what, is_bad in bad:
+        for row in frame.select(is_bad.arg_true()).to_series():
+            yield row, f"column {column}: {frame[column][row]} {what}"
+    # With most rows further apart than a frame, nothing could be measured between them.
+    rows = frame.select("scene", step=step).with_row_index("row")
+    far = rows.filter((pl.col("step").median().over("scene") > 1) & (pl.col("step") > 1))
+    for row, scene, frames in far.iter_rows():
+        yield (
+            row,
+            f"column frame: most rows of scene {scene} come {frames} frames after their track's "
+            f"last one; expected {1 / FRAME_S:.0f} frames a second, numbered one by one: resample "
+            "the recording",
         )
-        for column, what, is_bad in bad:
-            rows = self.frame.select(is_bad.arg_true()).to_series()
-            if len(rows):
-                field = self.frame[column][rows[0]]
-                self.refuse(
-                    rows[0],
-                    f"column {column}: {field} {what}",
-                )
-
-    def check_frame_rate(self) -> None:
-        """With most rows further apart than a frame, nothing could be measured between them."""
-        step = pl.col("frame").diff().over(TRACK)
-        rows = self.frame.select("scene", step=step).with_row_index("row")
-        far = rows.filter((pl.col("step").median().over("scene") > 1) & (pl.col("step") > 1))
-        for row, scene, frames in far.head(1).iter_rows():
-            self.refuse(
-                row,
-                f"column frame: most rows of scene {scene} come {frames} frames after their "
-                f"track's last one; expected {1 / FRAME_S:.0f} frames a second, numbered one by "
-                "one: resample the recording",
-            )
-
-    def check_units(self) -> None:
-        """Positions, speeds or sizes that cannot be in metres and seconds."""
-        # Distance per time, from one row to the next of a track.
-        moved, frames = (pl.col(name).diff().over(TRACK) for name in ("x", "frame"))
-        rates = moved / (frames * FRAME_S)
-        # Medians, which a few damaged rows do not move.
-        speed, length, rate = self.frame.select(
-            pl.col("speed", "length").median(),
-            rate=rates.median(),
-        ).row(0)
-        for column, median, bound, unit in (
-            (
-                "speed",
-                speed,
-                MAX_MEDIAN_SPEED_MPS,
-                "m/s; convert to m/s",
-            ),
-            (
-                "length",
-                length,
-                MAX_MEDIAN_LENGTH_M,
-                "m; convert feet to m",
-            ),
-        ):
-            if median > bound:
-                row = int((self.frame[column] > bound).arg_max() or 0)
-                self.refuse(
-                    row,
-                    f"column {column}: the median is {median:.1f}, which cannot be {unit}",
-                )
-        # Standing traffic shows no ratio.
-        if rate is None or max(abs(rate), abs(speed)) < 1.0:
-            return
-        # Not even rounded positions give another ratio than about 1.
-        if not speed / MAX_SPEED_RATIO < rate < speed * MAX_SPEED_RATIO:
-            low = pl.col("speed") / MAX_SPEED_RATIO
-            high = pl.col("speed") * MAX_SPEED_RATIO
-            differs = (~rates.is_between(low, high)).fill_null(False)
-            row = self.frame.select(differs.arg_true().first()).item()
-            self.refuse(
-                int(row or 0),
-                f"columns x and speed: x moves by {rate:.1f} m per second where speed says "
-                f"{speed:.1f} m/s; expected metres along the direction of travel, m/s and "
-                f"{1 / FRAME_S:.0f} frames a second",
-            )
+    # Distance per time, from one row to the next of a track.
+    rates = pl.col("x").diff().over(TRACK) / (step * FRAME_S)
+    # Medians, which a few damaged rows do not move.
+    speed, length, rate = frame.select(
+        pl.col("speed", "length").median(),
+        rate=rates.median(),
+    ).row(0)
+    for column, median, bound, unit in (
+        ("speed", speed, MAX_MEDIAN_SPEED_MPS, "m/s; convert to m/s"),
+        ("length", length, MAX_MEDIAN_LENGTH_M, "m; convert feet to m"),
+    ):
+        if median > bound:
+            row = frame.select((pl.col(column) > bound).arg_true().first()).item()
+            yield row, f"column {column}: the median is {median:.1f}, which cannot be {unit}"
+    # Standing traffic shows no ratio. Not even rounded positions give another one than about 1.
+    moves = rate is not None and max(abs(rate), abs(speed)) >= 1.0
+    if moves and not speed / MAX_SPEED_RATIO < rate < speed * MAX_SPEED_RATIO:
+        low = pl.col("speed") / MAX_SPEED_RATIO
+        high = pl.col("speed") * MAX_SPEED_RATIO
+        row = frame.select((~rates.is_between(low, high)).arg_true().first()).item()
+        yield (
+            row or 0,
+            f"columns x and speed: x moves by {rate:.1f} m per second where speed says "
+            f"{speed:.1f} m/s; expected metres along the direction of travel, m/s and "
+            f"{1 / FRAME_S:.0f} frames a second",
+        )

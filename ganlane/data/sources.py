@@ -79,6 +79,7 @@ def recordings_path(data: DataConfig) -> Path:
     Raises:
         UserError: there is no path and no default, or an error of :func:`download`.
     """
+    # Scenes have a default place; a raw recording is the user's own file.
     if data.format != "scenes" and data.path is None:
         raise UserError(f"data={data.format}: which file is missing; give data.path=FILE.")
     path = Path(data.path) if data.path else default_scenes()

@@ -5,28 +5,26 @@ Exposure, lane changes, speeds, accelerations, headways.
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, is_dataclass
-from typing import Any, Final, TypeVar, get_type_hints
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 import polars as pl
 from numpy.typing import ArrayLike
-from scipy.special import (
-    gammaincinv,
-)  # scipy.stats takes seconds to import
+from scipy.special import gammaincinv  # scipy.stats takes seconds to import
 
 from ganlane.data.lanes import (
+    Flags,
+    Floats,
     LaneChanges,
     find_lane_changes,
     tracks_of_frame,
 )
 from ganlane.data.schema import FRAME_S, TRACK, TRACK_STRIDE
 from ganlane.errors import UserError
+from ganlane.settings.record import Record, make, plain
 
-_Record = TypeVar("_Record")
 #: Levels of the stored quantiles: fine enough to sample from by linear interpolation.
 LEVELS: Final = (
     0.01,
@@ -41,16 +39,16 @@ _STANDSTILL_GAP_M = 2.0
 
 
 @dataclass(frozen=True)
-class Distribution:
+class Distribution(Record):
     """Number, mean, standard deviation and quantiles (at :data:`LEVELS`) of a sample.
 
     An empty sample has ``mean`` None and no quantiles; fewer than two samples have ``sd`` None.
     """
 
     count: int
-    mean: float | None
-    sd: float | None
-    quantiles: tuple[float, ...]
+    mean: float | None = None
+    sd: float | None = None
+    quantiles: tuple[float, ...] = ()
 
     def quantile(self, level: float) -> float:
         """Value at ``level``, linear between :data:`LEVELS` and constant beyond them."""
@@ -61,24 +59,15 @@ def describe(values: ArrayLike) -> Distribution:
     """Summarise a sample without NaN."""
     sample = np.asarray(values, dtype=np.float64)
     if not len(sample):
-        return Distribution(
-            0,
-            None,
-            None,
-            (),
-        )
+        return Distribution(0)
     # One sample has no spread.
     sd = float(sample.std(ddof=1)) if len(sample) > 1 else None
-    return Distribution(
-        len(sample),
-        float(sample.mean()),
-        sd,
-        tuple(float(q) for q in np.quantile(sample, LEVELS)),
-    )
+    quantiles = tuple(np.quantile(sample, LEVELS).tolist())
+    return Distribution(len(sample), float(sample.mean()), sd, quantiles)
 
 
 @dataclass(frozen=True)
-class Durations:
+class Durations(Record):
     """Durations of which some are censored, s.
 
     Attributes:
@@ -96,29 +85,23 @@ class Durations:
     survival_median_s: float | None
 
 
-def describe_durations(duration_s: ArrayLike, complete: ArrayLike) -> Durations:
+def describe_durations(duration_s: Floats, complete: Flags) -> Durations:
     """Summarise durations [C], of which those not ``complete`` [C] are lower bounds."""
-    times = np.asarray(duration_s, dtype=np.float64)
-    is_complete = np.asarray(complete, bool)
     mean = median = None
     # Without a complete duration the curve stays at 1.
-    if is_complete.any():
-        ends, survival = survival_curve(times, is_complete)
+    if complete.any():
+        ends, survival = survival_curve(duration_s, complete)
         # The area under a step curve, up to the longest duration.
-        edges = np.concatenate(([0.0], ends, [times.max()]))
+        edges = np.concatenate(([0.0], ends, [duration_s.max()]))
         mean = float(np.sum(np.diff(edges) * np.concatenate(([1.0], survival))))
         # The first time at which half of them have ended.
         halved = np.flatnonzero(survival <= 0.5)
         median = float(ends[halved[0]]) if len(halved) else None
-    return Durations(
-        describe(times[is_complete]),
-        int(np.count_nonzero(~is_complete)),
-        mean,
-        median,
-    )
+    censored = int(np.count_nonzero(~complete))
+    return Durations(describe(duration_s[complete]), censored, mean, median)
 
 
-def survival_curve(duration_s: ArrayLike, complete: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def survival_curve(duration_s: Floats, complete: Flags) -> tuple[np.ndarray, np.ndarray]:
     """Kaplan and Meier's (1958) survival curve of durations [C].
 
     Those not ``complete`` are lower bounds.
@@ -126,11 +109,9 @@ def survival_curve(duration_s: ArrayLike, complete: ArrayLike) -> tuple[np.ndarr
     Returns [E] the distinct complete durations, growing, and [E] the shares of longer durations,
     falling.
     """
-    times = np.asarray(duration_s, dtype=np.float64)
-    is_complete = np.asarray(complete, bool)
-    ends, ending = np.unique(times[is_complete], return_counts=True)
+    ends, ending = np.unique(duration_s[complete], return_counts=True)
     # Those that last at least as long.
-    at_risk = len(times) - np.searchsorted(np.sort(times), ends)
+    at_risk = len(duration_s) - np.searchsorted(np.sort(duration_s), ends)
     return ends, np.cumprod(1.0 - ending / at_risk)
 
 
@@ -148,84 +129,11 @@ class Bins:
     @property
     def edges(self) -> np.ndarray:
         """The bins' limits [number + 1]."""
-        return np.linspace(
-            self.low,
-            self.high,
-            self.number + 1,
-        )
-
-
-class Histogram:
-    """Counts per bin of samples that are added part by part, and their exact mean and spread."""
-
-    def __init__(self, bins: Bins) -> None:
-        self.bins = bins
-        self.counts = np.zeros(
-            bins.number,
-            dtype=np.int64,
-        )
-        self._sum = 0.0
-        self._squares = 0.0
-
-    @property
-    def total(self) -> int:
-        """Number of samples."""
-        return int(self.counts.sum())
-
-    def add(self, values: ArrayLike) -> None:
-        """Count more samples, without NaN."""
-        sample = np.asarray(values, dtype=np.float64)
-        low = self.bins.low
-        high = self.bins.high
-        # numpy drops values beyond the bins; these are to count in the outermost ones.
-        inside = sample.clip(low, high)
-        self.counts += np.histogram(inside, self.bins.number, (low, high))[0]
-        self._sum += float(sample.sum())
-        self._squares += float(np.square(sample).sum())
-
-    def describe(self) -> Distribution:
-        """As :func:`describe` of all samples."""
-        n = self.total
-        if not n:
-            return Distribution(
-                0,
-                None,
-                None,
-                (),
-            )
-        # Sums are exact where bins are not; rounding may make the variance negative.
-        mean = self._sum / n
-        spread = math.sqrt(max(self._squares - n * mean * mean, 0.0) / (n - 1)) if n > 1 else None
-        return Distribution(
-            n,
-            mean,
-            spread,
-            tuple(self.quantile(level) for level in LEVELS),
-        )
-
-    def quantile(self, level: float) -> float:
-        """Value at ``level``, linear within its bin, so accurate to a bin's width."""
-        # Samples are taken as evenly spread within their bin.
-        place = level * self.total
-        below = np.concatenate(([0], np.cumsum(self.counts)))
-        occupied = np.flatnonzero(self.counts)
-        index = np.searchsorted(below[occupied + 1], place).clip(max=len(occupied) - 1)
-        k = occupied[index]
-        share = ((place - below[k]) / self.counts[k]).clip(
-            0.0,
-            1.0,
-        )
-        edges = self.bins.edges
-        return float(edges[k] + share * (edges[k + 1] - edges[k]))
-
-    def density(self) -> np.ndarray:
-        """[number] probability density per unit of the quantity."""
-        width = (self.bins.high - self.bins.low) / self.bins.number
-        return self.counts / max(self.total, 1) / width
+        return np.linspace(self.low, self.high, self.number + 1)
 
 
 @dataclass(frozen=True)
-class Exposure:
+class Exposure(Record):
     """Amount of driving.
 
     ``cars`` are counted once per scene, ``road_m`` is the road's mean length over the cars.
@@ -253,12 +161,7 @@ def measure_exposure(frame: pl.DataFrame) -> Exposure:
         tracks=frame.select(TRACK).n_unique(),
         cars=int(roads["cars"].sum()),
         samples=frame.height,
-        road_m=float(
-            np.average(
-                roads["road"].to_numpy(),
-                weights=roads["cars"].to_numpy(),
-            )
-        ),
+        road_m=float(np.average(roads["road"].to_numpy(), weights=roads["cars"].to_numpy())),
         vehicle_km=float(frame.select(pl.sum_horizontal(*driven).sqrt().sum()).item()) / 1000.0,
     )
 
@@ -276,18 +179,11 @@ def leader_gaps(frame: pl.DataFrame) -> pl.DataFrame:
     }
     # Positions are those of the bodies' centres, so half of both lengths lies between.
     gap = ahead["x"] - pl.col("x") - 0.5 * (ahead["length"] + pl.col("length"))
-    ordered = frame.sort(
-        "scene",
-        "frame",
-        "lane",
-        "x",
-    )
+    ordered = frame.sort("scene", "frame", "lane", "x")
     return ordered.with_columns(gap=gap, leader_speed=ahead["speed"]).drop_nulls("gap")
 
 
-def quantities(
-    frame: pl.DataFrame,
-) -> dict[str, np.ndarray]:
+def quantities(frame: pl.DataFrame) -> dict[str, np.ndarray]:
     """Samples of every quantity of a frame in the schema, sorted: ``speed`` and those below.
 
     ``acceleration_raw``: differences of the recorded speed between frames, m/s2; mostly noise in
@@ -315,15 +211,7 @@ def quantities(
         / (lag * FRAME_S) ** 2,
     )
     # Sorting needs most memory: only once, and with no more columns than needed.
-    columns = frame.select(
-        "scene",
-        "vehicle",
-        "frame",
-        "x",
-        "speed",
-        "lane",
-        "length",
-    )
+    columns = frame.select(*TRACK, "frame", "x", "speed", "lane", "length")
     with_leader = leader_gaps(columns).select(*TRACK, "speed", "gap")
     # Further away a leader has no influence.
     close = pl.col("gap").is_between(0.0, _FOLLOWING_GAP_M)
@@ -350,7 +238,7 @@ def poisson_interval(count: int) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class LaneChangeStatistics:
+class LaneChangeStatistics(Record):
     """Rates, durations and lateral speeds of lane changes (equations 9, 10 and 11).
 
     Attributes:
@@ -407,7 +295,7 @@ def lane_change_statistics(
 
 
 @dataclass(frozen=True)
-class DrivingStatistics:
+class DrivingStatistics(Record):
     """Statistics of a recording in SI units.
 
     :meth:`to_dict` and :meth:`from_dict` are exact inverses.
@@ -428,34 +316,21 @@ class DrivingStatistics:
 
     def to_dict(self) -> dict[str, Any]:
         """Nested dictionaries of numbers, None and lists, as in JSON."""
-        # Through JSON, so that tuples become the lists that a file gives back.
-        return json.loads(json.dumps(asdict(self)))
+        return plain(self)
 
     @classmethod
     def from_dict(cls, numbers: Mapping[str, Any]) -> DrivingStatistics:
         """The statistics that :meth:`to_dict` wrote.
 
         Raises:
-            UserError: a name is missing or unknown.
+            UserError: a name is missing or unknown, or a value of another type.
         """
         try:
-            return _record(cls, numbers)
-        except (KeyError, TypeError) as error:
+            return make(cls, numbers)
+        except (UserError, TypeError) as error:
             raise UserError(
                 f"not the statistics of a recording ({error}); measure them again."
             ) from error
-
-
-def _record(kind: type[_Record], numbers: Mapping[str, Any]) -> _Record:
-    """A dataclass from nested dictionaries of its fields; lists become tuples."""
-    # Unknown names reach the constructor, which refuses them.
-    values: dict[str, Any] = {**numbers}
-    for name, hint in get_type_hints(kind).items():
-        if isinstance(hint, type) and is_dataclass(hint):
-            values[name] = _record(hint, values[name])
-        elif isinstance(values.get(name), list):
-            values[name] = tuple(values[name])
-    return kind(**values)
 
 
 def driving_statistics(
@@ -469,19 +344,11 @@ def driving_statistics(
     exposure = measure_exposure(frame)
     samples = quantities(frame)
     changes = find_lane_changes(tracks_of_frame(frame, lane_widths))
-    described = (
-        "speed",
-        "acceleration_raw",
-        "acceleration_smoothed",
-        "headway",
-    )
+    speed = float(samples["speed"].mean())
+    described = ("speed", "acceleration_raw", "acceleration_smoothed", "headway")
     return DrivingStatistics(
         exposure=exposure,
-        lane_changes=lane_change_statistics(
-            changes,
-            exposure,
-            float(samples["speed"].mean()),
-        ),
+        lane_changes=lane_change_statistics(changes, exposure, speed),
         speed_sd_in_frame=_mean_spread(frame, ["scene", "frame"]),
         speed_sd_in_lane=_mean_spread(frame, ["scene", "frame", "lane"]),
         **{name: describe(samples[name]) for name in described},
@@ -490,7 +357,6 @@ def driving_statistics(
 
 def _mean_spread(frame: pl.DataFrame, groups: list[str]) -> float | None:
     # In the order of the rows, so that the mean is the same to the last bit in every run.
-    spread = (
-        frame.group_by(groups, maintain_order=True).agg(sd=pl.col("speed").std())["sd"].drop_nulls()
-    )
-    return float(spread.mean()) if len(spread) else None  # type: ignore[arg-type]
+    spreads = frame.group_by(groups, maintain_order=True).agg(pl.col("speed").std())
+    # One vehicle has no deviation; the mean of nothing is None.
+    return spreads["speed"].drop_nulls().mean()  # type: ignore[return-value]

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from ganlane.data.schema import FRAME_S, SCHEMA, sort
+from ganlane.data.dense import track_table
+from ganlane.data.schema import FRAME_S, sort
 
 
 @dataclass(frozen=True)
@@ -73,20 +74,18 @@ def _scene(
         random,
     )
     # The nearest lane, as recordings have it.
-    lane = np.rint(y / traffic.lane_width_m).clip(0, traffic.lanes - 1).astype(np.int64)
-    # Rows vehicle by vehicle, each from its first frame to its last.
-    columns = {
-        "scene": np.full(n * frames, f"synthetic-{number}"),
-        "vehicle": np.repeat(np.arange(1, n + 1), frames),
-        "frame": np.tile(np.arange(frames), n),
-        "x": x.ravel(),
-        "y": y.ravel(),
-        "speed": speed.ravel(),
-        "lane": lane.ravel(),
-        "length": np.repeat(random.uniform(4.0, 5.5, n).round(2), frames),
-        "width": np.repeat(random.uniform(1.7, 2.2, n).round(2), frames),
-    }
-    return pl.DataFrame(columns, schema=SCHEMA)
+    lane = np.rint(y / traffic.lane_width_m).clip(0, traffic.lanes - 1)
+    return track_table(
+        f"synthetic-{number}",
+        np.ones((frames, n), bool),
+        vehicle=np.arange(1, n + 1),
+        x=x.T,
+        y=y.T,
+        speed=speed.T,
+        lane=lane.T,
+        length=random.uniform(4.0, 5.5, n).round(2),
+        width=random.uniform(1.7, 2.2, n).round(2),
+    )
 
 
 def _across(

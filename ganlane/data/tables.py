@@ -50,18 +50,8 @@ def read_table(path: str | Path, columns: Mapping[str, Kind]) -> pl.DataFrame:
             message names file, line and column.
     """
     path = Path(path)
-    blocks = []
-    for text in read_blocks(csv_table(path, columns), list(columns)):
-        converted = [
-            convert(
-                text,
-                name,
-                kind,
-                path,
-            )
-            for name, kind in columns.items()
-        ]
-        blocks.append(pl.DataFrame([*converted, text[LINE]]))
+    texts = read_blocks(csv_table(path, columns), list(columns))
+    blocks = [converted(text, columns, path) for text in texts]
     if not blocks:
         raise UserError(f"{path}: a header but no rows; give a file with at least one row of data.")
     return pl.concat(blocks)
@@ -102,6 +92,12 @@ def first_line(path: Path) -> str:
 def reason(error: Exception) -> str:
     """The first line of a library's error message, to be quoted inside one of ours."""
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(". ")
+
+
+def converted(text: pl.DataFrame, columns: Mapping[str, Kind], path: Path) -> pl.DataFrame:
+    """The ``columns`` of a block of text in their types, and ``line``; see :func:`convert`."""
+    series = [convert(text, name, kind, path) for name, kind in columns.items()]
+    return pl.DataFrame([*series, text[LINE]])
 
 
 def convert(
@@ -171,6 +167,12 @@ def raise_where(
         )
 
 
+def raise_unless_positive(rows: pl.DataFrame, columns: Sequence[str], path: Path) -> None:
+    """Raise a UserError that names the first of the ``rows`` with 0 or less in a column."""
+    for column in columns:
+        raise_where(rows[column] <= 0.0, rows, column, path, "is not above 0")
+
+
 def read_blocks(
     table: TextTable,
     wanted: Sequence[str],
@@ -186,17 +188,12 @@ def read_blocks(
     number = 1 if table.blanks else FIRST_LINE
     done = 0
     total = table.path.stat().st_size
-    for block, has_no_end in _whole_lines(table, block_bytes):
+    for block in _whole_lines(table, block_bytes):
         # A last line without a line break is a row only if it has all its fields.
-        if has_no_end:
-            _check_lines(
-                table,
-                block,
-                number,
-                cut_off=True,
-            )
-        # A last line without a line break counts.
-        rows = block.count(b"\n") + (not block.endswith(b"\n"))
+        cut_off = not block.endswith(b"\n")
+        if cut_off:
+            _check_lines(table, block, number, cut_off)
+        rows = block.count(b"\n") + cut_off
         lines = pl.int_range(number, number + rows, dtype=pl.Int64).alias(LINE)
         yield _parse(
             table,
@@ -211,8 +208,8 @@ def read_blocks(
             on_progress(done, total)
 
 
-def _whole_lines(table: TextTable, block_bytes: int) -> Iterator[tuple[bytes, bool]]:
-    """Blocks of whole lines; true for a last line without a line break.
+def _whole_lines(table: TextTable, block_bytes: int) -> Iterator[bytes]:
+    """Blocks of whole lines; the last line may have no line break.
 
     Empty lines at the end are left out.
     """
@@ -226,10 +223,10 @@ def _whole_lines(table: TextTable, block_bytes: int) -> Iterator[tuple[bytes, bo
             # The last non-empty line is held back: it may be the file's last.
             cut = together.rstrip().rfind(b"\n") + 1
             if cut:
-                yield together[:cut], False
+                yield together[:cut]
             rest = together[cut:]
         if rest.strip():
-            yield rest.rstrip(), not rest.endswith(b"\n")
+            yield rest.rstrip() + (b"\n" if rest.endswith(b"\n") else b"")
 
 
 def _fields(

@@ -80,22 +80,10 @@ def cells_of(config: ReproduceConfig, traffics: dict[str, TrafficConfig]) -> lis
         # A changed setting gives another file name, so that old episodes are never taken for new
         # ones.
         for driver in drivers:
-            settings = _settings(
-                driver,
-                option,
-                config,
-                config.episodes_on(traffic),
-            )
+            settings = _settings(driver, option, config, config.episodes_on(traffic))
             digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
             path = Path(config.cells) / f"{digest[:32]}.parquet"
-            cells.append(
-                Cell(
-                    driver.name,
-                    traffic,
-                    settings,
-                    path,
-                )
-            )
+            cells.append(Cell(driver.name, traffic, settings, path))
     return cells
 
 
@@ -139,17 +127,11 @@ def drive(cells: Sequence[Cell], config: ReproduceConfig) -> None:
     # What an earlier command drove is taken as it is.
     missing = [cell for cell in cells if not cell.path.is_file()]
     no_terminal = not sys.stderr.isatty()
-    with tqdm(
-        total=len(missing),
-        unit="cell",
-        file=sys.stderr,
-        disable=no_terminal,
-    ) as bar:
-        for cell in _driven(missing, config):
-            bar.update()
-            if no_terminal:
-                episodes = cell.settings["episodes"]
-                print(f"{cell.driver} on {cell.traffic}: {episodes} episodes", file=sys.stderr)
+    driven = _driven(missing, config)
+    for cell in tqdm(driven, total=len(missing), unit="cell", disable=no_terminal):
+        if no_terminal:
+            episodes = cell.settings["episodes"]
+            print(f"{cell.driver} on {cell.traffic}: {episodes} episodes", file=sys.stderr)
 
 
 def _driven(cells: Sequence[Cell], config: ReproduceConfig) -> Iterator[Cell]:
@@ -161,11 +143,9 @@ def _driven(cells: Sequence[Cell], config: ReproduceConfig) -> Iterator[Cell]:
         return
     # Fresh processes: torch does not survive a fork once it has computed something.
     # Ctrl-C reaches them too: they finish their cell.
-    quiet: Any = {
-        "initializer": signal.signal,
-        "initargs": (signal.SIGINT, signal.SIG_IGN),
-    }
-    with ProcessPoolExecutor(config.workers, multiprocessing.get_context("spawn"), **quiet) as pool:
+    quiet = (signal.SIGINT, signal.SIG_IGN)
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(config.workers, context, signal.signal, quiet) as pool:
         # Traffic by traffic, as in the list; slow ones may end later.
         jobs = {pool.submit(drive_cell, cell, config): cell for cell in cells}
         try:
@@ -184,16 +164,8 @@ def drive_cell(cell: Cell, config: ReproduceConfig) -> None:
     begun = time.monotonic()
     # The same call as in ganlane evaluate, with one driver on one traffic.
     traffics = {cell.traffic: config.traffics[cell.traffic]}
-    alone = replace(
-        config,
-        traffics=traffics,
-        episodes=cell.settings["episodes"],
-    )
-    driver = make_driver(
-        cell.driver,
-        config.env,
-        device=config.device,
-    )
+    alone = replace(config, traffics=traffics, episodes=cell.settings["episodes"])
+    driver = make_driver(cell.driver, config.env, device=config.device)
     table = compare([driver], alone, quiet=True)
     # The file tells what it holds, whoever finds it.
     origin = {
@@ -202,10 +174,7 @@ def drive_cell(cell: Cell, config: ReproduceConfig) -> None:
         "seconds": round(time.monotonic() - begun, 3),
     }
     with atomic_path(cell.path) as part:
-        table.write_parquet(
-            part,
-            metadata={_ORIGIN: json.dumps(origin)},
-        )
+        table.write_parquet(part, metadata={_ORIGIN: json.dumps(origin)})
 
 
 def read_cells(cells: Sequence[Cell]) -> tuple[pl.DataFrame, list[str], dict[str, float]]:
@@ -216,10 +185,7 @@ def read_cells(cells: Sequence[Cell]) -> tuple[pl.DataFrame, list[str], dict[str
     """
     tables = []
     revisions = set()
-    seconds = dict.fromkeys(
-        (cell.traffic for cell in cells),
-        0.0,
-    )
+    seconds = dict.fromkeys((cell.traffic for cell in cells), 0.0)
     for cell in cells:
         try:
             origin = json.loads(pl.read_parquet_metadata(cell.path)[_ORIGIN])

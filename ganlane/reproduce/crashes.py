@@ -92,21 +92,10 @@ class CrashList(Record):
     ) -> EnvBase:
         """The environment that repeats this list's episodes on a traffic."""
         # The tensor code, so that a list plays the same with and without the native kernel.
-        env = replace(
-            self.env,
-            kernel="torch",
-            compile=False,
-        )
+        env = replace(self.env, kernel="torch", compile=False)
         # The same stream of randomness, so that others start and act as they did.
         model = make_traffic(self.traffics[traffic], env, Stream.named(self.stream))
-        return make_env(
-            model,
-            env,
-            observation,
-            reward,
-            ROWS,
-            mask=mask,
-        )
+        return make_env(model, env, observation, reward, ROWS, mask=mask)
 
     def drive_again(self) -> list[str]:
         """Drive every crash with its actions; how each ends, in the order of the list."""
@@ -116,14 +105,8 @@ class CrashList(Record):
         ):
             # One script for all episodes of a driver on a traffic: they are driven side by side.
             actions = {crash.episode: crash.actions for crash in group}
-            # Nobody decides: the actions of the list are taken as they are.
-            policy = ScriptedPolicy(actions)
-            table = run_episodes(
-                self.make_env(traffic),
-                policy,
-                list(actions),
-                seed,
-            )
+            env = self.make_env(traffic)
+            table = run_episodes(env, ScriptedPolicy(actions), list(actions), seed)
             ends += table["reason"].to_list()
         return ends
 
@@ -149,12 +132,7 @@ def find_crashes(
         if name in _LISTED and name == traffic.label()
     }
     # A list without crashes makes the environment in which they are looked for.
-    listed = CrashList(
-        config.env,
-        traffics,
-        config.stream,
-        [],
-    )
+    listed = CrashList(config.env, traffics, config.stream, [])
     pair = ["traffic", "agent"]
     # The shortest of each pair: they show soonest what went wrong, and drive again fastest.
     failed = (
@@ -170,19 +148,8 @@ def find_crashes(
         driver = make_driver(str(name), config.env)
         mask, policy = driver.behind(config.mask)
         observation = config.observation.read_by(driver.observation)
-        env = listed.make_env(
-            str(traffic),
-            observation,
-            config.reward,
-            mask,
-        )
-        again = run_episodes(
-            env,
-            policy,
-            frame["episode"].to_list(),
-            config.seed,
-            actions=True,
-        )
+        env = listed.make_env(str(traffic), observation, config.reward, mask)
+        again = run_episodes(env, policy, frame["episode"].to_list(), config.seed, actions=True)
         # Both tables have the same episodes in the same order.
         same = again.filter(again["reason"] == frame["reason"])
         crashes += [
@@ -225,8 +192,7 @@ def read_crashes(path: str | Path) -> CrashList:
         UserError: no such file, or not a list of crashes.
     """
     try:
-        content = json.loads(read_whole(Path(path)))
-        return _checked(content)
+        return _checked(json.loads(read_whole(Path(path))))
     except OSError as error:
         raise UserError(
             f"{path}: cannot be read; give the crashes.json of ganlane reproduce."
@@ -252,9 +218,5 @@ def _checked(content: Any) -> CrashList:
         if name not in _LISTED or {"_target_", "name"} & set(options):
             raise ValueError(f"traffic {name!r:.80} is none of this package's")
         traffics[name] = make(TrafficConfig, {"name": name, **options}, "traffics")
-    listed = {
-        "stream": content["stream"],
-        "env": content["env"],
-        "crashes": crashes,
-    }
+    listed = {name: content[name] for name in ("stream", "env", "crashes")}
     return make(CrashList, {**listed, "traffics": traffics})

@@ -18,7 +18,6 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, NullLocator
 
 from ganlane.agents.checkpoint import with_seeds
-from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.data import FRAME_S, default_scenes, read_scenes
 from ganlane.errors import UserError
 from ganlane.generator import load_generator, shipped_generator
@@ -31,13 +30,14 @@ from ganlane.generator.windows import (
     group_windows,
     scene_tracks,
 )
+from ganlane.reproduce.episodes import drive_episode
 from ganlane.reproduce.report import Row, rows_of
 from ganlane.settings.commands import ReproduceConfig
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.sim.random import Stream
-from ganlane.view.curves import read_metrics
-from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, panel_grid
-from ganlane.view.record import EpisodeLabel, Trajectory, record_episode
+from ganlane.view.curves import plot_middle, read_metrics
+from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, FloatArray, add_legend, panel_grid
+from ganlane.view.record import EpisodeLabel, Trajectory
 
 #: Panels of Figure 2 by what the vehicle does, and samples drawn in each.
 PANELS = {
@@ -117,17 +117,8 @@ def forecasts_to_draw() -> pl.DataFrame:
     # Paths after the present, each [W, frames, 2]. The mean is the same for every seed.
     later = {"recorded": windows.future}
     for seed in range(SAMPLES):
-        drawn = paper_forecasts(
-            generator,
-            windows,
-            groups,
-            seed,
-            samples=1,
-        )
-        later |= {
-            "mean": drawn["mean"],
-            f"sample {seed + 1}": drawn["single"],
-        }
+        drawn = paper_forecasts(generator, windows, groups, seed, samples=1)
+        later |= {"mean": drawn["mean"], f"sample {seed + 1}": drawn["single"]}
     now = np.zeros((1, 2))
     parts = []
     for panel, (kind, row) in enumerate(interesting(windows)):
@@ -138,14 +129,14 @@ def forecasts_to_draw() -> pl.DataFrame:
             present = PRESENT if name == "observed" else 0
             # Time 0 is the present, in both directions.
             columns = {
+                "panel": panel,
+                "kind": kind,
+                "path": name,
                 "time_s": (np.arange(len(path)) - present) * FRAME_S,
                 "ahead_m": path[:, 0],
                 "left_m": path[:, 1],
             }
-            labels = [pl.lit(panel).alias("panel"), pl.lit(kind).alias("kind")]
-            parts.append(
-                pl.DataFrame(columns).select(*labels, pl.lit(name).alias("path"), pl.all())
-            )
+            parts.append(pl.DataFrame(columns))
     return pl.concat(parts)
 
 
@@ -164,20 +155,10 @@ def draw_forecasts(paths: pl.DataFrame) -> Figure:
     # What is drawn last lies above.
     styles: dict[str, dict[str, Any]] = {}
     for number in range(SAMPLES):
-        styles[f"sample {number + 1}"] = {
-            "color": colours["predicted"],
-            "lw": 0.8,
-        }
-    styles["mean"] = {
-        "color": colours["predicted, z = 0"],
-        "lw": 1.6,
-    }
+        styles[f"sample {number + 1}"] = {"color": colours["predicted"], "lw": 0.8}
+    styles["mean"] = {"color": colours["predicted, z = 0"], "lw": 1.6}
     for name in ("observed", "recorded"):
-        styles[name] = {
-            "color": colours[name],
-            "marker": ".",
-            "ms": 3,
-        }
+        styles[name] = {"color": colours[name], "marker": ".", "ms": 3}
     panels = paths.partition_by("panel", maintain_order=True)
     figure, grid = panel_grid(len(panels), 2.5, 1.7)
     for axes, panel in zip(grid, panels):
@@ -213,32 +194,8 @@ def drive_beginning(config: ReproduceConfig, traffic: TrafficConfig) -> Trajecto
     # The figure shows what generated traffic teaches.
     learnt = [name for name in config.agents if "agent_gan" in name]
     name = with_seeds([*learnt, config.agents[-1]][0])[0]
-    driver = make_driver(name, config.env, device=config.device)
-    observation = config.observation.read_by(driver.observation)
-    # A trained agent brings the mask and the observation that it was trained with.
-    mask, policy = driver.behind(config.mask)
-    module = make_traffic(
-        traffic,
-        config.env,
-        Stream.named(config.stream),
-    )
-    env = make_env(
-        module,
-        config.env,
-        observation,
-        config.reward,
-        device=config.device,
-        mask=mask,
-    )
-    return record_episode(
-        env,
-        policy,
-        config.seed,
-        0,
-        driver.name,
-        traffic.label(),
-        LONGEST_S,
-    )
+    stream = Stream.named(config.stream)
+    return drive_episode(name, traffic, config, 0, stream, LONGEST_S)
 
 
 def busiest(episode: Trajectory) -> pl.DataFrame:
@@ -249,10 +206,7 @@ def busiest(episode: Trajectory) -> pl.DataFrame:
         ``y_m``, ``heading_rad``, ``length_m`` and ``width_m``; a vehicle that is placed elsewhere
         meanwhile is left out.
     """
-    shown = min(
-        round(SHOWN_S / episode.frame_s),
-        len(episode) - 1,
-    )
+    shown = min(round(SHOWN_S / FRAME_S), len(episode) - 1)
     ahead = episode.x - episode.x[:, :1]
     # Vehicles in view, the ego left out.
     near = episode.valid & (ahead > AROUND_M[0]) & (ahead < AROUND_M[1] / 2.0)
@@ -264,20 +218,23 @@ def busiest(episode: Trajectory) -> pl.DataFrame:
     part = slice(first, first + shown + 1)
     # A vehicle that is recycled would draw a line across the picture.
     jumps = episode.jumped()[first + 1 : first + shown + 1].any(axis=0)
-    frames = []
-    for vehicle in np.flatnonzero(episode.valid[part].all(axis=0) & ~jumps).tolist():
-        at = part, vehicle
-        columns = {
-            "time_s": episode.time_s[part],
-            "vehicle": np.full(shown + 1, vehicle),
-            "x_m": episode.x[at] - episode.x[first, 0],
-            "y_m": episode.y[at],
-            "heading_rad": episode.heading[at],
-            "length_m": episode.length[at],
-            "width_m": episode.width[at],
+    chosen = np.flatnonzero(episode.valid[part].all(axis=0) & ~jumps)
+
+    def of_chosen(name: str) -> FloatArray:
+        """A field of the chosen vehicles, vehicle by vehicle."""
+        return getattr(episode, name)[part][:, chosen].T.ravel()
+
+    return pl.DataFrame(
+        {
+            "time_s": np.tile(episode.time_s[part], len(chosen)),
+            "vehicle": np.repeat(chosen, shown + 1),
+            "x_m": of_chosen("x") - episode.x[first, 0],
+            "y_m": of_chosen("y"),
+            "heading_rad": of_chosen("heading"),
+            "length_m": of_chosen("length"),
+            "width_m": of_chosen("width"),
         }
-        frames.append(pl.DataFrame(columns))
-    return pl.concat(frames)
+    )
 
 
 @rc_context(STYLE)
@@ -391,32 +348,11 @@ def draw_transfer(curves: pl.DataFrame, rows: Sequence[Row]) -> Figure:
     axes.xaxis.set_major_formatter(EngFormatter())
     for (_, phase), colour in zip(curves.group_by("phase", maintain_order=True), COLOURS):
         runs = phase.partition_by("run", maintain_order=True)
-        points = [run.select("decisions", "mean_reward").to_numpy().T for run in runs]
-        # All runs at the decisions of the first one.
-        x = points[0][0]
-        # Runs are evaluated at slightly different decisions, so they are interpolated.
-        y = np.stack([np.interp(x, *run) for run in points])
-        axes.fill_between(
-            x,
-            y.min(axis=0),
-            y.max(axis=0),
-            color=colour,
-            alpha=0.2,
-            lw=0,
-        )
-        axes.plot(
-            x,
-            np.median(y, axis=0),
-            color=colour,
-        )
+        points = [(run["decisions"].to_numpy(), run["mean_reward"].to_numpy()) for run in runs]
+        plot_middle(axes, points, with_range=True, middle=np.median, color=colour)
         if len(points) > 1:
             for run in points:
-                axes.plot(
-                    *run,
-                    color=colour,
-                    lw=0.5,
-                    alpha=0.6,
-                )
+                axes.plot(*run, color=colour, lw=0.5, alpha=0.6)
     # Where the second phase begins.
     switch = curves.filter(pl.col("phase") == "first")["decisions"].to_numpy().max()
     axes.axvline(
@@ -451,20 +387,12 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
     drivers = list(dict.fromkeys(row["driver"] for row in shown))
     traffics = list(dict.fromkeys(row["traffic"] for row in shown))
     # All panels have one scale, so that traffics can be compared.
-    bounds = [bound for row in shown for bound in _interval(row)]
+    bounds = [bound for row in shown for bound in row["minus_mobil_ci"]]
     lowest = min(-20.0, *bounds)
     highest = max(20.0, *bounds)
-    figure, grid = panel_grid(
-        len(traffics),
-        3.4,
-        1.3 + 0.19 * len(drivers),
-    )
+    figure, grid = panel_grid(len(traffics), 3.4, 1.3 + 0.19 * len(drivers))
     for place, (axes, traffic) in enumerate(zip(grid, traffics)):
-        axes.axvline(
-            0.0,
-            color=FAINT,
-            lw=0.9,
-        )
+        axes.axvline(0.0, color=FAINT, lw=0.9)
         axes.set(
             title=traffic,
             xlabel="mean reward minus MOBIL's",
@@ -472,14 +400,8 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
         )
         # Most leads lie within 20, those of random driving far below.
         axes.set_xscale("symlog", linthresh=20.0)
-        axes.set_yticks(
-            range(len(drivers)),
-            drivers if place % 3 == 0 else [],
-        )
-        axes.set_xticks(
-            [x for x in _LEADS if lowest <= x <= highest],
-            minor=False,
-        )
+        axes.set_yticks(range(len(drivers)), drivers if place % 3 == 0 else [])
+        axes.set_xticks([x for x in _LEADS if lowest <= x <= highest])
         axes.set_xlim(1.15 * lowest, 1.15 * highest)
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_locator(NullLocator())
@@ -490,43 +412,13 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
             trained = len(row["each"]) > 1
             colour = COLOURS[0] if trained else INK
             axes.plot(
-                _interval(row),
-                [line] * 2,
-                color=colour,
-                lw=2.2,
-                solid_capstyle="butt",
+                row["minus_mobil_ci"], [line] * 2, color=colour, lw=2.2, solid_capstyle="butt"
             )
-            axes.plot(
-                row["minus_mobil"],
-                line,
-                "o",
-                color=colour,
-            )
+            axes.plot(row["minus_mobil"], line, "o", color=colour)
             if trained:
                 leads = [training["mean_reward"] - mobil[traffic] for training in row["each"]]
-                axes.plot(
-                    leads,
-                    [line] * len(leads),
-                    "|",
-                    color=COLOURS[1],
-                    ms=6,
-                    mew=1,
-                )
-    one = Line2D(
-        [],
-        [],
-        color=COLOURS[1],
-        marker="|",
-        ls="",
-        ms=6,
-        label="one training",
-    )
+                axes.plot(leads, [line] * len(leads), "|", color=COLOURS[1], ms=6, mew=1)
+    one = Line2D([], [], color=COLOURS[1], marker="|", ls="", ms=6, label="one training")
     names = {"a recipe: mean, 95 % over trainings and episodes": COLOURS[0], "a single driver": INK}
     add_legend(figure, names, [one])
     return figure
-
-
-def _interval(row: Row) -> tuple[float, float]:
-    """That of the lead over MOBIL; the lead itself where there is none."""
-    low, high = row["minus_mobil_ci"] or (row["minus_mobil"],) * 2
-    return low, high

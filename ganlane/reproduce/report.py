@@ -82,10 +82,7 @@ def by_recipe(episodes: pl.DataFrame) -> dict[tuple[str, str], dict[str, pl.Data
     cells: dict[tuple[str, str], dict[str, pl.DataFrame]] = {}
     for (driver, traffic), frame in episodes.group_by("agent", "traffic", maintain_order=True):
         recipe = recipe_of(str(driver))
-        trainings = cells.setdefault(
-            (recipe, str(traffic)),
-            {},
-        )
+        trainings = cells.setdefault((recipe, str(traffic)), {})
         trainings[str(driver)] = frame.sort("episode")
         # The same training twice would count as two.
         if len(set(map(seed_of, trainings))) < len(trainings):
@@ -122,41 +119,29 @@ def rows(cells: Cells) -> list[Row]:
         failures of every training. A key with ``_ci`` holds the 95 % interval of its namesake over
         trainings and episodes.
     """
-    return [
-        _row(
-            recipe,
-            traffic,
-            trainings,
-            cells,
-        )
-        for (recipe, traffic), trainings in cells.items()
-    ]
+    return [_row(recipe, traffic, cells) for recipe, traffic in cells]
 
 
-def _row(
-    recipe: str,
-    traffic: str,
-    trainings: Mapping[str, pl.DataFrame],
-    cells: Cells,
-) -> Row:
+def _row(recipe: str, traffic: str, cells: Cells) -> Row:
+    trainings = cells[recipe, traffic]
     # Both [S, E]: trainings by episodes.
     rewards = column(trainings, "reward")
     km = column(trainings, pl.col("distance_m") / 1000.0)
-    mobil = _rewards(cells, SCALE_TOP, traffic)
-    random_legal = _rewards(cells, SCALE_BOTTOM, traffic)
+    # MOBIL drives on every traffic; it is not compared with itself.
+    mobil = column(cells[SCALE_TOP, traffic], "reward")
+    is_mobil = recipe == SCALE_TOP
     # What cannot be said stays None and is printed as a dash.
-    score = lead = probability = None
-    if mobil is not None and random_legal is not None:
+    score = None
+    if (SCALE_BOTTOM, traffic) in cells:
+        random_legal = column(cells[SCALE_BOTTOM, traffic], "reward")
         score = normalized_over_trainings(rewards, mobil, random_legal)
-    if recipe == SCALE_TOP:
-        mobil = None  # it is not compared with itself
-    if mobil is not None:
-        lead = difference(rewards, mobil)
-        probability = _probability(rewards, mobil)
+    lead = None if is_mobil else difference(rewards, mobil)
+    probability = None if is_mobil else _probability(rewards, mobil)
     # Counts and plain rates are of the episodes of all trainings.
     together = pl.concat(trainings.values())
     crashes = together.filter(_ended(FAILURES[:1]))
     seconds = float(together["duration_s"].sum())
+    changes = int(together["lane_changes"].sum())
     driven = float(km.sum())
     row: Row = {
         "driver": recipe,
@@ -175,11 +160,7 @@ def _row(
     }
     for name, ends in _RATES.items():
         rate = rate_over_trainings(column(trainings, _ended(ends)), km)
-        row |= entries(
-            f"{name}_per_1000_km",
-            None if rate is None else rate.scaled(1000.0),
-        )
-    changes = int(together["lane_changes"].sum())
+        row |= entries(f"{name}_per_1000_km", None if rate is None else rate.scaled(1000.0))
     row["mean_speed_mps"] = 1000.0 * driven / seconds if seconds > 0.0 else None
     row["lane_changes_per_km"] = changes / driven if driven > 0.0 else None
     row["soft_crash_behind_per_episode"] = together["soft_crash_behind"].mean()
@@ -187,29 +168,11 @@ def _row(
     # Trainings one by one, so that a reader sees how far they lie apart.
     row["each"] = []
     for (name, frame), reward in zip(trainings.items(), rewards[:, None]):
-        lead = None if mobil is None else difference(reward, mobil)
-        training = {
-            "driver": name,
-            **entries("mean_reward", over_trainings(reward)),
-        }
-        row["each"].append(
-            {
-                **training,
-                **entries("minus_mobil", lead),
-                **_failures(frame),
-            }
-        )
+        lead = None if is_mobil else difference(reward, mobil)
+        training = {"driver": name, **entries("mean_reward", over_trainings(reward))}
+        training |= {**entries("minus_mobil", lead), **_failures(frame)}
+        row["each"].append(training)
     return row
-
-
-def _rewards(
-    cells: Cells,
-    recipe: str,
-    traffic: str,
-) -> Array | None:
-    """The rewards [S, E] of a recipe on a traffic, if it drove there."""
-    trainings = cells.get((recipe, traffic))
-    return None if trainings is None else column(trainings, "reward")
 
 
 def _failures(episodes: pl.DataFrame) -> dict[str, int]:
@@ -233,11 +196,7 @@ def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:
             first = cells.get((one, traffic))
             second = cells.get((other, traffic))
             if first is not None and second is not None:
-                names = {
-                    "driver": one,
-                    "over": other,
-                    "traffic": traffic,
-                }
+                names = {"driver": one, "over": other, "traffic": traffic}
                 compared.append({**names, **_compared(first, second)})
     return compared
 
@@ -253,18 +212,12 @@ def _compared(first: Mapping[str, pl.DataFrame], second: Mapping[str, pl.DataFra
     namesakes = dict(zip(map(seed_of, second), other_crashed))
     # A driver without trainings, say MOBIL, is held against every training of the first.
     if len(namesakes) == 1:
-        namesakes = dict.fromkeys(
-            map(seed_of, first),
-            other_crashed[0],
-        )
+        namesakes = dict.fromkeys(map(seed_of, first), other_crashed[0])
     tests = []
     for name, crashes in zip(first, crashed):
         if seed_of(name) in namesakes:
             # On the same episodes only those count in which one of the two crashed.
-            test = mcnemar(
-                crashes > 0,
-                namesakes[seed_of(name)] > 0,
-            )
+            test = mcnemar(crashes > 0, namesakes[seed_of(name)] > 0)
             tests.append({"driver": name, **vars(test)})
     return {
         **entries("lead", difference(rewards, other_rewards)),
@@ -328,12 +281,7 @@ def matrix_table(rows: Sequence[Row]) -> Table:
         "changes/km": number_of("lane_changes_per_km", 2),
         "close behind": number_of("soft_crash_behind_per_episode", 2),
     }
-    return Table.of(
-        "Every driver on every traffic",
-        rows,
-        columns,
-        names=2,
-    )
+    return Table.of("Every driver on every traffic", rows, columns, names=2)
 
 
 def table_vi(rows: Sequence[Row]) -> Table:
@@ -345,28 +293,11 @@ def table_vi(rows: Sequence[Row]) -> Table:
         "each training": _each("hard_crash", 0),
     }
     paper = [
-        [
-            "paper",
-            "Traffic_IDM",
-            name,
-            "not stated",
-            *map(str, counts),
-            "",
-            "",
-        ]
+        ["paper", "Traffic_IDM", name, "not stated", *map(str, counts), "", ""]
         for name, counts in PAPER_VI.items()
     ]
-    ours = rows_of(
-        rows,
-        ["idm", "idm_mobil"],
-        [*PAPER_VI, "mobil"],
-    )
-    return _beside(
-        "Table VI: crashes on rule-driven traffic",
-        paper,
-        ours,
-        columns,
-    )
+    ours = rows_of(rows, ["idm", "idm_mobil"], [*PAPER_VI, "mobil"])
+    return _beside("Table VI: crashes on rule-driven traffic", paper, ours, columns)
 
 
 def table_vii(rows: Sequence[Row]) -> Table:
@@ -382,31 +313,12 @@ def table_vii(rows: Sequence[Row]) -> Table:
         "for MOBIL; the paper does not define its own."
     )
     paper = [
-        [
-            "paper",
-            "Traffic_GAN",
-            name,
-            "1000",
-            *(f"{value:.2f}" for value in numbers),
-            "",
-        ]
+        ["paper", "Traffic_GAN", name, "1000", *(f"{value:.2f}" for value in numbers), ""]
         for name, numbers in PAPER_VII.items()
     ]
-    ours = rows_of(
-        rows,
-        ["gan"],
-        [*PAPER_VII, "mobil", "random_legal"],
-    )
+    ours = rows_of(rows, ["gan"], [*PAPER_VII, "mobil", "random_legal"])
     title = "Table VII: performance on generated traffic"
-    return replace(
-        _beside(
-            title,
-            paper,
-            ours,
-            columns,
-        ),
-        notes=[note],
-    )
+    return _beside(title, paper, ours, columns, [note])
 
 
 def _each(key: str, digits: int) -> Cell:
@@ -419,6 +331,7 @@ def _beside(
     paper: list[list[str]],
     ours: list[Row],
     columns: Mapping[str, Cell],
+    notes: Sequence[str] = (),
 ) -> Table:
     """The paper's lines above our rows."""
     names: Mapping[str, Cell] = {
@@ -427,16 +340,8 @@ def _beside(
         "driver": text_of("driver"),
         "episodes": _trainings,
     }
-    here = Table.of(
-        title,
-        ours,
-        {**names, **columns},
-        names=3,
-    )
-    return replace(
-        here,
-        lines=[*paper, *here.lines],
-    )
+    here = Table.of(title, ours, {**names, **columns}, 3, notes)
+    return replace(here, lines=[*paper, *here.lines])
 
 
 def comparison_table(rows: Sequence[Row]) -> Table:
@@ -457,12 +362,7 @@ def comparison_table(rows: Sequence[Row]) -> Table:
         "crashes per 1000 episodes, more": number_of("crash_difference_per_1000_episodes", 1),
         "McNemar, each training: crashed alone, p": tests,
     }
-    return Table.of(
-        "Drivers compared on the same episodes",
-        rows,
-        columns,
-        names=3,
-    )
+    return Table.of("Drivers compared on the same episodes", rows, columns, names=3)
 
 
 # Files
@@ -518,18 +418,11 @@ def write_csv(path: Path, content: pl.DataFrame | Table | Sequence[Row]) -> None
     if isinstance(content, Table):
         # An empty cell reads as null; a dash would make the column a text.
         shown = [["" if cell == NOTHING else cell for cell in line] for line in content.lines]
-        frame = pl.DataFrame(
-            shown,
-            dict.fromkeys(content.headings, pl.String),
-            orient="row",
-        )
+        frame = pl.DataFrame(shown, dict.fromkeys(content.headings, pl.String), orient="row")
     elif isinstance(content, pl.DataFrame):
         frame = content
     else:
-        frame = pl.DataFrame(
-            list(map(_flat, content)),
-            infer_schema_length=None,
-        )
+        frame = pl.DataFrame(list(map(_flat, content)), infer_schema_length=None)
     with atomic_path(path) as part:
         frame.write_csv(part)
 

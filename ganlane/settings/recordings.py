@@ -55,9 +55,6 @@ class PrepareConfig(RunConfig):
             raise UserError(
                 f"device={self.device}: recordings are prepared on the CPU; use device=cpu."
             )
-        # Scenes have a default place; a raw recording is the user's own file.
-        if self.data.format != "scenes" and self.data.path is None:
-            raise UserError(f"data={self.data.format}: which file is missing; give data.path=FILE.")
 
 
 @dataclass(frozen=True)

@@ -51,8 +51,6 @@ class FilmConfig(Record):
         road_m: length of road in the picture, m.
         trail_s: length of the trails, s; 0: none.
         speeds: numbers on the roofs.
-        leader_line: a line to the leader, with the gap.
-        scale: size of the film, as a share of the picture's.
         max_bytes: gif: size and frame rate are lowered until it fits; html: the rate of samples.
     """
 
@@ -67,9 +65,7 @@ class FilmConfig(Record):
     road_m: Positive = 160.0
     trail_s: NotNegative = 3.0
     speeds: bool = True
-    leader_line: bool = False
     # the file
-    scale: Annotated[float, between(0.05, 4)] = 1.0
     max_bytes: Annotated[int, at_least(10_000)] | None = None
 
     def __post_init__(self) -> None:

@@ -1,3 +1,4 @@
+# ruff: noqa: F401  (the names that users import from here)
 """Seeing an episode: recorded once, then drawn, filmed or exported, all without a display.
 
 :func:`record_episode` gives a :class:`Trajectory`. :class:`FramePainter` draws its frames,
@@ -14,16 +15,3 @@ from ganlane.view.frames import FramePainter
 from ganlane.view.player import player_page, write_player
 from ganlane.view.record import EpisodeLabel, Recorder, Trajectory, record_episode
 from ganlane.view.tracks import to_tracks, write_tracks
-
-__all__ = [
-    "EpisodeLabel",
-    "FramePainter",
-    "Recorder",
-    "Trajectory",
-    "player_page",
-    "record_episode",
-    "to_tracks",
-    "write_film",
-    "write_player",
-    "write_tracks",
-]

@@ -27,12 +27,13 @@ GOOD = "#68d47e"
 AMBER = "#ffd640"
 BRAKE = "#ff3028"
 GLASS = "#181c24"
-LEADER = "#78e6be"
 #: Blue for the other vehicles, from standing to ``FAST_MPS``, in so many levels.
-_SLOW, _MIDDLE, _FAST = (38, 52, 128), (58, 122, 224), (158, 226, 255)
+_BLUES = (38, 52, 128), (58, 122, 224), (158, 226, 255)
 FAST_MPS, _LEVELS = 35.0, 36
 
 HEADER_HEIGHT, FOOTER_HEIGHT = 56, 24
+#: Height of the small letters, pixels.
+SMALL = 12
 #: Share of the road in the picture that lies behind the ego.
 BEHIND = 0.38
 #: The scale across the road is up to so many times that along it: vehicles and lateral movements
@@ -43,18 +44,12 @@ PERIOD_M, DASH_M = 18.0, 6.0
 POST_EVERY_M = 50.0
 
 
-# Red, green and blue of every level.
-_CHANNELS = [
-    np.interp(np.arange(_LEVELS + 1), (0, _LEVELS / 2, _LEVELS), channel)
-    for channel in zip(_SLOW, _MIDDLE, _FAST)
-]
-_TINTS = np.rint(np.transpose(_CHANNELS)).astype(np.uint8)
-
-
 def speed_tint(speed_mps: float) -> str:
     """Blue of a vehicle at this speed: dark at 0, pale at :data:`FAST_MPS` and above."""
     share = min(max(speed_mps / FAST_MPS, 0.0), 1.0)
-    return f"#{_TINTS[round(share * _LEVELS)].tobytes().hex()}"
+    place = 2.0 * round(share * _LEVELS) / _LEVELS
+    channels = [np.interp(place, (0.0, 1.0, 2.0), channel) for channel in zip(*_BLUES)]
+    return f"#{bytes(map(round, channels)).hex()}"
 
 
 def darker(colour: str) -> str:
@@ -89,8 +84,8 @@ def put_text(
     image: Image.Image,
     position: tuple[float, float],
     text: str,
-    size: int,
-    colour: str,
+    colour: str = FAINT,
+    size: int = SMALL,
     anchor: float = 0.0,
 ) -> None:
     """Write ``text`` with its top at ``position``.
@@ -184,11 +179,5 @@ class Backdrop:
         posts = np.arange(first, start + window.length_m + 10.0, POST_EVERY_M)
         for metres, column in zip(posts, window.column(posts, ego_x_m)):
             draw.line((column, lower + 7, column, lower + 20), fill=FAINT, width=2)
-            put_text(
-                picture,
-                (column + 7, lower + 8),
-                f"{int(metres)} m",
-                12,
-                FAINT,
-            )
+            put_text(picture, (column + 7, lower + 8), f"{int(metres)} m")
         return picture

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -20,8 +20,6 @@ from ganlane.errors import UserError
 from ganlane.evaluation.results import names_of_runs, runs_below
 from ganlane.view.figures import STYLE, FloatArray, add_legend, palette, panel_grid, plot_line
 
-#: Metrics of the runs that share a name: one, or the same with several seeds.
-Runs: TypeAlias = Mapping[str, Sequence[pl.DataFrame]]
 #: Number of decisions so far: the horizontal axis of every learning curve.
 X_COLUMN = "decisions"
 #: Prefix of the columns of ``evaluation.csv``.
@@ -148,15 +146,15 @@ def read_runs(paths: Sequence[str | Path]) -> dict[str, list[pl.DataFrame]]:
 
 @rc_context(STYLE)
 def draw_runs(
-    runs: Runs,
+    runs: Mapping[str, Sequence[pl.DataFrame]],
     columns: Sequence[str] | None = None,
     smooth: int = 1,
 ) -> Figure:
     """Training runs over the number of decisions, one colour per name.
 
     Args:
-        runs: name to metrics (:func:`read_run`). Of several, the mean is drawn, in a band from the
-            lowest to the highest.
+        runs: name to metrics (:func:`read_run`): one, or the same with several seeds. Of several,
+            the mean is drawn, in a band from the lowest to the highest.
         columns: one panel for each of these; by default those of :data:`PANELS` that any run has
             numbers for.
         smooth: rows that the running mean takes in; above 1 the rows themselves are drawn faintly.
@@ -194,28 +192,10 @@ def draw_runs(
             style: dict[str, Any] = {"color": colours[name]}
             # Smoothing hides the spread, so a single run is also drawn unsmoothed, faintly.
             if smooth > 1 and len(frames) == 1:
-                for x, y in _lines(frames, panel.column):
-                    plot_line(
-                        axes,
-                        x,
-                        y,
-                        **style,
-                        alpha=0.3,
-                        lw=0.8,
-                    )
-            _plot_mean(
-                axes,
-                _lines(frames, panel.column, smooth),
-                with_range=True,
-                **style,
-            )
-            _plot_mean(
-                axes,
-                _lines(frames, panel.dashed, smooth),
-                **style,
-                ls="--",
-                lw=1.2,
-            )
+                plot_middle(axes, _lines(frames, panel.column), **style, alpha=0.3, lw=0.8)
+            lines = _lines(frames, panel.column, smooth)
+            plot_middle(axes, lines, with_range=True, **style)
+            plot_middle(axes, _lines(frames, panel.dashed, smooth), **style, ls="--", lw=1.2)
     legend = {}
     for name, frames in runs.items():
         count = f" ({len(frames)} seeds: mean, range)" if len(frames) > 1 else ""
@@ -245,35 +225,25 @@ def _lines(
     return lines
 
 
-def _plot_mean(
+def plot_middle(
     axes: Axes,
     lines: Sequence[tuple[FloatArray, FloatArray]],
     with_range: bool = False,
+    middle: Callable[..., FloatArray] = np.mean,
     **style: Any,
 ) -> None:
-    """One line as it is; of several, the mean and perhaps the range where all have values."""
+    """One line as it is; of several, the ``middle`` and perhaps the range where all have values."""
     if len(lines) == 1:
         plot_line(axes, *lines[0], **style)
     if len(lines) < 2:
         return
     # Seeds are logged at different decisions: values in between are interpolated.
     x = np.unique(np.concatenate([x for x, _ in lines]))
-    # Only where all have values, else the mean would jump where a run begins or ends.
+    # Only where all have values, else the middle would jump where a run begins or ends.
     first, last = max(x[0] for x, _ in lines), min(x[-1] for x, _ in lines)
     shared = x[(x >= first) & (x <= last)]
     values = np.stack([np.interp(shared, *line) for line in lines])
-    plot_line(
-        axes,
-        shared,
-        values.mean(0),
-        **style,
-    )
+    plot_line(axes, shared, middle(values, axis=0), **style)
     if with_range:
-        axes.fill_between(
-            shared,
-            values.min(0),
-            values.max(0),
-            **style,
-            alpha=0.18,
-            lw=0,
-        )
+        low, high = values.min(0), values.max(0)
+        axes.fill_between(shared, low, high, **style, alpha=0.18, lw=0)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from subprocess import PIPE, Popen
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -22,7 +23,11 @@ from ganlane.view.record import Trajectory
 STRIP_FRAMES = 4
 #: How long the last frame stays, s of film.
 HOLD_S = 1.5
-_H264 = "-an -c:v libx264 -pix_fmt yuv420p -crf 20 -preset medium -movflags +faststart -f mp4"
+#: H.264 takes even sides only.
+_H264 = (
+    "-an -vf crop=trunc(iw/2)*2:trunc(ih/2)*2 -c:v libx264 -pix_fmt yuv420p -crf 20 "
+    "-preset medium -movflags +faststart -f mp4"
+)
 #: Frames from which a GIF's palette is taken, and colours of large flat areas, which are kept as
 #: they are.
 _PALETTE_FRAMES, _FLAT_COLOURS = 8, 8
@@ -46,13 +51,9 @@ def film_frames(trajectory: Trajectory, look: FilmConfig) -> list[int]:
     Raises:
         UserError: the film begins after the episode's end.
     """
+    trajectory.since(look.start_s)
     time = trajectory.time_s
-    end = float(time[-1]) if look.end_s is None else min(look.end_s, float(time[-1]))
-    if look.start_s > end:
-        raise UserError(
-            f"film from {look.start_s:g} to {end:g} s: the episode lasts {time[-1]:g} s; choose a "
-            "part of it."
-        )
+    end = min(look.end_s or np.inf, float(time[-1]))
     # 1e-9 s, so that rounding does not lose the last frame.
     times = np.arange(look.start_s, end + 1e-9, look.speedup / look.fps)
     # At every time of the film the last recorded frame is shown.
@@ -88,13 +89,7 @@ def write_film(
     painter, frames = FramePainter(trajectory, look), film_frames(trajectory, look)
     if kind == "gif":
         for share, colours, every in _GIF_SIZES:
-            content = _gif(
-                painter,
-                frames,
-                look.scale * share,
-                colours,
-                every,
-            )
+            content = _gif(painter, frames, share, colours, every)
             if look.max_bytes is None or len(content) <= look.max_bytes:
                 write_bytes(path, content)
                 return path
@@ -107,7 +102,7 @@ def write_film(
     elif kind == "png":
         with atomic_path(path) as part:
             strip = film_strip([painter.draw(frame) for frame in spread(frames, STRIP_FRAMES)])
-            _scaled(strip, look.scale).save(part, format="PNG", optimize=True)
+            Image.fromarray(strip).save(part, format="PNG", optimize=True)
     else:
         raise UserError(f"format={kind or 'none'}: expected mp4, gif or png; choose one of them.")
     return path
@@ -127,18 +122,12 @@ def spread(frames: Sequence[int], count: int) -> list[int]:
     return [frames[place] for place in places]
 
 
-def _scaled(
-    picture: Picture,
-    scale: float,
-    multiple: int = 1,
-) -> Image.Image:
-    """The picture at ``scale``, its sides a multiple of so many pixels."""
+def _scaled(picture: Picture, scale: float) -> Image.Image:
+    """The picture at ``scale``."""
     image = Image.fromarray(picture)
-    width, height = (
-        max(multiple, round(side * scale / multiple) * multiple) for side in image.size
-    )
-    if (width, height) == image.size:
+    if scale == 1.0:
         return image
+    width, height = (max(1, round(side * scale)) for side in image.size)
     return image.resize((width, height), Image.Resampling.LANCZOS, reducing_gap=2.0)
 
 
@@ -146,12 +135,7 @@ def _gif(
     painter: FramePainter, frames: Sequence[int], scale: float, colours: int, every: int
 ) -> bytes:
     """An endless GIF with one palette for the whole film."""
-    palette = _shared_palette(
-        painter,
-        frames,
-        scale,
-        colours,
-    )
+    palette = _shared_palette(painter, frames, scale, colours)
     pictures = [
         _scaled(painter.draw(frame), scale).quantize(palette=palette, dither=Image.Dither.NONE)
         for frame in frames[::every]
@@ -183,16 +167,12 @@ def _shared_palette(
     """
     chosen = spread(frames, _PALETTE_FRAMES)
     stack = np.concatenate([np.asarray(_scaled(painter.draw(frame), scale)) for frame in chosen])
-    # One number per colour, which sorts much faster than three.
-    packed = stack.reshape(-1, 3).astype(np.int64) @ np.array([1 << 16, 1 << 8, 1])
-    values, counts = np.unique(packed, return_counts=True)
-    top = values[np.argsort(-counts, kind="stable")[:_FLAT_COLOURS]]
-    exact = np.stack([top >> 16, (top >> 8) & 255, top & 255], axis=1)
-    covering = Image.fromarray(stack).quantize(
-        colours - len(exact), method=Image.Quantize.MAXCOVERAGE
-    )
+    together = Image.fromarray(stack)
+    counts: Any = together.getcolors(2**24)
+    exact = [colour for _, colour in sorted(counts, reverse=True)[:_FLAT_COLOURS]]
+    covering = together.quantize(colours - len(exact), method=Image.Quantize.MAXCOVERAGE)
     palette = Image.new("P", (1, 1))
-    palette.putpalette([*exact.ravel().tolist(), *(covering.getpalette() or [])])
+    palette.putpalette([*itertools.chain(*exact), *(covering.getpalette() or [])])
     return palette
 
 
@@ -217,12 +197,9 @@ def _write_mp4(
             "format=gif."
         ) from error
 
-    # H.264 takes even sides only.
-    pictures = (_scaled(painter.draw(frame), painter.look.scale, multiple=2) for frame in frames)
-    first = next(pictures)
-    width, height = first.size
-    rate = Fraction(painter.look.fps).limit_denominator()
-    raw = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {rate} -i -"
+    look = painter.look
+    rate = Fraction(look.fps).limit_denominator()
+    raw = f"-f rawvideo -pix_fmt rgb24 -s {look.width}x{look.height} -r {rate} -i -"
     with atomic_path(path) as part:
         words = [ffmpeg, "-y", "-v", "error", *raw.split(), *_H264.split(), str(part)]
         # In a session of its own, so that Ctrl-C reaches this process alone. ffmpeg ends with its
@@ -230,8 +207,8 @@ def _write_mp4(
         with Popen(words, stdin=PIPE, stderr=PIPE, start_new_session=True) as program:
             assert program.stdin is not None
             try:
-                for picture in itertools.chain([first], pictures):
-                    program.stdin.write(picture.tobytes())
+                for frame in frames:
+                    program.stdin.write(painter.draw(frame).tobytes())
             except BrokenPipeError:
                 pass  # It has ended early; its error message follows.
             _, message = program.communicate()

@@ -14,12 +14,12 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
+from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.render import FilmConfig
 from ganlane.view import canvas
-from ganlane.view.canvas import HEADER_HEIGHT, Backdrop, Window, put_text
-from ganlane.view.record import ACTION_NAMES, EpisodeLabel, Trajectory
+from ganlane.view.canvas import HEADER_HEIGHT, SMALL, Backdrop, Window, put_text
+from ganlane.view.record import ACTION_NAMES, EpisodeLabel, FloatArray, Trajectory
 
-FloatArray = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
 
 #: Braking harder than this lights the brake lights, m/s2.
@@ -28,11 +28,8 @@ _BRAKE_LIGHT = -0.8
 _SIGNAL_M = 0.4
 #: Indicators are lit for the first ``_LIT_S`` of every ``_BLINK_S``.
 _BLINK_S, _LIT_S = 0.6, 0.6 * 0.6
-_SMALL = 12
 #: Bodies and trails are drawn so many times larger and reduced, which smooths their edges.
 _BODY_OVERSAMPLING, _TRAIL_OVERSAMPLING = 3, 2
-#: Pixels around a trail that its width may reach into.
-_TRAIL_MARGIN = 3
 #: Coverage (0 to 255) of the oldest, middle and newest third of a trail, the ego's and the others'.
 _EGO_COVERAGE, _OTHER_COVERAGE = (110, 175, 240), (45, 80, 120)
 
@@ -82,7 +79,7 @@ class FramePainter:
 
     Args:
         trajectory: the recorded episode.
-        look: size of the picture, road shown, trails, speeds, leader line.
+        look: size of the picture, road shown, trails, speeds.
     """
 
     def __init__(self, trajectory: Trajectory, look: FilmConfig | None = None):
@@ -109,38 +106,18 @@ class FramePainter:
         lengths = t.length[frame] * self.window.along
         picture = self._backdrop.at(ego_x)
         self._draw_trails(picture, frame, ego_x)
-        if self.look.leader_line:
-            self._draw_leader_line(picture, frame)
         in_picture = (columns > -lengths) & (columns < width + lengths) & t.valid[frame]
         # The ego comes last, on top of the others.
         for vehicle in np.flatnonzero(in_picture)[::-1].tolist():
-            self._draw_vehicle(
-                picture,
-                frame,
-                vehicle,
-                float(columns[vehicle]),
-            )
+            self._draw_vehicle(picture, frame, vehicle, float(columns[vehicle]))
         behind = int((t.valid[frame] & (columns < 0)).sum())
         ahead = int((t.valid[frame] & (columns > width)).sum())
-        room_above = self.window.edges[0] - HEADER_HEIGHT > 2 * _SMALL
-        top = HEADER_HEIGHT + 6 if room_above else self.window.height - _SMALL - 6
+        room_above = self.window.edges[0] - HEADER_HEIGHT > 2 * SMALL
+        top = HEADER_HEIGHT + 6 if room_above else self.window.height - SMALL - 6
         if behind:
-            put_text(
-                picture,
-                (12, top),
-                f"{behind} behind",
-                _SMALL,
-                canvas.FAINT,
-            )
+            put_text(picture, (12, top), f"{behind} behind")
         if ahead:
-            put_text(
-                picture,
-                (width - 12, top),
-                f"{ahead} ahead",
-                _SMALL,
-                canvas.FAINT,
-                1.0,
-            )
+            put_text(picture, (width - 12, top), f"{ahead} ahead", anchor=1.0)
         if frame == len(t) - 1:
             self._draw_outcome(picture, float(columns[0]))
         self._draw_header(picture, frame)
@@ -168,10 +145,8 @@ class FramePainter:
         width, height = ((2 * reach + 1) * _BODY_OVERSAMPLING).tolist()
 
         overlaps = bool(self._overlapping[at])
-        colour, edge = canvas.EGO, canvas.TEXT
-        if not is_ego:
-            colour = canvas.speed_tint(float(t.speed[at]))
-            edge = canvas.darker(colour)
+        colour = canvas.EGO if is_ego else canvas.speed_tint(float(t.speed[at]))
+        edge = canvas.TEXT if is_ego else canvas.darker(colour)
         if overlaps:
             edge = canvas.CRASH
         patch = Image.new("RGBA", (width, height), f"{edge}00")
@@ -201,16 +176,9 @@ class FramePainter:
         smooth = patch.reduce(_BODY_OVERSAMPLING)
         picture.paste(smooth, tuple(corner.tolist()), smooth)
         if self.look.speeds:
-            place = (column - 0.09 * forward[0], middle[1] - _SMALL * 0.62)
+            place = (column - 0.09 * forward[0], middle[1] - SMALL * 0.62)
             ink = canvas.readable_on(colour)
-            put_text(
-                picture,
-                place,
-                f"{t.speed[at]:.0f}",
-                _SMALL,
-                ink,
-                0.5,
-            )
+            put_text(picture, place, f"{t.speed[at]:.0f}", ink, anchor=0.5)
 
     def _draw_trails(
         self,
@@ -220,70 +188,32 @@ class FramePainter:
     ) -> None:
         """Trails over the last seconds, as in the paper's Figure 3.
 
-        The ego's is brighter, older parts are fainter.
+        The ego's is brighter, older parts are fainter: a trail is three lines that share their
+        ends.
         """
         t = self.trajectory
-        steps = round(self.look.trail_s / t.frame_s)
+        steps = round(self.look.trail_s / PHYSICS_STEP_S)
         past = slice(max(0, frame - steps), frame + 1)
         # What came before a jump belongs to another place.
         is_here = self._jumps[past] == self._jumps[frame]
         shown = t.valid[past] & t.valid[frame] & is_here
-        columns, rows = self.window.column(t.x[past], ego_x), self.window.row(t.y[past])
-        places = np.stack((columns, rows), axis=-1)
-        for vehicle in reversed(range(t.x.shape[1])):
-            trail = places[:, vehicle][shown[:, vehicle]]
-            if len(trail) > 1:
-                self._draw_trail(picture, trail, _OTHER_COVERAGE if vehicle else _EGO_COVERAGE)
-
-    def _draw_trail(
-        self, picture: Image.Image, trail: FloatArray, coverage: tuple[int, int, int]
-    ) -> None:
-        """Places [S, 2], oldest first, as three lines that share their ends.
-
-        They are drawn on a mask no larger than they are; what is outside the road and a margin is
-        cut off.
-        """
+        # The mask is as high as the road, which takes less time than the whole picture.
         upper, lower = self.window.edges
-        corner = np.maximum(trail.min(0).astype(int) - _TRAIL_MARGIN, (0, int(upper) - 20))
-        far = (picture.width, int(lower) + 20)
-        size = np.minimum(trail.max(0).astype(int) + _TRAIL_MARGIN, far) - corner
-        if size.min() <= 0:
-            return
-        width, height = (size * _TRAIL_OVERSAMPLING).tolist()
-        mask = Image.new("L", (width, height))
+        top = int(upper) - 20
+        height = int(lower) + 20 - top
+        mask = Image.new("L", (picture.width * _TRAIL_OVERSAMPLING, height * _TRAIL_OVERSAMPLING))
+        columns, rows = self.window.column(t.x[past], ego_x), self.window.row(t.y[past]) - top
+        places = np.stack((columns, rows), axis=-1) * _TRAIL_OVERSAMPLING
         draw = ImageDraw.Draw(mask)
-        points = [(x, y) for x, y in ((trail - corner) * _TRAIL_OVERSAMPLING).tolist()]
-        # A short trail has fewer than three parts, the fainter ones.
-        cuts = np.linspace(0, len(points) - 1, 4).astype(int)
-        parts = [points[start : end + 1] for start, end in pairwise(cuts) if end > start]
-        for part, strength in zip(parts, coverage):
-            draw.line(part, fill=strength, width=2 * _TRAIL_OVERSAMPLING)
-        picture.paste("white", tuple(corner.tolist()), mask.reduce(_TRAIL_OVERSAMPLING))
-
-    def _draw_leader_line(self, picture: Image.Image, frame: int) -> None:
-        """A line from the ego's front to the rear of the nearest vehicle ahead in its lane.
-
-        The number is the net gap, m.
-        """
-        t, lane, x = self.trajectory, self.trajectory.lane()[frame], self.trajectory.x[frame]
-        ahead = t.valid[frame] & (lane == lane[0]) & (x > x[0])
-        if not ahead.any():
-            return
-        leader = int(np.where(ahead, x, np.inf).argmin())
-        front = x[0] + t.length[frame, 0] / 2
-        rear = x[leader] - t.length[frame, leader] / 2
-        start, end = self.window.column([front, rear], x[0])
-        row = float(self.window.row(t.y[frame, 0]))
-        ImageDraw.Draw(picture).line((start, row, end, row), fill=canvas.LEADER, width=1)
-        place = (start + min(end, self.window.width)) / 2, row - 17
-        put_text(
-            picture,
-            place,
-            f"{rear - front:.0f} m",
-            _SMALL,
-            canvas.LEADER,
-            0.5,
-        )
+        # The ego comes last, on top of the others.
+        for vehicle in reversed(range(t.x.shape[1])):
+            trail = [(x, y) for x, y in places[:, vehicle][shown[:, vehicle]].tolist()]
+            # A short trail has fewer than three parts, the fainter ones.
+            cuts = np.linspace(0, len(trail) - 1, 4).astype(int)
+            parts = [trail[start : end + 1] for start, end in pairwise(cuts) if end > start]
+            for part, strength in zip(parts, _OTHER_COVERAGE if vehicle else _EGO_COVERAGE):
+                draw.line(part, fill=strength, width=2 * _TRAIL_OVERSAMPLING)
+        picture.paste("white", (0, top), mask.reduce(_TRAIL_OVERSAMPLING))
 
     def _draw_header(self, picture: Image.Image, frame: int) -> None:
         """Put the header of one frame on the picture."""
@@ -299,13 +229,7 @@ class FramePainter:
         column = self._values_at
         for value, width in zip(values, _VALUES.values()):
             colour = canvas.EGO if value in ("left", "right") else canvas.TEXT
-            put_text(
-                picture,
-                (column, 25),
-                value,
-                18,
-                colour,
-            )
+            put_text(picture, (column, 25), value, colour, 18)
             column += width
 
     def _draw_outcome(self, picture: Image.Image, ego_column: float) -> None:
@@ -322,21 +246,8 @@ class FramePainter:
         width = canvas.text_mask(text, 24).width + 40
         left = (picture.width - width) // 2
         plate = (left, HEADER_HEIGHT + 6, left + width, HEADER_HEIGHT + 44)
-        draw.rounded_rectangle(
-            plate,
-            8,
-            fill=canvas.HEADER,
-            outline=colour,
-            width=2,
-        )
-        put_text(
-            picture,
-            (picture.width / 2, HEADER_HEIGHT + 11),
-            text,
-            24,
-            colour,
-            0.5,
-        )
+        draw.rounded_rectangle(plate, 8, fill=canvas.HEADER, outline=colour, width=2)
+        put_text(picture, (picture.width / 2, HEADER_HEIGHT + 11), text, colour, 24, 0.5)
 
 
 def _header(
@@ -350,33 +261,15 @@ def _header(
     for size in _TITLE_SIZES:
         if canvas.text_mask(title, size).width < values_at - 24:
             break
-    put_text(
-        picture,
-        (16, 8),
-        title,
-        size,
-        canvas.TEXT,
-    )
+    put_text(picture, (16, 8), title, canvas.TEXT, size)
     lanes = f"{label.lanes} lane{'s' if label.lanes > 1 else ''}"
     facts = f"episode {label.episode}, seed {label.seed}, {lanes}"
     factor = window.across / window.along
     if factor > 1.05:
         facts += f"; drawn {factor:.1f} times as wide as it is"
-    put_text(
-        picture,
-        (16, 34),
-        facts,
-        _SMALL,
-        canvas.FAINT,
-    )
+    put_text(picture, (16, 34), facts)
     for name, width in _VALUES.items():
-        put_text(
-            picture,
-            (values_at, 9),
-            name,
-            _SMALL,
-            canvas.FAINT,
-        )
+        put_text(picture, (values_at, 9), name)
         values_at += width
     return picture
 
@@ -388,27 +281,7 @@ def _draw_tints(header: Image.Image) -> None:
     for column in range(left, right):
         speed = (column - left) / (right - left) * canvas.FAST_MPS
         draw.line((column, 26, column, 35), fill=canvas.speed_tint(speed))
-    put_text(
-        header,
-        (left, 9),
-        "others' speed, m/s",
-        _SMALL,
-        canvas.FAINT,
-    )
-    put_text(
-        header,
-        (left, 38),
-        "0",
-        11,
-        canvas.FAINT,
-    )
-    for speed in (10, 20, 30):
+    put_text(header, (left, 9), "others' speed, m/s")
+    for speed in (0, 10, 20, 30):
         place = left + speed / canvas.FAST_MPS * (right - left), 38
-        put_text(
-            header,
-            place,
-            f"{speed}",
-            11,
-            canvas.FAINT,
-            0.5,
-        )
+        put_text(header, place, f"{speed}", size=11, anchor=0.5 if speed else 0.0)

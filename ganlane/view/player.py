@@ -26,8 +26,9 @@ import numpy.typing as npt
 
 from ganlane.errors import UserError
 from ganlane.files import write_bytes
+from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.render import FilmConfig
-from ganlane.view.record import ACTION_NAMES, Trajectory
+from ganlane.view.record import ACTION_NAMES, FloatArray, Trajectory
 
 #: Three episodes stay under 2 MB.
 MAX_BYTES_PER_EPISODE = 660_000
@@ -58,10 +59,8 @@ def player_page(trajectories: Sequence[Trajectory], look: FilmConfig | None = No
     0.2, 0.3, 0.5 or 1 s apart instead of 0.1 s; the player interpolates.
 
     Raises:
-        UserError: there is no episode, one is over by then, or the page is too large even so.
+        UserError: an episode is over by then, or the page is too large even so.
     """
-    if not trajectories:
-        raise UserError("format=html: no episode to play; record at least one.")
     look = look or FilmConfig()
     limit = look.max_bytes or MAX_BYTES_PER_EPISODE * len(trajectories)
     labels = [trajectory.label for trajectory in trajectories]
@@ -115,7 +114,7 @@ def _hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-def series(values: npt.NDArray[np.float64], unit: float) -> list[int]:
+def series(values: FloatArray, unit: float) -> list[int]:
     """[T] numbers as whole multiples of ``unit``, by their differences.
 
     Rounding errors do not add up.
@@ -197,13 +196,13 @@ def episode_data(
     }
 
 
-def ego_jerk(trajectory: Trajectory) -> npt.NDArray[np.float64]:
+def ego_jerk(trajectory: Trajectory) -> FloatArray:
     """Change of the ego's acceleration since the frame before, m/s3, [T].
 
     0 in the first two frames, since the reset begins with no acceleration, and after a jump.
     """
     acceleration = trajectory.acceleration[:, 0]
-    jerk = np.diff(acceleration, prepend=acceleration[0]) / trajectory.frame_s
+    jerk = np.diff(acceleration, prepend=acceleration[0]) / PHYSICS_STEP_S
     # The episode begins without a past: no change of acceleration is known there.
     jerk[:2] = 0.0
     # A vehicle that was placed elsewhere has another acceleration, not a jerk.

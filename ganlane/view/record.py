@@ -29,12 +29,18 @@ BoolArray = npt.NDArray[np.bool_]
 ACTION_NAMES = ("keep", "left", "right")
 #: A vehicle that moves further than this in a physics step was recycled (placed elsewhere), m.
 JUMP_M = 30.0
-#: Fields of ``vehicles`` that a trajectory keeps, with their types.
-_FIELDS = {
-    **dict.fromkeys(("x", "y", "heading", "speed", "acceleration", "length", "width"), np.float64),
-    "target_lane": np.int64,
-    "valid": np.bool_,
-}
+#: Fields of ``vehicles`` that a trajectory keeps.
+_FIELDS = (
+    "x",
+    "y",
+    "heading",
+    "speed",
+    "acceleration",
+    "length",
+    "width",
+    "target_lane",
+    "valid",
+)
 
 
 @dataclass(frozen=True)
@@ -52,7 +58,7 @@ class EpisodeLabel:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """T frames of M vehicles; the ego has index 0.
+    """T frames of M vehicles, a physics step (0.1 s) apart; the ego has index 0.
 
     Frame 0 is the state after the reset. SI units: positions of the bodies' centres in m, ``x``
     along the road, ``y`` to the left; ``heading`` in rad, anticlockwise.
@@ -75,22 +81,17 @@ class Trajectory:
     action: IntArray
     #: Return up to the decision before, [T]; the last frame has the whole return.
     returns: FloatArray
+    #: Action values of the policy, [T, A]; NaN before the first decision and where unknown.
+    action_values: FloatArray
+    #: Reward of the decision that a frame belongs to, [T]; NaN before the first and where unknown.
+    reward: FloatArray
+    #: Ends of the decisions with a soft crash, s.
+    soft_crash_s: FloatArray
     #: End event, one of :data:`ganlane.keys.END_EVENTS`; empty where the episode was cut off.
     outcome: str = ""
-    #: Action values of the policy, [T, A]; NaN before the first decision and where unknown.
-    action_values: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    #: Reward of the decision that a frame belongs to, [T]; NaN before the first and where unknown.
-    reward: FloatArray = field(default_factory=lambda: np.empty(0))
-    #: Ends of the decisions with a soft crash, s; empty if unknown.
-    soft_crash_s: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __len__(self) -> int:
         return len(self.time_s)
-
-    @property
-    def frame_s(self) -> float:
-        """Time between two frames, s."""
-        return float(np.median(np.diff(self.time_s))) if len(self) > 1 else keys.PHYSICS_STEP_S
 
     def lane(self) -> IntArray:
         """Lane whose centre is nearest, [T, M]."""
@@ -99,8 +100,7 @@ class Trajectory:
 
     def jumped(self) -> BoolArray:
         """Whether a vehicle was recycled (placed elsewhere) since the frame before, [T, M]."""
-        moved = np.abs(np.diff(self.x, axis=0, prepend=self.x[:1]))
-        return moved > JUMP_M * max(1.0, self.frame_s / keys.PHYSICS_STEP_S)
+        return np.abs(np.diff(self.x, axis=0, prepend=self.x[:1])) > JUMP_M
 
     def overlapping(self) -> BoolArray:
         """Whether a vehicle's box overlaps another's, [T, M]."""
@@ -164,8 +164,10 @@ class Recorder:
             "action_values": self.current_values,
             "reward": np.nan,  # known after the decision
         }
-        for name, kind in _FIELDS.items():
-            frame[name] = vehicles[name][self.row].detach().cpu().numpy().astype(kind)
+        for name in _FIELDS:
+            column = vehicles[name][self.row].detach().cpu().numpy()
+            # A copy, since the environment may write into its own.
+            frame[name] = column.astype(np.float64 if column.dtype.kind == "f" else column.dtype)
         self.frames.append(frame)
 
     def trajectory(self, label: EpisodeLabel, outcome: str = "") -> Trajectory:
@@ -177,12 +179,7 @@ class Recorder:
         arrays["time_s"] = arrays["time_s"].round(6)
         arrays["returns"][-1] = self.current_return
         soft_crash_s = np.array(self.soft_crash_s)
-        return Trajectory(
-            label,
-            outcome=outcome,
-            soft_crash_s=soft_crash_s,
-            **arrays,
-        )
+        return Trajectory(label, outcome=outcome, soft_crash_s=soft_crash_s, **arrays)
 
 
 def road_of_row(
@@ -243,23 +240,13 @@ def record_episode(
     try:
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             state = env.reset(start_of(env, [episode], seed))
-            label = EpisodeLabel(
-                agent,
-                traffic,
-                seed,
-                episode,
-                *road_of_row(state, base.road, 0),
-            )
+            road = road_of_row(state, base.road, 0)
             recorder.add(state[keys.VEHICLES], 0.0)
             while not state["done"][0] and recorder.time_s < end_s:
-                state = _decide(
-                    env,
-                    policy,
-                    state,
-                    recorder,
-                )
+                state = _decide(env, policy, state, recorder)
     finally:
         base.recorder = before
+    label = EpisodeLabel(agent, traffic, seed, episode, *road)
     return recorder.trajectory(label, outcome_of(state))
 
 
@@ -269,14 +256,9 @@ def _decide(
     """One decision; the state after it."""
     state = policy(state)
     recorder.current_action = int(state[keys.ACTION][0])
-    # A network's policy writes no action values [N, A]; others may.
     if isinstance(policy, GreedyPolicy):
         values = policy.network.values(state[keys.OBSERVATION])
-    else:
-        values = state.get("action_value", None)
-    if values is not None and values.shape[1:] == (keys.ACTIONS,):
         recorder.current_values = values[0].double().cpu().numpy()
-
     first = len(recorder.frames)
     stepped = env.step(state)
     after = stepped["next"]

@@ -9,52 +9,46 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ganlane.data import Histogram, PooledStatistics, survival_curve
+from ganlane.data import PooledStatistics, survival_curve
 from ganlane.view.figures import COLOURS, FAINT, STYLE, FloatArray, panel_grid
+
+#: Of each density.
+_BINS = 80
 
 
 @rc_context(STYLE)
 def draw_recordings(statistics: PooledStatistics) -> Figure:
     """Speeds, accelerations, lane-change times, headways and gaps of recorded driving."""
-    of = statistics.histograms
     figure, (speed, acceleration, changes, headway, time_headway, gap) = panel_grid(6)
-    # The limit follows the data; a few outliers must not squeeze the rest.
-    speed.set(
-        title="speed", xlabel="m/s", xlim=(0.0, min(60.0, 1.1 * of["speed"].quantile(1.0) + 1.0))
-    )
-    _draw_densities(speed, {"": of["speed"]})
-    acceleration.set(title="acceleration", xlabel="m/s²", xlim=(-5.0, 5.0))
-    # Differences of measured positions are noisy; over 1 s the noise averages out.
-    _draw_densities(
-        acceleration,
-        {"as recorded": of["acceleration_raw"], "over 1 s": of["acceleration_smoothed"]},
-    )
-    acceleration.legend(loc="upper right", fontsize=8)
     _draw_changes(changes, statistics)
-    title = "followers' headway: median (gap - 2 m) / speed"
-    headway.set(title=title, xlabel="s", xlim=(0.0, 6.0))
-    _draw_densities(headway, {"": of["headway"]})
-    time_headway.set(title="time headway: gap / speed", xlabel="s", xlim=(0.0, 8.0))
-    _draw_densities(time_headway, {"": of["time_headway"]})
-    gap.set(title="gap to the leader", xlabel="m", xlim=(0.0, 100.0))
-    _draw_densities(gap, {"": of["gap"]})
+    # The limit follows the data; a few outliers must not squeeze the rest.
+    fastest = min(60.0, 1.1 * statistics.sample("speed").max() + 1.0)
+    # Differences of measured positions are noisy; over 1 s the noise averages out.
+    accelerations = {"acceleration_raw": "as recorded", "acceleration_smoothed": "over 1 s"}
+    followers = "followers' headway: median (gap - 2 m) / speed"
+    for axes, title, unit, limits, names in (
+        (speed, "speed", "m/s", (0.0, fastest), {"speed": ""}),
+        (acceleration, "acceleration", "m/s²", (-5.0, 5.0), accelerations),
+        (headway, followers, "s", (0.0, 6.0), {"headway": ""}),
+        (time_headway, "time headway: gap / speed", "s", (0.0, 8.0), {"time_headway": ""}),
+        (gap, "gap to the leader", "m", (0.0, 100.0), {"gap": ""}),
+    ):
+        axes.set(title=title, xlabel=unit, ylabel=f"density, per {unit}", xlim=limits)
+        _draw_densities(axes, {names[name]: statistics.sample(name) for name in names})
+    acceleration.legend(loc="upper right", fontsize=8)
     return figure
 
 
-def _draw_densities(axes: Axes, histograms: Mapping[str, Histogram]) -> None:
+def _draw_densities(axes: Axes, samples: Mapping[str, FloatArray]) -> None:
     """Densities over the limits of the panel, and the share of the values beyond them."""
-    axes.set_ylabel(f"density, per {axes.get_xlabel()}")
-    for line, (label, histogram) in enumerate(histograms.items()):
-        middles, density = binned_density(histogram, *axes.get_xlim())
-        axes.plot(
-            middles,
-            density,
-            color=COLOURS[line],
-            label=label,
-        )
+    for line, (label, sample) in enumerate(samples.items()):
+        counts, edges = np.histogram(sample, _BINS, axes.get_xlim())
+        # By all values, those beyond the limits too, so densities of panels can be compared.
+        density = counts / (max(len(sample), 1) * (edges[1] - edges[0]))
+        axes.plot((edges[1:] + edges[:-1]) / 2, density, color=COLOURS[line], label=label)
         # What the panel cuts off is said in words, so that the curve is not taken for all of it.
-        beyond = 100.0 * (1.0 - float(np.sum(density)) * float(middles[1] - middles[0]))
-        if histogram.total and beyond >= 0.05:
+        beyond = 100.0 * (1.0 - counts.sum() / max(len(sample), 1))
+        if len(sample) and beyond >= 0.05:
             axes.text(
                 0.99,
                 0.6 - 0.1 * line,
@@ -64,25 +58,6 @@ def _draw_densities(axes: Axes, histograms: Mapping[str, Histogram]) -> None:
                 size=8,
                 transform=axes.transAxes,
             )
-
-
-def binned_density(
-    histogram: Histogram,
-    low: float,
-    high: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Middles of about 80 bins from ``low`` to ``high``, and the density there."""
-    edges = histogram.bins.edges
-    # Limits of the panel fall on edges of bins, except for rounding.
-    first, last = np.searchsorted(edges, (low - 1e-9, high - 1e-9))
-    # The histogram's own bins are finer.
-    merged = max(1, int(last - first) // 80)
-    number = int(last - first) // merged
-    counts = histogram.counts[first : first + number * merged].reshape(number, merged).sum(axis=1)
-    width = merged * float(edges[1] - edges[0])
-    middles = edges[first] + width * (np.arange(number) + 0.5)
-    # By all values, those beyond the limits too, so densities of panels can be compared.
-    return middles, counts / (max(histogram.total, 1) * width)
 
 
 def _draw_changes(axes: Axes, statistics: PooledStatistics) -> None:
@@ -111,11 +86,5 @@ def _draw_changes(axes: Axes, statistics: PooledStatistics) -> None:
         times, shares = survival_curve(changes.duration_s[those], changes.complete[those])
         # The curve begins at 1, before the first change ends.
         x, y = np.append(0.0, times), np.append(1.0, shares)
-        axes.step(
-            x,
-            y,
-            where="post",
-            color=colour,
-            label=label,
-        )
+        axes.step(x, y, where="post", color=colour, label=label)
     axes.legend(loc="upper right", fontsize=8)

@@ -10,10 +10,9 @@ from typing import Literal
 import numpy as np
 import polars as pl
 
-from ganlane import keys
+from ganlane.data.dense import track_table
 from ganlane.data.recordings import scene_csv, write_prepared
-from ganlane.data.schema import SCHEMA, TRACK_STRIDE, sort
-from ganlane.errors import UserError
+from ganlane.data.schema import TRACK_STRIDE, sort
 from ganlane.files import atomic_path
 from ganlane.view.record import Trajectory
 
@@ -27,12 +26,7 @@ def write_tracks(
     Parquet holds the schema (:mod:`ganlane.data.schema`) itself. In CSV, the form of recordings
     from elsewhere, the speed is called ``v``, lanes are counted from the left, from 1, and ``y`` is
     0 at the centre of lane 1. It has no lane width, and a rightmost lane without vehicles is lost.
-
-    Raises:
-        UserError: there is no episode, or one whose frames are not 0.1 s apart.
     """
-    if not trajectories:
-        raise UserError(f"format={format}: no episode to write; record at least one.")
     # The same driver, traffic, seed and episode may come twice; scenes need names of their own.
     times = Counter[str]()
     tables = []
@@ -55,27 +49,10 @@ def write_tracks(
 
 
 def to_tracks(trajectory: Trajectory, scene: str = "simulated") -> pl.DataFrame:
-    """The trajectory as a table in the schema of recordings; a recycled vehicle begins a new track.
-
-    Raises:
-        UserError: the frames are not 0.1 s apart.
-    """
-    # Recordings have rows this far apart, and what reads them relies on it.
-    if abs(trajectory.frame_s - keys.PHYSICS_STEP_S) > 1e-6:
-        raise UserError(
-            f"trajectory: its frames are {trajectory.frame_s:g} s apart, tracks need "
-            f"{keys.PHYSICS_STEP_S} s; record it at every physics step."
-        )
-    # A row for each vehicle that is on the road, frame by frame.
-    frame, vehicle = np.nonzero(trajectory.valid)
+    """The trajectory in the schema of recordings; a recycled vehicle begins a new track."""
+    # Numbers of later tracks lie a whole stride higher, so none is used twice.
     jumps = np.cumsum(trajectory.jumped(), axis=0)
-    columns = {
-        "scene": np.full(len(frame), scene),
-        # Numbers of later tracks lie a whole stride higher, so none is used twice.
-        "vehicle": vehicle + TRACK_STRIDE * jumps[frame, vehicle],
-        "frame": frame,
-        "lane": trajectory.lane()[frame, vehicle],
-    }
-    for name in ("x", "y", "speed", "length", "width"):
-        columns[name] = getattr(trajectory, name)[frame, vehicle]
-    return sort(pl.DataFrame({name: columns[name] for name in SCHEMA}, schema=SCHEMA))
+    numbers = np.arange(jumps.shape[1]) + TRACK_STRIDE * jumps
+    values = {name: getattr(trajectory, name) for name in ("x", "y", "speed", "length", "width")}
+    lane = trajectory.lane()
+    return sort(track_table(scene, trajectory.valid, vehicle=numbers, lane=lane, **values))

@@ -14,51 +14,34 @@ def recorded(steps, environments, seed):
     The observation is a serial number, and the one after a reset is another.
     """
     generator = torch.Generator().manual_seed(seed)
-    serial = 0.0
     current = torch.zeros(environments, 1)
     result = []
-    for _ in range(steps):
-        terminated = torch.rand(environments, 1, generator=generator) < 0.2
-        truncated = torch.rand(environments, 1, generator=generator) < 0.2
-        done = terminated | truncated
-        serial += 1.0
-        following = current * 0 + serial + torch.arange(environments)[:, None] / 100
+    for serial in range(1, steps + 1):
+        terminated, truncated = torch.rand(2, environments, 1, generator=generator) < 0.2
+        following = serial + torch.arange(environments)[:, None] / 100
         after = {
             "observation": following,
             "reward": torch.randn(environments, 1, generator=generator),
             "terminated": terminated,
             "truncated": truncated,
-            "done": done,
+            "done": terminated | truncated,
         }
         action = torch.randint(0, 3, (environments,), generator=generator)
-        step = TensorDict(
-            {
-                "observation": current,
-                "action": action,
-                "next": after,
-            },
-            [environments],
-        )
-        result.append(step)
-        current = torch.where(done, following + 0.5, following)
+        step = {"observation": current, "action": action, "next": after}
+        result.append(TensorDict(step, [environments]))
+        current = torch.where(after["done"], following + 0.5, following)
     return result
 
 
 def brute_force(steps, start, row, n, gamma):
-    reward = 0.0
-    length = 0
-    for step in steps[start : start + n]:
-        after = step["next"]
-        reward += gamma**length * float(after["reward"][row])
-        length += 1
-        if after["done"][row]:
+    """Reward, length, last observation and end of the steps from ``start``, each [1]."""
+    reward = torch.zeros(1)
+    for length, step in enumerate(steps[start : start + n], 1):
+        after = step["next"][row]
+        reward += gamma ** (length - 1) * after["reward"]
+        if after["done"]:
             break
-    return (
-        reward,
-        length,
-        after["observation"][row],
-        after["terminated"][row],
-    )
+    return reward, torch.tensor([float(length)]), after["observation"], after["terminated"]
 
 
 @settings(max_examples=30, deadline=None)
@@ -70,39 +53,14 @@ def test_each_transition_equals_the_loop_over_its_own_steps(n, environments, see
     transitions = [window.push(step) for step in steps]
     assert all(t is None for t in transitions[: n - 1])
     for start, transition in enumerate(transitions[n - 1 :]):
-        assert transition["steps_to_next_obs"].shape == (
-            environments,
-            1,
-        )
-        for row in range(environments):
-            reward, length, following, terminated = brute_force(steps, start, row, n, gamma)
-            assert torch.equal(
-                transition["observation"][row],
-                steps[start]["observation"][row],
-            )
-            assert transition["action"][row] == steps[start]["action"][row]
-            torch.testing.assert_close(
-                float(transition["next", "reward"][row]),
-                reward,
-                atol=1e-5,
-                rtol=1e-5,
-            )
-            assert transition["steps_to_next_obs"][row] == length
-            assert torch.equal(transition["next", "observation"][row], following)
-            assert transition["next", "terminated"][row] == terminated
-
-
-def test_a_saved_window_goes_on_as_if_nothing_had_happened():
-    steps = recorded(8, 3, 1)
-    whole = NStepWindow(3, 0.9)
-    first = NStepWindow(3, 0.9)
-    second = NStepWindow(3, 0.9)
-    expected = [whole.push(step) for step in steps][-1]
-    for step in steps[:4]:
-        first.push(step)
-    second.load_state_dict(first.state_dict())
-    actual = [second.push(step) for step in steps[4:]][-1]
-    assert (actual == expected).all()
+        expected = [brute_force(steps, start, row, n, gamma) for row in range(environments)]
+        rewards, lengths, following, terminated = map(torch.stack, zip(*expected))
+        torch.testing.assert_close(transition["next", "reward"], rewards, atol=1e-5, rtol=1e-5)
+        assert torch.equal(transition["steps_to_next_obs"], lengths)
+        assert torch.equal(transition["next", "observation"], following)
+        assert torch.equal(transition["next", "terminated"], terminated)
+        for name in ("observation", "action"):
+            assert torch.equal(transition[name], steps[start][name])
 
 
 def test_the_window_keeps_its_own_copy():

@@ -36,12 +36,8 @@ from benchmarks.peers.tolerance import (
     Largest,
     between,
     free_road_speed_mps,
-    slopes,
     tolerance,
-    unsettled_gap_m,
 )
-from ganlane.errors import UserError
-from ganlane.sim.idm import TABLE_V, IdmParameters
 from ganlane.sim.neighbours import FREE_GAP_M
 
 ROOT = Path(__file__).parents[2]
@@ -75,15 +71,6 @@ def test_the_plain_equations_drive_as_the_traffic_module_does(scene):
     )
 
 
-def test_on_a_free_road_the_schemes_give_one_speed_and_positions_that_half_a_step_tells_apart():
-    traces = {scheme: integrate(FREE_ROAD, scheme) for scheme in Scheme}
-    gained = traces[Scheme.BALLISTIC].speed - FREE_ROAD.speeds_mps[0]
-    for scheme in EULERS:
-        assert np.array_equal(traces[scheme].speed, traces[Scheme.BALLISTIC].speed)
-        ahead = traces[scheme].position - traces[Scheme.BALLISTIC].position
-        assert np.allclose(ahead, (scheme.value - 0.5) * 0.1 * gained, atol=1e-9)
-
-
 @pytest.mark.parametrize(
     "law", [LAW, Law(LENGTH_M, floored=False, reverses=True)], ids=["ganlane", "highway_env"]
 )
@@ -91,21 +78,6 @@ def test_a_platoon_at_the_equilibrium_gap_does_not_accelerate(law):
     for v in SETTLED_MPS:
         speed = np.array([v])
         assert abs(acceleration(speed, np.array([equilibrium_gap(v, law)]), speed, law)[0]) < 1e-12
-
-
-@pytest.mark.parametrize(
-    "law", [LAW, Law(LENGTH_M, floored=False, reverses=True)], ids=["ganlane", "highway_env"]
-)
-def test_slopes_are_the_derivatives_of_the_acceleration(law):
-    rng = np.random.default_rng(0)
-    at = rng.uniform([0.5, 3.0, 0.5], [24.0, 100.0, 24.0], (500, 3)).T
-    h, uncut = 1e-5, acceleration(*at, law) > TABLE_V.min_acceleration + 0.1
-    by = slopes(*at, law)
-    for i, slope in enumerate((by.speed, by.gap, by.leader)):
-        shift = np.zeros((3, 1))
-        shift[i] = h
-        numeric = (acceleration(*(at + shift), law) - acceleration(*(at - shift), law)) / (2 * h)
-        assert np.allclose(slope[uncut], numeric[uncut], rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("scheme", EULERS)
@@ -127,28 +99,14 @@ def test_another_driver_is_not_within_the_tolerance(offset_m):
     assert not within(between(other, trace), tolerance(trace, CONSTANT, Scheme.EXPLICIT_EULER))
 
 
-def test_what_has_not_settled_is_told_from_the_motion_left():
-    """A gap at which a car still closes in is as far from equilibrium as the acceleration says."""
-    gap, speed = equilibrium_gap(15.0) + 0.01, np.array([15.0, 15.0])
-    pull = acceleration(speed[1:], np.array([gap]), speed[:1])[0]
-    after = np.array([15.0, 15.0 + 0.1 * pull])
-    place = np.array([gap + LENGTH_M, 0.0])
-    allowed = unsettled_gap_m(Trace(np.stack((speed, after)), np.stack((place, place))))
-    assert 0.01 <= allowed <= 1.1 * MARGIN * 0.01
-
-
 def test_the_command_says_what_is_missing(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(
         simulators, "find_spec", lambda module: None if module == "libsumo" else object()
     )
     assert compare.main(["--out", str(tmp_path)]) == 2
-    assert (
-        capsys.readouterr().err
-        == "libsumo: not installed; pip install 'ganlane[bench]' brings the peers.\n"
-    )
+    told = "libsumo: not installed; pip install 'ganlane[bench]' brings the peers.\n"
+    assert capsys.readouterr().err == told
     assert not list(tmp_path.iterdir())
-    with pytest.raises(UserError, match="libsumo"):
-        simulators.require_peers()
 
 
 def test_the_page_shows_the_figures_that_stand_beside_it():
@@ -174,27 +132,19 @@ def title(value: Scene | simulators.Peer) -> str:
     return value.name.replace(" ", "_")
 
 
-each_peer = pytest.mark.parametrize("peer", simulators.PEERS, ids=title)
-each_scene = pytest.mark.parametrize("scene", SCENES, ids=title)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("scene", "peer"), SAME_LAW, ids=title)
-def test_a_peer_that_reads_the_model_as_we_do_drives_as_we_do(scene, peer):
-    """What the empty road's gap of 10 km costs is added: it is the one thing besides the scheme."""
-    slower = MARGIN * free_road_speed_mps(FREE_GAP_M) if scene is FREE_ROAD else 0.0
-    free = Largest(slower, 0.0, slower * scene.seconds)
-    allowed = Largest(*(a + b for a, b in zip(tolerance(mine(scene), scene, peer.scheme), free)))
-    assert within(between(theirs(scene, peer), mine(scene)), allowed)
-
-
-@pytest.mark.slow
-@each_peer
-@each_scene
+@pytest.mark.parametrize("peer", simulators.PEERS, ids=title)
+@pytest.mark.parametrize("scene", SCENES, ids=title)
 def test_the_scheme_and_the_reading_account_for_all_that_tells_a_peer_from_us(scene, peer):
     apart = compare.take_apart(scene, peer, mine(scene), theirs(scene, peer))
     assert within(apart.scheme, apart.allowed)
     assert within(apart.rest, ROUNDING)
+    if (scene, peer) in SAME_LAW:
+        # What the empty road's gap of 10 km costs is added: it is the one thing besides the scheme.
+        slower = MARGIN * free_road_speed_mps(FREE_GAP_M) if scene is FREE_ROAD else 0.0
+        free = Largest(slower, 0.0, slower * scene.seconds)
+        allowed = tolerance(mine(scene), scene, peer.scheme)
+        assert within(apart.direct, Largest(*map(sum, zip(allowed, free))))
 
 
 @pytest.mark.slow
@@ -210,25 +160,3 @@ def test_a_platoon_settles_at_the_equilibrium_gap(speed_mps, peer):
     assert platoon["away_m"] <= platoon["allowed_m"] <= 1e-5
     if not law.offset_m:
         assert platoon["gap_m"] == pytest.approx(equilibrium_gap(speed_mps), abs=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "peer", [peer for peer in simulators.PEERS if not peer.law.offset_m], ids=title
-)
-@pytest.mark.parametrize(
-    "other",
-    [
-        IdmParameters(headway_s=1.58),
-        IdmParameters(comfortable_deceleration=2.0),
-        IdmParameters(max_acceleration=0.72),
-    ],
-    ids=["headway", "deceleration", "acceleration"],
-)
-def test_a_peer_with_another_driver_is_found_out(other, peer):
-    """A headway 0.02 s shorter is more than the scheme may account for, and so are small changes of
-    the others.
-    """
-    need(peer.module)
-    sizes = between(peer.drive(CONSTANT, idm=other), mine(CONSTANT))
-    assert not within(sizes, tolerance(mine(CONSTANT), CONSTANT, peer.scheme))

@@ -39,12 +39,9 @@ def test_a_document_without_both_markers_once_and_in_order_is_refused_at_once(tm
     with pytest.raises(UserError, match=r"page\.md: expected the lines .* once each"):
         ReportSection(document, BEGIN, END)
     assert document.read_text() == text
-
-
-def test_a_missing_document_is_refused_and_not_made(tmp_path):
     with pytest.raises(UserError, match=r"gone\.md: no such file"):
         ReportSection(tmp_path / "gone.md", BEGIN, END)
-    assert list(tmp_path.iterdir()) == []
+    assert list(tmp_path.iterdir()) == [document]
 
 
 def test_the_result_is_printed_and_a_users_mistake_is_one_sentence_and_status_2(capsys):

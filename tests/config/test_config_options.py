@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
+from ganlane.__main__ import main
 from ganlane.config.help import help_text
 from ganlane.config.run import COMMANDS, settings
 from ganlane.errors import UserError
@@ -64,11 +65,15 @@ def test_every_traffic_is_an_option_under_its_own_name():
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_is_plain_text_and_gives_every_key_a_meaning(command):
+def test_help_is_plain_text_and_gives_every_key_a_meaning(command, capsys):
     text = help_text(command, COMMANDS[command][0])
+    assert main([command, "--help"]) == 0
+    assert capsys.readouterr().out == text + "\n"
     keys = text.partition("keys (KEY=VALUE")[2].partition("flags")[0]
     assert re.findall(r"^ +\w+: [^#\n]+$", keys, re.MULTILINE) == []
-    assert text.startswith("ganlane ")
+    assert text.startswith(f"ganlane {command}: ")
+    assert "seed: 0" in text
+    assert "exit status" in text
     assert not re.search(r":\w+:`|``", text)
 
 

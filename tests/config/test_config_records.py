@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -158,20 +159,11 @@ def test_a_record_is_made_again_from_its_plain_data(scene):
     assert make(EnvConfig, plain(env)) == env
 
 
-@pytest.mark.parametrize(
-    ("values", "told"),
-    [
-        (
-            {"timeout_s": 1e18},
-            "timeout_s=1e+18: expected a number above 0, at most 1000000, ",
-        ),
-        ({"goal_m": 100_001.0}, "goal_m=100001: expected a number above 0, at most 100000, "),
-        ({"goal_m": 0.0}, "goal_m=0: expected a number above 0"),
-    ],
-)
-def test_an_episode_ends_where_float32_still_counts(values, told):
-    with pytest.raises(ParameterError) as caught:
-        EpisodeParameters(**values)
-    assert told in str(caught.value).replace("}", "")
-    longest = EpisodeParameters(timeout_s=1e6, goal_m=1e5)
-    assert longest.most_decisions() == 1_000_000
+def test_an_episode_ends_where_float32_still_counts():
+    for told, values in (
+        ("timeout_s=1e+18: expected a number above 0, at most 1000000, ", {"timeout_s": 1e18}),
+        ("goal_m=100001: expected a number above 0, at most 100000, ", {"goal_m": 100_001.0}),
+    ):
+        with pytest.raises(ParameterError, match=re.escape(told)):
+            EpisodeParameters(**values)
+    assert EpisodeParameters(timeout_s=1e6, goal_m=1e5).most_decisions() == 1_000_000

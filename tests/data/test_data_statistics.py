@@ -7,8 +7,6 @@ import json
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from reference.refusals import user_error
 
 from ganlane.data import (
@@ -22,9 +20,7 @@ from ganlane.data import (
 )
 from ganlane.data.lanes import find_lane_changes
 from ganlane.data.statistics import (
-    Bins,
     DrivingStatistics,
-    Histogram,
     describe,
     describe_durations,
     driving_statistics,
@@ -215,35 +211,10 @@ def test_a_lone_lane_keeper_leaves_the_rest_open():
     ) == (0, None)
 
 
-@given(
-    st.lists(st.floats(-30.0, 30.0), min_size=2, max_size=300),
-    st.integers(1, 5),
-)
-def test_a_histogram_describes_a_sample_to_a_bins_width(values, parts):
-    # Values beyond the bins count in the outermost ones.
-    histogram = Histogram(Bins(-20.0, 20.0, 400))
-    for part in np.array_split(np.array(values), parts):
-        histogram.add(part)
-    described = histogram.describe()
-    exact = describe(values)
-    assert (described.count, described.mean) == (
-        exact.count,
-        pytest.approx(exact.mean, abs=1e-9),
-    )
-    assert described.sd == pytest.approx(exact.sd, abs=1e-5)
-    ordered = np.clip(np.sort(values), -20.0, 20.0)
-    for level in (0.25, 0.5, 0.95):
-        # Between the neighbours of the exact place, and a bin's width more.
-        at = level * len(ordered)
-        low = ordered[max(int(np.floor(at)) - 1, 0)]
-        high = ordered[min(int(np.ceil(at)), len(ordered) - 1)]
-        assert low - 0.1 - 1e-9 <= described.quantile(level) <= high + 0.1 + 1e-9
-
-
 def test_the_survival_curve_takes_censored_times_as_lower_bounds():
     # Worked by hand: of 5, one ends at 1 (4/5 are left), one is cut off at 2, of the other 3 one
     # ends at 3 (2/3 of 4/5), one is cut off at 4, the last ends at 5.
-    durations = [3.0, 1.0, 2.0, 5.0, 4.0], [True, True, False, True, False]
+    durations = np.array([3.0, 1.0, 2.0, 5.0, 4.0]), np.array([True, True, False, True, False])
     times, shares = survival_curve(*durations)
     assert times.tolist() == [1.0, 3.0, 5.0]
     assert shares == pytest.approx([0.8, 0.8 * 2 / 3, 0.0])
@@ -261,7 +232,7 @@ def test_the_survival_curve_takes_censored_times_as_lower_bounds():
 
 
 def test_durations_that_are_all_censored_have_no_mean():
-    durations = describe_durations([1.0, 2.0], [False, False])
+    durations = describe_durations(np.array([1.0, 2.0]), np.array([False, False]))
     assert (
         durations.censored,
         durations.survival_mean_s,
@@ -272,7 +243,8 @@ def test_durations_that_are_all_censored_have_no_mean():
         None,
     )
     # One seen and a longer one cut off: the curve stays at one half or above after the last end.
-    open_ended = describe_durations([1.0, 2.0, 2.5], [True, False, False])
+    times, complete = np.array([1.0, 2.0, 2.5]), np.array([True, False, False])
+    open_ended = describe_durations(times, complete)
     assert open_ended.survival_median_s is None
     assert open_ended.survival_mean_s == pytest.approx(1.0 + 1.5 * 2.0 / 3.0)
 
@@ -282,7 +254,6 @@ def test_a_sample_is_summed_up():
     assert (summary.count, summary.mean) == (101, 50.0)
     assert summary.quantile(0.05) == pytest.approx(5.0)
     assert summary.quantile(0.5) == pytest.approx(50.0)
-    assert Histogram(Bins(0.0, 1.0, 10)).describe() == describe([])
     assert describe([]).quantiles == ()
     assert describe([2.0]).sd is None
 

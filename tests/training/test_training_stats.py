@@ -7,66 +7,29 @@ from tensordict import TensorDict
 from ganlane.training.stats import EpisodeStats
 
 
-def step(
-    reward,
-    done,
-    crash=None,
-    goal=None,
-    distance=0.0,
-    lane_changes=0,
-    action=0,
-    value=None,
-):
+def step(reward, done, distance=0.0, lane_changes=0, action=0, value=None, **events):
     rows = len(reward)
-
-    def column(flags):
-        return torch.tensor(flags or [False] * rows)[:, None]
-
-    after = {
-        "reward": torch.tensor(reward)[:, None],
-        "done": column(done),
-        "events": {
-            "goal": column(goal),
-            "hard_crash": column(crash),
-        },
-        "ego": {
-            "distance": torch.full((rows,), distance),
-            "lane_changes": torch.full((rows,), lane_changes),
-        },
-    }
-    values = {} if value is None else {"chosen_action_value": torch.tensor(value)[:, None]}
-    return TensorDict(
-        {
-            "action": torch.full((rows,), action),
-            "next": after,
-            **values,
-        },
-        [rows],
-    )
+    no = [False] * rows
+    td = TensorDict(batch_size=[rows])
+    td["action"] = torch.full((rows,), action)
+    td["next", "reward"] = torch.tensor(reward)[:, None]
+    td["next", "done"] = torch.tensor(done)[:, None]
+    for name in ("hard_crash", "goal"):
+        td["next", "events", name] = torch.tensor(events.get(name, no))[:, None]
+    td["next", "ego", "distance"] = torch.full((rows,), distance)
+    td["next", "ego", "lane_changes"] = torch.full((rows,), lane_changes)
+    if value is not None:
+        td["chosen_action_value"] = torch.tensor(value)[:, None]
+    return td
 
 
 def test_returns_and_rates_are_those_of_the_finished_episodes():
     stats = EpisodeStats(2, 3, gamma=0.5)
+    crash = {"hard_crash": [True, False], "lane_changes": 3, "action": 2}
+    goal = {"goal": [False, True], "lane_changes": 1}
     stats.step(step([1.0, 10.0], [False, False], distance=500.0))
-    stats.step(
-        step(
-            [2.0, 20.0],
-            [True, False],
-            crash=[True, False],
-            distance=1000.0,
-            lane_changes=3,
-            action=2,
-        )
-    )
-    stats.step(
-        step(
-            [4.0, 40.0],
-            [True, True],
-            goal=[False, True],
-            distance=1000.0,
-            lane_changes=1,
-        )
-    )
+    stats.step(step([2.0, 20.0], [True, False], distance=1000.0, **crash))
+    stats.step(step([4.0, 40.0], [True, True], distance=1000.0, **goal))
     row = stats.read()
     assert row["episodes"] == 3
     assert row["mean_return"] == pytest.approx((3 + 4 + 70) / 3)
@@ -93,30 +56,10 @@ def test_update_figures_are_averaged():
 
 def test_what_an_environment_or_a_policy_does_not_write_has_no_column():
     stats = EpisodeStats(1, 2, gamma=1.0)
-    after = {
-        "reward": torch.ones(1, 1),
-        "done": torch.ones(1, 1, dtype=torch.bool),
-    }
-    stats.step(
-        TensorDict(
-            {
-                "action": torch.zeros(1, dtype=torch.int64),
-                "next": after,
-            },
-            [1],
-        )
-    )
-    means = {
-        "mean_return",
-        "mean_discounted_return",
-        "mean_return_to_go",
-    }
-    assert set(stats.read()) == {
-        "episodes",
-        "action_0_share",
-        "action_1_share",
-        *means,
-    }
+    written = step([1.0], [True]).select("action", ("next", "reward"), ("next", "done"))
+    stats.step(written)
+    means = {"mean_return", "mean_discounted_return", "mean_return_to_go"}
+    assert set(stats.read()) == {"episodes", "action_0_share", "action_1_share", *means}
 
 
 def test_returns_to_go_and_values_are_averaged_over_the_decisions_of_finished_episodes():
@@ -133,26 +76,3 @@ def test_returns_to_go_and_values_are_averaged_over_the_decisions_of_finished_ep
     # From the three decisions: 1 + 2/2 + 4/4, 2 + 4/2, 4.
     assert row["mean_return_to_go"] == pytest.approx((3.0 + 4.0 + 4.0) / 3.0)
     assert row["mean_value"] == pytest.approx(4.0)
-
-
-def test_the_return_to_go_agrees_with_a_sum_over_every_decision():
-    generator = torch.Generator().manual_seed(0)
-    gamma = 0.9
-    rows = 5
-    rewards = torch.randn(60, rows, generator=generator)
-    ends = torch.rand(60, rows, generator=generator) < 0.15
-    stats = EpisodeStats(rows, 2, gamma)
-    total = 0.0
-    count = 0
-    for reward, done in zip(rewards, ends):
-        stats.step(step(reward.tolist(), done.tolist()))
-    for row in range(rows):
-        begin = 0
-        for end in ends[:, row].nonzero().flatten().tolist():
-            episode = rewards[begin : end + 1, row].tolist()
-            total += sum(
-                gamma**i * r for start in range(len(episode)) for i, r in enumerate(episode[start:])
-            )
-            count = count + len(episode)
-            begin = end + 1
-    assert stats.read()["mean_return_to_go"] == pytest.approx(total / count, rel=1e-5)

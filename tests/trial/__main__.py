@@ -7,8 +7,8 @@
     python -m tests.trial soak --configurations 500 --minutes 40 --compiled 3
     python -m tests.trial soak --configuration 12               a configuration again
 
-Parts: kill (kill -9, signals, refused writes, then resumed to the same bits), damage (damaged
-files), misuse (of the API), soak (random configurations). Without a part's name all of them run.
+Parts: kill (kill -9, then resumed to the same bits), damage (damaged files), soak (random
+configurations). Without a part's name all of them run.
 Exits with 1 after a failure. Needs Linux.
 """
 
@@ -25,13 +25,12 @@ from benchmarks.script import ReportSection, add_report, make_parser, run_script
 
 from .damage import Trial, damage, good_files
 from .kill import kill
-from .misuse import misuse
 from .soak import once, soak
 from .tally import Tally
 
 MARKERS = "<!-- begin trial -->", "<!-- end trial -->"
 #: Parts, and their shares of the minutes.
-SHARES = {"kill": 6, "damage": 4, "misuse": 2, "soak": 8}
+SHARES = {"kill": 6, "damage": 4, "soak": 8}
 HEAD = "| part | tried | failed | minutes |\n|---|---|---|---|"
 
 
@@ -40,11 +39,9 @@ def run(part: str, options: argparse.Namespace, minutes: float, scratch: Path) -
     tally = Tally(part)
     begun = time.monotonic()
     if part == "kill":
-        kill(tally, options.runs, options.seed, minutes, scratch, options.only_kill)
+        kill(tally, options.runs, options.seed, minutes, scratch)
     elif part == "damage":
         damage(tally, options.inputs, options.seed, minutes, scratch)
-    elif part == "misuse":
-        misuse(tally, options.seed, minutes)
     else:
         soak(tally, options.configurations, options.seed, minutes, options.compiled)
     tally.seconds = time.monotonic() - begun
@@ -59,7 +56,6 @@ def parse() -> argparse.Namespace:
     add("--minutes", type=float, default=10.0, help="of all parts together, about")
     add("--seed", type=int, default=0)
     add("--runs", type=int, default=45, help="that kill disturbs")
-    add("--only-kill", action="store_true", help="kill -9 alone: no signals, no refused writes")
     add("--inputs", type=int, default=10_000, help="damaged files")
     add("--configurations", type=int, default=500, help="that soak drives")
     add("--compiled", type=int, default=0, help="of them compiled, a minute each before they drive")

@@ -19,7 +19,6 @@ from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any, NamedTuple
-from unittest.mock import patch
 
 import numpy as np
 import polars as pl
@@ -32,12 +31,7 @@ from ganlane.data import read_recordings, read_scenes, write_prepared, write_sce
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator.checkpoint import load_generator
-from ganlane.native import library
-from ganlane.native.batch import NativeBatch
-from ganlane.native.drivers import RuleDrivers
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
-from ganlane.runtime import has_compiler
-from ganlane.settings.driving import MobilParameters
 from ganlane.settings.generator import NgsimParameters
 from ganlane.sim.scene_files import read_scene
 from ganlane.training.logs import read_rows
@@ -94,48 +88,6 @@ def make_files(folder: Path) -> None:
     short = ["traffic=idm", "init=none", "total_decisions=192", f"hydra.run.dir={folder / 'run'}"]
     with redirect_stdout(io.StringIO()):
         assert train([*TINY, *short]) == 0
-    if has_compiler():
-        make_kernel(folder / "kernel")
-
-
-#: A compiler that compiles once and then makes the same library again, beside it.
-COMPILES_ONCE = """#!/bin/sh
-for last; do :; done
-[ "$last" = --version ] && exit
-[ -e "$0.so" ] || c++ "$@" && mv "$last" "$0.so"
-cp "$0.so" "$last"
-"""
-
-
-def make_kernel(folder: Path) -> None:
-    """A library of the native kernel (``library``) as it is in the cache, and its compiler."""
-    folder.mkdir()
-    compiler = folder / "compiler"
-    compiler.write_text(COMPILES_ONCE)
-    compiler.chmod(0o755)
-    (folder / "library").touch()
-    os.chdir(folder.parent)
-    _driven(folder / "library")
-    (built,) = (folder / "native").iterdir()
-    built.replace(folder / "library")
-    # The name stays: it follows from the compiler and the sources.
-    built.touch()
-
-
-def _driven(path: Path) -> Any:
-    """Two highways by the library at ``path`` or, where it is refused, by one built anew.
-
-    In the folder with the good files, so that the compiler has the same name.
-    """
-    with patch.dict(os.environ, GANLANE_CACHE=str(path.parent), CXX="kernel/compiler"):
-        for named in (path.parent / "native").glob("*.so"):
-            shutil.copy(path, named)
-        library._find.cache_clear()
-        batch = NativeBatch(2, drivers=RuleDrivers(mobil=MobilParameters()))
-        batch.start(0, [0, 1])
-        for action in (0, 1, 2):
-            batch.step(np.full(2, action))
-    return {"observation": batch.observation, **batch.reward_terms()}
 
 
 def _generator(path: Path) -> Any:
@@ -184,7 +136,6 @@ READERS = {
     "config.yaml": Reader("run/config.yaml", _resumed, TEXT, share=1),
     "metrics.csv, resumed": Reader("run/metrics.csv", read_rows, TEXT),
     "metrics.csv, drawn": Reader("run/metrics.csv", _curves, TEXT, share=1),
-    "native kernel": Reader("kernel/library", _driven, BYTES, True, 2),
     "histograms": Reader("reference.json", _reference, JSON, True),
     "scene CSV": Reader("scene.csv", read_scene, TEXT),
     "scene JSON": Reader("scene.json", read_scene, JSON),
@@ -203,8 +154,6 @@ def damage(tally: Tally, count: int, seed: int, minutes: float, scratch: Path) -
     end = time.monotonic() + 60.0 * minutes
     rng = random.Random(seed)
     names = [name for name, reader in READERS.items() for _ in range(reader.share)]
-    if not has_compiler():
-        names = [name for name in names if name != "native kernel"]
     for first in range(0, count, BATCH):
         numbers = range(first, min(first + BATCH, count))
         items = [(rng.choice(names), seed * 10**7 + number) for number in numbers]

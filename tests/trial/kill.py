@@ -8,7 +8,6 @@ process of its own, so ``kill -9`` of it is what it is to a user's run.
 from __future__ import annotations
 
 import csv
-import errno
 import json
 import os
 import random
@@ -56,10 +55,8 @@ SCHEMES = (
     [*TWO_PHASES, "traffic=gan_calibrated"],
     [*TWO_PHASES, "traffic=idm_faults", "agent.n_step=1", "mask=safe"],
 )
-#: Ways to end an attempt by kill -9, and the others.
-KILLS = ("kill -9", "kill -9 in the first second", "kill -9 in a write")
-SIGNALS = {"SIGTERM": signal.SIGTERM, "SIGINT": signal.SIGINT}
-FULL_DISK = "writes refused"
+#: Ways to end an attempt.
+WAYS = ("kill -9", "kill -9 in the first second", "kill -9 in a write")
 
 
 class Attempt(NamedTuple):
@@ -69,15 +66,12 @@ class Attempt(NamedTuple):
     said: str
 
 
-def kill(
-    tally: Tally, count: int, seed: int, minutes: float, scratch: Path, only_kill: bool = False
-) -> None:
+def kill(tally: Tally, count: int, seed: int, minutes: float, scratch: Path) -> None:
     """Disturb ``count`` runs, or as many as the minutes allow, each three times or more."""
     rng = random.Random(seed)
     end = time.monotonic() + 60.0 * minutes
     torch.set_num_threads(1)  # more must not exist before a fork
     train(["traffic=idm", "total_decisions=0"])  # refused, after Hydra was loaded
-    ways = KILLS if only_kill else (*KILLS, *SIGNALS, FULL_DISK)
     undisturbed: dict[int, tuple[Path, float]] = {}
     for number in range(count):
         if time.monotonic() > end:
@@ -94,7 +88,7 @@ def kill(
                 return
         folder = scratch / f"run-{number}"
         whole, wall_s = undisturbed[scheme]
-        history = disturb(tally, rng, arguments, folder, ways, wall_s)
+        history = disturb(tally, rng, arguments, folder, wall_s)
         told = f"{' '.join(arguments)}: {history}"
         if not (folder / "results.json").is_file():
             tally.fail(f"{told}: ended without results")
@@ -107,39 +101,26 @@ def kill(
 
 
 def disturb(
-    tally: Tally,
-    rng: random.Random,
-    arguments: list[str],
-    folder: Path,
-    ways: tuple[str, ...],
-    wall_s: float,
+    tally: Tally, rng: random.Random, arguments: list[str], folder: Path, wall_s: float
 ) -> list[str]:
     """Disturb a run three to five times, then leave it alone; what was done, in words."""
     log = folder.with_suffix(".log")
     history = []
-    for way in [*rng.choices(ways, k=rng.randint(3, 5)), "left alone"]:
+    for way in [*rng.choices(WAYS, k=rng.randint(3, 5)), "left alone"]:
         # As the user goes on: by resume where there is a checkpoint, else with the same command.
         started = any(folder.rglob("last.pt"))
         line = [f"resume={folder}"] if started else [*arguments, f"hydra.run.dir={folder}"]
-        prepare, after_s = None, None
         write, share = rng.randrange(20), rng.random()
-        if way == "kill -9 in a write":
-            prepare = torn_write(write, share)
-        elif way == FULL_DISK:
-            prepare = refused_writes(write)
-        elif way != "left alone":
+        prepare = torn_write(write, share) if way == "kill -9 in a write" else None
+        after_s = None
+        if prepare is None and way != "left alone":
             after_s = share * (1.0 if "first second" in way else wall_s)
         history.append(f"{way} (write {write}, share {share:.2f})")
-        attempt = run(line, log, prepare, after_s, SIGNALS.get(way, signal.SIGKILL))
+        attempt = run(line, log, prepare, after_s)
         if attempt.status == 0:
             break
-        number = SIGNALS.get(way, signal.SIGKILL)
-        expected = (2,) if way == FULL_DISK else (-number, 128 + number)
-        complaints = attempt.said.count("ganlane train: ")
-        if attempt.status not in expected or "Traceback" in attempt.said:
+        if attempt.status != -signal.SIGKILL or "Traceback" in attempt.said:
             tally.fail(f"{history}: status {attempt.status}: {attempt.said[-300:]}")
-        elif way == FULL_DISK and complaints != 1:
-            tally.fail(f"{history}: not one sentence: {attempt.said[-300:]}")
         else:
             tally.what[way] += 1
     return history
@@ -150,11 +131,10 @@ def run(
     log: Path,
     prepare: Callable[[], None] | None = None,
     after_s: float | None = None,
-    number: int = signal.SIGKILL,
 ) -> Attempt:
     """``ganlane train ARGUMENTS`` in a child, after ``prepare`` in it; how it ended.
 
-    It gets the signal ``number`` after ``after_s`` seconds, unless it has ended before.
+    It is killed after ``after_s`` seconds, unless it has ended before.
     """
     child = os.fork()
     if child == 0:
@@ -165,7 +145,7 @@ def run(
         time.sleep(0.002)
         ended, code = os.waitpid(child, os.WNOHANG)
         if ended == 0 and after_s is not None and time.monotonic() > begun + after_s:
-            os.kill(child, number)
+            os.kill(child, signal.SIGKILL)
             after_s = None
     said = log.read_text(errors="replace")
     if ended == 0:
@@ -193,24 +173,7 @@ def _train(arguments: list[str], log: Path, prepare: Callable[[], None] | None) 
 
 def torn_write(number: int, share: float) -> Callable[[], None]:
     """Makes a child kill itself in its write ``number``, with ``share`` of it on the disk."""
-    return _instead_of_fsync(number, lambda file: _tear(file, share))
 
-
-def _tear(file: int, share: float) -> None:
-    os.ftruncate(file, int(os.fstat(file).st_size * share))
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def refused_writes(first: int) -> Callable[[], None]:
-    """Makes a child's writes fail from this one on, as on a full disk."""
-
-    def refuse(file: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    return _instead_of_fsync(first, refuse)
-
-
-def _instead_of_fsync(first: int, act: Callable[[int], None]) -> Callable[[], None]:
     def prepare() -> None:
         fsync = os.fsync
         writes = 0
@@ -218,8 +181,9 @@ def _instead_of_fsync(first: int, act: Callable[[int], None]) -> Callable[[], No
         def counted(file: int) -> None:
             nonlocal writes
             writes += 1
-            if writes > first:
-                act(file)
+            if writes > number:
+                os.ftruncate(file, int(os.fstat(file).st_size * share))
+                os.kill(os.getpid(), signal.SIGKILL)
             fsync(file)
 
         os.fsync = counted

@@ -122,15 +122,6 @@ def test_padding_is_not_drawn():
     assert area(road_of(bare(scene)), tint) == 0
 
 
-def test_the_leader_line_ends_at_the_leader():
-    scene = straight([0, 50, 20], [1, 1, 2])
-    painter = FramePainter(scene, replace(BARE, leader_line=True))
-    drawn, row = painter.draw(0), round(float(painter.window.row(4.0)))
-    columns = np.nonzero(near(drawn[row], canvas.LEADER, 2))[0]
-    # From the ego's front to the rear of the leader: 45.5 m, the vehicle in the other lane is none.
-    assert len(columns) == pytest.approx(45.5 * 8, abs=4)
-
-
 @pytest.mark.parametrize("lanes", [1, 2, 5, 10])
 def test_any_number_of_lanes_fits_between_header_and_footer(lanes):
     window = Window(FilmConfig(), lanes, 4.0)

@@ -131,5 +131,3 @@ def test_a_page_is_written_whole(tmp_path):
     path = write_player([straight([0], [1])], tmp_path / "page.html")
     assert path.read_text(encoding="utf-8") == player_page([straight([0], [1])])
     assert [file.name for file in tmp_path.iterdir()] == ["page.html"]
-    with pytest.raises(UserError, match="no episode"):
-        write_player([], tmp_path / "none.html")

@@ -26,6 +26,9 @@ def straight(positions, lanes_of, frames=20, lanes=3, speed=20.0, outcome="", **
         "valid": full.astype(bool),
         "action": np.zeros(frames, np.int64),
         "returns": np.zeros(frames),
+        "action_values": np.full((frames, 3), np.nan),
+        "reward": np.full(frames, np.nan),
+        "soft_crash_s": np.empty(0),
     }
     return Trajectory(**{**fields, "outcome": outcome, **changed})
 

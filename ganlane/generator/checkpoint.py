@@ -1,4 +1,4 @@
-"""Fitted generators as files: weights with a description of the fit."""
+"""Fitted generators and policies as files: weights with a description of the fit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 
 from ganlane._version import __version__
 from ganlane.errors import UserError
-from ganlane.generator.human import HumanPolicy
+from ganlane.generator.human_estimator import HumanModel
 from ganlane.generator.networks import Generator
 from ganlane.settings.generator import (
     GENERATOR,
@@ -44,7 +44,7 @@ class FitResult:
     """
 
     config: FitConfig
-    module: Generator
+    module: Generator | HumanModel
     metrics: Metrics
     data: dict[str, Any]
     statistics: dict[str, Any]
@@ -80,7 +80,7 @@ class FitResult:
         }
         save_weights(
             path,
-            GENERATOR,
+            HUMAN if isinstance(self.module, HumanModel) else GENERATOR,
             self.module.state_dict(),
             metadata,
         )
@@ -114,8 +114,8 @@ def load_generator(
     return generator.eval().requires_grad_(False), metadata
 
 
-def load_human(path: str | Path) -> tuple[HumanPolicy, dict[str, Any]]:
-    """A policy of ``human`` in evaluation mode, without gradients, and its metadata.
+def load_human(path: str | Path) -> tuple[HumanModel, dict[str, Any]]:
+    """A model of ``human`` in evaluation mode, without gradients, and its metadata.
 
     Raises:
         UserError: no such file, another kind of file, or weights that do not fit the stored sizes.
@@ -127,10 +127,10 @@ def load_human(path: str | Path) -> tuple[HumanPolicy, dict[str, Any]]:
         if set(dict(sizes or {})) != names:
             raise ValueError("other names")
         with torch.random.fork_rng(devices=[]):
-            policy = HumanPolicy(HumanSizes(**sizes))  # type: ignore[arg-type]
-        policy.load_state_dict(tensors)
+            model = HumanModel(HumanSizes(**sizes))  # type: ignore[arg-type]
+        model.load_state_dict(tensors)
     except (RuntimeError, TypeError, ValueError) as error:
         raise UserError(
             f"{path}: its weights do not fit the sizes {sizes} of a human policy; fit it again."
         ) from error
-    return policy.eval().requires_grad_(False), metadata
+    return model.eval().requires_grad_(False), metadata

@@ -39,6 +39,8 @@ STRONGEST_ACCELERATION = 3.5
 #: Lateral speed per speed along the road, and its bound, m/s.
 STEEPEST = 0.12
 FASTEST_ASIDE_MPS = 2.0
+#: Time to the edge of the road, s, and what is kept from it, m.
+EDGE_S, EDGE_M = 0.8, 0.15
 #: A driver looks this far ahead for the lane that another one is entering, s.
 ANTICIPATION_S = 1.0
 #: Decisions after which a driver's age, and the time since its last lane change, count no more.
@@ -53,13 +55,13 @@ _MOST_LIKELY = 0.98
 class Tokens(NamedTuple):
     """Tokens of a change in physical units: dense around 0, sparse where changes are large.
 
-    ``scale`` is where the spacing begins to grow, ``most`` the outer tokens' value, ``count`` their
-    number. A value lies at ``asinh(value / scale)``, spaced evenly.
+    ``scale`` is where the spacing begins to grow, ``most`` the outer tokens' value, ``number`` how
+    many there are. A value lies at ``asinh(value / scale)``, spaced evenly.
     """
 
     scale: float
     most: float
-    count: int
+    number: int
 
     @property
     def reach(self) -> float:
@@ -67,18 +69,18 @@ class Tokens(NamedTuple):
         return math.asinh(self.most / self.scale)
 
     def centres(self, like: Tensor) -> Tensor:
-        """Values of the tokens [count]."""
-        return self.value(torch.arange(self.count, device=like.device).to(like.dtype))
+        """Values of the tokens [number]."""
+        return self.value(torch.arange(self.number, device=like.device).to(like.dtype))
 
     def value(self, index: Tensor) -> Tensor:
         """Value at a real-valued index."""
-        return self.scale * torch.sinh((index / (self.count - 1) * 2.0 - 1.0) * self.reach)
+        return self.scale * torch.sinh((index / (self.number - 1) * 2.0 - 1.0) * self.reach)
 
     def soft_target(self, value: Tensor, blur: float = 0.7) -> Tensor:
-        """A distribution over the tokens around ``value``, [..., count]."""
+        """A distribution over the tokens around ``value``, [..., number]."""
         place = torch.asinh(value / self.scale).clamp(-self.reach, self.reach)
-        index = (place / self.reach + 1.0) * 0.5 * (self.count - 1)
-        numbers = torch.arange(self.count, device=value.device).to(value.dtype)
+        index = (place / self.reach + 1.0) * 0.5 * (self.number - 1)
+        numbers = torch.arange(self.number, device=value.device).to(value.dtype)
         distance = (numbers - index[..., None]) / blur
         return torch.softmax(-0.5 * distance * distance, -1)
 
@@ -88,7 +90,7 @@ class Tokens(NamedTuple):
         """
         chance = torch.softmax(logits / temperature, -1)
         upper = chance.cumsum(-1)
-        token = (upper < u[..., None]).sum(-1).clamp_max(self.count - 1)
+        token = (upper < u[..., None]).sum(-1).clamp_max(self.number - 1)
         its_chance = chance.gather(-1, token[..., None])[..., 0].clamp_min(1e-9)
         its_upper = upper.gather(-1, token[..., None])[..., 0]
         within = ((u - (its_upper - its_chance)) / its_chance).clamp(0.0, 1.0) - 0.5
@@ -153,7 +155,7 @@ class Near(NamedTuple):
     """The nearest vehicles in the lanes to the right, the own one, to the left, [N, M, 3].
 
     Gap in m, speed less the own one in m/s, acceleration, place to the left in m, lateral speed,
-    whether there is one, and its index. Where nobody is, the gap is :data:`SIGHT_M` and the rest 0.
+    whether there is one, and which one. Where nobody is, the gap is :data:`SIGHT_M` and the rest 0.
     """
 
     gap: Tensor
@@ -162,7 +164,7 @@ class Near(NamedTuple):
     aside: Tensor
     lateral_speed: Tensor
     exists: Tensor
-    index: Tensor
+    which: Tensor
 
 
 def velocity(vehicles: Vehicles) -> tuple[Tensor, Tensor]:
@@ -252,8 +254,9 @@ def perceive(vehicles: Vehicles, memory: Memory, road: Road, sides: bool = True)
 def _only(near: Near, own: Tensor) -> Near:
     """Of the neighbours those in the ``own`` lane [3]."""
     exists = near.exists & own
-    numbers = [torch.where(own, number, 0.0) for number in near[1:5]]
-    return Near(torch.where(exists, near.gap, SIGHT_M), *numbers, exists, near.index)
+    names = ("closing", "acceleration", "aside", "lateral_speed")
+    numbers = {name: torch.where(own, getattr(near, name), 0.0) for name in names}
+    return near._replace(gap=torch.where(exists, near.gap, SIGHT_M), exists=exists, **numbers)
 
 
 def _own_state(
@@ -286,7 +289,7 @@ def _leader_of_leader(ahead: Near) -> list[Tensor]:
     """3 numbers: gap and closing speed between the leader and its own leader; what the leader
     does.
     """
-    leader = ahead.index[..., 1]
+    leader = ahead.which[..., 1]
     exists = ahead.exists[..., 1] & ahead.exists[..., 1].gather(1, leader)
     gap = torch.where(exists, ahead.gap[..., 1].gather(1, leader), SIGHT_M)
     closing = torch.where(exists, ahead.closing[..., 1].gather(1, leader), 0.0)
@@ -399,8 +402,8 @@ class HumanPolicy(nn.Module):
             nn.Linear(sizes.hidden, sizes.hidden),
             nn.SiLU(),
         )
-        self.along = nn.Linear(sizes.hidden, ALONG.count)
-        self.across = nn.Linear(sizes.hidden, ACROSS.count)
+        self.along = nn.Linear(sizes.hidden, ALONG.number)
+        self.across = nn.Linear(sizes.hidden, ACROSS.number)
         self.lane = nn.Sequential(
             nn.Linear(SIDE_FEATURES, sizes.lane_hidden),
             nn.SiLU(),
@@ -475,16 +478,23 @@ def with_style(memory: Memory, view: View, first: Tensor | None = None) -> Memor
 
 
 def bounded(
-    vehicles: Vehicles, memory: Memory, change: Tensor, aside: Tensor
+    vehicles: Vehicles, memory: Memory, road: Road, change: Tensor, aside: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Acceleration and lateral speed at the end of the decision, from their drawn changes."""
+    """Acceleration and lateral speed at the end of the decision, from their drawn changes.
+
+    Nobody rolls back, moves aside faster than a car can, or steers off the road: a body reaches the
+    edge in :data:`EDGE_S` at the soonest, and comes back from beyond it.
+    """
     speed, lateral = velocity(vehicles)
     acceleration = memory.accelerations[..., 0] + change
     acceleration = acceleration.clamp(HARDEST_BRAKING, STRONGEST_ACCELERATION)
-    # It stops, and never rolls back.
     acceleration = torch.maximum(acceleration, -speed / DECISION_S)
+    half = 0.5 * vehicles.width + EDGE_M
+    to_left = (road.left_edge_m() - vehicles.y - half) / EDGE_S
+    to_right = (vehicles.y - road.right_edge_m() - half) / EDGE_S
+    lateral = torch.maximum(torch.minimum(lateral + aside, to_left), -to_right)
     most = (STEEPEST * speed).clamp_max(FASTEST_ASIDE_MPS)
-    return acceleration, torch.minimum(torch.maximum(lateral + aside, -most), most)
+    return acceleration, torch.minimum(torch.maximum(lateral, -most), most)
 
 
 def remembered(

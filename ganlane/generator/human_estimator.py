@@ -14,9 +14,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import smooth_l1_loss
 
-from ganlane.generator.human import DECISION_S, STEPS
+from ganlane.generator.human import DECISION_S, STEPS, HumanPolicy
 from ganlane.generator.windows import OBSERVED_POSITIONS
 from ganlane.keys import PHYSICS_STEP_S
+from ganlane.settings.generator import HumanSizes
 
 if TYPE_CHECKING:
     from ganlane.generator.human_samples import SmoothScene
@@ -64,6 +65,16 @@ class Estimator(nn.Module):
         return level + scale * out
 
 
+class HumanModel(nn.Module):
+    """What a file of ``human`` holds: the policy, and the estimator for forecasts."""
+
+    def __init__(self, sizes: HumanSizes) -> None:
+        super().__init__()
+        self.sizes = sizes
+        self.policy = HumanPolicy(sizes)
+        self.estimator = Estimator()
+
+
 def roughness(positions: Tensor) -> Tensor:
     """How much speeds jitter from step to step, m/s, along and across, [..., 2]."""
     motion = positions.diff(dim=-2) / PHYSICS_STEP_S
@@ -75,10 +86,11 @@ def trust(positions: Tensor) -> Tensor:
     return 1.0 + 4.0 * torch.exp(-roughness(positions)[..., 0] / 0.15)
 
 
-def fit_estimator(scenes: Sequence[SmoothScene], random: torch.Generator) -> Estimator:
-    """The estimator of these scenes, which hold the recorded and the smoothed positions."""
+def fit_estimator(
+    estimator: Estimator, scenes: Sequence[SmoothScene], random: torch.Generator
+) -> None:
+    """Fit the estimator to these scenes, which hold the recorded and the smoothed positions."""
     raw, smooth, motion = _tracks(scenes)
-    estimator = Estimator()
     optimizer = torch.optim.Adam(estimator.parameters(), RATE)
     scales = torch.tensor(SCALES)
     for update in range(UPDATES):
@@ -100,7 +112,7 @@ def fit_estimator(scenes: Sequence[SmoothScene], random: torch.Generator) -> Est
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    return estimator.eval().requires_grad_(False)
+    estimator.requires_grad_(False)
 
 
 def _tracks(scenes: Sequence[SmoothScene]) -> tuple[Tensor, Tensor, Tensor]:

@@ -9,6 +9,7 @@ the lane) samples of IDM drivers with headways of their own stand in.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from ganlane.data.dense import Recording
 from ganlane.generator.human import (
     ACCELERATIONS,
     ACROSS,
@@ -26,7 +28,7 @@ from ganlane.generator.human import (
     see,
     with_velocity,
 )
-from ganlane.generator.human_estimator import Estimator
+from ganlane.generator.human_estimator import HumanModel, fit_estimator
 from ganlane.generator.human_samples import (
     DESIRED_MPS,
     Cut,
@@ -36,17 +38,21 @@ from ganlane.generator.human_samples import (
     cuts,
     joined,
     samples_of,
+    smooth_scene,
 )
+from ganlane.generator.human_tuning import Iteration, tune
 from ganlane.settings.driving import Visibility
 from ganlane.settings.generator import HumanConfig
 from ganlane.sim.idm import DriverIdm, following_acceleration
 from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.state import Road, Vehicles
 
-#: Says what the fit does, with its figures.
-Report = Callable[[str], None]
+#: Called with the steps made, of how many in all, and the last cost of the fine-tuning.
+Report = Callable[[int, int, float | None], None]
 #: Decisions of a segment: of whole scenes, and short ones, which begin more often as recorded.
 LONG_DECISIONS, SHORT_DECISIONS = 20, 5
+#: Weight of samples from files of one lane.
+ONE_LANE_WEIGHT = 0.5
 #: Random scenes of the prior, and vehicles in each.
 PRIOR_SCENES, PRIOR_VEHICLES = 9000, 8
 #: Samples of an update, and of the prior beside them.
@@ -86,47 +92,80 @@ def material_of(scenes: Sequence[SmoothScene], random: torch.Generator) -> Mater
     )
 
 
-def clone(
-    policy: HumanPolicy,
-    material: Material,
+def fit_human(
     config: HumanConfig,
-    random: torch.Generator,
-    report: Report,
+    recordings: Sequence[Recording],
+    following: Sequence[Recording] = (),
+    report: Report = lambda done, of, cost: None,
+) -> tuple[HumanModel, float]:
+    """Fit a model to ``recordings`` of several lanes and to cars ``following`` each other in one.
+
+    Returns:
+        The model, in evaluation mode, and the seconds that it took.
+    """
+    begun = time.monotonic()
+    random = torch.Generator().manual_seed(config.seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        model = HumanModel(config.sizes)
+    cutoffs = config.cutoff_hz, config.lateral_cutoff_hz
+    scenes = [smooth_scene(recording, *cutoffs) for recording in recordings]
+    fit_estimator(model.estimator, scenes, random)
+    if config.following:
+        scenes += [smooth_scene(one, *cutoffs, ONE_LANE_WEIGHT) for one in following]
+    material = material_of(scenes, random)
+    steps = 1 + config.rounds + config.tuning
+    teacher = clone(model.policy, material, config, random)
+    report(1, steps, None)
+
+    def after_round(number: int) -> None:
+        report(1 + number, steps, None)
+
+    close_the_loop(model, material, teacher, config, random, after_round)
+
+    def after_iteration(iteration: Iteration) -> None:
+        report(1 + config.rounds + iteration.number, steps, iteration.cost)
+
+    tune(model.policy, teacher, material.danger, config, random, after_iteration)
+    return model.eval().requires_grad_(False), time.monotonic() - begun
+
+
+def clone(
+    policy: HumanPolicy, material: Material, config: HumanConfig, random: torch.Generator
 ) -> Samples:
     """Fit ``policy`` to what recorded drivers did; gives the teacher samples."""
     samples = _gathered(material, Options(), config, random, times=3)
-    for part, rate in ((1, config.learning_rate), (2, 0.5 * config.learning_rate)):
-        loss = train_moves(policy, samples, material.prior, config.epochs // 2, rate, random)
-        report(f"cloning {part} of 2: {len(samples.features)} samples, loss {loss:.3f}")
+    moves = _moves(samples, slice(None))
+    for rate in (config.learning_rate, 0.5 * config.learning_rate):
+        train_moves(policy, moves, material.prior, max(1, config.epochs // 2), rate, random)
     train_lane_choice(policy, samples, material.danger, random)
     return samples
 
 
 def close_the_loop(
-    policy: HumanPolicy,
-    estimator: Estimator,
+    model: HumanModel,
     material: Material,
     teacher: Samples,
     config: HumanConfig,
     random: torch.Generator,
-    report: Report,
+    report: Callable[[int], None],
 ) -> None:
     """Rounds of closed-loop samples; the last two rounds and as many teacher samples count."""
-    bank: list[Samples] = []
+    bank: list[tuple[Tensor, ...]] = []
+    options = Options(model.policy, samples=config.samples)
+    noisy = options._replace(estimator=model.estimator)
     for number in range(config.rounds):
-        options = Options(policy, samples=config.samples)
         parts = _gathered(material, options, config, random, times=2)
-        noisy = options._replace(estimator=estimator)
         short = samples_of(material.short, noisy, random)
-        bank = [*bank[-1:], joined([parts, short])]
-        rows = torch.randperm(len(teacher.features), generator=random)
-        old = _moves(teacher, rows[: len(bank[-1].features)])
-        mixed = [_moves(samples, slice(None)) for samples in bank]
+        bank = [*bank[-1:], _moves(joined([parts, short]), slice(None))]
+        rows = torch.randperm(len(teacher.features), generator=random)[: len(bank[-1][0])]
+        mixed = [_moves(teacher, rows), *bank]
+        moves = tuple(torch.cat(tensors) for tensors in zip(*mixed))
+        # From half of the cloning's rate down to a sixth of it.
         rate = 0.5 * config.learning_rate * (1.0 - 0.7 * number / max(1, config.rounds - 1))
-        epochs = max(2, config.epochs // 3)
-        joint = tuple(torch.cat(tensors) for tensors in zip(old, *mixed))
-        loss = _descend(policy, joint, material.prior, epochs, rate, random)
-        report(f"closed loop {number + 1} of {config.rounds}: {len(joint[0])} samples, {loss:.3f}")
+        epochs = max(1, config.epochs // 3)
+        train_moves(model.policy, moves, material.prior, epochs, rate, random)
+        report(number + 1)
 
 
 def _gathered(
@@ -160,24 +199,13 @@ def move_losses(policy: HumanPolicy, moves: Sequence[Tensor]) -> Tensor:
 
 def train_moves(
     policy: HumanPolicy,
-    samples: Samples,
-    prior: Samples,
-    epochs: int,
-    rate: float,
-    random: torch.Generator,
-) -> float:
-    """Fit the moves to ``samples``; gives the mean loss of the last updates."""
-    return _descend(policy, _moves(samples, slice(None)), prior, epochs, rate, random)
-
-
-def _descend(
-    policy: HumanPolicy,
     moves: Sequence[Tensor],
     prior: Samples,
     epochs: int,
     rate: float,
     random: torch.Generator,
-) -> float:
+) -> None:
+    """Fit the distributions to ``moves`` (:func:`_moves`), with the prior's beside them."""
     parts = (policy.trunk, policy.along, policy.across)
     parameters = [parameter for part in parts for parameter in part.parameters()]
     optimizer = torch.optim.AdamW(parameters, lr=rate, weight_decay=1e-3, fused=True)
@@ -189,7 +217,6 @@ def _descend(
         return min(1.0, (update + 1) / 100) * 0.5 * (1.0 + math.cos(math.pi * update / updates))
 
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, share)
-    losses = []
     for _ in range(epochs):
         for batch in torch.randperm(rows, generator=random).split(BATCH):
             also = torch.randint(
@@ -205,9 +232,6 @@ def _descend(
             nn.utils.clip_grad_norm_(parameters, 5.0)
             optimizer.step()
             schedule.step()
-            losses.append(float(loss.detach()))
-    last = losses[-200:]
-    return sum(last) / len(last)
 
 
 def train_lane_choice(
@@ -249,9 +273,7 @@ def train_lane_choice(
 
 
 @torch.no_grad()
-def prior_samples(
-    random: torch.Generator, scenes: int = PRIOR_SCENES
-) -> tuple[Samples, Tensor]:
+def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[Samples, Tensor]:
     """IDM drivers with headways of their own where recordings show nothing, and lane changes into
     danger [D, SIDE_FEATURES].
     """
@@ -333,15 +355,11 @@ def prior_samples(
     return samples, dangerous_sides(vehicles, view.sides, view.exists, road)
 
 
-def dangerous_sides(
-    vehicles: Vehicles, sides: Tensor, exists: Tensor, road: Road
-) -> Tensor:
+def dangerous_sides(vehicles: Vehicles, sides: Tensor, exists: Tensor, road: Road) -> Tensor:
     """The sides [D, SIDE_FEATURES] to which a change would leave less than 2 m, or ask for more
     than 2.5 m/s2.
     """
     _, ahead, behind = see(vehicles, road)
-    narrow = [
-        torch.minimum(ahead.gap[..., side], behind.gap[..., side]) < 2.0 for side in (2, 0)
-    ]
+    narrow = [torch.minimum(ahead.gap[..., side], behind.gap[..., side]) < 2.0 for side in (2, 0)]
     hard = (sides[..., 9] > 2.5) | (sides[..., 10] > 2.5)
     return sides[(hard | torch.stack(narrow, -1)) & exists]

@@ -17,7 +17,6 @@ from ganlane.generator.human import (
     ALONG,
     DECISION_S,
     STEPS,
-    HumanPolicy,
     Memory,
     bounded,
     chosen,
@@ -30,7 +29,7 @@ from ganlane.generator.human import (
     with_style,
     with_velocity,
 )
-from ganlane.generator.human_estimator import Estimator, trust
+from ganlane.generator.human_estimator import Estimator, HumanModel, trust
 from ganlane.generator.human_samples import DESIRED_MPS, LONG_AGO
 from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT, SceneTracks, Segments
 from ganlane.keys import PHYSICS_STEP_S
@@ -98,8 +97,7 @@ def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memo
 
 @torch.no_grad()
 def human_forecasts(
-    policy: HumanPolicy,
-    estimator: Estimator,
+    model: HumanModel,
     scenes: list[SceneTracks],
     horizon: int,
     stride: int,
@@ -109,7 +107,7 @@ def human_forecasts(
     random = torch.Generator().manual_seed(0)
 
     def driver(segments: Segments) -> Tensor:
-        return _driven(policy, estimator, segments, horizon, samples, random)
+        return _driven(model, segments, horizon, samples, random)
 
     forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
     # The recording takes the same way, so that its windows come in the same order.
@@ -118,16 +116,16 @@ def human_forecasts(
 
 
 def _driven(
-    policy: HumanPolicy,
-    estimator: Estimator,
+    model: HumanModel,
     segments: Segments,
     horizon: int,
     samples: int,
     random: torch.Generator,
 ) -> Tensor:
     """Positions [1 + samples, B, horizon, V, 2]; the first are the mean driver's."""
+    policy = model.policy
     runs, rows = 1 + samples, len(segments.positions)
-    vehicles, memory, road = present_of(estimator, segments.repeated(runs))
+    vehicles, memory, road = present_of(model.estimator, segments.repeated(runs))
     mean = torch.zeros_like(vehicles.valid)
     mean[:rows] = True
     temperature = HumanTrafficConfig.temperature
@@ -149,7 +147,7 @@ def _driven(
             u = torch.rand(mean.shape, generator=random)
             drawn = tokens.sample(logits, u, temperature)
             changes.append(torch.where(mean, tokens.mean(logits), drawn))
-        acceleration, aside = bounded(vehicles, memory, *changes)
+        acceleration, aside = bounded(vehicles, memory, road, *changes)
         speed, lateral = velocity(vehicles)
         # Within a decision: constant acceleration, the lateral speed changing evenly.
         half = 0.5 * steps[:, None, None] ** 2

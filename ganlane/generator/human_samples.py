@@ -190,14 +190,20 @@ class Segments(NamedTuple):
     length: Tensor
     width: Tensor
     driven: Tensor
-    road: Road
+    lanes: Tensor
+    lane_width_m: Tensor
     two_dimensional: Tensor
     weight: Tensor
 
+    @property
+    def road(self) -> Road:
+        """One road per segment."""
+        return Road(self.lanes, self.lane_width_m)
+
     def mirrored(self) -> Segments:
         """Left and right swapped."""
-        last = self.road.lanes - 1
-        left = (last * self.road.lane_width_m)[:, None]
+        last = self.lanes - 1
+        left = (last * self.lane_width_m)[:, None]
         target = last[:, None].long() - self.target
         return self._replace(
             y=torch.where(self.present, left - self.y, self.y),
@@ -215,12 +221,11 @@ class Segments(NamedTuple):
     def widened(self, factor: Tensor) -> Segments:
         """Lanes and lateral moves times ``factor`` [B, 1]."""
         by = factor[:, None]
-        road = Road(self.road.lanes, self.road.lane_width_m * factor)
         return self._replace(
             y=self.y * by,
             raw_y=self.raw_y * by,
             lateral_speed=self.lateral_speed * by,
-            road=road,
+            lane_width_m=self.lane_width_m * factor,
         )
 
 
@@ -291,7 +296,8 @@ def segments_of(stretches: Sequence[Cut]) -> Segments:
     tensors = {name: torch.from_numpy(array) for name, array in (arrays | of_vehicle).items()}
     return Segments(
         **tensors,
-        road=Road(column("lanes", torch.float32), column("lane_width_m", torch.float32)),
+        lanes=column("lanes", torch.float32),
+        lane_width_m=column("lane_width_m", torch.float32),
         two_dimensional=column("two_dimensional", torch.bool),
         weight=column("weight", torch.float32),
     )
@@ -378,8 +384,8 @@ def joined(parts: Sequence[Samples]) -> Samples:
 class Options(NamedTuple):
     """How samples are cut.
 
-    ``policy`` drives, if given, by the nearest of ``samples`` moves; with an ``estimator`` it begins
-    from what nine noisy positions show. ``vary``: mirror and widen; ``scale``: lengthen by up to
+    ``policy`` drives, if given, by the nearest of ``samples`` moves; with an ``estimator``, from
+    where nine noisy positions show it. ``vary``: mirror and widen; ``scale``: lengthen by up to
     this share; ``blind``: share of batches without side lanes.
     """
 
@@ -400,7 +406,6 @@ def samples_of(stretches: Sequence[Cut], options: Options, random: torch.Generat
 def _samples(segments: Segments, options: Options, random: torch.Generator) -> Samples:
     """Samples of one batch."""
     s = varied(segments, options, random)
-    rows = len(s.x)
     top = torch.where(s.present, s.speed, 0.0).amax(1)
     above = DESIRED_ABOVE_MPS * torch.rand(top.shape, generator=random)
     desired = (top + above).clamp(*DESIRED_MPS)
@@ -439,11 +444,10 @@ def _samples(segments: Segments, options: Options, random: torch.Generator) -> S
         if options.policy is not None:
             change, aside = _nearest_move(options, view, change, aside, random)
             aside = torch.where(s.two_dimensional, aside, 0.0)
-        acceleration, lateral = bounded(vehicles, memory, change, aside)
+        acceleration, lateral = bounded(vehicles, memory, s.road, change, aside)
         after = remembered(vehicles, memory, view, acceleration, vehicles.target_lane)
         vehicles = moved(vehicles, acceleration, lateral)
         memory = after
-    assert rows
     return joined(parts)
 
 
@@ -509,9 +513,7 @@ def _taken(memory: Memory, other: Memory, where: Tensor) -> Memory:
     )
 
 
-def _led_back(
-    s: Segments, now: int, vehicles: Vehicles, memory: Memory
-) -> tuple[Tensor, Tensor]:
+def _led_back(s: Segments, now: int, vehicles: Vehicles, memory: Memory) -> tuple[Tensor, Tensor]:
     """Changes of acceleration and lateral speed that follow the recording, or lead back to it."""
     speed, lateral = velocity(vehicles)
     recorded_acceleration = (s.speed[:, now + STEPS] - s.speed[:, now]) / DECISION_S
@@ -533,8 +535,10 @@ def _nearest_move(
     nearest = []
     for tokens, its_logits, wanted in zip((ALONG, ACROSS), logits, (change, aside)):
         shape = (options.samples, *wanted.shape)
-        drawn = tokens.sample(its_logits.expand(options.samples, *its_logits.shape),
-                              torch.rand(shape, generator=random))
+        drawn = tokens.sample(
+            its_logits.expand(options.samples, *its_logits.shape),
+            torch.rand(shape, generator=random),
+        )
         best = (drawn - wanted).abs().argmin(0, keepdim=True)
         nearest.append(drawn.gather(0, best)[0])
     return nearest[0], nearest[1]

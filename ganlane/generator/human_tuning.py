@@ -156,17 +156,13 @@ def _flat(decisions: Decisions) -> Decisions:
     """The decisions of valid drivers, [R, ...]."""
     which = decisions.valid
     choice = LaneChoice(*(number[which] for number in decisions.choice))
-    others = {
-        name: value[which] for name, value in decisions._asdict().items() if name != "choice"
-    }
+    others = {name: value[which] for name, value in decisions._asdict().items() if name != "choice"}
     return Decisions(choice=choice, **others)
 
 
 def _rows(decisions: Decisions, rows: Tensor) -> Decisions:
     choice = LaneChoice(*(number[rows] for number in decisions.choice))
-    others = {
-        name: value[rows] for name, value in decisions._asdict().items() if name != "choice"
-    }
+    others = {name: value[rows] for name, value in decisions._asdict().items() if name != "choice"}
     return Decisions(choice=choice, **others)
 
 
@@ -217,9 +213,7 @@ def _policy_loss(
     gain = torch.minimum(ratio * advantage, bounded_ratio * advantage).mean()
     with torch.no_grad():
         theirs = _log_chances(reference, decisions)
-    apart = [
-        (mine.exp() * (mine - other)).sum(-1).mean() for mine, other in zip(chances, theirs)
-    ]
+    apart = [(mine.exp() * (mine - other)).sum(-1).mean() for mine, other in zip(chances, theirs)]
     return -gain + pull * (apart[0] + apart[1]) + LANE_PULL * apart[2]
 
 
@@ -275,7 +269,7 @@ def drive(
             jitter = torch.rand(token.shape, generator=random) - 0.5
             tokens.append(token)
             changed.append(axis.value(token + jitter))
-        acceleration, aside = bounded(vehicles, memory, changed[0], changed[1])
+        acceleration, aside = bounded(vehicles, memory, road, changed[0], changed[1])
         seen = Decisions(
             features=view.features,
             choice=choice,

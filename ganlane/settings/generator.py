@@ -322,7 +322,7 @@ class HumanConfig(FitConfig):
     samples: Annotated[int, between(1, 100)] = 6
     learning_rate: Positive = 2e-3
     # in simulation
-    tuning: CountOrZero = 80
+    tuning: CountOrZero = 150
     pull: NotNegative = 0.15
     changes_per_h: Positive | None = None
 

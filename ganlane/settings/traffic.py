@@ -195,7 +195,7 @@ class GanCalibratedTrafficConfig(TrafficConfig):
 
 @dataclass(frozen=True)
 class HumanTrafficConfig(TrafficConfig):
-    """``traffic=human``: drivers of a policy fitted to recorded ones (:mod:`ganlane.traffic.human`).
+    """``traffic=human``: a policy fitted to recorded drivers (:mod:`ganlane.traffic.human`).
 
     Attributes:
         path: weights of the preset 'human'; null: the ones that ship.

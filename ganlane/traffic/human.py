@@ -151,7 +151,7 @@ class HumanTraffic(TrafficModule):
         along, across = policy(view.features)
         change = ALONG.sample(along, u[0], self.temperature)
         aside = ACROSS.sample(across, u[1], self.temperature)
-        acceleration, lateral = bounded(vehicles, driver, change, aside)
+        acceleration, lateral = bounded(vehicles, driver, self.road, change, aside)
         driver = remembered(vehicles, driver, view, acceleration, target)
         return vehicles, {
             **driver._asdict(),

@@ -162,8 +162,8 @@ def human_traffic(
     Raises:
         UserError: the weights are missing or foreign.
     """
-    policy, _ = load_human(path or shipped_generator("human"))
-    return HumanTraffic(policy, road, stream, temperature)
+    model, _ = load_human(path or shipped_generator("human"))
+    return HumanTraffic(model.policy, road, stream, temperature)
 
 
 def _fitted(generator: Generator, metadata: Mapping[str, Any], source: object) -> FittedGenerator:

@@ -7,7 +7,7 @@ from copy import copy
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from ganlane.build import make_road, make_traffic
 from ganlane.data.dense import units_of
@@ -59,7 +59,8 @@ from ganlane.traffic import TrafficModule
 from ganlane.weights import load_weights
 
 #: Preset of the weights that a traffic drives with.
-PRESETS: Final[Mapping[str, Preset]] = {
+PRESETS: Final[Mapping[str, Preset | Literal["human"]]] = {
+    "human": "human",
     "gan": "paper",
     "gan_calibrated": "calibrated",
 }

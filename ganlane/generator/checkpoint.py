@@ -80,7 +80,7 @@ class FitResult:
         }
         save_weights(
             path,
-            HUMAN if isinstance(self.module, HumanModel) else GENERATOR,
+            GENERATOR,
             self.module.state_dict(),
             metadata,
         )
@@ -118,9 +118,13 @@ def load_human(path: str | Path) -> tuple[HumanModel, dict[str, Any]]:
     """A model of ``human`` in evaluation mode, without gradients, and its metadata.
 
     Raises:
-        UserError: no such file, another kind of file, or weights that do not fit the stored sizes.
+        UserError: no such file, another kind of file or preset, or weights that do not fit the
+            stored sizes.
     """
-    tensors, metadata = load_weights(path, HUMAN)
+    tensors, metadata = load_weights(path, GENERATOR)
+    stored = str(metadata.get("preset"))
+    if stored != HUMAN:
+        raise UserError(f"{path}: a generator of preset {stored!r}, expected 'human'; give one.")
     sizes = metadata.get("sizes")
     names = {field.name for field in fields(HumanSizes)}
     try:

@@ -22,7 +22,7 @@ from sklearn.model_selection import GroupKFold
 from ganlane.data import TRACK, driving_statistics
 from ganlane.data.dense import Recording
 from ganlane.errors import UserError
-from ganlane.generator.checkpoint import FitResult, Metrics
+from ganlane.generator.checkpoint import FitResult, Metrics, load_human
 from ganlane.generator.forecasts import (
     BASELINE,
     SAMPLES,
@@ -60,13 +60,14 @@ from ganlane.generator.windows import (
     scene_tracks,
 )
 from ganlane.settings.generator import (
+    GENERATOR,
     HUMAN,
     CalibratedConfig,
     HumanConfig,
     HumanSizes,
     PaperConfig,
 )
-from ganlane.weights import load_weights, save_weights
+from ganlane.weights import save_weights
 
 NetworkConfig = PaperConfig | CalibratedConfig
 Config = NetworkConfig | HumanConfig
@@ -256,11 +257,8 @@ def _run_human(
     key = f"{config.preset}_{fit_key(config, split)}_{len(following)}"
     path = None if folder is None else folder / f"{key}.safetensors"
     if path is not None and path.exists():
-        tensors, metadata = load_weights(path, HUMAN)
-        model = HumanModel(config.sizes)
-        model.load_state_dict(tensors)
-        task = HumanTask(config, model.eval().requires_grad_(False))
-        return Fitted(task, metadata["steps"], metadata["seconds"])
+        model, metadata = load_human(path)
+        return Fitted(HumanTask(config, model), metadata["steps"], metadata["seconds"])
     begun = time.monotonic()
     best = math.inf
 
@@ -277,8 +275,9 @@ def _run_human(
     model, seconds = fit_human(config, recordings, following, report)
     steps = 1 + config.rounds + config.tuning
     if path is not None:
-        metadata = {"steps": steps, "seconds": seconds, "sizes": asdict(config.sizes)}
-        save_weights(path, HUMAN, model.state_dict(), metadata)
+        metadata = {"preset": HUMAN, "sizes": asdict(config.sizes)}
+        metadata |= {"steps": steps, "seconds": seconds}
+        save_weights(path, GENERATOR, model.state_dict(), metadata)
     return Fitted(HumanTask(config, model), steps, seconds)
 
 

@@ -103,11 +103,21 @@ def fit_human(
     Returns:
         The model, in evaluation mode, and the seconds that it took.
     """
-    begun = time.monotonic()
-    random = torch.Generator().manual_seed(config.seed)
+    # Networks draw their first weights from torch's own generator, which stays the caller's.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        model = HumanModel(config.sizes)
+        return _fitted(config, recordings, following, report)
+
+
+def _fitted(
+    config: HumanConfig,
+    recordings: Sequence[Recording],
+    following: Sequence[Recording],
+    report: Report,
+) -> tuple[HumanModel, float]:
+    begun = time.monotonic()
+    random = torch.Generator().manual_seed(config.seed)
+    model = HumanModel(config.sizes)
     cutoffs = config.cutoff_hz, config.lateral_cutoff_hz
     scenes = [smooth_scene(recording, *cutoffs) for recording in recordings]
     fit_estimator(model.estimator, scenes, random)

@@ -30,10 +30,10 @@ from ganlane.settings.record import (
 )
 
 Preset = Literal["paper", "calibrated"]
+#: The preset that is no Social-GAN but a policy.
+HUMAN = "human"
 #: Kind of their files; weights of another kind, such as an agent's, are refused by it.
 GENERATOR = "generator"
-#: Kind of the files of ``human``.
-HUMAN = "human"
 #: Inputs of the calibrated preset in addition to the motion: IDM's acceleration, gap, closing
 #: speed, lane offset.
 EXTRA_INPUTS = 4

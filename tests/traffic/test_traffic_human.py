@@ -11,7 +11,6 @@ from ganlane.generator import shipped_generator
 from ganlane.generator.human import STEPS
 from ganlane.sim.random import episode_key
 from ganlane.sim.spawn import spawn
-from ganlane.sim.state import Road
 from ganlane.traffic.presets import human_traffic
 
 
@@ -20,7 +19,7 @@ def drive(episodes, steps, dtype=torch.float32):
     traffic = human_traffic()
     episode = torch.tensor(episodes)
     key = episode_key(traffic.stream, torch.zeros_like(episode), episode)
-    vehicles = spawn(key, 9, Road(), dtype=dtype)
+    vehicles = spawn(key, 9, 3, 4.0, dtype=dtype)
     memory = traffic.fresh_memory(vehicles, key)
     course = []
     for step in range(steps):

@@ -77,7 +77,7 @@ def wheel(tmp_path_factory):
     return Path(path)
 
 
-def test_the_wheel_holds_configuration_weights_and_kernel_and_is_below_5_mb(wheel):
+def test_the_wheel_holds_configuration_weights_and_kernel_and_is_below_5_5_mb(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     conf = ROOT / "conf"
     inside = {f"ganlane/conf/{path.relative_to(conf)}" for path in conf.rglob("*.yaml")}
@@ -89,4 +89,5 @@ def test_the_wheel_holds_configuration_weights_and_kernel_and_is_below_5_mb(whee
     assert len(kernels) == (1 if has_compiler() else 0)
     assert not [name for name in names if name.startswith(("tests/", "outputs/"))]
     assert wheel.name.startswith(f"ganlane-{ganlane.__version__}-")
-    assert wheel.stat().st_size < 5e6
+    # Three agents of 1.5 MB are most of it.
+    assert wheel.stat().st_size < 5.5e6

@@ -7,10 +7,11 @@ from copy import copy
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from ganlane.build import make_road, make_traffic
 from ganlane.data.dense import units_of
+from ganlane.data.one_lane import ONE_LANE_FILES, one_lane_files, read_one_lane
 from ganlane.data.recordings import read_scenes
 from ganlane.data.sources import data_folder, default_scenes
 from ganlane.errors import UserError
@@ -27,7 +28,6 @@ from ganlane.realism.card import (
     quantity_rows,
 )
 from ganlane.realism.driving import Factory, StartOptions
-from ganlane.realism.i80 import I80_FILES, read_i80
 from ganlane.realism.long_runs import (
     LongRunParameters,
     long_run,
@@ -59,12 +59,13 @@ from ganlane.traffic import TrafficModule
 from ganlane.weights import load_weights
 
 #: Preset of the weights that a traffic drives with.
-PRESETS: Final[Mapping[str, Preset]] = {
+PRESETS: Final[Mapping[str, Preset | Literal["human"]]] = {
+    "human": "human",
     "gan": "paper",
     "gan_calibrated": "calibrated",
 }
 #: Quantities that one lane shows.
-I80_QUANTITIES: Final = (
+ONE_LANE_QUANTITIES: Final = (
     "speed",
     "acceleration",
     "time_headway",
@@ -87,11 +88,11 @@ def realism(config: RealismConfig, folder: Path) -> str:
         )
     # Everything that can be refused is refused before hours of driving.
     factories = traffic_factories(config)
-    files = i80_files_wanted(config, path)
+    files = files_wanted(config, path)
     starts = drive_from_starts(config, factories, path)
-    # Empty without I-80 files; the card then leaves these rows out.
+    # Empty without files of one lane; the card then leaves these rows out.
     site = {
-        name: i80_rows(
+        name: one_lane_rows(
             config,
             factories,
             starts,
@@ -263,31 +264,30 @@ def drive_from_starts(
     )
 
 
-def i80_files_wanted(config: RealismConfig, path: Path | None) -> dict[str, Path]:
-    """The I-80 files next to the scenes that ``config`` asks for, by name."""
+def files_wanted(config: RealismConfig, path: Path | None) -> dict[str, Path]:
+    """The files of one lane next to the scenes that ``config`` asks for, by name."""
     files = {}
     if path is not None and config.i80 is not False:
-        files = {name: path.parent / file for name, file in I80_FILES.items()}
-        files = {name: file for name, file in files.items() if file.is_file()}
+        files = one_lane_files(path)
     # Asked for in so many words, so leaving it out in silence would be wrong.
     if config.i80 and not files:
         raise UserError(
-            f"i80=true: none of {', '.join(I80_FILES.values())} lies next to the scenes; use "
+            f"i80=true: none of {', '.join(ONE_LANE_FILES.values())} lies next to the scenes; use "
             "i80=false."
         )
     return files
 
 
-def i80_rows(
+def one_lane_rows(
     config: RealismConfig,
     factories: Mapping[str, Factory],
     starts: Starts,
     name: str,
     path: Path,
 ) -> dict[str, Any]:
-    """The card's rows on an I-80 file; nothing is fitted to the site."""
+    """The card's rows on a file of one lane; nothing is fitted to the site."""
     # Once each: the site has many more segments than scenes.
-    recordings = read_i80(name, path)
+    recordings = read_one_lane(name, path)
     options = StartOptions(seed=config.seed)
     frames = drive_all(
         factories,
@@ -300,7 +300,7 @@ def i80_rows(
     return quantity_rows(
         next(iter(factories)),
         {driver: measure(frame, units) for driver, frame in frames.items()},
-        {quantity: recorded[quantity] for quantity in I80_QUANTITIES},
+        {quantity: recorded[quantity] for quantity in ONE_LANE_QUANTITIES},
         floors={},
         resamples=config.resamples,
     )

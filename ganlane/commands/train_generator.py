@@ -18,10 +18,13 @@ from ganlane.data import (
     read_recordings,
     recordings_path,
 )
+from ganlane.data.dense import Recording
+from ganlane.data.one_lane import one_lane_files, read_one_lane
 from ganlane.evaluation import code_version, write_results
 from ganlane.evaluation.table import aligned, show
 from ganlane.generator import FitResult, Progress
 from ganlane.generator.forecasts import BASELINE, SAMPLES
+from ganlane.settings.generator import HumanConfig
 from ganlane.settings.recordings import TrainGeneratorConfig
 from ganlane.torch_settings import set_threads
 
@@ -60,6 +63,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     if config.folds:
         generator.assign_folds(scenes, config.folds)
 
+    following = following_cars(source) if isinstance(fit_config, HumanConfig) else []
     # A resumed command finds its finished fits here and does not repeat them.
     states = Path(config.resume or folder) / "fits"
     weights = folder / f"generator_{fit_config.preset}.safetensors"
@@ -84,6 +88,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
                 states,
                 progress,
                 str(source),
+                following,
             )
             # A realism card by folds drives every scene by the generator that never saw it.
             for number, fold in enumerate(results, start=1):
@@ -101,6 +106,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
             states,
             progress,
             str(source),
+            following,
         )
 
     show(metrics_table(result.metrics), columns=config.columns)
@@ -111,6 +117,14 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     context = {"seed": config.seed, "held_out": held_out}
     used = asdict(replace(config, generator=fit_config))
     return f"results: {write_results(folder, numbers, used, context)}"
+
+
+def following_cars(scenes: Path) -> list[Recording]:
+    """Cars that follow each other in one lane, from the files beside ``scenes``; perhaps none."""
+    recordings = []
+    for name, file in one_lane_files(scenes).items():
+        recordings += read_one_lane(name, file)
+    return recordings
 
 
 class FitProgress(AbstractContextManager["FitProgress"]):

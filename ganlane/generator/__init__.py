@@ -12,7 +12,7 @@ Read in this order:
   ablations.
 """
 
-from ganlane.generator.checkpoint import FitResult, load_generator
+from ganlane.generator.checkpoint import FitResult, load_generator, load_human
 from ganlane.generator.fit import (
     HELD_OUT,
     ablate,
@@ -54,6 +54,7 @@ __all__ = [
     "cross_validate",
     "fit_generator",
     "load_generator",
+    "load_human",
     "scene_tracks",
     "shipped_generator",
     "split_for_fit",

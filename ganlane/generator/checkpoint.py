@@ -1,9 +1,9 @@
-"""Fitted generators as files: weights with a description of the fit."""
+"""Fitted generators and policies as files: weights with a description of the fit."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +11,13 @@ import torch
 
 from ganlane._version import __version__
 from ganlane.errors import UserError
+from ganlane.generator.human_estimator import HumanModel
 from ganlane.generator.networks import Generator
 from ganlane.settings.generator import (
     GENERATOR,
+    HUMAN,
     FitConfig,
+    HumanSizes,
     Preset,
     stored_sizes,
 )
@@ -41,7 +44,7 @@ class FitResult:
     """
 
     config: FitConfig
-    module: Generator
+    module: Generator | HumanModel
     metrics: Metrics
     data: dict[str, Any]
     statistics: dict[str, Any]
@@ -109,3 +112,29 @@ def load_generator(
         ) from error
     # A generator that drives is not fitted further, and gradients would cost memory.
     return generator.eval().requires_grad_(False), metadata
+
+
+def load_human(path: str | Path) -> tuple[HumanModel, dict[str, Any]]:
+    """A model of ``human`` in evaluation mode, without gradients, and its metadata.
+
+    Raises:
+        UserError: no such file, another kind of file or preset, or weights that do not fit the
+            stored sizes.
+    """
+    tensors, metadata = load_weights(path, GENERATOR)
+    stored = str(metadata.get("preset"))
+    if stored != HUMAN:
+        raise UserError(f"{path}: a generator of preset {stored!r}, expected 'human'; give one.")
+    sizes = metadata.get("sizes")
+    names = {field.name for field in fields(HumanSizes)}
+    try:
+        if set(dict(sizes or {})) != names:
+            raise ValueError("other names")
+        with torch.random.fork_rng(devices=[]):
+            model = HumanModel(HumanSizes(**sizes))  # type: ignore[arg-type]
+        model.load_state_dict(tensors)
+    except (RuntimeError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{path}: its weights do not fit the sizes {sizes} of a human policy; fit it again."
+        ) from error
+    return model.eval().requires_grad_(False), metadata

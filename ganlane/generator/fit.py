@@ -9,6 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import time
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,8 +20,9 @@ import polars as pl
 from sklearn.model_selection import GroupKFold
 
 from ganlane.data import TRACK, driving_statistics
+from ganlane.data.dense import Recording
 from ganlane.errors import UserError
-from ganlane.generator.checkpoint import FitResult, Metrics
+from ganlane.generator.checkpoint import FitResult, Metrics, load_human
 from ganlane.generator.forecasts import (
     BASELINE,
     SAMPLES,
@@ -32,16 +35,22 @@ from ganlane.generator.forecasts import (
     long_rollout_scores,
     open_loop_scores,
     paper_forecasts,
+    repeated,
+    scene_metrics,
 )
+from ganlane.generator.human_estimator import HumanModel
+from ganlane.generator.human_fit import fit_human
+from ganlane.generator.human_forecasts import WIDTH_M, human_forecasts
 from ganlane.generator.tasks import (
     CalibratedTask,
-    Config,
     FitLoop,
     OnProgress,
     PaperTask,
+    Progress,
 )
 from ganlane.generator.windows import (
     OBSERVED_POSITIONS,
+    PREDICTED_STEPS,
     SceneTracks,
     Windows,
     count_windows,
@@ -50,7 +59,18 @@ from ganlane.generator.windows import (
     join_windows,
     scene_tracks,
 )
-from ganlane.settings.generator import CalibratedConfig, PaperConfig
+from ganlane.settings.generator import (
+    GENERATOR,
+    HUMAN,
+    CalibratedConfig,
+    HumanConfig,
+    HumanSizes,
+    PaperConfig,
+)
+from ganlane.weights import save_weights
+
+NetworkConfig = PaperConfig | CalibratedConfig
+Config = NetworkConfig | HumanConfig
 
 #: Scenes that are held out by default.
 HELD_OUT = ("us101-b", "us101-e", "us101-h", "us101-i")
@@ -171,15 +191,43 @@ def fit_key(config: Config, split: Split) -> str:
     return digest.hexdigest()[:12]
 
 
+class HumanTask(NamedTuple):
+    """A fitted ``human``, scored as the other presets are."""
+
+    config: HumanConfig
+    generator: HumanModel
+
+    def metrics(self, scenes: list[SceneTracks]) -> Metrics:
+        """Errors over 0.8 s of the mean driver, of drawn ones and of constant velocity."""
+        windows = cut_windows(scenes, STRIDE)
+        forecasts = human_forecasts(self.generator, scenes, PREDICTED_STEPS, STRIDE)
+        forecasts[BASELINE] = repeated(windows.past[:, -1], PREDICTED_STEPS)
+        return scene_metrics(windows, forecasts)
+
+
+class Fitted(NamedTuple):
+    """A finished fit of ``human``; the fields are those of a :class:`FitLoop`."""
+
+    task: HumanTask
+    best_update: int
+    seconds: float
+
+
 def run_fit(
     config: Config,
     split: Split,
     folder: Path | None = None,
     on_progress: OnProgress | None = None,
     name: str = "fit",
-) -> FitLoop:
-    """Fit to ``split`` until it stops improving; the state in ``folder`` is resumed from."""
+    following: Sequence[Recording] = (),
+) -> FitLoop | Fitted:
+    """Fit to ``split`` until it stops improving; the state in ``folder`` is resumed from.
+
+    ``human`` stops after its schedule, and a finished fit of it in ``folder`` is taken again.
+    """
     # The key names the fit, so other settings or recordings never resume a foreign state.
+    if isinstance(config, HumanConfig):
+        return _run_human(config, split, folder, on_progress, name, following)
     path = None if folder is None else folder / f"{config.preset}_{fit_key(config, split)}.pt"
     if isinstance(config, PaperConfig):
         loop = FitLoop(
@@ -197,6 +245,59 @@ def run_fit(
     return loop
 
 
+def _run_human(
+    config: HumanConfig,
+    split: Split,
+    folder: Path | None,
+    on_progress: OnProgress | None,
+    name: str,
+    following: Sequence[Recording],
+) -> Fitted:
+    """Fit ``human`` to all scenes that are not held out, or take the finished fit."""
+    key = f"{config.preset}_{fit_key(config, split)}_{len(following)}"
+    path = None if folder is None else folder / f"{key}.safetensors"
+    if path is not None and path.exists():
+        model, metadata = load_human(path)
+        return Fitted(HumanTask(config, model), metadata["steps"], metadata["seconds"])
+    begun = time.monotonic()
+    best = math.inf
+
+    def report(done: int, steps: int, cost: float | None) -> None:
+        nonlocal best
+        best = best if cost is None else min(best, cost)
+        if on_progress is not None:
+            seconds = time.monotonic() - begun
+            on_progress(Progress(name, done, steps, {}, cost, best, seconds))
+
+    # No scene stops it early, so those for validation are fitted to, too.
+    scenes = {scene.name: scene for scene in (*split.fitted, *split.validation)}
+    recordings = [_recording_of(scene) for scene in scenes.values()]
+    model, seconds = fit_human(config, recordings, following, report)
+    steps = 1 + config.rounds + config.tuning
+    if path is not None:
+        metadata = {"preset": HUMAN, "sizes": asdict(config.sizes)}
+        metadata |= {"steps": steps, "seconds": seconds}
+        save_weights(path, GENERATOR, model.state_dict(), metadata)
+    return Fitted(HumanTask(config, model), steps, seconds)
+
+
+def _recording_of(scene: SceneTracks) -> Recording:
+    count = scene.present.shape[1]
+    return Recording(
+        scene.name,
+        scene.name,
+        scene.lanes,
+        scene.lane_width_m,
+        x=scene.positions[..., 0],
+        y=scene.positions[..., 1],
+        speed=np.zeros(scene.present.shape),
+        present=scene.present,
+        length=scene.length,
+        width=np.full(count, WIDTH_M),
+        driven=np.ones(count, bool),
+    )
+
+
 def fit_generator(
     config: Config,
     frame: pl.DataFrame,
@@ -204,6 +305,7 @@ def fit_generator(
     folder: Path | None = None,
     on_progress: OnProgress | None = None,
     source: str = "",
+    following: Sequence[Recording] = (),
 ) -> FitResult:
     """Fit a generator to recorded trajectories in ``ganlane.data``'s schema.
 
@@ -212,24 +314,20 @@ def fit_generator(
     influence neither the weights nor early stopping. The driving statistics are of all scenes.
 
     Args:
-        config: :class:`PaperConfig` (positions only, open loop) or :class:`CalibratedConfig`
-            (anchored, closed-loop rollouts).
+        config: :class:`PaperConfig` (positions only, open loop), :class:`CalibratedConfig`
+            (anchored, closed-loop rollouts) or :class:`HumanConfig` (a policy).
         frame: the recordings.
         held_out: names of the scenes that are reported.
         folder: where the state is kept; the fit resumes from it.
         on_progress: called after every update.
         source: name of the recordings' file, for the metadata.
+        following: cars that follow each other in one lane, for ``human``.
 
     Raises:
         UserError: unusable recordings or scene names.
     """
     split = split_for_fit(scene_tracks(frame), held_out)
-    loop = run_fit(
-        config,
-        split,
-        folder,
-        on_progress,
-    )
+    loop = run_fit(config, split, folder, on_progress, following=following)
     return _fit_result(
         loop,
         split,
@@ -241,7 +339,7 @@ def fit_generator(
 
 
 def _fit_result(
-    loop: FitLoop,
+    loop: FitLoop | Fitted,
     split: Split,
     frame: pl.DataFrame,
     source: str,
@@ -276,7 +374,7 @@ class HeldOut(NamedTuple):
 
 
 def _held_out(
-    task: PaperTask | CalibratedTask,
+    task: PaperTask | CalibratedTask | HumanTask,
     split: Split,
     steps: int,
     stride: int,
@@ -295,6 +393,8 @@ def _held_out(
             task.config,
             samples,
         )
+    elif isinstance(task, HumanTask):
+        forecasts = human_forecasts(task.generator, split.held_out, steps, stride)
     else:
         groups = group_windows(windows, task.config.group_size, task.config.seed)
         forecasts = paper_forecasts(
@@ -311,20 +411,17 @@ def _held_out(
     return HeldOut(windows, forecasts)
 
 
-def short_forecasts(task: PaperTask | CalibratedTask, split: Split) -> HeldOut:
-    """Forecasts of the held-out scenes as far as the preset predicts."""
-    return _held_out(
-        task,
-        split,
-        task.config.sizes.predicted,
-        STRIDE,
-    )
+def short_forecasts(task: PaperTask | CalibratedTask | HumanTask, split: Split) -> HeldOut:
+    """Forecasts of the held-out scenes as far as the preset predicts; of ``human`` for 0.8 s."""
+    sizes = task.config.sizes
+    steps = PREDICTED_STEPS if isinstance(sizes, HumanSizes) else sizes.predicted
+    return _held_out(task, split, steps, STRIDE)
 
 
-def long_forecasts(task: PaperTask | CalibratedTask, split: Split) -> HeldOut | None:
+def long_forecasts(task: PaperTask | CalibratedTask | HumanTask, split: Split) -> HeldOut | None:
     """Forecasts of the held-out scenes for 5 s.
 
-    By the calibrated preset only, and only if a vehicle was recorded for long enough.
+    Not by the paper's preset, and only if a vehicle was recorded for long enough.
     """
     frames = OBSERVED_POSITIONS + LONG_STEPS
     # A window of 5 s needs the observed positions before it as well.
@@ -355,6 +452,7 @@ def cross_validate(
     folder: Path,
     on_progress: OnProgress | None = None,
     source: str = "",
+    following: Sequence[Recording] = (),
 ) -> tuple[dict[str, Any], list[FitResult]]:
     """Fit ``folds`` generators, each without its fold's scenes, and score them on these.
 
@@ -380,6 +478,7 @@ def cross_validate(
             folder,
             on_progress,
             f"fold {number} of {folds}",
+            following,
         )
         # A fold's statistics must not know its held-out scenes either.
         others = frame.filter(~pl.col("scene").is_in(split.names["held_out"]))
@@ -399,7 +498,7 @@ def cross_validate(
     return scores, results
 
 
-def variants(config: Config) -> dict[str, Config]:
+def variants(config: NetworkConfig) -> dict[str, NetworkConfig]:
     """Settings of the ablations by name, with a quarter of the updates.
 
     The first is the preset itself.
@@ -442,7 +541,7 @@ def variants(config: Config) -> dict[str, Config]:
 
 
 def ablate(
-    config: Config,
+    config: NetworkConfig,
     frame: pl.DataFrame,
     held_out: tuple[str, ...],
     folder: Path,

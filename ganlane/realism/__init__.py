@@ -17,7 +17,6 @@ traffic does over minutes.
 
 Modules, from the bottom up:
 
-- :mod:`~ganlane.realism.i80`: a site that no generator was fitted to.
 - :mod:`~ganlane.realism.measures`: what is measured of trajectories, the distance of two
   distributions, and the histograms that ship.
 - :mod:`~ganlane.realism.driving`: a traffic drives recorded scenes; reference drivers.

@@ -49,7 +49,7 @@ def card_text(numbers: Mapping[str, Any]) -> list[str]:
     tables.append(starts_table(numbers["driving"]))
     # A second site, to which nothing was fitted.
     for name, rows in numbers["i80"].items():
-        tables.append(f"I-80, {name}\n{quantities_table(rows, traffic)}")
+        tables.append(f"{name}\n{quantities_table(rows, traffic)}")
     for name, runs in {
         traffic: numbers["long_runs"],
         **numbers["long_runs_against"],

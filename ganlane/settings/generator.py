@@ -30,6 +30,8 @@ from ganlane.settings.record import (
 )
 
 Preset = Literal["paper", "calibrated"]
+#: The preset that is no Social-GAN but a policy.
+HUMAN = "human"
 #: Kind of their files; weights of another kind, such as an agent's, are refused by it.
 GENERATOR = "generator"
 #: Inputs of the calibrated preset in addition to the motion: IDM's acceleration, gap, closing
@@ -75,7 +77,7 @@ class GeneratorSizes(Record):
     differences: bool = True
 
 
-def shipped_generator(preset: Preset) -> Path:
+def shipped_generator(preset: Preset | Literal["human"]) -> Path:
     """Path of the weights that come with the package."""
     return CHECKPOINTS / f"generator_{preset}.safetensors"
 
@@ -119,6 +121,19 @@ def stored_sizes(path: object, metadata: Mapping[str, Any], preset: str | None) 
     if not isinstance(metadata.get("driving_statistics"), dict):
         raise UserError(f"{path}: holds no driving statistics of its recordings; fit it again.")
     return checked
+
+
+@dataclass(frozen=True)
+class HumanSizes(Record):
+    """Widths of the policy of ``human``; stored with its weights.
+
+    Attributes:
+        hidden: width of both layers behind the acceleration and the lateral speed.
+        lane_hidden: width of the layer behind lane changes.
+    """
+
+    hidden: Annotated[int, between(1, 512)] = 128
+    lane_hidden: Annotated[int, between(1, 512)] = 32
 
 
 @dataclass(frozen=True)
@@ -271,6 +286,45 @@ class CalibratedConfig(FitConfig):
                 "horizons "
                 f"{list(self.horizons)}, not all 0."
             )
+
+
+@dataclass(frozen=True)
+class HumanConfig(FitConfig):
+    """Settings of the fit of ``human``: cloning, closed-loop samples, fine-tuning in simulation.
+
+    Attributes:
+        sizes: of the policy.
+        cutoff_hz: recorded positions along the road are smoothed; of this frequency half is left.
+        lateral_cutoff_hz: the same across the road.
+        scale: further copies of the recordings are up to this much longer along the road, so that
+            the same headways are driven at other speeds.
+        epochs: passes over the samples in cloning.
+        rounds: closed-loop rounds after it.
+        samples: moves drawn per decision in them, of which the nearest to the recording counts.
+        learning_rate: of Adam in cloning.
+        tuning: iterations of the fine-tuning; 0: none.
+        pull: weight of the divergence from the cloned policy in it.
+        changes_per_h: lane changes per vehicle-hour that it keeps to; null: as recorded.
+        following: fit to the files of one lane beside the recordings, too (I-80, I-24), where
+            they are there.
+    """
+
+    preset: str = field(default="human", kw_only=True)
+    sizes: HumanSizes = field(default_factory=HumanSizes)
+    # what is fitted to
+    cutoff_hz: Positive = 0.6
+    lateral_cutoff_hz: Positive = 0.4
+    scale: NotNegative = 0.5
+    following: bool = True
+    # cloning
+    epochs: Count = 8
+    rounds: CountOrZero = 3
+    samples: Annotated[int, between(1, 100)] = 6
+    learning_rate: Positive = 2e-3
+    # in simulation
+    tuning: CountOrZero = 150
+    pull: NotNegative = 0.15
+    changes_per_h: Positive | None = None
 
 
 #: The NGSIM trajectories (doi:10.21949/1504477), as the portal of the US DOT exports them.

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from ganlane.errors import UserError
 from ganlane.settings.commands import RunConfig
 from ganlane.settings.env import EnvConfig
-from ganlane.settings.generator import DataConfig, FitConfig, PaperConfig
+from ganlane.settings.generator import DataConfig, FitConfig, HumanConfig, PaperConfig
 from ganlane.settings.record import CountOrZero, NotNegative, assign, at_least, between, one_of
 from ganlane.settings.traffic import IdmMobilTrafficConfig, TrafficConfig, traffics_of
 
@@ -81,6 +81,8 @@ class TrainGeneratorConfig(RunConfig):
             raise UserError(
                 "folds=1: one fold leaves nothing to fit to; use 2 or more, or 0 for none."
             )
+        if self.ablations and isinstance(self.generator, HumanConfig):
+            raise UserError("ablations=true: generator=human has none; leave it out.")
         # Found out now, not after minutes of fitting.
         if self.resume is not None and not Path(self.resume).is_dir():
             raise UserError(
@@ -107,7 +109,8 @@ class RealismConfig(RunConfig):
         vehicle_km: at least so many in every long run; 0 leaves them out.
         long_s: no episode of a long run lasts longer, s.
         long_against: true: long runs of the traffics of against, too.
-        i80: whether the I-80 files in the folder of the scenes are used; null: if they are there.
+        i80: whether the files of one lane (I-80, I-24) beside the scenes are used; null: if they
+            are there.
         resamples: of the bootstrap over scenes.
         quick: true: a check that it runs, in seconds.
         publish: true (maintainers): write the histograms that ship from these recordings.

@@ -194,6 +194,21 @@ class GanCalibratedTrafficConfig(TrafficConfig):
 
 
 @dataclass(frozen=True)
+class HumanTrafficConfig(TrafficConfig):
+    """``traffic=human``: a policy fitted to recorded drivers (:mod:`ganlane.traffic.human`).
+
+    Attributes:
+        path: weights of the preset 'human'; null: the ones that ship.
+        temperature: of the drivers' distributions; 1 as fitted, lower is calmer.
+    """
+
+    option = "human"
+    _target_: ImportPath = "ganlane.traffic.presets.human_traffic"
+    path: str | None = None
+    temperature: Annotated[float, between(0.1, 2)] = 0.8
+
+
+@dataclass(frozen=True)
 class IdmFaultsTrafficConfig(TrafficConfig, DriverFaults):
     """``traffic=idm_faults``: idm_mobil with driver errors (:mod:`ganlane.traffic.faults`)."""
 

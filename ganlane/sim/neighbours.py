@@ -224,20 +224,8 @@ def follower(scene: Scene, lane: Tensor) -> Follower:
     """
     lanes = lane[..., None] if lane.ndim == 2 else lane
     vehicles = scene.vehicles
-    if scene.queue is None:
-        front, index = _candidates(scene, lanes, -1).min(-1)
-    else:
-        numbers = torch.arange(vehicles.x.shape[1], device=lane.device)
-        key = _nearest_key(
-            scene,
-            scene.queue,
-            lanes,
-            -1,
-            numbers,
-        )
-        front = _unordered(key >> 32)
-        index = key & 0xFFFFFFFF
-    gap = _gap(scene, front, -1).view(lane.shape)
+    gap, index = nearest(scene, lanes, -1)
+    gap = gap.view(lane.shape)
     # What else is known of the vehicle that was found.
     flat = index.flatten(1)
     speed = vehicles.speed.gather(1, flat).view(lane.shape)
@@ -248,6 +236,29 @@ def follower(scene: Scene, lane: Tensor) -> Follower:
         desired_speed,
         gap < FREE_GAP_M,
     )
+
+
+def nearest(scene: Scene, lanes: Tensor, side: int) -> tuple[Tensor, Tensor]:
+    """Gap, m, and index of the nearest vehicle ahead (``side`` 1) or behind (-1) in ``lanes``.
+
+    All [N, K, L]. Of two level ones that with the lower index; without one the gap is
+    :data:`FREE_GAP_M`, and the index anyone's.
+    """
+    if scene.queue is None:
+        end, index = _candidates(scene, lanes, side).min(-1)
+    else:
+        numbers = torch.arange(scene.vehicles.x.shape[1], device=lanes.device)
+        key = _nearest_key(
+            scene,
+            scene.queue,
+            lanes,
+            side,
+            numbers,
+        )
+        end = _unordered(key >> 32)
+        # Nobody's key has no number in it.
+        index = key & 0xFFFFFFFF
+    return _gap(scene, end, side), index
 
 
 def _candidates(

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ganlane.generator import Generator, load_generator, shipped_generator
+from ganlane.generator import Generator, load_generator, load_human, shipped_generator
 from ganlane.native.drivers import FittedGenerator, calibrated_drivers, paper_drivers
 from ganlane.settings.driving import (
     DriverFaults,
@@ -19,6 +19,7 @@ from ganlane.settings.driving import (
 from ganlane.settings.traffic import (
     GanCalibratedTrafficConfig,
     GanTrafficConfig,
+    HumanTrafficConfig,
 )
 from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.idm import TABLE_V
@@ -27,6 +28,7 @@ from ganlane.sim.random import Stream
 from ganlane.sim.state import Road
 from ganlane.traffic.base import TrafficModule, TrafficSequential
 from ganlane.traffic.faults import with_faults
+from ganlane.traffic.human import HumanTraffic
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 from ganlane.traffic.overlays import (
     AccelerationOverlay,
@@ -147,6 +149,21 @@ def gan_calibrated_traffic(
         "lane_change": CalibratedLaneChange(road, stream, drivers.checked_changes, idm),
     }
     return TrafficSequential(parts, drivers)
+
+
+def human_traffic(
+    road: Road | None = None,
+    stream: int = Stream.TRAIN,
+    path: str | Path | None = None,
+    temperature: float = HumanTrafficConfig.temperature,
+) -> HumanTraffic:
+    """``traffic=human``: a policy fitted to recorded drivers (:mod:`ganlane.traffic.human`).
+
+    Raises:
+        UserError: the weights are missing or foreign.
+    """
+    model, _ = load_human(path or shipped_generator("human"))
+    return HumanTraffic(model.policy, road, stream, temperature)
 
 
 def _fitted(generator: Generator, metadata: Mapping[str, Any], source: object) -> FittedGenerator:

@@ -62,7 +62,7 @@ MISTAKES = {
     "evaluate traffics=[gann]": "traffic=gann: no such option (did you mean 'gan'?)",
     "render film.start_s=9 film.end_s=3": "expected more than film.start_s=9",
     "render out=nowhere/film.gif": "out=nowhere/film.gif: expected a file in a folder that exists",
-    "train_generator generator=gann": "choose one of calibrated, paper, social_gan",
+    "train_generator generator=gann": "choose one of calibrated, human, paper, social_gan",
     "train_generator folds=1": "one fold leaves nothing to fit to",
     "train agent.noisy=perhaps": "agent.noisy=perhaps: expected true or false",
     "train env=scene": "env.scene.path: no file; give one",

@@ -172,7 +172,7 @@ def test_a_users_own_traffic_gets_a_card_and_one_of_i80_beside_the_scenes(record
     assert results["traffic"] == "entry_own_parts.Cruise"
     assert results["quantities"]["speed"]["against"].keys() == {"idm"}
     assert len(results["scenes"]) == 4
-    assert results["i80"]["following"].keys() == {
+    assert results["i80"]["I-80, following"].keys() == {
         "speed",
         "acceleration",
         "time_headway",

@@ -1,9 +1,10 @@
-"""Three files of I-80, a site that no generator was fitted to, as scenes to drive.
+"""Files of one lane, I-80's and I-24's, as scenes to drive.
 
 ``i80_1600_lane1.csv`` holds every car of one lane, all of which are driven (no lengths are given:
-4.5 m). The two others hold pairs, in which the follower is driven behind its recorded leader. All
-three are cut into segments of 15 s, each of which starts as recorded, on a road of one lane.
-Positions in the files are of the front bumper; here they are of the centre, as everywhere.
+4.5 m). The others hold pairs, in which the follower is driven behind its recorded leader. I-24's
+follower measured its own speed, and the gap by radar: no camera's noise is in it. All are cut into
+segments of 15 s, each of which starts as recorded, on a road of one lane. Positions in the files
+are of the front bumper; here they are of the centre, as everywhere.
 """
 
 from __future__ import annotations
@@ -21,17 +22,20 @@ from ganlane.data.schema import FRAME_S
 from ganlane.data.tables import read_table
 from ganlane.errors import UserError
 
-#: Name to file.
-I80_FILES: Final = {
-    "lane_1": "i80_1600_lane1.csv",
-    "pairs": "i80_1600_pairs.csv",
-    "following": "i80_following.csv",
+#: Name to file, from the folder of NGSIM's scenes.
+ONE_LANE_FILES: Final = {
+    "I-80, lane_1": "i80_1600_lane1.csv",
+    "I-80, pairs": "i80_1600_pairs.csv",
+    "I-80, following": "i80_following.csv",
+    "I-24": "../i24/instrumented.csv",
 }
 SEGMENT_S: Final = 15.0
 #: The first seconds of a pair, in which the published smoothing bends the follower's speed, s.
 EDGE_S: Final = 3.0
 _LENGTH_M: Final = 4.5
 _WIDTH_M: Final = 2.0
+#: No leader comes nearer, or gets away, by more than this within 0.1 s, m.
+_JUMP_M: Final = 2.0
 _NUMBERS: Final = {
     "vehicle": pl.Int64,
     "frame": pl.Int64,
@@ -39,20 +43,27 @@ _NUMBERS: Final = {
 }
 
 
-def read_i80(name: str, path: Path) -> list[Recording]:
-    """Segments of 15 s from the file ``path``, the one of :data:`I80_FILES` called ``name``.
+def one_lane_files(scenes: Path) -> dict[str, Path]:
+    """Those of :data:`ONE_LANE_FILES` that are there beside the file ``scenes``, by name."""
+    files = {name: scenes.parent / file for name, file in ONE_LANE_FILES.items()}
+    return {name: file for name, file in files.items() if file.is_file()}
+
+
+def read_one_lane(name: str, path: Path) -> list[Recording]:
+    """Segments of 15 s from the file ``path``, the one of :data:`ONE_LANE_FILES` called ``name``.
 
     Raises:
         UserError: it is damaged, or no track in it lasts 15 s.
     """
     # A scene is the lane, or a pair of cars.
-    rows = _I80_READERS[name](path)
+    rows = _READERS[name](path)
+    whole_lane = name == "I-80, lane_1"
     pieces = []
     for scene in rows.partition_by("scene", maintain_order=True):
-        for piece in _one_lane(scene).segments(SEGMENT_S, 0.0 if name == "lane_1" else EDGE_S):
+        for piece in _one_lane(scene).segments(SEGMENT_S, 0.0 if whole_lane else EDGE_S):
             # Each segment of the lane is a unit of its own: the whole lane would be a single unit,
             # and gives no interval.
-            unit = piece.name if name == "lane_1" else piece.unit
+            unit = piece.name if whole_lane else piece.unit
             if piece.driven.any():
                 pieces.append(replace(piece, unit=unit))
     if not pieces:
@@ -120,10 +131,39 @@ def _following(path: Path) -> pl.DataFrame:
     return pl.concat(cars)
 
 
-_I80_READERS: Final = {
-    "lane_1": _lane,
-    "pairs": _pairs,
-    "following": _following,
+def _instrumented(path: Path) -> pl.DataFrame:
+    columns = {"drive": pl.String, "time_s": pl.Float64, "v": pl.Float64}
+    table = read_table(path, columns)
+    # Where nobody was seen there is no number, so this column is not checked.
+    gap = pl.read_csv(path, columns=["gap"], schema_overrides={"gap": pl.Float64})
+    drives = table.with_columns(
+        gap["gap"],
+        scene="drive-" + pl.col("drive"),
+        frame=(pl.col("time_s") / FRAME_S).round().cast(pl.Int64),
+        # The way driven, from its own speed.
+        x=(pl.col("v").cum_sum() * FRAME_S).over("drive"),
+    )
+    follower = drives.select("scene", "frame", "x", vehicle=0, driven=True)
+    # A gap that jumps belongs to another leader.
+    another = (pl.col("gap").diff().abs() > _JUMP_M).fill_null(True)
+    leaders = drives.filter(pl.col("gap").is_not_null()).select(
+        "scene",
+        "frame",
+        # From 1 on: 0 is the follower.
+        vehicle=another.cum_sum(),
+        x=pl.col("x") + pl.col("gap") + _LENGTH_M,
+        driven=False,
+    )
+    names = ["scene", "vehicle", "frame", "x", "driven"]
+    cars = [part.select(names).cast({"vehicle": pl.Int64}) for part in (follower, leaders)]
+    return pl.concat(cars).with_columns(length=_LENGTH_M)
+
+
+_READERS: Final = {
+    "I-80, lane_1": _lane,
+    "I-80, pairs": _pairs,
+    "I-80, following": _following,
+    "I-24": _instrumented,
 }
 
 

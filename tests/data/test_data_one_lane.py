@@ -1,11 +1,11 @@
-"""The I-80 files."""
+"""Files of one lane."""
 
 import polars as pl
 import pytest
 from reference.recordings import following_file
 from reference.refusals import user_error
 
-from ganlane.realism.i80 import I80_FILES, read_i80
+from ganlane.data.one_lane import ONE_LANE_FILES, read_one_lane
 from ganlane.realism.measures import measure_recordings
 
 
@@ -61,13 +61,13 @@ def test_pairs_have_a_driven_follower_at_the_recorded_gap(
     tmp_path,
 ):
     for name, write, gap, speed in (
-        ("pairs", pairs_file, 20.0, 9.0),
-        ("following", following_file, 10.0, 7.0),
+        ("I-80, pairs", pairs_file, 20.0, 9.0),
+        ("I-80, following", following_file, 10.0, 7.0),
     ):
-        write(tmp_path / I80_FILES[name])
-        recordings = read_i80(name, tmp_path / I80_FILES[name])
+        write(tmp_path / ONE_LANE_FILES[name])
+        recordings = read_one_lane(name, tmp_path / ONE_LANE_FILES[name])
         # 40 s and 20 s, less the first 3, in pieces of 15.
-        assert len(recordings) == {"pairs": 2, "following": 1}[name]
+        assert len(recordings) == {"I-80, pairs": 2, "I-80, following": 1}[name]
         assert {piece.lanes for piece in recordings} == {1}
         assert all(piece.driven.sum() == 1 for piece in recordings)
         quantiles = measure_recordings(recordings).quantiles
@@ -79,8 +79,8 @@ def test_pairs_have_a_driven_follower_at_the_recorded_gap(
 def test_a_lane_is_driven_as_a_whole_in_stretches_of_their_own(
     tmp_path,
 ):
-    lane_file(tmp_path / I80_FILES["lane_1"])
-    recordings = read_i80("lane_1", tmp_path / I80_FILES["lane_1"])
+    lane_file(tmp_path / ONE_LANE_FILES["I-80, lane_1"])
+    recordings = read_one_lane("I-80, lane_1", tmp_path / ONE_LANE_FILES["I-80, lane_1"])
     assert len({piece.unit for piece in recordings}) == len(recordings) == 2
     assert all(piece.driven.all() for piece in recordings)
     # 2 s apart at 18 m/s, cars of 4.5 m.
@@ -88,10 +88,30 @@ def test_a_lane_is_driven_as_a_whole_in_stretches_of_their_own(
 
 
 def test_damaged_files_are_named(tmp_path):
-    path = tmp_path / I80_FILES["lane_1"]
+    path = tmp_path / ONE_LANE_FILES["I-80, lane_1"]
     path.write_text("vehicle,frame,x\n1,2,three\n")
     with user_error("line 2, column x"):
-        read_i80("lane_1", path)
+        read_one_lane("I-80, lane_1", path)
     path.write_text("vehicle,frame,x\n1,2,3.0\n1,3,4.0\n")
     with user_error("nothing in it lasts 15 s"):
-        read_i80("lane_1", path)
+        read_one_lane("I-80, lane_1", path)
+
+
+def test_a_car_that_measured_itself_follows_at_the_measured_gap_and_each_leader_is_another_car(
+    tmp_path,
+):
+    rows = []
+    for frame in range(400):
+        # Nobody is seen for a second; then somebody else, nearer.
+        gap = None if 200 <= frame < 210 else 30.0 if frame < 200 else 20.0
+        rows.append((1, frame / 10, 25.0, 0.0, gap))
+    names = ["drive", "time_s", "v", "a", "gap"]
+    path = tmp_path / "instrumented.csv"
+    pl.DataFrame(rows, schema=names, orient="row").write_csv(path)
+    first, second = read_one_lane("I-24", path)
+    assert first.speed[first.present] == pytest.approx(25.0)
+    # From second 3 to 18 one leader, from there to 33 both.
+    assert (first.x.shape[1], second.x.shape[1]) == (2, 3)
+    assert first.driven.tolist() == [True, False]
+    assert first.x[:, 1] - first.x[:, 0] == pytest.approx(34.5)
+    assert second.x[-1, 2] - second.x[-1, 0] == pytest.approx(24.5)

@@ -1,0 +1,532 @@
+"""A driver as one stochastic policy: what it perceives, how it decides, and how it remembers.
+
+Every 0.4 s a driver perceives its neighbours, may begin a lane change or break one off, and draws
+a change of its acceleration and of its lateral speed from distributions over tokens. Its style
+(headway, restlessness, pace) is what its own history shows, so that drivers differ as recorded ones
+do. There is no anchor, guard or clock. All inputs are relative: gaps, times, speed differences.
+
+The same functions serve the fit (:mod:`ganlane.generator.human_fit`), its fine-tuning
+(:mod:`ganlane.generator.human_tuning`) and the traffic (:mod:`ganlane.traffic.human`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ganlane.keys import PHYSICS_STEP_S
+from ganlane.settings.generator import HumanSizes
+from ganlane.sim.neighbours import nearest
+from ganlane.sim.neighbours import perceive as scene_of
+from ganlane.sim.state import LaneRange, Road, Vehicles
+
+#: Physics steps of a decision, and its duration.
+STEPS = 4
+DECISION_S = STEPS * PHYSICS_STEP_S
+#: Accelerations and lateral speeds that a driver remembers, one per decision.
+ACCELERATIONS = 5
+LATERAL_SPEEDS = 2
+#: Nobody is seen beyond this gap, m.
+SIGHT_M = 150.0
+#: Time constant of a driver's style, s.
+STYLE_S = 6.0
+#: Bounds of the acceleration, m/s2.
+HARDEST_BRAKING = -8.0
+STRONGEST_ACCELERATION = 3.5
+#: Lateral speed per speed along the road, and its bound, m/s.
+STEEPEST = 0.12
+FASTEST_ASIDE_MPS = 2.0
+#: Time to the edge of the road, s, and what is kept from it, m.
+EDGE_S, EDGE_M = 0.8, 0.15
+#: A driver looks this far ahead for the lane that another one is entering, s.
+ANTICIPATION_S = 1.0
+#: Decisions after which a driver's age, and the time since its last lane change, count no more.
+LONGEST = 12.0
+#: Numbers of :attr:`View.features` and of :attr:`View.sides`.
+FEATURES = 65
+SIDE_FEATURES = 17
+#: The probabilities of both lane changes together are at most this.
+_MOST_LIKELY = 0.98
+
+
+class Tokens(NamedTuple):
+    """Tokens of a change in physical units: dense around 0, sparse where changes are large.
+
+    ``scale`` is where the spacing begins to grow, ``most`` the outer tokens' value, ``number`` how
+    many there are. A value lies at ``asinh(value / scale)``, spaced evenly.
+    """
+
+    scale: float
+    most: float
+    number: int
+
+    @property
+    def reach(self) -> float:
+        """``asinh`` of the outer token."""
+        return math.asinh(self.most / self.scale)
+
+    def centres(self, like: Tensor) -> Tensor:
+        """Values of the tokens [number]."""
+        return self.value(torch.arange(self.number, device=like.device).to(like.dtype))
+
+    def value(self, index: Tensor) -> Tensor:
+        """Value at a real-valued index."""
+        return self.scale * torch.sinh((index / (self.number - 1) * 2.0 - 1.0) * self.reach)
+
+    def soft_target(self, value: Tensor, blur: float = 0.7) -> Tensor:
+        """A distribution over the tokens around ``value``, [..., number]."""
+        place = torch.asinh(value / self.scale).clamp(-self.reach, self.reach)
+        index = (place / self.reach + 1.0) * 0.5 * (self.number - 1)
+        numbers = torch.arange(self.number, device=value.device).to(value.dtype)
+        distance = (numbers - index[..., None]) / blur
+        return torch.softmax(-0.5 * distance * distance, -1)
+
+    def sample(self, logits: Tensor, u: Tensor, temperature: float = 1.0) -> Tensor:
+        """A value from uniform numbers ``u`` [...]: the inverse of the distribution function,
+        linear within a token.
+        """
+        chance = torch.softmax(logits / temperature, -1)
+        upper = chance.cumsum(-1)
+        token = (upper < u[..., None]).sum(-1).clamp_max(self.number - 1)
+        its_chance = chance.gather(-1, token[..., None])[..., 0].clamp_min(1e-9)
+        its_upper = upper.gather(-1, token[..., None])[..., 0]
+        within = ((u - (its_upper - its_chance)) / its_chance).clamp(0.0, 1.0) - 0.5
+        return self.value(token + within)
+
+    def mean(self, logits: Tensor) -> Tensor:
+        """The expected value [...]."""
+        return torch.softmax(logits, -1) @ self.centres(logits)
+
+
+#: Changes of the acceleration, m/s2, and of the lateral speed, m/s, from decision to decision.
+ALONG = Tokens(0.15, 5.0, 41)
+ACROSS = Tokens(0.04, 0.6, 31)
+
+
+class Memory(NamedTuple):
+    """What a driver remembers, each [N, M, ...].
+
+    Attributes:
+        accelerations: of the last :data:`ACCELERATIONS` decisions, newest first, m/s2.
+        lateral_speeds: before the present one, newest first, m/s.
+        closing: speed of the leader less the own one at the last two decisions, m/s.
+        style: logarithm of the headway in s, mean square of the acceleration, and speed relative to
+            the neighbours in units of 3 m/s; means over :data:`STYLE_S`.
+        age: decisions that the driver has been seen for.
+        since: decisions since a lane change began or ended.
+    """
+
+    accelerations: Tensor
+    lateral_speeds: Tensor
+    closing: Tensor
+    style: Tensor
+    age: Tensor
+    since: Tensor
+
+
+class View(NamedTuple):
+    """What drivers perceive.
+
+    Attributes:
+        features: [N, M, FEATURES].
+        sides: of the lanes to the left and to the right, [N, M, 2, SIDE_FEATURES].
+        lane: whose centre is nearest, [N, M], float.
+        exists: whether there is a lane to the left, to the right, [N, M, 2].
+        closing: speed of the leader less the own one, m/s.
+        log_headway: of drivers who follow, NaN for others.
+        relative_speed: over the mean of the neighbours, m/s.
+        gap: to the leader in the own lane, m.
+    """
+
+    features: Tensor
+    sides: Tensor
+    lane: Tensor
+    exists: Tensor
+    closing: Tensor
+    log_headway: Tensor
+    relative_speed: Tensor
+    gap: Tensor
+
+
+class Near(NamedTuple):
+    """The nearest vehicles in the lanes to the right, the own one, to the left, [N, M, 3].
+
+    Gap in m, speed less the own one in m/s, acceleration, place to the left in m, lateral speed,
+    whether there is one, and which one. Where nobody is, the gap is :data:`SIGHT_M` and the rest 0.
+    """
+
+    gap: Tensor
+    closing: Tensor
+    acceleration: Tensor
+    aside: Tensor
+    lateral_speed: Tensor
+    exists: Tensor
+    which: Tensor
+
+
+def velocity(vehicles: Vehicles) -> tuple[Tensor, Tensor]:
+    """Speeds along and across the road, m/s."""
+    along = vehicles.speed * torch.cos(vehicles.heading)
+    return along, vehicles.speed * torch.sin(vehicles.heading)
+
+
+def see(vehicles: Vehicles, road: Road) -> tuple[Tensor, Near, Near]:
+    """The lane of each vehicle, and its neighbours ahead and behind in three lanes."""
+    speed, aside = velocity(vehicles)
+    lane = road.lane_of(vehicles.y)
+    soon = road.lane_of(vehicles.y + ANTICIPATION_S * aside)
+    soon = torch.minimum(torch.maximum(soon, lane - 1), lane + 1)
+    nowhere = torch.where(vehicles.valid, 0.0, torch.inf)
+    presence = LaneRange(torch.minimum(lane, soon) + nowhere, torch.maximum(lane, soon))
+    scene = scene_of(vehicles, road)._replace(presence=presence)
+    lanes = torch.stack((lane - 1, lane, lane + 1), -1)
+
+    def nearest_on(side: int) -> Near:
+        gap, index = nearest(scene, lanes, side)
+        exists = gap < SIGHT_M
+        # Nobody's index may be beyond the last vehicle.
+        index = torch.where(exists, index, 0)
+        flat = index.flatten(1)
+
+        def of(number: Tensor) -> Tensor:
+            return number.gather(1, flat).view(gap.shape)
+
+        def where_seen(number: Tensor) -> Tensor:
+            return torch.where(exists, number, 0.0)
+
+        return Near(
+            gap.clamp_max(SIGHT_M),
+            where_seen(of(speed) - speed[..., None]),
+            where_seen(of(vehicles.acceleration)),
+            where_seen(of(vehicles.y) - vehicles.y[..., None]),
+            where_seen(of(aside)),
+            exists,
+            index,
+        )
+
+    return lane, nearest_on(1), nearest_on(-1)
+
+
+def perceive(vehicles: Vehicles, memory: Memory, road: Road, sides: bool = True) -> View:
+    """What every driver perceives of its neighbours, its lane and itself.
+
+    Without ``sides`` a driver sees its own lane alone, as where only one lane was recorded.
+    """
+    lane, ahead, behind = see(vehicles, road)
+    last = road.lanes - 1
+    lanes = (lane - 1 >= 0, lane >= 0, lane + 1 <= last)
+    has_lane = torch.stack(lanes, -1)
+    if not sides:
+        own = torch.tensor([False, True, False], device=lane.device)
+        has_lane = has_lane & own
+        ahead, behind = _only(ahead, own), _only(behind, own)
+    speed, aside = velocity(vehicles)
+    gap = ahead.gap[..., 1]
+    features = [
+        *_own_state(vehicles, memory, road, lane, speed, aside),
+        *_leader_of_leader(ahead),
+        has_lane[..., 2].to(speed.dtype),
+        has_lane[..., 0].to(speed.dtype),
+        *_room(vehicles, road, ahead, behind),
+        *_seen(ahead, speed).flatten(-2).unbind(-1),
+        *_seen(behind, speed).flatten(-2).unbind(-1),
+    ]
+    # Followers within 80 m show their headway.
+    follows = ahead.exists[..., 1] & (gap < 80.0)
+    headway = (gap.clamp_min(0.5) / speed.clamp_min(2.0)).clamp(0.2, 6.0)
+    seen = torch.cat((ahead.exists, behind.exists), -1)
+    relative = -torch.cat((ahead.closing, behind.closing), -1)
+    return View(
+        torch.stack(features, -1),
+        _sides(vehicles, memory, road, lane, aside, speed, ahead, behind),
+        lane,
+        has_lane[..., [2, 0]],
+        ahead.closing[..., 1],
+        torch.where(follows, torch.log(headway), torch.nan),
+        (relative * seen).sum(-1) / seen.sum(-1).clamp_min(1),
+        gap,
+    )
+
+
+def _only(near: Near, own: Tensor) -> Near:
+    """Of the neighbours those in the ``own`` lane [3]."""
+    exists = near.exists & own
+    names = ("closing", "acceleration", "aside", "lateral_speed")
+    numbers = {name: torch.where(own, getattr(near, name), 0.0) for name in names}
+    return near._replace(gap=torch.where(exists, near.gap, SIGHT_M), exists=exists, **numbers)
+
+
+def _own_state(
+    vehicles: Vehicles, memory: Memory, road: Road, lane: Tensor, speed: Tensor, aside: Tensor
+) -> list[Tensor]:
+    """24 numbers of the driver itself and its place in the lane."""
+    target = vehicles.target_lane.to(speed.dtype)
+    from_target = vehicles.y - target * road.lane_width_m
+    from_centre = vehicles.y - lane * road.lane_width_m
+    return [
+        speed / 10.0,
+        ((vehicles.desired_speed - speed) / 5.0).clamp(-2.0, 2.0),
+        # Standing and crawling, told apart finely.
+        torch.tanh(speed / 2.0),
+        *memory.accelerations.unbind(-1),
+        *torch.asinh(memory.closing).unbind(-1),
+        from_target.clamp(-4.0, 4.0),
+        from_centre / road.lane_width_m * 2.0,
+        (target - lane).clamp(-1.0, 1.0),
+        aside * 2.0,
+        *(memory.lateral_speeds * 2.0).unbind(-1),
+        (vehicles.length > 7.0).to(speed.dtype),
+        memory.age.clamp_max(LONGEST) / LONGEST,
+        memory.since.clamp_max(LONGEST) / LONGEST,
+        *memory.style.unbind(-1),
+    ]
+
+
+def _leader_of_leader(ahead: Near) -> list[Tensor]:
+    """3 numbers: gap and closing speed between the leader and its own leader; what the leader
+    does.
+    """
+    leader = ahead.which[..., 1]
+    exists = ahead.exists[..., 1] & ahead.exists[..., 1].gather(1, leader)
+    gap = torch.where(exists, ahead.gap[..., 1].gather(1, leader), SIGHT_M)
+    closing = torch.where(exists, ahead.closing[..., 1].gather(1, leader), 0.0)
+    return [
+        torch.log(gap.clamp_min(0.5) / 10.0),
+        torch.asinh(closing),
+        ahead.acceleration[..., 1] / 1.5,
+    ]
+
+
+def _room(vehicles: Vehicles, road: Road, ahead: Near, behind: Near) -> list[Tensor]:
+    """8 numbers: room to those alongside, to the edges of the road, and where the leader is."""
+    width = vehicles.width
+    numbers = []
+    for side, sign in ((2, 1.0), (0, -1.0)):
+        nearest_aside = torch.full_like(width, 9.0)
+        alongside = torch.zeros_like(vehicles.valid)
+        for near in (ahead, behind):
+            beside = near.exists[..., side] & (near.gap[..., side] < 1.0)
+            distance = torch.where(beside, sign * near.aside[..., side], 9.0)
+            nearest_aside = torch.minimum(nearest_aside, distance)
+            alongside = alongside | beside
+        numbers += [(nearest_aside - width).clamp(-0.5, 1.5), alongside.to(width.dtype)]
+    to_left = road.left_edge_m() - vehicles.y - 0.5 * width
+    to_right = vehicles.y - road.right_edge_m() - 0.5 * width
+    return [
+        *numbers,
+        to_left.clamp(-0.5, 1.5),
+        to_right.clamp(-0.5, 1.5),
+        ahead.aside[..., 1].clamp(-2.0, 2.0),
+        ahead.lateral_speed[..., 1].clamp(-1.0, 1.0),
+    ]
+
+
+def _seen(near: Near, speed: Tensor) -> Tensor:
+    """5 numbers of each of three neighbours, [N, M, 5, 3]."""
+    exists = near.exists.to(speed.dtype)
+    pace = speed.clamp_min(3.0)[..., None]
+    # Nobody is as far away as can be seen.
+    distance = exists * torch.log(near.gap.clamp_min(0.5) / 10.0) + (1.0 - exists) * 2.7
+    time_s = (near.gap / pace).clamp(-1.0, 5.0) * 0.5
+    approach = (-near.closing / near.gap.clamp_min(2.0)).clamp(-1.0, 1.0) * 3.0
+    return torch.stack((distance, time_s, torch.asinh(near.closing), approach, exists), -2)
+
+
+def _sides(
+    vehicles: Vehicles,
+    memory: Memory,
+    road: Road,
+    lane: Tensor,
+    aside: Tensor,
+    speed: Tensor,
+    ahead: Near,
+    behind: Near,
+) -> Tensor:
+    """What counts for a lane change to the left and to the right, in the same order for both."""
+    pace = speed.clamp_min(3.0)
+    own_gap = torch.log(ahead.gap[..., 1].clamp_min(0.5) / 10.0)
+    # On a free lane one could be faster by 3 m/s.
+    here = torch.where(ahead.exists[..., 1], ahead.closing[..., 1], 3.0).clamp(-5.0, 5.0)
+    from_centre = vehicles.y - lane * road.lane_width_m
+    since = memory.since.clamp_max(LONGEST) / LONGEST
+    sides = []
+    for side, sign in ((2, 1.0), (0, -1.0)):
+        front, rear = ahead.gap[..., side], behind.gap[..., side]
+        front_closing, rear_closing = ahead.closing[..., side], behind.closing[..., side]
+        there = torch.where(ahead.exists[..., side], front_closing, 3.0).clamp(-5.0, 5.0)
+        towards = torch.where(front < 25.0, ahead.lateral_speed[..., side], 0.0)
+        towards = towards + torch.where(rear < 15.0, behind.lateral_speed[..., side], 0.0)
+        numbers = [
+            torch.log1p(front.clamp_min(0.0)) - 2.5,
+            torch.log1p(rear.clamp_min(0.0)) - 2.5,
+            own_gap,
+            (front / pace).clamp(-1.0, 4.0),
+            (rear / pace).clamp(-1.0, 4.0),
+            there / 3.0,
+            rear_closing.clamp(-5.0, 5.0) / 3.0,
+            here / 3.0,
+            (there - here) / 3.0,
+            _needed_braking(rear_closing, rear),
+            _needed_braking(-front_closing, front),
+            (1.5 - front).clamp(0.0, 2.0),
+            (1.5 - rear).clamp(0.0, 2.0),
+            (sign * towards).clamp(-1.0, 1.0),
+            (sign * aside * 3.0).clamp(-3.0, 3.0),
+            (sign * from_centre).clamp(-1.5, 1.5),
+            since,
+        ]
+        sides.append(torch.stack(numbers, -1))
+    return torch.stack(sides, 2)
+
+
+def _needed_braking(closing: Tensor, gap: Tensor) -> Tensor:
+    """Deceleration that keeps the rear one off the front one, m/s2, at most 8."""
+    return (closing.clamp_min(0.0).square() / (2.0 * (gap - 1.0).clamp_min(0.3))).clamp_max(8.0)
+
+
+class HumanPolicy(nn.Module):
+    """Distributions of a driver's next move; below 50,000 weights.
+
+    One network for both tokens, a small one of its own for lane changes, which are rare.
+    """
+
+    def __init__(self, sizes: HumanSizes) -> None:
+        super().__init__()
+        self.sizes = sizes
+        self.trunk = nn.Sequential(
+            nn.Linear(FEATURES, sizes.hidden),
+            nn.SiLU(),
+            nn.Linear(sizes.hidden, sizes.hidden),
+            nn.SiLU(),
+        )
+        self.along = nn.Linear(sizes.hidden, ALONG.number)
+        self.across = nn.Linear(sizes.hidden, ACROSS.number)
+        self.lane = nn.Sequential(
+            nn.Linear(SIDE_FEATURES, sizes.lane_hidden),
+            nn.SiLU(),
+            nn.Linear(sizes.lane_hidden, 2),
+        )
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits of the tokens along [..., 41] and across [..., 31]."""
+        inner = self.trunk(features)
+        return self.along(inner), self.across(inner)
+
+    def lane_chances(self, choice: LaneChoice) -> Tensor:
+        """Probabilities [..., 3]: to go on; to begin a change to the left, or break one off; to
+        begin one to the right.
+        """
+        logits = self.lane(choice.sides)
+        begin = torch.sigmoid(logits[..., 0]) * choice.exists * _MOST_LIKELY
+        total = begin.sum(-1, keepdim=True).clamp_min(1e-9)
+        begin = begin * (total.clamp_max(_MOST_LIKELY) / total)
+        stop = torch.sigmoid(torch.where(choice.to_left, logits[..., 0, 1], logits[..., 1, 1]))
+        first = torch.where(choice.keeping, begin[..., 0], stop).clamp_min(1e-9)
+        second = torch.where(choice.keeping, begin[..., 1], 0.0).clamp_min(1e-9)
+        return torch.stack(((1.0 - first - second).clamp_min(1e-6), first, second), -1)
+
+
+class LaneChoice(NamedTuple):
+    """What a lane choice depends on: ``sides`` [..., 2, S], whether lanes exist [..., 2], whether
+    the driver is in its target lane, and whether a change under way goes to the left, [...].
+    """
+
+    sides: Tensor
+    exists: Tensor
+    keeping: Tensor
+    to_left: Tensor
+
+
+def lane_choice(vehicles: Vehicles, view: View) -> LaneChoice:
+    """The choice that each driver has."""
+    lane = view.lane.long()
+    target = vehicles.target_lane
+    return LaneChoice(view.sides, view.exists, target == lane, target > lane)
+
+
+def new_target(vehicles: Vehicles, view: View, choice: Tensor) -> Tensor:
+    """Target lanes after a ``choice`` [N, M] of 0, 1 or 2 (:meth:`HumanPolicy.lane_chances`)."""
+    target = vehicles.target_lane
+    lane = view.lane.long()
+    keeping = target == lane
+    step = (choice == 1).long() - (choice == 2).long()
+    return torch.where(keeping, target + step, torch.where(choice == 1, lane, target))
+
+
+def chosen(chances: Tensor, u: Tensor) -> Tensor:
+    """A choice [N, M] with these ``chances`` [N, M, 3] from uniform numbers [N, M]."""
+    return (u < chances[..., 1]).long() + 2 * (u >= 1.0 - chances[..., 2]).long()
+
+
+def with_style(memory: Memory, view: View, first: Tensor | None = None) -> Memory:
+    """The memory with this decision's style; ``first`` [N, M]: drivers seen for the first time."""
+    old = memory.style
+    headway = torch.where(view.log_headway.isnan(), old[..., 0], view.log_headway)
+    effort = memory.accelerations[..., 0].square()
+    pace = (view.relative_speed / 3.0).clamp(-2.0, 2.0)
+    share = DECISION_S / STYLE_S
+    style = old + share * (torch.stack((headway, effort, pace), -1) - old)
+    if first is not None:
+        # Who follows nobody yet is taken to keep 2 s.
+        headway = torch.where(view.log_headway.isnan(), math.log(2.0), view.log_headway)
+        begun = torch.stack((headway, torch.full_like(headway, 0.5), pace), -1)
+        style = torch.where(first[..., None], begun, style)
+    return memory._replace(style=style)
+
+
+def bounded(
+    vehicles: Vehicles, memory: Memory, road: Road, change: Tensor, aside: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Acceleration and lateral speed at the end of the decision, from their drawn changes.
+
+    Nobody rolls back, moves aside faster than a car can, or steers off the road: a body reaches the
+    edge in :data:`EDGE_S` at the soonest, and comes back from beyond it.
+    """
+    speed, lateral = velocity(vehicles)
+    acceleration = memory.accelerations[..., 0] + change
+    acceleration = acceleration.clamp(HARDEST_BRAKING, STRONGEST_ACCELERATION)
+    acceleration = torch.maximum(acceleration, -speed / DECISION_S)
+    half = 0.5 * vehicles.width + EDGE_M
+    to_left = (road.left_edge_m() - vehicles.y - half) / EDGE_S
+    to_right = (vehicles.y - road.right_edge_m() - half) / EDGE_S
+    lateral = torch.maximum(torch.minimum(lateral + aside, to_left), -to_right)
+    most = (STEEPEST * speed).clamp_max(FASTEST_ASIDE_MPS)
+    return acceleration, torch.minimum(torch.maximum(lateral, -most), most)
+
+
+def remembered(
+    vehicles: Vehicles, memory: Memory, view: View, acceleration: Tensor, target: Tensor
+) -> Memory:
+    """The memory after a decision for ``target`` lanes; ``vehicles`` are as before it."""
+    _, lateral = velocity(vehicles)
+    changed = target != vehicles.target_lane
+    return Memory(
+        torch.cat((acceleration[..., None], memory.accelerations[..., :-1]), -1),
+        torch.stack((lateral, memory.lateral_speeds[..., 0]), -1),
+        torch.stack((view.closing, memory.closing[..., 0]), -1),
+        memory.style,
+        memory.age + 1.0,
+        torch.where(changed, 0.0, memory.since + 1.0),
+    )
+
+
+def moved(vehicles: Vehicles, acceleration: Tensor, aside: Tensor) -> Vehicles:
+    """The vehicles 0.4 s later: constant acceleration, lateral speed changing evenly."""
+    speed, lateral = velocity(vehicles)
+    later = (speed + acceleration * DECISION_S).clamp_min(0.0)
+    x = vehicles.x + 0.5 * (speed + later) * DECISION_S
+    y = vehicles.y + 0.5 * (lateral + aside) * DECISION_S
+    return with_velocity(vehicles.with_(x=x, y=y, acceleration=acceleration), later, aside)
+
+
+def with_velocity(vehicles: Vehicles, along: Tensor, across: Tensor) -> Vehicles:
+    """The vehicles at these speeds, m/s; nobody moves more aside than a fifth of its way ahead."""
+    # Who stands keeps its heading.
+    moves = along > 0.0
+    across = torch.minimum(torch.maximum(across, -0.2 * along), 0.2 * along)
+    heading = torch.where(moves, torch.atan2(across, along), vehicles.heading)
+    speed = torch.where(moves, torch.hypot(along, across), 0.0)
+    return vehicles.with_(speed=speed, heading=heading)

@@ -1,0 +1,133 @@
+"""A driver's present motion from its last nine positions, whatever noise is on them.
+
+A small network, fitted to pairs of recorded and smoothed tracks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import smooth_l1_loss
+
+from ganlane.generator.human import DECISION_S, STEPS, HumanPolicy
+from ganlane.generator.windows import OBSERVED_POSITIONS
+from ganlane.keys import PHYSICS_STEP_S
+from ganlane.settings.generator import HumanSizes
+
+if TYPE_CHECKING:
+    from ganlane.generator.human_samples import SmoothScene
+
+#: Of the fit.
+UPDATES, BATCH, RATE = 3000, 1024, 2e-3
+#: Errors that weigh alike: speed, both accelerations, both lateral speeds, both places.
+SCALES = (0.3, 0.8, 0.8, 0.1, 0.1, 0.05, 0.05)
+
+
+class Estimator(nn.Module):
+    """A driver's motion from nine positions.
+
+    Speed; acceleration over the last and the last but one 0.4 s; lateral speed now and 0.4 s ago;
+    and the errors of the last position along and across.
+    """
+
+    def __init__(self, hidden: int = 64) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Linear(20, hidden),
+            nn.SiLU(),
+            nn.Linear(hidden, hidden),
+            nn.SiLU(),
+            nn.Linear(hidden, len(SCALES)),
+        )
+
+    def forward(self, positions: Tensor) -> Tensor:
+        """[..., 7] from positions [..., 9, 2] in m."""
+        motion = positions.diff(dim=-2) / PHYSICS_STEP_S
+        mean = motion.mean(-2, keepdim=True)
+        apart = motion - mean
+        inputs = [
+            apart[..., 0],
+            3.0 * apart[..., 1],
+            torch.log(roughness(positions) + 0.02),
+            mean[..., 0] / 15.0,
+            mean[..., 1],
+        ]
+        out = self.layers(torch.cat(inputs, -1))
+        scale = torch.tensor([1.0, 1.0, 1.0, 0.3, 0.3, 0.1, 0.1])
+        level = torch.zeros_like(out)
+        level[..., 0] = mean[..., 0, 0]
+        level[..., 3:5] = mean[..., 0, 1:2]
+        return level + scale * out
+
+
+class HumanModel(nn.Module):
+    """What a file of ``human`` holds: the policy, and the estimator for forecasts."""
+
+    def __init__(self, sizes: HumanSizes) -> None:
+        super().__init__()
+        self.sizes = sizes
+        self.policy = HumanPolicy(sizes)
+        self.estimator = Estimator()
+
+
+def roughness(positions: Tensor) -> Tensor:
+    """How much speeds jitter from step to step, m/s, along and across, [..., 2]."""
+    motion = positions.diff(dim=-2) / PHYSICS_STEP_S
+    return motion.diff(dim=-2).diff(dim=-2).square().mean(-2).sqrt()
+
+
+def trust(positions: Tensor) -> Tensor:
+    """How far a history [..., 9, 2] can be trusted, as the age of a driver in decisions, 1 to 5."""
+    return 1.0 + 4.0 * torch.exp(-roughness(positions)[..., 0] / 0.15)
+
+
+def fit_estimator(
+    estimator: Estimator, scenes: Sequence[SmoothScene], random: torch.Generator
+) -> None:
+    """Fit the estimator to these scenes, which hold the recorded and the smoothed positions."""
+    raw, smooth, motion = _tracks(scenes)
+    optimizer = torch.optim.Adam(estimator.parameters(), RATE)
+    scales = torch.tensor(SCALES)
+    for update in range(UPDATES):
+        optimizer.param_groups[0]["lr"] = RATE * 0.5 * (1 + math.cos(math.pi * update / UPDATES))
+        rows = torch.randint(len(raw), (BATCH,), generator=random)
+        # From no noise to a little more than the recorded one.
+        noise = 1.2 * torch.rand((BATCH, 1, 1), generator=random)
+        draw = torch.rand((BATCH, 1, 1), generator=random)
+        noise = torch.where(draw < 0.25, 0.0, torch.where(draw < 0.65, 1.0, noise))
+        positions = smooth[rows] + noise * (raw[rows] - smooth[rows])
+        wanted = motion[rows].clone()
+        wanted[:, 5:] -= positions[:, -1]
+        side = torch.where(torch.rand(BATCH, generator=random) < 0.5, -1.0, 1.0)
+        positions = positions - positions[:, -1:]
+        positions[..., 1] *= side[:, None]
+        wanted[:, [3, 4, 6]] *= side[:, None]
+        error = (estimator(positions.float()) - wanted.float()) / scales
+        loss = smooth_l1_loss(error, torch.zeros_like(error))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    estimator.requires_grad_(False)
+
+
+def _tracks(scenes: Sequence[SmoothScene]) -> tuple[Tensor, Tensor, Tensor]:
+    """Nine recorded and smoothed positions [R, 9, 2], and the motion at the last one [R, 7]."""
+    raw, smooth, motion = [], [], []
+    for scene in scenes:
+        for track in range(scene.x.shape[1]):
+            rows = np.flatnonzero(scene.present[:, track])
+            for last in range(rows[0] + OBSERVED_POSITIONS - 1, rows[-1] + 1, 2):
+                at = slice(last - OBSERVED_POSITIONS + 1, last + 1), track
+                raw.append(np.stack((scene.raw_x[at], scene.raw_y[at]), -1))
+                smooth.append(np.stack((scene.x[at], scene.y[at]), -1))
+                speed = scene.speed[[last, last - STEPS, last - 2 * STEPS], track]
+                aside = scene.lateral_speed[[last, last - STEPS], track]
+                changes = -np.diff(speed) / DECISION_S
+                place = (scene.x[last, track], scene.y[last, track])
+                motion.append([speed[0], *changes, *aside, *place])
+    return tuple(torch.tensor(np.array(numbers)) for numbers in (raw, smooth, motion))  # type: ignore[return-value]

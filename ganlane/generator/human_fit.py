@@ -1,0 +1,375 @@
+"""The fit of ``human``: cloning, then samples in closed loop; fine-tuning follows it.
+
+Cloning alone drifts, since a clone never sees its own mistakes. So the policy drives the recorded
+scenes itself: of several moves that it draws, the nearest to the recording is made, and the target
+is what leads back to it. Where recordings are silent (fast, free, standing, about to collide, off
+the lane) samples of IDM drivers with headways of their own stand in.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from ganlane.data.dense import Recording
+from ganlane.generator.human import (
+    ACCELERATIONS,
+    ACROSS,
+    ALONG,
+    HumanPolicy,
+    Memory,
+    perceive,
+    see,
+    with_velocity,
+)
+from ganlane.generator.human_estimator import HumanModel, fit_estimator
+from ganlane.generator.human_samples import (
+    DESIRED_MPS,
+    Cut,
+    Options,
+    Samples,
+    SmoothScene,
+    cuts,
+    joined,
+    samples_of,
+    smooth_scene,
+)
+from ganlane.generator.human_tuning import Iteration, tune
+from ganlane.settings.driving import Visibility
+from ganlane.settings.generator import HumanConfig
+from ganlane.sim.idm import DriverIdm, following_acceleration
+from ganlane.sim.neighbours import perceive as scene_of
+from ganlane.sim.state import Road, Vehicles
+
+#: Called with the steps made, of how many in all, and the last cost of the fine-tuning.
+Report = Callable[[int, int, float | None], None]
+#: Decisions of a segment: of whole scenes, and short ones, which begin more often as recorded.
+LONG_DECISIONS, SHORT_DECISIONS = 20, 5
+#: Weight of samples from files of one lane.
+ONE_LANE_WEIGHT = 0.5
+#: Random scenes of the prior, and vehicles in each.
+PRIOR_SCENES, PRIOR_VEHICLES = 9000, 8
+#: Samples of an update, and of the prior beside them.
+BATCH = 1024
+PRIOR_SHARE = 0.15
+#: Noise on the inputs, so that the policy does not hang on their last digits.
+INPUT_NOISE = 0.02
+#: Updates of the lane choice, its learning rate and decay: lane changes are few.
+LANE_UPDATES, LANE_RATE, LANE_DECAY = 300, 3e-3, 0.05
+
+
+class Material(NamedTuple):
+    """What a policy is fitted to: stretches of recordings, and the prior's samples.
+
+    ``around`` and ``ahead`` are stretches of two-dimensional scenes and of one lane; ``short`` are
+    short ones of both; ``danger`` are lane changes that nobody survives, [D, SIDE_FEATURES].
+    """
+
+    around: list[Cut]
+    ahead: list[Cut]
+    short: list[Cut]
+    prior: Samples
+    danger: Tensor
+
+
+def material_of(scenes: Sequence[SmoothScene], random: torch.Generator) -> Material:
+    """Everything that a policy is fitted to."""
+    wide = [scene for scene in scenes if scene.two_dimensional]
+    narrow = [scene for scene in scenes if not scene.two_dimensional]
+    prior, danger = prior_samples(random)
+    return Material(
+        cuts(wide, LONG_DECISIONS, 10),
+        cuts(narrow, LONG_DECISIONS, 60),
+        [*cuts(wide, SHORT_DECISIONS, 4), *cuts(narrow, SHORT_DECISIONS, 40)],
+        prior,
+        danger,
+    )
+
+
+def fit_human(
+    config: HumanConfig,
+    recordings: Sequence[Recording],
+    following: Sequence[Recording] = (),
+    report: Report = lambda done, of, cost: None,
+) -> tuple[HumanModel, float]:
+    """Fit a model to ``recordings`` of several lanes and to cars ``following`` each other in one.
+
+    Returns:
+        The model, in evaluation mode, and the seconds that it took.
+    """
+    # Networks draw their first weights from torch's own generator, which stays the caller's.
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        return _fitted(config, recordings, following, report)
+
+
+def _fitted(
+    config: HumanConfig,
+    recordings: Sequence[Recording],
+    following: Sequence[Recording],
+    report: Report,
+) -> tuple[HumanModel, float]:
+    begun = time.monotonic()
+    random = torch.Generator().manual_seed(config.seed)
+    model = HumanModel(config.sizes)
+    cutoffs = config.cutoff_hz, config.lateral_cutoff_hz
+    scenes = [smooth_scene(recording, *cutoffs) for recording in recordings]
+    fit_estimator(model.estimator, scenes, random)
+    if config.following:
+        scenes += [smooth_scene(one, *cutoffs, ONE_LANE_WEIGHT) for one in following]
+    material = material_of(scenes, random)
+    steps = 1 + config.rounds + config.tuning
+    teacher = clone(model.policy, material, config, random)
+    report(1, steps, None)
+
+    def after_round(number: int) -> None:
+        report(1 + number, steps, None)
+
+    close_the_loop(model, material, teacher, config, random, after_round)
+
+    def after_iteration(iteration: Iteration) -> None:
+        report(1 + config.rounds + iteration.number, steps, iteration.cost)
+
+    tune(model.policy, teacher, material.danger, config, random, after_iteration)
+    return model.eval().requires_grad_(False), time.monotonic() - begun
+
+
+def clone(
+    policy: HumanPolicy, material: Material, config: HumanConfig, random: torch.Generator
+) -> Samples:
+    """Fit ``policy`` to what recorded drivers did; gives the teacher samples."""
+    samples = _gathered(material, Options(), config, random, times=3)
+    moves = _moves(samples, slice(None))
+    for rate in (config.learning_rate, 0.5 * config.learning_rate):
+        train_moves(policy, moves, material.prior, max(1, config.epochs // 2), rate, random)
+    train_lane_choice(policy, samples, material.danger, random)
+    return samples
+
+
+def close_the_loop(
+    model: HumanModel,
+    material: Material,
+    teacher: Samples,
+    config: HumanConfig,
+    random: torch.Generator,
+    report: Callable[[int], None],
+) -> None:
+    """Rounds of closed-loop samples; the last two rounds and as many teacher samples count."""
+    bank: list[tuple[Tensor, ...]] = []
+    options = Options(model.policy, samples=config.samples)
+    noisy = options._replace(estimator=model.estimator)
+    for number in range(config.rounds):
+        parts = _gathered(material, options, config, random, times=2)
+        short = samples_of(material.short, noisy, random)
+        bank = [*bank[-1:], _moves(joined([parts, short]), slice(None))]
+        rows = torch.randperm(len(teacher.features), generator=random)[: len(bank[-1][0])]
+        mixed = [_moves(teacher, rows), *bank]
+        moves = tuple(torch.cat(tensors) for tensors in zip(*mixed))
+        # From half of the cloning's rate down to a sixth of it.
+        rate = 0.5 * config.learning_rate * (1.0 - 0.7 * number / max(1, config.rounds - 1))
+        epochs = max(1, config.epochs // 3)
+        train_moves(model.policy, moves, material.prior, epochs, rate, random)
+        report(number + 1)
+
+
+def _gathered(
+    material: Material, options: Options, config: HumanConfig, random: torch.Generator, times: int
+) -> Samples:
+    """Samples of all stretches, ``times`` over; every third pass is lengthened."""
+    parts = []
+    for number in range(times):
+        scale = config.scale if number % 3 == times % 3 - 1 or number == 2 else 0.0
+        parts.append(samples_of(material.around, options._replace(scale=scale), random))
+    if material.ahead:
+        # Cars of one lane have no sides to be hidden, and nothing to be mirrored.
+        alone = options._replace(vary=False, blind=0.0)
+        parts.append(samples_of(material.ahead, alone, random))
+    return joined(parts)
+
+
+def _moves(samples: Samples, rows: Tensor | slice) -> tuple[Tensor, ...]:
+    """Features, wanted changes and weights of ``rows``."""
+    return tuple(tensor[rows] for tensor in samples[:5])
+
+
+def move_losses(policy: HumanPolicy, moves: Sequence[Tensor]) -> Tensor:
+    """Cross-entropies of the wanted changes along and across, weighted, [R]."""
+    features, change, aside, weight, lateral_weight = moves
+    along, across = policy(features)
+    loss = -(ALONG.soft_target(change) * along.log_softmax(-1)).sum(-1) * weight
+    lateral = -(ACROSS.soft_target(aside) * across.log_softmax(-1)).sum(-1) * lateral_weight
+    return loss + lateral
+
+
+def train_moves(
+    policy: HumanPolicy,
+    moves: Sequence[Tensor],
+    prior: Samples,
+    epochs: int,
+    rate: float,
+    random: torch.Generator,
+) -> None:
+    """Fit the distributions to ``moves`` (:func:`_moves`), with the prior's beside them."""
+    parts = (policy.trunk, policy.along, policy.across)
+    parameters = [parameter for part in parts for parameter in part.parameters()]
+    optimizer = torch.optim.AdamW(parameters, lr=rate, weight_decay=1e-3, fused=True)
+    rows = len(moves[0])
+    updates = max(1, epochs * (rows // BATCH))
+
+    def share(update: int) -> float:
+        # A short warm-up, then a half cosine to 0.
+        return min(1.0, (update + 1) / 100) * 0.5 * (1.0 + math.cos(math.pi * update / updates))
+
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, share)
+    for _ in range(epochs):
+        for batch in torch.randperm(rows, generator=random).split(BATCH):
+            also = torch.randint(
+                len(prior.features), (int(PRIOR_SHARE * len(batch)),), generator=random
+            )
+            both = [
+                torch.cat((mine[batch], theirs[also])) for mine, theirs in zip(moves, prior[:5])
+            ]
+            both[0] = both[0] + INPUT_NOISE * torch.randn(both[0].shape, generator=random)
+            loss = move_losses(policy, both).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(parameters, 5.0)
+            optimizer.step()
+            schedule.step()
+
+
+def train_lane_choice(
+    policy: HumanPolicy, samples: Samples, danger: Tensor, random: torch.Generator
+) -> None:
+    """Fit when a lane change begins, and when one is broken off.
+
+    Beginning is a logistic regression on the recorded ones; nobody begins one into danger. Changes
+    under way go on as recorded ones did, and are broken off in danger.
+    """
+    begun = samples.sides[samples.begins == 1]
+    not_begun = samples.sides[samples.begins == 0]
+    under_way = samples.sides[samples.begins < 0]
+    if not len(begun):
+        return  # without a recorded change nobody changes lanes
+    last = policy.lane[-1]
+    assert isinstance(last, nn.Linear)
+    with torch.no_grad():
+        # From the recorded rate on.
+        last.bias.copy_(torch.tensor([math.log(len(begun) / len(not_begun)), -2.0]))
+        last.weight.mul_(0.1)
+    optimizer = torch.optim.AdamW(policy.lane.parameters(), lr=LANE_RATE, weight_decay=LANE_DECAY)
+    for _ in range(LANE_UPDATES):
+        rows = torch.randint(len(not_begun), (4096,), generator=random)
+        others = torch.randint(len(danger), (1024,), generator=random)
+        begins = policy.lane(begun)[:, 0]
+        stays = policy.lane(not_begun[rows])[:, 0]
+        in_danger = policy.lane(danger[others])
+        scale = len(not_begun) / len(rows)
+        # Per recorded change, so that few count as much as many.
+        loss = (softplus(-begins).sum() + scale * softplus(stays).sum()) / len(begun)
+        loss = loss + 2.0 * softplus(in_danger[:, 0] + 10.0).mean()
+        loss = loss + softplus(-in_danger[:, 1]).mean()
+        if len(under_way):
+            loss = loss + 2.0 * softplus(policy.lane(under_way)[:, 1] + 1.0).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+
+@torch.no_grad()
+def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[Samples, Tensor]:
+    """IDM drivers with headways of their own where recordings show nothing, and lane changes into
+    danger [D, SIDE_FEATURES].
+    """
+    shape = (scenes, PRIOR_VEHICLES)
+
+    def rand(*size: int) -> Tensor:
+        return torch.rand(size or shape, generator=random)
+
+    def randn(*size: int) -> Tensor:
+        return torch.randn(size or shape, generator=random)
+
+    road = Road(3, 3.6)
+    lane = torch.randint(0, 3, shape, generator=random)
+    # A third of the drivers is somewhere between two lanes.
+    astray = rand() < 0.35
+    y = lane * 3.6 + torch.where(astray, 3.2, 0.5) * (rand() - 0.5)
+    pace = 36.0 * rand(scenes, 1) ** 0.8
+    speed = (pace + 6.0 * randn() * rand(scenes, 1)).clamp(0.0, 38.0)
+    speed = torch.where(rand() < 0.08, 3.0 * rand(), speed)
+    desired = torch.where(rand() < 0.5, 14.0 + 20.0 * rand(), speed + 8.0 * rand())
+    headway = torch.exp(math.log(1.25) + 0.42 * randn()).clamp(0.5, 3.0)
+    aside = torch.where(astray, 0.45, 0.15) * randn()
+    target = torch.where(astray, road.lane_of(y).long(), lane)
+    whole = torch.full(shape, 1.0)
+    vehicles = Vehicles(
+        x=rand() * (60.0 + 500.0 * rand(scenes, 1)),
+        y=y,
+        heading=0.0 * whole,
+        speed=speed,
+        acceleration=0.0 * whole,
+        length=4.5 * whole,
+        width=1.9 * whole,
+        desired_speed=desired.clamp(*DESIRED_MPS),
+        target_lane=target,
+        visibility=torch.full(shape, int(Visibility.CENTRE)),
+        valid=whole > 0,
+    )
+    vehicles = with_velocity(vehicles, speed, aside)
+    idm = DriverIdm(2.0, headway, 2.0 * whole, -8.0 * whole, 1.4 * whole)
+    wanted = following_acceleration(scene_of(vehicles, road), idm)
+    before = torch.where(rand() < 0.5, 0.6 * randn(), (wanted * rand()).clamp(-6.0, 2.0))
+    history = before[..., None] + 0.4 * randn(*shape, ACCELERATIONS)
+    history[..., 0] = before
+    style = torch.stack((torch.log(headway) + 0.2 * randn(), 0.5 * rand(), 0.5 * randn()), -1)
+    lateral = aside[..., None] + 0.03 * randn(*shape, 2)
+    none = torch.zeros(*shape, 2)
+    memory = Memory(history, lateral, none, style, 12.0 * rand(), 12.0 * rand())
+    vehicles = vehicles.with_(acceleration=before)
+    view = perceive(vehicles, memory, road)
+    closing = view.closing[..., None] + 0.3 * randn(*shape, 2)
+    view = perceive(vehicles, memory._replace(closing=closing), road)
+
+    time_to_collision = view.gap / (-view.closing).clamp_min(1e-3)
+    silent = (speed > 19.0) | (speed < 1.5) | (view.gap > 80.0)
+    silent |= (time_to_collision < 4.0) | (view.gap / speed.clamp_min(1.0) < 0.5)
+    # Few overlap.
+    silent &= ~((view.gap < 0.0) & (rand() < 0.8))
+    off_target = vehicles.y - target * 3.6
+    far_off = off_target.abs() > 0.75
+    counts = silent | far_off
+    # Half of the way to IDM's acceleration, all of it where that is hard braking.
+    hard = wanted < -2.0
+    change = torch.where(hard, 1.0, 0.5) * (wanted - before)
+    change = change + torch.where(hard, 0.05, 0.18) * randn()
+    back = (-0.45 * (vehicles.y - lane * 3.6)).clamp(-0.9, 0.9)
+    sideways = 0.4 * (back - aside) + 0.03 * randn()
+    nobody = torch.zeros(0)
+    samples = Samples(
+        view.features[counts],
+        change[counts],
+        sideways[counts],
+        silent.float()[counts],
+        torch.where(far_off, 0.5, 0.1)[counts],
+        view.sides[:0, 0, 0],
+        nobody,
+        view.sides[:0, 0],
+        view.exists[:0, 0],
+    )
+    return samples, dangerous_sides(vehicles, view.sides, view.exists, road)
+
+
+def dangerous_sides(vehicles: Vehicles, sides: Tensor, exists: Tensor, road: Road) -> Tensor:
+    """The sides [D, SIDE_FEATURES] to which a change would leave less than 2 m, or ask for more
+    than 2.5 m/s2.
+    """
+    _, ahead, behind = see(vehicles, road)
+    narrow = [torch.minimum(ahead.gap[..., side], behind.gap[..., side]) < 2.0 for side in (2, 0)]
+    hard = (sides[..., 9] > 2.5) | (sides[..., 10] > 2.5)
+    return sides[(hard | torch.stack(narrow, -1)) & exists]

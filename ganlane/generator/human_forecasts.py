@@ -1,0 +1,160 @@
+"""Forecasts of recorded drivers by ``human``.
+
+The present follows from nine noisy positions (:mod:`ganlane.generator.human_estimator`). From there
+on the policy drives everybody in the scene, by expected moves (the mean driver) or by drawn ones
+(samples).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ganlane.generator.forecasts import SAMPLES, Forecasts, by_kind, driven_windows
+from ganlane.generator.human import (
+    ACCELERATIONS,
+    ACROSS,
+    ALONG,
+    DECISION_S,
+    STEPS,
+    Memory,
+    bounded,
+    chosen,
+    lane_choice,
+    moved,
+    new_target,
+    perceive,
+    remembered,
+    velocity,
+    with_style,
+    with_velocity,
+)
+from ganlane.generator.human_estimator import Estimator, HumanModel, trust
+from ganlane.generator.human_samples import DESIRED_MPS, LONG_AGO
+from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT, SceneTracks, Segments
+from ganlane.keys import PHYSICS_STEP_S
+from ganlane.settings.driving import Visibility
+from ganlane.settings.traffic import HumanTrafficConfig
+from ganlane.sim.state import Road, Vehicles
+
+#: A driver's desired speed is its present one and this much, m/s.
+DESIRED_ABOVE_MPS = 4.0
+#: Width of a body where none is recorded, m.
+WIDTH_M = 1.9
+#: Who moves aside faster than this, m/s, away from its lane's centre, is changing lanes.
+CHANGING_MPS = 0.35
+
+
+def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memory, Road]:
+    """Vehicles and memories at the present of segments [B, V].
+
+    Who was not recorded in all of the nine frames goes on at constant velocity so far.
+    """
+    positions = segments.positions[:, :OBSERVED_POSITIONS]
+    whole = segments.present[:, :OBSERVED_POSITIONS].all(1)
+    nine = positions.transpose(1, 2)
+    last = nine[:, :, -1]
+    now = estimator(nine - last[:, :, None])
+    latest = (nine[:, :, -1, 0] - nine[:, :, -2, 0]) / PHYSICS_STEP_S
+    now = torch.where(whole[..., None], now, 0.0)
+    speed = torch.where(whole, now[..., 0], latest).clamp_min(0.0)
+    aside = now[..., 3]
+    road = Road(segments.lanes.float(), segments.lane_width)
+    x, y = last[..., 0] + now[..., 5], last[..., 1] + now[..., 6]
+    lane = road.lane_of(y)
+    leaving = (aside.abs() > CHANGING_MPS) & ((y - lane * road.lane_width_m) * aside > 0.1)
+    soon = road.lane_of(y + 1.5 * aside)
+    soon = torch.minimum(torch.maximum(soon, lane - 1), lane + 1)
+    zero = torch.zeros_like(x)
+    accelerations = torch.stack((now[..., 1], now[..., 2], *[zero] * (ACCELERATIONS - 2)), -1)
+    vehicles = Vehicles(
+        x=x,
+        y=y,
+        heading=zero,
+        speed=speed,
+        acceleration=accelerations[..., 0],
+        length=segments.length.clamp_min(1.0),
+        width=zero + WIDTH_M,
+        desired_speed=(speed + DESIRED_ABOVE_MPS).clamp(*DESIRED_MPS),
+        target_lane=torch.where(leaving, soon, lane).long(),
+        visibility=torch.full_like(lane, int(Visibility.CENTRE)).long(),
+        valid=segments.present[:, PRESENT],
+    )
+    vehicles = with_velocity(vehicles, speed, aside)
+    none = torch.stack((zero, zero), -1)
+    memory = Memory(
+        accelerations,
+        torch.stack((now[..., 4], now[..., 4]), -1),
+        none,
+        torch.stack((zero, zero, zero), -1),
+        torch.where(whole, trust(nine), 0.0),
+        zero + LONG_AGO,
+    )
+    view = perceive(vehicles, memory, road)
+    memory = memory._replace(closing=torch.stack((view.closing, view.closing), -1))
+    return vehicles, with_style(memory, view, torch.ones_like(whole)), road
+
+
+@torch.no_grad()
+def human_forecasts(
+    model: HumanModel,
+    scenes: list[SceneTracks],
+    horizon: int,
+    stride: int,
+    samples: int = SAMPLES,
+) -> Forecasts:
+    """The mean driver's and drawn drivers' positions in all windows of the scenes."""
+    random = torch.Generator().manual_seed(0)
+
+    def driver(segments: Segments) -> Tensor:
+        return _driven(model, segments, horizon, samples, random)
+
+    forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
+    # The recording takes the same way, so that its windows come in the same order.
+    recorded = driven_windows(lambda segments: segments.future[None], scenes, horizon, stride)[0]
+    return by_kind(forecasts, recorded)
+
+
+def _driven(
+    model: HumanModel,
+    segments: Segments,
+    horizon: int,
+    samples: int,
+    random: torch.Generator,
+) -> Tensor:
+    """Positions [1 + samples, B, horizon, V, 2]; the first are the mean driver's."""
+    policy = model.policy
+    runs, rows = 1 + samples, len(segments.positions)
+    vehicles, memory, road = present_of(model.estimator, segments.repeated(runs))
+    mean = torch.zeros_like(vehicles.valid)
+    mean[:rows] = True
+    temperature = HumanTrafficConfig.temperature
+    steps = torch.arange(1, STEPS + 1) * PHYSICS_STEP_S
+    course = []
+    for decision in range(-(-horizon // STEPS)):
+        if decision:
+            memory = with_style(memory, perceive(vehicles, memory, road))
+        view = perceive(vehicles, memory, road)
+        chances = policy.lane_chances(lane_choice(vehicles, view))
+        choice = chosen(chances, torch.rand(mean.shape, generator=random))
+        target = torch.where(mean, vehicles.target_lane, new_target(vehicles, view, choice))
+        changed = target != vehicles.target_lane
+        memory = memory._replace(since=torch.where(changed, 0.0, memory.since))
+        vehicles = vehicles.with_(target_lane=target)
+        view = perceive(vehicles, memory, road)
+        changes = []
+        for tokens, logits in zip((ALONG, ACROSS), policy(view.features)):
+            u = torch.rand(mean.shape, generator=random)
+            drawn = tokens.sample(logits, u, temperature)
+            changes.append(torch.where(mean, tokens.mean(logits), drawn))
+        acceleration, aside = bounded(vehicles, memory, road, *changes)
+        speed, lateral = velocity(vehicles)
+        # Within a decision: constant acceleration, the lateral speed changing evenly.
+        half = 0.5 * steps[:, None, None] ** 2
+        x = vehicles.x + speed * steps[:, None, None] + half * acceleration
+        y = vehicles.y + lateral * steps[:, None, None] + half * (aside - lateral) / DECISION_S
+        course.append(torch.stack((x, y), -1))
+        memory = remembered(vehicles, memory, view, acceleration, target)
+        vehicles = moved(vehicles, acceleration, aside)
+    positions = torch.cat(course)[:horizon]
+    return positions.transpose(0, 1).unflatten(0, (runs, rows))

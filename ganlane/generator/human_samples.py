@@ -1,0 +1,585 @@
+"""From recordings to samples of what ``human`` is fitted to: a view, and the move that follows it.
+
+A sample is a driver at a decision. *Teacher* samples are cut from the recordings as they are. For
+*closed-loop* samples the policy drives: of several moves that it draws, the one nearest to the
+recording is made, and the sample is what would lead back to the recording. Positions are smoothed
+first, since a camera's noise is no driver's wish (docs/generators.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter1d
+from torch import Tensor
+
+from ganlane.data.dense import Flags, Floats, Recording
+from ganlane.generator.human import (
+    ACCELERATIONS,
+    ACROSS,
+    ALONG,
+    DECISION_S,
+    HARDEST_BRAKING,
+    LATERAL_SPEEDS,
+    STEPS,
+    STRONGEST_ACCELERATION,
+    HumanPolicy,
+    LaneChoice,
+    Memory,
+    View,
+    bounded,
+    lane_choice,
+    moved,
+    perceive,
+    remembered,
+    velocity,
+    with_style,
+    with_velocity,
+)
+from ganlane.generator.human_estimator import Estimator, trust
+from ganlane.generator.windows import OBSERVED_POSITIONS
+from ganlane.keys import PHYSICS_STEP_S
+from ganlane.settings.driving import Visibility
+from ganlane.sim.state import Road, Vehicles
+
+#: Frames before the present that a segment holds, for the drivers' memory.
+HISTORY = ACCELERATIONS * STEPS
+#: Desired speeds are the track's highest speed and up to this much more, within bounds, m/s.
+DESIRED_ABOVE_MPS = 10.0
+DESIRED_MPS = (5.0, 36.0)
+#: A lane change begins where the driver last moved towards it by more than this, m/s, or was nearer
+#: to its lane's centre than that, m.
+BEGUN_MPS = 0.1
+BEGUN_M = 0.3
+#: Gains that lead a driver back to its recording: of speed, place along and place across.
+SPEED_GAIN = 0.5
+PLACE_GAIN = 0.08
+LATERAL_GAIN = 0.3
+#: Pairs of vehicles in a batch; bounds the memory.
+_MOST_PAIRS = 300_000
+
+
+@dataclass(frozen=True)
+class SmoothScene:
+    """A recording of T frames and V tracks, smoothed; entries of absent vehicles are 0.
+
+    Attributes:
+        x, y, speed, lateral_speed: [T, V], m and m/s; raw_x, raw_y: as recorded.
+        target: [T, V] lane that the driver heads for: the new one from the start of a change on.
+        present: [T, V]; length, width, driven: [V].
+        lanes, lane_width_m: of its road.
+        two_dimensional: whether positions across the road were recorded.
+        weight: of its samples.
+    """
+
+    x: Floats
+    y: Floats
+    raw_x: Floats
+    raw_y: Floats
+    speed: Floats
+    lateral_speed: Floats
+    target: np.ndarray
+    present: Flags
+    length: Floats
+    width: Floats
+    driven: Flags
+    lanes: int
+    lane_width_m: float
+    two_dimensional: bool
+    weight: float
+
+
+def smooth(track: Floats, cutoff_hz: float) -> Floats:
+    """A track [T] without what is faster than ``cutoff_hz``, of which half is left.
+
+    A Gaussian; beyond its ends the track is continued by its own point reflection.
+    """
+    # The transform of a Gaussian is one half at this frequency.
+    frames = np.sqrt(np.log(2.0) / 2.0) / (np.pi * cutoff_hz * PHYSICS_STEP_S)
+    reach = min(len(track) - 1, int(4.0 * frames) + 1)
+    longer = np.pad(track, reach, "reflect", reflect_type="odd")
+    return gaussian_filter1d(longer, frames)[reach : reach + len(track)]
+
+
+def smooth_scene(
+    recording: Recording,
+    cutoff_hz: float,
+    lateral_cutoff_hz: float,
+    weight: float = 1.0,
+) -> SmoothScene:
+    """The recording smoothed, with the drivers' target lanes."""
+    shape = recording.x.shape
+    arrays = {name: np.zeros(shape) for name in ("x", "y", "speed", "lateral_speed")}
+    target = np.zeros(shape, np.int64)
+    for track in range(shape[1]):
+        rows = np.flatnonzero(recording.present[:, track])
+        part = slice(rows[0], rows[-1] + 1), track
+        if len(rows) < 3:
+            arrays["x"][part] = recording.x[part]
+            arrays["y"][part] = recording.y[part]
+        else:
+            x = smooth(recording.x[part], cutoff_hz)
+            y = smooth(recording.y[part], lateral_cutoff_hz)
+            arrays["x"][part] = x
+            arrays["y"][part] = y
+            arrays["speed"][part] = np.gradient(x, PHYSICS_STEP_S).clip(0.0)
+            arrays["lateral_speed"][part] = np.gradient(y, PHYSICS_STEP_S)
+        target[part] = target_lanes(
+            arrays["y"][part],
+            arrays["lateral_speed"][part],
+            recording.lane_width_m,
+            recording.lanes,
+        )
+    return SmoothScene(
+        **arrays,
+        raw_x=recording.x,
+        raw_y=recording.y,
+        target=target,
+        present=recording.present,
+        length=recording.length.astype(float),
+        width=recording.width.astype(float),
+        driven=recording.driven,
+        lanes=recording.lanes,
+        lane_width_m=recording.lane_width_m,
+        two_dimensional=recording.lanes > 1,
+        weight=weight,
+    )
+
+
+def target_lanes(y: Floats, lateral_speed: Floats, width_m: float, lanes: int) -> np.ndarray:
+    """The lane [T] that a driver heads for: from the start of a change on the new one.
+
+    A change counts if the track stays for 0.5 s in each of the two lanes.
+    """
+    lane = np.rint(y / width_m).clip(0, lanes - 1).astype(np.int64)
+    target = lane.copy()
+    for last in np.flatnonzero(np.diff(lane)):
+        old, new = lane[last], lane[last + 1]
+        before, after = lane[max(0, last - 4) : last + 1], lane[last + 1 : last + 6]
+        if (before != old).any() or (after != new).any():
+            continue
+        side = np.sign(new - old)
+        begin = last
+        # Back to where the driver set out.
+        while (
+            begin > 0
+            and lane[begin - 1] == old
+            and abs(y[begin - 1] - old * width_m) > BEGUN_M
+            and side * lateral_speed[begin - 1] > BEGUN_MPS
+        ):
+            begin -= 1
+        target[begin : last + 1] = new
+    return target
+
+
+class Segments(NamedTuple):
+    """B stretches of scenes side by side, [B, T, M] each; the present is frame :data:`HISTORY`."""
+
+    x: Tensor
+    y: Tensor
+    raw_x: Tensor
+    raw_y: Tensor
+    speed: Tensor
+    lateral_speed: Tensor
+    target: Tensor
+    present: Tensor
+    length: Tensor
+    width: Tensor
+    driven: Tensor
+    lanes: Tensor
+    lane_width_m: Tensor
+    two_dimensional: Tensor
+    weight: Tensor
+
+    @property
+    def road(self) -> Road:
+        """One road per segment."""
+        return Road(self.lanes, self.lane_width_m)
+
+    def mirrored(self) -> Segments:
+        """Left and right swapped."""
+        last = self.lanes - 1
+        left = (last * self.lane_width_m)[:, None]
+        target = last[:, None].long() - self.target
+        return self._replace(
+            y=torch.where(self.present, left - self.y, self.y),
+            raw_y=torch.where(self.present, left - self.raw_y, self.raw_y),
+            target=torch.where(self.present, target, 0),
+            lateral_speed=-self.lateral_speed,
+        )
+
+    def scaled(self, factor: Tensor) -> Segments:
+        """Lengths along the road times ``factor`` [B, 1]; cars keep theirs, headways stay."""
+        by = factor[:, None]
+        noise = self.raw_x - self.x
+        return self._replace(x=self.x * by, raw_x=self.x * by + noise, speed=self.speed * by)
+
+    def widened(self, factor: Tensor) -> Segments:
+        """Lanes and lateral moves times ``factor`` [B, 1]."""
+        by = factor[:, None]
+        return self._replace(
+            y=self.y * by,
+            raw_y=self.raw_y * by,
+            lateral_speed=self.lateral_speed * by,
+            lane_width_m=self.lane_width_m * factor,
+        )
+
+
+class Cut(NamedTuple):
+    """A stretch of a scene: its first frame (before which history is missing) and its vehicles."""
+
+    scene: SmoothScene
+    start: int
+    frames: int
+    who: np.ndarray
+
+
+def cuts(scenes: Sequence[SmoothScene], decisions: int, stride: int) -> list[Cut]:
+    """Stretches of ``decisions`` that begin every ``stride`` frames."""
+    frames = HISTORY + STEPS * (decisions + 1) + 1
+    found = []
+    for scene in scenes:
+        for start in range(0, max(1, len(scene.x) - STEPS * 3), stride):
+            who = scene.present[start : start + frames - HISTORY].any(0)
+            if who.any():
+                found.append(Cut(scene, start - HISTORY, frames, np.flatnonzero(who)))
+    return found
+
+
+def batches(stretches: Sequence[Cut]) -> Iterator[Segments]:
+    """The stretches side by side, those with about as many vehicles together."""
+    waiting: list[Cut] = []
+    for stretch in sorted(stretches, key=lambda cut: len(cut.who)):
+        pairs = (len(waiting) + 1) * len(stretch.who) ** 2
+        if waiting and pairs > _MOST_PAIRS:
+            yield segments_of(waiting)
+            waiting = []
+        waiting.append(stretch)
+    if waiting:
+        yield segments_of(waiting)
+
+
+def segments_of(stretches: Sequence[Cut]) -> Segments:
+    """The stretches as one batch; frames outside of their scenes are absent."""
+    rows, most = len(stretches), max(len(cut.who) for cut in stretches)
+    frames = stretches[0].frames
+    kinds = {"target": np.int64, "present": bool}
+    arrays: dict[str, np.ndarray] = {
+        name: np.zeros((rows, frames, most), kinds.get(name, np.float32))
+        for name in ("x", "y", "raw_x", "raw_y", "speed", "lateral_speed", "target", "present")
+    }
+    # Finite lengths for those that fill the batch.
+    of_vehicle = {"length": np.ones((rows, most), np.float32)}
+    of_vehicle["width"] = np.ones((rows, most), np.float32)
+    of_vehicle["driven"] = np.zeros((rows, most), bool)
+    for row, cut in enumerate(stretches):
+        scene = cut.scene
+        first, last = max(cut.start, 0), min(cut.start + cut.frames, len(scene.x))
+        at = slice(first - cut.start, last - cut.start)
+        for name, array in arrays.items():
+            array[row, at, : len(cut.who)] = getattr(scene, name)[first:last, cut.who]
+        # Near 0, where float32 is exact to micrometres.
+        middle = scene.x[first:last, cut.who].mean()
+        arrays["x"][row] -= middle
+        arrays["raw_x"][row] -= middle
+        for name, array in of_vehicle.items():
+            array[row, : len(cut.who)] = getattr(scene, name)[cut.who]
+    scenes = [cut.scene for cut in stretches]
+
+    def column(name: str, dtype: torch.dtype) -> Tensor:
+        return torch.tensor([[getattr(scene, name)] for scene in scenes], dtype=dtype)
+
+    tensors = {name: torch.from_numpy(array) for name, array in (arrays | of_vehicle).items()}
+    return Segments(
+        **tensors,
+        lanes=column("lanes", torch.float32),
+        lane_width_m=column("lane_width_m", torch.float32),
+        two_dimensional=column("two_dimensional", torch.bool),
+        weight=column("weight", torch.float32),
+    )
+
+
+def recorded(segments: Segments, decision: int) -> tuple[Vehicles, Memory]:
+    """Vehicles and memories as recorded at a decision; style and closing speeds are empty."""
+    s = segments
+    now = HISTORY + STEPS * decision
+    present = s.present[:, now]
+    zero = torch.zeros_like(s.x[:, now])
+    accelerations = []
+    known = present
+    age = zero
+    for past in range(ACCELERATIONS):
+        later, earlier = now - STEPS * past, now - STEPS * (past + 1)
+        known = known & s.present[:, earlier]
+        change = (s.speed[:, later] - s.speed[:, earlier]) / DECISION_S
+        accelerations.append(torch.where(known, change, 0.0))
+        age = age + known
+    lateral = [
+        torch.where(
+            s.present[:, now - STEPS * past],
+            s.lateral_speed[:, now - STEPS * past],
+            s.lateral_speed[:, now],
+        )
+        for past in range(1, LATERAL_SPEEDS + 1)
+    ]
+    vehicles = Vehicles(
+        x=s.x[:, now],
+        y=s.y[:, now],
+        heading=zero,
+        speed=s.speed[:, now],
+        acceleration=accelerations[0],
+        length=s.length,
+        width=s.width,
+        desired_speed=zero,
+        target_lane=s.target[:, now],
+        visibility=torch.full_like(s.target[:, now], int(Visibility.CENTRE)),
+        valid=present,
+    )
+    vehicles = with_velocity(vehicles, s.speed[:, now], s.lateral_speed[:, now])
+    return vehicles, Memory(
+        torch.stack(accelerations, -1),
+        torch.stack(lateral, -1),
+        torch.stack((zero, zero), -1),
+        torch.stack((zero, zero, zero), -1),
+        age,
+        zero + LONG_AGO,
+    )
+
+
+#: Decisions since the last lane change of a driver whose last one was not recorded.
+LONG_AGO = 6.0
+
+
+class Samples(NamedTuple):
+    """R samples of moves, and S of lane choices.
+
+    Attributes:
+        features: [R, FEATURES]; change, aside: of acceleration and lateral speed that should
+            follow, [R]; weight, lateral_weight: [R].
+        sides: of drivers that could begin a lane change on a side, or are on one, [S, SIDE].
+        begins: [S] 1 where it begins, 0 where not, -1 where a change is under way.
+        keeping: lane choices of drivers in their lanes, of whom ``speed`` [K] in m/s.
+    """
+
+    features: Tensor
+    change: Tensor
+    aside: Tensor
+    weight: Tensor
+    lateral_weight: Tensor
+    sides: Tensor
+    begins: Tensor
+    keeping_sides: Tensor
+    keeping_exists: Tensor
+
+
+def joined(parts: Sequence[Samples]) -> Samples:
+    """All samples of the parts."""
+    return Samples(*(torch.cat(tensors) for tensors in zip(*parts)))
+
+
+class Options(NamedTuple):
+    """How samples are cut.
+
+    ``policy`` drives, if given, by the nearest of ``samples`` moves; with an ``estimator``, from
+    where nine noisy positions show it. ``vary``: mirror and widen; ``scale``: lengthen by up to
+    this share; ``blind``: share of batches without side lanes.
+    """
+
+    policy: HumanPolicy | None = None
+    estimator: Estimator | None = None
+    samples: int = 6
+    vary: bool = True
+    scale: float = 0.0
+    blind: float = 0.25
+
+
+@torch.no_grad()
+def samples_of(stretches: Sequence[Cut], options: Options, random: torch.Generator) -> Samples:
+    """Samples of all decisions in the stretches."""
+    return joined([_samples(segments, options, random) for segments in batches(stretches)])
+
+
+def _samples(segments: Segments, options: Options, random: torch.Generator) -> Samples:
+    """Samples of one batch."""
+    s = varied(segments, options, random)
+    top = torch.where(s.present, s.speed, 0.0).amax(1)
+    above = DESIRED_ABOVE_MPS * torch.rand(top.shape, generator=random)
+    desired = (top + above).clamp(*DESIRED_MPS)
+    sides_seen = not (options.blind and float(_rand(random)) < options.blind)
+    vehicles, memory = recorded(s, 0)
+    vehicles = vehicles.with_(desired_speed=desired, valid=torch.zeros_like(vehicles.valid))
+    parts = []
+    decisions = (s.x.shape[1] - HISTORY - 1) // STEPS - 1
+    for decision in range(decisions):
+        now = HISTORY + STEPS * decision
+        as_recorded, its_memory = recorded(s, decision)
+        present = as_recorded.valid
+        first = present & ~vehicles.valid
+        # As recorded: everybody, or who has just come, and who is not driven.
+        replace = present if options.policy is None else first | (present & ~s.driven)
+        changed = (as_recorded.target_lane != vehicles.target_lane) & present & ~first
+        since = torch.where(changed, 0.0, torch.where(first, LONG_AGO, memory.since))
+        as_recorded = as_recorded.with_(desired_speed=desired)
+        vehicles = vehicles.where(replace, as_recorded)
+        vehicles = vehicles.with_(valid=present, target_lane=as_recorded.target_lane)
+        memory = _taken(memory, its_memory, replace)._replace(since=since)
+        if options.estimator is not None and decision == 0:
+            vehicles, memory = _estimated(s, vehicles, memory, options.estimator, random)
+        view = perceive(vehicles, memory, s.road, sides_seen)
+        closing = torch.where(first[..., None], view.closing[..., None], memory.closing)
+        memory = with_style(memory._replace(closing=closing), view, first)
+        view = perceive(vehicles, memory, s.road, sides_seen)
+        change, aside = _led_back(s, now, vehicles, memory)
+        follows = s.present[:, now + STEPS] & present & s.driven
+        # A driver that has just come knows no acceleration of its own yet.
+        counts = follows & (memory.age > 0) if options.policy is None else follows
+        following_target = s.target[:, now + STEPS]
+        parts.append(
+            _at_decision(s, vehicles, view, counts, follows, change, aside, following_target)
+        )
+        if options.policy is not None:
+            change, aside = _nearest_move(options, view, change, aside, random)
+            aside = torch.where(s.two_dimensional, aside, 0.0)
+        acceleration, lateral = bounded(vehicles, memory, s.road, change, aside)
+        after = remembered(vehicles, memory, view, acceleration, vehicles.target_lane)
+        vehicles = moved(vehicles, acceleration, lateral)
+        memory = after
+    return joined(parts)
+
+
+def _estimated(
+    s: Segments,
+    vehicles: Vehicles,
+    memory: Memory,
+    estimator: Estimator,
+    random: torch.Generator,
+) -> tuple[Vehicles, Memory]:
+    """Driven vehicles as nine positions show them, with less or more noise than recorded."""
+    nine = slice(HISTORY - OBSERVED_POSITIONS + 1, HISTORY + 1)
+    whole = s.present[:, nine].all(1) & s.driven
+    shape = (len(s.x), 1, 1)
+    noise = 1.2 * torch.rand(shape, generator=random)
+    draw = torch.rand(shape, generator=random)
+    noise = torch.where(draw < 0.2, 0.0, torch.where(draw < 0.7, 1.0, noise))
+    x = s.x[:, nine] + noise * (s.raw_x - s.x)[:, nine]
+    y = s.y[:, nine] + noise * (s.raw_y - s.y)[:, nine]
+    positions = torch.stack((x, y), -1).transpose(1, 2)
+    last = positions[:, :, -1]
+    now = estimator(positions - last[:, :, None])
+    zero = torch.zeros_like(vehicles.x)
+    accelerations = torch.stack((now[..., 1], now[..., 2], *[zero] * (ACCELERATIONS - 2)), -1)
+    seen = vehicles.with_(
+        x=last[..., 0] + now[..., 5],
+        y=last[..., 1] + now[..., 6],
+        acceleration=now[..., 1],
+    )
+    seen = with_velocity(seen, now[..., 0].clamp_min(0.0), now[..., 3])
+    its_memory = memory._replace(
+        accelerations=accelerations,
+        lateral_speeds=torch.stack((now[..., 4], now[..., 4]), -1),
+        age=trust(positions),
+    )
+    return vehicles.where(whole, seen), _taken(memory, its_memory, whole)
+
+
+def varied(segments: Segments, options: Options, random: torch.Generator) -> Segments:
+    """The segments mirrored, widened and lengthened at random."""
+    s = segments
+    rows = len(s.x)
+    if options.vary:
+        if float(_rand(random)) < 0.5:
+            s = s.mirrored()
+        s = s.widened(0.95 + 0.25 * torch.rand((rows, 1), generator=random))
+    if options.scale:
+        s = s.scaled(1.0 + options.scale * torch.rand((rows, 1), generator=random))
+    return s
+
+
+def _rand(random: torch.Generator) -> Tensor:
+    return torch.rand((), generator=random)
+
+
+def _taken(memory: Memory, other: Memory, where: Tensor) -> Memory:
+    """The memory with accelerations, lateral speeds and age of ``other`` [N, M]."""
+    many = where[..., None]
+    return memory._replace(
+        accelerations=torch.where(many, other.accelerations, memory.accelerations),
+        lateral_speeds=torch.where(many, other.lateral_speeds, memory.lateral_speeds),
+        age=torch.where(where, other.age, memory.age),
+    )
+
+
+def _led_back(s: Segments, now: int, vehicles: Vehicles, memory: Memory) -> tuple[Tensor, Tensor]:
+    """Changes of acceleration and lateral speed that follow the recording, or lead back to it."""
+    speed, lateral = velocity(vehicles)
+    recorded_acceleration = (s.speed[:, now + STEPS] - s.speed[:, now]) / DECISION_S
+    wanted = (
+        recorded_acceleration
+        + SPEED_GAIN * (s.speed[:, now] - speed)
+        + PLACE_GAIN * (s.x[:, now] - vehicles.x)
+    ).clamp(HARDEST_BRAKING, STRONGEST_ACCELERATION)
+    wanted_aside = s.lateral_speed[:, now + STEPS] + LATERAL_GAIN * (s.y[:, now] - vehicles.y)
+    return wanted - memory.accelerations[..., 0], wanted_aside - lateral
+
+
+def _nearest_move(
+    options: Options, view: View, change: Tensor, aside: Tensor, random: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Of several moves that the policy draws, the nearest ones to ``change`` and ``aside``."""
+    assert options.policy is not None
+    logits = options.policy(view.features)
+    nearest = []
+    for tokens, its_logits, wanted in zip((ALONG, ACROSS), logits, (change, aside)):
+        shape = (options.samples, *wanted.shape)
+        drawn = tokens.sample(
+            its_logits.expand(options.samples, *its_logits.shape),
+            torch.rand(shape, generator=random),
+        )
+        best = (drawn - wanted).abs().argmin(0, keepdim=True)
+        nearest.append(drawn.gather(0, best)[0])
+    return nearest[0], nearest[1]
+
+
+def _at_decision(
+    s: Segments,
+    vehicles: Vehicles,
+    view: View,
+    counts: Tensor,
+    follows: Tensor,
+    change: Tensor,
+    aside: Tensor,
+    following_target: Tensor,
+) -> Samples:
+    """The samples of one decision."""
+    weight = s.weight.expand_as(vehicles.x)
+    lateral_weight = weight * s.two_dimensional
+    choice = lane_choice(vehicles, view)
+    step = following_target - vehicles.target_lane
+    begins = torch.stack((step == 1, step == -1), -1)
+    here = follows & s.two_dimensional
+    keeping = here & choice.keeping
+    could = choice.exists & keeping[..., None]
+    under_way = here & ~choice.keeping
+    side = torch.where(choice.to_left[..., None], view.sides[..., 0, :], view.sides[..., 1, :])
+    return Samples(
+        view.features[counts],
+        change[counts],
+        aside[counts],
+        weight[counts],
+        lateral_weight[counts],
+        torch.cat((view.sides[could], side[under_way])),
+        torch.cat((begins[could].float(), torch.full((int(under_way.sum()),), -1.0))),
+        view.sides[keeping],
+        choice.exists[keeping],
+    )
+
+
+def keeping_choice(samples: Samples, rows: Tensor) -> LaneChoice:
+    """The lane choices of ``rows`` of the samples' drivers who are in their lanes."""
+    yes = torch.ones(len(rows), dtype=torch.bool)
+    sides, exists = samples.keeping_sides[rows], samples.keeping_exists[rows]
+    return LaneChoice(sides, exists, yes, ~yes)

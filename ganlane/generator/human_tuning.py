@@ -1,0 +1,446 @@
+"""Fine-tuning of ``human`` in simulation: nobody collides, leaves the road or stands without need.
+
+Proximal policy optimisation (Schulman et al. 2017) of all drivers at once in random scenes, for a
+cost that recordings cannot teach, since nobody in them has an accident. A pull to the cloned policy
+(the divergence of both) keeps everything else as recorded, and a penalty keeps the rate of lane
+changes, which carries over between roads per second rather than per kilometre.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from copy import deepcopy
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import smooth_l1_loss, softplus
+
+from ganlane.generator.human import (
+    ACCELERATIONS,
+    ACROSS,
+    ALONG,
+    DECISION_S,
+    FEATURES,
+    SIDE_FEATURES,
+    HumanPolicy,
+    LaneChoice,
+    Memory,
+    bounded,
+    lane_choice,
+    moved,
+    new_target,
+    perceive,
+    remembered,
+    velocity,
+    with_style,
+    with_velocity,
+)
+from ganlane.generator.human_samples import DESIRED_MPS, LONG_AGO, Samples, keeping_choice
+from ganlane.settings.driving import Visibility
+from ganlane.settings.generator import HumanConfig
+from ganlane.sim.state import Road, Vehicles
+
+#: Scenes and vehicles of an iteration, and its decisions.
+SCENES, VEHICLES, DECISIONS = 40, 20, 60
+#: Discount per decision, and of the advantages' estimate (Schulman et al. 2016).
+GAMMA, LAMBDA = 0.93, 0.9
+#: Passes over an iteration's decisions, their batch, and the bound of the ratio.
+PASSES, BATCH, RATIO = 2, 4096, 0.2
+RATE, CRITIC_RATE = 3e-4, 1e-3
+#: Drivers draw from distributions that are somewhat sharper than fitted.
+TEMPERATURE = 0.8
+#: Weights of the rate of lane changes, and of the divergence of lane choices.
+RATE_PULL, LANE_PULL = 0.1, 1.0
+#: Bands of speed in each of which the rate is kept, m/s.
+BANDS_MPS = ((0.0, 9.0), (9.0, 16.0), (16.0, 40.0))
+
+
+class Iteration(NamedTuple):
+    """What happened in an iteration.
+
+    ``cost`` per decision of a driver; overlaps and departures per 1000 vehicle-km; lane changes
+    begun per vehicle-hour.
+    """
+
+    number: int
+    cost: float
+    overlaps: float
+    departures: float
+    changes_per_h: float
+
+
+class Decisions(NamedTuple):
+    """Decisions of all drivers, [T, N, M, ...]: what they saw, did, and what it cost."""
+
+    features: Tensor
+    choice: LaneChoice
+    speed: Tensor
+    along: Tensor
+    across: Tensor
+    lane: Tensor
+    log_chance: Tensor
+    value: Tensor
+    cost: Tensor
+    valid: Tensor
+    goes_on: Tensor
+
+
+def tune(
+    policy: HumanPolicy,
+    teacher: Samples,
+    danger: Tensor,
+    config: HumanConfig,
+    random: torch.Generator,
+    report: Callable[[Iteration], None],
+) -> None:
+    """Fine-tune ``policy`` in place.
+
+    Args:
+        policy: cloned; what it is now is what it is pulled to.
+        teacher: recorded lane choices, whose rate is kept.
+        danger: sides to which nobody changes, [D, SIDE_FEATURES].
+    """
+    reference = deepcopy(policy).requires_grad_(False)
+    critic = nn.Sequential(
+        nn.Linear(FEATURES + 2 * SIDE_FEATURES, 64),
+        nn.SiLU(),
+        nn.Linear(64, 64),
+        nn.SiLU(),
+        nn.Linear(64, 1),
+    )
+    optimizer = torch.optim.Adam(
+        [
+            {"params": policy.parameters(), "lr": RATE},
+            {"params": critic.parameters(), "lr": CRITIC_RATE},
+        ]
+    )
+    # Changes begun per decision of a driver who could.
+    recorded = float((teacher.begins == 1).sum()) / max(1, len(teacher.keeping_sides))
+    if config.changes_per_h is not None:
+        recorded = config.changes_per_h / 3600.0 * DECISION_S
+    for number in range(config.tuning):
+        rise, fall = min(1.0, (number + 1) / 5), 1.0 - 0.8 * number / config.tuning
+        optimizer.param_groups[0]["lr"] = RATE * rise * fall
+        decisions, iteration = drive(policy, critic, number, random)
+        advantage, wanted = advantages(decisions)
+        flat = _flat(decisions)
+        advantage, wanted = advantage[decisions.valid], wanted[decisions.valid]
+        advantage = (advantage - advantage.mean()) / (advantage.std() + 0.01)
+        for _ in range(PASSES):
+            for rows in torch.randperm(len(wanted), generator=random).split(BATCH):
+                part = _rows(flat, rows)
+                loss = _policy_loss(policy, reference, part, advantage[rows], config.pull)
+                loss = loss + smooth_l1_loss(_values(critic, part), wanted[rows])
+                if recorded > 0.0:
+                    off = _rate_loss(policy, part, teacher, recorded, random)
+                    loss = loss + RATE_PULL * off
+                shown = danger[torch.randint(len(danger), (512,), generator=random)]
+                lane = policy.lane(shown)
+                loss = loss + RATE_PULL * softplus(lane[:, 0] + 10.0).mean()
+                loss = loss + 0.2 * RATE_PULL * softplus(-lane[:, 1]).mean()
+                optimizer.zero_grad()
+                loss.backward()
+                nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+                optimizer.step()
+        report(iteration)
+
+
+def _values(critic: nn.Module, decisions: Decisions) -> Tensor:
+    inputs = (decisions.features, decisions.choice.sides.flatten(-2))
+    return critic(torch.cat(inputs, -1))[..., 0]
+
+
+def _flat(decisions: Decisions) -> Decisions:
+    """The decisions of valid drivers, [R, ...]."""
+    which = decisions.valid
+    choice = LaneChoice(*(number[which] for number in decisions.choice))
+    others = {name: value[which] for name, value in decisions._asdict().items() if name != "choice"}
+    return Decisions(choice=choice, **others)
+
+
+def _rows(decisions: Decisions, rows: Tensor) -> Decisions:
+    choice = LaneChoice(*(number[rows] for number in decisions.choice))
+    others = {name: value[rows] for name, value in decisions._asdict().items() if name != "choice"}
+    return Decisions(choice=choice, **others)
+
+
+def advantages(decisions: Decisions) -> tuple[Tensor, Tensor]:
+    """Advantages and values to learn, [T, N, M] (generalised advantage estimation)."""
+    reward, value = -decisions.cost, decisions.value
+    advantage = torch.zeros_like(reward)
+    following = value[-1]
+    last = torch.zeros_like(following)
+    for step in reversed(range(len(reward))):
+        goes_on = decisions.goes_on[step].to(reward.dtype)
+        error = reward[step] + GAMMA * goes_on * following - value[step]
+        last = error + GAMMA * LAMBDA * goes_on * last
+        advantage[step] = last
+        following = value[step]
+    return advantage, advantage + value
+
+
+def _log_chances(policy: HumanPolicy, decisions: Decisions) -> tuple[Tensor, Tensor, Tensor]:
+    """Logarithms of the chances of all tokens along and across, and of all lane choices."""
+    along, across = policy(decisions.features)
+    lane = policy.lane_chances(decisions.choice)
+    return (
+        torch.log_softmax(along / TEMPERATURE, -1),
+        torch.log_softmax(across / TEMPERATURE, -1),
+        lane.log(),
+    )
+
+
+def _of_actions(chances: tuple[Tensor, Tensor, Tensor], actions: tuple[Tensor, ...]) -> Tensor:
+    """Logarithm of the chance of what was done."""
+    taken = [log.gather(-1, action[..., None])[..., 0] for log, action in zip(chances, actions)]
+    return torch.stack(taken).sum(0)
+
+
+def _policy_loss(
+    policy: HumanPolicy,
+    reference: HumanPolicy,
+    decisions: Decisions,
+    advantage: Tensor,
+    pull: float,
+) -> Tensor:
+    """The clipped objective, and the divergence from the reference."""
+    chances = _log_chances(policy, decisions)
+    actions = (decisions.along, decisions.across, decisions.lane)
+    ratio = torch.exp((_of_actions(chances, actions) - decisions.log_chance).clamp(-5.0, 5.0))
+    bounded_ratio = ratio.clamp(1.0 - RATIO, 1.0 + RATIO)
+    gain = torch.minimum(ratio * advantage, bounded_ratio * advantage).mean()
+    with torch.no_grad():
+        theirs = _log_chances(reference, decisions)
+    apart = [(mine.exp() * (mine - other)).sum(-1).mean() for mine, other in zip(chances, theirs)]
+    return -gain + pull * (apart[0] + apart[1]) + LANE_PULL * apart[2]
+
+
+def _rate_loss(
+    policy: HumanPolicy,
+    decisions: Decisions,
+    teacher: Samples,
+    recorded: float,
+    random: torch.Generator,
+) -> Tensor:
+    """How far lane changes are from the recorded rate: at all speeds, and where recorded."""
+    chances = policy.lane_chances(decisions.choice)
+    begins = chances[:, 1] + chances[:, 2]
+    loss = torch.zeros(())
+    for low, high in BANDS_MPS:
+        here = (decisions.speed >= low) & (decisions.speed < high) & decisions.choice.keeping
+        if int(here.sum()) > 200:
+            loss = loss + torch.log(begins[here].mean() / recorded).square() / len(BANDS_MPS)
+    rows = torch.randint(len(teacher.keeping_sides), (8192,), generator=random)
+    chances = policy.lane_chances(keeping_choice(teacher, rows))
+    return loss + torch.log((chances[:, 1] + chances[:, 2]).mean() / recorded).square()
+
+
+@torch.no_grad()
+def drive(
+    policy: HumanPolicy, critic: nn.Module, number: int, random: torch.Generator
+) -> tuple[Decisions, Iteration]:
+    """Decisions of an iteration, and what happened."""
+    vehicles, memory, road = random_scenes(random)
+    steps: list[Decisions] = []
+    overlaps = departures = changes = metres = seconds = 0.0
+    was_off = torch.zeros_like(vehicles.valid)
+    for _ in range(DECISIONS):
+        memory = with_style(memory, perceive(vehicles, memory, road))
+        view = perceive(vehicles, memory, road)
+        choice = lane_choice(vehicles, view)
+        chances = policy.lane_chances(choice)
+        lane = torch.multinomial(chances.flatten(0, 1), 1, generator=random).view(vehicles.x.shape)
+        target = new_target(vehicles, view, lane)
+        begun = (target != vehicles.target_lane) & choice.keeping & vehicles.valid
+        memory = memory._replace(
+            since=torch.where(target != vehicles.target_lane, 0.0, memory.since)
+        )
+        vehicles = vehicles.with_(target_lane=target)
+        # The moves follow the choice.
+        view = perceive(vehicles, memory, road)
+        logits = policy(view.features)
+        tokens, changed = [], []
+        for axis, its_logits in zip((ALONG, ACROSS), logits):
+            chance = torch.softmax(its_logits / TEMPERATURE, -1)
+            drawn = torch.multinomial(chance.flatten(0, 1), 1, generator=random)
+            token = drawn.view(vehicles.x.shape)
+            jitter = torch.rand(token.shape, generator=random) - 0.5
+            tokens.append(token)
+            changed.append(axis.value(token + jitter))
+        acceleration, aside = bounded(vehicles, memory, road, changed[0], changed[1])
+        seen = Decisions(
+            features=view.features,
+            choice=choice,
+            speed=velocity(vehicles)[0],
+            along=tokens[0],
+            across=tokens[1],
+            lane=lane,
+            log_chance=torch.zeros_like(vehicles.x),
+            value=torch.zeros_like(vehicles.x),
+            cost=torch.zeros_like(vehicles.x),
+            valid=vehicles.valid,
+            goes_on=vehicles.valid,
+        )
+        log_chance = _of_actions(_log_chances(policy, seen), (*tokens, lane))
+        before = vehicles
+        memory = remembered(vehicles, memory, view, acceleration, target)
+        vehicles = moved(vehicles, acceleration, aside)
+        cost, hit, off = costs(vehicles, road, view.gap)
+        # Who has collided leaves the scene.
+        vehicles = vehicles.with_(valid=vehicles.valid & ~hit)
+        steps.append(
+            seen._replace(
+                log_chance=log_chance,
+                value=_values(critic, seen),
+                cost=cost,
+                goes_on=vehicles.valid,
+            )
+        )
+        overlaps += float((hit & before.valid).sum()) / 2.0
+        departures += float((off & ~was_off & before.valid).sum())
+        was_off = off
+        changes += float(begun.sum())
+        metres += float(((vehicles.x - before.x) * before.valid).sum())
+        seconds += DECISION_S * float(before.valid.sum())
+    joint = _stacked(steps)
+    count = float(joint.valid.sum())
+    per_1000_km = 1e6 / max(metres, 1.0)
+    cost_of_decision = float(joint.cost.sum()) / count
+    return joint, Iteration(
+        number + 1,
+        cost_of_decision,
+        overlaps * per_1000_km,
+        departures * per_1000_km,
+        3600.0 * changes / seconds,
+    )
+
+
+def _stacked(steps: list[Decisions]) -> Decisions:
+    choice = LaneChoice(*(torch.stack(numbers) for numbers in zip(*(s.choice for s in steps))))
+    names = [name for name in Decisions._fields if name != "choice"]
+    others = {name: torch.stack([getattr(step, name) for step in steps]) for name in names}
+    return Decisions(choice=choice, **others)
+
+
+def costs(vehicles: Vehicles, road: Road, gap: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Cost of every driver after a decision; who has collided; who has left the road. [N, M].
+
+    ``gap`` is that to the leader before the decision, m.
+    """
+    speed, lateral = velocity(vehicles)
+    along = vehicles.x[:, None, :] - vehicles.x[:, :, None]
+    across = vehicles.y[:, None, :] - vehicles.y[:, :, None]
+    count = vehicles.x.shape[1]
+    both = vehicles.valid[:, :, None] & vehicles.valid[:, None, :]
+    both = both & ~torch.eye(count, dtype=torch.bool, device=along.device)
+    lengths = 0.5 * (vehicles.length[:, :, None] + vehicles.length[:, None, :])
+    widths = 0.5 * (vehicles.width[:, :, None] + vehicles.width[:, None, :])
+    bumpers = along.abs() - lengths
+    sides = across.abs() - widths
+    # Bodies count as touching a little before they do.
+    touches = both & (bumpers < 0.2) & (sides < 0.05)
+    # To blame are the one behind, and the one who moves, or has moved, towards the other.
+    towards = torch.sign(across)
+    off_target = vehicles.y - vehicles.target_lane.to(lateral.dtype) * road.lane_width_m
+    sideways = (lateral[:, :, None] * towards > 0.15) | (off_target[:, :, None] * towards > 0.6)
+    behind = (along > 0) & (sides < -0.4)
+    blame = touches & (sideways | behind)
+    hit = touches.any(-1)
+    cost = 5.0 * blame.any(-1) + 1.0 * hit
+
+    # Close calls: a time to collision below 1.5 s, a gap below 0.25 s, sides within 0.35 m.
+    closing = speed[:, :, None] - speed[:, None, :]
+    ahead = both & (along > 0) & (sides < 0.15) & (bumpers > 0)
+    time_s = torch.where(ahead & (closing > 0.1), bumpers / closing.clamp_min(0.1), 99.0).amin(-1)
+    nearest = torch.where(ahead, bumpers, 99.0).amin(-1)
+    headway = nearest / speed.clamp_min(2.0)
+    cost = cost + 0.15 * ((1.5 - time_s).clamp_min(0.0) + 2.0 * (0.25 - headway).clamp_min(0.0))
+    beside = both & (bumpers < 0.5) & (sides < 0.35) & (sides >= 0.05) & sideways
+    cost = cost + 0.15 * beside.any(-1)
+
+    # The edges of the road, for the turned body.
+    turned = (lateral.abs() / speed.clamp_min(2.0)).clamp_max(0.3)
+    half = 0.5 * vehicles.width + 0.5 * vehicles.length * turned
+    beyond = torch.maximum(
+        road.right_edge_m() - (vehicles.y - half), vehicles.y + half - road.left_edge_m()
+    )
+    off = beyond > 0
+    cost = cost + 3.0 * off + 1.0 * (beyond + 0.25).clamp(0.0, 1.0)
+
+    # Nobody stands or crawls where the road is free.
+    cost = cost + 0.3 * ((speed < 3.0) & (gap > 40.0))
+    slow = (0.75 - speed / vehicles.desired_speed).clamp(0.0, 0.5)
+    cost = cost + 0.05 * slow * (gap > 80.0)
+    return cost * vehicles.valid, hit & vehicles.valid, off & vehicles.valid
+
+
+def random_scenes(random: torch.Generator) -> tuple[Vehicles, Memory, Road]:
+    """Scenes of 2 to 5 lanes, 3 to 28 m/s, people's headways, dense and sparse."""
+    shape = (SCENES, VEHICLES)
+
+    def rand(*size: int) -> Tensor:
+        return torch.rand(size or shape, generator=random)
+
+    def randn(*size: int) -> Tensor:
+        return torch.randn(size or shape, generator=random)
+
+    lanes = torch.randint(2, 6, (SCENES, 1), generator=random).float()
+    lanes = torch.where(rand(SCENES, 1) < 0.4, 3.0, lanes)
+    road = Road(lanes, 3.3 + 0.8 * rand(SCENES, 1))
+    lane = (rand() * lanes).floor()
+    of_lane = 3.0 + 25.0 * rand(SCENES, 1) + 1.5 * randn(SCENES, 6)
+    speed = (of_lane.gather(1, lane.long()) + 0.8 * randn()).clamp(0.5, 34.0)
+    sparse = torch.where(rand(SCENES, 1) < 0.5, 1.0, 1.0 + 4.0 * rand(SCENES, 1))
+    length = torch.where(rand() < 0.06, 12.0, 4.2 + 0.8 * rand())
+    headway = torch.exp(math.log(1.3) + 0.45 * randn()).clamp(0.6, 5.0) * sparse
+    space = headway * speed + 3.0 + length
+    x = torch.zeros(shape)
+    for number in range(5):  # one behind another in each lane
+        here = lane == number
+        behind = -(space * here).cumsum(1) - 30.0 * rand(SCENES, 1)
+        x = torch.where(here, behind, x)
+    desired = torch.where(rand(SCENES, 1) < 0.5, speed + 10.0 * rand(), 18.0 + 8.0 * rand())
+    zero = torch.zeros(shape)
+    vehicles = Vehicles(
+        x=x - 0.5 * length,
+        y=lane * road.lane_width_m + 0.25 * randn().clamp(-2.0, 2.0),
+        heading=zero,
+        speed=speed,
+        acceleration=zero,
+        length=length,
+        width=zero + 1.9,
+        desired_speed=desired.clamp(*DESIRED_MPS),
+        target_lane=lane.long(),
+        visibility=torch.full(shape, int(Visibility.CENTRE)),
+        valid=zero == 0,
+    )
+    vehicles = with_velocity(vehicles, speed, zero)
+    memory = entering_memory(vehicles, road, randn())
+    return vehicles, memory, road
+
+
+def entering_memory(vehicles: Vehicles, road: Road, drawn: Tensor) -> Memory:
+    """The memory of drivers who have always driven as they do now.
+
+    Who follows somebody keeps the present headway; the others' are drawn by the standard normal
+    numbers ``drawn`` [N, M]: 1.4 s in the middle, spread by a third.
+    """
+    zero = torch.zeros_like(vehicles.x)
+    _, lateral = velocity(vehicles)
+    memory = Memory(
+        zero[..., None].repeat(1, 1, ACCELERATIONS),
+        torch.stack((lateral, lateral), -1),
+        torch.stack((zero, zero), -1),
+        torch.stack((zero, zero, zero), -1),
+        zero,
+        zero + LONG_AGO,
+    )
+    view = perceive(vehicles, memory, road)
+    log_headway = math.log(1.4) + 0.35 * drawn
+    view = view._replace(
+        log_headway=torch.where(view.log_headway.isnan(), log_headway, view.log_headway)
+    )
+    memory = memory._replace(closing=torch.stack((view.closing, view.closing), -1))
+    return with_style(memory, view, torch.ones_like(vehicles.valid))

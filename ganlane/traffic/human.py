@@ -1,0 +1,176 @@
+"""``traffic=human``: one stochastic policy for all drivers, fitted to recorded ones.
+
+Every 0.4 s a driver decides (:mod:`ganlane.generator.human`); in between it holds its acceleration
+and goes over to its lateral speed evenly. The ego is a driver like any other to them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from ganlane.generator.human import (
+    ACCELERATIONS,
+    ACROSS,
+    ALONG,
+    LATERAL_SPEEDS,
+    STEPS,
+    HumanPolicy,
+    bounded,
+    chosen,
+    lane_choice,
+    new_target,
+    perceive,
+    remembered,
+    velocity,
+    with_style,
+    with_velocity,
+)
+from ganlane.generator.human import Memory as DriverMemory
+from ganlane.generator.human_tuning import entering_memory
+from ganlane.settings.driving import Visibility
+from ganlane.settings.traffic import HumanTrafficConfig
+from ganlane.sim.random import Purpose, Stream, normal
+from ganlane.sim.state import Road, Vehicles, reads_are_cheap
+from ganlane.traffic.base import Memory, MemoryFields, Moved, TrafficModule, uniforms
+
+
+class HumanTraffic(TrafficModule):
+    """Drivers of a fitted policy.
+
+    Memory: that of :class:`ganlane.generator.human.Memory`, and what was decided: ``acceleration``
+    in m/s2, ``lateral_from`` and ``lateral_to`` in m/s, [N, M] each.
+
+    Args:
+        policy: the fitted policy (:func:`ganlane.generator.load_human`).
+        road, stream: as for every traffic module.
+        temperature: of the distributions along and across; 1 as fitted, lower is calmer.
+    """
+
+    visibility = Visibility.BODY
+    memory_fields: MemoryFields = {  # noqa: RUF012
+        "accelerations": ((ACCELERATIONS,), None),
+        "lateral_speeds": ((LATERAL_SPEEDS,), None),
+        "closing": ((2,), None),
+        "style": ((3,), None),
+        "age": ((), None),
+        "since": ((), None),
+        "acceleration": ((), None),
+        "lateral_from": ((), None),
+        "lateral_to": ((), None),
+    }
+
+    def __init__(
+        self,
+        policy: HumanPolicy,
+        road: Road | None = None,
+        stream: int = Stream.TRAIN,
+        temperature: float = HumanTrafficConfig.temperature,
+    ) -> None:
+        super().__init__(road, stream)
+        self.policy = policy
+        self.temperature = temperature
+
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
+        """Drivers who have always driven as they do now; headways that nothing shows are drawn."""
+        count, dtype = vehicles.x.shape[1], vehicles.x.dtype
+        drawn = normal(key, -1, count, [Purpose.TRAIT_HEADWAY], dtype)[..., 0]
+        memory = entering_memory(vehicles, self.road, drawn)
+        _, lateral = velocity(vehicles)
+        nothing = torch.zeros_like(vehicles.x)
+        return {
+            **memory._asdict(),
+            "acceleration": nothing,
+            "lateral_from": lateral,
+            "lateral_to": lateral,
+        }
+
+    @torch.no_grad()
+    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """Drive 0.1 s, after a decision where one is due."""
+        phase = step % STEPS
+        vehicles, memory = self._where_due(vehicles, memory, key, step, phase == 0)
+        # Evenly from the lateral speed at the decision to the one that was chosen.
+        share = (phase[:, None] + 1).to(vehicles.x.dtype) / STEPS
+        across = memory["lateral_from"] + share * (memory["lateral_to"] - memory["lateral_from"])
+        speed, lateral = velocity(vehicles)
+        later = (speed + memory["acceleration"] * self.dt).clamp_min(0.0)
+        moved = with_velocity(vehicles, later, across)
+        new_lateral = velocity(moved)[1]
+        return moved.with_(
+            x=vehicles.x + 0.5 * (speed + later) * self.dt,
+            y=vehicles.y + 0.5 * (lateral + new_lateral) * self.dt,
+            acceleration=(later - speed) / self.dt,
+        ), memory
+
+    def _where_due(
+        self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor, due: Tensor
+    ) -> Moved:
+        """Decisions in the rows where one is ``due`` [N]."""
+        if not reads_are_cheap(vehicles.x):
+            decided, new_memory = self.decide(vehicles, memory, key, step)
+            return decided.where(due, vehicles), _where(due, new_memory, memory)
+        rows = due.nonzero()[:, 0]
+        if len(rows) == len(due):
+            return self.decide(vehicles, memory, key, step)
+        if not len(rows):
+            return vehicles, memory
+        part = Vehicles(*(field[rows] for field in vehicles))
+        its_memory = {name: value[rows] for name, value in memory.items()}
+        decided, new_memory = self.decide(part, its_memory, key[rows], step[rows])
+        target = vehicles.target_lane.index_copy(0, rows, decided.target_lane)
+        merged = {
+            name: value.index_copy(0, rows, new_memory[name]) for name, value in memory.items()
+        }
+        return vehicles.with_(target_lane=target), merged
+
+    def decide(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """Target lanes, and the memory with what every driver does for 0.4 s."""
+        policy = self._policy(vehicles.x.dtype)
+        vehicles = vehicles.with_(target_lane=self.road.clamp_lane(vehicles.target_lane))
+        driver = DriverMemory(*(memory[name] for name in DriverMemory._fields))
+        driver = with_style(driver, perceive(vehicles, driver, self.road))
+        view = perceive(vehicles, driver, self.road)
+        u = uniforms(
+            vehicles,
+            key,
+            step,
+            Purpose.ACCELERATION,
+            Purpose.LANE_CHANGE_SPEED,
+            Purpose.LANE_CHANGE_SIDE,
+        )
+        chances = policy.lane_chances(lane_choice(vehicles, view))
+        target = new_target(vehicles, view, chosen(chances, u[2]))
+        changed = target != vehicles.target_lane
+        driver = driver._replace(since=torch.where(changed, 0.0, driver.since))
+        vehicles = vehicles.with_(target_lane=target)
+        # Its moves follow the driver's choice.
+        view = perceive(vehicles, driver, self.road)
+        along, across = policy(view.features)
+        change = ALONG.sample(along, u[0], self.temperature)
+        aside = ACROSS.sample(across, u[1], self.temperature)
+        acceleration, lateral = bounded(vehicles, driver, self.road, change, aside)
+        driver = remembered(vehicles, driver, view, acceleration, target)
+        return vehicles, {
+            **driver._asdict(),
+            "acceleration": acceleration,
+            "lateral_from": velocity(vehicles)[1],
+            "lateral_to": lateral,
+        }
+
+    def _policy(self, dtype: torch.dtype) -> HumanPolicy:
+        """The policy in the run's float type."""
+        # Weights are stored in float32, a run may be in float64; converted once.
+        if self.policy.along.weight.dtype != dtype:
+            self.policy.to(dtype)
+        return self.policy
+
+
+def _where(rows: Tensor, new: Mapping[str, Tensor], old: Mapping[str, Tensor]) -> Memory:
+    """``new`` in the ``rows`` [N], ``old`` elsewhere."""
+    return {
+        name: torch.where(rows.view(-1, *[1] * (value.ndim - 1)), new[name], value)
+        for name, value in old.items()
+    }

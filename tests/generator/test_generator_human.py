@@ -1,0 +1,289 @@
+"""The policy of ``human``: what a driver perceives and does, its samples, fit and fine-tuning."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from reference.recordings import made_by_hand, recorded_cars
+from reference.refusals import user_error
+from reference.worlds import vehicles
+
+from ganlane.config.run import run_command
+from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
+from ganlane.generator import human_estimator, human_fit, human_tuning, load_generator, load_human
+from ganlane.generator.human import (
+    ALONG,
+    FEATURES,
+    HARDEST_BRAKING,
+    HumanPolicy,
+    bounded,
+    chosen,
+    lane_choice,
+    moved,
+    new_target,
+    perceive,
+    velocity,
+    with_velocity,
+)
+from ganlane.generator.human_estimator import Estimator, fit_estimator
+from ganlane.generator.human_fit import fit_human, prior_samples
+from ganlane.generator.human_samples import (
+    Options,
+    cuts,
+    samples_of,
+    smooth,
+    smooth_scene,
+    target_lanes,
+)
+from ganlane.generator.human_tuning import costs, entering_memory
+from ganlane.settings.generator import HumanConfig, HumanSizes, shipped_generator
+from ganlane.sim.state import Road
+
+ROAD = Road(3, 4.0)
+FLOAT = torch.float32
+CAR = {"x": 0.0, "lane": 1, "speed": 20.0, "width": 2.0}
+
+
+def scene(*cars):
+    return vehicles(*({**CAR, **car} for car in cars), dtype=FLOAT)
+
+
+def memory_of(cars, road=ROAD):
+    return entering_memory(cars, road, torch.zeros_like(cars.x))
+
+
+def policy():
+    torch.manual_seed(0)
+    return HumanPolicy(HumanSizes(hidden=16, lane_hidden=8)).requires_grad_(False)
+
+
+def test_a_soft_target_is_around_its_value_and_samples_follow_the_distribution():
+    value = torch.tensor([-1.3, 0.0, 0.4])
+    target = ALONG.soft_target(value)
+    assert torch.allclose((target * ALONG.centres(value)).sum(-1), value, atol=0.05)
+    logits = target.log()[2]
+    u = (torch.arange(4000) + 0.5) / 4000
+    drawn = ALONG.sample(logits.expand(4000, -1), u)
+    assert (drawn.diff() >= 0).all()
+    # A token stretches over more for large changes, so the mean is a little larger.
+    assert float(drawn.mean()) == pytest.approx(float(ALONG.mean(logits)), abs=0.02)
+    colder = ALONG.sample(logits.expand(4000, -1), u, temperature=0.5)
+    assert colder.std() < drawn.std()
+
+
+def test_a_driver_sees_the_gap_to_its_leader_and_nobody_in_an_empty_lane():
+    cars = scene({}, {"x": 34.5, "speed": 15.0}, {"x": -30.0, "lane": 2})
+    view = perceive(cars, memory_of(cars), ROAD)
+    assert view.features.shape == (1, 3, FEATURES)
+    assert float(view.gap[0, 0]) == pytest.approx(30.0)
+    assert float(view.closing[0, 0]) == pytest.approx(-5.0)
+    assert float(view.log_headway[0, 0]) == pytest.approx(np.log(30.0 / 20.0), abs=1e-5)
+    # The first in a lane follows nobody.
+    assert view.log_headway[0, 1].isnan()
+    assert float(view.gap[0, 1]) == 150.0
+    assert view.exists[0].tolist() == [[True, True], [True, True], [False, True]]
+    alone = perceive(cars, memory_of(cars), ROAD, sides=False)
+    assert not alone.exists.any()
+
+
+def test_left_and_right_are_alike():
+    cars = scene({}, {"x": 20.0, "lane": 2, "speed": 17.0}, {"x": -15.0, "lane": 0})
+    mirrored = scene({}, {"x": 20.0, "lane": 0, "speed": 17.0}, {"x": -15.0, "lane": 2})
+    here = perceive(cars, memory_of(cars), ROAD)
+    there = perceive(mirrored, memory_of(mirrored), ROAD)
+    assert torch.equal(here.sides[:, 0], there.sides[:, 0].flip(1))
+
+
+def test_who_is_not_there_is_not_seen_and_all_inputs_stay_finite():
+    cars = scene({}, {"x": 10.0, "valid": False, "speed": 1e3}, {"x": 2000.0})
+    view = perceive(cars, memory_of(cars), ROAD)
+    assert float(view.gap[0, 0]) == 150.0
+    assert view.features.isfinite().all()
+    assert view.features.abs().max() < 150.0
+
+
+def test_chances_add_up_nobody_changes_to_where_no_lane_is_and_a_change_can_be_broken_off():
+    cars = scene({"lane": 2}, {"lane": 0, "x": 50.0}, {"x": 100.0, "lane": 1, "target_lane": 2})
+    view = perceive(cars, memory_of(cars), ROAD)
+    chances = policy().lane_chances(lane_choice(cars, view))
+    assert torch.allclose(chances.sum(-1), torch.ones(1, 3), atol=1e-5)
+    left, right = chances[0, :, 1], chances[0, :, 2]
+    assert left[0] < 1e-6
+    assert right[1] < 1e-6
+    # Under way to the left, there is only going on and breaking off.
+    assert right[2] < 1e-6
+    low, high = (chosen(chances, torch.full((1, 3), u)) for u in (0.0, 0.999999))
+    assert low[0, 2] == 1
+    assert new_target(cars, view, low)[0].tolist()[1:] == [1, 1]
+    assert new_target(cars, view, high)[0, 0] == 1
+
+
+def test_nobody_rolls_back_brakes_harder_than_a_car_or_steers_off_the_road():
+    cars = scene({"speed": 1.0}, {"lane": 2, "x": 50.0}, {"y": -1.5, "lane": 0, "x": 100.0})
+    memory = memory_of(cars)
+    wild = torch.tensor([[-20.0, -20.0, 0.0]]), torch.tensor([[0.0, 5.0, 0.0]])
+    acceleration, aside = bounded(cars, memory, ROAD, *wild)
+    assert float(acceleration[0, 0]) == pytest.approx(-2.5)
+    assert float(acceleration[0, 1]) == HARDEST_BRAKING
+    # 10 m less the lane's centre, half a body and a margin, in 0.8 s.
+    assert float(aside[0, 1]) == pytest.approx((10.0 - 8.0 - 1.15) / 0.8, abs=1e-5)
+    # Whose body reaches beyond the edge comes back.
+    assert float(aside[0, 2]) == pytest.approx(0.65 / 0.8, abs=1e-5)
+    after = moved(cars, acceleration, aside)
+    assert (velocity(after)[0] >= 0).all()
+
+
+def test_a_smooth_track_stays_straight_and_loses_half_of_a_wave_at_the_cutoff():
+    line = 3.0 + 1.7 * np.arange(60)
+    assert smooth(line, 0.6) == pytest.approx(line)
+    time_s = 0.1 * np.arange(600)
+    wave = np.sin(2 * np.pi * 0.5 * time_s)
+    inner = slice(100, 500)
+    assert np.ptp(smooth(wave, 0.5)[inner]) == pytest.approx(0.5 * np.ptp(wave[inner]), rel=0.01)
+
+
+def test_a_lane_change_is_meant_from_where_the_driver_sets_out():
+    # 2 s in lane 0, 3 s over to lane 1, 2 s there.
+    over = np.linspace(0.0, 3.5, 31)
+    y = np.concatenate([np.zeros(20), over, np.full(20, 3.5)])
+    target = target_lanes(y, np.gradient(y, 0.1), 3.5, 2)
+    begin = int(np.flatnonzero(np.diff(target))[0]) + 1
+    # The first 0.3 m count as swaying.
+    assert 20 < begin <= 24
+    assert set(target[:begin]) == {0}
+    assert set(target[begin:]) == {1}
+    # A track that touches the next lane for a moment has no change.
+    touched = np.zeros(40)
+    touched[20:22] = 2.0
+    assert set(np.delete(target_lanes(touched, np.zeros(40), 3.5, 2), [20, 21])) == {0}
+
+
+def steady(speed=20.0, frames=140):
+    x = speed * 0.1 * np.arange(frames)[:, None] + np.array([0.0, 40.0])
+    return smooth_scene(made_by_hand(x, y=3.5), 0.6, 0.4)
+
+
+def test_teacher_samples_of_steady_driving_ask_for_no_change():
+    random = torch.Generator().manual_seed(0)
+    samples = samples_of(cuts([steady()], 10, 10), Options(vary=False, blind=0.0), random)
+    assert len(samples.features) > 20
+    assert samples.change.abs().max() < 1e-3
+    assert samples.aside.abs().max() < 1e-3
+    assert not (samples.begins == 1).any()
+
+
+def test_closed_loop_samples_lead_back_to_the_recording():
+    random = torch.Generator().manual_seed(0)
+    options = Options(policy(), samples=2, vary=False, blind=0.0)
+    samples = samples_of(cuts([steady()], 10, 10), options, random)
+    # An untrained policy strays, and is asked to turn back.
+    assert samples.change.abs().mean() > 0.1
+    assert samples.change.isfinite().all()
+
+
+def test_the_estimator_sees_through_noise(monkeypatch):
+    monkeypatch.setattr(human_estimator, "UPDATES", 400)
+    random = torch.Generator().manual_seed(0)
+    torch.manual_seed(0)
+    noise = np.random.default_rng(0).normal(0.0, 0.1, (140, 6))
+    speeds = np.array([8.0, 12.0, 15.0, 18.0, 22.0, 25.0])
+    x = 0.1 * speeds * np.arange(140)[:, None] + noise
+    smoothed = smooth_scene(made_by_hand(x, y=np.zeros_like(x)), 0.6, 0.4)
+    estimator = Estimator()
+    fit_estimator(estimator, [smoothed], random)
+    nine = np.stack([x[60:69].T, np.zeros((6, 9))], -1)
+    positions = torch.tensor(nine - nine[:, -1:], dtype=FLOAT)
+    speed = estimator(positions)[:, 0].numpy()
+    last = (x[68] - x[67]) / 0.1
+    assert np.abs(speed - speeds).mean() < 0.5 * np.abs(last - speeds).mean()
+
+
+def test_accidents_the_edge_and_standing_cost():
+    apart = scene({}, {"x": 60.0})
+    free = torch.full((1, 2), 150.0)
+    cost, hit, off = costs(apart, ROAD, free)
+    assert cost.max() < 0.01
+    assert not (hit | off).any()
+    cost, hit, _ = costs(scene({}, {"x": 4.0, "speed": 15.0}), ROAD, free)
+    assert hit.all()
+    # The one behind is to blame.
+    assert cost[0, 0] > cost[0, 1] + 4.0
+    cost, _, off = costs(scene({"lane": 0, "y": -1.2}), ROAD, free[:, :1])
+    assert off.all()
+    assert cost > 3.0
+    cost, _, _ = costs(scene({"speed": 1.0}), ROAD, free[:, :1])
+    assert cost > 0.3
+
+
+def test_where_recordings_are_silent_the_prior_brakes_and_keeps_out_of_danger():
+    samples, danger = prior_samples(torch.Generator().manual_seed(0), scenes=300)
+    assert samples.features.isfinite().all()
+    assert len(danger) > 100
+    assert samples.change.min() < -4.0
+
+
+def test_tokens_of_who_stands_do_not_turn_it():
+    cars = scene({"speed": 0.0})
+    after = with_velocity(cars, torch.zeros(1, 1), torch.ones(1, 1))
+    assert after.speed.item() == after.heading.item() == 0.0
+
+
+SMALL = {"epochs": 2, "rounds": 1, "tuning": 2, "samples": 2}
+
+
+@pytest.fixture
+def small_fits(monkeypatch):
+    """Fits that take a second."""
+    monkeypatch.setattr(human_estimator, "UPDATES", 20)
+    monkeypatch.setattr(human_fit, "PRIOR_SCENES", 100)
+    monkeypatch.setattr(human_fit, "LANE_UPDATES", 10)
+    monkeypatch.setattr(human_tuning, "SCENES", 4)
+    monkeypatch.setattr(human_tuning, "DECISIONS", 8)
+
+
+def test_a_fit_is_the_same_for_the_same_seed_and_reports_its_steps(small_fits):
+    recordings = recorded_cars(scenes=2, vehicles=6, seconds=6.0)
+    config = HumanConfig(sizes=HumanSizes(hidden=16, lane_hidden=8), **SMALL)
+    steps = []
+    state = torch.get_rng_state()
+    first, _ = fit_human(config, recordings, report=lambda *step: steps.append(step))
+    second, _ = fit_human(config, recordings)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert [done for done, _, _ in steps] == [1, 2, 3, 4]
+    for one, other in zip(first.state_dict().values(), second.state_dict().values()):
+        assert torch.equal(one, other)
+    assert all(tensor.isfinite().all() for tensor in first.state_dict().values())
+
+
+def test_the_command_fits_folds_keeps_what_is_finished_and_its_weights_load(
+    small_fits, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    write_scene_csv(
+        synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=5, seconds=7.0)), "recordings.csv"
+    )
+    options = [f"generator.{name}={value}" for name, value in SMALL.items()]
+    arguments = ["generator=human", "data.path=recordings.csv", "folds=2", *options]
+    assert run_command("train_generator", [*arguments, "hydra.run.dir=fit"]) == 0
+    results = json.loads(Path("fit/results.json").read_text())
+    assert results["ade_m"].keys() == {"mean", "single", "best_of_20", "constant_velocity"}
+    assert "rollout" in results["folds"]
+    model, metadata = load_human("fit/generator_human.safetensors")
+    assert metadata["preset"] == "human"
+    assert metadata["data"]["held_out"] == results["data"]["held_out"]
+    # What is finished is not fitted again.
+    monkeypatch.setattr("ganlane.generator.fit.fit_human", None)
+    assert run_command("train_generator", [*arguments, "resume=fit", "hydra.run.dir=again"]) == 0
+    again, _ = load_human("again/generator_human.safetensors")
+    assert torch.equal(model.policy.along.weight, again.policy.along.weight)
+    assert run_command("train_generator", [*arguments, "ablations=true"]) == 2
+    assert "generator=human has none" in capsys.readouterr().err
+
+
+def test_weights_of_another_kind_are_refused(tmp_path):
+    with user_error("human"):
+        load_human(shipped_generator("paper"))
+    with user_error("generator"):
+        load_generator(shipped_generator("human"))

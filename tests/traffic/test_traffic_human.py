@@ -1,0 +1,85 @@
+"""``traffic=human``: decisions every 0.4 s, the same for an episode wherever it is driven."""
+
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from ganlane import keys
+from ganlane.api import make_env
+from ganlane.errors import UserError
+from ganlane.generator import shipped_generator
+from ganlane.generator.human import STEPS
+from ganlane.sim.random import episode_key
+from ganlane.sim.spawn import spawn
+from ganlane.traffic.presets import human_traffic
+
+
+def drive(episodes, steps, dtype=torch.float32):
+    """Vehicles after every step."""
+    traffic = human_traffic()
+    episode = torch.tensor(episodes)
+    key = episode_key(traffic.stream, torch.zeros_like(episode), episode)
+    vehicles = spawn(key, 9, 3, 4.0, dtype=dtype)
+    memory = traffic.fresh_memory(vehicles, key)
+    course = []
+    for step in range(steps):
+        now = torch.full_like(episode, step)
+        vehicles, memory = traffic.move(vehicles, memory, key, now)
+        course.append((vehicles, memory))
+    return course
+
+
+def test_it_is_an_environment_and_rules_are_those_of_the_others():
+    env = make_env("human", num_envs=4)
+    check_env_specs(env)
+    td = env.reset()
+    assert td[keys.VEHICLES, "x"].shape == (4, 9)
+
+
+def test_a_decision_holds_for_four_steps():
+    course = drive([0, 1, 2], 8)
+    held = torch.stack([memory["acceleration"] for _, memory in course])
+    assert torch.equal(held[0], held[STEPS - 1])
+    assert not torch.equal(held[STEPS - 1], held[STEPS])
+    first, last = course[0][0], course[STEPS - 1][0]
+    speed = last.speed * torch.cos(last.heading) - first.speed * torch.cos(first.heading)
+    moving = last.speed > 1.0
+    expected = held[0] * 0.1 * (STEPS - 1)
+    assert torch.allclose(speed[moving], expected[moving], atol=1e-3)
+
+
+def test_an_episode_is_the_same_among_others_and_in_rows_that_decide_at_other_times():
+    together, alone = drive([0, 1, 2], 40), drive([1], 40)
+    for (many, _), (one, _) in zip(together, alone):
+        assert torch.allclose(many.x[1], one.x[0], atol=1e-3)
+        assert torch.equal(many.target_lane[1], one.target_lane[0])
+    traffic = human_traffic()
+    vehicles, memory = together[1]
+    key = episode_key(traffic.stream, torch.zeros(3, dtype=torch.int64), torch.arange(3))
+    # Rows at steps 2, 4 and 5: one of them decides.
+    _, after = traffic.move(vehicles, memory, key, torch.tensor([2, 4, 5]))
+    same = [torch.equal(after["age"][row], memory["age"][row]) for row in range(3)]
+    assert same == [True, False, True]
+
+
+def test_a_minute_of_driving_has_no_collision_and_nobody_leaves_the_road():
+    course = drive(range(8), 600)
+    vehicles, _ = course[-1]
+    assert vehicles.speed[:, 1:].min() > 5.0
+    for vehicles, _ in course[::20]:
+        assert vehicles.y.min() > -1.2
+        assert vehicles.y.max() < 9.2
+        assert vehicles.x.isfinite().all()
+
+
+def test_it_drives_in_double_precision_and_on_one_lane():
+    vehicles, _ = drive([0], 8, torch.float64)[-1]
+    assert vehicles.x.dtype == torch.float64
+    env = make_env("human", num_envs=2, env={"lanes": 1, "vehicles": 4})
+    after = env.rollout(5)
+    assert (after[keys.VEHICLES, "target_lane"][..., 1:] == 0).all()
+
+
+def test_foreign_weights_are_refused():
+    with pytest.raises(UserError, match="human"):
+        human_traffic(path=shipped_generator("calibrated"))

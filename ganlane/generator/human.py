@@ -220,9 +220,9 @@ def perceive(vehicles: Vehicles, memory: Memory, road: Road, sides: bool = True)
     lanes = (lane - 1 >= 0, lane >= 0, lane + 1 <= last)
     has_lane = torch.stack(lanes, -1)
     if not sides:
-        own = torch.tensor([False, True, False], device=lane.device)
-        has_lane = has_lane & own
-        ahead, behind = _only(ahead, own), _only(behind, own)
+        middle = torch.tensor([False, True, False], device=lane.device)
+        has_lane = has_lane & middle
+        ahead, behind = _only(ahead, middle), _only(behind, middle)
     speed, aside = velocity(vehicles)
     gap = ahead.gap[..., 1]
     features = [
@@ -251,11 +251,11 @@ def perceive(vehicles: Vehicles, memory: Memory, road: Road, sides: bool = True)
     )
 
 
-def _only(near: Near, own: Tensor) -> Near:
-    """Of the neighbours those in the ``own`` lane [3]."""
-    exists = near.exists & own
+def _only(near: Near, lanes: Tensor) -> Near:
+    """Of the neighbours those in the chosen ``lanes`` (boolean [3]: right, this lane, left)."""
+    exists = near.exists & lanes
     names = ("closing", "acceleration", "aside", "lateral_speed")
-    numbers = {name: torch.where(own, getattr(near, name), 0.0) for name in names}
+    numbers = {name: torch.where(lanes, getattr(near, name), 0.0) for name in names}
     return near._replace(gap=torch.where(exists, near.gap, SIGHT_M), exists=exists, **numbers)
 
 

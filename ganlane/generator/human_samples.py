@@ -241,13 +241,13 @@ class Cut(NamedTuple):
 def cuts(scenes: Sequence[SmoothScene], decisions: int, stride: int) -> list[Cut]:
     """Stretches of ``decisions`` that begin every ``stride`` frames."""
     frames = HISTORY + STEPS * (decisions + 1) + 1
-    found = []
+    stretches = []
     for scene in scenes:
         for start in range(0, max(1, len(scene.x) - STEPS * 3), stride):
             who = scene.present[start : start + frames - HISTORY].any(0)
             if who.any():
-                found.append(Cut(scene, start - HISTORY, frames, np.flatnonzero(who)))
-    return found
+                stretches.append(Cut(scene, start - HISTORY, frames, np.flatnonzero(who)))
+    return stretches
 
 
 def batches(stretches: Sequence[Cut]) -> Iterator[Segments]:
@@ -310,14 +310,14 @@ def recorded(segments: Segments, decision: int) -> tuple[Vehicles, Memory]:
     present = s.present[:, now]
     zero = torch.zeros_like(s.x[:, now])
     accelerations = []
-    known = present
+    recorded_since = present
     age = zero
     for past in range(ACCELERATIONS):
         later, earlier = now - STEPS * past, now - STEPS * (past + 1)
-        known = known & s.present[:, earlier]
+        recorded_since = recorded_since & s.present[:, earlier]
         change = (s.speed[:, later] - s.speed[:, earlier]) / DECISION_S
-        accelerations.append(torch.where(known, change, 0.0))
-        age = age + known
+        accelerations.append(torch.where(recorded_since, change, 0.0))
+        age = age + recorded_since
     lateral = [
         torch.where(
             s.present[:, now - STEPS * past],

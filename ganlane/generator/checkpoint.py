@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,10 @@ from ganlane.generator.human_estimator import HumanModel
 from ganlane.generator.networks import Generator
 from ganlane.settings.generator import (
     GENERATOR,
-    HUMAN,
     FitConfig,
-    HumanSizes,
     Preset,
+    human_sizes,
+    misfit,
     stored_sizes,
 )
 from ganlane.weights import load_weights, save_weights
@@ -122,19 +122,11 @@ def load_human(path: str | Path) -> tuple[HumanModel, dict[str, Any]]:
             stored sizes.
     """
     tensors, metadata = load_weights(path, GENERATOR)
-    stored = str(metadata.get("preset"))
-    if stored != HUMAN:
-        raise UserError(f"{path}: a generator of preset {stored!r}, expected 'human'; give one.")
-    sizes = metadata.get("sizes")
-    names = {field.name for field in fields(HumanSizes)}
+    sizes = human_sizes(path, metadata)
+    with torch.random.fork_rng(devices=[]):
+        model = HumanModel(sizes)
     try:
-        if set(dict(sizes or {})) != names:
-            raise ValueError("other names")
-        with torch.random.fork_rng(devices=[]):
-            model = HumanModel(HumanSizes(**sizes))  # type: ignore[arg-type]
         model.load_state_dict(tensors)
-    except (RuntimeError, TypeError, ValueError) as error:
-        raise UserError(
-            f"{path}: its weights do not fit the sizes {sizes} of a human policy; fit it again."
-        ) from error
+    except RuntimeError as error:
+        raise misfit(path, asdict(sizes)) from error
     return model.eval().requires_grad_(False), metadata

@@ -18,8 +18,8 @@ import numpy.typing as npt
 from ganlane import keys
 from ganlane.native import settings
 from ganlane.native.drivers import (
+    NETWORKS,
     Drivers,
-    GeneratedDrivers,
     RuleDrivers,
     decision_settings,
     parts_of,
@@ -182,9 +182,9 @@ class NativeBatch:
         self.mask = np.ones((rows, keys.ACTIONS), np.bool_)
         self._term_values = np.zeros((rows, len(self.terms)), np.float32)
         self._no_safe_action = np.zeros(rows, np.bool_)
-        generated = any(isinstance(part.drivers, GeneratedDrivers) for part in parts_of(drivers))
-        # The network of generated drivers fills the widest vectors with its own numbers.
-        self._library = load(variant) if variant or generated else load_for(rows)
+        by_network = any(isinstance(part.drivers, NETWORKS) for part in parts_of(drivers))
+        # A network fills the widest vectors with its own numbers.
+        self._library = load(variant) if variant or by_network else load_for(rows)
         deceleration = mask.safe_deceleration
         abort = ego.abort_lane_change
         # The kernel's structures, filled once. Referred to by this object, since a structure holds

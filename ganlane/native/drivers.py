@@ -8,7 +8,7 @@ from __future__ import annotations
 import ctypes
 import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from ctypes import c_float, c_int32, c_void_p
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -50,7 +50,11 @@ from ganlane.settings.generated import (
 )
 from ganlane.settings.generator import (
     GENERATOR,
+    HUMAN,
     GeneratorSizes,
+    HumanSizes,
+    human_sizes,
+    misfit,
     shipped_generator,
     stored_sizes,
 )
@@ -58,6 +62,7 @@ from ganlane.settings.record import part_of
 from ganlane.settings.traffic import (
     GanCalibratedTrafficConfig,
     GanTrafficConfig,
+    HumanTrafficConfig,
     IdmFaultsTrafficConfig,
     IdmMobilTrafficConfig,
     IdmRandomTrafficConfig,
@@ -202,13 +207,66 @@ class GeneratedDrivers:
         return {"generated": _generated_of(self)}
 
 
+@dataclass(frozen=True)
+class HumanDrivers:
+    """Drivers by a policy of ``human``.
+
+    Attributes:
+        idm: the ego's.
+        sizes, weights: of the policy, by the names of its ``state_dict``.
+        stream: family of episodes that the random numbers belong to.
+        temperature: of the distributions.
+    """
+
+    idm: IdmParameters
+    sizes: HumanSizes
+    weights: Weights = field(repr=False)
+    stream: int
+    temperature: float
+
+    steering: ClassVar[SteeringParameters] = SteeringParameters()
+    visibility: ClassVar[Visibility] = Visibility.BODY
+    #: Their lane changes are their own.
+    mobil: ClassVar[None] = None
+
+    def memory(self) -> MemoryArrays:
+        """Their memory in the order of human.hpp."""
+        widths: dict[str, tuple[int, ...]] = {
+            "accelerations": (5,),
+            "lateral_speeds": (2,),
+            "closing": (2,),
+            "style": (3,),
+        }
+        single = ("age", "since", "acceleration", "lateral_from", "lateral_to")
+        widths |= dict.fromkeys(single, ())
+        return {_memory(name): ("float32", shape) for name, shape in widths.items()}
+
+    def structures(self) -> dict[str, ctypes.Structure]:
+        """As of :class:`RuleDrivers`."""
+        w = self.weights
+        packed = _aligned(
+            _layer(w[f"{name}.weight"], w[f"{name}.bias"]) for name in _human_layers(self.sizes)
+        )
+        human = Human(
+            weights=packed.ctypes.data, **vars(self.sizes), temperature=self.temperature
+        )
+        human.packed = packed
+        return {"human": human}
+
+
+#: Drivers of one kind.
+OneKind: TypeAlias = RuleDrivers | GeneratedDrivers | HumanDrivers
+#: Those by a network.
+NETWORKS: Final = (GeneratedDrivers, HumanDrivers)
+
+
 class MixedDrivers(NamedTuple):
     """Drivers that differ from episode to episode, all with one model of the ego.
 
     ``parts`` by name; episode ``e`` belongs to the part number ``turns[e % len(turns)]``.
     """
 
-    parts: dict[str, RuleDrivers | GeneratedDrivers]
+    parts: dict[str, OneKind]
     turns: tuple[int, ...]
 
     @property
@@ -229,13 +287,13 @@ class MixedDrivers(NamedTuple):
         return memory
 
 
-Drivers: TypeAlias = RuleDrivers | GeneratedDrivers | MixedDrivers
+Drivers: TypeAlias = OneKind | MixedDrivers
 
 
 class Part(NamedTuple):
     """Drivers of some episodes, and their memory in the state."""
 
-    drivers: RuleDrivers | GeneratedDrivers
+    drivers: OneKind
     memory: MemoryArrays
 
 
@@ -253,9 +311,9 @@ def parts_of(drivers: Drivers) -> list[Part]:
     return parts
 
 
-def rows_per_thread(drivers: RuleDrivers | GeneratedDrivers) -> int:
+def rows_per_thread(drivers: OneKind) -> int:
     """Rows from which on a further thread pays."""
-    return BLOCK if isinstance(drivers, GeneratedDrivers) else ROWS_PER_THREAD
+    return BLOCK if isinstance(drivers, NETWORKS) else ROWS_PER_THREAD
 
 
 def turns_of(drivers: Drivers) -> tuple[int, ...]:
@@ -265,7 +323,7 @@ def turns_of(drivers: Drivers) -> tuple[int, ...]:
 
 def mixed_drivers(parts: Mapping[str, Drivers | None], shares: Mapping[str, int]) -> Drivers | None:
     """Drivers in turns, by their ``shares``; None where the kernel cannot drive one of them."""
-    drivers: dict[str, RuleDrivers | GeneratedDrivers] = {}
+    drivers: dict[str, OneKind] = {}
     for name, part in parts.items():
         if part is None or isinstance(part, MixedDrivers):
             return None
@@ -291,7 +349,7 @@ def decision_settings(
     shape: tuple[int, float, int],
     episode: EpisodeParameters | None,
     ego: EgoParameters | None,
-    drivers: RuleDrivers | GeneratedDrivers,
+    drivers: OneKind,
 ) -> Settings:
     """The numbers of a decision; ``shape`` is lanes, their width in m, and M."""
     return settings_of(
@@ -371,6 +429,19 @@ class Network(ctypes.Structure):
     ]
 
 
+class Human(ctypes.Structure):
+    """``Human`` of human.hpp."""
+
+    _fields_ = [
+        *fields(c_void_p, "weights"),
+        *fields(c_int32, "hidden lane_hidden"),
+        *fields(c_float, "temperature"),
+    ]
+
+    #: The array that ``weights`` points to.
+    packed: npt.NDArray[np.float32]
+
+
 class Generated(ctypes.Structure):
     """``Generated`` of generated.hpp."""
 
@@ -441,7 +512,7 @@ def _network_of(drivers: GeneratedDrivers) -> Network:
 
 
 def _packed(sizes: GeneratorSizes, weights: Weights) -> npt.NDArray[np.float32]:
-    """All layers in the order of ``layers_of`` in network.hpp, aligned to a vector.
+    """All layers in the order of ``layers_of`` in network.hpp.
 
     Of each the biases and the transposed weights, with zeros as further outputs. The gates of an
     LSTM are filled up one by one; the decoder's cell begins at 0, so its forget gate is left out.
@@ -463,7 +534,12 @@ def _packed(sizes: GeneratorSizes, weights: Weights) -> npt.NDArray[np.float32]:
         _layer(w["decoder.recurrent"], None, three),
         _layer(w["head.weight"], w["head.bias"]),
     ]
-    numbers = np.concatenate(layers)
+    return _aligned(layers)
+
+
+def _aligned(layers: Iterable[npt.NDArray[np.float32]]) -> npt.NDArray[np.float32]:
+    """The layers one after the other, aligned to a vector."""
+    numbers = np.concatenate(list(layers))
     room = np.empty(len(numbers) + _WIDEST, np.float32)
     # NumPy aligns to 16 bytes, a vector has up to 64.
     start = -room.ctypes.data % 64 // 4
@@ -633,8 +709,8 @@ def pays(drivers: Drivers) -> bool:
     Without an instruction for a product and a sum (x86 before 2013), a generator's network is a
     hundred times slower.
     """
-    generated = any(isinstance(part.drivers, GeneratedDrivers) for part in parts_of(drivers))
-    if not generated or platform.machine() not in ("x86_64", "AMD64"):
+    by_network = any(isinstance(part.drivers, NETWORKS) for part in parts_of(drivers))
+    if not by_network or platform.machine() not in ("x86_64", "AMD64"):
         return True
     library = find()
     return isinstance(library, Loaded) and library.variant != "default"
@@ -672,6 +748,8 @@ def drivers_of(
         return paper_drivers(_fitted(traffic.path, "paper"), traffic, idm, stream)
     if type(traffic) is GanCalibratedTrafficConfig:
         return calibrated_drivers(_fitted(traffic.path, "calibrated"), traffic, idm, stream)
+    if type(traffic) is HumanTrafficConfig:
+        return _human(traffic, idm, stream)
     if type(traffic) is MixedTrafficConfig:
         parts = {
             name: drivers_of(part, idm, mobil, stream) for name, part in traffic.parts().items()
@@ -689,6 +767,51 @@ def _fitted(path: str | None, preset: Any) -> FittedGenerator:
             f"{source}: its weights do not have the shapes that its sizes ask for; fit it again."
         )
     return FittedGenerator(weights, sizes, metadata, source)
+
+
+def _human(traffic: HumanTrafficConfig, idm: IdmParameters, stream: int) -> HumanDrivers:
+    source = Path(traffic.path or shipped_generator(HUMAN))
+    weights, metadata = load_arrays(source, GENERATOR)
+    sizes = human_sizes(source, metadata)
+    return human_drivers(weights, sizes, traffic.temperature, idm, stream, source)
+
+
+def human_drivers(
+    weights: Weights,
+    sizes: HumanSizes,
+    temperature: float,
+    idm: IdmParameters,
+    stream: int,
+    source: object,
+) -> HumanDrivers:
+    """Drivers of ``traffic=human``; ``weights`` are those of a file, ``source``, with its estimator.
+
+    Raises:
+        UserError: weights of other sizes.
+    """
+    policy = {
+        name.removeprefix("policy."): array
+        for name, array in weights.items()
+        if name.startswith("policy.")
+    }
+    shapes: dict[str, tuple[int, ...]] = {}
+    for name, (inputs, outputs) in _human_layers(sizes).items():
+        shapes |= {f"{name}.weight": (outputs, inputs), f"{name}.bias": (outputs,)}
+    if {name: array.shape for name, array in policy.items()} != shapes:
+        raise misfit(source, vars(sizes))
+    return HumanDrivers(idm, sizes, policy, stream, temperature)
+
+
+def _human_layers(sizes: HumanSizes) -> dict[str, tuple[int, int]]:
+    """Inputs and outputs of the layers, in the order of human.hpp."""
+    return {
+        "trunk.0": (65, sizes.hidden),
+        "trunk.2": (sizes.hidden, sizes.hidden),
+        "along": (sizes.hidden, 41),
+        "across": (sizes.hidden, 31),
+        "lane.0": (17, sizes.lane_hidden),
+        "lane.2": (sizes.lane_hidden, 2),
+    }
 
 
 def _shapes(sizes: GeneratorSizes) -> dict[str, tuple[int, ...]]:

@@ -57,32 +57,20 @@ struct Crowd {
     uint64_t* step_key;  // of the rows
 };
 
-static inline size_t room_for(size_t floats) { return (floats + WIDEST - 1) / WIDEST * WIDEST; }
-
-// Floats of memory that a thread needs for the network, and lays out.
-static size_t crowd_floats(const Network& n, int vehicles) {
-    size_t rows = (size_t)vehicles * LANES;
-    return activation_floats(n, rows, vehicles) + n.motions * room_for(4 * padded(n.hidden) * rows) +
-           3 * room_for(2 * rows) + room_for((size_t)n.extra_inputs * rows) + 4 * room_for(n.noise * rows) +
-           room_for(rows) + room_for(2 * (size_t)n.motions);
-}
-
-static Crowd crowd_in(float* memory, const Generated* g, int vehicles) {
+static Crowd crowd_in(Pieces& room, const Generated* g, int vehicles) {
     const Network& n = g->network;
     size_t rows = (size_t)vehicles * LANES;
-    auto room = [&](size_t floats) {
-        float* begin = memory;
-        memory += room_for(floats);
-        return begin;
-    };
     Crowd c;
     c.g = g, c.layers = layers_of(n), c.vehicles = vehicles;
     c.position = room(2 * rows), c.displacement = room(2 * rows), c.difference = room(2 * rows);
     c.extra = room(n.extra_inputs * rows), c.noise = room(n.noise * rows), c.scaled = room(n.noise * rows);
     c.first_uniform = room(n.noise * rows), c.second_uniform = room(n.noise * rows);
     c.valid = (uint8_t*)room(rows), c.motions = (float**)room(2 * (size_t)n.motions);
-    for (int t = 0; t < n.motions; t++) c.motions[t] = room(4 * padded(n.hidden) * rows);
-    c.work = activations_in(memory, n, rows, vehicles);
+    for (int t = 0; t < n.motions; t++) {
+        float* motion = room(4 * padded(n.hidden) * rows);
+        if (c.motions) c.motions[t] = motion;
+    }
+    c.work = activations_in(room, n, rows, vehicles);
     return c;
 }
 

@@ -19,6 +19,7 @@
 #include "arrays.hpp"
 #include "faults.hpp"
 #include "generated.hpp"
+#include "human.hpp"
 #include "random_drivers.hpp"
 
 const float RECYCLE_RANGE = 200.0f, RECYCLE_DECELERATION = 4.0f, RECYCLE_SIDE = 0.4f;
@@ -167,9 +168,28 @@ static inline void drive_by_rules(const Settings& s, Rows& r, const Drivers& dri
     else drive(s, r);
 }
 
-// `crowd`: the network of generated drivers; `ended(rows)` is called when rows end, before anything of them changes.
+// What drivers by a network work with; of rule-driven ones nothing.
+struct Networks {
+    Crowd crowd;
+    Humans humans;
+};
+
+static Networks networks_in(Pieces& room, const Settings& s) {
+    Networks networks = {};
+    if (s.generated) networks.crowd = crowd_in(room, s.generated, s.vehicles);
+    if (s.human) networks.humans = humans_in(room, s.human, s.vehicles);
+    return networks;
+}
+
+static size_t network_floats(const Settings& s) {
+    Pieces counted = {};
+    networks_in(counted, s);
+    return counted.count;
+}
+
+// `ended(rows)` is called when rows of generated drivers end, before anything of them changes.
 template <class Ended>
-static inline void decide(const Settings& s, Rows& r, Crowd& crowd, Ended ended) {
+static inline void decide(const Settings& s, Rows& r, Networks& networks, Ended ended) {
     Alike alike = {common(s)};
     Different different = {common(s)};
     find_lanes(s, r);
@@ -179,7 +199,10 @@ static inline void decide(const Settings& s, Rows& r, Crowd& crowd, Ended ended)
             for (int lane = 0; lane < LANES; lane++) r.step_key[lane] = absorb(r.episode_key[lane], r.start_step[lane] + substep);
         if (s.generated) {
             follow(s, r, alike);
-            drive_generated(s, r, crowd);
+            drive_generated(s, r, networks.crowd);
+        } else if (s.human) {
+            follow(s, r, alike);
+            drive_humans(s, r, networks.humans, substep);
         } else if (s.random) {
             drive_by_rules(s, r, different, substep);
         } else {
@@ -311,6 +334,7 @@ static void* scratch(size_t bytes) {
 
 static Fields fields_of(const Settings& s) {
     if (s.generated) return s.generated->calibrated ? CALIBRATED : PAPER;
+    if (s.human) return HUMAN;
     if (s.faults) return fields_of(*s.faults);
     return s.random ? fields_of(*s.random) : Fields{0, {}};
 }
@@ -322,15 +346,15 @@ extern "C" int ganlane_decide(const Settings* settings, const Inputs* in, const 
     for (long place = first; place < last; place++)
         if ((uint64_t)in->action[in->rows ? in->rows[place] : place] > 2) return 2;
     size_t floats = scratch_floats(s) * LANES;
-    size_t more = s.generated ? crowd_floats(s.generated->network, s.vehicles) : 0;
-    float* memory = (float*)scratch((floats + more) * sizeof(float));
+    float* memory = (float*)scratch((floats + network_floats(s)) * sizeof(float));
     if (!memory) return 1;
     Fields fields = fields_of(s);
     Rows r;
     r.memory_fields = count_of(fields);
     lay_out(r, (Float*)memory, s);
-    Crowd crowd = {};
-    if (s.generated) crowd = crowd_in(memory + floats, s.generated, s.vehicles);
+    Pieces room = {memory + floats, 0};
+    Networks networks = networks_in(room, s);
+    Crowd& crowd = networks.crowd;
     // Behind the fields, the network's memory.
     const Memory& network_before = *(const Memory*)(memory_of(in) + fields.arrays);
     const Memory& network_after = *(const Memory*)(memory_of(out) + fields.arrays);
@@ -351,7 +375,7 @@ extern "C" int ganlane_decide(const Settings* settings, const Inputs* in, const 
                 if (ended[lane]) store_memory(crowd, network_after, block.row[lane], lane);
         };
         if (s.generated) keep(~r.running);
-        decide(s, r, crowd, keep);
+        decide(s, r, networks, keep);
         if (s.generated) keep(r.running);
         if (in->recycles) {
             Mask recycles = none();
@@ -365,27 +389,61 @@ extern "C" int ganlane_decide(const Settings* settings, const Inputs* in, const 
     return 0;
 }
 
+// Step -1 of a key of its own: apart from the draws of the steps.
+static inline uint64_t before_first_step(const Settings& s, const Scene& scene, long row) {
+    return absorb(absorb(episode_key(s.stream, scene.seed[row], scene.episode[row]), 0), -1);
+}
+
+// First scenes, as far as drivers see them.
+static void load_scene(const Settings& s, Rows& r, const Scene& scene, const Outputs& out, const Block& block) {
+    for (int lane = 0; lane < LANES; lane++) {
+        long row = block.row[lane];
+        r.step_key[lane] = before_first_step(s, scene, row);
+        for (int i = 0; i < s.vehicles; i++) {
+            long from = row * s.vehicles + i;
+            at(r.index, i, lane) = (float)i;
+            at(r.x, i, lane) = out.x[from], at(r.y, i, lane) = out.y[from];
+            at(r.heading, i, lane) = out.heading[from], at(r.speed, i, lane) = out.speed[from];
+            at(r.acceleration, i, lane) = out.acceleration[from], at(r.half_length, i, lane) = 0.5f * scene.length[from];
+            at(r.valid, i, lane) = (float)(scene.valid[from] != 0);
+        }
+    }
+    put_in_order(r);
+    for (int i = 0; i < r.vehicles; i++) sincos_of(r.heading[i], r.sine[i], r.cosine[i]);
+}
+
 // Gives the drivers of those of the rows [first, last) that are `fresh` their first memory, and random ones their
 // desired speed: after ganlane_spawn. Returns 0, or 1 without memory.
 extern "C" int ganlane_enter(const Settings* settings, const Scene* scene, const Outputs* out, long first, long last) {
     const Settings& s = *settings;
     Fields fields = fields_of(s);
     if (!fields.arrays) return 0;
-    Crowd crowd = {};
-    float* memory = nullptr;
-    if (s.generated) {
-        memory = (float*)scratch(crowd_floats(s.generated->network, s.vehicles) * sizeof(float));
-        if (!memory) return 1;
-        crowd = crowd_in(memory, s.generated, s.vehicles);
-    }
+    float* memory = (float*)scratch((network_floats(s) + scratch_floats(s) * LANES) * sizeof(float));
+    if (!memory) return 1;
+    Pieces room = {memory + scratch_floats(s) * LANES, 0};
+    Networks networks = networks_in(room, s);
     void* const* arrays = memory_of(out);
+    Rows r;
+    r.memory_fields = count_of(fields);
+    __builtin_memset(memory, 0, scratch_floats(s) * LANES * sizeof(float));
+    lay_out(r, (Float*)memory, s);
+    Block block = {};
     for (long row = first; row < last; row++) {
-        if (!scene->fresh[row]) continue;
-        // Step -1 of a key of its own: apart from the draws of the steps.
-        uint64_t before_first_step = absorb(absorb(episode_key(s.stream, scene->seed[row], scene->episode[row]), 0), -1);
-        if (s.generated) enter(crowd, arrays, row, before_first_step, out->speed);
-        else if (s.faults) enter_with_faults(*s.faults, arrays, row * s.vehicles, (row + 1) * s.vehicles, out->acceleration);
-        else enter_with_traits(s, arrays, row, before_first_step, *scene, *out);
+        uint64_t key = before_first_step(s, *scene, row);
+        bool fresh = scene->fresh[row];
+        if (s.human) {
+            if (fresh) block.row[block.count++] = row;
+            if (!block.count || (block.count < LANES && row + 1 < last)) continue;
+            for (int lane = (int)block.count; lane < LANES; lane++) block.row[lane] = block.row[block.count - 1];
+            load_scene(s, r, *scene, *out, block);
+            enter_humans(s, r, networks.humans);
+            store_fields(fields, r, arrays, block);
+            block.count = 0;
+        } else if (fresh) {
+            if (s.generated) enter(networks.crowd, arrays, row, key, out->speed);
+            else if (s.faults) enter_with_faults(*s.faults, arrays, row * s.vehicles, (row + 1) * s.vehicles, out->acceleration);
+            else enter_with_traits(s, arrays, row, key, *scene, *out);
+        }
     }
     free(memory);
     return 0;

@@ -16,7 +16,7 @@ struct Field {
 
 struct Fields {
     int arrays;
-    Field field[6];
+    Field field[9];
 };
 
 static inline int count_of(const Fields& fields) {

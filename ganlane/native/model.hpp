@@ -18,6 +18,7 @@ struct Settings {
     int32_t lanes, vehicles, substeps, timeout_steps, mobil, abort_lane_change;
     int64_t stream;  // family of episodes that random numbers belong to
     const struct Generated* generated;  // generated.hpp; null: the others are rule-driven
+    const struct Human* human;          // human.hpp; null: they are not of `traffic=human`
     const struct Faults* faults;        // faults.hpp; null: drivers make none
     const struct Random* random;        // random_drivers.hpp; null: all drivers are alike
 };

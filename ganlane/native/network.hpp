@@ -34,6 +34,27 @@ struct Layer {
     int inputs, width;
 };
 
+// The layers one after the other, as they are packed (ganlane.native.drivers): biases first.
+struct PackedWeights {
+    const float* at;
+    Layer operator()(int inputs, int width) {
+        Layer l = {at + padded(width), at, inputs, padded(width)};
+        at += (size_t)(inputs + 1) * padded(width);
+        return l;
+    }
+};
+
+// Memory in pieces, each aligned to a vector. Without memory (`begin` null) they are only counted.
+struct Pieces {
+    float* begin;
+    size_t count;
+    float* operator()(size_t floats) {
+        float* piece = begin ? begin + count : nullptr;
+        count += (floats + WIDEST - 1) / WIDEST * WIDEST;
+        return piece;
+    }
+};
+
 INLINE Float read(const float* from) {
     Float numbers;
     __builtin_memcpy(&numbers, from, sizeof numbers);
@@ -110,12 +131,7 @@ struct Layers {
 };
 
 static Layers layers_of(const Network& n) {
-    const float* at = n.weights;
-    auto layer = [&](int inputs, int width) {
-        Layer l = {at + padded(width), at, inputs, padded(width)};
-        at += (size_t)(inputs + 1) * padded(width);
-        return l;
-    };
+    PackedWeights layer = {n.weights};
     int gates = 4 * padded(n.hidden);
     Layers l;
     l.embed = layer(4, n.embedding), l.input = layer(n.embedding, gates), l.recurrent = layer(n.hidden, gates);
@@ -139,20 +155,7 @@ struct Activations {
     float* distance;
 };
 
-static size_t activation_floats(const Network& n, int rows, int vehicles) {
-    size_t width = 4 + 2 * (size_t)padded(n.hidden) + 2 * padded(n.pooling) + n.hidden + n.pooled + n.extra_inputs +
-                   n.hidden + WIDEST;
-    size_t block = padded(n.embedding) + 4 * padded(n.hidden) + padded(n.pooling) + padded(n.pooled) +
-                   padded(n.context) + padded(n.hidden);
-    return width * rows + block * BLOCK_ROWS + 2 * (size_t)vehicles + 16 * WIDEST;
-}
-
-static Activations activations_in(float* memory, const Network& n, int rows, int vehicles) {
-    auto room = [&](size_t floats) {
-        float* begin = memory;
-        memory += (floats + WIDEST - 1) / WIDEST * WIDEST;
-        return begin;
-    };
+static Activations activations_in(Pieces& room, const Network& n, int rows, int vehicles) {
     Activations a;
     size_t r = rows;
     a.features = room(4 * r), a.hidden = room(padded(n.hidden) * r), a.cell = room(padded(n.hidden) * r);

@@ -165,7 +165,7 @@ class Settings(ctypes.Structure):
         ),
         *fields(c_int32, "lanes vehicles substeps timeout_steps mobil abort_lane_change"),
         *fields(c_int64, "stream"),
-        *fields(c_void_p, "generated faults random"),
+        *fields(c_void_p, "generated human faults random"),
     ]
 
     #: The structures that the last members point to, which have to live as long.
@@ -272,7 +272,7 @@ def settings_of(
         "stream": stream,
     }
     # ctypes has the addresses alone, so the structures are held beside them.
-    for name in ("generated", "faults", "random"):
+    for name in ("generated", "human", "faults", "random"):
         numbers[name] = ctypes.addressof(pointed[name]) if name in pointed else None
     settings = _filled(Settings, numbers)
     settings.pointed = list(pointed.values())

@@ -136,6 +136,31 @@ class HumanSizes(Record):
     lane_hidden: Annotated[int, between(1, 512)] = 32
 
 
+def human_sizes(path: object, metadata: Mapping[str, Any]) -> HumanSizes:
+    """The sizes of a policy of ``human`` from the ``metadata`` of its file.
+
+    Raises:
+        UserError: another preset, or no sizes of such a policy; ``path`` is for the message.
+    """
+    stored = str(metadata.get("preset"))
+    if stored != HUMAN:
+        raise UserError(f"{path}: a generator of preset {stored!r}, expected 'human'; give one.")
+    sizes = metadata.get("sizes")
+    try:
+        if set(dict(sizes or {})) != {field.name for field in fields(HumanSizes)}:
+            raise ValueError("other names")
+        return HumanSizes(**sizes)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ParameterError) as error:
+        raise misfit(path, sizes) from error
+
+
+def misfit(path: object, sizes: object) -> UserError:
+    """The error of a policy of ``human`` whose weights have other sizes than it says."""
+    return UserError(
+        f"{path}: its weights do not fit the sizes {sizes} of a human policy; fit it again."
+    )
+
+
 @dataclass(frozen=True)
 class LossWeights(Record):
     """Weights of the generator's loss terms; a weight of 0 switches a term off.

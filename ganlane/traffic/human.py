@@ -30,6 +30,7 @@ from ganlane.generator.human import (
 )
 from ganlane.generator.human import Memory as DriverMemory
 from ganlane.generator.human_tuning import entering_memory
+from ganlane.native.drivers import HumanDrivers
 from ganlane.settings.driving import Visibility
 from ganlane.settings.traffic import HumanTrafficConfig
 from ganlane.sim.random import Purpose, Stream, normal
@@ -47,6 +48,7 @@ class HumanTraffic(TrafficModule):
         policy: the fitted policy (:func:`ganlane.generator.load_human`).
         road, stream: as for every traffic module.
         temperature: of the distributions along and across; 1 as fitted, lower is calmer.
+        drivers: with which the native kernel drives as these do; None: it cannot.
     """
 
     visibility = Visibility.BODY
@@ -68,10 +70,16 @@ class HumanTraffic(TrafficModule):
         road: Road | None = None,
         stream: int = Stream.TRAIN,
         temperature: float = HumanTrafficConfig.temperature,
+        drivers: HumanDrivers | None = None,
     ) -> None:
         super().__init__(road, stream)
         self.policy = policy
         self.temperature = temperature
+        self._drivers = drivers
+
+    def native_drivers(self) -> HumanDrivers | None:
+        """Those that it was made with."""
+        return self._drivers
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """Drivers who have always driven as they do now; headways that nothing shows are drawn."""

@@ -10,7 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from ganlane.generator import Generator, load_generator, load_human, shipped_generator
-from ganlane.native.drivers import FittedGenerator, calibrated_drivers, paper_drivers
+from ganlane.native.drivers import (
+    FittedGenerator,
+    calibrated_drivers,
+    human_drivers,
+    paper_drivers,
+)
 from ganlane.settings.driving import (
     DriverFaults,
     IdmParameters,
@@ -156,14 +161,23 @@ def human_traffic(
     stream: int = Stream.TRAIN,
     path: str | Path | None = None,
     temperature: float = HumanTrafficConfig.temperature,
+    idm: IdmParameters = TABLE_V,
 ) -> HumanTraffic:
     """``traffic=human``: a policy fitted to recorded drivers (:mod:`ganlane.traffic.human`).
+
+    Args:
+        road, stream: as for every traffic module.
+        path, temperature: see :class:`~ganlane.settings.traffic.HumanTrafficConfig`.
+        idm: the ego's, where the kernel drives.
 
     Raises:
         UserError: the weights are missing or foreign.
     """
-    model, _ = load_human(path or shipped_generator("human"))
-    return HumanTraffic(model.policy, road, stream, temperature)
+    source = path or shipped_generator("human")
+    model, _ = load_human(source)
+    weights = {name: tensor.numpy() for name, tensor in model.state_dict().items()}
+    drivers = human_drivers(weights, model.sizes, temperature, idm, stream, source)
+    return HumanTraffic(model.policy, road, stream, temperature, drivers)
 
 
 def _fitted(generator: Generator, metadata: Mapping[str, Any], source: object) -> FittedGenerator:

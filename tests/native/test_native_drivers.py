@@ -15,6 +15,7 @@ from ganlane import keys
 from ganlane.api import make_env
 from ganlane.build import make_traffic
 from ganlane.generator import Generator, shipped_generator
+from ganlane.generator.human_estimator import HumanModel
 from ganlane.native.batch import NativeBatch
 from ganlane.native.drivers import GeneratedDrivers, drivers_of
 from ganlane.native.library import VARIANTS, best_variant, why_not
@@ -22,7 +23,7 @@ from ganlane.native.tensors import Kernel, NativeScenes
 from ganlane.runtime import kernel_threads
 from ganlane.settings.driving import IdmParameters, MobilParameters, Visibility
 from ganlane.settings.env import EnvConfig
-from ganlane.settings.generator import EXTRA_INPUTS, GENERATOR, GeneratorSizes
+from ganlane.settings.generator import EXTRA_INPUTS, GENERATOR, GeneratorSizes, HumanSizes
 from ganlane.settings.record import make
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.sim.state import Road
@@ -31,11 +32,18 @@ from ganlane.weights import load_weights, save_weights
 pytestmark = pytest.mark.skipif(why_not() is not None, reason="no C++ compiler")
 RUNNABLE = list(VARIANTS)[list(VARIANTS).index(best_variant()) :]
 PRESETS = {"gan": "paper", "gan_calibrated": "calibrated"}
-TRAFFICS = ["idm", "idm_mobil", "idm_faults", "idm_random", *PRESETS]
+TRAFFICS = ["idm", "idm_mobil", "idm_faults", "idm_random", "human", *PRESETS]
 #: Parts of all kinds; no batch size here is a multiple of the sum of their shares.
 MIXED = {
     "name": "mixed",
-    "shares": {"idm_mobil": 2, "gan": 1, "idm_faults": 1, "idm_random": 1, "gan_calibrated": 1},
+    "shares": {
+        "idm_mobil": 2,
+        "gan": 1,
+        "human": 1,
+        "idm_faults": 1,
+        "idm_random": 1,
+        "gan_calibrated": 1,
+    },
 }
 #: Faults so often that a few decisions meet all of them.
 OFTEN = {
@@ -59,6 +67,8 @@ ODD = {
 
 def odd_weights(preset, folder):
     """A generator of odd sizes and random weights, with the recordings of the shipped one."""
+    if preset == "human":
+        return odd_human(folder)
     _, metadata = load_weights(shipped_generator(preset), GENERATOR)
     extra_inputs = EXTRA_INPUTS if preset == "calibrated" else 0
     sizes = GeneratorSizes(**ODD, extra_inputs=extra_inputs)
@@ -66,6 +76,18 @@ def odd_weights(preset, folder):
     path = folder / f"{preset}.safetensors"
     state = Generator(sizes).state_dict()
     save_weights(path, GENERATOR, state, metadata | {"sizes": asdict(sizes)})
+    return str(path)
+
+
+def odd_human(folder):
+    """A policy of ``human`` of odd sizes and random weights."""
+    _, metadata = load_weights(shipped_generator("human"), GENERATOR)
+    sizes = HumanSizes(hidden=21, lane_hidden=9)
+    torch.manual_seed(3)
+    path = folder / "human.safetensors"
+    save_weights(
+        path, GENERATOR, HumanModel(sizes).state_dict(), metadata | {"sizes": asdict(sizes)}
+    )
     return str(path)
 
 
@@ -156,9 +178,9 @@ def test_it_decides_as_the_tensor_code(traffic):
     assert differ <= 1
 
 
-@pytest.mark.parametrize("traffic", PRESETS)
+@pytest.mark.parametrize("traffic", [*PRESETS, "human"])
 def test_networks_of_any_sizes_drive(traffic, tmp_path):
-    path = odd_weights(PRESETS[traffic], tmp_path)
+    path = odd_weights(PRESETS.get(traffic, traffic), tmp_path)
     differ, _ = compare({"name": traffic, "path": path}, highways=4, rows=12, decisions=3, seed=2)
     assert differ <= 1
 

@@ -18,7 +18,14 @@ import torch
 from torch import Tensor, nn
 
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.settings.generator import HumanSizes
+from ganlane.settings.generator import (
+    ACROSS_TOKENS,
+    ALONG_TOKENS,
+    FEATURES,
+    HUMAN_MEMORY,
+    SIDE_FEATURES,
+    HumanSizes,
+)
 from ganlane.sim.neighbours import nearest
 from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.state import LaneRange, Road, Vehicles
@@ -27,8 +34,8 @@ from ganlane.sim.state import LaneRange, Road, Vehicles
 STEPS = 4
 DECISION_S = STEPS * PHYSICS_STEP_S
 #: Accelerations and lateral speeds that a driver remembers, one per decision.
-ACCELERATIONS = 5
-LATERAL_SPEEDS = 2
+ACCELERATIONS = HUMAN_MEMORY["accelerations"]
+LATERAL_SPEEDS = HUMAN_MEMORY["lateral_speeds"]
 #: Nobody is seen beyond this gap, m.
 SIGHT_M = 150.0
 #: Time constant of a driver's style, s.
@@ -45,9 +52,6 @@ EDGE_S, EDGE_M = 0.8, 0.15
 ANTICIPATION_S = 1.0
 #: Decisions after which a driver's age, and the time since its last lane change, count no more.
 LONGEST = 12.0
-#: Numbers of :attr:`View.features` and of :attr:`View.sides`.
-FEATURES = 65
-SIDE_FEATURES = 17
 #: The probabilities of both lane changes together are at most this.
 _MOST_LIKELY = 0.98
 
@@ -102,8 +106,8 @@ class Tokens(NamedTuple):
 
 
 #: Changes of the acceleration, m/s2, and of the lateral speed, m/s, from decision to decision.
-ALONG = Tokens(0.15, 5.0, 41)
-ACROSS = Tokens(0.04, 0.6, 31)
+ALONG = Tokens(0.15, 5.0, ALONG_TOKENS)
+ACROSS = Tokens(0.04, 0.6, ACROSS_TOKENS)
 
 
 class Memory(NamedTuple):
@@ -262,7 +266,7 @@ def _only(near: Near, lanes: Tensor) -> Near:
 def _own_state(
     vehicles: Vehicles, memory: Memory, road: Road, lane: Tensor, speed: Tensor, aside: Tensor
 ) -> list[Tensor]:
-    """24 numbers of the driver itself and its place in the lane."""
+    """22 numbers of the driver itself and its place in the lane."""
     target = vehicles.target_lane.to(speed.dtype)
     from_target = vehicles.y - target * road.lane_width_m
     from_centre = vehicles.y - lane * road.lane_width_m

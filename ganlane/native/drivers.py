@@ -49,8 +49,12 @@ from ganlane.settings.generated import (
     SuddenAccelerations,
 )
 from ganlane.settings.generator import (
+    ACROSS_TOKENS,
+    ALONG_TOKENS,
+    FEATURES,
     GENERATOR,
-    HUMAN,
+    HUMAN_MEMORY,
+    SIDE_FEATURES,
     GeneratorSizes,
     HumanSizes,
     human_sizes,
@@ -231,15 +235,12 @@ class HumanDrivers:
 
     def memory(self) -> MemoryArrays:
         """Their memory in the order of human.hpp."""
-        widths: dict[str, tuple[int, ...]] = {
-            "accelerations": (5,),
-            "lateral_speeds": (2,),
-            "closing": (2,),
-            "style": (3,),
+        single = ("acceleration", "lateral_from", "lateral_to")
+        numbers = dict(HUMAN_MEMORY) | dict.fromkeys(single, 1)
+        return {
+            _memory(name): ("float32", () if count == 1 else (count,))
+            for name, count in numbers.items()
         }
-        single = ("age", "since", "acceleration", "lateral_from", "lateral_to")
-        widths |= dict.fromkeys(single, ())
-        return {_memory(name): ("float32", shape) for name, shape in widths.items()}
 
     def structures(self) -> dict[str, ctypes.Structure]:
         """As of :class:`RuleDrivers`."""
@@ -247,9 +248,7 @@ class HumanDrivers:
         packed = _aligned(
             _layer(w[f"{name}.weight"], w[f"{name}.bias"]) for name in _human_layers(self.sizes)
         )
-        human = Human(
-            weights=packed.ctypes.data, **vars(self.sizes), temperature=self.temperature
-        )
+        human = Human(weights=packed.ctypes.data, **vars(self.sizes), temperature=self.temperature)
         human.packed = packed
         return {"human": human}
 
@@ -770,7 +769,7 @@ def _fitted(path: str | None, preset: Any) -> FittedGenerator:
 
 
 def _human(traffic: HumanTrafficConfig, idm: IdmParameters, stream: int) -> HumanDrivers:
-    source = Path(traffic.path or shipped_generator(HUMAN))
+    source = Path(traffic.path or shipped_generator("human"))
     weights, metadata = load_arrays(source, GENERATOR)
     sizes = human_sizes(source, metadata)
     return human_drivers(weights, sizes, traffic.temperature, idm, stream, source)
@@ -784,7 +783,7 @@ def human_drivers(
     stream: int,
     source: object,
 ) -> HumanDrivers:
-    """Drivers of ``traffic=human``; ``weights`` are those of a file, ``source``, with its estimator.
+    """Drivers of ``traffic=human``; ``weights`` are those of the file ``source``.
 
     Raises:
         UserError: weights of other sizes.
@@ -805,11 +804,11 @@ def human_drivers(
 def _human_layers(sizes: HumanSizes) -> dict[str, tuple[int, int]]:
     """Inputs and outputs of the layers, in the order of human.hpp."""
     return {
-        "trunk.0": (65, sizes.hidden),
+        "trunk.0": (FEATURES, sizes.hidden),
         "trunk.2": (sizes.hidden, sizes.hidden),
-        "along": (sizes.hidden, 41),
-        "across": (sizes.hidden, 31),
-        "lane.0": (17, sizes.lane_hidden),
+        "along": (sizes.hidden, ALONG_TOKENS),
+        "across": (sizes.hidden, ACROSS_TOKENS),
+        "lane.0": (SIDE_FEATURES, sizes.lane_hidden),
         "lane.2": (sizes.lane_hidden, 2),
     }
 

@@ -10,7 +10,8 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from types import MappingProxyType
+from typing import Annotated, Any, Final, Literal, get_args
 
 from ganlane.errors import ParameterError, UserError
 from ganlane.files import CHECKPOINTS
@@ -121,6 +122,16 @@ def stored_sizes(path: object, metadata: Mapping[str, Any], preset: str | None) 
     if not isinstance(metadata.get("driving_statistics"), dict):
         raise UserError(f"{path}: holds no driving statistics of its recordings; fit it again.")
     return checked
+
+
+#: Numbers that a driver of ``human`` sees, and that it sees of a lane beside its own.
+FEATURES, SIDE_FEATURES = 65, 17
+#: Tokens of its acceleration and of its lateral speed.
+ALONG_TOKENS, ACROSS_TOKENS = 41, 31
+#: Its memory: name to numbers per driver (``ganlane.generator.human.Memory``).
+HUMAN_MEMORY: Final[Mapping[str, int]] = MappingProxyType(
+    {"accelerations": 5, "lateral_speeds": 2, "closing": 2, "style": 3, "age": 1, "since": 1}
+)
 
 
 @dataclass(frozen=True)

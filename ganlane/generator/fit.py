@@ -40,7 +40,7 @@ from ganlane.generator.forecasts import (
 )
 from ganlane.generator.human_estimator import HumanModel
 from ganlane.generator.human_fit import fit_human
-from ganlane.generator.human_forecasts import WIDTH_M, human_forecasts
+from ganlane.generator.human_forecasts import fit_observer, human_forecasts, recording_of
 from ganlane.generator.tasks import (
     CalibratedTask,
     FitLoop,
@@ -271,31 +271,15 @@ def _run_human(
 
     # No scene stops it early, so those for validation are fitted to, too.
     scenes = {scene.name: scene for scene in (*split.fitted, *split.validation)}
-    recordings = [_recording_of(scene) for scene in scenes.values()]
+    recordings = [recording_of(scene) for scene in scenes.values()]
     model, seconds = fit_human(config, recordings, following, report)
+    fit_observer(model, list(scenes.values()), config)
     steps = 1 + config.rounds + config.tuning
     if path is not None:
         metadata = {"preset": HUMAN, "sizes": asdict(config.sizes)}
         metadata |= {"steps": steps, "seconds": seconds}
         save_weights(path, GENERATOR, model.state_dict(), metadata)
     return Fitted(HumanTask(config, model), steps, seconds)
-
-
-def _recording_of(scene: SceneTracks) -> Recording:
-    count = scene.present.shape[1]
-    return Recording(
-        scene.name,
-        scene.name,
-        scene.lanes,
-        scene.lane_width_m,
-        x=scene.positions[..., 0],
-        y=scene.positions[..., 1],
-        speed=np.zeros(scene.present.shape),
-        present=scene.present,
-        length=scene.length,
-        width=np.full(count, WIDTH_M),
-        driven=np.ones(count, bool),
-    )
 
 
 def fit_generator(

@@ -355,6 +355,9 @@ def _sides(
     # On a free lane one could be faster by 3 m/s.
     here = torch.where(ahead.exists[..., 1], ahead.closing[..., 1], 3.0).clamp(-5.0, 5.0)
     from_centre = vehicles.y - lane * road.lane_width_m
+    # A change begins with a decision, not with the drift of a driver who keeps its lane: recorded
+    # ones are found by how they move, which a choice of when to begin must not see.
+    under_way = (vehicles.target_lane != lane).to(speed.dtype)
     since = memory.since.clamp_max(LONGEST) / LONGEST
     sides = []
     for side, sign in ((2, 1.0), (0, -1.0)):
@@ -378,8 +381,8 @@ def _sides(
             (1.5 - front).clamp(0.0, 2.0),
             (1.5 - rear).clamp(0.0, 2.0),
             (sign * towards).clamp(-1.0, 1.0),
-            (sign * aside * 3.0).clamp(-3.0, 3.0),
-            (sign * from_centre).clamp(-1.5, 1.5),
+            (sign * aside * 3.0).clamp(-3.0, 3.0) * under_way,
+            (sign * from_centre).clamp(-1.5, 1.5) * under_way,
             since,
         ]
         sides.append(torch.stack(numbers, -1))

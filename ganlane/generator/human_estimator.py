@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import smooth_l1_loss
 
 from ganlane.generator.human import DECISION_S, STEPS, HumanPolicy
-from ganlane.generator.windows import OBSERVED_POSITIONS
+from ganlane.generator.windows import OBSERVED_POSITIONS, PREDICTED_STEPS
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.generator import HumanSizes
 
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 UPDATES, BATCH, RATE = 3000, 1024, 2e-3
 #: Errors that weigh alike: speed, both accelerations, both lateral speeds, both places.
 SCALES = (0.3, 0.8, 0.8, 0.1, 0.1, 0.05, 0.05)
+#: Units of the observer along and across, m: of the motions, the forecast, and the differences.
+OBSERVED_SCALE, FORECAST_SCALE, DIFFERENCE_SCALE = (0.1, 0.03), (0.3, 0.1), (0.1, 0.03)
 
 
 class Estimator(nn.Module):
@@ -65,14 +67,46 @@ class Estimator(nn.Module):
         return level + scale * out
 
 
+class Observer(nn.Module):
+    """How recorded positions of the next 0.8 s differ from those that the policy forecasts.
+
+    A camera's errors last for some tenths of a second, so nine positions show what the next ones
+    will be. They are no driver's moves: traffic does without this network.
+    """
+
+    def __init__(self, hidden: int = 64) -> None:
+        super().__init__()
+        observed, predicted = OBSERVED_POSITIONS - 1, PREDICTED_STEPS
+        self.layers = nn.Sequential(
+            nn.Linear(2 * (observed + predicted), hidden),
+            nn.SiLU(),
+            nn.Linear(hidden, hidden),
+            nn.SiLU(),
+            nn.Linear(hidden, 2 * predicted),
+        )
+
+    def forward(self, positions: Tensor, forecast: Tensor) -> Tensor:
+        """Differences [..., 8, 2] in m; positions [..., 9, 2] and forecast [..., 8, 2] are relative
+        to the last position.
+        """
+        motion = positions.diff(dim=-2)
+        mean = motion.mean(-2, keepdim=True)
+        steps = torch.arange(1, PREDICTED_STEPS + 1, device=mean.device)[:, None]
+        apart = (motion - mean) / motion.new_tensor(OBSERVED_SCALE)
+        ahead = (forecast - steps * mean) / motion.new_tensor(FORECAST_SCALE)
+        out = self.layers(torch.cat((apart.flatten(-2), ahead.flatten(-2)), -1))
+        return out.unflatten(-1, (PREDICTED_STEPS, 2)) * motion.new_tensor(DIFFERENCE_SCALE)
+
+
 class HumanModel(nn.Module):
-    """What a file of ``human`` holds: the policy, and the estimator for forecasts."""
+    """What a file of ``human`` holds: the policy; estimator and observer for forecasts."""
 
     def __init__(self, sizes: HumanSizes) -> None:
         super().__init__()
         self.sizes = sizes
         self.policy = HumanPolicy(sizes)
         self.estimator = Estimator()
+        self.observer = Observer()
 
 
 def roughness(positions: Tensor) -> Tensor:

@@ -2,14 +2,22 @@
 
 The present follows from nine noisy positions (:mod:`ganlane.generator.human_estimator`). From there
 on the policy drives everybody in the scene, by expected moves (the mean driver) or by drawn ones
-(samples).
+(samples). What a recording shows besides, its camera's errors, is added for the first second.
 """
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import smooth_l1_loss
+
+from ganlane.data.dense import Recording
 from ganlane.generator.forecasts import SAMPLES, Forecasts, by_kind, driven_windows
 from ganlane.generator.human import (
     ACCELERATIONS,
@@ -29,11 +37,18 @@ from ganlane.generator.human import (
     with_style,
     with_velocity,
 )
-from ganlane.generator.human_estimator import Estimator, HumanModel, trust
-from ganlane.generator.human_samples import DESIRED_MPS, LONG_AGO
-from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT, SceneTracks, Segments
+from ganlane.generator.human_estimator import DIFFERENCE_SCALE, Estimator, HumanModel, trust
+from ganlane.generator.human_samples import DESIRED_MPS, LONG_AGO, smooth_scene
+from ganlane.generator.windows import (
+    OBSERVED_POSITIONS,
+    PREDICTED_STEPS,
+    PRESENT,
+    SceneTracks,
+    Segments,
+)
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.driving import Visibility
+from ganlane.settings.generator import HumanConfig
 from ganlane.settings.traffic import HumanTrafficConfig
 from ganlane.sim.state import Road, Vehicles
 
@@ -43,6 +58,9 @@ DESIRED_ABOVE_MPS = 4.0
 WIDTH_M = 1.9
 #: Who moves aside faster than this, m/s, away from its lane's centre, is changing lanes.
 CHANGING_MPS = 0.35
+#: Of the observer's fit: shares of the noise, frames between windows, and its updates.
+NOISE_SHARES = (0.0, 0.5, 1.0, 1.2)
+OBSERVER_STRIDE, OBSERVER_UPDATES, OBSERVER_BATCH, OBSERVER_RATE = 2, 20_000, 512, 3e-3
 
 
 def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memory, Road]:
@@ -157,4 +175,96 @@ def _driven(
         memory = remembered(vehicles, memory, view, acceleration, target)
         vehicles = moved(vehicles, acceleration, aside)
     positions = torch.cat(course)[:horizon]
-    return positions.transpose(0, 1).unflatten(0, (runs, rows))
+    positions = positions.transpose(0, 1).unflatten(0, (runs, rows))
+    return positions + _seen_besides(model, segments, positions[0])
+
+
+def _seen_besides(model: HumanModel, segments: Segments, mean: Tensor) -> Tensor:
+    """What the observer adds to positions [B, H, V, 2]; as much again later it has faded."""
+    added = torch.zeros_like(mean)
+    if mean.shape[1] < PREDICTED_STEPS:
+        return added
+    nine = segments.positions[:, :OBSERVED_POSITIONS].transpose(1, 2)
+    ahead = mean[:, :PREDICTED_STEPS].transpose(1, 2)
+    present = nine[:, :, -1:]
+    difference = model.observer(nine - present, ahead - present).transpose(1, 2)
+    whole = segments.present[:, :OBSERVED_POSITIONS].all(1)
+    difference = torch.where(whole[:, None, :, None], difference, 0.0)
+    added[:, :PREDICTED_STEPS] = difference
+    for step in range(PREDICTED_STEPS, min(2 * PREDICTED_STEPS, mean.shape[1])):
+        rest = 2.0 - (step + 1) / PREDICTED_STEPS
+        added[:, step] = rest * difference[:, -1]
+    return added
+
+
+def fit_observer(model: HumanModel, scenes: Sequence[SceneTracks], config: HumanConfig) -> None:
+    """Fit the observer of ``model`` to what its policy misses in these scenes.
+
+    Every scene counts with none, half, all and more of its noise, so that the observer adds nothing where
+    a recording has none.
+    """
+    random = torch.Generator().manual_seed(config.seed)
+
+    def mean_driver(segments: Segments) -> Tensor:
+        return _driven(model, segments, PREDICTED_STEPS, 0, random)
+
+    # The forecasts that it corrects are without it.
+    model.observer.requires_grad_(True)
+    with torch.no_grad():
+        last = model.observer.layers[-1]
+        assert isinstance(last, nn.Linear)
+        last.weight.zero_()
+        last.bias.zero_()
+    nine, forecasts, recorded = [], [], []
+    for share in NOISE_SHARES:
+        noisy = [_with_noise(scene, share, config) for scene in scenes]
+        cut = partial(driven_windows, scenes=noisy, horizon=PREDICTED_STEPS, stride=OBSERVER_STRIDE)
+        nine.append(cut(lambda segments: segments.positions[None, :, :OBSERVED_POSITIONS])[0])
+        recorded.append(cut(lambda segments: segments.future[None])[0])
+        with torch.no_grad():
+            forecasts.append(cut(mean_driver)[0])
+    positions, forecast, wanted = (
+        torch.from_numpy(np.concatenate(arrays)).float() for arrays in (nine, forecasts, recorded)
+    )
+    scale = torch.tensor(DIFFERENCE_SCALE)
+    optimizer = torch.optim.AdamW(model.observer.parameters(), OBSERVER_RATE, weight_decay=1e-2)
+    for update in range(OBSERVER_UPDATES):
+        share = 0.5 * (1.0 + math.cos(math.pi * update / OBSERVER_UPDATES))
+        optimizer.param_groups[0]["lr"] = OBSERVER_RATE * share
+        rows = torch.randint(len(wanted), (OBSERVER_BATCH,), generator=random)
+        # Left and right are alike.
+        side = torch.where(torch.rand(OBSERVER_BATCH, generator=random) < 0.5, -1.0, 1.0)
+        mirror = torch.stack((torch.ones_like(side), side), -1)[:, None]
+        seen, ahead = mirror * positions[rows], mirror * forecast[rows]
+        missed = mirror * wanted[rows] - ahead
+        error = (model.observer(seen, ahead) - missed) / scale
+        loss = smooth_l1_loss(error, torch.zeros_like(error))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    model.observer.requires_grad_(False)
+
+
+def _with_noise(scene: SceneTracks, share: float, config: HumanConfig) -> SceneTracks:
+    """The scene with a ``share`` of its camera's errors."""
+    smooth = smooth_scene(recording_of(scene), config.cutoff_hz, config.lateral_cutoff_hz)
+    without = np.stack((smooth.x, smooth.y), -1)
+    return replace(scene, positions=without + share * (scene.positions - without))
+
+
+def recording_of(scene: SceneTracks) -> Recording:
+    """The scene as a recording."""
+    count = scene.present.shape[1]
+    return Recording(
+        scene.name,
+        scene.name,
+        scene.lanes,
+        scene.lane_width_m,
+        x=scene.positions[..., 0],
+        y=scene.positions[..., 1],
+        speed=np.zeros(scene.present.shape),
+        present=scene.present,
+        length=scene.length,
+        width=np.full(count, WIDTH_M),
+        driven=np.ones(count, bool),
+    )

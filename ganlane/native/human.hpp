@@ -236,6 +236,7 @@ static inline void side_of(const Settings& s, const Rows& r, const Humans& m, in
     Float here = gain(leader), there = gain(front);
     Float towards = choose(front.gap < 25.0f, front.lateral_speed, zero);
     towards = towards + choose(rear.gap < 15.0f, rear.lateral_speed, zero);
+    Mask under_way = between(r.target[i], 0.0f, (float)(s.lanes - 1)) != m.lane[i];
     Float numbers[SIDE_FEATURES] = {
         logarithm(1.0f + larger(front.gap, zero)) - 2.5f,
         logarithm(1.0f + larger(rear.gap, zero)) - 2.5f,
@@ -251,8 +252,8 @@ static inline void side_of(const Settings& s, const Rows& r, const Humans& m, in
         between(1.5f - front.gap, 0.0f, 2.0f),
         between(1.5f - rear.gap, 0.0f, 2.0f),
         between(sign * towards, -1.0f, 1.0f),
-        between(sign * m.lateral[i] * 3.0f, -3.0f, 3.0f),
-        between(sign * (r.y[i] - m.lane[i] * s.lane_width), -1.5f, 1.5f),
+        choose(under_way, between(sign * m.lateral[i] * 3.0f, -3.0f, 3.0f), zero),
+        choose(under_way, between(sign * (r.y[i] - m.lane[i] * s.lane_width), -1.5f, 1.5f), zero),
         smaller(r.memory[SINCE][i], filled(LONGEST_MEMORY)) / LONGEST_MEMORY,
     };
     for (int k = 0; k < SIDE_FEATURES; k++) f[k] = numbers[k];

@@ -200,8 +200,8 @@ def _seen_besides(model: HumanModel, segments: Segments, mean: Tensor) -> Tensor
 def fit_observer(model: HumanModel, scenes: Sequence[SceneTracks], config: HumanConfig) -> None:
     """Fit the observer of ``model`` to what its policy misses in these scenes.
 
-    Every scene counts with none, half, all and more of its noise, so that the observer adds nothing where
-    a recording has none.
+    Every scene counts with none, half, all and more of its noise, so that the observer adds nothing
+    where a recording has none.
     """
     random = torch.Generator().manual_seed(config.seed)
 

@@ -43,7 +43,7 @@ BATCHES = {
 }
 TRAFFICS = {
     "sim": ["idm_mobil"],
-    "gymnasium": ["idm", "idm_mobil", "idm_faults", "idm_random", "gan", "gan_calibrated"],
+    "gymnasium": ["idm", "idm_mobil", "idm_faults", "idm_random", "human", "gan", "gan_calibrated"],
     "traffic": ["idm", "idm_mobil", "gan", "gan_calibrated"],
     "train": ["idm_mobil", "gan"],
 }

@@ -20,7 +20,7 @@ from ganlane.errors import UserError
 from ganlane.gym import ENV_IDS
 from ganlane.gym.base import make_rows
 from ganlane.gym.native_rows import NativeRows
-from ganlane.native.drivers import GeneratedDrivers, drivers_of
+from ganlane.native.drivers import NETWORKS, drivers_of
 from ganlane.native.library import why_not
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.episode import Stream
@@ -169,6 +169,7 @@ def test_a_row_of_a_batch_drives_as_one_alone_does():
         "idm_faults",
         "gan",
         "gan_calibrated",
+        "human",
         {"name": "mixed", "shares": {"idm_random": 2, "idm_faults": 1}},
         {"name": "mixed", "shares": {"idm": 1, "gan": 1}, "options": {"gan": {"execute_k": 2}}},
         {"name": "gan", "execute_k": 2},
@@ -182,7 +183,7 @@ def test_option_and_module_give_one_answer_to_who_drives(traffic):
     of_module = make_traffic(config, env).native_drivers()
     of_option = drivers_of(config, env.idm, env.mobil, Stream.TRAIN)
     assert type(of_module) is type(of_option)
-    if isinstance(of_option, GeneratedDrivers):
+    if isinstance(of_option, NETWORKS):
         for name, weights in of_option.weights.items():
             np.testing.assert_array_equal(weights, of_module.weights[name])
         of_module, of_option = (replace(drivers, weights={}) for drivers in (of_module, of_option))

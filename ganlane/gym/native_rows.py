@@ -10,7 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from ganlane import keys
-from ganlane.gym.rows import Flags, Floats, Integers, Rows, observation_space
+from ganlane.gym.rows import (
+    Flags,
+    Floats,
+    Integers,
+    Rows,
+    described,
+    measure,
+    observation_space,
+)
 from ganlane.native.batch import NativeBatch, Stepped
 from ganlane.native.drivers import drivers_of, pays
 from ganlane.native.library import why_not
@@ -33,7 +41,7 @@ class NativeRows(Rows):
         self._arrays: dict[str, Any] = {
             "scene_end": np.zeros(batch.rows, np.bool_),
             "lanes": batch.lanes,
-            "lane_width_m": batch.lane_width_m,
+            "lane_width_m": np.float32(batch.lane_width_m),
             keys.REWARD_TERMS: batch.reward_terms(),
         }
         for name in (keys.SEED, keys.EPISODE, keys.STEP):
@@ -45,6 +53,12 @@ class NativeRows(Rows):
         # Events with several beginnings are counted; the ego has a memory of the same names.
         for name in (*events, *keys.EVENT_COUNTS):
             self._arrays[name] = state[keys.EVENTS, name]
+        self._info = described(self._arrays, batch.mask)
+
+    def info(self) -> dict[str, Any]:
+        # All of it but the lane and the time are views.
+        measure(self._info, self._arrays)
+        return self._info
 
     def __getstate__(self) -> tuple[NativeBatch, HighwayConfig, bool]:
         """Without the views, which a copy has of its own arrays."""

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ganlane.arguments import seed_number, whole_number
 from ganlane.errors import UserError
 from ganlane.gym.base import OnRows, make_rows
-from ganlane.gym.rows import SEEDS, Floats, actions_of, array_of, reset_options, row_of
+from ganlane.gym.rows import SEEDS, Floats, action_of, reset_options, row_of
 from ganlane.gym.window import FilmWindow, has_display
 from ganlane.keys import ACTIONS, PHYSICS_STEP_S
 
@@ -127,11 +127,11 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         """One decision: observation, reward, terminated, truncated, info."""
         if not self._running:
             raise UserError("step(): no episode is under way; call reset() first.")
-        actions = actions_of(array_of(action).reshape(-1), 1)
+        number = action_of(action)
         # The view records the physics steps of the decision through the environment's recorder.
         if self._view is not None:
-            self._view.before_step(int(actions[0]))
-        stepped = self._rows.step(actions)
+            self._view.before_step(number)
+        stepped = self._rows.step(np.array([number]))
         reward = float(stepped.reward[0])
         terminated = bool(stepped.terminated[0])
         truncated = bool(stepped.truncated[0])

@@ -31,7 +31,7 @@ from .tally import Tally
 DATA = Path(os.environ.get("GANLANE_DATA", "../shared/data")).absolute()
 RECORDINGS = DATA / "ngsim" / "us101_scenes.csv"
 RULES = ("idm", "idm_mobil")
-TRAFFICS = (*RULES, *RULES, "idm_random", "idm_faults", "gan", "gan_calibrated", "mixed")
+TRAFFICS = (*RULES, *RULES, "idm_random", "idm_faults", "human", "gan", "gan_calibrated", "mixed")
 ENVS = ("highway", "highway", "highway", "dense", "cut_in", "stalled_car", "stop_and_go")
 ENVS += ("blocked_lane", "replay")
 #: Pairs of vehicles in all rows together; generated traffic needs a kilobyte or more for each.

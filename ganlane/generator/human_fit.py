@@ -37,10 +37,11 @@ from ganlane.generator.human_samples import (
     SmoothScene,
     cuts,
     joined,
+    keeping_choice,
     samples_of,
     smooth_scene,
 )
-from ganlane.generator.human_tuning import Iteration, tune
+from ganlane.generator.human_tuning import Iteration, begins_per_decision, tune
 from ganlane.settings.driving import Visibility
 from ganlane.settings.generator import HumanConfig
 from ganlane.sim.idm import DriverIdm, following_acceleration
@@ -137,6 +138,7 @@ def _fitted(
         report(1 + config.rounds + iteration.number, steps, iteration.cost)
 
     tune(model.policy, teacher, material.danger, config, random, after_iteration)
+    match_rate(model.policy, teacher, config)
     return model.eval().requires_grad_(False), time.monotonic() - begun
 
 
@@ -149,6 +151,7 @@ def clone(
     for rate in (config.learning_rate, 0.5 * config.learning_rate):
         train_moves(policy, moves, material.prior, max(1, config.epochs // 2), rate, random)
     train_lane_choice(policy, samples, material.danger, random)
+    match_rate(policy, samples, config)
     return samples
 
 
@@ -280,6 +283,27 @@ def train_lane_choice(
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
+
+
+@torch.no_grad()
+def match_rate(policy: HumanPolicy, samples: Samples, config: HumanConfig) -> None:
+    """Let lane changes begin as often as recorded ones did, over the recorded states.
+
+    Where recorded drivers took gaps that count as danger here, no change begins; others make up for
+    it. Only the level is moved: the bias of all beginnings.
+    """
+    wanted = begins_per_decision(samples, config)
+    last = policy.lane[-1]
+    assert isinstance(last, nn.Linear)
+    choice = keeping_choice(samples, torch.arange(len(samples.keeping_sides)))
+    unmoved = last.bias[0].clone()
+    low, high = -6.0, 6.0
+    # Bisection: the rate grows with the bias.
+    for _ in range(20):
+        middle = 0.5 * (low + high)
+        last.bias[0] = unmoved + middle
+        begins = float(policy.lane_chances(choice)[:, 1:].sum(-1).mean())
+        low, high = (middle, high) if begins < wanted else (low, middle)
 
 
 @torch.no_grad()

@@ -116,10 +116,7 @@ def tune(
             {"params": critic.parameters(), "lr": CRITIC_RATE},
         ]
     )
-    # Changes begun per decision of a driver who could.
-    recorded = float((teacher.begins == 1).sum()) / max(1, len(teacher.keeping_sides))
-    if config.changes_per_h is not None:
-        recorded = config.changes_per_h / 3600.0 * DECISION_S
+    recorded = begins_per_decision(teacher, config)
     for number in range(config.tuning):
         rise, fall = min(1.0, (number + 1) / 5), 1.0 - 0.8 * number / config.tuning
         optimizer.param_groups[0]["lr"] = RATE * rise * fall
@@ -145,6 +142,13 @@ def tune(
                 nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
                 optimizer.step()
         report(iteration)
+
+
+def begins_per_decision(teacher: Samples, config: HumanConfig) -> float:
+    """Lane changes begun per decision of a driver in its lane: as configured, or as recorded."""
+    if config.changes_per_h is not None:
+        return config.changes_per_h / 3600.0 * DECISION_S
+    return float((teacher.begins == 1).sum()) / max(1, len(teacher.keeping_sides))
 
 
 def _values(critic: nn.Module, decisions: Decisions) -> Tensor:

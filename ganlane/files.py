@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from mmap import mmap
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from ganlane.errors import UserError
 
@@ -109,6 +109,16 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise OSError(cause.errno, cause.strerror, str(path)) from error
     finally:
         part.unlink(missing_ok=True)
+
+
+@contextmanager
+def opened(path: str | Path) -> Iterator[BinaryIO]:
+    """An open file that takes the place of ``path`` as :func:`atomic_path` says.
+
+    For polars, which cannot write to a path that has bytes beyond the locale's characters.
+    """
+    with atomic_path(path) as part, part.open("wb") as file:
+        yield file
 
 
 @contextmanager

@@ -42,6 +42,12 @@ def parsed(command: str, words: Sequence[str]) -> list[Override]:
         UserError: a word is not of the form key=value, names no option, or would make Hydra import
             something.
     """
+    for word in words:
+        # Python reads bytes beyond the locale's characters as lone surrogates.
+        if not word.isprintable() and word != word.encode("utf-8", "ignore").decode():
+            raise UserError(
+                f"{word!a}: has characters that this locale does not know; set LC_ALL=C.UTF-8."
+            )
     # Hydra's own grammar, so that quotes, lists and sweeps mean what its users expect.
     try:
         overrides = OverridesParser.create().parse_overrides([_as_meant(command, w) for w in words])

@@ -34,8 +34,8 @@ from ganlane.errors import UserError
 from ganlane.files import (
     LARGEST_BYTES,
     PLACE,
-    atomic_path,
     has_checksum,
+    opened,
     sealed,
     write_bytes,
 )
@@ -82,8 +82,8 @@ def write_scene_csv(frame: pl.DataFrame, path: str | Path) -> None:
 
     Lane 1 is the leftmost in use in a scene.
     """
-    with atomic_path(path) as part:
-        scene_csv(frame, pl.col("lane").max().over("scene"), 3.5).write_csv(part)
+    with opened(path) as file:
+        scene_csv(frame, pl.col("lane").max().over("scene"), 3.5).write_csv(file)
 
 
 def scene_csv(

@@ -20,7 +20,7 @@ import torch
 
 from ganlane._version import __version__
 from ganlane.errors import UserError, as_typed
-from ganlane.files import PACKAGE, atomic_path, write_json
+from ganlane.files import PACKAGE, opened, write_json
 from ganlane.runtime import usable_cores
 from ganlane.settings.record import saved_config
 from ganlane.settings.traffic import OwnTraffic, TrafficConfig
@@ -183,8 +183,8 @@ def write_episodes(folder: str | Path, episodes: pl.DataFrame) -> Path:
     """Write one row per episode as ``episodes.parquet`` into ``folder``, atomically; its path."""
     path = Path(folder) / "episodes.parquet"
     # A reader never sees half a file.
-    with atomic_path(path) as part:
-        episodes.write_parquet(part)
+    with opened(path) as file:
+        episodes.write_parquet(file)
     return path
 
 

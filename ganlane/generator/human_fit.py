@@ -126,7 +126,9 @@ def _fitted(
         scenes += [smooth_scene(one, *cutoffs, ONE_LANE_WEIGHT) for one in following]
     material = material_of(scenes, random)
     steps = 1 + config.rounds + config.tuning
-    teacher = clone(model.policy, material, config, random)
+    # Lane changes are few: none of them is hidden, as the sides are from some of the moves.
+    choices = _gathered(material, Options(blind=0.0), config, random, times=2)
+    teacher = clone(model.policy, material, choices, config, random)
     report(1, steps, None)
 
     def after_round(number: int) -> None:
@@ -137,21 +139,27 @@ def _fitted(
     def after_iteration(iteration: Iteration) -> None:
         report(1 + config.rounds + iteration.number, steps, iteration.cost)
 
-    tune(model.policy, teacher, material.danger, config, random, after_iteration)
-    match_rate(model.policy, teacher, config)
+    tune(model.policy, choices, material.danger, config, random, after_iteration)
+    match_rate(model.policy, choices, config)
     return model.eval().requires_grad_(False), time.monotonic() - begun
 
 
 def clone(
-    policy: HumanPolicy, material: Material, config: HumanConfig, random: torch.Generator
+    policy: HumanPolicy,
+    material: Material,
+    choices: Samples,
+    config: HumanConfig,
+    random: torch.Generator,
 ) -> Samples:
-    """Fit ``policy`` to what recorded drivers did; gives the teacher samples."""
+    """Fit ``policy`` to what recorded drivers did, its lane choice to ``choices``; gives the
+    teacher samples.
+    """
     samples = _gathered(material, Options(), config, random, times=3)
     moves = _moves(samples, slice(None))
     for rate in (config.learning_rate, 0.5 * config.learning_rate):
         train_moves(policy, moves, material.prior, max(1, config.epochs // 2), rate, random)
-    train_lane_choice(policy, samples, material.danger, random)
-    match_rate(policy, samples, config)
+    train_lane_choice(policy, choices, material.danger, random)
+    match_rate(policy, choices, config)
     return samples
 
 

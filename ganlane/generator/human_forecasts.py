@@ -58,9 +58,9 @@ DESIRED_ABOVE_MPS = 4.0
 WIDTH_M = 1.9
 #: Who moves aside faster than this, m/s, away from its lane's centre, is changing lanes.
 CHANGING_MPS = 0.35
-#: Of the observer's fit: shares of the noise, frames between windows, and its updates.
+#: Of the observer's fit: shares of the noise, frames between windows, batch and learning rate.
 NOISE_SHARES = (0.0, 0.5, 1.0, 1.2)
-OBSERVER_STRIDE, OBSERVER_UPDATES, OBSERVER_BATCH, OBSERVER_RATE = 2, 20_000, 512, 3e-3
+OBSERVER_STRIDE, OBSERVER_BATCH, OBSERVER_RATE = 2, 512, 3e-3
 
 
 def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memory, Road]:
@@ -228,8 +228,8 @@ def fit_observer(model: HumanModel, scenes: Sequence[SceneTracks], config: Human
     )
     scale = torch.tensor(DIFFERENCE_SCALE)
     optimizer = torch.optim.AdamW(model.observer.parameters(), OBSERVER_RATE, weight_decay=1e-2)
-    for update in range(OBSERVER_UPDATES):
-        share = 0.5 * (1.0 + math.cos(math.pi * update / OBSERVER_UPDATES))
+    for update in range(config.observing):
+        share = 0.5 * (1.0 + math.cos(math.pi * update / config.observing))
         optimizer.param_groups[0]["lr"] = OBSERVER_RATE * share
         rows = torch.randint(len(wanted), (OBSERVER_BATCH,), generator=random)
         # Left and right are alike.

@@ -52,7 +52,7 @@ RATE, CRITIC_RATE = 3e-4, 1e-3
 #: Drivers draw from distributions that are somewhat sharper than fitted.
 TEMPERATURE = 0.8
 #: Weights of the rate of lane changes, and of the divergence of lane choices.
-RATE_PULL, LANE_PULL = 0.5, 1.0
+RATE_PULL, LANE_PULL = 0.1, 5.0
 #: Bands of speed in each of which the rate is kept, m/s.
 BANDS_MPS = ((0.0, 9.0), (9.0, 16.0), (16.0, 40.0))
 

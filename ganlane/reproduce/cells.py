@@ -24,7 +24,7 @@ from ganlane.build import Driver, make_driver, make_drivers, make_traffic
 from ganlane.compare import compare
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version
-from ganlane.files import atomic_path
+from ganlane.files import opened
 from ganlane.settings.commands import ReproduceConfig
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.torch_settings import set_threads
@@ -173,8 +173,8 @@ def drive_cell(cell: Cell, config: ReproduceConfig) -> None:
         "code": code_version(),
         "seconds": round(time.monotonic() - begun, 3),
     }
-    with atomic_path(cell.path) as part:
-        table.write_parquet(part, metadata={_ORIGIN: json.dumps(origin)})
+    with opened(cell.path) as file:
+        table.write_parquet(file, metadata={_ORIGIN: json.dumps(origin)})
 
 
 def read_cells(cells: Sequence[Cell]) -> tuple[pl.DataFrame, list[str], dict[str, float]]:

@@ -341,6 +341,7 @@ class HumanConfig(FitConfig):
         tuning: iterations of the fine-tuning; 0: none.
         pull: weight of the divergence from the cloned policy in it.
         changes_per_h: lane changes per vehicle-hour that it keeps to; null: as recorded.
+        observing: updates of the observer, which adds a camera's errors to forecasts.
         following: fit to the files of one lane beside the recordings, too (I-80, I-24), where
             they are there.
     """
@@ -361,6 +362,8 @@ class HumanConfig(FitConfig):
     tuning: CountOrZero = 150
     pull: NotNegative = 0.15
     changes_per_h: Positive | None = None
+    # of forecasts alone
+    observing: Count = 20_000
 
 
 #: The NGSIM trajectories (doi:10.21949/1504477), as the portal of the US DOT exports them.

@@ -13,7 +13,7 @@ import polars as pl
 from ganlane.data.dense import track_table
 from ganlane.data.recordings import scene_csv, write_prepared
 from ganlane.data.schema import TRACK_STRIDE, sort
-from ganlane.files import atomic_path
+from ganlane.files import opened
 from ganlane.view.record import Trajectory
 
 
@@ -43,8 +43,8 @@ def write_tracks(
     if format == "parquet":
         write_prepared(sort(pl.concat(tables)), path)
     else:
-        with atomic_path(path) as part:
-            pl.concat(tables).write_csv(part)
+        with opened(path) as file:
+            pl.concat(tables).write_csv(file)
     return Path(path)
 
 

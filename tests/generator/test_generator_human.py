@@ -230,7 +230,7 @@ def test_tokens_of_who_stands_do_not_turn_it():
     assert after.speed.item() == after.heading.item() == 0.0
 
 
-SMALL = {"epochs": 2, "rounds": 1, "tuning": 2, "samples": 2}
+SMALL = {"epochs": 2, "rounds": 1, "tuning": 2, "samples": 2, "observing": 20}
 
 
 @pytest.fixture

@@ -264,3 +264,26 @@ def test_a_folder_may_be_called_anything(name, here):
     word = "resume=" + QuotedString(name, Quote.single).with_quotes()
     config = settings("train", [word])
     assert (config.seed, config.resume) == (3, name)
+
+
+def test_a_folder_that_the_locale_cannot_name_is_a_folder_like_others(tmp_path):
+    """Such a locale is that of many containers and cron jobs."""
+    folder = tmp_path / "ü"
+    folder.mkdir()
+    line = [sys.executable, "-m", "ganlane", "evaluate", "agents=[mobil]", "traffics=[idm]"]
+    locale = {"LC_ALL": "POSIX", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    environment = os.environ | locale | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [*line, "episodes=2", "threads=1"],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr.decode(errors="replace")
+    assert list(folder.rglob("episodes.parquet"))
+
+
+def test_a_word_beyond_the_locale_is_refused_by_name():
+    with pytest.raises(UserError, match=r"characters that this locale does not know"):
+        parsed("render", ["out=film_\udcc3\udcbc.gif"])

@@ -30,6 +30,7 @@ from ganlane.sim.dynamics import (
     move_ego,
 )
 from ganlane.sim.idm import following_acceleration
+from ganlane.sim.lane_ends import hits_wall
 from ganlane.sim.spawn import recycle
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
 from ganlane.torch_settings import compiled
@@ -87,18 +88,12 @@ def begin(
 
     Rows whose command leaves the road have ended.
     """
-    # Recorded roads have as many lanes as their row says.
-    lanes = rules.road.lanes
-    if isinstance(lanes, Tensor):
-        lanes = lanes[:, 0]
-    target = vehicles.target_lane[:, EGO_INDEX]
-    direction = ego["change_direction"]
     # The command sets the lane that the ego steers to; the motion itself takes several decisions.
     command = apply_action(
         action,
-        target,
-        direction,
-        lanes,
+        vehicles,
+        ego["change_direction"],
+        rules.road,
         rules.ego.abort_lane_change,
     )
     others = vehicles.target_lane[:, 1:]
@@ -146,13 +141,12 @@ def advance(
     if not all_running:
         vehicles = vehicles.where(running, before.vehicles)
         steering = torch.where(running, steering, before.steering)
-    acceleration, ahead, behind = ego_surroundings(
-        ego_scene(vehicles, rules.road),
-        rules.idm,
-        rules.ego,
-    )
+    scene = ego_scene(vehicles, rules.road)
+    acceleration, ahead, behind = ego_surroundings(scene, rules.idm, rules.ego)
     # Of the events of one step a crash comes first, then the goal, then the time-out.
     crash = ego_overlaps(vehicles, rules.road).any(-1) & running
+    if rules.road.stretches:
+        crash = crash | (hits_wall(scene.observers, scene.body, rules.road)[:, 0] & running)
     goal = (vehicles.x[:, EGO_INDEX] >= rules.episode.goal_m) & running & ~crash
     step = before.step + running
     late = (step >= round(rules.episode.timeout_s / PHYSICS_STEP_S)) | scene_over(rules, step)

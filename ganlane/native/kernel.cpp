@@ -94,12 +94,24 @@ static inline void look_round(const Settings& s, const Rows& r, const Ego& e, Ma
     }
 }
 
+// Whether the ego has driven into the wall at the end of a lane that its body is in.
+static __attribute__((noinline)) Mask hits_wall(const Settings& s, const Ego& e) {
+    Mask hit = none();
+    for (int lane = 0; lane < s.lanes; lane++) {
+        Mask here = (e.low <= (float)lane) & ((float)lane <= e.high);
+        hit |= here & (s.ends->wall[lane] - (e.x + e.half_length) < 0.0f);
+    }
+    return hit;
+}
+
 // What a physics step led to. A hard crash comes before the goal, both before the time-out.
 static inline void note_events(const Settings& s, Rows& r) {
     Ego e = find_ego(r);
     Mask ahead, behind, on = r.running;
     look_round(s, r, e, ahead, behind);
-    Mask crash = crashed(e, r) & on, goal = (e.x >= s.goal) & on & ~crash;
+    Mask crash = crashed(e, r) & on;
+    if (s.ends) crash |= hits_wall(s, e) & on;
+    Mask goal = (e.x >= s.goal) & on & ~crash;
     Float one = filled(1.0f), zero = filled(0.0f);
     r.step = r.step + choose(on, one, zero);
     r.onsets = r.onsets + choose(ahead & ~r.ahead & on, one, zero);
@@ -206,7 +218,7 @@ static Command obey(const Settings& s, const Inputs& in, long row) {
     int64_t wish = in.action[row] == LEFT ? 1 : in.action[row] == RIGHT ? -1 : 0;
     int64_t direction = in.change_direction[row], target = in.target_lane[row * s.vehicles];
     if (!is_heard(wish, direction, s.abort_lane_change)) wish = 0;
-    bool off_road = !on_road(target + wish, s.lanes);
+    bool off_road = !may_change(s, target, wish, in.x[row * s.vehicles]);
     if (off_road) wish = 0;
     return {wish ? wish : direction, target + wish, wish != 0, off_road, in.speed[row * s.vehicles], in.step[row]};
 }

@@ -1,4 +1,4 @@
-"""The test scenarios cut-in, stalled car, stop-and-go wave and blocked lane; m, m/s.
+"""The test scenarios cut-in, stalled car, stop-and-go wave, blocked lane and merge; m, m/s.
 
 Functions of a few numbers that return the rows of a :class:`~ganlane.sim.scenes.FixedScene`, the
 ego first.
@@ -177,6 +177,44 @@ def stop_and_go(
                 # The columns of neighbouring lanes are 7 m apart, so that nobody stands level.
                 cars.append(SceneVehicle(x - 7.0 * lane, lane, speed, 15.0))
     return tuple(cars)
+
+
+def merge(
+    ego_speed_mps: float = 18.0,
+    speed_mps: float = 20.0,
+    spacing_m: float = 50.0,
+    lanes: int = 3,
+    desired_speed_mps: float = 25.0,
+) -> tuple[SceneVehicle, ...]:
+    """The ego alone on the rightmost lane, an on-ramp; ten vehicles ``spacing_m`` apart in each of
+    the others, a third of them ahead of it.
+    """
+    _at_least(lanes, 2, "merge")
+    cars = [SceneVehicle(0.0, 0, ego_speed_mps, desired_speed_mps)]
+    for lane in range(1, lanes):
+        # Neighbouring lanes are staggered by half of the spacing.
+        first_m = (3.0 + 0.5 * (lane % 2)) * spacing_m
+        cars += _stream(lane, 10, first_m, spacing_m, speed_mps)
+    return tuple(cars)
+
+
+def _stream(
+    lane: int,
+    vehicles: int,
+    first_m: float,
+    spacing_m: float,
+    speed_mps: float,
+) -> tuple[SceneVehicle, ...]:
+    """As :func:`_column`, of drivers that would like to be as fast, 10 % or 20 % faster."""
+    return tuple(
+        SceneVehicle(
+            first_m - spacing_m * k,
+            lane,
+            speed_mps,
+            speed_mps * (1.0 + 0.1 * (k % 3)),
+        )
+        for k in range(vehicles)
+    )
 
 
 def _at_least(

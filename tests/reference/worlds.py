@@ -308,7 +308,8 @@ def random_stretches(lanes: int, rng: random.Random) -> Stretches:
         if lane == going_on or rng.random() < 0.3:
             stretches.append(LaneStretch())
             continue
-        begin_m = rng.choice([-FAR_M, rng.uniform(-150.0, 50.0)])
-        end_m = rng.uniform(60.0, 350.0)
+        begin_m = rng.choice([-FAR_M, rng.uniform(-150.0, 0.0)])
+        # Some so near that an ego cannot stop.
+        end_m = rng.choice([rng.uniform(5.0, 40.0), rng.uniform(60.0, 350.0)])
         stretches.append(LaneStretch(begin_m, end_m, WALL))
     return tuple(stretches)

@@ -80,24 +80,22 @@ def test_a_car_that_stands_at_the_end_turns_out_as_soon_as_the_lane_is_free():
     assert now.x[0, 1] > 430.0
 
 
-def test_the_bias_grows_from_295_metres_before_the_end_to_6_at_the_end():
-    assert bias_at(0.0) == 0.0
-    assert bias_at(105.0) == 0.0
-    assert bias_at(252.5) == pytest.approx(3.0)
-    assert bias_at(400.0) == pytest.approx(6.0)
+def test_the_bias_grows_from_500_metres_before_the_end_to_8_at_the_end():
+    assert bias_at(-200.0) == 0.0
+    assert bias_at(-100.0) == 0.0
+    assert bias_at(150.0) == pytest.approx(4.0)
+    assert bias_at(400.0) == pytest.approx(8.0)
 
 
 def test_two_changes_are_as_urgent_twice_as_far_away():
     end = LaneStretch(end_m=400.0, end=WALL)
     road = Road(3, stretches=(end, end, LaneStretch()))
-    scene = perceive(vehicles({"x": -190.0}, {"x": -900.0}), road)
     lanes = torch.tensor([[[0.0, 1.0], [0.0, 1.0]]], dtype=torch.float64)
-    gain, possible = mandatory(scene, lanes, TABLE_IV, None)
-    assert gain[0, 0, 0] == 0.0
-    scene = perceive(vehicles({"x": 105.0}, {"x": -900.0}), road)
-    gain, possible = mandatory(scene, lanes, TABLE_IV, None)
-    assert gain[0, 0, 0] == pytest.approx(3.0)
-    assert possible.all()
+    for x, bias in ((-600.0, 0.0), (-100.0, 4.0), (150.0, 6.0)):
+        scene = perceive(vehicles({"x": x}, {"x": -900.0}), road)
+        gain, possible = mandatory(scene, lanes, TABLE_IV, None)
+        assert gain[0, 0, 0] == pytest.approx(bias)
+        assert possible[0, 0, 0]
 
 
 def test_the_end_decides_where_an_equal_lane_would_not():
@@ -119,8 +117,8 @@ def test_the_safety_criterion_never_yields(x):
 def test_nobody_changes_into_a_lane_that_ends_soon():
     """Not even behind a slow leader."""
     slow = {"lane": 1, "speed": 5.0, "desired_speed": 5.0}
-    assert wish(DROPPED, {"x": 0.0, "lane": 1}, {"x": 40.0, **slow}) == -1
-    assert wish(DROPPED, {"x": 110.0, "lane": 1}, {"x": 150.0, **slow}) == 0
+    assert wish(DROPPED, {"x": -110.0, "lane": 1}, {"x": -70.0, **slow}) == -1
+    assert wish(DROPPED, {"x": -90.0, "lane": 1}, {"x": -50.0, **slow}) == 0
 
 
 def test_nobody_changes_into_a_lane_that_has_not_begun_or_out_of_it():
@@ -236,7 +234,7 @@ def test_an_impossible_stretch_is_refused(stretch, wrong):
         LaneStretch(**stretch)
 
 
-# env=merge
+# env=merge, lane_drop, exit
 
 
 def outcomes(config: EnvConfig, driver: str, traffic: object, rows: int = 64) -> dict[str, int]:
@@ -255,11 +253,58 @@ def outcomes(config: EnvConfig, driver: str, traffic: object, rows: int = 64) ->
     return {name: count for name, count in counts.items() if count}
 
 
+@pytest.mark.parametrize("scene", ["merge", "lane_drop", "exit"])
 @pytest.mark.parametrize("driver", ["mobil", "mobil_egoistic"])
 @pytest.mark.parametrize("traffic", [IdmTrafficConfig(), IdmMobilTrafficConfig()])
-def test_a_mobil_ego_merges(driver, traffic):
-    assert outcomes(make(EnvConfig, "merge"), driver, traffic) == {"goal": 64}
+def test_a_mobil_ego_reaches_its_goal(scene, driver, traffic):
+    assert outcomes(make(EnvConfig, scene), driver, traffic) == {"goal": 64}
 
 
-def test_an_ego_that_keeps_its_lane_stands_at_its_end_until_the_time_is_up():
-    assert outcomes(make(EnvConfig, "merge"), "keep_lane", IdmTrafficConfig()) == {"timeout": 64}
+@pytest.mark.parametrize(
+    ("scene", "end"), [("merge", "timeout"), ("lane_drop", "timeout"), ("exit", "missed_exit")]
+)
+def test_an_ego_that_keeps_its_lane_does_not(scene, end):
+    """It stands at the end of its lane, or passes the exit."""
+    assert outcomes(make(EnvConfig, scene), "keep_lane", IdmTrafficConfig()) == {end: 64}
+
+
+def test_nobody_is_left_standing_at_a_lane_drop():
+    """All of the ending lane have found their way into the others within three minutes."""
+    config = replace(make(EnvConfig, "lane_drop"), goal_m=1e5, timeout_s=300.0)
+    env = make_env(make_traffic(IdmMobilTrafficConfig(), config), config, num_envs=32)
+    policy = make_driver("mobil", config).policy
+    td = env.reset()
+    for _ in range(180):
+        td = env.step(policy(td))["next"]
+        assert not td["done"].any()
+    assert (td[keys.VEHICLES, "x"] > 500.0).all()
+    assert (td[keys.VEHICLES, "speed"] > 10.0).all()
+
+
+@pytest.mark.parametrize("kernel", ["torch", "native"])
+@pytest.mark.parametrize(("lane", "event"), [(0, "goal"), (1, "missed_exit")])
+def test_at_the_end_of_the_exit_lane_the_ego_has_left_the_road_or_missed_it(kernel, lane, event):
+    exit_lane = LaneStretch(200.0, 400.0, EXIT)
+    env = environment(
+        lanes=2,
+        vehicles=2,
+        stretches=(exit_lane, LaneStretch()),
+        goal_m=100.0,
+        dtype=torch.float32,
+        kernel=kernel,
+    )
+    cars = ({"x": 395.0, "lane": lane}, {"x": -900.0, "lane": 1})
+    td = placed(env, vehicles(*cars, dtype=torch.float32))
+    after = step(env, td)
+    assert [name for name in keys.END_EVENTS if after[keys.EVENTS, name]] == [event]
+    assert after["terminated"]
+    assert 400.0 <= after[keys.VEHICLES, "x"][0, 0] < 402.5
+    earlier = placed(env, vehicles({**cars[0], "x": 360.0}, cars[1], dtype=torch.float32))
+    assert not step(env, earlier)["done"]
+
+
+def test_the_drivers_of_the_traffic_keep_out_of_the_exit_lane():
+    """Even behind a slow leader: they have nowhere to go there."""
+    slow = {"lane": 1, "speed": 5.0, "desired_speed": 5.0}
+    road = Road(2, stretches=(LaneStretch(200.0, 400.0, EXIT), LaneStretch()))
+    assert wish(road, {"x": 250.0, "lane": 1}, {"x": 290.0, **slow}) == 0

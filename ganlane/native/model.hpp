@@ -10,6 +10,7 @@ const int MOST_LANES = 20;
 struct Ends {
     float begin[MOST_LANES], end[MOST_LANES], wall[MOST_LANES], leave_by[MOST_LANES], reach[MOST_LANES];
     float mandatory_bias;
+    int32_t exit_lane;  // that the ego has to leave the road by; -1: none
 };
 
 struct Settings {

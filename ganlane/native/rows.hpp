@@ -39,7 +39,7 @@ struct Rows {
     Float *gap_ahead, *speed_ahead, *gap_behind, *speed_behind, *per_desired_behind;
     Nearest* nearest;  // [lanes]
     // Of the rows: whether they go on, physics steps since MOBIL's last decision and in all, and the ego's events.
-    Mask running, ahead, behind, crash, goal;
+    Mask running, ahead, behind, crash, goal, missed_exit;
     Float phase, step, onsets, onsets_behind;
     // Keys of the random numbers: of the episode, and of this step; physics steps at the start of the decision.
     uint64_t episode_key[LANES], step_key[LANES];
@@ -251,8 +251,9 @@ INLINE Float bias(const Settings& s, const Rows& r, int i, Float lane) {
 
 static __attribute__((noinline)) Mandatory mandatory(const Settings& s, const Rows& r, int i, float side) {
     Float lane = r.target[i];
-    Float gain = bias(s, r, i, lane) - bias(s, r, i, lane + side);
-    return {gain, exists(s, lane, r.x[i]) & exists(s, lane + side, r.x[i]) & (gain >= 0.0f)};
+    Float here = bias(s, r, i, lane), there = bias(s, r, i, lane + side);
+    return {choose(here > there, here, filled(0.0f)),
+            exists(s, lane, r.x[i]) & exists(s, lane + side, r.x[i]) & (here >= there)};
 }
 
 template <class Drivers>

@@ -23,7 +23,7 @@ from ganlane.settings.driving import (
 )
 from ganlane.settings.episode import EpisodeParameters, SpawnParameters
 from ganlane.settings.observation import NEARNESS_M, OVERLAP_M, ObservationScale, RewardParameters
-from ganlane.settings.road import FAR_M, WALL, Stretches, leaving
+from ganlane.settings.road import FAR_M, WALL, Stretches, exit_lane, leaving
 
 #: A key of the state as the environment's TensorDict has it: ``"step"``, ``("vehicles", "x")``.
 Key = str | tuple[str, ...]
@@ -52,6 +52,7 @@ EVENT_ARRAYS: Final[dict[Key, str]] = {
             "goal",
             "hard_crash",
             "out_of_road",
+            "missed_exit",
             "timeout",
         ),
         "bool",
@@ -184,6 +185,7 @@ class Ends(ctypes.Structure):
     _fields_ = [
         *fields(c_float * _MOST_LANES, "begin end wall leave_by reach"),  # type: ignore[arg-type]
         *fields(c_float, "mandatory_bias"),
+        *fields(c_int32, "exit_lane"),
     ]
 
 
@@ -318,7 +320,8 @@ def ends_of(
         "leave_by": leave_by,
         "reach": [mobil.mandatory_m * number for number in changes],
     }
-    ends = Ends(mandatory_bias=mobil.mandatory_bias)
+    goal = exit_lane(stretches)
+    ends = Ends(mandatory_bias=mobil.mandatory_bias, exit_lane=-1 if goal is None else goal)
     for name, row in numbers.items():
         for lane, number in enumerate(row):
             getattr(ends, name)[lane] = number

@@ -1,8 +1,8 @@
 """``env=...``: road, vehicles, initial scenes, and the end of an episode; m, s, m/s.
 
 ``env=highway`` and ``env=dense`` start with random scenes (Table II). ``env=cut_in, stalled_car,
-blocked_lane, stop_and_go, merge`` start with a scene made by :mod:`ganlane.sim.scenarios`,
-``env=scene`` with one from a file.
+blocked_lane, stop_and_go, merge, lane_drop, exit`` start with a scene made by
+:mod:`ganlane.sim.scenarios`, ``env=scene`` with one from a file.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from ganlane.settings.record import (
     one_of,
     part_of,
 )
-from ganlane.settings.road import WALL, LaneStretch, Stretches
+from ganlane.settings.road import EXIT, WALL, LaneStretch, Stretches
 
 if TYPE_CHECKING:
     from ganlane.sim.scenes import FixedScene, SceneVehicle
@@ -197,6 +197,79 @@ class MergeScene(SceneConfig):
         return merge(
             self.ego_speed_mps,
             self.speed_mps,
+            self.spacing_m,
+            env.lanes,
+            env.ego_desired_speed_mps,
+        )
+
+
+@dataclass(frozen=True)
+class LaneDropScene(SceneConfig):
+    """The ego's lane, the leftmost, ends for all; traffic in every lane.
+
+    Attributes:
+        drop_m: from the ego's centre to the wall at the end of its lane, m.
+        speed_mps: of the ego and the others, m/s.
+        spacing_m: centre to centre, of those in one lane, m.
+    """
+
+    kind: str = "lane_drop"
+    jitter_m: NotNegative = 14.0
+    jitter_mps: NotNegative = 2.0
+    drop_m: Positive = 500.0
+    speed_mps: Positive = 20.0
+    spacing_m: Positive = 60.0
+
+    def stretches(self, lanes: int) -> Stretches:
+        """The leftmost lane ends, the others go on."""
+        return (*[LaneStretch()] * (lanes - 1), LaneStretch(end_m=self.drop_m, end=WALL))
+
+    def vehicles(self, env: EnvConfig) -> tuple[SceneVehicle, ...]:
+        """The vehicles, the ego first."""
+        from ganlane.sim.scenarios import lane_drop
+
+        return lane_drop(
+            self.speed_mps,
+            self.spacing_m,
+            env.lanes,
+            env.ego_desired_speed_mps,
+        )
+
+
+@dataclass(frozen=True)
+class ExitScene(SceneConfig):
+    """The ego, in the leftmost lane, has to leave by the exit lane on the right.
+
+    Attributes:
+        distance_m: from the ego's centre to where the exit lane begins, m.
+        exit_m: length of the exit lane, at whose end the ego has left the road or missed the exit,
+            m; 250 m in the German guidelines for motorways (RAA 2008).
+        speed_mps: of the vehicles in the lane beside the exit lane, m/s.
+        faster_mps: how much faster each further lane to the left is, m/s.
+        spacing_m: centre to centre, of those in one lane, m.
+    """
+
+    kind: str = "exit"
+    jitter_m: NotNegative = 25.0
+    jitter_mps: NotNegative = 2.0
+    distance_m: Positive = 1000.0
+    exit_m: Positive = 250.0
+    speed_mps: Positive = 18.0
+    faster_mps: NotNegative = 3.0
+    spacing_m: Positive = 80.0
+
+    def stretches(self, lanes: int) -> Stretches:
+        """The rightmost lane is there for a while, the others go on."""
+        leaving = LaneStretch(self.distance_m, self.distance_m + self.exit_m, EXIT)
+        return (leaving, *[LaneStretch()] * (lanes - 1))
+
+    def vehicles(self, env: EnvConfig) -> tuple[SceneVehicle, ...]:
+        """The vehicles, the ego first."""
+        from ganlane.sim.scenarios import off_ramp
+
+        return off_ramp(
+            self.speed_mps,
+            self.faster_mps,
             self.spacing_m,
             env.lanes,
             env.ego_desired_speed_mps,

@@ -4,10 +4,11 @@ The end of a lane that a driver has to leave makes its lane changes mandatory. I
 bias of the incentive (Kesting, Treiber and Helbing 2007; Treiber and Kesting 2013, section 14.3);
 here it grows as the end nears, as the mandatory desire of Schakel, Knoop and van Arem (2012) does:
 
-    urgency = 1 - distance / (changes * 295 m), from 0 to 1.
+    urgency = 1 - distance / (changes * 500 m), from 0 to 1.
 
-The bias of a change is that of the lane it leaves less that of the lane it enters. MOBIL's safety
-criterion holds for these changes as for all others.
+A change into a lane that is less urgent to leave has the bias of the lane that it leaves; nobody
+changes into one that is more urgent to leave. MOBIL's safety criterion holds for these changes as
+for all others.
 
 All functions take lanes of any shape that broadcasts with the positions, whole numbers or floats.
 """
@@ -92,6 +93,14 @@ def room_before_wall(
 def hits_wall(vehicles: Vehicles, body: LaneRange, road: Road) -> Tensor:
     """Whether each vehicle [N, K], in the lanes ``body``, has driven into a wall; bool."""
     return (room_before_wall(vehicles, spanned(body), road) < 0.0).any(-1)
+
+
+def at_exit(vehicles: Vehicles, road: Road) -> tuple[Tensor, Tensor]:
+    """Whether each vehicle has left the road by its exit, and whether it has missed it, bool."""
+    assert road.exit_lane is not None
+    passed = vehicles.x >= ends(road)[road.exit_lane]
+    inside = road.lane_of(vehicles.y) == road.exit_lane
+    return passed & inside, passed & ~inside
 
 
 def bias(

@@ -212,10 +212,12 @@ def mandatory(
         mobil.mandatory_bias,
         mobil.mandatory_m,
     )
-    gain = leave[..., :1] - leave[..., 1:]
+    here = leave[..., :1]
+    there = leave[..., 1:]
+    gain = torch.where(here > there, here, 0.0)
     lane = lanes[..., :1]
     possible = may_change(scene.road, lane, lanes[..., 1:] - lane, x[..., None])
-    return gain, possible & (gain >= 0.0)
+    return gain, possible & (here >= there)
 
 
 def mobil_wishes(

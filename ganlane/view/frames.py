@@ -69,6 +69,7 @@ _OUTCOMES = {
     "goal": ("GOAL", canvas.GOOD),
     "hard_crash": ("HARD CRASH", canvas.CRASH),
     "out_of_road": ("OUT OF ROAD", canvas.CRASH),
+    "missed_exit": ("EXIT MISSED", canvas.AMBER),
     "timeout": ("TIME-OUT", canvas.AMBER),
     "scene_end": ("END OF RECORDING", canvas.AMBER),
 }

@@ -206,7 +206,7 @@ def there_is(lane: int, x: float, rules: Rules) -> bool:
 
 
 def urge(car: Car, lane: int, rules: Rules) -> float:
-    """How much the driver wants to leave the lane: from 295 m a change before its end up to 6 m/s2
+    """How much the driver wants to leave the lane: from 500 m a change before its end up to 8 m/s2
     at it.
     """
     if not rules.stretches or rules.stretches[lane][2] == "nothing":
@@ -214,7 +214,7 @@ def urge(car: Car, lane: int, rules: Rules) -> float:
     lasting = [k for k in range(rules.lanes) if rules.stretches[k][2] == "nothing"]
     changes = min(abs(k - lane) for k in lasting)
     remaining = rules.stretches[lane][1] - car.x
-    return 6.0 * min(1.0, max(0.0, 1.0 - remaining / (295.0 * changes)))
+    return 8.0 * min(1.0, max(0.0, 1.0 - remaining / (500.0 * changes)))
 
 
 def possible(car: Car, lane: int, rules: Rules) -> bool:
@@ -225,6 +225,17 @@ def possible(car: Car, lane: int, rules: Rules) -> bool:
         return True
     here = car.target_lane
     return there_is(here, car.x, rules) and urge(car, lane, rules) <= urge(car, here, rules)
+
+
+def arrival(ego: Car, rules: Rules) -> str:
+    """``goal``, ``missed_exit`` where there is an exit, or nothing yet."""
+    exits = [lane for lane, stretch in enumerate(rules.stretches) if stretch[2] == "exit"]
+    if not exits:
+        return "goal" if ego.x >= rules.goal else ""
+    if ego.x < rules.stretches[exits[0]][1]:
+        return ""
+    here = min(rules.lanes - 1, max(0, round(ego.y / rules.lane_width)))
+    return "goal" if here == exits[0] else "missed_exit"
 
 
 def in_the_wall(car: Car, rules: Rules) -> bool:
@@ -250,7 +261,8 @@ def incentive(view: View, i: int, lane: int) -> tuple[float, bool]:
     """
     here = view.cars[i].target_lane
     gain = view.in_a_lane(i, lane) - view.in_a_lane(i, here)
-    gain += urge(view.cars[i], here, view.rules) - urge(view.cars[i], lane, view.rules)
+    urgent = urge(view.cars[i], here, view.rules)
+    gain += urgent if urgent > urge(view.cars[i], lane, view.rules) else 0.0
     safe = view.in_a_lane(i, lane) >= -4.0
     new = view.follower(i, lane)
     if new is not None:
@@ -442,8 +454,8 @@ def decide(state: State, action: int, rules: Rules) -> Outcome:
         hit = any(overlap(ego, other) for other in state.cars[1:] if other.valid)
         if hit or in_the_wall(ego, rules):
             outcome.reasons.append("hard_crash")
-        elif ego.x >= rules.goal:
-            outcome.reasons.append("goal")
+        elif arrival(ego, rules):
+            outcome.reasons.append(arrival(ego, rules))
         elif state.step >= rules.timeout_steps:
             outcome.reasons.append("timeout")
     ego = state.cars[0]

@@ -17,7 +17,7 @@ from ganlane import keys
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.settings.driving import EgoParameters, Visibility
 from ganlane.settings.episode import SpawnParameters
-from ganlane.settings.road import FAR_M, WALL, LaneStretch, Stretches
+from ganlane.settings.road import EXIT, FAR_M, WALL, LaneStretch, Stretches
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.random import Stream
 from ganlane.sim.state import Road, Vehicles
@@ -301,15 +301,16 @@ def assert_same_tracks(some: dict[int, Track], others: dict[int, Track], at_leas
 
 
 def random_stretches(lanes: int, rng: random.Random) -> Stretches:
-    """One lane goes on; each of the others may begin late and end at a wall."""
+    """One lane goes on; each of the others may begin late and end at a wall, one at an exit."""
     going_on = rng.randrange(lanes)
+    exit_lane = rng.randrange(2 * lanes)
     stretches = []
     for lane in range(lanes):
-        if lane == going_on or rng.random() < 0.3:
+        if lane == going_on or (lane != exit_lane and rng.random() < 0.3):
             stretches.append(LaneStretch())
             continue
         begin_m = rng.choice([-FAR_M, rng.uniform(-150.0, 0.0)])
         # Some so near that an ego cannot stop.
         end_m = rng.choice([rng.uniform(5.0, 40.0), rng.uniform(60.0, 350.0)])
-        stretches.append(LaneStretch(begin_m, end_m, WALL))
+        stretches.append(LaneStretch(begin_m, end_m, EXIT if lane == exit_lane else WALL))
     return tuple(stretches)

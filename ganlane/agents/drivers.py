@@ -32,7 +32,7 @@ from ganlane.settings.driving import (
     IdmParameters,
     MobilParameters,
 )
-from ganlane.sim.dynamics import SIDES, ego_scene, on_road
+from ganlane.sim.dynamics import SIDES, ego_scene, stays_on_road
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV, mobil_wishes
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
@@ -209,7 +209,7 @@ def legal_actions(tensordict: TensorDictBase, road: Road) -> Tensor:
     """Which of the three actions stay on the road, bool [N, 3]: keeping the lane always does."""
     vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
     # beside the lane that it is moving to, not the one it is in
-    return on_road(vehicles, constant(SIDES, vehicles.target_lane), road)
+    return stays_on_road(vehicles, constant(SIDES, vehicles.target_lane), road)
 
 
 class RandomDriver(Driver):

@@ -165,7 +165,7 @@ def is_heard(
     return idle | (side == -direction) if abort else idle
 
 
-def on_road(
+def stays_on_road(
     vehicles: Vehicles,
     side: Tensor,
     road: Road,
@@ -191,7 +191,7 @@ def apply_action(
     # First what the ego ignores, then what the road does not have.
     side = torch.where(is_heard(side, direction, abort), side, 0)
     # The episode ends with this command; the target lane stays a lane of the road.
-    off_road = ~on_road(vehicles, side[:, None], road)[:, 0]
+    off_road = ~stays_on_road(vehicles, side[:, None], road)[:, 0]
     side = torch.where(off_road, 0, side)
     starts = side != 0
     return Command(

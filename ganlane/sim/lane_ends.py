@@ -47,13 +47,18 @@ def walls(road: Road) -> tuple[float, ...]:
     return tuple(its.end_m if its.end == WALL else FAR_M for its in road.stretches)
 
 
+def on_road(road: Road, lane: Tensor) -> Tensor:
+    """Whether the road has the ``lane`` anywhere, bool."""
+    return (lane >= 0) & (lane < road.lanes)
+
+
 def exists(
     road: Road,
     lane: Tensor,
     x: Tensor,
 ) -> Tensor:
     """Whether the road has the ``lane`` at ``x``, m; bool."""
-    inside = (lane >= 0) & (lane < road.lanes)
+    inside = on_road(road, lane)
     if not road.stretches:
         return inside
     begin = of_lane(begins(road), lane, x)

@@ -209,13 +209,13 @@ def lane_drop(
     lane, and six in its own.
     """
     _at_least(lanes, 2, "lane_drop")
-    own = lanes - 1
-    cars = [SceneVehicle(0.0, own, speed_mps, desired_speed_mps)]
+    leftmost = lanes - 1
+    cars = [SceneVehicle(0.0, leftmost, speed_mps, desired_speed_mps)]
     for lane in range(lanes):
         # Neighbouring lanes are staggered by half of the spacing.
-        first_m = (2.0 + 0.5 * ((own - lane) % 2)) * spacing_m
+        first_m = (2.0 + 0.5 * ((leftmost - lane) % 2)) * spacing_m
         stream = _stream(lane, 7, first_m, spacing_m, speed_mps)
-        cars += [car for car in stream if car.x_m or lane < own]
+        cars += [car for car in stream if car.x_m or lane < leftmost]
     return tuple(cars)
 
 
@@ -232,15 +232,15 @@ def off_ramp(
     Each lane is ``faster_mps`` faster than the one on its right.
     """
     _at_least(lanes, 2, "exit")
-    own = lanes - 1
-    ego_speed = speed_mps + faster_mps * (own - 1)
-    cars = [SceneVehicle(0.0, own, ego_speed, desired_speed_mps)]
+    leftmost = lanes - 1
+    ego_speed = speed_mps + faster_mps * (leftmost - 1)
+    cars = [SceneVehicle(0.0, leftmost, ego_speed, desired_speed_mps)]
     for lane in range(1, lanes):
         # Neighbouring lanes are staggered by half of the spacing.
-        first_m = (3.0 + 0.5 * ((own - lane) % 2)) * spacing_m
+        first_m = (3.0 + 0.5 * ((leftmost - lane) % 2)) * spacing_m
         speed = speed_mps + faster_mps * (lane - 1)
         stream = _stream(lane, 8, first_m, spacing_m, speed)
-        cars += [car for car in stream if car.x_m or lane < own]
+        cars += [car for car in stream if car.x_m or lane < leftmost]
     return tuple(cars)
 
 

@@ -15,16 +15,12 @@ from ganlane.errors import ParameterError, UserError
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
 from ganlane.settings.road import EXIT, WALL, LaneStretch, Stretches
-from ganlane.settings.traffic import (
-    GanTrafficConfig,
-    IdmFaultsTrafficConfig,
-    IdmMobilTrafficConfig,
-    IdmTrafficConfig,
-)
+from ganlane.settings.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV, mandatory, mobil_wishes
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.state import Road
+from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
 from ganlane.transforms import ActionMaskTransform
 
@@ -194,11 +190,16 @@ def test_beside_the_end_of_a_lane_one_passes():
 # What is refused
 
 
-@pytest.mark.parametrize("traffic", [GanTrafficConfig(), IdmFaultsTrafficConfig()])
-def test_traffic_that_does_not_heed_the_ends_of_lanes_is_refused(traffic):
-    config = make(EnvConfig, "merge")
-    with pytest.raises(UserError, match="does not heed the ends of lanes"):
-        make_env(make_traffic(traffic, config), config)
+class Cruise(TrafficModule):
+    """Drives on, whatever comes."""
+
+    def move(self, vehicles, memory, key, step):
+        return vehicles.with_(x=vehicles.x + vehicles.speed * self.dt), memory
+
+
+def test_traffic_that_does_not_heed_the_ends_of_lanes_is_refused():
+    with pytest.raises(UserError, match="Cruise does not heed the ends of lanes"):
+        HighwayEnv(Cruise(DROPPED))
 
 
 def test_recycling_is_refused():

@@ -191,8 +191,8 @@ class HighwayEnv(EnvBase):
         """Raise :class:`UserError` for parts that do not fit; ``vehicles`` is as given by users."""
         if self.road.stretches and not self.traffic.heeds_lane_ends:
             raise UserError(
-                f"{type(self.traffic).__name__} does not heed the ends of lanes; take traffic=idm, "
-                "idm_mobil or idm_random, or a road whose lanes go on."
+                f"{type(self.traffic).__name__} does not heed the ends of lanes; take another "
+                "traffic (idm_mobil, gan_calibrated, ...), or a road whose lanes go on."
             )
         if self.recycle and self.road.stretches:
             raise UserError(

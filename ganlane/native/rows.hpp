@@ -244,16 +244,35 @@ struct Mandatory {
     Mask possible;
 };
 
-INLINE Float bias(const Settings& s, const Rows& r, int i, Float lane) {
+INLINE Float urgency(const Settings& s, const Rows& r, int i, Float lane) {
     Float distance = of_lane(s, s.ends->leave_by, lane, NOBODY_M) - r.x[i];
-    return s.ends->mandatory_bias * between(1.0f - distance / of_lane(s, s.ends->reach, lane, 1.0f), 0.0f, 1.0f);
+    return between(1.0f - distance / of_lane(s, s.ends->reach, lane, 1.0f), 0.0f, 1.0f);
 }
 
 static __attribute__((noinline)) Mandatory mandatory(const Settings& s, const Rows& r, int i, float side) {
     Float lane = r.target[i];
-    Float here = bias(s, r, i, lane), there = bias(s, r, i, lane + side);
-    return {choose(here > there, here, filled(0.0f)),
+    Float here = urgency(s, r, i, lane), there = urgency(s, r, i, lane + side);
+    return {choose(here > there, s.ends->mandatory_bias * here, filled(0.0f)),
             exists(s, lane, r.x[i]) & exists(s, lane + side, r.x[i]) & (here >= there)};
+}
+
+// Of a driver who changes lanes as it likes: whether it may go left or right, the side to which it has to leave its lane
+// (0: none), and how urgently.
+struct WaysOut {
+    Mask left, right;
+    Float side, urgency;
+};
+
+static __attribute__((noinline)) WaysOut ways_out(const Settings& s, const Rows& r, int i) {
+    Float lane = r.target[i], x = r.x[i], one = filled(1.0f), zero = filled(0.0f);
+    Float here = urgency(s, r, i, lane), left = urgency(s, r, i, lane + 1.0f), right = urgency(s, r, i, lane - 1.0f);
+    WaysOut ways;
+    ways.left = exists(s, lane, x) & exists(s, lane + 1.0f, x) & (here >= left);
+    ways.right = exists(s, lane, x) & exists(s, lane - 1.0f, x) & (here >= right);
+    Mask out_left = ways.left & (here > left), out_right = ways.right & (here > right);
+    ways.side = choose(out_left & (~out_right | (left <= right)), one, choose(out_right, -one, zero));
+    ways.urgency = choose(ways.side != 0.0f, here, zero);
+    return ways;
 }
 
 template <class Drivers>

@@ -15,6 +15,8 @@ All functions take lanes of any shape that broadcasts with the positions, whole 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -128,6 +130,35 @@ def bias(
     distance = of_lane(by_m, lanes, x) - x[..., None]
     urgency = 1.0 - distance / of_lane(reaches, lanes, x)
     return strongest * urgency.clamp(0.0, 1.0)
+
+
+class WaysOut(NamedTuple):
+    """Of each driver [N, M]: whether it may go left or right, the side to which it has to leave its
+    lane (-1 right, 0 none, 1 left), and how urgently, 0 to 1.
+    """
+
+    left: Tensor
+    right: Tensor
+    side: Tensor
+    urgency: Tensor
+
+
+def ways_out(vehicles: Vehicles, road: Road, reach_m: float) -> WaysOut:
+    """Where drivers who stay on the road may and have to go; ``reach_m`` as of :func:`bias`."""
+    lane = vehicles.target_lane
+    sides = constant((0, 1, -1), lane)
+    lanes = lane[..., None] + sides
+    urgency = bias(road, lanes, vehicles.x, None, 1.0, reach_m)
+    here = urgency[..., :1]
+    possible = may_change(road, lane[..., None], sides, vehicles.x[..., None])[..., 1:]
+    possible = possible & (here >= urgency[..., 1:])
+    left, right = possible.unbind(-1)
+    # The better one of two sides, the left one at a tie; a lane as urgent is none.
+    out = torch.where(possible & (here > urgency[..., 1:]), urgency[..., 1:], torch.inf)
+    to_the_left, to_the_right = out.unbind(-1)
+    side = torch.where(to_the_left <= to_the_right, 1, -1)
+    side = torch.where(torch.isfinite(out).any(-1), side, 0)
+    return WaysOut(left, right, side, torch.where(side != 0, here[..., 0], 0.0))
 
 
 def stopping_room(

@@ -303,6 +303,8 @@ class Overlay(TrafficModule):
     Subclasses implement :meth:`rewrite` instead of :meth:`TrafficModule.move`.
     """
 
+    heeds_lane_ends = True  # as far as the model below does
+
     def rewrite(
         self,
         vehicles: Vehicles,

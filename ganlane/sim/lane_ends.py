@@ -1,7 +1,7 @@
 """Lanes that begin and end: where one may change, who stops before an end, and who has to leave.
 
 The end of a lane that a driver has to leave makes its lane changes mandatory. In MOBIL that is a
-bias of the incentive (Kesting, Treiber and Helbing 2007; Treiber and Kesting 2013, section 14.3);
+bias of the incentive (Kesting, Treiber and Helbing 2007; Treiber and Kesting 2013);
 here it grows as the end nears, as the mandatory desire of Schakel, Knoop and van Arem (2012) does:
 
     urgency = 1 - distance / (changes * 500 m), from 0 to 1.

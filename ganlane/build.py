@@ -47,7 +47,7 @@ from ganlane.transforms import (
 
 def make_road(env: EnvConfig) -> Road:
     """The road of an environment."""
-    return Road(env.lanes, env.lane_width_m)
+    return Road(env.lanes, env.lane_width_m, stretches=env.stretches())
 
 
 def make_highways(config: HighwayConfig) -> TransformedHighway:

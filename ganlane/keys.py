@@ -70,9 +70,16 @@ VEHICLE_FLAGS: Final = ("valid",)
 VEHICLE_FIELDS: Final = VEHICLE_FLOATS + VEHICLE_INTEGERS + VEHICLE_FLAGS
 
 #: Boolean events; a decision ends for at most one of them.
-END_EVENTS: Final = ("goal", "hard_crash", "out_of_road", "timeout", "scene_end")
+END_EVENTS: Final = (
+    "goal",
+    "hard_crash",
+    "out_of_road",
+    "missed_exit",
+    "timeout",
+    "scene_end",
+)
 #: Ends that are outcomes of the driving; the others are cut-offs.
-TERMINAL_EVENTS: Final = ("goal", "hard_crash", "out_of_road")
+TERMINAL_EVENTS: Final = ("goal", "hard_crash", "out_of_road", "missed_exit")
 TRUNCATING_EVENTS: Final = ("timeout", "scene_end")
 #: Number of soft-crash onsets in the decision, int64.
 SOFT_CRASH: Final = "soft_crash"

@@ -84,11 +84,13 @@ def bounds(form: str, vehicles: int) -> tuple[torch.Tensor, torch.Tensor]:
         # Speed over desired speed (at least 25 m/s; nobody drives twice that), a lane to the left,
         # to the right.
         observation.OWN: [(0.0, 2.0), (0.0, 1.0), (0.0, 1.0)],
+        observation.OWN_HERE: [(0.0, 2.0), (0.0, 1.0), (0.0, 1.0)],
         observation.LIST: [(-1.0, 1.0)] * 3 * others,
         observation.VIEW: gap * 6,
         observation.DRIFT_VIEW: [*gap, drift] * 6,
         observation.OVERLAP_VIEW: [*overlap, (-1.0, 1.0), drift] * 6,
         observation.CHANGE: [(0.0, 1.0), (-1.0, 1.0)],
+        observation.ROAD: [(0.0, 1.0)] * 6 + [(-1.0, 1.0), (0.0, 1.0)],
     }
     low, high = zip(*(pair for part in OBSERVATIONS[form] for pair in ranges[part]))
     return torch.tensor(low), torch.tensor(high)

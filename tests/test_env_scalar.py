@@ -13,6 +13,7 @@ from reference.worlds import (
     environment,
     packed,
     placed,
+    random_stretches,
     rules_of,
     scalar_state,
     step,
@@ -26,8 +27,11 @@ from ganlane.sim.state import Vehicles
 MOTION = ("x", "y", "heading", "speed", "acceleration")
 
 
-def random_environment(rng: random.Random, rows: int) -> HighwayEnv:
-    """1 to 6 lanes, 2 to 20 vehicles, sparse to dense, with and without MOBIL, all ends."""
+def random_environment(rng: random.Random, rows: int, ends: bool = False) -> HighwayEnv:
+    """1 to 6 lanes, 2 to 20 vehicles, sparse to dense, with and without MOBIL, all outcomes.
+
+    With ``ends`` some lanes begin late and end at a wall.
+    """
     lanes = rng.randint(1, 6)
     vehicles = rng.randint(2, 20)
     spacing = rng.choice([8.0, 12.0, 25.0])
@@ -43,6 +47,7 @@ def random_environment(rng: random.Random, rows: int) -> HighwayEnv:
         abort=rng.random() < 0.3,
         spawn=packed(spread, spacing),
         seed=rng.randrange(10**9),
+        stretches=random_stretches(lanes, rng) if ends else (),
     )
 
 
@@ -119,11 +124,17 @@ def assert_same(
     assert remembered == pytest.approx(ego, rel=0.0, abs=tolerance)
 
 
-def compare_random_scenes(scenes: int, rows: int, duration_s: float, seed: int) -> None:
+def compare_random_scenes(
+    scenes: int,
+    rows: int,
+    duration_s: float,
+    seed: int,
+    ends: bool = False,
+) -> None:
     rng = random.Random(seed)
     generator = torch.Generator().manual_seed(seed)
     for block in range(scenes // rows):
-        env = random_environment(rng, rows)
+        env = random_environment(rng, rows, ends)
         td = env.reset()
         if block % 2:
             td = disturb(env, td, generator)
@@ -137,6 +148,10 @@ def test_the_tensor_code_agrees_with_the_scalar_one_on_100_random_scenes():
 @pytest.mark.slow
 def test_the_tensor_code_agrees_with_the_scalar_one_on_2000_random_scenes():
     compare_random_scenes(scenes=2000, rows=5, duration_s=10.0, seed=1)
+
+
+def test_on_roads_with_lanes_that_end_they_agree_too():
+    compare_random_scenes(scenes=100, rows=4, duration_s=8.0, seed=2, ends=True)
 
 
 def test_on_a_ring_they_agree_too():

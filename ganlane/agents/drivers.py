@@ -32,7 +32,7 @@ from ganlane.settings.driving import (
     IdmParameters,
     MobilParameters,
 )
-from ganlane.sim.dynamics import SIDES, ego_scene, on_road
+from ganlane.sim.dynamics import SIDES, ego_scene, stays_on_road
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV, mobil_wishes
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
@@ -207,9 +207,9 @@ class Driver(TensorDictModuleBase):
 
 def legal_actions(tensordict: TensorDictBase, road: Road) -> Tensor:
     """Which of the three actions stay on the road, bool [N, 3]: keeping the lane always does."""
-    # of the lane that it is moving to, not of the one it is in
-    target = tensordict.get(keys.VEHICLES).get("target_lane")[:, EGO_INDEX, None]
-    return on_road(target + constant(SIDES, target), road.lanes)
+    vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
+    # beside the lane that it is moving to, not the one it is in
+    return stays_on_road(vehicles, constant(SIDES, vehicles.target_lane), road)
 
 
 class RandomDriver(Driver):
@@ -272,7 +272,8 @@ class MobilDriver(Driver):
         """MOBIL's wish as an action, in decisions in which a second of simulated time is full."""
         road = road_in(tensordict, self.road)
         # -1 right, 0 stay, 1 left, of the ego alone
-        wish = mobil_wishes(ego_scene(vehicles, road), road, self.idm, self.mobil)[:, 0]
+        scene = ego_scene(vehicles, road)
+        wish = mobil_wishes(scene, road, self.idm, self.mobil, road.exit_lane)[:, 0]
         # MOBIL decides once a second; the decisions of the ego may come more often.
         step = tensordict.get(keys.STEP)
         decisions = tensordict.get(keys.EGO).get("decisions")

@@ -189,6 +189,16 @@ class HighwayEnv(EnvBase):
 
     def _check_parts(self, vehicles: int | None) -> None:
         """Raise :class:`UserError` for parts that do not fit; ``vehicles`` is as given by users."""
+        if self.road.stretches and not self.traffic.heeds_lane_ends:
+            raise UserError(
+                f"{type(self.traffic).__name__} does not heed the ends of lanes; take another "
+                "traffic (idm_mobil, gan_calibrated, ...), or a road whose lanes go on."
+            )
+        if self.recycle and self.road.stretches:
+            raise UserError(
+                "env.recycle=true on a road with lanes that end: vehicles would return where their "
+                "lane is not; leave it off."
+            )
         if self.recycle and self.traffic.own_roads:
             raise UserError(
                 "env.recycle=true with replayed traffic: recorded vehicles go where they went; "

@@ -30,6 +30,7 @@ from ganlane.sim.dynamics import (
     move_ego,
 )
 from ganlane.sim.idm import following_acceleration
+from ganlane.sim.lane_ends import at_exit, hits_wall
 from ganlane.sim.spawn import recycle
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
 from ganlane.torch_settings import compiled
@@ -78,6 +79,7 @@ class Substep(NamedTuple):
     onsets_behind: Tensor
     hard_crash: Tensor
     goal: Tensor
+    missed_exit: Tensor
 
 
 def begin(
@@ -87,18 +89,12 @@ def begin(
 
     Rows whose command leaves the road have ended.
     """
-    # Recorded roads have as many lanes as their row says.
-    lanes = rules.road.lanes
-    if isinstance(lanes, Tensor):
-        lanes = lanes[:, 0]
-    target = vehicles.target_lane[:, EGO_INDEX]
-    direction = ego["change_direction"]
     # The command sets the lane that the ego steers to; the motion itself takes several decisions.
     command = apply_action(
         action,
-        target,
-        direction,
-        lanes,
+        vehicles,
+        ego["change_direction"],
+        rules.road,
         rules.ego.abort_lane_change,
     )
     others = vehicles.target_lane[:, 1:]
@@ -117,8 +113,18 @@ def begin(
         onsets_behind=none.long(),
         hard_crash=none,
         goal=none,
+        missed_exit=none,
     )
     return start, command
+
+
+def arrived(rules: Rules, ego: Vehicles) -> tuple[Tensor, Tensor]:
+    """Whether the ego has reached its goal, and whether it has missed its exit, each [N]."""
+    # On a road with an exit that is the goal, wherever it is.
+    if rules.road.exit_lane is not None:
+        return at_exit(ego, rules.road)
+    goal = ego.x >= rules.episode.goal_m
+    return goal, torch.zeros_like(goal)
 
 
 def advance(
@@ -129,8 +135,8 @@ def advance(
 ) -> Substep:
     """One physics step in which the others have ``moved``: moves the ego and finds the events.
 
-    A hard crash has precedence over the goal, and both over the time-out. With ``all_running`` no
-    row has ended, which saves the copies that keep ended rows as they are.
+    A hard crash has precedence over goal and missed exit, and all over the time-out. With
+    ``all_running`` no row has ended, which saves the copies that keep ended rows as they are.
     """
     ego, steering = move_ego(
         before.vehicles,
@@ -146,14 +152,14 @@ def advance(
     if not all_running:
         vehicles = vehicles.where(running, before.vehicles)
         steering = torch.where(running, steering, before.steering)
-    acceleration, ahead, behind = ego_surroundings(
-        ego_scene(vehicles, rules.road),
-        rules.idm,
-        rules.ego,
-    )
+    scene = ego_scene(vehicles, rules.road)
+    acceleration, ahead, behind = ego_surroundings(scene, rules.idm, rules.ego)
     # Of the events of one step a crash comes first, then the goal, then the time-out.
     crash = ego_overlaps(vehicles, rules.road).any(-1) & running
-    goal = (vehicles.x[:, EGO_INDEX] >= rules.episode.goal_m) & running & ~crash
+    if rules.road.stretches:
+        crash = crash | (hits_wall(scene.observers, scene.body, rules.road)[:, 0] & running)
+    going_on = running & ~crash
+    goal, missed = (event & going_on for event in arrived(rules, vehicles.at(EGO_INDEX)))
     step = before.step + running
     late = (step >= round(rules.episode.timeout_s / PHYSICS_STEP_S)) | scene_over(rules, step)
     return Substep(
@@ -163,12 +169,13 @@ def advance(
         ahead=torch.where(running, ahead, before.ahead),
         behind=torch.where(running, behind, before.behind),
         step=step,
-        running=running & ~(crash | goal | late),
+        running=running & ~(crash | goal | missed | late),
         # A soft crash counts when it begins, however long it lasts.
         onsets=before.onsets + (ahead & ~before.ahead & running),
         onsets_behind=before.onsets_behind + (behind & ~before.behind & running),
         hard_crash=before.hard_crash | crash,
         goal=before.goal | goal,
+        missed_exit=before.missed_exit | missed,
     )
 
 
@@ -203,7 +210,7 @@ def outcome(
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Events and done flags of a decision, each [N, 1]; every end has exactly one reason."""
     # Outcomes of the driving.
-    terminated = end.goal | end.hard_crash | command.off_road
+    terminated = end.goal | end.hard_crash | end.missed_exit | command.off_road
     # What has ended without an outcome was cut off: by the clock, or where its recording stops.
     truncated = ~end.running & ~terminated
     scene_end = truncated & scene_over(rules, end.step)
@@ -211,6 +218,7 @@ def outcome(
         "goal": end.goal,
         "hard_crash": end.hard_crash,
         "out_of_road": command.off_road,
+        "missed_exit": end.missed_exit,
         "timeout": truncated & ~scene_end,
         "scene_end": scene_end,
         keys.SOFT_CRASH: end.onsets,

@@ -25,7 +25,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.sim.collisions import ego_overlaps
-from ganlane.sim.state import STRAIGHT, Road, Vehicles
+from ganlane.sim.lane_ends import hits_wall
+from ganlane.sim.state import STRAIGHT, Road, Vehicles, body_lanes
 
 #: Decisions between two looks at which rows have ended. A look waits for the device and a reset
 #: costs about a tenth of a decision; a row that has ended waits 3.5 decisions on average, of more
@@ -389,7 +390,7 @@ def _episode_rows(
 
 
 def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
-    """Whether the ego moved into somebody, [N] bool; false where it hit nobody.
+    """Whether the ego moved into somebody or a wall, [N] bool; false where it hit nothing.
 
     Along the road whoever is behind moves into the other, across it whoever is faster towards the
     other: a rule of geometry, no law. A driver that cuts in and is struck from behind is not at
@@ -417,7 +418,11 @@ def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     towards = torch.sign(_gain(vehicles.y))
     pushes = towards * across[:, :1] > -towards * across[:, 1:]
     at_fault = torch.where(since_along < since_across, ahead > 0, pushes)
-    return (at_fault & ego_overlaps(vehicles, road)).any(-1)
+    into_somebody = (at_fault & ego_overlaps(vehicles, road)).any(-1)
+    if not road.stretches:
+        return into_somebody
+    ego = vehicles.columns(slice(0, 1))
+    return into_somebody | hits_wall(ego, body_lanes(ego, road), road)[:, 0]
 
 
 def _gain(values: Tensor) -> Tensor:

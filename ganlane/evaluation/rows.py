@@ -56,9 +56,9 @@ def evaluation_rows(episodes: pl.DataFrame) -> list[Row]:
     ``traffic`` added, for every pair, one below the other.
 
     Returns:
-        Per pair ``agent, traffic, episodes``; the counts ``goal, hard_crash, out_of_road, timeout,
-        scene_end`` (how episodes ended) and ``soft_crash`` (episodes with at least one),
-        ``soft_crash_onsets``, ``soft_crash_behind_onsets`` and the latter's mean
+        Per pair ``agent, traffic, episodes``; the counts ``goal, hard_crash, out_of_road,
+        missed_exit, timeout, scene_end`` (how episodes ended) and ``soft_crash`` (episodes with at
+        least one), ``soft_crash_onsets``, ``soft_crash_behind_onsets`` and the latter's mean
         ``soft_crash_behind_per_episode``; ``mean_reward`` and ``reward_sd``;
         ``mean_speed_mps`` (distance over time of all episodes together); ``lane_changes_per_km``;
         ``distance_km``; ``hard_crash_share`` and ``out_of_road_share`` of the episodes (exact
@@ -103,6 +103,7 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
         "hard_crash": ended["hard_crash"],
         "soft_crash": int(pair["had_soft_crash"].sum()),
         "out_of_road": ended["out_of_road"],
+        "missed_exit": ended["missed_exit"],
         "timeout": ended["timeout"],
         "scene_end": ended["scene_end"],
         "soft_crash_onsets": int(pair["soft_crash"].sum()),

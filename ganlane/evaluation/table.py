@@ -210,6 +210,7 @@ _COLUMNS: Mapping[str, Cell] = {
     "hard": text_of("hard_crash"),
     "soft": text_of("soft_crash"),
     "off road": text_of("out_of_road"),
+    "exit missed": text_of("missed_exit"),
     "time-out": text_of("timeout"),
     "scene end": text_of("scene_end"),
     "mean reward [95 %]": number_of("mean_reward", 1),
@@ -220,7 +221,7 @@ _COLUMNS: Mapping[str, Cell] = {
     "crashes/1000 km [95 %]": number_of("crashes_per_1000_km", 1),
 }
 #: Columns that are left out where no row has anything in them.
-_OPTIONAL = ("run", "time-out", "scene end", "minus MOBIL, paired")
+_OPTIONAL = ("run", "exit missed", "time-out", "scene end", "minus MOBIL, paired")
 #: Columns that a narrow terminal does without, the least telling first; the paired leads have a
 #: table of their own.
 _FIRST_TO_GO = (

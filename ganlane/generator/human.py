@@ -389,6 +389,15 @@ def _sides(
     return torch.stack(sides, 2)
 
 
+def leaves_room(side: Tensor) -> Tensor:
+    """Whether a change to a side [..., SIDE_FEATURES] leaves 2 m ahead and behind and makes nobody
+    brake harder than 2.5 m/s2; bool.
+    """
+    nearest = math.log1p(2.0) - 2.5
+    braking = torch.maximum(side[..., 9], side[..., 10])
+    return (side[..., 0] > nearest) & (side[..., 1] > nearest) & (braking < 2.5)
+
+
 def _needed_braking(closing: Tensor, gap: Tensor) -> Tensor:
     """Deceleration that keeps the rear one off the front one, m/s2, at most 8."""
     return (closing.clamp_min(0.0).square() / (2.0 * (gap - 1.0).clamp_min(0.3))).clamp_max(8.0)

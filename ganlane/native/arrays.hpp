@@ -41,7 +41,7 @@ struct Outputs {  // may be the same memory as the inputs
     int64_t *change_direction, *decisions, *lane_changes;
     uint8_t *soft_crash, *soft_crash_behind, *started_change;
     int64_t* step;
-    uint8_t *goal, *hard_crash, *out_of_road, *timeout;
+    uint8_t *goal, *hard_crash, *out_of_road, *missed_exit, *timeout;
     int64_t *soft_crashes, *soft_crashes_behind;
     uint8_t *done, *terminated, *truncated;
 };

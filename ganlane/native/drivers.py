@@ -26,6 +26,7 @@ from ganlane.native.settings import (
     MemoryArrays,
     Range,
     Settings,
+    ends_of,
     fields,
     settings_of,
 )
@@ -63,6 +64,7 @@ from ganlane.settings.generator import (
     stored_sizes,
 )
 from ganlane.settings.record import part_of
+from ganlane.settings.road import Stretches
 from ganlane.settings.traffic import (
     GanCalibratedTrafficConfig,
     GanTrafficConfig,
@@ -349,8 +351,11 @@ def decision_settings(
     episode: EpisodeParameters | None,
     ego: EgoParameters | None,
     drivers: OneKind,
+    stretches: Stretches = (),
 ) -> Settings:
-    """The numbers of a decision; ``shape`` is lanes, their width in m, and M."""
+    """The numbers of a decision; ``shape`` is lanes, their width in m, and M, ``stretches`` where
+    the lanes begin and end.
+    """
     return settings_of(
         *shape,
         episode,
@@ -359,7 +364,7 @@ def decision_settings(
         drivers.steering,
         drivers.mobil,
         drivers.stream,
-        drivers.structures(),
+        drivers.structures() | ends_of(stretches, drivers.mobil),
     )
 
 

@@ -208,8 +208,13 @@ INLINE void place(const Settings& s, Rows& r, int i, const Moved& moved) {
 // A random side with a lane: both where there are two, by the uniform number (overlays.random_side).
 INLINE Float random_side(const Settings& s, const Rows& r, int i, Float u) {
     Mask left = r.target[i] < (float)(s.lanes - 1), right = r.target[i] > 0.0f;
-    Float one = filled(1.0f), both = choose(u < 0.5f, one, -one);
-    return choose(left & right, both, choose(left, one, choose(right, -one, filled(0.0f))));
+    Float one = filled(1.0f), both = choose(u < 0.5f, one, -one), must = filled(0.0f);
+    if (s.ends) {
+        WaysOut ways = ways_out(s, r, i);
+        left = ways.left, right = ways.right, must = ways.side;
+    }
+    Float side = choose(left & right, both, choose(left, one, choose(right, -one, filled(0.0f))));
+    return choose(must != 0.0f, must, side);
 }
 
 // ---- The paper's drivers
@@ -221,6 +226,7 @@ static inline bool change_lanes_blindly(const Settings& s, Rows& r, const Crowd&
     for (int i = 0; i < r.vehicles; i++) {
         Keys keys = keys_of(r, i);
         Float hazard = between(r.memory[CLOCK][i] / filled(g.mean_steps), 0.0f, 1.0f), zero = filled(0.0f);
+        if (s.ends) hazard = larger(hazard, ways_out(s, r, i).urgency);
         Mask starts = (r.memory[LATERAL_SPEED][i] == 0.0f) & (r.valid[i] != 0.0f) & (uniform_of(keys, CHANGE_HAZARD) < hazard);
         r.wish[i] = zero, r.kept[i] = absolute(r.memory[LATERAL_SPEED][i]);
         if (!any(starts)) continue;
@@ -240,8 +246,11 @@ static inline void find_bounds(const Settings& s, const Generated& g, Rows& r) {
     nobody_met(s, r, NOBODY_M);
     for (int i = 0; i < r.vehicles; i++) {
         Float speed = r.speed[i], free = free_road(speed, r.per_desired[i]), hardest = filled(g.hardest_braking);
-        r.highest[i] = larger(limited(close, free, strongest_ahead(s, r, i, close)), hardest);
-        Float lowest = limited(usual, free, strongest_ahead(s, r, i, usual)) - g.slack * speed * r.per_desired[i];
+        Float ahead_close = strongest_ahead(s, r, i, close), ahead = strongest_ahead(s, r, i, usual);
+        if (s.ends) ahead_close = larger(ahead_close, strongest_wall(s, r, i, close));
+        if (s.ends) ahead = larger(ahead, strongest_wall(s, r, i, usual));
+        r.highest[i] = larger(limited(close, free, ahead_close), hardest);
+        Float lowest = limited(usual, free, ahead) - g.slack * speed * r.per_desired[i];
         r.lowest[i] = larger(lowest, hardest);
         meet_from_front(s, r, i);
     }
@@ -319,7 +328,9 @@ static inline void find_anchor(const Settings& s, Rows& r, Crowd& c) {
     for (int i = 0; i < r.vehicles; i++) {
         Float speed = r.speed[i];
         p.headway = r.memory[HEADWAY][i];
-        r.lowest[i] = limited(p, free_road(speed, r.per_desired[i]), strongest_ahead(own, r, i, p));
+        Float strongest = strongest_ahead(own, r, i, p);
+        if (s.ends) strongest = larger(strongest, strongest_wall(own, r, i, p));
+        r.lowest[i] = limited(p, free_road(speed, r.per_desired[i]), strongest);
         Nearest n = nearest_in(s, r, r.target[i], nobody_at(NOBODY_M, speed));
         Float ahead = gap_ahead(r, i, n.x, n.half_length), gap = larger(ahead, filled(0.0f));
         Float closing = (speed - choose(ahead < FREE_GAP, n.speed, speed)) / 5.0f;
@@ -345,6 +356,12 @@ static inline bool find_calibrated_wishes(const Settings& s, Rows& r, const Crow
         if (any(comes)) {
             Float side = random_side(s, r, i, uniform_of(keys, CHANGE_SIDE));
             wish = choose(wish != 0.0f, wish, choose(comes, side, zero));
+        }
+        if (s.ends) {
+            // The side that one has to go to comes before what one would like.
+            WaysOut ways = ways_out(s, r, i);
+            wish = choose(free & (ways.side != 0.0f), ways.side, wish);
+            wish = choose(((wish > 0.0f) & ways.left) | ((wish < 0.0f) & ways.right), wish, zero);
         }
         r.wish[i] = choose(is_ego(r, i), zero, wish);
         anybody |= r.wish[i] != 0.0f;

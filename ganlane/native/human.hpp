@@ -351,6 +351,19 @@ static inline void look_at(const Settings& s, Rows& r, Humans& m, int i, Mask du
     }
 }
 
+INLINE Mask choose_mask(Mask mask, Mask yes, Mask no) { return (mask & yes) | (~mask & no); }
+
+// Whether a change of vehicle i leaves 2 m ahead and behind and makes nobody brake harder than 2.5 m/s2.
+INLINE Mask leaves_room(const Humans& m, int i, Mask leftwards) {
+    Mask room[2];
+    for (int side = 0; side < 2; side++) {
+        const Near &front = m.ahead[3 * i + 2 * side], &rear = m.behind[3 * i + 2 * side];
+        Float braking = larger(needed_braking(rear.closing, rear.gap), needed_braking(-front.closing, front.gap));
+        room[side] = (front.gap > 2.0f) & (rear.gap > 2.0f) & (braking < 2.5f);
+    }
+    return choose_mask(leftwards, room[1], room[0]);
+}
+
 // Begins or breaks off lane changes of vehicle i; completes its features.
 static inline void choose_lane(const Settings& s, Rows& r, Humans& m, int i, Mask due, int count) {
     Float logits[4] = {};
@@ -361,16 +374,25 @@ static inline void choose_lane(const Settings& s, Rows& r, Humans& m, int i, Mas
         logits[0][lane] = choice[0], logits[1][lane] = choice[1];
         logits[2][lane] = choice[WIDEST], logits[3][lane] = choice[WIDEST + 1];
     }
+    WaysOut ways = {};
+    if (s.ends) ways = ways_out(s, r, i);
     Float lane = m.lane[i], target = between(r.target[i], 0.0f, (float)(s.lanes - 1)), zero = filled(0.0f);
     Mask keeping = target == lane;
-    Float left = choose(lane + 1.0f <= (float)(s.lanes - 1), MOST_LIKELY * sigmoid(logits[0]), zero);
-    Float right = choose(lane - 1.0f >= 0.0f, MOST_LIKELY * sigmoid(logits[2]), zero);
+    Mask to_left = lane + 1.0f <= (float)(s.lanes - 1), to_right = lane - 1.0f >= 0.0f;
+    if (s.ends) to_left = ways.left, to_right = ways.right;
+    Float left = choose(to_left, MOST_LIKELY * sigmoid(logits[0]), zero);
+    Float right = choose(to_right, MOST_LIKELY * sigmoid(logits[2]), zero);
     Float total = larger(left + right, filled(1e-9f)), share = smaller(total, filled(MOST_LIKELY)) / total;
     Float stop = sigmoid(choose(target > lane, logits[1], logits[3]));
     Float first = larger(choose(keeping, left * share, stop), filled(1e-9f));
     Float second = larger(choose(keeping, right * share, zero), filled(1e-9f));
     Float u = uniform_of(keys_of(r, i), CHANGE_SIDE);
     Mask one = u < first, two = u >= 1.0f - second;
+    if (s.ends) {
+        Mask wants = keeping & (ways.side != 0.0f) & (uniform_of(keys_of(r, i), CHANGE_HAZARD) < ways.urgency);
+        Mask leftwards = ways.side > 0.0f, leaves = wants & leaves_room(m, i, leftwards);
+        one = choose_mask(leaves, leftwards, one), two = choose_mask(leaves, ~leftwards, two);
+    }
     Float changed = choose(keeping, target + as_number(one) - as_number(two), choose(one, lane, target));
     Float since = choose(changed != target, zero, r.memory[SINCE][i]);
     r.target[i] = choose(due, changed, r.target[i]);
@@ -393,6 +415,12 @@ static inline void commit(const Settings& s, Rows& r, const Humans& m, int i, Ma
     Float acceleration = r.memory[ACCELERATIONS][i] + value_of(ALONG, change);
     acceleration = between(acceleration, HARDEST_BRAKING, STRONGEST_ACCELERATION);
     acceleration = larger(acceleration, -speed / DECISION_S);
+    if (s.ends) {
+        Idm p = common(s);
+        Float wall = strongest_wall(s, r, i, p);
+        Float stopping = limited(p, free_road(r.speed[i], r.per_desired[i]), wall);
+        acceleration = choose(wall > 0.0f, smaller(acceleration, stopping), acceleration);
+    }
     float left = ((float)s.lanes - 0.5f) * s.lane_width, right = -0.5f * s.lane_width;
     Float half = r.half_width[i] + EDGE_M;
     Float to_left = (left - r.y[i] - half) / EDGE_S, to_right = (r.y[i] - right - half) / EDGE_S;
@@ -425,6 +453,8 @@ static void decide_humans(const Settings& s, Rows& r, Humans& m, Mask due) {
     int count = for_drivers([&](int i, Mask decides, int before) { look_at(s, r, m, i, decides, before); });
     consider_lanes(m, count);
     for_drivers([&](int i, Mask decides, int before) { choose_lane(s, r, m, i, decides, before); });
+    // Who leaves its lane goes on up to the wall.
+    if (s.ends) find_lanes(s, r, false);
     decide_moves(m, count);
     for_drivers([&](int i, Mask decides, int before) { commit(s, r, m, i, decides, before); });
 }

@@ -95,20 +95,38 @@ static inline void look_round(const Settings& s, const Rows& r, const Ego& e, Ma
     }
 }
 
-// What a physics step led to. A hard crash comes before the goal, both before the time-out.
+// Whether the ego has driven into the wall at the end of a lane that its body is in.
+static __attribute__((noinline)) Mask hits_wall(const Settings& s, const Ego& e) {
+    Mask hit = none();
+    for (int lane = 0; lane < s.lanes; lane++) {
+        Mask here = (e.low <= (float)lane) & ((float)lane <= e.high);
+        hit |= here & (s.ends->wall[lane] - (e.x + e.half_length) < 0.0f);
+    }
+    return hit;
+}
+
+// What a physics step led to. A hard crash comes before goal and missed exit, all before the time-out.
 static inline void note_events(const Settings& s, Rows& r) {
     Ego e = find_ego(r);
     Mask ahead, behind, on = r.running;
     look_round(s, r, e, ahead, behind);
-    Mask crash = crashed(e, r) & on, goal = (e.x >= s.goal) & on & ~crash;
+    Mask crash = crashed(e, r) & on;
+    if (s.ends) crash |= hits_wall(s, e) & on;
+    Mask goal = e.x >= s.goal, missed = none();
+    if (s.ends && s.ends->exit_lane >= 0) {
+        // On a road with an exit that is the goal, wherever it is.
+        Mask passed = e.x >= s.ends->end[s.ends->exit_lane];
+        goal = passed & (lane_of(s, e.y) == (float)s.ends->exit_lane), missed = passed & ~goal;
+    }
+    goal &= on & ~crash, missed &= on & ~crash;
     Float one = filled(1.0f), zero = filled(0.0f);
     r.step = r.step + choose(on, one, zero);
     r.onsets = r.onsets + choose(ahead & ~r.ahead & on, one, zero);
     r.onsets_behind = r.onsets_behind + choose(behind & ~r.behind & on, one, zero);
     r.ahead = (ahead & on) | (r.ahead & ~on);
     r.behind = (behind & on) | (r.behind & ~on);
-    r.crash |= crash, r.goal |= goal;
-    r.running = on & ~crash & ~goal & (r.step < (float)s.timeout_steps);
+    r.crash |= crash, r.goal |= goal, r.missed_exit |= missed;
+    r.running = on & ~crash & ~goal & ~missed & (r.step < (float)s.timeout_steps);
 }
 
 // ---- Recycling: who is left far behind is put far ahead, and the reverse, where nobody has to brake hard for it
@@ -229,7 +247,7 @@ static Command obey(const Settings& s, const Inputs& in, long row) {
     int64_t wish = in.action[row] == LEFT ? 1 : in.action[row] == RIGHT ? -1 : 0;
     int64_t direction = in.change_direction[row], target = in.target_lane[row * s.vehicles];
     if (!is_heard(wish, direction, s.abort_lane_change)) wish = 0;
-    bool off_road = !on_road(target + wish, s.lanes);
+    bool off_road = !may_change(s, target, wish, in.x[row * s.vehicles]);
     if (off_road) wish = 0;
     return {wish ? wish : direction, target + wish, wish != 0, off_road, in.speed[row * s.vehicles], in.step[row]};
 }
@@ -277,7 +295,7 @@ static void load(const Settings& s, const Inputs& in, Rows& r, const Block& bloc
         r.episode_key[lane] = episode_key(s.stream, in.seed[row], in.episode[row]);
     }
     for (int i = 0; i < s.vehicles; i++) r.slip[i] = slip_of(r.steering[i]), r.slip_sine[i] = sine_of(r.slip[i]);
-    r.crash = r.goal = none();
+    r.crash = r.goal = r.missed_exit = none();
     r.onsets = r.onsets_behind = filled(0.0f);
 }
 
@@ -289,7 +307,8 @@ static void store_ego(const Settings& s, const Inputs& in, const Rows& r, const 
     int64_t direction = off < ARRIVED ? 0 : command.direction, step = (int64_t)r.step[lane];
     float progress = 1.0f - off / s.lane_width;
     int64_t steps = step - command.step;
-    bool goal = r.goal[lane], crash = r.crash[lane], ended = goal || crash || command.off_road;
+    bool goal = r.goal[lane], crash = r.crash[lane], missed = r.missed_exit[lane];
+    bool ended = goal || crash || missed || command.off_road;
     bool truncated = !r.running[lane] && !ended;
     out.mean_acceleration[row] = (out.speed[ego] - command.speed) / ((float)(steps < 1 ? 1 : steps) * PHYSICS_STEP);
     out.change_progress[row] = direction == 0 || progress < 0.0f ? 0.0f : progress > 1.0f ? 1.0f : progress;
@@ -302,6 +321,7 @@ static void store_ego(const Settings& s, const Inputs& in, const Rows& r, const 
     out.started_change[row] = command.starts;
     out.step[row] = step;
     out.goal[row] = goal, out.hard_crash[row] = crash, out.out_of_road[row] = command.off_road;
+    out.missed_exit[row] = missed;
     out.timeout[row] = out.truncated[row] = truncated;
     out.soft_crashes[row] = (int64_t)r.onsets[lane], out.soft_crashes_behind[row] = (int64_t)r.onsets_behind[lane];
     out.terminated[row] = ended, out.done[row] = ended || truncated;

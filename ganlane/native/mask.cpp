@@ -55,6 +55,12 @@ static inline void allow(const Settings& s, const MaskInputs& in, const MaskOutp
     Mask safe[3];
     for (int side = 0; side < 3; side++) {
         Float own = idm(s, speed, per_own_desired, gap[side], leader[side]);
+        if (s.ends) {
+            // The wall at the end of the lane: a standing obstacle, for a driver that keeps the lane.
+            Float wall = of_lane(s, s.ends->wall, target + SIDES[side], NOBODY_M);
+            Float braking = idm(s, speed, per_own_desired, wall - (x + half_length) - TURN_OUT, filled(0.0f));
+            own = choose(wall < NOBODY_M, smaller(own, braking), own);
+        }
         Float behind = idm(s, follower[side], per_desired[side], gap_behind[side], speed);
         behind = choose(gap_behind[side] < FREE_GAP, behind, filled(0.0f));
         safe[side] = smaller(own, behind) >= -s.safe_deceleration;
@@ -62,8 +68,8 @@ static inline void allow(const Settings& s, const MaskInputs& in, const MaskOutp
     for (int lane = 0; lane < rows; lane++) {
         long row = first + lane;
         int64_t direction = in.direction[row], at = in.target_lane[row * s.vehicles];
-        bool left = on_road(at + 1, s.lanes) && is_heard(1, direction, s.abort_lane_change);
-        bool right = on_road(at - 1, s.lanes) && is_heard(-1, direction, s.abort_lane_change);
+        bool left = may_change(s, at, 1, x[lane]) && is_heard(1, direction, s.abort_lane_change);
+        bool right = may_change(s, at, -1, x[lane]) && is_heard(-1, direction, s.abort_lane_change);
         uint8_t* mask = out.mask + 3 * row;
         mask[0] = 1, mask[1] = left && safe[1][lane], mask[2] = right && safe[2][lane];
         out.none[row] = !(safe[0][lane] || mask[1] || mask[2]);

@@ -4,6 +4,15 @@
 
 #include "vectors.hpp"
 
+// Where lanes begin and end (ganlane.sim.lane_ends), of each lane; NOBODY_M: far away. A wall is an end that nobody may
+// touch. `leave_by` and `reach`: where a driver has to have left it, and how long before that it becomes urgent.
+const int MOST_LANES = 20;
+struct Ends {
+    float begin[MOST_LANES], end[MOST_LANES], wall[MOST_LANES], leave_by[MOST_LANES], reach[MOST_LANES];
+    float mandatory_bias;
+    int32_t exit_lane;  // that the ego has to leave the road by; -1: none
+};
+
 struct Settings {
     // IDM, Table V
     float min_gap, headway, per_brake_scale, min_acceleration, max_acceleration;
@@ -21,6 +30,7 @@ struct Settings {
     const struct Human* human;          // human.hpp; null: they are not of `traffic=human`
     const struct Faults* faults;        // faults.hpp; null: drivers make none
     const struct Random* random;        // random_drivers.hpp; null: all drivers are alike
+    const Ends* ends;                   // null: all lanes go on for ever
 };
 
 // ---- Constants of the model (ganlane.sim)
@@ -29,6 +39,7 @@ const float PHYSICS_STEP = 0.1f, WHEELBASE = 2.7f;
 const float NOBODY_M = 1e9f;  // stands for the position of nobody
 const float FREE_GAP = 10000.0f, SMALLEST_GAP = 0.1f;
 const float ENTRY = 0.1f, ARRIVED = 0.3f;
+const float TURN_OUT = 15.0f;  // a driver that keeps its lane stops so far before the wall
 const float REST = 1e-12f;  // at most this is 0: see at_rest
 enum { CENTRE, BODY, SIGNALLED };
 
@@ -78,6 +89,26 @@ INLINE Float at_rest(Float number) { return choose(absolute(number) <= REST, fil
 
 INLINE Float lane_of(const Settings& s, Float y) {
     return between(rounded(y * s.per_lane_width), 0.0f, (float)(s.lanes - 1));
+}
+
+// Whether the road has a lane at `x`, and whether one may change from it to the one at its `side` there.
+static inline bool exists(const Settings& s, int64_t lane, float x) {
+    return lane >= 0 && lane < s.lanes && (!s.ends || (s.ends->begin[lane] <= x && x < s.ends->end[lane]));
+}
+
+static inline bool may_change(const Settings& s, int64_t lane, int64_t side, float x) {
+    return side == 0 || (exists(s, lane, x) && exists(s, lane + side, x));
+}
+
+// The number of the lane that each row has its own number of; `otherwise` where the road has no such lane.
+INLINE Float of_lane(const Settings& s, const float* numbers, Float lane, float otherwise) {
+    Float number = filled(otherwise);
+    for (int k = 0; k < s.lanes; k++) number = choose(lane == (float)k, filled(numbers[k]), number);
+    return number;
+}
+
+INLINE Mask exists(const Settings& s, Float lane, Float x) {
+    return (of_lane(s, s.ends->begin, lane, NOBODY_M) <= x) & (x < of_lane(s, s.ends->end, lane, -NOBODY_M));
 }
 
 // The lanes that a body at `y` is in, that its driver attends to, and in which the others see it: the lowest and the

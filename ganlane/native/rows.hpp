@@ -39,7 +39,7 @@ struct Rows {
     Float *gap_ahead, *speed_ahead, *gap_behind, *speed_behind, *per_desired_behind;
     Nearest* nearest;  // [lanes]
     // Of the rows: whether they go on, physics steps since MOBIL's last decision and in all, and the ego's events.
-    Mask running, ahead, behind, crash, goal;
+    Mask running, ahead, behind, crash, goal, missed_exit;
     Float phase, step, onsets, onsets_behind;
     // Keys of the random numbers: of the episode, and of this step; physics steps at the start of the decision.
     uint64_t episode_key[LANES], step_key[LANES];
@@ -209,21 +209,90 @@ INLINE Float strongest_ahead(const Settings& s, const Rows& r, int i, const Idm&
     return strongest;
 }
 
+// ---- Ends of lanes (ganlane.sim.lane_ends): out of line, since most roads have none
+
+// The interaction of IDM with a wall `room` m ahead: a standing obstacle.
+INLINE Float before_wall(const Settings& s, const Rows& r, int i, Float wall, Mask keeps, const Idm& p) {
+    Float room = wall - (r.x[i] + r.half_length[i]);
+    return interaction(p, s.min_gap, r.speed[i], choose(keeps, room - TURN_OUT, room), filled(0.0f));
+}
+
+// The strongest interaction with the walls of the lanes that vehicle i attends to.
+static __attribute__((noinline)) Float strongest_wall(const Settings& s, const Rows& r, int i, const Idm& p) {
+    Float strongest = filled(0.0f), low = r.low[i], high = r.high[i], middle = smaller(low + 1.0f, high);
+    for (int lane = 0; lane < s.lanes; lane++) {
+        if (s.ends->wall[lane] >= NOBODY_M) continue;
+        float number = (float)lane;
+        Mask here = (low == number) | (middle == number) | (high == number);
+        Float wall = before_wall(s, r, i, filled(s.ends->wall[lane]), r.target[i] == number, p);
+        strongest = choose(here, larger(strongest, wall), strongest);
+    }
+    return strongest;
+}
+
+// What vehicle i would accelerate with in a lane that it keeps: no more than `acceleration`.
+static __attribute__((noinline)) Float stopping(const Settings& s, const Rows& r, int i, Float lane, const Idm& p,
+                                                Float acceleration) {
+    Float wall = of_lane(s, s.ends->wall, lane, NOBODY_M);
+    Float braking = limited(p, free_road(r.speed[i], r.per_desired[i]), before_wall(s, r, i, wall, ~none(), p));
+    return choose(wall < NOBODY_M, smaller(acceleration, braking), acceleration);
+}
+
+// What the ends of lanes add to the incentive of a change to a `side` (MOBIL's bias); whether it is possible.
+struct Mandatory {
+    Float gain;
+    Mask possible;
+};
+
+INLINE Float urgency(const Settings& s, const Rows& r, int i, Float lane) {
+    Float distance = of_lane(s, s.ends->leave_by, lane, NOBODY_M) - r.x[i];
+    return between(1.0f - distance / of_lane(s, s.ends->reach, lane, 1.0f), 0.0f, 1.0f);
+}
+
+static __attribute__((noinline)) Mandatory mandatory(const Settings& s, const Rows& r, int i, float side) {
+    Float lane = r.target[i];
+    Float here = urgency(s, r, i, lane), there = urgency(s, r, i, lane + side);
+    return {choose(here > there, s.ends->mandatory_bias * here, filled(0.0f)),
+            exists(s, lane, r.x[i]) & exists(s, lane + side, r.x[i]) & (here >= there)};
+}
+
+// Of a driver who changes lanes as it likes: whether it may go left or right, the side to which it has to leave its lane
+// (0: none), and how urgently.
+struct WaysOut {
+    Mask left, right;
+    Float side, urgency;
+};
+
+static __attribute__((noinline)) WaysOut ways_out(const Settings& s, const Rows& r, int i) {
+    Float lane = r.target[i], x = r.x[i], one = filled(1.0f), zero = filled(0.0f);
+    Float here = urgency(s, r, i, lane), left = urgency(s, r, i, lane + 1.0f), right = urgency(s, r, i, lane - 1.0f);
+    WaysOut ways;
+    ways.left = exists(s, lane, x) & exists(s, lane + 1.0f, x) & (here >= left);
+    ways.right = exists(s, lane, x) & exists(s, lane - 1.0f, x) & (here >= right);
+    Mask out_left = ways.left & (here > left), out_right = ways.right & (here > right);
+    ways.side = choose(out_left & (~out_right | (left <= right)), one, choose(out_right, -one, zero));
+    ways.urgency = choose(ways.side != 0.0f, here, zero);
+    return ways;
+}
+
 template <class Drivers>
 static inline void follow(const Settings& s, Rows& r, const Drivers& drivers) {
     nobody_met(s, r, NOBODY_M);
     for (int i = 0; i < r.vehicles; i++) {
         Idm p = drivers.following(r, i);
-        r.following[i] = limited(p, free_road(r.speed[i], r.per_desired[i]), strongest_ahead(s, r, i, p));
+        Float strongest = strongest_ahead(s, r, i, p);
+        if (s.ends) strongest = larger(strongest, strongest_wall(s, r, i, p));
+        r.following[i] = limited(p, free_road(r.speed[i], r.per_desired[i]), strongest);
         meet_from_front(s, r, i);
     }
 }
 
 // ---- MOBIL
 
+const float SIDES[3] = {0.0f, 1.0f, -1.0f};
+
 // Leader and follower of everybody in the own lane, to the left and to the right.
 static inline void find_neighbours(const Settings& s, Rows& r) {
-    const float SIDES[3] = {0.0f, 1.0f, -1.0f};
     nobody_met(s, r, NOBODY_M);
     for (int i = 0; i < r.vehicles; i++) {
         for (int side = 0; side < 3; side++) {
@@ -260,8 +329,10 @@ INLINE Prospect prospect(const Settings& s, const Rows& r, int i, int side, cons
     Mask leads = ahead < FREE_GAP, follows = behind < FREE_GAP;
     Float gap = choose(leads, behind + 2.0f * r.half_length[i] + ahead, filled(FREE_GAP));
     Float without = limited(p, free, interaction(p, s.min_gap, follower, gap, choose(leads, r.speed_ahead[at], follower)));
+    Float own = idm(p, s.min_gap, r.speed[i], r.per_desired[i], ahead, r.speed_ahead[at]);
+    if (s.ends) own = stopping(s, r, i, r.target[i] + SIDES[side], p, own);
     return {
-        idm(p, s.min_gap, r.speed[i], r.per_desired[i], ahead, r.speed_ahead[at]),
+        own,
         choose(follows, with_it, filled(0.0f)),
         choose(follows, without, filled(0.0f)),
     };
@@ -271,9 +342,11 @@ INLINE Prospect prospect(const Settings& s, const Rows& r, int i, int side, cons
 const float NEVER = -1e30f;
 
 // The incentive of a change, m/s2; NEVER where it does not pay, is unsafe or leaves the road.
-INLINE Float incentive(const Settings& s, const Prospect& here, const Prospect& there, Mask exists, Float politeness) {
+INLINE Float incentive(const Settings& s, const Prospect& here, const Prospect& there, Mask exists, Float politeness,
+                       Float bias) {
     Float gain = there.own - here.own + politeness * s.politeness_side * (there.with_it - there.without) +
                  politeness * s.politeness_rear * (here.without - here.with_it);
+    if (s.ends) gain = gain + bias;
     Mask safe = smaller(there.with_it, there.own) >= -s.safe_deceleration;
     return choose(exists & safe & (gain > s.threshold), gain, filled(NEVER));
 }
@@ -291,8 +364,11 @@ static inline bool find_wishes(const Settings& s, Rows& r, Mask due, const Drive
         Idm p = drivers.predicting(r, i);
         Float politeness = drivers.politeness(r, i);
         Prospect here = prospect(s, r, i, 0, p);
-        Float left = incentive(s, here, prospect(s, r, i, 1, p), r.target[i] + 1.0f <= (float)(s.lanes - 1), politeness);
-        Float right = incentive(s, here, prospect(s, r, i, 2, p), r.target[i] - 1.0f >= 0.0f, politeness);
+        Mandatory to_left = {filled(0.0f), r.target[i] + 1.0f <= (float)(s.lanes - 1)};
+        Mandatory to_right = {filled(0.0f), r.target[i] - 1.0f >= 0.0f};
+        if (s.ends) to_left = mandatory(s, r, i, 1.0f), to_right = mandatory(s, r, i, -1.0f);
+        Float left = incentive(s, here, prospect(s, r, i, 1, p), to_left.possible, politeness, to_left.gain);
+        Float right = incentive(s, here, prospect(s, r, i, 2, p), to_right.possible, politeness, to_right.gain);
         Float side = choose(left >= right, filled(1.0f), filled(-1.0f));
         Mask pays = free & (larger(left, right) > NEVER);
         r.wish[i] = choose(pays, side, filled(0.0f));

@@ -14,6 +14,7 @@ from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
 from ganlane import keys
+from ganlane.errors import UserError
 from ganlane.settings.driving import (
     EgoParameters,
     IdmParameters,
@@ -22,6 +23,7 @@ from ganlane.settings.driving import (
 )
 from ganlane.settings.episode import EpisodeParameters, SpawnParameters
 from ganlane.settings.observation import NEARNESS_M, OVERLAP_M, ObservationScale, RewardParameters
+from ganlane.settings.road import FAR_M, WALL, Stretches, exit_lane, leaving
 
 #: A key of the state as the environment's TensorDict has it: ``"step"``, ``("vehicles", "x")``.
 Key = str | tuple[str, ...]
@@ -50,6 +52,7 @@ EVENT_ARRAYS: Final[dict[Key, str]] = {
             "goal",
             "hard_crash",
             "out_of_road",
+            "missed_exit",
             "timeout",
         ),
         "bool",
@@ -165,11 +168,25 @@ class Settings(ctypes.Structure):
         ),
         *fields(c_int32, "lanes vehicles substeps timeout_steps mobil abort_lane_change"),
         *fields(c_int64, "stream"),
-        *fields(c_void_p, "generated human faults random"),
+        *fields(c_void_p, "generated human faults random ends"),
     ]
 
     #: The structures that the last members point to, which have to live as long.
     pointed: list[Any]
+
+
+#: Lanes of a road whose lanes end; as in model.hpp.
+_MOST_LANES: Final = 20
+
+
+class Ends(ctypes.Structure):
+    """``Ends`` of model.hpp."""
+
+    _fields_ = [
+        *fields(c_float * _MOST_LANES, "begin end wall leave_by reach"),  # type: ignore[arg-type]
+        *fields(c_float, "mandatory_bias"),
+        *fields(c_int32, "exit_lane"),
+    ]
 
 
 class View(ctypes.Structure):
@@ -272,11 +289,43 @@ def settings_of(
         "stream": stream,
     }
     # ctypes has the addresses alone, so the structures are held beside them.
-    for name in ("generated", "human", "faults", "random"):
+    for name in ("generated", "human", "faults", "random", "ends"):
         numbers[name] = ctypes.addressof(pointed[name]) if name in pointed else None
     settings = _filled(Settings, numbers)
     settings.pointed = list(pointed.values())
     return settings
+
+
+def ends_of(
+    stretches: Stretches, mobil: MobilParameters | None = None
+) -> dict[str, ctypes.Structure]:
+    """Where lanes begin and end, for ``pointed`` of :func:`settings_of`; empty if all go on.
+
+    Raises:
+        UserError: more lanes than the kernel has room for.
+    """
+    if not stretches:
+        return {}
+    if len(stretches) > _MOST_LANES:
+        raise UserError(
+            f"lanes={len(stretches)}: the native kernel has at most {_MOST_LANES} lanes on roads "
+            "with lanes that end; set env.kernel=torch."
+        )
+    mobil = mobil or MobilParameters()
+    leave_by, changes = leaving(stretches)
+    numbers = {
+        "begin": [stretch.begin_m for stretch in stretches],
+        "end": [stretch.end_m for stretch in stretches],
+        "wall": [its.end_m if its.end == WALL else FAR_M for its in stretches],
+        "leave_by": leave_by,
+        "reach": [mobil.mandatory_m * number for number in changes],
+    }
+    goal = exit_lane(stretches)
+    ends = Ends(mandatory_bias=mobil.mandatory_bias, exit_lane=-1 if goal is None else goal)
+    for name, row in numbers.items():
+        for lane, number in enumerate(row):
+            getattr(ends, name)[lane] = number
+    return {"ends": ends}
 
 
 def mask_of(
@@ -286,6 +335,7 @@ def mask_of(
     idm: IdmParameters,
     safe_deceleration: float,
     abort: bool,
+    stretches: Stretches = (),
 ) -> Settings:
     """The numbers of the mask ``safe``; ``safe_deceleration`` in m/s2."""
     # The mask reads few of the decision's numbers; the others are defaults.
@@ -298,6 +348,7 @@ def mask_of(
         ego=ego,
         idm=idm,
         mobil=mobil,
+        pointed=ends_of(stretches),
     )
 
 

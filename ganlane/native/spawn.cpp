@@ -91,7 +91,8 @@ static void begin(const Spawn& s, const Scene& scene, const Outputs& state, cons
     state.ego_steering[row] = state.mean_acceleration[row] = state.change_progress[row] = state.distance[row] = 0.0f;
     state.change_direction[row] = state.decisions[row] = state.lane_changes[row] = state.step[row] = 0;
     state.soft_crash[row] = state.soft_crash_behind[row] = state.started_change[row] = 0;
-    state.goal[row] = state.hard_crash[row] = state.out_of_road[row] = state.timeout[row] = 0;
+    state.goal[row] = state.hard_crash[row] = state.out_of_road[row] = 0;
+    state.missed_exit[row] = state.timeout[row] = 0;
     state.soft_crashes[row] = state.soft_crashes_behind[row] = 0;
     state.done[row] = state.terminated[row] = state.truncated[row] = 0;
 }

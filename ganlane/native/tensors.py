@@ -190,7 +190,7 @@ class Kernel(_Parts):
         shape = _shape(road, vehicles)
         self._functions = []
         for part in self.parts:
-            numbers = decision_settings(shape, episode, ego, part.drivers)
+            numbers = decision_settings(shape, episode, ego, part.drivers, road.stretches)
             per_thread = rows_per_thread(part.drivers)
             self._functions.append(_Function("ganlane_decide", numbers, variant, per_thread))
 
@@ -375,6 +375,7 @@ class SafeActions(_Function):
             idm,
             safe_deceleration,
             abort,
+            road.stretches,
         )
         super().__init__("ganlane_mask", numbers)
 

@@ -85,6 +85,12 @@ class MobilParameters(Record):
         safe_deceleration: a change may not make any vehicle brake harder, m/s2, above 0.
         exclusive_m: of several vehicles that want to enter one lane within this distance, only the
             foremost does, m.
+        mandatory_bias: what the end of a lane that a driver has to leave adds to the incentive, at
+            the end itself, m/s2; twice the safe deceleration outweighs what two drivers may lose by
+            a safe change. The paper's road has no such lane.
+        mandatory_m: distance from the end at which that begins, m per lane change that the driver
+            has to make; 295 in Schakel, Knoop and van Arem (2012). Exits are announced 500 and
+            1000 m ahead on German motorways.
     """
 
     # Table IV
@@ -93,6 +99,9 @@ class MobilParameters(Record):
     politeness_side: NotNegative = 1.0
     safe_deceleration: Positive = 4.0
     exclusive_m: NotNegative = 60.0
+    # where lanes end
+    mandatory_bias: NotNegative = 8.0
+    mandatory_m: Positive = 500.0
 
 
 @dataclass(frozen=True)

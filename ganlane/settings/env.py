@@ -1,8 +1,8 @@
 """``env=...``: road, vehicles, initial scenes, and the end of an episode; m, s, m/s.
 
 ``env=highway`` and ``env=dense`` start with random scenes (Table II). ``env=cut_in, stalled_car,
-blocked_lane, stop_and_go`` start with a scene made by :mod:`ganlane.sim.scenarios`, ``env=scene``
-with one from a file.
+blocked_lane, stop_and_go, merge, lane_drop, exit`` start with a scene made by
+:mod:`ganlane.sim.scenarios`, ``env=scene`` with one from a file.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from ganlane.settings.record import (
     one_of,
     part_of,
 )
+from ganlane.settings.road import EXIT, WALL, LaneStretch, Stretches
 
 if TYPE_CHECKING:
     from ganlane.sim.scenes import FixedScene, SceneVehicle
@@ -84,6 +85,10 @@ class SceneConfig(Record):
             numbers,
             self.label(),
         )
+
+    def stretches(self, lanes: int) -> Stretches:
+        """Where each of the ``lanes`` begins and ends; empty: all go on for ever."""
+        return ()
 
     def label(self) -> str:
         """The scene, for messages."""
@@ -156,6 +161,119 @@ class StopAndGoScene(SceneConfig):
     waves: Annotated[int, between(1, 50)] = 2
     per_wave: Annotated[int, between(2, 50)] = 5
     speed_mps: Positive = 10.0
+
+
+@dataclass(frozen=True)
+class MergeScene(SceneConfig):
+    """The ego comes from an on-ramp, the rightmost lane, which ends; traffic in the other lanes.
+
+    Attributes:
+        ramp_m: from the ego to where the ramp becomes an acceleration lane, m.
+        merge_m: length of the acceleration lane, which ends at a wall, m; 250 m in the German
+            guidelines for motorways (RAA 2008).
+        ego_speed_mps: of the ego, m/s.
+        speed_mps: of the others, m/s.
+        spacing_m: centre to centre, of those in one lane, m.
+    """
+
+    kind: str = "merge"
+    jitter_m: NotNegative = 14.0
+    jitter_mps: NotNegative = 2.0
+    ramp_m: Positive = 100.0
+    merge_m: Positive = 250.0
+    ego_speed_mps: Positive = 18.0
+    speed_mps: Positive = 20.0
+    spacing_m: Positive = 50.0
+
+    def stretches(self, lanes: int) -> Stretches:
+        """The rightmost lane ends, the others go on."""
+        ramp = LaneStretch(self.ramp_m, self.ramp_m + self.merge_m, WALL)
+        return (ramp, *[LaneStretch()] * (lanes - 1))
+
+    def vehicles(self, env: EnvConfig) -> tuple[SceneVehicle, ...]:
+        """The vehicles, the ego first."""
+        from ganlane.sim.scenarios import merge
+
+        return merge(
+            self.ego_speed_mps,
+            self.speed_mps,
+            self.spacing_m,
+            env.lanes,
+            env.ego_desired_speed_mps,
+        )
+
+
+@dataclass(frozen=True)
+class LaneDropScene(SceneConfig):
+    """The ego's lane, the leftmost, ends for all; traffic in every lane.
+
+    Attributes:
+        drop_m: from the ego's centre to the wall at the end of its lane, m.
+        speed_mps: of the ego and the others, m/s.
+        spacing_m: centre to centre, of those in one lane, m.
+    """
+
+    kind: str = "lane_drop"
+    jitter_m: NotNegative = 14.0
+    jitter_mps: NotNegative = 2.0
+    drop_m: Positive = 500.0
+    speed_mps: Positive = 20.0
+    spacing_m: Positive = 60.0
+
+    def stretches(self, lanes: int) -> Stretches:
+        """The leftmost lane ends, the others go on."""
+        return (*[LaneStretch()] * (lanes - 1), LaneStretch(end_m=self.drop_m, end=WALL))
+
+    def vehicles(self, env: EnvConfig) -> tuple[SceneVehicle, ...]:
+        """The vehicles, the ego first."""
+        from ganlane.sim.scenarios import lane_drop
+
+        return lane_drop(
+            self.speed_mps,
+            self.spacing_m,
+            env.lanes,
+            env.ego_desired_speed_mps,
+        )
+
+
+@dataclass(frozen=True)
+class ExitScene(SceneConfig):
+    """The ego, in the leftmost lane, has to leave by the exit lane on the right.
+
+    Attributes:
+        distance_m: from the ego's centre to where the exit lane begins, m.
+        exit_m: length of the exit lane, at whose end the ego has left the road or missed the exit,
+            m; 250 m in the German guidelines for motorways (RAA 2008).
+        speed_mps: of the vehicles in the lane beside the exit lane, m/s.
+        faster_mps: how much faster each further lane to the left is, m/s.
+        spacing_m: centre to centre, of those in one lane, m.
+    """
+
+    kind: str = "exit"
+    jitter_m: NotNegative = 25.0
+    jitter_mps: NotNegative = 2.0
+    distance_m: Positive = 1000.0
+    exit_m: Positive = 250.0
+    speed_mps: Positive = 18.0
+    faster_mps: NotNegative = 3.0
+    spacing_m: Positive = 80.0
+
+    def stretches(self, lanes: int) -> Stretches:
+        """The rightmost lane is there for a while, the others go on."""
+        leaving = LaneStretch(self.distance_m, self.distance_m + self.exit_m, EXIT)
+        return (leaving, *[LaneStretch()] * (lanes - 1))
+
+    def vehicles(self, env: EnvConfig) -> tuple[SceneVehicle, ...]:
+        """The vehicles, the ego first."""
+        from ganlane.sim.scenarios import off_ramp
+
+        return off_ramp(
+            self.speed_mps,
+            self.faster_mps,
+            self.spacing_m,
+            env.lanes,
+            env.ego_desired_speed_mps,
+        )
 
 
 @dataclass(frozen=True)
@@ -324,13 +442,17 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
             others_visibility = Visibility.SIGNALLED
         return FixedScene(
             self.scene.vehicles(self),
-            Road(self.lanes, self.lane_width_m),
+            Road(self.lanes, self.lane_width_m, stretches=self.stretches()),
             jitter_m=self.scene.jitter_m,
             jitter_mps=self.scene.jitter_mps,
             ego_visibility=Visibility.named(self.ego.visibility),
             others_visibility=others_visibility,
             name=self.scene.label(),
         )
+
+    def stretches(self) -> Stretches:
+        """Where each lane begins and ends; empty: all go on for ever."""
+        return () if self.scene is None else self.scene.stretches(self.lanes)
 
     def spawn_parameters(self) -> SpawnParameters:
         """The parameters of Table II."""

@@ -28,6 +28,8 @@ NEARNESS_M = 15.0
 #: Overlap along the road that adds 1 to the nearness, m: drivers at the side brake so hard that one
 #: metre decides.
 OVERLAP_M = 1.0
+#: How far the ego knows the lanes ahead, m.
+ROAD_SIGHT_M = 1000.0
 #: The masks, in the order of the kernel's numbers; see
 #: :class:`ganlane.transforms.ActionMaskTransform`.
 MASKS = ("none", "legal", "safe")
@@ -116,10 +118,11 @@ def largest_number(form: str, longest_m: float = 4.5) -> float:
     """Upper bound of all numbers of observation ``form`` but the first (speed over desired speed,
     unbounded).
 
-    ``longest_m`` is the length of the longest vehicle, m: ``lane_view_overlap`` counts metres of
-    overlap.
+    ``longest_m`` is the length of the longest vehicle, m: ``lane_view_overlap`` and ``road_view``
+    count metres of overlap.
     """
-    return 1.0 + longest_m / OVERLAP_M if form == "lane_view_overlap" else 1.0
+    counts_overlap = form in ("lane_view_overlap", "road_view")
+    return 1.0 + longest_m / OVERLAP_M if counts_overlap else 1.0
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ from torch import Tensor
 from ganlane.keys import EGO_INDEX
 from ganlane.settings.driving import EgoParameters, IdmParameters, SteeringParameters
 from ganlane.sim.collisions import dangerously_close
-from ganlane.sim.idm import acceleration_behind
+from ganlane.sim.idm import acceleration_in
+from ganlane.sim.lane_ends import may_change
 from ganlane.sim.neighbours import Neighbour, Scene, follower, leader, perceive
 from ganlane.sim.state import Road, Vehicles, spanned
 from ganlane.torch_settings import constant
@@ -164,13 +165,21 @@ def is_heard(
     return idle | (side == -direction) if abort else idle
 
 
-def on_road(lane: Tensor, lanes: int | Tensor) -> Tensor:
-    """Whether the road of ``lanes`` has the ``lane``."""
-    return (lane >= 0) & (lane < lanes)
+def stays_on_road(
+    vehicles: Vehicles,
+    side: Tensor,
+    road: Road,
+) -> Tensor:
+    """Whether a change to each ``side`` [N, S] (-1, 0 or 1) leaves the ego on the road, [N, S].
+
+    The lane is the one beside its target lane, where the ego is.
+    """
+    ego = slice(EGO_INDEX, EGO_INDEX + 1)
+    return may_change(road, vehicles.target_lane[:, ego], side, vehicles.x[:, ego])
 
 
 def apply_action(
-    action: Tensor, target_lane: Tensor, direction: Tensor, lanes: int | Tensor, abort: bool
+    action: Tensor, vehicles: Vehicles, direction: Tensor, road: Road, abort: bool
 ) -> Command:
     """Apply ``action`` (0 keep, 1 left, 2 right) to an ego whose current lane change has
     ``direction``; [N] int64.
@@ -182,11 +191,11 @@ def apply_action(
     # First what the ego ignores, then what the road does not have.
     side = torch.where(is_heard(side, direction, abort), side, 0)
     # The episode ends with this command; the target lane stays a lane of the road.
-    off_road = ~on_road(target_lane + side, lanes)
+    off_road = ~stays_on_road(vehicles, side[:, None], road)[:, 0]
     side = torch.where(off_road, 0, side)
     starts = side != 0
     return Command(
-        target_lane + side,
+        vehicles.target_lane[:, EGO_INDEX] + side,
         torch.where(starts, side, direction),
         starts,
         off_road,
@@ -257,7 +266,7 @@ def ego_surroundings(
     closing = torch.where(behind.exists, behind.speed - speed, 0.0)
     limits = (ego.soft_crash_ttc_s, ego.soft_crash_gap_m)
     return (
-        acceleration_behind(scene, followed, idm).amin(-1)[:, 0],
+        acceleration_in(scene, attention, followed, idm)[:, 0],
         dangerously_close(near.gap, speed - near.speed, *limits).any(-1)[:, 0],
         dangerously_close(behind.gap, closing, *limits).any(-1)[:, 0],
     )

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.driving import IdmParameters
+from ganlane.sim.lane_ends import stopping_room
 from ganlane.sim.neighbours import Neighbour, Scene, leader
 from ganlane.sim.state import spanned
 
@@ -132,10 +133,53 @@ def following_acceleration(
     """IDM acceleration of every observer, m/s2, [N, K].
 
     During a lane change a vehicle is in two lanes, or three; the smallest acceleration over the
-    lanes is used.
+    lanes is used. The wall at the end of a lane is a standing obstacle.
     """
-    ahead = leader(scene, spanned(scene.attention))
-    return acceleration_behind(scene, ahead, parameters, headway_s).amin(-1)
+    lanes = spanned(scene.attention)
+    ahead = leader(scene, lanes)
+    return acceleration_in(
+        scene,
+        lanes,
+        ahead,
+        parameters,
+        headway_s,
+    )
+
+
+def acceleration_in(
+    scene: Scene,
+    lanes: Tensor,
+    ahead: Neighbour,
+    parameters: AnyIdm = TABLE_V,
+    headway_s: Tensor | float | None = None,
+) -> Tensor:
+    """IDM acceleration of every observer, m/s2, [N, K], in all of its ``lanes`` [N, K, L]: behind
+    ``ahead`` and before the lanes' walls.
+    """
+    acceleration = acceleration_behind(scene, ahead, parameters, headway_s)
+    if scene.road.stretches:
+        keeps = lanes == scene.observers.target_lane[..., None]
+        before = acceleration_before_wall(scene, lanes, keeps, parameters, headway_s)
+        acceleration = torch.minimum(acceleration, before)
+    return acceleration.amin(-1)
+
+
+def acceleration_before_wall(
+    scene: Scene,
+    lanes: Tensor,
+    keeps: Tensor,
+    parameters: AnyIdm = TABLE_V,
+    headway_s: Tensor | float | None = None,
+) -> Tensor:
+    """IDM acceleration of each observer before the walls of ``lanes`` [N, K, L], m/s2.
+
+    Infinite without a wall. ``keeps``: whether it keeps that lane
+    (:func:`ganlane.sim.lane_ends.stopping_room`).
+    """
+    room, has_wall = stopping_room(scene.observers, lanes, scene.road, keeps)
+    standing = Neighbour(room, torch.zeros_like(room))
+    acceleration = acceleration_behind(scene, standing, parameters, headway_s)
+    return torch.where(has_wall, acceleration, torch.inf)
 
 
 # Can a follower avoid a leader that brakes at the limit?

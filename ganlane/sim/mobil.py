@@ -1,4 +1,7 @@
-"""MOBIL lane-changing model (Kesting et al. 2007) with the paper's Table IV."""
+"""MOBIL lane-changing model (Kesting et al. 2007) with the paper's Table IV.
+
+Where lanes end, changes out of them are mandatory (:mod:`ganlane.sim.lane_ends`).
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,19 @@ from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
 from ganlane.settings.driving import MobilParameters
-from ganlane.sim.idm import TABLE_V, AnyIdm, DriverIdm, acceleration_behind, idm_acceleration
+from ganlane.sim.idm import (
+    TABLE_V,
+    AnyIdm,
+    DriverIdm,
+    acceleration_before_wall,
+    acceleration_behind,
+    idm_acceleration,
+)
+from ganlane.sim.lane_ends import bias, may_change
 from ganlane.sim.neighbours import FREE_GAP_M, Scene, compare, follower, leader
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
+
+TABLE_IV = MobilParameters()
 
 
 class DriverMobil(NamedTuple):
@@ -22,10 +35,11 @@ class DriverMobil(NamedTuple):
     politeness_side: Tensor
     safe_deceleration: float
     exclusive_m: float
+    mandatory_bias: float = TABLE_IV.mandatory_bias
+    mandatory_m: float = TABLE_IV.mandatory_m
 
 
 AnyMobil: TypeAlias = MobilParameters | DriverMobil
-TABLE_IV = MobilParameters()
 
 
 class LaneAccelerations(NamedTuple):
@@ -77,8 +91,13 @@ def lane_accelerations(
     )
     # Nobody behind: nobody is hindered or relieved.
     nobody = ~behind.exists
+    observer = acceleration_behind(scene, ahead, idm)
+    if scene.road.stretches:
+        # Whoever changes into a lane means to keep it.
+        keeps = torch.ones_like(lanes, dtype=torch.bool)
+        observer = torch.minimum(observer, acceleration_before_wall(scene, lanes, keeps, idm))
     return LaneAccelerations(
-        acceleration_behind(scene, ahead, idm),
+        observer,
         with_it.masked_fill(nobody, 0.0),
         without.masked_fill(nobody, 0.0),
     )
@@ -172,13 +191,46 @@ def _gives_way(
     return (same & near & (pairs.order > 0)).any(-1)
 
 
+def mandatory(
+    scene: Scene,
+    lanes: Tensor,
+    mobil: AnyMobil,
+    goal: int | None,
+) -> tuple[Tensor, Tensor]:
+    """What the ends of lanes add to the incentives of changes into ``lanes`` [N, K, L], m/s2, and
+    whether the changes are possible, bool.
+
+    The first of the lanes is the driver's. Nobody changes into a lane that it has to leave more
+    urgently. ``goal`` as of :func:`ganlane.sim.lane_ends.bias`.
+    """
+    x = scene.observers.x
+    leave = bias(
+        scene.road,
+        lanes,
+        x,
+        goal,
+        mobil.mandatory_bias,
+        mobil.mandatory_m,
+    )
+    here = leave[..., :1]
+    there = leave[..., 1:]
+    gain = torch.where(here > there, here, 0.0)
+    lane = lanes[..., :1]
+    possible = may_change(scene.road, lane, lanes[..., 1:] - lane, x[..., None])
+    return gain, possible & (here >= there)
+
+
 def mobil_wishes(
-    scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV
+    scene: Scene,
+    road: Road,
+    idm: AnyIdm = TABLE_V,
+    mobil: AnyMobil = TABLE_IV,
+    goal: int | None = None,
 ) -> Tensor:
     """Lane change that MOBIL proposes to each driver: -1 right, 0 none, +1 left, int64 [N, K].
 
     None during a lane change. If both sides qualify, the one with the larger incentive, left if
-    equal.
+    equal. ``goal`` is the exit lane that the drivers want to reach; None: they stay on the road.
     """
     vehicles = scene.observers
     lane = vehicles.target_lane.to(vehicles.x.dtype)
@@ -192,6 +244,10 @@ def mobil_wishes(
     to_the_left = lane + 1.0 <= road.lanes - 1
     to_the_right = lane - 1.0 >= 0
     exists = torch.stack((to_the_left, to_the_right), dim=-1)
+    if road.stretches:
+        gain, possible = mandatory(scene, lanes, mobil, goal)
+        incentive = incentive + gain
+        exists = exists & possible
     pays = exists & safe & (incentive > mobil.threshold)
     left, right = torch.where(pays, incentive, -torch.inf).unbind(-1)
     # A driver decides anew only when its last change is complete.

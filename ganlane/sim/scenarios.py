@@ -1,4 +1,5 @@
-"""The test scenarios cut-in, stalled car, stop-and-go wave and blocked lane; m, m/s.
+"""The test scenarios: cut-in, stalled car, stop-and-go wave, blocked lane, and roads with lanes
+that end: merge, lane drop, off-ramp; m, m/s.
 
 Functions of a few numbers that return the rows of a :class:`~ganlane.sim.scenes.FixedScene`, the
 ego first.
@@ -177,6 +178,89 @@ def stop_and_go(
                 # The columns of neighbouring lanes are 7 m apart, so that nobody stands level.
                 cars.append(SceneVehicle(x - 7.0 * lane, lane, speed, 15.0))
     return tuple(cars)
+
+
+def merge(
+    ego_speed_mps: float = 18.0,
+    speed_mps: float = 20.0,
+    spacing_m: float = 50.0,
+    lanes: int = 3,
+    desired_speed_mps: float = 25.0,
+) -> tuple[SceneVehicle, ...]:
+    """The ego alone on the rightmost lane, an on-ramp; ten vehicles ``spacing_m`` apart in each of
+    the others, a third of them ahead of it.
+    """
+    _at_least(lanes, 2, "merge")
+    cars = [SceneVehicle(0.0, 0, ego_speed_mps, desired_speed_mps)]
+    for lane in range(1, lanes):
+        # Neighbouring lanes are staggered by half of the spacing.
+        first_m = (3.0 + 0.5 * (lane % 2)) * spacing_m
+        cars += _stream(lane, 10, first_m, spacing_m, speed_mps)
+    return tuple(cars)
+
+
+def lane_drop(
+    speed_mps: float = 20.0,
+    spacing_m: float = 60.0,
+    lanes: int = 3,
+    desired_speed_mps: float = 25.0,
+) -> tuple[SceneVehicle, ...]:
+    """The ego in the leftmost lane, which ends; seven vehicles ``spacing_m`` apart in every other
+    lane, and six in its own.
+    """
+    _at_least(lanes, 2, "lane_drop")
+    leftmost = lanes - 1
+    cars = [SceneVehicle(0.0, leftmost, speed_mps, desired_speed_mps)]
+    for lane in range(lanes):
+        # Neighbouring lanes are staggered by half of the spacing.
+        first_m = (2.0 + 0.5 * ((leftmost - lane) % 2)) * spacing_m
+        stream = _stream(lane, 7, first_m, spacing_m, speed_mps)
+        cars += [car for car in stream if car.x_m or lane < leftmost]
+    return tuple(cars)
+
+
+def off_ramp(
+    speed_mps: float = 18.0,
+    faster_mps: float = 3.0,
+    spacing_m: float = 80.0,
+    lanes: int = 4,
+    desired_speed_mps: float = 25.0,
+) -> tuple[SceneVehicle, ...]:
+    """The ego in the leftmost lane; eight vehicles ``spacing_m`` apart in every other lane and
+    seven in its own, but none in the rightmost, the exit lane.
+
+    Each lane is ``faster_mps`` faster than the one on its right.
+    """
+    _at_least(lanes, 2, "exit")
+    leftmost = lanes - 1
+    ego_speed = speed_mps + faster_mps * (leftmost - 1)
+    cars = [SceneVehicle(0.0, leftmost, ego_speed, desired_speed_mps)]
+    for lane in range(1, lanes):
+        # Neighbouring lanes are staggered by half of the spacing.
+        first_m = (3.0 + 0.5 * ((leftmost - lane) % 2)) * spacing_m
+        speed = speed_mps + faster_mps * (lane - 1)
+        stream = _stream(lane, 8, first_m, spacing_m, speed)
+        cars += [car for car in stream if car.x_m or lane < leftmost]
+    return tuple(cars)
+
+
+def _stream(
+    lane: int,
+    vehicles: int,
+    first_m: float,
+    spacing_m: float,
+    speed_mps: float,
+) -> tuple[SceneVehicle, ...]:
+    """As :func:`_column`, of drivers that would like to be as fast, 10 % or 20 % faster."""
+    return tuple(
+        SceneVehicle(
+            first_m - spacing_m * k,
+            lane,
+            speed_mps,
+            speed_mps * (1.0 + 0.1 * (k % 3)),
+        )
+        for k in range(vehicles)
+    )
 
 
 def _at_least(

@@ -145,7 +145,7 @@ class FixedScene:
         """Raise :class:`UserError` if ``road`` is another, or a vehicle cannot brake in time."""
         lanes = self.road.lanes
         width = self.road.lane_width_m
-        if (lanes, width) != (road.lanes, road.lane_width_m) or road.ring_m is not None:
+        if self.road != road:
             ring = " and is a ring" if road.ring_m else ""
             raise UserError(
                 f"{self.name}: laid out for a straight road of {lanes} lanes of {width:g} m, the "

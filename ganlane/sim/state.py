@@ -18,8 +18,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ganlane.errors import UserError
 from ganlane.keys import VEHICLE_FIELDS
 from ganlane.settings.driving import Visibility
+from ganlane.settings.road import EXIT, NOTHING, Stretches, exit_lane
 
 #: A body is in a lane that it reaches into by more than this, m.
 ENTRY_M = 0.1
@@ -103,12 +105,39 @@ class Road:
 
     ``lanes`` and ``lane_width_m`` may be tensors [N, 1] if every environment has its own road
     (recorded scenes). ``ring_m`` closes the road to a ring of that length: positions stay
-    unwrapped, only distances between vehicles are taken modulo the ring.
+    unwrapped, only distances between vehicles are taken modulo the ring. ``stretches`` says where
+    each lane begins and ends (:mod:`ganlane.sim.lane_ends`); empty: all go on for ever.
+
+    Raises:
+        UserError: as many stretches as lanes are needed, one of them without an end and at most one
+            with an exit; and the road may be no ring.
     """
 
     lanes: int | Tensor = 3
     lane_width_m: float | Tensor = 4.0
     ring_m: float | None = None
+    stretches: Stretches = ()
+
+    def __post_init__(self) -> None:
+        if not self.stretches:
+            return
+        ends = [stretch.end for stretch in self.stretches]
+        if (
+            len(ends) != self.lanes
+            or NOTHING not in ends
+            or ends.count(EXIT) > 1
+            or self.ring_m is not None
+        ):
+            raise UserError(
+                f"stretches of {len(ends)} lanes with the ends {', '.join(ends)}: expected one for "
+                f"each of the {self.lanes} lanes of a straight road, of which one goes on and at "
+                "most one ends in an exit."
+            )
+
+    @property
+    def exit_lane(self) -> int | None:
+        """The lane that ends in an exit, which the ego has to reach; None without one."""
+        return exit_lane(self.stretches)
 
     def clamp_lane(self, lane: Tensor) -> Tensor:
         """``lane`` limited to the road."""

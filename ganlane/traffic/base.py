@@ -151,6 +151,8 @@ class TrafficModule(TensorDictModuleBase):
     #: row outside ``traffic`` (a foreign simulator). New episodes are recognised by step 0 of their
     #: (seed, episode).
     rows_must_stay: bool = False
+    #: Whether its vehicles stop before the end of a lane and change only between lanes that exist.
+    heeds_lane_ends: bool = False
     #: Per-vehicle memory; empty for a model without any.
     memory_fields: MemoryFields = {}  # noqa: RUF012
 
@@ -301,6 +303,8 @@ class Overlay(TrafficModule):
     Subclasses implement :meth:`rewrite` instead of :meth:`TrafficModule.move`.
     """
 
+    heeds_lane_ends = True  # as far as the model below does
+
     def rewrite(
         self,
         vehicles: Vehicles,
@@ -347,6 +351,7 @@ class TrafficParts(TrafficModule):
         # A ModuleDict, so that to(device) and state_dict() reach the parts.
         self.parts = nn.ModuleDict(parts)
         self.rows_must_stay = any(part.rows_must_stay for part in parts.values())
+        self.heeds_lane_ends = all(part.heeds_lane_ends for part in parts.values())
 
     def named_parts(self) -> list[tuple[str, TrafficModule]]:
         """Names and parts, in order."""

@@ -18,9 +18,11 @@ from ganlane.generator.human import (
     LATERAL_SPEEDS,
     STEPS,
     HumanPolicy,
+    View,
     bounded,
     chosen,
     lane_choice,
+    leaves_room,
     new_target,
     perceive,
     remembered,
@@ -33,8 +35,12 @@ from ganlane.generator.human_tuning import entering_memory
 from ganlane.native.drivers import HumanDrivers
 from ganlane.settings.driving import Visibility
 from ganlane.settings.traffic import HumanTrafficConfig
+from ganlane.sim.idm import TABLE_V, acceleration_before_wall
+from ganlane.sim.lane_ends import WaysOut, ways_out
+from ganlane.sim.mobil import TABLE_IV
+from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.random import Purpose, Stream, normal
-from ganlane.sim.state import Road, Vehicles, reads_are_cheap
+from ganlane.sim.state import Road, Vehicles, reads_are_cheap, spanned
 from ganlane.traffic.base import Memory, MemoryFields, Moved, TrafficModule, uniforms
 
 
@@ -52,6 +58,7 @@ class HumanTraffic(TrafficModule):
     """
 
     visibility = Visibility.BODY
+    heeds_lane_ends = True
     memory_fields: MemoryFields = {  # noqa: RUF012
         "accelerations": ((ACCELERATIONS,), None),
         "lateral_speeds": ((LATERAL_SPEEDS,), None),
@@ -76,6 +83,7 @@ class HumanTraffic(TrafficModule):
         self.policy = policy
         self.temperature = temperature
         self._drivers = drivers
+        self._idm = TABLE_V if drivers is None else drivers.idm
 
     def native_drivers(self) -> HumanDrivers | None:
         """Those that it was made with."""
@@ -148,9 +156,16 @@ class HumanTraffic(TrafficModule):
             Purpose.ACCELERATION,
             Purpose.LANE_CHANGE_SPEED,
             Purpose.LANE_CHANGE_SIDE,
+            Purpose.LANE_CHANGE_HAZARD,
         )
+        if self.road.stretches:
+            ways = ways_out(vehicles, self.road, TABLE_IV.mandatory_m)
+            view = view._replace(exists=torch.stack((ways.left, ways.right), -1))
         chances = policy.lane_chances(lane_choice(vehicles, view))
-        target = new_target(vehicles, view, chosen(chances, u[2]))
+        choice = chosen(chances, u[2])
+        if self.road.stretches:
+            choice = _leaving(choice, ways, vehicles, view, u[3])
+        target = new_target(vehicles, view, choice)
         changed = target != vehicles.target_lane
         driver = driver._replace(since=torch.where(changed, 0.0, driver.since))
         vehicles = vehicles.with_(target_lane=target)
@@ -160,6 +175,8 @@ class HumanTraffic(TrafficModule):
         change = ALONG.sample(along, u[0], self.temperature)
         aside = ACROSS.sample(across, u[1], self.temperature)
         acceleration, lateral = bounded(vehicles, driver, self.road, change, aside)
+        if self.road.stretches:
+            acceleration = torch.minimum(acceleration, self._before_walls(vehicles))
         driver = remembered(vehicles, driver, view, acceleration, target)
         return vehicles, {
             **driver._asdict(),
@@ -168,12 +185,32 @@ class HumanTraffic(TrafficModule):
             "lateral_to": lateral,
         }
 
+    def _before_walls(self, vehicles: Vehicles) -> Tensor:
+        """IDM's acceleration before the walls of the lanes that drivers are in, m/s2; else inf."""
+        scene = scene_of(vehicles, self.road)
+        lanes = spanned(scene.attention)
+        keeps = lanes == vehicles.target_lane[..., None]
+        return acceleration_before_wall(scene, lanes, keeps, self._idm).amin(-1)
+
     def _policy(self, dtype: torch.dtype) -> HumanPolicy:
         """The policy in the run's float type."""
         # Weights are stored in float32, a run may be in float64; converted once.
         if self.policy.along.weight.dtype != dtype:
             self.policy.to(dtype)
         return self.policy
+
+
+def _leaving(choice: Tensor, ways: WaysOut, vehicles: Vehicles, view: View, u: Tensor) -> Tensor:
+    """The choices of drivers whose lane ends: out of it, the sooner the nearer its end is.
+
+    Recordings show no such lanes, so this is no part of the policy. Like its own changes these
+    leave others room.
+    """
+    keeping = vehicles.target_lane == view.lane.long()
+    left = ways.side == 1
+    side = torch.where(left[..., None], view.sides[..., 0, :], view.sides[..., 1, :])
+    wants = keeping & (ways.side != 0) & (u < ways.urgency)
+    return torch.where(wants & leaves_room(side), torch.where(left, 1, 2), choice)
 
 
 def _where(rows: Tensor, new: Mapping[str, Tensor], old: Mapping[str, Tensor]) -> Memory:

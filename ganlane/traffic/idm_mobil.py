@@ -63,6 +63,7 @@ class IdmTraffic(TrafficModule):
     Memory: the steering angle of each vehicle, rad.
     """
 
+    heeds_lane_ends = True
     memory_fields = {"steering": ((), None)}  # noqa: RUF012
 
     def __init__(
@@ -435,6 +436,8 @@ class IdmRandomTraffic(IdmMobilTraffic):
             side,
             m.safe_deceleration,
             m.exclusive_m,
+            m.mandatory_bias,
+            m.mandatory_m,
         )
         # Predictions are not limited by what this driver would brake itself.
         braking = torch.full_like(drivers.headway, -self.idm.min_acceleration)

@@ -265,6 +265,7 @@ class BlindTraffic(TrafficModule):
         self.blind_share = blind_share
         self.visibility = model.visibility
         self.rows_must_stay = model.rows_must_stay
+        self.heeds_lane_ends = model.heeds_lane_ends
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``moved`` and ``traffic`` of the model, which does not see hidden egos."""

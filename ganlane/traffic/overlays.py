@@ -19,8 +19,10 @@ from ganlane.settings.generated import (
     LiteralChanges,
     SuddenAccelerations,
 )
-from ganlane.sim.idm import TABLE_V, acceleration_behind
+from ganlane.sim.idm import TABLE_V, acceleration_in
+from ganlane.sim.lane_ends import WaysOut, ways_out
 from ganlane.sim.mobil import (
+    TABLE_IV,
     one_at_a_time,
     safe_change,
     without_ego,
@@ -68,8 +70,15 @@ def random_side(
 
     ``u`` uniform, ``lane`` int64.
     """
-    left = lane < lanes - 1
-    right = lane > 0
+    return _one_of(u, lane < lanes - 1, lane > 0)
+
+
+def _one_of(
+    u: Tensor,
+    left: Tensor,
+    right: Tensor,
+) -> Tensor:
+    """A random one of the sides that are free."""
     # Drawn for everybody, used where there is a lane on both sides.
     both = torch.where(u < 0.5, 1, -1)
     return torch.where(
@@ -77,6 +86,13 @@ def random_side(
         both,
         torch.where(left, 1, torch.where(right, -1, 0)),
     )
+
+
+def side_on(ways: WaysOut, u: Tensor) -> Tensor:
+    """As :func:`random_side` where lanes end; the side to which a driver has to go, if there is
+    one.
+    """
+    return torch.where(ways.side != 0, ways.side, _one_of(u, ways.left, ways.right))
 
 
 class LiteralLaneChange(Overlay):
@@ -130,13 +146,14 @@ class LiteralLaneChange(Overlay):
             dtype,
         )[..., 0]
         # Blind: nobody looks for a gap, as in the paper.
-        comes = u < literal_hazard(memory["clock"].to(dtype), c.mean_steps)
-        starts = (memory["lateral_speed"] == 0) & vehicles.valid & comes
-        side = torch.where(
-            starts,
-            random_side(u_side, vehicles.target_lane, self.road.lanes),
-            0,
-        )
+        hazard = literal_hazard(memory["clock"].to(dtype), c.mean_steps)
+        side = random_side(u_side, vehicles.target_lane, self.road.lanes)
+        if self.road.stretches:
+            ways = ways_out(vehicles, self.road, TABLE_IV.mandatory_m)
+            hazard = torch.maximum(hazard, ways.urgency)
+            side = side_on(ways, u_side)
+        starts = (memory["lateral_speed"] == 0) & vehicles.valid & (u < hazard)
+        side = torch.where(starts, side, 0)
         target = vehicles.target_lane + side
         # One lateral speed for the whole change.
         drawn = (c.lateral_speed_mps + c.lateral_speed_sd_mps * gauss).clamp_min(c.slowest_mps)
@@ -210,8 +227,16 @@ class CalibratedLaneChange(Overlay):
         side = random_side(u_side, vehicles.target_lane, self.road.lanes)
         # Who is still changing does not wish for another change.
         free = lane_change_done(vehicles, self.road) & vehicles.valid
-        new = torch.where(comes & free, side, 0)
-        return without_ego(torch.where(memory["wish"] != 0, memory["wish"], new))
+        if not self.road.stretches:
+            new = torch.where(comes & free, side, 0)
+            return without_ego(torch.where(memory["wish"] != 0, memory["wish"], new))
+        # Where lanes end, the side that one has to go to comes before what one would like.
+        ways = ways_out(vehicles, self.road, self._limits.mandatory_m)
+        new = torch.where(comes & free, side_on(ways, u_side), 0)
+        wish = torch.where(memory["wish"] != 0, memory["wish"], new)
+        wish = torch.where(free & (ways.side != 0), ways.side, wish)
+        there = torch.where(wish > 0, ways.left, ways.right)
+        return without_ego(torch.where(there, wish, 0))
 
     def _contested(self, scene: Scene, lane: Tensor) -> Tensor:
         """Whether a near vehicle other than the ego is already moving into ``lane`` [N, M]."""
@@ -374,10 +399,11 @@ class Guard(Overlay):
         g = self.guard
         # With the new target lane: the guard also looks where the change goes.
         scene = perceive(vehicles.with_(target_lane=moved.target_lane), self.road)
-        ahead = leader(scene, spanned(scene.attention))
+        lanes = spanned(scene.attention)
+        ahead = leader(scene, lanes)
         # A shorter headway than IDM's: the network may follow more closely than the model would.
-        highest = acceleration_behind(scene, ahead, self.idm, g.headway_s).amin(-1)
-        lowest = acceleration_behind(scene, ahead, self.idm).amin(-1)
+        highest = acceleration_in(scene, lanes, ahead, self.idm, g.headway_s)
+        lowest = acceleration_in(scene, lanes, ahead, self.idm)
         lowest = lowest - g.slack * vehicles.speed / vehicles.desired_speed
         highest, lowest = (bound.clamp_min(g.hardest_braking) for bound in (highest, lowest))
         # What the chain made of it, whichever part moved the vehicle.

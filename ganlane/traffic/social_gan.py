@@ -59,6 +59,8 @@ class GeneratedTraffic(TrafficModule):
     """
 
     visibility = Visibility.BODY
+    #: By its guard or anchor, and where lane changes are laid over it.
+    heeds_lane_ends = True
     #: Inputs besides the motion; another number means weights of the other preset.
     extra_inputs = 0
 

@@ -22,10 +22,10 @@ from torchrl.data.tensor_specs import Binary
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.keys import ACTIONS, EGO_INDEX
+from ganlane.keys import ACTIONS
 from ganlane.native.tensors import SafeActions
 from ganlane.settings.driving import IdmParameters
-from ganlane.sim.dynamics import SIDES, ego_scene, is_heard, on_road
+from ganlane.sim.dynamics import SIDES, ego_scene, is_heard, stays_on_road
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import lane_accelerations
 from ganlane.sim.state import Road, Vehicles, road_in
@@ -127,10 +127,9 @@ class ActionMaskTransform(PerceptionTransform):
         change.
         """
         side = constant(SIDES, direction)
-        target = vehicles.target_lane[:, EGO_INDEX, None] + side
         # Keeping the lane is no command that the ego could fail to hear.
         obeyed = (side == 0) | is_heard(side, direction[:, None], self.abort)
-        legal = on_road(target, road.lanes) & obeyed
+        legal = stays_on_road(vehicles, side, road) & obeyed
         if self.form == "legal":
             return legal, torch.zeros_like(legal[:, 0])
         # Keeping the lane is always allowed: where nothing is safe, there is nothing better.

@@ -24,7 +24,8 @@ from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.native.tensors import LaneView, wants_gradient
-from ganlane.settings.observation import NEARNESS_M, OVERLAP_M, ObservationScale
+from ganlane.settings.observation import NEARNESS_M, OVERLAP_M, ROAD_SIGHT_M, ObservationScale
+from ganlane.sim.lane_ends import begins, ends, may_change, of_lane, on_road
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.torch_settings import compiled, constant
 from ganlane.transforms.sensors import PerceptionTransform
@@ -104,19 +105,19 @@ def _widest(lanes: int | Tensor) -> int | Tensor:
     return max(lanes - 1, 1)
 
 
-def own_state(view: View) -> Tensor:
+def own_state(view: View, here: bool = False) -> Tensor:
     """s1 to s3, [N, 3].
 
-    Speed over desired speed (not clipped), a lane to the left, a lane to the right.
+    Speed over desired speed (not clipped), a lane to the left, a lane to the right; ``here``: one
+    that the ego may change into where it is.
     """
     ego = view.vehicles.columns(slice(0, 1))
     road = view.road
     lane = road.lane_of(ego.y)
-    dtype = ego.y.dtype
+    sides = constant((1.0, -1.0), lane)
     # Whether there is a lane to change to.
-    left = (lane < road.lanes - 1).to(dtype)
-    right = (lane > 0).to(dtype)
-    return torch.cat((ego.speed / ego.desired_speed, left, right), dim=1)
+    there = may_change(road, lane, sides, ego.x) if here else on_road(road, lane + sides)
+    return torch.cat((ego.speed / ego.desired_speed, there.to(ego.y.dtype)), dim=1)
 
 
 def vehicle_list(view: View) -> Tensor:
@@ -188,6 +189,43 @@ def lane_change(view: View) -> Tensor:
     return torch.stack((view.progress, view.direction.to(view.progress.dtype)), dim=1)
 
 
+def road_ahead(view: View) -> Tensor:
+    """Where lanes begin and end, [N, 8]; distances over :data:`ROAD_SIGHT_M`, from 0 to 1.
+
+    Of the left, own and right lane how far it goes on, and how far away it begins: (0, 1) for a
+    lane that the road has not. Then the lanes between the ego and the exit lane over
+    ``max(n - 1, 1)``, positive to the left, and the distance of its end: (0, 1) without an exit.
+    """
+    ego = view.vehicles.columns(slice(0, 1))
+    road = view.road
+    front = ego.x + 0.5 * ego.length
+    lane = road.lane_of(ego.y)
+    lanes = lane + constant((1.0, 0.0, -1.0), lane)
+    there = on_road(road, lanes)
+    far = torch.ones_like(lanes)
+    goes_on = far
+    begins_in = far - 1.0
+    ahead = lane - lane
+    distance = far[:, :1]
+    if road.stretches:
+        goes_on = _in_sight(of_lane(ends(road), lanes, front) - front)
+        begins_in = _in_sight(of_lane(begins(road), lanes, front) - front)
+    if road.exit_lane is not None:
+        ahead = (road.exit_lane - lane) / _widest(road.lanes)
+        distance = _in_sight(ends(road)[road.exit_lane] - front)
+    numbers = [
+        torch.where(there, goes_on, 0.0),
+        torch.where(there, begins_in, 1.0),
+        ahead,
+        distance,
+    ]
+    return torch.cat(numbers, dim=1)
+
+
+def _in_sight(distance_m: Tensor) -> Tensor:
+    return (distance_m / ROAD_SIGHT_M).clamp(0.0, 1.0)
+
+
 class Part(NamedTuple):
     """A part of an observation: its size, given the number of others, and its numbers [N, size]."""
 
@@ -196,11 +234,13 @@ class Part(NamedTuple):
 
 
 OWN = Part(lambda others: 3, own_state)
+OWN_HERE = Part(lambda others: 3, partial(own_state, here=True))
 LIST = Part(lambda others: 3 * others, vehicle_list)
 VIEW = Part(lambda others: 18, lane_view)
 DRIFT_VIEW = Part(lambda others: 24, partial(lane_view, drift=True))
 OVERLAP_VIEW = Part(lambda others: 24, partial(lane_view, drift=True, overlap=True))
 CHANGE = Part(lambda others: 2, lane_change)
+ROAD = Part(lambda others: 8, road_ahead)
 
 #: The forms by name; ``table3`` is the paper's literal 3 + 3 (M - 1) numbers.
 OBSERVATIONS: Final[dict[str, tuple[Part, ...]]] = {
@@ -210,6 +250,7 @@ OBSERVATIONS: Final[dict[str, tuple[Part, ...]]] = {
     "table3_lane_view": (OWN, LIST, VIEW, CHANGE),
     "lane_view_drift": (OWN, DRIFT_VIEW, CHANGE),
     "lane_view_overlap": (OWN, OVERLAP_VIEW, CHANGE),
+    "road_view": (OWN_HERE, OVERLAP_VIEW, CHANGE, ROAD),
 }
 
 

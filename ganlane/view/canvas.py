@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from PIL.ImageColor import getrgb
 
 from ganlane.settings.render import FilmConfig
+from ganlane.settings.road import EXIT, WALL, LaneStretch, Stretches
 
 HEADER = "#16181c"
 VERGE = "#2a332e"
@@ -141,11 +142,12 @@ class Window:
 class Backdrop:
     """Verges, asphalt, edge lines and dashed lane marks.
 
-    Drawn once, one period wider than the picture.
+    Drawn once, one period wider than the picture. Where lanes begin and end is drawn on top.
     """
 
-    def __init__(self, window: Window):
+    def __init__(self, window: Window, stretches: Stretches = ()):
         self.window = window
+        self.stretches = stretches
         # Two periods of lane marks, after which the verge's stripes repeat, too.
         self.period = round(2 * PERIOD_M * window.along)
         size = (window.width + self.period, window.height)
@@ -173,6 +175,8 @@ class Backdrop:
         shift = round(-float(window.column(0.0, ego_x_m))) % self.period
         picture = self.strip.crop((shift, 0, shift + window.width, window.height))
         draw = ImageDraw.Draw(picture)
+        for lane, stretch in enumerate(self.stretches):
+            self._draw_ends(draw, lane, stretch, ego_x_m)
         # 10 m more at both ends, where a post's number may still reach into the picture.
         start = window.start(ego_x_m)
         first = np.ceil((start - 10.0) / POST_EVERY_M) * POST_EVERY_M
@@ -181,3 +185,32 @@ class Backdrop:
             draw.line((column, lower + 7, column, lower + 20), fill=FAINT, width=2)
             put_text(picture, (column + 7, lower + 8), f"{int(metres)} m")
         return picture
+
+    def _draw_ends(
+        self,
+        draw: ImageDraw.ImageDraw,
+        lane: int,
+        stretch: LaneStretch,
+        ego_x_m: float,
+    ) -> None:
+        """No road before an exit lane and behind a wall, which is red; a kerb beside a ramp."""
+        window = self.window
+        far_m = window.length_m * 2.0
+        # Within the picture's surroundings, since pixels of a lane without an end would overflow.
+        ends = np.clip([stretch.begin_m, stretch.end_m], ego_x_m - far_m, ego_x_m + far_m)
+        begin, end = window.column(ends, ego_x_m).tolist()
+        sides = (np.array([0.5, -0.5]) + lane) * window.lane_width_m
+        upper, lower = window.row(sides).tolist()
+        is_exit = stretch.end == EXIT
+        nothing = (0.0, begin) if is_exit else (end, float(window.width))
+        ramp = (end, float(window.width)) if is_exit else (0.0, begin)
+        # The outermost lanes have an edge of asphalt.
+        top = upper - 6 if lane == window.lanes - 1 else upper + 2
+        bottom = lower + 6 if lane == 0 else lower - 2
+        if nothing[0] < nothing[1]:
+            draw.rectangle((nothing[0], top, nothing[1], bottom), fill=VERGE)
+        if stretch.end == WALL:
+            draw.rectangle((end, top, end + 1.0 * window.along, bottom), fill=CRASH)
+        kerbs = [upper] * (lane < window.lanes - 1) + [lower] * (lane > 0)
+        for kerb in kerbs if ramp[0] < ramp[1] else ():
+            draw.line((ramp[0], kerb, ramp[1], kerb), fill=VERGE, width=6)

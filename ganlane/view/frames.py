@@ -69,6 +69,7 @@ _OUTCOMES = {
     "goal": ("GOAL", canvas.GOOD),
     "hard_crash": ("HARD CRASH", canvas.CRASH),
     "out_of_road": ("OUT OF ROAD", canvas.CRASH),
+    "missed_exit": ("EXIT MISSED", canvas.AMBER),
     "timeout": ("TIME-OUT", canvas.AMBER),
     "scene_end": ("END OF RECORDING", canvas.AMBER),
 }
@@ -87,7 +88,7 @@ class FramePainter:
         self.look = look or FilmConfig()
         label = trajectory.label
         self.window = Window(self.look, label.lanes, label.lane_width_m)
-        self._backdrop = Backdrop(self.window)
+        self._backdrop = Backdrop(self.window, label.stretches)
         # The scale of the tints takes 330 pixels at the right.
         has_tints = self.window.width >= _WIDTH_FOR_TINTS
         self._values_at = self.window.width - sum(_VALUES.values()) - (340 if has_tints else 10)

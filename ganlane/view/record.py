@@ -19,6 +19,7 @@ from ganlane import keys
 from ganlane.agents.drivers import GreedyPolicy
 from ganlane.errors import UserError
 from ganlane.evaluation.episodes import start_of
+from ganlane.settings.road import Stretches
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.state import Road, Vehicles, road_in
 
@@ -54,6 +55,8 @@ class EpisodeLabel:
     #: Number of lanes; lane 0 is the rightmost.
     lanes: int = 3
     lane_width_m: float = 4.0
+    #: Where each lane begins and ends; empty: all go on for ever.
+    stretches: Stretches = ()
 
 
 @dataclass(frozen=True)
@@ -186,8 +189,8 @@ def road_of_row(
     state: TensorDictBase,
     road: Road,
     row: int,
-) -> tuple[int, float]:
-    """Lanes and lane width, m, of a row.
+) -> tuple[int, float, Stretches]:
+    """Lanes, lane width, m, and where lanes begin and end, of a row.
 
     Of its replayed scene if ``state`` has one, else of ``road``.
     """
@@ -195,7 +198,11 @@ def road_of_row(
     # One number for all rows, or [N, 1].
     lanes = torch.as_tensor(scene.lanes).flatten()
     width = torch.as_tensor(scene.lane_width_m).flatten()
-    return int(lanes[min(row, len(lanes) - 1)]), float(width[min(row, len(width) - 1)])
+    return (
+        int(lanes[min(row, len(lanes) - 1)]),
+        float(width[min(row, len(width) - 1)]),
+        scene.stretches,
+    )
 
 
 def outcome_of(state: TensorDictBase, row: int = 0) -> str:

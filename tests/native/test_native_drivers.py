@@ -13,6 +13,7 @@ from reference.worlds import environment, leaves, packed, same_bits
 
 from ganlane import keys
 from ganlane.api import make_env
+from ganlane.build import make_env as make_highways
 from ganlane.build import make_traffic
 from ganlane.generator import Generator, shipped_generator
 from ganlane.generator.human_estimator import HumanModel
@@ -176,6 +177,29 @@ def test_it_decides_as_the_tensor_code(traffic):
     differ, _ = compare(traffic, highways=4, rows=12, decisions=4, seed=1)
     # A random number at a threshold may fall on its other side.
     assert differ <= 1
+
+
+@pytest.mark.parametrize("traffic", [*TRAFFICS, MIXED], ids=str)
+@pytest.mark.parametrize("scene", ["merge", "lane_drop", "exit"])
+def test_it_decides_as_the_tensor_code_where_lanes_end(scene, traffic):
+    """Some 10 s and 350 m, so that those in an ending lane have to leave it."""
+    config = make(EnvConfig, {"name": scene, "kernel": "torch"})
+    module = make_traffic(make(TrafficConfig, traffic), config)
+    env = make_highways(module, config, num_envs=6).base_env
+    kernel = kernel_of(env)
+    td = env.reset()
+    differ = 0
+    changed = 0
+    for _ in range(12):
+        td["action"] = torch.zeros(6, dtype=torch.int64)
+        out = kernel.decide(td["action"], td)
+        after = env.step(td)["next"].exclude("reward")
+        differ += int(differing(out, after).sum())
+        lanes = (after[keys.VEHICLES, "target_lane"], td[keys.VEHICLES, "target_lane"])
+        changed += int((lanes[0] != lanes[1]).sum())
+        td = after
+    assert differ <= 1
+    assert changed > 0 or traffic == "idm"
 
 
 @pytest.mark.parametrize("traffic", [*PRESETS, "human"])

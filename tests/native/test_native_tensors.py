@@ -16,6 +16,7 @@ from reference.worlds import (
     environment,
     leaves,
     packed,
+    random_stretches,
     rules_of,
     same_bits,
     scalar_state,
@@ -30,6 +31,7 @@ from ganlane.native.library import VARIANTS, best_variant, why_not
 from ganlane.native.tensors import Kernel, NativeScenes
 from ganlane.settings.driving import Visibility
 from ganlane.settings.episode import SpawnParameters
+from ganlane.settings.road import WALL, LaneStretch
 from ganlane.sim.random import episode_key
 from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road, Vehicles
@@ -39,9 +41,14 @@ pytestmark = pytest.mark.skipif(why_not() is not None, reason=f"the kernel {why_
 RUNNABLE = list(VARIANTS)[list(VARIANTS).index(best_variant()) :]
 
 
-def random_highway(rng: random.Random, rows: int, most_vehicles: int) -> HighwayEnv:
+def random_highway(
+    rng: random.Random,
+    rows: int,
+    most_vehicles: int,
+    ends: bool = False,
+) -> HighwayEnv:
     """1 to 6 lanes, 2 to 60 vehicles, dense and sparse, with and without MOBIL, all periods and
-    visibilities.
+    visibilities; with ``ends`` some lanes begin late and end at a wall.
     """
     lanes = rng.randint(1, 6)
     vehicles = rng.randint(2, most_vehicles)
@@ -59,7 +66,8 @@ def random_highway(rng: random.Random, rows: int, most_vehicles: int) -> Highway
         spawn=packed(max(60.0, 1.5 * spacing * vehicles / lanes + spacing), spacing),
         seed=rng.randrange(10**9),
         dtype=torch.float32,
-        recycle=rng.random() < 0.5,
+        recycle=rng.random() < 0.5 and not ends,
+        stretches=random_stretches(lanes, rng) if ends else (),
     )
 
 
@@ -154,7 +162,7 @@ def within_rounding(env: HighwayEnv, td: TensorDictBase, row: int) -> bool:
 
 
 def compare_random_highways(
-    highways: int, rows: int, decisions: int, seed: int, vehicles: int
+    highways: int, rows: int, decisions: int, seed: int, vehicles: int, ends: bool = False
 ) -> None:
     """Both decide from every state of the tensor code's episodes."""
     rng = random.Random(seed)
@@ -162,7 +170,7 @@ def compare_random_highways(
     compared = 0
     at_threshold = 0
     for highway in range(highways):
-        env = random_highway(rng, rows, vehicles)
+        env = random_highway(rng, rows, vehicles, ends)
         kernel = kernel_of(env)
         td = disturbed_start(env, generator) if highway % 2 else env.reset()
         for _ in range(decisions):
@@ -187,6 +195,15 @@ def test_it_decides_as_the_tensor_code_on_random_highways():
 @pytest.mark.slow
 def test_it_decides_as_the_tensor_code_on_a_million_decisions():
     compare_random_highways(highways=800, rows=128, decisions=10, seed=4, vehicles=60)
+
+
+def test_it_decides_as_the_tensor_code_on_roads_with_lanes_that_end():
+    compare_random_highways(highways=60, rows=16, decisions=8, seed=5, vehicles=25, ends=True)
+
+
+@pytest.mark.slow
+def test_it_decides_as_the_tensor_code_on_a_million_decisions_on_such_roads():
+    compare_random_highways(highways=800, rows=128, decisions=10, seed=6, vehicles=60, ends=True)
 
 
 def test_it_recycles_as_the_tensor_code():
@@ -268,10 +285,23 @@ def test_a_ring_is_refused_in_one_sentence():
 # The same bits
 
 
-@pytest.fixture(scope="module", params=[True, False], ids=["idm_mobil", "idm"])
+@pytest.fixture(scope="module", params=["idm_mobil", "idm", "lanes that end"])
 def crowd(request):
     """4096 rows in motion, and what one call makes of them."""
-    env = environment(num_envs=4096, mobil=request.param, dtype=torch.float32, seed=9)
+    stretches = ()
+    if request.param == "lanes that end":
+        stretches = (
+            LaneStretch(0.0, 150.0, WALL),
+            LaneStretch(),
+            LaneStretch(end_m=200.0, end=WALL),
+        )
+    env = environment(
+        num_envs=4096,
+        mobil=request.param != "idm",
+        dtype=torch.float32,
+        seed=9,
+        stretches=stretches,
+    )
     td = disturbed_start(env, torch.Generator().manual_seed(9))
     td["action"] = actions(env, torch.Generator().manual_seed(10))
     return env, td, by_kernel(kernel_of(env), td, recycle=True)

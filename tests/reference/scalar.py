@@ -51,6 +51,8 @@ class Rules:
     goal: float = 5000.0
     timeout_steps: int = 10_000
     ring: float | None = None
+    # of every lane: beginning, end, and what is there (wall, exit or nothing); none: all go on
+    stretches: tuple[tuple[float, float, str], ...] = ()
 
 
 @dataclass
@@ -165,8 +167,85 @@ class View:
 
     def demanded(self, i: int) -> float:
         """What the lanes that the driver attends to (body and target) allow."""
-        attended = lanes_entered(self.cars[i], self.rules) | {self.cars[i].target_lane}
-        return min(self.acceleration(i, self.leader(i, lane)) for lane in attended)
+        car = self.cars[i]
+        attended = lanes_entered(car, self.rules) | {car.target_lane}
+        behind_others = [self.acceleration(i, self.leader(i, lane)) for lane in attended]
+        # Who leaves a lane goes on up to its wall, who keeps it stops 15 m before.
+        before_walls = [
+            before_wall(car, lane, self.rules, 15.0 if lane == car.target_lane else 0.0)
+            for lane in attended
+        ]
+        return min(behind_others + before_walls)
+
+    def in_a_lane(self, i: int, lane: int) -> float:
+        """What the car would accelerate with if it kept ``lane``."""
+        behind = self.acceleration(i, self.leader(i, lane))
+        return min(behind, before_wall(self.cars[i], lane, self.rules, 15.0))
+
+
+# Where lanes end
+
+
+def front(car: Car) -> float:
+    return car.x + 0.5 * car.length
+
+
+def before_wall(car: Car, lane: int, rules: Rules, margin: float) -> float:
+    """IDM behind a standing obstacle ``margin`` m before the lane's wall; infinite without one."""
+    if not rules.stretches or rules.stretches[lane][2] != "wall":
+        return math.inf
+    gap = rules.stretches[lane][1] - margin - front(car)
+    return idm(car.speed, car.desired_speed, gap, 0.0)
+
+
+def there_is(lane: int, x: float, rules: Rules) -> bool:
+    """Whether the road has the lane at x."""
+    if not 0 <= lane < rules.lanes:
+        return False
+    return not rules.stretches or rules.stretches[lane][0] <= x < rules.stretches[lane][1]
+
+
+def urge(car: Car, lane: int, rules: Rules) -> float:
+    """How much the driver wants to leave the lane: from 500 m a change before its end up to 8 m/s2
+    at it.
+    """
+    if not rules.stretches or rules.stretches[lane][2] == "nothing":
+        return 0.0
+    lasting = [k for k in range(rules.lanes) if rules.stretches[k][2] == "nothing"]
+    changes = min(abs(k - lane) for k in lasting)
+    remaining = rules.stretches[lane][1] - car.x
+    return 8.0 * min(1.0, max(0.0, 1.0 - remaining / (500.0 * changes)))
+
+
+def possible(car: Car, lane: int, rules: Rules) -> bool:
+    """Whether the driver may change into the lane and would not be worse off there."""
+    if not there_is(lane, car.x, rules):
+        return False
+    if not rules.stretches:
+        return True
+    here = car.target_lane
+    return there_is(here, car.x, rules) and urge(car, lane, rules) <= urge(car, here, rules)
+
+
+def arrival(ego: Car, rules: Rules) -> str:
+    """``goal``, ``missed_exit`` where there is an exit, or nothing yet."""
+    exits = [lane for lane, stretch in enumerate(rules.stretches) if stretch[2] == "exit"]
+    if not exits:
+        return "goal" if ego.x >= rules.goal else ""
+    if ego.x < rules.stretches[exits[0]][1]:
+        return ""
+    here = min(rules.lanes - 1, max(0, round(ego.y / rules.lane_width)))
+    return "goal" if here == exits[0] else "missed_exit"
+
+
+def in_the_wall(car: Car, rules: Rules) -> bool:
+    """Whether its body is in a lane whose wall its front has passed."""
+    if not rules.stretches:
+        return False
+    return any(
+        rules.stretches[lane][2] == "wall" and front(car) > rules.stretches[lane][1]
+        for lane in lanes_entered(car, rules)
+    )
 
 
 # Across the road: MOBIL, Table IV
@@ -181,8 +260,10 @@ def incentive(view: View, i: int, lane: int) -> tuple[float, bool]:
     4 m/s2.
     """
     here = view.cars[i].target_lane
-    gain = view.acceleration(i, view.leader(i, lane)) - view.acceleration(i, view.leader(i, here))
-    safe = view.acceleration(i, view.leader(i, lane)) >= -4.0
+    gain = view.in_a_lane(i, lane) - view.in_a_lane(i, here)
+    urgent = urge(view.cars[i], here, view.rules)
+    gain += urgent if urgent > urge(view.cars[i], lane, view.rules) else 0.0
+    safe = view.in_a_lane(i, lane) >= -4.0
     new = view.follower(i, lane)
     if new is not None:
         after = view.acceleration(new, i)
@@ -204,7 +285,7 @@ def mobil_wish(view: View, i: int) -> int:
     best = -math.inf
     wish = 0
     for side in (1, -1):
-        if 0 <= car.target_lane + side < rules.lanes:
+        if possible(car, car.target_lane + side, rules):
             gain, safe = incentive(view, i, car.target_lane + side)
             if safe and gain > 0.1 and gain > best:
                 best = gain
@@ -342,8 +423,9 @@ def obey(state: State, action: int, rules: Rules) -> tuple[bool, bool]:
     turns_back = rules.abort and state.direction != 0 and wish == -state.direction
     if wish == 0 or (state.direction != 0 and not turns_back):
         return False, False
-    target = state.cars[0].target_lane + wish
-    if not 0 <= target < rules.lanes:
+    ego = state.cars[0]
+    target = ego.target_lane + wish
+    if not (there_is(target, ego.x, rules) and there_is(ego.target_lane, ego.x, rules)):
         return False, True
     state.cars[0] = replace(state.cars[0], target_lane=target)
     state.direction = wish
@@ -369,10 +451,11 @@ def decide(state: State, action: int, rules: Rules) -> Outcome:
         outcome.soft_crash_behind += behind and not state.close_behind
         state.close_ahead = ahead
         state.close_behind = behind
-        if any(overlap(ego, other) for other in state.cars[1:] if other.valid):
+        hit = any(overlap(ego, other) for other in state.cars[1:] if other.valid)
+        if hit or in_the_wall(ego, rules):
             outcome.reasons.append("hard_crash")
-        elif ego.x >= rules.goal:
-            outcome.reasons.append("goal")
+        elif arrival(ego, rules):
+            outcome.reasons.append(arrival(ego, rules))
         elif state.step >= rules.timeout_steps:
             outcome.reasons.append("timeout")
     ego = state.cars[0]

@@ -5,6 +5,7 @@ Vehicles placed by hand, environments in one line, states turned into scalar car
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
@@ -16,6 +17,7 @@ from ganlane import keys
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.settings.driving import EgoParameters, Visibility
 from ganlane.settings.episode import SpawnParameters
+from ganlane.settings.road import EXIT, FAR_M, WALL, LaneStretch, Stretches
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.random import Stream
 from ganlane.sim.state import Road, Vehicles
@@ -164,11 +166,12 @@ def environment(
     spawn: SpawnParameters | None = None,
     traffic: TrafficModule | None = None,
     ring_m: float | None = None,
+    stretches: Stretches = (),
     stream: int = Stream.TRAIN,
     **others: object,
 ) -> HighwayEnv:
     """A HighwayEnv in float64 unless told otherwise."""
-    road = Road(lanes=lanes, ring_m=ring_m)
+    road = Road(lanes=lanes, ring_m=ring_m, stretches=stretches)
     traffic = traffic or (IdmMobilTraffic(road, stream) if mobil else IdmTraffic(road, stream))
     return HighwayEnv(
         traffic,
@@ -191,6 +194,7 @@ def rules_of(env: HighwayEnv) -> scalar.Rules:
         goal=env.episode.goal_m,
         timeout_steps=round(env.episode.timeout_s / 0.1),
         ring=env.road.ring_m,
+        stretches=tuple((its.begin_m, its.end_m, its.end) for its in env.road.stretches),
     )
 
 
@@ -294,3 +298,19 @@ def assert_same_tracks(some: dict[int, Track], others: dict[int, Track], at_leas
     assert len(common) >= at_least
     for episode in common:
         assert torch.equal(torch.stack(some[episode]), torch.stack(others[episode])), episode
+
+
+def random_stretches(lanes: int, rng: random.Random) -> Stretches:
+    """One lane goes on; each of the others may begin late and end at a wall, one at an exit."""
+    going_on = rng.randrange(lanes)
+    exit_lane = rng.randrange(2 * lanes)
+    stretches = []
+    for lane in range(lanes):
+        if lane == going_on or (lane != exit_lane and rng.random() < 0.3):
+            stretches.append(LaneStretch())
+            continue
+        begin_m = rng.choice([-FAR_M, rng.uniform(-150.0, 0.0)])
+        # Some so near that an ego cannot stop.
+        end_m = rng.choice([rng.uniform(5.0, 40.0), rng.uniform(60.0, 350.0)])
+        stretches.append(LaneStretch(begin_m, end_m, EXIT if lane == exit_lane else WALL))
+    return tuple(stretches)

@@ -17,6 +17,7 @@ from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import largest_number
+from ganlane.settings.road import EXIT, WALL, LaneStretch
 from ganlane.sim import Road
 from ganlane.traffic import IdmMobilTraffic
 from ganlane.transforms import (
@@ -159,7 +160,7 @@ def test_no_number_but_the_first_exceeds_the_largest_of_its_form(form, length_m)
     values = observed(vehicles({"x": 0.0, "lane": 1, **size}, *beside), form)[1:]
     largest = largest_number(form, length_m)
     assert -1.0 <= values.min() <= values.max() <= largest
-    if form == "lane_view_overlap":  # bodies that overlap whole
+    if form in ("lane_view_overlap", "road_view"):  # bodies that overlap whole
         assert values.max() == largest == 1.0 + length_m
     else:
         assert largest == 1.0
@@ -224,3 +225,43 @@ def test_lengths_are_known_without_error_whatever_the_sensors_measure():
 def test_the_bounds_of_the_gymnasium_space_know_of_lorries(share, largest):
     space = gymnasium.make("ganlane/Highway-v0", env=EnvConfig(truck_share=share)).observation_space
     assert space.high[1:].tolist() == [largest] * (space.shape[0] - 1)
+
+
+# Where lanes begin and end
+
+
+def road_numbers(x: float, lane: int, *stretches: LaneStretch) -> list[float]:
+    """The last 8 numbers of ``road_view``, of an ego with its front at ``x``."""
+    road = Road(len(stretches), stretches=stretches)
+    cars = vehicles({"x": x - 2.25, "lane": lane}, {"x": -900.0, "lane": 0})
+    zero = torch.zeros(1, dtype=torch.float64)
+    transform = ObservationTransform(road, 2, "road_view")
+    return transform.observe(cars, zero, zero.long(), road)[0, -8:].tolist()
+
+
+def test_the_road_view_tells_how_far_the_lanes_go_on_and_when_they_begin():
+    wall = LaneStretch(200.0, 600.0, WALL)
+    assert road_numbers(100.0, 1, wall, LaneStretch()) == pytest.approx(
+        [0.0, 1.0, 0.5, 1.0, 0.0, 0.1, 0.0, 1.0]
+    )
+    assert road_numbers(500.0, 0, wall, LaneStretch()) == pytest.approx(
+        [1.0, 0.1, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0]
+    )
+
+
+def test_the_road_view_tells_which_lane_to_reach_and_by_when():
+    leaving = LaneStretch(200.0, 600.0, EXIT)
+    numbers = road_numbers(100.0, 2, leaving, LaneStretch(), LaneStretch())
+    assert numbers[-2:] == pytest.approx([-1.0, 0.5])
+    numbers = road_numbers(350.0, 0, leaving, LaneStretch(), LaneStretch())
+    assert numbers[-2:] == pytest.approx([0.0, 0.25])
+
+
+def test_own_state_knows_no_lane_where_none_has_begun():
+    road = Road(2, stretches=(LaneStretch(200.0, 600.0, WALL), LaneStretch()))
+    zero = torch.zeros(1, dtype=torch.float64)
+    for x, flags in ((100.0, [0.0, 0.0]), (300.0, [0.0, 1.0])):
+        cars = vehicles({"x": x, "lane": 1}, {"x": -900.0, "lane": 0})
+        transform = ObservationTransform(road, 2, "road_view")
+        observation = transform.observe(cars, zero, zero.long(), road)
+        assert observation[0, 1:3].tolist() == flags

@@ -11,7 +11,8 @@ from view_scenes import area, near, place, straight
 
 from ganlane import keys
 from ganlane.settings.render import FilmConfig
-from ganlane.view import FramePainter, canvas
+from ganlane.settings.road import EXIT, WALL, LaneStretch
+from ganlane.view import EpisodeLabel, FramePainter, canvas
 from ganlane.view.canvas import HEADER_HEIGHT, Window
 
 BARE = FilmConfig(trail_s=0.0, speeds=False)
@@ -149,3 +150,36 @@ def test_nine_vehicles_are_drawn_fast_enough_for_60_frames_a_second():
             painter.draw(frame)
         rounds.append(30 / (time.perf_counter() - start))
     assert max(rounds) > 60
+
+
+# Where lanes begin and end
+
+
+@pytest.mark.parametrize(
+    ("stretch", "road"),
+    [
+        (LaneStretch(end_m=20.0, end=WALL), [True, True, False]),
+        (LaneStretch(-20.0, 20.0, EXIT), [False, True, True]),
+        (LaneStretch(-20.0, 20.0, WALL), [True, True, False]),
+        (LaneStretch(), [True, True, True]),
+    ],
+)
+def test_there_is_asphalt_where_the_lane_is_and_a_ramp_before_or_behind_it(stretch, road):
+    """In the middle of the right lane, 30 m behind the ego, beside it, and 30 m ahead of it."""
+    label = EpisodeLabel(lanes=2, stretches=(stretch, LaneStretch()))
+    trajectory = straight([0.0], [1], lanes=2, label=label)
+    picture = FramePainter(trajectory, FilmConfig()).draw(0)
+    window = Window(FilmConfig(), 2, 4.0)
+    row = int(window.row(0.0))
+    columns = window.column([-30.0, 0.0, 30.0], 0.0).astype(int).tolist()
+    assert near(picture, canvas.ASPHALT)[row, columns].tolist() == road
+
+
+def test_a_wall_is_red():
+    wall = LaneStretch(end_m=20.0, end=WALL)
+    label = EpisodeLabel(lanes=2, stretches=(wall, LaneStretch()))
+    picture = FramePainter(straight([0.0], [1], lanes=2, label=label)).draw(0)
+    window = Window(FilmConfig(), 2, 4.0)
+    column, row = place(picture, canvas.CRASH)
+    assert column == pytest.approx(window.column(20.5, 0.0), abs=2.0)
+    assert row == pytest.approx(window.row(0.0), abs=4.0)

@@ -4,6 +4,7 @@ const OUTCOMES = {
   goal: "goal",
   hard_crash: "hard crash",
   out_of_road: "out of road",
+  missed_exit: "exit missed",
   timeout: "time-out",
   scene_end: "end of recording",
 };

@@ -80,6 +80,7 @@ class Road {
         pen.fillRect(this.column(x), mark - 0.75, 6 * this.along, 1.5);
       }
     }
+    this.episode.told.stretches.forEach((stretch, lane) => this.drawEnds(lane, stretch));
     pen.fillStyle = look("faint");
     pen.font = "11px system-ui, sans-serif";
     const factor = this.across / this.along;
@@ -91,6 +92,26 @@ class Road {
       pen.fillRect(this.column(x), bottom + 6, 1.5, 10);
       pen.fillText(`${x} m`, this.column(x) + 5, bottom + 16);
     }
+  }
+
+  // No road before an exit lane and behind a wall, which is red; a kerb beside a ramp.
+  drawEnds(lane, { begin_m: begin, end_m: end, end: kind }) {
+    const { pen, width } = this;
+    const { lanes, lane_width_m: laneWidth } = this.episode.told;
+    const within = (x) => Math.min(Math.max(this.column(x), 0), width);
+    const [upper, lower] = [this.row((lane + 0.5) * laneWidth), this.row((lane - 0.5) * laneWidth)];
+    const top = lane === lanes - 1 ? upper - 4 : upper + 1.5;
+    const bottom = lane === 0 ? lower + 4 : lower - 1.5;
+    const before = [0, within(begin)];
+    const behind = [within(end), width];
+    const [nothing, ramp] = kind === "exit" ? [before, behind] : [behind, before];
+    pen.fillStyle = look("verge");
+    pen.fillRect(nothing[0], top, nothing[1] - nothing[0], bottom - top);
+    if (lane < lanes - 1) pen.fillRect(ramp[0], upper - 2, ramp[1] - ramp[0], 4);
+    if (lane > 0) pen.fillRect(ramp[0], lower - 2, ramp[1] - ramp[0], 4);
+    if (kind !== "wall") return;
+    pen.fillStyle = look("crash");
+    pen.fillRect(this.column(end), top, this.along, bottom - top);
   }
 
   drawTrail(v, place, vehicle) {

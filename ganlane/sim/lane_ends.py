@@ -1,0 +1,176 @@
+"""Lanes that begin and end: where one may change, who stops before an end, and who has to leave.
+
+The end of a lane that a driver has to leave makes its lane changes mandatory. In MOBIL that is a
+bias of the incentive (Kesting, Treiber and Helbing 2007; Treiber and Kesting 2013);
+here it grows as the end nears, as the mandatory desire of Schakel, Knoop and van Arem (2012) does:
+
+    urgency = 1 - distance / (changes * 500 m), from 0 to 1.
+
+A change into a lane that is less urgent to leave has the bias of the lane that it leaves; nobody
+changes into one that is more urgent to leave. MOBIL's safety criterion holds for these changes as
+for all others.
+
+All functions take lanes of any shape that broadcasts with the positions, whole numbers or floats.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ganlane.settings.road import FAR_M, TURN_OUT_M, WALL, leaving
+from ganlane.sim.state import LaneRange, Road, Vehicles, spanned
+from ganlane.torch_settings import constant
+
+
+def of_lane(
+    numbers: tuple[float, ...],
+    lane: Tensor,
+    like: Tensor,
+) -> Tensor:
+    """The number of each ``lane``, in the type of ``like``; beyond the road, of the nearest one."""
+    return constant(numbers, like)[lane.long().clamp(0, len(numbers) - 1)]
+
+
+def begins(road: Road) -> tuple[float, ...]:
+    """Where each lane begins, m."""
+    return tuple(stretch.begin_m for stretch in road.stretches)
+
+
+def ends(road: Road) -> tuple[float, ...]:
+    """Where each lane ends, m; :data:`FAR_M` if it goes on."""
+    return tuple(stretch.end_m for stretch in road.stretches)
+
+
+def walls(road: Road) -> tuple[float, ...]:
+    """Where each lane's wall stands, m; :data:`FAR_M` without one."""
+    return tuple(its.end_m if its.end == WALL else FAR_M for its in road.stretches)
+
+
+def on_road(road: Road, lane: Tensor) -> Tensor:
+    """Whether the road has the ``lane`` anywhere, bool."""
+    return (lane >= 0) & (lane < road.lanes)
+
+
+def exists(
+    road: Road,
+    lane: Tensor,
+    x: Tensor,
+) -> Tensor:
+    """Whether the road has the ``lane`` at ``x``, m; bool."""
+    inside = on_road(road, lane)
+    if not road.stretches:
+        return inside
+    begin = of_lane(begins(road), lane, x)
+    end = of_lane(ends(road), lane, x)
+    return inside & (begin <= x) & (x < end)
+
+
+def may_change(
+    road: Road,
+    lane: Tensor,
+    side: Tensor,
+    x: Tensor,
+) -> Tensor:
+    """Whether one may go from ``lane`` to the one at its ``side`` (1 left, -1 right, 0 none).
+
+    Both have to exist at ``x``, m; keeping the lane is always possible. Bool.
+    """
+    there = exists(road, lane + side, x)
+    if not road.stretches:
+        return there
+    return (side == 0) | (there & exists(road, lane, x))
+
+
+def room_before_wall(
+    vehicles: Vehicles,
+    lanes: Tensor,
+    road: Road,
+) -> Tensor:
+    """From the front bumper of each vehicle [N, K] to the wall of ``lanes`` [N, K, L], m.
+
+    Below 0 behind it.
+    """
+    front = vehicles.x + 0.5 * vehicles.length
+    return of_lane(walls(road), lanes, vehicles.x) - front[..., None]
+
+
+def hits_wall(vehicles: Vehicles, body: LaneRange, road: Road) -> Tensor:
+    """Whether each vehicle [N, K], in the lanes ``body``, has driven into a wall; bool."""
+    return (room_before_wall(vehicles, spanned(body), road) < 0.0).any(-1)
+
+
+def at_exit(vehicles: Vehicles, road: Road) -> tuple[Tensor, Tensor]:
+    """Whether each vehicle has left the road by its exit, and whether it has missed it, bool."""
+    assert road.exit_lane is not None
+    passed = vehicles.x >= ends(road)[road.exit_lane]
+    inside = road.lane_of(vehicles.y) == road.exit_lane
+    return passed & inside, passed & ~inside
+
+
+def bias(
+    road: Road,
+    lanes: Tensor,
+    x: Tensor,
+    goal: int | None,
+    strongest: float,
+    reach_m: float,
+) -> Tensor:
+    """How much a driver at ``x`` [N, K], m, wants to leave each of ``lanes`` [N, K, L], m/s2.
+
+    Args:
+        goal: the exit lane that the drivers want to reach; None: they stay on the road.
+        strongest: at the end, m/s2.
+        reach_m: distance from the end at which it begins, m per lane change.
+    """
+    by_m, changes = leaving(road.stretches, goal)
+    reaches = tuple(reach_m * number for number in changes)
+    distance = of_lane(by_m, lanes, x) - x[..., None]
+    urgency = 1.0 - distance / of_lane(reaches, lanes, x)
+    return strongest * urgency.clamp(0.0, 1.0)
+
+
+class WaysOut(NamedTuple):
+    """Of each driver [N, M]: whether it may go left or right, the side to which it has to leave its
+    lane (-1 right, 0 none, 1 left), and how urgently, 0 to 1.
+    """
+
+    left: Tensor
+    right: Tensor
+    side: Tensor
+    urgency: Tensor
+
+
+def ways_out(vehicles: Vehicles, road: Road, reach_m: float) -> WaysOut:
+    """Where drivers who stay on the road may and have to go; ``reach_m`` as of :func:`bias`."""
+    lane = vehicles.target_lane
+    sides = constant((0, 1, -1), lane)
+    lanes = lane[..., None] + sides
+    urgency = bias(road, lanes, vehicles.x, None, 1.0, reach_m)
+    here = urgency[..., :1]
+    possible = may_change(road, lane[..., None], sides, vehicles.x[..., None])[..., 1:]
+    possible = possible & (here >= urgency[..., 1:])
+    left, right = possible.unbind(-1)
+    # The better one of two sides, the left one at a tie; a lane as urgent is none.
+    out = torch.where(possible & (here > urgency[..., 1:]), urgency[..., 1:], torch.inf)
+    to_the_left, to_the_right = out.unbind(-1)
+    side = torch.where(to_the_left <= to_the_right, 1, -1)
+    side = torch.where(torch.isfinite(out).any(-1), side, 0)
+    return WaysOut(left, right, side, torch.where(side != 0, here[..., 0], 0.0))
+
+
+def stopping_room(
+    vehicles: Vehicles,
+    lanes: Tensor,
+    road: Road,
+    keeps: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Room in which each driver [N, K] has to stop in ``lanes`` [N, K, L], m; whether it has to.
+
+    ``keeps``: whether it keeps the lane; who leaves it goes on up to the wall itself.
+    """
+    room = room_before_wall(vehicles, lanes, road)
+    has_wall = of_lane(walls(road), lanes, vehicles.x) < FAR_M
+    return torch.where(keeps, room - TURN_OUT_M, room), has_wall

@@ -1,0 +1,311 @@
+"""Roads whose lanes begin and end: what drivers do there, and what the ego may."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from reference.worlds import environment, moves, placed, step, vehicles
+
+from ganlane import keys
+from ganlane.build import make_driver, make_env, make_traffic
+from ganlane.env import HighwayEnv
+from ganlane.errors import ParameterError, UserError
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.record import make
+from ganlane.settings.road import EXIT, WALL, LaneStretch, Stretches
+from ganlane.settings.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
+from ganlane.sim.idm import TABLE_V
+from ganlane.sim.mobil import TABLE_IV, mandatory, mobil_wishes
+from ganlane.sim.neighbours import perceive
+from ganlane.sim.state import Road
+from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
+from ganlane.transforms import ActionMaskTransform
+
+#: The right lane of two ends 400 m ahead.
+DROP: Stretches = (LaneStretch(end_m=400.0, end=WALL), LaneStretch())
+DROPPED = Road(2, stretches=DROP)
+#: Beside a car that begins 200 m ahead.
+LATE = Road(2, stretches=(LaneStretch(200.0, 400.0, WALL), LaneStretch()))
+#: Half a car's length.
+HALF_M = 2.25
+
+
+def wish(road: Road, *cars: dict) -> int:
+    """Of the first car."""
+    return int(mobil_wishes(perceive(vehicles(*cars), road), road)[0, 0])
+
+
+def bias_at(x: float) -> float:
+    """Of a change to the left out of the lane that ends at 400 m."""
+    scene = perceive(vehicles({"x": x}, {"x": x - 900.0}), DROPPED)
+    lanes = torch.tensor([[[0.0, 1.0], [0.0, 1.0]]], dtype=torch.float64)
+    return float(mandatory(scene, lanes, TABLE_IV, None)[0][0, 0, 0])
+
+
+# Who drives towards the end of a lane
+
+
+@pytest.mark.parametrize("speed", [5.0, 15.0, 25.0, 35.0])
+def test_a_driver_that_keeps_its_lane_stops_some_17_metres_before_its_end(speed):
+    """IDM's gap of 2 m to a standing car, and 15 m to turn out."""
+    cars = vehicles({"x": 0.0, "speed": speed, "desired_speed": 36.0}, {"x": -500.0, "lane": 1})
+    *_, last = moves(IdmTraffic(DROPPED), cars, 1500)
+    room = 400.0 - (last.x[0, 0] + HALF_M)
+    assert 16.5 < room < 17.5
+    assert last.speed[0, 0] < 0.1
+
+
+def test_a_driver_whose_lane_goes_on_does_not_notice():
+    alone = vehicles({"x": 300.0, "lane": 1}, {"x": 0.0, "lane": 1})
+    for one, other in zip(
+        moves(IdmMobilTraffic(DROPPED), alone, 100), moves(IdmMobilTraffic(Road(2)), alone, 100)
+    ):
+        assert torch.equal(one.x, other.x)
+        assert torch.equal(one.y, other.y)
+
+
+def test_a_car_that_stands_at_the_end_turns_out_as_soon_as_the_lane_is_free():
+    """Its body is out of the lane before its front is at the wall."""
+    cars = vehicles({"x": -900.0, "lane": 1}, {"x": 400.0 - 17.0 - HALF_M, "speed": 0.0})
+    for now in moves(IdmMobilTraffic(DROPPED), cars, 300):
+        beside_the_wall = now.x[0, 1] + HALF_M > 400.0
+        assert not beside_the_wall or now.y[0, 1] > 2.0 + 1.25 - 0.1
+    assert now.x[0, 1] > 430.0
+
+
+def test_the_bias_grows_from_500_metres_before_the_end_to_8_at_the_end():
+    assert bias_at(-200.0) == 0.0
+    assert bias_at(-100.0) == 0.0
+    assert bias_at(150.0) == pytest.approx(4.0)
+    assert bias_at(400.0) == pytest.approx(8.0)
+
+
+def test_two_changes_are_as_urgent_twice_as_far_away():
+    end = LaneStretch(end_m=400.0, end=WALL)
+    road = Road(3, stretches=(end, end, LaneStretch()))
+    lanes = torch.tensor([[[0.0, 1.0], [0.0, 1.0]]], dtype=torch.float64)
+    for x, bias in ((-600.0, 0.0), (-100.0, 4.0), (150.0, 6.0)):
+        scene = perceive(vehicles({"x": x}, {"x": -900.0}), road)
+        gain, possible = mandatory(scene, lanes, TABLE_IV, None)
+        assert gain[0, 0, 0] == pytest.approx(bias)
+        assert possible[0, 0, 0]
+
+
+def test_the_end_decides_where_an_equal_lane_would_not():
+    car = {"speed": 20.0, "desired_speed": 20.0}
+    behind = {"x": -900.0, "lane": 1}
+    assert wish(Road(2), {"x": 300.0, **car}, behind) == 0
+    assert wish(DROPPED, {"x": 300.0, **car}, behind) == 1
+
+
+@pytest.mark.parametrize("x", [200.0, 250.0, 380.0])
+def test_the_safety_criterion_never_yields(x):
+    """However near the end is: who comes from behind would have to brake with more than 4 m/s2."""
+    car = {"x": x, "speed": 10.0, "desired_speed": 20.0}
+    fast = {"x": x - 25.0, "lane": 1, "speed": 25.0}
+    assert wish(DROPPED, car, fast) == 0
+    assert wish(DROPPED, car, {**fast, "x": x - 150.0}) == 1
+
+
+def test_nobody_changes_into_a_lane_that_ends_soon():
+    """Not even behind a slow leader."""
+    slow = {"lane": 1, "speed": 5.0, "desired_speed": 5.0}
+    assert wish(DROPPED, {"x": -110.0, "lane": 1}, {"x": -70.0, **slow}) == -1
+    assert wish(DROPPED, {"x": -90.0, "lane": 1}, {"x": -50.0, **slow}) == 0
+
+
+def test_nobody_changes_into_a_lane_that_has_not_begun_or_out_of_it():
+    slow = {"speed": 5.0, "desired_speed": 5.0}
+    road = replace(LATE, stretches=(LaneStretch(200.0, 900.0, WALL), LaneStretch()))
+    assert wish(road, {"x": 199.0, "lane": 1}, {"x": 240.0, "lane": 1, **slow}) == 0
+    assert wish(road, {"x": 201.0, "lane": 1}, {"x": 240.0, "lane": 1, **slow}) == -1
+    assert wish(road, {"x": 199.0}, {"x": 240.0, **slow}) == 0
+    assert wish(road, {"x": 201.0}, {"x": 240.0, **slow}) == 1
+
+
+# The ego
+
+
+def late_road(speed: float, x: float = 0.0) -> tuple[HighwayEnv, object]:
+    """The ego alone in a lane that begins at 200 m and ends at 400 m."""
+    env = environment(lanes=2, vehicles=2, stretches=LATE.stretches)
+    cars = ({"x": x, "speed": speed}, {"x": -900.0, "lane": 1})
+    return env, placed(env, vehicles(*cars))
+
+
+def test_a_command_to_where_no_lane_is_leaves_the_road():
+    env, td = late_road(10.0)
+    assert step(env, td, keys.LEFT)[keys.EVENTS, "out_of_road"]
+    env, td = late_road(10.0, x=210.0)
+    after = step(env, td, keys.LEFT)
+    assert not after["done"]
+    assert after[keys.VEHICLES, "target_lane"][0, 0] == 1
+
+
+@pytest.mark.parametrize("form", ["legal", "safe"])
+def test_the_mask_knows_where_lanes_are(form):
+    mask = ActionMaskTransform(LATE, form, idm=TABLE_V)
+    for x, left in ((0.0, False), (210.0, True)):
+        cars = vehicles({"x": x, "speed": 10.0}, {"x": -900.0, "lane": 1})
+        allowed, _ = mask.allowed(cars, torch.zeros(1, dtype=torch.int64), LATE)
+        assert allowed[0].tolist() == [True, left, False]
+
+
+def test_the_safe_mask_sees_a_wall_as_a_standing_car():
+    """At 25 m/s, 60 m before the end of the lane on the right: braking with more than 4 m/s2."""
+    mask = ActionMaskTransform(DROPPED, "safe", idm=TABLE_V)
+    for x, right in ((340.0, False), (0.0, True)):
+        cars = vehicles({"x": x, "lane": 1, "speed": 25.0}, {"x": -900.0, "lane": 1})
+        allowed, _ = mask.allowed(cars, torch.zeros(1, dtype=torch.int64), DROPPED)
+        assert allowed[0].tolist() == [True, False, right]
+
+
+@pytest.mark.parametrize("kernel", ["torch", "native"])
+def test_driving_into_the_end_of_a_lane_is_a_hard_crash(kernel):
+    """20 m before it nobody stops from 40 m/s."""
+    env = environment(
+        lanes=2, vehicles=2, stretches=LATE.stretches, dtype=torch.float32, kernel=kernel
+    )
+    cars = ({"x": 380.0 - HALF_M, "speed": 40.0}, {"x": -900.0, "lane": 1})
+    td = placed(env, vehicles(*cars, dtype=torch.float32))
+    after = step(env, td)
+    assert after[keys.EVENTS, "hard_crash"]
+    assert after["terminated"]
+    assert 400.0 < after[keys.VEHICLES, "x"][0, 0] + HALF_M < 404.0
+
+
+def test_beside_the_end_of_a_lane_one_passes():
+    env, td = late_road(20.0, x=390.0)
+    cars = vehicles({"x": 390.0, "lane": 1}, {"x": -900.0, "lane": 1})
+    for name, value in cars.as_dict().items():
+        td[keys.VEHICLES, name] = value
+    after = step(env, td)
+    assert not after["done"]
+    assert after[keys.VEHICLES, "x"][0, 0] > 405.0
+
+
+# What is refused
+
+
+class Cruise(TrafficModule):
+    """Drives on, whatever comes."""
+
+    def move(self, vehicles, memory, key, step):
+        return vehicles.with_(x=vehicles.x + vehicles.speed * self.dt), memory
+
+
+def test_traffic_that_does_not_heed_the_ends_of_lanes_is_refused():
+    with pytest.raises(UserError, match="Cruise does not heed the ends of lanes"):
+        HighwayEnv(Cruise(DROPPED))
+
+
+def test_recycling_is_refused():
+    config = make(EnvConfig, {"name": "merge", "recycle": True})
+    with pytest.raises(UserError, match=r"env.recycle=true on a road with lanes that end"):
+        make_env(make_traffic(IdmTrafficConfig(), config), config)
+
+
+@pytest.mark.parametrize(
+    "stretches",
+    [
+        (LaneStretch(),),
+        (LaneStretch(end_m=9.0, end=WALL),) * 2,
+        (LaneStretch(end_m=9.0, end=EXIT), LaneStretch(end_m=9.0, end=EXIT), LaneStretch()),
+    ],
+)
+def test_a_road_needs_a_stretch_for_each_lane_one_without_an_end_and_at_most_one_exit(stretches):
+    with pytest.raises(UserError, match="expected one for each of"):
+        Road(2 if len(stretches) < 3 else 3, stretches=stretches)
+
+
+@pytest.mark.parametrize(
+    ("stretch", "wrong"),
+    [
+        ({"begin_m": 9.0, "end_m": 9.0, "end": WALL}, "more than"),
+        ({"end_m": 9.0}, "wall or exit where the lane has an end"),
+        ({"end": WALL}, "nothing where it has none"),
+        ({"end_m": 9.0, "end": "cliff"}, "one of nothing, wall, exit"),
+    ],
+)
+def test_an_impossible_stretch_is_refused(stretch, wrong):
+    with pytest.raises(ParameterError, match=wrong):
+        LaneStretch(**stretch)
+
+
+# env=merge, lane_drop, exit
+
+
+def outcomes(config: EnvConfig, driver: str, traffic: object, rows: int = 64) -> dict[str, int]:
+    """How so many episodes end."""
+    env = make_env(make_traffic(traffic, config), config, num_envs=rows)
+    policy = make_driver(driver, config).policy
+    td = env.reset()
+    ended = torch.zeros(rows, dtype=torch.bool)
+    counts = dict.fromkeys(keys.END_EVENTS, 0)
+    while not ended.all():
+        td = env.step(policy(td))["next"]
+        fresh = td["done"][:, 0] & ~ended
+        for name in counts:
+            counts[name] += int((td[keys.EVENTS, name][:, 0] & fresh).sum())
+        ended |= fresh
+    return {name: count for name, count in counts.items() if count}
+
+
+@pytest.mark.parametrize("scene", ["merge", "lane_drop", "exit"])
+@pytest.mark.parametrize("driver", ["mobil", "mobil_egoistic"])
+@pytest.mark.parametrize("traffic", [IdmTrafficConfig(), IdmMobilTrafficConfig()])
+def test_a_mobil_ego_reaches_its_goal(scene, driver, traffic):
+    assert outcomes(make(EnvConfig, scene), driver, traffic) == {"goal": 64}
+
+
+@pytest.mark.parametrize(
+    ("scene", "end"), [("merge", "timeout"), ("lane_drop", "timeout"), ("exit", "missed_exit")]
+)
+def test_an_ego_that_keeps_its_lane_does_not(scene, end):
+    """It stands at the end of its lane, or passes the exit."""
+    assert outcomes(make(EnvConfig, scene), "keep_lane", IdmTrafficConfig()) == {end: 64}
+
+
+def test_nobody_is_left_standing_at_a_lane_drop():
+    """All of the ending lane have found their way into the others within three minutes."""
+    config = replace(make(EnvConfig, "lane_drop"), goal_m=1e5, timeout_s=300.0)
+    env = make_env(make_traffic(IdmMobilTrafficConfig(), config), config, num_envs=32)
+    policy = make_driver("mobil", config).policy
+    td = env.reset()
+    for _ in range(180):
+        td = env.step(policy(td))["next"]
+        assert not td["done"].any()
+    assert (td[keys.VEHICLES, "x"] > 500.0).all()
+    assert (td[keys.VEHICLES, "speed"] > 10.0).all()
+
+
+@pytest.mark.parametrize("kernel", ["torch", "native"])
+@pytest.mark.parametrize(("lane", "event"), [(0, "goal"), (1, "missed_exit")])
+def test_at_the_end_of_the_exit_lane_the_ego_has_left_the_road_or_missed_it(kernel, lane, event):
+    exit_lane = LaneStretch(200.0, 400.0, EXIT)
+    env = environment(
+        lanes=2,
+        vehicles=2,
+        stretches=(exit_lane, LaneStretch()),
+        goal_m=100.0,
+        dtype=torch.float32,
+        kernel=kernel,
+    )
+    cars = ({"x": 395.0, "lane": lane}, {"x": -900.0, "lane": 1})
+    td = placed(env, vehicles(*cars, dtype=torch.float32))
+    after = step(env, td)
+    assert [name for name in keys.END_EVENTS if after[keys.EVENTS, name]] == [event]
+    assert after["terminated"]
+    assert 400.0 <= after[keys.VEHICLES, "x"][0, 0] < 402.5
+    earlier = placed(env, vehicles({**cars[0], "x": 360.0}, cars[1], dtype=torch.float32))
+    assert not step(env, earlier)["done"]
+
+
+def test_the_drivers_of_the_traffic_keep_out_of_the_exit_lane():
+    """Even behind a slow leader: they have nowhere to go there."""
+    slow = {"lane": 1, "speed": 5.0, "desired_speed": 5.0}
+    road = Road(2, stretches=(LaneStretch(200.0, 400.0, EXIT), LaneStretch()))
+    assert wish(road, {"x": 250.0, "lane": 1}, {"x": 290.0, **slow}) == 0

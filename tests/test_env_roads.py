@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import gymnasium
 import pytest
 import torch
+from gymnasium.utils.env_checker import check_env
 from reference.worlds import environment, moves, placed, step, vehicles
 
 from ganlane import keys
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.env import HighwayEnv
 from ganlane.errors import ParameterError, UserError
+from ganlane.evaluation.episodes import ego_at_fault
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
 from ganlane.settings.road import EXIT, WALL, LaneStretch, Stretches
@@ -177,6 +180,12 @@ def test_driving_into_the_end_of_a_lane_is_a_hard_crash(kernel):
     assert 400.0 < after[keys.VEHICLES, "x"][0, 0] + HALF_M < 404.0
 
 
+@pytest.mark.parametrize(("lane", "at_fault"), [(0, True), (1, False)])
+def test_who_drives_into_a_wall_is_at_fault(lane, at_fault):
+    cars = vehicles({"x": 399.0, "lane": lane}, {"x": -900.0, "lane": 1})
+    assert bool(ego_at_fault(cars, DROPPED)) == at_fault
+
+
 def test_beside_the_end_of_a_lane_one_passes():
     env, td = late_road(20.0, x=390.0)
     cars = vehicles({"x": 390.0, "lane": 1}, {"x": -900.0, "lane": 1})
@@ -302,6 +311,15 @@ def test_at_the_end_of_the_exit_lane_the_ego_has_left_the_road_or_missed_it(kern
     assert 400.0 <= after[keys.VEHICLES, "x"][0, 0] < 402.5
     earlier = placed(env, vehicles({**cars[0], "x": 360.0}, cars[1], dtype=torch.float32))
     assert not step(env, earlier)["done"]
+
+
+@pytest.mark.parametrize("scene", ["merge", "lane_drop", "exit"])
+def test_gymnasium_has_no_complaint(scene):
+    env = gymnasium.make("ganlane/Highway-v0", env=scene, observation="road_view", mask="safe")
+    check_env(env.unwrapped, skip_render_check=True)
+    envs = gymnasium.make_vec("ganlane/Highway-v0", num_envs=3, env=scene)
+    observation, _ = envs.reset(seed=1)
+    assert envs.observation_space.contains(observation)
 
 
 def test_the_drivers_of_the_traffic_keep_out_of_the_exit_lane():

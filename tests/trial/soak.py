@@ -33,7 +33,8 @@ RECORDINGS = DATA / "ngsim" / "us101_scenes.csv"
 RULES = ("idm", "idm_mobil")
 TRAFFICS = (*RULES, *RULES, "idm_random", "idm_faults", "human", "gan", "gan_calibrated", "mixed")
 ENVS = ("highway", "highway", "highway", "dense", "cut_in", "stalled_car", "stop_and_go")
-ENVS += ("blocked_lane", "replay")
+ROADS = ("merge", "lane_drop", "exit")
+ENVS += (*ROADS, "blocked_lane", "replay")
 #: Pairs of vehicles in all rows together; generated traffic needs a kilobyte or more for each.
 MOST_PAIRS = 2_000_000
 #: Vehicles of a scenario, at most.
@@ -93,7 +94,7 @@ def random_choice(rng: random.Random, compiled: bool) -> dict[str, Any]:
         "decision_period_s": rng.choice((0.1, 0.3, 0.5, 1.0, 1.0, 1.0, 2.0)),
         "goal_m": rng.choice((30.0, 200.0, 1000.0, 5000.0)),
         "timeout_s": rng.choice((3.0, 60.0, 1000.0)),
-        "recycle": env != "replay" and rng.random() < 0.4,
+        "recycle": env not in ("replay", *ROADS) and rng.random() < 0.4,
         "recycle_share": rng.choice((1.0, 0.5)),
         "kernel": rng.choice(("auto", "torch")),
         "ego": {
@@ -227,7 +228,7 @@ def of_the_state(
     }
     # With an ego that keeps its lane, rule-driven cars never touch each other.
     alone = choice["policy"] == "keep" and "blind_share" not in choice["traffic"]
-    if rule_driven and alone and choice["env"] in ("highway", "dense"):
+    if rule_driven and alone and choice["env"] in ("highway", "dense", *ROADS):
         touching = pair_overlaps(now).any(-1).any(-1)
         holds["rule-driven cars overlap"] = ~touching | after[keys.EVENTS, "hard_crash"][:, 0]
     return holds

@@ -19,6 +19,7 @@ from ganlane.generator.fit import (
     assign_folds,
     cross_validate,
     fit_generator,
+    site_scores,
     split_for_fit,
 )
 from ganlane.generator.networks import Discriminator, Generator
@@ -57,5 +58,6 @@ __all__ = [
     "load_human",
     "scene_tracks",
     "shipped_generator",
+    "site_scores",
     "split_for_fit",
 ]

@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ from sklearn.model_selection import GroupKFold
 from ganlane.data import TRACK, driving_statistics
 from ganlane.data.dense import Recording
 from ganlane.errors import UserError
-from ganlane.generator.checkpoint import FitResult, Metrics, load_human
+from ganlane.generator.checkpoint import FitResult, Metrics, load_generator, load_human
 from ganlane.generator.forecasts import (
     BASELINE,
     SAMPLES,
@@ -40,7 +40,12 @@ from ganlane.generator.forecasts import (
 )
 from ganlane.generator.human_estimator import HumanModel
 from ganlane.generator.human_fit import fit_human
-from ganlane.generator.human_forecasts import fit_observer, human_forecasts, recording_of
+from ganlane.generator.human_forecasts import (
+    fit_observer,
+    human_forecasts,
+    recording_of,
+    tracks_of,
+)
 from ganlane.generator.tasks import (
     CalibratedTask,
     FitLoop,
@@ -59,6 +64,7 @@ from ganlane.generator.windows import (
     join_windows,
     scene_tracks,
 )
+from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.generator import (
     GENERATOR,
     HUMAN,
@@ -66,6 +72,7 @@ from ganlane.settings.generator import (
     HumanConfig,
     HumanSizes,
     PaperConfig,
+    shipped_generator,
 )
 from ganlane.weights import save_weights
 
@@ -203,6 +210,60 @@ class HumanTask(NamedTuple):
         forecasts = human_forecasts(self.generator, scenes, PREDICTED_STEPS, STRIDE)
         forecasts[BASELINE] = repeated(windows.past[:, -1], PREDICTED_STEPS)
         return scene_metrics(windows, forecasts)
+
+
+#: Segments of a site that are forecast, at most: the first ones of each.
+SITE_SCENES = 400
+#: Frames between two forecasts of 0.8 and of 5 s at other sites.
+SITE_STRIDES = {PREDICTED_STEPS: 10, LONG_STEPS: 25}
+
+
+def site_scores(
+    model: HumanModel, sites: Mapping[str, Sequence[Recording]]
+) -> dict[str, dict[str, float]]:
+    """Forecasts of sites that ``model`` was not fitted to, by site.
+
+    Of the cars that follow, not of those whose own leaders were not recorded. Windows; constant
+    velocity's ADE over 0.8 s and RMSE at 5 s, m; and by forecaster both errors over constant
+    velocity's: the mean driver, ``gan_calibrated`` as it ships, and IDM with each driver's own
+    headway.
+    """
+    calibrated, _ = load_generator(shipped_generator("calibrated"), "calibrated")
+    settings = CalibratedConfig()
+    scores: dict[str, dict[str, float]] = {}
+    for site, recordings in sites.items():
+        recordings = recordings[:SITE_SCENES]
+        scenes = [tracks_of(recording) for recording in recordings]
+        driven = {recording.name: recording.driven for recording in recordings}
+        row = scores[site] = {}
+        for steps, stride in SITE_STRIDES.items():
+            windows = cut_windows(scenes, stride, OBSERVED_POSITIONS + steps)
+            baseline = repeated(windows.past[:, -1], steps)
+            forecasts = {
+                "human": human_forecasts(model, scenes, steps, stride, samples=1)["mean"],
+                "gan_calibrated": calibrated_forecasts(
+                    calibrated, scenes, steps, stride, settings, samples=1
+                )["mean"],
+                "idm_own_headway": idm_forecasts(scenes, steps, stride)["idm_own_headway"],
+            }
+            name = f"{steps * PHYSICS_STEP_S:g} s"
+            follows = [driven[scene][car] for scene, car in zip(windows.scene, windows.vehicle)]
+            recorded = windows.future[follows]
+
+            def error(
+                positions: np.ndarray,
+                recorded: np.ndarray = recorded,
+                follows: list[bool] = follows,
+            ) -> float:
+                distance = np.linalg.norm(positions[follows] - recorded, axis=-1)
+                if distance.shape[1] == PREDICTED_STEPS:
+                    return float(distance.mean())
+                return float(np.sqrt(np.square(distance[:, -1]).mean()))
+
+            own = error(baseline)
+            row |= {f"windows, {name}": len(recorded), f"constant velocity, {name}, m": own}
+            row |= {f"{of}, {name}": error(its) / own for of, its in forecasts.items()}
+    return scores
 
 
 class Fitted(NamedTuple):

@@ -252,6 +252,19 @@ def _with_noise(scene: SceneTracks, share: float, config: HumanConfig) -> SceneT
     return replace(scene, positions=without + share * (scene.positions - without))
 
 
+def tracks_of(recording: Recording) -> SceneTracks:
+    """A recording as scene tracks."""
+    lane = np.rint(recording.y / recording.lane_width_m).clip(0, recording.lanes - 1)
+    return SceneTracks(
+        recording.name,
+        recording.lane_width_m,
+        np.stack((recording.x, recording.y), -1),
+        lane.astype(np.int64),
+        recording.present,
+        recording.length,
+    )
+
+
 def recording_of(scene: SceneTracks) -> Recording:
     """The scene as a recording."""
     count = scene.present.shape[1]

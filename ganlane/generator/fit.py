@@ -260,9 +260,9 @@ def site_scores(
                     return float(distance.mean())
                 return float(np.sqrt(np.square(distance[:, -1]).mean()))
 
-            own = error(baseline)
-            row |= {f"windows, {name}": len(recorded), f"constant velocity, {name}, m": own}
-            row |= {f"{of}, {name}": error(its) / own for of, its in forecasts.items()}
+            of_baseline = error(baseline)
+            row |= {f"windows, {name}": len(recorded), f"constant velocity, {name}, m": of_baseline}
+            row |= {f"{of}, {name}": error(its) / of_baseline for of, its in forecasts.items()}
     return scores
 
 

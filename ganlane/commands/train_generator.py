@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -294,7 +294,17 @@ def fold_tables(folds: Mapping[str, Any]) -> str:
     ]
     if "rollout" in folds:
         tables.append(_rollout(folds["rollout"]))
+        tables.append(_rollout_by_fold(folds["rollout"]["folds"]))
     return "\n\n".join(map(aligned, tables))
+
+
+def _rollout_by_fold(ratios: Sequence[Mapping[str, float]]) -> Lines:
+    """RMSE at 5 s over that of constant velocity, fold by fold."""
+    kinds = [kind for kind in ("mean", "single", "idm_own_headway") if kind in ratios[0]]
+    lines = [["RMSE at 5 s to CV, by fold", *kinds]]
+    for number, ratio in enumerate(ratios):
+        lines.append([str(number), *(f"{ratio[kind]:.2f}" for kind in kinds)])
+    return lines
 
 
 def _pooled(scores: Mapping[str, Any]) -> Lines:

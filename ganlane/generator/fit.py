@@ -540,6 +540,9 @@ def cross_validate(
     }
     if long:
         scores["rollout"] = long_rollout_scores(*pooled(long))
+        scores["rollout"]["folds"] = [
+            long_rollout_scores(*part)["ratio_to_constant_velocity"] for part in long
+        ]
     return scores, results
 
 

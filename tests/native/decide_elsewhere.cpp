@@ -1,0 +1,56 @@
+// Decisions of the kernel for another processor: arrays and settings in by a file, arrays out by another one
+// (test_native_processors.py writes and reads them).
+
+#include <stdio.h>
+
+#include "kernel.cpp"
+
+static FILE* file;
+
+static void take(void* to, size_t bytes) {
+    if (fread(to, 1, bytes, file) != bytes) abort();
+}
+
+static int64_t number() {
+    int64_t n;
+    take(&n, sizeof n);
+    return n;
+}
+
+int main(int, char** names) {
+    file = fopen(names[1], "rb");
+    int64_t rows = number(), decisions = number(), count = number();
+    Settings settings;
+    if (number() != sizeof settings) return 3;
+    take(&settings, sizeof settings);
+    Human human;
+    int64_t weights = number();
+    if (weights) {
+        if (number() != sizeof human) return 4;
+        take(&human, sizeof human);
+        float* packed = (float*)scratch(weights * sizeof(float));
+        take(packed, weights * sizeof(float));
+        human.weights = packed, settings.human = &human;
+    }
+    char** arrays = (char**)calloc(count, sizeof(char*));
+    int64_t* sizes = (int64_t*)calloc(count, sizeof(int64_t));
+    for (int64_t k = 0; k < count; k++) {
+        sizes[k] = number();
+        arrays[k] = (char*)scratch(sizes[k]);
+        take(arrays[k], sizes[k]);
+    }
+    // Inputs and outputs: places in `arrays`; -1 is a null pointer.
+    void* pointers[2][128] = {};
+    for (int side = 0; side < 2; side++) {
+        int64_t names_of_side = number();
+        for (int64_t k = 0; k < names_of_side; k++) {
+            int64_t place = number();
+            pointers[side][k] = place < 0 ? nullptr : arrays[place];
+        }
+    }
+    for (int64_t k = 0; k < decisions; k++)
+        if (int failed = ganlane_decide(&settings, (Inputs*)pointers[0], (Outputs*)pointers[1], 0, rows)) return failed;
+    file = fopen(names[2], "wb");
+    for (int64_t k = 0; k < count; k++) fwrite(arrays[k], 1, sizes[k], file);
+    return fclose(file);
+}

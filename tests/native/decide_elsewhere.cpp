@@ -23,14 +23,23 @@ int main(int, char** names) {
     Settings settings;
     if (number() != sizeof settings) return 3;
     take(&settings, sizeof settings);
-    Human human;
-    int64_t weights = number();
-    if (weights) {
-        if (number() != sizeof human) return 4;
-        take(&human, sizeof human);
-        float* packed = (float*)scratch(weights * sizeof(float));
-        take(packed, weights * sizeof(float));
-        human.weights = packed, settings.human = &human;
+    // Structures that the settings point to, in the order of `described`; each begins with a pointer to its weights if it
+    // has any.
+    const void** pointers_of_settings[] = {(const void**)&settings.generated, (const void**)&settings.human,
+                                           (const void**)&settings.faults, (const void**)&settings.random,
+                                           (const void**)&settings.ends};
+    for (const void** pointer : pointers_of_settings) {
+        int64_t bytes = number(), weights = number();
+        *pointer = nullptr;
+        if (!bytes) continue;
+        char* structure = (char*)scratch(bytes);
+        take(structure, bytes);
+        if (weights) {
+            float* packed = (float*)scratch(weights * sizeof(float));
+            take(packed, weights * sizeof(float));
+            *(float**)structure = packed;
+        }
+        *pointer = structure;
     }
     char** arrays = (char**)calloc(count, sizeof(char*));
     int64_t* sizes = (int64_t*)calloc(count, sizeof(int64_t));

@@ -1,4 +1,4 @@
-"""An Arm processor, here an emulated one, drives the same episodes as this one, bit for bit."""
+"""Emulated processors drive the same episodes as this one, bit for bit: Arm, older x86."""
 
 from __future__ import annotations
 
@@ -9,41 +9,72 @@ import struct
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from ganlane.native.batch import NativeBatch
-from ganlane.native.drivers import Human, drivers_of, parts_of
-from ganlane.native.library import FLAGS, why_not
-from ganlane.native.settings import Layout
+from ganlane.native.drivers import drivers_of, parts_of
+from ganlane.native.library import FLAGS, VARIANTS, why_not
+from ganlane.native.settings import Layout, ends_of
 from ganlane.settings.driving import IdmParameters, MobilParameters
 from ganlane.settings.record import make
+from ganlane.settings.road import WALL, LaneStretch
 from ganlane.settings.traffic import TrafficConfig
 
-EMULATOR = shutil.which("qemu-aarch64")
 HERE = Path(__file__).parent
 KERNEL = HERE.parents[1] / "ganlane" / "native"
 ROWS, DECISIONS = 6, 8
+#: Structures that the settings point to, in the order in which decide_elsewhere.cpp reads them.
+POINTED = ("generated", "human", "faults", "random", "ends")
+#: The left lane of three ends where cars that start near the ego soon come to.
+LANE_DROP = (LaneStretch(), LaneStretch(), LaneStretch(end_m=150.0, end=WALL))
+
+
+class Processor(NamedTuple):
+    """What the kernel is compiled for, by which of its variants, and what it is driven by."""
+
+    target: str
+    variant: str
+    emulator: tuple[str, ...]
+
+    def command(self) -> list[str] | None:
+        """The emulator, by its usual or by its statically linked name; None if not installed."""
+        name, *options = self.emulator
+        path = shutil.which(name) or shutil.which(f"{name}-static")
+        return None if path is None else [path, *options]
+
+
+PROCESSORS = {
+    "64-bit Arm": Processor("aarch64-linux-musl", "default", ("qemu-aarch64",)),
+    "x86 without AVX": Processor("x86_64-linux-musl", "default", ("qemu-x86_64", "-cpu", "qemu64")),
+    "x86 with AVX2": Processor("x86_64-linux-musl", "AVX2", ("qemu-x86_64", "-cpu", "Haswell")),
+}
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(why_not() is not None, reason="no C++ compiler"),
-    pytest.mark.skipif(EMULATOR is None, reason="qemu-aarch64 is not installed"),
     pytest.mark.skipif(
         importlib.util.find_spec("ziglang") is None, reason="ziglang is not installed"
     ),
 ]
 
 
-@pytest.fixture(scope="module")
-def program(tmp_path_factory):
-    """The kernel and a main function, for an Arm processor."""
-    path = tmp_path_factory.mktemp("arm") / "decide"
+@pytest.fixture(scope="module", params=PROCESSORS)
+def program(request, tmp_path_factory):
+    """The kernel and a main function for another processor, as a command that drives them."""
+    processor = PROCESSORS[request.param]
+    command = processor.command()
+    if command is None:
+        pytest.skip(f"{processor.emulator[0]} is not installed")
+    path = tmp_path_factory.mktemp("elsewhere") / "decide"
+    variant = VARIANTS[processor.variant]
     flags = [flag for flag in FLAGS if flag not in ("-shared", "-fPIC")]
-    compiler = [sys.executable, "-m", "ziglang", "c++", "-target", "aarch64-linux-musl", "-static"]
-    sources = [str(HERE / "decide_elsewhere.cpp"), f"-I{KERNEL}", "-DLANES=4"]
-    subprocess.run([*compiler, *flags, *sources, "-o", str(path)], check=True)
-    return path
+    compiler = [sys.executable, "-m", "ziglang", "c++", "-target", processor.target, "-static"]
+    sources = [str(HERE / "decide_elsewhere.cpp"), f"-I{KERNEL}", f"-DLANES={variant.lanes}"]
+    arguments = [*compiler, *flags, *variant.flags, *sources, "-o", str(path)]
+    subprocess.run(arguments, check=True)
+    return [*command, str(path)]
 
 
 def described(batch, layout):
@@ -51,17 +82,20 @@ def described(batch, layout):
     settings = batch._parts[0].pointed["settings"]
     names = list(batch.state)
     parts = [struct.pack("qqq", ROWS, DECISIONS, len(names))]
-    human = next((one for one in settings.pointed if isinstance(one, Human)), None)
     kind = type(settings)
-    alone = kind.from_buffer_copy(settings)
-    for name in ("generated", "human", "faults", "random", "ends"):
-        setattr(alone, name, None)
-    parts += [struct.pack("q", ctypes.sizeof(kind)), bytes(alone)]
-    if human is None:
-        parts.append(struct.pack("q", 0))
-    else:
-        sizes = struct.pack("qq", len(human.packed), ctypes.sizeof(human))
-        parts += [sizes, bytes(human), human.packed.tobytes()]
+    parts += [struct.pack("q", ctypes.sizeof(kind)), bytes(settings)]
+    structures = {ctypes.addressof(structure): structure for structure in settings.pointed}
+    for name in POINTED:
+        address = getattr(settings, name)
+        if address is None:
+            parts.append(struct.pack("qq", 0, 0))
+            continue
+        structure = structures[address]
+        weights = getattr(structure, "packed", None)
+        count = 0 if weights is None else len(weights)
+        parts += [struct.pack("qq", ctypes.sizeof(structure), count), bytes(structure)]
+        if weights is not None:
+            parts.append(weights.tobytes())
     for name in names:
         numbers = batch.state[name].tobytes()
         parts += [struct.pack("q", len(numbers)), numbers]
@@ -71,17 +105,25 @@ def described(batch, layout):
     return b"".join(parts)
 
 
-@pytest.mark.parametrize("traffic", ["idm", "idm_mobil", "human"])
-def test_an_arm_processor_drives_the_same_episodes(traffic, program, tmp_path):
+@pytest.mark.parametrize("ends", [(), LANE_DROP], ids=["highway", "lane_drop"])
+@pytest.mark.parametrize(
+    "traffic",
+    ["idm", "idm_mobil", "idm_faults", "idm_random", "gan", "gan_calibrated", "human"],
+)
+def test_another_processor_drives_the_same_episodes(traffic, ends, program, tmp_path):
     drivers = drivers_of(make(TrafficConfig, traffic), IdmParameters(), MobilParameters(), 0)
     batch = NativeBatch(ROWS, drivers=drivers)
+    settings = batch._parts[0].pointed["settings"]
+    for name, structure in ends_of(ends).items():
+        setattr(settings, name, ctypes.addressof(structure))
+        settings.pointed.append(structure)
     batch.start(0, np.arange(ROWS))
     batch.state["action"][:] = [0, 1, 2, 0, 0, 1]
     # Rows that end stay as they are, here and there.
     (part,) = parts_of(drivers)
     before, after = tmp_path / "before", tmp_path / "after"
     before.write_bytes(described(batch, Layout(part.memory)))
-    subprocess.run([EMULATOR, str(program), str(before), str(after)], check=True)
+    subprocess.run([*program, str(before), str(after)], check=True)
     for _ in range(DECISIONS):
         batch._parts[0].drive(batch._library.ganlane_decide, ROWS)
     there = after.read_bytes()

@@ -25,13 +25,19 @@ int main(int, char** names) {
     take(&settings, sizeof settings);
     // Structures that the settings point to, in the order of `described`; each begins with a pointer to its weights if it
     // has any.
-    const void** pointers_of_settings[] = {(const void**)&settings.generated, (const void**)&settings.human,
-                                           (const void**)&settings.faults, (const void**)&settings.random,
-                                           (const void**)&settings.ends};
-    for (const void** pointer : pointers_of_settings) {
+    struct {
+        const void** pointer;
+        int64_t size;
+    } structures[] = {{(const void**)&settings.generated, sizeof(Generated)},
+                      {(const void**)&settings.human, sizeof(Human)},
+                      {(const void**)&settings.faults, sizeof(Faults)},
+                      {(const void**)&settings.random, sizeof(Random)},
+                      {(const void**)&settings.ends, sizeof(Ends)}};
+    for (auto [pointer, size] : structures) {
         int64_t bytes = number(), weights = number();
         *pointer = nullptr;
         if (!bytes) continue;
+        if (bytes != size) return 4;
         char* structure = (char*)scratch(bytes);
         take(structure, bytes);
         if (weights) {

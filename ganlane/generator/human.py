@@ -52,6 +52,8 @@ EDGE_S, EDGE_M = 0.8, 0.15
 ANTICIPATION_S = 1.0
 #: Decisions after which a driver's age, and the time since its last lane change, count no more.
 LONGEST = 12.0
+#: What the driver behind would have to brake, among the numbers of a side.
+REAR_BRAKING = 9
 #: The probabilities of both lane changes together are at most this.
 _MOST_LIKELY = 0.98
 
@@ -394,7 +396,7 @@ def leaves_room(side: Tensor) -> Tensor:
     brake harder than 2.5 m/s2; bool.
     """
     nearest = math.log1p(2.0) - 2.5
-    braking = torch.maximum(side[..., 9], side[..., 10])
+    braking = torch.maximum(side[..., REAR_BRAKING], side[..., 10])
     return (side[..., 0] > nearest) & (side[..., 1] > nearest) & (braking < 2.5)
 
 
@@ -431,12 +433,12 @@ class HumanPolicy(nn.Module):
         inner = self.trunk(features)
         return self.along(inner), self.across(inner)
 
-    def lane_chances(self, choice: LaneChoice) -> Tensor:
+    def lane_chances(self, choice: LaneChoice, factor: float = 1.0) -> Tensor:
         """Probabilities [..., 3]: to go on; to begin a change to the left, or break one off; to
-        begin one to the right.
+        begin one to the right. ``factor``: of the probabilities to begin one.
         """
         logits = self.lane(choice.sides)
-        begin = torch.sigmoid(logits[..., 0]) * choice.exists * _MOST_LIKELY
+        begin = torch.sigmoid(logits[..., 0]) * choice.exists * (_MOST_LIKELY * factor)
         total = begin.sum(-1, keepdim=True).clamp_min(1e-9)
         begin = begin * (total.clamp_max(_MOST_LIKELY) / total)
         stop = torch.sigmoid(torch.where(choice.to_left, logits[..., 0, 1], logits[..., 1, 1]))

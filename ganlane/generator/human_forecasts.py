@@ -47,9 +47,8 @@ from ganlane.generator.windows import (
     Segments,
 )
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.settings.driving import Visibility
+from ganlane.settings.driving import HumanVariation, Visibility
 from ganlane.settings.generator import HumanConfig
-from ganlane.settings.traffic import HumanTrafficConfig
 from ganlane.sim.state import Road, Vehicles
 
 #: A driver's desired speed is its present one and this much, m/s.
@@ -146,7 +145,7 @@ def _driven(
     vehicles, memory, road = present_of(model.estimator, segments.repeated(runs))
     mean = torch.zeros_like(vehicles.valid)
     mean[:rows] = True
-    temperature = HumanTrafficConfig.temperature
+    temperature = HumanVariation.temperature
     steps = torch.arange(1, STEPS + 1) * PHYSICS_STEP_S
     course = []
     for decision in range(-(-horizon // STEPS)):

@@ -33,6 +33,7 @@ from ganlane.native.settings import (
 from ganlane.settings.driving import (
     DriverFaults,
     EgoParameters,
+    HumanVariation,
     IdmParameters,
     MobilParameters,
     RandomDrivers,
@@ -118,6 +119,7 @@ class RuleDrivers(NamedTuple):
     faults: DriverFaults | None = None
     random: RandomDrivers | None = None
     stream: int = 0
+    blind_share: float = 0.0
     #: When others see a lane change.
     visibility: Visibility = Visibility.SIGNALLED
 
@@ -174,6 +176,7 @@ class GeneratedDrivers:
     anchor: AnchorParameters | None = None
     checked_changes: CalibratedChanges = field(default_factory=CalibratedChanges)
     headways_s: tuple[float, ...] = ()
+    blind_share: float = 0.0
 
     #: Of the ego: the others do not steer.
     steering: ClassVar[SteeringParameters] = SteeringParameters()
@@ -221,14 +224,16 @@ class HumanDrivers:
         idm: the ego's.
         sizes, weights: of the policy, by the names of its ``state_dict``.
         stream: family of episodes that the random numbers belong to.
-        temperature: of the distributions.
+        variation: how they differ from the fitted ones.
+        blind_share: of the episodes: nobody sees the ego.
     """
 
     idm: IdmParameters
     sizes: HumanSizes
     weights: Weights = field(repr=False)
     stream: int
-    temperature: float
+    variation: HumanVariation
+    blind_share: float = 0.0
 
     steering: ClassVar[SteeringParameters] = SteeringParameters()
     visibility: ClassVar[Visibility] = Visibility.BODY
@@ -250,7 +255,7 @@ class HumanDrivers:
         packed = _aligned(
             _layer(w[f"{name}.weight"], w[f"{name}.bias"]) for name in _human_layers(self.sizes)
         )
-        human = Human(weights=packed.ctypes.data, **vars(self.sizes), temperature=self.temperature)
+        human = Human(weights=packed.ctypes.data, **vars(self.sizes), **vars(self.variation))
         human.packed = packed
         return {"human": human}
 
@@ -338,6 +343,22 @@ def mixed_drivers(parts: Mapping[str, Drivers | None], shares: Mapping[str, int]
     return mixed if same else None
 
 
+def blind(drivers: Drivers, share: float) -> Drivers | None:
+    """These drivers, who do not see the ego in a ``share`` of the episodes; None where some of
+    them are blind in others.
+    """
+    if isinstance(drivers, MixedDrivers):
+        parts = {name: blind(part, share) for name, part in drivers.parts.items()}
+        if None in parts.values():
+            return None
+        return drivers._replace(parts=parts)  # type: ignore[arg-type]
+    if drivers.blind_share:
+        return None
+    if isinstance(drivers, RuleDrivers):
+        return drivers._replace(blind_share=share)
+    return replace(drivers, blind_share=share)
+
+
 def _memory(*names: str) -> Key:
     return (keys.TRAFFIC, *names)
 
@@ -364,6 +385,7 @@ def decision_settings(
         drivers.steering,
         drivers.mobil,
         drivers.stream,
+        drivers.blind_share,
         drivers.structures() | ends_of(stretches, drivers.mobil),
     )
 
@@ -439,7 +461,8 @@ class Human(ctypes.Structure):
     _fields_ = [
         *fields(c_void_p, "weights"),
         *fields(c_int32, "hidden lane_hidden"),
-        *fields(c_float, "temperature"),
+        *fields(c_float, "temperature lane_changes politeness"),
+        *fields(c_int32, "delayed"),
     ]
 
     #: The array that ``weights`` points to.
@@ -737,8 +760,13 @@ def drivers_of(
     Raises:
         UserError: the weights are missing, foreign, of the other preset, or do not fit.
     """
-    if traffic.blind_share:
-        return None
+    drivers = _who_see(traffic, idm, mobil, stream)
+    return blind(drivers, traffic.blind_share) if drivers and traffic.blind_share else drivers
+
+
+def _who_see(
+    traffic: TrafficConfig, idm: IdmParameters, mobil: MobilParameters, stream: int
+) -> Drivers | None:
     if type(traffic) is IdmTrafficConfig:
         return RuleDrivers(idm)
     if type(traffic) is IdmMobilTrafficConfig:
@@ -777,13 +805,14 @@ def _human(traffic: HumanTrafficConfig, idm: IdmParameters, stream: int) -> Huma
     source = Path(traffic.path or shipped_generator("human"))
     weights, metadata = load_arrays(source, GENERATOR)
     sizes = human_sizes(source, metadata)
-    return human_drivers(weights, sizes, traffic.temperature, idm, stream, source)
+    variation = part_of(traffic, HumanVariation)
+    return human_drivers(weights, sizes, variation, idm, stream, source)
 
 
 def human_drivers(
     weights: Weights,
     sizes: HumanSizes,
-    temperature: float,
+    variation: HumanVariation,
     idm: IdmParameters,
     stream: int,
     source: object,
@@ -803,7 +832,7 @@ def human_drivers(
         shapes |= {f"{name}.weight": (outputs, inputs), f"{name}.bias": (outputs,)}
     if {name: array.shape for name, array in policy.items()} != shapes:
         raise misfit(source, vars(sizes))
-    return HumanDrivers(idm, sizes, policy, stream, temperature)
+    return HumanDrivers(idm, sizes, policy, stream, variation)
 
 
 def _human_layers(sizes: HumanSizes) -> dict[str, tuple[int, int]]:

@@ -145,7 +145,7 @@ static void look(const Rows& r, Crowd& c) {
                 c.displacement[2 * row + k] = motion[k];
             }
             c.position[2 * row] = at(r.x, i, lane), c.position[2 * row + 1] = at(r.y, i, lane);
-            c.valid[row] = at(r.valid, i, lane) != 0.0f;
+            c.valid[row] = at(r.valid, i, lane) != 0.0f && !(r.unseen[lane] && at(r.index, i, lane) == 0.0f);
         }
 }
 

@@ -11,7 +11,8 @@
 struct Human {
     const float* weights;  // in the order of `layers_of`, aligned to a vector
     int32_t hidden, lane_hidden;
-    float temperature;
+    float temperature, lane_changes, politeness;
+    int32_t delayed;  // decisions by which accelerations come late
 };
 
 const int DECISION_STEPS = 4, FEATURES = 65, SIDE_FEATURES = 17;
@@ -123,8 +124,7 @@ static void see(const Settings& s, const Rows& r, Humans& m) {
         Float lane = m.lane[i] = lane_of(s, r.y[i]);
         Float soon = lane_of(s, r.y[i] + ANTICIPATION_S * m.lateral[i]);
         soon = smaller(larger(soon, lane - 1.0f), lane + 1.0f);
-        Mask valid = r.valid[i] != 0.0f;
-        m.low[i] = choose(valid, smaller(lane, soon), filled(NOBODY_M)), m.high[i] = larger(lane, soon);
+        m.low[i] = choose(visible(r, i), smaller(lane, soon), filled(NOBODY_M)), m.high[i] = larger(lane, soon);
     }
     Float zero = filled(0.0f);
     for (int i = 0; i < r.vehicles; i++)
@@ -247,7 +247,7 @@ static inline void side_of(const Settings& s, const Rows& r, const Humans& m, in
         between(rear.closing, -5.0f, 5.0f) / 3.0f,
         here / 3.0f,
         (there - here) / 3.0f,
-        needed_braking(rear.closing, rear.gap),
+        m.h->politeness * needed_braking(rear.closing, rear.gap),
         needed_braking(-front.closing, front.gap),
         between(1.5f - front.gap, 0.0f, 2.0f),
         between(1.5f - rear.gap, 0.0f, 2.0f),
@@ -380,8 +380,9 @@ static inline void choose_lane(const Settings& s, Rows& r, Humans& m, int i, Mas
     Mask keeping = target == lane;
     Mask to_left = lane + 1.0f <= (float)(s.lanes - 1), to_right = lane - 1.0f >= 0.0f;
     if (s.ends) to_left = ways.left, to_right = ways.right;
-    Float left = choose(to_left, MOST_LIKELY * sigmoid(logits[0]), zero);
-    Float right = choose(to_right, MOST_LIKELY * sigmoid(logits[2]), zero);
+    float most = MOST_LIKELY * m.h->lane_changes;
+    Float left = choose(to_left, most * sigmoid(logits[0]), zero);
+    Float right = choose(to_right, most * sigmoid(logits[2]), zero);
     Float total = larger(left + right, filled(1e-9f)), share = smaller(total, filled(MOST_LIKELY)) / total;
     Float stop = sigmoid(choose(target > lane, logits[1], logits[3]));
     Float first = larger(choose(keeping, left * share, stop), filled(1e-9f));
@@ -433,7 +434,7 @@ static inline void commit(const Settings& s, Rows& r, const Humans& m, int i, Ma
     set(LATERAL_SPEEDS + 1, r.memory[LATERAL_SPEEDS][i]), set(LATERAL_SPEEDS, lateral);
     set(CLOSING + 1, r.memory[CLOSING][i]), set(CLOSING, m.ahead[3 * i + MIDDLE_LANE].closing);
     set(AGE, r.memory[AGE][i] + 1.0f), set(SINCE, r.memory[SINCE][i] + 1.0f);
-    set(DECIDED_ALONG, acceleration), set(LATERAL_FROM, lateral), set(LATERAL_TO, across);
+    set(DECIDED_ALONG, r.memory[ACCELERATIONS + m.h->delayed][i]), set(LATERAL_FROM, lateral), set(LATERAL_TO, across);
 }
 
 // The others' decisions in the environments that are `due`; the ego decides elsewhere.

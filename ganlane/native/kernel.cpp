@@ -252,6 +252,14 @@ static Command obey(const Settings& s, const Inputs& in, long row) {
     return {wish ? wish : direction, target + wish, wish != 0, off_road, in.speed[row * s.vehicles], in.step[row]};
 }
 
+// Whether nobody sees the ego in an episode (ganlane.traffic.BlindTraffic).
+static inline bool is_blind(const Settings& s, uint64_t episode) {
+    if (s.blind_share == 0.0) return false;
+    const int64_t ego = 0;
+    uint64_t key = absorb(absorb(before_first_step(episode), ego), BLIND_EPISODE);
+    return (double)(key >> 11) * (1.0 / 9007199254740992.0) < s.blind_share;
+}
+
 static void load(const Settings& s, const Inputs& in, Rows& r, const Block& block, Command* commands) {
     for (int lane = 0; lane < LANES; lane++) {
         long start = block.row[lane] * s.vehicles;
@@ -293,6 +301,7 @@ static void load(const Settings& s, const Inputs& in, Rows& r, const Block& bloc
         r.step[lane] = (float)command.step;
         r.start_step[lane] = command.step;
         r.episode_key[lane] = episode_key(s.stream, in.seed[row], in.episode[row]);
+        r.unseen[lane] = is_blind(s, r.episode_key[lane]) ? -1 : 0;
     }
     for (int i = 0; i < s.vehicles; i++) r.slip[i] = slip_of(r.steering[i]), r.slip_sine[i] = sine_of(r.slip[i]);
     r.crash = r.goal = r.missed_exit = none();
@@ -409,9 +418,8 @@ extern "C" int ganlane_decide(const Settings* settings, const Inputs* in, const 
     return 0;
 }
 
-// Step -1 of a key of its own: apart from the draws of the steps.
 static inline uint64_t before_first_step(const Settings& s, const Scene& scene, long row) {
-    return absorb(absorb(episode_key(s.stream, scene.seed[row], scene.episode[row]), 0), -1);
+    return before_first_step(episode_key(s.stream, scene.seed[row], scene.episode[row]));
 }
 
 // First scenes, as far as drivers see them.
@@ -419,6 +427,7 @@ static void load_scene(const Settings& s, Rows& r, const Scene& scene, const Out
     for (int lane = 0; lane < LANES; lane++) {
         long row = block.row[lane];
         r.step_key[lane] = before_first_step(s, scene, row);
+        r.unseen[lane] = 0;  // the first memory is that of drivers who see
         for (int i = 0; i < s.vehicles; i++) {
             long from = row * s.vehicles + i;
             at(r.index, i, lane) = (float)i;

@@ -26,6 +26,7 @@ struct Settings {
     float lane_width, per_lane_width;
     int32_t lanes, vehicles, substeps, timeout_steps, mobil, abort_lane_change;
     int64_t stream;  // family of episodes that random numbers belong to
+    double blind_share;  // of the episodes: nobody sees the ego
     const struct Generated* generated;  // generated.hpp; null: the others are rule-driven
     const struct Human* human;          // human.hpp; null: they are not of `traffic=human`
     const struct Faults* faults;        // faults.hpp; null: drivers make none

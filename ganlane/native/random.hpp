@@ -15,6 +15,9 @@ static inline uint64_t episode_key(int64_t stream, int64_t seed, int64_t episode
     return absorb(absorb(absorb((uint64_t)stream, 0), seed), episode);
 }
 
+// Step -1 of a key of its own: apart from the draws of the steps.
+static inline uint64_t before_first_step(uint64_t episode) { return absorb(absorb(episode, 0), -1); }
+
 static inline float uniform_of(uint64_t key) { return (float)(key >> 40) * (1.0f / 16777216.0f); }
 
 // Purpose of ganlane.sim.random.
@@ -22,5 +25,5 @@ enum {
     SPAWN_LANE, SPAWN_POSITION, SPAWN_SPEED, SPAWN_DESIRED_SPEED,
     CHANGE_HAZARD = 5, CHANGE_SIDE, CHANGE_SPEED, SUDDEN_ACCELERATION, OWN_HEADWAY,
     FAULT = 11, LATE_REACTION, HESITANT_CHANGE, ABORTED_CHANGE,
-    NOISE = 16, DRIVER = 70, SPAWN_TRUCK = 90, RECYCLED_EPISODE = 91,
+    NOISE = 16, BLIND_EPISODE = 69, DRIVER = 70, SPAWN_TRUCK = 90, RECYCLED_EPISODE = 91,
 };

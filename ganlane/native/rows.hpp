@@ -40,6 +40,7 @@ struct Rows {
     Nearest* nearest;  // [lanes]
     // Of the rows: whether they go on, physics steps since MOBIL's last decision and in all, and the ego's events.
     Mask running, ahead, behind, crash, goal, missed_exit;
+    Mask unseen;  // the ego, to everybody
     Float phase, step, onsets, onsets_behind;
     // Keys of the random numbers: of the episode, and of this step; physics steps at the start of the decision.
     uint64_t episode_key[LANES], step_key[LANES];
@@ -71,6 +72,9 @@ static void lay_out(Rows& rows, Float* scratch, const Settings& s) {
 }
 
 INLINE Mask is_ego(const Rows& r, int i) { return r.index[i] == 0.0f; }
+
+// Whether the others know of vehicle i.
+INLINE Mask visible(const Rows& r, int i) { return (r.valid[i] != 0.0f) & ~(r.unseen & is_ego(r, i)); }
 
 // Exchange two vehicles where `mask` holds; what follows from the state is computed anew afterwards, but for the slip
 // angle and its sine: they follow from the steering alone, which `drive` has at hand and find_lanes does not need.
@@ -108,7 +112,7 @@ static inline void find_lanes(const Settings& s, Rows& r, bool turned = true) {
     for (int i = 0; i < r.vehicles; i++) {
         if (turned) sincos_of(r.heading[i], r.sine[i], r.cosine[i]);
         LanesOf l = lanes_of(s, r.y[i], r.sine[i], r.cosine[i], r.half_length[i], r.half_width[i], r.target[i],
-                             r.visibility[i], r.valid[i] != 0.0f);
+                             r.visibility[i], visible(r, i));
         r.extent[i] = l.extent;
         r.body_low[i] = l.body_low, r.body_high[i] = l.body_high, r.low[i] = l.low, r.high[i] = l.high;
         r.seen_low[i] = l.seen_low, r.seen_high[i] = l.seen_high;

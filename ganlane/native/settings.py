@@ -168,6 +168,7 @@ class Settings(ctypes.Structure):
         ),
         *fields(c_int32, "lanes vehicles substeps timeout_steps mobil abort_lane_change"),
         *fields(c_int64, "stream"),
+        *fields(c_double, "blind_share"),
         *fields(c_void_p, "generated human faults random ends"),
     ]
 
@@ -260,11 +261,13 @@ def settings_of(
     steering: SteeringParameters | None = None,
     mobil: MobilParameters | None = None,
     stream: int = 0,
+    blind_share: float = 0.0,
     pointed: Mapping[str, ctypes.Structure] = MappingProxyType({}),
 ) -> Settings:
     """The numbers of road, driving and episode.
 
-    ``mobil=None``: the others keep their lanes. ``pointed``: further structures of the drivers, by
+    ``mobil=None``: the others keep their lanes. ``blind_share`` of the episodes: nobody sees the
+    ego. ``pointed``: further structures of the drivers, by
     their names in ``Settings``; of generated ones only MOBIL's limits of a lane change count.
     """
     episode = episode or EpisodeParameters()
@@ -287,6 +290,7 @@ def settings_of(
         "timeout_steps": round(episode.timeout_s / keys.PHYSICS_STEP_S),
         "mobil": mobil is not None and "generated" not in pointed,
         "stream": stream,
+        "blind_share": blind_share,
     }
     # ctypes has the addresses alone, so the structures are held beside them.
     for name in ("generated", "human", "faults", "random", "ends"):

@@ -23,6 +23,7 @@ from ganlane.settings.record import (
     Rule,
     Share,
     at_least,
+    between,
     one_of,
 )
 
@@ -239,6 +240,26 @@ class AbortFaults(Record):
 
     share: Share = 0.1
     at: Share = 0.5
+
+
+@dataclass(frozen=True)
+class HumanVariation(Record):
+    """How drivers of ``human`` differ from those recorded, one property each.
+
+    For experiments on what an agent learns from which property of traffic (docs/drivers.md).
+
+    Attributes:
+        temperature: of the distributions along and across; 1 as fitted, lower is calmer.
+        lane_changes: factor of the probability to begin a lane change.
+        politeness: factor of the braking that a lane change would ask of the driver behind, as the
+            driver takes it to be: 0, and it does not count.
+        delayed: decisions of 0.4 s by which accelerations come late.
+    """
+
+    temperature: Annotated[float, between(0.1, 2)] = 0.8
+    lane_changes: Annotated[float, between(0, 10)] = 1.0
+    politeness: Annotated[float, between(0, 10)] = 1.0
+    delayed: Annotated[int, between(0, 4)] = 0
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from ganlane.arguments import is_import_path
 from ganlane.errors import ParameterError
 from ganlane.settings.driving import (
     DriverFaults,
+    HumanVariation,
     RandomDrivers,
     Steps,
 )
@@ -194,18 +195,20 @@ class GanCalibratedTrafficConfig(TrafficConfig):
 
 
 @dataclass(frozen=True)
-class HumanTrafficConfig(TrafficConfig):
+class HumanTrafficConfig(TrafficConfig, HumanVariation):
     """``traffic=human``: a policy fitted to recorded drivers (:mod:`ganlane.traffic.human`).
 
     Attributes:
         path: weights of the preset 'human'; null: the ones that ship.
-        temperature: of the drivers' distributions; 1 as fitted, lower is calmer.
     """
 
     option = "human"
     _target_: ImportPath = "ganlane.traffic.presets.human_traffic"
     path: str | None = None
-    temperature: Annotated[float, between(0.1, 2)] = 0.8
+
+    def arguments(self) -> dict[str, Any]:
+        """The drivers' properties as one argument."""
+        return {"path": self.path, "variation": part_of(self, HumanVariation)}
 
 
 @dataclass(frozen=True)

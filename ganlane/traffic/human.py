@@ -16,6 +16,7 @@ from ganlane.generator.human import (
     ACROSS,
     ALONG,
     LATERAL_SPEEDS,
+    REAR_BRAKING,
     STEPS,
     HumanPolicy,
     View,
@@ -33,8 +34,7 @@ from ganlane.generator.human import (
 from ganlane.generator.human import Memory as DriverMemory
 from ganlane.generator.human_tuning import entering_memory
 from ganlane.native.drivers import HumanDrivers
-from ganlane.settings.driving import Visibility
-from ganlane.settings.traffic import HumanTrafficConfig
+from ganlane.settings.driving import HumanVariation, Visibility
 from ganlane.sim.idm import TABLE_V, acceleration_before_wall
 from ganlane.sim.lane_ends import WaysOut, ways_out
 from ganlane.sim.mobil import TABLE_IV
@@ -53,7 +53,7 @@ class HumanTraffic(TrafficModule):
     Args:
         policy: the fitted policy (:func:`ganlane.generator.load_human`).
         road, stream: as for every traffic module.
-        temperature: of the distributions along and across; 1 as fitted, lower is calmer.
+        variation: how they differ from the fitted ones.
         drivers: with which the native kernel drives as these do; None: it cannot.
     """
 
@@ -76,12 +76,12 @@ class HumanTraffic(TrafficModule):
         policy: HumanPolicy,
         road: Road | None = None,
         stream: int = Stream.TRAIN,
-        temperature: float = HumanTrafficConfig.temperature,
+        variation: HumanVariation | None = None,
         drivers: HumanDrivers | None = None,
     ) -> None:
         super().__init__(road, stream)
         self.policy = policy
-        self.temperature = temperature
+        self.variation = variation or HumanVariation()
         self._drivers = drivers
         self._idm = TABLE_V if drivers is None else drivers.idm
 
@@ -161,8 +161,10 @@ class HumanTraffic(TrafficModule):
         if self.road.stretches:
             ways = ways_out(vehicles, self.road, TABLE_IV.mandatory_m)
             view = view._replace(exists=torch.stack((ways.left, ways.right), -1))
-        chances = policy.lane_chances(lane_choice(vehicles, view))
-        choice = chosen(chances, u[2])
+        sides = view.sides.clone()
+        sides[..., REAR_BRAKING] *= self.variation.politeness
+        option = lane_choice(vehicles, view)._replace(sides=sides)
+        choice = chosen(policy.lane_chances(option, self.variation.lane_changes), u[2])
         if self.road.stretches:
             choice = _leaving(choice, ways, vehicles, view, u[3])
         target = new_target(vehicles, view, choice)
@@ -172,15 +174,15 @@ class HumanTraffic(TrafficModule):
         # Its moves follow the driver's choice.
         view = perceive(vehicles, driver, self.road)
         along, across = policy(view.features)
-        change = ALONG.sample(along, u[0], self.temperature)
-        aside = ACROSS.sample(across, u[1], self.temperature)
+        change = ALONG.sample(along, u[0], self.variation.temperature)
+        aside = ACROSS.sample(across, u[1], self.variation.temperature)
         acceleration, lateral = bounded(vehicles, driver, self.road, change, aside)
         if self.road.stretches:
             acceleration = torch.minimum(acceleration, self._before_walls(vehicles))
         driver = remembered(vehicles, driver, view, acceleration, target)
         return vehicles, {
             **driver._asdict(),
-            "acceleration": acceleration,
+            "acceleration": driver.accelerations[..., self.variation.delayed],
             "lateral_from": velocity(vehicles)[1],
             "lateral_to": lateral,
         }

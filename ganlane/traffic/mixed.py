@@ -15,7 +15,7 @@ from torch import Tensor
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
-from ganlane.native.drivers import Drivers, mixed_drivers
+from ganlane.native.drivers import Drivers, blind, mixed_drivers
 from ganlane.settings.traffic import interleaved
 from ganlane.sim.random import Purpose, absorb, uniform
 from ganlane.sim.state import VISIBILITY_OF_EPISODE, Vehicles
@@ -243,8 +243,7 @@ class BlindTraffic(TrafficModule):
 
     In these episodes the model gets a state in which the ego is invalid: no vehicle brakes or waits
     for it. The environment is as ever: the ego hits others, is hit, and observes. Whether an
-    episode is blind follows from (stream, seed, episode) alone. Memory: the model's as ``model``,
-    and ``unseen`` [N, M] bool, true for the ego of a blind episode.
+    episode is blind follows from (stream, seed, episode) alone. The memory is the model's.
 
     Args:
         model: the traffic.
@@ -267,52 +266,39 @@ class BlindTraffic(TrafficModule):
         self.rows_must_stay = model.rows_must_stay
         self.heeds_lane_ends = model.heeds_lane_ends
 
+    def native_drivers(self) -> Drivers | None:
+        """Those of the model, blind."""
+        drivers = self.model.native_drivers()
+        return None if drivers is None else blind(drivers, self.blind_share)
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``moved`` and ``traffic`` of the model, which does not see hidden egos."""
-        memory = memory_of(tensordict)
         vehicles = tensordict.get(keys.VEHICLES)
-        unseen = memory.get("unseen")
-        inputs = tensordict.copy()
-        # The copy is shallow: the state at t is not written to.
+        unseen = self.unseen(Vehicles.of(vehicles), key_of(tensordict, self.stream))
+        # The copies are shallow: the state at t is not written to.
         seen = vehicles.copy().set("valid", vehicles.get("valid") & ~unseen)
-        inputs.set(keys.VEHICLES, seen)
-        inputs.set(keys.TRAFFIC, memory_of(memory, "model"))
-        self.model(inputs)
+        inputs = self.model(tensordict.copy().set(keys.VEHICLES, seen))
         # What becomes of a hidden ego here does not matter: the environment overwrites it.
         tensordict.set(keys.MOVED, inputs.get(keys.MOVED))
-        new_memory = {"model": memory_of(inputs), "unseen": unseen}
-        tensordict.set(
-            keys.TRAFFIC,
-            new_tensordict(new_memory, tensordict.batch_size[0]),
-        )
-        return tensordict
+        return tensordict.set(keys.TRAFFIC, inputs.get(keys.TRAFFIC))
 
     def unseen(self, vehicles: Vehicles, key: Tensor) -> Tensor:
-        """The egos of blind episodes, bool [N, M].
-
-        ``key`` as for :meth:`TrafficModule.fresh_memory`.
-        """
-        # In float64, so that the same episodes are blind in runs of either float type.
-        u = uniform(key, -1, 1, [Purpose.BLIND_EPISODE], torch.float64)[..., 0]
+        """The egos of blind episodes, bool [N, M]; ``key`` [N] of the episodes."""
+        # Drawn before the first step, by a key of its own. In float64, so that the same episodes
+        # are blind in runs of either float type.
+        u = uniform(absorb(key, 0), -1, 1, [Purpose.BLIND_EPISODE], torch.float64)[..., 0]
         is_ego = torch.arange(vehicles.x.shape[1], device=key.device) == EGO_INDEX
         return (u < self.blind_share) & is_ego
 
     def enter(
         self, vehicles: Vehicles, key: Tensor, episode: Tensor
     ) -> tuple[Vehicles, TensorDictBase]:
-        """As the model, with ``unseen``."""
-        vehicles, memory = self.model.enter(vehicles, key, episode)
-        # The key that init_memory gets, so that both hide the same egos.
-        unseen = self.unseen(vehicles, absorb(key, 0))
-        return vehicles, new_tensordict({"model": memory, "unseen": unseen}, len(key))
+        """As the model."""
+        return self.model.enter(vehicles, key, episode)
 
     def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
-        """As the model's, with ``unseen``."""
-        memory = self.model.init_memory(vehicles, key)
-        return new_tensordict(
-            {"model": memory, "unseen": self.unseen(vehicles, key)},
-            len(key),
-        )
+        """As the model's."""
+        return self.model.init_memory(vehicles, key)
 
     def memory_spec(
         self,
@@ -320,11 +306,8 @@ class BlindTraffic(TrafficModule):
         m: int,
         dtype: torch.dtype = torch.float32,
     ) -> dict[str, Any]:
-        """As the model's, with ``unseen``."""
-        return {
-            "model": self.model.memory_spec(n, m, dtype),
-            "unseen": ((n, m), torch.bool),
-        }
+        """As the model's."""
+        return self.model.memory_spec(n, m, dtype)
 
     def compile_graphs(self) -> None:
         """Compile the model."""

@@ -18,13 +18,13 @@ from ganlane.native.drivers import (
 )
 from ganlane.settings.driving import (
     DriverFaults,
+    HumanVariation,
     IdmParameters,
     MobilParameters,
 )
 from ganlane.settings.traffic import (
     GanCalibratedTrafficConfig,
     GanTrafficConfig,
-    HumanTrafficConfig,
 )
 from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.idm import TABLE_V
@@ -160,14 +160,15 @@ def human_traffic(
     road: Road | None = None,
     stream: int = Stream.TRAIN,
     path: str | Path | None = None,
-    temperature: float = HumanTrafficConfig.temperature,
+    variation: HumanVariation | None = None,
     idm: IdmParameters = TABLE_V,
 ) -> HumanTraffic:
     """``traffic=human``: a policy fitted to recorded drivers (:mod:`ganlane.traffic.human`).
 
     Args:
         road, stream: as for every traffic module.
-        path, temperature: see :class:`~ganlane.settings.traffic.HumanTrafficConfig`.
+        path: see :class:`~ganlane.settings.traffic.HumanTrafficConfig`.
+        variation: how they differ from the fitted ones.
         idm: the ego's, where the kernel drives.
 
     Raises:
@@ -176,8 +177,9 @@ def human_traffic(
     source = path or shipped_generator("human")
     model, _ = load_human(source)
     weights = {name: tensor.numpy() for name, tensor in model.state_dict().items()}
-    drivers = human_drivers(weights, model.sizes, temperature, idm, stream, source)
-    return HumanTraffic(model.policy, road, stream, temperature, drivers)
+    variation = variation or HumanVariation()
+    drivers = human_drivers(weights, model.sizes, variation, idm, stream, source)
+    return HumanTraffic(model.policy, road, stream, variation, drivers)
 
 
 def _fitted(generator: Generator, metadata: Mapping[str, Any], source: object) -> FittedGenerator:

@@ -170,6 +170,10 @@ def compare(traffic, highways, rows, decisions, seed):
         {"name": "gan", "guard": False},
         {"name": "gan_calibrated", "changes_per_km": 30.0},
         {"name": "gan_calibrated", "noise_period_s": 0.0},
+        {"name": "human", "lane_changes": 8.0},
+        {"name": "human", "temperature": 1.5, "politeness": 0.0, "delayed": 2},
+        *[{"name": name, "blind_share": 0.5} for name in TRAFFICS],
+        MIXED | {"blind_share": 0.5},
     ],
     ids=lambda traffic: "-".join(traffic) if isinstance(traffic, dict) else traffic,
 )

@@ -9,14 +9,15 @@ from ganlane.api import make_env
 from ganlane.errors import UserError
 from ganlane.generator import shipped_generator
 from ganlane.generator.human import STEPS
+from ganlane.settings.driving import HumanVariation
 from ganlane.sim.random import episode_key
 from ganlane.sim.spawn import spawn
 from ganlane.traffic.presets import human_traffic
 
 
-def drive(episodes, steps, dtype=torch.float32):
-    """Vehicles after every step."""
-    traffic = human_traffic()
+def drive(episodes, steps, dtype=torch.float32, **variation):
+    """Vehicles and memory after every step."""
+    traffic = human_traffic(variation=HumanVariation(**variation))
     episode = torch.tensor(episodes)
     key = episode_key(traffic.stream, torch.zeros_like(episode), episode)
     vehicles = spawn(key, 9, 3, 4.0, dtype=dtype)
@@ -78,6 +79,33 @@ def test_it_drives_in_double_precision_and_on_one_lane():
     env = make_env("human", num_envs=2, env={"lanes": 1, "vehicles": 4})
     after = env.rollout(5)
     assert (after[keys.VEHICLES, "target_lane"][..., 1:] == 0).all()
+
+
+def changes(course):
+    """Lane changes that were begun."""
+    lanes = torch.stack([vehicles.target_lane for vehicles, _ in course])
+    return int((lanes[1:] != lanes[:-1]).sum())
+
+
+def test_drivers_change_lanes_as_often_as_they_are_told():
+    none, usual, more = (
+        changes(drive(range(16), 200, lane_changes=factor)) for factor in (0.0, 1.0, 8.0)
+    )
+    assert none == 0
+    assert 0 < usual < 0.5 * more
+
+
+def test_a_late_driver_does_what_it_decided_before():
+    prompt, late = (drive([0, 1], 9, delayed=delayed) for delayed in (0, 1))
+    # At the first decision nothing was decided before.
+    assert (late[0][1]["acceleration"] == 0.0).all()
+    torch.testing.assert_close(late[4][1]["acceleration"], prompt[0][1]["acceleration"])
+
+
+def test_who_is_behind_counts_the_less_the_less_polite_a_driver_is():
+    assert changes(drive(range(32), 200, politeness=0.0)) > changes(
+        drive(range(32), 200, politeness=4.0)
+    )
 
 
 def test_foreign_weights_are_refused():

@@ -35,7 +35,7 @@ from ganlane.settings.traffic import (
     MixedTrafficConfig,
     ReplayTrafficConfig,
 )
-from ganlane.sim import Road, Visibility
+from ganlane.sim import Road, Vehicles, Visibility
 from ganlane.traffic import (
     BlindTraffic,
     IdmMobilTraffic,
@@ -44,6 +44,7 @@ from ganlane.traffic import (
     MixedTraffic,
     TrafficModule,
 )
+from ganlane.traffic.base import key_of
 from ganlane.traffic.mixed import interleaved
 from ganlane.traffic.presets import (
     gan_traffic,
@@ -316,7 +317,7 @@ def test_nobody_is_blind_at_a_share_of_0_and_nothing_is_built(traffic):
         one = step(plain, one)
         other = step(blind, other)
         assert same_bits(one.exclude(keys.TRAFFIC), other.exclude(keys.TRAFFIC)) == []
-        assert same_bits(one[keys.TRAFFIC], other[keys.TRAFFIC, "model"]) == []
+        assert same_bits(one[keys.TRAFFIC], other[keys.TRAFFIC]) == []
     assert isinstance(
         make_traffic(IdmMobilTrafficConfig(), EnvConfig()),
         IdmMobilTraffic,
@@ -342,9 +343,12 @@ def test_the_ego_stays_where_the_environment_has_it():
 
 def test_as_many_episodes_are_blind_as_asked_for_whatever_the_batch_and_the_part():
     traffic = BlindTraffic(mixture(idm=1, idm_mobil=1), 0.3)
-    wide, narrow = (
-        environment(num_envs=n, traffic=traffic).reset()[keys.TRAFFIC, "unseen"] for n in (4000, 7)
-    )
+    unseen = []
+    for n in (4000, 7):
+        td = environment(num_envs=n, traffic=traffic).reset()
+        vehicles = Vehicles.of(td[keys.VEHICLES])
+        unseen.append(traffic.unseen(vehicles, key_of(td, traffic.stream)))
+    wide, narrow = unseen
     assert torch.equal(wide[:7], narrow)
     assert not wide[:, 1:].any()
     for rows in (wide[0::2, 0], wide[1::2, 0]):

@@ -1,0 +1,186 @@
+"""Which property of human-like traffic does an agent learn from?
+
+    python -m benchmarks.dose train
+    python -m benchmarks.dose train --part 1/2
+    python -m benchmarks.dose table
+
+The first takes hours on one core and goes on where it ended; the second makes the second half, for
+another core.
+
+Every training is `experiment=dose` with one property of the drivers changed. Its agent then drives
+on traffics that no training met. The table has, for each dose, the difference to the trainings
+among unchanged drivers: reward, and failures (crashes and departures) per 1000 episodes; the unit
+of the intervals is the training. It needs no recordings.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from benchmarks.script import make_parser, run_script
+from ganlane import api
+from ganlane.config.run import LAST
+from ganlane.errors import UserError
+from ganlane.evaluation.statistics import Estimate, difference
+from ganlane.evaluation.table import Table
+
+#: Values of each property; what is not named is as fitted.
+DOSES: dict[str, tuple[Any, ...]] = {
+    "lane_changes": (0.0, 0.5, 2.0, 4.0),
+    "politeness": (0.0, 3.0),
+    "temperature": (0.3, 1.2, 1.6),
+    "delayed": (1, 2),
+    "blind_share": (0.1, 0.3, 1.0),
+    "desired_speed_mps": ((21.0, 23.0), (14.0, 30.0)),
+}
+#: Properties of the scene rather than of the traffic.
+OF_SCENE = ("desired_speed_mps",)
+UNCHANGED = "as fitted"
+MASKS = ("legal", "safe")
+#: Traffics that no training met.
+HELD_OUT = ("idm_faults", "idm_random", "gan_calibrated")
+EPISODES = 300
+
+
+class Training(NamedTuple):
+    """One training: the mask, the varied property and its dose (None: unchanged drivers), the seed."""
+
+    mask: str
+    varied: str
+    dose: Any
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        dose = "" if self.dose is None else f"_{self.dose}".replace(" ", "")
+        return f"{self.mask}_{self.varied.replace(' ', '_')}{dose}_{self.seed}"
+
+    def settings(self) -> dict[str, Any]:
+        """What it changes of the experiment."""
+        changed = {} if self.dose is None else {self.varied: self.dose}
+        if self.varied in OF_SCENE:
+            return {"traffic": "human", **changed}
+        return {"traffic": {"name": "human", **changed}}
+
+
+def trainings(seeds: int) -> Iterator[Training]:
+    """All of them; the first seeds of everything come first."""
+    for seed in range(seeds):
+        for mask in MASKS:
+            yield Training(mask, UNCHANGED, None, seed)
+            for name, doses in DOSES.items():
+                for dose in doses:
+                    yield Training(mask, name, dose, seed)
+
+
+def train(folder: Path, seeds: int, part: int, parts: int) -> str:
+    """Make the trainings that are missing, and drive the agents on the held-out traffics."""
+    chosen = list(trainings(seeds))[part::parts]
+    for training in chosen:
+        home = folder / training.name
+        episodes = home / "held_out.parquet"
+        if episodes.is_file():
+            continue
+        weights = home / "agent.safetensors"
+        if (home / LAST).is_file() and not weights.is_file():
+            api.train(folder=home, resume=True)
+        elif not weights.is_file():
+            api.train(
+                folder=home,
+                experiment="dose",
+                mask=training.mask,
+                seed=training.seed,
+                threads=1,
+                **training.settings(),
+            )
+        table = api.evaluate(
+            [str(weights)], list(HELD_OUT), episodes=EPISODES, per_episode=True, threads=1
+        )
+        failed = pl.col("hard_crash") | pl.col("out_of_road")
+        table = table.select("traffic", "episode", pl.col("reward").cast(pl.Float32), failed=failed)
+        table.write_parquet(episodes)
+        print(f"{training.name}: done", flush=True)
+    return f"{len(chosen)} trainings in {folder}"
+
+
+def scores(folder: Path, training: Training, seeds: int) -> dict[str, npt.NDArray[np.float64]]:
+    """Rewards and failures [S, E] of a dose on all held-out traffics; empty where none is made."""
+    rewards, failures = [], []
+    for seed in range(seeds):
+        path = folder / training._replace(seed=seed).name / "held_out.parquet"
+        if path.is_file():
+            table = pl.read_parquet(path).sort("traffic", "episode")
+            rewards.append(table["reward"].to_numpy())
+            failures.append(1000.0 * table["failed"].to_numpy())
+    if not rewards:
+        return {}
+    return {"reward": np.array(rewards), "failures": np.array(failures, np.float64)}
+
+
+def as_text(estimate: Estimate) -> str:
+    """A difference with its interval."""
+    if estimate.low is None or estimate.high is None:
+        return f"{estimate.value:+.1f}"
+    return f"{estimate.value:+.1f} [{estimate.low:+.1f}, {estimate.high:+.1f}]"
+
+
+def dose_table(folder: Path, seeds: int) -> str:
+    """The table of all doses that were tried.
+
+    Raises:
+        UserError: there are no trainings among unchanged drivers to compare with.
+    """
+    rows = []
+    for mask in MASKS:
+        baseline = scores(folder, Training(mask, UNCHANGED, None, 0), seeds)
+        if not baseline:
+            continue
+        mean, rate = baseline["reward"].mean(), baseline["failures"].mean()
+        rows.append(
+            [mask, UNCHANGED, "", str(len(baseline["reward"])), f"{mean:.1f}", f"{rate:.1f}"]
+        )
+        for name, doses in DOSES.items():
+            for dose in doses:
+                changed = scores(folder, Training(mask, name, dose, 0), seeds)
+                if not changed:
+                    continue
+                cells = [
+                    as_text(difference(changed[score], baseline[score]))
+                    for score in ("reward", "failures")
+                ]
+                rows.append([mask, name, str(dose), str(len(changed["reward"])), *cells])
+    if not rows:
+        raise UserError(f"--folder {folder}: no finished trainings; run 'train' first.")
+    heads = ["mask", "property", "dose", "trainings", "reward", "failures/1000 episodes"]
+    return Table("", heads, rows, names=3).text()
+
+
+def measure(arguments: argparse.Namespace) -> str:
+    """Either of the two."""
+    if arguments.action == "table":
+        return dose_table(arguments.folder, arguments.seeds)
+    part, parts = (int(number) for number in arguments.part.split("/"))
+    return train(arguments.folder, arguments.seeds, part, parts)
+
+
+def main() -> int:
+    """The script."""
+    parser = make_parser(__doc__)
+    parser.add_argument("action", choices=("train", "table"))
+    parser.add_argument("--folder", type=Path, default=Path("outputs/dose"))
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--part", default="0/1", help="which part of how many, counted from 0")
+    return run_script(measure, parser.parse_args())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

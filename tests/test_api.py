@@ -12,12 +12,13 @@ import polars as pl
 import pytest
 import torch
 from reference.refusals import last_path
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 import ganlane
 from ganlane.__main__ import main
 from ganlane.agents.drivers import DRIVERS
 from ganlane.config.run import COMMANDS, function_of
-from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
+from ganlane.data import write_scene_csv
 from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.traffic import GanTrafficConfig

@@ -6,10 +6,11 @@ import json
 
 import polars as pl
 import pytest
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 from ganlane.build import make_driver
 from ganlane.compare import compare, publish
-from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
+from ganlane.data import write_scene_csv
 from ganlane.evaluation import crashes_by_scene, evaluation_rows, failed_episodes, paired_rows
 from ganlane.evaluation.results import plain
 from ganlane.settings.commands import EvaluateConfig

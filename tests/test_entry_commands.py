@@ -67,8 +67,6 @@ MISTAKES = {
     "prepare data=ngsim data.path=gone.csv": "gone.csv: no such file",
     "prepare data=highd data.path=gone.csv": "gone.csv: expected highD's XX_tracks.csv",
     "prepare data=ngsim": "data=ngsim: which file is missing; give data.path=FILE",
-    "prepare data=ngsim data.download=true": "data.download=true: where to is missing",
-    "prepare data=ngsim data.path=x data.url=ftp://x": "data.url=ftp://x: expected an address",
     "prepare data=scenes data.format=gpx": "data.format=gpx: expected one of scenes, ngsim, highd",
     "prepare device=cuda": "device=cuda",
     "render agent=nobody": "agent nobody: unknown",

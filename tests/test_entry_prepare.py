@@ -9,24 +9,13 @@ import json
 from functools import partial
 from pathlib import Path
 
-import polars as pl
 import pytest
 from PIL import Image
-from reference.file_server import SHA256, Server
-from reference.recordings import (
-    ngsim_rows,
-    portal_csv,
-    traffic,
-)
 from reference.refusals import last_path
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 from ganlane.config.run import run_command
-from ganlane.data import (
-    SyntheticTraffic,
-    read_scenes,
-    synthetic_scenes,
-    write_scene_csv,
-)
+from ganlane.data import read_scenes, write_scene_csv
 
 main = partial(run_command, "prepare")
 
@@ -74,30 +63,3 @@ def test_a_scene_csv_becomes_parquet_and_figures(here, capsys):
     }
     assert names <= numbers.keys()
     assert read_scenes("mine").equals(read_scenes("mine.csv"))
-
-
-def test_download_then_prepare(here, capsys):
-    content = portal_csv(ngsim_rows(traffic().filter(pl.col("scene") == "synthetic-0"))).encode()
-    # The connection breaks once.
-    with Server(content=content, breaks=[20_000]) as server:
-        fetched = [
-            "data=ngsim",
-            "data.path=ngsim.csv",
-            "data.download=true",
-            f"data.url={server.url}",
-        ]
-        assert (
-            main(
-                [
-                    *fetched,
-                    f"data.sha256={SHA256}",
-                    "data.path=other.csv",
-                ]
-            )
-            == 2
-        )
-        assert "its SHA-256 is" in capsys.readouterr().err
-        assert list(here.iterdir()) == []
-        assert main(fetched) == 0
-    assert results(capsys.readouterr().out)["rows"]["kept"] == 540
-    assert (here / "ngsim.csv").read_bytes() == content

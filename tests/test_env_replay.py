@@ -9,13 +9,14 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from reference.worlds import Track, assert_same_tracks, step, tracks
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from ganlane import keys
 from ganlane.agents.drivers import KeepLaneDriver, MobilDriver, RandomLegalDriver
-from ganlane.data import SyntheticTraffic, sort, synthetic_scenes
+from ganlane.data import sort
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.sim.random import episode_key
 from ganlane.traffic import ReplayTraffic

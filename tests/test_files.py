@@ -18,10 +18,11 @@ import pytest
 import torch
 from PIL import Image
 from reference.small_networks import PAPER, recorded_scenes
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from safetensors.torch import save_file
 
 from ganlane.agents import read_agent
-from ganlane.data import SyntheticTraffic, read_scenes, synthetic_scenes
+from ganlane.data import read_scenes
 from ganlane.data.recordings import write_prepared
 from ganlane.errors import UserError
 from ganlane.files import (

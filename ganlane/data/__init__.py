@@ -3,7 +3,7 @@
 
 - ``schema`` defines the common form and validates it; ``tables`` reads text tables with errors
   traced to line and column;
-- ``sources`` finds or fetches recordings, ``synthetic`` makes some;
+- ``sources`` finds recordings;
 - readers: ``ngsim``, ``highd``, and ``recordings`` (scene CSV, Parquet, any kind); ``prepared``
   measures recordings and writes them as Parquet;
 - measuring: ``lanes`` treats recordings and simulations alike, ``statistics`` combines all
@@ -41,8 +41,4 @@ from ganlane.data.statistics import (
     DrivingStatistics,
     driving_statistics,
     survival_curve,
-)
-from ganlane.data.synthetic import (
-    SyntheticTraffic,
-    synthetic_scenes,
 )

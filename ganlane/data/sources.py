@@ -1,4 +1,4 @@
-"""Where recordings come from: this machine's folder, or a download."""
+"""Where recordings are on this machine, and how much of them has been read."""
 
 from __future__ import annotations
 
@@ -11,13 +11,9 @@ from typing import Final
 
 from tqdm import tqdm
 
-from ganlane.data.download import download
 from ganlane.data.tables import OnProgress
 from ganlane.errors import UserError
-from ganlane.settings.generator import (
-    DataConfig,
-    NgsimDataConfig,
-)
+from ganlane.settings.generator import DataConfig
 
 #: Environment variable with the folder of the recordings.
 DATA_VARIABLE: Final = "GANLANE_DATA"
@@ -74,24 +70,15 @@ def default_scenes() -> Path:
 
 
 def recordings_path(data: DataConfig) -> Path:
-    """Path of the recordings that the group ``data`` names, downloaded first if asked for.
+    """Path of the recordings that the group ``data`` names.
 
     Raises:
-        UserError: there is no path and no default, or an error of :func:`download`.
+        UserError: there is no path and no default.
     """
     # Scenes have a default place; a raw recording is the user's own file.
     if data.format != "scenes" and data.path is None:
         raise UserError(f"data={data.format}: which file is missing; give data.path=FILE.")
-    path = Path(data.path) if data.path else default_scenes()
-    if isinstance(data, NgsimDataConfig) and data.download:
-        with byte_progress("download") as progress:
-            download(
-                data.url,
-                path,
-                data.sha256,
-                progress,
-            )
-    return path
+    return Path(data.path) if data.path else default_scenes()
 
 
 @contextmanager

@@ -6,7 +6,6 @@ Files and held-out scenes, sizes, schedule, both presets.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -366,19 +365,11 @@ class HumanConfig(FitConfig):
     observing: Count = 20_000
 
 
-#: The NGSIM trajectories (doi:10.21949/1504477), as the portal of the US DOT exports them.
-NGSIM_URL = "https://data.transportation.gov/api/views/8ect-6jqj/rows.csv?accessType=DOWNLOAD"
 #: Bytes of a file that are read at once: about 300,000 rows of NGSIM, which take a few times as
 #: much memory.
 BLOCK_BYTES = 32 * 2**20
 #: NGSIM's locations without crossings.
 MOTORWAYS = ("us-101", "i-80")
-_SHA256 = Rule(
-    lambda value: re.fullmatch(r"[0-9a-fA-F]{64}", value) is not None, "64 hexadecimal digits"
-)
-_ADDRESS = Rule(
-    lambda value: value.startswith(("http://", "https://")), "an address that begins with https://"
-)
 
 
 @dataclass(frozen=True)
@@ -448,25 +439,11 @@ class NgsimDataConfig(NgsimParameters, DataConfig):
     """``data=ngsim``: NGSIM's text files or the portal's CSV (:func:`ganlane.data.ngsim_scenes`).
 
     Attributes:
-        path: the file; with download=true, where to put it.
+        path: the file.
         held_out: names of scenes not to fit to.
-        download: true: fetch the file first, unless it is there; an interrupted transfer continues.
-        url: from where.
-        sha256: checksum of the file, 64 hexadecimal digits; another file is refused.
     """
 
     format: str = "ngsim"
-    download: bool = False
-    url: Annotated[str, _ADDRESS] = NGSIM_URL
-    sha256: Annotated[str, _SHA256] | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        # So large a file needs a place of the user's choice.
-        if self.download and self.path is None:
-            raise ParameterError(
-                "{download}=true: where to is missing; give {path}=FILE, for instance ngsim.csv."
-            )
 
     def parameters(self) -> NgsimParameters:
         """As the reader takes it."""

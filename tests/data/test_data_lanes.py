@@ -4,12 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.synthetic import synthetic_scenes
 
-from ganlane.data import (
-    Tracks,
-    synthetic_scenes,
-    tracks_of_frame,
-)
+from ganlane.data import Tracks, tracks_of_frame
 from ganlane.data.lanes import (
     find_lane_changes,
     lane_changes_of_arrays,

@@ -16,6 +16,7 @@ from reference.recordings import (
     write_highd,
 )
 from reference.refusals import user_error
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 from ganlane.commands.prepare import (
     long_report,
@@ -24,13 +25,11 @@ from ganlane.commands.prepare import (
 from ganlane.data import (
     SCHEMA,
     PooledStatistics,
-    SyntheticTraffic,
     driving_statistics,
     read_recordings,
     read_scenes,
     scene_lane_counts,
     scene_lane_widths,
-    synthetic_scenes,
     write_prepared,
     write_scene_csv,
 )

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.refusals import user_error
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.data.schema import validate
 from ganlane.data.tables import (
     LINE,

@@ -8,16 +8,9 @@ import numpy as np
 import polars as pl
 import pytest
 from reference.refusals import user_error
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-from ganlane.data import (
-    SCHEMA,
-    SyntheticTraffic,
-    default_scenes,
-    read_scenes,
-    scene_lane_widths,
-    synthetic_scenes,
-    tracks_of_frame,
-)
+from ganlane.data import SCHEMA, default_scenes, read_scenes, scene_lane_widths, tracks_of_frame
 from ganlane.data.lanes import find_lane_changes
 from ganlane.data.statistics import (
     DrivingStatistics,

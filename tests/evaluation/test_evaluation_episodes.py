@@ -11,6 +11,7 @@ import torch
 from evaluation_toy_env import ToyEnv, always, length, reason
 from polars.testing import assert_frame_equal
 from reference.refusals import user_error
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from reference.worlds import vehicles
 from tensordict.nn import TensorDictModule
 from torchrl.envs import StepCounter
@@ -18,7 +19,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type, step_mdp
 
 from ganlane import keys
 from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
+from ganlane.data import write_scene_csv
 from ganlane.evaluation import run_episodes
 from ganlane.evaluation.episodes import ScriptedPolicy, ego_at_fault
 from ganlane.settings.env import EnvConfig

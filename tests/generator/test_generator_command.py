@@ -9,7 +9,6 @@ from pathlib import Path
 
 import polars as pl
 import pytest
-from reference.file_server import Server
 from reference.recordings import (
     START_MS,
     ngsim_rows,
@@ -17,15 +16,12 @@ from reference.recordings import (
     raw_text,
     traffic,
 )
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 import ganlane.evaluation
 import ganlane.generator
 from ganlane.config.run import run_command
-from ganlane.data import (
-    SyntheticTraffic,
-    synthetic_scenes,
-    write_scene_csv,
-)
+from ganlane.data import write_scene_csv
 from ganlane.generator.checkpoint import load_generator
 from ganlane.realism.starts import check_folds_cover, fold_weights
 
@@ -124,19 +120,12 @@ def test_too_many_folds_are_refused_before_ablations_are_fitted(recordings, caps
     assert not fitted
 
 
-def test_the_periods_of_an_ngsim_file_are_the_scenes_whether_fetched_or_prepared(
-    here,
-):
+def test_the_periods_of_an_ngsim_file_are_the_scenes_whether_raw_or_prepared(here):
     scenes = traffic(scenes=3).partition_by("scene", maintain_order=True)
     rows = pl.concat(ngsim_rows(scene, START_MS + 900_000 * k) for k, scene in enumerate(scenes))
-    with Server(content=portal_csv(rows).encode()) as server:
-        fetched = run(
-            "data=ngsim",
-            "data.path=got.csv",
-            "data.download=true",
-            f"data.url={server.url}",
-        )
-    data = fetched["data"]
+    Path("got.csv").write_text(portal_csv(rows))
+    raw = run("data=ngsim", "data.path=got.csv")
+    data = raw["data"]
     assert (data["fitted"], data["validation"], data["held_out"]) == (
         ["us-101-3"],
         ["us-101-1"],
@@ -150,7 +139,7 @@ def test_the_periods_of_an_ngsim_file_are_the_scenes_whether_fetched_or_prepared
     assert prepare(["data=ngsim", "data.path=got.csv", "out=prepared"]) == 0
     prepared = run("data.path=prepared")
     for name in ("ade_m", "fde_m", "scenes"):
-        assert fetched[name] == prepared[name]
+        assert raw[name] == prepared[name]
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,9 @@ import polars as pl
 import pytest
 import torch
 from reference.small_networks import CALIBRATED, LOOP, PAPER
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 from ganlane.commands.train_generator import ablation_table, fold_tables
-from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.data.statistics import measure_exposure
 from ganlane.errors import UserError
 from ganlane.generator.checkpoint import load_generator

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 from reference.small_networks import silenced, small_generator
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.generator import forecasts
 from ganlane.generator.windows import (
     Windows,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from reference.recordings import made_by_hand
 from reference.refusals import user_error
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.data.dense import recorded_frame
 from ganlane.realism.card import card_rows
 from ganlane.realism.driving import (

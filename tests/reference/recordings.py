@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-from ganlane.data import SyntheticTraffic, scene_lane_widths, synthetic_scenes
+from ganlane.data import scene_lane_widths
 from ganlane.data.dense import Recording, recordings_of
 
 FOOT_M = 0.3048

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.generator.networks import Generator
 from ganlane.generator.windows import SceneTracks, scene_tracks
 from ganlane.settings.generator import CalibratedConfig, GeneratorSizes, LoopConfig, PaperConfig

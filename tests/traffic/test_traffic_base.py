@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from reference.worlds import environment, same_bits
 from tensordict import TensorDict
 
 from ganlane import keys
-from ganlane.data import SyntheticTraffic, sort, synthetic_scenes
+from ganlane.data import sort
 from ganlane.errors import UserError
 from ganlane.sim import Vehicles
 from ganlane.traffic import (

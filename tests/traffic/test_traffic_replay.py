@@ -8,16 +8,11 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from scipy.stats import chisquare
 
 from ganlane import keys
-from ganlane.data import (
-    SyntheticTraffic,
-    default_scenes,
-    sort,
-    synthetic_scenes,
-    write_scene_csv,
-)
+from ganlane.data import default_scenes, sort, write_scene_csv
 from ganlane.errors import UserError
 from ganlane.settings.driving import Visibility
 from ganlane.sim import Vehicles

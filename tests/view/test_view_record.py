@@ -10,12 +10,13 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from tensordict.nn import TensorDictModule
 from torchrl.envs import GymEnv
 from view_scenes import straight
 
 from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.data import SyntheticTraffic, read_scenes, scene_lane_widths, sort, synthetic_scenes
+from ganlane.data import read_scenes, scene_lane_widths, sort
 from ganlane.data.schema import SCHEMA, TRACK_STRIDE, validate
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError

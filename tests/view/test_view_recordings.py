@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from view_scenes import panels, words
 
-from ganlane.data import (
-    PooledStatistics,
-    Scene,
-    SyntheticTraffic,
-    synthetic_scenes,
-)
+from ganlane.data import PooledStatistics, Scene
 from ganlane.view.recordings import draw_recordings
 
 

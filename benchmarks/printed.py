@@ -22,11 +22,11 @@ from typing import Any
 from benchmarks.script import ReportSection, make_parser, run_script, split_at_markers
 from ganlane.errors import UserError
 from ganlane.evaluation.table import Table
-from ganlane.reproduce.report import PAPER_VI, PAPER_VII
+from ganlane.suite.report import PAPER_VI, PAPER_VII
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "reproduce" / "results.json"
-#: Folders below it with further results: ``ganlane reproduce`` with the control trainings,
+#: Folders below it with further results: ``ganlane benchmark`` with the control trainings,
 #: agent_general over more episodes and on traffics that are not the project's own;
 #: ``benchmarks.roads`` and ``benchmarks.ablations``.
 FURTHER = ("controls", "general", "roads", "elsewhere", "ablations")
@@ -430,7 +430,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = make_parser(__doc__)
     parser.add_argument(
-        "results", type=Path, nargs="?", default=RESULTS, help="of ganlane reproduce"
+        "results", type=Path, nargs="?", default=RESULTS, help="of ganlane benchmark"
     )
     parser.add_argument("--write", action="store_true", help="put the tables into the documents")
     return parser.parse_args(arguments)

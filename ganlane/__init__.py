@@ -9,13 +9,15 @@
     env = gymnasium.make("ganlane/Highway-v0", traffic="gan")
     envs = gymnasium.make_vec("ganlane/Highway-v0", num_envs=64, traffic="gan")
     env = ganlane.make_env(traffic="gan", num_envs=256)
+    # one score for a policy of your own, on the same episodes as everybody's
+    run = ganlane.benchmark(my_function)
     # agents on traffics, as a data frame
     table = ganlane.api.evaluate(agents=["mobil", "agent_idm"], traffics=["gan"])
 
 Imports run one way: ``data``, ``sim`` <- ``generator`` <- ``traffic`` <- ``env`` <- ``transforms``
-<- ``agents`` <- ``evaluation`` <- ``view`` <- ``config`` <- ``build`` <- ``training`` <- ``api`` <-
-``gym`` <- ``commands``. Below all of them are ``keys`` (every TensorDict key), ``errors``,
-``files`` and ``runtime``.
+<- ``agents`` <- ``evaluation`` <- ``view`` <- ``config`` <- ``build`` <- ``training`` <- ``suite``
+<- ``api`` <- ``gym`` <- ``commands``. Below all of them are ``keys`` (every TensorDict key),
+``errors``, ``files`` and ``runtime``.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ from ganlane.runtime import check_process, register_envs
 if TYPE_CHECKING:  # for type checkers and editors, which do not run __getattr__
     from ganlane import api as api
     from ganlane.api import Driver as Driver
+    from ganlane.api import benchmark as benchmark
     from ganlane.api import load_agent as load_agent
     from ganlane.api import make_env as make_env
     from ganlane.env import EpisodeParameters as EpisodeParameters
@@ -48,7 +51,7 @@ if TYPE_CHECKING:  # for type checkers and editors, which do not run __getattr__
     from ganlane.transforms import SensorTransform as SensorTransform
 
 _NAMES = {
-    "api": "Driver load_agent make_env",
+    "api": "Driver benchmark load_agent make_env",
     "env": "EpisodeParameters HighwayEnv",
     "errors": "UserError",
     "sim": "Road Stream",

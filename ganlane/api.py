@@ -18,7 +18,7 @@ a class of your own or its import path. Keys of the environment may be given alo
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -30,8 +30,8 @@ from torchrl.envs import Transform, TransformedEnv
 
 from ganlane import build
 from ganlane.agents.checkpoint import with_seeds
+from ganlane.agents.drivers import FunctionPolicy
 from ganlane.build import Driver
-from ganlane.compare import compare
 from ganlane.config.run import (
     COMMANDS,
     LAST,
@@ -49,12 +49,17 @@ from ganlane.runtime import kernel_threads, worker_number
 from ganlane.settings.commands import EvaluateConfig, highways
 from ganlane.settings.record import Record
 from ganlane.sim.random import Stream
+from ganlane.suite.driving import compare
+from ganlane.suite.run import drivers_of
+from ganlane.suite.run import run as run_suite
 from ganlane.torch_settings import set_threads
 
 #: An option's name; a mapping of its keys, with its name as ``name``; or its record.
 Option: TypeAlias = str | Mapping[str, Any] | Record | type
 #: A driver's name, a loaded driver, or a policy of your own (named by its class).
 Agent: TypeAlias = str | Path | Driver | TensorDictModuleBase
+#: The same, or a function of observations.
+Policy: TypeAlias = Agent | Callable[..., Any]
 
 
 def make_env(
@@ -206,6 +211,63 @@ def evaluate(
             seeds,
         )
     return table if per_episode else pl.DataFrame(rows, infer_schema_length=None)
+
+
+def benchmark(
+    policy: Policy | Sequence[Policy] | Mapping[str, Policy] = "agent_general",
+    *,
+    suite: str | Mapping[str, Any] = "shift-v1",
+    quick: bool = False,
+    folder: str | Path | None = None,
+    **keys: Any,
+) -> Run:
+    """Drive a suite and score what drove; see docs/benchmark.md.
+
+    Args:
+        policy: an agent of ``ganlane benchmark``, a driver, a policy (a TensorDictModule), or a
+            function that takes observations [N, D] as a NumPy array and returns N actions; or
+            several of them, by names of your own in a mapping.
+        suite: its protocol.
+        quick: a fifth of the episodes.
+        folder: of the run; None: a new one below ``outputs/benchmark``.
+        keys: further keys of the command, such as ``observation`` and ``mask`` (of functions).
+
+    Returns:
+        The run; its ``results["entries"]`` hold the scores.
+
+    Raises:
+        UserError: an unknown name, a wrong value, or a policy that does not fit.
+    """
+    asked: list[tuple[str | None, Any]]
+    if isinstance(policy, Mapping):
+        asked = list(policy.items())
+    else:
+        listed = policy if isinstance(policy, list | tuple) else [policy]
+        asked = [(None, single) for single in listed]
+    config = call_settings("benchmark", {"suite": suite, "quick": quick, **keys})
+    home = new_folder("benchmark") if folder is None else _path(folder)
+    with _torch_threads(), running(home, config):
+        drivers: list[Driver] = []
+        for name, single in asked:
+            if isinstance(single, str | Path):
+                several = drivers_of([str(single)], config)
+            elif isinstance(single, Driver):
+                several = [single]
+            elif isinstance(single, TensorDictModuleBase):
+                several = [Driver(type(single).__name__, single)]
+            elif callable(single):
+                usual = getattr(single, "__name__", type(single).__name__)
+                several = [Driver(usual, FunctionPolicy(single))]
+            else:
+                raise UserError(f"policy={single!r:.80}: expected an agent's name or a function.")
+            if name is not None:
+                # Several trainings stay one entry under the new name.
+                numbers = [f"@{number}" for number in range(len(several))]
+                names = [name] if len(several) == 1 else [f"{name}{number}" for number in numbers]
+                several = [driver.renamed(new) for driver, new in zip(several, names)]
+            drivers += several
+        run_suite(drivers, config, home)
+    return Run(home, json.loads((home / "results.json").read_text(encoding="utf-8")))
 
 
 def train(

@@ -68,27 +68,29 @@ def is_import_path(name: str) -> bool:
     return "." in name and all(part.isidentifier() for part in name.split("."))
 
 
-def import_target(
-    path: str,
-    key: str,
-    base: type[Made],
-) -> Callable[..., Made]:
-    """The subclass of ``base``, or the function annotated to return one, at import path ``path``.
+def is_function_path(name: str) -> bool:
+    """Whether ``name`` has the form ``my.module:function``."""
+    module, colon, function = name.partition(":")
+    return bool(colon) and is_import_path(f"{module}.{function}")
+
+
+def imported(path: str, key: str) -> Any:
+    """What is at the import path ``path``, ``my.module.name`` or ``my.module:name``.
 
     Importing a module executes it: ``path`` must come from the user's command line or call, or be
-    of this package (:func:`ganlane.config.run`). ``key`` is the
-    configuration's, for error messages.
+    of this package (:func:`ganlane.config.run`). ``key`` is the configuration's, for error
+    messages.
 
     Raises:
-        UserError: it cannot be imported, or does not make a ``base``.
+        UserError: it cannot be imported.
     """
-    module, _, name = path.rpartition(".")
+    module, _, name = path.replace(":", ".").rpartition(".")
     # A console script does not search the working folder for modules. It is added last, and only
     # when a module is named, so that no file there replaces an installed module.
     if "" not in sys.path:
         sys.path.append("")
     try:
-        target = getattr(importlib.import_module(module), name)
+        return getattr(importlib.import_module(module), name)
     except AttributeError as error:
         raise UserError(
             f"{key}={path}: {module} has no {name}; give the import path of a class or function."
@@ -100,6 +102,19 @@ def import_target(
             "path of a class or function, and start the command in the folder that holds its "
             "module."
         ) from error
+
+
+def import_target(
+    path: str,
+    key: str,
+    base: type[Made],
+) -> Callable[..., Made]:
+    """The subclass of ``base``, or the function annotated to return one, at import path ``path``.
+
+    Raises:
+        UserError: it cannot be imported (:func:`imported`), or does not make a ``base``.
+    """
+    target = imported(path, key)
     if not _makes(target, base):
         raise UserError(
             f"{key}={path}: expected a subclass of "

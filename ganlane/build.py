@@ -18,8 +18,14 @@ from torchrl.envs import Compose
 from ganlane import keys
 from ganlane.agents import load_agent
 from ganlane.agents.checkpoint import SHIPPED, names_agent, with_seeds
-from ganlane.agents.drivers import DRIVERS, MaskedPolicy
-from ganlane.arguments import call_with, import_target, is_import_path
+from ganlane.agents.drivers import DRIVERS, FunctionPolicy, MaskedPolicy
+from ganlane.arguments import (
+    call_with,
+    import_target,
+    imported,
+    is_function_path,
+    is_import_path,
+)
 from ganlane.env import HighwayEnv, TransformedHighway
 from ganlane.errors import ParameterError, UserError
 from ganlane.files import CHECKPOINTS
@@ -197,6 +203,10 @@ class Driver:
     observation: ObservationConfig | None = None
     mask: MaskParameters | None = None
 
+    def renamed(self, name: str) -> Driver:
+        """The same driver under another name."""
+        return replace(self, name=name)
+
     def behind(self, mask: MaskParameters | None) -> tuple[MaskParameters, TensorDictModuleBase]:
         """The mask in force, where ``mask`` is the default, and the policy with that mask."""
         # The driver's own mask goes before that of the command.
@@ -213,7 +223,9 @@ def make_driver(
         name: a rule-based one (:data:`ganlane.agents.drivers.DRIVERS`), a shipped agent
             (``agent_idm@1``: the recipe of ``agent_idm``, trained with seed 1), the path of an
             agent's file, or the import path of a policy of your own (a class or annotated function;
-            it may have ``road``, ``stream``, ``idm`` and ``mobil``). A suffix ``+safe``, ``+legal``
+            it may have ``road``, ``stream``, ``idm`` and ``mobil``; with a colon,
+            ``module:function``, a function of observations,
+            :class:`ganlane.agents.drivers.FunctionPolicy`). A suffix ``+safe``, ``+legal``
             or ``+none`` sets its mask in place of the one in its training.
         env: the environment in which it drives.
         stream: stream of its random numbers, if it draws any.
@@ -256,6 +268,9 @@ def make_driver(
             observation,
             mask_of(metadata),
         )
+    # a plain function of observations
+    if is_function_path(name):
+        return Driver(name, FunctionPolicy(imported(name, "agents")))
     # a user's own policy; it reads the raw state or the observation of the command
     if is_import_path(name):
         target = import_target(name, "agents", TensorDictModuleBase)
@@ -287,6 +302,7 @@ def make_drivers(
     names: Sequence[str],
     env: EnvConfig,
     device: str = "cpu",
+    stream: int = Stream.REPORT,
 ) -> list[Driver]:
     """:func:`make_driver` for several names.
 
@@ -294,7 +310,7 @@ def make_drivers(
     """
     # A dictionary drops repeated names and keeps their order.
     single_names = dict.fromkeys(single for name in names for single in with_seeds(name))
-    return [make_driver(name, env, device=device) for name in single_names]
+    return [make_driver(name, env, stream, device) for name in single_names]
 
 
 def mask_of(metadata: dict[str, Any]) -> MaskParameters | None:

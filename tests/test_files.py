@@ -37,7 +37,7 @@ from ganlane.files import (
 from ganlane.generator import load_generator
 from ganlane.generator.tasks import FitLoop, PaperTask
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
-from ganlane.reproduce.crashes import read_crashes
+from ganlane.suite.crashes import read_crashes
 from ganlane.training.checkpoint import load_checkpoint, save_checkpoint
 from ganlane.weights import load_weights, save_weights
 

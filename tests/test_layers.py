@@ -38,8 +38,8 @@ ORDER = [
     {"config"},
     {"build"},
     {"training"},
-    {"compare"},
-    {"realism", "reproduce", "doctor"},
+    {"suite"},
+    {"realism", "doctor"},
     # The typed calls run the commands' own functions.
     {"api"},
     {"gym"},

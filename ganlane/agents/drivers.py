@@ -136,6 +136,37 @@ class ExploringPolicy(TensorDictModuleBase):
         return tensordict.set(keys.ACTION, action).set(keys.CHOSEN_VALUE, chosen)
 
 
+class FunctionPolicy(TensorDictModuleBase):
+    """A plain function of observations as a policy, for ``ganlane benchmark`` and others.
+
+    Args:
+        function: takes observations, a NumPy array [N, D] float32, and returns [N] actions (0 keep,
+            1 left, 2 right) as an array or a list. It may not remember anything of a row: episodes
+            change their rows.
+    """
+
+    in_keys = [keys.OBSERVATION]  # noqa: RUF012
+    out_keys = [keys.ACTION]  # noqa: RUF012
+    rows_must_stay = False
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__()
+        self.function = function
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action``."""
+        observation = tensordict.get(keys.OBSERVATION)
+        chosen = torch.as_tensor(self.function(observation.cpu().numpy()))
+        if chosen.shape != observation.shape[:1] or chosen.is_floating_point():
+            name = getattr(self.function, "__name__", "the function")
+            raise UserError(
+                f"{name}: returned {chosen.dtype} {list(chosen.shape)} for observations "
+                f"{list(observation.shape)}; return a whole number 0, 1 or 2 for each row."
+            )
+        return tensordict.set(keys.ACTION, chosen.long().to(observation.device))
+
+
 class MaskedPolicy(TensorDictModuleBase):
     """Any policy behind the environment's ``action_mask``: what it forbids becomes 'keep the lane'.
 

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ganlane.build import make_driver
 from ganlane.errors import UserError
 from ganlane.evaluation.episodes import ScriptedPolicy
-from ganlane.reproduce.crashes import read_crashes
-from ganlane.reproduce.episodes import drive_episode
 from ganlane.settings.render import FILMS, MOST_EPISODES, RenderConfig
+from ganlane.sim.random import Stream
+from ganlane.suite.crashes import read_crashes
+from ganlane.suite.episodes import drive_episode
 from ganlane.torch_settings import set_threads
 from ganlane.view import Trajectory, record_episode, write_film, write_player, write_tracks
 from ganlane.view.curves import draw_runs, read_runs
@@ -33,8 +35,10 @@ def render(config: RenderConfig, folder: Path) -> str:
         episodes = []
         for agent, number in config.pairs():
             end_s = config.look.end_s
-            # The stream of reported figures: episode k here is episode k of an evaluation.
-            episode = drive_episode(agent, config.traffic, config, number, end_s=end_s)
+            # Episode k here is episode k of an evaluation.
+            stream = Stream.named(config.stream)
+            driver = make_driver(agent, config.env, stream, config.device)
+            episode = drive_episode(driver, config.traffic, config, number, end_s)
             print(_sentence(episode))
             episodes.append(episode)
         # A name of what is shown, so that several pictures can lie in one folder.

@@ -7,10 +7,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from ganlane.build import make_driver, make_drivers, make_traffic
-from ganlane.compare import compare, publish
+from ganlane.commands.evaluate import publish
 from ganlane.config.run import Stopped, earned
 from ganlane.errors import UserError
 from ganlane.settings.train import TrainConfig
+from ganlane.suite.driving import compare
 from ganlane.torch_settings import set_threads
 from ganlane.training.checkpoint import LAST
 from ganlane.training.phases import (

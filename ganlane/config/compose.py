@@ -6,6 +6,8 @@ Hydra as ``++key=value``, and a key that no record has is refused by the record.
 
 from __future__ import annotations
 
+import json
+import os
 import re
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -35,6 +37,10 @@ _HYDRA_PLUGIN = re.compile(r"hydra(/|\.)(launcher|sweeper)\b")
 ALIASES = {"render": {"agent": "driver"}, "record": {"agent": "driver"}}
 
 
+#: The key of a command whose values words without = are.
+BARE = {"benchmark": "agents"}
+
+
 def parsed(command: str, words: Sequence[str]) -> list[Override]:
     """The words of a command line by Hydra's grammar, as :func:`composed` takes them.
 
@@ -48,6 +54,12 @@ def parsed(command: str, words: Sequence[str]) -> list[Override]:
             raise UserError(
                 f"{word!a}: has characters that this locale does not know; set LC_ALL=C.UTF-8."
             )
+    # A path may have an = in it, as the folders of a sweep do.
+    bare = [word for word in words if "=" not in word or os.path.exists(word)]
+    if command in BARE and bare:
+        quoted = ",".join(json.dumps(word) for word in bare)
+        words = [word for word in words if word not in bare]
+        words.append(f"{BARE[command]}=[{quoted}]")
     # Hydra's own grammar, so that quotes, lists and sweeps mean what its users expect.
     try:
         overrides = OverridesParser.create().parse_overrides([_as_meant(command, w) for w in words])

@@ -26,7 +26,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
-from ganlane.arguments import is_import_path
+from ganlane.arguments import is_function_path, is_import_path
 from ganlane.config.compose import (
     ALIASES,
     VERSION_BASE,
@@ -50,12 +50,12 @@ from ganlane.runtime import (
 from ganlane.settings.commands import (
     EvaluateConfig,
     RecordConfig,
-    ReproduceConfig,
     with_env_keys,
 )
 from ganlane.settings.record import Record, make, merged, plain, saved_config
 from ganlane.settings.recordings import PrepareConfig, RealismConfig, TrainGeneratorConfig
 from ganlane.settings.render import RenderConfig
+from ganlane.settings.suite import BenchmarkConfig
 from ganlane.settings.train import TrainConfig
 
 try:
@@ -68,13 +68,13 @@ except ImportError:  # Windows
 #: checked, since importing torch takes seconds.
 COMMANDS: dict[str, tuple[type[Record], str]] = {
     "train": (TrainConfig, "ganlane.commands.train"),
-    "evaluate": (EvaluateConfig, "ganlane.compare"),
+    "evaluate": (EvaluateConfig, "ganlane.commands.evaluate"),
+    "benchmark": (BenchmarkConfig, "ganlane.commands.benchmark"),
     "render": (RenderConfig, "ganlane.commands.render"),
     "record": (RecordConfig, "ganlane.commands.record"),
     "prepare": (PrepareConfig, "ganlane.commands.prepare"),
     "train_generator": (TrainGeneratorConfig, "ganlane.commands.train_generator"),
     "realism": (RealismConfig, "ganlane.commands.realism"),
-    "reproduce": (ReproduceConfig, "ganlane.commands.reproduce"),
 }
 #: A function that does a command's work.
 Task = Callable[[Any, Path], str | None]
@@ -531,7 +531,8 @@ def _imports(config: TrainConfig) -> Iterator[tuple[str, str, str]]:
     for name in agents:
         path = name.partition("+")[0]
         # weights, which execute nothing, may have a name of this form
-        if is_import_path(path) and not path.endswith(".safetensors") and not Path(path).is_file():
+        is_code = is_import_path(path) or is_function_path(path)
+        if is_code and not path.endswith(".safetensors") and not Path(path).is_file():
             yield "evaluation.agents", as_typed(agents), path
 
 

@@ -24,9 +24,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.sim.collisions import ego_overlaps
-from ganlane.sim.lane_ends import hits_wall
-from ganlane.sim.state import STRAIGHT, Road, Vehicles, body_lanes
+from ganlane.evaluation.measures import LEAST, crash_kinds, ego_at_fault, first_marks, marks_after
+from ganlane.sim.state import STRAIGHT, Road, Vehicles, road_in
 
 #: Decisions between two looks at which rows have ended. A look waits for the device and a reset
 #: costs about a tenth of a decision; a row that has ended waits 3.5 decisions on average, of more
@@ -40,7 +39,7 @@ LARGEST_SHARE = 0.9
 #: The reason of an episode that something outside the environment ended (a user's own transform).
 OTHER = "other"
 #: What is read from the last state of an episode.
-_LAST = (keys.EVENTS, keys.EGO, keys.STEP, keys.VEHICLES)
+_LAST = (keys.EVENTS, keys.EGO, keys.STEP, keys.VEHICLES, keys.ROAD)
 
 
 def run_episodes(
@@ -75,9 +74,11 @@ def run_episodes(
         Columns ``episode, seed, reason`` (:data:`ganlane.keys.END_EVENTS`, or ``other``),
         ``soft_crash`` and ``soft_crash_behind`` (onsets), ``had_soft_crash``, ``reward``
         (undiscounted return), ``reward_*`` (each term's sum), ``decisions``, ``duration_s``,
-        ``distance_m``, ``mean_speed_mps`` (distance over time), ``lane_changes``, and ``at_fault``
-        of a hard crash (:func:`ego_at_fault`; else null). If asked for: ``actions`` (text, a digit
-        per decision).
+        ``distance_m``, ``mean_speed_mps`` (distance over time), ``lane_changes``; of a hard crash,
+        else null, ``at_fault`` (:func:`ganlane.evaluation.measures.ego_at_fault`) and ``crash``
+        (:data:`ganlane.evaluation.measures.CRASHES`); ``least_ttc_s``, ``least_headway_s``,
+        ``hardest_braking_mps2`` and ``rms_acceleration_mps2`` (at the ends of decisions). If asked
+        for: ``actions`` (text, a digit per decision).
 
     Raises:
         UserError: no episodes are asked for, the environment is not batched in one dimension, or
@@ -202,9 +203,11 @@ class _Evaluation:
                 seed,
             )
         )
-        # Sums over the decisions of each row's episode, and the last state of it.
+        # Sums over the decisions of each row's episode, the last state of it, and what is marked.
         self.sums: TensorDictBase | None = None
         self.last: TensorDictBase | None = None
+        self.marks: TensorDictBase = first_marks(self.driving)
+        self.road = getattr(env, "road", STRAIGHT)
 
     def run(self, on_progress: Callable[[int, int], None] | None) -> TensorDictBase:
         """Drive all episodes to their ends.
@@ -251,6 +254,8 @@ class _Evaluation:
             self.sums,
         )
         self.last = state.where(self.driving, self.last)
+        marks = marks_after(after["next"], self.marks, self.road)
+        self.marks = marks.where(self.driving, self.marks)
         # From its first end on a row counts no more, whatever it drives.
         self.driving = self.driving & ~after["next", "done"].squeeze(-1)
         self.state = step_mdp(after)
@@ -267,6 +272,7 @@ class _Evaluation:
                 "place": self.place,
                 "sums": self.sums,
                 "last": self.last,
+                "marks": self.marks,
             }
             self.finished.append(TensorDict(rows, self.place.shape)[ended].cpu())
             self.place[ended] = self.total
@@ -296,6 +302,7 @@ class _Evaluation:
         # The sums of a row begin anew with its episode.
         for total in self.sums.values():
             total[new] = 0.0
+        self.marks[new] = first_marks(self.driving[new])
         # Spare rows that have ended start theirs again, uncounted.
         mask = self.state["done"] & (self.place == self.total)[:, None]
         mask[new] = True
@@ -322,19 +329,21 @@ class _Evaluation:
 
     def _keep(self, rows: Tensor) -> None:
         """Continue with ``rows`` [K] (int64) alone, in that order."""
-        for name in ("state", "place", "driving", "sums", "last"):
+        for name in ("state", "place", "driving", "sums", "last", "marks"):
             setattr(self, name, getattr(self, name)[rows])
 
 
 def _added(state: TensorDictBase) -> TensorDict:
     """What one decision, which led to ``state``, adds to the sums of its episode; each [N]."""
+    rows = state.batch_size
     values = {"reward": state[keys.REWARD]}
     # Double precision: thousands of small rewards are summed.
     for name, term in state.get(keys.REWARD_TERMS, {}).items():
         values[f"reward_{name}"] = term
     for name in (keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND):
         values[name] = state[keys.EVENTS, name]
-    rows = state.batch_size
+    acceleration = state.get((keys.EGO, "mean_acceleration"), torch.zeros(()))
+    values["squared_acceleration"] = acceleration.double().square().expand(rows)
     return TensorDict(
         {name: value.reshape(rows).double() for name, value in values.items()},
         rows,
@@ -356,14 +365,17 @@ def _episode_rows(
     # What the ego counts itself since its episode began.
     columns |= {name: ego[name] for name in ("distance", "lane_changes", "decisions")}
     columns["duration_s"] = last[keys.STEP].double() * keys.PHYSICS_STEP_S
+    marks = driven["marks"]
+    columns |= {name: mark for name, mark in marks.items() if name != "change_s"}
     # A state without vehicles tells nothing about a crash.
     at_fault = pl.lit(None, pl.Boolean)
+    crash: pl.Expr | pl.Series = pl.lit(None, pl.String)
     if keys.VEHICLES in last:
-        columns["at_fault"] = ego_at_fault(
-            Vehicles.of(last[keys.VEHICLES]),
-            road,
-        )
+        vehicles = Vehicles.of(last[keys.VEHICLES])
+        since_s = columns["duration_s"] - marks["change_s"]
+        columns["at_fault"] = ego_at_fault(vehicles, road)
         at_fault = pl.col("at_fault")
+        crash = pl.Series(crash_kinds(vehicles, since_s, road_in(last, road)), dtype=pl.String)
     # The reward's terms are the environment's own, so their names are not known here.
     terms = [name for name in columns if name.startswith("reward_")]
     ends = [pl.when(pl.col(event)).then(pl.lit(event)) for event in keys.END_EVENTS]
@@ -386,70 +398,11 @@ def _episode_rows(
         pl.when(duration > 0).then(distance / duration).alias("mean_speed_mps"),
         pl.col("lane_changes").cast(pl.Int64),
         pl.when(pl.col("hard_crash")).then(at_fault).alias("at_fault"),
-    )
-
-
-def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
-    """Whether the ego moved into somebody or a wall, [N] bool; false where it hit nothing.
-
-    Along the road whoever is behind moves into the other, across it whoever is faster towards the
-    other: a rule of geometry, no law. A driver that cuts in and is struck from behind is not at
-    fault by it.
-    """
-    ahead = road.distance_ahead(
-        vehicles.x[:, :1],
-        vehicles.x[:, 1:],
-    )
-    along = vehicles.speed * torch.cos(vehicles.heading)
-    across = vehicles.speed * torch.sin(vehicles.heading)
-    # Two bodies met along the axis on which their extents began to overlap last. Headings are
-    # small, so the axes are those of the road.
-    since_along = _time_since(
-        ahead,
-        _gain(along),
-        _reach(vehicles.length),
-    )
-    since_across = _time_since(
-        _gain(vehicles.y),
-        _gain(across),
-        _reach(vehicles.width),
-    )
-    # Signs as seen from the ego: who has the higher speed towards the other pushes.
-    towards = torch.sign(_gain(vehicles.y))
-    pushes = towards * across[:, :1] > -towards * across[:, 1:]
-    at_fault = torch.where(since_along < since_across, ahead > 0, pushes)
-    into_somebody = (at_fault & ego_overlaps(vehicles, road)).any(-1)
-    if not road.stretches:
-        return into_somebody
-    ego = vehicles.columns(slice(0, 1))
-    return into_somebody | hits_wall(ego, body_lanes(ego, road), road)[:, 0]
-
-
-def _gain(values: Tensor) -> Tensor:
-    """What the others have more than the ego, [N, M - 1]."""
-    return values[:, 1:] - values[:, :1]
-
-
-def _reach(sizes: Tensor) -> Tensor:
-    """Distance of two centres at which bodies of these sizes touch, m, [N, M - 1]."""
-    return 0.5 * (sizes[:, 1:] + sizes[:, :1])
-
-
-def _time_since(
-    distance: Tensor,
-    speed: Tensor,
-    reach: Tensor,
-) -> Tensor:
-    """For how long (s) extents that touch at ``reach`` (m) overlap.
-
-    Infinite where they do not close.
-    """
-    # Both branches are computed, so the divisor is kept above 0.
-    closing = -torch.sign(distance) * speed
-    return torch.where(
-        closing > 0,
-        (reach - distance.abs()) / closing.clamp_min(1e-9),
-        torch.inf,
+        pl.when(pl.col("hard_crash")).then(crash).alias("crash"),
+        *(pl.col(name) for name in LEAST),
+        (pl.col("squared_acceleration") / pl.col("decisions"))
+        .sqrt()
+        .alias("rms_acceleration_mps2"),
     )
 
 

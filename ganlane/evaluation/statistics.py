@@ -14,6 +14,7 @@ Fisher 1935 (sign flips of paired differences); Cochran 1977 (standard error of 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -335,6 +336,36 @@ def normalized_over_trainings(
     )
 
 
+def score_over_traffics(traffics: Sequence[Sequence[npt.ArrayLike]]) -> Estimate:
+    """Interquartile mean over traffics of the normalised score of several trainings.
+
+    ``traffics`` are, for each, the rewards [S, E] of the agent, of the driver with score 100 and of
+    that with score 0, on the same episodes; S is the same on all traffics.
+    """
+
+    def middle(*means: Array) -> Array:
+        scores = [percent_of_way(*map(_mean, means[at : at + 3])) for at in range(0, len(means), 3)]
+        return interquartile_mean(np.stack(scores, axis=-1))
+
+    tables = [_table(rewards) for rewards in itertools.chain(*traffics)]
+    return _estimate(tables, middle, recipes=[0, 1, 2] * len(traffics))
+
+
+def improvement_over_traffics(
+    traffics: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]],
+) -> Estimate:
+    """:func:`probability_of_improvement`, its mean over traffics; rewards [S, E] and [S', E] of
+    each.
+    """
+
+    def share(*means: Array) -> Array:
+        pairs = zip(means[::2], means[1::2])
+        return np.mean([_share_above(first, second) for first, second in pairs], axis=0)
+
+    tables = [_table(rewards) for rewards in itertools.chain(*traffics)]
+    return _estimate(tables, share, bounds=(0.0, 1.0), recipes=[0, 1] * len(traffics))
+
+
 def percent_of_way(
     value: Array,
     top: Array,
@@ -392,6 +423,7 @@ def _estimate(
     tables: Sequence[Array],
     statistic: Callable[..., Array],
     bounds: tuple[float, float] = (-np.inf, np.inf),
+    recipes: Sequence[int] | None = None,
 ) -> Estimate:
     """``statistic`` of the trainings' means of ``tables`` [..., S, E], with its interval within
     ``bounds``.
@@ -401,31 +433,33 @@ def _estimate(
     that they should have, and few trainings tell it badly. So each table's part is widened by the
     root of S / (S - 1), and the sum of all parts by Student's t over the normal distribution, with
     Satterthwaite's degrees of freedom (infinite for the episodes).
+
+    Tables with one number in ``recipes`` are of the same trainings, on several traffics, and those
+    are drawn together; None: all are of different ones. Episodes are drawn together by number.
     """
     means = [table.mean(axis=-1)[None] for table in tables]
     value = float(statistic(*means)[0])
     if all(table.shape[-2:] == (1, 1) for table in tables):
         return Estimate(value)
-    # One draw of the episodes serves all tables: all drivers drove the same ones.
+    # One draw of the episodes serves all tables of a traffic: all drivers drove the same ones.
     generator = np.random.default_rng((0, 1))
-    episodes = tables[0].shape[-1]
-    counts = np.concatenate(kept_counts(episodes, FEWER_RESAMPLES)).astype(np.float64).T
-    parts = [
-        statistic(*(np.moveaxis(table @ counts, -1, 0) / episodes for table in tables)) - value
-    ]
+    parts = [statistic(*map(_resampled_means, tables)) - value]
     freedom = [np.inf]
-    for index, table in enumerate(tables):
-        trainings = table.shape[-2]
+    numbers = list(range(len(tables)) if recipes is None else recipes)
+    for recipe in dict.fromkeys(numbers):
+        places = [place for place, number in enumerate(numbers) if number == recipe]
+        trainings = tables[places[0]].shape[-2]
         if trainings == 1:
             continue
-        # This table's trainings are drawn anew, the others' stay as they are.
+        # The trainings of this recipe are drawn anew, the others' stay as they are.
         chosen = generator.integers(trainings, size=(FEWER_RESAMPLES, trainings))
         drawn = list(means)
-        drawn[index] = np.moveaxis(
-            means[index][0][..., chosen],
-            -2,
-            0,
-        )
+        for place in places:
+            drawn[place] = np.moveaxis(
+                means[place][0][..., chosen],
+                -2,
+                0,
+            )
         parts.append(np.sqrt(trainings / (trainings - 1)) * (statistic(*drawn) - value))
         freedom.append(trainings - 1)
     # Satterthwaite: the degrees of freedom of a sum of variances that are known unequally well.
@@ -438,6 +472,13 @@ def _estimate(
         *bounds,
     )
     return Estimate(value, float(low), float(high))
+
+
+def _resampled_means(table: Array) -> Array:
+    """Means [R, ..., S] over resampled episodes of a table [..., S, E]."""
+    episodes = table.shape[-1]
+    counts = np.concatenate(kept_counts(episodes, FEWER_RESAMPLES)).astype(np.float64).T
+    return np.moveaxis(table @ counts, -1, 0) / episodes
 
 
 def _share_above(first: Array, second: Array) -> Array:

@@ -1,4 +1,4 @@
-"""What the commands take: what all share; ``evaluate``, ``reproduce``, ``record``; environments."""
+"""What the commands take: what all share; ``evaluate``, ``record``; environments."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from ganlane.settings.record import (
     Seed,
     Text,
     assign,
-    at_least,
     between,
     key_names,
     make,
@@ -38,6 +37,8 @@ Names: TypeAlias = Annotated[list[str], DIFFERENT]
 Columns: TypeAlias = Annotated[str, one_of(("auto", "all"))]
 #: Family of episodes: of training, of model selection, of reported figures.
 StreamName: TypeAlias = Annotated[str, one_of(("train", "select", "report"))]
+#: The same where nobody is trained: also the episodes of ganlane benchmark.
+Measured: TypeAlias = Annotated[str, one_of(("report", "select", "benchmark"))]
 
 
 @dataclass(frozen=True)
@@ -140,20 +141,6 @@ def highways(**keys: Any) -> HighwayConfig:
     return make(HighwayConfig, with_env_keys(HighwayConfig, keys))
 
 
-#: Episodes of ``ganlane reproduce`` on slow traffics, so that the whole takes half an hour.
-FEWER = {
-    "idm_faults": 500,
-    "idm_random": 400,
-    "gan": 120,
-    "gan_calibrated": 100,
-    "replay": 100,
-    "sumo": 8,
-    "highway_env": 3,
-}
-_WITH_MOBIL = Rule(
-    lambda names: "mobil" in names and len(names) > 1,
-    "mobil and others, since every lead is one over mobil",
-)
 _DATASET = Rule(
     lambda name: re.fullmatch(r"(\w[\w-]*/)*\w[\w-]*-v\d+", name, re.ASCII) is not None,
     "a name such as highway/mobil-v0, its parts of letters, digits, - and _",
@@ -174,7 +161,8 @@ class EvaluateConfig(DrivingConfig):
             your own.
         episodes: the episodes 0 to episodes - 1 of the seed and stream.
         num_envs: episodes driven side by side, at most.
-        stream: select: the episodes kept for choosing among recipes, never for a reported figure.
+        stream: select: the episodes kept for choosing among recipes, never for a reported figure;
+            benchmark: those of ganlane benchmark.
     """
 
     # the matrix
@@ -187,71 +175,12 @@ class EvaluateConfig(DrivingConfig):
     # the same episodes for every pair; how many are driven at a time changes no result
     episodes: Episodes = 100
     num_envs: Environments = 512
-    stream: Annotated[str, one_of(("report", "select"))] = "report"
+    stream: Measured = "report"
 
     def __post_init__(self) -> None:
         # A list or a name becomes a mapping before its entries are checked.
         assign(self, traffics=traffics_of(self.traffics, "traffics"))
         super().__post_init__()
-
-
-def _paper_agents() -> list[str]:
-    """The drivers of the paper's tables, and ours; trained agents behind each mask."""
-    names = ["random_legal", "keep_lane", "mobil", "mobil_egoistic"]
-    for agent in ("agent_idm", "agent_gan"):
-        names += [f"{agent}@all+{mask}" for mask in ("none", "legal", "safe")]
-    return [*names, "agent_general@all+safe"]
-
-
-def _all_traffics() -> dict[str, TrafficConfig]:
-    """Every option of the group but the mixture."""
-    return traffics_of(["idm", "idm_mobil", *FEWER], "")
-
-
-@dataclass(frozen=True)
-class ReproduceConfig(EvaluateConfig):
-    """Every driver on every traffic, on the same episodes: tables and figures in one folder.
-
-    Attributes:
-        source: shipped: the agents that ship; scratch: train the paper's agents first, seed by seed
-            (hours).
-        agents: as of ganlane evaluate; agent_idm@all: every training of its recipe.
-        traffics: as of ganlane evaluate; what is not installed or not at hand is left out, with the
-            reason.
-        fewer: number of episodes on slow traffics, where it is smaller than episodes; it changes or
-            adds to {idm_faults: 500, idm_random: 400, gan: 120, gan_calibrated: 100, replay: 100,
-            sumo: 8, highway_env: 3}.
-        workers: processes that drive.
-        cells: folder of what was driven; a pair of driver and traffic that is there is not driven
-            again.
-        crashes: so many per driver and traffic, the earliest, are listed in crashes.json with their
-            actions.
-        runs: folders of training runs for the learning curves, each with the folder pretrain of its
-            first phase.
-        training_seeds: of source=scratch.
-        trained: of source=scratch: folder of the trainings; those in it go on where they stopped.
-    """
-
-    # what is compared
-    source: Annotated[str, one_of(("shipped", "scratch"))] = "shipped"
-    agents: Annotated[Names, _WITH_MOBIL] = field(default_factory=_paper_agents)
-    traffics: dict[str, TrafficConfig] = field(default_factory=_all_traffics)
-    episodes: Annotated[int, between(2, 10_000)] = 1000
-    fewer: dict[str, Annotated[int, at_least(2)]] = field(default_factory=dict)
-    # how the matrix is driven, and where its cells stay
-    workers: Annotated[int, between(1, 64)] = 2
-    cells: str = "outputs/cells"
-    crashes: Annotated[int, between(0, 100)] = 3
-    runs: list[str] = field(default_factory=list)
-    training_seeds: Annotated[list[Seed], DIFFERENT] = field(
-        default_factory=lambda: [0, 1, 2, 3, 4]
-    )
-    trained: str = "outputs/scratch"
-
-    def episodes_on(self, traffic: str) -> int:
-        """Number of episodes on a traffic."""
-        # A slow traffic gets fewer episodes, never more than asked for.
-        return min(self.episodes, {**FEWER, **self.fewer}.get(traffic, self.episodes))
 
 
 @dataclass(frozen=True)

@@ -35,13 +35,15 @@ _TIMEOUT = Rule(
 class Stream(IntEnum):
     """Disjoint sets of episodes.
 
-    For training, for selection (validation), and for reported results (test).
+    For training, for selection (validation), for reported results (test), and for ``ganlane
+    benchmark``, on which no call and no command trains.
     """
 
     # the numbers enter the random keys: other ones would change every episode
     TRAIN = 0
     SELECT = 1
     REPORT = 2
+    BENCHMARK = 3
 
     @classmethod
     def named(cls, name: str) -> Stream:

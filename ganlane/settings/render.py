@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 from ganlane.errors import ParameterError, UserError, as_typed
-from ganlane.settings.commands import DrivingConfig, Names
+from ganlane.settings.commands import DrivingConfig, Measured, Names
 from ganlane.settings.record import (
     DIFFERENT,
     Count,
@@ -96,13 +96,14 @@ class RenderConfig(DrivingConfig):
 
     Attributes:
         driver: agent=NAME says the same: a name, path or import path as in ganlane evaluate.
-        episode: of the seed, on the stream kept for reports: the episodes of ganlane evaluate.
+        episode: of the seed and stream: the same as in ganlane evaluate.
+        stream: benchmark: the episodes of ganlane benchmark.
         agents: html, csv, parquet: several instead of driver, for instance
             agents=[mobil,agent_idm].
         episodes: html, csv, parquet: several instead of episode, for instance episodes=[0,1,2].
         run: instead of an episode: learning curves of runs, run=FOLDER or 'run=[FOLDER,FOLDER]'.
-        crashes: instead of an episode: the crashes.json of ganlane reproduce, whose episodes are
-            driven again with their actions; agents, episodes and traffics choose among them.
+        crashes: instead of an episode: a list such as docs/reproduce/crashes.json, whose episodes
+            are driven again with their actions; agents, episodes and traffics choose among them.
         traffics: of crashes: on these traffics alone.
         format: gif, mp4 (needs the extra 'video'), png (a strip of four frames), html (a player),
             csv or parquet (trajectories); null: the ending of out, else gif.
@@ -114,6 +115,7 @@ class RenderConfig(DrivingConfig):
     # what is shown
     driver: str = "agent_general"
     episode: Seed = 0
+    stream: Measured = "report"
     agents: Annotated[list[str], DIFFERENT] | None = None
     episodes: Annotated[list[Seed], DIFFERENT] | None = None
     run: Annotated[list[Text], DIFFERENT] | None = None

@@ -237,13 +237,33 @@ class ReplayTraffic(TrafficModule):
 
     def scenes_of_episodes(self, seed: int, episodes: Sequence[int]) -> list[str]:
         """Name of the scene of each of ``episodes``, for figures by scene."""
+        scenes = self.scene[self._starts_of(seed, episodes)]
+        return [self.scene_names[number] for number in scenes.tolist()]
+
+    def cars_of_episodes(self, seed: int, episodes: Sequence[int]) -> list[int]:
+        """A number for the recorded car that the ego replaces in each of ``episodes``.
+
+        Episodes of one car begin a tenth of a second apart: they are near copies of each other.
+        """
+        # The last sample of its track is nobody else's.
+        return self.last[self.starts[self._starts_of(seed, episodes), 0]].tolist()
+
+    def episodes_once(self, seed: int) -> list[int]:
+        """The first episode of each start, in ascending order: every start is driven once."""
+        # Scenes are equally likely, so a start of the longest scene comes once in so many episodes.
+        rarest = len(self.scene_names) * int(self.starts_in.max())
+        starts = self._starts_of(seed, range(20 * rarest))
+        _, first = np.unique(starts.cpu().numpy(), return_index=True)
+        return sorted(first.tolist())
+
+    def _starts_of(self, seed: int, episodes: Sequence[int]) -> Tensor:
+        """Number of the start of each of ``episodes``."""
         numbers = torch.tensor(
             list(episodes),
             dtype=torch.int64,
             device=self.scene.device,
         )
-        key = episode_key(self.stream, torch.full_like(numbers, seed), numbers)
-        return [self.scene_names[number] for number in self.scene_of(key).tolist()]
+        return self.start_of(episode_key(self.stream, torch.full_like(numbers, seed), numbers))
 
     def steps_of(self, key: Tensor) -> Tensor:
         """Physics steps until the scene ends, [N] int64.

@@ -144,7 +144,7 @@ def test_a_mistake_is_reported_without_gymnasium(started):
 def test_a_command_that_there_is_not(capsys):
     assert main(["fly"]) == 2
     assert capsys.readouterr().err.startswith(
-        "ganlane: fly: no such command; choose one of evaluate, prepare"
+        "ganlane: fly: no such command; choose one of benchmark, evaluate"
     )
 
 

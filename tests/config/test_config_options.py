@@ -31,7 +31,7 @@ from ganlane.training.phases import describe, phases_of
 from ganlane.transforms import OBSERVATIONS
 
 #: Group to a command that has it.
-USED_BY = {"data": "train_generator", "generator": "train_generator"}
+USED_BY = {"data": "train_generator", "generator": "train_generator", "suite": "benchmark"}
 #: What an option cannot do without.
 NEEDS = {
     ("env", "scene"): [f"env.scene.path={Path(__file__).parents[1] / 'reference' / 'scene.csv'}"]

@@ -21,7 +21,8 @@ from ganlane import keys
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.data import write_scene_csv
 from ganlane.evaluation import run_episodes
-from ganlane.evaluation.episodes import ScriptedPolicy, ego_at_fault
+from ganlane.evaluation.episodes import ScriptedPolicy
+from ganlane.evaluation.measures import ego_at_fault
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import ObservationConfig, SensorParameters
 from ganlane.settings.traffic import (

@@ -8,7 +8,7 @@ import pytest
 from reference.refusals import user_error
 from scipy import stats
 
-from ganlane.reproduce.report import by_recipe, comparisons, recipe_of, rows
+from ganlane.suite.scores import by_recipe, comparisons, recipe_of, rows
 
 KM = 5.0
 
@@ -19,6 +19,7 @@ def driven(
     reasons=None,
     traffic="gan",
     at_fault=None,
+    ttc_s=3.0,
 ):
     """Episodes of 5 km and 200 s with these rewards and ends."""
     reasons = reasons or ["goal"] * len(rewards)
@@ -35,8 +36,13 @@ def driven(
             "had_soft_crash": False,
             "soft_crash_behind": 1,
             "at_fault": [at_fault if reason == "hard_crash" else None for reason in reasons],
+            "crash": ["cut_in" if reason == "hard_crash" else None for reason in reasons],
+            "least_ttc_s": ttc_s,
+            "least_headway_s": 1.0,
+            "rms_acceleration_mps2": 0.5,
+            "hardest_braking_mps2": -2.0,
         },
-        schema_overrides={"at_fault": pl.Boolean},
+        schema_overrides={"at_fault": pl.Boolean, "crash": pl.String},
     )
 
 

@@ -1,32 +1,31 @@
-"""One episode of a driver, recorded for a picture."""
+"""One episode of a driver, recorded for a film or a page."""
 
 from __future__ import annotations
 
-from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.settings.commands import DrivingConfig
+from ganlane.build import Driver, make_env, make_traffic
+from ganlane.settings.commands import EvaluateConfig
+from ganlane.settings.render import RenderConfig
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.sim.random import Stream
 from ganlane.view.record import Trajectory, record_episode
 
 
 def drive_episode(
-    name: str,
+    driver: Driver,
     traffic: TrafficConfig,
-    config: DrivingConfig,
+    config: EvaluateConfig | RenderConfig,
     episode: int,
-    stream: int = Stream.REPORT,
     end_s: float | None = None,
 ) -> Trajectory:
-    """Record an episode of the seed of ``config``, up to ``end_s``, with the driver ``name``.
+    """Record an episode of the seed and stream of ``config``, up to ``end_s``.
 
     Raises:
-        UserError: see :func:`ganlane.build.make_driver` and :func:`ganlane.build.make_traffic`.
+        UserError: see :func:`ganlane.build.make_traffic`.
     """
-    driver = make_driver(name, config.env, device=config.device)
     # A trained agent brings the mask and the observation that it was trained with.
     mask, policy = driver.behind(config.mask)
     env = make_env(
-        make_traffic(traffic, config.env, stream),
+        make_traffic(traffic, config.env, Stream.named(config.stream)),
         config.env,
         config.observation.read_by(driver.observation),
         config.reward,

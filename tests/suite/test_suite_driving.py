@@ -9,7 +9,7 @@ import pytest
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 from ganlane.build import make_driver
-from ganlane.compare import compare, publish
+from ganlane.commands.evaluate import publish
 from ganlane.data import write_scene_csv
 from ganlane.evaluation import crashes_by_scene, evaluation_rows, failed_episodes, paired_rows
 from ganlane.evaluation.results import plain
@@ -17,6 +17,7 @@ from ganlane.settings.commands import EvaluateConfig
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.traffic import IdmTrafficConfig, ReplayTrafficConfig
 from ganlane.sim.random import Stream
+from ganlane.suite.driving import compare
 from ganlane.traffic import ReplayTraffic
 
 EPISODES = 12

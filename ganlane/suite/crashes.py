@@ -1,8 +1,8 @@
 """Crashes and departures from the road as a list that can be driven again.
 
-The list is JSON and holds episode numbers and actions. ``ganlane reproduce`` writes it, ``ganlane
-render crashes=FILE`` plays it. Everything is driven by the tensor code in batches of :data:`ROWS`
-rows: generated traffic repeats bit by bit in batches of one size only.
+The list is JSON and holds episode numbers and actions; ``ganlane render crashes=FILE`` plays it.
+``docs/reproduce/crashes.json`` is one. Everything is driven by the tensor code in batches of
+:data:`ROWS` rows: generated traffic repeats there bit by bit in batches of one size only.
 """
 
 from __future__ import annotations
@@ -15,15 +15,13 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any
 
-import polars as pl
 from torchrl.envs import EnvBase
 
-from ganlane.build import make_driver, make_env, make_traffic
+from ganlane.build import make_env, make_traffic
 from ganlane.errors import UserError
 from ganlane.evaluation.episodes import ScriptedPolicy, run_episodes
 from ganlane.evaluation.rows import FAILURES
-from ganlane.files import read_whole, write_json
-from ganlane.settings.commands import EvaluateConfig
+from ganlane.files import read_whole
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MaskParameters, ObservationConfig, RewardParameters
 from ganlane.settings.record import (
@@ -34,7 +32,6 @@ from ganlane.settings.record import (
     Text,
     make,
     one_of,
-    plain,
 )
 from ganlane.settings.traffic import MixedTrafficConfig, OwnTraffic, TrafficConfig
 from ganlane.sim.random import Stream
@@ -111,82 +108,8 @@ class CrashList(Record):
         return ends
 
 
-def find_crashes(
-    episodes: pl.DataFrame,
-    config: EvaluateConfig,
-    most: int,
-) -> tuple[CrashList, int]:
-    """Drive failed episodes again and list those that end in the same way.
-
-    Args:
-        episodes: rows of failed and other episodes, driven with ``config``.
-        most: episodes per driver and traffic, those with the fewest decisions first.
-
-    Returns:
-        The list, and how many of the episodes ended otherwise: generated traffic rounds differently
-        in batches of another size.
-    """
-    traffics = {
-        name: traffic
-        for name, traffic in config.traffics.items()
-        if name in _LISTED and name == traffic.label()
-    }
-    # A list without crashes makes the environment in which they are looked for.
-    listed = CrashList(config.env, traffics, config.stream, [])
-    pair = ["traffic", "agent"]
-    # The shortest of each pair: they show soonest what went wrong, and drive again fastest.
-    failed = (
-        episodes.filter(pl.col("reason").is_in(FAILURES), pl.col("traffic").is_in(list(traffics)))
-        .sort("decisions", "episode")
-        .group_by(pair, maintain_order=True)
-        .head(most)
-        .sort(*pair, "episode")
-    )
-    crashes: list[Crash] = []
-    for (traffic, name), frame in failed.group_by(pair, maintain_order=True):
-        # Drive with the policy itself once more, to write down its actions.
-        driver = make_driver(str(name), config.env)
-        mask, policy = driver.behind(config.mask)
-        observation = config.observation.read_by(driver.observation)
-        env = listed.make_env(str(traffic), observation, config.reward, mask)
-        again = run_episodes(env, policy, frame["episode"].to_list(), config.seed, actions=True)
-        # Both tables have the same episodes in the same order.
-        same = again.filter(again["reason"] == frame["reason"])
-        crashes += [
-            Crash(
-                driver=str(name),
-                traffic=str(traffic),
-                seed=config.seed,
-                episode=row["episode"],
-                end=row["reason"],
-                # A crash in the first moments may leave a distance just below 0.
-                distance_m=round(max(row["distance_m"], 0.0), 1),
-                actions=row["actions"],
-            )
-            for row in same.to_dicts()
-        ]
-    return replace(listed, crashes=crashes), failed.height - len(crashes)
-
-
-def write_crashes(path: str | Path, listed: CrashList) -> None:
-    """Write a list as JSON, atomically; a traffic is named, and its import path left out."""
-    traffics = {}
-    # Traffics without a crash need no settings in the list.
-    for name in sorted({crash.traffic for crash in listed.crashes}):
-        traffics[name] = plain(listed.traffics[name])
-        del traffics[name]["_target_"]
-    content = {
-        "kind": _KIND,
-        "stream": listed.stream,
-        "env": plain(listed.env),
-        "traffics": traffics,
-        "crashes": plain(listed.crashes),
-    }
-    write_json(path, content)
-
-
 def read_crashes(path: str | Path) -> CrashList:
-    """Read what :func:`write_crashes` wrote.
+    """Read a list from its file.
 
     Raises:
         UserError: no such file, or not a list of crashes.
@@ -194,14 +117,12 @@ def read_crashes(path: str | Path) -> CrashList:
     try:
         return _checked(json.loads(read_whole(Path(path))))
     except OSError as error:
-        raise UserError(
-            f"{path}: cannot be read; give the crashes.json of ganlane reproduce."
-        ) from error
+        raise UserError(f"{path}: cannot be read; give docs/reproduce/crashes.json.") from error
     except _BROKEN as error:
         # Errors of libraries may have many lines; a user's mistake is one sentence.
         reason = " ".join(str(error).split())[:200]
         raise UserError(
-            f"{path}: not a list of crashes ({reason}); give the crashes.json of ganlane reproduce."
+            f"{path}: not a list of crashes ({reason}); give docs/reproduce/crashes.json."
         ) from error
 
 

@@ -8,21 +8,13 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import polars as pl
 import pytest
 from reference.refusals import user_error
 
 from ganlane.config.run import run_command
 from ganlane.evaluation.rows import FAILURES
-from ganlane.reproduce.crashes import (
-    Crash,
-    CrashList,
-    find_crashes,
-    read_crashes,
-    write_crashes,
-)
-from ganlane.settings.commands import EvaluateConfig
-from ganlane.settings.env import EnvConfig
+from ganlane.settings.record import plain
+from ganlane.suite.crashes import Crash, CrashList, read_crashes
 
 main = partial(run_command, "render")
 
@@ -68,31 +60,6 @@ def test_the_list_holds_failures_of_the_published_evaluation(shipped):
     drivers = {crash.driver.partition("+")[0] for crash in shipped.crashes}
     assert drivers >= {f"agent_{recipe}@{seed}" for recipe in ("idm", "gan") for seed in range(4)}
     assert SHIPPED.stat().st_size < 200_000
-
-
-def test_episodes_that_end_otherwise_are_counted_and_not_listed(tmp_path):
-    config = EvaluateConfig(
-        agents=["random"],
-        traffics=["idm"],
-        env=EnvConfig(goal_m=60.0),
-    )
-    episodes = {
-        "agent": "random",
-        "traffic": "idm",
-        "episode": [2, 3, 7],
-        "decisions": [9, 1, 5],
-    }
-    rows = pl.DataFrame({**episodes, "reason": ["out_of_road", "out_of_road", "hard_crash"]})
-    listed, others = find_crashes(rows, config, 3)
-    assert [crash.episode for crash in listed.crashes] == [2, 3]
-    assert others == 1
-    # the earliest
-    assert [crash.episode for crash in find_crashes(rows, config, 1)[0].crashes] == [3]
-    write_crashes(tmp_path / "crashes.json", listed)
-    read = read_crashes(tmp_path / "crashes.json")
-    assert read.crashes == listed.crashes
-    assert (read.env, read.stream) == (listed.env, "report")
-    check_they_happen_again(read)
 
 
 @pytest.mark.parametrize(
@@ -152,7 +119,8 @@ def small_list(
     """Two early crashes on traffic of two kinds."""
     monkeypatch.chdir(tmp_path)
     crashes = [earliest(shipped)[traffic] for traffic in ("idm_faults", "gan")]
-    write_crashes("crashes.json", replace(shipped, crashes=crashes))
+    content = json.loads(SHIPPED.read_text())
+    Path("crashes.json").write_text(json.dumps({**content, "crashes": plain(crashes)}))
     return Path("crashes.json")
 
 

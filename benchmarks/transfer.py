@@ -1,0 +1,104 @@
+"""The paper's Figure 4: learning curves of trainings in two phases, the change of traffic marked.
+
+    python -m benchmarks.transfer
+
+draws ``docs/reproduce/figure_4.png`` from the evaluations in ``docs/learning_curves/seed_*`` and
+from Agent_IDM's rewards in ``docs/reproduce/results.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from benchmarks.script import make_parser, run_script
+from ganlane.view.curves import plot_middle, read_metrics
+from ganlane.view.figures import COLOURS, FAINT, STYLE, add_legend, save_figure
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def read_curves(folders: Sequence[Path]) -> pl.DataFrame:
+    """The evaluations of training runs with two phases.
+
+    Returns:
+        Columns ``run``, ``decisions`` (over both phases), ``mean_reward`` and ``phase`` (``first``
+        or ``second``).
+
+    Raises:
+        UserError: a folder without evaluations of both phases.
+    """
+    parts = []
+    for folder in folders:
+        before = 0
+        for phase, path in (("first", folder / "pretrain"), ("second", folder)):
+            curve = read_metrics(path / "evaluation.csv")
+            parts.append(
+                curve.select(
+                    pl.lit(folder.name).alias("run"),
+                    pl.col("decisions") + before,
+                    "mean_reward",
+                    pl.lit(phase).alias("phase"),
+                )
+            )
+            # The second phase goes on counting where the first one ended.
+            before = curve["decisions"][-1]
+    return pl.concat(parts, how="vertical_relaxed")
+
+
+@rc_context(STYLE)
+def draw_transfer(curves: pl.DataFrame, before: Sequence[float]) -> Figure:
+    """Every run of :func:`read_curves`, their median, and the range between them.
+
+    The crosses are ``before``: rewards on the new traffic before any training there.
+    """
+    figure = Figure(figsize=(7.0, 3.4))
+    axes = figure.subplots()
+    axes.set(title="evaluations during training", xlabel="decisions", ylabel="mean reward")
+    axes.xaxis.set_major_formatter(EngFormatter())
+    for (_, phase), colour in zip(curves.group_by("phase", maintain_order=True), COLOURS):
+        runs = phase.partition_by("run", maintain_order=True)
+        points = [(run["decisions"].to_numpy(), run["mean_reward"].to_numpy()) for run in runs]
+        plot_middle(axes, points, with_range=True, middle=np.median, color=colour)
+        for run in points:
+            axes.plot(*run, color=colour, lw=0.5, alpha=0.6)
+    # Where the second phase begins.
+    switch = curves.filter(pl.col("phase") == "first")["decisions"].to_numpy().max()
+    axes.axvline(switch, color=FAINT, ls=":")
+    axes.plot([switch] * len(before), before, "x", color=COLOURS[1])
+    names = ("on idm_mobil", "on gan (x: before any training there)")
+    add_legend(figure, dict(zip(names, COLOURS)))
+    return figure
+
+
+def draw(options: argparse.Namespace) -> str:
+    """Draw the figure; the line that names it."""
+    results = json.loads((DOCS / "reproduce" / "results.json").read_text(encoding="utf-8"))
+    row = next(
+        row
+        for row in results["rows"]
+        if (row["driver"], row["traffic"]) == ("agent_idm+none", "gan")
+    )
+    before = [training["mean_reward"] for training in row["each"]]
+    curves = read_curves(sorted((DOCS / "learning_curves").glob("seed_*")))
+    return f"figure: {save_figure(draw_transfer(curves, before), options.out, 'png')}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Draw; the exit status."""
+    parser = make_parser(__doc__)
+    parser.add_argument("--out", type=Path, default=DOCS / "reproduce" / "figure_4.png")
+    return run_script(draw, parser.parse_args(arguments))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

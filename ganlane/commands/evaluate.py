@@ -1,0 +1,93 @@
+"""``ganlane evaluate``: agents on traffics, as one table; the quick form on any traffic."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from ganlane import evaluation
+from ganlane.build import make_drivers
+from ganlane.evaluation.statistics import entries
+from ganlane.evaluation.table import show
+from ganlane.settings.commands import EvaluateConfig
+from ganlane.suite.driving import compare
+from ganlane.torch_settings import set_threads
+
+
+def evaluate(config: EvaluateConfig, folder: Path) -> str:
+    """Run the episodes, print and save the table.
+
+    The line that names the results.
+    """
+    set_threads(config.threads)
+    table = compare(make_drivers(config.agents, config.env, config.device), config)
+    seeds = {
+        "stream": config.stream,
+        "seed": config.seed,
+        "episodes": [0, config.episodes - 1],
+    }
+    return publish(
+        table,
+        folder,
+        asdict(config),
+        seeds,
+    )
+
+
+def recorded_crashes(table: pl.DataFrame) -> list[dict[str, Any]]:
+    """Crashes per km of each agent on each traffic that replays recorded scenes.
+
+    Returns:
+        Per pair ``agent, traffic, per_km, per_km_ci`` (bootstrap over whole scenes) and ``scenes``,
+        see :func:`ganlane.evaluation.crashes_by_scene`; nothing for other traffics.
+    """
+    if "scene" not in table.columns:
+        return []
+    rows = []
+    # Generated and rule-driven traffics have no scenes to resample.
+    recorded = table.filter(pl.col("scene").is_not_null())
+    for (agent, traffic), episodes in recorded.group_by("agent", "traffic", maintain_order=True):
+        per_km, scenes = evaluation.crashes_by_scene(episodes, episodes["scene"].to_list())
+        row = {
+            "agent": agent,
+            "traffic": traffic,
+            **entries("per_km", per_km),
+            "scenes": scenes,
+        }
+        rows.append(row)
+    return rows
+
+
+def publish(
+    table: pl.DataFrame,
+    folder: Path,
+    config: Mapping[str, Any],
+    seeds: Mapping[str, Any],
+    numbers: Mapping[str, Any] | None = None,
+) -> str:
+    """Print the tables of what :func:`compare` gave, save its episodes and numbers.
+
+    ``results.json`` holds ``rows``, ``paired`` (:func:`ganlane.evaluation.paired_rows`; a second
+    table with two drivers or more), ``failures`` (:func:`ganlane.evaluation.failed_episodes`),
+    ``crashes_by_scene`` where a traffic replays recorded scenes (:func:`recorded_crashes`), and
+    further ``numbers``. Returns the line that names it.
+    """
+    # On the same episodes a difference shows long before two intervals part.
+    rows = evaluation.evaluation_rows(table)
+    paired = evaluation.paired_rows(table)
+    tables = [evaluation.text_table(rows)]
+    # A driver alone has nobody to be paired with.
+    if paired:
+        tables.append(evaluation.paired_table(paired))
+    show(*tables, columns=config.get("columns", "all"))
+    record: dict[str, Any] = {"rows": rows, "paired": paired}
+    recorded = recorded_crashes(table)
+    if recorded:
+        record["crashes_by_scene"] = recorded
+    record |= {"failures": evaluation.failed_episodes(table), **(numbers or {})}
+    evaluation.write_episodes(folder, table)
+    return f"results: {evaluation.write_results(folder, record, config, seeds)}"

@@ -1,0 +1,133 @@
+"""``ganlane benchmark``: what a suite fixes (its protocol), and what the command takes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+from ganlane.errors import ParameterError
+from ganlane.settings.commands import (
+    Environments,
+    Episodes,
+    EvaluateConfig,
+    Measured,
+    Names,
+    RunConfig,
+)
+from ganlane.settings.env import EnvConfig
+from ganlane.settings.observation import MaskParameters, ObservationConfig, RewardParameters
+from ganlane.settings.record import DIFFERENT, Record, Rule, Text, between, plain
+from ganlane.settings.traffic import traffics_of
+
+#: Of the episodes, what ``quick=true`` drives.
+QUICK_SHARE = 0.2
+_PAIR = Rule(lambda names: len(names) == 2, "two drivers, [first, second]")
+
+
+@dataclass(frozen=True)
+class Suite(Record):
+    """``suite``: the protocol of a benchmark. Whoever drives by the same one has the same hash.
+
+    Attributes:
+        version: its name; one that is published is never changed.
+        stream: family of the episodes; benchmark: that of no training.
+        baselines: drive beside random_legal (score 0) and mobil (score 100).
+        agents: of a command that names none.
+        scored: traffics that count in the score, with their episodes.
+        shown: traffics that are reported beside them where they are at hand.
+        pairs: which driver is compared with which, besides every agent with MOBIL and baselines.
+        env: road, vehicles, first scenes, end of an episode.
+        reward: section V.C.
+    """
+
+    group = "suite"
+
+    version: Text = "mine"
+    stream: Measured = "benchmark"
+    baselines: list[Text] = field(default_factory=list)
+    agents: Annotated[list[Text], DIFFERENT] = field(default_factory=lambda: ["agent_general"])
+    scored: dict[str, Annotated[int, between(2, 10_000)]] = field(
+        default_factory=lambda: {"idm_mobil": 100}
+    )
+    shown: dict[str, Episodes] = field(default_factory=dict)
+    pairs: list[Annotated[list[Text], _PAIR]] = field(default_factory=list)
+    env: EnvConfig = field(default_factory=EnvConfig)
+    reward: RewardParameters = field(default_factory=RewardParameters)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        twice = set(self.scored) & set(self.shown)
+        if not self.scored or twice:
+            raise ParameterError(
+                "{scored}: expected at least one traffic, and none of those in {shown}."
+            )
+        self.traffics()
+
+    def traffics(self) -> dict[str, Any]:
+        """The settings of every traffic by its name, those of the score first."""
+        return traffics_of([*self.scored, *self.shown], "scored")
+
+    def drivers(self) -> list[str]:
+        """Who drives beside the agents."""
+        return list(dict.fromkeys(["random_legal", "mobil", *self.baselines]))
+
+
+@dataclass(frozen=True)
+class BenchmarkConfig(RunConfig):
+    """Agents on a suite: scores, a table, a report with films.
+
+    Attributes:
+        agents: words without = mean the same: shipped agents, files, folders of trainings, import
+            paths; agent_idm@all: every training of its recipe, as one entry.
+        suite: the protocol; its keys may be changed, and the hash tells that they were.
+        quick: a fifth of the episodes.
+        observation: what a function of your own is given.
+        mask: which actions it may choose.
+        num_envs: episodes driven side by side, at most.
+        cells: folder of what was driven; a pair of driver and traffic that is there is not driven
+            again.
+        films: failures of each entry that the report shows, at most.
+    """
+
+    agents: Names | None = None
+    suite: Suite = field(default_factory=Suite)
+    quick: bool = False
+    observation: ObservationConfig = field(default_factory=ObservationConfig)
+    mask: MaskParameters = field(default_factory=MaskParameters)
+    num_envs: Environments = 256
+    cells: str = "outputs/cells"
+    films: Annotated[int, between(0, 10)] = 3
+
+    def episodes_on(self, traffic: str) -> int:
+        """Number of episodes on a traffic."""
+        episodes = {**self.suite.scored, **self.suite.shown}[traffic]
+        return max(2, round(episodes * QUICK_SHARE)) if self.quick else episodes
+
+    def protocol(self) -> str:
+        """Twelve digits of the SHA-256 of everything that decides a result, but the code."""
+        fixed = plain(self.suite)
+        # Who drives besides, and who is compared with whom, changes nobody's result.
+        del fixed["agents"], fixed["baselines"], fixed["pairs"]
+        # Both change how fast an episode is driven, not what happens in it.
+        del fixed["env"]["compile"], fixed["env"]["kernel"]
+        traffics = {name: item.description() for name, item in self.suite.traffics().items()}
+        everything = {**fixed, "traffics": traffics, "seed": self.seed, "quick": self.quick}
+        return hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()[:12]
+
+    def on(self, traffic: str) -> EvaluateConfig:
+        """The same for one traffic, as ``ganlane evaluate`` takes it."""
+        return EvaluateConfig(
+            seed=self.seed,
+            threads=self.threads,
+            device=self.device,
+            env=self.suite.env,
+            observation=self.observation,
+            mask=self.mask,
+            reward=self.suite.reward,
+            traffics={traffic: self.suite.traffics()[traffic]},
+            episodes=self.episodes_on(traffic),
+            num_envs=self.num_envs,
+            stream=self.suite.stream,
+        )

@@ -1,0 +1,220 @@
+"""The table of a benchmark, the paper's tables beside ours, and the page with films of failures."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ganlane.evaluation.measures import CRASHES
+from ganlane.evaluation.table import Cell, Table, number, number_of, text_of, with_interval
+from ganlane.files import write_bytes
+
+Row = Mapping[str, Any]
+#: The paper's Table VI: hard and soft crashes on Traffic_IDM, of an unstated number of runs.
+PAPER_VI = {
+    "agent_idm": (19, 2),
+    "agent_gan": (9, 0),
+}
+#: The paper's Table VII: % of MOBIL, mean reward and its standard deviation on Traffic_GAN, 1000
+#: runs.
+PAPER_VII = {
+    "agent_idm": (5.21, -22.33, 100.66),
+    "agent_gan": (114.82, 33.62, 95.19),
+}
+_CSS = """
+body { font: 15px/1.5 sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }
+body { color: #262a30 }
+table { border-collapse: collapse; font-size: 13px; margin: 1em 0 }
+td, th { padding: 2px 9px; text-align: right }
+th { border-bottom: 1px solid #6e747c }
+th[scope] { border: 0; font-weight: normal; text-align: left }
+iframe { width: 100%; height: 640px; border: 1px solid #c8ccd2 }
+.wide { overflow-x: auto }
+"""
+
+
+def _trainings(row: Row) -> str:
+    return f"{row['trainings']} x {row['episodes']}"
+
+
+def _kinds(row: Row) -> str:
+    return "/".join(str(row["crash_kinds"][kind]) for kind in CRASHES)
+
+
+def score_table(summaries: Sequence[Row], traffics: Sequence[str], notes: Sequence[str]) -> Table:
+    """Every entry with its score; the best first."""
+
+    def worst(row: Row) -> str:
+        return f"{number(row['worst'], 1)} {row['worst_traffic'] or ''}".rstrip()
+
+    def above_mobil(row: Row) -> str:
+        return with_interval(row["improvement"].get("mobil", {}), "probability", 2)
+
+    def on(traffic: str) -> Cell:
+        return lambda row: number(row["by_traffic"][traffic]["normalized_percent"], 1)
+
+    columns: dict[str, Cell] = {
+        "entry": text_of("entry"),
+        "n": text_of("trainings"),
+        "score [95 %]": number_of("score", 1),
+        "worst traffic": worst,
+        "crashes": number_of("crashes_per_1000_km", 1),
+        "off road": lambda row: number(row["departures_per_1000_km"], 1),
+        "at fault": lambda row: number(row["at_fault_per_1000_km"], 1),
+        "near misses": lambda row: number(row["near_misses_per_1000_km"], 1),
+        "m/s": lambda row: number(row["mean_speed_mps"], 1),
+        "P(above MOBIL)": above_mobil,
+        "headway s": lambda row: number(row["least_headway_s"], 2),
+        "braking": lambda row: number(row["hardest_braking_mps2"], 1),
+        "/".join(CRASHES): _kinds,
+        "decisions/s": lambda row: number(row["decisions_per_s"], 0),
+        **{traffic: on(traffic) for traffic in traffics},
+    }
+    best_first = sorted(summaries, key=lambda row: -row["score"])
+    return Table.of("", best_first, columns, 1, notes)
+
+
+def matrix_table(rows: Sequence[Row]) -> Table:
+    """Every driver on every traffic."""
+    columns: Mapping[str, Cell] = {
+        "driver": text_of("driver"),
+        "traffic": text_of("traffic"),
+        "episodes": _trainings,
+        "score": number_of("normalized_percent", 1),
+        "mean reward": number_of("mean_reward", 1),
+        "minus MOBIL": number_of("minus_mobil", 1),
+        "P(above MOBIL)": number_of("probability_above_mobil", 2),
+        "hard": text_of("hard_crash"),
+        "off road": text_of("out_of_road"),
+        "both per 1000 km": number_of("failures_per_1000_km", 1),
+        "/".join(CRASHES): _kinds,
+        "near misses per 1000 km": number_of("near_misses_per_1000_km", 1),
+        "headway s": lambda row: number(row["least_headway_s"], 2),
+        "m/s": number_of("mean_speed_mps", 1),
+        "changes/km": number_of("lane_changes_per_km", 2),
+        "close behind": number_of("soft_crash_behind_per_episode", 2),
+    }
+    return Table.of("Every driver on every traffic", rows, columns, names=2)
+
+
+def comparison_table(rows: Sequence[Row]) -> Table:
+    """Pairs of drivers on the same episodes."""
+
+    def tests(row: Row) -> str:
+        return "; ".join(
+            f"{test['only_first']}/{test['only_second']}, {test['p_value']:.2g}"
+            for test in row["mcnemar"]
+        )
+
+    columns: Mapping[str, Cell] = {
+        "driver": text_of("driver"),
+        "over": text_of("over"),
+        "traffic": text_of("traffic"),
+        "lead in reward": number_of("lead", 1),
+        "P(improvement)": number_of("probability", 2),
+        "crashes per 1000 episodes, more": number_of("crash_difference_per_1000_episodes", 1),
+        "McNemar, each training: crashed alone, p": tests,
+    }
+    return Table.of("Drivers compared on the same episodes", rows, columns, names=3)
+
+
+def paper_tables(rows: Sequence[Row]) -> list[Table]:
+    """The paper's Tables VI and VII with our rows below its own; none without its agents."""
+
+    def each(key: str, digits: int) -> Cell:
+        return lambda row: ", ".join(number(training[key], digits) for training in row["each"])
+
+    def ours(traffics: Sequence[str], drivers: Sequence[str]) -> list[Row]:
+        # Agents may say that they drive without a mask.
+        names = {name for driver in drivers for name in (driver, f"{driver}+none")}
+        return [row for row in rows if row["traffic"] in traffics and row["driver"] in names]
+
+    names: Mapping[str, Cell] = {
+        "source": lambda row: "here",
+        "traffic": text_of("traffic"),
+        "driver": text_of("driver"),
+        "episodes": _trainings,
+    }
+    crashes: Mapping[str, Cell] = {
+        "hard": text_of("hard_crash"),
+        "soft": text_of("soft_crash"),
+        "share of hard [95 %, exact]": number_of("hard_crash_share", 4),
+        "each training": each("hard_crash", 0),
+    }
+    rewards: Mapping[str, Cell] = {
+        "% of MOBIL": number_of("normalized_percent", 1),
+        "mean reward": number_of("mean_reward", 1),
+        "sd": number_of("reward_sd", 1),
+        "each training": each("mean_reward", 1),
+    }
+    drivers = [*PAPER_VI, "mobil", "random_legal"]
+    six = Table.of(
+        "Table VI: crashes on rule-driven traffic",
+        ours(["idm", "idm_mobil"], drivers),
+        {**names, **crashes},
+        3,
+    )
+    seven = Table.of(
+        "Table VII: performance on generated traffic",
+        ours(["gan"], drivers),
+        {**names, **rewards},
+        3,
+    )
+    lines_vi = [
+        ["paper", "Traffic_IDM", name, "not stated", *map(str, counts), "", ""]
+        for name, counts in PAPER_VI.items()
+    ]
+    lines_vii = [
+        ["paper", "Traffic_GAN", name, "1000", *(f"{value:.2f}" for value in values), ""]
+        for name, values in PAPER_VII.items()
+    ]
+    if not ours(["gan"], list(PAPER_VII)):
+        return []
+    return [
+        replace(six, lines=[*lines_vi, *six.lines]),
+        replace(seven, lines=[*lines_vii, *seven.lines]),
+    ]
+
+
+def write_report(
+    folder: Path,
+    title: str,
+    tables: Sequence[Table],
+    intro: Sequence[str],
+    films: Mapping[str, str],
+) -> Path:
+    """Write ``report.html``, one page that opens without a network; its path.
+
+    ``films`` are whole pages of the player by their heading.
+    """
+    parts = [f"<p>{html.escape(line)}</p>" for line in intro]
+    parts += map(_html, tables)
+    for heading, page in films.items():
+        # A page within the page: the player keeps its own style, scripts and policy.
+        frame = f'<iframe sandbox="allow-scripts" srcdoc="{html.escape(page)}"></iframe>'
+        parts.append(f"<h2>{html.escape(heading)}</h2>{frame}")
+    page = (
+        '<!doctype html><html lang="en"><meta charset="utf-8">'
+        f"<title>{html.escape(title)}</title><style>{_CSS}</style>"
+        f"<h1>{html.escape(title)}</h1>{''.join(parts)}</html>\n"
+    )
+    write_bytes(folder / "report.html", page.encode())
+    return folder / "report.html"
+
+
+def _html(table: Table) -> str:
+    # The columns with names are headings of their line.
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in table.headings)
+    lines = [f"<tr>{head}</tr>"]
+    # Everything is escaped: names of drivers and traffics come from the user.
+    for line in table.lines:
+        cells = [html.escape(cell) for cell in line]
+        names = "".join(f'<th scope="row">{cell}</th>' for cell in cells[: table.names])
+        numbers = "".join(f"<td>{cell}</td>" for cell in cells[table.names :])
+        lines.append(f"<tr>{names}{numbers}</tr>")
+    notes = "".join(f"<p>{html.escape(note)}</p>" for note in table.notes)
+    body = f'<div class="wide"><table>{"".join(lines)}</table></div>'
+    return f"<h2>{html.escape(table.title)}</h2>{body}{notes}"

@@ -1,0 +1,160 @@
+"""A benchmark from its drivers to its results: drive, score, print, write."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from ganlane.build import Driver, make_driver, make_drivers
+from ganlane.errors import UserError
+from ganlane.evaluation import failed_episodes, machine_sentence, write_results
+from ganlane.evaluation.table import show
+from ganlane.settings.suite import BenchmarkConfig
+from ganlane.sim.random import Stream
+from ganlane.suite import report, scores
+from ganlane.suite.cells import available, cells_of, drive
+from ganlane.suite.episodes import drive_episode
+from ganlane.torch_settings import set_threads
+from ganlane.view import Trajectory
+from ganlane.view.player import player_page
+
+#: What a film shows of a failure: so many seconds before it.
+_SHOWN_S = 15.0
+#: Version of the form of ``results.json``: what is in it, by what name (docs/benchmark.md).
+SCHEMA = 1
+
+
+def drivers_of(names: Sequence[str], config: BenchmarkConfig) -> list[Driver]:
+    """The drivers of entries by their names; a folder stands for the trainings in it.
+
+    Raises:
+        UserError: no such driver, a folder without agents, or one that does not fit.
+    """
+    stream = Stream.named(config.suite.stream)
+    drivers: list[Driver] = []
+    for name in names:
+        folder = Path(name)
+        if not folder.is_dir():
+            drivers += make_drivers([name], config.suite.env, config.device, stream)
+            continue
+        # Of a run its own agent, of a sweep those of its runs; a stable-baselines3 model each.
+        places = ("agent.safetensors", "*/agent.safetensors", "*.zip")
+        files = sorted(path for place in places for path in folder.glob(place))
+        if not files:
+            raise UserError(
+                f"{name}: no agent.safetensors and no .zip in this folder or its runs; give the "
+                "folder of a training, of a sweep, or a file."
+            )
+        for number, file in enumerate(files):
+            driver = make_driver(str(file), config.suite.env, stream, config.device)
+            drivers.append(driver.renamed(f"{folder.resolve().name}@{number}"))
+    return drivers
+
+
+def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
+    """Drive ``agents`` and the drivers of the suite, print the table, write results and report.
+
+    The line that names them.
+    """
+    set_threads(config.threads)
+    suite = config.suite
+    traffics, left_out = available(config)
+    for name, reason in left_out.items():
+        print(f"left out, {name}: {reason}", file=sys.stderr)
+    names = {driver.name for driver in agents}
+    others = drivers_of([name for name in suite.drivers() if name not in names], config)
+    cells = cells_of([*others, *agents], traffics, config)
+    episodes, seconds = drive(cells)
+    by_recipe = scores.by_recipe(episodes)
+    matrix = scores.rows(by_recipe)
+    entries = scores.summaries(by_recipe, matrix, suite)
+    for entry in entries:
+        mine = episodes.filter(episodes["agent"].is_in(_trainings(by_recipe, entry["entry"])))
+        took_s = sum(seconds[name] for name in mine["agent"].unique())
+        entry["decisions_per_s"] = int(mine["decisions"].sum()) / took_s
+    recipes = list(dict.fromkeys(scores.recipe_of(driver.name) for driver in agents))
+    pairs = [(one, other) for one in recipes for other in suite.drivers() if one != other]
+    pairs += [(first, second) for first, second in suite.pairs]
+    compared = scores.comparisons(by_recipe, list(dict.fromkeys(pairs)))
+    title = f"{suite.version}{', quick' if config.quick else ''}, protocol {config.protocol()}"
+    table = report.score_table(entries, list(suite.scored), _notes(title, config))
+    further = report.paper_tables(matrix) if suite.version == "paper" else []
+    show(table.text(), *(paper.text() for paper in further), columns=config.columns)
+    driven = {name: matrix_episodes(matrix, name) for name in traffics}
+    intro = [
+        "Intervals are 95 %: over trainings, where there are several of a recipe, and over "
+        "episodes.",
+        f"Episodes of seed {config.seed}, the same for all drivers: "
+        + ", ".join(f"{count} on {name}" for name, count in driven.items()),
+        *(f"Left out, {name}: {reason}" for name, reason in left_out.items()),
+        machine_sentence([config.threads or 1]),
+    ]
+    films = _films(agents, episodes, config) if config.films else {}
+    tables = [
+        table,
+        *further,
+        report.matrix_table(matrix),
+        report.comparison_table(compared),
+    ]
+    page = report.write_report(folder, f"ganlane benchmark: {title}", tables, intro, films)
+    record = {
+        "schema": SCHEMA,
+        "suite": suite.version,
+        "protocol": config.protocol(),
+        "quick": config.quick,
+        "entries": entries,
+        "rows": matrix,
+        "comparisons": compared,
+        "failures": failed_episodes(episodes),
+        "left_out": left_out,
+    }
+    seeds = {"stream": suite.stream, "seed": config.seed, "episodes": driven}
+    return f"report: {page}; results: {write_results(folder, record, asdict(config), seeds)}"
+
+
+def _trainings(cells: scores.Cells, recipe: str) -> list[str]:
+    """Names of the trainings of a recipe."""
+    return next(list(driven) for (name, _), driven in cells.items() if name == recipe)
+
+
+def matrix_episodes(matrix: Sequence[Mapping[str, Any]], traffic: str) -> int:
+    """How many episodes each driver drove on a traffic."""
+    return next(row["episodes"] for row in matrix if row["traffic"] == traffic)
+
+
+def _notes(title: str, config: BenchmarkConfig) -> list[str]:
+    """What stands below the table."""
+    scored = ", ".join(config.suite.scored)
+    return [
+        f"{title}: score 0 random_legal, 100 mobil; interquartile mean over {scored}.",
+        "crashes, off road, at fault, near misses: per 1000 km of all these traffics.",
+    ]
+
+
+def _films(
+    agents: Sequence[Driver], episodes: pl.DataFrame, config: BenchmarkConfig
+) -> dict[str, str]:
+    """Pages that play the last seconds of the first failures of every entry, by their headings."""
+    traffics = config.suite.traffics()
+    pages = {}
+    for driver in agents:
+        mine = episodes.filter(pl.col("agent") == driver.name)
+        failed = failed_episodes(mine)
+        # One traffic after the other, so that a film of each comes first.
+        listed = [
+            (number, row["traffic"])
+            for row in failed
+            for number in [*row["hard_crash"], *row["out_of_road"]][: config.films]
+        ][: config.films]
+        shown: list[Trajectory] = []
+        for number, traffic in listed:
+            film = drive_episode(driver, traffics[traffic], config.on(traffic), number)
+            shown.append(film.since(max(0.0, float(film.time_s[-1]) - _SHOWN_S)))
+        if shown:
+            pages[f"Failures of {driver.name}"] = player_page(shown)
+    return pages

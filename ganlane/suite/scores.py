@@ -1,0 +1,319 @@
+"""The numbers of a benchmark with the training as the unit: by traffic, over traffics, by pair."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from ganlane.errors import UserError
+from ganlane.evaluation.measures import CRASHES
+from ganlane.evaluation.rows import FAILURES, SCALE_BOTTOM, SCALE_TOP
+from ganlane.evaluation.statistics import (
+    Array,
+    Estimate,
+    clopper_pearson,
+    difference,
+    entries,
+    improvement_over_traffics,
+    interquartile_mean,
+    mcnemar,
+    normalized_over_trainings,
+    over_trainings,
+    probability_of_improvement,
+    rate_over_trainings,
+    score_over_traffics,
+)
+from ganlane.settings.suite import Suite
+
+Row = dict[str, Any]
+#: Recipe and traffic to the episodes of each training, by driver's name.
+Cells = Mapping[tuple[str, str], Mapping[str, pl.DataFrame]]
+#: A smaller time to collision is a near miss, s (van der Horst 1990).
+NEAR_MISS_S = 1.5
+#: Rates per 1000 km by name: the episodes that they count.
+_RATES = {
+    "crashes": pl.col("reason").is_in(FAILURES[:1]),
+    "departures": pl.col("reason").is_in(FAILURES[1:]),
+    "failures": pl.col("reason").is_in(FAILURES),
+    "at_fault": pl.col("at_fault").fill_null(False),
+    "near_misses": (pl.col("least_ttc_s") < NEAR_MISS_S) & (pl.col("reason") != FAILURES[0]),
+}
+
+
+def recipe_of(driver: str) -> str:
+    """``agent_idm+safe`` of ``agent_idm@3+safe`` and of ``FOLDER/agent_idm.safetensors@3+safe``."""
+    # Name, seed and mask: a folder and the file's ending do not belong to the recipe.
+    packed = re.fullmatch(r"(?:.*/)?(.+?)(?:\.safetensors)?@\d+(\+.*)?", driver)
+    return driver if packed is None else packed[1] + (packed[2] or "")
+
+
+def seed_of(driver: str) -> int:
+    """3 of ``agent_idm@3+safe``; 0 where no seed is named: ``agent_idm`` is ``agent_idm@0``."""
+    named = re.search(r"@(\d+)(?:\+|$)", driver)
+    return int(named[1]) if named else 0
+
+
+def by_recipe(episodes: pl.DataFrame) -> dict[tuple[str, str], dict[str, pl.DataFrame]]:
+    """The episodes of the matrix by recipe and traffic, in the order in which they first appear."""
+    cells: dict[tuple[str, str], dict[str, pl.DataFrame]] = {}
+    for (driver, traffic), frame in episodes.group_by("agent", "traffic", maintain_order=True):
+        recipe = recipe_of(str(driver))
+        trainings = cells.setdefault((recipe, str(traffic)), {})
+        trainings[str(driver)] = frame.sort("episode")
+        # The same training twice would count as two.
+        if len(set(map(seed_of, trainings))) < len(trainings):
+            names = ", ".join(trainings)
+            raise UserError(
+                f"agents: two of one seed are called {recipe} ({names}); leave one out."
+            )
+    return cells
+
+
+def column(trainings: Mapping[str, pl.DataFrame], value: str | pl.Expr) -> Array:
+    """A column of each training as a table [S, E].
+
+    Replayed episodes of one recorded car are near copies of each other: their mean is one entry.
+    """
+    columns = []
+    for frame in trainings.values():
+        expression = pl.col(value) if isinstance(value, str) else value
+        chosen = frame.select(expression.cast(pl.Float64).alias("value"))
+        if "car" in frame.columns and frame["car"].null_count() == 0:
+            cars = chosen.with_columns(car=frame["car"]).group_by("car", maintain_order=True)
+            chosen = cars.agg(pl.col("value").mean())
+        columns.append(chosen["value"].to_numpy())
+    return np.stack(columns)
+
+
+def rows(cells: Cells) -> list[Row]:
+    """One row per recipe and traffic.
+
+    Returns:
+        Per row ``driver, traffic, trainings`` S, ``episodes`` E of each; ``mean_reward``,
+        ``interquartile_mean`` (of the trainings' mean rewards) and ``reward_sd`` (over all
+        episodes); ``minus_mobil`` and ``probability_above_mobil`` (None for MOBIL, the latter for a
+        single training, too); ``normalized_percent``; ``hard_crash``, ``soft_crash`` (episodes with
+        one) and ``out_of_road`` of all trainings together; ``hard_crash_share`` (exact interval of
+        all episodes, as if they were independent); ``crashes``, ``departures`` and ``failures``
+        (both), ``at_fault`` (the ego moved into the other) and ``near_misses`` (episodes without a
+        crash, with a time to collision below :data:`NEAR_MISS_S`) ``_per_1000_km``;
+        ``mean_speed_mps, lane_changes_per_km, soft_crash_behind_per_episode``; ``at_fault_share``
+        of the hard crashes (None without any) and ``crash_kinds``, how many of each of
+        :data:`ganlane.evaluation.measures.CRASHES`; ``least_ttc_s`` and ``least_headway_s`` (median
+        of the episodes' smallest), ``rms_acceleration_mps2`` and ``hardest_braking_mps2`` (means of
+        the episodes'); and ``each``, mean reward, lead over MOBIL and
+        failures of every training. A key with ``_ci`` holds the 95 % interval of its namesake over
+        trainings and episodes.
+    """
+    return [_row(recipe, traffic, cells) for recipe, traffic in cells]
+
+
+def _row(recipe: str, traffic: str, cells: Cells) -> Row:
+    trainings = cells[recipe, traffic]
+    # Both [S, E]: trainings by episodes.
+    rewards = column(trainings, "reward")
+    # MOBIL drives on every traffic; it is not compared with itself.
+    mobil = column(cells[SCALE_TOP, traffic], "reward")
+    is_mobil = recipe == SCALE_TOP
+    # What cannot be said stays None and is printed as a dash.
+    score = None
+    if (SCALE_BOTTOM, traffic) in cells:
+        random_legal = column(cells[SCALE_BOTTOM, traffic], "reward")
+        score = normalized_over_trainings(rewards, mobil, random_legal)
+    lead = None if is_mobil else difference(rewards, mobil)
+    probability = None if is_mobil else _probability(rewards, mobil)
+    # Counts and plain rates are of the episodes of all trainings.
+    together = pl.concat(trainings.values())
+    row: Row = {
+        "driver": recipe,
+        "traffic": traffic,
+        "trainings": len(rewards),
+        "episodes": together.height // len(trainings),
+        **entries("mean_reward", over_trainings(rewards)),
+        **entries("interquartile_mean", over_trainings(rewards, interquartile_mean)),
+        "reward_sd": float(together["reward"].to_numpy().std(ddof=1)),
+        **entries("minus_mobil", lead),
+        **entries("probability_above_mobil", probability),
+        **entries("normalized_percent", score),
+        **safety(trainings),
+    }
+    # Trainings one by one, so that a reader sees how far they lie apart.
+    row["each"] = []
+    for (name, frame), reward in zip(trainings.items(), rewards[:, None]):
+        lead = None if is_mobil else difference(reward, mobil)
+        training = {"driver": name, **entries("mean_reward", over_trainings(reward))}
+        training |= {**entries("minus_mobil", lead), **_failures(frame)}
+        row["each"].append(training)
+    return row
+
+
+def safety(trainings: Mapping[str, pl.DataFrame]) -> Row:
+    """What :func:`rows` says of crashes, near misses, comfort and speed."""
+    together = pl.concat(trainings.values())
+    crashes = together.filter(_RATES["crashes"])
+    metres = float(together["distance_m"].sum())
+    seconds = float(together["duration_s"].sum())
+    km = column(trainings, pl.col("distance_m") / 1000.0)
+    kinds = {kind: int((crashes["crash"] == kind).sum()) for kind in CRASHES}
+    row: Row = {
+        **_failures(together),
+        "soft_crash": int(together["had_soft_crash"].sum()),
+        **entries("hard_crash_share", clopper_pearson(crashes.height, together.height)),
+        "at_fault_share": crashes["at_fault"].mean(),
+        "crash_kinds": kinds,
+        "least_ttc_s": together["least_ttc_s"].median(),
+        "least_headway_s": together["least_headway_s"].median(),
+        "rms_acceleration_mps2": together["rms_acceleration_mps2"].mean(),
+        "hardest_braking_mps2": together["hardest_braking_mps2"].mean(),
+        "mean_speed_mps": metres / seconds if seconds > 0.0 else None,
+        "lane_changes_per_km": None,
+        "soft_crash_behind_per_episode": together["soft_crash_behind"].mean(),
+    }
+    if metres > 0.0:
+        row["lane_changes_per_km"] = int(together["lane_changes"].sum()) / metres * 1000.0
+    for name, counted in _RATES.items():
+        rate = rate_over_trainings(column(trainings, counted), km)
+        row |= entries(f"{name}_per_1000_km", None if rate is None else rate.scaled(1000.0))
+    return row
+
+
+def _failures(episodes: pl.DataFrame) -> dict[str, int]:
+    return {end: int((episodes["reason"] == end).sum()) for end in FAILURES}
+
+
+def summaries(cells: Cells, matrix: Sequence[Row], suite: Suite) -> list[Row]:
+    """One row per recipe, over the traffics of the score.
+
+    Args:
+        cells: of :func:`by_recipe`.
+        matrix: their :func:`rows`.
+        suite: its traffics of the score.
+
+    Returns:
+        Per row ``entry, trainings``; ``score``, the interquartile mean over traffics of the
+        normalised scores; ``by_traffic``, those scores with their intervals; ``worst`` and
+        ``worst_traffic``, the lowest of them; ``improvement``, by name of each driver of the suite
+        how likely a training is above it on a traffic; and what :func:`rows` says of safety, of
+        all these traffics together.
+    """
+    scored = list(suite.scored)
+    summary = []
+    names = ("normalized_percent", "normalized_percent_ci")
+    for recipe in dict.fromkeys(recipe for recipe, _ in cells):
+        scores = {
+            row["traffic"]: {name: row[name] for name in names}
+            for row in matrix
+            if row["driver"] == recipe
+        }
+        percent = {name: scores[name]["normalized_percent"] for name in scored}
+        decided = [name for name in scored if percent[name] is not None]
+        worst = min(decided, key=lambda name: percent[name], default=None)
+        together = {
+            name: pl.concat([cells[recipe, traffic][name] for traffic in scored])
+            for name in cells[recipe, scored[0]]
+        }
+        summary.append(
+            {
+                "entry": recipe,
+                "trainings": len(together),
+                **entries("score", score_over_traffics(_rewards(cells, scored, recipe))),
+                "by_traffic": scores,
+                "worst": None if worst is None else percent[worst],
+                "worst_traffic": worst,
+                "improvement": _improvement(cells, scored, recipe, suite),
+                **safety(together),
+            }
+        )
+    return summary
+
+
+def _rewards(cells: Cells, traffics: Sequence[str], recipe: str) -> list[list[Array]]:
+    """By traffic the rewards of a recipe, MOBIL and the random driver."""
+    drivers = (recipe, SCALE_TOP, SCALE_BOTTOM)
+    return [[column(cells[name, traffic], "reward") for name in drivers] for traffic in traffics]
+
+
+def _improvement(
+    cells: Cells, traffics: Sequence[str], recipe: str, suite: Suite
+) -> dict[str, dict[str, Any]]:
+    """The probability of improvement over each driver of the suite."""
+    probabilities = {}
+    for other in suite.drivers():
+        if other == recipe:
+            continue
+        pairs = [
+            (column(cells[recipe, traffic], "reward"), column(cells[other, traffic], "reward"))
+            for traffic in traffics
+        ]
+        probabilities[other] = entries("probability", improvement_over_traffics(pairs))
+    return probabilities
+
+
+def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:
+    """Recipes compared on every traffic that both drove on.
+
+    Returns:
+        Per pair and traffic ``driver, over, traffic, lead`` (difference of mean rewards),
+        ``probability`` (that a training of the first is above one of the second),
+        ``crash_difference_per_1000_episodes``, and ``mcnemar``: for each training of the first that
+        has a namesake of the second (same seed, or the only one) the episodes in which one alone
+        crashed, and the exact probability.
+    """
+    compared = []
+    traffics = dict.fromkeys(traffic for _, traffic in cells)
+    for one, other in pairs:
+        for traffic in traffics:
+            first = cells.get((one, traffic))
+            second = cells.get((other, traffic))
+            if first is not None and second is not None:
+                names = {"driver": one, "over": other, "traffic": traffic}
+                compared.append({**names, **_compared(first, second)})
+    return compared
+
+
+def _compared(first: Mapping[str, pl.DataFrame], second: Mapping[str, pl.DataFrame]) -> Row:
+    """The numbers of a row of :func:`comparisons`."""
+    rewards = column(first, "reward")
+    other_rewards = column(second, "reward")
+    crashed, other_crashed = (column(cell, _RATES["crashes"]) for cell in (first, second))
+    # Per 1000 episodes, which is easier to read than a share.
+    more_crashes = _crash_difference(crashed, other_crashed).scaled(1000.0)
+    # Trainings of one seed started from the same random numbers.
+    namesakes = dict(zip(map(seed_of, second), other_crashed))
+    # A driver without trainings, say MOBIL, is held against every training of the first.
+    if len(namesakes) == 1:
+        namesakes = dict.fromkeys(map(seed_of, first), other_crashed[0])
+    tests = []
+    for name, crashes in zip(first, crashed):
+        if seed_of(name) in namesakes:
+            # On the same episodes only those count in which one of the two crashed.
+            test = mcnemar(crashes > 0, namesakes[seed_of(name)] > 0)
+            tests.append({"driver": name, **vars(test)})
+    return {
+        **entries("lead", difference(rewards, other_rewards)),
+        **entries("probability", _probability(rewards, other_rewards)),
+        **entries("crash_difference_per_1000_episodes", more_crashes),
+        "mcnemar": tests,
+    }
+
+
+def _crash_difference(first: Array, second: Array) -> Estimate:
+    """Difference of the shares of episodes with a crash.
+
+    Where there is none, resampling would leave no doubt.
+    """
+    if first.any() or second.any():
+        return difference(first, second)
+    # Nobody crashed, which is no proof that nobody would: the exact bound of no crash in E
+    # episodes.
+    most = clopper_pearson(0, first.shape[1]).high or 0.0
+    return Estimate(0.0, -most, most)
+
+
+def _probability(first: Array, second: Array) -> Estimate | None:
+    """None where neither has a second training: it says nothing then."""
+    return probability_of_improvement(first, second) if len(first) + len(second) > 2 else None

@@ -1,0 +1,161 @@
+"""``ganlane benchmark`` from end to end, with short episodes, in process."""
+
+from __future__ import annotations
+
+import json
+import re
+from functools import partial
+from pathlib import Path
+
+import pytest
+from reference.refusals import user_error
+
+import ganlane
+from ganlane.config.run import run_command, settings
+from ganlane.evaluation.rows import FAILURES
+from ganlane.suite import cells
+
+main = partial(run_command, "benchmark")
+SHORT = ["suite.env.goal_m=60", "hydra.run.dir=out", "suite.scored={idm_mobil: 3, gan: 2}"]
+ALONE = [*SHORT, "suite.shown={}", "suite.baselines=[]"]
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+
+@pytest.fixture
+def cells_driven(monkeypatch):
+    """The cells that were driven, by driver and traffic."""
+    driven, drive_cell = [], cells._drive
+
+    def noting(cell):
+        driven.append((cell.driver.name, cell.traffic))
+        return drive_cell(cell)
+
+    monkeypatch.setattr(cells, "_drive", noting)
+    return driven
+
+
+def results():
+    return json.loads(Path("out/results.json").read_text())
+
+
+def test_one_command_leaves_a_table_results_and_a_page(cells_driven, capsys):
+    assert main([*ALONE, "agent_idm@all+none", "keep_lane"]) == 0
+    out = capsys.readouterr().out
+    protocol = settings("benchmark", ALONE).protocol()
+    assert f"shift-v1, protocol {protocol}" in out
+    # agent_idm has five trainings
+    assert len(cells_driven) == len(set(cells_driven)) == 2 * (3 + 5)
+    told = results()
+    assert told["protocol"] == protocol
+    assert {entry["entry"]: entry["trainings"] for entry in told["entries"]} == {
+        "random_legal": 1,
+        "mobil": 1,
+        "agent_idm+none": 5,
+        "keep_lane": 1,
+    }
+    by_name = {entry["entry"]: entry for entry in told["entries"]}
+    assert (by_name["random_legal"]["score"], by_name["mobil"]["score"]) == (0.0, 100.0)
+    assert {"rows", "comparisons", "failures", "left_out", "code", "config"} <= told.keys()
+    page = Path("out/report.html").read_text()
+    assert "agent_idm+none" in page
+    assert not any(f'{attribute}="http' in page for attribute in ("src", "href"))
+
+
+def test_failures_are_films_within_the_page():
+    # Who drives at random leaves the road in the first seconds.
+    assert main([*ALONE, "random"]) == 0
+    page = Path("out/report.html").read_text()
+    assert "Failures of random" in page
+    assert page.count("<iframe") == 1
+    failures = [row for row in results()["failures"] if row["driver"] == "random"]
+    listed = [number for row in failures for end in FAILURES for number in row[end]]
+    shown = re.findall(r"&quot;episode&quot;:(\d+)", page)
+    assert len(shown) == 3
+    assert {int(number) for number in shown} <= set(listed)
+
+
+def test_what_was_driven_is_not_driven_again_and_gives_the_same_numbers(cells_driven, capsys):
+    told = []
+    for more in ([], [], ["keep_lane"], ["seed=1"]):
+        assert main([*ALONE, "random", *more]) == 0
+        told.append(results()["rows"])
+    assert told[0] == told[1]
+    drivers = ["random_legal", "mobil", "random"]
+    assert [driver for driver, traffic in cells_driven if traffic == "gan"] == [
+        *drivers,
+        "keep_lane",
+        *drivers,
+    ]
+    for cell in Path("outputs/cells").glob("*.parquet"):
+        cell.write_bytes(cell.read_bytes()[:-50])
+    capsys.readouterr()
+    assert main([*ALONE, "random"]) == 2
+    assert "not the episodes of a cell" in capsys.readouterr().err
+
+
+def test_traffic_that_is_not_at_hand_is_left_out_and_said_so(monkeypatch, capsys):
+    monkeypatch.setenv("GANLANE_DATA", "nowhere")
+    assert main([*SHORT, "suite.shown={replay: 5}", "suite.baselines=[]", "keep_lane"]) == 0
+    assert "left out, replay:" in capsys.readouterr().err
+    assert results()["left_out"].keys() == {"replay"}
+
+
+def test_a_plain_function_of_observations_is_an_agent(cells_driven):
+    Path("mine.py").write_text("def drive(observation):\n    return [0] * len(observation)\n")
+    for _ in range(2):
+        assert main([*ALONE, "mine:drive", "keep_lane"]) == 0
+    rows = {(row["driver"], row["traffic"]): row["mean_reward"] for row in results()["rows"]}
+    assert rows["mine:drive", "gan"] == rows["keep_lane", "gan"]
+    # Nobody knows whether the function is still the same.
+    assert cells_driven.count(("mine:drive", "gan")) == 2
+    assert cells_driven.count(("keep_lane", "gan")) == 1
+
+
+@pytest.mark.parametrize("returned", ["[0.0] * len(observation)", "0", "[0, 1, 2]"])
+def test_a_function_that_returns_something_else_is_refused_in_one_sentence(returned, capsys):
+    module = f"wrong_{abs(hash(returned))}"
+    Path(f"{module}.py").write_text(f"def drive(observation):\n    return {returned}\n")
+    assert main([*ALONE, f"{module}:drive"]) == 2
+    assert "drive: returned" in capsys.readouterr().err
+
+
+def test_a_folder_of_trainings_is_one_entry(cells_driven):
+    from ganlane.agents.checkpoint import agent_file
+
+    for number in range(2):
+        folder = Path(f"sweep/{number}")
+        folder.mkdir(parents=True)
+        agent = agent_file("agent_idm").read_bytes()
+        (folder / "agent.safetensors").write_bytes(agent)
+    assert main([*ALONE, "sweep"]) == 0
+    by_name = {entry["entry"]: entry for entry in results()["entries"]}
+    assert by_name["sweep"]["trainings"] == 2
+
+
+def test_the_protocol_is_that_of_everybody_and_changes_with_whatever_changes_a_result():
+    def protocol(*words):
+        return settings("benchmark", list(words)).protocol()
+
+    shipped = protocol()
+    assert shipped == protocol("keep_lane", "suite.baselines=[]", "threads=1", "num_envs=7")
+    changes = ("seed=1", "quick=true", "suite.scored.gan=299", "suite.env.lanes=4", "suite=paper")
+    assert len({shipped, *map(protocol, changes)}) == 1 + len(changes)
+
+
+def test_python_takes_a_function_a_driver_and_names_of_your_own():
+    def straight_on(observation):
+        return [0] * len(observation)
+
+    suite = {"name": "shift-v1", "scored": {"idm": 3}, "shown": {}, "baselines": []}
+    suite["env"] = {"goal_m": 60}
+    driver = ganlane.load_agent("agent_idm")
+    run = ganlane.benchmark(
+        {"mine": straight_on, "theirs": driver, "rule": "keep_lane"},
+        suite=suite,
+        folder="out",
+    )
+    scores = {entry["entry"]: entry["score"] for entry in run.results["entries"]}
+    assert scores.keys() == {"random_legal", "mobil", "mine", "theirs", "rule"}
+    assert scores["mine"] == scores["rule"]
+    with user_error("expected an agent's name or a function"):
+        ganlane.benchmark(3, suite=suite)

@@ -51,7 +51,7 @@ EPISODES = 300
 
 
 class Training(NamedTuple):
-    """One training: the mask, the varied property and its dose (None: unchanged drivers), the seed."""
+    """A training: mask, varied property and its dose (None: unchanged drivers), seed."""
 
     mask: str
     varied: str

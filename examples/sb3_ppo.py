@@ -25,11 +25,12 @@ def main(
     episodes="100",
     goal_m="5000",
     num_envs="256",
+    seed="0",
 ):
     """Train, then evaluate."""
     torch.set_num_threads(1)  # small networks: a second thread only costs
     options = {"mask": mask, "goal_m": float(goal_m)}
-    env = ganlane.sb3.make_vec_env("idm_mobil", num_envs=int(num_envs), seed=0, **options)
+    env = ganlane.sb3.make_vec_env("idm_mobil", num_envs=int(num_envs), seed=int(seed), **options)
     if algorithm == "PPO":
         # crashes make the rewards' scale large
         env = VecNormalize(env, norm_obs=False, gamma=0.98, clip_reward=1e9)
@@ -44,10 +45,13 @@ def main(
         gae_lambda=0.9,
         ent_coef=0.01,
         policy_kwargs={"net_arch": [128, 128]},
-        seed=0,
+        seed=int(seed),
     )
     model.learn(int(decisions))
-    drivers = [ganlane.sb3.driver(model), "mobil"]
+    driver = ganlane.sb3.driver(model)
+    # For `ganlane benchmark outputs/sb3/MaskablePPO_0.zip`.
+    driver.save(f"outputs/sb3/{algorithm}_{seed}.zip")
+    drivers = [driver, "mobil"]
     table = ganlane.api.evaluate(drivers, ["idm_mobil"], int(episodes), **options)
     print(table.select("agent", "episodes", "goal", "hard_crash", "mean_reward"))
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
@@ -19,6 +20,7 @@ from ganlane import keys
 from ganlane.agents import load_agent
 from ganlane.agents.checkpoint import SHIPPED, names_agent, with_seeds
 from ganlane.agents.drivers import DRIVERS, FunctionPolicy, MaskedPolicy
+from ganlane.agents.stored_models import load_model
 from ganlane.arguments import (
     call_with,
     import_target,
@@ -222,8 +224,9 @@ def make_driver(
     Args:
         name: a rule-based one (:data:`ganlane.agents.drivers.DRIVERS`), a shipped agent
             (``agent_idm@1``: the recipe of ``agent_idm``, trained with seed 1), the path of an
-            agent's file, or the import path of a policy of your own (a class or annotated function;
-            it may have ``road``, ``stream``, ``idm`` and ``mobil``; with a colon,
+            agent's file (.safetensors; .zip of ``ganlane.sb3.driver(model).save``), or the import
+            path of a policy of your own (a class or annotated function; it may have
+            ``road``, ``stream``, ``idm`` and ``mobil``; with a colon,
             ``module:function``, a function of observations,
             :class:`ganlane.agents.drivers.FunctionPolicy`). A suffix ``+safe``, ``+legal``
             or ``+none`` sets its mask in place of the one in its training.
@@ -268,6 +271,10 @@ def make_driver(
             observation,
             mask_of(metadata),
         )
+    # a model of stable-baselines3, by its weights
+    if name.endswith(".zip"):
+        model, reading = load_model(Path(name), device)
+        return Driver(name, model, reading.observation, reading.mask)
     # a plain function of observations
     if is_function_path(name):
         return Driver(name, FunctionPolicy(imported(name, "agents")))

@@ -17,9 +17,7 @@ Needs the extra ``sb3``.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -32,20 +30,22 @@ from tensordict.nn import TensorDictModuleBase
 
 from ganlane import keys
 from ganlane.agents.drivers import mask_in
+from ganlane.agents.stored_models import (
+    Floats,
+    Network,
+    Normaliser,
+    Reading,
+    description_of,
+    read_description,
+)
 from ganlane.arguments import seed_number
 from ganlane.build import Driver
-from ganlane.errors import UserError
-from ganlane.files import (
-    PLACE,
-    atomic_path,
-    has_checksum,
-    refuse_without_checksum,
-    write_json,
-)
+from ganlane.errors import ParameterError, UserError
+from ganlane.files import PLACE, atomic_path, write_json
 from ganlane.gym.base import OnRows
 from ganlane.gym.vector import HighwayVectorGym
 from ganlane.settings.observation import MaskParameters, ObservationConfig
-from ganlane.settings.record import NotNegative, Number, Positive, Record, make, plain
+from ganlane.settings.record import plain
 
 try:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -62,7 +62,6 @@ try:
 except ModuleNotFoundError as error:
     raise UserError("ganlane.sb3 needs stable-baselines3: pip install 'ganlane[sb3]'.") from error
 
-Floats = npt.NDArray[np.float32]
 Indices = int | Iterable[int] | None
 #: Methods that give one result for each row.
 _OF_ROWS = ("action_masks", "render")
@@ -247,37 +246,6 @@ _TRANSPARENT = (
 )
 
 
-@dataclass(frozen=True)
-class Normaliser(Record):
-    """The statistics of observations of a ``VecNormalize``, as a file has them.
-
-    Attributes:
-        mean, variance: of each number of the observation, [D].
-        epsilon: is added to the variance.
-        clip_obs: bound of what results.
-    """
-
-    mean: list[Number]
-    variance: list[NotNegative]
-    epsilon: NotNegative
-    clip_obs: Positive
-
-    def normalize_obs(self, observation: Floats) -> Floats:
-        """What a ``VecNormalize`` makes of observations [N, D]."""
-        deviation = np.sqrt(np.asarray(self.variance) + self.epsilon)
-        scaled = (observation - np.asarray(self.mean)) / deviation
-        return np.clip(scaled, -self.clip_obs, self.clip_obs).astype(np.float32)
-
-
-@dataclass(frozen=True)
-class Reading(Record):
-    """What a model reads and which actions it may choose, as the JSON beside its file says."""
-
-    observation: ObservationConfig
-    mask: MaskParameters | None
-    normaliser: Normaliser | None
-
-
 class ModelPolicy(TensorDictModuleBase):
     """The deterministic policy of a stable-baselines3 model, for one environment at a time.
 
@@ -346,7 +314,8 @@ class ModelDriver(Driver):
     def save(self, path: str | Path) -> None:
         """Store the model as ``model.save(path)`` does, and beside it what it reads, as JSON.
 
-        ``ppo.zip.json`` has observation, mask and normaliser for ``driver(model, stored="ppo")``.
+        ``ppo.zip.json`` has observation, mask and normaliser for ``driver(model, stored="ppo")``,
+        and the form of the network for ``ganlane benchmark ppo.zip``.
 
         Raises:
             OSError: the files cannot be written.
@@ -366,9 +335,11 @@ class ModelDriver(Driver):
         content = {
             "checksum": PLACE,
             "model_sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-            "reads": plain(Reading(self.observation, self.mask, normaliser)),
+            "reads": plain(
+                Reading(self.observation, self.mask, normaliser, _network(self.policy.model))
+            ),
         }
-        write_json(_description(file), content)
+        write_json(description_of(file), content)
 
 
 def driver(
@@ -398,7 +369,8 @@ def driver(
     if stored is None:
         observation, mask, normaliser = _of_environment(model)
     else:
-        observation, mask, normaliser = _of_file(stored)
+        reading = read_description(_model_file(stored))
+        observation, mask, normaliser = reading.observation, reading.mask, reading.normaliser
     policy = ModelPolicy(model, normaliser)
     return ModelDriver(name or type(model).__name__.lower(), policy, observation, mask)
 
@@ -444,6 +416,16 @@ def _of_environment(model: BaseAlgorithm) -> _Read:
     return settings.observation, mask, normaliser
 
 
+def _network(model: BaseAlgorithm) -> Network | None:
+    """The form of a model's network; None: not one that can be rebuilt from its weights."""
+    name = type(model).__name__
+    activation = getattr(model.policy, "activation_fn", None)
+    try:
+        return Network(name, getattr(activation, "__name__", ""))
+    except ParameterError:
+        return None
+
+
 def _is_masked(model: BaseAlgorithm) -> bool:
     """Whether the algorithm takes masks: sb3-contrib's MaskablePPO and its kin do."""
     return type(model).__name__.startswith("Maskable")
@@ -474,38 +456,3 @@ def _model_file(path: str | Path) -> Path:
     """The file that stable-baselines3 makes of ``path``: with the ending .zip, if it has none."""
     file = Path(path)
     return file if file.suffix else file.with_suffix(".zip")
-
-
-def _description(file: Path) -> Path:
-    """The JSON file beside that of a model."""
-    return file.with_name(f"{file.name}.json")
-
-
-def _of_file(stored: str | Path) -> _Read:
-    """What :meth:`ModelDriver.save` wrote beside a model.
-
-    Raises:
-        UserError: it is missing, damaged, or that of another model.
-    """
-    file = _model_file(stored)
-    description = _description(file)
-    try:
-        content = description.read_bytes()
-        whole = has_checksum(content, description)
-        described = json.loads(content)
-        reading = make(Reading, described["reads"])
-        digest = described["model_sha256"]
-        is_same = digest == hashlib.sha256(file.read_bytes()).hexdigest()
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise UserError(
-            f"{description}: it does not say what the model reads ({error}); store the model with "
-            "driver(model).save(path), or load it with env=make_vec_env(...)."
-        ) from error
-    if not whole:
-        refuse_without_checksum(description)
-    if not is_same:
-        raise UserError(
-            f"{description}: it was written for another model than {file.name} is now; store the "
-            "model with driver(model).save(path)."
-        )
-    return reading.observation, reading.mask, reading.normaliser

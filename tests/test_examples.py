@@ -45,7 +45,7 @@ def test_every_example_is_run_here():
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_the_example_runs_and_prints_its_result(name, monkeypatch, capsys):
+def test_the_example_runs_and_prints_its_result(name, monkeypatch, capsys, empty_folder):
     if name in NEEDS and importlib.util.find_spec(NEEDS[name]) is None:
         pytest.skip(f"{NEEDS[name]} is not installed")
     monkeypatch.setattr(sys, "argv", [name, *SHORT.get(name, [])])

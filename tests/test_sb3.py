@@ -28,8 +28,10 @@ from torchrl.envs.transforms import ObservationNorm, RewardScaling
 
 import ganlane
 import ganlane.sb3
+from ganlane.build import make_driver
 from ganlane.errors import UserError
 from ganlane.evaluation import episodes as evaluation_of_episodes
+from ganlane.settings.env import EnvConfig
 
 ROWS = 4
 SHORT = {"goal_m": 150.0}
@@ -279,8 +281,9 @@ def test_a_transform_of_the_reward_alone_is_none_of_the_drivers_business():
             {"mask": {"name": "safe", "safe_deceleration": 3.0}},
             lambda env: env,
         ),
+        (DQN, {}, lambda env: env),
     ],
-    ids=["normalised", "masked"],
+    ids=["normalised", "masked", "dqn"],
 )
 def test_a_stored_driver_drives_as_before(algorithm, options, wrap, tmp_path):
     env = wrap(busy_highways(**options))
@@ -290,6 +293,10 @@ def test_a_stored_driver_drives_as_before(algorithm, options, wrap, tmp_path):
     again = ganlane.sb3.driver(model, "again", stored=tmp_path / "ppo")
     assert (again.name, again.observation, again.mask) == ("again", driver.observation, driver.mask)
     assert returns_in_the_evaluation(again) == returns_in_the_evaluation(driver)
+    # By its weights alone, as `ganlane benchmark ppo.zip` loads it.
+    by_weights = make_driver(str(tmp_path / "ppo.zip"), EnvConfig())
+    assert (by_weights.observation, by_weights.mask) == (driver.observation, driver.mask)
+    assert returns_in_the_evaluation(by_weights) == returns_in_the_evaluation(driver)
     # And once more from what was loaded.
     again.save(tmp_path / "copy.zip")
     first, second = (

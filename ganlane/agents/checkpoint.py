@@ -66,6 +66,8 @@ def names_agent(name: str) -> bool:
     recipe, _, digits = name.rpartition("@")
     # a file's own name may end in @ and digits
     places = (name, recipe) if digits.isdecimal() else (name,)
+    if name.endswith(".zip"):
+        return False
     return any(
         place in SHIPPED or place.endswith(".safetensors") or os.path.isfile(place)
         for place in places

@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from ganlane.agents.drivers import Driver as RuleDriver
 from ganlane.agents.drivers import GreedyPolicy
+from ganlane.agents.stored_models import StoredModel
 from ganlane.build import Driver, make_traffic
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version
@@ -74,7 +75,7 @@ def cells_of(
         for driver in drivers:
             path = None
             # Of code of a user's own nobody knows when it changes.
-            if isinstance(driver.policy, GreedyPolicy | RuleDriver):
+            if isinstance(driver.policy, GreedyPolicy | RuleDriver | StoredModel):
                 settings = json.dumps(_settings(driver, alone), sort_keys=True, default=str)
                 digest = hashlib.sha256(settings.encode()).hexdigest()
                 path = Path(config.cells) / f"{digest[:32]}.parquet"

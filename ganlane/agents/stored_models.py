@@ -1,0 +1,229 @@
+"""Models of stable-baselines3 from their files, without stable-baselines3 and without its pickles.
+
+``ganlane.sb3.driver(model).save("ppo")`` writes ``ppo.zip``, as ``model.save`` does, and beside it
+``ppo.zip.json``: what the model reads, and the form of its network. From the archive only the
+weights are read, which execute nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import pickle
+import re
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+
+from ganlane import keys
+from ganlane.agents.drivers import mask_in
+from ganlane.errors import ParameterError, UserError
+from ganlane.files import has_checksum, refuse_without_checksum
+from ganlane.settings.observation import MaskParameters, ObservationConfig
+from ganlane.settings.record import NotNegative, Number, Positive, Record, make, one_of
+
+Floats = npt.NDArray[np.float32]
+#: Algorithms whose MlpPolicy is rebuilt here, and the layers of the network that acts, by the
+#: beginning of their names: hidden ones, and the last one.
+NETWORKS: Mapping[str, tuple[str, str]] = {
+    "PPO": ("mlp_extractor.policy_net.", "action_net."),
+    "A2C": ("mlp_extractor.policy_net.", "action_net."),
+    "MaskablePPO": ("mlp_extractor.policy_net.", "action_net."),
+    "DQN": ("q_net.q_net.", ""),
+}
+#: Layers that do not act: of critics and of target networks.
+_OTHERS = ("mlp_extractor.value_net.", "value_net.", "q_net_target.")
+_ACTIVATIONS = ("Tanh", "ReLU", "ELU", "SiLU", "GELU")
+#: Errors of archives and weights that are none.
+_BROKEN = (OSError, KeyError, ValueError, RuntimeError, zipfile.BadZipFile, pickle.UnpicklingError)
+
+
+@dataclass(frozen=True)
+class Normaliser(Record):
+    """The statistics of observations of a ``VecNormalize``, as a file has them.
+
+    Attributes:
+        mean, variance: of each number of the observation, [D].
+        epsilon: is added to the variance.
+        clip_obs: bound of what results.
+    """
+
+    mean: list[Number]
+    variance: list[NotNegative]
+    epsilon: NotNegative
+    clip_obs: Positive
+
+    def normalize_obs(self, observation: Floats) -> Floats:
+        """What a ``VecNormalize`` makes of observations [N, D]."""
+        deviation = np.sqrt(np.asarray(self.variance) + self.epsilon)
+        scaled = (observation - np.asarray(self.mean)) / deviation
+        return np.clip(scaled, -self.clip_obs, self.clip_obs).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Network(Record):
+    """The form of a model's network.
+
+    Attributes:
+        algorithm: its class.
+        activation: torch's name of the function between the layers.
+    """
+
+    algorithm: Annotated[str, one_of(NETWORKS)]
+    activation: Annotated[str, one_of(_ACTIVATIONS)]
+
+
+@dataclass(frozen=True)
+class Reading(Record):
+    """What a model reads and which actions it may choose, as the JSON beside its file says.
+
+    Attributes:
+        network: None: not one that can be rebuilt here.
+    """
+
+    observation: ObservationConfig
+    mask: MaskParameters | None
+    normaliser: Normaliser | None
+    network: Network | None = None
+
+
+class StoredModel(TensorDictModuleBase):
+    """The deterministic policy of a stored model: writes ``action`` [N] for ``observation`` [N, D].
+
+    Args:
+        layers: of the network that acts.
+        normaliser: of the observations.
+        is_masked: whether it was trained with masks, and reads ``action_mask`` [N, 3].
+    """
+
+    out_keys = [keys.ACTION]  # noqa: RUF012
+    rows_must_stay = False
+
+    def __init__(
+        self, layers: nn.Sequential, normaliser: Normaliser | None, is_masked: bool
+    ) -> None:
+        super().__init__()
+        self.layers = layers
+        self.normaliser = normaliser
+        self.is_masked = is_masked
+        self.in_keys = [keys.OBSERVATION, *([keys.ACTION_MASK] if is_masked else [])]
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action``."""
+        observation = tensordict.get(keys.OBSERVATION)
+        expected = self.layers[0].in_features
+        if observation.shape[-1] != expected:
+            raise UserError(
+                f"the model reads observations of {expected} numbers, but the environment gives "
+                f"{observation.shape[-1]}; use the observation, vehicles and lanes of its training."
+            )
+        if self.normaliser is not None:
+            normalised = self.normaliser.normalize_obs(observation.cpu().numpy())
+            observation = torch.from_numpy(normalised).to(observation.device)
+        values = self.layers(observation)
+        if self.is_masked:
+            values = values.masked_fill(~mask_in(tensordict), -torch.inf)
+        return tensordict.set(keys.ACTION, values.argmax(-1))
+
+
+def description_of(file: Path) -> Path:
+    """The JSON file beside that of a model."""
+    return file.with_name(f"{file.name}.json")
+
+
+def read_description(file: Path) -> Reading:
+    """What stands in the JSON file beside a model.
+
+    Raises:
+        UserError: it is missing, damaged, or that of another model.
+    """
+    description = description_of(file)
+    try:
+        content = description.read_bytes()
+        whole = has_checksum(content, description)
+        described = json.loads(content)
+        reading = make(Reading, described["reads"])
+        digest = described["model_sha256"]
+        is_same = digest == hashlib.sha256(file.read_bytes()).hexdigest()
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, ParameterError) as error:
+        raise UserError(
+            f"{description}: it does not say what the model reads ({error}); store the model with "
+            "ganlane.sb3.driver(model).save(path), or load it with env=make_vec_env(...)."
+        ) from error
+    if not whole:
+        refuse_without_checksum(description)
+    if not is_same:
+        raise UserError(
+            f"{description}: it was written for another model than {file.name} is now; store the "
+            "model with ganlane.sb3.driver(model).save(path)."
+        )
+    return reading
+
+
+def load_model(file: Path, device: str = "cpu") -> tuple[StoredModel, Reading]:
+    """The policy of a stored model, and what it reads.
+
+    Raises:
+        UserError: a missing or damaged file, or a network that is no plain MlpPolicy.
+    """
+    reading = read_description(file)
+    network = reading.network
+    if network is None:
+        raise _not_plain(file)
+    try:
+        with zipfile.ZipFile(file) as archive:
+            weights = io.BytesIO(archive.read("policy.pth"))
+        # weights_only: tensors and nothing that could be executed.
+        state = torch.load(weights, map_location=device, weights_only=True)
+    except _BROKEN as error:
+        raise UserError(
+            f"{file}: no model of stable-baselines3 ({type(error).__name__}); give the file that "
+            "ganlane.sb3.driver(model).save(path) wrote."
+        ) from error
+    layers = _layers(state, network)
+    if layers is None:
+        raise _not_plain(file)
+    is_masked = network.algorithm.startswith("Maskable")
+    return StoredModel(layers.to(device), reading.normaliser, is_masked), reading
+
+
+def _layers(state: Mapping[str, Any], network: Network) -> nn.Sequential | None:
+    """The network that acts, of a model's weights; None where they are of another form."""
+    hidden, last = NETWORKS[network.algorithm]
+    numbers = sorted(
+        int(match[1])
+        for name in state
+        if (match := re.fullmatch(rf"{re.escape(hidden)}(\d+)\.weight", name))
+    )
+    places = [f"{hidden}{number}." for number in numbers] + ([last] if last else [])
+    expected = {f"{place}{part}" for place in places for part in ("weight", "bias")}
+    others = {name for name in state if name.startswith(_OTHERS)}
+    if not places or expected | others != set(state):
+        return None
+    modules: list[nn.Module] = []
+    for place in places:
+        weight, bias = state[f"{place}weight"], state[f"{place}bias"]
+        linear = nn.Linear(weight.shape[1], weight.shape[0])
+        linear.load_state_dict({"weight": weight, "bias": bias})
+        modules += [linear, getattr(nn, network.activation)()]
+    # Nothing comes after the last layer.
+    layers = nn.Sequential(*modules[:-1])
+    return layers if modules[-2].out_features == keys.ACTIONS else None
+
+
+def _not_plain(file: Path) -> UserError:
+    return UserError(
+        f"{file}: its network is none that is rebuilt from weights ({', '.join(NETWORKS)} with "
+        "MlpPolicy); drive it in Python, ganlane.benchmark(ganlane.sb3.driver(model))."
+    )

@@ -1,0 +1,113 @@
+"""A stored model is its weights and a description; nothing else of the archive is read."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+from reference.refusals import Bomb, user_error
+from tensordict import TensorDict
+
+from ganlane import keys
+from ganlane.agents.stored_models import load_model
+from ganlane.build import make_driver
+from ganlane.files import PLACE, write_json
+from ganlane.settings.env import EnvConfig
+
+SIZE = 4
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+
+def weights(hidden="mlp_extractor.policy_net.", last="action_net."):
+    """A network that acts by the number of the observation that is largest."""
+    return {
+        f"{hidden}0.weight": torch.eye(SIZE),
+        f"{hidden}0.bias": torch.zeros(SIZE),
+        f"{last}weight": torch.eye(3, SIZE),
+        f"{last}bias": torch.zeros(3),
+        "value_net.weight": torch.ones(1, SIZE),
+    }
+
+
+def store(state, algorithm="PPO", mask=None, **changes):
+    """A file as driver(model).save() writes it, with whatever else in the archive."""
+    file = Path("ppo.zip")
+    content = io.BytesIO()
+    torch.save(state, content)
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("policy.pth", content.getvalue())
+        archive.writestr("data", "never read")
+    network = {"algorithm": algorithm, "activation": "ReLU"}
+    reads = {"observation": "lane_view", "mask": mask, "normaliser": None, "network": network}
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    described = {"checksum": PLACE, "model_sha256": digest, "reads": {**reads, **changes}}
+    write_json(Path("ppo.zip.json"), described)
+    return file
+
+
+def actions_of(policy, observation, mask=None):
+    rows = {keys.OBSERVATION: torch.tensor(observation)}
+    if mask is not None:
+        rows[keys.ACTION_MASK] = torch.tensor(mask)
+    return policy(TensorDict(rows, [len(observation)]))[keys.ACTION].tolist()
+
+
+def test_the_action_is_that_of_the_largest_output():
+    policy, reading = load_model(store(weights()))
+    assert actions_of(policy, [[0.0, 2.0, 1.0, 9.0], [3.0, 2.0, 1.0, 9.0]]) == [1, 0]
+    assert reading.observation.form == "lane_view"
+
+
+def test_a_value_network_is_read_as_well():
+    state = weights("q_net.q_net.", "q_net.q_net.2.")
+    policy, _ = load_model(store({**state, "q_net_target.q_net.0.bias": torch.ones(1)}, "DQN"))
+    del state["value_net.weight"]
+    assert actions_of(policy, [[0.0, 0.0, 1.0, 9.0]]) == [2]
+
+
+def test_a_model_with_masks_chooses_among_the_allowed_actions():
+    policy, reading = load_model(store(weights(), "MaskablePPO", mask={"form": "safe"}))
+    assert actions_of(policy, [[0.0, 2.0, 1.0, 9.0]], [[True, False, True]]) == [2]
+    assert reading.mask.form == "safe"
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"network": None},
+        {"network": {"algorithm": "TRPO", "activation": "ReLU"}},
+        {"network": {"algorithm": "PPO", "activation": "Module"}},
+    ],
+)
+def test_another_network_is_refused_in_one_sentence(changes):
+    with user_error("ppo.zip"):
+        make_driver(str(store(weights(), **changes)), EnvConfig())
+
+
+def test_weights_of_another_form_are_refused():
+    state = {**weights(), "features_extractor.cnn.0.weight": torch.ones(1)}
+    with user_error("none that is rebuilt from weights"):
+        load_model(store(state))
+
+
+def test_nothing_in_the_weights_is_executed():
+    with user_error("no model of stable-baselines3"):
+        load_model(store({"mlp_extractor.policy_net.0.weight": Bomb()}))
+    assert not Path("executed").exists()
+
+
+def test_the_description_is_bound_to_the_file():
+    file = store(weights())
+    file.write_bytes(file.read_bytes() + b" ")
+    with user_error("for another model than ppo.zip is now"):
+        load_model(file)
+    text = json.loads(Path("ppo.zip.json").read_text())
+    text["reads"]["observation"] = "table3"
+    Path("ppo.zip.json").write_text(json.dumps(text))
+    with user_error("ppo.zip.json"):
+        load_model(file)

@@ -9,7 +9,6 @@ import errno
 import os
 import sys
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ import polars as pl
 import pytest
 import torch
 from PIL import Image
-from reference.small_networks import PAPER, recorded_scenes
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from safetensors.torch import save_file
 
@@ -35,7 +33,6 @@ from ganlane.files import (
     write_bytes,
 )
 from ganlane.generator import load_generator
-from ganlane.generator.tasks import FitLoop, PaperTask
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
 from ganlane.suite.crashes import read_crashes
 from ganlane.training.checkpoint import load_checkpoint, save_checkpoint
@@ -131,11 +128,6 @@ def test_what_is_no_file_is_not_replaced(tmp_path):
 # --- checksums
 
 
-@cache
-def small_fit() -> PaperTask:
-    return PaperTask(*([scene] for scene in recorded_scenes()), PAPER)
-
-
 def copied(source: Path) -> Callable[[Path], object]:
     return lambda path: path.write_bytes(source.read_bytes())
 
@@ -161,10 +153,6 @@ FILES: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
     "reference.json": (
         lambda path: Reference.load(SHIPPED_REFERENCE).save(path),
         Reference.load,
-    ),
-    "fit.pt": (
-        lambda path: FitLoop(small_fit(), path).run(),
-        lambda path: FitLoop(small_fit(), path),
     ),
     "last.pt": (
         lambda path: save_checkpoint(path, {"weights": torch.arange(40), "count": 4}),

@@ -31,14 +31,6 @@ from ganlane.torch_settings import set_threads
 
 # Average and final displacement error, and the error at the window's end, m.
 _ERRORS = ("ade_m", "fde_m", "end_m")
-_PUBLISHED_VELOCITY_M = (0.73, 1.78, 3.13, 4.78, 6.68)
-#: RMSE in m after 1 to 5 s on NGSIM, as published: on other test sets than ours, so only roughly
-#: comparable.
-_PUBLISHED_RMSE_M = {
-    "constant velocity (published)": _PUBLISHED_VELOCITY_M,
-    "CS-LSTM (published)": (0.61, 1.27, 2.09, 3.10, 4.37),
-    "Social-GAN (published)": (0.57, 1.32, 2.22, 3.26, 4.40),
-}
 
 #: Headings and rows of a table.
 Lines = list[list[str]]
@@ -59,7 +51,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     fit_config: Any = replace(config.generator, seed=config.seed)
     scenes = generator.scene_tracks(frame)
     held_out = config.data.held_out_scenes([scene.name for scene in scenes], generator.HELD_OUT)
-    # Scenes that do not fit together are refused now rather than after hours of ablations.
+    # Scenes that do not fit together are refused now rather than after hours of fitting.
     generator.split_for_fit(scenes, held_out)
     if config.folds:
         generator.assign_folds(scenes, config.folds)
@@ -72,16 +64,6 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     further: dict[str, Any] = {}
     # What takes long is shown as soon as it is there; the last fit is the one that is saved.
     with FitProgress() as progress:
-        if config.ablations:
-            rows = generator.ablate(
-                fit_config,
-                frame,
-                held_out,
-                states,
-                progress,
-            )
-            show(ablation_table(rows), columns=config.columns)
-            further["ablations"] = rows
         if config.folds:
             further["folds"], results = generator.cross_validate(
                 fit_config,
@@ -257,31 +239,6 @@ def metrics_table(
     return aligned(lines)
 
 
-def ablation_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """The ablations as text.
-
-    Change of ADE over all predicted steps and over 0.4 s, ratio of the RMSE at 5 s.
-    """
-    # All rows have the same kinds of forecasts, so the first one names the columns.
-    first = next(iter(rows.values()))
-    kinds = [kind for kind in first["ade_change_percent"] if kind != BASELINE]
-    early = [f"{kind}, 0.4 s" for kind in kinds]
-    lines = [["ADE to CV, a quarter of the updates", *kinds, *early]]
-    for name, row in rows.items():
-        line = [name]
-        for change in (
-            row["ade_change_percent"],
-            row["ade_change_percent_0.4_s"],
-        ):
-            line += [_percent(change[kind]) for kind in kinds]
-        lines.append(line)
-    # Only the calibrated preset is rolled out that far.
-    if "rmse_5_s_ratio" in first:
-        ratios = [f"{row['rmse_5_s_ratio']['mean']:.2f}" for row in rows.values()]
-        lines = [[*line, ratio] for line, ratio in zip(lines, ["RMSE 5 s", *ratios])]
-    return aligned(lines)
-
-
 def fold_tables(folds: Mapping[str, Any]) -> str:
     """All tables of :func:`ganlane.generator.cross_validate`'s scores, as text."""
     scores = folds["open_loop"]
@@ -289,8 +246,6 @@ def fold_tables(folds: Mapping[str, Any]) -> str:
         _pooled(scores),
         _parts("by fold", scores["folds"]),
         _parts("by scene", scores["scenes"]),
-        _parts("by lane (1 leftmost) and class", scores["parts"]),
-        _direction(scores["direction"], scores["direction_whole_window"]),
     ]
     if "rollout" in folds:
         tables.append(_rollout(folds["rollout"]))
@@ -349,34 +304,8 @@ def _parts(title: str, parts: Mapping[str, Any]) -> Lines:
     return lines
 
 
-def _direction(later: Mapping[str, Any], whole: Mapping[str, Any]) -> Lines:
-    """Share of lateral moves of more than 0.1 m whose side is predicted correctly."""
-    lines = [
-        [
-            "lateral move to the right side",
-            "after present",
-            "whole window",
-        ],
-        [
-            "windows that move",
-            str(later["windows"]),
-            str(whole["windows"]),
-        ],
-    ]
-    for kind, share in later["share_right"].items():
-        shares = (share, whole["share_right"].get(kind))
-        lines.append(
-            [
-                kind,
-                *("" if value is None else f"{100 * value:.1f} %" for value in shares),
-            ]
-        )
-    return lines
-
-
 def _rollout(rollout: Mapping[str, Any]) -> Lines:
-    """RMSE after 1 to 5 s, with published values."""
-    # Root mean squared errors, as the published ones; the other tables have mean errors.
+    """RMSE after 1 to 5 s."""
     rmse = rollout["rmse_m"]
     lines = [
         [
@@ -393,10 +322,6 @@ def _rollout(rollout: Mapping[str, Any]) -> Lines:
                 f"{ratio:.2f}",
             ]
         )
-    for kind, published in _PUBLISHED_RMSE_M.items():
-        # Relative to the published constant velocity, since ours is on another test set.
-        ratio = published[-1] / _PUBLISHED_VELOCITY_M[-1]
-        lines.append([kind, *_two_digits(published), f"{ratio:.2f}"])
     return lines
 
 

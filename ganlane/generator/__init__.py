@@ -7,15 +7,13 @@ Read in this order:
   k-means groups);
 - ``closed_loop``: one step of each preset, in fitting and in simulation, and rollouts of whole
   scenes;
-- ``forecasts``: of networks, IDM and baselines, and their scores;
-- ``tasks``: what each preset fits, and the loop; ``fit``: splits, one call, folds by scene,
-  ablations.
+- ``forecasts``: of networks and IDM, and their scores;
+- ``tasks``: what each preset fits, and the loop; ``fit``: splits, one call, folds by scene.
 """
 
 from ganlane.generator.checkpoint import FitResult, load_generator, load_human
 from ganlane.generator.fit import (
     HELD_OUT,
-    ablate,
     assign_folds,
     cross_validate,
     fit_generator,
@@ -50,7 +48,6 @@ __all__ = [
     "PaperConfig",
     "Preset",
     "Progress",
-    "ablate",
     "assign_folds",
     "cross_validate",
     "fit_generator",

@@ -1,6 +1,6 @@
 """Forecasts of recorded windows, and their scores.
 
-Forecasters are both presets, IDM, and baselines without a network.
+Forecasters are the Social-GAN's presets, IDM, and constant velocity.
 Every forecast is positions [W, T, 2] in m relative to the present, for the windows of
 :func:`~ganlane.generator.windows.cut_windows` in the same order. Kinds of forecasts by a generator:
 ``mean`` (z = 0), ``single`` (one sample), ``best_of_20`` (by ADE). ADE is the mean error over the
@@ -10,15 +10,10 @@ predicted steps, FDE the error at the last of them, both in m.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
-from sklearn.ensemble import HistGradientBoostingClassifier
-from sklearn.linear_model import RidgeCV
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
 from ganlane.generator.checkpoint import Metrics
@@ -51,10 +46,6 @@ from ganlane.sim.state import Vehicles
 SAMPLES = 20
 #: Every ADE change is relative to this forecast: the last displacement repeated.
 BASELINE = "constant_velocity"
-#: Vehicles longer than this are trucks, m.
-TRUCK_M = 6.0
-#: A lateral move over the horizon has a direction if it is larger than this, m.
-SIDEWAYS_M = 0.1
 #: Keeps the gradient of a distance of 0 finite; 0.1 mm.
 _SMALLEST_DISTANCE_M = 1e-4
 #: Name of a forecast to positions [W, T, 2] in m relative to the present, or to errors [W, T] in m.
@@ -68,8 +59,6 @@ _GROUPS = 128
 _ROLLOUTS = 160
 #: Segments with three samples each.
 _SEGMENTS = 16
-#: Penalties from which the ridge regression chooses by leave-one-out validation.
-_PENALTIES = tuple(10.0**power for power in range(-2, 6))
 
 
 def distance(one: Tensor, other: Tensor) -> Tensor:
@@ -123,134 +112,18 @@ def displacement_errors(errors: Forecasts, rows: np.ndarray | None = None) -> Ro
     }
 
 
-def parts_of(windows: Windows, least: int) -> dict[str, np.ndarray]:
-    """Masks [W] of the windows by lane (1 the leftmost) and by class.
-
-    Parts with fewer than ``least`` windows are left out.
-    """
-    lanes = windows.lane_from_left
-    parts = {f"lane {lane}": lanes == lane for lane in np.unique(lanes)}
-    parts["car"] = windows.length <= TRUCK_M
-    parts["truck"] = windows.length > TRUCK_M
-    return {name: rows for name, rows in parts.items() if rows.sum() >= least}
-
-
-def direction_scores(
-    forecasts: Forecasts,
-    recorded: np.ndarray,
-    observed: np.ndarray | float = 0.0,
-) -> Row:
-    """Among vehicles that move more than 0.1 m sideways: share predicted to the right side.
-
-    ``observed`` are lateral moves [W] in m before the present, to be added to both.
-    """
-    # Vehicles that hardly move sideways have no side to predict.
-    lateral = observed + recorded[:, -1, 1]
-    moving = np.abs(lateral) > SIDEWAYS_M
-    shares: dict[str, float | None] = {}
-    for name, course in forecasts.items():
-        # A product above 0: both moves are to the same side.
-        right = ((observed + course[:, -1, 1]) * lateral > 0)[moving]
-        shares[name] = float(right.mean()) if len(right) else None
-    return {"windows": int(moving.sum()), "share_right": shares}
-
-
-def side_classifier_share(windows: Windows, fold: np.ndarray) -> float | None:
-    """Share of lateral moves after the present whose side a dedicated classifier predicts.
-
-    None without moves. Gradient boosting on the observed motion, the lane and the length, fitted to
-    the other folds' moving vehicles: a reference for :func:`direction_scores`, about as much as the
-    history contains.
-    """
-    lateral = windows.future[:, -1, 1]
-    moving = np.abs(lateral) > SIDEWAYS_M
-
-    # The observed displacements, their changes along the road, how far the vehicle has moved
-    # sideways since each of them; then the lane from both sides, and the length.
-    past = windows.past
-    # From the present backwards: entry k is the sum of the last k + 1 lateral displacements.
-    moved = past[..., 1][:, ::-1].cumsum(axis=1)
-    others = np.stack(
-        [windows.lane, windows.lane_from_left, windows.length],
-        axis=1,
-    )
-    differences = np.diff(past, axis=1)[..., 0]
-    features = np.concatenate(
-        [past.reshape(len(past), -1), differences, moved, others],
-        axis=1,
-    )
-    features = features[moving]
-    left = lateral[moving] > 0
-    fold = fold[moving]
-
-    hits = []
-    for number in np.unique(fold):
-        # Fitted to the other folds only; both sides must occur there.
-        tested = fold == number
-        if len(np.unique(left[~tested])) == 2:
-            model = HistGradientBoostingClassifier(max_iter=150, max_leaf_nodes=15, random_state=0)
-            model.fit(features[~tested], left[~tested])
-            hits.append(model.predict(features[tested]) == left[tested])
-    return float(np.concatenate(hits).mean()) if hits else None
-
-
-def rmse_by_second(
-    errors: Forecasts,
-) -> dict[str, dict[str, float]]:
-    """Root mean square error in m after each whole second (10 steps), of every forecast."""
-    rmse: dict[str, dict[str, float]] = {}
-    for name, values in errors.items():
-        # Steps are 0.1 s apart, so index 9 is the first whole second.
-        seconds = enumerate(values.T[9::10], start=1)
-        rmse[name] = {f"{k} s": float(np.sqrt((error**2).mean())) for k, error in seconds}
-    return rmse
-
-
-def open_loop_scores(
-    windows: Windows,
-    forecasts: Forecasts,
-    fold: np.ndarray,
-    least_part: int = 100,
-) -> Row:
-    """All scores of the forecasts of ``windows``, each of which was held out in its ``fold`` [W].
-
-    Parts (lanes, classes) of fewer than ``least_part`` windows are left out.
-    """
-    errors = errors_of(forecasts, windows.future)
-    folds = {str(number): fold == number for number in range(int(fold.max()) + 1)}
-
-    def by(masks: dict[str, np.ndarray]) -> dict[str, Row]:
-        return {
-            name: displacement_errors(errors, rows) for name, rows in masks.items() if rows.any()
-        }
-
-    direction = direction_scores(forecasts, windows.future)
-    direction["share_right"]["side classifier"] = side_classifier_share(windows, fold)
-    # The lateral move over the observed part, m.
-    observed = windows.past[..., 1].sum(1)
+def long_errors(errors: Forecasts) -> Row:
+    """RMSE in m after each whole second of every forecast; at the end, over constant velocity's."""
+    # Steps are 0.1 s apart, so index 9 is the first whole second.
+    rmse = {name: np.sqrt((values[:, 9::10] ** 2).mean(0)) for name, values in errors.items()}
     return {
-        **displacement_errors(errors),
-        "folds": by(folds),
-        "scenes": by(windows.by_scene),
-        "parts": by(parts_of(windows, least_part)),
-        "direction": direction,
-        "direction_whole_window": direction_scores(forecasts, windows.future, observed),
-    }
-
-
-def long_rollout_scores(windows: Windows, forecasts: Forecasts) -> Row:
-    """RMSE after each second, and its ratio to constant velocity's at the end.
-
-    The numbers of windows and tracks are added.
-    """
-    rmse = rmse_by_second(errors_of(forecasts, windows.future))
-    last = f"{windows.future.shape[1] // 10} s"
-    return {
-        "windows": len(windows),
-        "tracks": len(set(zip(windows.scene, windows.vehicle))),
-        "rmse_m": rmse,
+        "windows": len(errors[BASELINE]),
+        "rmse_m": {
+            name: {f"{second} s": float(value) for second, value in enumerate(values, start=1)}
+            for name, values in rmse.items()
+        },
         "ratio_to_constant_velocity": {
-            name: values[last] / rmse[BASELINE][last] for name, values in rmse.items()
+            name: float(values[-1] / rmse[BASELINE][-1]) for name, values in rmse.items()
         },
     }
 
@@ -356,37 +229,20 @@ def calibrated_forecasts(
             config,
         )
 
-    forecasts = driven_windows(
-        driver,
-        scenes,
-        horizon,
-        stride,
-        1 + samples,
-    )
-    # The recording takes the same way, so that its windows come in the same order.
-    recorded = driven_windows(
-        lambda segments: segments.future[None],
-        scenes,
-        horizon,
-        stride,
-    )[0]
-    return by_kind(forecasts, recorded)
+    forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
+    return by_kind(forecasts, cut_windows(scenes, stride, OBSERVED_POSITIONS + horizon).future)
 
 
 @torch.no_grad()
-def idm_forecasts(
-    scenes: list[SceneTracks],
-    horizon: int,
-    stride: int,
-) -> Forecasts:
-    """IDM along the road in whole scenes, with constant lateral positions.
+def idm_forecast(scenes: list[SceneTracks], horizon: int, stride: int) -> np.ndarray:
+    """Positions [W, H, 2] in m by IDM along the road, with constant lateral positions.
 
-    ``idm``: all drivers with Table V's headway and a desired speed of 22 m/s. ``idm_own_headway``:
-    with the headway at which each driver is in balance at present, the calibrated preset's anchor.
+    Every driver has the headway at which it is in balance at present: the calibrated preset's
+    anchor.
     """
 
-    def driver(segments: Segments, own_headway: bool) -> Tensor:
-        headway, desired = driver_params(segments, traits=own_headway)
+    def driver(segments: Segments) -> Tensor:
+        headway, desired = driver_params(segments)
 
         def move(vehicles: Vehicles, step: int) -> Vehicles:
             scene = perceive(vehicles, segments.road)
@@ -397,77 +253,12 @@ def idm_forecasts(
 
         return driven_positions(segments, desired, move)[None]
 
-    return {
-        name: driven_windows(
-            partial(driver, own_headway=balanced),
-            scenes,
-            horizon,
-            stride,
-        )[0]
-        for name, balanced in (
-            ("idm", False),
-            ("idm_own_headway", True),
-        )
-    }
-
-
-def baseline_forecasts(
-    windows: Windows,
-    others: list[SceneTracks],
-    stride: int,
-) -> Forecasts:
-    """Forecasts without a network.
-
-    ``mean_velocity`` repeats the mean observed displacement, which recorded noise disturbs less
-    than the last one. The ridge regression is fitted to windows of the scenes ``others``.
-    """
-    past = windows.past
-    steps = windows.future.shape[1]
-    fitted = cut_windows(others, stride, OBSERVED_POSITIONS + steps)
-    return {
-        BASELINE: repeated(past[:, -1], steps),
-        "mean_velocity": repeated(past.mean(axis=1), steps),
-        "constant_acceleration": constant_acceleration(past, steps),
-        "ridge": ridge_forecast(fitted, past),
-    }
+    return driven_windows(driver, scenes, horizon, stride)[0]
 
 
 def repeated(displacement: np.ndarray, steps: int) -> np.ndarray:
     """Positions [W, T, 2] in m after the present when ``displacement`` [W, 2] per 0.1 s repeats."""
     return displacement[:, None] * np.arange(1.0, steps + 1.0)[:, None]
-
-
-def constant_acceleration(past: np.ndarray, steps: int) -> np.ndarray:
-    """Positions [W, T, 2] in m when the displacement keeps changing by its mean observed change per
-    step.
-    """
-    # Eight displacements have seven changes between them.
-    change = ((past[:, -1] - past[:, 0]) / (past.shape[1] - 1))[:, None]
-    ahead = np.arange(1.0, steps + 1.0)[:, None]
-    # After n steps the change has been added 1 + 2 + ... + n times: n (n + 1) / 2.
-    return repeated(past[:, -1], steps) + 0.5 * change * ahead * (ahead + 1.0)
-
-
-def ridge_forecast(fitted: Windows, past: np.ndarray) -> np.ndarray:
-    """Positions [W, T, 2] in m that follow the displacements ``past`` [W, 8, 2].
-
-    Ridge regression from the last displacement and all observed differences to the error of
-    constant velocity; it is fitted to the windows ``fitted``, as they are and mirrored.
-    """
-
-    def features(past: np.ndarray) -> np.ndarray:
-        return np.concatenate([past[:, -1:], np.diff(past, axis=1)], axis=1).reshape(len(past), -1)
-
-    # Left and right are alike: the fit must not learn the side that was recorded more often.
-    mirrored = (1.0, -1.0)
-    observed = np.concatenate([fitted.past, fitted.past * mirrored])
-    future = np.concatenate([fitted.future, fitted.future * mirrored])
-    steps = future.shape[1]
-    # Fitted is what constant velocity misses, so the penalty pulls towards constant velocity.
-    missing = future - repeated(observed[:, -1], steps)
-    model = make_pipeline(StandardScaler(), RidgeCV(alphas=_PENALTIES))
-    model.fit(features(observed), missing.reshape(len(missing), -1))
-    return repeated(past[:, -1], steps) + model.predict(features(past)).reshape(len(past), steps, 2)
 
 
 def energy_score(

@@ -9,8 +9,7 @@ the lane) samples of IDM drivers with headways of their own stand in.
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -41,7 +40,7 @@ from ganlane.generator.human_samples import (
     samples_of,
     smooth_scene,
 )
-from ganlane.generator.human_tuning import Iteration, begins_per_decision, tune
+from ganlane.generator.human_tuning import begins_per_decision, tune
 from ganlane.settings.driving import Visibility
 from ganlane.settings.generator import HumanConfig
 from ganlane.sim.idm import DriverIdm, following_acceleration
@@ -98,11 +97,10 @@ def fit_human(
     recordings: Sequence[Recording],
     following: Sequence[Recording] = (),
     report: Report = lambda done, of, cost: None,
-) -> tuple[HumanModel, float]:
+) -> HumanModel:
     """Fit a model to ``recordings`` of several lanes and to cars ``following`` each other in one.
 
-    Returns:
-        The model, in evaluation mode, and the seconds that it took.
+    It is in evaluation mode.
     """
     # Networks draw their first weights from torch's own generator, which stays the caller's.
     with torch.random.fork_rng(devices=[]):
@@ -115,8 +113,7 @@ def _fitted(
     recordings: Sequence[Recording],
     following: Sequence[Recording],
     report: Report,
-) -> tuple[HumanModel, float]:
-    begun = time.monotonic()
+) -> HumanModel:
     random = torch.Generator().manual_seed(config.seed)
     model = HumanModel(config.sizes)
     cutoffs = config.cutoff_hz, config.lateral_cutoff_hz
@@ -131,17 +128,13 @@ def _fitted(
     teacher = clone(model.policy, material, choices, config, random)
     report(1, steps, None)
 
-    def after_round(number: int) -> None:
+    for number in close_the_loop(model, material, teacher, config, random):
         report(1 + number, steps, None)
-
-    close_the_loop(model, material, teacher, config, random, after_round)
-
-    def after_iteration(iteration: Iteration) -> None:
-        report(1 + config.rounds + iteration.number, steps, iteration.cost)
-
-    tune(model.policy, choices, material.danger, config, random, after_iteration)
+    tuning = tune(model.policy, choices, material.danger, config, random)
+    for number, cost in enumerate(tuning, start=2 + config.rounds):
+        report(number, steps, cost)
     match_rate(model.policy, choices, config)
-    return model.eval().requires_grad_(False), time.monotonic() - begun
+    return model.eval().requires_grad_(False)
 
 
 def clone(
@@ -169,9 +162,11 @@ def close_the_loop(
     teacher: Samples,
     config: HumanConfig,
     random: torch.Generator,
-    report: Callable[[int], None],
-) -> None:
-    """Rounds of closed-loop samples; the last two rounds and as many teacher samples count."""
+) -> Iterator[int]:
+    """Rounds of closed-loop samples, whose numbers are yielded as they are done.
+
+    The last two rounds and as many teacher samples count.
+    """
     bank: list[tuple[Tensor, ...]] = []
     options = Options(model.policy, samples=config.samples)
     noisy = options._replace(estimator=model.estimator)
@@ -186,7 +181,7 @@ def close_the_loop(
         rate = 0.5 * config.learning_rate * (1.0 - 0.7 * number / max(1, config.rounds - 1))
         epochs = max(1, config.epochs // 3)
         train_moves(model.policy, moves, material.prior, epochs, rate, random)
-        report(number + 1)
+        yield number + 1
 
 
 def _gathered(

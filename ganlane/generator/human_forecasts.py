@@ -45,6 +45,7 @@ from ganlane.generator.windows import (
     PRESENT,
     SceneTracks,
     Segments,
+    cut_windows,
 )
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.driving import HumanVariation, Visibility
@@ -127,9 +128,7 @@ def human_forecasts(
         return _driven(model, segments, horizon, samples, random)
 
     forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
-    # The recording takes the same way, so that its windows come in the same order.
-    recorded = driven_windows(lambda segments: segments.future[None], scenes, horizon, stride)[0]
-    return by_kind(forecasts, recorded)
+    return by_kind(forecasts, cut_windows(scenes, stride, OBSERVED_POSITIONS + horizon).future)
 
 
 def _driven(

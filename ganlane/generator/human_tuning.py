@@ -9,7 +9,7 @@ changes, which carries over between roads per second rather than per kilometre.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Iterator
 from copy import deepcopy
 from typing import NamedTuple
 
@@ -57,25 +57,14 @@ RATE_PULL, LANE_PULL = 0.1, 5.0
 BANDS_MPS = ((0.0, 9.0), (9.0, 16.0), (16.0, 40.0))
 
 
-class Iteration(NamedTuple):
-    """What happened in an iteration.
-
-    ``cost`` per decision of a driver; overlaps and departures per 1000 vehicle-km; lane changes
-    begun per vehicle-hour.
-    """
-
-    number: int
-    cost: float
-    overlaps: float
-    departures: float
-    changes_per_h: float
-
-
 class Decisions(NamedTuple):
     """Decisions of all drivers, [T, N, M, ...]: what they saw, did, and what it cost."""
 
     features: Tensor
-    choice: LaneChoice
+    sides: Tensor
+    exists: Tensor
+    keeping: Tensor
+    to_left: Tensor
     speed: Tensor
     along: Tensor
     across: Tensor
@@ -86,6 +75,15 @@ class Decisions(NamedTuple):
     valid: Tensor
     goes_on: Tensor
 
+    @property
+    def choice(self) -> LaneChoice:
+        """The lane choice that each driver had."""
+        return LaneChoice(self.sides, self.exists, self.keeping, self.to_left)
+
+    def rows(self, which: Tensor) -> Decisions:
+        """Those of an index or a mask."""
+        return Decisions(*(number[which] for number in self))
+
 
 def tune(
     policy: HumanPolicy,
@@ -93,9 +91,8 @@ def tune(
     danger: Tensor,
     config: HumanConfig,
     random: torch.Generator,
-    report: Callable[[Iteration], None],
-) -> None:
-    """Fine-tune ``policy`` in place.
+) -> Iterator[float]:
+    """Fine-tune ``policy`` in place; the mean cost of a decision in each iteration is yielded.
 
     Args:
         policy: cloned; what it is now is what it is pulled to.
@@ -120,14 +117,14 @@ def tune(
     for number in range(config.tuning):
         rise, fall = min(1.0, (number + 1) / 5), 1.0 - 0.8 * number / config.tuning
         optimizer.param_groups[0]["lr"] = RATE * rise * fall
-        decisions, iteration = drive(policy, critic, number, random)
+        decisions = drive(policy, critic, random)
         advantage, wanted = advantages(decisions)
-        flat = _flat(decisions)
+        flat = decisions.rows(decisions.valid)
         advantage, wanted = advantage[decisions.valid], wanted[decisions.valid]
         advantage = (advantage - advantage.mean()) / (advantage.std() + 0.01)
         for _ in range(PASSES):
             for rows in torch.randperm(len(wanted), generator=random).split(BATCH):
-                part = _rows(flat, rows)
+                part = flat.rows(rows)
                 loss = _policy_loss(policy, reference, part, advantage[rows], config.pull)
                 loss = loss + smooth_l1_loss(_values(critic, part), wanted[rows])
                 if recorded > 0.0:
@@ -141,7 +138,7 @@ def tune(
                 loss.backward()
                 nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
                 optimizer.step()
-        report(iteration)
+        yield float(decisions.cost.sum()) / float(decisions.valid.sum())
 
 
 def begins_per_decision(teacher: Samples, config: HumanConfig) -> float:
@@ -154,20 +151,6 @@ def begins_per_decision(teacher: Samples, config: HumanConfig) -> float:
 def _values(critic: nn.Module, decisions: Decisions) -> Tensor:
     inputs = (decisions.features, decisions.choice.sides.flatten(-2))
     return critic(torch.cat(inputs, -1))[..., 0]
-
-
-def _flat(decisions: Decisions) -> Decisions:
-    """The decisions of valid drivers, [R, ...]."""
-    which = decisions.valid
-    choice = LaneChoice(*(number[which] for number in decisions.choice))
-    others = {name: value[which] for name, value in decisions._asdict().items() if name != "choice"}
-    return Decisions(choice=choice, **others)
-
-
-def _rows(decisions: Decisions, rows: Tensor) -> Decisions:
-    choice = LaneChoice(*(number[rows] for number in decisions.choice))
-    others = {name: value[rows] for name, value in decisions._asdict().items() if name != "choice"}
-    return Decisions(choice=choice, **others)
 
 
 def advantages(decisions: Decisions) -> tuple[Tensor, Tensor]:
@@ -242,14 +225,10 @@ def _rate_loss(
 
 
 @torch.no_grad()
-def drive(
-    policy: HumanPolicy, critic: nn.Module, number: int, random: torch.Generator
-) -> tuple[Decisions, Iteration]:
-    """Decisions of an iteration, and what happened."""
+def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> Decisions:
+    """Decisions [T, N, M] in random scenes."""
     vehicles, memory, road = random_scenes(random)
     steps: list[Decisions] = []
-    overlaps = departures = changes = metres = seconds = 0.0
-    was_off = torch.zeros_like(vehicles.valid)
     for _ in range(DECISIONS):
         memory = with_style(memory, perceive(vehicles, memory, road))
         view = perceive(vehicles, memory, road)
@@ -257,7 +236,6 @@ def drive(
         chances = policy.lane_chances(choice)
         lane = torch.multinomial(chances.flatten(0, 1), 1, generator=random).view(vehicles.x.shape)
         target = new_target(vehicles, view, lane)
-        begun = (target != vehicles.target_lane) & choice.keeping & vehicles.valid
         memory = memory._replace(
             since=torch.where(target != vehicles.target_lane, 0.0, memory.since)
         )
@@ -276,7 +254,7 @@ def drive(
         acceleration, aside = bounded(vehicles, memory, road, changed[0], changed[1])
         seen = Decisions(
             features=view.features,
-            choice=choice,
+            **choice._asdict(),
             speed=velocity(vehicles)[0],
             along=tokens[0],
             across=tokens[1],
@@ -288,10 +266,9 @@ def drive(
             goes_on=vehicles.valid,
         )
         log_chance = _of_actions(_log_chances(policy, seen), (*tokens, lane))
-        before = vehicles
         memory = remembered(vehicles, memory, view, acceleration, target)
         vehicles = moved(vehicles, acceleration, aside)
-        cost, hit, off = costs(vehicles, road, view.gap)
+        cost, hit = costs(vehicles, road, view.gap)
         # Who has collided leaves the scene.
         vehicles = vehicles.with_(valid=vehicles.valid & ~hit)
         steps.append(
@@ -302,34 +279,11 @@ def drive(
                 goes_on=vehicles.valid,
             )
         )
-        overlaps += float((hit & before.valid).sum()) / 2.0
-        departures += float((off & ~was_off & before.valid).sum())
-        was_off = off
-        changes += float(begun.sum())
-        metres += float(((vehicles.x - before.x) * before.valid).sum())
-        seconds += DECISION_S * float(before.valid.sum())
-    joint = _stacked(steps)
-    count = float(joint.valid.sum())
-    per_1000_km = 1e6 / max(metres, 1.0)
-    cost_of_decision = float(joint.cost.sum()) / count
-    return joint, Iteration(
-        number + 1,
-        cost_of_decision,
-        overlaps * per_1000_km,
-        departures * per_1000_km,
-        3600.0 * changes / seconds,
-    )
+    return Decisions(*map(torch.stack, zip(*steps)))
 
 
-def _stacked(steps: list[Decisions]) -> Decisions:
-    choice = LaneChoice(*(torch.stack(numbers) for numbers in zip(*(s.choice for s in steps))))
-    names = [name for name in Decisions._fields if name != "choice"]
-    others = {name: torch.stack([getattr(step, name) for step in steps]) for name in names}
-    return Decisions(choice=choice, **others)
-
-
-def costs(vehicles: Vehicles, road: Road, gap: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Cost of every driver after a decision; who has collided; who has left the road. [N, M].
+def costs(vehicles: Vehicles, road: Road, gap: Tensor) -> tuple[Tensor, Tensor]:
+    """Cost of every driver after a decision, and who has collided, [N, M].
 
     ``gap`` is that to the leader before the decision, m.
     """
@@ -370,14 +324,13 @@ def costs(vehicles: Vehicles, road: Road, gap: Tensor) -> tuple[Tensor, Tensor, 
     beyond = torch.maximum(
         road.right_edge_m() - (vehicles.y - half), vehicles.y + half - road.left_edge_m()
     )
-    off = beyond > 0
-    cost = cost + 3.0 * off + 1.0 * (beyond + 0.25).clamp(0.0, 1.0)
+    cost = cost + 3.0 * (beyond > 0) + 1.0 * (beyond + 0.25).clamp(0.0, 1.0)
 
     # Nobody stands or crawls where the road is free.
     cost = cost + 0.3 * ((speed < 3.0) & (gap > 40.0))
     slow = (0.75 - speed / vehicles.desired_speed).clamp(0.0, 0.5)
     cost = cost + 0.05 * slow * (gap > 80.0)
-    return cost * vehicles.valid, hit & vehicles.valid, off & vehicles.valid
+    return cost * vehicles.valid, hit & vehicles.valid
 
 
 def random_scenes(random: torch.Generator) -> tuple[Vehicles, Memory, Road]:

@@ -1,4 +1,4 @@
-"""What is fitted: the losses, updates and scores of both presets, and the loop that runs them.
+"""What is fitted: the losses, updates and scores of each preset, and the loop that runs them.
 
 **paper**, open loop: adversarial, variety, single-sample and mean terms on k-means groups of
 windows. Losses after Gupta et al. (2018), with the changes that the fit needs here.
@@ -6,29 +6,31 @@ windows. Losses after Gupta et al. (2018), with the changes that the fit needs h
 **calibrated**: joint rollouts of whole scenes. Updates with z = 0, whose loss is the error,
 alternate with updates of two samples, whose loss is the energy score; both are divided, step by
 step, by the error of constant velocity.
+
+**human**: cloning, closed loop and fine-tuning (:mod:`ganlane.generator.human_fit`).
 """
 
 from __future__ import annotations
 
-import io
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from ganlane.errors import UserError
-from ganlane.files import has_checksum, read_whole, sealed_archive, write_bytes
+from ganlane.data.dense import Recording
 from ganlane.generator.checkpoint import Metrics
 from ganlane.generator.closed_loop import driver_params, rollout
 from ganlane.generator.forecasts import (
     BASELINE,
+    SAMPLES,
+    Forecasts,
+    calibrated_forecasts,
     distance,
     energy_score,
     mean_by_step,
@@ -37,6 +39,9 @@ from ganlane.generator.forecasts import (
     rollout_errors,
     scene_metrics,
 )
+from ganlane.generator.human_estimator import HumanModel
+from ganlane.generator.human_fit import fit_human
+from ganlane.generator.human_forecasts import fit_observer, human_forecasts, recording_of
 from ganlane.generator.networks import (
     DIFFERENCE_SCALE_M,
     Discriminator,
@@ -44,6 +49,7 @@ from ganlane.generator.networks import (
     displacements_of,
 )
 from ganlane.generator.windows import (
+    PREDICTED_STEPS,
     Groups,
     SceneTracks,
     Segments,
@@ -55,11 +61,14 @@ from ganlane.generator.windows import (
 )
 from ganlane.settings.generator import (
     CalibratedConfig,
+    HumanConfig,
     LoopConfig,
     PaperConfig,
 )
 
 Config = PaperConfig | CalibratedConfig
+#: Frames between the starts of two scored windows, the same for all presets.
+STRIDE = 3
 
 
 def distances(predicted: Tensor, recorded: Tensor) -> Tensor:
@@ -106,6 +115,10 @@ class _Task(nn.Module):
         self.random = torch.Generator().manual_seed(config.seed)
         self.largest_gradient = config.loop.largest_gradient
 
+    def fit(self, name: str, on_progress: OnProgress) -> int:
+        """Fit the generator; the updates that were made until it was best."""
+        return improve(self, name, on_progress)  # type: ignore[arg-type]
+
     def descend(self, network: str, loss: Tensor) -> float:
         """One step of a network down its ``loss``, whose value is returned.
 
@@ -148,7 +161,7 @@ class PaperTask(_Task):
             groups = groups.mirrored(torch.rand(len(groups), generator=self.random) < 0.5)
         # [n, T, 2]: vehicles of all groups, without padding.
         recorded = groups.displacements[groups.mask]
-        generated = self._samples(groups, config.history_noise)
+        generated = self._samples(groups, self.random, config.history_noise)
 
         # The discriminator learns from one sample, which carries no gradient to the generator.
         losses = {}
@@ -183,6 +196,13 @@ class PaperTask(_Task):
         mean = paper_forecasts(self.generator, windows, groups, samples=0)["mean"]
         return float(np.linalg.norm(mean - windows.future, axis=-1).mean())
 
+    def forecasts(
+        self, scenes: list[SceneTracks], steps: int, stride: int, samples: int = SAMPLES
+    ) -> Forecasts:
+        """Forecasts of the windows of ``scenes``, by kind."""
+        windows, groups = self._grouped_windows(scenes, stride)
+        return paper_forecasts(self.generator, windows, groups, self.config.seed, samples)
+
     @torch.no_grad()
     def metrics(self, scenes: list[SceneTracks]) -> Metrics:
         """ADE and FDE of the generator on ``scenes``, all and each.
@@ -199,7 +219,8 @@ class PaperTask(_Task):
         # Constant velocity on the same windows, for comparison.
         forecasts[BASELINE] = repeated(windows.past[:, -1], self.config.sizes.predicted)
         recorded = self.discriminator(groups.displacements[groups.mask])
-        generated = self.discriminator(self._samples(groups)[0])
+        random = torch.Generator().manual_seed(self.config.seed)
+        generated = self.discriminator(self._samples(groups, random)[0])
         accuracy = {"held_out_accuracy": float(discriminator_accuracy(recorded, generated))}
         return scene_metrics(windows, forecasts) | {"discriminator": accuracy}
 
@@ -210,7 +231,9 @@ class PaperTask(_Task):
         windows = cut_windows(scenes, stride, sizes.observed + 1 + sizes.predicted)
         return windows, group_windows(windows, self.config.group_size, self.config.seed)
 
-    def _samples(self, groups: Groups, history_noise: float = 0.0) -> Tensor:
+    def _samples(
+        self, groups: Groups, random: torch.Generator, history_noise: float = 0.0
+    ) -> Tensor:
         """Recorded past and generated future [K + 1, n, T, 2] of n vehicles.
 
         The samples come first, the mean prediction last. Only the pooling needs the padded groups;
@@ -222,7 +245,7 @@ class PaperTask(_Task):
         if history_noise > 0:
             # In units of typical differences, so that noise weighs alike along and across the road.
             scale = past.new_tensor(DIFFERENCE_SCALE_M)
-            observed = past + history_noise * scale * torch.randn(past.shape, generator=self.random)
+            observed = past + history_noise * scale * torch.randn(past.shape, generator=random)
         observation = self.generator.observe(observed, groups.position, mask)
         context = self.generator.summarise(observation)[mask]
 
@@ -232,7 +255,7 @@ class PaperTask(_Task):
             difference=observation.difference[mask],
         )
         shape = (self.config.samples + 1, len(context), sizes.noise)
-        noise = torch.randn(shape, generator=self.random)
+        noise = torch.randn(shape, generator=random)
         # The mean driver.
         noise[-1] = 0.0
         outputs = self.generator.decode(
@@ -318,6 +341,12 @@ class CalibratedTask(_Task):
         metrics = self.metrics(self.validation)["all"]
         return 0.5 * (metrics["relative_mean"] + metrics["relative_energy"])
 
+    def forecasts(
+        self, scenes: list[SceneTracks], steps: int, stride: int, samples: int = SAMPLES
+    ) -> Forecasts:
+        """Forecasts of the windows of ``scenes``, by kind."""
+        return calibrated_forecasts(self.generator, scenes, steps, stride, self.config, samples)
+
     def metrics(self, scenes: list[SceneTracks]) -> Metrics:
         """Errors of the generator on ``scenes``, all and each."""
         return rollout_errors(self.generator, scenes, self.config)
@@ -340,6 +369,52 @@ class CalibratedTask(_Task):
         return segments.mirrored() if flip else segments
 
 
+class HumanTask(nn.Module):
+    """A policy, fitted for a fixed schedule: no scene stops it early.
+
+    ``following`` are cars that follow each other in one lane.
+    """
+
+    def __init__(
+        self, scenes: list[SceneTracks], following: Sequence[Recording], config: HumanConfig
+    ):
+        super().__init__()
+        self.config = config
+        self.scenes = scenes
+        self.following = following
+        # The fit draws its own first weights; these must not change the caller's random numbers.
+        with torch.random.fork_rng(devices=[]):
+            self.generator = HumanModel(config.sizes)
+
+    def fit(self, name: str, on_progress: OnProgress) -> int:
+        """Fit the policy; the steps that were made."""
+        begun = time.monotonic()
+        best = math.inf
+
+        def report(done: int, steps: int, cost: float | None) -> None:
+            nonlocal best
+            best = best if cost is None else min(best, cost)
+            on_progress(Progress(name, done, steps, {}, cost, best, time.monotonic() - begun))
+
+        recordings = [recording_of(scene) for scene in self.scenes]
+        self.generator = fit_human(self.config, recordings, self.following, report)
+        fit_observer(self.generator, self.scenes, self.config)
+        return 1 + self.config.rounds + self.config.tuning
+
+    def forecasts(
+        self, scenes: list[SceneTracks], steps: int, stride: int, samples: int = SAMPLES
+    ) -> Forecasts:
+        """Forecasts of the windows of ``scenes``, by kind."""
+        return human_forecasts(self.generator, scenes, steps, stride, samples)
+
+    def metrics(self, scenes: list[SceneTracks]) -> Metrics:
+        """Errors over 0.8 s of the mean driver, of drawn ones and of constant velocity."""
+        windows = cut_windows(scenes, STRIDE)
+        forecasts = self.forecasts(scenes, PREDICTED_STEPS, STRIDE)
+        forecasts[BASELINE] = repeated(windows.past[:, -1], PREDICTED_STEPS)
+        return scene_metrics(windows, forecasts)
+
+
 @dataclass(frozen=True)
 class Progress:
     """State of the fit ``name`` after ``update`` of at most ``updates``.
@@ -360,130 +435,38 @@ class Progress:
 OnProgress = Callable[[Progress], None]
 
 
-class FitLoop:
-    """Runs a task until it stops improving: updates, evaluations, early stopping.
+def improve(task: PaperTask | CalibratedTask, name: str, on_progress: OnProgress) -> int:
+    """Update a task until it stops improving, and put the best weights into its networks.
 
-    ``path`` keeps the state after every evaluation on the validation scenes; the fit resumes from
-    it if it exists. ``seconds`` is the time of the updates, those in earlier runs of the same fit
-    too. ``name`` is for the display.
+    Returns:
+        Updates until the best evaluation on the validation scenes.
     """
-
-    def __init__(
-        self,
-        task: PaperTask | CalibratedTask,
-        path: Path | None = None,
-        name: str = "fit",
-    ):
-        self.task = task
-        self.config = task.config.loop
-        self.path = path
-        self.name = name
-        #: Updates so far, evaluations since the best one, updates until the best one.
-        self.done = 0
-        self.waited = 0
-        self.best_update = 0
-        self.best = math.inf
-        self.seconds = 0.0
-        self.best_weights: dict[str, Tensor] = {}
-        if path is not None and path.exists():
-            self._resume(path)
-
-    def run(self, on_progress: OnProgress | None = None) -> None:
-        """Fit, then put the best weights into the task's networks."""
-        # The limit on seconds is per run; the total counts earlier runs, too.
-        begun = time.monotonic()
-        earlier = self.seconds
-        score = None
-        while self.done < self.config.updates and self.waited < self.config.patience:
-            for optimiser in self.task.optimisers.values():
-                optimiser.param_groups[0]["lr"] = learning_rate(self.config, self.done)
-            losses = self.task.update(self.done)
-            self.done += 1
-            seconds = time.monotonic() - begun
-            self.seconds = earlier + seconds
-            late = self.config.max_seconds is not None and seconds > self.config.max_seconds
-            # A run that is out of time is evaluated too, so that its last weights are kept.
-            due = self.done % self.config.evaluate_every == 0
-            if due or late or self.done == self.config.updates:
-                score = self._evaluate()
-            if on_progress is not None:
-                progress = Progress(
-                    name=self.name,
-                    update=self.done,
-                    updates=self.config.updates,
-                    losses=losses,
-                    score=score,
-                    best=self.best,
-                    seconds=seconds,
-                )
-                on_progress(progress)
-            if late:
-                break
-        # Empty if no evaluation gave a finite score.
-        if self.best_weights:
-            self.task.load_state_dict(self.best_weights)
-
-    def _evaluate(self) -> float:
-        score = self.task.evaluate()
-        self.waited += 1
-        if score < self.best:
-            self.best = score
-            self.best_update = self.done
-            self.waited = 0
-            # A copy, since the next updates change the networks' own tensors.
-            self.best_weights = deepcopy(self.task.state_dict())
-        if self.path is not None:
-            self._keep(self.path)
-        return score
-
-    def _keep(self, path: Path) -> None:
-        """Write the state: tensors and plain data only."""
-        task = self.task
-        state = {
-            "counters": [self.done, self.waited, self.best_update],
-            "best": self.best,
-            "seconds": self.seconds,
-            "best_weights": self.best_weights,
-            "weights": task.state_dict(),
-            "optimisers": {
-                name: optimiser.state_dict() for name, optimiser in task.optimisers.items()
-            },
-            "random": task.random.get_state(),
-        }
-        # A checksum goes with it, so that a damaged state is refused and not resumed.
-        file = io.BytesIO()
-        torch.save(state, file)
-        write_bytes(path, sealed_archive(file.getvalue()))
-
-    def _resume(self, path: Path) -> None:
-        """Continue from a stored state; reading it never executes code."""
-        content = read_whole(path)
-        whole = has_checksum(content, path)
-        try:
-            if not whole:
-                raise ValueError("no checksum")
-            # weights_only: torch unpickles tensors and plain data, no other objects.
-            state = torch.load(io.BytesIO(content), weights_only=True)
-            counters = state["counters"]
-        except Exception as error:
-            raise UserError(
-                f"{path}: not the state of a fit; give the file that a fit keeps, or remove it."
-            ) from error
-        # A state that was written whole, but for other settings.
-        try:
-            self.task.load_state_dict(state["weights"])
-            for name, optimiser in self.task.optimisers.items():
-                optimiser.load_state_dict(state["optimisers"][name])
-        except (KeyError, RuntimeError, ValueError) as error:
-            raise UserError(
-                f"{path}: holds another fit than the one asked for; "
-                "give the same preset and sizes or remove it."
-            ) from error
-        self.done, self.waited, self.best_update = counters
-        self.best = state["best"]
-        self.seconds = state["seconds"]
-        self.best_weights = state["best_weights"]
-        self.task.random.set_state(state["random"])
+    config = task.config.loop
+    begun = time.monotonic()
+    best, best_update, waited = math.inf, 0, 0
+    best_weights: dict[str, Tensor] = {}
+    score = None
+    for done in range(1, config.updates + 1):
+        for optimiser in task.optimisers.values():
+            optimiser.param_groups[0]["lr"] = learning_rate(config, done - 1)
+        losses = task.update(done - 1)
+        seconds = time.monotonic() - begun
+        late = config.max_seconds is not None and seconds > config.max_seconds
+        # A fit that is out of time is evaluated too, so that its last weights are kept.
+        if done % config.evaluate_every == 0 or late or done == config.updates:
+            score = task.evaluate()
+            waited += 1
+            if score < best:
+                best, best_update, waited = score, done, 0
+                # A copy, since the next updates change the networks' own tensors.
+                best_weights = deepcopy(task.state_dict())
+        on_progress(Progress(name, done, config.updates, losses, score, best, seconds))
+        if late or waited >= config.patience:
+            break
+    # Empty if no evaluation gave a finite score.
+    if best_weights:
+        task.load_state_dict(best_weights)
+    return best_update
 
 
 def learning_rate(config: LoopConfig, number: int) -> float:

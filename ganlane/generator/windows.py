@@ -286,18 +286,12 @@ class Windows:
         scene: [W] str, the scene's name.
         start, vehicle: [W] int64, row of the scene at which the window starts, and column of its
             vehicle.
-        lane, lane_from_left: [W] int64, at the last observed position; 0 is the rightmost, 1 from
-            left the leftmost.
-        length: [W] float64, m.
     """
 
     positions: np.ndarray
     scene: np.ndarray
     start: np.ndarray
     vehicle: np.ndarray
-    lane: np.ndarray
-    lane_from_left: np.ndarray
-    length: np.ndarray
 
     def __len__(self) -> int:
         return len(self.start)
@@ -357,15 +351,11 @@ def cut_windows(
         start, vehicle = np.nonzero(_present_throughout(scene, frames)[::stride])
         # From rows of the thinned list back to rows of the scene.
         start *= stride
-        lane = scene.lane[start + PRESENT, vehicle]
         part = Windows(
             positions=scene.positions[start[:, None] + np.arange(frames), vehicle[:, None]],
             scene=np.full(len(start), scene.name),
             start=start,
             vehicle=vehicle,
-            lane=lane,
-            lane_from_left=scene.lanes - lane,
-            length=scene.length[vehicle],
         )
         parts.append(part)
     windows = join_windows(parts)

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from ganlane.errors import UserError
 from ganlane.settings.commands import RunConfig
 from ganlane.settings.env import EnvConfig
-from ganlane.settings.generator import DataConfig, FitConfig, HumanConfig, PaperConfig
+from ganlane.settings.generator import DataConfig, FitConfig, PaperConfig
 from ganlane.settings.record import CountOrZero, NotNegative, assign, at_least, between, one_of
 from ganlane.settings.traffic import IdmMobilTrafficConfig, TrafficConfig, traffics_of
 
@@ -64,15 +64,12 @@ class TrainGeneratorConfig(RunConfig):
     Attributes:
         folds: fit this many more, each without the scenes of its fold, and pool their errors; 0:
             none.
-        ablations: true: fit the preset with one part changed at a time, each with a quarter of the
-            updates.
         resume: folder of an earlier run: what was fitted there is not fitted again.
     """
 
     data: DataConfig = field(default_factory=DataConfig)
     generator: FitConfig = field(default_factory=PaperConfig)
     folds: CountOrZero = 0
-    ablations: bool = False
     resume: str | None = None
 
     def __post_init__(self) -> None:
@@ -81,8 +78,6 @@ class TrainGeneratorConfig(RunConfig):
             raise UserError(
                 "folds=1: one fold leaves nothing to fit to; use 2 or more, or 0 for none."
             )
-        if self.ablations and isinstance(self.generator, HumanConfig):
-            raise UserError("ablations=true: generator=human has none; leave it out.")
         # Found out now, not after minutes of fitting.
         if self.resume is not None and not Path(self.resume).is_dir():
             raise UserError(

@@ -1,6 +1,6 @@
 """``ganlane train_generator`` in process.
 
-On recordings as they are published, with folds, resuming and ablations.
+On recordings as they are published, with folds and resuming.
 """
 
 import json
@@ -68,16 +68,14 @@ def run(*arguments: str, folder: str = "fit") -> dict:
     return results
 
 
-def test_folds_and_ablations_are_pooled_kept_and_not_fitted_again(recordings, capsys):
-    options = (recordings, "folds=2", "ablations=true")
+def test_folds_are_pooled_kept_and_not_fitted_again(recordings, capsys):
+    options = (recordings, "folds=2")
     results = run(*options)
     pooled = results["folds"]["open_loop"]
     assert set(pooled["folds"]) == {"0", "1"}
     assert len(pooled["scenes"]) == 4
-    assert {"p_l = 4", "p_l = 12", "without pooling"} <= set(results["ablations"])
     out = capsys.readouterr().out
-    assert "ridge" in out
-    assert "without pooling" in out
+    assert "idm_own_headway" in out
     assert list(results["scenes"]) == results["data"]["held_out"]
     _, metadata = load_generator(Path("fit") / "generator_paper.safetensors", "paper")
     assert metadata["folds"]["open_loop"]["ade_m"]["mean"] == pytest.approx(pooled["ade_m"]["mean"])
@@ -92,7 +90,7 @@ def test_folds_and_ablations_are_pooled_kept_and_not_fitted_again(recordings, ca
 
     written = {path: path.stat().st_mtime_ns for path in Path("fit/fits").iterdir()}
     again = run(*options, "resume=fit", folder="again")
-    for name in ("folds", "ablations", "ade_m"):
+    for name in ("folds", "ade_m", "discriminator"):
         assert again[name] == results[name]
     assert {path: path.stat().st_mtime_ns for path in Path("fit/fits").iterdir()} == written
 
@@ -104,18 +102,18 @@ def test_what_was_fitted_stays_where_a_later_step_fails(recordings, capsys, monk
     monkeypatch.setattr("ganlane.commands.train_generator.write_results", refuse)
     assert main([recordings, *FEW]) == 2
     assert "results.json" in capsys.readouterr().err
-    assert len(list(tmp_path.rglob("fits/*.pt"))) == 1
+    assert len(list(tmp_path.rglob("fits/*.safetensors"))) == 1
     assert len(list(tmp_path.rglob("generator_paper.safetensors"))) == 1
 
 
-def test_too_many_folds_are_refused_before_ablations_are_fitted(recordings, capsys, monkeypatch):
+def test_too_many_folds_are_refused_before_anything_is_fitted(recordings, capsys, monkeypatch):
     fitted = []
     monkeypatch.setattr(
         ganlane.generator,
-        "ablate",
+        "cross_validate",
         lambda *arguments: fitted.append(arguments),
     )
-    assert main([recordings, "ablations=true", "folds=9", *FEW]) == 2
+    assert main([recordings, "folds=9", *FEW]) == 2
     assert "folds=9" in capsys.readouterr().err
     assert not fitted
 

@@ -1,7 +1,6 @@
-"""Splits of scenes, fits of both presets, k folds and ablations."""
+"""Splits of scenes, fits of both presets, and k folds."""
 
-import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import polars as pl
 import pytest
@@ -9,24 +8,17 @@ import torch
 from reference.small_networks import CALIBRATED, LOOP, PAPER
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-from ganlane.commands.train_generator import ablation_table, fold_tables
+from ganlane.commands.train_generator import fold_tables
 from ganlane.data.statistics import measure_exposure
 from ganlane.errors import UserError
 from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.fit import (
-    ablate,
     assign_folds,
     cross_validate,
     fit_generator,
     split_for_fit,
-    variants,
 )
 from ganlane.generator.windows import count_windows, scene_tracks
-from ganlane.settings.generator import (
-    CalibratedConfig,
-    LoopConfig,
-    PaperConfig,
-)
 
 
 @pytest.fixture(scope="module")
@@ -151,10 +143,9 @@ def test_every_scene_is_forecast_once_by_a_generator_that_never_saw_it(
         "single",
         "best_of_20",
         "constant_velocity",
-        "ridge",
-        "idm",
+        "idm_own_headway",
     }
-    assert kinds | {"constant_acceleration"} <= set(open_loop["ade_m"])
+    assert kinds == set(open_loop["ade_m"])
     assert "best_of_20" in fold_tables(scores)
 
 
@@ -175,7 +166,7 @@ def test_the_calibrated_preset_is_also_rolled_out_for_five_seconds(
 ):
     scores, _ = calibrated
     rollout = scores["rollout"]
-    assert rollout["tracks"] == 15
+    assert rollout["windows"] >= 15
     assert list(rollout["rmse_m"]["mean"]) == [
         "1 s",
         "2 s",
@@ -185,7 +176,7 @@ def test_the_calibrated_preset_is_also_rolled_out_for_five_seconds(
     ]
     assert rollout["ratio_to_constant_velocity"]["constant_velocity"] == 1.0
     assert scores["open_loop"]["windows"] > rollout["windows"]
-    assert "Social-GAN (published)" in fold_tables(scores)
+    assert "RMSE at 5 s to CV" in fold_tables(scores)
 
 
 @pytest.mark.parametrize("preset", ["paper", "calibrated"])
@@ -201,43 +192,3 @@ def test_the_folds_generators_name_the_scenes_they_were_fitted_to(preset, frame,
         others = frame.filter(~pl.col("scene").is_in(split["held_out"]))
         driven = metadata["driving_statistics"]["exposure"]["vehicle_km"]
         assert 0.0 < driven == measure_exposure(others).vehicle_km < kilometres
-
-
-def flat(config) -> dict:
-    """Settings and the settings within them."""
-    plain = asdict(config)
-    parts = {key: part for key, part in plain.items() if isinstance(part, dict)}
-    inner = {f"{key}.{name}": value for key, part in parts.items() for name, value in part.items()}
-    return {key: value for key, value in plain.items() if key not in parts} | inner
-
-
-@pytest.mark.parametrize("config", [PaperConfig(), CalibratedConfig()])
-def test_every_variant_has_a_quarter_of_the_updates_and_differs_in_its_part_alone(
-    config,
-):
-    first, *others = ((name, flat(variant)) for name, variant in variants(config).items())
-    assert first[1]["loop.updates"] == config.loop.updates // 4
-    for name, variant in others:
-        changed = {key for key, value in variant.items() if value != first[1][key]}
-        assert 1 <= len(changed) <= (3 if name == "variety term alone" else 1), name
-
-
-@pytest.mark.parametrize("config", [PAPER, CALIBRATED])
-def test_ablations_stand_side_by_side_and_the_calibrated_ones_are_rolled_out_too(
-    config, frame, tmp_path
-):
-    config = replace(config, loop=LoopConfig(updates=4, evaluate_every=4, warmup=1))
-    updates = []
-    rows = ablate(config, frame, ("synthetic-1",), tmp_path, updates.append)
-    assert [progress.name for progress in updates] == list(rows)
-    assert list(rows) == list(variants(config))
-    if config.preset == "calibrated":
-        assert variants(config)["without washout"].washout_s == math.inf
-        assert all(math.isfinite(row["rmse_5_s_ratio"]["mean"]) for row in rows.values())
-        assert rows["as it is"] != rows["without traits"]
-        assert "RMSE 5 s" in ablation_table(rows)
-    else:
-        short = rows["p_l = 4"]
-        assert short["windows"] > rows["p_l = 12"]["windows"]
-        assert short["ade_change_percent"] == short["ade_change_percent_0.4_s"]
-        assert len(ablation_table(rows).splitlines()) == 2 + len(rows)

@@ -1,6 +1,6 @@
 """What is fitted: losses, updates and scores of both presets.
 
-The loop's early stopping and resuming.
+The loop stops early.
 """
 
 import math
@@ -11,11 +11,9 @@ import torch
 from reference.small_networks import (
     CALIBRATED,
     PAPER,
-    SIZES,
     recorded_scenes,
 )
 
-from ganlane.errors import UserError
 from ganlane.generator import tasks
 from ganlane.settings.generator import LoopConfig
 
@@ -37,7 +35,7 @@ def paper_task(scenes, **changes) -> tasks.PaperTask:
 
 def test_fitting_the_papers_preset_lowers_its_error(scenes):
     seen = []
-    tasks.FitLoop(paper_task(scenes, updates=40)).run(seen.append)
+    tasks.improve(paper_task(scenes, updates=40), "fit", seen.append)
     losses = [progress.losses["mean"] for progress in seen]
     assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
     assert set(seen[-1].losses) == {
@@ -47,6 +45,22 @@ def test_fitting_the_papers_preset_lowers_its_error(scenes):
         "adversarial",
         "discriminator",
     }
+
+
+def test_a_fit_ends_with_the_weights_that_were_best_and_without_patience_soon(scenes):
+    task = paper_task(scenes, updates=40, patience=1)
+    seen = []
+    scores = iter([3.0, 2.0, 2.5, 1.0])
+    weights = {}
+
+    def evaluate():
+        weights[len(seen) + 1] = task.generator.head.weight.clone()
+        return next(scores)
+
+    task.evaluate = evaluate
+    assert task.fit("fit", seen.append) == 20
+    assert seen[-1].update == 30
+    assert torch.equal(task.generator.head.weight, weights[20])
 
 
 def test_the_calibrated_loss_falls(scenes):
@@ -59,39 +73,6 @@ def test_the_calibrated_loss_falls(scenes):
     task.optimisers["generator"].param_groups[0]["lr"] = 5e-3
     losses = [task.update(0)["mean"] for _ in range(16)]
     assert sum(losses[-5:]) < sum(losses[:5])
-
-
-def test_an_interrupted_fit_goes_on_to_the_same_weights(scenes, tmp_path):
-    whole, stopped, resumed = (paper_task(scenes, updates=16) for _ in range(3))
-    tasks.FitLoop(whole).run()
-
-    def stop(progress):
-        if progress.update == 12:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        tasks.FitLoop(stopped, tmp_path / "fit.pt").run(stop)
-    loop = tasks.FitLoop(resumed, tmp_path / "fit.pt")
-    assert loop.done == 10
-    loop.run()
-    for name, tensor in whole.generator.state_dict().items():
-        torch.testing.assert_close(resumed.generator.state_dict()[name], tensor, msg=name)
-
-
-def test_foreign_states_are_refused(scenes, tmp_path):
-    path = tmp_path / "fit.pt"
-    path.write_bytes(b"not a state")
-    task = paper_task(scenes, updates=2)
-    with pytest.raises(UserError, match="not the state of a fit"):
-        tasks.FitLoop(task, path)
-    path.unlink()
-    tasks.FitLoop(task, path).run()
-    other = tasks.PaperTask(
-        *([scene] for scene in scenes),
-        replace(task.config, sizes=replace(SIZES, hidden=20)),
-    )
-    with pytest.raises(UserError, match="another fit"):
-        tasks.FitLoop(other, path)
 
 
 def test_the_learning_rate_rises_and_then_falls_to_nothing():

@@ -113,10 +113,10 @@ def test_constant_velocity_errs_as_worked_by_hand(scenes):
 
 
 def brute_force_windows(frame: pl.DataFrame, stride: int) -> dict[tuple[str, int, int], np.ndarray]:
-    """(scene, start row, vehicle number) -> positions, lane and length, by looking every frame up
-    in a dictionary.
+    """(scene, start row, vehicle number) -> positions, by looking every frame up in a
+    dictionary.
     """
-    columns = ("scene", "vehicle", "frame", "x", "y", "lane", "length")
+    columns = ("scene", "vehicle", "frame", "x", "y")
     windows = {}
     rows = {row[:3]: row[3:] for row in frame.select(columns).iter_rows()}
     begins = dict(frame.group_by("scene").agg(pl.col("frame").min()).iter_rows())
@@ -124,10 +124,7 @@ def brute_force_windows(frame: pl.DataFrame, stride: int) -> dict[tuple[str, int
         course = [rows.get((scene, vehicle, first + step)) for step in range(WINDOW_FRAMES)]
         row = first - begins[scene]
         if None not in course and row % stride == 0:
-            windows[scene, row, vehicle] = (
-                np.array([place[:2] for place in course]),
-                course[PRESENT][2:],
-            )
+            windows[scene, row, vehicle] = np.array([place for place in course])
     return windows
 
 
@@ -140,8 +137,7 @@ def test_windows_are_those_of_a_brute_force_search(stride):
     # Columns of a scene are its vehicles in the order of their numbers, which begin at 1000.
     keys = list(zip(windows.scene, windows.start, 1000 + windows.vehicle))
     assert sorted(keys) == sorted(expected)
-    np.testing.assert_array_equal(windows.positions, np.stack([expected[key][0] for key in keys]))
-    assert list(zip(windows.lane, windows.length)) == [expected[key][1] for key in keys]
+    np.testing.assert_array_equal(windows.positions, np.stack([expected[key] for key in keys]))
     if stride == 1:
         assert [count_windows(scene) for scene in scenes] == [
             len(cut_windows([scene])) for scene in scenes

@@ -27,7 +27,8 @@ def compare(
     Each of ``drivers`` (:func:`ganlane.build.make_driver`) drives with its own observation and
     mask, or with those of ``config`` if it names none; the sensors are those of ``config`` for all.
     ``quiet`` shows no progress. ``once``: where a traffic replays, no start of the recordings is
-    driven twice, so that there may be fewer episodes.
+    driven twice (:meth:`ganlane.traffic.ReplayTraffic.episodes_once`), so that there may be fewer
+    episodes.
 
     Returns:
         What :func:`ganlane.evaluation.run_episodes` gives, with ``agent`` and ``traffic``, one
@@ -56,7 +57,7 @@ def compare(
         for traffic, module in modules.items():
             numbers: Sequence[int] = range(episodes)
             if once and isinstance(module, ReplayTraffic):
-                numbers = module.episodes_once(seed)[:episodes]
+                numbers = module.episodes_once(seed, env.idm)[:episodes]
             for driver in drivers:
                 observation = config.observation.read_by(driver.observation)
                 mask, policy = driver.behind(config.mask)

@@ -27,6 +27,8 @@ from ganlane.view.player import player_page
 _SHOWN_S = 15.0
 #: Version of the form of ``results.json``: what is in it, by what name (docs/benchmark.md).
 SCHEMA = 1
+#: So many episodes of each driver and traffic are in ``results.json`` one by one.
+SAMPLE = 5
 
 
 def drivers_of(names: Sequence[str], config: BenchmarkConfig) -> list[Driver]:
@@ -111,6 +113,7 @@ def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
         "rows": matrix,
         "comparisons": compared,
         "failures": failed_episodes(episodes),
+        "sample": _sample(episodes, list(suite.scored)),
         "left_out": left_out,
     }
     seeds = {"stream": suite.stream, "seed": config.seed, "episodes": driven}
@@ -125,6 +128,16 @@ def _trainings(cells: scores.Cells, recipe: str) -> list[str]:
 def matrix_episodes(matrix: Sequence[Mapping[str, Any]], traffic: str) -> int:
     """How many episodes each driver drove on a traffic."""
     return next(row["episodes"] for row in matrix if row["traffic"] == traffic)
+
+
+def _sample(episodes: pl.DataFrame, traffics: Sequence[str]) -> dict[str, Any]:
+    """The rewards of the first episodes, by driver and traffic: what anybody can drive again."""
+    sample: dict[str, Any] = {}
+    for (driver, traffic), driven in episodes.group_by("agent", "traffic", maintain_order=True):
+        if traffic in traffics:
+            rewards = driven.sort("episode")["reward"].head(SAMPLE).to_list()
+            sample.setdefault(str(driver), {})[str(traffic)] = rewards
+    return sample
 
 
 def _notes(title: str, config: BenchmarkConfig) -> list[str]:

@@ -27,6 +27,8 @@ from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, VEHICLE_FLOATS
 from ganlane.settings.driving import IdmParameters, Visibility
 from ganlane.settings.traffic import ReplayTrafficConfig
+from ganlane.sim.idm import following_acceleration
+from ganlane.sim.neighbours import perceive
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import Memory, Moved, TrafficModule
@@ -39,6 +41,9 @@ _HALF_WINDOW = 5
 #: A vehicle that moves less than this in the window keeps its heading along the road, m.
 _LEAST_PATH_M = 1.0
 _X = VEHICLE_FLOATS.index("x")
+#: Harder braking of the ego at once makes a start one that is not driven by
+#: :meth:`ReplayTraffic.episodes_once`, m/s2.
+HARD_BRAKING_MPS2 = -4.0
 #: Lower bound of a recorded driver's desired speed, m/s (it may be stopped in a jam all the time).
 LEAST_DESIRED_SPEED_MPS = 10.0
 
@@ -248,13 +253,24 @@ class ReplayTraffic(TrafficModule):
         # The last sample of its track is nobody else's.
         return self.last[self.starts[self._starts_of(seed, episodes), 0]].tolist()
 
-    def episodes_once(self, seed: int) -> list[int]:
-        """The first episode of each start, in ascending order: every start is driven once."""
+    def episodes_once(self, seed: int, idm: IdmParameters) -> list[int]:
+        """The first episode of each start that can be driven, in ascending order.
+
+        Every start is driven once. Left out are those at which the ego, which follows by ``idm``,
+        would brake beyond :data:`HARD_BRAKING_MPS2` at once: the recorded driver was nearer to the
+        vehicle ahead than IDM ever is, and a crash there is none of the agent's.
+        """
         # Scenes are equally likely, so a start of the longest scene comes once in so many episodes.
         rarest = len(self.scene_names) * int(self.starts_in.max())
-        starts = self._starts_of(seed, range(20 * rarest))
+        numbers = torch.arange(20 * rarest)
+        starts = self._starts_of(seed, numbers.tolist())
         _, first = np.unique(starts.cpu().numpy(), return_index=True)
-        return sorted(first.tolist())
+        numbers = numbers[torch.from_numpy(first).sort().values]
+        key = episode_key(self.stream, torch.full_like(numbers, seed), numbers).to(starts.device)
+        vehicles = self.scenes(MOST_VEHICLES)(key, torch.float32)
+        scene = perceive(vehicles, self.road_of(key), slice(0, 1))
+        softly = following_acceleration(scene, idm)[:, 0] >= HARD_BRAKING_MPS2
+        return numbers[softly.cpu()].tolist()
 
     def _starts_of(self, seed: int, episodes: Sequence[int]) -> Tensor:
         """Number of the start of each of ``episodes``."""

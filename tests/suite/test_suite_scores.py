@@ -8,7 +8,8 @@ import pytest
 from reference.refusals import user_error
 from scipy import stats
 
-from ganlane.suite.scores import by_recipe, comparisons, recipe_of, rows
+from ganlane.settings.suite import Suite
+from ganlane.suite.scores import by_recipe, comparisons, recipe_of, rows, summaries
 
 KM = 5.0
 
@@ -153,3 +154,48 @@ def test_two_agents_of_one_name_and_seed_are_not_mixed(other):
     both = pl.concat([driven("agent_idm@0", [0, 0]), driven(other, [0, 0])])
     with user_error("two of one seed are called agent_idm"):
         by_recipe(both)
+
+
+def test_the_score_is_the_interquartile_mean_over_traffics_and_the_worst_is_named():
+    suite = Suite(
+        scored={"idm": 2, "idm_mobil": 2, "gan": 2, "human": 2}, baselines=["mobil_egoistic"]
+    )
+    rewards = {"idm": 110, "idm_mobil": 120, "gan": 40, "human": 300}
+    parts = []
+    for traffic, reward in rewards.items():
+        parts += [
+            driven("random_legal", [0, 0], traffic=traffic),
+            driven("mobil", [100, 100], traffic=traffic),
+            driven("mobil_egoistic", [105, 105], traffic=traffic),
+            driven("mine@0", [reward - 4, reward], traffic=traffic, ttc_s=1.0),
+            driven("mine@1", [reward, reward + 4], ["goal", "hard_crash"], traffic=traffic),
+        ]
+    cells = by_recipe(pl.concat(parts))
+    by_name = {entry["entry"]: entry for entry in summaries(cells, rows(cells), suite)}
+    mine = by_name["mine"]
+    assert mine["score"] == pytest.approx((110 + 120) / 2)
+    low, high = mine["score_ci"]
+    assert low < mine["score"] < high
+    assert (mine["worst"], mine["worst_traffic"]) == (pytest.approx(40), "gan")
+    assert (by_name["mobil"]["score"], by_name["random_legal"]["score"]) == (100.0, 0.0)
+    assert by_name["mobil"]["score_ci"] == [100.0, 100.0]
+    # Above on three traffics of four.
+    assert mine["improvement"]["mobil"]["probability"] == 0.75
+    assert mine["improvement"].keys() == {"random_legal", "mobil", "mobil_egoistic"}
+    # One crash and two near misses on each traffic, in 4 episodes of 5 km.
+    assert mine["crashes_per_1000_km"] == pytest.approx(1000 / (4 * KM))
+    assert mine["near_misses_per_1000_km"] == pytest.approx(2000 / (4 * KM))
+    assert mine["crash_kinds"] == {"run_into": 0, "cut_in": 4, "leaving": 0, "sitting": 0}
+
+
+def test_replayed_episodes_of_one_recorded_car_are_one():
+    # Of car 1 three episodes, of which one crashed; of car 2 one.
+    ends = ["hard_crash", "goal", "goal", "goal"]
+    episodes = [driven("mobil", [0, 30, 60, 100]), driven("mine", [0, 30, 60, 120], ends)]
+    cars = [frame.with_columns(car=pl.Series([1, 1, 1, 2])) for frame in episodes]
+    (_, row) = rows(by_recipe(pl.concat(cars)))
+    assert row["episodes"] == 4
+    assert row["mean_reward"] == pytest.approx((30 + 120) / 2)
+    assert row["minus_mobil"] == pytest.approx(10)
+    assert row["crashes_per_1000_km"] == pytest.approx(1000 * (1 / 3) / (2 * KM))
+    assert row["hard_crash"] == 1

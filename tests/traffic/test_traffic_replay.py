@@ -14,7 +14,7 @@ from scipy.stats import chisquare
 from ganlane import keys
 from ganlane.data import default_scenes, sort, write_scene_csv
 from ganlane.errors import UserError
-from ganlane.settings.driving import Visibility
+from ganlane.settings.driving import IdmParameters, Visibility
 from ganlane.sim import Vehicles
 from ganlane.sim.collisions import ego_overlaps
 from ganlane.sim.random import episode_key
@@ -320,3 +320,42 @@ def test_how_long_the_us101_scenes_last_and_how_soon_they_empty(us101):
         driven = driven + running.sum().item()
         alone = alone + (running & empty).sum().item()
     assert alone / driven == pytest.approx(0.18, abs=0.01)
+
+
+# Starts that are driven once each
+
+STEADY = [
+    track(1, range(30), 0.0, 20.0, 0, scene="long"),
+    track(2, range(30), 60.0, 20.0, 0, scene="long"),
+    track(1, range(25), 0.0, 20.0, 0, scene="short"),
+    track(2, range(25), 60.0, 20.0, 0, scene="short"),
+]
+
+
+def test_every_start_is_driven_once_by_its_first_episode():
+    traffic = replay(*STEADY)
+    episodes = traffic.episodes_once(3, IdmParameters())
+    starts = traffic.start_of(keys_of(episodes, seed=3)).tolist()
+    assert sorted(starts) == list(range(10 + 5))
+    assert episodes == sorted(episodes)
+    before = traffic.start_of(keys_of(range(max(episodes)), seed=3)).tolist()
+    for episode, first in zip(episodes, starts):
+        assert first not in before[:episode]
+
+
+def test_starts_at_which_the_ego_would_brake_hard_at_once_are_left_out():
+    close = [
+        track(1, range(30), 0.0, 20.0, 0, scene="close"),
+        track(2, range(30), 7.0, 15.0, 0, scene="close"),
+    ]
+    traffic = replay(*STEADY, *close)
+    episodes = traffic.episodes_once(0, IdmParameters())
+    assert set(traffic.scenes_of_episodes(0, episodes)) == {"long", "short"}
+
+
+def test_episodes_of_one_recorded_car_are_known_by_its_number():
+    traffic = replay(*STEADY)
+    episodes = traffic.episodes_once(0, IdmParameters())
+    cars = traffic.cars_of_episodes(0, episodes)
+    scenes = traffic.scenes_of_episodes(0, episodes)
+    assert len(set(zip(cars, scenes))) == len(set(cars)) == 2

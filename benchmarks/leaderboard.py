@@ -1,0 +1,141 @@
+"""The leaderboard of ``ganlane benchmark``: the page from committed results, and their check.
+
+    python -m benchmarks.leaderboard                   # what differs from the page
+    python -m benchmarks.leaderboard --write           # write docs/leaderboard.md
+    python -m benchmarks.leaderboard --add outputs/benchmark/RUN/results.json --name NAME
+    python -m benchmarks.leaderboard --check           # drive the samples again
+
+``--add`` stores what the page needs of a run as ``docs/leaderboard/NAME.json``. ``--check`` drives
+the sampled episodes of every agent that can be had here, and names those that come out otherwise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from benchmarks.script import ReportSection, make_parser, run_script, split_at_markers
+from ganlane.config.run import settings
+from ganlane.errors import UserError
+from ganlane.files import write_json
+from ganlane.settings.suite import BenchmarkConfig
+from ganlane.suite.driving import compare
+from ganlane.suite.report import score_table
+from ganlane.suite.run import SAMPLE, SCHEMA, drivers_of
+
+ROOT = Path(__file__).parents[1]
+FOLDER = ROOT / "docs" / "leaderboard"
+PAGE = ROOT / "docs" / "leaderboard.md"
+MARKERS = ("<!-- leaderboard: begin -->", "<!-- leaderboard: end -->")
+#: What is stored of a run's results.
+PARTS = ("schema", "suite", "protocol", "quick", "entries", "sample", "code", "machine", "written")
+
+Results = Mapping[str, Any]
+
+
+def stored() -> dict[str, Results]:
+    """The stored results by name.
+
+    Raises:
+        UserError: one of another protocol than the suite has now.
+    """
+    protocol = settings("benchmark", []).protocol()
+    files = sorted(FOLDER.glob("*.json"))
+    results = {file.stem: json.loads(file.read_text(encoding="utf-8")) for file in files}
+    for name, content in results.items():
+        if (content.get("schema"), content.get("protocol")) != (SCHEMA, protocol):
+            raise UserError(
+                f"{name}.json: protocol {content.get('protocol')}, expected {protocol}; run "
+                "`ganlane benchmark` without changes to the suite."
+            )
+    return results
+
+
+def table(results: Mapping[str, Results]) -> str:
+    """One line per entry, the best first; drivers of the suite once."""
+    entries = {}
+    for name in sorted(results, key=lambda name: name != "shipped"):
+        for entry in results[name]["entries"]:
+            entries.setdefault(entry["entry"], entry)
+    traffics = list(settings("benchmark", []).suite.scored)
+    rows = [{**entry, "decisions_per_s": None} for entry in entries.values()]
+    return score_table(rows, traffics, []).markdown(heading=False)
+
+
+def add(path: Path, name: str) -> str:
+    """Store what the page needs of a run; the line that names the file."""
+    content = json.loads(path.read_text(encoding="utf-8"))
+    agents = content["config"]["agents"]
+    parts = {part: content[part] for part in PARTS}
+    file = FOLDER / f"{name}.json"
+    write_json(file, {"agents": agents, **parts})
+    return f"stored: {file}"
+
+
+def differences() -> list[str]:
+    """What of the page is not as the stored results say."""
+    before, after = split_at_markers(PAGE, *MARKERS)
+    whole = PAGE.read_text(encoding="utf-8")
+    if whole[len(before) : -len(after)].strip() == table(stored()):
+        return []
+    return [f"{PAGE.name}: differs; run `python -m benchmarks.leaderboard --write`."]
+
+
+def driven_again(name: str, results: Results, episodes: int = SAMPLE) -> list[str]:
+    """Drive the sample of one stored run again: a line for every episode that differs.
+
+    Raises:
+        UserError: an agent that is not at hand here.
+    """
+    config: BenchmarkConfig = settings("benchmark", [])
+    names = [*config.suite.drivers(), *(results["agents"] or config.suite.agents)]
+    wrong = []
+    for driver in drivers_of(list(dict.fromkeys(names)), config):
+        for traffic, rewards in results["sample"][driver.name].items():
+            count = min(episodes, len(rewards))
+            alone = replace(config.on(traffic), episodes=count)
+            evaluated = compare([driver], alone, quiet=True)
+            for number, (now, before) in enumerate(zip(evaluated["reward"], rewards)):
+                if now != before:
+                    wrong.append(
+                        f"{name}: {driver.name} on {traffic}, episode {number}: {now}, not {before}"
+                    )
+    return wrong
+
+
+def work(options: argparse.Namespace) -> str:
+    """What is asked for; the line or lines to print."""
+    if options.add is not None:
+        return add(options.add, options.name)
+    if options.check:
+        wrong = []
+        for name, results in stored().items():
+            try:
+                wrong += driven_again(name, results)
+            except UserError as error:
+                print(f"{name}: not driven again ({error})", file=sys.stderr)
+        if wrong:
+            raise UserError("; ".join(wrong))
+        return "every sampled episode came out as stored"
+    if options.write:
+        ReportSection(PAGE, *MARKERS).write(f"\n{table(stored())}\n")
+    return "\n".join(differences()) or "the page is as the stored results say"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write, add or check; the exit status."""
+    parser = make_parser(__doc__)
+    parser.add_argument("--write", action="store_true", help="write the page")
+    parser.add_argument("--check", action="store_true", help="drive the samples again")
+    parser.add_argument("--add", type=Path, help="the results.json of a run")
+    parser.add_argument("--name", default="mine", help="of the stored file")
+    return run_script(work, parser.parse_args(arguments))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

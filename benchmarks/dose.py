@@ -105,7 +105,7 @@ def train(folder: Path, seeds: int, part: int, parts: int) -> str:
         table = api.evaluate(
             [str(weights)], list(HELD_OUT), episodes=EPISODES, per_episode=True, threads=1
         )
-        failed = pl.col("hard_crash") | pl.col("out_of_road")
+        failed = pl.col("reason").is_in(["hard_crash", "out_of_road"])
         table = table.select("traffic", "episode", pl.col("reward").cast(pl.Float32), failed=failed)
         table.write_parquet(episodes)
         print(f"{training.name}: done", flush=True)

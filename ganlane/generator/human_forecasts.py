@@ -24,6 +24,7 @@ from ganlane.generator.human import (
     ACROSS,
     ALONG,
     DECISION_S,
+    SIGHT_M,
     STEPS,
     Memory,
     bounded,
@@ -52,7 +53,7 @@ from ganlane.settings.driving import HumanVariation, Visibility
 from ganlane.settings.generator import HumanConfig
 from ganlane.sim.state import Road, Vehicles
 
-#: A driver's desired speed is its present one and this much, m/s.
+#: The desired speed of a driver who follows another is its present one and this much, m/s.
 DESIRED_ABOVE_MPS = 4.0
 #: Width of a body where none is recorded, m.
 WIDTH_M = 1.9
@@ -93,7 +94,7 @@ def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memo
         acceleration=accelerations[..., 0],
         length=segments.length.clamp_min(1.0),
         width=zero + WIDTH_M,
-        desired_speed=(speed + DESIRED_ABOVE_MPS).clamp(*DESIRED_MPS),
+        desired_speed=speed,
         target_lane=torch.where(leaving, soon, lane).long(),
         visibility=torch.full_like(lane, int(Visibility.CENTRE)).long(),
         valid=segments.present[:, PRESENT],
@@ -109,6 +110,11 @@ def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memo
         zero + LONG_AGO,
     )
     view = perceive(vehicles, memory, road)
+    # Who sees nobody ahead has a leader that was not recorded rather than a free road, and is taken
+    # to keep its speed.
+    follows = view.gap < SIGHT_M
+    desired = (speed + DESIRED_ABOVE_MPS).clamp(*DESIRED_MPS)
+    vehicles = vehicles.with_(desired_speed=torch.where(follows, desired, speed))
     memory = memory._replace(closing=torch.stack((view.closing, view.closing), -1))
     return vehicles, with_style(memory, view, torch.ones_like(whole)), road
 

@@ -9,9 +9,12 @@ from ganlane.api import make_env
 from ganlane.errors import UserError
 from ganlane.generator import shipped_generator
 from ganlane.generator.human import STEPS
+from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.driving import HumanVariation
 from ganlane.sim.random import episode_key
 from ganlane.sim.spawn import spawn
+from ganlane.sim.state import Road, Vehicles
+from ganlane.traffic import IdmTraffic
 from ganlane.traffic.presets import human_traffic
 
 
@@ -106,6 +109,44 @@ def test_who_is_behind_counts_the_less_the_less_polite_a_driver_is():
     assert changes(drive(range(32), 200, politeness=0.0)) > changes(
         drive(range(32), 200, politeness=4.0)
     )
+
+
+def on_a_ring(traffic, vehicles, seconds):
+    """Where the vehicles are after so many seconds on the traffic's road."""
+    rows = len(vehicles.x)
+    key = episode_key(traffic.stream, torch.zeros(rows, dtype=torch.int64), torch.arange(rows))
+    memory = traffic.fresh_memory(vehicles, key)
+    for step in range(round(seconds / PHYSICS_STEP_S)):
+        vehicles, memory = traffic.move(vehicles, memory, key, torch.full((rows,), step))
+    return vehicles
+
+
+@pytest.mark.slow
+def test_a_stop_and_go_wave_forms_on_a_ring_where_idm_drivers_flow_on():
+    """22 cars on a ring, as in Sugiyama et al. 2008, here of 400 m."""
+    road = Road(1, 4.0, ring_m=400.0)
+    rows, cars = 4, 22
+    zero = torch.zeros(rows, cars)
+    noise = 0.3 * torch.randn(rows, cars, generator=torch.Generator().manual_seed(0))
+    even = Vehicles(
+        x=torch.arange(cars) * road.ring_m / cars + noise,
+        y=zero,
+        heading=zero,
+        speed=zero + 5.0,
+        acceleration=zero,
+        length=zero + 4.5,
+        width=zero + 1.8,
+        desired_speed=zero + 15.0,
+        target_lane=zero.long(),
+        visibility=zero.long(),
+        valid=zero == 0.0,
+    )
+    wave = on_a_ring(human_traffic(road), even, 100.0)
+    # Somebody nearly stands while others go on.
+    assert wave.speed.min(1).values.mean() < 1.0
+    assert wave.speed.max(1).values.mean() > 7.0
+    flow = on_a_ring(IdmTraffic(road), even, 100.0)
+    assert flow.speed.std(1).mean() < 0.1 * wave.speed.std(1).mean()
 
 
 def test_foreign_weights_are_refused():

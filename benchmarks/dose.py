@@ -34,7 +34,7 @@ from ganlane.evaluation.table import Table
 
 #: Values of each property; what is not named is as fitted.
 DOSES: dict[str, tuple[Any, ...]] = {
-    "lane_changes": (0.0, 0.5, 2.0, 4.0),
+    "lane_changes": (0.0, 0.9, 3.6),
     "politeness": (0.0, 3.0),
     "temperature": (0.3, 1.2, 1.6),
     "delayed": (1, 2),

@@ -157,7 +157,7 @@ def _driven(
         if decision:
             memory = with_style(memory, perceive(vehicles, memory, road))
         view = perceive(vehicles, memory, road)
-        chances = policy.lane_chances(lane_choice(vehicles, view))
+        chances = policy.lane_chances(lane_choice(vehicles, view), HumanVariation.lane_changes)
         choice = chosen(chances, torch.rand(mean.shape, generator=random))
         target = torch.where(mean, vehicles.target_lane, new_target(vehicles, view, choice))
         changed = target != vehicles.target_lane

@@ -8,7 +8,6 @@ from reference.worlds import environment, placed, same_bits, step, vehicles
 from torchrl.envs.utils import check_env_specs
 
 from ganlane import keys
-from ganlane.sim.random import Stream
 
 KEEP = keys.KEEP
 LEFT = keys.LEFT
@@ -46,14 +45,6 @@ def test_a_seed_gives_the_same_episodes_again_and_another_one_others():
     env.set_seed(3)
     assert same_bits(first, env.reset()) == []
     assert not torch.equal(first[keys.VEHICLES, "x"], other[keys.VEHICLES, "x"])
-
-
-def test_training_and_reported_episodes_are_different_ones():
-    scenes = [
-        environment(num_envs=4, stream=stream).reset()[keys.VEHICLES, "speed"] for stream in Stream
-    ]
-    assert not torch.equal(scenes[0], scenes[1])
-    assert not torch.equal(scenes[1], scenes[2])
 
 
 def test_row_i_starts_with_episode_first_plus_i():
@@ -141,28 +132,6 @@ def test_a_command_moves_the_ego_one_lane_and_commands_meanwhile_are_ignored():
     assert step(env, td, RIGHT)[keys.EGO, "change_direction"].item() == -1
 
 
-def test_a_command_off_the_road_is_ignored_in_the_middle_of_a_change():
-    env = environment(lanes=2, vehicles=2, mobil=False)
-    td = step(env, placed(env, vehicles({"x": 0.0, "lane": 0}, FAR)), LEFT)
-    td = step(env, td, LEFT)
-    assert ends(td) == []
-
-
-def test_with_abort_the_opposite_command_turns_back_and_the_same_one_does_nothing():
-    env = environment(lanes=3, vehicles=2, mobil=False, abort=True)
-    td = step(env, placed(env, vehicles({"x": 0.0, "lane": 0}, FAR)), LEFT)
-    again = step(env, td, LEFT)
-    assert again[keys.VEHICLES, "target_lane"][0, 0] == 1
-    assert remembered(again, "lane_changes") == 1
-    back = step(env, td, RIGHT)
-    assert back[keys.VEHICLES, "target_lane"][0, 0] == 0
-    assert remembered(back, "started_change")
-    for _ in range(6):
-        back = step(env, back)
-    assert back[keys.VEHICLES, "y"][0, 0].abs() < 0.1
-    assert remembered(back, "change_direction") == 0
-
-
 # Ends
 
 TO_GOAL = {"x": 999.0, "lane": 1, "speed": 20.0}
@@ -208,44 +177,3 @@ def test_an_episode_ends_for_one_reason_at_the_step_of_it(ego, others, action, r
     if reasons == ["out_of_road"]:
         assert same_bits(after[keys.VEHICLES], td[keys.VEHICLES]) == []
         assert not remembered(after, "started_change")
-
-
-def test_the_time_limit_truncates_in_the_middle_of_a_decision():
-    env = environment(period_s=2.0, timeout_s=3.0)
-    td = step(env, env.reset())
-    assert ends(td) == []
-    td = step(env, td)
-    assert ends(td) == ["timeout"]
-    assert flags(td) == (False, True, True)
-    assert td[keys.STEP].item() == 30
-
-
-# Soft crashes
-
-
-def standing(gap: float, behind: bool = False) -> list[dict]:
-    """The ego at rest with its neighbour ``gap`` m ahead or behind, and a third that keeps them
-    from driving off.
-    """
-    ego = {"x": 0.0, "lane": 1, "speed": 0.0}
-    near, third = (-4.5 - gap, 4.5 + 2.0) if behind else (4.5 + gap, 9.0 + gap + 0.5)
-    return [ego, {**ego, "x": near}, {**ego, "x": third}]
-
-
-@pytest.mark.parametrize(
-    ("behind", "counted", "silent"),
-    [
-        (False, keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND),
-        (True, keys.SOFT_CRASH_BEHIND, keys.SOFT_CRASH),
-    ],
-    ids=["ahead", "behind"],
-)
-def test_a_soft_crash_counts_once_until_it_is_over(behind, counted, silent):
-    env = environment(vehicles=3, mobil=False)
-    td = env.reset()
-    for gap, count in ((1.5, 1), (1.5, 0), (3.0, 0), (1.5, 1), (1.5, 0)):
-        td[keys.VEHICLES].update(vehicles(*standing(gap, behind)).as_dict())
-        td = step(env, td)
-        assert flags(td) == (False, False, False)  # it is no end
-        assert td[keys.EVENTS, counted].item() == count
-        assert td[keys.EVENTS, silent].item() == 0

@@ -168,12 +168,3 @@ def test_autocast_changes_no_traffic(traffic, dtype):
         cast = paths(HighwayEnv(model, 2, dtype=dtype), actions)
     assert plain.dtype == dtype
     torch.testing.assert_close(cast, plain, rtol=0.0, atol=0.0)
-
-
-def test_generated_traffic_in_float64_is_that_of_float32_up_to_rounding_even_side_by_side():
-    model = make_traffic(make(TrafficConfig, "gan_calibrated"), EnvConfig())
-    actions = torch.zeros(3, 2).long()
-    before = paths(HighwayEnv(model, 2), actions)
-    double = paths(HighwayEnv(model, 2, dtype=torch.float64), actions)
-    assert torch.allclose(before.double(), double, atol=1e-3)
-    assert torch.equal(paths(HighwayEnv(model, 2), actions), before)

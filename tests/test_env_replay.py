@@ -5,7 +5,6 @@ Its roads, its ends, and vehicles that leave within a decision.
 
 from __future__ import annotations
 
-import numpy as np
 import polars as pl
 import pytest
 import torch
@@ -136,10 +135,3 @@ def test_an_episode_is_the_same_bits_in_every_batch_and_after_automatic_resets(r
     wide = driven(24, 12)
     assert min(len(track) for track in wide.values()) >= 4
     assert_same_tracks(driven(1, 60), wide, at_least=4)
-
-
-def test_scenes_given_by_hand_come_before_the_recorded_ones(recordings):
-    traffic = ReplayTraffic(recordings=recordings, least_s=5.0)
-    env = HighwayEnv(traffic, 4, scenes=traffic.scenes(3))
-    assert env.reset()[keys.VEHICLES, "x"].shape == (4, 3)
-    assert np.isfinite(env.rollout(5)[keys.VEHICLES, "x"]).all()

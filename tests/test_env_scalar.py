@@ -73,10 +73,16 @@ def stay_on_the_road(rng: random.Random, state: scalar.State, lanes: int) -> int
     return rng.choice([0] * 20 + [1] * (lane < lanes - 1) + [2] * (lane > 0))
 
 
-def compare(env: HighwayEnv, td, duration_s: float, rng: random.Random, choose=any_action) -> None:
-    """Drive both simulators with the same random actions; compare states, events and memories."""
+def compare(
+    env: HighwayEnv, td, duration_s: float, rng: random.Random, choose=any_action
+) -> set[str]:
+    """Drive both simulators with the same random actions; compare states, events and memories.
+
+    Which ends and soft crashes there were.
+    """
     rules = rules_of(env)
     rows = env.batch_size[0]
+    seen = set()
     states = [scalar_state(td, row) for row in range(rows)]
     running = [True] * rows
     for _ in range(round(duration_s / env.episode.decision_period_s)):
@@ -86,9 +92,12 @@ def compare(env: HighwayEnv, td, duration_s: float, rng: random.Random, choose=a
             if running[row]:
                 outcome = scalar.decide(states[row], actions[row], rules)
                 assert_same(td, row, states[row], outcome)
+                seen |= {*outcome.reasons}
+                seen |= {name for name in keys.EVENT_COUNTS if getattr(outcome, name)}
                 running[row] = not outcome.reasons
         if not any(running):
             break
+    return seen
 
 
 def assert_same(
@@ -130,19 +139,23 @@ def compare_random_scenes(
     duration_s: float,
     seed: int,
     ends: bool = False,
-) -> None:
+) -> set[str]:
     rng = random.Random(seed)
+    seen = set()
     generator = torch.Generator().manual_seed(seed)
     for block in range(scenes // rows):
         env = random_environment(rng, rows, ends)
         td = env.reset()
         if block % 2:
             td = disturb(env, td, generator)
-        compare(env, td, duration_s, rng)
+        seen |= compare(env, td, duration_s, rng)
+    return seen
 
 
 def test_the_tensor_code_agrees_with_the_scalar_one_on_100_random_scenes():
-    compare_random_scenes(scenes=100, rows=4, duration_s=5.0, seed=0)
+    seen = compare_random_scenes(scenes=100, rows=4, duration_s=5.0, seed=0)
+    ends = {"out_of_road", "hard_crash", "goal", "timeout"}
+    assert seen >= {*ends, *keys.EVENT_COUNTS}
 
 
 @pytest.mark.slow

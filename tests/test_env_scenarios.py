@@ -81,13 +81,6 @@ def test_in_the_cut_in_the_ego_brakes_hard_but_nobody_crashes(driver, traffic):
     assert (ego.amin(0) < -4.0).all()
 
 
-def test_after_the_cut_in_a_keep_lane_ego_follows_and_a_mobil_ego_leaves_the_lane():
-    following = drive(SCENARIOS["cut_in"], "keep_lane", "idm", 45).frames[-1]
-    assert (following.speed[:, 0] < 17.5).all()
-    free = drive(SCENARIOS["cut_in"], "mobil", "idm", 45).frames[-1]
-    assert (free.x[:, 0] > following.x[:, 0] + 50.0).all()
-
-
 # Stalled car
 
 
@@ -118,11 +111,6 @@ def test_the_stalled_car_stays_in_its_lane_and_all_but_stands():
     assert (moved < 5.0).all()
     assert (seen.frames[-1].y[:, 1].abs() < 0.7).all()
     assert all((frame.target_lane[:, 1] == 0).all() for frame in seen.frames[::50])
-
-
-def test_who_keeps_its_lane_behind_a_stalled_car_runs_out_of_time():
-    seen = drive(SCENARIOS["stalled_car"], "keep_lane", "idm", 121)
-    assert seen.timeout.all()
 
 
 # Blocked lane

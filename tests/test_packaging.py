@@ -32,14 +32,6 @@ def test_the_version_stands_in_one_place():
     assert f"\nversion: {ganlane.__version__}\n" in (ROOT / "CITATION.cff").read_text()
 
 
-def test_the_console_script_is_the_dispatcher():
-    assert PROJECT["project"]["scripts"]["ganlane"] == "ganlane.__main__:main"
-
-
-def test_a_checkouts_conf_comes_before_a_copy_inside():
-    assert conf_folder() == PACKAGE.parent / "conf"
-
-
 def test_a_conf_folder_of_another_project_is_not_ours(tmp_path, monkeypatch):
     (tmp_path / "conf").mkdir()
     inside = tmp_path / "package" / "conf"

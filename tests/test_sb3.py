@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import (
     VecFrameStack,
     VecNormalize,
 )
-from torchrl.envs.transforms import ObservationNorm, RewardScaling
+from torchrl.envs.transforms import ObservationNorm
 
 import ganlane
 import ganlane.sb3
@@ -267,11 +267,6 @@ def test_a_masked_model_that_could_turn_back_without_a_mask_is_refused():
         ganlane.sb3.driver(untrained(sb3_contrib.MaskablePPO, env))
 
 
-def test_a_transform_of_the_reward_alone_is_none_of_the_drivers_business():
-    env = short_episodes(transforms=[RewardScaling(0.0, 0.1)])
-    assert ganlane.sb3.driver(untrained(PPO, env)).observation.form == "lane_view_overlap"
-
-
 @pytest.mark.parametrize(
     ("algorithm", "options", "wrap"),
     [
@@ -340,8 +335,3 @@ def test_an_environment_that_does_not_fit_the_model_is_refused_in_one_sentence()
     masked = ganlane.sb3.driver(untrained(sb3_contrib.MaskablePPO, short_episodes()))
     with pytest.raises(UserError, match="no action_mask"):
         ganlane.make_env("idm").rollout(2, masked.policy)
-
-
-def test_the_info_of_a_time_out_says_so():
-    *_, infos = drive(short_episodes(goal_m=5000.0, timeout_s=3.0), 3)[-1]
-    assert all(info["TimeLimit.truncated"] for info in infos)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
 import time
 
@@ -70,15 +69,6 @@ def test_a_reader_is_judged_by_how_it_ends(read, sealed, result, tmp_path, monke
     assert Trial(good, tmp_path / "damaged")(("file", 3)).startswith(result)
 
 
-@pytest.mark.parametrize("way", list(dict.fromkeys(damages.TEXT)), ids=lambda way: way.__name__)
-def test_damage_changes_a_file_and_is_the_same_for_the_same_number(way):
-    def damaged():
-        return [way(random.Random(number), SCENE.encode()) for number in range(20)]
-
-    assert damaged() == damaged()
-    assert sum(text != SCENE.encode() for text in damaged()) > 15
-
-
 def test_other_weights_figures_and_parts_of_files_are_seen(tmp_path):
     whole, other = tmp_path / "whole", tmp_path / "other"
     line = ["traffic=idm", "init=none", "total_decisions=96", "evaluate_every=0"]
@@ -141,9 +131,3 @@ def test_a_broken_invariant_is_seen(told, decision):
     broken[key] = torch.full_like(broken[key], value)
     wrong = violations(env.base_env, CHOICE, before, broken, following)
     assert any(told in text for text in wrong)
-
-
-def test_a_mask_without_any_action_is_seen(decision):
-    env, before, after, following = decision
-    none = following.clone().set(keys.ACTION_MASK, torch.zeros(8, 3, dtype=torch.bool))
-    assert list(violations(env.base_env, CHOICE, before, after, none)) == ["no action allowed"]

@@ -18,9 +18,7 @@ from ganlane.agents import (
     save_agent,
 )
 from ganlane.agents.checkpoint import with_seeds
-from ganlane.build import make_drivers
 from ganlane.errors import UserError
-from ganlane.settings.env import EnvConfig
 from ganlane.transforms import observation_size
 
 VEHICLES = 9
@@ -86,15 +84,6 @@ def test_names_of_seeds_stand_for_their_agents(packed):
     )
 
 
-def test_a_table_takes_every_seed_once(packed):
-    drivers = make_drivers(["agent_idm@all+safe", "agent_idm@1+safe", "mobil"], EnvConfig())
-    assert [driver.name for driver in drivers] == [
-        *(f"agent_idm@{seed}+safe" for seed in range(3)),
-        "mobil",
-    ]
-    assert {driver.mask.form for driver in drivers[:3]} == {"safe"}
-
-
 @pytest.mark.parametrize(
     ("name", "said"),
     [
@@ -133,17 +122,6 @@ def test_only_runs_of_one_recipe_and_different_seeds_are_packed(told, more, tmp_
     assert pack_seeds.main([str(one), str(other), "--out", str(out)]) == 2
     assert told in capsys.readouterr().err
     assert not out.exists()
-
-
-def test_a_training_joins_a_packed_file_and_leaves_the_others_as_they_are(packed, tmp_path, capsys):
-    third = run(tmp_path / "third", 3)
-    out = tmp_path / "out.safetensors"
-    assert pack_seeds.main([f"{packed}@all", str(third), "--out", str(out)]) == 0
-    assert with_seeds(f"{out}@all") == [f"{out}@{seed}" for seed in (1, 2, 3)]
-    for seed in (1, 2):
-        before, after = read_agent(f"{packed}@{seed}"), read_agent(f"{out}@{seed}")
-        assert after[1:] == before[1:]
-        assert all(torch.equal(value, before[0][name]) for name, value in after[0].items())
 
 
 def test_how_an_environment_was_computed_is_no_part_of_the_recipe_but_too_large_a_file_is_refused(

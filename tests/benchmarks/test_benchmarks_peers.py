@@ -92,23 +92,6 @@ def test_the_derived_tolerance_covers_the_other_scheme_and_no_more_than_a_fifth_
         assert limit <= 1.2 * size + rest
 
 
-@pytest.mark.parametrize("offset_m", [-0.5, 0.5])
-def test_another_driver_is_not_within_the_tolerance(offset_m):
-    trace = integrate(CONSTANT, Scheme.BALLISTIC)
-    other = integrate(CONSTANT, Scheme.EXPLICIT_EULER, Law(offset_m))
-    assert not within(between(other, trace), tolerance(trace, CONSTANT, Scheme.EXPLICIT_EULER))
-
-
-def test_the_command_says_what_is_missing(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(
-        simulators, "find_spec", lambda module: None if module == "libsumo" else object()
-    )
-    assert compare.main(["--out", str(tmp_path)]) == 2
-    told = "libsumo: not installed; pip install 'ganlane[bench]' brings the peers.\n"
-    assert capsys.readouterr().err == told
-    assert not list(tmp_path.iterdir())
-
-
 def test_the_page_shows_the_figures_that_stand_beside_it():
     figures = json.loads((ROOT / "docs/figures/peers.json").read_text())
     page = (ROOT / "docs/peers.md").read_text()

@@ -3,21 +3,10 @@
 import pytest
 import torch
 
-from benchmarks.script import ReportSection, add_report, make_parser, run_script
+from benchmarks.script import ReportSection, make_parser, run_script
 from ganlane.errors import UserError
 
 BEGIN, END = "<!-- begin -->", "<!-- end -->"
-
-
-def test_the_help_is_the_description_unchanged_and_names_the_markers(capsys):
-    parser = make_parser("What is measured.\n\n    python -m benchmarks.this --report FILE\n")
-    add_report(parser, BEGIN, END)
-    with pytest.raises(SystemExit, match="0"):
-        parser.parse_args(["--help"])
-    shown = capsys.readouterr().out
-    assert "\n    python -m benchmarks.this --report FILE\n" in shown
-    assert BEGIN in shown
-    assert END in shown
 
 
 def test_what_stands_between_the_markers_is_rewritten_and_the_rest_stays(tmp_path):

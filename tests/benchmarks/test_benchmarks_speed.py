@@ -16,7 +16,6 @@ from benchmarks.speed.measure import (
     calls_per_turn,
     make_row,
     take_turn,
-    take_turns,
 )
 from benchmarks.speed.systems import Road
 from ganlane.agents import RainbowConfig
@@ -30,16 +29,6 @@ def napping(calls):
     """Ten physics steps a call, each call a nap."""
     time.sleep(0.01 * calls)
     return 10 * calls
-
-
-def test_cases_take_turns_after_the_warm_up():
-    log = []
-
-    def logged(name):
-        return lambda calls: log.append(name) or napping(calls)
-
-    take_turns([CASE, CASE], [logged("A"), logged("B")], repetitions=3, seconds=0.004)
-    assert "".join(log[-6:]) == "ABABAB"
 
 
 def test_a_turn_lasts_as_long_as_asked_and_a_nap_costs_wall_time_but_no_cpu_time():
@@ -135,10 +124,3 @@ def test_every_traffic_is_measured_and_left_out_where_there_is_no_kernel(capsys,
     assert told.err.count("left out, native") == 2
     # Each in the table of all rows and in that of the best.
     assert told.out.count("ganlane traffic") == 4
-
-
-@pytest.mark.parametrize("suite", [*speed.SUITES, "train cuda"])
-def test_the_document_of_the_project_can_be_written(suite):
-    text = (speed.Path(__file__).parents[2] / "docs/speed.md").read_text()
-    assert text.count(f"<!-- begin bench {suite} -->") == 1
-    assert text.count(f"<!-- end bench {suite} -->") == 1

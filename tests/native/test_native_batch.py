@@ -4,9 +4,6 @@ environment does.
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 import torch
@@ -14,7 +11,7 @@ import torch
 from ganlane.api import make_env
 from ganlane.native.batch import NativeBatch
 from ganlane.native.drivers import RuleDrivers
-from ganlane.native.library import VARIANTS, best_variant, why_not
+from ganlane.native.library import why_not
 from ganlane.settings.driving import EgoParameters
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MaskParameters, ObservationConfig, RewardParameters
@@ -129,26 +126,3 @@ def test_a_batch_gives_the_torchrl_environments_numbers(
         assert_equal(state, batch, mask != "none")
         np.testing.assert_array_equal(state["episode"].numpy(), batch.state["episode"])
     assert ended > ROWS // 2
-
-
-def test_an_episode_is_the_same_bit_for_bit_in_every_variant_and_batch():
-    episodes = []
-    runnable = list(VARIANTS)[list(VARIANTS).index(best_variant()) :]
-    for rows, variant in [(1, None), (64, None), *((5, name) for name in runnable)]:
-        batch = batch_of(EnvConfig(), rows=rows, variant=variant)
-        batch.start(3, np.arange(rows))
-        for decision in range(30):
-            batch.step(np.full(rows, decision % 3 if decision % 5 == 0 else 0))
-        episodes.append(np.concatenate([batch.state["vehicles", "x"][0], batch.observation[0]]))
-    for other in episodes[1:]:
-        np.testing.assert_array_equal(other, episodes[0])
-
-
-def test_a_gymnasium_environment_with_rule_driven_traffic_needs_no_torch():
-    code = (
-        "import sys, gymnasium, ganlane; env = gymnasium.make('ganlane/Highway-v0'); "
-        "env.reset(seed=0); env.step(0); "
-        "print('torch' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"

@@ -147,12 +147,6 @@ def test_a_compiler_that_lacks_an_instruction_set_makes_the_kernel_for_the_next(
 
 
 @needs_compiler
-def test_old_names_of_instruction_sets_are_enough(compiler, plain):
-    compiler('case "$*" in *x86-64-v*) exit 1;; esac\n' + WORKS, plain)
-    assert library.find().variant == "AVX512"
-
-
-@needs_compiler
 @pytest.mark.parametrize(
     "lines", [FAILS, "exit 0", "kill -9 $$", WORKS.replace('cp "$library"', "echo no library >")]
 )

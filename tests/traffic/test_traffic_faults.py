@@ -9,8 +9,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from reference.foreign import overlaps_of_the_others
 from reference.worlds import (
     DOUBLE,
@@ -36,7 +34,6 @@ from ganlane.sim import (
     Road,
     SpawnParameters,
     Vehicles,
-    pair_overlaps,
     perceive,
 )
 from ganlane.traffic import (
@@ -47,8 +44,6 @@ from ganlane.traffic import (
     IdmMobilTraffic,
     IdmTraffic,
     LateReaction,
-    LiteralChanges,
-    LiteralLaneChange,
     Overlay,
     PhantomBraking,
     TrafficModule,
@@ -56,7 +51,6 @@ from ganlane.traffic import (
 )
 from ganlane.traffic.faults import driven_at
 from ganlane.traffic.presets import (
-    gan_calibrated_traffic,
     idm_faults_traffic,
     with_faults,
 )
@@ -237,25 +231,6 @@ def test_an_aborted_change_returns_to_the_centre_of_the_lane_it_left(share, targ
         assert (way[-30:].abs() < 0.05).all()
 
 
-def test_a_literal_change_that_is_broken_off_goes_back_as_fast_as_it_came():
-    scene = vehicles(*({"x": 150.0 * i, "lane": lane} for i, lane in enumerate((0, 0, 1, 2, 1, 0))))
-    # Everybody begins a change within ten steps, and another one within ten steps after it.
-    changes = LiteralLaneChange(
-        changes=LiteralChanges(10.0, lateral_speed_mps=0.8, lateral_speed_sd_mps=0.0)
-    )
-    track = play(
-        IdmTraffic(),
-        scene,
-        90,
-        change=changes,
-        fault=AbortedLaneChange(faults=AbortFaults(1.0)),
-    )
-    y = torch.stack([scene.y[0], *(now.y[0] for now in track)])[:, 1:]
-    assert y.diff(dim=0).abs().max() < 0.09
-    reached = (y - y[0]).abs().amax(0)
-    assert ((reached >= 2.0) & (reached < 2.2)).all()
-
-
 def test_a_hesitant_change_takes_about_twice_as_long_and_does_not_swing():
     scene = vehicles(
         EGO,
@@ -354,41 +329,6 @@ def test_faults_come_to_nobody_who_is_not_there_and_never_to_the_ego():
     ]
 
 
-@given(
-    speed=st.floats(0.0, 40.0),
-    usual=st.floats(-8.0, 3.0),
-    wanted=st.floats(-8.0, 3.0),
-    heading=st.floats(-0.2, 0.2),
-)
-def test_driving_a_path_at_another_speed_stays_on_it_and_never_goes_back(
-    speed, usual, wanted, heading
-):
-    start = vehicles(
-        {
-            "x": 10.0,
-            "y": 1.0,
-            "speed": speed,
-            "heading": heading,
-            "target_lane": 0,
-        }
-    )
-    gone = 0.5 * (speed + max(speed + usual * 0.1, 0.0)) * 0.1
-    angle = torch.tensor(heading, dtype=DOUBLE)
-    moved = start.with_(
-        x=start.x + gone * torch.cos(angle),
-        y=start.y + gone * torch.sin(angle),
-        speed=(start.speed + usual * 0.1).clamp_min(0.0),
-    )
-    other = driven_at(start, moved, torch.full_like(start.x, wanted), 0.1)
-    dx = (other.x - start.x).item()
-    dy = (other.y - start.y).item()
-    distance = 0.5 * (speed + max(speed + wanted * 0.1, 0.0)) * 0.1
-    assert other.speed.item() == pytest.approx(max(speed + wanted * 0.1, 0.0))
-    assert (dx * dx + dy * dy) ** 0.5 == pytest.approx(distance, abs=1e-9)
-    assert dx >= 0.0
-    assert dy * dx == pytest.approx(dx * dx * torch.tan(angle).item(), abs=1e-6)
-
-
 def test_a_delay_shorter_than_a_step_is_refused():
     with pytest.raises(UserError, match=r"delay_s=0\.01: expected at least 0\.1"):
         LateReaction(faults=ReactionFaults(delay_s=0.01))
@@ -418,20 +358,3 @@ def test_faults_make_no_overlaps(faults, vehicle_km, rows, seconds):
         SpawnParameters(spread_m=300.0),
     )
     assert overlaps_of_the_others(env, vehicle_km, seconds) == 0
-
-
-def test_faults_lie_over_generated_traffic_too():
-    # At a hundred times the default rates generated drivers, who keep less distance, do overlap.
-    env = HighwayEnv(with_faults(gan_calibrated_traffic(), TENFOLD), 16)
-    td = env.reset()
-    overlaps = 0
-    braked = 0
-    for _ in range(20):
-        td = step(env, td)
-        overlaps += pair_overlaps(Vehicles.of(td[keys.VEHICLES]))[:, 1:, 1:].sum().item()
-        braked += (td[keys.TRAFFIC, "phantom_braking", "left"] > 0).sum().item()
-    assert overlaps == 0
-    assert braked > 0
-    memory = td[keys.TRAFFIC]
-    assert memory["base", "generator", "noise"].isfinite().all()
-    assert ((td[keys.VEHICLES, "y"] > -2.0) & (td[keys.VEHICLES, "y"] < 10.0)).all()

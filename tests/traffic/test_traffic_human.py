@@ -98,13 +98,6 @@ def test_drivers_change_lanes_as_often_as_they_are_told():
     assert 0 < usual < 0.5 * more
 
 
-def test_a_late_driver_does_what_it_decided_before():
-    prompt, late = (drive([0, 1], 9, delayed=delayed) for delayed in (0, 1))
-    # At the first decision nothing was decided before.
-    assert (late[0][1]["acceleration"] == 0.0).all()
-    torch.testing.assert_close(late[4][1]["acceleration"], prompt[0][1]["acceleration"])
-
-
 def test_who_is_behind_counts_the_less_the_less_polite_a_driver_is():
     assert changes(drive(range(32), 200, politeness=0.0)) > changes(
         drive(range(32), 200, politeness=4.0)

@@ -14,7 +14,6 @@ from reference.worlds import (
     DOUBLE,
     environment,
     placed,
-    same_bits,
     step,
     vehicles,
 )
@@ -72,47 +71,6 @@ def move(traffic: TrafficModule, scene: Vehicles, step: int | list[int] = 0) -> 
 )
 def test_mobil_changes_lanes_at_full_seconds_and_idm_alone_does_not(traffic, step, target):
     assert move(traffic, vehicles(*CARS), step).target_lane.tolist() == [target]
-
-
-def test_each_row_has_a_clock_of_its_own():
-    rows = Vehicles(*(value.repeat(2, 1) for value in vehicles(*CARS)))
-    assert move(SELFISH, rows, [3, 10]).target_lane[:, 1].tolist() == [
-        0,
-        1,
-    ]
-
-
-def test_an_unspoken_wish_of_the_ego_holds_nobody_back():
-    """Traffic sees what the ego does, not what it might want.
-
-    The ego would go left if it were MOBIL's to drive; the third car, 10 m behind it, wants into the
-    same lane.
-    """
-    slow = {"speed": 15.0, "desired_speed": 15.0}
-    ego = {"x": 0.0, "lane": 0}
-    ahead = {"x": 54.5, "lane": 0, **slow}
-    other = {"x": -10.0, "lane": 2}
-    ahead_of_it = {"x": 44.5, "lane": 2, **slow}
-    traffic = IdmMobilTraffic(Road(lanes=3), mobil=SELFISH.mobil)
-    assert move(traffic, vehicles(ego, ahead, other, ahead_of_it)).target_lane[0, 2] == 1
-
-
-def test_traffic_is_the_same_whatever_the_decision_period_of_the_ego():
-    """After 6 s of an ego that keeps its lane."""
-    states = []
-    for period_s, decisions in ((0.1, 60), (0.5, 12), (2.0, 3)):
-        env = environment(num_envs=8, period_s=period_s)
-        td = env.reset()
-        for _ in range(decisions):
-            td = step(env, td)
-        states.append(td.select(keys.VEHICLES, keys.TRAFFIC))
-    assert torch.any(
-        states[0][keys.VEHICLES, "target_lane"] != env.reset()[keys.VEHICLES, "target_lane"]
-    )
-    assert [same_bits(states[0], other) for other in states[1:]] == [
-        [],
-        [],
-    ]
 
 
 def test_everybody_reacts_to_the_state_at_t_and_to_nothing_later():
@@ -291,7 +249,7 @@ def test_a_reaction_time_delays_the_acceleration_by_as_much():
 def test_a_driver_sways_within_its_lane(lane_width_m, bound):
     road = Road(lanes=3, lane_width_m=lane_width_m)
     widest = replace(RandomDrivers(), sway_m=(0.3, 0.3))
-    env = HighwayEnv(IdmRandomTraffic(road, drivers=widest), 32, dtype=torch.float64)
+    env = HighwayEnv(IdmRandomTraffic(road, drivers=widest), 12, dtype=torch.float64)
     td = env.reset()
     ways = []
     for _ in range(60):

@@ -56,15 +56,14 @@ def drive(traffic, rows: int, decisions: int, recycle: bool) -> tuple[float, flo
 
 
 @pytest.mark.parametrize(
-    ("traffic", "rows"),
+    ("traffic", "rows", "recycle"),
     [
-        (IdmTrafficConfig(), 32),
-        (IdmMobilTrafficConfig(), 32),
-        (GanCalibratedTrafficConfig(), 8),
+        (IdmTrafficConfig(), 32, False),
+        (IdmMobilTrafficConfig(), 32, True),
+        (GanCalibratedTrafficConfig(), 8, False),
     ],
     ids=["idm", "idm_mobil", "gan_calibrated"],
 )
-@pytest.mark.parametrize("recycle", [False, True], ids=["", "recycle"])
 def test_nobody_overlaps_a_lorry(traffic, rows, recycle):
     km, lorries, overlaps, crashes = drive(traffic, rows, 40, recycle)
     assert km > 0.5 * rows * 9 * 0.015 * 40

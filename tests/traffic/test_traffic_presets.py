@@ -174,18 +174,6 @@ def test_the_shipped_weights_and_older_ones_that_name_no_washout_drive_with_the_
     assert anchor_of(None) == anchor_of(older) == SIMULATED_ANCHOR
 
 
-def test_weights_that_see_no_further_inputs_drive_otherwise_than_those_that_do(
-    tmp_path,
-):
-    blind = gan_calibrated_traffic(
-        path=fitted_with(tmp_path, further_inputs=False),
-        noise_scale=0.0,
-    )
-    seeing = gan_calibrated_traffic(noise_scale=0.0)
-    ends = [others_of(traffic, 4, 3).speed[-1] for traffic in (blind, seeing)]
-    assert float((ends[0] - ends[1]).abs().max()) > 1e-3
-
-
 @pytest.mark.parametrize(
     ("settings", "told"),
     [

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 import polars as pl
 import pytest
@@ -95,12 +93,6 @@ def test_the_ego_takes_the_place_of_the_vehicle_nearest_the_middle():
     assert scene.visibility[0].tolist() == [Visibility.BODY] * 9
 
 
-def test_places_without_a_recorded_vehicle_are_not_valid():
-    scene = start(replay(*FIVE), keys_of([0]), vehicles=9)
-    assert scene.valid[0].tolist() == [True] * 5 + [False] * 4
-    assert all(torch.isfinite(value.double()).all() for value in scene)
-
-
 def test_the_episode_lasts_as_long_as_the_scene():
     assert replay(*FIVE).steps_of(keys_of([0, 1, 2])).tolist() == [
         20,
@@ -164,13 +156,6 @@ def test_every_scene_is_equally_likely_and_every_start_within_it():
     within = np.bincount(starts[traffic.scene_of(keys_of(episodes)) == 2].numpy())
     assert chisquare(within[within > 0]).pvalue > 1e-3
     assert len(starts.unique()) == starts.max() + 1
-
-
-def test_streams_and_seeds_take_other_starts():
-    traffic = ReplayTraffic(recordings=recorded())
-    families = ((0, 0), (1, 0), (2, 0), (0, 1))
-    starts = [traffic.start_of(keys_of(range(200), stream, seed)) for stream, seed in families]
-    assert all((one == other).float().mean() < 0.1 for one, other in combinations(starts, 2))
 
 
 def test_lanes_and_their_width_are_the_scenes_own():
@@ -300,26 +285,6 @@ def test_the_us101_scenes_can_all_be_replayed(us101):
     # Nobody starts in a crash: the ego's size is that of the vehicle it replaces.
     assert not ego_overlaps(scene).any()
     assert set(us101.road_of(key).lanes.unique().tolist()) == {5, 6, 7}
-
-
-def test_how_long_the_us101_scenes_last_and_how_soon_they_empty(us101):
-    key = keys_of(range(2000), stream=2)
-    steps = us101.steps_of(key)
-    scene = us101.scenes(9)(key, torch.float32)
-    assert steps.min() == 40
-    assert 290 <= steps.max() <= 300
-    assert steps.double().mean().item() == pytest.approx(80, abs=3)
-    farthest = torch.hypot(scene.x, scene.y - scene.y[:, :1]).amax(1)
-    assert farthest.median().item() == pytest.approx(24, abs=1)
-    driven = alone = 0
-    for number in range(1, 301):
-        running = number <= steps
-        empty = ~us101.recorded(key, torch.full_like(key, number), 9, torch.float32).valid[
-            :, 1:
-        ].any(1)
-        driven = driven + running.sum().item()
-        alone = alone + (running & empty).sum().item()
-    assert alone / driven == pytest.approx(0.18, abs=0.01)
 
 
 # Starts that are driven once each

@@ -123,17 +123,6 @@ def test_the_ego_is_a_neighbour_of_the_calibrated_drivers():
     assert (module(td)["moved", "speed"][:, 1:] != module(other)["moved", "speed"][:, 1:]).any()
 
 
-def test_z_of_zero_is_the_same_driving_for_every_stream():
-    modules = [
-        paper(noise_scale=0.0),
-        paper(noise_scale=0.0, stream=Stream.REPORT),
-    ]
-    start = begin(modules[0])
-    torch.testing.assert_close(
-        *(drive(module, start.clone(), 5)["vehicles", "x"] for module in modules)
-    )
-
-
 def test_the_calibrated_drivers_follow_their_target_lane():
     module = calibrated(noise_scale=0.0)
     td = begin(module, rows=1, vehicles=1)
@@ -156,18 +145,6 @@ def test_the_other_presets_weights_and_a_wrong_execute_k_are_refused():
         SocialGanTraffic(generator(EXTRA_INPUTS), ROAD)
     with pytest.raises(UserError, match="execute_k=9"):
         paper(execute_k=9)
-
-
-def test_the_past_is_moved_on_by_name_and_not_copied(module):
-    td = begin(module)
-    past = [td["traffic", name] for name in module.motions]
-    before = [motion.data_ptr() for motion in past]
-    # No two motions of a fresh past are one tensor.
-    assert len(set(before)) == 7
-    moved = module(td)
-    after = [moved["traffic", name].data_ptr() for name in module.motions]
-    assert after[:-1] == before[1:]
-    assert after[-1] not in before
 
 
 @pytest.mark.slow

@@ -137,17 +137,6 @@ def test_a_run_is_trained_resumed_and_evaluated():
     assert more.results["decisions"] >= 512
 
 
-def test_a_film_is_written_to_the_given_path():
-    path = ganlane.api.render(
-        "keep_lane", "idm", 2, out="strip.png", goal_m=30.0, film={"width": 640, "height": 200}
-    )
-    assert path == Path("strip.png")
-    assert path.read_bytes().startswith(b"\x89PNG")
-    assert ganlane.api.render("keep_lane", "idm", format="png", goal_m=20.0).parent.parent == Path(
-        "outputs/render"
-    )
-
-
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_its_function(command):
     if command == "record":

@@ -49,6 +49,19 @@ def test_help_is_printed_and_keys_are_refused(capsys):
     assert capsys.readouterr().err == told
 
 
+@pytest.mark.parametrize(
+    ("version", "allowed"),
+    [("2.11", True), ("2.13.0+cpu", True), ("2.10.9", False), ("2.14.0", False), ("10.0", False)],
+)
+def test_versions_are_compared_as_numbers(version, allowed, monkeypatch):
+    monkeypatch.setattr(doctor.metadata, "version", lambda name: version)
+    if allowed:
+        assert doctor.dependency("torch>=2.11,<2.14") == version
+    else:
+        with pytest.raises(UserError, match=r"needed .*; run python -m pip install"):
+            doctor.dependency("torch>=2.11,<2.14")
+
+
 def test_a_package_that_cannot_be_imported_is_missing(monkeypatch, capsys):
     broken = Mock(side_effect=OSError("lib.so:\n undefined symbol"))
     monkeypatch.setattr(doctor.importlib, "import_module", broken)

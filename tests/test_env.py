@@ -111,27 +111,6 @@ def test_a_reset_with_seed_and_episode_runs_exactly_those():
 # Commands
 
 
-def test_a_command_moves_the_ego_one_lane_and_commands_meanwhile_are_ignored():
-    env = environment(lanes=4, vehicles=2, mobil=False)
-    td = placed(env, vehicles({"x": 0.0, "lane": 1}, FAR))
-    td = step(env, td, LEFT)
-    assert remembered(td, "started_change")
-    assert remembered(td, "change_direction") == 1
-    assert 0.0 < remembered(td, "change_progress") < 1.0
-    for action in (LEFT, RIGHT):
-        td = step(env, td, action)
-        assert not remembered(td, "started_change")
-        assert td[keys.VEHICLES, "target_lane"][0, 0] == 2
-        assert ends(td) == []
-    td = step(env, step(env, td))
-    assert td[keys.VEHICLES, "y"][0, 0].item() == pytest.approx(8.0, abs=0.1)
-    assert remembered(td, "change_direction") == 0
-    assert remembered(td, "change_progress") == 0.0
-    assert remembered(td, "lane_changes") == 1
-    assert remembered(td, "decisions") == 5
-    assert step(env, td, RIGHT)[keys.EGO, "change_direction"].item() == -1
-
-
 # Ends
 
 TO_GOAL = {"x": 999.0, "lane": 1, "speed": 20.0}

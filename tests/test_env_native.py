@@ -10,7 +10,6 @@ import torch
 from entry_own_parts import Cruise
 from reference.worlds import environment, leaves
 from torchrl.envs import Transform
-from torchrl.envs.utils import check_env_specs
 
 import ganlane
 from ganlane import keys
@@ -32,10 +31,6 @@ pytestmark = pytest.mark.skipif(why_not() is not None, reason=f"the kernel {why_
 
 def native(num_envs: int = 8, **others):
     return environment(num_envs=num_envs, dtype=torch.float32, **{"kernel": "native", **others})
-
-
-def test_it_meets_the_specs():
-    check_env_specs(native(3))
 
 
 def test_its_keys_specs_and_first_states_are_those_of_the_tensor_code():

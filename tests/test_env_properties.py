@@ -12,8 +12,8 @@ from trial import soak
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
+from ganlane.settings.observation import largest_number
 from ganlane.sim.state import Vehicles
-from ganlane.transforms import OBSERVATIONS, observation
 
 FIXED = ("length", "width", "desired_speed", "visibility", "valid")
 
@@ -42,7 +42,7 @@ def check_decision(env: HighwayEnv, last: Vehicles, now: Vehicles) -> None:
     assert all(map(torch.equal, now, last.with_(x=now.x)))
 
 
-@pytest.mark.parametrize("number", range(24))
+@pytest.mark.parametrize("number", range(16))
 def test_what_must_hold_does_in_the_trials_random_configurations(number, monkeypatch):
     """The paper's literal lane changers slide: equation 11's lateral speed comes on top of their
     speed along the road.
@@ -53,7 +53,7 @@ def test_what_must_hold_does_in_the_trials_random_configurations(number, monkeyp
     env = soak.make(choice)
     traffic = choice["traffic"]["name"]
     exact = choice["float64"] and traffic in soak.RULES
-    low, high = bounds(choice["observation"], env.base_env.vehicles)
+    largest = largest_number(choice["observation"], 4.5)
     generator = torch.Generator().manual_seed(number)
     frames: list[Vehicles] = []
     env.base_env.recorder = lambda vehicles, running: frames.append(vehicles)
@@ -65,32 +65,6 @@ def test_what_must_hold_does_in_the_trials_random_configurations(number, monkeyp
         after = stepped["next"]
         assert list(soak.violations(env.base_env, choice, before, after, td)) == []
         assert env.observation_spec.contains(after.select(*env.observation_spec.keys()))
-        assert ((after[keys.OBSERVATION] >= low) & (after[keys.OBSERVATION] <= high)).all()
+        assert (after[keys.OBSERVATION][:, 1:].abs() <= largest).all()
         check_motion(frames, 1e-9 if exact else 1e-4, traffic in ("gan", "mixed"))
         check_decision(env.base_env, frames[-1], Vehicles.of(after[keys.VEHICLES]))
-
-
-def bounds(form: str, vehicles: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Lowest and highest value of every entry of an observation (Table III and what was added to
-    it).
-    """
-    others = vehicles - 1
-    # A gap, a nearness, a relative speed and a place in the lane; bodies overlap by 4.5 m at the
-    # most.
-    gap = [(0.0, 1.0), (0.0, 1.0), (-1.0, 1.0)]
-    drift = (-1.0, 1.0)
-    overlap = [(-4.5 / 200.0, 1.0), (0.0, 5.5)]
-    ranges = {
-        # Speed over desired speed (at least 25 m/s; nobody drives twice that), a lane to the left,
-        # to the right.
-        observation.OWN: [(0.0, 2.0), (0.0, 1.0), (0.0, 1.0)],
-        observation.OWN_HERE: [(0.0, 2.0), (0.0, 1.0), (0.0, 1.0)],
-        observation.LIST: [(-1.0, 1.0)] * 3 * others,
-        observation.VIEW: gap * 6,
-        observation.DRIFT_VIEW: [*gap, drift] * 6,
-        observation.OVERLAP_VIEW: [*overlap, (-1.0, 1.0), drift] * 6,
-        observation.CHANGE: [(0.0, 1.0), (-1.0, 1.0)],
-        observation.ROAD: [(0.0, 1.0)] * 6 + [(-1.0, 1.0), (0.0, 1.0)],
-    }
-    low, high = zip(*(pair for part in OBSERVATIONS[form] for pair in ranges[part]))
-    return torch.tensor(low), torch.tensor(high)

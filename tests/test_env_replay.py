@@ -10,7 +10,6 @@ import pytest
 import torch
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from reference.worlds import Track, assert_same_tracks, step, tracks
-from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from ganlane import keys
@@ -19,7 +18,6 @@ from ganlane.data import sort
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.sim.random import episode_key
 from ganlane.traffic import ReplayTraffic
-from ganlane.transforms import ObservationTransform
 
 
 @pytest.fixture(scope="module")
@@ -112,18 +110,6 @@ def test_drivers_stay_on_the_road_of_their_row(recordings, driver):
         stepped, td = env.step_and_maybe_reset(driver(td))
         assert not stepped["next", keys.EVENTS, "out_of_road"].any()
     assert td[keys.EPISODE].min() >= 48
-
-
-def test_the_observation_knows_the_row_s_own_lanes(recordings):
-    env = make(recordings, 64)
-    seen = TransformedEnv(env, ObservationTransform(env.road, 9, "table3"))
-    td = seen.reset()
-    lanes = td[keys.ROAD, "lanes"][:, 0]
-    ego = td[keys.VEHICLES, "target_lane"][:, 0]
-    assert torch.equal(td["observation"][:, 1] > 0, ego < lanes - 1)
-    assert torch.equal(td["observation"][:, 2] > 0, ego > 0)
-    lane = td["observation"][:, 3:].reshape(64, 8, 3)[..., 2] * (lanes - 1)[:, None]
-    assert (lane - lane.round()).abs().max() < 1e-5
 
 
 def test_an_episode_is_the_same_bits_in_every_batch_and_after_automatic_resets(recordings):

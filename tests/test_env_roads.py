@@ -20,7 +20,7 @@ from ganlane.settings.record import make
 from ganlane.settings.road import EXIT, WALL, LaneStretch, Stretches
 from ganlane.settings.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.sim.idm import TABLE_V
-from ganlane.sim.mobil import TABLE_IV, mandatory, mobil_wishes
+from ganlane.sim.mobil import mobil_wishes
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.state import Road
 from ganlane.traffic.base import TrafficModule
@@ -39,13 +39,6 @@ HALF_M = 2.25
 def wish(road: Road, *cars: dict) -> int:
     """Of the first car."""
     return int(mobil_wishes(perceive(vehicles(*cars), road), road)[0, 0])
-
-
-def bias_at(x: float) -> float:
-    """Of a change to the left out of the lane that ends at 400 m."""
-    scene = perceive(vehicles({"x": x}, {"x": x - 900.0}), DROPPED)
-    lanes = torch.tensor([[[0.0, 1.0], [0.0, 1.0]]], dtype=torch.float64)
-    return float(mandatory(scene, lanes, TABLE_IV, None)[0][0, 0, 0])
 
 
 # Who drives towards the end of a lane
@@ -79,31 +72,6 @@ def test_a_car_that_stands_at_the_end_turns_out_as_soon_as_the_lane_is_free():
     assert now.x[0, 1] > 430.0
 
 
-def test_the_bias_grows_from_500_metres_before_the_end_to_8_at_the_end():
-    assert bias_at(-200.0) == 0.0
-    assert bias_at(-100.0) == 0.0
-    assert bias_at(150.0) == pytest.approx(4.0)
-    assert bias_at(400.0) == pytest.approx(8.0)
-
-
-def test_two_changes_are_as_urgent_twice_as_far_away():
-    end = LaneStretch(end_m=400.0, end=WALL)
-    road = Road(3, stretches=(end, end, LaneStretch()))
-    lanes = torch.tensor([[[0.0, 1.0], [0.0, 1.0]]], dtype=torch.float64)
-    for x, bias in ((-600.0, 0.0), (-100.0, 4.0), (150.0, 6.0)):
-        scene = perceive(vehicles({"x": x}, {"x": -900.0}), road)
-        gain, possible = mandatory(scene, lanes, TABLE_IV, None)
-        assert gain[0, 0, 0] == pytest.approx(bias)
-        assert possible[0, 0, 0]
-
-
-def test_the_end_decides_where_an_equal_lane_would_not():
-    car = {"speed": 20.0, "desired_speed": 20.0}
-    behind = {"x": -900.0, "lane": 1}
-    assert wish(Road(2), {"x": 300.0, **car}, behind) == 0
-    assert wish(DROPPED, {"x": 300.0, **car}, behind) == 1
-
-
 @pytest.mark.parametrize("x", [200.0, 250.0, 380.0])
 def test_the_safety_criterion_never_yields(x):
     """However near the end is: who comes from behind would have to brake with more than 4 m/s2."""
@@ -118,15 +86,6 @@ def test_nobody_changes_into_a_lane_that_ends_soon():
     slow = {"lane": 1, "speed": 5.0, "desired_speed": 5.0}
     assert wish(DROPPED, {"x": -110.0, "lane": 1}, {"x": -70.0, **slow}) == -1
     assert wish(DROPPED, {"x": -90.0, "lane": 1}, {"x": -50.0, **slow}) == 0
-
-
-def test_nobody_changes_into_a_lane_that_has_not_begun_or_out_of_it():
-    slow = {"speed": 5.0, "desired_speed": 5.0}
-    road = replace(LATE, stretches=(LaneStretch(200.0, 900.0, WALL), LaneStretch()))
-    assert wish(road, {"x": 199.0, "lane": 1}, {"x": 240.0, "lane": 1, **slow}) == 0
-    assert wish(road, {"x": 201.0, "lane": 1}, {"x": 240.0, "lane": 1, **slow}) == -1
-    assert wish(road, {"x": 199.0}, {"x": 240.0, **slow}) == 0
-    assert wish(road, {"x": 201.0}, {"x": 240.0, **slow}) == 1
 
 
 # The ego
@@ -184,16 +143,6 @@ def test_driving_into_the_end_of_a_lane_is_a_hard_crash(kernel):
 def test_who_drives_into_a_wall_is_at_fault(lane, at_fault):
     cars = vehicles({"x": 399.0, "lane": lane}, {"x": -900.0, "lane": 1})
     assert bool(ego_at_fault(cars, DROPPED)) == at_fault
-
-
-def test_beside_the_end_of_a_lane_one_passes():
-    env, td = late_road(20.0, x=390.0)
-    cars = vehicles({"x": 390.0, "lane": 1}, {"x": -900.0, "lane": 1})
-    for name, value in cars.as_dict().items():
-        td[keys.VEHICLES, name] = value
-    after = step(env, td)
-    assert not after["done"]
-    assert after[keys.VEHICLES, "x"][0, 0] > 405.0
 
 
 # What is refused
@@ -320,10 +269,3 @@ def test_gymnasium_has_no_complaint(scene):
     envs = gymnasium.make_vec("ganlane/Highway-v0", num_envs=3, env=scene)
     observation, _ = envs.reset(seed=1)
     assert envs.observation_space.contains(observation)
-
-
-def test_the_drivers_of_the_traffic_keep_out_of_the_exit_lane():
-    """Even behind a slow leader: they have nowhere to go there."""
-    slow = {"lane": 1, "speed": 5.0, "desired_speed": 5.0}
-    road = Road(2, stretches=(LaneStretch(200.0, 400.0, EXIT), LaneStretch()))
-    assert wish(road, {"x": 250.0, "lane": 1}, {"x": 290.0, **slow}) == 0

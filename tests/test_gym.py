@@ -18,8 +18,6 @@ from reference.gym_env import ID, KEEP, LEFT, RIGHT, ROOT, make, make_vec, until
 from ganlane.build import make_traffic
 from ganlane.errors import UserError
 from ganlane.gym import ENV_IDS
-from ganlane.gym.base import make_rows
-from ganlane.gym.native_rows import NativeRows
 from ganlane.native.drivers import NETWORKS, drivers_of
 from ganlane.native.library import why_not
 from ganlane.settings.env import EnvConfig
@@ -210,15 +208,6 @@ def test_pictures_change_nobody():
         assert str(rest) == str(expected_rest)
 
 
-def test_the_goal_terminates_and_a_time_out_truncates():
-    *_, terminated, truncated, info = until_the_end(begun(make(goal_m=30.0)))
-    assert (terminated, truncated, info["goal"], info["timeout"]) == (True, False, True, False)
-    late = begun(make(goal_m=5000.0, timeout_s=3.0))
-    *_, terminated, truncated, info = until_the_end(late)
-    assert (terminated, truncated, info["goal"], info["timeout"]) == (False, True, False, True)
-    assert info["time_s"] == pytest.approx(3.0)
-
-
 def test_leaving_the_road_terminates_and_the_mask_says_so_beforehand():
     env = make(lanes=1)
     _, info = env.reset(seed=0)
@@ -376,15 +365,6 @@ def test_the_safe_mask_is_in_the_info_and_behind_maskable_ppos_method():
     assert not np.all(changes)
 
 
-def test_a_batch_has_a_mask_for_every_row():
-    envs = make_vec(5, mask="legal", lanes=2)
-    _, info = envs.reset(seed=0)
-    mask = envs.action_masks()
-    np.testing.assert_array_equal(mask, info["action_mask"].astype(bool))
-    assert (mask.sum(1) == 2).all()
-    assert not (mask == mask[0]).all()
-
-
 @pytest.mark.parametrize(
     "twin", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copied", "pickled"]
 )
@@ -397,8 +377,3 @@ def test_a_copy_goes_on_as_the_environment_does_and_leaves_it_alone(twin, traffi
     theirs = [other.step(action) for action in (KEEP, RIGHT)]
     ours = [env.step(action) for action in (KEEP, RIGHT)]
     assert data_equivalence(ours, theirs, exact=True)
-
-
-@pytest.mark.skipif(why_not() is not None, reason=f"no native kernel here: {why_not()}")
-def test_numpys_numbers_of_environments_get_the_native_kernel_too():
-    assert isinstance(make_rows("idm_mobil", np.int64(3), False, (), {}), NativeRows)

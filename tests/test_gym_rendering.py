@@ -30,17 +30,6 @@ def test_frames_show_the_road_and_change_as_the_ego_drives():
     assert not np.array_equal(one, other)
 
 
-def test_a_long_episode_keeps_no_more_frames_than_its_trails():
-    env = make(render_mode="rgb_array", goal_m=5000.0)
-    env.reset(seed=0)
-    for _ in range(8):
-        env.step(KEEP)
-    recorder = env.unwrapped._view._recorder
-    assert len(recorder.frames) == 31 + 10
-    assert recorder.time_s == pytest.approx(8.0)
-    assert env.render().shape == (320, 1280, 3)
-
-
 def test_a_list_of_frames_has_ten_for_every_second_of_driving():
     env = make(render_mode="rgb_array_list", goal_m=300.0)
     assert env.metadata["render_fps"] == 10

@@ -15,16 +15,6 @@ VECTOR = gymnasium.wrappers.vector
 MASKS_MAY_BE_ABSENT = tuple(map(int, re.findall(r"\d+", gymnasium.__version__)[:3])) >= (1, 2, 2)
 
 
-def test_a_users_transform_pays_what_it_says():
-    from torchrl.envs import RewardScaling
-
-    plain = make()
-    doubled = make(transforms=[RewardScaling(loc=0.0, scale=2.0)])
-    plain.reset(seed=0)
-    doubled.reset(seed=0)
-    assert doubled.step(KEEP)[1] == pytest.approx(2.0 * plain.step(KEEP)[1])
-
-
 @pytest.mark.parametrize("mode", ["same_step", "next_step"])
 def test_gymnasiums_own_vector_wrappers_take_the_batch(mode):
     envs = VECTOR.RecordEpisodeStatistics(make_vec(4, goal_m=40.0, autoreset_mode=mode))

@@ -151,27 +151,6 @@ def test_adam_goes_on_from_the_moments_that_it_is_given():
     assert not same_weights(trained, cold)
 
 
-def test_only_moments_are_taken_over_the_rate_is_ones_own():
-    trained = agent(learning_rate=1e-2, adam_eps=1e-3)
-    fresh = agent(learning_rate=1e-4, adam_eps=1e-8)
-    descend(trained, 1)
-    load_moments(fresh, trained.optimizer.state_dict()["state"])
-    (group,) = fresh.optimizer.param_groups
-    assert (group["lr"], group["eps"]) == (1e-4, 1e-8)
-
-
-def test_moments_kept_in_half_precision_come_back_as_floats():
-    trained = agent()
-    fresh = agent()
-    descend(trained, 1)
-    load_moments(fresh, trained.state_dict(with_replay=False)["optimizer"]["state"])
-    exact, rounded = (learner.optimizer.state_dict()["state"] for learner in (trained, fresh))
-    for row in exact:
-        assert rounded[row]["exp_avg_sq"].dtype == torch.float32
-        moments = (rounded[row]["exp_avg"], exact[row]["exp_avg"])
-        torch.testing.assert_close(*moments, rtol=2**-8, atol=0.0)
-
-
 #: Moments of the first two parameters, and how they are damaged.
 MOMENTS = {
     "absent": lambda first, second: first.clear(),

@@ -1,11 +1,8 @@
 """Rule-based drivers of the ego."""
 
-import pytest
 import torch
 
 from ganlane.agents.drivers import (
-    DRIVERS,
-    KeepLaneDriver,
     RandomDriver,
     RandomLegalDriver,
 )
@@ -17,18 +14,6 @@ from ganlane.traffic import IdmTraffic
 
 def states(n=256, lanes=3, m=9):
     return HighwayEnv(IdmTraffic(Road(lanes)), num_envs=n, vehicles=m).reset()
-
-
-@pytest.mark.parametrize("name", DRIVERS)
-def test_every_driver_writes_one_of_three_actions_per_row(name):
-    action = DRIVERS[name](Road(), 0)(states(64))["action"]
-    assert action.shape == (64,)
-    assert action.dtype == torch.int64
-    assert set(action.tolist()) <= {KEEP, LEFT, RIGHT}
-
-
-def test_keeping_the_lane_is_always_action_0():
-    assert (KeepLaneDriver(Road())(states())["action"] == KEEP).all()
 
 
 def test_random_drivers_use_all_actions_equally():

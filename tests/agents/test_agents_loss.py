@@ -17,7 +17,6 @@ from ganlane.agents.loss import (
     LeanDistributionalLoss,
     LeanDQNLoss,
     UpdateGraph,
-    project,
 )
 from ganlane.agents.network import redraw_noise
 from ganlane.runtime import has_compiler
@@ -79,22 +78,6 @@ def test_the_plain_loss_equals_torchrls(double):
         atol=1e-5,
         rtol=1e-5,
     )
-
-
-def test_without_double_the_target_network_chooses():
-    single = unlike_target(LeanDistributionalLoss(network(noisy=False), gamma=0.97, double=False))
-    data = batch()
-    values = single.target_network.values(data["next", "observation"])
-    assert torch.isclose(single(data)["mean_q"], values.amax(-1).mean())
-    double = LeanDistributionalLoss(single.network, gamma=0.97, double=True)
-    assert not torch.isclose(double(data)["mean_q"], values.amax(-1).mean())
-
-
-def test_a_return_exactly_on_an_atom_keeps_its_probability():
-    support = torch.linspace(-2, 2, 9)
-    probabilities = torch.randn(20, 9, generator=torch.Generator().manual_seed(0)).softmax(-1)
-    projected = project(support.expand(20, 9), probabilities, support)
-    torch.testing.assert_close(projected, probabilities)
 
 
 def test_the_loss_reports_the_share_of_the_returns_that_its_support_does_not_cover():

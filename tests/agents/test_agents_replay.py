@@ -64,12 +64,6 @@ def test_without_priorities_all_items_are_drawn_alike_and_nothing_outside_the_fi
     assert stats.chisquare(seen[:65]).pvalue > 0.001
 
 
-def test_nothing_outside_the_filled_part_is_drawn_by_priority():
-    seen = counts(buffer(rows=65, capacity=1000), 200)
-    assert seen[65:].sum() == 0
-    assert (seen[:65] > 0).all()
-
-
 def test_importance_weights_are_those_of_schaul_over_the_largest_of_the_batch():
     replay = buffer(alpha=0.5, beta_start=0.7)
     priority = torch.linspace(0.1, 9.0, 200)
@@ -90,14 +84,6 @@ def test_a_new_item_has_the_largest_priority_seen():
     flat = replay.sampler.priorities.view(-1)
     torch.testing.assert_close(flat[100:200], torch.full((100,), 7.0**0.5))
     torch.testing.assert_close(flat[:100], torch.full((100,), 0.1), atol=1e-5, rtol=1e-5)
-
-
-def test_the_item_of_an_index_is_the_one_stored_there_after_the_buffer_wraps():
-    replay = buffer(rows=200)
-    replay.extend(transitions(100, first=200))
-    drawn = replay.sample()
-    expected = torch.where(drawn["index"] < 44, drawn["index"] + 256, drawn["index"])
-    assert torch.equal(drawn["observation"].squeeze(-1), expected.float())
 
 
 @pytest.mark.parametrize("prioritised", [True, False])

@@ -3,42 +3,21 @@
 from __future__ import annotations
 
 import json
-import time
 
 import pytest
 
 from benchmarks.speed import __main__ as speed
 from benchmarks.speed import systems
 from benchmarks.speed.measure import (
-    Case,
     Labels,
     Sample,
-    calls_per_turn,
     make_row,
-    take_turn,
 )
 from benchmarks.speed.systems import Road
 from ganlane.agents import RainbowConfig
 
 LABELS = Labels("speed", "mine", "idm", "eager", "cpu", 1, 9, 3, 4)
-CASE = Case(LABELS, lambda: lambda calls: 0, 4)
 QUICK = ["--quick", "--seconds", "0.001", "--no-peers", "--modes", "eager"]
-
-
-def napping(calls):
-    """Ten physics steps a call, each call a nap."""
-    time.sleep(0.01 * calls)
-    return 10 * calls
-
-
-def test_a_turn_lasts_as_long_as_asked_and_a_nap_costs_wall_time_but_no_cpu_time():
-    # Naps are never shorter than asked, and on a busy machine longer.
-    assert 2 <= calls_per_turn(CASE, napping, 0.1) <= 10
-    assert calls_per_turn(CASE, napping, 0.001) == 1
-    sample = take_turn(CASE, napping, 5)
-    assert sample.wall_s >= 0.05
-    assert sample.cpu_s < 0.05
-    assert (sample.decisions, sample.physics_steps) == (20, 50)
 
 
 def test_a_row_holds_medians_over_the_turns():

@@ -21,13 +21,10 @@ from ganlane.settings.generator import CalibratedConfig, PaperConfig
 from ganlane.settings.observation import (
     FORMS,
     MASKS,
-    ObservationConfig,
     RewardParameters,
-    SensorParameters,
 )
 from ganlane.settings.record import make, option, option_names
 from ganlane.settings.traffic import TrafficConfig
-from ganlane.training.phases import describe, phases_of
 from ganlane.transforms import OBSERVATIONS
 
 #: Group to a command that has it.
@@ -81,12 +78,6 @@ def test_observation_forms_are_those_of_the_transform():
     assert set(FORMS) == set(OBSERVATIONS)
 
 
-def test_sensors_are_perfect_unless_an_error_is_asked_for():
-    assert config_of("train").observation.sensors is None
-    late = config_of("train", "observation=lane_view", "observation.sensors.delay_s=2").observation
-    assert late == ObservationConfig(form="lane_view", sensors=SensorParameters(delay_s=2.0))
-
-
 def test_considerate_is_the_paper_and_a_price_for_danger_behind():
     paper, considerate = (
         config_of("train", f"reward={name}").reward for name in ("paper", "considerate")
@@ -100,21 +91,6 @@ def test_considerate_is_the_paper_and_a_price_for_danger_behind():
     assert milder == RewardParameters(soft_crash_behind=-5.0)
     with pytest.raises(UserError, match=r"reward\.soft_crash_behind=3: expected at most 0"):
         settings("train", ["reward=considerate", "reward.soft_crash_behind=3"])
-
-
-def test_the_reward_stands_in_the_agents_metadata():
-    config = config_of("train", "reward=considerate")
-    assert (
-        describe(config, phases_of(config, Path("run"))[-1])["reward"]["soft_crash_behind"] == -10.0
-    )
-
-
-def test_dqn_switches_every_component_off():
-    config = config_of("train", "agent=dqn").agent
-    assert not any(
-        (config.noisy, config.dueling, config.distributional, config.double, config.prioritised)
-    )
-    assert config.n_step == 1
 
 
 def test_dense_traffic_keeps_the_density_for_any_number_of_vehicles():
@@ -132,22 +108,6 @@ def test_paper_experiment_is_two_phases_and_can_be_shortened():
     whole = settings("train", ["experiment=paper"])
     assert (whole.pretrain.total_decisions, whole.total_decisions) == (10_000_000, 3_000_000)
     assert whole.init.path is None
-
-
-@pytest.mark.parametrize(
-    ("control", "first", "second"), [("gan_only", "gan", "gan"), ("idm_long", None, "idm_mobil")]
-)
-def test_a_control_differs_from_the_papers_schedule_in_its_traffic_alone(control, first, second):
-    paper = settings("train", ["experiment=paper" if first else "experiment=paper_gan"])
-    config = settings("train", [f"experiment={control}"])
-    assert config.traffic.label() == second
-    assert (
-        config.pretrain.traffic is None
-        if first is None
-        else config.pretrain.traffic.label() == first
-    )
-    assert dataclasses.replace(config, traffic=paper.traffic, pretrain=paper.pretrain) == paper
-    assert config.pretrain.total_decisions == paper.pretrain.total_decisions
 
 
 def test_yaml_files_explain_themselves():
@@ -196,7 +156,3 @@ def test_shares_on_the_command_line_replace_those_of_an_experiment(shares):
         config_of("train", "experiment=general", f"traffic.shares={{{listed}}}").traffic.shares
         == shares
     )
-
-
-def test_an_experiment_on_top_of_another_sets_its_own_shares():
-    assert config_of("train", "experiment=general_continued").traffic.shares["gan"] == 4

@@ -29,7 +29,6 @@ from ganlane.settings.record import (
     make,
     merged,
     one_of,
-    option,
     plain,
 )
 
@@ -128,12 +127,6 @@ def test_numbers_of_numpy_and_torch_paths_and_whole_floats_are_taken():
     assert type(car.doors) is int
 
 
-def test_lists_become_tuples_where_the_field_is_one_and_a_text_a_list_of_one():
-    assert Car(speed_mps=[1.0, 2.0], wheels=[3]) == Car(speed_mps=(1.0, 2.0), wheels=(3,))
-    assert Car(names="mobil").names == ["mobil"]
-    assert replace(Car(), tow_share=0.5).tow_share == 0.5
-
-
 def test_an_option_is_its_name_or_a_mapping_with_changes():
     plainly = make(RainbowConfig, "dqn")
     assert not any((plainly.noisy, plainly.dueling, plainly.double))
@@ -146,11 +139,6 @@ def test_a_mapping_with_a_name_replaces_and_one_without_changes():
     below: dict[str, Any] = {"traffic": {"name": "gan", "guard": False}, "env": {"lanes": 3}}
     above = {"traffic": {"name": "idm"}, "env": {"vehicles": 5}}
     assert merged(below, above) == {"traffic": {"name": "idm"}, "env": {"lanes": 3, "vehicles": 5}}
-
-
-def test_what_a_reader_of_an_option_changes_stays_its_own():
-    option("env", "cut_in")["scene"]["kind"] = "another"
-    assert option("env", "cut_in")["scene"] == {"kind": "cut_in"}
 
 
 @pytest.mark.parametrize("scene", ["cut_in", "stalled_car", "blocked_lane", "stop_and_go", "dense"])

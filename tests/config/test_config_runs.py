@@ -25,7 +25,6 @@ from ganlane.config.run import (
     LOCK,
     as_yaml,
     held,
-    new_folder,
     newest_unfinished,
     run_command,
     settings,
@@ -130,17 +129,6 @@ def test_a_run_that_ends_in_an_error_after_training_keeps_its_command_line(error
     assert command("resume=run") == 0
 
 
-def test_a_run_that_is_refused_leaves_the_command_line_of_the_one_before(here, capsys):
-    def refused(config, folder):
-        raise UserError("no such agent")
-
-    assert command("hydra.run.dir=run") == 0
-    assert command("resume=run", "log_every=50", task=refused) == 2
-    assert "log_every: 50" not in (here / "run" / CONFIG).read_text()
-    assert command("hydra.run.dir=new", task=refused) == 2
-    assert not (here / "new").exists()
-
-
 def test_a_second_run_in_a_folder_is_refused_while_the_first_is_at_work(here, capsys):
     def second(config, folder):
         before = sorted(here.rglob("*"))
@@ -177,12 +165,6 @@ def test_the_lock_of_a_killed_run_stops_nobody_and_its_half_written_files_go(her
     with held(Path("run")):
         assert [path.name for path in here.rglob("*.part")] == [".a.film.part"]
     assert not (here / "run" / LOCK).exists()
-
-
-def test_two_runs_of_one_process_in_one_second_have_folders_of_their_own(here):
-    first = new_folder("train")
-    first.mkdir(parents=True)
-    assert new_folder("train") != first
 
 
 # --- the settings of a resumed run

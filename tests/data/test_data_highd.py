@@ -8,13 +8,11 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from reference.recordings import write_highd
 from reference.refusals import user_error
 
 from ganlane.data import SCHEMA, read_recordings
-from ganlane.data.highd import highd_scenes, resample
+from ganlane.data.highd import highd_scenes
 from ganlane.data.schema import RowCount
 
 
@@ -176,30 +174,3 @@ def test_the_metadata_files_are_required_and_checked(
         read_recordings("highd", recording.parent.parent)
     with user_error(r"expected highD's XX_tracks.csv"):
         read_recordings("highd", meta)
-
-
-@given(
-    first=st.integers(0, 40),
-    length=st.integers(1, 120),
-    rate=st.sampled_from([10.0, 25.0, 30.0, 50.0]),
-)
-def test_a_resampled_track_has_the_frames_within_it_and_lies_on_the_recorded_line(
-    first, length, rate
-):
-    old = np.arange(length) + first
-    numbers = {name: 2.0 * old for name in ("x", "y", "speed", "length", "width")}
-    lanes = (np.arange(length) >= 3).astype(int)
-    new = resample(
-        pl.DataFrame({"frame": old, "lane": lanes, **numbers}),
-        rate,
-    )
-    ends = (
-        first / rate - 1e-9,
-        (first + length - 1) / rate + 1e-9,
-    )
-    inside = [k for k in range(2000) if ends[0] <= k * 0.1 <= ends[1]]
-    assert new["frame"].to_list() == inside
-    at = 0.1 * rate * np.array(inside)
-    np.testing.assert_allclose(new["x"], 2.0 * at, atol=1e-9)
-    # The lane of the nearest old frame changes half a frame before the fourth one.
-    assert new["lane"].to_list() == (at - first > 2.5 + 1e-6).astype(int).tolist()

@@ -23,22 +23,6 @@ def test_lane_keepers_tell_the_width_to_a_few_centimetres(width, seed):
     assert lane_width(y, nearest) == pytest.approx(width, abs=0.06)
 
 
-def test_vehicles_on_the_boundary_tell_the_width_where_lane_keepers_sit_off_centre():
-    width = 3.5
-    # All keep half a metre to the left but in lane 0, so the spacing of the medians says 3.75 m;
-    # some cross over.
-    keepers = np.concatenate(
-        (
-            np.full(50, 0.0),
-            np.full(50, 4.0),
-            np.full(50, 7.5),
-        )
-    )
-    crossing = np.linspace(0.0, 7.0, 71)
-    y = np.concatenate((keepers, crossing))
-    assert lane_width(y, np.rint(y / width).astype(np.int64)) == pytest.approx(width, abs=0.03)
-
-
 def test_a_single_lane_gets_the_standard_width_and_one_stray_row_does_not_make_a_lane():
     assert (
         lane_width(
@@ -106,21 +90,6 @@ def test_a_flicker_shorter_than_half_a_second_is_no_change(samples, changes):
 def test_the_new_lane_must_be_seen_for_half_a_second(after, changes):
     assert len(changes_of(np.r_[np.full(20, 1.7), np.full(after, 1.9)])) == changes
     assert len(changes_of(np.r_[np.full(after, 1.7), np.full(20, 1.9)])) == changes
-
-
-def test_two_lanes_in_one_go_are_two_changes():
-    # Without a stop in the lane between.
-    y = np.clip(1.5 * (TIME - 1.0), 0.0, 2 * WIDTH)
-    changes = changes_of(y)
-    assert changes.old_lane.tolist() == [0, 1]
-    assert changes.new_lane.tolist() == [1, 2]
-
-
-def test_a_change_of_vehicle_is_no_lane_change():
-    # The same positions as one track, and as two.
-    y = np.r_[np.zeros(20), np.full(20, WIDTH)]
-    assert len(changes_of(y)) == 1
-    assert len(changes_of(y, new_track_at=[20])) == 0
 
 
 @settings(max_examples=20)

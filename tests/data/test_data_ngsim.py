@@ -155,13 +155,6 @@ def test_ramps_are_left_out_and_end_a_track(tmp_path):
     assert frames[10_002] == list(range(30, 60))
 
 
-def test_lanes_is_how_many_are_kept_from_the_left(tmp_path):
-    path = text_file(tmp_path, ngsim_rows(FIRST))
-    left = read_recordings("ngsim", path, NgsimParameters(lanes=2))
-    assert left.height == FIRST.filter(pl.col("lane") >= 1).height
-    assert sorted(left["lane"].unique()) == [0, 1]
-
-
 def changed(folder, row: int, column: str, value: str):
     """The portal's file with one field changed; ``row`` counts from 0 below the header."""
     # Without quotes, so that fields can be split at commas.
@@ -345,8 +338,3 @@ def test_temporary_files_are_removed_after_an_error(
             )
         )
     assert list(scratch.iterdir()) == []
-
-
-def test_a_small_extract_is_a_period_of_its_own(tmp_path):
-    rows = ngsim_rows(FIRST).filter((pl.col("Vehicle_ID") < 3) & (pl.col("Frame_ID") < 20))
-    assert read_recordings("ngsim", portal_file(tmp_path, portal_csv(rows))).height == 40

@@ -75,24 +75,6 @@ def test_lanes_are_counted_from_the_right_y_from_the_right_lanes_centre_and_rows
     assert read_scenes(written(tmp_path, by_frame)).equals(frame)
 
 
-def test_a_synthetic_recording_survives_the_file(tmp_path):
-    frame = synthetic_scenes(seed=3)
-    path = tmp_path / "made.csv"
-    write_scene_csv(frame, path)
-    read = read_scenes(path)
-    exact = ["scene", "vehicle", "frame", "lane"]
-    assert read.select(exact).equals(frame.select(exact))
-    # The lane width is estimated anew, to 4 cm; two lanes to the left that makes 8 cm.
-    for name, tolerance in {
-        "x": 1e-4,
-        "speed": 1e-4,
-        "length": 1e-9,
-        "width": 1e-9,
-        "y": 0.08,
-    }.items():
-        assert (read[name] - frame[name]).abs().max() <= tolerance
-
-
 @pytest.mark.parametrize(
     ("row", "column", "value", "message"),
     [

@@ -141,17 +141,6 @@ def test_foreign_line_breaks_are_refused_with_their_line(
         csv_table(tmp_path / "t.csv", {"a": pl.Int64})
 
 
-def test_empty_lines_at_the_end_are_no_rows(tmp_path):
-    assert (
-        read(
-            tmp_path / "t.csv",
-            b"a,b,c\n1,2,3\n\n \r\n\n",
-            block_bytes=4,
-        ).height
-        == 1
-    )
-
-
 def test_quoted_fields_may_hold_commas(tmp_path):
     parsed = read(
         tmp_path / "t.csv",

@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import sys
 
-import polars as pl
 import pytest
 from reference.refusals import user_error
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-from ganlane.data import byte_progress, default_scenes, scene_lane_counts, tracks_of_frame
-from ganlane.data.lanes import find_lane_changes
-from ganlane.data.schema import validate
+from ganlane.data import byte_progress, default_scenes
 from ganlane.data.sources import data_folder
-from ganlane.data.statistics import leader_gaps
 
 
 @pytest.mark.parametrize("terminal", [True, False])
@@ -57,40 +52,3 @@ def test_the_recordings_are_found_beside_the_current_folder(tmp_path, monkeypatc
     assert data_folder() is None
     (tmp_path / "shared" / "data").mkdir(parents=True)
     assert data_folder() == tmp_path / "shared" / "data"
-
-
-def test_a_seed_makes_one_recording_and_another_seed_another():
-    assert synthetic_scenes(seed=1).equals(synthetic_scenes(seed=1))
-    assert not synthetic_scenes(seed=1).equals(synthetic_scenes(seed=2))
-    # Scenes of one seed differ, too.
-    one, other = synthetic_scenes(seed=1).partition_by("scene", include_key=False)
-    assert not one.equals(other)
-
-
-@pytest.mark.parametrize("lanes", [1, 2, 5])
-def test_it_fits_the_schema_and_uses_every_lane(lanes):
-    frame = synthetic_scenes(SyntheticTraffic(lanes=lanes))
-    assert validate(frame, "made").equals(frame)
-    assert set(scene_lane_counts(frame).values()) == {lanes}
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_nobody_comes_near_another_along_the_road(seed):
-    # All put into one lane, the smallest gap is still that between slots less the sway of both.
-    one_lane = synthetic_scenes(seed=seed).with_columns(lane=pl.lit(0, pl.Int64))
-    assert leader_gaps(one_lane)["gap"].min() > 2.0
-
-
-def test_the_share_of_changing_vehicles_is_found_by_the_detector():
-    for changing, wander_m in (
-        (40, 0.0),
-        (0, SyntheticTraffic.wander_m),
-    ):
-        traffic = SyntheticTraffic(
-            scenes=1,
-            vehicles=40,
-            changing_share=changing / 40,
-            wander_m=wander_m,
-        )
-        tracks = tracks_of_frame(synthetic_scenes(traffic), {"synthetic-0": 3.5})
-        assert len(find_lane_changes(tracks)) == changing

@@ -10,11 +10,10 @@ import pytest
 from reference.refusals import user_error
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-from ganlane.data import SCHEMA, default_scenes, read_scenes, scene_lane_widths, tracks_of_frame
+from ganlane.data import SCHEMA, default_scenes, read_scenes, tracks_of_frame
 from ganlane.data.lanes import find_lane_changes
 from ganlane.data.statistics import (
     DrivingStatistics,
-    describe,
     describe_durations,
     driving_statistics,
     poisson_interval,
@@ -154,16 +153,6 @@ def test_a_recording_is_measured_as_by_hand():
     assert measured.speed_sd_in_frame == pytest.approx(0.0, abs=1e-9)
 
 
-def test_speeds_differ_within_a_frame_but_not_within_a_lane():
-    time = np.arange(30) * 0.1
-    slow = pl.concat([track(v, 10.0 * time + 30.0 * v) for v in (1, 2)])
-    fast = pl.concat([track(v, 14.0 * time + 30.0 * v, lane=1) for v in (3, 4)])
-    measured = driving_statistics(pl.concat((slow, fast)))
-    # 10, 10, 14, 14 about 12: the sum of squares is 16, over 3.
-    assert measured.speed_sd_in_frame == pytest.approx(np.sqrt(16 / 3))
-    assert measured.speed_sd_in_lane == pytest.approx(0.0, abs=1e-9)
-
-
 @pytest.mark.parametrize(
     "frame",
     [
@@ -242,15 +231,6 @@ def test_durations_that_are_all_censored_have_no_mean():
     assert open_ended.survival_mean_s == pytest.approx(1.0 + 1.5 * 2.0 / 3.0)
 
 
-def test_a_sample_is_summed_up():
-    summary = describe(np.arange(101.0))
-    assert (summary.count, summary.mean) == (101, 50.0)
-    assert summary.quantile(0.05) == pytest.approx(5.0)
-    assert summary.quantile(0.5) == pytest.approx(50.0)
-    assert describe([]).quantiles == ()
-    assert describe([2.0]).sd is None
-
-
 @pytest.fixture(scope="module")
 def scenes():
     try:
@@ -263,27 +243,6 @@ def scenes():
 @pytest.fixture(scope="module")
 def measured(scenes):
     return driving_statistics(scenes)
-
-
-def test_the_amount_of_driving(measured):
-    exposure = measured.exposure
-    assert (
-        exposure.scenes,
-        exposure.tracks,
-        exposure.cars,
-        exposure.samples,
-    ) == (
-        11,
-        645,
-        539,
-        47_382,
-    )
-    assert exposure.vehicle_km == pytest.approx(61.7, abs=0.05)
-    assert exposure.road_m == pytest.approx(309, abs=0.5)
-    assert (
-        measured.speed.mean,
-        measured.speed.quantile(0.5),
-    ) == pytest.approx((13.2, 13.7), abs=0.05)
 
 
 def test_the_lane_changes(scenes, measured):
@@ -304,29 +263,6 @@ def test_the_lane_changes(scenes, measured):
     counts = dict(scenes[rows]["scene"].value_counts().iter_rows())
     per_scene = [counts.get(f"us101-{letter}", 0) for letter in "abcdefghijk"]
     assert per_scene == [16, 5, 3, 21, 2, 0, 3, 3, 0, 3, 1]
-
-
-def test_the_lane_widths(scenes):
-    published = [
-        3.50,
-        3.54,
-        3.44,
-        3.42,
-        3.58,
-        3.56,
-        3.52,
-        3.33,
-        3.53,
-        3.35,
-        3.39,
-    ]
-    widths = scene_lane_widths(scenes)
-    assert [widths[f"us101-{letter}"] for letter in "abcdefghijk"] == pytest.approx(
-        published, abs=0.035
-    )
-    width = scenes["scene"].replace_strict(widths).to_numpy()
-    assert np.mean(np.rint(scenes["y"].to_numpy() / width) == scenes["lane"].to_numpy()) > 0.999
-    assert scenes.filter(pl.col("scene") == "us101-d")["lane"].max() == 6
 
 
 def test_the_spread_of_speeds_accelerations_and_headways(

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import polars as pl
 import pytest
 import torch
 
 import ganlane
-from ganlane.evaluation import code_version, results, write_episodes, write_results
+from ganlane.evaluation import code_version, results, write_results
 from ganlane.evaluation.results import Run
 
 
@@ -57,19 +56,6 @@ def test_numbers_and_their_origin_are_kept(tmp_path):
     assert read["machine"]["torch"] == torch.__version__
     assert read["machine"]["cores"] >= 1
     assert read["machine"]["threads"] == torch.get_num_threads()
-
-
-def test_episodes_come_back_as_they_were(tmp_path):
-    frame = pl.DataFrame(
-        {
-            "episode": [0, 1],
-            "reason": ["goal", "timeout"],
-            "reward": [1.0, 2.0],
-        }
-    )
-    path = write_episodes(tmp_path, frame)
-    assert pl.read_parquet(path).equals(frame)
-    assert [file.name for file in tmp_path.iterdir()] == ["episodes.parquet"]
 
 
 def test_a_failed_write_leaves_the_old_file_alone(tmp_path):

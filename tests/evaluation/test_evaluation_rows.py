@@ -175,15 +175,6 @@ def test_without_the_drivers_of_the_scale_a_reason_replaces_the_score_and_nobody
     assert "minus MOBIL" not in text
 
 
-def test_the_text_table_is_aligned_and_leaves_out_what_never_happened(rows):
-    lines = text_table(rows).splitlines()
-    assert len({len(line) for line in lines}) == 1
-    assert "time-out" in lines[0]
-    assert "scene end" not in lines[0]
-    assert "agent_idm" in lines[2]
-    assert "-2.5 [" in lines[2]
-
-
 def test_resamples_without_a_lead_do_not_spoil_the_interval():
     # In the first episode MOBIL leads by nothing: a resample of it alone has no scale. In the
     # others the agent is half way from random to MOBIL.
@@ -209,50 +200,6 @@ def test_the_first_driver_is_held_against_every_other_on_every_traffic():
         ("gan", "mobil", -2.0, "below"),
         ("gan", "keep_lane", 4.0, "above"),
     ]
-
-
-def test_only_episodes_that_both_drove_count_whatever_their_order():
-    # Shared are the episodes 2, 3 and 4: differences of 2, 4 and 6.
-    other = episodes("mobil", [10, 20, 30, 99], first=2).reverse()
-    (row,) = paired_rows(
-        pl.concat(
-            [
-                episodes(
-                    "a",
-                    [
-                        -50,
-                        -60,
-                        12,
-                        24,
-                        36,
-                    ],
-                ),
-                other,
-            ]
-        )
-    )
-    assert (row["episodes"], row["lead"]) == (3, pytest.approx(4.0))
-
-
-def test_an_interval_that_holds_zero_is_undecided():
-    (row,) = paired_rows(
-        pl.concat(
-            [
-                episodes(
-                    "a",
-                    [
-                        1,
-                        -1,
-                        2,
-                        -2,
-                    ],
-                ),
-                episodes("b", [0, 0, 0, 0.1]),
-            ]
-        )
-    )
-    assert row["lead_ci"][0] < 0.0 < row["lead_ci"][1]
-    assert row["verdict"] == "undecided"
 
 
 def verdict_of(differences, failed=0):

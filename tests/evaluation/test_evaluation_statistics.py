@@ -15,20 +15,11 @@ from ganlane.evaluation.statistics import (
     mcnemar,
     mean_interval,
     over_trainings,
-    paired_difference,
     poisson_interval,
     probability_of_improvement,
     rate_over_trainings,
-    resample_counts,
     sign_flip_p,
 )
-
-
-def test_a_resample_draws_as_many_episodes_as_there_are():
-    counts = np.concatenate(list(resample_counts(7, 1200, seed=1)))
-    assert counts.shape == (1200, 7)
-    assert np.all(counts.sum(axis=1) == 7)
-    assert counts.mean(axis=0) == pytest.approx(np.ones(7), abs=0.15)
 
 
 def test_the_interval_is_scipys_bca_and_repeats_with_its_seed():
@@ -63,18 +54,6 @@ def test_an_estimate_is_scaled_with_its_bounds_and_gives_a_rows_entries():
     assert entries("rate", Estimate(2.0, 1.0, 3.0)) == {"rate": 2.0, "rate_ci": [1.0, 3.0]}
     nothing = {"rate": None, "rate_ci": None}
     assert entries("rate", None) == entries("rate", Estimate(float("nan"))) == nothing
-
-
-def test_pairing_removes_what_the_episodes_have_in_common():
-    generator = np.random.default_rng(1)
-    common = generator.normal(0, 100, 100)
-    better = common + 5 + generator.normal(0, 1, 100)
-    difference = paired_difference(better, common)
-    assert difference.excludes_zero()
-    assert difference.low < 5 < difference.high
-    assert difference.high - difference.low < 1.0
-    with pytest.raises(ValueError, match="shape"):
-        paired_difference(common, common[1:])
 
 
 @pytest.mark.parametrize(
@@ -142,19 +121,6 @@ def test_one_training_has_the_interval_of_its_episodes_and_one_episode_that_of_i
     estimate = over_trainings(table)
     assert estimate.value == pytest.approx(table.mean())
     assert width(estimate) == pytest.approx(2 * 1.96 * table.std() / np.sqrt(table.size), rel=0.08)
-
-
-def test_a_recipe_whose_trainings_differ_has_a_wider_interval_than_its_episodes_alone():
-    table = scores(
-        5,
-        200,
-        between=10.0,
-        rest=10.0,
-        seed=1,
-    )
-    assert width(over_trainings(table)) > 4 * width(over_trainings(table.reshape(1, -1)))
-    of_means = stats.ttest_1samp(table.mean(axis=1), 0.0).confidence_interval()
-    assert width(over_trainings(table)) == pytest.approx(of_means.high - of_means.low, rel=0.1)
 
 
 @pytest.mark.parametrize("between", [0.0, 2.0, 20.0])
@@ -234,18 +200,6 @@ def test_a_rate_over_trainings_is_never_surer_than_its_count():
         rate = rate_over_trainings(crashes, km)
         exact = poisson_interval(int(crashes.sum())).scaled(per=float(km.sum()))
         assert rate.low <= exact.low < exact.high <= rate.high
-
-
-def test_trainings_that_differ_leave_room_for_higher_rates():
-    crashes = np.zeros((3, 100))
-    for training, count in enumerate((2, 8, 20)):
-        crashes[training, :count] = 1
-    rate = rate_over_trainings(crashes, np.ones((3, 100)))
-    of_counts = stats.ttest_1samp([2, 8, 20], 0.0).confidence_interval()
-    assert rate.value == pytest.approx(0.1)
-    # Student's half-width, taken on the logarithm's scale.
-    assert rate.high >= 0.1 * np.exp(of_counts.high / 10 - 1) * (1 - 1e-9)
-    assert rate.low == 0.0
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ganlane.evaluation.table import Table, aligned, count, fitting, percent, significant
+from ganlane.evaluation.table import Table, aligned, count, fitting, percent
 
 
 @pytest.mark.parametrize(
@@ -18,21 +18,6 @@ from ganlane.evaluation.table import Table, aligned, count, fitting, percent, si
 )
 def test_counts_have_three_digits_and_a_unit(value, shown):
     assert count(value) == shown
-
-
-@pytest.mark.parametrize(
-    ("value", "shown"),
-    [
-        (1.0, "1.00"),
-        (0.9134, "0.913"),
-        (12.345, "12.3"),
-        (1234.5, "1230"),
-        (0.0, "0"),
-        (None, "-"),
-    ],
-)
-def test_numbers_have_three_digits(value, shown):
-    assert significant(value) == shown
 
 
 def test_shares_are_per_cent():

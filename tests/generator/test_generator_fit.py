@@ -15,7 +15,6 @@ from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.fit import (
     assign_folds,
     cross_validate,
-    fit_generator,
     split_for_fit,
 )
 from ganlane.generator.windows import count_windows, scene_tracks
@@ -60,17 +59,6 @@ def test_reported_scenes_have_no_say_in_when_to_stop(scenes):
         assert total / 12 <= held < total / 2
 
 
-def test_a_single_other_scene_is_fitted_to_and_chooses_when_to_stop(
-    scenes,
-):
-    split = split_for_fit(scenes[:2], ("scene-1",))
-    assert split.names == {
-        "fitted": ["scene-0"],
-        "validation": ["scene-0"],
-        "held_out": ["scene-1"],
-    }
-
-
 def test_more_folds_than_scenes_and_splits_without_two_parts_are_refused(
     scenes,
 ):
@@ -90,21 +78,6 @@ def test_more_folds_than_scenes_and_splits_without_two_parts_are_refused(
 @pytest.fixture(scope="module")
 def frame():
     return synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=5, seconds=6.5))
-
-
-def test_a_fit_reports_the_held_out_scenes(frame):
-    result = fit_generator(CALIBRATED, frame, ("synthetic-1",), source="folder/made.csv")
-    assert set(result.metrics) == {"all", "synthetic-1"}
-    assert {*result.data["fitted"], *result.data["validation"]} == {
-        "synthetic-0",
-        "synthetic-2",
-    }
-    assert (result.data["held_out"], result.data["file"]) == (
-        ["synthetic-1"],
-        "made.csv",
-    )
-    assert result.updates in (2, 4)
-    assert {"headway", "lane_changes"} <= set(result.statistics)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ from ganlane.generator import forecasts
 from ganlane.generator.windows import (
     Windows,
     cut_windows,
-    group_windows,
     scene_tracks,
 )
 from ganlane.settings.generator import EXTRA_INPUTS, CalibratedConfig
@@ -99,27 +98,6 @@ def test_the_best_of_the_samples_is_the_nearest_on_average():
     }
 
 
-def test_forecasts_of_the_papers_preset_score_alike_in_a_fit_and_over_folds(
-    scenes,
-):
-    generator = small_generator(0)
-    windows = cut_windows(scenes, STRIDE)
-    predicted = forecasts.paper_forecasts(generator, windows, group_windows(windows, 4))
-    predicted["constant_velocity"] = forecasts.repeated(windows.past[:, -1], 8)
-    row = forecasts.displacement_errors(forecasts.errors_of(predicted, windows.future))
-    metrics = forecasts.scene_metrics(windows, predicted)
-    for kind in predicted:
-        assert metrics["all"][f"ade_m/{kind}"] == row["ade_m"][kind]
-        assert metrics["all"][f"fde_m/{kind}"] == row["fde_m"][kind]
-    assert metrics.keys() == {"all", "synthetic-0", "synthetic-1"}
-    assert (
-        sum(metrics[scene.name]["windows"] for scene in scenes)
-        == metrics["all"]["windows"]
-        == len(windows)
-    )
-    assert row["ade_m"]["best_of_20"] < row["ade_m"]["mean"] < 1.5 * row["ade_m"]["single"]
-
-
 def test_without_noise_in_the_weights_all_samples_of_a_rollout_agree(
     scenes,
 ):
@@ -132,11 +110,6 @@ def test_without_noise_in_the_weights_all_samples_of_a_rollout_agree(
     # headway
     idm = forecasts.idm_forecast(scenes, 8, STRIDE)
     np.testing.assert_allclose(driven["mean"][..., 0], idm[..., 0], atol=1e-3)
-
-
-def test_idm_keeps_the_lateral_position(scenes):
-    course = forecasts.idm_forecast(scenes, 8, STRIDE)
-    np.testing.assert_allclose(course[..., 1], 0.0, atol=1e-5)
 
 
 def course(start_mps: float, acceleration: float, frames: int = 17) -> np.ndarray:
@@ -153,20 +126,6 @@ def test_steady_driving_is_foreseen_by_constant_velocity():
     positions = forecasts.repeated(windows.past[:, -1], 8)
     np.testing.assert_allclose(positions, windows.future, atol=1e-9)
     np.testing.assert_allclose(windows.future[0, :, 0], 2.0 * np.arange(1, 9))
-
-
-def test_metrics_of_rollouts_name_every_scene_and_count_its_vehicles(
-    scenes,
-):
-    config = CalibratedConfig(held_out_horizon=9, held_out_stride=20)
-    metrics = forecasts.rollout_errors(small_generator(EXTRA_INPUTS), scenes, config)
-    assert set(metrics) == {"all", "synthetic-0", "synthetic-1"}
-    assert (
-        metrics["all"]["windows"]
-        == metrics["synthetic-0"]["windows"] + metrics["synthetic-1"]["windows"]
-    )
-    assert metrics["all"]["end_s"] == pytest.approx(0.9)
-    assert metrics["all"]["fde_m/mean"] > metrics["all"]["ade_m/mean"]
 
 
 def test_the_energy_score_is_least_for_the_right_spread():

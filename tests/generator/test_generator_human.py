@@ -26,15 +26,12 @@ from ganlane.generator.human import (
     new_target,
     perceive,
     velocity,
-    with_velocity,
 )
-from ganlane.generator.human_estimator import Estimator, fit_estimator
 from ganlane.generator.human_fit import fit_human, prior_samples
 from ganlane.generator.human_samples import (
     Options,
     cuts,
     samples_of,
-    smooth,
     smooth_scene,
     target_lanes,
 )
@@ -97,14 +94,6 @@ def test_left_and_right_are_alike():
     assert torch.equal(here.sides[:, 0], there.sides[:, 0].flip(1))
 
 
-def test_who_is_not_there_is_not_seen_and_all_inputs_stay_finite():
-    cars = scene({}, {"x": 10.0, "valid": False, "speed": 1e3}, {"x": 2000.0})
-    view = perceive(cars, memory_of(cars), ROAD)
-    assert float(view.gap[0, 0]) == 150.0
-    assert view.features.isfinite().all()
-    assert view.features.abs().max() < 150.0
-
-
 def test_chances_add_up_nobody_changes_to_where_no_lane_is_and_a_change_can_be_broken_off():
     cars = scene({"lane": 2}, {"lane": 0, "x": 50.0}, {"x": 100.0, "lane": 1, "target_lane": 2})
     view = perceive(cars, memory_of(cars), ROAD)
@@ -134,15 +123,6 @@ def test_nobody_rolls_back_brakes_harder_than_a_car_or_steers_off_the_road():
     assert float(aside[0, 2]) == pytest.approx(0.65 / 0.8, abs=1e-5)
     after = moved(cars, acceleration, aside)
     assert (velocity(after)[0] >= 0).all()
-
-
-def test_a_smooth_track_stays_straight_and_loses_half_of_a_wave_at_the_cutoff():
-    line = 3.0 + 1.7 * np.arange(60)
-    assert smooth(line, 0.6) == pytest.approx(line)
-    time_s = 0.1 * np.arange(600)
-    wave = np.sin(2 * np.pi * 0.5 * time_s)
-    inner = slice(100, 500)
-    assert np.ptp(smooth(wave, 0.5)[inner]) == pytest.approx(0.5 * np.ptp(wave[inner]), rel=0.01)
 
 
 def test_a_lane_change_is_meant_from_where_the_driver_sets_out():
@@ -175,32 +155,6 @@ def test_teacher_samples_of_steady_driving_ask_for_no_change():
     assert not (samples.begins == 1).any()
 
 
-def test_closed_loop_samples_lead_back_to_the_recording():
-    random = torch.Generator().manual_seed(0)
-    options = Options(policy(), samples=2, vary=False, blind=0.0)
-    samples = samples_of(cuts([steady()], 10, 10), options, random)
-    # An untrained policy strays, and is asked to turn back.
-    assert samples.change.abs().mean() > 0.1
-    assert samples.change.isfinite().all()
-
-
-def test_the_estimator_sees_through_noise(monkeypatch):
-    monkeypatch.setattr(human_estimator, "UPDATES", 400)
-    random = torch.Generator().manual_seed(0)
-    torch.manual_seed(0)
-    noise = np.random.default_rng(0).normal(0.0, 0.1, (140, 6))
-    speeds = np.array([8.0, 12.0, 15.0, 18.0, 22.0, 25.0])
-    x = 0.1 * speeds * np.arange(140)[:, None] + noise
-    smoothed = smooth_scene(made_by_hand(x, y=np.zeros_like(x)), 0.6, 0.4)
-    estimator = Estimator()
-    fit_estimator(estimator, [smoothed], random)
-    nine = np.stack([x[60:69].T, np.zeros((6, 9))], -1)
-    positions = torch.tensor(nine - nine[:, -1:], dtype=FLOAT)
-    speed = estimator(positions)[:, 0].numpy()
-    last = (x[68] - x[67]) / 0.1
-    assert np.abs(speed - speeds).mean() < 0.5 * np.abs(last - speeds).mean()
-
-
 def test_accidents_the_edge_and_standing_cost():
     apart = scene({}, {"x": 60.0})
     free = torch.full((1, 2), 150.0)
@@ -222,12 +176,6 @@ def test_where_recordings_are_silent_the_prior_brakes_and_keeps_out_of_danger():
     assert samples.features.isfinite().all()
     assert len(danger) > 100
     assert samples.change.min() < -4.0
-
-
-def test_tokens_of_who_stands_do_not_turn_it():
-    cars = scene({"speed": 0.0})
-    after = with_velocity(cars, torch.zeros(1, 1), torch.ones(1, 1))
-    assert after.speed.item() == after.heading.item() == 0.0
 
 
 SMALL = {"epochs": 2, "rounds": 1, "tuning": 2, "samples": 2, "observing": 20}

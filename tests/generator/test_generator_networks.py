@@ -7,7 +7,6 @@ from torch import nn
 
 from ganlane.generator import networks
 from ganlane.generator.closed_loop import push, recorded, start
-from ganlane.linear import ONEDNN
 
 
 @pytest.fixture
@@ -59,19 +58,6 @@ def test_it_is_a_linear_layer_for_few_rows_and_for_many(shape, relu):
         )
 
 
-@pytest.mark.skipif(not ONEDNN, reason="this torch was built without oneDNN")
-def test_many_rows_go_to_onednn_which_has_no_gradient(monkeypatch):
-    rows = []
-    monkeypatch.setattr(networks, "matrix_product", lambda x, *rest: rows.append(len(x)))
-    layer = nn.Linear(5, 7)
-    with torch.no_grad():
-        networks.apply(layer, torch.randn(700, 5))
-        networks.apply(layer, torch.randn(7, 5))
-    networks.apply(layer, torch.randn(700, 5)).sum().backward()
-    assert rows == [700]
-    assert layer.weight.grad.abs().sum() > 0
-
-
 def test_the_recurrence_is_torchs_own_lstm():
     torch.manual_seed(2)
     lstm = networks.MotionLSTM(5, 7)
@@ -118,31 +104,6 @@ def test_pooling_ignores_padding(pooled, count):
     )
 
 
-def test_the_split_first_layer_equals_the_whole_one(pooled):
-    pooling, (hidden, position, motion, mask) = pooled
-    index, seen = networks.nearest(position, mask, 8)
-    state = torch.cat(
-        [
-            position / torch.tensor([20.0, 4.0]),
-            motion / torch.tensor([0.4, 0.05]),
-        ],
-        dim=-1,
-    )
-    pairs = networks.gather_vehicles(state, index) - state[..., None, :]
-    whole = nn.Linear(4 + 12, 10)
-    with torch.no_grad():
-        whole.weight.copy_(
-            torch.cat(
-                [pooling.per_pair.weight, pooling.per_vehicle.weight],
-                dim=1,
-            )
-        )
-        whole.bias.copy_(pooling.per_pair.bias)
-    first = torch.relu(whole(torch.cat([pairs, networks.gather_vehicles(hidden, index)], dim=-1)))
-    expected = torch.relu(pooling.second(first)).masked_fill(~seen[..., None], 0.0).amax(-2)
-    torch.testing.assert_close(pooling(hidden, position, motion, mask), expected)
-
-
 def test_the_nearest_are_found_as_by_sorting(scene):
     _, position, mask = scene
     index, seen = networks.nearest(position, mask, 8)
@@ -151,14 +112,6 @@ def test_the_nearest_are_found_as_by_sorting(scene):
             others = [j for j in range(13) if j != vehicle and mask[row, j]]
             others.sort(key=lambda j: float((position[row, j] - position[row, vehicle]).norm()))
             assert set(index[row, vehicle][seen[row, vehicle]].tolist()) == set(others[:8])
-
-
-def test_a_few_vehicles_are_all_each_others_neighbours(scene):
-    _, position, mask = (part[:, :9] for part in scene)
-    index, seen = networks.nearest(position, mask, 8)
-    assert index is None
-    assert (seen.sum(-1) < mask.sum(-1, keepdim=True))[mask].all()
-    assert seen[1, 0].tolist() == [False] + [True] * 6 + [False] * 2
 
 
 def test_vehicles_out_of_range_have_no_influence():
@@ -175,16 +128,6 @@ def test_vehicles_out_of_range_have_no_influence():
     assert seen[0, 0].tolist() == [False, False, True]
 
 
-def test_a_recorded_jump_is_cut_off_before_it_reaches_the_network():
-    jump = torch.tensor([1.5, 0.0])
-    cut = torch.tensor([5.0 * networks.DIFFERENCE_SCALE_M[0], 0.0])
-    same = torch.zeros(2)
-    torch.testing.assert_close(
-        networks.motion_features(same, jump),
-        networks.motion_features(same, cut),
-    )
-
-
 def test_with_a_head_of_zeros_the_prediction_is_constant_velocity(scene, generator, now):
     displacements = scene[0]
     predicted = silenced(generator)(now, torch.randn(3, 13, 4))
@@ -198,11 +141,6 @@ def test_the_first_k_decoder_steps_are_those_of_the_whole(generator, now, execut
         generator(now, noise, execute_k),
         generator(now, noise)[..., :execute_k, :],
     )
-
-
-def test_samples_share_one_context(generator, now):
-    noise = torch.randn(5, 3, 13, 4)
-    torch.testing.assert_close(generator(now, noise)[3], generator(now, noise[3]))
 
 
 def test_kept_projections_equal_those_computed_anew(generator):

@@ -75,25 +75,6 @@ def test_the_calibrated_loss_falls(scenes):
     assert sum(losses[-5:]) < sum(losses[:5])
 
 
-def test_the_learning_rate_rises_and_then_falls_to_nothing():
-    config = LoopConfig(updates=100, warmup=10, learning_rate=1e-2)
-    rates = [tasks.learning_rate(config, number) for number in range(100)]
-    assert rates[0] < rates[5] < rates[9]
-    assert rates[10:] == sorted(rates[10:], reverse=True)
-    assert rates[-1] < 1e-5
-
-
-def test_distances_are_euclidean_accumulate_and_have_a_finite_gradient_at_0():
-    predicted = torch.tensor([[[3.0, 4.0], [0.0, 0.0], [3.0, 4.0]]])
-    torch.testing.assert_close(
-        tasks.distances(predicted, torch.zeros(1, 3, 2)),
-        torch.tensor([[5.0, 5.0, 10.0]]),
-    )
-    perfect = torch.zeros(1, 8, 2, requires_grad=True)
-    tasks.distances(perfect, torch.zeros(1, 8, 2)).sum().backward()
-    assert perfect.grad.isfinite().all()
-
-
 def test_losses_by_hand():
     # What is masked does not count.
     values = torch.tensor([[1.0, 100.0]])

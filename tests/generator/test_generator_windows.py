@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import polars as pl
 import pytest
@@ -12,7 +10,6 @@ from reference.small_networks import recorded_scenes
 
 from ganlane.data import SCHEMA
 from ganlane.errors import UserError
-from ganlane.generator.forecasts import distance
 from ganlane.generator.windows import (
     PRESENT,
     WINDOW_FRAMES,
@@ -67,14 +64,6 @@ def windows():
     return cut_windows(scene_tracks(recording()))
 
 
-def test_tracks_go_on_at_constant_velocity_beyond_their_ends(scenes):
-    present = np.array([False, False, True, True, True, False])[:, None]
-    positions = np.zeros((6, 1, 2))
-    positions[2:5, 0, 0] = [10.0, 11.0, 13.0]
-    endless = replace(scenes[0], positions=positions, present=present).endless_positions
-    np.testing.assert_allclose(endless[:, 0, 0], [8, 9, 10, 11, 13, 15])
-
-
 def test_a_changer_intends_its_new_lane_two_seconds_before_it_is_there(
     scenes,
 ):
@@ -92,24 +81,6 @@ def test_cut_segments_show_the_recorded_positions(scenes):
     shown = segments.positions[1].numpy()
     np.testing.assert_allclose(np.diff(shown, axis=0), np.diff(recorded, axis=0), atol=1e-4)
     np.testing.assert_allclose(shown[..., 1], recorded[..., 1], atol=1e-5)
-
-
-def test_mirroring_twice_changes_nothing_and_once_swaps_the_lanes(
-    scenes,
-):
-    segments = cut_segments([(scenes[0], 0)], horizon=4)
-    once = segments.mirrored()
-    torch.testing.assert_close(once.mirrored().positions, segments.positions, atol=1e-5, rtol=0)
-    assert (once.target_lane == 2 - segments.target_lane).all()
-    torch.testing.assert_close(once.positions[..., 1], 2 * 3.5 - segments.positions[..., 1])
-
-
-def test_constant_velocity_errs_as_worked_by_hand(scenes):
-    segments = cut_segments([(scenes[0], 0)], horizon=4)
-    course = segments.positions[0, :, 3]
-    expected = (course[8] + 3 * (course[8] - course[7]) - course[11]).norm()
-    errors = distance(segments.constant_velocity, segments.future)
-    assert errors[0, 2, 3].item() == pytest.approx(expected.item(), abs=1e-3)
 
 
 def brute_force_windows(frame: pl.DataFrame, stride: int) -> dict[tuple[str, int, int], np.ndarray]:

@@ -27,7 +27,6 @@ from ganlane.settings.env import EnvConfig
 from ganlane.settings.generator import EXTRA_INPUTS, GENERATOR, GeneratorSizes, HumanSizes
 from ganlane.settings.record import make
 from ganlane.settings.traffic import TrafficConfig
-from ganlane.sim.state import Road
 from ganlane.weights import load_weights, save_weights
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason="no C++ compiler")
@@ -331,11 +330,3 @@ def test_numbers_never_become_denormal():
         if array.dtype == np.float32:
             denormal = (array != 0) & (np.abs(array) < smallest)
             assert not denormal.any(), name
-
-
-def test_the_road_may_have_any_width():
-    env = random_highway(random.Random(0), "gan_calibrated", 4)
-    kernel = kernel_of(env)
-    assert kernel.decide(torch.zeros(4, dtype=torch.int64), env.reset()).batch_size == (4,)
-    wide = Kernel(Road(2, 5.0), env.vehicles, drivers=env.traffic.native_drivers())
-    assert wide.decide(torch.zeros(4, dtype=torch.int64), env.reset()).batch_size == (4,)

@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 
@@ -200,15 +199,6 @@ def test_a_library_that_cannot_be_loaded_from_the_cache_is_loaded_from_elsewhere
 
 
 @needs_compiler
-def test_a_user_without_a_home_has_no_cache(monkeypatch, compiler, plain):
-    compiler(WORKS, plain)
-    for name in ("GANLANE_CACHE", "XDG_CACHE_HOME"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(Path, "home", Mock(side_effect=RuntimeError("no home")))
-    assert library.find().troubles == ()
-
-
-@needs_compiler
 @pytest.mark.slow
 def test_processes_that_build_at_once_do_not_disturb_each_other():
     script = "from ganlane.native import library; library.load('default'); print('loaded')"
@@ -304,11 +294,3 @@ def test_a_wheel_whose_compiler_fails_has_no_kernel(tmp_path, compiler):
     paths, troubles = library.build_all(tmp_path / "wheel")
     assert paths == []
     assert "failed for default (x.cpp:1: error: it is full of stars)" in troubles[-1]
-
-
-def test_the_library_of_another_versions_sources_is_not_taken(monkeypatch, tmp_path):
-    ours = library._prebuilt("default")
-    other = tmp_path / "other.cpp"
-    other.write_text("other")
-    monkeypatch.setattr(library, "SOURCES", (other,))
-    assert library._prebuilt("default").name != ours.name

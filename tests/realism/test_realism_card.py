@@ -27,9 +27,7 @@ from ganlane.realism.measures import (
 )
 from ganlane.realism.sheets import (
     checks_text,
-    draw_distances,
     draw_distributions,
-    draw_speeds_over_time,
     long_table,
 )
 from ganlane.realism.starts import simulate
@@ -209,65 +207,3 @@ def row(distance, **against):
         **scale,
         "against": against,
     }
-
-
-def test_every_traffic_has_its_dot_and_interval_at_its_distance():
-    rival = {"distance": 0.75, "distance_ci": None}
-    figure = draw_distances(
-        {
-            "speed": row(0.25, rule=rival),
-            "gap": row(0.4, rule=rival),
-        },
-        "my.module.Mine",
-    )
-    (axes,) = figure.axes
-    interval, dot, *below = in_colour(axes, COLOURS[0])
-    assert interval.get_xdata() == pytest.approx([0.15, 0.35])
-    assert dot.get_xdata() == [0.25]
-    assert below[1].get_ydata()[0] > dot.get_ydata()[0]
-    assert [line.get_xdata()[0] for line in in_colour(axes, COLOURS[1])] == [0.75] * 4
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["speed", "gap"]
-    names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert names == [
-        "Mine",
-        "rule",
-        "half against half",
-        "random",
-    ]
-
-
-def test_the_ends_of_the_scale_are_upright_lines_and_what_is_not_known_has_no_mark():
-    (axes,) = draw_distances({"speed": row(0.5)}, "mine").axes
-    assert [lines.get_segments()[0][:, 0].tolist() for lines in axes.collections] == [
-        [0.1, 0.1],
-        [0.9, 0.9],
-    ]
-    nothing = {
-        **row(0.5),
-        "distance": None,
-        "distance_ci": None,
-        "ceiling": None,
-        "floor": None,
-    }
-    (axes,) = draw_distances({"lane_change_duration": nothing}, "mine").axes
-    assert in_colour(axes, COLOURS[0]) == []
-    assert len(axes.collections) == 0
-
-
-def test_drift_is_drawn_over_time_with_a_gap_where_nobody_was_left():
-    at = {
-        "10 s": (20.0, 2.0),
-        "60 s": (None, None),
-        "300 s": (22.0, 3.0),
-        "5000 m": (21.0, 2.5),
-    }
-    speeds = {
-        time: dict(zip(("mean_speed_mps", "spread_mps"), values)) for time, values in at.items()
-    }
-    figure = draw_speeds_over_time([{"vehicles": 9, "speeds": speeds}], spread_mps=2.8)
-    mean, spread = figure.axes
-    (line,) = in_colour(mean, COLOURS[0])
-    assert line.get_xdata().tolist() == [10.0, 60.0, 300.0]
-    assert line.get_ydata() == pytest.approx([20.0, np.nan, 22.0], nan_ok=True)
-    (level,) = in_colour(spread, INK)
-    assert set(level.get_ydata()) == {2.8}

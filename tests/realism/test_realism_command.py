@@ -299,21 +299,3 @@ def test_one_scene_is_refused_with_what_to_do_and_driven_whole_when_asked(record
     for part in ("one scene, synthetic-1", "scenes=all", "scene_s=30"):
         assert part in err
     assert run(capsys, "traffic=idm", f"data.path={recordings}", "scenes=all")[0] == 0
-
-
-@pytest.mark.slow
-def test_nothing_is_held_out_of_recordings_that_nothing_was_fitted_to(recordings, capsys):
-    # quick=true takes desired speeds as they are, and the shipped generator was fitted to other
-    # scenes.
-    asked = [
-        "traffic=gan_calibrated",
-        f"data.path={recordings}",
-        "scenes=all",
-        "against=[idm]",
-        "vehicle_km=0",
-    ]
-    status, results, out, _ = run(capsys, *asked)
-    assert status == 0
-    assert results["quantities_held_out"] is None
-    assert results["held_out"] == [[]]
-    assert "held-out" not in out

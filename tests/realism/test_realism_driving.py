@@ -20,7 +20,6 @@ from ganlane.realism.driving import (
     drive_recordings,
     with_recorded_headways,
 )
-from ganlane.realism.starts import simulate
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import IdmMobilTraffic, TrafficModule
 from ganlane.traffic.presets import (
@@ -128,21 +127,6 @@ def test_index_0_is_nobody_and_models_see_desired_speeds_above_the_speed_at_entr
     assert excess.mean() == pytest.approx(3.0, abs=0.5)
 
 
-def test_repeats_differ_and_the_same_seed_repeats_them():
-    runs = [
-        drive_recordings(
-            RandomDriving,
-            [steady()],
-            StartOptions(repeats=2, seed=seed),
-        )
-        for seed in (0, 0, 1)
-    ]
-    assert runs[0].equals(runs[1])
-    assert not runs[0].equals(runs[2])
-    one, other = (runs[0].filter(pl.col("scene") == f"steady#{number}")["x"] for number in (0, 1))
-    assert not one.equals(other)
-
-
 @pytest.mark.parametrize(
     "make",
     [
@@ -162,13 +146,6 @@ def test_every_traffic_stays_finite_from_recorded_starts(
     )
     assert all(there[name].is_finite().all() for name in ("x", "y"))
     assert there["lane"].is_between(0, 2).all()
-
-
-def test_the_floor_drives_neither_backwards_nor_smoothly():
-    # Twenty repeats, for quantiles of ten seconds.
-    there = simulate(RandomDriving, [steady()], StartOptions(repeats=20))
-    assert there.quantiles["acceleration"]["0.95"] > 1.0
-    assert there.quantiles["speed"]["0.05"] >= 0.0
 
 
 ROAD = Road()

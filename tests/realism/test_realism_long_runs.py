@@ -86,19 +86,6 @@ def test_blind_driving_overlaps_and_careful_driving_does_not():
     )
 
 
-def test_the_same_numbers_come_out_again_and_others_of_another_seed():
-    runs = [
-        long_run(
-            RandomDriving,
-            Road(),
-            LongRunParameters(6, 1.0, 20.0, seed=seed),
-        )
-        for seed in (0, 0, 1)
-    ]
-    assert runs[0] == runs[1]
-    assert runs[0] != runs[2]
-
-
 def test_totals_add_counts_up_and_know_nothing_of_nothing():
     runs = [
         long_run(

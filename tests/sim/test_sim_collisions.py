@@ -7,11 +7,9 @@ import math
 import pytest
 import torch
 from reference import scalar
-from reference.worlds import DOUBLE, drawing, vehicles
+from reference.worlds import drawing, vehicles
 
 from ganlane.sim.collisions import boxes_overlap, dangerously_close, ego_overlaps, pair_overlaps
-
-GRID_M = 0.08
 
 
 def random_pairs(count: int) -> tuple[torch.Tensor, ...]:
@@ -22,55 +20,6 @@ def random_pairs(count: int) -> tuple[torch.Tensor, ...]:
     one = between(*angle), *(between(*size) for size in sizes)
     other = between(*angle), *(between(*size) for size in sizes)
     return between(-6, 6), between(-6, 6), *one, *other
-
-
-def a_point_in_both(
-    dx, dy, heading, length, width, other_heading, other_length, other_width
-) -> bool:
-    """Whether a point of a fine grid on the first box lies in the other one."""
-    along = torch.linspace(-0.5, 0.5, math.ceil(length / GRID_M) + 1, dtype=DOUBLE) * length
-    across = torch.linspace(-0.5, 0.5, math.ceil(width / GRID_M) + 1, dtype=DOUBLE) * width
-    a, b = torch.meshgrid(along, across, indexing="ij")
-    x = a * math.cos(heading) - b * math.sin(heading) - dx
-    y = a * math.sin(heading) + b * math.cos(heading) - dy
-    c = math.cos(other_heading)
-    s = math.sin(other_heading)
-    inside = ((x * c + y * s).abs() < other_length / 2) & ((y * c - x * s).abs() < other_width / 2)
-    return bool(inside.any())
-
-
-def test_boxes_overlap_where_a_sampler_finds_a_common_point():
-    """A sampled point proves an overlap.
-
-    One that is left after both boxes shrink is deep enough to be sampled.
-    """
-    pairs = random_pairs(600)
-    dx, dy, heading, length, width, other_heading, other_length, other_width = pairs
-    sampled = torch.tensor(
-        [a_point_in_both(*(value.item() for value in pair)) for pair in zip(*pairs)]
-    )
-    said = boxes_overlap(*pairs)
-    shrunk = boxes_overlap(
-        dx,
-        dy,
-        heading,
-        length - 0.3,
-        width - 0.3,
-        other_heading,
-        other_length - 0.3,
-        other_width - 0.3,
-    )
-    assert (sampled & ~said).sum() == 0
-    assert (shrunk & ~sampled).sum() == 0
-    assert 100 < sampled.sum() < 500
-    assert (said != shrunk).sum() < 60  # few are too close to call
-
-
-def test_overlap_is_the_same_from_either_side():
-    dx, dy, *boxes = random_pairs(600)
-    assert torch.equal(
-        boxes_overlap(dx, dy, *boxes), boxes_overlap(-dx, -dy, *boxes[3:], *boxes[:3])
-    )
 
 
 def test_overlap_agrees_with_the_corners_of_the_scalar_simulator():

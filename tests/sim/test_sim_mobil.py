@@ -12,9 +12,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from reference import scalar
 from reference.worlds import DOUBLE, drawing, moves, random_scenes, vehicles, vehicles_at
 
 from ganlane import keys
@@ -109,32 +106,6 @@ def test_nobody_changes_where_it_would_have_to_brake_too_hard_itself():
     assert wish(SUBJECT, wall, other) == 0
 
 
-def test_nobody_changes_into_a_car_alongside_or_off_the_road():
-    assert wish(SUBJECT, SLOW, {"x": 2.0, "lane": 1}) == 0
-    assert wish(SUBJECT, SLOW, {"x": -2.0, "lane": 1}) == 0
-    assert wish(SUBJECT, SLOW, lanes=1) == 0
-
-
-def test_of_two_lanes_that_pay_the_better_is_taken_and_the_left_one_at_a_tie():
-    middle = {**SUBJECT, "lane": 1}
-    slow = {**SLOW, "lane": 1}
-    assert wish(middle, slow, lanes=3) == 1
-    assert wish(middle, slow, {"x": 90.0, "lane": 2, "speed": 18.0}, lanes=3) == -1
-
-
-def test_in_the_middle_of_a_change_nobody_wishes_for_another():
-    assert wish({**SUBJECT, "y": 0.29}, SLOW) == 1
-    assert wish({**SUBJECT, "y": 0.31}, SLOW) == 0
-
-
-def test_a_signalled_change_keeps_others_out_of_the_gap_and_one_seen_by_its_body_does_not():
-    coming = {"x": 3.0, "y": 8.0, "target_lane": 1}
-    middle = {**SUBJECT, "lane": 0}
-    slow = SLOW
-    assert wish(middle, slow, {**coming, "visibility": 2}, lanes=3) == 0
-    assert wish(middle, slow, {**coming, "visibility": 1}, lanes=3) == 1
-
-
 # One vehicle per gap. The ego (index 0) stands far away.
 
 FAR_EGO = {"x": 5000.0, "lane": 0, "speed": 25.0}
@@ -175,39 +146,6 @@ def test_a_gap_that_is_safe_for_a_car_may_not_be_so_for_a_lorry(length, safe):
 
 
 # The promise, at the decision
-
-
-@settings(max_examples=80)
-@given(
-    seed=st.integers(0, 2**31),
-    lanes=st.integers(2, 6),
-    cars=st.integers(3, 20),
-    mobil=st.sampled_from([TABLE_IV, SELFISH]),
-)
-def test_at_its_decision_mobil_asks_no_more_than_b_safe_of_the_new_follower(
-    seed, lanes, cars, mobil
-):
-    """Against the scalar simulator's idea of who the new follower is and what it is asked for.
-
-    Seen in any way.
-    """
-    road = Road(lanes)
-    scene = random_scenes(20, cars, lanes, seed)
-    generator = torch.Generator().manual_seed(seed)
-    scene = scene.with_(
-        visibility=torch.randint(0, 3, scene.x.shape, generator=generator),
-        valid=torch.rand(scene.x.shape, generator=generator) < 0.9,
-    )
-    change = mobil_changes(perceive(scene, road), road, mobil=mobil)
-    for row, car in change.nonzero().tolist():
-        fields = [
-            dict(zip(scene._fields, car)) for car in zip(*(value[row].tolist() for value in scene))
-        ]
-        view = scalar.View([scalar.Car(**numbers) for numbers in fields], scalar.Rules(lanes=lanes))
-        lane = view.cars[car].target_lane + change[row, car].item()
-        follower = view.follower(car, lane)
-        assert follower is None or view.acceleration(follower, car) >= -B_SAFE - 1e-9
-        assert view.acceleration(car, view.leader(car, lane)) >= -B_SAFE - 1e-9
 
 
 def new_demands(
@@ -352,11 +290,3 @@ def test_nor_is_the_new_follower_asked_for_more_than_b_safe_while_the_one_ahead_
     hard = film[0] < -0.75 * B_SAFE
     assert hard.sum() > 100
     assert (film[1:, hard] > film[0, hard]).all()
-
-
-def test_it_is_asked_for_more_where_the_one_ahead_brakes_or_where_b_safe_is_another():
-    film = demands(merges(rows=4000, seed=3), seconds=8.0, braking=8.0)
-    assert film[0].min() >= -B_SAFE
-    assert film.min() < -1.5 * B_SAFE, film.min()
-    bold = replace(SELFISH, safe_deceleration=2.0 * B_SAFE)
-    assert demand(merges(rows=4000, seed=3, mobil=bold)).min() < -B_SAFE

@@ -13,8 +13,6 @@ from reference.worlds import DOUBLE, drawing, vehicles, vehicles_at
 
 from ganlane.settings.driving import Visibility
 from ganlane.sim import neighbours
-from ganlane.sim.idm import TABLE_V
-from ganlane.sim.mobil import TABLE_IV, _gives_way, one_at_a_time
 from ganlane.sim.neighbours import FREE_GAP_M, follower, leader, perceive
 from ganlane.sim.state import Road, Vehicles
 
@@ -51,29 +49,6 @@ def test_leader_and_follower_are_the_nearest_in_the_lane_asked_for():
     assert not follower(seen, lane(0.0, scene)).exists[0, 0]
 
 
-def test_an_empty_lane_is_free_for_ten_kilometres_and_moves_with_the_driver():
-    scene = vehicles({"x": 0.0, "lane": 1, "speed": 17.0}, {"x": 5.0, "lane": 0})
-    ahead = leader(perceive(scene, ROAD), lane(2.0, scene))
-    assert (ahead.gap[0, 0], ahead.speed[0, 0]) == (FREE_GAP_M, 17.0)
-
-
-def test_an_invalid_car_is_nobodys_leader():
-    scene = vehicles(
-        {"x": 0.0, "lane": 1}, {"x": 10.0, "lane": 1, "valid": False}, {"x": 50.0, "lane": 1}
-    )
-    assert leader(perceive(scene, ROAD), lane(1.0, scene)).gap[0, 0] == 45.5
-
-
-def test_side_by_side_in_two_lanes_the_one_of_lower_index_is_ahead():
-    """So that of two who would enter one gap exactly one gives way."""
-    scene = vehicles({"x": 0.0, "lane": 0}, {"x": 0.0, "lane": 0})
-    seen = perceive(scene, ROAD)
-    ahead = leader(seen, lane(0.0, scene))
-    behind = follower(seen, lane(0.0, scene))
-    assert ahead.gap[0].tolist() == [FREE_GAP_M, -4.5]
-    assert behind.gap[0].tolist() == [-4.5, FREE_GAP_M]
-
-
 def test_followers_keep_off_the_rear_of_a_lorry_and_not_off_its_middle():
     """Centres 30 m apart, so 21.75 m are free.
 
@@ -81,19 +56,6 @@ def test_followers_keep_off_the_rear_of_a_lorry_and_not_off_its_middle():
     """
     scene = perceive(vehicles({"x": 0.0}, {"x": 30.0, "length": 12.0}, {"x": 60.0}), ROAD)
     assert leader(scene, scene.body.low).gap[0, :2].tolist() == pytest.approx([21.75, 21.75])
-
-
-def test_the_view_of_the_ego_alone_is_the_first_row_of_everybodys():
-    generator = torch.Generator().manual_seed(3)
-    scene = vehicles(*({"x": 10.0 * k, "lane": k % 3} for k in (3, 0, 1, 2, 4, 5)))
-    scene = scene.with_(y=scene.y + torch.randn(scene.y.shape, generator=generator, dtype=DOUBLE))
-    all_of_them = perceive(scene, ROAD)
-    ego = perceive(scene, ROAD, slice(0, 1))
-    for number in range(3):
-        whole = leader(all_of_them, lane(number, scene))
-        alone = leader(ego, torch.full((1, 1), float(number)))
-        assert torch.equal(whole.gap[:, :1], alone.gap)
-        assert torch.equal(whole.speed[:, :1], alone.speed)
 
 
 # Any scene
@@ -178,17 +140,3 @@ def test_on_a_ring_the_first_has_the_last_as_its_leader():
     near = around[:, 0] < 145.0
     assert near.any()
     assert torch.equal(gap.gather(1, first)[near], around[near])
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_among_the_few_who_wish_the_same_give_way_as_among_all(seed):
-    vehicles = scenes(20, 3, seed, grid_m=0.25, dtype=torch.float32)
-    wish = torch.randint(-1, 2, (ROWS, 20), generator=torch.Generator().manual_seed(seed)) * (
-        vehicles.speed > 20
-    )
-    granted = one_at_a_time(perceive(vehicles, ROAD), wish)
-    assert torch.equal(
-        granted, torch.where(_gives_way(vehicles, ROAD, wish, TABLE_V, TABLE_IV), 0, wish)
-    )
-    assert (granted != wish).any()
-    assert (granted != 0).any()

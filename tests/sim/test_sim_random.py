@@ -81,16 +81,6 @@ def test_numbers_are_uniform_along_every_field():
     assert by_episode.max() < 1.0
 
 
-def test_neighbours_in_any_field_are_independent():
-    """Pairs fill 16 x 16 bins evenly."""
-    u = uniform(keys(20_000), 3, 2, [0, 1], torch.float64)
-    after = uniform(keys(20_000), 4, 1, [0], torch.float64)[:, 0, 0]
-    first = u[:, 0, 0]
-    for other in (u[:, 1, 0], u[:, 0, 1], u[:, 0, 0].roll(1), after):
-        pair = ((first * 16).long() * 16 + (other * 16).long() + 0.5) / 256
-        assert abs(chi_square(pair, 256)) < 4.5
-
-
 def test_no_two_places_share_a_number():
     """All of a block of (stream, seed, episode, step, vehicle, purpose), the fields' values
     overlapping.
@@ -102,18 +92,6 @@ def test_no_two_places_share_a_number():
         seen.append(draw_keys(key, step, 6, list(range(6))).flatten())
     seen = torch.cat(seen)
     assert seen.unique().numel() == seen.numel() == 3 * 6**5
-
-
-def test_a_million_episodes_have_a_million_keys():
-    assert keys(1_000_000).unique().numel() == 1_000_000
-
-
-def test_workers_and_seeds_far_apart_do_not_meet():
-    episodes = torch.cat([w * 2**40 + torch.arange(1000) for w in range(50)])
-    both = torch.cat(
-        [episode_key(0, torch.full_like(episodes, seed), episodes) for seed in (0, 1, 2**40, 2**62)]
-    )
-    assert both.unique().numel() == both.numel()
 
 
 def test_float32_and_float64_numbers_agree_to_24_bits():

@@ -17,13 +17,10 @@ from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.idm import idm_acceleration
 from ganlane.sim.state import (
     ARRIVED_M,
-    LaneRange,
     Road,
     Vehicles,
     body_lanes,
-    lane_change_done,
     presence,
-    spanned,
     with_target,
 )
 from ganlane.traffic.idm_mobil import IdmTraffic
@@ -80,22 +77,6 @@ def test_a_signalled_car_is_in_its_target_lane_from_the_command_on():
     assert seen_in(y=4.0, target_lane=0, visibility=Visibility.SIGNALLED) == (0, 1)
 
 
-def test_an_invalid_car_is_nowhere():
-    low, high = seen_in(lane=1, valid=False)
-    assert low > high
-
-
-def test_a_change_is_complete_within_0_3_m_of_the_centre():
-    scene = vehicles(*({"x": 0.0, "y": y, "target_lane": 1} for y in (3.69, 3.71, 4.29, 4.31)))
-    assert lane_change_done(scene, ROAD).tolist() == [[False, True, True, False]]
-
-
-def test_the_lanes_of_a_range_are_its_ends_and_the_one_after_the_lowest():
-    low = torch.tensor([1.0, 1.0, 1.0])
-    high = torch.tensor([1.0, 2.0, 3.0])
-    assert spanned(LaneRange(low, high)).tolist() == [[1, 1, 1], [1, 2, 2], [1, 2, 3]]
-
-
 # The road
 
 
@@ -104,11 +85,6 @@ def test_lane_zero_is_the_rightmost_and_lanes_end_at_the_edges():
     assert ROAD.lane_of(y).tolist() == [0, 0, 0, 1, 2, 2]
     assert ROAD.centre_of(torch.tensor([0, 1, 2])).tolist() == [0.0, 4.0, 8.0]
     assert (ROAD.right_edge_m(), ROAD.left_edge_m()) == (-2.0, 10.0)
-
-
-def test_every_row_may_have_a_road_of_its_own():
-    road = Road(lanes=torch.tensor([[1], [4]]), lane_width_m=torch.tensor([[3.0], [4.0]]))
-    assert road.lane_of(torch.tensor([[6.1], [6.1]])).tolist() == [[0.0], [2.0]]
 
 
 def test_on_a_ring_distances_take_the_nearer_way_round():

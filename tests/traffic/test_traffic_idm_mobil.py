@@ -21,71 +21,17 @@ from reference.worlds import (
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
-from ganlane.settings.driving import MobilParameters, RandomDrivers
+from ganlane.settings.driving import RandomDrivers
 from ganlane.settings.traffic import IdmRandomTrafficConfig
 from ganlane.sim import Road, SpawnParameters, Vehicles
 from ganlane.traffic import (
     IdmMobilTraffic,
     IdmRandomTraffic,
-    IdmTraffic,
-    TrafficModule,
 )
 from ganlane.traffic.idm_mobil import DriverParams, start_braking
 
 ROAD = Road(lanes=2)
 EGO = {"x": -1000.0, "lane": 0}
-# The second car wants to overtake the third. (With Table IV the third would politely move aside.)
-SELFISH = IdmMobilTraffic(
-    ROAD,
-    mobil=MobilParameters(politeness_rear=0.0, politeness_side=0.0),
-)
-CARS = (
-    EGO,
-    {"x": 0.0, "lane": 0, "speed": 20.0},
-    {"x": 54.5, "lane": 0, "speed": 15.0, "desired_speed": 15.0},
-)
-
-
-def move(traffic: TrafficModule, scene: Vehicles, step: int | list[int] = 0) -> Vehicles:
-    rows = scene.x.shape[0]
-    zero = torch.zeros(rows, dtype=torch.int64)
-    return traffic.move(
-        scene,
-        traffic.fresh_memory(scene, zero),
-        zero,
-        torch.as_tensor(step).expand(rows),
-    )[0]
-
-
-@pytest.mark.parametrize(
-    ("traffic", "step", "target"),
-    [
-        (IdmTraffic(ROAD), 0, [0, 0, 0]),
-        (SELFISH, 0, [0, 1, 0]),
-        (SELFISH, 20, [0, 1, 0]),
-        # MOBIL decides only when a second is full.
-        *((SELFISH, step, [0, 0, 0]) for step in (1, 5, 9, 11)),
-        # A polite slow driver moves aside for the one behind.
-        (IdmMobilTraffic(ROAD), 0, [0, 0, 1]),
-    ],
-)
-def test_mobil_changes_lanes_at_full_seconds_and_idm_alone_does_not(traffic, step, target):
-    assert move(traffic, vehicles(*CARS), step).target_lane.tolist() == [target]
-
-
-def test_everybody_reacts_to_the_state_at_t_and_to_nothing_later():
-    """The leader brakes hard in this step; its follower's acceleration does not know yet."""
-    cars = (
-        EGO,
-        {"x": 0.0, "lane": 0},
-        {"x": 50.0, "lane": 0, "speed": 20.0},
-    )
-    wall = {"x": 65.0, "lane": 0, "speed": 0.0}
-    calm, braking = (
-        move(IdmTraffic(ROAD), scene) for scene in (vehicles(*cars), vehicles(*cars, wall))
-    )
-    assert braking.acceleration[0, 2] < -5.0
-    assert calm.acceleration[0, 1] == braking.acceleration[0, 1]
 
 
 # Random drivers

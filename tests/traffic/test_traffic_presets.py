@@ -10,11 +10,10 @@ import torch
 from reference.foreign import drive, start
 
 from ganlane import keys
-from ganlane.data import DrivingStatistics
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.generator import shipped_generator
-from ganlane.native.drivers import SIMULATED_ANCHOR, sudden_accelerations
+from ganlane.native.drivers import SIMULATED_ANCHOR
 from ganlane.sim import Road, Vehicles, pair_overlaps
 from ganlane.sim.state import lateral_half_extent
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
@@ -190,23 +189,3 @@ def test_the_shipped_weights_and_older_ones_that_name_no_washout_drive_with_the_
 def test_weights_of_a_fit_that_this_traffic_cannot_have_are_refused(tmp_path, settings, told):
     with pytest.raises(UserError, match=told):
         gan_calibrated_traffic(path=fitted_with(tmp_path, **settings))
-
-
-@pytest.mark.parametrize(
-    ("recorded", "driven"),
-    [
-        ((0.0, 0.0), (0.0, 0.0)),
-        ((0.3, 0.5), (0.3, 0.5)),
-        ((None, None), (0.0, 0.8)),
-    ],
-)
-def test_recorded_accelerations_of_zero_are_not_missing_ones(recorded, driven):
-    _, metadata = load_weights(shipped_generator("paper"), "generator")
-    statistics = DrivingStatistics.from_dict(metadata["driving_statistics"])
-    smoothed = replace(
-        statistics.acceleration_smoothed,
-        mean=recorded[0],
-        sd=recorded[1],
-    )
-    sudden = sudden_accelerations(replace(statistics, acceleration_smoothed=smoothed))
-    assert (sudden.mean, sudden.sd) == driven

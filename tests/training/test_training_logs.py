@@ -150,19 +150,6 @@ def fake(monkeypatch):
     return module
 
 
-def test_wandb_writes_below_the_run_folder_and_is_named_after_it(fake, tmp_path):
-    folder = tmp_path / "sweep" / "3"
-    WandbLog(folder, "mine", {"seed": 7})
-    options = {
-        "dir": str(folder),
-        "project": "mine",
-        "name": "sweep/3",
-        "config": {"seed": 7},
-    }
-    assert fake.init.call_args.kwargs.items() >= options.items()
-    assert folder.is_dir()  # wandb falls back to a temporary folder otherwise
-
-
 def test_wandb_is_offline_unless_told_gets_every_figure_over_the_decisions_and_is_finished(
     fake, tmp_path, monkeypatch
 ):

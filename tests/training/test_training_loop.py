@@ -1,7 +1,6 @@
 """The loop on a small highway: it learns, logs, stops, and resumes to the same weights."""
 
 import signal
-import time
 
 import pytest
 import torch
@@ -142,12 +141,3 @@ def test_the_best_evaluated_agent_is_kept_and_the_last_one_too(tmp_path):
         if name == "best":
             assert metadata["training"]["mean_reward"] == 3.0
             assert metadata["training"]["decisions"] == 800
-
-
-def test_writing_checkpoints_takes_at_most_a_fiftieth_of_the_time(tmp_path, monkeypatch):
-    saver = Checkpointer(TrainingState(road(8), agent()), tmp_path, 0.0, True, {})
-    slow = "ganlane.training.checkpoint.save_checkpoint"
-    monkeypatch.setattr(slow, lambda path, state: time.sleep(0.1))
-    saver.save()
-    assert saver.pause_s > 5.0
-    assert not saver.due()

@@ -173,26 +173,6 @@ def test_a_run_with_an_adopted_support_goes_on_without_what_it_started_from(
     assert metadata["agent"]["v_min"] == -120.0
 
 
-def test_a_second_phase_begins_with_a_fresh_optimiser(trained, tmp_path):
-    words = [
-        *WITHOUT_INIT,
-        "init=idm_ckpt",
-        f"init.path={trained}",
-        "init.optimizer=true",
-    ]
-    words += [
-        "traffic@pretrain.traffic=idm_mobil",
-        "pretrain.total_decisions=16",
-    ]
-    config = settings("train", words)
-    first, second = phases_of(config, tmp_path)
-    assert make_initial_agent(config, first, None)[1].optimizer.state_dict()["state"]
-    run_phase(config, first)
-    _, agent = make_initial_agent(config, second, None)
-    assert equal(agent.weights(), read_agent(first.folder / AGENT_FILE)[0])
-    assert agent.optimizer.state_dict()["state"] == {}
-
-
 def test_another_observation_is_refused_from_a_checkpoint_too(trained, tmp_path):
     with pytest.raises(UserError, match="give observation=table3_progress or start"):
         start(tmp_path, trained, "observation=table3")

@@ -38,22 +38,6 @@ def test_returns_and_rates_are_those_of_the_finished_episodes():
     assert row["lane_changes_per_km"] == pytest.approx(5 / 3)
 
 
-def test_an_interval_starts_afresh_but_a_running_episode_goes_on():
-    stats = EpisodeStats(1, 3, gamma=1.0)
-    stats.step(step([5.0], [False]))
-    assert "mean_return" not in stats.read()
-    stats.step(step([2.0], [True]))
-    assert stats.read()["mean_return"] == 7.0
-
-
-def test_update_figures_are_averaged():
-    stats = EpisodeStats(1, 3, gamma=1.0)
-    for value in (1.0, 2.0, 6.0):
-        stats.update({"loss": torch.tensor(value)})
-    assert stats.read()["loss"] == pytest.approx(3.0)
-    assert "loss" not in stats.read()
-
-
 def test_what_an_environment_or_a_policy_does_not_write_has_no_column():
     stats = EpisodeStats(1, 2, gamma=1.0)
     written = step([1.0], [True]).select("action", ("next", "reward"), ("next", "done"))

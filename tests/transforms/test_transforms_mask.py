@@ -117,13 +117,6 @@ def test_a_change_is_allowed_up_to_the_braking_that_it_asks_for(
     assert allowed(car, other, limit=braking - 1e-6)[0] == without
 
 
-def test_a_lorry_reaches_farther_than_a_car():
-    ego = {"x": 0.0, "lane": 0, "speed": 20.0}
-    behind = {"x": -13.0, "lane": 1, "speed": 16.0}
-    assert allowed(ego, behind)[0] == LEFT_ONLY
-    assert allowed(ego, {**behind, "length": 25.0})[0] == KEEP_ONLY
-
-
 def test_nobody_changes_into_a_vehicle_alongside_but_where_it_is_not_there():
     assert allowed(*BESIDE)[0] == KEEP_ONLY
     assert allowed({"x": 0.0, "lane": 1}, {"x": 0.0, "lane": 2, "valid": False})[0] == ALL
@@ -168,20 +161,6 @@ def test_a_random_driver_behind_the_legal_mask_never_leaves_the_road():
     assert bool(bare["next", "events", "out_of_road"].any())
 
 
-def test_no_follower_brakes_harder_than_the_limit_in_the_step_after_an_allowed_change():
-    """In rule-driven traffic, where everybody drives by the IDM that the mask judges by."""
-    env = masked(num_envs=32, stream=2)
-    rollout = env.rollout(
-        40, MaskedPolicy(RandomDriver(env.base_env.road, 2)), break_when_any_done=False
-    )["next"]
-    hardest = (
-        rollout["vehicles", "acceleration"][..., 1:]
-        .amin(-1)[rollout["ego", "started_change"]]
-        .amin()
-    )
-    assert -6.0 < hardest.item() < 0.0
-
-
 def test_the_mask_sees_what_the_ego_perceives_and_not_the_truth():
     """Sensors that never see anybody: every change looks safe."""
     blind = {"name": "lane_view_overlap", "sensors": {"dropout": 1.0}}
@@ -219,12 +198,6 @@ def test_exploration_draws_allowed_actions_alone():
         "action"
     ]
     assert set(drawn.tolist()) == {0, 1}
-
-
-def test_any_other_driver_keeps_its_lane_where_its_action_is_not_allowed():
-    env = masked("legal", num_envs=1, lanes=1)
-    rollout = env.rollout(5, MaskedPolicy(RandomDriver(Road(lanes=1), 2)))
-    assert rollout["action"].tolist() == [[0] * 5]
 
 
 def test_a_masked_driver_in_an_environment_without_a_mask_is_refused():

@@ -24,10 +24,8 @@ from ganlane.transforms import (
     OBSERVATIONS,
     ObservationTransform,
     RewardTransform,
-    SensorParameters,
     observation_size,
 )
-from ganlane.transforms.sensors import measure
 
 EGO = (0.0, 1, 20.0, 25.0)
 NOBODY = [1.0, 0.0, 0.0]
@@ -182,43 +180,12 @@ def test_the_gap_to_a_lorry_is_bumper_to_bumper_ahead_and_behind(row, x_m, lane)
     assert view[row, 1].item() == pytest.approx(np.exp(-21.75 / 15.0))
 
 
-def test_an_ego_that_is_a_lorry_has_its_own_length_too():
-    """Two lorries: 6 m of either; a lorry and a car: 6 m and 2.25 m."""
-    view = view_of({"x": 30.0, "lane": 1, **LORRY}, {"x": -30.0, "lane": 2}, ego_length=12.0)
-    assert view[2, 0].item() == pytest.approx(18.0)
-    assert view[1, 0].item() == pytest.approx(21.75)
-
-
-def test_of_the_nearest_its_own_length_is_taken_and_nobody_elses():
-    ahead = [
-        {"x": 20.0, "lane": 1},
-        {"x": 40.0, "lane": 1, **LORRY},
-        {"x": 10.0, "lane": 2, **LORRY},
-    ]
-    view = view_of(*ahead)
-    assert view[2, 0].item() == pytest.approx(15.5)
-    assert view[0, 0].item() == pytest.approx(1.75)
-
-
 @pytest.mark.parametrize(("x_m", "overlap_m"), [(0.0, 8.25), (-5.0, 3.25), (-8.25, 0.0)])
 def test_beside_a_lorry_the_overlap_is_as_long_as_the_two_bodies(x_m, overlap_m):
     view = view_of({"x": x_m, "lane": 2, **LORRY}, form="lane_view_overlap")
     assert view[1, 0].item() == pytest.approx(-overlap_m)
     assert view[1, 1].item() == pytest.approx(1.0 + overlap_m)
     assert view_of({"x": x_m, "lane": 2, **LORRY})[1, 0].item() == 0.0
-
-
-def test_lengths_are_known_without_error_whatever_the_sensors_measure():
-    scene = vehicles(
-        {"x": 0.0, "lane": 1}, {"x": 30.0, "lane": 2, **LORRY}, {"x": -50.0, "lane": 1}
-    )
-    errors = SensorParameters(position_noise_m=2.0, speed_noise_mps=1.0)
-    seen = measure(scene, torch.tensor([5]), torch.tensor([0]), errors)
-    assert seen["x"][0, 1] != 30.0
-    observation = observed(scene, "lane_view_overlap", seen=scene.with_(**seen))
-    gaps = 200.0 * observation[3:-2].reshape(6, 4)[:, 0]
-    assert gaps[0].item() == pytest.approx(seen["x"][0, 1].item() - 8.25)
-    assert gaps[3].item() == pytest.approx(-seen["x"][0, 2].item() - 4.5)
 
 
 @pytest.mark.parametrize(("share", "largest"), [(0.0, 5.5), (0.5, 13.0)])

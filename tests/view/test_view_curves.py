@@ -46,14 +46,6 @@ def test_every_panel_shows_every_run_that_has_its_numbers_in_the_run_s_colour(ru
     assert drawn["crash rate"].xaxis.get_major_formatter()(250_000) == "250 k"
 
 
-def test_the_discounted_return_is_dashed_below_the_q_values(runs):
-    axes = panels(draw_runs({"a": runs["a"]}))["mean Q (replayed); dashed: discounted return"]
-    assert [line.get_linestyle() for line in axes.lines] == ["-", "--"]
-    # the first three rows have no Q-value
-    assert axes.lines[0].get_ydata()[0] == pytest.approx(0.3)
-    assert len(axes.lines[0].get_xdata()) == 27
-
-
 def test_a_smoothed_line_is_drawn_over_its_values(runs):
     raw, smooth = panels(draw_runs({"a": runs["a"]}, smooth=5))["mean return"].lines
     assert raw.get_ydata() == pytest.approx(np.arange(1.0, 31.0))
@@ -70,15 +62,6 @@ def test_columns_of_ones_choice_take_the_place_of_the_panels_and_unknown_ones_ar
         draw_runs(runs, ["nothing"])
     with pytest.raises(UserError, match="foreign: no numbers"):
         draw_runs({"foreign": [pl.DataFrame({"decisions": [1], "name": ["a"]})]})
-
-
-def test_a_runs_evaluations_are_merged_with_its_metrics(runs):
-    (frame,) = runs["a"]
-    assert frame.height == 33
-    evaluated = frame.drop_nulls("evaluation_crash_rate")
-    assert evaluated["decisions"].to_list() == [100_000, 200_000, 300_000]
-    assert evaluated["evaluation_mean_reward"].to_list() == [1.0, 3.0, 2.0]
-    assert runs["b"][0].height == 30
 
 
 def test_runs_are_called_by_the_shortest_ends_that_tell_them_apart(tmp_path):
@@ -150,9 +133,3 @@ def test_what_is_no_metrics_file_is_named(content, message, tmp_path):
         (tmp_path / "metrics.csv").write_bytes(content)
     with pytest.raises(UserError, match=message):
         read_run(tmp_path)
-
-
-def test_the_running_mean_skips_gaps():
-    run = pl.DataFrame({"decisions": range(5), "loss": [1.0, 3.0, np.nan, 5.0, 9.0]})
-    _, smooth = draw_runs({"run": [run]}, ["loss"], smooth=2).axes[0].lines
-    assert smooth.get_ydata() == pytest.approx([1.0, 2.0, np.nan, 5.0, 7.0], nan_ok=True)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ganlane.errors import UserError
-from ganlane.view.figures import add_legend, palette, panel_grid, plot_line, save_figure
+from ganlane.view.figures import panel_grid, plot_line, save_figure
 
 
 def chart():
@@ -45,21 +45,6 @@ def test_a_value_between_gaps_is_a_dot_and_no_other_is():
         False,
     ]
     assert np.flatnonzero(line.get_markevery()).tolist() == [0, 2]
-
-
-def test_long_names_share_the_legend_over_several_rows():
-    for length, rows in ((3, 1), (40, 4)):
-        figure = Figure(figsize=(4.0, 3.0))
-        add_legend(figure, palette([f"{k}".rjust(length, "x") for k in range(4)]))
-        assert -(-4 // figure.legends[0]._ncols) == rows
-
-
-def test_no_panel_is_alone_in_its_row():
-    for count in (1, 2, 3, 4, 5, 7, 10, 13):
-        figure, grid = panel_grid(count)
-        rows = [axes.get_subplotspec().rowspan.start for axes in grid]
-        assert len(grid) == len(figure.axes) == count
-        assert count in (1, 2, 3) or min(rows.count(row) for row in rows) > 1
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from view_scenes import straight
 
 from ganlane.errors import UserError
 from ganlane.settings.render import FilmConfig
-from ganlane.view import EpisodeLabel, player_page, write_player
+from ganlane.view import EpisodeLabel, player_page
 from ganlane.view.player import UNITS, episode_data, series, steps
 
 
@@ -109,11 +109,6 @@ def noisy(frames, vehicles=9):
     return episode
 
 
-def test_three_episodes_of_four_minutes_stay_under_two_megabytes():
-    page = player_page([noisy(2500)] * 3)
-    assert len(page.encode()) < 2_000_000
-
-
 def test_a_page_that_is_too_large_takes_fewer_samples_and_keeps_the_last():
     episode = noisy(600)
     whole = player_page([episode])
@@ -125,9 +120,3 @@ def test_a_page_that_is_too_large_takes_fewer_samples_and_keeps_the_last():
     assert times[-1] == pytest.approx(59.9)
     with pytest.raises(UserError, match="max_bytes"):
         player_page([episode], FilmConfig(max_bytes=10_000))
-
-
-def test_a_page_is_written_whole(tmp_path):
-    path = write_player([straight([0], [1])], tmp_path / "page.html")
-    assert path.read_text(encoding="utf-8") == player_page([straight([0], [1])])
-    assert [file.name for file in tmp_path.iterdir()] == ["page.html"]

@@ -17,7 +17,7 @@ from view_scenes import straight
 
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.data import read_scenes, scene_lane_widths, sort
-from ganlane.data.schema import SCHEMA, TRACK_STRIDE, validate
+from ganlane.data.schema import SCHEMA, TRACK_STRIDE
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig
@@ -26,7 +26,6 @@ from ganlane.sim.state import Road
 from ganlane.traffic import ReplayTraffic
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 from ganlane.view import EpisodeLabel, record_episode, to_tracks, write_tracks
-from ganlane.view.player import ego_jerk, episode_data
 
 
 def highway(goal_m=150.0, rows=1, lanes=3, vehicles=5):
@@ -88,14 +87,6 @@ def test_the_label_has_the_road_of_the_replayed_scene():
         )
 
 
-def test_frames_are_one_step_of_driving_apart(short):
-    moved = np.diff(short.x, axis=0)
-    assert np.abs(moved - 0.1 * short.speed[:-1]).max() < 0.05
-    assert np.diff(short.time_s) == pytest.approx(0.1)
-    assert not short.overlapping().any()
-    assert not short.jumped().any()
-
-
 def test_a_command_off_the_road_ends_the_recording_at_once():
     trajectory = recorded(highway(lanes=1), action=1)
     assert trajectory.outcome == "out_of_road"
@@ -137,17 +128,6 @@ def test_a_network_tells_its_values_and_the_rewards_add_up(short):
     assert np.isnan(short.action_values).all()
 
 
-def test_a_part_of_a_recording_keeps_its_numbers(short):
-    later = short.since(1.0)
-    assert later.time_s[0] == pytest.approx(1.0)
-    assert np.array_equal(later.x, short.x[10:])
-    assert np.array_equal(later.reward, short.reward[10:])
-    assert episode_data(short, start_s=1.5)["jerk"][0] == round(10 * ego_jerk(short)[15])
-    assert later.outcome == short.outcome
-    with pytest.raises(UserError, match="choose a part"):
-        short.since(1000.0)
-
-
 # Tracks
 
 
@@ -184,16 +164,6 @@ def test_csv_comes_back_through_the_reader_of_recordings(episodes, tmp_path):
     assert list(scene_lane_widths(read).values()) == pytest.approx([4.0, 4.0], abs=0.02)
 
 
-def test_csv_counts_lanes_from_the_left(tmp_path):
-    path = write_tracks([straight([0, 30], [0, 2], frames=12)], tmp_path / "a.csv", "csv")
-    right, left = (pl.read_csv(path).filter(pl.col("vehicle") == vehicle) for vehicle in (0, 1))
-    assert set(right["lane"]) == {3}
-    assert set(left["lane"]) == {1}
-    assert right["y"].to_numpy() == pytest.approx(np.full(12, -8.0))
-    assert left["y"].to_numpy() == pytest.approx(np.zeros(12))
-    assert left["v"].to_numpy() == pytest.approx(np.full(12, 20.0))
-
-
 def test_episodes_that_would_share_a_name_are_numbered(tmp_path):
     label = EpisodeLabel("a/agent.safetensors", "idm", 0, 3)
     labels = [label, replace(label, agent="b/agent.safetensors"), replace(label, agent="mobil")]
@@ -201,17 +171,6 @@ def test_episodes_that_would_share_a_name_are_numbered(tmp_path):
     read = read_scenes(write_tracks(scenes, tmp_path / "a.parquet", "parquet"))
     names = {"agent_idm_0_3", "agent_idm_0_3-2", "mobil_idm_0_3"}
     assert set(read["scene"]) == names
-
-
-def test_tracks_have_the_form_of_recorded_traffic():
-    trajectory = straight([0, 30], [0, 2], frames=12)
-    tracks = to_tracks(trajectory, "film")
-    assert tracks.schema == SCHEMA
-    assert validate(tracks, "film").height == 24
-    second = tracks.filter(tracks["vehicle"] == 1)
-    assert second["x"].to_list() == pytest.approx(trajectory.x[:, 1].tolist())
-    assert second["frame"].to_list() == list(range(12))
-    assert set(second["lane"]) == {2}
 
 
 def test_a_recycled_vehicle_begins_a_new_track_and_padding_is_left_out():

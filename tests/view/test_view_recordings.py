@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-import pytest
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from view_scenes import panels, words
 
@@ -35,15 +33,3 @@ def test_recordings_are_drawn_in_six_panels_with_their_units():
     assert words(drawn.pop("time to change lanes").texts) == ["none recorded from start to end"]
     assert all(line.get_ydata().sum() > 0 for axes in drawn.values() for line in axes.lines)
     assert words(drawn["acceleration"].get_legend().get_texts()) == ["as recorded", "over 1 s"]
-
-
-def test_lane_changes_are_drawn_as_the_share_that_lasts_longer():
-    statistics = measured()
-    assert statistics.changes.complete.sum() == 3
-    for line in panels(draw_recordings(statistics))["time to change lanes"].lines:
-        times, shares = line.get_xdata(), line.get_ydata()
-        assert line.get_drawstyle() == "steps-post"
-        assert times.tolist() == [0.0, *np.unique(statistics.changes.duration_s)]
-        assert shares == pytest.approx(
-            [(statistics.changes.duration_s > time).mean() for time in times]
-        )

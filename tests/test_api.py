@@ -12,13 +12,11 @@ import polars as pl
 import pytest
 import torch
 from reference.refusals import last_path
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 import ganlane
 from ganlane.__main__ import main
 from ganlane.agents.drivers import DRIVERS
 from ganlane.config.run import COMMANDS, function_of
-from ganlane.data import write_scene_csv
 from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.traffic import GanTrafficConfig
@@ -142,19 +140,6 @@ def test_every_command_has_its_function(command):
     if command == "record":
         pytest.importorskip("minari")
     assert function_of(command).__name__ == command
-
-
-def test_recordings_become_a_generator_that_drives():
-    write_scene_csv(
-        synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=8, seconds=7.0)), Path("mine.csv")
-    )
-    prepared = ganlane.api.run("prepare", data={"path": Path("mine.csv")}, out="mine")
-    assert prepared.results["files"]
-    short = {"batch": 4, "loop": {"updates": 2, "evaluate_every": 1}}
-    fitted = ganlane.api.run("train_generator", data={"path": "mine"}, generator=short, seed=1)
-    assert fitted.results["ade_m"].keys() >= {"mean", "constant_velocity"}
-    env = ganlane.make_env({"name": "gan", "path": fitted.results["weights"]}, 2)
-    assert env.rollout(2)["next", "reward"].shape == (2, 2, 1)
 
 
 def test_the_short_blocks_in_the_docs_run(capsys):

@@ -96,8 +96,6 @@ def test_the_second_phase_starts_from_the_first_ones_agent(capsys):
 @pytest.mark.parametrize(
     ("traffic", "init"),
     [
-        ("idm", "idm_ckpt"),
-        ("idm_mobil", "none"),
         ("gan", "idm_ckpt"),
         ("gan_calibrated", "none"),
     ],

@@ -84,20 +84,6 @@ def test_a_partial_reset_leaves_the_other_rows_as_they_are_bit_for_bit():
     assert same_bits(after[mask], whole[torch.tensor([6, 9])]) == []
 
 
-def test_an_automatic_reset_goes_on_with_episode_i_plus_n():
-    env = environment(num_envs=3)
-    td = env.reset()
-    td["action"] = torch.tensor([KEEP, LEFT, KEEP])
-    td[keys.VEHICLES, "target_lane"][1, 0] = 2  # so that its command leaves the road
-    stepped, following = env.step_and_maybe_reset(td)
-    assert ends(stepped["next"], 1) == ["out_of_road"]
-    assert following[keys.EPISODE].tolist() == [0, 4, 2]
-    assert following[keys.STEP].tolist() == [10, 0, 10]
-    others = torch.tensor([0, 2])
-    after = stepped["next"].exclude("reward")[others]
-    assert same_bits(following.exclude("action", "reward")[others], after) == []
-
-
 def test_a_reset_with_seed_and_episode_runs_exactly_those():
     env = environment(num_envs=3)
     td = env.reset().select(keys.SEED, keys.EPISODE)

@@ -152,8 +152,6 @@ def paths(env, actions):
 @pytest.mark.parametrize(
     ("traffic", "dtype"),
     [
-        ("idm_mobil", torch.float32),
-        ("gan", torch.float32),
         ("gan", torch.float64),
         ("gan_calibrated", torch.float32),
         ("mixed", torch.float32),

@@ -54,15 +54,6 @@ def test_a_driver_that_keeps_its_lane_stops_some_17_metres_before_its_end(speed)
     assert last.speed[0, 0] < 0.1
 
 
-def test_a_driver_whose_lane_goes_on_does_not_notice():
-    alone = vehicles({"x": 300.0, "lane": 1}, {"x": 0.0, "lane": 1})
-    for one, other in zip(
-        moves(IdmMobilTraffic(DROPPED), alone, 100), moves(IdmMobilTraffic(Road(2)), alone, 100)
-    ):
-        assert torch.equal(one.x, other.x)
-        assert torch.equal(one.y, other.y)
-
-
 def test_a_car_that_stands_at_the_end_turns_out_as_soon_as_the_lane_is_free():
     """Its body is out of the lane before its front is at the wall."""
     cars = vehicles({"x": -900.0, "lane": 1}, {"x": 400.0 - 17.0 - HALF_M, "speed": 0.0})
@@ -213,8 +204,10 @@ def outcomes(config: EnvConfig, driver: str, traffic: object, rows: int = 64) ->
 
 
 @pytest.mark.parametrize("scene", ["merge", "lane_drop", "exit"])
-@pytest.mark.parametrize("driver", ["mobil", "mobil_egoistic"])
-@pytest.mark.parametrize("traffic", [IdmTrafficConfig(), IdmMobilTrafficConfig()])
+@pytest.mark.parametrize(
+    ("driver", "traffic"),
+    [("mobil", IdmMobilTrafficConfig()), ("mobil_egoistic", IdmTrafficConfig())],
+)
 def test_a_mobil_ego_reaches_its_goal(scene, driver, traffic):
     assert outcomes(make(EnvConfig, scene), driver, traffic) == {"goal": 64}
 

@@ -100,19 +100,6 @@ def test_the_keep_lane_ego_stops_two_metres_behind_the_stalled_car(traffic):
     assert (last.speed[:, 0] < 0.1).all()
 
 
-def test_the_stalled_car_stays_in_its_lane_and_all_but_stands():
-    """A vehicle that desires next to nothing creeps 3.5 cm/s.
-
-    IDM's first step from a stand is 0.07 m/s.
-    """
-    seen = drive(SCENARIOS["stalled_car"], "keep_lane", "idm_mobil", 90)
-    assert len(seen.frames) == 900
-    moved = seen.frames[-1].x[:, 1] - seen.frames[0].x[:, 1]
-    assert (moved < 5.0).all()
-    assert (seen.frames[-1].y[:, 1].abs() < 0.7).all()
-    assert all((frame.target_lane[:, 1] == 0).all() for frame in seen.frames[::50])
-
-
 # Blocked lane
 
 

@@ -16,10 +16,8 @@ import ganlane
 from ganlane import keys
 from ganlane.env.state import checked_action
 from ganlane.errors import UserError
-from ganlane.sim.random import Purpose, uniform
-from ganlane.torch_settings import constant
 
-TRAFFICS = ("idm", "idm_mobil", "idm_random", "idm_faults", "gan", "gan_calibrated", "mixed")
+TRAFFICS = ("idm_random", "idm_faults", "gan_calibrated", "mixed")
 KEEP = torch.zeros(2, dtype=torch.int64)
 
 
@@ -127,13 +125,3 @@ def test_the_kernel_alone_refuses_gradients():
         decided(env, vehicles={"speed": speed})
     with torch.no_grad():
         decided(env, vehicles={"speed": speed})
-
-
-def test_a_constant_is_made_once_and_serves_in_and_out_of_inference_mode():
-    key = torch.arange(3)
-    with torch.inference_mode():
-        first = constant((3, 5), key)
-    assert constant([3, 5], key) is first
-    assert not first.is_inference()
-    drawn = uniform(key, 0, 1, [Purpose.FAULT, Purpose.LATE_REACTION])
-    assert torch.equal(drawn[..., 1:], uniform(key, 0, 1, [Purpose.LATE_REACTION]))

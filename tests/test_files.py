@@ -184,9 +184,9 @@ def test_any_flipped_byte_is_refused_in_one_sentence(name, tmp_path, capsys):
     assert has_checksum(whole, path)
     # Both ends, where formats keep their headers, and places all over.
     places = {
-        *range(0, 200, 9),
-        *range(len(whole) - 120, len(whole), 7),
-        *range(0, len(whole), len(whole) // 40),
+        *range(0, 200, 29),
+        *range(len(whole) - 120, len(whole), 19),
+        *range(0, len(whole), len(whole) // 10),
     }
     for place in sorted(place for place in places if place < len(whole)):
         path.write_bytes(flipped(whole, place, place % 8))

@@ -144,24 +144,6 @@ def test_without_a_seed_two_environments_differ():
     assert len({make().reset()[1]["seed"] for _ in range(3)}) == 3
 
 
-def test_a_row_of_a_batch_drives_as_one_alone_does():
-    actions = np.array([[LEFT, KEEP, KEEP], [KEEP, KEEP, LEFT], [KEEP, RIGHT, KEEP]])
-    envs = make_vec(3, traffic="idm_mobil", goal_m=300.0)
-    envs.reset(seed=2, options={"episode": 3})
-    steps = [envs.step(decision) for decision in actions]
-    for row in range(3):
-        alone = make(traffic="idm_mobil", goal_m=300.0)
-        alone.reset(seed=2, options={"episode": 3 + row})
-        for together, decision in zip(steps, actions):
-            seen, *rest, _ = alone.step(decision[row])
-            assert [part[row] for part in together[1:4]] == rest
-            ended = any(rest[1:])
-            observations = together[4]["final_obs"] if ended else together[0]
-            np.testing.assert_array_equal(observations[row], seen)
-            if ended:
-                break
-
-
 @pytest.mark.parametrize(
     "traffic",
     [

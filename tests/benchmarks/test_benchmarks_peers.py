@@ -9,7 +9,6 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from benchmarks.peers import compare, report, simulators
@@ -17,16 +16,13 @@ from benchmarks.peers.scene import (
     CONSTANT,
     FREE_ROAD,
     LAW,
-    LENGTH_M,
     OBSTACLE,
     SCENES,
     SETTLED_MPS,
     STEP,
-    Law,
     Scene,
     Scheme,
     Trace,
-    acceleration,
     equilibrium_gap,
     integrate,
 )
@@ -69,15 +65,6 @@ def test_the_plain_equations_drive_as_the_traffic_module_does(scene):
     assert within(
         between(integrate(scene, Scheme.BALLISTIC), simulators.drive_ours(scene)), ROUNDING
     )
-
-
-@pytest.mark.parametrize(
-    "law", [LAW, Law(LENGTH_M, floored=False, reverses=True)], ids=["ganlane", "highway_env"]
-)
-def test_a_platoon_at_the_equilibrium_gap_does_not_accelerate(law):
-    for v in SETTLED_MPS:
-        speed = np.array([v])
-        assert abs(acceleration(speed, np.array([equilibrium_gap(v, law)]), speed, law)[0]) < 1e-12
 
 
 @pytest.mark.parametrize("scheme", EULERS)

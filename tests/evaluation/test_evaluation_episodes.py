@@ -86,24 +86,6 @@ def test_the_policy_acts_deterministically_and_without_gradients_while_progress_
     assert seen[-1] == (6, 6)
 
 
-def test_an_end_that_the_environment_does_not_name_is_called_other():
-    class Nameless(ToyEnv):
-        def _step(self, tensordict):
-            after = super()._step(tensordict)
-            after["events", "goal"].zero_()
-            return after
-
-    assert run_episodes(
-        Nameless(1),
-        always(0),
-        [0, 1],
-        seed=0,
-    )["reason"].to_list() == [
-        "other",
-        "hard_crash",
-    ]
-
-
 class Remade:
     """Makes an environment of any size, and remembers the sizes that were asked for."""
 

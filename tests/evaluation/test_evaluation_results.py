@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
 import ganlane
@@ -56,30 +55,6 @@ def test_numbers_and_their_origin_are_kept(tmp_path):
     assert read["machine"]["torch"] == torch.__version__
     assert read["machine"]["cores"] >= 1
     assert read["machine"]["threads"] == torch.get_num_threads()
-
-
-def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
-    path = write_results(
-        tmp_path,
-        {"rows": [1]},
-        {},
-        {},
-    )
-    before = path.read_bytes()
-
-    class Unwritable:
-        def __str__(self):
-            raise RuntimeError("no")
-
-    with pytest.raises(RuntimeError):
-        write_results(
-            tmp_path,
-            {"rows": [Unwritable()]},
-            {},
-            {},
-        )
-    assert path.read_bytes() == before
-    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_a_copy_in_somebody_elses_checkout_has_no_revision(monkeypatch, tmp_path):

@@ -103,20 +103,6 @@ def test_a_network_that_always_pushes_sideways_does_not_push_the_body_out_of_its
     assert 0.2 < state.y.item() < room + 0.05
 
 
-def test_nobody_rolls_back_or_slides_sideways():
-    state = vehicles([0.0, 0.0], speed=0.0)
-    after = closed_loop.moved_by(
-        state,
-        torch.tensor([[-3.0, 10.0]]).double(),
-        torch.tensor([[2.0, 9.0]]).double(),
-    )
-    assert (after.x[0, 0].item(), after.y[0, 0].item()) == (0.0, 0.0)
-    assert (
-        after.y[0, 1].item(),
-        after.heading[0, 1].item(),
-    ) == pytest.approx((closed_loop.STEEPEST, math.atan(closed_loop.STEEPEST)))
-
-
 def test_the_latent_vector_stays_standard_normal_and_forgets_in_its_period():
     torch.manual_seed(0)
     begin = z = torch.randn(20000)

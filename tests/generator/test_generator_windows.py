@@ -14,7 +14,6 @@ from ganlane.generator.windows import (
     PRESENT,
     WINDOW_FRAMES,
     count_windows,
-    cut_segments,
     cut_windows,
     group_windows,
     kmeans_labels,
@@ -72,15 +71,6 @@ def test_a_changer_intends_its_new_lane_two_seconds_before_it_is_there(
     crossed = int((lanes[:, changer] != lanes[0, changer]).argmax())
     first = int((scenes[0].target_lane[:, changer] == lanes[crossed, changer]).argmax())
     assert first == max(0, crossed - 20)
-
-
-def test_cut_segments_show_the_recorded_positions(scenes):
-    segments = cut_segments([(scenes[0], 3), (scenes[1], 5)], horizon=6)
-    assert segments.positions.shape == (2, 15, 7, 2)
-    recorded = scenes[1].positions[5:20]
-    shown = segments.positions[1].numpy()
-    np.testing.assert_allclose(np.diff(shown, axis=0), np.diff(recorded, axis=0), atol=1e-4)
-    np.testing.assert_allclose(shown[..., 1], recorded[..., 1], atol=1e-5)
 
 
 def brute_force_windows(frame: pl.DataFrame, stride: int) -> dict[tuple[str, int, int], np.ndarray]:

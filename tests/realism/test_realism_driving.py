@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
-from reference.recordings import made_by_hand, recorded_cars
+from reference.recordings import made_by_hand
 from reference.worlds import vehicles as vehicles_of
 from tensordict import TensorDict
 
@@ -21,11 +21,7 @@ from ganlane.realism.driving import (
     with_recorded_headways,
 )
 from ganlane.sim.state import Road, Vehicles
-from ganlane.traffic import IdmMobilTraffic, TrafficModule
-from ganlane.traffic.presets import (
-    gan_calibrated_traffic,
-    gan_traffic,
-)
+from ganlane.traffic import TrafficModule
 
 
 def steady(**changed):
@@ -125,27 +121,6 @@ def test_index_0_is_nobody_and_models_see_desired_speeds_above_the_speed_at_entr
     excess = (seen[0].desired_speed - seen[0].speed)[:, 1:3]
     assert 0.0 <= excess.min() <= excess.max() <= 6.0
     assert excess.mean() == pytest.approx(3.0, abs=0.5)
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        IdmMobilTraffic,
-        gan_traffic,
-        gan_calibrated_traffic,
-        RandomDriving,
-    ],
-)
-def test_every_traffic_stays_finite_from_recorded_starts(
-    make,
-):
-    there = drive_recordings(
-        make,
-        recorded_cars(scenes=1, vehicles=8, seconds=5.0),
-        StartOptions(),
-    )
-    assert all(there[name].is_finite().all() for name in ("x", "y"))
-    assert there["lane"].is_between(0, 2).all()
 
 
 ROAD = Road()

@@ -130,11 +130,6 @@ def test_distance_is_that_of_scipy(rows):
     )
 
 
-def test_disjoint_histograms_are_at_1_and_an_empty_one_has_no_distance():
-    assert jensen_shannon(np.array([5.0, 0.0]), np.array([0.0, 2.0])) == pytest.approx(1.0)
-    assert np.isnan(jensen_shannon(np.zeros(2), np.ones(2)))
-
-
 def histograms(shift, seed, number=12):
     random = np.random.default_rng(seed)
     scenes = [random.binomial(20, 0.3 + shift, 200) for _ in range(number)]
@@ -200,7 +195,7 @@ def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(
 
 @pytest.mark.parametrize(
     ("number", "shift"),
-    [(4, 0.0), (11, 0.0), (4, 0.1), (11, 0.1)],
+    [(4, 0.0), (11, 0.1)],
 )
 def test_two_equally_good_models_are_seldom_told_apart(number, shift):
     verdicts = [

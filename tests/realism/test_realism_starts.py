@@ -6,22 +6,17 @@ from reference.recordings import made_by_hand
 from reference.refusals import user_error
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-from ganlane.data.dense import recorded_frame
 from ganlane.realism.card import card_rows
 from ganlane.realism.driving import (
     ConstantVelocity,
     StartOptions,
 )
-from ganlane.realism.long_runs import LongRunParameters
 from ganlane.realism.measures import ceiling
 from ganlane.realism.starts import (
     Fold,
     fit_excess,
     recorded_starts,
-    spawned_recordings,
 )
-from ganlane.sim.state import Road
-from ganlane.traffic import IdmTraffic
 
 NAMES = [f"synthetic-{number}" for number in range(4)]
 MAKERS = {"cruise": ConstantVelocity}
@@ -81,22 +76,6 @@ def test_a_fold_without_scenes_is_passed_over_and_none_at_all_is_refused(
         starts_of(frame, Fold(MAKERS, [], []))
     with user_error("moon"):
         starts_of(frame, Fold(MAKERS, NAMES, ["moon"]))
-
-
-def test_spawned_trajectories_are_whole_tracks_in_the_schema():
-    frame = recorded_frame(
-        spawned_recordings(
-            IdmTraffic,
-            Road(),
-            LongRunParameters(5, most_s=10.0),
-            2,
-        )
-    )
-    assert frame.height == 2 * 5 * 101
-    assert frame["unit"].unique().sort().to_list() == [
-        "spawned-0",
-        "spawned-1",
-    ]
 
 
 def test_the_excess_that_was_used_is_the_one_that_is_fitted():

@@ -10,7 +10,6 @@ from reference.worlds import drawing, environment, random_scenes, step, vehicles
 
 from ganlane import keys
 from ganlane.agents.drivers import MobilDriver
-from ganlane.errors import UserError
 from ganlane.settings.driving import Visibility
 from ganlane.settings.episode import SpawnParameters
 from ganlane.sim.collisions import pair_overlaps
@@ -221,9 +220,3 @@ def test_only_a_share_of_the_episodes_is_recycled_and_the_same_ones_in_any_batch
     assert left[2] < 0.2 * left[0]  # who finds no room waits
     assert 0.2 < left[1] / left[0] < 0.8
     assert torch.equal(half[8:12], driven(0.5, num_envs=4, first_episode=8))
-
-
-@pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
-def test_a_share_outside_0_to_1_is_refused(share):
-    with pytest.raises(UserError, match="recycle_share"):
-        environment(num_envs=2, recycle=True, recycle_share=share)

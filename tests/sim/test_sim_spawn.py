@@ -145,15 +145,6 @@ def test_a_scene_depends_on_its_key_alone(share):
             assert torch.equal(one[0], all_[row]), name
 
 
-def test_float32_and_float64_give_the_same_scene_to_rounding():
-    single = spawn(episode_keys(50), 9, 3, 4.0, dtype=torch.float32)
-    double = scenes(50)
-    assert torch.equal(single.target_lane, double.target_lane)
-    for name in ("x", "speed", "desired_speed"):
-        difference = getattr(single, name).double() - getattr(double, name)
-        assert difference.abs().max() < 1e-4
-
-
 @given(
     data=st.data(),
     lanes=st.integers(1, 6),
@@ -203,20 +194,6 @@ def test_vehicles_that_do_not_fit_or_cannot_brake_are_refused_in_a_sentence(
 ):
     with pytest.raises(UserError, match=sentence):
         check_start(parameters, vehicles, 3)
-
-
-@pytest.mark.parametrize(
-    ("parameters", "vehicles"),
-    [
-        (SpawnParameters(), 27),
-        (LORRIES, 21),
-        # The remedies that the message names work.
-        (SpawnParameters(min_spacing_m=17.8), 9),
-        (SpawnParameters(min_spacing_m=10.0, rear_speed_mps=(15.0, 17.7)), 9),
-    ],
-)
-def test_others_are_not(parameters, vehicles):
-    check_start(parameters, vehicles, 3)
 
 
 def test_weak_brakes_make_table_ii_hopeless():

@@ -102,29 +102,6 @@ def test_a_step_is_that_of_highway_envs_own_road(traffic):
         before = after
 
 
-def test_nobody_jumps_and_speeds_are_differences_of_positions(driven):
-    vehicles, _ = driven
-    dx, dy = (field[1:] - field[:-1] for field in (vehicles.x, vehicles.y))
-    # Explicit Euler: a step is driven at its first speed, in the direction of the wheels.
-    driven_m = torch.hypot(dx, dy)[..., 1:]
-    assert (driven_m - 0.1 * vehicles.speed[:-1, :, 1:]).abs().max() < 1e-3
-    assert dy[..., 1:].abs().max() < 0.8, "HighwayEnv changes lanes at up to 7 m/s"
-    assert vehicles.acceleration[..., 1:].abs().max() < 6.01
-    assert (vehicles.speed >= 0.0).all()
-
-
-def test_a_target_lane_is_where_a_change_ends(driven):
-    vehicles, _ = driven
-    y = vehicles.y[..., 1:]
-    target = vehicles.target_lane[..., 1:]
-    assert (target[1:] != target[:-1]).any(), "nobody changed lanes"
-    # Within 6 s of a new target the vehicle is there, or has thought again.
-    begins = target[1:-60] != target[:-61]
-    said = target[1:-60][begins]
-    came = (y[61:][begins] / 4.0).round().long()
-    assert (said == came).float().mean() > 0.8
-
-
 def test_an_episode_is_the_same_alone_and_beside_others(traffic):
     assert_same_alone(HighwayEnv, traffic, [1, 3], 12)
 
@@ -161,15 +138,6 @@ def two(x_ego, ego=None, slow=None):
 def moved(traffic, scene, timer=0.0):
     key = torch.zeros(1, dtype=torch.int64)
     return traffic.move(scene, {"timer": torch.full_like(scene.x, timer)}, key, key)[0]
-
-
-@pytest.mark.parametrize(("x_ego", "changes"), [(-60.0, True), (0.0, False), (-8.0, False)])
-def test_a_driver_changes_lanes_before_an_ego_that_is_far_behind_and_not_before_one_that_is_near(
-    x_ego, changes
-):
-    assert (
-        bool(moved(HighwayEnvTraffic(Road(2)), two(x_ego), 2.0).target_lane[0, 1] == 1) is changes
-    )
 
 
 def test_a_follower_brakes_for_an_ego_that_stands_in_its_lane(traffic):

@@ -52,10 +52,3 @@ def test_net_gaps_are_those_of_the_scene_of_cars():
             rtol=0.0,
             atol=1e-9,
         )
-
-
-def test_without_lorries_it_is_the_scene_of_cars():
-    one, other = (
-        scenes(keys_of(20), torch.float32) for scenes in (LorryScenes(CARS, share=0.0), CARS)
-    )
-    assert all(map(torch.equal, one, other))

@@ -29,7 +29,6 @@ from ganlane.sim.state import Road, Vehicles, body_lanes
 from ganlane_simulators import SumoTraffic
 
 LEFT = 1
-RIGHT = 2
 KEEP = torch.zeros(1, dtype=torch.int64)
 
 
@@ -99,16 +98,6 @@ def test_a_target_lane_is_where_a_change_ends_or_turns_back_from(
     assert (target[1:-40][begins] != target[:-41][begins]).all()
 
 
-def test_the_others_signal_and_are_all_there_and_some_are_lorries_who_keep_their_length(
-    driven,
-):
-    vehicles, _ = driven
-    assert vehicles.valid.all()
-    assert (vehicles.visibility[..., 1:] == int(Visibility.SIGNALLED)).all()
-    assert 0.05 < (vehicles.length[0, :, 1:] == 12.0).float().mean() < 0.3
-    assert (vehicles.length == vehicles.length[0]).all()
-
-
 def test_an_episode_is_the_same_alone_and_beside_others_whatever_was_driven_before(
     traffic,
 ):
@@ -148,22 +137,6 @@ def test_a_follower_brakes_for_an_ego_that_moves_in_front_and_only_then():
     assert torch.equal(free.speed[:enters, 0, 1], cut_off.speed[:enters, 0, 1])
     assert cut_off.speed[enters, 0, 1] < 20.0
     assert cut_off.speed[:, 0, 1].amin() < 17.0 or cut_off.y[-1, 0, 1] > 6.0
-
-
-def test_the_ego_is_followed_when_it_brakes_to_a_stand():
-    # A parked lorry ahead of the ego; the driver behind has nowhere to go on a road of one lane.
-    one_lane = SumoTraffic(Road(1), speed_wander=0.0)
-    first = scene(
-        Road(1),
-        (0.0, 0, 15.0, 20.0),
-        (-25.0, 0, 15.0, 20.0),
-        (120.0, 0, 0.0, 0.1, 12.0),
-    )
-    driven, running, _ = drive(HighwayEnv(one_lane, 1, scenes=first), [0], 40)
-    assert running.all()
-    assert driven.speed[-1, 0, 0] < 0.5
-    gap = driven.x[-1, 0, 0] - driven.x[-1, 0, 1] - 4.5
-    assert 0.5 < gap < 8.0
 
 
 def test_vehicles_that_return_in_front_of_the_ego_are_followed(traffic):

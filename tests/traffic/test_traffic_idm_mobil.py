@@ -30,10 +30,6 @@ from ganlane.traffic import (
 )
 from ganlane.traffic.idm_mobil import DriverParams, start_braking
 
-ROAD = Road(lanes=2)
-EGO = {"x": -1000.0, "lane": 0}
-
-
 # Random drivers
 
 #: Everybody drives by Tables IV and V.

@@ -101,17 +101,6 @@ def test_calibrated_traffic_changes_lanes_as_often_as_recorded_and_touches_nobod
     assert 0.70 < changes / km < 1.20
 
 
-def test_calibrated_drivers_keep_different_headways_and_their_own():
-    env = HighwayEnv(gan_calibrated_traffic(), num_envs=64)
-    before, (_, _, after) = (
-        start(env, range(64)),
-        drive(env, range(64), 1),
-    )
-    headway = before["traffic", "generator", "headway"]
-    assert headway.std() > 0.3
-    assert torch.equal(after["traffic", "generator", "headway"], headway)
-
-
 @pytest.mark.parametrize(
     "preset",
     [

@@ -5,33 +5,11 @@ import sys
 import time
 from pathlib import Path
 
-import torch
 from training.small_runs import agent, road, same, settings, train
 
-from ganlane import keys
 from ganlane.training.checkpoint import (
     load_checkpoint,
 )
-from ganlane.training.collectors import Collector
-
-
-def test_the_state_of_a_highway_is_taken_over_row_by_row_or_its_next_episodes_begun():
-    learner = agent()
-    first = Collector(road(6))
-    second = Collector(road(6))
-    for _ in range(3):
-        first.step(learner)
-    second.load_state_dict(first.state_dict(True), True)
-    noise = learner.generators["collect"].get_state()
-    expected = first.step(learner).clone()
-    learner.generators["collect"].set_state(noise)
-    assert (second.step(learner) == expected).all()
-    episodes = first.env_state[keys.EPISODE]
-    second.load_state_dict(first.state_dict(False), False)
-    step = second.step(learner)
-    assert step[keys.STEP].eq(0).all()
-    assert torch.equal(step[keys.EPISODE], episodes + 6)
-
 
 KILLED = """
 import sys

@@ -180,14 +180,6 @@ def test_the_gap_to_a_lorry_is_bumper_to_bumper_ahead_and_behind(row, x_m, lane)
     assert view[row, 1].item() == pytest.approx(np.exp(-21.75 / 15.0))
 
 
-@pytest.mark.parametrize(("x_m", "overlap_m"), [(0.0, 8.25), (-5.0, 3.25), (-8.25, 0.0)])
-def test_beside_a_lorry_the_overlap_is_as_long_as_the_two_bodies(x_m, overlap_m):
-    view = view_of({"x": x_m, "lane": 2, **LORRY}, form="lane_view_overlap")
-    assert view[1, 0].item() == pytest.approx(-overlap_m)
-    assert view[1, 1].item() == pytest.approx(1.0 + overlap_m)
-    assert view_of({"x": x_m, "lane": 2, **LORRY})[1, 0].item() == 0.0
-
-
 @pytest.mark.parametrize(("share", "largest"), [(0.0, 5.5), (0.5, 13.0)])
 def test_the_bounds_of_the_gymnasium_space_know_of_lorries(share, largest):
     space = gymnasium.make("ganlane/Highway-v0", env=EnvConfig(truck_share=share)).observation_space

@@ -39,22 +39,6 @@ def test_the_ego_stays_at_its_column_and_others_stand_at_their_distance():
         assert ego[1] - other[1] == pytest.approx(4.0 * 1.5 * 1280 / 160, abs=2)
 
 
-@pytest.mark.parametrize("length_m", [4.5, 12.0])
-def test_a_lorry_is_drawn_at_its_length(length_m):
-    trajectory = straight([0, 30], [1, 2])
-    trajectory.length[:, 1] = length_m
-    picture = road_of(bare(trajectory))
-    columns = np.nonzero(near(picture, canvas.speed_tint(20.0)))[1]
-    # 8 pixels a metre, less the dark edge of the body.
-    assert columns.max() - columns.min() == pytest.approx(0.93 * 8 * length_m, abs=3)
-
-
-def test_overlapping_vehicles_have_a_red_edge():
-    apart, together = (bare(straight([0, x], [1, 1])) for x in (30, 3))
-    assert area(apart, canvas.CRASH) == 0
-    assert area(together, canvas.CRASH) > 50
-
-
 def test_every_end_is_written_on_the_last_frame_only_and_a_crash_has_a_ring():
     cut_off = FramePainter(straight([0], [1]))
     ended = {end: FramePainter(straight([0], [1], outcome=end)) for end in keys.END_EVENTS}

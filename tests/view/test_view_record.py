@@ -99,12 +99,6 @@ def test_the_batch_makes_no_difference_and_the_hook_is_taken_out_again(short):
     assert env.recorder is None
 
 
-def test_a_recording_can_be_cut_off():
-    trajectory = recorded(highway(goal_m=5000.0), max_time_s=3.0)
-    assert trajectory.outcome == ""
-    assert trajectory.time_s[-1] == pytest.approx(3.0)
-
-
 def test_an_environment_without_the_hook_cannot_be_recorded():
     with pytest.raises(UserError, match="HighwayEnv"):
         recorded(GymEnv("CartPole-v1"))

@@ -63,19 +63,6 @@ def test_an_episode_is_truncated_at_the_step_where_its_scene_ends(recordings):
     assert not running.any()
 
 
-def test_vehicles_leave_in_the_middle_of_a_decision_and_do_not_come_back(recordings):
-    env = make(recordings, 64)
-    valid: list[torch.Tensor] = []
-    env.recorder = lambda vehicles, running: valid.append(vehicles.valid[:, 1:].clone())
-    td = env.reset()
-    for _ in range(4):
-        td = step(env, td).exclude("reward")
-    record = torch.stack(valid)
-    left = (record[:-1] & ~record[1:]).any(-1).any(-1).nonzero()[:, 0] + 1
-    assert (left % 10 != 0).any()
-    assert not (~record[:-1] & record[1:]).any()
-
-
 def test_every_row_has_the_lanes_of_its_scene(recordings):
     env = make(recordings, 64)
     td = env.reset()

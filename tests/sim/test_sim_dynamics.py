@@ -6,8 +6,6 @@ import math
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from reference.worlds import DOUBLE
 
 from ganlane.sim.dynamics import WHEELBASE_M, advance, steer
@@ -62,21 +60,6 @@ def test_constant_acceleration_is_exact_and_braking_ends_at_rest():
     assert pose.x.item() == pytest.approx(0.05)
     # what was realised, not what was asked for
     assert pose.acceleration.item() == pytest.approx(-10.0)
-
-
-@given(
-    speed=st.floats(0.0, 60.0),
-    acceleration=st.floats(-20.0, 0.7),
-    steering=st.floats(-0.5, 0.5),
-    heading=st.floats(-1.5, 1.5),
-)
-def test_nobody_goes_farther_than_its_speed_allows_nor_backwards(
-    speed, acceleration, steering, heading
-):
-    pose = advance(ZERO, ZERO, *map(number, (heading, speed, acceleration, steering)), 0.1)
-    moved = math.hypot(pose.x.item(), pose.y.item())
-    assert pose.speed.item() >= 0.0
-    assert moved <= max(speed, pose.speed.item()) * 0.1 + 1e-12
 
 
 # Steering

@@ -127,16 +127,3 @@ def test_the_leader_has_the_nearest_rear_and_is_the_slowest_of_those():
             ]
             expected = min(ahead, default=(FREE_GAP_M, vehicles.speed[row, i].item()))
             assert (nearest.gap[row, i].item(), nearest.speed[row, i].item()) == expected
-
-
-def test_on_a_ring_the_first_has_the_last_as_its_leader():
-    vehicles = scenes(8, 1, seed=1, grid_m=1.0, dtype=DOUBLE)
-    vehicles = vehicles.with_(
-        valid=torch.ones_like(vehicles.valid), length=torch.full_like(vehicles.x, 4.5)
-    )
-    gap = leader(perceive(vehicles, Road(1, ring_m=300.0)), torch.zeros_like(vehicles.x)).gap
-    first = vehicles.x.argmax(1, keepdim=True)
-    around = vehicles.x.amin(1, keepdim=True) + 300.0 - vehicles.x.gather(1, first) - 4.5
-    near = around[:, 0] < 145.0
-    assert near.any()
-    assert torch.equal(gap.gather(1, first)[near], around[near])

@@ -87,13 +87,6 @@ def test_lane_zero_is_the_rightmost_and_lanes_end_at_the_edges():
     assert (ROAD.right_edge_m(), ROAD.left_edge_m()) == (-2.0, 10.0)
 
 
-def test_on_a_ring_distances_take_the_nearer_way_round():
-    ring = Road(lanes=1, ring_m=100.0)
-    start = torch.tensor([95.0, 5.0, 0.0, 0.0])
-    end = torch.tensor([5.0, 95.0, 210.0, 40.0])
-    assert ring.distance_ahead(start, end).tolist() == [10.0, -10.0, 10.0, 40.0]
-
-
 # In narrow lanes a body that is turned stands in three lanes at once, and its driver looks into all
 # of them: a second change right after a first one, the rear still in the lane that it comes from,
 # and a slow car in the lane between.

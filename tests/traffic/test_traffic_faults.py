@@ -287,17 +287,6 @@ def test_a_phantom_braker_loses_the_speed_it_says_and_goes_on_as_before():
     assert (track[-1].x[0, 2] - scene.x[0, 2]).item() == pytest.approx(3.0**2 / 8.0, abs=0.05)
 
 
-def test_a_driver_who_brakes_harder_anyway_goes_on_doing_so():
-    scene = vehicles(EGO, {"x": 0.0, "speed": 25.0}, {"x": 20.0, "speed": 5.0})
-    always = PhantomBraking(faults=BrakingFaults(per_hour=1e9))
-    (faulty,), (plain,) = (
-        play(IdmTraffic(), scene, 1, fault=always),
-        play(IdmTraffic(), scene, 1),
-    )
-    assert plain.acceleration[0, 1] < -4.0
-    assert faulty.acceleration[0, 1] == plain.acceleration[0, 1]
-
-
 def test_faults_come_to_nobody_who_is_not_there_and_never_to_the_ego():
     scene = vehicles(EGO, {"x": 0.0, "valid": False}, {"x": 100.0})
     always = DriverFaults(

@@ -30,7 +30,6 @@ from ganlane.settings.driving import (
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
 from ganlane.settings.traffic import (
-    IdmMobilTrafficConfig,
     IdmTrafficConfig,
     MixedTrafficConfig,
     ReplayTrafficConfig,
@@ -263,29 +262,6 @@ def test_a_follower_brakes_for_an_ego_unless_it_does_not_see_it_and_the_environm
         crashes.append(bool(td[keys.EVENTS, "hard_crash"]))
     assert any(crashes) == (share == 1.0)
     assert min(speeds) > 24.9 if share else min(speeds) < 15.0
-
-
-@pytest.mark.parametrize("traffic", [IdmMobilTraffic, idm_faults_traffic])
-def test_nobody_is_blind_at_a_share_of_0_and_nothing_is_built(traffic):
-    plain, blind = (
-        environment(num_envs=16, traffic=model)
-        for model in (traffic(), BlindTraffic(traffic(), 0.0))
-    )
-    one = plain.reset()
-    other = blind.reset()
-    for _ in range(10):
-        one = step(plain, one)
-        other = step(blind, other)
-        assert same_bits(one.exclude(keys.TRAFFIC), other.exclude(keys.TRAFFIC)) == []
-        assert same_bits(one[keys.TRAFFIC], other[keys.TRAFFIC]) == []
-    assert isinstance(
-        make_traffic(IdmMobilTrafficConfig(), EnvConfig()),
-        IdmMobilTraffic,
-    )
-    assert isinstance(
-        make_traffic(IdmTrafficConfig(blind_share=0.5), EnvConfig()),
-        BlindTraffic,
-    )
 
 
 def test_as_many_episodes_are_blind_as_asked_for_whatever_the_batch_and_the_part():

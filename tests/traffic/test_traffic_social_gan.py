@@ -123,14 +123,6 @@ def test_the_ego_is_a_neighbour_of_the_calibrated_drivers():
     assert (module(td)["moved", "speed"][:, 1:] != module(other)["moved", "speed"][:, 1:]).any()
 
 
-def test_the_calibrated_drivers_follow_their_target_lane():
-    module = calibrated(noise_scale=0.0)
-    td = begin(module, rows=1, vehicles=1)
-    td["vehicles", "y"].zero_()
-    td["vehicles", "target_lane"].fill_(2)
-    assert drive(module, td, 100)["vehicles", "y"].item() == pytest.approx(8.0, abs=1.0)
-
-
 def test_headways_come_from_the_quantiles_given():
     module = calibrated(headway_quantiles_s=(1.0, 1.1, 1.2, 1.3, 1.4))
     headway = begin(module, rows=200)["traffic", "headway"]

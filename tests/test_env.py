@@ -94,9 +94,6 @@ def test_a_reset_with_seed_and_episode_runs_exactly_those():
     assert same_bits(asked[2:3], environment(num_envs=1, seed=5).reset()) == []
 
 
-# Commands
-
-
 # Ends
 
 TO_GOAL = {"x": 999.0, "lane": 1, "speed": 20.0}

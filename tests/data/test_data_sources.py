@@ -1,4 +1,4 @@
-"""Where recordings are, and synthetic recordings, in which nobody overlaps."""
+"""Where recordings are, and how far reading them is."""
 
 from __future__ import annotations
 

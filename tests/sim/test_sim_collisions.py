@@ -1,4 +1,4 @@
-"""Box overlap against a brute-force sampler, and cases by hand."""
+"""Box overlap against the corners of the scalar simulator, and cases by hand."""
 
 from __future__ import annotations
 

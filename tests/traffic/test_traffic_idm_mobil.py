@@ -1,7 +1,4 @@
-"""Rule-driven traffic: keys, memory, MOBIL once a second.
-
-Random drivers, within their ranges and obeyed.
-"""
+"""Rule-driven traffic whose drivers differ: within their ranges, and obeyed."""
 
 from __future__ import annotations
 
@@ -29,8 +26,6 @@ from ganlane.traffic import (
     IdmRandomTraffic,
 )
 from ganlane.traffic.idm_mobil import DriverParams, start_braking
-
-# Random drivers
 
 #: Everybody drives by Tables IV and V.
 ALIKE = RandomDrivers(

@@ -1,4 +1,4 @@
-"""The collector: order of time, its state, and runs that are killed."""
+"""Runs that are killed."""
 
 import subprocess
 import sys

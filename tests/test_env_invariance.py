@@ -62,8 +62,8 @@ def test_the_episodes_compared_end_in_several_ways(mobil):
 @pytest.mark.parametrize(
     ("batch", "decisions", "episodes", "at_least"),
     [
-        (7, 45, None, 25),  # in the middle of a run
-        (1, 45, None, 4),  # alone
+        (7, 30, None, 14),  # in the middle of a run
+        (1, 30, None, 2),  # alone
         # Replayed from their numbers, in any slot.
         (1, 11, [61], 1),
         (7, 11, [5, 40, 3, 21, 63, 0, 13], 7),

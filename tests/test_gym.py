@@ -209,7 +209,7 @@ def returns_by_episode(mode, kernel):
     numbers = info["episode_number"]
     ended = np.zeros(3, bool)
     returns = {}
-    for _ in range(40):
+    for _ in range(26):
         before = ended
         _, reward, terminated, truncated, info = envs.step(np.zeros(3, int))
         if mode is AutoresetMode.NEXT_STEP:
@@ -230,7 +230,7 @@ def test_episodes_are_the_same_in_every_autoreset_mode(kernel):
     for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
         other = returns_by_episode(mode, kernel)
         shared = same.keys() & other.keys()
-        assert len(shared) >= 9
+        assert len(shared) >= 6
         assert {number: other[number] for number in shared} == pytest.approx(
             {n: same[n] for n in shared}, abs=1e-3
         )

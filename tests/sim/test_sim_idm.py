@@ -7,6 +7,7 @@ The theory is that of ``tests/reference/stability.py``; the simulation is the pa
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -88,7 +89,7 @@ def test_idm_stops_within_the_kinematic_distance_and_a_step(speed):
 DESIRED = 25.0
 FOLLOWERS = 9
 LENGTH_M = 4.5
-SPEEDS = (1.0, 3.0, 6.0, 10.0, 15.0, 18.0, 20.0)
+SPEEDS = (1.0, 3.0, 6.0, 10.0, 15.0, 18.0)
 #: Start of every platoon: bumper to bumper gap, m, and speed, m/s (or the leader's, if that is
 #: lower).
 START_GAP_M = 40.0
@@ -207,6 +208,26 @@ def test_the_slopes_of_the_theory_are_those_of_the_package(desired, speed):
     assert (gap.grad.item(), its_speed.grad.item(), leader.grad.item()) == pytest.approx(
         stability.slopes(speed, desired)
     )
+
+
+@pytest.mark.parametrize(("desired", "critical"), [(18.0, 12.1), (25.0, 17.3)])
+def test_the_critical_its_speedof_linear_theory(desired, critical):
+    """Neither the time step nor the size of the ring moves it by as much as is tested below."""
+    threshold = stability.critical_speed(desired)
+    assert threshold == pytest.approx(critical, abs=0.05)
+    # One change of sign: unstable all the way down.
+    signs = [stability.instability(v, desired) > 0.0 for v in np.linspace(0.1, 0.99 * desired, 200)]
+    assert sum(one != other for one, other in pairwise(signs)) == 1
+    # 400 cars in steps of 0.1 s: within 0.01 m/s. 50 are too few for the longest waves: 0.2 to 0.3
+    # lower.
+    for cars, tolerance in ((400, 0.01), (CARS, 0.35)):
+
+        def growth(v: float, cars: int = cars) -> float:
+            return stability.growth_rate(v, desired, cars, PHYSICS_STEP_S)[0]
+
+        assert stability.zero_of(growth, threshold - 1.5, threshold + 1.5) == pytest.approx(
+            threshold, abs=tolerance
+        )
 
 
 def test_every_ring_grows_or_decays_at_the_rate_of_the_linear_theory():

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.worlds import DOUBLE, packed
 
@@ -145,6 +145,7 @@ def test_a_scene_depends_on_its_key_alone(share):
             assert torch.equal(one[0], all_[row]), name
 
 
+@settings(max_examples=50)
 @given(
     data=st.data(),
     lanes=st.integers(1, 6),

@@ -81,7 +81,7 @@ def test_each_event_has_its_price(what, term, value):
 
 @pytest.mark.parametrize("parameters", [RewardParameters(), CONSIDERATE])
 def test_the_reward_is_the_sum_of_its_terms_and_zero_after_a_reset(parameters):
-    base = HighwayEnv(IdmMobilTraffic(), num_envs=32)
+    base = HighwayEnv(IdmMobilTraffic(), num_envs=8)
     env = TransformedEnv(base, Compose(RewardTransform(1.0, parameters)))
     state = env.reset()
     driver = RandomDriver(base.road)

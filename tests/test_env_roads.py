@@ -20,8 +20,6 @@ from ganlane.settings.record import make
 from ganlane.settings.road import EXIT, WALL, LaneStretch, Stretches
 from ganlane.settings.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.sim.idm import TABLE_V
-from ganlane.sim.mobil import mobil_wishes
-from ganlane.sim.neighbours import perceive
 from ganlane.sim.state import Road
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
@@ -34,11 +32,6 @@ DROPPED = Road(2, stretches=DROP)
 LATE = Road(2, stretches=(LaneStretch(200.0, 400.0, WALL), LaneStretch()))
 #: Half a car's length.
 HALF_M = 2.25
-
-
-def wish(road: Road, *cars: dict) -> int:
-    """Of the first car."""
-    return int(mobil_wishes(perceive(vehicles(*cars), road), road)[0, 0])
 
 
 # Who drives towards the end of a lane
@@ -61,22 +54,6 @@ def test_a_car_that_stands_at_the_end_turns_out_as_soon_as_the_lane_is_free():
         beside_the_wall = now.x[0, 1] + HALF_M > 400.0
         assert not beside_the_wall or now.y[0, 1] > 2.0 + 1.25 - 0.1
     assert now.x[0, 1] > 430.0
-
-
-@pytest.mark.parametrize("x", [200.0, 250.0, 380.0])
-def test_the_safety_criterion_never_yields(x):
-    """However near the end is: who comes from behind would have to brake with more than 4 m/s2."""
-    car = {"x": x, "speed": 10.0, "desired_speed": 20.0}
-    fast = {"x": x - 25.0, "lane": 1, "speed": 25.0}
-    assert wish(DROPPED, car, fast) == 0
-    assert wish(DROPPED, car, {**fast, "x": x - 150.0}) == 1
-
-
-def test_nobody_changes_into_a_lane_that_ends_soon():
-    """Not even behind a slow leader."""
-    slow = {"lane": 1, "speed": 5.0, "desired_speed": 5.0}
-    assert wish(DROPPED, {"x": -110.0, "lane": 1}, {"x": -70.0, **slow}) == -1
-    assert wish(DROPPED, {"x": -90.0, "lane": 1}, {"x": -50.0, **slow}) == 0
 
 
 # The ego

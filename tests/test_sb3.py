@@ -89,18 +89,6 @@ def test_the_info_of_a_row_that_ends_holds_its_statistics_and_its_last_observati
     assert ends > ROWS
 
 
-def test_a_seed_gives_the_same_episodes_again_and_the_next_reset_new_ones():
-    env = short_episodes(seed=None)
-    env.seed(7)
-    first = env.reset()
-    second = env.reset()
-    assert not np.array_equal(first, second)
-    for episode, expected in ((0, first), (ROWS, second)):
-        env.seed(7)
-        env.set_options({"episode": episode})
-        assert np.array_equal(env.reset(), expected)
-
-
 def test_masks_are_given_to_sb3_contrib_by_row():
     env = short_episodes(mask="safe")
     env.reset()

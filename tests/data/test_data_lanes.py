@@ -2,14 +2,12 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from reference.synthetic import synthetic_scenes
 
-from ganlane.data import Tracks, tracks_of_frame
+from ganlane.data import Tracks
 from ganlane.data.lanes import (
     find_lane_changes,
-    lane_changes_of_arrays,
     lane_width,
 )
 
@@ -90,24 +88,3 @@ def test_a_flicker_shorter_than_half_a_second_is_no_change(samples, changes):
 def test_the_new_lane_must_be_seen_for_half_a_second(after, changes):
     assert len(changes_of(np.r_[np.full(20, 1.7), np.full(after, 1.9)])) == changes
     assert len(changes_of(np.r_[np.full(after, 1.7), np.full(20, 1.9)])) == changes
-
-
-@settings(max_examples=20)
-@given(seed=st.integers(0, 500))
-def test_recordings_and_arrays_are_measured_alike_and_mirroring_changes_nothing_but_the_side(
-    seed,
-):
-    frame = synthetic_scenes(seed=seed)
-    widths = {"synthetic-0": 3.5, "synthetic-1": 3.5}
-    of_frame = find_lane_changes(tracks_of_frame(frame, widths))
-    # Every vehicle is present in all of the 100 frames.
-    y = frame["y"].to_numpy().reshape(24, 100).T
-    of_arrays, mirrored = (lane_changes_of_arrays(across, 3.5) for across in (y, 7.0 - y))
-    np.testing.assert_array_equal(of_frame.sample, of_arrays.sample)
-    np.testing.assert_array_equal(of_frame.duration_s, of_arrays.duration_s)
-    np.testing.assert_array_equal(of_frame.new_lane, 2 - mirrored.new_lane)
-    np.testing.assert_allclose(
-        of_frame.lateral_speed,
-        mirrored.lateral_speed,
-        atol=1e-9,
-    )

@@ -141,28 +141,6 @@ def test_an_interval_holds_the_truth_in_95_of_100_recipes(trainings, between):
     assert 0.91 <= np.mean(held) <= 0.99
 
 
-def test_a_difference_pairs_the_episodes_and_resamples_the_trainings_of_both():
-    episodes = scores(1, 300, shared=50.0)
-    better = episodes + 5.0 + scores(4, 300, rest=0.1)
-    estimate = difference(better, episodes)
-    assert estimate.value == pytest.approx(5.0, abs=0.02)
-    assert width(estimate) < 0.1
-    first, second = (
-        scores(6, 1, between=1.0),
-        scores(
-            6,
-            1,
-            between=1.0,
-            seed=2,
-        ),
-    )
-    theirs = stats.ttest_ind(first[:, 0], second[:, 0], equal_var=False).confidence_interval()
-    ours = difference(first, second)
-    assert ours.interval == pytest.approx(
-        [theirs.low, theirs.high], abs=0.1 * (theirs.high - theirs.low)
-    )
-
-
 def test_the_probability_of_improvement_is_the_share_of_pairs():
     table = scores(
         5,

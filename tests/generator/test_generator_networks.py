@@ -134,15 +134,6 @@ def test_with_a_head_of_zeros_the_prediction_is_constant_velocity(scene, generat
     torch.testing.assert_close(predicted, displacements[..., -1:, :].expand_as(predicted))
 
 
-@pytest.mark.parametrize("execute_k", [1, 3, 8])
-def test_the_first_k_decoder_steps_are_those_of_the_whole(generator, now, execute_k):
-    noise = torch.randn(3, 13, 4)
-    torch.testing.assert_close(
-        generator(now, noise, execute_k),
-        generator(now, noise)[..., :execute_k, :],
-    )
-
-
 def test_kept_projections_equal_those_computed_anew(generator):
     displacements = torch.tensor([1.3, 0.0]) + 0.05 * torch.randn(2, 4, 20, 2)
     history = recorded(generator, displacements[..., :7, :])

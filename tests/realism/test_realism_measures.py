@@ -193,18 +193,6 @@ def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(
     assert sum(interval.low > 0.0 for interval in intervals) >= 0.9 * len(intervals)
 
 
-@pytest.mark.parametrize(
-    ("number", "shift"),
-    [(4, 0.0), (11, 0.1)],
-)
-def test_two_equally_good_models_are_seldom_told_apart(number, shift):
-    verdicts = [
-        verdict(distance_difference(*models, recorded, resamples=300))
-        for recorded, *models in draws(shift, number)
-    ]
-    assert verdicts.count("undecided") >= 0.9 * len(verdicts)
-
-
 def test_a_model_does_not_differ_from_itself_and_unpaired_units_are_resampled_on_its_side():
     model = histograms(0.1, 3)
     assert distance_difference(model, model, histograms(0.0, 5), resamples=50) == Estimate(

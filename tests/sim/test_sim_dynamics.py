@@ -89,13 +89,6 @@ def test_a_lane_change_takes_two_to_five_seconds_at_every_speed_without_overshoo
     assert remaining[-1].abs().max() < 1e-3
 
 
-def test_a_crawling_car_changes_lanes_over_the_distance_of_one_at_3_mps():
-    """Below 3 m/s the path is the same, only slower."""
-    slow = lane_change(number(1.5), 4.0)[1::2]
-    fast = lane_change(number(3.0), 4.0)[:150]
-    assert (slow - fast).abs().max() < 0.1
-
-
 @pytest.mark.parametrize(
     ("steering", "y", "heading", "speed", "expected"),
     [

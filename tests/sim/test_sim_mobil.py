@@ -97,29 +97,7 @@ def test_nobody_changes_in_front_of_somebody_who_would_have_to_brake_too_hard():
     assert wish(SUBJECT, SLOW, fast_follower(41.5), mobil=SELFISH) == 0
 
 
-# One vehicle per gap. The ego (index 0) stands far away.
-
-FAR_EGO = {"x": 5000.0, "lane": 0, "speed": 25.0}
-
-
-def changes(*cars) -> list[int]:
-    """Of selfish drivers (a polite slow one would move aside) on three lanes."""
-    road = Road(lanes=3)
-    return mobil_changes(perceive(vehicles(*cars), road), road, mobil=SELFISH)[0].tolist()
-
-
-def pair(distance: float) -> list[dict]:
-    """Two who both want the empty lane 1, from lanes 0 and 2, the second ``distance`` behind."""
-    cars = []
-    for x, lane in ((0.0, 0), (-distance, 2)):
-        cars += [{**SUBJECT, "x": x, "lane": lane}, {**SLOW, "x": x + 54.5, "lane": lane}]
-    return cars
-
-
-def test_of_two_who_want_the_same_gap_the_foremost_goes_and_farther_than_60_m_apart_both():
-    assert changes(FAR_EGO, *pair(10.0)) == [0, 1, 0, 0, 0]
-    assert changes(FAR_EGO, *pair(59.0)) == [0, 1, 0, 0, 0]
-    assert changes(FAR_EGO, *pair(61.0)) == [0, 1, 0, -1, 0]
+# Lorries
 
 
 @pytest.mark.parametrize(("length", "safe"), [(4.5, True), (12.0, False)])

@@ -14,7 +14,7 @@ from reference.worlds import DOUBLE
 
 from ganlane.errors import UserError
 from ganlane.settings.driving import Visibility
-from ganlane.sim.idm import TABLE_V, highest_speed
+from ganlane.sim.idm import TABLE_V
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.scenes import LARGEST, FixedScene, SceneVehicle
 from ganlane.sim.state import Road
@@ -140,20 +140,3 @@ def test_a_pair_is_refused_exactly_where_it_cannot_brake(gap, speed, leader):
             pair(gap, speed, leader).check(ROAD, TABLE_V)
     elif closing * (closing + 2.0) / (2.0 * gap) < -0.9 * TABLE_V.min_acceleration:
         pair(gap, speed, leader).check(ROAD, TABLE_V)
-
-
-@pytest.mark.parametrize("gap", [1.5, 7.5, 20.5])
-def test_a_column_of_twelve_survives_where_a_pair_does(gap):
-    """The leader stands, all the others come at the highest speed, each as close to the next as is
-    allowed.
-    """
-    speed = highest_speed(gap, 0.0, 25.0)
-    column = [
-        SceneVehicle(-k * (gap + 4.5), 0, speed if k else 0.0, 25.0 if k else 0.001)
-        for k in range(12)
-    ]
-    ego_first = (column[5], *column[:5], *column[6:])
-    FixedScene(ego_first, ROAD).check(ROAD, TABLE_V)
-    faster = tuple(replace(car, speed_mps=1.05 * car.speed_mps) for car in ego_first)
-    with pytest.raises(UserError, match=r"would need|crash"):
-        FixedScene(faster, ROAD).check(ROAD, TABLE_V)

@@ -63,13 +63,6 @@ def test_a_turned_body_takes_more_room():
         assert seen_in(y=0.44, heading=heading, target_lane=0, visibility=Visibility.BODY) == (0, 1)
 
 
-@pytest.mark.parametrize(
-    ("y", "lanes"), [(0.0, (0, 0)), (1.9, (0, 0)), (2.1, (1, 1)), (-3.0, (0, 0)), (30.0, (2, 2))]
-)
-def test_seen_by_its_centre_a_car_is_in_one_lane_of_the_road(y, lanes):
-    assert seen_in(y=y, target_lane=1, visibility=Visibility.CENTRE) == lanes
-
-
 def test_a_signalled_car_is_in_its_target_lane_from_the_command_on():
     assert seen_in(y=0.0, target_lane=1, visibility=Visibility.SIGNALLED) == (0, 1)
     assert seen_in(y=0.0, target_lane=1, visibility=Visibility.BODY) == (0, 0)

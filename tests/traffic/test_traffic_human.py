@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from torchrl.envs.utils import check_env_specs
 
 from ganlane import keys
 from ganlane.api import make_env
@@ -31,13 +30,6 @@ def drive(episodes, steps, dtype=torch.float32, **variation):
         vehicles, memory = traffic.move(vehicles, memory, key, now)
         course.append((vehicles, memory))
     return course
-
-
-def test_it_is_an_environment_and_rules_are_those_of_the_others():
-    env = make_env("human", num_envs=4)
-    check_env_specs(env)
-    td = env.reset()
-    assert td[keys.VEHICLES, "x"].shape == (4, 9)
 
 
 def test_a_decision_holds_for_four_steps():

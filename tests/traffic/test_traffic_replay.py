@@ -93,22 +93,6 @@ def test_the_ego_takes_the_place_of_the_vehicle_nearest_the_middle():
     assert scene.visibility[0].tolist() == [Visibility.BODY] * 9
 
 
-def test_the_episode_lasts_as_long_as_the_scene():
-    assert replay(*FIVE).steps_of(keys_of([0, 1, 2])).tolist() == [
-        20,
-        20,
-        20,
-    ]
-    longer = replay(*FIVE, track(7, range(10, 41), 0.0, 10.0, 0))
-    # Whoever the ego replaces, and whenever: the scene ends at frame 40.
-    key = keys_of(range(50))
-    first_frame = 40 - longer.steps_of(key)
-    assert first_frame.unique().tolist() == [
-        *range(0, 1),
-        *range(10, 21),
-    ]
-
-
 def test_a_track_with_a_missing_frame_ends_there():
     holes = [frame for frame in range(21) if frame != 10]
     traffic = replay(*FIVE[1:3], track(9, holes, 33.0, 12.0, 2))

@@ -214,13 +214,3 @@ def test_the_road_view_tells_which_lane_to_reach_and_by_when():
     assert numbers[-2:] == pytest.approx([-1.0, 0.5])
     numbers = road_numbers(350.0, 0, leaving, LaneStretch(), LaneStretch())
     assert numbers[-2:] == pytest.approx([0.0, 0.25])
-
-
-def test_own_state_knows_no_lane_where_none_has_begun():
-    road = Road(2, stretches=(LaneStretch(200.0, 600.0, WALL), LaneStretch()))
-    zero = torch.zeros(1, dtype=torch.float64)
-    for x, flags in ((100.0, [0.0, 0.0]), (300.0, [0.0, 1.0])):
-        cars = vehicles({"x": x, "lane": 1}, {"x": -900.0, "lane": 0})
-        transform = ObservationTransform(road, 2, "road_view")
-        observation = transform.observe(cars, zero, zero.long(), road)
-        assert observation[0, 1:3].tolist() == flags

@@ -46,13 +46,6 @@ def test_every_panel_shows_every_run_that_has_its_numbers_in_the_run_s_colour(ru
     assert drawn["crash rate"].xaxis.get_major_formatter()(250_000) == "250 k"
 
 
-def test_a_smoothed_line_is_drawn_over_its_values(runs):
-    raw, smooth = panels(draw_runs({"a": runs["a"]}, smooth=5))["mean return"].lines
-    assert raw.get_ydata() == pytest.approx(np.arange(1.0, 31.0))
-    assert raw.get_alpha() < 1.0
-    assert smooth.get_ydata()[4:] == pytest.approx(np.arange(3.0, 29.0))
-
-
 def test_columns_of_ones_choice_take_the_place_of_the_panels_and_unknown_ones_are_named(runs):
     assert list(panels(draw_runs(runs, ["loss", "evaluation_mean_reward"]))) == [
         "loss",

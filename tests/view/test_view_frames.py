@@ -64,19 +64,6 @@ def test_lights_show_braking_and_the_lane_to_be_entered():
     assert area(road_of(bare(signalling, 5)), canvas.AMBER, 12) == 0
 
 
-@pytest.mark.parametrize("lanes", [1, 2, 5, 10])
-def test_any_number_of_lanes_fits_between_header_and_footer(lanes):
-    window = Window(FilmConfig(), lanes, 4.0)
-    upper, lower = window.edges
-    assert HEADER_HEIGHT < upper < lower < 320 - 20
-    picture = FramePainter(straight(15.0 * np.arange(lanes), range(lanes), lanes=lanes)).draw(0)
-    # lanes - 1 broken marks and two edges: rows of the picture that are bright over at least a
-    # tenth of it.
-    bright = near(picture, canvas.MARK, 5).mean(axis=1) > 0.15
-    runs = np.sum(np.diff(np.concatenate([[0], bright[HEADER_HEIGHT:].astype(int)])) == 1)
-    assert runs == lanes + 1
-
-
 @pytest.mark.slow
 def test_nine_vehicles_are_drawn_fast_enough_for_60_frames_a_second():
     generator = np.random.default_rng(0)

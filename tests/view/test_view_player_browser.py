@@ -146,22 +146,3 @@ def test_every_canvas_has_the_size_of_its_place_whatever_came_after_it(pages, tm
     assert len(boxes) == 6 * 6
     assert [box for box in boxes if box[:2] != box[2:]] == []
     assert min(box[0] for box in boxes) > 500
-
-
-def test_events_are_marked_and_a_key_goes_to_the_next(pages, tmp_path):
-    opened, _ = pages
-    lane = np.ones((60, 1), int)
-    lane[30:] = 2
-    one = straight(
-        [0], [1], 60, target_lane=lane, soft_crash_s=np.array([4.0]), outcome="hard_crash"
-    )
-    opened.open(write_player([one], tmp_path / "events.html"))
-    for colour in (BLUE, (230, 167, 0), RED):
-        assert ink(opened, ".events", colour) > 15
-    visited = []
-    for _ in range(4):
-        opened.key("e", code="KeyE", windowsVirtualKeyCode=69)
-        visited.append(opened.value(CLOCK))
-    assert visited == pytest.approx([3.0, 4.0, 5.9, 5.9])
-    opened.key("E", code="KeyE", windowsVirtualKeyCode=69, modifiers=8)
-    assert opened.value(CLOCK) == pytest.approx(4.0)

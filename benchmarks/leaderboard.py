@@ -1,7 +1,7 @@
-"""The leaderboard of ``ganlane benchmark``: the page from committed results, and their check.
+"""The leaderboard of ``ganlane benchmark``: tables from committed results, and their check.
 
-    python -m benchmarks.leaderboard                   # what differs from the page
-    python -m benchmarks.leaderboard --write           # write docs/leaderboard.md
+    python -m benchmarks.leaderboard                   # what differs in the documents
+    python -m benchmarks.leaderboard --write           # write README's table and the page
     python -m benchmarks.leaderboard --add outputs/benchmark/RUN/results.json --name NAME
     python -m benchmarks.leaderboard --check           # drive the samples again
 
@@ -22,6 +22,7 @@ from typing import Any
 from benchmarks.script import ReportSection, make_parser, run_script, split_at_markers
 from ganlane.config.run import settings
 from ganlane.errors import UserError
+from ganlane.evaluation.table import Table
 from ganlane.files import write_json
 from ganlane.settings.suite import BenchmarkConfig
 from ganlane.suite.driving import compare
@@ -30,7 +31,14 @@ from ganlane.suite.run import SAMPLE, SCHEMA, drivers_of
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "leaderboard"
-PAGE = ROOT / "docs" / "leaderboard.md"
+#: Documents, the stored results behind the table in each (None: all), and its columns (None: all).
+PAGES: Mapping[str, tuple[str | None, tuple[str, ...] | None]] = {
+    "docs/leaderboard.md": (None, None),
+    "README.md": (
+        "agent_general",
+        ("entry", "score [95 %]", "worst traffic", "crashes", "near misses", "P(above MOBIL)"),
+    ),
+}
 MARKERS = ("<!-- leaderboard: begin -->", "<!-- leaderboard: end -->")
 #: What is stored of a run's results.
 PARTS = ("schema", "suite", "protocol", "quick", "entries", "sample", "code", "machine", "written")
@@ -56,15 +64,22 @@ def stored() -> dict[str, Results]:
     return results
 
 
-def table(results: Mapping[str, Results]) -> str:
-    """One line per entry, the best first; drivers of the suite once."""
+def table(document: str) -> str:
+    """The table of a document: one line per entry, the best first; drivers of the suite once."""
+    only, columns = PAGES[document]
+    results = stored() if only is None else {only: stored()[only]}
     entries = {}
     for name in sorted(results, key=lambda name: name != "shipped"):
         for entry in results[name]["entries"]:
             entries.setdefault(entry["entry"], entry)
     traffics = list(settings("benchmark", []).suite.scored)
     rows = [{**entry, "decisions_per_s": None} for entry in entries.values()]
-    return score_table(rows, traffics, []).markdown(heading=False)
+    whole = score_table(rows, traffics, [])
+    # How fast one machine drove is no property of an agent.
+    wanted = columns or [name for name in whole.headings if name != "decisions/s"]
+    places = [whole.headings.index(name) for name in wanted]
+    lines = [[line[place] for place in places] for line in whole.lines]
+    return Table("", list(wanted), lines).markdown(heading=False)
 
 
 def add(path: Path, name: str) -> str:
@@ -78,12 +93,14 @@ def add(path: Path, name: str) -> str:
 
 
 def differences() -> list[str]:
-    """What of the page is not as the stored results say."""
-    before, after = split_at_markers(PAGE, *MARKERS)
-    whole = PAGE.read_text(encoding="utf-8")
-    if whole[len(before) : -len(after)].strip() == table(stored()):
-        return []
-    return [f"{PAGE.name}: differs; run `python -m benchmarks.leaderboard --write`."]
+    """Which documents are not as the stored results say."""
+    wrong = []
+    for document in PAGES:
+        before, after = split_at_markers(ROOT / document, *MARKERS)
+        whole = (ROOT / document).read_text(encoding="utf-8")
+        if whole[len(before) : -len(after)].strip() != table(document):
+            wrong.append(f"{document}: differs; run `python -m benchmarks.leaderboard --write`.")
+    return wrong
 
 
 def driven_again(name: str, results: Results, episodes: int = SAMPLE) -> list[str]:
@@ -96,7 +113,7 @@ def driven_again(name: str, results: Results, episodes: int = SAMPLE) -> list[st
     names = [*config.suite.drivers(), *(results["agents"] or config.suite.agents)]
     wrong = []
     for driver in drivers_of(list(dict.fromkeys(names)), config):
-        for traffic, rewards in results["sample"][driver.name].items():
+        for traffic, rewards in results["sample"].get(driver.name, {}).items():
             count = min(episodes, len(rewards))
             alone = replace(config.on(traffic), episodes=count)
             evaluated = compare([driver], alone, quiet=True)
@@ -122,9 +139,9 @@ def work(options: argparse.Namespace) -> str:
         if wrong:
             raise UserError("; ".join(wrong))
         return "every sampled episode came out as stored"
-    if options.write:
-        ReportSection(PAGE, *MARKERS).write(f"\n{table(stored())}\n")
-    return "\n".join(differences()) or "the page is as the stored results say"
+    for document in PAGES if options.write else ():
+        ReportSection(ROOT / document, *MARKERS).write(f"\n{table(document)}\n")
+    return "\n".join(differences()) or "the documents are as the stored results say"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -74,6 +74,12 @@ class Suite(Record):
         return list(dict.fromkeys(["random_legal", "mobil", *self.baselines]))
 
 
+def _changed(record: Record) -> dict[str, Any]:
+    """The keys of a record that have not their defaults."""
+    defaults = plain(type(record)())
+    return {name: value for name, value in plain(record).items() if value != defaults[name]}
+
+
 @dataclass(frozen=True)
 class BenchmarkConfig(RunConfig):
     """Agents on a suite: scores, a table, a report with films.
@@ -106,15 +112,26 @@ class BenchmarkConfig(RunConfig):
         return max(2, round(episodes * QUICK_SHARE)) if self.quick else episodes
 
     def protocol(self) -> str:
-        """Twelve digits of the SHA-256 of everything that decides a result, but the code."""
-        fixed = plain(self.suite)
-        # Who drives besides, and who is compared with whom, changes nobody's result.
-        del fixed["agents"], fixed["baselines"], fixed["pairs"]
+        """Twelve digits of the SHA-256 of everything that the suite and the command fix.
+
+        What has its default is left out, so a new key of a traffic changes no hash. That nobody
+        changes what an option does is a matter of the tests.
+        """
+        suite = self.suite
+        fixed: dict[str, Any] = {
+            "version": suite.version,
+            "stream": suite.stream,
+            "scored": suite.scored,
+            "shown": suite.shown,
+            "env": _changed(suite.env),
+            "reward": _changed(suite.reward),
+            "seed": self.seed,
+            "quick": self.quick,
+        }
         # Both change how fast an episode is driven, not what happens in it.
-        del fixed["env"]["compile"], fixed["env"]["kernel"]
-        traffics = {name: item.description() for name, item in self.suite.traffics().items()}
-        everything = {**fixed, "traffics": traffics, "seed": self.seed, "quick": self.quick}
-        return hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()[:12]
+        for name in ("compile", "kernel"):
+            fixed["env"].pop(name, None)
+        return hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:12]
 
     def on(self, traffic: str) -> EvaluateConfig:
         """The same for one traffic, as ``ganlane evaluate`` takes it."""

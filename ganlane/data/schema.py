@@ -43,6 +43,8 @@ TRACK: Final = ("scene", "vehicle")
 MAX_MEDIAN_SPEED_MPS: Final = 60.0
 MAX_MEDIAN_LENGTH_M: Final = 12.0
 MAX_SPEED_RATIO: Final = 1.4
+#: A track that ends so far behind its beginning runs backwards, m.
+BACKWARDS_M: Final = 5.0
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,8 @@ def validate(
 
     Raises:
         UserError: a missing column, no rows, NaN or null, a frame number that does not grow within
-            its track, a size of 0 or less, or units that cannot be metres and metres per second.
+            its track, a track that runs backwards, a size of 0 or less, or units that cannot be
+            metres and metres per second.
     """
     # Columns beyond the schema are ignored.
     missing = [name for name in SCHEMA if name not in frame.columns]
@@ -177,6 +180,14 @@ def _mistakes(frame: pl.DataFrame) -> Iterator[tuple[int, str]]:
             f"column frame: most rows of scene {scene} come {frames} frames after their track's "
             f"last one; expected {1 / FRAME_S:.0f} frames a second, numbered one by one: resample "
             "the recording",
+        )
+    # Noise moves a standing car back by decimetres; further back a whole track is turned round.
+    track_m = (pl.col("x").last() - pl.col("x").first()).over(TRACK)
+    for row in frame.select((track_m < -BACKWARDS_M).arg_true().first()).to_series().drop_nulls():
+        yield (
+            row,
+            "column x: its track runs backwards, against the direction of growing x; turn x and y "
+            "of that carriageway round, or leave its tracks out",
         )
     # Distance per time, from one row to the next of a track.
     rates = pl.col("x").diff().over(TRACK) / (step * FRAME_S)

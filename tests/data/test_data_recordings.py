@@ -75,6 +75,12 @@ def test_lanes_are_counted_from_the_right_y_from_the_right_lanes_centre_and_rows
     assert read_scenes(written(tmp_path, by_frame)).equals(frame)
 
 
+def test_a_track_that_runs_backwards_is_refused(tmp_path):
+    path = written(tmp_path, changed("x", lambda x: str(100.0 - 1.5 * float(x))))
+    with user_error("line 2, column x: its track runs backwards"):
+        read_scenes(path)
+
+
 @pytest.mark.parametrize(
     ("row", "column", "value", "message"),
     [

@@ -69,7 +69,7 @@ def table(document: str) -> str:
     only, columns = PAGES[document]
     results = stored() if only is None else {only: stored()[only]}
     entries = {}
-    for name in sorted(results, key=lambda name: name != "shipped"):
+    for name in results:
         for entry in results[name]["entries"]:
             entries.setdefault(entry["entry"], entry)
     traffics = list(settings("benchmark", []).suite.scored)
@@ -110,7 +110,10 @@ def driven_again(name: str, results: Results, episodes: int = SAMPLE) -> list[st
         UserError: an agent that is not at hand here.
     """
     config: BenchmarkConfig = settings("benchmark", [])
-    names = [*config.suite.drivers(), *(results["agents"] or config.suite.agents)]
+    agents = results["agents"] or config.suite.agents
+    # Weights of a contributor lie beside the results, in a folder of the entry's name.
+    beside = [str(FOLDER / agent) if (FOLDER / agent).is_dir() else agent for agent in agents]
+    names = [*config.suite.drivers(), *beside]
     wrong = []
     for driver in drivers_of(list(dict.fromkeys(names)), config):
         for traffic, rewards in results["sample"].get(driver.name, {}).items():

@@ -53,8 +53,11 @@ from ganlane.settings.driving import HumanVariation, Visibility
 from ganlane.settings.generator import HumanConfig
 from ganlane.sim.state import Road, Vehicles
 
-#: The desired speed of a driver who follows another is its present one and this much, m/s.
+#: A driver's desired speed is its present one and this much, m/s.
 DESIRED_ABOVE_MPS = 4.0
+#: What is left after a decision of the acceleration of a driver who leads the recorded scene: its
+#: leader was not recorded, and an acceleration lasts for about a second.
+LEFT_OF_ACCELERATION = 0.6
 #: Width of a body where none is recorded, m.
 WIDTH_M = 1.9
 #: Who moves aside faster than this, m/s, away from its lane's centre, is changing lanes.
@@ -94,7 +97,7 @@ def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memo
         acceleration=accelerations[..., 0],
         length=segments.length.clamp_min(1.0),
         width=zero + WIDTH_M,
-        desired_speed=speed,
+        desired_speed=(speed + DESIRED_ABOVE_MPS).clamp(*DESIRED_MPS),
         target_lane=torch.where(leaving, soon, lane).long(),
         visibility=torch.full_like(lane, int(Visibility.CENTRE)).long(),
         valid=segments.present[:, PRESENT],
@@ -110,11 +113,6 @@ def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memo
         zero + LONG_AGO,
     )
     view = perceive(vehicles, memory, road)
-    # Who sees nobody ahead has a leader that was not recorded rather than a free road, and is taken
-    # to keep its speed.
-    follows = view.gap < SIGHT_M
-    desired = (speed + DESIRED_ABOVE_MPS).clamp(*DESIRED_MPS)
-    vehicles = vehicles.with_(desired_speed=torch.where(follows, desired, speed))
     memory = memory._replace(closing=torch.stack((view.closing, view.closing), -1))
     return vehicles, with_style(memory, view, torch.ones_like(whole)), road
 
@@ -150,6 +148,7 @@ def _driven(
     vehicles, memory, road = present_of(model.estimator, segments.repeated(runs))
     mean = torch.zeros_like(vehicles.valid)
     mean[:rows] = True
+    leads = perceive(vehicles, memory, road).gap >= SIGHT_M
     temperature = HumanVariation.temperature
     steps = torch.arange(1, STEPS + 1) * PHYSICS_STEP_S
     course = []
@@ -169,6 +168,8 @@ def _driven(
             u = torch.rand(mean.shape, generator=random)
             drawn = tokens.sample(logits, u, temperature)
             changes.append(torch.where(mean, tokens.mean(logits), drawn))
+        fading = (LEFT_OF_ACCELERATION - 1.0) * memory.accelerations[..., 0]
+        changes[0] = torch.where(leads, fading, changes[0])
         acceleration, aside = bounded(vehicles, memory, road, *changes)
         speed, lateral = velocity(vehicles)
         # Within a decision: constant acceleration, the lateral speed changing evenly.

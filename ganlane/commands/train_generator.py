@@ -18,7 +18,7 @@ from ganlane.data import (
     read_recordings,
     recordings_path,
 )
-from ganlane.data.dense import Recording
+from ganlane.data.dense import Recording, recordings_of
 from ganlane.data.one_lane import one_lane_files, read_one_lane
 from ganlane.evaluation import code_version, write_results
 from ganlane.evaluation.table import aligned, show
@@ -49,7 +49,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
         )
     # The seed of the command is that of the fit.
     fit_config: Any = replace(config.generator, seed=config.seed)
-    scenes = generator.scene_tracks(frame)
+    scenes = recordings_of(frame)
     held_out = config.data.held_out_scenes([scene.name for scene in scenes], generator.HELD_OUT)
     # Scenes that do not fit together are refused now rather than after hours of fitting.
     generator.split_for_fit(scenes, held_out)

@@ -8,14 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import ArrayLike
 
-from ganlane.data.lanes import Flags, Floats
+from ganlane.data.lanes import Flags, Floats, Integers, scene_lane_widths
 from ganlane.data.schema import FRAME_S, SCHEMA
+from ganlane.errors import UserError
+
+#: In fitting, a recorded driver's target lane is its lane after this time, s.
+INTENTION_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -27,6 +32,7 @@ class Recording:
         unit: what is resampled together: the scene, or the pair that several segments come from.
         lanes, lane_width_m: its road.
         x, y, speed: [T, V] centre of the body, m, and m/s.
+        lane: [T, V] as recorded; of simulations, the one whose centre is nearest.
         present: [T, V] in the scene in this frame; a track has no gap.
         length, width: [V] m.
         driven: [V] simulated; the others are replayed as recorded and left out of every measure.
@@ -39,6 +45,7 @@ class Recording:
     x: Floats
     y: Floats
     speed: Floats
+    lane: Integers
     present: Flags
     length: Floats
     width: Floats
@@ -65,9 +72,10 @@ class Recording:
         # Values per frame and track; 0 where the track is absent.
         arrays: dict[str, Any] = {"present": np.zeros(shape, bool)}
         arrays["present"][time, track] = True
-        for name in ("x", "y", "speed"):
-            arrays[name] = np.zeros(shape)
-            arrays[name][time, track] = rows[name].to_numpy()
+        for name in ("x", "y", "speed", "lane"):
+            column = rows[name].to_numpy()
+            arrays[name] = np.zeros(shape, column.dtype)
+            arrays[name][time, track] = column
         # Values per track, the same in all of its rows.
         for name in ("length", "width", "driven"):
             column = rows[name].to_numpy()
@@ -77,6 +85,43 @@ class Recording:
         # Lane 0 is the rightmost; lanes beyond the leftmost one in use are not known.
         lanes = int(rows["lane"].to_numpy().max()) + 1
         return cls(scene, scene, lanes, lane_width_m, **arrays)
+
+    @cached_property
+    def positions(self) -> Floats:
+        """``x`` and ``y`` side by side, [T, V, 2]."""
+        return np.stack((self.x, self.y), -1)
+
+    @cached_property
+    def endless_positions(self) -> Floats:
+        """Positions [T, V, 2], finite in every frame.
+
+        They go on at constant velocity before a vehicle's first and after its last present frame.
+        """
+        frames = np.arange(len(self.present))[:, None]
+        column = np.arange(self.present.shape[1])
+        first, last = self._first_and_last
+        # The frame to go on from: itself, or the first or last one of the track.
+        nearest = np.clip(frames, first, last)
+        # The first and the last displacement of each vehicle; 0 where it was seen only once.
+        early = self.positions[np.minimum(first + 1, last), column] - self.positions[first, column]
+        late = self.positions[last, column] - self.positions[np.maximum(last - 1, first), column]
+        displacement = np.where((frames < first)[..., None], early, late)
+        # Frames since the last, or until the first, recorded one; negative before it.
+        beyond = (frames - nearest)[..., None]
+        return self.positions[nearest, column] + displacement * beyond
+
+    @cached_property
+    def target_lane(self) -> Integers:
+        """Lane [T, V] of each vehicle after :data:`INTENTION_S`, or at the end of its track."""
+        # The frame INTENTION_S later; clipped, since the track may end before.
+        ahead = np.arange(len(self.present))[:, None] + round(INTENTION_S / FRAME_S)
+        return np.take_along_axis(self.lane, np.clip(ahead, *self._first_and_last), axis=0)
+
+    @property
+    def _first_and_last(self) -> tuple[Integers, Integers]:
+        """First and last present frame of each vehicle, [V] each."""
+        # argmax is the first true entry; the last one is the first of the reversed frames.
+        return self.present.argmax(0), len(self.present) - 1 - self.present[::-1].argmax(0)
 
     @property
     def end_m(self) -> float:
@@ -121,9 +166,8 @@ class Recording:
             # Vehicles that are absent all the time are left out.
             rows = slice(start, start + length)
             who = self.present[rows].any(0)
-            arrays = {
-                name: getattr(self, name)[rows, who] for name in ("x", "y", "speed", "present")
-            }
+            names = ("x", "y", "speed", "lane", "present")
+            arrays = {name: getattr(self, name)[rows, who] for name in names}
             arrays |= {name: getattr(self, name)[who] for name in ("length", "width", "driven")}
             # The unit stays that of the recording: pieces of one scene are not independent.
             pieces.append(replace(self, name=f"{self.name}@{start}", **arrays))
@@ -145,8 +189,24 @@ def track_table(scene: str, present: Flags, **values: ArrayLike) -> pl.DataFrame
     return pl.DataFrame({name: columns[name] for name in SCHEMA}, schema=SCHEMA)
 
 
-def recordings_of(frame: pl.DataFrame, lane_widths: Mapping[str, float]) -> list[Recording]:
-    """The scenes of a frame in the schema, by name; ``lane_widths`` are in m."""
+def recordings_of(
+    frame: pl.DataFrame, lane_widths: Mapping[str, float] | None = None
+) -> list[Recording]:
+    """The scenes of a frame in the schema, by name.
+
+    ``lane_widths`` in m are estimated where not given.
+
+    Raises:
+        UserError: a column is missing, there is no row, or lanes are implausibly wide or narrow.
+    """
+    missing = [name for name in SCHEMA if name not in frame.columns]
+    if missing or frame.is_empty():
+        raise UserError(
+            f"a frame without {missing or 'rows'}: expected {list(SCHEMA)}; read recordings with "
+            "ganlane.data.read_scenes."
+        )
+    if lane_widths is None:
+        lane_widths = scene_lane_widths(frame)
     # Sorted by name, so that the order of the file has no effect.
     scenes = frame.partition_by("scene", as_dict=True)
     return [Recording.of(scenes[key], lane_widths[str(key[0])]) for key in sorted(scenes)]

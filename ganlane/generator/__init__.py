@@ -22,7 +22,6 @@ from ganlane.generator.fit import (
 )
 from ganlane.generator.networks import Discriminator, Generator
 from ganlane.generator.tasks import Progress
-from ganlane.generator.windows import scene_tracks
 from ganlane.settings.generated import ANCHOR, AnchorParameters
 from ganlane.settings.generator import (
     CalibratedConfig,
@@ -53,7 +52,6 @@ __all__ = [
     "fit_generator",
     "load_generator",
     "load_human",
-    "scene_tracks",
     "shipped_generator",
     "site_scores",
     "split_for_fit",

@@ -19,7 +19,7 @@ import polars as pl
 from sklearn.model_selection import GroupKFold
 
 from ganlane.data import TRACK, driving_statistics
-from ganlane.data.dense import Recording
+from ganlane.data.dense import Recording, recordings_of
 from ganlane.errors import UserError
 from ganlane.generator.checkpoint import FitResult, Metrics, load_generator
 from ganlane.generator.forecasts import (
@@ -34,15 +34,13 @@ from ganlane.generator.forecasts import (
     repeated,
 )
 from ganlane.generator.human_estimator import HumanModel
-from ganlane.generator.human_forecasts import human_forecasts, tracks_of
+from ganlane.generator.human_forecasts import human_forecasts
 from ganlane.generator.tasks import STRIDE, CalibratedTask, HumanTask, OnProgress, PaperTask
 from ganlane.generator.windows import (
     OBSERVED_POSITIONS,
     PREDICTED_STEPS,
-    SceneTracks,
     count_windows,
     cut_windows,
-    scene_tracks,
 )
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.generator import (
@@ -70,9 +68,9 @@ LONG_STRIDE = 5
 class Split(NamedTuple):
     """Scenes by use: fitted, validation (early stopping) and held out (reported)."""
 
-    fitted: list[SceneTracks]
-    validation: list[SceneTracks]
-    held_out: list[SceneTracks]
+    fitted: list[Recording]
+    validation: list[Recording]
+    held_out: list[Recording]
 
     @property
     def names(self) -> dict[str, list[str]]:
@@ -80,7 +78,7 @@ class Split(NamedTuple):
         return {part: [scene.name for scene in scenes] for part, scenes in self._asdict().items()}
 
 
-def assign_folds(scenes: list[SceneTracks], folds: int) -> list[tuple[str, ...]]:
+def assign_folds(scenes: list[Recording], folds: int) -> list[tuple[str, ...]]:
     """Names of the scenes in each fold, with about as many windows in each.
 
     Raises:
@@ -101,7 +99,7 @@ def assign_folds(scenes: list[SceneTracks], folds: int) -> list[tuple[str, ...]]
     return [tuple(np.unique(scene_of[tested]).tolist()) for _, tested in splits]
 
 
-def split_for_fit(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> Split:
+def split_for_fit(scenes: list[Recording], held_out: tuple[str, ...]) -> Split:
     """The three parts of a fit that reports ``held_out``.
 
     The smallest of the other scenes are for validation, as few as hold a twelfth of their windows.
@@ -137,7 +135,7 @@ def split_for_fit(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> Split
     return Split(fitted, validation or fitted, reported)
 
 
-def _validation_names(scenes: list[SceneTracks]) -> set[str]:
+def _validation_names(scenes: list[Recording]) -> set[str]:
     """The smallest of ``scenes`` that together hold a twelfth of the windows; never all of them."""
     # The smallest scenes cost the fit least.
     sizes = {scene.name: count_windows(scene) for scene in scenes}
@@ -173,19 +171,18 @@ def site_scores(
     settings = CalibratedConfig()
     scores: dict[str, dict[str, float]] = {}
     for site, recordings in sites.items():
-        recordings = recordings[:SITE_SCENES]
-        scenes = [tracks_of(recording) for recording in recordings]
+        recordings = list(recordings[:SITE_SCENES])
         driven = {recording.name: recording.driven for recording in recordings}
         row = scores[site] = {}
         for steps, stride in SITE_STRIDES.items():
-            windows = cut_windows(scenes, stride, OBSERVED_POSITIONS + steps)
+            windows = cut_windows(recordings, stride, OBSERVED_POSITIONS + steps)
             forecasts = {
                 BASELINE: repeated(windows.past[:, -1], steps),
-                "human": human_forecasts(model, scenes, steps, stride, samples=1)["mean"],
+                "human": human_forecasts(model, recordings, steps, stride, samples=1)["mean"],
                 "gan_calibrated": calibrated_forecasts(
-                    calibrated, scenes, steps, stride, settings, samples=1
+                    calibrated, recordings, steps, stride, settings, samples=1
                 )["mean"],
-                "idm_own_headway": idm_forecast(scenes, steps, stride),
+                "idm_own_headway": idm_forecast(recordings, steps, stride),
             }
             follows = [driven[scene][car] for scene, car in zip(windows.scene, windows.vehicle)]
             errors = {}
@@ -286,7 +283,7 @@ def fit_generator(
     Raises:
         UserError: unusable recordings or scene names.
     """
-    split = split_for_fit(scene_tracks(frame), held_out)
+    split = split_for_fit(recordings_of(frame), held_out)
     fitted = run_fit(config, split, folder, on_progress, following=following)
     return _fit_result(
         fitted,
@@ -330,7 +327,7 @@ def _fit_result(
 HeldOut = tuple[np.ndarray, Forecasts]
 
 
-def held_out_errors(task: Any, scenes: list[SceneTracks], steps: int, stride: int) -> HeldOut:
+def held_out_errors(task: Any, scenes: list[Recording], steps: int, stride: int) -> HeldOut:
     """Errors of forecasts of held-out ``scenes``: by the fit, constant velocity and IDM."""
     # The same windows for every forecaster, in the same order.
     windows = cut_windows(scenes, stride, OBSERVED_POSITIONS + steps)
@@ -371,7 +368,7 @@ def cross_validate(
     Raises:
         UserError: too many folds for the recordings.
     """
-    scenes = scene_tracks(frame)
+    scenes = recordings_of(frame)
     splits = [split_for_fit(scenes, names) for names in assign_folds(scenes, folds)]
     results = []
     short = []

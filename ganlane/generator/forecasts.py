@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ganlane.data.dense import Recording
 from ganlane.generator.checkpoint import Metrics
 from ganlane.generator.closed_loop import (
     displacement_of,
@@ -30,7 +31,6 @@ from ganlane.generator.windows import (
     PREDICTED_STEPS,
     PRESENT,
     Groups,
-    SceneTracks,
     Segments,
     Windows,
     cut_windows,
@@ -173,7 +173,7 @@ def paper_forecasts(
 
 def driven_windows(
     driver: Callable[[Segments], Tensor],
-    scenes: list[SceneTracks],
+    scenes: list[Recording],
     horizon: int,
     stride: int,
     samples: int = 1,
@@ -199,7 +199,7 @@ def driven_windows(
 @torch.no_grad()
 def calibrated_forecasts(
     generator: Generator,
-    scenes: list[SceneTracks],
+    scenes: list[Recording],
     horizon: int,
     stride: int,
     config: CalibratedConfig,
@@ -234,7 +234,7 @@ def calibrated_forecasts(
 
 
 @torch.no_grad()
-def idm_forecast(scenes: list[SceneTracks], horizon: int, stride: int) -> np.ndarray:
+def idm_forecast(scenes: list[Recording], horizon: int, stride: int) -> np.ndarray:
     """Positions [W, H, 2] in m by IDM along the road, with constant lateral positions.
 
     Every driver has the headway at which it is in balance at present: the calibrated preset's
@@ -278,7 +278,7 @@ def energy_score(
 @torch.no_grad()
 def rollout_errors(
     generator: Generator,
-    scenes: list[SceneTracks],
+    scenes: list[Recording],
     config: CalibratedConfig,
 ) -> Metrics:
     """Errors of the calibrated preset's rollouts through scenes, for all and for each scene.

@@ -44,7 +44,6 @@ from ganlane.generator.windows import (
     OBSERVED_POSITIONS,
     PREDICTED_STEPS,
     PRESENT,
-    SceneTracks,
     Segments,
     cut_windows,
 )
@@ -120,7 +119,7 @@ def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memo
 @torch.no_grad()
 def human_forecasts(
     model: HumanModel,
-    scenes: list[SceneTracks],
+    scenes: list[Recording],
     horizon: int,
     stride: int,
     samples: int = SAMPLES,
@@ -202,7 +201,7 @@ def _seen_besides(model: HumanModel, segments: Segments, mean: Tensor) -> Tensor
     return added
 
 
-def fit_observer(model: HumanModel, scenes: Sequence[SceneTracks], config: HumanConfig) -> None:
+def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanConfig) -> None:
     """Fit the observer of ``model`` to what its policy misses in these scenes.
 
     Every scene counts with none, half, all and more of its noise, so that the observer adds nothing
@@ -250,39 +249,16 @@ def fit_observer(model: HumanModel, scenes: Sequence[SceneTracks], config: Human
     model.observer.requires_grad_(False)
 
 
-def _with_noise(scene: SceneTracks, share: float, config: HumanConfig) -> SceneTracks:
+def _with_noise(scene: Recording, share: float, config: HumanConfig) -> Recording:
     """The scene with a ``share`` of its camera's errors."""
-    smooth = smooth_scene(recording_of(scene), config.cutoff_hz, config.lateral_cutoff_hz)
-    without = np.stack((smooth.x, smooth.y), -1)
-    return replace(scene, positions=without + share * (scene.positions - without))
-
-
-def tracks_of(recording: Recording) -> SceneTracks:
-    """A recording as scene tracks."""
-    lane = np.rint(recording.y / recording.lane_width_m).clip(0, recording.lanes - 1)
-    return SceneTracks(
-        recording.name,
-        recording.lane_width_m,
-        np.stack((recording.x, recording.y), -1),
-        lane.astype(np.int64),
-        recording.present,
-        recording.length,
+    smooth = smooth_scene(scene, config.cutoff_hz, config.lateral_cutoff_hz)
+    return replace(
+        scene,
+        x=smooth.x + share * (scene.x - smooth.x),
+        y=smooth.y + share * (scene.y - smooth.y),
     )
 
 
-def recording_of(scene: SceneTracks) -> Recording:
-    """The scene as a recording."""
-    count = scene.present.shape[1]
-    return Recording(
-        scene.name,
-        scene.name,
-        scene.lanes,
-        scene.lane_width_m,
-        x=scene.positions[..., 0],
-        y=scene.positions[..., 1],
-        speed=np.zeros(scene.present.shape),
-        present=scene.present,
-        length=scene.length,
-        width=np.full(count, WIDTH_M),
-        driven=np.ones(count, bool),
-    )
+def standard_width(recording: Recording) -> Recording:
+    """The recording with cars that are all equally wide."""
+    return replace(recording, width=np.full(len(recording.width), WIDTH_M))

@@ -41,7 +41,7 @@ from ganlane.generator.forecasts import (
 )
 from ganlane.generator.human_estimator import HumanModel
 from ganlane.generator.human_fit import fit_human
-from ganlane.generator.human_forecasts import fit_observer, human_forecasts, recording_of
+from ganlane.generator.human_forecasts import fit_observer, human_forecasts, standard_width
 from ganlane.generator.networks import (
     DIFFERENCE_SCALE_M,
     Discriminator,
@@ -51,7 +51,6 @@ from ganlane.generator.networks import (
 from ganlane.generator.windows import (
     PREDICTED_STEPS,
     Groups,
-    SceneTracks,
     Segments,
     Windows,
     cut_segments,
@@ -140,8 +139,8 @@ class PaperTask(_Task):
 
     def __init__(
         self,
-        fitted: list[SceneTracks],
-        validation: list[SceneTracks],
+        fitted: list[Recording],
+        validation: list[Recording],
         config: PaperConfig,
     ):
         super().__init__(config)
@@ -197,14 +196,14 @@ class PaperTask(_Task):
         return float(np.linalg.norm(mean - windows.future, axis=-1).mean())
 
     def forecasts(
-        self, scenes: list[SceneTracks], steps: int, stride: int, samples: int = SAMPLES
+        self, scenes: list[Recording], steps: int, stride: int, samples: int = SAMPLES
     ) -> Forecasts:
         """Forecasts of the windows of ``scenes``, by kind."""
         windows, groups = self._grouped_windows(scenes, stride)
         return paper_forecasts(self.generator, windows, groups, self.config.seed, samples)
 
     @torch.no_grad()
-    def metrics(self, scenes: list[SceneTracks]) -> Metrics:
+    def metrics(self, scenes: list[Recording]) -> Metrics:
         """ADE and FDE of the generator on ``scenes``, all and each.
 
         The discriminator's accuracy on them is added.
@@ -224,7 +223,7 @@ class PaperTask(_Task):
         accuracy = {"held_out_accuracy": float(discriminator_accuracy(recorded, generated))}
         return scene_metrics(windows, forecasts) | {"discriminator": accuracy}
 
-    def _grouped_windows(self, scenes: list[SceneTracks], stride: int) -> tuple[Windows, Groups]:
+    def _grouped_windows(self, scenes: list[Recording], stride: int) -> tuple[Windows, Groups]:
         """All windows of ``scenes`` and their k-means groups."""
         sizes = self.config.sizes
         # n displacements need n + 1 positions.
@@ -276,8 +275,8 @@ class CalibratedTask(_Task):
 
     def __init__(
         self,
-        fitted: list[SceneTracks],
-        validation: list[SceneTracks],
+        fitted: list[Recording],
+        validation: list[Recording],
         config: CalibratedConfig,
     ):
         super().__init__(config)
@@ -342,12 +341,12 @@ class CalibratedTask(_Task):
         return 0.5 * (metrics["relative_mean"] + metrics["relative_energy"])
 
     def forecasts(
-        self, scenes: list[SceneTracks], steps: int, stride: int, samples: int = SAMPLES
+        self, scenes: list[Recording], steps: int, stride: int, samples: int = SAMPLES
     ) -> Forecasts:
         """Forecasts of the windows of ``scenes``, by kind."""
         return calibrated_forecasts(self.generator, scenes, steps, stride, self.config, samples)
 
-    def metrics(self, scenes: list[SceneTracks]) -> Metrics:
+    def metrics(self, scenes: list[Recording]) -> Metrics:
         """Errors of the generator on ``scenes``, all and each."""
         return rollout_errors(self.generator, scenes, self.config)
 
@@ -376,7 +375,7 @@ class HumanTask(nn.Module):
     """
 
     def __init__(
-        self, scenes: list[SceneTracks], following: Sequence[Recording], config: HumanConfig
+        self, scenes: list[Recording], following: Sequence[Recording], config: HumanConfig
     ):
         super().__init__()
         self.config = config
@@ -396,18 +395,18 @@ class HumanTask(nn.Module):
             best = best if cost is None else min(best, cost)
             on_progress(Progress(name, done, steps, {}, cost, best, time.monotonic() - begun))
 
-        recordings = [recording_of(scene) for scene in self.scenes]
-        self.generator = fit_human(self.config, recordings, self.following, report)
+        scenes = [standard_width(scene) for scene in self.scenes]
+        self.generator = fit_human(self.config, scenes, self.following, report)
         fit_observer(self.generator, self.scenes, self.config)
         return 1 + self.config.rounds + self.config.tuning
 
     def forecasts(
-        self, scenes: list[SceneTracks], steps: int, stride: int, samples: int = SAMPLES
+        self, scenes: list[Recording], steps: int, stride: int, samples: int = SAMPLES
     ) -> Forecasts:
         """Forecasts of the windows of ``scenes``, by kind."""
         return human_forecasts(self.generator, scenes, steps, stride, samples)
 
-    def metrics(self, scenes: list[SceneTracks]) -> Metrics:
+    def metrics(self, scenes: list[Recording]) -> Metrics:
         """Errors over 0.8 s of the mean driver, of drawn ones and of constant velocity."""
         windows = cut_windows(scenes, STRIDE)
         forecasts = self.forecasts(scenes, PREDICTED_STEPS, STRIDE)

@@ -1,4 +1,4 @@
-"""Recorded scenes as arrays, and what is cut from them: segments, windows and groups of windows.
+"""What is cut from recorded scenes: segments, windows and groups of windows.
 
 A segment is a stretch of a scene with all its vehicles, for joint rollouts; a window is 9 observed
 and 8 future positions of one vehicle. Nothing is smoothed: a filter applied before windows are cut
@@ -9,19 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 
 import numpy as np
-import polars as pl
 import torch
 from numpy.lib.stride_tricks import sliding_window_view
 from sklearn.cluster import KMeans
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from ganlane.data import SCHEMA, scene_lane_widths
+from ganlane.data.dense import Recording
 from ganlane.errors import UserError
-from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.state import Road
 
 #: Observed positions; they give 8 observed displacements (the paper's ``o_l`` = 8).
@@ -31,102 +28,6 @@ PRESENT = OBSERVED_POSITIONS - 1
 #: Predicted positions (the paper's ``p_l``): 0.8 s.
 PREDICTED_STEPS = 8
 WINDOW_FRAMES = OBSERVED_POSITIONS + PREDICTED_STEPS
-#: In fitting, a recorded driver's target lane is its lane after this time, s.
-INTENTION_S = 2.0
-
-
-@dataclass(frozen=True)
-class SceneTracks:
-    """One recorded scene of T frames (0.1 s apart) and V vehicles; entries of absent vehicles are
-    0.
-
-    Attributes:
-        positions: [T, V, 2] float64, centre of the body, m; x along the road, y to the left.
-        lane, present: [T, V] int64, 0 is the rightmost, and bool.
-        length: [V] float64, m.
-    """
-
-    name: str
-    lane_width_m: float
-    positions: np.ndarray
-    lane: np.ndarray
-    present: np.ndarray
-    length: np.ndarray
-
-    @property
-    def lanes(self) -> int:
-        """Number of lanes: the highest lane number plus one."""
-        return int(self.lane[self.present].max()) + 1
-
-    @cached_property
-    def endless_positions(self) -> np.ndarray:
-        """Positions [T, V, 2], finite in every frame.
-
-        They go on at constant velocity before a vehicle's first and after its last present frame.
-        """
-        frames = np.arange(len(self.present))[:, None]
-        column = np.arange(self.present.shape[1])
-        first, last = self._first_and_last
-        # The frame to go on from: itself, or the first or last one of the track.
-        nearest = np.clip(frames, first, last)
-        # The first and the last displacement of each vehicle; 0 where it was seen only once.
-        early = self.positions[np.minimum(first + 1, last), column] - self.positions[first, column]
-        late = self.positions[last, column] - self.positions[np.maximum(last - 1, first), column]
-        displacement = np.where((frames < first)[..., None], early, late)
-        # Frames since the last, or until the first, recorded one; negative before it.
-        beyond = (frames - nearest)[..., None]
-        return self.positions[nearest, column] + displacement * beyond
-
-    @cached_property
-    def target_lane(self) -> np.ndarray:
-        """Lane [T, V] of each vehicle after :data:`INTENTION_S`, or at the end of its track."""
-        # The frame INTENTION_S later; clipped, since the track may end before.
-        ahead = np.arange(len(self.present))[:, None] + round(INTENTION_S / PHYSICS_STEP_S)
-        return np.take_along_axis(self.lane, np.clip(ahead, *self._first_and_last), axis=0)
-
-    @property
-    def _first_and_last(self) -> tuple[np.ndarray, np.ndarray]:
-        """First and last present frame of each vehicle, [V] each."""
-        # argmax is the first true entry; the last one is the first of the reversed frames.
-        return self.present.argmax(0), len(self.present) - 1 - self.present[::-1].argmax(0)
-
-
-def scene_tracks(frame: pl.DataFrame) -> list[SceneTracks]:
-    """Every scene of a trajectory frame (``ganlane.data``'s schema), in order of their names.
-
-    Raises:
-        UserError: a column is missing, there is no row, or lanes are implausibly wide or narrow.
-    """
-    missing = [name for name in SCHEMA if name not in frame.columns]
-    if missing:
-        raise UserError(
-            f"trajectory frame: columns {missing} are missing; expected {list(SCHEMA)}; "
-            "read the recordings with ganlane.data.read_scenes."
-        )
-    if frame.is_empty():
-        raise UserError("trajectory frame: no rows; give recordings of at least 1.7 s.")
-    scenes = []
-    for name, lane_width_m in sorted(scene_lane_widths(frame).items()):
-        rows = frame.filter(pl.col("scene") == name)
-        vehicles, column = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)
-        # A scene's first frame is row 0; a frame that nobody is in is a row too.
-        row = rows["frame"].to_numpy()
-        row = row - row.min()
-        shape = (int(row.max()) + 1, len(vehicles))
-        scene = SceneTracks(
-            name=name,
-            lane_width_m=lane_width_m,
-            positions=np.zeros((*shape, 2)),
-            lane=np.zeros(shape, dtype=np.int64),
-            present=np.zeros(shape, dtype=bool),
-            length=np.zeros(len(vehicles)),
-        )
-        scene.positions[row, column] = rows.select("x", "y").to_numpy()
-        scene.lane[row, column] = rows["lane"].to_numpy()
-        scene.present[row, column] = True
-        scene.length[column] = rows["length"].to_numpy()
-        scenes.append(scene)
-    return scenes
 
 
 @dataclass(frozen=True)
@@ -211,7 +112,7 @@ class Segments:
 
 
 def segment_starts(
-    scene: SceneTracks,
+    scene: Recording,
     horizon: int,
     stride: int = 1,
 ) -> list[int]:
@@ -227,7 +128,7 @@ def segment_starts(
 
 
 def segment_batches(
-    scene: SceneTracks,
+    scene: Recording,
     horizon: int,
     stride: int,
     size: int,
@@ -241,7 +142,7 @@ def segment_batches(
         )
 
 
-def cut_segments(cuts: list[tuple[SceneTracks, int]], horizon: int) -> Segments:
+def cut_segments(cuts: list[tuple[Recording, int]], horizon: int) -> Segments:
     """The segments that start at (scene, row), padded to one batch.
 
     They end ``horizon`` steps after the present.
@@ -320,7 +221,7 @@ def join_windows(parts: list[Windows]) -> Windows:
     )
 
 
-def _present_throughout(scene: SceneTracks, frames: int) -> np.ndarray:
+def _present_throughout(scene: Recording, frames: int) -> np.ndarray:
     """Whether each vehicle is present in all ``frames`` that start at a row; bool [rows, V]."""
     # sliding_window_view refuses a window that is longer than the array.
     if len(scene.present) < frames:
@@ -328,13 +229,13 @@ def _present_throughout(scene: SceneTracks, frames: int) -> np.ndarray:
     return np.all(sliding_window_view(scene.present, frames, axis=0), axis=-1)
 
 
-def count_windows(scene: SceneTracks) -> int:
+def count_windows(scene: Recording) -> int:
     """Number of windows of 17 frames in a scene, one per possible start."""
     return int(_present_throughout(scene, WINDOW_FRAMES).sum())
 
 
 def cut_windows(
-    scenes: list[SceneTracks],
+    scenes: list[Recording],
     stride: int = 1,
     frames: int = WINDOW_FRAMES,
 ) -> Windows:

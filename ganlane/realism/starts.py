@@ -385,6 +385,7 @@ def spawned_recordings(
             x=paths.x[:, row],
             y=paths.y[:, row],
             speed=paths.speed[:, row],
+            lane=np.rint(paths.y[:, row] / float(road.lane_width_m)).astype(np.int64),
             present=everywhere,
             length=paths.length[row],
             width=paths.width[row],

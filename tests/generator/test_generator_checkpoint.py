@@ -9,12 +9,12 @@ import torch
 from reference.small_networks import SIZES, small_generator
 
 from ganlane.data import default_scenes, read_scenes
+from ganlane.data.dense import recordings_of
 from ganlane.errors import UserError
 from ganlane.generator.checkpoint import FitResult, load_generator
 from ganlane.generator.fit import split_for_fit
 from ganlane.generator.forecasts import rollout_errors
 from ganlane.generator.tasks import PaperTask
-from ganlane.generator.windows import scene_tracks
 from ganlane.native.drivers import drivers_of
 from ganlane.settings.driving import IdmParameters, MobilParameters
 from ganlane.settings.episode import Stream
@@ -206,7 +206,7 @@ def recordings():
 def test_the_stated_errors_are_those_of_the_shipped_weights(preset, recordings):
     generator, metadata = load_generator(shipped_generator(preset), preset)
     config = CONFIGS[preset]
-    split = split_for_fit(scene_tracks(recordings), tuple(metadata["data"]["held_out"]))
+    split = split_for_fit(recordings_of(recordings), tuple(metadata["data"]["held_out"]))
     scenes = split.held_out[:1]
     stated = metadata["metrics"][scenes[0].name]
     if preset == "paper":

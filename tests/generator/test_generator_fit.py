@@ -9,6 +9,7 @@ from reference.small_networks import CALIBRATED, LOOP, PAPER
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 from ganlane.commands.train_generator import fold_tables
+from ganlane.data.dense import recordings_of
 from ganlane.data.statistics import measure_exposure
 from ganlane.errors import UserError
 from ganlane.generator.checkpoint import load_generator
@@ -17,7 +18,7 @@ from ganlane.generator.fit import (
     cross_validate,
     split_for_fit,
 )
-from ganlane.generator.windows import count_windows, scene_tracks
+from ganlane.generator.windows import count_windows
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ def scenes():
         for number in range(7)
     ]
     return [
-        replace(scene_tracks(frame)[0], name=f"scene-{number}")
+        replace(recordings_of(frame)[0], name=f"scene-{number}")
         for number, frame in enumerate(frames)
     ]
 

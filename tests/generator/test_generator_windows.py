@@ -9,6 +9,7 @@ import torch
 from reference.small_networks import recorded_scenes
 
 from ganlane.data import SCHEMA
+from ganlane.data.dense import recordings_of
 from ganlane.errors import UserError
 from ganlane.generator.windows import (
     PRESENT,
@@ -17,7 +18,6 @@ from ganlane.generator.windows import (
     cut_windows,
     group_windows,
     kmeans_labels,
-    scene_tracks,
 )
 
 
@@ -60,7 +60,7 @@ def scenes():
 
 @pytest.fixture(scope="module")
 def windows():
-    return cut_windows(scene_tracks(recording()))
+    return cut_windows(recordings_of(recording()))
 
 
 def test_a_changer_intends_its_new_lane_two_seconds_before_it_is_there(
@@ -92,7 +92,7 @@ def brute_force_windows(frame: pl.DataFrame, stride: int) -> dict[tuple[str, int
 @pytest.mark.parametrize("stride", [1, 3])
 def test_windows_are_those_of_a_brute_force_search(stride):
     frame = recording()
-    scenes = scene_tracks(frame)
+    scenes = recordings_of(frame)
     windows = cut_windows(scenes, stride)
     expected = brute_force_windows(frame, stride)
     # Columns of a scene are its vehicles in the order of their numbers, which begin at 1000.
@@ -107,11 +107,11 @@ def test_windows_are_those_of_a_brute_force_search(stride):
 
 def test_recordings_without_a_needed_column_or_too_short_are_refused():
     with pytest.raises(UserError, match="lane"):
-        scene_tracks(recording().drop("lane"))
-    with pytest.raises(UserError, match="no rows"):
-        scene_tracks(recording().clear())
+        recordings_of(recording().drop("lane"))
+    with pytest.raises(UserError, match="without rows"):
+        recordings_of(recording().clear())
     with pytest.raises(UserError, match="17 frames"):
-        cut_windows(scene_tracks(recording().filter(pl.col("frame") < 110)))
+        cut_windows(recordings_of(recording().filter(pl.col("frame") < 110)))
 
 
 def test_groups_never_mix_scenes_or_frames_lose_nobody_and_hold_the_displacements_of_their_windows(

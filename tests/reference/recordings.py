@@ -127,6 +127,7 @@ def made_by_hand(x, y=None, speed=0.0, lanes=3, name="scene", **changed) -> Reco
     fields = {
         "y": y,
         "speed": speed,
+        "lane": np.rint(y / 3.5).astype(np.int64),
         "present": np.ones(x.shape, bool),
         "driven": size > 0,
         **changed,

@@ -7,8 +7,8 @@ from dataclasses import replace
 import torch
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
+from ganlane.data.dense import Recording, recordings_of
 from ganlane.generator.networks import Generator
-from ganlane.generator.windows import SceneTracks, scene_tracks
 from ganlane.settings.generator import CalibratedConfig, GeneratorSizes, LoopConfig, PaperConfig
 
 SIZES = GeneratorSizes(embedding=16, hidden=12, pooling=10, pooled=6, context=14, noise=4)
@@ -38,7 +38,7 @@ def silenced(generator: Generator) -> Generator:
     return generator
 
 
-def recorded_scenes() -> list[SceneTracks]:
+def recorded_scenes() -> list[Recording]:
     """Two synthetic scenes of 8 s with seven vehicles on three lanes of 3.5 m."""
     frame = synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=7, seconds=8.0))
-    return [replace(scene, lane_width_m=3.5) for scene in scene_tracks(frame)]
+    return [replace(scene, lane_width_m=3.5) for scene in recordings_of(frame)]

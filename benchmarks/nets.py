@@ -246,7 +246,7 @@ def cards(arguments: argparse.Namespace, work: Path) -> Iterator[tuple[str, Grou
     folder = work / "realism"
     run_command("realism", folder, "quick=true", "traffic=gan_calibrated")
     results = results_in(folder)
-    for name in ("quantities", "quantities_held_out", "driving", "long_runs", "checks"):
+    for name in ("quantities", "quantities_held_out", "driving", "long_runs"):
         yield f"quick card, {name}", values_of(results[name])
 
 

@@ -16,7 +16,7 @@ rivals='against=[gan,idm_mobil,idm,idm_faults,ganlane.realism.driving.HeadwayIdm
 
 "$python" -m ganlane realism traffic=gan_calibrated "$rivals" scenes=all long_against=true \
     hydra.run.dir=outputs/cards/all
-for figure in distributions distances drift; do
+for figure in distributions distances; do
     cp "outputs/cards/all/$figure.png" "docs/figures/realism_$figure.png"
 done
 if [ -n "${FOLDS:-}" ]; then

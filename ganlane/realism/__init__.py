@@ -6,7 +6,7 @@
     ganlane realism traffic=gan_calibrated scenes=all long_against=true
     ganlane realism traffic=idm quick=true
 
-Writes results.json, distributions.png, distances.png and drift.png into its run folder. Without
+Writes results.json, distributions.png and distances.png into its run folder. Without
 recordings on the machine it uses the histograms that ship, and says so.
 
 Every traffic of a card drives from the same starts: the recorded scenes, for as long as they were
@@ -23,7 +23,7 @@ Modules, from the bottom up:
 - :mod:`~ganlane.realism.long_runs`: long runs, and the events in them.
 - :mod:`~ganlane.realism.starts`: every traffic from recorded or spawned starts, its desired speeds
   fitted, by folds where asked for.
-- :mod:`~ganlane.realism.card`: a card's numbers and checks.
+- :mod:`~ganlane.realism.card`: a card's numbers.
 - :mod:`~ganlane.realism.sheets`: the same as tables and figures.
 """
 

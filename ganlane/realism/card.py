@@ -1,9 +1,9 @@
-"""The numbers of a card: a traffic's distances to the recordings, and checks."""
+"""The numbers of a card: a traffic's distances to the recordings."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from ganlane.evaluation.statistics import (
@@ -23,15 +23,6 @@ from ganlane.realism.measures import (
     pooled_distance,
 )
 from ganlane.realism.starts import Starts
-
-#: Quantities in which generated traffic should come closer to recordings than rules do.
-CLOSER_IN = (
-    "speed_spread",
-    "acceleration",
-    "time_headway",
-    "time_to_collision",
-    "lane_change_duration",
-)
 
 
 def card_numbers(
@@ -61,9 +52,6 @@ def card_numbers(
     for name, measured in starts.driven.items():
         driving[name] = measured.summary()
     runs = long_runs[traffic]
-    rate = starts.reference.rate()["per_vehicle_km_ci"]
-    ours = driving[traffic]["quantiles"]
-    recorded = driving["recorded"]["quantiles"]
     return {
         "traffic": traffic,
         **starts.description(),
@@ -75,14 +63,6 @@ def card_numbers(
         **totals(runs),
         "long_runs": runs,
         "long_runs_against": {name: long_runs[name] for name in long_runs if name != traffic},
-        "checks": card_checks(
-            rows,
-            ours,
-            recorded,
-            rate,
-            starts.reference.spread_mps,
-            runs,
-        ),
     }
 
 
@@ -92,13 +72,11 @@ def card_rows(
     resamples: int,
 ) -> dict[str, Any]:
     """The rows of a traffic's card, compared with every other traffic from the same starts."""
-    floors = starts.reference.floors
-    recorded = starts.recorded.counts
     return quantity_rows(
         traffic,
         starts.driven,
-        recorded,
-        floors,
+        starts.recorded.counts,
+        starts.reference.floors,
         starts.paired,
         resamples,
     )
@@ -200,68 +178,3 @@ def verdict(difference: Estimate) -> str:
     if not difference.excludes_zero():
         return "undecided"
     return "closer" if difference.value < 0.0 else "farther"
-
-
-def card_checks(
-    quantities: Mapping[str, Any],
-    ours: Mapping[str, Any],
-    recorded: Mapping[str, Any],
-    recorded_rate: Sequence[float] | None,
-    spread_mps: float,
-    runs: Sequence[Mapping[str, Any]],
-) -> dict[str, Any]:
-    """The checks by name; None where the data to decide are missing.
-
-    Args:
-        quantities: the card's rows.
-        ours, recorded: quantiles of the traffic and of the recordings, from the same starts.
-        recorded_rate: interval of the recorded lane changes per vehicle-km.
-        spread_mps: recorded mean spread of speeds within a frame.
-        runs: the long runs.
-    """
-    # Verdicts by rival, of the quantities that matter most.
-    rivals: dict[str, dict[str, str]] = {}
-    for name in CLOSER_IN:
-        for rival, row in quantities[name]["against"].items():
-            rivals.setdefault(rival, {})[name] = row["verdict"]
-    # Both tails of the accelerations.
-    near: bool | None = True
-    for level in ("0.05", "0.95"):
-        value = ours["acceleration"][level]
-        target = recorded["acceleration"][level]
-        if value is None or target is None:
-            near = None
-            break
-        near = near and abs(value - target) <= 0.3 * abs(target)
-    return {
-        "compared_with": rivals,
-        "acceleration_quantiles_within_30_percent": near,
-        "long_runs": [_run_checks(run, recorded_rate, spread_mps) for run in runs],
-    }
-
-
-def _run_checks(
-    run: Mapping[str, Any],
-    recorded_rate: Sequence[float] | None,
-    spread_mps: float,
-) -> dict[str, Any]:
-    """The checks of one long run."""
-    changes = run["lane_changes_per_vehicle_km"]
-    overlaps = run["overlaps_per_1000_vehicle_km"]
-    # Unknown until there is something to compare.
-    inside = wide = None
-    if changes is not None and recorded_rate:
-        inside = recorded_rate[0] <= changes <= recorded_rate[1]
-    # Speeds must not converge during minutes of driving.
-    spreads = [at["spread_mps"] for at in run["speeds"].values() if at["spread_mps"] is not None]
-    if spreads:
-        wide = min(spreads) >= 0.5 * spread_mps
-    return {
-        "vehicles": run["vehicles"],
-        "lane_changes_inside_recorded_interval": inside,
-        "overlaps_under_1_per_1000_vehicle_km": None if overlaps is None else overlaps < 1.0,
-        "nobody_off_the_road": run["off_road"] == 0,
-        "nobody_standing_in_free_flow": run["standstills_in_free_flow"] == 0,
-        "spread_at_least_half_the_recorded": wide,
-        "guard_under_5_percent": None if run["guard_share"] is None else run["guard_share"] < 0.05,
-    }

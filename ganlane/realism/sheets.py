@@ -56,7 +56,7 @@ def card_text(numbers: Mapping[str, Any]) -> list[str]:
     }.items():
         if runs:
             tables.append(long_table(runs, name))
-    return [*tables, checks_text(numbers["checks"])]
+    return tables
 
 
 def quantities_table(quantities: Mapping[str, Any], traffic: str) -> str:
@@ -159,29 +159,6 @@ def _run_cells(run: Mapping[str, Any], traffic: str) -> dict[str, str]:
     return cells
 
 
-def checks_text(checks: Mapping[str, Any]) -> str:
-    """The card's checks, a line each."""
-
-    def told(name: str, value: bool | None) -> str:
-        unknown = "no guard" if name == "guard_under_5_percent" else "unknown"
-        # None: what the check looks at was not there.
-        answer = {
-            True: "yes",
-            False: "no",
-            None: unknown,
-        }[value]
-        return f"{name.replace('_', ' ')}: {answer}"
-
-    near = "acceleration_quantiles_within_30_percent"
-    lines = [told(near, checks[near])]
-    for rival, verdicts in checks["compared_with"].items():
-        lines.append(f"than {short_name(rival)}: " + ", ".join(map(" ".join, verdicts.items())))
-    for run in checks["long_runs"]:
-        results = ", ".join(told(name, value) for name, value in run.items() if name != "vehicles")
-        lines.append(f"{run['vehicles']} vehicles: {results}")
-    return "\n".join(lines)
-
-
 def short_name(traffic: str) -> str:
     """A traffic's name without the path that it is imported from."""
     return traffic.rpartition(".")[2]
@@ -192,10 +169,7 @@ def draw(
     starts: Starts,
     to: Path,
 ) -> None:
-    """The figures of a card, into the folder ``to``.
-
-    Distributions, distances, and drift if there are long runs.
-    """
+    """The figures of a card, distributions and distances, into the folder ``to``."""
     # The reference drivers would hide the others.
     simulated = {name: starts.driven[name] for name in starts.driven if name not in FLOORS}
     totals = {short_name(name): _pooled(measured) for name, measured in simulated.items()}
@@ -203,12 +177,6 @@ def draw(
     save_figure(distributions, to / "distributions.png")
     distances = draw_distances(numbers["quantities"], numbers["traffic"])
     save_figure(distances, to / "distances.png")
-    if numbers["long_runs"]:
-        drift = draw_speeds_over_time(
-            numbers["long_runs"],
-            numbers["recorded_spread_mps"],
-        )
-        save_figure(drift, to / "drift.png")
 
 
 def _pooled(measured: Measured) -> dict[str, FloatArray]:
@@ -368,39 +336,4 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
         {short_name(name): colour for name, colour in colours.items()},
         marks,
     )
-    return figure
-
-
-@rc_context(STYLE)
-def draw_speeds_over_time(runs: Sequence[Mapping[str, Any]], spread_mps: float) -> Figure:
-    """Mean and spread of the speeds of long runs over time.
-
-    The recorded mean spread within a frame as a level.
-    """
-    figure, grid = panel_grid(2)
-    colours = palette([f"{run['vehicles']} vehicles" for run in runs])
-    titles = {
-        "mean_speed_mps": "mean speed",
-        "spread_mps": "spread of speeds",
-    }
-    for axes, (key, title) in zip(grid, titles.items()):
-        axes.set(
-            title=title,
-            xlabel="time, s",
-            ylabel="m/s",
-        )
-        for run, colour in zip(runs, colours.values()):
-            # The time at 5000 m differs from run to run, and is no point in time.
-            speeds = {time: at[key] for time, at in run["speeds"].items() if time.endswith(" s")}
-            x = [float(time.removesuffix(" s")) for time in speeds]
-            # None, where nobody was left to measure, becomes NaN.
-            plot_line(
-                axes,
-                x,
-                np.array(list(speeds.values()), np.float64),
-                color=colour,
-            )
-    # A traffic that holds the recorded spread stays near this level.
-    grid[1].axhline(spread_mps, color=INK)
-    add_legend(figure, {"recorded": INK, **colours})
     return figure

@@ -1,4 +1,4 @@
-"""The rows and checks of a card; a card as text and figures."""
+"""The rows of a card; a card as text and figures."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,6 @@ from matplotlib.colors import to_hex
 from reference.recordings import recorded_cars
 
 from ganlane.realism.card import (
-    CLOSER_IN,
-    card_checks,
     quantity_rows,
 )
 from ganlane.realism.driving import (
@@ -26,13 +24,11 @@ from ganlane.realism.measures import (
     measure_recordings,
 )
 from ganlane.realism.sheets import (
-    checks_text,
     draw_distributions,
     long_table,
 )
 from ganlane.realism.starts import simulate
 from ganlane.sim.state import Road
-from ganlane.traffic import IdmTraffic
 from ganlane.traffic.presets import (
     gan_calibrated_traffic,
     gan_traffic,
@@ -83,32 +79,6 @@ def test_a_card_puts_the_model_between_its_ceiling_and_its_floors_driven_or_meas
     assert rows["speed"]["constant_velocity"] is None
 
 
-def test_checks_hold_runs_against_the_recordings():
-    run = long_run(
-        IdmTraffic,
-        Road(),
-        LongRunParameters(vehicles=6, vehicle_km=1.0, most_s=20.0),
-    )
-    quantities = {name: {"against": {"rival": {"verdict": "closer"}}} for name in CLOSER_IN}
-    quantiles = [{"acceleration": {"0.05": low, "0.95": 1.0}} for low in (-1.0, -1.2)]
-    checks = card_checks(quantities, *quantiles, [0.7, 1.2], 2.8, [run])
-    assert checks["acceleration_quantiles_within_30_percent"] is True
-    assert checks["compared_with"]["rival"]["acceleration"] == "closer"
-    (of_run,) = checks["long_runs"]
-    assert of_run["nobody_off_the_road"] is of_run["overlaps_under_1_per_1000_vehicle_km"] is True
-    assert of_run["lane_changes_inside_recorded_interval"] is False
-    assert of_run["guard_under_5_percent"] is None
-    # One tail is twice as far out.
-    far = {"acceleration": {"0.05": -2.0, "0.95": 1.0}}
-    checks = card_checks(quantities, quantiles[0], far, None, 2.8, [run])
-    assert checks["acceleration_quantiles_within_30_percent"] is False
-    assert checks["long_runs"][0]["lane_changes_inside_recorded_interval"] is None
-
-
-ROWS = {name: {"against": {}} for name in CLOSER_IN}
-QUANTILES = {"acceleration": {"0.05": -1.0, "0.95": 1.0}}
-
-
 class Still(ConstantVelocity):
     """Nobody moves."""
 
@@ -119,10 +89,6 @@ class Still(ConstantVelocity):
 def cells(table, row):
     (line,) = [line for line in table.splitlines() if line.startswith(row)]
     return line.removeprefix(row).split()
-
-
-def checked(run, rate=(0.7, 1.2)):
-    return card_checks(ROWS, QUANTILES, QUANTILES, rate, 2.8, [run])
 
 
 def test_traffic_that_stands_still_has_counts_and_no_rates():
@@ -141,11 +107,6 @@ def test_traffic_that_stands_still_has_counts_and_no_rates():
         == cells(table, "overlaps per 1000 vehicle-km")
         == ["-"]
     )
-    (checks,) = checked(run)["long_runs"]
-    assert checks["lane_changes_inside_recorded_interval"] is None
-    assert checks["overlaps_under_1_per_1000_vehicle_km"] is None
-    assert checks["nobody_standing_in_free_flow"] is False
-    assert "lane changes inside recorded interval: unknown" in checks_text(checked(run))
 
 
 def test_a_traffic_without_a_guard_has_none_in_its_card():
@@ -158,8 +119,6 @@ def test_a_traffic_without_a_guard_has_none_in_its_card():
     assert 0.0 < with_guard["guard_share"] < 1.0
     assert cells(long_table([without], "a"), "the guard's share") == ["none"]
     assert cells(long_table([with_guard], "a"), "the guard's share")[1] == "%"
-    assert "guard under 5 percent: no guard" in checks_text(checked(without))
-    assert "no guard" not in checks_text(checked(with_guard))
 
 
 def in_colour(axes, colour):
@@ -197,13 +156,3 @@ def test_densities_have_area_one_and_the_quantitys_unit():
     assert recorded.get_ydata()[[0, 1, 2, 49]] == pytest.approx([1.25, 2.5, 0.0, 1.25])
     assert simulated.get_ydata()[:2] == pytest.approx([5.0, 0.0])
     assert in_colour(axes, COLOURS[1]) == []
-
-
-def row(distance, **against):
-    scale = {"ceiling": 0.1, "floor": 0.9}
-    return {
-        "distance": distance,
-        "distance_ci": [distance - 0.1, distance + 0.1],
-        **scale,
-        "against": against,
-    }

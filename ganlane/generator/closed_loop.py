@@ -69,8 +69,6 @@ SHORTEST_HEADWAY_S = 0.1
 #: Desired speed above the present one, m/s: range drawn from in fitting, and the middle used in
 #: evaluation.
 DESIRED_EXCESS_MPS = (1.0, 11.0)
-#: Desired speed of all drivers if they do not differ: the middle of Table II's range, m/s.
-COMMON_SPEED_MPS = 22.0
 #: In fitting, standard deviation of the headways' logarithm about the balanced ones, so that
 #: drivers are off balance.
 _SCATTER = 0.25
@@ -492,19 +490,14 @@ def balanced_headway(
 
 def driver_params(
     segments: Segments,
-    traits: bool = True,
     random: torch.Generator | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Headways in s and desired speeds in m/s of the drivers, [B, V] each.
 
     With ``random``, for fitting: random ones, about the balanced headways and above the present
     speeds, since in congestion the recordings do not show the desired speeds. Without it, for
-    evaluation: the balanced headway or the median one, and the middle desired speed. Without
-    ``traits`` (an ablation): Table V's headway and 22 m/s for all.
+    evaluation: the balanced headway or the median one, and the middle desired speed.
     """
-    if not traits:
-        headway = torch.full_like(segments.length, TABLE_V.headway_s)
-        return headway, torch.full_like(headway, COMMON_SPEED_MPS)
     low, high = DESIRED_EXCESS_MPS
     shape = segments.length.shape
     # Desired speeds are not known yet: 1 m/s holds their place.

@@ -220,7 +220,7 @@ def calibrated_forecasts(
         )
         noise = torch.randn(shape, generator=random)
         noise[:, 0] = 0.0
-        drivers = driver_params(segments, config.traits)
+        drivers = driver_params(segments)
         return rollout(
             generator,
             segments,
@@ -298,7 +298,7 @@ def rollout_errors(
         for batch in segment_batches(scene, horizon, config.held_out_stride, _SEGMENTS):
             segments = batch.without_intentions()
             future = segments.future
-            drivers = driver_params(segments, config.traits)
+            drivers = driver_params(segments)
             # Three rollouts at once: the mean prediction, and two samples.
             shape = (
                 1 + horizon,

@@ -23,8 +23,8 @@ from ganlane.generator.human import (
     ALONG,
     HumanPolicy,
     Memory,
+    leaves_room,
     perceive,
-    see,
     with_velocity,
 )
 from ganlane.generator.human_estimator import HumanModel, fit_estimator
@@ -133,7 +133,7 @@ def _fitted(
     tuning = tune(model.policy, choices, material.danger, config, random)
     for number, cost in enumerate(tuning, start=2 + config.rounds):
         report(number, steps, cost)
-    match_rate(model.policy, choices, config)
+    match_rate(model.policy, choices)
     return model.eval().requires_grad_(False)
 
 
@@ -152,7 +152,7 @@ def clone(
     for rate in (config.learning_rate, 0.5 * config.learning_rate):
         train_moves(policy, moves, material.prior, max(1, config.epochs // 2), rate, random)
     train_lane_choice(policy, choices, material.danger, random)
-    match_rate(policy, choices, config)
+    match_rate(policy, choices)
     return samples
 
 
@@ -289,13 +289,13 @@ def train_lane_choice(
 
 
 @torch.no_grad()
-def match_rate(policy: HumanPolicy, samples: Samples, config: HumanConfig) -> None:
+def match_rate(policy: HumanPolicy, samples: Samples) -> None:
     """Let lane changes begin as often as recorded ones did, over the recorded states.
 
     Where recorded drivers took gaps that count as danger here, no change begins; others make up for
     it. Only the level is moved: the bias of all beginnings.
     """
-    wanted = begins_per_decision(samples, config)
+    wanted = begins_per_decision(samples)
     last = policy.lane[-1]
     assert isinstance(last, nn.Linear)
     choice = keeping_choice(samples, torch.arange(len(samples.keeping_sides)))
@@ -389,14 +389,4 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
         view.sides[:0, 0],
         view.exists[:0, 0],
     )
-    return samples, dangerous_sides(vehicles, view.sides, view.exists, road)
-
-
-def dangerous_sides(vehicles: Vehicles, sides: Tensor, exists: Tensor, road: Road) -> Tensor:
-    """The sides [D, SIDE_FEATURES] to which a change would leave less than 2 m, or ask for more
-    than 2.5 m/s2.
-    """
-    _, ahead, behind = see(vehicles, road)
-    narrow = [torch.minimum(ahead.gap[..., side], behind.gap[..., side]) < 2.0 for side in (2, 0)]
-    hard = (sides[..., 9] > 2.5) | (sides[..., 10] > 2.5)
-    return sides[(hard | torch.stack(narrow, -1)) & exists]
+    return samples, view.sides[~leaves_room(view.sides) & view.exists]

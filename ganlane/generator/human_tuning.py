@@ -21,7 +21,6 @@ from ganlane.generator.human import (
     ACCELERATIONS,
     ACROSS,
     ALONG,
-    DECISION_S,
     FEATURES,
     SIDE_FEATURES,
     HumanPolicy,
@@ -113,7 +112,7 @@ def tune(
             {"params": critic.parameters(), "lr": CRITIC_RATE},
         ]
     )
-    recorded = begins_per_decision(teacher, config)
+    recorded = begins_per_decision(teacher)
     for number in range(config.tuning):
         rise, fall = min(1.0, (number + 1) / 5), 1.0 - 0.8 * number / config.tuning
         optimizer.param_groups[0]["lr"] = RATE * rise * fall
@@ -141,10 +140,8 @@ def tune(
         yield float(decisions.cost.sum()) / float(decisions.valid.sum())
 
 
-def begins_per_decision(teacher: Samples, config: HumanConfig) -> float:
-    """Lane changes begun per decision of a driver in its lane: as configured, or as recorded."""
-    if config.changes_per_h is not None:
-        return config.changes_per_h / 3600.0 * DECISION_S
+def begins_per_decision(teacher: Samples) -> float:
+    """Lane changes begun per recorded decision of a driver in its lane."""
     return float((teacher.begins == 1).sum()) / max(1, len(teacher.keeping_sides))
 
 

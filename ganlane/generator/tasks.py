@@ -43,7 +43,6 @@ from ganlane.generator.human_estimator import HumanModel
 from ganlane.generator.human_fit import fit_human
 from ganlane.generator.human_forecasts import fit_observer, human_forecasts, standard_width
 from ganlane.generator.networks import (
-    DIFFERENCE_SCALE_M,
     Discriminator,
     Generator,
     displacements_of,
@@ -156,11 +155,10 @@ class PaperTask(_Task):
         rows = torch.randint(len(self.groups), (config.batch,), generator=self.random)
         # Left and right are alike on a motorway, so mirrored groups are as good as recorded ones.
         groups = self.groups.select(rows)
-        if config.mirror:
-            groups = groups.mirrored(torch.rand(len(groups), generator=self.random) < 0.5)
+        groups = groups.mirrored(torch.rand(len(groups), generator=self.random) < 0.5)
         # [n, T, 2]: vehicles of all groups, without padding.
         recorded = groups.displacements[groups.mask]
-        generated = self._samples(groups, self.random, config.history_noise)
+        generated = self._samples(groups, self.random)
 
         # The discriminator learns from one sample, which carries no gradient to the generator.
         losses = {}
@@ -230,9 +228,7 @@ class PaperTask(_Task):
         windows = cut_windows(scenes, stride, sizes.observed + 1 + sizes.predicted)
         return windows, group_windows(windows, self.config.group_size, self.config.seed)
 
-    def _samples(
-        self, groups: Groups, random: torch.Generator, history_noise: float = 0.0
-    ) -> Tensor:
+    def _samples(self, groups: Groups, random: torch.Generator) -> Tensor:
         """Recorded past and generated future [K + 1, n, T, 2] of n vehicles.
 
         The samples come first, the mean prediction last. Only the pooling needs the padded groups;
@@ -240,12 +236,8 @@ class PaperTask(_Task):
         """
         sizes = self.config.sizes
         mask = groups.mask
-        past = observed = groups.displacements[..., : sizes.observed, :]
-        if history_noise > 0:
-            # In units of typical differences, so that noise weighs alike along and across the road.
-            scale = past.new_tensor(DIFFERENCE_SCALE_M)
-            observed = past + history_noise * scale * torch.randn(past.shape, generator=random)
-        observation = self.generator.observe(observed, groups.position, mask)
+        past = groups.displacements[..., : sizes.observed, :]
+        observation = self.generator.observe(past, groups.position, mask)
         context = self.generator.summarise(observation)[mask]
 
         # [B, G, ...] -> [n, ...]: from here on without padding.
@@ -300,7 +292,7 @@ class CalibratedTask(_Task):
         """
         config = self.config
         segments = self._batch()
-        drivers = driver_params(segments, config.traits, self.random)
+        drivers = driver_params(segments, self.random)
         # The energy score needs two samples, the mean error one.
         sampled = number % 2 == 1
         samples = 2 if sampled else 1
@@ -364,7 +356,7 @@ class CalibratedTask(_Task):
         rows = torch.randperm(span, generator=self.random)[: self.config.batch] + begin
         segments = cut_segments([self.cuts[row] for row in rows.tolist()], horizon)
 
-        flip = self.config.mirror and float(torch.rand((), generator=self.random)) < 0.5
+        flip = float(torch.rand((), generator=self.random)) < 0.5
         return segments.mirrored() if flip else segments
 
 
@@ -449,18 +441,16 @@ def improve(task: PaperTask | CalibratedTask, name: str, on_progress: OnProgress
         for optimiser in task.optimisers.values():
             optimiser.param_groups[0]["lr"] = learning_rate(config, done - 1)
         losses = task.update(done - 1)
-        seconds = time.monotonic() - begun
-        late = config.max_seconds is not None and seconds > config.max_seconds
-        # A fit that is out of time is evaluated too, so that its last weights are kept.
-        if done % config.evaluate_every == 0 or late or done == config.updates:
+        if done % config.evaluate_every == 0 or done == config.updates:
             score = task.evaluate()
             waited += 1
             if score < best:
                 best, best_update, waited = score, done, 0
                 # A copy, since the next updates change the networks' own tensors.
                 best_weights = deepcopy(task.state_dict())
+        seconds = time.monotonic() - begun
         on_progress(Progress(name, done, config.updates, losses, score, best, seconds))
-        if late or waited >= config.patience:
+        if waited >= config.patience:
             break
     # Empty if no evaluation gave a finite score.
     if best_weights:

@@ -703,19 +703,12 @@ def fitted_anchor(metadata: Mapping[str, Any], source: object) -> AnchorParamete
             for messages.
 
     Raises:
-        UserError: fitted without per-driver parameters, which this traffic always draws; or
-            impossible values.
+        UserError: impossible values.
     """
     # A file may lack these entries: then the defaults of the fit hold.
     config = metadata["config"] if isinstance(metadata.get("config"), Mapping) else {}
     washout_s = config.get("washout_s", ANCHOR.washout_s)
     further_inputs = config.get("further_inputs", ANCHOR.further_inputs)
-    if config.get("traits", True) is not True:
-        raise UserError(
-            f"{source}: fitted with traits={config['traits']}, but every driver of gan_calibrated "
-            "has a headway and a desired speed of its own; give weights fitted with "
-            "generator.traits=true."
-        )
     # `not washout_s > 0` since NaN has to fail; `type` since True is no number of seconds.
     if type(washout_s) not in (int, float) or not washout_s > 0 or type(further_inputs) is not bool:
         raise UserError(

@@ -208,7 +208,6 @@ class LoopConfig(Record):
         learning_rate: of Adam, after the warm-up.
         warmup: updates over which the learning rate rises.
         largest_gradient: norm at which gradients are clipped.
-        max_seconds: stop after this long, s; null: never.
     """
 
     # how long
@@ -219,7 +218,6 @@ class LoopConfig(Record):
     learning_rate: Positive = 4e-3
     warmup: CountOrZero = 100
     largest_gradient: Positive = 1.0
-    max_seconds: Positive | None = None
 
 
 @dataclass(frozen=True)
@@ -249,11 +247,8 @@ class PaperConfig(FitConfig):
         group_size: approximate number of vehicles per k-means group.
         stride: frames between the starts of two windows, in fitting.
         held_out_stride: the same on validation and held-out scenes.
-        history_noise: in fitting, standard deviation of noise on the observed displacements, in
-            units of a typical difference (0.04 m along and 0.02 m across the road); 0 is no noise.
         samples: samples per update; the best counts in the variety term.
         batch: groups per update.
-        mirror: swap left and right in half of the groups.
     """
 
     preset: str = field(default="paper", kw_only=True)
@@ -266,9 +261,7 @@ class PaperConfig(FitConfig):
     held_out_stride: Count = 3
     # one update
     samples: Annotated[int, between(1, 100)] = 6
-    history_noise: NotNegative = 0.0
     batch: Count = 48
-    mirror: bool = True
 
 
 @dataclass(frozen=True)
@@ -284,12 +277,10 @@ class CalibratedConfig(FitConfig):
         batch: segments per update.
         held_out_stride: frames between the starts of the segments in evaluation.
         noise_period_s: time constant of each driver's latent vector, s.
-        mirror: swap left and right in half of the updates.
         washout_s: time constant of the residual's mean, which is subtracted, s; inf: without
             washout. The simulation uses the value stored with the weights.
         further_inputs: whether the network gets gap, closing speed, IDM's acceleration and lane
             offset.
-        traits: whether every driver has its own headway and desired speed.
     """
 
     preset: str = field(default="calibrated", kw_only=True)
@@ -308,10 +299,8 @@ class CalibratedConfig(FitConfig):
     held_out_stride: Count = 3
     # what makes drivers differ
     noise_period_s: NotNegative = 5.0
-    mirror: bool = True
     washout_s: Annotated[float, _WASHOUT] = 3.0
     further_inputs: bool = True
-    traits: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -339,7 +328,6 @@ class HumanConfig(FitConfig):
         learning_rate: of Adam in cloning.
         tuning: iterations of the fine-tuning; 0: none.
         pull: weight of the divergence from the cloned policy in it.
-        changes_per_h: lane changes per vehicle-hour that it keeps to; null: as recorded.
         observing: updates of the observer, which adds a camera's errors to forecasts.
         following: fit to the files of one lane beside the recordings, too (I-80, I-24), where
             they are there.
@@ -360,7 +348,6 @@ class HumanConfig(FitConfig):
     # in simulation
     tuning: CountOrZero = 150
     pull: NotNegative = 0.15
-    changes_per_h: Positive | None = None
     # of forecasts alone
     observing: Count = 20_000
 

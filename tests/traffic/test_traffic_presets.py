@@ -158,17 +158,13 @@ def test_calibrated_weights_drive_with_the_washout_and_the_further_inputs_they_w
 def test_the_shipped_weights_and_older_ones_that_name_no_washout_drive_with_the_default_anchor(
     tmp_path,
 ):
-    older = fitted_with(tmp_path, "washout_s", "further_inputs", "traits")
+    older = fitted_with(tmp_path, "washout_s", "further_inputs")
     assert anchor_of(None) == anchor_of(older) == SIMULATED_ANCHOR
 
 
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
-        (
-            {"traits": False},
-            r"generator\.safetensors: fitted with traits=False",
-        ),
         ({"washout_s": 0.0}, "fit it again"),
         ({"washout_s": math.nan}, "fit it again"),
         ({"washout_s": "3"}, "fit it again"),

@@ -240,19 +240,21 @@ def run_fit(
         task = PaperTask(split.fitted, split.validation, config)
     else:
         task = CalibratedTask(split.fitted, split.validation, config)
-    if folder is None:
-        begun = time.monotonic()
-        return Fitted(task, task.fit(name, on_progress), time.monotonic() - begun)
-    # The key names the fit, so other settings or recordings never take a foreign one.
-    path = folder / f"{config.preset}_{fit_key(config, split, following)}.safetensors"
-    if not path.is_file():
-        fitted = run_fit(config, split, None, on_progress, name, following)
+    path = None
+    if folder is not None:
+        # The key names the fit, so other settings or recordings never take a foreign one.
+        path = folder / f"{config.preset}_{fit_key(config, split, following)}.safetensors"
+        if path.is_file():
+            weights, description = load_weights(path, FIT)
+            task.load_state_dict(weights)
+            return Fitted(task, description["updates"], description["seconds"])
+    begun = time.monotonic()
+    updates = task.fit(name, on_progress)
+    fitted = Fitted(task, updates, time.monotonic() - begun)
+    if path is not None:
         numbers = {"updates": fitted.updates, "seconds": fitted.seconds}
-        save_weights(path, FIT, fitted.task.state_dict(), numbers)
-        return fitted
-    weights, description = load_weights(path, FIT)
-    task.load_state_dict(weights)
-    return Fitted(task, description["updates"], description["seconds"])
+        save_weights(path, FIT, task.state_dict(), numbers)
+    return fitted
 
 
 def fit_generator(

@@ -23,8 +23,9 @@ from torch import Tensor
 
 from benchmarks.script import make_parser, run_script
 from ganlane.agents import NetworkConfig, read_agent
-from ganlane.agents.checkpoint import save_agents, with_seeds
+from ganlane.agents.checkpoint import SEVERAL, with_seeds
 from ganlane.errors import UserError
+from ganlane.weights import save_weights
 
 #: Weights, network and metadata.
 Agent = tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]
@@ -46,6 +47,34 @@ RECIPE = (
     "network",
 )
 WITHOUT_EFFECT = ("compile", "kernel")
+
+
+def save_agents(
+    path: str | Path,
+    agents: Mapping[int, tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]],
+) -> None:
+    """Write several trainings of one recipe into one file; ``path@SEED`` names each of them.
+
+    ``agents`` holds by seed what :func:`read_agent` gives. The scales of the noise are kept in half
+    precision, everything that a greedy agent computes with as it is.
+    """
+    # the names of a training's tensors begin with its seed
+    tensors = {
+        f"{seed}/{name}": value.half() if name.endswith("_sigma") else value
+        for seed, (weights, _, _) in agents.items()
+        for name, value in weights.items()
+    }
+    described = {
+        str(seed): {**metadata, "network": network.description()}
+        for seed, (_, network, metadata) in agents.items()
+    }
+    # each agent's metadata by its seed, as text: JSON has no other keys
+    save_weights(
+        path,
+        SEVERAL,
+        tensors,
+        {"agents": described},
+    )
 
 
 def recipe_of(metadata: Mapping[str, Any]) -> dict[str, Any]:

@@ -90,7 +90,7 @@ def draw(options: argparse.Namespace) -> str:
     )
     before = [training["mean_reward"] for training in row["each"]]
     curves = read_curves(sorted((DOCS / "learning_curves").glob("seed_*")))
-    return f"figure: {save_figure(draw_transfer(curves, before), options.out, 'png')}"
+    return f"figure: {save_figure(draw_transfer(curves, before), options.out)}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -12,7 +12,7 @@ from ganlane.files import conf_folder
 from ganlane.runtime import open_closed_streams, status_of
 
 #: ``doctor`` takes no keys; every other command has a YAML file with its defaults.
-DOCTOR = "check the installation; show the command for what is missing"
+DOCTOR = "check the installation"
 
 
 def commands() -> dict[str, str]:

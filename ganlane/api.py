@@ -18,8 +18,8 @@ a class of your own or its import path. Keys of the environment may be given alo
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -37,13 +37,12 @@ from ganlane.config.run import (
     LAST,
     Stopped,
     call_settings,
-    cleared_after_mistakes,
     function_of,
     new_folder,
     running,
 )
 from ganlane.errors import UserError, did_you_mean
-from ganlane.evaluation import evaluation_rows, paired_rows, write_episodes, write_results
+from ganlane.evaluation import evaluation_rows
 from ganlane.evaluation.results import Run, TrainingRun, plain
 from ganlane.runtime import kernel_threads, worker_number
 from ganlane.settings.commands import EvaluateConfig, highways
@@ -71,7 +70,7 @@ def make_env(
 ) -> TransformedEnv:
     """A batched TorchRL environment with observation and reward.
 
-    ``make_env("gan", 256, lanes=4, recycle=True)`` is ``traffic=gan collector.num_envs=256
+    ``make_env("gan", 256, lanes=4, recycle=True)`` is ``traffic=gan num_envs=256
     env.lanes=4 env.recycle=true`` on the command line.
 
     Args:
@@ -141,7 +140,6 @@ def evaluate(
     episodes: int = 100,
     *,
     per_episode: bool = False,
-    folder: str | Path | None = None,
     **keys: Any,
 ) -> pl.DataFrame:
     """Evaluate every agent on every traffic, on the same episodes; one row for each pair.
@@ -152,7 +150,6 @@ def evaluate(
         traffics: options as in :func:`make_env`, or a mapping that gives them names of your own.
         episodes: the episodes 0 to ``episodes - 1`` of the seed, on the stream kept for reports.
         per_episode: one row per episode instead (:func:`ganlane.evaluation.run_episodes`).
-        folder: write ``results.json`` and ``episodes.parquet`` there, as the command does.
         keys: ``seed``, options (``env``, ``reward``; ``observation`` and ``mask`` for policies that
             name none), keys of the command (``num_envs``, ``device``, ``stream``) or of the
             environment.
@@ -162,7 +159,6 @@ def evaluate(
 
     Raises:
         UserError: an unknown name, a wrong value, or a policy that does not fit.
-        OSError: a folder that cannot be written to.
     """
     # Names are loaded once the settings are checked; agent_idm@all means several.
     try:
@@ -186,12 +182,7 @@ def evaluate(
     config: EvaluateConfig = call_settings(
         "evaluate", {"agents": names, "traffics": traffics, "episodes": episodes, **keys}
     )
-    home = None if folder is None else _path(folder)
-    # A folder that this call made is removed again if a mistake ends it.
-    with _torch_threads(config.threads), cleared_after_mistakes(home) if home else nullcontext():
-        if home is not None:  # before hours of driving
-            home.mkdir(parents=True, exist_ok=True)
-        # Loaded inside the block, so that an unknown name also leaves no folder behind.
+    with _torch_threads(config.threads):
         loaded = [
             build.make_driver(driver, config.env, device=config.device)
             if isinstance(driver, str)
@@ -199,18 +190,10 @@ def evaluate(
             for driver in drivers
         ]
         table = compare(loaded, config)
-    # Plain Python numbers: JSON and polars take no others.
-    rows = plain(evaluation_rows(table))
-    if home is not None:
-        seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
-        write_episodes(home, table)
-        write_results(
-            home,
-            {"rows": rows, "paired": paired_rows(table)},
-            plain(config),
-            seeds,
-        )
-    return table if per_episode else pl.DataFrame(rows, infer_schema_length=None)
+    if per_episode:
+        return table
+    # Plain Python numbers: polars takes no others.
+    return pl.DataFrame(plain(evaluation_rows(table)), infer_schema_length=None)
 
 
 def benchmark(
@@ -304,11 +287,8 @@ def train(
             "resume=True: which run? give its folder, for instance folder='outputs/train/RUN'."
         )
     # None leaves the command's default, or what the resumed run has.
-    named = {"traffic": traffic, "init": init}
+    named = {"traffic": traffic, "init": init, "num_envs": num_envs}
     keys |= {name: value for name, value in named.items() if value is not None}
-    # The number of environments is a key of the group collector on the command line.
-    if num_envs is not None:
-        keys["collector"] = {"num_envs": num_envs}
     if resume:
         keys["resume"] = str(folder)
     try:
@@ -339,32 +319,21 @@ def render(
     """Write episodes as a film, page or table, or the learning curves of runs; the file's path.
 
     Args:
-        agent: as ``name`` in :func:`load_agent`; several for html, csv and parquet.
+        agent: as ``name`` in :func:`load_agent`; several for html and parquet.
         traffic: as in :func:`make_env`.
         episode: number of the episode, the same as in ``evaluate``; several as for ``agent``.
         out: file to write; None: into a new folder below ``outputs/render``.
         run: folders of training runs; their learning curves are drawn instead of an episode.
         keys: ``film`` (its keys ``fps, speedup, start_s, end_s, width, height, ...``), options
-            (``env``, ``observation``, ``reward``, ``mask``), keys of the command (``seed``;
-            ``format``, by default the ending of ``out``, else ``gif``) or of the environment.
+            (``env``, ``observation``, ``reward``, ``mask``), keys of the command (``seed``,
+            ``stream``) or of the environment.
 
     Raises:
         UserError: a wrong value.
         OSError: a file that cannot be written.
     """
-    # The command has two keys each, one for one and one for several.
-    keys |= {"traffic": traffic, "out": out}
-    if isinstance(agent, str | Path):
-        keys["driver"] = agent
-    else:
-        keys["agents"] = list(agent)
-    if isinstance(episode, Iterable):
-        keys["episodes"] = list(episode)
-    else:
-        keys["episode"] = episode
-    if run is not None:
-        keys["run"] = [run] if isinstance(run, str | Path) else list(run)
-    config = call_settings("render", keys)
+    shown = {"agents": agent, "episodes": episode, "run": run}
+    config = call_settings("render", {"traffic": traffic, "out": out, **shown, **keys})
     with _torch_threads():
         # With no file to write named, the run gets a folder with its settings, as the command does.
         if out is None:

@@ -171,11 +171,6 @@ def make_env(
         abort, vehicles = env.ego.abort_lane_change, None if kernel is None else kernel.vehicles
         parameters = (mask.form, mask.safe_deceleration, env.idm, abort, vehicles)
         transforms.append(ActionMaskTransform(base.road, *parameters))
-    # Simulator and transforms have graphs of their own, so each is compiled by itself.
-    if env.compile:
-        base.compile()
-        for transform in transforms:
-            transform.compile_graphs()
     sensors = observation.sensors
     errors = []
     try:

@@ -7,7 +7,6 @@ connection or a lost process is an OSError that no user can fix: it keeps its tr
 from __future__ import annotations
 
 import difflib
-import errno
 import os
 import re
 from collections.abc import Iterable, Iterator
@@ -16,25 +15,6 @@ from typing import Any
 
 #: Exit status after a user's mistake or a failing disk.
 USER_ERROR = 2
-
-_ROOM = "make room there, or write to another disk"
-_RIGHTS = "check the permissions, or name a place where you may write"
-_PATH = "check the path"
-_LATER = "close other programs and run the command again"
-#: Advice by error number.
-ADVICE = {
-    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _ROOM),
-    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), _RIGHTS),
-    **dict.fromkeys(
-        (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENOTEMPTY), _PATH
-    ),
-    **dict.fromkeys(
-        (errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL, errno.ENXIO, errno.ENODEV), _PATH
-    ),
-    **dict.fromkeys((errno.EBUSY, errno.ETXTBSY, errno.EMFILE, errno.ENFILE, errno.ENOMEM), _LATER),
-    errno.EIO: "the disk does not work as it should; check it",
-    errno.ESTALE: "the network drive is gone; mount it again",
-}
 
 
 #: Characters that a terminal obeys instead of showing them.
@@ -100,15 +80,15 @@ def as_typed(value: Any) -> str:
 
 def is_users_matter(error: BaseException) -> bool:
     """Whether a user can fix the error: one about a path, a permission or a disk."""
-    return isinstance(error, OSError) and error.errno in ADVICE
+    others = (ConnectionError, ChildProcessError, ProcessLookupError, TimeoutError)
+    return isinstance(error, OSError) and bool(error.errno) and not isinstance(error, others)
 
 
 def file_sentence(error: OSError) -> str:
     """The path, what is wrong, and what to do."""
-    number = error.errno or 0
     where = error.filename2 or error.filename or "a file or standard output"
-    reason = error.strerror or os.strerror(number)
-    return printable(f"{where}: {reason}; {ADVICE.get(number, _PATH)}.")
+    reason = error.strerror or os.strerror(error.errno or 0)
+    return printable(f"{where}: {reason}; check the path, its permissions and the space there.")
 
 
 @contextmanager

@@ -9,7 +9,6 @@ from __future__ import annotations
 import ctypes
 import multiprocessing
 import os
-import select
 import shutil
 import subprocess
 import sys
@@ -17,7 +16,7 @@ import tempfile
 from contextvars import ContextVar
 from functools import lru_cache
 from pathlib import Path
-from typing import Final, TextIO
+from typing import Final
 
 from ganlane.errors import USER_ERROR, UserError, file_sentence, is_users_matter
 
@@ -29,7 +28,6 @@ COMPILERS = ("c++", "g++", "clang++", "cl")
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 #: Bytes; blocks up to this size come from the heap, and as much free memory is kept at its end.
 KEPT_BYTES = 2**28
-_STATUS = Path("/proc/self/status")
 #: Threads of the native kernel, where they are not as many as torch's.
 kernel_threads: ContextVar[int | None] = ContextVar("threads of the kernel", default=None)
 ENV_ID: Final = "ganlane/Highway-v0"
@@ -105,17 +103,6 @@ def _compiles(compiler: str) -> bool:
         return len(os.listdir(folder)) > 1
 
 
-def check_compiler() -> None:
-    """Raise :class:`UserError` where torch would find no C++ compiler that works."""
-    path, names = find_compiler()
-    if not has_compiler():
-        trouble = f"there is none (looked for {names})" if path is None else f"{path} fails"
-        raise UserError(
-            f"compile=true needs a C++ compiler, and {trouble}; install one "
-            "(Debian: apt install g++) or set compile=false."
-        )
-
-
 def check_process() -> None:
     """Raise :class:`UserError` if TorchRL cannot be imported (``-OO``) or the working directory is
     gone.
@@ -151,41 +138,20 @@ def status_of(error: OSError, program: str) -> int:
     Raises:
         OSError: the error, where it is no matter of the user's.
     """
-    if _discard_broken_streams() and isinstance(error, BrokenPipeError):
+    # Python writes again at exit, and would fail with a message and a status of its own.
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
+    if isinstance(error, BrokenPipeError):
         return READER_LEFT
     if not is_users_matter(error):
         raise error
     print(f"{program}: {file_sentence(error)}", file=sys.stderr)
     return USER_ERROR
-
-
-def _discard_broken_streams() -> bool:
-    """Redirect streams that cannot be written to os.devnull; return whether the reader of a pipe
-    has closed it.
-
-    Otherwise Python would write again at exit, print an error, and exit with a status of its own.
-    """
-    closed = [_has_no_reader(stream) for stream in (sys.stdout, sys.stderr)]
-    for stream, gone in zip((sys.stdout, sys.stderr), closed):
-        try:
-            stream.flush()
-        except OSError:
-            gone = True
-        if gone:
-            devnull = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(devnull, stream.fileno())
-            os.close(devnull)
-    return any(closed)
-
-
-def _has_no_reader(stream: TextIO) -> bool:
-    """Whether the stream is a pipe without a reader; always False on Windows."""
-    try:
-        poll = select.poll()
-        poll.register(stream.fileno(), 0)
-    except (AttributeError, OSError):  # Windows, or a stream without a file, as in a notebook
-        return False
-    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
 
 
 def keep_freed_memory() -> bool:
@@ -221,20 +187,3 @@ def worker_number() -> int:
     for part in getattr(process, "_identity", ()):
         number = 1000 * number + part
     return number
-
-
-def peak_resident_bytes() -> int | None:
-    """Peak resident memory of this process so far; None where the system does not report it.
-
-    Linux's ``ru_maxrss`` is not used: a fresh process inherits its parent's.
-    """
-    if _STATUS.is_file():
-        peaks = [
-            line.split() for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM")
-        ]
-        return int(peaks[0][1]) * 1024 if peaks else None
-    if sys.platform == "darwin":
-        import resource
-
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return None

@@ -67,9 +67,6 @@ class HighwayEnvTraffic(TrafficModule):
         super().__setstate__(state)
         self._highway = _Highway(self.road)
 
-    def compile_graphs(self) -> None:
-        """Nothing can be compiled."""
-
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """HighwayEnv's staggering of drivers by their initial positions."""
         return {"timer": torch.remainder((vehicles.x + vehicles.y) * torch.pi, 1.0)}

@@ -199,9 +199,6 @@ class SumoTraffic(TrafficModule):
         """Without the simulation: a copy, or another process, starts its own."""
         return {**self.__dict__, "_simulation": None}
 
-    def compile_graphs(self) -> None:
-        """Nothing can be compiled."""
-
     def scenes(
         self,
         vehicles: int,

@@ -10,12 +10,12 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from PIL import Image
 from reference.refusals import last_path
+from reference.scene_csv import write_scene_csv
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 from ganlane.config.run import run_command
-from ganlane.data import read_scenes, write_scene_csv
+from ganlane.data import read_scenes
 
 main = partial(run_command, "prepare")
 
@@ -27,13 +27,7 @@ def here(empty_folder, monkeypatch):
 
 
 def results(out: str) -> dict:
-    path = last_path(out)
-    assert Image.open(path.with_name("report.png")).size == (
-        1440,
-        588,
-    )
-    assert path.with_name("report.md").read_text().startswith("# Recordings: ")
-    return json.loads(path.read_text())
+    return json.loads(last_path(out).read_text())
 
 
 def write_csv(path: Path, **more) -> Path:

@@ -102,7 +102,7 @@ def test_the_second_phase_starts_from_the_first_ones_agent(capsys):
 )
 def test_every_traffic_and_every_start_runs(traffic, init, capsys):
     words = (
-        "total_decisions=64 collector.num_envs=16 env.goal_m=40 agent.warmup=256 log_every=64 "
+        "total_decisions=64 num_envs=16 env.goal_m=40 agent.warmup=256 log_every=64 "
         "evaluation.agents=[keep_lane] evaluation.episodes=1 agent.capacity=1000"
     )
     assert main([f"traffic={traffic}", f"init={init}", *words.split()]) == 0
@@ -129,7 +129,7 @@ def test_a_resume_with_other_settings_is_refused_and_leaves_the_run_as_it_was(
         "env.vehicles=5",
         "seed=5",
         "reward.goal=1000",
-        "collector.num_envs=8",
+        "num_envs=8",
     ):
         assert main([f"resume={folder}", "total_decisions=640", change]) == 2
         message = capsys.readouterr().err

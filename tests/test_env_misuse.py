@@ -155,7 +155,7 @@ def paths(env, actions):
         ("gan", torch.float64),
         ("gan_calibrated", torch.float32),
         ("mixed", torch.float32),
-        ({"name": "gan", "execute_k": 3, "blind_share": 0.5}, torch.float32),
+        ({"name": "gan", "blind_share": 0.5}, torch.float32),
     ],
 )
 def test_autocast_changes_no_traffic(traffic, dtype):

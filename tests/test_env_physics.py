@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
-
 import pytest
 import torch
-from reference.worlds import environment, leaves, same_bits, step
+from reference.worlds import environment, same_bits, step
 
-from ganlane import build, keys, runtime
-from ganlane.agents.drivers import MobilDriver
-from ganlane.env import HighwayEnv
+from ganlane import keys, runtime
 from ganlane.env.physics import EndedRows
-from ganlane.errors import UserError
 from ganlane.settings.driving import Visibility
-from ganlane.settings.env import EnvConfig
-from ganlane.settings.traffic import IdmTrafficConfig
 from ganlane.traffic import IdmTraffic, Overlay, TrafficModule, TrafficSequential
 
 # What traffic remembers of a row that has ended is what it remembered when the row ended.
@@ -79,30 +72,6 @@ def test_where_a_look_would_stall_the_device_the_memory_is_the_same(monkeypatch)
         assert torch.equal(one, other)
 
 
-# HighwayEnv.compile(): the same drive to rounding, and one sentence where it cannot be
-
-
-def test_without_a_compiler_on_the_path_one_sentence_says_so(monkeypatch):
-    monkeypatch.delenv("CXX", raising=False)
-    monkeypatch.setattr(shutil, "which", lambda name: None)
-    with pytest.raises(
-        UserError, match=r"^compile=true needs a C\+\+ compiler, and there is none \(looked"
-    ):
-        runtime.check_compiler()
-    with pytest.raises(UserError, match="apt install"):
-        environment(vehicles=3).compile()
-
-
-def test_the_compiler_that_cxx_names_is_the_one_that_is_looked_for(monkeypatch):
-    monkeypatch.setenv("CXX", "my-compiler")
-    monkeypatch.setattr(shutil, "which", lambda name: "/bin/g++" if name == "g++" else None)
-    with pytest.raises(UserError, match="looked for CXX=my-compiler"):
-        runtime.check_compiler()
-    monkeypatch.delenv("CXX")
-    monkeypatch.setattr(runtime, "_compiles", lambda path: path == "/bin/g++")
-    runtime.check_compiler()
-
-
 @pytest.mark.parametrize("lines", ["exit 1", "exit 0"])
 def test_a_compiler_that_makes_nothing_is_none(lines, monkeypatch, tmp_path):
     program = tmp_path / "compiler"
@@ -110,47 +79,3 @@ def test_a_compiler_that_makes_nothing_is_none(lines, monkeypatch, tmp_path):
     program.chmod(0o755)
     monkeypatch.setenv("CXX", str(program))
     assert not runtime.has_compiler()
-    with pytest.raises(UserError, match=f"compiler, and {program} fails; install one"):
-        runtime.check_compiler()
-
-
-def test_arguments_of_torchrls_version_are_refused():
-    with pytest.raises(UserError, match="takes no arguments, not mode, dynamic"):
-        environment(vehicles=3).compile(mode="reduce-overhead", dynamic=True)
-
-
-@pytest.mark.parametrize("asked", [True, False])
-def test_env_compile_reaches_the_environment_and_the_observation(asked, monkeypatch):
-    seen = []
-    monkeypatch.setattr(HighwayEnv, "compile", lambda env: seen.append("environment"))
-    monkeypatch.setattr(
-        build.ObservationTransform, "compile_graphs", lambda transform: seen.append("observation")
-    )
-    config = EnvConfig(vehicles=3, compile=asked)
-    build.make_env(build.make_traffic(IdmTrafficConfig(), config), config)
-    assert seen == (["environment", "observation"] if asked else [])
-
-
-def test_torchrls_keyword_calls_it_too(monkeypatch):
-    seen = []
-    monkeypatch.setattr(HighwayEnv, "compile", lambda env, **options: seen.append(options) or env)
-    HighwayEnv(environment(vehicles=3).traffic, vehicles=3, compile=True)
-    assert seen == [{}]
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not any(map(shutil.which, runtime.COMPILERS)), reason="no C++ compiler")
-def test_a_compiled_environment_drives_as_the_eager_one_to_rounding():
-    """In float64: 20 decisions of 4 rows, several episodes each, with vehicles that return."""
-    settings = {"num_envs": 4, "vehicles": 4, "goal_m": 150.0, "recycle": True}
-    eager = environment(**settings)
-    compiled = environment(**settings)
-    assert compiled.compile() is compiled
-    driver = MobilDriver(eager.road)
-    one, other = eager.reset(), compiled.reset()
-    for _ in range(20):
-        expected, one = eager.step_and_maybe_reset(driver(one))
-        actual, other = compiled.step_and_maybe_reset(driver(other))
-        for name, value in leaves(expected["next"]):
-            torch.testing.assert_close(value, actual["next", name], rtol=1e-9, atol=1e-9)
-    assert one[keys.EPISODE].max() >= 8

@@ -48,7 +48,7 @@ def test_what_must_hold_does_in_the_trials_random_configurations(number, monkeyp
     speed along the road.
     """
     monkeypatch.setattr(soak, "RECORDINGS", Path("none"))
-    choice = soak.random_choice(random.Random(number), compiled=False)
+    choice = soak.random_choice(random.Random(number))
     choice |= {"num_envs": 3, "truck_share": 0.0}
     env = soak.make(choice)
     traffic = choice["traffic"]["name"]

@@ -155,8 +155,6 @@ def test_without_a_seed_two_environments_differ():
         "gan_calibrated",
         "human",
         {"name": "mixed", "shares": {"idm_random": 2, "idm_faults": 1}},
-        {"name": "mixed", "shares": {"idm": 1, "gan": 1}, "options": {"gan": {"execute_k": 2}}},
-        {"name": "gan", "execute_k": 2},
         {"name": "gan", "blind_share": 0.5},
         {"name": "idm", "blind_share": 0.5},
     ],
@@ -172,8 +170,7 @@ def test_option_and_module_give_one_answer_to_who_drives(traffic):
             np.testing.assert_array_equal(weights, of_module.weights[name])
         of_module, of_option = (replace(drivers, weights={}) for drivers in (of_module, of_option))
     assert of_module == of_option
-    # The kernel drives no plans of several steps.
-    assert (of_option is not None) == ("execute_k" not in str(traffic))
+    assert of_option is not None
 
 
 @pytest.mark.skipif(why_not() is not None, reason=f"no native kernel here: {why_not()}")

@@ -2,7 +2,7 @@
 
     python -m benchmarks.speed --suite sim --report docs/speed.md
     python -m benchmarks.speed --suite gymnasium --report docs/speed.md
-    python -m benchmarks.speed --suite traffic --traffics gan gan_calibrated --modes eager compiled
+    python -m benchmarks.speed --suite traffic --traffics gan gan_calibrated --modes eager native
     python -m benchmarks.speed --suite train --modes eager native --stored 100000 --seconds 2
     python -m benchmarks.speed --quick
 
@@ -202,7 +202,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--quick", action="store_true", help="a check that it runs: small batches, short turns")
     add("--traffics", nargs="+", metavar="NAME", help="options of the group traffic")
     add("--batches", nargs="+", type=int, metavar="N", help="environments side by side")
-    modes = ("eager", "compiled", "native")
+    modes = ("eager", "native")
     add("--modes", nargs="+", choices=modes, default=["eager", "native"])
     add("--threads", nargs="+", type=int, default=[1], metavar="N", help="of torch")
     add("--device", choices=("cpu", "cuda"), default="cpu")

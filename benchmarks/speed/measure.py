@@ -31,7 +31,7 @@ class Labels:
 
     Attributes:
         part: ``speed``, or ``growth``: the same with other numbers of vehicles.
-        mode: how the environment is computed: ``eager``, ``compiled`` or ``native``.
+        mode: how the environment is computed: ``eager`` or ``native``.
         threads: of torch.
         batch: environments side by side.
     """
@@ -160,9 +160,6 @@ def measure(
     started: list[Case] = []
     runners: list[Runner] = []
     with torch_threads(cases[0].labels.threads):
-        if any(case.labels.mode == "compiled" for case in cases):
-            # The cases compile for their own sizes; torch would fall back to eager after a few.
-            torch.compiler.reset()
         for case in cases if peer is None else [peer, *cases]:
             try:
                 runners.append(case.start())

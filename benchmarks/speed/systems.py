@@ -61,7 +61,6 @@ class Road:
             "observation": OBSERVATION,
             "seed": self.seed,
             "kernel": "native" if mode == "native" else "torch",
-            "compile": mode == "compiled",
         }
 
     def make(self, mode: str, device: str, batch: int, **more: Any) -> TransformedEnv:

@@ -77,7 +77,7 @@ def names_agent(name: str) -> bool:
 def with_seeds(name: str) -> list[str]:
     """``agent_idm@all`` as ``agent_idm@0``, ``agent_idm@1`` ..., all trainings there are.
 
-    ``FILE@all`` stands for all agents of a file of :func:`save_agents`; a mask (``+safe``) may
+    ``FILE@all`` stands for all agents of a file with several trainings; a mask (``+safe``) may
     follow. Other names stand alone.
 
     Raises:
@@ -103,7 +103,7 @@ def with_seeds(name: str) -> list[str]:
 def _read_several(
     path: Path,
 ) -> tuple[dict[str, Tensor], dict[int, dict[str, Any]]]:
-    """Tensors and, by seed, metadata of a file of :func:`save_agents`."""
+    """Tensors and, by seed, metadata of a file with several trainings."""
     tensors, metadata = load_weights(path, SEVERAL)
     agents = metadata.get("agents")
     if not isinstance(agents, dict) or not all(
@@ -153,34 +153,6 @@ def save_agent(
         "agent",
         agent.weights(),
         header,
-    )
-
-
-def save_agents(
-    path: str | Path,
-    agents: Mapping[int, tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]],
-) -> None:
-    """Write several trainings of one recipe into one file; ``path@SEED`` names each of them.
-
-    ``agents`` holds by seed what :func:`read_agent` gives. The scales of the noise are kept in half
-    precision, everything that a greedy agent computes with as it is.
-    """
-    # the names of a training's tensors begin with its seed
-    tensors = {
-        f"{seed}/{name}": value.half() if name.endswith("_sigma") else value
-        for seed, (weights, _, _) in agents.items()
-        for name, value in weights.items()
-    }
-    described = {
-        str(seed): {**metadata, "network": network.description()}
-        for seed, (_, network, metadata) in agents.items()
-    }
-    # each agent's metadata by its seed, as text: JSON has no other keys
-    save_weights(
-        path,
-        SEVERAL,
-        tensors,
-        {"agents": described},
     )
 
 
@@ -272,14 +244,11 @@ def warm_start(
     name: str | Path,
     weights: Mapping[str, Tensor],
     network: NetworkConfig,
-    moments: Mapping[int, Any] | None = None,
 ) -> None:
-    """Start ``agent`` from the ``weights`` of the trained agent ``name``, and from Adam's
-    ``moments`` if given.
+    """Start ``agent`` from the ``weights`` of the trained agent ``name``.
 
     Raises:
-        UserError: the networks differ in what their weights mean, or the moments are those of
-            another network.
+        UserError: the networks differ in what their weights mean.
     """
     # first the mistake that is made most often
     check_observation_size(name, network, agent.network.config.observation_size)
@@ -296,49 +265,15 @@ def warm_start(
         if option not in ignored and getattr(here, option) != getattr(trained, option)
     ]
     if differing:
-        # Only the support of returns can be adopted; other differences need other options.
-        adopt = "give init.support=trained, " if set(differing) <= set(SUPPORT) else ""
         raise UserError(
             f"agent {name}: it has another network than this run (here: "
-            f"{as_options(here, differing)}); {adopt}set {as_options(trained, differing)}, or "
+            f"{as_options(here, differing)}); set {as_options(trained, differing)}, or "
             "start with init=none."
         )
+    # Adam starts anew, as at the start of a training.
     agent.load_weights(weights)
-    # Without moments Adam starts anew, as at the start of a training.
-    if moments is not None:
-        load_moments(agent, moments)
 
 
 def as_options(agent: RainbowConfig, names: Sequence[str]) -> str:
     """Options of ``agent`` as they are typed on the command line."""
     return " ".join(f"agent.{name}={as_typed(getattr(agent, name))}" for name in names)
-
-
-def load_moments(agent: Rainbow, moments: Mapping[int, Mapping[str, Tensor]]) -> None:
-    """Let ``agent``'s Adam go on from ``moments``, those of an agent with the same network.
-
-    ``moments`` is the part ``state`` of an optimiser's state: ``step``, ``exp_avg`` and
-    ``exp_avg_sq`` by the place of the parameter in the network.
-
-    Raises:
-        UserError: they are those of other parameters.
-    """
-    # Adam would write beyond moments that are too short
-    shapes = {row: value.shape for row, value in enumerate(agent.network.parameters())}
-    try:
-        fitting = moments.keys() == shapes.keys() and all(
-            moments[row][name].shape == shape and moments[row]["step"].numel() == 1
-            for row, shape in shapes.items()
-            for name in ("exp_avg", "exp_avg_sq")
-        )
-    except (AttributeError, KeyError, TypeError):
-        fitting = False
-    if not fitting:
-        raise UserError(
-            "init.optimizer=true: the moments in the checkpoint are not those of its network; "
-            "give another one or init.optimizer=false."
-        )
-    # copies: Adam works in place on what it is given
-    agent.load_moments(
-        {row: {name: value.clone() for name, value in moments[row].items()} for row in shapes}
-    )

@@ -21,12 +21,11 @@ from ganlane.view.figures import save_figure
 
 def render(config: RenderConfig, folder: Path) -> str:
     """Draw episodes or learning curves; the line that names the file."""
-    kind: Any = config.kind
+    kind = config.kind
     # Learning curves need no simulator.
     if config.run is not None:
         out = Path(config.out or folder / f"curves.{kind}")
-        figure = draw_runs(read_runs(config.run), config.curves.columns, config.curves.smooth)
-        return f"curves: {save_figure(figure, out, kind)}"
+        return f"curves: {save_figure(draw_runs(read_runs(config.run)), out)}"
     set_threads(config.threads)
     if config.crashes is not None:
         episodes = _crashes(config, config.crashes)
@@ -48,12 +47,12 @@ def render(config: RenderConfig, folder: Path) -> str:
         name = "_".join([*agents, config.traffic.label(), str(config.seed), *numbers])
     out = Path(config.out or folder / f"{name}.{kind}")
     if kind in FILMS:
-        return f"film: {write_film(episodes[0], out, config.look, kind)}"
+        return f"film: {write_film(episodes[0], out, config.look)}"
     if kind == "html":
         return f"player: {write_player(episodes, out, config.look)}"
     # Films and pages cut off the beginning themselves; a table has it cut off here.
     shown = [episode.since(config.look.start_s) for episode in episodes]
-    return f"tracks: {write_tracks(shown, out, kind)}"
+    return f"tracks: {write_tracks(shown, out)}"
 
 
 def _sentence(episode: Trajectory) -> str:

@@ -47,7 +47,7 @@ def train(config: TrainConfig, folder: Path) -> str:
         # stopped before its first checkpoint, a phase starts anew
         last = phase.folder / LAST
         resume = last if config.resume is not None and last.is_file() else None
-        result = run_phase(config.compiled(), phase, resume)
+        result = run_phase(config, phase, resume)
         if result.stopped_by is not None:
             print(
                 f"saved; go on with: ganlane train resume={folder}",

@@ -34,7 +34,10 @@ _HELP = "run the command with --help to see all keys"
 HYDRA_KEYS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
 _HYDRA_PLUGIN = re.compile(r"hydra(/|\.)(launcher|sweeper)\b")
 #: Keys that a command calls by another name, because ``agent=`` would choose an option of a group.
-ALIASES = {"render": {"agent": "driver"}, "record": {"agent": "driver"}}
+ALIASES = {
+    "render": {"agent": "agents", "episode": "episodes"},
+    "record": {"agent": "driver"},
+}
 
 
 #: The key of a command whose values words without = are.

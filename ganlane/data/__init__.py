@@ -22,7 +22,6 @@ from ganlane.data.recordings import (
     read_recordings,
     read_scenes,
     write_prepared,
-    write_scene_csv,
 )
 from ganlane.data.schema import (
     FRAME_S,

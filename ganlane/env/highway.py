@@ -19,7 +19,15 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from ganlane import keys
 from ganlane.arguments import seed_number, whole_number
-from ganlane.env.physics import Physics, Recorder, Rules, known_false, outcome, run_decision
+from ganlane.env.physics import (
+    Recorder,
+    Rules,
+    begin,
+    known_false,
+    outcome,
+    remember,
+    run_decision,
+)
 from ganlane.env.state import (
     check_counter,
     checked_action,
@@ -39,7 +47,7 @@ from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.random import Purpose, episode_key, uniform
 from ganlane.sim.scenes import Scenes
-from ganlane.sim.spawn import RandomScenes, out_of_range
+from ganlane.sim.spawn import RandomScenes, out_of_range, recycle
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.traffic.base import TrafficModule
 
@@ -156,7 +164,6 @@ class HighwayEnv(EnvBase):
             idm,
             steering,
         )
-        self.physics = Physics()
         self._seed = seed_number(seed)
         #: Seed and episode [N] of the rows in the last call; automatic resets continue from there.
         self.last_episodes: tuple[Tensor, Tensor] | None = None
@@ -248,30 +255,6 @@ class HighwayEnv(EnvBase):
     def to(self, device: torch.device | str) -> HighwayEnv:
         """On another device; raises :class:`UserError` where there is none such."""
         return super().to(usable_device(device, self.dtype))
-
-    def compile(self, **kwargs: Any) -> HighwayEnv:
-        """Compile physics and traffic to several small graphs; returns the environment.
-
-        Compiling takes about a minute in the first steps; docs/speed.md has the speeds.
-        Results are equal up to rounding, not bitwise. Overrides TorchRL's method, which compiles a
-        whole step to one graph; ``HighwayEnv(compile=True)`` calls this one too.
-
-        Raises:
-            UserError: there is no C++ compiler, or an argument of TorchRL's version is given.
-        """
-        if kwargs:
-            names = ", ".join(kwargs)
-            raise UserError(
-                f"HighwayEnv.compile() takes no arguments, not {names}; call it without."
-            )
-        self.physics.compile()
-        self.traffic.compile_graphs()
-        return self
-
-    @property
-    def runs_graphs(self) -> bool:
-        """Whether a step runs compiled graphs: not where the kernel drives."""
-        return self.physics.compiled and self.kernel is None
 
     def _set_seed(self, seed: int | None) -> None:
         self._seed = 0 if seed is None else seed_number(seed)
@@ -383,7 +366,7 @@ class HighwayEnv(EnvBase):
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         ego = dict(state.get(keys.EGO).items())
         # The command, then traffic and ego step by step, then what the ego remembers of it.
-        start, command = self.physics.begin(
+        start, command = begin(
             rules,
             action,
             vehicles,
@@ -392,14 +375,13 @@ class HighwayEnv(EnvBase):
         )
         end, memory = run_decision(
             self.traffic,
-            self.physics,
             rules,
             state,
             start,
             key,
             self.recorder,
         )
-        ego = self.physics.remember(
+        ego = remember(
             rules,
             ego,
             start,
@@ -414,7 +396,7 @@ class HighwayEnv(EnvBase):
         vehicles = end.vehicles
         if self.recycle and not known_false(out_of_range(vehicles, rules.road).any()):
             # In running rows with recycling those left behind are moved.
-            recycled = self.physics.recycle(vehicles, rules.road, rules.idm)
+            recycled = recycle(vehicles, rules.road, rules.idm)
             vehicles = recycled.where(end.running & self._recycling_rows(key), vehicles)
         return pack(
             vehicles,

@@ -1,8 +1,7 @@
 """One decision of the ego through its physics steps.
 
-The ego in one physics step and the outcome of a decision are pure functions on tensors, each of
-which compiles to one graph (:meth:`Physics.compile`); :func:`run_decision` joins them with the
-traffic.
+The ego in one physics step and the outcome of a decision are pure functions on tensors;
+:func:`run_decision` joins them with the traffic.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from torch import Tensor
 
 from ganlane import keys
 from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
-from ganlane.runtime import check_compiler
 from ganlane.settings.driving import EgoParameters, IdmParameters, SteeringParameters
 from ganlane.settings.episode import EpisodeParameters
 from ganlane.sim.collisions import ego_overlaps
@@ -31,9 +29,7 @@ from ganlane.sim.dynamics import (
 )
 from ganlane.sim.idm import following_acceleration
 from ganlane.sim.lane_ends import at_exit, hits_wall
-from ganlane.sim.spawn import recycle
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
-from ganlane.torch_settings import compiled
 from ganlane.traffic.base import TrafficModule, memory_of
 
 #: Name to tensor [N]: the ego's memory (:mod:`ganlane.env.state`).
@@ -232,28 +228,6 @@ def _columns(values: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: value[:, None] for name, value in values.items()}
 
 
-class Physics:
-    """The functions above and recycling, not compiled until :meth:`compile`."""
-
-    def __init__(self) -> None:
-        self.compiled = False
-        self.begin = begin
-        self.remember = remember
-        self.recycle = recycle
-        self.advance = advance
-
-    def compile(self) -> None:
-        """Compile each function to a graph.
-
-        Raises:
-            UserError: there is no C++ compiler.
-        """
-        check_compiler()
-        self.compiled = True
-        for name in ("begin", "remember", "recycle", "advance"):
-            setattr(self, name, compiled(getattr(self, name)))
-
-
 # A whole decision
 
 
@@ -321,7 +295,6 @@ def _where(
 
 def run_decision(
     traffic: TrafficModule,
-    physics: Physics,
     rules: Rules,
     state: TensorDictBase,
     start: Substep,
@@ -362,10 +335,9 @@ def run_decision(
             keys.STEP: start.step + count,
         }
         after = traffic(TensorDict._new_unsafe(fields, batch_size=size))
-        # In a graph the copies cost nothing, so one graph serves both cases.
-        all_running = not physics.compiled and known_false((~before.running).any())
+        all_running = known_false((~before.running).any())
         moved = Vehicles.of(after.get(keys.MOVED))
-        now = physics.advance(
+        now = advance(
             rules,
             before,
             moved,

@@ -65,9 +65,9 @@ def run_episodes(
         episodes: their numbers.
         on_progress: called now and then with (episodes finished, episodes in all).
         make_smaller: makes ``env`` with fewer rows; the last episodes move there when at most
-            :data:`LARGEST_SHARE` of the rows are still driving. Not used where physics are graphs,
-            which are of one batch size, nor where something is held per row: by traffic with
-            ``rows_must_stay``, and by every policy without ``rows_must_stay = False``.
+            :data:`LARGEST_SHARE` of the rows are still driving. Not used where something is held
+            per row: by traffic with ``rows_must_stay``, and by every policy without
+            ``rows_must_stay = False``.
         actions: whether to return the column ``actions``, too.
 
     Returns:
@@ -177,8 +177,6 @@ class _Evaluation:
             False,
         )
         may_move = not rows_stay and not getattr(policy, "rows_must_stay", True)
-        # TorchRL's environments hand attributes on to what they wrap.
-        may_move = may_move and not getattr(env, "runs_graphs", False)
         self.env = env
         self.policy = policy
         self.taken = taken

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
+from torch import nn
 
 from ganlane._version import __version__
 from ganlane.errors import UserError
+from ganlane.generator.human import HumanPolicy
 from ganlane.generator.human_estimator import HumanModel
 from ganlane.generator.networks import Generator
 from ganlane.settings.generator import (
     GENERATOR,
     FitConfig,
+    GeneratorSizes,
+    HumanSizes,
     Preset,
     human_sizes,
     misfit,
@@ -23,6 +27,7 @@ from ganlane.settings.generator import (
 )
 from ganlane.weights import load_weights, save_weights
 
+Network = TypeVar("Network", bound=nn.Module)
 #: ``{"all" or scene: {"ERROR/KIND": value}}``.
 Metrics = dict[str, dict[str, float]]
 
@@ -100,18 +105,38 @@ def load_generator(
     """
     tensors, metadata = load_weights(path, GENERATOR)
     sizes = stored_sizes(path, metadata, preset)
-    # A file that is read must not change the caller's random numbers.
-    with torch.random.fork_rng(devices=[]):
-        generator = Generator(sizes)
-    # Strict: a missing tensor or one too many is an error, too.
     try:
-        generator.load_state_dict(tensors)
+        return driving_generator(sizes, tensors), metadata
     except RuntimeError as error:
         raise UserError(
             f"{path}: its weights do not have the shapes that its sizes ask for; fit it again."
         ) from error
-    # A generator that drives is not fitted further, and gradients would cost memory.
-    return generator.eval().requires_grad_(False), metadata
+
+
+def driving_generator(sizes: GeneratorSizes, weights: Mapping[str, Any]) -> Generator:
+    """A generator with these tensors or arrays, in evaluation mode, without gradients.
+
+    Raises:
+        RuntimeError: they have other names or shapes.
+    """
+    return _with_weights(Generator, sizes, weights)
+
+
+def driving_policy(sizes: HumanSizes, weights: Mapping[str, Any]) -> HumanPolicy:
+    """As :func:`driving_generator`, a policy of ``human``."""
+    return _with_weights(HumanPolicy, sizes, weights)
+
+
+def _with_weights(
+    kind: Callable[[Any], Network], sizes: Any, weights: Mapping[str, Any]
+) -> Network:
+    # A file that is read must not change the caller's random numbers.
+    with torch.random.fork_rng(devices=[]):
+        network = kind(sizes)
+    # Strict: a missing tensor or one too many is an error, too.
+    network.load_state_dict({name: torch.as_tensor(value) for name, value in weights.items()})
+    # A network that drives is not fitted further, and gradients would cost memory.
+    return network.eval().requires_grad_(False)
 
 
 def load_human(path: str | Path) -> tuple[HumanModel, dict[str, Any]]:
@@ -123,10 +148,7 @@ def load_human(path: str | Path) -> tuple[HumanModel, dict[str, Any]]:
     """
     tensors, metadata = load_weights(path, GENERATOR)
     sizes = human_sizes(path, metadata)
-    with torch.random.fork_rng(devices=[]):
-        model = HumanModel(sizes)
     try:
-        model.load_state_dict(tensors)
+        return _with_weights(HumanModel, sizes, tensors), metadata
     except RuntimeError as error:
         raise misfit(path, asdict(sizes)) from error
-    return model.eval().requires_grad_(False), metadata

@@ -187,27 +187,15 @@ def wander(
     return share * noise + math.sqrt(1.0 - share * share) * fresh
 
 
-class Plan(NamedTuple):
-    """Predicted displacements not yet driven: ``ahead`` [N, M, execute_k, 2] in m, next first.
-
-    ``left`` of them.
-    """
-
-    ahead: Tensor
-    left: Tensor
-
-
 def paper_step(
     generator: Generator,
     vehicles: Vehicles,
     history: History,
     noise: Tensor,
-    plan: Plan | None = None,
-) -> tuple[Vehicles, History, Plan | None]:
-    """One step of the paper's preset: vehicles 0.1 s later, their history, the rest of the plan.
+) -> tuple[Vehicles, History]:
+    """One step of the paper's preset: vehicles 0.1 s later, and their history.
 
-    Without a plan (``execute_k`` = 1) one decoder step is run and driven. With one, ``execute_k``
-    steps are run for the vehicles whose last plan is finished.
+    One decoder step is run and driven.
     """
     history, difference = push(generator, history, displacement_of(vehicles))
     no_extra = difference[..., :0]
@@ -218,21 +206,8 @@ def paper_step(
         vehicles,
         no_extra,
     )
-    steps = 1 if plan is None else plan.ahead.shape[-2]
-    predicted = generator(observation, noise, steps)
-    if plan is not None:
-        # All rows predict, so that shapes stay the same; unfinished plans go on as they are.
-        finished = plan.left <= 0
-        predicted = torch.where(finished[..., None, None], predicted, plan.ahead)
-        left = torch.where(finished, steps, plan.left) - 1
-        # The next displacement moves to the front; what wraps around to the end is never driven.
-        plan = Plan(torch.roll(predicted, -1, dims=-2), left)
-    velocity = predicted[..., 0, :] / PHYSICS_STEP_S
-    return (
-        moved_by(vehicles, velocity[..., 0], velocity[..., 1]),
-        history,
-        plan,
-    )
+    velocity = generator(observation, noise, 1)[..., 0, :] / PHYSICS_STEP_S
+    return moved_by(vehicles, velocity[..., 0], velocity[..., 1]), history
 
 
 class DriverMemory(NamedTuple):

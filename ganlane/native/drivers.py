@@ -592,52 +592,39 @@ def _layer(
 # From weights and their metadata
 
 
-class FittedGenerator(NamedTuple):
-    """A generator as its file has it: weights, their sizes, metadata, and the file for messages."""
-
-    weights: Weights
-    sizes: GeneratorSizes
-    metadata: Mapping[str, Any]
-    source: object
-
-
-def paper_drivers(
-    generator: FittedGenerator,
-    config: GanTrafficConfig,
-    idm: IdmParameters,
-    stream: int,
-) -> GeneratedDrivers:
+def gan_drivers(config: GanTrafficConfig, idm: IdmParameters, stream: int) -> GeneratedDrivers:
     """Drivers of ``traffic=gan``.
 
     Raises:
-        UserError: the recordings hold no complete lane change.
+        UserError: the weights are missing, foreign or of the other preset, or their recordings hold
+            no complete lane change.
     """
-    statistics = _statistics(generator.metadata)
+    source, weights, sizes, metadata = _fitted(config.path, "paper")
+    statistics = _statistics(metadata)
     return GeneratedDrivers(
         idm,
-        generator.sizes,
-        generator.weights,
+        sizes,
+        weights,
         stream,
         config.noise_scale,
         PAPER_NOISE_PERIOD_S,
         sudden=sudden_accelerations(statistics),
-        changes=literal_changes(statistics, generator.source),
+        changes=literal_changes(statistics, source),
         guard=GuardParameters() if config.guard else None,
     )
 
 
 def calibrated_drivers(
-    generator: FittedGenerator,
-    config: GanCalibratedTrafficConfig,
-    idm: IdmParameters,
-    stream: int,
+    config: GanCalibratedTrafficConfig, idm: IdmParameters, stream: int
 ) -> GeneratedDrivers:
     """Drivers of ``traffic=gan_calibrated``.
 
     Raises:
-        UserError: fitted without per-driver parameters.
+        UserError: the weights are missing, foreign, of the other preset, or fitted without
+            per-driver parameters.
     """
-    statistics = _statistics(generator.metadata)
+    source, weights, sizes, metadata = _fitted(config.path, "calibrated")
+    statistics = _statistics(metadata)
     # Without a recorded change nobody changes lanes.
     recorded = statistics.lane_changes.per_vehicle_km or 0.0
     # Only None asks for the recorded rate; 0 is a rate.
@@ -645,12 +632,12 @@ def calibrated_drivers(
     wishes = WISH_PER_CHANGE * recorded if wishes is None else wishes
     return GeneratedDrivers(
         idm,
-        generator.sizes,
-        generator.weights,
+        sizes,
+        weights,
         stream,
         config.noise_scale,
         config.noise_period_s,
-        anchor=fitted_anchor(generator.metadata, generator.source),
+        anchor=fitted_anchor(metadata, source),
         checked_changes=CalibratedChanges(wishes),
         headways_s=tuple(statistics.headway.quantile(level) for level in QUANTILE_LEVELS),
     )
@@ -769,12 +756,12 @@ def _who_see(
     if type(traffic) is IdmRandomTrafficConfig:
         random = part_of(traffic, RandomDrivers)
         return RuleDrivers(idm, mobil=mobil, random=random, stream=stream)
-    if type(traffic) is GanTrafficConfig and traffic.execute_k == 1:
-        return paper_drivers(_fitted(traffic.path, "paper"), traffic, idm, stream)
+    if type(traffic) is GanTrafficConfig:
+        return gan_drivers(traffic, idm, stream)
     if type(traffic) is GanCalibratedTrafficConfig:
-        return calibrated_drivers(_fitted(traffic.path, "calibrated"), traffic, idm, stream)
+        return calibrated_drivers(traffic, idm, stream)
     if type(traffic) is HumanTrafficConfig:
-        return _human(traffic, idm, stream)
+        return human_drivers(traffic, idm, stream)
     if type(traffic) is MixedTrafficConfig:
         parts = {
             name: drivers_of(part, idm, mobil, stream) for name, part in traffic.parts().items()
@@ -783,7 +770,10 @@ def _who_see(
     return None
 
 
-def _fitted(path: str | None, preset: Any) -> FittedGenerator:
+def _fitted(
+    path: str | None, preset: Any
+) -> tuple[Path, Weights, GeneratorSizes, Mapping[str, Any]]:
+    """A generator's file, weights, sizes and metadata."""
     source = Path(path or shipped_generator(preset))
     weights, metadata = load_arrays(source, GENERATOR)
     sizes = stored_sizes(source, metadata, preset)
@@ -791,30 +781,18 @@ def _fitted(path: str | None, preset: Any) -> FittedGenerator:
         raise UserError(
             f"{source}: its weights do not have the shapes that its sizes ask for; fit it again."
         )
-    return FittedGenerator(weights, sizes, metadata, source)
+    return source, weights, sizes, metadata
 
 
-def _human(traffic: HumanTrafficConfig, idm: IdmParameters, stream: int) -> HumanDrivers:
-    source = Path(traffic.path or shipped_generator("human"))
-    weights, metadata = load_arrays(source, GENERATOR)
-    sizes = human_sizes(source, metadata)
-    variation = part_of(traffic, HumanVariation)
-    return human_drivers(weights, sizes, variation, idm, stream, source)
-
-
-def human_drivers(
-    weights: Weights,
-    sizes: HumanSizes,
-    variation: HumanVariation,
-    idm: IdmParameters,
-    stream: int,
-    source: object,
-) -> HumanDrivers:
-    """Drivers of ``traffic=human``; ``weights`` are those of the file ``source``.
+def human_drivers(config: HumanTrafficConfig, idm: IdmParameters, stream: int) -> HumanDrivers:
+    """Drivers of ``traffic=human``.
 
     Raises:
-        UserError: weights of other sizes.
+        UserError: the weights are missing, foreign, or of other sizes.
     """
+    source = Path(config.path or shipped_generator("human"))
+    weights, metadata = load_arrays(source, GENERATOR)
+    sizes = human_sizes(source, metadata)
     policy = {
         name.removeprefix("policy."): array
         for name, array in weights.items()
@@ -825,7 +803,7 @@ def human_drivers(
         shapes |= {f"{name}.weight": (outputs, inputs), f"{name}.bias": (outputs,)}
     if {name: array.shape for name, array in policy.items()} != shapes:
         raise misfit(source, vars(sizes))
-    return HumanDrivers(idm, sizes, policy, stream, variation)
+    return HumanDrivers(idm, sizes, policy, stream, part_of(config, HumanVariation))
 
 
 def _human_layers(sizes: HumanSizes) -> dict[str, tuple[int, int]]:

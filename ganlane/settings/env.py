@@ -326,8 +326,6 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
         recycle: true: vehicles that the ego leaves 200 m behind return ahead of it, and the
             reverse.
         recycle_share: share of the episodes in which they do, 0 to 1.
-        compile: true: physics, traffic and the agent's update as compiled graphs (needs a C++
-            compiler); faster, after a minute or so of compiling, and the same up to rounding.
         kernel: what drives a decision: the tensor code (torch), the native kernel (native), which
             does the same up to rounding on a CPU (not for recordings, foreign simulators and
             traffic of your own), or the kernel where it can (auto).
@@ -349,7 +347,6 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
     recycle: bool = False
     recycle_share: Share = 1.0
     # how a decision is computed; the course of an episode is the same
-    compile: bool = False
     kernel: Annotated[str, one_of(KERNELS)] = "auto"
     # what stands at the start, and how everybody drives
     scene: SceneConfig | None = None

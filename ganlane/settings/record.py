@@ -338,7 +338,8 @@ def _fitted(
         value = value.tolist()
     if kind in (list, tuple):
         # A set or an array is as good as a list; a mapping is a mistake.
-        entries = [value] if isinstance(value, str) else value  # agents=mobil
+        one = kind is list and isinstance(value, str | Path | int)
+        entries = [value] if one or isinstance(value, str) else value  # agents=mobil, episodes=3
         if not isinstance(entries, Collection) or isinstance(entries, Mapping):
             raise _refusal(key, value, "a list in brackets", field)
         if kind is tuple and inner[1] is not Ellipsis and len(entries) != len(inner):

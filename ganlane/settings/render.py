@@ -12,26 +12,21 @@ from ganlane.errors import ParameterError, UserError, as_typed
 from ganlane.settings.commands import DrivingConfig, Measured, Names
 from ganlane.settings.record import (
     DIFFERENT,
-    Count,
     NotNegative,
     Positive,
     Record,
     Seed,
     Text,
-    at_least,
     between,
-    one_of,
 )
 from ganlane.settings.traffic import IdmMobilTrafficConfig, TrafficConfig
 
 #: Learning curves.
 CHARTS = ("png", "svg", "pdf")
 #: Any number of episodes.
-PAGES = ("html", "csv", "parquet")
+PAGES = ("html", "parquet")
 #: One episode.
 FILMS = ("gif", "mp4", "png")
-# png is a film and a chart, listed once.
-FORMATS = tuple(dict.fromkeys((*FILMS, *PAGES, *CHARTS)))
 MOST_EPISODES = 12
 #: A GIF of a whole episode takes minutes to draw, and tens of MB.
 GIF_S = 30.0
@@ -51,7 +46,6 @@ class FilmConfig(Record):
         road_m: length of road in the picture, m.
         trail_s: length of the trails, s; 0: none.
         speeds: numbers on the roofs.
-        max_bytes: gif: size and frame rate are lowered until it fits; html: the rate of samples.
     """
 
     # which part of the episode, how fast
@@ -65,8 +59,6 @@ class FilmConfig(Record):
     road_m: Positive = 160.0
     trail_s: NotNegative = 3.0
     speeds: bool = True
-    # the file
-    max_bytes: Annotated[int, at_least(10_000)] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -77,63 +69,43 @@ class FilmConfig(Record):
 
 
 @dataclass(frozen=True)
-class CurvesConfig(Record):
-    """``curves``: learning curves of training runs.
-
-    Attributes:
-        columns: of metrics.csv and evaluation_NAME of evaluation.csv; null: the ones that matter
-            most.
-        smooth: rows that a running mean takes in.
-    """
-
-    columns: list[Text] | None = None
-    smooth: Count = 1
-
-
-@dataclass(frozen=True)
 class RenderConfig(DrivingConfig):
     """Episodes of agents on one traffic, as a film, page or table; or the learning curves of runs.
 
     Attributes:
-        driver: agent=NAME says the same: a name, path or import path as in ganlane evaluate.
-        episode: of the seed and stream: the same as in ganlane evaluate.
+        agents: agent=NAME says the same: names, paths or import paths as in ganlane evaluate; html,
+            parquet: several, agents=[mobil,agent_idm]; null: agent_general, of crashes all.
+        episodes: episode=NUMBER says the same: of the seed and stream, the same as in ganlane
+            evaluate; html, parquet: several, episodes=[0,1,2]; null: 0, of crashes all.
         stream: benchmark: the episodes of ganlane benchmark.
-        agents: html, csv, parquet: several instead of driver, for instance
-            agents=[mobil,agent_idm].
-        episodes: html, csv, parquet: several instead of episode, for instance episodes=[0,1,2].
         run: instead of an episode: learning curves of runs, run=FOLDER or 'run=[FOLDER,FOLDER]'.
         crashes: instead of an episode: a list such as docs/reproduce/crashes.json, whose episodes
             are driven again with their actions; agents, episodes and traffics choose among them.
         traffics: of crashes: on these traffics alone.
-        format: gif, mp4 (needs the extra 'video'), png (a strip of four frames), html (a player),
-            csv or parquet (trajectories); null: the ending of out, else gif.
-        out: file to write; null: into the run folder.
+        out: file to write, whose ending says what: gif, mp4 (needs the extra 'video'), png (a strip
+            of four frames), html (a player), parquet (trajectories); of learning curves png, svg,
+            pdf; null: a gif, html of crashes or png of curves, into the run folder.
         film: how a film looks.
-        curves: how learning curves look.
     """
 
     # what is shown
-    driver: str = "agent_general"
-    episode: Seed = 0
+    agents: Names | None = None
     stream: Measured = "report"
-    agents: Annotated[list[str], DIFFERENT] | None = None
     episodes: Annotated[list[Seed], DIFFERENT] | None = None
     run: Annotated[list[Text], DIFFERENT] | None = None
     crashes: Text | None = None
     traffics: Names | None = None
     # how, and where it goes
-    format: Annotated[str, one_of(FORMATS)] | None = None
     out: str | None = None
     traffic: TrafficConfig = field(default_factory=IdmMobilTrafficConfig)
     film: FilmConfig = field(default_factory=FilmConfig)
-    curves: CurvesConfig = field(default_factory=CurvesConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        kind, ending, count = self.kind, self._ending, len(self.pairs())
+        kind, count = self.kind, len(self.pairs())
         path = Path(self.out or "")
         is_film = kind in FILMS
-        episodes, charts = ", ".join(FILMS + PAGES), ", ".join(CHARTS)
+        endings = CHARTS if self.run else PAGES if self.crashes else FILMS + PAGES
         # Whether something is wrong, and the sentence about it.
         checks = [
             (
@@ -142,31 +114,19 @@ class RenderConfig(DrivingConfig):
                 "it first.",
             ),
             (
-                ending not in ("", kind),
-                f"out={path}: the ending says {ending} and format {kind}; give one of them.",
-            ),
-            (
                 self.run and self.crashes,
                 "crashes and run: either crashes or learning curves are drawn; leave one of them "
                 "out.",
             ),
             (
-                self.run and kind not in CHARTS,
-                f"format={kind}: learning curves are one of {charts}; choose one of these.",
+                kind not in endings,
+                f"out={path}: the ending is {kind}, expected one of {', '.join(endings)}; choose "
+                "one of these.",
             ),
             (
-                not self.run and kind not in FILMS + PAGES,
-                f"format={kind}: for learning curves only, or unknown; episodes are one of "
-                f"{episodes}.",
-            ),
-            (
-                self.crashes and is_film,
-                f"format={kind}: shows one episode; crashes are one of {', '.join(PAGES)}.",
-            ),
-            (
-                not self.run and is_film and count > 1,
-                f"format={kind}: a film shows one episode, not {count}; use format=html for "
-                "several.",
+                is_film and count > 1,
+                f"out={path}: a film shows one episode, not {count}; for several give a file "
+                "that ends in .html.",
             ),
             (
                 not self.crashes and count > MOST_EPISODES,
@@ -179,8 +139,8 @@ class RenderConfig(DrivingConfig):
             ),
             (
                 kind == "mp4" and find_spec("imageio_ffmpeg") is None,
-                "format=mp4: needs the extra 'video'; run `pip install \"ganlane[video]\"` or "
-                "choose format=gif.",
+                f"out={path}: mp4 needs the extra 'video'; run `pip install \"ganlane[video]\"` or "
+                "choose a gif.",
             ),
         ]
         for is_wrong, sentence in checks:
@@ -188,16 +148,11 @@ class RenderConfig(DrivingConfig):
                 raise UserError(sentence)
 
     @property
-    def _ending(self) -> str:
-        """The ending of ``out``, without the dot; empty: none."""
-        return Path(self.out or "").suffix.removeprefix(".").lower()
-
-    @property
     def kind(self) -> str:
-        """``format``, else the ending of ``out``, else what suits what is drawn."""
+        """The ending of ``out``, without the dot, else what suits what is drawn."""
         # Curves are a picture, crashes are many episodes, else one episode is a film.
         default = "png" if self.run is not None else "gif" if self.crashes is None else "html"
-        return self.format or self._ending or default
+        return Path(self.out or "").suffix.removeprefix(".").lower() or default
 
     @property
     def look(self) -> FilmConfig:
@@ -208,7 +163,9 @@ class RenderConfig(DrivingConfig):
 
     def pairs(self) -> list[tuple[str, int]]:
         """The episodes to record: agent and number of each."""
-        agents = [self.driver] if self.agents is None else self.agents
-        episodes = [self.episode] if self.episodes is None else self.episodes
         # Episode by episode, so that the agents of one stand side by side.
-        return [(agent, episode) for episode in episodes for agent in agents]
+        return [
+            (agent, episode)
+            for episode in self.episodes or [0]
+            for agent in self.agents or ["agent_general"]
+        ]

@@ -158,7 +158,6 @@ class GanTrafficConfig(TrafficConfig):
         path: weights of the preset 'paper'; null: the ones that ship.
         guard: false: without it vehicles leave the road within a minute.
         noise_scale: 1 samples trajectories as fitted, 0 takes the mean prediction.
-        execute_k: predicted steps driven before predicting again, 1 (the paper) to 8.
     """
 
     option = "gan"
@@ -167,7 +166,6 @@ class GanTrafficConfig(TrafficConfig):
     # the network knows no lanes, so something else has to keep vehicles on the road
     guard: bool = True
     noise_scale: NotNegative = 1.0
-    execute_k: Annotated[int, between(1, 8)] = 1
 
 
 @dataclass(frozen=True)
@@ -205,10 +203,6 @@ class HumanTrafficConfig(TrafficConfig, HumanVariation):
     option = "human"
     _target_: ImportPath = "ganlane.traffic.presets.human_traffic"
     path: str | None = None
-
-    def arguments(self) -> dict[str, Any]:
-        """The drivers' properties as one argument."""
-        return {"path": self.path, "variation": part_of(self, HumanVariation)}
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
-"""``ganlane train``: the run, and the groups ``init``, ``collector`` and ``logger``."""
+"""``ganlane train``: the run, and the groups ``init`` and ``logger``."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from ganlane.errors import ParameterError
@@ -20,43 +20,13 @@ class InitConfig(Record):
     """``init=idm_ckpt``: start from a trained agent; ``init=none``: from random weights.
 
     Attributes:
-        path: a shipped agent's name, a .safetensors file, or a training run's folder or last.pt;
-            null: random weights.
-        support: trained: its atoms, v_min and v_max instead of those of agent; run: both must
-            agree.
-        optimizer: true: Adam's moments too; they are in a run's last.pt, not in a .safetensors
-            file.
+        path: a shipped agent's name, a .safetensors file, or a finished training's folder; null:
+            random weights.
     """
 
     group = "init"
 
     path: str | None = None
-    support: Annotated[str, one_of(("run", "trained"))] = "run"
-    optimizer: bool = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        # Both keys need an agent; the message names the one that was given.
-        asked = "{optimizer}=true" if self.optimizer else "{support}=trained"
-        if self.path is None and (self.optimizer or self.support == "trained"):
-            raise ParameterError(
-                f"{asked}: of which agent? give init=idm_ckpt, and {{path}}=PATH unless the "
-                "shipped one."
-            )
-
-
-@dataclass(frozen=True)
-class CollectorConfig(Record):
-    """``collector=single``: one process steps all environments side by side.
-
-    Attributes:
-        num_envs: environments of the process, 1 to 65536; a step of the loop has a decision of
-            each.
-    """
-
-    group = "collector"
-
-    num_envs: Environments = 512
 
 
 @dataclass(frozen=True)
@@ -122,10 +92,10 @@ class TrainConfig(DrivingConfig):
 
     Attributes:
         total_decisions: of all environments together.
-        compile: always, never; auto: where compiling is known to work
-            (:func:`ganlane.torch_settings.can_compile`) and the training is long enough to gain by
-            it (:data:`WORTH_COMPILING`). The final evaluation is compiled with ``env.compile=true``
-            alone.
+        num_envs: environments side by side, 1 to 65536; a step of the loop has a decision of each.
+        compile: the agent's update as one graph: always, never; auto: where compiling is known to
+            work (:func:`ganlane.torch_settings.can_compile`) and the training is long enough to
+            gain by it (:data:`WORTH_COMPILING`).
         log_every: decisions between two rows of metrics.csv.
         evaluate_every: decisions between two evaluations while training (0: none); the best agent
             is kept.
@@ -140,6 +110,7 @@ class TrainConfig(DrivingConfig):
 
     # how long, and what is written on the way
     total_decisions: Count = 600_000
+    num_envs: Environments = 512
     compile: Annotated[str, one_of(("auto", "always", "never"))] = "auto"
     log_every: Count = 10_000
     evaluate_every: CountOrZero = 0
@@ -153,22 +124,20 @@ class TrainConfig(DrivingConfig):
     traffic: TrafficConfig = field(default_factory=IdmMobilTrafficConfig)
     init: InitConfig = field(default_factory=InitConfig)
     agent: RainbowConfig = field(default_factory=RainbowConfig)
-    collector: CollectorConfig = field(default_factory=CollectorConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     # the phase before, and the comparison after
     pretrain: PretrainConfig = field(default_factory=PretrainConfig)
     evaluation: FinalEvaluationConfig = field(default_factory=FinalEvaluationConfig)
 
-    def compiled(self) -> TrainConfig:
-        """The config with ``env.compile`` set according to ``compile``."""
+    def compiles(self) -> bool:
+        """Whether the agent's update is compiled."""
         # Imported here, since it imports torch, which takes seconds.
         from ganlane.torch_settings import can_compile
 
-        # Compiling takes minutes: the benefit has to be larger.
-        worth = self.total_decisions >= WORTH_COMPILING and can_compile()
-        if self.env.compile or self.compile == "never" or (self.compile == "auto" and not worth):
-            return self
-        return replace(self, env=replace(self.env, compile=True))
+        if self.compile == "auto":
+            # Compiling takes a minute: the benefit has to be larger.
+            return self.total_decisions >= WORTH_COMPILING and can_compile()
+        return self.compile == "always"
 
     def all_traffic(self) -> list[TrafficConfig]:
         """Every traffic of the run."""

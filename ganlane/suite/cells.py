@@ -96,7 +96,6 @@ def _settings(driver: Driver, config: EvaluateConfig) -> dict[str, Any]:
     # They change how fast the cell is driven, not what happens.
     for name in ("threads", "columns", "num_envs", "agents", "traffics"):
         del settings[name]
-    del settings["env"]["compile"]
     return {
         **settings,
         "driver": driver.name,

@@ -89,7 +89,7 @@ class CrashList(Record):
     ) -> EnvBase:
         """The environment that repeats this list's episodes on a traffic."""
         # The tensor code, so that a list plays the same with and without the native kernel.
-        env = replace(self.env, kernel="torch", compile=False)
+        env = replace(self.env, kernel="torch")
         # The same stream of randomness, so that others start and act as they did.
         model = make_traffic(self.traffics[traffic], env, Stream.named(self.stream))
         return make_env(model, env, observation, reward, ROWS, mask=mask)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any, TypeAlias, cast
 
 import torch
@@ -19,7 +18,7 @@ from ganlane.settings.driving import Visibility
 from ganlane.sim.random import Stream, absorb, episode_key, uniform
 from ganlane.sim.scenes import Scenes
 from ganlane.sim.state import Road, Vehicles
-from ganlane.torch_settings import compiled, outside_autocast
+from ganlane.torch_settings import outside_autocast
 
 #: A module's memory: name to tensor [N, M, ...].
 Memory: TypeAlias = dict[str, Tensor]
@@ -48,37 +47,19 @@ def with_rows(
     whole: TensorDictBase,
     rows: Tensor,
     part: Mapping[str, Any],
-    origins: Mapping[Tensor, Tensor] = MappingProxyType({}),
 ) -> TensorDict:
     """``whole`` [N] with its ``rows`` [R] replaced by those of ``part``, leaf by leaf.
 
-    Nothing is written in place. Further rows of ``part`` are padding.
-
-    Args:
-        whole, rows: the batch, and the indices of the rows.
-        part: their new values; what it lacks stays.
-        origins: tensors of the whole batch by the leaves that were taken from them. Where ``part``
-            returns such a leaf, under any name, the tensor is used again instead of a copy.
+    Nothing is written in place; what ``part`` lacks stays.
     """
     fields = dict(whole.items())
     for name, value in part.items():
-        if not isinstance(value, Tensor):
-            # TorchRL drops empty TensorDicts between decisions.
-            if name in fields:
-                fields[name] = with_rows(
-                    fields[name],
-                    rows,
-                    value,
-                    origins,
-                )
-        elif value in origins:
-            fields[name] = origins[value]
-        else:
-            # Padding repeats rows; the first ones are real.
-            if len(value) > len(rows):
-                value = value[: len(rows)]
+        if isinstance(value, Tensor):
             # Not index_copy_, which would write into the caller's tensor.
             fields[name] = fields[name].index_copy(0, rows, value)
+        # TorchRL drops empty TensorDicts between decisions.
+        elif name in fields:
+            fields[name] = with_rows(fields[name], rows, value)
     return new_tensordict(fields, whole.batch_size[0])
 
 
@@ -212,14 +193,6 @@ class TrafficModule(TensorDictModuleBase):
         """What the native kernel needs to drive as this model does; None: it cannot."""
         return None
 
-    def compile_graphs(self) -> None:
-        """Compile the pure functions on tensors (``env.compile=true``); here :meth:`move`.
-
-        A model whose :meth:`move` reads the value of a tensor overrides this and compiles the parts
-        between.
-        """
-        self.move = compiled(self.move)  # type: ignore[method-assign]
-
     # Below: TensorDicts in and out, so that models can be chained and stored. A model of your own
     # needs nothing of it.
 
@@ -333,10 +306,6 @@ class Overlay(TrafficModule):
             tensordict.get(keys.STEP),
         )
 
-    def compile_graphs(self) -> None:
-        """Compile :meth:`rewrite`."""
-        self.rewrite = compiled(self.rewrite)  # type: ignore[method-assign]
-
 
 class TrafficParts(TrafficModule):
     """Base of traffics made of several, each with its own memory under its name.
@@ -359,11 +328,6 @@ class TrafficParts(TrafficModule):
             "list[tuple[str, TrafficModule]]",
             list(self.parts.items()),
         )
-
-    def compile_graphs(self) -> None:
-        """Compile every part."""
-        for _, part in self.named_parts():
-            part.compile_graphs()
 
     def memory_spec(
         self,

@@ -34,12 +34,12 @@ from ganlane.generator.human import (
 from ganlane.generator.human import Memory as DriverMemory
 from ganlane.generator.human_tuning import entering_memory
 from ganlane.native.drivers import HumanDrivers
-from ganlane.settings.driving import HumanVariation, Visibility
-from ganlane.sim.idm import TABLE_V, acceleration_before_wall
+from ganlane.settings.driving import Visibility
+from ganlane.sim.idm import acceleration_before_wall
 from ganlane.sim.lane_ends import WaysOut, ways_out
 from ganlane.sim.mobil import TABLE_IV
 from ganlane.sim.neighbours import perceive as scene_of
-from ganlane.sim.random import Purpose, Stream, normal
+from ganlane.sim.random import Purpose, normal
 from ganlane.sim.state import Road, Vehicles, reads_are_cheap, spanned
 from ganlane.traffic.base import Memory, MemoryFields, Moved, TrafficModule, uniforms
 
@@ -74,18 +74,16 @@ class HumanTraffic(TrafficModule):
     def __init__(
         self,
         policy: HumanPolicy,
+        drivers: HumanDrivers,
         road: Road | None = None,
-        stream: int = Stream.TRAIN,
-        variation: HumanVariation | None = None,
-        drivers: HumanDrivers | None = None,
     ) -> None:
-        super().__init__(road, stream)
+        super().__init__(road, drivers.stream)
         self.policy = policy
-        self.variation = variation or HumanVariation()
+        self.variation = drivers.variation
         self._drivers = drivers
-        self._idm = TABLE_V if drivers is None else drivers.idm
+        self._idm = drivers.idm
 
-    def native_drivers(self) -> HumanDrivers | None:
+    def native_drivers(self) -> HumanDrivers:
         """Those that it was made with."""
         return self._drivers
 

@@ -33,7 +33,6 @@ from ganlane.sim.mobil import TABLE_IV, DriverMobil, mobil_changes
 from ganlane.sim.neighbours import Scene, in_lane, perceive
 from ganlane.sim.random import Purpose, Stream, absorb
 from ganlane.sim.state import Road, Vehicles, reads_are_cheap
-from ganlane.torch_settings import compiled
 from ganlane.traffic.base import (
     Memory,
     MemoryFields,
@@ -208,11 +207,6 @@ class IdmMobilTraffic(IdmTraffic):
             self.idm,
             self.mobil,
         )
-
-    def compile_graphs(self) -> None:
-        """One graph for a step with decisions, one for a step without."""
-        self.keep_lanes = compiled(self.keep_lanes)  # type: ignore[method-assign]
-        self.decide = compiled(self.decide)  # type: ignore[method-assign]
 
 
 class DriverParams(NamedTuple):

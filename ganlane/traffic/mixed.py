@@ -30,12 +30,11 @@ from ganlane.traffic.base import (
 
 
 class RowsOfPart(NamedTuple):
-    """A part and its ``rows`` [R] of the batch; ``padded`` repeats the first of them at the end."""
+    """A part and its ``rows`` [R] of the batch."""
 
     name: str
     part: TrafficModule
     rows: Tensor
-    padded: Tensor
 
 
 class MixedTraffic(TrafficParts):
@@ -88,7 +87,6 @@ class MixedTraffic(TrafficParts):
         turns = torch.tensor([names.index(name) for name in interleaved(shares)])
         self.register_buffer("turns", turns, persistent=False)
         self._shares = {name.replace(".", "_"): share for name, share in shares.items()}
-        self.compiled = False
         # Of the present decision: the keys of its episodes, and the rows of the parts.
         self._rows: tuple[Tensor, list[RowsOfPart]] | None = None
 
@@ -105,23 +103,16 @@ class MixedTraffic(TrafficParts):
     def rows_of_parts(self, episode: Tensor) -> list[RowsOfPart]:
         """The parts that have rows in the batch of ``episode`` [N].
 
-        A graph is compiled for every number of rows, which takes a minute, so compiled parts get at
-        most some 16 numbers, by padding. On a GPU this waits for the queue once.
+        On a GPU this waits for the queue once.
         """
         part_of_row = self.part_of(episode)
-        batch = len(episode)
         numbers = torch.arange(len(self.parts), device=episode.device)
         sizes = (part_of_row[:, None] == numbers).sum(0).tolist()
         rows_of_part = part_of_row.argsort(stable=True).split(sizes)
         chosen = []
         for (name, part), rows in zip(self.named_parts(), rows_of_part):
-            padded = rows
-            if self.compiled:
-                size = max(8, batch // 16)
-                # -n % size rows fill n up to the next multiple of size.
-                padded = torch.cat((rows, rows[:1].expand(-len(rows) % size)))
             if len(rows):
-                chosen.append(RowsOfPart(name, part, rows, padded))
+                chosen.append(RowsOfPart(name, part, rows))
         return chosen
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -139,12 +130,9 @@ class MixedTraffic(TrafficParts):
         key = inputs[keys.EPISODE_KEY]
         if self._rows is None or self._rows[0] is not key:
             self._rows = key, self.rows_of_parts(inputs[keys.EPISODE])
-        for name, part, rows, padded in self._rows[1]:
+        for name, part, rows in self._rows[1]:
             memory = memory_of(memories, name)
-            # A generator's memory is large, and most of it is only renamed in a step: what a part
-            # returns as it was given keeps its tensor of the whole batch.
-            origins: dict[Tensor, Tensor] = {}
-            taken = _take({**inputs, keys.TRAFFIC: memory}, padded, origins)
+            taken = _take({**inputs, keys.TRAFFIC: memory}, rows)
             before = taken.get(keys.VEHICLES)
             output = part(taken)
             # Vehicles are compared by name, since other parts have written into the others' rows.
@@ -154,12 +142,7 @@ class MixedTraffic(TrafficParts):
                 if value is not before.get(field):
                     changed[field] = value
             moved = with_rows(moved, rows, changed)
-            new_memories[name] = with_rows(
-                memory,
-                rows,
-                memory_of(output),
-                origins,
-            )
+            new_memories[name] = with_rows(memory, rows, memory_of(output))
         tensordict.set(keys.MOVED, moved)
         tensordict.set(
             keys.TRAFFIC,
@@ -174,7 +157,7 @@ class MixedTraffic(TrafficParts):
         (n, m), x = vehicles.x.shape, vehicles.x
         together = new_tensordict(vehicles.as_dict(), n)
         memories = _zeros(self.memory_spec(n, m, x.dtype), n, x.device)
-        for name, part, rows, _ in self.rows_of_parts(episode):
+        for name, part, rows in self.rows_of_parts(episode):
             # A traffic sees only its own rows of the scene.
             scene = Vehicles(*(field[rows] for field in vehicles))
             # Here the part is known, so the placeholder becomes its visibility.
@@ -196,29 +179,15 @@ class MixedTraffic(TrafficParts):
             "this."
         )
 
-    def compile_graphs(self) -> None:
-        """Compile every part; from now on the rows of a part come in few different numbers."""
-        self.compiled = True
-        super().compile_graphs()
 
-
-def _take(
-    fields: Mapping[str, Any],
-    rows: Tensor,
-    origins: dict[Tensor, Tensor],
-) -> TensorDict:
-    """``rows`` of tensors, or of TensorDicts of them, by name.
-
-    ``origins`` collects, by the tensor taken, the one that it was taken from.
-    """
+def _take(fields: Mapping[str, Any], rows: Tensor) -> TensorDict:
+    """``rows`` of tensors, or of TensorDicts of them, by name."""
     taken: dict[str, Any] = {}
     for name, field in fields.items():
         if isinstance(field, Tensor):
             taken[name] = field.index_select(0, rows)
-            # Tensors hash by identity, so they can be keys.
-            origins[taken[name]] = field
         else:
-            taken[name] = _take(field, rows, origins)
+            taken[name] = _take(field, rows)
     return new_tensordict(taken, len(rows))
 
 
@@ -308,7 +277,3 @@ class BlindTraffic(TrafficModule):
     ) -> dict[str, Any]:
         """As the model's."""
         return self.model.memory_spec(n, m, dtype)
-
-    def compile_graphs(self) -> None:
-        """Compile the model."""
-        self.model.compile_graphs()

@@ -5,26 +5,19 @@ The paper's generated traffic, the calibrated one, and rule-driven drivers with 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-from ganlane.generator import Generator, load_generator, load_human, shipped_generator
-from ganlane.native.drivers import (
-    FittedGenerator,
-    calibrated_drivers,
-    human_drivers,
-    paper_drivers,
-)
+from ganlane.generator.checkpoint import driving_generator, driving_policy
+from ganlane.native.drivers import calibrated_drivers, gan_drivers, human_drivers
 from ganlane.settings.driving import (
     DriverFaults,
-    HumanVariation,
     IdmParameters,
     MobilParameters,
 )
 from ganlane.settings.traffic import (
     GanCalibratedTrafficConfig,
     GanTrafficConfig,
+    HumanTrafficConfig,
 )
 from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.idm import TABLE_V
@@ -50,106 +43,61 @@ from ganlane.traffic.social_gan import (
 def gan_traffic(
     road: Road | None = None,
     stream: int = Stream.TRAIN,
-    path: str | Path | None = None,
-    guard: bool = GanTrafficConfig.guard,
-    noise_scale: float = GanTrafficConfig.noise_scale,
-    execute_k: int = GanTrafficConfig.execute_k,
     idm: IdmParameters = TABLE_V,
+    **keys: Any,
 ) -> TrafficSequential:
     """``traffic=gan``, the paper's: positions only, literal blind lane changes, sudden
     accelerations.
 
     Args:
         road, stream: as for every traffic module.
-        path, guard, noise_scale, execute_k: see
-            :class:`~ganlane.settings.traffic.GanTrafficConfig`.
         idm: of the guard's bounds on acceleration.
+        keys: those of :class:`~ganlane.settings.traffic.GanTrafficConfig`.
 
     Raises:
         UserError: the weights are missing, foreign or of the other preset.
     """
-    source = path or shipped_generator("paper")
-    generator, metadata = load_generator(source, "paper")
-    config = GanTrafficConfig(guard=guard, noise_scale=noise_scale, execute_k=execute_k)
-    drivers = paper_drivers(
-        _fitted(generator, metadata, source),
-        config,
-        idm,
-        stream,
-    )
+    drivers = gan_drivers(GanTrafficConfig(**keys), idm, stream)
+    generator = driving_generator(drivers.sizes, drivers.weights)
+    noise = (drivers.noise_period_s, drivers.noise_scale)
     # The order matters: a lane change moves sideways whatever the network did, and the guard bounds
     # the sum of all.
     parts: dict[str, TrafficModule] = {
-        "generator": SocialGanTraffic(
-            generator,
-            road,
-            stream,
-            drivers.noise_period_s,
-            noise_scale,
-            execute_k,
-        ),
+        "generator": SocialGanTraffic(generator, road, stream, *noise),
         "acceleration": AccelerationOverlay(road, stream, drivers.sudden),
         "lane_change": LiteralLaneChange(road, stream, drivers.changes),
     }
     # Last, so that nothing moves a vehicle after it.
     if drivers.guard is not None:
-        parts["guard"] = Guard(
-            road,
-            stream,
-            drivers.guard,
-            idm,
-        )
-    # The kernel drives no plans.
-    return TrafficSequential(parts, drivers if execute_k == 1 else None)
+        parts["guard"] = Guard(road, stream, drivers.guard, idm)
+    return TrafficSequential(parts, drivers)
 
 
 def gan_calibrated_traffic(
     road: Road | None = None,
     stream: int = Stream.TRAIN,
-    path: str | Path | None = None,
-    noise_scale: float = GanCalibratedTrafficConfig.noise_scale,
-    changes_per_km: float | None = None,
-    noise_period_s: float = GanCalibratedTrafficConfig.noise_period_s,
     idm: IdmParameters = TABLE_V,
+    **keys: Any,
 ) -> TrafficSequential:
     """``traffic=gan_calibrated``: anchored residual, per-driver headways, checked lane changes at
     the recorded rate.
 
     Args:
         road, stream: as for every traffic module.
-        path, noise_scale, noise_period_s: see
-            :class:`~ganlane.settings.traffic.GanCalibratedTrafficConfig`.
-        changes_per_km: hazard of wishing for a lane change; by default the recorded rate
-            times ``WISH_PER_CHANGE``, which gives that rate in the simulation.
         idm: of the gap check; the anchor keeps its own (``SIMULATED_ANCHOR``).
+        keys: those of :class:`~ganlane.settings.traffic.GanCalibratedTrafficConfig`.
 
     Raises:
         UserError: the weights are missing, foreign, of the other preset, or fitted without
             per-driver parameters.
     """
-    source = path or shipped_generator("calibrated")
-    generator, metadata = load_generator(source, "calibrated")
-    config = GanCalibratedTrafficConfig(
-        noise_scale=noise_scale,
-        noise_period_s=noise_period_s,
-        changes_per_km=changes_per_km,
-    )
-    drivers = calibrated_drivers(
-        _fitted(generator, metadata, source),
-        config,
-        idm,
-        stream,
-    )
+    drivers = calibrated_drivers(GanCalibratedTrafficConfig(**keys), idm, stream)
+    generator = driving_generator(drivers.sizes, drivers.weights)
+    noise = (drivers.noise_period_s, drivers.noise_scale)
     assert drivers.anchor is not None
     parts: dict[str, TrafficModule] = {
         "generator": AnchoredGanTraffic(
-            generator,
-            road,
-            stream,
-            noise_period_s,
-            noise_scale,
-            drivers.headways_s,
-            drivers.anchor,
+            generator, road, stream, *noise, drivers.headways_s, drivers.anchor
         ),
         "lane_change": CalibratedLaneChange(road, stream, drivers.checked_changes, idm),
     }
@@ -159,33 +107,21 @@ def gan_calibrated_traffic(
 def human_traffic(
     road: Road | None = None,
     stream: int = Stream.TRAIN,
-    path: str | Path | None = None,
-    variation: HumanVariation | None = None,
     idm: IdmParameters = TABLE_V,
+    **keys: Any,
 ) -> HumanTraffic:
     """``traffic=human``: a policy fitted to recorded drivers (:mod:`ganlane.traffic.human`).
 
     Args:
         road, stream: as for every traffic module.
-        path: see :class:`~ganlane.settings.traffic.HumanTrafficConfig`.
-        variation: how they differ from the fitted ones.
         idm: the ego's, where the kernel drives.
+        keys: those of :class:`~ganlane.settings.traffic.HumanTrafficConfig`.
 
     Raises:
         UserError: the weights are missing or foreign.
     """
-    source = path or shipped_generator("human")
-    model, _ = load_human(source)
-    weights = {name: tensor.numpy() for name, tensor in model.state_dict().items()}
-    variation = variation or HumanVariation()
-    drivers = human_drivers(weights, model.sizes, variation, idm, stream, source)
-    return HumanTraffic(model.policy, road, stream, variation, drivers)
-
-
-def _fitted(generator: Generator, metadata: Mapping[str, Any], source: object) -> FittedGenerator:
-    """The generator as the kernel takes it."""
-    weights = {name: tensor.numpy() for name, tensor in generator.state_dict().items()}
-    return FittedGenerator(weights, generator.sizes, metadata, source)
+    drivers = human_drivers(HumanTrafficConfig(**keys), idm, stream)
+    return HumanTraffic(driving_policy(drivers.sizes, drivers.weights), drivers, road)
 
 
 def idm_faults_traffic(

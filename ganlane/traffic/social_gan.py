@@ -17,7 +17,6 @@ from ganlane.generator.closed_loop import (
     AnchorParameters,
     DriverMemory,
     History,
-    Plan,
     anchored_step,
     headway_from_uniform,
     paper_step,
@@ -154,59 +153,7 @@ class SocialGanTraffic(GeneratedTraffic):
     The first predicted displacement moves the vehicle.
     It knows neither lanes nor road: alone the closed loop drifts (design, section 4), so a guard
     belongs behind it. Lane changes and sudden accelerations are overlays.
-
-    Args:
-        execute_k: predicted displacements driven before predicting again, 1 (the paper) to 8. With
-            more than 1 the memory also holds ``plan`` [N, M, execute_k, 2] in m and ``plan_left``
-            [N, M].
-
-    Raises:
-        UserError: ``execute_k`` is out of range; see also :class:`GeneratedTraffic`.
     """
-
-    def __init__(
-        self,
-        generator: Generator,
-        road: Road | None = None,
-        stream: int = Stream.TRAIN,
-        noise_period_s: float = 5.0,
-        noise_scale: float = 1.0,
-        execute_k: int = 1,
-    ) -> None:
-        super().__init__(
-            generator,
-            road,
-            stream,
-            noise_period_s,
-            noise_scale,
-        )
-        if not 1 <= execute_k <= generator.sizes.predicted:
-            raise UserError(
-                f"execute_k={execute_k}: the generator predicts {generator.sizes.predicted} steps; "
-                f"choose 1 to {generator.sizes.predicted}."
-            )
-        self.execute_k = execute_k
-        # What is left of a prediction is driven before the next one is made.
-        if execute_k > 1:
-            plan: MemoryFields = {
-                "plan": ((execute_k, 2), None),
-                "plan_left": ((), torch.int64),
-            }
-            self.memory_fields = {**self.memory_fields, **plan}
-
-    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
-        """See :class:`GeneratedTraffic`; no plan is left."""
-        memory = super().fresh_memory(vehicles, key)
-        if self.execute_k > 1:
-            # For its shape only: no plan is left, so none of it is driven.
-            memory["plan"] = memory["displacement"][..., None, :].repeat(
-                1,
-                1,
-                self.execute_k,
-                1,
-            )
-            memory["plan_left"] = torch.zeros_like(vehicles.target_lane)
-        return memory
 
     @torch.no_grad()
     def move(
@@ -216,26 +163,12 @@ class SocialGanTraffic(GeneratedTraffic):
         key: Tensor,
         step: Tensor,
     ) -> Moved:
-        """Predict, and drive the first displacement (or what is left of the plan)."""
+        """Predict, and drive the first displacement."""
         network = self.network(vehicles.x.dtype)
-        # With execute_k = 1 every step predicts anew.
         history, noise = self.before(memory, key, step)
-        plan = Plan(memory["plan"], memory["plan_left"]) if self.execute_k > 1 else None
-        moved, history, plan = paper_step(
-            network,
-            vehicles,
-            history,
-            # Scaled for the network alone: the memory keeps unit variance.
-            self.noise_scale * noise,
-            plan,
-        )
-        new_memory = {**self.remember(history), "noise": noise}
-        if plan is not None:
-            new_memory |= {
-                "plan": plan.ahead,
-                "plan_left": plan.left,
-            }
-        return moved, new_memory
+        # Scaled for the network alone: the memory keeps unit variance.
+        moved, history = paper_step(network, vehicles, history, self.noise_scale * noise)
+        return moved, {**self.remember(history), "noise": noise}
 
 
 class AnchoredGanTraffic(GeneratedTraffic):

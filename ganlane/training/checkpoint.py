@@ -25,8 +25,6 @@ from ganlane.training.stats import EpisodeStats
 
 KIND = "ganlane training checkpoint"
 VERSION = 2
-#: Parts of an identity that may change at a resume; the run is bit-exact only if they do not.
-COMPUTED_BY = ("env.compile",)
 #: After a checkpoint that took t seconds the next comes after 50 t or later: 2 % of the time.
 PATIENCE = 50.0
 #: Parts of a checkpoint in which every number must be finite.
@@ -140,7 +138,7 @@ class TrainingState:
         now = flat(self.identity)
         # the first difference is enough for a sentence
         for name in (*now, *before):
-            if name not in COMPUTED_BY and before.get(name) != now.get(name):
+            if before.get(name) != now.get(name):
                 raise UserError(
                     f"resume={path}: {name}={now.get(name)}, but the run was started with "
                     f"{before.get(name)}; go on with that, or start a new run."

@@ -23,11 +23,9 @@ from ganlane.agents import (
     GreedyPolicy,
     NetworkConfig,
     Rainbow,
-    RainbowConfig,
 )
 from ganlane.agents.checkpoint import (
     SHIPPED,
-    SUPPORT,
     read_agent,
     save_agent,
     warm_start,
@@ -47,7 +45,7 @@ from ganlane.settings.observation import ObservationConfig
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.settings.train import TrainConfig
 from ganlane.sim.random import Stream
-from ganlane.training.checkpoint import LAST, flat, load_checkpoint
+from ganlane.training.checkpoint import flat
 from ganlane.training.logs import make_logs
 from ganlane.training.loop import Evaluate, TrainingResult, train
 from ganlane.transforms import observation_size
@@ -116,7 +114,7 @@ def length_if_finished(config: TrainConfig, phase: Phase) -> dict[str, float] | 
     done = training["decisions"]
     wanted = phase.total_decisions
     # the last step of all environments may go beyond it
-    if not wanted <= done < wanted + config.collector.num_envs:
+    if not wanted <= done < wanted + config.num_envs:
         raise UserError(
             f"pretrain.total_decisions={wanted}: this phase is over, after {done} decisions; "
             "resume with the value that the run was started with."
@@ -141,9 +139,9 @@ def run_phase(
     Raises:
         UserError: the agent to start from, the weights of the traffic or the checkpoint do not fit.
     """
-    config, agent = make_initial_agent(config, phase, resume)
+    agent = make_initial_agent(config, phase, resume is not None)
     metadata = describe(config, phase)
-    env = env_maker(config, phase.traffic, Stream.TRAIN)(config.collector.num_envs)
+    env = env_maker(config, phase.traffic, Stream.TRAIN)(config.num_envs)
     result = train(
         env,
         agent,
@@ -227,71 +225,25 @@ def make_selection(config: TrainConfig, traffic: TrafficConfig) -> Evaluate:
 
 @dataclass(frozen=True)
 class Start:
-    """A trained agent to start from; ``moments`` are Adam's (None: the file has weights only)."""
+    """A trained agent to start from."""
 
     name: str
     weights: Mapping[str, Tensor]
     network: NetworkConfig
     observation: ObservationConfig
-    moments: Mapping[int, Any] | None = None
 
 
-def read_start(name: str, key: str = "init.path") -> Start:
-    """Read the agent of ``init.path``.
-
-    ``name`` is a shipped agent or a ``.safetensors`` file; or a training run's folder or its
-    ``last.pt``, for the agent as the run last saved it, with its moments. ``key`` is its
-    configuration key, for error messages.
+def read_start(name: str) -> Start:
+    """Read the agent of ``init.path``: a shipped one, a file, or that of a run's folder.
 
     Raises:
         UserError: the file is missing or cannot be read.
     """
     path = Path(name)
-    if path.suffix != ".pt" and (not path.is_dir() or name in SHIPPED):
-        weights, network, metadata = read_agent(name)
-        return Start(
-            name,
-            weights,
-            network,
-            observation_of(metadata),
-        )
-    # a folder stands for its last checkpoint
-    path = path / LAST if path.is_dir() else path
-    if not path.is_file():
-        raise UserError(
-            f"{key}={path}: no such file; give a training run's folder, its {LAST}, or an agent's "
-            "file."
-        )
-    # a run's checkpoint also has the moments, and the observation in its identity
-    state = load_checkpoint(path, key=key)
-    try:
-        agent = state["agent"]
-        trained_on = state["identity"]["observation"]
-        observation = ObservationConfig(
-            **{name: trained_on[name] for name in ("form", "range_m", "speed_mps")}
-        )
-        # The input size is not in the checkpoint; it follows from observation and vehicles.
-        size = observation_size(observation.form, state["identity"]["env"]["vehicles"])
-        network = NetworkConfig(RainbowConfig(**agent["config"]), size)
-        weights = {name: value.detach() for name, value in agent["network"].items()}
-        return Start(
-            str(path),
-            weights,
-            network,
-            observation,
-            agent["optimizer"]["state"],
-        )
-    except (
-        AttributeError,
-        KeyError,
-        TypeError,
-        ValueError,
-        UserError,
-    ) as error:
-        raise UserError(
-            f"{key}={path}: not a training checkpoint that this version of ganlane can read; give "
-            f"a run's folder, its {LAST}, or an agent's .safetensors file."
-        ) from error
+    if path.is_dir() and name not in SHIPPED:
+        name = str(path / AGENT_FILE)
+    weights, network, metadata = read_agent(name)
+    return Start(name, weights, network, observation_of(metadata))
 
 
 def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
@@ -313,55 +265,24 @@ def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
         seed=config.seed,
         device=config.device,
         legal=partial(legal_actions, road=make_road(config.env)),
-        compile=config.env.compile,
+        compile=config.compiles(),
     )
 
 
-def make_initial_agent(
-    config: TrainConfig, phase: Phase, resume: str | Path | None
-) -> tuple[TrainConfig, Rainbow]:
-    """The initial agent of ``phase``, and ``config`` with the agent's support of returns.
+def make_initial_agent(config: TrainConfig, phase: Phase, resumes: bool) -> Rainbow:
+    """The initial agent of ``phase``; if it ``resumes``, one to be restored.
 
-    With ``resume`` it is an agent to be restored, since the file that the run started from may no
-    longer exist.
+    The file that a resumed run started from may no longer exist.
 
     Raises:
         UserError: the agent to start from does not fit.
     """
-    adopts = config.init.support == "trained"
-    # a resumed agent gets its weights from the checkpoint, later
-    resumed = resume is not None
-    if phase.init is None or (resumed and not adopts):
-        return config, make_agent(config, phase)
-    start = read_start(str(resume), "resume") if resumed else read_start(phase.init)
-    # a resumed run has been checked when it was started
-    if not resumed:
-        check_observation(start, config.observation)
-    if adopts:
-        # what the outputs of the trained network stand for
-        support = {name: getattr(start.network.agent, name) for name in SUPPORT}
-        config = replace(config, agent=replace(config.agent, **support))
     agent = make_agent(config, phase)
-    if resumed:
-        return config, agent
-    # a second phase starts from the best agent of the first, whose moments are not saved
-    # only the agent of init.path brings its moments
-    with_moments = config.init.optimizer and phase.init == config.init.path
-    if with_moments and not start.moments:
-        raise UserError(
-            f"init.optimizer=true: {start.name} holds no moments of the optimiser; give init.path "
-            f"a training run's folder or its {LAST}, saved after its first update, or "
-            "init.optimizer=false."
-        )
-    moments = start.moments if with_moments else None
-    warm_start(
-        agent,
-        start.name,
-        start.weights,
-        start.network,
-        moments,
-    )
-    return config, agent
+    if phase.init is not None and not resumes:
+        start = read_start(phase.init)
+        check_observation(start, config.observation)
+        warm_start(agent, start.name, start.weights, start.network)
+    return agent
 
 
 def check_observation(start: Start, observation: ObservationConfig) -> None:
@@ -428,7 +349,7 @@ def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
         "reward": asdict(config.reward),
         "mask": asdict(config.mask),
         "init": config.init.path,
-        "collector": asdict(config.collector),
+        "num_envs": config.num_envs,
         "seed": config.seed,
     }
 
@@ -445,7 +366,7 @@ def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
             "lanes": config.env.lanes,
         },
         "env": plain(config.env),
-        "num_envs": config.collector.num_envs,
+        "num_envs": config.num_envs,
         "code": code_version(),
         "agent": plain(config.agent),
         "reward": asdict(config.reward),

@@ -29,7 +29,7 @@ from ganlane.sim.dynamics import SIDES, ego_scene, is_heard, stays_on_road
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import lane_accelerations
 from ganlane.sim.state import Road, Vehicles, road_in
-from ganlane.torch_settings import compiled, constant
+from ganlane.torch_settings import constant
 from ganlane.transforms.sensors import PerceptionTransform
 
 #: What this transform computes; an environment without a mask (``none``) has no transform.
@@ -138,10 +138,6 @@ class ActionMaskTransform(PerceptionTransform):
         keep = torch.ones_like(safe[:, :1])
         changes = legal[:, 1:] & safe[:, 1:]
         return torch.cat((keep, changes), dim=1), none
-
-    def compile_graphs(self) -> None:
-        """Compile the mask to one graph (``env.compile=true``)."""
-        self.allowed = compiled(self.allowed)  # type: ignore[method-assign]
 
     def write(
         self,

@@ -27,7 +27,7 @@ from ganlane.native.tensors import LaneView, wants_gradient
 from ganlane.settings.observation import NEARNESS_M, OVERLAP_M, ROAD_SIGHT_M, ObservationScale
 from ganlane.sim.lane_ends import begins, ends, may_change, of_lane, on_road
 from ganlane.sim.state import Road, Vehicles, road_in
-from ganlane.torch_settings import compiled, constant
+from ganlane.torch_settings import constant
 from ganlane.transforms.sensors import PerceptionTransform
 
 #: Of the lane view: lane to the left, own, to the right, each ahead (+1) and behind (-1).
@@ -329,10 +329,6 @@ class ObservationTransform(PerceptionTransform):
         )
         parts = [part.numbers(view) for part in OBSERVATIONS[self.form]]
         return torch.cat(parts, dim=1)
-
-    def compile_graphs(self) -> None:
-        """Compile the observation to one graph (``env.compile=true``)."""
-        self.observe = compiled(self.observe)  # type: ignore[method-assign]
 
     def write(
         self,

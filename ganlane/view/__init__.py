@@ -7,7 +7,7 @@ several episodes side by side, :func:`write_tracks` a file in the form of record
 of them look is a :class:`ganlane.settings.render.FilmConfig`.
 
 Charts are made with matplotlib, in the style of :mod:`ganlane.view.figures`:
-:mod:`ganlane.view.curves` draws learning curves, :mod:`ganlane.view.recordings` statistics.
+:mod:`ganlane.view.curves` draws learning curves.
 """
 
 from ganlane.view.film import write_film

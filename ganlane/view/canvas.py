@@ -27,7 +27,6 @@ CRASH = "#ff3e3e"
 GOOD = "#68d47e"
 AMBER = "#ffd640"
 BRAKE = "#ff3028"
-GLASS = "#181c24"
 #: Blue for the other vehicles, from standing to ``FAST_MPS``, in so many levels.
 _BLUES = (38, 52, 128), (58, 122, 224), (158, 226, 255)
 FAST_MPS, _LEVELS = 35.0, 36

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,37 +21,18 @@ from ganlane.view.figures import STYLE, FloatArray, add_legend, palette, panel_g
 
 #: Number of decisions so far: the horizontal axis of every learning curve.
 X_COLUMN = "decisions"
-#: Prefix of the columns of ``evaluation.csv``.
-EVALUATION = "evaluation_"
-#: Matplotlib cannot scale an axis for much larger numbers.
-_LARGEST = 1e100
-
-
-@dataclass(frozen=True)
-class Panel:
-    """One panel: a column, its axis label, and a second column drawn dashed."""
-
-    title: str
-    column: str
-    label: str = ""
-    dashed: str = ""
-
-
-PANELS = [
-    # Reward per episode, undiscounted; the agent itself maximises the discounted return.
-    Panel("mean return", "mean_return", "reward per episode"),
-    Panel("crash rate", "crash_rate", "share of episodes"),
-    Panel("lane changes", "lane_changes_per_km", "per km"),
-    Panel(
-        "mean Q (replayed); dashed: discounted return",
-        "mean_q",
-        "reward",
-        "mean_discounted_return",
-    ),
-    Panel("evaluation: mean return", f"{EVALUATION}mean_reward", "reward per episode"),
-    Panel("evaluation: crash rate", f"{EVALUATION}crash_rate", "share of episodes"),
-    Panel("evaluation: lane changes", f"{EVALUATION}lane_changes_per_km", "per km"),
-]
+#: Title and unit of the columns that are drawn. The agent maximises the discounted return, of which
+#: mean Q is its own estimate.
+PANELS = {
+    "mean_return": ("mean return", "reward per episode"),
+    "crash_rate": ("crash rate", "share of episodes"),
+    "lane_changes_per_km": ("lane changes", "per km"),
+    "mean_q": ("mean Q (replayed)", "reward"),
+    "mean_discounted_return": ("discounted return", "reward"),
+    "evaluation_mean_reward": ("evaluation: mean return", "reward per episode"),
+    "evaluation_crash_rate": ("evaluation: crash rate", "share of episodes"),
+    "evaluation_lane_changes_per_km": ("evaluation: lane changes", "per km"),
+}
 
 
 def read_metrics(path: str | Path) -> pl.DataFrame:
@@ -64,44 +44,27 @@ def read_metrics(path: str | Path) -> pl.DataFrame:
     """
     path = Path(path)
     file = path / "metrics.csv" if path.is_dir() else path
-    if not file.is_file():
-        raise UserError(
-            f"{file}: no such file; expected the metrics.csv of a training run, give its run "
-            "folder."
-        )
     try:
         # Types are inferred from all rows: a column may be empty for the first thousands.
         frame = pl.read_csv(file, infer_schema_length=None)
-    except (PolarsError, UnicodeDecodeError) as error:
+        numbers = frame.select(X_COLUMN, pl.all().exclude(X_COLUMN).cast(pl.Float64))
+        if numbers.is_empty():
+            raise ValueError("it has no rows")
+    except (PolarsError, OSError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise UserError(
-            f"{file}: not a readable CSV file ({reason}); give a run's metrics.csv."
-        ) from error
-    # The two files of a run have this column in common; without it nothing can be drawn.
-    if X_COLUMN not in frame.columns or frame.is_empty():
-        raise UserError(
-            f"{file}: expected a column '{X_COLUMN}' and at least one row; give a run's "
+            f"{file}: no metrics of a training run ({reason:.200}); give a run's folder or its "
             "metrics.csv."
-        )
-    # Text, or numbers beyond what can be drawn, is refused by its column. NaN is a gap.
-    for column in frame.iter_columns():
-        wrong = column.drop_nulls()
-        if column.dtype.is_numeric():
-            wrong = wrong.filter(wrong.is_finite() & (wrong.abs() > _LARGEST))
-        if wrong.len():
-            raise UserError(
-                f"{file}: column {column.name!r} holds {str(wrong[0])[:40]!r}, expected numbers "
-                "that one can draw; repair it."
-            )
-    return frame
+        ) from error
+    return numbers
 
 
 def read_run(path: str | Path) -> pl.DataFrame:
     """``metrics.csv`` of a run's folder, with the rows of ``evaluation.csv`` if there is one.
 
     Returns:
-        ``decisions`` and the columns of both files, those of the second with :data:`EVALUATION`
-        before their names; null where a row is of the other file.
+        ``decisions`` and the columns of both files, those of the second with ``evaluation_`` before
+        their names; null where a row is of the other file.
 
     Raises:
         UserError: see :func:`read_metrics`.
@@ -110,9 +73,8 @@ def read_run(path: str | Path) -> pl.DataFrame:
     metrics, evaluation = read_metrics(path), path / "evaluation.csv"
     if not evaluation.is_file():
         return metrics
-    evaluated = read_metrics(evaluation).select(
-        X_COLUMN, pl.exclude(X_COLUMN).name.prefix(EVALUATION)
-    )
+    columns = pl.exclude(X_COLUMN).name.prefix("evaluation_")
+    evaluated = read_metrics(evaluation).select(X_COLUMN, columns)
     # Rows of both files, in order of decisions; columns of the other file are null there.
     return pl.concat([metrics, evaluated], how="diagonal_relaxed").sort(X_COLUMN)
 
@@ -145,57 +107,33 @@ def read_runs(paths: Sequence[str | Path]) -> dict[str, list[pl.DataFrame]]:
 
 
 @rc_context(STYLE)
-def draw_runs(
-    runs: Mapping[str, Sequence[pl.DataFrame]],
-    columns: Sequence[str] | None = None,
-    smooth: int = 1,
-) -> Figure:
+def draw_runs(runs: Mapping[str, Sequence[pl.DataFrame]]) -> Figure:
     """Training runs over the number of decisions, one colour per name.
 
-    Args:
-        runs: name to metrics (:func:`read_run`): one, or the same with several seeds. Of several,
-            the mean is drawn, in a band from the lowest to the highest.
-        columns: one panel for each of these; by default those of :data:`PANELS` that any run has
-            numbers for.
-        smooth: rows that the running mean takes in; above 1 the rows themselves are drawn faintly.
+    ``runs`` holds by name the metrics (:func:`read_run`) of one run, or of the same with several
+    seeds, whose mean is drawn in a band from the lowest to the highest. There is a panel for those
+    of :data:`PANELS` that any run has numbers for.
 
     Raises:
-        UserError: there is nothing to draw, or a column that no run has.
+        UserError: there is nothing to draw.
     """
-    with_numbers: dict[str, None] = {}  # in the order of the files
-    for frame in (frame for frames in runs.values() for frame in frames):
-        numeric = [column for column in frame if column.dtype.is_numeric()]
-        with_numbers |= {column.name: None for column in numeric if column.count()}
-    with_numbers.pop(X_COLUMN, None)
-    for name in columns or ():
-        if name not in with_numbers:
-            raise UserError(
-                f"column {name}: no run has numbers there; choose among {', '.join(with_numbers)}."
-            )
-    panels = PANELS
-    if columns is not None:
-        # Columns the caller names are drawn under their own names.
-        panels = [Panel(name.replace("_", " "), name, name.replace("_", " ")) for name in columns]
-    drawn = [panel for panel in panels if panel.column in with_numbers]
+    lines = {
+        column: {name: _lines(frames, column) for name, frames in runs.items()} for column in PANELS
+    }
+    drawn = [column for column in PANELS if any(lines[column].values())]
     if not drawn:
-        wanted = ", ".join(panel.column for panel in PANELS)
         raise UserError(
-            f"run={','.join(runs)}: no numbers in any of {wanted}; give the folder of a training "
-            "run."
+            f"run={','.join(runs)}: no numbers in any of {', '.join(PANELS)}; give the folder of a "
+            "training run."
         )
     figure, grid = panel_grid(len(drawn))
     colours = palette(list(runs))
-    for axes, panel in zip(grid, drawn):
-        axes.set(title=panel.title, ylabel=panel.label, xlabel=X_COLUMN)
+    for axes, column in zip(grid, drawn):
+        title, unit = PANELS[column]
+        axes.set(title=title, ylabel=unit, xlabel=X_COLUMN)
         axes.xaxis.set_major_formatter(EngFormatter())
-        for name, frames in runs.items():
-            style: dict[str, Any] = {"color": colours[name]}
-            # Smoothing hides the spread, so a single run is also drawn unsmoothed, faintly.
-            if smooth > 1 and len(frames) == 1:
-                plot_middle(axes, _lines(frames, panel.column), **style, alpha=0.3, lw=0.8)
-            lines = _lines(frames, panel.column, smooth)
-            plot_middle(axes, lines, with_range=True, **style)
-            plot_middle(axes, _lines(frames, panel.dashed, smooth), **style, ls="--", lw=1.2)
+        for name, of_run in lines[column].items():
+            plot_middle(axes, of_run, with_range=True, color=colours[name])
     legend = {}
     for name, frames in runs.items():
         count = f" ({len(frames)} seeds: mean, range)" if len(frames) > 1 else ""
@@ -205,21 +143,14 @@ def draw_runs(
 
 
 def _lines(
-    frames: Sequence[pl.DataFrame], column: str, smooth: int = 1
+    frames: Sequence[pl.DataFrame],
+    column: str,
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Decisions and values of a column, of every run that has it: the means over ``smooth`` rows.
-
-    Means ignore NaN, and are NaN where the value itself is.
-    """
+    """Decisions and values of a column, of every run that has it."""
     lines = []
-    # NaN counts as missing; gaps stay gaps, instead of being filled by the rolling mean.
-    number = pl.col(column).fill_nan(None)
-    mean = pl.when(number.is_not_null()).then(number.rolling_mean(smooth, min_samples=1))
     for frame in frames:
         if column in frame.columns:
             table = frame.select(pl.col(X_COLUMN, column).cast(pl.Float64)).drop_nulls()
-            if smooth > 1:
-                table = table.with_columns(mean.alias(column))
             if table.height:
                 lines.append((table[X_COLUMN].to_numpy(), table[column].to_numpy()))
     return lines

@@ -16,7 +16,6 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from PIL import Image
 
 from ganlane.errors import UserError
 from ganlane.files import atomic_path
@@ -73,42 +72,29 @@ def palette(names: Sequence[str]) -> dict[str, str]:
     return {name: COLOURS[index % len(COLOURS)] for index, name in enumerate(names)}
 
 
-def save_figure(
-    figure: Figure,
-    path: str | Path,
-    kind: str | None = None,
-) -> Path:
-    """Write a figure, atomically, as ``kind`` (one of :data:`FORMATS`; by default the file's
-    ending).
+def save_figure(figure: Figure, path: str | Path) -> Path:
+    """Write a figure, atomically, in the format of the file's ending (one of :data:`FORMATS`).
 
     Raises:
         UserError: another format.
     """
-    kind = kind or Path(path).suffix.removeprefix(".").lower()
+    kind = Path(path).suffix.removeprefix(".").lower()
     if kind not in FORMATS:
         raise UserError(
             f"{path}: a figure is one of {', '.join(FORMATS)}; give the file one of these endings."
         )
     with atomic_path(path) as part, rc_context(STYLE):
         figure.savefig(part, format=kind, metadata=FORMATS[kind])
-        if kind == "png":
-            # 256 colours, which no chart exceeds by much, take a third of the size.
-            with Image.open(part) as full:
-                reduced = full.convert("RGB").quantize(256, dither=Image.Dither.NONE)
-            reduced.save(part, format="png", optimize=True)
     return Path(path)
 
 
 def panel_grid(
     count: int, width_in: float = 4.0, height_in: float = 2.3
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with ``count`` panels of this size, inches, about three in a row, and room for a
+    """A figure with ``count`` panels of this size, inches, three in a row, and room for a
     legend above.
     """
-    # As many rows as need be, none with a single panel below fuller ones.
-    across = next(
-        (number for number in (3, 2, 4, 5) if count > number and count % number != 1), min(3, count)
-    )
+    across = min(3, count)
     # -(-a // b) is a / b rounded up.
     down = -(-count // across)
     figure = Figure(figsize=(across * width_in, down * height_in + 0.3))

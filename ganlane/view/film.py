@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import io
-import itertools
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from subprocess import PIPE, Popen
-from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -16,7 +14,7 @@ from PIL import Image
 from ganlane.errors import UserError
 from ganlane.files import atomic_path, write_bytes
 from ganlane.settings.render import FilmConfig
-from ganlane.view.frames import FramePainter, Picture
+from ganlane.view.frames import FramePainter
 from ganlane.view.record import Trajectory
 
 #: Frames of a film strip, as in the paper's Figure 3.
@@ -28,21 +26,8 @@ _H264 = (
     "-an -vf crop=trunc(iw/2)*2:trunc(ih/2)*2 -c:v libx264 -pix_fmt yuv420p -crf 20 "
     "-preset medium -movflags +faststart -f mp4"
 )
-#: Frames from which a GIF's palette is taken, and colours of large flat areas, which are kept as
-#: they are.
-_PALETTE_FRAMES, _FLAT_COLOURS = 8, 8
-#: Tried in turn to make a GIF fit: share of the picture's size, colours, and every how many frames
-#: one is kept.
-_GIF_SIZES = (
-    (1.0, 128, 1),
-    (0.85, 96, 1),
-    (0.75, 64, 1),
-    (0.75, 64, 2),
-    (0.6, 64, 2),
-    (0.5, 48, 2),
-    (0.5, 32, 3),
-    (0.4, 32, 4),
-)
+#: A GIF's colours, and the frames that they are taken from.
+_COLOURS, _PALETTE_FRAMES = 128, 8
 
 
 def film_frames(trajectory: Trajectory, look: FilmConfig) -> list[int]:
@@ -66,54 +51,35 @@ def write_film(
     trajectory: Trajectory,
     path: str | Path,
     look: FilmConfig | None = None,
-    kind: str | None = None,
 ) -> Path:
     """Write an episode's film, whole or not at all, and return its path.
 
     Args:
         trajectory: the recorded episode.
-        path: where to write.
+        path: where to write: ``.mp4`` (needs the extra ``video``), ``.gif``, or ``.png``, a strip
+            of four frames.
         look: part of the episode, speed and size. A GIF counts in hundredths of a second, so 10,
-            20, 25 and 50 frames per second are exact; with ``max_bytes`` its size, frame rate and
-            colours are lowered until it fits.
-        kind: ``mp4`` (needs the extra ``video``), ``gif`` or ``png`` (a strip of four frames,
-            stacked); by default the file's ending.
+            20, 25 and 50 frames per second are exact.
 
     Raises:
-        UserError: unknown format, the film begins after the episode's end, the extra ``video`` is
-            missing, or no GIF is small enough.
+        UserError: unknown format, the film begins after the episode's end, or the extra ``video``
+            is missing.
     """
     path = Path(path)
-    kind = kind or path.suffix.removeprefix(".").lower()
+    kind = path.suffix.removeprefix(".").lower()
     look = look or FilmConfig()
     painter, frames = FramePainter(trajectory, look), film_frames(trajectory, look)
     if kind == "gif":
-        for share, colours, every in _GIF_SIZES:
-            content = _gif(painter, frames, share, colours, every)
-            if look.max_bytes is None or len(content) <= look.max_bytes:
-                write_bytes(path, content)
-                return path
-        raise UserError(
-            f"{path}: the smallest GIF has {len(content)} bytes, max_bytes={look.max_bytes} were "
-            "allowed; show a shorter part of the episode or allow more."
-        )
-    if kind == "mp4":
+        write_bytes(path, _gif(painter, frames))
+    elif kind == "mp4":
         _write_mp4(painter, frames, path)
     elif kind == "png":
+        rows = [painter.draw(frame) for frame in spread(frames, STRIP_FRAMES)]
         with atomic_path(path) as part:
-            strip = film_strip([painter.draw(frame) for frame in spread(frames, STRIP_FRAMES)])
-            Image.fromarray(strip).save(part, format="PNG", optimize=True)
+            Image.fromarray(np.concatenate(rows)).save(part, format="PNG", optimize=True)
     else:
-        raise UserError(f"format={kind or 'none'}: expected mp4, gif or png; choose one of them.")
+        raise UserError(f"{path}: a film ends in .mp4, .gif or .png; choose one of them.")
     return path
-
-
-def film_strip(pictures: Sequence[Picture]) -> Picture:
-    """Pictures one below the other, with a white line between them."""
-    gap = np.full((4, pictures[0].shape[1], 3), 255, np.uint8)
-    rows = [row for picture in pictures for row in (gap, picture)]
-    # Without the line above the first picture.
-    return np.concatenate(rows[1:])
 
 
 def spread(frames: Sequence[int], count: int) -> list[int]:
@@ -122,26 +88,17 @@ def spread(frames: Sequence[int], count: int) -> list[int]:
     return [frames[place] for place in places]
 
 
-def _scaled(picture: Picture, scale: float) -> Image.Image:
-    """The picture at ``scale``."""
-    image = Image.fromarray(picture)
-    if scale == 1.0:
-        return image
-    width, height = (max(1, round(side * scale)) for side in image.size)
-    return image.resize((width, height), Image.Resampling.LANCZOS, reducing_gap=2.0)
-
-
-def _gif(
-    painter: FramePainter, frames: Sequence[int], scale: float, colours: int, every: int
-) -> bytes:
+def _gif(painter: FramePainter, frames: Sequence[int]) -> bytes:
     """An endless GIF with one palette for the whole film."""
-    palette = _shared_palette(painter, frames, scale, colours)
+    # The commonest colours would leave out small bright things, such as lights.
+    some = np.concatenate([painter.draw(frame) for frame in spread(frames, _PALETTE_FRAMES)])
+    palette = Image.fromarray(some).quantize(_COLOURS, method=Image.Quantize.MAXCOVERAGE)
     pictures = [
-        _scaled(painter.draw(frame), scale).quantize(palette=palette, dither=Image.Dither.NONE)
-        for frame in frames[::every]
+        Image.fromarray(painter.draw(frame)).quantize(palette=palette, dither=Image.Dither.NONE)
+        for frame in frames
     ]
     # Whole hundredths of a second that add up to the film's length.
-    ends = np.rint(np.arange(len(pictures) + 1) * 100.0 / (painter.look.fps / every)).astype(int)
+    ends = np.rint(np.arange(len(pictures) + 1) * 100.0 / painter.look.fps).astype(int)
     durations_ms = (np.diff(ends).clip(min=2) * 10).tolist()
     file = io.BytesIO()
     pictures[0].save(
@@ -155,25 +112,6 @@ def _gif(
         disposal=1,
     )
     return file.getvalue()
-
-
-def _shared_palette(
-    painter: FramePainter, frames: Sequence[int], scale: float, colours: int
-) -> Image.Image:
-    """A palette for all frames, from some of them: the commonest colours, the others covered.
-
-    Without the former, large flat areas would change their colour a little; without the latter,
-    small bright things would lose theirs.
-    """
-    chosen = spread(frames, _PALETTE_FRAMES)
-    stack = np.concatenate([np.asarray(_scaled(painter.draw(frame), scale)) for frame in chosen])
-    together = Image.fromarray(stack)
-    counts: Any = together.getcolors(2**24)
-    exact = [colour for _, colour in sorted(counts, reverse=True)[:_FLAT_COLOURS]]
-    covering = together.quantize(colours - len(exact), method=Image.Quantize.MAXCOVERAGE)
-    palette = Image.new("P", (1, 1))
-    palette.putpalette([*itertools.chain(*exact), *(covering.getpalette() or [])])
-    return palette
 
 
 def _write_mp4(
@@ -194,7 +132,7 @@ def _write_mp4(
     except (ImportError, RuntimeError) as error:
         raise UserError(
             f"{path}: mp4 needs the extra 'video'; run `pip install \"ganlane[video]\"` or choose "
-            "format=gif."
+            "a gif."
         ) from error
 
     look = painter.look
@@ -215,4 +153,4 @@ def _write_mp4(
         if program.returncode != 0:
             lines = message.decode(errors="replace").strip().splitlines()
             reason = lines[-1] if lines else f"status {program.returncode}"
-            raise UserError(f"{path}: ffmpeg cannot write it ({reason}); choose format=gif.")
+            raise UserError(f"{path}: ffmpeg cannot write it ({reason}); choose a gif.")

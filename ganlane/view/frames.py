@@ -1,14 +1,12 @@
 """Frames of a recorded episode, drawn with Pillow alone: no display is needed.
 
 A top view that follows the ego (orange, pointed, with a white edge); the others are blue, the
-faster the paler, with glass, indicators and brake lights. White trails show where vehicles came
+faster the paler, with indicators and brake lights. White trails show where vehicles came
 from, numbers on the roofs are speeds in m/s. Overlapping vehicles have a red edge. The scale across
 the road is larger than along it (:data:`ganlane.view.canvas.EXAGGERATION`), as the header says.
 """
 
 from __future__ import annotations
-
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -30,8 +28,8 @@ _SIGNAL_M = 0.4
 _BLINK_S, _LIT_S = 0.6, 0.6 * 0.6
 #: Bodies and trails are drawn so many times larger and reduced, which smooths their edges.
 _BODY_OVERSAMPLING, _TRAIL_OVERSAMPLING = 3, 2
-#: Coverage (0 to 255) of the oldest, middle and newest third of a trail, the ego's and the others'.
-_EGO_COVERAGE, _OTHER_COVERAGE = (110, 175, 240), (45, 80, 120)
+#: Coverage (0 to 255) of the ego's trail and of the others'.
+_EGO_COVERAGE, _OTHER_COVERAGE = 200, 90
 
 #: Moves a point, as shares of length and width, from the left side to the right one.
 _MIRROR = (1.0, -1.0)
@@ -50,8 +48,6 @@ _BODY = _symmetric(
     (0.5, 0.34),
 )
 _EGO = _symmetric((-0.5, 0.5), (0.2, 0.5), (0.5, 0.08))
-_WINDSCREEN = _symmetric((0.14, 0.42), (0.27, 0.34))
-_REAR_WINDOW = _symmetric((-0.38, 0.36), (-0.31, 0.40))
 # Lights of the left side.
 _BRAKE = np.array([(-0.5, 0.42), (-0.44, 0.42), (-0.44, 0.2), (-0.5, 0.2)])
 _INDICATORS = (
@@ -61,10 +57,8 @@ _INDICATORS = (
 
 #: Titles and widths in pixels of the header's values.
 _VALUES = {"time": 90, "speed": 100, "return": 90, "action": 80}
-#: Sizes of the title; the largest that leaves room for the values is taken, pixels.
-_TITLE_SIZES = (20, 17, 14, 12)
-#: A narrower picture has no scale of the tints.
-_WIDTH_FOR_TINTS = 1000
+#: Size of the title, pixels.
+_TITLE = 17
 _OUTCOMES = {
     "goal": ("GOAL", canvas.GOOD),
     "hard_crash": ("HARD CRASH", canvas.CRASH),
@@ -89,12 +83,8 @@ class FramePainter:
         label = trajectory.label
         self.window = Window(self.look, label.lanes, label.lane_width_m)
         self._backdrop = Backdrop(self.window, label.stretches)
-        # The scale of the tints takes 330 pixels at the right.
-        has_tints = self.window.width >= _WIDTH_FOR_TINTS
-        self._values_at = self.window.width - sum(_VALUES.values()) - (340 if has_tints else 10)
+        self._values_at = self.window.width - sum(_VALUES.values()) - 10
         self._header = _header(label, self.window, self._values_at)
-        if has_tints:
-            _draw_tints(self._header)
         self._overlapping = trajectory.overlapping()
         # How often a vehicle has jumped so far; trails are cut where this number changes.
         self._jumps = np.cumsum(trajectory.jumped(), axis=0)
@@ -111,14 +101,6 @@ class FramePainter:
         # The ego comes last, on top of the others.
         for vehicle in np.flatnonzero(in_picture)[::-1].tolist():
             self._draw_vehicle(picture, frame, vehicle, float(columns[vehicle]))
-        behind = int((t.valid[frame] & (columns < 0)).sum())
-        ahead = int((t.valid[frame] & (columns > width)).sum())
-        room_above = self.window.edges[0] - HEADER_HEIGHT > 2 * SMALL
-        top = HEADER_HEIGHT + 6 if room_above else self.window.height - SMALL - 6
-        if behind:
-            put_text(picture, (12, top), f"{behind} behind")
-        if ahead:
-            put_text(picture, (width - 12, top), f"{ahead} ahead", anchor=1.0)
         if frame == len(t) - 1:
             self._draw_outcome(picture, float(columns[0]))
         self._draw_header(picture, frame)
@@ -162,9 +144,6 @@ class FramePainter:
         body = _EGO if is_ego else _BODY
         fill(body, edge)
         fill(body * (0.86 if overlaps or is_ego else 0.93), colour)
-        if not is_ego:
-            fill(_WINDSCREEN, canvas.GLASS)
-        fill(_REAR_WINDOW, canvas.GLASS)
         if t.acceleration[at] < _BRAKE_LIGHT:
             fill(_BRAKE, canvas.BRAKE)
             fill(_BRAKE * _MIRROR, canvas.BRAKE)
@@ -189,8 +168,7 @@ class FramePainter:
     ) -> None:
         """Trails over the last seconds, as in the paper's Figure 3.
 
-        The ego's is brighter, older parts are fainter: a trail is three lines that share their
-        ends.
+        The ego's is brighter.
         """
         t = self.trajectory
         steps = round(self.look.trail_s / PHYSICS_STEP_S)
@@ -209,11 +187,8 @@ class FramePainter:
         # The ego comes last, on top of the others.
         for vehicle in reversed(range(t.x.shape[1])):
             trail = [(x, y) for x, y in places[:, vehicle][shown[:, vehicle]].tolist()]
-            # A short trail has fewer than three parts, the fainter ones.
-            cuts = np.linspace(0, len(trail) - 1, 4).astype(int)
-            parts = [trail[start : end + 1] for start, end in pairwise(cuts) if end > start]
-            for part, strength in zip(parts, _OTHER_COVERAGE if vehicle else _EGO_COVERAGE):
-                draw.line(part, fill=strength, width=2 * _TRAIL_OVERSAMPLING)
+            coverage = _OTHER_COVERAGE if vehicle else _EGO_COVERAGE
+            draw.line(trail, fill=coverage, width=2 * _TRAIL_OVERSAMPLING)
         picture.paste("white", (0, top), mask.reduce(_TRAIL_OVERSAMPLING))
 
     def _draw_header(self, picture: Image.Image, frame: int) -> None:
@@ -259,10 +234,7 @@ def _header(
     """What stays in the line above the picture: driver, traffic, episode, titles of the values."""
     picture = Image.new("RGB", (window.width, HEADER_HEIGHT), canvas.HEADER)
     title = f"{label.agent}  on  {label.traffic}"
-    for size in _TITLE_SIZES:
-        if canvas.text_mask(title, size).width < values_at - 24:
-            break
-    put_text(picture, (16, 8), title, canvas.TEXT, size)
+    put_text(picture, (16, 8), title, canvas.TEXT, _TITLE)
     lanes = f"{label.lanes} lane{'s' if label.lanes > 1 else ''}"
     facts = f"episode {label.episode}, seed {label.seed}, {lanes}"
     factor = window.across / window.along
@@ -273,16 +245,3 @@ def _header(
         put_text(picture, (values_at, 9), name)
         values_at += width
     return picture
-
-
-def _draw_tints(header: Image.Image) -> None:
-    """The scale of the others' tints, at the right of the header."""
-    left, right = header.width - 170, header.width - 20
-    draw = ImageDraw.Draw(header)
-    for column in range(left, right):
-        speed = (column - left) / (right - left) * canvas.FAST_MPS
-        draw.line((column, 26, column, 35), fill=canvas.speed_tint(speed))
-    put_text(header, (left, 9), "others' speed, m/s")
-    for speed in (0, 10, 20, 30):
-        place = left + speed / canvas.FAST_MPS * (right - left), 38
-        put_text(header, place, f"{speed}", size=11, anchor=0.5 if speed else 0.0)

@@ -24,14 +24,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ganlane.errors import UserError
 from ganlane.files import write_bytes
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.render import FilmConfig
 from ganlane.view.record import ACTION_NAMES, FloatArray, Trajectory
 
-#: Three episodes stay under 2 MB.
-MAX_BYTES_PER_EPISODE = 660_000
 #: Units of series: s, m, m, rad, m/s, m/s2, m/s3.
 UNITS = dict(
     time=0.01,
@@ -55,27 +52,14 @@ def write_player(
 def player_page(trajectories: Sequence[Trajectory], look: FilmConfig | None = None) -> str:
     """A whole HTML page that plays ``trajectories`` side by side, from ``look.start_s`` on.
 
-    Where the page is larger than ``look.max_bytes`` (None: 660 kB an episode), samples are taken
-    0.2, 0.3, 0.5 or 1 s apart instead of 0.1 s; the player interpolates.
-
     Raises:
-        UserError: an episode is over by then, or the page is too large even so.
+        UserError: an episode is over by then.
     """
     look = look or FilmConfig()
-    limit = look.max_bytes or MAX_BYTES_PER_EPISODE * len(trajectories)
     labels = [trajectory.label for trajectory in trajectories]
     title = ", ".join(dict.fromkeys(f"{label.agent} on {label.traffic}" for label in labels))
-    # Every so many frames, until the page is small enough; the road moves less smoothly then.
-    for stride in (1, 2, 3, 5, 10):
-        episodes = [episode_data(trajectory, stride, look.start_s) for trajectory in trajectories]
-        page = _fill(title, {"units": UNITS, "episodes": episodes})
-        size = len(page.encode())
-        if size <= limit:
-            return page
-    raise UserError(
-        f"format=html: the page takes {size} bytes, {limit} are allowed; choose fewer episodes, an "
-        "earlier film.end_s or a larger film.max_bytes."
-    )
+    episodes = [episode_data(trajectory, look.start_s) for trajectory in trajectories]
+    return _fill(title, {"units": UNITS, "episodes": episodes})
 
 
 def _fill(title: str, data: dict[str, Any]) -> str:
@@ -136,16 +120,11 @@ def steps(values: npt.NDArray[Any]) -> list[Any]:
     return changes
 
 
-def episode_data(
-    trajectory: Trajectory,
-    stride: int = 1,
-    start_s: float = 0.0,
-) -> dict[str, Any]:
+def episode_data(trajectory: Trajectory, start_s: float = 0.0) -> dict[str, Any]:
     """A trajectory as JSON-serialisable data.
 
     Args:
         trajectory: a recorded episode.
-        stride: frames from one sample to the next; the last frame is always a sample.
         start_s: time of the first sample.
 
     Returns:
@@ -158,31 +137,29 @@ def episode_data(
         action values are empty if unknown.
     """
     t = trajectory.since(start_s)
-    # The last frame always, since it shows how the episode ended.
-    samples = np.union1d(np.arange(0, len(t), stride), len(t) - 1)
     # A frame has the action and reward of the decision that led to it; the player shows those of
     # the decision that begins there, so they are taken from the next frame.
-    under_way = np.minimum(samples + 1, len(t) - 1)
+    under_way = np.minimum(np.arange(len(t)) + 1, len(t) - 1)
     acceleration = t.acceleration[:, 0]
     jerk = ego_jerk(trajectory)[-len(t) :]
     data: dict[str, Any] = {
         **asdict(t.label),
         "outcome": t.outcome,
-        "time": series(t.time_s[samples], UNITS["time"]),
+        "time": series(t.time_s, UNITS["time"]),
     }
     for name in ("x", "y", "heading", "speed"):
-        data[name] = [series(row, UNITS[name]) for row in getattr(t, name)[samples].T]
+        data[name] = [series(row, UNITS[name]) for row in getattr(t, name).T]
     for name in ("length", "width", "target_lane", "valid"):
-        data[name] = [steps(row) for row in getattr(t, name)[samples].T]
+        data[name] = [steps(row) for row in getattr(t, name).T]
     # Rule-based drivers have no action values; the page gets an empty list for them.
     knows_values = np.isfinite(t.action_values).any()
     knows_reward = np.isfinite(t.reward).any()
     return data | {
-        "acceleration": series(acceleration[samples], UNITS["acceleration"]),
-        "jerk": series(jerk[samples], UNITS["jerk"]),
+        "acceleration": series(acceleration, UNITS["acceleration"]),
+        "jerk": series(jerk, UNITS["jerk"]),
         "action": steps(t.action[under_way]),
         "reward": steps(t.reward[under_way]) if knows_reward else [],
-        "return": steps(t.returns[samples]),
+        "return": steps(t.returns),
         "action_values": (
             [steps(row) for row in t.action_values[under_way].T] if knows_values else []
         ),

@@ -1,5 +1,7 @@
 """Trained agents as files, and agents that start from them."""
 
+from copy import deepcopy
+
 import pytest
 import torch
 from agents_small import agent, same_weights, saved_in
@@ -14,7 +16,6 @@ from ganlane.agents import (
     save_agent,
     warm_start,
 )
-from ganlane.agents.checkpoint import load_moments
 from ganlane.errors import UserError
 from ganlane.weights import load_weights, save_weights
 
@@ -106,7 +107,7 @@ def test_a_network_that_is_not_understood_is_refused(damage, saved):
     [
         (
             {"v_min": -10.0},
-            r"here: agent.v_min=-10\).*init.support=trained, set agent.v_min=-120,",
+            r"here: agent.v_min=-10\); set agent.v_min=-120,",
         ),
         (
             {"hidden": (8,), "atoms": 51},
@@ -142,35 +143,13 @@ def test_adam_goes_on_from_the_moments_that_it_is_given():
         descend(trained, seed)
     for fresh in (warm, cold):
         fresh.load_weights(trained.weights())
-    load_moments(warm, trained.optimizer.state_dict()["state"])
+    warm.load_moments(deepcopy(trained.optimizer.state_dict()["state"]))
     # In this order: the two must not share what they change.
     for learner in (trained, warm, cold):
         descend(learner, 4)
         descend(learner, 5)
     assert same_weights(trained, warm)
     assert not same_weights(trained, cold)
-
-
-#: Moments of the first two parameters, and how they are damaged.
-MOMENTS = {
-    "absent": lambda first, second: first.clear(),
-    "fewer": lambda first, second: second.pop("exp_avg_sq"),
-    "another shape": lambda first, second: first.update(exp_avg=first["exp_avg"][:1]),
-    "no step": lambda first, second: first.pop("step"),
-    "text": lambda first, second: first.update(step="moments"),
-}
-
-
-@pytest.mark.parametrize("damage", MOMENTS)
-def test_moments_of_another_network_are_refused(damage):
-    trained = agent()
-    fresh = agent()
-    descend(trained, 1)
-    moments = {row: dict(state) for row, state in trained.optimizer.state_dict()["state"].items()}
-    MOMENTS[damage](moments[0], moments[1])
-    with pytest.raises(UserError, match="not those of its network"):
-        load_moments(fresh, moments)
-    assert fresh.optimizer.state_dict()["state"] == {}
 
 
 #: What is saved in the place of an agent: the kind of the weights, and how they are described.

@@ -138,16 +138,15 @@ def test_the_weights_that_ship_were_fitted_with_the_commands_defaults(config):
 def test_a_training_is_told_whether_to_compile(value):
     config = config_of("train", f"compile={value}")
     assert config.compile == value
-    assert config_of("train", "total_decisions=16", f"compile={value}").compiled().env.compile is (
-        value == "always"
-    )
+    short = config_of("train", "total_decisions=16", f"compile={value}")
+    assert short.compiles() is (value == "always")
 
 
 @pytest.mark.parametrize(("version", "compiles"), [("2.11.0+cu130", False), ("2.13.0+cpu", True)])
 def test_a_long_training_is_compiled_where_that_is_known_to_work(version, compiles, monkeypatch):
     monkeypatch.setattr("torch.__version__", version)
     monkeypatch.setattr("ganlane.torch_settings.has_compiler", lambda: True)
-    assert config_of("train", "total_decisions=1000000").compiled().env.compile is compiles
+    assert config_of("train", "total_decisions=1000000").compiles() is compiles
 
 
 @pytest.mark.parametrize(

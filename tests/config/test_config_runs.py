@@ -103,7 +103,7 @@ def test_a_run_ended_by_a_full_disk_goes_on_to_the_same_weights(
         patch.setattr("ganlane.files.os.fsync", Disk(writes))
         patch.setattr("ganlane.training.checkpoint.PATIENCE", 0.0)
         assert command("hydra.run.dir=run") == 2
-    assert "No space left on device; make room" in capsys.readouterr().err
+    assert "No space left on device; check the path" in capsys.readouterr().err
     assert not list(here.rglob("*.part"))
     assert (
         (here / "run" / LAST).is_file()

@@ -16,12 +16,10 @@ from reference.recordings import (
     write_highd,
 )
 from reference.refusals import user_error
+from reference.scene_csv import write_scene_csv
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-from ganlane.commands.prepare import (
-    long_report,
-    short_report,
-)
+from ganlane.commands.prepare import short_report
 from ganlane.data import (
     SCHEMA,
     PooledStatistics,
@@ -31,7 +29,6 @@ from ganlane.data import (
     scene_lane_counts,
     scene_lane_widths,
     write_prepared,
-    write_scene_csv,
 )
 from ganlane.data.prepared import prepare_recordings
 from ganlane.data.recordings import cut_into_scenes
@@ -316,14 +313,10 @@ def test_reports_state_rows_rates_and_durations(tmp_path):
     # One row comes twice.
     path.write_text("\n".join([*lines, lines[5], ""]))
     prepared = prepare_recordings("ngsim", path, tmp_path / "out")
-    for report in (
-        short_report(prepared),
-        long_report(prepared, "portal.csv", "report.png"),
-    ):
-        assert "541 read, 540 kept, 540 written" in report
-        assert "dropped: 1 (duplicate)" in report
-        assert "lane changes: 0; 0.000 per vehicle and km of road (equation 9)" in report
-    assert "| us-101-1 | 540 | 9 | 6 | 3 |" in long_report(prepared, "portal.csv", "report.png")
+    report = short_report(prepared)
+    assert "541 read, 540 kept, 540 written" in report
+    assert "dropped: 1 (duplicate)" in report
+    assert "lane changes: 0; 0.000 per vehicle and km of road (equation 9)" in report
 
 
 def test_the_output_folder_appears_only_when_everything_was_written(

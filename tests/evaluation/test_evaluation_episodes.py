@@ -11,6 +11,7 @@ import torch
 from evaluation_toy_env import ToyEnv, always, length, reason
 from polars.testing import assert_frame_equal
 from reference.refusals import user_error
+from reference.scene_csv import write_scene_csv
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from reference.worlds import vehicles
 from tensordict.nn import TensorDictModule
@@ -19,7 +20,6 @@ from torchrl.envs.utils import ExplorationType, exploration_type, step_mdp
 
 from ganlane import keys
 from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.data import write_scene_csv
 from ganlane.evaluation import run_episodes
 from ganlane.evaluation.episodes import ScriptedPolicy
 from ganlane.evaluation.measures import ego_at_fault

@@ -16,12 +16,12 @@ from reference.recordings import (
     raw_text,
     traffic,
 )
+from reference.scene_csv import write_scene_csv
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 import ganlane.evaluation
 import ganlane.generator
 from ganlane.config.run import run_command
-from ganlane.data import write_scene_csv
 from ganlane.generator.checkpoint import load_generator
 from ganlane.realism.starts import check_folds_cover, fold_weights
 

@@ -8,11 +8,11 @@ import pytest
 import torch
 from reference.recordings import made_by_hand, recorded_cars
 from reference.refusals import user_error
+from reference.scene_csv import write_scene_csv
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from reference.worlds import vehicles
 
 from ganlane.config.run import run_command
-from ganlane.data import write_scene_csv
 from ganlane.generator import human_estimator, human_fit, human_tuning, load_generator, load_human
 from ganlane.generator.human import (
     ALONG,

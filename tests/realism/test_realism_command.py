@@ -10,11 +10,11 @@ import polars as pl
 import pytest
 from PIL import Image
 from reference.recordings import following_file
+from reference.scene_csv import write_scene_csv
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 from ganlane.commands import realism as command
 from ganlane.config.run import run_command
-from ganlane.data import write_scene_csv
 from ganlane.generator import shipped_generator
 from ganlane.realism.measures import (
     QUANTITIES,

@@ -123,7 +123,7 @@ def test_several_that_return_at_once_burden_nobody():
 
 
 def in_range_by_km(
-    on: bool, cars: int = 9, goal_m: float = 5000.0, rows: int = 8
+    monkeypatch: pytest.MonkeyPatch, on: bool, cars: int = 9, goal_m: float = 5000.0, rows: int = 8
 ) -> tuple[list[float], int]:
     """Mean number of others within 200 m of a MOBIL ego, in each kilometre; and how often one of
     them was moved.
@@ -147,7 +147,7 @@ def in_range_by_km(
         assert not pair_overlaps(cars)[running].any()
 
     if on:
-        env.physics.recycle = spied
+        monkeypatch.setattr("ganlane.env.highway.recycle", spied)
         env.recorder = record
     seen: list[list[int]] = [[] for _ in range(round(goal_m / 1000.0) + 1)]
     running = torch.ones(rows, dtype=torch.bool)
@@ -162,22 +162,22 @@ def in_range_by_km(
 
 
 @pytest.mark.slow
-def test_without_recycling_the_ego_loses_its_company_over_5_km():
-    alone, _ = in_range_by_km(on=False)
+def test_without_recycling_the_ego_loses_its_company_over_5_km(monkeypatch):
+    alone, _ = in_range_by_km(monkeypatch, on=False)
     assert alone[0] > 7.0
     assert alone[-1] < 4.0
 
 
 @pytest.mark.parametrize("goal_m", [2000.0, pytest.param(5000.0, marks=pytest.mark.slow)])
-def test_with_it_the_ego_keeps_its_company_and_nobody_is_burdened(goal_m):
-    company, moved = in_range_by_km(on=True, goal_m=goal_m)
+def test_with_it_the_ego_keeps_its_company_and_nobody_is_burdened(goal_m, monkeypatch):
+    company, moved = in_range_by_km(monkeypatch, on=True, goal_m=goal_m)
     assert min(company) > 7.5
     assert moved > goal_m / 100.0
 
 
 @pytest.mark.slow
-def test_among_30_vehicles_too_nobody_overlaps_or_is_burdened():
-    company, _ = in_range_by_km(on=True, cars=30, rows=16)
+def test_among_30_vehicles_too_nobody_overlaps_or_is_burdened(monkeypatch):
+    company, _ = in_range_by_km(monkeypatch, on=True, cars=30, rows=16)
     assert min(company) > 20.0
 
 

@@ -142,7 +142,7 @@ def test_one_page_plays_crashes_of_several_traffics(small_list, capsys):
     [
         ("crashes=nowhere.json", "nowhere.json: cannot be read"),
         ("crashes=crashes.json agents=[nobody]", "none of these agents"),
-        ("crashes=crashes.json format=gif", "crashes are one of html, csv, parquet"),
+        ("crashes=crashes.json out=a.gif", "expected one of html, parquet"),
         ("crashes=crashes.json run=RUN", "leave one of them out"),
         ("traffics=[idm]", "goes with crashes=FILE"),
     ],

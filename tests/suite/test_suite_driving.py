@@ -6,11 +6,11 @@ import json
 
 import polars as pl
 import pytest
+from reference.scene_csv import write_scene_csv
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 from ganlane.build import make_driver
 from ganlane.commands.evaluate import publish
-from ganlane.data import write_scene_csv
 from ganlane.evaluation import crashes_by_scene, evaluation_rows, failed_episodes, paired_rows
 from ganlane.evaluation.results import plain
 from ganlane.settings.commands import EvaluateConfig

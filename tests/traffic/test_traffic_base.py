@@ -39,7 +39,6 @@ MAKE = {
     "idm_random": IdmRandomTraffic,
     "idm_faults": idm_faults_traffic,
     "gan": gan_traffic,
-    "gan_planning": lambda: gan_traffic(execute_k=3),
     "gan_calibrated": gan_calibrated_traffic,
     "mixed": lambda: MixedTraffic(
         {"idm": IdmTraffic(), "faults": idm_faults_traffic()},

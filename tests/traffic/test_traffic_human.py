@@ -9,7 +9,6 @@ from ganlane.errors import UserError
 from ganlane.generator import shipped_generator
 from ganlane.generator.human import STEPS
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.settings.driving import HumanVariation
 from ganlane.sim.random import episode_key
 from ganlane.sim.spawn import spawn
 from ganlane.sim.state import Road, Vehicles
@@ -19,7 +18,7 @@ from ganlane.traffic.presets import human_traffic
 
 def drive(episodes, steps, dtype=torch.float32, **variation):
     """Vehicles and memory after every step."""
-    traffic = human_traffic(variation=HumanVariation(**variation))
+    traffic = human_traffic(**variation)
     episode = torch.tensor(episodes)
     key = episode_key(traffic.stream, torch.zeros_like(episode), episode)
     vehicles = spawn(key, 9, 3, 4.0, dtype=dtype)

@@ -4,8 +4,6 @@ the ego.
 
 from __future__ import annotations
 
-import copy
-
 import pytest
 import torch
 from reference.worlds import (
@@ -148,26 +146,6 @@ def test_scenes_set_by_hand_and_faults_laid_over_a_mixture_see_it_too():
         2,
         1,
     ]
-
-
-def test_graphs_meet_few_numbers_of_rows(monkeypatch):
-    traffic = mixture(idm=2, idm_mobil=1)
-    for _, part in traffic.named_parts():
-        monkeypatch.setattr(part, "compile_graphs", lambda: None)
-    plain = drive(copy.deepcopy(traffic), 64)
-    traffic.compile_graphs()
-    generator = torch.Generator().manual_seed(0)
-    sizes = set()
-    for _ in range(50):
-        episodes = torch.randint(0, 999, (64,), generator=generator)
-        parts = traffic.rows_of_parts(episodes)
-        assert sum(len(rows) for _, _, rows, _ in parts) == 64
-        sizes |= {len(padded) for *_, padded in parts}
-    assert len(sizes) <= 8
-    parts = traffic.rows_of_parts(torch.arange(48))
-    assert [len(padded) for *_, padded in parts] == [32, 16]
-    for one, other in zip(plain, drive(traffic, 64)):
-        assert same_bits(one, other) == []
 
 
 @pytest.mark.parametrize(

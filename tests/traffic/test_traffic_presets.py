@@ -105,7 +105,6 @@ def test_calibrated_traffic_changes_lanes_as_often_as_recorded_and_touches_nobod
     "preset",
     [
         gan_traffic,
-        lambda: gan_traffic(execute_k=3),
         gan_calibrated_traffic,
     ],
 )

@@ -6,11 +6,12 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from reference.scene_csv import write_scene_csv
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from scipy.stats import chisquare
 
 from ganlane import keys
-from ganlane.data import default_scenes, sort, write_scene_csv
+from ganlane.data import default_scenes, sort
 from ganlane.errors import UserError
 from ganlane.settings.driving import IdmParameters, Visibility
 from ganlane.sim import Vehicles

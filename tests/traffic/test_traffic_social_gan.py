@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -44,8 +42,8 @@ def calibrated(**options):
 
 
 @pytest.fixture(
-    params=[paper, calibrated, lambda: paper(execute_k=3)],
-    ids=["paper", "calibrated", "planning"],
+    params=[paper, calibrated],
+    ids=["paper", "calibrated"],
 )
 def module(request):
     return request.param()
@@ -130,29 +128,8 @@ def test_headways_come_from_the_quantiles_given():
     assert headway.median().item() == pytest.approx(1.2, abs=0.03)
 
 
-def test_the_other_presets_weights_and_a_wrong_execute_k_are_refused():
+def test_the_other_presets_weights_are_refused():
     with pytest.raises(UserError, match="expected 4"):
         AnchoredGanTraffic(generator(), ROAD)
     with pytest.raises(UserError, match="expected 0"):
         SocialGanTraffic(generator(EXTRA_INPUTS), ROAD)
-    with pytest.raises(UserError, match="execute_k=9"):
-        paper(execute_k=9)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(
-    shutil.which("c++") is None and shutil.which("g++") is None,
-    reason="needs a C++ compiler",
-)
-def test_a_graph_drives_as_without_one(module):
-    # So many rows that oneDNN multiplies.
-    eager = drive(module, begin(module, rows=64), 12)
-    module.compile_graphs()
-    graph = drive(module, begin(module, rows=64), 12)
-    for name in ("x", "y", "speed"):
-        torch.testing.assert_close(
-            eager["vehicles", name],
-            graph["vehicles", name],
-            atol=1e-3,
-            rtol=1e-5,
-        )

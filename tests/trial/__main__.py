@@ -4,7 +4,7 @@
     python -m tests.trial kill --runs 45 --minutes 15
     python -m tests.trial damage --inputs 10000
     python -m tests.trial damage --input 'scene CSV:17'         a damaged file again
-    python -m tests.trial soak --configurations 500 --minutes 40 --compiled 3
+    python -m tests.trial soak --configurations 500 --minutes 40
     python -m tests.trial soak --configuration 12               a configuration again
 
 Parts: kill (kill -9, then resumed to the same bits), damage (damaged files), soak (random
@@ -43,7 +43,7 @@ def run(part: str, options: argparse.Namespace, minutes: float, scratch: Path) -
     elif part == "damage":
         damage(tally, options.inputs, options.seed, minutes, scratch)
     else:
-        soak(tally, options.configurations, options.seed, minutes, options.compiled)
+        soak(tally, options.configurations, options.seed, minutes)
     tally.seconds = time.monotonic() - begun
     return tally
 
@@ -58,7 +58,6 @@ def parse() -> argparse.Namespace:
     add("--runs", type=int, default=45, help="that kill disturbs")
     add("--inputs", type=int, default=10_000, help="damaged files")
     add("--configurations", type=int, default=500, help="that soak drives")
-    add("--compiled", type=int, default=0, help="of them compiled, a minute each before they drive")
     add("--input", metavar="KIND:NUMBER", help="one damaged file, as a failure names it")
     add("--configuration", type=int, help="one configuration, as a failure names it")
     add_report(parser, *MARKERS)

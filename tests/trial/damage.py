@@ -25,9 +25,10 @@ import polars as pl
 import torch
 from matplotlib import pyplot
 from reference.recordings import ngsim_rows, portal_csv, traffic, write_highd
+from reference.scene_csv import write_scene_csv
 
 from ganlane.agents import read_agent
-from ganlane.data import read_recordings, read_scenes, write_prepared, write_scene_csv
+from ganlane.data import read_recordings, read_scenes, write_prepared
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator.checkpoint import load_generator

@@ -36,7 +36,7 @@ AT_MOST_S = 300.0
 _TINY = """
 env.goal_m=12 env.decision_period_s=0.2 env.vehicles=4 agent=rainbow observation=lane_view
 mask=legal log_every=48 evaluate_every=96 selection_episodes=2 checkpoint_every_s=0.02
-collector.num_envs=8 agent.hidden=[16,16] agent.batch_size=16 agent.warmup=32 agent.capacity=200
+num_envs=8 agent.hidden=[16,16] agent.batch_size=16 agent.warmup=32 agent.capacity=200
 agent.decisions_per_update=16 evaluation.episodes=2 evaluation.agents=[mobil,random_legal]
 logger.progress=false
 """

@@ -43,9 +43,8 @@ IN_SCENARIO = 44
 FASTEST_MPS = 70.0
 
 
-def soak(tally: Tally, count: int, seed: int, minutes: float, compiled: int = 0) -> None:
-    """Drive ``count`` configurations, each for its share of the minutes; the first ``compiled`` are
-    compiled.
+def soak(tally: Tally, count: int, seed: int, minutes: float) -> None:
+    """Drive ``count`` configurations, each for its share of the minutes.
 
     Where making them takes longer than that, fewer are driven.
     """
@@ -55,21 +54,21 @@ def soak(tally: Tally, count: int, seed: int, minutes: float, compiled: int = 0)
         if time.monotonic() > begun + 60.0 * minutes:
             return
         until = begun + 60.0 * minutes * (i + 1) / count
-        one_configuration(tally, seed * 10**6 + i, compiled > i, until)
+        one_configuration(tally, seed * 10**6 + i, until)
 
 
 def once(number: int) -> str:
     """The configuration of this number again, for a minute."""
     tally = Tally("soak")
-    one_configuration(tally, number, False, time.monotonic() + 60.0)
+    one_configuration(tally, number, time.monotonic() + 60.0)
     return tally.row()
 
 
-def one_configuration(tally: Tally, number: int, compiled: bool, until: float) -> None:
+def one_configuration(tally: Tally, number: int, until: float) -> None:
     """The first choice of this number that is not refused, driven until then, or for a moment."""
     rng = random.Random(number)
     while True:
-        choice = random_choice(rng, compiled)
+        choice = random_choice(rng)
         try:
             env = make(choice)
             break
@@ -80,7 +79,7 @@ def one_configuration(tally: Tally, number: int, compiled: bool, until: float) -
     tally.what["configurations"] += 1
 
 
-def random_choice(rng: random.Random, compiled: bool) -> dict[str, Any]:
+def random_choice(rng: random.Random) -> dict[str, Any]:
     """Random arguments of :func:`ganlane.make_env`, and ``policy`` and ``float64`` of ours."""
     env = rng.choice(ENVS if RECORDINGS.is_file() else ENVS[:-1])
     traffic: dict[str, Any] = {"name": rng.choice(TRAFFICS)}
@@ -103,7 +102,6 @@ def random_choice(rng: random.Random, compiled: bool) -> dict[str, Any]:
         },
         "float64": rng.random() < 0.3,
         "policy": rng.choice(("random", "random", "legal", "keep", "weave")),
-        "compile": compiled,
     }
     if env in ("highway", "dense", "replay"):
         choice["lanes"] = rng.randint(1, 6)

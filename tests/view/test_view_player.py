@@ -14,10 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from view_scenes import straight
 
-from ganlane.errors import UserError
-from ganlane.settings.render import FilmConfig
 from ganlane.view import EpisodeLabel, player_page
-from ganlane.view.player import UNITS, episode_data, series, steps
+from ganlane.view.player import episode_data, series, steps
 
 
 def data_of(page):
@@ -98,25 +96,3 @@ def test_only_the_pages_own_scripts_may_run_and_nothing_may_be_loaded():
         digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
         assert f"{directive} 'sha256-{digest}'" in policy
     assert not re.search(r"https?://|src=|@import", page)
-
-
-def noisy(frames, vehicles=9):
-    """Driving that does not compress: accelerations, headings and lateral positions of noise."""
-    generator = np.random.default_rng(0)
-    episode = straight(np.arange(vehicles) * 30.0, np.arange(vehicles) % 3, frames=frames)
-    for name, spread in {"y": 0.05, "heading": 0.01, "speed": 0.3, "acceleration": 1.0}.items():
-        getattr(episode, name)[:] += generator.normal(0, spread, episode.x.shape)
-    return episode
-
-
-def test_a_page_that_is_too_large_takes_fewer_samples_and_keeps_the_last():
-    episode = noisy(600)
-    whole = player_page([episode])
-    page = player_page([episode], FilmConfig(max_bytes=len(whole) // 2))
-    (shown,) = data_of(page)["episodes"]
-    times = np.array(list(accumulate(shown["time"]))) * UNITS["time"]
-    assert len(page) < len(whole) // 2
-    assert np.diff(times)[:-1].min() > 0.1
-    assert times[-1] == pytest.approx(59.9)
-    with pytest.raises(UserError, match="max_bytes"):
-        player_page([episode], FilmConfig(max_bytes=10_000))

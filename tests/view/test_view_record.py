@@ -16,7 +16,7 @@ from torchrl.envs import GymEnv
 from view_scenes import straight
 
 from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.data import read_scenes, scene_lane_widths, sort
+from ganlane.data import read_scenes, sort
 from ganlane.data.schema import SCHEMA, TRACK_STRIDE
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
@@ -133,7 +133,7 @@ def episodes():
 
 
 def test_parquet_comes_back_exactly(episodes, tmp_path):
-    read = read_scenes(write_tracks(episodes, tmp_path / "simulated.parquet", "parquet"))
+    read = read_scenes(write_tracks(episodes, tmp_path / "simulated.parquet"))
     assert read.schema == SCHEMA
     assert read["scene"].unique().sort().to_list() == [
         "keep_lane_traffic_0_0",
@@ -146,23 +146,11 @@ def test_parquet_comes_back_exactly(episodes, tmp_path):
         assert one["speed"].to_numpy() == pytest.approx(episode.speed[:, 3])
 
 
-def test_csv_comes_back_through_the_reader_of_recordings(episodes, tmp_path):
-    read, exact = (
-        read_scenes(write_tracks(episodes, tmp_path / f"a.{kind}", kind))
-        for kind in ("csv", "parquet")
-    )
-    same = ["scene", "vehicle", "frame", "x", "speed", "lane", "length", "width"]
-    assert read.select(same).equals(exact.select(same))
-    # The reader works out the width of the lanes from the positions.
-    assert (read["y"] - exact["y"]).abs().max() < 0.05
-    assert list(scene_lane_widths(read).values()) == pytest.approx([4.0, 4.0], abs=0.02)
-
-
 def test_episodes_that_would_share_a_name_are_numbered(tmp_path):
     label = EpisodeLabel("a/agent.safetensors", "idm", 0, 3)
     labels = [label, replace(label, agent="b/agent.safetensors"), replace(label, agent="mobil")]
     scenes = [straight([0], [0], label=label) for label in labels]
-    read = read_scenes(write_tracks(scenes, tmp_path / "a.parquet", "parquet"))
+    read = read_scenes(write_tracks(scenes, tmp_path / "a.parquet"))
     names = {"agent_idm_0_3", "agent_idm_0_3-2", "mobil_idm_0_3"}
     assert set(read["scene"]) == names
 

@@ -16,6 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = {
     "own_traffic.py": r"mean speed of the others \d+\.\d m/s, \d+ % look away",
     "own_reward.py": r"random_legal courteous: mean return +-?\d+\.\d, \d+ onsets behind",
+    "own_function.py": r"(?s)entry .*drive .*shift-v1, protocol ",
     "own_policy.py": r"(?s)mobil .*agent_idm .*random_legal .*largest_gap ",
     "torchrl_dqn.py": r"(?s)loss \d+\.\d+, reward per decision -?\d+\.\d+.*torchrl_dqn .*mobil ",
     "torchrl_ppo.py": r"(?s)reward per decision -?\d+\.\d+.*torchrl_ppo .*mobil ",
@@ -30,6 +31,7 @@ EXAMPLES = {
 }
 #: Budgets that keep a run to seconds.
 SHORT = {
+    "own_function.py": ["60"],
     "torchrl_dqn.py": ["2048", "2", "60", "16"],
     "torchrl_ppo.py": ["2048", "2", "60", "16"],
     "cleanrl_style.py": ["2048"],

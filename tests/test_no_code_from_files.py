@@ -92,6 +92,8 @@ STORED = {
     "a policy": {"evaluation": {"agents": ["mobil", "random_legal", "evil.Policy"]}},
     "a policy alone": {"evaluation": {"agents": "evil.Policy"}},
     "a masked policy": {"evaluation": {"agents": ["mobil", "evil.Policy+safe"]}},
+    "a function as policy": {"evaluation": {"agents": ["mobil", "evil:make"]}},
+    "a masked function": {"evaluation": {"agents": ["mobil", "evil:make+safe"]}},
     "a shell as policy": {"evaluation": {"agents": ["mobil", "os.system"]}},
     "a reference to a name": {
         "init": {"path": "evil.Traffic"},

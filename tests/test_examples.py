@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = {
     "own_traffic.py": r"mean speed of the others \d+\.\d m/s, \d+ % look away",
     "own_reward.py": r"random_legal courteous: mean return +-?\d+\.\d, \d+ onsets behind",
-    "own_function.py": r"(?s)entry .*drive .*shift-v1, protocol ",
+    "own_function.py": r"(?s)entry .*drive .*shift-v1, quick, protocol ",
     "own_policy.py": r"(?s)mobil .*agent_idm .*random_legal .*largest_gap ",
     "torchrl_dqn.py": r"(?s)loss \d+\.\d+, reward per decision -?\d+\.\d+.*torchrl_dqn .*mobil ",
     "torchrl_ppo.py": r"(?s)reward per decision -?\d+\.\d+.*torchrl_ppo .*mobil ",

@@ -31,6 +31,7 @@ from ganlane.arguments import (
 from ganlane.env import HighwayEnv, TransformedHighway
 from ganlane.errors import ParameterError, UserError
 from ganlane.files import CHECKPOINTS
+from ganlane.settings.actions import ActionParameters
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import (
@@ -158,18 +159,24 @@ def make_env(
         recycle=env.recycle,
         recycle_share=env.recycle_share,
         kernel=env.kernel,
+        actions=env.actions,
     )
     # None where the native kernel does not implement what is asked for.
     kernel = base.kernel
     transforms: list[ObservationTransform | ActionMaskTransform] = [
         ObservationTransform(
-            base.road, env.vehicles, observation.form, observation.scale(), kernel is not None
+            base.road,
+            env.vehicles,
+            observation.form,
+            observation.scale(),
+            kernel is not None,
+            env.actions,
         )
     ]
     # The mask needs to know whether a lane change under way may be called off.
     if mask is not None and mask.form != "none":
         abort, vehicles = env.ego.abort_lane_change, None if kernel is None else kernel.vehicles
-        parameters = (mask.form, mask.safe_deceleration, env.idm, abort, vehicles)
+        parameters = (mask.form, mask.safe_deceleration, env.idm, abort, vehicles, env.actions)
         transforms.append(ActionMaskTransform(base.road, *parameters))
     sensors = observation.sensors
     errors = []
@@ -193,12 +200,18 @@ class Driver:
         policy: writes ``action``.
         observation: what it reads; None: any.
         mask: of its actions; None: that of the command or call, by default none.
+        actions: what it commands; None: what the environment of the command or call takes.
     """
 
     name: str
     policy: TensorDictModuleBase = field(repr=False)
     observation: ObservationConfig | None = None
     mask: MaskParameters | None = None
+    actions: ActionParameters | None = None
+
+    def env(self, env: EnvConfig) -> EnvConfig:
+        """``env`` with the actions that it commands."""
+        return env if self.actions in (None, env.actions) else replace(env, actions=self.actions)
 
     def renamed(self, name: str) -> Driver:
         """The same driver under another name."""
@@ -253,7 +266,7 @@ def make_driver(
             {},
             "agents",
         )
-        return Driver(name, policy.to(device))
+        return Driver(name, policy.to(device), actions=ActionParameters())
     if names_agent(name):
         # Read first without a size: only the metadata tell which observation the agent needs.
         network, metadata = load_agent(name, device=device)
@@ -265,11 +278,12 @@ def make_driver(
             network,
             observation,
             mask_of(metadata),
+            ActionParameters(),
         )
     # a model of stable-baselines3, by its weights
     if name.endswith(".zip"):
         model, reading = load_model(Path(name), device)
-        return Driver(name, model, reading.observation, reading.mask)
+        return Driver(name, model, reading.observation, reading.mask, reading.actions)
     # a plain function of observations
     if is_function_path(name):
         return Driver(name, FunctionPolicy(imported(name, "agents")))

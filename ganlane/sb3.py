@@ -44,6 +44,7 @@ from ganlane.errors import ParameterError, UserError
 from ganlane.files import PLACE, atomic_path, write_json
 from ganlane.gym.base import OnRows
 from ganlane.gym.vector import HighwayVectorGym
+from ganlane.settings.actions import ActionParameters
 from ganlane.settings.observation import MaskParameters, ObservationConfig
 from ganlane.settings.record import plain
 
@@ -149,7 +150,7 @@ class HighwayVecEnv(VecEnv):
         return self._seeds
 
     def action_masks(self) -> npt.NDArray[np.bool_]:
-        """Which actions are allowed now, bool [N, 3]."""
+        """Which actions are allowed now, bool [N, A]."""
         return self.highways.action_masks()
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
@@ -222,9 +223,12 @@ def make_vec_env(
     return HighwayVecEnv(HighwayVectorGym(num_envs=num_envs, traffic=traffic, seed=seed, **options))
 
 
-#: Observation, mask and normaliser.
+#: Observation, mask, normaliser and actions.
 _Read: TypeAlias = tuple[
-    ObservationConfig, MaskParameters | None, "VecNormalize | Normaliser | None"
+    ObservationConfig,
+    MaskParameters | None,
+    "VecNormalize | Normaliser | None",
+    ActionParameters,
 ]
 #: What may stand between a model and the highway, since it changes neither observation nor action.
 _TRANSPARENT = (
@@ -301,8 +305,10 @@ class ModelPolicy(TensorDictModuleBase):
             if self._memory is not None and self._memory[0].shape[1] == len(observation):
                 more["state"] = self._memory
         chosen, self._memory = self.model.predict(observation, deterministic=True, **more)
+        # Whole numbers of several types; floats are controls as they are.
         action = torch.as_tensor(chosen, device=tensordict.device)
-        return tensordict.set(keys.ACTION, action.long())
+        numbered = isinstance(self.model.action_space, gymnasium.spaces.Discrete)
+        return tensordict.set(keys.ACTION, action.long() if numbered else action)
 
 
 class ModelDriver(Driver):
@@ -310,6 +316,7 @@ class ModelDriver(Driver):
 
     policy: ModelPolicy
     observation: ObservationConfig
+    actions: ActionParameters
 
     def save(self, path: str | Path) -> None:
         """Store the model as ``model.save(path)`` does, and beside it what it reads, as JSON.
@@ -336,7 +343,13 @@ class ModelDriver(Driver):
             "checksum": PLACE,
             "model_sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
             "reads": plain(
-                Reading(self.observation, self.mask, normaliser, _network(self.policy.model))
+                Reading(
+                    self.observation,
+                    self.mask,
+                    normaliser,
+                    _network(self.policy.model),
+                    self.actions,
+                )
             ),
         }
         write_json(description_of(file), content)
@@ -367,16 +380,18 @@ def driver(
             missing, damaged, or that of another model.
     """
     if stored is None:
-        observation, mask, normaliser = _of_environment(model)
+        observation, mask, normaliser, actions = _of_environment(model)
     else:
         reading = read_description(_model_file(stored))
         observation, mask, normaliser = reading.observation, reading.mask, reading.normaliser
+        actions = reading.actions
     policy = ModelPolicy(model, normaliser)
-    return ModelDriver(name or type(model).__name__.lower(), policy, observation, mask)
+    name = name or type(model).__name__.lower()
+    return ModelDriver(name, policy, observation, mask, actions)
 
 
 def _of_environment(model: BaseAlgorithm) -> _Read:
-    """Observation, mask and normaliser that the environment of a model has."""
+    """Observation, mask, normaliser and actions that the environment of a model has."""
     env = model.get_env()
     if env is None:
         kind = type(model).__name__
@@ -402,7 +417,7 @@ def _of_environment(model: BaseAlgorithm) -> _Read:
             raise _not_repeatable(layer)
     # Other algorithms drive without a mask, whatever mask their environment shows.
     if not _is_masked(model):
-        return settings.observation, None, normaliser
+        return settings.observation, None, normaliser, settings.env.actions
     mask = settings.mask
     if mask.form == "none":
         # The environment showed which actions stay on the road. `legal` excludes more: commands
@@ -413,7 +428,7 @@ def _of_environment(model: BaseAlgorithm) -> _Read:
                 "that can be turned back; train it with mask='legal' or 'safe'."
             )
         mask = MaskParameters("legal")
-    return settings.observation, mask, normaliser
+    return settings.observation, mask, normaliser, settings.env.actions
 
 
 def _network(model: BaseAlgorithm) -> Network | None:

@@ -234,12 +234,13 @@ class SumoTraffic(TrafficModule):
             self._start(now, row, before, key)
         # Where the egos will be at t + 0.1 s, as the environment moves them.
         acceleration = following_acceleration(ego_scene(vehicles, self.road), self.idm)[:, 0]
+        line = self.road.centre_of(vehicles.target_lane[:, :1], vehicles.y.dtype)[:, 0]
         steering = memory["steering"]
         ego, wheels = move_ego(
             vehicles,
             acceleration,
             steering[:, 0],
-            self.road,
+            line,
             self.steering,
             self.dt,
         )

@@ -21,13 +21,16 @@ from reference.worlds import (
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
+from ganlane.settings.actions import ActionParameters
 from ganlane.settings.episode import SpawnParameters
 from ganlane.sim.state import Vehicles
 
 MOTION = ("x", "y", "heading", "speed", "acceleration")
 
 
-def random_environment(rng: random.Random, rows: int, ends: bool = False) -> HighwayEnv:
+def random_environment(
+    rng: random.Random, rows: int, ends: bool = False, actions: str = "lane"
+) -> HighwayEnv:
     """1 to 6 lanes, 2 to 20 vehicles, sparse to dense, with and without MOBIL, all outcomes.
 
     With ``ends`` some lanes begin late and end at a wall.
@@ -48,6 +51,7 @@ def random_environment(rng: random.Random, rows: int, ends: bool = False) -> Hig
         spawn=packed(spread, spacing),
         seed=rng.randrange(10**9),
         stretches=random_stretches(lanes, rng) if ends else (),
+        actions=ActionParameters(actions),
     )
 
 
@@ -68,9 +72,21 @@ def any_action(rng: random.Random, state: scalar.State, lanes: int) -> int:
     return rng.choice((0, 0, 1, 2))
 
 
+def any_speed(rng: random.Random, state: scalar.State, lanes: int) -> int:
+    return rng.choice((0, 3, 3, 4, 4, 4, 1, 2) if rng.random() < 0.2 else (0, 3, 4))
+
+
+def any_controls(rng: random.Random, state: scalar.State, lanes: int) -> tuple[float, float]:
+    wheel = rng.choice((0.0, 0.0, 0.4, -0.4, 1.0, -1.0)) + rng.uniform(-0.1, 0.1)
+    return rng.uniform(-0.6, 1.0), max(-1.0, min(1.0, wheel))
+
+
 def stay_on_the_road(rng: random.Random, state: scalar.State, lanes: int) -> int:
     lane = state.cars[0].target_lane
     return rng.choice([0] * 20 + [1] * (lane < lanes - 1) + [2] * (lane > 0))
+
+
+CHOICES = {"lane": any_action, "lane_speed": any_speed, "continuous": any_controls}
 
 
 def compare(
@@ -139,16 +155,17 @@ def compare_random_scenes(
     duration_s: float,
     seed: int,
     ends: bool = False,
+    actions: str = "lane",
 ) -> set[str]:
     rng = random.Random(seed)
     seen = set()
     generator = torch.Generator().manual_seed(seed)
     for block in range(scenes // rows):
-        env = random_environment(rng, rows, ends)
+        env = random_environment(rng, rows, ends, actions)
         td = env.reset()
         if block % 2:
             td = disturb(env, td, generator)
-        seen |= compare(env, td, duration_s, rng)
+        seen |= compare(env, td, duration_s, rng, CHOICES[actions])
     return seen
 
 
@@ -165,6 +182,12 @@ def test_the_tensor_code_agrees_with_the_scalar_one_on_2000_random_scenes():
 
 def test_on_roads_with_lanes_that_end_they_agree_too():
     compare_random_scenes(scenes=60, rows=4, duration_s=8.0, seed=2, ends=True)
+
+
+@pytest.mark.parametrize("actions", ["lane_speed", "continuous"])
+@pytest.mark.parametrize("ends", [False, True])
+def test_with_other_actions_they_agree_too(actions, ends):
+    compare_random_scenes(60, 4, duration_s=8.0, seed=5 + ends, ends=ends, actions=actions)
 
 
 def test_on_a_ring_they_agree_too():

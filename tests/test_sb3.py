@@ -323,3 +323,28 @@ def test_an_environment_that_does_not_fit_the_model_is_refused_in_one_sentence()
     masked = ganlane.sb3.driver(untrained(sb3_contrib.MaskablePPO, short_episodes()))
     with pytest.raises(UserError, match="no action_mask"):
         ganlane.make_env("idm").rollout(2, masked.policy)
+
+
+@pytest.mark.parametrize("actions", ["lane", "lane_speed", "continuous"])
+@pytest.mark.parametrize("scene", ["highway", "merge"])
+def test_the_checker_of_stable_baselines3_warns_of_no_form_of_actions(actions, scene):
+    from stable_baselines3.common.env_checker import check_env
+
+    env = gymnasium.make("ganlane/Highway-v0", env=scene, actions=actions)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped, warn=True, skip_render_check=True)
+
+
+def test_a_model_of_continuous_actions_drives_in_a_table_beside_mobil(tmp_path):
+    from stable_baselines3 import SAC
+
+    options = {"env": "merge", "goal_m": 300.0}
+    env = ganlane.sb3.make_vec_env("idm", num_envs=2, seed=0, actions="continuous", **options)
+    model = SAC("MlpPolicy", env, learning_starts=10, batch_size=8, seed=0).learn(20)
+    driver = ganlane.sb3.driver(model)
+    table = ganlane.api.evaluate([driver, "mobil"], ["idm"], 2, **options)
+    assert table["agent"].to_list() == ["sac", "mobil"]
+    driver.save(tmp_path / "sac")
+    again = ganlane.sb3.driver(SAC.load(tmp_path / "sac"), stored=tmp_path / "sac")
+    assert again.actions == driver.actions

@@ -28,6 +28,7 @@ from ganlane.agents.network import (
 )
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, LEFT, RIGHT
+from ganlane.settings.actions import LANE_SPEED, ActionParameters
 from ganlane.settings.driving import (
     IdmParameters,
     MobilParameters,
@@ -39,6 +40,7 @@ from ganlane.sim.random import Purpose, Stream, episode_key, uniform
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.torch_settings import constant
 from ganlane.traffic.idm_mobil import MOBIL_PERIOD_STEPS
+from ganlane.transforms.mask import allowed_speeds
 
 #: Gives the legal actions, [N, A] bool, of what the environment wrote.
 LegalActions = Callable[[TensorDictBase], Tensor]
@@ -236,11 +238,25 @@ class Driver(TensorDictModuleBase):
         )
 
 
-def legal_actions(tensordict: TensorDictBase, road: Road) -> Tensor:
-    """Which of the three actions stay on the road, bool [N, 3]: keeping the lane always does."""
+def legal_actions(
+    tensordict: TensorDictBase,
+    road: Road,
+    actions: ActionParameters | None = None,
+) -> Tensor:
+    """Which actions stay on the road, bool [N, A]: keeping the lane always does.
+
+    Of ``lane_speed`` also which have an effect on the speed; of actions that are not numbered
+    [N, 0].
+    """
     vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
     # beside the lane that it is moving to, not the one it is in
-    return stays_on_road(vehicles, constant(SIDES, vehicles.target_lane), road)
+    legal = stays_on_road(vehicles, constant(SIDES, vehicles.target_lane), road)
+    actions = actions or ActionParameters()
+    if not actions.names:
+        return legal[:, :0]
+    if actions.form == LANE_SPEED:
+        legal = torch.cat((legal, allowed_speeds(tensordict, actions)), dim=1)
+    return legal
 
 
 class RandomDriver(Driver):

@@ -14,7 +14,7 @@ import pickle
 import re
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -29,6 +29,7 @@ from ganlane import keys
 from ganlane.agents.drivers import mask_in
 from ganlane.errors import ParameterError, UserError
 from ganlane.files import has_checksum, refuse_without_checksum
+from ganlane.settings.actions import ActionParameters
 from ganlane.settings.observation import MaskParameters, ObservationConfig
 from ganlane.settings.record import NotNegative, Number, Positive, Record, make, one_of
 
@@ -85,9 +86,10 @@ class Network(Record):
 
 @dataclass(frozen=True)
 class Reading(Record):
-    """What a model reads and which actions it may choose, as the JSON beside its file says.
+    """What a model reads and commands, as the JSON beside its file says.
 
     Attributes:
+        mask: which actions it may choose.
         network: None: not one that can be rebuilt here.
     """
 
@@ -95,6 +97,7 @@ class Reading(Record):
     mask: MaskParameters | None
     normaliser: Normaliser | None
     network: Network | None = None
+    actions: ActionParameters = field(default_factory=ActionParameters)
 
 
 class StoredModel(TensorDictModuleBase):
@@ -191,15 +194,18 @@ def load_model(file: Path, device: str = "cpu") -> tuple[StoredModel, Reading]:
             f"{file}: no model of stable-baselines3 ({type(error).__name__}); give the file that "
             "ganlane.sb3.driver(model).save(path) wrote."
         ) from error
-    layers = _layers(state, network)
+    layers = _layers(state, network, len(reading.actions.names))
     if layers is None:
         raise _not_plain(file)
     is_masked = network.algorithm.startswith("Maskable")
     return StoredModel(layers.to(device), reading.normaliser, is_masked), reading
 
 
-def _layers(state: Mapping[str, Any], network: Network) -> nn.Sequential | None:
-    """The network that acts, of a model's weights; None where they are of another form."""
+def _layers(state: Mapping[str, Any], network: Network, actions: int) -> nn.Sequential | None:
+    """The network that acts, of a model's weights; None where they are of another form.
+
+    ``actions`` is the number of those that it chooses among.
+    """
     hidden, last = NETWORKS[network.algorithm]
     numbers = sorted(
         int(match[1])
@@ -219,7 +225,7 @@ def _layers(state: Mapping[str, Any], network: Network) -> nn.Sequential | None:
         modules += [linear, getattr(nn, network.activation)()]
     # Nothing comes after the last layer.
     layers = nn.Sequential(*modules[:-1])
-    return layers if modules[-2].out_features == keys.ACTIONS else None
+    return layers if modules[-2].out_features == actions else None
 
 
 def _not_plain(file: Path) -> UserError:

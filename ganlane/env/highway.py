@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Categorical, Composite, Unbounded
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
 from ganlane import keys
@@ -41,6 +41,7 @@ from ganlane.errors import UserError
 from ganlane.native.drivers import pays
 from ganlane.native.library import torch_on_one_thread, why_not
 from ganlane.native.tensors import Kernel, NativeScenes, wants_gradient
+from ganlane.settings.actions import CONTINUOUS, CONTROLS, LANE, LANE_SPEED, ActionParameters
 from ganlane.settings.driving import EgoParameters, IdmParameters, Visibility
 from ganlane.settings.episode import KERNELS, EpisodeParameters, SpawnParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
@@ -75,6 +76,7 @@ class HighwayEnv(EnvBase):
             reverse (:mod:`ganlane.sim.spawn`), so that the road never empties.
         recycle_share: share of the episodes in which ``recycle`` applies, 0 to 1, chosen by their
             numbers: a mixture of roads that empty and roads that do not.
+        actions: what the driver of the ego commands.
         kernel: what drives a decision: ``torch``, the tensor code; ``native``, the kernel
             (:mod:`ganlane.native`), which does the same up to rounding, for all shipped traffic
             but recordings, on a CPU and without gradients; ``auto``, the kernel where it can.
@@ -111,6 +113,7 @@ class HighwayEnv(EnvBase):
         recycle: bool = False,
         recycle_share: float = 1.0,
         kernel: str = "torch",
+        actions: ActionParameters | None = None,
     ) -> None:
         # Those who call this from Python meet no record that would check types.
         if not isinstance(traffic, TrafficModule):
@@ -148,6 +151,7 @@ class HighwayEnv(EnvBase):
         self.spawn_parameters = spawn_parameters or SpawnParameters()
         self.ego = ego or EgoParameters()
         self.episode = episode or EpisodeParameters()
+        self.actions = actions or ActionParameters()
         self.stream = traffic.stream
         self.dtype = dtype
         self.scenes = scenes or self._default_scenes(vehicles or 9)
@@ -163,6 +167,7 @@ class HighwayEnv(EnvBase):
             self.episode,
             idm,
             steering,
+            self.actions,
         )
         self._seed = seed_number(seed)
         #: Seed and episode [N] of the rows in the last call; automatic resets continue from there.
@@ -201,6 +206,11 @@ class HighwayEnv(EnvBase):
                 f"{type(self.traffic).__name__} does not heed the ends of lanes; take another "
                 "traffic (idm_mobil, gan_calibrated, ...), or a road whose lanes go on."
             )
+        if self.actions.form == CONTINUOUS and self.traffic.rows_must_stay:
+            raise UserError(
+                f"env.actions={CONTINUOUS} with a foreign simulator, which moves its copy of the "
+                "ego by car following; take another traffic, or env.actions=lane."
+            )
         if self.recycle and self.road.stretches:
             raise UserError(
                 "env.recycle=true on a road with lanes that end: vehicles would return where their "
@@ -234,6 +244,7 @@ class HighwayEnv(EnvBase):
             self.dtype,
             memory,
             self.traffic.own_roads,
+            self.actions,
         )
         self.observation_spec = spec.to(device)
         # A TransformedEnv passes to a reset only the keys of the state spec; without the counters a
@@ -243,12 +254,12 @@ class HighwayEnv(EnvBase):
             keys.EPISODE: self.observation_spec[keys.EPISODE].clone(),
         }
         self.state_spec = Composite(counters, shape=(n,), device=device)
-        self.action_spec = Categorical(
-            keys.ACTIONS,
-            shape=(n,),
-            dtype=torch.int64,
-            device=device,
-        )
+        if self.actions.form == CONTINUOUS:
+            shape = (n, CONTROLS)
+            self.action_spec = Bounded(-1.0, 1.0, shape=shape, dtype=self.dtype, device=device)
+        else:
+            count = len(self.actions.names)
+            self.action_spec = Categorical(count, shape=(n,), dtype=torch.int64, device=device)
         self.reward_spec = Unbounded(shape=(n, 1), dtype=self.dtype, device=device)
         self.done_spec = done_spec(n).to(device)
 
@@ -330,6 +341,7 @@ class HighwayEnv(EnvBase):
             episode,
             vehicles,
             memory,
+            self.actions,
         )
         if self.traffic.own_roads:
             road = self.traffic.road_of(key, self.dtype)
@@ -356,7 +368,7 @@ class HighwayEnv(EnvBase):
 
     def _tensor_step(self, state: TensorDictBase) -> TensorDictBase:
         """One decision by the tensor code."""
-        action = checked_action(state.get(keys.ACTION, None), self.batch_size[0])
+        action = checked_action(state.get(keys.ACTION, None), self.batch_size[0], self.actions)
         key = episode_key(self.stream, state.get(keys.SEED), state.get(keys.EPISODE))
         rules = self.rules
         if self.traffic.own_roads:  # replayed scenes have their own roads and ends
@@ -388,12 +400,15 @@ class HighwayEnv(EnvBase):
             end,
             command,
         )
-        events, rest = outcome(rules, end, command)
+        events, rest = outcome(rules, end)
         rest |= {name: state.get(name) for name in (keys.SEED, keys.EPISODE)}
         rest[keys.STEP] = end.step
         if self.traffic.own_roads:
             rest[keys.ROAD] = state.get(keys.ROAD)
         vehicles = end.vehicles
+        if self.actions.form == LANE_SPEED:
+            # The desired speed itself is the same in all of an episode.
+            vehicles = vehicles.with_(desired_speed=state.get(keys.VEHICLES).get("desired_speed"))
         if self.recycle and not known_false(out_of_range(vehicles, rules.road).any()):
             # In running rows with recycling those left behind are moved.
             recycled = recycle(vehicles, rules.road, rules.idm)
@@ -417,7 +432,7 @@ class HighwayEnv(EnvBase):
                 )
             return self._tensor_step(state)
         rows = self.batch_size[0]
-        action = checked_action(state.get(keys.ACTION, None), rows, values=False)
+        action = checked_action(state.get(keys.ACTION, None), rows, self.actions, values=False)
         if not self._must_be_native:
             say_once("env.kernel=auto: the native kernel")
         recycles = None
@@ -428,7 +443,7 @@ class HighwayEnv(EnvBase):
         try:
             after = self.kernel.decide(action, state, recycles)
         except ValueError:
-            checked_action(action, rows)  # says which
+            checked_action(action, rows, self.actions)  # says which
             raise
         if self.recorder is not None:
             self._show_steps(self.recorder, state, action)
@@ -489,6 +504,8 @@ class HighwayEnv(EnvBase):
         if drivers is None:
             name = type(self.traffic).__name__
             reason = f"does not drive {name}"
+        elif self.actions.form != LANE:
+            reason = f"drives env.actions={LANE} alone"
         elif wanted == "auto" and not pays(drivers):
             reason = "is slow with generated traffic on a processor without FMA"
         elif self.device.type != "cpu" or self.dtype != torch.float32:

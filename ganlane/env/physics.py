@@ -16,8 +16,10 @@ from torch import Tensor
 
 from ganlane import keys
 from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
+from ganlane.settings.actions import CONTINUOUS, LANE_SPEED, ActionParameters
 from ganlane.settings.driving import EgoParameters, IdmParameters, SteeringParameters
 from ganlane.settings.episode import EpisodeParameters
+from ganlane.sim.actions import apply_controls, commanded_speed
 from ganlane.sim.collisions import ego_overlaps
 from ganlane.sim.dynamics import (
     Command,
@@ -28,7 +30,7 @@ from ganlane.sim.dynamics import (
     move_ego,
 )
 from ganlane.sim.idm import following_acceleration
-from ganlane.sim.lane_ends import at_exit, hits_wall
+from ganlane.sim.lane_ends import at_exit, hits_wall, leaves_road
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
 from ganlane.traffic.base import TrafficModule, memory_of
 
@@ -46,6 +48,7 @@ class Rules(NamedTuple):
     episode: EpisodeParameters
     idm: IdmParameters
     steering: SteeringParameters
+    actions: ActionParameters = ActionParameters()
     #: Physics steps [N] after which a recorded scene ends; None: never.
     scene_steps: Tensor | None = None
 
@@ -60,19 +63,22 @@ def scene_over(rules: Rules, step: Tensor) -> Tensor:
 class Substep(NamedTuple):
     """State between two physics steps of a decision; fields [N] except the vehicles [N, M].
 
-    ``acceleration`` is the ego's for the next step, m/s2. ``ahead`` and ``behind`` are its soft
+    ``acceleration`` is the ego's for the next step, m/s2, ``line`` the one that it steers to, m.
+    ``ahead`` and ``behind`` are its soft
     crashes, ``onsets`` counts their beginnings.
     """
 
     vehicles: Vehicles
     acceleration: Tensor
     steering: Tensor
+    line: Tensor
     ahead: Tensor
     behind: Tensor
     step: Tensor
     running: Tensor
     onsets: Tensor
     onsets_behind: Tensor
+    out_of_road: Tensor
     hard_crash: Tensor
     goal: Tensor
     missed_exit: Tensor
@@ -86,32 +92,49 @@ def begin(
     Rows whose command leaves the road have ended.
     """
     # The command sets the lane that the ego steers to; the motion itself takes several decisions.
-    command = apply_action(
-        action,
-        vehicles,
-        ego["change_direction"],
-        rules.road,
-        rules.ego.abort_lane_change,
-    )
-    others = vehicles.target_lane[:, 1:]
-    targets = torch.cat((command.target_lane[:, None], others), dim=1)
-    vehicles = vehicles.with_(target_lane=targets)
+    road = rules.road
+    direction = ego["change_direction"]
+    line = acceleration = None
+    if rules.actions.form == CONTINUOUS:
+        period_s = rules.episode.decision_period_s
+        command, line, acceleration = apply_controls(
+            action, vehicles, direction, road, rules.actions, period_s
+        )
+    else:
+        command = apply_action(action, vehicles, direction, road, rules.ego.abort_lane_change)
+    if rules.actions.form == LANE_SPEED:
+        # Within the decision this is the speed that the ego desires, for all who look at it.
+        desired = vehicles.desired_speed
+        speed = commanded_speed(action, ego["set_speed"], desired[:, EGO_INDEX], rules.actions)
+        vehicles = vehicles.with_(desired_speed=with_ego(speed, desired))
+    vehicles = vehicles.with_(target_lane=with_ego(command.target_lane, vehicles.target_lane))
+    if line is None:
+        line = road.centre_of(command.target_lane[:, None], vehicles.y.dtype)[:, 0]
+    if acceleration is None:
+        acceleration = following_acceleration(ego_scene(vehicles, road), rules.idm)[:, 0]
     none = torch.zeros_like(command.off_road)
     start = Substep(
         vehicles=vehicles,
-        acceleration=following_acceleration(ego_scene(vehicles, rules.road), rules.idm)[:, 0],
+        acceleration=acceleration,
         steering=ego["steering"],
+        line=line,
         ahead=ego["soft_crash"],
         behind=ego["soft_crash_behind"],
         step=step,
         running=~command.off_road,
         onsets=none.long(),
         onsets_behind=none.long(),
+        out_of_road=command.off_road,
         hard_crash=none,
         goal=none,
         missed_exit=none,
     )
     return start, command
+
+
+def with_ego(number: Tensor, numbers: Tensor) -> Tensor:
+    """``numbers`` [N, M] with those of the ego replaced by ``number`` [N]."""
+    return torch.cat((number[:, None], numbers[:, 1:]), dim=1)
 
 
 def arrived(rules: Rules, ego: Vehicles) -> tuple[Tensor, Tensor]:
@@ -131,14 +154,15 @@ def advance(
 ) -> Substep:
     """One physics step in which the others have ``moved``: moves the ego and finds the events.
 
-    A hard crash has precedence over goal and missed exit, and all over the time-out. With
+    A hard crash has precedence over leaving the road, that over goal and missed exit, and all over
+    the time-out. With
     ``all_running`` no row has ended, which saves the copies that keep ended rows as they are.
     """
     ego, steering = move_ego(
         before.vehicles,
         before.acceleration,
         before.steering,
-        rules.road,
+        before.line,
         rules.steering,
         PHYSICS_STEP_S,
     )
@@ -150,11 +174,20 @@ def advance(
         steering = torch.where(running, steering, before.steering)
     scene = ego_scene(vehicles, rules.road)
     acceleration, ahead, behind = ego_surroundings(scene, rules.idm, rules.ego)
+    if rules.actions.form == CONTINUOUS:
+        acceleration = before.acceleration
     # Of the events of one step a crash comes first, then the goal, then the time-out.
     crash = ego_overlaps(vehicles, rules.road).any(-1) & running
     if rules.road.stretches:
         crash = crash | (hits_wall(scene.observers, scene.body, rules.road)[:, 0] & running)
     going_on = running & ~crash
+    out_of_road = before.out_of_road
+    if rules.actions.form == CONTINUOUS:
+        # Where the lane itself is commanded, the command alone can leave the road.
+        y, new_y, x = (field[:, :1] for field in (before.vehicles.y, vehicles.y, vehicles.x))
+        left = leaves_road(rules.road, y, new_y, x)[:, 0] & going_on
+        out_of_road = out_of_road | left
+        going_on = going_on & ~left
     goal, missed = (event & going_on for event in arrived(rules, vehicles.at(EGO_INDEX)))
     step = before.step + running
     late = (step >= round(rules.episode.timeout_s / PHYSICS_STEP_S)) | scene_over(rules, step)
@@ -162,13 +195,15 @@ def advance(
         vehicles=vehicles,
         acceleration=acceleration,
         steering=steering,
+        line=before.line,
         ahead=torch.where(running, ahead, before.ahead),
         behind=torch.where(running, behind, before.behind),
         step=step,
-        running=running & ~(crash | goal | missed | late),
+        running=going_on & ~(goal | missed | late),
         # A soft crash counts when it begins, however long it lasts.
         onsets=before.onsets + (ahead & ~before.ahead & running),
         onsets_behind=before.onsets_behind + (behind & ~before.behind & running),
+        out_of_road=out_of_road,
         hard_crash=before.hard_crash | crash,
         goal=before.goal | goal,
         missed_exit=before.missed_exit | missed,
@@ -187,7 +222,7 @@ def remember(
     # A row that ended at once drove no step: its speed did not change either.
     steps = (end.step - start.step).clamp_min(1)
     seconds = steps.to(ego.speed.dtype) * PHYSICS_STEP_S
-    return {
+    memory = {
         "steering": end.steering,
         "mean_acceleration": (ego.speed - speed) / seconds,
         "change_progress": change_progress(ego, direction, rules.road),
@@ -199,21 +234,22 @@ def remember(
         "soft_crash_behind": end.behind,
         "started_change": command.starts,
     }
+    if rules.actions.form == LANE_SPEED:
+        memory["set_speed"] = end.vehicles.desired_speed[:, EGO_INDEX]
+    return memory
 
 
-def outcome(
-    rules: Rules, end: Substep, command: Command
-) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+def outcome(rules: Rules, end: Substep) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Events and done flags of a decision, each [N, 1]; every end has exactly one reason."""
     # Outcomes of the driving.
-    terminated = end.goal | end.hard_crash | end.missed_exit | command.off_road
+    terminated = end.goal | end.hard_crash | end.missed_exit | end.out_of_road
     # What has ended without an outcome was cut off: by the clock, or where its recording stops.
     truncated = ~end.running & ~terminated
     scene_end = truncated & scene_over(rules, end.step)
     events = {
         "goal": end.goal,
         "hard_crash": end.hard_crash,
-        "out_of_road": command.off_road,
+        "out_of_road": end.out_of_road,
         "missed_exit": end.missed_exit,
         "timeout": truncated & ~scene_end,
         "scene_end": scene_end,

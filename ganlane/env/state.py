@@ -17,6 +17,7 @@ from torchrl.data.tensor_specs import Binary
 
 from ganlane import keys
 from ganlane.errors import UserError
+from ganlane.settings.actions import CONTROLS, LANE_SPEED, ActionParameters
 from ganlane.sim.state import Vehicles
 from ganlane.torch_settings import check_default_device
 
@@ -41,6 +42,8 @@ EGO: Fields = {
     "soft_crash_behind": torch.bool,  # and with the one behind
     "started_change": torch.bool,  # in the last decision
 }
+#: And further with ``env.actions=lane_speed``: the speed aimed at, m/s.
+SET_SPEED: Fields = {"set_speed": None}
 EVENTS: Fields = {
     **dict.fromkeys(keys.END_EVENTS, torch.bool),
     **dict.fromkeys((keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND), torch.int64),
@@ -50,15 +53,21 @@ COUNTERS: Fields = dict.fromkeys((keys.SEED, keys.EPISODE, keys.STEP), torch.int
 
 
 def state_spec(
-    n: int, m: int, dtype: torch.dtype, memory: dict[str, Any], own_roads: bool
+    n: int,
+    m: int,
+    dtype: torch.dtype,
+    memory: dict[str, Any],
+    own_roads: bool,
+    actions: ActionParameters,
 ) -> Composite:
     """Spec of everything that a step writes except done flags and reward.
 
     ``memory`` is the traffic's, nested name to (shape, dtype); ``own_roads``: each row has a road.
     """
+    ego = {**EGO, **SET_SPEED} if actions.form == LANE_SPEED else EGO
     parts = {
         keys.VEHICLES: Composite(_specs(VEHICLES, (n, m), dtype), shape=(n,)),
-        keys.EGO: Composite(_specs(EGO, (n,), dtype), shape=(n,)),
+        keys.EGO: Composite(_specs(ego, (n,), dtype), shape=(n,)),
         keys.EVENTS: Composite(_specs(EVENTS, (n, 1), dtype), shape=(n,)),
         **_memory_spec({keys.TRAFFIC: memory}, n),
         **_specs(COUNTERS, (n,), dtype),
@@ -104,13 +113,19 @@ def _memory_spec(memory: dict[str, Any], n: int) -> dict[str, Any]:
 
 
 def first_state(
-    seed: Tensor, episode: Tensor, vehicles: Vehicles, memory: TensorDictBase
+    seed: Tensor,
+    episode: Tensor,
+    vehicles: Vehicles,
+    memory: TensorDictBase,
+    actions: ActionParameters,
 ) -> TensorDictBase:
     """The state of the episodes (``seed``, ``episode``) [N] that begin, without roads."""
     # Everything starts at 0, false, and no lane change.
     row = vehicles.x.new_zeros(seed.shape)
     column = row[:, None]
     ego = {name: row.to(kind or row.dtype) for name, kind in EGO.items()}
+    if actions.form == LANE_SPEED:
+        ego["set_speed"] = vehicles.desired_speed[:, keys.EGO_INDEX].clone()
     events = {name: column.to(kind) for name, kind in EVENTS.items()}
     done = {name: column.to(kind) for name, kind in DONE.items()}
     counters = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: torch.zeros_like(seed)}
@@ -191,39 +206,58 @@ def usable_device(device: Any, dtype: Any) -> torch.device:
 def checked_action(
     action: Tensor | None,
     rows: int,
+    actions: ActionParameters,
     values: bool = True,
 ) -> Tensor:
-    """``action`` [N] as int64.
+    """``action`` [N] as int64, or [N, 2] for ``actions`` that are not numbered.
 
     ``values=False`` leaves out that of the values, which the native kernel looks at itself. It
     waits for a GPU's queue.
 
     Raises:
-        UserError: there is none, or it has another shape, no whole numbers, or others than 0 to 2.
+        UserError: there is none, or it has another shape, no whole numbers, others than the actions
+            have, or one that is not finite.
     """
     if action is None:
-        raise UserError(
-            f"step(): no action; give 'action' [{rows}], int64, from 0 to {keys.ACTIONS - 1}."
-        )
+        raise UserError(f"step(): no action; give 'action', {_expected(rows, actions)}.")
+    if not actions.names:
+        return _checked_controls(action, rows, actions)
+    count = len(actions.names)
     # Flags and floats would be cast without a word.
     if action.shape != (rows,) or action.is_floating_point() or action.dtype == torch.bool:
-        raise _refused(f"of shape {list(action.shape)} in {action.dtype}", rows)
+        raise _refused(f"of shape {list(action.shape)} in {action.dtype}", rows, actions)
     action = action.long()
     if torch.compiler.is_compiling():
         # A graph cannot branch on values.
-        legal = (action >= 0) & (action < keys.ACTIONS)
-        torch._assert_async(legal.all(), f"action: each must be 0 to {keys.ACTIONS - 1}")
+        legal = (action >= 0) & (action < count)
+        torch._assert_async(legal.all(), f"action: each must be 0 to {count - 1}")
     elif values:
         # As unsigned numbers, of which those below 0 are large, and by NumPy: some microseconds.
         numbers = action.cpu().numpy()
-        wrong = numbers.view(np.uint64) >= keys.ACTIONS
+        wrong = numbers.view(np.uint64) >= count
         if wrong.any():
-            raise _refused(str(numbers[wrong][0]), rows)
+            raise _refused(str(numbers[wrong][0]), rows, actions)
     return action
 
 
-def _refused(what: str, rows: int) -> UserError:
-    return UserError(
-        f"action {what}: expected {rows} whole numbers (int64, shape [{rows}]), "
-        "each 0 (keep), 1 (left) or 2 (right); correct the policy."
-    )
+def _checked_controls(action: Tensor, rows: int, actions: ActionParameters) -> Tensor:
+    if action.shape != (rows, CONTROLS) or not action.is_floating_point():
+        raise _refused(f"of shape {list(action.shape)} in {action.dtype}", rows, actions)
+    finite = torch.isfinite(action).all()
+    if torch.compiler.is_compiling():
+        torch._assert_async(finite, "action: each number must be finite")
+    elif not finite:
+        raise _refused("with a number that is not finite", rows, actions)
+    return action
+
+
+def _expected(rows: int, actions: ActionParameters) -> str:
+    if not actions.names:
+        return f"floats of shape [{rows}, {CONTROLS}] from -1 to 1"
+    meanings = [f"{number} ({name})" for number, name in enumerate(actions.names)]
+    choices = f"{', '.join(meanings[:-1])} or {meanings[-1]}"
+    return f"{rows} whole numbers (int64, shape [{rows}]), each {choices}"
+
+
+def _refused(what: str, rows: int, actions: ActionParameters) -> UserError:
+    return UserError(f"action {what}: expected {_expected(rows, actions)}; correct the policy.")

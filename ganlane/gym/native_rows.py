@@ -23,6 +23,7 @@ from ganlane.native.batch import NativeBatch, Stepped
 from ganlane.native.drivers import drivers_of, pays
 from ganlane.native.library import why_not
 from ganlane.native.settings import NATIVE_FORMS
+from ganlane.settings.actions import LANE
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.episode import Stream
 
@@ -77,7 +78,7 @@ class NativeRows(Rows):
         # Row i drives the episodes i, i + N, i + 2N, ...
         self.batch.start(state[keys.SEED], state[keys.EPISODE] + self.count, rows)
 
-    def step(self, actions: Integers) -> Stepped:
+    def step(self, actions: Integers | Floats) -> Stepped:
         return self.batch.step(actions)
 
     def observation(self) -> Floats:
@@ -102,6 +103,7 @@ def native_rows(config: HighwayConfig) -> NativeRows | None:
         or (env.kernel == "auto" and not pays(drivers))
         or env.kernel == "torch"
         or env.scene is not None
+        or env.actions.form != LANE
         or observation.form not in NATIVE_FORMS
         or observation.sensors is not None
         or config.device != "cpu"

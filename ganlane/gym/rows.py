@@ -14,11 +14,12 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Discrete
 
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.native.batch import SPEED_RATIO_LIMIT, Stepped
+from ganlane.settings.actions import CONTROLS, ActionParameters
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.episode import EpisodeParameters
 
@@ -73,8 +74,19 @@ class Rows(ABC):
     def restart(self, rows: Flags) -> None:
         """Begin the next episode, number n + N after n, in the rows where ``rows`` [N] is true."""
 
+    @property
+    def actions(self) -> ActionParameters:
+        """What the driver of the ego commands."""
+        return self.config.env.actions
+
+    def action_space(self) -> Box | Discrete:
+        """Of one action."""
+        if self.actions.names:
+            return Discrete(len(self.actions.names))
+        return Box(-1.0, 1.0, (CONTROLS,), np.float32)
+
     @abstractmethod
-    def step(self, actions: Integers) -> Stepped:
+    def step(self, actions: Integers | Floats) -> Stepped:
         """One decision in every row; no row is reset. The arrays are valid until the next call."""
 
     @abstractmethod
@@ -83,7 +95,9 @@ class Rows(ABC):
 
     @abstractmethod
     def mask(self) -> Flags:
-        """Allowed actions [N, 3]: the mask's, without one those that stay on the road.
+        """Allowed actions [N, A]: the mask's, without one those that stay on the road.
+
+        Of actions that are not numbered [N, 0].
 
         Valid until the next call.
         """
@@ -113,7 +127,8 @@ def described(state: Mapping[str, Any], mask: Flags) -> dict[str, Any]:
     info["time_s"] = np.empty(rows)
     info["lane"] = np.empty(rows, np.int64)
     # gymnasium's Discrete.sample() takes masks of int8; the bytes of booleans are the same.
-    info[ACTION_MASK] = mask.view(np.int8)
+    if mask.shape[1]:
+        info[ACTION_MASK] = mask.view(np.int8)
     info[keys.REWARD_TERMS] = state[keys.REWARD_TERMS]
     measure(info, state)
     return info
@@ -149,7 +164,8 @@ def row_of(info: Mapping[str, Any], row: int) -> dict[str, Any]:
     # again.
     values = {name: value.item(row) for name, value in info.items() if name not in _NO_NUMBERS}
     # A copy, since arrays are views of what the next step overwrites.
-    values[ACTION_MASK] = info[ACTION_MASK][row].copy()
+    if ACTION_MASK in info:
+        values[ACTION_MASK] = info[ACTION_MASK][row].copy()
     terms = info[keys.REWARD_TERMS]
     values[keys.REWARD_TERMS] = {name: value.item(row) for name, value in terms.items()}
     return values
@@ -167,31 +183,41 @@ def array_of(value: Any) -> npt.NDArray[Any]:
         return np.asarray(None)
 
 
-def action_of(action: Any) -> int:
-    """A user's action of one environment; an array of one number will do.
+def action_of(action: Any, actions: ActionParameters) -> Integers | Floats:
+    """A user's action of one environment, [1] or [1, 2]; of a number an array of one will do.
 
     Raises:
         UserError: as :func:`actions_of`.
     """
     # Plain numbers are most of them; to look at an array takes 3 of a step's 25 microseconds.
-    if type(action) in (int, np.int64) and 0 <= action < keys.ACTIONS:
-        return action
-    return int(actions_of(array_of(action).reshape(-1), 1)[0])
+    if type(action) in (int, np.int64) and 0 <= action < len(actions.names):
+        return np.array([action])
+    array = array_of(action)
+    return actions_of(array.reshape(-1) if actions.names else array[None], 1, actions)
 
 
-def actions_of(actions: Any, rows: int) -> Integers:
-    """A user's actions as an array [rows] int64.
+def actions_of(commanded: Any, rows: int, actions: ActionParameters) -> Integers | Floats:
+    """A user's actions as an array [rows] int64, or [rows, 2] float32.
 
     Raises:
-        UserError: another shape, or no such action.
+        UserError: another shape, no such action, or a number that is not finite.
     """
-    array = array_of(actions)
+    array = array_of(commanded)
+    if not actions.names:
+        fits = array.shape == (rows, CONTROLS) and array.dtype.kind in "iuf"
+        if not fits or not np.isfinite(array).all():
+            raise UserError(
+                f"action {commanded!r:.80}: expected {rows} times {CONTROLS} numbers from -1 to 1, "
+                "acceleration and lateral target; give both for every environment."
+            )
+        return array.astype(np.float32, copy=False)
     # Before any cast, which would round and wrap.
     whole = array.shape == (rows,) and array.dtype.kind in "iu"
-    if not whole or not 0 <= array.min() <= array.max() < keys.ACTIONS:
+    if not whole or not 0 <= array.min() <= array.max() < len(actions.names):
+        meanings = [f"{number} ({name})" for number, name in enumerate(actions.names)]
         raise UserError(
-            f"action {actions!r:.80}: expected {rows} whole number(s), 0 (keep), 1 (left) or "
-            "2 (right); give one for every environment."
+            f"action {commanded!r:.80}: expected {rows} whole number(s), "
+            f"{', '.join(meanings[:-1])} or {meanings[-1]}; give one for every environment."
         )
     return array.astype(np.int64, copy=False)
 

@@ -14,7 +14,7 @@ from ganlane.errors import UserError
 from ganlane.gym.base import OnRows, make_rows
 from ganlane.gym.rows import SEEDS, Floats, action_of, reset_options, row_of
 from ganlane.gym.window import FilmWindow, has_display
-from ganlane.keys import ACTIONS, PHYSICS_STEP_S
+from ganlane.keys import PHYSICS_STEP_S
 
 if TYPE_CHECKING:
     from gymnasium.wrappers import RecordVideo
@@ -38,9 +38,9 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
             ``transforms``, ``stream``, ``device``, and keys of the environment.
 
     ``reset(seed=s)`` begins episode 0 of seed s, every further ``reset()`` the next one;
-    ``reset(options={"episode": k})`` runs episode k. ``action`` is 0 (keep), 1 (left) or 2 (right);
-    docs/gymnasium.md lists observations and infos. ``spec.max_episode_steps`` follows from
-    ``timeout_s``.
+    ``reset(options={"episode": k})`` runs episode k. ``action`` is 0 (keep), 1 (left) or 2 (right)
+    unless ``actions`` says otherwise; docs/gymnasium.md lists actions, observations and infos.
+    ``spec.max_episode_steps`` follows from ``timeout_s``.
 
     Raises:
         UserError: a wrong value, or ``human`` without a display.
@@ -74,7 +74,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
             options,
         )
         self.observation_space: gymnasium.spaces.Box = self._rows.space  # type: ignore[assignment]
-        self.action_space = gymnasium.spaces.Discrete(ACTIONS)
+        self.action_space = self._rows.action_space()
         self.render_mode = render_mode
         fps = FPS
         if render_mode == "rgb_array":  # a picture per decision
@@ -127,11 +127,12 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         """One decision: observation, reward, terminated, truncated, info."""
         if not self._running:
             raise UserError("step(): no episode is under way; call reset() first.")
-        number = action_of(action)
+        commanded = action_of(action, self._rows.actions)
         # The view records the physics steps of the decision through the environment's recorder.
         if self._view is not None:
-            self._view.before_step(number)
-        stepped = self._rows.step(np.array([number]))
+            # Pictures name the numbered actions.
+            self._view.before_step(int(commanded[0]) if self._rows.actions.names else -1)
+        stepped = self._rows.step(commanded)
         reward = float(stepped.reward[0])
         terminated = bool(stepped.terminated[0])
         truncated = bool(stepped.truncated[0])
@@ -161,7 +162,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         wrapper.frames_per_sec = FPS
 
     def action_masks(self) -> npt.NDArray[np.bool_]:
-        """Which actions are allowed now, bool [3]; sb3-contrib's MaskablePPO asks for them."""
+        """Which actions are allowed now, bool [A]; sb3-contrib's MaskablePPO asks for them."""
         return self._rows.mask()[0].copy()
 
     def render(self) -> Any:

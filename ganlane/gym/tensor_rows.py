@@ -67,7 +67,7 @@ class TensorRows(Rows):
         self.state = self.env.reset(self.now().set("_reset", mask))
 
     @torch.no_grad()
-    def step(self, actions: Integers) -> Stepped:
+    def step(self, actions: Integers | Floats) -> Stepped:
         action = torch.as_tensor(actions, device=self.env.device)
         stepped = self.env.step(self.now().set(keys.ACTION, action))
         # Rows are not reset here: the environments above decide when.
@@ -95,7 +95,7 @@ class TensorRows(Rows):
         # An environment with a mask has computed it; without one it is the actions on the road.
         mask = state.get(keys.ACTION_MASK, None)
         if mask is None:
-            mask = legal_actions(state, road_in(state, self.env.base_env.road))
+            mask = legal_actions(state, road_in(state, self.env.base_env.road), self.actions)
         return _array(mask)
 
     def state_arrays(self) -> Mapping[str, Any]:

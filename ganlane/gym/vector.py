@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
@@ -15,10 +14,9 @@ from ganlane.arguments import seed_number, whole_number
 from ganlane.errors import UserError
 from ganlane.gym.base import OnRows, make_rows
 from ganlane.gym.rows import SEEDS, Flags, Floats, actions_of, array_of, reset_options
-from ganlane.keys import ACTIONS
 
 
-class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]]):
+class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[Any]]):
     """``gymnasium.make_vec("ganlane/Highway-v0", num_envs=64, ...)``.
 
     Args:
@@ -98,7 +96,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         fps = max(1, round(1.0 / episode.decision_period_s))
         self.metadata = {**self.metadata, "autoreset_mode": self._mode, "render_fps": fps}
         self.single_observation_space = self._rows.space
-        self.single_action_space = Discrete(ACTIONS)
+        self.single_action_space = self._rows.action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._seed = None if seed is None else seed_number(seed)
@@ -187,12 +185,14 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
                 "reset(options={'reset_mask': mask}) first, or choose another autoreset_mode."
             )
         # The arrays of the rows are overwritten by their next call; what callers get are copies.
-        stepped = self._rows.step(actions_of(actions, self.num_envs))
+        commanded = actions_of(actions, self.num_envs, self._rows.actions)
+        stepped = self._rows.step(commanded)
         reward = stepped.reward.astype(np.float64)
         terminated = stepped.terminated.copy()
         truncated = stepped.truncated.copy()
         if self._view is not None:
-            self._view.after_step(actions, reward)
+            # Pictures name the numbered actions.
+            self._view.after_step(commanded if self._rows.actions.names else -1, reward)
         # NEXT_STEP: these rows ended one step ago. They were stepped with the others, which is
         # discarded here.
         if waiting.any():
@@ -214,7 +214,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         return observation, reward, terminated, truncated, info | final
 
     def action_masks(self) -> Flags:
-        """Which actions are allowed now, bool [N, 3]."""
+        """Which actions are allowed now, bool [N, A]."""
         return self._rows.mask().copy()
 
     def render(self) -> tuple[Any, ...] | None:

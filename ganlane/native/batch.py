@@ -278,7 +278,7 @@ class NativeBatch:
     def _part_of_row(self) -> npt.NDArray[np.int64]:
         return self._turns[self.state[keys.EPISODE] % len(self._turns)]
 
-    def step(self, actions: npt.NDArray[np.int64]) -> Stepped:
+    def step(self, actions: npt.NDArray[Any]) -> Stepped:
         """One decision of every row, by the actions [N]; no row is reset."""
         # Copied, since the kernel holds the address of this array.
         self.state[keys.ACTION][:] = actions

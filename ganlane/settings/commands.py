@@ -99,6 +99,7 @@ class DrivingConfig(RunConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_reward(self.env, self.reward)
+        self.env.actions.check_mask(self.mask.form)
 
 
 @dataclass(frozen=True)
@@ -202,6 +203,10 @@ class RecordConfig(HighwayConfig):
     # where they go
     out: Text | None = None
     dataset: Annotated[str, _DATASET] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.env.actions.check_lane("record")
 
     def dataset_name(self) -> str:
         """The dataset's name; by default made from traffic and driver."""

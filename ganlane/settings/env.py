@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from ganlane.arguments import call_with
 from ganlane.errors import ParameterError, as_typed
+from ganlane.settings.actions import ActionParameters
 from ganlane.settings.driving import EgoParameters, IdmParameters, MobilParameters, Visibility
 from ganlane.settings.episode import KERNELS, EpisodeParameters, SpawnParameters
 from ganlane.settings.observation import RewardParameters
@@ -330,6 +331,7 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
             does the same up to rounding on a CPU (not for recordings, foreign simulators and
             traffic of your own), or the kernel where it can (auto).
         scene: the first scene, set by hand; null: Table II.
+        actions: what the ego's driver commands: lane (the paper's), lane_speed or continuous.
         ego: how the ego drives.
         idm: how all follow, Table V.
         mobil: how the others change lanes, Table IV.
@@ -350,6 +352,7 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
     kernel: Annotated[str, one_of(KERNELS)] = "auto"
     # what stands at the start, and how everybody drives
     scene: SceneConfig | None = None
+    actions: ActionParameters = field(default_factory=ActionParameters)
     ego: EgoParameters = field(default_factory=EgoParameters)
     idm: IdmParameters = field(default_factory=IdmParameters)
     mobil: MobilParameters = field(default_factory=MobilParameters)

@@ -129,6 +129,10 @@ class TrainConfig(DrivingConfig):
     pretrain: PretrainConfig = field(default_factory=PretrainConfig)
     evaluation: FinalEvaluationConfig = field(default_factory=FinalEvaluationConfig)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.env.actions.check_lane("train")
+
     def compiles(self) -> bool:
         """Whether the agent's update is compiled."""
         # Imported here, since it imports torch, which takes seconds.

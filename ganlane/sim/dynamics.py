@@ -136,6 +136,8 @@ def steer(
 
 #: The side to which each action wishes to go: keep, left, right.
 SIDES = (0, 1, -1)
+#: The same with the actions that change the speed: faster, slower.
+COMMANDED_SIDES = (*SIDES, 0, 0)
 
 
 class Command(NamedTuple):
@@ -181,13 +183,13 @@ def stays_on_road(
 def apply_action(
     action: Tensor, vehicles: Vehicles, direction: Tensor, road: Road, abort: bool
 ) -> Command:
-    """Apply ``action`` (0 keep, 1 left, 2 right) to an ego whose current lane change has
-    ``direction``; [N] int64.
+    """Apply ``action`` (0 keep, 1 left, 2 right; others keep the lane) to an ego whose current lane
+    change has ``direction``; [N] int64.
 
     An action that is not heard has no effect and no penalty (:func:`is_heard`); one that would
     leave the road has no effect except ``off_road``.
     """
-    side = constant(SIDES, action)[action]
+    side = constant(COMMANDED_SIDES, action)[action]
     # First what the ego ignores, then what the road does not have.
     side = torch.where(is_heard(side, direction, abort), side, 0)
     # The episode ends with this command; the target lane stays a lane of the road.
@@ -211,23 +213,22 @@ def move_ego(
     vehicles: Vehicles,
     acceleration: Tensor,
     steering: Tensor,
-    road: Road,
+    line: Tensor,
     wheel: SteeringParameters,
     dt: float,
 ) -> tuple[Vehicles, Tensor]:
     """The ego after ``dt`` seconds (fields [N]) and its steering angle (rad, [N]).
 
-    It accelerates with ``acceleration`` (m/s2, [N]) and steers towards its target lane.
+    It accelerates with ``acceleration`` (m/s2, [N]) and steers to the line at ``line`` (m, [N]).
     """
     ego = vehicles.at(EGO_INDEX)
-    # The kinematics know no lanes: a lane change is another centre to steer to.
-    centre = road.centre_of(vehicles.target_lane[:, :1], ego.y.dtype)[:, 0]
+    # The kinematics know no lanes: a lane change is another line to steer to.
     steering = steer(
         steering,
         ego.y,
         ego.heading,
         ego.speed,
-        centre,
+        line,
         dt,
         wheel,
     )

@@ -84,6 +84,20 @@ def may_change(
     return (side == 0) | (there & exists(road, lane, x))
 
 
+def leaves_road(
+    road: Road,
+    y: Tensor,
+    new_y: Tensor,
+    x: Tensor,
+) -> Tensor:
+    """Whether a body at ``x`` that moves from ``y`` to ``new_y`` has crossed a line beside which
+    there is no lane to change into; m, [N, 1], bool.
+    """
+    lane = torch.round(y / road.lane_width_m)
+    side = torch.round(new_y / road.lane_width_m) - lane
+    return (side != 0) & ~may_change(road, lane, side, x)
+
+
 def room_before_wall(
     vehicles: Vehicles,
     lanes: Tensor,

@@ -96,6 +96,7 @@ def _settings(driver: Driver, config: EvaluateConfig) -> dict[str, Any]:
     # They change how fast the cell is driven, not what happens.
     for name in ("threads", "columns", "num_envs", "agents", "traffics"):
         del settings[name]
+    settings["env"] = asdict(driver.env(config.env))
     return {
         **settings,
         "driver": driver.name,

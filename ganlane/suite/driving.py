@@ -61,21 +61,23 @@ def compare(
             for driver in drivers:
                 observation = config.observation.read_by(driver.observation)
                 mask, policy = driver.behind(config.mask)
+                of_driver = driver.env(env)
                 # All but the number of rows, which shrinks towards the end.
                 make = partial(
                     make_env,
                     module,
-                    env,
+                    of_driver,
                     observation,
                     config.reward,
                     seed=seed,
                     device=config.device,
                     mask=mask,
                 )
-                if current != (traffic, observation, mask):
-                    # Drivers with the same observation and mask share an environment, so that it is
-                    # compiled once.
-                    current = (traffic, observation, mask)
+                parts = (traffic, observation, mask, of_driver.actions)
+                if current != parts:
+                    # Drivers with the same observation, mask and actions share an environment, so
+                    # that it is compiled once.
+                    current = parts
                     batch = make(min(config.num_envs, len(numbers)))
                 report = None if quiet else _reporter(bar, f"{driver.name} on {traffic}")
                 table = evaluation.run_episodes(

@@ -26,7 +26,7 @@ def drive_episode(
     mask, policy = driver.behind(config.mask)
     env = make_env(
         make_traffic(traffic, config.env, Stream.named(config.stream)),
-        config.env,
+        driver.env(config.env),
         config.observation.read_by(driver.observation),
         config.reward,
         device=config.device,

@@ -1,11 +1,11 @@
-"""Action masks: which of the ego's three actions are allowed at each decision.
+"""Action masks: which of the ego's numbered actions are allowed at each decision.
 
 A mask is a safety layer between a driver and the road (action masking, Krasowski et al. 2020;
 shielding, Alshiekh et al. 2018): computed by rules, never learnt, and the same for every driver.
 ``legal`` removes commands without an effect (off the road, or during a lane change). ``safe`` also
 removes lane changes that violate MOBIL's safety criterion (Kesting et al. 2007): after the change
 neither the new follower nor the ego itself would have to brake harder than ``safe_deceleration`` by
-IDM. Keeping the lane is always allowed.
+IDM. Keeping the lane is always allowed, and so are faster and slower where they have an effect.
 
 The mask uses what the ego perceives: with sensor errors it can be wrong. It holds at the instant of
 the command; a lane change that has begun continues (or, with ``abort_lane_change``, can be turned
@@ -22,9 +22,10 @@ from torchrl.data.tensor_specs import Binary
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.keys import ACTIONS
 from ganlane.native.tensors import SafeActions
+from ganlane.settings.actions import LANE_SPEED, ActionParameters
 from ganlane.settings.driving import IdmParameters
+from ganlane.sim.actions import speed_changes
 from ganlane.sim.dynamics import SIDES, ego_scene, is_heard, stays_on_road
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import lane_accelerations
@@ -54,8 +55,14 @@ def braking_demand(
     return torch.minimum(accelerations.observer, accelerations.with_it)[:, 0]
 
 
+def allowed_speeds(state: TensorDictBase, actions: ActionParameters) -> Tensor:
+    """Whether ``faster`` and ``slower`` have an effect in ``state``, bool [N, 2]."""
+    desired = state.get(keys.VEHICLES).get("desired_speed")[:, keys.EGO_INDEX]
+    return speed_changes(state.get(keys.EGO).get("set_speed"), desired, actions)
+
+
 class ActionMaskTransform(PerceptionTransform):
-    """Write ``action_mask`` [N, 3] bool: which actions are allowed; TorchRL's key and meaning.
+    """Write ``action_mask`` [N, A] bool: which actions are allowed; TorchRL's key and meaning.
 
     Belongs after a :class:`~ganlane.transforms.SensorTransform`. Append TorchRL's own
     ``ActionMask()`` to restrict the action spec, and with it ``env.rand_action``.
@@ -72,9 +79,11 @@ class ActionMaskTransform(PerceptionTransform):
         abort: whether the ego may turn back during a lane change (``env.ego.abort_lane_change``).
         native_vehicles: M, where the native kernel computes ``safe`` (float32, CPU); None: the
             tensor code does.
+        actions: those of the environment.
 
     Raises:
-        UserError: an unknown form, or a deceleration that is not above 0.
+        UserError: an unknown form, actions that are not numbered, or a deceleration that is not
+            above 0.
     """
 
     def __init__(
@@ -85,6 +94,7 @@ class ActionMaskTransform(PerceptionTransform):
         idm: IdmParameters = TABLE_V,
         abort: bool = False,
         native_vehicles: int | None = None,
+        actions: ActionParameters | None = None,
     ) -> None:
         if form not in FORMS:
             raise UserError(
@@ -94,6 +104,8 @@ class ActionMaskTransform(PerceptionTransform):
             raise UserError(
                 f"mask.safe_deceleration={safe_deceleration:g}: expected a number above 0, in m/s2."
             )
+        self.actions = actions or ActionParameters()
+        self.actions.check_mask(form)
         # Behind legal there is nothing to report: keeping the lane is always legal.
         out_keys = [keys.ACTION_MASK]
         if form == "safe":
@@ -151,6 +163,8 @@ class ActionMaskTransform(PerceptionTransform):
             mask, none = self.native.allowed(seen, direction)
         else:
             mask, none = self.allowed(seen, direction, road_in(state, self.road))
+        if self.actions.form == LANE_SPEED:
+            mask = torch.cat((mask, allowed_speeds(state, self.actions)), dim=1)
         state.set(keys.ACTION_MASK, mask)
         return state.set(keys.NO_SAFE_ACTION, none[:, None]) if self.form == "safe" else state
 
@@ -158,7 +172,7 @@ class ActionMaskTransform(PerceptionTransform):
         """Add the mask to the spec."""
         assert isinstance(observation_spec, Composite)
         for name in self.out_keys:
-            size = ACTIONS if name == keys.ACTION_MASK else 1
+            size = len(self.actions.names) if name == keys.ACTION_MASK else 1
             observation_spec[name] = Binary(
                 shape=(*observation_spec.shape, size),
                 dtype=torch.bool,

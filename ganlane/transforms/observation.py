@@ -24,6 +24,7 @@ from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.native.tensors import LaneView, wants_gradient
+from ganlane.settings.actions import CONTINUOUS, LANE_SPEED, ActionParameters
 from ganlane.settings.observation import NEARNESS_M, OVERLAP_M, ROAD_SIGHT_M, ObservationScale
 from ganlane.sim.lane_ends import begins, ends, may_change, of_lane, on_road
 from ganlane.sim.state import Road, Vehicles, road_in
@@ -254,9 +255,35 @@ OBSERVATIONS: Final[dict[str, tuple[Part, ...]]] = {
 }
 
 
-def observation_size(name: str, vehicles: int) -> int:
+#: Numbers at the end of every form that the driver needs to command more than the lane.
+CONTROL_NUMBERS: Final = {LANE_SPEED: 1, CONTINUOUS: 2}
+#: Heading that counts as 1, rad: some 5 m/s to the side at 25 m/s.
+HEADING_RAD = 0.2
+
+
+def control_numbers(
+    vehicles: Vehicles,
+    set_speed: Tensor | None,
+    road: Road,
+) -> Tensor:
+    """What the driver needs to command more than the lane, [N, 1] or [N, 2].
+
+    With a ``set_speed`` [N], m/s, that over the desired speed; without one, for ``continuous``, the
+    ego's offset in its lane (1 on the left line, -1 on the right one) and its heading over
+    :data:`HEADING_RAD`, to the left positive, clipped.
+    """
+    ego = vehicles.columns(slice(0, 1))
+    if set_speed is not None:
+        return set_speed[:, None] / ego.desired_speed
+    centre = road.centre_of(road.lane_of(ego.y), ego.y.dtype)
+    offset = 2.0 * (ego.y - centre) / road.lane_width_m
+    return torch.cat((offset, ego.heading / HEADING_RAD), dim=1).clamp(-1.0, 1.0)
+
+
+def observation_size(name: str, vehicles: int, actions: ActionParameters | None = None) -> int:
     """Length D of observation ``name`` for ``vehicles`` vehicles, the ego included."""
-    return sum(part.size(vehicles - 1) for part in OBSERVATIONS[name])
+    parts = sum(part.size(vehicles - 1) for part in OBSERVATIONS[name])
+    return parts + (0 if actions is None else CONTROL_NUMBERS.get(actions.form, 0))
 
 
 class ObservationTransform(PerceptionTransform):
@@ -268,6 +295,7 @@ class ObservationTransform(PerceptionTransform):
         form: a key of :data:`OBSERVATIONS`.
         scale: normalisers.
         native: the native kernel computes the forms in ``NATIVE_FORMS``, for float32 on a CPU.
+        actions: those of the environment; :func:`control_numbers` are at the end for some.
 
     Raises:
         UserError: an unknown form, or fewer than two vehicles.
@@ -280,6 +308,7 @@ class ObservationTransform(PerceptionTransform):
         form: str = "table3_progress",
         scale: ObservationScale | None = None,
         native: bool = False,
+        actions: ActionParameters | None = None,
     ) -> None:
         super().__init__(in_keys=[keys.VEHICLES, keys.EGO], out_keys=[keys.OBSERVATION])
         if form not in OBSERVATIONS:
@@ -294,6 +323,7 @@ class ObservationTransform(PerceptionTransform):
         self.road = road
         self.vehicles = vehicles
         self.form = form
+        self.actions = actions or ActionParameters()
         self.scale = scale or ObservationScale()
         self.native: LaneView | None = None
         if native and form in NATIVE_FORMS:
@@ -358,12 +388,16 @@ class ObservationTransform(PerceptionTransform):
                 road,
                 seen,
             )
+        if self.actions.form in CONTROL_NUMBERS:
+            set_speed = ego.get("set_speed") if self.actions.form == LANE_SPEED else None
+            further = control_numbers(vehicles, set_speed, road_in(state, self.road))
+            observation = torch.cat((observation, further), dim=1)
         return state.set(keys.OBSERVATION, observation)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add ``observation`` to the spec."""
         assert isinstance(observation_spec, Composite)
-        shape = (*observation_spec.shape, observation_size(self.form, self.vehicles))
+        shape = (*observation_spec.shape, observation_size(self.form, self.vehicles, self.actions))
         true = observation_spec[keys.VEHICLES, "x"]
         observation_spec[keys.OBSERVATION] = Unbounded(
             shape=shape,

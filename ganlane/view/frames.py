@@ -13,10 +13,11 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw
 
 from ganlane.keys import PHYSICS_STEP_S
+from ganlane.settings.actions import LANE_SPEED, NUMBERED
 from ganlane.settings.render import FilmConfig
 from ganlane.view import canvas
 from ganlane.view.canvas import HEADER_HEIGHT, SMALL, Backdrop, Window, put_text
-from ganlane.view.record import ACTION_NAMES, EpisodeLabel, FloatArray, Trajectory
+from ganlane.view.record import EpisodeLabel, FloatArray, Trajectory
 
 Picture = npt.NDArray[np.uint8]
 
@@ -199,7 +200,7 @@ class FramePainter:
             f"{t.speed[frame, 0]:.1f} m/s",
             f"{t.returns[frame]:.1f}",
             # There is none before the first decision.
-            "-" if action < 0 else ACTION_NAMES[action],
+            "-" if action < 0 else NUMBERED[LANE_SPEED][action],
         )
         picture.paste(self._header, (0, 0))
         column = self._values_at

@@ -21,6 +21,8 @@ SIGNALLED = 2
 KEEP = 0
 LEFT = 1
 RIGHT = 2
+FASTER = 3
+SLOWER = 4
 
 
 @dataclass
@@ -53,6 +55,8 @@ class Rules:
     ring: float | None = None
     # of every lane: beginning, end, and what is there (wall, exit or nothing); none: all go on
     stretches: tuple[tuple[float, float, str], ...] = ()
+    # what the ego is commanded: lane, lane_speed or continuous
+    actions: str = "lane"
 
 
 @dataclass
@@ -65,6 +69,11 @@ class State:
     close_ahead: bool = False
     close_behind: bool = False
     lane_changes: int = 0
+    # of lane_speed: what the ego aims at
+    set_speed: float = 25.0
+    # of continuous: the line that the ego steers to, and what it accelerates with
+    line: float | None = None
+    throttle: float | None = None
 
 
 @dataclass
@@ -410,16 +419,19 @@ def physics_step(state: State, rules: Rules) -> None:
     if rules.mobil and state.step % 10 == 0:
         for i, change in mobil_changes(view).items():
             state.cars[i] = replace(state.cars[i], target_lane=state.cars[i].target_lane + change)
+    lines = [car.target_lane * rules.lane_width for car in state.cars]
+    if state.line is not None and state.throttle is not None:
+        lines[0] = state.line
+        accelerations[0] = state.throttle
     state.cars = [
-        driven(car, a, steered(car, car.target_lane * rules.lane_width))
-        for car, a in zip(state.cars, accelerations)
+        driven(car, a, steered(car, line)) for car, a, line in zip(state.cars, accelerations, lines)
     ]
     state.step += 1
 
 
 def obey(state: State, action: int, rules: Rules) -> tuple[bool, bool]:
     """Whether the command starts a change, and whether it would leave the road."""
-    wish = {KEEP: 0, LEFT: 1, RIGHT: -1}[action]
+    wish = {LEFT: 1, RIGHT: -1}.get(action, 0)
     turns_back = rules.abort and state.direction != 0 and wish == -state.direction
     if wish == 0 or (state.direction != 0 and not turns_back):
         return False, False
@@ -433,19 +445,53 @@ def obey(state: State, action: int, rules: Rules) -> tuple[bool, bool]:
     return True, False
 
 
-def decide(state: State, action: int, rules: Rules) -> Outcome:
+def crossing_allowed(lane: int, other: int, x: float, rules: Rules) -> bool:
+    return lane == other or (there_is(lane, x, rules) and there_is(other, x, rules))
+
+
+def be_steered(state: State, pedal: float, wheel: float, rules: Rules) -> bool:
+    """Acceleration and line of this decision; whether the lane aimed at becomes another one."""
+    ego = state.cars[0]
+    lane = min(rules.lanes - 1, max(0, round(ego.y / rules.lane_width)))
+    state.line = (lane + wheel) * rules.lane_width
+    target = lane + (wheel > 0.5) - (wheel < -0.5)
+    if not crossing_allowed(lane, target, ego.x, rules):
+        target = lane
+    # Up to 3 m/s2, and 8 m/s2 braking; no faster than desired at the end of the decision.
+    remaining = max(0.0, (ego.desired_speed - ego.speed) / (rules.substeps * DT))
+    state.throttle = min(pedal * (3.0 if pedal > 0 else 8.0), remaining)
+    if target == ego.target_lane:
+        return False
+    state.direction = 1 if target > ego.target_lane else -1
+    state.cars[0] = replace(ego, target_lane=target)
+    state.lane_changes += 1
+    return True
+
+
+def decide(state: State, action: int | tuple[float, float], rules: Rules) -> Outcome:
     """One decision, in place; a state that has ended stays as it was at that instant."""
     outcome = Outcome()
     start_speed = state.cars[0].speed
     start_step = state.step
-    outcome.started_change, off_road = obey(state, action, rules)
+    off_road = False
+    desired = state.cars[0].desired_speed
+    if isinstance(action, tuple):
+        outcome.started_change = be_steered(state, *action, rules)
+    else:
+        outcome.started_change, off_road = obey(state, action, rules)
+    if rules.actions == "lane_speed":
+        wanted = state.set_speed + {FASTER: 2.5, SLOWER: -2.5}.get(action, 0.0)
+        state.set_speed = min(desired, max(min(5.0, desired), wanted))
+        state.cars[0] = replace(state.cars[0], desired_speed=state.set_speed)
     if off_road:
         outcome.reasons.append("out_of_road")
     for _ in range(rules.substeps):
         if outcome.reasons:
             break
+        lane = round(state.cars[0].y / rules.lane_width)
         physics_step(state, rules)
         ego = state.cars[0]
+        left = not crossing_allowed(lane, round(ego.y / rules.lane_width), ego.x, rules)
         ahead, behind = ego_close(View(state.cars, rules))
         outcome.soft_crash += ahead and not state.close_ahead
         outcome.soft_crash_behind += behind and not state.close_behind
@@ -454,11 +500,13 @@ def decide(state: State, action: int, rules: Rules) -> Outcome:
         hit = any(overlap(ego, other) for other in state.cars[1:] if other.valid)
         if hit or in_the_wall(ego, rules):
             outcome.reasons.append("hard_crash")
+        elif rules.actions == "continuous" and left:
+            outcome.reasons.append("out_of_road")
         elif arrival(ego, rules):
             outcome.reasons.append(arrival(ego, rules))
         elif state.step >= rules.timeout_steps:
             outcome.reasons.append("timeout")
-    ego = state.cars[0]
+    state.cars[0] = ego = replace(state.cars[0], desired_speed=desired)
     if settled(ego, rules):
         state.direction = 0
     if state.step > start_step:

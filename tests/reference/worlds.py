@@ -195,6 +195,7 @@ def rules_of(env: HighwayEnv) -> scalar.Rules:
         timeout_steps=round(env.episode.timeout_s / 0.1),
         ring=env.road.ring_m,
         stretches=tuple((its.begin_m, its.end_m, its.end) for its in env.road.stretches),
+        actions=env.actions.form,
     )
 
 
@@ -211,7 +212,10 @@ def step(
 ) -> TensorDictBase:
     """The state after one decision; ``td`` stays as it is."""
     td = td.clone()
-    td["action"] = torch.as_tensor(action, dtype=torch.int64).expand(env.batch_size).clone()
+    if env.actions.names:
+        td["action"] = torch.as_tensor(action, dtype=torch.int64).expand(env.batch_size).clone()
+    else:
+        td["action"] = torch.as_tensor(action, dtype=torch.float64).expand(*env.batch_size, 2)
     return env.step(td)["next"]
 
 
@@ -229,6 +233,7 @@ def scalar_state(td: TensorDictBase, row: int) -> scalar.State:
         scalar.Car(**{name: value[i] for name, value in fields.items()}, steering=steering[i])
         for i in range(count)
     ]
+    set_speed = td.get((keys.EGO, "set_speed"), None)
     return scalar.State(
         cars,
         step=td[keys.STEP][row].item(),
@@ -236,6 +241,7 @@ def scalar_state(td: TensorDictBase, row: int) -> scalar.State:
         close_ahead=td[keys.EGO, "soft_crash"][row].item(),
         close_behind=td[keys.EGO, "soft_crash_behind"][row].item(),
         lane_changes=td[keys.EGO, "lane_changes"][row].item(),
+        set_speed=25.0 if set_speed is None else set_speed[row].item(),
     )
 
 

@@ -1,0 +1,228 @@
+"""Egos that are commanded more than a lane: `lane_speed` and `continuous`."""
+
+from __future__ import annotations
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from reference.worlds import environment, placed, step, vehicles
+from torchrl.envs.utils import check_env_specs
+
+import ganlane
+from ganlane import keys
+from ganlane.env import HighwayEnv
+from ganlane.errors import UserError
+from ganlane.settings.actions import ActionParameters
+from ganlane.settings.road import WALL, LaneStretch, Stretches
+from ganlane.transforms import ActionMaskTransform, observation_size
+
+KEEP, LEFT, RIGHT, FASTER, SLOWER = range(5)
+FAR = {"x": -900.0}
+
+
+def alone(form: str, *, stretches: Stretches = (), lanes: int = 3, **ego: float) -> tuple:
+    """An environment and its state, with the ego alone in the right lane at 20 m/s."""
+    env = environment(
+        lanes, vehicles=2, mobil=False, stretches=stretches, actions=ActionParameters(form)
+    )
+    return env, placed(env, vehicles({"x": 0.0, "visibility": 1, **ego}, FAR))
+
+
+def driven(env: HighwayEnv, td, action, decisions: int):
+    for _ in range(decisions):
+        td = step(env, td, action)
+        if td["done"].item():
+            break
+    return td
+
+
+def ego(td, name: str) -> float:
+    return td[keys.VEHICLES, name][0, 0].item()
+
+
+# lane_speed
+
+
+def test_an_ego_that_is_told_slower_slows_down_to_the_lowest_speed_and_faster_to_the_desired_one():
+    env, td = alone("lane_speed")
+    slow = driven(env, td, SLOWER, 60)
+    assert ego(slow, "speed") == pytest.approx(5.0, abs=0.1)
+    fast = driven(env, slow, FASTER, 100)
+    assert ego(fast, "speed") == pytest.approx(25.0, abs=0.3)
+    assert ego(fast, "desired_speed") == ego(slow, "desired_speed") == 25.0
+
+
+def test_one_slower_sets_the_speed_one_step_below_and_it_stays():
+    env, td = alone("lane_speed", speed=25.0)
+    td = driven(env, step(env, td, SLOWER), KEEP, 60)
+    assert td[keys.EGO, "set_speed"].item() == 22.5
+    assert ego(td, "speed") == pytest.approx(22.5, abs=0.1)
+
+
+def test_without_commands_of_speed_an_episode_is_the_same_as_with_the_papers_actions():
+    rng = torch.Generator().manual_seed(0)
+    paper = environment(num_envs=16, seed=3)
+    more = environment(num_envs=16, seed=3, actions=ActionParameters("lane_speed"))
+    one, other = paper.reset(), more.reset()
+    for _ in range(20):
+        action = torch.randint(0, 3, (16,), generator=rng)
+        one, other = step(paper, one, action), step(more, other, action)
+        for name in keys.VEHICLE_FIELDS:
+            assert torch.equal(one[keys.VEHICLES, name], other[keys.VEHICLES, name])
+
+
+def test_faster_and_slower_are_allowed_where_they_have_an_effect():
+    env, td = alone("lane_speed")
+    mask = ActionMaskTransform(env.road, "legal", actions=env.actions)
+    td = mask._call(td)
+    assert td[keys.ACTION_MASK][0].tolist() == [True, True, False, False, True]
+    td = mask._call(driven(env, td, SLOWER, 12))
+    assert td[keys.ACTION_MASK][0].tolist() == [True, True, False, True, False]
+
+
+def test_the_speed_aimed_at_is_the_last_number_of_the_observation():
+    env = ganlane.make_env(actions="lane_speed", seed=1)
+    td = env.reset()
+    assert td["observation"][0, -1] == 1.0
+    td = env.step(td.set("action", torch.tensor([SLOWER])))["next"]
+    assert td["observation"][0, -1].item() == pytest.approx(0.9)
+    assert td["observation"].shape[1] == observation_size("lane_view_overlap", 9) + 1
+
+
+# continuous
+
+
+@pytest.mark.parametrize(("pedal", "expected"), [(1.0, 3.0), (-1.0, -8.0), (0.0, 0.0)])
+def test_the_pedal_is_the_acceleration(pedal, expected):
+    env, td = alone("continuous", speed=20.0)
+    after = step(env, td, (pedal, 0.0))
+    assert ego(after, "speed") == pytest.approx(20.0 + expected)
+    assert after[keys.EGO, "mean_acceleration"].item() == pytest.approx(expected)
+
+
+def test_the_ego_gets_no_faster_than_desired_and_brakes_to_a_stop():
+    env, td = alone("continuous", speed=24.0)
+    assert ego(driven(env, td, (1.0, 0.0), 5), "speed") == pytest.approx(25.0)
+    assert ego(driven(env, td, (-1.0, 0.0), 5), "speed") == 0.0
+
+
+def test_who_does_not_brake_runs_into_the_car_ahead():
+    env, td = alone("continuous")
+    td = placed(env, vehicles({"x": 0.0}, {"x": 60.0, "speed": 0.0, "desired_speed": 0.001}))
+    assert driven(env, td, (0.0, 0.0), 10)[keys.EVENTS, "hard_crash"].item()
+    assert not driven(env, td, (-1.0, 0.0), 10)[keys.EVENTS, "hard_crash"].item()
+
+
+def test_a_wheel_of_one_leads_to_the_next_lane_and_of_zero_keeps_its_centre():
+    env, td = alone("continuous")
+    while ego(td, "y") < 2.0:
+        td = step(env, td, (0.0, 1.0))
+    assert td[keys.EGO, "lane_changes"].item() == 1
+    td = driven(env, td, (0.0, 0.0), 6)
+    assert ego(td, "y") == pytest.approx(4.0, abs=0.05)
+    assert td[keys.EGO, "lane_changes"].item() == 1
+    assert td[keys.EGO, "change_direction"].item() == 0
+
+
+def test_a_line_within_the_lane_is_no_lane_change():
+    env, td = alone("continuous")
+    td = driven(env, td, (0.0, 0.25), 8)
+    assert ego(td, "y") == pytest.approx(1.0, abs=0.05)
+    assert td[keys.EGO, "lane_changes"].item() == 0
+
+
+def test_whose_centre_crosses_the_edge_has_left_the_road():
+    env, td = alone("continuous")
+    td = driven(env, td, (0.0, -1.0), 10)
+    assert td[keys.EVENTS, "out_of_road"].item()
+    assert td["terminated"].item()
+    assert ego(td, "y") < -2.0
+
+
+def test_a_line_beside_which_there_is_no_lane_yet_must_not_be_crossed():
+    ramp = (LaneStretch(200.0, 400.0, WALL), LaneStretch())
+    env, td = alone("continuous", stretches=ramp, lanes=2)
+    assert driven(env, td, (0.0, 1.0), 10)[keys.EVENTS, "out_of_road"].item()
+    beside = placed(env, vehicles({"x": 210.0, "visibility": 1}, FAR))
+    beside = driven(env, beside, (0.0, 1.0), 3)
+    assert not beside[keys.EVENTS, "out_of_road"].item()
+    assert ego(beside, "y") > 2.0
+
+
+# In the libraries
+
+
+@pytest.mark.parametrize("actions", ["lane", "lane_speed", "continuous"])
+@pytest.mark.parametrize("env", ["highway", "merge", "exit"])
+def test_torchrl_and_gymnasium_find_nothing_wrong(actions, env):
+    check_env_specs(ganlane.make_env(num_envs=3, env=env, actions=actions))
+    made = gymnasium.make("ganlane/Highway-v0", env=env, actions=actions)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(made.unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("actions", ["lane_speed", "continuous"])
+def test_a_batch_of_gymnasium_drives_the_rows_of_single_environments(actions):
+    envs = gymnasium.make_vec("ganlane/Highway-v0", num_envs=2, env="merge", actions=actions)
+    env = gymnasium.make("ganlane/Highway-v0", env="merge", actions=actions)
+    envs.reset(seed=4)
+    env.reset(seed=4)
+    envs.action_space.seed(0)
+    for _ in range(5):
+        action = envs.action_space.sample()
+        observations, *_ = envs.step(action)
+        observation, _, terminated, *_ = env.step(action[0])
+        if terminated:
+            break
+        # Rows may round differently in other batches of the tensor code.
+        np.testing.assert_allclose(observations[0], observation, atol=1e-5)
+
+
+@pytest.mark.parametrize("actions", ["lane_speed", "continuous"])
+def test_pictures_show_such_episodes_too(actions):
+    env = gymnasium.make("ganlane/Highway-v0", actions=actions, render_mode="rgb_array")
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    assert env.render().ndim == 3
+
+
+@pytest.mark.parametrize(
+    ("action", "wrong"),
+    [
+        (torch.zeros(1, dtype=torch.int64), "of shape"),
+        (torch.tensor([[torch.nan, 0.0]]), "not finite"),
+        (torch.zeros(1, 3), "of shape"),
+    ],
+)
+def test_controls_of_another_kind_are_refused(action, wrong):
+    env, td = alone("continuous")
+    with pytest.raises(UserError, match=wrong):
+        env.step(td.set("action", action))
+
+
+@pytest.mark.parametrize("action", [[2.0], 1, [0.0, np.inf]])
+def test_gymnasium_refuses_them_too(action):
+    env = gymnasium.make("ganlane/Highway-v0", actions="continuous").unwrapped
+    env.reset(seed=0)
+    with pytest.raises(UserError, match="acceleration and lateral target"):
+        env.step(action)
+
+
+def test_masks_and_commands_that_know_numbered_lanes_alone_say_so():
+    with pytest.raises(UserError, match="leave the mask out"):
+        ganlane.make_env(actions="continuous", mask="safe")
+    with pytest.raises(UserError, match=r"ganlane train has lane alone"):
+        ganlane.api.train(actions="lane_speed")
+    with pytest.raises(UserError, match="expected one of lane, lane_speed, continuous"):
+        ganlane.make_env(actions="pedals")
+
+
+def test_drivers_by_rule_drive_in_the_same_table_as_those_of_other_actions():
+    """An environment of `continuous` is compared with MOBIL, which commands lanes."""
+    table = ganlane.api.evaluate(["mobil"], ["idm"], 2, actions="continuous", goal_m=200.0)
+    assert table["goal"].to_list() == [2]

@@ -20,8 +20,9 @@ N environments, M vehicles, the ego at index 0; floats in the run's dtype, SI un
 ``road.lanes``                          [N, 1] i64  only where every row has its own road (replay)
 ``road.lane_width_m``                   [N, 1]      the same, m
 ``events.*``                            [N, 1]      events of the last decision
-``action``                              [N] i64     0 keep, 1 left, 2 right
-``action_mask``                         [N, 3] b    which of them are allowed, where there is a mask
+``action``                              [N] i64     0 keep, 1 left, 2 right (``env.actions=lane``;
+                                                    :mod:`ganlane.settings.actions`)
+``action_mask``                         [N, A] b    which of them are allowed, where there is a mask
 ======================================  ==========  ==============================================
 """
 
@@ -91,6 +92,8 @@ DONE_FLAGS: Final = ("done", "terminated", "truncated")
 #: Of ``ego``: steering angle (rad), mean acceleration in the last decision (m/s2), lane change
 #: progress (0 to 1), distance (m).
 EGO_FLOATS: Final = ("steering", "mean_acceleration", "change_progress", "distance")
+#: And with ``env.actions=lane_speed`` the speed that it aims at, m/s.
+SET_SPEED: Final = "set_speed"
 #: Direction of the current lane change (-1, 0, 1), decisions and started lane changes in this
 #: episode.
 EGO_INTEGERS: Final = ("change_direction", "decisions", "lane_changes")

@@ -153,6 +153,16 @@ def test_a_line_beside_which_there_is_no_lane_yet_must_not_be_crossed():
     assert ego(beside, "y") > 2.0
 
 
+def test_the_kernel_shows_a_recorder_the_steps_of_a_decision():
+    env = ganlane.make_env("idm", actions="continuous", kernel="auto", seed=2)
+    steps = []
+    env.base_env.recorder = lambda vehicles, running: steps.append(vehicles.x[0, 0].item())
+    td = env.reset()
+    after = env.step(td.set("action", torch.tensor([[0.5, 1.0]])))["next"]
+    assert len(steps) == 10
+    assert steps[-1] == pytest.approx(ego(after, "x"), abs=1e-3)
+
+
 # In the libraries
 
 

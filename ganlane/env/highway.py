@@ -41,7 +41,7 @@ from ganlane.errors import UserError
 from ganlane.native.drivers import pays
 from ganlane.native.library import torch_on_one_thread, why_not
 from ganlane.native.tensors import Kernel, NativeScenes, wants_gradient
-from ganlane.settings.actions import CONTINUOUS, CONTROLS, LANE, LANE_SPEED, ActionParameters
+from ganlane.settings.actions import CONTINUOUS, CONTROLS, LANE_SPEED, ActionParameters
 from ganlane.settings.driving import EgoParameters, IdmParameters, Visibility
 from ganlane.settings.episode import KERNELS, EpisodeParameters, SpawnParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
@@ -179,7 +179,7 @@ class HighwayEnv(EnvBase):
         self._native_scenes: NativeScenes | None = None
         if self.kernel is not None and type(self.scenes) is RandomScenes:
             self._native_scenes = NativeScenes(
-                self.scenes, self.stream, self.traffic.native_drivers()
+                self.scenes, self.stream, self.traffic.native_drivers(), self.actions
             )
         self._make_specs()
 
@@ -459,6 +459,10 @@ class HighwayEnv(EnvBase):
 
         The kernel drives it once more, in decisions of one physics step, which gives the same bits.
         """
+        if self.actions.form == CONTINUOUS:
+            # Its line is one of the decision, so it cannot be given step by step.
+            self._tensor_step(state)
+            return
         drivers = self.traffic.native_drivers()
         assert drivers is not None
         episode = replace(self.episode, decision_period_s=keys.PHYSICS_STEP_S)
@@ -469,6 +473,7 @@ class HighwayEnv(EnvBase):
             episode,
             self.ego,
             drivers,
+            actions=self.actions,
         )
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         running = torch.ones_like(action, dtype=torch.bool)
@@ -504,8 +509,6 @@ class HighwayEnv(EnvBase):
         if drivers is None:
             name = type(self.traffic).__name__
             reason = f"does not drive {name}"
-        elif self.actions.form != LANE:
-            reason = f"drives env.actions={LANE} alone"
         elif wanted == "auto" and not pays(drivers):
             reason = "is slow with generated traffic on a processor without FMA"
         elif self.device.type != "cpu" or self.dtype != torch.float32:
@@ -525,6 +528,7 @@ class HighwayEnv(EnvBase):
                 self.episode,
                 self.ego,
                 drivers,
+                actions=self.actions,
             )
         if wanted == "native":
             raise UserError(f"env.kernel=native {reason or missing}; set env.kernel=torch.")

@@ -105,7 +105,7 @@ def begin(
     if rules.actions.form == LANE_SPEED:
         # Within the decision this is the speed that the ego desires, for all who look at it.
         desired = vehicles.desired_speed
-        speed = commanded_speed(action, ego["set_speed"], desired[:, EGO_INDEX], rules.actions)
+        speed = commanded_speed(action, ego[keys.SET_SPEED], desired[:, EGO_INDEX], rules.actions)
         vehicles = vehicles.with_(desired_speed=with_ego(speed, desired))
     vehicles = vehicles.with_(target_lane=with_ego(command.target_lane, vehicles.target_lane))
     if line is None:
@@ -235,7 +235,7 @@ def remember(
         "started_change": command.starts,
     }
     if rules.actions.form == LANE_SPEED:
-        memory["set_speed"] = end.vehicles.desired_speed[:, EGO_INDEX]
+        memory[keys.SET_SPEED] = end.vehicles.desired_speed[:, EGO_INDEX]
     return memory
 
 

@@ -43,7 +43,7 @@ EGO: Fields = {
     "started_change": torch.bool,  # in the last decision
 }
 #: And further with ``env.actions=lane_speed``: the speed aimed at, m/s.
-SET_SPEED: Fields = {"set_speed": None}
+COMMANDED: Fields = {keys.SET_SPEED: None}
 EVENTS: Fields = {
     **dict.fromkeys(keys.END_EVENTS, torch.bool),
     **dict.fromkeys((keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND), torch.int64),
@@ -64,7 +64,7 @@ def state_spec(
 
     ``memory`` is the traffic's, nested name to (shape, dtype); ``own_roads``: each row has a road.
     """
-    ego = {**EGO, **SET_SPEED} if actions.form == LANE_SPEED else EGO
+    ego = {**EGO, **COMMANDED} if actions.form == LANE_SPEED else EGO
     parts = {
         keys.VEHICLES: Composite(_specs(VEHICLES, (n, m), dtype), shape=(n,)),
         keys.EGO: Composite(_specs(ego, (n,), dtype), shape=(n,)),
@@ -125,7 +125,7 @@ def first_state(
     column = row[:, None]
     ego = {name: row.to(kind or row.dtype) for name, kind in EGO.items()}
     if actions.form == LANE_SPEED:
-        ego["set_speed"] = vehicles.desired_speed[:, keys.EGO_INDEX].clone()
+        ego[keys.SET_SPEED] = vehicles.desired_speed[:, keys.EGO_INDEX].clone()
     events = {name: column.to(kind) for name, kind in EVENTS.items()}
     done = {name: column.to(kind) for name, kind in DONE.items()}
     counters = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: torch.zeros_like(seed)}

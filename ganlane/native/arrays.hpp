@@ -29,7 +29,9 @@ struct Inputs {
     const int64_t* step;
     const uint8_t* recycles;  // whether the row recycles its vehicles; null: none does
     const int64_t *seed, *episode;
-    const int64_t* rows;  // those to drive: a decision's rows [first, last) are places here; null: all
+    const float* controls;   // [rows, 2], acceleration and line, -1 to 1; null: there is `action`
+    const float* set_speed;  // that the ego aims at; null: the desired one
+    const int64_t* rows;     // those to drive: a decision's rows [first, last) are places here; null: all
     // and the memory of generated drivers (Memory of generated.hpp), here and in Outputs
 };
 
@@ -43,6 +45,7 @@ struct Outputs {  // may be the same memory as the inputs
     int64_t* step;
     uint8_t *goal, *hard_crash, *out_of_road, *missed_exit, *timeout;
     int64_t *soft_crashes, *soft_crashes_behind;
+    float* set_speed;
     uint8_t *done, *terminated, *truncated;
 };
 

@@ -26,10 +26,12 @@ from ganlane.native.settings import (
     MemoryArrays,
     Range,
     Settings,
+    actions_of,
     ends_of,
     fields,
     settings_of,
 )
+from ganlane.settings.actions import ActionParameters
 from ganlane.settings.driving import (
     DriverFaults,
     EgoParameters,
@@ -373,10 +375,12 @@ def decision_settings(
     ego: EgoParameters | None,
     drivers: OneKind,
     stretches: Stretches = (),
+    actions: ActionParameters | None = None,
 ) -> Settings:
     """The numbers of a decision; ``shape`` is lanes, their width in m, and M, ``stretches`` where
-    the lanes begin and end.
+    the lanes begin and end, ``actions`` what the ego is commanded (None: lanes).
     """
+    ends = ends_of(stretches, drivers.mobil)
     return settings_of(
         *shape,
         episode,
@@ -386,7 +390,7 @@ def decision_settings(
         drivers.mobil,
         drivers.stream,
         drivers.blind_share,
-        drivers.structures() | ends_of(stretches, drivers.mobil),
+        drivers.structures() | ends | actions_of(actions, episode),
     )
 
 

@@ -23,7 +23,9 @@
 #include "random_drivers.hpp"
 
 const float RECYCLE_RANGE = 200.0f, RECYCLE_DECELERATION = 4.0f, RECYCLE_SIDE = 0.4f;
-enum { KEEP, LEFT, RIGHT };
+enum { KEEP, LEFT, RIGHT, FASTER, SLOWER };
+
+static inline bool is_steered(const Settings& s) { return s.actions && s.actions->form == CONTINUOUS; }
 
 // ---- The ego among the others
 
@@ -105,28 +107,32 @@ static __attribute__((noinline)) Mask hits_wall(const Settings& s, const Ego& e)
     return hit;
 }
 
-// What a physics step led to. A hard crash comes before goal and missed exit, all before the time-out.
-static inline void note_events(const Settings& s, Rows& r) {
+// What a physics step led to. A hard crash comes before leaving the road, that before goal and missed exit, all before
+// the time-out. `y_before`: where the ego was, if it is steered.
+static inline void note_events(const Settings& s, Rows& r, Float y_before) {
     Ego e = find_ego(r);
     Mask ahead, behind, on = r.running;
     look_round(s, r, e, ahead, behind);
     Mask crash = crashed(e, r) & on;
     if (s.ends) crash |= hits_wall(s, e) & on;
-    Mask goal = e.x >= s.goal, missed = none();
+    Mask left = none(), goal = e.x >= s.goal, missed = none();
+    if (is_steered(s))
+        for (int lane = 0; lane < LANES; lane++) left[lane] = leaves_road(s, y_before[lane], e.y[lane], e.x[lane]) ? -1 : 0;
+    left &= on & ~crash;
     if (s.ends && s.ends->exit_lane >= 0) {
         // On a road with an exit that is the goal, wherever it is.
         Mask passed = e.x >= s.ends->end[s.ends->exit_lane];
         goal = passed & (lane_of(s, e.y) == (float)s.ends->exit_lane), missed = passed & ~goal;
     }
-    goal &= on & ~crash, missed &= on & ~crash;
+    goal &= on & ~crash & ~left, missed &= on & ~crash & ~left;
     Float one = filled(1.0f), zero = filled(0.0f);
     r.step = r.step + choose(on, one, zero);
     r.onsets = r.onsets + choose(ahead & ~r.ahead & on, one, zero);
     r.onsets_behind = r.onsets_behind + choose(behind & ~r.behind & on, one, zero);
     r.ahead = (ahead & on) | (r.ahead & ~on);
     r.behind = (behind & on) | (r.behind & ~on);
-    r.crash |= crash, r.goal |= goal, r.missed_exit |= missed;
-    r.running = on & ~crash & ~goal & ~missed & (r.step < (float)s.timeout_steps);
+    r.crash |= crash, r.goal |= goal, r.missed_exit |= missed, r.out_of_road |= left;
+    r.running = on & ~crash & ~left & ~goal & ~missed & (r.step < (float)s.timeout_steps);
 }
 
 // ---- Recycling: who is left far behind is put far ahead, and the reverse, where nobody has to brake hard for it
@@ -205,6 +211,34 @@ static size_t network_floats(const Settings& s) {
     return counted.count;
 }
 
+static inline Mover ego_mover(const Rows& r) {
+    Mover ego = mover(r, 0);
+    for (int i = 1; i < r.vehicles; i++) {
+        Mask it = is_ego(r, i);
+        Mover m = mover(r, i);
+        ego.x = choose(it, m.x, ego.x), ego.y = choose(it, m.y, ego.y);
+        ego.heading = choose(it, m.heading, ego.heading), ego.speed = choose(it, m.speed, ego.speed);
+        ego.acceleration = choose(it, m.acceleration, ego.acceleration);
+        ego.steering = choose(it, m.steering, ego.steering);
+        ego.slip = choose(it, m.slip, ego.slip), ego.slip_sine = choose(it, m.slip_sine, ego.slip_sine);
+    }
+    return ego;
+}
+
+// The ego, which has been driven like the others, from where it was `before` by its own pedal and line.
+static inline void drive_ego(const Settings& s, Rows& r, Mover before) {
+    steer_and_move(s, before, r.line, r.pedal, r.running);
+    for (int i = 0; i < r.vehicles; i++) {
+        Mask it = is_ego(r, i);
+        r.x[i] = choose(it, before.x, r.x[i]), r.y[i] = choose(it, before.y, r.y[i]);
+        r.heading[i] = choose(it, before.heading, r.heading[i]), r.speed[i] = choose(it, before.speed, r.speed[i]);
+        r.acceleration[i] = choose(it, before.acceleration, r.acceleration[i]);
+        r.steering[i] = choose(it, before.steering, r.steering[i]);
+        r.slip[i] = choose(it, before.slip, r.slip[i]);
+        r.slip_sine[i] = choose(it, before.slip_sine, r.slip_sine[i]);
+    }
+}
+
 // `ended(rows)` is called when rows of generated drivers end, before anything of them changes.
 template <class Ended>
 static inline void decide(const Settings& s, Rows& r, Networks& networks, Ended ended) {
@@ -213,6 +247,8 @@ static inline void decide(const Settings& s, Rows& r, Networks& networks, Ended 
     find_lanes(s, r);
     for (int substep = 0; substep < s.substeps && any(r.running); substep++) {
         Mask running = r.running;
+        Mover before = {};
+        if (is_steered(s)) before = ego_mover(r);
         if (r.memory_fields)  // drivers with a memory draw random numbers
             for (int lane = 0; lane < LANES; lane++) r.step_key[lane] = absorb(r.episode_key[lane], r.start_step[lane] + substep);
         if (s.generated) {
@@ -226,9 +262,10 @@ static inline void decide(const Settings& s, Rows& r, Networks& networks, Ended 
         } else {
             drive_by_rules(s, r, alike, substep);
         }
+        if (is_steered(s)) drive_ego(s, r, before);
         put_in_order(r);
         find_lanes(s, r);
-        note_events(s, r);
+        note_events(s, r, before.y);
         if (s.generated) ended(running & ~r.running);
     }
 }
@@ -240,16 +277,48 @@ struct Command {  // of one row, what the action leads to
     bool starts, off_road;
     float speed;
     int64_t step;
+    float set_speed, line, pedal;  // where there are such commands
 };
 
-// The action 0 keep, 1 left, 2 right; ignored during a lane change, but with `abort_lane_change` it may turn back.
+// Acceleration and line (ganlane.sim.actions.apply_controls). A lane change starts where the lane of the line becomes
+// another one.
+static Command be_steered(const Settings& s, const Inputs& in, long row) {
+    long ego = row * s.vehicles;
+    const Actions& a = *s.actions;
+    auto limited = [](float number) { return number < -1.0f ? -1.0f : number > 1.0f ? 1.0f : number; };
+    float pedal = limited(in.controls[2 * row]), wheel = limited(in.controls[2 * row + 1]);
+    float nearest = __builtin_rintf(in.y[ego] * s.per_lane_width), last = (float)(s.lanes - 1);
+    nearest = nearest < 0.0f ? 0.0f : nearest > last ? last : nearest;
+    int64_t lane = (int64_t)nearest, side = wheel > 0.5f ? 1 : wheel < -0.5f ? -1 : 0;
+    int64_t target = may_change(s, lane, side, in.x[ego]) ? lane + side : lane, shift = target - in.target_lane[ego];
+    float room = (in.desired_speed[ego] - in.speed[ego]) / a.period;
+    float acceleration = pedal * (pedal > 0.0f ? a.strongest_acceleration : a.strongest_braking);
+    room = room < 0.0f ? 0.0f : room;
+    return {shift ? (shift > 0 ? 1 : -1) : in.change_direction[row], target, shift != 0, false, in.speed[ego], in.step[row],
+            0.0f, (nearest + wheel) * s.lane_width, acceleration < room ? acceleration : room};
+}
+
+// The speed that the ego aims at after its action.
+static float commanded_speed(const Settings& s, const Inputs& in, long row) {
+    if (!in.set_speed) return in.desired_speed[row * s.vehicles];
+    const Actions& a = *s.actions;
+    int64_t action = in.action[row];
+    float highest = in.desired_speed[row * s.vehicles], lowest = highest < a.lowest_speed ? highest : a.lowest_speed;
+    float speed = in.set_speed[row] + (action == FASTER ? a.speed_step : action == SLOWER ? -a.speed_step : 0.0f);
+    speed = speed < lowest ? lowest : speed;
+    return speed < highest ? speed : highest;
+}
+
+// The action 0 keep, 1 left, 2 right (3 faster, 4 slower keep the lane); ignored during a lane change, but with `abort_lane_change` it may turn back.
 static Command obey(const Settings& s, const Inputs& in, long row) {
+    if (is_steered(s)) return be_steered(s, in, row);
     int64_t wish = in.action[row] == LEFT ? 1 : in.action[row] == RIGHT ? -1 : 0;
     int64_t direction = in.change_direction[row], target = in.target_lane[row * s.vehicles];
     if (!is_heard(wish, direction, s.abort_lane_change)) wish = 0;
     bool off_road = !may_change(s, target, wish, in.x[row * s.vehicles]);
     if (off_road) wish = 0;
-    return {wish ? wish : direction, target + wish, wish != 0, off_road, in.speed[row * s.vehicles], in.step[row]};
+    return {wish ? wish : direction, target + wish, wish != 0, off_road, in.speed[row * s.vehicles], in.step[row],
+            commanded_speed(s, in, row), 0.0f, 0.0f};
 }
 
 // Whether nobody sees the ego in an episode (ganlane.traffic.BlindTraffic).
@@ -288,12 +357,13 @@ static void load(const Settings& s, const Inputs& in, Rows& r, const Block& bloc
             at(r.acceleration, i, lane) = in.acceleration[from];
             at(r.half_length, i, lane) = 0.5f * in.length[from];
             at(r.half_width, i, lane) = 0.5f * in.width[from];
-            at(r.per_desired, i, lane) = 1.0f / in.desired_speed[from];
+            at(r.per_desired, i, lane) = 1.0f / (index == 0 && in.set_speed ? command.set_speed : in.desired_speed[from]);
             at(r.target, i, lane) = (float)(index == 0 ? command.target : in.target_lane[from]);
             at(r.visibility, i, lane) = (float)in.visibility[from];
             at(r.valid, i, lane) = (float)(in.valid[from] != 0);
             at(r.steering, i, lane) = index == 0 ? in.ego_steering[row] : in.steering ? in.steering[from] : 0.0f;
         }
+        r.line[lane] = command.line, r.pedal[lane] = command.pedal;
         r.running[lane] = lane < block.count && !command.off_road ? -1 : 0;
         r.ahead[lane] = in.soft_crash[row] ? -1 : 0;
         r.behind[lane] = in.soft_crash_behind[row] ? -1 : 0;
@@ -304,7 +374,7 @@ static void load(const Settings& s, const Inputs& in, Rows& r, const Block& bloc
         r.unseen[lane] = is_blind(s, r.episode_key[lane]) ? -1 : 0;
     }
     for (int i = 0; i < s.vehicles; i++) r.slip[i] = slip_of(r.steering[i]), r.slip_sine[i] = sine_of(r.slip[i]);
-    r.crash = r.goal = r.missed_exit = none();
+    r.crash = r.goal = r.missed_exit = r.out_of_road = none();
     r.onsets = r.onsets_behind = filled(0.0f);
 }
 
@@ -317,7 +387,9 @@ static void store_ego(const Settings& s, const Inputs& in, const Rows& r, const 
     float progress = 1.0f - off / s.lane_width;
     int64_t steps = step - command.step;
     bool goal = r.goal[lane], crash = r.crash[lane], missed = r.missed_exit[lane];
-    bool ended = goal || crash || missed || command.off_road;
+    bool off_road = command.off_road || r.out_of_road[lane];
+    bool ended = goal || crash || missed || off_road;
+    if (out.set_speed) out.set_speed[row] = command.set_speed;
     bool truncated = !r.running[lane] && !ended;
     out.mean_acceleration[row] = (out.speed[ego] - command.speed) / ((float)(steps < 1 ? 1 : steps) * PHYSICS_STEP);
     out.change_progress[row] = direction == 0 || progress < 0.0f ? 0.0f : progress > 1.0f ? 1.0f : progress;
@@ -329,7 +401,7 @@ static void store_ego(const Settings& s, const Inputs& in, const Rows& r, const 
     out.soft_crash_behind[row] = r.behind[lane] != 0;
     out.started_change[row] = command.starts;
     out.step[row] = step;
-    out.goal[row] = goal, out.hard_crash[row] = crash, out.out_of_road[row] = command.off_road;
+    out.goal[row] = goal, out.hard_crash[row] = crash, out.out_of_road[row] = off_road;
     out.missed_exit[row] = missed;
     out.timeout[row] = out.truncated[row] = truncated;
     out.soft_crashes[row] = (int64_t)r.onsets[lane], out.soft_crashes_behind[row] = (int64_t)r.onsets_behind[lane];
@@ -369,11 +441,17 @@ static Fields fields_of(const Settings& s) {
 }
 
 // Drives the rows [first, last) through one decision. Returns 0, or 1 without memory, or 2 and drives none of them
-// where an action is not 0, 1 or 2.
+// where an action is none of those there are, or no finite number.
 extern "C" int ganlane_decide(const Settings* settings, const Inputs* in, const Outputs* out, long first, long last) {
     const Settings& s = *settings;
-    for (long place = first; place < last; place++)
-        if ((uint64_t)in->action[in->rows ? in->rows[place] : place] > 2) return 2;
+    uint64_t actions = s.actions ? 5 : 3;
+    for (long place = first; place < last; place++) {
+        long row = in->rows ? (long)in->rows[place] : place;
+        if (is_steered(s)) {
+            for (int k = 0; k < 2; k++)
+                if (!__builtin_isfinite(in->controls[2 * row + k])) return 2;
+        } else if ((uint64_t)in->action[row] >= actions) return 2;
+    }
     size_t floats = scratch_floats(s) * LANES;
     float* memory = (float*)scratch((floats + network_floats(s)) * sizeof(float));
     if (!memory) return 1;

@@ -13,6 +13,13 @@ struct Ends {
     int32_t exit_lane;  // that the ego has to leave the road by; -1: none
 };
 
+// What the ego is commanded beside lanes (ganlane.sim.actions): its speed, or acceleration and line.
+enum { LANE_SPEED, CONTINUOUS };
+struct Actions {
+    float speed_step, lowest_speed, strongest_acceleration, strongest_braking, period;
+    int32_t form;
+};
+
 struct Settings {
     // IDM, Table V
     float min_gap, headway, per_brake_scale, min_acceleration, max_acceleration;
@@ -32,6 +39,7 @@ struct Settings {
     const struct Faults* faults;        // faults.hpp; null: drivers make none
     const struct Random* random;        // random_drivers.hpp; null: all drivers are alike
     const Ends* ends;                   // null: all lanes go on for ever
+    const Actions* actions;             // null: the ego is commanded lanes alone
 };
 
 // ---- Constants of the model (ganlane.sim)
@@ -99,6 +107,12 @@ static inline bool exists(const Settings& s, int64_t lane, float x) {
 
 static inline bool may_change(const Settings& s, int64_t lane, int64_t side, float x) {
     return side == 0 || (exists(s, lane, x) && exists(s, lane + side, x));
+}
+
+// Whether a body at `x` that moves from `y` to `later` crosses a line beside which there is no lane to change into.
+static inline bool leaves_road(const Settings& s, float y, float later, float x) {
+    int64_t lane = (int64_t)__builtin_rintf(y * s.per_lane_width), beside = (int64_t)__builtin_rintf(later * s.per_lane_width);
+    return !may_change(s, lane, beside - lane, x);
 }
 
 // The number of the lane that each row has its own number of; `otherwise` where the road has no such lane.

@@ -39,9 +39,10 @@ struct Rows {
     Float *gap_ahead, *speed_ahead, *gap_behind, *speed_behind, *per_desired_behind;
     Nearest* nearest;  // [lanes]
     // Of the rows: whether they go on, physics steps since MOBIL's last decision and in all, and the ego's events.
-    Mask running, ahead, behind, crash, goal, missed_exit;
+    Mask running, ahead, behind, crash, goal, missed_exit, out_of_road;
     Mask unseen;  // the ego, to everybody
     Float phase, step, onsets, onsets_behind;
+    Float line, pedal;  // of `continuous`: the line that the ego steers to, and its acceleration
     // Keys of the random numbers: of the episode, and of this step; physics steps at the start of the decision.
     uint64_t episode_key[LANES], step_key[LANES];
     int64_t start_step[LANES];

@@ -15,6 +15,7 @@ from typing import Any, Final, TypeVar
 
 from ganlane import keys
 from ganlane.errors import UserError
+from ganlane.settings.actions import CONTINUOUS, LANE, LANE_SPEED, ActionParameters
 from ganlane.settings.driving import (
     EgoParameters,
     IdmParameters,
@@ -68,6 +69,8 @@ EGO_ARRAYS: Final[dict[Key, str]] = {
 }
 #: Counters [rows].
 COUNTERS: Final[dict[Key, str]] = dict.fromkeys((keys.SEED, keys.EPISODE, keys.STEP), "int64")
+#: The speed that the ego aims at, where it is commanded.
+SET_SPEED: Final = (keys.EGO, keys.SET_SPEED)
 #: What goes into a decision, before the memory of generated drivers.
 INPUTS: Final = (
     keys.ACTION,
@@ -80,6 +83,8 @@ INPUTS: Final = (
     "recycles",
     keys.SEED,
     keys.EPISODE,
+    "controls",
+    SET_SPEED,
     "rows",
 )
 #: What comes out of it, and out of the start of an episode.
@@ -96,7 +101,9 @@ OUTPUTS: Final = (
     STEERING,
     *EGO_ARRAYS,
     keys.STEP,
-    *EVENT_ARRAYS,
+    *(name for name in EVENT_ARRAYS if name not in keys.DONE_FLAGS),
+    SET_SPEED,
+    *keys.DONE_FLAGS,
 )
 #: Fields of ``vehicles`` that no decision changes: the start of an episode sets them.
 SCENE: Final = _within(
@@ -135,8 +142,10 @@ class Layout:
         written: the outputs that are in ``kinds``.
     """
 
-    def __init__(self, memory: MemoryArrays) -> None:
+    def __init__(self, memory: MemoryArrays, actions: ActionParameters | None = None) -> None:
         self.kinds: dict[Key, str] = {**VEHICLE_ARRAYS, **EGO_ARRAYS, **EVENT_ARRAYS, **COUNTERS}
+        if actions is not None and actions.form == LANE_SPEED:
+            self.kinds[SET_SPEED] = "float32"
         self.kinds |= {name: kind for name, (kind, _) in memory.items()}
         self._memory = memory
         # Rule-driven drivers' steering angles have their place among the others.
@@ -169,7 +178,7 @@ class Settings(ctypes.Structure):
         *fields(c_int32, "lanes vehicles substeps timeout_steps mobil abort_lane_change"),
         *fields(c_int64, "stream"),
         *fields(c_double, "blind_share"),
-        *fields(c_void_p, "generated human faults random ends"),
+        *fields(c_void_p, "generated human faults random ends actions"),
     ]
 
     #: The structures that the last members point to, which have to live as long.
@@ -188,6 +197,31 @@ class Ends(ctypes.Structure):
         *fields(c_float, "mandatory_bias"),
         *fields(c_int32, "exit_lane"),
     ]
+
+
+class Actions(ctypes.Structure):
+    """``Actions`` of model.hpp."""
+
+    _fields_ = [
+        *fields(
+            c_float,
+            "speed_step_mps lowest_speed_mps strongest_acceleration strongest_braking"
+            " decision_period_s",
+        ),
+        *fields(c_int32, "form"),
+    ]
+
+
+def actions_of(
+    actions: ActionParameters | None, episode: EpisodeParameters | None
+) -> dict[str, ctypes.Structure]:
+    """What the ego is commanded, for ``pointed`` of :func:`settings_of`; empty for lanes alone."""
+    if actions is None or actions.form == LANE:
+        return {}
+    form = (LANE_SPEED, CONTINUOUS).index(actions.form)
+    period_s = (episode or EpisodeParameters()).decision_period_s
+    numbers = vars(actions) | {"form": form, "decision_period_s": period_s}
+    return {"actions": _filled(Actions, numbers)}
 
 
 class View(ctypes.Structure):
@@ -293,7 +327,7 @@ def settings_of(
         "blind_share": blind_share,
     }
     # ctypes has the addresses alone, so the structures are held beside them.
-    for name in ("generated", "human", "faults", "random", "ends"):
+    for name in ("generated", "human", "faults", "random", "ends", "actions"):
         numbers[name] = ctypes.addressof(pointed[name]) if name in pointed else None
     settings = _filled(Settings, numbers)
     settings.pointed = list(pointed.values())

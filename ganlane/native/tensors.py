@@ -27,6 +27,7 @@ from ganlane.native.drivers import (
 )
 from ganlane.native.library import ROWS_PER_THREAD, addresses, in_threads, load
 from ganlane.native.settings import Key, Layout
+from ganlane.settings.actions import ActionParameters
 from ganlane.settings.driving import (
     EgoParameters,
     IdmParameters,
@@ -152,11 +153,13 @@ class _Parts(_Remade):
     ``layouts`` are those of the parts, ``layout`` is that of the whole state.
     """
 
-    def __init__(self, drivers: Drivers, vehicles: int) -> None:
+    def __init__(
+        self, drivers: Drivers, vehicles: int, actions: ActionParameters | None = None
+    ) -> None:
         self.vehicles = vehicles
-        self.layout = Layout(drivers.memory())
+        self.layout = Layout(drivers.memory(), actions)
         self.parts = parts_of(drivers)
-        self.layouts = [Layout(part.memory) for part in self.parts]
+        self.layouts = [Layout(part.memory, actions) for part in self.parts]
         self._turns = torch.tensor(turns_of(drivers))
 
     def of_part(self, number: int, episode: Tensor) -> Tensor:
@@ -174,6 +177,7 @@ class Kernel(_Parts):
         ego: lane changes and soft crashes.
         drivers: the others, and how the ego follows and steers; by default they keep their lanes.
         variant: see :class:`_Function`.
+        actions: what the ego is commanded; None: lanes.
     """
 
     def __init__(
@@ -184,13 +188,15 @@ class Kernel(_Parts):
         ego: EgoParameters | None = None,
         drivers: Drivers | None = None,
         variant: str | None = None,
+        actions: ActionParameters | None = None,
     ) -> None:
-        super().__init__(drivers or RuleDrivers(), vehicles)
+        super().__init__(drivers or RuleDrivers(), vehicles, actions)
+        self._controls = actions is not None and not actions.names
         self._dtypes = {name: getattr(torch, kind) for name, kind in self.layout.kinds.items()}
         shape = _shape(road, vehicles)
         self._functions = []
         for part in self.parts:
-            numbers = decision_settings(shape, episode, ego, part.drivers, road.stretches)
+            numbers = decision_settings(shape, episode, ego, part.drivers, road.stretches, actions)
             per_thread = rows_per_thread(part.drivers)
             self._functions.append(_Function("ganlane_decide", numbers, variant, per_thread))
 
@@ -200,18 +206,22 @@ class Kernel(_Parts):
         """The state after one decision of every row, without a reward.
 
         Args:
-            action: 0 keep, 1 left, 2 right, [N] int64.
+            action: numbered, [N] int64, or controls [N, 2].
             state: of the environment (:mod:`ganlane.keys`); it stays as it is.
             recycles: rows that put vehicles left behind ahead of the ego again, [N] bool; None: no
                 row does.
 
         Raises:
-            ValueError: an action is not 0, 1 or 2.
+            ValueError: an action is none that there is.
             TypeError: a part of the state is not as the kernel reads it.
         """
         rows = action.shape[0]
         layout = self.layout
-        arrays: dict[Key, Tensor | None] = {keys.ACTION: action, "recycles": recycles}
+        arrays: dict[Key, Tensor | None] = {"recycles": recycles}
+        if self._controls:
+            arrays |= {keys.ACTION: None, "controls": action.float()}
+        else:
+            arrays |= {keys.ACTION: action, "controls": None}
         for name in layout.inputs:
             if name in arrays or name not in layout.kinds:
                 continue
@@ -265,10 +275,17 @@ class NativeScenes(_Parts):
         scenes: with a straight road, the same in all rows.
         stream: family of episodes.
         drivers: of the others; None: rule-driven.
+        actions: what the ego is commanded; None: lanes.
     """
 
-    def __init__(self, scenes: RandomScenes, stream: int, drivers: Drivers | None = None) -> None:
-        super().__init__(drivers or RuleDrivers(), scenes.vehicles)
+    def __init__(
+        self,
+        scenes: RandomScenes,
+        stream: int,
+        drivers: Drivers | None = None,
+        actions: ActionParameters | None = None,
+    ) -> None:
+        super().__init__(drivers or RuleDrivers(), scenes.vehicles, actions)
         shape = _shape(scenes.road, scenes.vehicles)
         self._functions = []
         for part in self.parts:
@@ -305,6 +322,9 @@ class NativeScenes(_Parts):
             outputs = [state.get(name) for name in self.layouts[number].outputs]
             for function in functions:
                 function.run(len(seed), inputs, outputs)
+        if settings.SET_SPEED in state:
+            desired = state[keys.VEHICLES, "desired_speed"]
+            state[settings.SET_SPEED] = desired[:, keys.EGO_INDEX].clone()
         return _state(state)
 
 

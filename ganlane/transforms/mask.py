@@ -58,7 +58,7 @@ def braking_demand(
 def allowed_speeds(state: TensorDictBase, actions: ActionParameters) -> Tensor:
     """Whether ``faster`` and ``slower`` have an effect in ``state``, bool [N, 2]."""
     desired = state.get(keys.VEHICLES).get("desired_speed")[:, keys.EGO_INDEX]
-    return speed_changes(state.get(keys.EGO).get("set_speed"), desired, actions)
+    return speed_changes(state.get(keys.EGO).get(keys.SET_SPEED), desired, actions)
 
 
 class ActionMaskTransform(PerceptionTransform):

@@ -389,7 +389,7 @@ class ObservationTransform(PerceptionTransform):
                 seen,
             )
         if self.actions.form in CONTROL_NUMBERS:
-            set_speed = ego.get("set_speed") if self.actions.form == LANE_SPEED else None
+            set_speed = ego.get(keys.SET_SPEED) if self.actions.form == LANE_SPEED else None
             further = control_numbers(vehicles, set_speed, road_in(state, self.road))
             observation = torch.cat((observation, further), dim=1)
         return state.set(keys.OBSERVATION, observation)

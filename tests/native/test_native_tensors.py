@@ -26,6 +26,7 @@ from ganlane.errors import UserError
 from ganlane.native.drivers import RuleDrivers
 from ganlane.native.library import VARIANTS, best_variant, why_not
 from ganlane.native.tensors import Kernel, NativeScenes
+from ganlane.settings.actions import ActionParameters
 from ganlane.settings.driving import Visibility
 from ganlane.settings.episode import SpawnParameters
 from ganlane.settings.road import WALL, LaneStretch
@@ -43,6 +44,7 @@ def random_highway(
     rows: int,
     most_vehicles: int,
     ends: bool = False,
+    form: str = "lane",
 ) -> HighwayEnv:
     """1 to 6 lanes, 2 to 60 vehicles, dense and sparse, with and without MOBIL, all periods and
     visibilities; with ``ends`` some lanes begin late and end at a wall.
@@ -65,6 +67,7 @@ def random_highway(
         dtype=torch.float32,
         recycle=rng.random() < 0.5 and not ends,
         stretches=random_stretches(lanes, rng) if ends else (),
+        actions=ActionParameters(form),
     )
 
 
@@ -94,18 +97,24 @@ def kernel_of(env: HighwayEnv, variant: str | None = None) -> Kernel:
     """The kernel for the environment's road, rules and traffic."""
     mobil = env.traffic.mobil if isinstance(env.traffic, IdmMobilTraffic) else None
     drivers = RuleDrivers(mobil=mobil)
-    return Kernel(env.road, env.vehicles, env.episode, env.ego, drivers, variant)
+    return Kernel(env.road, env.vehicles, env.episode, env.ego, drivers, variant, env.actions)
 
 
 def by_kernel(kernel: Kernel, td: TensorDictBase, recycle: bool = False) -> TensorDictBase:
     """The decision ``td["action"]`` from the state ``td``."""
-    recycles = torch.ones_like(td["action"], dtype=torch.bool) if recycle else None
+    recycles = torch.ones(len(td), dtype=torch.bool) if recycle else None
     return kernel.decide(td["action"], td, recycles)
 
 
 def actions(env: HighwayEnv, generator: torch.Generator, change: float = 0.2) -> torch.Tensor:
     """Random actions [N], mostly to keep the lane."""
+    if env.actions.form == "continuous":
+        between = drawing(env.batch_size, generator, env.dtype)
+        wheel = between(-0.4, 0.4) + between(-1, 1) * (between(0, 1) < 2 * change)
+        return torch.stack((between(-1.1, 1.1), wheel), dim=1)
     drawn = torch.rand(env.batch_size, generator=generator)
+    if env.actions.form == "lane_speed" and bool(drawn[0] < 0.5):
+        return torch.randint(3, 5, env.batch_size, generator=generator)
     return torch.where(
         drawn < 0.5 * change, keys.LEFT, torch.where(drawn < change, keys.RIGHT, keys.KEEP)
     )
@@ -138,7 +147,7 @@ def within_rounding(env: HighwayEnv, td: TensorDictBase, row: int) -> bool:
     copies = 64
     exact = HighwayEnv(
         env.traffic, copies, env.vehicles, env.spawn_parameters, env.ego, env.episode,
-        dtype=torch.float64, recycle=env.recycle,
+        dtype=torch.float64, recycle=env.recycle, actions=env.actions,
     )  # fmt: skip
     state = td[row : row + 1].expand(copies).clone()
     between = drawing((copies, env.vehicles), 0)
@@ -148,6 +157,8 @@ def within_rounding(env: HighwayEnv, td: TensorDictBase, row: int) -> bool:
         state[keys.VEHICLES, name] = state[keys.VEHICLES, name].double()
     for group in (keys.TRAFFIC, keys.EGO):
         state[group, "steering"] = state[group, "steering"].double()
+    if env.actions.form == "lane_speed":
+        state[keys.EGO, keys.SET_SPEED] = state[keys.EGO, keys.SET_SPEED].double()
     after = exact.step(state)["next"]
     whole = [
         value.reshape(copies, -1) for _, value in leaves(after) if not value.is_floating_point()
@@ -159,7 +170,13 @@ def within_rounding(env: HighwayEnv, td: TensorDictBase, row: int) -> bool:
 
 
 def compare_random_highways(
-    highways: int, rows: int, decisions: int, seed: int, vehicles: int, ends: bool = False
+    highways: int,
+    rows: int,
+    decisions: int,
+    seed: int,
+    vehicles: int,
+    ends: bool = False,
+    form: str = "lane",
 ) -> None:
     """Both decide from every state of the tensor code's episodes."""
     rng = random.Random(seed)
@@ -167,13 +184,17 @@ def compare_random_highways(
     compared = 0
     at_threshold = 0
     for highway in range(highways):
-        env = random_highway(rng, rows, vehicles, ends)
+        env = random_highway(rng, rows, vehicles, ends, form)
         kernel = kernel_of(env)
         td = disturbed_start(env, generator) if highway % 2 else env.reset()
         for _ in range(decisions):
             td["action"] = actions(env, generator)
             out = by_kernel(kernel, td, env.recycle)
             stepped, following = env.step_and_maybe_reset(td.clone())
+            if form == "continuous":
+                # The traffic's memory of the ego, which it does not drive, is nobody's concern.
+                wheel = stepped["next", keys.TRAFFIC, "steering"][:, 0]
+                out[keys.TRAFFIC, "steering"][:, 0] = wheel
             differs = differing_rows(out, stepped["next"])
             for row in differs.nonzero()[:, 0].tolist():
                 assert within_rounding(env, td, row), (seed, highway, row)
@@ -207,6 +228,18 @@ def test_it_decides_as_the_tensor_code_on_a_million_decisions_on_such_roads():
     compare_random_highways(highways=800, rows=128, decisions=10, seed=6, vehicles=60, ends=True)
 
 
+@pytest.mark.parametrize("form", ["lane_speed", "continuous"])
+@pytest.mark.parametrize("ends", [False, True])
+def test_it_decides_as_the_tensor_code_on_other_commands(form, ends):
+    compare_random_highways(40, 16, decisions=8, seed=7, vehicles=20, ends=ends, form=form)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["lane_speed", "continuous"])
+def test_it_decides_as_the_tensor_code_on_half_a_million_other_commands(form):
+    compare_random_highways(400, 128, decisions=10, seed=8, vehicles=40, ends=True, form=form)
+
+
 def test_it_recycles_as_the_tensor_code():
     """Over a minute slow vehicles fall behind and fast ones run away."""
     env = environment(num_envs=32, recycle=True, dtype=torch.float32)
@@ -232,8 +265,12 @@ def test_a_ring_is_refused_in_one_sentence():
 
 # The same bits
 
+OTHER_FORMS = ("lane_speed", "continuous")
 
-@pytest.fixture(scope="module", params=["idm_mobil", "idm", "lanes that end"])
+
+@pytest.fixture(
+    scope="module", params=["idm_mobil", "idm", "lanes that end", "lane_speed", "continuous"]
+)
 def crowd(request):
     """1024 rows in motion, and what one call makes of them."""
     stretches = ()
@@ -249,6 +286,7 @@ def crowd(request):
         dtype=torch.float32,
         seed=9,
         stretches=stretches,
+        actions=ActionParameters(request.param if request.param in OTHER_FORMS else "lane"),
     )
     td = disturbed_start(env, torch.Generator().manual_seed(9))
     td["action"] = actions(env, torch.Generator().manual_seed(10))

@@ -170,10 +170,10 @@ def test_the_kernel_shows_a_recorder_the_steps_of_a_decision():
 @pytest.mark.parametrize("env", ["highway", "merge", "exit"])
 def test_torchrl_and_gymnasium_find_nothing_wrong(actions, env):
     check_env_specs(ganlane.make_env(num_envs=3, env=env, actions=actions))
-    made = gymnasium.make("ganlane/Highway-v0", env=env, actions=actions)
+    highway = gymnasium.make("ganlane/Highway-v0", env=env, actions=actions)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(made.unwrapped, skip_render_check=True)
+        check_env(highway.unwrapped, skip_render_check=True)
 
 
 @pytest.mark.parametrize("actions", ["lane_speed", "continuous"])

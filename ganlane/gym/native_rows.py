@@ -23,7 +23,6 @@ from ganlane.native.batch import NativeBatch, Stepped
 from ganlane.native.drivers import drivers_of, pays
 from ganlane.native.library import why_not
 from ganlane.native.settings import NATIVE_FORMS
-from ganlane.settings.actions import LANE
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.episode import Stream
 
@@ -102,8 +101,6 @@ def native_rows(config: HighwayConfig) -> NativeRows | None:
         drivers is None
         or (env.kernel == "auto" and not pays(drivers))
         or env.kernel == "torch"
-        or env.scene is not None
-        or env.actions.form != LANE
         or observation.form not in NATIVE_FORMS
         or observation.sensors is not None
         or config.device != "cpu"
@@ -126,5 +123,8 @@ def native_rows(config: HighwayConfig) -> NativeRows | None:
         config.reward,
         config.mask,
         stream,
+        actions=env.actions,
+        stretches=env.stretches(),
+        scenes=None if env.scene is None else env.scenes,
     )
     return NativeRows(batch, config)

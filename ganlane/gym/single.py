@@ -75,6 +75,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         )
         self.observation_space: gymnasium.spaces.Box = self._rows.space  # type: ignore[assignment]
         self.action_space = self._rows.action_space()
+        self._actions = self._rows.actions
         self.render_mode = render_mode
         fps = FPS
         if render_mode == "rgb_array":  # a picture per decision
@@ -127,11 +128,11 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         """One decision: observation, reward, terminated, truncated, info."""
         if not self._running:
             raise UserError("step(): no episode is under way; call reset() first.")
-        commanded = action_of(action, self._rows.actions)
+        commanded = action_of(action, self._actions)
         # The view records the physics steps of the decision through the environment's recorder.
         if self._view is not None:
             # Pictures name the numbered actions.
-            self._view.before_step(int(commanded[0]) if self._rows.actions.names else -1)
+            self._view.before_step(int(commanded[0]) if self._actions.names else -1)
         stepped = self._rows.step(commanded)
         reward = float(stepped.reward[0])
         terminated = bool(stepped.terminated[0])

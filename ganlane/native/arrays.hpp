@@ -53,12 +53,20 @@ struct Range {
     float low, span;
 };
 
+// A scene set by hand, the ego first; the others' positions and all speeds vary by up to the jitter.
+struct Fixed {
+    const float *x, *y, *speed, *length, *width, *desired_speed;
+    const int64_t *target_lane, *visibility;
+    float jitter_m, jitter_mps;
+};
+
 struct Spawn {  // Table II
     double recycle_share;
     int64_t stream;
     Range front_speed, rear_speed, ego_speed, desired_speed, truck_desired_speed;
     float spread, spacing, ego_desired_speed, truck_share, length, width, truck_length, truck_width, lane_width;
     int32_t vehicles, lanes, capacity, ego_visibility, others_visibility, recycle;
+    const Fixed* fixed;  // instead of Table II; null: none
 };
 
 struct Scene {  // what an episode's start sets besides the state

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,7 @@ from ganlane.native.drivers import (
 )
 from ganlane.native.library import addresses, in_threads, load, load_for
 from ganlane.native.settings import Key, Layout, fields
+from ganlane.settings.actions import CONTROLS, LANE, LANE_SPEED, ActionParameters
 from ganlane.settings.driving import EgoParameters, Visibility
 from ganlane.settings.episode import EpisodeParameters, SpawnParameters
 from ganlane.settings.observation import (
@@ -36,6 +37,10 @@ from ganlane.settings.observation import (
     RewardParameters,
     largest_number,
 )
+from ganlane.settings.road import Stretches
+
+if TYPE_CHECKING:
+    from ganlane.sim.scenes import FixedScene
 
 #: Speed over desired speed beyond which the observation is cut off, for a space with bounds; IDM
 #: stays far below.
@@ -58,6 +63,8 @@ _VIEWS = [
     *_vehicles("speed desired_speed length y x y speed valid"),
     (keys.EGO, "change_progress"),
     (keys.EGO, "change_direction"),
+    *_vehicles("x heading"),
+    settings.SET_SPEED,
 ]
 _MASKS = [
     *_vehicles("x y heading speed length width desired_speed target_lane visibility valid"),
@@ -72,7 +79,7 @@ class _Batch(ctypes.Structure):
         *fields(
             ctypes.c_void_p,
             "settings inputs outputs spawn scene reward_settings reward terms view view_inputs"
-            " observation mask_settings mask_inputs mask_outputs mask",
+            " observation mask_settings mask_inputs mask_outputs mask speed_mask",
         ),
         *fields(ctypes.c_float, "lowest highest fastest"),
         *fields(ctypes.c_int32, "vehicles lanes size mask_form abort_lane_change"),
@@ -114,7 +121,7 @@ class _Part(NamedTuple):
 
 
 class NativeBatch:
-    """N highways, from the random first scenes of Table II.
+    """N highways, from the random first scenes of Table II or a scene set by hand.
 
     Args:
         rows: N.
@@ -128,6 +135,9 @@ class NativeBatch:
         reward: section V.C.
         mask: of the ego's actions; ``none``: those that stay on the road.
         stream: family of episodes.
+        actions: what the ego is commanded.
+        stretches: where lanes begin and end; empty: all go on.
+        scenes: the first scene by the others' visibility; None: Table II.
         variant: one of :data:`ganlane.native.library.VARIANTS`; None: the best for this processor.
 
     Attributes:
@@ -154,6 +164,9 @@ class NativeBatch:
         mask: MaskParameters | None = None,
         stream: int = 0,
         variant: str | None = None,
+        actions: ActionParameters | None = None,
+        stretches: Stretches = (),
+        scenes: Callable[[int], FixedScene | None] | None = None,
     ) -> None:
         # For copies and other processes, which make the batch anew.
         self._arguments = {name: value for name, value in locals().items() if name != "self"}
@@ -164,22 +177,31 @@ class NativeBatch:
         observation = observation or ObservationConfig()
         reward = reward or RewardParameters()
         mask = mask or MaskParameters()
+        actions = actions or ActionParameters()
         self.rows = rows
         self.lanes = lanes
         self.lane_width_m = lane_width_m
         self.terms = reward.term_names
         road = (lanes, lane_width_m, vehicles)
-        view = settings.view_of(*road, observation.scale(), observation.form)
-        self.bounds = (-1.0, largest_number(observation.form, spawn.longest_m))
+        view = settings.view_of(*road, observation.scale(), observation.form, stretches, actions)
+        scene = None if scenes is None else scenes(Visibility.SIGNALLED)
+        longest_m = spawn.longest_m if scene is None else scene.longest_m
+        self.bounds = (-1.0, largest_number(observation.form, longest_m))
         # All arrays of the state in place, written by the kernel and read by whoever asks.
         self.state: dict[Key, npt.NDArray[Any]] = {}
-        layout = Layout(drivers.memory())
+        layout = Layout(drivers.memory(), actions)
         for name, kind in layout.kinds.items():
             self.state[name] = np.zeros(layout.shape(name, rows, vehicles), kind)
         for name, kind in _ROW_ARRAYS.items():
             self.state[name] = np.zeros(rows, kind)
+        self._commands = self.state[keys.ACTION]
+        if not actions.names:
+            self._commands = self.state["controls"] = np.zeros((rows, CONTROLS), np.float32)
         self.observation = np.zeros((rows, view.numbers()), np.float32)
-        self.mask = np.ones((rows, keys.ACTIONS), np.bool_)
+        self._lane_mask = np.ones((rows, keys.ACTIONS), np.bool_)
+        self.mask = self._lane_mask
+        if actions.form != LANE:
+            self.mask = np.ones((rows, len(actions.names)), np.bool_)
         self._term_values = np.zeros((rows, len(self.terms)), np.float32)
         self._no_safe_action = np.zeros(rows, np.bool_)
         by_network = any(isinstance(part.drivers, NETWORKS) for part in parts_of(drivers))
@@ -193,15 +215,16 @@ class NativeBatch:
             "reward_settings": settings.reward_of(reward, episode.decision_period_s),
             "view": view,
             "view_inputs": self._pointers(_VIEWS),
-            "mask_settings": settings.mask_of(*road, drivers.idm, deceleration, abort),
+            "mask_settings": settings.mask_of(*road, drivers.idm, deceleration, abort, stretches),
             "mask_inputs": self._pointers(_MASKS),
-            "mask_outputs": addresses([self.mask, self._no_safe_action]),
+            "mask_outputs": addresses([self._lane_mask, self._no_safe_action]),
         }
         numbers: dict[str, Any] = {
             "reward": self.state[keys.REWARD].ctypes.data,
             "terms": self._term_values.ctypes.data,
             "observation": self.observation.ctypes.data,
-            "mask": self.mask.ctypes.data,
+            "mask": self._lane_mask.ctypes.data,
+            "speed_mask": self.mask.ctypes.data if actions.form == LANE_SPEED else None,
             "lowest": self.bounds[0],
             "highest": self.bounds[1],
             "fastest": SPEED_RATIO_LIMIT,
@@ -214,16 +237,17 @@ class NativeBatch:
         self._turns = np.array(turns_of(drivers))
         self._parts = []
         for part in parts_of(drivers):
-            layout = Layout(part.memory)
+            layout = Layout(part.memory, actions)
             # Of several parts each drives the rows that are its own.
             row_list = np.zeros(rows, np.int64) if len(self._turns) > 1 else None
             # When others see the ego's lane changes, and the ego theirs.
             visible = (Visibility.named(ego.visibility), part.drivers.visibility)
+            scene = None if scenes is None else scenes(part.drivers.visibility)
             of_part = pointed | {
-                "settings": decision_settings(road, episode, ego, part.drivers),
+                "settings": decision_settings(road, episode, ego, part.drivers, stretches, actions),
                 "inputs": self._pointers(layout.inputs, row_list),
                 "outputs": self._pointers(layout.outputs),
-                "spawn": settings.spawn_of(*road, spawn, stream, *visible, recycle_share),
+                "spawn": settings.spawn_of(*road, spawn, stream, *visible, recycle_share, scene),
                 "scene": self._pointers(settings.STARTS),
             }
             batch = _Batch(
@@ -248,7 +272,13 @@ class NativeBatch:
             array[:] = numbers
 
     def _arrays(self) -> list[npt.NDArray[Any]]:
-        written = [self.observation, self.mask, self._term_values, self._no_safe_action]
+        written = [
+            self.observation,
+            self.mask,
+            self._lane_mask,
+            self._term_values,
+            self._no_safe_action,
+        ]
         return [*self.state.values(), *written]
 
     def _pointers(
@@ -279,9 +309,9 @@ class NativeBatch:
         return self._turns[self.state[keys.EPISODE] % len(self._turns)]
 
     def step(self, actions: npt.NDArray[Any]) -> Stepped:
-        """One decision of every row, by the actions [N]; no row is reset."""
+        """One decision of every row, by the actions [N] or [N, 2]; no row is reset."""
         # Copied, since the kernel holds the address of this array.
-        self.state[keys.ACTION][:] = actions
+        self._commands[:] = actions
         if len(self._parts) == 1:
             self._parts[0].call(self._library.ganlane_step, self.rows)
             return self._stepped

@@ -3,12 +3,16 @@
 #include <stdint.h>
 #include <stdlib.h>
 
-#include "vectors.hpp"
+#include "model.hpp"
+
+// What is at the end for drivers that command more than the lane (ganlane.transforms.observation.control_numbers).
+enum { NO_CONTROL, SPEED_CONTROL, STEERED };
 
 // As ganlane/native/settings.py declares them.
 struct View {
-    float range, speed_scale, lane_width, nearness_m, overlap_m;
-    int32_t lanes, vehicles, drift, overlap;
+    float range, speed_scale, lane_width, nearness_m, overlap_m, sight_m, heading_rad;
+    int32_t lanes, vehicles, drift, overlap, road, control;
+    const Ends* ends;  // null: all lanes go on for ever
 };
 
 struct ViewInputs {  // [rows, vehicles] or [rows]; the `seen` are as the ego perceives them
@@ -17,7 +21,37 @@ struct ViewInputs {  // [rows, vehicles] or [rows]; the `seen` are as the ego pe
     const uint8_t* seen_valid;
     const float* progress;
     const int64_t* direction;
+    const float *x, *heading;  // of the vehicles as they are
+    const float* set_speed;    // null without
 };
+
+static inline float in_sight(const View& v, float distance) {
+    float share = distance / v.sight_m;
+    return share < 0.0f ? 0.0f : share > 1.0f ? 1.0f : share;
+}
+
+static inline bool lane_there(const View& v, int lane, float x) {
+    return lane >= 0 && lane < v.lanes && (!v.ends || (v.ends->begin[lane] <= x && x < v.ends->end[lane]));
+}
+
+// Where lanes begin and end (ganlane.transforms.observation.road_ahead): eight numbers.
+static float* look_ahead(const View& v, int lane, float front, float* out) {
+    for (int k = 0; k < 3; k++) {
+        int beside = lane + 1 - k;
+        bool there = beside >= 0 && beside < v.lanes;
+        out[k] = !there ? 0.0f : v.ends ? in_sight(v, v.ends->end[beside] - front) : 1.0f;
+        out[3 + k] = !there ? 1.0f : v.ends ? in_sight(v, v.ends->begin[beside] - front) : 0.0f;
+    }
+    int exit = v.ends ? v.ends->exit_lane : -1, widest = v.lanes > 1 ? v.lanes - 1 : 1;
+    out[6] = exit < 0 ? 0.0f : (float)(exit - lane) / (float)widest;
+    out[7] = exit < 0 ? 1.0f : in_sight(v, v.ends->end[exit] - front);
+    return out + 8;
+}
+
+static inline float limited(float number) { return number < -1.0f ? -1.0f : number > 1.0f ? 1.0f : number; }
+
+// Length of an observation.
+static inline long size_of(const View& v) { return 5 + 6 * (v.drift ? 4 : 3) + (v.road ? 8 : 0) + v.control; }
 
 const float UNSEEN = 1e9f;
 
@@ -74,10 +108,10 @@ static inline void look(const View& v, const ViewInputs& in, float* out, long si
         }
     }
     Float numbers[3 + 6 * 4];
-    Float lane = view_lane(v, gather(in.y, 0));
+    Float lane_here = view_lane(v, gather(in.y, 0));
     numbers[0] = gather(in.speed, 0) / gather(in.desired_speed, 0);
-    numbers[1] = choose(lane < (float)(v.lanes - 1), filled(1.0f), filled(0.0f));
-    numbers[2] = choose(lane > 0.0f, filled(1.0f), filled(0.0f));
+    numbers[1] = choose(lane_here < (float)(v.lanes - 1), filled(1.0f), filled(0.0f));
+    numbers[2] = choose(lane_here > 0.0f, filled(1.0f), filled(0.0f));
     int count = 3;
     for (int slot = 0; slot < 6; slot++) {
         const Found& f = found[slot];
@@ -94,15 +128,30 @@ static inline void look(const View& v, const ViewInputs& in, float* out, long si
     for (int lane = 0; lane < rows; lane++) {
         long row = first + lane;
         for (int k = 0; k < count; k++) out[row * size + k] = numbers[k][lane];
-        out[row * size + count] = in.progress[row];
-        out[row * size + count + 1] = (float)in.direction[row];
+        float* end = out + row * size + count;
+        *end++ = in.progress[row];
+        *end++ = (float)in.direction[row];
+        long ego = row * v.vehicles;
+        int here = (int)lane_here[lane];
+        if (v.road) {
+            // A lane that the ego may change into where it is.
+            bool own = lane_there(v, here, in.x[ego]);
+            out[row * size + 1] = own && lane_there(v, here + 1, in.x[ego]) ? 1.0f : 0.0f;
+            out[row * size + 2] = own && lane_there(v, here - 1, in.x[ego]) ? 1.0f : 0.0f;
+            end = look_ahead(v, here, in.x[ego] + 0.5f * in.length[ego], end);
+        }
+        if (v.control == SPEED_CONTROL) *end++ = in.set_speed[row] / in.desired_speed[ego];
+        if (v.control == STEERED) {
+            *end++ = limited(2.0f * (in.y[ego] - (float)here * v.lane_width) / v.lane_width);
+            *end++ = limited(in.heading[ego] / v.heading_rad);
+        }
     }
 }
 
 // The observations [rows, size] of the rows [first, last).
 extern "C" int ganlane_lane_view(const View* view, const ViewInputs* in, float* const* out, long first, long last) {
     Found found[6];
-    long size = 5 + 6 * (view->drift ? 4 : 3);
+    long size = size_of(*view);
     for (long row = first; row < last; row += LANES)
         look(*view, *in, *out, size, row, last - row < LANES ? last - row : LANES, found);
     return 0;

@@ -11,7 +11,10 @@ import ctypes
 from collections.abc import Mapping
 from ctypes import c_double, c_float, c_int32, c_int64, c_void_p
 from types import MappingProxyType
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import numpy as np
+import numpy.typing as npt
 
 from ganlane import keys
 from ganlane.errors import UserError
@@ -23,8 +26,17 @@ from ganlane.settings.driving import (
     SteeringParameters,
 )
 from ganlane.settings.episode import EpisodeParameters, SpawnParameters
-from ganlane.settings.observation import NEARNESS_M, OVERLAP_M, ObservationScale, RewardParameters
+from ganlane.settings.observation import (
+    NEARNESS_M,
+    OVERLAP_M,
+    ROAD_SIGHT_M,
+    ObservationScale,
+    RewardParameters,
+)
 from ganlane.settings.road import FAR_M, WALL, Stretches, exit_lane, leaving
+
+if TYPE_CHECKING:
+    from ganlane.sim.scenes import FixedScene
 
 #: A key of the state as the environment's TensorDict has it: ``"step"``, ``("vehicles", "x")``.
 Key = str | tuple[str, ...]
@@ -117,12 +129,17 @@ SCENE: Final = _within(
 #: What the start of an episode reads, and what it writes besides the outputs of a decision.
 STARTS: Final = (keys.SEED, keys.EPISODE, "fresh", *SCENE, "recycles")
 
-#: The observations that the kernel computes: whether with drift, and with overlap.
+#: The observations that the kernel computes: whether with drift, overlap, and the road ahead.
 NATIVE_FORMS: Final = {
-    "lane_view": (False, False),
-    "lane_view_drift": (True, False),
-    "lane_view_overlap": (True, True),
+    "lane_view": (False, False, False),
+    "lane_view_drift": (True, False, False),
+    "lane_view_overlap": (True, True, False),
+    "road_view": (True, True, True),
 }
+#: Numbers at the end of every observation that the driver needs to command more than the lane.
+CONTROL_NUMBERS: Final = {LANE: 0, LANE_SPEED: 1, CONTINUOUS: 2}
+#: Heading that counts as 1 there, rad: some 5 m/s to the side at 25 m/s.
+HEADING_RAD: Final = 0.2
 #: The action masks, in the order of step.cpp's numbers ``MASK_ROAD, MASK_LEGAL, MASK_SAFE``.
 MASK_FORMS: Final = ("none", "legal", "safe")
 
@@ -228,19 +245,38 @@ class View(ctypes.Structure):
     """``View`` of observation.cpp."""
 
     _fields_ = [
-        *fields(c_float, "range_m speed_mps lane_width_m nearness_m overlap_m"),
-        *fields(c_int32, "lanes vehicles drift overlap"),
+        *fields(c_float, "range_m speed_mps lane_width_m nearness_m overlap_m sight_m heading_rad"),
+        *fields(c_int32, "lanes vehicles drift overlap road control"),
+        ("ends", c_void_p),
     ]
 
+    #: The structure that ``ends`` points to, which has to live as long.
+    pointed: Any
+
     def numbers(self) -> int:
-        """Length of the observation: own state, lane view, own lane change."""
-        return 5 + 6 * (4 if self.drift else 3)
+        """Length of the observation: own state, lane view, own lane change, road, commands."""
+        return 5 + 6 * (4 if self.drift else 3) + (8 if self.road else 0) + self.control
 
 
 class Range(ctypes.Structure):
     """``Range`` of arrays.hpp."""
 
     _fields_ = fields(c_float, "low span")
+
+
+_FIXED_ARRAYS: Final = "x y speed length width desired_speed target_lane visibility"
+
+
+class Fixed(ctypes.Structure):
+    """``Fixed`` of arrays.hpp."""
+
+    _fields_ = [
+        *fields(c_void_p, _FIXED_ARRAYS),
+        *fields(c_float, "jitter_m jitter_mps"),
+    ]
+
+    #: The arrays that its members point to, which have to live as long.
+    arrays: list[npt.NDArray[Any]]
 
 
 class Spawn(ctypes.Structure):
@@ -260,7 +296,11 @@ class Spawn(ctypes.Structure):
             " truck_length_m truck_width_m lane_width_m",
         ),
         *fields(c_int32, "vehicles lanes capacity ego_visibility others_visibility recycle"),
+        ("fixed", c_void_p),
     ]
+
+    #: The structure that ``fixed`` points to, which has to live as long.
+    pointed: Any
 
 
 class Reward(ctypes.Structure):
@@ -391,17 +431,30 @@ def mask_of(
 
 
 def view_of(
-    lanes: int, lane_width_m: float, vehicles: int, scale: ObservationScale, form: str
+    lanes: int,
+    lane_width_m: float,
+    vehicles: int,
+    scale: ObservationScale,
+    form: str,
+    stretches: Stretches = (),
+    actions: ActionParameters | None = None,
 ) -> View:
-    """The numbers of an observation in :data:`NATIVE_FORMS`."""
-    road = (lane_width_m, NEARNESS_M, OVERLAP_M, lanes, vehicles)
+    """The numbers of an observation in :data:`NATIVE_FORMS`; ``actions``: those at whose numbers it
+    ends.
+    """
+    ends = ends_of(stretches).get("ends")
+    road = (lane_width_m, NEARNESS_M, OVERLAP_M, ROAD_SIGHT_M, HEADING_RAD, lanes, vehicles)
     # By position, in the order of the members of View.
-    return View(
+    view = View(
         scale.range_m,
         scale.speed_mps,
         *road,
         *NATIVE_FORMS[form],
+        CONTROL_NUMBERS[actions.form if actions is not None else LANE],
+        None if ends is None else ctypes.addressof(ends),
     )
+    view.pointed = ends
+    return view
 
 
 def spawn_of(
@@ -413,8 +466,12 @@ def spawn_of(
     ego_visibility: int,
     others_visibility: int,
     recycle_share: float | None,
+    scene: FixedScene | None = None,
 ) -> Spawn:
-    """The numbers of Table II; ``recycle_share`` of the episodes recycle, None: none does."""
+    """The numbers of Table II, or of a ``scene``; ``recycle_share`` of the episodes recycle, None:
+    none does.
+    """
+    fixed = None if scene is None else _fixed_of(scene)
     numbers = vars(spawn) | {
         "lanes": lanes,
         "lane_width_m": lane_width_m,
@@ -426,12 +483,30 @@ def spawn_of(
         "capacity": spawn.lane_capacity(),
         "recycle": recycle_share is not None,
         "recycle_share": recycle_share or 0.0,
+        "fixed": None if fixed is None else ctypes.addressof(fixed),
     }
     # Ranges as their lower end and their span, as the draw needs them.
     for name, value in numbers.items():
         if isinstance(value, tuple | list):
             numbers[name] = Range(value[0], value[1] - value[0])
-    return _filled(Spawn, numbers)
+    filled = _filled(Spawn, numbers)
+    filled.pointed = fixed
+    return filled
+
+
+def _fixed_of(scene: FixedScene) -> Fixed:
+    """The vehicles of a scene as arrays."""
+    # Its numbers in float64, rounded as the environment's float32 is.
+    base = {name: value.numpy()[0] for name, value in scene.base().as_dict().items()}
+    arrays = {}
+    for name in _FIXED_ARRAYS.split():
+        numbers = base[name]
+        kind = np.float32 if numbers.dtype == np.float64 else np.int64
+        arrays[name] = np.ascontiguousarray(numbers.astype(kind))
+    pointers = {name: array.ctypes.data for name, array in arrays.items()}
+    fixed = Fixed(**pointers, jitter_m=scene.jitter_m, jitter_mps=scene.jitter_mps)
+    fixed.arrays = list(arrays.values())
+    return fixed
 
 
 def reward_of(reward: RewardParameters, decision_period_s: float) -> Reward:

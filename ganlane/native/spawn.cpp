@@ -62,8 +62,8 @@ static void put_ego_first(const Spawn& s, const Draft& d) {
 
 static inline float from(const Range& range, float u) { return range.low + u * range.span; }
 
-static void begin(const Spawn& s, const Scene& scene, const Outputs& state, const Draft& d, long row) {
-    uint64_t key = episode_key(s.stream, scene.seed[row], scene.episode[row]), at_start = absorb(key, 0);
+// The vehicles of Table II.
+static void place_random(const Spawn& s, const Scene& scene, const Outputs& state, const Draft& d, long row, uint64_t at_start) {
     for (int i = 0; i < s.vehicles; i++) d.u[i] = uniform_of(absorb(absorb(at_start, i), SPAWN_POSITION));
     draw_lanes(s, at_start, d);
     place_in_lanes(s, d);
@@ -75,16 +75,44 @@ static void begin(const Spawn& s, const Scene& scene, const Outputs& state, cons
         bool ego = i == 0, lorry = !ego && uniform_of(absorb(vehicle, SPAWN_TRUCK)) < s.truck_share;
         state.x[at] = d.x[i];
         state.y[at] = (float)d.lane[i] * s.lane_width;
-        state.heading[at] = state.acceleration[at] = 0.0f;
-        if (state.steering) state.steering[at] = 0.0f;
         state.speed[at] = from(ego ? s.ego_speed : d.x[i] > 0.0f ? s.front_speed : s.rear_speed, speed);
         state.target_lane[at] = d.lane[i];
         scene.desired_speed[at] = ego ? s.ego_desired_speed : from(lorry ? s.truck_desired_speed : s.desired_speed, desired);
         scene.length[at] = lorry ? s.truck_length : s.length;
         scene.width[at] = lorry ? s.truck_width : s.width;
         scene.visibility[at] = ego ? s.ego_visibility : s.others_visibility;
+    }
+}
+
+// The vehicles of a scene set by hand (ganlane.sim.scenes.FixedScene).
+static void place_fixed(const Spawn& s, const Scene& scene, const Outputs& state, long row, uint64_t at_start) {
+    const Fixed& f = *s.fixed;
+    for (int i = 0; i < s.vehicles; i++) {
+        long at = row * s.vehicles + i;
+        uint64_t vehicle = absorb(at_start, i);
+        float along = 2.0f * uniform_of(absorb(vehicle, SPAWN_POSITION)) - 1.0f;
+        float faster = 2.0f * uniform_of(absorb(vehicle, SPAWN_SPEED)) - 1.0f, varied = f.speed[i] + f.jitter_mps * faster;
+        state.x[at] = i == 0 ? f.x[i] : f.x[i] + f.jitter_m * along;
+        state.y[at] = f.y[i];
+        // Who stands remains standing.
+        state.speed[at] = f.speed[i] > 0.0f ? (varied < 0.0f ? 0.0f : varied) : f.speed[i];
+        state.target_lane[at] = f.target_lane[i];
+        scene.desired_speed[at] = f.desired_speed[i];
+        scene.length[at] = f.length[i], scene.width[at] = f.width[i];
+        scene.visibility[at] = f.visibility[i];
+    }
+}
+
+static void begin(const Spawn& s, const Scene& scene, const Outputs& state, const Draft& d, long row) {
+    uint64_t key = episode_key(s.stream, scene.seed[row], scene.episode[row]), at_start = absorb(key, 0);
+    if (s.fixed) place_fixed(s, scene, state, row, at_start);
+    else place_random(s, scene, state, d, row, at_start);
+    for (long at = row * s.vehicles; at < (row + 1) * s.vehicles; at++) {
+        state.heading[at] = state.acceleration[at] = 0.0f;
+        if (state.steering) state.steering[at] = 0.0f;
         scene.valid[at] = 1;
     }
+    if (state.set_speed) state.set_speed[row] = scene.desired_speed[row * s.vehicles];
     // Share of the episodes in which vehicles are recycled: 53 bits, as float64 has them.
     uint64_t chosen = absorb(absorb(absorb(key, -1), 0), RECYCLED_EPISODE);
     scene.recycles[row] = s.recycle && (double)(chosen >> 11) * (1.0 / 9007199254740992.0) < s.recycle_share;

@@ -3,8 +3,8 @@
 #include <stdint.h>
 
 #include "arrays.hpp"
+#include "model.hpp"
 
-struct Settings;
 struct View;
 struct ViewInputs;
 struct MaskInputs;
@@ -40,7 +40,8 @@ struct Batch {
     const Settings* mask_settings;
     const MaskInputs* mask_inputs;
     const MaskOutputs* mask_outputs;
-    uint8_t* mask;  // [rows, 3]
+    uint8_t* mask;       // [rows, 3]
+    uint8_t* speed_mask;  // [rows, 5], with faster and slower; null: there are no such actions
     float lowest, highest, fastest;  // bounds of the observation; the last one is that of its first number
     int32_t vehicles, lanes, size, mask_form, abort_lane_change;
 };
@@ -69,8 +70,17 @@ static void allow(const Batch& b, long row) {
     mask[0] = 1;
     for (int action = 1; action < 3; action++) {
         bool heard = b.mask_form == MASK_ROAD || is_heard(SIDES[action], direction, b.abort_lane_change);
-        mask[action] = heard && on_road(lane + SIDES[action], b.lanes);
+        mask[action] = heard && may_change(*b.settings, lane, SIDES[action], b.out->x[row * b.vehicles]);
     }
+}
+
+// The mask with faster and slower, which are allowed where they have an effect.
+static void allow_speeds(const Batch& b, long row) {
+    uint8_t* mask = b.speed_mask + 5 * row;
+    for (int action = 0; action < 3; action++) mask[action] = b.mask[3 * row + action];
+    float speed = b.out->set_speed[row];
+    mask[3] = speed < b.scene->desired_speed[row * b.vehicles];
+    mask[4] = speed > b.settings->actions->lowest_speed;
 }
 
 // Mask and observation of the rows [first, last).
@@ -84,7 +94,10 @@ static int look(const Batch& b, long first, long last) {
         }
         if (b.mask_form != MASK_SAFE) allow(b, row);
     }
-    return failed || (b.mask_form == MASK_SAFE && ganlane_mask(b.mask_settings, b.mask_inputs, b.mask_outputs, first, last));
+    if (b.mask_form == MASK_SAFE) failed |= ganlane_mask(b.mask_settings, b.mask_inputs, b.mask_outputs, first, last);
+    if (b.speed_mask)
+        for (long row = first; row < last; row++) allow_speeds(b, row);
+    return failed;
 }
 
 // Reward, mask and observation of the rows [first, last), which have been driven. Returns 0, or 1 without memory.

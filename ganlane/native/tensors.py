@@ -322,9 +322,6 @@ class NativeScenes(_Parts):
             outputs = [state.get(name) for name in self.layouts[number].outputs]
             for function in functions:
                 function.run(len(seed), inputs, outputs)
-        if settings.SET_SPEED in state:
-            desired = state[keys.VEHICLES, "desired_speed"]
-            state[settings.SET_SPEED] = desired[:, keys.EGO_INDEX].clone()
         return _state(state)
 
 
@@ -346,7 +343,7 @@ class LaneView(_Function):
         scale: ObservationScale,
         form: str,
     ) -> None:
-        view = settings.view_of(*_shape(road, vehicles), scale, form)
+        view = settings.view_of(*_shape(road, vehicles), scale, form, road.stretches)
         self.size = view.numbers()
         super().__init__("ganlane_lane_view", view)
 
@@ -358,7 +355,7 @@ class LaneView(_Function):
         Arguments as :meth:`ganlane.transforms.ObservationTransform.observe`.
         """
         v = vehicles
-        inputs = [
+        inputs: list[Tensor | None] = [
             v.speed,
             v.desired_speed,
             v.length,
@@ -367,10 +364,15 @@ class LaneView(_Function):
             seen.y,
             seen.speed,
             seen.valid,
+            progress,
+            direction,
+            v.x,
+            v.heading,
+            None,
         ]
         # In the order of observation.cpp: the ego as it is, the others as they are seen.
         out = torch.empty((len(v.x), self.size), dtype=torch.float32)
-        self.run(len(out), [*inputs, progress, direction], [out])
+        self.run(len(out), inputs, [out])
         return out
 
 

@@ -22,9 +22,9 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.native.settings import NATIVE_FORMS
+from ganlane.native.settings import CONTROL_NUMBERS, HEADING_RAD, NATIVE_FORMS
 from ganlane.native.tensors import LaneView, wants_gradient
-from ganlane.settings.actions import CONTINUOUS, LANE_SPEED, ActionParameters
+from ganlane.settings.actions import LANE_SPEED, ActionParameters
 from ganlane.settings.observation import NEARNESS_M, OVERLAP_M, ROAD_SIGHT_M, ObservationScale
 from ganlane.sim.lane_ends import begins, ends, may_change, of_lane, on_road
 from ganlane.sim.state import Road, Vehicles, road_in
@@ -255,12 +255,6 @@ OBSERVATIONS: Final[dict[str, tuple[Part, ...]]] = {
 }
 
 
-#: Numbers at the end of every form that the driver needs to command more than the lane.
-CONTROL_NUMBERS: Final = {LANE_SPEED: 1, CONTINUOUS: 2}
-#: Heading that counts as 1, rad: some 5 m/s to the side at 25 m/s.
-HEADING_RAD = 0.2
-
-
 def control_numbers(
     vehicles: Vehicles,
     set_speed: Tensor | None,
@@ -270,7 +264,7 @@ def control_numbers(
 
     With a ``set_speed`` [N], m/s, that over the desired speed; without one, for ``continuous``, the
     ego's offset in its lane (1 on the left line, -1 on the right one) and its heading over
-    :data:`HEADING_RAD`, to the left positive, clipped.
+    ``HEADING_RAD``, to the left positive, clipped.
     """
     ego = vehicles.columns(slice(0, 1))
     if set_speed is not None:
@@ -283,7 +277,7 @@ def control_numbers(
 def observation_size(name: str, vehicles: int, actions: ActionParameters | None = None) -> int:
     """Length D of observation ``name`` for ``vehicles`` vehicles, the ego included."""
     parts = sum(part.size(vehicles - 1) for part in OBSERVATIONS[name])
-    return parts + (0 if actions is None else CONTROL_NUMBERS.get(actions.form, 0))
+    return parts + (0 if actions is None else CONTROL_NUMBERS[actions.form])
 
 
 class ObservationTransform(PerceptionTransform):
@@ -388,7 +382,7 @@ class ObservationTransform(PerceptionTransform):
                 road,
                 seen,
             )
-        if self.actions.form in CONTROL_NUMBERS:
+        if CONTROL_NUMBERS[self.actions.form]:
             set_speed = ego.get(keys.SET_SPEED) if self.actions.form == LANE_SPEED else None
             further = control_numbers(vehicles, set_speed, road_in(state, self.road))
             observation = torch.cat((observation, further), dim=1)

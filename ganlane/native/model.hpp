@@ -112,7 +112,8 @@ static inline bool may_change(const Settings& s, int64_t lane, int64_t side, flo
 // Whether a body at `x` that moves from `y` to `later` crosses a line beside which there is no lane to change into.
 static inline bool leaves_road(const Settings& s, float y, float later, float x) {
     int64_t lane = (int64_t)__builtin_rintf(y * s.per_lane_width), beside = (int64_t)__builtin_rintf(later * s.per_lane_width);
-    return !may_change(s, lane, beside - lane, x);
+    // Who is beside the road may come back.
+    return beside != lane && !(exists(s, beside, x) && (!s.ends || exists(s, lane, x)));
 }
 
 // The number of the lane that each row has its own number of; `otherwise` where the road has no such lane.

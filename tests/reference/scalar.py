@@ -446,7 +446,9 @@ def obey(state: State, action: int, rules: Rules) -> tuple[bool, bool]:
 
 
 def crossing_allowed(lane: int, other: int, x: float, rules: Rules) -> bool:
-    return lane == other or (there_is(lane, x, rules) and there_is(other, x, rules))
+    """From lane to lane; where none ends, one may come back from beside the road."""
+    from_here = not rules.stretches or there_is(lane, x, rules)
+    return lane == other or (from_here and there_is(other, x, rules))
 
 
 def be_steered(state: State, pedal: float, wheel: float, rules: Rules) -> bool:

@@ -233,10 +233,42 @@ def test_at_the_end_of_the_exit_lane_the_ego_has_left_the_road_or_missed_it(kern
     assert not step(env, earlier)["done"]
 
 
-@pytest.mark.parametrize("scene", ["merge", "lane_drop", "exit"])
+@pytest.mark.parametrize("scene", ["merge", "on_ramp", "lane_drop", "weave", "exit"])
 def test_gymnasium_has_no_complaint(scene):
     env = gymnasium.make("ganlane/Highway-v0", env=scene, observation="road_view", mask="safe")
     check_env(env.unwrapped, skip_render_check=True)
     envs = gymnasium.make_vec("ganlane/Highway-v0", num_envs=3, env=scene)
     observation, _ = envs.reset(seed=1)
     assert envs.observation_space.contains(observation)
+
+
+# env=on_ramp, weave
+
+
+@pytest.mark.parametrize("driver", ["mobil", "keep_lane"])
+def test_an_ego_beside_an_on_ramp_lets_the_others_merge(driver):
+    config = make(EnvConfig, "on_ramp")
+    assert outcomes(config, driver, IdmMobilTrafficConfig()) == {"goal": 64}
+
+
+def test_all_who_come_from_the_ramp_find_their_way_onto_the_road():
+    config = replace(make(EnvConfig, "on_ramp"), goal_m=1e5, timeout_s=300.0)
+    env = make_env(make_traffic(IdmMobilTrafficConfig(), config), config, num_envs=32)
+    policy = make_driver("mobil", config).policy
+    td = env.reset()
+    assert ((td[keys.VEHICLES, "target_lane"] == 0).sum(1) == 6).all()
+    for _ in range(180):
+        td = env.step(policy(td))["next"]
+        assert not td["done"].any()
+    assert (td[keys.VEHICLES, "x"] > 400.0).all()
+    assert (td[keys.VEHICLES, "target_lane"] > 0).all()
+    assert (td[keys.VEHICLES, "speed"] > 10.0).all()
+
+
+def test_where_a_ramp_becomes_an_exit_most_mobil_egos_leave_the_road_by_it():
+    ends = outcomes(make(EnvConfig, "weave"), "mobil", IdmMobilTrafficConfig())
+    assert ends.keys() <= {"goal", "missed_exit"}
+    assert ends["goal"] > 55
+    assert outcomes(make(EnvConfig, "weave"), "keep_lane", IdmTrafficConfig()) == {
+        "missed_exit": 64
+    }

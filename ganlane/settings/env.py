@@ -1,7 +1,7 @@
 """``env=...``: road, vehicles, initial scenes, and the end of an episode; m, s, m/s.
 
 ``env=highway`` and ``env=dense`` start with random scenes (Table II). ``env=cut_in, stalled_car,
-blocked_lane, stop_and_go, merge, lane_drop, exit`` start with a scene made by
+blocked_lane, stop_and_go, merge, on_ramp, lane_drop, weave, exit`` start with a scene made by
 :mod:`ganlane.sim.scenarios`, ``env=scene`` with one from a file.
 """
 
@@ -271,6 +271,51 @@ class ExitScene(SceneConfig):
         return off_ramp(
             self.speed_mps,
             self.faster_mps,
+            self.spacing_m,
+            env.lanes,
+            env.ego_desired_speed_mps,
+        )
+
+
+@dataclass(frozen=True)
+class OnRampScene(SceneConfig):
+    """Others come from an on-ramp, the rightmost lane, and merge in front of the ego beside it.
+
+    Attributes:
+        ramp_m: from the ego to where the ramp becomes an acceleration lane, m.
+        merge_m: length of the acceleration lane, m; as of ``merge``.
+        exit: whether that lane becomes the one of an exit, by which the ego has to leave the road
+            (env=weave); else it ends at a wall.
+        ramp_speed_mps: of the vehicles on the ramp, m/s.
+        ramp_spacing_m: centre to centre, of those on the ramp, m.
+        speed_mps: of the ego and the others on the road, m/s.
+        spacing_m: centre to centre, of those in one lane of the road, m.
+    """
+
+    kind: str = "on_ramp"
+    jitter_m: NotNegative = 14.0
+    jitter_mps: NotNegative = 2.0
+    ramp_m: Positive = 150.0
+    merge_m: Positive = 250.0
+    exit: bool = False
+    ramp_speed_mps: Positive = 18.0
+    ramp_spacing_m: Positive = 50.0
+    speed_mps: Positive = 20.0
+    spacing_m: Positive = 60.0
+
+    def stretches(self, lanes: int) -> Stretches:
+        """The rightmost lane ends, the others go on."""
+        ramp = LaneStretch(self.ramp_m, self.ramp_m + self.merge_m, EXIT if self.exit else WALL)
+        return (ramp, *[LaneStretch()] * (lanes - 1))
+
+    def vehicles(self, env: EnvConfig) -> tuple[SceneVehicle, ...]:
+        """The vehicles, the ego first."""
+        from ganlane.sim.scenarios import beside_ramp
+
+        return beside_ramp(
+            self.ramp_speed_mps,
+            self.ramp_spacing_m,
+            self.speed_mps,
             self.spacing_m,
             env.lanes,
             env.ego_desired_speed_mps,

@@ -1,5 +1,5 @@
 """The test scenarios: cut-in, stalled car, stop-and-go wave, blocked lane, and roads with lanes
-that end: merge, lane drop, off-ramp; m, m/s.
+that end: merge, on-ramp, weave, lane drop, off-ramp; m, m/s.
 
 Functions of a few numbers that return the rows of a :class:`~ganlane.sim.scenes.FixedScene`, the
 ego first.
@@ -196,6 +196,29 @@ def merge(
         # Neighbouring lanes are staggered by half of the spacing.
         first_m = (3.0 + 0.5 * (lane % 2)) * spacing_m
         cars += _stream(lane, 10, first_m, spacing_m, speed_mps)
+    return tuple(cars)
+
+
+def beside_ramp(
+    ramp_speed_mps: float = 18.0,
+    ramp_spacing_m: float = 50.0,
+    speed_mps: float = 20.0,
+    spacing_m: float = 60.0,
+    lanes: int = 3,
+    desired_speed_mps: float = 25.0,
+) -> tuple[SceneVehicle, ...]:
+    """Six vehicles ``ramp_spacing_m`` apart on the rightmost lane, an on-ramp, three of them ahead
+    of the ego in the lane beside it; seven ``spacing_m`` apart in every other lane, and six in its
+    own.
+    """
+    _at_least(lanes, 2, "on_ramp")
+    cars = [SceneVehicle(0.0, 1, speed_mps, desired_speed_mps)]
+    cars += _stream(0, 6, 2.5 * ramp_spacing_m, ramp_spacing_m, ramp_speed_mps)
+    for lane in range(1, lanes):
+        # Neighbouring lanes are staggered by half of the spacing.
+        first_m = (2.0 + 0.5 * ((lane - 1) % 2)) * spacing_m
+        stream = _stream(lane, 7, first_m, spacing_m, speed_mps)
+        cars += [car for car in stream if car.x_m or lane > 1]
     return tuple(cars)
 
 

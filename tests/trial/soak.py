@@ -33,7 +33,7 @@ RECORDINGS = DATA / "ngsim" / "us101_scenes.csv"
 RULES = ("idm", "idm_mobil")
 TRAFFICS = (*RULES, *RULES, "idm_random", "idm_faults", "human", "gan", "gan_calibrated", "mixed")
 ENVS = ("highway", "highway", "highway", "dense", "cut_in", "stalled_car", "stop_and_go")
-ROADS = ("merge", "lane_drop", "exit")
+ROADS = ("merge", "on_ramp", "lane_drop", "weave", "exit")
 ENVS += (*ROADS, "blocked_lane", "replay")
 #: Pairs of vehicles in all rows together; generated traffic needs a kilobyte or more for each.
 MOST_PAIRS = 2_000_000

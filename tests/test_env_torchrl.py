@@ -16,6 +16,7 @@ import ganlane
 from ganlane import keys
 from ganlane.env.state import checked_action
 from ganlane.errors import UserError
+from ganlane.settings.actions import ActionParameters
 
 TRAFFICS = ("idm_random", "idm_faults", "gan_calibrated", "mixed")
 KEEP = torch.zeros(2, dtype=torch.int64)
@@ -94,9 +95,9 @@ def test_episodes_are_the_same_bits_whatever_torchs_default_type_is(traffic, req
 
 def test_the_check_of_actions_is_part_of_a_compiled_graph():
     check = torch.compile(checked_action, fullgraph=True, backend="eager")
-    assert torch.equal(check(KEEP, 2), KEEP)
+    assert torch.equal(check(KEEP, 2, ActionParameters()), KEEP)
     with pytest.raises(RuntimeError, match="action: each must be 0 to 2"):
-        check(KEEP - 1, 2)
+        check(KEEP - 1, 2, ActionParameters())
 
 
 @pytest.mark.slow  # tracing takes some seconds

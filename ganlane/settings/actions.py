@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Annotated, Any, Final
 
 from ganlane.errors import ParameterError
@@ -49,7 +48,7 @@ class ActionParameters(Record):
         """The record; the name of a form alone will do."""
         return super().chosen({"form": data} if isinstance(data, str) else data)
 
-    @cached_property
+    @property
     def names(self) -> tuple[str, ...]:
         """The numbered actions; empty for ``continuous``."""
         return NUMBERED.get(self.form, ())

@@ -1,7 +1,8 @@
-"""SAC of stable-baselines3 learns to accelerate, brake and steer on an on-ramp that ends.
+"""SAC of stable-baselines3 accelerates, brakes and steers on an on-ramp that ends.
 
-``python examples/sb3_sac_merge.py`` trains for 30,000 decisions, some minutes on one core, and
-compares the result with MOBIL; ``... 100000 PPO`` trains PPO. Needs ``pip install 'ganlane[sb3]'``.
+``python examples/sb3_sac_merge.py`` trains for 30,000 decisions and compares the result with MOBIL;
+``... 100000 PPO`` trains PPO. A starting point, not a tuned recipe: a run of this length with a
+quarter of the updates learned to stand still. Needs ``pip install 'ganlane[sb3]'``.
 """
 
 import sys

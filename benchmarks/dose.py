@@ -1,11 +1,10 @@
 """Which property of human-like traffic does an agent learn from?
 
     python -m benchmarks.dose train
-    python -m benchmarks.dose train --part 1/2
     python -m benchmarks.dose table
 
-The first takes hours on one core and goes on where it ended; the second makes the second half, for
-another core.
+The first takes hours on one core and goes on where it ended. For two cores: `train --part 0/2`
+beside `train --part 1/2`.
 
 Every training is `experiment=dose` with one property of the drivers changed. Its agent then drives
 on traffics that no training met. The table has, for each dose, the difference to the trainings

@@ -7,6 +7,7 @@ ego first.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import accumulate
 
 from ganlane.errors import UserError
@@ -191,12 +192,8 @@ def merge(
     the others, a third of them ahead of it.
     """
     _at_least(lanes, 2, "merge")
-    cars = [SceneVehicle(0.0, 0, ego_speed_mps, desired_speed_mps)]
-    for lane in range(1, lanes):
-        # Neighbouring lanes are staggered by half of the spacing.
-        first_m = (3.0 + 0.5 * (lane % 2)) * spacing_m
-        cars += _stream(lane, 10, first_m, spacing_m, speed_mps)
-    return tuple(cars)
+    ego = SceneVehicle(0.0, 0, ego_speed_mps, desired_speed_mps)
+    return (ego, *_around(ego, range(1, lanes), 10, 3.0, spacing_m, speed_mps))
 
 
 def beside_ramp(
@@ -212,14 +209,9 @@ def beside_ramp(
     own.
     """
     _at_least(lanes, 2, "on_ramp")
-    cars = [SceneVehicle(0.0, 1, speed_mps, desired_speed_mps)]
-    cars += _stream(0, 6, 2.5 * ramp_spacing_m, ramp_spacing_m, ramp_speed_mps)
-    for lane in range(1, lanes):
-        # Neighbouring lanes are staggered by half of the spacing.
-        first_m = (2.0 + 0.5 * ((lane - 1) % 2)) * spacing_m
-        stream = _stream(lane, 7, first_m, spacing_m, speed_mps)
-        cars += [car for car in stream if car.x_m or lane > 1]
-    return tuple(cars)
+    ego = SceneVehicle(0.0, 1, speed_mps, desired_speed_mps)
+    ramp = _stream(0, 6, 2.5 * ramp_spacing_m, ramp_spacing_m, ramp_speed_mps)
+    return (ego, *ramp, *_around(ego, range(1, lanes), 7, 2.0, spacing_m, speed_mps))
 
 
 def lane_drop(
@@ -232,14 +224,8 @@ def lane_drop(
     lane, and six in its own.
     """
     _at_least(lanes, 2, "lane_drop")
-    leftmost = lanes - 1
-    cars = [SceneVehicle(0.0, leftmost, speed_mps, desired_speed_mps)]
-    for lane in range(lanes):
-        # Neighbouring lanes are staggered by half of the spacing.
-        first_m = (2.0 + 0.5 * ((leftmost - lane) % 2)) * spacing_m
-        stream = _stream(lane, 7, first_m, spacing_m, speed_mps)
-        cars += [car for car in stream if car.x_m or lane < leftmost]
-    return tuple(cars)
+    ego = SceneVehicle(0.0, lanes - 1, speed_mps, desired_speed_mps)
+    return (ego, *_around(ego, range(lanes), 7, 2.0, spacing_m, speed_mps))
 
 
 def off_ramp(
@@ -255,16 +241,9 @@ def off_ramp(
     Each lane is ``faster_mps`` faster than the one on its right.
     """
     _at_least(lanes, 2, "exit")
-    leftmost = lanes - 1
-    ego_speed = speed_mps + faster_mps * (leftmost - 1)
-    cars = [SceneVehicle(0.0, leftmost, ego_speed, desired_speed_mps)]
-    for lane in range(1, lanes):
-        # Neighbouring lanes are staggered by half of the spacing.
-        first_m = (3.0 + 0.5 * ((leftmost - lane) % 2)) * spacing_m
-        speed = speed_mps + faster_mps * (lane - 1)
-        stream = _stream(lane, 8, first_m, spacing_m, speed)
-        cars += [car for car in stream if car.x_m or lane < leftmost]
-    return tuple(cars)
+    ego_speed = speed_mps + faster_mps * (lanes - 2)
+    ego = SceneVehicle(0.0, lanes - 1, ego_speed, desired_speed_mps)
+    return (ego, *_around(ego, range(1, lanes), 8, 3.0, spacing_m, speed_mps, faster_mps))
 
 
 def _stream(
@@ -284,6 +263,31 @@ def _stream(
         )
         for k in range(vehicles)
     )
+
+
+def _around(
+    ego: SceneVehicle,
+    lanes: Iterable[int],
+    vehicles: int,
+    ahead: float,
+    spacing_m: float,
+    speed_mps: float,
+    faster_mps: float = 0.0,
+) -> tuple[SceneVehicle, ...]:
+    """A :func:`_stream` in each of the ``lanes``, the first one ``ahead`` spacings before the ego.
+
+    Neighbouring lanes are staggered by half of the spacing. In its own lane the ego has the place
+    of one of them. Each lane is ``faster_mps`` faster than the one on its right, from
+    ``speed_mps`` in lane 1.
+    """
+    assert ego.lane is not None
+    cars: list[SceneVehicle] = []
+    for lane in lanes:
+        first_m = (ahead + 0.5 * (abs(lane - ego.lane) % 2)) * spacing_m
+        speed = speed_mps + faster_mps * (lane - 1)
+        stream = _stream(lane, vehicles, first_m, spacing_m, speed)
+        cars += [car for car in stream if car.x_m or lane != ego.lane]
+    return tuple(cars)
 
 
 def _at_least(

@@ -155,6 +155,7 @@ def test_python_takes_a_function_a_driver_and_names_of_your_own():
         folder="out",
     )
     scores = {entry["entry"]: entry["score"] for entry in run.results["entries"]}
+    assert {row["traffic"] for row in run.results["rows"]} == {"idm"}
     assert scores.keys() == {"random_legal", "mobil", "mine", "theirs", "rule"}
     assert scores["mine"] == scores["rule"]
     with user_error("expected an agent's name or a function"):

@@ -143,12 +143,17 @@ def option(group: str, name: str) -> dict[str, Any]:
     return deepcopy(_option_file(conf_folder() / group / f"{name}.yaml"))
 
 
+#: Keys whose names with numbers are one value: it replaces the one below, as on the command line.
+ONE_VALUE = frozenset({"scored", "shown", "shares"})
+
+
 def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
     """``below`` with ``above`` on top, mapping by mapping; one with a ``name`` begins anew."""
     result = dict(below)
     for name, value in above.items():
         before = result.get(name)
-        if isinstance(before, Mapping) and isinstance(value, Mapping) and "name" not in value:
+        begins_anew = name in ONE_VALUE or not isinstance(value, Mapping) or "name" in value
+        if isinstance(before, Mapping) and not begins_anew:
             value = merged(before, value)
         result[name] = value
     return result

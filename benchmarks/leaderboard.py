@@ -3,23 +3,30 @@
     python -m benchmarks.leaderboard                   # what differs in the documents
     python -m benchmarks.leaderboard --write           # write README's table and the page
     python -m benchmarks.leaderboard --add outputs/benchmark/RUN/results.json --name NAME
-    python -m benchmarks.leaderboard --check           # drive the samples again
+    python -m benchmarks.leaderboard --check           # drive a part of the samples again
+    python -m benchmarks.leaderboard --check --all     # all of them
 
-``--add`` stores what the page needs of a run as ``docs/leaderboard/NAME.json``. ``--check`` drives
-the sampled episodes of every agent that can be had here, and names those that come out otherwise.
+``--add`` stores what the page needs of a run as ``docs/leaderboard/NAME.json``, and of an agent
+that is a folder of stable-baselines3 models or plain networks the layers that act. ``--check``
+drives sampled episodes of every agent that can be had here, and refuses those that come out
+otherwise: two of each entry on three traffics, drawn by its name; with ``--all`` every one.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import random
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from benchmarks.script import ReportSection, make_parser, run_script, split_at_markers
+from ganlane.agents.stored_models import load_model, save_network
+from ganlane.build import Driver
 from ganlane.config.run import settings
 from ganlane.errors import UserError
 from ganlane.evaluation.table import Table
@@ -27,7 +34,8 @@ from ganlane.files import write_json
 from ganlane.settings.suite import BenchmarkConfig
 from ganlane.suite.driving import compare
 from ganlane.suite.report import score_table
-from ganlane.suite.run import SAMPLE, SCHEMA, drivers_of
+from ganlane.suite.run import SCHEMA, drivers_of
+from ganlane.suite.scores import recipe_of
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "leaderboard"
@@ -42,8 +50,12 @@ PAGES: Mapping[str, tuple[str | None, tuple[str, ...] | None]] = {
 MARKERS = ("<!-- leaderboard: begin -->", "<!-- leaderboard: end -->")
 #: What is stored of a run's results.
 PARTS = ("schema", "suite", "protocol", "quick", "entries", "sample", "code", "machine", "written")
+#: Of each entry ``--check`` drives again so many episodes on so many traffics.
+EPISODES, TRAFFICS = 2, 3
 
 Results = Mapping[str, Any]
+#: Of the first episodes, by driver and traffic.
+Rewards: TypeAlias = dict[tuple[str, str], list[float]]
 
 
 def stored() -> dict[str, Results]:
@@ -65,13 +77,18 @@ def stored() -> dict[str, Results]:
 
 
 def table(document: str) -> str:
-    """The table of a document: one line per entry, the best first; drivers of the suite once."""
+    """The table of a document: one line per entry, the best first; drivers of the suite once.
+
+    Of an entry that was driven with one training and with several the latter counts.
+    """
     only, columns = PAGES[document]
     results = stored() if only is None else {only: stored()[only]}
-    entries = {}
+    entries: dict[str, Results] = {}
     for name in results:
         for entry in results[name]["entries"]:
-            entries.setdefault(entry["entry"], entry)
+            before = entries.get(entry["entry"])
+            if before is None or entry["trainings"] > before["trainings"]:
+                entries[entry["entry"]] = entry
     traffics = list(settings("benchmark", []).suite.scored)
     rows = [{**entry, "decisions_per_s": None} for entry in entries.values()]
     whole = score_table(rows, traffics, [])
@@ -83,13 +100,24 @@ def table(document: str) -> str:
 
 
 def add(path: Path, name: str) -> str:
-    """Store what the page needs of a run; the line that names the file."""
+    """Store what the page needs of a run, and the weights of agents in folders; names the file."""
     content = json.loads(path.read_text(encoding="utf-8"))
-    agents = content["config"]["agents"]
-    parts = {part: content[part] for part in PARTS}
+    agents = list(content["config"]["agents"] or ())
+    for number, agent in enumerate(agents):
+        if Path(agent).is_dir() and any(Path(agent).glob("*.zip")):
+            agents[number] = add_weights(Path(agent))
     file = FOLDER / f"{name}.json"
-    write_json(file, {"agents": agents, **parts})
+    write_json(file, {"agents": agents, **{part: content[part] for part in PARTS}})
     return f"stored: {file}"
+
+
+def add_weights(folder: Path) -> str:
+    """Store the layers that act, without critics and optimisers; the name of their folder."""
+    name = folder.resolve().name
+    for file in sorted(folder.glob("*.zip")):
+        model, reading = load_model(file)
+        save_network(FOLDER / name / file.name, model.layers, reading)
+    return name
 
 
 def differences() -> list[str]:
@@ -103,8 +131,8 @@ def differences() -> list[str]:
     return wrong
 
 
-def driven_again(name: str, results: Results, episodes: int = SAMPLE) -> list[str]:
-    """Drive the sample of one stored run again: a line for every episode that differs.
+def cells(results: Results, every: bool) -> list[tuple[Driver, str]]:
+    """The trainings of a stored run and the traffics on which they are driven again.
 
     Raises:
         UserError: an agent that is not at hand here.
@@ -114,17 +142,49 @@ def driven_again(name: str, results: Results, episodes: int = SAMPLE) -> list[st
     # Weights of a contributor lie beside the results, in a folder of the entry's name.
     beside = [str(FOLDER / agent) if (FOLDER / agent).is_dir() else agent for agent in agents]
     names = [*config.suite.drivers(), *beside]
-    wrong = []
+    entries: dict[str, list[Driver]] = {}
     for driver in drivers_of(list(dict.fromkeys(names)), config):
-        for traffic, rewards in results["sample"].get(driver.name, {}).items():
-            count = min(episodes, len(rewards))
+        entries.setdefault(recipe_of(driver.name), []).append(driver)
+    traffics = list(config.suite.scored)
+    drawn: list[tuple[Driver, str]] = []
+    for entry, trainings in entries.items():
+        if every:
+            drawn += product(trainings, traffics)
+        else:
+            # The same for everybody, and another for another entry.
+            chance = random.Random(entry)
+            drawn += [
+                (chance.choice(trainings), name) for name in chance.sample(traffics, TRAFFICS)
+            ]
+    return drawn
+
+
+def driven_again(name: str, results: Results, rewards: Rewards, every: bool = False) -> list[str]:
+    """Drive sampled episodes of one stored run again: a line for every one that differs.
+
+    Args:
+        name: of the stored run.
+        results: its content.
+        rewards: what was driven before, so that nothing is driven twice; is added to.
+        every: all that is stored.
+    """
+    config: BenchmarkConfig = settings("benchmark", [])
+    wrong = []
+    for driver, traffic in cells(results, every):
+        before = results["sample"].get(driver.name, {}).get(traffic, [])
+        if not before:
+            wrong.append(f"{name}: {driver.name} on {traffic} has no sample")
+            continue
+        count = len(before) if every else min(EPISODES, len(before))
+        cell = driver.name, traffic
+        if len(rewards.get(cell, [])) < count:
             alone = replace(config.on(traffic), episodes=count)
-            evaluated = compare([driver], alone, quiet=True)
-            for number, (now, before) in enumerate(zip(evaluated["reward"], rewards)):
-                if now != before:
-                    wrong.append(
-                        f"{name}: {driver.name} on {traffic}, episode {number}: {now}, not {before}"
-                    )
+            rewards[cell] = compare([driver], alone, quiet=True)["reward"].to_list()
+        for number, (now, then) in enumerate(zip(rewards[cell], before)):
+            if now != then:
+                wrong.append(
+                    f"{name}: {driver.name} on {traffic}, episode {number}: {now}, not {then}"
+                )
     return wrong
 
 
@@ -134,14 +194,16 @@ def work(options: argparse.Namespace) -> str:
         return add(options.add, options.name)
     if options.check:
         wrong = []
+        rewards: Rewards = {}
         for name, results in stored().items():
             try:
-                wrong += driven_again(name, results)
+                wrong += driven_again(name, results, rewards, options.all)
             except UserError as error:
                 print(f"{name}: not driven again ({error})", file=sys.stderr)
         if wrong:
-            raise UserError("; ".join(wrong))
-        return "every sampled episode came out as stored"
+            more = f" ({len(wrong) - 1} more differ)" if len(wrong) > 1 else ""
+            raise UserError(f"{wrong[0]}{more}; store what this code drives, or mend the code.")
+        return f"{sum(map(len, rewards.values()))} sampled episodes came out as stored"
     for document in PAGES if options.write else ():
         ReportSection(ROOT / document, *MARKERS).write(f"\n{table(document)}\n")
     return "\n".join(differences()) or "the documents are as the stored results say"
@@ -151,7 +213,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Write, add or check; the exit status."""
     parser = make_parser(__doc__)
     parser.add_argument("--write", action="store_true", help="write the page")
-    parser.add_argument("--check", action="store_true", help="drive the samples again")
+    parser.add_argument("--check", action="store_true", help="drive samples again")
+    parser.add_argument("--all", action="store_true", help="with --check: every one of them")
     parser.add_argument("--add", type=Path, help="the results.json of a run")
     parser.add_argument("--name", default="mine", help="of the stored file")
     return run_script(work, parser.parse_args(arguments))

@@ -2,7 +2,8 @@
 episodes.
 
 Run it with ``python examples/sb3_dqn.py`` (needs ``pip install stable-baselines3``); a short
-training by default, more with ``python examples/sb3_dqn.py 200000``.
+training by default, more with ``python examples/sb3_dqn.py 200000``. The policy is stored for
+``ganlane benchmark outputs/sb3/DQN_0.zip``.
 """
 
 from __future__ import annotations
@@ -17,18 +18,21 @@ import ganlane
 import ganlane.sb3
 
 
-def main(decisions=2_000, episodes=20, goal_m=1000.0):
+def main(decisions=2_000, episodes=20, goal_m=1000.0, seed=0):
     """Train on one highway, then evaluate on a batch of them."""
-    torch.manual_seed(0)
+    torch.set_num_threads(1)  # small networks: a second thread only costs
     env = gymnasium.make("ganlane/Highway-v0", traffic="idm_mobil", goal_m=goal_m)
-    model = DQN("MlpPolicy", env, learning_starts=decisions // 4, gamma=0.98, train_freq=4, seed=0)
+    options = {"learning_starts": decisions // 4, "gamma": 0.98, "train_freq": 4, "seed": seed}
+    model = DQN("MlpPolicy", env, **options)
     model.learn(decisions)
     finished = [episode["r"] for episode in model.ep_info_buffer]
     print(
         f"{model.num_timesteps} decisions, mean return of the last {len(finished)} episodes "
         f"{mean(finished):.1f}"
     )
-    drivers = [ganlane.sb3.driver(model, "sb3_dqn"), "mobil", "random_legal"]
+    driver = ganlane.sb3.driver(model, "sb3_dqn")
+    driver.save(f"outputs/sb3/DQN_{seed}.zip")
+    drivers = [driver, "mobil", "random_legal"]
     table = ganlane.api.evaluate(drivers, ["idm_mobil"], episodes, goal_m=goal_m)
     print(table.select("agent", "episodes", "goal", "hard_crash", "mean_reward"))
 

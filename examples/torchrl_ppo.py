@@ -2,7 +2,8 @@
 same episodes.
 
 ``python examples/torchrl_ppo.py`` trains for 2 M decisions;
-``python examples/torchrl_ppo.py 20000 4`` for some seconds, and compares on 4 episodes.
+``python examples/torchrl_ppo.py 20000 4`` for some seconds, and compares on 4 episodes. The policy
+is stored for ``ganlane benchmark outputs/torchrl/PPO_0.zip``.
 """
 
 import sys
@@ -15,18 +16,20 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 import ganlane
+from ganlane.agents.stored_models import Reading, save_network
+from ganlane.settings.observation import MaskParameters
 
 STEPS = 64
 EPOCHS = 4
 MINIBATCH = 2048
 
 
-def main(decisions="2000000", episodes="100", goal_m="5000", num_envs="256"):
+def main(decisions="2000000", episodes="100", goal_m="5000", num_envs="256", seed="0"):
     """Collect, update, evaluate."""
-    torch.manual_seed(0)
+    torch.manual_seed(int(seed))
     torch.set_num_threads(1)  # small networks: a second thread only costs
     options = {"mask": "safe", "goal_m": float(goal_m)}
-    env = ganlane.make_env("idm_mobil", int(num_envs), **options)
+    env = ganlane.make_env("idm_mobil", int(num_envs), seed=int(seed), **options)
     size = env.observation_spec["observation"].shape[-1]
     logits, value = (
         MLP(size, out, num_cells=[128, 128], activation_class=torch.nn.Tanh) for out in (3, 1)
@@ -70,6 +73,8 @@ def main(decisions="2000000", episodes="100", goal_m="5000", num_envs="256"):
                 optimiser.zero_grad()
         schedule.step()
     print(f"reward per decision {batch['next', 'reward'].mean():.2f}")
+    reading = Reading(mask=MaskParameters("safe"))
+    save_network(f"outputs/torchrl/PPO_{seed}.zip", logits, reading)
     drivers = [ganlane.Driver("torchrl_ppo", actor), "mobil"]
     table = ganlane.api.evaluate(drivers, ["idm_mobil"], int(episodes), **options)
     print(table.select("agent", "episodes", "goal", "hard_crash", "mean_reward"))

@@ -16,7 +16,6 @@ Needs the extra ``sb3``.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -35,18 +34,17 @@ from ganlane.agents.stored_models import (
     Network,
     Normaliser,
     Reading,
-    description_of,
     read_description,
+    write_description,
 )
 from ganlane.arguments import seed_number
 from ganlane.build import Driver
 from ganlane.errors import ParameterError, UserError
-from ganlane.files import PLACE, atomic_path, write_json
+from ganlane.files import atomic_path
 from ganlane.gym.base import OnRows
 from ganlane.gym.vector import HighwayVectorGym
 from ganlane.settings.actions import ActionParameters
 from ganlane.settings.observation import MaskParameters, ObservationConfig
-from ganlane.settings.record import plain
 
 try:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -339,20 +337,9 @@ class ModelDriver(Driver):
                 normaliser.epsilon,
                 normaliser.clip_obs,
             )
-        content = {
-            "checksum": PLACE,
-            "model_sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-            "reads": plain(
-                Reading(
-                    self.observation,
-                    self.mask,
-                    normaliser,
-                    _network(self.policy.model),
-                    self.actions,
-                )
-            ),
-        }
-        write_json(description_of(file), content)
+        network = _network(self.policy.model)
+        reading = Reading(self.observation, self.mask, normaliser, network, self.actions)
+        write_description(file, reading)
 
 
 def driver(

@@ -7,6 +7,7 @@ import re
 from functools import partial
 from pathlib import Path
 
+import jsonschema
 import pytest
 from reference.refusals import user_error
 
@@ -18,6 +19,8 @@ from ganlane.suite import cells
 main = partial(run_command, "benchmark")
 SHORT = ["suite.env.goal_m=60", "hydra.run.dir=out", "suite.scored={idm_mobil: 3, gan: 2}"]
 ALONE = [*SHORT, "suite.shown={}", "suite.baselines=[]"]
+ROOT = Path(__file__).resolve().parents[1]
+SCHEMA = json.loads((ROOT / "docs" / "results.schema.json").read_text())
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
@@ -55,10 +58,24 @@ def test_one_command_leaves_a_table_results_and_a_page(cells_driven, capsys):
     }
     by_name = {entry["entry"]: entry for entry in told["entries"]}
     assert (by_name["random_legal"]["score"], by_name["mobil"]["score"]) == (0.0, 100.0)
-    assert {"rows", "comparisons", "failures", "left_out", "code", "config"} <= told.keys()
+    jsonschema.validate(told, SCHEMA)
     page = Path("out/report.html").read_text()
     assert "agent_idm+none" in page
     assert not any(f'{attribute}="http' in page for attribute in ("src", "href"))
+
+
+def test_stored_results_are_of_the_published_schema_which_refuses_others():
+    validator = jsonschema.Draft202012Validator(SCHEMA)
+    validator.check_schema(SCHEMA)
+    # A source distribution has no stored results.
+    for file in (ROOT / "docs" / "leaderboard").glob("*.json"):
+        whole = json.loads(file.read_text())
+        validator.validate(whole)
+        entry = {**whole["entries"][0], "score": "101.7"}
+        for change in ({"schema": 2}, {"entries": [entry]}, {"sample": {"mobil": [1.0]}}):
+            assert not validator.is_valid({**whole, **change})
+        for name in whole:
+            assert not validator.is_valid({key: whole[key] for key in whole if key != name})
 
 
 def test_failures_are_films_within_the_page():

@@ -1,8 +1,8 @@
-"""Models of stable-baselines3 from their files, without stable-baselines3 and without its pickles.
+"""Models of stable-baselines3 and plain networks from their files, without anybody's pickles.
 
 ``ganlane.sb3.driver(model).save("ppo")`` writes ``ppo.zip``, as ``model.save`` does, and beside it
 ``ppo.zip.json``: what the model reads, and the form of its network. From the archive only the
-weights are read, which execute nothing.
+weights are read, which execute nothing. :func:`save_network` does so for a network of torch.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import pickle
 import re
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,12 +28,14 @@ from torch import nn
 from ganlane import keys
 from ganlane.agents.drivers import mask_in
 from ganlane.errors import ParameterError, UserError
-from ganlane.files import has_checksum, refuse_without_checksum
+from ganlane.files import PLACE, atomic_path, has_checksum, refuse_without_checksum, write_json
 from ganlane.settings.actions import ActionParameters
 from ganlane.settings.observation import MaskParameters, ObservationConfig
-from ganlane.settings.record import NotNegative, Number, Positive, Record, make, one_of
+from ganlane.settings.record import NotNegative, Number, Positive, Record, make, one_of, plain
 
 Floats = npt.NDArray[np.float32]
+#: Name of a network of :func:`save_network` among the algorithms.
+_PLAIN = "MLP"
 #: Algorithms whose MlpPolicy is rebuilt here, and the layers of the network that acts, by the
 #: beginning of their names: hidden ones, and the last one.
 NETWORKS: Mapping[str, tuple[str, str]] = {
@@ -41,6 +43,7 @@ NETWORKS: Mapping[str, tuple[str, str]] = {
     "A2C": ("mlp_extractor.policy_net.", "action_net."),
     "MaskablePPO": ("mlp_extractor.policy_net.", "action_net."),
     "DQN": ("q_net.q_net.", ""),
+    _PLAIN: ("", ""),
 }
 #: Layers that do not act: of critics and of target networks.
 _OTHERS = ("mlp_extractor.value_net.", "value_net.", "q_net_target.")
@@ -89,13 +92,13 @@ class Reading(Record):
     """What a model reads and commands, as the JSON beside its file says.
 
     Attributes:
-        mask: which actions it may choose.
+        mask: which actions it may choose; None: it is not told.
         network: None: not one that can be rebuilt here.
     """
 
-    observation: ObservationConfig
-    mask: MaskParameters | None
-    normaliser: Normaliser | None
+    observation: ObservationConfig = field(default_factory=ObservationConfig)
+    mask: MaskParameters | None = None
+    normaliser: Normaliser | None = None
     network: Network | None = None
     actions: ActionParameters = field(default_factory=ActionParameters)
 
@@ -106,7 +109,7 @@ class StoredModel(TensorDictModuleBase):
     Args:
         layers: of the network that acts.
         normaliser: of the observations.
-        is_masked: whether it was trained with masks, and reads ``action_mask`` [N, 3].
+        is_masked: whether it reads ``action_mask`` [N, 3].
     """
 
     out_keys = [keys.ACTION]  # noqa: RUF012
@@ -143,6 +146,41 @@ class StoredModel(TensorDictModuleBase):
 def description_of(file: Path) -> Path:
     """The JSON file beside that of a model."""
     return file.with_name(f"{file.name}.json")
+
+
+def write_description(file: Path, reading: Reading) -> None:
+    """The JSON file beside that of a model, whose checksum it holds."""
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    content = {"checksum": PLACE, "model_sha256": digest, "reads": plain(reading)}
+    write_json(description_of(file), content)
+
+
+def save_network(path: str | Path, layers: nn.Sequential, reading: Reading | None = None) -> None:
+    """Store a network for ``ganlane benchmark PATH``: it acts by the largest of its outputs.
+
+    Args:
+        path: of the file, .zip; a JSON file is written beside it.
+        layers: Linear layers with one kind of activation between them, say ``torchrl.modules.MLP``.
+        reading: what it reads; None: the default observation, without a mask.
+
+    Raises:
+        UserError: another kind of network.
+    """
+    file = Path(path)
+    linear, between = list(layers)[::2], list(layers)[1::2]
+    kinds = {type(layer).__name__ for layer in between}
+    is_plain = len(linear) == len(between) + 1 and all(type(one) is nn.Linear for one in linear)
+    if file.suffix != ".zip" or not is_plain or len(kinds) != 1 or not kinds <= {*_ACTIVATIONS}:
+        raise UserError(
+            f"{path}: expected a file .zip, and Linear layers with one of "
+            f"{', '.join(_ACTIVATIONS)} between them."
+        )
+    weights = io.BytesIO()
+    torch.save(layers.state_dict(), weights)
+    with atomic_path(file) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("policy.pth", weights.getvalue())
+    network = Network(_PLAIN, kinds.pop())
+    write_description(file, replace(reading or Reading(), network=network))
 
 
 def read_description(file: Path) -> Reading:
@@ -197,8 +235,7 @@ def load_model(file: Path, device: str = "cpu") -> tuple[StoredModel, Reading]:
     layers = _layers(state, network, len(reading.actions.names))
     if layers is None:
         raise _not_plain(file)
-    is_masked = network.algorithm.startswith("Maskable")
-    return StoredModel(layers.to(device), reading.normaliser, is_masked), reading
+    return StoredModel(layers.to(device), reading.normaliser, reading.mask is not None), reading
 
 
 def _layers(state: Mapping[str, Any], network: Network, actions: int) -> nn.Sequential | None:

@@ -14,10 +14,11 @@ from reference.refusals import Bomb, user_error
 from tensordict import TensorDict
 
 from ganlane import keys
-from ganlane.agents.stored_models import load_model
+from ganlane.agents.stored_models import Reading, load_model, save_network
 from ganlane.build import make_driver
 from ganlane.files import PLACE, write_json
 from ganlane.settings.env import EnvConfig
+from ganlane.settings.observation import MaskParameters
 
 SIZE = 4
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -111,3 +112,42 @@ def test_the_description_is_bound_to_the_file():
     Path("ppo.zip.json").write_text(json.dumps(text))
     with user_error("ppo.zip.json"):
         load_model(file)
+
+
+def network(*between, last=None):
+    """Linear layers with others between them."""
+    layers = [torch.nn.Linear(SIZE, SIZE)]
+    for layer in between:
+        layers += [layer, torch.nn.Linear(SIZE, SIZE)]
+    return torch.nn.Sequential(*layers, *([] if last is None else [last]))
+
+
+def test_a_plain_network_is_stored_and_acts_as_before():
+    layers = torch.nn.Sequential(*network(torch.nn.Tanh())[:2], torch.nn.Linear(SIZE, 3))
+    save_network("mlp.zip", layers, Reading(mask=MaskParameters("safe")))
+    driver = make_driver("mlp.zip", EnvConfig())
+    assert driver.mask == MaskParameters("safe")
+    observation = torch.randn(50, SIZE, generator=torch.Generator().manual_seed(0))
+    values = layers(observation)
+    anything = [[True] * 3] * len(values)
+    assert actions_of(driver.policy, observation.tolist(), anything) == values.argmax(-1).tolist()
+    assert set(actions_of(driver.policy, observation.tolist(), [[True, False, True]] * 50)) == {
+        0,
+        2,
+    }
+
+
+@pytest.mark.parametrize(
+    ("path", "layers"),
+    [
+        ("mlp.pt", network(torch.nn.Tanh())),
+        ("mlp.zip", network(torch.nn.Tanh(), torch.nn.ReLU())),
+        ("mlp.zip", network(torch.nn.Softplus())),
+        ("mlp.zip", network(torch.nn.Tanh(), last=torch.nn.Tanh())),
+        ("mlp.zip", torch.nn.Sequential(torch.nn.LayerNorm(SIZE), torch.nn.Tanh(), *network())),
+    ],
+)
+def test_a_network_of_another_kind_is_not_stored(path, layers):
+    with user_error("expected a file .zip, and Linear layers with one of Tanh, ReLU"):
+        save_network(path, layers)
+    assert not list(Path().iterdir())

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 
+import polars as pl
 import pytest
+import torch
 from reference.refusals import user_error
 
 from benchmarks import leaderboard
+from ganlane.agents.stored_models import load_model, save_network
 from ganlane.native.library import find
 
 
@@ -20,25 +23,79 @@ def test_the_page_is_made_from_the_stored_results():
     assert leaderboard.differences() == []
 
 
-def test_the_first_episodes_come_out_as_stored_to_the_last_digit(shipped):
+def test_the_first_episodes_come_out_as_stored_to_the_last_digit(shipped, monkeypatch):
     if isinstance(find(), str):
         pytest.skip("the tensor code differs from the kernel by rounding")
-    # The others take as long again and are driven by the slow test.
-    sample = {name: shipped["sample"][name] for name in ("agent_general", "mobil")}
-    assert leaderboard.driven_again("shipped", {**shipped, "sample": sample}, episodes=2) == []
+    cells = leaderboard.cells(shipped, every=False)
+    assert {driver.name for driver, _ in cells} == shipped["sample"].keys()
+    # The others take as long again; CI drives them, too.
+    alone = [cell for cell in cells if cell[0].name in ("agent_general", "mobil")]
+    assert len(alone) == 2 * leaderboard.TRAFFICS
+    monkeypatch.setattr(leaderboard, "cells", lambda *_: alone)
+    rewards = {}
+    assert leaderboard.driven_again("shipped", shipped, rewards) == []
+    assert sum(map(len, rewards.values())) == leaderboard.EPISODES * len(alone)
 
 
 @pytest.mark.slow
 def test_every_sampled_episode_comes_out_as_stored():
+    assert leaderboard.main(["--check", "--all"]) == 0
+
+
+@pytest.fixture
+def as_stored(monkeypatch, shipped):
+    """Driving again takes no time and gives what is stored."""
+
+    def compare(drivers, config, **_):
+        (traffic,) = config.traffics
+        return pl.DataFrame({"reward": shipped["sample"][drivers[0].name][traffic]})
+
+    monkeypatch.setattr(leaderboard, "compare", compare)
+
+
+@pytest.mark.usefixtures("as_stored")
+@pytest.mark.parametrize("change", [1e-9, None])
+def test_a_falsified_or_missing_sample_is_refused_in_one_sentence(
+    tmp_path, monkeypatch, capsys, shipped, change
+):
+    sample = json.loads(json.dumps(shipped["sample"]))
+    monkeypatch.setattr(leaderboard, "FOLDER", tmp_path)
+    file = tmp_path / "mine.json"
+    file.write_text(json.dumps({**shipped, "sample": sample}))
     assert leaderboard.main(["--check"]) == 0
+    for traffic, rewards in sample["agent_general"].items():
+        sample["agent_general"][traffic] = (
+            [] if change is None else [rewards[0], rewards[1] + change]
+        )
+    file.write_text(json.dumps({**shipped, "sample": sample}))
+    capsys.readouterr()
+    assert leaderboard.main(["--check"]) == 2
+    (told,) = capsys.readouterr().err.strip().splitlines()
+    assert told.startswith("error: mine: agent_general on ")
+    assert ("has no sample" if change is None else ", episode 1: ") in told
+    assert f"({leaderboard.TRAFFICS - 1} more differ)" in told
 
 
-def test_another_reward_is_named_by_its_episode(shipped):
-    first, second, *_ = shipped["sample"]["mobil"]["idm_mobil"]
-    sample = {"mobil": {"idm_mobil": [first, second + 1e-9]}}
-    changed = {**shipped, "sample": sample}
-    (told,) = leaderboard.driven_again("shipped", changed, episodes=2)
-    assert told.startswith("shipped: mobil on idm_mobil, episode 1: ")
+def test_of_a_folder_of_models_the_layers_that_act_are_stored(tmp_path, monkeypatch, shipped):
+    layers = torch.nn.Sequential(torch.nn.Linear(29, 8), torch.nn.ReLU(), torch.nn.Linear(8, 3))
+    save_network(tmp_path / "runs/mine/0.zip", layers)
+    monkeypatch.setattr(leaderboard, "FOLDER", tmp_path)
+    run = {**shipped, "config": {"agents": [str(tmp_path / "runs/mine"), "mobil"]}}
+    (tmp_path / "results.json").write_text(json.dumps(run))
+    leaderboard.main(["--add", str(tmp_path / "results.json"), "--name", "mine"])
+    assert json.loads((tmp_path / "mine.json").read_text())["agents"] == ["mine", "mobil"]
+    model, _ = load_model(tmp_path / "mine/0.zip")
+    assert torch.equal(model.layers[0].weight, layers[0].weight)
+
+
+def test_an_entry_with_more_trainings_takes_the_place_of_one(tmp_path, monkeypatch, shipped):
+    monkeypatch.setattr(leaderboard, "FOLDER", tmp_path)
+    several = [{**entry, "trainings": 7} for entry in shipped["entries"]]
+    for name, entries in (("a", shipped["entries"]), ("b", several), ("c", shipped["entries"])):
+        (tmp_path / f"{name}.json").write_text(json.dumps({**shipped, "entries": entries}))
+    lines = leaderboard.table("docs/leaderboard.md").splitlines()[2:]
+    assert len(lines) == len(shipped["entries"])
+    assert {line.split("|")[2].strip() for line in lines} == {"7"}
 
 
 def test_results_of_another_protocol_are_refused(tmp_path, monkeypatch, shipped):

@@ -2,7 +2,7 @@
 them.
 
     python -m benchmarks.printed          # print what is not as the results say
-    python -m benchmarks.printed outputs/reproduce/RUN/results.json --write
+    python -m benchmarks.printed outputs/benchmark/RUN/results.json --write
 
 Tables stand between ``<!-- matrix NAME: begin -->`` and ``<!-- matrix NAME: end -->``. A test makes
 them again from ``docs/reproduce/results.json`` and from those of :data:`FURTHER`; it also looks up
@@ -27,8 +27,8 @@ from ganlane.suite.report import PAPER_VI, PAPER_VII
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "reproduce" / "results.json"
 #: Folders below it with further results: ``ganlane benchmark`` with the control trainings,
-#: agent_general over more episodes and on traffics that are not the project's own;
-#: ``benchmarks.roads`` and ``benchmarks.ablations``.
+#: agent_general over more episodes and on traffics that are not the project's own; other roads and
+#: ablations are of scripts of revision 878329b.
 FURTHER = ("controls", "general", "roads", "elsewhere", "ablations")
 #: Driver of the matrix to its name in a document, and the traffics that it was trained on.
 DRIVERS: Mapping[str, tuple[str, frozenset[str]]] = {

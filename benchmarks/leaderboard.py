@@ -100,14 +100,25 @@ def table(document: str) -> str:
 
 
 def add(path: Path, name: str) -> str:
-    """Store what the page needs of a run, and the weights of agents in folders; names the file."""
-    content = json.loads(path.read_text(encoding="utf-8"))
-    agents = list(content["config"]["agents"] or ())
+    """Store what the page needs of a run, and the weights of agents in folders; names the file.
+
+    Raises:
+        UserError: not the results of a benchmark.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        agents = list(content["config"]["agents"] or ())
+        parts = {part: content[part] for part in PARTS}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        message = (
+            f"{path}: not the results.json of ganlane benchmark ({error!r}); give that of a run."
+        )
+        raise UserError(message) from error
     for number, agent in enumerate(agents):
         if Path(agent).is_dir() and any(Path(agent).glob("*.zip")):
             agents[number] = add_weights(Path(agent))
     file = FOLDER / f"{name}.json"
-    write_json(file, {"agents": agents, **{part: content[part] for part in PARTS}})
+    write_json(file, {"agents": agents, **parts})
     return f"stored: {file}"
 
 

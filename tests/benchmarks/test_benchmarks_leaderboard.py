@@ -114,3 +114,13 @@ def test_a_run_is_stored_without_what_the_page_does_not_need(tmp_path, monkeypat
     assert stored["agents"] == ["mine"]
     assert stored["entries"] == shipped["entries"]
     assert not {"rows", "failures", "config"} & stored.keys()
+
+
+@pytest.mark.parametrize("text", [None, "no JSON", "[]", '{"config": {}}'])
+def test_what_is_no_result_of_a_benchmark_is_refused_in_one_sentence(tmp_path, capsys, text):
+    file = tmp_path / "results.json"
+    if text is not None:
+        file.write_text(text)
+    assert leaderboard.main(["--add", str(file)]) == 2
+    (told,) = capsys.readouterr().err.strip().splitlines()
+    assert "not the results.json of ganlane benchmark" in told

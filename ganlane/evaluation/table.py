@@ -137,12 +137,22 @@ class Table:
         columns: Mapping[str, Cell],
         names: int = 1,
         notes: Sequence[str] = (),
+        optional: Sequence[str] = (),
     ) -> Table:
-        """One line per row; ``columns`` maps each heading to the maker of its cells."""
-        lines = [[cell(row) for cell in columns.values()] for row in rows]
+        """One line per row; ``columns`` maps each heading to the maker of its cells.
+
+        Those of ``optional`` are left out where no row has anything in them.
+        """
+        # Columns that say nothing here make room for those that do.
+        shown = {
+            heading: cell
+            for heading, cell in columns.items()
+            if heading not in optional or any(cell(row) not in ("0", NOTHING) for row in rows)
+        }
+        lines = [[cell(row) for cell in shown.values()] for row in rows]
         return cls(
             title,
-            list(columns),
+            list(shown),
             lines,
             names,
             notes,
@@ -243,12 +253,6 @@ def text_table(rows: Sequence[Row]) -> str:
 
     Below them stands a line for each reason why a score is missing.
     """
-    # Columns that say nothing here make room for those that do.
-    columns = {
-        heading: cell
-        for heading, cell in _COLUMNS.items()
-        if heading not in _OPTIONAL or any(cell(row) not in ("0", NOTHING) for row in rows)
-    }
     # Each reason with its traffics, once each.
     reasons: dict[str, list[str]] = {}
     for row in rows:
@@ -263,9 +267,10 @@ def text_table(rows: Sequence[Row]) -> str:
     return Table.of(
         "",
         rows,
-        columns,
-        2 + ("run" in columns),
-        notes,
+        _COLUMNS,
+        names=2 + any("run" in row for row in rows),
+        notes=notes,
+        optional=_OPTIONAL,
     ).text()
 
 

@@ -87,6 +87,10 @@ def matrix_table(rows: Sequence[Row]) -> Table:
         "mean reward": number_of("mean_reward", 1),
         "minus MOBIL": number_of("minus_mobil", 1),
         "P(above MOBIL)": number_of("probability_above_mobil", 2),
+        "goal": text_of("goal"),
+        "goal s": number_of("goal_s", 1),
+        "exit missed": text_of("missed_exit"),
+        "time-out": text_of("timeout"),
         "hard": text_of("hard_crash"),
         "off road": text_of("out_of_road"),
         "both per 1000 km": number_of("failures_per_1000_km", 1),
@@ -97,7 +101,8 @@ def matrix_table(rows: Sequence[Row]) -> Table:
         "changes/km": number_of("lane_changes_per_km", 2),
         "close behind": number_of("soft_crash_behind_per_episode", 2),
     }
-    return Table.of("Every driver on every traffic", rows, columns, names=2)
+    optional = ("exit missed", "time-out")
+    return Table.of("Every driver on every traffic", rows, columns, names=2, optional=optional)
 
 
 def comparison_table(rows: Sequence[Row]) -> Table:

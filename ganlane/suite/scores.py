@@ -34,6 +34,8 @@ Row = dict[str, Any]
 Cells = Mapping[tuple[str, str], Mapping[str, pl.DataFrame]]
 #: A smaller time to collision is a near miss, s (van der Horst 1990).
 NEAR_MISS_S = 1.5
+#: How an episode ends without a failure.
+ENDS = ("goal", "missed_exit", "timeout")
 #: Rates per 1000 km by name: the episodes that they count.
 _RATES = {
     "crashes": pl.col("reason").is_in(FAILURES[:1]),
@@ -97,7 +99,8 @@ def rows(cells: Cells) -> list[Row]:
         ``interquartile_mean`` (of the trainings' mean rewards) and ``reward_sd`` (over all
         episodes); ``minus_mobil`` and ``probability_above_mobil`` (None for MOBIL, the latter for a
         single training, too); ``normalized_percent``; ``hard_crash``, ``soft_crash`` (episodes with
-        one) and ``out_of_road`` of all trainings together; ``hard_crash_share`` (exact interval of
+        one) and ``out_of_road`` of all trainings together, and so ``goal``, ``missed_exit`` and
+        ``timeout``; ``goal_s``, the mean time until the goal where it was reached; ``hard_crash_share`` (exact interval of
         all episodes, as if they were independent); ``crashes``, ``departures`` and ``failures``
         (both), ``at_fault`` (the ego moved into the other) and ``near_misses`` (episodes without a
         crash, with a time to collision below :data:`NEAR_MISS_S`) ``_per_1000_km``;
@@ -161,6 +164,8 @@ def safety(trainings: Mapping[str, pl.DataFrame]) -> Row:
     kinds = {kind: int((crashes["crash"] == kind).sum()) for kind in CRASHES}
     row: Row = {
         **_failures(together),
+        **{end: int((together["reason"] == end).sum()) for end in ENDS},
+        "goal_s": together.filter(pl.col("reason") == "goal")["duration_s"].mean(),
         "soft_crash": int(together["had_soft_crash"].sum()),
         **entries("hard_crash_share", clopper_pearson(crashes.height, together.height)),
         "at_fault_share": crashes["at_fault"].mean(),

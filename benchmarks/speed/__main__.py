@@ -2,13 +2,15 @@
 
     python -m benchmarks.speed --suite sim --report docs/speed.md
     python -m benchmarks.speed --suite gymnasium --report docs/speed.md
+    python -m benchmarks.speed --suite scenarios --report docs/speed.md
     python -m benchmarks.speed --suite traffic --traffics gan gan_calibrated --modes eager native
     python -m benchmarks.speed --suite train --modes eager native --stored 100000 --seconds 2
     python -m benchmarks.speed --quick
 
 sim: the simulator, bare and as a whole environment through TorchRL, beside HighwayEnv; gymnasium:
 every traffic through gymnasium, with random actions and with an ego that keeps its lane to the
-goal, beside EnvPool and HighwayEnv; traffic: every traffic model; train: the training loop, beside
+goal, beside EnvPool and HighwayEnv; scenarios: merging and taking an exit, beside their versions of
+the same; traffic: every traffic model; train: the training loop, beside
 stable-baselines3's DQN on HighwayEnv. Peers are measured where they are installed.
 """
 
@@ -19,6 +21,7 @@ import itertools
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from datetime import date
 from functools import partial
 from pathlib import Path
@@ -33,17 +36,19 @@ from ganlane.evaluation import machine_sentence
 from ganlane.evaluation.table import Table, count, percent, significant
 from ganlane.files import write_json
 
-SUITES = ("sim", "gymnasium", "traffic", "train")
+SUITES = ("sim", "gymnasium", "scenarios", "traffic", "train")
 #: Defaults of each suite: batches and traffics.
 BATCHES = {
     "sim": [1, 16, 64, 256, 1024, 4096],
     "gymnasium": [1, 16, 256, 1024, 4096],
+    "scenarios": [1, 256],
     "traffic": [512, 2048],
     "train": [256, 512, 1024],
 }
 TRAFFICS = {
     "sim": ["idm_mobil"],
     "gymnasium": ["idm", "idm_mobil", "idm_faults", "idm_random", "human", "gan", "gan_calibrated"],
+    "scenarios": ["idm_mobil"],
     "traffic": ["idm", "idm_mobil", "gan", "gan_calibrated"],
     "train": ["idm_mobil", "gan"],
 }
@@ -53,6 +58,10 @@ SIMULATORS: dict[str, Callable[..., Any]] = {
 }
 #: What the egos of the suite gymnasium do, and whether they keep their lanes.
 EGOS = {"random actions": False, "keeping its lane": True}
+#: Scenes of the suite scenarios: vehicles and lanes of each.
+SCENES = {"merge": (21, 3), "exit": (24, 4)}
+#: Suites that go through gymnasium.
+THROUGH_GYMNASIUM = ("gymnasium", "scenarios")
 TRAFFIC, TRAINING = "ganlane traffic", "ganlane training"
 #: What stands for the traffic of HighwayEnv.
 THEIR_TRAFFIC = "its IDM and MOBIL"
@@ -79,12 +88,13 @@ def cases_of(
     """What takes turns in one group: every system, traffic and mode of the suite."""
     cases = []
     for traffic in options.traffics:
-        here = Road(traffic, road.vehicles, road.lanes, road.seed)
+        here = replace(road, traffic=traffic)
         starts: dict[str, Callable[..., Any]]
         if options.suite == "sim":
             starts = SIMULATORS
-        elif options.suite == "gymnasium":
-            starts = {f"ganlane, {ego}": partial(systems.start_gymnasium, keep=EGOS[ego])}
+        elif options.suite in THROUGH_GYMNASIUM:
+            name = f"ganlane{_scene_of(road)}, {ego}"
+            starts = {name: partial(systems.start_gymnasium, keep=EGOS[ego])}
         elif options.suite == "traffic":
             starts = {TRAFFIC: systems.start_traffic}
         else:
@@ -95,6 +105,11 @@ def cases_of(
                 labels = labels_of(here, "speed", system, mode, options.device, threads, batch)
                 cases.append(Case(labels, partial(start, here, mode, options.device, batch), batch))
     return cases
+
+
+def _scene_of(road: Road) -> str:
+    """For the name of a system."""
+    return "" if road.scene == "highway" else f" {road.scene}"
 
 
 def labels_of(road: Road, part: str, system: str, *place: Any) -> Labels:
@@ -108,7 +123,7 @@ def peers_of(
     options: argparse.Namespace, road: Road, threads: int, batch: int, ego: str
 ) -> list[Case]:
     """The peers of a group that are installed; ratios are to the first."""
-    theirs = Road(THEIR_TRAFFIC, road.vehicles, road.lanes, road.seed)
+    theirs = replace(road, traffic=THEIR_TRAFFIC)
     highway = installed_version("highway-env")
     envpool, learner = installed_version("envpool"), installed_version("stable-baselines3")
     peers: list[Case] = []
@@ -120,15 +135,15 @@ def peers_of(
         name = f"HighwayEnv {highway}"
         labels = labels_of(theirs, "speed", name, "eager", "cpu", threads, 1)
         peers.append(Case(labels, partial(systems.start_highway, road), 1))
-    elif options.suite == "gymnasium":
+    elif options.suite in THROUGH_GYMNASIUM:
         keep = EGOS[ego]
         if envpool is not None:
-            name = f"EnvPool {envpool}, {ego}"
+            name = f"EnvPool {envpool}{_scene_of(road)}, {ego}"
             labels = labels_of(theirs, "speed", name, "native", "cpu", threads, batch)
             peers.append(
                 Case(labels, partial(systems.start_envpool, road, batch, threads, keep), batch)
             )
-        name = f"HighwayEnv {highway}, {ego}"
+        name = f"HighwayEnv {highway}{_scene_of(road)}, {ego}"
         labels = labels_of(theirs, "speed", name, "eager", "cpu", threads, 1)
         peers.append(Case(labels, partial(systems.start_highway, road, keep), 1))
     elif options.suite == "train" and learner is not None:
@@ -155,14 +170,22 @@ def growth_cases(options: argparse.Namespace, system: str, threads: int) -> list
 def rows_of(options: argparse.Namespace) -> list[Row]:
     """Rows of all groups, each group's peers first."""
     road = Road(options.traffics[0], options.vehicles, options.lanes, options.seed)
+    roads = [road]
+    if options.suite == "scenarios":
+        roads = [
+            replace(road, scene=scene, vehicles=vehicles, lanes=lanes)
+            for scene, (vehicles, lanes) in SCENES.items()
+        ]
     rows = []
-    egos = list(EGOS) if options.suite == "gymnasium" else [""]
-    for threads, batch, ego in itertools.product(options.threads, options.batches, egos):
+    egos = list(EGOS) if options.suite in THROUGH_GYMNASIUM else [""]
+    groups = itertools.product(options.threads, options.batches, roads, egos)
+    for threads, batch, road, ego in groups:
         cases = cases_of(options, road, threads, batch, ego)
         peers = peers_of(options, road, threads, batch, ego)
         first = peers[0] if peers else None
         rows += measure([*peers[1:], *cases], first, options.repetitions, options.seconds)
-        print(f"threads {threads}, batch {batch} {ego}: done", file=sys.stderr, flush=True)
+        where = f"threads {threads}, batch {batch}{_scene_of(road)} {ego}"
+        print(f"{where}: done", file=sys.stderr, flush=True)
     if options.suite == "sim" and len(options.vehicle_counts) > 1:
         for system in ("ganlane physics", "ganlane environment"):
             cases = growth_cases(options, system, options.threads[0])
@@ -174,7 +197,8 @@ def tables_of(rows: Sequence[Row]) -> list[Table]:
     """Speed, the best rows, and growth with the vehicles."""
     speed = [row for row in rows if row["part"] == "speed"]
     grown = [row for row in rows if row["part"] == "growth"]
-    place = f"{speed[0]['vehicles']} vehicles on {speed[0]['lanes']} lanes"
+    places = {f"{row['vehicles']} vehicles on {row['lanes']} lanes": None for row in speed}
+    place = ", ".join(places)
     note = "Medians; spread is the interquartile range of the wall time over its median."
     short = {name: cell for name, cell in COLUMNS.items() if name != "spread"}
     tables = [
@@ -221,7 +245,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="a document with <!-- begin bench SUITE -->; on cuda, SUITE cuda")  # fmt: skip
     options = parser.parse_args(arguments)
     options.traffics = options.traffics or TRAFFICS[options.suite]
-    if options.suite == "gymnasium":
+    if options.suite in THROUGH_GYMNASIUM:
         options.modes = ["native"]
     options.batches = options.batches or BATCHES[options.suite]
     if options.quick:

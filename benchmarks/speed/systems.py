@@ -40,15 +40,25 @@ TIMEOUT_S = 1000.0
 
 @dataclass(frozen=True)
 class Road:
-    """An environment except for its batch and how it is computed."""
+    """An environment except for its batch and how it is computed; ``scene``: ``env=merge``..."""
 
     traffic: str = "idm_mobil"
     vehicles: int = 9
     lanes: int = 3
     seed: int = 0
+    scene: str = "highway"
 
     def keys_of(self, mode: str) -> dict[str, Any]:
         """Keywords of :func:`ganlane.make_env` and of ``gymnasium.make`` for a mode."""
+        if self.scene != "highway":
+            # It sets vehicles and lanes itself.
+            return {
+                "traffic": self.traffic,
+                "env": self.scene,
+                "observation": OBSERVATION,
+                "seed": self.seed,
+                "kernel": "native" if mode == "native" else "torch",
+            }
         return {
             "traffic": self.traffic,
             # The first scene grows with the vehicles, at Table II's density.
@@ -224,7 +234,12 @@ def installed_version(package: str) -> str | None:
 
 
 def _highway_settings(road: Road) -> dict[str, Any]:
-    """``config`` of ``highway-v0`` for the same road; the rest keeps HighwayEnv's defaults."""
+    """``config`` of ``highway-v0`` for the same road; the rest keeps HighwayEnv's defaults.
+
+    Its ``merge-v0`` and ``exit-v0`` have roads and vehicles of their own.
+    """
+    if road.scene != "highway":
+        return {"simulation_frequency": STEPS, "policy_frequency": 1}
     return {
         "lanes_count": road.lanes,
         "vehicles_count": road.vehicles - 1,  # the others
@@ -235,7 +250,7 @@ def _highway_settings(road: Road) -> dict[str, Any]:
 
 
 def make_highway(road: Road) -> Any:
-    """``highway-v0`` without rendering and gymnasium's checks."""
+    """``highway-v0`` (``merge-v0``, ``exit-v0``) without rendering and gymnasium's checks."""
     import highway_env
 
     seen = {"observation": {"type": "Kinematics"}, "action": {"type": "DiscreteMetaAction"}}
@@ -244,7 +259,7 @@ def make_highway(road: Road) -> Any:
         # In some releases the import registers the environments, in others this function.
         getattr(highway_env, "register_highway_envs", lambda: None)()
         config = _highway_settings(road) | seen
-        env = gymnasium.make("highway-v0", config=config, disable_env_checker=True)
+        env = gymnasium.make(f"{road.scene}-v0", config=config, disable_env_checker=True)
     env.unwrapped.reset(seed=road.seed)
     return env.unwrapped
 
@@ -270,7 +285,7 @@ def start_envpool(road: Road, batch: int, threads: int, keep: bool = False) -> R
     import envpool
 
     env = envpool.make_gymnasium(
-        "Highway-v0",
+        f"{road.scene.capitalize()}-v0",
         num_envs=batch,
         num_threads=min(threads, batch),
         max_episode_steps=round(TIMEOUT_S),

@@ -100,17 +100,17 @@ def rows(cells: Cells) -> list[Row]:
         episodes); ``minus_mobil`` and ``probability_above_mobil`` (None for MOBIL, the latter for a
         single training, too); ``normalized_percent``; ``hard_crash``, ``soft_crash`` (episodes with
         one) and ``out_of_road`` of all trainings together, and so ``goal``, ``missed_exit`` and
-        ``timeout``; ``goal_s``, the mean time until the goal where it was reached; ``hard_crash_share`` (exact interval of
-        all episodes, as if they were independent); ``crashes``, ``departures`` and ``failures``
-        (both), ``at_fault`` (the ego moved into the other) and ``near_misses`` (episodes without a
-        crash, with a time to collision below :data:`NEAR_MISS_S`) ``_per_1000_km``;
-        ``mean_speed_mps, lane_changes_per_km, soft_crash_behind_per_episode``; ``at_fault_share``
-        of the hard crashes (None without any) and ``crash_kinds``, how many of each of
-        :data:`ganlane.evaluation.measures.CRASHES`; ``least_ttc_s`` and ``least_headway_s`` (median
-        of the episodes' smallest), ``rms_acceleration_mps2`` and ``hardest_braking_mps2`` (means of
-        the episodes'); and ``each``, mean reward, lead over MOBIL and
-        failures of every training. A key with ``_ci`` holds the 95 % interval of its namesake over
-        trainings and episodes.
+        ``timeout``; ``goal_s``, the mean time until the goal where it was reached;
+        ``hard_crash_share`` (exact interval of all episodes, as if they were independent);
+        ``crashes``, ``departures`` and ``failures`` (both), ``at_fault`` (the ego moved into the
+        other) and ``near_misses`` (episodes without a crash, with a time to collision below
+        :data:`NEAR_MISS_S`) ``_per_1000_km``; ``mean_speed_mps, lane_changes_per_km,
+        soft_crash_behind_per_episode``; ``at_fault_share`` of the hard crashes (None without any)
+        and ``crash_kinds``, how many of each of :data:`ganlane.evaluation.measures.CRASHES`;
+        ``least_ttc_s`` and ``least_headway_s`` (median of the episodes' smallest),
+        ``rms_acceleration_mps2`` and ``hardest_braking_mps2`` (means of the episodes'); and
+        ``each``, mean reward, lead over MOBIL and failures of every training. A key with ``_ci``
+        holds the 95 % interval of its namesake over trainings and episodes.
     """
     return [_row(recipe, traffic, cells) for recipe, traffic in cells]
 

@@ -50,6 +50,16 @@ def test_only_simulated_steps_count(start, batch):
     assert 0.4 * 10 * batch * decisions < run(decisions) < 10 * batch * decisions
 
 
+def test_scenes_are_driven_with_the_vehicles_and_lanes_that_the_table_names(capsys):
+    for scene, (vehicles, lanes) in speed.SCENES.items():
+        road = systems.ganlane.make_env(**Road(scene=scene).keys_of("native")).base_env
+        assert (road.vehicles, road.road.lanes) == (vehicles, lanes)
+    assert speed.main([*QUICK, "--suite", "scenarios", "--batches", "2"]) == 0
+    told = capsys.readouterr().out
+    for name in ("ganlane merge, random actions", "ganlane exit, keeping its lane"):
+        assert name in told
+
+
 def test_a_training_fills_its_buffer_and_learns_as_often_as_it_should(monkeypatch):
     small = {"hidden": (16, 16), "batch_size": 32, "capacity": 512, "warmup": 64}
     config = RainbowConfig(**small, decisions_per_update=8)
@@ -76,6 +86,8 @@ def test_peers_drive_our_road_and_the_baseline_has_our_network():
     env = systems.make_highway(Road(vehicles=4, lanes=2))
     assert (len(env.road.vehicles), len(env.road.network.lanes_list())) == (4, 2)
     assert systems.start_highway(Road())(2) == 20
+    exits = systems.make_highway(Road(scene="exit"))
+    assert type(exits).__name__ == "ExitEnv"
     config = RainbowConfig(hidden=(12, 8), batch_size=8, decisions_per_update=8)
     assert systems.start_baseline(Road(vehicles=4), config)(2) == 2 * 8 * 10
 

@@ -40,6 +40,7 @@ from ganlane.settings.observation import (
     ObservationConfig,
     RewardParameters,
 )
+from ganlane.settings.record import make
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.sim.dynamics import STEERING
 from ganlane.sim.random import Stream
@@ -271,15 +272,10 @@ def make_driver(
         # Read first without a size: only the metadata tell which observation the agent needs.
         network, metadata = load_agent(name, device=device)
         observation = observation_of(metadata)
+        actions = actions_of(metadata)
         # checks that the sizes fit
-        load_agent(name, observation_size(observation.form, env.vehicles), device)
-        return Driver(
-            name,
-            network,
-            observation,
-            mask_of(metadata),
-            ActionParameters(),
-        )
+        load_agent(name, observation_size(observation.form, env.vehicles, actions), device)
+        return Driver(name, network, observation, mask_of(metadata), actions)
     # a model of stable-baselines3, by its weights
     if name.endswith(".zip"):
         model, reading = load_model(Path(name), device)
@@ -342,6 +338,22 @@ def mask_of(metadata: dict[str, Any]) -> MaskParameters | None:
             f"the agent's metadata name no mask that is known here ({error}); train it again."
         ) from error
     return None if mask.form == "none" else mask
+
+
+def actions_of(metadata: dict[str, Any]) -> ActionParameters:
+    """The actions that an agent was trained with; those of 0.3.0 had no others than the lane.
+
+    Raises:
+        UserError: unknown actions.
+    """
+    env = metadata.get("env")
+    stored = env.get("actions") if isinstance(env, dict) else None
+    try:
+        return make(ActionParameters, stored or {})
+    except ParameterError as error:
+        raise UserError(
+            f"the agent's metadata name no actions that are known here ({error}); train it again."
+        ) from error
 
 
 def observation_of(metadata: dict[str, Any]) -> ObservationConfig:

@@ -25,7 +25,7 @@ from ganlane.files import whole_folder
 from ganlane.gym import ENV_ID
 from ganlane.gym.rows import row_of
 from ganlane.gym.tensor_rows import TensorRows
-from ganlane.keys import ACTION, ACTIONS, END_EVENTS, EPISODE
+from ganlane.keys import ACTION, END_EVENTS, EPISODE
 from ganlane.settings.commands import RecordConfig
 from ganlane.settings.record import plain
 from ganlane.sim.random import Stream
@@ -59,6 +59,7 @@ def record(config: RecordConfig, folder: Path) -> str:
     mask, policy = driver.behind(config.mask)
     driven = replace(
         config,
+        env=driver.env(config.env),
         # A trained agent reads the observation that it was trained with, whatever the command says.
         observation=config.observation.read_by(driver.observation),
         mask=mask,
@@ -79,13 +80,7 @@ def record(config: RecordConfig, folder: Path) -> str:
         )
     # A dataset that is half written is not found by Minari.
     with cleared_after_mistakes(place.parent), whole_folder(place) as part:
-        actions = gymnasium.spaces.Discrete(ACTIONS)
-        storage = MinariStorage.new(
-            part / "data",
-            rows.space,
-            actions,
-            spec,
-        )
+        storage = MinariStorage.new(part / "data", rows.space, rows.action_space, spec)
         storage.update_metadata(
             {
                 "dataset_id": name,

@@ -53,18 +53,6 @@ class ActionParameters(Record):
         """The numbered actions; empty for ``continuous``."""
         return NUMBERED.get(self.form, ())
 
-    def check_lane(self, command: str) -> None:
-        """Refuse another form than ``lane`` for a ``command`` that knows that one alone.
-
-        Raises:
-            ParameterError: for another form.
-        """
-        if self.form != LANE:
-            raise ParameterError(
-                f"{{env.actions.form}}={self.form}: ganlane {command} has {LANE} alone; train with "
-                "stable-baselines3 or TorchRL, and compare by ganlane.api.evaluate."
-            )
-
     def check_mask(self, form: str) -> None:
         """Refuse a mask of actions that are not numbered.
 

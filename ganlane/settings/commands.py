@@ -204,10 +204,6 @@ class RecordConfig(HighwayConfig):
     out: Text | None = None
     dataset: Annotated[str, _DATASET] | None = None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.env.actions.check_lane("record")
-
     def dataset_name(self) -> str:
         """The dataset's name; by default made from traffic and driver."""
         if self.dataset is not None:

@@ -131,7 +131,11 @@ class TrainConfig(DrivingConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.env.actions.check_lane("train")
+        if not self.env.actions.names:
+            raise ParameterError(
+                f"{{env.actions.form}}={self.env.actions.form}: Rainbow chooses among numbered "
+                "actions; take lane or lane_speed, or train with stable-baselines3."
+            )
 
     def compiles(self) -> bool:
         """Whether the agent's update is compiled."""

@@ -251,6 +251,7 @@ def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
 
     One that will get trained weights explores little.
     """
+    actions = config.env.actions
     # a falling learning rate reaches its end with the phase
     options = config.agent.for_phase(phase.total_decisions)
     # Trained weights need no long phase of random actions.
@@ -261,10 +262,11 @@ def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
         )
     return Rainbow(
         options,
-        observation_size(config.observation.form, config.env.vehicles),
+        observation_size(config.observation.form, config.env.vehicles, actions),
+        len(actions.names),
         seed=config.seed,
         device=config.device,
-        legal=partial(legal_actions, road=make_road(config.env)),
+        legal=partial(legal_actions, road=make_road(config.env), actions=actions),
         compile=config.compiles(),
     )
 

@@ -12,6 +12,7 @@ import pytest
 from reference.refusals import last_path
 from training.small_runs import rows, signal_at
 
+import ganlane
 from ganlane.agents import read_agent
 from ganlane.config.run import run_command
 
@@ -109,6 +110,18 @@ def test_every_traffic_and_every_start_runs(traffic, init, capsys):
     assert main([f"traffic={traffic}", f"init={init}", *words.split()]) == 0
     results = json.loads(last_path(capsys.readouterr().out).read_text())
     assert [row["traffic"] for row in results["rows"]] == [traffic, traffic]
+
+
+def test_an_agent_that_sets_its_speed_does_so_wherever_it_drives(capsys):
+    folder, results = train(capsys, "env.actions=lane_speed", "observation=lane_view")
+    shares = [name for name in rows(folder / "metrics.csv")[0] if name.endswith("_share")]
+    assert len([name for name in shares if name.startswith("action_")]) == 5
+    # Elsewhere the environment takes its actions, and MOBIL's beside it are those of the lane.
+    table = ganlane.api.evaluate(
+        [str(folder / "agent.safetensors"), "mobil"], ["idm"], 2, goal_m=40.0
+    )
+    assert table["goal"].to_list() == [2, 2]
+    assert results["rows"][0]["mean_reward"] == table["mean_reward"][0]
 
 
 def test_a_trained_agent_survives_an_error_after_training(tmp_path, capsys, monkeypatch):

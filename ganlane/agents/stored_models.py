@@ -29,7 +29,7 @@ from ganlane import keys
 from ganlane.agents.drivers import mask_in
 from ganlane.errors import ParameterError, UserError
 from ganlane.files import PLACE, atomic_path, has_checksum, refuse_without_checksum, write_json
-from ganlane.settings.actions import ActionParameters
+from ganlane.settings.actions import CONTROLS, ActionParameters
 from ganlane.settings.observation import MaskParameters, ObservationConfig
 from ganlane.settings.record import NotNegative, Number, Positive, Record, make, one_of, plain
 
@@ -45,8 +45,8 @@ NETWORKS: Mapping[str, tuple[str, str]] = {
     "DQN": ("q_net.q_net.", ""),
     _PLAIN: ("", ""),
 }
-#: Layers that do not act: of critics and of target networks.
-_OTHERS = ("mlp_extractor.value_net.", "value_net.", "q_net_target.")
+#: What does not act: layers of critics and of target networks, and the spread of controls.
+_OTHERS = ("mlp_extractor.value_net.", "value_net.", "q_net_target.", "log_std")
 _ACTIVATIONS = ("Tanh", "ReLU", "ELU", "SiLU", "GELU")
 #: Errors of archives and weights that are none.
 _BROKEN = (OSError, KeyError, ValueError, RuntimeError, zipfile.BadZipFile, pickle.UnpicklingError)
@@ -104,25 +104,25 @@ class Reading(Record):
 
 
 class StoredModel(TensorDictModuleBase):
-    """The deterministic policy of a stored model: writes ``action`` [N] for ``observation`` [N, D].
+    """The deterministic policy of a stored model: writes ``action`` for ``observation`` [N, D].
+
+    The action is the number [N] of the largest output, or outputs [N, 2] from -1 to 1.
 
     Args:
         layers: of the network that acts.
-        normaliser: of the observations.
-        is_masked: whether it reads ``action_mask`` [N, 3].
+        reading: what it reads and commands.
     """
 
     out_keys = [keys.ACTION]  # noqa: RUF012
     rows_must_stay = False
 
-    def __init__(
-        self, layers: nn.Sequential, normaliser: Normaliser | None, is_masked: bool
-    ) -> None:
+    def __init__(self, layers: nn.Sequential, reading: Reading) -> None:
         super().__init__()
         self.layers = layers
-        self.normaliser = normaliser
-        self.is_masked = is_masked
-        self.in_keys = [keys.OBSERVATION, *([keys.ACTION_MASK] if is_masked else [])]
+        self.normaliser = reading.normaliser
+        self.is_masked = reading.mask is not None
+        self.is_numbered = bool(reading.actions.names)
+        self.in_keys = [keys.OBSERVATION, *([keys.ACTION_MASK] if self.is_masked else [])]
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -138,6 +138,8 @@ class StoredModel(TensorDictModuleBase):
             normalised = self.normaliser.normalize_obs(observation.cpu().numpy())
             observation = torch.from_numpy(normalised).to(observation.device)
         values = self.layers(observation)
+        if not self.is_numbered:
+            return tensordict.set(keys.ACTION, values.clamp(-1.0, 1.0))
         if self.is_masked:
             values = values.masked_fill(~mask_in(tensordict), -torch.inf)
         return tensordict.set(keys.ACTION, values.argmax(-1))
@@ -232,16 +234,16 @@ def load_model(file: Path, device: str = "cpu") -> tuple[StoredModel, Reading]:
             f"{file}: no model of stable-baselines3 ({type(error).__name__}); give the file that "
             "ganlane.sb3.driver(model).save(path) wrote."
         ) from error
-    layers = _layers(state, network, len(reading.actions.names))
+    layers = _layers(state, network, len(reading.actions.names) or CONTROLS)
     if layers is None:
         raise _not_plain(file)
-    return StoredModel(layers.to(device), reading.normaliser, reading.mask is not None), reading
+    return StoredModel(layers.to(device), reading), reading
 
 
 def _layers(state: Mapping[str, Any], network: Network, actions: int) -> nn.Sequential | None:
     """The network that acts, of a model's weights; None where they are of another form.
 
-    ``actions`` is the number of those that it chooses among.
+    ``actions`` is the number of its outputs.
     """
     hidden, last = NETWORKS[network.algorithm]
     numbers = sorted(

@@ -77,6 +77,13 @@ def test_a_model_with_masks_chooses_among_the_allowed_actions():
     assert reading.mask.form == "safe"
 
 
+def test_controls_are_the_outputs_themselves_within_their_bounds():
+    state = {**weights(), "log_std": torch.zeros(2)}
+    state["action_net.weight"], state["action_net.bias"] = torch.eye(2, SIZE), torch.zeros(2)
+    policy, _ = load_model(store(state, actions={"form": "continuous"}))
+    assert actions_of(policy, [[0.5, 2.0, 1.0, 9.0]]) == [[0.5, 1.0]]
+
+
 @pytest.mark.parametrize(
     "changes",
     [

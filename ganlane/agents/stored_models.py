@@ -158,7 +158,9 @@ def write_description(file: Path, reading: Reading) -> None:
 
 
 def save_network(path: str | Path, layers: nn.Sequential, reading: Reading | None = None) -> None:
-    """Store a network for ``ganlane benchmark PATH``: it acts by the largest of its outputs.
+    """Store a network for ``ganlane benchmark PATH``.
+
+    It acts by the largest of its outputs; where the actions are continuous, its outputs are they.
 
     Args:
         path: of the file, .zip; a JSON file is written beside it.

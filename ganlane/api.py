@@ -20,6 +20,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -29,7 +30,6 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Transform, TransformedEnv
 
 from ganlane import build
-from ganlane.agents.checkpoint import with_seeds
 from ganlane.agents.drivers import FunctionPolicy
 from ganlane.build import Driver
 from ganlane.config.run import (
@@ -130,7 +130,12 @@ def load_agent(
 
 
 def evaluate(
-    agents: Sequence[Agent] = ("mobil", "keep_lane", "random_legal", "agent_idm"),
+    agents: Policy | Sequence[Policy] | Mapping[str, Policy] = (
+        "mobil",
+        "keep_lane",
+        "random_legal",
+        "agent_idm",
+    ),
     traffics: Sequence[Option] | Mapping[str, Option] = (
         "idm",
         "idm_mobil",
@@ -145,8 +150,8 @@ def evaluate(
     """Evaluate every agent on every traffic, on the same episodes; one row for each pair.
 
     Args:
-        agents: names, drivers from :func:`load_agent`, or policies of your own; ``mobil`` and
-            ``random_legal`` are needed for the normalised score.
+        agents: names, drivers from :func:`load_agent`, policies or functions of your own, as in
+            :func:`benchmark`; ``mobil`` and ``random_legal`` are needed for the normalised score.
         traffics: options as in :func:`make_env`, or a mapping that gives them names of your own.
         episodes: the episodes 0 to ``episodes - 1`` of the seed, on the stream kept for reports.
         per_episode: one row per episode instead (:func:`ganlane.evaluation.run_episodes`).
@@ -160,36 +165,18 @@ def evaluate(
     Raises:
         UserError: an unknown name, a wrong value, or a policy that does not fit.
     """
-    # Names are loaded once the settings are checked; agent_idm@all means several.
-    try:
-        asked = list(agents)
-    except TypeError as error:
-        message = f"agents={agents!r:.80}: expected a list of drivers, such as ['mobil']."
-        raise UserError(message) from error
     if not isinstance(per_episode, bool):
         raise UserError(f"per_episode={per_episode!r:.80}: expected True or False.")
-    # One list of drivers: loaded ones as they are, policies under the name of their class.
-    drivers: list[str | Driver] = []
-    for agent in asked:
-        if isinstance(agent, Driver):
-            drivers.append(agent)
-        elif isinstance(agent, TensorDictModuleBase):
-            drivers.append(Driver(type(agent).__name__, agent))
-        else:
-            drivers.extend(with_seeds(str(agent)))
-    # The settings of the command know drivers by name; loaded ones and policies go by theirs.
-    names = [driver.name if isinstance(driver, Driver) else driver for driver in drivers]
     config: EvaluateConfig = call_settings(
-        "evaluate", {"agents": names, "traffics": traffics, "episodes": episodes, **keys}
+        "evaluate", {"traffics": traffics, "episodes": episodes, **keys}
     )
     with _torch_threads(config.threads):
-        loaded = [
-            build.make_driver(driver, config.env, device=config.device)
-            if isinstance(driver, str)
-            else driver
-            for driver in drivers
-        ]
-        table = compare(loaded, config)
+        drivers = _drivers(
+            agents, lambda name: build.make_drivers([name], config.env, config.device)
+        )
+        # Two of one name would share a row of the table.
+        config = replace(config, agents=[driver.name for driver in drivers])
+        table = compare(drivers, config)
     if per_episode:
         return table
     # Plain Python numbers: polars takes no others.
@@ -221,36 +208,40 @@ def benchmark(
     Raises:
         UserError: an unknown name, a wrong value, or a policy that does not fit.
     """
-    asked: list[tuple[str | None, Any]]
-    if isinstance(policy, Mapping):
-        asked = list(policy.items())
-    else:
-        listed = policy if isinstance(policy, list | tuple) else [policy]
-        asked = [(None, single) for single in listed]
     config = call_settings("benchmark", {"suite": suite, "quick": quick, **keys})
     home = new_folder("benchmark") if folder is None else _path(folder)
     with _torch_threads(), running(home, config):
-        drivers: list[Driver] = []
-        for name, single in asked:
-            if isinstance(single, str | Path):
-                several = drivers_of([str(single)], config)
-            elif isinstance(single, Driver):
-                several = [single]
-            elif isinstance(single, TensorDictModuleBase):
-                several = [Driver(type(single).__name__, single)]
-            elif callable(single):
-                usual = getattr(single, "__name__", type(single).__name__)
-                several = [Driver(usual, FunctionPolicy(single))]
-            else:
-                raise UserError(f"policy={single!r:.80}: expected an agent's name or a function.")
-            if name is not None:
-                # Several trainings stay one entry under the new name.
-                numbers = [f"@{number}" for number in range(len(several))]
-                names = [name] if len(several) == 1 else [f"{name}{number}" for number in numbers]
-                several = [driver.renamed(new) for driver, new in zip(several, names)]
-            drivers += several
+        drivers = _drivers(policy, lambda name: drivers_of([name], config))
         run_suite(drivers, config, home)
     return Run(home, json.loads((home / "results.json").read_text(encoding="utf-8")))
+
+
+def _drivers(policies: Any, load: Callable[[str], list[Driver]]) -> list[Driver]:
+    """One policy, a list or a mapping of them as drivers; ``load`` gives those of a name."""
+    asked: list[tuple[str | None, Any]]
+    if isinstance(policies, Mapping):
+        asked = list(policies.items())
+    else:
+        listed = policies if isinstance(policies, list | tuple) else [policies]
+        asked = [(None, policy) for policy in listed]
+    drivers: list[Driver] = []
+    for name, policy in asked:
+        if isinstance(policy, str | Path):
+            several = load(str(policy))
+        elif isinstance(policy, Driver):
+            several = [policy]
+        elif isinstance(policy, TensorDictModuleBase):
+            several = [Driver(type(policy).__name__, policy)]
+        elif callable(policy):
+            usual = getattr(policy, "__name__", type(policy).__name__)
+            several = [Driver(usual, FunctionPolicy(policy))]
+        else:
+            raise UserError(f"{policy!r:.80}: expected an agent's name, a policy or a function.")
+        # Several trainings stay one entry under a name of the caller's.
+        for number, driver in enumerate(several):
+            place = "" if len(several) == 1 else f"@{number}"
+            drivers.append(driver if name is None else driver.renamed(f"{name}{place}"))
+    return drivers
 
 
 def train(

@@ -18,7 +18,12 @@ from torchrl.envs import Compose
 
 from ganlane import keys
 from ganlane.agents import load_agent
-from ganlane.agents.checkpoint import SHIPPED, names_agent, with_seeds
+from ganlane.agents.checkpoint import (
+    SHIPPED,
+    check_observation_size,
+    names_agent,
+    with_seeds,
+)
 from ganlane.agents.drivers import DRIVERS, FunctionPolicy, MaskedPolicy
 from ganlane.agents.stored_models import load_model
 from ganlane.arguments import (
@@ -269,12 +274,12 @@ def make_driver(
         )
         return Driver(name, policy.to(device), actions=ActionParameters())
     if names_agent(name):
-        # Read first without a size: only the metadata tell which observation the agent needs.
+        # Only the metadata tell which observation the agent needs.
         network, metadata = load_agent(name, device=device)
         observation = observation_of(metadata)
         actions = actions_of(metadata)
-        # checks that the sizes fit
-        load_agent(name, observation_size(observation.form, env.vehicles, actions), device)
+        size = observation_size(observation.form, env.vehicles, actions)
+        check_observation_size(name, network.network.config, size)
         return Driver(name, network, observation, mask_of(metadata), actions)
     # a model of stable-baselines3, by its weights
     if name.endswith(".zip"):

@@ -319,8 +319,8 @@ class ModelDriver(Driver):
     def save(self, path: str | Path) -> None:
         """Store the model as ``model.save(path)`` does, and beside it what it reads, as JSON.
 
-        ``ppo.zip.json`` has observation, mask and normaliser for ``driver(model, stored="ppo")``,
-        and the form of the network for ``ganlane benchmark ppo.zip``.
+        ``ppo.zip.json`` has observation, mask, normaliser and the form of the network for ``ganlane
+        benchmark ppo.zip``.
 
         Raises:
             OSError: the files cannot be written.

@@ -124,16 +124,6 @@ def test_an_agent_that_sets_its_speed_does_so_wherever_it_drives(capsys):
     assert results["rows"][0]["mean_reward"] == table["mean_reward"][0]
 
 
-def test_a_trained_agent_survives_an_error_after_training(tmp_path, capsys, monkeypatch):
-    def broken(*arguments, **options):
-        raise PermissionError(13, "Permission denied", "results.json")
-
-    monkeypatch.setattr("ganlane.commands.train.compare", broken)
-    assert main(TINY) == 2
-    assert any(tmp_path.rglob("agent.safetensors"))
-    assert any(tmp_path.rglob("last.pt"))
-
-
 def test_a_resume_with_other_settings_is_refused_and_leaves_the_run_as_it_was(
     finished, capsys, tmp_path
 ):

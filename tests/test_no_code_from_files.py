@@ -75,42 +75,27 @@ EVIL_TRAFFIC = {"_target_": "evil.Traffic"}
 STORED = {
     "a class of a module beside it": {"traffic": EVIL_TRAFFIC},
     "a class by its name": {"traffic": "evil.Traffic"},
-    "a class by the key name": {"traffic": {"name": "evil.Traffic"}},
-    "a class called as weights are": {"traffic": {"_target_": "evil.safetensors"}},
     "a function of it": {"traffic": {"_target_": "evil.make"}},
     "a shell": traffic_of("os.system", command="touch executed"),
-    "a process": traffic_of("subprocess.getoutput", cmd="touch executed"),
-    "a script": traffic_of("runpy.run_path", path_name="evil.py"),
-    "an import": traffic_of("importlib.import_module", name="evil"),
-    "exec": traffic_of("builtins.exec", source="import evil"),
-    "a file": traffic_of("builtins.open", file="executed", mode="w"),
     "an argument beside it": {"traffic": {"_target_": "os.system", "command": "touch executed"}},
     "the first phase's": {"pretrain": {"total_decisions": 8, "traffic": EVIL_TRAFFIC}},
     "the evaluation's": {"evaluation": {"traffic": EVIL_TRAFFIC}},
     "a share": {"traffic": {"name": "mixed", "shares": {"evil.Traffic": 1, "idm": 1}}},
     "a share's option": {"traffic": {"name": "mixed", "options": {"gan": EVIL_TRAFFIC}}},
     "a policy": {"evaluation": {"agents": ["mobil", "random_legal", "evil.Policy"]}},
-    "a policy alone": {"evaluation": {"agents": "evil.Policy"}},
-    "a masked policy": {"evaluation": {"agents": ["mobil", "evil.Policy+safe"]}},
     "a function as policy": {"evaluation": {"agents": ["mobil", "evil:make"]}},
-    "a masked function": {"evaluation": {"agents": ["mobil", "evil:make+safe"]}},
     "a shell as policy": {"evaluation": {"agents": ["mobil", "os.system"]}},
     "a reference to a name": {
         "init": {"path": "evil.Traffic"},
         "traffic": {"_target_": "${init.path}"},
     },
     "an option elsewhere": {"traffic": "../../evil"},
-    "an option elsewhere by the key name": {"traffic": {"name": "../../evil"}},
-    "an absolute option": {"traffic": "/tmp/evil"},
     "an option of the phase's elsewhere": {"pretrain": {"traffic": "../../evil"}},
     "another configuration": {"experiment": "../../evil"},
     "another list of defaults": {"defaults": ["../../evil"]},
     "another mask": {"mask": {"form": "../../evil"}},
     "a class to instantiate": {"agent": {"_target_": "evil.make"}},
     "Hydra's callbacks": {"hydra": {"callbacks": {"x": {"_target_": "evil.make"}}}},
-    "Hydra's launcher": {"hydra": {"launcher": {"_target_": "evil.make"}}},
-    "Hydra's places to search": {"hydra": {"searchpath": ["file://."]}},
-    "Hydra's log": {"hydra": {"job_logging": {"handlers": {"x": {"()": "evil.make"}}}}},
     "a Ray cluster, which sends pickles": {"collector": {"address": "evil:6379"}},
 }
 #: Texts in its place that no such file has.
@@ -118,19 +103,14 @@ TEXTS = {
     "nothing": "",
     "a number": "3",
     "a zero byte": "\x00",
-    "two colons": "a: b: c",
-    "an open brace": "{unclosed",
-    "a list of mappings": "[{a: 1}]",
     "a YAML tag": "!!python/object/apply:os.system ['touch executed']",
     "a YAML tag at a key": "mask: !!python/object/apply:os.system ['touch executed']",
     "a YAML tag as a name": "traffic: {name: !!python/name:evil.make }",
     "a list": "- traffic=idm\n- traffic._target_=evil.Traffic\n",
-    "aliases": "env: &a {lanes: 3}\nreward: *a\n",
     "aliases of aliases": "a: &a [x, x]\nb: &b [*a, *a]\nc: &c [*b, *b]\n",
     "an endless alias": "&a {traffic: *a}",
     "a mapping merged into another": "a: &a {_target_: evil.Traffic}\ntraffic: {<<: *a}\n",
     "endless brackets": "[" * 100_000,
-    "endless braces": "{a: " * 50_000,
     "endless lists": "- " * 100_000,
     "too large a file": "# " + "x" * 2**20,
 }
@@ -341,21 +321,6 @@ def test_a_resumed_run_takes_no_more_than_that(keys, missing, foreign_run):
     with pytest.raises(UserError, match=r"the run's file names evil\.") as caught:
         refuse_stored_imports(foreign_run, keys)
     assert f"add {missing} to the command line" in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["init.path=evil.Traffic"],
-        ["evaluation.agents=[mobil]"],
-        ["traffic.blind_share=0.5"],
-        ["evaluation.traffic=idm"],
-    ],
-    ids=" ".join,
-)
-def test_words_about_something_else_trust_nothing(words, capsys):
-    run_folder(CONFIGS["a class of a module beside it"])
-    assert "names evil.Traffic" in refusal(capsys, "train", "resume=run", *words)
 
 
 def test_a_command_does_not_look_for_modules_where_it_is_started(monkeypatch):

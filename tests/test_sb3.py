@@ -294,23 +294,6 @@ def test_a_model_of_which_nothing_says_what_it_reads_is_refused(tmp_path):
     loaded = PPO.load(tmp_path / "ppo.zip")
     with pytest.raises(UserError, match=r"PPO has no environment.*PPO\.load\(path, env="):
         ganlane.sb3.driver(loaded)
-    description = tmp_path / "ppo.zip.json"
-    text = description.read_text()
-    for damaged in (
-        text.replace("200.0", "100.0"),
-        text.replace("ganlane sha256", "nothing"),
-        text[:50],
-        "[" * 100_000,
-        "3",
-    ):
-        description.write_text(damaged)
-        with pytest.raises(UserError, match=r"ppo\.zip\.json: "):
-            ganlane.sb3.driver(loaded, stored=tmp_path / "ppo")
-    description.write_text(text)
-    model.learn(64)
-    model.save(tmp_path / "ppo.zip")
-    with pytest.raises(UserError, match=r"for another model than ppo\.zip is now"):
-        ganlane.sb3.driver(loaded, stored=tmp_path / "ppo")
     with pytest.raises(UserError, match=r"none\.zip\.json: .*No such file"):
         ganlane.sb3.driver(loaded, stored=tmp_path / "none")
 

@@ -201,21 +201,14 @@ def read_agent(
 
 
 def load_agent(
-    name: str | Path,
-    observation_size: int | None = None,
-    device: torch.device | str = "cpu",
+    name: str | Path, device: torch.device | str = "cpu"
 ) -> tuple[GreedyPolicy, dict[str, Any]]:
     """A trained agent, shipped or from a file, as a greedy policy on ``device``, with its metadata.
 
-    ``observation_size`` D of the environment it is to drive in is checked if given.
-
     Raises:
-        UserError: no such agent, a foreign file, or another observation size.
+        UserError: no such agent, or a foreign file.
     """
     weights, config, metadata = read_agent(name)
-    # What does not fit the environment is refused before the network is built.
-    if observation_size is not None:
-        check_observation_size(name, config, observation_size)
     try:
         # its parameters are drawn and at once replaced
         network = QNetwork(config)

@@ -35,24 +35,14 @@ class Step(NamedTuple):
     def copied(cls, step: TensorDictBase) -> Step:
         """The tensors of a step, copied: the environment may write into its own afterwards."""
         after = step.get("next")
-        observation, action = (step.get(name).clone() for name in ("observation", "action"))
-        reward, following, terminated, done = (
-            after.get(name).clone()
-            for name in (
-                "reward",
-                "observation",
-                "terminated",
-                "done",
-            )
-        )
         mask = after.get(keys.ACTION_MASK, None)
         return cls(
-            observation,
-            action,
-            reward,
-            following,
-            terminated,
-            done,
+            step.get("observation").clone(),
+            step.get("action").clone(),
+            after.get("reward").clone(),
+            after.get("observation").clone(),
+            after.get("terminated").clone(),
+            after.get("done").clone(),
             None if mask is None else mask.clone(),
         )
 
@@ -109,22 +99,17 @@ class NStepWindow:
             running = running & ~after.done
         # The oldest step has its transition now and is not needed again.
         del self.steps[0]
-        end = {
-            "observation": following,
-            "reward": reward,
-            "terminated": terminated,
-        }
+        size = reward.shape[:1]
+        end = {"observation": following, "reward": reward, "terminated": terminated}
         if mask is not None:
             end[keys.ACTION_MASK] = mask
-        begin = {
+        transition = {
             "observation": first.observation,
             "action": first.action,
             "steps_to_next_obs": length,
+            "next": TensorDict(end, size),
         }
-        return TensorDict(
-            {**begin, "next": TensorDict(end, reward.shape[:1])},
-            reward.shape[:1],
-        )
+        return TensorDict(transition, size)
 
     def state_dict(self) -> dict[str, Any]:
         """The steps in the window, as plain dictionaries of tensors."""

@@ -56,9 +56,9 @@ class NetworkConfig:
         sizes = {
             "observation_size": self.observation_size,
             "actions": self.actions,
+            "atoms": self.agent.atoms,
         }
         sizes |= {f"hidden[{i}]": width for i, width in enumerate(self.agent.hidden)}
-        sizes["atoms"] = self.agent.atoms
         for name, size in sizes.items():
             if type(size) is not int or not 1 <= size <= LARGEST:
                 raise UserError(
@@ -72,11 +72,10 @@ class NetworkConfig:
 
     def description(self) -> dict[str, Any]:
         """Plain data for a file, which :meth:`described` reads."""
-        options = {name: getattr(self.agent, name) for name in SHAPE}
         return {
             "observation_size": self.observation_size,
             "actions": self.actions,
-            **options,
+            **{name: getattr(self.agent, name) for name in SHAPE},
         }
 
     @classmethod
@@ -86,9 +85,9 @@ class NetworkConfig:
         Raises:
             UserError: an entry is missing, unknown, or no such value.
         """
-        sizes = {"observation_size", "actions"}
-        if description.keys() != sizes | set(SHAPE):
-            raise UserError(f"expected the entries {', '.join((*sorted(sizes), *SHAPE))}")
+        expected_names = ("actions", "observation_size", *SHAPE)
+        if description.keys() != {*expected_names}:
+            raise UserError(f"expected the entries {', '.join(expected_names)}")
         # values come from a file, so their types are checked here
         options = {name: description[name] for name in SHAPE}
         for name, value in options.items():
@@ -100,12 +99,8 @@ class NetworkConfig:
             }.get(expected, expected)
             if not isinstance(value, accepted):
                 raise UserError(f"network {name}={value!r}: expected a {expected.__name__}.")
-        agent = RainbowConfig(**options)
-        return cls(
-            agent,
-            description["observation_size"],
-            description["actions"],
-        )
+        sizes = (description["observation_size"], description["actions"])
+        return cls(RainbowConfig(**options), *sizes)
 
 
 class QNetwork(nn.Module):

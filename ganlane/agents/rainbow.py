@@ -21,7 +21,6 @@ from ganlane.agents.loss import (
     Learned,
     UpdateGraph,
 )
-from ganlane.agents.n_step import NStepWindow
 from ganlane.agents.network import (
     NetworkConfig,
     QNetwork,
@@ -113,31 +112,15 @@ class Rainbow:
         self.graph: UpdateGraph | None = None
         # The graph is of the whole of Rainbow; with any part left out the update is computed step
         # by step.
-        parts = (
-            "distributional",
-            "double",
-            "dueling",
-            "noisy",
-            "prioritised",
-            "kl_priority",
-        )
+        parts = ("distributional", "double", "dueling", "noisy", "prioritised", "kl_priority")
         if compile and all(getattr(config, part) for part in parts) and self.device.type == "cpu":
-            self.graph = UpdateGraph(
-                self.network,
-                self.loss,
-                self.optimizer,
-                config,
-            )
+            self.graph = UpdateGraph(self.network, self.loss, self.optimizer, config)
         self.anneal(0)
 
     @property
     def ready(self) -> bool:
         """Whether the buffer holds enough to learn from."""
         return len(self.replay) >= self.config.warmup
-
-    def window(self) -> NStepWindow:
-        """A fresh n-step window for a batch of environments."""
-        return NStepWindow(self.config.n_step, self.config.gamma)
 
     def anneal(self, decisions: int) -> None:
         """Set the share of random actions and the learning rate after ``decisions``."""
@@ -184,10 +167,7 @@ class Rainbow:
         # a hard copy, as in Rainbow
         if self.updates % config.target_period == 0:
             self.loss.update_target()
-        return {
-            **learned._asdict(),
-            "priority": learned.priority.mean(),
-        }
+        return {**learned._asdict(), "priority": learned.priority.mean()}
 
     def _descend(self, batch: TensorDict, generator: torch.Generator) -> Learned:
         """What :class:`~ganlane.agents.loss.UpdateGraph` does, for every ``config`` and device."""
@@ -233,7 +213,15 @@ class Rainbow:
         """Let Adam go on from ``moments``, the part ``state`` of an optimiser's state.
 
         The learning rate and the other options are those of this agent.
+
+        Raises:
+            ValueError: they are of other weights.
         """
+        # Adam would write beyond moments that are too short.
+        shapes = [parameter.shape for parameter in self.network.parameters()]
+        for name in ("exp_avg", "exp_avg_sq"):
+            if moments and [moments[row][name].shape for row in moments] != shapes:
+                raise ValueError("the optimiser's moments are of other weights")
         # Learning rate and eps stay those of this run.
         self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": moments})
 

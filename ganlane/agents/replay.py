@@ -44,12 +44,7 @@ def make_replay(config: RainbowConfig, generator: torch.Generator) -> TensorDict
     device = generator.device
     sampler = RandomSampler()
     if config.prioritised:
-        sampler = RowSampler(
-            capacity,
-            config.alpha,
-            config.beta_start,
-            device,
-        )
+        sampler = RowSampler(capacity, config.alpha, config.beta_start, device)
     return TensorDictReplayBuffer(
         storage=LazyTensorStorage(capacity, device=device),
         sampler=sampler,
@@ -79,13 +74,10 @@ def replay_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
     # a view would be saved with all of the storage behind it
     if len(buffer) < buffer.storage.max_size:
         tensors = {name: tensor.clone() for name, tensor in tensors.items()}
-    writer = {
-        "cursor": buffer.writer._cursor,
-        "writes": buffer.write_count,
-    }
     return {
         "rows": tensors,
-        **writer,
+        "cursor": buffer.writer._cursor,
+        "writes": buffer.write_count,
         "sampler": buffer.sampler.state_dict(),
     }
 

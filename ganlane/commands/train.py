@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 from ganlane.build import make_driver, make_drivers, make_traffic
@@ -40,14 +40,14 @@ def train(config: TrainConfig, folder: Path) -> str:
     lengths: dict[str, dict[str, float]] = {}
     for phase in phases_of(config, folder):
         # a resumed run does not repeat a first phase that is over
-        finished = length_if_finished(config, phase)
+        finished = length_if_finished(phase)
         if finished is not None:
             lengths[phase.name] = finished
             continue
         # stopped before its first checkpoint, a phase starts anew
         last = phase.folder / LAST
         resume = last if config.resume is not None and last.is_file() else None
-        result = run_phase(config, phase, resume)
+        result = run_phase(phase, resume)
         if result.stopped_by is not None:
             print(
                 f"saved; go on with: ganlane train resume={folder}",
@@ -55,19 +55,9 @@ def train(config: TrainConfig, folder: Path) -> str:
             )
             # the exit status says by which signal
             raise Stopped(result.stopped_by)
-        lengths[phase.name] = {
-            "decisions": result.decisions,
-            "updates": result.updates,
-            "wall_s": result.wall_s,
-        }
-    trained = replace(
-        make_driver(
-            str(folder / AGENT_FILE),
-            config.env,
-            device=config.device,
-        ),
-        name=TRAINED,
-    )
+        lengths[phase.name] = result.progress
+    agent = str(folder / AGENT_FILE)
+    trained = make_driver(agent, config.env, device=config.device).renamed(TRAINED)
     # the trained agent and the others drive the same episodes
     table = compare([trained, *others], config.final_evaluation())
     seeds = {
@@ -78,12 +68,6 @@ def train(config: TrainConfig, folder: Path) -> str:
     numbers = {
         **lengths["train"],
         "phases": lengths,
-        "agent": str(folder / AGENT_FILE),
+        "agent": agent,
     }
-    return publish(
-        table,
-        folder,
-        asdict(config),
-        seeds,
-        numbers,
-    )
+    return publish(table, folder, asdict(config), seeds, numbers)

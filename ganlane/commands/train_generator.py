@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -240,26 +240,12 @@ def metrics_table(
 
 
 def fold_tables(folds: Mapping[str, Any]) -> str:
-    """All tables of :func:`ganlane.generator.cross_validate`'s scores, as text."""
+    """What :func:`ganlane.generator.cross_validate` scored, but for single scenes, as text."""
     scores = folds["open_loop"]
-    tables = [
-        _pooled(scores),
-        _parts("by fold", scores["folds"]),
-        _parts("by scene", scores["scenes"]),
-    ]
+    tables = [_pooled(scores), _parts("by fold", scores["folds"])]
     if "rollout" in folds:
         tables.append(_rollout(folds["rollout"]))
-        tables.append(_rollout_by_fold(folds["rollout"]["folds"]))
     return "\n\n".join(map(aligned, tables))
-
-
-def _rollout_by_fold(ratios: Sequence[Mapping[str, float]]) -> Lines:
-    """RMSE at 5 s over that of constant velocity, fold by fold."""
-    kinds = [kind for kind in ("mean", "single", "idm_own_headway") if kind in ratios[0]]
-    lines = [["RMSE at 5 s to CV, by fold", *kinds]]
-    for number, ratio in enumerate(ratios):
-        lines.append([str(number), *(f"{ratio[kind]:.2f}" for kind in kinds)])
-    return lines
 
 
 def _pooled(scores: Mapping[str, Any]) -> Lines:
@@ -273,15 +259,8 @@ def _pooled(scores: Mapping[str, Any]) -> Lines:
         ]
     ]
     for kind, ade in scores["ade_m"].items():
-        change = _percent(scores["ade_change_percent"][kind])
-        lines.append(
-            [
-                kind,
-                f"{ade:.3f}",
-                f"{scores['fde_m'][kind]:.3f}",
-                change,
-            ]
-        )
+        errors = [f"{ade:.3f}", f"{scores['fde_m'][kind]:.3f}"]
+        lines.append([kind, *errors, _percent(scores["ade_change_percent"][kind])])
     return lines
 
 
@@ -315,15 +294,6 @@ def _rollout(rollout: Mapping[str, Any]) -> Lines:
         ]
     ]
     for kind, ratio in rollout["ratio_to_constant_velocity"].items():
-        lines.append(
-            [
-                kind,
-                *_two_digits(rmse[kind].values()),
-                f"{ratio:.2f}",
-            ]
-        )
+        numbers = [*rmse[kind].values(), ratio]
+        lines.append([kind, *(f"{number:.2f}" for number in numbers)])
     return lines
-
-
-def _two_digits(values: Iterable[float]) -> list[str]:
-    return [f"{value:.2f}" for value in values]

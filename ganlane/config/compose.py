@@ -22,9 +22,9 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ganlane.errors import UserError, did_you_mean
+from ganlane.errors import UserError
 from ganlane.files import conf_folder
-from ganlane.settings.record import merged, option_names
+from ganlane.settings.record import merged, option
 
 #: Hydra's defaults are those of this version, whichever is installed.
 VERSION_BASE = "1.3"
@@ -116,14 +116,9 @@ def _check(override: Override) -> None:
     values = [override.value()]
     if override.is_sweep_override():
         values = list(override.sweep_iterator())
-    names = option_names(key)
     for value in values:
-        if value not in names:
-            shown = str(word).partition("=")[2] if len(values) == 1 else value
-            hint = did_you_mean(str(value), names)
-            raise UserError(
-                f"{key}={shown}: no such option{hint}; choose one of {', '.join(names)}."
-            )
+        # Refused where there is no such option.
+        option(key, value)
 
 
 def for_hydra(overrides: Sequence[Override]) -> list[str]:

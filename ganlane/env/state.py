@@ -31,24 +31,17 @@ VEHICLES: Fields = {
 }
 #: What is remembered of the ego from one decision to the next.
 EGO: Fields = {
-    "steering": None,  # angle, rad
-    "mean_acceleration": None,  # in the last decision, m/s2
-    "change_progress": None,  # of the lane change, 0 to 1
-    "distance": None,  # m
-    "change_direction": torch.int64,  # of the lane change: -1, 0, 1
-    "decisions": torch.int64,  # in this episode
-    "lane_changes": torch.int64,  # started in this episode
-    "soft_crash": torch.bool,  # in the last physics step, with the vehicle ahead
-    "soft_crash_behind": torch.bool,  # and with the one behind
-    "started_change": torch.bool,  # in the last decision
+    **dict.fromkeys(keys.EGO_FLOATS),
+    **dict.fromkeys(keys.EGO_INTEGERS, torch.int64),
+    **dict.fromkeys(keys.EGO_FLAGS, torch.bool),
 }
 #: And further with ``env.actions=lane_speed``: the speed aimed at, m/s.
 COMMANDED: Fields = {keys.SET_SPEED: None}
 EVENTS: Fields = {
     **dict.fromkeys(keys.END_EVENTS, torch.bool),
-    **dict.fromkeys((keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND), torch.int64),
+    **dict.fromkeys(keys.EVENT_COUNTS, torch.int64),
 }
-DONE: Fields = dict.fromkeys(("done", "terminated", "truncated"), torch.bool)
+DONE: Fields = dict.fromkeys(keys.DONE_FLAGS, torch.bool)
 COUNTERS: Fields = dict.fromkeys((keys.SEED, keys.EPISODE, keys.STEP), torch.int64)
 
 
@@ -254,9 +247,7 @@ def _checked_controls(action: Tensor, rows: int, actions: ActionParameters) -> T
 def _expected(rows: int, actions: ActionParameters) -> str:
     if not actions.names:
         return f"floats of shape [{rows}, {CONTROLS}] from -1 to 1"
-    meanings = [f"{number} ({name})" for number, name in enumerate(actions.names)]
-    choices = f"{', '.join(meanings[:-1])} or {meanings[-1]}"
-    return f"{rows} whole numbers (int64, shape [{rows}]), each {choices}"
+    return f"{rows} whole numbers (int64, shape [{rows}]), each {actions.meanings()}"
 
 
 def _refused(what: str, rows: int, actions: ActionParameters) -> UserError:

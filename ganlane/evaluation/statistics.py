@@ -14,7 +14,6 @@ Fisher 1935 (sign flips of paired differences); Cochran 1977 (standard error of 
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -272,11 +271,7 @@ def probability_of_improvement(first: npt.ArrayLike, second: npt.ArrayLike) -> E
     Where all trainings at hand of one are above all of the other it is 1, from 1 to 1: it says
     nothing of others.
     """
-    return _estimate(
-        _pair(first, second),
-        _share_above,
-        bounds=(0.0, 1.0),
-    )
+    return improvement_over_traffics([(first, second)])
 
 
 def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate | None:
@@ -327,13 +322,9 @@ def normalized_over_trainings(
     None where the interval of MOBIL's lead over the random driver includes 0: the scale would have
     no length.
     """
-    tables = [_pair(rewards, mobil)[0] for rewards in (agent, mobil, random_legal)]
-    if not difference(tables[1], tables[2]).excludes_zero():
+    if not difference(mobil, random_legal).excludes_zero():
         return None
-    return _estimate(
-        tables,
-        lambda *rewards: percent_of_way(*map(_mean, rewards)),
-    )
+    return score_over_traffics([(agent, mobil, random_legal)])
 
 
 def score_over_traffics(traffics: Sequence[Sequence[npt.ArrayLike]]) -> Estimate:
@@ -347,7 +338,8 @@ def score_over_traffics(traffics: Sequence[Sequence[npt.ArrayLike]]) -> Estimate
         scores = [percent_of_way(*map(_mean, means[at : at + 3])) for at in range(0, len(means), 3)]
         return interquartile_mean(np.stack(scores, axis=-1))
 
-    tables = [_table(rewards) for rewards in itertools.chain(*traffics)]
+    # Each on the episodes of the traffic's first driver.
+    tables = [_pair(rewards, drivers[0])[0] for drivers in traffics for rewards in drivers]
     return _estimate(tables, middle, recipes=[0, 1, 2] * len(traffics))
 
 
@@ -362,7 +354,7 @@ def improvement_over_traffics(
         pairs = zip(means[::2], means[1::2])
         return np.mean([_share_above(first, second) for first, second in pairs], axis=0)
 
-    tables = [_table(rewards) for rewards in itertools.chain(*traffics)]
+    tables = [table for pair in traffics for table in _pair(*pair)]
     return _estimate(tables, share, bounds=(0.0, 1.0), recipes=[0, 1] * len(traffics))
 
 

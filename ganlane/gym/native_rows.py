@@ -108,23 +108,4 @@ def native_rows(config: HighwayConfig) -> NativeRows | None:
         or why_not() is not None
     ):
         return None
-    # By position, in the order of NativeBatch's arguments.
-    batch = NativeBatch(
-        config.num_envs,
-        env.lanes,
-        env.lane_width_m,
-        env.vehicles,
-        env.spawn_parameters(),
-        env.ego,
-        env.episode_parameters(),
-        drivers,
-        env.recycle_share if env.recycle else None,
-        observation,
-        config.reward,
-        config.mask,
-        stream,
-        actions=env.actions,
-        stretches=env.stretches(),
-        scenes=None if env.scene is None else env.scenes,
-    )
-    return NativeRows(batch, config)
+    return NativeRows(NativeBatch(config, drivers), config)

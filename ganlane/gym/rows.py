@@ -214,10 +214,9 @@ def actions_of(commanded: Any, rows: int, actions: ActionParameters) -> Integers
     # Before any cast, which would round and wrap.
     whole = array.shape == (rows,) and array.dtype.kind in "iu"
     if not whole or not 0 <= array.min() <= array.max() < len(actions.names):
-        meanings = [f"{number} ({name})" for number, name in enumerate(actions.names)]
         raise UserError(
             f"action {commanded!r:.80}: expected {rows} whole number(s), "
-            f"{', '.join(meanings[:-1])} or {meanings[-1]}; give one for every environment."
+            f"{actions.meanings()}; give one for every environment."
         )
     return array.astype(np.int64, copy=False)
 

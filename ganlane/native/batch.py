@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -20,27 +20,19 @@ from ganlane.native import settings
 from ganlane.native.drivers import (
     NETWORKS,
     Drivers,
-    RuleDrivers,
     decision_settings,
+    mask_settings,
     parts_of,
     rows_per_thread,
     turns_of,
 )
 from ganlane.native.library import addresses, in_threads, load, load_for
 from ganlane.native.settings import Key, Layout, fields
-from ganlane.settings.actions import CONTROLS, LANE, LANE_SPEED, ActionParameters
-from ganlane.settings.driving import EgoParameters, Visibility
-from ganlane.settings.episode import EpisodeParameters, SpawnParameters
-from ganlane.settings.observation import (
-    MaskParameters,
-    ObservationConfig,
-    RewardParameters,
-    largest_number,
-)
-from ganlane.settings.road import Stretches
-
-if TYPE_CHECKING:
-    from ganlane.sim.scenes import FixedScene
+from ganlane.settings.actions import CONTROLS, LANE, LANE_SPEED
+from ganlane.settings.commands import HighwayConfig
+from ganlane.settings.driving import Visibility
+from ganlane.settings.episode import Stream
+from ganlane.settings.observation import largest_number
 
 #: Speed over desired speed beyond which the observation is cut off, for a space with bounds; IDM
 #: stays far below.
@@ -121,23 +113,12 @@ class _Part(NamedTuple):
 
 
 class NativeBatch:
-    """N highways, from the random first scenes of Table II or a scene set by hand.
+    """N highways as ``config`` describes them.
 
     Args:
-        rows: N.
-        lanes, lane_width_m: of the road.
-        vehicles: M, the ego included.
-        spawn, ego, episode: the first scene, what is special about the ego, and the episode's end.
-        drivers: the others, and how the ego follows; by default they keep their lanes.
-        recycle_share: share of the episodes in which vehicles left behind return ahead; None: of
-            none.
-        observation: one of :data:`ganlane.native.settings.NATIVE_FORMS`, without sensor errors.
-        reward: section V.C.
-        mask: of the ego's actions; ``none``: those that stay on the road.
-        stream: family of episodes.
-        actions: what the ego is commanded.
-        stretches: where lanes begin and end; empty: all go on.
-        scenes: the first scene by the others' visibility; None: Table II.
+        config: with an observation of :data:`ganlane.native.settings.NATIVE_FORMS` and without
+            sensor errors.
+        drivers: the others, and how the ego follows.
         variant: one of :data:`ganlane.native.library.VARIANTS`; None: the best for this processor.
 
     Attributes:
@@ -148,50 +129,27 @@ class NativeBatch:
         UserError: the kernel cannot be built here.
     """
 
-    def __init__(
-        self,
-        rows: int = 1,
-        lanes: int = 3,
-        lane_width_m: float = 4.0,
-        vehicles: int = 9,
-        spawn: SpawnParameters | None = None,
-        ego: EgoParameters | None = None,
-        episode: EpisodeParameters | None = None,
-        drivers: Drivers | None = None,
-        recycle_share: float | None = None,
-        observation: ObservationConfig | None = None,
-        reward: RewardParameters | None = None,
-        mask: MaskParameters | None = None,
-        stream: int = 0,
-        variant: str | None = None,
-        actions: ActionParameters | None = None,
-        stretches: Stretches = (),
-        scenes: Callable[[int], FixedScene | None] | None = None,
-    ) -> None:
+    def __init__(self, config: HighwayConfig, drivers: Drivers, variant: str | None = None) -> None:
         # For copies and other processes, which make the batch anew.
-        self._arguments = {name: value for name, value in locals().items() if name != "self"}
-        spawn = spawn or SpawnParameters()
-        ego = ego or EgoParameters()
-        episode = episode or EpisodeParameters()
-        drivers = drivers or RuleDrivers()
-        observation = observation or ObservationConfig()
-        reward = reward or RewardParameters()
-        mask = mask or MaskParameters()
-        actions = actions or ActionParameters()
-        self.rows = rows
-        self.lanes = lanes
-        self.lane_width_m = lane_width_m
+        self._arguments = (config, drivers, variant)
+        env, reward, mask, form = config.env, config.reward, config.mask, config.observation.form
+        episode, spawn, actions = env.episode_parameters(), env.spawn_parameters(), env.actions
+        stretches = env.stretches()
+        stream = int(Stream.named(config.stream))
+        self.rows = rows = config.num_envs
+        self.lanes = env.lanes
+        self.lane_width_m = env.lane_width_m
         self.terms = reward.term_names
-        road = (lanes, lane_width_m, vehicles)
-        view = settings.view_of(*road, observation.scale(), observation.form, stretches, actions)
-        scene = None if scenes is None else scenes(Visibility.SIGNALLED)
+        road = (env.lanes, env.lane_width_m, env.vehicles)
+        view = settings.view_of(*road, config.observation.scale(), form, stretches, actions)
+        scene = env.scenes()
         longest_m = spawn.longest_m if scene is None else scene.longest_m
-        self.bounds = (-1.0, largest_number(observation.form, longest_m))
+        self.bounds = (-1.0, largest_number(form, longest_m))
         # All arrays of the state in place, written by the kernel and read by whoever asks.
         self.state: dict[Key, npt.NDArray[Any]] = {}
         layout = Layout(drivers.memory(), actions)
         for name, kind in layout.kinds.items():
-            self.state[name] = np.zeros(layout.shape(name, rows, vehicles), kind)
+            self.state[name] = np.zeros(layout.shape(name, rows, env.vehicles), kind)
         for name, kind in _ROW_ARRAYS.items():
             self.state[name] = np.zeros(rows, kind)
         self._commands = self.state[keys.ACTION]
@@ -208,14 +166,14 @@ class NativeBatch:
         # A network fills the widest vectors with its own numbers.
         self._library = load(variant) if variant or by_network else load_for(rows)
         deceleration = mask.safe_deceleration
-        abort = ego.abort_lane_change
+        abort = env.ego.abort_lane_change
         # The kernel's structures, filled once. Referred to by this object, since a structure holds
         # no more than their addresses.
         pointed: dict[str, Any] = {
             "reward_settings": settings.reward_of(reward, episode.decision_period_s),
             "view": view,
             "view_inputs": self._pointers(_VIEWS),
-            "mask_settings": settings.mask_of(*road, drivers.idm, deceleration, abort, stretches),
+            "mask_settings": mask_settings(road, drivers.idm, deceleration, abort, stretches),
             "mask_inputs": self._pointers(_MASKS),
             "mask_outputs": addresses([self._lane_mask, self._no_safe_action]),
         }
@@ -228,8 +186,8 @@ class NativeBatch:
             "lowest": self.bounds[0],
             "highest": self.bounds[1],
             "fastest": SPEED_RATIO_LIMIT,
-            "vehicles": vehicles,
-            "lanes": lanes,
+            "vehicles": env.vehicles,
+            "lanes": env.lanes,
             "size": view.numbers(),
             "mask_form": settings.MASK_FORMS.index(mask.form),
             "abort_lane_change": abort,
@@ -241,10 +199,12 @@ class NativeBatch:
             # Of several parts each drives the rows that are its own.
             row_list = np.zeros(rows, np.int64) if len(self._turns) > 1 else None
             # When others see the ego's lane changes, and the ego theirs.
-            visible = (Visibility.named(ego.visibility), part.drivers.visibility)
-            scene = None if scenes is None else scenes(part.drivers.visibility)
+            visible = (Visibility.named(env.ego.visibility), part.drivers.visibility)
+            scene = env.scenes(part.drivers.visibility)
+            recycle_share = env.recycle_share if env.recycle else None
+            numbers_of_part = (road, part.drivers, episode, env.ego, stretches, actions)
             of_part = pointed | {
-                "settings": decision_settings(road, episode, ego, part.drivers, stretches, actions),
+                "settings": decision_settings(*numbers_of_part),
                 "inputs": self._pointers(layout.inputs, row_list),
                 "outputs": self._pointers(layout.outputs),
                 "spawn": settings.spawn_of(*road, spawn, stream, *visible, recycle_share, scene),
@@ -266,7 +226,7 @@ class NativeBatch:
         return {"arguments": self._arguments, "arrays": self._arrays()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(**state["arguments"])  # type: ignore[misc]  # anew, in place
+        self.__init__(*state["arguments"])  # type: ignore[misc]  # anew, in place
         # Copied, since the kernel's structures hold the addresses of these arrays.
         for array, numbers in zip(self._arrays(), state["arrays"]):
             array[:] = numbers

@@ -29,7 +29,7 @@ from ganlane.native.settings import (
     actions_of,
     ends_of,
     fields,
-    settings_of,
+    filled,
 )
 from ganlane.settings.actions import ActionParameters
 from ganlane.settings.driving import (
@@ -371,27 +371,61 @@ def _steps(seconds: float) -> int:
 
 def decision_settings(
     shape: tuple[int, float, int],
-    episode: EpisodeParameters | None,
-    ego: EgoParameters | None,
     drivers: OneKind,
+    episode: EpisodeParameters | None = None,
+    ego: EgoParameters | None = None,
     stretches: Stretches = (),
     actions: ActionParameters | None = None,
 ) -> Settings:
-    """The numbers of a decision; ``shape`` is lanes, their width in m, and M, ``stretches`` where
-    the lanes begin and end, ``actions`` what the ego is commanded (None: lanes).
+    """The numbers of a decision: of road, driving and episode.
+
+    ``shape`` is lanes, their width in m, and M, ``stretches`` where the lanes begin and end,
+    ``actions`` what the ego is commanded (None: lanes).
     """
-    ends = ends_of(stretches, drivers.mobil)
-    return settings_of(
-        *shape,
-        episode,
-        ego,
-        drivers.idm,
-        drivers.steering,
-        drivers.mobil,
-        drivers.stream,
-        drivers.blind_share,
-        drivers.structures() | ends | actions_of(actions, episode),
-    )
+    episode = episode or EpisodeParameters()
+    idm, steering = drivers.idm, drivers.steering
+    mobil = drivers.mobil or MobilParameters()
+    # No two of these records have a field of one name.
+    records = (episode, ego or EgoParameters(), idm, steering, mobil)
+    numbers = {name: value for record in records for name, value in vars(record).items()}
+    numbers |= {
+        "lanes": shape[0],
+        "lane_width_m": shape[1],
+        "vehicles": shape[2],
+        # The kernel multiplies where the model divides by a constant.
+        "per_brake_scale": 1.0 / idm.brake_scale(),
+        "per_near_s": 1.0 / steering.near_s,
+        "per_far_s": 1.0 / steering.far_s,
+        "per_lane_width": 1.0 / shape[1],
+        "substeps": episode.substeps(),
+        # A number of steps, since sums of 0.1 s drift in floats.
+        "timeout_steps": _steps(episode.timeout_s),
+        # Of generated drivers only the limits of a lane change count.
+        "mobil": isinstance(drivers, RuleDrivers) and drivers.mobil is not None,
+        "stream": drivers.stream,
+        "blind_share": drivers.blind_share,
+    }
+    pointed = drivers.structures() | ends_of(stretches, mobil) | actions_of(actions, episode)
+    # ctypes has the addresses alone, so the structures are held beside them.
+    for name in ("generated", "human", "faults", "random", "ends", "actions"):
+        numbers[name] = ctypes.addressof(pointed[name]) if name in pointed else None
+    settings = filled(Settings, numbers)
+    settings.pointed = list(pointed.values())
+    return settings
+
+
+def mask_settings(
+    shape: tuple[int, float, int],
+    idm: IdmParameters,
+    safe_deceleration: float,
+    abort: bool,
+    stretches: Stretches,
+) -> Settings:
+    """The numbers of the mask ``safe``; ``safe_deceleration`` in m/s2."""
+    # The mask reads few of the decision's numbers; the others are defaults.
+    drivers = RuleDrivers(idm, mobil=MobilParameters(safe_deceleration=safe_deceleration))
+    ego = EgoParameters(abort_lane_change=abort)
+    return decision_settings(shape, drivers, ego=ego, stretches=stretches)
 
 
 class _Faults(ctypes.Structure):
@@ -501,14 +535,14 @@ def _generated_of(drivers: GeneratedDrivers) -> Generated:
     dt = keys.PHYSICS_STEP_S
     guard = drivers.guard or GuardParameters()
     anchor = drivers.anchor or ANCHOR
-    sudden = drivers.sudden
+    sudden, sizes = drivers.sudden, drivers.sizes
     period = drivers.noise_period_s
     # As closed_loop.wander: what stays of a latent vector in a step.
     share = math.exp(-dt / period) if period > 0 else 0.0
     numbers: dict[str, Any] = {**vars(drivers.changes), **vars(anchor), **vars(anchor.idm)}
     numbers |= vars(guard)
     numbers |= {
-        "network": _network_of(drivers),
+        "network": filled(Network, vars(sizes) | {"weights": None, "motions": sizes.observed - 1}),
         "noise_share": share,
         "noise_fresh": math.sqrt(1.0 - share * share),
         "noise_scale": drivers.noise_scale,
@@ -529,42 +563,55 @@ def _generated_of(drivers: GeneratedDrivers) -> Generated:
         "patience_steps": round(drivers.checked_changes.patience_s / dt),
         "headways_s": (drivers.headways_s or (0.0,) * len(QUANTILE_LEVELS)),
     }
-    generated = Generated(**{name: numbers[name] for name, *_ in Generated._fields_})
+    generated = filled(Generated, numbers)
     # ctypes copies the address alone, so the numbers have to be held here.
-    generated.packed = _packed(drivers.sizes, drivers.weights)
+    generated.packed = _packed(sizes, drivers.weights)
     generated.network.weights = generated.packed.ctypes.data
     return generated
 
 
-def _network_of(drivers: GeneratedDrivers) -> Network:
-    sizes = vars(drivers.sizes)
-    numbers = {name: sizes[name] for name, *_ in Network._fields_ if name in sizes}
-    return Network(**numbers, motions=drivers.sizes.observed - 1)
+class _Layer(NamedTuple):
+    """A layer of a generator by its names in the ``state_dict``.
+
+    ``gates``: those of an LSTM that the kernel computes; a layer without gates is one gate.
+    """
+
+    weight: str
+    bias: str | None
+    inputs: int
+    outputs: int
+    gates: tuple[int, ...] = (0,)
+
+
+def _layers(s: GeneratorSizes) -> list[_Layer]:
+    """All layers in the order of ``layers_of`` in network.hpp."""
+    motion, gates, state = 4, 4 * s.hidden, s.hidden + s.pooled + s.extra_inputs
+    # The decoder's cell begins at 0, so its forget gate is left out.
+    every, three = (0, 1, 2, 3), (0, 2, 3)
+    pair, second = "pooling.per_pair.bias", "pooling.second"
+    return [
+        _Layer("encoder.embed.weight", "encoder.embed.bias", motion, s.embedding),
+        _Layer("encoder.input.weight", "encoder.input.bias", s.embedding, gates, every),
+        _Layer("encoder.recurrent", None, s.hidden, gates, every),
+        # The bias of a pair's first layer is added with the other vehicle's term.
+        _Layer("pooling.per_pair.weight", None, motion, s.pooling),
+        _Layer("pooling.per_vehicle.weight", pair, s.hidden, s.pooling),
+        _Layer(f"{second}.weight", f"{second}.bias", s.pooling, s.pooled),
+        _Layer("context.0.weight", "context.0.bias", state, s.context),
+        _Layer("context.2.weight", "context.2.bias", s.context, s.hidden - s.noise),
+        _Layer("decoder.embed.weight", "decoder.embed.bias", motion, s.embedding),
+        _Layer("decoder.input.weight", "decoder.input.bias", s.embedding, gates, three),
+        _Layer("decoder.recurrent", None, s.hidden, gates, three),
+        _Layer("head.weight", "head.bias", s.hidden, 2),
+    ]
 
 
 def _packed(sizes: GeneratorSizes, weights: Weights) -> npt.NDArray[np.float32]:
-    """All layers in the order of ``layers_of`` in network.hpp.
-
-    Of each the biases and the transposed weights, with zeros as further outputs. The gates of an
-    LSTM are filled up one by one; the decoder's cell begins at 0, so its forget gate is left out.
-    """
-    w = weights
-    every, three = (0, 1, 2, 3), (0, 2, 3)
-    layers = [
-        _layer(w["encoder.embed.weight"], w["encoder.embed.bias"]),
-        _layer(w["encoder.input.weight"], w["encoder.input.bias"], every),
-        _layer(w["encoder.recurrent"], None, every),
-        # The bias of a pair's first layer is added with the other vehicle's term.
-        _layer(w["pooling.per_pair.weight"], None),
-        _layer(w["pooling.per_vehicle.weight"], w["pooling.per_pair.bias"]),
-        _layer(w["pooling.second.weight"], w["pooling.second.bias"]),
-        _layer(w["context.0.weight"], w["context.0.bias"]),
-        _layer(w["context.2.weight"], w["context.2.bias"]),
-        _layer(w["decoder.embed.weight"], w["decoder.embed.bias"]),
-        _layer(w["decoder.input.weight"], w["decoder.input.bias"], three),
-        _layer(w["decoder.recurrent"], None, three),
-        _layer(w["head.weight"], w["head.bias"]),
-    ]
+    """Of every layer the biases and the transposed weights, with zeros as further outputs."""
+    layers = []
+    for layer in _layers(sizes):
+        bias = None if layer.bias is None else weights[layer.bias]
+        layers.append(_layer(weights[layer.weight], bias, layer.gates))
     return _aligned(layers)
 
 
@@ -584,7 +631,7 @@ def _layer(
     bias: npt.NDArray[np.float32] | None,
     gates: tuple[int, ...] = (0,),
 ) -> npt.NDArray[np.float32]:
-    # [gates, outputs of a gate, inputs]; a layer without gates is one gate.
+    # [gates, outputs of a gate, inputs]; the gates of an LSTM are filled up one by one.
     blocks = 1 if gates == (0,) else 4
     parts = np.column_stack([np.zeros(len(weight)) if bias is None else bias, weight])
     parts = parts.reshape(blocks, len(weight) // blocks, -1)[list(gates)]
@@ -781,10 +828,13 @@ def _fitted(
     source = Path(path or shipped_generator(preset))
     weights, metadata = load_arrays(source, GENERATOR)
     sizes = stored_sizes(source, metadata, preset)
-    if {name: array.shape for name, array in weights.items()} != _shapes(sizes):
-        raise UserError(
-            f"{source}: its weights do not have the shapes that its sizes ask for; fit it again."
-        )
+    shapes: dict[str, tuple[int, ...]] = {}
+    for layer in _layers(sizes):
+        shapes[layer.weight] = (layer.outputs, layer.inputs)
+        if layer.bias is not None:
+            shapes[layer.bias] = (layer.outputs,)
+    if {name: array.shape for name, array in weights.items()} != shapes:
+        raise misfit(source, vars(sizes))
     return source, weights, sizes, metadata
 
 
@@ -820,23 +870,3 @@ def _human_layers(sizes: HumanSizes) -> dict[str, tuple[int, int]]:
         "lane.0": (SIDE_FEATURES, sizes.lane_hidden),
         "lane.2": (sizes.lane_hidden, 2),
     }
-
-
-def _shapes(sizes: GeneratorSizes) -> dict[str, tuple[int, ...]]:
-    """Shapes of the weights, by the names in the ``state_dict`` of a generator."""
-    s = sizes
-    linear = {
-        "pooling.per_pair": (4, s.pooling),
-        "pooling.second": (s.pooling, s.pooled),
-        "context.0": (s.hidden + s.pooled + s.extra_inputs, s.context),
-        "context.2": (s.context, s.hidden - s.noise),
-        "head": (s.hidden, 2),
-    }
-    shapes: dict[str, tuple[int, ...]] = {"pooling.per_vehicle.weight": (s.pooling, s.hidden)}
-    for part in ("encoder", "decoder"):
-        linear[f"{part}.embed"] = (4, s.embedding)
-        linear[f"{part}.input"] = (s.embedding, 4 * s.hidden)
-        shapes[f"{part}.recurrent"] = (4 * s.hidden, s.hidden)
-    for name, (inputs, outputs) in linear.items():
-        shapes |= {f"{name}.weight": (outputs, inputs), f"{name}.bias": (outputs,)}
-    return shapes

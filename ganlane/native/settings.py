@@ -10,7 +10,6 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping
 from ctypes import c_double, c_float, c_int32, c_int64, c_void_p
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
@@ -20,10 +19,7 @@ from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.settings.actions import CONTINUOUS, LANE, LANE_SPEED, ActionParameters
 from ganlane.settings.driving import (
-    EgoParameters,
-    IdmParameters,
     MobilParameters,
-    SteeringParameters,
 )
 from ganlane.settings.episode import EpisodeParameters, SpawnParameters
 from ganlane.settings.observation import (
@@ -232,13 +228,13 @@ class Actions(ctypes.Structure):
 def actions_of(
     actions: ActionParameters | None, episode: EpisodeParameters | None
 ) -> dict[str, ctypes.Structure]:
-    """What the ego is commanded, for ``pointed`` of :func:`settings_of`; empty for lanes alone."""
+    """What the ego is commanded, by the name in :class:`Settings`; empty for lanes alone."""
     if actions is None or actions.form == LANE:
         return {}
     form = (LANE_SPEED, CONTINUOUS).index(actions.form)
     period_s = (episode or EpisodeParameters()).decision_period_s
     numbers = vars(actions) | {"form": form, "decision_period_s": period_s}
-    return {"actions": _filled(Actions, numbers)}
+    return {"actions": filled(Actions, numbers)}
 
 
 class View(ctypes.Structure):
@@ -319,65 +315,16 @@ class Reward(ctypes.Structure):
 Structure = TypeVar("Structure", bound=ctypes.Structure)
 
 
-def _filled(kind: type[Structure], numbers: Mapping[str, Any]) -> Structure:
+def filled(kind: type[Structure], numbers: Mapping[str, Any]) -> Structure:
     """A structure with those of the ``numbers`` that it has."""
     # A missing number is a KeyError here instead of a 0 in the kernel.
     return kind(**{member[0]: numbers[member[0]] for member in kind._fields_})
 
 
-def settings_of(
-    lanes: int,
-    lane_width_m: float,
-    vehicles: int,
-    episode: EpisodeParameters | None = None,
-    ego: EgoParameters | None = None,
-    idm: IdmParameters | None = None,
-    steering: SteeringParameters | None = None,
-    mobil: MobilParameters | None = None,
-    stream: int = 0,
-    blind_share: float = 0.0,
-    pointed: Mapping[str, ctypes.Structure] = MappingProxyType({}),
-) -> Settings:
-    """The numbers of road, driving and episode.
-
-    ``mobil=None``: the others keep their lanes. ``blind_share`` of the episodes: nobody sees the
-    ego. ``pointed``: further structures of the drivers, by
-    their names in ``Settings``; of generated ones only MOBIL's limits of a lane change count.
-    """
-    episode = episode or EpisodeParameters()
-    idm = idm or IdmParameters()
-    steering = steering or SteeringParameters()
-    # No two of these records have a field of one name.
-    records = (episode, ego or EgoParameters(), idm, steering, mobil or MobilParameters())
-    numbers = {name: value for record in records for name, value in vars(record).items()}
-    numbers |= {
-        "lanes": lanes,
-        "lane_width_m": lane_width_m,
-        "vehicles": vehicles,
-        # The kernel multiplies where the model divides by a constant.
-        "per_brake_scale": 1.0 / idm.brake_scale(),
-        "per_near_s": 1.0 / steering.near_s,
-        "per_far_s": 1.0 / steering.far_s,
-        "per_lane_width": 1.0 / lane_width_m,
-        "substeps": episode.substeps(),
-        # A number of steps, since sums of 0.1 s drift in floats.
-        "timeout_steps": round(episode.timeout_s / keys.PHYSICS_STEP_S),
-        "mobil": mobil is not None and "generated" not in pointed,
-        "stream": stream,
-        "blind_share": blind_share,
-    }
-    # ctypes has the addresses alone, so the structures are held beside them.
-    for name in ("generated", "human", "faults", "random", "ends", "actions"):
-        numbers[name] = ctypes.addressof(pointed[name]) if name in pointed else None
-    settings = _filled(Settings, numbers)
-    settings.pointed = list(pointed.values())
-    return settings
-
-
 def ends_of(
     stretches: Stretches, mobil: MobilParameters | None = None
 ) -> dict[str, ctypes.Structure]:
-    """Where lanes begin and end, for ``pointed`` of :func:`settings_of`; empty if all go on.
+    """Where lanes begin and end, by the name in :class:`Settings`; empty if all go on.
 
     Raises:
         UserError: more lanes than the kernel has room for.
@@ -404,30 +351,6 @@ def ends_of(
         for lane, number in enumerate(row):
             getattr(ends, name)[lane] = number
     return {"ends": ends}
-
-
-def mask_of(
-    lanes: int,
-    lane_width_m: float,
-    vehicles: int,
-    idm: IdmParameters,
-    safe_deceleration: float,
-    abort: bool,
-    stretches: Stretches = (),
-) -> Settings:
-    """The numbers of the mask ``safe``; ``safe_deceleration`` in m/s2."""
-    # The mask reads few of the decision's numbers; the others are defaults.
-    ego = EgoParameters(abort_lane_change=abort)
-    mobil = MobilParameters(safe_deceleration=safe_deceleration)
-    return settings_of(
-        lanes,
-        lane_width_m,
-        vehicles,
-        ego=ego,
-        idm=idm,
-        mobil=mobil,
-        pointed=ends_of(stretches),
-    )
 
 
 def view_of(
@@ -489,9 +412,9 @@ def spawn_of(
     for name, value in numbers.items():
         if isinstance(value, tuple | list):
             numbers[name] = Range(value[0], value[1] - value[0])
-    filled = _filled(Spawn, numbers)
-    filled.pointed = fixed
-    return filled
+    structure = filled(Spawn, numbers)
+    structure.pointed = fixed
+    return structure
 
 
 def _fixed_of(scene: FixedScene) -> Fixed:
@@ -512,4 +435,4 @@ def _fixed_of(scene: FixedScene) -> Fixed:
 def reward_of(reward: RewardParameters, decision_period_s: float) -> Reward:
     """The numbers of the reward, and of how many terms it is the sum."""
     numbers = {"decision_period_s": decision_period_s, "terms": len(reward.term_names)}
-    return _filled(Reward, vars(reward) | numbers)
+    return filled(Reward, vars(reward) | numbers)

@@ -21,6 +21,7 @@ from ganlane.native.drivers import (
     Drivers,
     RuleDrivers,
     decision_settings,
+    mask_settings,
     parts_of,
     rows_per_thread,
     turns_of,
@@ -196,7 +197,7 @@ class Kernel(_Parts):
         shape = _shape(road, vehicles)
         self._functions = []
         for part in self.parts:
-            numbers = decision_settings(shape, episode, ego, part.drivers, road.stretches, actions)
+            numbers = decision_settings(shape, part.drivers, episode, ego, road.stretches, actions)
             per_thread = rows_per_thread(part.drivers)
             self._functions.append(_Function("ganlane_decide", numbers, variant, per_thread))
 
@@ -293,7 +294,7 @@ class NativeScenes(_Parts):
             others = part.drivers.visibility if others == VISIBILITY_OF_EPISODE else others
             seen = (scenes.ego_visibility, others)
             spawn = settings.spawn_of(*shape, scenes.parameters, stream, *seen, recycle_share=None)
-            enter = decision_settings(shape, None, None, part.drivers)
+            enter = decision_settings(shape, part.drivers)
             # The scene first, then the drivers' memory of it.
             functions = (_Function("ganlane_spawn", spawn), _Function("ganlane_enter", enter))
             self._functions.append(functions)
@@ -392,13 +393,8 @@ class SafeActions(_Function):
     def __init__(
         self, road: Road, vehicles: int, idm: IdmParameters, safe_deceleration: float, abort: bool
     ) -> None:
-        numbers = settings.mask_of(
-            *_shape(road, vehicles),
-            idm,
-            safe_deceleration,
-            abort,
-            road.stretches,
-        )
+        shape = _shape(road, vehicles)
+        numbers = mask_settings(shape, idm, safe_deceleration, abort, road.stretches)
         super().__init__("ganlane_mask", numbers)
 
     def allowed(self, seen: Vehicles, direction: Tensor) -> tuple[Tensor, Tensor]:

@@ -53,6 +53,11 @@ class ActionParameters(Record):
         """The numbered actions; empty for ``continuous``."""
         return NUMBERED.get(self.form, ())
 
+    def meanings(self) -> str:
+        """The numbered actions in words: ``0 (keep), 1 (left) or 2 (right)``."""
+        *first, last = [f"{number} ({name})" for number, name in enumerate(self.names)]
+        return f"{', '.join(first)} or {last}"
+
     def check_mask(self, form: str) -> None:
         """Refuse a mask of actions that are not numbered.
 

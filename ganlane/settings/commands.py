@@ -73,6 +73,16 @@ class RunConfig(Record):
             )
 
 
+@dataclass(frozen=True)
+class CpuConfig(RunConfig):
+    """Keys of the commands that run on the CPU alone."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.device != "cpu":
+            raise UserError(f"device={self.device}: this runs on the CPU alone; use device=cpu.")
+
+
 def has_cuda() -> bool:
     """Whether torch sees a CUDA device."""
     import torch  # takes seconds

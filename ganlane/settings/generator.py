@@ -97,19 +97,9 @@ def stored_sizes(path: object, metadata: Mapping[str, Any], preset: str | None) 
         raise UserError(
             f"{path}: a generator of preset {stored!r}, expected {expected!r}; give one."
         )
-    sizes = metadata.get("sizes")
-    # The defaults tell the types, since a text or a float would fail only where layers are made.
-    types = {field.name: type(field.default) for field in fields(GeneratorSizes)}
-    try:
-        if {name: type(size) for name, size in dict(sizes or {}).items()} != types:
-            raise ValueError("other names or types")
-        checked = GeneratorSizes(**sizes)  # type: ignore[arg-type]
-        if checked.noise >= checked.hidden:
-            raise ValueError("noise is not below hidden")
-    except (TypeError, ValueError, ParameterError) as error:
-        raise UserError(
-            f"{path}: sizes {sizes} are not those of a generator ({sorted(types)}); fit it again."
-        ) from error
+    checked: GeneratorSizes = _sizes_in(path, metadata, GeneratorSizes)
+    if checked.noise >= checked.hidden:
+        raise misfit(path, vars(checked))
     # The presets differ in their inputs; weights of one would drive badly under the other's name.
     needed = EXTRA_INPUTS if stored == "calibrated" else 0
     if checked.extra_inputs != needed:
@@ -155,20 +145,25 @@ def human_sizes(path: object, metadata: Mapping[str, Any]) -> HumanSizes:
     stored = str(metadata.get("preset"))
     if stored != HUMAN:
         raise UserError(f"{path}: a generator of preset {stored!r}, expected 'human'; give one.")
+    return _sizes_in(path, metadata, HumanSizes)
+
+
+def _sizes_in(path: object, metadata: Mapping[str, Any], kind: Any) -> Any:
+    """The record of class ``kind`` in the ``metadata`` of a file."""
     sizes = metadata.get("sizes")
+    # The defaults tell the types, since a text or a float would fail only where layers are made.
+    types = {field.name: type(field.default) for field in fields(kind)}
     try:
-        if set(dict(sizes or {})) != {field.name for field in fields(HumanSizes)}:
-            raise ValueError("other names")
-        return HumanSizes(**sizes)  # type: ignore[arg-type]
+        if {name: type(size) for name, size in dict(sizes or {}).items()} != types:
+            raise ValueError("other names or types")
+        return kind(**sizes)  # type: ignore[arg-type]
     except (TypeError, ValueError, ParameterError) as error:
         raise misfit(path, sizes) from error
 
 
 def misfit(path: object, sizes: object) -> UserError:
-    """The error of a policy of ``human`` whose weights have other sizes than it says."""
-    return UserError(
-        f"{path}: its weights do not fit the sizes {sizes} of a human policy; fit it again."
-    )
+    """The error of a file whose weights have no such sizes."""
+    return UserError(f"{path}: its weights do not fit the sizes {sizes}; fit it again.")
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,7 @@ def _option_file(path: Path) -> dict[str, Any]:
     return yaml.safe_load(path.read_text(encoding="utf-8")) or {}
 
 
-def option(group: str, name: str) -> dict[str, Any]:
+def option(group: str, name: Any) -> dict[str, Any]:
     """What ``conf/GROUP/NAME.yaml`` says: the keys that differ from the record's defaults.
 
     Raises:
@@ -135,9 +135,9 @@ def option(group: str, name: str) -> dict[str, Any]:
     """
     names = option_names(group)
     if name not in names:
+        hint = did_you_mean(str(name), names)
         raise ParameterError(
-            f"{group}={name!s:.80}: no such option{did_you_mean(str(name), names)}; choose one of "
-            f"{', '.join(names)}."
+            f"{group}={as_typed(name):.80}: no such option{hint}; choose one of {', '.join(names)}."
         )
     # A copy, since the mapping in the cache is shared by all callers.
     return deepcopy(_option_file(conf_folder() / group / f"{name}.yaml"))

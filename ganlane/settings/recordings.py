@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from ganlane.errors import UserError
-from ganlane.settings.commands import RunConfig
+from ganlane.settings.commands import CpuConfig
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.generator import DataConfig, FitConfig, PaperConfig
 from ganlane.settings.record import CountOrZero, NotNegative, assign, at_least, between, one_of
@@ -34,7 +34,7 @@ _QUICK_S = 30.0
 
 
 @dataclass(frozen=True)
-class PrepareConfig(RunConfig):
+class PrepareConfig(CpuConfig):
     """Recordings, and where their Parquet goes. Nothing is drawn at random; polars takes its own
     number of threads.
 
@@ -49,16 +49,9 @@ class PrepareConfig(RunConfig):
     out: str | None = None
     scene_s: Annotated[float, at_least(1)] | None = None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.device != "cpu":
-            raise UserError(
-                f"device={self.device}: recordings are prepared on the CPU; use device=cpu."
-            )
-
 
 @dataclass(frozen=True)
-class TrainGeneratorConfig(RunConfig):
+class TrainGeneratorConfig(CpuConfig):
     """Recordings, what is fitted to them, and how it is measured.
 
     Attributes:
@@ -83,15 +76,10 @@ class TrainGeneratorConfig(RunConfig):
             raise UserError(
                 f"resume={self.resume}: no such folder; give the folder of an earlier run."
             )
-        if self.device != "cpu":
-            raise UserError(
-                f"device={self.device}: generators are fitted on the CPU, in minutes; use "
-                "device=cpu."
-            )
 
 
 @dataclass(frozen=True)
-class RealismConfig(RunConfig):
+class RealismConfig(CpuConfig):
     """A traffic, what it is compared with, the recordings, and how much is driven.
 
     Attributes:
@@ -143,10 +131,6 @@ class RealismConfig(RunConfig):
                 raise UserError(f"against={name}: every card holds it anyway; leave it out.")
         assign(self, against=traffics_of(against, "against") if against else {})
         super().__post_init__()
-        if self.device != "cpu":
-            raise UserError(
-                f"device={self.device}: the card is made on the CPU, in minutes; use device=cpu."
-            )
         if self.traffic.label() in _WITHOUT_CARD:
             raise UserError(
                 f"traffic={self.traffic.label()}: {_WITHOUT_CARD[self.traffic.label()]}."

@@ -6,6 +6,8 @@ import csv
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import closing
+from datetime import timedelta
 from importlib import import_module
 from pathlib import Path
 from time import monotonic
@@ -118,22 +120,14 @@ class Logs:
         It replaces one at the same decisions from before the run was resumed.
         """
         # Opened for one row: the columns are known only with the first evaluation.
-        evaluation = CsvLog(
-            self.evaluation_file,
-            list(row),
-            # Less 1: a row at the same decisions, from before a resume, is replaced.
-            int(row["decisions"]) - 1,
-        )
-        evaluation.write(row)
-        evaluation.close()
+        # Less 1: a row at the same decisions, from before a resume, is replaced.
+        last = int(row["decisions"]) - 1
+        with closing(CsvLog(self.evaluation_file, list(row), last)) as evaluation:
+            evaluation.write(row)
         # With a prefix, so that these figures are not mixed with those of the training.
         for log in self.further:
-            log.write(
-                {
-                    name if name == "decisions" else f"evaluation/{name}": value
-                    for name, value in row.items()
-                }
-            )
+            figures = {f"evaluation/{name}": value for name, value in row.items()}
+            log.write({**figures, "decisions": row["decisions"]})
 
     def advance(self, decisions: int) -> None:
         """Move the progress bar."""
@@ -256,18 +250,15 @@ class Progress:
         self.figures: dict[str, float] = {}
         self._bar = None
         if self.stream.isatty():
-            options = {
-                "unit": "",
-                "unit_scale": True,
-                "dynamic_ncols": True,
-                "bar_format": BAR,
-                "file": self.stream,
-            }
             self._bar = tqdm(
                 total=total,
                 initial=done,
                 desc="train",
-                **options,
+                unit="",
+                unit_scale=True,
+                dynamic_ncols=True,
+                bar_format=BAR,
+                file=self.stream,
             )
 
     def advance(self, decisions: int) -> None:
@@ -288,12 +279,8 @@ class Progress:
         # The bound avoids a division by 0 where there is no rate yet.
         rate = max(row.get("decisions_per_s", 0.0), 1e-9)
         # remaining time at the rate of the last interval
-        minutes, seconds = divmod(
-            round(max(self.total - row["decisions"], 0.0) / rate),
-            60,
-        )
-        left = f"{minutes // 60}:{minutes % 60:02}:{seconds:02} left"
-        head = f"{int(row['decisions']):,} of {self.total:,} decisions, {rate:,.0f}/s, {left}"
+        left = timedelta(seconds=round(max(self.total - row["decisions"], 0.0) / rate))
+        head = f"{int(row['decisions']):,} of {self.total:,} decisions, {rate:,.0f}/s, {left} left"
         print(", ".join([head, *shown]), file=self.stream, flush=True)
 
     def close(self) -> None:
@@ -374,19 +361,16 @@ class WandbLog:
         # else W&B falls back to a temporary folder
         folder.mkdir(parents=True, exist_ok=True)
         name = "/".join(folder.absolute().parts[-2:])
-        options: dict[str, Any] = {
-            "project": project,
-            "name": name,
-            "dir": str(folder),
-            "mode": mode,
-        }
         try:
             # W&B's console would capture the stream of the progress bar.
             settings = wandb.Settings(console="off")
             self._run = wandb.init(
+                project=project,
+                name=name,
+                dir=str(folder),
+                mode=mode,
                 config=dict(about or {}),
                 settings=settings,
-                **options,
             )
         except (wandb.Error, ValueError) as error:
             raise UserError(

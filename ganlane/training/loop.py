@@ -31,13 +31,12 @@ STOPPING = (signal.SIGINT, signal.SIGTERM)
 class TrainingResult:
     """Result of a run.
 
-    ``stopped_by`` is the number of the signal that stopped it early, or None. ``best`` is the mean
-    reward of the best evaluation. ``checkpoint`` is the file to resume from.
+    ``progress`` has ``decisions``, ``updates`` and ``wall_s``. ``stopped_by`` is the number of the
+    signal that stopped it early, or None. ``best`` is the mean reward of the best evaluation.
+    ``checkpoint`` is the file to resume from.
     """
 
-    decisions: int
-    updates: int
-    wall_s: float
+    progress: dict[str, Any]
     best: float | None
     stopped_by: int | None
     checkpoint: Path
@@ -107,13 +106,8 @@ def train(
     state = TrainingState(env, agent, identity)
     # None: everything could be restored
     missing = None if resume is None else state.restore(resume)
-    saver = Checkpointer(
-        state,
-        run_folder,
-        config.checkpoint_every_s,
-        config.checkpoint_replay,
-        metadata or {},
-    )
+    seconds, replay = config.checkpoint_every_s, config.checkpoint_replay
+    saver = Checkpointer(state, run_folder, seconds, replay, metadata or {})
     actions = agent.network.config.actions
     shown = config.total_decisions if config.logger.progress else None
     # logs are closed, and their last rows written, whatever ends the run
@@ -130,32 +124,15 @@ def train(
                 if state.passed(config.log_every):
                     log.write(metrics(state))
                 if evaluate is not None and state.passed(config.evaluate_every):
-                    keep_best(
-                        state,
-                        evaluate,
-                        log,
-                        saver,
-                    )
+                    keep_best(state, evaluate, log, saver)
                 if saver.due():
                     saver.save()
             # the last agent is evaluated too, unless that has just been done
             if evaluate is not None and not signals and state.evaluated_at < state.decisions:
-                keep_best(
-                    state,
-                    evaluate,
-                    log,
-                    saver,
-                )
+                keep_best(state, evaluate, log, saver)
             saver.save()
     stopped_by = signals[-1] if signals else None
-    return TrainingResult(
-        state.decisions,
-        agent.updates,
-        state.wall_s,
-        state.best,
-        stopped_by,
-        saver.path,
-    )
+    return TrainingResult(state.progress(), state.best, stopped_by, saver.path)
 
 
 def advance(state: TrainingState) -> TensorDictBase:
@@ -190,13 +167,9 @@ def learn(state: TrainingState) -> None:
 def metrics(state: TrainingState) -> dict[str, float]:
     """A row of metrics, copied from the device."""
     agent = state.agent
-    row = {
-        "decisions": state.decisions,
-        "updates": agent.updates,
-        "wall_s": state.wall_s,
+    return {
+        **state.progress(),
         **state.stats.read(),
-    }
-    return row | {
         "sigma": float(agent.sigma()),
         "epsilon": agent.policy.epsilon,
     }

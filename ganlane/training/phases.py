@@ -42,7 +42,6 @@ from ganlane.errors import UserError
 from ganlane.evaluation import code_version, run_episodes
 from ganlane.evaluation.results import plain
 from ganlane.settings.observation import ObservationConfig
-from ganlane.settings.traffic import TrafficConfig
 from ganlane.settings.train import TrainConfig
 from ganlane.sim.random import Stream
 from ganlane.training.checkpoint import flat
@@ -61,50 +60,37 @@ class Phase:
     Attributes:
         name: ``pretrain`` or ``train``.
         folder: of its files.
-        traffic: of the other vehicles.
-        total_decisions: its length.
-        init: the agent to start from; None: random weights.
+        config: of the run, with the traffic and the length of this phase.
+        start: the agent to start from; None: random weights.
     """
 
     name: str
     folder: Path
-    traffic: TrafficConfig
-    total_decisions: int
-    init: str | None
+    config: TrainConfig
+    start: str | None
 
 
 def phases_of(config: TrainConfig, folder: Path) -> list[Phase]:
     """The phases of ``config``, in order."""
-    main = Phase(
-        "train",
-        folder,
-        config.traffic,
-        config.total_decisions,
-        config.init.path,
-    )
+    start = config.init.path
     before = config.pretrain
     # one phase unless another is asked for
     if before.total_decisions == 0 or before.traffic is None:
-        return [main]
+        return [Phase("train", folder, config, start)]
     # the second phase starts from the agent that the first one leaves
-    first = Phase(
-        "pretrain",
-        folder / "pretrain",
-        before.traffic,
-        before.total_decisions,
-        config.init.path,
-    )
+    first = replace(config, traffic=before.traffic, total_decisions=before.total_decisions)
+    place = folder / "pretrain"
     return [
-        first,
-        replace(main, init=str(first.folder / AGENT_FILE)),
+        Phase("pretrain", place, first, start),
+        Phase("train", folder, config, str(place / AGENT_FILE)),
     ]
 
 
-def length_if_finished(config: TrainConfig, phase: Phase) -> dict[str, float] | None:
+def length_if_finished(phase: Phase) -> dict[str, float] | None:
     """Decisions, updates and wall time of a finished first phase; None for any other phase.
 
     Raises:
-        UserError: its length or traffic differ from those of ``config``.
+        UserError: its length or traffic are not those asked for.
     """
     path = phase.folder / AGENT_FILE
     if phase.name != "pretrain" or not path.is_file():
@@ -112,70 +98,56 @@ def length_if_finished(config: TrainConfig, phase: Phase) -> dict[str, float] | 
     # the file is written at the end of the phase, with its length
     training = read_agent(path)[2]["training"]
     done = training["decisions"]
-    wanted = phase.total_decisions
+    wanted = phase.config.total_decisions
     # the last step of all environments may go beyond it
-    if not wanted <= done < wanted + config.num_envs:
+    if not wanted <= done < wanted + phase.config.num_envs:
         raise UserError(
             f"pretrain.total_decisions={wanted}: this phase is over, after {done} decisions; "
             "resume with the value that the run was started with."
         )
-    if flat(training["traffic"]) != flat(phase.traffic.description()):
+    if flat(training["traffic"]) != flat(phase.config.traffic.description()):
         raise UserError(
             "traffic@pretrain.traffic: this phase is over, on other traffic; resume with the same."
         )
     return {name: training[name] for name in ("decisions", "updates", "wall_s")}
 
 
-def run_phase(
-    config: TrainConfig,
-    phase: Phase,
-    resume: str | Path | None = None,
-) -> TrainingResult:
+def run_phase(phase: Phase, resume: str | Path | None = None) -> TrainingResult:
     """Train the agent of one phase and write its :data:`AGENT_FILE`.
 
-    Nothing is written if a signal stopped it early. ``config`` is that of the whole run, ``resume``
-    a checkpoint to continue from.
+    Nothing is written if a signal stopped it early. ``resume`` is a checkpoint to continue from.
 
     Raises:
         UserError: the agent to start from, the weights of the traffic or the checkpoint do not fit.
     """
-    agent = make_initial_agent(config, phase, resume is not None)
-    metadata = describe(config, phase)
-    env = env_maker(config, phase.traffic, Stream.TRAIN)(config.num_envs)
+    config, folder = phase.config, phase.folder
+    agent = make_initial_agent(phase, resume is not None)
+    metadata = describe(phase)
     result = train(
-        env,
+        env_maker(config, Stream.TRAIN)(config.num_envs),
         agent,
-        # The loop knows the decisions of its own phase only.
-        replace(config, total_decisions=phase.total_decisions),
-        phase.folder,
-        evaluate=make_selection(config, phase.traffic) if config.evaluate_every else None,
-        logs=make_logs(config.logger, phase.folder, metadata),
+        config,
+        folder,
+        evaluate=make_selection(config) if config.evaluate_every else None,
+        logs=make_logs(config.logger, folder, metadata),
         metadata=metadata,
         resume=resume,
-        identity=identity(config, phase),
+        identity=identity(config),
     )
     # a phase that was stopped is not over
     if result.stopped_by is None:
-        save_final_agent(
-            agent,
-            phase.folder,
-            metadata,
-            result,
-            config.selection_episodes,
-        )
+        save_final_agent(agent, phase, metadata, result)
     return result
 
 
 # --- the environments
 
 
-def env_maker(
-    config: TrainConfig, traffic: TrafficConfig, stream: Stream
-) -> Callable[..., EnvBase]:
-    """What makes any number of environments with ``traffic``, on the episodes of ``stream``."""
+def env_maker(config: TrainConfig, stream: Stream) -> Callable[..., EnvBase]:
+    """What makes any number of environments, on the episodes of ``stream``."""
     return partial(
         make_env,
-        make_traffic(traffic, config.env, stream),
+        make_traffic(config.traffic, config.env, stream),
         config.env,
         config.observation,
         config.reward,
@@ -185,21 +157,15 @@ def env_maker(
     )
 
 
-def make_selection(config: TrainConfig, traffic: TrafficConfig) -> Evaluate:
+def make_selection(config: TrainConfig) -> Evaluate:
     """A function that evaluates the greedy policy on episodes that are never trained on."""
-    make = env_maker(config, traffic, Stream.SELECT)
+    make = env_maker(config, Stream.SELECT)
     env = make(min(config.selection_episodes, config.evaluation.num_envs))
     # the same episodes in every call, so that figures can be compared
     episodes = range(config.selection_episodes)
 
     def evaluate(policy: GreedyPolicy) -> dict[str, float]:
-        table = run_episodes(
-            env,
-            policy,
-            episodes,
-            config.seed,
-            make_smaller=make,
-        )
+        table = run_episodes(env, policy, episodes, config.seed, make_smaller=make)
         total = table.select(
             "reward",
             "lane_changes",
@@ -246,20 +212,15 @@ def read_start(name: str) -> Start:
     return Start(name, weights, network, observation_of(metadata))
 
 
-def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
-    """A new agent for the observation of ``config``.
-
-    One that will get trained weights explores little.
-    """
+def make_agent(phase: Phase) -> Rainbow:
+    """A new agent; one that will get trained weights explores little."""
+    config = phase.config
     actions = config.env.actions
     # a falling learning rate reaches its end with the phase
-    options = config.agent.for_phase(phase.total_decisions)
+    options = config.agent.for_phase(config.total_decisions)
     # Trained weights need no long phase of random actions.
-    if phase.init is not None:
-        options = replace(
-            options,
-            epsilon_start=min(options.epsilon_start, options.epsilon),
-        )
+    if phase.start is not None:
+        options = replace(options, epsilon_start=min(options.epsilon_start, options.epsilon))
     return Rainbow(
         options,
         observation_size(config.observation.form, config.env.vehicles, actions),
@@ -271,7 +232,7 @@ def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
     )
 
 
-def make_initial_agent(config: TrainConfig, phase: Phase, resumes: bool) -> Rainbow:
+def make_initial_agent(phase: Phase, resumes: bool) -> Rainbow:
     """The initial agent of ``phase``; if it ``resumes``, one to be restored.
 
     The file that a resumed run started from may no longer exist.
@@ -279,10 +240,10 @@ def make_initial_agent(config: TrainConfig, phase: Phase, resumes: bool) -> Rain
     Raises:
         UserError: the agent to start from does not fit.
     """
-    agent = make_agent(config, phase)
-    if phase.init is not None and not resumes:
-        start = read_start(phase.init)
-        check_observation(start, config.observation)
+    agent = make_agent(phase)
+    if phase.start is not None and not resumes:
+        start = read_start(phase.start)
+        check_observation(start, phase.config.observation)
         warm_start(agent, start.name, start.weights, start.network)
     return agent
 
@@ -302,10 +263,9 @@ def check_observation(start: Start, observation: ObservationConfig) -> None:
 
 def save_final_agent(
     agent: Rainbow,
-    folder: Path,
+    phase: Phase,
     metadata: Mapping[str, Any],
     result: TrainingResult,
-    selection_episodes: int,
 ) -> None:
     """Write the agent of the phase: the best one by evaluation, or the last without evaluations.
 
@@ -313,7 +273,7 @@ def save_final_agent(
     selection stream.
     """
     training = dict(metadata["training"])
-    best = folder / "checkpoints" / "best.safetensors"
+    best = phase.folder / "checkpoints" / "best.safetensors"
     further = {}
     # the best agent replaces the last one
     if result.best is not None and best.is_file():
@@ -321,32 +281,20 @@ def save_final_agent(
         load_parameters(agent.network, weights)
         # what the evaluation added to the metadata of the best agent
         figures = {name: value for name, value in saved["training"].items() if name not in training}
-        selected = {
-            **figures,
-            "episodes": selection_episodes,
-            "stream": "select",
-        }
-        further = {"selected": selected}
-    training |= {
-        "decisions": result.decisions,
-        "updates": result.updates,
-        "wall_s": result.wall_s,
-    }
-    save_agent(
-        folder / AGENT_FILE,
-        agent,
-        {**metadata, "training": training, **further},
-    )
+        episodes = phase.config.selection_episodes
+        further = {"selected": {**figures, "episodes": episodes, "stream": "select"}}
+    training |= result.progress
+    save_agent(phase.folder / AGENT_FILE, agent, {**metadata, "training": training, **further})
 
 
 # --- metadata
 
 
-def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
+def identity(config: TrainConfig) -> dict[str, Any]:
     """The settings that a resumed run must share with the run that was stopped."""
     return {
         "env": plain(config.env),
-        "traffic": phase.traffic.description(),
+        "traffic": config.traffic.description(),
         "observation": asdict(config.observation),
         "reward": asdict(config.reward),
         "mask": asdict(config.mask),
@@ -356,8 +304,9 @@ def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
     }
 
 
-def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
+def describe(phase: Phase) -> dict[str, Any]:
     """Metadata of the agent's files."""
+    config = phase.config
     return {
         "observation": config.observation.form,
         "observation_scale": asdict(config.observation.scale()),
@@ -374,8 +323,8 @@ def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
         "reward": asdict(config.reward),
         "training": {
             "phase": phase.name,
-            "init": phase.init,
+            "init": phase.start,
             "seed": config.seed,
-            "traffic": phase.traffic.description(),
+            "traffic": config.traffic.description(),
         },
     }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import zipfile
 from pathlib import Path
 
@@ -114,11 +113,17 @@ def test_the_description_is_bound_to_the_file():
     file.write_bytes(file.read_bytes() + b" ")
     with user_error("for another model than ppo.zip is now"):
         load_model(file)
-    text = json.loads(Path("ppo.zip.json").read_text())
-    text["reads"]["observation"] = "table3"
-    Path("ppo.zip.json").write_text(json.dumps(text))
-    with user_error("ppo.zip.json"):
-        load_model(file)
+    text = Path("ppo.zip.json").read_text()
+    for damaged in (
+        text.replace("lane_view", "table3"),
+        text.replace("ganlane sha256", "nothing"),
+        text[:50],
+        "[" * 100_000,
+        "3",
+    ):
+        Path("ppo.zip.json").write_text(damaged)
+        with user_error("ppo.zip.json: "):
+            load_model(file)
 
 
 def network(*between, last=None):
@@ -138,10 +143,8 @@ def test_a_plain_network_is_stored_and_acts_as_before():
     values = layers(observation)
     anything = [[True] * 3] * len(values)
     assert actions_of(driver.policy, observation.tolist(), anything) == values.argmax(-1).tolist()
-    assert set(actions_of(driver.policy, observation.tolist(), [[True, False, True]] * 50)) == {
-        0,
-        2,
-    }
+    masked = actions_of(driver.policy, observation.tolist(), [[True, False, True]] * 50)
+    assert set(masked) <= {0, 2}
 
 
 @pytest.mark.parametrize(

@@ -14,71 +14,17 @@ import sys
 from pathlib import Path
 
 import pytest
-import yaml
-from reference.refusals import everything_below, is_one_sentence, refusal
+from reference.refusals import everything_below, is_one_sentence
 
 from ganlane.__main__ import main
 from ganlane.config.compose import parsed
 from ganlane.config.run import Stopped, run_command, settings
 from ganlane.errors import UserError, is_users_matter
 from ganlane.files import write_bytes
-from ganlane.settings.commands import EvaluateConfig
 from ganlane.settings.record import make
 from ganlane.settings.traffic import TrafficConfig
 
 ROOT = Path(__file__).resolve().parents[2]
-#: Command line to a part of its sentence.
-MISTAKES = {
-    "train env.lane=3": "env.lane: no such key (did you mean 'lanes'?)",
-    "train trafic=gan": "trafic: no such key (did you mean 'traffic'?); known are agent",
-    "train agent.gama=0.9": "agent.gama: no such key (did you mean 'gamma'?); agent has adam_eps",
-    "train env.idm.gap=2": "env.idm.gap: no such key; env.idm has comfortable_deceleration",
-    "train pretrain.traffic.guard=false": "pretrain.traffic._target_: of which traffic? name it",
-    "train traffic=mixed traffic.options.idm.blind_share=1": "traffic.options.idm: it has no share",
-    "train traffic=mixed traffic.shares={replay:1}": "traffic.shares=replay: it plays recordings",
-    "train traffic=idm traffic.pace=2": "traffic.pace: no such key; traffic has _target_, blind_",
-    "train traffic=ganny": "traffic=ganny: no such option (did you mean 'gan'?)",
-    "train env=[a,b]": "choose one of blocked_lane",
-    "train env.idm=3": "env.idm.NAME=VALUE",
-    "train +env.wheels=3": "env.wheels: no such key",
-    "train ++env.wheels=3": "env.wheels: no such key",
-    "train ~env.lanes": "keys cannot be deleted",
-    "train lanes": "not of the form key=value",
-    "train --quick": "--quick: no such flag; run the command with --help",
-    "train seed=0,1": "add -m for a sweep",
-    "train -m seed=0,-1": "seed=-1: expected a number from 0",
-    "train -m seed=0,1 traffic=idm,ganny": "traffic=ganny: no such option",
-    "train -m seed=0,1 resume=auto": "one run is resumed at a time",
-    "train resume=nowhere": "resume=nowhere: no checkpoint there",
-    "train env.vehicles=100": "env.vehicles=100 do not fit: 3 lanes x 9 vehicles",
-    "train env.decision_period_s=0.15": "not a multiple of 0.1 s",
-    "train agent.warmup=5": "expected at least agent.batch_size=256",
-    "train pretrain.total_decisions=10": "give for instance pretrain.traffic=idm_mobil",
-    "train traffic._target_=nonsense": "expected an import path",
-    "train hydra.nonsense=1": "hydra.nonsense: no such key",
-    "evaluate traffic=gan": "did you mean traffics=[NAME,NAME]?",
-    "evaluate traffics=[gann]": "traffic=gann: no such option (did you mean 'gan'?)",
-    "render film.start_s=9 film.end_s=3": "expected more than film.start_s=9",
-    "render out=nowhere/film.gif": "out=nowhere/film.gif: expected a file in a folder that exists",
-    "train_generator generator=gann": "choose one of calibrated, human, paper, social_gan",
-    "train_generator folds=1": "one fold leaves nothing to fit to",
-    "train agent.noisy=perhaps": "agent.noisy=perhaps: expected true or false",
-    "train env=scene": "env.scene.path: no file; give one",
-    "evaluate env=cut_in env.vehicles=5": "env.vehicles=5: the scene has 6",
-    "evaluate env=cut_in env.lanes=1": "env=cut_in needs 2 lanes or more",
-    "evaluate env=stalled_car env.spread_m=300": "env.spread_m=300",
-    "evaluate env=cut_in env.scene.gap_m=3 env.scene.speed_mps=36": "would need 100 m/s2",
-    "evaluate env.min_spacing_m=12": "raise env.min_spacing_m to 17.8",
-    "evaluate traffics=[gan,gan]": "expected a list of different traffics",
-    "evaluate seed=1,2": "seed=1,2: several values; write [a,b] for a list, or add -m",
-    "evaluate --config-dir .": "--config-dir: no such flag",
-    "evaluate --cfg job agents=[mobil,mobil]": "a list of different entries",
-}
-
-
-@pytest.mark.parametrize("line", MISTAKES)
-def test_a_mistake_ends_in_one_sentence_and_leaves_nothing(line, empty_folder, capsys):
-    assert MISTAKES[line] in refusal(capsys, *line.split())
 
 
 @pytest.mark.parametrize(
@@ -149,14 +95,6 @@ def test_an_escape_sequence_reaches_no_terminal(line, empty_folder, capsys):
     told = capsys.readouterr().err
     assert r"\x1b[31m" in told
     assert "\x1b" not in told
-
-
-def test_cfg_prints_what_a_run_would_be_made_of(capsys, empty_folder):
-    assert main(["evaluate", "env.lanes=4", "--cfg", "job"]) == 0
-    shown = yaml.safe_load(capsys.readouterr().out)
-    assert shown["env"]["lanes"] == 4
-    assert make(EvaluateConfig, shown) == settings("evaluate", ["env.lanes=4"])
-    assert list(empty_folder.iterdir()) == []
 
 
 @pytest.mark.parametrize("override", ["seed=" + "9" * 6000, "agents=" + "[" * 500 + "]" * 500])

@@ -53,6 +53,7 @@ def test_every_option_composes(group, name):
 def test_every_form_is_an_option_of_its_name(group, names):
     assert set(option_names(group)) == set(names)
     assert all(option(group, name) == {"form": name} for name in names)
+    assert set(FORMS) == set(OBSERVATIONS)
 
 
 def test_every_traffic_is_an_option_under_its_own_name():
@@ -69,13 +70,11 @@ def test_help_is_plain_text_and_gives_every_key_a_meaning(command, capsys):
     keys = text.partition("keys (KEY=VALUE")[2].partition("flags")[0]
     assert re.findall(r"^ +\w+: [^#\n]+$", keys, re.MULTILINE) == []
     assert text.startswith(f"ganlane {command}: ")
+    for group in re.findall(r"^  (\w+)$", text.partition("keys (KEY")[0], re.MULTILINE):
+        assert all(name in text for name in option_names(group)), group
     assert "seed: 0" in text
     assert "exit status" in text
     assert not re.search(r":\w+:`|``", text)
-
-
-def test_observation_forms_are_those_of_the_transform():
-    assert set(FORMS) == set(OBSERVATIONS)
 
 
 def test_considerate_is_the_paper_and_a_price_for_danger_behind():

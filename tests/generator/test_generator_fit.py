@@ -150,7 +150,7 @@ def test_the_calibrated_preset_is_also_rolled_out_for_five_seconds(
     ]
     assert rollout["ratio_to_constant_velocity"]["constant_velocity"] == 1.0
     assert scores["open_loop"]["windows"] > rollout["windows"]
-    assert "RMSE at 5 s to CV" in fold_tables(scores)
+    assert "idm_own_headway" in fold_tables(scores)
 
 
 @pytest.mark.parametrize("preset", ["paper", "calibrated"])

@@ -6,130 +6,24 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
-from ganlane.api import make_env
 from ganlane.gym.base import make_rows
 from ganlane.gym.native_rows import NativeRows
 from ganlane.gym.tensor_rows import TensorRows
-from ganlane.native.batch import NativeBatch
-from ganlane.native.drivers import RuleDrivers
 from ganlane.native.library import why_not
 from ganlane.settings.commands import highways
-from ganlane.settings.driving import EgoParameters
-from ganlane.settings.env import EnvConfig
-from ganlane.settings.observation import MaskParameters, ObservationConfig, RewardParameters
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason="no C++ compiler")
 ROWS = 37
 
 
-def batch_of(env, mobil=True, rows=ROWS, **parts):
-    return NativeBatch(
-        rows,
-        env.lanes,
-        env.lane_width_m,
-        env.vehicles,
-        env.spawn_parameters(),
-        env.ego,
-        env.episode_parameters(),
-        RuleDrivers(env.idm, mobil=env.mobil if mobil else None),
-        env.recycle_share if env.recycle else None,
-        **parts,
-    )
-
-
-def assert_equal(state, batch, masked):
-    for name, value in state["vehicles"].items():
-        np.testing.assert_array_equal(value.numpy(), batch.state["vehicles", name], name)
-    low, high = batch.bounds
-    seen = (
-        state["observation"]
-        .numpy()
-        .clip([0.0, *[low] * (batch.observation.shape[1] - 1)], max(high, 4.0))
-    )
-    np.testing.assert_array_equal(seen, batch.observation)
-    for name, value in state["reward_terms"].items():
-        np.testing.assert_array_equal(value[:, 0].numpy(), batch.reward_terms()[name], name)
-    if masked:
-        np.testing.assert_array_equal(state["action_mask"].numpy(), batch.mask)
-
-
 LORRIES = {"truck_share": 0.3, "truck_desired_speed_mps": (20.0, 22.0)}
-
-
-@pytest.mark.parametrize(
-    ("traffic", "options", "observation", "reward", "mask"),
-    [
-        ("idm_mobil", {"goal_m": 700.0}, "lane_view_overlap", {}, "none"),
-        (
-            "idm",
-            {"goal_m": 700.0, "lanes": 5, "vehicles": 30, "spread_m": 500.0},
-            "lane_view",
-            {},
-            "legal",
-        ),
-        (
-            "idm_mobil",
-            {"recycle": True, "recycle_share": 0.5, "goal_m": 900.0, **LORRIES},
-            "lane_view_drift",
-            {"soft_crash_behind": -5.0, "literal_low_acceleration": True, "low_acceleration": -0.2},
-            "safe",
-        ),
-        (
-            "idm_mobil",
-            {
-                "decision_period_s": 0.5,
-                "timeout_s": 9.0,
-                "ego": EgoParameters(abort_lane_change=True),
-            },
-            "lane_view_overlap",
-            {},
-            "safe",
-        ),
-    ],
-)
-def test_a_batch_gives_the_torchrl_environments_numbers(
-    traffic, options, observation, reward, mask
-):
-    config = EnvConfig(**options)
-    batch = batch_of(
-        config,
-        traffic == "idm_mobil",
-        observation=ObservationConfig(form=observation),
-        reward=RewardParameters(**reward),
-        mask=MaskParameters(mask),
-    )
-    env = make_env(
-        traffic,
-        ROWS,
-        env=config,
-        kernel="native",
-        observation=observation,
-        reward=reward,
-        mask=mask,
-        seed=5,
-    )
-    state = env.reset()
-    batch.start(5, np.arange(ROWS))
-    assert_equal(state, batch, mask != "none")
-    draw = np.random.default_rng(0)
-    ended = 0
-    for decision in range(60):
-        actions = draw.integers(0, 3, ROWS) * (decision % 3 == 0)
-        both, state = env.step_and_maybe_reset(state.set("action", torch.as_tensor(actions)))
-        after = both["next"]
-        stepped = batch.step(actions)
-        assert_equal(after, batch, mask != "none")
-        np.testing.assert_array_equal(after["reward"][:, 0].numpy(), stepped.reward)
-        for name in ("done", "terminated", "truncated"):
-            np.testing.assert_array_equal(after[name][:, 0].numpy(), batch.state[name])
-        done = batch.state["done"].copy()
-        ended += done.sum()
-        batch.start(batch.state["seed"], batch.state["episode"] + ROWS, done)
-        assert_equal(state, batch, mask != "none")
-        np.testing.assert_array_equal(state["episode"].numpy(), batch.state["episode"])
-    assert ended > ROWS // 2
+MIXED = {"name": "mixed", "shares": {"idm_mobil": 2, "gan": 1, "human": 1, "idm_faults": 1}}
+OTHER_REWARD = {
+    "soft_crash_behind": -5.0,
+    "literal_low_acceleration": True,
+    "low_acceleration": -0.2,
+}
 
 
 def both_ways(traffic, rows, **options):
@@ -153,6 +47,7 @@ def any_commands(rows, rng):
 @pytest.mark.parametrize(
     ("traffic", "options"),
     [
+        *((traffic, {}) for traffic in ("idm_random", "human", "gan", "gan_calibrated", MIXED)),
         ("idm_mobil", {"env": "merge", "observation": "road_view"}),
         ("idm_mobil", {"env": "exit", "observation": "road_view", "mask": "safe"}),
         ("idm_faults", {"env": "lane_drop", "observation": "lane_view", "mask": "legal"}),
@@ -160,13 +55,29 @@ def any_commands(rows, rng):
         ("idm_mobil", {"env": "exit", "observation": "road_view", "actions": "lane_speed"}),
         ("idm_mobil", {"env": "merge", "observation": "road_view", "actions": "continuous"}),
         ("idm_mobil", {"env": "highway", "actions": "continuous"}),
+        ("idm_mobil", {"goal_m": 700.0, "observation": "lane_view_overlap"}),
+        (
+            "idm",
+            {"lanes": 5, "vehicles": 30, "spread_m": 500.0, "mask": "legal", "goal_m": 700.0}
+            | {"observation": "lane_view"},
+        ),
+        (
+            "idm_mobil",
+            {"recycle": True, "recycle_share": 0.5, "goal_m": 700.0, "mask": "safe", **LORRIES}
+            | {"observation": "lane_view_drift", "reward": OTHER_REWARD},
+        ),
+        (
+            "idm_mobil",
+            {"decision_period_s": 0.5, "timeout_s": 9.0, "mask": "safe"}
+            | {"ego": {"abort_lane_change": True}},
+        ),
     ],
 )
 def test_scenes_and_other_commands_are_driven_like_behind_torchrl(traffic, options):
     one, other = both_ways(traffic, ROWS, **options)
     rng = np.random.default_rng(0)
     ended = 0
-    for _ in range(30):
+    for _ in range(40):
         np.testing.assert_array_equal(one.observation(), other.observation())
         np.testing.assert_array_equal(one.mask(), other.mask())
         commands = any_commands(one, rng)
@@ -176,6 +87,10 @@ def test_scenes_and_other_commands_are_driven_like_behind_torchrl(traffic, optio
         assert mine.keys() == theirs.keys()
         for name in mine.keys() - {"reward_terms"}:
             np.testing.assert_array_equal(mine[name], theirs[name], name)
+        for name, term in theirs["reward_terms"].items():
+            np.testing.assert_array_equal(mine["reward_terms"][name], term, name)
+        for name, value in other.now()["vehicles"].items():
+            np.testing.assert_array_equal(one.batch.state["vehicles", name], value.numpy(), name)
         over = mine["hard_crash"] | mine["out_of_road"] | mine["goal"] | mine["missed_exit"]
         over = over | mine["timeout"]
         ended += int(over.sum())

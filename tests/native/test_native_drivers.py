@@ -22,7 +22,8 @@ from ganlane.native.drivers import drivers_of
 from ganlane.native.library import VARIANTS, best_variant, why_not
 from ganlane.native.tensors import Kernel, NativeScenes
 from ganlane.runtime import kernel_threads
-from ganlane.settings.driving import IdmParameters, MobilParameters, Visibility
+from ganlane.settings.commands import highways
+from ganlane.settings.driving import Visibility
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.generator import EXTRA_INPUTS, GENERATOR, GeneratorSizes, HumanSizes
 from ganlane.settings.record import make
@@ -212,19 +213,34 @@ def test_it_decides_as_the_tensor_code_in_a_hundred_thousand_decisions(traffic):
     assert differ <= compared * (4 if sensitive else 1) // 10_000, (differ, compared)
 
 
-@pytest.fixture(scope="module", params=[*TRAFFICS[2:], MIXED], ids=str)
+#: Traffic, and what else differs from the default highway.
+HIGHWAYS = [(traffic, {}) for traffic in [*TRAFFICS[1:], MIXED]]
+HIGHWAYS += [("idm", {"actions": form}) for form in ("lane_speed", "continuous")]
+HIGHWAYS += [("idm_mobil", {"env": "lane_drop", "recycle": False})]
+
+
+@pytest.fixture(scope="module", params=HIGHWAYS, ids=str)
 def episodes(request):
-    """Drivers, and the states of 37 episodes after every decision, and the actions."""
-    traffic = make(TrafficConfig, request.param)
-    drivers = drivers_of(traffic, IdmParameters(), MobilParameters(), 0)
-    actions = np.random.default_rng(0).choice(3, (12, 37), p=[0.8, 0.1, 0.1])
-    return drivers, actions, drive(drivers, actions, range(37))
+    """Traffic and options, the actions, and the states of 37 episodes after every decision."""
+    _, options = request.param
+    rng = np.random.default_rng(0)
+    actions = rng.choice(3, (12, 37), p=[0.8, 0.1, 0.1])
+    if options.get("actions") == "continuous":
+        actions = rng.uniform(-0.5, 0.5, (12, 37, 2))
+    return request.param, actions, drive(request.param, actions, range(37))
 
 
-def drive(drivers, actions, numbers, variant=None):
+def batch_of(traffic, rows, variant=None, **options):
+    config = highways(traffic=traffic, num_envs=rows, **options)
+    drivers = drivers_of(config.traffic, config.env.idm, config.env.mobil, 0)
+    return NativeBatch(config, drivers, variant)
+
+
+def drive(highway, actions, numbers, variant=None):
     """The arrays of the state after every decision of the episodes ``numbers``."""
+    traffic, options = highway
     numbers = np.array(numbers)
-    batch = NativeBatch(len(numbers), drivers=drivers, variant=variant)
+    batch = batch_of(traffic, len(numbers), variant, **options)
     batch.start(3, numbers)
     states = []
     for action in actions[:, numbers]:
@@ -242,8 +258,8 @@ def assert_same(states, whole, rows):
 
 @pytest.mark.parametrize("numbers", [[0], [36], range(5, 12), range(1, 18)], ids=str)
 def test_an_episode_is_the_same_bit_for_bit_in_any_batch(episodes, numbers):
-    drivers, actions, whole = episodes
-    assert_same(drive(drivers, actions, numbers), whole, np.array(numbers))
+    highway, actions, whole = episodes
+    assert_same(drive(highway, actions, numbers), whole, np.array(numbers))
 
 
 @pytest.mark.slow
@@ -252,12 +268,12 @@ def test_an_episode_is_the_same_bit_for_bit_in_any_batch(episodes, numbers):
 def test_an_episode_is_the_same_among_a_thousand_and_in_any_number_of_threads(
     episodes, rows, threads
 ):
-    drivers, actions, whole = episodes
+    highway, actions, whole = episodes
     context = copy_context()
     context.run(kernel_threads.set, threads)
-    others = np.resize(actions, (len(actions), rows))
+    others = np.resize(actions, (len(actions), rows, *actions.shape[2:]))
     others[:, :37] = actions
-    states = context.run(drive, drivers, others, range(rows))
+    states = context.run(drive, highway, others, range(rows))
     for state in states:
         for name, array in state.items():
             state[name] = array[:37]
@@ -266,28 +282,10 @@ def test_an_episode_is_the_same_among_a_thousand_and_in_any_number_of_threads(
 
 @pytest.mark.parametrize("variant", RUNNABLE)
 def test_every_instruction_set_gives_the_same_bits(episodes, variant):
-    drivers, actions, whole = episodes
+    highway, actions, whole = episodes
     # Without an instruction for it, a product and a sum take a hundred times as long.
     few = range(3) if variant == "default" else range(37)
-    assert_same(drive(drivers, actions[:4], few, variant), whole[:4], np.array(few))
-
-
-@pytest.mark.parametrize("traffic", [*TRAFFICS, MIXED], ids=str)
-def test_torchrl_and_gymnasium_drive_the_same_episodes(traffic):
-    rows = 8
-    env = make_env(traffic, num_envs=rows, kernel="native", seed=3)
-    drivers = drivers_of(make(TrafficConfig, traffic), IdmParameters(), MobilParameters(), 0)
-    batch = NativeBatch(rows, drivers=drivers)
-    batch.start(3, np.arange(rows))
-    td = env.reset()
-    for _ in range(5):
-        action = np.array([0, 1, 2, 0, 0, 0, 0, 2])
-        batch.step(action)
-        td = env.step(td.set("action", torch.from_numpy(action)))["next"]
-        for name, array in batch.state.items():
-            if isinstance(name, tuple):
-                expected = td[name].numpy().reshape(array.shape)
-                np.testing.assert_array_equal(array, expected, str(name))
+    assert_same(drive(highway, actions[:4], few, variant), whole[:4], np.array(few))
 
 
 @pytest.mark.parametrize("traffic", [*TRAFFICS, MIXED], ids=str)
@@ -320,8 +318,7 @@ def test_a_row_that_ends_leaves_its_drivers_memory_alone():
 
 def test_numbers_never_become_denormal():
     """They decay by a factor a step; a product with a denormal takes a hundred times as long."""
-    drivers = drivers_of(make(TrafficConfig, MIXED), IdmParameters(), MobilParameters(), 0)
-    batch = NativeBatch(64, drivers=drivers)
+    batch = batch_of(MIXED, 64)
     batch.start(0, np.arange(64))
     for _ in range(200):
         batch.step(np.zeros(64, np.int64))

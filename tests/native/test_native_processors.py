@@ -18,6 +18,7 @@ from ganlane.native.batch import NativeBatch
 from ganlane.native.drivers import drivers_of, parts_of
 from ganlane.native.library import FLAGS, VARIANTS, why_not
 from ganlane.native.settings import Layout, ends_of
+from ganlane.settings.commands import highways
 from ganlane.settings.driving import IdmParameters, MobilParameters
 from ganlane.settings.record import make
 from ganlane.settings.road import WALL, LaneStretch
@@ -112,7 +113,7 @@ def described(batch, layout):
 )
 def test_another_processor_drives_the_same_episodes(traffic, ends, program, tmp_path):
     drivers = drivers_of(make(TrafficConfig, traffic), IdmParameters(), MobilParameters(), 0)
-    batch = NativeBatch(ROWS, drivers=drivers)
+    batch = NativeBatch(highways(num_envs=ROWS), drivers)
     settings = batch._parts[0].pointed["settings"]
     for name, structure in ends_of(ends).items():
         setattr(settings, name, ctypes.addressof(structure))

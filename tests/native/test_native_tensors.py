@@ -24,19 +24,17 @@ from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.native.drivers import RuleDrivers
-from ganlane.native.library import VARIANTS, best_variant, why_not
+from ganlane.native.library import why_not
 from ganlane.native.tensors import Kernel, NativeScenes
 from ganlane.settings.actions import ActionParameters
 from ganlane.settings.driving import Visibility
 from ganlane.settings.episode import SpawnParameters
-from ganlane.settings.road import WALL, LaneStretch
 from ganlane.sim.random import episode_key
 from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason=f"the kernel {why_not()}")
-RUNNABLE = list(VARIANTS)[list(VARIANTS).index(best_variant()) :]
 
 
 def random_highway(
@@ -93,11 +91,11 @@ def disturbed_start(env: HighwayEnv, generator: torch.Generator) -> TensorDictBa
     return td
 
 
-def kernel_of(env: HighwayEnv, variant: str | None = None) -> Kernel:
+def kernel_of(env: HighwayEnv) -> Kernel:
     """The kernel for the environment's road, rules and traffic."""
     mobil = env.traffic.mobil if isinstance(env.traffic, IdmMobilTraffic) else None
     drivers = RuleDrivers(mobil=mobil)
-    return Kernel(env.road, env.vehicles, env.episode, env.ego, drivers, variant, env.actions)
+    return Kernel(env.road, env.vehicles, env.episode, env.ego, drivers, actions=env.actions)
 
 
 def by_kernel(kernel: Kernel, td: TensorDictBase, recycle: bool = False) -> TensorDictBase:
@@ -210,52 +208,20 @@ def compare_random_highways(
     assert at_threshold <= max(1, compared // 100_000), (at_threshold, compared)
 
 
-def test_it_decides_as_the_tensor_code_on_random_highways():
-    compare_random_highways(highways=40, rows=16, decisions=6, seed=3, vehicles=25)
+def size(highways: int, rows: int, decisions: int, vehicles: int, *slow: pytest.MarkDecorator):
+    return pytest.param((highways, rows, decisions, vehicles), marks=slow)
 
 
-@pytest.mark.slow
-def test_it_decides_as_the_tensor_code_on_a_million_decisions():
-    compare_random_highways(highways=800, rows=128, decisions=10, seed=4, vehicles=60)
-
-
-def test_it_decides_as_the_tensor_code_on_roads_with_lanes_that_end():
-    compare_random_highways(highways=60, rows=16, decisions=8, seed=5, vehicles=25, ends=True)
-
-
-@pytest.mark.slow
-def test_it_decides_as_the_tensor_code_on_a_million_decisions_on_such_roads():
-    compare_random_highways(highways=800, rows=128, decisions=10, seed=6, vehicles=60, ends=True)
-
-
-@pytest.mark.parametrize("form", ["lane_speed", "continuous"])
-@pytest.mark.parametrize("ends", [False, True])
-def test_it_decides_as_the_tensor_code_on_other_commands(form, ends):
-    compare_random_highways(40, 16, decisions=8, seed=7, vehicles=20, ends=ends, form=form)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("form", ["lane_speed", "continuous"])
-def test_it_decides_as_the_tensor_code_on_half_a_million_other_commands(form):
-    compare_random_highways(400, 128, decisions=10, seed=8, vehicles=40, ends=True, form=form)
-
-
-def test_it_recycles_as_the_tensor_code():
-    """Over a minute slow vehicles fall behind and fast ones run away."""
-    env = environment(num_envs=32, recycle=True, dtype=torch.float32)
-    kernel = kernel_of(env)
-    td = env.reset()
-    jumped = 0
-    for _ in range(60):
-        td["action"] = torch.zeros(32, dtype=torch.int64)
-        out = by_kernel(kernel, td, recycle=True)
-        after = env.step(td)["next"]
-        distance = out[keys.VEHICLES, "x"] - td[keys.VEHICLES, "x"]
-        jumped += int((distance.abs() > 100).sum())
-        assert not differing_rows(out, after).any()
-        assert max(errors(out, after, torch.ones(32, dtype=torch.bool)).values()) < 1e-3
-        td = after.exclude("reward")
-    assert jumped > 20
+@pytest.mark.parametrize(
+    "size",
+    [size(40, 16, 8, 25), size(800, 128, 10, 60, pytest.mark.slow)],
+    ids=["few", "a million"],
+)
+@pytest.mark.parametrize("ends", [False, True], ids=["highway", "lanes that end"])
+@pytest.mark.parametrize("form", ["lane", "lane_speed", "continuous"])
+def test_it_decides_as_the_tensor_code_on_random_highways(size, ends, form):
+    highways, rows, decisions, vehicles = size
+    compare_random_highways(highways, rows, decisions, 3, vehicles, ends, form)
 
 
 def test_a_ring_is_refused_in_one_sentence():
@@ -263,56 +229,14 @@ def test_a_ring_is_refused_in_one_sentence():
         Kernel(Road(3, ring_m=500.0), 9)
 
 
-# The same bits
-
-OTHER_FORMS = ("lane_speed", "continuous")
-
-
-@pytest.fixture(
-    scope="module", params=["idm_mobil", "idm", "lanes that end", "lane_speed", "continuous"]
-)
-def crowd(request):
-    """1024 rows in motion, and what one call makes of them."""
-    stretches = ()
-    if request.param == "lanes that end":
-        stretches = (
-            LaneStretch(0.0, 150.0, WALL),
-            LaneStretch(),
-            LaneStretch(end_m=200.0, end=WALL),
-        )
-    env = environment(
-        num_envs=1024,
-        mobil=request.param != "idm",
-        dtype=torch.float32,
-        seed=9,
-        stretches=stretches,
-        actions=ActionParameters(request.param if request.param in OTHER_FORMS else "lane"),
-    )
+def test_what_goes_in_stays_as_it_is_and_need_not_be_contiguous():
+    env = environment(num_envs=64, dtype=torch.float32, seed=9)
     td = disturbed_start(env, torch.Generator().manual_seed(9))
     td["action"] = actions(env, torch.Generator().manual_seed(10))
-    return env, td, by_kernel(kernel_of(env), td, recycle=True)
-
-
-@pytest.mark.parametrize("batch", [1, 7])
-def test_a_row_is_the_same_bit_for_bit_in_any_batch(crowd, batch):
-    env, td, whole = crowd
-    kernel = kernel_of(env)
-    for start in range(0, 60 * batch, batch):
-        rows = slice(start, start + batch)
-        assert same_bits(by_kernel(kernel, td[rows], recycle=True), whole[rows]) == []
-
-
-@pytest.mark.parametrize("variant", RUNNABLE)
-def test_every_instruction_set_gives_the_same_bits(crowd, variant):
-    env, td, whole = crowd
-    assert same_bits(by_kernel(kernel_of(env, variant), td, recycle=True), whole) == []
-
-
-def test_what_goes_in_stays_as_it_is_and_need_not_be_contiguous(crowd):
-    env, td, whole = crowd
     before = td.clone()
-    strided = td.apply(lambda value: value.repeat_interleave(2, dim=0)[::2], batch_size=[1024])
-    assert same_bits(by_kernel(kernel_of(env), strided, recycle=True), whole) == []
+    strided = td.apply(lambda value: value.repeat_interleave(2, dim=0)[::2], batch_size=[64])
+    whole, other = (by_kernel(kernel_of(env), state, recycle=True) for state in (td, strided))
+    assert same_bits(other, whole) == []
     assert (td == before).all()
 
 

@@ -72,7 +72,8 @@ def test_an_interrupted_and_resumed_run_gives_the_same_weights(decisions, whole,
     result = train(road(8), resumed, settings(1600), tmp_path, resume=first.checkpoint)
     assert same(whole[0], resumed)
     assert "bit-exact" not in capsys.readouterr().err
-    assert (result.decisions, result.updates) == (1600, whole[0].updates)
+    assert result.progress["decisions"] == 1600
+    assert result.progress["updates"] == whole[0].updates
     columns = ("decisions", "loss", "mean_return", "out_of_road_rate")
     ours, theirs = (
         [[row[column] for column in columns] for row in rows(folder / "metrics.csv")]
@@ -90,10 +91,10 @@ def test_a_light_checkpoint_refills_the_buffer_before_its_first_update_and_says_
     result = train(road(8), resumed, light, tmp_path, resume=first.checkpoint)
     assert "not bit-exact" in capsys.readouterr().err
     assert len(resumed.replay) == 40  # 7 steps of 8, of which the new window of 3 still holds 2
-    assert result.updates == first.updates
+    assert result.progress["updates"] == first.progress["updates"]
     more = settings(864 + 32)
     result = train(road(8), resumed, more, tmp_path, resume=first.checkpoint)
-    assert result.updates == first.updates + 3
+    assert result.progress["updates"] == first.progress["updates"] + 3
 
 
 def test_a_light_checkpoint_of_the_full_sized_network_is_under_5_mb(tmp_path):
@@ -111,7 +112,7 @@ def test_a_signal_ends_the_run_after_its_step_with_a_checkpoint(whole, tmp_path)
     with signal_at(160, number):
         stopped = loop.train(road(8), agent(), settings(1600), tmp_path)
     assert stopped.stopped_by == number
-    assert stopped.decisions == 160
+    assert stopped.progress["decisions"] == 160
     assert signal.getsignal(number) == handler
     resumed = agent()
     train(road(8), resumed, settings(1600), tmp_path, resume=stopped.checkpoint)
@@ -133,7 +134,7 @@ def test_the_best_evaluated_agent_is_kept_and_the_last_one_too(tmp_path):
     assert [row["mean_reward"] for row in rows(tmp_path / "evaluation.csv")] == ["1", "3", "2"]
     for name, expected in (("best", seen[1]), ("last", learner.weights()["head.weight_mu"])):
         path = tmp_path / "checkpoints" / f"{name}.safetensors"
-        policy, metadata = load_agent(path, observation_size=OBSERVATION_SIZE)
+        policy, metadata = load_agent(path)
         assert torch.equal(policy.network.head.weight_mu, expected)
         if name == "best":
             assert metadata["training"]["mean_reward"] == 3.0

@@ -45,7 +45,7 @@ WITHOUT_INIT = [option for option in entry_tiny.TINY if option != "init=none"]
 def run(folder, *options, resume=None):
     """A tiny training, the phase of it that ``folder`` gets."""
     config = settings("train", [*TINY, *options])
-    run_phase(config, phases_of(config, folder)[0], resume)
+    run_phase(phases_of(config, folder)[0], resume)
     return folder
 
 
@@ -58,7 +58,7 @@ def start(folder, path, *options, resume=None):
         *options,
     ]
     config = settings("train", words)
-    return make_initial_agent(config, phases_of(config, folder)[0], resume is not None)
+    return make_initial_agent(phases_of(config, folder)[0], resume is not None)
 
 
 def equal(one, other):
@@ -179,7 +179,7 @@ def test_a_first_phase_that_is_over_must_be_the_one_asked_for(
         ["experiment=paper", "pretrain.total_decisions=5000"],
     )
     phase = phases_of(config, tmp_path)[0]
-    metadata = describe(config, phase)
+    metadata = describe(phase)
     metadata["training"] |= {
         "decisions": 5120,
         "updates": 3,
@@ -187,14 +187,17 @@ def test_a_first_phase_that_is_over_must_be_the_one_asked_for(
     }
     save_agent(
         phase.folder / AGENT_FILE,
-        make_agent(config, phase),
+        make_agent(phase),
         metadata,
     )
-    assert length_if_finished(config, phase)["decisions"] == 5120
-    with pytest.raises(UserError, match="after 5120 decisions"):
-        length_if_finished(config, replace(phase, total_decisions=9000))
-    with pytest.raises(UserError, match="on other traffic"):
-        length_if_finished(config, replace(phase, traffic=config.traffic))
+    assert length_if_finished(phase)["decisions"] == 5120
+    others = {
+        "after 5120 decisions": {"total_decisions": 9000},
+        "on other traffic": {"traffic": config.traffic},
+    }
+    for told, other in others.items():
+        with pytest.raises(UserError, match=told):
+            length_if_finished(replace(phase, config=replace(phase.config, **other)))
 
 
 def test_a_falling_learning_rate_has_reached_its_end_when_its_phase_is_over(
@@ -208,12 +211,11 @@ def test_a_falling_learning_rate_has_reached_its_end_when_its_phase_is_over(
     ]
     config = settings("train", told)
     lengths = [
-        make_agent(config, phase).config.learning_rate_decisions
-        for phase in phases_of(config, tmp_path)
+        make_agent(phase).config.learning_rate_decisions for phase in phases_of(config, tmp_path)
     ]
     assert lengths == [5000, 90]
     config = replace(config, agent=replace(config.agent, learning_rate_decisions=300))
-    assert make_agent(config, phases_of(config, tmp_path)[0]).config.learning_rate_decisions == 300
+    assert make_agent(phases_of(config, tmp_path)[0]).config.learning_rate_decisions == 300
 
 
 # --- masks
@@ -273,7 +275,7 @@ from ganlane.training.phases import phases_of, run_phase
 if __name__ == "__main__":
     folder, resume, *told = sys.argv[1:]
     config = settings("train", told)
-    run_phase(config, phases_of(config, Path(folder))[0], resume or None)
+    run_phase(phases_of(config, Path(folder))[0], resume or None)
 """
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference.worlds import same_bits, vehicles
+from reference.worlds import assert_same_tracks, same_bits, tracks, vehicles
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -181,50 +181,10 @@ def test_a_state_without_the_delayed_measurements_is_refused():
         env.step(td.set("action", action(td)))
 
 
-def episodes(env, decisions):
-    """Finished episode to what it saw, over a run with automatic resets."""
-    tracks = {}
-    finished = set()
-    td = env.reset()
-    for _ in range(decisions):
-        td["action"] = action(td)
-        for row, episode in enumerate(td[keys.EPISODE].tolist()):
-            tracks.setdefault(episode, []).append(td["observation"][row].clone())
-        stepped, td = env.step_and_maybe_reset(td)
-        after = stepped["next"]
-        for row, episode in enumerate(after[keys.EPISODE].tolist()):
-            if after["done"][row]:
-                tracks[episode].append(after["observation"][row].clone())
-                finished.add(episode)
-    return {episode: torch.stack(tracks[episode]) for episode in finished}
-
-
-def test_an_episode_is_seen_alike_in_any_batch_and_after_automatic_resets():
-    in_32 = episodes(world(EVERYTHING, 32, goal_m=140.0), 12)
-    in_5, alone = (episodes(world(EVERYTHING, rows, goal_m=140.0), 26) for rows in (5, 1))
-    for some, at_least in ((in_5, 7), (alone, 2)):
-        common = some.keys() & in_32.keys()
-        assert len(common) >= at_least
-        assert max(common) >= at_least - 1
-        for episode in common:
-            assert torch.equal(some[episode], in_32[episode]), episode
-
-
-def test_a_partial_reset_leaves_the_measurements_of_the_other_rows():
-    env = world(EVERYTHING, 3)
-    before = drive(env, 4)[-1]
-    mask = torch.tensor([[False], [True], [False]])
-    after = env.reset(before.clone().set("_reset", mask))
-    fresh = after["sensors", "x"][1]
-    assert (fresh == fresh[:1]).all()
-    assert torch.equal(after["perceived", "x"][1], fresh[0])
-    for row in (0, 2):
-        assert (
-            same_bits(after[row].exclude("_reset", "action"), before[row].exclude("action")) == []
-        )
-    # Row 1 saw its measurements of four decisions before; now all of them are of its new first
-    # scene.
-    assert not torch.equal(before["sensors", "x"][1], fresh)
+@pytest.mark.parametrize(("rows", "at_least"), [(5, 7), (1, 2)])
+def test_an_episode_is_seen_alike_in_any_batch_and_after_automatic_resets(rows, at_least):
+    in_32 = tracks(world(EVERYTHING, 32, goal_m=140.0), 12, action)
+    assert_same_tracks(tracks(world(EVERYTHING, rows, goal_m=140.0), 26, action), in_32, at_least)
 
 
 @pytest.mark.parametrize("sensors", [NOISY, EVERYTHING])
@@ -246,20 +206,6 @@ def test_a_transform_with_the_traffics_stream_is_inserted_where_there_are_errors
     assert names == [*first, "ObservationTransform", "RewardTransform"]
     if first:
         assert (env.transform[0].parameters, env.transform[0].stream) == (LATE, Stream.REPORT)
-
-
-def test_a_shipped_agent_drives_with_the_sensors_it_is_given():
-    rewards = []
-    for dropout in (0.0, 1.0):
-        table = ganlane.api.evaluate(
-            ["agent_idm"],
-            ["idm_mobil"],
-            episodes=3,
-            goal_m=1000.0,
-            observation={"sensors": {"dropout": dropout}},
-        )
-        rewards.append(table["mean_reward"][0])
-    assert rewards[0] != rewards[1]
 
 
 def test_a_delay_between_two_decisions_is_a_users_mistake():

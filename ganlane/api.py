@@ -172,7 +172,12 @@ def evaluate(
     )
     with _torch_threads(config.threads):
         drivers = _drivers(
-            agents, lambda name: build.make_drivers([name], config.env, config.device)
+            agents,
+            lambda name: build.make_drivers(
+                [name],
+                config.env,
+                config.device,
+            ),
         )
         # Two of one name would share a row of the table.
         config = replace(config, agents=[driver.name for driver in drivers])

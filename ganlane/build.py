@@ -193,7 +193,12 @@ def make_env(
     except ParameterError as error:
         raise error.below("observation.sensors") from error
     return TransformedHighway(
-        base, Compose(*errors, *transforms, RewardTransform(env.decision_period_s, reward))
+        base,
+        Compose(
+            *errors,
+            *transforms,
+            RewardTransform(env.decision_period_s, reward),
+        ),
     )
 
 
@@ -280,11 +285,23 @@ def make_driver(
         actions = actions_of(metadata)
         size = observation_size(observation.form, env.vehicles, actions)
         check_observation_size(name, network.network.config, size)
-        return Driver(name, network, observation, mask_of(metadata), actions)
+        return Driver(
+            name,
+            network,
+            observation,
+            mask_of(metadata),
+            actions,
+        )
     # a model of stable-baselines3, by its weights
     if name.endswith(".zip"):
         model, reading = load_model(Path(name), device)
-        return Driver(name, model, reading.observation, reading.mask, reading.actions)
+        return Driver(
+            name,
+            model,
+            reading.observation,
+            reading.mask,
+            reading.actions,
+        )
     # a plain function of observations
     if is_function_path(name):
         return Driver(name, FunctionPolicy(imported(name, "agents")))

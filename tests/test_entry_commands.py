@@ -21,7 +21,11 @@ def test_usage_lists_every_command(capsys):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_cfg_shows_the_config_and_leaves_nothing_behind(name, empty_folder, capsys):
+def test_cfg_shows_the_config_and_leaves_nothing_behind(
+    name,
+    empty_folder,
+    capsys,
+):
     assert main([name, "--cfg", "job"]) == 0
     shown = capsys.readouterr()
     assert make(COMMANDS[name][0], yaml.safe_load(shown.out)) == settings(name, [])
@@ -119,7 +123,11 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("line", MISTAKES)
-def test_a_mistake_is_one_sentence_and_leaves_nothing(line, empty_folder, capsys):
+def test_a_mistake_is_one_sentence_and_leaves_nothing(
+    line,
+    empty_folder,
+    capsys,
+):
     (empty_folder / "unmarked.md").write_text("nothing")
     printed = line.startswith("render")
     assert MISTAKES[line] in refusal(capsys, *line.split(), printed=printed)

@@ -64,7 +64,11 @@ def test_a_run_leaves_agent_metrics_config_and_table(finished):
     assert (folder / "config.yaml").is_file()
 
 
-def test_a_new_run_in_the_folder_of_another_is_refused(finished, capsys, tmp_path):
+def test_a_new_run_in_the_folder_of_another_is_refused(
+    finished,
+    capsys,
+    tmp_path,
+):
     folder = shutil.copytree(finished, tmp_path / "run")
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     assert main([*TINY, f"hydra.run.dir={folder}", "seed=9"]) == 2
@@ -73,7 +77,11 @@ def test_a_new_run_in_the_folder_of_another_is_refused(finished, capsys, tmp_pat
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_saves_and_the_run_can_be_resumed(number, capsys, tmp_path):
+def test_a_signal_saves_and_the_run_can_be_resumed(
+    number,
+    capsys,
+    tmp_path,
+):
     with signal_at(320, number):
         # A training of this length would compile its update, which is no matter here.
         assert main([*TINY, "total_decisions=10000000", "compile=never"]) == 128 + number
@@ -102,7 +110,11 @@ def test_the_second_phase_starts_from_the_first_ones_agent(capsys):
         ("gan_calibrated", "none"),
     ],
 )
-def test_every_traffic_and_every_start_runs(traffic, init, capsys):
+def test_every_traffic_and_every_start_runs(
+    traffic,
+    init,
+    capsys,
+):
     words = (
         "total_decisions=64 num_envs=16 env.goal_m=40 agent.warmup=256 log_every=64 "
         "evaluation.agents=[keep_lane] evaluation.episodes=1 agent.capacity=1000"
@@ -113,7 +125,11 @@ def test_every_traffic_and_every_start_runs(traffic, init, capsys):
 
 
 def test_an_agent_that_sets_its_speed_does_so_wherever_it_drives(capsys):
-    folder, results = train(capsys, "env.actions=lane_speed", "observation=lane_view")
+    folder, results = train(
+        capsys,
+        "env.actions=lane_speed",
+        "observation=lane_view",
+    )
     shares = [name for name in rows(folder / "metrics.csv")[0] if name.endswith("_share")]
     assert len([name for name in shares if name.startswith("action_")]) == 5
     # Elsewhere the environment takes its actions, and MOBIL's beside it are those of the lane.

@@ -32,7 +32,12 @@ def alone(form: str, *, stretches: Stretches = (), lanes: int = 3, **ego: float)
     return env, placed(env, vehicles({"x": 0.0, "visibility": 1, **ego}, FAR))
 
 
-def driven(env: HighwayEnv, td, action, decisions: int):
+def driven(
+    env: HighwayEnv,
+    td,
+    action,
+    decisions: int,
+):
     for _ in range(decisions):
         td = step(env, td, action)
         if td["done"].item():
@@ -66,7 +71,11 @@ def test_one_slower_sets_the_speed_one_step_below_and_it_stays():
 def test_without_commands_of_speed_an_episode_is_the_same_as_with_the_papers_actions():
     rng = torch.Generator().manual_seed(0)
     paper = environment(num_envs=16, seed=3)
-    more = environment(num_envs=16, seed=3, actions=ActionParameters("lane_speed"))
+    more = environment(
+        num_envs=16,
+        seed=3,
+        actions=ActionParameters("lane_speed"),
+    )
     one, other = paper.reset(), more.reset()
     for _ in range(20):
         action = torch.randint(0, 3, (16,), generator=rng)
@@ -178,7 +187,11 @@ def test_torchrl_and_gymnasium_find_nothing_wrong(actions, env):
 
 @pytest.mark.parametrize("actions", ["lane_speed", "continuous"])
 def test_pictures_show_such_episodes_too(actions):
-    env = gymnasium.make("ganlane/Highway-v0", actions=actions, render_mode="rgb_array")
+    env = gymnasium.make(
+        "ganlane/Highway-v0",
+        actions=actions,
+        render_mode="rgb_array",
+    )
     env.reset(seed=0)
     env.step(env.action_space.sample())
     assert env.render().ndim == 3
@@ -217,5 +230,11 @@ def test_masks_and_commands_that_know_numbered_lanes_alone_say_so():
 
 def test_drivers_by_rule_drive_in_the_same_table_as_those_of_other_actions():
     """An environment of `continuous` is compared with MOBIL, which commands lanes."""
-    table = ganlane.api.evaluate(["mobil"], ["idm"], 2, actions="continuous", goal_m=200.0)
+    table = ganlane.api.evaluate(
+        ["mobil"],
+        ["idm"],
+        2,
+        actions="continuous",
+        goal_m=200.0,
+    )
     assert table["goal"].to_list() == [2]

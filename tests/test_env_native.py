@@ -30,7 +30,11 @@ pytestmark = pytest.mark.skipif(why_not() is not None, reason=f"the kernel {why_
 
 
 def native(num_envs: int = 8, **others):
-    return environment(num_envs=num_envs, dtype=torch.float32, **{"kernel": "native", **others})
+    return environment(
+        num_envs=num_envs,
+        dtype=torch.float32,
+        **{"kernel": "native", **others},
+    )
 
 
 def test_its_keys_specs_and_first_states_are_those_of_the_tensor_code():
@@ -177,7 +181,11 @@ def driven(env, decisions):
 @pytest.mark.parametrize("form", sorted(NATIVE_FORMS))
 @pytest.mark.parametrize("abort", [False, True])
 @SENSORS
-def test_the_lane_view_and_the_safe_actions_are_those_of_the_tensor_code(form, abort, sensors):
+def test_the_lane_view_and_the_safe_actions_are_those_of_the_tensor_code(
+    form,
+    abort,
+    sensors,
+):
     """The view up to the rounding of the exponential function.
 
     With lorries, and with what the sensors deliver.
@@ -191,14 +199,24 @@ def test_the_lane_view_and_the_safe_actions_are_those_of_the_tensor_code(form, a
     )
     view = ObservationConfig(form=form, sensors=sensors)
     mask = MaskParameters(form="safe")
-    env = make_env(IdmMobilTraffic(Road()), config, view, num_envs=64, mask=mask)
+    env = make_env(
+        IdmMobilTraffic(Road()),
+        config,
+        view,
+        num_envs=64,
+        mask=mask,
+    )
     plain_view = ObservationTransform(Road(), 20, form)
     plain_mask = ActionMaskTransform(Road(), "safe", abort=abort)
     refused = 0
     hopeless = 0
     for td in driven(env, 40):
         expected = plain_mask(plain_view(td.clone()))
-        assert torch.allclose(td[keys.OBSERVATION], expected[keys.OBSERVATION], atol=1e-6)
+        assert torch.allclose(
+            td[keys.OBSERVATION],
+            expected[keys.OBSERVATION],
+            atol=1e-6,
+        )
         for name in (keys.ACTION_MASK, keys.NO_SAFE_ACTION):
             assert torch.equal(td[name], expected[name])
         refused += int((~td[keys.ACTION_MASK]).sum())

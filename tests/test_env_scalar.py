@@ -28,7 +28,12 @@ from ganlane.sim.state import Vehicles
 MOTION = ("x", "y", "heading", "speed", "acceleration")
 
 
-def random_environment(rng: random.Random, rows: int, ends: bool, actions: str) -> HighwayEnv:
+def random_environment(
+    rng: random.Random,
+    rows: int,
+    ends: bool,
+    actions: str,
+) -> HighwayEnv:
     """1 to 6 lanes, 2 to 20 vehicles, sparse to dense, with and without MOBIL, all outcomes.
 
     With ``ends`` some lanes begin late and end at a wall.
@@ -53,7 +58,11 @@ def random_environment(rng: random.Random, rows: int, ends: bool, actions: str) 
     )
 
 
-def disturb(env: HighwayEnv, td, generator: torch.Generator):
+def disturb(
+    env: HighwayEnv,
+    td,
+    generator: torch.Generator,
+):
     """A state in which the wheels are turned and some, the ego included, are in the middle of a
     change.
     """
@@ -66,20 +75,36 @@ def disturb(env: HighwayEnv, td, generator: torch.Generator):
     return td
 
 
-def any_action(rng: random.Random, state: scalar.State, lanes: int) -> int:
+def any_action(
+    rng: random.Random,
+    state: scalar.State,
+    lanes: int,
+) -> int:
     return rng.choice((0, 0, 1, 2))
 
 
-def any_speed(rng: random.Random, state: scalar.State, lanes: int) -> int:
+def any_speed(
+    rng: random.Random,
+    state: scalar.State,
+    lanes: int,
+) -> int:
     return rng.choice((0, 3, 3, 4, 4, 4, 1, 2) if rng.random() < 0.2 else (0, 3, 4))
 
 
-def any_controls(rng: random.Random, state: scalar.State, lanes: int) -> tuple[float, float]:
+def any_controls(
+    rng: random.Random,
+    state: scalar.State,
+    lanes: int,
+) -> tuple[float, float]:
     wheel = rng.choice((0.0, 0.0, 0.4, -0.4, 1.0, -1.0)) + rng.uniform(-0.1, 0.1)
     return rng.uniform(-0.6, 1.0), max(-1.0, min(1.0, wheel))
 
 
-def stay_on_the_road(rng: random.Random, state: scalar.State, lanes: int) -> int:
+def stay_on_the_road(
+    rng: random.Random,
+    state: scalar.State,
+    lanes: int,
+) -> int:
     lane = state.cars[0].target_lane
     return rng.choice([0] * 20 + [1] * (lane < lanes - 1) + [2] * (lane > 0))
 
@@ -120,7 +145,13 @@ def assert_same(
     for name in MOTION:
         expected = torch.tensor([getattr(car, name) for car in state.cars], dtype=DOUBLE)
         actual = td[keys.VEHICLES, name][row]
-        torch.testing.assert_close(actual, expected, rtol=0.0, atol=tolerance, msg=name)
+        torch.testing.assert_close(
+            actual,
+            expected,
+            rtol=0.0,
+            atol=tolerance,
+            msg=name,
+        )
     assert td[keys.VEHICLES, "target_lane"][row].tolist() == [car.target_lane for car in state.cars]
     assert td[keys.STEP][row] == state.step
     reasons = set(outcome.reasons)
@@ -168,22 +199,46 @@ def compare_random_scenes(
 
 
 @pytest.mark.parametrize("actions", CHOICES)
-@pytest.mark.parametrize("ends", [False, True], ids=["highway", "lanes that end"])
+@pytest.mark.parametrize(
+    "ends",
+    [False, True],
+    ids=["highway", "lanes that end"],
+)
 @pytest.mark.parametrize(
     ("scenes", "duration_s"), [(60, 8.0), pytest.param(2000, 10.0, marks=pytest.mark.slow)]
 )
 def test_the_tensor_code_agrees_with_the_scalar_one_on_random_scenes(
     scenes, duration_s, ends, actions
 ):
-    seen = compare_random_scenes(scenes, 4, duration_s, seed=int(ends), ends=ends, actions=actions)
+    seen = compare_random_scenes(
+        scenes,
+        4,
+        duration_s,
+        seed=int(ends),
+        ends=ends,
+        actions=actions,
+    )
     ways = {"out_of_road", "hard_crash", "goal", "timeout", *keys.EVENT_COUNTS}
     assert seen >= ways or actions != "lane"
 
 
 def test_on_a_ring_they_agree_too():
     spawn = SpawnParameters(spread_m=170.0, min_spacing_m=20.0)
-    env = environment(lanes=2, num_envs=3, vehicles=12, ring_m=200.0, spawn=spawn, seed=8)
-    compare(env, env.reset(), duration_s=10.0, rng=random.Random(4), choose=stay_on_the_road)
+    env = environment(
+        lanes=2,
+        num_envs=3,
+        vehicles=12,
+        ring_m=200.0,
+        spawn=spawn,
+        seed=8,
+    )
+    compare(
+        env,
+        env.reset(),
+        duration_s=10.0,
+        rng=random.Random(4),
+        choose=stay_on_the_road,
+    )
 
 
 def compare_whole_episodes(episodes: int, goal_m: float) -> None:

@@ -148,7 +148,11 @@ def test_a_wrong_value_in_the_settings_of_a_run_is_named(capsys):
     ],
     ids=str,
 )
-def test_a_pickle_in_the_place_of_another_file_is_refused(arguments, here, capsys):
+def test_a_pickle_in_the_place_of_another_file_is_refused(
+    arguments,
+    here,
+    capsys,
+):
     file = io.BytesIO()
     torch.save({"kind": "ganlane training checkpoint", "version": 2, "state": Bomb()}, file)
     (here / "bomb").mkdir()
@@ -177,7 +181,12 @@ def test_an_agents_description_is_not_instantiated(key):
     )
     with pytest.raises(UserError):
         make_driver("agent.safetensors", EnvConfig())
-    save_weights("agent.safetensors", "agent", weights, {**metadata, "_target_": "evil.make"})
+    save_weights(
+        "agent.safetensors",
+        "agent",
+        weights,
+        {**metadata, "_target_": "evil.make"},
+    )
     assert load_agent("agent.safetensors")[1]["_target_"] == "evil.make"
 
 
@@ -213,7 +222,11 @@ COMMAND_LINES = [
 
 
 @pytest.mark.parametrize("arguments", COMMAND_LINES, ids=" ".join)
-def test_hydra_imports_nothing_and_reads_no_other_configuration(arguments, here, capsys):
+def test_hydra_imports_nothing_and_reads_no_other_configuration(
+    arguments,
+    here,
+    capsys,
+):
     (here / "evil.pickle").write_bytes(pickle.dumps(Bomb()))
     refusal(capsys, "train", *arguments)
 
@@ -317,7 +330,11 @@ def test_a_resumed_run_takes_what_this_command_line_repeats(foreign_run):
         (["traffic.blind_share", "init.path", "resume"], "traffic._target_=evil.Traffic"),
     ],
 )
-def test_a_resumed_run_takes_no_more_than_that(keys, missing, foreign_run):
+def test_a_resumed_run_takes_no_more_than_that(
+    keys,
+    missing,
+    foreign_run,
+):
     with pytest.raises(UserError, match=r"the run's file names evil\.") as caught:
         refuse_stored_imports(foreign_run, keys)
     assert f"add {missing} to the command line" in str(caught.value)

@@ -53,7 +53,11 @@ BUSY = {"goal_m": 400.0, "stream": "report", "seed": 3}
 
 
 def short_episodes(**options):
-    return ganlane.sb3.make_vec_env("idm", num_envs=ROWS, **{"seed": 0, **SHORT, **options})
+    return ganlane.sb3.make_vec_env(
+        "idm",
+        num_envs=ROWS,
+        **{"seed": 0, **SHORT, **options},
+    )
 
 
 def untrained(algorithm, env):
@@ -137,14 +141,24 @@ def test_the_algorithm_trains_unchanged_and_its_policy_can_be_evaluated(algorith
             assert len(returns) == len(lengths) == 4
     assert model.ep_info_buffer
     driver = ganlane.sb3.driver(model)
-    table = ganlane.api.evaluate([driver, "mobil"], ["idm"], 3, mask="safe", **SHORT)
+    table = ganlane.api.evaluate(
+        [driver, "mobil"],
+        ["idm"],
+        3,
+        mask="safe",
+        **SHORT,
+    )
     assert table["agent"].to_list() == [algorithm.__name__.lower(), "mobil"]
     assert table["episodes"].to_list() == [3, 3]
     assert table["out_of_road"].to_list() == [0, 0]
 
 
 def busy_highways(**options):
-    return ganlane.sb3.make_vec_env("idm_mobil", num_envs=ROWS, **{**BUSY, **options})
+    return ganlane.sb3.make_vec_env(
+        "idm_mobil",
+        num_envs=ROWS,
+        **{**BUSY, **options},
+    )
 
 
 def sharp(model):
@@ -168,7 +182,13 @@ def returns_in_the_own_loop(model, env):
         masks = {}
         if isinstance(model, sb3_contrib.MaskablePPO):
             masks["action_masks"] = np.stack(env.env_method("action_masks"))
-        action, state = model.predict(observation, state, start, deterministic=True, **masks)
+        action, state = model.predict(
+            observation,
+            state,
+            start,
+            deterministic=True,
+            **masks,
+        )
         observation, _, start, infos = env.step(action)
         for info in infos:
             if info:
@@ -178,7 +198,13 @@ def returns_in_the_own_loop(model, env):
 
 def returns_in_the_evaluation(driver, **options):
     keys = {**BUSY, "num_envs": ROWS, **options}
-    table = ganlane.api.evaluate([driver], ["idm_mobil"], EPISODES, per_episode=True, **keys)
+    table = ganlane.api.evaluate(
+        [driver],
+        ["idm_mobil"],
+        EPISODES,
+        per_episode=True,
+        **keys,
+    )
     return table.sort("episode")["reward"].to_list()
 
 
@@ -268,7 +294,12 @@ def test_a_masked_model_that_could_turn_back_without_a_mask_is_refused():
     ],
     ids=["normalised", "masked", "dqn"],
 )
-def test_a_stored_driver_drives_as_before(algorithm, options, wrap, tmp_path):
+def test_a_stored_driver_drives_as_before(
+    algorithm,
+    options,
+    wrap,
+    tmp_path,
+):
     env = wrap(busy_highways(**options))
     driver = ganlane.sb3.driver(sharp(untrained(algorithm, env)))
     driver.save(tmp_path / "ppo")
@@ -323,7 +354,13 @@ def test_a_model_of_continuous_actions_drives_in_a_table_beside_mobil(tmp_path):
     from stable_baselines3 import SAC
 
     options = {"env": "merge", "goal_m": 300.0}
-    env = ganlane.sb3.make_vec_env("idm", num_envs=2, seed=0, actions="continuous", **options)
+    env = ganlane.sb3.make_vec_env(
+        "idm",
+        num_envs=2,
+        seed=0,
+        actions="continuous",
+        **options,
+    )
     model = SAC("MlpPolicy", env, learning_starts=10, batch_size=8, seed=0).learn(20)
     driver = ganlane.sb3.driver(model)
     table = ganlane.api.evaluate([driver, "mobil"], ["idm"], 2, **options)

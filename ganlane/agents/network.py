@@ -132,7 +132,11 @@ class QNetwork(nn.Module):
         """Weight and bias of every layer, the head last, with the present noise added."""
         return [(layer.weight, layer.bias) for layer in (*self.trunk, self.head)]
 
-    def logits(self, observation: Tensor, weights: Weights | None = None) -> Tensor:
+    def logits(
+        self,
+        observation: Tensor,
+        weights: Weights | None = None,
+    ) -> Tensor:
         """Unnormalised output [*, A, atoms] (atoms is 1 when not distributional) for observations
         [*, D].
 
@@ -241,7 +245,11 @@ def noise_of(network: nn.Module, generator: torch.Generator) -> list[tuple[Tenso
         return []
     # one draw for all layers, which is faster than one for each
     sizes = [size for layer in layers for size in (layer.in_features, layer.out_features)]
-    normal = torch.randn(sum(sizes), generator=generator, device=generator.device)
+    normal = torch.randn(
+        sum(sizes),
+        generator=generator,
+        device=generator.device,
+    )
     # f(x) = sgn(x) sqrt(|x|), equation 11 of Fortunato et al.
     noise = (normal.sign() * normal.abs().sqrt()).split(sizes)
     return list(zip(noise[::2], noise[1::2]))

@@ -105,7 +105,11 @@ class Rainbow:
         # which draws from a generator of its own
         self.replay = make_replay(config, self.generators["replay"])
         # one network, two ways to drive with it
-        self.policy = ExploringPolicy(self.network, self.generators["collect"], legal)
+        self.policy = ExploringPolicy(
+            self.network,
+            self.generators["collect"],
+            legal,
+        )
         self.greedy = GreedyPolicy(self.network)
         # since the start of the training
         self.updates = 0
@@ -114,7 +118,12 @@ class Rainbow:
         # by step.
         parts = ("distributional", "double", "dueling", "noisy", "prioritised", "kl_priority")
         if compile and all(getattr(config, part) for part in parts) and self.device.type == "cpu":
-            self.graph = UpdateGraph(self.network, self.loss, self.optimizer, config)
+            self.graph = UpdateGraph(
+                self.network,
+                self.loss,
+                self.optimizer,
+                config,
+            )
         self.anneal(0)
 
     @property
@@ -169,7 +178,11 @@ class Rainbow:
             self.loss.update_target()
         return {**learned._asdict(), "priority": learned.priority.mean()}
 
-    def _descend(self, batch: TensorDict, generator: torch.Generator) -> Learned:
+    def _descend(
+        self,
+        batch: TensorDict,
+        generator: torch.Generator,
+    ) -> Learned:
         """What :class:`~ganlane.agents.loss.UpdateGraph` does, for every ``config`` and device."""
         # both networks get new noise for every update
         for module in (self.network, self.loss.target_network):

@@ -44,7 +44,12 @@ def make_replay(config: RainbowConfig, generator: torch.Generator) -> TensorDict
     device = generator.device
     sampler = RandomSampler()
     if config.prioritised:
-        sampler = RowSampler(capacity, config.alpha, config.beta_start, device)
+        sampler = RowSampler(
+            capacity,
+            config.alpha,
+            config.beta_start,
+            device,
+        )
     return TensorDictReplayBuffer(
         storage=LazyTensorStorage(capacity, device=device),
         sampler=sampler,
@@ -125,7 +130,11 @@ class RowSampler(PrioritizedSampler):
         # rounded up
         rows = -(-self._max_capacity // ROW)
         self.priorities = torch.zeros(rows, ROW, device=self._device)
-        self.row_sums = torch.zeros(rows, dtype=torch.float64, device=self._device)
+        self.row_sums = torch.zeros(
+            rows,
+            dtype=torch.float64,
+            device=self._device,
+        )
         self.largest = torch.ones((), device=self._device)
 
     @property
@@ -141,7 +150,11 @@ class RowSampler(PrioritizedSampler):
     def _maybe_init_from_storage(self, storage: Storage | None) -> None:
         """The device is the constructor's, not the storage's."""
 
-    def _retransform_priority_trees(self, old_alpha: float, new_alpha: float) -> None:
+    def _retransform_priority_trees(
+        self,
+        old_alpha: float,
+        new_alpha: float,
+    ) -> None:
         raise NotImplementedError("alpha is fixed for the life of a RowSampler")
 
     @torch.no_grad()
@@ -163,7 +176,11 @@ class RowSampler(PrioritizedSampler):
         self.row_sums[row] = self.priorities[row].sum(-1, dtype=torch.float64)
 
     @torch.no_grad()
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
+    def sample(
+        self,
+        storage: Storage,
+        batch_size: int,
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         """Indices [B] and ``priority_weight`` [B], in (0, 1]."""
         if len(storage) == 0:
             raise RuntimeError("cannot sample from an empty replay buffer")

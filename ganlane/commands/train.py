@@ -70,4 +70,10 @@ def train(config: TrainConfig, folder: Path) -> str:
         "phases": lengths,
         "agent": agent,
     }
-    return publish(table, folder, asdict(config), seeds, numbers)
+    return publish(
+        table,
+        folder,
+        asdict(config),
+        seeds,
+        numbers,
+    )

@@ -176,7 +176,11 @@ class _Evaluation:
             "rows_must_stay",
             False,
         )
-        may_move = not rows_stay and not getattr(policy, "rows_must_stay", True)
+        may_move = not rows_stay and not getattr(
+            policy,
+            "rows_must_stay",
+            True,
+        )
         self.env = env
         self.policy = policy
         self.taken = taken

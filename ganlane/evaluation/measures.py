@@ -34,7 +34,11 @@ def first_marks(rows: Tensor) -> TensorDict:
     return TensorDict({**marks, "change_s": -endless}, rows.shape).clone()
 
 
-def marks_after(state: TensorDictBase, marks: TensorDictBase, road: Road) -> TensorDictBase:
+def marks_after(
+    state: TensorDictBase,
+    marks: TensorDictBase,
+    road: Road,
+) -> TensorDictBase:
     """``marks`` [N] after the decision that led to ``state`` [N].
 
     :data:`LEAST`, and ``change_s``, the time at which the last lane change began.
@@ -57,11 +61,19 @@ def marks_after(state: TensorDictBase, marks: TensorDictBase, road: Road) -> Ten
     }
     least = {name: torch.minimum(marks[name], value.float()) for name, value in now.items()}
     time_s = state[keys.STEP] * keys.PHYSICS_STEP_S
-    change_s = torch.where(ego["started_change"], time_s.float(), marks["change_s"])
+    change_s = torch.where(
+        ego["started_change"],
+        time_s.float(),
+        marks["change_s"],
+    )
     return TensorDict({**least, "change_s": change_s}, marks.batch_size)
 
 
-def crash_kinds(vehicles: Vehicles, since_s: Tensor, road: Road = STRAIGHT) -> list[str]:
+def crash_kinds(
+    vehicles: Vehicles,
+    since_s: Tensor,
+    road: Road = STRAIGHT,
+) -> list[str]:
     """One of :data:`CRASHES` for every row [N], as if it had crashed; ``since_s`` [N] is the time
     since its last lane change began.
     """

@@ -146,7 +146,11 @@ def paired_lead(driver: pl.DataFrame, other: pl.DataFrame) -> tuple[Estimate | N
     return (paired_difference(first, second) if len(first) > 1 else None), len(first)
 
 
-def verdict(lead: Estimate, differences: Array, one_failed: npt.NDArray[np.bool_]) -> str:
+def verdict(
+    lead: Estimate,
+    differences: Array,
+    one_failed: npt.NDArray[np.bool_],
+) -> str:
     """``above``, ``below`` or ``undecided``: the sign of a ``lead``, where it is decided.
 
     Decided is what at least 30 episodes say, whose interval and sign-flip test both exclude that
@@ -195,7 +199,11 @@ def paired_rows(episodes: pl.DataFrame) -> list[Row]:
             if lead is None:
                 continue
             returns = _paired(ours, theirs)
-            failed = _paired(ours, theirs, what=pl.col("reason").is_in(FAILURES))
+            failed = _paired(
+                ours,
+                theirs,
+                what=pl.col("reason").is_in(FAILURES),
+            )
             row = {
                 "agent": first,
                 "over": other,
@@ -305,7 +313,11 @@ def crashes_by_scene(episodes: pl.DataFrame, scenes: Sequence[str]) -> tuple[Est
             f"{len(scenes)} scenes for {episodes.height} episodes: expected one for each."
         )
     by_scene = (
-        episodes.select("reason", "distance_m", pl.Series("scene", scenes, pl.String))
+        episodes.select(
+            "reason",
+            "distance_m",
+            pl.Series("scene", scenes, pl.String),
+        )
         .group_by("scene")
         .agg(
             pl.len().alias("episodes"),

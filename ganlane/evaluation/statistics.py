@@ -294,7 +294,11 @@ def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate |
         return np.asarray(sums[:, 0] / np.maximum(sums[:, 1], np.finfo(np.float64).tiny))
 
     # One table, so that a draw of trainings is one for events and kilometres.
-    resampled = _estimate([np.stack([happened, amount])], ratio, bounds=(0.0, np.inf))
+    resampled = _estimate(
+        [np.stack([happened, amount])],
+        ratio,
+        bounds=(0.0, np.inf),
+    )
     rate = resampled.value
     low, high = (bound / total for bound in poisson_bounds(round(happened.sum())))
     # One episode of one training has no spread to resample.
@@ -355,7 +359,12 @@ def improvement_over_traffics(
         return np.mean([_share_above(first, second) for first, second in pairs], axis=0)
 
     tables = [table for pair in traffics for table in _pair(*pair)]
-    return _estimate(tables, share, bounds=(0.0, 1.0), recipes=[0, 1] * len(traffics))
+    return _estimate(
+        tables,
+        share,
+        bounds=(0.0, 1.0),
+        recipes=[0, 1] * len(traffics),
+    )
 
 
 def percent_of_way(

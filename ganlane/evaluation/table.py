@@ -278,7 +278,11 @@ def paired_table(rows: Sequence[Row]) -> str:
     """The rows of :func:`ganlane.evaluation.paired_rows`, each lead with its sign."""
 
     def lead(row: Row) -> str:
-        return ("" if row["lead"] < 0.0 else "+") + with_interval(row, "lead", 1)
+        return ("" if row["lead"] < 0.0 else "+") + with_interval(
+            row,
+            "lead",
+            1,
+        )
 
     columns: Mapping[str, Cell] = {
         "paired lead": lambda row: f"{row['agent']} over {row['over']}",

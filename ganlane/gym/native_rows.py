@@ -30,7 +30,11 @@ from ganlane.settings.episode import Stream
 class NativeRows(Rows):
     """N highways by the native kernel."""
 
-    def __init__(self, batch: NativeBatch, config: HighwayConfig) -> None:
+    def __init__(
+        self,
+        batch: NativeBatch,
+        config: HighwayConfig,
+    ) -> None:
         self.batch, self.count, self.config = batch, batch.rows, config
         self.episode = config.env.episode_parameters()
         self.space = observation_space(batch.observation.shape[1], batch.bounds[1])
@@ -68,14 +72,22 @@ class NativeRows(Rows):
         self.__init__(*state[:2])  # type: ignore[misc]
         self.started = state[2]
 
-    def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
+    def start(
+        self,
+        seed: npt.ArrayLike,
+        episode: npt.ArrayLike,
+    ) -> None:
         self.started = True
         self.batch.start(seed, episode)
 
     def restart(self, rows: Flags) -> None:
         state = self.batch.state
         # Row i drives the episodes i, i + N, i + 2N, ...
-        self.batch.start(state[keys.SEED], state[keys.EPISODE] + self.count, rows)
+        self.batch.start(
+            state[keys.SEED],
+            state[keys.EPISODE] + self.count,
+            rows,
+        )
 
     def step(self, actions: Integers | Floats) -> Stepped:
         return self.batch.step(actions)

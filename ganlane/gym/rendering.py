@@ -46,7 +46,11 @@ class LiveView:
         window: shows every physics step in real time; None: pictures on request.
     """
 
-    def __init__(self, rows: TensorRows, window: FilmWindow | None = None) -> None:
+    def __init__(
+        self,
+        rows: TensorRows,
+        window: FilmWindow | None = None,
+    ) -> None:
         self.rows = rows
         self.window = window
 
@@ -116,7 +120,11 @@ class BatchView:
         """New episodes begin in the rows where ``fresh`` [N] is true."""
         self._returns[fresh], self._actions[fresh] = 0.0, -1
 
-    def after_step(self, actions: npt.ArrayLike, reward: npt.NDArray[np.float64]) -> None:
+    def after_step(
+        self,
+        actions: npt.ArrayLike,
+        reward: npt.NDArray[np.float64],
+    ) -> None:
         """Record actions and rewards [N] of a step."""
         self._returns += reward
         self._actions[:] = actions

@@ -34,7 +34,11 @@ class TensorRows(Rows):
         state: of its rows, from the first :meth:`start` on.
     """
 
-    def __init__(self, config: HighwayConfig, transforms: Sequence[Transform] = ()) -> None:
+    def __init__(
+        self,
+        config: HighwayConfig,
+        transforms: Sequence[Transform] = (),
+    ) -> None:
         self.config, self.transforms = config, transforms
         self.env = make_highways(config)
         for transform in transforms:
@@ -52,7 +56,11 @@ class TensorRows(Rows):
     state: TensorDictBase
 
     @torch.no_grad()
-    def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
+    def start(
+        self,
+        seed: npt.ArrayLike,
+        episode: npt.ArrayLike,
+    ) -> None:
         counters = TensorDict({}, [self.count], device=self.env.device)
         for name, value in ((keys.SEED, seed), (keys.EPISODE, episode)):
             # One number for all rows, or one for each.
@@ -95,7 +103,11 @@ class TensorRows(Rows):
         # An environment with a mask has computed it; without one it is the actions on the road.
         mask = state.get(keys.ACTION_MASK, None)
         if mask is None:
-            mask = legal_actions(state, road_in(state, self.env.base_env.road), self.actions)
+            mask = legal_actions(
+                state,
+                road_in(state, self.env.base_env.road),
+                self.actions,
+            )
         return _array(mask)
 
     def state_arrays(self) -> Mapping[str, Any]:

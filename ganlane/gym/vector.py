@@ -134,7 +134,11 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
         if self._view is not None:
             self._view.start(fresh)
 
-    def _start(self, seed: int | Sequence[int] | None, episode: Any) -> None:
+    def _start(
+        self,
+        seed: int | Sequence[int] | None,
+        episode: Any,
+    ) -> None:
         """Begin the episodes that the arguments of a reset name, or the next ones, in all rows."""
         rows = np.arange(self.num_envs)
         seeds: Any

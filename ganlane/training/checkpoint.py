@@ -136,7 +136,11 @@ class TrainingState:
             return "the replay buffer: it is filled again before the next update"
         return None
 
-    def _take_over(self, state: Mapping[str, Any], path: str | Path) -> None:
+    def _take_over(
+        self,
+        state: Mapping[str, Any],
+        path: str | Path,
+    ) -> None:
         """Restore everything from ``state``; see :meth:`restore`."""
         # by dotted name, as on the command line
         before = flat(state["identity"])
@@ -206,7 +210,11 @@ class Checkpointer:
         # a slow disk must not slow down the training
         self.pause_s = max(self.every_s, PATIENCE * (self.saved_s - begun))
 
-    def save_weights(self, name: str, figures: Mapping[str, Any]) -> None:
+    def save_weights(
+        self,
+        name: str,
+        figures: Mapping[str, Any],
+    ) -> None:
         """Write the online network as ``NAME.safetensors``, with ``figures`` in its metadata."""
         training = {
             **self.metadata.get("training", {}),

@@ -78,7 +78,11 @@ def phases_of(config: TrainConfig, folder: Path) -> list[Phase]:
     if before.total_decisions == 0 or before.traffic is None:
         return [Phase("train", folder, config, start)]
     # the second phase starts from the agent that the first one leaves
-    first = replace(config, traffic=before.traffic, total_decisions=before.total_decisions)
+    first = replace(
+        config,
+        traffic=before.traffic,
+        total_decisions=before.total_decisions,
+    )
     place = folder / "pretrain"
     return [
         Phase("pretrain", place, first, start),
@@ -165,7 +169,13 @@ def make_selection(config: TrainConfig) -> Evaluate:
     episodes = range(config.selection_episodes)
 
     def evaluate(policy: GreedyPolicy) -> dict[str, float]:
-        table = run_episodes(env, policy, episodes, config.seed, make_smaller=make)
+        table = run_episodes(
+            env,
+            policy,
+            episodes,
+            config.seed,
+            make_smaller=make,
+        )
         total = table.select(
             "reward",
             "lane_changes",
@@ -209,7 +219,12 @@ def read_start(name: str) -> Start:
     if path.is_dir() and name not in SHIPPED:
         name = str(path / AGENT_FILE)
     weights, network, metadata = read_agent(name)
-    return Start(name, weights, network, observation_of(metadata))
+    return Start(
+        name,
+        weights,
+        network,
+        observation_of(metadata),
+    )
 
 
 def make_agent(phase: Phase) -> Rainbow:
@@ -244,7 +259,12 @@ def make_initial_agent(phase: Phase, resumes: bool) -> Rainbow:
     if phase.start is not None and not resumes:
         start = read_start(phase.start)
         check_observation(start, phase.config.observation)
-        warm_start(agent, start.name, start.weights, start.network)
+        warm_start(
+            agent,
+            start.name,
+            start.weights,
+            start.network,
+        )
     return agent
 
 
@@ -284,7 +304,11 @@ def save_final_agent(
         episodes = phase.config.selection_episodes
         further = {"selected": {**figures, "episodes": episodes, "stream": "select"}}
     training |= result.progress
-    save_agent(phase.folder / AGENT_FILE, agent, {**metadata, "training": training, **further})
+    save_agent(
+        phase.folder / AGENT_FILE,
+        agent,
+        {**metadata, "training": training, **further},
+    )
 
 
 # --- metadata

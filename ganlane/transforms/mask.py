@@ -58,7 +58,11 @@ def braking_demand(
 def allowed_speeds(state: TensorDictBase, actions: ActionParameters) -> Tensor:
     """Whether ``faster`` and ``slower`` have an effect in ``state``, bool [N, 2]."""
     desired = state.get(keys.VEHICLES).get("desired_speed")[:, keys.EGO_INDEX]
-    return speed_changes(state.get(keys.EGO).get(keys.SET_SPEED), desired, actions)
+    return speed_changes(
+        state.get(keys.EGO).get(keys.SET_SPEED),
+        desired,
+        actions,
+    )
 
 
 class ActionMaskTransform(PerceptionTransform):
@@ -162,7 +166,11 @@ class ActionMaskTransform(PerceptionTransform):
         if self.native is not None:
             mask, none = self.native.allowed(seen, direction)
         else:
-            mask, none = self.allowed(seen, direction, road_in(state, self.road))
+            mask, none = self.allowed(
+                seen,
+                direction,
+                road_in(state, self.road),
+            )
         if self.actions.form == LANE_SPEED:
             mask = torch.cat((mask, allowed_speeds(state, self.actions)), dim=1)
         state.set(keys.ACTION_MASK, mask)

@@ -160,7 +160,11 @@ def lane_view(
     in_sight = (others.valid & (others.position.abs() < 1.0))[:, None, :]
     on_that_end = (distance > 0) | ((distance == 0) & (ahead < 0))
     lanes_apart = torch.round(others.lane * _widest(view.road.lanes))[:, None, :]
-    distance = torch.add(distance, ~(in_sight & on_that_end & (lanes_apart == side)), alpha=_MASKED)
+    distance = torch.add(
+        distance,
+        ~(in_sight & on_that_end & (lanes_apart == side)),
+        alpha=_MASKED,
+    )
     nearest = distance.amin(-1, keepdim=True)
     # Several vehicles can be equally near: the minimum over all of them is taken below.
     farther = distance > nearest
@@ -274,7 +278,11 @@ def control_numbers(
     return torch.cat((offset, ego.heading / HEADING_RAD), dim=1).clamp(-1.0, 1.0)
 
 
-def observation_size(name: str, vehicles: int, actions: ActionParameters | None = None) -> int:
+def observation_size(
+    name: str,
+    vehicles: int,
+    actions: ActionParameters | None = None,
+) -> int:
     """Length D of observation ``name`` for ``vehicles`` vehicles, the ego included."""
     parts = sum(part.size(vehicles - 1) for part in OBSERVATIONS[name])
     return parts + (0 if actions is None else CONTROL_NUMBERS[actions.form])
@@ -384,7 +392,11 @@ class ObservationTransform(PerceptionTransform):
             )
         if CONTROL_NUMBERS[self.actions.form]:
             set_speed = ego.get(keys.SET_SPEED) if self.actions.form == LANE_SPEED else None
-            further = control_numbers(vehicles, set_speed, road_in(state, self.road))
+            further = control_numbers(
+                vehicles,
+                set_speed,
+                road_in(state, self.road),
+            )
             observation = torch.cat((observation, further), dim=1)
         return state.set(keys.OBSERVATION, observation)
 

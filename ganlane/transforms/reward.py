@@ -29,7 +29,11 @@ def speed_reward(
     reward = (speed - p.base_speed_mps) / (desired_speed - p.base_speed_mps)
     # The paper negates the reward, which below the base speed would pay for hard braking.
     punished = -reward if p.literal_low_acceleration else -reward.abs()
-    return torch.where(mean_acceleration < p.low_acceleration, punished, reward)
+    return torch.where(
+        mean_acceleration < p.low_acceleration,
+        punished,
+        reward,
+    )
 
 
 class RewardTransform(Transform):
@@ -90,7 +94,11 @@ class RewardTransform(Transform):
         assert isinstance(observation_spec, Composite)
         shape = observation_spec.shape
         true = observation_spec[keys.VEHICLES, "x"]
-        term = Unbounded(shape=(*shape, 1), dtype=true.dtype, device=true.device)
+        term = Unbounded(
+            shape=(*shape, 1),
+            dtype=true.dtype,
+            device=true.device,
+        )
         terms = dict.fromkeys(self.parameters.term_names, term)
         observation_spec[keys.REWARD_TERMS] = Composite(terms, shape=shape).to(true.device)
         return observation_spec

@@ -66,7 +66,11 @@ def measure(
         drawn = uniform(key, step, count, [Purpose.SENSED_DROPOUT], dtype)[..., 0]
         valid = valid & ~((drawn < parameters.dropout) & other)
     values["valid"] = valid
-    return TensorDict._new_unsafe(values, batch_size=shape[:1], device=valid.device)
+    return TensorDict._new_unsafe(
+        values,
+        batch_size=shape[:1],
+        device=valid.device,
+    )
 
 
 class PerceptionTransform(Transform):
@@ -134,7 +138,11 @@ class SensorTransform(Transform):
         """The measurement of the true state in ``state``."""
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         # The traffic's key: purposes of their own keep the numbers apart.
-        key = episode_key(self.stream, state.get(keys.SEED), state.get(keys.EPISODE))
+        key = episode_key(
+            self.stream,
+            state.get(keys.SEED),
+            state.get(keys.EPISODE),
+        )
         return measure(
             vehicles,
             key,
@@ -142,7 +150,11 @@ class SensorTransform(Transform):
             self.parameters,
         )
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+    def _step(
+        self,
+        tensordict: TensorDictBase,
+        next_tensordict: TensorDictBase,
+    ) -> TensorDictBase:
         # One measurement in per decision, one out: the queue keeps its length.
         newest = self._measured(next_tensordict)
         if self.delay == 0:

@@ -113,7 +113,11 @@ def test_a_network_that_is_not_understood_is_refused(damage, saved):
         ),
     ],
 )
-def test_another_network_or_support_is_refused_naming_the_ways_out(options, message, saved):
+def test_another_network_or_support_is_refused_naming_the_ways_out(
+    options,
+    message,
+    saved,
+):
     with pytest.raises(UserError, match=message):
         start_from(agent(**options), saved)
 
@@ -163,6 +167,11 @@ def test_weights_that_are_no_agents_are_refused(name, saved):
     kind, description = NO_AGENTS[name]
     described = load_weights(saved, "agent")[1]
     del described["kind"]
-    save_weights(saved, kind, {"weight": torch.zeros(3)}, description(described))
+    save_weights(
+        saved,
+        kind,
+        {"weight": torch.zeros(3)},
+        description(described),
+    )
     with pytest.raises(UserError, match=saved.name):
         load_agent(saved)

@@ -37,7 +37,11 @@ def test_a_signal_while_the_configuration_is_composed_is_no_error(
         raise stop
 
     monkeypatch.setattr("ganlane.config.run.composed", interrupted)
-    assert main(["train", "traffic=idm"]) == 128 + getattr(stop, "number", signal.SIGINT)
+    assert main(["train", "traffic=idm"]) == 128 + getattr(
+        stop,
+        "number",
+        signal.SIGINT,
+    )
     assert capsys.readouterr().err in ("", "ganlane train: stopped by Ctrl-C.\n")
     assert list(empty_folder.iterdir()) == []
 
@@ -90,7 +94,11 @@ def test_a_command_that_there_is_not(capsys):
 
 
 @pytest.mark.parametrize("line", ["\x1b[31mfly", "evaluate agents=[mobil,'\x1b[31mred']"])
-def test_an_escape_sequence_reaches_no_terminal(line, empty_folder, capsys):
+def test_an_escape_sequence_reaches_no_terminal(
+    line,
+    empty_folder,
+    capsys,
+):
     assert main(line.split()) == 2
     told = capsys.readouterr().err
     assert r"\x1b[31m" in told
@@ -134,19 +142,32 @@ def refused(capsys, task, *arguments):
         (errno.EROFS, "Read-only file system; check the path"),
     ],
 )
-def test_a_refusal_while_a_command_writes(number, told, empty_folder, capsys):
+def test_a_refusal_while_a_command_writes(
+    number,
+    told,
+    empty_folder,
+    capsys,
+):
     def task(config, folder):
         write_bytes(folder / "first.txt", b"whole")
         with (folder / "second.txt").open("w") as file:
             file.write("half")
-            raise OSError(number, os.strerror(number), str(folder / "second.txt"))
+            raise OSError(
+                number,
+                os.strerror(number),
+                str(folder / "second.txt"),
+            )
 
     err = refused(capsys, task)
     assert f"second.txt: {told}" in err
 
 
 @pytest.mark.parametrize("kind", [OSError, RuntimeError])
-def test_a_library_that_gives_the_number_in_its_text_alone(kind, empty_folder, capsys):
+def test_a_library_that_gives_the_number_in_its_text_alone(
+    kind,
+    empty_folder,
+    capsys,
+):
     """So does polars."""
 
     def task(config, folder):
@@ -172,7 +193,11 @@ def test_what_was_earned_before_the_disk_was_full_stays(empty_folder, capsys):
 
 def test_a_run_folder_below_a_file(empty_folder, capsys):
     (empty_folder / "file").write_text("no folder")
-    err = refused(capsys, lambda config, folder: None, "hydra.run.dir=file/run")
+    err = refused(
+        capsys,
+        lambda config, folder: None,
+        "hydra.run.dir=file/run",
+    )
     assert "file/run: Not a directory; check the path" in err
 
 
@@ -217,7 +242,11 @@ def test_what_no_user_can_mend_keeps_its_traceback(empty_folder):
         ),
     ],
 )
-def test_a_word_sets_what_it_says(line, key, value):
+def test_a_word_sets_what_it_says(
+    line,
+    key,
+    value,
+):
     command, *words = line.split()
     found_value = settings(command, words)
     for name in key.split("."):

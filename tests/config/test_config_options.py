@@ -142,7 +142,11 @@ def test_a_training_is_told_whether_to_compile(value):
 
 
 @pytest.mark.parametrize(("version", "compiles"), [("2.11.0+cu130", False), ("2.13.0+cpu", True)])
-def test_a_long_training_is_compiled_where_that_is_known_to_work(version, compiles, monkeypatch):
+def test_a_long_training_is_compiled_where_that_is_known_to_work(
+    version,
+    compiles,
+    monkeypatch,
+):
     monkeypatch.setattr("torch.__version__", version)
     monkeypatch.setattr("ganlane.torch_settings.has_compiler", lambda: True)
     assert config_of("train", "total_decisions=1000000").compiles() is compiles

@@ -72,7 +72,11 @@ SUMS = {
 }
 
 
-def alone(make, policy, episodes):
+def alone(
+    make,
+    policy,
+    episodes,
+):
     """Each episode, driven with nothing beside it and counted by hand."""
     env, rows = make(1), []
     for episode in episodes:
@@ -239,7 +243,11 @@ def test_no_episodes_and_an_environment_that_ignores_those_it_is_given_are_refus
 
 def test_an_episode_comes_back_from_its_actions():
     config = EnvConfig(goal_m=90.0)
-    env = make_env(make_traffic(IdmMobilTrafficConfig(), config), config, num_envs=2)
+    env = make_env(
+        make_traffic(IdmMobilTrafficConfig(), config),
+        config,
+        num_envs=2,
+    )
     policy = make_driver("random_legal", config).policy
     table = run_episodes(
         env,

@@ -95,7 +95,13 @@ def paper(frame, folder):
 @pytest.fixture(scope="module")
 def calibrated(frame, folder):
     """The same of the other preset."""
-    return cross_validate(CALIBRATED, frame, 3, folder, source="folder/made.csv")
+    return cross_validate(
+        CALIBRATED,
+        frame,
+        3,
+        folder,
+        source="folder/made.csv",
+    )
 
 
 def test_every_scene_is_forecast_once_by_a_generator_that_never_saw_it(
@@ -123,7 +129,11 @@ def test_every_scene_is_forecast_once_by_a_generator_that_never_saw_it(
     assert "best_of_20" in fold_tables(scores)
 
 
-def test_what_is_fitted_is_not_fitted_again_and_gives_the_same(frame, folder, paper):
+def test_what_is_fitted_is_not_fitted_again_and_gives_the_same(
+    frame,
+    folder,
+    paper,
+):
     updates = []
     scores, fits = cross_validate(PAPER, frame, 3, folder, updates.append)
     assert scores == paper[0]
@@ -154,7 +164,12 @@ def test_the_calibrated_preset_is_also_rolled_out_for_five_seconds(
 
 
 @pytest.mark.parametrize("preset", ["paper", "calibrated"])
-def test_the_folds_generators_name_the_scenes_they_were_fitted_to(preset, frame, request, tmp_path):
+def test_the_folds_generators_name_the_scenes_they_were_fitted_to(
+    preset,
+    frame,
+    request,
+    tmp_path,
+):
     scores, fits = request.getfixturevalue(preset)
     kilometres = measure_exposure(frame).vehicle_km
     for fit, split in zip(fits, scores["splits"], strict=True):

@@ -95,16 +95,31 @@ def kernel_of(env: HighwayEnv) -> Kernel:
     """The kernel for the environment's road, rules and traffic."""
     mobil = env.traffic.mobil if isinstance(env.traffic, IdmMobilTraffic) else None
     drivers = RuleDrivers(mobil=mobil)
-    return Kernel(env.road, env.vehicles, env.episode, env.ego, drivers, actions=env.actions)
+    return Kernel(
+        env.road,
+        env.vehicles,
+        env.episode,
+        env.ego,
+        drivers,
+        actions=env.actions,
+    )
 
 
-def by_kernel(kernel: Kernel, td: TensorDictBase, recycle: bool = False) -> TensorDictBase:
+def by_kernel(
+    kernel: Kernel,
+    td: TensorDictBase,
+    recycle: bool = False,
+) -> TensorDictBase:
     """The decision ``td["action"]`` from the state ``td``."""
     recycles = torch.ones(len(td), dtype=torch.bool) if recycle else None
     return kernel.decide(td["action"], td, recycles)
 
 
-def actions(env: HighwayEnv, generator: torch.Generator, change: float = 0.2) -> torch.Tensor:
+def actions(
+    env: HighwayEnv,
+    generator: torch.Generator,
+    change: float = 0.2,
+) -> torch.Tensor:
     """Random actions [N], mostly to keep the lane."""
     if env.actions.form == "continuous":
         between = drawing(env.batch_size, generator, env.dtype)
@@ -114,7 +129,13 @@ def actions(env: HighwayEnv, generator: torch.Generator, change: float = 0.2) ->
     if env.actions.form == "lane_speed" and bool(drawn[0] < 0.5):
         return torch.randint(3, 5, env.batch_size, generator=generator)
     return torch.where(
-        drawn < 0.5 * change, keys.LEFT, torch.where(drawn < change, keys.RIGHT, keys.KEEP)
+        drawn < 0.5 * change,
+        keys.LEFT,
+        torch.where(
+            drawn < change,
+            keys.RIGHT,
+            keys.KEEP,
+        ),
     )
 
 
@@ -127,7 +148,11 @@ def differing_rows(out: TensorDictBase, after: TensorDictBase) -> torch.Tensor:
     return differs
 
 
-def errors(out: TensorDictBase, after: TensorDictBase, rows: torch.Tensor) -> dict[str, float]:
+def errors(
+    out: TensorDictBase,
+    after: TensorDictBase,
+    rows: torch.Tensor,
+) -> dict[str, float]:
     """The largest difference of every number in ``rows``, of valid vehicles."""
     counted = {1: rows, 2: after[keys.VEHICLES, "valid"] & rows[:, None]}
     return {
@@ -137,7 +162,11 @@ def errors(out: TensorDictBase, after: TensorDictBase, rows: torch.Tensor) -> di
     }
 
 
-def within_rounding(env: HighwayEnv, td: TensorDictBase, row: int) -> bool:
+def within_rounding(
+    env: HighwayEnv,
+    td: TensorDictBase,
+    row: int,
+) -> bool:
     """Whether the decision of ``row`` hangs by a rounding.
 
     64 states a rounding beside it lead to different ones.
@@ -217,11 +246,27 @@ def size(highways: int, rows: int, decisions: int, vehicles: int, *slow: pytest.
     [size(40, 16, 8, 25), size(800, 128, 10, 60, pytest.mark.slow)],
     ids=["few", "a million"],
 )
-@pytest.mark.parametrize("ends", [False, True], ids=["highway", "lanes that end"])
+@pytest.mark.parametrize(
+    "ends",
+    [False, True],
+    ids=["highway", "lanes that end"],
+)
 @pytest.mark.parametrize("form", ["lane", "lane_speed", "continuous"])
-def test_it_decides_as_the_tensor_code_on_random_highways(size, ends, form):
+def test_it_decides_as_the_tensor_code_on_random_highways(
+    size,
+    ends,
+    form,
+):
     highways, rows, decisions, vehicles = size
-    compare_random_highways(highways, rows, decisions, 3, vehicles, ends, form)
+    compare_random_highways(
+        highways,
+        rows,
+        decisions,
+        3,
+        vehicles,
+        ends,
+        form,
+    )
 
 
 def test_a_ring_is_refused_in_one_sentence():

@@ -65,11 +65,22 @@ def test_there_is_one_update_per_decisions_per_update_whatever_the_batch(environ
 
 
 @pytest.mark.parametrize("decisions", [40, 1200])  # before the buffer is full, and after
-def test_an_interrupted_and_resumed_run_gives_the_same_weights(decisions, whole, tmp_path, capsys):
+def test_an_interrupted_and_resumed_run_gives_the_same_weights(
+    decisions,
+    whole,
+    tmp_path,
+    capsys,
+):
     first = train(road(8), agent(), settings(decisions), tmp_path)
     torch.manual_seed(99)
     resumed = agent(seed=5)
-    result = train(road(8), resumed, settings(1600), tmp_path, resume=first.checkpoint)
+    result = train(
+        road(8),
+        resumed,
+        settings(1600),
+        tmp_path,
+        resume=first.checkpoint,
+    )
     assert same(whole[0], resumed)
     assert "bit-exact" not in capsys.readouterr().err
     assert result.progress["decisions"] == 1600
@@ -85,7 +96,12 @@ def test_an_interrupted_and_resumed_run_gives_the_same_weights(decisions, whole,
 def test_a_light_checkpoint_refills_the_buffer_before_its_first_update_and_says_so(
     tmp_path, capsys
 ):
-    first = train(road(8), agent(), settings(800, checkpoint_replay=False), tmp_path)
+    first = train(
+        road(8),
+        agent(),
+        settings(800, checkpoint_replay=False),
+        tmp_path,
+    )
     resumed = agent()
     light = settings(856, progress=True)
     result = train(road(8), resumed, light, tmp_path, resume=first.checkpoint)
@@ -115,7 +131,13 @@ def test_a_signal_ends_the_run_after_its_step_with_a_checkpoint(whole, tmp_path)
     assert stopped.progress["decisions"] == 160
     assert signal.getsignal(number) == handler
     resumed = agent()
-    train(road(8), resumed, settings(1600), tmp_path, resume=stopped.checkpoint)
+    train(
+        road(8),
+        resumed,
+        settings(1600),
+        tmp_path,
+        resume=stopped.checkpoint,
+    )
     assert same(whole[0], resumed)
 
 

@@ -86,7 +86,12 @@ def last(trained):
 
 
 @pytest.mark.parametrize("place", ["", AGENT_FILE])
-def test_a_run_starts_from_a_folder_or_an_agents_file(place, trained, last, tmp_path):
+def test_a_run_starts_from_a_folder_or_an_agents_file(
+    place,
+    trained,
+    last,
+    tmp_path,
+):
     """This run chose among no agents: the one it left is the last one."""
     agent = start(tmp_path, trained / place)
     assert equal(agent.weights(), last["network"])
@@ -101,7 +106,12 @@ def test_a_run_whose_rate_has_fallen_is_prolonged_at_its_end(tmp_path):
     told = r"agent\.learning_rate_decisions=320: the saved agent has 160"
     with pytest.raises(UserError, match=told):
         run(folder, *more, resume=folder / LAST)
-    run(folder, *more, "agent.learning_rate_decisions=160", resume=folder / LAST)
+    run(
+        folder,
+        *more,
+        "agent.learning_rate_decisions=160",
+        resume=folder / LAST,
+    )
     state = load_checkpoint(folder / LAST)
     assert state["counters"]["decisions"] == 320
     assert state["agent"]["optimizer"]["param_groups"][0]["lr"] == 1e-5
@@ -115,7 +125,11 @@ OTHER_SUPPORT = [
 
 
 @pytest.mark.parametrize("place", ["", AGENT_FILE])
-def test_another_support_is_refused_with_the_options_to_set(place, trained, tmp_path):
+def test_another_support_is_refused_with_the_options_to_set(
+    place,
+    trained,
+    tmp_path,
+):
     told = r"set agent\.atoms=101 agent\.v_min=-120"
     with pytest.raises(UserError, match=told):
         start(tmp_path, trained / place, *OTHER_SUPPORT)

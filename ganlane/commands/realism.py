@@ -39,11 +39,8 @@ from ganlane.realism.measures import (
 )
 from ganlane.realism.sheets import card_text, draw
 from ganlane.realism.starts import (
-    Fold,
     Starts,
-    check_folds_cover,
     drive_all,
-    fold_weights,
     print_progress,
     recorded_starts,
     spawned_starts,
@@ -132,31 +129,9 @@ def scenes_path(config: RealismConfig) -> Path | None:
         return None
 
 
-def traffic_factories(
-    config: RealismConfig,
-    weights: Mapping[str, Path] | None = None,
-) -> dict[str, Factory]:
-    """Factories by name: the card's traffic first, then its rivals.
-
-    ``weights`` of a fold, by preset, replace those that generated traffics name themselves;
-    :class:`UserError` where there are none of a preset.
-    """
-    # The card's own traffic first.
-    traffics = {
-        config.traffic.label(): config.traffic,
-        **config.rivals(),
-    }
-    for name, preset in PRESETS.items():
-        if weights is None or name not in traffics:
-            continue
-        path = weights.get(preset)
-        if path is None:
-            raise UserError(
-                f"fold_weights: traffic {name} needs the preset {preset}, and a fold has no such "
-                "file; give one for every fold."
-            )
-        # A fold's weights take the place of those that ship.
-        traffics[name] = replace(traffics[name], path=str(path))  # type: ignore[call-arg]
+def traffic_factories(config: RealismConfig) -> dict[str, Factory]:
+    """Factories by name: the card's traffic first, then its rivals."""
+    traffics = {config.traffic.label(): config.traffic, **config.rivals()}
     return {name: partial(_make, traffic, config.env) for name, traffic in traffics.items()}
 
 
@@ -177,20 +152,10 @@ def _make(
     return make_traffic(traffic, env, Stream.REPORT)
 
 
-def folds_of(config: RealismConfig, scenes: Sequence[str]) -> list[Fold]:
-    """The scenes that traffics start from: the held-out ones, all, or all by folds."""
-    if config.fold_weights:
-        # Every scene is driven by weights that never saw it.
-        folds = fold_weights([Path(path) for path in config.fold_weights])
-        check_folds_cover(list(folds), scenes)
-        return [
-            Fold(
-                traffic_factories(config, weights),
-                held_out,
-                held_out,
-            )
-            for held_out, weights in folds.items()
-        ]
+def starts_and_held_out(
+    config: RealismConfig, scenes: Sequence[str]
+) -> tuple[Sequence[str], Sequence[str]]:
+    """The scenes that traffics start from, and those that nothing was fitted to."""
     # Nothing is held out of recordings that nothing is fitted to.
     held_out: Sequence[str] = ()
     if config.scenes != "all" or _fits(config, scenes):
@@ -202,7 +167,7 @@ def folds_of(config: RealismConfig, scenes: Sequence[str]) -> list[Fold]:
             f"recordings of one scene, {', '.join(scenes)}: none is held out to start from; give "
             "scenes=all, or cut it into several with ganlane prepare ... scene_s=30."
         )
-    return [Fold(traffic_factories(config), starts, held_out)]
+    return starts, held_out
 
 
 def _fits(config: RealismConfig, scenes: Sequence[str]) -> bool:
@@ -247,7 +212,7 @@ def drive_from_starts(
         )
     # Recorded starts: every vehicle begins where and as fast as it was recorded.
     frame = read_scenes(path)
-    folds = folds_of(config, sorted(frame["scene"].unique().to_list()))
+    chosen = starts_and_held_out(config, sorted(frame["scene"].unique().to_list()))
     # Desired speeds are fitted unless the user gives them.
     options = StartOptions(repeats=config.repeats, seed=config.seed)
     if config.desired_above_mps is not None:
@@ -256,7 +221,8 @@ def drive_from_starts(
             desired_above_mps=config.desired_above_mps,
         )
     return recorded_starts(
-        folds,
+        factories,
+        *chosen,
         frame,
         options,
         config.desired_above_mps is None,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
@@ -28,9 +27,6 @@ from ganlane.generator.human_estimator import HumanModel
 from ganlane.settings.generator import HumanConfig
 from ganlane.settings.recordings import TrainGeneratorConfig
 from ganlane.torch_settings import set_threads
-
-# Average and final displacement error, and the error at the window's end, m.
-_ERRORS = ("ade_m", "fde_m", "end_m")
 
 #: Headings and rows of a table.
 Lines = list[list[str]]
@@ -65,19 +61,9 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     # What takes long is shown as soon as it is there; the last fit is the one that is saved.
     with FitProgress() as progress:
         if config.folds:
-            further["folds"], results = generator.cross_validate(
-                fit_config,
-                frame,
-                config.folds,
-                states,
-                progress,
-                str(source),
-                following,
+            further["folds"] = generator.cross_validate(
+                fit_config, frame, config.folds, states, progress, following
             )
-            # A realism card by folds drives every scene by the generator that never saw it.
-            for number, fold in enumerate(results, start=1):
-                path = weights.with_stem(f"{weights.stem}_fold_{number}")
-                fold.save(path, code=code_version())
             show(
                 fold_tables(further["folds"]),
                 columns=config.columns,
@@ -93,7 +79,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
             following,
         )
 
-    show(metrics_table(result.metrics), columns=config.columns)
+    show(aligned(errors_table(result.metrics["all"], "held out")), columns=config.columns)
     if isinstance(result.module, HumanModel) and sites and not fit_config.following:
         further["sites"] = generator.site_scores(result.module, sites)
         show(aligned(site_table(further["sites"])), columns=config.columns)
@@ -122,91 +108,42 @@ def site_table(scores: Mapping[str, Mapping[str, float]]) -> Lines:
 
 
 class FitProgress(AbstractContextManager["FitProgress"]):
-    """Shows fits, one after the other: a bar on a terminal, else a line per improvement.
-
-    A context that closes the last bar.
-    """
+    """Shows fits, a bar for one after the other. A context that closes the last bar."""
 
     def __init__(self) -> None:
-        self._name = ""
         self._bar: tqdm | None = None
-        self._best = math.inf
+        # Log files get a line every ten seconds at most.
+        self._every_s = 0.1 if sys.stderr.isatty() else 10.0
 
     def __call__(self, progress: Progress) -> None:
         """Called by the fit after every update."""
-        if progress.name != self._name:
-            self._start(progress)
-        update = progress.update
-        updates = progress.updates
-        scores = ""
-        if progress.score is not None:
-            scores = f"validation score {progress.score:.4f}, best {progress.best:.4f}"
-        if self._bar is not None:
-            self._bar.update(update - self._bar.n)
-            self._bar.set_postfix_str(scores, refresh=False)
-        # On no terminal a line per improvement is enough; logs would grow without end.
-        elif progress.best < self._best or update == updates:
-            self._best = progress.best
-            # Early stopping may end the fit sooner.
-            left_s = progress.seconds / update * (updates - update)
-            parts = [
-                f"{update} of {updates} updates",
-                f"at most {left_s:.0f} s left",
-                scores,
-            ]
-            print(
-                ", ".join(filter(None, parts)),
-                file=sys.stderr,
-                flush=True,
-            )
-
-    def _start(self, progress: Progress) -> None:
-        """The first update of another fit."""
-        # Closes the bar of the fit before, if there was one.
-        self.__exit__()
-        self._name = progress.name
-        self._best = math.inf
-        if sys.stderr.isatty():
+        if self._bar is None or self._bar.desc != progress.name:
+            self.__exit__()
             self._bar = tqdm(
                 total=progress.updates,
                 desc=progress.name,
                 unit="update",
+                file=sys.stderr,
+                mininterval=self._every_s,
             )
-        else:
-            print(progress.name, file=sys.stderr, flush=True)
+        if progress.score is not None:
+            scores = f"validation score {progress.score:.4f}, best {progress.best:.4f}"
+            self._bar.set_postfix_str(scores, refresh=False)
+        self._bar.update(progress.update - self._bar.n)
 
     def __exit__(self, *error: object) -> None:
         if self._bar is not None:
             self._bar.close()
 
 
-def _by_kind(measured: Mapping[str, float]) -> dict[str, Any]:
-    """``{"ade_m/mean": x, "windows": n}`` as ``{"ade_m": {"mean": x}, "windows": n}``."""
-    nested: dict[str, Any] = {}
-    for name, value in measured.items():
-        error, _, kind = name.partition("/")
-        if kind:
-            nested.setdefault(error, {})[kind] = value
-        else:
-            nested[name] = value
-    return nested
-
-
 def results_of(result: FitResult) -> dict[str, Any]:
     """The numbers of ``results.json``: errors over all held-out scenes, and per scene."""
-    # A copy: parts are taken out below, and the result keeps its own.
-    metrics = dict(result.metrics)
-    overall = _by_kind(metrics.pop("all"))
-    # Held-out scenes without windows have no errors.
-    scenes = {
-        name: _by_kind(metrics.pop(name)) for name in result.data["held_out"] if name in metrics
-    }
+    scenes = dict(result.metrics)
+    overall = scenes.pop("all")
     return {
         "preset": result.config.preset,
         **overall,
         "scenes": scenes,
-        # What is no scene: the discriminator of the paper's preset.
-        **metrics,
         "data": result.data,
         "statistics": result.statistics,
         "updates": result.updates,
@@ -218,41 +155,20 @@ def _percent(change: float) -> str:
     return f"{change:+.1f} %"
 
 
-def metrics_table(
-    metrics: Mapping[str, Mapping[str, float]],
-) -> str:
-    """ADE and FDE of the generator and of constant velocity on the held-out scenes, as text."""
-    overall = _by_kind(metrics["all"])
-    errors = [error for error in _ERRORS if error in overall]
-    lines = [
-        [
-            "held-out scenes",
-            *(error.replace("_m", ", m") for error in errors),
-            "ADE to CV",
-        ]
-    ]
-    for kind, ade in overall["ade_m"].items():
-        cells = [f"{overall[error].get(kind, math.nan):.3f}" for error in errors]
-        # ADE relative to constant velocity, the baseline that any model has to beat.
-        change = 100.0 * (ade / overall["ade_m"][BASELINE] - 1.0)
-        lines.append([kind, *cells, _percent(change)])
-    return aligned(lines)
-
-
 def fold_tables(folds: Mapping[str, Any]) -> str:
     """What :func:`ganlane.generator.cross_validate` scored, but for single scenes, as text."""
     scores = folds["open_loop"]
-    tables = [_pooled(scores), _parts("by fold", scores["folds"])]
+    tables = [errors_table(scores, "of all folds"), _parts("by fold", scores["folds"])]
     if "rollout" in folds:
         tables.append(_rollout(folds["rollout"]))
     return "\n\n".join(map(aligned, tables))
 
 
-def _pooled(scores: Mapping[str, Any]) -> Lines:
-    """ADE and FDE of all forecasts over the windows of all folds."""
+def errors_table(scores: Mapping[str, Any], which: str) -> Lines:
+    """ADE and FDE of all forecasts over the windows ``which``; the ADE to constant velocity's."""
     lines = [
         [
-            f"{scores['windows']} windows of all folds",
+            f"{scores['windows']} windows {which}",
             "ADE, m",
             "FDE, m",
             "ADE to CV",

@@ -28,8 +28,6 @@ from ganlane.settings.generator import (
 from ganlane.weights import load_weights, save_weights
 
 Network = TypeVar("Network", bound=nn.Module)
-#: ``{"all" or scene: {"ERROR/KIND": value}}``.
-Metrics = dict[str, dict[str, float]]
 
 
 @dataclass(frozen=True)
@@ -38,19 +36,17 @@ class FitResult:
 
     Attributes:
         config: settings of the fit, with its preset.
-        metrics: on the held-out scenes, for ``"all"`` and each scene; the paper's preset also has
-            ``"discriminator": {"held_out_accuracy"}``. Empty for a fold's fit: folds are scored
-            together.
+        metrics: errors on the held-out scenes, ``"all"`` and by scene
+            (:func:`ganlane.generator.forecasts.displacement_errors`).
         data: file, rows and tracks, and the names of the fitted, validation and held-out scenes.
-        statistics: ``DrivingStatistics.to_dict()`` of all recordings; for a fold's fit of its other
-            scenes.
+        statistics: ``DrivingStatistics.to_dict()`` of all recordings.
         updates: updates after which the weights were taken (early stopping).
         seconds: duration of the fit, with its evaluations on the validation scenes.
     """
 
     config: FitConfig
     module: Generator | HumanModel
-    metrics: Metrics
+    metrics: dict[str, Any]
     data: dict[str, Any]
     statistics: dict[str, Any]
     updates: int

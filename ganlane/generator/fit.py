@@ -21,7 +21,7 @@ from sklearn.model_selection import GroupKFold
 from ganlane.data import TRACK, driving_statistics
 from ganlane.data.dense import Recording, recordings_of
 from ganlane.errors import UserError
-from ganlane.generator.checkpoint import FitResult, Metrics, load_generator
+from ganlane.generator.checkpoint import FitResult, load_generator
 from ganlane.generator.forecasts import (
     BASELINE,
     SAMPLES,
@@ -35,10 +35,11 @@ from ganlane.generator.forecasts import (
 )
 from ganlane.generator.human_estimator import HumanModel
 from ganlane.generator.human_forecasts import human_forecasts
-from ganlane.generator.tasks import STRIDE, CalibratedTask, HumanTask, OnProgress, PaperTask
+from ganlane.generator.tasks import CalibratedTask, HumanTask, OnProgress, PaperTask
 from ganlane.generator.windows import (
     OBSERVED_POSITIONS,
     PREDICTED_STEPS,
+    Windows,
     count_windows,
     cut_windows,
 )
@@ -55,6 +56,8 @@ from ganlane.weights import load_weights, save_weights
 Config = PaperConfig | CalibratedConfig | HumanConfig
 #: Kind of the files of finished fits.
 FIT = "fit"
+#: Frames between the starts of two scored windows, the same for all presets.
+STRIDE = 3
 
 #: Scenes that are held out by default.
 HELD_OUT = ("us101-b", "us101-e", "us101-h", "us101-i")
@@ -175,18 +178,16 @@ def site_scores(
         driven = {recording.name: recording.driven for recording in recordings}
         row = scores[site] = {}
         for steps, stride in SITE_STRIDES.items():
-            windows = cut_windows(recordings, stride, OBSERVED_POSITIONS + steps)
             forecasts = {
-                BASELINE: repeated(windows.past[:, -1], steps),
                 "human": human_forecasts(model, recordings, steps, stride, samples=1)["mean"],
                 "gan_calibrated": calibrated_forecasts(
                     calibrated, recordings, steps, stride, settings, samples=1
                 )["mean"],
-                "idm_own_headway": idm_forecast(recordings, steps, stride),
             }
+            windows, distances_of = beside_references(forecasts, recordings, steps, stride)
             follows = [driven[scene][car] for scene, car in zip(windows.scene, windows.vehicle)]
             errors = {}
-            for name, distances in errors_of(forecasts, windows.future).items():
+            for name, distances in distances_of.items():
                 followers = distances[follows]
                 if steps == PREDICTED_STEPS:
                     errors[name] = float(followers.mean())
@@ -286,27 +287,8 @@ def fit_generator(
         UserError: unusable recordings or scene names.
     """
     split = split_for_fit(recordings_of(frame), held_out)
-    fitted = run_fit(config, split, folder, on_progress, following=following)
-    return _fit_result(
-        fitted,
-        split,
-        frame,
-        source,
-        fitted.task.metrics(split.held_out),
-        frame,
-    )
-
-
-def _fit_result(
-    fitted: Fitted,
-    split: Split,
-    frame: pl.DataFrame,
-    source: str,
-    metrics: Metrics,
-    driven: pl.DataFrame,
-) -> FitResult:
-    """The result of a fit; its driving statistics are those of ``driven``."""
-    task = fitted.task
+    task, updates, seconds = run_fit(config, split, folder, on_progress, following=following)
+    held = held_out_errors(task, split.held_out, predicted_steps(config), STRIDE)
     data = {
         "file": Path(source).name,
         "rows": frame.height,
@@ -317,12 +299,18 @@ def _fit_result(
         config=task.config,
         # In evaluation mode and without gradients, as load_generator returns it.
         module=task.generator.eval().requires_grad_(False),
-        metrics=metrics,
+        metrics={"all": displacement_errors(held[1]), **errors_by_scene(held)},
         data=data,
-        statistics=driving_statistics(driven).to_dict(),
-        updates=fitted.updates,
-        seconds=fitted.seconds,
+        statistics=driving_statistics(frame).to_dict(),
+        updates=updates,
+        seconds=seconds,
     )
+
+
+def predicted_steps(config: Config) -> int:
+    """Steps of the short forecasts: those that a generator predicts."""
+    sizes = config.sizes
+    return PREDICTED_STEPS if isinstance(sizes, HumanSizes) else sizes.predicted
 
 
 #: Scene of each window [W], and errors [W, T] in m of every forecast.
@@ -331,14 +319,32 @@ HeldOut = tuple[np.ndarray, Forecasts]
 
 def held_out_errors(task: Any, scenes: list[Recording], steps: int, stride: int) -> HeldOut:
     """Errors of forecasts of held-out ``scenes``: by the fit, constant velocity and IDM."""
-    # The same windows for every forecaster, in the same order.
-    windows = cut_windows(scenes, stride, OBSERVED_POSITIONS + steps)
     # The best of 20 is for short forecasts only; the policy draws many in any case.
     few = steps == LONG_STEPS and isinstance(task, CalibratedTask)
     forecasts = task.forecasts(scenes, steps, stride, 1 if few else SAMPLES)
-    forecasts[BASELINE] = repeated(windows.past[:, -1], steps)
-    forecasts["idm_own_headway"] = idm_forecast(scenes, steps, stride)
-    return windows.scene, errors_of(forecasts, windows.future)
+    windows, errors = beside_references(forecasts, scenes, steps, stride)
+    return windows.scene, errors
+
+
+def beside_references(
+    forecasts: Forecasts, scenes: Sequence[Recording], steps: int, stride: int
+) -> tuple[Windows, Forecasts]:
+    """The windows of ``scenes``, and errors of their forecasts, of constant velocity and of IDM.
+
+    The same windows for every forecaster, in the same order.
+    """
+    windows = cut_windows(list(scenes), stride, OBSERVED_POSITIONS + steps)
+    references = {
+        BASELINE: repeated(windows.past[:, -1], steps),
+        "idm_own_headway": idm_forecast(list(scenes), steps, stride),
+    }
+    return windows, errors_of(forecasts | references, windows.future)
+
+
+def errors_by_scene(held: HeldOut) -> dict[str, Any]:
+    """:func:`displacement_errors` of each scene, by its name."""
+    scene, errors = held
+    return {str(name): displacement_errors(errors, scene == name) for name in np.unique(scene)}
 
 
 def pooled(parts: list[HeldOut]) -> HeldOut:
@@ -355,56 +361,45 @@ def cross_validate(
     folds: int,
     folder: Path,
     on_progress: OnProgress = lambda progress: None,
-    source: str = "",
     following: Sequence[Recording] = (),
-) -> tuple[dict[str, Any], list[FitResult]]:
+) -> dict[str, Any]:
     """Fit ``folds`` generators, each without its fold's scenes, and score them on these.
 
     Returns:
-        The scores: ``open_loop`` (:func:`displacement_errors`, of all windows, by fold and by
-        scene), ``splits`` (names of the scenes of each fold's parts), and ``rollout``
-        (:func:`long_errors`) where 5 s were recorded, but not of the paper's preset. Then each
-        fold's generator, with driving statistics of its other scenes only and ``source`` as the
-        recordings' name.
+        ``open_loop`` (:func:`displacement_errors`, of all windows, by fold and by scene),
+        ``splits`` (names of the scenes of each fold's parts), and ``rollout``
+        (:func:`long_errors`) where 5 s were recorded, but not of the paper's preset.
 
     Raises:
         UserError: too many folds for the recordings.
     """
     scenes = recordings_of(frame)
     splits = [split_for_fit(scenes, names) for names in assign_folds(scenes, folds)]
-    results = []
     short = []
     long = []
     for number, split in enumerate(splits, start=1):
         name = f"fold {number} of {folds}"
-        fitted = run_fit(config, split, folder, on_progress, name, following)
-        # A fold's statistics must not know its held-out scenes either.
-        others = frame.filter(~pl.col("scene").is_in(split.names["held_out"]))
-        results.append(_fit_result(fitted, split, frame, source, {}, others))
-        sizes = config.sizes
-        steps = PREDICTED_STEPS if isinstance(sizes, HumanSizes) else sizes.predicted
-        short.append(held_out_errors(fitted.task, split.held_out, steps, STRIDE))
+        task = run_fit(config, split, folder, on_progress, name, following).task
+        short.append(held_out_errors(task, split.held_out, predicted_steps(config), STRIDE))
         # A window of 5 s needs the observed positions before it as well.
         frames = OBSERVED_POSITIONS + LONG_STEPS
         recorded = any((scene.present.sum(0) >= frames).any() for scene in split.held_out)
         if recorded and not isinstance(config, PaperConfig):
-            long.append(held_out_errors(fitted.task, split.held_out, LONG_STEPS, LONG_STRIDE))
+            long.append(held_out_errors(task, split.held_out, LONG_STEPS, LONG_STRIDE))
 
     # All folds are scored together; each window was held out in one of them.
-    scene, errors = pooled(short)
+    held = pooled(short)
     scores: dict[str, Any] = {
         "splits": [split.names for split in splits],
         "open_loop": {
-            **displacement_errors(errors),
+            **displacement_errors(held[1]),
             "folds": {
                 str(number): displacement_errors(part) for number, (_, part) in enumerate(short)
             },
-            "scenes": {
-                str(name): displacement_errors(errors, scene == name) for name in np.unique(scene)
-            },
+            "scenes": errors_by_scene(held),
         },
     }
     if long:
         ratios = [long_errors(part)["ratio_to_constant_velocity"] for _, part in long]
         scores["rollout"] = {**long_errors(pooled(long)[1]), "folds": ratios}
-    return scores, results
+    return scores

@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from ganlane.data.dense import Recording
-from ganlane.generator.checkpoint import Metrics
 from ganlane.generator.closed_loop import (
     displacement_of,
     driven_positions,
@@ -28,7 +27,6 @@ from ganlane.generator.closed_loop import (
 from ganlane.generator.networks import Generator
 from ganlane.generator.windows import (
     OBSERVED_POSITIONS,
-    PREDICTED_STEPS,
     PRESENT,
     Groups,
     Segments,
@@ -65,24 +63,6 @@ def distance(one: Tensor, other: Tensor) -> Tensor:
     """Euclidean distance [...] between positions [..., 2], with a finite gradient at distance 0."""
     apart = one - other
     return torch.sqrt((apart * apart).sum(-1) + _SMALLEST_DISTANCE_M * _SMALLEST_DISTANCE_M)
-
-
-def scene_metrics(windows: Windows, forecasts: Forecasts) -> Metrics:
-    """``{"all" or scene: {"ade_m/KIND", "fde_m/KIND", ..., "windows"}}`` of the forecasts, in m."""
-    errors = errors_of(forecasts, windows.future)
-    everywhere = np.ones(len(windows), dtype=bool)
-    metrics: Metrics = {}
-    for name, rows in {
-        "all": everywhere,
-        **windows.by_scene,
-    }.items():
-        # Flat names, as metadata and tables want them.
-        row = displacement_errors(errors, rows)
-        metrics[name] = {"windows": float(row["windows"])}
-        for error in ("ade_m", "fde_m"):
-            for kind in forecasts:
-                metrics[name][f"{error}/{kind}"] = row[error][kind]
-    return metrics
 
 
 def errors_of(forecasts: Forecasts, recorded: np.ndarray) -> Forecasts:
@@ -276,24 +256,21 @@ def energy_score(
 
 
 @torch.no_grad()
-def rollout_errors(
+def rollout_score(
     generator: Generator,
     scenes: list[Recording],
     config: CalibratedConfig,
-) -> Metrics:
-    """Errors of the calibrated preset's rollouts through scenes, for all and for each scene.
+) -> float:
+    """Score of the calibrated preset's rollouts through scenes; 1 is constant velocity, 0 is best.
 
-    Target lanes and driver parameters are those of the present, so no information of the future is
-    used. Unlike forecasts of windows, these count a vehicle for as long as it is recorded.
-
-    Returns:
-        ``{"all" or scene: {"ade_m/KIND" over 0.8 s, "fde_m/KIND" at 0.8 s, "end_m/KIND" at the last
-        step, "relative_mean", "relative_energy", "end_s", "windows"}}`` with the kinds ``mean``,
-        ``single``, ``constant_velocity`` and ``energy`` (the energy score of two samples).
+    The mean of the error for z = 0 and of the energy score of two samples, both over constant
+    velocity's error at the same step. Target lanes and driver parameters are those of the present,
+    so no information of the future is used. Unlike in forecasts of windows, a vehicle counts for as
+    long as it is recorded.
     """
     random = torch.Generator().manual_seed(0)
     horizon = config.held_out_horizon
-    parts: dict[str, list[tuple[dict[str, Tensor], Tensor]]] = {"all": []}
+    parts: list[tuple[dict[str, Tensor], Tensor]] = []
     for scene in scenes:
         for batch in segment_batches(scene, horizon, config.held_out_stride, _SEGMENTS):
             segments = batch.without_intentions()
@@ -317,38 +294,22 @@ def rollout_errors(
             )
             errors = {
                 "mean": distance(mean, future),
-                "single": distance(one, future),
                 "energy": energy_score(one, other, future),
                 BASELINE: distance(segments.constant_velocity, future),
             }
-            for name in ("all", scene.name):
-                parts.setdefault(name, []).append((errors, segments.scored))
-    return {name: _step_means(errors, horizon) for name, errors in parts.items()}
-
-
-def _step_means(parts: list[tuple[dict[str, Tensor], Tensor]], horizon: int) -> dict[str, float]:
-    """Means over the vehicles that are still recorded at the step in question."""
-    means = {
+            parts.append((errors, segments.scored))
+    by_step = {
         kind: mean_by_step([(errors[kind], scored) for errors, scored in parts])
-        for kind in parts[0][0]
+        for kind in ("mean", "energy", BASELINE)
     }
-    # ADE and FDE are over 0.8 s at most, so that they compare with those of windows.
-    short = min(PREDICTED_STEPS, horizon)
-    windows = float(sum(scored[:, 0].sum() for _, scored in parts))
-    metrics = {"end_s": 0.1 * horizon, "windows": max(1.0, windows)}
-    for kind, errors in means.items():
-        metrics[f"ade_m/{kind}"] = float(errors[:short].mean())
-        metrics[f"fde_m/{kind}"] = float(errors[short - 1])
-        metrics[f"end_m/{kind}"] = float(errors[-1])
-    for kind in ("mean", "energy"):
-        ratio = means[kind] / means[BASELINE].clamp_min(1e-6)
-        metrics[f"relative_{kind}"] = float(ratio.mean())
-    return metrics
+    least = by_step[BASELINE].clamp_min(1e-6)
+    ratios = [float((by_step[kind] / least).mean()) for kind in ("mean", "energy")]
+    return 0.5 * (ratios[0] + ratios[1])
 
 
 def mean_by_step(parts: list[tuple[Tensor, Tensor]]) -> Tensor:
-    # Sums and counts are pooled first, since batches differ in their number of vehicles.
     """Mean [H] of errors [B, H, V] where their mask [B, H, V] is true, over all parts."""
+    # Sums and counts are pooled first, since batches differ in their number of vehicles.
     count = torch.stack([scored.sum((0, 2)) for _, scored in parts]).sum(0).clamp_min(1)
     total = torch.stack([(errors * scored).sum((0, 2)) for errors, scored in parts]).sum(0)
     return total / count

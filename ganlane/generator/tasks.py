@@ -13,7 +13,6 @@ step, by the error of constant velocity.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
@@ -24,10 +23,8 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from ganlane.data.dense import Recording
-from ganlane.generator.checkpoint import Metrics
 from ganlane.generator.closed_loop import driver_params, rollout
 from ganlane.generator.forecasts import (
-    BASELINE,
     SAMPLES,
     Forecasts,
     calibrated_forecasts,
@@ -35,9 +32,7 @@ from ganlane.generator.forecasts import (
     energy_score,
     mean_by_step,
     paper_forecasts,
-    repeated,
-    rollout_errors,
-    scene_metrics,
+    rollout_score,
 )
 from ganlane.generator.human_estimator import HumanModel
 from ganlane.generator.human_fit import fit_human
@@ -48,7 +43,6 @@ from ganlane.generator.networks import (
     displacements_of,
 )
 from ganlane.generator.windows import (
-    PREDICTED_STEPS,
     Groups,
     Segments,
     Windows,
@@ -65,8 +59,6 @@ from ganlane.settings.generator import (
 )
 
 Config = PaperConfig | CalibratedConfig
-#: Frames between the starts of two scored windows, the same for all presets.
-STRIDE = 3
 
 
 def distances(predicted: Tensor, recorded: Tensor) -> Tensor:
@@ -83,11 +75,6 @@ def cross_entropy(logits: Tensor, recorded: float) -> Tensor:
     """
     labels = torch.full_like(logits, recorded)
     return binary_cross_entropy_with_logits(logits, labels, reduction="none").mean()
-
-
-def discriminator_accuracy(recorded: Tensor, generated: Tensor) -> Tensor:
-    """Share of logits with the right sign, both classes with equal weight; 0.5 is chance."""
-    return 0.5 * ((recorded > 0).float().mean() + (generated <= 0).float().mean())
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
@@ -200,27 +187,6 @@ class PaperTask(_Task):
         windows, groups = self._grouped_windows(scenes, stride)
         return paper_forecasts(self.generator, windows, groups, self.config.seed, samples)
 
-    @torch.no_grad()
-    def metrics(self, scenes: list[Recording]) -> Metrics:
-        """ADE and FDE of the generator on ``scenes``, all and each.
-
-        The discriminator's accuracy on them is added.
-        """
-        windows, groups = self._grouped_windows(scenes, self.config.held_out_stride)
-        forecasts = paper_forecasts(
-            self.generator,
-            windows,
-            groups,
-            self.config.seed,
-        )
-        # Constant velocity on the same windows, for comparison.
-        forecasts[BASELINE] = repeated(windows.past[:, -1], self.config.sizes.predicted)
-        recorded = self.discriminator(groups.displacements[groups.mask])
-        random = torch.Generator().manual_seed(self.config.seed)
-        generated = self.discriminator(self._samples(groups, random)[0])
-        accuracy = {"held_out_accuracy": float(discriminator_accuracy(recorded, generated))}
-        return scene_metrics(windows, forecasts) | {"discriminator": accuracy}
-
     def _grouped_windows(self, scenes: list[Recording], stride: int) -> tuple[Windows, Groups]:
         """All windows of ``scenes`` and their k-means groups."""
         sizes = self.config.sizes
@@ -325,22 +291,14 @@ class CalibratedTask(_Task):
         return {name: self.descend("generator", loss)}
 
     def evaluate(self) -> float:
-        """Mean of the error for z = 0 and the energy score on the validation scenes.
-
-        Both are relative to constant velocity's.
-        """
-        metrics = self.metrics(self.validation)["all"]
-        return 0.5 * (metrics["relative_mean"] + metrics["relative_energy"])
+        """The score of rollouts through the validation scenes."""
+        return rollout_score(self.generator, self.validation, self.config)
 
     def forecasts(
         self, scenes: list[Recording], steps: int, stride: int, samples: int = SAMPLES
     ) -> Forecasts:
         """Forecasts of the windows of ``scenes``, by kind."""
         return calibrated_forecasts(self.generator, scenes, steps, stride, self.config, samples)
-
-    def metrics(self, scenes: list[Recording]) -> Metrics:
-        """Errors of the generator on ``scenes``, all and each."""
-        return rollout_errors(self.generator, scenes, self.config)
 
     def _batch(self) -> Segments:
         """Segments with similar numbers of vehicles over a random horizon.
@@ -379,13 +337,12 @@ class HumanTask(nn.Module):
 
     def fit(self, name: str, on_progress: OnProgress) -> int:
         """Fit the policy; the steps that were made."""
-        begun = time.monotonic()
         best = math.inf
 
         def report(done: int, steps: int, cost: float | None) -> None:
             nonlocal best
             best = best if cost is None else min(best, cost)
-            on_progress(Progress(name, done, steps, {}, cost, best, time.monotonic() - begun))
+            on_progress(Progress(name, done, steps, {}, cost, best))
 
         scenes = [standard_width(scene) for scene in self.scenes]
         self.generator = fit_human(self.config, scenes, self.following, report)
@@ -398,20 +355,13 @@ class HumanTask(nn.Module):
         """Forecasts of the windows of ``scenes``, by kind."""
         return human_forecasts(self.generator, scenes, steps, stride, samples)
 
-    def metrics(self, scenes: list[Recording]) -> Metrics:
-        """Errors over 0.8 s of the mean driver, of drawn ones and of constant velocity."""
-        windows = cut_windows(scenes, STRIDE)
-        forecasts = self.forecasts(scenes, PREDICTED_STEPS, STRIDE)
-        forecasts[BASELINE] = repeated(windows.past[:, -1], PREDICTED_STEPS)
-        return scene_metrics(windows, forecasts)
-
 
 @dataclass(frozen=True)
 class Progress:
     """State of the fit ``name`` after ``update`` of at most ``updates``.
 
     ``losses`` are the last update's; ``score`` is the last evaluation's (lower is better), ``best``
-    the lowest; ``seconds`` have passed since the start of this run.
+    the lowest.
     """
 
     name: str
@@ -420,7 +370,6 @@ class Progress:
     losses: dict[str, float]
     score: float | None
     best: float
-    seconds: float
 
 
 OnProgress = Callable[[Progress], None]
@@ -433,7 +382,6 @@ def improve(task: PaperTask | CalibratedTask, name: str, on_progress: OnProgress
         Updates until the best evaluation on the validation scenes.
     """
     config = task.config.loop
-    begun = time.monotonic()
     best, best_update, waited = math.inf, 0, 0
     best_weights: dict[str, Tensor] = {}
     score = None
@@ -448,8 +396,7 @@ def improve(task: PaperTask | CalibratedTask, name: str, on_progress: OnProgress
                 best, best_update, waited = score, done, 0
                 # A copy, since the next updates change the networks' own tensors.
                 best_weights = deepcopy(task.state_dict())
-        seconds = time.monotonic() - begun
-        on_progress(Progress(name, done, config.updates, losses, score, best, seconds))
+        on_progress(Progress(name, done, config.updates, losses, score, best))
         if waited >= config.patience:
             break
     # Empty if no evaluation gave a finite score.

@@ -16,8 +16,7 @@ nothing else. So a traffic with a headway per driver (a memory ``headway`` [N, M
 those that balance the recorded gaps. Traffic with one headway for everybody (IDM, Table V) keeps
 it.
 
-Two drivers mark the ends of the scale (random driving, constant velocity); :class:`HeadwayIdm` is a
-control.
+Two drivers mark the ends of the scale: random driving and constant velocity.
 """
 
 from __future__ import annotations
@@ -33,12 +32,7 @@ from torch.nn.functional import pad
 
 from ganlane import keys
 from ganlane.data.dense import Recording
-from ganlane.generator.closed_loop import (
-    balanced_headway,
-    headway_from_uniform,
-)
-from ganlane.sim.idm import following_acceleration
-from ganlane.sim.neighbours import perceive
+from ganlane.generator.closed_loop import balanced_headway
 from ganlane.sim.random import (
     Purpose,
     absorb,
@@ -397,21 +391,6 @@ def with_recorded_headways(
     return memory.named_apply(shown, nested_keys=True)
 
 
-def _accelerated(
-    vehicles: Vehicles,
-    speed: Tensor,
-    dt: float,
-    **changed: Tensor,
-) -> Vehicles:
-    """The vehicles after a step at constant acceleration to ``speed``, other fields changed."""
-    return vehicles.with_(
-        x=vehicles.x + 0.5 * (vehicles.speed + speed) * dt,
-        speed=speed,
-        acceleration=(speed - vehicles.speed) / dt,
-        **changed,
-    )
-
-
 class ConstantVelocity(TrafficModule):
     """Every vehicle keeps its lane and the speed at which it entered."""
 
@@ -488,54 +467,13 @@ class RandomDriving(TrafficModule):
         stride = self.road.lane_width_m * self.dt / self.change_s
         aside = (remaining / stride).clamp(-1.0, 1.0) * stride
         speed = (v.speed + self.hardest * (2.0 * pace - 1.0) * self.dt).clamp_min(0.0)
-        target = v.target_lane + side
-        return _accelerated(
-            v,
-            speed,
-            self.dt,
+        return v.with_(
+            x=v.x + 0.5 * (v.speed + speed) * self.dt,
             y=v.y + aside,
-            target_lane=target,
+            speed=speed,
+            acceleration=(speed - v.speed) / self.dt,
+            target_lane=v.target_lane + side,
         ), memory
-
-
-class HeadwayIdm(TrafficModule):
-    """IDM without lane changes, each driver with its own headway.
-
-    A control, none of the shipped traffics: generated traffic without its network. Table V gives
-    everybody the same headway. Here they are drawn from the recorded distribution, or taken from a
-    recorded start.
-    """
-
-    memory_fields = {"headway": ((), None)}  # noqa: RUF012
-
-    def fresh_memory(
-        self,
-        vehicles: Vehicles,
-        key: Tensor,
-    ) -> dict[str, Tensor]:
-        """A random headway for each driver."""
-        u = uniform(
-            key,
-            -1,
-            vehicles.x.shape[1],
-            [Purpose.TRAIT_HEADWAY],
-            vehicles.x.dtype,
-        )[..., 0]
-        return {"headway": headway_from_uniform(u)}
-
-    def move(
-        self,
-        vehicles: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
-    ) -> Moved:
-        """One step along the road."""
-        # The nearest vehicle ahead in the lane.
-        perceived = perceive(vehicles, self.road)
-        wanted = following_acceleration(perceived, headway_s=memory["headway"])
-        speed = (vehicles.speed + wanted * self.dt).clamp_min(0.0)
-        return _accelerated(vehicles, speed, self.dt), memory
 
 
 #: Reference drivers at the ends of the scale.

@@ -36,7 +36,7 @@ from ganlane.sim.state import (
     Vehicles,
     lateral_half_extent,
 )
-from ganlane.traffic import Guard, TrafficModule
+from ganlane.traffic import TrafficModule
 
 #: Times at which speeds are summarised, s; and the distance of the goal, m.
 SPEEDS_AT_S = (10.0, 60.0, 150.0, 300.0)
@@ -50,9 +50,6 @@ EDGE_M: Final = 0.01
 #: m.
 STANDING_MPS: Final = 1.0
 FREE_M: Final = 50.0
-#: A guard intervenes where it alters more than this, m/s2 and m.
-ALTERED_ACCELERATION: Final = 0.1
-ALTERED_POSITION_M: Final = 0.02
 
 
 @dataclass(frozen=True)
@@ -144,45 +141,6 @@ class EventCounter:
         return int((now & ~before).sum())
 
 
-class GuardMeter:
-    """Counts the vehicle-steps in which a guard alters acceleration or lateral position."""
-
-    def __init__(self) -> None:
-        self._altered, self._steps = torch.zeros(
-            2,
-            dtype=torch.int64,
-        )
-
-    def watch(self, traffic: TrafficModule) -> None:
-        """Be called by every guard in ``traffic`` from now on."""
-        for part in traffic.modules():
-            if isinstance(part, Guard):
-                part.observer = self
-
-    def __call__(
-        self,
-        before: Vehicles,
-        moved: Vehicles,
-        guarded: Vehicles,
-    ) -> None:
-        """Called by the guard at every step; index 0 is the ego's and does not count."""
-        wanted = (moved.speed - before.speed) / PHYSICS_STEP_S
-        allowed = (guarded.speed - before.speed) / PHYSICS_STEP_S
-        along = (allowed - wanted).abs() > ALTERED_ACCELERATION
-        across = (guarded.y - moved.y).abs() > ALTERED_POSITION_M
-        # Shares are of the vehicles that drive.
-        counts = before.valid.clone()
-        counts[:, 0] = False
-        self._altered = self._altered + ((along | across) & counts).sum()
-        self._steps = self._steps + counts.sum()
-
-    @property
-    def share(self) -> float | None:
-        """Share of the vehicle-steps; None where no guard was at work."""
-        steps = int(self._steps)
-        return int(self._altered) / steps if steps else None
-
-
 def long_run(
     make: Factory,
     road: Road,
@@ -196,8 +154,6 @@ def long_run(
     """
     traffic = make(road)
     events = EventCounter(road)
-    meter = GuardMeter()
-    meter.watch(traffic)
     parts: list[dict[str, Any]] = []
     km = 0.0
     episodes = 0
@@ -238,7 +194,6 @@ def long_run(
             f"{level:g}": float(np.quantile(acceleration, level)) for level in (0.05, 0.95)
         },
         "speeds": speeds,
-        "guard_share": meter.share,
     }
 
 

@@ -14,7 +14,6 @@ from matplotlib.lines import Line2D
 from ganlane.evaluation.table import (
     aligned,
     number,
-    percent,
     with_interval,
 )
 from ganlane.realism.driving import FLOORS
@@ -154,8 +153,6 @@ def _run_cells(run: Mapping[str, Any], traffic: str) -> dict[str, str]:
     # The tails show most: recorded drivers brake and accelerate harder than models.
     for level, value in run["acceleration_quantiles"].items():
         cells[f"acceleration, {100 * float(level):g} % quantile"] = number(value, 2)
-    share = run["guard_share"]
-    cells["the guard's share"] = "none" if share is None else percent(share, 1)
     return cells
 
 

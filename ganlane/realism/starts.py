@@ -1,8 +1,7 @@
 """Every traffic from the same starts: recorded scenes, or spawned ones where there are none.
 
 Recordings do not show how fast drivers would like to go, so the mean desired speed is fitted for
-every traffic. Generators may be split into folds, so that no scene is driven by weights that were
-fitted to it. Without recordings everything is compared with the histograms that ship.
+every traffic. Without recordings everything is compared with the histograms that ship.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,7 +45,6 @@ from ganlane.realism.measures import (
 )
 from ganlane.sim.spawn import SpawnParameters
 from ganlane.sim.state import Road
-from ganlane.weights import load_weights
 
 #: A scene must last longer than the seconds that every measure leaves out, s.
 SHORTEST_S = 4.0
@@ -133,9 +130,8 @@ class Starts:
 
     Attributes:
         scenes: recorded scenes started from; empty where the starts were spawned.
-        held_out: by fold, the scenes that desired speeds were not fitted on.
-        desired_above_mps: by traffic, mean excess of desired speeds; over several folds the mean of
-            what was fitted.
+        held_out: the scenes that desired speeds were not fitted on.
+        desired_above_mps: by traffic, mean excess of desired speeds.
         driven: by name, the card's traffic first, then its rivals, then :data:`FLOORS` (recorded
             starts only).
         recorded: the same scenes (spawned starts: all recordings).
@@ -143,7 +139,7 @@ class Starts:
     """
 
     scenes: list[str]
-    held_out: list[list[str]]
+    held_out: list[str]
     desired_above_mps: Mapping[str, float]
     driven: Mapping[str, Measured]
     recorded: Measured
@@ -157,10 +153,7 @@ class Starts:
     @property
     def separately_held_out(self) -> list[str]:
         """The held-out scenes, if other scenes were driven too; else empty."""
-        # With several folds every scene is held out once.
-        if len(self.held_out) != 1:
-            return []
-        held_out = [name for name in self.scenes if name in self.held_out[0]]
+        held_out = [name for name in self.scenes if name in self.held_out]
         return held_out if len(held_out) < len(self.scenes) else []
 
     def restricted_to(self, scenes: Sequence[str]) -> Starts:
@@ -188,107 +181,48 @@ class Starts:
         }
 
 
-@dataclass(frozen=True)
-class Fold:
-    """Traffics by name, the card's own first and the same in every fold, and where they start.
-
-    ``starts`` are names of scenes. Desired speeds are not fitted on the ``held_out`` scenes.
-    """
-
-    factories: Mapping[str, Factory]
-    starts: Sequence[str]
-    held_out: Sequence[str]
-
-
-def fold_weights(
-    paths: Sequence[Path],
-) -> dict[tuple[str, ...], dict[str, Path]]:
-    """Weights of k folds: by held-out scenes, then by preset (``paper``, ``calibrated``).
-
-    Raises:
-        UserError: a file is not a generator's, names no held-out scenes, or two files are of one
-            fold and preset.
-    """
-    folds: dict[tuple[str, ...], dict[str, Path]] = {}
-    for path in paths:
-        metadata = load_weights(path, "generator")[1]
-        # The scenes without which a generator was fitted name its fold.
-        held_out = tuple(sorted(metadata.get("data", {}).get("held_out", ())))
-        preset = str(metadata.get("preset"))
-        if not held_out or preset in folds.get(held_out, {}):
-            raise UserError(
-                f"fold_weights={path}: expected one generator per preset and fold, each fitted "
-                f"without the scenes of its fold; this one is of the preset {preset}, left out: "
-                f"{', '.join(held_out) or 'none'}."
-            )
-        folds.setdefault(held_out, {})[preset] = path
-    return folds
-
-
-def check_folds_cover(folds: Sequence[Sequence[str]], scenes: Sequence[str]) -> None:
-    """Raise :class:`UserError` unless every scene is in exactly one fold."""
-    held_out = [name for fold in folds for name in fold]
-    # Scenes that no fold names, or that no recording has, are wrong as well.
-    for name in sorted({*held_out, *scenes}):
-        if held_out.count(name) != 1 or name not in scenes:
-            raise UserError(
-                f"fold_weights: the scene {name} is held out {held_out.count(name)} times, "
-                f"expected once for every scene of the recordings ({', '.join(scenes)}); give one "
-                "generator per fold."
-            )
-
-
 def recorded_starts(
-    folds: Sequence[Fold],
+    factories: Mapping[str, Factory],
+    starts: Sequence[str],
+    held_out: Sequence[str],
     frame: pl.DataFrame,
     options: StartOptions,
     fit: bool,
     source: str,
 ) -> Starts:
-    """Drive every traffic from recorded scenes (``frame``, in the schema), but the shortest ones.
+    """Drive every traffic from the recorded scenes ``starts`` of ``frame`` (in the schema).
 
-    ``fit``: every traffic's desired speeds, on a fold's other scenes; else they are those of
-    ``options``.
+    The shortest scenes are left out. ``fit``: every traffic's desired speeds, on the scenes that
+    are not ``held_out``; else they are those of ``options``.
 
     Raises:
-        UserError: a fold names an unknown scene, or no scene is long enough.
+        UserError: an unknown scene is held out, or no scene is long enough.
     """
     widths = scene_lane_widths(frame)
     recordings = recordings_of(frame, widths)
     names = [recording.name for recording in recordings]
     # A mistyped scene would be fitted to in silence.
-    for name in (name for fold in folds for name in fold.held_out):
+    for name in held_out:
         if name not in names:
             raise UserError(
                 f"data.held_out={name}: no such scene in {source}; choose among {', '.join(names)}."
             )
     # Every measure leaves out the first 3 s.
     long = [recording for recording in recordings if len(recording.x) * FRAME_S >= SHORTEST_S]
-    chosen: list[Recording] = []
-    excesses: dict[str, list[float]] = {}
-    frames: dict[str, list[pl.DataFrame]] = {}
-    for fold in folds:
-        scenes = [recording for recording in long if recording.name in fold.starts]
-        if not scenes:
-            continue
-        chosen += scenes
-        # Never on the scenes that are held out, even if they are not driven.
-        others = [recording for recording in long if recording.name not in fold.held_out]
-        for name, make in fold.factories.items():
-            excess = options.desired_above_mps
-            if fit and others:
-                print_progress(f"{name}: fitting desired speeds on {len(others)} scenes")
-                excess = fit_excess(make, others, options)
-            excesses.setdefault(name, []).append(excess)
-        # Those of this fold.
-        fitted = {name: values[-1] for name, values in excesses.items()}
-        for name, driven in drive_all(fold.factories, scenes, options, fitted).items():
-            frames.setdefault(name, []).append(driven)
+    chosen = [recording for recording in long if recording.name in starts]
     if not chosen:
         raise UserError(
             f"{source}: no scene to start from lasts {SHORTEST_S:g} s; give longer ones or "
             "scenes=all."
         )
+    # Never on the scenes that are held out, even if they are not driven.
+    others = [recording for recording in long if recording.name not in held_out]
+    excesses = dict.fromkeys(factories, options.desired_above_mps)
+    if fit and others:
+        for name, make in factories.items():
+            print_progress(f"{name}: fitting desired speeds on {len(others)} scenes")
+            excesses[name] = fit_excess(make, others, options)
+    driven = drive_all(factories, chosen, options, excesses)
     # Long runs are compared with all frames, not only with those that count.
     statistics = driving_statistics(frame, widths)
     reference = Reference(
@@ -302,13 +236,12 @@ def recorded_starts(
         },
         floors={},
     )
-    # Measured once over all folds, so that every traffic has the same units.
     units = units_of(chosen)
     return Starts(
         scenes=units,
-        held_out=[list(fold.held_out) for fold in folds],
-        desired_above_mps={name: float(np.mean(values)) for name, values in excesses.items()},
-        driven={name: measure(pl.concat(parts), units) for name, parts in frames.items()},
+        held_out=list(held_out),
+        desired_above_mps=excesses,
+        driven={name: measure(frames, units) for name, frames in driven.items()},
         recorded=measure_recordings(chosen),
         reference=reference,
     )

@@ -97,8 +97,6 @@ class RealismConfig(CpuConfig):
         resamples: of the bootstrap over scenes.
         quick: true: a check that it runs, in seconds.
         publish: true (maintainers): write the histograms that ship from these recordings.
-        fold_weights: generators of k folds: every scene is driven by the one that was fitted
-            without it.
     """
 
     traffic: TrafficConfig = field(default_factory=IdmMobilTrafficConfig)
@@ -121,7 +119,6 @@ class RealismConfig(CpuConfig):
     publish: bool = False
     env: EnvConfig = field(default_factory=EnvConfig)
     data: DataConfig = field(default_factory=DataConfig)
-    fold_weights: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         # One name stands for a list of one.

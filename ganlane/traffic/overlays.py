@@ -7,8 +7,6 @@ relative positions as its only input drifts off the road within a minute, and to
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -372,15 +370,8 @@ class AccelerationOverlay(Overlay):
         }
 
 
-#: Called with the vehicles at t, as the chain moved them, and as the guard moves them.
-Observer = Callable[[Vehicles, Vehicles, Vehicles], None]
-
-
 class Guard(Overlay):
-    """Bound the acceleration, pull towards the target lane, keep the body on the road.
-
-    :attr:`observer`, if set, is called with every correction.
-    """
+    """Bound the acceleration, pull towards the target lane, keep the body on the road."""
 
     def __init__(
         self,
@@ -392,7 +383,6 @@ class Guard(Overlay):
         super().__init__(road, stream)
         self.guard = guard or GuardParameters()
         self.idm = idm
-        self.observer: Observer | None = None
 
     def along(self, vehicles: Vehicles, moved: Vehicles) -> Vehicles:
         """``moved`` with its acceleration between the bounds by IDM."""
@@ -459,7 +449,4 @@ class Guard(Overlay):
         step: Tensor,
     ) -> Moved:
         """Along the road, then across it."""
-        guarded = self.across(vehicles, self.along(vehicles, moved))
-        if self.observer is not None:
-            self.observer(vehicles, moved, guarded)
-        return guarded, memory
+        return self.across(vehicles, self.along(vehicles, moved)), memory

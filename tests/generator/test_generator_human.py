@@ -216,7 +216,7 @@ def test_the_command_fits_folds_keeps_what_is_finished_and_its_weights_load(
     arguments = ["generator=human", "data.path=recordings.csv", "folds=2", *options]
     assert run_command("train_generator", [*arguments, "hydra.run.dir=fit"]) == 0
     results = json.loads(Path("fit/results.json").read_text())
-    assert results["ade_m"].keys() == {"mean", "single", "best_of_20", "constant_velocity"}
+    assert {"mean", "single", "best_of_20", "constant_velocity"} < results["ade_m"].keys()
     assert "rollout" in results["folds"]
     model, metadata = load_human("fit/generator_human.safetensors")
     assert metadata["preset"] == "human"

@@ -29,10 +29,6 @@ from ganlane.realism.sheets import (
 )
 from ganlane.realism.starts import simulate
 from ganlane.sim.state import Road
-from ganlane.traffic.presets import (
-    gan_calibrated_traffic,
-    gan_traffic,
-)
 from ganlane.view.figures import COLOURS, INK
 
 WITHOUT_CHANGES = [name for name in QUANTITIES if name != "lane_change_duration"]
@@ -107,18 +103,6 @@ def test_traffic_that_stands_still_has_counts_and_no_rates():
         == cells(table, "overlaps per 1000 vehicle-km")
         == ["-"]
     )
-
-
-def test_a_traffic_without_a_guard_has_none_in_its_card():
-    # The paper's generated traffic is guarded, the calibrated one is not.
-    short = LongRunParameters(vehicles=4, vehicle_km=0.1, most_s=10.0)
-    without, with_guard = (
-        long_run(make, Road(), short) for make in (gan_calibrated_traffic, gan_traffic)
-    )
-    assert without["guard_share"] is None
-    assert 0.0 < with_guard["guard_share"] < 1.0
-    assert cells(long_table([without], "a"), "the guard's share") == ["none"]
-    assert cells(long_table([with_guard], "a"), "the guard's share")[1] == "%"
 
 
 def in_colour(axes, colour):

@@ -15,7 +15,6 @@ from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 from ganlane.commands import realism as command
 from ganlane.config.run import run_command
-from ganlane.generator import shipped_generator
 from ganlane.realism.measures import (
     QUANTITIES,
     SHIPPED_REFERENCE,
@@ -23,7 +22,6 @@ from ganlane.realism.measures import (
 )
 from ganlane.realism.sheets import card_text
 from ganlane.settings.recordings import RealismConfig
-from ganlane.weights import load_weights, save_weights
 
 main = partial(run_command, "realism")
 
@@ -173,55 +171,6 @@ def test_a_users_own_traffic_gets_a_card_and_one_of_i80_beside_the_scenes(record
         "time_headway",
     }
     assert "I-80, following" in out
-
-
-def fold(path, held_out):
-    """The shipped weights, as if they had been fitted without some scenes."""
-    tensors, metadata = load_weights(shipped_generator("calibrated"), "generator")
-    # Everything else is that of the weights that ship.
-    metadata["data"]["held_out"] = held_out
-    save_weights(path, metadata.pop("kind"), tensors, metadata)
-    return path
-
-
-def test_by_folds_every_scene_is_driven_by_weights_that_never_saw_it(recordings, capsys, tmp_path):
-    pairs = (
-        ["synthetic-0", "synthetic-3"],
-        ["synthetic-1", "synthetic-2"],
-    )
-    files = [fold(tmp_path / f"fold{index}.safetensors", pair) for index, pair in enumerate(pairs)]
-    arguments = [
-        "traffic=gan_calibrated",
-        "vehicle_km=0",
-        f"data.path={recordings}",
-    ]
-    status, results, _, _ = run(
-        capsys,
-        *arguments,
-        f"fold_weights=[{files[0]},{files[1]}]",
-    )
-    assert status == 0
-    assert results["scenes"] == [*pairs[0], *pairs[1]]
-    assert results["held_out"] == list(pairs)
-    assert results["driving"]["recorded"]["vehicle_km"] == pytest.approx(
-        results["driving"]["constant_velocity"]["vehicle_km"],
-        rel=0.2,
-    )
-    mistakes = {
-        "synthetic-1 is held out 0 times": [
-            *arguments,
-            f"fold_weights=[{files[0]}]",
-        ],
-        "needs the preset paper": [
-            "traffic=gan",
-            *arguments[1:],
-            f"fold_weights=[{files[0]},{files[1]}]",
-        ],
-    }
-    for said, wrong in mistakes.items():
-        status, _, _, err = run(capsys, *wrong)
-        assert status == 2
-        assert said in err
 
 
 @pytest.mark.parametrize(

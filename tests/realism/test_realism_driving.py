@@ -7,6 +7,7 @@ import polars as pl
 import pytest
 import torch
 from reference.recordings import made_by_hand
+from reference.small_networks import silenced, small_generator
 from reference.worlds import vehicles as vehicles_of
 from tensordict import TensorDict
 
@@ -14,14 +15,15 @@ from ganlane.data.dense import recorded_frame
 from ganlane.generator.closed_loop import balanced_headway
 from ganlane.realism.driving import (
     ConstantVelocity,
-    HeadwayIdm,
     RandomDriving,
     StartOptions,
     drive_recordings,
     with_recorded_headways,
 )
+from ganlane.settings.generator import EXTRA_INPUTS
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import TrafficModule
+from ganlane.traffic.social_gan import AnchoredGanTraffic
 
 
 def steady(**changed):
@@ -190,8 +192,10 @@ def test_a_recorded_platoon_keeps_its_gaps_behind_a_leader_at_constant_speed():
         lanes=1,
         driven=np.array([True, True, True, False]),
     )
+    network = silenced(small_generator(EXTRA_INPUTS))
     there = drive_recordings(
-        HeadwayIdm,
+        # Without a residual there are only IDM and each driver's headway.
+        lambda road: AnchoredGanTraffic(network, road),
         [scene],
         StartOptions(desired_above_mps=5.0),
     )

@@ -9,7 +9,6 @@ from ganlane.realism.driving import (
 )
 from ganlane.realism.long_runs import (
     EventCounter,
-    GuardMeter,
     LongRunParameters,
     long_run,
     spawned_vehicles,
@@ -17,7 +16,7 @@ from ganlane.realism.long_runs import (
 )
 from ganlane.sim.random import episode_key
 from ganlane.sim.state import Road
-from ganlane.traffic import Guard, IdmTraffic, TrafficModule
+from ganlane.traffic import IdmTraffic
 
 SHORT = LongRunParameters(vehicles=6, vehicle_km=1.0, most_s=20.0)
 
@@ -62,7 +61,6 @@ def test_constant_velocity_keeps_every_speed_and_changes_no_lane():
         "spread_mps": None,
         "episodes": 0,
     }
-    assert run["guard_share"] is None
 
 
 def test_blind_driving_overlaps_and_careful_driving_does_not():
@@ -141,31 +139,3 @@ def test_standing_in_a_queue_is_no_standstill_but_standing_alone_is():
     ):  # only the foremost has nobody ahead
         counter.count(queue, step)
         assert counter.standstills == expected
-
-
-class Swerver(TrafficModule):
-    """Brakes hard with vehicle 1, moves vehicle 2 aside."""
-
-    def move(self, vehicles, memory, key, step):
-        index = torch.arange(vehicles.x.shape[1])
-        speed = vehicles.speed - torch.where(index == 1, 2.0, 0.0)
-        return vehicles.with_(
-            speed=speed,
-            y=vehicles.y + torch.where(index == 2, 0.5, 0.0),
-        ), memory
-
-
-def test_the_guard_meter_counts_what_the_guard_alters_and_changes_nothing():
-    guard = Guard(Road())
-    meter = GuardMeter()
-    vehicles = in_line(200.0, 15.0).with_(y=start(Road()).y)
-    # Moved by hand, then rewritten by the guard.
-    moved, _ = Swerver().move(vehicles, {}, torch.zeros(3), torch.zeros(3))
-    assert meter.share is None
-    unwatched, _ = guard.rewrite(vehicles, moved, {}, torch.zeros(3), torch.zeros(3))
-    meter.watch(guard)
-    guarded, _ = guard.rewrite(vehicles, moved, {}, torch.zeros(3), torch.zeros(3))
-    # Vehicle 1 brakes with 20 m/s2, vehicle 2 moves by 0.5 m of which a fifth is damped; the other
-    # seven do neither.
-    assert meter.share == pytest.approx(2 / 9)
-    assert torch.equal(unwatched.x, guarded.x)

@@ -13,7 +13,6 @@ from ganlane.realism.driving import (
 )
 from ganlane.realism.measures import ceiling
 from ganlane.realism.starts import (
-    Fold,
     fit_excess,
     recorded_starts,
 )
@@ -27,14 +26,14 @@ def frame():
     return synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=8, seconds=6.0))
 
 
-def starts_of(frame, *folds, fit=False):
-    return recorded_starts(folds, frame, StartOptions(), fit, "made up")
+def starts_of(frame, starts, held_out):
+    return recorded_starts(MAKERS, starts, held_out, frame, StartOptions(), False, "made up")
 
 
 def test_scenes_alone_have_the_ceiling_of_their_own_halves(
     frame,
 ):
-    starts = starts_of(frame, Fold(MAKERS, NAMES, NAMES[1:3]))
+    starts = starts_of(frame, NAMES, NAMES[1:3])
     assert starts.separately_held_out == NAMES[1:3]
     # The ceiling is that of two scenes, no longer of four.
     alone = card_rows(
@@ -48,34 +47,12 @@ def test_scenes_alone_have_the_ceiling_of_their_own_halves(
         assert alone[name]["recorded_samples"] == starts.recorded.counts[name][1:3].sum()
 
 
-def test_folds_are_driven_one_by_one_and_joined(frame):
-    folds = (
-        Fold(MAKERS, NAMES[:2], NAMES[:2]),
-        Fold(MAKERS, NAMES[2:], NAMES[2:]),
-    )
-    apart = starts_of(frame, *folds)
-    whole = starts_of(frame, Fold(MAKERS, NAMES, []))
-    assert apart.scenes == whole.scenes == NAMES
-    assert apart.separately_held_out == []
-    assert np.array_equal(
-        apart.driven["cruise"].counts["speed"],
-        whole.driven["cruise"].counts["speed"],
-    )
-
-
-def test_a_fold_without_scenes_is_passed_over_and_none_at_all_is_refused(
-    frame,
-):
-    starts = starts_of(
-        frame,
-        Fold(MAKERS, [], []),
-        Fold(MAKERS, NAMES[:2], []),
-    )
-    assert starts.scenes == NAMES[:2]
+def test_scenes_that_are_not_there_are_refused(frame):
+    assert starts_of(frame, NAMES[:2], []).scenes == NAMES[:2]
     with user_error("no scene to start from"):
-        starts_of(frame, Fold(MAKERS, [], []))
+        starts_of(frame, [], [])
     with user_error("moon"):
-        starts_of(frame, Fold(MAKERS, NAMES, ["moon"]))
+        starts_of(frame, NAMES, ["moon"])
 
 
 def test_the_excess_that_was_used_is_the_one_that_is_fitted():

@@ -12,6 +12,7 @@ The same functions serve the fit (:mod:`ganlane.generator.human_fit`), its fine-
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -216,6 +217,12 @@ def see(vehicles: Vehicles, road: Road) -> tuple[Tensor, Near, Near]:
     return lane, nearest_on(1), nearest_on(-1)
 
 
+def look(vehicles: Vehicles, memory: Memory, road: Road) -> tuple[Memory, View]:
+    """The memory with this decision's style, and what drivers perceive before they decide."""
+    memory = with_style(memory, perceive(vehicles, memory, road))
+    return memory, perceive(vehicles, memory, road)
+
+
 def perceive(vehicles: Vehicles, memory: Memory, road: Road, sides: bool = True) -> View:
     """What every driver perceives of its neighbours, its lane and itself.
 
@@ -405,6 +412,14 @@ def _needed_braking(closing: Tensor, gap: Tensor) -> Tensor:
     return (closing.clamp_min(0.0).square() / (2.0 * (gap - 1.0).clamp_min(0.3))).clamp_max(8.0)
 
 
+def layers(*widths: int) -> nn.Sequential:
+    """Linear layers of these widths with SiLU between them."""
+    parts: list[nn.Module] = []
+    for before, after in pairwise(widths):
+        parts += [nn.Linear(before, after), nn.SiLU()]
+    return nn.Sequential(*parts[:-1])
+
+
 class HumanPolicy(nn.Module):
     """Distributions of a driver's next move; below 50,000 weights.
 
@@ -414,19 +429,10 @@ class HumanPolicy(nn.Module):
     def __init__(self, sizes: HumanSizes) -> None:
         super().__init__()
         self.sizes = sizes
-        self.trunk = nn.Sequential(
-            nn.Linear(FEATURES, sizes.hidden),
-            nn.SiLU(),
-            nn.Linear(sizes.hidden, sizes.hidden),
-            nn.SiLU(),
-        )
+        self.trunk = layers(FEATURES, sizes.hidden, sizes.hidden).append(nn.SiLU())
         self.along = nn.Linear(sizes.hidden, ALONG.number)
         self.across = nn.Linear(sizes.hidden, ACROSS.number)
-        self.lane = nn.Sequential(
-            nn.Linear(SIDE_FEATURES, sizes.lane_hidden),
-            nn.SiLU(),
-            nn.Linear(sizes.lane_hidden, 2),
-        )
+        self.lane = layers(SIDE_FEATURES, sizes.lane_hidden, 2)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Logits of the tokens along [..., 41] and across [..., 31]."""
@@ -515,19 +521,22 @@ def bounded(
     return acceleration, torch.minimum(torch.maximum(lateral, -most), most)
 
 
-def remembered(
-    vehicles: Vehicles, memory: Memory, view: View, acceleration: Tensor, target: Tensor
-) -> Memory:
-    """The memory after a decision for ``target`` lanes; ``vehicles`` are as before it."""
+def heading_for(vehicles: Vehicles, memory: Memory, target: Tensor) -> tuple[Vehicles, Memory]:
+    """Vehicles and memory with these target lanes; who has chosen another one counts anew."""
+    since = torch.where(target != vehicles.target_lane, 0.0, memory.since)
+    return vehicles.with_(target_lane=target), memory._replace(since=since)
+
+
+def remembered(vehicles: Vehicles, memory: Memory, view: View, acceleration: Tensor) -> Memory:
+    """The memory a decision later; ``vehicles`` have not moved yet."""
     _, lateral = velocity(vehicles)
-    changed = target != vehicles.target_lane
     return Memory(
         torch.cat((acceleration[..., None], memory.accelerations[..., :-1]), -1),
         torch.stack((lateral, memory.lateral_speeds[..., 0]), -1),
         torch.stack((view.closing, memory.closing[..., 0]), -1),
         memory.style,
         memory.age + 1.0,
-        torch.where(changed, 0.0, memory.since + 1.0),
+        memory.since + 1.0,
     )
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import smooth_l1_loss
 
-from ganlane.generator.human import DECISION_S, STEPS, HumanPolicy
+from ganlane.generator.human import DECISION_S, STEPS, HumanPolicy, layers
 from ganlane.generator.windows import OBSERVED_POSITIONS, PREDICTED_STEPS
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.generator import HumanSizes
@@ -39,13 +39,7 @@ class Estimator(nn.Module):
 
     def __init__(self, hidden: int = 64) -> None:
         super().__init__()
-        self.layers = nn.Sequential(
-            nn.Linear(20, hidden),
-            nn.SiLU(),
-            nn.Linear(hidden, hidden),
-            nn.SiLU(),
-            nn.Linear(hidden, len(SCALES)),
-        )
+        self.layers = layers(20, hidden, hidden, len(SCALES))
 
     def forward(self, positions: Tensor) -> Tensor:
         """[..., 7] from positions [..., 9, 2] in m."""
@@ -76,14 +70,8 @@ class Observer(nn.Module):
 
     def __init__(self, hidden: int = 64) -> None:
         super().__init__()
-        observed, predicted = OBSERVED_POSITIONS - 1, PREDICTED_STEPS
-        self.layers = nn.Sequential(
-            nn.Linear(2 * (observed + predicted), hidden),
-            nn.SiLU(),
-            nn.Linear(hidden, hidden),
-            nn.SiLU(),
-            nn.Linear(hidden, 2 * predicted),
-        )
+        inputs = OBSERVED_POSITIONS - 1 + PREDICTED_STEPS
+        self.layers = layers(2 * inputs, hidden, hidden, 2 * PREDICTED_STEPS)
 
     def forward(self, positions: Tensor, forecast: Tensor) -> Tensor:
         """Differences [..., 8, 2] in m; positions [..., 9, 2] and forecast [..., 8, 2] are relative

@@ -29,7 +29,9 @@ from ganlane.generator.human import (
     Memory,
     bounded,
     chosen,
+    heading_for,
     lane_choice,
+    look,
     moved,
     new_target,
     perceive,
@@ -147,20 +149,19 @@ def _driven(
     vehicles, memory, road = present_of(model.estimator, segments.repeated(runs))
     mean = torch.zeros_like(vehicles.valid)
     mean[:rows] = True
-    leads = perceive(vehicles, memory, road).gap >= SIGHT_M
+    view = perceive(vehicles, memory, road)
+    leads = view.gap >= SIGHT_M
     temperature = HumanVariation.temperature
     steps = torch.arange(1, STEPS + 1) * PHYSICS_STEP_S
     course = []
     for decision in range(-(-horizon // STEPS)):
+        # The present's style is that of the nine positions.
         if decision:
-            memory = with_style(memory, perceive(vehicles, memory, road))
-        view = perceive(vehicles, memory, road)
+            memory, view = look(vehicles, memory, road)
         chances = policy.lane_chances(lane_choice(vehicles, view), HumanVariation.lane_changes)
         choice = chosen(chances, torch.rand(mean.shape, generator=random))
         target = torch.where(mean, vehicles.target_lane, new_target(vehicles, view, choice))
-        changed = target != vehicles.target_lane
-        memory = memory._replace(since=torch.where(changed, 0.0, memory.since))
-        vehicles = vehicles.with_(target_lane=target)
+        vehicles, memory = heading_for(vehicles, memory, target)
         view = perceive(vehicles, memory, road)
         changes = []
         for tokens, logits in zip((ALONG, ACROSS), policy(view.features)):
@@ -176,7 +177,7 @@ def _driven(
         x = vehicles.x + speed * steps[:, None, None] + half * acceleration
         y = vehicles.y + lateral * steps[:, None, None] + half * (aside - lateral) / DECISION_S
         course.append(torch.stack((x, y), -1))
-        memory = remembered(vehicles, memory, view, acceleration, target)
+        memory = remembered(vehicles, memory, view, acceleration)
         vehicles = moved(vehicles, acceleration, aside)
     positions = torch.cat(course)[:horizon]
     positions = positions.transpose(0, 1).unflatten(0, (runs, rows))

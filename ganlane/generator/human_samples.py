@@ -9,7 +9,7 @@ first, since a camera's noise is no driver's wish (docs/generators.md).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ import torch
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
-from ganlane.data.dense import Flags, Floats, Recording
+from ganlane.data.dense import Floats, Recording
 from ganlane.generator.human import (
     ACCELERATIONS,
     ACROSS,
@@ -41,7 +41,7 @@ from ganlane.generator.human import (
     with_velocity,
 )
 from ganlane.generator.human_estimator import Estimator, trust
-from ganlane.generator.windows import OBSERVED_POSITIONS
+from ganlane.generator.windows import OBSERVED_POSITIONS, side_by_side
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.driving import Visibility
 from ganlane.sim.state import Road, Vehicles
@@ -64,33 +64,26 @@ _MOST_PAIRS = 300_000
 
 
 @dataclass(frozen=True)
-class SmoothScene:
-    """A recording of T frames and V tracks, smoothed; entries of absent vehicles are 0.
+class SmoothScene(Recording):
+    """A recording whose ``x``, ``y`` and ``speed`` are smoothed; entries of absent vehicles are 0.
 
     Attributes:
-        x, y, speed, lateral_speed: [T, V], m and m/s; raw_x, raw_y: as recorded.
+        raw_x, raw_y: [T, V] as recorded, m.
+        lateral_speed: [T, V] m/s.
         target: [T, V] lane that the driver heads for: the new one from the start of a change on.
-        present: [T, V]; length, width, driven: [V].
-        lanes, lane_width_m: of its road.
-        two_dimensional: whether positions across the road were recorded.
         weight: of its samples.
     """
 
-    x: Floats
-    y: Floats
     raw_x: Floats
     raw_y: Floats
-    speed: Floats
     lateral_speed: Floats
     target: np.ndarray
-    present: Flags
-    length: Floats
-    width: Floats
-    driven: Flags
-    lanes: int
-    lane_width_m: float
-    two_dimensional: bool
     weight: float
+
+    @property
+    def two_dimensional(self) -> bool:
+        """Whether positions across the road were recorded."""
+        return self.lanes > 1
 
 
 def smooth(track: Floats, cutoff_hz: float) -> Floats:
@@ -134,18 +127,12 @@ def smooth_scene(
             recording.lane_width_m,
             recording.lanes,
         )
+    same = {part.name: getattr(recording, part.name) for part in fields(Recording)}
     return SmoothScene(
-        **arrays,
+        **same | arrays,
         raw_x=recording.x,
         raw_y=recording.y,
         target=target,
-        present=recording.present,
-        length=recording.length.astype(float),
-        width=recording.width.astype(float),
-        driven=recording.driven,
-        lanes=recording.lanes,
-        lane_width_m=recording.lane_width_m,
-        two_dimensional=recording.lanes > 1,
         weight=weight,
     )
 
@@ -265,42 +252,49 @@ def batches(stretches: Sequence[Cut]) -> Iterator[Segments]:
 
 def segments_of(stretches: Sequence[Cut]) -> Segments:
     """The stretches as one batch; frames outside of their scenes are absent."""
-    rows, most = len(stretches), max(len(cut.who) for cut in stretches)
-    frames = stretches[0].frames
-    kinds = {"target": np.int64, "present": bool}
-    arrays: dict[str, np.ndarray] = {
-        name: np.zeros((rows, frames, most), kinds.get(name, np.float32))
-        for name in ("x", "y", "raw_x", "raw_y", "speed", "lateral_speed", "target", "present")
-    }
-    # Finite lengths for those that fill the batch.
-    of_vehicle = {"length": np.ones((rows, most), np.float32)}
-    of_vehicle["width"] = np.ones((rows, most), np.float32)
-    of_vehicle["driven"] = np.zeros((rows, most), bool)
-    for row, cut in enumerate(stretches):
-        scene = cut.scene
-        first, last = max(cut.start, 0), min(cut.start + cut.frames, len(scene.x))
-        at = slice(first - cut.start, last - cut.start)
-        for name, array in arrays.items():
-            array[row, at, : len(cut.who)] = getattr(scene, name)[first:last, cut.who]
-        # Near 0, where float32 is exact to micrometres.
-        middle = scene.x[first:last, cut.who].mean()
-        arrays["x"][row] -= middle
-        arrays["raw_x"][row] -= middle
-        for name, array in of_vehicle.items():
-            array[row, : len(cut.who)] = getattr(scene, name)[cut.who]
     scenes = [cut.scene for cut in stretches]
 
     def column(name: str, dtype: torch.dtype) -> Tensor:
         return torch.tensor([[getattr(scene, name)] for scene in scenes], dtype=dtype)
 
-    tensors = {name: torch.from_numpy(array) for name, array in (arrays | of_vehicle).items()}
+    arrays: dict[str, list[np.ndarray]] = {
+        name: [stretch_of(cut, name) for cut in stretches] for name in IN_FRAMES
+    }
+    for number, cut in enumerate(stretches):
+        # Near 0, where float32 is exact to micrometres.
+        frames = slice(max(cut.start, 0), cut.start + cut.frames)
+        middle = cut.scene.x[frames, cut.who].mean()
+        for name in ("x", "raw_x"):
+            arrays[name][number] = (arrays[name][number] - middle).astype(np.float32)
+    driven = [cut.scene.driven[cut.who] for cut in stretches]
+    # Finite sizes for those that fill the batch.
+    sizes = {
+        name: [getattr(cut.scene, name)[cut.who].astype(np.float32) for cut in stretches]
+        for name in ("length", "width")
+    }
     return Segments(
-        **tensors,
+        **{name: side_by_side(parts) for name, parts in arrays.items()},
+        **{name: side_by_side(parts, 1.0) for name, parts in sizes.items()},
+        driven=side_by_side(driven),
         lanes=column("lanes", torch.float32),
         lane_width_m=column("lane_width_m", torch.float32),
         two_dimensional=column("two_dimensional", torch.bool),
         weight=column("weight", torch.float32),
     )
+
+
+#: What a stretch holds in every frame.
+IN_FRAMES = ("x", "y", "raw_x", "raw_y", "speed", "lateral_speed", "target", "present")
+
+
+def stretch_of(cut: Cut, name: str) -> np.ndarray:
+    """A field of the stretch's scene, [T, M], of its vehicles; 0 in frames outside of the scene."""
+    numbers = getattr(cut.scene, name)
+    frames = cut.start + np.arange(cut.frames)
+    outside = (frames < 0) | (frames >= len(numbers))
+    taken = numbers[np.ix_(frames.clip(0, len(numbers) - 1), cut.who)]
+    taken[outside] = 0
+    return taken.astype(np.float32) if taken.dtype == np.float64 else taken
 
 
 def recorded(segments: Segments, decision: int) -> tuple[Vehicles, Memory]:
@@ -445,9 +439,8 @@ def _samples(segments: Segments, options: Options, random: torch.Generator) -> S
             change, aside = _nearest_move(options, view, change, aside, random)
             aside = torch.where(s.two_dimensional, aside, 0.0)
         acceleration, lateral = bounded(vehicles, memory, s.road, change, aside)
-        after = remembered(vehicles, memory, view, acceleration, vehicles.target_lane)
+        memory = remembered(vehicles, memory, view, acceleration)
         vehicles = moved(vehicles, acceleration, lateral)
-        memory = after
     return joined(parts)
 
 

@@ -27,7 +27,10 @@ from ganlane.generator.human import (
     LaneChoice,
     Memory,
     bounded,
+    heading_for,
     lane_choice,
+    layers,
+    look,
     moved,
     new_target,
     perceive,
@@ -99,13 +102,7 @@ def tune(
         danger: sides to which nobody changes, [D, SIDE_FEATURES].
     """
     reference = deepcopy(policy).requires_grad_(False)
-    critic = nn.Sequential(
-        nn.Linear(FEATURES + 2 * SIDE_FEATURES, 64),
-        nn.SiLU(),
-        nn.Linear(64, 64),
-        nn.SiLU(),
-        nn.Linear(64, 1),
-    )
+    critic = layers(FEATURES + 2 * SIDE_FEATURES, 64, 64, 1)
     optimizer = torch.optim.Adam(
         [
             {"params": policy.parameters(), "lr": RATE},
@@ -227,16 +224,11 @@ def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> De
     vehicles, memory, road = random_scenes(random)
     steps: list[Decisions] = []
     for _ in range(DECISIONS):
-        memory = with_style(memory, perceive(vehicles, memory, road))
-        view = perceive(vehicles, memory, road)
+        memory, view = look(vehicles, memory, road)
         choice = lane_choice(vehicles, view)
         chances = policy.lane_chances(choice)
         lane = torch.multinomial(chances.flatten(0, 1), 1, generator=random).view(vehicles.x.shape)
-        target = new_target(vehicles, view, lane)
-        memory = memory._replace(
-            since=torch.where(target != vehicles.target_lane, 0.0, memory.since)
-        )
-        vehicles = vehicles.with_(target_lane=target)
+        vehicles, memory = heading_for(vehicles, memory, new_target(vehicles, view, lane))
         # The moves follow the choice.
         view = perceive(vehicles, memory, road)
         logits = policy(view.features)
@@ -263,7 +255,7 @@ def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> De
             goes_on=vehicles.valid,
         )
         log_chance = _of_actions(_log_chances(policy, seen), (*tokens, lane))
-        memory = remembered(vehicles, memory, view, acceleration, target)
+        memory = remembered(vehicles, memory, view, acceleration)
         vehicles = moved(vehicles, acceleration, aside)
         cost, hit = costs(vehicles, road, view.gap)
         # Who has collided leaves the scene.

@@ -7,7 +7,7 @@ would carry the future into the past.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -150,32 +150,39 @@ def cut_segments(cuts: list[tuple[Recording, int]], horizon: int) -> Segments:
     frames = OBSERVED_POSITIONS + horizon
     # Who is recorded in any frame of a segment is in it.
     members = [np.flatnonzero(scene.present[row : row + frames].any(0)) for scene, row in cuts]
-    batch = len(cuts)
-    # The fullest segment sets the width; the others are padded.
-    most = max(map(len, members))
-    segments = Segments(
-        positions=torch.zeros(batch, frames, most, 2),
-        present=torch.zeros(batch, frames, most, dtype=torch.bool),
-        target_lane=torch.zeros(batch, frames, most, dtype=torch.int64),
-        length=torch.ones(batch, most),
+
+    def taken(name: str) -> list[np.ndarray]:
+        """A field in the frames of each segment, of its vehicles."""
+        return [
+            getattr(scene, name)[row : row + frames][:, who]
+            for (scene, row), who in zip(cuts, members)
+        ]
+
+    positions = []
+    for places in taken("endless_positions"):
+        # Far down the road, float32 loses digits; the lateral zero is the road's.
+        middle = np.array([places[PRESENT, :, 0].mean(), 0.0])
+        positions.append((places - middle).astype(np.float32))
+    lengths = [scene.length[who].astype(np.float32) for (scene, _), who in zip(cuts, members)]
+    return Segments(
+        positions=side_by_side(positions),
+        present=side_by_side(taken("present")),
+        target_lane=side_by_side(taken("target_lane")),
+        length=side_by_side(lengths, 1.0),
         lanes=torch.tensor([[scene.lanes] for scene, _ in cuts]),
         lane_width=torch.tensor(
             [[scene.lane_width_m] for scene, _ in cuts],
             dtype=torch.float32,
         ),
     )
-    for number, ((scene, row), who) in enumerate(zip(cuts, members)):
-        # All frames of the segment, and the columns of its vehicles.
-        at = slice(row, row + frames), who
-        positions = scene.endless_positions[at]
-        count = len(who)
-        # Far down the road, float32 loses digits; the lateral zero is the road's.
-        middle = np.array([positions[PRESENT, :, 0].mean(), 0.0])
-        segments.positions[number, :, :count] = torch.from_numpy(positions - middle)
-        segments.present[number, :, :count] = torch.from_numpy(scene.present[at])
-        segments.target_lane[number, :, :count] = torch.from_numpy(scene.target_lane[at])
-        segments.length[number, :count] = torch.from_numpy(scene.length[who])
-    return segments
+
+
+def side_by_side(arrays: Sequence[np.ndarray], filler: float = 0.0) -> Tensor:
+    """Arrays [T, V, ...] or [V] of several widths V as one batch, filled up to the widest."""
+    vehicles = min(1, arrays[0].ndim - 1)
+    parts = [torch.from_numpy(np.moveaxis(array, vehicles, 0)) for array in arrays]
+    batch = pad_sequence(parts, batch_first=True, padding_value=filler)
+    return batch.movedim(1, 1 + vehicles).contiguous()
 
 
 @dataclass(frozen=True)

@@ -22,13 +22,14 @@ from ganlane.generator.human import (
     View,
     bounded,
     chosen,
+    heading_for,
     lane_choice,
     leaves_room,
+    look,
     new_target,
     perceive,
     remembered,
     velocity,
-    with_style,
     with_velocity,
 )
 from ganlane.generator.human import Memory as DriverMemory
@@ -145,8 +146,7 @@ class HumanTraffic(TrafficModule):
         policy = self._policy(vehicles.x.dtype)
         vehicles = vehicles.with_(target_lane=self.road.clamp_lane(vehicles.target_lane))
         driver = DriverMemory(*(memory[name] for name in DriverMemory._fields))
-        driver = with_style(driver, perceive(vehicles, driver, self.road))
-        view = perceive(vehicles, driver, self.road)
+        driver, view = look(vehicles, driver, self.road)
         u = uniforms(
             vehicles,
             key,
@@ -166,9 +166,7 @@ class HumanTraffic(TrafficModule):
         if self.road.stretches:
             choice = _leaving(choice, ways, vehicles, view, u[3])
         target = new_target(vehicles, view, choice)
-        changed = target != vehicles.target_lane
-        driver = driver._replace(since=torch.where(changed, 0.0, driver.since))
-        vehicles = vehicles.with_(target_lane=target)
+        vehicles, driver = heading_for(vehicles, driver, target)
         # Its moves follow the driver's choice.
         view = perceive(vehicles, driver, self.road)
         along, across = policy(view.features)
@@ -177,7 +175,7 @@ class HumanTraffic(TrafficModule):
         acceleration, lateral = bounded(vehicles, driver, self.road, change, aside)
         if self.road.stretches:
             acceleration = torch.minimum(acceleration, self._before_walls(vehicles))
-        driver = remembered(vehicles, driver, view, acceleration, target)
+        driver = remembered(vehicles, driver, view, acceleration)
         return vehicles, {
             **driver._asdict(),
             "acceleration": driver.accelerations[..., self.variation.delayed],

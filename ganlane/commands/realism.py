@@ -24,7 +24,6 @@ from ganlane.generator import (
 )
 from ganlane.realism.card import (
     card_numbers,
-    floors_of,
     quantity_rows,
 )
 from ganlane.realism.driving import Factory, StartOptions
@@ -33,7 +32,6 @@ from ganlane.realism.long_runs import (
     long_run,
 )
 from ganlane.realism.measures import (
-    SHIPPED_REFERENCE,
     measure,
     measure_recordings,
 )
@@ -79,10 +77,6 @@ def realism(config: RealismConfig, folder: Path) -> str:
     config = config.shortened()
     set_threads(config.threads)
     path = scenes_path(config)
-    if config.publish and path is None:
-        raise UserError(
-            "publish=true: the file that ships is made from recordings; give data.path=FILE."
-        )
     # Everything that can be refused is refused before hours of driving.
     factories = traffic_factories(config)
     files = files_wanted(config, path)
@@ -111,8 +105,6 @@ def realism(config: RealismConfig, folder: Path) -> str:
         config.resamples,
     )
     draw(numbers, starts, folder)
-    if config.publish:
-        publish(starts)
     show(*card_text(numbers), columns=config.columns)
     seeds = {"stream": "report", "seed": config.seed}
     return f"results: {write_results(folder, numbers, asdict(config), seeds)}"
@@ -304,16 +296,3 @@ def long_runs(
             )
         )
     return runs
-
-
-def publish(starts: Starts) -> None:
-    """Write the file that ships, with the distances of the reference drivers of this run."""
-    # The file's name without its folder, which is nobody's business.
-    source = Path(starts.reference.source).name
-    floors = floors_of(starts.driven, starts.recorded.counts)
-    replace(
-        starts.reference,
-        floors=floors,
-        source=source,
-    ).save(SHIPPED_REFERENCE)
-    print_progress(f"wrote {SHIPPED_REFERENCE}")

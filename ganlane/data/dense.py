@@ -99,7 +99,7 @@ class Recording:
         """
         frames = np.arange(len(self.present))[:, None]
         column = np.arange(self.present.shape[1])
-        first, last = self._first_and_last
+        first, last = self.ends
         # The frame to go on from: itself, or the first or last one of the track.
         nearest = np.clip(frames, first, last)
         # The first and the last displacement of each vehicle; 0 where it was seen only once.
@@ -115,10 +115,10 @@ class Recording:
         """Lane [T, V] of each vehicle after :data:`INTENTION_S`, or at the end of its track."""
         # The frame INTENTION_S later; clipped, since the track may end before.
         ahead = np.arange(len(self.present))[:, None] + round(INTENTION_S / FRAME_S)
-        return np.take_along_axis(self.lane, np.clip(ahead, *self._first_and_last), axis=0)
+        return np.take_along_axis(self.lane, np.clip(ahead, *self.ends), axis=0)
 
     @property
-    def _first_and_last(self) -> tuple[Integers, Integers]:
+    def ends(self) -> tuple[Integers, Integers]:
         """First and last present frame of each vehicle, [V] each."""
         # argmax is the first true entry; the last one is the first of the reversed frames.
         return self.present.argmax(0), len(self.present) - 1 - self.present[::-1].argmax(0)

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from ganlane.data.dense import Flags, Floats, Recording
+from ganlane.data.dense import Recording
 from ganlane.data.lanes import STANDARD_LANE_WIDTH_M
 from ganlane.data.schema import FRAME_S
 from ganlane.data.tables import read_table
@@ -185,23 +185,11 @@ def _one_lane(rows: pl.DataFrame) -> Recording:
     )
     # Positions across the road are not given, and all lanes are alike.
     recording = Recording.of(rows, STANDARD_LANE_WIDTH_M)
-    return replace(
-        recording,
-        speed=_speeds(recording.x, recording.present),
-    )
-
-
-def _speeds(x: Floats, present: Flags) -> Floats:
-    """Speeds [T, V], m/s: over up to 0.5 s on either side, within the track."""
     # Half a second before and after, or as far as the track reaches.
-    index = np.arange(len(x))[:, None]
-    first = present.argmax(0)
-    last = len(x) - 1 - present[::-1].argmax(0)
-    before = np.clip(index - 5, first, last)
-    after = np.clip(index + 5, first, last)
+    frames = np.arange(len(recording.x))[:, None]
+    before = np.clip(frames - 5, *recording.ends)
+    after = np.clip(frames + 5, *recording.ends)
+    x = recording.x
     moved = np.take_along_axis(x, after, 0) - np.take_along_axis(x, before, 0)
-    return np.where(
-        present,
-        moved / (np.maximum(after - before, 1) * FRAME_S),
-        0.0,
-    )
+    speed = moved / (np.maximum(after - before, 1) * FRAME_S)
+    return replace(recording, speed=np.where(recording.present, speed, 0.0))

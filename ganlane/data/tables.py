@@ -189,11 +189,7 @@ def read_blocks(
     done = 0
     total = table.path.stat().st_size
     for block in _whole_lines(table, block_bytes):
-        # A last line without a line break is a row only if it has all its fields.
-        cut_off = not block.endswith(b"\n")
-        if cut_off:
-            _check_lines(table, block, number, cut_off)
-        rows = block.count(b"\n") + cut_off
+        rows = block.count(b"\n") + (not block.endswith(b"\n"))
         lines = pl.int_range(number, number + rows, dtype=pl.Int64).alias(LINE)
         yield _parse(
             table,
@@ -282,16 +278,8 @@ def _parse(
     return frame.select(pl.col(places[table.names.index(name)]).alias(name) for name in wanted)
 
 
-def _check_lines(
-    table: TextTable,
-    block: bytes,
-    number: int,
-    cut_off: bool = False,
-) -> None:
-    """Raise a UserError that names the first line of a block that does not fit the table.
-
-    ``cut_off``: the block is the file's last line and has no line break.
-    """
+def _check_lines(table: TextTable, block: bytes, number: int) -> None:
+    """Raise a UserError that names the first line of a block that does not fit the table."""
     expected = len(table.names)
     for line, raw in enumerate(block.removesuffix(b"\n").split(b"\n"), number):
         place = f"{table.path}, line {line}"
@@ -304,23 +292,14 @@ def _check_lines(
                 f"{place}: the line is not text; copy or download the file again."
             ) from error
         fields = len(_fields(text, place, table.blanks))
-        # The last column that the row still has.
-        column = table.names[max(min(fields, expected) - 1, 0)]
-        if fields < expected and cut_off:
-            raise UserError(
-                f"{place}, column {column}: the file breaks off here, {fields} of {expected} "
-                "columns into the row; copy or download it again."
-            )
         if raw.count(b'"') % 2:
             raise UserError(
                 f"{place}: a quotation mark without its counterpart; correct or remove the row."
             )
-        if fields > expected:
+        if fields != expected:
+            # The last column that the row still has.
+            column = table.names[max(min(fields, expected) - 1, 0)]
             raise UserError(
-                f"{place}: {fields} fields, expected {expected}; correct or remove the row."
-            )
-        if fields < expected:
-            raise UserError(
-                f"{place}, column {column}: the row ends after {fields} of {expected} fields; "
-                "correct or remove it."
+                f"{place}, column {column}: the row has {fields} fields, expected {expected}; "
+                "correct or remove it, or copy the file again if it breaks off here."
             )

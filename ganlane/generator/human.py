@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from ganlane.keys import PHYSICS_STEP_S
+from ganlane.settings.driving import Visibility
 from ganlane.settings.generator import (
     ACROSS_TOKENS,
     ALONG_TOKENS,
@@ -53,6 +54,8 @@ EDGE_S, EDGE_M = 0.8, 0.15
 ANTICIPATION_S = 1.0
 #: Decisions after which a driver's age, and the time since its last lane change, count no more.
 LONGEST = 12.0
+#: Decisions since the last lane change of a driver whose last one was not recorded.
+LONG_AGO = 6.0
 #: What the driver behind would have to brake, among the numbers of a side.
 REAR_BRAKING = 9
 #: The probabilities of both lane changes together are at most this.
@@ -132,6 +135,19 @@ class Memory(NamedTuple):
     style: Tensor
     age: Tensor
     since: Tensor
+
+
+def memory_of(accelerations: Tensor, lateral_speeds: Tensor, age: Tensor) -> Memory:
+    """A memory [N, M] without style and closing speeds; the last lane change is long ago."""
+    zero = torch.zeros_like(age)
+    return Memory(
+        accelerations,
+        lateral_speeds,
+        torch.stack((zero, zero), -1),
+        torch.stack((zero, zero, zero), -1),
+        age,
+        zero + LONG_AGO,
+    )
 
 
 class View(NamedTuple):
@@ -547,6 +563,23 @@ def moved(vehicles: Vehicles, acceleration: Tensor, aside: Tensor) -> Vehicles:
     x = vehicles.x + 0.5 * (speed + later) * DECISION_S
     y = vehicles.y + 0.5 * (lateral + aside) * DECISION_S
     return with_velocity(vehicles.with_(x=x, y=y, acceleration=acceleration), later, aside)
+
+
+def cars(x: Tensor, y: Tensor, speed: Tensor, aside: Tensor, **others: Tensor) -> Vehicles:
+    """Vehicles at these speeds along and across the road, m/s, seen where their centres are.
+
+    ``others``: the further fields but heading and visibility; all are valid unless it says
+    otherwise.
+    """
+    vehicles = Vehicles(
+        x=x,
+        y=y,
+        heading=torch.zeros_like(x),
+        speed=speed,
+        visibility=torch.full(x.shape, int(Visibility.CENTRE), device=x.device),
+        **{"valid": torch.ones_like(x, dtype=torch.bool), **others},
+    )
+    return with_velocity(vehicles, speed, aside)
 
 
 def with_velocity(vehicles: Vehicles, along: Tensor, across: Tensor) -> Vehicles:

@@ -23,9 +23,9 @@ from ganlane.generator.human import (
     ALONG,
     HumanPolicy,
     Memory,
+    cars,
     leaves_room,
     perceive,
-    with_velocity,
 )
 from ganlane.generator.human_estimator import HumanModel, fit_estimator
 from ganlane.generator.human_samples import (
@@ -35,17 +35,17 @@ from ganlane.generator.human_samples import (
     Samples,
     SmoothScene,
     cuts,
+    draws,
     joined,
     keeping_choice,
     samples_of,
     smooth_scene,
 )
 from ganlane.generator.human_tuning import begins_per_decision, tune
-from ganlane.settings.driving import Visibility
 from ganlane.settings.generator import HumanConfig
 from ganlane.sim.idm import DriverIdm, following_acceleration
 from ganlane.sim.neighbours import perceive as scene_of
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road
 
 #: Called with the steps made, of how many in all, and the last cost of the fine-tuning.
 Report = Callable[[int, int, float | None], None]
@@ -316,11 +316,7 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
     """
     shape = (scenes, PRIOR_VEHICLES)
 
-    def rand(*size: int) -> Tensor:
-        return torch.rand(size or shape, generator=random)
-
-    def randn(*size: int) -> Tensor:
-        return torch.randn(size or shape, generator=random)
+    rand, randn = draws(shape, random)
 
     road = Road(3, 3.6)
     lane = torch.randint(0, 3, shape, generator=random)
@@ -335,20 +331,17 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
     aside = torch.where(astray, 0.45, 0.15) * randn()
     target = torch.where(astray, road.lane_of(y).long(), lane)
     whole = torch.full(shape, 1.0)
-    vehicles = Vehicles(
-        x=rand() * (60.0 + 500.0 * rand(scenes, 1)),
-        y=y,
-        heading=0.0 * whole,
-        speed=speed,
+    vehicles = cars(
+        rand() * (60.0 + 500.0 * rand(scenes, 1)),
+        y,
+        speed,
+        aside,
         acceleration=0.0 * whole,
         length=4.5 * whole,
         width=1.9 * whole,
         desired_speed=desired.clamp(*DESIRED_MPS),
         target_lane=target,
-        visibility=torch.full(shape, int(Visibility.CENTRE)),
-        valid=whole > 0,
     )
-    vehicles = with_velocity(vehicles, speed, aside)
     idm = DriverIdm(2.0, headway, 2.0 * whole, -8.0 * whole, 1.4 * whole)
     wanted = following_acceleration(scene_of(vehicles, road), idm)
     before = torch.where(rand() < 0.5, 0.6 * randn(), (wanted * rand()).clamp(-6.0, 2.0))

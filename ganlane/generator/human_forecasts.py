@@ -28,20 +28,21 @@ from ganlane.generator.human import (
     STEPS,
     Memory,
     bounded,
+    cars,
     chosen,
     heading_for,
     lane_choice,
     look,
+    memory_of,
     moved,
     new_target,
     perceive,
     remembered,
     velocity,
     with_style,
-    with_velocity,
 )
 from ganlane.generator.human_estimator import DIFFERENCE_SCALE, Estimator, HumanModel, trust
-from ganlane.generator.human_samples import DESIRED_MPS, LONG_AGO, smooth_scene
+from ganlane.generator.human_samples import DESIRED_MPS, smooth_scene
 from ganlane.generator.windows import (
     OBSERVED_POSITIONS,
     PREDICTED_STEPS,
@@ -50,7 +51,7 @@ from ganlane.generator.windows import (
     cut_windows,
 )
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.settings.driving import HumanVariation, Visibility
+from ganlane.settings.driving import HumanVariation
 from ganlane.settings.generator import HumanConfig
 from ganlane.sim.state import Road, Vehicles
 
@@ -90,29 +91,20 @@ def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memo
     soon = torch.minimum(torch.maximum(soon, lane - 1), lane + 1)
     zero = torch.zeros_like(x)
     accelerations = torch.stack((now[..., 1], now[..., 2], *[zero] * (ACCELERATIONS - 2)), -1)
-    vehicles = Vehicles(
-        x=x,
-        y=y,
-        heading=zero,
-        speed=speed,
+    vehicles = cars(
+        x,
+        y,
+        speed,
+        aside,
         acceleration=accelerations[..., 0],
         length=segments.length.clamp_min(1.0),
         width=zero + WIDTH_M,
         desired_speed=(speed + DESIRED_ABOVE_MPS).clamp(*DESIRED_MPS),
         target_lane=torch.where(leaving, soon, lane).long(),
-        visibility=torch.full_like(lane, int(Visibility.CENTRE)).long(),
         valid=segments.present[:, PRESENT],
     )
-    vehicles = with_velocity(vehicles, speed, aside)
-    none = torch.stack((zero, zero), -1)
-    memory = Memory(
-        accelerations,
-        torch.stack((now[..., 4], now[..., 4]), -1),
-        none,
-        torch.stack((zero, zero, zero), -1),
-        torch.where(whole, trust(nine), 0.0),
-        zero + LONG_AGO,
-    )
+    lateral = torch.stack((now[..., 4], now[..., 4]), -1)
+    memory = memory_of(accelerations, lateral, torch.where(whole, trust(nine), 0.0))
     view = perceive(vehicles, memory, road)
     memory = memory._replace(closing=torch.stack((view.closing, view.closing), -1))
     return vehicles, with_style(memory, view, torch.ones_like(whole)), road

@@ -8,7 +8,7 @@ first, since a camera's noise is no driver's wish (docs/generators.md).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
@@ -25,6 +25,7 @@ from ganlane.generator.human import (
     DECISION_S,
     HARDEST_BRAKING,
     LATERAL_SPEEDS,
+    LONG_AGO,
     STEPS,
     STRONGEST_ACCELERATION,
     HumanPolicy,
@@ -32,7 +33,9 @@ from ganlane.generator.human import (
     Memory,
     View,
     bounded,
+    cars,
     lane_choice,
+    memory_of,
     moved,
     perceive,
     remembered,
@@ -43,7 +46,6 @@ from ganlane.generator.human import (
 from ganlane.generator.human_estimator import Estimator, trust
 from ganlane.generator.windows import OBSERVED_POSITIONS, side_by_side
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.settings.driving import Visibility
 from ganlane.sim.state import Road, Vehicles
 
 #: Frames before the present that a segment holds, for the drivers' memory.
@@ -320,32 +322,19 @@ def recorded(segments: Segments, decision: int) -> tuple[Vehicles, Memory]:
         )
         for past in range(1, LATERAL_SPEEDS + 1)
     ]
-    vehicles = Vehicles(
-        x=s.x[:, now],
-        y=s.y[:, now],
-        heading=zero,
-        speed=s.speed[:, now],
+    vehicles = cars(
+        s.x[:, now],
+        s.y[:, now],
+        s.speed[:, now],
+        s.lateral_speed[:, now],
         acceleration=accelerations[0],
         length=s.length,
         width=s.width,
         desired_speed=zero,
         target_lane=s.target[:, now],
-        visibility=torch.full_like(s.target[:, now], int(Visibility.CENTRE)),
         valid=present,
     )
-    vehicles = with_velocity(vehicles, s.speed[:, now], s.lateral_speed[:, now])
-    return vehicles, Memory(
-        torch.stack(accelerations, -1),
-        torch.stack(lateral, -1),
-        torch.stack((zero, zero), -1),
-        torch.stack((zero, zero, zero), -1),
-        age,
-        zero + LONG_AGO,
-    )
-
-
-#: Decisions since the last lane change of a driver whose last one was not recorded.
-LONG_AGO = 6.0
+    return vehicles, memory_of(torch.stack(accelerations, -1), torch.stack(lateral, -1), age)
 
 
 class Samples(NamedTuple):
@@ -490,6 +479,20 @@ def varied(segments: Segments, options: Options, random: torch.Generator) -> Seg
     if options.scale:
         s = s.scaled(1.0 + options.scale * torch.rand((rows, 1), generator=random))
     return s
+
+
+def draws(
+    shape: tuple[int, ...], random: torch.Generator
+) -> tuple[Callable[..., Tensor], Callable[..., Tensor]]:
+    """Uniform and standard normal numbers, of this shape or of another that is asked for."""
+
+    def rand(*size: int) -> Tensor:
+        return torch.rand(size or shape, generator=random)
+
+    def randn(*size: int) -> Tensor:
+        return torch.randn(size or shape, generator=random)
+
+    return rand, randn
 
 
 def _rand(random: torch.Generator) -> Tensor:

@@ -27,20 +27,25 @@ from ganlane.generator.human import (
     LaneChoice,
     Memory,
     bounded,
+    cars,
     heading_for,
     lane_choice,
     layers,
     look,
+    memory_of,
     moved,
     new_target,
     perceive,
     remembered,
     velocity,
     with_style,
-    with_velocity,
 )
-from ganlane.generator.human_samples import DESIRED_MPS, LONG_AGO, Samples, keeping_choice
-from ganlane.settings.driving import Visibility
+from ganlane.generator.human_samples import (
+    DESIRED_MPS,
+    Samples,
+    draws,
+    keeping_choice,
+)
 from ganlane.settings.generator import HumanConfig
 from ganlane.sim.state import Road, Vehicles
 
@@ -326,11 +331,7 @@ def random_scenes(random: torch.Generator) -> tuple[Vehicles, Memory, Road]:
     """Scenes of 2 to 5 lanes, 3 to 28 m/s, people's headways, dense and sparse."""
     shape = (SCENES, VEHICLES)
 
-    def rand(*size: int) -> Tensor:
-        return torch.rand(size or shape, generator=random)
-
-    def randn(*size: int) -> Tensor:
-        return torch.randn(size or shape, generator=random)
+    rand, randn = draws(shape, random)
 
     lanes = torch.randint(2, 6, (SCENES, 1), generator=random).float()
     lanes = torch.where(rand(SCENES, 1) < 0.4, 3.0, lanes)
@@ -349,20 +350,17 @@ def random_scenes(random: torch.Generator) -> tuple[Vehicles, Memory, Road]:
         x = torch.where(here, behind, x)
     desired = torch.where(rand(SCENES, 1) < 0.5, speed + 10.0 * rand(), 18.0 + 8.0 * rand())
     zero = torch.zeros(shape)
-    vehicles = Vehicles(
-        x=x - 0.5 * length,
-        y=lane * road.lane_width_m + 0.25 * randn().clamp(-2.0, 2.0),
-        heading=zero,
-        speed=speed,
+    vehicles = cars(
+        x - 0.5 * length,
+        lane * road.lane_width_m + 0.25 * randn().clamp(-2.0, 2.0),
+        speed,
+        zero,
         acceleration=zero,
         length=length,
         width=zero + 1.9,
         desired_speed=desired.clamp(*DESIRED_MPS),
         target_lane=lane.long(),
-        visibility=torch.full(shape, int(Visibility.CENTRE)),
-        valid=zero == 0,
     )
-    vehicles = with_velocity(vehicles, speed, zero)
     memory = entering_memory(vehicles, road, randn())
     return vehicles, memory, road
 
@@ -375,14 +373,8 @@ def entering_memory(vehicles: Vehicles, road: Road, drawn: Tensor) -> Memory:
     """
     zero = torch.zeros_like(vehicles.x)
     _, lateral = velocity(vehicles)
-    memory = Memory(
-        zero[..., None].repeat(1, 1, ACCELERATIONS),
-        torch.stack((lateral, lateral), -1),
-        torch.stack((zero, zero), -1),
-        torch.stack((zero, zero, zero), -1),
-        zero,
-        zero + LONG_AGO,
-    )
+    steady = zero[..., None].repeat(1, 1, ACCELERATIONS)
+    memory = memory_of(steady, torch.stack((lateral, lateral), -1), zero)
     view = perceive(vehicles, memory, road)
     log_headway = math.log(1.4) + 0.35 * drawn
     view = view._replace(

@@ -96,7 +96,6 @@ class RealismConfig(CpuConfig):
             are there.
         resamples: of the bootstrap over scenes.
         quick: true: a check that it runs, in seconds.
-        publish: true (maintainers): write the histograms that ship from these recordings.
     """
 
     traffic: TrafficConfig = field(default_factory=IdmMobilTrafficConfig)
@@ -116,7 +115,6 @@ class RealismConfig(CpuConfig):
     i80: bool | None = None
     resamples: Annotated[int, between(100, 100_000)] = 2000
     quick: bool = False
-    publish: bool = False
     env: EnvConfig = field(default_factory=EnvConfig)
     data: DataConfig = field(default_factory=DataConfig)
 
@@ -137,12 +135,6 @@ class RealismConfig(CpuConfig):
                 f"data={self.data.format}: the card reads scenes; run ganlane prepare "
                 f"data={self.data.format} first, "
                 "and give data=scenes data.path=FOLDER with what it wrote."
-            )
-        # Histograms of some scenes would not stand for the recordings.
-        if self.publish and self.scenes != "all":
-            raise UserError(
-                "publish=true: the file that ships is made from all recorded scenes; give "
-                "scenes=all."
             )
 
     def rivals(self) -> dict[str, TrafficConfig]:

@@ -132,7 +132,7 @@ class MixedTraffic(TrafficParts):
             self._rows = key, self.rows_of_parts(inputs[keys.EPISODE])
         for name, part, rows in self._rows[1]:
             memory = memory_of(memories, name)
-            taken = _take({**inputs, keys.TRAFFIC: memory}, rows)
+            taken = new_tensordict({**inputs, keys.TRAFFIC: memory}, len(key))[rows]
             before = taken.get(keys.VEHICLES)
             output = part(taken)
             # Vehicles are compared by name, since other parts have written into the others' rows.
@@ -178,17 +178,6 @@ class MixedTraffic(TrafficParts):
             "traffic=mixed: its memory begins with an episode's number; call enter() in place of "
             "this."
         )
-
-
-def _take(fields: Mapping[str, Any], rows: Tensor) -> TensorDict:
-    """``rows`` of tensors, or of TensorDicts of them, by name."""
-    taken: dict[str, Any] = {}
-    for name, field in fields.items():
-        if isinstance(field, Tensor):
-            taken[name] = field.index_select(0, rows)
-        else:
-            taken[name] = _take(field, rows)
-    return new_tensordict(taken, len(rows))
 
 
 def _zeros(

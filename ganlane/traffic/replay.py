@@ -22,6 +22,7 @@ from ganlane.data import (
     read_scenes,
     scene_lane_counts,
     scene_lane_widths,
+    tracks_of_frame,
 )
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, VEHICLE_FLOATS
@@ -48,25 +49,17 @@ HARD_BRAKING_MPS2 = -4.0
 LEAST_DESIRED_SPEED_MPS = 10.0
 
 
-def _with_tracks(frame: pl.DataFrame) -> pl.DataFrame:
+def _with_tracks(frame: pl.DataFrame, lane_widths: dict[str, float]) -> pl.DataFrame:
     """The samples with their ``index`` and their track's ``first`` and ``last`` one.
 
     ``fastest`` is its highest speed. A missing frame ends a track.
     """
-    # Samples are sorted by scene, vehicle and frame.
-    goes_on = (pl.col("frame").diff() == 1) & (pl.col("vehicle").diff() == 0)
-    same_scene = pl.col("scene") == pl.col("scene").shift(1)
-    # The first row has none before it and is null: a beginning, too.
-    begins = ~(goes_on & same_scene).fill_null(False)
-    index = pl.col("index")
+    tracks = tracks_of_frame(frame, lane_widths)
     return frame.with_columns(
         index=pl.int_range(pl.len(), dtype=pl.Int64),
-        track=begins.cum_sum(),
-    ).with_columns(
-        first=index.min().over("track"),
-        last=index.max().over("track"),
-        fastest=pl.col("speed").max().over("track"),
-    )
+        first=pl.Series(tracks.first),
+        last=pl.Series(tracks.last),
+    ).with_columns(fastest=pl.col("speed").max().over("first"))
 
 
 def _motion(samples: pl.DataFrame) -> Tensor:
@@ -190,7 +183,8 @@ class ReplayTraffic(TrafficModule):
     ) -> None:
         self.source = "recordings" if recordings is not None else str(path or _default_path())
         frame = read_scenes(self.source) if recordings is None else recordings
-        samples = _with_tracks(frame)
+        widths = scene_lane_widths(frame)
+        samples = _with_tracks(frame, widths)
         starts, table = _starts(samples, round(least_s / FRAME_S))
         if len(starts) == 0:
             raise UserError(
@@ -204,7 +198,6 @@ class ReplayTraffic(TrafficModule):
             return_counts=True,
         )
         scene_names = tuple(names.tolist())
-        widths = scene_lane_widths(frame)
         counts = scene_lane_counts(frame)
         lanes = torch.tensor([counts[name] for name in scene_names])
         width_m = torch.tensor(

@@ -26,8 +26,9 @@ import numpy.typing as npt
 
 from ganlane.files import write_bytes
 from ganlane.keys import PHYSICS_STEP_S
+from ganlane.settings.actions import LANE, NUMBERED
 from ganlane.settings.render import FilmConfig
-from ganlane.view.record import ACTION_NAMES, FloatArray, Trajectory
+from ganlane.view.record import FloatArray, Trajectory
 
 #: Units of series: s, m, m, rad, m/s, m/s2, m/s3.
 UNITS = dict(
@@ -163,7 +164,7 @@ def episode_data(trajectory: Trajectory, start_s: float = 0.0) -> dict[str, Any]
         "action_values": (
             [steps(row) for row in t.action_values[under_way].T] if knows_values else []
         ),
-        "action_names": list(ACTION_NAMES),
+        "action_names": list(NUMBERED[LANE]),
         "comfort": {
             "rms_acceleration": round(float(np.sqrt(np.mean(acceleration**2))), 3),
             "rms_jerk": round(float(np.sqrt(np.mean(jerk**2))), 3),

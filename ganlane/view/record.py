@@ -27,21 +27,8 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
-ACTION_NAMES = ("keep", "left", "right")
 #: A vehicle that moves further than this in a physics step was recycled (placed elsewhere), m.
 JUMP_M = 30.0
-#: Fields of ``vehicles`` that a trajectory keeps.
-_FIELDS = (
-    "x",
-    "y",
-    "heading",
-    "speed",
-    "acceleration",
-    "length",
-    "width",
-    "target_lane",
-    "valid",
-)
 
 
 @dataclass(frozen=True)
@@ -130,6 +117,10 @@ class Trajectory:
             if name not in ("label", "outcome", "soft_crash_s")
         }
         return replace(self, **later)
+
+
+#: Fields of ``vehicles`` that a trajectory keeps.
+_FIELDS = tuple(name for name in keys.VEHICLE_FIELDS if name in Trajectory.__annotations__)
 
 
 @dataclass

@@ -78,15 +78,15 @@ def test_the_size_of_a_block_changes_nothing(
     [
         (
             ["1,2,3", "4,5", "7,8,9"],
-            r"line 3, column b: the row ends after 2 of 3 fields",
+            r"line 3, column b: the row has 2 fields, expected 3",
         ),
         (
             ["1,2,3", "4,5,6,6", "7,8,9"],
-            r"line 3: 4 fields, expected 3",
+            r"line 3, column c: the row has 4 fields, expected 3",
         ),
         (
             ["1,2,3", "4,1,234.5,6", "7,8,9"],
-            r"line 3: 4 fields, expected 3",
+            r"line 3, column c: the row has 4 fields, expected 3",
         ),
         (
             ["1,2,3", "", "7,8,9"],
@@ -98,7 +98,7 @@ def test_the_size_of_a_block_changes_nothing(
         ),
         (
             ["1,2,3", "4,5,6", "7,8"],
-            r"line 4, column b: the row ends after 2 of 3 fields",
+            r"line 4, column b: the row has 2 fields, expected 3",
         ),
         (
             ["1,2,3", "4,5,\xff\xfe"],

@@ -13,15 +13,11 @@ from reference.recordings import following_file
 from reference.scene_csv import write_scene_csv
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-from ganlane.commands import realism as command
 from ganlane.config.run import run_command
 from ganlane.realism.measures import (
     QUANTITIES,
-    SHIPPED_REFERENCE,
-    Reference,
 )
 from ganlane.realism.sheets import card_text
-from ganlane.settings.recordings import RealismConfig
 
 main = partial(run_command, "realism")
 
@@ -186,7 +182,6 @@ def test_a_users_own_traffic_gets_a_card_and_one_of_i80_beside_the_scenes(record
         (["traffic=replay"], "recordings themselves"),
         (["data=ngsim"], "ganlane prepare"),
         (["i80=true"], "i80=true"),
-        (["publish=true"], "scenes=all"),
         (["scenes=some"], "held_out, all"),
         (["device=cuda"], "device=cuda"),
         (
@@ -214,29 +209,6 @@ def test_mistakes_are_told_in_a_sentence_and_leave_nothing(
     assert part in err
     assert "Traceback" not in err
     assert sorted(path.name for path in tmp_path.iterdir()) == before
-
-
-def test_the_file_that_ships_is_written_on_request_alone(recordings, capsys, monkeypatch, tmp_path):
-    assert not RealismConfig().publish
-    # The file in the package must not change in a test.
-    there = tmp_path / "shipped.json"
-    before = SHIPPED_REFERENCE.read_bytes()
-    monkeypatch.setattr(command, "SHIPPED_REFERENCE", there)
-    arguments = [
-        "against=[]",
-        "vehicle_km=0",
-        "scenes=all",
-        "publish=true",
-    ]
-    status, _, _, _ = run(
-        capsys,
-        "traffic=idm",
-        f"data.path={recordings}",
-        *arguments,
-    )
-    assert status == 0
-    assert Reference.load(there).source == "scenes.csv"
-    assert SHIPPED_REFERENCE.read_bytes() == before
 
 
 def test_one_scene_is_refused_with_what_to_do_and_driven_whole_when_asked(recordings, capsys):

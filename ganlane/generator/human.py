@@ -202,6 +202,7 @@ def see(vehicles: Vehicles, road: Road) -> tuple[Tensor, Near, Near]:
     lane = road.lane_of(vehicles.y)
     soon = road.lane_of(vehicles.y + ANTICIPATION_S * aside)
     soon = torch.minimum(torch.maximum(soon, lane - 1), lane + 1)
+    # Who changes lanes is in both; absent vehicles are in none.
     nowhere = torch.where(vehicles.valid, 0.0, torch.inf)
     presence = LaneRange(torch.minimum(lane, soon) + nowhere, torch.maximum(lane, soon))
     scene = scene_of(vehicles, road)._replace(presence=presence)

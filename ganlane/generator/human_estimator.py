@@ -55,6 +55,7 @@ class Estimator(nn.Module):
         ]
         out = self.layers(torch.cat(inputs, -1))
         scale = torch.tensor([1.0, 1.0, 1.0, 0.3, 0.3, 0.1, 0.1])
+        # The network corrects the mean speeds along and across.
         level = torch.zeros_like(out)
         level[..., 0] = mean[..., 0, 0]
         level[..., 3:5] = mean[..., 0, 1:2]
@@ -123,6 +124,7 @@ def fit_estimator(
         draw = torch.rand((BATCH, 1, 1), generator=random)
         noise = torch.where(draw < 0.25, 0.0, torch.where(draw < 0.65, 1.0, noise))
         positions = smooth[rows] + noise * (raw[rows] - smooth[rows])
+        # The last two numbers are the error of the last position.
         wanted = motion[rows].clone()
         wanted[:, 5:] -= positions[:, -1]
         side = torch.where(torch.rand(BATCH, generator=random) < 0.5, -1.0, 1.0)

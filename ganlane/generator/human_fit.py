@@ -105,36 +105,27 @@ def fit_human(
     # Networks draw their first weights from torch's own generator, which stays the caller's.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        return _fitted(config, recordings, following, report)
+        random = torch.Generator().manual_seed(config.seed)
+        model = HumanModel(config.sizes)
+        cutoffs = config.cutoff_hz, config.lateral_cutoff_hz
+        scenes = [smooth_scene(recording, *cutoffs) for recording in recordings]
+        fit_estimator(model.estimator, scenes, random)
+        if config.following:
+            scenes += [smooth_scene(one, *cutoffs, ONE_LANE_WEIGHT) for one in following]
+        material = material_of(scenes, random)
+        steps = 1 + config.rounds + config.tuning
+        # Lane changes are few: none of them is hidden, as the sides are from some of the moves.
+        choices = _gathered(material, Options(blind=0.0), config, random, times=2)
+        teacher = clone(model.policy, material, choices, config, random)
+        report(1, steps, None)
 
-
-def _fitted(
-    config: HumanConfig,
-    recordings: Sequence[Recording],
-    following: Sequence[Recording],
-    report: Report,
-) -> HumanModel:
-    random = torch.Generator().manual_seed(config.seed)
-    model = HumanModel(config.sizes)
-    cutoffs = config.cutoff_hz, config.lateral_cutoff_hz
-    scenes = [smooth_scene(recording, *cutoffs) for recording in recordings]
-    fit_estimator(model.estimator, scenes, random)
-    if config.following:
-        scenes += [smooth_scene(one, *cutoffs, ONE_LANE_WEIGHT) for one in following]
-    material = material_of(scenes, random)
-    steps = 1 + config.rounds + config.tuning
-    # Lane changes are few: none of them is hidden, as the sides are from some of the moves.
-    choices = _gathered(material, Options(blind=0.0), config, random, times=2)
-    teacher = clone(model.policy, material, choices, config, random)
-    report(1, steps, None)
-
-    for number in close_the_loop(model, material, teacher, config, random):
-        report(1 + number, steps, None)
-    tuning = tune(model.policy, choices, material.danger, config, random)
-    for number, cost in enumerate(tuning, start=2 + config.rounds):
-        report(number, steps, cost)
-    match_rate(model.policy, choices)
-    return model.eval().requires_grad_(False)
+        for number in close_the_loop(model, material, teacher, config, random):
+            report(1 + number, steps, None)
+        tuning = tune(model.policy, choices, material.danger, config, random)
+        for number, cost in enumerate(tuning, start=2 + config.rounds):
+            report(number, steps, cost)
+        match_rate(model.policy, choices)
+        return model.eval().requires_grad_(False)
 
 
 def clone(
@@ -171,6 +162,7 @@ def close_the_loop(
     options = Options(model.policy, samples=config.samples)
     noisy = options._replace(estimator=model.estimator)
     for number in range(config.rounds):
+        # Long stretches begin as recorded, short ones as nine noisy positions show drivers.
         parts = _gathered(material, options, config, random, times=2)
         short = samples_of(material.short, noisy, random)
         bank = [*bank[-1:], _moves(joined([parts, short]), slice(None))]

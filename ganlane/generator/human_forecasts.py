@@ -86,6 +86,7 @@ def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memo
     road = Road(segments.lanes.float(), segments.lane_width)
     x, y = last[..., 0] + now[..., 5], last[..., 1] + now[..., 6]
     lane = road.lane_of(y)
+    # Who moves away from its lane's centre is on its way to the next lane.
     leaving = (aside.abs() > CHANGING_MPS) & ((y - lane * road.lane_width_m) * aside > 0.1)
     soon = road.lane_of(y + 1.5 * aside)
     soon = torch.minimum(torch.maximum(soon, lane - 1), lane + 1)
@@ -139,6 +140,7 @@ def _driven(
     policy = model.policy
     runs, rows = 1 + samples, len(segments.positions)
     vehicles, memory, road = present_of(model.estimator, segments.repeated(runs))
+    # The first copy of the segments makes the expected moves, the others draw theirs.
     mean = torch.zeros_like(vehicles.valid)
     mean[:rows] = True
     view = perceive(vehicles, memory, road)
@@ -160,6 +162,7 @@ def _driven(
             u = torch.rand(mean.shape, generator=random)
             drawn = tokens.sample(logits, u, temperature)
             changes.append(torch.where(mean, tokens.mean(logits), drawn))
+        # A policy that sees no leader would speed up.
         fading = (LEFT_OF_ACCELERATION - 1.0) * memory.accelerations[..., 0]
         changes[0] = torch.where(leads, fading, changes[0])
         acceleration, aside = bounded(vehicles, memory, road, *changes)

@@ -392,6 +392,7 @@ def _samples(segments: Segments, options: Options, random: torch.Generator) -> S
     top = torch.where(s.present, s.speed, 0.0).amax(1)
     above = DESIRED_ABOVE_MPS * torch.rand(top.shape, generator=random)
     desired = (top + above).clamp(*DESIRED_MPS)
+    # A policy for single lanes, too, has to do without the sides now and then.
     sides_seen = not (options.blind and float(_rand(random)) < options.blind)
     vehicles, memory = recorded(s, 0)
     vehicles = vehicles.with_(desired_speed=desired, valid=torch.zeros_like(vehicles.valid))
@@ -416,6 +417,7 @@ def _samples(segments: Segments, options: Options, random: torch.Generator) -> S
         closing = torch.where(first[..., None], view.closing[..., None], memory.closing)
         memory = with_style(memory._replace(closing=closing), view, first)
         view = perceive(vehicles, memory, s.road, sides_seen)
+        # What should follow: the recorded move, corrected towards the recording.
         change, aside = _led_back(s, now, vehicles, memory)
         follows = s.present[:, now + STEPS] & present & s.driven
         # A driver that has just come knows no acceleration of its own yet.
@@ -424,6 +426,7 @@ def _samples(segments: Segments, options: Options, random: torch.Generator) -> S
         parts.append(
             _at_decision(s, vehicles, view, counts, follows, change, aside, following_target)
         )
+        # In closed loop the policy makes the move itself, so that it sees its own mistakes.
         if options.policy is not None:
             change, aside = _nearest_move(options, view, change, aside, random)
             aside = torch.where(s.two_dimensional, aside, 0.0)
@@ -553,6 +556,7 @@ def _at_decision(
     """The samples of one decision."""
     weight = s.weight.expand_as(vehicles.x)
     lateral_weight = weight * s.two_dimensional
+    # A change begins at the decision after which the target lane is another one.
     choice = lane_choice(vehicles, view)
     step = following_target - vehicles.target_lane
     begins = torch.stack((step == 1, step == -1), -1)

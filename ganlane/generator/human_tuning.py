@@ -116,6 +116,7 @@ def tune(
     )
     recorded = begins_per_decision(teacher)
     for number in range(config.tuning):
+        # A warm-up of five iterations, then linearly down to a fifth.
         rise, fall = min(1.0, (number + 1) / 5), 1.0 - 0.8 * number / config.tuning
         optimizer.param_groups[0]["lr"] = RATE * rise * fall
         decisions = drive(policy, critic, random)
@@ -128,9 +129,11 @@ def tune(
                 part = flat.rows(rows)
                 loss = _policy_loss(policy, reference, part, advantage[rows], config.pull)
                 loss = loss + smooth_l1_loss(_values(critic, part), wanted[rows])
+                # Recordings without a lane change say nothing about their rate.
                 if recorded > 0.0:
                     off = _rate_loss(policy, part, teacher, recorded, random)
                     loss = loss + RATE_PULL * off
+                # Nobody begins a change into danger, and who is in one breaks it off.
                 shown = danger[torch.randint(len(danger), (512,), generator=random)]
                 lane = policy.lane(shown)
                 loss = loss + RATE_PULL * softplus(lane[:, 0] + 10.0).mean()
@@ -158,6 +161,7 @@ def advantages(decisions: Decisions) -> tuple[Tensor, Tensor]:
     advantage = torch.zeros_like(reward)
     following = value[-1]
     last = torch.zeros_like(following)
+    # Backwards in time: an advantage holds the errors that follow, discounted.
     for step in reversed(range(len(reward))):
         goes_on = decisions.goes_on[step].to(reward.dtype)
         error = reward[step] + GAMMA * goes_on * following - value[step]
@@ -282,6 +286,7 @@ def costs(vehicles: Vehicles, road: Road, gap: Tensor) -> tuple[Tensor, Tensor]:
     ``gap`` is that to the leader before the decision, m.
     """
     speed, lateral = velocity(vehicles)
+    # Pairs [N, M, M]: the last index is the other vehicle.
     along = vehicles.x[:, None, :] - vehicles.x[:, :, None]
     across = vehicles.y[:, None, :] - vehicles.y[:, :, None]
     count = vehicles.x.shape[1]

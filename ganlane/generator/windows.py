@@ -8,7 +8,7 @@ would carry the future into the past.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -205,11 +205,6 @@ class Windows:
         return len(self.start)
 
     @property
-    def by_scene(self) -> dict[str, np.ndarray]:
-        """Masks [W] of the windows of each scene, by name."""
-        return {str(name): self.scene == name for name in np.unique(self.scene)}
-
-    @property
     def future(self) -> np.ndarray:
         """Recorded positions [W, T, 2] after the present, relative to it, m."""
         return self.positions[:, OBSERVED_POSITIONS:] - self.positions[:, PRESENT : PRESENT + 1]
@@ -218,14 +213,6 @@ class Windows:
     def past(self) -> np.ndarray:
         """Observed displacements [W, 8, 2], m per 0.1 s."""
         return np.diff(self.positions[:, :OBSERVED_POSITIONS], axis=1)
-
-
-def join_windows(parts: list[Windows]) -> Windows:
-    """All windows of ``parts`` in order."""
-    names = [field.name for field in fields(Windows)]
-    return Windows(
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    )
 
 
 def _present_throughout(scene: Recording, frames: int) -> np.ndarray:
@@ -259,14 +246,9 @@ def cut_windows(
         start, vehicle = np.nonzero(_present_throughout(scene, frames)[::stride])
         # From rows of the thinned list back to rows of the scene.
         start *= stride
-        part = Windows(
-            positions=scene.positions[start[:, None] + np.arange(frames), vehicle[:, None]],
-            scene=np.full(len(start), scene.name),
-            start=start,
-            vehicle=vehicle,
-        )
-        parts.append(part)
-    windows = join_windows(parts)
+        positions = scene.positions[start[:, None] + np.arange(frames), vehicle[:, None]]
+        parts.append((positions, np.full(len(start), scene.name), start, vehicle))
+    windows = Windows(*map(np.concatenate, zip(*parts)))
     if not len(windows):
         raise UserError(
             f"recordings: no vehicle is present for {frames} frames in a row; "

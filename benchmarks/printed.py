@@ -16,6 +16,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +28,9 @@ from ganlane.suite.report import PAPER_VI, PAPER_VII
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "reproduce" / "results.json"
 #: Folders below it with further results: ``ganlane benchmark`` with the control trainings,
-#: agent_general over more episodes and on traffics that are not the project's own; other roads and
-#: ablations are of scripts of revision 878329b.
-FURTHER = ("controls", "general", "roads", "elsewhere", "ablations")
+#: agent_general over more episodes and on traffics that are not the project's own, and the missions
+#: (suite=exit-v1 and merge-v1); other roads and ablations are of scripts of revision 878329b.
+FURTHER = ("controls", "general", "roads", "elsewhere", "ablations", "exit", "merge")
 #: Driver of the matrix to its name in a document, and the traffics that it was trained on.
 DRIVERS: Mapping[str, tuple[str, frozenset[str]]] = {
     "agent_general+safe": ("agent_general", frozenset({"idm", "idm_mobil", "idm_random", "gan"})),
@@ -80,6 +81,7 @@ CHECKED = (
     ("docs/drivers.md", "## Recordings, other simulators, individual drivers"),
     ("docs/drivers.md", "## What each part is worth"),
     ("docs/drivers.md", "## agent_general over trainings"),
+    ("docs/scenarios.md", "## Trained agents"),
 )
 _INTERVAL = re.compile(r"([-+]?\d+(?:\.\d+)?) \[(-?\d+(?:\.\d+)?), (-?\d+(?:\.\d+)?)\]")
 
@@ -320,6 +322,32 @@ def elsewhere(results: Results) -> str:
     return _by_traffic(part, "lead; crashes, departures", [episodes, *lines])
 
 
+def missions(results: Results, name: str) -> str:
+    """Drivers by traffics on a road with an exit or a lane that ends.
+
+    Lead over MOBIL (its mean reward); goals, crashes, missed exits and time-outs of all episodes,
+    in per cent; mean time until the goal, s.
+    """
+    part = results[name]
+
+    def cell(row: Row) -> str:
+        episodes = row["trainings"] * row["episodes"]
+        ends = ("goal", "hard_crash", "missed_exit", "timeout")
+        shares = ", ".join(f"{100 * row[end] / episodes:.1f}" for end in ends)
+        is_mobil = row["minus_mobil"] is None
+        lead = f"({row['mean_reward']:.1f})" if is_mobil else _lead(row, frozenset())
+        return f"{lead}; {shares}; {row['goal_s']:.0f}" if row["goal"] else f"{lead}; {shares}"
+
+    drivers = dict.fromkeys(row["driver"] for row in part["rows"])
+    # How random drivers and those without a mission end is told in a sentence.
+    shown = [driver for driver in drivers if driver not in ("random_legal", "keep_lane")]
+    lines = [
+        [f"`{driver}`", *(cell(_at(part, driver, traffic)) for traffic in _traffics(part))]
+        for driver in shown
+    ]
+    return _by_traffic(part, "lead; goal, crash, missed, time-out, %; s", lines)
+
+
 def ablations(results: Results) -> str:
     """Trainings with one thing changed by traffics.
 
@@ -353,6 +381,8 @@ SECTIONS: Mapping[tuple[str, str], Callable[[Results], str]] = {
     ("docs/drivers.md", "elsewhere"): elsewhere,
     ("docs/drivers.md", "ablations"): ablations,
     ("docs/drivers.md", "trainings"): trainings,
+    ("docs/scenarios.md", "exit"): partial(missions, name="exit"),
+    ("docs/scenarios.md", "merge"): partial(missions, name="merge"),
 }
 
 

@@ -75,7 +75,7 @@ def wheel(tmp_path_factory):
     return Path(path)
 
 
-def test_the_wheel_holds_configuration_weights_and_kernel_and_is_below_5_5_mb(wheel):
+def test_the_wheel_holds_configuration_weights_and_kernel_and_is_below_6_8_mb(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     conf = ROOT / "conf"
     inside = {f"ganlane/conf/{path.relative_to(conf)}" for path in conf.rglob("*.yaml")}
@@ -87,5 +87,5 @@ def test_the_wheel_holds_configuration_weights_and_kernel_and_is_below_5_5_mb(wh
     assert len(kernels) == 1
     assert not [name for name in names if name.startswith(("tests/", "outputs/"))]
     assert wheel.name.startswith(f"ganlane-{ganlane.__version__}-")
-    # Three agents of 1.5 MB are most of it.
-    assert wheel.stat().st_size < 5.5e6
+    # Four agents of 1.4 MB are most of it.
+    assert wheel.stat().st_size < 6.8e6

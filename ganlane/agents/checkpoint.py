@@ -27,7 +27,7 @@ from ganlane.settings.agent import RainbowConfig
 from ganlane.weights import load_weights, save_weights
 
 #: Agents that come with the package; others are given by their path.
-SHIPPED = ("agent_general", "agent_idm", "agent_gan")
+SHIPPED = ("agent_general", "agent_idm", "agent_gan", "agent_exit")
 #: Kind of a file with several agents.
 SEVERAL = "agents"
 #: What says which returns the outputs of a distributional network stand for.

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,8 +28,8 @@ from benchmarks.script import make_parser, run_script
 from ganlane import api
 from ganlane.config.run import LAST
 from ganlane.errors import UserError
-from ganlane.evaluation.statistics import Estimate, difference
-from ganlane.evaluation.table import Table
+from ganlane.evaluation.statistics import difference, entries
+from ganlane.evaluation.table import Table, with_interval
 
 #: Values of each property; what is not named is as fitted.
 DOSES: dict[str, tuple[Any, ...]] = {
@@ -125,13 +125,6 @@ def scores(folder: Path, training: Training, seeds: int) -> dict[str, npt.NDArra
     return {"reward": np.array(rewards), "failures": np.array(failures, np.float64)}
 
 
-def as_text(estimate: Estimate) -> str:
-    """A difference with its interval."""
-    if estimate.low is None or estimate.high is None:
-        return f"{estimate.value:+.1f}"
-    return f"{estimate.value:+.1f} [{estimate.low:+.1f}, {estimate.high:+.1f}]"
-
-
 def dose_table(folder: Path, seeds: int) -> str:
     """The table of all doses that were tried.
 
@@ -152,10 +145,10 @@ def dose_table(folder: Path, seeds: int) -> str:
                 changed = scores(folder, Training(mask, name, dose, 0), seeds)
                 if not changed:
                     continue
-                cells = [
-                    as_text(difference(changed[score], baseline[score]))
-                    for score in ("reward", "failures")
-                ]
+                cells = []
+                for score in ("reward", "failures"):
+                    row = entries(score, difference(changed[score], baseline[score]))
+                    cells.append(with_interval(row, score, 1))
                 rows.append([mask, name, str(dose), str(len(changed["reward"])), *cells])
     if not rows:
         raise UserError(f"--folder {folder}: no finished trainings; run 'train' first.")
@@ -167,18 +160,31 @@ def measure(arguments: argparse.Namespace) -> str:
     """Either of the two."""
     if arguments.action == "table":
         return dose_table(arguments.folder, arguments.seeds)
-    part, parts = (int(number) for number in arguments.part.split("/"))
+    part, parts = arguments.part
     return train(arguments.folder, arguments.seeds, part, parts)
 
 
-def main() -> int:
+def part_of_many(text: str) -> tuple[int, int]:
+    """``0/2`` is the first of two parts."""
+    part, parts = (int(number) for number in text.split("/"))
+    if not 0 <= part < parts:
+        raise ValueError
+    return part, parts
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
     """The script."""
     parser = make_parser(__doc__)
     parser.add_argument("action", choices=("train", "table"))
     parser.add_argument("--folder", type=Path, default=Path("outputs/dose"))
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--part", default="0/1", help="which part of how many, counted from 0")
-    return run_script(measure, parser.parse_args())
+    parser.add_argument(
+        "--part",
+        type=part_of_many,
+        default=(0, 1),
+        help="which part of how many, counted from 0: 0/2",
+    )
+    return run_script(measure, parser.parse_args(arguments))
 
 
 if __name__ == "__main__":

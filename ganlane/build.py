@@ -62,7 +62,8 @@ from ganlane.transforms import (
 
 def make_road(env: EnvConfig) -> Road:
     """The road of an environment."""
-    return Road(env.lanes, env.lane_width_m, stretches=env.stretches())
+    flow = env.flow if env.flow.is_on else None
+    return Road(env.lanes, env.lane_width_m, stretches=env.stretches(), flow=flow)
 
 
 def make_highways(config: HighwayConfig) -> TransformedHighway:

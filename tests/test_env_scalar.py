@@ -13,6 +13,7 @@ from reference.worlds import (
     environment,
     packed,
     placed,
+    random_flow,
     random_stretches,
     rules_of,
     scalar_state,
@@ -29,19 +30,17 @@ MOTION = ("x", "y", "heading", "speed", "acceleration")
 
 
 def random_environment(
-    rng: random.Random,
-    rows: int,
-    ends: bool,
-    actions: str,
+    rng: random.Random, rows: int, ends: bool, actions: str, flow: bool
 ) -> HighwayEnv:
     """1 to 6 lanes, 2 to 20 vehicles, sparse to dense, with and without MOBIL, all outcomes.
 
-    With ``ends`` some lanes begin late and end at a wall.
+    With ``ends`` some lanes begin late and end at a wall; with ``flow`` vehicles enter and leave.
     """
     lanes = rng.randint(1, 6)
     vehicles = rng.randint(2, 20)
     spacing = rng.choice([8.0, 12.0, 25.0])
     spread = max(60.0, 1.5 * spacing * vehicles / lanes + spacing)
+    stretches = random_stretches(lanes, rng) if ends else ()
     return environment(
         lanes,
         rows,
@@ -53,7 +52,8 @@ def random_environment(
         abort=rng.random() < 0.3,
         spawn=packed(spread, spacing),
         seed=rng.randrange(10**9),
-        stretches=random_stretches(lanes, rng) if ends else (),
+        stretches=stretches,
+        flow=random_flow(stretches, rng) if flow else None,
         actions=ActionParameters(actions),
     )
 
@@ -117,19 +117,24 @@ def compare(
 ) -> set[str]:
     """Drive both simulators with the same random actions; compare states, events and memories.
 
-    Which ends and soft crashes there were.
+    Which ends and soft crashes there were, and whether anybody entered or left.
     """
     rules = rules_of(env)
     rows = env.batch_size[0]
     seen = set()
-    states = [scalar_state(td, row) for row in range(rows)]
+    states = [scalar_state(td, row, env) for row in range(rows)]
     running = [True] * rows
     for _ in range(round(duration_s / env.episode.decision_period_s)):
         actions = [choose(rng, state, rules.lanes) for state in states]
         td = step(env, td, actions)
         for row in range(rows):
             if running[row]:
+                before = [car.valid for car in states[row].cars]
                 outcome = scalar.decide(states[row], actions[row], rules)
+                pairs = zip(before, states[row].cars)
+                seen |= {
+                    "entered" if car.valid else "left" for was, car in pairs if was != car.valid
+                }
                 assert_same(td, row, states[row], outcome)
                 seen |= {*outcome.reasons}
                 seen |= {name for name in keys.EVENT_COUNTS if getattr(outcome, name)}
@@ -153,6 +158,7 @@ def assert_same(
             msg=name,
         )
     assert td[keys.VEHICLES, "target_lane"][row].tolist() == [car.target_lane for car in state.cars]
+    assert td[keys.VEHICLES, "valid"][row].tolist() == [car.valid for car in state.cars]
     assert td[keys.STEP][row] == state.step
     reasons = set(outcome.reasons)
     flags = {
@@ -185,12 +191,13 @@ def compare_random_scenes(
     seed: int,
     ends: bool,
     actions: str,
+    flow: bool = False,
 ) -> set[str]:
     rng = random.Random(seed)
     seen = set()
     generator = torch.Generator().manual_seed(seed)
     for block in range(scenes // rows):
-        env = random_environment(rng, rows, ends, actions)
+        env = random_environment(rng, rows, ends, actions, flow)
         td = env.reset()
         if block % 2:
             td = disturb(env, td, generator)
@@ -220,6 +227,11 @@ def test_the_tensor_code_agrees_with_the_scalar_one_on_random_scenes(
     )
     ways = {"out_of_road", "hard_crash", "goal", "timeout", *keys.EVENT_COUNTS}
     assert seen >= ways or actions != "lane"
+
+
+def test_where_vehicles_enter_and_leave_they_agree_too():
+    seen = compare_random_scenes(60, 4, 12.0, seed=3, ends=True, actions="lane", flow=True)
+    assert seen >= {"entered", "left"}
 
 
 def test_on_a_ring_they_agree_too():

@@ -45,6 +45,7 @@ from ganlane.settings.actions import CONTINUOUS, CONTROLS, LANE_SPEED, ActionPar
 from ganlane.settings.driving import EgoParameters, IdmParameters, Visibility
 from ganlane.settings.episode import KERNELS, EpisodeParameters, SpawnParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
+from ganlane.sim.flow import let_in_and_out
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.random import Purpose, episode_key, uniform
 from ganlane.sim.scenes import Scenes
@@ -413,6 +414,10 @@ class HighwayEnv(EnvBase):
             # In running rows with recycling those left behind are moved.
             recycled = recycle(vehicles, rules.road, rules.idm)
             vehicles = recycled.where(end.running & self._recycling_rows(key), vehicles)
+        if rules.road.flow is not None:
+            period_s = self.episode.decision_period_s
+            flowed = let_in_and_out(vehicles, rules.road, rules.idm, key, end.step, period_s)
+            vehicles = flowed.where(end.running, vehicles)
         return pack(
             vehicles,
             ego,
@@ -436,6 +441,9 @@ class HighwayEnv(EnvBase):
         if not self._must_be_native:
             say_once("env.kernel=auto: the native kernel")
         recycles = None
+        if self.road.flow is not None:
+            # In every row vehicles enter and leave.
+            recycles = torch.ones_like(state.get(keys.EPISODE), dtype=torch.bool)
         if self.recycle:
             key = episode_key(self.stream, state.get(keys.SEED), state.get(keys.EPISODE))
             recycles = self._recycling_rows(key)
@@ -466,7 +474,8 @@ class HighwayEnv(EnvBase):
         drivers = self.traffic.native_drivers()
         assert drivers is not None
         episode = replace(self.episode, decision_period_s=keys.PHYSICS_STEP_S)
-        # Steps of 0.1 s instead of a decision period; nothing else differs.
+        # Steps of 0.1 s instead of a decision period, after which nobody enters or leaves; nothing
+        # else differs.
         kernel = Kernel(
             self.road,
             self.vehicles,

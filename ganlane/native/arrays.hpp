@@ -27,7 +27,7 @@ struct Inputs {
     const int64_t *change_direction, *decisions, *lane_changes;
     const uint8_t *soft_crash, *soft_crash_behind;
     const int64_t* step;
-    const uint8_t* recycles;  // whether the row recycles its vehicles; null: none does
+    const uint8_t* recycles;  // whether vehicles of the row return, or enter and leave; null: in none
     const int64_t *seed, *episode;
     const float* controls;   // [rows, 2], acceleration and line, -1 to 1; null: there is `action`
     const float* set_speed;  // that the ego aims at; null: the desired one
@@ -47,6 +47,7 @@ struct Outputs {  // may be the same memory as the inputs
     int64_t *soft_crashes, *soft_crashes_behind;
     float* set_speed;
     uint8_t *done, *terminated, *truncated;
+    uint8_t* valid;  // null: nobody enters or leaves
 };
 
 struct Range {
@@ -58,6 +59,7 @@ struct Fixed {
     const float *x, *y, *speed, *length, *width, *desired_speed;
     const int64_t *target_lane, *visibility;
     float jitter_m, jitter_mps;
+    int32_t waiting;  // so many of the last ones are outside at the start
 };
 
 struct Spawn {  // Table II

@@ -135,6 +135,7 @@ class NativeBatch:
         env, reward, mask, form = config.env, config.reward, config.mask, config.observation.form
         episode, spawn, actions = env.episode_parameters(), env.spawn_parameters(), env.actions
         stretches = env.stretches()
+        flow = env.flow if env.flow.is_on else None
         stream = int(Stream.named(config.stream))
         self.rows = rows = config.num_envs
         self.lanes = env.lanes
@@ -147,7 +148,7 @@ class NativeBatch:
         self.bounds = (-1.0, largest_number(form, longest_m))
         # All arrays of the state in place, written by the kernel and read by whoever asks.
         self.state: dict[Key, npt.NDArray[Any]] = {}
-        layout = Layout(drivers.memory(), actions)
+        layout = Layout(drivers.memory(), actions, flow)
         for name, kind in layout.kinds.items():
             self.state[name] = np.zeros(layout.shape(name, rows, env.vehicles), kind)
         for name, kind in _ROW_ARRAYS.items():
@@ -195,14 +196,17 @@ class NativeBatch:
         self._turns = np.array(turns_of(drivers))
         self._parts = []
         for part in parts_of(drivers):
-            layout = Layout(part.memory, actions)
+            layout = Layout(part.memory, actions, flow)
             # Of several parts each drives the rows that are its own.
             row_list = np.zeros(rows, np.int64) if len(self._turns) > 1 else None
             # When others see the ego's lane changes, and the ego theirs.
             visible = (Visibility.named(env.ego.visibility), part.drivers.visibility)
             scene = env.scenes(part.drivers.visibility)
             recycle_share = env.recycle_share if env.recycle else None
-            numbers_of_part = (road, part.drivers, episode, env.ego, stretches, actions)
+            if flow is not None:
+                # In every episode vehicles enter and leave.
+                recycle_share = 1.0
+            numbers_of_part = (road, part.drivers, episode, env.ego, stretches, actions, flow)
             of_part = pointed | {
                 "settings": decision_settings(*numbers_of_part),
                 "inputs": self._pointers(layout.inputs, row_list),

@@ -30,6 +30,7 @@ from ganlane.native.settings import (
     ends_of,
     fields,
     filled,
+    flow_of,
 )
 from ganlane.settings.actions import ActionParameters
 from ganlane.settings.driving import (
@@ -67,7 +68,7 @@ from ganlane.settings.generator import (
     stored_sizes,
 )
 from ganlane.settings.record import part_of
-from ganlane.settings.road import Stretches
+from ganlane.settings.road import FlowParameters, Stretches
 from ganlane.settings.traffic import (
     GanCalibratedTrafficConfig,
     GanTrafficConfig,
@@ -376,11 +377,13 @@ def decision_settings(
     ego: EgoParameters | None = None,
     stretches: Stretches = (),
     actions: ActionParameters | None = None,
+    flow: FlowParameters | None = None,
 ) -> Settings:
     """The numbers of a decision: of road, driving and episode.
 
     ``shape`` is lanes, their width in m, and M, ``stretches`` where the lanes begin and end,
-    ``actions`` what the ego is commanded (None: lanes).
+    ``actions`` what the ego is commanded (None: lanes), ``flow`` who enters and leaves (None:
+    nobody).
     """
     episode = episode or EpisodeParameters()
     idm, steering = drivers.idm, drivers.steering
@@ -406,8 +409,9 @@ def decision_settings(
         "blind_share": drivers.blind_share,
     }
     pointed = drivers.structures() | ends_of(stretches, mobil) | actions_of(actions, episode)
+    pointed |= flow_of(flow, stretches, episode.decision_period_s, mobil)
     # ctypes has the addresses alone, so the structures are held beside them.
-    for name in ("generated", "human", "faults", "random", "ends", "actions"):
+    for name in ("generated", "human", "faults", "random", "ends", "actions", "flow"):
         numbers[name] = ctypes.addressof(pointed[name]) if name in pointed else None
     settings = filled(Settings, numbers)
     settings.pointed = list(pointed.values())
@@ -799,9 +803,9 @@ def _who_see(
     traffic: TrafficConfig, idm: IdmParameters, mobil: MobilParameters, stream: int
 ) -> Drivers | None:
     if type(traffic) is IdmTrafficConfig:
-        return RuleDrivers(idm)
+        return RuleDrivers(idm, stream=stream)
     if type(traffic) is IdmMobilTrafficConfig:
-        return RuleDrivers(idm, mobil=mobil)
+        return RuleDrivers(idm, mobil=mobil, stream=stream)
     if type(traffic) is IdmFaultsTrafficConfig:
         return faulty_drivers(RuleDrivers(idm, mobil=mobil), part_of(traffic, DriverFaults), stream)
     if type(traffic) is IdmRandomTrafficConfig:

@@ -444,7 +444,8 @@ static void decide_humans(const Settings& s, Rows& r, Humans& m, Mask due) {
     auto for_drivers = [&](auto of_vehicle) {
         int count = 0;
         for (int i = 0; i < r.vehicles; i++) {
-            Mask decides = due & ~is_ego(r, i) & (r.valid[i] != 0.0f);
+            Mask decides = due & ~is_ego(r, i);
+            if (!s.flow) decides &= r.valid[i] != 0.0f;  // who waits to enter drives on
             if (!any(decides)) continue;
             of_vehicle(i, decides, count);
             for (int lane = 0; lane < LANES; lane++) count += decides[lane] != 0;

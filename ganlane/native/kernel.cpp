@@ -137,13 +137,24 @@ static inline void note_events(const Settings& s, Rows& r, Float y_before) {
 
 // ---- Recycling: who is left far behind is put far ahead, and the reverse, where nobody has to brake hard for it
 
-// Whether vehicle i at `x` leaves room to vehicle j at `other`: none of the two brakes harder than is safe.
-INLINE Mask leaves_room(const Settings& s, const Rows& r, int i, Float x, int j, Float other, Mask tie_ahead) {
-    Float distance = other - x, bumpers = r.half_length[i] + r.half_length[j];
+// A vehicle at the place to which it may be put.
+struct Placed {
+    Float x, y, speed, per_desired, half_length, half_width, low, high, index;
+};
+
+// Whether it has nothing to do with vehicle j.
+INLINE Mask is_apart(const Rows& r, const Placed& p, int j) {
+    Mask beside = absolute(p.y - r.y[j]) < p.half_width + r.half_width[j] + RECYCLE_SIDE;
+    return ~((((p.low <= r.high[j]) & (r.low[j] <= p.high)) | beside) & (r.valid[j] != 0.0f));
+}
+
+// Whether it leaves room to vehicle j at `other`: none of the two brakes harder than is safe.
+INLINE Mask leaves_room(const Settings& s, const Rows& r, const Placed& p, int j, Float other, Mask tie_ahead) {
+    Float distance = other - p.x, bumpers = p.half_length + r.half_length[j];
     Mask ahead = (distance > 0.0f) | ((distance == 0.0f) & tie_ahead);
     Float gap = smaller(absolute(distance) - bumpers, filled(FREE_GAP));
-    Float behind_it = idm(s, r.speed[i], r.per_desired[i], gap, r.speed[j]);
-    Float before_it = idm(s, r.speed[j], r.per_desired[j], gap, r.speed[i]);
+    Float behind_it = idm(s, p.speed, p.per_desired, gap, r.speed[j]);
+    Float before_it = idm(s, r.speed[j], r.per_desired[j], gap, p.speed);
     return choose(ahead, behind_it, before_it) >= -RECYCLE_DECELERATION;
 }
 
@@ -163,17 +174,87 @@ static inline void recycle(const Settings& s, Rows& r, Mask rows) {
         Mask room = rows & (moved[i] != r.x[i]);
         r.kept[i] = r.x[i];
         if (!any(room)) continue;
+        Placed p = {moved[i], r.y[i], r.speed[i], r.per_desired[i], r.half_length[i], r.half_width[i], r.low[i], r.high[i], r.index[i]};
         for (int j = 0; j < r.vehicles; j++) {
-            Mask beside = absolute(r.y[i] - r.y[j]) < r.half_width[i] + r.half_width[j] + RECYCLE_SIDE;
-            Mask counts = (((r.low[i] <= r.high[j]) & (r.low[j] <= r.high[i])) | beside) & (r.valid[j] != 0.0f);
-            if (j == i || !any(counts & room)) continue;
+            Mask apart = is_apart(r, p, j);
+            if (j == i || !any(room & ~apart)) continue;
             // Everybody where it may be put, and where it is: whoever else moves, there is room.
-            room &= ~counts | (leaves_room(s, r, i, moved[i], j, moved[j], r.index[j] < r.index[i]) &
-                               leaves_room(s, r, i, moved[i], j, r.x[j], none()));
+            room &= apart | (leaves_room(s, r, p, j, moved[j], r.index[j] < p.index) & leaves_room(s, r, p, j, r.x[j], none()));
         }
         r.kept[i] = choose(room, moved[i], r.x[i]);
     }
     for (int i = 0; i < r.vehicles; i++) r.x[i] = r.kept[i];
+}
+
+// ---- Flow: who has passed the end of the section is out, and others come in (ganlane.sim.flow)
+
+// Whether the driver of a slot leaves by the exit.
+static inline bool leaves_by_exit(const Flow& f, int64_t slot) {
+    return (int64_t)__builtin_floor((double)slot * f.exit_share) > (int64_t)__builtin_floor((double)(slot - 1) * f.exit_share);
+}
+
+static inline void let_out(const Settings& s, Rows& r, Mask rows) {
+    int exit = s.ends->exit_lane;
+    for (int i = 0; i < r.vehicles; i++) {
+        Mask left = r.x[i] > s.flow->to;
+        if (exit >= 0) left |= (r.x[i] >= s.ends->end[exit]) & (lane_of(s, r.y[i]) == (float)exit);
+        r.valid[i] = choose(left & ~is_ego(r, i) & rows, filled(0.0f), r.valid[i]);
+    }
+}
+
+// Who comes into an entry where somebody arrives: one of those who wait, of a row; -1 where nobody does. As everywhere
+// its place in the row's order, not its index.
+static int who_comes(const Settings& s, const Rows& r, int lane, uint64_t at_step, bool exits) {
+    int comes = -1;
+    int64_t lowest = 0;
+    for (int i = 0; i < r.vehicles; i++) {
+        int64_t slot = (int64_t)at(r.index, i, lane);
+        float off = at(r.y, i, lane) - at(r.target, i, lane) * s.lane_width;
+        if (slot == 0 || at(r.valid, i, lane) != 0.0f || !((off < 0.0f ? -off : off) < ARRIVED)) continue;
+        int64_t number = (int64_t)(absorb(absorb(at_step, slot), FLOW_SLOT) >> 40);
+        if (s.flow->exit_share > 0.0 && s.ends->exit_lane >= 0 && leaves_by_exit(*s.flow, slot) != exits) number += 1 << 24;
+        bool lower = comes < 0 || number < lowest || (number == lowest && slot < (int64_t)at(r.index, comes, lane));
+        if (lower) comes = i, lowest = number;
+    }
+    return comes;
+}
+
+static void let_in(const Settings& s, Rows& r, Mask rows) {
+    const Flow& f = *s.flow;
+    // Entry by entry, so that nobody enters beside one who has just done so without room.
+    for (int entry = 0; entry < s.lanes; entry++) {
+        if (f.arrival[entry] == 0.0) continue;
+        int who[LANES];
+        Mask room = none();
+        Float zero = filled(0.0f), target = filled((float)entry), sine = zero, cosine = zero, visibility = zero;
+        Placed p = {filled(f.from), zero, zero, zero, zero, zero, zero, zero, zero};
+        for (int lane = 0; lane < LANES; lane++) {
+            uint64_t at_step = absorb(r.episode_key[lane], (int64_t)r.step[lane]), at_entry = absorb(at_step, entry);
+            if (!rows[lane] || !(fine_uniform_of(absorb(at_entry, FLOW_ARRIVAL)) < f.arrival[entry])) continue;
+            int i = who[lane] = who_comes(s, r, lane, at_step, fine_uniform_of(absorb(at_entry, FLOW_EXIT)) < f.exit_share);
+            if (i < 0) continue;
+            room[lane] = -1;
+            p.y[lane] = at(r.y, i, lane) + ((float)entry - at(r.target, i, lane)) * s.lane_width;
+            p.speed[lane] = at(r.speed, i, lane), p.per_desired[lane] = at(r.per_desired, i, lane);
+            p.half_length[lane] = at(r.half_length, i, lane), p.half_width[lane] = at(r.half_width, i, lane);
+            p.index[lane] = at(r.index, i, lane), visibility[lane] = at(r.visibility, i, lane);
+            sine[lane] = at(r.sine, i, lane), cosine[lane] = at(r.cosine, i, lane);
+        }
+        if (!any(room)) continue;
+        LanesOf l = lanes_of(s, p.y, sine, cosine, p.half_length, p.half_width, target, visibility, room);
+        p.low = l.low, p.high = l.high;
+        // Who waits, as the one who comes, is not valid and so in nobody's way.
+        for (int j = 0; j < r.vehicles; j++) {
+            Mask apart = is_apart(r, p, j);
+            if (any(room & ~apart)) room &= apart | leaves_room(s, r, p, j, r.x[j], r.index[j] < p.index);
+        }
+        for (int lane = 0; lane < LANES; lane++) {
+            if (!room[lane]) continue;
+            int i = who[lane];
+            at(r.x, i, lane) = f.from, at(r.y, i, lane) = p.y[lane], at(r.target, i, lane) = (float)entry;
+            at(r.low, i, lane) = p.low[lane], at(r.high, i, lane) = p.high[lane], at(r.valid, i, lane) = 1.0f;
+        }
+    }
 }
 
 // ---- A decision
@@ -326,10 +407,11 @@ static inline bool is_blind(const Settings& s, uint64_t episode) {
     if (s.blind_share == 0.0) return false;
     const int64_t ego = 0;
     uint64_t key = absorb(absorb(before_first_step(episode), ego), BLIND_EPISODE);
-    return (double)(key >> 11) * (1.0 / 9007199254740992.0) < s.blind_share;
+    return fine_uniform_of(key) < s.blind_share;
 }
 
 static void load(const Settings& s, const Inputs& in, Rows& r, const Block& block, Command* commands) {
+    bool exits = s.flow && s.flow->exit_share > 0.0 && s.ends->exit_lane >= 0;
     for (int lane = 0; lane < LANES; lane++) {
         long start = block.row[lane] * s.vehicles;
         for (int i = 0; i < s.vehicles; i++) at(r.x, i, lane) = in.x[start + i], at(r.index, i, lane) = (float)i;
@@ -361,6 +443,7 @@ static void load(const Settings& s, const Inputs& in, Rows& r, const Block& bloc
             at(r.target, i, lane) = (float)(index == 0 ? command.target : in.target_lane[from]);
             at(r.visibility, i, lane) = (float)in.visibility[from];
             at(r.valid, i, lane) = (float)(in.valid[from] != 0);
+            if (exits && leaves_by_exit(*s.flow, index) && in.valid[from]) at(r.valid, i, lane) = EXITS;
             at(r.steering, i, lane) = index == 0 ? in.ego_steering[row] : in.steering ? in.steering[from] : 0.0f;
         }
         r.line[lane] = command.line, r.pedal[lane] = command.pedal;
@@ -422,6 +505,7 @@ static void store(const Settings& s, const Inputs& in, Rows& r, const Outputs& o
             out.target_lane[to] = (int64_t)at(r.target, i, lane);
             if (out.steering) out.steering[to] = at(r.steering, i, lane);
             if (index == 0) out.ego_steering[row] = at(r.steering, i, lane);
+            if (out.valid) out.valid[to] = at(r.valid, i, lane) != 0.0f;
         }
         store_ego(s, in, r, out, row, lane, commands[lane]);
     }
@@ -487,7 +571,9 @@ extern "C" int ganlane_decide(const Settings* settings, const Inputs* in, const 
         if (in->recycles) {
             Mask recycles = none();
             for (int lane = 0; lane < block.count; lane++) recycles[lane] = in->recycles[block.row[lane]] ? -1 : 0;
-            recycle(s, r, recycles & r.running);
+            recycles &= r.running;
+            if (s.flow) let_out(s, r, recycles), let_in(s, r, recycles);
+            else recycle(s, r, recycles);
         }
         store_fields(fields, r, memory_of(out), block);
         store(s, *in, r, *out, block, commands);

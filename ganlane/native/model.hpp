@@ -13,6 +13,15 @@ struct Ends {
     int32_t exit_lane;  // that the ego has to leave the road by; -1: none
 };
 
+// Who enters a section of the road and leaves it (ganlane.sim.flow). `exit_by` and `exit_reach`: as `leave_by` and
+// `reach`, of drivers who leave by the exit.
+struct Flow {
+    double arrival[MOST_LANES];  // probability of one in a decision, of each lane
+    double exit_share;
+    float exit_by[MOST_LANES], exit_reach[MOST_LANES];
+    float from, to;
+};
+
 // What the ego is commanded beside lanes (ganlane.sim.actions): its speed, or acceleration and line.
 enum { LANE_SPEED, CONTINUOUS };
 struct Actions {
@@ -40,6 +49,7 @@ struct Settings {
     const struct Random* random;        // random_drivers.hpp; null: all drivers are alike
     const Ends* ends;                   // null: all lanes go on for ever
     const Actions* actions;             // null: the ego is commanded lanes alone
+    const Flow* flow;                   // null: nobody enters or leaves
 };
 
 // ---- Constants of the model (ganlane.sim)

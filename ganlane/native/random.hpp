@@ -20,10 +20,13 @@ static inline uint64_t before_first_step(uint64_t episode) { return absorb(absor
 
 static inline float uniform_of(uint64_t key) { return (float)(key >> 40) * (1.0f / 16777216.0f); }
 
+// With the 53 bits that float64 has.
+static inline double fine_uniform_of(uint64_t key) { return (double)(key >> 11) * (1.0 / 9007199254740992.0); }
+
 // Purpose of ganlane.sim.random.
 enum {
     SPAWN_LANE, SPAWN_POSITION, SPAWN_SPEED, SPAWN_DESIRED_SPEED,
     CHANGE_HAZARD = 5, CHANGE_SIDE, CHANGE_SPEED, SUDDEN_ACCELERATION, OWN_HEADWAY,
     FAULT = 11, LATE_REACTION, HESITANT_CHANGE, ABORTED_CHANGE,
-    NOISE = 16, BLIND_EPISODE = 69, DRIVER = 70, SPAWN_TRUCK = 90, RECYCLED_EPISODE = 91,
+    NOISE = 16, BLIND_EPISODE = 69, DRIVER = 70, SPAWN_TRUCK = 90, RECYCLED_EPISODE = 91, FLOW_ARRIVAL, FLOW_EXIT, FLOW_SLOT,
 };

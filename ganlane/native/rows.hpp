@@ -24,7 +24,8 @@ struct Nearest {
 
 struct Rows {
     int vehicles, memory_fields;  // how many of `memory` are used
-    // State, [vehicles]; `index` is the place in the arrays, the ego's is 0. Visibility, lanes and flags as floats.
+    // State, [vehicles]; `index` is the place in the arrays, the ego's is 0. Visibility, lanes and flags as floats;
+    // `valid` is EXITS of drivers who leave the road by its exit.
     Float *x, *y, *heading, *speed, *acceleration, *half_length, *half_width, *per_desired, *target, *visibility;
     Float *valid, *steering, *index;
     // Follows from the state: slip angle, heading's sine and cosine, lateral half extent; the lowest and highest lane
@@ -71,6 +72,8 @@ static void lay_out(Rows& rows, Float* scratch, const Settings& s) {
     for (int k = 0; k < rows.memory_fields; k++) rows.memory[k] = scratch, scratch += s.vehicles;
     rows.nearest = (Nearest*)scratch;
 }
+
+const float EXITS = 2.0f;  // a valid vehicle whose driver leaves the road by its exit
 
 INLINE Mask is_ego(const Rows& r, int i) { return r.index[i] == 0.0f; }
 
@@ -250,8 +253,13 @@ struct Mandatory {
 };
 
 INLINE Float urgency(const Settings& s, const Rows& r, int i, Float lane) {
-    Float distance = of_lane(s, s.ends->leave_by, lane, NOBODY_M) - r.x[i];
-    return between(1.0f - distance / of_lane(s, s.ends->reach, lane, 1.0f), 0.0f, 1.0f);
+    Float by = of_lane(s, s.ends->leave_by, lane, NOBODY_M), reach = of_lane(s, s.ends->reach, lane, 1.0f);
+    if (s.flow) {
+        Mask exits = r.valid[i] == EXITS;
+        by = choose(exits, of_lane(s, s.flow->exit_by, lane, NOBODY_M), by);
+        reach = choose(exits, of_lane(s, s.flow->exit_reach, lane, 1.0f), reach);
+    }
+    return between(1.0f - (by - r.x[i]) / reach, 0.0f, 1.0f);
 }
 
 static __attribute__((noinline)) Mandatory mandatory(const Settings& s, const Rows& r, int i, float side) {

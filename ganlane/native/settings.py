@@ -29,7 +29,14 @@ from ganlane.settings.observation import (
     ObservationScale,
     RewardParameters,
 )
-from ganlane.settings.road import FAR_M, WALL, Stretches, exit_lane, leaving
+from ganlane.settings.road import (
+    FAR_M,
+    WALL,
+    FlowParameters,
+    Stretches,
+    exit_lane,
+    leaving,
+)
 
 if TYPE_CHECKING:
     from ganlane.sim.scenes import FixedScene
@@ -79,6 +86,8 @@ EGO_ARRAYS: Final[dict[Key, str]] = {
 COUNTERS: Final[dict[Key, str]] = dict.fromkeys((keys.SEED, keys.EPISODE, keys.STEP), "int64")
 #: The speed that the ego aims at, where it is commanded.
 SET_SPEED: Final = (keys.EGO, keys.SET_SPEED)
+#: Who is on the road, which a decision changes where vehicles enter and leave.
+VALID: Final = (keys.VEHICLES, "valid")
 #: What goes into a decision, before the memory of generated drivers.
 INPUTS: Final = (
     keys.ACTION,
@@ -112,6 +121,7 @@ OUTPUTS: Final = (
     *(name for name in EVENT_ARRAYS if name not in keys.DONE_FLAGS),
     SET_SPEED,
     *keys.DONE_FLAGS,
+    VALID,
 )
 #: Fields of ``vehicles`` that no decision changes: the start of an episode sets them.
 SCENE: Final = _within(
@@ -146,7 +156,7 @@ def fields(kind: type, names: str) -> list[tuple[str, type]]:
 
 
 class Layout:
-    """The arrays of the state with drivers of this ``memory``.
+    """The arrays of the state with drivers of this ``memory``; ``flow``: who enters and leaves.
 
     Attributes:
         kinds: type of every array that the kernel reads or writes, by key.
@@ -155,7 +165,12 @@ class Layout:
         written: the outputs that are in ``kinds``.
     """
 
-    def __init__(self, memory: MemoryArrays, actions: ActionParameters | None = None) -> None:
+    def __init__(
+        self,
+        memory: MemoryArrays,
+        actions: ActionParameters | None = None,
+        flow: FlowParameters | None = None,
+    ) -> None:
         self.kinds: dict[Key, str] = {**VEHICLE_ARRAYS, **EGO_ARRAYS, **EVENT_ARRAYS, **COUNTERS}
         if actions is not None and actions.form == LANE_SPEED:
             self.kinds[SET_SPEED] = "float32"
@@ -166,6 +181,9 @@ class Layout:
         further = [name for name in memory if name != steering]
         self.inputs: list[Key] = [steering if name == STEERING else name for name in INPUTS]
         self.outputs: list[Key] = [steering if name == STEERING else name for name in OUTPUTS]
+        if flow is None:
+            # The place of no array: a null pointer.
+            self.outputs[self.outputs.index(VALID)] = "valid"
         self.inputs += further
         self.outputs += further
         self.written = [name for name in self.outputs if name in self.kinds]
@@ -191,7 +209,7 @@ class Settings(ctypes.Structure):
         *fields(c_int32, "lanes vehicles substeps timeout_steps mobil abort_lane_change"),
         *fields(c_int64, "stream"),
         *fields(c_double, "blind_share"),
-        *fields(c_void_p, "generated human faults random ends actions"),
+        *fields(c_void_p, "generated human faults random ends actions flow"),
     ]
 
     #: The structures that the last members point to, which have to live as long.
@@ -209,6 +227,17 @@ class Ends(ctypes.Structure):
         *fields(c_float * _MOST_LANES, "begin end wall leave_by reach"),  # type: ignore[arg-type]
         *fields(c_float, "mandatory_bias"),
         *fields(c_int32, "exit_lane"),
+    ]
+
+
+class Flow(ctypes.Structure):
+    """``Flow`` of model.hpp."""
+
+    _fields_ = [
+        ("arrival", c_double * _MOST_LANES),
+        *fields(c_double, "exit_share"),
+        *fields(c_float * _MOST_LANES, "exit_by exit_reach"),  # type: ignore[arg-type]
+        *fields(c_float, "from_m to_m"),
     ]
 
 
@@ -269,6 +298,7 @@ class Fixed(ctypes.Structure):
     _fields_ = [
         *fields(c_void_p, _FIXED_ARRAYS),
         *fields(c_float, "jitter_m jitter_mps"),
+        *fields(c_int32, "waiting"),
     ]
 
     #: The arrays that its members point to, which have to live as long.
@@ -353,6 +383,28 @@ def ends_of(
     return {"ends": ends}
 
 
+def flow_of(
+    flow: FlowParameters | None,
+    stretches: Stretches,
+    period_s: float,
+    mobil: MobilParameters,
+) -> dict[str, ctypes.Structure]:
+    """Who enters and leaves, by the name in :class:`Settings`; empty if nobody does."""
+    if flow is None:
+        return {}
+    leave_by, changes = leaving(stretches, exit_lane(stretches))
+    numbers = {
+        "arrival": flow.arrivals(stretches, period_s),
+        "exit_by": leave_by,
+        "exit_reach": [mobil.mandatory_m * number for number in changes],
+    }
+    structure = Flow(exit_share=flow.exit_share, from_m=flow.from_m, to_m=flow.to_m)
+    for name, row in numbers.items():
+        for lane, number in enumerate(row):
+            getattr(structure, name)[lane] = number
+    return {"flow": structure}
+
+
 def view_of(
     lanes: int,
     lane_width_m: float,
@@ -427,7 +479,8 @@ def _fixed_of(scene: FixedScene) -> Fixed:
         kind = np.float32 if numbers.dtype == np.float64 else np.int64
         arrays[name] = np.ascontiguousarray(numbers.astype(kind))
     pointers = {name: array.ctypes.data for name, array in arrays.items()}
-    fixed = Fixed(**pointers, jitter_m=scene.jitter_m, jitter_mps=scene.jitter_mps)
+    jitter = {"jitter_m": scene.jitter_m, "jitter_mps": scene.jitter_mps}
+    fixed = Fixed(**pointers, **jitter, waiting=scene.waiting)
     fixed.arrays = list(arrays.values())
     return fixed
 

@@ -110,12 +110,12 @@ static void begin(const Spawn& s, const Scene& scene, const Outputs& state, cons
     for (long at = row * s.vehicles; at < (row + 1) * s.vehicles; at++) {
         state.heading[at] = state.acceleration[at] = 0.0f;
         if (state.steering) state.steering[at] = 0.0f;
-        scene.valid[at] = 1;
+        scene.valid[at] = at < (row + 1) * s.vehicles - (s.fixed ? s.fixed->waiting : 0);
     }
     if (state.set_speed) state.set_speed[row] = scene.desired_speed[row * s.vehicles];
-    // Share of the episodes in which vehicles are recycled: 53 bits, as float64 has them.
+    // Share of the episodes in which vehicles are recycled.
     uint64_t chosen = absorb(absorb(absorb(key, -1), 0), RECYCLED_EPISODE);
-    scene.recycles[row] = s.recycle && (double)(chosen >> 11) * (1.0 / 9007199254740992.0) < s.recycle_share;
+    scene.recycles[row] = s.recycle && fine_uniform_of(chosen) < s.recycle_share;
     state.ego_steering[row] = state.mean_acceleration[row] = state.change_progress[row] = state.distance[row] = 0.0f;
     state.change_direction[row] = state.decisions[row] = state.lane_changes[row] = state.step[row] = 0;
     state.soft_crash[row] = state.soft_crash_behind[row] = state.started_change[row] = 0;

@@ -35,6 +35,7 @@ from ganlane.settings.driving import (
 )
 from ganlane.settings.episode import EpisodeParameters
 from ganlane.settings.observation import ObservationScale
+from ganlane.settings.road import FlowParameters
 from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import VISIBILITY_OF_EPISODE, Road, Vehicles
 
@@ -155,12 +156,16 @@ class _Parts(_Remade):
     """
 
     def __init__(
-        self, drivers: Drivers, vehicles: int, actions: ActionParameters | None = None
+        self,
+        drivers: Drivers,
+        vehicles: int,
+        actions: ActionParameters | None = None,
+        flow: FlowParameters | None = None,
     ) -> None:
         self.vehicles = vehicles
-        self.layout = Layout(drivers.memory(), actions)
+        self.layout = Layout(drivers.memory(), actions, flow)
         self.parts = parts_of(drivers)
-        self.layouts = [Layout(part.memory, actions) for part in self.parts]
+        self.layouts = [Layout(part.memory, actions, flow) for part in self.parts]
         self._turns = torch.tensor(turns_of(drivers))
 
     def of_part(self, number: int, episode: Tensor) -> Tensor:
@@ -191,13 +196,14 @@ class Kernel(_Parts):
         variant: str | None = None,
         actions: ActionParameters | None = None,
     ) -> None:
-        super().__init__(drivers or RuleDrivers(), vehicles, actions)
+        super().__init__(drivers or RuleDrivers(), vehicles, actions, road.flow)
         self._controls = actions is not None and not actions.names
         self._dtypes = {name: getattr(torch, kind) for name, kind in self.layout.kinds.items()}
         shape = _shape(road, vehicles)
         self._functions = []
         for part in self.parts:
-            numbers = decision_settings(shape, part.drivers, episode, ego, road.stretches, actions)
+            of_road = (road.stretches, actions, road.flow)
+            numbers = decision_settings(shape, part.drivers, episode, ego, *of_road)
             per_thread = rows_per_thread(part.drivers)
             self._functions.append(_Function("ganlane_decide", numbers, variant, per_thread))
 
@@ -209,8 +215,8 @@ class Kernel(_Parts):
         Args:
             action: numbered, [N] int64, or controls [N, 2].
             state: of the environment (:mod:`ganlane.keys`); it stays as it is.
-            recycles: rows that put vehicles left behind ahead of the ego again, [N] bool; None: no
-                row does.
+            recycles: rows that put vehicles left behind ahead of the ego again, or on a road with a
+                flow those in which vehicles enter and leave, [N] bool; None: no row does.
 
         Raises:
             ValueError: an action is none that there is.
@@ -252,7 +258,7 @@ class Kernel(_Parts):
                 self._run(number, len(chosen), arrays, after)
         # What no decision changes is shared with the state before, not copied.
         lasting = {name: arrays[name] for name in (*settings.SCENE, keys.SEED, keys.EPISODE)}
-        return _state(after | lasting)  # type: ignore[arg-type]
+        return _state(lasting | after)  # type: ignore[arg-type]
 
     def _run(
         self,

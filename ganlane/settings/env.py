@@ -29,7 +29,7 @@ from ganlane.settings.record import (
     one_of,
     part_of,
 )
-from ganlane.settings.road import EXIT, WALL, LaneStretch, Stretches
+from ganlane.settings.road import EXIT, WALL, FlowParameters, LaneStretch, Stretches
 
 if TYPE_CHECKING:
     from ganlane.sim.scenes import FixedScene, SceneVehicle
@@ -376,6 +376,7 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
             does the same up to rounding on a CPU (not for recordings, foreign simulators and
             traffic of your own), or the kernel where it can (auto).
         scene: the first scene, set by hand; null: Table II.
+        flow: who enters the road and leaves it; by default nobody does.
         actions: what the ego's driver commands: lane (the paper's), lane_speed or continuous.
         ego: how the ego drives.
         idm: how all follow, Table V.
@@ -397,6 +398,7 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
     kernel: Annotated[str, one_of(KERNELS)] = "auto"
     # what stands at the start, and how everybody drives
     scene: SceneConfig | None = None
+    flow: FlowParameters = field(default_factory=FlowParameters)
     actions: ActionParameters = field(default_factory=ActionParameters)
     ego: EgoParameters = field(default_factory=EgoParameters)
     idm: IdmParameters = field(default_factory=IdmParameters)
@@ -429,6 +431,7 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
                 f"{{timeout_s}}={self.timeout_s:g}: expected at least {{decision_period_s}}="
                 f"{self.decision_period_s:g}, or every episode ends in its first step."
             )
+        self._check_flow()
         self._check_start()
 
     def _take_road_of(self, file: FileScene) -> None:
@@ -439,6 +442,23 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
             lane_width_m=float(scene.road.lane_width_m),
             ego_desired_speed_mps=scene.rows[0].desired_speed_mps,
         )
+
+    def _check_flow(self) -> None:
+        if not self.flow.is_on:
+            return
+        if not self.stretches():
+            raise ParameterError(
+                "{flow}: vehicles enter and leave on roads whose lanes end; take env=merge, "
+                "on_ramp, weave, lane_drop or exit."
+            )
+        if self.recycle:
+            raise ParameterError(
+                "{recycle}=true: with a flow of vehicles nobody returns; leave it off."
+            )
+        try:
+            self.flow.check(self.stretches(), self.decision_period_s)
+        except ParameterError as error:
+            raise error.below("flow") from error
 
     def _check_start(self) -> None:
         """Refuse first scenes that do not fit on the road, or make a crash unavoidable."""
@@ -480,19 +500,22 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
         if self.scene is None:
             return None
         # Imported here, since it imports torch, which takes seconds.
-        from ganlane.sim.scenes import FixedScene
+        from ganlane.sim.scenes import FixedScene, with_waiting
         from ganlane.sim.state import Road
 
         if others_visibility is None:
             others_visibility = Visibility.SIGNALLED
+        flow = self.flow if self.flow.is_on else None
+        road = Road(self.lanes, self.lane_width_m, stretches=self.stretches(), flow=flow)
         return FixedScene(
-            self.scene.vehicles(self),
-            Road(self.lanes, self.lane_width_m, stretches=self.stretches()),
+            with_waiting(self.scene.vehicles(self), road),
+            road,
             jitter_m=self.scene.jitter_m,
             jitter_mps=self.scene.jitter_mps,
             ego_visibility=Visibility.named(self.ego.visibility),
             others_visibility=others_visibility,
             name=self.scene.label(),
+            waiting=0 if flow is None else flow.slots,
         )
 
     def stretches(self) -> Stretches:

@@ -1,16 +1,17 @@
-"""The road's lanes, and where each begins and ends.
+"""The road's lanes, where each begins and ends, and who enters and leaves.
 
 Positions are those of the vehicles: x runs along the road and is 0 where the ego starts.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated, NamedTuple
 
 from ganlane.errors import ParameterError
-from ganlane.settings.record import Number, Record, one_of
+from ganlane.settings.record import NotNegative, Number, Record, Share, between, one_of
 
 #: Stands for the beginning or end of a lane that has none, m.
 FAR_M = 1e9
@@ -95,3 +96,69 @@ def leaving(stretches: Stretches, goal: int | None = None) -> Leaving:
         by_m.append(last if away else FAR_M)
         changes.append(float(max(away, 1)))
     return Leaving(tuple(by_m), tuple(changes))
+
+
+@dataclass(frozen=True)
+class FlowParameters(Record):
+    """Vehicles that enter a section of the road and leave it, in a fixed number of slots.
+
+    A vehicle that has passed the end of the section, or of the exit lane, has left: it waits
+    outside. Vehicles arrive at random at the section's beginning, in every lane on its own; one
+    that would make anybody brake hard, or for which nobody waits, is turned away.
+
+    Attributes:
+        vph: that arrive in each lane of the road, veh/h.
+        ramp_vph: and in each lane that begins within the section, an on-ramp, veh/h.
+        exit_share: of the drivers, who leave the road by its exit.
+        from_m: beginning of the section, m; the ego starts at 0.
+        to_m: its end, m, behind the ends of all lanes.
+        slots: vehicles that wait outside at the start, beside those of the scene, 0 to 900.
+    """
+
+    vph: NotNegative = 0.0
+    ramp_vph: NotNegative = 0.0
+    exit_share: Share = 0.0
+    from_m: Number = -300.0
+    to_m: Number = 1300.0
+    slots: Annotated[int, between(0, 900)] = 60
+
+    @property
+    def is_on(self) -> bool:
+        """Whether anybody arrives, or leaves by the exit."""
+        return self.vph > 0 or self.ramp_vph > 0 or self.exit_share > 0
+
+    def arrivals(self, stretches: Stretches, period_s: float) -> tuple[float, ...]:
+        """The probability of an arrival within ``period_s``, of each lane."""
+        rates = [self.ramp_vph if its.begin_m > self.from_m else self.vph for its in stretches]
+        return tuple(rate * period_s / 3600.0 for rate in rates)
+
+    def exits(self, vehicles: int) -> tuple[bool, ...]:
+        """Whether the driver of each slot leaves by the exit; the share, as evenly as it can be."""
+        share = self.exit_share
+        return tuple(
+            math.floor(slot * share) > math.floor((slot - 1) * share) for slot in range(vehicles)
+        )
+
+    def check(self, stretches: Stretches, period_s: float) -> None:
+        """Raise :class:`ParameterError` for a section that does not fit the road, or more vehicles
+        than can arrive.
+        """
+        last_m = max((its.end_m for its in stretches if its.end != NOTHING), default=-FAR_M)
+        first_m = min(its.end_m for its in stretches)
+        if not (self.from_m < min(first_m, 0.0) and max(last_m, 0.0) < self.to_m):
+            raise ParameterError(
+                f"{{from_m}}={self.from_m:g}, {{to_m}}={self.to_m:g}: expected a section around "
+                f"the ego's start and the ends of all lanes, from below {min(first_m, 0.0):g} m to "
+                f"above {max(last_m, 0.0):g} m."
+            )
+        if self.exit_share > 0 and exit_lane(stretches) is None:
+            raise ParameterError(
+                f"{{exit_share}}={self.exit_share:g}: the road has no exit; leave it out, or take "
+                "env=weave or env=exit."
+            )
+        for name in ("vph", "ramp_vph"):
+            if getattr(self, name) * period_s > 3600.0:
+                raise ParameterError(
+                    f"{{{name}}}={getattr(self, name):g}: expected at most {3600.0 / period_s:g}, "
+                    "one vehicle in a decision."
+                )

@@ -124,6 +124,13 @@ def at_exit(vehicles: Vehicles, road: Road) -> tuple[Tensor, Tensor]:
     return passed & inside, passed & ~inside
 
 
+def exiting(road: Road, like: Tensor) -> Tensor | None:
+    """Which of the drivers ``like`` [N, M] leave the road by its exit, bool [M]; None: nobody."""
+    if road.flow is None or road.exit_lane is None or not road.flow.exit_share:
+        return None
+    return constant(road.flow.exits(like.shape[-1]), like) > 0
+
+
 def bias(
     road: Road,
     lanes: Tensor,
@@ -131,6 +138,7 @@ def bias(
     goal: int | None,
     strongest: float,
     reach_m: float,
+    exits: Tensor | None = None,
 ) -> Tensor:
     """How much a driver at ``x`` [N, K], m, wants to leave each of ``lanes`` [N, K, L], m/s2.
 
@@ -138,12 +146,21 @@ def bias(
         goal: the exit lane that the drivers want to reach; None: they stay on the road.
         strongest: at the end, m/s2.
         reach_m: distance from the end at which it begins, m per lane change.
+        exits: drivers [N, K] or [K] who want to reach the exit lane, whatever the goal; None:
+            nobody.
     """
+    urgency = _urgency(road, lanes, x, goal, reach_m)
+    if exits is not None:
+        to_exit = _urgency(road, lanes, x, road.exit_lane, reach_m)
+        urgency = torch.where(exits[..., None], to_exit, urgency)
+    return strongest * urgency.clamp(0.0, 1.0)
+
+
+def _urgency(road: Road, lanes: Tensor, x: Tensor, goal: int | None, reach_m: float) -> Tensor:
     by_m, changes = leaving(road.stretches, goal)
     reaches = tuple(reach_m * number for number in changes)
     distance = of_lane(by_m, lanes, x) - x[..., None]
-    urgency = 1.0 - distance / of_lane(reaches, lanes, x)
-    return strongest * urgency.clamp(0.0, 1.0)
+    return 1.0 - distance / of_lane(reaches, lanes, x)
 
 
 class WaysOut(NamedTuple):
@@ -158,11 +175,11 @@ class WaysOut(NamedTuple):
 
 
 def ways_out(vehicles: Vehicles, road: Road, reach_m: float) -> WaysOut:
-    """Where drivers who stay on the road may and have to go; ``reach_m`` as of :func:`bias`."""
+    """Where the drivers of a traffic may and have to go; ``reach_m`` as of :func:`bias`."""
     lane = vehicles.target_lane
     sides = constant((0, 1, -1), lane)
     lanes = lane[..., None] + sides
-    urgency = bias(road, lanes, vehicles.x, None, 1.0, reach_m)
+    urgency = bias(road, lanes, vehicles.x, None, 1.0, reach_m, exiting(road, lane))
     here = urgency[..., :1]
     possible = may_change(road, lane[..., None], sides, vehicles.x[..., None])[..., 1:]
     possible = possible & (here >= urgency[..., 1:])

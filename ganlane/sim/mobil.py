@@ -20,7 +20,7 @@ from ganlane.sim.idm import (
     acceleration_behind,
     idm_acceleration,
 )
-from ganlane.sim.lane_ends import bias, may_change
+from ganlane.sim.lane_ends import bias, exiting, may_change
 from ganlane.sim.neighbours import FREE_GAP_M, Scene, compare, follower, leader
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
 
@@ -196,12 +196,13 @@ def mandatory(
     lanes: Tensor,
     mobil: AnyMobil,
     goal: int | None,
+    exits: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """What the ends of lanes add to the incentives of changes into ``lanes`` [N, K, L], m/s2, and
     whether the changes are possible, bool.
 
     The first of the lanes is the driver's. Nobody changes into a lane that it has to leave more
-    urgently. ``goal`` as of :func:`ganlane.sim.lane_ends.bias`.
+    urgently. ``goal`` and ``exits`` as of :func:`ganlane.sim.lane_ends.bias`.
     """
     x = scene.observers.x
     leave = bias(
@@ -211,6 +212,7 @@ def mandatory(
         goal,
         mobil.mandatory_bias,
         mobil.mandatory_m,
+        exits,
     )
     here = leave[..., :1]
     there = leave[..., 1:]
@@ -226,11 +228,13 @@ def mobil_wishes(
     idm: AnyIdm = TABLE_V,
     mobil: AnyMobil = TABLE_IV,
     goal: int | None = None,
+    exits: Tensor | None = None,
 ) -> Tensor:
     """Lane change that MOBIL proposes to each driver: -1 right, 0 none, +1 left, int64 [N, K].
 
     None during a lane change. If both sides qualify, the one with the larger incentive, left if
     equal. ``goal`` is the exit lane that the drivers want to reach; None: they stay on the road.
+    ``exits`` are those of them who want to reach it all the same.
     """
     vehicles = scene.observers
     lane = vehicles.target_lane.to(vehicles.x.dtype)
@@ -245,7 +249,7 @@ def mobil_wishes(
     to_the_right = lane - 1.0 >= 0
     exists = torch.stack((to_the_left, to_the_right), dim=-1)
     if road.stretches:
-        gain, possible = mandatory(scene, lanes, mobil, goal)
+        gain, possible = mandatory(scene, lanes, mobil, goal, exits)
         incentive = incentive + gain
         exists = exists & possible
     pays = exists & safe & (incentive > mobil.threshold)
@@ -263,9 +267,10 @@ def mobil_changes(
 
     The ego (vehicle 0) is controlled by the agent: its column is 0, and it blocks no other change.
     """
+    exits = exiting(road, scene.observers.target_lane)
     return one_at_a_time(
         scene,
-        without_ego(mobil_wishes(scene, road, idm, mobil)),
+        without_ego(mobil_wishes(scene, road, idm, mobil, exits=exits)),
         idm,
         mobil,
     )

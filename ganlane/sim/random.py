@@ -54,6 +54,9 @@ class Purpose(IntEnum):
     DRIVER = 70  # and the 15 purposes after it: per-driver parameters (traffic=idm_random)
     SPAWN_TRUCK = 90
     RECYCLED_EPISODE = 91
+    FLOW_ARRIVAL = 92  # of each lane
+    FLOW_EXIT = 93
+    FLOW_SLOT = 94
     # and the 15 purposes after it: drivers of a foreign simulator, one per parameter
     FOREIGN_DRIVER = 128
 

@@ -8,7 +8,7 @@ the vehicles.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Protocol
 
@@ -18,6 +18,7 @@ from torch import Tensor
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.driving import IdmParameters, Visibility
+from ganlane.settings.road import NOTHING
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.dynamics import advance, steer
 from ganlane.sim.idm import following_acceleration, needed_deceleration
@@ -35,6 +36,8 @@ MOST_VEHICLES = 1000
 MOST_LANES = 100
 LARGEST = 1e6
 SMALLEST = 1e-6
+#: Distance between vehicles that wait outside at the start, m: nobody sees them there.
+SLOT_M = 20.0
 
 
 class Scenes(Protocol):
@@ -113,6 +116,7 @@ class FixedScene:
             stopped. Both depend on (stream, seed, episode) only.
         ego_visibility, others_visibility: for vehicles without a visibility of their own.
         name: of the scene, for messages.
+        waiting: so many of the last ``rows`` wait outside the road (:mod:`ganlane.sim.flow`).
 
     Raises:
         UserError: a vehicle is off the road, has an impossible number, or overlaps another;
@@ -126,6 +130,7 @@ class FixedScene:
     ego_visibility: int = Visibility.BODY
     others_visibility: int = Visibility.SIGNALLED
     name: str = "scene"
+    waiting: int = 0
 
     def __post_init__(self) -> None:
         check_rows(self)
@@ -214,7 +219,7 @@ class FixedScene:
             desired_speed=column([row.desired_speed_mps for row in rows]),
             target_lane=column(targets, torch.int64),
             visibility=column(seen, torch.int64),
-            valid=torch.ones_like(zero, dtype=torch.bool),
+            valid=torch.arange(len(rows), device=device)[None] < len(rows) - self.waiting,
         )
 
     def label(self, index: int) -> str:
@@ -222,6 +227,26 @@ class FixedScene:
         name = "the ego" if index == 0 else f"vehicle {index}"
         origin = self.rows[index].origin
         return f"{name} ({origin})" if origin else name
+
+
+def with_waiting(rows: tuple[SceneVehicle, ...], road: Road) -> tuple[SceneVehicle, ...]:
+    """``rows``, and with a flow its slots: drivers like the others of the scene in turn, beyond the
+    end of the section at their desired speeds, in a lane that goes on.
+    """
+    flow = road.flow
+    if flow is None:
+        return rows
+    ends = [its.end for its in road.stretches]
+    lane = ends.index(NOTHING)
+    waiting = []
+    for slot in range(flow.slots):
+        like = rows[1 + slot % (len(rows) - 1)]
+        speed = like.desired_speed_mps
+        x_m = flow.to_m + SLOT_M * (slot + 1)
+        waiting.append(
+            replace(like, x_m=x_m, y_m=None, lane=lane, target_lane=lane, speed_mps=speed)
+        )
+    return (*rows, *waiting)
 
 
 def check_count(name: str, vehicles: int) -> None:

@@ -21,7 +21,7 @@ from torch import Tensor
 from ganlane.errors import UserError
 from ganlane.keys import VEHICLE_FIELDS
 from ganlane.settings.driving import Visibility
-from ganlane.settings.road import EXIT, NOTHING, Stretches, exit_lane
+from ganlane.settings.road import EXIT, NOTHING, FlowParameters, Stretches, exit_lane
 
 #: A body is in a lane that it reaches into by more than this, m.
 ENTRY_M = 0.1
@@ -106,7 +106,8 @@ class Road:
     ``lanes`` and ``lane_width_m`` may be tensors [N, 1] if every environment has its own road
     (recorded scenes). ``ring_m`` closes the road to a ring of that length: positions stay
     unwrapped, only distances between vehicles are taken modulo the ring. ``stretches`` says where
-    each lane begins and ends (:mod:`ganlane.sim.lane_ends`); empty: all go on for ever.
+    each lane begins and ends (:mod:`ganlane.sim.lane_ends`); empty: all go on for ever. ``flow``
+    says who enters and leaves (:mod:`ganlane.sim.flow`); None: nobody.
 
     Raises:
         UserError: as many stretches as lanes are needed, one of them without an end and at most one
@@ -117,8 +118,11 @@ class Road:
     lane_width_m: float | Tensor = 4.0
     ring_m: float | None = None
     stretches: Stretches = ()
+    flow: FlowParameters | None = None
 
     def __post_init__(self) -> None:
+        if self.flow is not None and not self.stretches:
+            raise UserError("a flow of vehicles needs a road whose lanes end; give stretches.")
         if not self.stretches:
             return
         ends = [stretch.end for stretch in self.stretches]

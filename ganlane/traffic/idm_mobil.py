@@ -89,7 +89,9 @@ class IdmTraffic(TrafficModule):
     def native_drivers(self) -> RuleDrivers | None:
         """The kernel's drivers; None for a subclass, which may drive otherwise."""
         # Not isinstance: a subclass may override any part of a step.
-        return RuleDrivers(self.idm, self.steering) if type(self) is IdmTraffic else None
+        if type(self) is not IdmTraffic:
+            return None
+        return RuleDrivers(self.idm, self.steering, stream=self.stream)
 
     def keep_lanes(self, vehicles: Vehicles, memory: Memory) -> Moved:
         """A step without decisions."""
@@ -185,7 +187,7 @@ class IdmMobilTraffic(IdmTraffic):
         """As of :class:`IdmTraffic`, with lane changes."""
         if type(self) is not IdmMobilTraffic:
             return None
-        return RuleDrivers(self.idm, self.steering, self.mobil)
+        return RuleDrivers(self.idm, self.steering, self.mobil, stream=self.stream)
 
     def decide(
         self,

@@ -15,6 +15,7 @@ from reference.worlds import (
     environment,
     leaves,
     packed,
+    random_flow,
     random_stretches,
     same_bits,
 )
@@ -24,17 +25,19 @@ from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.native.drivers import RuleDrivers
-from ganlane.native.library import why_not
+from ganlane.native.library import VARIANTS, best_variant, why_not
 from ganlane.native.tensors import Kernel, NativeScenes
 from ganlane.settings.actions import ActionParameters
 from ganlane.settings.driving import Visibility
 from ganlane.settings.episode import SpawnParameters
+from ganlane.settings.road import EXIT, FlowParameters, LaneStretch
 from ganlane.sim.random import episode_key
 from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason=f"the kernel {why_not()}")
+RUNNABLE = list(VARIANTS)[list(VARIANTS).index(best_variant()) :]
 
 
 def random_highway(
@@ -43,13 +46,16 @@ def random_highway(
     most_vehicles: int,
     ends: bool = False,
     form: str = "lane",
+    flow: bool = False,
 ) -> HighwayEnv:
     """1 to 6 lanes, 2 to 60 vehicles, dense and sparse, with and without MOBIL, all periods and
-    visibilities; with ``ends`` some lanes begin late and end at a wall.
+    visibilities; with ``ends`` some lanes begin late and end at a wall, with ``flow`` vehicles
+    enter and leave.
     """
     lanes = rng.randint(1, 6)
     vehicles = rng.randint(2, most_vehicles)
     spacing = rng.choice([8.0, 12.0, 25.0])
+    stretches = random_stretches(lanes, rng) if ends else ()
     return environment(
         lanes,
         rows,
@@ -64,7 +70,8 @@ def random_highway(
         seed=rng.randrange(10**9),
         dtype=torch.float32,
         recycle=rng.random() < 0.5 and not ends,
-        stretches=random_stretches(lanes, rng) if ends else (),
+        stretches=stretches,
+        flow=random_flow(stretches, rng) if flow else None,
         actions=ActionParameters(form),
     )
 
@@ -91,18 +98,11 @@ def disturbed_start(env: HighwayEnv, generator: torch.Generator) -> TensorDictBa
     return td
 
 
-def kernel_of(env: HighwayEnv) -> Kernel:
+def kernel_of(env: HighwayEnv, variant: str | None = None) -> Kernel:
     """The kernel for the environment's road, rules and traffic."""
     mobil = env.traffic.mobil if isinstance(env.traffic, IdmMobilTraffic) else None
     drivers = RuleDrivers(mobil=mobil)
-    return Kernel(
-        env.road,
-        env.vehicles,
-        env.episode,
-        env.ego,
-        drivers,
-        actions=env.actions,
-    )
+    return Kernel(env.road, env.vehicles, env.episode, env.ego, drivers, variant, env.actions)
 
 
 def by_kernel(
@@ -204,19 +204,21 @@ def compare_random_highways(
     vehicles: int,
     ends: bool = False,
     form: str = "lane",
+    flow: bool = False,
 ) -> None:
     """Both decide from every state of the tensor code's episodes."""
     rng = random.Random(seed)
     generator = torch.Generator().manual_seed(seed)
     compared = 0
     at_threshold = 0
+    entered = 0
     for highway in range(highways):
-        env = random_highway(rng, rows, vehicles, ends, form)
+        env = random_highway(rng, rows, vehicles, ends, form, flow)
         kernel = kernel_of(env)
         td = disturbed_start(env, generator) if highway % 2 else env.reset()
         for _ in range(decisions):
             td["action"] = actions(env, generator)
-            out = by_kernel(kernel, td, env.recycle)
+            out = by_kernel(kernel, td, env.recycle or flow)
             stepped, following = env.step_and_maybe_reset(td.clone())
             if form == "continuous":
                 # The traffic's memory of the ego, which it does not drive, is nobody's concern.
@@ -233,8 +235,11 @@ def compare_random_highways(
             assert acceleration < 1e-2
             compared = compared + rows
             at_threshold = at_threshold + int(differs.sum())
+            came = out[keys.VEHICLES, "valid"] & ~td[keys.VEHICLES, "valid"]
+            entered = entered + int(came.sum())
             td = following
     assert at_threshold <= max(1, compared // 100_000), (at_threshold, compared)
+    assert not flow or entered > compared // 50, (entered, compared)
 
 
 def size(highways: int, rows: int, decisions: int, vehicles: int, *slow: pytest.MarkDecorator):
@@ -267,6 +272,46 @@ def test_it_decides_as_the_tensor_code_on_random_highways(
         ends,
         form,
     )
+
+
+@pytest.mark.parametrize(
+    "size",
+    [size(40, 16, 12, 25), size(800, 128, 10, 60, pytest.mark.slow)],
+    ids=["few", "a million"],
+)
+def test_it_decides_as_the_tensor_code_where_vehicles_enter_and_leave(size):
+    highways, rows, decisions, vehicles = size
+    compare_random_highways(highways, rows, decisions, 9, vehicles, ends=True, flow=True)
+
+
+@pytest.fixture(scope="module")
+def crowd():
+    """4096 rows into which vehicles enter and which they leave, and what one call makes of them."""
+    stretches = (LaneStretch(0.0, 150.0, EXIT), LaneStretch(), LaneStretch())
+    flow = FlowParameters(1800.0, 1200.0, 0.4, from_m=-150.0, to_m=160.0)
+    env = environment(num_envs=4096, dtype=torch.float32, seed=9, stretches=stretches, flow=flow)
+    td = disturbed_start(env, torch.Generator().manual_seed(9))
+    td["action"] = actions(env, torch.Generator().manual_seed(10))
+    return env, td, by_kernel(kernel_of(env), td, recycle=True)
+
+
+@pytest.mark.parametrize("batch", [1, 7, 64])
+def test_whoever_enters_and_leaves_does_so_in_any_batch(crowd, batch):
+    env, td, whole = crowd
+    kernel = kernel_of(env)
+    entered = 0
+    for start in range(0, min(60 * batch, 1024), batch):
+        rows = slice(start, start + batch)
+        assert same_bits(by_kernel(kernel, td[rows], recycle=True), whole[rows]) == []
+        came = whole[rows][keys.VEHICLES, "valid"] & ~td[rows][keys.VEHICLES, "valid"]
+        entered += int(came.sum())
+    assert entered > 0
+
+
+@pytest.mark.parametrize("variant", RUNNABLE)
+def test_and_with_every_instruction_set(crowd, variant):
+    env, td, whole = crowd
+    assert same_bits(by_kernel(kernel_of(env, variant), td, recycle=True), whole) == []
 
 
 def test_a_ring_is_refused_in_one_sentence():

@@ -39,6 +39,7 @@ class Car:
     visibility: int
     valid: bool
     steering: float = 0.0
+    exits: bool = False
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,17 @@ class Rules:
     stretches: tuple[tuple[float, float, str], ...] = ()
     # what the ego is commanded: lane, lane_speed or continuous
     actions: str = "lane"
+    flow: Flow | None = None
+
+
+@dataclass(frozen=True)
+class Flow:
+    """Who enters and leaves a section of the road."""
+
+    arrivals: tuple[float, ...]  # probability in a decision, of every lane
+    exit_share: float
+    start: float
+    end: float
 
 
 @dataclass
@@ -69,6 +81,8 @@ class State:
     close_ahead: bool = False
     close_behind: bool = False
     lane_changes: int = 0
+    # of the episode, for random numbers
+    key: int = 0
     # of lane_speed: what the ego aims at
     set_speed: float = 25.0
     # of continuous: the line that the ego steers to, and what it accelerates with
@@ -216,8 +230,13 @@ def there_is(lane: int, x: float, rules: Rules) -> bool:
 
 def urge(car: Car, lane: int, rules: Rules) -> float:
     """How much the driver wants to leave the lane: from 500 m a change before its end up to 8 m/s2
-    at it.
+    at it. Who leaves by the exit has to leave every other lane before the exit's end.
     """
+    way_out = exit_of(rules)
+    if car.exits and way_out is not None:
+        remaining = rules.stretches[way_out][1] - car.x
+        changes = abs(lane - way_out)
+        return 8.0 * min(1.0, max(0.0, 1.0 - remaining / (500.0 * changes))) if changes else 0.0
     if not rules.stretches or rules.stretches[lane][2] == "nothing":
         return 0.0
     lasting = [k for k in range(rules.lanes) if rules.stretches[k][2] == "nothing"]
@@ -236,15 +255,24 @@ def possible(car: Car, lane: int, rules: Rules) -> bool:
     return there_is(here, car.x, rules) and urge(car, lane, rules) <= urge(car, here, rules)
 
 
+def exit_of(rules: Rules) -> int | None:
+    """The lane that ends in an exit."""
+    exits = [lane for lane, stretch in enumerate(rules.stretches) if stretch[2] == "exit"]
+    return exits[0] if exits else None
+
+
+def nearest_lane(car: Car, rules: Rules) -> int:
+    return min(rules.lanes - 1, max(0, round(car.y / rules.lane_width)))
+
+
 def arrival(ego: Car, rules: Rules) -> str:
     """``goal``, ``missed_exit`` where there is an exit, or nothing yet."""
-    exits = [lane for lane, stretch in enumerate(rules.stretches) if stretch[2] == "exit"]
-    if not exits:
+    way_out = exit_of(rules)
+    if way_out is None:
         return "goal" if ego.x >= rules.goal else ""
-    if ego.x < rules.stretches[exits[0]][1]:
+    if ego.x < rules.stretches[way_out][1]:
         return ""
-    here = min(rules.lanes - 1, max(0, round(ego.y / rules.lane_width)))
-    return "goal" if here == exits[0] else "missed_exit"
+    return "goal" if nearest_lane(ego, rules) == way_out else "missed_exit"
 
 
 def in_the_wall(car: Car, rules: Rules) -> bool:
@@ -470,6 +498,68 @@ def be_steered(state: State, pedal: float, wheel: float, rules: Rules) -> bool:
     return True
 
 
+# Who enters and leaves
+
+
+def mixed(key: int, number: int) -> int:
+    """A random 64-bit number of the two: the finaliser of splitmix64."""
+    h = ((key ^ number % 2**64) + 0x9E3779B97F4A7C15) % 2**64
+    h = (h ^ (h >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
+    h = (h ^ (h >> 27)) * 0x94D049BB133111EB % 2**64
+    return h ^ (h >> 31)
+
+
+def drawn(key: int, *numbers: int) -> int:
+    for number in numbers:
+        key = mixed(key, number)
+    return key
+
+
+def may_enter(newcomer: Car, number: int, state: State, rules: Rules) -> bool:
+    """Whether it and nobody else has to brake harder than 4 m/s2."""
+    cars = [*state.cars[:number], replace(newcomer, valid=True), *state.cars[number + 1 :]]
+    view = View(cars, rules)
+    mine = lanes_entered(newcomer, rules) | {newcomer.target_lane}
+    for other, car in enumerate(cars):
+        theirs = lanes_entered(car, rules) | {car.target_lane}
+        beside = abs(car.y - newcomer.y) < (car.width + newcomer.width) / 2 + 0.4
+        meet = max(min(mine), min(theirs)) <= min(max(mine), max(theirs)) or beside
+        if other == number or not car.valid or not meet:
+            continue
+        behind, ahead = (number, other) if view.is_ahead(number, other) else (other, number)
+        if view.acceleration(behind, ahead) < -4.0:
+            return False
+    return True
+
+
+def let_in_and_out(state: State, rules: Rules) -> None:
+    """After a decision: who is past the end has left, and others enter."""
+    flow = rules.flow
+    way_out = exit_of(rules)
+    for number, car in enumerate(state.cars):
+        by_exit = way_out is not None and nearest_lane(car, rules) == way_out
+        past = by_exit and car.x >= rules.stretches[way_out][1]
+        if number and (past or car.x > flow.end):
+            state.cars[number] = replace(car, valid=False)
+    for lane, probability in enumerate(flow.arrivals):
+        arrives, leaves = (drawn(state.key, state.step, lane, use) / 2**64 for use in (92, 93))
+        if arrives >= probability:
+            continue
+        numbers = {}
+        for slot, car in enumerate(state.cars):
+            if slot and not car.valid and settled(car, rules):
+                differs = way_out is not None and car.exits != (leaves < flow.exit_share)
+                numbers[slot] = (differs, drawn(state.key, state.step, slot, 94))
+        if not numbers:
+            continue
+        slot = min(numbers, key=numbers.__getitem__)
+        car = state.cars[slot]
+        y = car.y + (lane - car.target_lane) * rules.lane_width
+        newcomer = replace(car, x=flow.start, y=y, target_lane=lane)
+        if may_enter(newcomer, slot, state, rules):
+            state.cars[slot] = replace(newcomer, valid=True)
+
+
 def decide(state: State, action: int | tuple[float, float], rules: Rules) -> Outcome:
     """One decision, in place; a state that has ended stays as it was at that instant."""
     outcome = Outcome()
@@ -516,4 +606,6 @@ def decide(state: State, action: int | tuple[float, float], rules: Rules) -> Out
     if state.direction:
         remaining = abs(ego.y - ego.target_lane * rules.lane_width) / rules.lane_width
         outcome.progress = min(1.0, max(0.0, 1.0 - remaining))
+    if rules.flow is not None and not outcome.reasons:
+        let_in_and_out(state, rules)
     return outcome

@@ -17,9 +17,9 @@ from ganlane import keys
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.settings.driving import EgoParameters, Visibility
 from ganlane.settings.episode import SpawnParameters
-from ganlane.settings.road import EXIT, FAR_M, WALL, LaneStretch, Stretches
+from ganlane.settings.road import EXIT, FAR_M, NOTHING, WALL, FlowParameters, LaneStretch, Stretches
 from ganlane.sim.idm import TABLE_V
-from ganlane.sim.random import Stream
+from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
@@ -167,11 +167,12 @@ def environment(
     traffic: TrafficModule | None = None,
     ring_m: float | None = None,
     stretches: Stretches = (),
+    flow: FlowParameters | None = None,
     stream: int = Stream.TRAIN,
     **others: object,
 ) -> HighwayEnv:
     """A HighwayEnv in float64 unless told otherwise."""
-    road = Road(lanes=lanes, ring_m=ring_m, stretches=stretches)
+    road = Road(lanes=lanes, ring_m=ring_m, stretches=stretches, flow=flow)
     traffic = traffic or (IdmMobilTraffic(road, stream) if mobil else IdmTraffic(road, stream))
     return HighwayEnv(
         traffic,
@@ -186,6 +187,10 @@ def environment(
 
 def rules_of(env: HighwayEnv) -> scalar.Rules:
     """The scalar simulator's settings for the same run."""
+    flow = env.road.flow
+    if flow is not None:
+        arrivals = flow.arrivals(env.road.stretches, env.episode.decision_period_s)
+        flow = scalar.Flow(arrivals, flow.exit_share, flow.from_m, flow.to_m)
     return scalar.Rules(
         lanes=env.road.lanes,
         mobil=isinstance(env.traffic, IdmMobilTraffic),
@@ -196,6 +201,7 @@ def rules_of(env: HighwayEnv) -> scalar.Rules:
         ring=env.road.ring_m,
         stretches=tuple((its.begin_m, its.end_m, its.end) for its in env.road.stretches),
         actions=env.actions.form,
+        flow=flow,
     )
 
 
@@ -219,20 +225,22 @@ def step(
     return env.step(td)["next"]
 
 
-def scalar_state(td: TensorDictBase, row: int) -> scalar.State:
+def scalar_state(td: TensorDictBase, row: int, env: HighwayEnv | None = None) -> scalar.State:
     """Row ``row`` of an environment's state as scalar cars.
 
-    Wheels are straight in traffic that has none.
+    Wheels are straight in traffic that has none. ``env`` knows who leaves by the exit.
     """
     fields = {name: td[keys.VEHICLES, name][row].tolist() for name in keys.VEHICLE_FIELDS}
     count = len(fields["x"])
     wheels = td.get((keys.TRAFFIC, "steering"), None)
     steering = [0.0] * count if wheels is None else wheels[row].tolist()
     steering[0] = td[keys.EGO, "steering"][row].item()
-    cars = [
-        scalar.Car(**{name: value[i] for name, value in fields.items()}, steering=steering[i])
-        for i in range(count)
-    ]
+    flow = None if env is None else env.road.flow
+    exits = [False] * count if flow is None else flow.exits(count)
+    cars = []
+    for i in range(count):
+        numbers = {name: value[i] for name, value in fields.items()}
+        cars.append(scalar.Car(**numbers, steering=steering[i], exits=exits[i]))
     set_speed = td.get((keys.EGO, "set_speed"), None)
     return scalar.State(
         cars,
@@ -241,8 +249,14 @@ def scalar_state(td: TensorDictBase, row: int) -> scalar.State:
         close_ahead=td[keys.EGO, "soft_crash"][row].item(),
         close_behind=td[keys.EGO, "soft_crash_behind"][row].item(),
         lane_changes=td[keys.EGO, "lane_changes"][row].item(),
+        key=0 if env is None else key_of(env, td, row),
         set_speed=25.0 if set_speed is None else set_speed[row].item(),
     )
+
+
+def key_of(env: HighwayEnv, td: TensorDictBase, row: int) -> int:
+    """The key of the row's episode, of random numbers."""
+    return int(episode_key(env.stream, td[keys.SEED], td[keys.EPISODE])[row])
 
 
 def leaves(td: TensorDictBase) -> Iterator[tuple[str | tuple[str, ...], torch.Tensor]]:
@@ -320,3 +334,15 @@ def random_stretches(lanes: int, rng: random.Random) -> Stretches:
         end_m = rng.choice([rng.uniform(5.0, 40.0), rng.uniform(60.0, 350.0)])
         stretches.append(LaneStretch(begin_m, end_m, EXIT if lane == exit_lane else WALL))
     return tuple(stretches)
+
+
+def random_flow(stretches: Stretches, rng: random.Random) -> FlowParameters:
+    """Little and much of it, on a section on which the vehicles of a random scene stand."""
+    ends = [its.end_m for its in stretches if its.end != NOTHING]
+    return FlowParameters(
+        vph=rng.choice([0.0, 400.0, 1800.0]),
+        ramp_vph=rng.choice([0.0, 800.0]),
+        exit_share=rng.choice([0.0, 0.3, 1.0]),
+        from_m=rng.uniform(-250.0, -150.0),
+        to_m=max([0.0, *ends]) + rng.uniform(1.0, 60.0),
+    )

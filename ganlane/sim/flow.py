@@ -1,0 +1,127 @@
+"""Vehicles that enter a section of a road and leave it, in a fixed number of slots.
+
+After every decision those who are past the end of the section, or of the exit lane, have left: they
+are invalid and wait outside. In every lane a vehicle arrives with a probability of its own, once a
+decision at most. It is one of those who wait, at random; with ``exit_share`` one who leaves by the
+exit, as long as one waits. It keeps its speed, its memory and its place in its lane, so that only
+its position changes. It enters unless anybody would have to brake harder than is safe; then it is
+turned away.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ganlane.keys import EGO_INDEX
+from ganlane.settings.driving import IdmParameters
+from ganlane.settings.road import FlowParameters
+from ganlane.sim.idm import idm_acceleration
+from ganlane.sim.lane_ends import at_exit, exiting
+from ganlane.sim.neighbours import FREE_GAP_M
+from ganlane.sim.random import Purpose, draw_keys, uniform
+from ganlane.sim.spawn import SAFE_DECELERATION, SIDE_M
+from ganlane.sim.state import (
+    Road,
+    Vehicles,
+    body_lanes,
+    lane_change_done,
+    reads_are_cheap,
+    with_target,
+)
+
+#: Bits of the random number that chooses among those who wait.
+_CHOICE_BITS = 24
+
+
+def has_left(vehicles: Vehicles, road: Road, flow: FlowParameters) -> Tensor:
+    """Whether each vehicle has passed the end of the section or of the exit lane, bool [N, M]."""
+    left = vehicles.x > flow.to_m
+    if road.exit_lane is not None:
+        by_exit, _ = at_exit(vehicles, road)
+        left = left | by_exit
+    others = torch.arange(vehicles.x.shape[1], device=vehicles.x.device) != EGO_INDEX
+    return left & others & vehicles.valid
+
+
+def _chosen(vehicles: Vehicles, road: Road, wanted: Tensor, number: Tensor) -> Tensor:
+    """Who comes where somebody arrives, at most one of a row, bool [N, M].
+
+    Args:
+        wanted: whether it leaves by the exit, bool [N].
+        number: a random one of each slot, [N, M] int64.
+    """
+    slot = torch.arange(vehicles.x.shape[1], device=number.device)
+    exits = exiting(road, number)
+    other_way = torch.zeros_like(vehicles.valid) if exits is None else exits != wanted[:, None]
+    waits = ~vehicles.valid & (slot != EGO_INDEX) & lane_change_done(vehicles, road)
+    # The lowest of those who go where it is wanted, else of the others.
+    rank = torch.where(waits, number + (other_way.long() << _CHOICE_BITS), 1 << (_CHOICE_BITS + 1))
+    first = rank.amin(1, keepdim=True)
+    lowest = torch.where(rank == first, slot, len(slot)).amin(1, keepdim=True)
+    return waits & (slot == lowest)
+
+
+def _room(vehicles: Vehicles, comes: Tensor, road: Road, idm: IdmParameters) -> Tensor:
+    """Whether nobody, the one who ``comes`` included, brakes harder than is safe, bool [N].
+
+    ``vehicles`` has it at its new position; ``comes`` bool [N, M] is true of at most one of a row.
+    """
+    slot = torch.arange(vehicles.x.shape[1], device=vehicles.x.device)
+    its = comes.to(torch.uint8).argmax(1, keepdim=True)
+    low, high = with_target(body_lanes(vehicles, road), vehicles)
+    sides = 0.5 * vehicles.width.gather(1, its) + 0.5 * vehicles.width + SIDE_M
+    shares = (low.gather(1, its) <= high) & (low <= high.gather(1, its))
+    shares = shares | ((vehicles.y.gather(1, its) - vehicles.y).abs() < sides)
+    distance = vehicles.x - vehicles.x.gather(1, its)
+    ahead = (distance > 0.0) | ((distance == 0.0) & (slot < its))
+    bumpers = 0.5 * vehicles.length.gather(1, its) + 0.5 * vehicles.length
+    gap = (distance.abs() - bumpers).clamp_max(FREE_GAP_M)
+    speed = vehicles.speed.gather(1, its)
+    desired = vehicles.desired_speed.gather(1, its)
+    behind_it = idm_acceleration(speed, desired, gap, vehicles.speed, idm)
+    before_it = idm_acceleration(vehicles.speed, vehicles.desired_speed, gap, speed, idm)
+    asked = torch.where(ahead, behind_it, before_it)
+    return (~(shares & vehicles.valid) | (asked >= -SAFE_DECELERATION)).all(1)
+
+
+def let_in_and_out(
+    vehicles: Vehicles,
+    road: Road,
+    idm: IdmParameters,
+    key: Tensor,
+    step: Tensor,
+    period_s: float,
+) -> Vehicles:
+    """``vehicles`` after some have left and others have entered.
+
+    Args:
+        road: with a flow.
+        key: of the episodes, [N] int64.
+        step: physics steps since their start, [N] int64.
+        period_s: since the last call, s.
+    """
+    flow = road.flow
+    assert flow is not None
+    arrivals = flow.arrivals(road.stretches, period_s)
+    vehicles = vehicles.with_(valid=vehicles.valid & ~has_left(vehicles, road, flow))
+    purposes = [int(Purpose.FLOW_ARRIVAL), int(Purpose.FLOW_EXIT)]
+    u = uniform(key, step, len(arrivals), purposes, torch.float64)
+    keys = draw_keys(key, step, vehicles.x.shape[1], [int(Purpose.FLOW_SLOT)])[..., 0]
+    number = (keys >> (64 - _CHOICE_BITS)) & ((1 << _CHOICE_BITS) - 1)
+    # Lane by lane, so that nobody enters beside one who has just done so without room.
+    for lane, probability in enumerate(arrivals):
+        arrives = u[:, lane, 0] < probability
+        if probability == 0.0 or (reads_are_cheap(arrives) and not bool(arrives.any())):
+            continue
+        wanted = u[:, lane, 1] < flow.exit_share
+        comes = _chosen(vehicles, road, wanted, number) & arrives[:, None]
+        lanes = (lane - vehicles.target_lane).to(vehicles.y.dtype)
+        there = vehicles.with_(
+            x=torch.where(comes, flow.from_m, vehicles.x),
+            y=torch.where(comes, vehicles.y + lanes * road.lane_width_m, vehicles.y),
+            target_lane=torch.where(comes, lane, vehicles.target_lane),
+        )
+        enters = comes & _room(there, comes, road, idm)[:, None]
+        vehicles = there.with_(valid=vehicles.valid | enters).where(enters, vehicles)
+    return vehicles

@@ -190,7 +190,7 @@ static inline void recycle(const Settings& s, Rows& r, Mask rows) {
 
 // Whether the driver of a slot leaves by the exit.
 static inline bool leaves_by_exit(const Flow& f, int64_t slot) {
-    return (int64_t)__builtin_floor((double)slot * f.exit_share) > (int64_t)__builtin_floor((double)(slot - 1) * f.exit_share);
+    return slot > 0 && (int64_t)__builtin_floor((double)slot * f.exit_share) > (int64_t)__builtin_floor((double)(slot - 1) * f.exit_share);
 }
 
 static inline void let_out(const Settings& s, Rows& r, Mask rows) {
@@ -202,8 +202,7 @@ static inline void let_out(const Settings& s, Rows& r, Mask rows) {
     }
 }
 
-// Who comes into an entry where somebody arrives: one of those who wait, of a row; -1 where nobody does. As everywhere
-// its place in the row's order, not its index.
+// Who comes where somebody arrives: the place in the row's order of one of those who wait; -1 where nobody does.
 static int who_comes(const Settings& s, const Rows& r, int lane, uint64_t at_step, bool exits) {
     int comes = -1;
     int64_t lowest = 0;

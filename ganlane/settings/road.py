@@ -135,9 +135,10 @@ class FlowParameters(Record):
     def exits(self, vehicles: int) -> tuple[bool, ...]:
         """Whether the driver of each slot leaves by the exit; the share, as evenly as it can be."""
         share = self.exit_share
-        return tuple(
-            math.floor(slot * share) > math.floor((slot - 1) * share) for slot in range(vehicles)
-        )
+        exits = [False]
+        for slot in range(1, vehicles):
+            exits.append(math.floor(slot * share) > math.floor((slot - 1) * share))
+        return tuple(exits)
 
     def check(self, stretches: Stretches, period_s: float) -> None:
         """Raise :class:`ParameterError` for a section that does not fit the road, or more vehicles

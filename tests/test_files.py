@@ -34,7 +34,6 @@ from ganlane.files import (
 )
 from ganlane.generator import load_generator
 from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
-from ganlane.suite.crashes import read_crashes
 from ganlane.training.checkpoint import load_checkpoint, save_checkpoint
 from ganlane.weights import load_weights, save_weights
 
@@ -268,7 +267,7 @@ def test_a_content_without_the_place_cannot_be_sealed():
         sealed(b"nothing")
 
 
-@pytest.mark.parametrize("kind", ["weights", "histograms", "crashes", "recordings", "checkpoint"])
+@pytest.mark.parametrize("kind", ["weights", "histograms", "recordings", "checkpoint"])
 def test_a_huge_file_is_refused_before_it_is_read(kind, tmp_path):
     path = tmp_path / "huge.parquet"
     with path.open("wb") as file:
@@ -276,7 +275,6 @@ def test_a_huge_file_is_refused_before_it_is_read(kind, tmp_path):
     read = {
         "weights": lambda: load_weights(path, "agent"),
         "histograms": lambda: Reference.load(path),
-        "crashes": lambda: read_crashes(path),
         "recordings": lambda: read_scenes(path),
         "checkpoint": lambda: load_checkpoint(path),
     }

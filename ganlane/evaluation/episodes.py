@@ -4,15 +4,14 @@ The rows of a batch drive side by side. A row whose episode has ended takes the 
 not been driven yet, so none waits for the slowest. Once all have been handed out, the last ones
 move to smaller batches.
 
-The simulation is deterministic, so :class:`ScriptedPolicy` drives an episode again from its number
-and its actions: by the kernel bit for bit in any batch, and so is rule-driven traffic by the tensor
-code; generated traffic is there in batches of the same size (its network's matrix products round
-differently in others).
+The simulation is deterministic, so a driver's episode is the same again: by the kernel bit for bit
+in any batch, and so is rule-driven traffic by the tensor code; generated traffic is so there in
+batches of the same size (its network's matrix products round differently in others).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import polars as pl
 import torch
@@ -49,7 +48,6 @@ def run_episodes(
     seed: int,
     on_progress: Callable[[int, int], None] | None = None,
     make_smaller: Callable[[int], EnvBase] | None = None,
-    actions: bool = False,
 ) -> pl.DataFrame:
     """Drive exactly ``episodes`` of ``seed``, each to its own end; one row each, in that order.
 
@@ -68,7 +66,6 @@ def run_episodes(
             :data:`LARGEST_SHARE` of the rows are still driving. Not used where something is held
             per row: by traffic with ``rows_must_stay``, and by every policy without
             ``rows_must_stay = False``.
-        actions: whether to return the column ``actions``, too.
 
     Returns:
         Columns ``episode, seed, reason`` (:data:`ganlane.keys.END_EVENTS`, or ``other``),
@@ -77,8 +74,7 @@ def run_episodes(
         ``distance_m``, ``mean_speed_mps`` (distance over time), ``lane_changes``; of a hard crash,
         else null, ``at_fault`` (:func:`ganlane.evaluation.measures.ego_at_fault`) and ``crash``
         (:data:`ganlane.evaluation.measures.CRASHES`); ``least_ttc_s``, ``least_headway_s``,
-        ``hardest_braking_mps2`` and ``rms_acceleration_mps2`` (at the ends of decisions). If asked
-        for: ``actions`` (text, a digit per decision).
+        ``hardest_braking_mps2`` and ``rms_acceleration_mps2`` (at the ends of decisions).
 
     Raises:
         UserError: no episodes are asked for, the environment is not batched in one dimension, or
@@ -90,7 +86,6 @@ def run_episodes(
             f"env: batch size {shape} was found, expected [N]; build the environment with N rows."
         )
     numbers = list(episodes)
-    taken: list[TensorDict] | None = [] if actions else None
     # Noisy layers and epsilon-greedy stay off: a table is about the learnt policy.
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         driven = _Evaluation(
@@ -99,28 +94,12 @@ def run_episodes(
             numbers,
             seed,
             make_smaller,
-            taken,
         ).run(on_progress)
-    table = _episode_rows(
+    return _episode_rows(
         driven,
         numbers,
         seed,
         getattr(env, "road", STRAIGHT),
-    )
-    if taken is None:
-        return table
-    # A place is driven by one row at a time, so the order of the decisions is the order in time.
-    decisions = TensorDict.cat(taken).cpu()
-    texts = []
-    for place in range(len(numbers)):
-        digits = decisions["action"][decisions["place"] == place].tolist()
-        texts.append("".join(map(str, digits)))
-    return table.with_columns(
-        pl.Series(
-            "actions",
-            texts,
-            pl.String,
-        )
     )
 
 
@@ -154,8 +133,8 @@ def start_of(
 class _Evaluation:
     """Episodes on their way through the rows of an environment.
 
-    Arguments as in :func:`run_episodes`; the actions of every decision go to the list ``taken``,
-    if there is one. All attributes named in :meth:`_keep` have the batch size [N].
+    Arguments as in :func:`run_episodes`. All attributes named in :meth:`_keep` have the batch size
+    [N].
     """
 
     def __init__(
@@ -165,7 +144,6 @@ class _Evaluation:
         numbers: list[int],
         seed: int,
         make_smaller: Callable[[int], EnvBase] | None,
-        taken: list[TensorDict] | None,
     ) -> None:
         rows = env.batch_size[0]
         self.total = len(numbers)
@@ -183,7 +161,6 @@ class _Evaluation:
         )
         self.env = env
         self.policy = policy
-        self.taken = taken
         self.make_smaller = make_smaller if may_move else None
         # What holds something per row outside the tensordict might not stand being driven on after
         # an end.
@@ -236,15 +213,6 @@ class _Evaluation:
         """
         # The policy writes into the tensordict that it reads.
         after = self.env.step(self.policy(self.state))
-        if self.taken is not None:
-            place = torch.where(
-                self.driving,
-                self.place,
-                self.total,
-            )
-            self.taken.append(
-                TensorDict({"place": place, "action": after[keys.ACTION].clone()}, place.shape)
-            )
         added = _added(after["next"])
         state = after["next"].select(*_LAST, strict=False)
         if self.sums is None or self.last is None:
@@ -406,37 +374,3 @@ def _episode_rows(
         .sqrt()
         .alias("rms_acceleration_mps2"),
     )
-
-
-class ScriptedPolicy(TensorDictModuleBase):
-    """Takes given actions in given episodes, and keeps its lane after the last of them.
-
-    Args:
-        actions: by the number of the episode a text with one digit per decision (0 keep, 1 left,
-            2 right).
-    """
-
-    in_keys = [keys.EPISODE, keys.EGO]  # noqa: RUF012
-    out_keys = [keys.ACTION]  # noqa: RUF012
-
-    def __init__(self, actions: Mapping[int, str]) -> None:
-        super().__init__()
-        numbers = sorted(actions)
-        # One more than the longest, so that every script ends with keeping its lane.
-        longest = max(map(len, actions.values())) + 1
-        padded = [actions[number].ljust(longest, str(keys.KEEP)) for number in numbers]
-        # Sorted numbers, so that a search finds the row of an episode.
-        self.episodes = torch.tensor(numbers)
-        self.table = torch.tensor([list(map(int, digits)) for digits in padded])
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action``."""
-        episode = tensordict[keys.EPISODE]
-        row = torch.searchsorted(self.episodes, episode.cpu())
-        # A row that is driven on after its script keeps reading the last column.
-        last = self.table.shape[1] - 1
-        decision = tensordict[keys.EGO, "decisions"].cpu().clamp_max(last)
-        return tensordict.set(
-            keys.ACTION,
-            self.table[row, decision].to(episode.device),
-        )

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
-from ganlane.errors import ParameterError, UserError, as_typed
+from ganlane.errors import ParameterError, UserError
 from ganlane.settings.commands import DrivingConfig, Measured, Names
 from ganlane.settings.record import (
     DIFFERENT,
@@ -74,17 +74,14 @@ class RenderConfig(DrivingConfig):
 
     Attributes:
         agents: agent=NAME says the same: names, paths or import paths as in ganlane evaluate; html,
-            parquet: several, agents=[mobil,agent_idm]; null: agent_general, of crashes all.
+            parquet: several, agents=[mobil,agent_idm]; null: agent_general.
         episodes: episode=NUMBER says the same: of the seed and stream, the same as in ganlane
-            evaluate; html, parquet: several, episodes=[0,1,2]; null: 0, of crashes all.
+            evaluate; html, parquet: several, episodes=[0,1,2]; null: 0.
         stream: benchmark: the episodes of ganlane benchmark.
         run: instead of an episode: learning curves of runs, run=FOLDER or 'run=[FOLDER,FOLDER]'.
-        crashes: instead of an episode: a list such as docs/reproduce/crashes.json, whose episodes
-            are driven again with their actions; agents, episodes and traffics choose among them.
-        traffics: of crashes: on these traffics alone.
         out: file to write, whose ending says what: gif, mp4 (needs the extra 'video'), png (a strip
             of four frames), html (a player), parquet (trajectories); of learning curves png, svg,
-            pdf; null: a gif, html of crashes or png of curves, into the run folder.
+            pdf; null: a gif, or png of curves, into the run folder.
         film: how a film looks.
     """
 
@@ -93,8 +90,6 @@ class RenderConfig(DrivingConfig):
     stream: Measured = "report"
     episodes: Annotated[list[Seed], DIFFERENT] | None = None
     run: Annotated[list[Text], DIFFERENT] | None = None
-    crashes: Text | None = None
-    traffics: Names | None = None
     # how, and where it goes
     out: str | None = None
     traffic: TrafficConfig = field(default_factory=IdmMobilTrafficConfig)
@@ -105,18 +100,13 @@ class RenderConfig(DrivingConfig):
         kind, count = self.kind, len(self.pairs())
         path = Path(self.out or "")
         is_film = kind in FILMS
-        endings = CHARTS if self.run else PAGES if self.crashes else FILMS + PAGES
+        endings = CHARTS if self.run else FILMS + PAGES
         # Whether something is wrong, and the sentence about it.
         checks = [
             (
                 path.name and (path.is_dir() or not os.access(path.parent, os.W_OK)),
                 f"out={path}: expected a file in a folder that exists and can be written to; make "
                 "it first.",
-            ),
-            (
-                self.run and self.crashes,
-                "crashes and run: either crashes or learning curves are drawn; leave one of them "
-                "out.",
             ),
             (
                 kind not in endings,
@@ -129,13 +119,8 @@ class RenderConfig(DrivingConfig):
                 "that ends in .html.",
             ),
             (
-                not self.crashes and count > MOST_EPISODES,
+                count > MOST_EPISODES,
                 f"agents x episodes: {count} episodes; choose at most {MOST_EPISODES}.",
-            ),
-            (
-                self.traffics and not self.crashes,
-                f"traffics={as_typed(self.traffics)}: goes with crashes=FILE; else give "
-                "traffic=NAME.",
             ),
             (
                 kind == "mp4" and find_spec("imageio_ffmpeg") is None,
@@ -150,8 +135,8 @@ class RenderConfig(DrivingConfig):
     @property
     def kind(self) -> str:
         """The ending of ``out``, without the dot, else what suits what is drawn."""
-        # Curves are a picture, crashes are many episodes, else one episode is a film.
-        default = "png" if self.run is not None else "gif" if self.crashes is None else "html"
+        # Curves are a picture, an episode is a film.
+        default = "gif" if self.run is None else "png"
         return Path(self.out or "").suffix.removeprefix(".").lower() or default
 
     @property

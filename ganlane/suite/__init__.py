@@ -11,5 +11,4 @@ Modules:
 - :mod:`~ganlane.suite.report`: the table, and the page with films.
 - :mod:`~ganlane.suite.run`: all of it, from drivers to results.
 - :mod:`~ganlane.suite.episodes`: records an episode for a film.
-- :mod:`~ganlane.suite.crashes`: a published list of crashes, driven again.
 """

@@ -20,7 +20,6 @@ from ganlane import keys
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.env import HighwayEnv
 from ganlane.evaluation import run_episodes
-from ganlane.evaluation.episodes import ScriptedPolicy
 from ganlane.evaluation.measures import ego_at_fault
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import ObservationConfig, SensorParameters
@@ -239,35 +238,6 @@ def test_no_episodes_and_an_environment_that_ignores_those_it_is_given_are_refus
         run_episodes(Stubborn(traffic, 2), policy, [0, 1, 5, 9], seed=0)
     with user_error("episodes"):
         run_episodes(HighwayEnv(traffic, 2), policy, [], seed=0)
-
-
-def test_an_episode_comes_back_from_its_actions():
-    config = EnvConfig(goal_m=90.0)
-    env = make_env(
-        make_traffic(IdmMobilTrafficConfig(), config),
-        config,
-        num_envs=2,
-    )
-    policy = make_driver("random_legal", config).policy
-    table = run_episodes(
-        env,
-        policy,
-        [4, 1, 7],
-        seed=3,
-        actions=True,
-    )
-    assert table["actions"].str.len_chars().to_list() == table["decisions"].to_list()
-    script = ScriptedPolicy(dict(table.select("episode", "actions").iter_rows()))
-    assert_frame_equal(
-        run_episodes(
-            env,
-            script,
-            [4, 1, 7],
-            seed=3,
-            actions=True,
-        ),
-        table,
-    )
 
 
 @pytest.mark.parametrize(

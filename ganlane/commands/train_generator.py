@@ -23,7 +23,6 @@ from ganlane.evaluation import code_version, write_results
 from ganlane.evaluation.table import aligned, show
 from ganlane.generator import FitResult, Progress
 from ganlane.generator.forecasts import BASELINE, SAMPLES
-from ganlane.generator.human_estimator import HumanModel
 from ganlane.settings.generator import HumanConfig
 from ganlane.settings.recordings import TrainGeneratorConfig
 from ganlane.torch_settings import set_threads
@@ -52,8 +51,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     if config.folds:
         generator.assign_folds(scenes, config.folds)
 
-    sites = sites_beside(source) if isinstance(fit_config, HumanConfig) else {}
-    following = [recording for recordings in sites.values() for recording in recordings]
+    following = cars_beside(source) if isinstance(fit_config, HumanConfig) else []
     # A resumed command finds its finished fits here and does not repeat them.
     states = Path(config.resume or folder) / "fits"
     weights = folder / f"generator_{fit_config.preset}.safetensors"
@@ -80,9 +78,6 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
         )
 
     show(aligned(errors_table(result.metrics["all"], "held out")), columns=config.columns)
-    if isinstance(result.module, HumanModel) and sites and not fit_config.following:
-        further["sites"] = generator.site_scores(result.module, sites)
-        show(aligned(site_table(further["sites"])), columns=config.columns)
     result.save(weights, further.get("folds"), code_version())
     print(f"weights: {weights}")
     # What the command line shows is also in results.json, in full.
@@ -92,19 +87,12 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     return f"results: {write_results(folder, numbers, used, context)}"
 
 
-def sites_beside(scenes: Path) -> dict[str, list[Recording]]:
+def cars_beside(scenes: Path) -> list[Recording]:
     """Cars that follow each other in one lane, from the files beside ``scenes``; perhaps none."""
-    return {name: read_one_lane(name, file) for name, file in one_lane_files(scenes).items()}
-
-
-def site_table(scores: Mapping[str, Mapping[str, float]]) -> Lines:
-    """What :func:`ganlane.generator.site_scores` found: a column per site."""
-    names = next(iter(scores.values()))
-    lines = [["at other sites; errors to CV", *scores]]
-    for name in names:
-        digits = 0 if name.startswith("windows") else 2
-        lines.append([name, *(f"{row[name]:.{digits}f}" for row in scores.values())])
-    return lines
+    cars = []
+    for name, file in one_lane_files(scenes).items():
+        cars += read_one_lane(name, file)
+    return cars
 
 
 class FitProgress(AbstractContextManager["FitProgress"]):

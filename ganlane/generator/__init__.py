@@ -17,7 +17,6 @@ from ganlane.generator.fit import (
     assign_folds,
     cross_validate,
     fit_generator,
-    site_scores,
     split_for_fit,
 )
 from ganlane.generator.networks import Discriminator, Generator
@@ -53,6 +52,5 @@ __all__ = [
     "load_generator",
     "load_human",
     "shipped_generator",
-    "site_scores",
     "split_for_fit",
 ]

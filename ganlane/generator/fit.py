@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,35 +21,29 @@ from sklearn.model_selection import GroupKFold
 from ganlane.data import TRACK, driving_statistics
 from ganlane.data.dense import Recording, recordings_of
 from ganlane.errors import UserError
-from ganlane.generator.checkpoint import FitResult, load_generator
+from ganlane.generator.checkpoint import FitResult
 from ganlane.generator.forecasts import (
     BASELINE,
     SAMPLES,
     Forecasts,
-    calibrated_forecasts,
     displacement_errors,
     errors_of,
     idm_forecast,
     long_errors,
     repeated,
 )
-from ganlane.generator.human_estimator import HumanModel
-from ganlane.generator.human_forecasts import human_forecasts
 from ganlane.generator.tasks import CalibratedTask, HumanTask, OnProgress, PaperTask
 from ganlane.generator.windows import (
     OBSERVED_POSITIONS,
     PREDICTED_STEPS,
-    Windows,
     count_windows,
     cut_windows,
 )
-from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.generator import (
     CalibratedConfig,
     HumanConfig,
     HumanSizes,
     PaperConfig,
-    shipped_generator,
 )
 from ganlane.weights import load_weights, save_weights
 
@@ -152,53 +146,6 @@ def _validation_names(scenes: list[Recording]) -> set[str]:
         names.add(name)
         held += sizes[name]
     return names if held else set()
-
-
-#: Segments of a site that are forecast, at most: the first ones of each.
-SITE_SCENES = 400
-#: Frames between two forecasts of 0.8 and of 5 s at other sites.
-SITE_STRIDES = {PREDICTED_STEPS: 10, LONG_STEPS: 25}
-
-
-def site_scores(
-    model: HumanModel, sites: Mapping[str, Sequence[Recording]]
-) -> dict[str, dict[str, float]]:
-    """Forecasts of sites that ``model`` was not fitted to, by site.
-
-    Of the cars that follow, not of those whose own leaders were not recorded. Windows; constant
-    velocity's ADE over 0.8 s and RMSE at 5 s, m; and by forecaster both errors over constant
-    velocity's: the mean driver, ``gan_calibrated`` as it ships, and IDM with each driver's own
-    headway.
-    """
-    calibrated, _ = load_generator(shipped_generator("calibrated"), "calibrated")
-    settings = CalibratedConfig()
-    scores: dict[str, dict[str, float]] = {}
-    for site, recordings in sites.items():
-        recordings = list(recordings[:SITE_SCENES])
-        driven = {recording.name: recording.driven for recording in recordings}
-        row = scores[site] = {}
-        for steps, stride in SITE_STRIDES.items():
-            forecasts = {
-                "human": human_forecasts(model, recordings, steps, stride, samples=1)["mean"],
-                "gan_calibrated": calibrated_forecasts(
-                    calibrated, recordings, steps, stride, settings, samples=1
-                )["mean"],
-            }
-            windows, distances_of = beside_references(forecasts, recordings, steps, stride)
-            follows = [driven[scene][car] for scene, car in zip(windows.scene, windows.vehicle)]
-            errors = {}
-            for name, distances in distances_of.items():
-                followers = distances[follows]
-                if steps == PREDICTED_STEPS:
-                    errors[name] = float(followers.mean())
-                else:
-                    errors[name] = float(np.sqrt(np.square(followers[:, -1]).mean()))
-            seconds = f"{steps * PHYSICS_STEP_S:g} s"
-            of_baseline = errors.pop(BASELINE)
-            row[f"windows, {seconds}"] = sum(follows)
-            row[f"constant velocity, {seconds}, m"] = of_baseline
-            row |= {f"{name}, {seconds}": error / of_baseline for name, error in errors.items()}
-    return scores
 
 
 def fit_key(config: Config, split: Split, following: Sequence[Recording]) -> str:
@@ -322,23 +269,11 @@ def held_out_errors(task: Any, scenes: list[Recording], steps: int, stride: int)
     # The best of 20 is for short forecasts only; the policy draws many in any case.
     few = steps == LONG_STEPS and isinstance(task, CalibratedTask)
     forecasts = task.forecasts(scenes, steps, stride, 1 if few else SAMPLES)
-    windows, errors = beside_references(forecasts, scenes, steps, stride)
-    return windows.scene, errors
-
-
-def beside_references(
-    forecasts: Forecasts, scenes: Sequence[Recording], steps: int, stride: int
-) -> tuple[Windows, Forecasts]:
-    """The windows of ``scenes``, and errors of their forecasts, of constant velocity and of IDM.
-
-    The same windows for every forecaster, in the same order.
-    """
-    windows = cut_windows(list(scenes), stride, OBSERVED_POSITIONS + steps)
-    references = {
-        BASELINE: repeated(windows.past[:, -1], steps),
-        "idm_own_headway": idm_forecast(list(scenes), steps, stride),
-    }
-    return windows, errors_of(forecasts | references, windows.future)
+    # The same windows for every forecaster, in the same order.
+    windows = cut_windows(scenes, stride, OBSERVED_POSITIONS + steps)
+    forecasts[BASELINE] = repeated(windows.past[:, -1], steps)
+    forecasts["idm_own_headway"] = idm_forecast(scenes, steps, stride)
+    return windows.scene, errors_of(forecasts, windows.future)
 
 
 def errors_by_scene(held: HeldOut) -> dict[str, Any]:

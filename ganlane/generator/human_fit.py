@@ -110,8 +110,7 @@ def fit_human(
         cutoffs = config.cutoff_hz, config.lateral_cutoff_hz
         scenes = [smooth_scene(recording, *cutoffs) for recording in recordings]
         fit_estimator(model.estimator, scenes, random)
-        if config.following:
-            scenes += [smooth_scene(one, *cutoffs, ONE_LANE_WEIGHT) for one in following]
+        scenes += [smooth_scene(one, *cutoffs, ONE_LANE_WEIGHT) for one in following]
         material = material_of(scenes, random)
         steps = 1 + config.rounds + config.tuning
         # Lane changes are few: none of them is hidden, as the sides are from some of the moves.

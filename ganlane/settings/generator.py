@@ -311,6 +311,8 @@ class CalibratedConfig(FitConfig):
 class HumanConfig(FitConfig):
     """Settings of the fit of ``human``: cloning, closed-loop samples, fine-tuning in simulation.
 
+    It is fitted to the files of one lane beside the recordings (I-80, I-24), too, where they are.
+
     Attributes:
         sizes: of the policy.
         cutoff_hz: recorded positions along the road are smoothed; of this frequency half is left.
@@ -324,8 +326,6 @@ class HumanConfig(FitConfig):
         tuning: iterations of the fine-tuning; 0: none.
         pull: weight of the divergence from the cloned policy in it.
         observing: updates of the observer, which adds a camera's errors to forecasts.
-        following: fit to the files of one lane beside the recordings, too (I-80, I-24), where
-            they are there.
     """
 
     preset: str = field(default="human", kw_only=True)
@@ -334,7 +334,6 @@ class HumanConfig(FitConfig):
     cutoff_hz: Positive = 0.6
     lateral_cutoff_hz: Positive = 0.4
     scale: NotNegative = 0.5
-    following: bool = True
     # cloning
     epochs: Count = 8
     rounds: CountOrZero = 3

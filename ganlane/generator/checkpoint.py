@@ -11,15 +11,11 @@ import torch
 from torch import nn
 
 from ganlane._version import __version__
-from ganlane.errors import UserError
-from ganlane.generator.human import HumanPolicy
 from ganlane.generator.human_estimator import HumanModel
 from ganlane.generator.networks import Generator
 from ganlane.settings.generator import (
     GENERATOR,
     FitConfig,
-    GeneratorSizes,
-    HumanSizes,
     Preset,
     human_sizes,
     misfit,
@@ -101,38 +97,7 @@ def load_generator(
     """
     tensors, metadata = load_weights(path, GENERATOR)
     sizes = stored_sizes(path, metadata, preset)
-    try:
-        return driving_generator(sizes, tensors), metadata
-    except RuntimeError as error:
-        raise UserError(
-            f"{path}: its weights do not have the shapes that its sizes ask for; fit it again."
-        ) from error
-
-
-def driving_generator(sizes: GeneratorSizes, weights: Mapping[str, Any]) -> Generator:
-    """A generator with these tensors or arrays, in evaluation mode, without gradients.
-
-    Raises:
-        RuntimeError: they have other names or shapes.
-    """
-    return _with_weights(Generator, sizes, weights)
-
-
-def driving_policy(sizes: HumanSizes, weights: Mapping[str, Any]) -> HumanPolicy:
-    """As :func:`driving_generator`, a policy of ``human``."""
-    return _with_weights(HumanPolicy, sizes, weights)
-
-
-def _with_weights(
-    kind: Callable[[Any], Network], sizes: Any, weights: Mapping[str, Any]
-) -> Network:
-    # A file that is read must not change the caller's random numbers.
-    with torch.random.fork_rng(devices=[]):
-        network = kind(sizes)
-    # Strict: a missing tensor or one too many is an error, too.
-    network.load_state_dict({name: torch.as_tensor(value) for name, value in weights.items()})
-    # A network that drives is not fitted further, and gradients would cost memory.
-    return network.eval().requires_grad_(False)
+    return with_weights(Generator, sizes, tensors, path), metadata
 
 
 def load_human(path: str | Path) -> tuple[HumanModel, dict[str, Any]]:
@@ -143,8 +108,27 @@ def load_human(path: str | Path) -> tuple[HumanModel, dict[str, Any]]:
             stored sizes.
     """
     tensors, metadata = load_weights(path, GENERATOR)
-    sizes = human_sizes(path, metadata)
+    return with_weights(HumanModel, human_sizes(path, metadata), tensors, path), metadata
+
+
+def with_weights(
+    kind: Callable[[Any], Network],
+    sizes: Any,
+    weights: Mapping[str, Any],
+    path: object = "weights",
+) -> Network:
+    """A network with these tensors or arrays, in evaluation mode, without gradients.
+
+    Raises:
+        UserError: they have other names or shapes; ``path`` is for the message.
+    """
+    # A file that is read must not change the caller's random numbers.
+    with torch.random.fork_rng(devices=[]):
+        network = kind(sizes)
     try:
-        return _with_weights(HumanModel, sizes, tensors), metadata
+        # Strict: a missing tensor or one too many is an error, too.
+        network.load_state_dict({name: torch.as_tensor(value) for name, value in weights.items()})
     except RuntimeError as error:
         raise misfit(path, asdict(sizes)) from error
+    # A network that drives is not fitted further, and gradients would cost memory.
+    return network.eval().requires_grad_(False)

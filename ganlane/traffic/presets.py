@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from ganlane.generator.checkpoint import driving_generator, driving_policy
+from ganlane.generator.checkpoint import with_weights
+from ganlane.generator.human import HumanPolicy
+from ganlane.generator.networks import Generator
 from ganlane.native.drivers import calibrated_drivers, gan_drivers, human_drivers
 from ganlane.settings.driving import (
     DriverFaults,
@@ -58,7 +60,7 @@ def gan_traffic(
         UserError: the weights are missing, foreign or of the other preset.
     """
     drivers = gan_drivers(GanTrafficConfig(**keys), idm, stream)
-    generator = driving_generator(drivers.sizes, drivers.weights)
+    generator = with_weights(Generator, drivers.sizes, drivers.weights)
     noise = (drivers.noise_period_s, drivers.noise_scale)
     # The order matters: a lane change moves sideways whatever the network did, and the guard bounds
     # the sum of all.
@@ -92,7 +94,7 @@ def gan_calibrated_traffic(
             per-driver parameters.
     """
     drivers = calibrated_drivers(GanCalibratedTrafficConfig(**keys), idm, stream)
-    generator = driving_generator(drivers.sizes, drivers.weights)
+    generator = with_weights(Generator, drivers.sizes, drivers.weights)
     noise = (drivers.noise_period_s, drivers.noise_scale)
     assert drivers.anchor is not None
     parts: dict[str, TrafficModule] = {
@@ -121,7 +123,7 @@ def human_traffic(
         UserError: the weights are missing or foreign.
     """
     drivers = human_drivers(HumanTrafficConfig(**keys), idm, stream)
-    return HumanTraffic(driving_policy(drivers.sizes, drivers.weights), drivers, road)
+    return HumanTraffic(with_weights(HumanPolicy, drivers.sizes, drivers.weights), drivers, road)
 
 
 def idm_faults_traffic(

@@ -33,7 +33,7 @@ struct Settings {
     // IDM, Table V
     float min_gap, headway, per_brake_scale, min_acceleration, max_acceleration;
     // MOBIL, Table IV
-    float threshold, politeness_rear, politeness_side, safe_deceleration, exclusive;
+    float threshold, politeness_rear, politeness_side, safe_deceleration, exclusive, courtesy;
     // two-point steering
     float per_near_s, per_far_s, gain_far, gain_near, gain_integral, slow, max_angle;
     // ego and episode
@@ -58,6 +58,7 @@ const float PHYSICS_STEP = 0.1f, WHEELBASE = 2.7f;
 const float NOBODY_M = 1e9f;  // stands for the position of nobody
 const float FREE_GAP = 10000.0f, SMALLEST_GAP = 0.1f;
 const float ENTRY = 0.1f, ARRIVED = 0.3f;
+const float ASKS_FROM = 0.577f;  // others make room for those who have to leave their lane so urgently
 const float TURN_OUT = 15.0f;  // a driver that keeps its lane stops so far before the wall
 const float REST = 1e-12f;  // at most this is 0: see at_rest
 enum { CENTRE, BODY, SIGNALLED };

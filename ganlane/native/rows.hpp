@@ -38,7 +38,7 @@ struct Rows {
     Float* memory[MOST_FIELDS];
     // MOBIL's neighbours in the own, left and right lane: [3][vehicles].
     Float *gap_ahead, *speed_ahead, *gap_behind, *speed_behind, *per_desired_behind;
-    Nearest* nearest;  // [lanes]
+    Nearest *nearest, *asking;  // [lanes]; `asking`: of those who have to change into the lane
     // Of the rows: whether they go on, physics steps since MOBIL's last decision and in all, and the ego's events.
     Mask running, ahead, behind, crash, goal, missed_exit, out_of_road;
     Mask unseen;  // the ego, to everybody
@@ -52,7 +52,7 @@ struct Rows {
 const int STATE_FIELDS = 13, VEHICLE_FIELDS = 31, MOBIL_FIELDS = 5;
 
 static size_t scratch_floats(const Settings& s) {
-    return (size_t)s.vehicles * (VEHICLE_FIELDS + 3 * MOBIL_FIELDS + MOST_FIELDS) + 5 * (size_t)s.lanes;
+    return (size_t)s.vehicles * (VEHICLE_FIELDS + 3 * MOBIL_FIELDS + MOST_FIELDS) + 10 * (size_t)s.lanes;
 }
 
 static void lay_out(Rows& rows, Float* scratch, const Settings& s) {
@@ -70,7 +70,7 @@ static void lay_out(Rows& rows, Float* scratch, const Settings& s) {
     };
     for (Float** field : neighbours) *field = scratch, scratch += 3 * s.vehicles;
     for (int k = 0; k < rows.memory_fields; k++) rows.memory[k] = scratch, scratch += s.vehicles;
-    rows.nearest = (Nearest*)scratch;
+    rows.nearest = (Nearest*)scratch, rows.asking = rows.nearest + s.lanes;
 }
 
 const float EXITS = 2.0f;  // a valid vehicle whose driver leaves the road by its exit
@@ -288,14 +288,61 @@ static __attribute__((noinline)) WaysOut ways_out(const Settings& s, const Rows&
     return ways;
 }
 
+// ---- Courtesy (ganlane.sim.mobil.yielding), on roads with a flow
+
+// No more than the acceleration with which vehicle i makes room for the nearest ahead that has to change into its lane.
+static __attribute__((noinline)) Float with_courtesy(const Settings& s, const Rows& r, int i, const Idm& p, Float acceleration) {
+    Nearest n = nobody_at(NOBODY_M, filled(0.0f));
+    for (int lane = 0; lane < s.lanes; lane++) {
+        Mask here = r.target[i] == (float)lane;
+        n.x = choose(here, r.asking[lane].x, n.x);
+        n.half_length = choose(here, r.asking[lane].half_length, n.half_length);
+        n.speed = choose(here, r.asking[lane].speed, n.speed);
+    }
+    Mask exists = (n.x < NOBODY_M) & ~is_ego(r, i);
+    if (!any(exists)) return acceleration;
+    Float gap = gap_ahead(r, i, n.x, n.half_length);
+    exists &= gap > 0.5f * s.min_gap;
+    Float free = free_road(r.speed[i], r.per_desired[i]);
+    Float makes_room = larger(limited(p, free, interaction(p, s.min_gap, r.speed[i], gap, n.speed)), filled(-s.courtesy));
+    return choose(exists, smaller(acceleration, makes_room), acceleration);
+}
+
+// On the way from the front: vehicle i asks for room in a lane beside its own, and falls behind the leader there.
+static __attribute__((noinline)) void ask_from_front(const Settings& s, Rows& r, int i, const Idm& p) {
+    WaysOut ways = ways_out(s, r, i);
+    Mask asks = (ways.side != 0.0f) & (ways.urgency > ASKS_FROM) & visible(r, i);
+    if (!any(asks)) return;
+    Nearest leader = nearest_in(s, r, r.target[i] + ways.side, nobody_at(NOBODY_M, r.speed[i]));
+    Float gap = gap_ahead(r, i, leader.x, leader.half_length), free = free_road(r.speed[i], r.per_desired[i]);
+    Float speed = choose(gap < FREE_GAP, leader.speed, r.speed[i]);
+    Float behind = larger(limited(p, free, interaction(p, s.min_gap, r.speed[i], gap, speed)), filled(-s.courtesy));
+    r.following[i] = choose(asks & ~is_ego(r, i), smaller(r.following[i], behind), r.following[i]);
+    for (int lane = 0; lane < s.lanes; lane++) {
+        Nearest& n = r.asking[lane];
+        Float nearer = (n.x - r.x[i]) + (r.half_length[i] - n.half_length);
+        Mask here = asks & (r.target[i] + ways.side == (float)lane) &
+                    ((nearer > 0.0f) | ((nearer == 0.0f) & (r.speed[i] < n.speed)));
+        n.x = choose(here, r.x[i], n.x);
+        n.half_length = choose(here, r.half_length[i], n.half_length);
+        n.speed = choose(here, r.speed[i], n.speed);
+    }
+}
+
 template <class Drivers>
 static inline void follow(const Settings& s, Rows& r, const Drivers& drivers) {
     nobody_met(s, r, NOBODY_M);
+    bool courteous = s.flow && s.mobil && s.courtesy > 0.0f;
+    for (int lane = 0; courteous && lane < s.lanes; lane++) r.asking[lane] = nobody_at(NOBODY_M, filled(0.0f));
     for (int i = 0; i < r.vehicles; i++) {
         Idm p = drivers.following(r, i);
         Float strongest = strongest_ahead(s, r, i, p);
         if (s.ends) strongest = larger(strongest, strongest_wall(s, r, i, p));
         r.following[i] = limited(p, free_road(r.speed[i], r.per_desired[i]), strongest);
+        if (courteous) {
+            r.following[i] = with_courtesy(s, r, i, p, r.following[i]);
+            ask_from_front(s, r, i, p);
+        }
         meet_from_front(s, r, i);
     }
 }

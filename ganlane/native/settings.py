@@ -202,7 +202,7 @@ class Settings(ctypes.Structure):
         *fields(
             c_float,
             "min_gap_m headway_s per_brake_scale min_acceleration max_acceleration"
-            " threshold politeness_rear politeness_side safe_deceleration exclusive_m"
+            " threshold politeness_rear politeness_side safe_deceleration exclusive_m courtesy"
             " per_near_s per_far_s gain_far gain_near gain_integral slow_mps max_angle_rad"
             " soft_crash_ttc_s soft_crash_gap_m goal_m lane_width_m per_lane_width",
         ),

@@ -22,6 +22,9 @@ EXIT = "exit"
 #: A driver that keeps a lane stops this far before its wall: the room that a standing car needs to
 #: turn into the next lane, m.
 TURN_OUT_M = 15.0
+#: Of those who have to leave their lane so urgently, others make room: the share of the urgency at
+#: the end itself (Schakel, Knoop and van Arem 2012).
+ASKS_FROM = 0.577
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
 from ganlane.settings.driving import MobilParameters
+from ganlane.settings.road import ASKS_FROM
 from ganlane.sim.idm import (
     TABLE_V,
     AnyIdm,
@@ -20,7 +21,7 @@ from ganlane.sim.idm import (
     acceleration_behind,
     idm_acceleration,
 )
-from ganlane.sim.lane_ends import bias, exiting, may_change
+from ganlane.sim.lane_ends import bias, exiting, may_change, ways_out
 from ganlane.sim.neighbours import FREE_GAP_M, Scene, compare, follower, leader
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
 
@@ -220,6 +221,44 @@ def mandatory(
     lane = lanes[..., :1]
     possible = may_change(scene.road, lane, lanes[..., 1:] - lane, x[..., None])
     return gain, possible & (here >= there)
+
+
+def yielding(scene: Scene, idm: AnyIdm, mobil: MobilParameters) -> Tensor:
+    """Acceleration with which every driver makes room, m/s2, [N, M]; infinite where none is needed.
+
+    It follows the nearest vehicle ahead that has to change into its lane from one beside it, as if
+    that were its leader already, but brakes for it no harder than ``courtesy``. Who has to change
+    follows the leader in the other lane likewise. Of two who are in
+    each other's way only the one behind makes room; and one that is nearer than half of IDM's
+    least gap goes past, since nobody would change in front of it. So they cannot block one another.
+    """
+    vehicles = scene.vehicles
+    ways = ways_out(vehicles, scene.road, mobil.mandatory_m)
+    asks = vehicles.valid & (ways.side != 0) & (ways.urgency > ASKS_FROM)
+    if mobil.courtesy == 0.0 or (reads_are_cheap(asks) and not bool(asks.any())):
+        return torch.full_like(vehicles.x, torch.inf)
+    pairs = scene.pairs
+    wanted = vehicles.target_lane + ways.side
+    into_its_lane = wanted[:, None, :] == vehicles.target_lane[:, :, None]
+    ahead = asks[:, None, :] & into_its_lane & (pairs.order > 0)
+    gaps = torch.where(ahead, pairs.gap, torch.inf)
+    gap = gaps.amin(-1, keepdim=True)
+    # Of two at the same gap the slower one counts.
+    slowest = torch.where(ahead & (gaps == gap), vehicles.speed[:, None, :], torch.inf)
+    exists = torch.isfinite(gap) & (gap > 0.5 * idm.min_gap_m)
+    leader_speed = torch.where(exists, slowest.amin(-1, keepdim=True), 0.0)
+    acceleration = idm_acceleration(
+        vehicles.speed[..., None],
+        vehicles.desired_speed[..., None],
+        torch.where(exists, gap, FREE_GAP_M).clamp_max(FREE_GAP_M),
+        leader_speed,
+        idm.per_lane(),
+    )
+    makes_room = torch.where(exists, acceleration, torch.inf)
+    ahead_there = leader(scene, wanted.to(vehicles.x.dtype)[..., None])
+    falls_behind = acceleration_behind(scene, ahead_there, idm)
+    falls_behind = torch.where(asks[..., None], falls_behind, torch.inf)
+    return torch.minimum(makes_room, falls_behind).clamp_min(-mobil.courtesy)[..., 0]
 
 
 def mobil_wishes(

@@ -25,11 +25,12 @@ from ganlane.sim.dynamics import (
 )
 from ganlane.sim.idm import (
     TABLE_V,
+    AnyIdm,
     DriverIdm,
     following_acceleration,
     needed_deceleration,
 )
-from ganlane.sim.mobil import TABLE_IV, DriverMobil, mobil_changes
+from ganlane.sim.mobil import TABLE_IV, DriverMobil, mobil_changes, yielding
 from ganlane.sim.neighbours import Scene, in_lane, perceive
 from ganlane.sim.random import Purpose, Stream, absorb
 from ganlane.sim.state import Road, Vehicles, reads_are_cheap
@@ -109,7 +110,7 @@ class IdmTraffic(TrafficModule):
     ) -> Moved:
         """The vehicles at t + 0.1 s, steered to the lanes ``target`` [N, M] int64."""
         centre = self.road.centre_of(target, scene.vehicles.y.dtype)
-        acceleration = following_acceleration(scene, self.idm)
+        acceleration = self.following(scene, self.idm)
         return self._advanced(
             scene.vehicles,
             acceleration,
@@ -117,6 +118,10 @@ class IdmTraffic(TrafficModule):
             centre,
             memory,
         )
+
+    def following(self, scene: Scene, idm: AnyIdm) -> Tensor:
+        """Accelerations [N, M], m/s2."""
+        return following_acceleration(scene, idm)
 
     def _advanced(
         self,
@@ -200,6 +205,13 @@ class IdmMobilTraffic(IdmTraffic):
         # Rows that are not at a full second keep their target lanes.
         change = torch.where(due[:, None], self.changes(scene, memory), 0)
         return self.drive(scene, vehicles.target_lane + change, memory)
+
+    def following(self, scene: Scene, idm: AnyIdm) -> Tensor:
+        """As IDM; on roads with a flow drivers make room for those who have to leave their lane."""
+        acceleration = super().following(scene, idm)
+        if self.road.flow is None:
+            return acceleration
+        return torch.minimum(acceleration, yielding(scene, idm, self.mobil))
 
     def changes(self, scene: Scene, memory: Memory) -> Tensor:
         """The side that each driver changes to, -1, 0 or 1, [N, M]."""
@@ -454,7 +466,7 @@ class IdmRandomTraffic(IdmMobilTraffic):
         v = scene.vehicles
         drivers = DriverParams.of(memory)
         idm = drivers.idm(self.idm.min_gap_m, drivers.strongest_braking)
-        acceleration = following_acceleration(scene, idm)
+        acceleration = self.following(scene, idm)
         new_memory = {_PARAMETERS: memory[_PARAMETERS]}
         if self.delay_steps:
             # What was decided ``delay`` steps ago is driven now.

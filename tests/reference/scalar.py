@@ -198,7 +198,26 @@ class View:
             before_wall(car, lane, self.rules, 15.0 if lane == car.target_lane else 0.0)
             for lane in attended
         ]
-        return min(behind_others + before_walls)
+        return min([*behind_others, *before_walls, self.making_room(i)])
+
+    def making_room(self, i: int) -> float:
+        """Behind the nearest ahead that has to change into its lane, and before its own change
+        behind the leader there, braking with up to 2 m/s2.
+        """
+        if self.rules.flow is None or not self.rules.mobil or i == 0:
+            return math.inf
+        lane = self.cars[i].target_lane
+        wanted = asked(self.cars[i], self.rules) if self.cars[i].valid else None
+        slowest = math.inf if wanted is None else self.acceleration(i, self.leader(i, wanted))
+        asking = [
+            j
+            for j, car in enumerate(self.cars)
+            if j != i and car.valid and self.is_ahead(i, j) and asked(car, self.rules) == lane
+        ]
+        nearest = min(asking, key=lambda j: (self.gap(i, j), self.cars[j].speed), default=None)
+        if nearest is not None and self.gap(i, nearest) > 1.0:
+            slowest = min(slowest, self.acceleration(i, nearest))
+        return max(-2.0, slowest)
 
     def in_a_lane(self, i: int, lane: int) -> float:
         """What the car would accelerate with if it kept ``lane``."""
@@ -253,6 +272,18 @@ def possible(car: Car, lane: int, rules: Rules) -> bool:
         return True
     here = car.target_lane
     return there_is(here, car.x, rules) and urge(car, lane, rules) <= urge(car, here, rules)
+
+
+def asked(car: Car, rules: Rules) -> int | None:
+    """The lane that the driver has to change into, the sooner the better; the left one at a tie."""
+    here = urge(car, car.target_lane, rules)
+    best = here
+    lane = None
+    for side in (1, -1):
+        other = car.target_lane + side
+        if possible(car, other, rules) and urge(car, other, rules) < best:
+            lane, best = other, urge(car, other, rules)
+    return lane if here > 0.577 * 8.0 else None
 
 
 def exit_of(rules: Rules) -> int | None:

@@ -5,8 +5,8 @@
 Of an on-ramp (`env=on_ramp`) and a weave (`env=weave`), on a section that begins 1.1 km upstream,
 without an ego. More vehicles arrive than the road can hold, in the lanes and on the ramp. After a
 while in which the queue forms, those who leave are counted: downstream, by the exit, and those who
-wanted to leave by it but drove past. Standing is below 0.1 m/s: `stood` is the longest time that a vehicle
-stood, `last` how long one had stood at the end. Beside it, the largest flow of a platoon in
+wanted to leave by it but drove past. Standing is below 0.1 m/s: `stood` is the longest time that a
+vehicle stood, `last` how long one had stood at the end. Beside it, the largest flow of a platoon in
 equilibrium by IDM alone.
 """
 

@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -392,11 +391,6 @@ def rollout(
     V] each; ``noise`` [1 + H, K, B, V, Z] the latent vectors at the start, then the numbers that
     change them (:func:`wander`).
     """
-    parameters = replace(
-        ANCHOR,
-        washout_s=config.washout_s,
-        further_inputs=config.further_inputs,
-    )
     # The samples are further rows of the batch.
     samples = noise.shape[1]
     segments = segments.repeated(samples)
@@ -417,7 +411,6 @@ def rollout(
             road,
             memory,
             latent,
-            parameters,
         )
         latent = wander(latent, fresh[step], config.noise_period_s)
         return moved

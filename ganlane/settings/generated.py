@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ganlane.settings.driving import IdmParameters
-from ganlane.settings.generator import CalibratedConfig
 
 #: Levels of the headway quantiles.
 QUANTILE_LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
@@ -85,18 +84,17 @@ class AnchorParameters:
         lane_stiffness: pull to the target lane's centre, 1/s2.
         lane_damping: of the lateral velocity, 1/s; with the stiffness critically damped.
         residual: largest residual along and across the road.
-        washout_s: time constant of the residual's mean, which is subtracted; infinite never does
-            (an ablation).
-        further_inputs: whether the network gets :func:`extra_inputs`; if not, they are 0 (an
-            ablation).
+        washout_s: time constant of the residual's mean, which is subtracted, s.
+        further_inputs: whether the network gets gap, closing speed, IDM's acceleration and lane
+            offset. Weights of ablations (up to 0.3.0) have other values of these two.
     """
 
     idm: IdmParameters = field(default_factory=lambda: IdmParameters(min_acceleration=-8.0))
     lane_stiffness: float = 0.3
     lane_damping: float = 1.1
     residual: tuple[float, float] = (4.0, 2.0)
-    washout_s: float = CalibratedConfig.washout_s
-    further_inputs: bool = CalibratedConfig.further_inputs
+    washout_s: float = 3.0
+    further_inputs: bool = True
 
 
 ANCHOR = AnchorParameters()

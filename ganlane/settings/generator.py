@@ -5,7 +5,6 @@ Files and held-out scenes, sizes, schedule, both presets.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -21,7 +20,6 @@ from ganlane.settings.record import (
     NotNegative,
     Positive,
     Record,
-    Rule,
     Text,
     assign,
     at_least,
@@ -39,8 +37,6 @@ GENERATOR = "generator"
 EXTRA_INPUTS = 4
 #: The bound keeps a file of weights from requesting all memory.
 _Width = Annotated[int, between(1, 4096)]
-#: inf is allowed: a residual without washout, for an ablation.
-_WASHOUT = Rule(lambda value: value > 0 and not math.isnan(value), "a number above 0, or inf")
 
 
 @dataclass(frozen=True)
@@ -272,10 +268,6 @@ class CalibratedConfig(FitConfig):
         batch: segments per update.
         held_out_stride: frames between the starts of the segments in evaluation.
         noise_period_s: time constant of each driver's latent vector, s.
-        washout_s: time constant of the residual's mean, which is subtracted, s; inf: without
-            washout. The simulation uses the value stored with the weights.
-        further_inputs: whether the network gets gap, closing speed, IDM's acceleration and lane
-            offset.
     """
 
     preset: str = field(default="calibrated", kw_only=True)
@@ -294,8 +286,6 @@ class CalibratedConfig(FitConfig):
     held_out_stride: Count = 3
     # what makes drivers differ
     noise_period_s: NotNegative = 5.0
-    washout_s: Annotated[float, _WASHOUT] = 3.0
-    further_inputs: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

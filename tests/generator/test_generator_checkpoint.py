@@ -146,7 +146,14 @@ def test_the_shipped_weights_are_of_the_default_settings_and_beat_constant_veloc
     path = shipped_generator(preset)
     _, metadata = load_generator(path, preset)
     # Options that went since then were at what the fit does now.
-    gone = {"history_noise": 0.0, "mirror": True, "traits": True, "loop": {"max_seconds": None}}
+    gone = {
+        "history_noise": 0.0,
+        "mirror": True,
+        "traits": True,
+        "washout_s": 3.0,
+        "further_inputs": True,
+        "loop": {"max_seconds": None},
+    }
     settings = plain(CONFIGS[preset])
     assert settings.pop("preset") == metadata["preset"]
     for name, value in metadata["config"].items():

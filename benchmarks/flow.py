@@ -23,7 +23,7 @@ from benchmarks.script import make_parser, run_script
 from ganlane import keys
 from ganlane.build import make_env, make_traffic
 from ganlane.evaluation.table import Table
-from ganlane.settings.driving import IdmParameters
+from ganlane.settings.driving import IdmParameters, MobilParameters
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
 from ganlane.settings.traffic import TrafficConfig
@@ -77,12 +77,19 @@ class Passed:
         return (self.downstream + self.by_exit) / self.hours / self.lanes
 
 
-def measure(scene: str, traffic: str, vehicles: int, rows: int = 16) -> Passed:
-    """Until so many ``vehicles`` have left, in all ``rows`` together."""
+def measure(
+    scene: str,
+    traffic: str,
+    vehicles: int,
+    courtesy: float = MobilParameters.courtesy,
+    rows: int = 16,
+) -> Passed:
+    """Until so many ``vehicles`` have left, in all ``rows`` together; ``courtesy`` in m/s2."""
     exit_share = EXIT_SHARE if scene == "weave" else 0.0
     flow = {"vph": VPH, "ramp_vph": RAMP_VPH, "exit_share": exit_share}
     flow |= {"from_m": FROM_M, "to_m": TO_M, "slots": SLOTS}
-    config = make(EnvConfig, {"name": scene, "flow": flow, "timeout_s": 1e6})
+    drivers = {"courtesy": courtesy}
+    config = make(EnvConfig, {"name": scene, "flow": flow, "mobil": drivers, "timeout_s": 1e6})
     env = make_env(make_traffic(make(TrafficConfig, traffic), config), config, num_envs=rows)
     base = env.base_env
     passed = Passed(scene, traffic, lanes=config.lanes - 1)
@@ -157,7 +164,7 @@ def table_of(results: list[Passed]) -> Table:
 def report(arguments: argparse.Namespace) -> str:
     """All that is asked for."""
     results = [
-        measure(scene, traffic, arguments.vehicles)
+        measure(scene, traffic, arguments.vehicles, arguments.courtesy)
         for scene in arguments.scenes
         for traffic in arguments.traffics
     ]
@@ -170,6 +177,7 @@ def main() -> int:
     parser.add_argument("--vehicles", type=int, default=10_000, help="that leave, of a line")
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
     parser.add_argument("--traffics", nargs="+", default=list(TRAFFICS))
+    parser.add_argument("--courtesy", type=float, default=MobilParameters.courtesy, help="m/s2")
     return run_script(report, parser.parse_args())
 
 

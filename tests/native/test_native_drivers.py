@@ -31,7 +31,11 @@ from ganlane.settings.traffic import TrafficConfig
 from ganlane.weights import load_weights, save_weights
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason="no C++ compiler")
-RUNNABLE = list(VARIANTS)[list(VARIANTS).index(best_variant()) :]
+#: The one for any processor takes long to build and to drive; .ci/run has a step for it.
+RUNNABLE = [
+    pytest.param(name, marks=pytest.mark.slow) if name == "default" else name
+    for name in list(VARIANTS)[list(VARIANTS).index(best_variant()) :]
+]
 PRESETS = {"gan": "paper", "gan_calibrated": "calibrated"}
 TRAFFICS = ["idm", "idm_mobil", "idm_faults", "idm_random", "human", *PRESETS]
 #: Parts of all kinds; no batch size here is a multiple of the sum of their shares.

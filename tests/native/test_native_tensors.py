@@ -37,7 +37,11 @@ from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason=f"the kernel {why_not()}")
-RUNNABLE = list(VARIANTS)[list(VARIANTS).index(best_variant()) :]
+#: The one for any processor takes long to build and to drive; .ci/run has a step for it.
+RUNNABLE = [
+    pytest.param(name, marks=pytest.mark.slow) if name == "default" else name
+    for name in list(VARIANTS)[list(VARIANTS).index(best_variant()) :]
+]
 
 
 def random_highway(

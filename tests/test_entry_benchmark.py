@@ -175,5 +175,5 @@ def test_python_takes_a_function_a_driver_and_names_of_your_own():
     assert {row["traffic"] for row in run.results["rows"]} == {"idm"}
     assert scores.keys() == {"random_legal", "mobil", "mine", "theirs", "rule"}
     assert scores["mine"] == scores["rule"]
-    with user_error("expected an agent's name or a function"):
+    with user_error("expected an agent's name, a policy or a function"):
         ganlane.benchmark(3, suite=suite)

@@ -167,7 +167,7 @@ def learn() -> dict[str, Any]:
     small = RainbowConfig(hidden=[8], capacity=256, batch_size=4, warmup=4, n_step=2)
     agent = Rainbow(small, 29, device=GPU)
     collector = Collector(env)
-    window = agent.window()
+    window = NStepWindow(small.n_step, small.gamma)
     # A window of two steps fills the buffer from the second on, which then takes its shape.
     for _ in range(3):
         waits()
@@ -181,7 +181,7 @@ def learn() -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    from ganlane.agents import Rainbow, RainbowConfig
+    from ganlane.agents import NStepWindow, Rainbow, RainbowConfig
     from ganlane.build import make_env, make_traffic
     from ganlane.settings.commands import highways
     from ganlane.sim.spawn import RandomScenes

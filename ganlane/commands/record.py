@@ -80,7 +80,7 @@ def record(config: RecordConfig, folder: Path) -> str:
         )
     # A dataset that is half written is not found by Minari.
     with cleared_after_mistakes(place.parent), whole_folder(place) as part:
-        storage = MinariStorage.new(part / "data", rows.space, rows.action_space, spec)
+        storage = MinariStorage.new(part / "data", rows.space, rows.action_space(), spec)
         storage.update_metadata(
             {
                 "dataset_id": name,

@@ -167,6 +167,7 @@ def make_env(
         recycle_share=env.recycle_share,
         kernel=env.kernel,
         actions=env.actions,
+        mobil=env.mobil,
     )
     # None where the native kernel does not implement what is asked for.
     kernel = base.kernel

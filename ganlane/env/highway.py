@@ -38,15 +38,16 @@ from ganlane.env.state import (
     usable_device,
 )
 from ganlane.errors import UserError
-from ganlane.native.drivers import pays
+from ganlane.native.drivers import Drivers, RuleDrivers, parts_of, pays
 from ganlane.native.library import torch_on_one_thread, why_not
 from ganlane.native.tensors import Kernel, NativeScenes, wants_gradient
 from ganlane.settings.actions import CONTINUOUS, CONTROLS, LANE_SPEED, ActionParameters
-from ganlane.settings.driving import EgoParameters, IdmParameters, Visibility
+from ganlane.settings.driving import EgoParameters, IdmParameters, MobilParameters, Visibility
 from ganlane.settings.episode import KERNELS, EpisodeParameters, SpawnParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.flow import let_in_and_out
 from ganlane.sim.idm import TABLE_V
+from ganlane.sim.mobil import TABLE_IV
 from ganlane.sim.random import Purpose, episode_key, uniform
 from ganlane.sim.scenes import Scenes
 from ganlane.sim.spawn import RandomScenes, out_of_range, recycle
@@ -78,6 +79,7 @@ class HighwayEnv(EnvBase):
         recycle_share: share of the episodes in which ``recycle`` applies, 0 to 1, chosen by their
             numbers: a mixture of roads that empty and roads that do not.
         actions: what the driver of the ego commands.
+        mobil: how the ego falls behind before a lane change that it has to make.
         kernel: what drives a decision: ``torch``, the tensor code; ``native``, the kernel
             (:mod:`ganlane.native`), which does the same up to rounding, for all shipped traffic
             but recordings, on a CPU and without gradients; ``auto``, the kernel where it can.
@@ -115,6 +117,7 @@ class HighwayEnv(EnvBase):
         recycle_share: float = 1.0,
         kernel: str = "torch",
         actions: ActionParameters | None = None,
+        mobil: MobilParameters = TABLE_IV,
     ) -> None:
         # Those who call this from Python meet no record that would check types.
         if not isinstance(traffic, TrafficModule):
@@ -169,6 +172,7 @@ class HighwayEnv(EnvBase):
             idm,
             steering,
             self.actions,
+            mobil,
         )
         self._seed = seed_number(seed)
         #: Seed and episode [N] of the rows in the last call; automatic resets continue from there.
@@ -483,6 +487,7 @@ class HighwayEnv(EnvBase):
             self.ego,
             drivers,
             actions=self.actions,
+            mobil=self.rules.mobil,
         )
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         running = torch.ones_like(action, dtype=torch.bool)
@@ -498,6 +503,11 @@ class HighwayEnv(EnvBase):
             running = running & ~state.get("done")[:, 0]
             # The command is given once; during a lane change keeping the lane continues it.
             action = torch.full_like(action, keys.KEEP)
+
+    def _others_change_otherwise(self, drivers: Drivers) -> bool:
+        parts = [part.drivers for part in parts_of(drivers)]
+        rule_driven = [part.mobil for part in parts if isinstance(part, RuleDrivers)]
+        return any(mobil not in (None, self.rules.mobil) for mobil in rule_driven)
 
     def _make_kernel(self, wanted: str) -> Kernel | None:
         """The kernel for ``wanted`` (``torch``, ``native`` or ``auto``); None: the tensor code.
@@ -528,6 +538,8 @@ class HighwayEnv(EnvBase):
             reason = (
                 "has one set of parameters of car following and steering for the ego and the others"
             )
+        elif self.road.stretches and self._others_change_otherwise(drivers):
+            reason = "has one set of parameters of lane changes for the ego and the others"
         # And whether there is a library at all, which may have to be built.
         missing = why_not() if reason is None else None
         if drivers is not None and reason is None and missing is None:
@@ -538,6 +550,7 @@ class HighwayEnv(EnvBase):
                 self.ego,
                 drivers,
                 actions=self.actions,
+                mobil=self.rules.mobil,
             )
         if wanted == "native":
             raise UserError(f"env.kernel=native {reason or missing}; set env.kernel=torch.")

@@ -17,7 +17,12 @@ from torch import Tensor
 from ganlane import keys
 from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
 from ganlane.settings.actions import CONTINUOUS, LANE_SPEED, ActionParameters
-from ganlane.settings.driving import EgoParameters, IdmParameters, SteeringParameters
+from ganlane.settings.driving import (
+    EgoParameters,
+    IdmParameters,
+    MobilParameters,
+    SteeringParameters,
+)
 from ganlane.settings.episode import EpisodeParameters
 from ganlane.sim.actions import apply_controls, commanded_speed
 from ganlane.sim.collisions import ego_overlaps
@@ -30,7 +35,9 @@ from ganlane.sim.dynamics import (
     move_ego,
 )
 from ganlane.sim.idm import following_acceleration
-from ganlane.sim.lane_ends import at_exit, hits_wall, leaves_road
+from ganlane.sim.lane_ends import at_exit, hits_wall, leaves_road, ways_out
+from ganlane.sim.mobil import TABLE_IV, falling_behind
+from ganlane.sim.neighbours import Scene
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
 from ganlane.traffic.base import TrafficModule, memory_of
 
@@ -49,6 +56,8 @@ class Rules(NamedTuple):
     idm: IdmParameters
     steering: SteeringParameters
     actions: ActionParameters = ActionParameters()
+    #: How the ego falls behind before a lane change that it has to make.
+    mobil: MobilParameters = TABLE_IV
     #: Physics steps [N] after which a recorded scene ends; None: never.
     scene_steps: Tensor | None = None
 
@@ -111,7 +120,9 @@ def begin(
     if line is None:
         line = road.centre_of(command.target_lane[:, None], vehicles.y.dtype)[:, 0]
     if acceleration is None:
-        acceleration = following_acceleration(ego_scene(vehicles, road), rules.idm)[:, 0]
+        scene = ego_scene(vehicles, road)
+        acceleration = following_acceleration(scene, rules.idm)[:, 0]
+        acceleration = before_change(rules, scene, acceleration)
     none = torch.zeros_like(command.off_road)
     start = Substep(
         vehicles=vehicles,
@@ -130,6 +141,15 @@ def begin(
         missed_exit=none,
     )
     return start, command
+
+
+def before_change(rules: Rules, scene: Scene, acceleration: Tensor) -> Tensor:
+    """The ego's ``acceleration`` [N], or less where it has to leave its lane soon; m/s2."""
+    if not rules.road.stretches or rules.mobil.courtesy == 0.0:
+        return acceleration
+    ways = ways_out(scene.observers, rules.road, rules.mobil.mandatory_m)
+    behind = falling_behind(scene, ways, rules.idm, rules.mobil)[:, 0]
+    return torch.minimum(acceleration, behind)
 
 
 def with_ego(number: Tensor, numbers: Tensor) -> Tensor:
@@ -174,6 +194,7 @@ def advance(
         steering = torch.where(running, steering, before.steering)
     scene = ego_scene(vehicles, rules.road)
     acceleration, ahead, behind = ego_surroundings(scene, rules.idm, rules.ego)
+    acceleration = before_change(rules, scene, acceleration)
     if rules.actions.form == CONTINUOUS:
         acceleration = before.acceleration
     # Of the events of one step a crash comes first, then the goal, then the time-out.

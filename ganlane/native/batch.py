@@ -208,7 +208,7 @@ class NativeBatch:
                 recycle_share = 1.0
             numbers_of_part = (road, part.drivers, episode, env.ego, stretches, actions, flow)
             of_part = pointed | {
-                "settings": decision_settings(*numbers_of_part),
+                "settings": decision_settings(*numbers_of_part, env.mobil),
                 "inputs": self._pointers(layout.inputs, row_list),
                 "outputs": self._pointers(layout.outputs),
                 "spawn": settings.spawn_of(*road, spawn, stream, *visible, recycle_share, scene),

@@ -378,12 +378,14 @@ def decision_settings(
     stretches: Stretches = (),
     actions: ActionParameters | None = None,
     flow: FlowParameters | None = None,
+    ego_mobil: MobilParameters | None = None,
 ) -> Settings:
     """The numbers of a decision: of road, driving and episode.
 
     ``shape`` is lanes, their width in m, and M, ``stretches`` where the lanes begin and end,
     ``actions`` what the ego is commanded (None: lanes), ``flow`` who enters and leaves (None:
-    nobody).
+    nobody), ``ego_mobil`` how the ego falls behind before a change that it has to make (None: as
+    the others).
     """
     episode = episode or EpisodeParameters()
     idm, steering = drivers.idm, drivers.steering
@@ -408,8 +410,10 @@ def decision_settings(
         "stream": drivers.stream,
         "blind_share": drivers.blind_share,
     }
-    pointed = drivers.structures() | ends_of(stretches, mobil) | actions_of(actions, episode)
-    pointed |= flow_of(flow, stretches, episode.decision_period_s, mobil)
+    ego_mobil = ego_mobil or mobil
+    numbers["courtesy"] = ego_mobil.courtesy
+    pointed = drivers.structures() | ends_of(stretches, ego_mobil) | actions_of(actions, episode)
+    pointed |= flow_of(flow, stretches, episode.decision_period_s)
     # ctypes has the addresses alone, so the structures are held beside them.
     for name in ("generated", "human", "faults", "random", "ends", "actions", "flow"):
         numbers[name] = ctypes.addressof(pointed[name]) if name in pointed else None

@@ -410,7 +410,7 @@ static inline bool is_blind(const Settings& s, uint64_t episode) {
 }
 
 static void load(const Settings& s, const Inputs& in, Rows& r, const Block& block, Command* commands) {
-    bool exits = s.flow && s.flow->exit_share > 0.0 && s.ends->exit_lane >= 0;
+    bool has_exit = s.ends && s.ends->exit_lane >= 0;
     for (int lane = 0; lane < LANES; lane++) {
         long start = block.row[lane] * s.vehicles;
         for (int i = 0; i < s.vehicles; i++) at(r.x, i, lane) = in.x[start + i], at(r.index, i, lane) = (float)i;
@@ -442,7 +442,8 @@ static void load(const Settings& s, const Inputs& in, Rows& r, const Block& bloc
             at(r.target, i, lane) = (float)(index == 0 ? command.target : in.target_lane[from]);
             at(r.visibility, i, lane) = (float)in.visibility[from];
             at(r.valid, i, lane) = (float)(in.valid[from] != 0);
-            if (exits && leaves_by_exit(*s.flow, index) && in.valid[from]) at(r.valid, i, lane) = EXITS;
+            bool exits = has_exit && (index == 0 || (s.flow && leaves_by_exit(*s.flow, index)));
+            if (exits && in.valid[from]) at(r.valid, i, lane) = EXITS;
             at(r.steering, i, lane) = index == 0 ? in.ego_steering[row] : in.steering ? in.steering[from] : 0.0f;
         }
         r.line[lane] = command.line, r.pedal[lane] = command.pedal;

@@ -5,20 +5,20 @@
 #include "vectors.hpp"
 
 // Where lanes begin and end (ganlane.sim.lane_ends), of each lane; NOBODY_M: far away. A wall is an end that nobody may
-// touch. `leave_by` and `reach`: where a driver has to have left it, and how long before that it becomes urgent.
+// touch. `leave_by` and `reach`: where a driver has to have left it, and how long before that it becomes urgent;
+// `exit_by` and `exit_reach`: the same of drivers who leave by the exit.
 const int MOST_LANES = 20;
 struct Ends {
     float begin[MOST_LANES], end[MOST_LANES], wall[MOST_LANES], leave_by[MOST_LANES], reach[MOST_LANES];
+    float exit_by[MOST_LANES], exit_reach[MOST_LANES];
     float mandatory_bias;
     int32_t exit_lane;  // that the ego has to leave the road by; -1: none
 };
 
-// Who enters a section of the road and leaves it (ganlane.sim.flow). `exit_by` and `exit_reach`: as `leave_by` and
-// `reach`, of drivers who leave by the exit.
+// Who enters a section of the road and leaves it (ganlane.sim.flow).
 struct Flow {
     double arrival[MOST_LANES];  // probability of one in a decision, of each lane
     double exit_share;
-    float exit_by[MOST_LANES], exit_reach[MOST_LANES];
     float from, to;
 };
 

@@ -254,10 +254,10 @@ struct Mandatory {
 
 INLINE Float urgency(const Settings& s, const Rows& r, int i, Float lane) {
     Float by = of_lane(s, s.ends->leave_by, lane, NOBODY_M), reach = of_lane(s, s.ends->reach, lane, 1.0f);
-    if (s.flow) {
+    if (s.ends->exit_lane >= 0) {
         Mask exits = r.valid[i] == EXITS;
-        by = choose(exits, of_lane(s, s.flow->exit_by, lane, NOBODY_M), by);
-        reach = choose(exits, of_lane(s, s.flow->exit_reach, lane, 1.0f), reach);
+        by = choose(exits, of_lane(s, s.ends->exit_by, lane, NOBODY_M), by);
+        reach = choose(exits, of_lane(s, s.ends->exit_reach, lane, 1.0f), reach);
     }
     return between(1.0f - (by - r.x[i]) / reach, 0.0f, 1.0f);
 }
@@ -288,7 +288,7 @@ static __attribute__((noinline)) WaysOut ways_out(const Settings& s, const Rows&
     return ways;
 }
 
-// ---- Courtesy (ganlane.sim.mobil.yielding), on roads with a flow
+// ---- Courtesy (ganlane.sim.mobil.yielding), where lanes end
 
 // No more than the acceleration with which vehicle i makes room for the nearest ahead that has to change into its lane.
 static __attribute__((noinline)) Float with_courtesy(const Settings& s, const Rows& r, int i, const Idm& p, Float acceleration) {
@@ -308,16 +308,19 @@ static __attribute__((noinline)) Float with_courtesy(const Settings& s, const Ro
     return choose(exists, smaller(acceleration, makes_room), acceleration);
 }
 
-// On the way from the front: vehicle i asks for room in a lane beside its own, and falls behind the leader there.
+// On the way from the front: vehicle i asks for room in a lane beside its own, and falls behind the leader there. The ego
+// does among all drivers, the others in traffic with MOBIL alone.
 static __attribute__((noinline)) void ask_from_front(const Settings& s, Rows& r, int i, const Idm& p) {
     WaysOut ways = ways_out(s, r, i);
-    Mask asks = (ways.side != 0.0f) & (ways.urgency > ASKS_FROM) & visible(r, i);
+    Mask asks = (ways.side != 0.0f) & (ways.urgency > ASKS_FROM) & (r.valid[i] != 0.0f);
+    if (!s.mobil) asks &= is_ego(r, i);
     if (!any(asks)) return;
     Nearest leader = nearest_in(s, r, r.target[i] + ways.side, nobody_at(NOBODY_M, r.speed[i]));
     Float gap = gap_ahead(r, i, leader.x, leader.half_length), free = free_road(r.speed[i], r.per_desired[i]);
     Float speed = choose(gap < FREE_GAP, leader.speed, r.speed[i]);
     Float behind = larger(limited(p, free, interaction(p, s.min_gap, r.speed[i], gap, speed)), filled(-s.courtesy));
-    r.following[i] = choose(asks & ~is_ego(r, i), smaller(r.following[i], behind), r.following[i]);
+    r.following[i] = choose(asks, smaller(r.following[i], behind), r.following[i]);
+    asks &= visible(r, i);
     for (int lane = 0; lane < s.lanes; lane++) {
         Nearest& n = r.asking[lane];
         Float nearer = (n.x - r.x[i]) + (r.half_length[i] - n.half_length);
@@ -332,7 +335,7 @@ static __attribute__((noinline)) void ask_from_front(const Settings& s, Rows& r,
 template <class Drivers>
 static inline void follow(const Settings& s, Rows& r, const Drivers& drivers) {
     nobody_met(s, r, NOBODY_M);
-    bool courteous = s.flow && s.mobil && s.courtesy > 0.0f;
+    bool courteous = s.ends && s.courtesy > 0.0f;
     for (int lane = 0; courteous && lane < s.lanes; lane++) r.asking[lane] = nobody_at(NOBODY_M, filled(0.0f));
     for (int i = 0; i < r.vehicles; i++) {
         Idm p = drivers.following(r, i);
@@ -340,7 +343,7 @@ static inline void follow(const Settings& s, Rows& r, const Drivers& drivers) {
         if (s.ends) strongest = larger(strongest, strongest_wall(s, r, i, p));
         r.following[i] = limited(p, free_road(r.speed[i], r.per_desired[i]), strongest);
         if (courteous) {
-            r.following[i] = with_courtesy(s, r, i, p, r.following[i]);
+            if (s.mobil) r.following[i] = with_courtesy(s, r, i, p, r.following[i]);
             ask_from_front(s, r, i, p);
         }
         meet_from_front(s, r, i);

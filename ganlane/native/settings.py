@@ -224,7 +224,7 @@ class Ends(ctypes.Structure):
     """``Ends`` of model.hpp."""
 
     _fields_ = [
-        *fields(c_float * _MOST_LANES, "begin end wall leave_by reach"),  # type: ignore[arg-type]
+        *fields(c_float * _MOST_LANES, "begin end wall leave_by reach exit_by exit_reach"),  # type: ignore[arg-type]
         *fields(c_float, "mandatory_bias"),
         *fields(c_int32, "exit_lane"),
     ]
@@ -236,7 +236,6 @@ class Flow(ctypes.Structure):
     _fields_ = [
         ("arrival", c_double * _MOST_LANES),
         *fields(c_double, "exit_share"),
-        *fields(c_float * _MOST_LANES, "exit_by exit_reach"),  # type: ignore[arg-type]
         *fields(c_float, "from_m to_m"),
     ]
 
@@ -367,15 +366,18 @@ def ends_of(
             "with lanes that end; set env.kernel=torch."
         )
     mobil = mobil or MobilParameters()
+    goal = exit_lane(stretches)
     leave_by, changes = leaving(stretches)
+    exit_by, exit_changes = leaving(stretches, goal)
     numbers = {
         "begin": [stretch.begin_m for stretch in stretches],
         "end": [stretch.end_m for stretch in stretches],
         "wall": [its.end_m if its.end == WALL else FAR_M for its in stretches],
         "leave_by": leave_by,
         "reach": [mobil.mandatory_m * number for number in changes],
+        "exit_by": exit_by,
+        "exit_reach": [mobil.mandatory_m * number for number in exit_changes],
     }
-    goal = exit_lane(stretches)
     ends = Ends(mandatory_bias=mobil.mandatory_bias, exit_lane=-1 if goal is None else goal)
     for name, row in numbers.items():
         for lane, number in enumerate(row):
@@ -387,21 +389,13 @@ def flow_of(
     flow: FlowParameters | None,
     stretches: Stretches,
     period_s: float,
-    mobil: MobilParameters,
 ) -> dict[str, ctypes.Structure]:
     """Who enters and leaves, by the name in :class:`Settings`; empty if nobody does."""
     if flow is None:
         return {}
-    leave_by, changes = leaving(stretches, exit_lane(stretches))
-    numbers = {
-        "arrival": flow.arrivals(stretches, period_s),
-        "exit_by": leave_by,
-        "exit_reach": [mobil.mandatory_m * number for number in changes],
-    }
     structure = Flow(exit_share=flow.exit_share, from_m=flow.from_m, to_m=flow.to_m)
-    for name, row in numbers.items():
-        for lane, number in enumerate(row):
-            getattr(structure, name)[lane] = number
+    for lane, probability in enumerate(flow.arrivals(stretches, period_s)):
+        structure.arrival[lane] = probability
     return {"flow": structure}
 
 

@@ -32,6 +32,7 @@ from ganlane.settings.actions import ActionParameters
 from ganlane.settings.driving import (
     EgoParameters,
     IdmParameters,
+    MobilParameters,
 )
 from ganlane.settings.episode import EpisodeParameters
 from ganlane.settings.observation import ObservationScale
@@ -184,6 +185,7 @@ class Kernel(_Parts):
         drivers: the others, and how the ego follows and steers; by default they keep their lanes.
         variant: see :class:`_Function`.
         actions: what the ego is commanded; None: lanes.
+        mobil: how the ego falls behind before a lane change that it has to make; None: as others.
     """
 
     def __init__(
@@ -195,6 +197,7 @@ class Kernel(_Parts):
         drivers: Drivers | None = None,
         variant: str | None = None,
         actions: ActionParameters | None = None,
+        mobil: MobilParameters | None = None,
     ) -> None:
         super().__init__(drivers or RuleDrivers(), vehicles, actions, road.flow)
         self._controls = actions is not None and not actions.names
@@ -202,7 +205,7 @@ class Kernel(_Parts):
         shape = _shape(road, vehicles)
         self._functions = []
         for part in self.parts:
-            of_road = (road.stretches, actions, road.flow)
+            of_road = (road.stretches, actions, road.flow, mobil)
             numbers = decision_settings(shape, part.drivers, episode, ego, *of_road)
             per_thread = rows_per_thread(part.drivers)
             self._functions.append(_Function("ganlane_decide", numbers, variant, per_thread))

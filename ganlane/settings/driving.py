@@ -92,9 +92,9 @@ class MobilParameters(Record):
         mandatory_m: distance from the end at which that begins, m per lane change that the driver
             has to make; 295 in Schakel, Knoop and van Arem (2012). Exits are announced 500 and
             1000 m ahead on German motorways.
-        courtesy: on roads with a flow, the deceleration with which a driver makes room for one
-            ahead beside it who has to leave its lane, m/s2; 0: none does. About IDM's comfortable
-            one, as in Schakel, Knoop and van Arem (2012).
+        courtesy: where lanes end, the deceleration with which a driver makes room for one ahead
+            beside it who has to leave its lane, and falls behind before its own such change, m/s2;
+            0: none does. About IDM's comfortable one, as in Schakel, Knoop and van Arem (2012).
     """
 
     # Table IV

@@ -136,9 +136,11 @@ class FlowParameters(Record):
         return tuple(rate * period_s / 3600.0 for rate in rates)
 
     def exits(self, vehicles: int) -> tuple[bool, ...]:
-        """Whether the driver of each slot leaves by the exit; the share, as evenly as it can be."""
+        """Whether the driver of each slot leaves by the exit: the ego, whose mission it is, and the
+        share of the others, as evenly as it can be.
+        """
         share = self.exit_share
-        exits = [False]
+        exits = [True]
         for slot in range(1, vehicles):
             exits.append(math.floor(slot * share) > math.floor((slot - 1) * share))
         return tuple(exits)

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ganlane.settings.road import FAR_M, TURN_OUT_M, WALL, leaving
+from ganlane.settings.road import ASKS_FROM, FAR_M, TURN_OUT_M, WALL, FlowParameters, leaving
 from ganlane.sim.state import LaneRange, Road, Vehicles, spanned
 from ganlane.torch_settings import constant
 
@@ -125,10 +125,14 @@ def at_exit(vehicles: Vehicles, road: Road) -> tuple[Tensor, Tensor]:
 
 
 def exiting(road: Road, like: Tensor) -> Tensor | None:
-    """Which of the drivers ``like`` [N, M] leave the road by its exit, bool [M]; None: nobody."""
-    if road.flow is None or road.exit_lane is None or not road.flow.exit_share:
+    """Which of the drivers ``like`` [N, M] leave the road by its exit, bool [M]; None without one.
+
+    The first of them is the ego, whose mission is the exit.
+    """
+    if road.exit_lane is None:
         return None
-    return constant(road.flow.exits(like.shape[-1]), like) > 0
+    flow = road.flow or FlowParameters()
+    return constant(flow.exits(like.shape[-1]), like) > 0
 
 
 def bias(
@@ -173,9 +177,14 @@ class WaysOut(NamedTuple):
     side: Tensor
     urgency: Tensor
 
+    @property
+    def asks(self) -> Tensor:
+        """Whether each has to leave its lane so soon that others make room, bool."""
+        return (self.side != 0) & (self.urgency > ASKS_FROM)
+
 
 def ways_out(vehicles: Vehicles, road: Road, reach_m: float) -> WaysOut:
-    """Where the drivers of a traffic may and have to go; ``reach_m`` as of :func:`bias`."""
+    """Where the drivers, the ego first, may and have to go; ``reach_m`` as of :func:`bias`."""
     lane = vehicles.target_lane
     sides = constant((0, 1, -1), lane)
     lanes = lane[..., None] + sides

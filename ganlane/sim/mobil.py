@@ -12,7 +12,6 @@ from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
 from ganlane.settings.driving import MobilParameters
-from ganlane.settings.road import ASKS_FROM
 from ganlane.sim.idm import (
     TABLE_V,
     AnyIdm,
@@ -21,7 +20,7 @@ from ganlane.sim.idm import (
     acceleration_behind,
     idm_acceleration,
 )
-from ganlane.sim.lane_ends import bias, exiting, may_change, ways_out
+from ganlane.sim.lane_ends import WaysOut, bias, exiting, may_change, ways_out
 from ganlane.sim.neighbours import FREE_GAP_M, Scene, compare, follower, leader
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
 
@@ -223,18 +222,35 @@ def mandatory(
     return gain, possible & (here >= there)
 
 
+def falling_behind(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParameters) -> Tensor:
+    """Acceleration of each observer who has to change its lane soon, m/s2, [N, K]; infinite for
+    others.
+
+    It follows the leader in the lane that it has to reach, so that it does not stay beside anybody,
+    but brakes for it no harder than ``courtesy``.
+
+    Args:
+        ways: of the observers.
+    """
+    wanted = scene.observers.target_lane + ways.side
+    ahead = leader(scene, wanted.to(scene.observers.x.dtype)[..., None])
+    acceleration = acceleration_behind(scene, ahead, idm)[..., 0].clamp_min(-mobil.courtesy)
+    asks = ways.asks & scene.observers.valid
+    return torch.where(asks, acceleration, torch.inf)
+
+
 def yielding(scene: Scene, idm: AnyIdm, mobil: MobilParameters) -> Tensor:
     """Acceleration with which every driver makes room, m/s2, [N, M]; infinite where none is needed.
 
     It follows the nearest vehicle ahead that has to change into its lane from one beside it, as if
     that were its leader already, but brakes for it no harder than ``courtesy``. Who has to change
-    follows the leader in the other lane likewise. Of two who are in
+    falls behind likewise (:func:`falling_behind`). Of two who are in
     each other's way only the one behind makes room; and one that is nearer than half of IDM's
     least gap goes past, since nobody would change in front of it. So they cannot block one another.
     """
     vehicles = scene.vehicles
     ways = ways_out(vehicles, scene.road, mobil.mandatory_m)
-    asks = vehicles.valid & (ways.side != 0) & (ways.urgency > ASKS_FROM)
+    asks = vehicles.valid & ways.asks
     if mobil.courtesy == 0.0 or (reads_are_cheap(asks) and not bool(asks.any())):
         return torch.full_like(vehicles.x, torch.inf)
     pairs = scene.pairs
@@ -254,11 +270,8 @@ def yielding(scene: Scene, idm: AnyIdm, mobil: MobilParameters) -> Tensor:
         leader_speed,
         idm.per_lane(),
     )
-    makes_room = torch.where(exists, acceleration, torch.inf)
-    ahead_there = leader(scene, wanted.to(vehicles.x.dtype)[..., None])
-    falls_behind = acceleration_behind(scene, ahead_there, idm)
-    falls_behind = torch.where(asks[..., None], falls_behind, torch.inf)
-    return torch.minimum(makes_room, falls_behind).clamp_min(-mobil.courtesy)[..., 0]
+    makes_room = torch.where(exists, acceleration, torch.inf).clamp_min(-mobil.courtesy)[..., 0]
+    return torch.minimum(makes_room, falling_behind(scene, ways, idm, mobil))
 
 
 def mobil_wishes(

@@ -207,9 +207,9 @@ class IdmMobilTraffic(IdmTraffic):
         return self.drive(scene, vehicles.target_lane + change, memory)
 
     def following(self, scene: Scene, idm: AnyIdm) -> Tensor:
-        """As IDM; on roads with a flow drivers make room for those who have to leave their lane."""
+        """As IDM; where lanes end, drivers make room for those who have to leave theirs."""
         acceleration = super().following(scene, idm)
-        if self.road.flow is None:
+        if not self.road.stretches:
             return acceleration
         return torch.minimum(acceleration, yielding(scene, idm, self.mobil))
 

@@ -204,7 +204,7 @@ class View:
         """Behind the nearest ahead that has to change into its lane, and before its own change
         behind the leader there, braking with up to 2 m/s2.
         """
-        if self.rules.flow is None or not self.rules.mobil or i == 0:
+        if not self.rules.stretches or not (self.rules.mobil or i == 0):
             return math.inf
         lane = self.cars[i].target_lane
         wanted = asked(self.cars[i], self.rules) if self.cars[i].valid else None
@@ -215,7 +215,8 @@ class View:
             if j != i and car.valid and self.is_ahead(i, j) and asked(car, self.rules) == lane
         ]
         nearest = min(asking, key=lambda j: (self.gap(i, j), self.cars[j].speed), default=None)
-        if nearest is not None and self.gap(i, nearest) > 1.0:
+        # The ego makes room for nobody, and only it falls behind where nobody changes lanes.
+        if i and nearest is not None and self.gap(i, nearest) > 1.0:
             slowest = min(slowest, self.acceleration(i, nearest))
         return max(-2.0, slowest)
 

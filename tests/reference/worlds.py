@@ -235,8 +235,10 @@ def scalar_state(td: TensorDictBase, row: int, env: HighwayEnv | None = None) ->
     wheels = td.get((keys.TRAFFIC, "steering"), None)
     steering = [0.0] * count if wheels is None else wheels[row].tolist()
     steering[0] = td[keys.EGO, "steering"][row].item()
-    flow = None if env is None else env.road.flow
-    exits = [False] * count if flow is None else flow.exits(count)
+    has_exit = env is not None and env.road.exit_lane is not None
+    exits = [has_exit] + [False] * (count - 1)
+    if env is not None and env.road.flow is not None:
+        exits = list(env.road.flow.exits(count))
     cars = []
     for i in range(count):
         numbers = {name: value[i] for name, value in fields.items()}

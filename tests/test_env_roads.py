@@ -11,15 +11,18 @@ from gymnasium.utils.env_checker import check_env
 from reference.worlds import environment, moves, placed, step, vehicles
 
 from ganlane import keys
+from ganlane.agents.drivers import MobilDriver
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.env import HighwayEnv
 from ganlane.errors import ParameterError, UserError
 from ganlane.evaluation.episodes import ego_at_fault
+from ganlane.settings.driving import MobilParameters
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
 from ganlane.settings.road import EXIT, WALL, LaneStretch, Stretches
 from ganlane.settings.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.sim.idm import TABLE_V
+from ganlane.sim.neighbours import perceive
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
@@ -112,6 +115,43 @@ def test_driving_into_the_end_of_a_lane_is_a_hard_crash(kernel):
 def test_who_drives_into_a_wall_is_at_fault(lane, at_fault):
     cars = vehicles({"x": 399.0, "lane": lane}, {"x": -900.0, "lane": 1})
     assert bool(ego_at_fault(cars, DROPPED)) == at_fault
+
+
+# Who has to change its lane
+
+
+#: The right lane of two leaves the road 400 m ahead.
+LEAVING: Stretches = (LaneStretch(end_m=400.0, end=EXIT), LaneStretch())
+
+
+@pytest.mark.parametrize("kernel", ["torch", "native"])
+@pytest.mark.parametrize(("courtesy", "end"), [(2.0, "goal"), (0.0, "missed_exit")])
+def test_an_ego_beside_a_car_as_fast_as_it_falls_behind_and_takes_the_exit(kernel, courtesy, end):
+    env = HighwayEnv(
+        IdmTraffic(Road(2, stretches=LEAVING)),
+        vehicles=2,
+        kernel=kernel,
+        mobil=MobilParameters(courtesy=courtesy),
+    )
+    alike = {"speed": 20.0, "desired_speed": 20.0}
+    cars = vehicles({"x": 0.0, "lane": 1, **alike}, {"x": 1.0, **alike}, dtype=torch.float32)
+    driver = MobilDriver(env.road)
+    td = placed(env, cars)
+    while not td["done"].any():
+        td = step(env, td, driver(td)["action"])
+    assert td[keys.EVENTS, end]
+
+
+@pytest.mark.parametrize(("courtesy", "braking"), [(2.0, 2.0), (0.0, 0.0)])
+def test_who_is_behind_one_who_has_to_change_makes_room(courtesy, braking):
+    """Two in neighbouring lanes, as fast, the one ahead 100 m before the end of its lane."""
+    alike = {"speed": 15.0, "desired_speed": 15.0}
+    nobody = {"x": -900.0, "lane": 1}
+    ahead = {"x": 300.0, **alike}
+    behind = {"x": 290.0, "lane": 1, **alike}
+    traffic = IdmMobilTraffic(DROPPED, mobil=MobilParameters(courtesy=courtesy))
+    scene = perceive(vehicles(nobody, ahead, behind), DROPPED)
+    assert traffic.following(scene, TABLE_V)[0, 2].item() == pytest.approx(-braking, abs=1e-4)
 
 
 # What is refused

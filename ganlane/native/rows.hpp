@@ -318,8 +318,8 @@ static __attribute__((noinline)) void ask_from_front(const Settings& s, Rows& r,
     Nearest leader = nearest_in(s, r, r.target[i] + ways.side, nobody_at(NOBODY_M, r.speed[i]));
     Float gap = gap_ahead(r, i, leader.x, leader.half_length), free = free_road(r.speed[i], r.per_desired[i]);
     Float speed = choose(gap < FREE_GAP, leader.speed, r.speed[i]);
-    Float behind = larger(limited(p, free, interaction(p, s.min_gap, r.speed[i], gap, speed)), filled(-s.courtesy));
-    r.following[i] = choose(asks, smaller(r.following[i], behind), r.following[i]);
+    Mask blocked = limited(p, free, interaction(p, s.min_gap, r.speed[i], gap, speed)) < -s.safe_deceleration;
+    r.following[i] = choose(asks & blocked, smaller(r.following[i], filled(-s.courtesy)), r.following[i]);
     asks &= visible(r, i);
     for (int lane = 0; lane < s.lanes; lane++) {
         Nearest& n = r.asking[lane];

@@ -223,20 +223,21 @@ def mandatory(
 
 
 def falling_behind(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParameters) -> Tensor:
-    """Acceleration of each observer who has to change its lane soon, m/s2, [N, K]; infinite for
-    others.
+    """Acceleration of each observer who has to change its lane soon and is kept from it by who is
+    ahead there, m/s2, [N, K]; infinite for others.
 
-    It follows the leader in the lane that it has to reach, so that it does not stay beside anybody,
-    but brakes for it no harder than ``courtesy``.
+    It brakes with ``courtesy`` where the leader in the lane that it has to reach makes the change
+    unsafe, so that it does not stay beside it. Where it does not, the driver keeps its speed, and
+    passes those who drive beside it.
 
     Args:
         ways: of the observers.
     """
     wanted = scene.observers.target_lane + ways.side
     ahead = leader(scene, wanted.to(scene.observers.x.dtype)[..., None])
-    acceleration = acceleration_behind(scene, ahead, idm)[..., 0].clamp_min(-mobil.courtesy)
+    blocked = acceleration_behind(scene, ahead, idm)[..., 0] < -mobil.safe_deceleration
     asks = ways.asks & scene.observers.valid
-    return torch.where(asks, acceleration, torch.inf)
+    return torch.where(asks & blocked, -mobil.courtesy, torch.inf)
 
 
 def yielding(scene: Scene, idm: AnyIdm, mobil: MobilParameters) -> Tensor:

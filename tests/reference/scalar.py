@@ -201,21 +201,22 @@ class View:
         return min([*behind_others, *before_walls, self.making_room(i)])
 
     def making_room(self, i: int) -> float:
-        """Behind the nearest ahead that has to change into its lane, and before its own change
-        behind the leader there, braking with up to 2 m/s2.
+        """Behind the nearest ahead that has to change into its lane, with up to 2 m/s2; with
+        2 m/s2 where the leader in the lane that it has to reach itself would make it brake hard.
         """
         if not self.rules.stretches or not (self.rules.mobil or i == 0):
             return math.inf
         lane = self.cars[i].target_lane
         wanted = asked(self.cars[i], self.rules) if self.cars[i].valid else None
-        slowest = math.inf if wanted is None else self.acceleration(i, self.leader(i, wanted))
+        blocked = wanted is not None and self.acceleration(i, self.leader(i, wanted)) < -4.0
+        slowest = -2.0 if blocked else math.inf
         asking = [
             j
             for j, car in enumerate(self.cars)
             if j != i and car.valid and self.is_ahead(i, j) and asked(car, self.rules) == lane
         ]
         nearest = min(asking, key=lambda j: (self.gap(i, j), self.cars[j].speed), default=None)
-        # The ego makes room for nobody, and only it falls behind where nobody changes lanes.
+        # The ego makes room for nobody.
         if i and nearest is not None and self.gap(i, nearest) > 1.0:
             slowest = min(slowest, self.acceleration(i, nearest))
         return max(-2.0, slowest)

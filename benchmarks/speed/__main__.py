@@ -10,8 +10,8 @@
 sim: the simulator, bare and as a whole environment through TorchRL, beside HighwayEnv; gymnasium:
 every traffic through gymnasium, with random actions and with an ego that keeps its lane to the
 goal, beside EnvPool and HighwayEnv; scenarios: merging and taking an exit, beside their versions of
-the same; traffic: every traffic model; train: the training loop, beside
-stable-baselines3's DQN on HighwayEnv. Peers are measured where they are installed.
+the same and a highway with as many vehicles; traffic: every traffic model; train: the training
+loop, beside stable-baselines3's DQN on HighwayEnv. Peers are measured where they are installed.
 """
 
 from __future__ import annotations
@@ -93,8 +93,12 @@ def cases_of(
         if options.suite == "sim":
             starts = SIMULATORS
         elif options.suite in THROUGH_GYMNASIUM:
-            name = f"ganlane{_scene_of(road)}, {ego}"
-            starts = {name: partial(systems.start_gymnasium, keep=EGOS[ego])}
+            start = partial(systems.start_gymnasium, keep=EGOS[ego])
+            starts = {f"ganlane{_scene_of(road)}, {ego}": start}
+            if options.suite == "scenarios":
+                # What the ends of lanes cost.
+                name = f"ganlane highway with as many vehicles, {ego}"
+                starts[name] = partial(systems.start_without_ends, start)
         elif options.suite == "traffic":
             starts = {TRAFFIC: systems.start_traffic}
         else:

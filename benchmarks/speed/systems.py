@@ -6,6 +6,7 @@ The road is the paper's, with other numbers of vehicles and lanes where asked fo
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -220,6 +221,11 @@ def start_training(
         return int(simulated)
 
     return run
+
+
+def start_without_ends(start: Callable[..., Runner], road: Road, *place: Any) -> Runner:
+    """The same on a highway whose lanes go on, with as many vehicles and lanes."""
+    return start(replace(road, scene="highway"), *place)
 
 
 # Peers

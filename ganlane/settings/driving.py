@@ -93,8 +93,9 @@ class MobilParameters(Record):
             has to make; 295 in Schakel, Knoop and van Arem (2012). Exits are announced 500 and
             1000 m ahead on German motorways.
         courtesy: where lanes end, the deceleration with which a driver makes room for one ahead
-            beside it who has to leave its lane, and falls behind before its own such change, m/s2;
-            0: none does. About IDM's comfortable one, as in Schakel, Knoop and van Arem (2012).
+            beside it who has to leave its lane, and with which one who has to falls behind whoever
+            blocks it, m/s2; 0: none does. About IDM's comfortable one, as in Schakel, Knoop and van
+            Arem (2012).
     """
 
     # Table IV

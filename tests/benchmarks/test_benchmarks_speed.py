@@ -56,7 +56,8 @@ def test_scenes_are_driven_with_the_vehicles_and_lanes_that_the_table_names(caps
         assert (road.vehicles, road.road.lanes) == (vehicles, lanes)
     assert speed.main([*QUICK, "--suite", "scenarios", "--batches", "2"]) == 0
     told = capsys.readouterr().out
-    for name in ("ganlane merge, random actions", "ganlane exit, keeping its lane"):
+    highway = "ganlane highway with as many vehicles, random actions"
+    for name in ("ganlane merge, random actions", "ganlane exit, keeping its lane", highway):
         assert name in told
 
 

@@ -7,6 +7,8 @@ one. Run it with ``python examples/own_reward.py``.
 
 from __future__ import annotations
 
+import sys
+
 from torchrl.envs import Compose, Transform, TransformedEnv
 
 from ganlane import keys
@@ -34,12 +36,12 @@ class Courtesy(Transform):
         return tensordict_reset
 
 
-def main():
+def main(goal_m="300"):
     """Returns of two drivers under the paper's reward and under the courteous one, on the same
     episodes.
     """
     road = Road(lanes=3)
-    short = EpisodeParameters(goal_m=300.0)
+    short = EpisodeParameters(goal_m=float(goal_m))
     for name in ("mobil", "random_legal"):
         driver = DRIVERS[name](road, Stream.REPORT)
         for title, transforms in (("paper", []), ("courteous", [Courtesy()])):
@@ -53,4 +55,4 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

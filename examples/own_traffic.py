@@ -7,6 +7,8 @@ PYTHONPATH).
 
 from __future__ import annotations
 
+import sys
+
 import torch
 
 from ganlane.agents.drivers import MobilDriver
@@ -40,18 +42,20 @@ class Daydreamers(TrafficModule):
         return v.with_(**pose._asdict()), {"away": (away - 1).clamp_min(0)}
 
 
-def main():
+def main(decisions="30"):
     """Drive a MOBIL ego through eight episodes side by side for half a minute."""
     road = Road(lanes=3)
     env = HighwayEnv(Daydreamers(road, every_s=20.0), num_envs=8, vehicles=9)
     env.check_env_specs()
-    state = env.rollout(30, MobilDriver(road), auto_reset=True, break_when_any_done=False)["next"]
+    state = env.rollout(int(decisions), MobilDriver(road), break_when_any_done=False)["next"]
     others = state["vehicles"][..., 1:]
     looking_away = (state["traffic", "away"][..., 1:] > 0).double().mean()
     speed = others["speed"].mean()
     print(f"mean speed of the others {speed:.1f} m/s, {100 * looking_away:.0f} % look away")
-    print(f"soft crashes of the ego: {int(state['events', 'soft_crash'].sum())} in 8 x 30 s")
+    print(
+        f"soft crashes of the ego: {int(state['events', 'soft_crash'].sum())} in 8 x {decisions} s"
+    )
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

@@ -17,6 +17,7 @@ from reference.refusals import is_one_sentence
 from ganlane.__main__ import main
 
 TINY = [*entry_tiny.TINY, "evaluation.agents=[random_legal]"]
+EVALUATE = ["evaluate", "-m", "seed=0,1", "traffics=[idm]", "episodes=2", "env.goal_m=40"]
 #: Option of hydra/launcher to the package that brings it and what it is told beside.
 LAUNCHERS = {
     "basic": ("hydra", []),
@@ -75,25 +76,13 @@ def own_logging(monkeypatch):
 
 @pytest.mark.usefixtures("empty_folder", "own_logging")
 def test_a_sweep_of_evaluate_has_a_folder_for_each_run_and_ends_with_one_table(capsys):
-    assert (
-        main(
-            [
-                "evaluate",
-                "-m",
-                "seed=0,1",
-                *["agents=[mobil,random_legal]", "traffics=[idm]", "episodes=2"],
-            ]
-        )
-        == 0
-    )
+    assert main([*EVALUATE, "agents=[mobil,keep_lane]"]) == 0
     (folder,) = Path("outputs/evaluate_sweeps").iterdir()
-    seeds = [
-        json.loads((folder / run / "results.json").read_text())["config"]["seed"]
-        for run in ("0", "1")
-    ]
-    assert seeds == [0, 1]
+    for run in (0, 1):
+        results = json.loads((folder / str(run) / "results.json").read_text())
+        assert results["config"]["seed"] == run
     table = capsys.readouterr().out.rpartition("results: ")[2]
-    assert table.count("random_legal") == 2
+    assert table.count("keep_lane") == 2
     assert "seed=0" in table
     assert "seed=1" in table
     assert f"sweep: {folder.absolute()}" in table
@@ -101,17 +90,6 @@ def test_a_sweep_of_evaluate_has_a_folder_for_each_run_and_ends_with_one_table(c
 
 @pytest.mark.usefixtures("empty_folder", "own_logging")
 def test_a_run_of_a_sweep_that_is_refused_ends_it_with_one_sentence(capsys):
-    assert (
-        main(
-            [
-                "evaluate",
-                "-m",
-                "seed=0,1",
-                "agents=[missing.safetensors]",
-                "traffics=[idm]",
-            ]
-        )
-        == 2
-    )
+    assert main([*EVALUATE, "agents=[missing.safetensors]"]) == 2
     assert is_one_sentence(capsys.readouterr().err, "evaluate")
     assert not list(Path("outputs").rglob("config.yaml"))

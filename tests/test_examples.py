@@ -32,7 +32,9 @@ EXAMPLES = {
 }
 #: Budgets that keep a run to seconds.
 SHORT = {
-    "own_function.py": ["60"],
+    "own_function.py": ["30"],
+    "own_reward.py": ["40"],
+    "own_traffic.py": ["3"],
     "torchrl_dqn.py": ["2048", "2", "60", "16"],
     "torchrl_ppo.py": ["2048", "2", "60", "16"],
     "cleanrl_style.py": ["2048"],
@@ -57,6 +59,9 @@ def test_the_example_runs_and_prints_its_result(name, monkeypatch, capsys, empty
     if name in NEEDS and importlib.util.find_spec(NEEDS[name]) is None:
         pytest.skip(f"{NEEDS[name]} is not installed")
     monkeypatch.setattr(sys, "argv", [name, *SHORT.get(name, [])])
+    # Of a suite two episodes on each traffic; whether recordings are at hand has no effect.
+    monkeypatch.setattr("ganlane.settings.suite.QUICK_SHARE", 0.0)
+    monkeypatch.setenv("GANLANE_DATA", str(empty_folder))
     with torch.random.fork_rng():
         runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
     assert re.search(EXAMPLES[name], capsys.readouterr().out)

@@ -256,7 +256,7 @@ def test_a_folder_that_the_locale_cannot_name_is_a_folder_like_others(tmp_path):
     locale = {"LC_ALL": "POSIX", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     environment = os.environ | locale | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(
-        [*line, "episodes=2", "threads=1"],
+        [*line, "episodes=2", "threads=1", "env.goal_m=40"],
         cwd=folder,
         env=environment,
         capture_output=True,

@@ -1,6 +1,7 @@
 """The policy of ``human``: what a driver perceives and does, its samples, fit and fine-tuning."""
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -178,17 +179,18 @@ def test_where_recordings_are_silent_the_prior_brakes_and_keeps_out_of_danger():
     assert samples.change.min() < -4.0
 
 
-SMALL = {"epochs": 2, "rounds": 1, "tuning": 2, "samples": 2, "observing": 20}
+SMALL = {"epochs": 2, "rounds": 1, "tuning": 2, "samples": 2, "observing": 4}
 
 
 @pytest.fixture
 def small_fits(monkeypatch):
-    """Fits that take a second."""
-    monkeypatch.setattr(human_estimator, "UPDATES", 20)
-    monkeypatch.setattr(human_fit, "PRIOR_SCENES", 100)
-    monkeypatch.setattr(human_fit, "LANE_UPDATES", 10)
+    """Fits that take half a second."""
+    monkeypatch.setattr(human_estimator, "UPDATES", 5)
+    monkeypatch.setattr(human_fit, "prior_samples", partial(prior_samples, scenes=100))
+    monkeypatch.setattr(human_fit, "LANE_UPDATES", 5)
+    monkeypatch.setattr(human_fit, "LONG_DECISIONS", 5)
     monkeypatch.setattr(human_tuning, "SCENES", 4)
-    monkeypatch.setattr(human_tuning, "DECISIONS", 8)
+    monkeypatch.setattr(human_tuning, "DECISIONS", 3)
 
 
 def test_a_fit_is_the_same_for_the_same_seed_and_reports_its_steps(small_fits):

@@ -11,23 +11,21 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import pytest
 
-from ganlane.config.run import COMMANDS, settings
+from ganlane.config.run import COMMANDS, call_settings
 from ganlane.errors import UserError
 from ganlane.settings.record import NO_KEY, make, option_names, plain
 
 SCENE = Path(__file__).parent / "reference" / "scene.csv"
-#: Words that reach every record: each command, and each option of a group in a command that has it.
-WORDS: dict[str, list[str]] = {
-    **{command: [command] for command in COMMANDS},
-    **{f"traffic={name}": ["train", f"traffic={name}"] for name in option_names("traffic")},
-    **{f"generator={n}": ["train_generator", f"generator={n}"] for n in option_names("generator")},
-    **{f"data={name}": ["prepare", f"data={name}", "data.path=x"] for name in ("ngsim", "highd")},
-    "env=scene": ["train", "env=scene", f"env.scene.path={SCENE}"],
-    "env=cut_in": ["train", "env=cut_in"],
-    "env=blocked_lane": ["train", "env=blocked_lane"],
-    "env=stop_and_go": ["train", "env=stop_and_go"],
-    "sensors": ["train", "observation.sensors.delay_s=1"],
-}
+#: Calls that reach every record: each command, and each option of a group in a command that has it.
+CALLS: list[tuple[str, dict[str, Any]]] = [
+    *((command, {}) for command in COMMANDS),
+    *(("train", {"traffic": name}) for name in option_names("traffic")),
+    *(("train_generator", {"generator": name}) for name in option_names("generator")),
+    *(("prepare", {"data": {"name": name, "path": "x"}}) for name in ("ngsim", "highd")),
+    *(("train", {"env": name}) for name in ("cut_in", "blocked_lane", "stop_and_go")),
+    ("train", {"env": {"name": "scene", "scene": {"path": SCENE}}}),
+    ("train", {"observation": {"sensors": {"delay_s": 1}}}),
+]
 #: What no key of a kind takes, and what one with a range would not.
 WRONG_TYPE: dict[Any, Any] = {
     int: "many",
@@ -69,50 +67,42 @@ def keys_of(
             yield type(record), path, hints[field.name]
 
 
-@cache
-def data_of(name: str) -> tuple[type, Any]:
-    """The record of some words, as its class and plain data."""
-    command, *words = WORDS[name]
-    record = settings(command, words)
-    return type(record), record
-
-
-def refusal_of(name: str, path: tuple[str, ...], value: Any) -> str:
+def refusal_of(record: Any, path: tuple[str, ...], value: Any) -> str:
     """The error of the record's constructor with another value at ``path``."""
-    kind, record = data_of(name)
     data = plain(record)
     inner = data
     for part in path[:-1]:
         inner = inner[part]
     inner[path[-1]] = value
     with pytest.raises(UserError) as caught:
-        make(kind, data)
+        make(type(record), data)
     return str(caught.value)
 
 
 @cache
-def places() -> dict[tuple[type, str], tuple[str, tuple[str, ...], Any]]:
-    """Every key of every record once: where it stands first, and its annotation."""
+def places() -> dict[tuple[type, str], tuple[Any, tuple[str, ...], Any]]:
+    """Every key of every record once: the whole where it stands first, and its annotation."""
     first = {}
-    for name in WORDS:
-        for record, path, hint in keys_of(data_of(name)[1]):
-            first.setdefault((record, path[-1]), (name, path, hint))
+    for command, keys in CALLS:
+        whole = call_settings(command, keys)
+        for record, path, hint in keys_of(whole):
+            first.setdefault((record, path[-1]), (whole, path, hint))
     return first
 
 
 def test_every_key_refuses_a_wrong_type():
-    for name, path, hint in places().values():
+    for whole, path, hint in places().values():
         kind, _ = kind_and_rules(hint)
         if kind in WRONG_TYPE and path[-1] not in ("traffics", "against"):
-            told = refusal_of(name, path, WRONG_TYPE[kind])
+            told = refusal_of(whole, path, WRONG_TYPE[kind])
             assert told.startswith(".".join(path)), told
             assert "expected" in told
             assert "\n" not in told
 
 
 def test_every_key_with_a_range_refuses_what_is_outside():
-    for name, path, hint in places().values():
+    for whole, path, hint in places().values():
         kind, has_range = kind_and_rules(hint)
         # A text that must not be empty takes any other.
         if has_range and kind in OUT_OF_RANGE and not (kind is str and "not empty" in str(hint)):
-            assert "expected" in refusal_of(name, path, OUT_OF_RANGE[kind]), path
+            assert "expected" in refusal_of(whole, path, OUT_OF_RANGE[kind]), path

@@ -33,7 +33,8 @@ USED_BY = {"data": "train_generator", "generator": "train_generator", "suite": "
 NEEDS = {
     ("env", "scene"): [f"env.scene.path={Path(__file__).parents[1] / 'reference' / 'scene.csv'}"]
 }
-GROUPS = sorted(path.name for path in conf_folder().iterdir() if path.is_dir())
+#: Experiments are composed, and trained from their start, in test_training_phases.py.
+GROUPS = sorted({path.name for path in conf_folder().iterdir() if path.is_dir()} - {"experiment"})
 OPTIONS = [(group, name) for group in GROUPS for name in option_names(group)]
 
 

@@ -35,6 +35,12 @@ SEED = 4
 SHORT = EnvConfig(goal_m=60.0, kernel="torch")
 
 
+@pytest.fixture(autouse=True)
+def smaller_batches(monkeypatch):
+    """Rows are left out of batches of 6, too."""
+    monkeypatch.setattr("ganlane.evaluation.episodes.SMALL_BATCH", 4)
+
+
 class Remade:
     """Makes an environment of any size, and remembers the sizes that were asked for."""
 
@@ -152,32 +158,32 @@ def test_every_episode_is_bit_for_bit_what_it_is_alone(
 ):
     monkeypatch.setattr("ganlane.evaluation.episodes.CHECK_EVERY", 2)
     make, driver = sources(recordings)[name], "agent_idm" if name == "late sensors" else "random"
-    policy, episodes = make_driver(driver, make.env).policy, [*range(30, 47), 7, 3]
+    policy, episodes = make_driver(driver, make.env).policy, [*range(30, 36), 7, 3]
     expected, modes = alone(make, policy, episodes), set()
     look = policy.register_forward_hook(
         lambda *_: modes.add((exploration_type(), torch.is_grad_enabled()))
     )
-    assert_as_alone(run_episodes(make(5), policy, episodes, SEED), expected)
+    assert_as_alone(run_episodes(make(3), policy, episodes, SEED), expected)
     make.sizes.clear()
     seen = []
     wide = run_episodes(
-        make(17), policy, episodes, SEED, lambda *counts: seen.append(counts), make_smaller=make
+        make(6), policy, episodes, SEED, lambda *counts: seen.append(counts), make_smaller=make
     )
     assert_as_alone(wide, expected)
     look.remove()
     # No noise, and no gradients; progress counts up.
     assert modes == {(ExplorationType.DETERMINISTIC, False)}
     assert seen == sorted(seen)
-    assert seen[-1] == (19, 19)
-    assert make.sizes[0] == 17
+    assert seen[-1] == (8, 8)
+    assert make.sizes[0] == 6
     assert (expected["reason"] == "other").any() == (name == "cut short")
 
 
 def test_episodes_stay_in_their_rows_unless_the_policy_says_that_they_may_move():
     make, policy = Remade(IdmTrafficConfig()), make_driver("random", SHORT).policy
     policy.rows_must_stay = True
-    run_episodes(make(17), policy, range(17), SEED, make_smaller=make)
-    assert make.sizes == [17]
+    run_episodes(make(6), policy, range(6), SEED, make_smaller=make)
+    assert make.sizes == [6]
 
 
 class Watchful(IdmTraffic):
@@ -203,26 +209,16 @@ class Watchful(IdmTraffic):
 
 def test_rows_stay_and_are_never_driven_on_where_the_traffic_holds_something_per_row():
     traffic, make = Watchful(), Remade(IdmTrafficConfig())
-    env, policy = make_env(traffic, SHORT, num_envs=17), make_driver("random", SHORT).policy
-    table = run_episodes(
-        env,
-        policy,
-        range(30),
-        SEED,
-        make_smaller=lambda rows: pytest.fail("moved"),
-    )
+    env, policy = make_env(traffic, SHORT, num_envs=6), make_driver("random", SHORT).policy
+
+    def never(rows):
+        pytest.fail("moved")
+
+    table = run_episodes(env, policy, range(12), SEED, make_smaller=never)
     moved = table.filter(pl.col("duration_s") > 0)["episode"]
-    assert set(moved) <= set(traffic.begun) <= set(range(30))
-    assert_frame_equal(
-        table,
-        run_episodes(
-            make(17),
-            policy,
-            range(30),
-            SEED,
-        ),
-        check_exact=True,
-    )
+    assert set(moved) <= set(traffic.begun) <= set(range(12))
+    expected = run_episodes(make(6), policy, range(12), SEED)
+    assert_frame_equal(table, expected, check_exact=True)
 
 
 class Stubborn(HighwayEnv):

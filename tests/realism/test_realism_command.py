@@ -62,52 +62,36 @@ def run(capsys, *arguments):
     return status, results, out, err
 
 
-def test_a_card_holds_every_quantity_in_numbers_tables_and_figures(recordings, capsys):
-    asked = [
-        "scenes=all",
-        "long_against=true",
-        "data.held_out=[synthetic-1]",
-    ]
-    status, results, out, _ = run(
-        capsys,
-        "traffic=idm",
-        f"data.path={recordings}",
-        *asked,
-    )
+def test_a_users_own_traffic_gets_a_card_of_every_quantity_and_one_of_i80_beside_the_scenes(
+    recordings, capsys
+):
+    # Found beside the scenes.
+    following_file(recordings.parent / "i80_following.csv")
+    mine = ["traffic=idm", "traffic._target_=entry_own_parts.Cruise", f"data.path={recordings}"]
+    more = ["scenes=all", "i80=true", "long_against=true", "data.held_out=[synthetic-1]"]
+    status, results, out, _ = run(capsys, *mine, *more)
     assert status == 0
-    assert results["traffic"] == "idm"
+    assert results["traffic"] == "entry_own_parts.Cruise"
+    assert len(results["scenes"]) == 4
     assert results["quantities"].keys() == QUANTITIES.keys()
     # A row holds distance, interval, scale and rivals.
     row = results["quantities"]["speed"]
     assert 0.0 <= row["distance_ci"][0] <= row["distance"] <= 1.0
     assert None not in (row["ceiling"], row["floor"])
-    assert row["against"]["idm_mobil"]["verdict"] in (
-        "closer",
-        "farther",
-        "undecided",
-    )
+    assert row["against"].keys() == {"idm_mobil"}
+    assert row["against"]["idm_mobil"]["verdict"] in ("closer", "farther", "undecided")
     assert results["quantities_held_out"]["speed"]["samples"] < row["samples"]
-    for key in (
-        "lane_changes_per_vehicle_km",
-        "overlaps_per_1000_vehicle_km_ci",
-        "off_road",
-        "machine",
-    ):
+    assert results["i80"]["I-80, following"].keys() == {"speed", "acceleration", "time_headway"}
+    for key in ("lane_changes_per_vehicle_km", "overlaps_per_1000_vehicle_km_ci", "off_road"):
         assert results[key] is not None
+    assert results["machine"]
     assert results["long_runs"][0]["vehicle_km"] >= 0.5
     assert results["long_runs_against"].keys() == {"idm_mobil"}
-    for part in (
-        "changes per vehicle-km",
-        "held-out scenes alone",
-        "idm_mobil, long runs",
-    ):
-        assert part in out
+    parts = ("changes per vehicle-km", "held-out scenes alone", "idm_mobil, long runs")
+    assert all(part in out for part in (*parts, "I-80, following"))
     # The tables can be made again from the file.
     assert "\n\n".join(card_text(results)) in out
-    for name in (
-        "distributions.png",
-        "distances.png",
-    ):
+    for name in ("distributions.png", "distances.png"):
         assert Image.open(results["folder"] / name).width > 400
 
 
@@ -145,28 +129,6 @@ def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(
     assert "no recordings here" in err
     speed = results["quantities"]["speed"]
     assert None not in (speed["ceiling"], speed["floor"])
-
-
-def test_a_users_own_traffic_gets_a_card_and_one_of_i80_beside_the_scenes(recordings, capsys):
-    # Found beside the scenes.
-    following_file(recordings.parent / "i80_following.csv")
-    mine = [
-        "traffic=idm",
-        "traffic._target_=entry_own_parts.Cruise",
-        "against=[idm]",
-    ]
-    more = ["scenes=all", "i80=true", "vehicle_km=0"]
-    status, results, out, _ = run(capsys, *mine, f"data.path={recordings}", *more)
-    assert status == 0
-    assert results["traffic"] == "entry_own_parts.Cruise"
-    assert results["quantities"]["speed"]["against"].keys() == {"idm"}
-    assert len(results["scenes"]) == 4
-    assert results["i80"]["I-80, following"].keys() == {
-        "speed",
-        "acceleration",
-        "time_headway",
-    }
-    assert "I-80, following" in out
 
 
 @pytest.mark.parametrize(
@@ -217,4 +179,5 @@ def test_one_scene_is_refused_with_what_to_do_and_driven_whole_when_asked(record
     assert status == 2
     for part in ("one scene, synthetic-1", "scenes=all", "scene_s=30"):
         assert part in err
-    assert run(capsys, "traffic=idm", f"data.path={recordings}", "scenes=all")[0] == 0
+    alone = ["scenes=all", "against=[]", "vehicle_km=0"]
+    assert run(capsys, "traffic=idm", f"data.path={recordings}", *alone)[0] == 0

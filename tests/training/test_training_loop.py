@@ -26,7 +26,7 @@ def whole(tmp_path_factory):
     """The agent and the folder of a run in one piece."""
     folder = tmp_path_factory.mktemp("whole")
     learner = agent()
-    train(road(8), learner, settings(1600), folder)
+    train(road(8), learner, settings(800), folder)
     return learner, folder
 
 
@@ -47,10 +47,10 @@ def test_the_agent_learns_to_stay_on_the_road_and_the_global_random_state_is_lef
 def test_the_rows_of_the_metrics_hold_what_happened(whole):
     learner, folder = whole
     figures = rows(folder / "metrics.csv")
-    assert [row["decisions"] for row in figures] == ["400", "800", "1200", "1600"]
+    assert [row["decisions"] for row in figures] == ["400", "800"]
     last = {name: float(value) for name, value in figures[-1].items()}
     # The updates of the last 8 decisions are still due: they are made while the next are driven.
-    assert last["updates"] == learner.updates == (1600 - 64 - 3 * 8 + 8) // 8
+    assert last["updates"] == learner.updates == (800 - 64 - 3 * 8 + 8) // 8
     assert sum(last[f"action_{i}_share"] for i in range(3)) == pytest.approx(1.0, abs=1e-4)
     assert last["goal_rate"] + last["out_of_road_rate"] == pytest.approx(1.0, abs=1e-4)
     assert last.keys() >= {"loss", "mean_q", "clamped_fraction", "sigma", "priority"}
@@ -60,11 +60,11 @@ def test_the_rows_of_the_metrics_hold_what_happened(whole):
 @pytest.mark.parametrize("environments", [4, 32])
 def test_there_is_one_update_per_decisions_per_update_whatever_the_batch(environments, tmp_path):
     learner = agent(warmup=96, decisions_per_update=16, n_step=1)
-    train(road(environments), learner, settings(960), tmp_path)
-    assert abs(learner.updates - (960 - 96) // 16) <= 2
+    train(road(environments), learner, settings(480), tmp_path)
+    assert abs(learner.updates - (480 - 96) // 16) <= 2
 
 
-@pytest.mark.parametrize("decisions", [40, 1200])  # before the buffer is full, and after
+@pytest.mark.parametrize("decisions", [40, 600])  # before the buffer is full, and after
 def test_an_interrupted_and_resumed_run_gives_the_same_weights(
     decisions,
     whole,
@@ -74,16 +74,10 @@ def test_an_interrupted_and_resumed_run_gives_the_same_weights(
     first = train(road(8), agent(), settings(decisions), tmp_path)
     torch.manual_seed(99)
     resumed = agent(seed=5)
-    result = train(
-        road(8),
-        resumed,
-        settings(1600),
-        tmp_path,
-        resume=first.checkpoint,
-    )
+    result = train(road(8), resumed, settings(800), tmp_path, resume=first.checkpoint)
     assert same(whole[0], resumed)
     assert "bit-exact" not in capsys.readouterr().err
-    assert result.progress["decisions"] == 1600
+    assert result.progress["decisions"] == 800
     assert result.progress["updates"] == whole[0].updates
     columns = ("decisions", "loss", "mean_return", "out_of_road_rate")
     ours, theirs = (
@@ -96,19 +90,14 @@ def test_an_interrupted_and_resumed_run_gives_the_same_weights(
 def test_a_light_checkpoint_refills_the_buffer_before_its_first_update_and_says_so(
     tmp_path, capsys
 ):
-    first = train(
-        road(8),
-        agent(),
-        settings(800, checkpoint_replay=False),
-        tmp_path,
-    )
+    first = train(road(8), agent(), settings(160, checkpoint_replay=False), tmp_path)
     resumed = agent()
-    light = settings(856, progress=True)
+    light = settings(216, progress=True)
     result = train(road(8), resumed, light, tmp_path, resume=first.checkpoint)
     assert "not bit-exact" in capsys.readouterr().err
     assert len(resumed.replay) == 40  # 7 steps of 8, of which the new window of 3 still holds 2
     assert result.progress["updates"] == first.progress["updates"]
-    more = settings(864 + 32)
+    more = settings(224 + 32)
     result = train(road(8), resumed, more, tmp_path, resume=first.checkpoint)
     assert result.progress["updates"] == first.progress["updates"] + 3
 
@@ -126,18 +115,12 @@ def test_a_signal_ends_the_run_after_its_step_with_a_checkpoint(whole, tmp_path)
     number = signal.SIGTERM
     handler = signal.getsignal(number)
     with signal_at(160, number):
-        stopped = loop.train(road(8), agent(), settings(1600), tmp_path)
+        stopped = loop.train(road(8), agent(), settings(800), tmp_path)
     assert stopped.stopped_by == number
     assert stopped.progress["decisions"] == 160
     assert signal.getsignal(number) == handler
     resumed = agent()
-    train(
-        road(8),
-        resumed,
-        settings(1600),
-        tmp_path,
-        resume=stopped.checkpoint,
-    )
+    train(road(8), resumed, settings(800), tmp_path, resume=stopped.checkpoint)
     assert same(whole[0], resumed)
 
 
@@ -150,7 +133,7 @@ def test_the_best_evaluated_agent_is_kept_and_the_last_one_too(tmp_path):
         seen.append(learner.weights()["head.weight_mu"])
         return {"mean_reward": next(scores), "crash_rate": 0.5}
 
-    often = settings(1200, evaluate_every=400)
+    often = settings(240, evaluate_every=80)
     result = train(road(8), learner, often, tmp_path, evaluate)
     assert result.best == 3.0
     assert [row["mean_reward"] for row in rows(tmp_path / "evaluation.csv")] == ["1", "3", "2"]
@@ -160,4 +143,4 @@ def test_the_best_evaluated_agent_is_kept_and_the_last_one_too(tmp_path):
         assert torch.equal(policy.network.head.weight_mu, expected)
         if name == "best":
             assert metadata["training"]["mean_reward"] == 3.0
-            assert metadata["training"]["decisions"] == 800
+            assert metadata["training"]["decisions"] == 160

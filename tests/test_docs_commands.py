@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -37,10 +38,15 @@ def test_every_command_of_a_page_is_accepted(page, monkeypatch):
     monkeypatch.setattr(scenes, "DRIVES", 1)
     monkeypatch.setattr(scenes, "_first_overlap", scenes._first_overlap.__wrapped__)
     for command, words in commands_of(page):
-        runs = [words]
-        if "-m" in words:
-            runs = single_runs(parsed(command, [word for word in words if word != "-m"]))
-        settings(command, runs[0])
+        accept(command, *words)
+
+
+@cache
+def accept(command, *words):
+    """Once, on whichever page it stands."""
+    if "-m" in words:
+        words = single_runs(parsed(command, [word for word in words if word != "-m"]))[0]
+    settings(command, words)
 
 
 def test_the_commands_are_found():

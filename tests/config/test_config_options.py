@@ -29,13 +29,10 @@ from ganlane.transforms import OBSERVATIONS
 
 #: Group to a command that has it.
 USED_BY = {"data": "train_generator", "generator": "train_generator", "suite": "benchmark"}
-#: What an option cannot do without.
-NEEDS = {
-    ("env", "scene"): [f"env.scene.path={Path(__file__).parents[1] / 'reference' / 'scene.csv'}"]
-}
+#: What env=scene cannot do without.
+SCENE = [f"env.scene.path={Path(__file__).parents[1] / 'reference' / 'scene.csv'}"]
 #: Experiments are composed, and trained from their start, in test_training_phases.py.
 GROUPS = sorted({path.name for path in conf_folder().iterdir() if path.is_dir()} - {"experiment"})
-OPTIONS = [(group, name) for group in GROUPS for name in option_names(group)]
 
 
 @cache
@@ -44,10 +41,19 @@ def config_of(command, *words):
     return settings(command, words)
 
 
-@pytest.mark.parametrize(("group", "name"), OPTIONS)
-def test_every_option_composes(group, name):
-    words = [f"{group}={name}", *NEEDS.get((group, name), [])]
-    config_of(USED_BY.get(group, "train"), *words)
+def lines_with_every_option():
+    """As few command lines as there can be: each has one option of all groups of its command."""
+    for command in ("train", *sorted(set(USED_BY.values()))):
+        groups = [group for group in GROUPS if USED_BY.get(group, "train") == command]
+        for number in range(max(len(option_names(group)) for group in groups)):
+            names = [option_names(group) for group in groups]
+            words = [f"{group}={of[number % len(of)]}" for group, of in zip(groups, names)]
+            yield [command, *words, *(SCENE if "env=scene" in words else [])]
+
+
+@pytest.mark.parametrize("line", lines_with_every_option(), ids=" ".join)
+def test_every_option_composes(line):
+    settings(line[0], line[1:])
 
 
 @pytest.mark.parametrize(("group", "names"), [("observation", FORMS), ("mask", MASKS)])

@@ -25,7 +25,7 @@ from ganlane.agents.checkpoint import (
     with_seeds,
 )
 from ganlane.agents.drivers import DRIVERS, FunctionPolicy, MaskedPolicy
-from ganlane.agents.stored_models import load_model
+from ganlane.agents.stored_models import SHIPPED_MODELS, load_model
 from ganlane.arguments import (
     call_with,
     import_target,
@@ -295,8 +295,9 @@ def make_driver(
             actions,
         )
     # a model of stable-baselines3, by its weights
-    if name.endswith(".zip"):
-        model, reading = load_model(Path(name), device)
+    stored = CHECKPOINTS / f"{name}.zip" if name in SHIPPED_MODELS else Path(name)
+    if stored.suffix == ".zip":
+        model, reading = load_model(stored, device)
         return Driver(
             name,
             model,
@@ -326,7 +327,7 @@ def make_driver(
         return Driver(name, policy.to(device))
     # A light wheel lacks some of the files, so only those that are there are suggested.
     shipped = [name for name in SHIPPED if (CHECKPOINTS / f"{name}.safetensors").is_file()]
-    names = ", ".join([*DRIVERS, *shipped])
+    names = ", ".join([*DRIVERS, *shipped, *SHIPPED_MODELS])
     raise UserError(
         f"agent {name:.100}: unknown; choose one of {names}, or give a checkpoint's path "
         "(.safetensors) or the "

@@ -45,6 +45,8 @@ NETWORKS: Mapping[str, tuple[str, str]] = {
     "DQN": ("q_net.q_net.", ""),
     _PLAIN: ("", ""),
 }
+#: Models that come with the package.
+SHIPPED_MODELS = ("agent_merge",)
 #: What does not act: layers of critics and of target networks, and the spread of controls.
 _OTHERS = ("mlp_extractor.value_net.", "value_net.", "q_net_target.", "log_std")
 _ACTIVATIONS = ("Tanh", "ReLU", "ELU", "SiLU", "GELU")

@@ -67,7 +67,7 @@ class SceneConfig(Record):
 
     def vehicles(self, env: EnvConfig) -> tuple[SceneVehicle, ...]:
         """The vehicles, the ego first."""
-        # The scene function takes what its signature names: of the road, and its own numbers.
+        # The scene's function takes what its signature names: of the road, and of its record.
         from ganlane.sim import scenarios
 
         offered = {
@@ -75,17 +75,9 @@ class SceneConfig(Record):
             "desired_speed_mps": env.ego_desired_speed_mps,
             "lane_width_m": env.lane_width_m,
             "idm": env.idm,
+            **vars(self),
         }
-        # Kind and jitter belong to every scene; the rest are the function's own arguments.
-        shared = key_names(SceneConfig)
-        names = [name for name in key_names(type(self)) if name not in shared]
-        numbers = {name: getattr(self, name) for name in names}
-        return call_with(
-            getattr(scenarios, self.kind),
-            offered,
-            numbers,
-            self.label(),
-        )
+        return call_with(getattr(scenarios, self.kind), offered, {}, self.label())
 
     def stretches(self, lanes: int) -> Stretches:
         """Where each of the ``lanes`` begins and ends; empty: all go on for ever."""
@@ -191,18 +183,6 @@ class MergeScene(SceneConfig):
         ramp = LaneStretch(self.ramp_m, self.ramp_m + self.merge_m, WALL)
         return (ramp, *[LaneStretch()] * (lanes - 1))
 
-    def vehicles(self, env: EnvConfig) -> tuple[SceneVehicle, ...]:
-        """The vehicles, the ego first."""
-        from ganlane.sim.scenarios import merge
-
-        return merge(
-            self.ego_speed_mps,
-            self.speed_mps,
-            self.spacing_m,
-            env.lanes,
-            env.ego_desired_speed_mps,
-        )
-
 
 @dataclass(frozen=True)
 class LaneDropScene(SceneConfig):
@@ -224,17 +204,6 @@ class LaneDropScene(SceneConfig):
     def stretches(self, lanes: int) -> Stretches:
         """The leftmost lane ends, the others go on."""
         return (*[LaneStretch()] * (lanes - 1), LaneStretch(end_m=self.drop_m, end=WALL))
-
-    def vehicles(self, env: EnvConfig) -> tuple[SceneVehicle, ...]:
-        """The vehicles, the ego first."""
-        from ganlane.sim.scenarios import lane_drop
-
-        return lane_drop(
-            self.speed_mps,
-            self.spacing_m,
-            env.lanes,
-            env.ego_desired_speed_mps,
-        )
 
 
 @dataclass(frozen=True)
@@ -263,18 +232,6 @@ class ExitScene(SceneConfig):
         """The rightmost lane is there for a while, the others go on."""
         leaving = LaneStretch(self.distance_m, self.distance_m + self.exit_m, EXIT)
         return (leaving, *[LaneStretch()] * (lanes - 1))
-
-    def vehicles(self, env: EnvConfig) -> tuple[SceneVehicle, ...]:
-        """The vehicles, the ego first."""
-        from ganlane.sim.scenarios import off_ramp
-
-        return off_ramp(
-            self.speed_mps,
-            self.faster_mps,
-            self.spacing_m,
-            env.lanes,
-            env.ego_desired_speed_mps,
-        )
 
 
 @dataclass(frozen=True)
@@ -307,19 +264,6 @@ class OnRampScene(SceneConfig):
         """The rightmost lane ends, the others go on."""
         ramp = LaneStretch(self.ramp_m, self.ramp_m + self.merge_m, EXIT if self.exit else WALL)
         return (ramp, *[LaneStretch()] * (lanes - 1))
-
-    def vehicles(self, env: EnvConfig) -> tuple[SceneVehicle, ...]:
-        """The vehicles, the ego first."""
-        from ganlane.sim.scenarios import beside_ramp
-
-        return beside_ramp(
-            self.ramp_speed_mps,
-            self.ramp_spacing_m,
-            self.speed_mps,
-            self.spacing_m,
-            env.lanes,
-            env.ego_desired_speed_mps,
-        )
 
 
 @dataclass(frozen=True)

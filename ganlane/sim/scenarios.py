@@ -2,7 +2,7 @@
 that end: merge, on-ramp, weave, lane drop, off-ramp; m, m/s.
 
 Functions of a few numbers that return the rows of a :class:`~ganlane.sim.scenes.FixedScene`, the
-ego first.
+ego first. The numbers are those of the records in :mod:`ganlane.settings.env`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from itertools import accumulate
 
 from ganlane.errors import UserError
 from ganlane.settings.driving import IdmParameters
-from ganlane.sim.idm import TABLE_V
 from ganlane.sim.scenes import SceneVehicle
 
 #: Length of every vehicle here, m: that of a car in SpawnParameters.
@@ -27,18 +26,18 @@ ASKEW_M = 0.6
 def stalled(
     x_m: float,
     lane: int,
-    lane_width_m: float = 4.0,
+    lane_width_m: float,
 ) -> SceneVehicle:
     """A vehicle that has broken down in ``lane``."""
     return SceneVehicle(x_m, y_m=lane * lane_width_m - ASKEW_M, desired_speed_mps=STALLED_MPS)
 
 
 def cut_in(
-    gap_m: float = 20.0,
-    speed_mps: float = 20.0,
-    cutter_speed_mps: float = 17.0,
-    lanes: int = 3,
-    desired_speed_mps: float = 25.0,
+    gap_m: float,
+    speed_mps: float,
+    cutter_speed_mps: float,
+    lanes: int,
+    desired_speed_mps: float,
 ) -> tuple[SceneVehicle, ...]:
     """A slower vehicle one lane to the left, ``gap_m`` ahead of the ego's bumper, moves into its
     lane at once.
@@ -71,12 +70,12 @@ def cut_in(
 
 
 def stalled_car(
-    distance_m: float = 200.0,
-    speed_mps: float = 20.0,
-    spacing_m: float = 120.0,
-    lanes: int = 3,
-    desired_speed_mps: float = 25.0,
-    lane_width_m: float = 4.0,
+    distance_m: float,
+    speed_mps: float,
+    spacing_m: float,
+    lanes: int,
+    desired_speed_mps: float,
+    lane_width_m: float,
 ) -> tuple[SceneVehicle, ...]:
     """A broken-down vehicle ``distance_m`` ahead in the ego's lane, the rightmost.
 
@@ -104,13 +103,13 @@ def stalled_car(
 
 
 def blocked_lane(
-    distance_m: float = 250.0,
-    standing: int = 3,
-    speed_mps: float = 15.0,
-    spacing_m: float = 60.0,
-    lanes: int = 2,
-    desired_speed_mps: float = 25.0,
-    lane_width_m: float = 4.0,
+    distance_m: float,
+    standing: int,
+    speed_mps: float,
+    spacing_m: float,
+    lanes: int,
+    desired_speed_mps: float,
+    lane_width_m: float,
 ) -> tuple[SceneVehicle, ...]:
     """The rightmost lane is closed by ``standing`` vehicles in a row, from ``distance_m`` on; the
     others are open.
@@ -144,12 +143,12 @@ def _column(
 
 
 def stop_and_go(
-    waves: int = 2,
-    per_wave: int = 5,
-    speed_mps: float = 10.0,
-    lanes: int = 2,
-    desired_speed_mps: float = 25.0,
-    idm: IdmParameters = TABLE_V,
+    waves: int,
+    per_wave: int,
+    speed_mps: float,
+    lanes: int,
+    desired_speed_mps: float,
+    idm: IdmParameters,
 ) -> tuple[SceneVehicle, ...]:
     """Columns in every lane, of alternately ``per_wave`` stopped and ``per_wave`` moving vehicles.
 
@@ -182,11 +181,11 @@ def stop_and_go(
 
 
 def merge(
-    ego_speed_mps: float = 18.0,
-    speed_mps: float = 20.0,
-    spacing_m: float = 50.0,
-    lanes: int = 3,
-    desired_speed_mps: float = 25.0,
+    ego_speed_mps: float,
+    speed_mps: float,
+    spacing_m: float,
+    lanes: int,
+    desired_speed_mps: float,
 ) -> tuple[SceneVehicle, ...]:
     """The ego alone on the rightmost lane, an on-ramp; ten vehicles ``spacing_m`` apart in each of
     the others, a third of them ahead of it.
@@ -196,13 +195,13 @@ def merge(
     return (ego, *_around(ego, range(1, lanes), 10, 3.0, spacing_m, speed_mps))
 
 
-def beside_ramp(
-    ramp_speed_mps: float = 18.0,
-    ramp_spacing_m: float = 50.0,
-    speed_mps: float = 20.0,
-    spacing_m: float = 60.0,
-    lanes: int = 3,
-    desired_speed_mps: float = 25.0,
+def on_ramp(
+    ramp_speed_mps: float,
+    ramp_spacing_m: float,
+    speed_mps: float,
+    spacing_m: float,
+    lanes: int,
+    desired_speed_mps: float,
 ) -> tuple[SceneVehicle, ...]:
     """Six vehicles ``ramp_spacing_m`` apart on the rightmost lane, an on-ramp, three of them ahead
     of the ego in the lane beside it; seven ``spacing_m`` apart in every other lane, and six in its
@@ -215,10 +214,10 @@ def beside_ramp(
 
 
 def lane_drop(
-    speed_mps: float = 20.0,
-    spacing_m: float = 60.0,
-    lanes: int = 3,
-    desired_speed_mps: float = 25.0,
+    speed_mps: float,
+    spacing_m: float,
+    lanes: int,
+    desired_speed_mps: float,
 ) -> tuple[SceneVehicle, ...]:
     """The ego in the leftmost lane, which ends; seven vehicles ``spacing_m`` apart in every other
     lane, and six in its own.
@@ -228,12 +227,12 @@ def lane_drop(
     return (ego, *_around(ego, range(lanes), 7, 2.0, spacing_m, speed_mps))
 
 
-def off_ramp(
-    speed_mps: float = 18.0,
-    faster_mps: float = 3.0,
-    spacing_m: float = 80.0,
-    lanes: int = 4,
-    desired_speed_mps: float = 25.0,
+def exit(
+    speed_mps: float,
+    faster_mps: float,
+    spacing_m: float,
+    lanes: int,
+    desired_speed_mps: float,
 ) -> tuple[SceneVehicle, ...]:
     """The ego in the leftmost lane; eight vehicles ``spacing_m`` apart in every other lane and
     seven in its own, but none in the rightmost, the exit lane.

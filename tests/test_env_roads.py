@@ -10,6 +10,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from reference.worlds import environment, moves, placed, step, vehicles
 
+import ganlane
 from ganlane import keys
 from ganlane.agents.drivers import MobilDriver
 from ganlane.build import make_driver, make_env, make_traffic
@@ -152,6 +153,18 @@ def test_who_is_behind_one_who_has_to_change_makes_room(courtesy, braking):
     traffic = IdmMobilTraffic(DROPPED, mobil=MobilParameters(courtesy=courtesy))
     scene = perceive(vehicles(nobody, ahead, behind), DROPPED)
     assert traffic.following(scene, TABLE_V)[0, 2].item() == pytest.approx(-braking, abs=1e-4)
+
+
+# The agent that ships
+
+
+def test_agent_merge_merges_from_the_ramp_sooner_than_mobil():
+    table = ganlane.api.evaluate(
+        ["agent_merge", "mobil"], ["idm_mobil"], 30, env="merge", goal_m=800.0
+    )
+    assert table["goal"].to_list() == [30, 30]
+    agent, mobil = table["mean_speed_mps"].to_list()
+    assert agent > mobil
 
 
 # What is refused

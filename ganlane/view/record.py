@@ -253,7 +253,9 @@ def _decide(
 ) -> TensorDictBase:
     """One decision; the state after it."""
     state = policy(state)
-    recorder.current_action = int(state[keys.ACTION][0])
+    action = state[keys.ACTION][0]
+    # Acceleration and line have no number; pictures then name no action.
+    recorder.current_action = int(action) if action.ndim == 0 else -1
     if isinstance(policy, GreedyPolicy):
         values = policy.network.values(state[keys.OBSERVATION])
         recorder.current_values = values[0].double().cpu().numpy()

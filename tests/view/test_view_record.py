@@ -21,6 +21,7 @@ from ganlane.data.schema import SCHEMA, TRACK_STRIDE
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig
+from ganlane.settings.record import make
 from ganlane.settings.traffic import IdmMobilTrafficConfig
 from ganlane.sim.state import Road
 from ganlane.traffic import ReplayTraffic
@@ -120,6 +121,16 @@ def test_a_network_tells_its_values_and_the_rewards_add_up(short):
     assert trajectory.returns[-1] == pytest.approx(reward[1::10].sum())
     assert len(np.unique(reward[1:])) > 1
     assert np.isnan(short.action_values).all()
+
+
+def test_an_agent_with_the_pedals_is_recorded_too():
+    config = make(EnvConfig, {"name": "merge", "goal_m": 100.0})
+    driver = make_driver("agent_merge", config)
+    traffic = make_traffic(IdmMobilTrafficConfig(), config)
+    env = make_env(traffic, driver.env(config), driver.observation)
+    trajectory = record_episode(env, driver.policy, seed=0, episode=0)
+    assert (trajectory.action == -1).all()
+    assert trajectory.x[-1, 0] >= 100.0
 
 
 # Tracks

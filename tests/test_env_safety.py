@@ -68,6 +68,7 @@ def drive(rng: random.Random, most_vehicles: int, duration_s: float) -> float:
         seed=rng.randrange(10**9),
         dtype=torch.float32,
         recycle=rng.random() < 0.5,
+        kernel="auto",
     )
     driver = (MobilDriver if rng.random() < 0.5 else KeepLaneDriver)(env.road)
     km = 0.0

@@ -158,7 +158,7 @@ def test_a_driver_brakes_for_nothing_or_does_not_attend_as_often_as_asked_for(
     traffic = idm_faults_traffic(faults=replace(NONE, **{part: faults}))
     begun = 0
     driven = 0
-    for before, after, _, _ in in_simulation(traffic, 32, 60, part, "left"):
+    for before, after, _, _ in in_simulation(traffic, 96, 20, part, "left"):
         begun += ((before == 0) & (after == at_first)).sum().item()
         driven += (before == 0).sum().item()
     assert begun > least
@@ -185,7 +185,7 @@ def test_the_share_of_changes_asked_for_is_hesitant_or_broken_off(fault, field):
     faulty = started = 0
     changes = CalibratedLaneChange(changes=CalibratedChanges(per_km=10.0))
     traffic = TrafficSequential({"base": IdmTraffic(), "change": changes, "fault": fault})
-    for before, after, was, now in in_simulation(traffic, 48, 60, "fault", field):
+    for before, after, was, now in in_simulation(traffic, 96, 30, "fault", field):
         moves = was.target_lane != now.target_lane
         turns = moves & (before >= 0) & (after < 0) & (now.target_lane == before)
         faulty += (turns if field == "origin" else after & moves).sum().item()
@@ -200,7 +200,7 @@ def test_with_everything_off_the_base_is_left_bitwise_as_it_is(base):
     faulty = environment(num_envs=16, traffic=with_faults(base(), NONE))
     one = plain.reset()
     other = faulty.reset()
-    for decision in range(40):
+    for decision in range(12):
         action = torch.full((16,), decision % 7 % 3)
         one = step(plain, one, action)
         other = step(faulty, other, action)

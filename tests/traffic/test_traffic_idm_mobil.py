@@ -186,10 +186,10 @@ def test_a_reaction_time_delays_the_acceleration_by_as_much():
 def test_a_driver_sways_within_its_lane(lane_width_m, bound):
     road = Road(lanes=3, lane_width_m=lane_width_m)
     widest = replace(RandomDrivers(), sway_m=(0.3, 0.3))
-    env = HighwayEnv(IdmRandomTraffic(road, drivers=widest), 12, dtype=torch.float64)
+    env = HighwayEnv(IdmRandomTraffic(road, drivers=widest), 24, dtype=torch.float64)
     td = env.reset()
     ways = []
-    for _ in range(60):
+    for _ in range(30):
         td = step(env, td)
         v = Vehicles.of(td[keys.VEHICLES])
         off = v.y - road.centre_of(v.target_lane, v.y.dtype)

@@ -94,7 +94,7 @@ def test_literal_changes_end_on_a_lane_centre_at_their_own_lateral_speed_and_res
 
 
 def test_calibrated_changes_find_gaps_and_touch_nobody():
-    others, _ = run(32, 12, 60, IdmTraffic(), change=CalibratedLaneChange())
+    others, _ = run(64, 12, 30, IdmTraffic(), change=CalibratedLaneChange())
     assert changes_started(others) > 50
     assert not any(pair_overlaps(Vehicles(*at)).any() for at in zip(*others))
 
@@ -129,7 +129,7 @@ def test_sudden_accelerations_fill_a_third_of_the_time_with_the_spread_of_the_da
 
 def test_the_guard_keeps_a_drifting_network_on_the_road_and_at_a_speed_people_drive():
     road = Road()
-    others, state = run(16, 9, 90, Drift(road), guard=Guard(road))
+    others, state = run(32, 9, 40, Drift(road), guard=Guard(road))
     half = lateral_half_extent(others)
     outside = torch.maximum(
         others.y + half - road.left_edge_m(),
@@ -142,7 +142,7 @@ def test_the_guard_keeps_a_drifting_network_on_the_road_and_at_a_speed_people_dr
 
 
 def test_the_guard_does_not_let_a_network_that_always_brakes_stand_still():
-    others, _ = run(8, 3, 120, Drift(lateral=0.0, acceleration=-3.0), guard=Guard())
+    others, _ = run(16, 3, 60, Drift(lateral=0.0, acceleration=-3.0), guard=Guard())
     assert others.speed[-1].min() > 4.0
 
 

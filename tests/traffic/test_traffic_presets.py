@@ -25,7 +25,7 @@ def others_of(traffic, n, decisions):
     return Vehicles(
         *(
             field[..., 1:]
-            for field in drive(HighwayEnv(traffic, num_envs=n), range(n), decisions)[0]
+            for field in drive(HighwayEnv(traffic, n, kernel="auto"), range(n), decisions)[0]
         )
     )
 

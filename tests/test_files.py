@@ -230,7 +230,11 @@ def test_a_file_that_lost_its_checksum_is_refused(tmp_path):
 def test_what_ships_has_checksums(capsys):
     for path in CHECKPOINTS.iterdir():
         assert path.stat().st_size < 5_000_000
-        assert has_checksum(path.read_bytes(), path), path
+        if path.suffix == ".zip":
+            # The description beside a model holds the checksums of both.
+            read_description(path)
+        else:
+            assert has_checksum(path.read_bytes(), path), path
     read_agent("agent_idm")
     assert capsys.readouterr().err == ""
 

@@ -20,6 +20,7 @@ from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from safetensors.torch import save_file
 
 from ganlane.agents import read_agent
+from ganlane.agents.stored_models import read_description
 from ganlane.data import read_scenes
 from ganlane.data.recordings import write_prepared
 from ganlane.errors import UserError

@@ -10,8 +10,9 @@
 sim: the simulator, bare and as a whole environment through TorchRL, beside HighwayEnv; gymnasium:
 every traffic through gymnasium, with random actions and with an ego that keeps its lane to the
 goal, beside EnvPool and HighwayEnv; scenarios: merging and taking an exit, beside their versions of
-the same and a highway with as many vehicles; traffic: every traffic model; train: the training
-loop, beside stable-baselines3's DQN on HighwayEnv. Peers are measured where they are installed.
+the same, an on-ramp beside SUMO's, each beside a highway with as many vehicles; traffic: every
+traffic model; train: the training loop, beside stable-baselines3's DQN on HighwayEnv. Peers are
+measured where they are installed.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from typing import Any
 from benchmarks.script import ReportSection, make_parser, run_script
 from benchmarks.speed import systems
 from benchmarks.speed.measure import Case, Labels, Row, best_rows, exponent, measure
+from benchmarks.speed.sumo import start_on_ramp
 from benchmarks.speed.systems import Road, installed_version
 from ganlane.agents import RainbowConfig
 from ganlane.evaluation import machine_sentence
@@ -59,7 +61,7 @@ SIMULATORS: dict[str, Callable[..., Any]] = {
 #: What the egos of the suite gymnasium do, and whether they keep their lanes.
 EGOS = {"random actions": False, "keeping its lane": True}
 #: Scenes of the suite scenarios: vehicles and lanes of each.
-SCENES = {"merge": (21, 3), "exit": (24, 4)}
+SCENES = {"merge": (21, 3), "exit": (24, 4), "on_ramp": (20, 3)}
 #: Suites that go through gymnasium.
 THROUGH_GYMNASIUM = ("gymnasium", "scenarios")
 TRAFFIC, TRAINING = "ganlane traffic", "ganlane training"
@@ -139,6 +141,14 @@ def peers_of(
         name = f"HighwayEnv {highway}"
         labels = labels_of(theirs, "speed", name, "eager", "cpu", threads, 1)
         peers.append(Case(labels, partial(systems.start_highway, road), 1))
+    elif road.scene == "on_ramp":
+        # Neither HighwayEnv nor EnvPool has one where others merge.
+        simulator = installed_version("libsumo")
+        if simulator is not None:
+            name = f"SUMO {simulator} on_ramp, {ego}"
+            its_road = replace(road, traffic="its IDM and LC2013")
+            labels = labels_of(its_road, "speed", name, "native", "cpu", threads, 1)
+            peers.append(Case(labels, partial(start_on_ramp, road.seed, EGOS[ego]), 1))
     elif options.suite in THROUGH_GYMNASIUM:
         keep = EGOS[ego]
         if envpool is not None:

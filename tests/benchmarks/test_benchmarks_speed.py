@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+import ganlane
 from benchmarks.speed import __main__ as speed
 from benchmarks.speed import systems
 from benchmarks.speed.measure import (
@@ -13,7 +14,9 @@ from benchmarks.speed.measure import (
     Sample,
     make_row,
 )
+from benchmarks.speed.sumo import EGO, ROOM_M, OnRamp, start_on_ramp
 from benchmarks.speed.systems import Road
+from ganlane import keys
 from ganlane.agents import RainbowConfig
 
 LABELS = Labels("speed", "mine", "idm", "eager", "cpu", 1, 9, 3, 4)
@@ -91,6 +94,25 @@ def test_peers_drive_our_road_and_the_baseline_has_our_network():
     assert type(exits).__name__ == "ExitEnv"
     config = RainbowConfig(hidden=(12, 8), batch_size=8, decisions_per_update=8)
     assert systems.start_baseline(Road(vehicles=4), config)(2) == 2 * 8 * 10
+
+
+def test_sumo_drives_our_on_ramp_until_its_ego_is_at_the_goal():
+    pytest.importorskip("libsumo", reason="libsumo comes with the extra 'bench'")
+    ramp = OnRamp(seed=0)
+    vehicle = ramp.sumo.vehicle
+    state = ganlane.make_env(env="on_ramp", seed=0).reset()[keys.VEHICLES]
+    fronts_m = (state["x"] + 0.5 * state["length"])[0].tolist()
+    assert len(vehicle.getIDList()) == len(fronts_m) == 20
+    for slot, front_m in enumerate(fronts_m):
+        is_beside = vehicle.getRoadID(str(slot)) == "beside"
+        begin_m = 150.0 if is_beside else -ROOM_M
+        assert vehicle.getLanePosition(str(slot)) == pytest.approx(front_m - begin_m, abs=1e-3)
+    seconds = 0
+    while vehicle.getDistance(EGO) > 1.0 or seconds == 0:
+        seconds += ramp.step(keys.KEEP) / 10
+    # At the goal it starts anew; on the way the ramp's vehicles have merged.
+    assert 1000 / 23 < seconds < ramp.timeout_s
+    assert start_on_ramp(0)(3) == 30
 
 
 def test_the_tables_go_into_the_document_and_the_rows_into_a_file(tmp_path):

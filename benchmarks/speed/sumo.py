@@ -1,0 +1,175 @@
+"""An on-ramp in SUMO: the road and the vehicles of ``env=on_ramp``, driven by SUMO's own drivers.
+
+SUMO holds one simulation per process, and a simulation here is one environment: no batches.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import ganlane
+from benchmarks.speed.measure import Runner
+from ganlane import keys
+from ganlane.env import HighwayEnv
+from ganlane.errors import UserError
+
+#: Road before x = 0, where the ego starts, and behind the goal, m.
+ROOM_M = 500.0
+EGO = "0"
+STEPS = round(1 / keys.PHYSICS_STEP_S)
+#: The ego takes every change that is asked for, unless it would hit somebody.
+ASKED_ONLY = 512
+OPTIONS = (
+    *("--step-length", str(keys.PHYSICS_STEP_S), "--collision.action", "none"),
+    *("--time-to-teleport", "-1", "--xml-validation", "never", "--no-step-log", "true"),
+    *("--duration-log.disable", "true", "--no-warnings", "true"),
+)
+
+
+def build_road(folder: Path, env: HighwayEnv) -> Path:
+    """The network: a ramp becomes the rightmost lane for as long as one may leave it.
+
+    Raises:
+        UserError: SUMO's ``netconvert`` refuses it.
+    """
+    ramp = env.road.stretches[0]
+    end_m = env.episode.goal_m + ROOM_M
+    lanes = env.road.lanes
+    places = {"in": -ROOM_M, "on": ramp.begin_m, "off": ramp.end_m, "out": end_m}
+    nodes = [f'<node id="{name}" x="{x}" y="0"/>' for name, x in places.items()]
+    nodes.append(f'<node id="yard" x="{-ROOM_M}" y="-50"/>')
+    edges = []
+    for name, start, end, its_lanes in (
+        ("before", "in", "on", lanes - 1),
+        ("ramp", "yard", "on", 1),
+        ("beside", "on", "off", lanes),
+        ("after", "off", "out", lanes - 1),
+    ):
+        length_m = places[end] - places.get(start, -ROOM_M)
+        edges.append(
+            f'<edge id="{name}" from="{start}" to="{end}" numLanes="{its_lanes}" speed="50" '
+            f'width="{env.road.lane_width_m}" length="{length_m}"/>'
+        )
+    joints = ['<connection from="ramp" to="beside" fromLane="0" toLane="0"/>']
+    for lane in range(lanes - 1):
+        ends = f'fromLane="{lane}" toLane="{lane + 1}"'
+        joints.append(f'<connection from="before" to="beside" {ends}/>')
+        ends = f'fromLane="{lane + 1}" toLane="{lane}"'
+        joints.append(f'<connection from="beside" to="after" {ends}/>')
+    call = ["netconvert", "--no-internal-links", "--output-file", str(folder / "net.xml")]
+    for name, lines in (("node", nodes), ("edge", edges), ("connection", joints)):
+        path = folder / f"{name}s.xml"
+        path.write_text(f"<{name}s>\n" + "\n".join(lines) + f"\n</{name}s>\n")
+        call += [f"--{name}-files", str(path)]
+    outcome = subprocess.run(call, capture_output=True, text=True, check=False)
+    if outcome.returncode:
+        raise UserError(f"netconvert cannot build the on-ramp: {outcome.stderr.strip()}")
+    return folder / "net.xml"
+
+
+def write_vehicles(folder: Path, env: HighwayEnv) -> Path:
+    """The vehicles of the first scene, each with SUMO's IDM and LC2013 and its own desired speed.
+
+    Front bumpers are half a length ahead of the centres.
+    """
+    ramp = env.road.stretches[0]
+    state = env.reset()[keys.VEHICLES]
+    lines = []
+    for name, edges in (
+        ("main", "before beside after"),
+        ("main_on", "beside after"),
+        ("ramp", "ramp beside after"),
+        ("ramp_on", "beside after"),
+    ):
+        lines.append(f'<route id="{name}" edges="{edges}"/>')
+    names = ("x", "target_lane", "speed", "length", "desired_speed")
+    columns = [state[name][0].tolist() for name in names]
+    for slot, (x, lane, speed_mps, length_m, desired_mps) in enumerate(zip(*columns)):
+        front_m = x + 0.5 * length_m
+        is_on = front_m >= ramp.begin_m
+        route = ("main" if lane else "ramp") + ("_on" if is_on else "")
+        at_m = front_m - (ramp.begin_m if is_on else -ROOM_M)
+        lane_there = lane if is_on or lane == 0 else lane - 1
+        lines.append(
+            f'<vType id="type{slot}" carFollowModel="IDM" maxSpeed="{desired_mps}" '
+            f'length="{length_m}" speedFactor="1" speedDev="0"/>'
+        )
+        lines.append(
+            f'<vehicle id="{slot}" type="type{slot}" route="{route}" depart="0" '
+            f'departLane="{lane_there}" departPos="{at_m}" '
+            f'departSpeed="{min(speed_mps, desired_mps)}" '
+            'insertionChecks="none"/>'
+        )
+    path = folder / "vehicles.xml"
+    path.write_text("<routes>\n" + "\n".join(lines) + "\n</routes>\n")
+    return path
+
+
+class OnRamp:
+    """``env=on_ramp`` in SUMO, one environment: an ego and the drivers around it."""
+
+    def __init__(self, seed: int) -> None:
+        import libsumo
+
+        env: HighwayEnv = ganlane.make_env(env="on_ramp", num_envs=1, seed=seed).base_env
+        self.goal_m = env.episode.goal_m
+        self.timeout_s = env.episode.timeout_s
+        self.sumo: Any = libsumo
+        # SUMO reads its files when it starts, and the state at every reset.
+        self._folder = tempfile.TemporaryDirectory()
+        folder = Path(self._folder.name)
+        network, routes = build_road(folder, env), write_vehicles(folder, env)
+        if libsumo.isLoaded():
+            libsumo.close()
+        files = ("--net-file", str(network), "--route-files", str(routes))
+        libsumo.start(["sumo", *files, *OPTIONS, "--seed", str(seed)])
+        libsumo.simulationStep()
+        self._start = str(folder / "start.xml")
+        libsumo.simulation.saveState(self._start)
+        self._started_s = libsumo.simulation.getTime()
+        self._hold()
+
+    def _hold(self) -> None:
+        """The ego changes lanes when told to only."""
+        self.sumo.vehicle.setLaneChangeMode(EGO, ASKED_ONLY)
+
+    def reset(self) -> None:
+        """The first scene again."""
+        self.sumo.simulation.loadState(self._start)
+        self._hold()
+
+    def step(self, action: int) -> int:
+        """A decision: 0 keeps the lane, 1 is left, 2 is right. Returns its physics steps."""
+        if action != keys.KEEP:
+            aside = 1 if action == keys.LEFT else -1
+            self.sumo.vehicle.changeLaneRelative(EGO, aside, 1.0)
+        for _ in range(STEPS):
+            self.sumo.simulationStep()
+        if self._is_over():
+            self.reset()
+        return STEPS
+
+    def _is_over(self) -> bool:
+        vehicle = self.sumo.vehicle
+        driven_s = self.sumo.simulation.getTime() - self._started_s
+        return vehicle.getDistance(EGO) > self.goal_m or driven_s > self.timeout_s
+
+
+def start_on_ramp(seed: int, keep: bool = False) -> Runner:
+    """SUMO's on-ramp: random actions, or the lane is kept."""
+    ramp = OnRamp(seed)
+    random = np.random.default_rng(seed)
+
+    def run(decisions: int) -> int:
+        drawn = random.integers(3, size=decisions)
+        steps = 0
+        for action in drawn:
+            steps += ramp.step(keys.KEEP if keep else int(action))
+        return steps
+
+    return run

@@ -291,7 +291,11 @@ def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate |
 
     def ratio(both: Array) -> Array:
         sums = both.sum(axis=-1)
-        return np.asarray(sums[:, 0] / np.maximum(sums[:, 1], np.finfo(np.float64).tiny))
+        driven = sums[:, 1] > 0.0
+        # A draw without a kilometre says nothing about the rate.
+        rates = np.full(len(sums), happened.sum() / total)
+        rates[driven] = sums[driven, 0] / sums[driven, 1]
+        return rates
 
     # One table, so that a draw of trainings is one for events and kilometres.
     resampled = _estimate(

@@ -147,7 +147,10 @@ class FixedScene:
         return max(row.length_m for row in self.rows)
 
     def check(self, road: Road, idm: IdmParameters) -> None:
-        """Raise :class:`UserError` if ``road`` is another, or a vehicle cannot brake in time."""
+        """Raise :class:`UserError` if ``road`` is another, or a vehicle cannot brake in time.
+
+        Those who wait outside are out of everybody's way.
+        """
         lanes = self.road.lanes
         width = self.road.lane_width_m
         if self.road != road:
@@ -157,8 +160,9 @@ class FixedScene:
                 f"traffic's has {road.lanes} of {road.lane_width_m} m{ring}; give both the same "
                 "road."
             )
-        check_braking(self, idm)
-        check_drive(self, idm)
+        present = replace(self, rows=self.rows[: self.vehicles - self.waiting], waiting=0)
+        check_braking(present, idm)
+        check_drive(present, idm)
 
     def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:
         """The scene once per key [N], varied by the jitter."""

@@ -209,6 +209,11 @@ def test_a_rate_is_all_events_over_all_kilometres_and_no_crash_leaves_room_for_s
     rate = rate_over_trainings(np.zeros((1, 10)), np.full((1, 10), 5.0))
     assert rate.interval == pytest.approx([0.0, poisson_interval(0).high / 50])
     assert rate_over_trainings([[0.0]], [[0.0]]) is None
+    # Of two trainings one left the road at once: a draw of that one alone tells no rate.
+    rate = rate_over_trainings([[1.0, 0.0], [0.0, 0.0]], [[4.0, 6.0], [0.0, 0.0]])
+    assert rate is not None
+    assert rate.value == pytest.approx(0.1)
+    assert np.isfinite([rate.low, rate.high]).all()
 
 
 def test_mcnemar_counts_the_episodes_in_which_the_drivers_differ():

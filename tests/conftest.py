@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import pytest
@@ -19,8 +21,48 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     os.environ["GANLANE_CACHE"] = tempfile.mkdtemp(prefix="ganlane-tests-")
 
 
+#: There while the kernel is being built.
+BUILDING = Path(os.environ["GANLANE_CACHE"], "building")
+BUILD = """
+import sys
+from pathlib import Path
+
+try:
+    from ganlane.native.library import why_not
+
+    why_not()
+finally:
+    Path(sys.argv[1]).unlink(missing_ok=True)
+"""
+
+
+def pytest_configure(config):
+    """With several workers the kernel is built beside their collection, and once for all."""
+    if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
+        BUILDING.touch()
+        config.kernel_build = subprocess.Popen([sys.executable, "-c", BUILD, str(BUILDING)])
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop():
+    while "PYTEST_XDIST_WORKER" in os.environ and BUILDING.exists():
+        time.sleep(0.1)
+
+
+def pytest_runtest_setup(item):
+    if item.get_closest_marker("kernel") is not None:
+        from ganlane.native.library import why_not
+
+        reason = why_not()
+        if reason is not None:
+            pytest.skip(f"the kernel {reason}")
+
+
 def pytest_unconfigure(config):
     if not hasattr(config, "workerinput"):
+        if hasattr(config, "kernel_build"):
+            config.kernel_build.kill()
+            config.kernel_build.wait()
         shutil.rmtree(os.environ["GANLANE_CACHE"], ignore_errors=True)
 
 

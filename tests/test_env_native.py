@@ -16,7 +16,7 @@ from ganlane import keys
 from ganlane.build import make_env
 from ganlane.env.highway import say_once
 from ganlane.errors import UserError
-from ganlane.native.library import ROWS_PER_THREAD, threads_allowed, why_not
+from ganlane.native.library import ROWS_PER_THREAD, threads_allowed
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.runtime import kernel_threads
 from ganlane.settings.driving import EgoParameters, IdmParameters
@@ -26,7 +26,7 @@ from ganlane.sim.state import Road
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 from ganlane.transforms import ActionMaskTransform, ObservationTransform
 
-pytestmark = pytest.mark.skipif(why_not() is not None, reason=f"the kernel {why_not()}")
+pytestmark = pytest.mark.kernel
 
 
 def native(num_envs: int = 8, **others):

@@ -26,9 +26,6 @@ from ganlane.traffic import IdmTraffic
 ROWS = 16
 TRAFFICS = {"idm": IdmTrafficConfig(), "idm_mobil": IdmMobilTrafficConfig()}
 TRAFFIC = pytest.mark.parametrize("traffic", list(TRAFFICS))
-SCENARIOS = {
-    name: make(EnvConfig, name) for name in ("cut_in", "stalled_car", "stop_and_go", "blocked_lane")
-}
 
 
 class Drive(NamedTuple):
@@ -42,8 +39,9 @@ class Drive(NamedTuple):
     timeout: torch.Tensor
 
 
-def drive(config: EnvConfig, driver: str, traffic: str, seconds: int) -> Drive:
+def drive(scene: str | EnvConfig, driver: str, traffic: str, seconds: int) -> Drive:
     """``ROWS`` episodes side by side, without a goal, until one of them ends; nobody is touched."""
+    config = make(EnvConfig, scene) if isinstance(scene, str) else scene
     config = replace(config, goal_m=1e5)
     env = make_env(make_traffic(TRAFFICS[traffic], config), config, num_envs=ROWS)
     policy = make_driver(driver, config).policy
@@ -75,7 +73,7 @@ def test_in_the_cut_in_the_ego_brakes_hard_but_nobody_crashes(driver, traffic):
 
     It starts with 20 m, 3 m/s too fast, and brakes with 5 to 9 m/s2.
     """
-    seen = drive(SCENARIOS["cut_in"], driver, traffic, 25)
+    seen = drive("cut_in", driver, traffic, 25)
     assert -10.0 < seen.hardest < -4.0
     ego = torch.stack([frame.acceleration[:, 0] for frame in seen.frames[:20]])
     assert (ego.amin(0) < -4.0).all()
@@ -86,14 +84,14 @@ def test_in_the_cut_in_the_ego_brakes_hard_but_nobody_crashes(driver, traffic):
 
 @TRAFFIC
 def test_the_mobil_ego_passes_the_stalled_car_without_a_crash(traffic):
-    seen = drive(SCENARIOS["stalled_car"], "mobil", traffic, 60)
+    seen = drive("stalled_car", "mobil", traffic, 60)
     assert (seen.frames[-1].x[:, 0] > 300.0).all()
     assert seen.hardest > -3.0
 
 
 @TRAFFIC
 def test_the_keep_lane_ego_stops_two_metres_behind_the_stalled_car(traffic):
-    seen = drive(SCENARIOS["stalled_car"], "keep_lane", traffic, 60)
+    seen = drive("stalled_car", "keep_lane", traffic, 60)
     last = seen.frames[-1]
     gap = last.x[:, 1] - last.x[:, 0] - 4.5
     assert ((gap > 1.7) & (gap < 2.6)).all()
@@ -108,9 +106,9 @@ def test_polite_mobil_strands_at_the_closed_lane_and_egoistic_mobil_finds_a_gap(
     """With politeness 1 a gap of 55 m costs the follower more than the ego gains, until it stands
     and cannot go.
     """
-    polite = drive(SCENARIOS["blocked_lane"], "mobil", traffic, 60)
+    polite = drive("blocked_lane", "mobil", traffic, 60)
     assert ((polite.frames[-1].x[:, 0] < 250.0) & (polite.frames[-1].speed[:, 0] < 0.5)).all()
-    egoistic = drive(SCENARIOS["blocked_lane"], "mobil_egoistic", traffic, 60)
+    egoistic = drive("blocked_lane", "mobil_egoistic", traffic, 60)
     assert (egoistic.frames[-1].x[:, 0] > 320.0).all()
 
 
@@ -134,7 +132,7 @@ def test_the_wave_travels_backwards_while_everybody_drives_forwards():
 
 
 def test_the_ego_stops_for_the_wave_and_drives_on_and_the_scene_brakes_gently():
-    seen = drive(SCENARIOS["stop_and_go"], "keep_lane", "idm", 60)
+    seen = drive("stop_and_go", "keep_lane", "idm", 60)
     speed = torch.stack([frame.speed[:, 0] for frame in seen.frames])
     assert (speed.amin(0) < 3.0).all()
     assert (speed[-1] > 5.0).all()

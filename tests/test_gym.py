@@ -19,7 +19,6 @@ from ganlane.build import make_traffic
 from ganlane.errors import UserError
 from ganlane.gym import ENV_IDS
 from ganlane.native.drivers import NETWORKS, drivers_of
-from ganlane.native.library import why_not
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.episode import Stream
 from ganlane.settings.record import make as make_record
@@ -115,7 +114,7 @@ def test_neither_making_nor_running_a_batch_warns(traffic, mode):
     assert terminated.dtype == truncated.dtype == np.bool_
 
 
-@pytest.mark.skipif(why_not() is not None, reason=f"no native kernel here: {why_not()}")
+@pytest.mark.kernel
 def test_the_id_imports_the_package_which_drives_by_rules_without_torch_and_hydra():
     code = (
         "import sys, gymnasium; env = gymnasium.make('ganlane:ganlane/Highway-v0'); "
@@ -173,7 +172,7 @@ def test_option_and_module_give_one_answer_to_who_drives(traffic):
     assert of_option is not None
 
 
-@pytest.mark.skipif(why_not() is not None, reason=f"no native kernel here: {why_not()}")
+@pytest.mark.kernel
 def test_pictures_change_nobody():
     """With a render mode the same kernel drives, behind the TorchRL environment."""
     plain = make()

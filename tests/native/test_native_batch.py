@@ -10,10 +10,9 @@ import pytest
 from ganlane.gym.base import make_rows
 from ganlane.gym.native_rows import NativeRows
 from ganlane.gym.tensor_rows import TensorRows
-from ganlane.native.library import why_not
 from ganlane.settings.commands import highways
 
-pytestmark = pytest.mark.skipif(why_not() is not None, reason="no C++ compiler")
+pytestmark = pytest.mark.kernel
 ROWS = 37
 
 

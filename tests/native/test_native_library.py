@@ -15,7 +15,7 @@ from ganlane.errors import UserError
 from ganlane.files import PLACE
 from ganlane.native import library
 
-needs_compiler = pytest.mark.skipif(library.why_not() is not None, reason="no C++ compiler")
+needs_compiler = pytest.mark.kernel
 
 
 @pytest.fixture(scope="module")

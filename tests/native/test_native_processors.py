@@ -16,7 +16,7 @@ import pytest
 
 from ganlane.native.batch import NativeBatch
 from ganlane.native.drivers import drivers_of, parts_of
-from ganlane.native.library import FLAGS, VARIANTS, why_not
+from ganlane.native.library import FLAGS, VARIANTS
 from ganlane.native.settings import Layout, ends_of
 from ganlane.settings.commands import highways
 from ganlane.settings.driving import IdmParameters, MobilParameters
@@ -54,7 +54,7 @@ PROCESSORS = {
 }
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(why_not() is not None, reason="no C++ compiler"),
+    pytest.mark.kernel,
     pytest.mark.skipif(
         importlib.util.find_spec("ziglang") is None, reason="ziglang is not installed"
     ),

@@ -26,7 +26,7 @@ from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.native.drivers import RuleDrivers
-from ganlane.native.library import VARIANTS, best_variant, why_not
+from ganlane.native.library import VARIANTS, best_variant
 from ganlane.native.tensors import Kernel, NativeScenes
 from ganlane.settings.actions import ActionParameters
 from ganlane.settings.driving import Visibility
@@ -37,7 +37,7 @@ from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 
-pytestmark = pytest.mark.skipif(why_not() is not None, reason=f"the kernel {why_not()}")
+pytestmark = pytest.mark.kernel
 #: The one for any processor takes long to build and to drive; .ci/run has a step for it.
 RUNNABLE = [
     pytest.param(name, marks=pytest.mark.slow) if name == "default" else name

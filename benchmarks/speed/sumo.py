@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 
 import ganlane
+from benchmarks.peers.simulators import command, vehicle_type
 from benchmarks.speed.measure import Runner
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
+from ganlane.sim.idm import TABLE_V
 
 #: Road before x = 0, where the ego starts, and behind the goal, m.
 ROOM_M = 500.0
@@ -24,14 +26,9 @@ EGO = "0"
 STEPS = round(1 / keys.PHYSICS_STEP_S)
 #: The ego takes every change that is asked for, unless it would hit somebody.
 ASKED_ONLY = 512
-OPTIONS = (
-    *("--step-length", str(keys.PHYSICS_STEP_S), "--collision.action", "none"),
-    *("--time-to-teleport", "-1", "--xml-validation", "never", "--no-step-log", "true"),
-    *("--duration-log.disable", "true", "--no-warnings", "true"),
-)
 
 
-def build_road(folder: Path, env: HighwayEnv) -> Path:
+def build_road(folder: Path, env: HighwayEnv) -> None:
     """The network: a ramp becomes the rightmost lane for as long as one may leave it.
 
     Raises:
@@ -69,45 +66,32 @@ def build_road(folder: Path, env: HighwayEnv) -> Path:
     outcome = subprocess.run(call, capture_output=True, text=True, check=False)
     if outcome.returncode:
         raise UserError(f"netconvert cannot build the on-ramp: {outcome.stderr.strip()}")
-    return folder / "net.xml"
 
 
-def write_vehicles(folder: Path, env: HighwayEnv) -> Path:
-    """The vehicles of the first scene, each with SUMO's IDM and LC2013 and its own desired speed.
+def write_vehicles(folder: Path, env: HighwayEnv) -> None:
+    """The vehicles of the first scene, with Table V's IDM and SUMO's lane changes (LC2013).
 
     Front bumpers are half a length ahead of the centres.
     """
     ramp = env.road.stretches[0]
     state = env.reset()[keys.VEHICLES]
-    lines = []
-    for name, edges in (
-        ("main", "before beside after"),
-        ("main_on", "beside after"),
-        ("ramp", "ramp beside after"),
-        ("ramp_on", "beside after"),
-    ):
-        lines.append(f'<route id="{name}" edges="{edges}"/>')
     names = ("x", "target_lane", "speed", "length", "desired_speed")
     columns = [state[name][0].tolist() for name in names]
+    lines = []
     for slot, (x, lane, speed_mps, length_m, desired_mps) in enumerate(zip(*columns)):
         front_m = x + 0.5 * length_m
-        is_on = front_m >= ramp.begin_m
-        route = ("main" if lane else "ramp") + ("_on" if is_on else "")
-        at_m = front_m - (ramp.begin_m if is_on else -ROOM_M)
-        lane_there = lane if is_on or lane == 0 else lane - 1
+        edges, at_m = "beside after", front_m - ramp.begin_m
+        if at_m < 0.0:
+            edges, at_m = f"{'before' if lane else 'ramp'} {edges}", front_m + ROOM_M
+            # There the main road has one lane less.
+            lane = max(lane - 1, 0)
+        lines.append(vehicle_type(f"type{slot}", desired_mps, keys.PHYSICS_STEP_S, TABLE_V))
         lines.append(
-            f'<vType id="type{slot}" carFollowModel="IDM" maxSpeed="{desired_mps}" '
-            f'length="{length_m}" speedFactor="1" speedDev="0"/>'
+            f'<vehicle id="{slot}" type="type{slot}" depart="0" departLane="{lane}" '
+            f'departPos="{at_m}" departSpeed="{min(speed_mps, desired_mps)}" '
+            f'insertionChecks="none"><route edges="{edges}"/></vehicle>'
         )
-        lines.append(
-            f'<vehicle id="{slot}" type="type{slot}" route="{route}" depart="0" '
-            f'departLane="{lane_there}" departPos="{at_m}" '
-            f'departSpeed="{min(speed_mps, desired_mps)}" '
-            'insertionChecks="none"/>'
-        )
-    path = folder / "vehicles.xml"
-    path.write_text("<routes>\n" + "\n".join(lines) + "\n</routes>\n")
-    return path
+    (folder / "routes.xml").write_text("<routes>\n" + "\n".join(lines) + "\n</routes>\n")
 
 
 class OnRamp:
@@ -123,25 +107,21 @@ class OnRamp:
         # SUMO reads its files when it starts, and the state at every reset.
         self._folder = tempfile.TemporaryDirectory()
         folder = Path(self._folder.name)
-        network, routes = build_road(folder, env), write_vehicles(folder, env)
+        build_road(folder, env)
+        write_vehicles(folder, env)
         if libsumo.isLoaded():
             libsumo.close()
-        files = ("--net-file", str(network), "--route-files", str(routes))
-        libsumo.start(["sumo", *files, *OPTIONS, "--seed", str(seed)])
+        libsumo.start([*command(folder, True, keys.PHYSICS_STEP_S), "--seed", str(seed)])
         libsumo.simulationStep()
         self._start = str(folder / "start.xml")
         libsumo.simulation.saveState(self._start)
         self._started_s = libsumo.simulation.getTime()
-        self._hold()
-
-    def _hold(self) -> None:
-        """The ego changes lanes when told to only."""
-        self.sumo.vehicle.setLaneChangeMode(EGO, ASKED_ONLY)
+        self.reset()
 
     def reset(self) -> None:
-        """The first scene again."""
+        """The first scene again; the ego changes lanes when told to only."""
         self.sumo.simulation.loadState(self._start)
-        self._hold()
+        self.sumo.vehicle.setLaneChangeMode(EGO, ASKED_ONLY)
 
     def step(self, action: int) -> int:
         """A decision: 0 keeps the lane, 1 is left, 2 is right. Returns its physics steps."""

@@ -106,7 +106,7 @@ def test_sumo_drives_our_on_ramp_until_its_ego_is_at_the_goal():
     for slot, front_m in enumerate(fronts_m):
         is_beside = vehicle.getRoadID(str(slot)) == "beside"
         begin_m = 150.0 if is_beside else -ROOM_M
-        assert vehicle.getLanePosition(str(slot)) == pytest.approx(front_m - begin_m, abs=1e-3)
+        assert vehicle.getLanePosition(str(slot)) == pytest.approx(front_m - begin_m, abs=0.01)
     seconds = 0
     while vehicle.getDistance(EGO) > 1.0 or seconds == 0:
         seconds += ramp.step(keys.KEEP) / 10

@@ -72,9 +72,9 @@ class Training(NamedTuple):
 
 
 def trainings(seeds: int) -> Iterator[Training]:
-    """All of them; the first seeds of everything come first."""
-    for seed in range(seeds):
-        for mask in MASKS:
+    """All of them; all seeds of the first mask come first, so that one whole table is soon there."""
+    for mask in MASKS:
+        for seed in range(seeds):
             yield Training(mask, UNCHANGED, None, seed)
             for name, doses in DOSES.items():
                 for dose in doses:

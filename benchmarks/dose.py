@@ -72,7 +72,7 @@ class Training(NamedTuple):
 
 
 def trainings(seeds: int) -> Iterator[Training]:
-    """All of them; all seeds of the first mask come first, so that one whole table is soon there."""
+    """All of them; all seeds of a mask come first, so that one whole table is soon there."""
     for mask in MASKS:
         for seed in range(seeds):
             yield Training(mask, UNCHANGED, None, seed)

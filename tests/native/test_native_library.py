@@ -15,8 +15,6 @@ from ganlane.errors import UserError
 from ganlane.files import PLACE
 from ganlane.native import library
 
-needs_compiler = pytest.mark.kernel
-
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory):
@@ -70,7 +68,7 @@ def calls(program: Path) -> int:
     return Path(f"{program}.calls").read_text().count("kernel.so")
 
 
-@needs_compiler
+@pytest.mark.kernel
 def test_it_is_built_once(compiler, plain):
     program = compiler(WORKS, plain)
     library.load()
@@ -79,7 +77,7 @@ def test_it_is_built_once(compiler, plain):
     assert len(built()) == calls(program) == 1
 
 
-@needs_compiler
+@pytest.mark.kernel
 def test_another_source_is_another_library(monkeypatch, tmp_path, compiler, plain):
     compiler(WORKS, plain)
     library.load()
@@ -108,7 +106,7 @@ def damaged(content: bytes) -> list[bytes]:
     ]
 
 
-@needs_compiler
+@pytest.mark.kernel
 def test_a_damaged_library_is_built_anew_and_never_loaded(monkeypatch, compiler, plain):
     program = compiler(WORKS, plain)
     library.load()
@@ -123,7 +121,7 @@ def test_a_damaged_library_is_built_anew_and_never_loaded(monkeypatch, compiler,
         assert calls(program) == count
 
 
-@needs_compiler
+@pytest.mark.kernel
 def test_a_damaged_library_of_a_wheel_is_passed_over(monkeypatch, tmp_path, compiler, plain):
     compiler(WORKS, plain)
     monkeypatch.setattr(library, "PREBUILT", tmp_path)
@@ -131,7 +129,7 @@ def test_a_damaged_library_of_a_wheel_is_passed_over(monkeypatch, tmp_path, comp
     assert library.find().maker == str(tmp_path / "compiler")
 
 
-@needs_compiler
+@pytest.mark.kernel
 def test_a_compiler_that_lacks_an_instruction_set_makes_the_kernel_for_the_next(
     compiler, plain, capsys
 ):
@@ -145,7 +143,7 @@ def test_a_compiler_that_lacks_an_instruction_set_makes_the_kernel_for_the_next(
     assert isinstance(library.find("AVX512"), str)
 
 
-@needs_compiler
+@pytest.mark.kernel
 @pytest.mark.parametrize(
     "lines", [FAILS, "exit 0", "kill -9 $$", WORKS.replace('cp "$library"', "echo no library >")]
 )
@@ -162,7 +160,7 @@ def test_the_clang_of_ziglang_is_asked_after_a_compiler_that_fails(
     assert "cannot be used" not in told
 
 
-@needs_compiler
+@pytest.mark.kernel
 @pytest.mark.parametrize("place", ["file", "/proc/nowhere"])
 def test_a_cache_that_cannot_be_used_is_passed_over(
     place, monkeypatch, tmp_path, compiler, plain, capsys
@@ -178,7 +176,7 @@ def test_a_cache_that_cannot_be_used_is_passed_over(
     assert told.endswith("point GANLANE_CACHE at another.\n")
 
 
-@needs_compiler
+@pytest.mark.kernel
 def test_a_library_that_cannot_be_loaded_from_the_cache_is_loaded_from_elsewhere(
     monkeypatch, compiler, plain
 ):
@@ -198,7 +196,7 @@ def test_a_library_that_cannot_be_loaded_from_the_cache_is_loaded_from_elsewhere
     assert calls(program) == 1
 
 
-@needs_compiler
+@pytest.mark.kernel
 @pytest.mark.slow
 def test_processes_that_build_at_once_do_not_disturb_each_other():
     script = "from ganlane.native import library; library.load('default'); print('loaded')"
@@ -272,7 +270,7 @@ def test_a_processor_gets_the_fastest_variant_that_it_runs(
     assert library.best_variant() == variant
 
 
-@needs_compiler
+@pytest.mark.kernel
 def test_the_library_of_a_wheel_is_taken_and_needs_no_compiler(
     monkeypatch, tmp_path, compiler, plain
 ):

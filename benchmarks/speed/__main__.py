@@ -135,20 +135,22 @@ def peers_of(
     peers: list[Case] = []
     if options.no_peers or options.suite == "traffic":
         return peers
-    if highway is None:
+    if road.scene == "on_ramp":
+        # Neither HighwayEnv nor EnvPool has one where others merge.
+        simulator = installed_version("libsumo")
+        if simulator is None:
+            print("left out, SUMO: pip install 'ganlane[bench]' brings it.", file=sys.stderr)
+            return peers
+        name = f"SUMO {simulator} on_ramp, {ego}"
+        its_road = replace(road, traffic="its IDM and LC2013")
+        labels = labels_of(its_road, "speed", name, "native", "cpu", threads, 1)
+        peers.append(Case(labels, partial(start_on_ramp, road.seed, EGOS[ego]), 1))
+    elif highway is None:
         print("left out, HighwayEnv: pip install 'ganlane[bench]' brings it.", file=sys.stderr)
     elif options.suite == "sim":
         name = f"HighwayEnv {highway}"
         labels = labels_of(theirs, "speed", name, "eager", "cpu", threads, 1)
         peers.append(Case(labels, partial(systems.start_highway, road), 1))
-    elif road.scene == "on_ramp":
-        # Neither HighwayEnv nor EnvPool has one where others merge.
-        simulator = installed_version("libsumo")
-        if simulator is not None:
-            name = f"SUMO {simulator} on_ramp, {ego}"
-            its_road = replace(road, traffic="its IDM and LC2013")
-            labels = labels_of(its_road, "speed", name, "native", "cpu", threads, 1)
-            peers.append(Case(labels, partial(start_on_ramp, road.seed, EGOS[ego]), 1))
     elif options.suite in THROUGH_GYMNASIUM:
         keep = EGOS[ego]
         if envpool is not None:

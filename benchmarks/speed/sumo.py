@@ -15,6 +15,7 @@ import numpy as np
 import ganlane
 from benchmarks.peers.simulators import command, vehicle_type
 from benchmarks.speed.measure import Runner
+from benchmarks.speed.systems import STEPS
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
@@ -22,8 +23,7 @@ from ganlane.sim.idm import TABLE_V
 
 #: Road before x = 0, where the ego starts, and behind the goal, m.
 ROOM_M = 500.0
-EGO = "0"
-STEPS = round(1 / keys.PHYSICS_STEP_S)
+EGO = str(keys.EGO_INDEX)
 #: The ego takes every change that is asked for, unless it would hit somebody.
 ASKED_ONLY = 512
 
@@ -123,8 +123,8 @@ class OnRamp:
         self.sumo.simulation.loadState(self._start)
         self.sumo.vehicle.setLaneChangeMode(EGO, ASKED_ONLY)
 
-    def step(self, action: int) -> int:
-        """A decision: 0 keeps the lane, 1 is left, 2 is right. Returns its physics steps."""
+    def step(self, action: int) -> None:
+        """A decision; a reset after its end, as the other peers have it."""
         if action != keys.KEEP:
             aside = 1 if action == keys.LEFT else -1
             self.sumo.vehicle.changeLaneRelative(EGO, aside, 1.0)
@@ -132,7 +132,6 @@ class OnRamp:
             self.sumo.simulationStep()
         if self._is_over():
             self.reset()
-        return STEPS
 
     def _is_over(self) -> bool:
         vehicle = self.sumo.vehicle
@@ -147,9 +146,8 @@ def start_on_ramp(seed: int, keep: bool = False) -> Runner:
 
     def run(decisions: int) -> int:
         drawn = random.integers(3, size=decisions)
-        steps = 0
         for action in drawn:
-            steps += ramp.step(keys.KEEP if keep else int(action))
-        return steps
+            ramp.step(keys.KEEP if keep else int(action))
+        return decisions * STEPS
 
     return run

@@ -18,6 +18,7 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -25,7 +26,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import EnvBase, GymEnv, SerialEnv
 
-from benchmarks.script import ReportSection, add_report, make_parser, run_script
+from benchmarks.script import ReportSection, make_parser, run_script
 from ganlane.agents import GreedyPolicy, Rainbow, RainbowConfig
 from ganlane.evaluation.table import Table
 from ganlane.settings.train import LoggerConfig, TrainConfig
@@ -146,15 +147,6 @@ def table(outcomes: Sequence[Outcome]) -> str:
     )
 
 
-def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The command line."""
-    parser = make_parser(__doc__)
-    parser.add_argument("--frames", type=int, default=300_000, help="at most, per seed")
-    parser.add_argument("--seeds", type=int, default=5)
-    add_report(parser, BEGIN, END)
-    return parser.parse_args(arguments)
-
-
 def measure(options: argparse.Namespace) -> str:
     """Run all seeds; the table, in the document too where one is named."""
     section, outcomes = ReportSection(options.report, BEGIN, END), []
@@ -167,7 +159,11 @@ def measure(options: argparse.Namespace) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure; the exit status."""
-    return run_script(measure, parse(arguments))
+    parser = make_parser(__doc__)
+    parser.add_argument("--frames", type=int, default=300_000, help="at most, per seed")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--report", type=Path, help=f"a document with the lines {BEGIN} and {END}")
+    return run_script(measure, parser.parse_args(arguments))
 
 
 if __name__ == "__main__":

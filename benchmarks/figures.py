@@ -2,7 +2,6 @@
 courses.
 
     python -m benchmarks.figures --folder docs/figures
-    python -m benchmarks.figures --folder docs/figures --scene us101-e --lane 1
 
 Writes generator_architecture.png (the paper's Figure 1, with the shapes of the generator that
 ships) and generator_courses.png (its Figure 2: a scene that the generator was not fitted to; needs
@@ -17,7 +16,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import polars as pl
 import torch
 from matplotlib import rc_context
@@ -39,6 +37,8 @@ from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, palette
 
 #: Boxes in a row of the drawing of a network, and inches from one box to the next, across and down.
 _ACROSS, _STEP_X, _STEP_Y = 4, 2.0, 1.15
+#: A scene that the generator was not fitted to, and the lane that is drawn; 0 is the rightmost.
+SCENE, LANE = "us101-b", 2
 
 
 @dataclass(frozen=True)
@@ -210,40 +210,25 @@ def _draw_block(axes: Axes, left: float, top: float, block: Block, colour: str) 
         )
 
 
-def lane_courses(frame: pl.DataFrame, lane: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Time, s, and position, m, of every vehicle of one scene that appears in ``lane``.
-
-    Args:
-        frame: one scene in the schema, sorted by track.
-        lane: 0 is the rightmost.
-    """
-    tracks = [
-        track
-        for track in frame.partition_by("vehicle", maintain_order=True)
-        if track["lane"][0] == lane
-    ]
-    return [(track["frame"].to_numpy() * FRAME_S, track["x"].to_numpy()) for track in tracks]
-
-
 @rc_context(STYLE)
-def draw_space_time(scene: str, lane: int, courses: Mapping[str, pl.DataFrame]) -> Figure:
-    """Positions over time of one lane's vehicles, the first of ``courses`` in black and the others
-    dashed over it.
+def draw_space_time(courses: Mapping[str, pl.DataFrame]) -> Figure:
+    """Positions over time of the vehicles in :data:`LANE`, the first of ``courses`` in black and
+    the others dashed over it.
 
     Args:
-        scene: its name.
-        lane: whose vehicles are drawn.
-        courses: name to trajectories (:func:`ganlane.data.dense.Recording.frame`) of the same
-            scene.
+        courses: name to trajectories (:func:`ganlane.data.dense.Recording.frame`) of
+            :data:`SCENE`.
     """
     first, *others = courses
     colours = {first: INK, **palette(others)}
     figure = Figure(figsize=(7.5, 4.3))
     axes = figure.subplots()
-    axes.set(title=f"{scene}, lane {lane}", xlabel="time, s", ylabel="position, m")
+    axes.set(title=f"{SCENE}, lane {LANE}", xlabel="time, s", ylabel="position, m")
     for name, frame in courses.items():
-        for time_s, x_m in lane_courses(frame, lane):
-            axes.plot(time_s, x_m, "-" if name == first else "--", color=colours[name])
+        style = "-" if name == first else "--"
+        for track in frame.partition_by("vehicle", maintain_order=True):
+            if track["lane"][0] == LANE:
+                axes.plot(track["frame"] * FRAME_S, track["x"], style, color=colours[name])
     add_legend(figure, colours)
     return figure
 
@@ -263,7 +248,7 @@ def architecture() -> Figure:
     )
 
 
-def courses(scene: str, lane: int) -> Figure:
+def courses() -> Figure:
     """The vehicles of one lane as recorded, and as the calibrated traffic drives them from the same
     start.
     """
@@ -271,36 +256,25 @@ def courses(scene: str, lane: int) -> Figure:
     def make(road: Road) -> TrafficModule:
         return gan_calibrated_traffic(road, Stream.REPORT)
 
-    frame = read_scenes(default_scenes()).filter(pl.col("scene") == scene)
+    frame = read_scenes(default_scenes()).filter(pl.col("scene") == SCENE)
     (recording,) = recordings_of(frame, scene_lane_widths(frame))
     driven = drive_recordings(make, [recording], StartOptions(desired_above_mps=11.0))
-    return draw_space_time(
-        scene, lane, {"recorded": recorded_frame([recording]), "gan_calibrated": driven}
-    )
-
-
-def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The command line."""
-    parser = make_parser(__doc__)
-    parser.add_argument("--folder", type=Path, default=Path("docs/figures"))
-    parser.add_argument(
-        "--scene", default="us101-b", help="a scene that the generator was not fitted to"
-    )
-    parser.add_argument("--lane", type=int, default=2, help="0 is the rightmost")
-    return parser.parse_args(arguments)
+    return draw_space_time({"recorded": recorded_frame([recording]), "gan_calibrated": driven})
 
 
 def draw(options: argparse.Namespace) -> str:
     """Draw and write; where the figures are."""
     written = [options.folder / f"generator_{name}.png" for name in ("architecture", "courses")]
     save_figure(architecture(), written[0])
-    save_figure(courses(options.scene, options.lane), written[1])
+    save_figure(courses(), written[1])
     return "\n".join(map(str, written))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Draw; the exit status."""
-    return run_script(draw, parse(arguments))
+    parser = make_parser(__doc__)
+    parser.add_argument("--folder", type=Path, default=Path("docs/figures"))
+    return run_script(draw, parser.parse_args(arguments))
 
 
 if __name__ == "__main__":

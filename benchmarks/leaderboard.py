@@ -24,7 +24,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from benchmarks.script import ReportSection, make_parser, run_script, split_at_markers
+from benchmarks.script import ReportSection, make_parser, run_script
 from ganlane.agents.stored_models import load_model, save_network
 from ganlane.build import Driver
 from ganlane.config.run import settings
@@ -110,10 +110,9 @@ def add(path: Path, name: str) -> str:
         agents = list(content["config"]["agents"] or ())
         parts = {part: content[part] for part in PARTS}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        message = (
+        raise UserError(
             f"{path}: not the results.json of ganlane benchmark ({error!r}); give that of a run."
-        )
-        raise UserError(message) from error
+        ) from error
     for number, agent in enumerate(agents):
         if Path(agent).is_dir() and any(Path(agent).glob("*.zip")):
             agents[number] = add_weights(Path(agent))
@@ -135,9 +134,7 @@ def differences() -> list[str]:
     """Which documents are not as the stored results say."""
     wrong = []
     for document in PAGES:
-        before, after = split_at_markers(ROOT / document, *MARKERS)
-        whole = (ROOT / document).read_text(encoding="utf-8")
-        if whole[len(before) : -len(after)].strip() != table(document):
+        if ReportSection(ROOT / document, *MARKERS).read() != table(document):
             wrong.append(f"{document}: differs; run `python -m benchmarks.leaderboard --write`.")
     return wrong
 

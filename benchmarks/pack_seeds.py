@@ -49,10 +49,7 @@ RECIPE = (
 WITHOUT_EFFECT = ("compile", "kernel")
 
 
-def save_agents(
-    path: str | Path,
-    agents: Mapping[int, tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]],
-) -> None:
+def save_agents(path: Path, agents: Mapping[int, Agent]) -> None:
     """Write several trainings of one recipe into one file; ``path@SEED`` names each of them.
 
     ``agents`` holds by seed what :func:`read_agent` gives. The scales of the noise are kept in half
@@ -69,12 +66,7 @@ def save_agents(
         for seed, (_, network, metadata) in agents.items()
     }
     # each agent's metadata by its seed, as text: JSON has no other keys
-    save_weights(
-        path,
-        SEVERAL,
-        tensors,
-        {"agents": described},
-    )
+    save_weights(path, SEVERAL, tensors, {"agents": described})
 
 
 def recipe_of(metadata: Mapping[str, Any]) -> dict[str, Any]:
@@ -137,14 +129,6 @@ def collect(folders: Sequence[str | Path]) -> dict[int, Agent]:
     return dict(sorted(agents.items()))
 
 
-def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The command line."""
-    parser = make_parser(__doc__)
-    parser.add_argument("folders", nargs="+", metavar="RUN_FOLDER")
-    parser.add_argument("--out", type=Path, required=True, help="the .safetensors file to write")
-    return parser.parse_args(arguments)
-
-
 def pack(options: argparse.Namespace) -> str:
     """Write the file; the line that names it."""
     if options.out.suffix != ".safetensors":
@@ -167,7 +151,10 @@ def pack(options: argparse.Namespace) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Pack; the exit status."""
-    return run_script(pack, parse(arguments))
+    parser = make_parser(__doc__)
+    parser.add_argument("folders", nargs="+", metavar="RUN_FOLDER")
+    parser.add_argument("--out", type=Path, required=True, help="the .safetensors file to write")
+    return run_script(pack, parser.parse_args(arguments))
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.script import ReportSection, make_parser, run_script, split_at_markers
+from benchmarks.script import ReportSection, make_parser, run_script
 from ganlane.errors import UserError
 from ganlane.evaluation.table import Table
 from ganlane.suite.report import PAPER_VI, PAPER_VII
@@ -29,7 +29,8 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "reproduce" / "results.json"
 #: Folders below it with further results: ``ganlane benchmark`` with the control trainings,
 #: agent_general over more episodes and on traffics that are not the project's own, and the missions
-#: (suite=exit-v1 and merge-v1); other roads and ablations are of scripts of revision 878329b.
+#: (suite=exit-v1 and merge-v1); other roads and ablations are of scripts of revision 878329b, whose
+#: tables nothing makes again: of those the figures with intervals are looked up.
 FURTHER = ("controls", "general", "roads", "elsewhere", "ablations", "exit", "merge")
 #: Driver of the matrix to its name in a document, and the traffics that it was trained on.
 DRIVERS: Mapping[str, tuple[str, frozenset[str]]] = {
@@ -110,10 +111,9 @@ def _lead(row: Row, trained: frozenset[str]) -> str:
     return f"*{text}*" if trained and row["traffic"] not in trained else text
 
 
-def _lead_and_failures(row: Row, lead: str = "minus_mobil") -> str:
-    return (
-        f"{_with_interval(row[lead], row[f'{lead}_ci'])}; {row['hard_crash']}, {row['out_of_road']}"
-    )
+def _lead_and_failures(row: Row) -> str:
+    lead = _with_interval(row["minus_mobil"], row["minus_mobil_ci"])
+    return f"{lead}; {row['hard_crash']}, {row['out_of_road']}"
 
 
 def _mean_and_failures(row: Row) -> str:
@@ -279,24 +279,6 @@ def readme(results: Results) -> str:
     return _by_traffic(results, "driver", lines)
 
 
-def roads(results: Results) -> str:
-    """Drivers by roads, traffic by traffic: lead over MOBIL, and failures."""
-    rows = results["roads"]["rows"]
-    places = list(dict.fromkeys((row["vehicles"], row["lanes"]) for row in rows))
-    by_place = {(row["driver"], row["traffic"], row["vehicles"], row["lanes"]): row for row in rows}
-    lines = []
-    for driver, traffic in dict.fromkeys(
-        (row["driver"], row["traffic"]) for row in rows if row["driver"] != "mobil"
-    ):
-        cells = [_lead_and_failures(by_place[(driver, traffic, *place)]) for place in places]
-        lines.append([f"{DRIVERS[driver][0]}, `{traffic}`", *cells])
-    headings = [
-        "lead; crashes, departures",
-        *(f"{vehicles} on {lanes}" for vehicles, lanes in places),
-    ]
-    return Table("", headings, lines).markdown(heading=False)
-
-
 def elsewhere(results: Results) -> str:
     """Drivers by traffics that are not the project's own: lead over MOBIL, and failures."""
     part = results["elsewhere"]
@@ -348,27 +330,6 @@ def missions(results: Results, name: str) -> str:
     return _by_traffic(part, "lead; goal, crash, missed, time-out, %; s", lines)
 
 
-def ablations(results: Results) -> str:
-    """Trainings with one thing changed by traffics.
-
-    Lead over the one without a change, and failures.
-    """
-    part = results["ablations"]
-    leads = {(row["driver"], row["traffic"]): row for row in part["comparisons"]}
-    lines = []
-    for name, changed in part["changed"].items():
-        cells = []
-        for traffic in _traffics(part):
-            row = _at(part, name, traffic)
-            cells.append(
-                _lead_and_failures({**row, **leads[name, traffic]}, "lead")
-                if changed
-                else _mean_and_failures(row)
-            )
-        lines.append([f"`{' '.join(changed)}`" if changed else "nothing (its mean reward)", *cells])
-    return _by_traffic(part, "changed: lead; crashes, departures", lines)
-
-
 #: Document and name of the markers to the table between them.
 SECTIONS: Mapping[tuple[str, str], Callable[[Results], str]] = {
     ("README.md", "readme"): readme,
@@ -377,9 +338,7 @@ SECTIONS: Mapping[tuple[str, str], Callable[[Results], str]] = {
     ("docs/drivers.md", "paper"): paper,
     ("docs/drivers.md", "claims"): claims,
     ("docs/drivers.md", "controls"): controls,
-    ("docs/drivers.md", "roads"): roads,
     ("docs/drivers.md", "elsewhere"): elsewhere,
-    ("docs/drivers.md", "ablations"): ablations,
     ("docs/drivers.md", "trainings"): trainings,
     ("docs/scenarios.md", "exit"): partial(missions, name="exit"),
     ("docs/scenarios.md", "merge"): partial(missions, name="merge"),
@@ -437,33 +396,21 @@ def unsourced(text: str, results: Results) -> list[str]:
     return wrong
 
 
-def differences(results: Results, root: Path = ROOT) -> list[str]:
+def differences(results: Results) -> list[str]:
     """What in the documents is not as the results say, one line each."""
     wrong = []
     for (document, name), table in SECTIONS.items():
-        before, after = split_at_markers(root / document, *markers(name))
-        whole = (root / document).read_text(encoding="utf-8")
-        if whole[len(before) : -len(after)].strip() != table(results):
+        if ReportSection(ROOT / document, *markers(name)).read() != table(results):
             wrong.append(
                 f"{document}: the table {name} differs; run `python -m benchmarks.printed --write`."
             )
     for document, heading in CHECKED:
-        text = section((root / document).read_text(encoding="utf-8"), heading)
+        text = section((ROOT / document).read_text(encoding="utf-8"), heading)
         wrong += [
             f"{document}, {heading}: {figure} is not in the results."
             for figure in unsourced(text, results)
         ]
     return wrong
-
-
-def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The command line."""
-    parser = make_parser(__doc__)
-    parser.add_argument(
-        "results", type=Path, nargs="?", default=RESULTS, help="of ganlane benchmark"
-    )
-    parser.add_argument("--write", action="store_true", help="put the tables into the documents")
-    return parser.parse_args(arguments)
 
 
 def load(path: Path = RESULTS) -> Results:
@@ -485,7 +432,12 @@ def compare_or_write(options: argparse.Namespace) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compare or write; the exit status."""
-    return run_script(compare_or_write, parse(arguments))
+    parser = make_parser(__doc__)
+    parser.add_argument(
+        "results", type=Path, nargs="?", default=RESULTS, help="of ganlane benchmark"
+    )
+    parser.add_argument("--write", action="store_true", help="put the tables into the documents")
+    return run_script(compare_or_write, parser.parse_args(arguments))
 
 
 if __name__ == "__main__":

@@ -20,13 +20,8 @@ def make_parser(description: str | None) -> argparse.ArgumentParser:
     )
 
 
-def add_report(parser: argparse.ArgumentParser, begin: str, end: str) -> None:
-    """Offer ``--report``, the document for a :class:`ReportSection` between these markers."""
-    parser.add_argument("--report", type=Path, help=f"a document with the lines {begin} and {end}")
-
-
-def split_at_markers(path: Path, begin: str, end: str) -> tuple[str, str]:
-    """The text of a document up to the marker ``begin`` and from ``end`` on, both included.
+def split_at_markers(path: Path, begin: str, end: str) -> tuple[str, str, str]:
+    """The text of a document up to the marker ``begin``, between the two, and from ``end`` on.
 
     Raises:
         UserError: there is no such file, or it does not hold the two markers once each and in
@@ -42,7 +37,9 @@ def split_at_markers(path: Path, begin: str, end: str) -> tuple[str, str]:
         raise UserError(
             f"report={path}: expected the lines {begin} and {end} in it, once each; add them."
         )
-    return text[: text.index(begin) + len(begin)], text[text.index(end) :]
+    before, _, rest = text.partition(begin)
+    between, _, after = rest.partition(end)
+    return before + begin, between, end + after
 
 
 class ReportSection:
@@ -65,10 +62,16 @@ class ReportSection:
         if document is not None:
             split_at_markers(document, begin, end)
 
+    def read(self) -> str:
+        """What stands between the markers now; without a document nothing."""
+        if self.document is None:
+            return ""
+        return split_at_markers(self.document, *self.markers)[1].strip()
+
     def write(self, content: str) -> None:
         """Put ``content`` between the markers, on lines of its own."""
         if self.document is not None:
-            before, after = split_at_markers(self.document, *self.markers)
+            before, _, after = split_at_markers(self.document, *self.markers)
             write_bytes(self.document, f"{before}\n{content}\n{after}".encode())
 
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,6 +46,7 @@ from benchmarks.peers.simulators import (
     versions,
 )
 from benchmarks.peers.tolerance import Largest, between, largest, tolerance, unsettled_gap_m
+from benchmarks.script import make_parser, run_script
 from ganlane.errors import UserError
 from ganlane.files import write_bytes, write_json
 
@@ -160,33 +161,34 @@ def every(trace: Trace, stride: int) -> Trace:
     return Trace(trace.speed[::stride], trace.position[::stride])
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Print the tables, write JSON and plot; 2 after a user's mistake."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def write(options: argparse.Namespace) -> str:
+    """Measure, write JSON and plot, and fill the page; its tables.
+
+    Raises:
+        UserError: HighwayEnv or SUMO is not installed, or there is no such page.
+    """
+    require_peers()
+    if not options.page.is_file():
+        raise UserError(
+            f"{options.page}: no such page; run from the repository root or give --page."
+        )
+    figures, traces = collect()
+    write_json(options.out / "peers.json", figures)
+    draw(traces, figures, options.out / "peers.png")
+    write_bytes(options.page, fill(options.page.read_text(), figures).encode())
+    return f"{page(figures)}\nresults: {options.out / 'peers.json'}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compare; the exit status."""
+    parser = make_parser(__doc__)
     parser.add_argument(
         "--out", type=Path, default=Path("docs/figures"), help="folder of peers.json and peers.png"
     )
     parser.add_argument(
         "--page", type=Path, default=Path("docs/peers.md"), help="page whose tables are replaced"
     )
-    arguments = parser.parse_args(argv)
-    out = arguments.out
-    try:
-        require_peers()
-        if not arguments.page.is_file():
-            raise UserError(
-                f"{arguments.page}: no such page; run from the repository root or give --page."
-            )
-        figures, traces = collect()
-    except UserError as error:
-        print(error, file=sys.stderr)
-        return 2
-    print(page(figures))
-    write_json(out / "peers.json", figures)
-    draw(traces, figures, out / "peers.png")
-    write_bytes(arguments.page, fill(arguments.page.read_text(), figures).encode())
-    print(f"results: {out / 'peers.json'}")
-    return 0
+    return run_script(write, parser.parse_args(arguments))
 
 
 if __name__ == "__main__":

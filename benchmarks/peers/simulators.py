@@ -44,17 +44,17 @@ from benchmarks.peers.scene import DESIRED_SPEED_MPS, LENGTH_M, ROAD_M, Law, Sce
 from ganlane._version import __version__
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.sim.idm import TABLE_V, IdmParameters
+from ganlane.sim.idm import TABLE_V
 from ganlane.sim.state import Road, Vehicles, Visibility
 from ganlane.traffic.idm_mobil import IdmTraffic
 
 
-def vehicles_of(scene: Scene, dtype: torch.dtype = torch.float64) -> Vehicles:
+def vehicles_of(scene: Scene) -> Vehicles:
     """The first moment of ``scene`` as one row of vehicles on the centre of lane 0."""
-    speed = torch.tensor([scene.speeds_mps], dtype=dtype)
+    speed = torch.tensor([scene.speeds_mps], dtype=torch.float64)
     zero, whole = torch.zeros_like(speed), torch.zeros_like(speed, dtype=torch.int64)
     return Vehicles(
-        x=torch.tensor(scene.positions_m(), dtype=dtype)[None],
+        x=torch.tensor(scene.positions_m())[None],
         y=zero,
         heading=zero,
         speed=speed,
@@ -68,33 +68,28 @@ def vehicles_of(scene: Scene, dtype: torch.dtype = torch.float64) -> Vehicles:
     )
 
 
-def led(before: Vehicles, moved: Vehicles, leader_mps: float, dt: float) -> Vehicles:
+def led(before: Vehicles, moved: Vehicles, leader_mps: float) -> Vehicles:
     """``moved`` with the foremost at its prescribed speed, at constant acceleration within the
     step.
     """
     speed, x = moved.speed.clone(), moved.x.clone()
     speed[:, 0] = leader_mps
-    x[:, 0] = before.x[:, 0] + 0.5 * dt * (before.speed[:, 0] + leader_mps)
+    x[:, 0] = before.x[:, 0] + 0.5 * PHYSICS_STEP_S * (before.speed[:, 0] + leader_mps)
     return moved.with_(speed=speed, x=x)
 
 
-def drive_ours(
-    scene: Scene, dt: float = PHYSICS_STEP_S, dtype: torch.dtype = torch.float64
-) -> Trace:
-    """Drive ``scene`` with :class:`~ganlane.traffic.idm_mobil.IdmTraffic` as it stands, at steps of
-    ``dt`` s.
-    """
+def drive_ours(scene: Scene) -> Trace:
+    """Drive ``scene`` with :class:`~ganlane.traffic.idm_mobil.IdmTraffic` as it stands."""
     traffic = IdmTraffic(Road(lanes=1))
-    traffic.dt = dt
-    vehicles = vehicles_of(scene, dtype)
+    vehicles = vehicles_of(scene)
     key = torch.zeros(1, dtype=torch.int64)
     memory = traffic.fresh_memory(vehicles, key)
     speeds, positions = [vehicles.speed], [vehicles.x]
-    for step in range(scene.steps(dt)):
+    for step in range(scene.steps()):
         moved, memory = traffic.move(vehicles, memory, key, key + step)
-        vehicles = (
-            led(vehicles, moved, scene.leader_speeds(dt)[step + 1], dt) if scene.leader else moved
-        )
+        if scene.leader:
+            moved = led(vehicles, moved, scene.leader_speeds()[step + 1])
+        vehicles = moved
         speeds.append(vehicles.speed)
         positions.append(vehicles.x)
     return Trace(_stack(speeds), _stack(positions))
@@ -114,23 +109,23 @@ class Distances(Enum):
     BUMPERS = 0.0
 
 
-def driver_class(distances: Distances, idm: IdmParameters) -> Any:
-    """``IDMVehicle`` with the parameters ``idm`` and vehicles of 4.5 m."""
+def driver_class(distances: Distances) -> Any:
+    """``IDMVehicle`` with Table V and vehicles of 4.5 m."""
     from highway_env.vehicle.behavior import IDMVehicle
 
     class Driver(IDMVehicle):
         LENGTH = LENGTH_M
-        ACC_MAX = -idm.min_acceleration
-        COMFORT_ACC_MAX = idm.max_acceleration
-        COMFORT_ACC_MIN = -idm.comfortable_deceleration
-        DISTANCE_WANTED = idm.min_gap_m + distances.value
-        TIME_WANTED = idm.headway_s
+        ACC_MAX = -TABLE_V.min_acceleration
+        COMFORT_ACC_MAX = TABLE_V.max_acceleration
+        COMFORT_ACC_MIN = -TABLE_V.comfortable_deceleration
+        DISTANCE_WANTED = TABLE_V.min_gap_m + distances.value
+        TIME_WANTED = TABLE_V.headway_s
         DELTA = 4.0
 
     return Driver
 
 
-def highway_env_road(scene: Scene, distances: Distances, idm: IdmParameters) -> Any:
+def highway_env_road(scene: Scene, distances: Distances) -> Any:
     """A HighwayEnv road with the vehicles of ``scene`` at their places, the foremost first."""
     from highway_env.road.road import Road, RoadNetwork
     from highway_env.vehicle.kinematics import Vehicle
@@ -139,7 +134,7 @@ def highway_env_road(scene: Scene, distances: Distances, idm: IdmParameters) -> 
         lanes=1, length=ROAD_M, speed_limit=2.0 * DESIRED_SPEED_MPS
     )
     road = Road(network, np_random=np.random.RandomState(0))
-    driver = driver_class(distances, idm)
+    driver = driver_class(distances)
     squeezed = scene.positions_m() + squeeze(scene, distances)
     for rank, (x, speed) in enumerate(zip(squeezed, scene.speeds_mps)):
         if rank == 0 and scene.leader:
@@ -168,16 +163,13 @@ def squeeze(scene: Scene, distances: Distances) -> np.ndarray:
 
 
 def drive_highway_env(
-    scene: Scene,
-    distances: Distances = Distances.BUMPERS,
-    dt: float = PHYSICS_STEP_S,
-    idm: IdmParameters = TABLE_V,
+    scene: Scene, distances: Distances = Distances.BUMPERS, dt: float = PHYSICS_STEP_S
 ) -> Trace:
     """Drive ``scene`` with HighwayEnv at steps of ``dt`` seconds.
 
     Positions in the trace are the bodies' centres.
     """
-    road = highway_env_road(scene, distances, idm)
+    road = highway_env_road(scene, distances)
     leader = scene.leader_speeds(dt) if scene.leader else None
     speeds, positions = [_speeds(road)], [_positions(road)]
     for step in range(scene.steps(dt)):
@@ -217,8 +209,9 @@ NETWORK = f"""<net version="1.20">
 """
 
 
-def vehicle_type(name: str, max_speed_mps: float, dt: float, p: IdmParameters) -> str:
-    """A ``vType`` of drivers with the parameters ``p``."""
+def vehicle_type(name: str, max_speed_mps: float, dt: float) -> str:
+    """A ``vType`` of Table V's drivers."""
+    p = TABLE_V
     return (
         f'<vType id="{name}" carFollowModel="IDM" length="{LENGTH_M}" minGap="{p.min_gap_m}" '
         f'tau="{p.headway_s}" accel="{p.max_acceleration}" decel="{p.comfortable_deceleration}" '
@@ -228,13 +221,13 @@ def vehicle_type(name: str, max_speed_mps: float, dt: float, p: IdmParameters) -
     )
 
 
-def demand(scene: Scene, dt: float, idm: IdmParameters) -> str:
+def demand(scene: Scene, dt: float) -> str:
     """The route file.
 
     Everybody on the road from the first step, front bumpers half a length ahead of the centres.
     """
     limits = {"leader": 2 * DESIRED_SPEED_MPS, "driver": DESIRED_SPEED_MPS}
-    lines = [vehicle_type(name, limit, dt, idm) for name, limit in limits.items()]
+    lines = [vehicle_type(name, limit, dt) for name, limit in limits.items()]
     lines.append('<route id="all" edges="road"/>')
     for rank, (x, speed) in enumerate(zip(scene.positions_m().tolist(), scene.speeds_mps)):
         kind = "leader" if rank == 0 and scene.leader else "driver"
@@ -247,30 +240,23 @@ def demand(scene: Scene, dt: float, idm: IdmParameters) -> str:
 
 def command(folder: Path, ballistic: bool, dt: float) -> list[str]:
     """SUMO's command line for the files in ``folder``."""
-    return [
-        *(
-            "sumo",
-            "--net-file",
-            str(folder / "net.xml"),
-            "--route-files",
-            str(folder / "routes.xml"),
-        ),
-        *(
-            "--step-length",
-            str(dt),
-            "--step-method.ballistic",
-            str(ballistic).lower(),
-            "--default.speeddev",
-            "0",
-        ),
-        *("--collision.action", "none", "--time-to-teleport", "-1", "--xml-validation", "never"),
-        *("--no-step-log", "true", "--duration-log.disable", "true", "--no-warnings", "true"),
-    ]
+    options = {
+        "net-file": folder / "net.xml",
+        "route-files": folder / "routes.xml",
+        "step-length": dt,
+        "step-method.ballistic": str(ballistic).lower(),
+        "default.speeddev": 0,
+        "collision.action": "none",
+        "time-to-teleport": -1,
+        "xml-validation": "never",
+        "no-step-log": "true",
+        "duration-log.disable": "true",
+        "no-warnings": "true",
+    }
+    return ["sumo", *(f"--{name}={value}" for name, value in options.items())]
 
 
-def drive_sumo(
-    scene: Scene, ballistic: bool = True, dt: float = PHYSICS_STEP_S, idm: IdmParameters = TABLE_V
-) -> Trace:
+def drive_sumo(scene: Scene, ballistic: bool = True, dt: float = PHYSICS_STEP_S) -> Trace:
     """Drive ``scene`` with SUMO at steps of ``dt`` seconds; positions in the trace are the bodies'
     centres.
 
@@ -282,7 +268,7 @@ def drive_sumo(
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "net.xml").write_text(NETWORK)
-        (folder / "routes.xml").write_text(demand(scene, dt, idm))
+        (folder / "routes.xml").write_text(demand(scene, dt))
         libsumo.start(command(folder, ballistic, dt))
         try:
             return _run_sumo(libsumo, scene, dt)

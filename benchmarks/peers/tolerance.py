@@ -74,13 +74,12 @@ def slopes(speed: Array, gap: Array, leader_speed: Array, law: Law = LAW) -> Slo
     )
 
 
-def difference(
-    trace: Trace, scene: Scene, scheme: Scheme, law: Law = LAW, dt: float = PHYSICS_STEP_S
-) -> Trace:
+def difference(trace: Trace, scene: Scene, scheme: Scheme, law: Law = LAW) -> Trace:
     """First-order difference of speed and position between ``scheme`` and the ballistic ``trace``,
     [steps + 1, M].
     """
     by = slopes(trace.speed, *ahead(trace, law), law)
+    dt = PHYSICS_STEP_S
     shift = (scheme.value - 0.5) * dt * np.diff(trace.speed, axis=0)
     speed, position = np.zeros_like(trace.speed), np.zeros_like(trace.speed)
     for k in range(len(shift)):
@@ -119,14 +118,12 @@ def between(one: Trace, other: Trace) -> Largest:
     )
 
 
-def tolerance(
-    trace: Trace, scene: Scene, scheme: Scheme, law: Law = LAW, dt: float = PHYSICS_STEP_S
-) -> Largest:
+def tolerance(trace: Trace, scene: Scene, scheme: Scheme, law: Law = LAW) -> Largest:
     """How far ``scheme`` may be from the ballistic ``trace``.
 
     :func:`difference`, margin and rounding.
     """
-    expected = difference(trace, scene, scheme, law, dt)
+    expected = difference(trace, scene, scheme, law)
     gap = expected.position[:, :-1] - expected.position[:, 1:]
     sizes = (largest(expected.speed), largest(gap), largest(expected.position))
     return Largest(*(MARGIN * size + rest for size, rest in zip(sizes, ROUNDING)))

@@ -30,7 +30,7 @@ from typing import Any
 
 from benchmarks.script import ReportSection, make_parser, run_script
 from benchmarks.speed import systems
-from benchmarks.speed.measure import Case, Labels, Row, best_rows, exponent, measure
+from benchmarks.speed.measure import Case, Labels, Row, best_rows, measure
 from benchmarks.speed.sumo import start_on_ramp
 from benchmarks.speed.systems import Road, installed_version
 from ganlane.agents import RainbowConfig
@@ -54,17 +54,12 @@ TRAFFICS = {
     "traffic": ["idm", "idm_mobil", "gan", "gan_calibrated"],
     "train": ["idm_mobil", "gan"],
 }
-SIMULATORS: dict[str, Callable[..., Any]] = {
-    "ganlane physics": systems.start_physics,
-    "ganlane environment": systems.start_environment,
-}
 #: What the egos of the suite gymnasium do, and whether they keep their lanes.
 EGOS = {"random actions": False, "keeping its lane": True}
 #: Scenes of the suite scenarios: vehicles and lanes of each.
 SCENES = {"merge": (21, 3), "exit": (24, 4), "on_ramp": (20, 3)}
 #: Suites that go through gymnasium.
 THROUGH_GYMNASIUM = ("gymnasium", "scenarios")
-TRAFFIC, TRAINING = "ganlane traffic", "ganlane training"
 #: What stands for the traffic of HighwayEnv.
 THEIR_TRAFFIC = "its IDM and MOBIL"
 #: Heading to cell of the tables' columns.
@@ -93,7 +88,10 @@ def cases_of(
         here = replace(road, traffic=traffic)
         starts: dict[str, Callable[..., Any]]
         if options.suite == "sim":
-            starts = SIMULATORS
+            starts = {
+                "ganlane physics": systems.start_physics,
+                "ganlane environment": systems.start_environment,
+            }
         elif options.suite in THROUGH_GYMNASIUM:
             start = partial(systems.start_gymnasium, keep=EGOS[ego])
             starts = {f"ganlane{_scene_of(road)}, {ego}": start}
@@ -102,13 +100,13 @@ def cases_of(
                 name = f"ganlane highway with as many vehicles, {ego}"
                 starts[name] = partial(systems.start_without_ends, start)
         elif options.suite == "traffic":
-            starts = {TRAFFIC: systems.start_traffic}
+            starts = {"ganlane traffic": systems.start_traffic}
         else:
             agent = {"config": RainbowConfig(), "stored": options.stored}
-            starts = {TRAINING: partial(systems.start_training, **agent)}
+            starts = {"ganlane training": partial(systems.start_training, **agent)}
         for system, start in starts.items():
             for mode in options.modes:
-                labels = labels_of(here, "speed", system, mode, options.device, threads, batch)
+                labels = labels_of(here, system, mode, options.device, threads, batch)
                 cases.append(Case(labels, partial(start, here, mode, options.device, batch), batch))
     return cases
 
@@ -118,11 +116,9 @@ def _scene_of(road: Road) -> str:
     return "" if road.scene == "highway" else f" {road.scene}"
 
 
-def labels_of(road: Road, part: str, system: str, *place: Any) -> Labels:
+def labels_of(road: Road, system: str, *place: Any) -> Labels:
     """Labels of a case; ``place`` is mode, device, threads and batch."""
-    mode, device, threads, batch = place
-    size = (road.vehicles, road.lanes, batch)
-    return Labels(part, system, road.traffic, mode, device, threads, *size)
+    return Labels(system, road.traffic, road.vehicles, road.lanes, *place)
 
 
 def peers_of(
@@ -143,44 +139,32 @@ def peers_of(
             return peers
         name = f"SUMO {simulator} on_ramp, {ego}"
         its_road = replace(road, traffic="its IDM and LC2013")
-        labels = labels_of(its_road, "speed", name, "native", "cpu", threads, 1)
+        labels = labels_of(its_road, name, "native", "cpu", threads, 1)
         peers.append(Case(labels, partial(start_on_ramp, road.seed, EGOS[ego]), 1))
     elif highway is None:
         print("left out, HighwayEnv: pip install 'ganlane[bench]' brings it.", file=sys.stderr)
     elif options.suite == "sim":
         name = f"HighwayEnv {highway}"
-        labels = labels_of(theirs, "speed", name, "eager", "cpu", threads, 1)
+        labels = labels_of(theirs, name, "eager", "cpu", threads, 1)
         peers.append(Case(labels, partial(systems.start_highway, road), 1))
     elif options.suite in THROUGH_GYMNASIUM:
         keep = EGOS[ego]
         if envpool is not None:
             name = f"EnvPool {envpool}{_scene_of(road)}, {ego}"
-            labels = labels_of(theirs, "speed", name, "native", "cpu", threads, batch)
+            labels = labels_of(theirs, name, "native", "cpu", threads, batch)
             peers.append(
                 Case(labels, partial(systems.start_envpool, road, batch, threads, keep), batch)
             )
         name = f"HighwayEnv {highway}{_scene_of(road)}, {ego}"
-        labels = labels_of(theirs, "speed", name, "eager", "cpu", threads, 1)
+        labels = labels_of(theirs, name, "eager", "cpu", threads, 1)
         peers.append(Case(labels, partial(systems.start_highway, road, keep), 1))
     elif options.suite == "train" and learner is not None:
         agent = RainbowConfig()
         name = f"stable-baselines3 {learner} DQN on HighwayEnv {highway}"
-        labels = labels_of(theirs, "speed", name, "eager", "cpu", threads, 1)
+        labels = labels_of(theirs, name, "eager", "cpu", threads, 1)
         start = partial(systems.start_baseline, road, agent)
         peers.append(Case(labels, start, agent.decisions_per_update))
     return peers
-
-
-def growth_cases(options: argparse.Namespace, system: str, threads: int) -> list[Case]:
-    """A system, eager, with different numbers of vehicles."""
-    cases = []
-    batch = max(options.batches)
-    for vehicles in options.vehicle_counts:
-        road = Road(options.traffics[0], vehicles, options.lanes, options.seed)
-        labels = labels_of(road, "growth", system, "eager", options.device, threads, batch)
-        start = partial(SIMULATORS[system], road, "eager", options.device, batch)
-        cases.append(Case(labels, start, batch))
-    return cases
 
 
 def rows_of(options: argparse.Namespace) -> list[Row]:
@@ -202,36 +186,19 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
         rows += measure([*peers[1:], *cases], first, options.repetitions, options.seconds)
         where = f"threads {threads}, batch {batch}{_scene_of(road)} {ego}"
         print(f"{where}: done", file=sys.stderr, flush=True)
-    if options.suite == "sim" and len(options.vehicle_counts) > 1:
-        for system in ("ganlane physics", "ganlane environment"):
-            cases = growth_cases(options, system, options.threads[0])
-            rows += measure(cases, None, options.repetitions, options.seconds)
     return rows
 
 
 def tables_of(rows: Sequence[Row]) -> list[Table]:
-    """Speed, the best rows, and growth with the vehicles."""
-    speed = [row for row in rows if row["part"] == "speed"]
-    grown = [row for row in rows if row["part"] == "growth"]
-    places = {f"{row['vehicles']} vehicles on {row['lanes']} lanes": None for row in speed}
+    """Speed, and the best rows."""
+    places = {f"{row['vehicles']} vehicles on {row['lanes']} lanes": None for row in rows}
     place = ", ".join(places)
     note = "Medians; spread is the interquartile range of the wall time over its median."
     short = {name: cell for name, cell in COLUMNS.items() if name != "spread"}
-    tables = [
-        Table.of(f"Speed, {place}", speed, COLUMNS, 4, [note]),
-        Table.of("The best of each", best_rows(speed, "physics_steps_per_s"), short, 4),
+    return [
+        Table.of(f"Speed, {place}", rows, COLUMNS, 4, [note]),
+        Table.of("The best of each", best_rows(rows), short, 4),
     ]
-    lines = []
-    for system in dict.fromkeys(row["system"] for row in grown):
-        of_system = [row for row in grown if row["system"] == system]
-        vehicles = [row["vehicles"] for row in of_system]
-        costs = [row["ms_per_call"] for row in of_system]
-        cells = [", ".join(map(str, vehicles)), ", ".join(map(significant, costs))]
-        lines.append([system, *cells, f"{exponent(vehicles, costs):.2f}"])
-    if lines:
-        headings = ["system", "vehicles", "ms per decision", "exponent"]
-        tables.append(Table("Growth of the cost", headings, lines))
-    return tables
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -248,8 +215,6 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--device", choices=("cpu", "cuda"), default="cpu")
     add("--vehicles", type=int, default=9, metavar="N", help="the ego included")
     add("--lanes", type=int, default=3, metavar="N")
-    add("--vehicle-counts", nargs="*", type=int, default=[9, 15, 30, 60], metavar="N",
-        help="suite sim: how the cost grows with them, at the largest batch")  # fmt: skip
     add("--stored", type=int, default=1_000_000, metavar="N",
         help="suite train: transitions in the replay buffer when the clock starts")  # fmt: skip
     add("--repetitions", type=int, default=5, metavar="N", help="turns of every case")
@@ -266,7 +231,6 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     options.batches = options.batches or BATCHES[options.suite]
     if options.quick:
         options.batches = [min(*options.batches, 64)]
-        options.vehicle_counts = options.vehicle_counts[:2]
         options.stored = min(options.stored, 1000)
         options.repetitions, options.seconds = 2, 0.01
     options.told = shlex.join(sys.argv[1:] if arguments is None else arguments)

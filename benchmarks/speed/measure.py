@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any, NamedTuple
@@ -30,20 +29,18 @@ class Labels:
     """What is measured: the first columns of a row.
 
     Attributes:
-        part: ``speed``, or ``growth``: the same with other numbers of vehicles.
         mode: how the environment is computed: ``eager`` or ``native``.
         threads: of torch.
         batch: environments side by side.
     """
 
-    part: str
     system: str
     traffic: str
+    vehicles: int
+    lanes: int
     mode: str
     device: str
     threads: int
-    vehicles: int
-    lanes: int
     batch: int
 
 
@@ -71,17 +68,6 @@ class Sample(NamedTuple):
         """Physics steps per second of wall and of CPU time."""
         # A coarse CPU clock may not have moved.
         return self.physics_steps / self.wall_s, self.physics_steps / max(self.cpu_s, 1e-6)
-
-
-@contextmanager
-def torch_threads(threads: int) -> Iterator[None]:
-    """Let torch use so many threads inside."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def take_turn(case: Case, run: Runner, calls: int) -> Sample:
@@ -128,10 +114,10 @@ def make_row(labels: Labels, samples: Sequence[Sample], peer: Sequence[Sample] =
         peer: the turns of the system that it is compared with, if any, of the same rounds.
 
     Returns:
-        The labels; ``physics_steps_per_s``, ``decisions_per_s``, ``physics_steps_per_cpu_s``; the
-        ``ms_per_call`` of wall time; ``spread``, the interquartile range of the turns' wall time
-        over its median; ``ratio`` and ``ratio_cpu``: physics steps per second of wall and of CPU
-        time over the peer's turn of the same round, median of the rounds, or None.
+        The labels; ``physics_steps_per_s``, ``decisions_per_s``, ``physics_steps_per_cpu_s``;
+        ``spread``, the interquartile range of the turns' wall time over its median; ``ratio`` and
+        ``ratio_cpu``: physics steps per second of wall and of CPU time over the peer's turn of the
+        same round, median of the rounds, or None.
     """
     per_s, per_cpu_s = np.median([sample.rates for sample in samples], axis=0).tolist()
     walls_s = [sample.wall_s for sample in samples]
@@ -146,7 +132,6 @@ def make_row(labels: Labels, samples: Sequence[Sample], peer: Sequence[Sample] =
         "physics_steps_per_s": per_s,
         "decisions_per_s": median(sample.decisions / sample.wall_s for sample in samples),
         "physics_steps_per_cpu_s": per_cpu_s,
-        "ms_per_call": 1000 * median(walls_s) * labels.batch / samples[0].decisions,
         "spread": float(high - low) / median(walls_s),
         "ratio": ratio,
         "ratio_cpu": ratio_cpu,
@@ -159,31 +144,29 @@ def measure(
     """Rows of cases with the same number of threads that take turns; the ``peer``'s comes first."""
     started: list[Case] = []
     runners: list[Runner] = []
-    with torch_threads(cases[0].labels.threads):
-        for case in cases if peer is None else [peer, *cases]:
-            try:
-                runners.append(case.start())
-                started.append(case)
-            except UserError as error:
-                if case.labels.mode == "eager":
-                    raise
-                # No compiler here, or a traffic that the kernel does not drive.
-                print(f"left out, {case.labels.mode}: {error}", file=sys.stderr)
-        samples = take_turns(started, runners, repetitions, seconds)
+    torch.set_num_threads(cases[0].labels.threads)
+    for case in cases if peer is None else [peer, *cases]:
+        try:
+            runners.append(case.start())
+            started.append(case)
+        except UserError as error:
+            if case.labels.mode == "eager":
+                raise
+            # No compiler here, or a traffic that the kernel does not drive.
+            print(f"left out, {case.labels.mode}: {error}", file=sys.stderr)
+    samples = take_turns(started, runners, repetitions, seconds)
     of_peer = samples[0] if peer is not None else []
     return [make_row(case.labels, turns, of_peer) for case, turns in zip(started, samples)]
 
 
-def best_rows(rows: Sequence[Row], figure: str) -> list[Row]:
-    """The row with the highest ``figure`` of each system and traffic, in the order of ``rows``."""
+def best_rows(rows: Sequence[Row]) -> list[Row]:
+    """The row with most physics steps per second of each system and traffic, in the order of
+    ``rows``.
+    """
+    rate = "physics_steps_per_s"
     best: dict[tuple[str, str], Row] = {}
     for row in rows:
         key = row["system"], row["traffic"]
-        if key not in best or row[figure] > best[key][figure]:
+        if key not in best or row[rate] > best[key][rate]:
             best[key] = row
     return list(best.values())
-
-
-def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
-    """``p`` of the least-squares fit ``cost ~ size ** p``; 1 is linear."""
-    return float(np.polyfit(np.log(sizes), np.log(costs), 1)[0])

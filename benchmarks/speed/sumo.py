@@ -19,7 +19,6 @@ from benchmarks.speed.systems import STEPS
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
-from ganlane.sim.idm import TABLE_V
 
 #: Road before x = 0, where the ego starts, and behind the goal, m.
 ROOM_M = 500.0
@@ -85,7 +84,7 @@ def write_vehicles(folder: Path, env: HighwayEnv) -> None:
             edges, at_m = f"{'before' if lane else 'ramp'} {edges}", front_m + ROOM_M
             # There the main road has one lane less.
             lane = max(lane - 1, 0)
-        lines.append(vehicle_type(f"type{slot}", desired_mps, keys.PHYSICS_STEP_S, TABLE_V))
+        lines.append(vehicle_type(f"type{slot}", desired_mps, keys.PHYSICS_STEP_S))
         lines.append(
             f'<vehicle id="{slot}" type="type{slot}" depart="0" departLane="{lane}" '
             f'departPos="{at_m}" departSpeed="{min(speed_mps, desired_mps)}" '

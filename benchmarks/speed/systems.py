@@ -51,17 +51,17 @@ class Road:
 
     def keys_of(self, mode: str) -> dict[str, Any]:
         """Keywords of :func:`ganlane.make_env` and of ``gymnasium.make`` for a mode."""
+        shared = {
+            "traffic": self.traffic,
+            "observation": OBSERVATION,
+            "seed": self.seed,
+            "kernel": "native" if mode == "native" else "torch",
+        }
         if self.scene != "highway":
             # It sets vehicles and lanes itself.
-            return {
-                "traffic": self.traffic,
-                "env": self.scene,
-                "observation": OBSERVATION,
-                "seed": self.seed,
-                "kernel": "native" if mode == "native" else "torch",
-            }
+            return {**shared, "env": self.scene}
         return {
-            "traffic": self.traffic,
+            **shared,
             # The first scene grows with the vehicles, at Table II's density.
             "env": "highway" if self.vehicles <= 9 else "dense",
             "vehicles": self.vehicles,
@@ -69,9 +69,6 @@ class Road:
             # A road that does not empty; recorded vehicles go where they went, and the range of
             # recycling would crowd a longer scene.
             "recycle": self.traffic != "replay" and self.vehicles <= 9,
-            "observation": OBSERVATION,
-            "seed": self.seed,
-            "kernel": "native" if mode == "native" else "torch",
         }
 
     def make(self, mode: str, device: str, batch: int, **more: Any) -> TransformedEnv:
@@ -244,13 +241,13 @@ def _highway_settings(road: Road) -> dict[str, Any]:
 
     Its ``merge-v0`` and ``exit-v0`` have roads and vehicles of their own.
     """
+    frequencies = {"simulation_frequency": STEPS, "policy_frequency": 1}
     if road.scene != "highway":
-        return {"simulation_frequency": STEPS, "policy_frequency": 1}
+        return frequencies
     return {
+        **frequencies,
         "lanes_count": road.lanes,
         "vehicles_count": road.vehicles - 1,  # the others
-        "simulation_frequency": STEPS,
-        "policy_frequency": 1,
         "duration": round(TIMEOUT_S),
     }
 

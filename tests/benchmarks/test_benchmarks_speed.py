@@ -19,14 +19,14 @@ from benchmarks.speed.systems import Road
 from ganlane import keys
 from ganlane.agents import RainbowConfig
 
-LABELS = Labels("speed", "mine", "idm", "eager", "cpu", 1, 9, 3, 4)
+LABELS = Labels("mine", "idm", 9, 3, "eager", "cpu", 1, 4)
 QUICK = ["--quick", "--seconds", "0.001", "--no-peers", "--modes", "eager"]
 
 
 def test_a_row_holds_medians_over_the_turns():
     row = make_row(LABELS, [Sample(wall_s, 2 * wall_s, 40, 400) for wall_s in (1.0, 4.0, 2.0)])
     assert (row["physics_steps_per_s"], row["decisions_per_s"]) == (200, 20)
-    assert (row["physics_steps_per_cpu_s"], row["ms_per_call"]) == (100, 200)
+    assert row["physics_steps_per_cpu_s"] == 100
     assert row["spread"] == pytest.approx(1.5 / 2)
     assert (row["ratio"], row["system"]) == (None, "mine")
 
@@ -119,14 +119,13 @@ def test_sumo_drives_our_on_ramp_until_its_ego_is_at_the_goal():
 def test_the_tables_go_into_the_document_and_the_rows_into_a_file(tmp_path):
     document, rows = tmp_path / "page.md", tmp_path / "rows.json"
     document.write_text("before\n<!-- begin bench sim -->\n<!-- end bench sim -->\nafter\n")
-    line = [*QUICK, "--batches", "2", "--vehicle-counts", "9", "12"]
+    line = [*QUICK, "--batches", "2"]
     assert speed.main([*line, "--report", str(document), "--json", str(rows)]) == 0
     text = document.read_text()
     assert "python -m benchmarks.speed --quick" in text
     assert "| ganlane physics | idm_mobil | eager | cpu | 1 | 2 |" in text
-    assert "### Growth of the cost" in text
     systems_of = [row["system"] for row in json.loads(rows.read_text())["rows"]]
-    assert sorted(systems_of) == ["ganlane environment"] * 3 + ["ganlane physics"] * 3
+    assert sorted(systems_of) == ["ganlane environment", "ganlane physics"]
 
 
 def test_every_traffic_is_measured_and_left_out_where_there_is_no_kernel(capsys, monkeypatch):

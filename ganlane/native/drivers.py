@@ -189,10 +189,7 @@ class GeneratedDrivers:
     @property
     def mobil(self) -> MobilParameters:
         """The limits of a lane change, as MOBIL has them."""
-        changes = self.checked_changes
-        return MobilParameters(
-            safe_deceleration=changes.safe_deceleration, exclusive_m=changes.exclusive_m
-        )
+        return self.checked_changes.limits()
 
     def memory(self) -> MemoryArrays:
         """Their memory in the order of generated.hpp."""
@@ -782,11 +779,10 @@ def pays(drivers: Drivers) -> bool:
     return isinstance(library, Loaded) and library.variant != "default"
 
 
-def faulty_drivers(drivers: RuleDrivers, faults: DriverFaults, stream: int) -> RuleDrivers | None:
+def faulty_drivers(drivers: RuleDrivers, faults: DriverFaults) -> RuleDrivers | None:
     """``drivers`` with ``faults``; None where they react later than the kernel can remember."""
-    if _steps(faults.late_reaction.delay_s) > _MOST_STEPS:
-        return None
-    return drivers._replace(faults=faults, stream=stream)
+    late = _steps(faults.late_reaction.delay_s) > _MOST_STEPS
+    return None if late else drivers._replace(faults=faults)
 
 
 def drivers_of(
@@ -799,34 +795,27 @@ def drivers_of(
     Raises:
         UserError: the weights are missing, foreign, of the other preset, or do not fit.
     """
-    drivers = _who_see(traffic, idm, mobil, stream)
+    drivers: Drivers | None = None
+    rules = RuleDrivers(idm, mobil=mobil, stream=stream)
+    if isinstance(traffic, IdmTrafficConfig):
+        drivers = rules._replace(mobil=None)
+    elif isinstance(traffic, IdmMobilTrafficConfig):
+        drivers = rules
+    elif isinstance(traffic, IdmFaultsTrafficConfig):
+        drivers = faulty_drivers(rules, part_of(traffic, DriverFaults))
+    elif isinstance(traffic, IdmRandomTrafficConfig):
+        drivers = rules._replace(random=part_of(traffic, RandomDrivers))
+    elif isinstance(traffic, GanTrafficConfig):
+        drivers = gan_drivers(traffic, idm, stream)
+    elif isinstance(traffic, GanCalibratedTrafficConfig):
+        drivers = calibrated_drivers(traffic, idm, stream)
+    elif isinstance(traffic, HumanTrafficConfig):
+        drivers = human_drivers(traffic, idm, stream)
+    elif isinstance(traffic, MixedTrafficConfig):
+        parts = traffic.parts()
+        driven = {name: drivers_of(parts[name], idm, mobil, stream) for name in parts}
+        drivers = mixed_drivers(driven, traffic.shares)
     return blind(drivers, traffic.blind_share) if drivers and traffic.blind_share else drivers
-
-
-def _who_see(
-    traffic: TrafficConfig, idm: IdmParameters, mobil: MobilParameters, stream: int
-) -> Drivers | None:
-    if type(traffic) is IdmTrafficConfig:
-        return RuleDrivers(idm, stream=stream)
-    if type(traffic) is IdmMobilTrafficConfig:
-        return RuleDrivers(idm, mobil=mobil, stream=stream)
-    if type(traffic) is IdmFaultsTrafficConfig:
-        return faulty_drivers(RuleDrivers(idm, mobil=mobil), part_of(traffic, DriverFaults), stream)
-    if type(traffic) is IdmRandomTrafficConfig:
-        random = part_of(traffic, RandomDrivers)
-        return RuleDrivers(idm, mobil=mobil, random=random, stream=stream)
-    if type(traffic) is GanTrafficConfig:
-        return gan_drivers(traffic, idm, stream)
-    if type(traffic) is GanCalibratedTrafficConfig:
-        return calibrated_drivers(traffic, idm, stream)
-    if type(traffic) is HumanTrafficConfig:
-        return human_drivers(traffic, idm, stream)
-    if type(traffic) is MixedTrafficConfig:
-        parts = {
-            name: drivers_of(part, idm, mobil, stream) for name, part in traffic.parts().items()
-        }
-        return mixed_drivers(parts, traffic.shares)
-    return None
 
 
 def _fitted(

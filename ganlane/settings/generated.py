@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ganlane.settings.driving import IdmParameters
+from ganlane.settings.driving import IdmParameters, MobilParameters
 
 #: Levels of the headway quantiles.
 QUANTILE_LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
@@ -117,3 +117,9 @@ class CalibratedChanges:
     patience_s: float = 20.0
     safe_deceleration: float = 2.0
     exclusive_m: float = 60.0
+
+    def limits(self) -> MobilParameters:
+        """The limits of a lane change, as MOBIL has them."""
+        return MobilParameters(
+            safe_deceleration=self.safe_deceleration, exclusive_m=self.exclusive_m
+        )

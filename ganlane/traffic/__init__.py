@@ -9,22 +9,14 @@ recordings. :mod:`~ganlane.traffic.mixed` chooses a model per episode, or hides 
 Traffic of foreign simulators is the package :mod:`ganlane_simulators`.
 """
 
-from ganlane.traffic.base import (
-    Overlay,
-    TrafficModule,
-    TrafficSequential,
-)
+from ganlane.traffic.base import Overlay, TrafficModule, TrafficSequential
 from ganlane.traffic.faults import (
     AbortedLaneChange,
     HesitantLaneChange,
     LateReaction,
     PhantomBraking,
 )
-from ganlane.traffic.idm_mobil import (
-    IdmMobilTraffic,
-    IdmRandomTraffic,
-    IdmTraffic,
-)
+from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmRandomTraffic, IdmTraffic
 from ganlane.traffic.mixed import BlindTraffic, MixedTraffic
 from ganlane.traffic.overlays import (
     AccelerationOverlay,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias, TypeVar, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -26,6 +26,7 @@ Memory: TypeAlias = dict[str, Tensor]
 Moved: TypeAlias = tuple[Vehicles, Memory]
 #: Name to (trailing shape after [N, M], dtype); the dtype None is the run's float type.
 MemoryFields: TypeAlias = Mapping[str, tuple[tuple[int, ...], torch.dtype | None]]
+Network = TypeVar("Network", bound=nn.Module)
 
 
 def new_tensordict(fields: Mapping[str, Any], n: int) -> TensorDict:
@@ -43,11 +44,7 @@ def memory_of(tensordict: TensorDictBase, key: str = keys.TRAFFIC) -> TensorDict
     return TensorDict({}, batch_size=tensordict.batch_size) if memory is None else memory
 
 
-def with_rows(
-    whole: TensorDictBase,
-    rows: Tensor,
-    part: Mapping[str, Any],
-) -> TensorDict:
+def with_rows(whole: TensorDictBase, rows: Tensor, part: Mapping[str, Any]) -> TensorDict:
     """``whole`` [N] with its ``rows`` [R] replaced by those of ``part``, leaf by leaf.
 
     Nothing is written in place; what ``part`` lacks stays.
@@ -67,30 +64,25 @@ def key_of(tensordict: TensorDictBase, stream: int) -> Tensor:
     """The episodes' keys [N]: those that the caller has computed, or from seed and episode."""
     key = tensordict.get(keys.EPISODE_KEY, None)
     if key is None:
-        return episode_key(
-            stream,
-            tensordict.get(keys.SEED),
-            tensordict.get(keys.EPISODE),
-        )
+        return episode_key(stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
     return key
 
 
 def uniforms(
-    vehicles: Vehicles,
-    key: Tensor,
-    step: Tensor | int,
-    *purposes: int,
+    vehicles: Vehicles, key: Tensor, step: Tensor | int, *purposes: int
 ) -> tuple[Tensor, ...]:
     """A uniform number in [0, 1) for every vehicle, [N, M], of each of the ``purposes``."""
     # All purposes in one call, which shares the hashing of episode and step.
-    drawn = uniform(
-        key,
-        step,
-        vehicles.x.shape[1],
-        list(purposes),
-        vehicles.x.dtype,
-    )
-    return drawn.unbind(-1)
+    x = vehicles.x
+    return uniform(key, step, x.shape[1], list(purposes), x.dtype).unbind(-1)
+
+
+def in_dtype(network: Network, dtype: torch.dtype) -> Network:
+    """A fitted ``network`` in the run's float type."""
+    # Weights are stored in float32, a run may be in float64; converted once.
+    if next(network.parameters()).dtype != dtype:
+        network.to(dtype)
+    return network
 
 
 class TrafficModule(TensorDictModuleBase):
@@ -114,13 +106,7 @@ class TrafficModule(TensorDictModuleBase):
         stream: family of episodes that the random numbers belong to.
     """
 
-    in_keys = [  # noqa: RUF012
-        keys.VEHICLES,
-        keys.TRAFFIC,
-        keys.SEED,
-        keys.EPISODE,
-        keys.STEP,
-    ]
+    in_keys = [keys.VEHICLES, keys.TRAFFIC, keys.SEED, keys.EPISODE, keys.STEP]  # noqa: RUF012
     out_keys = [keys.MOVED, keys.TRAFFIC]  # noqa: RUF012
 
     #: When others see the lane changes of this model's vehicles; ``VISIBILITY_OF_EPISODE`` if
@@ -144,13 +130,7 @@ class TrafficModule(TensorDictModuleBase):
         # Under a short name, for models of your own.
         self.dt = PHYSICS_STEP_S
 
-    def move(
-        self,
-        vehicles: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
-    ) -> Moved:
+    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """The vehicles at t + 0.1 s, and the memory to keep.
 
         Args:
@@ -181,10 +161,7 @@ class TrafficModule(TensorDictModuleBase):
         return None
 
     def scenes(
-        self,
-        vehicles: int,
-        ego_visibility: int,
-        ego_desired_speed_mps: float,
+        self, vehicles: int, ego_visibility: int, ego_desired_speed_mps: float
     ) -> Scenes | None:
         """The initial scenes of this traffic; None: those of the environment."""
         return None
@@ -206,33 +183,16 @@ class TrafficModule(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``moved`` and ``traffic``."""
-        vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
-        memory = dict(memory_of(tensordict).items())
         # Plain fields from here on, so that a model needs to know nothing of TensorDicts.
-        moved, memory = self._call(
-            tensordict,
-            vehicles,
-            memory,
-            key_of(tensordict, self.stream),
-        )
+        memory = dict(memory_of(tensordict).items())
+        counters = (key_of(tensordict, self.stream), tensordict.get(keys.STEP))
+        moved, memory = self._call(tensordict, memory, *counters)
         n = tensordict.batch_size[0]
         tensordict.set(keys.MOVED, new_tensordict(moved.as_dict(), n))
-        tensordict.set(keys.TRAFFIC, new_tensordict(memory, n))
-        return tensordict
+        return tensordict.set(keys.TRAFFIC, new_tensordict(memory, n))
 
-    def _call(
-        self,
-        tensordict: TensorDictBase,
-        vehicles: Vehicles,
-        memory: Memory,
-        key: Tensor,
-    ) -> Moved:
-        return self.move(
-            vehicles,
-            memory,
-            key,
-            tensordict.get(keys.STEP),
-        )
+    def _call(self, state: TensorDictBase, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        return self.move(Vehicles.of(state.get(keys.VEHICLES)), memory, key, step)
 
     @outside_autocast
     def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
@@ -253,20 +213,12 @@ class TrafficModule(TensorDictModuleBase):
         # What is drawn at the start has a key of its own, apart from the draws of the steps.
         return vehicles, self.init_memory(vehicles, absorb(key, 0))
 
-    def memory_spec(
-        self,
-        n: int,
-        m: int,
-        dtype: torch.dtype = torch.float32,
-    ) -> dict[str, Any]:
+    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
         """Nested name -> (shape, dtype) of the memory of ``n`` rows of ``m`` vehicles."""
         # The dtype None stands for the run's float type.
         return {
             name: ((n, m, *shape), own_dtype or dtype)
-            for name, (
-                shape,
-                own_dtype,
-            ) in self.memory_fields.items()
+            for name, (shape, own_dtype) in self.memory_fields.items()
         }
 
 
@@ -279,32 +231,16 @@ class Overlay(TrafficModule):
     heeds_lane_ends = True  # as far as the model below does
 
     def rewrite(
-        self,
-        vehicles: Vehicles,
-        moved: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
     ) -> Moved:
         """The new ``moved``, and the memory to keep; arguments as in :meth:`TrafficModule.move`."""
         raise NotImplementedError
 
-    def _call(
-        self,
-        tensordict: TensorDictBase,
-        vehicles: Vehicles,
-        memory: Memory,
-        key: Tensor,
-    ) -> Moved:
+    def _call(self, state: TensorDictBase, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        vehicles = Vehicles.of(state.get(keys.VEHICLES))
         # What the model and the overlays before this one made of the step.
-        moved = Vehicles.of(tensordict.get(keys.MOVED))
-        return self.rewrite(
-            vehicles,
-            moved,
-            memory,
-            key,
-            tensordict.get(keys.STEP),
-        )
+        moved = Vehicles.of(state.get(keys.MOVED))
+        return self.rewrite(vehicles, moved, memory, key, step)
 
 
 class TrafficParts(TrafficModule):
@@ -324,17 +260,9 @@ class TrafficParts(TrafficModule):
 
     def named_parts(self) -> list[tuple[str, TrafficModule]]:
         """Names and parts, in order."""
-        return cast(
-            "list[tuple[str, TrafficModule]]",
-            list(self.parts.items()),
-        )
+        return cast("list[tuple[str, TrafficModule]]", list(self.parts.items()))
 
-    def memory_spec(
-        self,
-        n: int,
-        m: int,
-        dtype: torch.dtype = torch.float32,
-    ) -> dict[str, Any]:
+    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
         """The parts' specs, by name."""
         return {name: part.memory_spec(n, m, dtype) for name, part in self.named_parts()}
 

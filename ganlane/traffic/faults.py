@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
-from ganlane.native.drivers import RuleDrivers, faulty_drivers
+from ganlane.native.drivers import faulty_drivers
 from ganlane.settings.driving import (
     AbortFaults,
     BrakingFaults,
@@ -24,14 +24,7 @@ from ganlane.settings.driving import (
 )
 from ganlane.sim.random import Purpose, Stream
 from ganlane.sim.state import Road, Vehicles, lane_change_done
-from ganlane.traffic.base import (
-    Memory,
-    Moved,
-    Overlay,
-    TrafficModule,
-    TrafficSequential,
-    uniforms,
-)
+from ganlane.traffic.base import Memory, Moved, Overlay, TrafficModule, TrafficSequential, uniforms
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 
 #: A step shorter than this has no direction of its own, m: the vehicle then moves along its
@@ -55,12 +48,7 @@ def starting(vehicles: Vehicles, moved: Vehicles) -> Tensor:
     return (moved.target_lane != vehicles.target_lane) & other_drivers(vehicles)
 
 
-def driven_at(
-    vehicles: Vehicles,
-    moved: Vehicles,
-    acceleration: Tensor,
-    dt: float,
-) -> Vehicles:
+def driven_at(vehicles: Vehicles, moved: Vehicles, acceleration: Tensor, dt: float) -> Vehicles:
     """``moved`` with another ``acceleration`` (m/s2, [N, M]): the same path, slower or faster.
 
     Position and heading follow the path from ``vehicles`` to ``moved`` in proportion to the
@@ -74,16 +62,8 @@ def driven_at(
     share = distance / usual.clamp_min(_SHORTEST_M)
     # A standing vehicle that moves off has no path to follow yet, and its share means nothing.
     path = usual > _SHORTEST_M
-    dx = torch.where(
-        path,
-        share * (moved.x - vehicles.x),
-        distance * torch.cos(vehicles.heading),
-    )
-    dy = torch.where(
-        path,
-        share * (moved.y - vehicles.y),
-        distance * torch.sin(vehicles.heading),
-    )
+    dx = torch.where(path, share * (moved.x - vehicles.x), distance * torch.cos(vehicles.heading))
+    dy = torch.where(path, share * (moved.y - vehicles.y), distance * torch.sin(vehicles.heading))
     turn = torch.where(path, share * (moved.heading - vehicles.heading), 0.0)
     return moved.with_(
         x=vehicles.x + dx,
@@ -112,12 +92,7 @@ class Fault(Overlay, Generic[Faults]):
         super().__init__(road, stream)
         self.faults: Faults = faults or self.kind()
 
-    def draw(
-        self,
-        vehicles: Vehicles,
-        key: Tensor,
-        step: Tensor,
-    ) -> Tensor:
+    def draw(self, vehicles: Vehicles, key: Tensor, step: Tensor) -> Tensor:
         """A uniform number per vehicle, [N, M]."""
         return uniforms(vehicles, key, step, self.purpose)[0]
 
@@ -125,13 +100,7 @@ class Fault(Overlay, Generic[Faults]):
 class TimedFault(Fault[Timed]):
     """A fault that lasts. Memory: ``left``, its remaining steps."""
 
-    def steps_left(
-        self,
-        left: Tensor,
-        vehicles: Vehicles,
-        key: Tensor,
-        step: Tensor,
-    ) -> Tensor:
+    def steps_left(self, left: Tensor, vehicles: Vehicles, key: Tensor, step: Tensor) -> Tensor:
         """``left`` [N, M] int64, or all steps of a fault that begins now.
 
         A fault begins where there is none, at a constant hazard.
@@ -152,29 +121,14 @@ class PhantomBraking(TimedFault[BrakingFaults]):
     purpose = Purpose.FAULT
 
     def rewrite(
-        self,
-        vehicles: Vehicles,
-        moved: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
     ) -> Moved:
         """Brake during a fault."""
-        left = self.steps_left(
-            memory["left"],
-            vehicles,
-            key,
-            step,
-        )
+        left = self.steps_left(memory["left"], vehicles, key, step)
         wanted = torch.full_like(moved.acceleration, -self.faults.deceleration)
         # A driver who brakes harder anyway goes on doing so.
         brakes = (left > 0) & (moved.acceleration > wanted)
-        braking = driven_at(
-            vehicles,
-            moved,
-            wanted,
-            self.dt,
-        )
+        braking = driven_at(vehicles, moved, wanted, self.dt)
         return braking.where(brakes, moved), {"left": (left - 1).clamp_min(0)}
 
 
@@ -202,54 +156,24 @@ class LateReaction(TimedFault[ReactionFaults]):
         super().__init__(road, stream, faults)
         # At least 1, since delay_s is a physics step or longer.
         self.delay_steps = round(self.faults.delay_s / self.dt)
-        self.memory_fields = {
-            "past": ((self.delay_steps,), None),
-            "left": ((), torch.int64),
-        }
+        self.memory_fields = {"past": ((self.delay_steps,), None), "left": ((), torch.int64)}
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """No lapse, a constant past acceleration."""
         # As if the driver had always accelerated as it does now.
         past = vehicles.acceleration[..., None].repeat(1, 1, self.delay_steps)
-        return {
-            "past": past,
-            "left": torch.zeros_like(vehicles.target_lane),
-        }
+        return {"past": past, "left": torch.zeros_like(vehicles.target_lane)}
 
     def rewrite(
-        self,
-        vehicles: Vehicles,
-        moved: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
     ) -> Moved:
         """Drive at the acceleration of ``delay_s`` ago during a lapse."""
-        left = self.steps_left(
-            memory["left"],
-            vehicles,
-            key,
-            step,
-        )
+        left = self.steps_left(memory["left"], vehicles, key, step)
         # Entry 0 is the oldest: decided delay_s ago.
-        late = driven_at(
-            vehicles,
-            moved,
-            memory["past"][..., 0],
-            self.dt,
-        )
+        late = driven_at(vehicles, moved, memory["past"][..., 0], self.dt)
         # The model's decision is stored during a lapse, too, so the queue never has a hole.
-        past = torch.cat(
-            (
-                memory["past"][..., 1:],
-                moved.acceleration[..., None],
-            ),
-            dim=-1,
-        )
-        return late.where(left > 0, moved), {
-            "past": past,
-            "left": (left - 1).clamp_min(0),
-        }
+        past = torch.cat((memory["past"][..., 1:], moved.acceleration[..., None]), dim=-1)
+        return late.where(left > 0, moved), {"past": past, "left": (left - 1).clamp_min(0)}
 
 
 class HesitantLaneChange(Fault[HesitationFaults]):
@@ -264,12 +188,7 @@ class HesitantLaneChange(Fault[HesitationFaults]):
     purpose = Purpose.HESITANT_CHANGE
 
     def rewrite(
-        self,
-        vehicles: Vehicles,
-        moved: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
     ) -> Moved:
         """Reduce the lateral motion of hesitant changes."""
         begins = starting(vehicles, moved)
@@ -299,12 +218,7 @@ class AbortedLaneChange(Fault[AbortFaults]):
         return {"origin": torch.full_like(vehicles.target_lane, _NO_LANE)}
 
     def rewrite(
-        self,
-        vehicles: Vehicles,
-        moved: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
     ) -> Moved:
         """Set the old lane as the target where the change has come far enough."""
         begins = starting(vehicles, moved)
@@ -328,17 +242,14 @@ def with_faults(base: TrafficModule, faults: DriverFaults | None = None) -> Traf
     Phantom braking comes after the late reactions, since it is no reaction and must not be delayed.
     """
     faults = faults or DriverFaults()
-    road = base.road
-    stream = base.stream
+    road = (base.road, base.stream)
     # Memories are stored under these names.
     parts: dict[str, TrafficModule] = {
         "base": base,
-        "late_reaction": LateReaction(road, stream, faults.late_reaction),
-        "phantom_braking": PhantomBraking(road, stream, faults.phantom_braking),
-        "hesitant_change": HesitantLaneChange(road, stream, faults.hesitant_change),
-        "aborted_change": AbortedLaneChange(road, stream, faults.aborted_change),
+        "late_reaction": LateReaction(*road, faults.late_reaction),
+        "phantom_braking": PhantomBraking(*road, faults.phantom_braking),
+        "hesitant_change": HesitantLaneChange(*road, faults.hesitant_change),
+        "aborted_change": AbortedLaneChange(*road, faults.aborted_change),
     }
-    drivers = base.native_drivers()
-    if type(base) is IdmMobilTraffic and isinstance(drivers, RuleDrivers):
-        return TrafficSequential(parts, faulty_drivers(drivers, faults, stream))
-    return TrafficSequential(parts)
+    drivers = base.native_drivers() if type(base) is IdmMobilTraffic else None
+    return TrafficSequential(parts, None if drivers is None else faulty_drivers(drivers, faults))

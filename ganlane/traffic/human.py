@@ -12,10 +12,8 @@ import torch
 from torch import Tensor
 
 from ganlane.generator.human import (
-    ACCELERATIONS,
     ACROSS,
     ALONG,
-    LATERAL_SPEEDS,
     REAR_BRAKING,
     STEPS,
     HumanPolicy,
@@ -42,7 +40,15 @@ from ganlane.sim.mobil import TABLE_IV
 from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.random import Purpose, normal
 from ganlane.sim.state import Road, Vehicles, reads_are_cheap, spanned
-from ganlane.traffic.base import Memory, MemoryFields, Moved, TrafficModule, uniforms
+from ganlane.traffic.base import Memory, Moved, TrafficModule, in_dtype, uniforms
+
+#: Random numbers of a decision: moves along and across, a lane change, and one where a lane ends.
+_DRAWS = (
+    Purpose.ACCELERATION,
+    Purpose.LANE_CHANGE_SPEED,
+    Purpose.LANE_CHANGE_SIDE,
+    Purpose.LANE_CHANGE_HAZARD,
+)
 
 
 class HumanTraffic(TrafficModule):
@@ -53,40 +59,26 @@ class HumanTraffic(TrafficModule):
 
     Args:
         policy: the fitted policy (:func:`ganlane.generator.load_human`).
-        road, stream: as for every traffic module.
-        variation: how they differ from the fitted ones.
-        drivers: with which the native kernel drives as these do; None: it cannot.
+        drivers: the same for the native kernel: how they differ from the fitted ones, their stream.
+        road: as for every traffic module.
     """
 
     visibility = Visibility.BODY
     heeds_lane_ends = True
-    memory_fields: MemoryFields = {  # noqa: RUF012
-        "accelerations": ((ACCELERATIONS,), None),
-        "lateral_speeds": ((LATERAL_SPEEDS,), None),
-        "closing": ((2,), None),
-        "style": ((3,), None),
-        "age": ((), None),
-        "since": ((), None),
-        "acceleration": ((), None),
-        "lateral_from": ((), None),
-        "lateral_to": ((), None),
-    }
 
     def __init__(
-        self,
-        policy: HumanPolicy,
-        drivers: HumanDrivers,
-        road: Road | None = None,
+        self, policy: HumanPolicy, drivers: HumanDrivers, road: Road | None = None
     ) -> None:
         super().__init__(road, drivers.stream)
         self.policy = policy
-        self.variation = drivers.variation
-        self._drivers = drivers
-        self._idm = drivers.idm
+        self.drivers = drivers
+        # The same as the kernel's, in the run's float type.
+        memory = drivers.memory().items()
+        self.memory_fields = {key[-1]: (shape, None) for key, (_, shape) in memory}
 
     def native_drivers(self) -> HumanDrivers:
         """Those that it was made with."""
-        return self._drivers
+        return self.drivers
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """Drivers who have always driven as they do now; headways that nothing shows are drawn."""
@@ -143,26 +135,18 @@ class HumanTraffic(TrafficModule):
 
     def decide(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """Target lanes, and the memory with what every driver does for 0.4 s."""
-        policy = self._policy(vehicles.x.dtype)
+        policy, variation = in_dtype(self.policy, vehicles.x.dtype), self.drivers.variation
         vehicles = vehicles.with_(target_lane=self.road.clamp_lane(vehicles.target_lane))
         driver = DriverMemory(*(memory[name] for name in DriverMemory._fields))
         driver, view = look(vehicles, driver, self.road)
-        u = uniforms(
-            vehicles,
-            key,
-            step,
-            Purpose.ACCELERATION,
-            Purpose.LANE_CHANGE_SPEED,
-            Purpose.LANE_CHANGE_SIDE,
-            Purpose.LANE_CHANGE_HAZARD,
-        )
+        u = uniforms(vehicles, key, step, *_DRAWS)
         if self.road.stretches:
             ways = ways_out(vehicles, self.road, TABLE_IV.mandatory_m)
             view = view._replace(exists=torch.stack((ways.left, ways.right), -1))
         sides = view.sides.clone()
-        sides[..., REAR_BRAKING] *= self.variation.politeness
+        sides[..., REAR_BRAKING] *= variation.politeness
         option = lane_choice(vehicles, view)._replace(sides=sides)
-        choice = chosen(policy.lane_chances(option, self.variation.lane_changes), u[2])
+        choice = chosen(policy.lane_chances(option, variation.lane_changes), u[2])
         if self.road.stretches:
             choice = _leaving(choice, ways, vehicles, view, u[3])
         target = new_target(vehicles, view, choice)
@@ -170,15 +154,15 @@ class HumanTraffic(TrafficModule):
         # Its moves follow the driver's choice.
         view = perceive(vehicles, driver, self.road)
         along, across = policy(view.features)
-        change = ALONG.sample(along, u[0], self.variation.temperature)
-        aside = ACROSS.sample(across, u[1], self.variation.temperature)
+        change = ALONG.sample(along, u[0], variation.temperature)
+        aside = ACROSS.sample(across, u[1], variation.temperature)
         acceleration, lateral = bounded(vehicles, driver, self.road, change, aside)
         if self.road.stretches:
             acceleration = torch.minimum(acceleration, self._before_walls(vehicles))
         driver = remembered(vehicles, driver, view, acceleration)
         return vehicles, {
             **driver._asdict(),
-            "acceleration": driver.accelerations[..., self.variation.delayed],
+            "acceleration": driver.accelerations[..., variation.delayed],
             "lateral_from": velocity(vehicles)[1],
             "lateral_to": lateral,
         }
@@ -188,14 +172,7 @@ class HumanTraffic(TrafficModule):
         scene = scene_of(vehicles, self.road)
         lanes = spanned(scene.attention)
         keeps = lanes == vehicles.target_lane[..., None]
-        return acceleration_before_wall(scene, lanes, keeps, self._idm).amin(-1)
-
-    def _policy(self, dtype: torch.dtype) -> HumanPolicy:
-        """The policy in the run's float type."""
-        # Weights are stored in float32, a run may be in float64; converted once.
-        if self.policy.along.weight.dtype != dtype:
-            self.policy.to(dtype)
-        return self.policy
+        return acceleration_before_wall(scene, lanes, keeps, self.drivers.idm).amin(-1)
 
 
 def _leaving(choice: Tensor, ways: WaysOut, vehicles: Vehicles, view: View, u: Tensor) -> Tensor:

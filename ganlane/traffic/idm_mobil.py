@@ -11,36 +11,15 @@ from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
 from ganlane.native.drivers import RuleDrivers
-from ganlane.settings.driving import (
-    IdmParameters,
-    MobilParameters,
-    RandomDrivers,
-)
+from ganlane.settings.driving import IdmParameters, MobilParameters, RandomDrivers
 from ganlane.settings.record import Range
-from ganlane.sim.dynamics import (
-    STEERING,
-    SteeringParameters,
-    advance,
-    steer,
-)
-from ganlane.sim.idm import (
-    TABLE_V,
-    AnyIdm,
-    DriverIdm,
-    following_acceleration,
-    needed_deceleration,
-)
+from ganlane.sim.dynamics import STEERING, SteeringParameters, advance, steer
+from ganlane.sim.idm import TABLE_V, AnyIdm, DriverIdm, following_acceleration, needed_deceleration
 from ganlane.sim.mobil import TABLE_IV, DriverMobil, mobil_changes, yielding
 from ganlane.sim.neighbours import Scene, in_lane, perceive
 from ganlane.sim.random import Purpose, Stream, absorb
 from ganlane.sim.state import Road, Vehicles, reads_are_cheap
-from ganlane.traffic.base import (
-    Memory,
-    MemoryFields,
-    Moved,
-    TrafficModule,
-    uniforms,
-)
+from ganlane.traffic.base import Memory, Moved, TrafficModule, uniforms
 
 #: MOBIL decides once a second of simulated time, whatever the ego's decision period.
 MOBIL_PERIOD_STEPS = 10
@@ -65,6 +44,9 @@ class IdmTraffic(TrafficModule):
 
     heeds_lane_ends = True
     memory_fields = {"steering": ((), None)}  # noqa: RUF012
+    #: How drivers change lanes, and the ranges that they are drawn from, if they do and are.
+    mobil: MobilParameters | None = None
+    drivers: RandomDrivers | None = None
 
     def __init__(
         self,
@@ -77,84 +59,47 @@ class IdmTraffic(TrafficModule):
         self.idm = idm
         self.steering = steering
 
-    def move(
-        self,
-        vehicles: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
-    ) -> Moved:
-        """Accelerate, steer, advance."""
-        return self.keep_lanes(vehicles, memory)
-
     def native_drivers(self) -> RuleDrivers | None:
         """The kernel's drivers; None for a subclass, which may drive otherwise."""
         # Not isinstance: a subclass may override any part of a step.
-        if type(self) is not IdmTraffic:
+        if type(self) not in (IdmTraffic, IdmMobilTraffic, IdmRandomTraffic):
             return None
-        return RuleDrivers(self.idm, self.steering, stream=self.stream)
+        rules = (self.idm, self.steering, self.mobil)
+        return RuleDrivers(*rules, random=self.drivers, stream=self.stream)
 
-    def keep_lanes(self, vehicles: Vehicles, memory: Memory) -> Moved:
-        """A step without decisions."""
-        return self.drive(
-            perceive(vehicles, self.road),
-            vehicles.target_lane,
-            memory,
-        )
+    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """Decide, accelerate, steer, advance."""
+        scene = perceive(vehicles, self.road)
+        return self.drive(scene, self.targets(scene, memory, step), memory, step)
 
-    def drive(
-        self,
-        scene: Scene,
-        target: Tensor,
-        memory: Memory,
-    ) -> Moved:
+    def targets(self, scene: Scene, memory: Memory, step: Tensor) -> Tensor:
+        """The lane that each driver keeps or changes to, [N, M] int64."""
+        return scene.vehicles.target_lane
+
+    def drive(self, scene: Scene, target: Tensor, memory: Memory, step: Tensor) -> Moved:
         """The vehicles at t + 0.1 s, steered to the lanes ``target`` [N, M] int64."""
         centre = self.road.centre_of(target, scene.vehicles.y.dtype)
-        acceleration = self.following(scene, self.idm)
-        return self._advanced(
-            scene.vehicles,
-            acceleration,
-            target,
-            centre,
-            memory,
-        )
+        return self.advanced(scene, self.following(scene, self.idm), target, centre, memory)
 
     def following(self, scene: Scene, idm: AnyIdm) -> Tensor:
         """Accelerations [N, M], m/s2."""
         return following_acceleration(scene, idm)
 
-    def _advanced(
-        self,
-        v: Vehicles,
-        acceleration: Tensor,
-        target: Tensor,
-        line: Tensor,
-        memory: Memory,
+    def advanced(
+        self, scene: Scene, acceleration: Tensor, target: Tensor, line: Tensor, memory: Memory
     ) -> Moved:
         """Steered to the lines at ``line`` (m, [N, M])."""
-        steering = steer(
-            memory["steering"],
-            v.y,
-            v.heading,
-            v.speed,
-            line,
-            self.dt,
-            self.steering,
-        )
-        pose = advance(
-            v.x,
-            v.y,
-            v.heading,
-            v.speed,
-            acceleration,
-            steering,
-            self.dt,
-        )
-        return v.with_(target_lane=target, **pose._asdict()), {"steering": steering}
+        v = scene.vehicles
+        pose = (v.y, v.heading, v.speed)
+        steering = steer(memory["steering"], *pose, line, self.dt, self.steering)
+        moved = advance(v.x, *pose, acceleration, steering, self.dt)
+        return v.with_(target_lane=target, **moved._asdict()), {"steering": steering}
 
 
 class IdmMobilTraffic(IdmTraffic):
     """``traffic=idm_mobil``: IDM with MOBIL's lane changes once a second (Tables IV and V)."""
+
+    mobil: MobilParameters
 
     def __init__(
         self,
@@ -164,47 +109,19 @@ class IdmMobilTraffic(IdmTraffic):
         steering: SteeringParameters = STEERING,
         mobil: MobilParameters = TABLE_IV,
     ) -> None:
-        super().__init__(
-            road,
-            stream,
-            idm,
-            steering,
-        )
+        super().__init__(road, stream, idm, steering)
         self.mobil = mobil
 
-    def move(
-        self,
-        vehicles: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
-    ) -> Moved:
-        """As IDM; rows at a full second decide first."""
+    def targets(self, scene: Scene, memory: Memory, step: Tensor) -> Tensor:
+        """As IDM; drivers of the rows at a full second decide."""
+        lane = scene.vehicles.target_lane
         due = step % MOBIL_PERIOD_STEPS == 0
         # Reading a flag is cheap on a CPU and saves nine evaluations of MOBIL in ten: without it a
         # decision of idm_mobil and idm_random takes half as long again (64 x 9 vehicles, one core).
         # On a GPU it would stall the queue.
         if reads_are_cheap(due) and not bool(due.any()):
-            return self.keep_lanes(vehicles, memory)
-        return self.decide(vehicles, memory, due)
-
-    def native_drivers(self) -> RuleDrivers | None:
-        """As of :class:`IdmTraffic`, with lane changes."""
-        if type(self) is not IdmMobilTraffic:
-            return None
-        return RuleDrivers(self.idm, self.steering, self.mobil, stream=self.stream)
-
-    def decide(
-        self,
-        vehicles: Vehicles,
-        memory: Memory,
-        due: Tensor,
-    ) -> Moved:
-        """A step in which the drivers of the rows ``due`` [N] decide."""
-        scene = perceive(vehicles, self.road)
-        # Rows that are not at a full second keep their target lanes.
-        change = torch.where(due[:, None], self.changes(scene, memory), 0)
-        return self.drive(scene, vehicles.target_lane + change, memory)
+            return lane
+        return lane + torch.where(due[:, None], self.changes(scene, memory), 0)
 
     def following(self, scene: Scene, idm: AnyIdm) -> Tensor:
         """As IDM; where lanes end, drivers make room for those who have to leave theirs."""
@@ -215,12 +132,7 @@ class IdmMobilTraffic(IdmTraffic):
 
     def changes(self, scene: Scene, memory: Memory) -> Tensor:
         """The side that each driver changes to, -1, 0 or 1, [N, M]."""
-        return mobil_changes(
-            scene,
-            self.road,
-            self.idm,
-            self.mobil,
-        )
+        return mobil_changes(scene, self.road, self.idm, self.mobil)
 
 
 class DriverParams(NamedTuple):
@@ -253,13 +165,8 @@ class DriverParams(NamedTuple):
         No driver brakes harder than ``braking`` (m/s2, [N, M]).
         """
         # IDM's bound is an acceleration, so braking changes its sign.
-        return DriverIdm(
-            min_gap_m,
-            self.headway,
-            self.comfortable_deceleration,
-            -braking,
-            self.max_acceleration,
-        )
+        driver = (self.headway, self.comfortable_deceleration, -braking, self.max_acceleration)
+        return DriverIdm(min_gap_m, *driver)
 
     def sway_m(self, time_s: Tensor) -> Tensor:
         """How far each driver aims to the left of its lane's centre at ``time_s`` [N, 1], m."""
@@ -319,6 +226,8 @@ class IdmRandomTraffic(IdmMobilTraffic):
         drivers: the ranges.
     """
 
+    drivers: RandomDrivers
+
     def __init__(
         self,
         road: Road | None = None,
@@ -328,39 +237,20 @@ class IdmRandomTraffic(IdmMobilTraffic):
         mobil: MobilParameters = TABLE_IV,
         drivers: RandomDrivers | None = None,
     ) -> None:
-        super().__init__(
-            road,
-            stream,
-            idm,
-            steering,
-            mobil,
-        )
+        super().__init__(road, stream, idm, steering, mobil)
         self.drivers = drivers or RandomDrivers()
         # The queue is as long as the slowest driver's reaction.
         self.delay_steps = round(self.drivers.reaction_s[1] / self.dt)
-        past: MemoryFields = {"past": ((self.delay_steps,), None)} if self.delay_steps else {}
-        self.memory_fields = {
-            "steering": ((), None),
-            _PARAMETERS: ((len(DriverParams._fields),), None),
-            **past,
-        }
-
-    def native_drivers(self) -> RuleDrivers | None:
-        """As of :class:`IdmTraffic`, no two alike."""
-        if type(self) is not IdmRandomTraffic:
-            return None
-        rules = (self.idm, self.steering, self.mobil)
-        return RuleDrivers(*rules, random=self.drivers, stream=self.stream)
+        fields = {"steering": (), _PARAMETERS: (len(DriverParams._fields),)}
+        if self.delay_steps:
+            fields["past"] = (self.delay_steps,)
+        self.memory_fields = {name: (shape, None) for name, shape in fields.items()}
 
     def _drawn(self, vehicles: Vehicles, key: Tensor) -> tuple[Tensor, ...]:
         """Uniform numbers [N, M] of every purpose."""
         # Step -1 is no step of an episode, so nothing else draws these numbers.
-        return uniforms(
-            vehicles,
-            key,
-            -1,
-            *(Purpose.DRIVER + index for index in range(_DRAWS)),
-        )
+        purposes = range(Purpose.DRIVER, Purpose.DRIVER + _DRAWS)
+        return uniforms(vehicles, key, -1, *purposes)
 
     def driver_params(self, vehicles: Vehicles, key: Tensor) -> DriverParams:
         """The drivers at the start of the episodes with ``key`` [N]."""
@@ -369,20 +259,15 @@ class IdmRandomTraffic(IdmMobilTraffic):
         u = self._drawn(vehicles, key)
         # The scene may ask more of a driver than its range has: it then brakes as hard as that.
         reaction_s = in_range(u[5], d.reaction_s)
-        required = start_braking(
-            vehicles,
-            self.road,
-            reaction_s,
-            self.idm.min_gap_m,
-        )
-        least_braking = _START_MARGIN * required
+        required = start_braking(vehicles, self.road, reaction_s, self.idm.min_gap_m)
+        braking = torch.maximum(in_range(u[3], d.strongest_braking), _START_MARGIN * required)
         # Even at its largest sway a body stays within its lane.
         room = 0.5 * (self.road.lane_width_m - vehicles.width) - _LANE_MARGIN_M
         return DriverParams(
             headway=in_range(u[0], d.headway_s),
             max_acceleration=in_range(u[1], d.max_acceleration),
             comfortable_deceleration=in_range(u[2], d.comfortable_deceleration),
-            strongest_braking=torch.maximum(in_range(u[3], d.strongest_braking), least_braking),
+            strongest_braking=braking,
             politeness=in_range(u[4], d.politeness),
             delay=torch.round(reaction_s / self.dt),
             sway=torch.minimum(in_range(u[6], d.sway_m), room.clamp_min(0.0)),
@@ -398,13 +283,8 @@ class IdmRandomTraffic(IdmMobilTraffic):
         """Gives every driver but the ego its own desired speed."""
         u = self._drawn(vehicles, absorb(key, 0))[_DESIRED_SPEED]
         # The ego's is the environment's.
-        factor = in_range(u, self.drivers.desired_speed)
-        others = torch.arange(vehicles.x.shape[1], device=key.device) != EGO_INDEX
-        desired = torch.where(
-            others,
-            factor * vehicles.desired_speed,
-            vehicles.desired_speed,
-        )
+        desired = in_range(u, self.drivers.desired_speed) * vehicles.desired_speed
+        desired[:, EGO_INDEX] = vehicles.desired_speed[:, EGO_INDEX]
         return super().enter(vehicles.with_(desired_speed=desired), key, episode)
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
@@ -415,33 +295,16 @@ class IdmRandomTraffic(IdmMobilTraffic):
             memory["past"] = vehicles.acceleration[..., None].repeat(1, 1, self.delay_steps)
         return memory
 
-    def move(
-        self,
-        vehicles: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
-    ) -> Moved:
-        """As :class:`IdmMobilTraffic`; the memory carries the step, for the sway."""
-        return super().move(
-            vehicles,
-            {**memory, "step": step},
-            key,
-            step,
-        )
-
     def changes(self, scene: Scene, memory: Memory) -> Tensor:
         """As :class:`IdmMobilTraffic`, with each driver's parameters."""
         m = self.mobil
         drivers = DriverParams.of(memory)
         # [N, M, 1]: one weight for both sides that a driver looks at.
         politeness = drivers.politeness[..., None]
-        rear = politeness * m.politeness_rear
-        side = politeness * m.politeness_side
         mobil = DriverMobil(
             m.threshold,
-            rear,
-            side,
+            politeness * m.politeness_rear,
+            politeness * m.politeness_side,
             m.safe_deceleration,
             m.exclusive_m,
             m.mandatory_bias,
@@ -449,21 +312,10 @@ class IdmRandomTraffic(IdmMobilTraffic):
         )
         # Predictions are not limited by what this driver would brake itself.
         braking = torch.full_like(drivers.headway, -self.idm.min_acceleration)
-        return mobil_changes(
-            scene,
-            self.road,
-            drivers.idm(self.idm.min_gap_m, braking),
-            mobil,
-        )
+        return mobil_changes(scene, self.road, drivers.idm(self.idm.min_gap_m, braking), mobil)
 
-    def drive(
-        self,
-        scene: Scene,
-        target: Tensor,
-        memory: Memory,
-    ) -> Moved:
+    def drive(self, scene: Scene, target: Tensor, memory: Memory, step: Tensor) -> Moved:
         """The vehicles at t + 0.1 s, with each driver's delay and sway."""
-        v = scene.vehicles
         drivers = DriverParams.of(memory)
         idm = drivers.idm(self.idm.min_gap_m, drivers.strongest_braking)
         acceleration = self.following(scene, idm)
@@ -475,13 +327,7 @@ class IdmRandomTraffic(IdmMobilTraffic):
             index = self.delay_steps - drivers.delay.long()
             acceleration = recent.gather(-1, index[..., None])[..., 0]
             new_memory["past"] = recent[..., 1:].contiguous()
-        time_s = (memory["step"].to(drivers.sway.dtype) * self.dt)[:, None]
-        line = self.road.centre_of(target, v.y.dtype) + drivers.sway_m(time_s)
-        moved, steering = self._advanced(
-            v,
-            acceleration,
-            target,
-            line,
-            memory,
-        )
+        time_s = (step.to(drivers.sway.dtype) * self.dt)[:, None]
+        line = self.road.centre_of(target, scene.vehicles.y.dtype) + drivers.sway_m(time_s)
+        moved, steering = self.advanced(scene, acceleration, target, line, memory)
         return moved, {**steering, **new_memory}

@@ -6,7 +6,7 @@ Which one an episode gets follows from its number or key, so it is the same in e
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, cast
+from typing import Any, TypeAlias, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -28,13 +28,8 @@ from ganlane.traffic.base import (
     with_rows,
 )
 
-
-class RowsOfPart(NamedTuple):
-    """A part and its ``rows`` [R] of the batch."""
-
-    name: str
-    part: TrafficModule
-    rows: Tensor
+#: A part, its name before it, and its rows [R] of the batch.
+RowsOfPart: TypeAlias = tuple[str, TrafficModule, Tensor]
 
 
 class MixedTraffic(TrafficParts):
@@ -55,11 +50,7 @@ class MixedTraffic(TrafficParts):
         UserError: no parts, shares of other names, or a part that plays recordings.
     """
 
-    def __init__(
-        self,
-        parts: Mapping[str, TrafficModule],
-        shares: Mapping[str, int],
-    ) -> None:
+    def __init__(self, parts: Mapping[str, TrafficModule], shares: Mapping[str, int]) -> None:
         if not parts or set(parts) != set(shares) or min(shares.values()) < 1:
             raise UserError(
                 f"traffic.shares={dict(shares)}: expected a whole number of at least 1 for each of "
@@ -109,11 +100,8 @@ class MixedTraffic(TrafficParts):
         numbers = torch.arange(len(self.parts), device=episode.device)
         sizes = (part_of_row[:, None] == numbers).sum(0).tolist()
         rows_of_part = part_of_row.argsort(stable=True).split(sizes)
-        chosen = []
-        for (name, part), rows in zip(self.named_parts(), rows_of_part):
-            if len(rows):
-                chosen.append(RowsOfPart(name, part, rows))
-        return chosen
+        parts = zip(self.named_parts(), rows_of_part)
+        return [(name, part, rows) for (name, part), rows in parts if len(rows)]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``moved`` and ``traffic``, each part its rows."""
@@ -122,12 +110,9 @@ class MixedTraffic(TrafficParts):
         moved = vehicles
         new_memories = dict(memories.items())
         inputs = {name: tensordict.get(name) for name in (keys.SEED, keys.EPISODE, keys.STEP)}
-        inputs |= {
-            keys.EPISODE_KEY: key_of(tensordict, self.stream),
-            keys.VEHICLES: vehicles,
-        }
         # The steps of a decision share the tensor of the keys, which is made anew for the next.
-        key = inputs[keys.EPISODE_KEY]
+        key = key_of(tensordict, self.stream)
+        inputs |= {keys.EPISODE_KEY: key, keys.VEHICLES: vehicles}
         if self._rows is None or self._rows[0] is not key:
             self._rows = key, self.rows_of_parts(inputs[keys.EPISODE])
         for name, part, rows in self._rows[1]:
@@ -144,11 +129,7 @@ class MixedTraffic(TrafficParts):
             moved = with_rows(moved, rows, changed)
             new_memories[name] = with_rows(memory, rows, memory_of(output))
         tensordict.set(keys.MOVED, moved)
-        tensordict.set(
-            keys.TRAFFIC,
-            new_tensordict(new_memories, tensordict.batch_size[0]),
-        )
-        return tensordict
+        return tensordict.set(keys.TRAFFIC, new_tensordict(new_memories, len(key)))
 
     def enter(
         self, vehicles: Vehicles, key: Tensor, episode: Tensor
@@ -180,19 +161,14 @@ class MixedTraffic(TrafficParts):
         )
 
 
-def _zeros(
-    spec: Mapping[str, Any],
-    n: int,
-    device: torch.device,
-) -> TensorDict:
+def _zeros(spec: Mapping[str, Any], n: int, device: torch.device) -> TensorDict:
     """A memory of zeros by :meth:`TrafficModule.memory_spec`."""
     fields: dict[str, Any] = {}
     for name, entry in spec.items():
         if isinstance(entry, Mapping):
             fields[name] = _zeros(entry, n, device)
         else:
-            shape, dtype = entry
-            fields[name] = torch.zeros(shape, dtype=dtype, device=device)
+            fields[name] = torch.zeros(entry[0], dtype=entry[1], device=device)
     return new_tensordict(fields, n)
 
 
@@ -258,11 +234,6 @@ class BlindTraffic(TrafficModule):
         """As the model's."""
         return self.model.init_memory(vehicles, key)
 
-    def memory_spec(
-        self,
-        n: int,
-        m: int,
-        dtype: torch.dtype = torch.float32,
-    ) -> dict[str, Any]:
+    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
         """As the model's."""
         return self.model.memory_spec(n, m, dtype)

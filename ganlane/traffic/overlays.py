@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ganlane.settings.driving import IdmParameters, MobilParameters
+from ganlane.settings.driving import IdmParameters
 from ganlane.settings.generated import (
     CalibratedChanges,
     GuardParameters,
@@ -19,20 +19,10 @@ from ganlane.settings.generated import (
 )
 from ganlane.sim.idm import TABLE_V, acceleration_in
 from ganlane.sim.lane_ends import WaysOut, ways_out
-from ganlane.sim.mobil import (
-    TABLE_IV,
-    one_at_a_time,
-    safe_change,
-    without_ego,
-)
+from ganlane.sim.mobil import TABLE_IV, one_at_a_time, safe_change, without_ego
 from ganlane.sim.neighbours import Scene, leader, perceive
 from ganlane.sim.random import Purpose, Stream, normal
-from ganlane.sim.state import (
-    Road,
-    Vehicles,
-    lane_change_done,
-    spanned,
-)
+from ganlane.sim.state import Road, Vehicles, lane_change_done, spanned
 from ganlane.traffic.base import Memory, Moved, Overlay, uniforms
 
 #: Random numbers of a lane change: whether it starts, and to which side.
@@ -49,21 +39,7 @@ def literal_hazard(clock: Tensor, mean_steps: float) -> Tensor:
     return (clock / mean_steps).clamp(0.0, 1.0)
 
 
-def distance_hazard(
-    speed: Tensor,
-    changes_per_km: float,
-    dt: float,
-) -> Tensor:
-    """Probability per step of ``dt`` s of a change, at a constant rate per kilometre driven."""
-    # The probability of at least one event of a Poisson process within the step.
-    return 1.0 - torch.exp(-speed * (dt * changes_per_km / 1000.0))
-
-
-def random_side(
-    u: Tensor,
-    lane: Tensor,
-    lanes: int | Tensor,
-) -> Tensor:
+def random_side(u: Tensor, lane: Tensor, lanes: int | Tensor) -> Tensor:
     """A random side with a lane: -1 right, +1 left, 0 on a single-lane road.
 
     ``u`` uniform, ``lane`` int64.
@@ -71,19 +47,11 @@ def random_side(
     return _one_of(u, lane < lanes - 1, lane > 0)
 
 
-def _one_of(
-    u: Tensor,
-    left: Tensor,
-    right: Tensor,
-) -> Tensor:
+def _one_of(u: Tensor, left: Tensor, right: Tensor) -> Tensor:
     """A random one of the sides that are free."""
     # Drawn for everybody, used where there is a lane on both sides.
     both = torch.where(u < 0.5, 1, -1)
-    return torch.where(
-        left & right,
-        both,
-        torch.where(left, 1, torch.where(right, -1, 0)),
-    )
+    return torch.where(left & right, both, torch.where(left, 1, torch.where(right, -1, 0)))
 
 
 def side_on(ways: WaysOut, u: Tensor) -> Tensor:
@@ -116,12 +84,7 @@ class LiteralLaneChange(Overlay):
         self.changes = changes or LiteralChanges()
 
     def rewrite(
-        self,
-        vehicles: Vehicles,
-        moved: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
     ) -> Moved:
         """Start changes, and move current ones sideways at their own speed until they arrive.
 
@@ -130,19 +93,8 @@ class LiteralLaneChange(Overlay):
         """
         c = self.changes
         dtype = vehicles.x.dtype
-        u, u_side = uniforms(
-            vehicles,
-            key,
-            step,
-            *_CHANGE,
-        )
-        gauss = normal(
-            key,
-            step,
-            vehicles.x.shape[1],
-            [Purpose.LANE_CHANGE_SPEED],
-            dtype,
-        )[..., 0]
+        u, u_side = uniforms(vehicles, key, step, *_CHANGE)
+        gauss = normal(key, step, vehicles.x.shape[1], [Purpose.LANE_CHANGE_SPEED], dtype)[..., 0]
         # Blind: nobody looks for a gap, as in the paper.
         hazard = literal_hazard(memory["clock"].to(dtype), c.mean_steps)
         side = random_side(u_side, vehicles.target_lane, self.road.lanes)
@@ -202,39 +154,28 @@ class CalibratedLaneChange(Overlay):
         super().__init__(road, stream)
         self.changes = changes or CalibratedChanges()
         self.idm = idm
-        self._limits = MobilParameters(
-            safe_deceleration=self.changes.safe_deceleration,
-            exclusive_m=self.changes.exclusive_m,
-        )
+        self._limits = self.changes.limits()
 
-    def _wishes(
-        self,
-        vehicles: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
-    ) -> Tensor:
+    def _wishes(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Tensor:
         """The current wish, or a new one."""
-        u, u_side = uniforms(
-            vehicles,
-            key,
-            step,
-            *_CHANGE,
-        )
-        comes = u < distance_hazard(vehicles.speed, self.changes.per_km, self.dt)
+        u, u_side = uniforms(vehicles, key, step, *_CHANGE)
+        # At a constant rate per kilometre driven: the probability of at least one event of a
+        # Poisson process within the step.
+        comes = u < 1.0 - torch.exp(-vehicles.speed * (self.dt * self.changes.per_km / 1000.0))
         side = random_side(u_side, vehicles.target_lane, self.road.lanes)
+        if self.road.stretches:
+            ways = ways_out(vehicles, self.road, self._limits.mandatory_m)
+            side = side_on(ways, u_side)
         # Who is still changing does not wish for another change.
         free = lane_change_done(vehicles, self.road) & vehicles.valid
-        if not self.road.stretches:
-            new = torch.where(comes & free, side, 0)
-            return without_ego(torch.where(memory["wish"] != 0, memory["wish"], new))
-        # Where lanes end, the side that one has to go to comes before what one would like.
-        ways = ways_out(vehicles, self.road, self._limits.mandatory_m)
-        new = torch.where(comes & free, side_on(ways, u_side), 0)
+        new = torch.where(comes & free, side, 0)
         wish = torch.where(memory["wish"] != 0, memory["wish"], new)
-        wish = torch.where(free & (ways.side != 0), ways.side, wish)
-        there = torch.where(wish > 0, ways.left, ways.right)
-        return without_ego(torch.where(there, wish, 0))
+        if self.road.stretches:
+            # Where lanes end, the side that one has to go to comes before what one would like.
+            wish = torch.where(free & (ways.side != 0), ways.side, wish)
+            there = torch.where(wish > 0, ways.left, ways.right)
+            wish = torch.where(there, wish, 0)
+        return without_ego(wish)
 
     def _contested(self, scene: Scene, lane: Tensor) -> Tensor:
         """Whether a near vehicle other than the ego is already moving into ``lane`` [N, M]."""
@@ -247,47 +188,24 @@ class CalibratedLaneChange(Overlay):
         return (near & changing[:, None, :] & (target[:, None, :] == lane[:, :, None])).any(-1)
 
     def rewrite(
-        self,
-        vehicles: Vehicles,
-        moved: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
     ) -> Moved:
         """Set the target lane of those whose wish finds a gap."""
-        wish = self._wishes(
-            vehicles,
-            memory,
-            key,
-            step,
-        )
+        wish = self._wishes(vehicles, memory, key, step)
         scene = perceive(vehicles, self.road)
         # As floats, since the lanes of an absent vehicle are infinite.
         lane = (vehicles.target_lane + wish).to(vehicles.x.dtype)
         # Neither the driver nor its new follower has to brake harder than the limit, by IDM.
-        safe = safe_change(
-            scene,
-            lane,
-            self.idm,
-            self._limits,
-        )
+        safe = safe_change(scene, lane, self.idm, self._limits)
         wanted = torch.where(safe & ~self._contested(scene, lane), wish, 0)
         # Two that would start into the same gap at once cannot see each other's intention.
-        starts = one_at_a_time(
-            scene,
-            wanted,
-            self.idm,
-            self._limits,
-        )
+        starts = one_at_a_time(scene, wanted, self.idm, self._limits)
         waited = torch.where(wish != 0, memory["waited"] + 1, 0)
         # Otherwise wishes pile up in dense traffic and all come true when it thins out.
         gives_up = waited >= round(self.changes.patience_s / self.dt)
         rest = torch.where((starts != 0) | gives_up, 0, wish)
         moved = moved.with_(target_lane=vehicles.target_lane + starts)
-        return moved, {
-            "wish": rest,
-            "waited": torch.where(rest == 0, 0, waited),
-        }
+        return moved, {"wish": rest, "waited": torch.where(rest == 0, 0, waited)}
 
 
 def _accelerated(
@@ -303,11 +221,7 @@ def _accelerated(
         speed=torch.where(who, speed, moved.speed),
         # As realised, not as asked for: braking ends at a standstill.
         acceleration=torch.where(who, (speed - vehicles.speed) / dt, moved.acceleration),
-        x=torch.where(
-            who,
-            vehicles.x + 0.5 * (vehicles.speed + speed) * dt,
-            moved.x,
-        ),
+        x=torch.where(who, vehicles.x + 0.5 * (vehicles.speed + speed) * dt, moved.x),
     )
 
 
@@ -334,40 +248,21 @@ class AccelerationOverlay(Overlay):
         self.sudden = sudden or SuddenAccelerations()
 
     def rewrite(
-        self,
-        vehicles: Vehicles,
-        moved: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
     ) -> Moved:
         """Replace speed and position along the road during a sudden acceleration."""
         s = self.sudden
         m = vehicles.x.shape[1]
         dtype = vehicles.x.dtype
-        (u,) = uniforms(
-            vehicles,
-            key,
-            step,
-            Purpose.ACCELERATION,
-        )
+        (u,) = uniforms(vehicles, key, step, Purpose.ACCELERATION)
         gauss = normal(key, step, m, [Purpose.ACCELERATION], dtype)[..., 0]
         # A constant hazard while none is going on.
         # For short steps dt / every_s is the probability within one.
         starts = (memory["left"] == 0) & (u < self.dt / s.every_s) & vehicles.valid
         acceleration = torch.where(starts, s.mean + s.sd * gauss, memory["acceleration"])
         left = torch.where(starts, round(s.lasts_s / self.dt), memory["left"])
-        moved = _accelerated(
-            vehicles,
-            moved,
-            left > 0,
-            acceleration,
-            self.dt,
-        )
-        return moved, {
-            "acceleration": acceleration,
-            "left": (left - 1).clamp_min(0),
-        }
+        moved = _accelerated(vehicles, moved, left > 0, acceleration, self.dt)
+        return moved, {"acceleration": acceleration, "left": (left - 1).clamp_min(0)}
 
 
 class Guard(Overlay):
@@ -399,18 +294,9 @@ class Guard(Overlay):
         # What the chain made of it, whichever part moved the vehicle.
         wanted = (moved.speed - vehicles.speed) / self.dt
         # Where the bounds cross, the upper one holds: keeping off the leader comes first.
-        acceleration = torch.minimum(
-            torch.maximum(wanted, torch.minimum(lowest, highest)),
-            highest,
-        )
-        return _accelerated(
-            vehicles,
-            moved,
-            # Who is within the bounds moves bit for bit as the chain says.
-            acceleration != wanted,
-            acceleration,
-            self.dt,
-        )
+        acceleration = wanted.clamp(lowest, highest)
+        # Who is within the bounds moves bit for bit as the chain says.
+        return _accelerated(vehicles, moved, acceleration != wanted, acceleration, self.dt)
 
     def across(self, vehicles: Vehicles, moved: Vehicles) -> Vehicles:
         """``moved`` pulled towards its lane's centre, and kept inside the edges of the road.
@@ -428,25 +314,17 @@ class Guard(Overlay):
         half = 0.5 * moved.width
         left = road.left_edge_m() - g.edge_margin_m
         right = road.right_edge_m() + g.edge_margin_m
-        y = torch.minimum(torch.maximum(y, right + half), left - half)
+        y = y.clamp(right + half, left - half)
         # A standing vehicle has no direction of its own, so the divisor is bounded.
         heading = torch.atan((y - vehicles.y) / ((moved.x - vehicles.x).clamp_min(0.1)))
         heading = torch.where(y == moved.y, moved.heading, heading)
         # A turned body is wider by half its length times the sine, which the angle exceeds.
         room = torch.minimum(left - y, y - right) - half
         steepest = (room / (0.5 * moved.length)).clamp(0.0, g.steepest_rad)
-        return moved.with_(
-            y=y,
-            heading=torch.minimum(torch.maximum(heading, -steepest), steepest),
-        )
+        return moved.with_(y=y, heading=heading.clamp(-steepest, steepest))
 
     def rewrite(
-        self,
-        vehicles: Vehicles,
-        moved: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
     ) -> Moved:
         """Along the road, then across it."""
         return self.across(vehicles, self.along(vehicles, moved)), memory

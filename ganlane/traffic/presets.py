@@ -11,11 +11,7 @@ from ganlane.generator.checkpoint import with_weights
 from ganlane.generator.human import HumanPolicy
 from ganlane.generator.networks import Generator
 from ganlane.native.drivers import calibrated_drivers, gan_drivers, human_drivers
-from ganlane.settings.driving import (
-    DriverFaults,
-    IdmParameters,
-    MobilParameters,
-)
+from ganlane.settings.driving import DriverFaults, IdmParameters, MobilParameters
 from ganlane.settings.traffic import (
     GanCalibratedTrafficConfig,
     GanTrafficConfig,
@@ -36,10 +32,7 @@ from ganlane.traffic.overlays import (
     Guard,
     LiteralLaneChange,
 )
-from ganlane.traffic.social_gan import (
-    AnchoredGanTraffic,
-    SocialGanTraffic,
-)
+from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
 
 
 def gan_traffic(

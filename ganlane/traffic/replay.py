@@ -122,10 +122,7 @@ def _starts(samples: pl.DataFrame, least: int) -> tuple[pl.DataFrame, Tensor]:
     there = (
         there.with_columns(distance=distance)
         .sort("scene", "frame", "distance", "index")
-        .with_columns(
-            start=pl.struct(moment).rle_id(),
-            rank=pl.int_range(pl.len()).over(moment),
-        )
+        .with_columns(start=pl.struct(moment).rle_id(), rank=pl.int_range(pl.len()).over(moment))
         .filter(pl.col("rank") < MOST_VEHICLES)
     )
     starts = there.filter(pl.col("rank") == 0)
@@ -200,10 +197,7 @@ class ReplayTraffic(TrafficModule):
         scene_names = tuple(names.tolist())
         counts = scene_lane_counts(frame)
         lanes = torch.tensor([counts[name] for name in scene_names])
-        width_m = torch.tensor(
-            [widths[name] for name in scene_names],
-            dtype=torch.float64,
-        )
+        width_m = torch.tensor([widths[name] for name in scene_names], dtype=torch.float64)
         # For sizes only; the road of a row is road_of's.
         super().__init__(Road(int(lanes.max()), float(width_m.mean())), stream)
         self.scene_names = scene_names
@@ -267,11 +261,7 @@ class ReplayTraffic(TrafficModule):
 
     def _starts_of(self, seed: int, episodes: Sequence[int]) -> Tensor:
         """Number of the start of each of ``episodes``."""
-        numbers = torch.tensor(
-            list(episodes),
-            dtype=torch.int64,
-            device=self.scene.device,
-        )
+        numbers = torch.tensor(list(episodes), dtype=torch.int64, device=self.scene.device)
         return self.start_of(episode_key(self.stream, torch.full_like(numbers, seed), numbers))
 
     def steps_of(self, key: Tensor) -> Tensor:
@@ -286,13 +276,7 @@ class ReplayTraffic(TrafficModule):
         scene = self.scene_of(key)[:, None]
         return Road(self.lanes[scene], self.lane_width_m[scene].to(dtype))
 
-    def recorded(
-        self,
-        key: Tensor,
-        step: Tensor,
-        vehicles: int,
-        dtype: torch.dtype,
-    ) -> Vehicles:
+    def recorded(self, key: Tensor, step: Tensor, vehicles: int, dtype: torch.dtype) -> Vehicles:
         """The vehicles [N, ``vehicles``] as recorded ``step`` [N] steps after the start; x = 0 is
         the ego's start.
 
@@ -327,27 +311,11 @@ class ReplayTraffic(TrafficModule):
         ego_desired_speed_mps: float = 25.0,
     ) -> RecordedScenes:
         """The initial scenes of this traffic."""
-        return RecordedScenes(
-            self,
-            vehicles,
-            ego_visibility,
-            ego_desired_speed_mps,
-        )
+        return RecordedScenes(self, vehicles, ego_visibility, ego_desired_speed_mps)
 
-    def move(
-        self,
-        vehicles: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
-    ) -> Moved:
+    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """The next recorded frame."""
-        moved = self.recorded(
-            key,
-            step + 1,
-            vehicles.x.shape[1],
-            vehicles.x.dtype,
-        )
+        moved = self.recorded(key, step + 1, vehicles.x.shape[1], vehicles.x.dtype)
         # The ego is driven by the environment, not by the recording.
         return moved.with_first(vehicles.at(EGO_INDEX)), memory
 
@@ -378,19 +346,10 @@ class RecordedScenes:
 
         The ego at index 0 and x = 0.
         """
-        scene = self.traffic.recorded(
-            key,
-            torch.zeros_like(key),
-            self.vehicles,
-            dtype,
-        )
+        scene = self.traffic.recorded(key, torch.zeros_like(key), self.vehicles, dtype)
         is_ego = torch.arange(self.vehicles, device=key.device) == EGO_INDEX
         return scene.with_(
-            desired_speed=torch.where(
-                is_ego,
-                self.ego_desired_speed_mps,
-                scene.desired_speed,
-            ),
+            desired_speed=torch.where(is_ego, self.ego_desired_speed_mps, scene.desired_speed),
             visibility=torch.where(is_ego, int(self.ego_visibility), scene.visibility),
         )
 

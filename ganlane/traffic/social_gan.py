@@ -29,13 +29,7 @@ from ganlane.settings.driving import Visibility
 from ganlane.settings.generator import EXTRA_INPUTS
 from ganlane.sim.random import Purpose, Stream, normal
 from ganlane.sim.state import Road, Vehicles
-from ganlane.traffic.base import (
-    Memory,
-    MemoryFields,
-    Moved,
-    TrafficModule,
-    uniforms,
-)
+from ganlane.traffic.base import Memory, MemoryFields, Moved, TrafficModule, in_dtype, uniforms
 
 #: Latent dimensions that :class:`ganlane.sim.random.Purpose` has room for.
 _MOST_NOISE = int(Purpose.RECYCLE) - int(Purpose.NOISE)
@@ -87,63 +81,30 @@ class GeneratedTraffic(TrafficModule):
         self.motions = [f"motion_{index}" for index in range(sizes.observed - 1)]
         # A purpose per latent dimension keeps them independent.
         self.purposes = [Purpose.NOISE + index for index in range(sizes.noise)]
-        motions: MemoryFields = {name: ((4 * sizes.hidden,), None) for name in self.motions}
-        self.memory_fields = {
-            **motions,
-            "displacement": ((2,), None),
-            "noise": ((sizes.noise,), None),
-        }
+        motions: MemoryFields = dict.fromkeys(self.motions, ((4 * sizes.hidden,), None))
+        latent = {"displacement": ((2,), None), "noise": ((sizes.noise,), None)}
+        self.memory_fields = {**motions, **latent}
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """Straight driving at the present speed, and latent vectors of this episode."""
         # Metres per step along the lane, none across.
         along = vehicles.speed * PHYSICS_STEP_S
         displacement = torch.stack([along, torch.zeros_like(along)], dim=-1)
-        history = start(self.network(vehicles.x.dtype), displacement)
-        noise = normal(
-            key,
-            # Step -1: before the first step of the episode.
-            -1,
-            vehicles.x.shape[1],
-            self.purposes,
-            vehicles.x.dtype,
-        )
+        history = start(in_dtype(self.generator, vehicles.x.dtype), displacement)
+        # Step -1: before the first step of the episode.
+        noise = normal(key, -1, along.shape[1], self.purposes, along.dtype)
         return {**self.remember(history), "noise": noise}
-
-    def network(self, dtype: torch.dtype) -> Generator:
-        """The generator in the run's float type."""
-        # Weights are stored in float32, a run may be in float64; converted once.
-        if self.generator.encoder.recurrent.dtype != dtype:
-            self.generator.to(dtype)
-        return self.generator
 
     def remember(self, history: History) -> Memory:
         """The history as memory; motions move on by name, without copies."""
-        return {
-            **dict(zip(self.motions, history.motions)),
-            "displacement": history.displacement,
-        }
+        return {**dict(zip(self.motions, history.motions)), "displacement": history.displacement}
 
-    def before(
-        self,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
-    ) -> tuple[History, Tensor]:
+    def before(self, memory: Memory, key: Tensor, step: Tensor) -> tuple[History, Tensor]:
         """The drivers' history from the memory, and the latent vectors [N, M, Z] of this step."""
         # An autoregressive process: the latent vector keeps its variance and forgets slowly.
         noise = memory["noise"]
-        fresh = normal(
-            key,
-            step,
-            noise.shape[1],
-            self.purposes,
-            noise.dtype,
-        )
-        history = History(
-            tuple(memory[name] for name in self.motions),
-            memory["displacement"],
-        )
+        fresh = normal(key, step, noise.shape[1], self.purposes, noise.dtype)
+        history = History(tuple(memory[name] for name in self.motions), memory["displacement"])
         return history, wander(noise, fresh, self.noise_period_s)
 
 
@@ -156,15 +117,9 @@ class SocialGanTraffic(GeneratedTraffic):
     """
 
     @torch.no_grad()
-    def move(
-        self,
-        vehicles: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
-    ) -> Moved:
+    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """Predict, and drive the first displacement."""
-        network = self.network(vehicles.x.dtype)
+        network = in_dtype(self.generator, vehicles.x.dtype)
         history, noise = self.before(memory, key, step)
         # Scaled for the network alone: the memory keeps unit variance.
         moved, history = paper_step(network, vehicles, history, self.noise_scale * noise)
@@ -194,63 +149,30 @@ class AnchoredGanTraffic(GeneratedTraffic):
         headway_quantiles_s: tuple[float, ...] = HEADWAY_QUANTILES_S,
         anchor: AnchorParameters = ANCHOR,
     ) -> None:
-        super().__init__(
-            generator,
-            road,
-            stream,
-            noise_period_s,
-            noise_scale,
-        )
+        super().__init__(generator, road, stream, noise_period_s, noise_scale)
         self.headway_quantiles_s = headway_quantiles_s
         self.anchor = anchor
-        self.memory_fields = {
-            **self.memory_fields,
-            "residual_mean": ((2,), None),
-            "headway": ((), None),
-        }
+        further = {"residual_mean": ((2,), None), "headway": ((), None)}
+        self.memory_fields = {**self.memory_fields, **further}
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """See :class:`GeneratedTraffic`; a headway for every driver, residual mean 0."""
         memory = super().fresh_memory(vehicles, key)
-        (u,) = uniforms(
-            vehicles,
-            key,
-            -1,
-            Purpose.TRAIT_HEADWAY,
-        )
+        (u,) = uniforms(vehicles, key, -1, Purpose.TRAIT_HEADWAY)
         # Headways as recorded, so that drivers differ as recorded ones do.
         memory["headway"] = headway_from_uniform(u, self.headway_quantiles_s)
         memory["residual_mean"] = torch.zeros_like(memory["displacement"])
         return memory
 
     @torch.no_grad()
-    def move(
-        self,
-        vehicles: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
-    ) -> Moved:
+    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """One :func:`~ganlane.generator.closed_loop.anchored_step`."""
-        network = self.network(vehicles.x.dtype)
+        network = in_dtype(self.generator, vehicles.x.dtype)
         history, noise = self.before(memory, key, step)
         # The washout's mean and the headway belong to the driver, as the history does.
         driver = DriverMemory(history, memory["residual_mean"], memory["headway"])
-        moved, driver = anchored_step(
-            network,
-            vehicles,
-            self.road,
-            driver,
-            # Scaled for the network alone: the memory keeps unit variance.
-            self.noise_scale * noise,
-            self.anchor,
-        )
-        new_memory = {
-            "noise": noise,
-            "residual_mean": driver.mean,
-            "headway": driver.headway,
-        }
-        return moved, {
-            **self.remember(driver.history),
-            **new_memory,
-        }
+        # Scaled for the network alone: the memory keeps unit variance.
+        latent = self.noise_scale * noise
+        moved, driver = anchored_step(network, vehicles, self.road, driver, latent, self.anchor)
+        new_memory = {"noise": noise, "residual_mean": driver.mean, "headway": driver.headway}
+        return moved, {**self.remember(driver.history), **new_memory}

@@ -73,7 +73,7 @@ class OneChange(IdmTraffic):
     def move(self, vehicles, memory, key, step):
         target = vehicles.target_lane
         changed = torch.where((step == 10)[:, None], target + 1, target)
-        return self.drive(perceive(vehicles, self.road), changed, memory)
+        return self.drive(perceive(vehicles, self.road), changed, memory, step)
 
 
 def play(

@@ -229,13 +229,8 @@ class Driver(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action``."""
-        return tensordict.set(
-            keys.ACTION,
-            self.act(
-                Vehicles.of(tensordict.get(keys.VEHICLES)),
-                tensordict,
-            ),
-        )
+        vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
+        return tensordict.set(keys.ACTION, self.act(vehicles, tensordict))
 
 
 def legal_actions(

@@ -1,30 +1,26 @@
-"""The losses, from TorchRL's, and a whole update of Rainbow as one compiled function.
+"""The loss of a batch, and a whole update of Rainbow as one compiled function.
 
-:class:`LeanDistributionalLoss` equals :class:`torchrl.objectives.DistributionalDQNLoss` (Bellemare
-et al. 2017, double) to 1e-6 and takes half of its time, by a lean forward on plain tensors;
-:class:`LeanDQNLoss` does the same for the plain DQN loss. Both keep TorchRL's parameter containers,
-so a TorchRL user finds ``value_network_params`` and the target where expected.
+:func:`loss_of` equals TorchRL's :class:`torchrl.objectives.DistributionalDQNLoss` (Bellemare et al.
+2017, double) and :class:`torchrl.objectives.DQNLoss` to 1e-6, on plain tensors and with a mask of
+the next actions.
 
-:func:`update` is what :meth:`ganlane.agents.rainbow.Rainbow.update` does with the first of them,
-autograd, ``clip_grad_norm_`` and Adam, here without any of these, for the agent with all six
-components: noise is part of the weights, the backward pass is written out, and the duel is folded
-into the head, since ``Q_a = V + A_a - mean(A)`` is linear in its weights. :class:`UpdateGraph`
-compiles it to one graph. Equal to the other way up to rounding (tests/agents/test_agents_loss.py),
-and faster on a CPU (docs/speed.md).
+:func:`update` is what :meth:`ganlane.agents.rainbow.Rainbow.update` does with it, autograd,
+``clip_grad_norm_`` and Adam, here without any of these, for the agent with all six components:
+noise is part of the weights, the backward pass is written out, and the duel is folded into the
+head, since ``Q_a = V + A_a - mean(A)`` is linear in its weights. :class:`UpdateGraph` compiles it
+to one graph. Equal to the other way up to rounding (tests/agents/test_agents_loss.py), and faster
+on a CPU (docs/speed.md).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from copy import deepcopy
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
-from torchrl.envs.utils import ExplorationType
-from torchrl.modules import DistributionalQValueActor, QValueActor
-from torchrl.objectives import DistributionalDQNLoss, DQNLoss
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn.functional import smooth_l1_loss
 
 from ganlane import keys
 from ganlane.agents.network import QNetwork, Weights, allowed_values, noise_of
@@ -39,174 +35,56 @@ _BETA_1 = 0.9
 _BETA_2 = 0.999
 
 
-class _WithTarget:
-    """Mixin: a second module with the loss's target parameters, whose noise can be drawn anew."""
-
-    target_network: QNetwork
-    network: QNetwork
-
-    def _attach(self, network: QNetwork, actor: nn.Module) -> None:
-        # update_target does it: TorchRL need not warn that no updater is registered
-        self._has_update_associated["value_network"] = True  # type: ignore[attr-defined]
-        actor_copy = deepcopy(actor)
-        self.target_value_network_params.to_module(actor_copy)  # type: ignore[attr-defined]
-        networks = [module for module in actor_copy.modules() if isinstance(module, QNetwork)]
-        # in __dict__, as TorchRL does with the online module, so that no parameter is listed twice
-        self.__dict__.update(network=network, target_network=networks[0])
-        # losses run deterministic by default; without noise the sigmas would never get a gradient.
-        self.deterministic_sampling_mode = ExplorationType.RANDOM
-
-    @torch.no_grad()
-    def update_target(self) -> None:
-        """Copy the online parameters to the target network."""
-        # Noise is not copied: it is drawn anew before each use.
-        for target, online in zip(
-            self.target_network.parameters(),
-            self.network.parameters(),
-        ):
-            target.copy_(online)
-
-
-class LeanDistributionalLoss(_WithTarget, DistributionalDQNLoss):
-    """Categorical (C51) loss, double or not.
-
-    Args:
-        network: distributional Q-network.
-        gamma: discount per decision; a transition over k decisions is discounted by ``gamma ** k``.
-        double: choose the next action by the online network rather than by the target network.
-        kl_priority: ``td_error`` is the Kullback-Leibler divergence (Hessel et al. 2018) rather
-            than the cross-entropy, which is larger by the entropy of the target and is what TorchRL
-            uses.
+class Loss(NamedTuple):
+    """Of a batch: ``loss`` and ``priority`` [B]; 0-dim ``mean_q``, the mean value of the best next
+    actions, and ``clamped_fraction``, the mass of the targets outside the support.
     """
 
-    def __init__(
-        self,
-        network: QNetwork,
-        gamma: float,
-        double: bool = True,
-        kl_priority: bool = True,
-    ) -> None:
-        # TorchRL's actor gives its loss the parameters and keys; the forward below does not call it
-        actor = DistributionalQValueActor(
-            network,
-            network.support,
-            in_keys=["observation"],
-            action_space="categorical",
-            make_log_softmax=False,
-        )
-        super().__init__(
-            actor,
-            gamma=gamma,
-            delay_value=True,
-            reduction="none",
-            use_prioritized_weights=False,
-        )
-        self.double = double
-        self.kl_priority = kl_priority
-        self._attach(network, actor)
+    loss: Tensor
+    priority: Tensor
+    mean_q: Tensor
+    clamped_fraction: Tensor
 
-    def forward(self, batch: TensorDictBase) -> TensorDict:
-        """Cross-entropy per transition.
 
-        Reads ``observation`` [B, D], ``action`` [B], ``steps_to_next_obs`` [B, 1] and ``next``'s
-        ``observation``, ``reward`` and ``terminated`` [B, 1]; where ``next`` has ``action_mask``
-        [B, A], the best next action is one that it allows. Writes ``td_error`` [B, 1]. Returns
-        ``loss`` [B] and, 0-dim, ``clamped_fraction`` (mass of the targets outside the support) and
-        ``mean_q`` (of the best next action).
-        """
-        weights = self.network.weights()
-        with torch.no_grad():
-            # the same noise for both observations: the weights are composed once
-            target, clamped, mean_q = self._target(batch, weights)
-        logits = self.network.logits(batch.get("observation"), weights)
-        log_p = pick(logits, batch.get("action")).log_softmax(-1)
-        # The entropy of the target, the rest of the KL divergence, has no gradient.
-        loss = -(target * log_p).sum(-1)
-        priority = loss.detach()
-        # the entropy of the target is not the network's fault
-        if self.kl_priority:
-            priority = (priority - torch.special.entr(target).sum(-1)).clamp_min(0.0)
-        batch.set("td_error", priority[:, None])
-        return TensorDict(
-            {
-                "loss": loss,
-                "clamped_fraction": clamped,
-                "mean_q": mean_q,
-            }
-        )
+def loss_of(
+    network: QNetwork, target_network: QNetwork, batch: TensorDictBase, config: RainbowConfig
+) -> Loss:
+    """Cross-entropy (C51) per transition; Huber loss where ``config`` is not distributional.
 
-    def _target(self, batch: TensorDictBase, weights: Weights) -> tuple[Tensor, Tensor, Tensor]:
-        """The Bellman targets: distribution [B, atoms], clamped mass, mean best value."""
-        following = batch.get(("next", "observation"))
-        support = self.network.support
-        target_logits = self.target_network.logits(following)
+    The priority is the Kullback-Leibler divergence (Hessel et al. 2018), or without
+    ``kl_priority`` the cross-entropy, which is larger by the entropy of the target and is what
+    TorchRL uses; of the Huber loss it is |error|.
+
+    ``batch`` has ``observation`` [B, D], ``action`` [B], ``steps_to_next_obs`` [B, 1] and
+    ``next``'s ``observation``, ``reward`` and ``terminated`` [B, 1]; where ``next`` has
+    ``action_mask`` [B, A], the best next action is one that it allows.
+    """
+    # the same noise for both observations: the weights are composed once
+    weights = network.weights()
+    following = batch.get(("next", "observation"))
+    with torch.no_grad():
+        target_logits = target_network.logits(following)
         # double Q-learning: one network chooses, the other one values
-        choosing = self.network.logits(following, weights) if self.double else target_logits
+        choosing = network.logits(following, weights) if config.double else target_logits
         mask = batch.get(("next", keys.ACTION_MASK), None)
-        best, action = allowed_values(self.network.expected(choosing), mask).max(-1)
-        returns = bellman(batch, self.gamma, support)
-        probabilities = pick(target_logits, action).softmax(-1)
-        target, clamped = projected(returns, probabilities, support)
-        return target, clamped, best.mean()
-
-
-class LeanDQNLoss(_WithTarget, DQNLoss):
-    """Plain DQN loss (Huber), double or not: Rainbow with ``distributional=False``."""
-
-    def __init__(
-        self,
-        network: QNetwork,
-        gamma: float,
-        double: bool = True,
-    ) -> None:
-        actor = QValueActor(
-            network,
-            in_keys=["observation"],
-            action_space="categorical",
-        )
-        super().__init__(
-            actor,
-            loss_function="smooth_l1",
-            delay_value=True,
-            double_dqn=double,
-            action_space="categorical",
-            reduction="none",
-            use_prioritized_weights=False,
-        )
-        # for TorchRL's own forward; the one below takes self.discount
-        self.make_value_estimator(gamma=gamma)
-        self.discount = gamma
-        self._attach(network, actor)
-
-    def forward(self, batch: TensorDictBase) -> TensorDict:
-        """Huber loss per transition.
-
-        Keys as in :meth:`LeanDistributionalLoss.forward`, ``td_error`` is |error|.
-        """
-        following = batch.get(("next", "observation"))
-        with torch.no_grad():
-            target_values = self.target_network(following)
-            values = self.network(following) if self.double_dqn else target_values
-            mask = batch.get(("next", keys.ACTION_MASK), None)
-            best, action = allowed_values(values, mask).max(-1)
-            target = bellman(
-                batch,
-                self.discount,
-                target_values.gather(-1, action[:, None]),
-            )
-        values = self.network(batch.get("observation"))
-        value = values.gather(-1, batch.get("action")[:, None])
-        loss = nn.functional.smooth_l1_loss(value, target, reduction="none").squeeze(-1)
-        batch.set("td_error", (target - value.detach()).abs())
-        # without a support nothing is clamped
-        clamped = torch.zeros((), device=loss.device)
-        return TensorDict(
-            {
-                "loss": loss,
-                "clamped_fraction": clamped,
-                "mean_q": best.mean(),
-            }
-        )
+        best, next_action = allowed_values(network.expected(choosing), mask).max(-1)
+    mean_q = best.mean()
+    following_logits = pick(target_logits, next_action)
+    logits = pick(network.logits(batch.get("observation"), weights), batch.get("action"))
+    if not config.distributional:
+        # a single number in place of a distribution; nothing is clamped without a support
+        target = bellman(batch, config.gamma, following_logits)
+        loss = smooth_l1_loss(logits, target, reduction="none").squeeze(-1)
+        error = (target - logits.detach()).abs().squeeze(-1)
+        return Loss(loss, error, mean_q, torch.zeros_like(mean_q))
+    returns = bellman(batch, config.gamma, network.support)
+    wanted, clamped = project(returns, following_logits.softmax(-1), network.support)
+    loss = -(wanted * logits.log_softmax(-1)).sum(-1)
+    priority = loss.detach()
+    # the entropy of the target, the rest of the KL divergence, is not the network's fault
+    if config.kl_priority:
+        priority = (priority - torch.special.entr(wanted).sum(-1)).clamp_min(0.0)
+    return Loss(loss, priority, mean_q, clamped)
 
 
 def bellman(
@@ -228,8 +106,10 @@ def project(
     values: Tensor,
     probabilities: Tensor,
     support: Tensor,
-) -> Tensor:
+) -> tuple[Tensor, Tensor]:
     """Project the distribution with ``probabilities`` at ``values``, [B, K], onto ``support`` [K].
+
+    Returns it, and the mass that is clamped, a mean over the batch, 0-dim.
 
     Values outside the support are clamped to its ends. Each mass is split between its two
     neighbours in proportion to the nearness of the other (Bellemare et al. 2017, equation 7); the
@@ -246,18 +126,10 @@ def project(
     index = lower.long()
     projected = torch.zeros_like(probabilities)
     projected.scatter_add_(1, index, probabilities - share)
-    return projected.scatter_add_(1, index + 1, share)
-
-
-def projected(
-    values: Tensor,
-    probabilities: Tensor,
-    support: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """What :func:`project` gives, and the mass that it clamps, a mean over the batch, 0-dim."""
+    projected.scatter_add_(1, index + 1, share)
     # counted before the clamping, weighted by probability
-    outside = (values < support[0]) | (values > support[-1])
-    return project(values, probabilities, support), (probabilities * outside).sum(-1).mean()
+    outside = (values < low) | (values > high)
+    return projected, (probabilities * outside).sum(-1).mean()
 
 
 def pick(rows: Tensor, action: Tensor) -> Tensor:
@@ -301,27 +173,23 @@ class Settings(NamedTuple):
     adam_eps: float
 
 
-def composed(parameters: Sequence[Tensor], noise: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Weight [O, I], bias [O] of a noisy layer (Fortunato et al. 2017), ``noise`` [I] and [O]."""
-    # factorised noise: the outer product of one vector per side
-    weight_mu, weight_sigma, bias_mu, bias_sigma = parameters
-    inputs, outputs = noise
-    return weight_mu + weight_sigma * torch.outer(outputs, inputs), bias_mu + bias_sigma * outputs
-
-
 def composed_layers(
     parameters: list[Tensor],
     noise: Sequence[Sequence[Tensor]],
     actions: int,
 ) -> Weights:
-    """Weight and bias of every layer of a network, the duel folded into the last."""
-    # Four parameters for each layer, in the order of _PARAMETERS.
-    layers = [composed(parameters[4 * i : 4 * i + 4], drawn) for i, drawn in enumerate(noise)]
-    weight, bias = layers[-1]
-    return [
-        *layers[:-1],
-        (folded(weight, actions), folded(bias, actions)),
-    ]
+    """Weight and bias of every layer of a network (Fortunato et al. 2017), the duel folded into the
+    last.
+    """
+    layers = []
+    for i, (inputs, outputs) in enumerate(noise):
+        # four parameters for each layer, in the order of _PARAMETERS
+        weight_mu, weight_sigma, bias_mu, bias_sigma = parameters[4 * i : 4 * i + 4]
+        # factorised noise: the outer product of one vector per side
+        weight = weight_mu + weight_sigma * torch.outer(outputs, inputs)
+        layers.append((weight, bias_mu + bias_sigma * outputs))
+    weight, bias = layers.pop()
+    return [*layers, (folded(weight, actions), folded(bias, actions))]
 
 
 def folded(part: Tensor, actions: int) -> Tensor:
@@ -431,7 +299,7 @@ def update(
     target_logits = forward(target_layers, batch.following)[-1].unflatten(-1, (actions, atoms))
     discount = torch.pow(settings.gamma, batch.steps)
     values = batch.reward[:, None] + (batch.alive * discount)[:, None] * support
-    wanted, clamped = projected(values, pick(target_logits, chosen).softmax(-1), support)
+    wanted, clamped = project(values, pick(target_logits, chosen).softmax(-1), support)
     # the loss is the cross-entropy, the priority its excess over the target's entropy
     log_p = pick(logits[:rows], batch.action).log_softmax(-1)
     loss = -(wanted * log_p).sum(-1)
@@ -478,13 +346,13 @@ class UpdateGraph:
     def __init__(
         self,
         network: QNetwork,
-        loss: LeanDistributionalLoss,
+        target: QNetwork,
         optimizer: torch.optim.Adam,
         config: RainbowConfig,
         compile: bool = True,
     ) -> None:
         self.network = network
-        self.target = loss.target_network
+        self.target = target
         self.optimizer = optimizer
         (group,) = optimizer.param_groups
         self.settings = Settings(
@@ -498,7 +366,7 @@ class UpdateGraph:
 
     @torch.no_grad()
     def __call__(self, batch: TensorDictBase, generator: torch.Generator) -> Learned:
-        """One update on ``batch`` (keys as in :class:`LeanDistributionalLoss`).
+        """One update on ``batch`` (keys as in :func:`loss_of`).
 
         Noise from ``generator``.
         """

@@ -88,19 +88,9 @@ class NetworkConfig:
         expected_names = ("actions", "observation_size", *SHAPE)
         if description.keys() != {*expected_names}:
             raise UserError(f"expected the entries {', '.join(expected_names)}")
-        # values come from a file, so their types are checked here
-        options = {name: description[name] for name in SHAPE}
-        for name, value in options.items():
-            expected: Any = type(getattr(RainbowConfig, name))
-            # JSON has lists for tuples, and whole numbers for some floats.
-            accepted = {
-                tuple: (list, tuple),
-                float: (int, float),
-            }.get(expected, expected)
-            if not isinstance(value, accepted):
-                raise UserError(f"network {name}={value!r}: expected a {expected.__name__}.")
-        sizes = (description["observation_size"], description["actions"])
-        return cls(RainbowConfig(**options), *sizes)
+        # the record checks the types of the values
+        options = RainbowConfig(**{name: description[name] for name in SHAPE})
+        return cls(options, description["observation_size"], description["actions"])
 
 
 class QNetwork(nn.Module):
@@ -157,17 +147,6 @@ class QNetwork(nn.Module):
         # [*, (1 +) A, atoms]
         rows = linear(hidden, *head).unflatten(-1, (-1, self.config.outputs))
         return duel(rows) if self.config.agent.dueling else rows
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """What TorchRL's actors and losses expect.
-
-        Log-probabilities [*, atoms, A], or values [*, A].
-        """
-        logits = self.logits(observation)
-        # TorchRL wants log probabilities with the actions last.
-        if self.config.agent.distributional:
-            return logits.log_softmax(-1).transpose(-1, -2)
-        return logits.squeeze(-1)
 
     def expected(self, logits: Tensor) -> Tensor:
         """Action values [*, A] of the ``logits`` [*, A, atoms]."""

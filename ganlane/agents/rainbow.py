@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import asdict
 from typing import Any
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ganlane.agents.drivers import (
     ExploringPolicy,
     GreedyPolicy,
     LegalActions,
 )
-from ganlane.agents.loss import (
-    LeanDistributionalLoss,
-    LeanDQNLoss,
-    Learned,
-    UpdateGraph,
-)
+from ganlane.agents.loss import Learned, UpdateGraph, loss_of
 from ganlane.agents.network import (
     NetworkConfig,
     QNetwork,
@@ -84,16 +81,7 @@ class Rainbow:
             torch.default_generator.manual_seed(seed)
             network = QNetwork(NetworkConfig(config, observation_size, actions))
         self.network = network.to(self.device)
-        self.loss = (
-            LeanDistributionalLoss(
-                self.network,
-                config.gamma,
-                config.double,
-                config.kl_priority,
-            )
-            if config.distributional
-            else LeanDQNLoss(self.network, config.gamma, config.double)
-        )
+        self.target = deepcopy(self.network).requires_grad_(False)
         # Rainbow's 1.5e-4 is 0.005 over its batch of 32
         adam_eps = 0.005 / config.batch_size if config.adam_eps is None else config.adam_eps
         self.optimizer = torch.optim.Adam(
@@ -120,7 +108,7 @@ class Rainbow:
         if compile and all(getattr(config, part) for part in parts) and self.device.type == "cpu":
             self.graph = UpdateGraph(
                 self.network,
-                self.loss,
+                self.target,
                 self.optimizer,
                 config,
             )
@@ -175,7 +163,7 @@ class Rainbow:
         self.updates += 1
         # a hard copy, as in Rainbow
         if self.updates % config.target_period == 0:
-            self.loss.update_target()
+            load_parameters(self.target, self.weights())
         return {**learned._asdict(), "priority": learned.priority.mean()}
 
     def _descend(
@@ -185,22 +173,22 @@ class Rainbow:
     ) -> Learned:
         """What :class:`~ganlane.agents.loss.UpdateGraph` does, for every ``config`` and device."""
         # both networks get new noise for every update
-        for module in (self.network, self.loss.target_network):
+        for module in (self.network, self.target):
             redraw_noise(module, generator)
-        terms = self.loss(batch)
-        weight = batch.get("priority_weight", None)
+        # without exploration the noisy layers have no noise, and the sigmas never get a gradient
+        with set_exploration_type(ExplorationType.RANDOM):
+            terms = loss_of(self.network, self.target, batch, self.config)
         # Rainbow's mean of w * loss; TorchRL's own 'mean' divides by the sum of the weights.
-        objective = (terms["loss"] if weight is None else weight * terms["loss"]).mean()
+        objective = (batch.get("priority_weight", 1.0) * terms.loss).mean()
         self.optimizer.zero_grad(set_to_none=True)
         objective.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
         self.optimizer.step()
-        priority = batch.get("td_error")[:, 0]
         return Learned(
-            priority,
+            terms.priority,
             objective.detach(),
-            terms["mean_q"],
-            terms["clamped_fraction"],
+            terms.mean_q,
+            terms.clamped_fraction,
             norm,
         )
 
@@ -218,9 +206,9 @@ class Rainbow:
         return parameters_of(self.network)
 
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
-        """Start from trained ``weights``: load them first, then let the target follow."""
-        load_parameters(self.network, weights)
-        self.loss.update_target()
+        """Start both networks from trained ``weights``."""
+        for network in (self.network, self.target):
+            load_parameters(network, weights)
 
     def load_moments(self, moments: Mapping[int, Any]) -> None:
         """Let Adam go on from ``moments``, the part ``state`` of an optimiser's state.
@@ -253,7 +241,7 @@ class Rainbow:
         return {
             "config": asdict(self.config),
             "network": self.weights(),
-            "target": parameters_of(self.loss.target_network),
+            "target": parameters_of(self.target),
             "optimizer": optimizer,
             "generators": {
                 name: generator.get_state() for name, generator in self.generators.items()
@@ -279,7 +267,7 @@ class Rainbow:
                 )
         # in place: policies, losses and optimiser keep their references
         load_parameters(self.network, state["network"])
-        load_parameters(self.loss.target_network, state["target"])
+        load_parameters(self.target, state["target"])
         self.load_moments(state["optimizer"]["state"])
         for name, generator in self.generators.items():
             generator.set_state(state["generators"][name].cpu())

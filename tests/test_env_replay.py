@@ -5,6 +5,9 @@ Its roads, its ends, and vehicles that leave within a decision.
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import polars as pl
 import pytest
 import torch
@@ -16,8 +19,11 @@ from ganlane import keys
 from ganlane.agents.drivers import KeepLaneDriver, MobilDriver, RandomLegalDriver
 from ganlane.data import sort
 from ganlane.env import EpisodeParameters, HighwayEnv
+from ganlane.errors import UserError
+from ganlane.settings.road import FAR_M, WALL
 from ganlane.sim.random import episode_key
 from ganlane.traffic import ReplayTraffic
+from ganlane.view.record import road_of_row
 
 
 @pytest.fixture(scope="module")
@@ -108,3 +114,77 @@ def test_an_episode_is_the_same_bits_in_every_batch_and_after_automatic_resets(r
     wide = driven(24, 12)
     assert min(len(track) for track in wide.values()) >= 4
     assert_same_tracks(driven(1, 60), wide, at_least=4)
+
+
+# Roads whose lanes end
+
+
+@pytest.fixture(scope="module")
+def roads(tmp_path_factory) -> Path:
+    """The right lane of the widest scene begins 50 m down the recorded road and has a wall."""
+    file = tmp_path_factory.mktemp("roads") / "roads.json"
+    ramp = {"begin_m": 50, "end_m": 250, "end": "wall"}
+    file.write_text(json.dumps({"scene-2": [ramp, {}, {}, {}]}))
+    return file
+
+
+def test_lanes_end_where_the_roads_say_seen_from_the_start_of_each_episode(recordings, roads):
+    traffic = ReplayTraffic(recordings=recordings, least_s=5.0, roads=roads)
+    env = HighwayEnv(traffic, 64)
+    check_env_specs(env)
+    td = env.reset()
+    key = episode_key(0, td[keys.SEED], td[keys.EPISODE])
+    ends = traffic.scene_of(key) == 2
+    assert 0 < ends.sum() < 64
+    start_m = traffic.samples[traffic.starts[traffic.start_of(key), 0], 0]
+    road = td[keys.ROAD]
+    torch.testing.assert_close(road["begin_m"][ends, 0], (50.0 - start_m[ends]).float())
+    torch.testing.assert_close(road["wall_m"][ends, 0], (250.0 - start_m[ends]).float())
+    assert (road["begin_m"][~ends] == -FAR_M).all()
+    assert (road["wall_m"][~ends] == FAR_M).all()
+    # A state of each step still has them.
+    assert torch.equal(step(env, td)[keys.ROAD, "wall_m"], road["wall_m"])
+
+
+@pytest.mark.parametrize(("before_m", "crashes"), [(60.0, False), (1.5, True)])
+def test_the_ego_brakes_for_the_wall_of_its_own_row(recordings, tmp_path, before_m, crashes):
+    """From 10 m/s it needs 2.5 m at 20 m/s2; where nobody else has ever been."""
+    file = tmp_path / "roads.json"
+    wall = {"end_m": 5000, "end": "wall"}
+    file.write_text(json.dumps({"scene-2": [wall, {}, {}, {}]}))
+    env = HighwayEnv(ReplayTraffic(recordings=recordings, least_s=5.0, roads=file), 32)
+    td = env.reset()
+    wall_m = td[keys.ROAD, "wall_m"][:, 0]
+    ends = wall_m < FAR_M
+    front_m = 0.5 * td[keys.VEHICLES, "length"][:, 0]
+    place = {"x": torch.where(ends, wall_m, 6000.0) - before_m - front_m, "target_lane": 0}
+    for name, value in (place | {"y": 0.0, "heading": 0.0, "speed": 10.0}).items():
+        td[keys.VEHICLES, name][:, 0] = value
+    after = step(env, td)
+    assert torch.equal(after[keys.EVENTS, "hard_crash"][:, 0], ends & crashes)
+    speed = after[keys.VEHICLES, "speed"][:, 0]
+    assert speed[ends].max() < 10.0 < speed[~ends].min()
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        ({"scene-3": [{}]}, r"no scene scene-3 in recordings \(did you mean 'scene-2'\?\)"),
+        ({"scene-2": [{}, {}]}, "scene-2: 2 lanes; expected the 4 of the recording"),
+    ],
+)
+def test_roads_of_other_scenes_are_refused(recordings, tmp_path, content, what):
+    file = tmp_path / "roads.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(UserError, match=what):
+        ReplayTraffic(recordings=recordings, least_s=5.0, roads=file)
+
+
+def test_a_film_shows_where_the_lanes_of_a_recorded_scene_end(recordings, roads):
+    env = HighwayEnv(ReplayTraffic(recordings=recordings, least_s=5.0, roads=roads), 32)
+    td = env.reset()
+    shown = [road_of_row(td, env.road, row) for row in range(32)]
+    walls = td[keys.ROAD, "wall_m"][:, 0] < FAR_M
+    for (lanes, _, stretches), has_wall in zip(shown, walls.tolist()):
+        assert len(stretches) == lanes
+        assert (stretches[0].end == WALL) == has_wall

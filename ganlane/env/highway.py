@@ -51,7 +51,7 @@ from ganlane.sim.mobil import TABLE_IV
 from ganlane.sim.random import Purpose, episode_key, uniform
 from ganlane.sim.scenes import Scenes
 from ganlane.sim.spawn import RandomScenes, out_of_range, recycle
-from ganlane.sim.state import Road, Vehicles, road_in
+from ganlane.sim.state import Road, Vehicles, road_fields, road_in
 from ganlane.traffic.base import TrafficModule
 
 #: An automatic reset draws the scenes of the ended rows alone where they are at most one in so
@@ -243,12 +243,17 @@ class HighwayEnv(EnvBase):
         device = self.device
         # The traffic's memory travels in the state, so its shapes belong to the spec.
         memory = self.traffic.memory_spec(n, self.vehicles, self.dtype)
+        row_road = None
+        if self.traffic.own_roads:
+            # Of any episode: the shapes are those of all.
+            key = torch.zeros(1, dtype=torch.int64, device=device)
+            row_road = self.traffic.road_of(key, self.dtype)
         spec = state_spec(
             n,
             self.vehicles,
             self.dtype,
             memory,
-            self.traffic.own_roads,
+            row_road,
             self.actions,
         )
         self.observation_spec = spec.to(device)
@@ -349,8 +354,7 @@ class HighwayEnv(EnvBase):
             self.actions,
         )
         if self.traffic.own_roads:
-            road = self.traffic.road_of(key, self.dtype)
-            fields = {"lanes": road.lanes, "lane_width_m": road.lane_width_m}
+            fields = road_fields(self.traffic.road_of(key, self.dtype))
             state.set(keys.ROAD, TensorDict(fields, seed.shape))
         return state
 

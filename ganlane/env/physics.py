@@ -145,7 +145,7 @@ def begin(
 
 def before_change(rules: Rules, scene: Scene, acceleration: Tensor) -> Tensor:
     """The ego's ``acceleration`` [N], or less where it has to leave its lane soon; m/s2."""
-    if not rules.road.stretches or rules.mobil.courtesy == 0.0:
+    if not rules.road.has_lane_ends or rules.mobil.courtesy == 0.0:
         return acceleration
     ways = ways_out(scene.observers, rules.road, rules.mobil.mandatory_m)
     behind = falling_behind(scene, ways, rules.idm, rules.mobil)[:, 0]
@@ -199,7 +199,7 @@ def advance(
         acceleration = before.acceleration
     # Of the events of one step a crash comes first, then the goal, then the time-out.
     crash = ego_overlaps(vehicles, rules.road).any(-1) & running
-    if rules.road.stretches:
+    if rules.road.has_lane_ends:
         crash = crash | (hits_wall(scene.observers, scene.body, rules.road)[:, 0] & running)
     going_on = running & ~crash
     out_of_road = before.out_of_road

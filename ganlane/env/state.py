@@ -18,7 +18,7 @@ from torchrl.data.tensor_specs import Binary
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.settings.actions import CONTROLS, LANE_SPEED, ActionParameters
-from ganlane.sim.state import Vehicles
+from ganlane.sim.state import Road, Vehicles, road_fields
 from ganlane.torch_settings import check_default_device
 
 #: Name of a field to its type; None: the run's float type.
@@ -50,12 +50,13 @@ def state_spec(
     m: int,
     dtype: torch.dtype,
     memory: dict[str, Any],
-    own_roads: bool,
+    row_road: Road | None,
     actions: ActionParameters,
 ) -> Composite:
     """Spec of everything that a step writes except done flags and reward.
 
-    ``memory`` is the traffic's, nested name to (shape, dtype); ``own_roads``: each row has a road.
+    ``memory`` is the traffic's, nested name to (shape, dtype); ``row_road`` is the road of a row
+    where each has its own.
     """
     ego = {**EGO, **COMMANDED} if actions.form == LANE_SPEED else EGO
     parts = {
@@ -65,9 +66,11 @@ def state_spec(
         **_memory_spec({keys.TRAFFIC: memory}, n),
         **_specs(COUNTERS, (n,), dtype),
     }
-    if own_roads:
-        road = {"lane_width_m": None, "lanes": torch.int64}
-        parts[keys.ROAD] = Composite(_specs(road, (n, 1), dtype), shape=(n,))
+    if row_road is not None:
+        of_road = {}
+        for name, field in road_fields(row_road).items():
+            of_road[name] = Unbounded(shape=(n, field.shape[1]), dtype=field.dtype)
+        parts[keys.ROAD] = Composite(of_road, shape=(n,))
     return Composite(parts, shape=(n,))
 
 

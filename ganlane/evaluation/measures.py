@@ -116,7 +116,7 @@ def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     pushes = towards * across[:, :1] > -towards * across[:, 1:]
     at_fault = torch.where(since_along < since_across, ahead > 0, pushes)
     into_somebody = (at_fault & ego_overlaps(vehicles, road)).any(-1)
-    if not road.stretches:
+    if not road.has_lane_ends:
         return into_somebody
     ego = vehicles.columns(slice(0, 1))
     return into_somebody | hits_wall(ego, body_lanes(ego, road), road)[:, 0]

@@ -296,6 +296,12 @@ class FileScene(SceneConfig):
         """Those of the file."""
         return self.read(env).rows
 
+    def stretches(self, lanes: int) -> Stretches:
+        """Those of the file."""
+        from ganlane.sim.scene_files import read_scene
+
+        return () if self.path is None else read_scene(self.path).road.stretches
+
     def label(self) -> str:
         """The file."""
         return str(self.path)

@@ -58,6 +58,12 @@ class LaneStretch(Record):
                 "where it has none."
             )
 
+    def seen_from(self, start_m: float) -> LaneStretch:
+        """The same stretch where positions are counted from ``start_m`` on."""
+        begin_m = self.begin_m if self.begin_m == -FAR_M else self.begin_m - start_m
+        end_m = self.end_m if self.end_m == FAR_M else self.end_m - start_m
+        return LaneStretch(begin_m, end_m, self.end)
+
 
 #: Of the lanes from the right to the left; empty: all lanes go on for ever.
 Stretches = tuple[LaneStretch, ...]

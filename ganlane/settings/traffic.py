@@ -305,12 +305,15 @@ class ReplayTrafficConfig(TrafficConfig):
             ../shared/data.
         least_s: the vehicle that the ego replaces is recorded at least so long from the start on,
             s.
+        roads: JSON file that says where the lanes of the scenes begin and end
+            (:func:`ganlane.sim.scene_files.read_roads`); null: all go on for ever.
     """
 
     option = "replay"
     _target_: ImportPath = "ganlane.traffic.ReplayTraffic"
     path: str | None = None
     least_s: Steps = 4.0
+    roads: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -157,7 +157,7 @@ def acceleration_in(
     ``ahead`` and before the lanes' walls.
     """
     acceleration = acceleration_behind(scene, ahead, parameters, headway_s)
-    if scene.road.stretches:
+    if scene.road.has_lane_ends:
         keeps = lanes == scene.observers.target_lane[..., None]
         before = acceleration_before_wall(scene, lanes, keeps, parameters, headway_s)
         acceleration = torch.minimum(acceleration, before)

@@ -15,43 +15,74 @@ All functions take lanes of any shape that broadcasts with the positions, whole 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ganlane.settings.road import ASKS_FROM, FAR_M, TURN_OUT_M, WALL, FlowParameters, leaving
-from ganlane.sim.state import LaneRange, Road, Vehicles, spanned
+from ganlane.settings.road import (
+    ASKS_FROM,
+    EXIT,
+    FAR_M,
+    NOTHING,
+    TURN_OUT_M,
+    WALL,
+    FlowParameters,
+    LaneStretch,
+    Stretches,
+    leaving,
+)
+from ganlane.sim.state import LaneRange, Road, RowStretches, Vehicles, spanned
 from ganlane.torch_settings import constant
+
+#: A number of each lane: of one road, or [N, L] of every row's.
+OfLanes = tuple[float, ...] | Tensor
 
 
 def of_lane(
-    numbers: tuple[float, ...],
+    numbers: OfLanes,
     lane: Tensor,
     like: Tensor,
 ) -> Tensor:
-    """The number of each ``lane``, in the type of ``like``; beyond the road, of the nearest one."""
+    """The number of each ``lane``, in the type of ``like``; beyond the road, of the nearest one.
+
+    Where every row has its own numbers, the first dimension of ``lane`` is that of the rows.
+    """
+    if isinstance(numbers, Tensor):
+        index = lane.long().clamp(0, numbers.shape[1] - 1)
+        return numbers.gather(1, index.flatten(1)).view(index.shape)
     return constant(numbers, like)[lane.long().clamp(0, len(numbers) - 1)]
 
 
-def begins(road: Road) -> tuple[float, ...]:
+def begins(road: Road) -> OfLanes:
     """Where each lane begins, m."""
+    if road.row_stretches is not None:
+        return road.row_stretches.begin_m
     return tuple(stretch.begin_m for stretch in road.stretches)
 
 
-def ends(road: Road) -> tuple[float, ...]:
+def ends(road: Road) -> OfLanes:
     """Where each lane ends, m; :data:`FAR_M` if it goes on."""
+    if road.row_stretches is not None:
+        return road.row_stretches.end_m
     return tuple(stretch.end_m for stretch in road.stretches)
 
 
-def walls(road: Road) -> tuple[float, ...]:
+def walls(road: Road) -> OfLanes:
     """Where each lane's wall stands, m; :data:`FAR_M` without one."""
+    if road.row_stretches is not None:
+        return road.row_stretches.wall_m
     return tuple(its.end_m if its.end == WALL else FAR_M for its in road.stretches)
 
 
 def on_road(road: Road, lane: Tensor) -> Tensor:
     """Whether the road has the ``lane`` anywhere, bool."""
-    return (lane >= 0) & (lane < road.lanes)
+    lanes = road.lanes
+    if isinstance(lanes, Tensor):
+        # [N, 1] as the rows of ``lane``, which may have more dimensions.
+        lanes = lanes.view(-1, *[1] * (lane.ndim - 1))
+    return (lane >= 0) & (lane < lanes)
 
 
 def exists(
@@ -61,7 +92,7 @@ def exists(
 ) -> Tensor:
     """Whether the road has the ``lane`` at ``x``, m; bool."""
     inside = on_road(road, lane)
-    if not road.stretches:
+    if not road.has_lane_ends:
         return inside
     begin = of_lane(begins(road), lane, x)
     end = of_lane(ends(road), lane, x)
@@ -79,7 +110,7 @@ def may_change(
     Both have to exist at ``x``, m; keeping the lane is always possible. Bool.
     """
     there = exists(road, lane + side, x)
-    if not road.stretches:
+    if not road.has_lane_ends:
         return there
     return (side == 0) | (there & exists(road, lane, x))
 
@@ -161,10 +192,58 @@ def bias(
 
 
 def _urgency(road: Road, lanes: Tensor, x: Tensor, goal: int | None, reach_m: float) -> Tensor:
-    by_m, changes = leaving(road.stretches, goal)
-    reaches = tuple(reach_m * number for number in changes)
+    by_m: OfLanes
+    reaches: OfLanes
+    if road.row_stretches is not None:
+        by_m = road.row_stretches.leave_by_m
+        reaches = reach_m * road.row_stretches.changes
+    else:
+        by_m, changes = leaving(road.stretches, goal)
+        reaches = tuple(reach_m * number for number in changes)
     distance = of_lane(by_m, lanes, x) - x[..., None]
     return 1.0 - distance / of_lane(reaches, lanes, x)
+
+
+def stretches_of_roads(roads: Sequence[Stretches]) -> RowStretches:
+    """The stretches of S roads, in every row one, float64 [S, L].
+
+    Lanes that a road does not have, but another one has, go on.
+    """
+    widest = max(len(stretches) for stretches in roads)
+    rows = []
+    for stretches in roads:
+        road = Road(len(stretches), stretches=stretches)
+        numbers = (begins(road), ends(road), walls(road), *leaving(stretches))
+        beyond = (-FAR_M, FAR_M, FAR_M, FAR_M, 1.0)
+        missing = widest - len(stretches)
+        rows.append([[*of_lanes, *[far] * missing] for of_lanes, far in zip(numbers, beyond)])
+    return RowStretches(*torch.tensor(rows, dtype=torch.float64).unbind(1))
+
+
+def from_start(stretches: RowStretches, start_m: Tensor, dtype: torch.dtype) -> RowStretches:
+    """The stretches of each row by the distance from ``start_m`` [N, 1] on; in ``dtype``."""
+
+    def moved(place_m: Tensor) -> Tensor:
+        # What is far away stays where the others expect it.
+        return torch.where(place_m.abs() < FAR_M, place_m - start_m, place_m).to(dtype)
+
+    return RowStretches(
+        begin_m=moved(stretches.begin_m),
+        end_m=moved(stretches.end_m),
+        wall_m=moved(stretches.wall_m),
+        leave_by_m=moved(stretches.leave_by_m),
+        changes=stretches.changes.to(dtype),
+    )
+
+
+def stretches_of_row(stretches: RowStretches, row: int) -> Stretches:
+    """The lanes of one row, as :func:`stretches_of_roads` was given them."""
+    lanes = []
+    numbers = (stretches.begin_m, stretches.end_m, stretches.wall_m)
+    for begin_m, end_m, wall_m in zip(*(places[row].tolist() for places in numbers)):
+        end = WALL if wall_m < FAR_M else EXIT if end_m < FAR_M else NOTHING
+        lanes.append(LaneStretch(begin_m, end_m, end))
+    return tuple(lanes)
 
 
 class WaysOut(NamedTuple):

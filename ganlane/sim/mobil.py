@@ -92,7 +92,7 @@ def lane_accelerations(
     # Nobody behind: nobody is hindered or relieved.
     nobody = ~behind.exists
     observer = acceleration_behind(scene, ahead, idm)
-    if scene.road.stretches:
+    if scene.road.has_lane_ends:
         # Whoever changes into a lane means to keep it.
         keeps = torch.ones_like(lanes, dtype=torch.bool)
         observer = torch.minimum(observer, acceleration_before_wall(scene, lanes, keeps, idm))
@@ -301,7 +301,7 @@ def mobil_wishes(
     to_the_left = lane + 1.0 <= road.lanes - 1
     to_the_right = lane - 1.0 >= 0
     exists = torch.stack((to_the_left, to_the_right), dim=-1)
-    if road.stretches:
+    if road.has_lane_ends:
         gain, possible = mandatory(scene, lanes, mobil, goal, exits)
         incentive = incentive + gain
         exists = exists & possible

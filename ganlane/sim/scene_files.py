@@ -6,8 +6,10 @@ are required; lines that start with ``#`` are skipped, and an empty cell means t
     x_m, lane, y_m, speed_mps, desired_speed_mps, length_m, width_m, target_lane, visibility
 
 JSON is a list of objects with the same names, or
-``{"lanes": 3, "lane_width_m": 4.0, "vehicles": [...]}``. Every mistake is named by file, line (or
-entry) and column.
+``{"lanes": 3, "lane_width_m": 4.0, "stretches": [...], "vehicles": [...]}``, where ``stretches``
+has an object for each lane from the right, with the fields of
+:class:`~ganlane.settings.road.LaneStretch`. Every mistake is named by file, line (or entry) and
+column.
 """
 
 from __future__ import annotations
@@ -19,8 +21,10 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from ganlane.errors import UserError
+from ganlane.errors import ParameterError, UserError
 from ganlane.settings.driving import Visibility
+from ganlane.settings.record import make
+from ganlane.settings.road import LaneStretch, Stretches
 from ganlane.sim.scenes import FixedScene, SceneVehicle, check_count
 from ganlane.sim.state import Road
 
@@ -49,23 +53,7 @@ def read_scene(
             column), a road other than the file's, or an impossible scene.
     """
     path = Path(path)
-    if not path.is_file():
-        raise UserError(f"{path}: no such file; give a scene as .csv or .json.")
-    # Endings are checked before anything is read.
-    if path.suffix.lower() not in (".csv", ".json"):
-        raise UserError(f"{path}: expected a scene as .csv or .json; rename or convert the file.")
-    # A film given by mistake is not read into memory.
-    if path.stat().st_size > _MOST_BYTES:
-        raise UserError(
-            f"{path}: more than {_MOST_BYTES} bytes, which no scene has; give a smaller file."
-        )
-    try:
-        # utf-8-sig, since spreadsheets write a byte order mark.
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise UserError(
-            f"{path}: not a text file in UTF-8 ({error.reason}); save the scene as one."
-        ) from error
+    text = _text(path, "a scene", (".csv", ".json"))
     road: dict[str, Any] = {}
     if path.suffix.lower() == ".csv":
         rows = _read_csv(path, text)
@@ -73,14 +61,81 @@ def read_scene(
         rows, road = _read_json(path, text)
     # The file's numbers hold unless it gives none.
     width = _agreed(path, "lane_width_m", road, lane_width_m) or LANE_WIDTH_M
-    count = _agreed(path, "lanes", road, lanes) or _lanes_in(rows, width)
-    return FixedScene(tuple(rows), Road(int(count), float(width)), name=str(path))
+    stretches = road.get("stretches", ())
+    count = _agreed(path, "lanes", road, lanes) or len(stretches) or _lanes_in(rows, width)
+    if stretches and rows:
+        # The ego starts at 0, wherever the file has it.
+        stretches = tuple(stretch.seen_from(rows[0].x_m) for stretch in stretches)
+    try:
+        whole = Road(int(count), float(width), stretches=stretches)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    return FixedScene(tuple(rows), whole, name=str(path))
+
+
+def read_roads(path: str | Path) -> dict[str, Stretches]:
+    """Where the lanes of recorded scenes begin and end, by the names of the scenes.
+
+    JSON: ``{"SCENE": [...], ...}`` with an object for each lane of the scene, from the right, as in
+    the ``stretches`` of a scene's file. Positions are those of the recording, m.
+
+    Raises:
+        UserError: no such file, not JSON, or a wrong value (named by file, scene and lane).
+    """
+    path = Path(path)
+    content = _json(path, _text(path, "roads", (".json",)))
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: expected an object of scenes; see docs/traffic.md.")
+    return {scene: _stretches(lanes, f"{path}: {scene}") for scene, lanes in content.items()}
 
 
 def with_ego_speed(scene: FixedScene, desired_speed_mps: float) -> FixedScene:
     """The scene with another desired speed of the ego, m/s."""
     ego, *others = scene.rows
     return replace(scene, rows=(replace(ego, desired_speed_mps=desired_speed_mps), *others))
+
+
+def _text(path: Path, what: str, endings: Sequence[str]) -> str:
+    """The file's text; ``what`` it should hold, for messages."""
+    expected = " or ".join(endings)
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; give {what} as {expected}.")
+    # Endings are checked before anything is read.
+    if path.suffix.lower() not in endings:
+        raise UserError(f"{path}: expected {what} as {expected}; rename or convert the file.")
+    # A film given by mistake is not read into memory.
+    if path.stat().st_size > _MOST_BYTES:
+        raise UserError(
+            f"{path}: more than {_MOST_BYTES} bytes, too much for {what}; give a smaller file."
+        )
+    try:
+        # utf-8-sig, since spreadsheets write a byte order mark.
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise UserError(
+            f"{path}: not a text file in UTF-8 ({error.reason}); save it as one."
+        ) from error
+
+
+def _json(path: Path, text: str) -> Any:
+    try:
+        return json.loads(text)
+    # A ValueError without a place in the file: a whole number of thousands of digits.
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path}: not JSON ({error}); fix the file.") from error
+
+
+def _stretches(lanes: Any, where: str) -> Stretches:
+    """The stretches of a road's lanes, from the right."""
+    if not isinstance(lanes, list) or not lanes:
+        raise UserError(f"{where}: expected a list with an object for each lane, from the right.")
+    stretches = []
+    for number, lane in enumerate(lanes):
+        try:
+            stretches.append(make(LaneStretch, lane))
+        except ParameterError as error:
+            raise UserError(f"{where}, lane {number}: {error}") from error
+    return tuple(stretches)
 
 
 def _agreed(
@@ -154,11 +209,7 @@ def _cells(line: str, where: str) -> list[str]:
 
 def _read_json(path: Path, text: str) -> tuple[list[SceneVehicle], dict[str, Any]]:
     """The vehicles, and what the file says of the road."""
-    try:
-        content = json.loads(text)
-    # A ValueError without a place in the file: a whole number of thousands of digits.
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}: not JSON ({error}); fix the file.") from error
+    content = _json(path, text)
     # A bare list of vehicles is short for an object without a road.
     if isinstance(content, list):
         content = {"vehicles": content}
@@ -178,12 +229,15 @@ def _read_json(path: Path, text: str) -> tuple[list[SceneVehicle], dict[str, Any
         values = {name: value for name, value in vehicle.items() if value is not None}
         rows.append(_row(values, where, f"entry {number}"))
     # What is left are keys of the road.
+    road: dict[str, Any] = {}
+    if content.get("stretches") is not None:
+        road["stretches"] = _stretches(content.pop("stretches"), f"{path}: stretches")
     for name in sorted(content):
         if name not in ROAD:
             raise UserError(
-                f"{path}: unknown key {_quoted(name)}; expected lanes, lane_width_m and vehicles."
+                f"{path}: unknown key {_quoted(name)}; expected lanes, lane_width_m, stretches and "
+                "vehicles."
             )
-    road = {}
     for name in ROAD:
         if content.get(name) is not None:
             road[name] = value = _value(name, content[name], f"{path}: {name}")

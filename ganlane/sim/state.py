@@ -99,6 +99,21 @@ class Vehicles(NamedTuple):
         return Vehicles(*(torch.where(mask, mine, theirs) for mine, theirs in zip(self, other)))
 
 
+class RowStretches(NamedTuple):
+    """Where the lanes of each row begin and end, [N, L]; L is the largest number of lanes.
+
+    m; :data:`~ganlane.settings.road.FAR_M` behind or ahead where there is nothing. ``wall_m`` is
+    where a lane's wall stands; ``leave_by_m`` and ``changes`` are those of
+    :class:`~ganlane.settings.road.Leaving`.
+    """
+
+    begin_m: Tensor
+    end_m: Tensor
+    wall_m: Tensor
+    leave_by_m: Tensor
+    changes: Tensor
+
+
 @dataclass(frozen=True)
 class Road:
     """Lane 0 is the rightmost; the centre of lane k lies at ``y = k * lane_width_m``.
@@ -106,8 +121,9 @@ class Road:
     ``lanes`` and ``lane_width_m`` may be tensors [N, 1] if every environment has its own road
     (recorded scenes). ``ring_m`` closes the road to a ring of that length: positions stay
     unwrapped, only distances between vehicles are taken modulo the ring. ``stretches`` says where
-    each lane begins and ends (:mod:`ganlane.sim.lane_ends`); empty: all go on for ever. ``flow``
-    says who enters and leaves (:mod:`ganlane.sim.flow`); None: nobody.
+    each lane begins and ends (:mod:`ganlane.sim.lane_ends`); empty: all go on for ever.
+    ``row_stretches`` says so of roads that differ between rows, on which nobody has the mission to
+    reach an exit. ``flow`` says who enters and leaves (:mod:`ganlane.sim.flow`); None: nobody.
 
     Raises:
         UserError: as many stretches as lanes are needed, one of them without an end and at most one
@@ -118,6 +134,7 @@ class Road:
     lane_width_m: float | Tensor = 4.0
     ring_m: float | None = None
     stretches: Stretches = ()
+    row_stretches: RowStretches | None = None
     flow: FlowParameters | None = None
 
     def __post_init__(self) -> None:
@@ -137,6 +154,11 @@ class Road:
                 f"each of the {self.lanes} lanes of a straight road, of which one goes on and at "
                 "most one ends in an exit."
             )
+
+    @property
+    def has_lane_ends(self) -> bool:
+        """Whether there is a lane that begins or ends."""
+        return bool(self.stretches) or self.row_stretches is not None
 
     @property
     def exit_lane(self) -> int | None:
@@ -184,7 +206,20 @@ STRAIGHT = Road()
 def road_in(state: Any, default: Road) -> Road:
     """The road of each row from ``state["road"]``, or ``default`` without that key."""
     rows = state.get("road", None)
-    return default if rows is None else Road(rows.get("lanes"), rows.get("lane_width_m"))
+    if rows is None:
+        return default
+    stretches = None
+    if RowStretches._fields[0] in rows.keys():  # noqa: SIM118 (a TensorDict is no Mapping)
+        stretches = RowStretches(*(rows.get(name) for name in RowStretches._fields))
+    return Road(rows.get("lanes"), rows.get("lane_width_m"), row_stretches=stretches)
+
+
+def road_fields(road: Road) -> dict[str, Tensor]:
+    """What :func:`road_in` reads of a road that differs between rows: [N, 1], stretches [N, L]."""
+    fields = {"lanes": road.lanes, "lane_width_m": road.lane_width_m}
+    if road.row_stretches is not None:
+        fields |= road.row_stretches._asdict()
+    return fields  # type: ignore[return-value]
 
 
 # Which lanes a vehicle occupies: as seen by others, and by its own driver

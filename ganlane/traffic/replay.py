@@ -7,7 +7,7 @@ long as its track lasts.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,14 +24,17 @@ from ganlane.data import (
     scene_lane_widths,
     tracks_of_frame,
 )
-from ganlane.errors import UserError
+from ganlane.errors import UserError, did_you_mean
 from ganlane.keys import EGO_INDEX, VEHICLE_FLOATS
 from ganlane.settings.driving import IdmParameters, Visibility
+from ganlane.settings.road import LaneStretch
 from ganlane.settings.traffic import ReplayTrafficConfig
 from ganlane.sim.idm import following_acceleration
+from ganlane.sim.lane_ends import from_start, stretches_of_roads
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.scene_files import read_roads
+from ganlane.sim.state import Road, RowStretches, Vehicles
 from ganlane.traffic.base import Memory, Moved, TrafficModule
 
 #: Vehicles kept at a start, the ego included: more than anybody simulates around one ego.
@@ -137,15 +140,16 @@ class ReplayTraffic(TrafficModule):
 
     The ego replaces the recorded vehicle nearest the middle of the episode's first frame, with its
     position, speed and size; the M - 1 nearest to it (or fewer) are its neighbours for the whole
-    episode. A neighbour whose track ends is no longer valid; the episode ends with the scene. Lanes
-    and lane width are the scene's, so they differ between rows (:meth:`road_of`).
+    episode. A neighbour whose track ends is no longer valid; the episode ends with the scene.
+    Lanes, lane width, and where ``roads`` says so the ends of lanes, are the scene's, so they
+    differ between rows (:meth:`road_of`).
 
     Scene and start of an episode follow from its key, that is from (stream, seed, episode), so
     there is no memory. Scenes are equally likely, whatever their length.
 
     Args:
         stream: as for every traffic module.
-        path, least_s: see :class:`~ganlane.settings.traffic.ReplayTrafficConfig`.
+        path, least_s, roads: see :class:`~ganlane.settings.traffic.ReplayTrafficConfig`.
         recordings: in place of a file, tracks in the schema of :mod:`ganlane.data`, sorted by
             scene, vehicle and frame.
 
@@ -153,7 +157,8 @@ class ReplayTraffic(TrafficModule):
         scene_names: of the S scenes.
 
     Raises:
-        UserError: no recordings, a damaged file, or no vehicle is recorded for ``least_s``.
+        UserError: no recordings, a damaged file, no vehicle is recorded for ``least_s``, or the
+            roads of other scenes or with other numbers of lanes.
     """
 
     visibility = Visibility.BODY
@@ -170,6 +175,8 @@ class ReplayTraffic(TrafficModule):
     starts_in: Tensor
     lanes: Tensor
     lane_width_m: Tensor
+    # [S, 5, L], the fields of RowStretches by positions of the recordings; None: all lanes go on.
+    stretches: Tensor | None
 
     def __init__(
         self,
@@ -177,6 +184,7 @@ class ReplayTraffic(TrafficModule):
         path: str | Path | None = None,
         least_s: float = ReplayTrafficConfig.least_s,
         recordings: pl.DataFrame | None = None,
+        roads: str | Path | None = None,
     ) -> None:
         self.source = "recordings" if recordings is not None else str(path or _default_path())
         frame = read_scenes(self.source) if recordings is None else recordings
@@ -211,9 +219,28 @@ class ReplayTraffic(TrafficModule):
             "starts_in": torch.from_numpy(starts_in),
             "lanes": lanes,
             "lane_width_m": width_m,
+            "stretches": None if roads is None else self._stretches(roads, counts),
         }
         for name, tensor in buffers.items():
             self.register_buffer(name, tensor, persistent=False)
+
+    def _stretches(self, path: str | Path, lanes: Mapping[str, int]) -> Tensor:
+        """Those of the scenes' lanes in the file ``path``; ``lanes`` counts them."""
+        roads = read_roads(path)
+        for name, stretches in roads.items():
+            if name not in lanes:
+                raise UserError(
+                    f"{path}: no scene {name} in {self.source}{did_you_mean(name, lanes)}; "
+                    "remove it."
+                )
+            if len(stretches) != lanes[name]:
+                raise UserError(
+                    f"{path}: {name}: {len(stretches)} lanes; expected the {lanes[name]} of the "
+                    "recording, from the right."
+                )
+        go_on = {name: (LaneStretch(),) * count for name, count in lanes.items()}
+        of_scenes = [(go_on | roads)[name] for name in self.scene_names]
+        return torch.stack(stretches_of_roads(of_scenes), dim=1)
 
     def start_of(self, key: Tensor) -> Tensor:
         """Number of the start, [N] int64, of the episodes with ``key`` [N]."""
@@ -272,9 +299,21 @@ class ReplayTraffic(TrafficModule):
         return self.steps[self.start_of(key)]
 
     def road_of(self, key: Tensor, dtype: torch.dtype = torch.float32) -> Road:
-        """The road of each row: ``lanes`` [N, 1] int64 and ``lane_width_m`` [N, 1]."""
-        scene = self.scene_of(key)[:, None]
-        return Road(self.lanes[scene], self.lane_width_m[scene].to(dtype))
+        """The road of each row: ``lanes`` [N, 1] int64, ``lane_width_m`` [N, 1], and where its
+        lanes begin and end [N, L]; x = 0 is the ego's start.
+        """
+        start = self.start_of(key)
+        scene = self.scene[start]
+        stretches = None
+        if self.stretches is not None:
+            of_scenes = RowStretches(*self.stretches[scene].unbind(1))
+            ego_m = self.samples[self.starts[start, :1], _X]
+            stretches = from_start(of_scenes, ego_m, dtype)
+        return Road(
+            self.lanes[scene][:, None],
+            self.lane_width_m[scene][:, None].to(dtype),
+            row_stretches=stretches,
+        )
 
     def recorded(self, key: Tensor, step: Tensor, vehicles: int, dtype: torch.dtype) -> Vehicles:
         """The vehicles [N, ``vehicles``] as recorded ``step`` [N] steps after the start; x = 0 is

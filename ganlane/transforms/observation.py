@@ -212,7 +212,7 @@ def road_ahead(view: View) -> Tensor:
     begins_in = far - 1.0
     ahead = lane - lane
     distance = far[:, :1]
-    if road.stretches:
+    if road.has_lane_ends:
         goes_on = _in_sight(of_lane(ends(road), lanes, front) - front)
         begins_in = _in_sight(of_lane(begins(road), lanes, front) - front)
     if road.exit_lane is not None:

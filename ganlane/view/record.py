@@ -21,6 +21,7 @@ from ganlane.errors import UserError
 from ganlane.evaluation.episodes import start_of
 from ganlane.settings.road import Stretches
 from ganlane.sim.collisions import pair_overlaps
+from ganlane.sim.lane_ends import stretches_of_row
 from ganlane.sim.state import Road, Vehicles, road_in
 
 FloatArray = npt.NDArray[np.float64]
@@ -189,10 +190,14 @@ def road_of_row(
     # One number for all rows, or [N, 1].
     lanes = torch.as_tensor(scene.lanes).flatten()
     width = torch.as_tensor(scene.lane_width_m).flatten()
+    count = int(lanes[min(row, len(lanes) - 1)])
+    stretches = scene.stretches
+    if scene.row_stretches is not None:
+        stretches = stretches_of_row(scene.row_stretches, row)[:count]
     return (
-        int(lanes[min(row, len(lanes) - 1)]),
+        count,
         float(width[min(row, len(width) - 1)]),
-        scene.stretches,
+        stretches,
     )
 
 

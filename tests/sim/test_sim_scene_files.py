@@ -8,7 +8,8 @@ import pytest
 
 from ganlane.errors import UserError
 from ganlane.settings.driving import Visibility
-from ganlane.sim.scene_files import read_scene
+from ganlane.settings.road import EXIT, WALL, LaneStretch
+from ganlane.sim.scene_files import read_roads, read_scene
 from ganlane.sim.scenes import SceneVehicle
 from ganlane.sim.state import Road
 
@@ -74,6 +75,16 @@ def test_a_scene_is_read_from_csv_and_from_json_alike(tmp_path):
         ("a.json", '{"cars": []}', "expected a list of vehicles"),
         ("a.json", '{"lanes": 0, "vehicles": []}', "lanes=0: expected a finite number above 0"),
         ("a.json", '{"roads": 1, "vehicles": []}', "unknown key 'roads'"),
+        (
+            "a.json",
+            '{"stretches": [{"end": "wal"}], "vehicles": []}',
+            "stretches, lane 0: end=wal: expected one of nothing, wall, exit",
+        ),
+        (
+            "a.json",
+            '{"lanes": 3, "stretches": [{}], "vehicles": []}',
+            "stretches of 1 lanes with the ends nothing: expected one for each of the 3 lanes",
+        ),
         ("a.json", "[[1, 2]]", "vehicles entry 1: expected an object"),
         (
             "a.json",
@@ -113,3 +124,39 @@ def test_a_fault_in_a_file_is_named_by_line_or_entry_and_column(tmp_path, name, 
         read_scene(path, lanes=3 if "asked for" in what else None)
     assert what in str(refused.value)
     assert str(path) in str(refused.value)
+
+
+def test_the_lanes_of_a_scene_begin_and_end_where_its_file_says_seen_from_the_ego(tmp_path):
+    content = {
+        "stretches": [{"begin_m": 110, "end_m": 360, "end": "wall"}, {}],
+        "vehicles": [{"x_m": 10, "lane": 0}, {"x_m": 60, "lane": 1}],
+    }
+    (tmp_path / "ramp.json").write_text(json.dumps(content))
+    road = read_scene(tmp_path / "ramp.json").road
+    assert road == Road(2, stretches=(LaneStretch(100.0, 350.0, WALL), LaneStretch()))
+
+
+def test_the_roads_of_recorded_scenes_are_read(tmp_path):
+    file = tmp_path / "roads.json"
+    file.write_text('{"a": [{"end_m": 200, "end": "exit"}, {}], "b": [{}]}')
+    assert read_roads(file) == {
+        "a": (LaneStretch(end_m=200.0, end=EXIT), LaneStretch()),
+        "b": (LaneStretch(),),
+    }
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        ("[]", "expected an object of scenes"),
+        ('{"a": {}}', "a: expected a list with an object for each lane"),
+        ('{"a": []}', "a: expected a list with an object for each lane"),
+        ('{"a": [3]}', "a, lane 0: "),
+        ('{"a": [{}, {"end_m": 20}]}', "a, lane 1: end=nothing: expected wall or exit"),
+    ],
+)
+def test_a_mistake_in_the_roads_is_named_by_scene_and_lane(tmp_path, content, what):
+    file = tmp_path / "roads.json"
+    file.write_text(content)
+    with pytest.raises(UserError, match=f"roads.json: {what}"):
+        read_roads(file)

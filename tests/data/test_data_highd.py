@@ -22,27 +22,14 @@ def recording(tmp_path):
     return tmp_path / "01_tracks.csv"
 
 
-def test_each_direction_is_a_scene_at_10_hz_with_x_forward_and_lane_0_rightmost(
-    recording,
-):
+def test_each_direction_is_a_scene_at_10_hz_with_x_forward_and_lane_0_rightmost(recording):
     upper, lower = highd_scenes(recording)
-    assert (upper.name, lower.name) == (
-        "highd-01-upper",
-        "highd-01-lower",
-    )
+    assert (upper.name, lower.name) == ("highd-01-upper", "highd-01-lower")
     assert upper.frame.schema == lower.frame.schema == SCHEMA
-    assert (upper.lane_width_m, lower.lane_width_m) == (
-        4.0,
-        4.0,
-    )
+    assert (upper.lane_width_m, lower.lane_width_m) == (4.0, 4.0)
     # Upwards in the picture is to the right for those who drive to the left: lanes 2 (y 8 to 12)
     # and 3. Lower lanes: 5 (y 20 to 24) is the left one, 6 the right one; left is up.
-    expected = {
-        1: (0, 0.0, 30.0),
-        2: (1, 4.5, 35.0),
-        3: (0, 0.0, 25.0),
-        4: (1, 4.0, 28.0),
-    }
+    expected = {1: (0, 0.0, 30.0), 2: (1, 4.5, 35.0), 3: (0, 0.0, 25.0), 4: (1, 4.0, 28.0)}
     # The first row of each vehicle, to compare their places.
     begin = {}
     for scene in (upper, lower):
@@ -80,9 +67,7 @@ def test_a_folder_is_read_recording_by_recording(tmp_path):
     assert (count.read, count.kept) == (4 * 300, 4 * 300)
 
 
-def test_rows_off_the_lanes_are_dropped_and_end_a_track(
-    recording,
-):
+def test_rows_off_the_lanes_are_dropped_and_end_a_track(recording):
     rows = pl.read_csv(recording)
     aside = (pl.col("id") == 3) & pl.col("frame").is_between(80, 90)
     rows.with_columns(laneId=pl.when(aside).then(7).otherwise("laneId")).write_csv(recording)
@@ -90,11 +75,7 @@ def test_rows_off_the_lanes_are_dropped_and_end_a_track(
     _, lower = highd_scenes(recording, count)
     assert dict(count.dropped) == {"off the lanes of its direction": 11}
     # Car 3 comes back as a track of its own.
-    assert sorted(lower.frame["vehicle"].unique()) == [
-        3,
-        4,
-        10_003,
-    ]
+    assert sorted(lower.frame["vehicle"].unique()) == [3, 4, 10_003]
 
 
 def damaged(path, column, row, value):
@@ -107,30 +88,10 @@ def damaged(path, column, row, value):
 @pytest.mark.parametrize(
     ("column", "row", "value", "message"),
     [
-        (
-            "x",
-            10,
-            "left",
-            r"01_tracks.csv, line 12, column x: 'left' is not a number",
-        ),
-        (
-            "frame",
-            6,
-            "4",
-            r"01_tracks.csv, line 8, column frame: 4 is not after the last frame",
-        ),
-        (
-            "id",
-            250,
-            "77",
-            r"01_tracks.csv, line 252, column id: 77 is not in the tracksMeta file",
-        ),
-        (
-            "width",
-            0,
-            "0",
-            r"01_tracks.csv, line 2, column width: 0.0 is not above 0",
-        ),
+        ("x", 10, "left", r"01_tracks.csv, line 12, column x: 'left' is not a number"),
+        ("frame", 6, "4", r"01_tracks.csv, line 8, column frame: 4 is not after the last frame"),
+        ("id", 250, "77", r"01_tracks.csv, line 252, column id: 77 is not in the tracksMeta file"),
+        ("width", 0, "0", r"01_tracks.csv, line 2, column width: 0.0 is not above 0"),
     ],
 )
 def test_a_damaged_field_is_named(recording, column, row, value, message):
@@ -150,9 +111,7 @@ def test_units_that_cannot_be_are_refused(recording):
         read_recordings("highd", recording)
 
 
-def test_the_metadata_files_are_required_and_checked(
-    recording,
-):
+def test_the_metadata_files_are_required_and_checked(recording):
     meta = recording.with_name("01_recordingMeta.csv")
     # First the markings, then files that are not there.
     damaged(meta, "upperLaneMarkings", 0, "8.0;moon")
@@ -162,12 +121,7 @@ def test_the_metadata_files_are_required_and_checked(
     with user_error(r"01_recordingMeta.csv: no such file"):
         read_recordings("highd", recording)
     write_highd(recording.parent)
-    damaged(
-        recording.with_name("01_tracksMeta.csv"),
-        "drivingDirection",
-        1,
-        "3",
-    )
+    damaged(recording.with_name("01_tracksMeta.csv"), "drivingDirection", 1, "3")
     with user_error(r"01_tracksMeta.csv, line 3, column drivingdirection: 3 is neither"):
         read_recordings("highd", recording)
     with user_error(r"no XX_tracks.csv in this folder"):

@@ -6,10 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ganlane.data import Tracks
-from ganlane.data.lanes import (
-    find_lane_changes,
-    lane_width,
-)
+from ganlane.data.lanes import find_lane_changes, lane_width
 
 
 @given(width=st.floats(3.0, 4.0), seed=st.integers(0, 10_000))
@@ -22,13 +19,7 @@ def test_lane_keepers_tell_the_width_to_a_few_centimetres(width, seed):
 
 
 def test_a_single_lane_gets_the_standard_width_and_one_stray_row_does_not_make_a_lane():
-    assert (
-        lane_width(
-            np.linspace(-0.3, 0.3, 20),
-            np.zeros(20, np.int64),
-        )
-        == 3.66
-    )
+    assert lane_width(np.linspace(-0.3, 0.3, 20), np.zeros(20, np.int64)) == 3.66
     # Fewer rows than half a second of one vehicle.
     y = np.concatenate((np.zeros(50), np.full(50, 3.5), [30.0]))
     lane = np.concatenate((np.zeros(50), np.ones(50), [5])).astype(np.int64)

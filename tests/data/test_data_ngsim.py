@@ -7,14 +7,7 @@ from __future__ import annotations
 
 import polars as pl
 import pytest
-from reference.recordings import (
-    LANE_M,
-    START_MS,
-    ngsim_rows,
-    portal_csv,
-    raw_text,
-    traffic,
-)
+from reference.recordings import LANE_M, START_MS, ngsim_rows, portal_csv, raw_text, traffic
 from reference.refusals import user_error
 
 from ganlane.data import SCHEMA, read_recordings
@@ -52,16 +45,10 @@ def same_driving(read: pl.DataFrame, expected: pl.DataFrame) -> None:
         assert (read[name] - expected[name]).abs().max() < tolerance, name
 
 
-def test_raw_text_gives_back_the_recording_in_metres_from_centres_and_from_the_right(
-    tmp_path,
-):
+def test_raw_text_gives_back_the_recording_in_metres_from_centres_and_from_the_right(tmp_path):
     path = text_file(tmp_path, ngsim_rows(FIRST))
     (scene,) = ngsim_scenes(path)
-    assert (
-        scene.name,
-        scene.frame.schema,
-        scene.lanes,
-    ) == (
+    assert (scene.name, scene.frame.schema, scene.lanes) == (
         "trajectories-0750am-0805am-1",
         SCHEMA,
         3,
@@ -74,10 +61,7 @@ def test_raw_text_gives_back_the_recording_in_metres_from_centres_and_from_the_r
         read_recordings("moon", path)
 
 
-@pytest.mark.parametrize(
-    ("block_bytes", "thousands"),
-    [(10_000, True), (2**25, False)],
-)
+@pytest.mark.parametrize(("block_bytes", "thousands"), [(10_000, True), (2**25, False)])
 def test_the_portals_periods_are_separated_by_time_in_any_order_and_blocks(
     tmp_path, block_bytes, thousands
 ):
@@ -87,25 +71,14 @@ def test_the_portals_periods_are_separated_by_time_in_any_order_and_blocks(
     )
     path = portal_file(tmp_path, portal_csv(rows, thousands=thousands))
     count = RowCount()
-    scenes = list(
-        ngsim_scenes(
-            path,
-            NgsimParameters(block_bytes=block_bytes),
-            count,
-        )
-    )
-    assert [scene.name for scene in scenes] == [
-        "us-101-1",
-        "us-101-2",
-    ]
+    scenes = list(ngsim_scenes(path, NgsimParameters(block_bytes=block_bytes), count))
+    assert [scene.name for scene in scenes] == ["us-101-1", "us-101-2"]
     same_driving(scenes[0].frame, FIRST)
     same_driving(scenes[1].frame, SECOND)
     assert (count.read, count.kept) == (1080, 1080)
 
 
-def test_duplicates_and_other_places_are_dropped_and_counted(
-    tmp_path,
-):
+def test_duplicates_and_other_places_are_dropped_and_counted(tmp_path):
     rows = ngsim_rows(FIRST)
     # The same vehicle and time, at another speed.
     other = rows.head(1).with_columns(v_Vel=pl.lit(9.0))
@@ -113,19 +86,11 @@ def test_duplicates_and_other_places_are_dropped_and_counted(
         portal_csv(pl.concat((rows, rows.head(30), other))),
         *(
             portal_csv(rows.head(n), place).partition("\n")[2]
-            for place, n in (
-                ("lankershim", 7),
-                ("peachtree", 5),
-            )
+            for place, n in (("lankershim", 7), ("peachtree", 5))
         ),
     ]
     count = RowCount()
-    scenes = list(
-        ngsim_scenes(
-            portal_file(tmp_path, "".join(parts)),
-            count=count,
-        )
-    )
+    scenes = list(ngsim_scenes(portal_file(tmp_path, "".join(parts)), count=count))
     same_driving(scenes[0].frame, FIRST)
     assert dict(count.dropped) == {
         "location lankershim": 7,
@@ -168,48 +133,18 @@ def changed(folder, row: int, column: str, value: str):
 @pytest.mark.parametrize(
     ("row", "column", "value", "message"),
     [
-        (
-            400,
-            "local_x",
-            "NaN",
-            r"line 402, column local_x: 'NaN' is not a finite number",
-        ),
-        (
-            7,
-            "v_vel",
-            "-3.0",
-            r"line 9, column v_vel: -3.0 is below 0",
-        ),
-        (
-            8,
-            "v_length",
-            "0",
-            r"line 10, column v_length: 0.0 is not above 0",
-        ),
-        (
-            6,
-            "local_y",
-            '"1,2"',
-            r"line 8, column local_y: '1,2' is not a number",
-        ),
-        (
-            6,
-            "location",
-            "us-10",
-            r"line 8, column location: 'us-10' is no known place",
-        ),
+        (400, "local_x", "NaN", r"line 402, column local_x: 'NaN' is not a finite number"),
+        (7, "v_vel", "-3.0", r"line 9, column v_vel: -3.0 is below 0"),
+        (8, "v_length", "0", r"line 10, column v_length: 0.0 is not above 0"),
+        (6, "local_y", '"1,2"', r"line 8, column local_y: '1,2' is not a number"),
+        (6, "location", "us-10", r"line 8, column location: 'us-10' is no known place"),
         (
             9,
             "frame_id",
             "9000000",
             r"line 11, columns frame_id and global_time: frame 9000000 .* fits no recording",
         ),
-        (
-            9,
-            "frame_id",
-            "7",
-            r"line 11, column frame_id: 7 does not grow with global_time",
-        ),
+        (9, "frame_id", "7", r"line 11, column frame_id: 7 does not grow with global_time"),
         (
             9,
             "global_time",
@@ -224,34 +159,18 @@ def test_a_damaged_field_is_named_by_file_line_and_column(
 ):
     path = changed(tmp_path, row, column, value)
     with user_error(message) as caught:
-        read_recordings(
-            "ngsim",
-            path,
-            NgsimParameters(block_bytes=block_bytes),
-        )
+        read_recordings("ngsim", path, NgsimParameters(block_bytes=block_bytes))
     assert str(path) in str(caught.value)
 
 
-def test_a_truncated_file_is_refused_and_a_whole_one_read(
-    tmp_path,
-):
+def test_a_truncated_file_is_refused_and_a_whole_one_read(tmp_path):
     rows = ngsim_rows(FIRST)
     # A missing line break at the end does no harm, missing fields do.
     whole = portal_csv(rows, thousands=False)
-    assert (
-        read_recordings(
-            "ngsim",
-            portal_file(tmp_path, whole.rstrip("\n")),
-        ).height
-        == 540
-    )
+    assert read_recordings("ngsim", portal_file(tmp_path, whole.rstrip("\n"))).height == 540
     with user_error(r"line 541, column lane_id: the row has 14 fields, expected 19"):
         read_recordings(
-            "ngsim",
-            portal_file(
-                tmp_path,
-                ",".join(whole.rstrip("\n").split(",")[:-5]),
-            ),
+            "ngsim", portal_file(tmp_path, ",".join(whole.rstrip("\n").split(",")[:-5]))
         )
     text = text_file(tmp_path, rows)
     text.write_bytes(text.read_bytes()[:-30])
@@ -263,37 +182,15 @@ def test_a_truncated_file_is_refused_and_a_whole_one_read(
     ("columns", "factor", "message"),
     [
         (
-            (
-                "Local_X",
-                "Local_Y",
-                "v_length",
-                "v_Width",
-                "v_Vel",
-            ),
+            ("Local_X", "Local_Y", "v_length", "v_Width", "v_Vel"),
             0.3048,
             "column v_length: .*they look like metres",
         ),
-        (
-            ("v_Vel",),
-            1.09728,
-            "columns local_y and v_vel: vehicles cover 0.91 times",
-        ),
-        (
-            ("v_Vel",),
-            0.3048,
-            "columns local_y and v_vel: vehicles cover 3.28 times",
-        ),
-        (
-            ("v_Vel",),
-            0.681818,
-            "columns local_y and v_vel: vehicles cover 1.47 times",
-        ),
+        (("v_Vel",), 1.09728, "columns local_y and v_vel: vehicles cover 0.91 times"),
+        (("v_Vel",), 0.3048, "columns local_y and v_vel: vehicles cover 3.28 times"),
+        (("v_Vel",), 0.681818, "columns local_y and v_vel: vehicles cover 1.47 times"),
         (("Local_Y",), 0.3048, "vehicles cover 0.30 times"),
-        (
-            ("v_length",),
-            30.48,
-            "they look like centimetres or inches",
-        ),
+        (("v_length",), 30.48, "they look like centimetres or inches"),
     ],
 )
 def test_units_that_cannot_be_feet_and_seconds_are_refused(tmp_path, columns, factor, message):
@@ -304,37 +201,18 @@ def test_units_that_cannot_be_feet_and_seconds_are_refused(tmp_path, columns, fa
     assert "line 1" in str(caught.value)
 
 
-def test_files_of_other_columns_or_places_are_refused(
-    tmp_path,
-):
+def test_files_of_other_columns_or_places_are_refused(tmp_path):
     with user_error(r"line 1: 17 columns; expected the 18"):
-        read_recordings(
-            "ngsim",
-            text_file(tmp_path, ngsim_rows(FIRST).drop("v_Class")),
-        )
+        read_recordings("ngsim", text_file(tmp_path, ngsim_rows(FIRST).drop("v_Class")))
     with user_error(r"no rows of us-101, i-80; check data.locations"):
-        read_recordings(
-            "ngsim",
-            portal_file(
-                tmp_path,
-                portal_csv(ngsim_rows(FIRST), "peachtree"),
-            ),
-        )
+        read_recordings("ngsim", portal_file(tmp_path, portal_csv(ngsim_rows(FIRST), "peachtree")))
 
 
-def test_temporary_files_are_removed_after_an_error(
-    tmp_path,
-):
+def test_temporary_files_are_removed_after_an_error(tmp_path):
     path = changed(tmp_path, 500, "local_y", "far")
     scratch = tmp_path / "scratch"
     # The damage is late in the file, when blocks are on the disk.
     scratch.mkdir()
     with pytest.raises(UserError):
-        list(
-            ngsim_scenes(
-                path,
-                NgsimParameters(block_bytes=20_000),
-                scratch=scratch,
-            )
-        )
+        list(ngsim_scenes(path, NgsimParameters(block_bytes=20_000), scratch=scratch))
     assert list(scratch.iterdir()) == []

@@ -15,51 +15,20 @@ def lane_file(path):
         for car in range(12)
         for frame in range(20 * car, 320)
     ]
-    pl.DataFrame(
-        rows,
-        schema=["vehicle", "frame", "x", "x_raw"],
-        orient="row",
-    ).write_csv(path)
+    pl.DataFrame(rows, schema=["vehicle", "frame", "x", "x_raw"], orient="row").write_csv(path)
 
 
 def pairs_file(path):
     rows = [
-        (
-            "2-1",
-            role,
-            number,
-            float(frame),
-            10.0 + start + 0.9 * frame,
-            None,
-            9.0,
-            2,
-            5.0,
-            2.0,
-        )
+        ("2-1", role, number, float(frame), 10.0 + start + 0.9 * frame, None, 9.0, 2, 5.0, 2.0)
         for frame in range(400)
-        for role, number, start in (
-            ("follower", 2, 0.0),
-            ("leader", 1, 25.0),
-        )
+        for role, number, start in (("follower", 2, 0.0), ("leader", 1, 25.0))
     ]
-    names = [
-        "pair",
-        "role",
-        "vehicle",
-        "frame",
-        "x",
-        "y_right",
-        "v",
-        "lane",
-        "length",
-        "width",
-    ]
+    names = ["pair", "role", "vehicle", "frame", "x", "y_right", "v", "lane", "length", "width"]
     pl.DataFrame(rows, schema=names, orient="row").write_csv(path)
 
 
-def test_pairs_have_a_driven_follower_at_the_recorded_gap(
-    tmp_path,
-):
+def test_pairs_have_a_driven_follower_at_the_recorded_gap(tmp_path):
     for name, write, gap, speed in (
         ("I-80, pairs", pairs_file, 20.0, 9.0),
         ("I-80, following", following_file, 10.0, 7.0),
@@ -76,9 +45,7 @@ def test_pairs_have_a_driven_follower_at_the_recorded_gap(
         assert recordings[0].speed[recordings[0].present] == pytest.approx(speed)
 
 
-def test_a_lane_is_driven_as_a_whole_in_stretches_of_their_own(
-    tmp_path,
-):
+def test_a_lane_is_driven_as_a_whole_in_stretches_of_their_own(tmp_path):
     lane_file(tmp_path / ONE_LANE_FILES["I-80, lane_1"])
     recordings = read_one_lane("I-80, lane_1", tmp_path / ONE_LANE_FILES["I-80, lane_1"])
     assert len({piece.unit for piece in recordings}) == len(recordings) == 2

@@ -9,12 +9,7 @@ from pathlib import Path
 
 import polars as pl
 import pytest
-from reference.recordings import (
-    ngsim_rows,
-    portal_csv,
-    traffic,
-    write_highd,
-)
+from reference.recordings import ngsim_rows, portal_csv, traffic, write_highd
 from reference.refusals import user_error
 from reference.scene_csv import write_scene_csv
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
@@ -81,36 +76,11 @@ def test_a_track_that_runs_backwards_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("row", "column", "value", "message"),
     [
-        (
-            7,
-            "lane",
-            "0",
-            r"line 9, column lane: 0 is below 1",
-        ),
-        (
-            8,
-            "frame",
-            "1",
-            r"line 10, column frame: 1 comes twice",
-        ),
-        (
-            9,
-            "frame",
-            "0",
-            r"line 11, column frame: 0 is before",
-        ),
-        (
-            10,
-            "length",
-            "0",
-            r"line 12, column length: 0.0 is not above 0",
-        ),
-        (
-            11,
-            "x",
-            "here",
-            r"line 13, column x: 'here' is not a number",
-        ),
+        (7, "lane", "0", r"line 9, column lane: 0 is below 1"),
+        (8, "frame", "1", r"line 10, column frame: 1 comes twice"),
+        (9, "frame", "0", r"line 11, column frame: 0 is before"),
+        (10, "length", "0", r"line 12, column length: 0.0 is not above 0"),
+        (11, "x", "here", r"line 13, column x: 'here' is not a number"),
     ],
 )
 def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column, value, message):
@@ -123,42 +93,22 @@ def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column,
 @pytest.mark.parametrize(
     ("column", "factor", "message"),
     [
-        (
-            "v",
-            10.0,
-            "line 2, column speed: the median is 100.0",
-        ),
+        ("v", 10.0, "line 2, column speed: the median is 100.0"),
         (
             "v",
             3.6,
             "line 3, columns x and speed: x moves by 10.0 m per second where speed says 36.0",
         ),
-        (
-            "x",
-            3.28,
-            "x moves by 32.8 m per second where speed says 10.0",
-        ),
+        ("x", 3.28, "x moves by 32.8 m per second where speed says 10.0"),
         ("x", -1.0, "x moves by -10.0 m per second"),
-        (
-            "length",
-            3.28,
-            "line 2, column length: the median is 14.8",
-        ),
+        ("length", 3.28, "line 2, column length: the median is 14.8"),
         ("y", 3.28, "lanes are 11.48 m apart"),
         ("y", -1.0, "lanes are -3.50 m apart"),
     ],
 )
 def test_units_and_directions_that_cannot_be_are_refused(tmp_path, column, factor, message):
     with user_error(message):
-        read_scenes(
-            written(
-                tmp_path,
-                changed(
-                    column,
-                    lambda field: str(float(field) * factor),
-                ),
-            )
-        )
+        read_scenes(written(tmp_path, changed(column, lambda field: str(float(field) * factor))))
 
 
 @pytest.mark.parametrize(
@@ -169,10 +119,7 @@ def test_units_and_directions_that_cannot_be_are_refused(tmp_path, column, facto
             r"line 1: no column v, lane.*found .*speed; expected",
         ),
         (HEADER.encode() + b"\n", "a header but no rows"),
-        (
-            b"\x89PNG\r\n\x1a\n\x00\xff\xfe" * 50,
-            r"line 1: not text",
-        ),
+        (b"\x89PNG\r\n\x1a\n\x00\xff\xfe" * 50, r"line 1: not text"),
     ],
 )
 def test_files_without_columns_rows_or_text_are_refused(content, message, tmp_path):
@@ -192,10 +139,7 @@ def test_absent_files_are_refused(name, tmp_path):
 def test_a_scene_in_two_files_is_refused(tmp_path):
     # Two scenes in one file, one of them in the other, too.
     write_prepared(synthetic_scenes(), tmp_path / "a.parquet")
-    write_prepared(
-        synthetic_scenes(SyntheticTraffic(scenes=1)),
-        tmp_path / "b.parquet",
-    )
+    write_prepared(synthetic_scenes(SyntheticTraffic(scenes=1)), tmp_path / "b.parquet")
     with user_error(r"b.parquet: scene synthetic-0 is in .*a.parquet too; remove one"):
         read_scenes(tmp_path)
 
@@ -215,10 +159,7 @@ def test_damaged_parquet_is_refused(tmp_path):
         read_scenes(path)
 
 
-@pytest.mark.parametrize(
-    ("every", "renumbered"),
-    [(2, False), (5, False), (2, True), (3, True)],
-)
+@pytest.mark.parametrize(("every", "renumbered"), [(2, False), (5, False), (2, True), (3, True)])
 def test_recordings_with_frames_missing_throughout_are_refused(every, renumbered, tmp_path):
     frame = synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=6, seconds=8.0))
     # One scene is whole; the other one has every second frame alone, or so.
@@ -251,19 +192,12 @@ def test_scenes_one_by_one_say_what_they_say_together(seed):
         assert getattr(apart.lane_changes, name) == pytest.approx(
             getattr(together.lane_changes, name)
         ), name
-    for name in (
-        "speed",
-        "acceleration_raw",
-        "acceleration_smoothed",
-        "headway",
-    ):
+    for name in ("speed", "acceleration_raw", "acceleration_smoothed", "headway"):
         one = describe(apart.sample(name))
         other = getattr(together, name)
-        assert (
-            one.count,
-            one.mean,
-            one.sd,
-        ) == pytest.approx((other.count, other.mean, other.sd)), name
+        assert (one.count, one.mean, one.sd) == pytest.approx(
+            (other.count, other.mean, other.sd)
+        ), name
         assert one.quantiles == pytest.approx(other.quantiles), name
 
 
@@ -319,9 +253,7 @@ def test_reports_state_rows_rates_and_durations(tmp_path):
     assert "lane changes: 0; 0.000 per vehicle and km of road (equation 9)" in report
 
 
-def test_the_output_folder_appears_only_when_everything_was_written(
-    tmp_path,
-):
+def test_the_output_folder_appears_only_when_everything_was_written(tmp_path):
     lines = ngsim_lines(thousands=False)
     # The last row is damaged.
     (tmp_path / "bad.csv").write_text("\n".join([*lines, lines[-1].replace(",", ",x", 1)]))
@@ -341,27 +273,18 @@ def refused(frame: pl.DataFrame, folder: Path, message: str) -> None:
         prepare_recordings("scenes", folder / "a.parquet", folder / "out")
 
 
-def test_parked_cars_and_names_that_differ_in_a_blank_alone_are_refused(
-    tmp_path,
-):
+def test_parked_cars_and_names_that_differ_in_a_blank_alone_are_refused(tmp_path):
     # Nobody moves in any scene.
     parked = synthetic_scenes().with_columns(
-        speed=pl.lit(0.0),
-        x=pl.col("x").first().over("scene", "vehicle"),
+        speed=pl.lit(0.0), x=pl.col("x").first().over("scene", "vehicle")
     )
     refused(parked, tmp_path, "no scene in which anybody drives")
     names = pl.col("scene").replace({"synthetic-0": "my road", "synthetic-1": "my_road"})
     message = r"a second scene that my_road.parquet is the file of"
-    refused(
-        synthetic_scenes().with_columns(names),
-        tmp_path,
-        message,
-    )
+    refused(synthetic_scenes().with_columns(names), tmp_path, message)
 
 
-def test_recordings_without_vehicles_on_the_lanes_are_refused(
-    tmp_path,
-):
+def test_recordings_without_vehicles_on_the_lanes_are_refused(tmp_path):
     write_highd(tmp_path)
     # A lane number that neither direction has.
     tracks = tmp_path / "01_tracks.csv"
@@ -370,21 +293,13 @@ def test_recordings_without_vehicles_on_the_lanes_are_refused(
         read_recordings("highd", tmp_path)
 
 
-def test_an_error_names_the_folder_to_be_and_other_files_as_they_are(
-    tmp_path,
-):
+def test_an_error_names_the_folder_to_be_and_other_files_as_they_are(tmp_path):
     out = tmp_path / "scenes"
     too_long = "s" * 300
-    with (
-        pytest.raises(OSError, match="too long") as caught,
-        whole_folder(out) as folder,
-    ):
+    with pytest.raises(OSError, match="too long") as caught, whole_folder(out) as folder:
         write_bytes(folder / too_long, b"")
     assert caught.value.filename == str(out / too_long)
-    with (
-        pytest.raises(FileNotFoundError) as caught,
-        whole_folder(out),
-    ):
+    with pytest.raises(FileNotFoundError) as caught, whole_folder(out):
         (tmp_path / "absent").read_bytes()
     assert caught.value.filename == str(tmp_path / "absent")
     assert list(tmp_path.iterdir()) == []

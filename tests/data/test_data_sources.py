@@ -42,9 +42,7 @@ def test_the_recordings_are_found_beside_the_current_folder(tmp_path, monkeypatc
     module = sys.modules["ganlane.data.sources"]
     # As if the package were installed elsewhere.
     monkeypatch.setattr(
-        module,
-        "__file__",
-        str(tmp_path / "site" / "ganlane" / "data" / "sources.py"),
+        module, "__file__", str(tmp_path / "site" / "ganlane" / "data" / "sources.py")
     )
     work = tmp_path / "work"
     work.mkdir()

@@ -40,21 +40,12 @@ def track(vehicle, x, lane=0, scene="s", y=None, length=4.0):
         [length] * n,
         [2.0] * n,
     ]
-    return pl.DataFrame(
-        dict(zip(SCHEMA, columns)),
-        schema=SCHEMA,
-        strict=False,
-    )
+    return pl.DataFrame(dict(zip(SCHEMA, columns)), schema=SCHEMA, strict=False)
 
 
 @pytest.mark.parametrize(
     ("count", "low", "high"),
-    [
-        (0, 0.0, 3.689),
-        (1, 0.0253, 5.572),
-        (10, 4.795, 18.39),
-        (57, 43.17, 73.85),
-    ],
+    [(0, 0.0, 3.689), (1, 0.0253, 5.572), (10, 4.795, 18.39), (57, 43.17, 73.85)],
 )
 def test_the_exact_interval_of_a_count_is_the_tabled_one(count, low, high):
     # Garwood's limits as tabled in textbooks of epidemiology.
@@ -113,26 +104,14 @@ def recording():
     early, late = (
         track(v, 20.0 * time[:51] + off, lane=2) for v, off in ((3, 0.0), (10_003, 400.0))
     )
-    return pl.concat(
-        (
-            one,
-            other,
-            early,
-            late.with_columns(pl.col("frame") + 200),
-        )
-    )
+    return pl.concat((one, other, early, late.with_columns(pl.col("frame") + 200)))
 
 
 def test_a_recording_is_measured_as_by_hand():
     measured = driving_statistics(recording(), {"s": 3.5})
     exposure = measured.exposure
     changes = measured.lane_changes
-    assert (
-        exposure.scenes,
-        exposure.tracks,
-        exposure.cars,
-        exposure.samples,
-    ) == (1, 4, 3, 604)
+    assert (exposure.scenes, exposure.tracks, exposure.cars, exposure.samples) == (1, 4, 3, 604)
     assert exposure.road_m == pytest.approx(500.0)
     # Straight: 500 + 500 + 100 + 100 m; the change adds 3.5 s of sqrt(20^2 + 1) less 20 m/s, 0.09
     # m.
@@ -140,10 +119,7 @@ def test_a_recording_is_measured_as_by_hand():
     assert changes.count == 1
     assert changes.srlc == pytest.approx(1 / 3 * 1000 / 500)
     assert changes.per_vehicle_km == pytest.approx(1 / 1.2, rel=1e-3)
-    bounds = (
-        changes.per_vehicle_km_low,
-        changes.per_vehicle_km_high,
-    )
+    bounds = (changes.per_vehicle_km_low, changes.per_vehicle_km_high)
     assert bounds == pytest.approx((0.0253 / 1.2, 5.572 / 1.2), rel=1e-2)
     assert changes.t_m_srlc_steps == pytest.approx(750.0)
     assert changes.t_m_vehicle_km_steps == pytest.approx(600.0, rel=1e-3)
@@ -154,11 +130,7 @@ def test_a_recording_is_measured_as_by_hand():
 
 
 @pytest.mark.parametrize(
-    "frame",
-    [
-        recording(),
-        synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=1)),
-    ],
+    "frame", [recording(), synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=1))]
 )
 def test_statistics_survive_json(frame):
     measured = driving_statistics(frame)
@@ -181,16 +153,9 @@ def test_a_lone_lane_keeper_leaves_the_rest_open():
         synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=1, changing_share=0.0))
     )
     changes = measured.lane_changes
-    assert (
-        changes.count,
-        changes.t_m_srlc_steps,
-        changes.per_vehicle_km_low,
-    ) == (0, None, 0.0)
+    assert (changes.count, changes.t_m_srlc_steps, changes.per_vehicle_km_low) == (0, None, 0.0)
     assert changes.per_vehicle_km_high > 0.0
-    assert (
-        measured.headway.count,
-        measured.speed_sd_in_frame,
-    ) == (0, None)
+    assert (measured.headway.count, measured.speed_sd_in_frame) == (0, None)
 
 
 def test_the_survival_curve_takes_censored_times_as_lower_bounds():
@@ -203,23 +168,13 @@ def test_the_survival_curve_takes_censored_times_as_lower_bounds():
     described = describe_durations(*durations)
     assert described.survival_mean_s == pytest.approx(1.0 + 2 * 0.8 + 2 * 0.8 * 2 / 3)
     assert described.survival_median_s == 5.0
-    assert (
-        described.complete.count,
-        described.censored,
-    ) == (3, 2)
-    assert (
-        described.complete.mean,
-        described.complete.sd,
-    ) == (3.0, 2.0)
+    assert (described.complete.count, described.censored) == (3, 2)
+    assert (described.complete.mean, described.complete.sd) == (3.0, 2.0)
 
 
 def test_durations_that_are_all_censored_have_no_mean():
     durations = describe_durations(np.array([1.0, 2.0]), np.array([False, False]))
-    assert (
-        durations.censored,
-        durations.survival_mean_s,
-        durations.complete.mean,
-    ) == (
+    assert (durations.censored, durations.survival_mean_s, durations.complete.mean) == (
         2,
         None,
         None,
@@ -265,13 +220,10 @@ def test_the_lane_changes(scenes, measured):
     assert per_scene == [16, 5, 3, 21, 2, 0, 3, 3, 0, 3, 1]
 
 
-def test_the_spread_of_speeds_accelerations_and_headways(
-    measured,
-):
-    assert (
-        measured.speed_sd_in_frame,
-        measured.speed_sd_in_lane,
-    ) == pytest.approx((2.8, 1.7), abs=0.05)
+def test_the_spread_of_speeds_accelerations_and_headways(measured):
+    assert (measured.speed_sd_in_frame, measured.speed_sd_in_lane) == pytest.approx(
+        (2.8, 1.7), abs=0.05
+    )
     smooth = [measured.acceleration_smoothed.quantile(level) for level in (0.05, 0.95)]
     assert smooth == pytest.approx([-1.2, 1.4], abs=0.05)
     headways = [measured.headway.quantile(level) for level in (0.05, 0.25, 0.5, 0.75, 0.95)]

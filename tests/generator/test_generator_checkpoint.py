@@ -30,33 +30,18 @@ def plain(record) -> dict:
     return json.loads(json.dumps(asdict(record)))
 
 
-def test_save_and_load_give_the_same_network_and_its_description(
-    tmp_path,
-):
+def test_save_and_load_give_the_same_network_and_its_description(tmp_path):
     path = tmp_path / "generator.safetensors"
     config = PaperConfig()
-    described = {
-        "data": {"file": "a.csv"},
-        "statistics": {"headway": {}},
-    }
+    described = {"data": {"file": "a.csv"}, "statistics": {"headway": {}}}
     metrics = {"all": {"ade_m/mean": 0.5}}
-    fitted = FitResult(
-        config,
-        small_generator(),
-        metrics,
-        updates=7,
-        seconds=1.25,
-        **described,
-    )
+    fitted = FitResult(config, small_generator(), metrics, updates=7, seconds=1.25, **described)
     fitted.save(path, folds={"splits": []})
     generator, metadata = load_generator(path, "paper")
     for name, tensor in fitted.module.state_dict().items():
         assert (generator.state_dict()[name] == tensor).all(), name
     assert not any(parameter.requires_grad for parameter in generator.parameters())
-    assert metadata["metrics"] == {
-        **metrics,
-        "fit": {"updates": 7, "seconds": 1.2},
-    }
+    assert metadata["metrics"] == {**metrics, "fit": {"updates": 7, "seconds": 1.2}}
     assert metadata["config"] == plain(config)
     assert metadata["data"] == described["data"]
     assert metadata["driving_statistics"] == described["statistics"]
@@ -78,30 +63,14 @@ PLAIN_SIZES = asdict(SIZES)
 @pytest.mark.parametrize(
     ("wrong", "preset", "message"),
     [
-        (
-            {"kind": "agent"},
-            None,
-            "expected a ganlane checkpoint of kind generator",
-        ),
+        ({"kind": "agent"}, None, "expected a ganlane checkpoint of kind generator"),
         ({}, "calibrated", "expected 'calibrated'"),
         ({"preset": "own"}, None, "preset 'own'"),
         ({"sizes": None}, None, "do not fit the sizes"),
         ({"sizes": {"hidden": 3}}, None, "do not fit the sizes"),
-        (
-            {"sizes": PLAIN_SIZES | {"hidden": 10**9}},
-            None,
-            "do not fit the sizes",
-        ),
-        (
-            {"sizes": PLAIN_SIZES | {"neighbours": True}},
-            None,
-            "do not fit the sizes",
-        ),
-        (
-            {"sizes": PLAIN_SIZES | {"noise": 20}},
-            None,
-            "do not fit the sizes",
-        ),
+        ({"sizes": PLAIN_SIZES | {"hidden": 10**9}}, None, "do not fit the sizes"),
+        ({"sizes": PLAIN_SIZES | {"neighbours": True}}, None, "do not fit the sizes"),
+        ({"sizes": PLAIN_SIZES | {"noise": 20}}, None, "do not fit the sizes"),
         ({"sizes": PLAIN_SIZES | {"hidden": 20}}, None, "do not fit the sizes"),
         ({"tensors": {"x": torch.zeros(2)}}, None, "do not fit the sizes"),
         ({"preset": "calibrated"}, "calibrated", "further inputs"),
@@ -131,14 +100,7 @@ def test_wrong_checkpoints_are_refused_in_one_sentence(wrong, preset, message, t
 @pytest.mark.parametrize(
     ("preset", "most"),
     [
-        (
-            "paper",
-            {
-                "ade_m/mean": 0.85,
-                "ade_m/single": 0.95,
-                "ade_m/best_of_20": 0.65,
-            },
-        ),
+        ("paper", {"ade_m/mean": 0.85, "ade_m/single": 0.95, "ade_m/best_of_20": 0.65}),
         ("calibrated", {"ade_m/mean": 0.91, "end_m/mean": 0.75}),
     ],
 )
@@ -171,10 +133,7 @@ def test_the_shipped_weights_are_of_the_default_settings_and_beat_constant_veloc
 
 @pytest.mark.parametrize(
     ("preset", "least"),
-    [
-        ("paper", {"mean": 15, "single": 5, "best_of_20": 35}),
-        ("calibrated", {"mean": 9}),
-    ],
+    [("paper", {"mean": 15, "single": 5, "best_of_20": 35}), ("calibrated", {"mean": 9})],
 )
 def test_pooled_over_folds_the_errors_stay_under_constant_velocitys_and_stand_in_the_docs(
     preset, least
@@ -192,11 +151,7 @@ def test_pooled_over_folds_the_errors_stay_under_constant_velocitys_and_stand_in
         assert folds["rollout"]["tracks"] > 400
         assert folds["rollout"]["ratio_to_constant_velocity"]["mean"] <= 0.75
     page = (Path(__file__).parents[2] / "docs" / "generators.md").read_text()
-    texts = {
-        "mean": "mean prediction",
-        "single": "a single sample",
-        "best_of_20": "best of 20",
-    }
+    texts = {"mean": "mean prediction", "single": "a single sample", "best_of_20": "best of 20"}
     for kind, text in texts.items():
         begin = f"| `generator_{preset}`, {text}"
         row = next(line for line in page.splitlines() if line.startswith(begin))

@@ -5,22 +5,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from reference.small_networks import (
-    recorded_scenes,
-    silenced,
-    small_generator,
-)
+from reference.small_networks import recorded_scenes, silenced, small_generator
 from reference.worlds import vehicles as placed
 
 from ganlane.generator import closed_loop
 from ganlane.generator.networks import Generator
 from ganlane.generator.windows import cut_segments
 from ganlane.settings.generator import EXTRA_INPUTS, CalibratedConfig
-from ganlane.sim.idm import (
-    IdmParameters,
-    equilibrium_gap,
-    idm_acceleration,
-)
+from ganlane.sim.idm import IdmParameters, equilibrium_gap, idm_acceleration
 from ganlane.sim.state import Road, Visibility
 
 ROAD = Road(3, 4.0)
@@ -121,8 +113,7 @@ def test_the_paper_drives_the_first_predicted_displacement():
     noise = torch.randn(1, 2, 4).double()
     past = closed_loop.displacement_of(state)[..., None, :].expand(1, 2, 8, 2)
     predicted = generator(
-        generator.observe(past, torch.stack([state.x, state.y], -1), state.valid),
-        noise,
+        generator.observe(past, torch.stack([state.x, state.y], -1), state.valid), noise
     )
     after, _ = closed_loop.paper_step(generator, state, history, noise)
     moved = torch.stack([after.x - state.x, after.y - state.y], -1)
@@ -162,8 +153,7 @@ def test_a_rollout_is_the_same_with_more_padding(segments, generator):
         length=pad(segments.length, (0, 4), value=1.0),
     )
     torch.testing.assert_close(
-        typical_rollout(generator, wide)[:, :, :7],
-        typical_rollout(generator, segments),
+        typical_rollout(generator, wide)[:, :, :7], typical_rollout(generator, segments)
     )
 
 
@@ -183,11 +173,7 @@ def test_gradient_of_a_rollout_is_finite_and_reaches_every_parameter(scenes, gen
     segments = cut_segments([(scenes[0], 0), (scenes[1], 9)], horizon=6)
     noise = torch.randn(7, 3, 2, 7, 4)
     positions = closed_loop.rollout(
-        generator,
-        segments,
-        closed_loop.driver_params(segments),
-        noise,
-        CalibratedConfig(),
+        generator, segments, closed_loop.driver_params(segments), noise, CalibratedConfig()
     )
     (positions - segments.future).abs()[:, segments.scored].sum().backward()
     for name, parameter in generator.named_parameters():
@@ -200,7 +186,4 @@ def test_nothing_of_the_future_enters_an_evaluation(segments, generator):
     before = typical_rollout(generator, segments.without_intentions())
     segments.positions[:, 9:] += 7.0
     segments.target_lane[:, 9:] = 0
-    torch.testing.assert_close(
-        typical_rollout(generator, segments.without_intentions()),
-        before,
-    )
+    torch.testing.assert_close(typical_rollout(generator, segments.without_intentions()), before)

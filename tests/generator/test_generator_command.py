@@ -9,13 +9,7 @@ from pathlib import Path
 
 import polars as pl
 import pytest
-from reference.recordings import (
-    START_MS,
-    ngsim_rows,
-    portal_csv,
-    raw_text,
-    traffic,
-)
+from reference.recordings import START_MS, ngsim_rows, portal_csv, raw_text, traffic
 from reference.scene_csv import write_scene_csv
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
@@ -46,10 +40,7 @@ def here(tmp_path, monkeypatch):
 def recordings(here):
     """A scene CSV in the current folder."""
     path = here / "recordings.csv"
-    write_scene_csv(
-        synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=5, seconds=4.0)),
-        path,
-    )
+    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=5, seconds=4.0)), path)
     return f"data.path={path}"
 
 
@@ -86,9 +77,7 @@ def test_folds_are_pooled_kept_and_not_fitted_again(recordings, capsys):
 def test_too_many_folds_are_refused_before_anything_is_fitted(recordings, capsys, monkeypatch):
     fitted = []
     monkeypatch.setattr(
-        ganlane.generator,
-        "cross_validate",
-        lambda *arguments: fitted.append(arguments),
+        ganlane.generator, "cross_validate", lambda *arguments: fitted.append(arguments)
     )
     assert main([recordings, "folds=9", *FEW]) == 2
     assert "folds=9" in capsys.readouterr().err
@@ -106,11 +95,7 @@ def test_the_periods_of_an_ngsim_file_are_the_scenes_whether_raw_or_prepared(her
         ["us-101-1"],
         ["us-101-2"],
     )
-    assert (data["file"], data["rows"], data["tracks"]) == (
-        "got.csv",
-        3 * 9 * 60,
-        27,
-    )
+    assert (data["file"], data["rows"], data["tracks"]) == ("got.csv", 3 * 9 * 60, 27)
     assert prepare(["data=ngsim", "data.path=got.csv", "out=prepared"]) == 0
     prepared = run("data.path=prepared")
     for name in ("ade_m", "fde_m", "scenes"):
@@ -120,10 +105,7 @@ def test_the_periods_of_an_ngsim_file_are_the_scenes_whether_raw_or_prepared(her
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
-        (
-            ["data=ngsim"],
-            "data=ngsim: which file is missing; give data.path=FILE.",
-        ),
+        (["data=ngsim"], "data=ngsim: which file is missing; give data.path=FILE."),
         (
             ["data=ngsim", "data.path=one.txt"],
             "recordings of one scene, one-1: one has to be fitted to and another",
@@ -142,8 +124,4 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing(arguments, part, here, rec
     err = capsys.readouterr().err
     assert part in err
     assert err.count("\n") == 1
-    assert sorted(path.name for path in here.iterdir()) == [
-        "cut.txt",
-        "one.txt",
-        "recordings.csv",
-    ]
+    assert sorted(path.name for path in here.iterdir()) == ["cut.txt", "one.txt", "recordings.csv"]

@@ -11,12 +11,7 @@ from ganlane.data.dense import recordings_of
 from ganlane.data.statistics import measure_exposure
 from ganlane.errors import UserError
 from ganlane.generator.checkpoint import load_generator
-from ganlane.generator.fit import (
-    assign_folds,
-    cross_validate,
-    fit_generator,
-    split_for_fit,
-)
+from ganlane.generator.fit import assign_folds, cross_validate, fit_generator, split_for_fit
 from ganlane.generator.windows import count_windows
 
 
@@ -24,10 +19,7 @@ from ganlane.generator.windows import count_windows
 def scenes():
     """Seven scenes of 2.5 to 8.5 s, so that they differ in their windows."""
     frames = [
-        synthetic_scenes(
-            SyntheticTraffic(scenes=1, vehicles=6, seconds=2.5 + number),
-            seed=number,
-        )
+        synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=6, seconds=2.5 + number), seed=number)
         for number in range(7)
     ]
     return [
@@ -59,18 +51,12 @@ def test_reported_scenes_have_no_say_in_when_to_stop(scenes):
         assert total / 12 <= held < total / 2
 
 
-def test_more_folds_than_scenes_and_splits_without_two_parts_are_refused(
-    scenes,
-):
+def test_more_folds_than_scenes_and_splits_without_two_parts_are_refused(scenes):
     with pytest.raises(UserError, match="folds=8"):
         assign_folds(scenes, 8)
     with pytest.raises(UserError, match="at least 3 scenes"):
         assign_folds(scenes[:2], 2)
-    for held_out in (
-        ("nowhere",),
-        (),
-        tuple(scene.name for scene in scenes),
-    ):
+    for held_out in (("nowhere",), (), tuple(scene.name for scene in scenes)):
         with pytest.raises(UserError, match=r"data\.held_out="):
             split_for_fit(scenes, held_out)
 
@@ -97,35 +83,20 @@ def calibrated(frame, folder):
     return cross_validate(CALIBRATED, frame, 3, folder)
 
 
-def test_every_scene_is_forecast_once_by_a_generator_that_never_saw_it(
-    paper,
-):
+def test_every_scene_is_forecast_once_by_a_generator_that_never_saw_it(paper):
     splits = paper["splits"]
     open_loop = paper["open_loop"]
     held_out = {name for split in splits for name in split["held_out"]}
     assert held_out == set(open_loop["scenes"])
     for split in splits:
-        assert not set(split["held_out"]) & {
-            *split["fitted"],
-            *split["validation"],
-        }
+        assert not set(split["held_out"]) & {*split["fitted"], *split["validation"]}
     assert open_loop["windows"] == sum(row["windows"] for row in open_loop["folds"].values()) > 0
-    kinds = {
-        "mean",
-        "single",
-        "best_of_20",
-        "constant_velocity",
-        "idm_own_headway",
-    }
+    kinds = {"mean", "single", "best_of_20", "constant_velocity", "idm_own_headway"}
     assert kinds == set(open_loop["ade_m"])
     assert "best_of_20" in fold_tables(paper)
 
 
-def test_what_is_fitted_is_not_fitted_again_and_gives_the_same(
-    frame,
-    folder,
-    paper,
-):
+def test_what_is_fitted_is_not_fitted_again_and_gives_the_same(frame, folder, paper):
     updates = []
     assert cross_validate(PAPER, frame, 3, folder, updates.append) == paper
     assert not updates
@@ -133,18 +104,10 @@ def test_what_is_fitted_is_not_fitted_again_and_gives_the_same(
     assert len(updates) == 3 * LOOP.updates
 
 
-def test_the_calibrated_preset_is_also_rolled_out_for_five_seconds(
-    calibrated,
-):
+def test_the_calibrated_preset_is_also_rolled_out_for_five_seconds(calibrated):
     rollout = calibrated["rollout"]
     assert rollout["windows"] >= 15
-    assert list(rollout["rmse_m"]["mean"]) == [
-        "1 s",
-        "2 s",
-        "3 s",
-        "4 s",
-        "5 s",
-    ]
+    assert list(rollout["rmse_m"]["mean"]) == ["1 s", "2 s", "3 s", "4 s", "5 s"]
     assert rollout["ratio_to_constant_velocity"]["constant_velocity"] == 1.0
     assert calibrated["open_loop"]["windows"] > rollout["windows"]
     assert "idm_own_headway" in fold_tables(calibrated)

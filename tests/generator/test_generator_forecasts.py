@@ -8,10 +8,7 @@ from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 from ganlane.data.dense import recordings_of
 from ganlane.generator import forecasts
-from ganlane.generator.windows import (
-    Windows,
-    cut_windows,
-)
+from ganlane.generator.windows import Windows, cut_windows
 from ganlane.settings.generator import EXTRA_INPUTS, CalibratedConfig
 
 
@@ -40,20 +37,14 @@ def test_errors_by_hand():
     row = forecasts.displacement_errors(errors)
     assert row["ade_m"] == {"own": 2.25, "constant_velocity": 4.5}
     assert row["fde_m"]["own"] == 2.0
-    assert row["ade_change_percent"] == {
-        "own": -50.0,
-        "constant_velocity": 0.0,
-    }
+    assert row["ade_change_percent"] == {"own": -50.0, "constant_velocity": 0.0}
     assert forecasts.displacement_errors(errors, np.array([False, True]))["ade_m"]["own"] == 1.5
 
 
 def test_root_mean_square_after_whole_seconds():
     errors = np.zeros((2, 25))
     errors[:, 9], errors[:, 19] = [3.0, 4.0], [6.0, 8.0]
-    expected = {
-        "1 s": pytest.approx(np.sqrt(12.5)),
-        "2 s": pytest.approx(np.sqrt(50.0)),
-    }
+    expected = {"1 s": pytest.approx(np.sqrt(12.5)), "2 s": pytest.approx(np.sqrt(50.0))}
     scores = forecasts.long_errors({"own": errors, "constant_velocity": 2.0 * errors})
     assert scores["rmse_m"]["own"] == expected
     assert scores["windows"] == 2
@@ -92,15 +83,10 @@ def test_the_best_of_the_samples_is_the_nearest_on_average():
     kinds = forecasts.by_kind(samples, recorded)
     np.testing.assert_array_equal(kinds["best_of_20"], np.stack([samples[4, 0], samples[9, 1]]))
     assert forecasts.by_kind(samples[:1], recorded).keys() == {"mean"}
-    assert forecasts.by_kind(samples[:2], recorded).keys() == {
-        "mean",
-        "single",
-    }
+    assert forecasts.by_kind(samples[:2], recorded).keys() == {"mean", "single"}
 
 
-def test_without_noise_in_the_weights_all_samples_of_a_rollout_agree(
-    scenes,
-):
+def test_without_noise_in_the_weights_all_samples_of_a_rollout_agree(scenes):
     generator = silenced(small_generator(EXTRA_INPUTS))
     driven = forecasts.calibrated_forecasts(
         generator, scenes, 8, STRIDE, CalibratedConfig(), samples=3
@@ -133,9 +119,7 @@ def test_the_energy_score_is_least_for_the_right_spread():
     recorded = torch.randn(20000, 2)
     scores = {
         spread: forecasts.energy_score(
-            spread * torch.randn(20000, 2),
-            spread * torch.randn(20000, 2),
-            recorded,
+            spread * torch.randn(20000, 2), spread * torch.randn(20000, 2), recorded
         )
         .mean()
         .item()

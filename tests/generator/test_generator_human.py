@@ -29,13 +29,7 @@ from ganlane.generator.human import (
     velocity,
 )
 from ganlane.generator.human_fit import fit_human, prior_samples
-from ganlane.generator.human_samples import (
-    Options,
-    cuts,
-    samples_of,
-    smooth_scene,
-    target_lanes,
-)
+from ganlane.generator.human_samples import Options, cuts, samples_of, smooth_scene, target_lanes
 from ganlane.generator.human_tuning import costs, entering_memory
 from ganlane.settings.generator import HumanConfig, HumanSizes, shipped_generator
 from ganlane.sim.state import Road

@@ -53,8 +53,7 @@ def test_it_is_a_linear_layer_for_few_rows_and_for_many(shape, relu):
         torch.testing.assert_close(networks.apply(layer, x, relu), expected)
         torch.testing.assert_close(networks.dense(x, layer.weight), x @ layer.weight.T)
         torch.testing.assert_close(
-            networks.apply(layer.double(), x.double(), relu).float(),
-            expected,
+            networks.apply(layer.double(), x.double(), relu).float(), expected
         )
 
 
@@ -73,8 +72,7 @@ def test_the_recurrence_is_torchs_own_lstm():
     difference = 0.05 * torch.randn(4, 6, 2)
     embedded = torch.relu(lstm.embed(networks.motion_features(displacement, difference)))
     torch.testing.assert_close(
-        lstm.encode(lstm.project(displacement, difference)),
-        reference(embedded)[1][0][0],
+        lstm.encode(lstm.project(displacement, difference)), reference(embedded)[1][0][0]
     )
 
 
@@ -92,16 +90,10 @@ def test_pooling_ignores_padding(pooled, count):
     expected = pooling(*arguments)
     real = mask[..., None]
     noisy = pooling(
-        torch.where(real, hidden, 99.0),
-        torch.where(real, position, -3.0),
-        motion,
-        mask,
+        torch.where(real, hidden, 99.0), torch.where(real, position, -3.0), motion, mask
     )
     torch.testing.assert_close(noisy[mask], expected[mask])
-    torch.testing.assert_close(
-        pooling(*(part[1:2, :7] for part in arguments)),
-        expected[1:2, :7],
-    )
+    torch.testing.assert_close(pooling(*(part[1:2, :7] for part in arguments)), expected[1:2, :7])
 
 
 def test_the_nearest_are_found_as_by_sorting(scene):
@@ -116,13 +108,7 @@ def test_the_nearest_are_found_as_by_sorting(scene):
 
 def test_vehicles_out_of_range_have_no_influence():
     position = torch.tensor(
-        [
-            [
-                [0.0, 0.0],
-                [networks.RANGE_M + 1.0, 0.0],
-                [networks.RANGE_M - 1.0, 0.0],
-            ]
-        ]
+        [[[0.0, 0.0], [networks.RANGE_M + 1.0, 0.0], [networks.RANGE_M - 1.0, 0.0]]]
     )
     _, seen = networks.nearest(position, torch.ones(1, 3, dtype=torch.bool), 8)
     assert seen[0, 0].tolist() == [False, False, True]
@@ -142,8 +128,7 @@ def test_kept_projections_equal_those_computed_anew(generator):
         anew = generator.project(displacements[..., step - 7 : step + 1, :])
         torch.testing.assert_close(torch.stack(history.motions, -2), anew)
         torch.testing.assert_close(
-            difference,
-            displacements[..., step, :] - displacements[..., step - 1, :],
+            difference, displacements[..., step, :] - displacements[..., step - 1, :]
         )
 
 
@@ -151,8 +136,7 @@ def test_a_fresh_history_is_that_of_constant_velocity(generator):
     displacement = torch.tensor([[[1.7, 0.0], [0.9, 0.0]]])
     always = displacement[..., None, :].expand(1, 2, 8, 2)
     torch.testing.assert_close(
-        torch.stack(start(generator, displacement).motions, -2),
-        generator.project(always),
+        torch.stack(start(generator, displacement).motions, -2), generator.project(always)
     )
 
 

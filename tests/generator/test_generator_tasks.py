@@ -8,11 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from reference.small_networks import (
-    CALIBRATED,
-    PAPER,
-    recorded_scenes,
-)
+from reference.small_networks import CALIBRATED, PAPER, recorded_scenes
 
 from ganlane.generator import tasks
 from ganlane.settings.generator import LoopConfig
@@ -27,9 +23,7 @@ def paper_task(scenes, **changes) -> tasks.PaperTask:
     loop = LoopConfig(evaluate_every=10, learning_rate=5e-3, warmup=1, **changes)
     fitted, validation = scenes
     return tasks.PaperTask(
-        [fitted],
-        [validation],
-        replace(PAPER, loop=loop, stride=4, samples=3, batch=8),
+        [fitted], [validation], replace(PAPER, loop=loop, stride=4, samples=3, batch=8)
     )
 
 
@@ -38,13 +32,7 @@ def test_fitting_the_papers_preset_lowers_its_error(scenes):
     tasks.improve(paper_task(scenes, updates=40), "fit", seen.append)
     losses = [progress.losses["mean"] for progress in seen]
     assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
-    assert set(seen[-1].losses) == {
-        "variety",
-        "single",
-        "mean",
-        "adversarial",
-        "discriminator",
-    }
+    assert set(seen[-1].losses) == {"variety", "single", "mean", "adversarial", "discriminator"}
 
 
 def test_a_fit_ends_with_the_weights_that_were_best_and_without_patience_soon(scenes):
@@ -66,9 +54,7 @@ def test_a_fit_ends_with_the_weights_that_were_best_and_without_patience_soon(sc
 def test_the_calibrated_loss_falls(scenes):
     fitted, validation = scenes
     task = tasks.CalibratedTask(
-        [fitted],
-        [validation],
-        replace(CALIBRATED, horizons=(4, 6), shares=(1.0, 1.0), batch=3),
+        [fitted], [validation], replace(CALIBRATED, horizons=(4, 6), shares=(1.0, 1.0), batch=3)
     )
     task.optimisers["generator"].param_groups[0]["lr"] = 5e-3
     losses = [task.update(0)["mean"] for _ in range(16)]

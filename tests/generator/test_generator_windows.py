@@ -63,9 +63,7 @@ def windows():
     return cut_windows(recordings_of(recording()))
 
 
-def test_a_changer_intends_its_new_lane_two_seconds_before_it_is_there(
-    scenes,
-):
+def test_a_changer_intends_its_new_lane_two_seconds_before_it_is_there(scenes):
     lanes = scenes[0].lane
     changer = next(v for v in range(lanes.shape[1]) if len(set(lanes[:, v])) == 2)
     crossed = int((lanes[:, changer] != lanes[0, changer]).argmax())
@@ -127,9 +125,7 @@ def test_groups_never_mix_scenes_or_frames_lose_nobody_and_hold_the_displacement
         place = windows.positions[inside, PRESENT]
         np.testing.assert_allclose(moves, np.diff(windows.positions[inside], axis=1), atol=1e-6)
         np.testing.assert_allclose(
-            groups.position[row][mask].numpy(),
-            place - place.mean(0),
-            atol=1e-4,
+            groups.position[row][mask].numpy(), place - place.mean(0), atol=1e-4
         )
 
 

@@ -87,17 +87,9 @@ def test_scenes_and_other_commands_are_driven_like_behind_torchrl(traffic, optio
         for name in mine.keys() - {"reward_terms"}:
             np.testing.assert_array_equal(mine[name], theirs[name], name)
         for name, term in theirs["reward_terms"].items():
-            np.testing.assert_array_equal(
-                mine["reward_terms"][name],
-                term,
-                name,
-            )
+            np.testing.assert_array_equal(mine["reward_terms"][name], term, name)
         for name, value in other.now()["vehicles"].items():
-            np.testing.assert_array_equal(
-                one.batch.state["vehicles", name],
-                value.numpy(),
-                name,
-            )
+            np.testing.assert_array_equal(one.batch.state["vehicles", name], value.numpy(), name)
         over = mine["hard_crash"] | mine["out_of_road"] | mine["goal"] | mine["missed_exit"]
         over = over | mine["timeout"]
         ended += int(over.sum())
@@ -113,8 +105,4 @@ def test_generated_drivers_of_a_scene_begin_alike_up_to_rounding():
     for _ in range(3):
         one.step(np.zeros(5, np.int64))
         other.step(np.zeros(5, np.int64))
-        np.testing.assert_allclose(
-            one.observation(),
-            other.observation(),
-            atol=1e-3,
-        )
+        np.testing.assert_allclose(one.observation(), other.observation(), atol=1e-3)

@@ -84,11 +84,7 @@ def odd_weights(preset, folder):
     return str(path)
 
 
-def random_highway(
-    rng,
-    traffic,
-    rows,
-):
+def random_highway(rng, traffic, rows):
     """1 to 5 lanes, 2 to 25 vehicles, dense and sparse, all periods and the ego's visibilities."""
     env = EnvConfig(lanes=rng.randint(1, 5))
     module = make_traffic(make(TrafficConfig, traffic), env)
@@ -113,14 +109,7 @@ def random_highway(
 def kernel_of(env, variant=None):
     """The kernel for the environment's road, rules and traffic."""
     drivers = env.traffic.native_drivers()
-    return Kernel(
-        env.road,
-        env.vehicles,
-        env.episode,
-        env.ego,
-        drivers,
-        variant,
-    )
+    return Kernel(env.road, env.vehicles, env.episode, env.ego, drivers, variant)
 
 
 def differing(out, after):
@@ -141,13 +130,7 @@ def differing(out, after):
     return differs
 
 
-def compare(
-    traffic,
-    highways,
-    rows,
-    decisions,
-    seed,
-):
+def compare(traffic, highways, rows, decisions, seed):
     """Both decide from every state of the tensor code's episodes; the share of rows that differ."""
     rng = random.Random(seed)
     generator = torch.Generator().manual_seed(seed)
@@ -220,30 +203,14 @@ def test_it_decides_as_the_tensor_code_where_lanes_end(scene, traffic):
 @pytest.mark.parametrize("traffic", [*PRESETS, "human"])
 def test_networks_of_any_sizes_drive(traffic, tmp_path):
     path = odd_weights(PRESETS.get(traffic, traffic), tmp_path)
-    differ, _ = compare(
-        {"name": traffic, "path": path},
-        highways=4,
-        rows=12,
-        decisions=3,
-        seed=2,
-    )
+    differ, _ = compare({"name": traffic, "path": path}, highways=4, rows=12, decisions=3, seed=2)
     assert differ <= 1
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "traffic",
-    [*TRAFFICS, MIXED, {"name": "idm_faults"} | OFTEN],
-    ids=str,
-)
+@pytest.mark.parametrize("traffic", [*TRAFFICS, MIXED, {"name": "idm_faults"} | OFTEN], ids=str)
 def test_it_decides_as_the_tensor_code_in_a_hundred_thousand_decisions(traffic):
-    differ, compared = compare(
-        traffic,
-        highways=80,
-        rows=128,
-        decisions=10,
-        seed=4,
-    )
+    differ, compared = compare(traffic, highways=80, rows=128, decisions=10, seed=4)
     # Where the network of `gan` drives, the tensor code in double precision differs from itself in
     # 3.0 of 10,000 decisions: a guard's bound or a threshold takes the other side.
     sensitive = traffic == "gan" or traffic is MIXED
@@ -273,12 +240,7 @@ def batch_of(traffic, rows, variant=None, **options):
     return NativeBatch(config, drivers, variant)
 
 
-def drive(
-    highway,
-    actions,
-    numbers,
-    variant=None,
-):
+def drive(highway, actions, numbers, variant=None):
     """The arrays of the state after every decision of the episodes ``numbers``."""
     traffic, options = highway
     numbers = np.array(numbers)
@@ -292,25 +254,13 @@ def drive(
     return states
 
 
-def assert_same(
-    states,
-    whole,
-    rows,
-):
+def assert_same(states, whole, rows):
     for state, expected in zip(states, whole):
         for name, array in state.items():
-            np.testing.assert_array_equal(
-                array,
-                expected[name][rows],
-                str(name),
-            )
+            np.testing.assert_array_equal(array, expected[name][rows], str(name))
 
 
-@pytest.mark.parametrize(
-    "numbers",
-    [[0], [36], range(5, 12), range(1, 18)],
-    ids=str,
-)
+@pytest.mark.parametrize("numbers", [[0], [36], range(5, 12), range(1, 18)], ids=str)
 def test_an_episode_is_the_same_bit_for_bit_in_any_batch(episodes, numbers):
     highway, actions, whole = episodes
     assert_same(drive(highway, actions, numbers), whole, np.array(numbers))
@@ -339,23 +289,13 @@ def test_every_instruction_set_gives_the_same_bits(episodes, variant):
     highway, actions, whole = episodes
     # Without an instruction for it, a product and a sum take a hundred times as long.
     few = range(3) if variant == "default" else range(37)
-    assert_same(
-        drive(highway, actions[:4], few, variant),
-        whole[:4],
-        np.array(few),
-    )
+    assert_same(drive(highway, actions[:4], few, variant), whole[:4], np.array(few))
 
 
 @pytest.mark.parametrize("traffic", [*TRAFFICS, MIXED], ids=str)
 def test_the_first_memory_is_that_of_the_tensor_code(traffic):
     module = make_traffic(make(TrafficConfig, traffic), EnvConfig())
-    env = environment(
-        num_envs=20,
-        traffic=module,
-        seed=7,
-        dtype=torch.float32,
-        kernel="torch",
-    )
+    env = environment(num_envs=20, traffic=module, seed=7, dtype=torch.float32, kernel="torch")
     expected = env.reset()
     seed = torch.full((20,), 7)
     state = NativeScenes(env.scenes, 0, module.native_drivers()).start(seed, torch.arange(20))
@@ -364,12 +304,7 @@ def test_the_first_memory_is_that_of_the_tensor_code(traffic):
         name for name, _ in leaves(expected[keys.TRAFFIC])
     }
     for name, value in leaves(memory):
-        torch.testing.assert_close(
-            value,
-            expected[keys.TRAFFIC][name],
-            atol=2e-5,
-            rtol=1e-5,
-        )
+        torch.testing.assert_close(value, expected[keys.TRAFFIC][name], atol=2e-5, rtol=1e-5)
     desired = state[keys.VEHICLES, "desired_speed"]
     torch.testing.assert_close(desired, expected[keys.VEHICLES, "desired_speed"])
 

@@ -106,27 +106,12 @@ def described(batch, layout):
     return b"".join(parts)
 
 
+@pytest.mark.parametrize("ends", [(), LANE_DROP], ids=["highway", "lane_drop"])
 @pytest.mark.parametrize(
-    "ends",
-    [(), LANE_DROP],
-    ids=["highway", "lane_drop"],
+    "traffic", ["idm", "idm_mobil", "idm_faults", "idm_random", "gan", "gan_calibrated", "human"]
 )
-@pytest.mark.parametrize(
-    "traffic",
-    ["idm", "idm_mobil", "idm_faults", "idm_random", "gan", "gan_calibrated", "human"],
-)
-def test_another_processor_drives_the_same_episodes(
-    traffic,
-    ends,
-    program,
-    tmp_path,
-):
-    drivers = drivers_of(
-        make(TrafficConfig, traffic),
-        IdmParameters(),
-        MobilParameters(),
-        0,
-    )
+def test_another_processor_drives_the_same_episodes(traffic, ends, program, tmp_path):
+    drivers = drivers_of(make(TrafficConfig, traffic), IdmParameters(), MobilParameters(), 0)
     batch = NativeBatch(highways(num_envs=ROWS), drivers)
     settings = batch._parts[0].pointed["settings"]
     for name, structure in ends_of(ends).items():

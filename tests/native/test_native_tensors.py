@@ -110,21 +110,13 @@ def kernel_of(env: HighwayEnv, variant: str | None = None) -> Kernel:
     return Kernel(env.road, env.vehicles, env.episode, env.ego, drivers, variant, env.actions)
 
 
-def by_kernel(
-    kernel: Kernel,
-    td: TensorDictBase,
-    recycle: bool = False,
-) -> TensorDictBase:
+def by_kernel(kernel: Kernel, td: TensorDictBase, recycle: bool = False) -> TensorDictBase:
     """The decision ``td["action"]`` from the state ``td``."""
     recycles = torch.ones(len(td), dtype=torch.bool) if recycle else None
     return kernel.decide(td["action"], td, recycles)
 
 
-def actions(
-    env: HighwayEnv,
-    generator: torch.Generator,
-    change: float = 0.2,
-) -> torch.Tensor:
+def actions(env: HighwayEnv, generator: torch.Generator, change: float = 0.2) -> torch.Tensor:
     """Random actions [N], mostly to keep the lane."""
     if env.actions.form == "continuous":
         between = drawing(env.batch_size, generator, env.dtype)
@@ -134,13 +126,7 @@ def actions(
     if env.actions.form == "lane_speed" and bool(drawn[0] < 0.5):
         return torch.randint(3, 5, env.batch_size, generator=generator)
     return torch.where(
-        drawn < 0.5 * change,
-        keys.LEFT,
-        torch.where(
-            drawn < change,
-            keys.RIGHT,
-            keys.KEEP,
-        ),
+        drawn < 0.5 * change, keys.LEFT, torch.where(drawn < change, keys.RIGHT, keys.KEEP)
     )
 
 

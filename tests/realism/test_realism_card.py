@@ -5,28 +5,11 @@ import pytest
 from matplotlib.colors import to_hex
 from reference.recordings import recorded_cars
 
-from ganlane.realism.card import (
-    quantity_rows,
-)
-from ganlane.realism.driving import (
-    ConstantVelocity,
-    RandomDriving,
-    StartOptions,
-)
-from ganlane.realism.long_runs import (
-    LongRunParameters,
-    long_run,
-    totals,
-)
-from ganlane.realism.measures import (
-    QUANTITIES,
-    ceiling,
-    measure_recordings,
-)
-from ganlane.realism.sheets import (
-    draw_distributions,
-    long_table,
-)
+from ganlane.realism.card import quantity_rows
+from ganlane.realism.driving import ConstantVelocity, RandomDriving, StartOptions
+from ganlane.realism.long_runs import LongRunParameters, long_run, totals
+from ganlane.realism.measures import QUANTITIES, ceiling, measure_recordings
+from ganlane.realism.sheets import draw_distributions, long_table
 from ganlane.realism.starts import simulate
 from ganlane.sim.state import Road
 from ganlane.view.figures import COLOURS, INK
@@ -35,12 +18,7 @@ WITHOUT_CHANGES = [name for name in QUANTITIES if name != "lane_change_duration"
 
 
 def test_a_card_puts_the_model_between_its_ceiling_and_its_floors_driven_or_measured_before():
-    recordings = recorded_cars(
-        scenes=4,
-        vehicles=10,
-        seconds=8.0,
-        speed_swing_mps=0.2,
-    )
+    recordings = recorded_cars(scenes=4, vehicles=10, seconds=8.0, speed_swing_mps=0.2)
     recorded = measure_recordings(recordings).counts
     makers = {
         "cruise": ConstantVelocity,
@@ -49,11 +27,7 @@ def test_a_card_puts_the_model_between_its_ceiling_and_its_floors_driven_or_meas
     }
     driven = {name: simulate(make, recordings, StartOptions()) for name, make in makers.items()}
     rows = quantity_rows(
-        "cruise",
-        {**driven, "rival": driven["random"]},
-        recorded,
-        {},
-        resamples=100,
+        "cruise", {**driven, "rival": driven["random"]}, recorded, {}, resamples=100
     )
     assert rows["speed"]["distance"] == rows["speed"]["constant_velocity"] < rows["speed"]["floor"]
     assert rows["acceleration"]["against"]["rival"]["verdict"] == "closer"
@@ -63,13 +37,7 @@ def test_a_card_puts_the_model_between_its_ceiling_and_its_floors_driven_or_meas
     # Without reference drivers in the run, what was measured before counts.
     alone = {"cruise": driven["cruise"]}
     speeds = {"speed": recorded["speed"]}
-    rows = quantity_rows(
-        "cruise",
-        alone,
-        speeds,
-        {"random": {"speed": 0.5}},
-        resamples=100,
-    )
+    rows = quantity_rows("cruise", alone, speeds, {"random": {"speed": 0.5}}, resamples=100)
     assert rows.keys() == {"speed"}
     assert rows["speed"]["floor"] == 0.5
     assert rows["speed"]["constant_velocity"] is None
@@ -88,11 +56,7 @@ def cells(table, row):
 
 
 def test_traffic_that_stands_still_has_counts_and_no_rates():
-    run = long_run(
-        Still,
-        Road(),
-        LongRunParameters(vehicles=4, vehicle_km=1.0, most_s=10.0),
-    )
+    run = long_run(Still, Road(), LongRunParameters(vehicles=4, vehicle_km=1.0, most_s=10.0))
     assert run["vehicle_km"] == 0.0
     assert run["standstills_in_free_flow"] > 0
     for rate in ("lane_changes_per_vehicle_km", "overlaps_per_1000_vehicle_km"):
@@ -115,23 +79,13 @@ def test_densities_have_area_one_and_the_quantitys_unit():
     counts[[0, 1, 49]] = 1, 2, 1
     rule = np.eye(len(counts))[0] * 4
     figure = draw_distributions(
-        {"jerk": counts},
-        {
-            "idm": {"jerk": rule},
-            "nobody": {"jerk": 0 * rule},
-        },
+        {"jerk": counts}, {"idm": {"jerk": rule}, "nobody": {"jerk": 0 * rule}}
     )
     (axes,) = figure.axes
     assert axes.get_ylabel() == "density, per m/s³"
-    (recorded, *ends), (simulated, *left_end) = (
-        in_colour(axes, INK),
-        in_colour(axes, COLOURS[0]),
-    )
+    (recorded, *ends), (simulated, *left_end) = (in_colour(axes, INK), in_colour(axes, COLOURS[0]))
     # The bins at the ends hold what lies beyond them, too.
-    assert (
-        [mark.get_marker() for mark in ends],
-        [mark.get_marker() for mark in left_end],
-    ) == (
+    assert ([mark.get_marker() for mark in ends], [mark.get_marker() for mark in left_end]) == (
         ["<", ">"],
         ["<"],
     )

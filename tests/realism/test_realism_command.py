@@ -14,19 +14,12 @@ from reference.scene_csv import write_scene_csv
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 from ganlane.config.run import run_command
-from ganlane.realism.measures import (
-    QUANTITIES,
-)
+from ganlane.realism.measures import QUANTITIES
 from ganlane.realism.sheets import card_text
 
 main = partial(run_command, "realism")
 
-QUICK = [
-    "quick=true",
-    "vehicle_km=0.5",
-    "long_s=10",
-    "long_vehicles=[4]",
-]
+QUICK = ["quick=true", "vehicle_km=0.5", "long_s=10", "long_vehicles=[4]"]
 
 
 @pytest.fixture(autouse=True)
@@ -43,10 +36,7 @@ def _in_an_empty_folder(tmp_path, monkeypatch):
 def recordings(tmp_path):
     path = tmp_path / "recordings" / "scenes.csv"
     path.parent.mkdir()
-    write_scene_csv(
-        synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=8, seconds=7.0)),
-        path,
-    )
+    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=8, seconds=7.0)), path)
     return path
 
 
@@ -106,13 +96,7 @@ def test_desired_speeds_are_fitted_on_the_scenes_that_are_not_held_out(recording
         "against=[]",
     ]
     held_out = "data.held_out=[synthetic-1]"
-    _, results, _, err = run(
-        capsys,
-        "traffic=idm",
-        f"data.path={recordings}",
-        held_out,
-        *arguments,
-    )
+    _, results, _, err = run(capsys, "traffic=idm", f"data.path={recordings}", held_out, *arguments)
     assert "idm: fitting desired speeds on 3 scenes" in err
     assert results["desired_above_mps"].keys() == {"idm"}
     assert results["scenes"] == ["synthetic-1"]
@@ -120,9 +104,7 @@ def test_desired_speeds_are_fitted_on_the_scenes_that_are_not_held_out(recording
     assert results["overlaps_per_1000_vehicle_km"] is None
 
 
-def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(
-    capsys,
-):
+def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(capsys):
     status, results, _, err = run(capsys, "traffic=idm_mobil", "against=[]")
     assert status == 0
     assert (results["starts"], results["i80"]) == ("spawned", {})
@@ -136,23 +118,14 @@ def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(
     [
         (["data.path=gone.csv"], "gone.csv: no such file"),
         (["data.held_out=[moon]"], "moon"),
-        (
-            ["against=[idm_mobli]"],
-            "did you mean 'idm_mobil'",
-        ),
+        (["against=[idm_mobli]"], "did you mean 'idm_mobil'"),
         (["against=[random]"], "leave it out"),
         (["traffic=replay"], "recordings themselves"),
         (["data=ngsim"], "ganlane prepare"),
         (["i80=true"], "i80=true"),
         (["scenes=some"], "held_out, all"),
         (["device=cuda"], "device=cuda"),
-        (
-            [
-                "traffic.path=gone.safetensors",
-                "traffic=gan",
-            ],
-            "gone.safetensors",
-        ),
+        (["traffic.path=gone.safetensors", "traffic=gan"], "gone.safetensors"),
     ],
 )
 def test_mistakes_are_told_in_a_sentence_and_leave_nothing(
@@ -161,11 +134,7 @@ def test_mistakes_are_told_in_a_sentence_and_leave_nothing(
     # Nothing may be left behind, not even a run folder.
     before = sorted(path.name for path in tmp_path.iterdir())
     status, _, _, err = run(
-        capsys,
-        "traffic=idm",
-        f"data.path={recordings}",
-        "vehicle_km=0",
-        *arguments,
+        capsys, "traffic=idm", f"data.path={recordings}", "vehicle_km=0", *arguments
     )
     assert status == 2
     assert part in err

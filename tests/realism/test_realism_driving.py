@@ -36,36 +36,21 @@ def steady(**changed):
     present = np.ones((100, 3), bool)
     present[:40, 2] = present[80:, 2] = False
     x = np.array([0.0, 40.0, 20.0]) + speed * time
-    fields = {
-        "x": x,
-        "y": np.array([0.0, 0.0, 3.5]),
-        "speed": speed,
-        "present": present,
-        **changed,
-    }
+    fields = {"x": x, "y": np.array([0.0, 0.0, 3.5]), "speed": speed, "present": present, **changed}
     return made_by_hand(**fields, lanes=2, name="steady")
 
 
 def test_constant_velocity_repeats_a_recording_of_it_from_a_vehicles_first_frame_to_its_last():
     there = drive_recordings(ConstantVelocity, [steady()], StartOptions())
     recorded = recorded_frame([steady()])
-    joined = there.join(
-        recorded,
-        on=["vehicle", "frame"],
-        suffix="_recorded",
-    )
+    joined = there.join(recorded, on=["vehicle", "frame"], suffix="_recorded")
     assert joined.height == there.height == recorded.height
     assert (joined["x"] - joined["x_recorded"]).abs().max() < 1e-3
     assert (joined["y"] - joined["y_recorded"]).abs().max() < 1e-5
     frames = there.group_by("vehicle").agg(
-        pl.col("frame").min().alias("first"),
-        pl.col("frame").max().alias("last"),
+        pl.col("frame").min().alias("first"), pl.col("frame").max().alias("last")
     )
-    assert frames.sort("vehicle").rows() == [
-        (0, 0, 99),
-        (1, 0, 99),
-        (2, 40, 79),
-    ]
+    assert frames.sort("vehicle").rows() == [(0, 0, 99), (1, 0, 99), (2, 40, 79)]
 
 
 def test_a_vehicle_waits_while_another_stands_in_its_place():
@@ -84,12 +69,7 @@ def test_a_vehicle_waits_while_another_stands_in_its_place():
 def test_nobody_drives_beyond_the_end_of_the_recorded_road():
     class Fast(ConstantVelocity):
         def move(self, vehicles, memory, key, step):
-            return super().move(
-                vehicles.with_(speed=vehicles.speed + 1.0),
-                memory,
-                key,
-                step,
-            )
+            return super().move(vehicles.with_(speed=vehicles.speed + 1.0), memory, key, step)
 
     recording = steady()
     there = drive_recordings(Fast, [recording], StartOptions())
@@ -114,11 +94,7 @@ def test_index_0_is_nobody_and_models_see_desired_speeds_above_the_speed_at_entr
             seen.append(vehicles)
             return vehicles, memory
 
-    drive_recordings(
-        Watcher,
-        [steady()],
-        StartOptions(desired_above_mps=3.0, repeats=50),
-    )
+    drive_recordings(Watcher, [steady()], StartOptions(desired_above_mps=3.0, repeats=50))
     assert not any(bool(vehicles.valid[:, 0].any()) for vehicles in seen)
     excess = (seen[0].desired_speed - seen[0].speed)[:, 1:3]
     assert 0.0 <= excess.min() <= excess.max() <= 6.0
@@ -131,20 +107,8 @@ DRAWN = 9.0
 
 def queue(x, speed=10.0, desired=20.0):
     """One row of vehicles of 4 m in the first lane; index 0 is nobody."""
-    cars = [
-        {
-            "x": at,
-            "speed": speed,
-            "desired_speed": desired,
-            "length": 4.0,
-        }
-        for at in x
-    ]
-    return vehicles_of(
-        {"x": -500.0, "valid": False},
-        *cars,
-        dtype=torch.float32,
-    )
+    cars = [{"x": at, "speed": speed, "desired_speed": desired, "length": 4.0} for at in x]
+    return vehicles_of({"x": -500.0, "valid": False}, *cars, dtype=torch.float32)
 
 
 def headways(vehicles):
@@ -154,10 +118,7 @@ def headways(vehicles):
 def test_a_follower_shows_its_headway_unless_it_is_far_behind_and_none_under_a_tenth_of_a_second():
     behind, ahead = headways(queue([0.0, 24.0]))
     # At 20 m and 10 m/s: (20 m sqrt(1 - (10 / 20)^4) - 2 m) / (10 m/s)
-    assert behind == pytest.approx(
-        (20.0 * math.sqrt(15.0 / 16.0) - 2.0) / 10.0,
-        abs=1e-4,
-    )
+    assert behind == pytest.approx((20.0 * math.sqrt(15.0 / 16.0) - 2.0) / 10.0, abs=1e-4)
     assert ahead == headways(queue([0.0, 64.0]))[0] == DRAWN
     assert headways(queue([0.0, 5.0]))[0] == pytest.approx(0.1)
 
@@ -166,11 +127,7 @@ def test_only_those_who_enter_are_credited_and_other_memories_stay_as_they_are()
     vehicles = queue([0.0, 24.0, 48.0])
     drawn = torch.full_like(vehicles.x, DRAWN)
     memory = TensorDict(
-        {
-            "driver": TensorDict({"headway": drawn, "noise": drawn}, [1]),
-            "wish": drawn,
-        },
-        [1],
+        {"driver": TensorDict({"headway": drawn, "noise": drawn}, [1]), "wish": drawn}, [1]
     )
     # Only the first of the three enters.
     who = torch.tensor([[False, True, False, False]])
@@ -186,12 +143,7 @@ def test_a_recorded_platoon_keeps_its_gaps_behind_a_leader_at_constant_speed():
     time = np.arange(60)[:, None] * 0.1
     # The foremost is replayed.
     x = np.array([0.0, 12.0, 40.0, 55.0]) + 10.0 * time
-    scene = made_by_hand(
-        x,
-        speed=10.0,
-        lanes=1,
-        driven=np.array([True, True, True, False]),
-    )
+    scene = made_by_hand(x, speed=10.0, lanes=1, driven=np.array([True, True, True, False]))
     network = silenced(small_generator(EXTRA_INPUTS))
     there = drive_recordings(
         # Without a residual there are only IDM and each driver's headway.

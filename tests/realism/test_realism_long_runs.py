@@ -3,10 +3,7 @@
 import pytest
 import torch
 
-from ganlane.realism.driving import (
-    ConstantVelocity,
-    RandomDriving,
-)
+from ganlane.realism.driving import ConstantVelocity, RandomDriving
 from ganlane.realism.long_runs import (
     EventCounter,
     LongRunParameters,
@@ -23,16 +20,8 @@ SHORT = LongRunParameters(vehicles=6, vehicle_km=1.0, most_s=20.0)
 
 def start(road, vehicles=9):
     """Three episodes; index 0 is nobody."""
-    key = episode_key(
-        2,
-        torch.zeros(3, dtype=torch.int64),
-        torch.arange(3),
-    )
-    return spawned_vehicles(
-        IdmTraffic(road),
-        LongRunParameters(vehicles=vehicles),
-        key,
-    )
+    key = episode_key(2, torch.zeros(3, dtype=torch.int64), torch.arange(3))
+    return spawned_vehicles(IdmTraffic(road), LongRunParameters(vehicles=vehicles), key)
 
 
 def test_all_but_the_ego_are_there_and_start_as_the_simulators_episodes_do():
@@ -53,46 +42,23 @@ def test_constant_velocity_keeps_every_speed_and_changes_no_lane():
     assert run["lane_changes"] == run["off_road"] == run["standstills_in_free_flow"] == 0
     assert run["acceleration_quantiles"]["0.95"] == pytest.approx(0.0, abs=0.01)
     assert run["speeds"]["10 s"]["mean_speed_mps"] == pytest.approx(
-        1000 * run["vehicle_km"] / (20 * 6 * run["episodes"]),
-        rel=1e-3,
+        1000 * run["vehicle_km"] / (20 * 6 * run["episodes"]), rel=1e-3
     )
-    assert run["speeds"]["60 s"] == {
-        "mean_speed_mps": None,
-        "spread_mps": None,
-        "episodes": 0,
-    }
+    assert run["speeds"]["60 s"] == {"mean_speed_mps": None, "spread_mps": None, "episodes": 0}
 
 
 def test_blind_driving_overlaps_and_careful_driving_does_not():
     # Nobody looks at anybody.
-    random = long_run(
-        RandomDriving,
-        Road(),
-        LongRunParameters(9, 5.0, 30.0),
-    )
+    random = long_run(RandomDriving, Road(), LongRunParameters(9, 5.0, 30.0))
     assert random["overlaps"] > 0
     assert random["lane_changes"] > 0
     low, high = random["overlaps_per_1000_vehicle_km_ci"]
     assert low < random["overlaps_per_1000_vehicle_km"] < high
-    assert (
-        long_run(
-            IdmTraffic,
-            Road(),
-            LongRunParameters(9, 5.0, 30.0),
-        )["overlaps"]
-        == 0
-    )
+    assert long_run(IdmTraffic, Road(), LongRunParameters(9, 5.0, 30.0))["overlaps"] == 0
 
 
 def test_totals_add_counts_up_and_know_nothing_of_nothing():
-    runs = [
-        long_run(
-            RandomDriving,
-            Road(),
-            LongRunParameters(n, 2.0, 20.0),
-        )
-        for n in (5, 9)
-    ]
+    runs = [long_run(RandomDriving, Road(), LongRunParameters(n, 2.0, 20.0)) for n in (5, 9)]
     km, overlaps, off_road = (
         sum(run[name] for run in runs) for name in ("vehicle_km", "overlaps", "off_road")
     )
@@ -105,11 +71,7 @@ def in_line(spacing_m, speed_mps):
     """Three rows of ten vehicles in the first lane; index 0 is nobody."""
     # From the rearmost to the foremost.
     x = spacing_m * torch.arange(10.0).expand(3, 10)
-    return start(Road()).with_(
-        x=x,
-        y=torch.zeros_like(x),
-        speed=torch.full_like(x, speed_mps),
-    )
+    return start(Road()).with_(x=x, y=torch.zeros_like(x), speed=torch.full_like(x, speed_mps))
 
 
 def test_events_are_counted_when_they_begin_and_the_ego_which_is_not_there_meets_nobody():
@@ -132,10 +94,6 @@ def test_events_are_counted_when_they_begin_and_the_ego_which_is_not_there_meets
 def test_standing_in_a_queue_is_no_standstill_but_standing_alone_is():
     queue = in_line(20.0, 0.0)
     counter = EventCounter(Road())
-    for step, expected in (
-        (8, 0),
-        (9, 3),
-        (19, 3),
-    ):  # only the foremost has nobody ahead
+    for step, expected in ((8, 0), (9, 3), (19, 3)):  # only the foremost has nobody ahead
         counter.count(queue, step)
         assert counter.standstills == expected

@@ -16,11 +16,7 @@ from reference.refusals import user_error
 from scipy.spatial.distance import jensenshannon
 from scipy.stats import binom
 
-from ganlane.data import (
-    default_scenes,
-    read_scenes,
-    scene_lane_widths,
-)
+from ganlane.data import default_scenes, read_scenes, scene_lane_widths
 from ganlane.data.dense import recorded_frame, recordings_of
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Estimate
@@ -63,10 +59,7 @@ def test_the_first_three_seconds_of_a_vehicle_do_not_count():
     present = np.ones((100, 2), bool)
     # The second appears after 5 s.
     present[:50, 1] = False
-    result = made_by_hand(
-        np.hstack([20.0 * TIME, 20.0 * TIME + 30.0]),
-        present=present,
-    )
+    result = made_by_hand(np.hstack([20.0 * TIME, 20.0 * TIME + 30.0]), present=present)
     # The first: samples 30 to 94. The second appears at 50: samples 80 to 94.
     assert len(values(result, "speed")) == 65 + 15
     assert measure_recordings([result]).vehicle_km == pytest.approx((70 + 20) * 2.0 / 1000.0)
@@ -84,10 +77,7 @@ def test_gap_headway_and_time_to_collision_of_two_cars_whether_or_not_the_leader
         assert values(result, "time_to_collision") == pytest.approx(gap / 2.0)
         assert len(values(result, "speed")) == 65 * (1 + driven)
     # A leader in another lane is none.
-    beside = made_by_hand(
-        CLOSING_IN,
-        np.hstack([0.0 * TIME, 0.0 * TIME + 3.5]),
-    )
+    beside = made_by_hand(CLOSING_IN, np.hstack([0.0 * TIME, 0.0 * TIME + 3.5]))
     assert measure_recordings([beside]).quantiles["gap"]["0.5"] is None
 
 
@@ -156,17 +146,11 @@ def draws(shift, number, trials=40):
         means = random.normal(0.3, 0.05, number).clip(0.1, 0.6)
         size = random.integers(15, 60, number)
         model = means + shift
-        yield (
-            sampled(means, size),
-            sampled(model, 4 * size),
-            sampled(model, 4 * size),
-        )
+        yield (sampled(means, size), sampled(model, 4 * size), sampled(model, 4 * size))
 
 
 @pytest.mark.parametrize("number", [4, 11])
-def test_the_interval_of_a_perfect_model_holds_0_and_its_own_estimate(
-    number,
-):
+def test_the_interval_of_a_perfect_model_holds_0_and_its_own_estimate(number):
     intervals = [
         distance(model, recorded, resamples=300) for recorded, model, _ in draws(0.0, number)
     ]
@@ -174,9 +158,7 @@ def test_the_interval_of_a_perfect_model_holds_0_and_its_own_estimate(
 
 
 @pytest.mark.parametrize("number", [4, 11])
-def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(
-    number,
-):
+def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(number):
     # The distance of the distributions that both are drawn from.
     many = np.random.default_rng(1).normal(0.3, 0.05, 2000).clip(0.1, 0.6)
     true = float(
@@ -208,15 +190,8 @@ def test_a_model_does_not_differ_from_itself_and_unpaired_units_are_resampled_on
 @pytest.fixture
 def reference():
     recordings = recorded_cars(scenes=3)
-    whole = {
-        "lane_changes": 3,
-        "vehicle_km": 2.0,
-        "speed_spread_mps": 1.0,
-    }
-    floors = {
-        "random": {"speed": 0.5},
-        "constant_velocity": {"speed": 0.2},
-    }
+    whole = {"lane_changes": 3, "vehicle_km": 2.0, "speed_spread_mps": 1.0}
+    floors = {"random": {"speed": 0.5}, "constant_velocity": {"speed": 0.2}}
     return Reference(
         **vars(measure_recordings(recordings)),
         source="made up",
@@ -232,10 +207,7 @@ def test_a_reference_comes_back_from_its_file(reference, tmp_path):
     again = Reference.load(path)
     for name in QUANTITIES:
         assert np.array_equal(again.counts[name], reference.counts[name])
-    assert {**vars(again), "counts": 0} == {
-        **vars(reference),
-        "counts": 0,
-    }
+    assert {**vars(again), "counts": 0} == {**vars(reference), "counts": 0}
     assert json.loads(path.read_text())["ceilings"].keys() == QUANTITIES.keys()
 
 
@@ -246,10 +218,7 @@ def test_another_file_is_refused_in_a_sentence(damage, reference, tmp_path):
         reference.save(path)
         numbers = json.loads(path.read_text())
         del numbers["checksum"]  # that of another content
-        numbers |= {
-            "kind": {"kind": "a recipe"},
-            "bins": {"bins": {}},
-        }.get(damage, {})
+        numbers |= {"kind": {"kind": "a recipe"}, "bins": {"bins": {}}}.get(damage, {})
         path.write_text("{" if damage == "text" else json.dumps(numbers))
     with user_error(r"reference\.json: not the histograms"):
         Reference.load(path)
@@ -264,12 +233,7 @@ def test_what_ships_is_small_and_holds_no_trajectories():
     assert rate["lane_changes"] == 57
     assert rate["per_vehicle_km_ci"] == pytest.approx([0.70, 1.20], abs=0.01)
     assert shipped.spread_mps == pytest.approx(2.8, abs=0.05)
-    for name in (
-        "acceleration",
-        "jerk",
-        "time_headway",
-        "time_to_collision",
-    ):
+    for name in ("acceleration", "jerk", "time_headway", "time_to_collision"):
         assert ceiling(shipped.counts[name]) < shipped.floors["random"][name]
     assert all(0.0 < ceiling(shipped.counts[name]) < 1.0 for name in QUANTITIES)
 

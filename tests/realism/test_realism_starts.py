@@ -7,15 +7,9 @@ from reference.refusals import user_error
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 from ganlane.realism.card import card_rows
-from ganlane.realism.driving import (
-    ConstantVelocity,
-    StartOptions,
-)
+from ganlane.realism.driving import ConstantVelocity, StartOptions
 from ganlane.realism.measures import ceiling
-from ganlane.realism.starts import (
-    fit_excess,
-    recorded_starts,
-)
+from ganlane.realism.starts import fit_excess, recorded_starts
 
 NAMES = [f"synthetic-{number}" for number in range(4)]
 MAKERS = {"cruise": ConstantVelocity}
@@ -30,17 +24,11 @@ def starts_of(frame, starts, held_out):
     return recorded_starts(MAKERS, starts, held_out, frame, StartOptions(), False, "made up")
 
 
-def test_scenes_alone_have_the_ceiling_of_their_own_halves(
-    frame,
-):
+def test_scenes_alone_have_the_ceiling_of_their_own_halves(frame):
     starts = starts_of(frame, NAMES, NAMES[1:3])
     assert starts.separately_held_out == NAMES[1:3]
     # The ceiling is that of two scenes, no longer of four.
-    alone = card_rows(
-        starts.restricted_to(starts.separately_held_out),
-        "cruise",
-        100,
-    )
+    alone = card_rows(starts.restricted_to(starts.separately_held_out), "cruise", 100)
     for name in ("speed", "gap"):
         assert alone[name]["ceiling"] == ceiling(starts.recorded.counts[name][1:3])
         assert alone[name]["ceiling"] != card_rows(starts, "cruise", 100)[name]["ceiling"]
@@ -60,12 +48,7 @@ def test_the_excess_that_was_used_is_the_one_that_is_fitted():
         """Drives at its desired speed at once."""
 
         def move(self, vehicles, memory, key, step):
-            return super().move(
-                vehicles.with_(speed=vehicles.desired_speed),
-                memory,
-                key,
-                step,
-            )
+            return super().move(vehicles.with_(speed=vehicles.desired_speed), memory, key, step)
 
     time = np.arange(80)[:, None] * 0.1
     random = np.random.default_rng(0)
@@ -74,12 +57,4 @@ def test_the_excess_that_was_used_is_the_one_that_is_fitted():
     x = 100.0 * np.arange(30) + speed * time
     shown = np.where(np.arange(80)[:, None] == 0, 10.0, speed)
     scene = made_by_hand(x, speed=shown, lanes=1)
-    assert (
-        fit_excess(
-            Eager,
-            [scene],
-            StartOptions(repeats=1),
-            (1.0, 4.0, 8.0),
-        )
-        == 4.0
-    )
+    assert fit_excess(Eager, [scene], StartOptions(repeats=1), (1.0, 4.0, 8.0)) == 4.0

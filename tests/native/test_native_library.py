@@ -18,14 +18,9 @@ from ganlane.native import library
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory):
-    """A library for every processor, not optimised, since nothing is driven here."""
-    flags = tuple("-O0" if flag == "-O3" else flag for flag in library.FLAGS)
+    """The kernel of this processor without a checksum, as a compiler leaves it."""
     path = tmp_path_factory.mktemp("plain") / "kernel.so"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(library, "FLAGS", flags)
-        (command,) = library.compilers()[:1]
-        content = library._compiled(library._command("default", command))
-    path.write_bytes(content[: -len(PLACE)])
+    path.write_bytes(Path(library.load()._name).read_bytes()[: -len(PLACE)])
     return path
 
 
@@ -57,7 +52,15 @@ def compiler(monkeypatch, tmp_path):
 WORKS = """for last; do :; done
 [ "$last" = --version ] || cp "$library" "$last" && echo "$last" >> "$0.calls"
 """
+REFUSES_AVX512 = """case "$*" in *-mavx512f*) echo "error: unknown option" >&2; exit 1;; esac
+"""
 FAILS = "echo the first line >&2; echo 'x.cpp:1: error: it is full of stars' >&2; exit 1"
+
+
+@pytest.fixture
+def working(compiler, plain):
+    """The program of a compiler that works."""
+    return compiler(WORKS, plain)
 
 
 def built() -> list[Path]:
@@ -69,23 +72,19 @@ def calls(program: Path) -> int:
 
 
 @pytest.mark.kernel
-def test_it_is_built_once(compiler, plain):
-    program = compiler(WORKS, plain)
+def test_it_is_built_once(working):
     library.load()
     library._find.cache_clear()
     library.load()
-    assert len(built()) == calls(program) == 1
+    assert len(built()) == calls(working) == 1
 
 
 @pytest.mark.kernel
-def test_another_source_is_another_library(monkeypatch, tmp_path, compiler, plain):
-    compiler(WORKS, plain)
+def test_another_source_is_another_library(monkeypatch, tmp_path, working):
     library.load()
-    for source in library.SOURCES:
-        (tmp_path / source.name).write_text(source.read_text() + "\n")
-    monkeypatch.setattr(
-        library, "SOURCES", tuple(tmp_path / source.name for source in library.SOURCES)
-    )
+    source = tmp_path / "kernel.cpp"
+    source.write_text("another")
+    monkeypatch.setattr(library, "SOURCES", (*library.SOURCES, source))
     library._find.cache_clear()
     library.load()
     assert len(built()) == 2
@@ -93,22 +92,15 @@ def test_another_source_is_another_library(monkeypatch, tmp_path, compiler, plai
 
 def damaged(content: bytes) -> list[bytes]:
     """Shorter, without its checksum, with a bit flipped in the code or in the checksum, longer."""
-    middle, digit = len(content) // 2, len(content) - 30
-    return [
-        content[:middle],
-        content[: -len(PLACE)],
-        *(
-            content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
-            for place in (middle, digit)
-        ),
-        content + b"more",
-        b"",
-    ]
+    middle = len(content) // 2
+    flipped = []
+    for place in (middle, len(content) - 30):
+        flipped.append(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+    return [content[:middle], content[: -len(PLACE)], *flipped, content + b"more", b""]
 
 
 @pytest.mark.kernel
-def test_a_damaged_library_is_built_anew_and_never_loaded(monkeypatch, compiler, plain):
-    program = compiler(WORKS, plain)
+def test_a_damaged_library_is_built_anew_and_never_loaded(working):
     library.load()
     (path,) = built()
     whole = path.read_bytes()
@@ -118,23 +110,21 @@ def test_a_damaged_library_is_built_anew_and_never_loaded(monkeypatch, compiler,
         library._find.cache_clear()
         library.load()
         assert path.read_bytes() == whole
-        assert calls(program) == count
+        assert calls(working) == count
 
 
 @pytest.mark.kernel
-def test_a_damaged_library_of_a_wheel_is_passed_over(monkeypatch, tmp_path, compiler, plain):
-    compiler(WORKS, plain)
+def test_a_damaged_library_of_a_wheel_is_passed_over(monkeypatch, tmp_path, working, plain):
     monkeypatch.setattr(library, "PREBUILT", tmp_path)
     library._prebuilt("AVX512").write_bytes(plain.read_bytes()[:-1000])
-    assert library.find().maker == str(tmp_path / "compiler")
+    assert library.find().maker == str(working)
 
 
 @pytest.mark.kernel
 def test_a_compiler_that_lacks_an_instruction_set_makes_the_kernel_for_the_next(
     compiler, plain, capsys
 ):
-    refuses = 'case "$*" in *-mavx512f*) echo "error: unknown option" >&2; exit 1;; esac\n'
-    program = compiler(refuses + WORKS, plain)
+    program = compiler(REFUSES_AVX512 + WORKS, plain)
     loaded = library.find()
     assert (loaded.variant, loaded.maker) == ("AVX2", str(program))
     told = f"for AVX2 by {program} drives; {program} failed for AVX512 (error: unknown option).\n"
@@ -148,10 +138,9 @@ def test_a_compiler_that_lacks_an_instruction_set_makes_the_kernel_for_the_next(
     "lines", [FAILS, "exit 0", "kill -9 $$", WORKS.replace('cp "$library"', "echo no library >")]
 )
 def test_the_clang_of_ziglang_is_asked_after_a_compiler_that_fails(
-    lines, compiler, plain, monkeypatch, tmp_path, capsys
+    lines, compiler, working, monkeypatch, tmp_path, capsys
 ):
-    ziglang = tmp_path / "ziglang"
-    compiler(WORKS, plain).rename(ziglang)
+    ziglang = working.rename(tmp_path / "ziglang")
     program = compiler(lines)
     monkeypatch.setattr(library, "compilers", lambda: ((str(program),), (str(ziglang),)))
     assert library.find().maker == str(ziglang)
@@ -162,10 +151,7 @@ def test_the_clang_of_ziglang_is_asked_after_a_compiler_that_fails(
 
 @pytest.mark.kernel
 @pytest.mark.parametrize("place", ["file", "/proc/nowhere"])
-def test_a_cache_that_cannot_be_used_is_passed_over(
-    place, monkeypatch, tmp_path, compiler, plain, capsys
-):
-    compiler(WORKS, plain)
+def test_a_cache_that_cannot_be_used_is_passed_over(place, monkeypatch, tmp_path, working, capsys):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("GANLANE_CACHE", str(tmp_path / place))
     assert library.find().variant == "AVX512"
@@ -178,10 +164,9 @@ def test_a_cache_that_cannot_be_used_is_passed_over(
 
 @pytest.mark.kernel
 def test_a_library_that_cannot_be_loaded_from_the_cache_is_loaded_from_elsewhere(
-    monkeypatch, compiler, plain
+    monkeypatch, working
 ):
     """As where the cache is mounted with ``noexec``."""
-    program = compiler(WORKS, plain)
     load = library.ctypes.CDLL
 
     def refuse(path):
@@ -193,7 +178,7 @@ def test_a_library_that_cannot_be_loaded_from_the_cache_is_loaded_from_elsewhere
     for _ in range(2):
         assert library.find().troubles[0].count("failed to map segment") == 1
         library._find.cache_clear()
-    assert calls(program) == 1
+    assert calls(working) == 1
 
 
 @pytest.mark.kernel
@@ -274,8 +259,7 @@ def test_a_processor_gets_the_fastest_variant_that_it_runs(
 def test_the_library_of_a_wheel_is_taken_and_needs_no_compiler(
     monkeypatch, tmp_path, compiler, plain
 ):
-    refuses = 'case "$*" in *-mavx512f*) echo "error: unknown option" >&2; exit 1;; esac\n'
-    compiler(refuses + WORKS, plain)
+    compiler(REFUSES_AVX512 + WORKS, plain)
     monkeypatch.setattr(library.platform, "machine", lambda: "x86_64")
     paths, troubles = library.build_all(tmp_path / "wheel")
     assert [path.name.split("-")[1] for path in paths] == ["avx2", "default"]

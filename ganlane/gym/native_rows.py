@@ -22,7 +22,7 @@ from ganlane.gym.rows import (
 from ganlane.native.batch import NativeBatch, Stepped
 from ganlane.native.drivers import drivers_of, pays
 from ganlane.native.library import why_not
-from ganlane.native.settings import NATIVE_FORMS
+from ganlane.native.settings import END_EVENTS, NATIVE_FORMS
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.episode import Stream
 
@@ -40,12 +40,11 @@ class NativeRows(Rows):
         self.space = observation_space(batch.observation.shape[1], batch.bounds[1])
         # Made once, since they are views of arrays that the kernel writes to.
         state = batch.state
-        # No recorded scene is driven by the kernel, so none can end.
-        events = [name for name in keys.END_EVENTS if name != "scene_end"]
         self._arrays: dict[str, Any] = {
+            # No recorded scene is driven by the kernel, so none can end.
             "scene_end": np.zeros(batch.rows, np.bool_),
-            "lanes": batch.lanes,
-            "lane_width_m": np.float32(batch.lane_width_m),
+            "lanes": config.env.lanes,
+            "lane_width_m": np.float32(config.env.lane_width_m),
             keys.REWARD_TERMS: batch.reward_terms(),
         }
         for name in (keys.SEED, keys.EPISODE, keys.STEP):
@@ -55,7 +54,7 @@ class NativeRows(Rows):
         for name in (*keys.EGO_FLOATS, *keys.EGO_INTEGERS):
             self._arrays[name] = state[keys.EGO, name]
         # Events with several beginnings are counted; the ego has a memory of the same names.
-        for name in (*events, *keys.EVENT_COUNTS):
+        for name in (*END_EVENTS, *keys.EVENT_COUNTS):
             self._arrays[name] = state[keys.EVENTS, name]
         self._info = described(self._arrays, batch.mask)
 

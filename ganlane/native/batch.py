@@ -9,7 +9,7 @@ are, number for number, those of the TorchRL environment with ``env.kernel=nativ
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,8 +18,8 @@ import numpy.typing as npt
 from ganlane import keys
 from ganlane.native import settings
 from ganlane.native.drivers import (
-    NETWORKS,
     Drivers,
+    by_network,
     decision_settings,
     mask_settings,
     parts_of,
@@ -27,7 +27,7 @@ from ganlane.native.drivers import (
     turns_of,
 )
 from ganlane.native.library import addresses, in_threads, load, load_for
-from ganlane.native.settings import Key, Layout, fields
+from ganlane.native.settings import Array, Floats, Highway, Key, Layout, fields, filled, within
 from ganlane.settings.actions import CONTROLS, LANE, LANE_SPEED
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.driving import Visibility
@@ -43,31 +43,26 @@ _ROW_ARRAYS: dict[Key, str] = {
     keys.REWARD: "float32",
     **dict.fromkeys(("recycles", "fresh"), "bool"),
 }
-
-
-def _vehicles(names: str) -> list[Key]:
-    return [(keys.VEHICLES, name) for name in names.split()]
-
-
 # What a function of the kernel reads, in the order of its structure in C++. The ego perceives all
 # vehicles as they are: of what it sees and of what there is the view reads the same arrays.
-_VIEWS = [
-    *_vehicles("speed desired_speed length y x y speed valid"),
-    (keys.EGO, "change_progress"),
-    (keys.EGO, "change_direction"),
-    *_vehicles("x heading"),
+_VIEWS = (
+    *within(keys.VEHICLES, "speed desired_speed length y x y speed valid"),
+    *within(keys.EGO, "change_progress change_direction"),
+    *within(keys.VEHICLES, "x heading"),
     settings.SET_SPEED,
-]
-_MASKS = [
-    *_vehicles("x y heading speed length width desired_speed target_lane visibility valid"),
+)
+_MASKS = (
+    *within(
+        keys.VEHICLES, "x y heading speed length width desired_speed target_lane visibility valid"
+    ),
     (keys.EGO, "change_direction"),
-]
+)
 
 
-class _Batch(ctypes.Structure):
+class _Batch(settings.Structure):
     """``Batch`` of step.cpp."""
 
-    _fields_ = [
+    _fields_ = (
         *fields(
             ctypes.c_void_p,
             "settings inputs outputs spawn scene reward_settings reward terms view view_inputs"
@@ -75,7 +70,7 @@ class _Batch(ctypes.Structure):
         ),
         *fields(ctypes.c_float, "lowest highest fastest"),
         *fields(ctypes.c_int32, "vehicles lanes size mask_form abort_lane_change"),
-    ]
+    )
 
 
 class Stepped(NamedTuple):
@@ -84,19 +79,18 @@ class Stepped(NamedTuple):
     ``observation`` [N, D] and ``reward`` [N] float32, ``terminated`` and ``truncated`` [N] bool.
     """
 
-    observation: npt.NDArray[np.float32]
-    reward: npt.NDArray[np.float32]
+    observation: Floats
+    reward: Floats
     terminated: npt.NDArray[np.bool_]
     truncated: npt.NDArray[np.bool_]
 
 
 class _Part(NamedTuple):
-    """What drives the rows of one part of the drivers: its structures, and its rows in ``rows``."""
+    """What drives the rows of one part of the drivers, and its rows."""
 
     batch: _Batch
     rows: npt.NDArray[np.int64] | None
     rows_per_thread: int
-    pointed: dict[str, Any]
 
     def call(self, function: Callable[..., int], count: int) -> None:
         """A function of a whole batch, on ``count`` rows."""
@@ -107,9 +101,8 @@ class _Part(NamedTuple):
 
     def drive(self, decide: Callable[..., int], count: int) -> None:
         """The first ``count`` of ``rows``."""
-        pointers = [self.pointed[name] for name in ("settings", "inputs", "outputs")]
-        addresses = [ctypes.byref(structure) for structure in pointers]
-        in_threads(count, lambda first, last: decide(*addresses, first, last), self.rows_per_thread)
+        pointers = (self.batch.settings, self.batch.inputs, self.batch.outputs)
+        in_threads(count, lambda first, last: decide(*pointers, first, last), self.rows_per_thread)
 
 
 class NativeBatch:
@@ -132,27 +125,24 @@ class NativeBatch:
     def __init__(self, config: HighwayConfig, drivers: Drivers, variant: str | None = None) -> None:
         # For copies and other processes, which make the batch anew.
         self._arguments = (config, drivers, variant)
-        env, reward, mask, form = config.env, config.reward, config.mask, config.observation.form
+        env, mask, form = config.env, config.mask, config.observation.form
         episode, spawn, actions = env.episode_parameters(), env.spawn_parameters(), env.actions
-        stretches = env.stretches()
         flow = env.flow if env.flow.is_on else None
-        stream = int(Stream.named(config.stream))
-        self.rows = rows = config.num_envs
-        self.lanes = env.lanes
-        self.lane_width_m = env.lane_width_m
-        self.terms = reward.term_names
         road = (env.lanes, env.lane_width_m, env.vehicles)
-        view = settings.view_of(*road, config.observation.scale(), form, stretches, actions)
+        highway = Highway(*road, env.stretches(), flow, actions)
+        self.rows = rows = config.num_envs
+        self.terms = config.reward.term_names
+        view = settings.view_of(highway, config.observation, form)
         scene = env.scenes()
         longest_m = spawn.longest_m if scene is None else scene.longest_m
         self.bounds = (-1.0, largest_number(form, longest_m))
         # All arrays of the state in place, written by the kernel and read by whoever asks.
-        self.state: dict[Key, npt.NDArray[Any]] = {}
-        layout = Layout(drivers.memory(), actions, flow)
-        for name, kind in layout.kinds.items():
-            self.state[name] = np.zeros(layout.shape(name, rows, env.vehicles), kind)
-        for name, kind in _ROW_ARRAYS.items():
-            self.state[name] = np.zeros(rows, kind)
+        layout = Layout(drivers.memory(), highway)
+        self.state: dict[Key, Array] = {
+            name: np.zeros(layout.shape(name, rows, env.vehicles), kind)
+            for name, kind in layout.kinds.items()
+        }
+        self.state |= {name: np.zeros(rows, kind) for name, kind in _ROW_ARRAYS.items()}
         self._commands = self.state[keys.ACTION]
         if not actions.names:
             self._commands = self.state["controls"] = np.zeros((rows, CONTROLS), np.float32)
@@ -163,20 +153,19 @@ class NativeBatch:
             self.mask = np.ones((rows, len(actions.names)), np.bool_)
         self._term_values = np.zeros((rows, len(self.terms)), np.float32)
         self._no_safe_action = np.zeros(rows, np.bool_)
-        by_network = any(isinstance(part.drivers, NETWORKS) for part in parts_of(drivers))
         # A network fills the widest vectors with its own numbers.
-        self._library = load(variant) if variant or by_network else load_for(rows)
-        deceleration = mask.safe_deceleration
+        chosen = variant or by_network(drivers)
+        self._library = load(variant) if chosen else load_for(rows)
         abort = env.ego.abort_lane_change
-        # The kernel's structures, filled once. Referred to by this object, since a structure holds
-        # no more than their addresses.
+        # The kernel's structures, filled once.
         pointed: dict[str, Any] = {
-            "reward_settings": settings.reward_of(reward, episode.decision_period_s),
+            "reward_settings": settings.reward_of(config.reward, episode.decision_period_s),
             "view": view,
             "view_inputs": self._pointers(_VIEWS),
-            "mask_settings": mask_settings(road, drivers.idm, deceleration, abort, stretches),
+            "mask_settings": mask_settings(highway, drivers.idm, mask.safe_deceleration, abort),
             "mask_inputs": self._pointers(_MASKS),
             "mask_outputs": addresses([self._lane_mask, self._no_safe_action]),
+            "scene": self._pointers(settings.STARTS),
         }
         numbers: dict[str, Any] = {
             "reward": self.state[keys.REWARD].ctypes.data,
@@ -193,32 +182,29 @@ class NativeBatch:
             "mask_form": settings.MASK_FORMS.index(mask.form),
             "abort_lane_change": abort,
         }
+        recycle_share = env.recycle_share if env.recycle else None
+        if flow is not None:
+            # In every episode vehicles enter and leave.
+            recycle_share = 1.0
         self._turns = np.array(turns_of(drivers))
         self._parts = []
         for part in parts_of(drivers):
-            layout = Layout(part.memory, actions, flow)
+            layout = Layout(part.memory, highway)
             # Of several parts each drives the rows that are its own.
             row_list = np.zeros(rows, np.int64) if len(self._turns) > 1 else None
             # When others see the ego's lane changes, and the ego theirs.
-            visible = (Visibility.named(env.ego.visibility), part.drivers.visibility)
-            scene = env.scenes(part.drivers.visibility)
-            recycle_share = env.recycle_share if env.recycle else None
-            if flow is not None:
-                # In every episode vehicles enter and leave.
-                recycle_share = 1.0
-            numbers_of_part = (road, part.drivers, episode, env.ego, stretches, actions, flow)
+            others = part.drivers.visibility
+            visible = (Visibility.named(env.ego.visibility), others)
+            start = (Stream.named(config.stream), *visible, recycle_share, env.scenes(others))
             of_part = pointed | {
-                "settings": decision_settings(*numbers_of_part, env.mobil),
+                "settings": decision_settings(highway, part.drivers, episode, env.ego, env.mobil),
                 "inputs": self._pointers(layout.inputs, row_list),
                 "outputs": self._pointers(layout.outputs),
-                "spawn": settings.spawn_of(*road, spawn, stream, *visible, recycle_share, scene),
-                "scene": self._pointers(settings.STARTS),
+                "spawn": settings.spawn_of(highway, spawn, *start),
             }
-            batch = _Batch(
-                **{name: ctypes.addressof(structure) for name, structure in of_part.items()},
-                **numbers,
-            )
-            self._parts.append(_Part(batch, row_list, rows_per_thread(part.drivers), of_part))
+            pointers = {name: ctypes.addressof(of_part[name]) for name in of_part}
+            batch = filled(_Batch, pointers | numbers, of_part)
+            self._parts.append(_Part(batch, row_list, rows_per_thread(part.drivers)))
         ends = (self.state["terminated"], self.state["truncated"])
         self._stepped = Stepped(self.observation, self.state[keys.REWARD], *ends)
 
@@ -235,18 +221,12 @@ class NativeBatch:
         for array, numbers in zip(self._arrays(), state["arrays"]):
             array[:] = numbers
 
-    def _arrays(self) -> list[npt.NDArray[Any]]:
-        written = [
-            self.observation,
-            self.mask,
-            self._lane_mask,
-            self._term_values,
-            self._no_safe_action,
-        ]
-        return [*self.state.values(), *written]
+    def _arrays(self) -> list[Array]:
+        masks = (self.mask, self._lane_mask, self._no_safe_action)
+        return [*self.state.values(), self.observation, *masks, self._term_values]
 
     def _pointers(
-        self, names: Sequence[Key], rows: npt.NDArray[np.int64] | None = None
+        self, names: Iterable[Key], rows: Array | None = None
     ) -> ctypes.Array[ctypes.c_void_p]:
         arrays: dict[Key, Any] = {**self.state, "rows": rows}
         return addresses([arrays.get(name) for name in names])
@@ -272,7 +252,7 @@ class NativeBatch:
     def _part_of_row(self) -> npt.NDArray[np.int64]:
         return self._turns[self.state[keys.EPISODE] % len(self._turns)]
 
-    def step(self, actions: npt.NDArray[Any]) -> Stepped:
+    def step(self, actions: Array) -> Stepped:
         """One decision of every row, by the actions [N] or [N, 2]; no row is reset."""
         # Copied, since the kernel holds the address of this array.
         self._commands[:] = actions
@@ -288,6 +268,6 @@ class NativeBatch:
         self._parts[0].call(self._library.ganlane_judge, self.rows)
         return self._stepped
 
-    def reward_terms(self) -> dict[str, npt.NDArray[np.float32]]:
+    def reward_terms(self) -> dict[str, Floats]:
         """The terms of the last reward by name, each [N]."""
         return dict(zip(self.terms, self._term_values.T))

@@ -5,34 +5,34 @@ Imports no torch. The weights of a generator are packed as network.hpp reads the
 
 from __future__ import annotations
 
-import ctypes
 import math
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from ctypes import c_float, c_int32, c_void_p
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.native.library import BLOCK, ROWS_PER_THREAD, Loaded, find
 from ganlane.native.settings import (
-    STEERING,
-    Key,
+    Floats,
+    Highway,
     MemoryArrays,
     Range,
     Settings,
+    Structure,
     actions_of,
+    address,
     ends_of,
     fields,
     filled,
     flow_of,
+    range_of,
 )
-from ganlane.settings.actions import ActionParameters
 from ganlane.settings.driving import (
     DriverFaults,
     EgoParameters,
@@ -68,7 +68,6 @@ from ganlane.settings.generator import (
     stored_sizes,
 )
 from ganlane.settings.record import part_of
-from ganlane.settings.road import FlowParameters, Stretches
 from ganlane.settings.traffic import (
     GanCalibratedTrafficConfig,
     GanTrafficConfig,
@@ -86,7 +85,7 @@ from ganlane.weights import load_arrays
 if TYPE_CHECKING:
     from ganlane.data.statistics import DrivingStatistics
 
-Weights: TypeAlias = Mapping[str, npt.NDArray[np.float32]]
+Weights: TypeAlias = Mapping[str, Floats]
 #: Parameters of a random driver in its memory.
 _TRAITS: Final = 11
 #: The longest delay of a reaction, in steps: MOST_FIELDS of rows.hpp less 12 other numbers.
@@ -107,17 +106,31 @@ SIMULATED_ANCHOR: AnchorParameters = replace(
 #: while the driver is near its lane's centre, and waiting for a gap costs distance. A slow test
 #: holds the resulting rate.
 WISH_PER_CHANGE = 1.8
+#: An array of a memory: its type, and its shape behind [rows, vehicles].
+_Array: TypeAlias = tuple[str, tuple[int, ...]]
+_NUMBER: Final[_Array] = ("float32", ())
+_COUNT: Final[_Array] = ("int64", ())
 
 
-class RuleDrivers(NamedTuple):
+def _numbers(count: int) -> _Array:
+    return ("float32", (count,))
+
+
+def _memory(fields: Mapping[str, _Array]) -> MemoryArrays:
+    """The arrays of a memory by their keys in the state; names have dots for groups."""
+    return {(keys.TRAFFIC, *name.split(".")): array for name, array in fields.items()}
+
+
+@dataclass(frozen=True)
+class RuleDrivers:
     """Rule-driven drivers.
 
     ``mobil=None``: they keep their lanes. With ``faults`` they make mistakes; with ``random``
     ranges no two are alike.
     """
 
-    idm: IdmParameters = IdmParameters()
-    steering: SteeringParameters = SteeringParameters()
+    idm: IdmParameters = field(default_factory=IdmParameters)
+    steering: SteeringParameters = field(default_factory=SteeringParameters)
     mobil: MobilParameters | None = None
     faults: DriverFaults | None = None
     random: RandomDrivers | None = None
@@ -129,24 +142,25 @@ class RuleDrivers(NamedTuple):
     def memory(self) -> MemoryArrays:
         """Their memory in the order of faults.hpp or random_drivers.hpp, after the steering."""
         if self.faults is not None:
-            delay = _steps(self.faults.late_reaction.delay_s)
-            return {
-                _memory("base", "steering"): ("float32", ()),
-                _memory("late_reaction", "past"): ("float32", (delay,)),
-                _memory("late_reaction", "left"): ("int64", ()),
-                _memory("phantom_braking", "left"): ("int64", ()),
-                _memory("hesitant_change", "hesitant"): ("bool", ()),
-                _memory("aborted_change", "origin"): ("int64", ()),
-            }
-        arrays: MemoryArrays = {STEERING: ("float32", ())}
+            return _memory(
+                {
+                    "base.steering": _NUMBER,
+                    "late_reaction.past": _numbers(_steps(self.faults.late_reaction.delay_s)),
+                    "late_reaction.left": _COUNT,
+                    "phantom_braking.left": _COUNT,
+                    "hesitant_change.hesitant": ("bool", ()),
+                    "aborted_change.origin": _COUNT,
+                }
+            )
+        arrays = {"steering": _NUMBER}
         if self.random is not None:
-            arrays[_memory("traits")] = ("float32", (_TRAITS,))
+            arrays["traits"] = _numbers(_TRAITS)
             delay = _steps(self.random.reaction_s[1])
             if delay:
-                arrays[_memory("past")] = ("float32", (delay,))
-        return arrays
+                arrays["past"] = _numbers(delay)
+        return _memory(arrays)
 
-    def structures(self) -> dict[str, ctypes.Structure]:
+    def structures(self) -> dict[str, Structure]:
         """Further structures, by their names in :class:`~ganlane.native.settings.Settings`."""
         if self.faults is not None:
             return {"faults": _faults_of(self.faults)}
@@ -178,7 +192,7 @@ class GeneratedDrivers:
     guard: GuardParameters | None = None
     anchor: AnchorParameters | None = None
     checked_changes: CalibratedChanges = field(default_factory=CalibratedChanges)
-    headways_s: tuple[float, ...] = ()
+    headways_s: tuple[float, ...] = (0.0,) * len(QUANTILE_LEVELS)
     blind_share: float = 0.0
 
     #: Of the ego: the others do not steer.
@@ -194,24 +208,27 @@ class GeneratedDrivers:
     def memory(self) -> MemoryArrays:
         """Their memory in the order of generated.hpp."""
         sizes = self.sizes
-        arrays: MemoryArrays = {}
         if self.anchor is None:
-            arrays[_memory("acceleration", "acceleration")] = ("float32", ())
-            arrays[_memory("acceleration", "left")] = ("int64", ())
-            arrays[_memory("lane_change", "clock")] = ("int64", ())
-            arrays[_memory("lane_change", "lateral_speed")] = ("float32", ())
+            arrays = {
+                "acceleration.acceleration": _NUMBER,
+                "acceleration.left": _COUNT,
+                "lane_change.clock": _COUNT,
+                "lane_change.lateral_speed": _NUMBER,
+            }
         else:
-            arrays[_memory("generator", "residual_mean")] = ("float32", (2,))
-            arrays[_memory("generator", "headway")] = ("float32", ())
-            arrays[_memory("lane_change", "wish")] = ("int64", ())
-            arrays[_memory("lane_change", "waited")] = ("int64", ())
-        arrays[_memory("generator", "displacement")] = ("float32", (2,))
-        arrays[_memory("generator", "noise")] = ("float32", (sizes.noise,))
+            arrays = {
+                "generator.residual_mean": _numbers(2),
+                "generator.headway": _NUMBER,
+                "lane_change.wish": _COUNT,
+                "lane_change.waited": _COUNT,
+            }
+        arrays["generator.displacement"] = _numbers(2)
+        arrays["generator.noise"] = _numbers(sizes.noise)
         for index in range(sizes.observed - 1):
-            arrays[_memory("generator", f"motion_{index}")] = ("float32", (4 * sizes.hidden,))
-        return arrays
+            arrays[f"generator.motion_{index}"] = _numbers(4 * sizes.hidden)
+        return _memory(arrays)
 
-    def structures(self) -> dict[str, ctypes.Structure]:
+    def structures(self) -> dict[str, Structure]:
         """As of :class:`RuleDrivers`."""
         return {"generated": _generated_of(self)}
 
@@ -242,22 +259,18 @@ class HumanDrivers:
 
     def memory(self) -> MemoryArrays:
         """Their memory in the order of human.hpp."""
-        single = ("acceleration", "lateral_from", "lateral_to")
-        numbers = dict(HUMAN_MEMORY) | dict.fromkeys(single, 1)
-        return {
-            _memory(name): ("float32", () if count == 1 else (count,))
-            for name, count in numbers.items()
-        }
-
-    def structures(self) -> dict[str, ctypes.Structure]:
-        """As of :class:`RuleDrivers`."""
-        w = self.weights
-        packed = _aligned(
-            _layer(w[f"{name}.weight"], w[f"{name}.bias"]) for name in _human_layers(self.sizes)
+        counts = dict(HUMAN_MEMORY) | dict.fromkeys(
+            ("acceleration", "lateral_from", "lateral_to"), 1
         )
-        human = Human(weights=packed.ctypes.data, **vars(self.sizes), **vars(self.variation))
-        human.packed = packed
-        return {"human": human}
+        return _memory(
+            {name: _NUMBER if count == 1 else _numbers(count) for name, count in counts.items()}
+        )
+
+    def structures(self) -> dict[str, Structure]:
+        """As of :class:`RuleDrivers`."""
+        packed = _packed(_human_layers(self.sizes), self.weights)
+        numbers = vars(self.sizes) | vars(self.variation) | {"weights": packed.ctypes.data}
+        return {"human": filled(Human, numbers, packed)}
 
 
 #: Drivers of one kind.
@@ -266,7 +279,8 @@ OneKind: TypeAlias = RuleDrivers | GeneratedDrivers | HumanDrivers
 NETWORKS: Final = (GeneratedDrivers, HumanDrivers)
 
 
-class MixedDrivers(NamedTuple):
+@dataclass(frozen=True)
+class MixedDrivers:
     """Drivers that differ from episode to episode, all with one model of the ego.
 
     ``parts`` by name; episode ``e`` belongs to the part number ``turns[e % len(turns)]``.
@@ -327,6 +341,11 @@ def turns_of(drivers: Drivers) -> tuple[int, ...]:
     return drivers.turns if isinstance(drivers, MixedDrivers) else (0,)
 
 
+def by_network(drivers: Drivers) -> bool:
+    """Whether a network moves some of them."""
+    return any(isinstance(part.drivers, NETWORKS) for part in parts_of(drivers))
+
+
 def mixed_drivers(parts: Mapping[str, Drivers | None], shares: Mapping[str, int]) -> Drivers | None:
     """Drivers in turns, by their ``shares``; None where the kernel cannot drive one of them."""
     drivers: dict[str, OneKind] = {}
@@ -349,18 +368,8 @@ def blind(drivers: Drivers, share: float) -> Drivers | None:
     """
     if isinstance(drivers, MixedDrivers):
         parts = {name: blind(part, share) for name, part in drivers.parts.items()}
-        if None in parts.values():
-            return None
-        return drivers._replace(parts=parts)  # type: ignore[arg-type]
-    if drivers.blind_share:
-        return None
-    if isinstance(drivers, RuleDrivers):
-        return drivers._replace(blind_share=share)
-    return replace(drivers, blind_share=share)
-
-
-def _memory(*names: str) -> Key:
-    return (keys.TRAFFIC, *names)
+        return None if None in parts.values() else replace(drivers, parts=parts)  # type: ignore[arg-type]
+    return None if drivers.blind_share else replace(drivers, blind_share=share)
 
 
 def _steps(seconds: float) -> int:
@@ -368,21 +377,16 @@ def _steps(seconds: float) -> int:
 
 
 def decision_settings(
-    shape: tuple[int, float, int],
+    highway: Highway,
     drivers: OneKind,
     episode: EpisodeParameters | None = None,
     ego: EgoParameters | None = None,
-    stretches: Stretches = (),
-    actions: ActionParameters | None = None,
-    flow: FlowParameters | None = None,
     ego_mobil: MobilParameters | None = None,
 ) -> Settings:
     """The numbers of a decision: of road, driving and episode.
 
-    ``shape`` is lanes, their width in m, and M, ``stretches`` where the lanes begin and end,
-    ``actions`` what the ego is commanded (None: lanes), ``flow`` who enters and leaves (None:
-    nobody), ``ego_mobil`` how the ego falls behind before a change that it has to make (None: as
-    the others).
+    ``ego_mobil``: how the ego falls behind before a change that it has to make; None: as the
+    others.
     """
     episode = episode or EpisodeParameters()
     idm, steering = drivers.idm, drivers.steering
@@ -390,15 +394,16 @@ def decision_settings(
     # No two of these records have a field of one name.
     records = (episode, ego or EgoParameters(), idm, steering, mobil)
     numbers = {name: value for record in records for name, value in vars(record).items()}
+    ego_mobil = ego_mobil or mobil
     numbers |= {
-        "lanes": shape[0],
-        "lane_width_m": shape[1],
-        "vehicles": shape[2],
+        "lanes": highway.lanes,
+        "lane_width_m": highway.lane_width_m,
+        "vehicles": highway.vehicles,
         # The kernel multiplies where the model divides by a constant.
         "per_brake_scale": 1.0 / idm.brake_scale(),
         "per_near_s": 1.0 / steering.near_s,
         "per_far_s": 1.0 / steering.far_s,
-        "per_lane_width": 1.0 / shape[1],
+        "per_lane_width": 1.0 / highway.lane_width_m,
         "substeps": episode.substeps(),
         # A number of steps, since sums of 0.1 s drift in floats.
         "timeout_steps": _steps(episode.timeout_s),
@@ -406,44 +411,36 @@ def decision_settings(
         "mobil": isinstance(drivers, RuleDrivers) and drivers.mobil is not None,
         "stream": drivers.stream,
         "blind_share": drivers.blind_share,
+        "courtesy": ego_mobil.courtesy,
     }
-    ego_mobil = ego_mobil or mobil
-    numbers["courtesy"] = ego_mobil.courtesy
-    pointed = drivers.structures() | ends_of(stretches, ego_mobil) | actions_of(actions, episode)
-    pointed |= flow_of(flow, stretches, episode.decision_period_s)
-    # ctypes has the addresses alone, so the structures are held beside them.
+    pointed = drivers.structures() | ends_of(highway.stretches, ego_mobil)
+    pointed |= actions_of(highway.actions, episode.decision_period_s)
+    pointed |= flow_of(highway, episode.decision_period_s)
     for name in ("generated", "human", "faults", "random", "ends", "actions", "flow"):
-        numbers[name] = ctypes.addressof(pointed[name]) if name in pointed else None
-    settings = filled(Settings, numbers)
-    settings.pointed = list(pointed.values())
-    return settings
+        numbers[name] = address(pointed.get(name))
+    return filled(Settings, numbers, list(pointed.values()))
 
 
 def mask_settings(
-    shape: tuple[int, float, int],
-    idm: IdmParameters,
-    safe_deceleration: float,
-    abort: bool,
-    stretches: Stretches,
+    highway: Highway, idm: IdmParameters, safe_deceleration: float, abort: bool
 ) -> Settings:
     """The numbers of the mask ``safe``; ``safe_deceleration`` in m/s2."""
     # The mask reads few of the decision's numbers; the others are defaults.
     drivers = RuleDrivers(idm, mobil=MobilParameters(safe_deceleration=safe_deceleration))
-    ego = EgoParameters(abort_lane_change=abort)
-    return decision_settings(shape, drivers, ego=ego, stretches=stretches)
+    return decision_settings(highway, drivers, ego=EgoParameters(abort_lane_change=abort))
 
 
-class _Faults(ctypes.Structure):
+class _Faults(Structure):
     """``Faults`` of faults.hpp."""
 
-    _fields_ = [
+    _fields_ = (
         *fields(
             c_float,
             "braking_chance braking_steps deceleration lapse_chance lapse_steps"
             " hesitation_share pace abort_share abort_at",
         ),
         *fields(c_int32, "delay_steps"),
-    ]
+    )
 
 
 def _faults_of(faults: DriverFaults) -> _Faults:
@@ -467,55 +464,52 @@ def _chance(per_hour: float) -> float:
     return -math.expm1(-per_hour * keys.PHYSICS_STEP_S / 3600.0)
 
 
-class _Random(ctypes.Structure):
+class _Random(Structure):
     """``Random`` of random_drivers.hpp."""
 
-    _fields_ = [
+    _fields_ = (
         *fields(
             Range,
             "headway_s max_acceleration comfortable_deceleration strongest_braking politeness"
             " reaction_s sway_m sway_period_s desired_speed",
         ),
         *fields(c_int32, "delay_steps"),
-    ]
+    )
 
 
 def _random_of(drivers: RandomDrivers) -> _Random:
-    ranges = {name: Range(low, high - low) for name, (low, high) in vars(drivers).items()}
+    ranges = {name: range_of(bounds) for name, bounds in vars(drivers).items()}
     return _Random(**ranges, delay_steps=_steps(drivers.reaction_s[1]))
 
 
-class Network(ctypes.Structure):
+class Network(Structure):
     """``Network`` of network.hpp."""
 
-    _fields_ = [
+    _fields_ = (
         *fields(c_void_p, "weights"),
         *fields(
             c_int32,
             "embedding hidden pooling pooled context noise neighbours extra_inputs motions"
             " differences",
         ),
-    ]
+    )
 
 
-class Human(ctypes.Structure):
+class Human(Structure):
     """``Human`` of human.hpp."""
 
-    _fields_ = [
+    _fields_ = (
         *fields(c_void_p, "weights"),
         *fields(c_int32, "hidden lane_hidden"),
         *fields(c_float, "temperature lane_changes politeness"),
         *fields(c_int32, "delayed"),
-    ]
-
-    #: The array that ``weights`` points to.
-    packed: npt.NDArray[np.float32]
+    )
 
 
-class Generated(ctypes.Structure):
+class Generated(Structure):
     """``Generated`` of generated.hpp."""
 
-    _fields_ = [
+    _fields_ = (
         *fields(Network, "network"),
         *fields(c_float, "noise_share noise_fresh noise_scale"),
         *fields(c_int32, "calibrated guard"),
@@ -530,10 +524,7 @@ class Generated(ctypes.Structure):
         ),
         ("headways_s", c_float * len(QUANTILE_LEVELS)),
         *fields(c_int32, "further_inputs"),
-    ]
-
-    #: The array that ``network.weights`` points to.
-    packed: npt.NDArray[np.float32]
+    )
 
 
 def _generated_of(drivers: GeneratedDrivers) -> Generated:
@@ -544,10 +535,12 @@ def _generated_of(drivers: GeneratedDrivers) -> Generated:
     period = drivers.noise_period_s
     # As closed_loop.wander: what stays of a latent vector in a step.
     share = math.exp(-dt / period) if period > 0 else 0.0
+    packed = _packed(_layers(sizes), drivers.weights)
+    widths = vars(sizes) | {"weights": packed.ctypes.data, "motions": sizes.observed - 1}
     numbers: dict[str, Any] = {**vars(drivers.changes), **vars(anchor), **vars(anchor.idm)}
     numbers |= vars(guard)
     numbers |= {
-        "network": filled(Network, vars(sizes) | {"weights": None, "motions": sizes.observed - 1}),
+        "network": filled(Network, widths),
         "noise_share": share,
         "noise_fresh": math.sqrt(1.0 - share * share),
         "noise_scale": drivers.noise_scale,
@@ -556,7 +549,7 @@ def _generated_of(drivers: GeneratedDrivers) -> Generated:
         "sudden_chance": dt / sudden.every_s,
         "sudden_mean": sudden.mean,
         "sudden_sd": sudden.sd,
-        "sudden_steps": round(sudden.lasts_s / dt),
+        "sudden_steps": _steps(sudden.lasts_s),
         "guard_headway_s": guard.headway_s,
         # The guard's pull within a step.
         "centring": guard.centring_per_s * dt,
@@ -565,18 +558,14 @@ def _generated_of(drivers: GeneratedDrivers) -> Generated:
         "residual_across": anchor.residual[1],
         "washout_share": dt / anchor.washout_s,
         "changes_per_m": dt * drivers.checked_changes.per_km / 1000.0,
-        "patience_steps": round(drivers.checked_changes.patience_s / dt),
-        "headways_s": (drivers.headways_s or (0.0,) * len(QUANTILE_LEVELS)),
+        "patience_steps": _steps(drivers.checked_changes.patience_s),
+        "headways_s": drivers.headways_s,
     }
-    generated = filled(Generated, numbers)
-    # ctypes copies the address alone, so the numbers have to be held here.
-    generated.packed = _packed(sizes, drivers.weights)
-    generated.network.weights = generated.packed.ctypes.data
-    return generated
+    return filled(Generated, numbers, packed)
 
 
 class _Layer(NamedTuple):
-    """A layer of a generator by its names in the ``state_dict``.
+    """A layer of a network by its names in the ``state_dict``.
 
     ``gates``: those of an LSTM that the kernel computes; a layer without gates is one gate.
     """
@@ -588,41 +577,61 @@ class _Layer(NamedTuple):
     gates: tuple[int, ...] = (0,)
 
 
+def _dense(name: str, inputs: int, outputs: int, gates: tuple[int, ...] = (0,)) -> _Layer:
+    return _Layer(f"{name}.weight", f"{name}.bias", inputs, outputs, gates)
+
+
 def _layers(s: GeneratorSizes) -> list[_Layer]:
-    """All layers in the order of ``layers_of`` in network.hpp."""
+    """All layers of a generator in the order of ``layers_of`` in network.hpp."""
     motion, gates, state = 4, 4 * s.hidden, s.hidden + s.pooled + s.extra_inputs
     # The decoder's cell begins at 0, so its forget gate is left out.
     every, three = (0, 1, 2, 3), (0, 2, 3)
-    pair, second = "pooling.per_pair.bias", "pooling.second"
+    pair = "pooling.per_pair.bias"
     return [
-        _Layer("encoder.embed.weight", "encoder.embed.bias", motion, s.embedding),
-        _Layer("encoder.input.weight", "encoder.input.bias", s.embedding, gates, every),
+        _dense("encoder.embed", motion, s.embedding),
+        _dense("encoder.input", s.embedding, gates, every),
         _Layer("encoder.recurrent", None, s.hidden, gates, every),
         # The bias of a pair's first layer is added with the other vehicle's term.
         _Layer("pooling.per_pair.weight", None, motion, s.pooling),
         _Layer("pooling.per_vehicle.weight", pair, s.hidden, s.pooling),
-        _Layer(f"{second}.weight", f"{second}.bias", s.pooling, s.pooled),
-        _Layer("context.0.weight", "context.0.bias", state, s.context),
-        _Layer("context.2.weight", "context.2.bias", s.context, s.hidden - s.noise),
-        _Layer("decoder.embed.weight", "decoder.embed.bias", motion, s.embedding),
-        _Layer("decoder.input.weight", "decoder.input.bias", s.embedding, gates, three),
+        _dense("pooling.second", s.pooling, s.pooled),
+        _dense("context.0", state, s.context),
+        _dense("context.2", s.context, s.hidden - s.noise),
+        _dense("decoder.embed", motion, s.embedding),
+        _dense("decoder.input", s.embedding, gates, three),
         _Layer("decoder.recurrent", None, s.hidden, gates, three),
-        _Layer("head.weight", "head.bias", s.hidden, 2),
+        _dense("head", s.hidden, 2),
     ]
 
 
-def _packed(sizes: GeneratorSizes, weights: Weights) -> npt.NDArray[np.float32]:
-    """Of every layer the biases and the transposed weights, with zeros as further outputs."""
-    layers = []
-    for layer in _layers(sizes):
-        bias = None if layer.bias is None else weights[layer.bias]
-        layers.append(_layer(weights[layer.weight], bias, layer.gates))
-    return _aligned(layers)
+def _human_layers(sizes: HumanSizes) -> list[_Layer]:
+    """All layers of a policy of ``human`` in the order of human.hpp."""
+    return [
+        _dense("trunk.0", FEATURES, sizes.hidden),
+        _dense("trunk.2", sizes.hidden, sizes.hidden),
+        _dense("along", sizes.hidden, ALONG_TOKENS),
+        _dense("across", sizes.hidden, ACROSS_TOKENS),
+        _dense("lane.0", SIDE_FEATURES, sizes.lane_hidden),
+        _dense("lane.2", sizes.lane_hidden, 2),
+    ]
 
 
-def _aligned(layers: Iterable[npt.NDArray[np.float32]]) -> npt.NDArray[np.float32]:
-    """The layers one after the other, aligned to a vector."""
-    numbers = np.concatenate(list(layers))
+def _check_shapes(source: Path, sizes: Any, layers: list[_Layer], weights: Weights) -> None:
+    """Raise :class:`UserError` unless the ``weights`` are those of the ``layers``."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    for layer in layers:
+        shapes[layer.weight] = (layer.outputs, layer.inputs)
+        if layer.bias is not None:
+            shapes[layer.bias] = (layer.outputs,)
+    if {name: array.shape for name, array in weights.items()} != shapes:
+        raise misfit(source, vars(sizes))
+
+
+def _packed(layers: list[_Layer], weights: Weights) -> Floats:
+    """Of every layer the biases and the transposed weights, with zeros as further outputs; aligned
+    to a vector.
+    """
+    numbers = np.concatenate([_filled_up(layer, weights) for layer in layers])
     room = np.empty(len(numbers) + _WIDEST, np.float32)
     # NumPy aligns to 16 bytes, a vector has up to 64.
     start = -room.ctypes.data % 64 // 4
@@ -631,18 +640,16 @@ def _aligned(layers: Iterable[npt.NDArray[np.float32]]) -> npt.NDArray[np.float3
     return aligned
 
 
-def _layer(
-    weight: npt.NDArray[np.float32],
-    bias: npt.NDArray[np.float32] | None,
-    gates: tuple[int, ...] = (0,),
-) -> npt.NDArray[np.float32]:
+def _filled_up(layer: _Layer, weights: Weights) -> Floats:
+    weight = weights[layer.weight]
+    bias = np.zeros(len(weight)) if layer.bias is None else weights[layer.bias]
     # [gates, outputs of a gate, inputs]; the gates of an LSTM are filled up one by one.
-    blocks = 1 if gates == (0,) else 4
-    parts = np.column_stack([np.zeros(len(weight)) if bias is None else bias, weight])
-    parts = parts.reshape(blocks, len(weight) // blocks, -1)[list(gates)]
+    blocks = 1 if layer.gates == (0,) else 4
+    parts = np.column_stack([bias, weight])
+    parts = parts.reshape(blocks, len(weight) // blocks, -1)[list(layer.gates)]
     missing = -parts.shape[1] % _WIDEST
-    filled = np.pad(parts, ((0, 0), (0, missing), (0, 0)))
-    return filled.reshape(-1, parts.shape[2]).T.astype(np.float32).ravel()
+    padded = np.pad(parts, ((0, 0), (0, missing), (0, 0)))
+    return padded.reshape(-1, parts.shape[2]).T.astype(np.float32).ravel()
 
 
 # From weights and their metadata
@@ -709,11 +716,7 @@ def _statistics(metadata: Mapping[str, Any]) -> DrivingStatistics:
 def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralChanges:
     """Equations 9 to 11 with the numbers of all recordings given to the fit, held-out ones too."""
     changes = statistics.lane_changes
-    numbers = (
-        changes.t_m_srlc_steps,
-        changes.lateral_speed.mean,
-        changes.lateral_speed.sd,
-    )
+    numbers = (changes.t_m_srlc_steps, changes.lateral_speed.mean, changes.lateral_speed.sd)
     # A number is missing if no change was recorded from beginning to end.
     if None in numbers:
         raise UserError(
@@ -724,9 +727,7 @@ def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralCha
     return LiteralChanges(*(float(number) for number in numbers if number is not None))
 
 
-def sudden_accelerations(
-    statistics: DrivingStatistics,
-) -> SuddenAccelerations:
+def sudden_accelerations(statistics: DrivingStatistics) -> SuddenAccelerations:
     """Gaussian of the recorded accelerations over one second, of all scenes."""
     recorded = statistics.acceleration_smoothed
     default = SuddenAccelerations()
@@ -759,11 +760,7 @@ def fitted_anchor(metadata: Mapping[str, Any], source: object) -> AnchorParamete
             f"further_inputs={further_inputs!r}, expected seconds above 0 and true or false; fit "
             "it again."
         )
-    return replace(
-        SIMULATED_ANCHOR,
-        washout_s=float(washout_s),
-        further_inputs=further_inputs,
-    )
+    return replace(SIMULATED_ANCHOR, washout_s=float(washout_s), further_inputs=further_inputs)
 
 
 def pays(drivers: Drivers) -> bool:
@@ -772,8 +769,7 @@ def pays(drivers: Drivers) -> bool:
     Without an instruction for a product and a sum (x86 before 2013), a generator's network is a
     hundred times slower.
     """
-    by_network = any(isinstance(part.drivers, NETWORKS) for part in parts_of(drivers))
-    if not by_network or platform.machine() not in ("x86_64", "AMD64"):
+    if not by_network(drivers) or platform.machine() not in ("x86_64", "AMD64"):
         return True
     library = find()
     return isinstance(library, Loaded) and library.variant != "default"
@@ -782,7 +778,7 @@ def pays(drivers: Drivers) -> bool:
 def faulty_drivers(drivers: RuleDrivers, faults: DriverFaults) -> RuleDrivers | None:
     """``drivers`` with ``faults``; None where they react later than the kernel can remember."""
     late = _steps(faults.late_reaction.delay_s) > _MOST_STEPS
-    return None if late else drivers._replace(faults=faults)
+    return None if late else replace(drivers, faults=faults)
 
 
 def drivers_of(
@@ -798,13 +794,13 @@ def drivers_of(
     drivers: Drivers | None = None
     rules = RuleDrivers(idm, mobil=mobil, stream=stream)
     if isinstance(traffic, IdmTrafficConfig):
-        drivers = rules._replace(mobil=None)
+        drivers = replace(rules, mobil=None)
     elif isinstance(traffic, IdmMobilTrafficConfig):
         drivers = rules
     elif isinstance(traffic, IdmFaultsTrafficConfig):
         drivers = faulty_drivers(rules, part_of(traffic, DriverFaults))
     elif isinstance(traffic, IdmRandomTrafficConfig):
-        drivers = rules._replace(random=part_of(traffic, RandomDrivers))
+        drivers = replace(rules, random=part_of(traffic, RandomDrivers))
     elif isinstance(traffic, GanTrafficConfig):
         drivers = gan_drivers(traffic, idm, stream)
     elif isinstance(traffic, GanCalibratedTrafficConfig):
@@ -825,13 +821,7 @@ def _fitted(
     source = Path(path or shipped_generator(preset))
     weights, metadata = load_arrays(source, GENERATOR)
     sizes = stored_sizes(source, metadata, preset)
-    shapes: dict[str, tuple[int, ...]] = {}
-    for layer in _layers(sizes):
-        shapes[layer.weight] = (layer.outputs, layer.inputs)
-        if layer.bias is not None:
-            shapes[layer.bias] = (layer.outputs,)
-    if {name: array.shape for name, array in weights.items()} != shapes:
-        raise misfit(source, vars(sizes))
+    _check_shapes(source, sizes, _layers(sizes), weights)
     return source, weights, sizes, metadata
 
 
@@ -849,21 +839,5 @@ def human_drivers(config: HumanTrafficConfig, idm: IdmParameters, stream: int) -
         for name, array in weights.items()
         if name.startswith("policy.")
     }
-    shapes: dict[str, tuple[int, ...]] = {}
-    for name, (inputs, outputs) in _human_layers(sizes).items():
-        shapes |= {f"{name}.weight": (outputs, inputs), f"{name}.bias": (outputs,)}
-    if {name: array.shape for name, array in policy.items()} != shapes:
-        raise misfit(source, vars(sizes))
+    _check_shapes(source, sizes, _human_layers(sizes), policy)
     return HumanDrivers(idm, sizes, policy, stream, part_of(config, HumanVariation))
-
-
-def _human_layers(sizes: HumanSizes) -> dict[str, tuple[int, int]]:
-    """Inputs and outputs of the layers, in the order of human.hpp."""
-    return {
-        "trunk.0": (FEATURES, sizes.hidden),
-        "trunk.2": (sizes.hidden, sizes.hidden),
-        "along": (sizes.hidden, ALONG_TOKENS),
-        "across": (sizes.hidden, ACROSS_TOKENS),
-        "lane.0": (SIDE_FEATURES, sizes.lane_hidden),
-        "lane.2": (sizes.lane_hidden, 2),
-    }

@@ -8,9 +8,9 @@ they come from.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from ctypes import c_double, c_float, c_int32, c_int64, c_void_p
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,10 +18,8 @@ import numpy.typing as npt
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.settings.actions import CONTINUOUS, LANE, LANE_SPEED, ActionParameters
-from ganlane.settings.driving import (
-    MobilParameters,
-)
-from ganlane.settings.episode import EpisodeParameters, SpawnParameters
+from ganlane.settings.driving import MobilParameters
+from ganlane.settings.episode import SpawnParameters
 from ganlane.settings.observation import (
     NEARNESS_M,
     OVERLAP_M,
@@ -29,24 +27,47 @@ from ganlane.settings.observation import (
     ObservationScale,
     RewardParameters,
 )
-from ganlane.settings.road import (
-    FAR_M,
-    WALL,
-    FlowParameters,
-    Stretches,
-    exit_lane,
-    leaving,
-)
+from ganlane.settings.road import FAR_M, WALL, FlowParameters, Stretches, exit_lane, leaving
 
 if TYPE_CHECKING:
     from ganlane.sim.scenes import FixedScene
 
 #: A key of the state as the environment's TensorDict has it: ``"step"``, ``("vehicles", "x")``.
 Key = str | tuple[str, ...]
+Array: TypeAlias = npt.NDArray[Any]
+Floats: TypeAlias = npt.NDArray[np.float32]
 
 
-def _within(group: str, *names: str) -> tuple[Key, ...]:
-    return tuple((group, name) for name in names)
+def within(group: str, names: str | Iterable[str]) -> tuple[Key, ...]:
+    """The keys of ``names`` in a group of the state."""
+    listed = names.split() if isinstance(names, str) else names
+    return tuple((group, name) for name in listed)
+
+
+def _kinds(
+    group: str, floats: Iterable[str], integers: Iterable[str], flags: Iterable[str]
+) -> dict[Key, str]:
+    """Types of the arrays of a group."""
+    return {
+        **dict.fromkeys(within(group, floats), "float32"),
+        **dict.fromkeys(within(group, integers), "int64"),
+        **dict.fromkeys(within(group, flags), "bool"),
+    }
+
+
+class Highway(NamedTuple):
+    """A highway as the kernel is told of it.
+
+    ``vehicles`` is M, ``stretches`` where the lanes begin and end, ``flow`` who enters and leaves
+    (None: nobody), ``actions`` what the ego is commanded.
+    """
+
+    lanes: int = 3
+    lane_width_m: float = 4.0
+    vehicles: int = 9
+    stretches: Stretches = ()
+    flow: FlowParameters | None = None
+    actions: ActionParameters = ActionParameters()
 
 
 #: Stands for the steering angles of rule-driven drivers, wherever their memory has them.
@@ -54,34 +75,19 @@ STEERING: Final = (keys.TRAFFIC, "steering")
 #: Of the drivers' memory, by key: type, and shape behind [rows, vehicles].
 MemoryArrays = dict[Key, tuple[str, tuple[int, ...]]]
 #: Arrays [rows, vehicles] and their types.
-VEHICLE_ARRAYS: Final[dict[Key, str]] = {
-    **dict.fromkeys(_within(keys.VEHICLES, *keys.VEHICLE_FLOATS), "float32"),
-    **dict.fromkeys(_within(keys.VEHICLES, *keys.VEHICLE_INTEGERS), "int64"),
-    **dict.fromkeys(_within(keys.VEHICLES, *keys.VEHICLE_FLAGS), "bool"),
-}
+VEHICLE_ARRAYS: Final = _kinds(
+    keys.VEHICLES, keys.VEHICLE_FLOATS, keys.VEHICLE_INTEGERS, keys.VEHICLE_FLAGS
+)
+#: The ends of an episode but that of a recorded scene, which the kernel does not drive.
+END_EVENTS: Final = tuple(name for name in keys.END_EVENTS if name != "scene_end")
 #: Arrays that the state has as [rows, 1]: of the events, and whether the episode has ended.
 EVENT_ARRAYS: Final[dict[Key, str]] = {
-    # the end of a scene is one of recorded scenes, which the kernel does not drive
-    **dict.fromkeys(
-        _within(
-            keys.EVENTS,
-            "goal",
-            "hard_crash",
-            "out_of_road",
-            "missed_exit",
-            "timeout",
-        ),
-        "bool",
-    ),
-    **dict.fromkeys(_within(keys.EVENTS, *keys.EVENT_COUNTS), "int64"),
+    **dict.fromkeys(within(keys.EVENTS, END_EVENTS), "bool"),
+    **dict.fromkeys(within(keys.EVENTS, keys.EVENT_COUNTS), "int64"),
     **dict.fromkeys(keys.DONE_FLAGS, "bool"),
 }
 #: The ego's memory [rows].
-EGO_ARRAYS: Final[dict[Key, str]] = {
-    **dict.fromkeys(_within(keys.EGO, *keys.EGO_FLOATS), "float32"),
-    **dict.fromkeys(_within(keys.EGO, *keys.EGO_INTEGERS), "int64"),
-    **dict.fromkeys(_within(keys.EGO, *keys.EGO_FLAGS), "bool"),
-}
+EGO_ARRAYS: Final = _kinds(keys.EGO, keys.EGO_FLOATS, keys.EGO_INTEGERS, keys.EGO_FLAGS)
 #: Counters [rows].
 COUNTERS: Final[dict[Key, str]] = dict.fromkeys((keys.SEED, keys.EPISODE, keys.STEP), "int64")
 #: The speed that the ego aims at, where it is commanded.
@@ -94,8 +100,7 @@ INPUTS: Final = (
     *VEHICLE_ARRAYS,
     STEERING,
     (keys.EGO, "steering"),
-    *_within(keys.EGO, *keys.EGO_INTEGERS),
-    *_within(keys.EGO, keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND),
+    *within(keys.EGO, (*keys.EGO_INTEGERS, *keys.EVENT_COUNTS)),
     keys.STEP,
     "recycles",
     keys.SEED,
@@ -106,15 +111,7 @@ INPUTS: Final = (
 )
 #: What comes out of it, and out of the start of an episode.
 OUTPUTS: Final = (
-    *_within(
-        keys.VEHICLES,
-        "x",
-        "y",
-        "heading",
-        "speed",
-        "acceleration",
-        "target_lane",
-    ),
+    *within(keys.VEHICLES, "x y heading speed acceleration target_lane"),
     STEERING,
     *EGO_ARRAYS,
     keys.STEP,
@@ -124,14 +121,7 @@ OUTPUTS: Final = (
     VALID,
 )
 #: Fields of ``vehicles`` that no decision changes: the start of an episode sets them.
-SCENE: Final = _within(
-    keys.VEHICLES,
-    "length",
-    "width",
-    "desired_speed",
-    "visibility",
-    "valid",
-)
+SCENE: Final = within(keys.VEHICLES, "length width desired_speed visibility valid")
 #: What the start of an episode reads, and what it writes besides the outputs of a decision.
 STARTS: Final = (keys.SEED, keys.EPISODE, "fresh", *SCENE, "recycles")
 
@@ -156,7 +146,7 @@ def fields(kind: type, names: str) -> list[tuple[str, type]]:
 
 
 class Layout:
-    """The arrays of the state with drivers of this ``memory``; ``flow``: who enters and leaves.
+    """The arrays of the state of a ``highway`` with drivers of this ``memory``.
 
     Attributes:
         kinds: type of every array that the kernel reads or writes, by key.
@@ -165,27 +155,21 @@ class Layout:
         written: the outputs that are in ``kinds``.
     """
 
-    def __init__(
-        self,
-        memory: MemoryArrays,
-        actions: ActionParameters | None = None,
-        flow: FlowParameters | None = None,
-    ) -> None:
+    def __init__(self, memory: MemoryArrays, highway: Highway) -> None:
         self.kinds: dict[Key, str] = {**VEHICLE_ARRAYS, **EGO_ARRAYS, **EVENT_ARRAYS, **COUNTERS}
-        if actions is not None and actions.form == LANE_SPEED:
+        if highway.actions.form == LANE_SPEED:
             self.kinds[SET_SPEED] = "float32"
         self.kinds |= {name: kind for name, (kind, _) in memory.items()}
         self._memory = memory
         # Rule-driven drivers' steering angles have their place among the others.
         steering = next((name for name in memory if name[-1] == "steering"), STEERING)
-        further = [name for name in memory if name != steering]
-        self.inputs: list[Key] = [steering if name == STEERING else name for name in INPUTS]
-        self.outputs: list[Key] = [steering if name == STEERING else name for name in OUTPUTS]
-        if flow is None:
+        places: dict[Key, Key] = {STEERING: steering}
+        if highway.flow is None:
             # The place of no array: a null pointer.
-            self.outputs[self.outputs.index(VALID)] = "valid"
-        self.inputs += further
-        self.outputs += further
+            places[VALID] = "valid"
+        further = [name for name in memory if name != steering]
+        self.inputs = [steering if name == STEERING else name for name in INPUTS] + further
+        self.outputs = [places.get(name, name) for name in OUTPUTS] + further
         self.written = [name for name in self.outputs if name in self.kinds]
 
     def shape(self, name: Key, rows: int, vehicles: int) -> tuple[int, ...]:
@@ -195,7 +179,14 @@ class Layout:
         return (rows, vehicles) if name in VEHICLE_ARRAYS else (rows,)
 
 
-class Settings(ctypes.Structure):
+class Structure(ctypes.Structure):
+    """A structure of the kernel."""
+
+    #: What its members point to, which has to live as long; ctypes holds the addresses alone.
+    pointed: Any
+
+
+class Settings(Structure):
     """``Settings`` of model.hpp."""
 
     _fields_ = [
@@ -212,15 +203,12 @@ class Settings(ctypes.Structure):
         *fields(c_void_p, "generated human faults random ends actions flow"),
     ]
 
-    #: The structures that the last members point to, which have to live as long.
-    pointed: list[Any]
-
 
 #: Lanes of a road whose lanes end; as in model.hpp.
 _MOST_LANES: Final = 20
 
 
-class Ends(ctypes.Structure):
+class Ends(Structure):
     """``Ends`` of model.hpp."""
 
     _fields_ = [
@@ -230,7 +218,7 @@ class Ends(ctypes.Structure):
     ]
 
 
-class Flow(ctypes.Structure):
+class Flow(Structure):
     """``Flow`` of model.hpp."""
 
     _fields_ = [
@@ -240,7 +228,7 @@ class Flow(ctypes.Structure):
     ]
 
 
-class Actions(ctypes.Structure):
+class Actions(Structure):
     """``Actions`` of model.hpp."""
 
     _fields_ = [
@@ -253,19 +241,7 @@ class Actions(ctypes.Structure):
     ]
 
 
-def actions_of(
-    actions: ActionParameters | None, episode: EpisodeParameters | None
-) -> dict[str, ctypes.Structure]:
-    """What the ego is commanded, by the name in :class:`Settings`; empty for lanes alone."""
-    if actions is None or actions.form == LANE:
-        return {}
-    form = (LANE_SPEED, CONTINUOUS).index(actions.form)
-    period_s = (episode or EpisodeParameters()).decision_period_s
-    numbers = vars(actions) | {"form": form, "decision_period_s": period_s}
-    return {"actions": filled(Actions, numbers)}
-
-
-class View(ctypes.Structure):
+class View(Structure):
     """``View`` of observation.cpp."""
 
     _fields_ = [
@@ -274,15 +250,12 @@ class View(ctypes.Structure):
         ("ends", c_void_p),
     ]
 
-    #: The structure that ``ends`` points to, which has to live as long.
-    pointed: Any
-
     def numbers(self) -> int:
         """Length of the observation: own state, lane view, own lane change, road, commands."""
         return 5 + 6 * (4 if self.drift else 3) + (8 if self.road else 0) + self.control
 
 
-class Range(ctypes.Structure):
+class Range(Structure):
     """``Range`` of arrays.hpp."""
 
     _fields_ = fields(c_float, "low span")
@@ -291,7 +264,7 @@ class Range(ctypes.Structure):
 _FIXED_ARRAYS: Final = "x y speed length width desired_speed target_lane visibility"
 
 
-class Fixed(ctypes.Structure):
+class Fixed(Structure):
     """``Fixed`` of arrays.hpp."""
 
     _fields_ = [
@@ -300,11 +273,8 @@ class Fixed(ctypes.Structure):
         *fields(c_int32, "waiting"),
     ]
 
-    #: The arrays that its members point to, which have to live as long.
-    arrays: list[npt.NDArray[Any]]
 
-
-class Spawn(ctypes.Structure):
+class Spawn(Structure):
     """``Spawn`` of arrays.hpp."""
 
     _fields_ = [
@@ -324,11 +294,8 @@ class Spawn(ctypes.Structure):
         ("fixed", c_void_p),
     ]
 
-    #: The structure that ``fixed`` points to, which has to live as long.
-    pointed: Any
 
-
-class Reward(ctypes.Structure):
+class Reward(Structure):
     """``Reward`` of step.cpp."""
 
     _fields_ = [
@@ -341,18 +308,41 @@ class Reward(ctypes.Structure):
     ]
 
 
-Structure = TypeVar("Structure", bound=ctypes.Structure)
+Kind = TypeVar("Kind", bound=Structure)
 
 
-def filled(kind: type[Structure], numbers: Mapping[str, Any]) -> Structure:
+def filled(kind: type[Kind], numbers: Mapping[str, Any], pointed: Any = None) -> Kind:
     """A structure with those of the ``numbers`` that it has."""
     # A missing number is a KeyError here instead of a 0 in the kernel.
-    return kind(**{member[0]: numbers[member[0]] for member in kind._fields_})
+    structure = kind(**{member[0]: numbers[member[0]] for member in kind._fields_})
+    structure.pointed = pointed
+    return structure
+
+
+def address(structure: ctypes.Structure | None) -> int | None:
+    """Where a structure is; None: a null pointer."""
+    return None if structure is None else ctypes.addressof(structure)
+
+
+def range_of(bounds: tuple[float, float]) -> Range:
+    """A range as its lower end and its span, as the draw needs them."""
+    low, high = bounds
+    return Range(low, high - low)
+
+
+def actions_of(actions: ActionParameters, decision_period_s: float) -> dict[str, Structure]:
+    """What the ego is commanded, by the name in :class:`Settings`; empty for lanes alone."""
+    if actions.form == LANE:
+        return {}
+    form = (LANE_SPEED, CONTINUOUS).index(actions.form)
+    numbers = vars(actions) | {"form": form, "decision_period_s": decision_period_s}
+    return {"actions": filled(Actions, numbers)}
 
 
 def ends_of(
-    stretches: Stretches, mobil: MobilParameters | None = None
-) -> dict[str, ctypes.Structure]:
+    stretches: Stretches,
+    mobil: MobilParameters = MobilParameters(),  # noqa: B008 - frozen
+) -> dict[str, Structure]:
     """Where lanes begin and end, by the name in :class:`Settings`; empty if all go on.
 
     Raises:
@@ -365,71 +355,52 @@ def ends_of(
             f"lanes={len(stretches)}: the native kernel has at most {_MOST_LANES} lanes on roads "
             "with lanes that end; set env.kernel=torch."
         )
-    mobil = mobil or MobilParameters()
     goal = exit_lane(stretches)
     leave_by, changes = leaving(stretches)
     exit_by, exit_changes = leaving(stretches, goal)
-    numbers = {
-        "begin": [stretch.begin_m for stretch in stretches],
-        "end": [stretch.end_m for stretch in stretches],
-        "wall": [its.end_m if its.end == WALL else FAR_M for its in stretches],
-        "leave_by": leave_by,
-        "reach": [mobil.mandatory_m * number for number in changes],
-        "exit_by": exit_by,
-        "exit_reach": [mobil.mandatory_m * number for number in exit_changes],
-    }
-    ends = Ends(mandatory_bias=mobil.mandatory_bias, exit_lane=-1 if goal is None else goal)
-    for name, row in numbers.items():
-        for lane, number in enumerate(row):
-            getattr(ends, name)[lane] = number
+    ends = Ends(
+        begin=tuple(its.begin_m for its in stretches),
+        end=tuple(its.end_m for its in stretches),
+        wall=tuple(its.end_m if its.end == WALL else FAR_M for its in stretches),
+        leave_by=leave_by,
+        reach=tuple(mobil.mandatory_m * number for number in changes),
+        exit_by=exit_by,
+        exit_reach=tuple(mobil.mandatory_m * number for number in exit_changes),
+        mandatory_bias=mobil.mandatory_bias,
+        exit_lane=-1 if goal is None else goal,
+    )
     return {"ends": ends}
 
 
-def flow_of(
-    flow: FlowParameters | None,
-    stretches: Stretches,
-    period_s: float,
-) -> dict[str, ctypes.Structure]:
+def flow_of(highway: Highway, period_s: float) -> dict[str, Structure]:
     """Who enters and leaves, by the name in :class:`Settings`; empty if nobody does."""
+    flow = highway.flow
     if flow is None:
         return {}
-    structure = Flow(exit_share=flow.exit_share, from_m=flow.from_m, to_m=flow.to_m)
-    for lane, probability in enumerate(flow.arrivals(stretches, period_s)):
-        structure.arrival[lane] = probability
-    return {"flow": structure}
+    arrivals = flow.arrivals(highway.stretches, period_s)
+    return {"flow": Flow(arrivals, flow.exit_share, flow.from_m, flow.to_m)}
 
 
-def view_of(
-    lanes: int,
-    lane_width_m: float,
-    vehicles: int,
-    scale: ObservationScale,
-    form: str,
-    stretches: Stretches = (),
-    actions: ActionParameters | None = None,
-) -> View:
-    """The numbers of an observation in :data:`NATIVE_FORMS`; ``actions``: those at whose numbers it
-    ends.
-    """
-    ends = ends_of(stretches).get("ends")
-    road = (lane_width_m, NEARNESS_M, OVERLAP_M, ROAD_SIGHT_M, HEADING_RAD, lanes, vehicles)
+def view_of(highway: Highway, scale: ObservationScale, form: str) -> View:
+    """The numbers of an observation in :data:`NATIVE_FORMS`."""
+    ends = ends_of(highway.stretches).get("ends")
     # By position, in the order of the members of View.
     view = View(
         scale.range_m,
         scale.speed_mps,
-        *road,
+        highway.lane_width_m,
+        *(NEARNESS_M, OVERLAP_M, ROAD_SIGHT_M, HEADING_RAD),
+        *(highway.lanes, highway.vehicles),
         *NATIVE_FORMS[form],
-        CONTROL_NUMBERS[actions.form if actions is not None else LANE],
-        None if ends is None else ctypes.addressof(ends),
+        CONTROL_NUMBERS[highway.actions.form],
+        address(ends),
     )
     view.pointed = ends
     return view
 
 
 def spawn_of(
-    lanes: int,
-    lane_width_m: float,
-    vehicles: int,
+    highway: Highway,
     spawn: SpawnParameters,
     stream: int,
     ego_visibility: int,
@@ -441,10 +412,10 @@ def spawn_of(
     none does.
     """
     fixed = None if scene is None else _fixed_of(scene)
-    numbers = vars(spawn) | {
-        "lanes": lanes,
-        "lane_width_m": lane_width_m,
-        "vehicles": vehicles,
+    numbers: dict[str, Any] = {}
+    for name, value in vars(spawn).items():
+        numbers[name] = range_of(value) if isinstance(value, tuple) else value
+    numbers |= highway._asdict() | {
         "stream": stream,
         "ego_visibility": ego_visibility,
         "others_visibility": others_visibility,
@@ -452,15 +423,9 @@ def spawn_of(
         "capacity": spawn.lane_capacity(),
         "recycle": recycle_share is not None,
         "recycle_share": recycle_share or 0.0,
-        "fixed": None if fixed is None else ctypes.addressof(fixed),
+        "fixed": address(fixed),
     }
-    # Ranges as their lower end and their span, as the draw needs them.
-    for name, value in numbers.items():
-        if isinstance(value, tuple | list):
-            numbers[name] = Range(value[0], value[1] - value[0])
-    structure = filled(Spawn, numbers)
-    structure.pointed = fixed
-    return structure
+    return filled(Spawn, numbers, fixed)
 
 
 def _fixed_of(scene: FixedScene) -> Fixed:
@@ -469,14 +434,10 @@ def _fixed_of(scene: FixedScene) -> Fixed:
     base = {name: value.numpy()[0] for name, value in scene.base().as_dict().items()}
     arrays = {}
     for name in _FIXED_ARRAYS.split():
-        numbers = base[name]
-        kind = np.float32 if numbers.dtype == np.float64 else np.int64
-        arrays[name] = np.ascontiguousarray(numbers.astype(kind))
+        kind = np.float32 if base[name].dtype == np.float64 else np.int64
+        arrays[name] = np.ascontiguousarray(base[name].astype(kind))
     pointers = {name: array.ctypes.data for name, array in arrays.items()}
-    jitter = {"jitter_m": scene.jitter_m, "jitter_mps": scene.jitter_mps}
-    fixed = Fixed(**pointers, **jitter, waiting=scene.waiting)
-    fixed.arrays = list(arrays.values())
-    return fixed
+    return filled(Fixed, vars(scene) | pointers, arrays)
 
 
 def reward_of(reward: RewardParameters, decision_period_s: float) -> Reward:

@@ -27,16 +27,11 @@ from ganlane.native.drivers import (
     turns_of,
 )
 from ganlane.native.library import ROWS_PER_THREAD, addresses, in_threads, load
-from ganlane.native.settings import Key, Layout
+from ganlane.native.settings import Highway, Key, Layout
 from ganlane.settings.actions import ActionParameters
-from ganlane.settings.driving import (
-    EgoParameters,
-    IdmParameters,
-    MobilParameters,
-)
+from ganlane.settings.driving import EgoParameters, IdmParameters, MobilParameters
 from ganlane.settings.episode import EpisodeParameters
 from ganlane.settings.observation import ObservationScale
-from ganlane.settings.road import FlowParameters
 from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import VISIBILITY_OF_EPISODE, Road, Vehicles
 
@@ -85,16 +80,17 @@ def _tensordict(groups: Mapping[str, Any], size: torch.Size) -> TensorDict:
     return TensorDict._new_unsafe(fields, batch_size=size, device=torch.device("cpu"))
 
 
-def _shape(road: Road, vehicles: int) -> tuple[int, float, int]:
-    """Lanes, their width in m, and M."""
+def _highway(road: Road, vehicles: int, actions: ActionParameters | None = None) -> Highway:
+    """What the kernel is told of the road, M and the actions (None: lanes)."""
     # The settings have one number of lanes and one width for all rows.
-    of_rows = isinstance(road.lanes, Tensor) or isinstance(road.lane_width_m, Tensor)
-    if of_rows or road.ring_m is not None:
+    lanes, width_m = road.lanes, road.lane_width_m
+    if isinstance(lanes, Tensor) or isinstance(width_m, Tensor) or road.ring_m is not None:
         raise UserError(
             "env.kernel=native: the road must be straight and the same in all rows; "
             "set env.kernel=torch."
         )
-    return road.lanes, road.lane_width_m, vehicles  # type: ignore[return-value]
+    commands = actions or ActionParameters()
+    return Highway(lanes, width_m, vehicles, road.stretches, road.flow, commands)
 
 
 class _Remade:
@@ -135,10 +131,7 @@ class _Function(_Remade):
         self._call = getattr(load(variant), name)
 
     def run(
-        self,
-        rows: int,
-        inputs: Iterable[Tensor | None],
-        outputs: Sequence[Tensor | None],
+        self, rows: int, inputs: Iterable[Tensor | None], outputs: Sequence[Tensor | None]
     ) -> None:
         """Call it on ``rows`` rows, with its arrays in the kernel's order."""
         # The contiguous copies have to live until the call is over.
@@ -156,17 +149,11 @@ class _Parts(_Remade):
     ``layouts`` are those of the parts, ``layout`` is that of the whole state.
     """
 
-    def __init__(
-        self,
-        drivers: Drivers,
-        vehicles: int,
-        actions: ActionParameters | None = None,
-        flow: FlowParameters | None = None,
-    ) -> None:
-        self.vehicles = vehicles
-        self.layout = Layout(drivers.memory(), actions, flow)
+    def __init__(self, drivers: Drivers, highway: Highway) -> None:
+        self.vehicles = highway.vehicles
+        self.layout = Layout(drivers.memory(), highway)
         self.parts = parts_of(drivers)
-        self.layouts = [Layout(part.memory, actions, flow) for part in self.parts]
+        self.layouts = [Layout(part.memory, highway) for part in self.parts]
         self._turns = torch.tensor(turns_of(drivers))
 
     def of_part(self, number: int, episode: Tensor) -> Tensor:
@@ -199,14 +186,12 @@ class Kernel(_Parts):
         actions: ActionParameters | None = None,
         mobil: MobilParameters | None = None,
     ) -> None:
-        super().__init__(drivers or RuleDrivers(), vehicles, actions, road.flow)
-        self._controls = actions is not None and not actions.names
-        self._dtypes = {name: getattr(torch, kind) for name, kind in self.layout.kinds.items()}
-        shape = _shape(road, vehicles)
+        highway = _highway(road, vehicles, actions)
+        super().__init__(drivers or RuleDrivers(), highway)
+        self._controls = not highway.actions.names
         self._functions = []
         for part in self.parts:
-            of_road = (road.stretches, actions, road.flow, mobil)
-            numbers = decision_settings(shape, part.drivers, episode, ego, *of_road)
+            numbers = decision_settings(highway, part.drivers, episode, ego, mobil)
             per_thread = rows_per_thread(part.drivers)
             self._functions.append(_Function("ganlane_decide", numbers, variant, per_thread))
 
@@ -227,11 +212,9 @@ class Kernel(_Parts):
         """
         rows = action.shape[0]
         layout = self.layout
-        arrays: dict[Key, Tensor | None] = {"recycles": recycles}
+        arrays: dict[Key, Tensor | None] = {"recycles": recycles, keys.ACTION: action}
         if self._controls:
             arrays |= {keys.ACTION: None, "controls": action.float()}
-        else:
-            arrays |= {keys.ACTION: action, "controls": None}
         for name in layout.inputs:
             if name in arrays or name not in layout.kinds:
                 continue
@@ -240,9 +223,10 @@ class Kernel(_Parts):
             for part in (name,) if isinstance(name, str) else name:
                 number = number.get(part)
             # A wrong type would be read as other numbers, without an error.
-            if number.dtype is not self._dtypes[name] or number.shape[0] != rows:
+            dtype = getattr(torch, layout.kinds[name])
+            if number.dtype is not dtype or number.shape[0] != rows:
                 raise TypeError(
-                    f"the kernel takes {rows} rows of {self._dtypes[name]} as {name}, "
+                    f"the kernel takes {rows} rows of {dtype} as {name}, "
                     f"not {number.dtype} {number.shape}"
                 )
             arrays[name] = number
@@ -271,8 +255,8 @@ class Kernel(_Parts):
         after: Mapping[Key, Tensor],
     ) -> None:
         layout = self.layouts[number]
-        inputs = [arrays.get(name) for name in layout.inputs]
-        self._functions[number].run(rows, inputs, [after.get(name) for name in layout.outputs])
+        inputs, outputs = map(arrays.get, layout.inputs), list(map(after.get, layout.outputs))
+        self._functions[number].run(rows, inputs, outputs)
 
 
 class NativeScenes(_Parts):
@@ -295,25 +279,20 @@ class NativeScenes(_Parts):
         drivers: Drivers | None = None,
         actions: ActionParameters | None = None,
     ) -> None:
-        super().__init__(drivers or RuleDrivers(), scenes.vehicles, actions)
-        shape = _shape(scenes.road, scenes.vehicles)
+        highway = _highway(scenes.road, scenes.vehicles, actions)
+        super().__init__(drivers or RuleDrivers(), highway)
         self._functions = []
         for part in self.parts:
             others = scenes.others_visibility
             others = part.drivers.visibility if others == VISIBILITY_OF_EPISODE else others
-            seen = (scenes.ego_visibility, others)
-            spawn = settings.spawn_of(*shape, scenes.parameters, stream, *seen, recycle_share=None)
-            enter = decision_settings(shape, part.drivers)
+            start = (stream, scenes.ego_visibility, others, None)
+            spawn = settings.spawn_of(highway, scenes.parameters, *start)
+            enter = decision_settings(highway, part.drivers)
             # The scene first, then the drivers' memory of it.
             functions = (_Function("ganlane_spawn", spawn), _Function("ganlane_enter", enter))
             self._functions.append(functions)
 
-    def start(
-        self,
-        seed: Tensor,
-        episode: Tensor,
-        rows: Tensor | None = None,
-    ) -> TensorDict:
+    def start(self, seed: Tensor, episode: Tensor, rows: Tensor | None = None) -> TensorDict:
         """The first states of the episodes (``seed``, ``episode``) [N] int64.
 
         ``rows`` [N] bool are those to be drawn; None: all. The others are zeros, without a vehicle.
@@ -346,14 +325,8 @@ class LaneView(_Function):
         form: one of :data:`ganlane.native.settings.NATIVE_FORMS`.
     """
 
-    def __init__(
-        self,
-        road: Road,
-        vehicles: int,
-        scale: ObservationScale,
-        form: str,
-    ) -> None:
-        view = settings.view_of(*_shape(road, vehicles), scale, form, road.stretches)
+    def __init__(self, road: Road, vehicles: int, scale: ObservationScale, form: str) -> None:
+        view = settings.view_of(_highway(road, vehicles), scale, form)
         self.size = view.numbers()
         super().__init__("ganlane_lane_view", view)
 
@@ -365,24 +338,11 @@ class LaneView(_Function):
         Arguments as :meth:`ganlane.transforms.ObservationTransform.observe`.
         """
         v = vehicles
-        inputs: list[Tensor | None] = [
-            v.speed,
-            v.desired_speed,
-            v.length,
-            v.y,
-            seen.x,
-            seen.y,
-            seen.speed,
-            seen.valid,
-            progress,
-            direction,
-            v.x,
-            v.heading,
-            None,
-        ]
         # In the order of observation.cpp: the ego as it is, the others as they are seen.
+        inputs = [v.speed, v.desired_speed, v.length, v.y, seen.x, seen.y, seen.speed, seen.valid]
+        inputs += [progress, direction, v.x, v.heading]
         out = torch.empty((len(v.x), self.size), dtype=torch.float32)
-        self.run(len(out), inputs, [out])
+        self.run(len(out), [*inputs, None], [out])
         return out
 
 
@@ -402,8 +362,7 @@ class SafeActions(_Function):
     def __init__(
         self, road: Road, vehicles: int, idm: IdmParameters, safe_deceleration: float, abort: bool
     ) -> None:
-        shape = _shape(road, vehicles)
-        numbers = mask_settings(shape, idm, safe_deceleration, abort, road.stretches)
+        numbers = mask_settings(_highway(road, vehicles), idm, safe_deceleration, abort)
         super().__init__("ganlane_mask", numbers)
 
     def allowed(self, seen: Vehicles, direction: Tensor) -> tuple[Tensor, Tensor]:
@@ -413,9 +372,9 @@ class SafeActions(_Function):
         lane change.
         """
         v = seen
-        rows = seen.x.shape[0]
-        inputs = [v.x, v.y, v.heading, v.speed, v.length, v.width, v.desired_speed]
+        rows = len(v.x)
         # In the order of the structure in C++.
+        inputs = [v.x, v.y, v.heading, v.speed, v.length, v.width, v.desired_speed]
         inputs += [v.target_lane, v.visibility, v.valid, direction]
         mask = torch.empty(rows, 3, dtype=torch.bool)
         none = torch.empty(rows, dtype=torch.bool)

@@ -17,7 +17,7 @@ import pytest
 from ganlane.native.batch import NativeBatch
 from ganlane.native.drivers import drivers_of, parts_of
 from ganlane.native.library import FLAGS, VARIANTS
-from ganlane.native.settings import Layout, ends_of
+from ganlane.native.settings import Highway, Layout, ends_of
 from ganlane.settings.commands import highways
 from ganlane.settings.driving import IdmParameters, MobilParameters
 from ganlane.settings.record import make
@@ -80,7 +80,7 @@ def program(request, tmp_path_factory):
 
 def described(batch, layout):
     """The state before a decision, as decide_elsewhere.cpp reads it."""
-    settings = batch._parts[0].pointed["settings"]
+    settings = batch._parts[0].batch.pointed["settings"]
     names = list(batch.state)
     parts = [struct.pack("qqq", ROWS, DECISIONS, len(names))]
     kind = type(settings)
@@ -113,7 +113,7 @@ def described(batch, layout):
 def test_another_processor_drives_the_same_episodes(traffic, ends, program, tmp_path):
     drivers = drivers_of(make(TrafficConfig, traffic), IdmParameters(), MobilParameters(), 0)
     batch = NativeBatch(highways(num_envs=ROWS), drivers)
-    settings = batch._parts[0].pointed["settings"]
+    settings = batch._parts[0].batch.pointed["settings"]
     for name, structure in ends_of(ends).items():
         setattr(settings, name, ctypes.addressof(structure))
         settings.pointed.append(structure)
@@ -122,7 +122,7 @@ def test_another_processor_drives_the_same_episodes(traffic, ends, program, tmp_
     # Rows that end stay as they are, here and there.
     (part,) = parts_of(drivers)
     before, after = tmp_path / "before", tmp_path / "after"
-    before.write_bytes(described(batch, Layout(part.memory)))
+    before.write_bytes(described(batch, Layout(part.memory, Highway())))
     subprocess.run([*program, str(before), str(after)], check=True)
     for _ in range(DECISIONS):
         batch._parts[0].drive(batch._library.ganlane_decide, ROWS)

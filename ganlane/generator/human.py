@@ -58,6 +58,8 @@ LONGEST = 12.0
 LONG_AGO = 6.0
 #: What the driver behind would have to brake, among the numbers of a side.
 REAR_BRAKING = 9
+#: Standard deviation of the soft targets, in tokens.
+BLUR = 0.7
 #: The probabilities of both lane changes together are at most this.
 _MOST_LIKELY = 0.98
 
@@ -86,12 +88,12 @@ class Tokens(NamedTuple):
         """Value at a real-valued index."""
         return self.scale * torch.sinh((index / (self.number - 1) * 2.0 - 1.0) * self.reach)
 
-    def soft_target(self, value: Tensor, blur: float = 0.7) -> Tensor:
+    def soft_target(self, value: Tensor) -> Tensor:
         """A distribution over the tokens around ``value``, [..., number]."""
         place = torch.asinh(value / self.scale).clamp(-self.reach, self.reach)
         index = (place / self.reach + 1.0) * 0.5 * (self.number - 1)
         numbers = torch.arange(self.number, device=value.device).to(value.dtype)
-        distance = (numbers - index[..., None]) / blur
+        distance = (numbers - index[..., None]) / BLUR
         return torch.softmax(-0.5 * distance * distance, -1)
 
     def sample(self, logits: Tensor, u: Tensor, temperature: float = 1.0) -> Tensor:
@@ -196,12 +198,22 @@ def velocity(vehicles: Vehicles) -> tuple[Tensor, Tensor]:
     return along, vehicles.speed * torch.sin(vehicles.heading)
 
 
-def see(vehicles: Vehicles, road: Road) -> tuple[Tensor, Near, Near]:
-    """The lane of each vehicle, and its neighbours ahead and behind in three lanes."""
+def lane_after(y: Tensor, aside: Tensor, road: Road, seconds: float) -> Tensor:
+    """The lane that a vehicle at ``y`` in m is in after so long at the lateral speed ``aside`` in
+    m/s; at most the next one.
+    """
+    lane = road.lane_of(y)
+    return road.lane_of(y + seconds * aside).clamp(lane - 1, lane + 1)
+
+
+def see(vehicles: Vehicles, road: Road, sides: bool) -> tuple[Tensor, Near, Near]:
+    """The lane of each vehicle, and its neighbours ahead and behind in three lanes.
+
+    Without ``sides`` in the own lane alone.
+    """
     speed, aside = velocity(vehicles)
     lane = road.lane_of(vehicles.y)
-    soon = road.lane_of(vehicles.y + ANTICIPATION_S * aside)
-    soon = torch.minimum(torch.maximum(soon, lane - 1), lane + 1)
+    soon = lane_after(vehicles.y, aside, road, ANTICIPATION_S)
     # Who changes lanes is in both; absent vehicles are in none.
     nowhere = torch.where(vehicles.valid, 0.0, torch.inf)
     presence = LaneRange(torch.minimum(lane, soon) + nowhere, torch.maximum(lane, soon))
@@ -211,6 +223,8 @@ def see(vehicles: Vehicles, road: Road) -> tuple[Tensor, Near, Near]:
     def nearest_on(side: int) -> Near:
         gap, index = nearest(scene, lanes, side)
         exists = gap < SIGHT_M
+        if not sides:
+            exists = exists & torch.tensor([False, True, False], device=gap.device)
         # Nobody's index may be beyond the last vehicle.
         index = torch.where(exists, index, 0)
         flat = index.flatten(1)
@@ -222,7 +236,7 @@ def see(vehicles: Vehicles, road: Road) -> tuple[Tensor, Near, Near]:
             return torch.where(exists, number, 0.0)
 
         return Near(
-            gap.clamp_max(SIGHT_M),
+            torch.where(exists, gap, SIGHT_M),
             where_seen(of(speed) - speed[..., None]),
             where_seen(of(vehicles.acceleration)),
             where_seen(of(vehicles.y) - vehicles.y[..., None]),
@@ -245,21 +259,14 @@ def perceive(vehicles: Vehicles, memory: Memory, road: Road, sides: bool = True)
 
     Without ``sides`` a driver sees its own lane alone, as where only one lane was recorded.
     """
-    lane, ahead, behind = see(vehicles, road)
-    last = road.lanes - 1
-    lanes = (lane - 1 >= 0, lane >= 0, lane + 1 <= last)
-    has_lane = torch.stack(lanes, -1)
-    if not sides:
-        middle = torch.tensor([False, True, False], device=lane.device)
-        has_lane = has_lane & middle
-        ahead, behind = _only(ahead, middle), _only(behind, middle)
+    lane, ahead, behind = see(vehicles, road, sides)
+    exists = torch.stack((lane + 1 < road.lanes, lane > 0), -1) & sides
     speed, aside = velocity(vehicles)
     gap = ahead.gap[..., 1]
     features = [
         *_own_state(vehicles, memory, road, lane, speed, aside),
         *_leader_of_leader(ahead),
-        has_lane[..., 2].to(speed.dtype),
-        has_lane[..., 0].to(speed.dtype),
+        *exists.to(speed.dtype).unbind(-1),
         *_room(vehicles, road, ahead, behind),
         *_seen(ahead, speed).flatten(-2).unbind(-1),
         *_seen(behind, speed).flatten(-2).unbind(-1),
@@ -273,20 +280,12 @@ def perceive(vehicles: Vehicles, memory: Memory, road: Road, sides: bool = True)
         torch.stack(features, -1),
         _sides(vehicles, memory, road, lane, aside, speed, ahead, behind),
         lane,
-        has_lane[..., [2, 0]],
+        exists,
         ahead.closing[..., 1],
         torch.where(follows, torch.log(headway), torch.nan),
         (relative * seen).sum(-1) / seen.sum(-1).clamp_min(1),
         gap,
     )
-
-
-def _only(near: Near, lanes: Tensor) -> Near:
-    """Of the neighbours those in the chosen ``lanes`` (boolean [3]: right, this lane, left)."""
-    exists = near.exists & lanes
-    names = ("closing", "acceleration", "aside", "lateral_speed")
-    numbers = {name: torch.where(lanes, getattr(near, name), 0.0) for name in names}
-    return near._replace(gap=torch.where(exists, near.gap, SIGHT_M), exists=exists, **numbers)
 
 
 def _own_state(
@@ -445,7 +444,7 @@ class HumanPolicy(nn.Module):
 
     def __init__(self, sizes: HumanSizes) -> None:
         super().__init__()
-        self.sizes = sizes
+
         self.trunk = layers(FEATURES, sizes.hidden, sizes.hidden).append(nn.SiLU())
         self.along = nn.Linear(sizes.hidden, ALONG.number)
         self.across = nn.Linear(sizes.hidden, ACROSS.number)
@@ -488,13 +487,17 @@ def lane_choice(vehicles: Vehicles, view: View) -> LaneChoice:
     return LaneChoice(view.sides, view.exists, target == lane, target > lane)
 
 
-def new_target(vehicles: Vehicles, view: View, choice: Tensor) -> Tensor:
-    """Target lanes after a ``choice`` [N, M] of 0, 1 or 2 (:meth:`HumanPolicy.lane_chances`)."""
-    target = vehicles.target_lane
-    lane = view.lane.long()
-    keeping = target == lane
+def with_choice(
+    vehicles: Vehicles, memory: Memory, view: View, choice: Tensor
+) -> tuple[Vehicles, Memory]:
+    """Vehicles and memory after a ``choice`` [N, M] of 0, 1 or 2
+    (:meth:`HumanPolicy.lane_chances`): who has chosen another lane heads for it and counts anew.
+    """
+    old, lane = vehicles.target_lane, view.lane.long()
     step = (choice == 1).long() - (choice == 2).long()
-    return torch.where(keeping, target + step, torch.where(choice == 1, lane, target))
+    target = torch.where(old == lane, old + step, torch.where(choice == 1, lane, old))
+    since = torch.where(target != old, 0.0, memory.since)
+    return vehicles.with_(target_lane=target), memory._replace(since=since)
 
 
 def chosen(chances: Tensor, u: Tensor) -> Tensor:
@@ -503,19 +506,27 @@ def chosen(chances: Tensor, u: Tensor) -> Tensor:
 
 
 def with_style(memory: Memory, view: View, first: Tensor | None = None) -> Memory:
-    """The memory with this decision's style; ``first`` [N, M]: drivers seen for the first time."""
+    """The memory with this decision's style.
+
+    ``first`` [N, M]: drivers seen for the first time, who have closed in as they do now.
+    """
     old = memory.style
-    headway = torch.where(view.log_headway.isnan(), old[..., 0], view.log_headway)
+    free = view.log_headway.isnan()
+    headway = torch.where(free, old[..., 0], view.log_headway)
     effort = memory.accelerations[..., 0].square()
     pace = (view.relative_speed / 3.0).clamp(-2.0, 2.0)
     share = DECISION_S / STYLE_S
     style = old + share * (torch.stack((headway, effort, pace), -1) - old)
-    if first is not None:
-        # Who follows nobody yet is taken to keep 2 s.
-        headway = torch.where(view.log_headway.isnan(), math.log(2.0), view.log_headway)
-        begun = torch.stack((headway, torch.full_like(headway, 0.5), pace), -1)
-        style = torch.where(first[..., None], begun, style)
-    return memory._replace(style=style)
+    if first is None:
+        return memory._replace(style=style)
+    # Who follows nobody yet is taken to keep 2 s.
+    headway = torch.where(free, math.log(2.0), view.log_headway)
+    begun = torch.stack((headway, torch.full_like(headway, 0.5), pace), -1)
+    first = first[..., None]
+    return memory._replace(
+        style=torch.where(first, begun, style),
+        closing=torch.where(first, view.closing[..., None], memory.closing),
+    )
 
 
 def bounded(
@@ -535,13 +546,7 @@ def bounded(
     to_right = (vehicles.y - road.right_edge_m() - half) / EDGE_S
     lateral = torch.maximum(torch.minimum(lateral + aside, to_left), -to_right)
     most = (STEEPEST * speed).clamp_max(FASTEST_ASIDE_MPS)
-    return acceleration, torch.minimum(torch.maximum(lateral, -most), most)
-
-
-def heading_for(vehicles: Vehicles, memory: Memory, target: Tensor) -> tuple[Vehicles, Memory]:
-    """Vehicles and memory with these target lanes; who has chosen another one counts anew."""
-    since = torch.where(target != vehicles.target_lane, 0.0, memory.since)
-    return vehicles.with_(target_lane=target), memory._replace(since=since)
+    return acceleration, lateral.clamp(-most, most)
 
 
 def remembered(vehicles: Vehicles, memory: Memory, view: View, acceleration: Tensor) -> Memory:
@@ -587,7 +592,7 @@ def with_velocity(vehicles: Vehicles, along: Tensor, across: Tensor) -> Vehicles
     """The vehicles at these speeds, m/s; nobody moves more aside than a fifth of its way ahead."""
     # Who stands keeps its heading.
     moves = along > 0.0
-    across = torch.minimum(torch.maximum(across, -0.2 * along), 0.2 * along)
+    across = across.clamp(-0.2 * along, 0.2 * along)
     heading = torch.where(moves, torch.atan2(across, along), vehicles.heading)
     speed = torch.where(moves, torch.hypot(along, across), 0.0)
     return vehicles.with_(speed=speed, heading=heading)

@@ -12,9 +12,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import smooth_l1_loss
+from torch.nn.functional import pad, smooth_l1_loss
 
-from ganlane.generator.human import DECISION_S, STEPS, HumanPolicy, layers
+from ganlane.generator.human import (
+    ACCELERATIONS,
+    DECISION_S,
+    LATERAL_SPEEDS,
+    STEPS,
+    HumanPolicy,
+    Memory,
+    layers,
+    memory_of,
+)
 from ganlane.generator.windows import OBSERVED_POSITIONS, PREDICTED_STEPS
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.generator import HumanSizes
@@ -22,6 +31,8 @@ from ganlane.settings.generator import HumanSizes
 if TYPE_CHECKING:
     from ganlane.generator.human_samples import SmoothScene
 
+#: Width of the networks' layers.
+HIDDEN = 64
 #: Of the fit.
 UPDATES, BATCH, RATE = 3000, 1024, 2e-3
 #: Errors that weigh alike: speed, both accelerations, both lateral speeds, both places.
@@ -37,9 +48,9 @@ class Estimator(nn.Module):
     and the errors of the last position along and across.
     """
 
-    def __init__(self, hidden: int = 64) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.layers = layers(20, hidden, hidden, len(SCALES))
+        self.layers = layers(20, HIDDEN, HIDDEN, len(SCALES))
 
     def forward(self, positions: Tensor) -> Tensor:
         """[..., 7] from positions [..., 9, 2] in m."""
@@ -69,10 +80,10 @@ class Observer(nn.Module):
     will be. They are no driver's moves: traffic does without this network.
     """
 
-    def __init__(self, hidden: int = 64) -> None:
+    def __init__(self) -> None:
         super().__init__()
         inputs = OBSERVED_POSITIONS - 1 + PREDICTED_STEPS
-        self.layers = layers(2 * inputs, hidden, hidden, 2 * PREDICTED_STEPS)
+        self.layers = layers(2 * inputs, HIDDEN, HIDDEN, 2 * PREDICTED_STEPS)
 
     def forward(self, positions: Tensor, forecast: Tensor) -> Tensor:
         """Differences [..., 8, 2] in m; positions [..., 9, 2] and forecast [..., 8, 2] are relative
@@ -107,6 +118,13 @@ def roughness(positions: Tensor) -> Tensor:
 def trust(positions: Tensor) -> Tensor:
     """How far a history [..., 9, 2] can be trusted, as the age of a driver in decisions, 1 to 5."""
     return 1.0 + 4.0 * torch.exp(-roughness(positions)[..., 0] / 0.15)
+
+
+def present_memory(motion: Tensor, age: Tensor) -> Memory:
+    """What drivers remember whose ``motion`` [N, M, 7] is the :class:`Estimator`'s."""
+    # Older accelerations are not known.
+    accelerations = pad(motion[..., 1:3], (0, ACCELERATIONS - 2))
+    return memory_of(accelerations, motion[..., 4:5].repeat(1, 1, LATERAL_SPEEDS), age)
 
 
 def fit_estimator(

@@ -30,14 +30,15 @@ from ganlane.generator.human import (
 from ganlane.generator.human_estimator import HumanModel, fit_estimator
 from ganlane.generator.human_samples import (
     DESIRED_MPS,
+    Choices,
     Cut,
+    Moves,
     Options,
     Samples,
     SmoothScene,
     cuts,
     draws,
     joined,
-    keeping_choice,
     samples_of,
     smooth_scene,
 )
@@ -74,7 +75,7 @@ class Material(NamedTuple):
     around: list[Cut]
     ahead: list[Cut]
     short: list[Cut]
-    prior: Samples
+    prior: Moves
     danger: Tensor
 
 
@@ -107,14 +108,13 @@ def fit_human(
         torch.manual_seed(config.seed)
         random = torch.Generator().manual_seed(config.seed)
         model = HumanModel(config.sizes)
-        cutoffs = config.cutoff_hz, config.lateral_cutoff_hz
-        scenes = [smooth_scene(recording, *cutoffs) for recording in recordings]
+        scenes = [smooth_scene(recording, config) for recording in recordings]
         fit_estimator(model.estimator, scenes, random)
-        scenes += [smooth_scene(one, *cutoffs, ONE_LANE_WEIGHT) for one in following]
+        scenes += [smooth_scene(one, config, ONE_LANE_WEIGHT) for one in following]
         material = material_of(scenes, random)
         steps = 1 + config.rounds + config.tuning
         # Lane changes are few: none of them is hidden, as the sides are from some of the moves.
-        choices = _gathered(material, Options(blind=0.0), config, random, times=2)
+        choices = _gathered(material, Options(blind=0.0), config, random, times=2).choices
         teacher = clone(model.policy, material, choices, config, random)
         report(1, steps, None)
 
@@ -130,26 +130,25 @@ def fit_human(
 def clone(
     policy: HumanPolicy,
     material: Material,
-    choices: Samples,
+    choices: Choices,
     config: HumanConfig,
     random: torch.Generator,
-) -> Samples:
+) -> Moves:
     """Fit ``policy`` to what recorded drivers did, its lane choice to ``choices``; gives the
-    teacher samples.
+    teacher samples of moves.
     """
-    samples = _gathered(material, Options(), config, random, times=3)
-    moves = _moves(samples, slice(None))
+    moves = _gathered(material, Options(), config, random, times=3).moves
     for rate in (config.learning_rate, 0.5 * config.learning_rate):
         train_moves(policy, moves, material.prior, max(1, config.epochs // 2), rate, random)
     train_lane_choice(policy, choices, material.danger, random)
     match_rate(policy, choices)
-    return samples
+    return moves
 
 
 def close_the_loop(
     model: HumanModel,
     material: Material,
-    teacher: Samples,
+    teacher: Moves,
     config: HumanConfig,
     random: torch.Generator,
 ) -> Iterator[int]:
@@ -157,17 +156,17 @@ def close_the_loop(
 
     The last two rounds and as many teacher samples count.
     """
-    bank: list[tuple[Tensor, ...]] = []
+    bank: list[Moves] = []
     options = Options(model.policy, samples=config.samples)
     noisy = options._replace(estimator=model.estimator)
     for number in range(config.rounds):
         # Long stretches begin as recorded, short ones as nine noisy positions show drivers.
         parts = _gathered(material, options, config, random, times=2)
         short = samples_of(material.short, noisy, random)
-        bank = [*bank[-1:], _moves(joined([parts, short]), slice(None))]
-        rows = torch.randperm(len(teacher.features), generator=random)[: len(bank[-1][0])]
-        mixed = [_moves(teacher, rows), *bank]
-        moves = tuple(torch.cat(tensors) for tensors in zip(*mixed))
+        latest = joined([parts, short]).moves
+        bank = [*bank[-1:], latest]
+        rows = torch.randperm(len(teacher.change), generator=random)[: len(latest.change)]
+        moves = Moves(*map(torch.cat, zip(teacher.rows(rows), *bank)))
         # From half of the cloning's rate down to a sixth of it.
         rate = 0.5 * config.learning_rate * (1.0 - 0.7 * number / max(1, config.rounds - 1))
         epochs = max(1, config.epochs // 3)
@@ -178,11 +177,9 @@ def close_the_loop(
 def _gathered(
     material: Material, options: Options, config: HumanConfig, random: torch.Generator, times: int
 ) -> Samples:
-    """Samples of all stretches, ``times`` over; every third pass is lengthened."""
-    parts = []
-    for number in range(times):
-        scale = config.scale if number % 3 == times % 3 - 1 or number == 2 else 0.0
-        parts.append(samples_of(material.around, options._replace(scale=scale), random))
+    """Samples of all stretches, ``times`` over; in the last pass they are lengthened."""
+    scales = [0.0] * (times - 1) + [config.scale]
+    parts = [samples_of(material.around, options._replace(scale=scale), random) for scale in scales]
     if material.ahead:
         # Cars of one lane have no sides to be hidden, and nothing to be mirrored.
         alone = options._replace(vary=False, blind=0.0)
@@ -190,33 +187,27 @@ def _gathered(
     return joined(parts)
 
 
-def _moves(samples: Samples, rows: Tensor | slice) -> tuple[Tensor, ...]:
-    """Features, wanted changes and weights of ``rows``."""
-    return tuple(tensor[rows] for tensor in samples[:5])
-
-
-def move_losses(policy: HumanPolicy, moves: Sequence[Tensor]) -> Tensor:
+def move_losses(policy: HumanPolicy, moves: Moves) -> Tensor:
     """Cross-entropies of the wanted changes along and across, weighted, [R]."""
-    features, change, aside, weight, lateral_weight = moves
-    along, across = policy(features)
-    loss = -(ALONG.soft_target(change) * along.log_softmax(-1)).sum(-1) * weight
-    lateral = -(ACROSS.soft_target(aside) * across.log_softmax(-1)).sum(-1) * lateral_weight
-    return loss + lateral
+    along, across = policy(moves.features)
+    loss = -(ALONG.soft_target(moves.change) * along.log_softmax(-1)).sum(-1) * moves.weight
+    lateral = -(ACROSS.soft_target(moves.aside) * across.log_softmax(-1)).sum(-1)
+    return loss + lateral * moves.lateral_weight
 
 
 def train_moves(
     policy: HumanPolicy,
-    moves: Sequence[Tensor],
-    prior: Samples,
+    moves: Moves,
+    prior: Moves,
     epochs: int,
     rate: float,
     random: torch.Generator,
 ) -> None:
-    """Fit the distributions to ``moves`` (:func:`_moves`), with the prior's beside them."""
+    """Fit the distributions to ``moves``, with the prior's beside them."""
     parts = (policy.trunk, policy.along, policy.across)
     parameters = [parameter for part in parts for parameter in part.parameters()]
     optimizer = torch.optim.AdamW(parameters, lr=rate, weight_decay=1e-3, fused=True)
-    rows = len(moves[0])
+    rows = len(moves.change)
     updates = max(1, epochs * (rows // BATCH))
 
     def share(update: int) -> float:
@@ -226,14 +217,11 @@ def train_moves(
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, share)
     for _ in range(epochs):
         for batch in torch.randperm(rows, generator=random).split(BATCH):
-            also = torch.randint(
-                len(prior.features), (int(PRIOR_SHARE * len(batch)),), generator=random
-            )
-            both = [
-                torch.cat((mine[batch], theirs[also])) for mine, theirs in zip(moves, prior[:5])
-            ]
-            both[0] = both[0] + INPUT_NOISE * torch.randn(both[0].shape, generator=random)
-            loss = move_losses(policy, both).mean()
+            beside = int(PRIOR_SHARE * len(batch))
+            also = torch.randint(len(prior.change), (beside,), generator=random)
+            both = Moves(*map(torch.cat, zip(moves.rows(batch), prior.rows(also))))
+            noise = INPUT_NOISE * torch.randn(both.features.shape, generator=random)
+            loss = move_losses(policy, both._replace(features=both.features + noise)).mean()
             optimizer.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(parameters, 5.0)
@@ -242,16 +230,16 @@ def train_moves(
 
 
 def train_lane_choice(
-    policy: HumanPolicy, samples: Samples, danger: Tensor, random: torch.Generator
+    policy: HumanPolicy, choices: Choices, danger: Tensor, random: torch.Generator
 ) -> None:
     """Fit when a lane change begins, and when one is broken off.
 
     Beginning is a logistic regression on the recorded ones; nobody begins one into danger. Changes
     under way go on as recorded ones did, and are broken off in danger.
     """
-    begun = samples.sides[samples.begins == 1]
-    not_begun = samples.sides[samples.begins == 0]
-    under_way = samples.sides[samples.begins < 0]
+    begun = choices.sides[choices.begins == 1]
+    not_begun = choices.sides[choices.begins == 0]
+    under_way = choices.sides[choices.begins < 0]
     if not len(begun):
         return  # without a recorded change nobody changes lanes
     last = policy.lane[-1]
@@ -280,16 +268,16 @@ def train_lane_choice(
 
 
 @torch.no_grad()
-def match_rate(policy: HumanPolicy, samples: Samples) -> None:
+def match_rate(policy: HumanPolicy, choices: Choices) -> None:
     """Let lane changes begin as often as recorded ones did, over the recorded states.
 
     Where recorded drivers took gaps that count as danger here, no change begins; others make up for
     it. Only the level is moved: the bias of all beginnings.
     """
-    wanted = begins_per_decision(samples)
+    wanted = begins_per_decision(choices)
     last = policy.lane[-1]
     assert isinstance(last, nn.Linear)
-    choice = keeping_choice(samples, torch.arange(len(samples.keeping_sides)))
+    choice = choices.keeping(slice(None))
     unmoved = last.bias[0].clone()
     low, high = -6.0, 6.0
     # Bisection: the rate grows with the bias.
@@ -301,14 +289,12 @@ def match_rate(policy: HumanPolicy, samples: Samples) -> None:
 
 
 @torch.no_grad()
-def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[Samples, Tensor]:
+def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[Moves, Tensor]:
     """IDM drivers with headways of their own where recordings show nothing, and lane changes into
     danger [D, SIDE_FEATURES].
     """
     shape = (scenes, PRIOR_VEHICLES)
-
     rand, randn = draws(shape, random)
-
     road = Road(3, 3.6)
     lane = torch.randint(0, 3, shape, generator=random)
     # A third of the drivers is somewhere between two lanes.
@@ -354,23 +340,14 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
     silent &= ~((view.gap < 0.0) & (rand() < 0.8))
     off_target = vehicles.y - target * 3.6
     far_off = off_target.abs() > 0.75
-    counts = silent | far_off
+
     # Half of the way to IDM's acceleration, all of it where that is hard braking.
     hard = wanted < -2.0
     change = torch.where(hard, 1.0, 0.5) * (wanted - before)
     change = change + torch.where(hard, 0.05, 0.18) * randn()
     back = (-0.45 * (vehicles.y - lane * 3.6)).clamp(-0.9, 0.9)
     sideways = 0.4 * (back - aside) + 0.03 * randn()
-    nobody = torch.zeros(0)
-    samples = Samples(
-        view.features[counts],
-        change[counts],
-        sideways[counts],
-        silent.float()[counts],
-        torch.where(far_off, 0.5, 0.1)[counts],
-        view.sides[:0, 0, 0],
-        nobody,
-        view.sides[:0, 0],
-        view.exists[:0, 0],
-    )
-    return samples, view.sides[~leaves_room(view.sides) & view.exists]
+    lateral_weight = torch.where(far_off, 0.5, 0.1)
+    moves = Moves(view.features, change, sideways, silent.float(), lateral_weight)
+    danger = view.sides[~leaves_room(view.sides) & view.exists]
+    return moves.rows(silent | far_off), danger

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -20,7 +19,6 @@ from torch.nn.functional import smooth_l1_loss
 from ganlane.data.dense import Recording
 from ganlane.generator.forecasts import SAMPLES, Forecasts, by_kind, driven_windows
 from ganlane.generator.human import (
-    ACCELERATIONS,
     ACROSS,
     ALONG,
     DECISION_S,
@@ -30,18 +28,23 @@ from ganlane.generator.human import (
     bounded,
     cars,
     chosen,
-    heading_for,
+    lane_after,
     lane_choice,
     look,
-    memory_of,
     moved,
-    new_target,
     perceive,
     remembered,
     velocity,
+    with_choice,
     with_style,
 )
-from ganlane.generator.human_estimator import DIFFERENCE_SCALE, Estimator, HumanModel, trust
+from ganlane.generator.human_estimator import (
+    DIFFERENCE_SCALE,
+    Estimator,
+    HumanModel,
+    present_memory,
+    trust,
+)
 from ganlane.generator.human_samples import DESIRED_MPS, smooth_scene
 from ganlane.generator.windows import (
     OBSERVED_POSITIONS,
@@ -74,40 +77,32 @@ def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memo
 
     Who was not recorded in all of the nine frames goes on at constant velocity so far.
     """
-    positions = segments.positions[:, :OBSERVED_POSITIONS]
     whole = segments.present[:, :OBSERVED_POSITIONS].all(1)
-    nine = positions.transpose(1, 2)
+    nine = segments.positions[:, :OBSERVED_POSITIONS].transpose(1, 2)
     last = nine[:, :, -1]
-    now = estimator(nine - last[:, :, None])
+    motion = torch.where(whole[..., None], estimator(nine - last[:, :, None]), 0.0)
     latest = (nine[:, :, -1, 0] - nine[:, :, -2, 0]) / PHYSICS_STEP_S
-    now = torch.where(whole[..., None], now, 0.0)
-    speed = torch.where(whole, now[..., 0], latest).clamp_min(0.0)
-    aside = now[..., 3]
+    speed = torch.where(whole, motion[..., 0], latest).clamp_min(0.0)
+    aside = motion[..., 3]
+    x, y = (last + motion[..., 5:]).unbind(-1)
     road = Road(segments.lanes.float(), segments.lane_width)
-    x, y = last[..., 0] + now[..., 5], last[..., 1] + now[..., 6]
     lane = road.lane_of(y)
     # Who moves away from its lane's centre is on its way to the next lane.
     leaving = (aside.abs() > CHANGING_MPS) & ((y - lane * road.lane_width_m) * aside > 0.1)
-    soon = road.lane_of(y + 1.5 * aside)
-    soon = torch.minimum(torch.maximum(soon, lane - 1), lane + 1)
-    zero = torch.zeros_like(x)
-    accelerations = torch.stack((now[..., 1], now[..., 2], *[zero] * (ACCELERATIONS - 2)), -1)
     vehicles = cars(
         x,
         y,
         speed,
         aside,
-        acceleration=accelerations[..., 0],
+        acceleration=motion[..., 1],
         length=segments.length.clamp_min(1.0),
-        width=zero + WIDTH_M,
+        width=torch.full_like(x, WIDTH_M),
         desired_speed=(speed + DESIRED_ABOVE_MPS).clamp(*DESIRED_MPS),
-        target_lane=torch.where(leaving, soon, lane).long(),
+        target_lane=torch.where(leaving, lane_after(y, aside, road, 1.5), lane).long(),
         valid=segments.present[:, PRESENT],
     )
-    lateral = torch.stack((now[..., 4], now[..., 4]), -1)
-    memory = memory_of(accelerations, lateral, torch.where(whole, trust(nine), 0.0))
+    memory = present_memory(motion, torch.where(whole, trust(nine), 0.0))
     view = perceive(vehicles, memory, road)
-    memory = memory._replace(closing=torch.stack((view.closing, view.closing), -1))
     return vehicles, with_style(memory, view, torch.ones_like(whole)), road
 
 
@@ -153,9 +148,9 @@ def _driven(
         if decision:
             memory, view = look(vehicles, memory, road)
         chances = policy.lane_chances(lane_choice(vehicles, view), HumanVariation.lane_changes)
-        choice = chosen(chances, torch.rand(mean.shape, generator=random))
-        target = torch.where(mean, vehicles.target_lane, new_target(vehicles, view, choice))
-        vehicles, memory = heading_for(vehicles, memory, target)
+        # The mean driver goes on as it does.
+        choice = chosen(chances, torch.rand(mean.shape, generator=random)).masked_fill(mean, 0)
+        vehicles, memory = with_choice(vehicles, memory, view, choice)
         view = perceive(vehicles, memory, road)
         changes = []
         for tokens, logits in zip((ALONG, ACROSS), policy(view.features)):
@@ -181,20 +176,15 @@ def _driven(
 
 def _seen_besides(model: HumanModel, segments: Segments, mean: Tensor) -> Tensor:
     """What the observer adds to positions [B, H, V, 2]; as much again later it has faded."""
-    added = torch.zeros_like(mean)
-    if mean.shape[1] < PREDICTED_STEPS:
-        return added
     nine = segments.positions[:, :OBSERVED_POSITIONS].transpose(1, 2)
     ahead = mean[:, :PREDICTED_STEPS].transpose(1, 2)
     present = nine[:, :, -1:]
     difference = model.observer(nine - present, ahead - present).transpose(1, 2)
     whole = segments.present[:, :OBSERVED_POSITIONS].all(1)
     difference = torch.where(whole[:, None, :, None], difference, 0.0)
-    added[:, :PREDICTED_STEPS] = difference
-    for step in range(PREDICTED_STEPS, min(2 * PREDICTED_STEPS, mean.shape[1])):
-        rest = 2.0 - (step + 1) / PREDICTED_STEPS
-        added[:, step] = rest * difference[:, -1]
-    return added
+    step = torch.arange(mean.shape[1])
+    share = (2.0 - (step + 1) / PREDICTED_STEPS).clamp(0.0, 1.0)
+    return share[:, None, None] * difference[:, step.clamp_max(PREDICTED_STEPS - 1)]
 
 
 def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanConfig) -> None:
@@ -205,8 +195,9 @@ def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanCo
     """
     random = torch.Generator().manual_seed(config.seed)
 
-    def mean_driver(segments: Segments) -> Tensor:
-        return _driven(model, segments, PREDICTED_STEPS, 0, random)
+    def recorded_and_driven(segments: Segments) -> Tensor:
+        mean = _driven(model, segments, PREDICTED_STEPS, 0, random)
+        return torch.cat((segments.positions[None], mean), 2)
 
     # The forecasts that it corrects are without it.
     model.observer.requires_grad_(True)
@@ -215,17 +206,11 @@ def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanCo
         assert isinstance(last, nn.Linear)
         last.weight.zero_()
         last.bias.zero_()
-    nine, forecasts, recorded = [], [], []
-    for share in NOISE_SHARES:
-        noisy = [_with_noise(scene, share, config) for scene in scenes]
-        cut = partial(driven_windows, scenes=noisy, horizon=PREDICTED_STEPS, stride=OBSERVER_STRIDE)
-        nine.append(cut(lambda segments: segments.positions[None, :, :OBSERVED_POSITIONS])[0])
-        recorded.append(cut(lambda segments: segments.future[None])[0])
-        with torch.no_grad():
-            forecasts.append(cut(mean_driver)[0])
-    positions, forecast, wanted = (
-        torch.from_numpy(np.concatenate(arrays)).float() for arrays in (nine, forecasts, recorded)
-    )
+    noisy = [_with_noise(scene, share, config) for share in NOISE_SHARES for scene in scenes]
+    with torch.no_grad():
+        windows = driven_windows(recorded_and_driven, noisy, PREDICTED_STEPS, OBSERVER_STRIDE)[0]
+    parts = (OBSERVED_POSITIONS, PREDICTED_STEPS, PREDICTED_STEPS)
+    positions, wanted, forecast = torch.from_numpy(windows).float().split(parts, 1)
     scale = torch.tensor(DIFFERENCE_SCALE)
     optimizer = torch.optim.AdamW(model.observer.parameters(), OBSERVER_RATE, weight_decay=1e-2)
     for update in range(config.observing):
@@ -247,7 +232,7 @@ def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanCo
 
 def _with_noise(scene: Recording, share: float, config: HumanConfig) -> Recording:
     """The scene with a ``share`` of its camera's errors."""
-    smooth = smooth_scene(scene, config.cutoff_hz, config.lateral_cutoff_hz)
+    smooth = smooth_scene(scene, config)
     return replace(
         scene,
         x=smooth.x + share * (scene.x - smooth.x),

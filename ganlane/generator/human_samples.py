@@ -43,9 +43,10 @@ from ganlane.generator.human import (
     with_style,
     with_velocity,
 )
-from ganlane.generator.human_estimator import Estimator, trust
+from ganlane.generator.human_estimator import Estimator, present_memory, trust
 from ganlane.generator.windows import OBSERVED_POSITIONS, side_by_side
 from ganlane.keys import PHYSICS_STEP_S
+from ganlane.settings.generator import HumanConfig
 from ganlane.sim.state import Road, Vehicles
 
 #: Frames before the present that a segment holds, for the drivers' memory.
@@ -100,12 +101,7 @@ def smooth(track: Floats, cutoff_hz: float) -> Floats:
     return gaussian_filter1d(longer, frames)[reach : reach + len(track)]
 
 
-def smooth_scene(
-    recording: Recording,
-    cutoff_hz: float,
-    lateral_cutoff_hz: float,
-    weight: float = 1.0,
-) -> SmoothScene:
+def smooth_scene(recording: Recording, config: HumanConfig, weight: float = 1.0) -> SmoothScene:
     """The recording smoothed, with the drivers' target lanes."""
     shape = recording.x.shape
     arrays = {name: np.zeros(shape) for name in ("x", "y", "speed", "lateral_speed")}
@@ -117,8 +113,8 @@ def smooth_scene(
             arrays["x"][part] = recording.x[part]
             arrays["y"][part] = recording.y[part]
         else:
-            x = smooth(recording.x[part], cutoff_hz)
-            y = smooth(recording.y[part], lateral_cutoff_hz)
+            x = smooth(recording.x[part], config.cutoff_hz)
+            y = smooth(recording.y[part], config.lateral_cutoff_hz)
             arrays["x"][part] = x
             arrays["y"][part] = y
             arrays["speed"][part] = np.gradient(x, PHYSICS_STEP_S).clip(0.0)
@@ -181,7 +177,6 @@ class Segments(NamedTuple):
     driven: Tensor
     lanes: Tensor
     lane_width_m: Tensor
-    two_dimensional: Tensor
     weight: Tensor
 
     @property
@@ -189,23 +184,27 @@ class Segments(NamedTuple):
         """One road per segment."""
         return Road(self.lanes, self.lane_width_m)
 
+    @property
+    def two_dimensional(self) -> Tensor:
+        """Whether positions across the road were recorded, [B, 1]."""
+        return self.lanes > 1
+
     def mirrored(self) -> Segments:
         """Left and right swapped."""
-        last = self.lanes - 1
-        left = (last * self.lane_width_m)[:, None]
-        target = last[:, None].long() - self.target
+        last = (self.lanes - 1)[:, None]
+        left = last * self.lane_width_m[:, None]
         return self._replace(
             y=torch.where(self.present, left - self.y, self.y),
             raw_y=torch.where(self.present, left - self.raw_y, self.raw_y),
-            target=torch.where(self.present, target, 0),
+            target=torch.where(self.present, last.long() - self.target, 0),
             lateral_speed=-self.lateral_speed,
         )
 
     def scaled(self, factor: Tensor) -> Segments:
         """Lengths along the road times ``factor`` [B, 1]; cars keep theirs, headways stay."""
-        by = factor[:, None]
+        x = self.x * factor[:, None]
         noise = self.raw_x - self.x
-        return self._replace(x=self.x * by, raw_x=self.x * by + noise, speed=self.speed * by)
+        return self._replace(x=x, raw_x=x + noise, speed=self.speed * factor[:, None])
 
     def widened(self, factor: Tensor) -> Segments:
         """Lanes and lateral moves times ``factor`` [B, 1]."""
@@ -256,8 +255,8 @@ def segments_of(stretches: Sequence[Cut]) -> Segments:
     """The stretches as one batch; frames outside of their scenes are absent."""
     scenes = [cut.scene for cut in stretches]
 
-    def column(name: str, dtype: torch.dtype) -> Tensor:
-        return torch.tensor([[getattr(scene, name)] for scene in scenes], dtype=dtype)
+    def column(name: str) -> Tensor:
+        return torch.tensor([[getattr(scene, name)] for scene in scenes], dtype=torch.float32)
 
     arrays: dict[str, list[np.ndarray]] = {
         name: [stretch_of(cut, name) for cut in stretches] for name in IN_FRAMES
@@ -278,10 +277,9 @@ def segments_of(stretches: Sequence[Cut]) -> Segments:
         **{name: side_by_side(parts) for name, parts in arrays.items()},
         **{name: side_by_side(parts, 1.0) for name, parts in sizes.items()},
         driven=side_by_side(driven),
-        lanes=column("lanes", torch.float32),
-        lane_width_m=column("lane_width_m", torch.float32),
-        two_dimensional=column("two_dimensional", torch.bool),
-        weight=column("weight", torch.float32),
+        lanes=column("lanes"),
+        lane_width_m=column("lane_width_m"),
+        weight=column("weight"),
     )
 
 
@@ -299,53 +297,40 @@ def stretch_of(cut: Cut, name: str) -> np.ndarray:
     return taken.astype(np.float32) if taken.dtype == np.float64 else taken
 
 
-def recorded(segments: Segments, decision: int) -> tuple[Vehicles, Memory]:
+def recorded(s: Segments, decision: int, desired: Tensor) -> tuple[Vehicles, Memory]:
     """Vehicles and memories as recorded at a decision; style and closing speeds are empty."""
-    s = segments
-    now = HISTORY + STEPS * decision
-    present = s.present[:, now]
-    zero = torch.zeros_like(s.x[:, now])
-    accelerations = []
-    recorded_since = present
-    age = zero
-    for past in range(ACCELERATIONS):
-        later, earlier = now - STEPS * past, now - STEPS * (past + 1)
-        recorded_since = recorded_since & s.present[:, earlier]
-        change = (s.speed[:, later] - s.speed[:, earlier]) / DECISION_S
-        accelerations.append(torch.where(recorded_since, change, 0.0))
-        age = age + recorded_since
-    lateral = [
-        torch.where(
-            s.present[:, now - STEPS * past],
-            s.lateral_speed[:, now - STEPS * past],
-            s.lateral_speed[:, now],
-        )
-        for past in range(1, LATERAL_SPEEDS + 1)
-    ]
+    # The present, and the decisions before it, newest first.
+    frames = HISTORY + STEPS * (decision - torch.arange(ACCELERATIONS + 1))
+    now = frames[0]
+    speed, aside = s.speed[:, frames], s.lateral_speed[:, frames]
+    present = s.present[:, frames]
+    without_gap = present.cumprod(1)[:, 1:]
+    changes = (speed[:, :-1] - speed[:, 1:]) / DECISION_S
+    accelerations = torch.where(without_gap > 0, changes, 0.0).movedim(1, -1)
+    past = slice(1, LATERAL_SPEEDS + 1)
+    lateral_speeds = torch.where(present[:, past], aside[:, past], aside[:, :1]).movedim(1, -1)
     vehicles = cars(
         s.x[:, now],
         s.y[:, now],
-        s.speed[:, now],
-        s.lateral_speed[:, now],
-        acceleration=accelerations[0],
+        speed[:, 0],
+        aside[:, 0],
+        acceleration=accelerations[..., 0],
         length=s.length,
         width=s.width,
-        desired_speed=zero,
+        desired_speed=desired,
         target_lane=s.target[:, now],
-        valid=present,
+        valid=present[:, 0],
     )
-    return vehicles, memory_of(torch.stack(accelerations, -1), torch.stack(lateral, -1), age)
+    return vehicles, memory_of(accelerations, lateral_speeds, without_gap.sum(1).to(speed.dtype))
 
 
-class Samples(NamedTuple):
-    """R samples of moves, and S of lane choices.
+class Moves(NamedTuple):
+    """R samples of moves.
 
     Attributes:
-        features: [R, FEATURES]; change, aside: of acceleration and lateral speed that should
-            follow, [R]; weight, lateral_weight: [R].
-        sides: of drivers that could begin a lane change on a side, or are on one, [S, SIDE].
-        begins: [S] 1 where it begins, 0 where not, -1 where a change is under way.
-        keeping: lane choices of drivers in their lanes, of whom ``speed`` [K] in m/s.
+        features: [R, FEATURES] what drivers perceive.
+        change, aside: [R] of the acceleration and of the lateral speed, that should follow.
+        weight, lateral_weight: [R].
     """
 
     features: Tensor
@@ -353,15 +338,45 @@ class Samples(NamedTuple):
     aside: Tensor
     weight: Tensor
     lateral_weight: Tensor
+
+    def rows(self, which: Tensor) -> Moves:
+        """Those of an index or a mask."""
+        return Moves(*(number[which] for number in self))
+
+
+class Choices(NamedTuple):
+    """Samples of lane choices.
+
+    Attributes:
+        sides: of drivers that could begin a lane change on a side, or are on one, [S, SIDE].
+        begins: [S] 1 where it begins, 0 where not, -1 where a change is under way.
+        keeping_sides, keeping_exists: [K, 2, ...] of drivers in their lanes, as in
+            :class:`~ganlane.generator.human.LaneChoice`.
+    """
+
     sides: Tensor
     begins: Tensor
     keeping_sides: Tensor
     keeping_exists: Tensor
 
+    def keeping(self, rows: Tensor | slice) -> LaneChoice:
+        """The lane choices of ``rows`` of the drivers who are in their lanes."""
+        sides, exists = self.keeping_sides[rows], self.keeping_exists[rows]
+        yes = torch.ones(len(sides), dtype=torch.bool)
+        return LaneChoice(sides, exists, yes, ~yes)
+
+
+class Samples(NamedTuple):
+    """Samples of what drivers do, and of when they change lanes."""
+
+    moves: Moves
+    choices: Choices
+
 
 def joined(parts: Sequence[Samples]) -> Samples:
     """All samples of the parts."""
-    return Samples(*(torch.cat(tensors) for tensors in zip(*parts)))
+    moves, choices = zip(*parts)
+    return Samples(Moves(*map(torch.cat, zip(*moves))), Choices(*map(torch.cat, zip(*choices))))
 
 
 class Options(NamedTuple):
@@ -393,39 +408,38 @@ def _samples(segments: Segments, options: Options, random: torch.Generator) -> S
     above = DESIRED_ABOVE_MPS * torch.rand(top.shape, generator=random)
     desired = (top + above).clamp(*DESIRED_MPS)
     # A policy for single lanes, too, has to do without the sides now and then.
-    sides_seen = not (options.blind and float(_rand(random)) < options.blind)
-    vehicles, memory = recorded(s, 0)
-    vehicles = vehicles.with_(desired_speed=desired, valid=torch.zeros_like(vehicles.valid))
+    sides_seen = not (options.blind and torch.rand((), generator=random) < options.blind)
+    vehicles, memory = recorded(s, 0, desired)
+    vehicles = vehicles.with_(valid=torch.zeros_like(vehicles.valid))
     parts = []
     decisions = (s.x.shape[1] - HISTORY - 1) // STEPS - 1
     for decision in range(decisions):
         now = HISTORY + STEPS * decision
-        as_recorded, its_memory = recorded(s, decision)
+        as_recorded, its_memory = recorded(s, decision, desired)
         present = as_recorded.valid
         first = present & ~vehicles.valid
         # As recorded: everybody, or who has just come, and who is not driven.
         replace = present if options.policy is None else first | (present & ~s.driven)
         changed = (as_recorded.target_lane != vehicles.target_lane) & present & ~first
         since = torch.where(changed, 0.0, torch.where(first, LONG_AGO, memory.since))
-        as_recorded = as_recorded.with_(desired_speed=desired)
         vehicles = vehicles.where(replace, as_recorded)
         vehicles = vehicles.with_(valid=present, target_lane=as_recorded.target_lane)
         memory = _taken(memory, its_memory, replace)._replace(since=since)
         if options.estimator is not None and decision == 0:
             vehicles, memory = _estimated(s, vehicles, memory, options.estimator, random)
         view = perceive(vehicles, memory, s.road, sides_seen)
-        closing = torch.where(first[..., None], view.closing[..., None], memory.closing)
-        memory = with_style(memory._replace(closing=closing), view, first)
+        memory = with_style(memory, view, first)
         view = perceive(vehicles, memory, s.road, sides_seen)
         # What should follow: the recorded move, corrected towards the recording.
         change, aside = _led_back(s, now, vehicles, memory)
         follows = s.present[:, now + STEPS] & present & s.driven
         # A driver that has just come knows no acceleration of its own yet.
         counts = follows & (memory.age > 0) if options.policy is None else follows
-        following_target = s.target[:, now + STEPS]
-        parts.append(
-            _at_decision(s, vehicles, view, counts, follows, change, aside, following_target)
-        )
+        weight = s.weight.expand_as(change)
+        moves = Moves(view.features, change, aside, weight, weight * s.two_dimensional)
+        step = s.target[:, now + STEPS] - vehicles.target_lane
+        choices = _choices(vehicles, view, follows & s.two_dimensional, step)
+        parts.append(Samples(moves.rows(counts), choices))
         # In closed loop the policy makes the move itself, so that it sees its own mistakes.
         if options.policy is not None:
             change, aside = _nearest_move(options, view, change, aside, random)
@@ -454,20 +468,11 @@ def _estimated(
     y = s.y[:, nine] + noise * (s.raw_y - s.y)[:, nine]
     positions = torch.stack((x, y), -1).transpose(1, 2)
     last = positions[:, :, -1]
-    now = estimator(positions - last[:, :, None])
-    zero = torch.zeros_like(vehicles.x)
-    accelerations = torch.stack((now[..., 1], now[..., 2], *[zero] * (ACCELERATIONS - 2)), -1)
-    seen = vehicles.with_(
-        x=last[..., 0] + now[..., 5],
-        y=last[..., 1] + now[..., 6],
-        acceleration=now[..., 1],
-    )
-    seen = with_velocity(seen, now[..., 0].clamp_min(0.0), now[..., 3])
-    its_memory = memory._replace(
-        accelerations=accelerations,
-        lateral_speeds=torch.stack((now[..., 4], now[..., 4]), -1),
-        age=trust(positions),
-    )
+    motion = estimator(positions - last[:, :, None])
+    its_memory = present_memory(motion, trust(positions))
+    x, y = (last + motion[..., 5:]).unbind(-1)
+    seen = vehicles.with_(x=x, y=y, acceleration=motion[..., 1])
+    seen = with_velocity(seen, motion[..., 0].clamp_min(0.0), motion[..., 3])
     return vehicles.where(whole, seen), _taken(memory, its_memory, whole)
 
 
@@ -476,7 +481,7 @@ def varied(segments: Segments, options: Options, random: torch.Generator) -> Seg
     s = segments
     rows = len(s.x)
     if options.vary:
-        if float(_rand(random)) < 0.5:
+        if torch.rand((), generator=random) < 0.5:
             s = s.mirrored()
         s = s.widened(0.95 + 0.25 * torch.rand((rows, 1), generator=random))
     if options.scale:
@@ -496,10 +501,6 @@ def draws(
         return torch.randn(size or shape, generator=random)
 
     return rand, randn
-
-
-def _rand(random: torch.Generator) -> Tensor:
-    return torch.rand((), generator=random)
 
 
 def _taken(memory: Memory, other: Memory, where: Tensor) -> Memory:
@@ -543,43 +544,21 @@ def _nearest_move(
     return nearest[0], nearest[1]
 
 
-def _at_decision(
-    s: Segments,
-    vehicles: Vehicles,
-    view: View,
-    counts: Tensor,
-    follows: Tensor,
-    change: Tensor,
-    aside: Tensor,
-    following_target: Tensor,
-) -> Samples:
-    """The samples of one decision."""
-    weight = s.weight.expand_as(vehicles.x)
-    lateral_weight = weight * s.two_dimensional
-    # A change begins at the decision after which the target lane is another one.
+def _choices(vehicles: Vehicles, view: View, counts: Tensor, step: Tensor) -> Choices:
+    """The lane choices of one decision, of drivers who ``counts`` and who change to the left or
+    right by ``step`` until the next one.
+    """
     choice = lane_choice(vehicles, view)
-    step = following_target - vehicles.target_lane
+    # A change begins at the decision after which the target lane is another one.
     begins = torch.stack((step == 1, step == -1), -1)
-    here = follows & s.two_dimensional
-    keeping = here & choice.keeping
+    keeping = counts & choice.keeping
     could = choice.exists & keeping[..., None]
-    under_way = here & ~choice.keeping
+    under_way = counts & ~choice.keeping
     side = torch.where(choice.to_left[..., None], view.sides[..., 0, :], view.sides[..., 1, :])
-    return Samples(
-        view.features[counts],
-        change[counts],
-        aside[counts],
-        weight[counts],
-        lateral_weight[counts],
-        torch.cat((view.sides[could], side[under_way])),
-        torch.cat((begins[could].float(), torch.full((int(under_way.sum()),), -1.0))),
+    aside = side[under_way]
+    return Choices(
+        torch.cat((view.sides[could], aside)),
+        torch.cat((begins[could].float(), torch.full((len(aside),), -1.0))),
         view.sides[keeping],
         choice.exists[keeping],
     )
-
-
-def keeping_choice(samples: Samples, rows: Tensor) -> LaneChoice:
-    """The lane choices of ``rows`` of the samples' drivers who are in their lanes."""
-    yes = torch.ones(len(rows), dtype=torch.bool)
-    sides, exists = samples.keeping_sides[rows], samples.keeping_exists[rows]
-    return LaneChoice(sides, exists, yes, ~yes)

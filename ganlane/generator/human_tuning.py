@@ -28,24 +28,18 @@ from ganlane.generator.human import (
     Memory,
     bounded,
     cars,
-    heading_for,
     lane_choice,
     layers,
     look,
     memory_of,
     moved,
-    new_target,
     perceive,
     remembered,
     velocity,
+    with_choice,
     with_style,
 )
-from ganlane.generator.human_samples import (
-    DESIRED_MPS,
-    Samples,
-    draws,
-    keeping_choice,
-)
+from ganlane.generator.human_samples import DESIRED_MPS, Choices, draws
 from ganlane.settings.generator import HumanConfig
 from ganlane.sim.state import Road, Vehicles
 
@@ -94,7 +88,7 @@ class Decisions(NamedTuple):
 
 def tune(
     policy: HumanPolicy,
-    teacher: Samples,
+    teacher: Choices,
     danger: Tensor,
     config: HumanConfig,
     random: torch.Generator,
@@ -128,7 +122,8 @@ def tune(
             for rows in torch.randperm(len(wanted), generator=random).split(BATCH):
                 part = flat.rows(rows)
                 loss = _policy_loss(policy, reference, part, advantage[rows], config.pull)
-                loss = loss + smooth_l1_loss(_values(critic, part), wanted[rows])
+                values = _values(critic, part.features, part.sides)
+                loss = loss + smooth_l1_loss(values, wanted[rows])
                 # Recordings without a lane change say nothing about their rate.
                 if recorded > 0.0:
                     off = _rate_loss(policy, part, teacher, recorded, random)
@@ -145,14 +140,13 @@ def tune(
         yield float(decisions.cost.sum()) / float(decisions.valid.sum())
 
 
-def begins_per_decision(teacher: Samples) -> float:
+def begins_per_decision(teacher: Choices) -> float:
     """Lane changes begun per recorded decision of a driver in its lane."""
     return float((teacher.begins == 1).sum()) / max(1, len(teacher.keeping_sides))
 
 
-def _values(critic: nn.Module, decisions: Decisions) -> Tensor:
-    inputs = (decisions.features, decisions.choice.sides.flatten(-2))
-    return critic(torch.cat(inputs, -1))[..., 0]
+def _values(critic: nn.Module, features: Tensor, sides: Tensor) -> Tensor:
+    return critic(torch.cat((features, sides.flatten(-2)), -1))[..., 0]
 
 
 def advantages(decisions: Decisions) -> tuple[Tensor, Tensor]:
@@ -171,18 +165,17 @@ def advantages(decisions: Decisions) -> tuple[Tensor, Tensor]:
     return advantage, advantage + value
 
 
-def _log_chances(policy: HumanPolicy, decisions: Decisions) -> tuple[Tensor, Tensor, Tensor]:
+def _log_chances(policy: HumanPolicy, features: Tensor, choice: LaneChoice) -> tuple[Tensor, ...]:
     """Logarithms of the chances of all tokens along and across, and of all lane choices."""
-    along, across = policy(decisions.features)
-    lane = policy.lane_chances(decisions.choice)
+    along, across = policy(features)
     return (
         torch.log_softmax(along / TEMPERATURE, -1),
         torch.log_softmax(across / TEMPERATURE, -1),
-        lane.log(),
+        policy.lane_chances(choice).log(),
     )
 
 
-def _of_actions(chances: tuple[Tensor, Tensor, Tensor], actions: tuple[Tensor, ...]) -> Tensor:
+def _of_actions(chances: tuple[Tensor, ...], actions: tuple[Tensor, ...]) -> Tensor:
     """Logarithm of the chance of what was done."""
     taken = [log.gather(-1, action[..., None])[..., 0] for log, action in zip(chances, actions)]
     return torch.stack(taken).sum(0)
@@ -196,13 +189,13 @@ def _policy_loss(
     pull: float,
 ) -> Tensor:
     """The clipped objective, and the divergence from the reference."""
-    chances = _log_chances(policy, decisions)
+    chances = _log_chances(policy, decisions.features, decisions.choice)
     actions = (decisions.along, decisions.across, decisions.lane)
     ratio = torch.exp((_of_actions(chances, actions) - decisions.log_chance).clamp(-5.0, 5.0))
     bounded_ratio = ratio.clamp(1.0 - RATIO, 1.0 + RATIO)
     gain = torch.minimum(ratio * advantage, bounded_ratio * advantage).mean()
     with torch.no_grad():
-        theirs = _log_chances(reference, decisions)
+        theirs = _log_chances(reference, decisions.features, decisions.choice)
     apart = [(mine.exp() * (mine - other)).sum(-1).mean() for mine, other in zip(chances, theirs)]
     return -gain + pull * (apart[0] + apart[1]) + LANE_PULL * apart[2]
 
@@ -210,7 +203,7 @@ def _policy_loss(
 def _rate_loss(
     policy: HumanPolicy,
     decisions: Decisions,
-    teacher: Samples,
+    teacher: Choices,
     recorded: float,
     random: torch.Generator,
 ) -> Tensor:
@@ -219,11 +212,11 @@ def _rate_loss(
     begins = chances[:, 1] + chances[:, 2]
     loss = torch.zeros(())
     for low, high in BANDS_MPS:
-        here = (decisions.speed >= low) & (decisions.speed < high) & decisions.choice.keeping
+        here = (decisions.speed >= low) & (decisions.speed < high) & decisions.keeping
         if int(here.sum()) > 200:
             loss = loss + torch.log(begins[here].mean() / recorded).square() / len(BANDS_MPS)
     rows = torch.randint(len(teacher.keeping_sides), (8192,), generator=random)
-    chances = policy.lane_chances(keeping_choice(teacher, rows))
+    chances = policy.lane_chances(teacher.keeping(rows))
     return loss + torch.log((chances[:, 1] + chances[:, 2]).mean() / recorded).square()
 
 
@@ -237,7 +230,7 @@ def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> De
         choice = lane_choice(vehicles, view)
         chances = policy.lane_chances(choice)
         lane = torch.multinomial(chances.flatten(0, 1), 1, generator=random).view(vehicles.x.shape)
-        vehicles, memory = heading_for(vehicles, memory, new_target(vehicles, view, lane))
+        vehicles, memory = with_choice(vehicles, memory, view, lane)
         # The moves follow the choice.
         view = perceive(vehicles, memory, road)
         logits = policy(view.features)
@@ -249,34 +242,28 @@ def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> De
             jitter = torch.rand(token.shape, generator=random) - 0.5
             tokens.append(token)
             changed.append(axis.value(token + jitter))
-        acceleration, aside = bounded(vehicles, memory, road, changed[0], changed[1])
-        seen = Decisions(
+        acceleration, aside = bounded(vehicles, memory, road, *changed)
+        memory = remembered(vehicles, memory, view, acceleration)
+        later = moved(vehicles, acceleration, aside)
+        cost, hit = costs(later, road, view.gap)
+        # Who has collided leaves the scene.
+        goes_on = vehicles.valid & ~hit
+        log_chances = _log_chances(policy, view.features, choice)
+        decisions = Decisions(
             features=view.features,
             **choice._asdict(),
             speed=velocity(vehicles)[0],
             along=tokens[0],
             across=tokens[1],
             lane=lane,
-            log_chance=torch.zeros_like(vehicles.x),
-            value=torch.zeros_like(vehicles.x),
-            cost=torch.zeros_like(vehicles.x),
+            log_chance=_of_actions(log_chances, (*tokens, lane)),
+            value=_values(critic, view.features, choice.sides),
+            cost=cost,
             valid=vehicles.valid,
-            goes_on=vehicles.valid,
+            goes_on=goes_on,
         )
-        log_chance = _of_actions(_log_chances(policy, seen), (*tokens, lane))
-        memory = remembered(vehicles, memory, view, acceleration)
-        vehicles = moved(vehicles, acceleration, aside)
-        cost, hit = costs(vehicles, road, view.gap)
-        # Who has collided leaves the scene.
-        vehicles = vehicles.with_(valid=vehicles.valid & ~hit)
-        steps.append(
-            seen._replace(
-                log_chance=log_chance,
-                value=_values(critic, seen),
-                cost=cost,
-                goes_on=vehicles.valid,
-            )
-        )
+        steps.append(decisions)
+        vehicles = later.with_(valid=goes_on)
     return Decisions(*map(torch.stack, zip(*steps)))
 
 
@@ -335,9 +322,7 @@ def costs(vehicles: Vehicles, road: Road, gap: Tensor) -> tuple[Tensor, Tensor]:
 def random_scenes(random: torch.Generator) -> tuple[Vehicles, Memory, Road]:
     """Scenes of 2 to 5 lanes, 3 to 28 m/s, people's headways, dense and sparse."""
     shape = (SCENES, VEHICLES)
-
     rand, randn = draws(shape, random)
-
     lanes = torch.randint(2, 6, (SCENES, 1), generator=random).float()
     lanes = torch.where(rand(SCENES, 1) < 0.4, 3.0, lanes)
     road = Road(lanes, 3.3 + 0.8 * rand(SCENES, 1))
@@ -381,9 +366,7 @@ def entering_memory(vehicles: Vehicles, road: Road, drawn: Tensor) -> Memory:
     steady = zero[..., None].repeat(1, 1, ACCELERATIONS)
     memory = memory_of(steady, torch.stack((lateral, lateral), -1), zero)
     view = perceive(vehicles, memory, road)
-    log_headway = math.log(1.4) + 0.35 * drawn
-    view = view._replace(
-        log_headway=torch.where(view.log_headway.isnan(), log_headway, view.log_headway)
-    )
-    memory = memory._replace(closing=torch.stack((view.closing, view.closing), -1))
+    free = view.log_headway.isnan()
+    log_headway = torch.where(free, math.log(1.4) + 0.35 * drawn, view.log_headway)
+    view = view._replace(log_headway=log_headway)
     return with_style(memory, view, torch.ones_like(vehicles.valid))

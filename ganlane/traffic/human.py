@@ -20,14 +20,13 @@ from ganlane.generator.human import (
     View,
     bounded,
     chosen,
-    heading_for,
     lane_choice,
     leaves_room,
     look,
-    new_target,
     perceive,
     remembered,
     velocity,
+    with_choice,
     with_velocity,
 )
 from ganlane.generator.human import Memory as DriverMemory
@@ -149,8 +148,7 @@ class HumanTraffic(TrafficModule):
         choice = chosen(policy.lane_chances(option, variation.lane_changes), u[2])
         if self.road.stretches:
             choice = _leaving(choice, ways, vehicles, view, u[3])
-        target = new_target(vehicles, view, choice)
-        vehicles, driver = heading_for(vehicles, driver, target)
+        vehicles, driver = with_choice(vehicles, driver, view, choice)
         # Its moves follow the driver's choice.
         view = perceive(vehicles, driver, self.road)
         along, across = policy(view.features)

@@ -24,9 +24,9 @@ from ganlane.generator.human import (
     chosen,
     lane_choice,
     moved,
-    new_target,
     perceive,
     velocity,
+    with_choice,
 )
 from ganlane.generator.human_fit import fit_human, prior_samples
 from ganlane.generator.human_samples import Options, cuts, samples_of, smooth_scene, target_lanes
@@ -101,8 +101,12 @@ def test_chances_add_up_nobody_changes_to_where_no_lane_is_and_a_change_can_be_b
     assert right[2] < 1e-6
     low, high = (chosen(chances, torch.full((1, 3), u)) for u in (0.0, 0.999999))
     assert low[0, 2] == 1
-    assert new_target(cars, view, low)[0].tolist()[1:] == [1, 1]
-    assert new_target(cars, view, high)[0, 0] == 1
+    after_low, after_high = (
+        with_choice(cars, memory_of(cars), view, choice)[0].target_lane[0].tolist()
+        for choice in (low, high)
+    )
+    assert after_low[1:] == [1, 1]
+    assert after_high[0] == 1
 
 
 def test_nobody_rolls_back_brakes_harder_than_a_car_or_steers_off_the_road():
@@ -138,16 +142,17 @@ def test_a_lane_change_is_meant_from_where_the_driver_sets_out():
 
 def steady(speed=20.0, frames=140):
     x = speed * 0.1 * np.arange(frames)[:, None] + np.array([0.0, 40.0])
-    return smooth_scene(made_by_hand(x, y=3.5), 0.6, 0.4)
+    return smooth_scene(made_by_hand(x, y=3.5), HumanConfig())
 
 
 def test_teacher_samples_of_steady_driving_ask_for_no_change():
     random = torch.Generator().manual_seed(0)
-    samples = samples_of(cuts([steady()], 10, 10), Options(vary=False, blind=0.0), random)
-    assert len(samples.features) > 20
-    assert samples.change.abs().max() < 1e-3
-    assert samples.aside.abs().max() < 1e-3
-    assert not (samples.begins == 1).any()
+    options = Options(vary=False, blind=0.0)
+    moves, choices = samples_of(cuts([steady()], 10, 10), options, random)
+    assert len(moves.features) > 20
+    assert moves.change.abs().max() < 1e-3
+    assert moves.aside.abs().max() < 1e-3
+    assert not (choices.begins == 1).any()
 
 
 def test_accidents_the_edge_and_standing_cost():
@@ -167,10 +172,10 @@ def test_accidents_the_edge_and_standing_cost():
 
 
 def test_where_recordings_are_silent_the_prior_brakes_and_keeps_out_of_danger():
-    samples, danger = prior_samples(torch.Generator().manual_seed(0), scenes=300)
-    assert samples.features.isfinite().all()
+    moves, danger = prior_samples(torch.Generator().manual_seed(0), scenes=300)
+    assert moves.features.isfinite().all()
     assert len(danger) > 100
-    assert samples.change.min() < -4.0
+    assert moves.change.min() < -4.0
 
 
 SMALL = {"epochs": 2, "rounds": 1, "tuning": 2, "samples": 2, "observing": 4}

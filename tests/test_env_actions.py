@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
-from reference.worlds import environment, placed, step, vehicles
+from reference.worlds import environment, placed, same_bits, step, vehicles
 from torchrl.envs.utils import check_env_specs
 
 import ganlane
@@ -32,12 +32,7 @@ def alone(form: str, *, stretches: Stretches = (), lanes: int = 3, **ego: float)
     return env, placed(env, vehicles({"x": 0.0, "visibility": 1, **ego}, FAR))
 
 
-def driven(
-    env: HighwayEnv,
-    td,
-    action,
-    decisions: int,
-):
+def driven(env: HighwayEnv, td, action, decisions: int):
     for _ in range(decisions):
         td = step(env, td, action)
         if td["done"].item():
@@ -53,17 +48,18 @@ def ego(td, name: str) -> float:
 
 
 def test_an_ego_that_is_told_slower_slows_down_to_the_lowest_speed_and_faster_to_the_desired_one():
-    env, td = alone("lane_speed")
-    slow = driven(env, td, SLOWER, 60)
+    env, td = alone("lane_speed", speed=6.0)
+    slow = driven(env, td, SLOWER, 20)
     assert ego(slow, "speed") == pytest.approx(5.0, abs=0.1)
-    fast = driven(env, slow, FASTER, 100)
+    env, td = alone("lane_speed", speed=25.0)
+    fast = driven(env, step(env, td, SLOWER), FASTER, 10)
     assert ego(fast, "speed") == pytest.approx(25.0, abs=0.3)
     assert ego(fast, "desired_speed") == ego(slow, "desired_speed") == 25.0
 
 
 def test_one_slower_sets_the_speed_one_step_below_and_it_stays():
-    env, td = alone("lane_speed", speed=25.0)
-    td = driven(env, step(env, td, SLOWER), KEEP, 60)
+    env, td = alone("lane_speed", speed=23.0)
+    td = driven(env, step(env, td, SLOWER), KEEP, 20)
     assert td[keys.EGO, "set_speed"].item() == 22.5
     assert ego(td, "speed") == pytest.approx(22.5, abs=0.1)
 
@@ -71,17 +67,12 @@ def test_one_slower_sets_the_speed_one_step_below_and_it_stays():
 def test_without_commands_of_speed_an_episode_is_the_same_as_with_the_papers_actions():
     rng = torch.Generator().manual_seed(0)
     paper = environment(num_envs=16, seed=3)
-    more = environment(
-        num_envs=16,
-        seed=3,
-        actions=ActionParameters("lane_speed"),
-    )
+    more = environment(num_envs=16, seed=3, actions=ActionParameters("lane_speed"))
     one, other = paper.reset(), more.reset()
-    for _ in range(20):
+    for _ in range(8):
         action = torch.randint(0, 3, (16,), generator=rng)
         one, other = step(paper, one, action), step(more, other, action)
-        for name in keys.VEHICLE_FIELDS:
-            assert torch.equal(one[keys.VEHICLES, name], other[keys.VEHICLES, name])
+        assert same_bits(one[keys.VEHICLES], other[keys.VEHICLES]) == []
 
 
 def test_faster_and_slower_are_allowed_where_they_have_an_effect():
@@ -175,8 +166,9 @@ def test_the_kernel_shows_a_recorder_the_steps_of_a_decision():
 # In the libraries
 
 
-@pytest.mark.parametrize("actions", ["lane", "lane_speed", "continuous"])
-@pytest.mark.parametrize("env", ["highway", "merge", "exit"])
+@pytest.mark.parametrize(
+    ("actions", "env"), [("lane", "highway"), ("lane_speed", "merge"), ("continuous", "exit")]
+)
 def test_torchrl_and_gymnasium_find_nothing_wrong(actions, env):
     check_env_specs(ganlane.make_env(num_envs=3, env=env, actions=actions))
     highway = gymnasium.make("ganlane/Highway-v0", env=env, actions=actions)
@@ -187,11 +179,7 @@ def test_torchrl_and_gymnasium_find_nothing_wrong(actions, env):
 
 @pytest.mark.parametrize("actions", ["lane_speed", "continuous"])
 def test_pictures_show_such_episodes_too(actions):
-    env = gymnasium.make(
-        "ganlane/Highway-v0",
-        actions=actions,
-        render_mode="rgb_array",
-    )
+    env = gymnasium.make("ganlane/Highway-v0", actions=actions, render_mode="rgb_array")
     env.reset(seed=0)
     env.step(env.action_space.sample())
     assert env.render().ndim == 3
@@ -230,11 +218,5 @@ def test_masks_and_commands_that_know_numbered_lanes_alone_say_so():
 
 def test_drivers_by_rule_drive_in_the_same_table_as_those_of_other_actions():
     """An environment of `continuous` is compared with MOBIL, which commands lanes."""
-    table = ganlane.api.evaluate(
-        ["mobil"],
-        ["idm"],
-        2,
-        actions="continuous",
-        goal_m=200.0,
-    )
+    table = ganlane.api.evaluate(["mobil"], ["idm"], 2, actions="continuous", goal_m=200.0)
     assert table["goal"].to_list() == [2]

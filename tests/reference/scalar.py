@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 DT = 0.1
 REST = 1e-12  # a heading, steering angle or lateral position of at most this is 0
@@ -59,6 +60,12 @@ class Rules:
     # what the ego is commanded: lane, lane_speed or continuous
     actions: str = "lane"
     flow: Flow | None = None
+
+    @cached_property
+    def exit_lane(self) -> int | None:
+        """The lane that ends in an exit."""
+        exits = [lane for lane, stretch in enumerate(self.stretches) if stretch[2] == "exit"]
+        return exits[0] if exits else None
 
 
 @dataclass(frozen=True)
@@ -200,6 +207,11 @@ class View:
         ]
         return min([*behind_others, *before_walls, self.making_room(i)])
 
+    @cached_property
+    def wanted_lanes(self) -> list[int | None]:
+        """Where each driver that is there has to change to."""
+        return [asked(car, self.rules) if car.valid else None for car in self.cars]
+
     def making_room(self, i: int) -> float:
         """Behind the nearest ahead that has to change into its lane, with up to 2 m/s2; with
         2 m/s2 where the leader in the lane that it has to reach itself would make it brake hard.
@@ -207,13 +219,13 @@ class View:
         if not self.rules.stretches or not (self.rules.mobil or i == 0):
             return math.inf
         lane = self.cars[i].target_lane
-        wanted = asked(self.cars[i], self.rules) if self.cars[i].valid else None
+        wanted = self.wanted_lanes[i]
         blocked = wanted is not None and self.acceleration(i, self.leader(i, wanted)) < -4.0
         slowest = -2.0 if blocked else math.inf
         asking = [
             j
-            for j, car in enumerate(self.cars)
-            if j != i and car.valid and self.is_ahead(i, j) and asked(car, self.rules) == lane
+            for j, theirs in enumerate(self.wanted_lanes)
+            if j != i and theirs == lane and self.is_ahead(i, j)
         ]
         nearest = min(asking, key=lambda j: (self.gap(i, j), self.cars[j].speed), default=None)
         # The ego makes room for nobody.
@@ -253,7 +265,7 @@ def urge(car: Car, lane: int, rules: Rules) -> float:
     """How much the driver wants to leave the lane: from 500 m a change before its end up to 8 m/s2
     at it. Who leaves by the exit has to leave every other lane before the exit's end.
     """
-    way_out = exit_of(rules)
+    way_out = rules.exit_lane
     if car.exits and way_out is not None:
         remaining = rules.stretches[way_out][1] - car.x
         changes = abs(lane - way_out)
@@ -288,19 +300,13 @@ def asked(car: Car, rules: Rules) -> int | None:
     return lane if here > 0.577 * 8.0 else None
 
 
-def exit_of(rules: Rules) -> int | None:
-    """The lane that ends in an exit."""
-    exits = [lane for lane, stretch in enumerate(rules.stretches) if stretch[2] == "exit"]
-    return exits[0] if exits else None
-
-
 def nearest_lane(car: Car, rules: Rules) -> int:
     return min(rules.lanes - 1, max(0, round(car.y / rules.lane_width)))
 
 
 def arrival(ego: Car, rules: Rules) -> str:
     """``goal``, ``missed_exit`` where there is an exit, or nothing yet."""
-    way_out = exit_of(rules)
+    way_out = rules.exit_lane
     if way_out is None:
         return "goal" if ego.x >= rules.goal else ""
     if ego.x < rules.stretches[way_out][1]:
@@ -568,7 +574,7 @@ def may_enter(newcomer: Car, number: int, state: State, rules: Rules) -> bool:
 def let_in_and_out(state: State, rules: Rules) -> None:
     """After a decision: who is past the end has left, and others enter."""
     flow = rules.flow
-    way_out = exit_of(rules)
+    way_out = rules.exit_lane
     for number, car in enumerate(state.cars):
         by_exit = way_out is not None and nearest_lane(car, rules) == way_out
         past = by_exit and car.x >= rules.stretches[way_out][1]

@@ -180,12 +180,12 @@ def test_a_recorder_sees_the_steps_of_the_tensor_code():
         frames = []
         env.base_env.recorder = lambda cars, running: frames.append(cars)
         td = env.reset()
-        for _ in range(15):
+        for _ in range(8):
             td = env.step(td.set("action", torch.zeros(3, dtype=torch.int64)))["next"]
         return frames
 
     frames = list(zip(seen("native"), seen("torch")))
-    assert len(frames) == 150
+    assert len(frames) == 80
     for one, other in frames:
         assert torch.equal(one.valid, other.valid)
         assert torch.allclose(one.x, other.x, atol=2e-2)

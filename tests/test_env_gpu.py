@@ -40,16 +40,10 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def on_a_pretended_gpu(*names: str) -> dict:
-    """What :mod:`reference.pretend_gpu` reports."""
-    command = [sys.executable, str(PROGRAM), *names]
+def test_a_decision_of_all_traffics_and_a_training_stay_on_the_gpu_and_wait_for_what_is_listed():
+    command = [sys.executable, str(PROGRAM)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-def test_a_decision_of_all_traffics_and_a_training_stay_on_the_gpu_and_wait_for_what_is_listed():
-    report = on_a_pretended_gpu("mixed", "training")
+    report = json.loads(done.stdout.splitlines()[-1])
     mixed = {"reset": RESET | ROWS, "decision": DECISION | ROWS, "elsewhere": []}
-    assert report["mixed"] == mixed
-    assert report["training"] == TRAINING
+    assert report == {"mixed": mixed, "training": TRAINING}

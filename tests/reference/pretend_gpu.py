@@ -1,14 +1,13 @@
 """A pretended GPU: tensors with a device but without numbers, on a machine that has no GPU.
 
-As a program it drives every traffic and a training on it, and prints as JSON for what a GPU's host
-would have waited. Its device, ``gpu``, is PyTorch's place for backends that are written in Python;
-it cannot be taken back, so a process of its own has it.
+As a program it drives a mixture of all traffics and a training on it, and prints as JSON for what
+a GPU's host would have waited. Its device, ``gpu``, is PyTorch's place for backends that are
+written in Python; it cannot be taken back, so a process of its own has it.
 """
 
 from __future__ import annotations
 
 import json
-import sys
 import traceback
 from collections import Counter
 from typing import Any
@@ -26,6 +25,8 @@ GPU = torch.device("gpu:0")
 TRAFFICS = ("idm", "idm_mobil", "idm_random", "idm_faults", "gan", "gan_calibrated")
 #: One of each traffic where they are mixed.
 ROWS = len(TRAFFICS)
+#: The tensor code, of which one physics step is as the other.
+OPTIONS: dict[str, Any] = {"kernel": "torch", "decision_period_s": 0.1}
 #: Operations whose result the host reads, or whose shape depends on it.
 READS = ("_local_scalar_dense", "nonzero", "equal", "masked_select", "_unique2", "bincount")
 #: Packages of which the innermost line is named.
@@ -138,13 +139,10 @@ def elsewhere(tensordict: Any) -> list[str]:
     return [str(name) for name, tensor in leaves if tensor.device != GPU]
 
 
-def drive(traffic: str) -> dict[str, Any]:
-    """A reset and a decision of two physics steps; ``mixed`` is of all :data:`TRAFFICS`."""
-    words = {"mask": "safe", "recycle": True, "decision_period_s": 0.2}
-    option: Any = traffic
-    if traffic == "mixed":
-        option = {"name": traffic, "shares": dict.fromkeys(TRAFFICS, 1)}
-    config = highways(traffic=option, num_envs=ROWS, **words)
+def drive() -> dict[str, Any]:
+    """A reset and a decision of one physics step, in a mixture of all :data:`TRAFFICS`."""
+    mixed = {"name": "mixed", "shares": dict.fromkeys(TRAFFICS, 1)}
+    config = highways(traffic=mixed, num_envs=ROWS, mask="safe", recycle=True, **OPTIONS)
     # Weights are read from files, with their numbers.
     with _disable_current_modes():
         model = make_traffic(config.traffic, config.env)
@@ -161,7 +159,7 @@ def drive(traffic: str) -> dict[str, Any]:
 
 def learn() -> dict[str, Any]:
     """Steps of a training: policy, environment, window, buffer, loss and update."""
-    config = highways(traffic="idm", num_envs=ROWS, decision_period_s=0.1)
+    config = highways(traffic="idm", num_envs=ROWS, **OPTIONS)
     traffic = make_traffic(config.traffic, config.env)
     env = make_env(traffic, config.env, num_envs=ROWS, device="gpu")
     small = RainbowConfig(hidden=[8], capacity=256, batch_size=4, warmup=4, n_step=2)
@@ -199,5 +197,5 @@ if __name__ == "__main__":
     RandomScenes.check = lambda *parts: None
     MODE = Waits()
     with FakeTensorMode(allow_non_fake_inputs=True), MODE:
-        report = {name: learn() if name == "training" else drive(name) for name in sys.argv[1:]}
+        report = {"mixed": drive(), "training": learn()}
     print(json.dumps(report))

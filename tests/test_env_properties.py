@@ -42,7 +42,7 @@ def check_decision(env: HighwayEnv, last: Vehicles, now: Vehicles) -> None:
     assert all(map(torch.equal, now, last.with_(x=now.x)))
 
 
-@pytest.mark.parametrize("number", range(16))
+@pytest.mark.parametrize("number", range(12))
 def test_what_must_hold_does_in_the_trials_random_configurations(number, monkeypatch):
     """The paper's literal lane changers slide: equation 11's lateral speed comes on top of their
     speed along the road.
@@ -58,7 +58,7 @@ def test_what_must_hold_does_in_the_trials_random_configurations(number, monkeyp
     frames: list[Vehicles] = []
     env.base_env.recorder = lambda vehicles, running: frames.append(vehicles)
     td = env.reset()
-    for _ in range(4):
+    for _ in range(3):
         frames[:] = [Vehicles.of(td[keys.VEHICLES])]
         before = td.set("action", torch.randint(3, (3,), generator=generator))
         stepped, td = env.step_and_maybe_reset(before)

@@ -69,7 +69,7 @@ def test_nobody_accelerates_at_the_equilibrium_gap():
 # Braking
 
 
-def test_a_stop_needs_its_speedsquared_over_twice_the_gap():
+def test_a_stop_needs_its_speed_squared_over_twice_the_gap():
     assert needed_deceleration(*doubles(20.0, 0.0, 10.0)).item() == pytest.approx(20.0)
     assert needed_deceleration(*doubles(10.0, 20.0, 0.5)).item() == 0.0
 
@@ -87,9 +87,9 @@ def test_idm_stops_within_the_kinematic_distance_and_a_step(speed):
 # their cars. How long that takes follows from the linear theory, not from a look at the run.
 
 DESIRED = 25.0
-FOLLOWERS = 9
+FOLLOWERS = 5
 LENGTH_M = 4.5
-SPEEDS = (1.0, 3.0, 6.0, 10.0, 15.0, 18.0)
+SPEEDS = (1.0, 3.0, 6.0, 10.0, 15.0)
 #: Start of every platoon: bumper to bumper gap, m, and speed, m/s (or the leader's, if that is
 #: lower).
 START_GAP_M = 40.0
@@ -211,7 +211,7 @@ def test_the_slopes_of_the_theory_are_those_of_the_package(desired, speed):
 
 
 @pytest.mark.parametrize(("desired", "critical"), [(18.0, 12.1), (25.0, 17.3)])
-def test_the_critical_its_speedof_linear_theory(desired, critical):
+def test_the_critical_speed_of_linear_theory(desired, critical):
     """Neither the time step nor the size of the ring moves it by as much as is tested below."""
     threshold = stability.critical_speed(desired)
     assert threshold == pytest.approx(critical, abs=0.05)
@@ -253,7 +253,7 @@ def test_every_ring_grows_or_decays_at_the_rate_of_the_linear_theory():
 
 
 @pytest.mark.slow
-def test_in_1500_s_a_small_disturbance_grows_below_the_critical_its_speedand_dies_above_it():
+def test_in_1500_s_a_small_disturbance_grows_below_the_critical_speed_and_dies_above_it():
     """Random displacements of all cars; the outcome is the linear theory's, car by car."""
     steps = 15_000
     displacement = 1e-4 * np.random.default_rng(0).standard_normal((4, CARS))

@@ -15,11 +15,7 @@ from ganlane.settings.episode import SpawnParameters
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.idm import TABLE_V, following_acceleration
 from ganlane.sim.neighbours import perceive
-from ganlane.sim.spawn import (
-    RANGE_M,
-    SAFE_DECELERATION,
-    recycle,
-)
+from ganlane.sim.spawn import RANGE_M, SAFE_DECELERATION, recycle
 from ganlane.sim.state import Road, Vehicles
 
 # Recycling, by hand
@@ -81,7 +77,7 @@ def scenes_around(rows: int, cars: int, lanes: int, seed: int) -> Vehicles:
 ANY = {"seed": st.integers(0, 2**31), "lanes": st.integers(1, 5), "cars": st.integers(2, 25)}
 
 
-@settings(max_examples=50)
+@settings(max_examples=20)
 @given(**ANY)
 def test_positions_change_by_twice_the_range_the_ego_and_padding_never_move(seed, lanes, cars):
     before = scenes_around(20, cars, lanes, seed)
@@ -168,7 +164,7 @@ def test_without_recycling_the_ego_loses_its_company_over_5_km(monkeypatch):
     assert alone[-1] < 4.0
 
 
-@pytest.mark.parametrize("goal_m", [2000.0, pytest.param(5000.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("goal_m", [1500.0, pytest.param(5000.0, marks=pytest.mark.slow)])
 def test_with_it_the_ego_keeps_its_company_and_nobody_is_burdened(goal_m, monkeypatch):
     company, moved = in_range_by_km(monkeypatch, on=True, goal_m=goal_m)
     assert min(company) > 7.5

@@ -130,7 +130,7 @@ def test_the_road_must_be_the_scenes():
         pair(50.0, 10.0, 10.0).check(Road(3), TABLE_V)
 
 
-@settings(max_examples=12)
+@settings(max_examples=8)
 @given(gap=st.floats(0.2, 60.0), speed=st.floats(0.0, 40.0), leader=st.floats(0.0, 40.0))
 def test_a_pair_is_refused_exactly_where_it_cannot_brake(gap, speed, leader):
     closing = max(speed - leader, 0.0)

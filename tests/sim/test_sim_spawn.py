@@ -22,12 +22,7 @@ from ganlane.settings.record import make
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.idm import TABLE_V, can_brake
 from ganlane.sim.random import episode_key
-from ganlane.sim.spawn import (
-    RandomScenes,
-    check_start,
-    draw_lanes,
-    spawn,
-)
+from ganlane.sim.spawn import RandomScenes, check_start, draw_lanes, spawn
 from ganlane.sim.state import Road, Vehicles
 
 LORRIES = SpawnParameters(truck_share=0.3)
@@ -145,7 +140,7 @@ def test_a_scene_depends_on_its_key_alone(share):
             assert torch.equal(one[0], all_[row]), name
 
 
-@settings(max_examples=50)
+@settings(max_examples=20)
 @given(
     data=st.data(),
     lanes=st.integers(1, 6),

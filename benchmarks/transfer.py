@@ -68,7 +68,7 @@ def draw_transfer(curves: pl.DataFrame, before: Sequence[float]) -> Figure:
     for (_, phase), colour in zip(curves.group_by("phase", maintain_order=True), COLOURS):
         runs = phase.partition_by("run", maintain_order=True)
         points = [(run["decisions"].to_numpy(), run["mean_reward"].to_numpy()) for run in runs]
-        plot_middle(axes, points, with_range=True, middle=np.median, color=colour)
+        plot_middle(axes, points, middle=np.median, color=colour)
         for run in points:
             axes.plot(*run, color=colour, lw=0.5, alpha=0.6)
     # Where the second phase begins.

@@ -7,7 +7,7 @@ import math
 import platform
 import re
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from datetime import datetime, timezone
 from html import escape
@@ -77,23 +77,15 @@ def write_results(
     """
     path = Path(folder) / "results.json"
     # Whoever finds the file later can tell where its numbers come from.
-    origin = {
+    content = {
+        **numbers,
         "seeds": seeds,
         "config": config,
         "code": code_version(),
         "machine": machine(),
+        "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
-    written = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    write_json(
-        path,
-        plain(
-            {
-                **numbers,
-                **origin,
-                "written": written,
-            }
-        ),
-    )
+    write_json(path, plain(content))
     return path
 
 
@@ -104,20 +96,14 @@ def names_of_runs(folders: Sequence[Path]) -> list[str]:
     the ends of their paths.
     """
     runs = [_settings(folder) for folder in folders]
-    # Alphabetical, so that the order does not depend on which run comes first.
-    keys = sorted({key for settings in runs for key in settings})
     # A key that some lack belongs to a traffic or a scene that they do not have.
-    shared = [key for key in keys if all(key in settings for settings in runs)]
+    shared = [key for key in runs[0] if all(key in settings for settings in runs)] if runs else []
     differing = [key for key in shared if len({settings[key] for settings in runs}) > 1]
-    differing.sort(key=lambda key: key == "seed")
-    names = []
-    for settings in runs:
-        names.append(", ".join(f"{key}={settings[key]}" for key in differing))
+    # Alphabetical, so that the order does not depend on which run comes first.
+    differing.sort(key=lambda key: (key == "seed", key))
+    names = [", ".join(f"{key}={settings[key]}" for key in differing) for settings in runs]
     # Paths from the right, as long as it takes to tell all of them apart.
-    longest = max(
-        (len(folder.parts) for folder in folders),
-        default=0,
-    )
+    longest = max((len(folder.parts) for folder in folders), default=0)
     for depth in range(1, longest + 1):
         if all(names) and len(set(names)) == len(names):
             break
@@ -133,25 +119,29 @@ def _settings(folder: Path) -> dict[str, str]:
         return {}
     # Which checkpoint a run went on from does not tell what it is.
     data.pop("resume", None)
-    # One level of dotted keys, as they are typed on the command line.
-    settings = dict(_leaves(data))
+    settings = {}
+    for key, value in flat(data).items():
+        owner, _, name = key.rpartition(".")
+        if name == "_target_":
+            # A traffic is known by its option, one of the user's own by its import path.
+            kind = TrafficConfig.kinds().get(str(value), OwnTraffic)
+            settings[owner] = kind.option or as_typed(value)  # type: ignore[attr-defined]
+        else:
+            settings[key] = as_typed(value)
     if isinstance(data.get("traffics"), Mapping):
         settings["traffics"] = as_typed(list(data["traffics"]))
     return settings
 
 
-def _leaves(data: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
-    """Every value of nested mappings with its dotted key."""
-    for name, value in data.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{above}{name}.")
-        elif name == "_target_":
-            # A traffic is known by its option, one of the user's own by its import path.
-            kind = TrafficConfig.kinds().get(str(value), OwnTraffic)
-            option = kind.option  # type: ignore[attr-defined]
-            yield above.rstrip("."), option or as_typed(value)
+def flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Nested plain data by dotted name; tuples become lists, as when read from a file."""
+    names: dict[str, Any] = {}
+    for name, value in nested.items():
+        if isinstance(value, Mapping) and value:
+            names |= flat(value, f"{above}{name}.")
         else:
-            yield f"{above}{name}", as_typed(value)
+            names[f"{above}{name}"] = list(value) if isinstance(value, tuple) else value
+    return names
 
 
 def runs_below(folder: Path, file: str) -> list[Path]:
@@ -216,41 +206,18 @@ def code_version() -> dict[str, Any]:
     own file.
     """
     # None where git does not know: an installed package, or a machine without git.
-    version: dict[str, Any] = {
-        "version": __version__,
-        "revision": None,
-        "modified": None,
-    }
+    revision = modified = None
     if _git("ls-files", "--error-unmatch", "__init__.py") is not None:
-        version["revision"] = _git("rev-parse", "HEAD")
-        version["modified"] = bool(
-            _git(
-                "status",
-                "--porcelain",
-                "--untracked-files=no",
-                "--",
-                ".",
-            )
-        )
-    return version
+        revision = _git("rev-parse", "HEAD")
+        modified = bool(_git("status", "--porcelain", "--untracked-files=no", "--", "."))
+    return {"version": __version__, "revision": revision, "modified": modified}
 
 
 def _git(*arguments: str) -> str | None:
     """Output of a git command in the package's folder; None where git is absent or fails."""
-    command = [
-        "git",
-        "-C",
-        str(PACKAGE),
-        *arguments,
-    ]
+    command = ["git", "-C", str(PACKAGE), *arguments]
     try:
-        done = subprocess.run(
-            command,
-            capture_output=True,
-            text=True,
-            timeout=10,
-            check=True,
-        )
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()
@@ -262,11 +229,7 @@ def machine() -> dict[str, Any]:
     # Linux names the model of the CPU here.
     info = Path("/proc/cpuinfo")
     if info.is_file():
-        model = re.search(
-            r"^model name\s*:(.*)$",
-            info.read_text(errors="replace"),
-            re.MULTILINE,
-        )
+        model = re.search(r"(?m)^model name\s*:(.*)$", info.read_text(errors="replace"))
         cpu = model[1].strip() if model else cpu
     return {
         "cpu": cpu,

@@ -5,7 +5,7 @@ By driver and traffic, by pair of drivers, by scene.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -78,20 +78,16 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
     ``same_traffic`` also holds the drivers that give the scale.
     """
     # Every end has its column, also one that never happened.
-    ended = {reason: int((pair["reason"] == reason).sum()) for reason in keys.END_EVENTS}
-    # Rates are of all episodes together, not means of the episodes' own rates: short episodes would
-    # count as much as long ones.
+    ended = counts_of_ends(pair, keys.END_EVENTS)
     returns = pair["reward"].to_numpy()
     distance_m = float(pair["distance_m"].sum())
-    duration_s = float(pair["duration_s"].sum())
-    lane_changes_per_km = crashes = lead = None
+    crashes = lead = None
     if distance_m > 0.0:
-        lane_changes_per_km = int(pair["lane_changes"].sum()) / distance_m * 1000.0
         crashes = poisson_interval(ended[_CRASH]).scaled(1e6 / distance_m)
     # MOBIL has no lead over itself, and without it nobody has one.
-    mobil = same_traffic.filter(pl.col("agent") == SCALE_TOP)
-    if pair["agent"][0] != SCALE_TOP and mobil.height > 0:
-        lead, _ = paired_lead(pair, mobil)
+    returns_of_both = _paired(pair, same_traffic.filter(pl.col("agent") == SCALE_TOP))
+    if pair["agent"][0] != SCALE_TOP and len(returns_of_both[0]) > 1:
+        lead = paired_difference(*returns_of_both)
     # Someone close behind is no end of an episode, so it is counted by episode.
     behind = mean_interval(pair["soft_crash_behind"].to_numpy())
     score, reason = _score(pair, same_traffic)
@@ -111,8 +107,7 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
         **entries("soft_crash_behind_per_episode", behind),
         **entries("mean_reward", mean_interval(returns)),
         "reward_sd": float(np.std(returns, ddof=1)) if len(returns) > 1 else None,
-        "mean_speed_mps": distance_m / duration_s if duration_s > 0 else None,
-        "lane_changes_per_km": lane_changes_per_km,
+        **speed_and_lane_changes(pair),
         "distance_km": distance_m / 1000.0,
         **entries("hard_crash_share", clopper_pearson(ended["hard_crash"], pair.height)),
         **entries("out_of_road_share", clopper_pearson(ended["out_of_road"], pair.height)),
@@ -120,6 +115,26 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
         **entries("minus_mobil", lead),
         **entries("normalized_percent", score),
         "normalized_percent_reason": reason,
+    }
+
+
+def counts_of_ends(episodes: pl.DataFrame, ends: Iterable[str]) -> dict[str, int]:
+    """How many episodes ended so, by end."""
+    return {end: int((episodes["reason"] == end).sum()) for end in ends}
+
+
+def speed_and_lane_changes(episodes: pl.DataFrame) -> Row:
+    """``mean_speed_mps`` and ``lane_changes_per_km``; None where nobody drove.
+
+    Rates are of all episodes together, not means of the episodes' own rates: short episodes would
+    count as much as long ones.
+    """
+    distance_m = float(episodes["distance_m"].sum())
+    duration_s = float(episodes["duration_s"].sum())
+    changes = int(episodes["lane_changes"].sum())
+    return {
+        "mean_speed_mps": distance_m / duration_s if duration_s > 0.0 else None,
+        "lane_changes_per_km": changes / distance_m * 1000.0 if distance_m > 0.0 else None,
     }
 
 
@@ -134,16 +149,6 @@ def _paired(*drivers: pl.DataFrame, what: pl.Expr = _RETURN) -> list[Array]:
     # Joins keep no order.
     ordered = shared.sort(_EPISODE)
     return [ordered[str(column)].cast(pl.Float64).to_numpy() for column in range(len(drivers))]
-
-
-def paired_lead(driver: pl.DataFrame, other: pl.DataFrame) -> tuple[Estimate | None, int]:
-    """Mean return of ``driver`` minus that of ``other``, and the number of episodes that both
-    drove.
-
-    No estimate for fewer than two episodes.
-    """
-    first, second = _paired(driver, other)
-    return (paired_difference(first, second) if len(first) > 1 else None), len(first)
 
 
 def verdict(
@@ -195,28 +200,20 @@ def paired_rows(episodes: pl.DataFrame) -> list[Row]:
         ours = driven.filter(pl.col("agent") == first)
         others = driven.filter(pl.col("agent") != first)
         for (other,), theirs in others.group_by("agent", maintain_order=True):
-            lead, shared = paired_lead(ours, theirs)
-            if lead is None:
-                continue
             returns = _paired(ours, theirs)
-            failed = _paired(
-                ours,
-                theirs,
-                what=pl.col("reason").is_in(FAILURES),
-            )
+            failed = _paired(ours, theirs, what=pl.col("reason").is_in(FAILURES))
+            if len(returns[0]) < 2:
+                continue
+            lead = paired_difference(*returns)
             row = {
                 "agent": first,
                 "over": other,
                 "traffic": traffic,
-                "episodes": shared,
+                "episodes": len(returns[0]),
+                **entries("lead", lead),
+                "verdict": verdict(lead, returns[0] - returns[1], failed[0] != failed[1]),
             }
-            rows.append(
-                {
-                    **row,
-                    **entries("lead", lead),
-                    "verdict": verdict(lead, returns[0] - returns[1], failed[0] != failed[1]),
-                }
-            )
+            rows.append(row)
     return rows
 
 
@@ -259,15 +256,9 @@ def normalized_percent(
         MOBIL's lead over the random driver includes 0, so the scale would have no length.
     """
     drivers = (agent, mobil, random_legal)
-    returns = np.stack(
-        [np.asarray(values, dtype=np.float64) for values in drivers],
-        axis=1,
-    )
+    returns = np.stack([np.asarray(values, dtype=np.float64) for values in drivers], axis=1)
     # The scale has a length only if MOBIL is better than random driving beyond doubt.
-    lead = paired_difference(
-        returns[:, 1],
-        returns[:, 2],
-    )
+    lead = paired_difference(returns[:, 1], returns[:, 2])
     if lead.interval is None:
         return None, "fewer than two episodes"
     if not lead.excludes_zero():
@@ -276,10 +267,7 @@ def normalized_percent(
     means = bootstrap_means(returns)
     # A resample without MOBIL's lead would divide by zero.
     with_scale = means[means[:, 1] != means[:, 2]]
-    low, high = np.quantile(
-        percent_of_way(*with_scale.T),
-        TAIL_LEVELS,
-    )
+    low, high = np.quantile(percent_of_way(*with_scale.T), TAIL_LEVELS)
     # The value itself is of all episodes, not of the resamples.
     value = percent_of_way(*returns.mean(axis=0))
     return Estimate(float(value), float(low), float(high)), None
@@ -312,26 +300,20 @@ def crashes_by_scene(episodes: pl.DataFrame, scenes: Sequence[str]) -> tuple[Est
         raise UserError(
             f"{len(scenes)} scenes for {episodes.height} episodes: expected one for each."
         )
+    with_scene = episodes.with_columns(pl.Series("scene", scenes, pl.String))
     by_scene = (
-        episodes.select(
-            "reason",
-            "distance_m",
-            pl.Series("scene", scenes, pl.String),
-        )
-        .group_by("scene")
+        with_scene.group_by("scene")
         .agg(
-            pl.len().alias("episodes"),
-            (pl.col("reason") == _CRASH).sum().alias(_CRASH),
-            (pl.col("distance_m").cast(pl.Float64).sum() / 1000.0).alias("distance_km"),
+            episodes=pl.len(),
+            hard_crash=(pl.col("reason") == _CRASH).sum(),
+            distance_km=pl.col("distance_m").cast(pl.Float64).sum() / 1000.0,
         )
         .sort("scene")
     )
     rows = []
     for row in by_scene.to_dicts():
-        rate = None
         km = row["distance_km"]
-        if km > 0.0:
-            rate = poisson_interval(row[_CRASH]).scaled(per=km)
+        rate = poisson_interval(row[_CRASH]).scaled(per=km) if km > 0.0 else None
         rows.append({**row, **entries("crashes_per_km", rate)})
     crashes = by_scene[_CRASH].to_numpy().astype(np.float64)
     driven = by_scene["distance_km"].to_numpy()
@@ -340,19 +322,19 @@ def crashes_by_scene(episodes: pl.DataFrame, scenes: Sequence[str]) -> tuple[Est
         raise UserError(
             "crashes per km: nobody drove; give episodes that last at least one decision."
         )
+    rate_of_all = float(crashes.sum() / total)
     # One scene has no spread to resample.
     if len(driven) < 2:
-        return Estimate(float(crashes.sum() / total)), rows
+        return Estimate(rate_of_all), rows
     if crashes.sum() == 0:
         return no_events(total), rows
     # A resample may hold nothing but scenes in which nobody drove.
     driven = driven.clip(min=np.finfo(np.float64).tiny)
     ratios = [
-        counts @ crashes / (counts @ driven)
-        for counts in resample_counts(len(driven), RESAMPLES, seed=0)
+        counts @ crashes / (counts @ driven) for counts in resample_counts(len(driven), RESAMPLES)
     ]
     low, high = np.quantile(np.concatenate(ratios), TAIL_LEVELS)
-    return Estimate(float(crashes.sum() / total), float(low), float(high)), rows
+    return Estimate(rate_of_all, float(low), float(high)), rows
 
 
 def failed_episodes(episodes: pl.DataFrame) -> list[Row]:
@@ -361,21 +343,7 @@ def failed_episodes(episodes: pl.DataFrame) -> list[Row]:
     Per ``driver, traffic, seed`` the numbers of the episodes that ended so.
     """
     failed = episodes.filter(pl.col("reason").is_in(FAILURES))
-    rows = []
     # A row per driver, traffic and seed, so that an episode can be driven again by its numbers.
-    for names, frame in failed.group_by(
-        "agent",
-        "traffic",
-        "seed",
-        maintain_order=True,
-    ):
-        row: Row = dict(
-            zip(
-                ("driver", "traffic", "seed"),
-                names,
-            )
-        )
-        for end in FAILURES:
-            row[end] = frame.filter(pl.col("reason") == end)["episode"].sort().to_list()
-        rows.append(row)
-    return rows
+    names = (pl.col("agent").alias("driver"), "traffic", "seed")
+    ended = {end: pl.col("episode").filter(pl.col("reason") == end).sort() for end in FAILURES}
+    return failed.group_by(*names, maintain_order=True).agg(**ended).to_dicts()

@@ -93,12 +93,11 @@ def entries(name: str, estimate: Estimate | None) -> dict[str, Any]:
 def resample_counts(
     size: int,
     resamples: int,
-    seed: int,
 ) -> Iterator[Array]:
     """Chunks [R, size] of how often each of ``size`` episodes occurs in a resample of ``size`` with
     replacement.
     """
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     for start in range(0, resamples, _CHUNK):
         # Each row of a chunk counts in a range of its own, so that one bincount serves all rows.
         rows = min(_CHUNK, resamples - start)
@@ -114,7 +113,7 @@ def kept_counts(size: int, resamples: int) -> tuple[npt.NDArray[np.uint16], ...]
 
     A table's intervals draw the same ones, 0.25 s for 1000 episodes.
     """
-    return tuple(counts.astype(np.uint16) for counts in resample_counts(size, resamples, seed=0))
+    return tuple(counts.astype(np.uint16) for counts in resample_counts(size, resamples))
 
 
 def bootstrap_means(values: Array) -> Array:
@@ -124,11 +123,7 @@ def bootstrap_means(values: Array) -> Array:
     """
     size = len(values)
     # All tables of one evaluation have the same number of episodes, so the draws are shared.
-    counts: Iterable[Array | npt.NDArray[np.uint16]] = resample_counts(
-        size,
-        RESAMPLES,
-        seed=0,
-    )
+    counts: Iterable[npt.NDArray[Any]] = resample_counts(size, RESAMPLES)
     if size * RESAMPLES <= _MOST_KEPT:
         counts = kept_counts(size, RESAMPLES)
     return np.concatenate([chunk.astype(np.float64) @ values / size for chunk in counts])
@@ -147,15 +142,7 @@ def _bca_levels(values: Array, means: Array) -> Array:
     below = ((means < mean).mean() + (means <= mean).mean()) / 2.0
     # Half a resample away from 0 and 1, where the normal quantile is infinite.
     edge = 0.5 / len(means)
-    bias = _NORMAL.inv_cdf(
-        float(
-            np.clip(
-                below,
-                edge,
-                1.0 - edge,
-            )
-        )
-    )
+    bias = _NORMAL.inv_cdf(float(np.clip(below, edge, 1.0 - edge)))
     shifted = [bias + _NORMAL.inv_cdf(float(level)) for level in TAIL_LEVELS]
     return np.array([_NORMAL.cdf(bias + z / (1.0 - acceleration * z)) for z in shifted])
 
@@ -239,13 +226,7 @@ def no_events(amount: float) -> Estimate:
 
 def interquartile_mean(scores: npt.ArrayLike) -> Array:
     """Mean of the middle half of the last axis: without a quarter, rounded down, at both ends."""
-    return np.asarray(
-        scipy.stats.trim_mean(
-            np.asarray(scores, dtype=np.float64),
-            0.25,
-            axis=-1,
-        )
-    )
+    return np.asarray(scipy.stats.trim_mean(np.asarray(scores, np.float64), 0.25, axis=-1))
 
 
 def over_trainings(scores: npt.ArrayLike, statistic: Callable[[Array], Array] = _mean) -> Estimate:

@@ -16,7 +16,7 @@ from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.render import FilmConfig
 from ganlane.view import EpisodeLabel, FramePainter, Recorder
 from ganlane.view.frames import Picture
-from ganlane.view.record import outcome_of, road_of_row
+from ganlane.view.record import outcome_of
 
 #: Recorded physics steps that are kept: as many as the trails show.
 _TRAIL_STEPS = round(FilmConfig.trail_s / PHYSICS_STEP_S) + 1
@@ -24,18 +24,7 @@ _TRAIL_STEPS = round(FilmConfig.trail_s / PHYSICS_STEP_S) + 1
 
 def _label(rows: TensorRows, row: int) -> EpisodeLabel:
     """The header's text for a row."""
-    state = rows.now()
-    # Which episode this is, and on what road.
-    seed = int(state.get(keys.SEED)[row])
-    episode = int(state.get(keys.EPISODE)[row])
-    road = road_of_row(state, rows.env.base_env.road, row)
-    return EpisodeLabel(
-        "ego",
-        rows.traffic,
-        seed,
-        episode,
-        *road,
-    )
+    return EpisodeLabel.of(rows.now(), rows.env.base_env.road, "ego", rows.traffic, row)
 
 
 class LiveView:

@@ -219,15 +219,7 @@ def _resampled(
     if units < 2:
         return np.empty((len(models), 0))
     # The same resamples for all models, so that differences are paired.
-    counts = np.concatenate(
-        list(
-            resample_counts(
-                units,
-                resamples,
-                seed=0,
-            )
-        )
-    )
+    counts = np.concatenate(list(resample_counts(units, resamples)))
     against = counts @ recorded if paired else recorded.sum(0)
     distances = np.stack([jensen_shannon(counts @ model, against) for model in models])
     # A resample of units without samples has no distance.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -76,8 +76,9 @@ def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
     matrix = scores.rows(by_recipe)
     entries = scores.summaries(by_recipe, matrix, suite)
     for entry in entries:
-        mine = episodes.filter(episodes["agent"].is_in(_trainings(by_recipe, entry["entry"])))
-        took_s = sum(seconds[name] for name in mine["agent"].unique())
+        trainings = [name for name in seconds if scores.recipe_of(name) == entry["entry"]]
+        mine = episodes.filter(pl.col("agent").is_in(trainings))
+        took_s = sum(seconds[name] for name in trainings)
         entry["decisions_per_s"] = int(mine["decisions"].sum()) / took_s
     recipes = list(dict.fromkeys(scores.recipe_of(driver.name) for driver in agents))
     pairs = [(one, other) for one in recipes for other in suite.drivers() if one != other]
@@ -87,7 +88,7 @@ def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
     table = report.score_table(entries, list(suite.scored), _notes(title, config))
     further = report.paper_tables(matrix) if suite.version == "paper" else []
     show(table.text(), *(paper.text() for paper in further), columns=config.columns)
-    driven = {name: matrix_episodes(matrix, name) for name in traffics}
+    driven = {row["traffic"]: row["episodes"] for row in matrix}
     intro = [
         "Intervals are 95 %: over trainings, where there are several of a recipe, and over "
         "episodes.",
@@ -118,16 +119,6 @@ def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
     }
     seeds = {"stream": suite.stream, "seed": config.seed, "episodes": driven}
     return f"report: {page}; results: {write_results(folder, record, asdict(config), seeds)}"
-
-
-def _trainings(cells: scores.Cells, recipe: str) -> list[str]:
-    """Names of the trainings of a recipe."""
-    return next(list(driven) for (name, _), driven in cells.items() if name == recipe)
-
-
-def matrix_episodes(matrix: Sequence[Mapping[str, Any]], traffic: str) -> int:
-    """How many episodes each driver drove on a traffic."""
-    return next(row["episodes"] for row in matrix if row["traffic"] == traffic)
 
 
 def _sample(episodes: pl.DataFrame, traffics: Sequence[str]) -> dict[str, Any]:

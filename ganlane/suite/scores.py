@@ -11,7 +11,13 @@ import polars as pl
 
 from ganlane.errors import UserError
 from ganlane.evaluation.measures import CRASHES
-from ganlane.evaluation.rows import FAILURES, SCALE_BOTTOM, SCALE_TOP
+from ganlane.evaluation.rows import (
+    FAILURES,
+    SCALE_BOTTOM,
+    SCALE_TOP,
+    counts_of_ends,
+    speed_and_lane_changes,
+)
 from ganlane.evaluation.statistics import (
     Array,
     Estimate,
@@ -149,7 +155,7 @@ def _row(recipe: str, traffic: str, cells: Cells) -> Row:
     for (name, frame), reward in zip(trainings.items(), rewards[:, None]):
         lead = None if is_mobil else difference(reward, mobil)
         training = {"driver": name, **entries("mean_reward", over_trainings(reward))}
-        training |= {**entries("minus_mobil", lead), **_failures(frame)}
+        training |= {**entries("minus_mobil", lead), **counts_of_ends(frame, FAILURES)}
         row["each"].append(training)
     return row
 
@@ -158,13 +164,10 @@ def safety(trainings: Mapping[str, pl.DataFrame]) -> Row:
     """What :func:`rows` says of crashes, near misses, comfort and speed."""
     together = pl.concat(trainings.values())
     crashes = together.filter(_RATES["crashes"])
-    metres = float(together["distance_m"].sum())
-    seconds = float(together["duration_s"].sum())
     km = column(trainings, pl.col("distance_m") / 1000.0)
     kinds = {kind: int((crashes["crash"] == kind).sum()) for kind in CRASHES}
     row: Row = {
-        **_failures(together),
-        **{end: int((together["reason"] == end).sum()) for end in ENDS},
+        **counts_of_ends(together, (*FAILURES, *ENDS)),
         "goal_s": together.filter(pl.col("reason") == "goal")["duration_s"].mean(),
         "soft_crash": int(together["had_soft_crash"].sum()),
         **entries("hard_crash_share", clopper_pearson(crashes.height, together.height)),
@@ -174,20 +177,13 @@ def safety(trainings: Mapping[str, pl.DataFrame]) -> Row:
         "least_headway_s": together["least_headway_s"].median(),
         "rms_acceleration_mps2": together["rms_acceleration_mps2"].mean(),
         "hardest_braking_mps2": together["hardest_braking_mps2"].mean(),
-        "mean_speed_mps": metres / seconds if seconds > 0.0 else None,
-        "lane_changes_per_km": None,
+        **speed_and_lane_changes(together),
         "soft_crash_behind_per_episode": together["soft_crash_behind"].mean(),
     }
-    if metres > 0.0:
-        row["lane_changes_per_km"] = int(together["lane_changes"].sum()) / metres * 1000.0
     for name, counted in _RATES.items():
         rate = rate_over_trainings(column(trainings, counted), km)
         row |= entries(f"{name}_per_1000_km", None if rate is None else rate.scaled(1000.0))
     return row
-
-
-def _failures(episodes: pl.DataFrame) -> dict[str, int]:
-    return {end: int((episodes["reason"] == end).sum()) for end in FAILURES}
 
 
 def summaries(cells: Cells, matrix: Sequence[Row], suite: Suite) -> list[Row]:

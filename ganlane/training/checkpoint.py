@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 from ganlane.agents import NStepWindow, Rainbow, save_agent
 from ganlane.config.run import LAST
 from ganlane.errors import UserError
+from ganlane.evaluation.results import flat
 from ganlane.files import atomic_path, has_checksum, refuse_without_checksum, seal_archive
 from ganlane.training.collectors import Collector
 from ganlane.training.stats import EpisodeStats
@@ -281,14 +282,3 @@ def _finite(state: Any) -> bool:
     if isinstance(state, dict):
         return all(map(_finite, state.values()))
     return not isinstance(state, list | tuple) or all(map(_finite, state))
-
-
-def flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    """Nested plain data by dotted name; tuples become lists, as when read from a file."""
-    names: dict[str, Any] = {}
-    for name, value in nested.items():
-        if isinstance(value, Mapping) and value:
-            names |= flat(value, f"{above}{name}.")
-        else:
-            names[f"{above}{name}"] = list(value) if isinstance(value, tuple) else value
-    return names

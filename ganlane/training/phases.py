@@ -40,11 +40,10 @@ from ganlane.build import (
 )
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version, run_episodes
-from ganlane.evaluation.results import plain
+from ganlane.evaluation.results import flat, plain
 from ganlane.settings.observation import ObservationConfig
 from ganlane.settings.train import TrainConfig
 from ganlane.sim.random import Stream
-from ganlane.training.checkpoint import flat
 from ganlane.training.logs import make_logs
 from ganlane.training.loop import Evaluate, TrainingResult, train
 from ganlane.transforms import observation_size

@@ -47,7 +47,7 @@ def read_metrics(path: str | Path) -> pl.DataFrame:
     try:
         # Types are inferred from all rows: a column may be empty for the first thousands.
         frame = pl.read_csv(file, infer_schema_length=None)
-        numbers = frame.select(X_COLUMN, pl.all().exclude(X_COLUMN).cast(pl.Float64))
+        numbers = frame.select(X_COLUMN, pl.exclude(X_COLUMN)).cast(pl.Float64)
         if numbers.is_empty():
             raise ValueError("it has no rows")
     except (PolarsError, OSError, ValueError) as error:
@@ -133,7 +133,7 @@ def draw_runs(runs: Mapping[str, Sequence[pl.DataFrame]]) -> Figure:
         axes.set(title=title, ylabel=unit, xlabel=X_COLUMN)
         axes.xaxis.set_major_formatter(EngFormatter())
         for name, of_run in lines[column].items():
-            plot_middle(axes, of_run, with_range=True, color=colours[name])
+            plot_middle(axes, of_run, color=colours[name])
     legend = {}
     for name, frames in runs.items():
         count = f" ({len(frames)} seeds: mean, range)" if len(frames) > 1 else ""
@@ -150,7 +150,7 @@ def _lines(
     lines = []
     for frame in frames:
         if column in frame.columns:
-            table = frame.select(pl.col(X_COLUMN, column).cast(pl.Float64)).drop_nulls()
+            table = frame.select(X_COLUMN, column).drop_nulls()
             if table.height:
                 lines.append((table[X_COLUMN].to_numpy(), table[column].to_numpy()))
     return lines
@@ -159,11 +159,10 @@ def _lines(
 def plot_middle(
     axes: Axes,
     lines: Sequence[tuple[FloatArray, FloatArray]],
-    with_range: bool = False,
     middle: Callable[..., FloatArray] = np.mean,
     **style: Any,
 ) -> None:
-    """One line as it is; of several, the ``middle`` and perhaps the range where all have values."""
+    """One line as it is; of several, the ``middle`` and the range where all have values."""
     if len(lines) == 1:
         plot_line(axes, *lines[0], **style)
     if len(lines) < 2:
@@ -175,6 +174,4 @@ def plot_middle(
     shared = x[(x >= first) & (x <= last)]
     values = np.stack([np.interp(shared, *line) for line in lines])
     plot_line(axes, shared, middle(values, axis=0), **style)
-    if with_range:
-        low, high = values.min(0), values.max(0)
-        axes.fill_between(shared, low, high, **style, alpha=0.18, lw=0)
+    axes.fill_between(shared, values.min(0), values.max(0), **style, alpha=0.18, lw=0)

@@ -88,16 +88,12 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
     return Path(path)
 
 
-def panel_grid(
-    count: int, width_in: float = 4.0, height_in: float = 2.3
-) -> tuple[Figure, list[Axes]]:
-    """A figure with ``count`` panels of this size, inches, three in a row, and room for a
-    legend above.
-    """
+def panel_grid(count: int) -> tuple[Figure, list[Axes]]:
+    """A figure with ``count`` panels, three in a row, and room for a legend above."""
     across = min(3, count)
     # -(-a // b) is a / b rounded up.
     down = -(-count // across)
-    figure = Figure(figsize=(across * width_in, down * height_in + 0.3))
+    figure = Figure(figsize=(across * 4.0, down * 2.3 + 0.3))
     grid = figure.subplots(down, across, squeeze=False).ravel()
     for unused in grid[count:]:
         unused.remove()

@@ -46,6 +46,23 @@ class EpisodeLabel:
     #: Where each lane begins and ends; empty: all go on for ever.
     stretches: Stretches = ()
 
+    @classmethod
+    def of(
+        cls, state: TensorDictBase, road: Road, agent: str, traffic: str, row: int = 0
+    ) -> EpisodeLabel:
+        """Of a row of ``state``: on its replayed scene if it has one, else on ``road``."""
+        scene = road_in(state, road)
+        # One number for all rows, or [N, 1].
+        lanes, width_m = (
+            torch.as_tensor(size).flatten().expand(state.batch_size)[row]
+            for size in (scene.lanes, scene.lane_width_m)
+        )
+        stretches = scene.stretches
+        if scene.row_stretches is not None:
+            stretches = stretches_of_row(scene.row_stretches, row)[: int(lanes)]
+        seed, episode = (int(state[name][row]) for name in (keys.SEED, keys.EPISODE))
+        return cls(agent, traffic, seed, episode, int(lanes), float(width_m), stretches)
+
 
 @dataclass(frozen=True)
 class Trajectory:
@@ -177,34 +194,10 @@ class Recorder:
         return Trajectory(label, outcome=outcome, soft_crash_s=soft_crash_s, **arrays)
 
 
-def road_of_row(
-    state: TensorDictBase,
-    road: Road,
-    row: int,
-) -> tuple[int, float, Stretches]:
-    """Lanes, lane width, m, and where lanes begin and end, of a row.
-
-    Of its replayed scene if ``state`` has one, else of ``road``.
-    """
-    scene = road_in(state, road)
-    # One number for all rows, or [N, 1].
-    lanes = torch.as_tensor(scene.lanes).flatten()
-    width = torch.as_tensor(scene.lane_width_m).flatten()
-    count = int(lanes[min(row, len(lanes) - 1)])
-    stretches = scene.stretches
-    if scene.row_stretches is not None:
-        stretches = stretches_of_row(scene.row_stretches, row)[:count]
-    return (
-        count,
-        float(width[min(row, len(width) - 1)]),
-        stretches,
-    )
-
-
-def outcome_of(state: TensorDictBase, row: int = 0) -> str:
-    """The event that ended the episode of a row; empty where none did."""
+def outcome_of(state: TensorDictBase) -> str:
+    """The event that ended the episode of the first row; empty where none did."""
     events = state[keys.EVENTS]
-    return next((name for name in keys.END_EVENTS if bool(events[name][row])), "")
+    return next((name for name in keys.END_EVENTS if bool(events[name][0])), "")
 
 
 def record_episode(
@@ -243,13 +236,12 @@ def record_episode(
     try:
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             state = env.reset(start_of(env, [episode], seed))
-            road = road_of_row(state, base.road, 0)
+            label = EpisodeLabel.of(state, base.road, agent, traffic)
             recorder.add(state[keys.VEHICLES], 0.0)
             while not state["done"][0] and recorder.time_s < end_s:
                 state = _decide(env, policy, state, recorder)
     finally:
         base.recorder = before
-    label = EpisodeLabel(agent, traffic, seed, episode, *road)
     return recorder.trajectory(label, outcome_of(state))
 
 

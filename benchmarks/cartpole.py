@@ -26,7 +26,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import EnvBase, GymEnv, SerialEnv
 
-from benchmarks.script import ReportSection, make_parser, run_script
+from benchmarks.script import ReportSection, make_parser, markdown, run_script
 from ganlane.agents import GreedyPolicy, Rainbow, RainbowConfig
 from ganlane.evaluation.table import Table
 from ganlane.settings.train import LoggerConfig, TrainConfig
@@ -142,9 +142,8 @@ def median(outcomes: Sequence[Outcome]) -> str:
 def table(outcomes: Sequence[Outcome]) -> str:
     """All seeds and their median, as Markdown."""
     lines = [*(outcome.cells() for outcome in outcomes), ["median", median(outcomes), "", ""]]
-    return Table("", ["seed", "frames to 475", "best mean return", "time"], lines, 4).markdown(
-        heading=False
-    )
+    headings = ["seed", "frames to 475", "best mean return", "time"]
+    return markdown(Table("", headings, lines, 4))
 
 
 def measure(options: argparse.Namespace) -> str:

@@ -24,7 +24,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from benchmarks.script import ReportSection, make_parser, run_script
+from benchmarks.script import ReportSection, make_parser, markdown, run_script
 from ganlane.agents.stored_models import load_model, save_network
 from ganlane.build import Driver
 from ganlane.config.run import settings
@@ -96,7 +96,7 @@ def table(document: str) -> str:
     wanted = columns or [name for name in whole.headings if name != "decisions/s"]
     places = [whole.headings.index(name) for name in wanted]
     lines = [[line[place] for place in places] for line in whole.lines]
-    return Table("", list(wanted), lines).markdown(heading=False)
+    return markdown(Table("", list(wanted), lines))
 
 
 def add(path: Path, name: str) -> str:

@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.script import ReportSection, make_parser, run_script
+from benchmarks.script import ReportSection, make_parser, markdown, run_script
 from ganlane.errors import UserError
 from ganlane.evaluation.table import Table
 from ganlane.suite.report import PAPER_VI, PAPER_VII
@@ -127,9 +127,8 @@ def _drivers(results: Results, among: Sequence[str]) -> list[str]:
 
 def _by_traffic(results: Results, first: str, lines: Sequence[Sequence[str]]) -> str:
     """Lines of a name and a cell for every traffic."""
-    return Table("", [first, *(f"`{traffic}`" for traffic in _traffics(results))], lines).markdown(
-        heading=False
-    )
+    headings = [first, *(f"`{traffic}`" for traffic in _traffics(results))]
+    return markdown(Table("", headings, lines))
 
 
 def leads(results: Results) -> str:
@@ -217,7 +216,7 @@ def paper(results: Results) -> str:
         "VII, % of MOBIL; reward (its standard deviation): the paper, Traffic_GAN",
         "here, `gan`",
     ]
-    return Table("", headings, lines).markdown(heading=False)
+    return markdown(Table("", headings, lines))
 
 
 def controls(results: Results) -> str:

@@ -1,4 +1,6 @@
-"""Shared by the scripts: command line, the part of a document that one writes, exit status."""
+"""Shared by the scripts: command line, numbers and tables as documents show them, the part of a
+document that one writes, exit status.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +12,7 @@ from pathlib import Path
 import torch
 
 from ganlane.errors import UserError
+from ganlane.evaluation.table import Table
 from ganlane.files import write_bytes
 
 
@@ -18,6 +21,44 @@ def make_parser(description: str | None) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+
+
+def markdown(table: Table) -> str:
+    """A title as a heading, the table, and the notes below."""
+    rulers = ["---"] * table.names + ["---:"] * (len(table.headings) - table.names)
+    rows = [table.headings, rulers, *table.lines]
+    parts = [f"### {table.title}"] if table.title else []
+    parts.append("\n".join("| " + " | ".join(row) + " |" for row in rows))
+    if table.notes:
+        parts.append("\n".join(table.notes))
+    return "\n\n".join(parts)
+
+
+def significant(value: float | None) -> str:
+    """Three significant digits, without exponent."""
+    if value is None:
+        return "-"
+    # Rounded first: 9.996 has three digits as 10.0, not as 10.00.
+    rounded = float(f"{value:.3g}")
+    # Digits before the point; below 1 the format counts them itself.
+    whole = len(str(int(abs(rounded))))
+    return f"{rounded:.{max(0, 3 - whole)}f}" if abs(rounded) >= 1 else f"{rounded:.3g}"
+
+
+def count(value: float | None) -> str:
+    """Three significant digits, with k, M and G: ``612``, ``54.3 k``, ``1.23 M``."""
+    if value is None:
+        return "-"
+    for limit, unit in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
+        # What rounds up to the next unit is given in that unit: 1.00 M, not 1000 k.
+        if abs(value) >= limit * 0.9995:
+            return f"{significant(value / limit)}{unit}"
+    return significant(value)
+
+
+def percent(share: float | None) -> str:
+    """A share as whole per cent."""
+    return "-" if share is None else f"{100 * share:.0f} %"
 
 
 def split_at_markers(path: Path, begin: str, end: str) -> tuple[str, str, str]:

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.peers.scene import OBSTACLE, SLOW_AND_GO, Scheme, Trace, equilibrium_gap
 from benchmarks.peers.tolerance import difference
+from benchmarks.script import markdown
 from ganlane.evaluation.table import Table
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.idm import TABLE_V
@@ -42,7 +43,7 @@ def fill(text: str, figures: Figures) -> str:
 
 def table(head: list[str], rows: list[list[str]]) -> str:
     """A Markdown table."""
-    return Table("", head, rows, names=len(head)).markdown(heading=False)
+    return markdown(Table("", head, rows, names=len(head)))
 
 
 def number(value: float) -> str:

@@ -28,14 +28,22 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.script import ReportSection, make_parser, run_script
+from benchmarks.script import (
+    ReportSection,
+    count,
+    make_parser,
+    markdown,
+    percent,
+    run_script,
+    significant,
+)
 from benchmarks.speed import systems
 from benchmarks.speed.measure import Case, Labels, Row, best_rows, measure
 from benchmarks.speed.sumo import start_on_ramp
 from benchmarks.speed.systems import Road, installed_version
 from ganlane.agents import RainbowConfig
 from ganlane.evaluation import machine_sentence
-from ganlane.evaluation.table import Table, count, percent, significant
+from ganlane.evaluation.table import Table
 from ganlane.files import write_json
 
 SUITES = ("sim", "gymnasium", "scenarios", "traffic", "train")
@@ -248,8 +256,7 @@ def compare(options: argparse.Namespace) -> str:
     tables = tables_of(rows)
     taken = f"Taken on {date.today()}: {machine_sentence(options.threads)}"
     command = f"    python -m benchmarks.speed {options.told}".rstrip()
-    markdown = [table.markdown() for table in tables]
-    section.write("\n" + "\n\n".join([command, taken, *markdown]) + "\n")
+    section.write("\n" + "\n\n".join([command, taken, *map(markdown, tables)]) + "\n")
     return "\n\n".join(table.text() for table in tables)
 
 

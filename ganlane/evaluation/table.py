@@ -172,43 +172,6 @@ class Table:
             lines += ["", *self.notes]
         return "\n".join(lines)
 
-    def markdown(self, heading: bool = True) -> str:
-        """The title as a heading (unless turned off), the table, and the notes below."""
-        rulers = ["---"] * self.names + ["---:"] * (len(self.headings) - self.names)
-        lines = ["| " + " | ".join(line) + " |" for line in [self.headings, rulers, *self.lines]]
-        parts = [f"### {self.title}"] if heading else []
-        parts.append("\n".join(lines))
-        if self.notes:
-            parts.append("\n".join(self.notes))
-        return "\n\n".join(parts)
-
-
-def significant(value: float | None) -> str:
-    """Three significant digits, without exponent."""
-    if value is None:
-        return NOTHING
-    # Rounded first: 9.996 has three digits as 10.0, not as 10.00.
-    rounded = float(f"{value:.3g}")
-    # Digits before the point; below 1 the format counts them itself.
-    whole = len(str(int(abs(rounded))))
-    return f"{rounded:.{max(0, 3 - whole)}f}" if abs(rounded) >= 1 else f"{rounded:.3g}"
-
-
-def count(value: float | None) -> str:
-    """Three significant digits, with k, M and G: ``612``, ``54.3 k``, ``1.23 M``."""
-    if value is None:
-        return NOTHING
-    for limit, unit in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
-        # What rounds up to the next unit is given in that unit: 1.00 M, not 1000 k.
-        if abs(value) >= limit * 0.9995:
-            return f"{significant(value / limit)}{unit}"
-    return significant(value)
-
-
-def percent(share: float | None, digits: int = 0) -> str:
-    """A share as per cent."""
-    return NOTHING if share is None else f"{100 * share:.{digits}f} %"
-
 
 #: Columns of an evaluation, names before numbers; ``run``: of a sweep.
 _COLUMNS: Mapping[str, Cell] = {

@@ -3,10 +3,46 @@
 import pytest
 import torch
 
-from benchmarks.script import ReportSection, make_parser, run_script
+from benchmarks.script import (
+    ReportSection,
+    count,
+    make_parser,
+    markdown,
+    percent,
+    run_script,
+)
 from ganlane.errors import UserError
+from ganlane.evaluation.table import Table
 
 BEGIN, END = "<!-- begin -->", "<!-- end -->"
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        (None, "-"),
+        (612.4, "612"),
+        (1234, "1.23 k"),
+        (54321, "54.3 k"),
+        (999_600, "1.00 M"),
+        (2.5e9, "2.50 G"),
+    ],
+)
+def test_counts_have_three_digits_and_a_unit(value, shown):
+    assert count(value) == shown
+
+
+def test_shares_are_per_cent():
+    assert (percent(0.126), percent(None)) == ("13 %", "-")
+
+
+def test_a_table_in_markdown_has_its_title_as_a_heading_if_it_has_one():
+    table = "| who | n |\n| --- | ---: |\n| a | 10 |\n| long | 2 |"
+    lines = [["a", "10"], ["long", "2"]]
+    assert markdown(Table("Speed", ["who", "n"], lines, 1, ["Said."])) == (
+        f"### Speed\n\n{table}\n\nSaid."
+    )
+    assert markdown(Table("", ["who", "n"], lines)) == table
 
 
 def test_what_stands_between_the_markers_is_rewritten_and_the_rest_stays(tmp_path):

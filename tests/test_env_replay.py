@@ -23,7 +23,7 @@ from ganlane.errors import UserError
 from ganlane.settings.road import FAR_M, WALL
 from ganlane.sim.random import episode_key
 from ganlane.traffic import ReplayTraffic
-from ganlane.view.record import road_of_row
+from ganlane.view.record import EpisodeLabel
 
 
 @pytest.fixture(scope="module")
@@ -183,7 +183,8 @@ def test_roads_of_other_scenes_are_refused(recordings, tmp_path, content, what):
 def test_a_film_shows_where_the_lanes_of_a_recorded_scene_end(recordings, roads):
     env = HighwayEnv(ReplayTraffic(recordings=recordings, least_s=5.0, roads=roads), 32)
     td = env.reset()
-    shown = [road_of_row(td, env.road, row) for row in range(32)]
+    labels = [EpisodeLabel.of(td, env.road, "ego", "replay", row) for row in range(32)]
+    shown = [(label.lanes, label.lane_width_m, label.stretches) for label in labels]
     walls = td[keys.ROAD, "wall_m"][:, 0] < FAR_M
     for (lanes, _, stretches), has_wall in zip(shown, walls.tolist()):
         assert len(stretches) == lanes

@@ -88,6 +88,8 @@ _INTERVAL = re.compile(r"([-+]?\d+(?:\.\d+)?) \[(-?\d+(?:\.\d+)?), (-?\d+(?:\.\d
 
 Results = Mapping[str, Any]
 Row = Mapping[str, Any]
+#: Value, low, high, and the digits behind the point that they are printed with.
+Figure = tuple[float, ...]
 
 
 def _at(results: Results, driver: str, traffic: str) -> Row:
@@ -377,20 +379,27 @@ def _values(node: Any) -> Iterator[tuple[float, float, float]]:
             yield from _values(value)
 
 
-def unsourced(text: str, results: Results) -> list[str]:
-    """Figures with an interval in ``text`` that the results do not have, rounded as they are
-    printed.
+def sourced(results: Results) -> set[Figure]:
+    """The figures with an interval that the results have, as they may be printed.
 
     A lead may be told the other way round: ``12 [10, 14]`` below as ``-12 [-14, -10]``.
     """
     sources = [results, *(results[name] for name in FURTHER)]
     values = list(_values([[source["rows"], source.get("comparisons", [])] for source in sources]))
     values += [(-value, -high, -low) for value, low, high in values]
+    return {
+        (*(float(f"{x:.{digits}f}") for x in value), digits)
+        for value in values
+        for digits in (0, 1, 2)
+    }
+
+
+def unsourced(text: str, figures: set[Figure]) -> list[str]:
+    """Figures with an interval in ``text`` that are none of :func:`sourced`."""
     wrong = []
     for match in _INTERVAL.finditer(text):
         digits = len(match[1].partition(".")[2])
-        printed = tuple(float(x) for x in match.groups())
-        if not any(tuple(float(f"{x:.{digits}f}") for x in value) == printed for value in values):
+        if (*map(float, match.groups()), digits) not in figures:
             wrong.append(match[0])
     return wrong
 
@@ -403,11 +412,12 @@ def differences(results: Results) -> list[str]:
             wrong.append(
                 f"{document}: the table {name} differs; run `python -m benchmarks.printed --write`."
             )
+    figures = sourced(results)
     for document, heading in CHECKED:
         text = section((ROOT / document).read_text(encoding="utf-8"), heading)
         wrong += [
             f"{document}, {heading}: {figure} is not in the results."
-            for figure in unsourced(text, results)
+            for figure in unsourced(text, figures)
         ]
     return wrong
 

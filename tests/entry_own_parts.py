@@ -30,8 +30,3 @@ class Stubborn(TensorDictModuleBase):
 
     def forward(self, tensordict):
         return tensordict.set("action", torch.zeros_like(tensordict["episode"]))
-
-
-def not_a_model(road):
-    """Something that is called like a traffic model but is none."""
-    return road

@@ -65,12 +65,7 @@ def test_options_come_as_names_mappings_configs_and_classes():
 
 def test_a_loaded_agent_drives_an_environment():
     agent = ganlane.load_agent("agent_idm")
-    env = ganlane.make_env(
-        "idm",
-        2,
-        observation=agent.observation,
-        goal_m=50.0,
-    )
+    env = ganlane.make_env("idm", 2, observation=agent.observation, goal_m=50.0)
     rollout = env.rollout(3, agent.policy)
     assert rollout["action"].shape == (2, 3)
     assert ganlane.load_agent("mobil").observation is None
@@ -193,11 +188,7 @@ def api(name, *arguments, **keys):
         (api("run", "trian"), "no such command (did you mean 'train'"),
     ],
 )
-def test_a_mistake_is_one_sentence_and_leaves_nothing(
-    call,
-    message,
-    tmp_path,
-):
+def test_a_mistake_is_one_sentence_and_leaves_nothing(call, message, tmp_path):
     with pytest.raises(UserError, match=re.escape(message)) as caught:
         call()
     assert "\n" not in str(caught.value)

@@ -31,12 +31,21 @@ def commands_of(page):
             yield command, shlex.split(rest)
 
 
+@pytest.fixture(scope="module")
+def one_drive():
+    """One drive shows whether a first scene can do without a crash.
+
+    It is remembered here alone, since a command drives more.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scenes, "DRIVES", 1)
+        patch.setattr(scenes, "_first_overlap", cache(scenes._first_overlap.__wrapped__))
+        yield
+
+
+@pytest.mark.usefixtures("one_drive")
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_command_of_a_page_is_accepted(page, monkeypatch):
-    # One drive shows whether the first scene can do without a crash. It is not remembered, since
-    # a command drives more.
-    monkeypatch.setattr(scenes, "DRIVES", 1)
-    monkeypatch.setattr(scenes, "_first_overlap", scenes._first_overlap.__wrapped__)
+def test_every_command_of_a_page_is_accepted(page):
     for command, words in commands_of(page):
         accept(command, *words)
 

@@ -17,7 +17,7 @@ from ganlane.evaluation.rows import FAILURES
 from ganlane.suite import cells
 
 main = partial(run_command, "benchmark")
-SHORT = ["suite.env.goal_m=60", "hydra.run.dir=out", "suite.scored={idm_mobil: 3, gan: 2}"]
+SHORT = ["suite.env.goal_m=60", "hydra.run.dir=out", "suite.scored={idm: 2}"]
 ALONE = [*SHORT, "suite.shown={}", "suite.baselines=[]"]
 ROOT = Path(__file__).resolve().parents[1]
 SCHEMA = json.loads((ROOT / "docs" / "results.schema.json").read_text())
@@ -43,9 +43,10 @@ def results():
 
 def test_one_command_leaves_a_table_results_and_a_page_with_films_of_failures(cells_driven, capsys):
     # Who drives at random leaves the road in the first seconds.
-    assert main([*ALONE, "agent_idm@all+none", "random", "films=2"]) == 0
+    scored = [*ALONE, "suite.scored={idm_mobil: 3, gan: 2}"]
+    assert main([*scored, "agent_idm@all+none", "random", "films=2"]) == 0
     out = capsys.readouterr().out
-    protocol = settings("benchmark", ALONE).protocol()
+    protocol = settings("benchmark", scored).protocol()
     assert f"shift-v1, protocol {protocol}" in out
     # agent_idm has five trainings
     assert len(cells_driven) == len(set(cells_driven)) == 2 * (3 + 5)
@@ -92,11 +93,7 @@ def test_what_was_driven_is_not_driven_again_and_gives_the_same_numbers(cells_dr
         told.append(results()["rows"])
     assert told[0] == told[1]
     drivers = ["random_legal", "mobil", "random"]
-    assert [driver for driver, traffic in cells_driven if traffic == "gan"] == [
-        *drivers,
-        "keep_lane",
-        *drivers,
-    ]
+    assert [driver for driver, _ in cells_driven] == [*drivers, "keep_lane", *drivers]
     for cell in Path("outputs/cells").glob("*.parquet"):
         cell.write_bytes(cell.read_bytes()[:-50])
     capsys.readouterr()
@@ -115,14 +112,14 @@ def test_a_plain_function_of_observations_is_an_agent(cells_driven):
     Path("mine.py").write_text("def drive(observation):\n    return [0] * len(observation)\n")
     for _ in range(2):
         assert main([*ALONE, "mine:drive", "keep_lane"]) == 0
-    rows = {(row["driver"], row["traffic"]): row["mean_reward"] for row in results()["rows"]}
-    assert rows["mine:drive", "gan"] == rows["keep_lane", "gan"]
+    rows = {row["driver"]: row["mean_reward"] for row in results()["rows"]}
+    assert rows["mine:drive"] == rows["keep_lane"]
     # Nobody knows whether the function is still the same.
-    assert cells_driven.count(("mine:drive", "gan")) == 2
-    assert cells_driven.count(("keep_lane", "gan")) == 1
+    assert cells_driven.count(("mine:drive", "idm")) == 2
+    assert cells_driven.count(("keep_lane", "idm")) == 1
 
 
-@pytest.mark.parametrize("returned", ["[0.0] * len(observation)", "0", "[0, 1, 2]"])
+@pytest.mark.parametrize("returned", ["[0.0] * len(observation)", "[0, 1, 2]"])
 def test_a_function_that_returns_something_else_is_refused_in_one_sentence(returned, capsys):
     module = f"wrong_{abs(hash(returned))}"
     Path(f"{module}.py").write_text(f"def drive(observation):\n    return {returned}\n")

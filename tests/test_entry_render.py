@@ -18,11 +18,10 @@ main = partial(run_command, "render")
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
-@pytest.mark.parametrize("agent", ["mobil", "random"])
-def test_an_episode_becomes_a_film(agent, capsys):
-    assert main([*SHORT, f"agent={agent}", "episode=2"]) == 0
+def test_an_episode_becomes_a_film(capsys):
+    assert main([*SHORT, "agent=random", "episode=2"]) == 0
     film = last_path(capsys.readouterr().out)
-    assert film.name == f"{agent}_idm_mobil_0_2.gif"
+    assert film.name == "random_idm_mobil_0_2.gif"
     with Image.open(film) as picture:
         assert picture.size == (640, 160)
         assert picture.n_frames > 3
@@ -65,17 +64,12 @@ def test_simulated_traffic_is_replayed_like_recorded_traffic(capsys):
     assert read_scenes("again.parquet")["vehicle"].n_unique() > 1
 
 
-@pytest.mark.parametrize(("asked", "file", "begins"), [
-    ("out=curves.png", "curves.png", b"\x89PNG"),
-    ("out=curves.pdf", "curves.pdf", b"%PDF"),
-    ("out=curves.svg", "curves.svg", b"<?xml"),
-])  # fmt: skip
-def test_curves_of_runs_come_in_the_format_that_is_asked_for(asked, file, begins, capsys, tmp_path):
+def test_curves_of_runs_come_in_the_format_that_is_asked_for(capsys, tmp_path):
     for name in ("first", "second"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "metrics.csv").write_text(
             "decisions,mean_return,crash_rate\n1,2,0.5\n10,3,0.2\n"
         )
-    assert main(["run=[first,second]", *asked.split()]) == 0
-    assert capsys.readouterr().out == f"curves: {file}\n"
-    assert (tmp_path / file).read_bytes().startswith(begins)
+    assert main(["run=[first,second]", "out=curves.svg"]) == 0
+    assert capsys.readouterr().out == "curves: curves.svg\n"
+    assert (tmp_path / "curves.svg").read_bytes().startswith(b"<?xml")

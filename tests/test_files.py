@@ -79,10 +79,7 @@ def test_a_full_disk_is_told_of_in_the_systems_words_and_leaves_the_old_file(
         atomic_path(path) as part,
     ):
         WRITERS[writer](part)
-    assert (caught.value.errno, caught.value.filename) == (
-        errno.EFBIG,
-        str(path),
-    )
+    assert (caught.value.errno, caught.value.filename) == (errno.EFBIG, str(path))
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -102,10 +99,7 @@ def test_an_error_about_something_else_is_passed_on_as_it_is(tmp_path):
         (ZeroDivisionError, lambda: 1 / 0),
         (FileNotFoundError, (tmp_path / "other").read_bytes),
     ):
-        with (
-            pytest.raises(error) as caught,
-            atomic_path(tmp_path / "a"),
-        ):
+        with pytest.raises(error) as caught, atomic_path(tmp_path / "a"):
             fail()
         assert getattr(caught.value, "filename", None) != str(tmp_path / "a")
     assert list(tmp_path.iterdir()) == []

@@ -198,14 +198,14 @@ def test_leaving_the_road_terminates_and_the_mask_says_so_beforehand():
 
 def returns_by_episode(mode, kernel):
     """Return of every finished episode by its number; all rows keep their lanes."""
-    envs = make_vec(3, kernel=kernel, autoreset_mode=mode, goal_m=60.0)
+    envs = make_vec(3, kernel=kernel, autoreset_mode=mode, goal_m=40.0)
     assert envs.metadata["autoreset_mode"] is mode
     _, info = envs.reset(seed=4)
     running = np.zeros(3)
     numbers = info["episode_number"]
     ended = np.zeros(3, bool)
     returns = {}
-    for _ in range(15):
+    for _ in range(10):
         before = ended
         _, reward, terminated, truncated, info = envs.step(np.zeros(3, int))
         if mode is AutoresetMode.NEXT_STEP:
@@ -296,10 +296,6 @@ def begun(env):
         (lambda: make().reset(options={"episodes": 3}), "episodes unknown; a reset takes episode"),
         (lambda: make().reset(options={"episode": -3}), "expected a whole number from 0"),
         (
-            lambda: make().reset(options={"episode": [1, 2]}),
-            "episode=.1, 2.: expected a whole number",
-        ),
-        (
             lambda: make_vec(2).reset(options={"episode": [[1, 2], [3]]}),
             "expected whole numbers from 0",
         ),
@@ -308,17 +304,11 @@ def begun(env):
             "expected one seed and one episode, or 2 of each",
         ),
         (
-            lambda: make_vec(2).reset(options={"reset_mask": [[True, True], [True]]}),
-            "expected a boolean array",
-        ),
-        (
             lambda: make_vec(2).reset(options={"reset_mask": np.array([1, 0])}),
             r"a boolean array of shape \(2,\)",
         ),
         (lambda: begun(make()).step(3), r"0 \(keep\), 1 \(left\) or 2 \(right\)"),
         (lambda: begun(make_vec(2)).step(np.zeros(3, int)), "expected 2 whole number"),
-        (lambda: begun(make()).step(["x", None]), r"expected \d whole number"),
-        (lambda: begun(make()).step(None), r"expected \d whole number"),
         (lambda: begun(make_vec(2)).step([[0, 1], [2]]), r"expected \d whole number"),
     ],
 )
@@ -344,10 +334,10 @@ def test_the_safe_mask_is_in_the_info_and_behind_maskable_ppos_method():
 
 
 @pytest.mark.parametrize(
-    "twin", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copied", "pickled"]
+    ("traffic", "twin"),
+    [("idm_mobil", copy.deepcopy), ("gan", lambda env: pickle.loads(pickle.dumps(env)))],
 )
-@pytest.mark.parametrize("traffic", ["idm_mobil", "gan"])
-def test_a_copy_goes_on_as_the_environment_does_and_leaves_it_alone(twin, traffic):
+def test_a_copy_goes_on_as_the_environment_does_and_leaves_it_alone(traffic, twin):
     env = make(traffic=traffic, mask="safe", goal_m=300.0)
     env.reset(seed=3)
     env.step(LEFT)

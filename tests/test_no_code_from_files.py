@@ -75,22 +75,18 @@ EVIL_TRAFFIC = {"_target_": "evil.Traffic"}
 STORED = {
     "a class of a module beside it": {"traffic": EVIL_TRAFFIC},
     "a class by its name": {"traffic": "evil.Traffic"},
-    "a function of it": {"traffic": {"_target_": "evil.make"}},
     "a shell": traffic_of("os.system", command="touch executed"),
-    "an argument beside it": {"traffic": {"_target_": "os.system", "command": "touch executed"}},
     "the first phase's": {"pretrain": {"total_decisions": 8, "traffic": EVIL_TRAFFIC}},
     "the evaluation's": {"evaluation": {"traffic": EVIL_TRAFFIC}},
     "a share": {"traffic": {"name": "mixed", "shares": {"evil.Traffic": 1, "idm": 1}}},
     "a share's option": {"traffic": {"name": "mixed", "options": {"gan": EVIL_TRAFFIC}}},
     "a policy": {"evaluation": {"agents": ["mobil", "random_legal", "evil.Policy"]}},
     "a function as policy": {"evaluation": {"agents": ["mobil", "evil:make"]}},
-    "a shell as policy": {"evaluation": {"agents": ["mobil", "os.system"]}},
     "a reference to a name": {
         "init": {"path": "evil.Traffic"},
         "traffic": {"_target_": "${init.path}"},
     },
     "an option elsewhere": {"traffic": "../../evil"},
-    "an option of the phase's elsewhere": {"pretrain": {"traffic": "../../evil"}},
     "another configuration": {"experiment": "../../evil"},
     "another list of defaults": {"defaults": ["../../evil"]},
     "another mask": {"mask": {"form": "../../evil"}},
@@ -102,16 +98,13 @@ STORED = {
 TEXTS = {
     "nothing": "",
     "a number": "3",
-    "a zero byte": "\x00",
     "a YAML tag": "!!python/object/apply:os.system ['touch executed']",
-    "a YAML tag at a key": "mask: !!python/object/apply:os.system ['touch executed']",
     "a YAML tag as a name": "traffic: {name: !!python/name:evil.make }",
     "a list": "- traffic=idm\n- traffic._target_=evil.Traffic\n",
     "aliases of aliases": "a: &a [x, x]\nb: &b [*a, *a]\nc: &c [*b, *b]\n",
     "an endless alias": "&a {traffic: *a}",
     "a mapping merged into another": "a: &a {_target_: evil.Traffic}\ntraffic: {<<: *a}\n",
     "endless brackets": "[" * 100_000,
-    "endless lists": "- " * 100_000,
     "too large a file": "# " + "x" * 2**20,
 }
 CONFIGS = TEXTS | {way: json.dumps(stored) for way, stored in STORED.items()}
@@ -136,11 +129,9 @@ def test_a_wrong_value_in_the_settings_of_a_run_is_named(capsys):
     "arguments",
     [
         ["train", "traffic=idm", "init.path=bomb/last.pt"],
-        ["train", "traffic=gan", "traffic.path=bomb/agent.safetensors"],
         ["evaluate", "agents=[bomb/agent.safetensors]"],
         ["evaluate", "agents=[bomb/last.pt]"],
         ["evaluate", "traffics={gan:{name:gan,path:bomb/agent.safetensors}}"],
-        ["render", "agent=bomb/agent.safetensors"],
         ["render", "run=bomb"],
         ["evaluate", "env=scene", "env.scene.path=bomb.json"],
         ["prepare", "data=scenes", "data.path=bomb.parquet"],
@@ -148,11 +139,7 @@ def test_a_wrong_value_in_the_settings_of_a_run_is_named(capsys):
     ],
     ids=str,
 )
-def test_a_pickle_in_the_place_of_another_file_is_refused(
-    arguments,
-    here,
-    capsys,
-):
+def test_a_pickle_in_the_place_of_another_file_is_refused(arguments, here, capsys):
     file = io.BytesIO()
     torch.save({"kind": "ganlane training checkpoint", "version": 2, "state": Bomb()}, file)
     (here / "bomb").mkdir()
@@ -207,15 +194,11 @@ COMMAND_LINES = [
     ["-m", "hydra.callbacks={x: {_target_: evil.make}}", "seed=0,1"],
     ["-m", "hydra/launcher=../../evil", "seed=0,1"],
     ["-m", "hydra.launcher._target_=evil.make", "seed=0,1"],
-    ["-m", "+hydra.launcher.x={y: [{_target_: evil.make}]}", "seed=0,1"],
     ["-m", "hydra.searchpath=['file://.']", "seed=0,1"],
     ["--cfg", "job", "+hydra.callbacks.x._target_=evil.make"],
-    ["--info", "config", "hydra.searchpath=['file://.']"],
     ["~hydra.callbacks"],
     ["--experimental-rerun", "evil.pickle"],
     ["--config-dir", "."],
-    ["--config-path", "."],
-    ["--config-name", "evil"],
     ["experiment=../../evil"],
     ["-m", "experiment=paper,../../evil"],
 ]
@@ -234,12 +217,12 @@ def test_hydra_imports_nothing_and_reads_no_other_configuration(
 @pytest.mark.parametrize(
     "override",
     [
-        *("hydra.run.dir=out", "hydra.sweep.dir=out", "hydra/launcher=joblib"),
-        *(
-            "hydra.launcher.n_jobs=2",
-            "hydra.sweeper.max_batch_size=4",
-            "+hydra.launcher.ray.init.num_cpus=2",
-        ),
+        "hydra.run.dir=out",
+        "hydra.sweep.dir=out",
+        "hydra/launcher=joblib",
+        "hydra.launcher.n_jobs=2",
+        "hydra.sweeper.max_batch_size=4",
+        "+hydra.launcher.ray.init.num_cpus=2",
     ],
 )
 def test_what_sweeps_need_of_hydra_can_be_given(override):
@@ -330,11 +313,7 @@ def test_a_resumed_run_takes_what_this_command_line_repeats(foreign_run):
         (["traffic.blind_share", "init.path", "resume"], "traffic._target_=evil.Traffic"),
     ],
 )
-def test_a_resumed_run_takes_no_more_than_that(
-    keys,
-    missing,
-    foreign_run,
-):
+def test_a_resumed_run_takes_no_more_than_that(keys, missing, foreign_run):
     with pytest.raises(UserError, match=r"the run's file names evil\.") as caught:
         refuse_stored_imports(foreign_run, keys)
     assert f"add {missing} to the command line" in str(caught.value)

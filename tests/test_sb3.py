@@ -239,11 +239,9 @@ def test_an_evaluation_prints_the_reward_of_the_users_own_loop(
     model = sharp(untrained(algorithm, env))
     expected = returns_in_the_own_loop(model, env)
     assert np.ptp(expected) > 1.0
-    driver = ganlane.sb3.driver(model)
-    # In as many rows as the loop has, and in another number of them.
-    for rows in (ROWS, 3):
-        printed = returns_in_the_evaluation(driver, num_envs=rows)
-        assert printed == pytest.approx(expected, abs=1e-3)
+    # In another number of rows than the loop has.
+    printed = returns_in_the_evaluation(ganlane.sb3.driver(model), num_envs=ROWS - 1)
+    assert printed == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_single_environment_of_gymnasium_says_what_the_model_reads():
@@ -294,12 +292,7 @@ def test_a_masked_model_that_could_turn_back_without_a_mask_is_refused():
     ],
     ids=["normalised", "masked", "dqn"],
 )
-def test_a_stored_driver_drives_as_before(
-    algorithm,
-    options,
-    wrap,
-    tmp_path,
-):
+def test_a_stored_driver_drives_as_before(algorithm, options, wrap, tmp_path):
     env = wrap(busy_highways(**options))
     driver = ganlane.sb3.driver(sharp(untrained(algorithm, env)))
     driver.save(tmp_path / "ppo")

@@ -106,10 +106,11 @@ def collect() -> tuple[dict[str, Any], dict[str, dict[str, Trace]]]:
         "traces": rows,
         "settled": _settled(),
         "stops": _stops(traces),
+        "steps": _steps(),
+        # At steps of a millisecond the final gap is the model's own.
+        "final_gap_at_1_ms_m": float(integrate(OBSTACLE, Scheme.BALLISTIC, dt=0.001).gap[-1, 0]),
     }
-    # At steps of a millisecond the final gap is the model's own.
-    final_gap_m = float(integrate(OBSTACLE, Scheme.BALLISTIC, dt=0.001).gap[-1, 0])
-    return {**figures, "steps": _steps(), "final_gap_at_1_ms_m": final_gap_m}, traces
+    return figures, traces
 
 
 def _settled() -> list[dict[str, Any]]:

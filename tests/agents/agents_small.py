@@ -7,12 +7,7 @@ from tensordict import TensorDict
 
 from ganlane.agents import Rainbow, RainbowConfig, save_agent
 
-SMALL = {
-    "hidden": (8, 8),
-    "batch_size": 8,
-    "warmup": 8,
-    "capacity": 100,
-}
+SMALL = {"hidden": (8, 8), "batch_size": 8, "warmup": 8, "capacity": 100}
 
 
 def agent(size=5, seed=0, **options):

@@ -103,10 +103,7 @@ def test_a_network_that_is_not_understood_is_refused(damage, saved):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            {"v_min": -10.0},
-            r"here: agent.v_min=-10\); set agent.v_min=-120,",
-        ),
+        ({"v_min": -10.0}, r"here: agent.v_min=-10\); set agent.v_min=-120,"),
         (
             {"hidden": (8,), "atoms": 51},
             r"atoms=51\); set agent.hidden=\[8,8\] agent.atoms=101, or start",
@@ -167,11 +164,6 @@ def test_weights_that_are_no_agents_are_refused(name, saved):
     kind, description = NO_AGENTS[name]
     described = load_weights(saved, "agent")[1]
     del described["kind"]
-    save_weights(
-        saved,
-        kind,
-        {"weight": torch.zeros(3)},
-        description(described),
-    )
+    save_weights(saved, kind, {"weight": torch.zeros(3)}, description(described))
     with pytest.raises(UserError, match=saved.name):
         load_agent(saved)

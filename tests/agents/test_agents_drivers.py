@@ -2,10 +2,7 @@
 
 import torch
 
-from ganlane.agents.drivers import (
-    RandomDriver,
-    RandomLegalDriver,
-)
+from ganlane.agents.drivers import RandomDriver, RandomLegalDriver
 from ganlane.env import HighwayEnv
 from ganlane.keys import KEEP, LEFT, RIGHT
 from ganlane.sim import Road

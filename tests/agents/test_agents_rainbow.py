@@ -146,13 +146,7 @@ def test_an_update_gives_the_drawn_items_their_new_priority_and_metrics_without_
     assert all(value.shape == () and not value.requires_grad for value in metrics.values())
 
 
-SWITCHES = [
-    "noisy",
-    "dueling",
-    "distributional",
-    "double",
-    "prioritised",
-]
+SWITCHES = ["noisy", "dueling", "distributional", "double", "prioritised"]
 
 
 def mean_loss(learner):
@@ -162,9 +156,7 @@ def mean_loss(learner):
 
 
 @pytest.mark.parametrize("off", [[name] for name in SWITCHES] + [SWITCHES])
-def test_each_component_can_be_switched_off_and_the_rest_learns(
-    off,
-):
+def test_each_component_can_be_switched_off_and_the_rest_learns(off):
     learner = filled(
         **dict.fromkeys(off, False),
         learning_rate=3e-3,

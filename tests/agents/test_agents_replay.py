@@ -3,16 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from scipy import (
-    stats,
-)  # scikit-learn, a dependency, brings it along
+from scipy import stats  # scikit-learn, a dependency, brings it along
 from tensordict import TensorDict
 
 from ganlane.agents import RainbowConfig
-from ganlane.agents.replay import (
-    draw,
-    make_replay,
-)
+from ganlane.agents.replay import draw, make_replay
 
 
 def transitions(rows, first=0):

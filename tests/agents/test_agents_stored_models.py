@@ -50,11 +50,7 @@ def store(state, algorithm="PPO", mask=None, **changes):
     return file
 
 
-def actions_of(
-    policy,
-    observation,
-    mask=None,
-):
+def actions_of(policy, observation, mask=None):
     rows = {keys.OBSERVATION: torch.tensor(observation)}
     if mask is not None:
         rows[keys.ACTION_MASK] = torch.tensor(mask)
@@ -143,11 +139,7 @@ def test_a_plain_network_is_stored_and_acts_as_before():
     save_network("mlp.zip", layers, Reading(mask=MaskParameters("safe")))
     driver = make_driver("mlp.zip", EnvConfig())
     assert driver.mask == MaskParameters("safe")
-    observation = torch.randn(
-        50,
-        SIZE,
-        generator=torch.Generator().manual_seed(0),
-    )
+    observation = torch.randn(50, SIZE, generator=torch.Generator().manual_seed(0))
     values = layers(observation)
     anything = [[True] * 3] * len(values)
     assert actions_of(driver.policy, observation.tolist(), anything) == values.argmax(-1).tolist()

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.figures import (
-    generator_blocks,
-)
+from benchmarks.figures import generator_blocks
 from ganlane.generator import load_generator, shipped_generator
 
 

@@ -35,8 +35,9 @@ def test_a_figure_with_an_interval_is_one_of_the_results_rounded_as_it_is_printe
     right = f"{row['minus_mobil']:.1f} [{low:.1f}, {high:.1f}]"
     turned_round = f"{-row['minus_mobil']:.1f} [{-high:.1f}, {-low:.1f}]"
     wrong = f"{row['minus_mobil']:.1f} [{low:.1f}, {high + 0.1:.1f}]"
-    assert printed.unsourced(f"It leads by {right}, or trails by {turned_round}.", results) == []
-    assert printed.unsourced(f"It leads by {wrong}.", results) == [wrong]
+    figures = printed.sourced(results)
+    assert printed.unsourced(f"It leads by {right}, or trails by {turned_round}.", figures) == []
+    assert printed.unsourced(f"It leads by {wrong}.", figures) == [wrong]
 
 
 def test_the_results_name_their_command_revision_seeds_and_machine(results):

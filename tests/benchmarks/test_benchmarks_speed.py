@@ -9,11 +9,7 @@ import pytest
 import ganlane
 from benchmarks.speed import __main__ as speed
 from benchmarks.speed import systems
-from benchmarks.speed.measure import (
-    Labels,
-    Sample,
-    make_row,
-)
+from benchmarks.speed.measure import Labels, Sample, make_row
 from benchmarks.speed.sumo import EGO, ROOM_M, OnRamp, start_on_ramp
 from benchmarks.speed.systems import Road
 from ganlane import keys

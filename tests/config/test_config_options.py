@@ -18,11 +18,7 @@ from ganlane.errors import UserError
 from ganlane.files import conf_folder
 from ganlane.generator import load_generator, shipped_generator
 from ganlane.settings.generator import CalibratedConfig, PaperConfig
-from ganlane.settings.observation import (
-    FORMS,
-    MASKS,
-    RewardParameters,
-)
+from ganlane.settings.observation import FORMS, MASKS, RewardParameters
 from ganlane.settings.record import make, option, option_names
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.transforms import OBSERVATIONS
@@ -142,8 +138,6 @@ def test_the_weights_that_ship_were_fitted_with_the_commands_defaults(config):
 
 @pytest.mark.parametrize("value", ["auto", "always", "never"])
 def test_a_training_is_told_whether_to_compile(value):
-    config = config_of("train", f"compile={value}")
-    assert config.compile == value
     short = config_of("train", "total_decisions=16", f"compile={value}")
     assert short.compiles() is (value == "always")
 
@@ -159,12 +153,6 @@ def test_a_long_training_is_compiled_where_that_is_known_to_work(
     assert config_of("train", "total_decisions=1000000").compiles() is compiles
 
 
-@pytest.mark.parametrize(
-    "shares", [{"idm": 1}, {"idm": 1, "gan_calibrated": 2}], ids=["fewer", "new"]
-)
-def test_shares_on_the_command_line_replace_those_of_an_experiment(shares):
-    listed = ", ".join(f"{name}: {share}" for name, share in shares.items())
-    assert (
-        config_of("train", "experiment=general", f"traffic.shares={{{listed}}}").traffic.shares
-        == shares
-    )
+def test_shares_on_the_command_line_replace_those_of_an_experiment():
+    words = ["experiment=general", "traffic.shares={idm: 1, gan_calibrated: 2}"]
+    assert config_of("train", *words).traffic.shares == {"idm": 1, "gan_calibrated": 2}

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ganlane.errors import ParameterError, UserError
@@ -93,6 +93,7 @@ def test_a_value_that_will_not_do_is_told_in_one_sentence(values, told):
     assert str(caught.value).startswith(told)
 
 
+@settings(max_examples=40)
 @given(
     st.dictionaries(
         st.sampled_from(["doors", "length_m", "paint", "wheels", "engine", "seats", "names"]),

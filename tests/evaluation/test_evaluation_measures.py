@@ -4,34 +4,22 @@ from __future__ import annotations
 
 import pytest
 import torch
+from reference.worlds import vehicles
 from tensordict import TensorDict
 
 from ganlane import keys
 from ganlane.evaluation.measures import CHANGE_S, CRASHES, crash_kinds, first_marks, marks_after
 from ganlane.sim import Road
-from ganlane.sim.state import Vehicles
 
 ROAD = Road(lanes=3, lane_width_m=4.0)
 
 
-def scene(*others, y=0.0, speed=20.0, target=0):
-    """The ego at x = 0 and others as (x, y, speed), all 4 m long and 2 m wide."""
-    rows = [(0.0, y, speed), *others]
-    columns = {name: torch.zeros(1, len(rows)) for name in keys.VEHICLE_FLOATS}
-    for name, column in zip(("x", "y", "speed"), zip(*rows)):
-        columns[name] = torch.tensor([column])
-    columns |= {
-        "length": torch.full((1, len(rows)), 4.0),
-        "width": torch.full((1, len(rows)), 2.0),
-    }
-    lanes = torch.round(columns["y"] / 4.0).long()
-    lanes[:, 0] = target
-    return Vehicles(
-        **columns,
-        target_lane=lanes,
-        visibility=torch.ones_like(lanes),
-        valid=torch.ones_like(lanes, dtype=torch.bool),
-    )
+def scene(*others, y=0.0, target=0):
+    """The ego at x = 0 and 20 m/s, and others as (x, y, speed), all 4 m long and 2 m wide."""
+    cars = [{"x": 0.0, "y": y, "speed": 20.0, "target_lane": target}]
+    for x, side, speed in others:
+        cars.append({"x": x, "y": side, "speed": speed, "target_lane": round(side / 4.0)})
+    return vehicles(*({"length": 4.0, "width": 2.0, **car} for car in cars), dtype=torch.float32)
 
 
 @pytest.mark.parametrize(

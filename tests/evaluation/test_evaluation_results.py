@@ -39,13 +39,7 @@ def test_numbers_and_their_origin_are_kept(tmp_path):
     )
     read = json.loads(path.read_text())
     assert path.name == "results.json"
-    assert read["rows"] == [
-        {
-            "mean_reward": 1.5,
-            "ci": [1.0, 2.0],
-            "score": None,
-        }
-    ]
+    assert read["rows"] == [{"mean_reward": 1.5, "ci": [1.0, 2.0], "score": None}]
     assert read["config"] == {
         "evaluate": {"agents": ["mobil"], "folder": str(Path("a/b"))},
         "weight": 2,

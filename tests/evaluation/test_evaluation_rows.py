@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 import polars as pl
 import pytest
+from reference.driven_episodes import driven
 from reference.refusals import user_error
 
 from ganlane.evaluation import (
@@ -23,64 +24,17 @@ from ganlane.evaluation.rows import verdict
 from ganlane.evaluation.statistics import mean_interval
 
 
-def episodes(
-    agent,
-    rewards,
-    reasons=None,
-    traffic="idm",
-    first=0,
-):
-    """Episodes of 5000 m in 200 s with two lane changes; three soft crashes in the first one."""
-    n = len(rewards)
-    return pl.DataFrame(
-        {
-            "agent": agent,
-            "traffic": traffic,
-            "seed": 7,
-            "episode": range(first, first + n),
-            "reason": reasons or ["goal"] * n,
-            "reward": list(map(float, rewards)),
-            "soft_crash": [3, *[0] * (n - 1)],
-            "had_soft_crash": [True, *[False] * (n - 1)],
-            "soft_crash_behind": 1,
-            "lane_changes": 2,
-            "duration_s": 200.0,
-            "distance_m": 5000.0,
-        }
-    )
-
-
 @pytest.fixture(scope="module")
 def rows():
-    ends = [
-        "goal",
-        "timeout",
-        "hard_crash",
-        "out_of_road",
-    ]
+    ends = ["goal", "timeout", "hard_crash", "out_of_road"]
+    # Three soft crashes in the first episode.
+    soft = {"soft_crash": [3, 0, 0, 0], "had_soft_crash": [True, False, False, False]}
     return evaluation_rows(
         pl.concat(
             [
-                episodes(
-                    "agent_idm",
-                    [
-                        20,
-                        24,
-                        -80,
-                        26,
-                    ],
-                    ends,
-                ),
-                episodes("mobil", [30, 32, 34, 36]),
-                episodes(
-                    "random_legal",
-                    [
-                        -10,
-                        -8,
-                        -6,
-                        -4,
-                    ],
-                ),
+                driven("agent_idm", [20, 24, -80, 26], ends, **soft),
+                driven("mobil", [30, 32, 34, 36]),
+                driven("random_legal", [-10, -8, -6, -4]),
             ]
         )
     )
@@ -109,7 +63,7 @@ def test_rates_relate_to_the_distance_of_all_episodes(rows):
     expected = {
         "distance_km": 20.0,
         "mean_speed_mps": 25.0,
-        "lane_changes_per_km": 8 / 20,
+        "lane_changes_per_km": 40 / 20,
         "crashes_per_1000_km": 50.0,
         "hard_crash_share": 0.25,
         "out_of_road_share": 0.25,
@@ -136,24 +90,15 @@ def test_the_form_of_the_score_fits_both_rows_of_the_papers_table():
 
 
 def test_a_scale_without_a_length_gives_no_score():
-    score, reason = normalized_percent(
-        [5, 6, 7, 8],
-        [
-            1,
-            -2,
-            3,
-            -1,
-        ],
-        [0] * 4,
-    )
+    score, reason = normalized_percent([5, 6, 7, 8], [1, -2, 3, -1], [0] * 4)
     assert score is None
     assert "includes 0" in reason
 
 
 def test_drivers_are_paired_by_episode_whatever_their_order():
-    mobil = episodes("mobil", [30, 32, 34, 36])
-    random_legal = episodes("random_legal", [0, 2, 4, 6])
-    agent = episodes("a", [15, 17, 19, 21])
+    mobil = driven("mobil", [30, 32, 34, 36])
+    random_legal = driven("random_legal", [0, 2, 4, 6])
+    agent = driven("a", [15, 17, 19, 21])
     for order in (agent, agent.reverse()):
         row, mobils, _ = evaluation_rows(pl.concat([order, mobil, random_legal.reverse()]))
         # The agent stands half-way in every single episode: no doubt is left.
@@ -165,8 +110,8 @@ def test_drivers_are_paired_by_episode_whatever_their_order():
 
 
 def test_without_the_drivers_of_the_scale_a_reason_replaces_the_score_and_nobody_leads_mobil():
-    driven = [episodes("a", [1, 2, 3], traffic=name) for name in ("idm", "gan")]
-    rows = evaluation_rows(pl.concat(driven))
+    tables = [driven("a", [1, 2, 3], traffic=name) for name in ("idm", "gan")]
+    rows = evaluation_rows(pl.concat(tables))
     assert [row["traffic"] for row in rows] == ["idm", "gan"]
     assert rows[0]["normalized_percent"] is rows[0]["minus_mobil"] is None
     assert "mobil is missing" in rows[0]["normalized_percent_reason"]
@@ -187,12 +132,12 @@ def test_resamples_without_a_lead_do_not_spoil_the_interval():
 
 
 def test_the_first_driver_is_held_against_every_other_on_every_traffic():
-    driven = [
-        episodes(agent, [base, base + 1.0] * 15, traffic=traffic)
+    tables = [
+        driven(agent, [base, base + 1.0] * 15, traffic=traffic)
         for traffic in ("idm", "gan")
         for agent, base in (("trained", 5.0), ("mobil", 7.0), ("keep_lane", 1.0))
     ]
-    rows = paired_rows(pl.concat(driven))
+    rows = paired_rows(pl.concat(tables))
     assert {(row["agent"], row["episodes"]) for row in rows} == {("trained", 30)}
     assert [(row["traffic"], row["over"], row["lead"], row["verdict"]) for row in rows] == [
         ("idm", "mobil", -2.0, "below"),
@@ -205,8 +150,8 @@ def test_the_first_driver_is_held_against_every_other_on_every_traffic():
 def verdict_of(differences, failed=0):
     """The verdict on ``differences`` over a driver of return 0; the first ``failed`` crashed."""
     reasons = ["hard_crash"] * failed + ["goal"] * (len(differences) - failed)
-    ours = episodes("a", differences, reasons)
-    (row,) = paired_rows(pl.concat([ours, episodes("b", [0.0] * len(differences))]))
+    ours = driven("a", differences, reasons)
+    (row,) = paired_rows(pl.concat([ours, driven("b", [0.0] * len(differences))]))
     return row["verdict"]
 
 
@@ -220,7 +165,7 @@ def test_a_verdict_does_not_hang_on_few_crashes():
     rest = [3.0, -3.0] * 60
     # Four crashes move the whole interval to one side, and are no evidence.
     (row,) = paired_rows(
-        pl.concat([episodes("a", [-240.0] * 4 + rest), episodes("b", [0.0] * (4 + len(rest)))])
+        pl.concat([driven("a", [-240.0] * 4 + rest), driven("b", [0.0] * (4 + len(rest)))])
     )
     assert row["lead_ci"][1] < 0.0
     assert verdict_of([-240.0] * 4 + rest, failed=4) == "undecided"
@@ -257,39 +202,16 @@ def test_equal_drivers_get_a_verdict_in_at_most_6_of_100_comparisons(count, cras
 
 
 def test_a_single_driver_and_a_single_episode_give_no_pairs():
-    assert paired_rows(episodes("a", [1, 2])) == []
-    assert paired_rows(pl.concat([episodes("a", [1]), episodes("b", [2])])) == []
+    assert paired_rows(driven("a", [1, 2])) == []
+    assert paired_rows(pl.concat([driven("a", [1]), driven("b", [2])])) == []
 
 
 def test_the_table_gives_the_sign_the_interval_and_the_verdict():
-    row = {
-        "agent": "trained",
-        "over": "mobil",
-        "traffic": "gan",
-        "episodes": 200,
-    }
-    above = {
-        **row,
-        "lead": 12.34,
-        "lead_ci": [4.51, 20.1],
-        "verdict": "above",
-    }
-    below = {
-        **row,
-        "lead": -3.0,
-        "lead_ci": [-5.0, -1.0],
-        "verdict": "below",
-    }
+    row = {"agent": "trained", "over": "mobil", "traffic": "gan", "episodes": 200}
+    above = {**row, "lead": 12.34, "lead_ci": [4.51, 20.1], "verdict": "above"}
+    below = {**row, "lead": -3.0, "lead_ci": [-5.0, -1.0], "verdict": "below"}
     heading, _, first, second = paired_table([above, below]).splitlines()
-    assert heading.split() == [
-        "paired",
-        "lead",
-        "traffic",
-        "reward",
-        "[95",
-        "%]",
-        "verdict",
-    ]
+    assert " ".join(heading.split()) == "paired lead traffic reward [95 %] verdict"
     assert first.split(maxsplit=4)[-1] == "+12.3 [4.5, 20.1]    above"
     assert second.split(maxsplit=4)[-1] == "-3.0 [-5.0, -1.0]    below"
     few = {**below, "episodes": 29, "verdict": "undecided"}
@@ -302,12 +224,8 @@ def by_scene(*scenes):
     for scene, count, crashes, metres in scenes:
         names += [scene] * count
         ends += [("hard_crash", metres)] * crashes + [("goal", metres)] * (count - crashes)
-    driven = pl.DataFrame(
-        ends,
-        schema=["reason", "distance_m"],
-        orient="row",
-    )
-    return crashes_by_scene(driven, names)
+    table = pl.DataFrame(ends, schema=["reason", "distance_m"], orient="row")
+    return crashes_by_scene(table, names)
 
 
 def test_the_rate_is_all_crashes_over_all_kilometres():
@@ -351,18 +269,13 @@ def test_one_scene_has_no_interval_and_one_without_distance_no_rate():
 
 def test_what_does_not_fit_together_is_refused():
     with user_error("2 scenes for 3 episodes"):
-        crashes_by_scene(episodes("a", [0, 0, 0]), ["a", "a"])
+        crashes_by_scene(driven("a", [0, 0, 0]), ["a", "a"])
     with user_error("nobody drove"):
         by_scene(("a", 3, 0, 0.0))
 
 
 def test_every_failure_is_listed_with_its_seed_and_episode():
-    table = episodes(
-        "mobil",
-        [0, 0, 0],
-        ["hard_crash", "goal", "out_of_road"],
-        "gan",
-    )
-    (row,) = failed_episodes(table)
+    ends = ["hard_crash", "goal", "out_of_road"]
+    (row,) = failed_episodes(driven("mobil", [0, 0, 0], ends, "gan"))
     assert (row["driver"], row["traffic"], row["seed"]) == ("mobil", "gan", 7)
     assert (row["hard_crash"], row["out_of_road"]) == ([0], [2])

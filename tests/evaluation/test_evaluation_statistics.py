@@ -28,11 +28,7 @@ def test_the_interval_is_scipys_bca_and_repeats_with_its_seed():
     skewed = np.where(generator.random(200) < 0.08, -20.0, 260.0) + generator.normal(0, 20, 200)
     ours = mean_interval(skewed)
     theirs = stats.bootstrap(
-        (skewed,),
-        np.mean,
-        n_resamples=10_000,
-        method="BCa",
-        random_state=5,
+        (skewed,), np.mean, n_resamples=10_000, method="BCa", random_state=5
     ).confidence_interval
     width = theirs.high - theirs.low
     assert ours.value == pytest.approx(skewed.mean())
@@ -57,15 +53,7 @@ def test_an_estimate_is_scaled_with_its_bounds_and_gives_a_rows_entries():
 
 
 @pytest.mark.parametrize(
-    ("count", "trials"),
-    [
-        (0, 1),
-        (0, 50),
-        (1, 1),
-        (3, 20),
-        (50, 50),
-        (700, 2000),
-    ],
+    ("count", "trials"), [(0, 1), (0, 50), (1, 1), (3, 20), (50, 50), (700, 2000)]
 )
 def test_the_binomial_interval_agrees_with_scipy(count, trials):
     theirs = stats.binomtest(count, trials).proportion_ci(0.95, "exact")
@@ -75,14 +63,7 @@ def test_the_binomial_interval_agrees_with_scipy(count, trials):
 # Several trainings of one recipe
 
 
-def scores(
-    trainings,
-    episodes,
-    between=0.0,
-    shared=0.0,
-    rest=0.0,
-    seed=0,
-):
+def scores(trainings, episodes, between=0.0, shared=0.0, rest=0.0, seed=0):
     """Scores [S, E] that vary between trainings, between episodes (shared), and otherwise."""
     generator = np.random.default_rng(seed)
     of_training = between * generator.normal(size=(trainings, 1))
@@ -95,21 +76,7 @@ def width(estimate):
 
 
 def test_the_interquartile_mean_is_that_of_the_middle_half():
-    assert (
-        interquartile_mean(
-            [
-                100.0,
-                2.0,
-                3.0,
-                4.0,
-                5.0,
-                6.0,
-                7.0,
-                -50.0,
-            ]
-        )
-        == 4.5
-    )
+    assert interquartile_mean([100.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, -50.0]) == 4.5
     assert interquartile_mean([9.0, 1.0, 2.0, 3.0, 100.0]) == pytest.approx((2 + 3 + 9) / 3)
     assert interquartile_mean([[1.0, 3.0], [5.0, 7.0]]) == pytest.approx([2.0, 6.0])
 
@@ -126,14 +93,7 @@ def test_one_training_has_the_interval_of_its_episodes_and_one_episode_that_of_i
 @pytest.mark.parametrize(("trainings", "between"), [(3, 0.0), (3, 20.0), (5, 2.0)])
 def test_an_interval_holds_the_truth_in_95_of_100_recipes(trainings, between):
     tables = [
-        scores(
-            trainings,
-            100,
-            between=between,
-            shared=10.0,
-            rest=10.0,
-            seed=seed,
-        )
+        scores(trainings, 100, between=between, shared=10.0, rest=10.0, seed=seed)
         for seed in range(200)
     ]
     held = [estimate.low <= 0.0 <= estimate.high for estimate in map(over_trainings, tables)]
@@ -142,12 +102,7 @@ def test_an_interval_holds_the_truth_in_95_of_100_recipes(trainings, between):
 
 
 def test_the_probability_of_improvement_is_the_share_of_pairs():
-    table = scores(
-        5,
-        50,
-        between=1.0,
-        rest=1.0,
-    )
+    table = scores(5, 50, between=1.0, rest=1.0)
     assert probability_of_improvement(table, table).value == 0.5
     assert probability_of_improvement(table + 100.0, table).interval == [1.0, 1.0]
     first, second = [[1.0], [3.0], [2.0]], [[2.0], [0.0]]

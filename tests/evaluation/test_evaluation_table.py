@@ -24,24 +24,9 @@ def test_a_table_aligns_words_left_and_numbers_right():
 def test_a_narrow_terminal_gets_fewer_columns_and_a_line_that_names_the_others():
     table = aligned(
         [
-            [
-                "agent",
-                "hard",
-                "m/s",
-                "last",
-            ],
-            [
-                "mobil",
-                "1",
-                "22.5",
-                "1234",
-            ],
-            [
-                "a_long_name",
-                "10",
-                "3.0",
-                "5",
-            ],
+            ["agent", "hard", "m/s", "last"],
+            ["mobil", "1", "22.5", "1234"],
+            ["a_long_name", "10", "3.0", "5"],
         ]
     )
     text = f"a title\n\n{table}\n\na note that is longer than what the terminal has room for"

@@ -119,18 +119,8 @@ def two(x_ego, ego=None, slow=None):
     """A fast driver in lane 0 at x = 0 behind a slow one, and an ego in lane 1 that is beside or
     behind it.
     """
-    first = {
-        "x": x_ego,
-        "lane": 1,
-        "desired_speed": 20.0,
-        **(ego or {}),
-    }
-    last = {
-        "x": 30.0,
-        "speed": 10.0,
-        "desired_speed": 10.0,
-        **(slow or {}),
-    }
+    first = {"x": x_ego, "lane": 1, "desired_speed": 20.0, **(ego or {})}
+    last = {"x": 30.0, "speed": 10.0, "desired_speed": 10.0, **(slow or {})}
     cars = ({"visibility": int(Visibility.BODY), **car} for car in (first, {"x": 0.0}, last))
     return scene_of(*cars, dtype=torch.float32)
 

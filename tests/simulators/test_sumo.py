@@ -10,13 +10,7 @@ pytest.importorskip(
     reason="SUMO is not installed: pip install 'ganlane[sumo]'",
 )
 
-from reference.foreign import (
-    assert_same_alone,
-    drive,
-    overlaps,
-    start,
-    turns,
-)
+from reference.foreign import assert_same_alone, drive, overlaps, start, turns
 
 from ganlane import keys
 from ganlane.agents.drivers import DRIVERS
@@ -70,10 +64,7 @@ def test_nobody_jumps_and_speeds_are_differences_of_positions(driven):
     assert dy[..., 1:].abs().max() < 0.11, "4 m in 4 s"
     acceleration = (vehicles.speed[1:] - vehicles.speed[:-1]) / 0.1
     torch.testing.assert_close(
-        vehicles.acceleration[1:, :, 1:],
-        acceleration[..., 1:],
-        rtol=0.0,
-        atol=1e-3,
+        vehicles.acceleration[1:, :, 1:], acceleration[..., 1:], rtol=0.0, atol=1e-3
     )
     assert vehicles.acceleration.amin() > -9.1
     assert vehicles.heading.abs().max() <= 0.2

@@ -5,46 +5,12 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 import pytest
+from reference.driven_episodes import KM, driven
 from reference.refusals import user_error
 from scipy import stats
 
 from ganlane.settings.suite import Suite
 from ganlane.suite.scores import by_recipe, comparisons, recipe_of, rows, summaries
-
-KM = 5.0
-
-
-def driven(
-    agent,
-    rewards,
-    reasons=None,
-    traffic="gan",
-    at_fault=None,
-    ttc_s=3.0,
-):
-    """Episodes of 5 km and 200 s with these rewards and ends."""
-    reasons = reasons or ["goal"] * len(rewards)
-    return pl.DataFrame(
-        {
-            "agent": agent,
-            "traffic": traffic,
-            "episode": range(len(rewards)),
-            "reason": reasons,
-            "reward": list(map(float, rewards)),
-            "distance_m": 1000.0 * KM,
-            "duration_s": 200.0,
-            "lane_changes": 10,
-            "had_soft_crash": False,
-            "soft_crash_behind": 1,
-            "at_fault": [at_fault if reason == "hard_crash" else None for reason in reasons],
-            "crash": ["cut_in" if reason == "hard_crash" else None for reason in reasons],
-            "least_ttc_s": ttc_s,
-            "least_headway_s": 1.0,
-            "rms_acceleration_mps2": 0.5,
-            "hardest_braking_mps2": -2.0,
-        },
-        schema_overrides={"at_fault": pl.Boolean, "crash": pl.String},
-    )
 
 
 @pytest.fixture(scope="module")
@@ -133,12 +99,7 @@ def test_trainings_are_matched_by_their_seed():
     theirs = [driven(f"agent_idm@{seed}", [0, 0], ends) for seed, ends in ((2, goal), (1, crash))]
     (row,) = comparisons(by_recipe(pl.concat([*ours, *theirs])), [("agent_gan", "agent_idm")])
     assert row["mcnemar"] == [
-        {
-            "driver": "agent_gan@1",
-            "only_first": 0,
-            "only_second": 0,
-            "p_value": 1.0,
-        }
+        {"driver": "agent_gan@1", "only_first": 0, "only_second": 0, "p_value": 1.0}
     ]
 
 
@@ -167,7 +128,7 @@ def test_the_score_is_the_interquartile_mean_over_traffics_and_the_worst_is_name
             driven("random_legal", [0, 0], traffic=traffic),
             driven("mobil", [100, 100], traffic=traffic),
             driven("mobil_egoistic", [105, 105], traffic=traffic),
-            driven("mine@0", [reward - 4, reward], traffic=traffic, ttc_s=1.0),
+            driven("mine@0", [reward - 4, reward], traffic=traffic, least_ttc_s=1.0),
             driven("mine@1", [reward, reward + 4], ["goal", "hard_crash"], traffic=traffic),
         ]
     cells = by_recipe(pl.concat(parts))

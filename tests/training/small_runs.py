@@ -20,7 +20,7 @@ OBSERVATION_SIZE = 29
 SMALL = {
     "hidden": (32, 32),
     "batch_size": 64,
-    "capacity": 500,
+    "capacity": 300,
     "warmup": 64,
     "decisions_per_update": 8,
     "atoms": 21,

@@ -36,11 +36,7 @@ DAMAGE = {
 }
 
 
-def with_damage(
-    state,
-    place,
-    value,
-):
+def with_damage(state, place, value):
     name, _, below = place.partition(".")
     name = int(name) if name.isdigit() else name
     changed = dict(enumerate(state)) if isinstance(state, list) else dict(state)
@@ -79,11 +75,7 @@ KIND = "ganlane training checkpoint"
     ],
     ids=("empty", "text", "number", "old version", "no state", "pickle"),
 )
-def test_what_is_no_state_of_a_run_is_refused(
-    content,
-    tmp_path,
-    monkeypatch,
-):
+def test_what_is_no_state_of_a_run_is_refused(content, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "last.pt"
     if isinstance(content, bytes):

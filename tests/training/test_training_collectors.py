@@ -1,42 +1,41 @@
 """Runs that are killed."""
 
-import subprocess
-import sys
+import os
+import signal
 import time
-from pathlib import Path
 
+import pytest
 from training.small_runs import agent, road, same, settings, train
 
-from ganlane.training.checkpoint import (
-    load_checkpoint,
-)
-
-KILLED = """
-import sys
-import torch
-torch.set_num_threads(1)
-sys.path[:0] = [{tests!r}]
-from training.small_runs import agent, road, settings, train
-import ganlane.training.checkpoint as checkpoint
-checkpoint.PATIENCE = 0.0
-train(road(8), agent(), settings(10**9, checkpoint_every_s=0.0), {folder!r})
-"""
+from ganlane.training import checkpoint
+from ganlane.training.checkpoint import LAST, load_checkpoint
 
 
+def train_until_killed(folder):
+    """A run without an end, which saves whenever it may, in a child; its process."""
+    child = os.fork()
+    if child == 0:
+        try:
+            checkpoint.PATIENCE = 0.0
+            train(road(8), agent(), settings(10**9, checkpoint_every_s=0.0), folder)
+        finally:
+            os._exit(1)
+    return child
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_run_killed_at_any_moment_is_resumed_to_the_same_weights(tmp_path):
     """Killed a tenth of a second after its first checkpoint; other moments are in tests/trial."""
     folder = tmp_path / "parts"
-    tests = Path(__file__).resolve().parent.parent
-    script = KILLED.format(tests=str(tests), folder=str(folder))
-    last = folder / "checkpoints" / "last.pt"
-    line = [sys.executable, "-c", script]
-    with subprocess.Popen(line, cwd=tests.parent) as process:
-        while not last.exists():
-            assert process.poll() is None
-            time.sleep(0.01)
-        time.sleep(0.11)
-        process.kill()
-    more = settings(int(load_checkpoint(last)["counters"]["decisions"]) + 400)
+    last = folder / LAST
+    child = train_until_killed(folder)
+    while not last.exists():
+        assert os.waitpid(child, os.WNOHANG) == (0, 0)
+        time.sleep(0.01)
+    time.sleep(0.11)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    more = settings(int(load_checkpoint(last)["counters"]["decisions"]) + 160)
     resumed = agent(seed=5)
     whole = agent()
     train(road(8), resumed, more, folder, resume=last)

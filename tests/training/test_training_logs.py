@@ -20,19 +20,11 @@ from ganlane.training.logs import (
 # --- CSV
 
 
-def test_a_resumed_log_forgets_the_rows_after_the_checkpoint(
-    tmp_path,
-):
+def test_a_resumed_log_forgets_the_rows_after_the_checkpoint(tmp_path):
     path = tmp_path / "metrics.csv"
     first = CsvLog(path, ["decisions", "loss"])
     for decisions in (100, 200, 300):
-        first.write(
-            {
-                "decisions": decisions,
-                "loss": 1.0 / 3.0,
-                "unknown": 5.0,
-            }
-        )
+        first.write({"decisions": decisions, "loss": 1.0 / 3.0, "unknown": 5.0})
     first.close()
     second = CsvLog(path, ["decisions", "loss"], decisions=200)
     second.write({"decisions": 260})
@@ -40,9 +32,7 @@ def test_a_resumed_log_forgets_the_rows_after_the_checkpoint(
     assert path.read_text() == "decisions,loss\n100,0.333333\n200,0.333333\n260,\n"
 
 
-def test_a_log_torn_at_any_byte_holds_its_whole_rows_and_no_other(
-    tmp_path,
-):
+def test_a_log_torn_at_any_byte_holds_its_whole_rows_and_no_other(tmp_path):
     path = tmp_path / "metrics.csv"
     log = CsvLog(path, ["loss", "decisions"])  # the last column is the one that can be cut unseen
     rows = [
@@ -64,10 +54,7 @@ def test_a_log_torn_at_any_byte_holds_its_whole_rows_and_no_other(
 def test_a_row_of_too_few_or_too_many_columns_is_left_out(tmp_path, torn):
     path = tmp_path / "metrics.csv"
     path.write_text(f"decisions,loss,sigma\n10,0.5,1\n{torn}\n40,0.5,\n")
-    assert [row["decisions"] for row in read_rows(path)] == [
-        "10",
-        "40",
-    ]
+    assert [row["decisions"] for row in read_rows(path)] == ["10", "40"]
 
 
 @pytest.mark.parametrize(
@@ -88,8 +75,7 @@ def test_a_log_that_is_none_is_refused_in_one_sentence(content, tmp_path):
     path = tmp_path / "metrics.csv"
     path.write_bytes(content)
     with pytest.raises(
-        UserError,
-        match=r"metrics\.csv: damaged \(.*\); repair it, or move it away",
+        UserError, match=r"metrics\.csv: damaged \(.*\); repair it, or move it away"
     ):
         CsvLog(path, ["decisions", "loss"])
     assert path.read_bytes() == content
@@ -124,13 +110,7 @@ def test_progress_on_a_terminal_is_a_bar_with_rate_time_left_return_and_crashes(
     stream.isatty = lambda: True
     progress = Progress(100_000, stream=stream)
     progress.advance(10_000)
-    progress.write(
-        {
-            "decisions": 10_000,
-            "mean_return": 3.0,
-            "crash_rate": 0.25,
-        }
-    )
+    progress.write({"decisions": 10_000, "mean_return": 3.0, "crash_rate": 0.25})
     progress.close()
     last = stream.getvalue().splitlines()[-1].rpartition("\r")[2]
     assert "10.0k/100k decisions" in last

@@ -20,13 +20,16 @@ from ganlane.agents import Rainbow, RainbowConfig, load_agent
 from ganlane.training import loop
 from ganlane.training.checkpoint import Checkpointer, TrainingState
 
+#: So long that the buffer is full for a while.
+WHOLE = settings(480, log_every=240)
+
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """The agent and the folder of a run in one piece."""
     folder = tmp_path_factory.mktemp("whole")
     learner = agent()
-    train(road(8), learner, settings(800), folder)
+    train(road(8), learner, WHOLE, folder)
     return learner, folder
 
 
@@ -47,10 +50,10 @@ def test_the_agent_learns_to_stay_on_the_road_and_the_global_random_state_is_lef
 def test_the_rows_of_the_metrics_hold_what_happened(whole):
     learner, folder = whole
     figures = rows(folder / "metrics.csv")
-    assert [row["decisions"] for row in figures] == ["400", "800"]
+    assert [row["decisions"] for row in figures] == ["240", "480"]
     last = {name: float(value) for name, value in figures[-1].items()}
     # The updates of the last 8 decisions are still due: they are made while the next are driven.
-    assert last["updates"] == learner.updates == (800 - 64 - 3 * 8 + 8) // 8
+    assert last["updates"] == learner.updates == (480 - 64 - 3 * 8 + 8) // 8
     assert sum(last[f"action_{i}_share"] for i in range(3)) == pytest.approx(1.0, abs=1e-4)
     assert last["goal_rate"] + last["out_of_road_rate"] == pytest.approx(1.0, abs=1e-4)
     assert last.keys() >= {"loss", "mean_q", "clamped_fraction", "sigma", "priority"}
@@ -64,20 +67,20 @@ def test_there_is_one_update_per_decisions_per_update_whatever_the_batch(environ
     assert abs(learner.updates - (480 - 96) // 16) <= 2
 
 
-@pytest.mark.parametrize("decisions", [40, 600])  # before the buffer is full, and after
+@pytest.mark.parametrize("decisions", [40, 400])  # before the buffer is full, and after
 def test_an_interrupted_and_resumed_run_gives_the_same_weights(
     decisions,
     whole,
     tmp_path,
     capsys,
 ):
-    first = train(road(8), agent(), settings(decisions), tmp_path)
+    first = train(road(8), agent(), settings(decisions, log_every=240), tmp_path)
     torch.manual_seed(99)
     resumed = agent(seed=5)
-    result = train(road(8), resumed, settings(800), tmp_path, resume=first.checkpoint)
+    result = train(road(8), resumed, WHOLE, tmp_path, resume=first.checkpoint)
     assert same(whole[0], resumed)
     assert "bit-exact" not in capsys.readouterr().err
-    assert result.progress["decisions"] == 800
+    assert result.progress["decisions"] == 480
     assert result.progress["updates"] == whole[0].updates
     columns = ("decisions", "loss", "mean_return", "out_of_road_rate")
     ours, theirs = (
@@ -115,12 +118,12 @@ def test_a_signal_ends_the_run_after_its_step_with_a_checkpoint(whole, tmp_path)
     number = signal.SIGTERM
     handler = signal.getsignal(number)
     with signal_at(160, number):
-        stopped = loop.train(road(8), agent(), settings(800), tmp_path)
+        stopped = loop.train(road(8), agent(), WHOLE, tmp_path)
     assert stopped.stopped_by == number
     assert stopped.progress["decisions"] == 160
     assert signal.getsignal(number) == handler
     resumed = agent()
-    train(road(8), resumed, settings(800), tmp_path, resume=stopped.checkpoint)
+    train(road(8), resumed, WHOLE, tmp_path, resume=stopped.checkpoint)
     assert same(whole[0], resumed)
 
 

@@ -21,10 +21,7 @@ from ganlane.files import conf_folder
 from ganlane.runtime import has_compiler
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MaskParameters
-from ganlane.training.checkpoint import (
-    LAST,
-    load_checkpoint,
-)
+from ganlane.training.checkpoint import LAST, load_checkpoint
 from ganlane.training.phases import (
     AGENT_FILE,
     check_observation,
@@ -51,12 +48,7 @@ def run(folder, *options, resume=None):
 
 def start(folder, path, *options, resume=None):
     """Config and agent of a run in ``folder`` that is to begin from the agent at ``path``."""
-    words = [
-        *WITHOUT_INIT,
-        "init=idm_ckpt",
-        f"init.path={path}",
-        *options,
-    ]
+    words = [*WITHOUT_INIT, "init=idm_ckpt", f"init.path={path}", *options]
     config = settings("train", words)
     return make_initial_agent(phases_of(config, folder)[0], resume is not None)
 
@@ -106,33 +98,16 @@ def test_a_run_whose_rate_has_fallen_is_prolonged_at_its_end(tmp_path):
     told = r"agent\.learning_rate_decisions=320: the saved agent has 160"
     with pytest.raises(UserError, match=told):
         run(folder, *more, resume=folder / LAST)
-    run(
-        folder,
-        *more,
-        "agent.learning_rate_decisions=160",
-        resume=folder / LAST,
-    )
+    run(folder, *more, "agent.learning_rate_decisions=160", resume=folder / LAST)
     state = load_checkpoint(folder / LAST)
     assert state["counters"]["decisions"] == 320
     assert state["agent"]["optimizer"]["param_groups"][0]["lr"] == 1e-5
 
 
-OTHER_SUPPORT = [
-    "agent.v_min=-50",
-    "agent.v_max=60",
-    "agent.atoms=21",
-]
-
-
-@pytest.mark.parametrize("place", ["", AGENT_FILE])
-def test_another_support_is_refused_with_the_options_to_set(
-    place,
-    trained,
-    tmp_path,
-):
+def test_another_support_is_refused_with_the_options_to_set(trained, tmp_path):
     told = r"set agent\.atoms=101 agent\.v_min=-120"
     with pytest.raises(UserError, match=told):
-        start(tmp_path, trained / place, *OTHER_SUPPORT)
+        start(tmp_path, trained, "agent.v_min=-50", "agent.v_max=60", "agent.atoms=21")
 
 
 def test_a_run_goes_on_without_what_it_started_from(tmp_path):
@@ -173,9 +148,7 @@ EXPERIMENTS = sorted(
 
 
 @pytest.mark.parametrize(
-    "overrides",
-    [[], *([f"experiment={name}"] for name in EXPERIMENTS)],
-    ids=str,
+    "overrides", [[], *([f"experiment={name}"] for name in EXPERIMENTS)], ids=str
 )
 def test_every_experiment_composes_and_fits_the_agent_that_it_starts_from(
     overrides,
@@ -194,16 +167,8 @@ def test_a_first_phase_that_is_over_must_be_the_one_asked_for(
     )
     phase = phases_of(config, tmp_path)[0]
     metadata = describe(phase)
-    metadata["training"] |= {
-        "decisions": 5120,
-        "updates": 3,
-        "wall_s": 1.0,
-    }
-    save_agent(
-        phase.folder / AGENT_FILE,
-        make_agent(phase),
-        metadata,
-    )
+    metadata["training"] |= {"decisions": 5120, "updates": 3, "wall_s": 1.0}
+    save_agent(phase.folder / AGENT_FILE, make_agent(phase), metadata)
     assert length_if_finished(phase)["decisions"] == 5120
     others = {
         "after 5120 decisions": {"total_decisions": 9000},
@@ -234,11 +199,7 @@ def test_a_falling_learning_rate_has_reached_its_end_when_its_phase_is_over(
 
 # --- masks
 
-MASKED = [
-    "traffic=idm_mobil",
-    "mask=safe",
-    "mask.safe_deceleration=3",
-]
+MASKED = ["traffic=idm_mobil", "mask=safe", "mask.safe_deceleration=3"]
 
 
 @pytest.fixture(scope="module")
@@ -246,18 +207,14 @@ def masked(tmp_path_factory):
     return run(tmp_path_factory.mktemp("masked"), *MASKED)
 
 
-def test_an_agent_drives_behind_the_mask_that_it_was_trained_with(
-    masked,
-):
+def test_an_agent_drives_behind_the_mask_that_it_was_trained_with(masked):
     driver = make_driver(str(masked / AGENT_FILE), EnvConfig())
     assert driver.mask == MaskParameters("safe", 3.0)
     assert make_driver(f"{masked / AGENT_FILE}+safe", EnvConfig()).mask == driver.mask
     assert make_driver(f"{masked / AGENT_FILE}+legal", EnvConfig()).mask == MaskParameters("legal")
 
 
-def test_the_mask_of_the_next_state_is_kept_with_every_transition(
-    masked,
-):
+def test_the_mask_of_the_next_state_is_kept_with_every_transition(masked):
     rows = load_checkpoint(masked / LAST)["agent"]["replay"]["rows"]
     mask = rows["next.action_mask"]
     assert mask.shape == (len(rows["action"]), 3)

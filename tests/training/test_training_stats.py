@@ -49,13 +49,7 @@ def test_what_an_environment_or_a_policy_does_not_write_has_no_column():
 def test_returns_to_go_and_values_are_averaged_over_the_decisions_of_finished_episodes():
     stats = EpisodeStats(2, 2, gamma=0.5)
     for reward, value in ((1.0, 2.0), (2.0, 4.0), (4.0, 6.0)):
-        stats.step(
-            step(
-                [reward, 9.0],
-                [reward == 4.0, False],
-                value=[value, 0.0],
-            )
-        )
+        stats.step(step([reward, 9.0], [reward == 4.0, False], value=[value, 0.0]))
     row = stats.read()
     # From the three decisions: 1 + 2/2 + 4/4, 2 + 4/2, 4.
     assert row["mean_return_to_go"] == pytest.approx((3.0 + 4.0 + 4.0) / 3.0)

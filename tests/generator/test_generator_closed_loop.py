@@ -50,7 +50,7 @@ def drive(generator, state, seconds, headway=1.27, noise=0.0):
 def test_without_a_residual_a_follower_settles_at_its_own_equilibrium_gap():
     state = vehicles([0.0, 36.0], speed=18.0, desired=18.0)
     state = state.with_(desired_speed=torch.tensor([[25.0, 18.0]]).double())
-    state, _ = drive(silent_generator(), state, 60)
+    state, _ = drive(silent_generator(), state, 25)
     gap = state.x[0, 1] - state.x[0, 0] - 4.5
     idm = IdmParameters(headway_s=1.27)
     assert gap.item() == pytest.approx(
@@ -82,7 +82,7 @@ def test_the_first_step_is_idm_and_the_lateral_law():
 def test_a_network_that_always_pushes_changes_the_speed_for_a_while_only():
     generator = silent_generator()
     generator.head.bias.copy_(torch.tensor([3.0, 0.0]))
-    state, memory = drive(generator, vehicles([0.0], speed=20.0, desired=20.0), 40)
+    state, memory = drive(generator, vehicles([0.0], speed=20.0, desired=20.0), 32)
     assert state.speed.item() == pytest.approx(20.0, abs=0.3)
     assert memory.mean[0, 0, 0].item() == pytest.approx(4 * math.tanh(0.75), abs=1e-4)
 

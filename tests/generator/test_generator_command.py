@@ -10,11 +10,10 @@ from pathlib import Path
 import polars as pl
 import pytest
 from reference.recordings import START_MS, ngsim_rows, portal_csv, raw_text, traffic
+from reference.refusals import refusal
 from reference.scene_csv import write_scene_csv
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-import ganlane.evaluation
-import ganlane.generator
 from ganlane.config.run import run_command
 from ganlane.generator.checkpoint import load_generator
 
@@ -29,19 +28,16 @@ FEW = [
 ]
 
 
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    """Runs in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
 @pytest.fixture
-def recordings(here):
+def recordings():
     """A scene CSV in the current folder."""
-    path = here / "recordings.csv"
-    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=5, seconds=4.0)), path)
-    return f"data.path={path}"
+    write_scene_csv(
+        synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=5, seconds=4.0)), "recordings.csv"
+    )
+    return "data.path=recordings.csv"
 
 
 def run(*arguments: str, folder: str = "fit") -> dict:
@@ -74,17 +70,7 @@ def test_folds_are_pooled_kept_and_not_fitted_again(recordings, capsys):
     assert metadata["data"]["validation"]
 
 
-def test_too_many_folds_are_refused_before_anything_is_fitted(recordings, capsys, monkeypatch):
-    fitted = []
-    monkeypatch.setattr(
-        ganlane.generator, "cross_validate", lambda *arguments: fitted.append(arguments)
-    )
-    assert main([recordings, "folds=9", *FEW]) == 2
-    assert "folds=9" in capsys.readouterr().err
-    assert not fitted
-
-
-def test_the_periods_of_an_ngsim_file_are_the_scenes_whether_raw_or_prepared(here):
+def test_the_periods_of_an_ngsim_file_are_the_scenes_whether_raw_or_prepared():
     scenes = traffic(scenes=3).partition_by("scene", maintain_order=True)
     rows = pl.concat(ngsim_rows(scene, START_MS + 900_000 * k) for k, scene in enumerate(scenes))
     Path("got.csv").write_text(portal_csv(rows))
@@ -113,15 +99,12 @@ def test_the_periods_of_an_ngsim_file_are_the_scenes_whether_raw_or_prepared(her
         (["data=ngsim", "data.path=cut.txt"], "cut.txt, line 200"),
         (["data.path=recordings.csv", "data.held_out=[moon]"], "moon"),
         (["data.path=recordings.csv", "folds=1"], "folds=1"),
+        (["data.path=recordings.csv", "folds=9"], "folds=9"),
         (["data.path=recordings.csv", "resume=gone"], "resume=gone"),
     ],
 )
-def test_a_mistake_is_one_sentence_and_leaves_nothing(arguments, part, here, recordings, capsys):
+def test_a_mistake_is_one_sentence_and_leaves_nothing(arguments, part, recordings, capsys):
     text = raw_text(ngsim_rows(traffic().filter(pl.col("scene") == "synthetic-0")))
-    (here / "one.txt").write_text(text)
-    (here / "cut.txt").write_text("\n".join(text.splitlines()[:200])[:-40])
-    assert main([*arguments, *FEW]) == 2
-    err = capsys.readouterr().err
-    assert part in err
-    assert err.count("\n") == 1
-    assert sorted(path.name for path in here.iterdir()) == ["cut.txt", "one.txt", "recordings.csv"]
+    Path("one.txt").write_text(text)
+    Path("cut.txt").write_text("\n".join(text.splitlines()[:200])[:-40])
+    assert part in refusal(capsys, "train_generator", *arguments, *FEW)

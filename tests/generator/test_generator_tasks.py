@@ -20,7 +20,7 @@ def scenes():
 
 
 def paper_task(scenes, **changes) -> tasks.PaperTask:
-    loop = LoopConfig(evaluate_every=10, learning_rate=5e-3, warmup=1, **changes)
+    loop = LoopConfig(evaluate_every=5, learning_rate=1e-2, warmup=1, **changes)
     fitted, validation = scenes
     return tasks.PaperTask(
         [fitted], [validation], replace(PAPER, loop=loop, stride=4, samples=3, batch=8)
@@ -29,14 +29,14 @@ def paper_task(scenes, **changes) -> tasks.PaperTask:
 
 def test_fitting_the_papers_preset_lowers_its_error(scenes):
     seen = []
-    tasks.improve(paper_task(scenes, updates=40), "fit", seen.append)
+    tasks.improve(paper_task(scenes, updates=25), "fit", seen.append)
     losses = [progress.losses["mean"] for progress in seen]
     assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
     assert set(seen[-1].losses) == {"variety", "single", "mean", "adversarial", "discriminator"}
 
 
 def test_a_fit_ends_with_the_weights_that_were_best_and_without_patience_soon(scenes):
-    task = paper_task(scenes, updates=40, patience=1)
+    task = paper_task(scenes, updates=20, patience=1)
     seen = []
     scores = iter([3.0, 2.0, 2.5, 1.0])
     weights = {}
@@ -46,9 +46,9 @@ def test_a_fit_ends_with_the_weights_that_were_best_and_without_patience_soon(sc
         return next(scores)
 
     task.evaluate = evaluate
-    assert task.fit("fit", seen.append) == 20
-    assert seen[-1].update == 30
-    assert torch.equal(task.generator.head.weight, weights[20])
+    assert task.fit("fit", seen.append) == 10
+    assert seen[-1].update == 15
+    assert torch.equal(task.generator.head.weight, weights[10])
 
 
 def test_the_calibrated_loss_falls(scenes):

@@ -6,11 +6,11 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from reference.refusals import user_error
 from reference.small_networks import recorded_scenes
+from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-from ganlane.data import SCHEMA
 from ganlane.data.dense import recordings_of
-from ganlane.errors import UserError
 from ganlane.generator.windows import (
     PRESENT,
     WINDOW_FRAMES,
@@ -21,36 +21,17 @@ from ganlane.generator.windows import (
 )
 
 
-def recording(seed: int = 0, scenes: int = 3, vehicles: int = 14) -> pl.DataFrame:
-    """Vehicles that come and go at random, some with a gap in their track."""
-    random = np.random.default_rng(seed)
-    rows = []
-    for scene in range(scenes):
-        for vehicle in range(vehicles):
-            first = random.integers(0, 12)
-            last = random.integers(20, 40)
-            gap = random.integers(0, 60)
-            lane = vehicle % 3
-            x = random.uniform(0, 200)
-            y = 3.5 * lane
-            for frame in range(100 + first, 100 + last):
-                if frame != 100 + gap:
-                    x = x + random.uniform(0.5, 2.0)
-                    y = y + random.normal(0, 0.05)
-                    rows.append(
-                        (
-                            f"scene-{scene}",
-                            1000 + vehicle,
-                            frame,
-                            x,
-                            y,
-                            12.0,
-                            lane,
-                            4.5 + vehicle % 3,
-                            2.0,
-                        )
-                    )
-    return pl.DataFrame(rows, schema=SCHEMA, orient="row")
+def recording() -> pl.DataFrame:
+    """Three scenes of vehicles that come and go at random, some with a gap in their track."""
+    frame = synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=14, seconds=4.0))
+    random = np.random.default_rng(0)
+    tracks = []
+    for _, track in frame.group_by("scene", "vehicle", maintain_order=True):
+        first, last, gap = random.integers([0, 20, 0], [12, 40, 60])
+        number = pl.col("frame")
+        tracks.append(track.filter(number.is_between(first, last) & (number != gap)))
+    # Numbers that are no indices.
+    return pl.concat(tracks).with_columns(pl.col("vehicle") + 999, pl.col("frame") + 100)
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +64,7 @@ def brute_force_windows(frame: pl.DataFrame, stride: int) -> dict[tuple[str, int
         course = [rows.get((scene, vehicle, first + step)) for step in range(WINDOW_FRAMES)]
         row = first - begins[scene]
         if None not in course and row % stride == 0:
-            windows[scene, row, vehicle] = np.array([place for place in course])
+            windows[scene, row, vehicle] = np.array(course)
     return windows
 
 
@@ -104,11 +85,11 @@ def test_windows_are_those_of_a_brute_force_search(stride):
 
 
 def test_recordings_without_a_needed_column_or_too_short_are_refused():
-    with pytest.raises(UserError, match="lane"):
+    with user_error("lane"):
         recordings_of(recording().drop("lane"))
-    with pytest.raises(UserError, match="without rows"):
+    with user_error("without rows"):
         recordings_of(recording().clear())
-    with pytest.raises(UserError, match="17 frames"):
+    with user_error("17 frames"):
         cut_windows(recordings_of(recording().filter(pl.col("frame") < 110)))
 
 

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ganlane.data import Tracks
 from ganlane.data.lanes import find_lane_changes, lane_width
 
 
+@settings(max_examples=30)
 @given(width=st.floats(3.0, 4.0), seed=st.integers(0, 10_000))
 def test_lane_keepers_tell_the_width_to_a_few_centimetres(width, seed):
     random = np.random.default_rng(seed)

@@ -13,10 +13,11 @@ from reference.refusals import user_error
 from ganlane.data import SCHEMA, read_recordings
 from ganlane.data.ngsim import ngsim_scenes
 from ganlane.data.schema import RowCount, validate
-from ganlane.errors import UserError
 from ganlane.settings.generator import NgsimParameters
 
 LATER_MS = START_MS + 900_000
+#: A file takes several.
+SMALL_BLOCKS = NgsimParameters(block_bytes=20_000)
 #: Two periods of one place: the same vehicle and frame numbers again.
 FIRST, SECOND = (scene for _, scene in traffic().group_by("scene", maintain_order=True))
 
@@ -109,13 +110,7 @@ def test_ramps_are_left_out_and_end_a_track(tmp_path):
     count = RowCount()
     (scene,) = ngsim_scenes(text_file(tmp_path, rows), count=count)
     assert dict(count.dropped) == {"ramp": 10}
-    frames = dict(
-        scene.frame.filter(pl.col("vehicle") % 10_000 == 2)
-        .group_by("vehicle")
-        .agg("frame")
-        .iter_rows()
-    )
-    assert sorted(frames) == [2, 10_002]
+    frames = dict(scene.frame.group_by("vehicle").agg("frame").iter_rows())
     assert frames[2] == list(range(20))
     assert frames[10_002] == list(range(30, 60))
 
@@ -136,7 +131,6 @@ def changed(folder, row: int, column: str, value: str):
         (400, "local_x", "NaN", r"line 402, column local_x: 'NaN' is not a finite number"),
         (7, "v_vel", "-3.0", r"line 9, column v_vel: -3.0 is below 0"),
         (8, "v_length", "0", r"line 10, column v_length: 0.0 is not above 0"),
-        (6, "local_y", '"1,2"', r"line 8, column local_y: '1,2' is not a number"),
         (6, "location", "us-10", r"line 8, column location: 'us-10' is no known place"),
         (
             9,
@@ -153,25 +147,21 @@ def changed(folder, row: int, column: str, value: str):
         ),
     ],
 )
-@pytest.mark.parametrize("block_bytes", [20_000, 2**25])
-def test_a_damaged_field_is_named_by_file_line_and_column(
-    tmp_path, row, column, value, message, block_bytes
-):
+def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column, value, message):
     path = changed(tmp_path, row, column, value)
-    with user_error(message) as caught:
-        read_recordings("ngsim", path, NgsimParameters(block_bytes=block_bytes))
-    assert str(path) in str(caught.value)
+    with user_error(f"{path}, {message}"):
+        read_recordings("ngsim", path, SMALL_BLOCKS)
 
 
 def test_a_truncated_file_is_refused_and_a_whole_one_read(tmp_path):
     rows = ngsim_rows(FIRST)
     # A missing line break at the end does no harm, missing fields do.
     whole = portal_csv(rows, thousands=False)
-    assert read_recordings("ngsim", portal_file(tmp_path, whole.rstrip("\n"))).height == 540
-    with user_error(r"line 541, column lane_id: the row has 14 fields, expected 19"):
-        read_recordings(
-            "ngsim", portal_file(tmp_path, ",".join(whole.rstrip("\n").split(",")[:-5]))
-        )
+    path = portal_file(tmp_path, whole.rstrip("\n"))
+    assert read_recordings("ngsim", path).height == 540
+    path.write_text(whole.rpartition(",2,")[0])
+    with user_error(r"line 541, column \w+: the row has .* fields, expected 19"):
+        read_recordings("ngsim", path)
     text = text_file(tmp_path, rows)
     text.write_bytes(text.read_bytes()[:-30])
     with user_error(r"line 540, column \w+: the row has .* fields, expected 18"):
@@ -187,18 +177,15 @@ def test_a_truncated_file_is_refused_and_a_whole_one_read(tmp_path):
             "column v_length: .*they look like metres",
         ),
         (("v_Vel",), 1.09728, "columns local_y and v_vel: vehicles cover 0.91 times"),
-        (("v_Vel",), 0.3048, "columns local_y and v_vel: vehicles cover 3.28 times"),
         (("v_Vel",), 0.681818, "columns local_y and v_vel: vehicles cover 1.47 times"),
-        (("Local_Y",), 0.3048, "vehicles cover 0.30 times"),
-        (("v_length",), 30.48, "they look like centimetres or inches"),
+        (("v_length",), 30.48, "column v_length: .*they look like centimetres or inches"),
     ],
 )
 def test_units_that_cannot_be_feet_and_seconds_are_refused(tmp_path, columns, factor, message):
     # All else stays in feet.
     rows = ngsim_rows(FIRST).with_columns(pl.col(name) * factor for name in columns)
-    with user_error(message) as caught:
+    with user_error(f"line 1, {message}"):
         read_recordings("ngsim", text_file(tmp_path, rows))
-    assert "line 1" in str(caught.value)
 
 
 def test_files_of_other_columns_or_places_are_refused(tmp_path):
@@ -213,6 +200,6 @@ def test_temporary_files_are_removed_after_an_error(tmp_path):
     scratch = tmp_path / "scratch"
     # The damage is late in the file, when blocks are on the disk.
     scratch.mkdir()
-    with pytest.raises(UserError):
-        list(ngsim_scenes(path, NgsimParameters(block_bytes=20_000), scratch=scratch))
+    with user_error("'far' is not a number"):
+        list(ngsim_scenes(path, SMALL_BLOCKS, scratch=scratch))
     assert list(scratch.iterdir()) == []

@@ -20,24 +20,20 @@ WITHOUT_CHANGES = [name for name in QUANTITIES if name != "lane_change_duration"
 def test_a_card_puts_the_model_between_its_ceiling_and_its_floors_driven_or_measured_before():
     recordings = recorded_cars(scenes=4, vehicles=10, seconds=8.0, speed_swing_mps=0.2)
     recorded = measure_recordings(recordings).counts
-    makers = {
-        "cruise": ConstantVelocity,
-        "random": RandomDriving,
-        "constant_velocity": ConstantVelocity,
-    }
-    driven = {name: simulate(make, recordings, StartOptions()) for name, make in makers.items()}
-    rows = quantity_rows(
-        "cruise", {**driven, "rival": driven["random"]}, recorded, {}, resamples=100
+    cruise, random = (
+        simulate(make, recordings, StartOptions()) for make in (ConstantVelocity, RandomDriving)
     )
+    driven = {"cruise": cruise, "random": random, "constant_velocity": cruise, "rival": random}
+    rows = quantity_rows("cruise", driven, recorded, {}, resamples=100)
     assert rows["speed"]["distance"] == rows["speed"]["constant_velocity"] < rows["speed"]["floor"]
     assert rows["acceleration"]["against"]["rival"]["verdict"] == "closer"
     assert rows["speed"]["against"].keys() == {"rival"}
     assert all(rows[name]["samples"] > 0 for name in WITHOUT_CHANGES)
     assert all(rows[name]["ceiling"] == ceiling(recorded[name]) for name in WITHOUT_CHANGES)
     # Without reference drivers in the run, what was measured before counts.
-    alone = {"cruise": driven["cruise"]}
     speeds = {"speed": recorded["speed"]}
-    rows = quantity_rows("cruise", alone, speeds, {"random": {"speed": 0.5}}, resamples=100)
+    floors = {"random": {"speed": 0.5}}
+    rows = quantity_rows("cruise", {"cruise": cruise}, speeds, floors, resamples=100)
     assert rows.keys() == {"speed"}
     assert rows["speed"]["floor"] == 0.5
     assert rows["speed"]["constant_velocity"] is None

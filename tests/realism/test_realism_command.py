@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from functools import partial
 from pathlib import Path
 
 import polars as pl
 import pytest
 from PIL import Image
 from reference.recordings import following_file
+from reference.refusals import everything_below, last_path, refusal
 from reference.scene_csv import write_scene_csv
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
@@ -17,39 +17,30 @@ from ganlane.config.run import run_command
 from ganlane.realism.measures import QUANTITIES
 from ganlane.realism.sheets import card_text
 
-main = partial(run_command, "realism")
-
 QUICK = ["quick=true", "vehicle_km=0.5", "long_s=10", "long_vehicles=[4]"]
 
 
 @pytest.fixture(autouse=True)
-def _in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
-    nothing = tmp_path / "nothing"
+def _without_recordings_of_this_machine(empty_folder, monkeypatch):
+    nothing = empty_folder / "nothing"
     nothing.mkdir()
-    # So that recordings of this machine have no effect.
     monkeypatch.setenv("GANLANE_DATA", str(nothing))
 
 
 @pytest.fixture
-def recordings(tmp_path):
-    path = tmp_path / "recordings" / "scenes.csv"
+def recordings(empty_folder):
+    path = empty_folder / "recordings" / "scenes.csv"
     path.parent.mkdir()
-    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=8, seconds=7.0)), path)
+    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=6, seconds=6.0)), path)
     return path
 
 
 def run(capsys, *arguments):
-    """Exit status, results.json (None without), stdout, stderr."""
-    status = main([*QUICK, *arguments])
+    """results.json with its folder, stdout, stderr."""
+    assert run_command("realism", [*QUICK, *arguments]) == 0
     out, err = capsys.readouterr()
-    last = (out.splitlines() or [""])[-1]
-    path = Path(last.removeprefix("results: ")) if last.startswith("results: ") else None
-    results = None
-    if path is not None:
-        results = {**json.loads(path.read_text()), "folder": path.parent}
-    return status, results, out, err
+    path = last_path(out)
+    return {**json.loads(path.read_text()), "folder": path.parent}, out, err
 
 
 def test_a_users_own_traffic_gets_a_card_of_every_quantity_and_one_of_i80_beside_the_scenes(
@@ -59,10 +50,9 @@ def test_a_users_own_traffic_gets_a_card_of_every_quantity_and_one_of_i80_beside
     following_file(recordings.parent / "i80_following.csv")
     mine = ["traffic=idm", "traffic._target_=entry_own_parts.Cruise", f"data.path={recordings}"]
     more = ["scenes=all", "i80=true", "long_against=true", "data.held_out=[synthetic-1]"]
-    status, results, out, _ = run(capsys, *mine, *more)
-    assert status == 0
+    results, out, _ = run(capsys, *mine, *more)
     assert results["traffic"] == "entry_own_parts.Cruise"
-    assert len(results["scenes"]) == 4
+    assert len(results["scenes"]) == 3
     assert results["quantities"].keys() == QUANTITIES.keys()
     # A row holds distance, interval, scale and rivals.
     row = results["quantities"]["speed"]
@@ -87,17 +77,10 @@ def test_a_users_own_traffic_gets_a_card_of_every_quantity_and_one_of_i80_beside
 
 @pytest.mark.slow
 def test_desired_speeds_are_fitted_on_the_scenes_that_are_not_held_out(recordings, capsys):
-    arguments = [
-        "quick=false",
-        "repeats=1",
-        "i80=false",
-        "vehicle_km=0",
-        "resamples=100",
-        "against=[]",
-    ]
-    held_out = "data.held_out=[synthetic-1]"
-    _, results, _, err = run(capsys, "traffic=idm", f"data.path={recordings}", held_out, *arguments)
-    assert "idm: fitting desired speeds on 3 scenes" in err
+    held_out = ["traffic=idm", f"data.path={recordings}", "data.held_out=[synthetic-1]"]
+    short = ["quick=false", "repeats=1", "i80=false", "vehicle_km=0", "resamples=100"]
+    results, _, err = run(capsys, *held_out, *short, "against=[]")
+    assert "idm: fitting desired speeds on 2 scenes" in err
     assert results["desired_above_mps"].keys() == {"idm"}
     assert results["scenes"] == ["synthetic-1"]
     assert results["long_runs"] == []
@@ -105,8 +88,7 @@ def test_desired_speeds_are_fitted_on_the_scenes_that_are_not_held_out(recording
 
 
 def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(capsys):
-    status, results, _, err = run(capsys, "traffic=idm_mobil", "against=[]")
-    assert status == 0
+    results, _, err = run(capsys, "traffic=idm_mobil", "against=[]")
     assert (results["starts"], results["i80"]) == ("spawned", {})
     assert "no recordings here" in err
     speed = results["quantities"]["speed"]
@@ -125,28 +107,26 @@ def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(capsy
         (["i80=true"], "i80=true"),
         (["scenes=some"], "held_out, all"),
         (["device=cuda"], "device=cuda"),
-        (["traffic.path=gone.safetensors", "traffic=gan"], "gone.safetensors"),
     ],
 )
-def test_mistakes_are_told_in_a_sentence_and_leave_nothing(
-    arguments, part, recordings, capsys, tmp_path
-):
-    # Nothing may be left behind, not even a run folder.
-    before = sorted(path.name for path in tmp_path.iterdir())
-    status, _, _, err = run(
-        capsys, "traffic=idm", f"data.path={recordings}", "vehicle_km=0", *arguments
-    )
-    assert status == 2
-    assert part in err
-    assert "Traceback" not in err
-    assert sorted(path.name for path in tmp_path.iterdir()) == before
+def test_mistakes_are_told_in_a_sentence_and_leave_nothing(arguments, part, recordings, capsys):
+    driven = ["traffic=idm", f"data.path={recordings}", "vehicle_km=0"]
+    assert part in refusal(capsys, "realism", *QUICK, *driven, *arguments)
+
+
+def test_weights_that_are_not_there_are_told_too_and_leave_nothing(recordings, capsys):
+    before = everything_below(Path.cwd())
+    gone = ["traffic=gan", "traffic.path=gone.safetensors", f"data.path={recordings}"]
+    assert run_command("realism", [*QUICK, *gone]) == 2
+    assert "realism: gone.safetensors: no such file" in capsys.readouterr().err
+    assert everything_below(Path.cwd()) == before
 
 
 def test_one_scene_is_refused_with_what_to_do_and_driven_whole_when_asked(recordings, capsys):
     pl.read_csv(recordings).filter(pl.col("scene") == "synthetic-1").write_csv(recordings)
-    status, _, _, err = run(capsys, "traffic=idm", f"data.path={recordings}")
-    assert status == 2
+    driven = ["traffic=idm", f"data.path={recordings}"]
+    sentence = refusal(capsys, "realism", *QUICK, *driven)
     for part in ("one scene, synthetic-1", "scenes=all", "scene_s=30"):
-        assert part in err
-    alone = ["scenes=all", "against=[]", "vehicle_km=0"]
-    assert run(capsys, "traffic=idm", f"data.path={recordings}", *alone)[0] == 0
+        assert part in sentence
+    results, _, _ = run(capsys, *driven, "scenes=all", "against=[]", "vehicle_km=0")
+    assert results["scenes"] == ["synthetic-1"]

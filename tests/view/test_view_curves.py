@@ -6,9 +6,9 @@ import numpy as np
 import polars as pl
 import pytest
 from matplotlib.colors import to_hex
+from reference.refusals import user_error
 from view_scenes import panels, run_folder, words
 
-from ganlane.errors import UserError
 from ganlane.view.curves import draw_runs, read_run, read_runs
 from ganlane.view.figures import COLOURS
 
@@ -51,7 +51,7 @@ def test_missing_values_are_left_out_and_runs_without_numbers_are_refused(runs):
     # the first three rows have no Q-value
     assert line.get_ydata()[0] == pytest.approx(0.3)
     assert len(line.get_xdata()) == 27
-    with pytest.raises(UserError, match="foreign: no numbers"):
+    with user_error("foreign: no numbers"):
         draw_runs({"foreign": [pl.DataFrame({"decisions": [1], "other": [2.0]})]})
 
 
@@ -60,7 +60,7 @@ def test_runs_are_called_by_the_shortest_ends_that_tell_them_apart(tmp_path):
     assert list(read_runs([one, two])) == list(read_runs([other, two])) == ["one", "two"]
     assert list(read_runs([one, other])) == ["x/one", "y/one"]
     assert list(read_runs([one / "metrics.csv"])) == ["one"]
-    with pytest.raises(UserError, match="twice"):
+    with user_error("twice"):
         read_runs([one, one])
 
 
@@ -117,5 +117,5 @@ def test_seeds_are_drawn_as_their_mean_in_a_band(tmp_path):
 def test_what_is_no_metrics_file_is_named(content, message, tmp_path):
     if content is not None:
         (tmp_path / "metrics.csv").write_bytes(content)
-    with pytest.raises(UserError, match=message):
+    with user_error(message):
         read_run(tmp_path)

@@ -9,9 +9,9 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
+from reference.refusals import user_error
 from view_scenes import straight
 
-from ganlane.errors import UserError
 from ganlane.settings.render import FilmConfig
 from ganlane.view import FramePainter, write_film
 from ganlane.view import film as film_module
@@ -44,9 +44,9 @@ def test_speedup_and_part_choose_frames_by_time_and_the_last_one_is_held():
 
 
 def test_films_of_nothing_and_unknown_formats_are_refused(episode, tmp_path):
-    with pytest.raises(UserError, match="start at 9 s: the episode lasts 4 s"):
+    with user_error("start at 9 s: the episode lasts 4 s"):
         write_film(episode, tmp_path / "a.gif", FilmConfig(start_s=9.0))
-    with pytest.raises(UserError, match="avi"):
+    with user_error("avi"):
         write_film(episode, tmp_path / "a.avi")
 
 
@@ -112,13 +112,13 @@ def test_half_an_mp4_on_a_full_disk_is_none(episode, empty):
 @needs_video
 def test_an_ffmpeg_that_refuses_is_quoted(episode, empty, monkeypatch):
     monkeypatch.setattr(film_module, "_H264", "-c:v no_such_codec -f mp4")
-    with pytest.raises(UserError, match=r"a\.mp4: ffmpeg cannot write it \(.*choose a gif"):
+    with user_error(r"a\.mp4: ffmpeg cannot write it \(.*choose a gif"):
         write_film(episode, empty / "a.mp4", SHORT)
 
 
 def test_without_the_extra_video_the_message_names_it(episode, empty, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(UserError, match=r"ganlane\[video\]"):
+    with user_error(r"ganlane\[video\]"):
         write_film(episode, empty / "a.mp4")
 
 

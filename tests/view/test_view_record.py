@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from reference.refusals import user_error
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from tensordict.nn import TensorDictModule
 from torchrl.envs import GymEnv
@@ -19,7 +20,6 @@ from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.data import read_scenes, sort
 from ganlane.data.schema import SCHEMA, TRACK_STRIDE
 from ganlane.env import EpisodeParameters, HighwayEnv
-from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
 from ganlane.settings.traffic import IdmMobilTrafficConfig
@@ -29,7 +29,7 @@ from ganlane.traffic.idm_mobil import IdmMobilTraffic
 from ganlane.view import EpisodeLabel, record_episode, to_tracks, write_tracks
 
 
-def highway(goal_m=150.0, rows=1, lanes=3, vehicles=5):
+def highway(goal_m=60.0, rows=1, lanes=3, vehicles=5):
     episode = EpisodeParameters(goal_m=goal_m)
     traffic = IdmMobilTraffic(Road(lanes=lanes))
     return HighwayEnv(traffic, rows, vehicles=vehicles, episode=episode)
@@ -45,7 +45,7 @@ def recorded(env, action=0, **options):
 
 @pytest.fixture(scope="module")
 def short():
-    return recorded(highway(goal_m=60.0))
+    return recorded(highway())
 
 
 def test_the_recording_has_a_frame_per_physics_step():
@@ -58,14 +58,11 @@ def test_the_recording_has_a_frame_per_physics_step():
     assert len(trajectory) == int(state["step"]) + 1
     assert trajectory.time_s[-1] == pytest.approx(0.1 * int(state["step"]))
     assert trajectory.x[-1] == pytest.approx(state["vehicles", "x"][0].double().numpy())
-    assert trajectory.x[-1, 0] >= 150.0 > trajectory.x[-2, 0]
+    assert trajectory.x[-1, 0] >= 60.0 > trajectory.x[-2, 0]
     assert trajectory.outcome == "goal"
     assert trajectory.action.tolist() == [-1] + [0] * (len(trajectory) - 1)
-    assert (trajectory.label.agent, trajectory.label.lanes, trajectory.label.lane_width_m) == (
-        "keep_lane",
-        3,
-        4.0,
-    )
+    label = trajectory.label
+    assert (label.agent, label.lanes, label.lane_width_m) == ("keep_lane", 3, 4.0)
 
 
 def test_the_label_has_the_road_of_the_replayed_scene():
@@ -78,14 +75,10 @@ def test_the_label_has_the_road_of_the_replayed_scene():
     )
     traffic = ReplayTraffic(recordings=sort(scenes), least_s=5.0)
     names = traffic.scenes_of_episodes(0, range(10))
+    env = HighwayEnv(traffic, 1, vehicles=5)
     for lanes in (2, 3, 4):
-        episode = names.index(f"{lanes} lanes")
-        assert (
-            recorded(
-                HighwayEnv(traffic, 1, vehicles=5), episode=episode, max_time_s=1.0
-            ).label.lanes
-            == lanes
-        )
+        trajectory = recorded(env, episode=names.index(f"{lanes} lanes"), max_time_s=1.0)
+        assert trajectory.label.lanes == lanes
 
 
 def test_a_command_off_the_road_ends_the_recording_at_once():
@@ -95,13 +88,13 @@ def test_a_command_off_the_road_ends_the_recording_at_once():
 
 
 def test_the_batch_makes_no_difference_and_the_hook_is_taken_out_again(short):
-    env = highway(goal_m=60.0, rows=3)
+    env = highway(rows=3)
     assert np.array_equal(recorded(env).x, short.x)
     assert env.recorder is None
 
 
 def test_an_environment_without_the_hook_cannot_be_recorded():
-    with pytest.raises(UserError, match="HighwayEnv"):
+    with user_error("HighwayEnv"):
         recorded(GymEnv("CartPole-v1"))
 
 
@@ -138,8 +131,8 @@ def test_an_agent_with_the_pedals_is_recorded_too():
 
 @pytest.fixture(scope="module")
 def episodes():
-    """Two episodes of a dozen seconds, in which MOBIL changes lanes."""
-    env = highway(goal_m=200.0, vehicles=9)
+    """Two episodes of a few seconds."""
+    env = highway()
     return [recorded(env, episode=number, agent="keep_lane") for number in (0, 1)]
 
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -121,12 +121,7 @@ def load_agent(
     """
     config = highways(stream=stream, **keys)
     # The random numbers of a driver come from the stream of the episodes that it drives.
-    return build.make_driver(
-        str(name),
-        config.env,
-        Stream.named(config.stream),
-        config.device,
-    )
+    return build.make_driver(str(name), config.env, Stream.named(config.stream), config.device)
 
 
 def evaluate(
@@ -173,11 +168,7 @@ def evaluate(
     with _torch_threads(config.threads):
         drivers = _drivers(
             agents,
-            lambda name: build.make_drivers(
-                [name],
-                config.env,
-                config.device,
-            ),
+            lambda name: build.make_drivers([name], config.env, config.device),
         )
         # Two of one name would share a row of the table.
         config = replace(config, agents=[driver.name for driver in drivers])
@@ -214,23 +205,21 @@ def benchmark(
         UserError: an unknown name, a wrong value, or a policy that does not fit.
     """
     config = call_settings("benchmark", {"suite": suite, "quick": quick, **keys})
-    home = new_folder("benchmark") if folder is None else _path(folder)
+    home = _home("benchmark", folder)
     with _torch_threads(), running(home, config):
         drivers = _drivers(policy, lambda name: drivers_of([name], config))
         run_suite(drivers, config, home)
-    return Run(home, json.loads((home / "results.json").read_text(encoding="utf-8")))
+    return _finished(home)
 
 
 def _drivers(policies: Any, load: Callable[[str], list[Driver]]) -> list[Driver]:
     """One policy, a list or a mapping of them as drivers; ``load`` gives those of a name."""
-    asked: list[tuple[str | None, Any]]
-    if isinstance(policies, Mapping):
-        asked = list(policies.items())
-    else:
-        listed = policies if isinstance(policies, list | tuple) else [policies]
-        asked = [(None, policy) for policy in listed]
+    if not isinstance(policies, Mapping | list | tuple):
+        policies = [policies]
+    names = list(policies) if isinstance(policies, Mapping) else [None] * len(policies)
+    listed = policies.values() if isinstance(policies, Mapping) else policies
     drivers: list[Driver] = []
-    for name, policy in asked:
+    for name, policy in zip(names, listed):
         if isinstance(policy, str | Path):
             several = load(str(policy))
         elif isinstance(policy, Driver):
@@ -295,12 +284,7 @@ def train(
             "the run was saved; go on with its folder and resume=True"
         ) from stop
     table = pl.DataFrame(finished.results["rows"], infer_schema_length=None)
-    return TrainingRun(
-        finished.folder,
-        finished.results,
-        Path(finished.results["agent"]),
-        table,
-    )
+    return TrainingRun(finished.folder, finished.results, Path(finished.results["agent"]), table)
 
 
 def render(
@@ -330,23 +314,15 @@ def render(
     """
     shown = {"agents": agent, "episodes": episode, "run": run}
     config = call_settings("render", {"traffic": traffic, "out": out, **shown, **keys})
-    with _torch_threads():
-        # With no file to write named, the run gets a folder with its settings, as the command does.
-        if out is None:
-            folder = new_folder("render")
-            with running(folder, config):
-                line = function_of("render")(config, folder)
-        else:
-            line = function_of("render")(config, Path(out).parent)
+    # With no file to write named, the run gets a folder with its settings, as the command does.
+    folder = new_folder("render") if out is None else Path(out).parent
+    with _torch_threads(), running(folder, config) if out is None else nullcontext():
+        line = function_of("render")(config, folder)
     # The line is 'film: PATH' or alike; a path may itself hold ': ', so only the first one counts.
     return Path(str(line).partition(": ")[2])
 
 
-def run(
-    command: str,
-    folder: str | Path | None = None,
-    **keys: Any,
-) -> Run:
+def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
     """Run any command that writes ``results.json``: ``record``, ``prepare``, ``realism`` ...
 
     ``run("prepare", data={"name": "ngsim", "path": "raw.txt"}, out="us101")`` is
@@ -368,7 +344,7 @@ def run(
             f"run({command!r}): no such command{hint}; choose one of {', '.join(names)}."
         )
     # Going on with a run means its own folder.
-    home = new_folder(command) if folder is None else _path(folder)
+    home = _home(command, folder)
     # Another run's checkpoint in a new folder would mix the results of two runs.
     if command == "train" and keys.get("resume") is not None:
         is_own = folder is not None and str(keys["resume"]) == str(folder)
@@ -380,16 +356,23 @@ def run(
     config = call_settings(command, keys)
     with _torch_threads(), running(home, config):
         function_of(command)(config, home)
+    return _finished(home)
+
+
+def _finished(home: Path) -> Run:
+    """The run in a folder."""
     # Commands write their results as a file; reading it back gives what a later reader would see.
     return Run(home, json.loads((home / "results.json").read_text(encoding="utf-8")))
 
 
-def _path(folder: str | Path) -> Path:
-    """The folder of a call.
+def _home(command: str, folder: str | Path | None) -> Path:
+    """The folder of a call; None: a new one.
 
     Raises:
         UserError: it is no path.
     """
+    if folder is None:
+        return new_folder(command)
     # Python refuses a zero byte only when the path is used
     if not isinstance(folder, str | Path) or "\0" in str(folder):
         raise UserError(f"folder={folder!r:.80}: expected a path, such as 'mine'.")

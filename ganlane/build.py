@@ -18,38 +18,21 @@ from torchrl.envs import Compose
 
 from ganlane import keys
 from ganlane.agents import load_agent
-from ganlane.agents.checkpoint import (
-    SHIPPED,
-    check_observation_size,
-    names_agent,
-    with_seeds,
-)
+from ganlane.agents.checkpoint import SHIPPED, check_observation_size, names_agent, with_seeds
 from ganlane.agents.drivers import DRIVERS, FunctionPolicy, MaskedPolicy
 from ganlane.agents.stored_models import SHIPPED_MODELS, load_model
-from ganlane.arguments import (
-    call_with,
-    import_target,
-    imported,
-    is_function_path,
-    is_import_path,
-)
+from ganlane.arguments import call_with, import_target, imported, is_function_path, is_import_path
 from ganlane.env import HighwayEnv, TransformedHighway
 from ganlane.errors import ParameterError, UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.settings.actions import ActionParameters
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.env import EnvConfig
-from ganlane.settings.observation import (
-    MASKS,
-    MaskParameters,
-    ObservationConfig,
-    RewardParameters,
-)
+from ganlane.settings.observation import MASKS, MaskParameters, ObservationConfig, RewardParameters
 from ganlane.settings.record import make
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.sim.dynamics import STEERING
 from ganlane.sim.random import Stream
-from ganlane.sim.state import Road
 from ganlane.traffic import BlindTraffic, TrafficModule
 from ganlane.transforms import (
     ActionMaskTransform,
@@ -58,12 +41,6 @@ from ganlane.transforms import (
     SensorTransform,
     observation_size,
 )
-
-
-def make_road(env: EnvConfig) -> Road:
-    """The road of an environment."""
-    flow = env.flow if env.flow.is_on else None
-    return Road(env.lanes, env.lane_width_m, stretches=env.stretches(), flow=flow)
 
 
 def make_highways(config: HighwayConfig) -> TransformedHighway:
@@ -92,7 +69,7 @@ def _constructor_arguments(env: EnvConfig, stream: int) -> dict[str, Any]:
     # Everything a constructor may ask for by the name of its argument; what it does not name
     # is left out by call_with().
     return {
-        "road": make_road(env),
+        "road": env.road(),
         "stream": stream,
         "idm": env.idm,
         "mobil": env.mobil,
@@ -117,12 +94,7 @@ def make_traffic(
     arguments, parts = traffic.arguments(), traffic.parts()
     if parts:
         arguments["parts"] = {name: make_traffic(part, env, stream) for name, part in parts.items()}
-    module = call_with(
-        target,
-        _constructor_arguments(env, stream),
-        arguments,
-        key,
-    )
+    module = call_with(target, _constructor_arguments(env, stream), arguments, key)
     if not isinstance(module, TrafficModule):  # an annotation may be wrong
         raise UserError(
             f"{key}={traffic._target_}: returned a {type(module).__name__}, expected a "
@@ -196,11 +168,7 @@ def make_env(
         raise error.below("observation.sensors") from error
     return TransformedHighway(
         base,
-        Compose(
-            *errors,
-            *transforms,
-            RewardTransform(env.decision_period_s, reward),
-        ),
+        Compose(*errors, *transforms, RewardTransform(env.decision_period_s, reward)),
     )
 
 
@@ -261,24 +229,14 @@ def make_driver(
     # A name such as agent_idm+safe: the agent, behind another mask than its own.
     unmasked, plus, form = name.rpartition("+")
     if plus and form in MASKS:
-        driver = make_driver(
-            unmasked,
-            env,
-            stream,
-            device,
-        )
+        driver = make_driver(unmasked, env, stream, device)
         mask = driver.mask
         # the agent's own bounds stay where its form is asked for
         if mask is None or mask.form != form:
             mask = MaskParameters(form)
         return replace(driver, name=name, mask=mask)
     if name in DRIVERS:
-        policy = call_with(
-            DRIVERS[name],
-            _constructor_arguments(env, stream),
-            {},
-            "agents",
-        )
+        policy = call_with(DRIVERS[name], _constructor_arguments(env, stream), {}, "agents")
         return Driver(name, policy.to(device), actions=ActionParameters())
     if names_agent(name):
         # Only the metadata tell which observation the agent needs.
@@ -287,36 +245,19 @@ def make_driver(
         actions = actions_of(metadata)
         size = observation_size(observation.form, env.vehicles, actions)
         check_observation_size(name, network.network.config, size)
-        return Driver(
-            name,
-            network,
-            observation,
-            mask_of(metadata),
-            actions,
-        )
+        return Driver(name, network, observation, mask_of(metadata), actions)
     # a model of stable-baselines3, by its weights
     stored = CHECKPOINTS / f"{name}.zip" if name in SHIPPED_MODELS else Path(name)
     if stored.suffix == ".zip":
         model, reading = load_model(stored, device)
-        return Driver(
-            name,
-            model,
-            reading.observation,
-            reading.mask,
-            reading.actions,
-        )
+        return Driver(name, model, reading.observation, reading.mask, reading.actions)
     # a plain function of observations
     if is_function_path(name):
         return Driver(name, FunctionPolicy(imported(name, "agents")))
     # a user's own policy; it reads the raw state or the observation of the command
     if is_import_path(name):
         target = import_target(name, "agents", TensorDictModuleBase)
-        policy = call_with(
-            target,
-            _constructor_arguments(env, stream),
-            {},
-            "agents",
-        )
+        policy = call_with(target, _constructor_arguments(env, stream), {}, "agents")
         if not isinstance(policy, TensorDictModuleBase) or keys.ACTION not in getattr(
             policy, "out_keys", []
         ):

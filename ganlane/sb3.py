@@ -126,11 +126,7 @@ class HighwayVecEnv(VecEnv):
         self._length[done] = 0
         return observation, reward.astype(np.float32), done, infos
 
-    def _final_info(
-        self,
-        row: int,
-        info: dict[str, Any],
-    ) -> dict[str, Any]:
+    def _final_info(self, row: int, info: dict[str, Any]) -> dict[str, Any]:
         """What an ended row reports: gymnasium's info but for the terms of the reward."""
         # Whatever is nested, the terms of the reward, is left out.
         final = {}
@@ -155,20 +151,11 @@ class HighwayVecEnv(VecEnv):
         """Which actions are allowed now, bool [N, A]."""
         return self.highways.action_masks()
 
-    def get_attr(
-        self,
-        attr_name: str,
-        indices: Indices = None,
-    ) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
         """An attribute of the batch, once per row."""
         return [getattr(self.highways, attr_name) for _ in self._get_indices(indices)]
 
-    def set_attr(
-        self,
-        attr_name: str,
-        value: Any,
-        indices: Indices = None,
-    ) -> None:
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
         """Refused: the rows are one batch and have no attributes of their own.
 
         Raises:
@@ -196,11 +183,7 @@ class HighwayVecEnv(VecEnv):
         results = getattr(self.highways, method_name)(*args, **kwargs)
         return [results[row] for row in self._get_indices(indices)]
 
-    def env_is_wrapped(
-        self,
-        wrapper_class: type[Any],
-        indices: Indices = None,
-    ) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Indices = None) -> list[bool]:
         """True only for ``Monitor``, whose episode statistics are in the infos."""
         # evaluate_policy() of stable-baselines3 asks for it, and warns where Monitor is missing.
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]
@@ -314,11 +297,7 @@ class ModelPolicy(TensorDictModuleBase):
             # [layers, N, size]; another environment may have another N.
             if self._memory is not None and self._memory[0].shape[1] == len(observation):
                 more["state"] = self._memory
-        chosen, self._memory = self.model.predict(
-            observation,
-            deterministic=True,
-            **more,
-        )
+        chosen, self._memory = self.model.predict(observation, deterministic=True, **more)
         # Whole numbers of several types; floats are controls as they are.
         action = torch.as_tensor(chosen, device=tensordict.device)
         numbered = isinstance(self.model.action_space, gymnasium.spaces.Discrete)
@@ -354,13 +333,7 @@ class ModelDriver(Driver):
                 normaliser.clip_obs,
             )
         network = _network(self.policy.model)
-        reading = Reading(
-            self.observation,
-            self.mask,
-            normaliser,
-            network,
-            self.actions,
-        )
+        reading = Reading(self.observation, self.mask, normaliser, network, self.actions)
         write_description(file, reading)
 
 
@@ -396,13 +369,7 @@ def driver(
         actions = reading.actions
     policy = ModelPolicy(model, normaliser)
     name = name or type(model).__name__.lower()
-    return ModelDriver(
-        name,
-        policy,
-        observation,
-        mask,
-        actions,
-    )
+    return ModelDriver(name, policy, observation, mask, actions)
 
 
 def _of_environment(model: BaseAlgorithm) -> _Read:

@@ -24,7 +24,7 @@ def test_usage_lists_every_command(capsys):
 def test_cfg_shows_the_config_and_leaves_nothing_behind(name, empty_folder, capsys):
     assert main([name, "--cfg", "job"]) == 0
     shown = capsys.readouterr()
-    assert make(COMMANDS[name][0], yaml.safe_load(shown.out)) == settings(name, [])
+    assert make(COMMANDS[name], yaml.safe_load(shown.out)) == settings(name, [])
     assert shown.err == ""
     assert list(empty_folder.iterdir()) == []
 

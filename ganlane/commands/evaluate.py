@@ -25,17 +25,8 @@ def evaluate(config: EvaluateConfig, folder: Path) -> str:
     """
     set_threads(config.threads)
     table = compare(make_drivers(config.agents, config.env, config.device), config)
-    seeds = {
-        "stream": config.stream,
-        "seed": config.seed,
-        "episodes": [0, config.episodes - 1],
-    }
-    return publish(
-        table,
-        folder,
-        asdict(config),
-        seeds,
-    )
+    seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
+    return publish(table, folder, asdict(config), seeds)
 
 
 def recorded_crashes(table: pl.DataFrame) -> list[dict[str, Any]]:
@@ -52,12 +43,7 @@ def recorded_crashes(table: pl.DataFrame) -> list[dict[str, Any]]:
     recorded = table.filter(pl.col("scene").is_not_null())
     for (agent, traffic), episodes in recorded.group_by("agent", "traffic", maintain_order=True):
         per_km, scenes = evaluation.crashes_by_scene(episodes, episodes["scene"].to_list())
-        row = {
-            "agent": agent,
-            "traffic": traffic,
-            **entries("per_km", per_km),
-            "scenes": scenes,
-        }
+        row = {"agent": agent, "traffic": traffic, **entries("per_km", per_km), "scenes": scenes}
         rows.append(row)
     return rows
 

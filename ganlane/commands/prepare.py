@@ -56,10 +56,7 @@ def short_report(prepared: PooledStatistics) -> str:
         f"driving: {exposure.scenes} scenes, {exposure.cars} cars, {exposure.tracks} tracks, "
         f"{exposure.vehicle_km:.1f} vehicle-km"
     )
-    lines += [
-        *_lane_change_lines(prepared),
-        *_acceleration_lines(prepared),
-    ]
+    lines += [*_lane_change_lines(prepared), *_acceleration_lines(prepared)]
     return "\n".join(lines)
 
 
@@ -94,10 +91,7 @@ def _lane_change_lines(prepared: PooledStatistics) -> list[str]:
 def _acceleration_lines(prepared: PooledStatistics) -> list[str]:
     parts = []
     # Raw ones are mostly noise of the measurement; both are shown, so that this shows.
-    for name, title in (
-        ("raw", "as recorded"),
-        ("smoothed", "over 1 s"),
-    ):
+    for name, title in (("raw", "as recorded"), ("smoothed", "over 1 s")):
         share = prepared.strong_share(f"acceleration_{name}")
         if share is not None:
             parts.append(f"{100.0 * share:.1f} % {title}")

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from ganlane.build import make_road, make_traffic
+from ganlane.build import make_traffic
 from ganlane.data.dense import units_of
 from ganlane.data.one_lane import ONE_LANE_FILES, one_lane_files, read_one_lane
 from ganlane.data.recordings import read_scenes
@@ -17,24 +17,11 @@ from ganlane.data.sources import data_folder, default_scenes
 from ganlane.errors import UserError
 from ganlane.evaluation import write_results
 from ganlane.evaluation.table import show
-from ganlane.generator import (
-    HELD_OUT,
-    Preset,
-    shipped_generator,
-)
-from ganlane.realism.card import (
-    card_numbers,
-    quantity_rows,
-)
+from ganlane.generator import HELD_OUT, Preset, shipped_generator
+from ganlane.realism.card import card_numbers, quantity_rows
 from ganlane.realism.driving import Factory, StartOptions
-from ganlane.realism.long_runs import (
-    LongRunParameters,
-    long_run,
-)
-from ganlane.realism.measures import (
-    measure,
-    measure_recordings,
-)
+from ganlane.realism.long_runs import LongRunParameters, long_run
+from ganlane.realism.measures import measure, measure_recordings
 from ganlane.realism.sheets import card_text, draw
 from ganlane.realism.starts import (
     Starts,
@@ -60,11 +47,7 @@ PRESETS: Final[Mapping[str, Preset | Literal["human"]]] = {
     "gan_calibrated": "calibrated",
 }
 #: Quantities that one lane shows.
-ONE_LANE_QUANTITIES: Final = (
-    "speed",
-    "acceleration",
-    "time_headway",
-)
+ONE_LANE_QUANTITIES: Final = ("speed", "acceleration", "time_headway")
 
 
 def realism(config: RealismConfig, folder: Path) -> str:
@@ -82,28 +65,14 @@ def realism(config: RealismConfig, folder: Path) -> str:
     files = files_wanted(config, path)
     starts = drive_from_starts(config, factories, path)
     # Empty without files of one lane; the card then leaves these rows out.
-    site = {
-        name: one_lane_rows(
-            config,
-            factories,
-            starts,
-            name,
-            files[name],
-        )
-        for name in files
-    }
+    site = {name: one_lane_rows(config, factories, starts, name, files[name]) for name in files}
     # Long runs of the rivals take as long again, so they are made on request.
     runs = {}
     for name, make in factories.items():
         if name == config.traffic.label() or config.long_against:
             runs[name] = long_runs(config, name, make)
     # Measured and compared here; drawing and printing only show it.
-    numbers = card_numbers(
-        starts,
-        site,
-        runs,
-        config.resamples,
-    )
+    numbers = card_numbers(starts, site, runs, config.resamples)
     draw(numbers, starts, folder)
     show(*card_text(numbers), columns=config.columns)
     seeds = {"stream": "report", "seed": config.seed}
@@ -127,19 +96,11 @@ def traffic_factories(config: RealismConfig) -> dict[str, Factory]:
     return {name: partial(_make, traffic, config.env) for name, traffic in traffics.items()}
 
 
-def _make(
-    traffic: TrafficConfig,
-    env: EnvConfig,
-    road: Road,
-) -> TrafficModule:
+def _make(traffic: TrafficConfig, env: EnvConfig, road: Road) -> TrafficModule:
     """The traffic on a road."""
     # A copy that is not checked again: a recorded road need not fit Table II's vehicles.
     env = copy(env)
-    assign(
-        env,
-        lanes=int(road.lanes),
-        lane_width_m=float(road.lane_width_m),
-    )
+    assign(env, lanes=int(road.lanes), lane_width_m=float(road.lane_width_m))
     # The stream of reported figures, never the one that recipes are chosen on.
     return make_traffic(traffic, env, Stream.REPORT)
 
@@ -170,19 +131,13 @@ def _fits(config: RealismConfig, scenes: Sequence[str]) -> bool:
     # Desired speeds that are fitted need scenes of their own, too.
     if config.data.held_out is not None or config.desired_above_mps is None:
         return True
-    used = {
-        **config.rivals(),
-        config.traffic.label(): config.traffic,
-    }
+    used = {**config.rivals(), config.traffic.label(): config.traffic}
     for name in PRESETS.keys() & used.keys():
         # The file of weights tells what it was fitted to.
         path = getattr(used[name], "path", None) or shipped_generator(PRESETS[name])
         data = load_weights(path, "generator")[1].get("data", {})
         # Scenes that chose the weights (early stopping) count as seen, like those of the fit.
-        if set(scenes) & {
-            *data.get("fitted", ()),
-            *data.get("validation", ()),
-        }:
+        if set(scenes) & {*data.get("fitted", ()), *data.get("validation", ())}:
             return True
     return False
 
@@ -195,23 +150,14 @@ def drive_from_starts(
     """Drive every traffic from recorded scenes, or from spawned ones where there are none."""
     if path is None:
         spawn = config.env.spawn_parameters()
-        return spawned_starts(
-            factories,
-            make_road(config.env),
-            spawn,
-            config.repeats,
-            config.seed,
-        )
+        return spawned_starts(factories, config.env.road(), spawn, config.repeats, config.seed)
     # Recorded starts: every vehicle begins where and as fast as it was recorded.
     frame = read_scenes(path)
     chosen = starts_and_held_out(config, sorted(frame["scene"].unique().to_list()))
     # Desired speeds are fitted unless the user gives them.
     options = StartOptions(repeats=config.repeats, seed=config.seed)
     if config.desired_above_mps is not None:
-        options = replace(
-            options,
-            desired_above_mps=config.desired_above_mps,
-        )
+        options = replace(options, desired_above_mps=config.desired_above_mps)
     return recorded_starts(
         factories,
         *chosen,
@@ -247,12 +193,7 @@ def one_lane_rows(
     # Once each: the site has many more segments than scenes.
     recordings = read_one_lane(name, path)
     options = StartOptions(seed=config.seed)
-    frames = drive_all(
-        factories,
-        recordings,
-        options,
-        starts.desired_above_mps,
-    )
+    frames = drive_all(factories, recordings, options, starts.desired_above_mps)
     units = units_of(recordings)
     recorded = measure_recordings(recordings).counts
     return quantity_rows(
@@ -264,11 +205,7 @@ def one_lane_rows(
     )
 
 
-def long_runs(
-    config: RealismConfig,
-    name: str,
-    make: Factory,
-) -> list[dict[str, Any]]:
+def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str, Any]]:
     """One long run of a traffic per number of vehicles."""
     runs: list[dict[str, Any]] = []
     if config.vehicle_km <= 0:
@@ -287,12 +224,5 @@ def long_runs(
         def report(km: float, what: str = what) -> None:
             print_progress(f"{what}: {km:.0f} of {config.vehicle_km:g} vehicle-km")
 
-        runs.append(
-            long_run(
-                make,
-                make_road(config.env),
-                parameters,
-                report,
-            )
-        )
+        runs.append(long_run(make, config.env.road(), parameters, report))
     return runs

@@ -50,12 +50,7 @@ def record(config: RecordConfig, folder: Path) -> str:
     """Drive the episodes and write them; the line that names the dataset."""
     set_threads(config.threads)
     # The stream decides which episodes are driven; a random driver draws from it, too.
-    driver = make_driver(
-        config.driver,
-        config.env,
-        Stream.named(config.stream),
-        config.device,
-    )
+    driver = make_driver(config.driver, config.env, Stream.named(config.stream), config.device)
     mask, policy = driver.behind(config.mask)
     driven = replace(
         config,
@@ -93,35 +88,19 @@ def record(config: RecordConfig, folder: Path) -> str:
         )
         facts = _write(storage, _episodes(rows, policy, config), config.episodes)
     seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
-    write_results(
-        folder,
-        {"dataset": name, "root": str(root), **facts},
-        plain(config),
-        seeds,
-    )
+    write_results(folder, {"dataset": name, "root": str(root), **facts}, plain(config), seeds)
     print(", ".join(f"{key.replace('_', ' ')} {value}" for key, value in facts.items()))
     return f"dataset: minari.load_dataset({name!r}) with MINARI_DATASETS_PATH={root}"
 
 
-def _episodes(
-    rows: TensorRows,
-    policy: Any,
-    config: RecordConfig,
-) -> Iterator[EpisodeBuffer]:
+def _episodes(rows: TensorRows, policy: Any, config: RecordConfig) -> Iterator[EpisodeBuffer]:
     """The episodes as they end; row i of N drives i, i + N, i + 2N, ..."""
     buffers: dict[int, Any] = {}
 
     def begin(chosen: Iterable[int]) -> None:
         for row in chosen:
             number = int(rows.now().get(EPISODE)[row])
-            buffers[row] = EpisodeBuffer(
-                number,
-                config.seed,
-                {"episode": number},
-                [],
-                [],
-                infos={},
-            )
+            buffers[row] = EpisodeBuffer(number, config.seed, {"episode": number}, [], [], infos={})
         observe(chosen)
 
     def observe(chosen: Iterable[int]) -> None:
@@ -164,11 +143,7 @@ def _append(lists: dict[str, Any], values: dict[str, Any]) -> None:
             lists.setdefault(name, []).append(value)
 
 
-def _write(
-    storage: Any,
-    episodes: Iterator[EpisodeBuffer],
-    count: int,
-) -> dict[str, Any]:
+def _write(storage: Any, episodes: Iterator[EpisodeBuffer], count: int) -> dict[str, Any]:
     """Write the episodes in the order of their numbers, as Minari wants; what they were like."""
     waiting: dict[int | None, EpisodeBuffer] = {}
     written, decisions, total, ends = 0, 0, 0.0, Counter[str]()

@@ -14,12 +14,7 @@ from ganlane.settings.train import TrainConfig
 from ganlane.suite.driving import compare
 from ganlane.torch_settings import set_threads
 from ganlane.training.checkpoint import LAST
-from ganlane.training.phases import (
-    AGENT_FILE,
-    length_if_finished,
-    phases_of,
-    run_phase,
-)
+from ganlane.training.phases import AGENT_FILE, length_if_finished, phases_of, run_phase
 
 #: Name of the agent of this run in the table.
 TRAINED = "trained"
@@ -49,10 +44,7 @@ def train(config: TrainConfig, folder: Path) -> str:
         resume = last if config.resume is not None and last.is_file() else None
         result = run_phase(phase, resume)
         if result.stopped_by is not None:
-            print(
-                f"saved; go on with: ganlane train resume={folder}",
-                file=sys.stderr,
-            )
+            print(f"saved; go on with: ganlane train resume={folder}", file=sys.stderr)
             # the exit status says by which signal
             raise Stopped(result.stopped_by)
         lengths[phase.name] = result.progress
@@ -65,15 +57,5 @@ def train(config: TrainConfig, folder: Path) -> str:
         "stream": "report",
         "episodes": [0, config.evaluation.episodes - 1],
     }
-    numbers = {
-        **lengths["train"],
-        "phases": lengths,
-        "agent": agent,
-    }
-    return publish(
-        table,
-        folder,
-        asdict(config),
-        seeds,
-        numbers,
-    )
+    numbers = {**lengths["train"], "phases": lengths, "agent": agent}
+    return publish(table, folder, asdict(config), seeds, numbers)

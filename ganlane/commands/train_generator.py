@@ -12,11 +12,7 @@ from typing import Any
 from tqdm import tqdm
 
 from ganlane import generator
-from ganlane.data import (
-    byte_progress,
-    read_recordings,
-    recordings_path,
-)
+from ganlane.data import byte_progress, read_recordings, recordings_path
 from ganlane.data.dense import Recording, recordings_of
 from ganlane.data.one_lane import one_lane_files, read_one_lane
 from ganlane.evaluation import code_version, write_results
@@ -36,12 +32,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     set_threads(config.threads)
     source = recordings_path(config.data)
     with byte_progress("read") as read:
-        frame = read_recordings(
-            config.data.format,
-            source,
-            config.data.parameters(),
-            read,
-        )
+        frame = read_recordings(config.data.format, source, config.data.parameters(), read)
     # The seed of the command is that of the fit.
     fit_config: Any = replace(config.generator, seed=config.seed)
     scenes = recordings_of(frame)
@@ -62,10 +53,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
             further["folds"] = generator.cross_validate(
                 fit_config, frame, config.folds, states, progress, following
             )
-            show(
-                fold_tables(further["folds"]),
-                columns=config.columns,
-            )
+            show(fold_tables(further["folds"]), columns=config.columns)
         # The generator that is saved is fitted to everything but the held-out scenes.
         result = generator.fit_generator(
             fit_config,

@@ -34,10 +34,7 @@ _HELP = "run the command with --help to see all keys"
 HYDRA_KEYS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir")
 _HYDRA_PLUGIN = re.compile(r"hydra(/|\.)(launcher|sweeper)\b")
 #: Keys that a command calls by another name, because ``agent=`` would choose an option of a group.
-ALIASES = {
-    "render": {"agent": "agents", "episode": "episodes"},
-    "record": {"agent": "driver"},
-}
+ALIASES = {"render": {"agent": "agents", "episode": "episodes"}, "record": {"agent": "driver"}}
 
 
 #: The key of a command whose values words without = are.
@@ -186,13 +183,7 @@ def resumed(saved: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str
     for override in overrides:
         key = key_of(override)
         if not key.startswith("hydra"):
-            OmegaConf.update(
-                config,
-                key,
-                OmegaConf.select(now, key),
-                merge=False,
-                force_add=True,
-            )
+            OmegaConf.update(config, key, OmegaConf.select(now, key), merge=False, force_add=True)
     return OmegaConf.to_container(config)  # type: ignore[return-value]
 
 

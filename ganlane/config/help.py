@@ -8,7 +8,6 @@ import re
 import textwrap
 from collections.abc import Iterator
 from dataclasses import is_dataclass
-from functools import cache
 
 from ganlane.config.compose import composed
 from ganlane.errors import as_typed
@@ -96,22 +95,13 @@ def meaning(kind: type, name: str) -> str:
     return ""
 
 
-@cache
 def _attributes(kind: type) -> dict[str, str]:
     """First sentences of the section ``Attributes`` of a class's docstring, by field."""
     _, _, section = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")
     # Google's docstring style: a name, a colon, lines that are indented further.
-    items = re.findall(
-        r"^    (\w+): (.*(?:\n {8}.*)*)",
-        section,
-        flags=re.MULTILINE,
-    )
+    items = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", section, flags=re.MULTILINE)
     meanings = {}
     for name, text in items:
-        joined = re.sub(
-            r":\w+:`~?(?:[\w.]+\.)?(\w+)`",
-            r"\1",
-            " ".join(text.split()),
-        )
+        joined = re.sub(r":\w+:`~?(?:[\w.]+\.)?(\w+)`", r"\1", " ".join(text.split()))
         meanings[name] = re.split(r"\.(?= [A-Z])", joined)[0].rstrip(".").replace("``", "")
     return meanings

@@ -14,7 +14,7 @@ import shutil
 import signal
 import socket
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -47,11 +47,7 @@ from ganlane.runtime import (
     register_envs,
     status_of,
 )
-from ganlane.settings.commands import (
-    EvaluateConfig,
-    RecordConfig,
-    with_env_keys,
-)
+from ganlane.settings.commands import EvaluateConfig, RecordConfig, with_env_keys
 from ganlane.settings.record import Record, make, merged, plain, saved_config
 from ganlane.settings.recordings import PrepareConfig, RealismConfig, TrainGeneratorConfig
 from ganlane.settings.render import RenderConfig
@@ -63,21 +59,18 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-#: A command's settings, and the module with the function of its name, which takes settings and run
-#: folder and returns the line that names its results. It is imported once the settings are
-#: checked, since importing torch takes seconds.
-COMMANDS: dict[str, tuple[type[Record], str]] = {
-    "train": (TrainConfig, "ganlane.commands.train"),
-    "evaluate": (EvaluateConfig, "ganlane.commands.evaluate"),
-    "benchmark": (BenchmarkConfig, "ganlane.commands.benchmark"),
-    "render": (RenderConfig, "ganlane.commands.render"),
-    "record": (RecordConfig, "ganlane.commands.record"),
-    "prepare": (PrepareConfig, "ganlane.commands.prepare"),
-    "train_generator": (TrainGeneratorConfig, "ganlane.commands.train_generator"),
-    "realism": (RealismConfig, "ganlane.commands.realism"),
+#: A command's settings. The module of its name in :mod:`ganlane.commands` has a function of its
+#: name, which takes settings and run folder and returns the line that names its results.
+COMMANDS: dict[str, type[Record]] = {
+    "train": TrainConfig,
+    "evaluate": EvaluateConfig,
+    "benchmark": BenchmarkConfig,
+    "render": RenderConfig,
+    "record": RecordConfig,
+    "prepare": PrepareConfig,
+    "train_generator": TrainGeneratorConfig,
+    "realism": RealismConfig,
 }
-#: A function that does a command's work.
-Task = Callable[[Any, Path], str | None]
 #: File in the run folder with all settings; what a run is resumed from.
 CONFIG = "config.yaml"
 #: File that names the process that uses the folder.
@@ -85,13 +78,7 @@ LOCK = ".lock"
 #: The checkpoint of a run, below its folder.
 LAST = Path("checkpoints") / "last.pt"
 #: Files that took time to make.
-EARNED = (
-    "results.json",
-    "agent.safetensors",
-    "last.pt",
-    "fits/*.pt",
-    "generator_*.safetensors",
-)
+EARNED = ("results.json", "agent.safetensors", "last.pt", "fits/*.pt", "generator_*.safetensors")
 OUTPUTS = Path("outputs")
 #: Folders of a run that it writes to itself; others below it may be runs of their own.
 _OWN_FOLDERS = (".", "checkpoints", "pretrain", "pretrain/checkpoints", "fits")
@@ -111,13 +98,8 @@ class Stopped(BaseException):
 # --- the command line
 
 
-def run_command(
-    command: str, arguments: Sequence[str] | None = None, task: Task | None = None
-) -> int:
-    """``ganlane COMMAND key=value ...`` (None: the process's arguments); the exit status.
-
-    A ``task`` takes the place of the command's function.
-    """
+def run_command(command: str, arguments: Sequence[str] | None = None) -> int:
+    """``ganlane COMMAND key=value ...`` (None: the process's arguments); the exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     # Before anything is opened: a file would get the number of a closed stream.
     open_closed_streams()
@@ -125,17 +107,14 @@ def run_command(
     keep_freed_memory()
     try:
         with _sigterm_as_exception():
-            single = _single_run(command, words, task)
+            single = _single_run(command, words)
             if single is not None:
-                config, folder = single
-                with running(folder, config):
-                    line = (task or function_of(command))(config, folder)
-                if line:
-                    print(line)
+                _run(command, *single)
             # Here, so that a reader who has left is noticed while it can still be reported.
             sys.stdout.flush()
     except UserError as error:
-        print(f"ganlane {command}: {_one_line(error)}", file=sys.stderr)
+        line = " ".join(str(error).split()).rstrip(".")
+        print(f"ganlane {command}: {line}.", file=sys.stderr)
         return USER_ERROR
     except OSError as error:
         return status_of(error, f"ganlane {command}")
@@ -147,15 +126,14 @@ def run_command(
     return 0
 
 
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()).rstrip(".") + "."
+def _run(command: str, config: Any, folder: Path) -> None:
+    """Do what a command does, and print the line that names its results."""
+    with running(folder, config):
+        line = function_of(command)(config, folder)
+    print(line, flush=True)
 
 
-def _single_run(
-    command: str,
-    words: list[str],
-    task: Task | None,
-) -> tuple[Any, Path] | None:
+def _single_run(command: str, words: list[str]) -> tuple[Any, Path] | None:
     """The settings and folder of the run that the words ask for.
 
     None where they ask for something else, which is done here: help, the configuration, a sweep.
@@ -164,7 +142,7 @@ def _single_run(
     flags = [word for word in words if word.startswith("-")]
     keys = [word for word in words if word not in flags]
     if {"-h", "--help"} & set(flags):
-        print(help_text(command, COMMANDS[command][0]))
+        print(help_text(command, COMMANDS[command]))
         return None
     if flags == ["--cfg"] and "job" in keys:
         keys.remove("job")
@@ -176,7 +154,7 @@ def _single_run(
     check_process()
     overrides = parsed(command, keys)
     if flags:
-        _sweep(command, overrides, task)
+        _sweep(command, overrides)
         return None
     config, folder = _settings_and_folder(command, overrides)
     return config, folder.absolute()
@@ -205,9 +183,9 @@ def _settings_and_folder(command: str, overrides: list[Override]) -> tuple[Any, 
         if folder is not None:
             data = resumed(saved_config(folder / CONFIG), rest)
             config: Any = make(TrainConfig, {**data, "resume": str(folder)})
-            refuse_stored_imports(config, [key_of(word) for word in rest])
+            refuse_stored_imports(config, map(key_of, rest))
             return config, folder
-    config = make(COMMANDS[command][0], composed(command, rest))
+    config = make(COMMANDS[command], composed(command, rest))
     where = values.get("hydra.run.dir")
     return config, new_folder(command) if where is None else Path(str(where.value()))
 
@@ -228,12 +206,12 @@ def call_settings(command: str, keys: Mapping[str, Any]) -> Any:
     Raises:
         UserError: an unknown key or option, a value of the wrong type or out of range.
     """
-    kind = COMMANDS[command][0]
+    kind = COMMANDS[command]
     aliases = ALIASES.get(command, {})
     keys = with_env_keys(kind, {aliases.get(name, name): keys[name] for name in keys})
     if command == "train" and keys.get("resume") is not None:
         config: Any = make(kind, merged(saved_config(Path(keys["resume"]) / CONFIG), keys))
-        refuse_stored_imports(config, list(_whole_keys(keys)))
+        refuse_stored_imports(config, _whole_keys(keys))
         return config
     return make(kind, called(command, keys))
 
@@ -241,11 +219,7 @@ def call_settings(command: str, keys: Mapping[str, Any]) -> Any:
 # --- sweeps
 
 
-def _sweep(
-    command: str,
-    overrides: list[Override],
-    task: Task | None,
-) -> None:
+def _sweep(command: str, overrides: list[Override]) -> None:
     """All combinations, each in its own folder, by Hydra's launcher; all are checked before."""
     if any(word.key_or_group == "resume" for word in overrides):
         raise UserError("resume: one run is resumed at a time; start without -m.")
@@ -261,12 +235,7 @@ def _sweep(
         # Without the ++ that for_hydra has put before the key.
         words = [str(word).lstrip("+") for word in state.overrides.task]
         try:
-            folder = Path(state.runtime.output_dir)
-            config = settings(command, words)
-            with running(folder, config):
-                line = (task or function_of(command))(config, folder)
-            if line:
-                print(line, flush=True)
+            _run(command, settings(command, words), Path(state.runtime.output_dir))
         except (UserError, OSError) as error:
             # Hydra would print it too; a worker process must raise.
             mistakes.append(error)
@@ -301,11 +270,11 @@ def single_runs(overrides: Sequence[Override]) -> list[list[str]]:
     for override in overrides:
         if str(override.key_or_group).startswith("hydra"):
             continue
+        words = [str(override.input_line)]
         if override.is_sweep_override():
             key = override.get_key_element()
-            choices.append([f"{key}={value}" for value in override.sweep_string_iterator()])
-        else:
-            choices.append([str(override.input_line)])
+            words = [f"{key}={value}" for value in override.sweep_string_iterator()]
+        choices.append(words)
     return [list(words) for words in itertools.product(*choices)]
 
 
@@ -317,12 +286,7 @@ def _show_sweep(folder: Path, columns: str) -> None:
 
     rows = sweep_rows(folder)
     if rows:
-        show(
-            "",
-            text_table(rows),
-            f"sweep: {folder.absolute()}",
-            columns=columns,
-        )
+        show("", text_table(rows), f"sweep: {folder.absolute()}", columns=columns)
 
 
 # --- a run and its folder
@@ -349,7 +313,7 @@ def running(folder: Path, config: Any) -> Iterator[None]:
 
 def function_of(command: str) -> Callable[[Any, Path], str]:
     """The command's function; importing its module imports torch, which takes seconds."""
-    return getattr(importlib.import_module(COMMANDS[command][1]), command)
+    return getattr(importlib.import_module(f"ganlane.commands.{command}"), command)
 
 
 @contextmanager
@@ -441,9 +405,8 @@ def _locked(folder: Path) -> Iterator[None]:
 
 def earned(folder: Path) -> set[tuple[Path, int]]:
     """The run's files that took time to make, with the times of their last change."""
-    files = [
-        path for part in _OWN_FOLDERS for name in EARNED for path in (folder / part).glob(name)
-    ]
+    patterns = [f"{part}/{name}" for part in _OWN_FOLDERS for name in EARNED]
+    files = [path for pattern in patterns for path in folder.glob(pattern)]
     return {(path, path.stat().st_mtime_ns) for path in files}
 
 
@@ -484,15 +447,13 @@ def newest_unfinished(runs: Path) -> Path | None:
     # The newest checkpoint first; a run's folder is the nearest one above with settings.
     checkpoints = sorted(runs.rglob(LAST.name), key=lambda path: -path.stat().st_mtime)
     for checkpoint in checkpoints:
-        for folder in checkpoint.parents:
-            if (folder / CONFIG).is_file():
-                if not (folder / "results.json").is_file():
-                    return folder
-                break
+        folder = next((path for path in checkpoint.parents if (path / CONFIG).is_file()), None)
+        if folder is not None and not (folder / "results.json").is_file():
+            return folder
     return None
 
 
-def refuse_stored_imports(config: TrainConfig, named: Collection[str]) -> None:
+def refuse_stored_imports(config: TrainConfig, named: Iterable[str]) -> None:
     """Refuse code from outside the package that a run's file names, unless the user names it too.
 
     ``named`` are the whole keys that stand on the command line or in the call.
@@ -500,11 +461,11 @@ def refuse_stored_imports(config: TrainConfig, named: Collection[str]) -> None:
     Raises:
         UserError: the file names a class or function of another package.
     """
-    # Naming the code is the user's word that it may run.
+    # Naming the code is the user's word that it may run; traffic=my.module.MyTraffic names all keys
+    # below it.
+    asked = tuple(f"{name}." for name in named)
     for key, value, path in _imports(config):
-        # traffic=my.module.MyTraffic names all keys below it
-        is_asked = any(f"{key}.".startswith(f"{name}.") for name in named)
-        if not is_asked and not path.startswith(_OWN_PACKAGES):
+        if not f"{key}.".startswith(asked) and not path.startswith(_OWN_PACKAGES):
             raise UserError(
                 f"resume={config.resume}: the run's file names {path}, and code from there would "
                 f"be executed; if you trust it, add {key}={value} to the command line."

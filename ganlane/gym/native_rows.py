@@ -10,15 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ganlane import keys
-from ganlane.gym.rows import (
-    Flags,
-    Floats,
-    Integers,
-    Rows,
-    described,
-    measure,
-    observation_space,
-)
+from ganlane.gym.rows import Flags, Floats, Integers, Rows, described, measure, observation_space
 from ganlane.native.batch import NativeBatch, Stepped
 from ganlane.native.drivers import drivers_of, pays
 from ganlane.native.library import why_not
@@ -30,21 +22,18 @@ from ganlane.settings.episode import Stream
 class NativeRows(Rows):
     """N highways by the native kernel."""
 
-    def __init__(
-        self,
-        batch: NativeBatch,
-        config: HighwayConfig,
-    ) -> None:
-        self.batch, self.count, self.config = batch, batch.rows, config
-        self.episode = config.env.episode_parameters()
+    def __init__(self, batch: NativeBatch) -> None:
+        self.batch, self.count, self.config = batch, batch.rows, batch.config
+        env = self.config.env
+        self.episode = env.episode_parameters()
         self.space = observation_space(batch.observation.shape[1], batch.bounds[1])
         # Made once, since they are views of arrays that the kernel writes to.
         state = batch.state
         self._arrays: dict[str, Any] = {
             # No recorded scene is driven by the kernel, so none can end.
             "scene_end": np.zeros(batch.rows, np.bool_),
-            "lanes": config.env.lanes,
-            "lane_width_m": np.float32(config.env.lane_width_m),
+            "lanes": env.lanes,
+            "lane_width_m": np.float32(env.lane_width_m),
             keys.REWARD_TERMS: batch.reward_terms(),
         }
         for name in (keys.SEED, keys.EPISODE, keys.STEP):
@@ -63,30 +52,23 @@ class NativeRows(Rows):
         measure(self._info, self._arrays)
         return self._info
 
-    def __getstate__(self) -> tuple[NativeBatch, HighwayConfig, bool]:
+    def __getstate__(self) -> tuple[NativeBatch, bool]:
         """Without the views, which a copy has of its own arrays."""
-        return self.batch, self.config, self.started
+        return self.batch, self.started
 
-    def __setstate__(self, state: tuple[NativeBatch, HighwayConfig, bool]) -> None:
-        self.__init__(*state[:2])  # type: ignore[misc]
-        self.started = state[2]
+    def __setstate__(self, state: tuple[NativeBatch, bool]) -> None:
+        batch, started = state
+        self.__init__(batch)  # type: ignore[misc]
+        self.started = started
 
-    def start(
-        self,
-        seed: npt.ArrayLike,
-        episode: npt.ArrayLike,
-    ) -> None:
+    def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
         self.started = True
         self.batch.start(seed, episode)
 
     def restart(self, rows: Flags) -> None:
         state = self.batch.state
         # Row i drives the episodes i, i + N, i + 2N, ...
-        self.batch.start(
-            state[keys.SEED],
-            state[keys.EPISODE] + self.count,
-            rows,
-        )
+        self.batch.start(state[keys.SEED], state[keys.EPISODE] + self.count, rows)
 
     def step(self, actions: Integers | Floats) -> Stepped:
         return self.batch.step(actions)
@@ -119,4 +101,4 @@ def native_rows(config: HighwayConfig) -> NativeRows | None:
         or why_not() is not None
     ):
         return None
-    return NativeRows(NativeBatch(config, drivers), config)
+    return NativeRows(NativeBatch(config, drivers))

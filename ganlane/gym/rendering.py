@@ -24,7 +24,8 @@ _TRAIL_STEPS = round(FilmConfig.trail_s / PHYSICS_STEP_S) + 1
 
 def _label(rows: TensorRows, row: int) -> EpisodeLabel:
     """The header's text for a row."""
-    return EpisodeLabel.of(rows.now(), rows.env.base_env.road, "ego", rows.traffic, row)
+    name = rows.config.traffic.label()
+    return EpisodeLabel.of(rows.now(), rows.env.base_env.road, "ego", name, row)
 
 
 class LiveView:
@@ -35,11 +36,7 @@ class LiveView:
         window: shows every physics step in real time; None: pictures on request.
     """
 
-    def __init__(
-        self,
-        rows: TensorRows,
-        window: FilmWindow | None = None,
-    ) -> None:
+    def __init__(self, rows: TensorRows, window: FilmWindow | None = None) -> None:
         self.rows = rows
         self.window = window
 
@@ -109,11 +106,7 @@ class BatchView:
         """New episodes begin in the rows where ``fresh`` [N] is true."""
         self._returns[fresh], self._actions[fresh] = 0.0, -1
 
-    def after_step(
-        self,
-        actions: npt.ArrayLike,
-        reward: npt.NDArray[np.float64],
-    ) -> None:
+    def after_step(self, actions: npt.ArrayLike, reward: npt.NDArray[np.float64]) -> None:
         """Record actions and rewards [N] of a step."""
         self._returns += reward
         self._actions[:] = actions

@@ -67,11 +67,7 @@ class Rows(ABC):
     episode: EpisodeParameters
 
     @abstractmethod
-    def start(
-        self,
-        seed: npt.ArrayLike,
-        episode: npt.ArrayLike,
-    ) -> None:
+    def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
         """Begin the episodes [N] of the seeds [N]; each may be one number for all rows."""
 
     @abstractmethod
@@ -197,18 +193,10 @@ def action_of(action: Any, actions: ActionParameters) -> Integers | Floats:
     if type(action) in (int, np.int64) and 0 <= action < len(actions.names):
         return np.array([action])
     array = array_of(action)
-    return actions_of(
-        array.reshape(-1) if actions.names else array[None],
-        1,
-        actions,
-    )
+    return actions_of(array.reshape(-1) if actions.names else array[None], 1, actions)
 
 
-def actions_of(
-    commanded: Any,
-    rows: int,
-    actions: ActionParameters,
-) -> Integers | Floats:
+def actions_of(commanded: Any, rows: int, actions: ActionParameters) -> Integers | Floats:
     """A user's actions as an array [rows] int64, or [rows, 2] float32.
 
     Raises:

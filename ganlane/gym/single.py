@@ -66,13 +66,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         self._seed = None if seed is None else seed_number(seed)
         self._episode = -1
         self._running = False
-        self._rows = make_rows(
-            traffic,
-            1,
-            render_mode is not None,
-            transforms,
-            options,
-        )
+        self._rows = make_rows(traffic, 1, render_mode is not None, transforms, options)
         self.observation_space: gymnasium.spaces.Box = self._rows.space  # type: ignore[assignment]
         self.action_space = self._rows.action_space()
         self._actions = self._rows.actions
@@ -108,12 +102,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         elif self._seed is None:
             self._seed = int(self.np_random.integers(SEEDS))
         episode = chosen.get("episode", self._episode + 1)
-        self._episode = whole_number(
-            "options: episode",
-            episode,
-            0,
-            2**62,
-        )
+        self._episode = whole_number("options: episode", episode, 0, 2**62)
         self._rows.start(self._seed, self._episode)
         self._running = True
         # The first frame is the scene before anything moves.

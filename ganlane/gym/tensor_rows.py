@@ -22,7 +22,6 @@ from ganlane.native.batch import Stepped
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.observation import largest_number
 from ganlane.sim.state import road_in
-from ganlane.transforms import ObservationTransform
 
 
 class TensorRows(Rows):
@@ -30,15 +29,10 @@ class TensorRows(Rows):
 
     Attributes:
         env: the TorchRL environment of the settings, with a user's own transforms at the end.
-        traffic: its name, for pictures.
         state: of its rows, from the first :meth:`start` on.
     """
 
-    def __init__(
-        self,
-        config: HighwayConfig,
-        transforms: Sequence[Transform] = (),
-    ) -> None:
+    def __init__(self, config: HighwayConfig, transforms: Sequence[Transform] = ()) -> None:
         self.config, self.transforms = config, transforms
         self.env = make_highways(config)
         for transform in transforms:
@@ -46,21 +40,15 @@ class TensorRows(Rows):
         base = self.env.base_env
         self.count = config.num_envs
         self.episode = base.episode
-        self.traffic = config.traffic.label()
-        parts = list(self.env.transform)
-        observed = next(part for part in parts if isinstance(part, ObservationTransform))
         size = self.env.observation_spec[keys.OBSERVATION].shape[-1]
         # One form counts metres of overlap, so its bound follows from the longest vehicle.
-        self.space = observation_space(size, largest_number(observed.form, base.scenes.longest_m))
+        largest = largest_number(config.observation.form, base.scenes.longest_m)
+        self.space = observation_space(size, largest)
 
     state: TensorDictBase
 
     @torch.no_grad()
-    def start(
-        self,
-        seed: npt.ArrayLike,
-        episode: npt.ArrayLike,
-    ) -> None:
+    def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
         counters = TensorDict({}, [self.count], device=self.env.device)
         for name, value in ((keys.SEED, seed), (keys.EPISODE, episode)):
             # One number for all rows, or one for each.
@@ -80,13 +68,9 @@ class TensorRows(Rows):
         stepped = self.env.step(self.now().set(keys.ACTION, action))
         # Rows are not reset here: the environments above decide when.
         self.state = self.env.step_mdp(stepped)
-        after = stepped.get("next")
-        return Stepped(
-            self.observation(),
-            _array(after.get(keys.REWARD)[:, 0]).astype(np.float32),
-            _array(after.get("terminated")[:, 0]),
-            _array(after.get("truncated")[:, 0]),
-        )
+        names = (keys.REWARD, "terminated", "truncated")
+        reward, *ends = (_array(stepped["next", name][:, 0]) for name in names)
+        return Stepped(self.observation(), reward.astype(np.float32), *ends)
 
     def now(self) -> TensorDictBase:
         """The state of all rows; raises :class:`UserError` before the first :meth:`start`."""
@@ -103,11 +87,8 @@ class TensorRows(Rows):
         # An environment with a mask has computed it; without one it is the actions on the road.
         mask = state.get(keys.ACTION_MASK, None)
         if mask is None:
-            mask = legal_actions(
-                state,
-                road_in(state, self.env.base_env.road),
-                self.actions,
-            )
+            road = road_in(state, self.env.base_env.road)
+            mask = legal_actions(state, road, self.actions)
         return _array(mask)
 
     def state_arrays(self) -> Mapping[str, Any]:
@@ -126,10 +107,8 @@ class TensorRows(Rows):
         tensors["lanes"] = torch.as_tensor(road.lanes).flatten()
         tensors["lane_width_m"] = torch.as_tensor(road.lane_width_m).flatten()
         arrays: dict[str, Any] = {name: _array(value) for name, value in tensors.items()}
-        terms = state.get(keys.REWARD_TERMS)
-        arrays[keys.REWARD_TERMS] = {}
-        for name, term in terms.items():
-            arrays[keys.REWARD_TERMS][name] = _array(term[:, 0])
+        terms = state.get(keys.REWARD_TERMS).items()
+        arrays[keys.REWARD_TERMS] = {name: _array(term[:, 0]) for name, term in terms}
         return arrays
 
 

@@ -69,23 +69,12 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
         # What happens to a row whose episode is over: reset in this step, in the next, or by the
         # caller.
         self._mode = _mode_of(autoreset_mode)
-        self._rows = make_rows(
-            traffic,
-            num_envs,
-            render_mode is not None,
-            transforms,
-            options,
-        )
+        self._rows = make_rows(traffic, num_envs, render_mode is not None, transforms, options)
         self.num_envs = self._rows.count
         self.render_mode = render_mode
         episode = self._rows.episode
         if max_episode_steps is not None:
-            limit = whole_number(
-                "max_episode_steps",
-                max_episode_steps,
-                1,
-                2**31,
-            )
+            limit = whole_number("max_episode_steps", max_episode_steps, 1, 2**31)
             # make_vec() passes the limit of the specification; a batch cannot end episodes earlier.
             if limit < episode.most_decisions():
                 raise UserError(
@@ -134,11 +123,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
         if self._view is not None:
             self._view.start(fresh)
 
-    def _start(
-        self,
-        seed: int | Sequence[int] | None,
-        episode: Any,
-    ) -> None:
+    def _start(self, seed: int | Sequence[int] | None, episode: Any) -> None:
         """Begin the episodes that the arguments of a reset name, or the next ones, in all rows."""
         rows = np.arange(self.num_envs)
         seeds: Any
@@ -234,8 +219,8 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
 def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
     """gymnasium's mode, given as such or by name."""
     names = [choice.name.lower() for choice in AutoresetMode]
-    for choice in AutoresetMode:
-        if mode is choice or str(mode).lower() in (choice.name.lower(), choice.value.lower()):
+    for choice, name in zip(AutoresetMode, names):
+        if mode is choice or str(mode).lower() in (name, choice.value.lower()):
             return choice
     raise UserError(
         f"autoreset_mode={mode}: expected one of {', '.join(names)}; choose one of them."

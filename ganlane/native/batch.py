@@ -123,6 +123,7 @@ class NativeBatch:
     """
 
     def __init__(self, config: HighwayConfig, drivers: Drivers, variant: str | None = None) -> None:
+        self.config = config
         # For copies and other processes, which make the batch anew.
         self._arguments = (config, drivers, variant)
         env, mask, form = config.env, config.mask, config.observation.form
@@ -154,8 +155,8 @@ class NativeBatch:
         self._term_values = np.zeros((rows, len(self.terms)), np.float32)
         self._no_safe_action = np.zeros(rows, np.bool_)
         # A network fills the widest vectors with its own numbers.
-        chosen = variant or by_network(drivers)
-        self._library = load(variant) if chosen else load_for(rows)
+        widest = variant or by_network(drivers)
+        self._library = load(variant) if widest else load_for(rows)
         abort = env.ego.abort_lane_change
         # The kernel's structures, filled once.
         pointed: dict[str, Any] = {
@@ -167,7 +168,7 @@ class NativeBatch:
             "mask_outputs": addresses([self._lane_mask, self._no_safe_action]),
             "scene": self._pointers(settings.STARTS),
         }
-        numbers: dict[str, Any] = {
+        numbers = highway._asdict() | {
             "reward": self.state[keys.REWARD].ctypes.data,
             "terms": self._term_values.ctypes.data,
             "observation": self.observation.ctypes.data,
@@ -176,8 +177,6 @@ class NativeBatch:
             "lowest": self.bounds[0],
             "highest": self.bounds[1],
             "fastest": SPEED_RATIO_LIMIT,
-            "vehicles": env.vehicles,
-            "lanes": env.lanes,
             "size": view.numbers(),
             "mask_form": settings.MASK_FORMS.index(mask.form),
             "abort_lane_change": abort,
@@ -222,8 +221,7 @@ class NativeBatch:
             array[:] = numbers
 
     def _arrays(self) -> list[Array]:
-        masks = (self.mask, self._lane_mask, self._no_safe_action)
-        return [*self.state.values(), self.observation, *masks, self._term_values]
+        return [*self.state.values(), self.observation, self.mask, self._term_values]
 
     def _pointers(
         self, names: Iterable[Key], rows: Array | None = None

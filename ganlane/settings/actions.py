@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 from ganlane.errors import ParameterError
 from ganlane.settings.record import Positive, Record, one_of
@@ -37,16 +37,13 @@ class ActionParameters(Record):
         strongest_braking: of ``continuous``, m/s2; about 9 is what dry asphalt allows.
     """
 
+    alone = "form"
+
     form: Annotated[str, one_of((*NUMBERED, CONTINUOUS))] = LANE
     speed_step_mps: Positive = 2.5
     lowest_speed_mps: Positive = 5.0
     strongest_acceleration: Positive = 3.0
     strongest_braking: Positive = 8.0
-
-    @classmethod
-    def chosen(cls, data: Any) -> tuple[type[Record], Any]:
-        """The record; the name of a form alone will do."""
-        return super().chosen({"form": data} if isinstance(data, str) else data)
 
     @property
     def names(self) -> tuple[str, ...]:

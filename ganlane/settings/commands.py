@@ -66,11 +66,14 @@ class RunConfig(Record):
 
             check_default_device("cuda")  # no other one can be the environment's
         super().__post_init__()
-        if self.device == "cuda" and not has_cuda():
-            raise UserError(
-                "device=cuda: torch sees no CUDA device here; use device=cpu or install torch for "
-                "CUDA."
-            )
+        if self.device == "cuda":
+            import torch  # takes seconds
+
+            if not torch.cuda.is_available():
+                raise UserError(
+                    "device=cuda: torch sees no CUDA device here; use device=cpu or install torch "
+                    "for CUDA."
+                )
 
 
 @dataclass(frozen=True)
@@ -81,13 +84,6 @@ class CpuConfig(RunConfig):
         super().__post_init__()
         if self.device != "cpu":
             raise UserError(f"device={self.device}: this runs on the CPU alone; use device=cpu.")
-
-
-def has_cuda() -> bool:
-    """Whether torch sees a CUDA device."""
-    import torch  # takes seconds
-
-    return torch.cuda.is_available()
 
 
 @dataclass(frozen=True)
@@ -139,7 +135,7 @@ def with_env_keys(kind: type[Record], keys: Mapping[str, Any]) -> dict[str, Any]
     # The name of an option is short for a mapping.
     if isinstance(base, str):
         base = {"name": base}
-    result["env"] = {**(plain(base) if isinstance(base, Record) else base), **of_env}
+    result["env"] = {**plain(base), **of_env}
     return result
 
 

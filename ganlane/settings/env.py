@@ -8,7 +8,7 @@ blocked_lane, stop_and_go, merge, on_ramp, lane_drop, weave, exit`` start with a
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 from ganlane.arguments import call_with
 from ganlane.errors import ParameterError, as_typed
@@ -33,6 +33,7 @@ from ganlane.settings.road import EXIT, WALL, FlowParameters, LaneStretch, Stret
 
 if TYPE_CHECKING:
     from ganlane.sim.scenes import FixedScene, SceneVehicle
+    from ganlane.sim.state import Road
 
 #: The ego and at least one other.
 Vehicles: TypeAlias = Annotated[int, between(2, 1000)]
@@ -54,16 +55,11 @@ class SceneConfig(Record):
         jitter_mps: and speeds, m/s; standing vehicles remain standing.
     """
 
-    chosen_by = "kind"
+    chosen_by = alone = "kind"
 
     kind: str
     jitter_m: NotNegative = 0.5
     jitter_mps: NotNegative = 0.5
-
-    @classmethod
-    def chosen(cls, data: Any) -> tuple[type[Record], Any]:
-        """The scene of this kind; its name alone will do."""
-        return super().chosen({"kind": data} if isinstance(data, str) else data)
 
     def vehicles(self, env: EnvConfig) -> tuple[SceneVehicle, ...]:
         """The vehicles, the ego first."""
@@ -451,12 +447,10 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
             return None
         # Imported here, since it imports torch, which takes seconds.
         from ganlane.sim.scenes import FixedScene, with_waiting
-        from ganlane.sim.state import Road
 
         if others_visibility is None:
             others_visibility = Visibility.SIGNALLED
-        flow = self.flow if self.flow.is_on else None
-        road = Road(self.lanes, self.lane_width_m, stretches=self.stretches(), flow=flow)
+        road = self.road()
         return FixedScene(
             with_waiting(self.scene.vehicles(self), road),
             road,
@@ -465,8 +459,15 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
             ego_visibility=Visibility.named(self.ego.visibility),
             others_visibility=others_visibility,
             name=self.scene.label(),
-            waiting=0 if flow is None else flow.slots,
+            waiting=0 if road.flow is None else road.flow.slots,
         )
+
+    def road(self) -> Road:
+        """The road, and who enters and leaves it."""
+        from ganlane.sim.state import Road  # with torch, which takes seconds
+
+        flow = self.flow if self.flow.is_on else None
+        return Road(self.lanes, self.lane_width_m, stretches=self.stretches(), flow=flow)
 
     def stretches(self) -> Stretches:
         """Where each lane begins and ends; empty: all go on for ever."""

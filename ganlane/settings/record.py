@@ -17,7 +17,6 @@ import math
 import operator
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from copy import deepcopy
 from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import cache
 from numbers import Real
@@ -122,11 +121,6 @@ def option_names(group: str) -> list[str]:
     return sorted(path.stem for path in (conf_folder() / group).glob("*.yaml"))
 
 
-@cache
-def _option_file(path: Path) -> dict[str, Any]:
-    return yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-
-
 def option(group: str, name: Any) -> dict[str, Any]:
     """What ``conf/GROUP/NAME.yaml`` says: the keys that differ from the record's defaults.
 
@@ -139,8 +133,8 @@ def option(group: str, name: Any) -> dict[str, Any]:
         raise ParameterError(
             f"{group}={as_typed(name):.80}: no such option{hint}; choose one of {', '.join(names)}."
         )
-    # A copy, since the mapping in the cache is shared by all callers.
-    return deepcopy(_option_file(conf_folder() / group / f"{name}.yaml"))
+    file = conf_folder() / group / f"{name}.yaml"
+    return yaml.safe_load(file.read_text(encoding="utf-8")) or {}
 
 
 #: Keys whose names with numbers are one value: it replaces the one below, as on the command line.
@@ -171,6 +165,7 @@ class Record:
     Attributes:
         group: folder of ``conf/`` with the options; empty: none.
         chosen_by: field whose value tells which subclass is meant; empty: there are none.
+        alone: field that a text stands for where there is no ``group``; empty: none.
 
     Raises:
         ParameterError: for the first value that will not do; names field, value, what was expected,
@@ -179,19 +174,17 @@ class Record:
 
     group: ClassVar[str] = ""
     chosen_by: ClassVar[str] = ""
+    alone: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
-        # A frozen dataclass is set through object's own setter, before anybody sees it.
         hints = _hints(type(self))  # type: ignore[arg-type]
         # In the order of the fields, so that the first mistake is the one reported.
         for field in fields(self):  # type: ignore[arg-type]
-            value = _fitted(
-                hints[field.name],
-                getattr(self, field.name),
-                field.name,
-                field,
-            )
-            assign(self, **{field.name: value})
+            name = field.name
+            try:
+                assign(self, **{name: _fitted(hints[name], getattr(self, name), name)})
+            except _Refusal as refusal:
+                raise refusal.told(field) from refusal.__cause__
 
     @classmethod
     def kinds(cls) -> dict[str, type[Record]]:
@@ -203,15 +196,15 @@ class Record:
     def chosen(cls, data: Any) -> tuple[type[Record], Any]:
         """The class that ``data`` ask for, and the data of its constructor."""
         # A name is the option of that name; a mapping with a name is that option with changes.
-        if isinstance(data, str) and cls.group:
-            data = {"name": data}
+        short = "name" if cls.group else cls.alone
+        if isinstance(data, str) and short:
+            data = {short: data}
         if isinstance(data, Mapping) and cls.group and "name" in data:
             changes = {name: value for name, value in data.items() if name != "name"}
             data = merged(option(cls.group, data["name"]), changes)
-        kinds = cls.kinds() if cls.chosen_by else {}
-        if not kinds or not isinstance(data, Mapping) or cls.chosen_by not in data:
+        if not isinstance(data, Mapping) or cls.chosen_by not in data:
             return cls, data
-        choice = data[cls.chosen_by]
+        kinds, choice = cls.kinds(), data[cls.chosen_by]
         if not isinstance(choice, str) or choice not in kinds:
             raise ParameterError(
                 f"{{{cls.chosen_by}}}={as_typed(choice)}: expected one of {', '.join(kinds)}; "
@@ -220,11 +213,7 @@ class Record:
         return kinds[choice], data
 
 
-def make(
-    kind: type[Part],
-    data: Any,
-    key: str = "",
-) -> Part:
+def make(kind: type[Part], data: Any, key: str = "") -> Part:
     """A record of ``kind`` from plain data; ``key`` is its own, for messages.
 
     Raises:
@@ -306,36 +295,38 @@ _WORDS = {
 }
 
 
-def _fitted(
-    hint: Any,
-    value: Any,
-    key: str,
-    field: Field[Any],
-) -> Any:
+class _Refusal(Exception):
+    """A value that will not do: its key, the value, and what was expected in words."""
+
+    def told(self, field: Field[Any]) -> ParameterError:
+        """The sentence about it, with an example of the ``field``."""
+        key, value, expected = self.args
+        # The default is a value that works, so it serves as the example.
+        default = field.default
+        if field.default_factory is not MISSING:
+            default = field.default_factory()
+        example = ""
+        if default not in (MISSING, None, "") and not isinstance(default, dict | Record):
+            example = f"; give for instance {{{field.name}}}={as_typed(default)}"
+        text = " ".join(as_typed(value).split())
+        return ParameterError(f"{{{key}}}={text:.80}: expected {expected}{example}.")
+
+
+def _fitted(hint: Any, value: Any, key: str) -> Any:
     """``value`` as the annotation ``hint`` wants it, its ranges checked."""
     # Peel the annotation from the outside: optional, ranges, then what the value itself is.
     kind, inner = get_origin(hint) or hint, get_args(hint)
     # Records have unions with None only.
     if kind in (Union, UnionType):
-        if value is None and NoneType in inner:
+        if value is None:
             return None
         present = next(alternative for alternative in inner if alternative is not NoneType)
-        return _fitted(
-            present,
-            value,
-            key,
-            field,
-        )
+        return _fitted(present, value, key)
     if kind is Annotated:
-        value = _fitted(
-            inner[0],
-            value,
-            key,
-            field,
-        )
+        value = _fitted(inner[0], value, key)
         for rule in inner[1:]:
             if not rule.holds(value):
-                raise _refusal(key, value, rule.expected, field)
+                raise _Refusal(key, value, rule.expected)
         return value
     if is_dataclass(kind):
         return make(kind, value, key)  # type: ignore[arg-type]
@@ -343,71 +334,46 @@ def _fitted(
         value = value.tolist()
     if kind in (list, tuple):
         # A set or an array is as good as a list; a mapping is a mistake.
-        one = kind is list and isinstance(value, str | Path | int)
-        entries = [value] if one or isinstance(value, str) else value  # agents=mobil, episodes=3
+        one = isinstance(value, str) or (kind is list and isinstance(value, Path | int))
+        entries = [value] if one else value  # agents=mobil, episodes=3
         if not isinstance(entries, Collection) or isinstance(entries, Mapping):
-            raise _refusal(key, value, "a list in brackets", field)
+            raise _Refusal(key, value, "a list in brackets")
         if kind is tuple and inner[1] is not Ellipsis and len(entries) != len(inner):
-            raise _refusal(key, value, f"{len(inner)} entries", field)
-        return kind(_fitted(inner[0], entry, key, field) for entry in entries)
+            raise _Refusal(key, value, f"{len(inner)} entries")
+        return kind(_fitted(inner[0], entry, key) for entry in entries)
     if kind is dict and isinstance(value, Mapping):
         return {
-            _scalar(str, str(name), key, field): _fitted(inner[1], entry, f"{key}.{name}", field)
+            _scalar(str, str(name), key): _fitted(inner[1], entry, f"{key}.{name}")
             for name, entry in value.items()
         }
-    return _scalar(
-        kind,
-        value,
-        key,
-        field,
-    )
+    return _scalar(kind, value, key)
 
 
-def _scalar(
-    kind: Any,
-    value: Any,
-    key: str,
-    field: Field[Any],
-) -> Any:
+def _scalar(kind: Any, value: Any, key: str) -> Any:
     """A number, text or switch of the type ``kind``."""
     if kind is Any:
         return value
     # bool is a subclass of int, but true is no number.
+    if isinstance(value, bool) and kind is not bool:
+        raise _Refusal(key, value, _WORDS[kind])
     is_number = isinstance(value, Real) and not isinstance(value, bool)
     if kind is float and is_number:
         try:
             return float(value)
         except OverflowError as error:
-            raise _refusal(key, value, "a number of fewer digits", field) from error
+            raise _Refusal(key, value, "a number of fewer digits") from error
     # YAML reads 1e6 as a float.
     if kind is int and isinstance(value, float) and value.is_integer():
         return int(value)  # 1e6
-    if kind is int and hasattr(value, "__index__") and not isinstance(value, bool):
+    if kind is int and hasattr(value, "__index__"):
         return operator.index(value)
     if kind is str and (is_number or isinstance(value, Path)):
         return str(value)
     if kind is str and isinstance(value, str) and CONTROL.search(value):
-        raise _refusal(key, value, "a text without control characters", field)
-    if isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
+        raise _Refusal(key, value, "a text without control characters")
+    if isinstance(value, kind):
         return value
-    raise _refusal(key, value, _WORDS.get(kind, kind.__name__), field)
-
-
-def _refusal(
-    key: str,
-    value: Any,
-    expected: str,
-    field: Field[Any],
-) -> ParameterError:
-    # The default is a value that works, so it serves as the example.
-    default = field.default
-    if field.default_factory is not MISSING:
-        default = field.default_factory()
-    example = ""
-    if default not in (MISSING, None, "") and not isinstance(default, dict | Record):
-        example = f"; give for instance {{{field.name}}}={as_typed(default)}"
-    text = " ".join(as_typed(value).split())
-    return ParameterError(f"{{{key}}}={text:.80}: expected {expected}{example}.")
+    raise _Refusal(key, value, _WORDS.get(kind, kind.__name__))
 
 
 # --- saved settings

@@ -10,15 +10,7 @@ from typing import Annotated
 
 from ganlane.errors import ParameterError, UserError
 from ganlane.settings.commands import DrivingConfig, Measured, Names
-from ganlane.settings.record import (
-    DIFFERENT,
-    NotNegative,
-    Positive,
-    Record,
-    Seed,
-    Text,
-    between,
-)
+from ganlane.settings.record import DIFFERENT, NotNegative, Positive, Record, Seed, Text, between
 from ganlane.settings.traffic import IdmMobilTrafficConfig, TrafficConfig
 
 #: Learning curves.

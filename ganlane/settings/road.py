@@ -94,15 +94,13 @@ def leaving(stretches: Stretches, goal: int | None = None) -> Leaving:
     """
     by_m = []
     changes = []
-    going_on = [lane for lane, its in enumerate(stretches) if its.end == NOTHING]
+    goals = [lane for lane, its in enumerate(stretches) if its.end == NOTHING]
+    if goal is not None:
+        goals = [goal]
     for lane, its in enumerate(stretches):
-        if goal is not None:
-            away = abs(lane - goal)
-            last = stretches[goal].end_m
-        else:
-            away = min(abs(lane - other) for other in going_on)
-            last = its.end_m
-        by_m.append(last if away else FAR_M)
+        away = min(abs(lane - other) for other in goals)
+        last = its if goal is None else stretches[goal]
+        by_m.append(last.end_m if away else FAR_M)
         changes.append(float(max(away, 1)))
     return Leaving(tuple(by_m), tuple(changes))
 
@@ -145,11 +143,8 @@ class FlowParameters(Record):
         """Whether the driver of each slot leaves by the exit: the ego, whose mission it is, and the
         share of the others, as evenly as it can be.
         """
-        share = self.exit_share
-        exits = [True]
-        for slot in range(1, vehicles):
-            exits.append(math.floor(slot * share) > math.floor((slot - 1) * share))
-        return tuple(exits)
+        leave = [math.floor(slot * self.exit_share) for slot in range(vehicles)]
+        return (True, *(leave[slot] > leave[slot - 1] for slot in range(1, vehicles)))
 
     def check(self, stretches: Stretches, period_s: float) -> None:
         """Raise :class:`ParameterError` for a section that does not fit the road, or more vehicles

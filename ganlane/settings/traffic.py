@@ -17,12 +17,7 @@ from typing import Annotated, Any, ClassVar, TypeAlias
 
 from ganlane.arguments import is_import_path
 from ganlane.errors import ParameterError
-from ganlane.settings.driving import (
-    DriverFaults,
-    HumanVariation,
-    RandomDrivers,
-    Steps,
-)
+from ganlane.settings.driving import DriverFaults, HumanVariation, RandomDrivers, Steps
 from ganlane.settings.record import (
     NotNegative,
     Record,
@@ -71,22 +66,23 @@ class TrafficConfig(Record):
         ``data`` may also be a class or an import path, alone or as the mapping's ``name``.
         """
         # A class, its import path, an option's name: all become the mapping with _target_.
-        if inspect.isclass(data) and not isinstance(data, cls):
-            data = f"{data.__module__}.{data.__qualname__}"
-        if isinstance(data, str):
+        if isinstance(data, str) or inspect.isclass(data):
             data = {"name": data}
-        if isinstance(data, Mapping) and inspect.isclass(data.get("name")):
-            target = data["name"]
-            data = {**data, "name": f"{target.__module__}.{target.__qualname__}"}
-        if isinstance(data, Mapping) and "." in str(data.get("name")):
-            data = {"_target_" if key == "name" else key: value for key, value in data.items()}
-        if isinstance(data, Mapping) and not {"_target_", "name"} & set(data):
+        # What is no mapping goes to the base class, which says what is wrong with it.
+        if not isinstance(data, Mapping):
+            return super().chosen(data)
+        name = data.get("name")
+        if inspect.isclass(name):
+            name = f"{name.__module__}.{name.__qualname__}"
+        if "." in str(name):
+            others = {key: value for key, value in data.items() if key != "name"}
+            data = {"_target_": name, **others}
+        if not {"_target_", "name"} & set(data):
             raise ParameterError(
                 "{_target_}: of which traffic? name it first, as in traffic=gan or "
                 "pretrain.traffic=gan."
             )
-        # What is no mapping goes to the base class, which says what is wrong with it.
-        target = data.get("_target_") if isinstance(data, Mapping) else None
+        target = data.get("_target_")
         if not isinstance(target, str) or target in cls.kinds():
             return super().chosen(data)
         # A model of your own: what is no key of every traffic is an argument of its constructor.

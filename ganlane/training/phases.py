@@ -34,7 +34,6 @@ from ganlane.agents.drivers import legal_actions
 from ganlane.agents.network import load_parameters
 from ganlane.build import (
     make_env,
-    make_road,
     make_traffic,
     observation_of,
 )
@@ -241,7 +240,7 @@ def make_agent(phase: Phase) -> Rainbow:
         len(actions.names),
         seed=config.seed,
         device=config.device,
-        legal=partial(legal_actions, road=make_road(config.env), actions=actions),
+        legal=partial(legal_actions, road=config.env.road(), actions=actions),
         compile=config.compiles(),
     )
 

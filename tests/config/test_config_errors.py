@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 from reference.refusals import everything_below, is_one_sentence
@@ -114,13 +115,19 @@ def test_a_whole_number_that_no_float_can_hold_is_one_sentence():
 # --- a disk that refuses
 
 
+def run_task(task, *arguments):
+    """``ganlane evaluate`` with this function in place of the command's."""
+    with patch("ganlane.config.run.function_of", lambda command: task):
+        return run_command("evaluate", arguments)
+
+
 def refused(capsys, task, *arguments):
     """The sentence with which ``ganlane evaluate`` ends when its task is this one.
 
     Nothing new is left.
     """
     before = everything_below(Path.cwd())
-    assert run_command("evaluate", arguments, task) == 2
+    assert run_task(task, *arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert is_one_sentence(err, "evaluate")
@@ -160,7 +167,7 @@ def test_what_was_earned_before_the_disk_was_full_stays(empty_folder, capsys):
         write_bytes(folder / "agent.safetensors", b"trained for hours")
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    assert run_command("evaluate", ["hydra.run.dir=run"], task) == 2
+    assert run_task(task, "hydra.run.dir=run") == 2
     assert capsys.readouterr().err == (
         "ganlane evaluate: a file or standard output: No space left on device; "
         "check the path, its permissions and the space there.\n"
@@ -179,7 +186,7 @@ def test_what_no_user_can_mend_keeps_its_traceback(empty_folder):
         raise ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
 
     with pytest.raises(ConnectionRefusedError):
-        run_command("evaluate", [], task)
+        run_task(task)
     assert list(empty_folder.rglob("*")) == []
     assert not is_users_matter(OSError("libfile.so: undefined symbol"))
     assert not is_users_matter(ValueError(errno.ENOSPC))

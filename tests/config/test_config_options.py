@@ -67,7 +67,7 @@ def test_every_traffic_is_an_option_under_its_own_name():
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_is_plain_text_and_gives_every_key_a_meaning(command, capsys):
-    text = help_text(command, COMMANDS[command][0])
+    text = help_text(command, COMMANDS[command])
     assert main([command, "--help"]) == 0
     assert capsys.readouterr().out == text + "\n"
     keys = text.partition("keys (KEY=VALUE")[2].partition("flags")[0]

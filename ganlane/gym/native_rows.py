@@ -3,18 +3,17 @@
 # ruff: noqa: D102 - Rows has the docstrings of the methods
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ganlane import keys
-from ganlane.gym.rows import Flags, Floats, Integers, Rows, described, measure, observation_space
+from ganlane.gym.rows import Flags, Floats, Integers, Rows, observation_space
 from ganlane.native.batch import NativeBatch, Stepped
 from ganlane.native.drivers import drivers_of, pays
 from ganlane.native.library import why_not
-from ganlane.native.settings import END_EVENTS, NATIVE_FORMS
+from ganlane.native.settings import NATIVE_FORMS, Array, Key
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.episode import Stream
 
@@ -24,32 +23,15 @@ class NativeRows(Rows):
 
     def __init__(self, batch: NativeBatch) -> None:
         self.batch, self.count, self.config = batch, batch.rows, batch.config
-        env = self.config.env
-        self.episode = env.episode_parameters()
+        self.episode = self.config.env.episode_parameters()
         self.space = observation_space(batch.observation.shape[1], batch.bounds[1])
-        # Made once, since they are views of arrays that the kernel writes to.
-        state = batch.state
-        self._arrays: dict[str, Any] = {
-            # No recorded scene is driven by the kernel, so none can end.
-            "scene_end": np.zeros(batch.rows, np.bool_),
-            "lanes": env.lanes,
-            "lane_width_m": np.float32(env.lane_width_m),
-            keys.REWARD_TERMS: batch.reward_terms(),
-        }
-        for name in (keys.SEED, keys.EPISODE, keys.STEP):
-            self._arrays[name] = state[name]
-        for name in ("y", "speed"):
-            self._arrays[name] = state[keys.VEHICLES, name][:, keys.EGO_INDEX]
-        for name in (*keys.EGO_FLOATS, *keys.EGO_INTEGERS):
-            self._arrays[name] = state[keys.EGO, name]
-        # Events with several beginnings are counted; the ego has a memory of the same names.
-        for name in (*END_EVENTS, *keys.EVENT_COUNTS):
-            self._arrays[name] = state[keys.EVENTS, name]
-        self._info = described(self._arrays, batch.mask)
+        # No recorded scene is driven by the kernel, so none can end.
+        self._no_end = np.zeros(self.count, np.bool_)
+        # Made once, since all of it but the lane and the time are views of the kernel's arrays.
+        self._info = super().info()
 
     def info(self) -> dict[str, Any]:
-        # All of it but the lane and the time are views.
-        measure(self._info, self._arrays)
+        self.measure(self._info)
         return self._info
 
     def __getstate__(self) -> tuple[NativeBatch, bool]:
@@ -79,8 +61,15 @@ class NativeRows(Rows):
     def mask(self) -> Flags:
         return self.batch.mask
 
-    def state_arrays(self) -> Mapping[str, Any]:
-        return self._arrays
+    def array(self, key: Key) -> Array:
+        array = self.batch.state.get(key, self._no_end)
+        return array[:, keys.EGO_INDEX] if array.ndim > 1 else array
+
+    def lanes(self) -> tuple[Any, Any]:
+        return self.config.env.lanes, self.config.env.lane_width_m
+
+    def reward_terms(self) -> dict[str, Array]:
+        return self.batch.reward_terms()
 
 
 def native_rows(config: HighwayConfig) -> NativeRows | None:

@@ -19,6 +19,7 @@ from gymnasium.spaces import Box, Discrete
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.native.batch import SPEED_RATIO_LIMIT, Stepped
+from ganlane.native.settings import Array, Key
 from ganlane.settings.actions import CONTROLS, ActionParameters
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.episode import EpisodeParameters
@@ -28,17 +29,15 @@ Integers = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 #: Exclusive upper bound of the seeds that unseeded environments draw.
 SEEDS: Final = 2**31
-#: Gymnasium's names of those parts of the info that are arrays of the state as they are.
-INFO: Final = {
+#: Those parts of gymnasium's info that are arrays of the state as they are, and their keys there.
+INFO: Final[dict[str, Key]] = {
     "seed": keys.SEED,
     "episode_number": keys.EPISODE,
-    "distance_m": "distance",
-    "speed_mps": "speed",
-    "decisions": "decisions",
-    "lane_changes": "lane_changes",
-    **{event: event for event in keys.END_EVENTS},
-    keys.SOFT_CRASH: keys.SOFT_CRASH,
-    keys.SOFT_CRASH_BEHIND: keys.SOFT_CRASH_BEHIND,
+    "distance_m": (keys.EGO, "distance"),
+    "speed_mps": (keys.VEHICLES, "speed"),
+    "decisions": (keys.EGO, "decisions"),
+    "lane_changes": (keys.EGO, "lane_changes"),
+    **{name: (keys.EVENTS, name) for name in (*keys.END_EVENTS, *keys.EVENT_COUNTS)},
 }
 #: Its name of the allowed actions.
 ACTION_MASK: Final = "action_mask"
@@ -103,12 +102,16 @@ class Rows(ABC):
         """
 
     @abstractmethod
-    def state_arrays(self) -> Mapping[str, Any]:
-        """What :meth:`info` is made of, arrays [N]; valid until the next call.
+    def array(self, key: Key) -> Array:
+        """An array [N] of the state (:mod:`ganlane.keys`), of ``vehicles`` the ego's."""
 
-        The values of :data:`INFO`, the ego's ``y`` in m, ``step``, ``reward_terms`` by name, and
-        ``lanes`` and ``lane_width_m``, each perhaps one number for all rows.
-        """
+    @abstractmethod
+    def lanes(self) -> tuple[Any, Any]:
+        """The road's number of lanes and their width in m, each perhaps one number for all rows."""
+
+    @abstractmethod
+    def reward_terms(self) -> dict[str, Array]:
+        """The terms of the last reward by name, each [N]."""
 
     def check_started(self) -> None:
         """Raise :class:`UserError` before the first :meth:`start`."""
@@ -117,32 +120,26 @@ class Rows(ABC):
 
     def info(self) -> dict[str, Any]:
         """Gymnasium's info (docs/gymnasium.md) as arrays [N] by name; valid until the next call."""
-        return described(self.state_arrays(), self.mask())
+        info: dict[str, Any] = {name: self.array(key) for name, key in INFO.items()}
+        info["time_s"] = np.empty(self.count)
+        info["lane"] = np.empty(self.count, np.int64)
+        # gymnasium's Discrete.sample() takes masks of int8; the bytes of booleans are the same.
+        if self.actions.names:
+            info[ACTION_MASK] = self.mask().view(np.int8)
+        info[keys.REWARD_TERMS] = self.reward_terms()
+        self.measure(info)
+        return info
 
-
-def described(state: Mapping[str, Any], mask: Flags) -> dict[str, Any]:
-    """The info of a ``state`` (:meth:`Rows.state_arrays`) and its action mask."""
-    info = {name: state[field] for name, field in INFO.items()}
-    rows = len(state["y"])
-    info["time_s"] = np.empty(rows)
-    info["lane"] = np.empty(rows, np.int64)
-    # gymnasium's Discrete.sample() takes masks of int8; the bytes of booleans are the same.
-    if mask.shape[1]:
-        info[ACTION_MASK] = mask.view(np.int8)
-    info[keys.REWARD_TERMS] = state[keys.REWARD_TERMS]
-    measure(info, state)
-    return info
-
-
-def measure(info: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-    """Write the info's time in s and the ego's lane."""
-    # Simulated time is counted in physics steps, so it has no sum of rounding errors.
-    np.multiply(state[keys.STEP], keys.PHYSICS_STEP_S, out=info["time_s"])
-    # The road's own rounding, in the run's float type.
-    y = state["y"]
-    lane = np.rint(y / np.asarray(state["lane_width_m"], y.dtype))
-    # An ego that has left the road is beyond the outer lanes.
-    info["lane"][:] = np.minimum(np.maximum(lane, 0.0), state["lanes"] - 1)
+    def measure(self, info: Mapping[str, Any]) -> None:
+        """Write the info's time in s and the ego's lane."""
+        # Simulated time is counted in physics steps, so it has no sum of rounding errors.
+        np.multiply(self.array(keys.STEP), keys.PHYSICS_STEP_S, out=info["time_s"])
+        # The road's own rounding, in the run's float type.
+        y = self.array((keys.VEHICLES, "y"))
+        lanes, width_m = self.lanes()
+        lane = np.rint(y / np.asarray(width_m, y.dtype))
+        # An ego that has left the road is beyond the outer lanes.
+        info["lane"][:] = np.minimum(np.maximum(lane, 0.0), lanes - 1)
 
 
 def observation_space(size: int, largest: float) -> Box:

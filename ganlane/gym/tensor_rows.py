@@ -3,7 +3,7 @@
 # ruff: noqa: D102 - Rows has the docstrings of the methods
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from ganlane.build import make_highways
 from ganlane.gym.rows import Flags, Floats, Integers, Rows, observation_space
 from ganlane.keys import EGO_INDEX
 from ganlane.native.batch import Stepped
+from ganlane.native.settings import Array, Key
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.observation import largest_number
 from ganlane.sim.state import road_in
@@ -91,25 +92,20 @@ class TensorRows(Rows):
             mask = legal_actions(state, road, self.actions)
         return _array(mask)
 
-    def state_arrays(self) -> Mapping[str, Any]:
-        state = self.now()
-        vehicles = state.get(keys.VEHICLES)
-        road = road_in(state, self.env.base_env.road)
-        tensors = dict(state.get(keys.EGO).items())
-        for name in (keys.SEED, keys.EPISODE, keys.STEP):
-            tensors[name] = state.get(name)
-        for name in ("y", "speed"):
-            tensors[name] = vehicles.get(name)[:, EGO_INDEX]
-        # Events have the shape [N, 1]. That of a soft crash replaces the ego's memory of it.
-        for name, event in state.get(keys.EVENTS).items():
-            tensors[name] = event[:, 0]
+    def array(self, key: Key) -> Array:
+        array = _array(self.now().get(key))
+        # The ego is the first vehicle; events have the shape [N, 1].
+        return array[:, EGO_INDEX] if array.ndim > 1 else array
+
+    def lanes(self) -> tuple[Any, Any]:
+        road = road_in(self.now(), self.env.base_env.road)
         # One number for all rows, or [N, 1].
-        tensors["lanes"] = torch.as_tensor(road.lanes).flatten()
-        tensors["lane_width_m"] = torch.as_tensor(road.lane_width_m).flatten()
-        arrays: dict[str, Any] = {name: _array(value) for name, value in tensors.items()}
-        terms = state.get(keys.REWARD_TERMS).items()
-        arrays[keys.REWARD_TERMS] = {name: _array(term[:, 0]) for name, term in terms}
-        return arrays
+        lanes, width_m = map(torch.as_tensor, (road.lanes, road.lane_width_m))
+        return _array(lanes.flatten()), _array(width_m.flatten())
+
+    def reward_terms(self) -> dict[str, Array]:
+        terms = self.now().get(keys.REWARD_TERMS).items()
+        return {name: _array(term[:, 0]) for name, term in terms}
 
 
 def _array(tensor: Tensor) -> npt.NDArray[Any]:

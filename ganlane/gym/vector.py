@@ -10,6 +10,7 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from ganlane import keys
 from ganlane.arguments import seed_number, whole_number
 from ganlane.errors import UserError
 from ganlane.gym.base import OnRows, make_rows
@@ -134,10 +135,9 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
             first = rows
             super().reset(seed=seeds[0] if len(seeds) == 1 else None)
         elif self._rows.started:
-            state = self._rows.state_arrays()
             # A copy: the state's own array is overwritten by the start.
-            seeds = state["seed"].copy()
-            first = state["episode"] + self.num_envs
+            seeds = self._rows.array(keys.SEED).copy()
+            first = self._rows.array(keys.EPISODE) + self.num_envs
         else:
             seeds = self._seed
             first = rows

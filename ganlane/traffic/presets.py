@@ -54,11 +54,10 @@ def gan_traffic(
     """
     drivers = gan_drivers(GanTrafficConfig(**keys), idm, stream)
     generator = with_weights(Generator, drivers.sizes, drivers.weights)
-    noise = (drivers.noise_period_s, drivers.noise_scale)
     # The order matters: a lane change moves sideways whatever the network did, and the guard bounds
     # the sum of all.
     parts: dict[str, TrafficModule] = {
-        "generator": SocialGanTraffic(generator, road, stream, *noise),
+        "generator": SocialGanTraffic(generator, drivers, road),
         "acceleration": AccelerationOverlay(road, stream, drivers.sudden),
         "lane_change": LiteralLaneChange(road, stream, drivers.changes),
     }
@@ -88,12 +87,8 @@ def gan_calibrated_traffic(
     """
     drivers = calibrated_drivers(GanCalibratedTrafficConfig(**keys), idm, stream)
     generator = with_weights(Generator, drivers.sizes, drivers.weights)
-    noise = (drivers.noise_period_s, drivers.noise_scale)
-    assert drivers.anchor is not None
     parts: dict[str, TrafficModule] = {
-        "generator": AnchoredGanTraffic(
-            generator, road, stream, *noise, drivers.headways_s, drivers.anchor
-        ),
+        "generator": AnchoredGanTraffic(generator, drivers, road),
         "lane_change": CalibratedLaneChange(road, stream, drivers.checked_changes, idm),
     }
     return TrafficSequential(parts, drivers)

@@ -12,9 +12,6 @@ from torch import Tensor
 
 from ganlane.errors import UserError
 from ganlane.generator.closed_loop import (
-    ANCHOR,
-    HEADWAY_QUANTILES_S,
-    AnchorParameters,
     DriverMemory,
     History,
     anchored_step,
@@ -25,11 +22,12 @@ from ganlane.generator.closed_loop import (
 )
 from ganlane.generator.networks import Generator
 from ganlane.keys import PHYSICS_STEP_S
+from ganlane.native.drivers import GeneratedDrivers
 from ganlane.settings.driving import Visibility
 from ganlane.settings.generator import EXTRA_INPUTS
-from ganlane.sim.random import Purpose, Stream, normal
+from ganlane.sim.random import Purpose, normal
 from ganlane.sim.state import Road, Vehicles
-from ganlane.traffic.base import Memory, MemoryFields, Moved, TrafficModule, in_dtype, uniforms
+from ganlane.traffic.base import Memory, Moved, TrafficModule, in_dtype, uniforms
 
 #: Latent dimensions that :class:`ganlane.sim.random.Purpose` has room for.
 _MOST_NOISE = int(Purpose.RECYCLE) - int(Purpose.NOISE)
@@ -44,8 +42,8 @@ class GeneratedTraffic(TrafficModule):
 
     Args:
         generator: the fitted network (:func:`ganlane.generator.load_generator`).
-        noise_period_s: correlation time of a driver's latent vector; 0 draws it anew at every step.
-        noise_scale: 1 samples as fitted, 0 drives by the mean prediction (z = 0).
+        drivers: the same for the native kernel: their noise, anchor and headways, their stream.
+        road: as for every traffic module.
 
     Raises:
         UserError: the generator belongs to the other preset, or its latent vector is too long.
@@ -58,14 +56,9 @@ class GeneratedTraffic(TrafficModule):
     extra_inputs = 0
 
     def __init__(
-        self,
-        generator: Generator,
-        road: Road | None = None,
-        stream: int = Stream.TRAIN,
-        noise_period_s: float = 5.0,
-        noise_scale: float = 1.0,
+        self, generator: Generator, drivers: GeneratedDrivers, road: Road | None = None
     ) -> None:
-        super().__init__(road, stream)
+        super().__init__(road, drivers.stream)
         sizes = generator.sizes
         # Purposes of the latent vector end where those of recycling begin.
         if sizes.extra_inputs != self.extra_inputs or sizes.noise > _MOST_NOISE:
@@ -75,15 +68,16 @@ class GeneratedTraffic(TrafficModule):
                 "weights of this traffic's own preset."
             )
         self.generator = generator
-        self.noise_period_s = noise_period_s
-        self.noise_scale = noise_scale
+        self.drivers = drivers
         # A tensor per motion, so that a step renames them instead of moving numbers.
         self.motions = [f"motion_{index}" for index in range(sizes.observed - 1)]
         # A purpose per latent dimension keeps them independent.
         self.purposes = [Purpose.NOISE + index for index in range(sizes.noise)]
-        motions: MemoryFields = dict.fromkeys(self.motions, ((4 * sizes.hidden,), None))
-        latent = {"displacement": ((2,), None), "noise": ((sizes.noise,), None)}
-        self.memory_fields = {**motions, **latent}
+        # The same as the kernel's, in the run's float type.
+        memory = drivers.memory().items()
+        self.memory_fields = {
+            key[-1]: (shape, None) for key, (_, shape) in memory if key[1] == "generator"
+        }
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """Straight driving at the present speed, and latent vectors of this episode."""
@@ -105,7 +99,7 @@ class GeneratedTraffic(TrafficModule):
         noise = memory["noise"]
         fresh = normal(key, step, noise.shape[1], self.purposes, noise.dtype)
         history = History(tuple(memory[name] for name in self.motions), memory["displacement"])
-        return history, wander(noise, fresh, self.noise_period_s)
+        return history, wander(noise, fresh, self.drivers.noise_period_s)
 
 
 class SocialGanTraffic(GeneratedTraffic):
@@ -122,7 +116,7 @@ class SocialGanTraffic(GeneratedTraffic):
         network = in_dtype(self.generator, vehicles.x.dtype)
         history, noise = self.before(memory, key, step)
         # Scaled for the network alone: the memory keeps unit variance.
-        moved, history = paper_step(network, vehicles, history, self.noise_scale * noise)
+        moved, history = paper_step(network, vehicles, history, self.drivers.noise_scale * noise)
         return moved, {**self.remember(history), "noise": noise}
 
 
@@ -131,36 +125,16 @@ class AnchoredGanTraffic(GeneratedTraffic):
 
     It follows ``vehicles.target_lane``, which an overlay sets, and ``vehicles.desired_speed``.
     Additional memory: ``residual_mean`` [N, M, 2] in m/s2 (the washout), ``headway`` [N, M] in s.
-
-    Args:
-        headway_quantiles_s: 5, 25, 50, 75 and 95 % quantiles of the drivers' headways.
-        anchor: its parameters.
     """
 
     extra_inputs = EXTRA_INPUTS
-
-    def __init__(
-        self,
-        generator: Generator,
-        road: Road | None = None,
-        stream: int = Stream.TRAIN,
-        noise_period_s: float = 5.0,
-        noise_scale: float = 1.0,
-        headway_quantiles_s: tuple[float, ...] = HEADWAY_QUANTILES_S,
-        anchor: AnchorParameters = ANCHOR,
-    ) -> None:
-        super().__init__(generator, road, stream, noise_period_s, noise_scale)
-        self.headway_quantiles_s = headway_quantiles_s
-        self.anchor = anchor
-        further = {"residual_mean": ((2,), None), "headway": ((), None)}
-        self.memory_fields = {**self.memory_fields, **further}
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """See :class:`GeneratedTraffic`; a headway for every driver, residual mean 0."""
         memory = super().fresh_memory(vehicles, key)
         (u,) = uniforms(vehicles, key, -1, Purpose.TRAIT_HEADWAY)
         # Headways as recorded, so that drivers differ as recorded ones do.
-        memory["headway"] = headway_from_uniform(u, self.headway_quantiles_s)
+        memory["headway"] = headway_from_uniform(u, self.drivers.headways_s)
         memory["residual_mean"] = torch.zeros_like(memory["displacement"])
         return memory
 
@@ -171,8 +145,10 @@ class AnchoredGanTraffic(GeneratedTraffic):
         history, noise = self.before(memory, key, step)
         # The washout's mean and the headway belong to the driver, as the history does.
         driver = DriverMemory(history, memory["residual_mean"], memory["headway"])
+        anchor = self.drivers.anchor
+        assert anchor is not None
         # Scaled for the network alone: the memory keeps unit variance.
-        latent = self.noise_scale * noise
-        moved, driver = anchored_step(network, vehicles, self.road, driver, latent, self.anchor)
+        latent = self.drivers.noise_scale * noise
+        moved, driver = anchored_step(network, vehicles, self.road, driver, latent, anchor)
         new_memory = {"noise": noise, "residual_mean": driver.mean, "headway": driver.headway}
         return moved, {**self.remember(driver.history), **new_memory}

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 import torch
 from reference.recordings import made_by_hand
-from reference.small_networks import silenced, small_generator
+from reference.small_networks import anchored_drivers, silenced, small_generator
 from reference.worlds import vehicles as vehicles_of
 from tensordict import TensorDict
 
@@ -147,7 +147,7 @@ def test_a_recorded_platoon_keeps_its_gaps_behind_a_leader_at_constant_speed():
     network = silenced(small_generator(EXTRA_INPUTS))
     there = drive_recordings(
         # Without a residual there are only IDM and each driver's headway.
-        lambda road: AnchoredGanTraffic(network, road),
+        lambda road: AnchoredGanTraffic(network, anchored_drivers(network), road),
         [scene],
         StartOptions(desired_above_mps=5.0),
     )

@@ -9,6 +9,10 @@ from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 from ganlane.data.dense import Recording, recordings_of
 from ganlane.generator.networks import Generator
+from ganlane.native.drivers import GeneratedDrivers
+from ganlane.settings.driving import IdmParameters
+from ganlane.settings.episode import Stream
+from ganlane.settings.generated import ANCHOR, HEADWAY_QUANTILES_S
 from ganlane.settings.generator import CalibratedConfig, GeneratorSizes, LoopConfig, PaperConfig
 
 SIZES = GeneratorSizes(embedding=16, hidden=12, pooling=10, pooled=6, context=14, noise=4)
@@ -29,6 +33,22 @@ def small_generator(extra_inputs: int = 0, seed: int = 0) -> Generator:
     """A generator with random weights."""
     torch.manual_seed(seed)
     return Generator(replace(SIZES, extra_inputs=extra_inputs))
+
+
+def anchored_drivers(
+    generator: Generator, headways_s: tuple[float, ...] = HEADWAY_QUANTILES_S
+) -> GeneratedDrivers:
+    """Drivers of the calibrated traffic with the generator's sizes."""
+    return GeneratedDrivers(
+        IdmParameters(),
+        generator.sizes,
+        {},
+        Stream.TRAIN,
+        noise_scale=1.0,
+        noise_period_s=5.0,
+        anchor=ANCHOR,
+        headways_s=headways_s,
+    )
 
 
 def silenced(generator: Generator) -> Generator:

@@ -137,7 +137,7 @@ def fitted_with(folder, *without, **settings):
 
 
 def anchor_of(path):
-    return dict(gan_calibrated_traffic(path=path).named_parts())["generator"].anchor
+    return dict(gan_calibrated_traffic(path=path).named_parts())["generator"].drivers.anchor
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import pytest
 import torch
+from reference.small_networks import anchored_drivers
 from tensordict import TensorDict
 
 from ganlane.errors import UserError
 from ganlane.generator.networks import Generator
+from ganlane.native.drivers import GeneratedDrivers
+from ganlane.settings.driving import IdmParameters
+from ganlane.settings.generated import HEADWAY_QUANTILES_S
 from ganlane.settings.generator import EXTRA_INPUTS, GeneratorSizes
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.spawn import spawn
@@ -33,12 +37,15 @@ def generator(extra_inputs=0):
     return Generator(GeneratorSizes(**SMALL, extra_inputs=extra_inputs)).requires_grad_(False)
 
 
-def paper(**options):
-    return SocialGanTraffic(generator(), ROAD, **options)
+def paper(extra_inputs=0):
+    network = generator(extra_inputs)
+    drivers = GeneratedDrivers(IdmParameters(), network.sizes, {}, Stream.TRAIN, 1.0, 5.0)
+    return SocialGanTraffic(network, drivers, ROAD)
 
 
-def calibrated(**options):
-    return AnchoredGanTraffic(generator(EXTRA_INPUTS), ROAD, **options)
+def calibrated(extra_inputs=EXTRA_INPUTS, headways_s=HEADWAY_QUANTILES_S):
+    network = generator(extra_inputs)
+    return AnchoredGanTraffic(network, anchored_drivers(network, headways_s), ROAD)
 
 
 @pytest.fixture(
@@ -122,7 +129,7 @@ def test_the_ego_is_a_neighbour_of_the_calibrated_drivers():
 
 
 def test_headways_come_from_the_quantiles_given():
-    module = calibrated(headway_quantiles_s=(1.0, 1.1, 1.2, 1.3, 1.4))
+    module = calibrated(headways_s=(1.0, 1.1, 1.2, 1.3, 1.4))
     headway = begin(module, rows=200)["traffic", "headway"]
     assert 1.0 <= headway.min() < headway.max() <= 1.4
     assert headway.median().item() == pytest.approx(1.2, abs=0.03)
@@ -130,6 +137,6 @@ def test_headways_come_from_the_quantiles_given():
 
 def test_the_other_presets_weights_are_refused():
     with pytest.raises(UserError, match="expected 4"):
-        AnchoredGanTraffic(generator(), ROAD)
+        calibrated(extra_inputs=0)
     with pytest.raises(UserError, match="expected 0"):
-        SocialGanTraffic(generator(EXTRA_INPUTS), ROAD)
+        paper(extra_inputs=EXTRA_INPUTS)

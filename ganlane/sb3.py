@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -217,7 +217,7 @@ def make_vec_env(
 
 
 #: Observation, mask, normaliser and actions.
-_Read: TypeAlias = tuple[
+_Read = tuple[
     ObservationConfig,
     MaskParameters | None,
     "VecNormalize | Normaliser | None",

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from ctypes import c_float, c_int32, c_void_p
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
@@ -85,7 +85,7 @@ from ganlane.weights import load_arrays
 if TYPE_CHECKING:
     from ganlane.data.statistics import DrivingStatistics
 
-Weights: TypeAlias = Mapping[str, Floats]
+Weights = Mapping[str, Floats]
 #: Parameters of a random driver in its memory.
 _TRAITS: Final = 11
 #: The longest delay of a reaction, in steps: MOST_FIELDS of rows.hpp less 12 other numbers.
@@ -107,7 +107,7 @@ SIMULATED_ANCHOR: AnchorParameters = replace(
 #: holds the resulting rate.
 WISH_PER_CHANGE = 1.8
 #: An array of a memory: its type, and its shape behind [rows, vehicles].
-_Array: TypeAlias = tuple[str, tuple[int, ...]]
+_Array = tuple[str, tuple[int, ...]]
 _NUMBER: Final[_Array] = ("float32", ())
 _COUNT: Final[_Array] = ("int64", ())
 
@@ -129,8 +129,8 @@ class RuleDrivers:
     ranges no two are alike.
     """
 
-    idm: IdmParameters = field(default_factory=IdmParameters)
-    steering: SteeringParameters = field(default_factory=SteeringParameters)
+    idm: IdmParameters = IdmParameters()
+    steering: SteeringParameters = SteeringParameters()
     mobil: MobilParameters | None = None
     faults: DriverFaults | None = None
     random: RandomDrivers | None = None
@@ -187,11 +187,11 @@ class GeneratedDrivers:
     stream: int
     noise_scale: float
     noise_period_s: float
-    sudden: SuddenAccelerations = field(default_factory=SuddenAccelerations)
-    changes: LiteralChanges = field(default_factory=LiteralChanges)
+    sudden: SuddenAccelerations = SuddenAccelerations()
+    changes: LiteralChanges = LiteralChanges()
     guard: GuardParameters | None = None
     anchor: AnchorParameters | None = None
-    checked_changes: CalibratedChanges = field(default_factory=CalibratedChanges)
+    checked_changes: CalibratedChanges = CalibratedChanges()
     headways_s: tuple[float, ...] = (0.0,) * len(QUANTILE_LEVELS)
     blind_share: float = 0.0
 
@@ -274,7 +274,7 @@ class HumanDrivers:
 
 
 #: Drivers of one kind.
-OneKind: TypeAlias = RuleDrivers | GeneratedDrivers | HumanDrivers
+OneKind = RuleDrivers | GeneratedDrivers | HumanDrivers
 #: Those by a network.
 NETWORKS: Final = (GeneratedDrivers, HumanDrivers)
 
@@ -307,7 +307,7 @@ class MixedDrivers:
         return memory
 
 
-Drivers: TypeAlias = OneKind | MixedDrivers
+Drivers = OneKind | MixedDrivers
 
 
 class Part(NamedTuple):

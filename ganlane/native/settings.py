@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Iterable, Mapping
 from ctypes import c_double, c_float, c_int32, c_int64, c_void_p
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 #: A key of the state as the environment's TensorDict has it: ``"step"``, ``("vehicles", "x")``.
 Key = str | tuple[str, ...]
-Array: TypeAlias = npt.NDArray[Any]
-Floats: TypeAlias = npt.NDArray[np.float32]
+Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float32]
 
 
 def within(group: str, names: str | Iterable[str]) -> tuple[Key, ...]:

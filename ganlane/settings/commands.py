@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any
 
 from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig, check_reward
@@ -28,17 +28,17 @@ from ganlane.settings.record import (
 from ganlane.settings.traffic import IdmMobilTrafficConfig, TrafficConfig, traffics_of
 
 #: Number of environments in a batch.
-Environments: TypeAlias = Annotated[int, between(1, 65536)]
+Environments = Annotated[int, between(1, 65536)]
 #: A number of episodes; their results stay in memory.
-Episodes: TypeAlias = Annotated[int, between(1, 10_000_000)]
+Episodes = Annotated[int, between(1, 10_000_000)]
 #: Names without repetitions.
-Names: TypeAlias = Annotated[list[str], DIFFERENT]
+Names = Annotated[list[str], DIFFERENT]
 #: Columns of printed tables.
-Columns: TypeAlias = Annotated[str, one_of(("auto", "all"))]
+Columns = Annotated[str, one_of(("auto", "all"))]
 #: Family of episodes: of training, of model selection, of reported figures.
-StreamName: TypeAlias = Annotated[str, one_of(("train", "select", "report"))]
+StreamName = Annotated[str, one_of(("train", "select", "report"))]
 #: The same where nobody is trained: also the episodes of ganlane benchmark.
-Measured: TypeAlias = Annotated[str, one_of(("report", "select", "benchmark"))]
+Measured = Annotated[str, one_of(("report", "select", "benchmark"))]
 
 
 @dataclass(frozen=True)
@@ -97,10 +97,10 @@ class DrivingConfig(RunConfig):
         reward: section V.C.
     """
 
-    env: EnvConfig = field(default_factory=EnvConfig)
-    observation: ObservationConfig = field(default_factory=ObservationConfig)
-    mask: MaskParameters = field(default_factory=MaskParameters)
-    reward: RewardParameters = field(default_factory=RewardParameters)
+    env: EnvConfig = EnvConfig()
+    observation: ObservationConfig = ObservationConfig()
+    mask: MaskParameters = MaskParameters()
+    reward: RewardParameters = RewardParameters()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -118,7 +118,7 @@ class HighwayConfig(DrivingConfig):
         stream: family of the episodes: train, select or report (the episodes of ganlane evaluate).
     """
 
-    traffic: TrafficConfig = field(default_factory=IdmMobilTrafficConfig)
+    traffic: TrafficConfig = IdmMobilTrafficConfig()
     num_envs: Environments = 1
     stream: StreamName = "train"
 

@@ -7,7 +7,7 @@ The latter are generated, random, faulty and recorded ones, and those of SUMO.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Annotated
 
@@ -280,7 +280,7 @@ class DriverFaults(Record):
         aborted_change: a driver turns back during a lane change.
     """
 
-    phantom_braking: BrakingFaults = field(default_factory=BrakingFaults)
-    late_reaction: ReactionFaults = field(default_factory=ReactionFaults)
-    hesitant_change: HesitationFaults = field(default_factory=HesitationFaults)
-    aborted_change: AbortFaults = field(default_factory=AbortFaults)
+    phantom_braking: BrakingFaults = BrakingFaults()
+    late_reaction: ReactionFaults = ReactionFaults()
+    hesitant_change: HesitationFaults = HesitationFaults()
+    aborted_change: AbortFaults = AbortFaults()

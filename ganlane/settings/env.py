@@ -7,8 +7,8 @@ blocked_lane, stop_and_go, merge, on_ramp, lane_drop, weave, exit`` start with a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
 
 from ganlane.arguments import call_with
 from ganlane.errors import ParameterError, as_typed
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from ganlane.sim.state import Road
 
 #: The ego and at least one other.
-Vehicles: TypeAlias = Annotated[int, between(2, 1000)]
+Vehicles = Annotated[int, between(2, 1000)]
 # 0 waits for the number of vehicles in the scene.
 _VEHICLES_OR_SCENE = Rule(lambda count: count == 0 or 2 <= count <= 1000, "a number from 2 to 1000")
 #: Keys of Table II, which do not apply to a given scene.
@@ -344,11 +344,11 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
     kernel: Annotated[str, one_of(KERNELS)] = "auto"
     # what stands at the start, and how everybody drives
     scene: SceneConfig | None = None
-    flow: FlowParameters = field(default_factory=FlowParameters)
-    actions: ActionParameters = field(default_factory=ActionParameters)
-    ego: EgoParameters = field(default_factory=EgoParameters)
-    idm: IdmParameters = field(default_factory=IdmParameters)
-    mobil: MobilParameters = field(default_factory=MobilParameters)
+    flow: FlowParameters = FlowParameters()
+    actions: ActionParameters = ActionParameters()
+    ego: EgoParameters = EgoParameters()
+    idm: IdmParameters = IdmParameters()
+    mobil: MobilParameters = MobilParameters()
 
     def __post_init__(self) -> None:
         super().__post_init__()

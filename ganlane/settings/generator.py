@@ -243,9 +243,9 @@ class PaperConfig(FitConfig):
     """
 
     preset: str = field(default="paper", kw_only=True)
-    sizes: GeneratorSizes = field(default_factory=GeneratorSizes)
-    weights: LossWeights = field(default_factory=LossWeights)
-    loop: LoopConfig = field(default_factory=LoopConfig)
+    sizes: GeneratorSizes = GeneratorSizes()
+    weights: LossWeights = LossWeights()
+    loop: LoopConfig = LoopConfig()
     # how windows are cut from the recordings
     group_size: Count = 9
     stride: Count = 1
@@ -319,7 +319,7 @@ class HumanConfig(FitConfig):
     """
 
     preset: str = field(default="human", kw_only=True)
-    sizes: HumanSizes = field(default_factory=HumanSizes)
+    sizes: HumanSizes = HumanSizes()
     # what is fitted to
     cutoff_hz: Positive = 0.6
     lateral_cutoff_hz: Positive = 0.4

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from ganlane import keys
@@ -94,7 +94,7 @@ class ObservationConfig(ObservationScale):
     group = "observation"
 
     form: Annotated[str, one_of(FORMS)] = "lane_view_overlap"
-    sensors: SensorParameters | None = field(default_factory=SensorParameters)
+    sensors: SensorParameters | None = SensorParameters()
 
     def __post_init__(self) -> None:
         super().__post_init__()

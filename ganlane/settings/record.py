@@ -28,7 +28,6 @@ from typing import (
     ClassVar,
     Final,
     NamedTuple,
-    TypeAlias,
     TypeVar,
     Union,
     get_args,
@@ -96,21 +95,21 @@ _RANGE_ABOVE_0 = Rule(
     lambda pair: _is_range(pair) and pair[0] > 0, "two numbers [low, high], 0 < low <= high"
 )
 
-Number: TypeAlias = Annotated[float, Rule(_finite, "a finite number")]
-Positive: TypeAlias = Annotated[float, _ABOVE_0]
-Negative: TypeAlias = Annotated[float, _BELOW_0]
-NotNegative: TypeAlias = Annotated[float, at_least(0)]
-NotPositive: TypeAlias = Annotated[float, _AT_MOST_0]
-Share: TypeAlias = Annotated[float, between(0, 1)]
-PositiveShare: TypeAlias = Annotated[float, _SHARE_ABOVE_0]
-Count: TypeAlias = Annotated[int, at_least(1)]
-CountOrZero: TypeAlias = Annotated[int, at_least(0)]
+Number = Annotated[float, Rule(_finite, "a finite number")]
+Positive = Annotated[float, _ABOVE_0]
+Negative = Annotated[float, _BELOW_0]
+NotNegative = Annotated[float, at_least(0)]
+NotPositive = Annotated[float, _AT_MOST_0]
+Share = Annotated[float, between(0, 1)]
+PositiveShare = Annotated[float, _SHARE_ABOVE_0]
+Count = Annotated[int, at_least(1)]
+CountOrZero = Annotated[int, at_least(0)]
 #: Up to 2**53 a whole number survives as a float, as in JSON.
-Seed: TypeAlias = Annotated[int, between(0, 2**53)]
-Text: TypeAlias = Annotated[str, Rule(bool, "a text that is not empty")]
+Seed = Annotated[int, between(0, 2**53)]
+Text = Annotated[str, Rule(bool, "a text that is not empty")]
 #: Lowest and highest value, from 0 on; or above 0.
-Range: TypeAlias = Annotated[tuple[float, float], _RANGE]
-PositiveRange: TypeAlias = Annotated[tuple[float, float], _RANGE_ABOVE_0]
+Range = Annotated[tuple[float, float], _RANGE]
+PositiveRange = Annotated[tuple[float, float], _RANGE_ABOVE_0]
 
 
 # --- options: a YAML file each

@@ -45,7 +45,7 @@ class PrepareConfig(CpuConfig):
         scene_s: cut recordings into scenes of so many seconds, so that some can be held out.
     """
 
-    data: DataConfig = field(default_factory=DataConfig)
+    data: DataConfig = DataConfig()
     out: str | None = None
     scene_s: Annotated[float, at_least(1)] | None = None
 
@@ -60,8 +60,8 @@ class TrainGeneratorConfig(CpuConfig):
         resume: folder of an earlier run: what was fitted there is not fitted again.
     """
 
-    data: DataConfig = field(default_factory=DataConfig)
-    generator: FitConfig = field(default_factory=PaperConfig)
+    data: DataConfig = DataConfig()
+    generator: FitConfig = PaperConfig()
     folds: CountOrZero = 0
     resume: str | None = None
 
@@ -98,7 +98,7 @@ class RealismConfig(CpuConfig):
         quick: true: a check that it runs, in seconds.
     """
 
-    traffic: TrafficConfig = field(default_factory=IdmMobilTrafficConfig)
+    traffic: TrafficConfig = IdmMobilTrafficConfig()
     against: dict[str, TrafficConfig] = field(
         default_factory=lambda: traffics_of(["idm_mobil"], "")
     )
@@ -115,8 +115,8 @@ class RealismConfig(CpuConfig):
     i80: bool | None = None
     resamples: Annotated[int, between(100, 100_000)] = 2000
     quick: bool = False
-    env: EnvConfig = field(default_factory=EnvConfig)
-    data: DataConfig = field(default_factory=DataConfig)
+    env: EnvConfig = EnvConfig()
+    data: DataConfig = DataConfig()
 
     def __post_init__(self) -> None:
         # One name stands for a list of one.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
@@ -84,8 +84,8 @@ class RenderConfig(DrivingConfig):
     run: Annotated[list[Text], DIFFERENT] | None = None
     # how, and where it goes
     out: str | None = None
-    traffic: TrafficConfig = field(default_factory=IdmMobilTrafficConfig)
-    film: FilmConfig = field(default_factory=FilmConfig)
+    traffic: TrafficConfig = IdmMobilTrafficConfig()
+    film: FilmConfig = FilmConfig()
 
     def __post_init__(self) -> None:
         super().__post_init__()

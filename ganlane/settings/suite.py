@@ -53,8 +53,8 @@ class Suite(Record):
     )
     shown: dict[str, Episodes] = field(default_factory=dict)
     pairs: list[Annotated[list[Text], _PAIR]] = field(default_factory=list)
-    env: EnvConfig = field(default_factory=EnvConfig)
-    reward: RewardParameters = field(default_factory=RewardParameters)
+    env: EnvConfig = EnvConfig()
+    reward: RewardParameters = RewardParameters()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -100,8 +100,8 @@ class BenchmarkConfig(RunConfig):
     agents: Names | None = None
     suite: Suite = field(default_factory=Suite)
     quick: bool = False
-    observation: ObservationConfig = field(default_factory=ObservationConfig)
-    mask: MaskParameters = field(default_factory=MaskParameters)
+    observation: ObservationConfig = ObservationConfig()
+    mask: MaskParameters = MaskParameters()
     num_envs: Environments = 256
     cells: str = "outputs/cells"
     films: Annotated[int, between(0, 10)] = 3

@@ -13,7 +13,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, TypeAlias
+from typing import Annotated, Any, ClassVar
 
 from ganlane.arguments import is_import_path
 from ganlane.errors import ParameterError
@@ -31,9 +31,7 @@ from ganlane.settings.record import (
     plain,
 )
 
-ImportPath: TypeAlias = Annotated[
-    str, Rule(is_import_path, "an import path such as my.module.MyTraffic")
-]
+ImportPath = Annotated[str, Rule(is_import_path, "an import path such as my.module.MyTraffic")]
 #: A larger sum would be a period of more episodes than anybody drives side by side.
 MOST_SHARES = 1000
 _SHARES = Rule(

@@ -121,13 +121,13 @@ class TrainConfig(DrivingConfig):
     # going on with a run; none of the settings of the run itself
     resume: str | None = None
     # on what, from what, by which agent
-    traffic: TrafficConfig = field(default_factory=IdmMobilTrafficConfig)
-    init: InitConfig = field(default_factory=InitConfig)
-    agent: RainbowConfig = field(default_factory=RainbowConfig)
-    logger: LoggerConfig = field(default_factory=LoggerConfig)
+    traffic: TrafficConfig = IdmMobilTrafficConfig()
+    init: InitConfig = InitConfig()
+    agent: RainbowConfig = RainbowConfig()
+    logger: LoggerConfig = LoggerConfig()
     # the phase before, and the comparison after
-    pretrain: PretrainConfig = field(default_factory=PretrainConfig)
-    evaluation: FinalEvaluationConfig = field(default_factory=FinalEvaluationConfig)
+    pretrain: PretrainConfig = PretrainConfig()
+    evaluation: FinalEvaluationConfig = FinalEvaluationConfig()
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, TypeAlias, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -21,11 +21,11 @@ from ganlane.sim.state import Road, Vehicles
 from ganlane.torch_settings import outside_autocast
 
 #: A module's memory: name to tensor [N, M, ...].
-Memory: TypeAlias = dict[str, Tensor]
+Memory = dict[str, Tensor]
 #: The vehicles after a step, and the memory to keep.
-Moved: TypeAlias = tuple[Vehicles, Memory]
+Moved = tuple[Vehicles, Memory]
 #: Name to (trailing shape after [N, M], dtype); the dtype None is the run's float type.
-MemoryFields: TypeAlias = Mapping[str, tuple[tuple[int, ...], torch.dtype | None]]
+MemoryFields = Mapping[str, tuple[tuple[int, ...], torch.dtype | None]]
 Network = TypeVar("Network", bound=nn.Module)
 
 

@@ -6,7 +6,7 @@ Which one an episode gets follows from its number or key, so it is the same in e
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, TypeAlias, cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -29,7 +29,7 @@ from ganlane.traffic.base import (
 )
 
 #: A part, its name before it, and its rows [R] of the batch.
-RowsOfPart: TypeAlias = tuple[str, TrafficModule, Tensor]
+RowsOfPart = tuple[str, TrafficModule, Tensor]
 
 
 class MixedTraffic(TrafficParts):

@@ -216,13 +216,6 @@ def make_vec_env(
     return HighwayVecEnv(HighwayVectorGym(num_envs=num_envs, traffic=traffic, seed=seed, **options))
 
 
-#: Observation, mask, normaliser and actions.
-_Read = tuple[
-    ObservationConfig,
-    MaskParameters | None,
-    "VecNormalize | Normaliser | None",
-    ActionParameters,
-]
 #: What may stand between a model and the highway, since it changes neither observation nor action.
 _TRANSPARENT = (
     HighwayVecEnv,
@@ -257,9 +250,7 @@ class ModelPolicy(TensorDictModuleBase):
     out_keys = [keys.ACTION]  # noqa: RUF012
 
     def __init__(
-        self,
-        model: BaseAlgorithm,
-        normaliser: VecNormalize | Normaliser | None = None,
+        self, model: BaseAlgorithm, normaliser: VecNormalize | Normaliser | None = None
     ) -> None:
         super().__init__()
         self.model = model
@@ -361,19 +352,19 @@ def driver(
             (``VecFrameStack``, an ``ObservationWrapper``, ...), or the file beside ``stored`` is
             missing, damaged, or that of another model.
     """
+    normaliser: VecNormalize | Normaliser | None
     if stored is None:
-        observation, mask, normaliser, actions = _of_environment(model)
+        reading, normaliser = _of_environment(model)
     else:
         reading = read_description(_model_file(stored))
-        observation, mask, normaliser = reading.observation, reading.mask, reading.normaliser
-        actions = reading.actions
+        normaliser = reading.normaliser
     policy = ModelPolicy(model, normaliser)
     name = name or type(model).__name__.lower()
-    return ModelDriver(name, policy, observation, mask, actions)
+    return ModelDriver(name, policy, reading.observation, reading.mask, reading.actions)
 
 
-def _of_environment(model: BaseAlgorithm) -> _Read:
-    """Observation, mask, normaliser and actions that the environment of a model has."""
+def _of_environment(model: BaseAlgorithm) -> tuple[Reading, VecNormalize | None]:
+    """What the environment of a model says that it reads and commands, and its normaliser."""
     env = model.get_env()
     if env is None:
         kind = type(model).__name__
@@ -398,10 +389,8 @@ def _of_environment(model: BaseAlgorithm) -> _Read:
         elif not isinstance(layer, _TRANSPARENT):
             raise _not_repeatable(layer)
     # Other algorithms drive without a mask, whatever mask their environment shows.
-    if not _is_masked(model):
-        return settings.observation, None, normaliser, settings.env.actions
-    mask = settings.mask
-    if mask.form == "none":
+    mask = settings.mask if _is_masked(model) else None
+    if mask is not None and mask.form == "none":
         # The environment showed which actions stay on the road. `legal` excludes more: commands
         # during a lane change, all of which have no effect unless a change can be turned back.
         if settings.env.ego.abort_lane_change:
@@ -410,7 +399,7 @@ def _of_environment(model: BaseAlgorithm) -> _Read:
                 "that can be turned back; train it with mask='legal' or 'safe'."
             )
         mask = MaskParameters("legal")
-    return settings.observation, mask, normaliser, settings.env.actions
+    return Reading(settings.observation, mask, actions=settings.env.actions), normaliser
 
 
 def _network(model: BaseAlgorithm) -> Network | None:

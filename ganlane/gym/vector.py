@@ -126,23 +126,19 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
 
     def _start(self, seed: int | Sequence[int] | None, episode: Any) -> None:
         """Begin the episodes that the arguments of a reset name, or the next ones, in all rows."""
-        rows = np.arange(self.num_envs)
-        seeds: Any
+        # Row i begins with episode i and adds N each time, so no two rows drive the same one.
+        rows = first = np.arange(self.num_envs)
+        seeds: Any = self._seed
         # A seed starts with its first episodes; without one every row goes on with its next.
         if seed is not None:
             seeds = [seed_number(one) for one in array_of(seed).ravel().tolist()]
-            # Row i begins with episode i and adds N each time, so no two rows drive the same one.
-            first = rows
             super().reset(seed=seeds[0] if len(seeds) == 1 else None)
         elif self._rows.started:
             # A copy: the state's own array is overwritten by the start.
             seeds = self._rows.array(keys.SEED).copy()
             first = self._rows.array(keys.EPISODE) + self.num_envs
-        else:
-            seeds = self._seed
-            first = rows
-            if seeds is None:
-                seeds = int(self.np_random.integers(SEEDS))
+        elif seeds is None:
+            seeds = int(self.np_random.integers(SEEDS))
         if episode is not None:
             first = array_of(episode)
             # Cast first: an unsigned number too large for int64 is below 0 then.

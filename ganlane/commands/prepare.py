@@ -49,21 +49,16 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
 
 def short_report(prepared: PooledStatistics) -> str:
     """Rows, exposure, lane-change rates and durations in a few lines."""
-    exposure = prepared.exposure
+    exposure, count = prepared.exposure, prepared.count
     # What was read and dropped first: a wrong format shows there.
-    lines = _row_lines(prepared)
+    lines = [f"rows: {count.read:,} read, {count.kept:,} kept, {prepared.written:,} written"]
+    lines += [f"dropped: {rows:,} ({reason})" for reason, rows in count.dropped.most_common()]
     lines.append(
         f"driving: {exposure.scenes} scenes, {exposure.cars} cars, {exposure.tracks} tracks, "
         f"{exposure.vehicle_km:.1f} vehicle-km"
     )
     lines += [*_lane_change_lines(prepared), *_acceleration_lines(prepared)]
     return "\n".join(lines)
-
-
-def _row_lines(prepared: PooledStatistics) -> list[str]:
-    count = prepared.count
-    lines = [f"rows: {count.read:,} read, {count.kept:,} kept, {prepared.written:,} written"]
-    return lines + [f"dropped: {rows:,} ({reason})" for reason, rows in count.dropped.most_common()]
 
 
 def _lane_change_lines(prepared: PooledStatistics) -> list[str]:

@@ -99,7 +99,7 @@ def _episodes(rows: TensorRows, policy: Any, config: RecordConfig) -> Iterator[E
 
     def begin(chosen: Iterable[int]) -> None:
         for row in chosen:
-            number = int(rows.now().get(EPISODE)[row])
+            number = int(rows.array(EPISODE)[row])
             buffers[row] = EpisodeBuffer(number, config.seed, {"episode": number}, [], [], infos={})
         observe(chosen)
 

@@ -17,7 +17,7 @@ from ganlane.data.dense import Recording, recordings_of
 from ganlane.data.one_lane import one_lane_files, read_one_lane
 from ganlane.evaluation import code_version, write_results
 from ganlane.evaluation.table import aligned, show
-from ganlane.generator import FitResult, Progress
+from ganlane.generator import Progress
 from ganlane.generator.forecasts import BASELINE, SAMPLES
 from ganlane.settings.generator import HumanConfig
 from ganlane.settings.recordings import TrainGeneratorConfig
@@ -42,7 +42,11 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     if config.folds:
         generator.assign_folds(scenes, config.folds)
 
-    following = cars_beside(source) if isinstance(fit_config, HumanConfig) else []
+    following: list[Recording] = []
+    # Cars that follow each other in one lane, from the files beside the scenes; perhaps none.
+    if isinstance(fit_config, HumanConfig):
+        for name, file in one_lane_files(source).items():
+            following += read_one_lane(name, file)
     # A resumed command finds its finished fits here and does not repeat them.
     states = Path(config.resume or folder) / "fits"
     weights = folder / f"generator_{fit_config.preset}.safetensors"
@@ -65,22 +69,26 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
             following,
         )
 
-    show(aligned(errors_table(result.metrics["all"], "held out")), columns=config.columns)
+    scenes_apart = dict(result.metrics)
+    overall = scenes_apart.pop("all")
+    show(aligned(errors_table(overall, "held out")), columns=config.columns)
     result.save(weights, further.get("folds"), code_version())
     print(f"weights: {weights}")
     # What the command line shows is also in results.json, in full.
-    numbers = results_of(result) | further | {"weights": str(weights)}
+    numbers = {
+        "preset": result.config.preset,
+        **overall,
+        "scenes": scenes_apart,
+        "data": result.data,
+        "statistics": result.statistics,
+        "updates": result.updates,
+        "wall_s": result.seconds,
+        **further,
+        "weights": str(weights),
+    }
     context = {"seed": config.seed, "held_out": held_out}
     used = asdict(replace(config, generator=fit_config))
     return f"results: {write_results(folder, numbers, used, context)}"
-
-
-def cars_beside(scenes: Path) -> list[Recording]:
-    """Cars that follow each other in one lane, from the files beside ``scenes``; perhaps none."""
-    cars = []
-    for name, file in one_lane_files(scenes).items():
-        cars += read_one_lane(name, file)
-    return cars
 
 
 class FitProgress(AbstractContextManager["FitProgress"]):
@@ -110,21 +118,6 @@ class FitProgress(AbstractContextManager["FitProgress"]):
     def __exit__(self, *error: object) -> None:
         if self._bar is not None:
             self._bar.close()
-
-
-def results_of(result: FitResult) -> dict[str, Any]:
-    """The numbers of ``results.json``: errors over all held-out scenes, and per scene."""
-    scenes = dict(result.metrics)
-    overall = scenes.pop("all")
-    return {
-        "preset": result.config.preset,
-        **overall,
-        "scenes": scenes,
-        "data": result.data,
-        "statistics": result.statistics,
-        "updates": result.updates,
-        "wall_s": result.seconds,
-    }
 
 
 def _percent(change: float) -> str:

@@ -21,11 +21,7 @@ from ganlane.traffic import (
     ReplayTraffic,
     TrafficSequential,
 )
-from ganlane.traffic.presets import (
-    gan_calibrated_traffic,
-    gan_traffic,
-    idm_faults_traffic,
-)
+from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic, idm_faults_traffic
 
 
 def replay() -> ReplayTraffic:
@@ -41,8 +37,7 @@ MAKE = {
     "gan": gan_traffic,
     "gan_calibrated": gan_calibrated_traffic,
     "mixed": lambda: MixedTraffic(
-        {"idm": IdmTraffic(), "faults": idm_faults_traffic()},
-        {"idm": 1, "faults": 1},
+        {"idm": IdmTraffic(), "faults": idm_faults_traffic()}, {"idm": 1, "faults": 1}
     ),
     "blind": lambda: BlindTraffic(IdmMobilTraffic(), 0.5),
     "replay": replay,
@@ -58,9 +53,7 @@ def shapes(memory: TensorDict) -> dict:
 
 
 @pytest.mark.parametrize("name", MAKE)
-def test_memory_and_moved_are_as_declared_and_the_state_at_t_is_never_written(
-    name,
-):
+def test_memory_and_moved_are_as_declared_and_the_state_at_t_is_never_written(name):
     traffic = MAKE[name]()
     state = environment(num_envs=4, traffic=traffic, dtype=torch.float32).reset()
     for step in range(2):
@@ -79,10 +72,7 @@ def test_memory_and_moved_are_as_declared_and_the_state_at_t_is_never_written(
         assert tuple(Vehicles.of(moved)._fields) == keys.VEHICLE_FIELDS
         others = before[keys.VEHICLES, "valid"] & (torch.arange(9) > 0)
         assert (moved["x"] > before[keys.VEHICLES, "x"])[others].all()
-        state[keys.VEHICLES], state[keys.STEP] = (
-            moved,
-            torch.full((4,), step + 1),
-        )
+        state[keys.VEHICLES], state[keys.STEP] = (moved, torch.full((4,), step + 1))
         state[keys.TRAFFIC] = after.get(keys.TRAFFIC, TensorDict({}, [4]))
 
 

@@ -58,7 +58,7 @@ def test_an_episode_is_the_same_among_others_and_in_rows_that_decide_at_other_ti
 
 
 def test_a_minute_of_driving_has_no_collision_and_nobody_leaves_the_road():
-    course = drive(range(8), 600)
+    course = drive(range(16), 300)
     vehicles, _ = course[-1]
     assert vehicles.speed[:, 1:].min() > 5.0
     for vehicles, _ in course[::20]:
@@ -83,15 +83,15 @@ def changes(course):
 
 def test_drivers_change_lanes_as_often_as_they_are_told():
     none, usual, more = (
-        changes(drive(range(16), 200, lane_changes=factor)) for factor in (0.0, 1.0, 8.0)
+        changes(drive(range(32), 100, lane_changes=factor)) for factor in (0.0, 1.0, 8.0)
     )
     assert none == 0
     assert 0 < usual < 0.5 * more
 
 
 def test_who_is_behind_counts_the_less_the_less_polite_a_driver_is():
-    assert changes(drive(range(32), 200, politeness=0.0)) > changes(
-        drive(range(32), 200, politeness=4.0)
+    assert changes(drive(range(64), 100, politeness=0.0)) > changes(
+        drive(range(64), 100, politeness=4.0)
     )
 
 

@@ -19,13 +19,7 @@ from ganlane.settings.traffic import (
     IdmMobilTrafficConfig,
     IdmTrafficConfig,
 )
-from ganlane.sim import (
-    Road,
-    SpawnParameters,
-    Vehicles,
-    pair_overlaps,
-    perceive,
-)
+from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps, perceive
 from ganlane.traffic import IdmTraffic
 
 

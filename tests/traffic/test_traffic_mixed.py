@@ -6,13 +6,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from reference.worlds import (
-    environment,
-    placed,
-    same_bits,
-    step,
-    vehicles,
-)
+from reference.worlds import environment, placed, same_bits, step, vehicles
 from scipy.stats import binomtest
 
 from ganlane import keys
@@ -27,11 +21,7 @@ from ganlane.settings.driving import (
 )
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
-from ganlane.settings.traffic import (
-    IdmTrafficConfig,
-    MixedTrafficConfig,
-    ReplayTrafficConfig,
-)
+from ganlane.settings.traffic import IdmTrafficConfig, MixedTrafficConfig, ReplayTrafficConfig
 from ganlane.sim import Road, Vehicles
 from ganlane.traffic import (
     BlindTraffic,
@@ -43,11 +33,7 @@ from ganlane.traffic import (
 )
 from ganlane.traffic.base import key_of
 from ganlane.traffic.mixed import interleaved
-from ganlane.traffic.presets import (
-    gan_traffic,
-    idm_faults_traffic,
-    with_faults,
-)
+from ganlane.traffic.presets import gan_traffic, idm_faults_traffic, with_faults
 
 #: So many faults that a few decisions hold some.
 OFTEN = DriverFaults(
@@ -70,16 +56,12 @@ def mixture(**shares: int) -> MixedTraffic:
     return MixedTraffic({name: MAKE[name]() for name in shares}, shares)
 
 
-def drive(traffic: TrafficModule, rows: int, decisions: int = 12) -> list:
+def drive(traffic: TrafficModule, rows: int, decisions: int = 6) -> list:
     env = environment(num_envs=rows, traffic=traffic, dtype=torch.float32)
     td = env.reset()
     seen = []
     for _ in range(decisions):
-        td = step(
-            env,
-            td,
-            (td[keys.EPISODE] + td[keys.EGO, "decisions"]) % 5 % 3,
-        )
+        td = step(env, td, (td[keys.EPISODE] + td[keys.EGO, "decisions"]) % 5 % 3)
         seen.append(td)
     return seen
 
@@ -117,13 +99,7 @@ def test_an_episode_is_the_same_bits_in_every_batch_and_in_every_rule_driven_tra
 def test_a_part_drives_its_episodes_to_the_bit_as_it_does_alone(name, wide):
     rows = [row for row in range(20) if interleaved(RULES)[row % 5] == name]
     for one, other in zip(wide, drive(MAKE[name](), 20)):
-        assert (
-            same_bits(
-                one[rows].exclude(keys.TRAFFIC),
-                other[rows].exclude(keys.TRAFFIC),
-            )
-            == []
-        )
+        assert same_bits(one[rows].exclude(keys.TRAFFIC), other[rows].exclude(keys.TRAFFIC)) == []
         assert same_bits(one[rows][keys.TRAFFIC, name], other[rows][keys.TRAFFIC]) == []
 
 
@@ -140,53 +116,23 @@ def test_scenes_set_by_hand_and_faults_laid_over_a_mixture_see_it_too():
     traffic = make_traffic(MixedTrafficConfig(shares={"gan": 1, "idm": 1}), scene)
     assert (make_env(traffic, scene, num_envs=4).reset()[keys.VEHICLES, "visibility"] >= 0).all()
     chain = drive(with_faults(mixture(idm=1, gan=1)), 4, 2)[-1]
-    assert chain[keys.VEHICLES, "visibility"][:, 1].tolist() == [
-        2,
-        1,
-        2,
-        1,
-    ]
+    assert chain[keys.VEHICLES, "visibility"][:, 1].tolist() == [2, 1, 2, 1]
 
 
 @pytest.mark.parametrize(
     ("make", "told"),
     [
-        (
-            lambda: MixedTrafficConfig(shares={"replay": 1}),
-            "replay: it plays recordings",
-        ),
-        (
-            lambda: MixedTrafficConfig(shares={"idm_mobli": 1}),
-            "did you mean 'idm_mobil'",
-        ),
-        (
-            lambda: MixedTrafficConfig(shares={}),
-            "whole numbers of at least 1",
-        ),
-        (
-            lambda: MixedTrafficConfig(shares={"idm": 2000}),
-            "whole numbers of at least 1",
-        ),
-        (
-            lambda: MixedTrafficConfig(shares={"idm": 0}),
-            "expected at least 1",
-        ),
-        (
-            lambda: MixedTrafficConfig(shares={"idm": 0.5}),
-            "expected a whole number",
-        ),
-        (
-            lambda: MixedTrafficConfig(shares=3),
-            "expected names with values",
-        ),
-        (
-            lambda: MixedTrafficConfig(shares={"mixed": 1}),
-            "is a mixture itself",
-        ),
+        (lambda: MixedTrafficConfig(shares={"replay": 1}), "replay: it plays recordings"),
+        (lambda: MixedTrafficConfig(shares={"idm_mobli": 1}), "did you mean 'idm_mobil'"),
+        (lambda: MixedTrafficConfig(shares={}), "whole numbers of at least 1"),
+        (lambda: MixedTrafficConfig(shares={"idm": 2000}), "whole numbers of at least 1"),
+        (lambda: MixedTrafficConfig(shares={"idm": 0}), "expected at least 1"),
+        (lambda: MixedTrafficConfig(shares={"idm": 0.5}), "expected a whole number"),
+        (lambda: MixedTrafficConfig(shares=3), "expected names with values"),
+        (lambda: MixedTrafficConfig(shares={"mixed": 1}), "is a mixture itself"),
         (
             lambda: MixedTraffic(
-                {"a": IdmTraffic(), "b": IdmTraffic(Road(lanes=2))},
-                {"a": 1, "b": 1},
+                {"a": IdmTraffic(), "b": IdmTraffic(Road(lanes=2))}, {"a": 1, "b": 1}
             ),
             "different roads or streams",
         ),
@@ -201,8 +147,7 @@ def test_what_cannot_be_is_refused_in_one_sentence(make, told):
 
 def test_a_model_of_ones_own_is_mixed_by_its_import_path():
     traffic = make_traffic(
-        MixedTrafficConfig(shares={"ganlane.traffic.IdmTraffic": 1, "idm_mobil": 1}),
-        EnvConfig(),
+        MixedTrafficConfig(shares={"ganlane.traffic.IdmTraffic": 1, "idm_mobil": 1}), EnvConfig()
     )
     assert isinstance(traffic, MixedTraffic)
     assert [name for name, _ in traffic.named_parts()] == [
@@ -226,9 +171,7 @@ CHASE = vehicles(
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
-def test_a_follower_brakes_for_an_ego_unless_it_does_not_see_it_and_the_environment_says_so(
-    share,
-):
+def test_a_follower_brakes_for_an_ego_unless_it_does_not_see_it_and_the_environment_says_so(share):
     """A fast driver behind a slow ego, second by second."""
     env = environment(vehicles=2, traffic=BlindTraffic(IdmTraffic(), share))
     td = placed(env, CHASE)

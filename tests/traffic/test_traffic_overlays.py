@@ -23,9 +23,7 @@ from ganlane.traffic import (
     TrafficModule,
     TrafficSequential,
 )
-from ganlane.traffic.overlays import (
-    literal_hazard,
-)
+from ganlane.traffic.overlays import literal_hazard
 
 
 class Drift(TrafficModule):
@@ -46,11 +44,7 @@ def run(n, m, seconds, base, **overlays):
     """The others [T + 1, N, M - 1] after every physics step beside a keep-lane ego, and the last
     state.
     """
-    env = HighwayEnv(
-        TrafficSequential({"base": base, **overlays}),
-        num_envs=n,
-        vehicles=m,
-    )
+    env = HighwayEnv(TrafficSequential({"base": base, **overlays}), num_envs=n, vehicles=m)
     all_vehicles, _, state = drive(env, range(n), seconds)
     return Vehicles(*(field[..., 1:] for field in all_vehicles)), state
 
@@ -76,13 +70,7 @@ def test_the_mean_wait_of_equation_10_is_the_root_of_half_pi_t_m_and_not_t_m():
 
 def test_literal_changes_end_on_a_lane_centre_at_their_own_lateral_speed_and_restart_the_clock():
     changes = LiteralChanges(mean_steps=60.0, lateral_speed_mps=1.0, lateral_speed_sd_mps=0.0)
-    others, state = run(
-        16,
-        6,
-        40,
-        IdmTraffic(),
-        change=LiteralLaneChange(changes=changes),
-    )
+    others, state = run(32, 6, 20, IdmTraffic(), change=LiteralLaneChange(changes=changes))
     moved = others.y.diff(dim=0).abs()
     fast = moved[moved > 0.05]
     assert len(fast) > 1000
@@ -94,7 +82,7 @@ def test_literal_changes_end_on_a_lane_centre_at_their_own_lateral_speed_and_res
 
 
 def test_calibrated_changes_find_gaps_and_touch_nobody():
-    others, _ = run(64, 12, 30, IdmTraffic(), change=CalibratedLaneChange())
+    others, _ = run(64, 12, 15, IdmTraffic(), change=CalibratedLaneChange())
     assert changes_started(others) > 50
     assert not any(pair_overlaps(Vehicles(*at)).any() for at in zip(*others))
 
@@ -107,17 +95,11 @@ def test_sudden_accelerations_fill_a_third_of_the_time_with_the_spread_of_the_da
     vehicles = HighwayEnv(IdmTraffic(), num_envs=200).reset()["vehicles"].clone()
     vehicles["speed"][:] = 20.0
     view = TensorDict({"vehicles": vehicles, "moved": vehicles.clone()}, [200])
-    view["seed"], view["episode"] = (
-        torch.zeros(200, dtype=torch.int64),
-        torch.arange(200),
-    )
+    view["seed"], view["episode"] = (torch.zeros(200, dtype=torch.int64), torch.arange(200))
     view["traffic"] = overlay.init_memory(Vehicles.of(vehicles), view["episode"])
     record = []
     for step in range(300):
-        view["step"], view["moved"] = (
-            torch.full((200,), step),
-            vehicles.clone(),
-        )
+        view["step"], view["moved"] = (torch.full((200,), step), vehicles.clone())
         record.append(overlay(view)["moved", "acceleration"])
     acceleration = torch.stack(record)
     active = acceleration.abs() > 1e-4
@@ -129,11 +111,10 @@ def test_sudden_accelerations_fill_a_third_of_the_time_with_the_spread_of_the_da
 
 def test_the_guard_keeps_a_drifting_network_on_the_road_and_at_a_speed_people_drive():
     road = Road()
-    others, state = run(32, 9, 40, Drift(road), guard=Guard(road))
+    others, state = run(32, 9, 20, Drift(road), guard=Guard(road))
     half = lateral_half_extent(others)
     outside = torch.maximum(
-        others.y + half - road.left_edge_m(),
-        road.right_edge_m() - (others.y - half),
+        others.y + half - road.left_edge_m(), road.right_edge_m() - (others.y - half)
     )
     assert outside[1:].max() <= 1e-4
     vehicles = state["vehicles"]
@@ -142,22 +123,15 @@ def test_the_guard_keeps_a_drifting_network_on_the_road_and_at_a_speed_people_dr
 
 
 def test_the_guard_does_not_let_a_network_that_always_brakes_stand_still():
-    others, _ = run(16, 3, 60, Drift(lateral=0.0, acceleration=-3.0), guard=Guard())
+    others, _ = run(16, 3, 20, Drift(lateral=0.0, acceleration=-3.0), guard=Guard())
     assert others.speed[-1].min() > 4.0
 
 
 @pytest.mark.parametrize("overlays", [{}, {"guard": Guard()}])
-def test_a_model_without_memory_drives_through_rollouts_and_resets(
-    overlays,
-):
+def test_a_model_without_memory_drives_through_rollouts_and_resets(overlays):
     model = Drift(lateral=0.0)
     traffic = TrafficSequential({"base": model, **overlays}) if overlays else model
     env = HighwayEnv(traffic, num_envs=3, episode=EpisodeParameters(goal_m=60.0))
     assert env.rollout(12, break_when_any_done=False)["next", "done"].any()
-    again = env.rollout(
-        3,
-        tensordict=env.reset(),
-        auto_reset=False,
-        break_when_any_done=False,
-    )
+    again = env.rollout(3, tensordict=env.reset(), auto_reset=False, break_when_any_done=False)
     assert again.shape == (3, 3)

@@ -16,19 +16,9 @@ from ganlane.settings.generator import EXTRA_INPUTS, GeneratorSizes
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.spawn import spawn
 from ganlane.sim.state import Road, Vehicles
-from ganlane.traffic.social_gan import (
-    AnchoredGanTraffic,
-    SocialGanTraffic,
-)
+from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
 
-SMALL = {
-    "embedding": 16,
-    "hidden": 12,
-    "pooling": 10,
-    "pooled": 6,
-    "context": 14,
-    "noise": 4,
-}
+SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
 ROAD = Road(3, 4.0)
 
 
@@ -48,10 +38,7 @@ def calibrated(extra_inputs=EXTRA_INPUTS, headways_s=HEADWAY_QUANTILES_S):
     return AnchoredGanTraffic(network, anchored_drivers(network, headways_s), ROAD)
 
 
-@pytest.fixture(
-    params=[paper, calibrated],
-    ids=["paper", "calibrated"],
-)
+@pytest.fixture(params=[paper, calibrated], ids=["paper", "calibrated"])
 def module(request):
     return request.param()
 
@@ -62,19 +49,10 @@ def begin(module, rows=4, vehicles=9, seed=5):
     episode = torch.arange(rows)
     key = episode_key(module.stream, seed, episode)
     state = spawn(key, vehicles, 3, 4.0)
-    counters = {
-        "seed": seed,
-        "episode": episode,
-        "step": torch.zeros_like(seed),
-    }
+    counters = {"seed": seed, "episode": episode, "step": torch.zeros_like(seed)}
     memory = module.init_memory(state, key)
     return TensorDict(
-        {
-            "vehicles": TensorDict(state.as_dict(), [rows]),
-            "traffic": memory,
-            **counters,
-        },
-        [rows],
+        {"vehicles": TensorDict(state.as_dict(), [rows]), "traffic": memory, **counters}, [rows]
     )
 
 
@@ -94,18 +72,13 @@ def test_streams_seeds_and_episodes_give_other_drivers(module):
     assert (one != begin(module, rows=2)["traffic", "noise"]).all()
 
 
-def test_a_vehicle_that_enters_has_driven_straight_at_its_present_speed(
-    module,
-):
+def test_a_vehicle_that_enters_has_driven_straight_at_its_present_speed(module):
     td = drive(module, begin(module), 3)
     key = episode_key(module.stream, td["seed"], td["episode"])
     fresh = module.init_memory(Vehicles.of(td["vehicles"]), key)
     assert all(leaf.shape[:2] == (4, 9) for leaf in fresh.values())
     speed = td["vehicles", "speed"][1, 4]
-    torch.testing.assert_close(
-        fresh["displacement"][1, 4],
-        torch.stack([0.1 * speed, 0.0 * speed]),
-    )
+    torch.testing.assert_close(fresh["displacement"][1, 4], torch.stack([0.1 * speed, 0.0 * speed]))
 
 
 def test_who_is_not_valid_is_not_seen(module):

@@ -20,12 +20,7 @@ from ganlane.settings.observation import largest_number
 from ganlane.settings.road import EXIT, WALL, LaneStretch
 from ganlane.sim import Road
 from ganlane.traffic import IdmMobilTraffic
-from ganlane.transforms import (
-    OBSERVATIONS,
-    ObservationTransform,
-    RewardTransform,
-    observation_size,
-)
+from ganlane.transforms import OBSERVATIONS, ObservationTransform, RewardTransform, observation_size
 
 EGO = (0.0, 1, 20.0, 25.0)
 NOBODY = [1.0, 0.0, 0.0]

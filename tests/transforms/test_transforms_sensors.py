@@ -31,22 +31,10 @@ EVERYTHING = SensorParameters(1.0, 0.5, 2.0, dropout=0.2, delay_s=2.0)
 OWN = 3
 
 
-def world(
-    sensors,
-    num_envs=3,
-    goal_m=5000.0,
-    period_s=1.0,
-    form="table3",
-    seed=11,
-):
+def world(sensors, num_envs=3, goal_m=5000.0, period_s=1.0, form="table3", seed=11):
     """IDM-MOBIL traffic with these sensors; None: without the transform."""
     episode = EpisodeParameters(decision_period_s=period_s, goal_m=goal_m)
-    base = HighwayEnv(
-        IdmMobilTraffic(),
-        num_envs=num_envs,
-        episode=episode,
-        seed=seed,
-    )
+    base = HighwayEnv(IdmMobilTraffic(), num_envs=num_envs, episode=episode, seed=seed)
     between = [] if sensors is None else [SensorTransform(sensors, base.stream, period_s)]
     seen = ObservationTransform(base.road, 9, form)
     return TransformedEnv(base, Compose(*between, seen, RewardTransform(period_s)))
@@ -55,18 +43,10 @@ def world(
 def action(td):
     """A fixed function of the episode and the decision: some lane changes, few of them legal."""
     number = (td[keys.EPISODE] * 7 + td[keys.EGO, "decisions"] * 5) % 11
-    return torch.where(
-        number == 1,
-        keys.LEFT,
-        torch.where(number == 2, keys.RIGHT, keys.KEEP),
-    )
+    return torch.where(number == 1, keys.LEFT, torch.where(number == 2, keys.RIGHT, keys.KEEP))
 
 
-def drive(
-    env,
-    decisions,
-    td=None,
-):
+def drive(env, decisions, td=None):
     """The states of a run without resets, the first one included, and the rewards that led to the
     others.
     """
@@ -82,31 +62,18 @@ def scene(rows, count):
     return Vehicles(*(field.expand(rows, count) for field in one))
 
 
-def many(
-    sensors,
-    rows=5000,
-    count=5,
-):
+def many(sensors, rows=5000, count=5):
     """The errors of many measurements of one scene.
 
     (along, across, speed) [rows, count], and who is seen.
     """
     true = scene(rows, count)
     numbers = torch.arange(rows)
-    seen = measure(
-        true,
-        episode_key(Stream.TRAIN, numbers * 0, numbers),
-        numbers % 10,
-        sensors,
-    )
+    seen = measure(true, episode_key(Stream.TRAIN, numbers * 0, numbers), numbers % 10, sensors)
     return (seen["x"] - true.x, seen["y"] - true.y, seen["speed"] - true.speed), seen["valid"]
 
 
-NOISY = SensorParameters(
-    position_noise_m=2.0,
-    lateral_noise_m=0.5,
-    speed_noise_mps=3.0,
-)
+NOISY = SensorParameters(position_noise_m=2.0, lateral_noise_m=0.5, speed_noise_mps=3.0)
 
 
 def test_errors_are_gaussian_without_bias_and_of_the_size_asked_for():
@@ -150,12 +117,12 @@ def test_nobody_is_seen_at_a_dropout_of_one_and_a_vehicle_that_is_not_there_neve
 
 
 def test_perfect_sensors_show_the_present_observation_bit_for_bit():
-    plain, perfect = (drive(world(sensors), 8) for sensors in (None, SensorParameters()))
+    plain, perfect = (drive(world(sensors), 4) for sensors in (None, SensorParameters()))
     for one, other in zip(plain, perfect):
         assert same_bits(one, other.exclude("perceived")) == []
 
 
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(
     st.floats(0, 5),
     st.floats(0, 3),
@@ -167,13 +134,7 @@ def test_perfect_sensors_show_the_present_observation_bit_for_bit():
 def test_the_true_state_reward_and_own_part_of_the_observation_are_untouched(
     along, across, speed, dropout, k, seed
 ):
-    sensors = SensorParameters(
-        along,
-        across,
-        speed,
-        dropout,
-        delay_s=float(k),
-    )
+    sensors = SensorParameters(along, across, speed, dropout, delay_s=float(k))
     for one, other in zip(*(drive(world(use, 2, seed=seed), 3) for use in (None, sensors))):
         bare = other.exclude("perceived", "sensors", "observation")
         assert same_bits(one.exclude("observation"), bare) == []
@@ -192,9 +153,9 @@ def test_a_delay_of_k_decisions_shows_the_others_as_they_were_measured_k_decisio
     form, k, errors
 ):
     """The noise belongs to the measurement, and comes as late as it."""
-    prompt = [td["observation"] for td in drive(world(SensorParameters(**errors), form=form), 8)]
+    prompt = [td["observation"] for td in drive(world(SensorParameters(**errors), form=form), 5)]
     sensors = SensorParameters(**errors, delay_s=float(k))
-    late = [td["observation"] for td in drive(world(sensors, form=form), 8)]
+    late = [td["observation"] for td in drive(world(sensors, form=form), 5)]
     others = slice(OWN, None if form == "table3" else -2)
     for number, observation in enumerate(late):
         # Until a measurement is old enough, the first one is delivered.
@@ -220,14 +181,13 @@ def test_a_state_without_the_delayed_measurements_is_refused():
         env.step(td.set("action", action(td)))
 
 
-@pytest.mark.parametrize(("rows", "at_least"), [(5, 7), (1, 2)])
-def test_an_episode_is_seen_alike_in_any_batch_and_after_automatic_resets(rows, at_least):
-    in_32 = tracks(world(EVERYTHING, 32, goal_m=140.0), 12, action)
-    assert_same_tracks(
-        tracks(world(EVERYTHING, rows, goal_m=140.0), 26, action),
-        in_32,
-        at_least,
+def test_an_episode_is_seen_alike_in_any_batch_and_after_automatic_resets():
+    in_32, in_5, alone = (
+        tracks(world(EVERYTHING, rows, goal_m=140.0), decisions, action)
+        for rows, decisions in ((32, 12), (5, 20), (1, 26))
     )
+    assert_same_tracks(in_5, in_32, at_least=7)
+    assert_same_tracks(alone, in_32, at_least=2)
 
 
 @pytest.mark.parametrize("sensors", [NOISY, EVERYTHING])
@@ -244,12 +204,7 @@ LATE = SensorParameters(delay_s=1.0, dropout=0.1)
 def test_a_transform_with_the_traffics_stream_is_inserted_where_there_are_errors(sensors, first):
     road = EnvConfig()
     traffic = make_traffic(IdmTrafficConfig(), road, Stream.REPORT)
-    env = make_env(
-        traffic,
-        road,
-        ObservationConfig(sensors=sensors),
-        num_envs=2,
-    )
+    env = make_env(traffic, road, ObservationConfig(sensors=sensors), num_envs=2)
     names = [type(transform).__name__ for transform in env.transform.transforms]
     assert names == [*first, "ObservationTransform", "RewardTransform"]
     if first:

@@ -61,7 +61,11 @@ def realism(config: RealismConfig, folder: Path) -> str:
     set_threads(config.threads)
     path = scenes_path(config)
     # Everything that can be refused is refused before hours of driving.
-    factories = traffic_factories(config)
+    # The card's traffic first, then its rivals.
+    traffics = {config.traffic.label(): config.traffic, **config.rivals()}
+    factories: dict[str, Factory] = {
+        name: partial(_make, traffic, config.env) for name, traffic in traffics.items()
+    }
     files = files_wanted(config, path)
     starts = drive_from_starts(config, factories, path)
     # Empty without files of one lane; the card then leaves these rows out.
@@ -88,12 +92,6 @@ def scenes_path(config: RealismConfig) -> Path | None:
         return default_scenes()
     except UserError:
         return None
-
-
-def traffic_factories(config: RealismConfig) -> dict[str, Factory]:
-    """Factories by name: the card's traffic first, then its rivals."""
-    traffics = {config.traffic.label(): config.traffic, **config.rivals()}
-    return {name: partial(_make, traffic, config.env) for name, traffic in traffics.items()}
 
 
 def _make(traffic: TrafficConfig, env: EnvConfig, road: Road) -> TrafficModule:

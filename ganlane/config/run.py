@@ -260,8 +260,17 @@ def _sweep(command: str, overrides: list[Override]) -> None:
             os.environ["HYDRA_FULL_ERROR"] = full
     if mistakes:
         raise mistakes[0]
-    if sweep_folder:
-        _show_sweep(sweep_folder[0], checked[0].columns)
+    if not sweep_folder:
+        return
+    # Imported here, since they import torch, which takes seconds.
+    from ganlane.evaluation.results import sweep_rows
+    from ganlane.evaluation.table import show, text_table
+
+    # One table of all comparisons.
+    rows = sweep_rows(sweep_folder[0])
+    if rows:
+        line = f"sweep: {sweep_folder[0].absolute()}"
+        show("", text_table(rows), line, columns=checked[0].columns)
 
 
 def single_runs(overrides: Sequence[Override]) -> list[list[str]]:
@@ -276,17 +285,6 @@ def single_runs(overrides: Sequence[Override]) -> list[list[str]]:
             words = [f"{key}={value}" for value in override.sweep_string_iterator()]
         choices.append(words)
     return [list(words) for words in itertools.product(*choices)]
-
-
-def _show_sweep(folder: Path, columns: str) -> None:
-    """One table of all comparisons of a sweep."""
-    # Imported here, since they import torch, which takes seconds.
-    from ganlane.evaluation.results import sweep_rows
-    from ganlane.evaluation.table import show, text_table
-
-    rows = sweep_rows(folder)
-    if rows:
-        show("", text_table(rows), f"sweep: {folder.absolute()}", columns=columns)
 
 
 # --- a run and its folder

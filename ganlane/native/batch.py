@@ -159,8 +159,12 @@ class NativeBatch:
         self._library = load(variant) if widest else load_for(rows)
         abort = env.ego.abort_lane_change
         # The kernel's structures, filled once.
+        period_and_terms = {
+            "decision_period_s": episode.decision_period_s,
+            "terms": len(self.terms),
+        }
         pointed: dict[str, Any] = {
-            "reward_settings": settings.reward_of(config.reward, episode.decision_period_s),
+            "reward_settings": filled(settings.Reward, vars(config.reward) | period_and_terms),
             "view": view,
             "view_inputs": self._pointers(_VIEWS),
             "mask_settings": mask_settings(highway, drivers.idm, mask.safe_deceleration, abort),

@@ -164,7 +164,10 @@ class RuleDrivers:
         """Further structures, by their names in :class:`~ganlane.native.settings.Settings`."""
         if self.faults is not None:
             return {"faults": _faults_of(self.faults)}
-        return {} if self.random is None else {"random": _random_of(self.random)}
+        if self.random is None:
+            return {}
+        ranges = {name: range_of(bounds) for name, bounds in vars(self.random).items()}
+        return {"random": _Random(**ranges, delay_steps=_steps(self.random.reaction_s[1]))}
 
 
 @dataclass(frozen=True)
@@ -475,11 +478,6 @@ class _Random(Structure):
         ),
         *fields(c_int32, "delay_steps"),
     )
-
-
-def _random_of(drivers: RandomDrivers) -> _Random:
-    ranges = {name: range_of(bounds) for name, bounds in vars(drivers).items()}
-    return _Random(**ranges, delay_steps=_steps(drivers.reaction_s[1]))
 
 
 class Network(Structure):

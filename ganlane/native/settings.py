@@ -25,7 +25,6 @@ from ganlane.settings.observation import (
     OVERLAP_M,
     ROAD_SIGHT_M,
     ObservationScale,
-    RewardParameters,
 )
 from ganlane.settings.road import FAR_M, WALL, FlowParameters, Stretches, exit_lane, leaving
 
@@ -438,9 +437,3 @@ def _fixed_of(scene: FixedScene) -> Fixed:
         arrays[name] = np.ascontiguousarray(base[name].astype(kind))
     pointers = {name: array.ctypes.data for name, array in arrays.items()}
     return filled(Fixed, vars(scene) | pointers, arrays)
-
-
-def reward_of(reward: RewardParameters, decision_period_s: float) -> Reward:
-    """The numbers of the reward, and of how many terms it is the sum."""
-    numbers = {"decision_period_s": decision_period_s, "terms": len(reward.term_names)}
-    return filled(Reward, vars(reward) | numbers)

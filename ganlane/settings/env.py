@@ -356,7 +356,13 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
         if self.metres_per_vehicle is not None:
             assign(self, spread_m=max(self.spread_m, self.metres_per_vehicle * self.vehicles))
         if isinstance(self.scene, FileScene):
-            self._take_road_of(self.scene)
+            scene = self.scene.read(self)
+            assign(
+                self,
+                lanes=int(scene.road.lanes),
+                lane_width_m=float(scene.road.lane_width_m),
+                ego_desired_speed_mps=scene.rows[0].desired_speed_mps,
+            )
         # A file has given what was 0; the number of vehicles may still wait for its scene.
         for name in ("vehicles", "lanes", "ego_desired_speed_mps"):
             if getattr(self, name) == 0 and (self.scene is None or name != "vehicles"):
@@ -379,15 +385,6 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
             )
         self._check_flow()
         self._check_start()
-
-    def _take_road_of(self, file: FileScene) -> None:
-        scene = file.read(self)
-        assign(
-            self,
-            lanes=int(scene.road.lanes),
-            lane_width_m=float(scene.road.lane_width_m),
-            ego_desired_speed_mps=scene.rows[0].desired_speed_mps,
-        )
 
     def _check_flow(self) -> None:
         if not self.flow.is_on:

@@ -19,7 +19,6 @@ from ganlane.errors import UserError
 from ganlane.native import settings
 from ganlane.native.drivers import (
     Drivers,
-    RuleDrivers,
     decision_settings,
     mask_settings,
     parts_of,
@@ -169,7 +168,7 @@ class Kernel(_Parts):
         vehicles: M, the ego included.
         episode: decision period, goal and time-out.
         ego: lane changes and soft crashes.
-        drivers: the others, and how the ego follows and steers; by default they keep their lanes.
+        drivers: the others, and how the ego follows and steers.
         variant: see :class:`_Function`.
         actions: what the ego is commanded; None: lanes.
         mobil: how the ego falls behind before a lane change that it has to make; None: as others.
@@ -179,15 +178,15 @@ class Kernel(_Parts):
         self,
         road: Road,
         vehicles: int,
-        episode: EpisodeParameters | None = None,
-        ego: EgoParameters | None = None,
-        drivers: Drivers | None = None,
+        episode: EpisodeParameters,
+        ego: EgoParameters,
+        drivers: Drivers,
         variant: str | None = None,
         actions: ActionParameters | None = None,
         mobil: MobilParameters | None = None,
     ) -> None:
         highway = _highway(road, vehicles, actions)
-        super().__init__(drivers or RuleDrivers(), highway)
+        super().__init__(drivers, highway)
         self._controls = not highway.actions.names
         self._functions = []
         for part in self.parts:
@@ -268,7 +267,7 @@ class NativeScenes(_Parts):
     Args:
         scenes: with a straight road, the same in all rows.
         stream: family of episodes.
-        drivers: of the others; None: rule-driven.
+        drivers: of the others.
         actions: what the ego is commanded; None: lanes.
     """
 
@@ -276,11 +275,11 @@ class NativeScenes(_Parts):
         self,
         scenes: RandomScenes,
         stream: int,
-        drivers: Drivers | None = None,
+        drivers: Drivers,
         actions: ActionParameters | None = None,
     ) -> None:
         highway = _highway(scenes.road, scenes.vehicles, actions)
-        super().__init__(drivers or RuleDrivers(), highway)
+        super().__init__(drivers, highway)
         self._functions = []
         for part in self.parts:
             others = scenes.others_visibility

@@ -25,10 +25,11 @@ from tensordict import TensorDict, TensorDictBase
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
+from ganlane.native.drivers import RuleDrivers
 from ganlane.native.tensors import Kernel, NativeScenes
 from ganlane.settings.actions import ActionParameters
-from ganlane.settings.driving import Visibility
-from ganlane.settings.episode import SpawnParameters
+from ganlane.settings.driving import EgoParameters, Visibility
+from ganlane.settings.episode import EpisodeParameters, SpawnParameters
 from ganlane.settings.road import EXIT, FlowParameters, LaneStretch
 from ganlane.sim.random import episode_key
 from ganlane.sim.spawn import RandomScenes
@@ -269,7 +270,7 @@ def test_and_with_every_instruction_set(crowd, variant):
 
 def test_a_ring_is_refused_in_one_sentence():
     with pytest.raises(UserError, match="must be straight"):
-        Kernel(Road(3, ring_m=500.0), 9)
+        Kernel(Road(3, ring_m=500.0), 9, EpisodeParameters(), EgoParameters(), RuleDrivers())
 
 
 def test_what_goes_in_stays_as_it_is_and_need_not_be_contiguous():
@@ -305,7 +306,7 @@ def test_what_goes_in_stays_as_it_is_and_need_not_be_contiguous():
 def test_every_number_of_a_first_scene_is_that_of_the_tensor_code(scenes):
     seed = torch.full((200,), 7)
     episode = torch.arange(200) * 13 - 50
-    state = NativeScenes(scenes, 2).start(seed, episode)
+    state = NativeScenes(scenes, 2, RuleDrivers()).start(seed, episode)
     expected = scenes(episode_key(2, seed, episode), torch.float32)
     assert same_bits(state[keys.VEHICLES], TensorDict(expected.as_dict(), [200])) == []
     rest = state.exclude(keys.VEHICLES, keys.SEED, keys.EPISODE)
@@ -316,7 +317,7 @@ def test_rows_that_are_not_asked_for_stay_empty():
     seed = torch.zeros(600, dtype=torch.int64)
     episode = torch.arange(600)
     rows = torch.arange(600) % 7 == 3
-    kernel = NativeScenes(RandomScenes(), 2)
+    kernel = NativeScenes(RandomScenes(), 2, RuleDrivers())
     some, every = (kernel.start(seed, episode, drawn)[keys.VEHICLES] for drawn in (rows, None))
     assert torch.equal(some["x"][rows], every["x"][rows])
     assert not some["valid"][~rows].any()

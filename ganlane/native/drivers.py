@@ -449,10 +449,10 @@ class _Faults(Structure):
 def _faults_of(faults: DriverFaults) -> _Faults:
     braking, late = faults.phantom_braking, faults.late_reaction
     return _Faults(
-        braking_chance=_chance(braking.per_hour),
+        braking_chance=chance_in_step(braking.per_hour),
         braking_steps=_steps(braking.lasts_s),
         deceleration=braking.deceleration,
-        lapse_chance=_chance(late.per_hour),
+        lapse_chance=chance_in_step(late.per_hour),
         lapse_steps=_steps(late.lasts_s),
         hesitation_share=faults.hesitant_change.share,
         pace=faults.hesitant_change.pace,
@@ -462,7 +462,7 @@ def _faults_of(faults: DriverFaults) -> _Faults:
     )
 
 
-def _chance(per_hour: float) -> float:
+def chance_in_step(per_hour: float) -> float:
     """Of at least one event of a Poisson process within a step."""
     return -math.expm1(-per_hour * keys.PHYSICS_STEP_S / 3600.0)
 

@@ -7,14 +7,13 @@ towards ``vehicles.target_lane``, as every model that ships does.
 
 from __future__ import annotations
 
-import math
 from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
-from ganlane.native.drivers import faulty_drivers
+from ganlane.native.drivers import chance_in_step, faulty_drivers
 from ganlane.settings.driving import (
     AbortFaults,
     BrakingFaults,
@@ -105,9 +104,7 @@ class TimedFault(Fault[Timed]):
 
         A fault begins where there is none, at a constant hazard.
         """
-        # Poisson process: the chance of at least one fault within a step.
-        per_step = -math.expm1(-self.faults.per_hour * self.dt / 3600.0)
-        comes = self.draw(vehicles, key, step) < per_step
+        comes = self.draw(vehicles, key, step) < chance_in_step(self.faults.per_hour)
         # A fault that lasts is not prolonged by a second one.
         begins = (left == 0) & other_drivers(vehicles) & comes
         return torch.where(begins, round(self.faults.lasts_s / self.dt), left)

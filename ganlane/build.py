@@ -141,21 +141,21 @@ def make_env(
         actions=env.actions,
         mobil=env.mobil,
     )
-    # None where the native kernel does not implement what is asked for.
-    kernel = base.kernel
+    # False where the native kernel does not implement what is asked for.
+    native = base.kernel is not None
     transforms: list[ObservationTransform | ActionMaskTransform] = [
         ObservationTransform(
             base.road,
             env.vehicles,
             observation.form,
             observation.scale(),
-            kernel is not None,
+            native,
             env.actions,
         )
     ]
     # The mask needs to know whether a lane change under way may be called off.
     if mask is not None and mask.form != "none":
-        abort, vehicles = env.ego.abort_lane_change, None if kernel is None else kernel.vehicles
+        abort, vehicles = env.ego.abort_lane_change, env.vehicles if native else None
         parameters = (mask.form, mask.safe_deceleration, env.idm, abort, vehicles, env.actions)
         transforms.append(ActionMaskTransform(base.road, *parameters))
     sensors = observation.sensors

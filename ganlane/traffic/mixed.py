@@ -121,11 +121,12 @@ class MixedTraffic(TrafficParts):
             before = taken.get(keys.VEHICLES)
             output = part(taken)
             # Vehicles are compared by name, since other parts have written into the others' rows.
-            changed = {}
-            for field, value in output.get(keys.MOVED).items():
-                # `is`, not ==: a field that was only passed on needs no write.
-                if value is not before.get(field):
-                    changed[field] = value
+            # `is`, not ==: a field that was only passed on needs no write.
+            changed = {
+                field: value
+                for field, value in output.get(keys.MOVED).items()
+                if value is not before.get(field)
+            }
             moved = with_rows(moved, rows, changed)
             new_memories[name] = with_rows(memory, rows, memory_of(output))
         tensordict.set(keys.MOVED, moved)

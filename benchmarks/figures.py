@@ -128,7 +128,7 @@ def discriminator_blocks(
     """The discriminator's parts, run on ``steps`` displacements of ``vehicles`` vehicles."""
     shown = torch.zeros(1, vehicles, steps, 2)
     encoder = discriminator.encoder
-    projected = encoder.project(shown[..., 1:, :], shown.diff(dim=-2))
+    projected = encoder.project_course(shown)
     return [
         Block("displacements", ("observed, then recorded", "or predicted"), _shape(shown)),
         Block(

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import polars as pl
@@ -29,9 +28,9 @@ from ganlane.data.schema import (
 from ganlane.data.tables import LINE, raise_unless_positive, raise_where, read_table
 from ganlane.errors import UserError
 
-_TRACKS: Final = "_tracks.csv"
+_TRACKS = "_tracks.csv"
 #: Columns of ``XX_tracks.csv`` that are read.
-COLUMNS: Final = {
+COLUMNS = {
     **dict.fromkeys(("frame", "id", "laneid"), pl.Int64),
     **dict.fromkeys(
         ("x", "y", "width", "height", "xvelocity"),
@@ -39,14 +38,14 @@ COLUMNS: Final = {
     ),
 }
 #: Columns of ``XX_recordingMeta.csv`` that are read.
-_META: Final = {
+_META = {
     "framerate": pl.Float64,
     "upperlanemarkings": pl.String,
     "lowerlanemarkings": pl.String,
 }
 #: Each direction's side of the image, its ``drivingDirection``, and whether ``x`` of the image
 #: grows (1) or falls (-1) along it.
-_SIDES: Final = (("upper", 1, -1.0), ("lower", 2, 1.0))
+_SIDES = (("upper", 1, -1.0), ("lower", 2, 1.0))
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ drivers keep an offset. Where the track ends first, the change is censored on th
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 import polars as pl
@@ -29,7 +28,7 @@ from ganlane.data.schema import FRAME_S
 from ganlane.errors import UserError
 
 #: 12 feet, the standard lane of a US freeway: used where a recording has one lane only.
-STANDARD_LANE_WIDTH_M: Final = 3.66
+STANDARD_LANE_WIDTH_M = 3.66
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
@@ -203,11 +202,7 @@ def tracks_of_frame(
         width=pl.col("scene").replace_strict(widths, return_dtype=pl.Float64),
         begins=~(continues & same_scene).fill_null(False),
     )
-    return Tracks(
-        columns["y"].to_numpy(),
-        columns["width"].to_numpy(),
-        columns["begins"].to_numpy(),
-    )
+    return Tracks(*(column.to_numpy() for column in columns))
 
 
 @dataclass(frozen=True)
@@ -279,13 +274,8 @@ def lane_changes_of_arrays(y: ArrayLike, lane_width: float) -> LaneChanges:
     # Every vehicle is a track of its own, present all the time.
     begins = np.zeros(columns.shape, bool)
     begins[:, 0] = True
-    return find_lane_changes(
-        Tracks(
-            columns.ravel(),
-            np.full(columns.size, lane_width),
-            begins.ravel(),
-        )
-    )
+    widths = np.full(columns.size, lane_width)
+    return find_lane_changes(Tracks(columns.ravel(), widths, begins.ravel()))
 
 
 def _crossings(lane: Integers, tracks: Tracks) -> Integers:

@@ -18,18 +18,12 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import polars as pl
 
 from ganlane.data.lanes import lane_grid
-from ganlane.data.schema import (
-    SCHEMA,
-    RowCount,
-    Scene,
-    number_tracks,
-    sort,
-)
+from ganlane.data.schema import RowCount, Scene, number_tracks, sort
 from ganlane.data.tables import (
     LINE,
     OnProgress,
@@ -48,10 +42,10 @@ from ganlane.settings.generator import (
     NgsimParameters,
 )
 
-FOOT_M: Final = 0.3048
-FRAME_MS: Final = 100
+FOOT_M = 0.3048
+FRAME_MS = 100
 #: The 18 columns of the raw text files, which have no header.
-RAW_NAMES: Final = (
+RAW_NAMES = (
     "vehicle_id",
     "frame_id",
     "total_frames",
@@ -72,34 +66,25 @@ RAW_NAMES: Final = (
     "time_headway",
 )
 #: Columns that are read; ``location`` too, where it exists.
-COLUMNS: Final = {
+COLUMNS = {
     **dict.fromkeys(("vehicle_id", "frame_id", "global_time"), pl.Int64),
-    **dict.fromkeys(
-        (
-            "local_x",
-            "local_y",
-            "v_length",
-            "v_width",
-            "v_vel",
-        ),
-        pl.Float64,
-    ),
+    **dict.fromkeys(("local_x", "local_y", "v_length", "v_width", "v_vel"), pl.Float64),
     "lane_id": pl.Int64,
 }
-LOCATION: Final = "location"
+LOCATION = "location"
 #: Further locations in the portal's file: streets with intersections.
-STREETS: Final = ("lankershim", "peachtree")
+STREETS = ("lankershim", "peachtree")
 #: A file has about six periods; a damaged column of times or frames makes hundreds, or one of a few
 #: rows. The least number of rows, where there are several periods, are those of a vehicle for 5 s.
 MAX_PERIODS = 500
 MIN_ROWS = 50
 #: Maximum number of rows from which lane width and position are estimated.
-ROWS_FOR_LANES: Final = 500_000
+ROWS_FOR_LANES = 500_000
 #: Medians of vehicle lengths that can be feet: 15 is usual, 4.5 would be metres, 450 centimetres.
-LENGTHS_FT: Final = (8.0, 40.0)
+LENGTHS_FT = (8.0, 40.0)
 #: Distance covered divided by speed times time. Recordings give 1.00; km/h give 0.91, miles per
 #: hour 1.47.
-PACE: Final = (0.94, 1.06)
+PACE = (0.94, 1.06)
 #: The pace is measured on tracks of at least 2 s at 10 ft/s or more.
 _PACE_FRAMES = 20
 _PACE_FT_S = 10.0
@@ -225,10 +210,7 @@ def _store_by_period(
     periods: dict[str, list[Path]] = {}
     numbers = Counter[str]()
     for location, minute in sorted(parts):
-        numbers[location] += (
-            location,
-            minute - 1,
-        ) not in parts
+        numbers[location] += (location, minute - 1) not in parts
         periods.setdefault(f"{location}-{numbers[location]}", []).extend(parts[location, minute])
     for name, files in periods.items():
         location = name.rpartition("-")[0]
@@ -278,9 +260,9 @@ def _scene(
     last = int(from_left.max())
     # Front centres in feet become centres of the body in metres.
     frame = rows.select(
-        pl.lit(name).alias("scene"),
-        pl.col("vehicle_id").alias("vehicle"),
-        pl.col("frame_id").alias("frame"),
+        scene=pl.lit(name),
+        vehicle="vehicle_id",
+        frame="frame_id",
         x=FOOT_M * (pl.col("local_y") - 0.5 * pl.col("v_length")),
         y=pl.Series(last * width - (right_m - first_centre)),
         speed=FOOT_M * pl.col("v_vel"),
@@ -288,11 +270,7 @@ def _scene(
         length=FOOT_M * pl.col("v_length"),
         width=FOOT_M * pl.col("v_width"),
     )
-    return Scene(
-        name,
-        sort(number_tracks(frame, str(path))).select(SCHEMA.names()),
-        width,
-    )
+    return Scene(name, sort(number_tracks(frame, str(path))), width)
 
 
 def _drop_duplicates(rows: pl.DataFrame, count: RowCount) -> pl.DataFrame:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import polars as pl
@@ -23,20 +22,20 @@ from ganlane.data.tables import read_table
 from ganlane.errors import UserError
 
 #: Name to file, from the folder of NGSIM's scenes.
-ONE_LANE_FILES: Final = {
+ONE_LANE_FILES = {
     "I-80, lane_1": "i80_1600_lane1.csv",
     "I-80, pairs": "i80_1600_pairs.csv",
     "I-80, following": "i80_following.csv",
     "I-24": "../i24/instrumented.csv",
 }
-SEGMENT_S: Final = 15.0
+SEGMENT_S = 15.0
 #: The first seconds of a pair, in which the published smoothing bends the follower's speed, s.
-EDGE_S: Final = 3.0
-_LENGTH_M: Final = 4.5
-_WIDTH_M: Final = 2.0
+EDGE_S = 3.0
+_LENGTH_M = 4.5
+_WIDTH_M = 2.0
 #: No leader comes nearer, or gets away, by more than this within 0.1 s, m.
-_JUMP_M: Final = 2.0
-_NUMBERS: Final = {
+_JUMP_M = 2.0
+_NUMBERS = {
     "vehicle": pl.Int64,
     "frame": pl.Int64,
     "x": pl.Float64,
@@ -159,7 +158,7 @@ def _instrumented(path: Path) -> pl.DataFrame:
     return pl.concat(cars).with_columns(length=_LENGTH_M)
 
 
-_READERS: Final = {
+_READERS = {
     "I-80, lane_1": _lane,
     "I-80, pairs": _pairs,
     "I-80, following": _following,

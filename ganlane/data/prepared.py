@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -35,8 +35,8 @@ from ganlane.files import whole_folder
 from ganlane.settings.generator import NgsimParameters
 
 #: Accelerations beyond it, which few cars reach, are strong, m/s2.
-_STRONG_MPS2: Final = 3.0
-_ACCELERATIONS: Final = ("acceleration_raw", "acceleration_smoothed")
+_STRONG_MPS2 = 3.0
+_ACCELERATIONS = ("acceleration_raw", "acceleration_smoothed")
 
 
 class PooledStatistics:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
 
 import polars as pl
 
@@ -42,8 +41,8 @@ from ganlane.settings.generator import NgsimParameters
 
 #: Columns of a scene CSV: the schema's, but the speed is ``v``; ``y`` is positive to the left and 0
 #: at the centre of lane 1, which is the leftmost.
-COLUMNS: Final = {"v" if name == "speed" else name: kind for name, kind in SCHEMA.items()}
-PARQUET: Final = ".parquet"
+COLUMNS = {"v" if name == "speed" else name: kind for name, kind in SCHEMA.items()}
+PARQUET = ".parquet"
 #: How a Parquet file begins.
 _PARQUET = b"PAR1"
 

@@ -10,17 +10,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Final, SupportsInt
+from typing import SupportsInt
 
 import polars as pl
 
 from ganlane.data.tables import FIRST_LINE
 from ganlane.errors import UserError
 
-FRAME_S: Final = 0.1
-TRACK_STRIDE: Final = 10_000
+FRAME_S = 0.1
+TRACK_STRIDE = 10_000
 #: Columns in order, with their types.
-SCHEMA: Final = pl.Schema(
+SCHEMA = pl.Schema(
     {
         "scene": pl.String(),  # one recording; scenes are independent of each other
         # number of the track in its scene; ``vehicle % TRACK_STRIDE`` is the car
@@ -38,13 +38,13 @@ SCHEMA: Final = pl.Schema(
     }
 )
 #: Columns that identify a track.
-TRACK: Final = ("scene", "vehicle")
+TRACK = ("scene", "vehicle")
 #: Bounds that no recording of road traffic in SI units exceeds.
-MAX_MEDIAN_SPEED_MPS: Final = 60.0
-MAX_MEDIAN_LENGTH_M: Final = 12.0
-MAX_SPEED_RATIO: Final = 1.4
+MAX_MEDIAN_SPEED_MPS = 60.0
+MAX_MEDIAN_LENGTH_M = 12.0
+MAX_SPEED_RATIO = 1.4
 #: A track that ends so far behind its beginning runs backwards, m.
-BACKWARDS_M: Final = 5.0
+BACKWARDS_M = 5.0
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
 
 from tqdm import tqdm
 
@@ -16,8 +15,8 @@ from ganlane.errors import UserError
 from ganlane.settings.generator import DataConfig
 
 #: Environment variable with the folder of the recordings.
-DATA_VARIABLE: Final = "GANLANE_DATA"
-SCENES: Final = Path("ngsim") / "us101_scenes.csv"
+DATA_VARIABLE = "GANLANE_DATA"
+SCENES = Path("ngsim") / "us101_scenes.csv"
 _FOLDER = Path("shared") / "data"
 
 

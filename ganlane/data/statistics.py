@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -26,7 +26,7 @@ from ganlane.errors import UserError
 from ganlane.settings.record import Record, make, plain
 
 #: Levels of the stored quantiles: fine enough to sample from by linear interpolation.
-LEVELS: Final = (
+LEVELS = (
     0.01,
     *(round(0.05 * k, 2) for k in range(1, 20)),
     0.99,

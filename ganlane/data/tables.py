@@ -11,8 +11,8 @@ from collections.abc import (
     Sequence,
 )
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Final
 
 import polars as pl
 
@@ -20,11 +20,11 @@ from ganlane.errors import UserError
 from ganlane.settings.generator import BLOCK_BYTES
 
 #: Column that holds each row's line number in the file.
-LINE: Final = "line"
+LINE = "line"
 #: Line of the first row of data below a header, which is line 1.
-FIRST_LINE: Final = 2
+FIRST_LINE = 2
 #: ``1,118,846,980,200``: commas that separate thousands, unlike a decimal comma.
-_THOUSANDS: Final = r"^[+-]?\d{1,3}(,\d{3})+(\.\d*)?$"
+_THOUSANDS = r"^[+-]?\d{1,3}(,\d{3})+(\.\d*)?$"
 Kind = pl.DataType | type[pl.DataType]
 #: Called with the bytes done so far and the total, None where the total is unknown.
 OnProgress = Callable[[int, int | None], None]
@@ -116,20 +116,8 @@ def convert(
     """
     text = text.select(pl.col(column).str.strip_chars(), LINE)
     field = text[column]
-
-    def refuse(bad: pl.Series, what: str) -> None:
-        raise_where(
-            bad,
-            text,
-            column,
-            path,
-            what,
-        )
-
-    refuse(
-        field.is_null() | (field == ""),
-        "is empty; the row is incomplete",
-    )
+    refuse = partial(raise_where, rows=text, column=column, path=path)
+    refuse(field.is_null() | (field == ""), what="is empty; the row is incomplete")
     if kind == pl.String:
         return field
     # Any other comma stays, so that the field is reported as no number.
@@ -137,17 +125,11 @@ def convert(
     field = without.zip_with(field.str.contains(_THOUSANDS), field)
     # Through floats, since whole numbers may be written as 3.0.
     numbers = field.cast(pl.Float64, strict=False)
-    refuse(numbers.is_null(), "is not a number")
-    refuse(~numbers.is_finite(), "is not a finite number")
+    refuse(numbers.is_null(), what="is not a number")
+    refuse(~numbers.is_finite(), what="is not a finite number")
     if kind == pl.Int64:
-        refuse(
-            numbers != numbers.round(),
-            "is not a whole number",
-        )
-        refuse(
-            numbers.abs() >= 2.0**63,
-            "is too large a number",
-        )
+        refuse(numbers != numbers.round(), what="is not a whole number")
+        refuse(numbers.abs() >= 2.0**63, what="is too large a number")
     return numbers.cast(kind)
 
 
@@ -191,13 +173,7 @@ def read_blocks(
     for block in _whole_lines(table, block_bytes):
         rows = block.count(b"\n") + (not block.endswith(b"\n"))
         lines = pl.int_range(number, number + rows, dtype=pl.Int64).alias(LINE)
-        yield _parse(
-            table,
-            block,
-            number,
-            rows,
-            wanted,
-        ).with_columns(lines)
+        yield _parse(table, block, number, rows, wanted).with_columns(lines)
         number += rows
         done += len(block)
         if on_progress is not None:
@@ -263,10 +239,7 @@ def _parse(
             has_header=False,
             schema=dict.fromkeys(places, pl.String()),
         )
-    except (
-        pl.exceptions.PolarsError,
-        UnicodeDecodeError,
-    ) as error:
+    except (pl.exceptions.PolarsError, UnicodeDecodeError) as error:
         _check_lines(table, block, number)
         raise UserError(
             f"{table.path}, from line {number}: not a readable table ({error})."

@@ -90,10 +90,8 @@ def start(generator: Generator, displacement: Tensor) -> History:
     one = generator.encoder.project(displacement, torch.zeros_like(displacement))
     # Equal, but separate tensors: a compiled graph assumes that inputs which share memory always
     # do.
-    return History(
-        tuple(one.clone() for _ in range(generator.sizes.observed - 1)),
-        displacement,
-    )
+    motions = tuple(one.clone() for _ in range(generator.sizes.observed - 1))
+    return History(motions, displacement)
 
 
 def recorded(generator: Generator, displacements: Tensor) -> History:
@@ -101,7 +99,7 @@ def recorded(generator: Generator, displacements: Tensor) -> History:
 
     The oldest motion is repeated.
     """
-    motions = generator.project(displacements).unbind(dim=-2)
+    motions = generator.encoder.project_course(displacements).unbind(dim=-2)
     return History((motions[0], *motions), displacements[..., -1, :])
 
 
@@ -142,9 +140,8 @@ def displacement_of(vehicles: Vehicles) -> Tensor:
     after 5 km.
     """
     length = vehicles.speed * PHYSICS_STEP_S
-    along = length * torch.cos(vehicles.heading)
-    across = length * torch.sin(vehicles.heading)
-    return torch.stack([along, across], dim=-1)
+    heading = vehicles.heading
+    return torch.stack([length * torch.cos(heading), length * torch.sin(heading)], dim=-1)
 
 
 def moved_by(
@@ -197,14 +194,8 @@ def paper_step(
     One decoder step is run and driven.
     """
     history, difference = push(generator, history, displacement_of(vehicles))
-    no_extra = difference[..., :0]
     # The paper's preset has positions only: further inputs of width 0.
-    observation = observe(
-        history,
-        difference,
-        vehicles,
-        no_extra,
-    )
+    observation = observe(history, difference, vehicles, difference[..., :0])
     velocity = generator(observation, noise, 1)[..., 0, :] / PHYSICS_STEP_S
     return moved_by(vehicles, velocity[..., 0], velocity[..., 1]), history
 
@@ -291,12 +282,7 @@ def anchored_step(
     extra = extra_inputs(scene, anchor_x, offset)
     if not p.further_inputs:
         extra = torch.zeros_like(extra)
-    observation = observe(
-        history,
-        difference,
-        vehicles,
-        extra,
-    )
+    observation = observe(history, difference, vehicles, extra)
     context = generator.summarise(observation)
     outputs = generator.decode(context, noise, observation, steps=1)[..., 0, :]
     limit = constant(p.residual, outputs)
@@ -306,13 +292,7 @@ def anchored_step(
     mean = memory.mean + (PHYSICS_STEP_S / p.washout_s) * (residual - memory.mean)
     residual = residual - mean
     room = 0.5 * (road.lane_width_m - vehicles.width) - _MARGIN_M
-    residual_y = inside_lane(
-        residual[..., 1],
-        offset,
-        velocity[..., 1],
-        room,
-        p.lane_damping,
-    )
+    residual_y = inside_lane(residual[..., 1], offset, velocity[..., 1], room, p.lane_damping)
 
     velocity_x = velocity[..., 0] + (anchor_x + residual[..., 0]) * PHYSICS_STEP_S
     velocity_y = velocity[..., 1] + (anchor_y + residual_y) * PHYSICS_STEP_S
@@ -378,6 +358,12 @@ def driven_positions(
     return torch.stack(positions, dim=1)
 
 
+def noise_shape(generator: Generator, segments: Segments, samples: int) -> tuple[int, ...]:
+    """Of the numbers that :func:`rollout` takes for so many samples."""
+    steps = 1 + segments.future.shape[1]
+    return (steps, samples, *segments.length.shape, generator.sizes.noise)
+
+
 def rollout(
     generator: Generator,
     segments: Segments,
@@ -405,13 +391,7 @@ def rollout(
 
     def move(vehicles: Vehicles, step: int) -> Vehicles:
         nonlocal memory, latent
-        moved, memory = anchored_step(
-            generator,
-            vehicles,
-            road,
-            memory,
-            latent,
-        )
+        moved, memory = anchored_step(generator, vehicles, road, memory, latent)
         latent = wander(latent, fresh[step], config.noise_period_s)
         return moved
 
@@ -443,10 +423,7 @@ def balanced_headway(
     It follows from gap, speed and desired speed. For vehicles without a leader, or further behind
     it than the largest quantile, it is unknown: ``otherwise``.
     """
-    ahead = leader(
-        perceive(vehicles, road),
-        vehicles.target_lane.to(vehicles.x.dtype),
-    )
+    ahead = leader(perceive(vehicles, road), vehicles.target_lane.to(vehicles.x.dtype))
     # IDM's equation for an acceleration of 0 at the leader's speed, solved for the headway.
     ratio = vehicles.speed / vehicles.desired_speed
     # Products in place of a power, whose last bits may differ between batch sizes.
@@ -468,14 +445,12 @@ def driver_params(
     """
     low, high = DESIRED_EXCESS_MPS
     shape = segments.length.shape
+    one = torch.ones_like(segments.length)
     # Desired speeds are not known yet: 1 m/s holds their place.
-    now = recorded_vehicles(segments, PRESENT, torch.ones_like(segments.length))
+    now = recorded_vehicles(segments, PRESENT, one)
     if random is None:
-        scatter = torch.ones_like(segments.length)
-        otherwise = torch.full_like(
-            scatter,
-            HEADWAY_QUANTILES_S[len(HEADWAY_QUANTILES_S) // 2],
-        )
+        scatter = one
+        otherwise = one * HEADWAY_QUANTILES_S[len(HEADWAY_QUANTILES_S) // 2]
         desired = now.speed + 0.5 * (low + high)
     else:
         excess, level = torch.rand(2, *shape, generator=random)

@@ -42,7 +42,6 @@ from ganlane.generator.windows import (
 from ganlane.settings.generator import (
     CalibratedConfig,
     HumanConfig,
-    HumanSizes,
     PaperConfig,
 )
 from ganlane.weights import load_weights, save_weights
@@ -173,10 +172,10 @@ class Fitted(NamedTuple):
 def run_fit(
     config: Config,
     split: Split,
-    folder: Path | None = None,
-    on_progress: OnProgress = lambda progress: None,
-    name: str = "fit",
-    following: Sequence[Recording] = (),
+    folder: Path | None,
+    on_progress: OnProgress,
+    name: str,
+    following: Sequence[Recording],
 ) -> Fitted:
     """Fit to ``split``; what was fitted with ``folder`` before is taken from there."""
     task: PaperTask | CalibratedTask | HumanTask
@@ -198,11 +197,11 @@ def run_fit(
             return Fitted(task, description["updates"], description["seconds"])
     begun = time.monotonic()
     updates = task.fit(name, on_progress)
-    fitted = Fitted(task, updates, time.monotonic() - begun)
+    seconds = time.monotonic() - begun
     if path is not None:
-        numbers = {"updates": fitted.updates, "seconds": fitted.seconds}
+        numbers = {"updates": updates, "seconds": seconds}
         save_weights(path, FIT, task.state_dict(), numbers)
-    return fitted
+    return Fitted(task, updates, seconds)
 
 
 def fit_generator(
@@ -234,7 +233,7 @@ def fit_generator(
         UserError: unusable recordings or scene names.
     """
     split = split_for_fit(recordings_of(frame), held_out)
-    task, updates, seconds = run_fit(config, split, folder, on_progress, following=following)
+    task, updates, seconds = run_fit(config, split, folder, on_progress, "fit", following)
     held = held_out_errors(task, split.held_out, predicted_steps(config), STRIDE)
     data = {
         "file": Path(source).name,
@@ -256,8 +255,7 @@ def fit_generator(
 
 def predicted_steps(config: Config) -> int:
     """Steps of the short forecasts: those that a generator predicts."""
-    sizes = config.sizes
-    return PREDICTED_STEPS if isinstance(sizes, HumanSizes) else sizes.predicted
+    return PREDICTED_STEPS if isinstance(config, HumanConfig) else config.sizes.predicted
 
 
 #: Scene of each window [W], and errors [W, T] in m of every forecast.
@@ -310,8 +308,7 @@ def cross_validate(
     """
     scenes = recordings_of(frame)
     splits = [split_for_fit(scenes, names) for names in assign_folds(scenes, folds)]
-    short = []
-    long = []
+    short, long = [], []
     for number, split in enumerate(splits, start=1):
         name = f"fold {number} of {folds}"
         task = run_fit(config, split, folder, on_progress, name, following).task

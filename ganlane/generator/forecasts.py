@@ -22,6 +22,7 @@ from ganlane.generator.closed_loop import (
     driven_positions,
     driver_params,
     moved_by,
+    noise_shape,
     rollout,
 )
 from ganlane.generator.networks import Generator
@@ -126,8 +127,8 @@ def paper_forecasts(
     generator: Generator,
     windows: Windows,
     groups: Groups,
-    seed: int = 0,
-    samples: int = SAMPLES,
+    seed: int,
+    samples: int,
 ) -> Forecasts:
     """The paper's preset, open loop, on the windows in ``groups``."""
     random = torch.Generator().manual_seed(seed)
@@ -136,12 +137,8 @@ def paper_forecasts(
         chunk = groups.select(rows)
         past = chunk.displacements[..., : generator.sizes.observed, :]
         observation = generator.observe(past, chunk.position, chunk.mask)
-        noise = torch.randn(
-            1 + samples,
-            *chunk.mask.shape,
-            generator.sizes.noise,
-            generator=random,
-        )
+        shape = (1 + samples, *chunk.mask.shape, generator.sizes.noise)
+        noise = torch.randn(shape, generator=random)
         # The first sample is the mean prediction.
         noise[0] = 0.0
         predicted = generator(observation, noise).cumsum(dim=-2)
@@ -192,22 +189,9 @@ def calibrated_forecasts(
     random = torch.Generator().manual_seed(0)
 
     def driver(segments: Segments) -> Tensor:
-        shape = (
-            1 + horizon,
-            1 + samples,
-            *segments.length.shape,
-            generator.sizes.noise,
-        )
-        noise = torch.randn(shape, generator=random)
+        noise = torch.randn(noise_shape(generator, segments, 1 + samples), generator=random)
         noise[:, 0] = 0.0
-        drivers = driver_params(segments)
-        return rollout(
-            generator,
-            segments,
-            drivers,
-            noise,
-            config,
-        )
+        return rollout(generator, segments, driver_params(segments), noise, config)
 
     forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
     return by_kind(forecasts, cut_windows(scenes, stride, OBSERVED_POSITIONS + horizon).future)
@@ -270,41 +254,26 @@ def rollout_score(
     """
     random = torch.Generator().manual_seed(0)
     horizon = config.held_out_horizon
-    parts: list[tuple[dict[str, Tensor], Tensor]] = []
+    parts: list[tuple[tuple[Tensor, ...], Tensor]] = []
     for scene in scenes:
         for batch in segment_batches(scene, horizon, config.held_out_stride, _SEGMENTS):
             segments = batch.without_intentions()
             future = segments.future
-            drivers = driver_params(segments)
             # Three rollouts at once: the mean prediction, and two samples.
-            shape = (
-                1 + horizon,
-                2,
-                *segments.length.shape,
-                generator.sizes.noise,
-            )
-            fresh = torch.randn(shape, generator=random)
+            fresh = torch.randn(noise_shape(generator, segments, 2), generator=random)
             noise = torch.cat([torch.zeros_like(fresh[:, :1]), fresh], dim=1)
-            mean, one, other = rollout(
-                generator,
-                segments,
-                drivers,
-                noise,
-                config,
+            mean, one, other = rollout(generator, segments, driver_params(segments), noise, config)
+            errors = (
+                distance(mean, future),
+                energy_score(one, other, future),
+                distance(segments.constant_velocity, future),
             )
-            errors = {
-                "mean": distance(mean, future),
-                "energy": energy_score(one, other, future),
-                BASELINE: distance(segments.constant_velocity, future),
-            }
             parts.append((errors, segments.scored))
-    by_step = {
-        kind: mean_by_step([(errors[kind], scored) for errors, scored in parts])
-        for kind in ("mean", "energy", BASELINE)
-    }
-    least = by_step[BASELINE].clamp_min(1e-6)
-    ratios = [float((by_step[kind] / least).mean()) for kind in ("mean", "energy")]
-    return 0.5 * (ratios[0] + ratios[1])
+    mean_error, energy, baseline = (
+        mean_by_step([(errors[kind], scored) for errors, scored in parts]) for kind in range(3)
+    )
+    least = baseline.clamp_min(1e-6)
+    return 0.5 * (float((mean_error / least).mean()) + float((energy / least).mean()))
 
 
 def mean_by_step(parts: list[tuple[Tensor, Tensor]]) -> Tensor:

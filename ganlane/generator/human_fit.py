@@ -9,7 +9,7 @@ the lane) samples of IDM drivers with headways of their own stand in.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -42,14 +42,12 @@ from ganlane.generator.human_samples import (
     samples_of,
     smooth_scene,
 )
-from ganlane.generator.human_tuning import begins_per_decision, tune
+from ganlane.generator.human_tuning import Report, begins_per_decision, tune
 from ganlane.settings.generator import HumanConfig
 from ganlane.sim.idm import DriverIdm, following_acceleration
 from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.state import Road
 
-#: Called with the steps made, of how many in all, and the last cost of the fine-tuning.
-Report = Callable[[int, int, float | None], None]
 #: Decisions of a segment: of whole scenes, and short ones, which begin more often as recorded.
 LONG_DECISIONS, SHORT_DECISIONS = 20, 5
 #: Weight of samples from files of one lane.
@@ -63,6 +61,11 @@ PRIOR_SHARE = 0.15
 INPUT_NOISE = 0.02
 #: Updates of the lane choice, its learning rate and decay: lane changes are few.
 LANE_UPDATES, LANE_RATE, LANE_DECAY = 300, 3e-3, 0.05
+
+
+def fit_steps(config: HumanConfig) -> int:
+    """Steps of a fit: cloning, the rounds in closed loop, and the iterations of fine-tuning."""
+    return 1 + config.rounds + config.tuning
 
 
 class Material(NamedTuple):
@@ -97,11 +100,11 @@ def fit_human(
     config: HumanConfig,
     recordings: Sequence[Recording],
     following: Sequence[Recording] = (),
-    report: Report = lambda done, of, cost: None,
+    report: Report = lambda cost: None,
 ) -> HumanModel:
     """Fit a model to ``recordings`` of several lanes and to cars ``following`` each other in one.
 
-    It is in evaluation mode.
+    It is in evaluation mode. Each of the :func:`fit_steps` is reported.
     """
     # Networks draw their first weights from torch's own generator, which stays the caller's.
     with torch.random.fork_rng(devices=[]):
@@ -112,17 +115,12 @@ def fit_human(
         fit_estimator(model.estimator, scenes, random)
         scenes += [smooth_scene(one, config, ONE_LANE_WEIGHT) for one in following]
         material = material_of(scenes, random)
-        steps = 1 + config.rounds + config.tuning
         # Lane changes are few: none of them is hidden, as the sides are from some of the moves.
         choices = _gathered(material, Options(blind=0.0), config, random, times=2).choices
         teacher = clone(model.policy, material, choices, config, random)
-        report(1, steps, None)
-
-        for number in close_the_loop(model, material, teacher, config, random):
-            report(1 + number, steps, None)
-        tuning = tune(model.policy, choices, material.danger, config, random)
-        for number, cost in enumerate(tuning, start=2 + config.rounds):
-            report(number, steps, cost)
+        report(None)
+        close_the_loop(model, material, teacher, config, random, report)
+        tune(model.policy, choices, material.danger, config, random, report)
         match_rate(model.policy, choices)
         return model.eval().requires_grad_(False)
 
@@ -151,11 +149,9 @@ def close_the_loop(
     teacher: Moves,
     config: HumanConfig,
     random: torch.Generator,
-) -> Iterator[int]:
-    """Rounds of closed-loop samples, whose numbers are yielded as they are done.
-
-    The last two rounds and as many teacher samples count.
-    """
+    report: Report,
+) -> None:
+    """Rounds of closed-loop samples: the last two rounds and as many teacher samples count."""
     bank: list[Moves] = []
     options = Options(model.policy, samples=config.samples)
     noisy = options._replace(estimator=model.estimator)
@@ -171,7 +167,7 @@ def close_the_loop(
         rate = 0.5 * config.learning_rate * (1.0 - 0.7 * number / max(1, config.rounds - 1))
         epochs = max(1, config.epochs // 3)
         train_moves(model.policy, moves, material.prior, epochs, rate, random)
-        yield number + 1
+        report(None)
 
 
 def _gathered(

@@ -9,7 +9,7 @@ changes, which carries over between roads per second rather than per kilometre.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable
 from copy import deepcopy
 from typing import NamedTuple
 
@@ -43,6 +43,8 @@ from ganlane.generator.human_samples import DESIRED_MPS, Choices, draws
 from ganlane.settings.generator import HumanConfig
 from ganlane.sim.state import Road, Vehicles
 
+#: Called after every step of a fit, with its cost if it is one of the fine-tuning.
+Report = Callable[[float | None], None]
 #: Scenes and vehicles of an iteration, and its decisions.
 SCENES, VEHICLES, DECISIONS = 40, 20, 60
 #: Discount per decision, and of the advantages' estimate (Schulman et al. 2016).
@@ -92,8 +94,9 @@ def tune(
     danger: Tensor,
     config: HumanConfig,
     random: torch.Generator,
-) -> Iterator[float]:
-    """Fine-tune ``policy`` in place; the mean cost of a decision in each iteration is yielded.
+    report: Report,
+) -> None:
+    """Fine-tune ``policy`` in place; the mean cost of a decision in each iteration is reported.
 
     Args:
         policy: cloned; what it is now is what it is pulled to.
@@ -137,7 +140,7 @@ def tune(
                 loss.backward()
                 nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
                 optimizer.step()
-        yield float(decisions.cost.sum()) / float(decisions.valid.sum())
+        report(float(decisions.cost.sum()) / float(decisions.valid.sum()))
 
 
 def begins_per_decision(teacher: Choices) -> float:

@@ -85,13 +85,8 @@ def motion_features(displacement: Tensor, difference: Tensor) -> Tensor:
     # Typical values become about 1.
     scaled = displacement / constant(DISPLACEMENT_SCALE_M, displacement)
     change = difference / constant(DIFFERENCE_SCALE_M, difference)
-    return torch.cat(
-        [
-            scaled,
-            change.clamp(-LARGEST_DIFFERENCE, LARGEST_DIFFERENCE),
-        ],
-        dim=-1,
-    )
+    change = change.clamp(-LARGEST_DIFFERENCE, LARGEST_DIFFERENCE)
+    return torch.cat([scaled, change], dim=-1)
 
 
 class MotionLSTM(nn.Module):
@@ -131,6 +126,10 @@ class MotionLSTM(nn.Module):
             relu=True,
         )
         return apply(self.input, embedded)
+
+    def project_course(self, displacements: Tensor) -> Tensor:
+        """Projections [..., T - 1, 4H] of T displacements [..., T, 2], one for every motion."""
+        return self.project(displacements[..., 1:, :], displacements.diff(dim=-2))
 
     def step(
         self,
@@ -208,15 +207,9 @@ def gather_vehicles(values: Tensor, index: Tensor | None) -> Tensor:
     """
     if index is None:
         return values[..., None, :, :]
-    batch, count, chosen = index.shape
     # gather needs an index as wide as the values.
-    flat = index.reshape(batch, count * chosen, 1).expand(-1, -1, values.shape[-1])
-    return values.gather(1, flat).reshape(
-        batch,
-        count,
-        chosen,
-        values.shape[-1],
-    )
+    flat = index.flatten(1)[..., None].expand(-1, -1, values.shape[-1])
+    return values.gather(1, flat).unflatten(1, index.shape[1:])
 
 
 class PairPooling(nn.Module):
@@ -274,8 +267,8 @@ class Observation(NamedTuple):
 
     Attributes:
         projections: [B, G, observed - 1, 4H] or a sequence of [B, G, 4H], input projections of the
-            observed motions (:meth:`Generator.project`), oldest first. A motion is a displacement
-            and its difference to the one before, so 8 displacements are 7 motions.
+            observed motions (:meth:`MotionLSTM.project_course`), oldest first. A motion is a
+            displacement and its difference to the one before, so 8 displacements are 7 motions.
         displacement, difference: [B, G, 2], the last displacement, m per 0.1 s, and its difference
             to the one before.
         position: [B, G, 2], m, relative to any common point.
@@ -316,13 +309,6 @@ class Generator(nn.Module):
         self.decoder = MotionLSTM(sizes.embedding, sizes.hidden, sizes.differences)
         self.head = nn.Linear(sizes.hidden, 2)
 
-    def project(self, displacements: Tensor) -> Tensor:
-        """Projections [..., T - 1, 4H] of T displacements [..., T, 2].
-
-        One for every motion in them.
-        """
-        return self.encoder.project(displacements[..., 1:, :], displacements.diff(dim=-2))
-
     def observe(
         self,
         displacements: Tensor,
@@ -335,7 +321,7 @@ class Generator(nn.Module):
         # Width 0: the paper's preset has no further inputs.
         extra = last.new_zeros((*last.shape[:-1], 0))
         return Observation(
-            self.project(displacements),
+            self.encoder.project_course(displacements),
             last,
             last - before,
             position,
@@ -374,18 +360,11 @@ class Generator(nn.Module):
         next step continues.
         """
         leading = torch.broadcast_shapes(context.shape[:-1], noise.shape[:-1])
-        hidden = torch.cat(
-            [
-                context.expand(*leading, -1),
-                noise.expand(*leading, -1),
-            ],
-            dim=-1,
-        )
         # The decoder's first hidden state is context and noise side by side.
+        hidden = torch.cat([part.expand(*leading, -1) for part in (context, noise)], dim=-1)
         cell = torch.zeros_like(hidden)
         scale = constant(DIFFERENCE_SCALE_M, hidden)
-        displacement = now.displacement
-        difference = now.difference
+        displacement, difference = now.displacement, now.difference
         outputs = []
         for _ in range(steps):
             projected = self.decoder.project(displacement, difference)
@@ -407,12 +386,7 @@ class Generator(nn.Module):
         All by default.
         """
         steps = self.sizes.predicted if steps is None else steps
-        outputs = self.decode(
-            self.summarise(now),
-            noise,
-            now,
-            steps,
-        )
+        outputs = self.decode(self.summarise(now), noise, now, steps)
         return displacements_of(outputs, now.displacement)
 
 
@@ -430,7 +404,7 @@ class Discriminator(nn.Module):
     Outputs a logit (the original's ReLU cannot say 'fake').
     """
 
-    def __init__(self, embedding: int = 64, hidden: int = 32):
+    def __init__(self, embedding: int, hidden: int):
         super().__init__()
         self.encoder = MotionLSTM(embedding, hidden)
         self.head = nn.Sequential(
@@ -441,5 +415,5 @@ class Discriminator(nn.Module):
 
     def forward(self, displacements: Tensor) -> Tensor:
         """Logits [...] that the observed and following displacements [..., T, 2] were recorded."""
-        projections = self.encoder.project(displacements[..., 1:, :], displacements.diff(dim=-2))
+        projections = self.encoder.project_course(displacements)
         return self.head(self.encoder.encode(projections)).squeeze(-1)

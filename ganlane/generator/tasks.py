@@ -23,9 +23,8 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from ganlane.data.dense import Recording
-from ganlane.generator.closed_loop import driver_params, rollout
+from ganlane.generator.closed_loop import driver_params, noise_shape, rollout
 from ganlane.generator.forecasts import (
-    SAMPLES,
     Forecasts,
     calibrated_forecasts,
     distance,
@@ -35,7 +34,7 @@ from ganlane.generator.forecasts import (
     rollout_score,
 )
 from ganlane.generator.human_estimator import HumanModel
-from ganlane.generator.human_fit import fit_human
+from ganlane.generator.human_fit import fit_human, fit_steps
 from ganlane.generator.human_forecasts import fit_observer, human_forecasts, standard_width
 from ganlane.generator.networks import (
     Discriminator,
@@ -59,13 +58,6 @@ from ganlane.settings.generator import (
 )
 
 Config = PaperConfig | CalibratedConfig
-
-
-def distances(predicted: Tensor, recorded: Tensor) -> Tensor:
-    """Distances [..., T] in m between two trajectories given as displacements [..., T, 2]."""
-    # Positions are the sums of displacements.
-    apart = (predicted - recorded).cumsum(dim=-2)
-    return distance(apart, torch.zeros_like(apart))
 
 
 def cross_entropy(logits: Tensor, recorded: float) -> Tensor:
@@ -112,10 +104,7 @@ class _Task(nn.Module):
         optimiser = self.optimisers[network]
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        nn.utils.clip_grad_norm_(
-            optimiser.param_groups[0]["params"],
-            self.largest_gradient,
-        )
+        nn.utils.clip_grad_norm_(optimiser.param_groups[0]["params"], self.largest_gradient)
         optimiser.step()
         return float(loss.detach())
 
@@ -145,7 +134,7 @@ class PaperTask(_Task):
         groups = groups.mirrored(torch.rand(len(groups), generator=self.random) < 0.5)
         # [n, T, 2]: vehicles of all groups, without padding.
         recorded = groups.displacements[groups.mask]
-        generated = self._samples(groups, self.random)
+        generated = self._samples(groups)
 
         # The discriminator learns from one sample, which carries no gradient to the generator.
         losses = {}
@@ -156,11 +145,10 @@ class PaperTask(_Task):
             losses["discriminator"] = self.descend("discriminator", loss)
 
         # The generator: what it predicted, in all samples and for z = 0 (the last).
-        observed = config.sizes.observed
-        errors = distances(
-            generated[..., observed:, :],
-            recorded[..., observed:, :],
-        ).mean(-1)
+        missed = (generated - recorded)[..., config.sizes.observed :, :]
+        # Positions are the sums of displacements.
+        apart = missed.cumsum(dim=-2)
+        errors = distance(apart, torch.zeros_like(apart)).mean(-1)
         terms = {
             # Only the best of each vehicle's samples counts.
             "variety": errors[:-1].amin(dim=0).mean(),
@@ -177,11 +165,11 @@ class PaperTask(_Task):
     def evaluate(self) -> float:
         """ADE of the mean prediction on the validation scenes, m."""
         windows, groups = self.validation
-        mean = paper_forecasts(self.generator, windows, groups, samples=0)["mean"]
+        mean = paper_forecasts(self.generator, windows, groups, self.config.seed, 0)["mean"]
         return float(np.linalg.norm(mean - windows.future, axis=-1).mean())
 
     def forecasts(
-        self, scenes: list[Recording], steps: int, stride: int, samples: int = SAMPLES
+        self, scenes: list[Recording], steps: int, stride: int, samples: int
     ) -> Forecasts:
         """Forecasts of the windows of ``scenes``, by kind."""
         windows, groups = self._grouped_windows(scenes, stride)
@@ -194,7 +182,7 @@ class PaperTask(_Task):
         windows = cut_windows(scenes, stride, sizes.observed + 1 + sizes.predicted)
         return windows, group_windows(windows, self.config.group_size, self.config.seed)
 
-    def _samples(self, groups: Groups, random: torch.Generator) -> Tensor:
+    def _samples(self, groups: Groups) -> Tensor:
         """Recorded past and generated future [K + 1, n, T, 2] of n vehicles.
 
         The samples come first, the mean prediction last. Only the pooling needs the padded groups;
@@ -212,20 +200,12 @@ class PaperTask(_Task):
             difference=observation.difference[mask],
         )
         shape = (self.config.samples + 1, len(context), sizes.noise)
-        noise = torch.randn(shape, generator=random)
+        noise = torch.randn(shape, generator=self.random)
         # The mean driver.
         noise[-1] = 0.0
-        outputs = self.generator.decode(
-            context,
-            noise,
-            vehicles,
-            sizes.predicted,
-        )
+        outputs = self.generator.decode(context, noise, vehicles, sizes.predicted)
         future = displacements_of(outputs, vehicles.displacement)
-        return torch.cat(
-            [past[mask].expand(len(future), -1, -1, -1), future],
-            dim=-2,
-        )
+        return torch.cat([past[mask].expand(len(future), -1, -1, -1), future], dim=-2)
 
 
 class CalibratedTask(_Task):
@@ -261,41 +241,23 @@ class CalibratedTask(_Task):
         drivers = driver_params(segments, self.random)
         # The energy score needs two samples, the mean error one.
         sampled = number % 2 == 1
-        samples = 2 if sampled else 1
-        steps = 1 + segments.future.shape[1]
-        shape = (
-            steps,
-            samples,
-            *segments.length.shape,
-            config.sizes.noise,
-        )
+        shape = noise_shape(self.generator, segments, 2 if sampled else 1)
         noise = torch.randn(shape, generator=self.random) if sampled else torch.zeros(shape)
-        positions = rollout(
-            self.generator,
-            segments,
-            drivers,
-            noise,
-            config,
-        )
+        positions = rollout(self.generator, segments, drivers, noise, config)
         if sampled:
-            name = "energy"
             losses = energy_score(positions[0], positions[1], segments.future)
         else:
-            name = "mean"
             losses = distance(positions[0], segments.future)
         # Late steps err most, so each is measured by what constant velocity errs there.
-        loss = masked_mean(
-            losses / self.scale[: losses.shape[1], None],
-            segments.scored,
-        )
-        return {name: self.descend("generator", loss)}
+        loss = masked_mean(losses / self.scale[: losses.shape[1], None], segments.scored)
+        return {"energy" if sampled else "mean": self.descend("generator", loss)}
 
     def evaluate(self) -> float:
         """The score of rollouts through the validation scenes."""
         return rollout_score(self.generator, self.validation, self.config)
 
     def forecasts(
-        self, scenes: list[Recording], steps: int, stride: int, samples: int = SAMPLES
+        self, scenes: list[Recording], steps: int, stride: int, samples: int
     ) -> Forecasts:
         """Forecasts of the windows of ``scenes``, by kind."""
         return calibrated_forecasts(self.generator, scenes, steps, stride, self.config, samples)
@@ -337,20 +299,22 @@ class HumanTask(nn.Module):
 
     def fit(self, name: str, on_progress: OnProgress) -> int:
         """Fit the policy; the steps that were made."""
-        best = math.inf
+        steps = fit_steps(self.config)
+        done, best = 0, math.inf
 
-        def report(done: int, steps: int, cost: float | None) -> None:
-            nonlocal best
+        def report(cost: float | None) -> None:
+            nonlocal done, best
+            done += 1
             best = best if cost is None else min(best, cost)
             on_progress(Progress(name, done, steps, {}, cost, best))
 
         scenes = [standard_width(scene) for scene in self.scenes]
         self.generator = fit_human(self.config, scenes, self.following, report)
         fit_observer(self.generator, self.scenes, self.config)
-        return 1 + self.config.rounds + self.config.tuning
+        return steps
 
     def forecasts(
-        self, scenes: list[Recording], steps: int, stride: int, samples: int = SAMPLES
+        self, scenes: list[Recording], steps: int, stride: int, samples: int
     ) -> Forecasts:
         """Forecasts of the windows of ``scenes``, by kind."""
         return human_forecasts(self.generator, scenes, steps, stride, samples)

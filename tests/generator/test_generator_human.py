@@ -28,7 +28,7 @@ from ganlane.generator.human import (
     velocity,
     with_choice,
 )
-from ganlane.generator.human_fit import fit_human, prior_samples
+from ganlane.generator.human_fit import fit_human, fit_steps, prior_samples
 from ganlane.generator.human_samples import Options, cuts, samples_of, smooth_scene, target_lanes
 from ganlane.generator.human_tuning import costs, entering_memory
 from ganlane.settings.generator import HumanConfig, HumanSizes, shipped_generator
@@ -195,12 +195,14 @@ def small_fits(monkeypatch):
 def test_a_fit_is_the_same_for_the_same_seed_and_reports_its_steps(small_fits):
     recordings = recorded_cars(scenes=2, vehicles=5, seconds=5.0)
     config = HumanConfig(sizes=HumanSizes(hidden=16, lane_hidden=8), **SMALL)
-    steps = []
+    costs_of_steps = []
     state = torch.get_rng_state()
-    first = fit_human(config, recordings, report=lambda *step: steps.append(step))
+    first = fit_human(config, recordings, report=costs_of_steps.append)
     second = fit_human(config, recordings)
     assert torch.equal(torch.get_rng_state(), state)
-    assert [done for done, _, _ in steps] == [1, 2, 3]
+    assert len(costs_of_steps) == fit_steps(config) == 3
+    # Fine-tuning alone has a cost.
+    assert [cost is None for cost in costs_of_steps] == [True, True, False]
     for one, other in zip(first.state_dict().values(), second.state_dict().values()):
         assert torch.equal(one, other)
     assert all(tensor.isfinite().all() for tensor in first.state_dict().values())

@@ -125,7 +125,7 @@ def test_kept_projections_equal_those_computed_anew(generator):
     history = recorded(generator, displacements[..., :7, :])
     for step in range(7, 20):
         history, difference = push(generator, history, displacements[..., step, :])
-        anew = generator.project(displacements[..., step - 7 : step + 1, :])
+        anew = generator.encoder.project_course(displacements[..., step - 7 : step + 1, :])
         torch.testing.assert_close(torch.stack(history.motions, -2), anew)
         torch.testing.assert_close(
             difference, displacements[..., step, :] - displacements[..., step - 1, :]
@@ -136,7 +136,8 @@ def test_a_fresh_history_is_that_of_constant_velocity(generator):
     displacement = torch.tensor([[[1.7, 0.0], [0.9, 0.0]]])
     always = displacement[..., None, :].expand(1, 2, 8, 2)
     torch.testing.assert_close(
-        torch.stack(start(generator, displacement).motions, -2), generator.project(always)
+        torch.stack(start(generator, displacement).motions, -2),
+        generator.encoder.project_course(always),
     )
 
 

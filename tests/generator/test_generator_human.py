@@ -215,8 +215,8 @@ def test_the_command_fits_folds_keeps_what_is_finished_and_its_weights_load(
         synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=4, seconds=6.5)), "recordings.csv"
     )
     options = [f"generator.{name}={value}" for name, value in SMALL.items()]
-    arguments = ["generator=human", "data.path=recordings.csv", "folds=2", *options]
-    assert run_command("train_generator", [*arguments, "hydra.run.dir=fit"]) == 0
+    arguments = ["generator=human", "data.path=recordings.csv", *options]
+    assert run_command("train_generator", [*arguments, "folds=2", "hydra.run.dir=fit"]) == 0
     results = json.loads(Path("fit/results.json").read_text())
     assert {"mean", "single", "best_of_20", "constant_velocity"} < results["ade_m"].keys()
     assert "rollout" in results["folds"]

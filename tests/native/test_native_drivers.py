@@ -141,7 +141,7 @@ OTHER_OPTIONS = [
 
 @pytest.mark.parametrize("traffic", OTHER_OPTIONS, ids="-".join)
 def test_it_decides_as_the_tensor_code(traffic):
-    differ, _ = compare(traffic, highways=3, rows=16, decisions=3, seed=1)
+    differ, _ = compare(traffic, highways=2, rows=32, decisions=4, seed=3)
     # A random number at a threshold may fall on its other side.
     assert differ <= 1
 
@@ -171,7 +171,7 @@ def test_it_decides_as_the_tensor_code_where_lanes_end(scene):
 @pytest.mark.parametrize("traffic", [*PRESETS, "human"])
 def test_networks_of_any_sizes_drive(traffic, tmp_path):
     path = odd_weights(PRESETS.get(traffic, traffic), tmp_path)
-    differ, _ = compare({"name": traffic, "path": path}, highways=2, rows=16, decisions=3, seed=2)
+    differ, _ = compare({"name": traffic, "path": path}, highways=2, rows=16, decisions=4, seed=3)
     assert differ <= 1
 
 

@@ -26,7 +26,7 @@ def test_each_direction_is_a_scene_at_10_hz_with_x_forward_and_lane_0_rightmost(
     upper, lower = highd_scenes(recording)
     assert (upper.name, lower.name) == ("highd-01-upper", "highd-01-lower")
     assert upper.frame.schema == lower.frame.schema == SCHEMA
-    assert (upper.lane_width_m, lower.lane_width_m) == (4.0, 4.0)
+    assert upper.lane_width_m == lower.lane_width_m == 4.0
     # Upwards in the picture is to the right for those who drive to the left: lanes 2 (y 8 to 12)
     # and 3. Lower lanes: 5 (y 20 to 24) is the left one, 6 the right one; left is up.
     expected = {1: (0, 0.0, 30.0), 2: (1, 4.5, 35.0), 3: (0, 0.0, 25.0), 4: (1, 4.0, 28.0)}
@@ -39,14 +39,9 @@ def test_each_direction_is_a_scene_at_10_hz_with_x_forward_and_lane_0_rightmost(
             lane, y, speed = expected[vehicle]
             assert rows["lane"].unique().to_list() == [lane]
             assert begin[vehicle]["y"] == pytest.approx(y)
-            assert [begin[vehicle][name] for name in ("length", "width", "speed")] == [
-                5.0,
-                2.0,
-                speed,
-            ]
-            assert np.diff(rows["x"].to_numpy()) / 0.1 == pytest.approx(
-                np.full(rows.height - 1, speed)
-            )
+            sizes = rows.select("length", "width", "speed").row(0)
+            assert sizes == (5.0, 2.0, speed)
+            assert np.diff(rows["x"].to_numpy()) / 0.1 == pytest.approx(speed)
             # Recorded are the frames 1 to 200 at 25 Hz, 0.04 to 8 s.
             assert rows["frame"].to_list() == list(range(1, 81))
     assert begin.keys() == expected.keys()
@@ -61,9 +56,7 @@ def test_a_folder_is_read_recording_by_recording(tmp_path):
     write_highd(tmp_path, "02", seconds=4.0)
     count = RowCount()
     names = [scene.name for scene in highd_scenes(tmp_path, count)]
-    assert names == [
-        f"highd-{number}-{side}" for number in ("01", "02") for side in ("upper", "lower")
-    ]
+    assert names == ["highd-01-upper", "highd-01-lower", "highd-02-upper", "highd-02-lower"]
     assert (count.read, count.kept) == (4 * 300, 4 * 300)
 
 
@@ -88,15 +81,15 @@ def damaged(path, column, row, value):
 @pytest.mark.parametrize(
     ("column", "row", "value", "message"),
     [
-        ("x", 10, "left", r"01_tracks.csv, line 12, column x: 'left' is not a number"),
-        ("frame", 6, "4", r"01_tracks.csv, line 8, column frame: 4 is not after the last frame"),
-        ("id", 250, "77", r"01_tracks.csv, line 252, column id: 77 is not in the tracksMeta file"),
-        ("width", 0, "0", r"01_tracks.csv, line 2, column width: 0.0 is not above 0"),
+        ("x", 10, "left", r"line 12, column x: 'left' is not a number"),
+        ("frame", 6, "4", r"line 8, column frame: 4 is not after the last frame"),
+        ("id", 250, "77", r"line 252, column id: 77 is not in the tracksMeta file"),
+        ("width", 0, "0", r"line 2, column width: 0.0 is not above 0"),
     ],
 )
 def test_a_damaged_field_is_named(recording, column, row, value, message):
     damaged(recording, column, row, value)
-    with user_error(message):
+    with user_error(f"01_tracks.csv, {message}"):
         read_recordings("highd", recording)
 
 

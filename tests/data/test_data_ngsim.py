@@ -5,6 +5,8 @@ What is read, in how many blocks, and errors in damaged files.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import polars as pl
 import pytest
 from reference.recordings import LANE_M, START_MS, ngsim_rows, portal_csv, raw_text, traffic
@@ -15,6 +17,7 @@ from ganlane.data.ngsim import ngsim_scenes
 from ganlane.data.schema import RowCount, validate
 from ganlane.settings.generator import NgsimParameters
 
+pytestmark = pytest.mark.usefixtures("empty_folder")
 LATER_MS = START_MS + 900_000
 #: A file takes several.
 SMALL_BLOCKS = NgsimParameters(block_bytes=20_000)
@@ -22,14 +25,14 @@ SMALL_BLOCKS = NgsimParameters(block_bytes=20_000)
 FIRST, SECOND = (scene for _, scene in traffic().group_by("scene", maintain_order=True))
 
 
-def text_file(folder, rows):
-    path = folder / "trajectories-0750am-0805am.txt"
+def text_file(rows):
+    path = Path("trajectories-0750am-0805am.txt")
     path.write_bytes(raw_text(rows).encode())
     return path
 
 
-def portal_file(folder, content):
-    path = folder / "portal.csv"
+def portal_file(content):
+    path = Path("portal.csv")
     path.write_text(content)
     return path
 
@@ -39,21 +42,16 @@ def same_driving(read: pl.DataFrame, expected: pl.DataFrame) -> None:
     same = ["vehicle", "frame", "lane"]
     assert read.select(same).equals(expected.select(same))
     # Lane width and the first lane's centre are estimated from positions that wander by 0.15 m.
-    for name, tolerance in {
-        **dict.fromkeys(("x", "speed", "length", "width"), 1e-5),
-        "y": 0.2,
-    }.items():
+    for name in ("x", "speed", "length", "width", "y"):
+        tolerance = 0.2 if name == "y" else 1e-5
         assert (read[name] - expected[name]).abs().max() < tolerance, name
 
 
-def test_raw_text_gives_back_the_recording_in_metres_from_centres_and_from_the_right(tmp_path):
-    path = text_file(tmp_path, ngsim_rows(FIRST))
+def test_raw_text_gives_back_the_recording_in_metres_from_centres_and_from_the_right():
+    path = text_file(ngsim_rows(FIRST))
     (scene,) = ngsim_scenes(path)
-    assert (scene.name, scene.frame.schema, scene.lanes) == (
-        "trajectories-0750am-0805am-1",
-        SCHEMA,
-        3,
-    )
+    assert (scene.name, scene.lanes) == ("trajectories-0750am-0805am-1", 3)
+    assert scene.frame.schema == SCHEMA
     assert scene.lane_width_m == pytest.approx(LANE_M, abs=0.1)
     same_driving(scene.frame, FIRST)
     validate(scene.frame, "read")
@@ -63,14 +61,12 @@ def test_raw_text_gives_back_the_recording_in_metres_from_centres_and_from_the_r
 
 
 @pytest.mark.parametrize(("block_bytes", "thousands"), [(10_000, True), (2**25, False)])
-def test_the_portals_periods_are_separated_by_time_in_any_order_and_blocks(
-    tmp_path, block_bytes, thousands
-):
+def test_the_portals_periods_are_separated_by_time_in_any_order_and_blocks(block_bytes, thousands):
     # In any order, since the portal does not promise one.
     rows = pl.concat((ngsim_rows(FIRST), ngsim_rows(SECOND, LATER_MS))).sample(
         fraction=1.0, shuffle=True, seed=1
     )
-    path = portal_file(tmp_path, portal_csv(rows, thousands=thousands))
+    path = portal_file(portal_csv(rows, thousands=thousands))
     count = RowCount()
     scenes = list(ngsim_scenes(path, NgsimParameters(block_bytes=block_bytes), count))
     assert [scene.name for scene in scenes] == ["us-101-1", "us-101-2"]
@@ -79,19 +75,16 @@ def test_the_portals_periods_are_separated_by_time_in_any_order_and_blocks(
     assert (count.read, count.kept) == (1080, 1080)
 
 
-def test_duplicates_and_other_places_are_dropped_and_counted(tmp_path):
+def test_duplicates_and_other_places_are_dropped_and_counted():
     rows = ngsim_rows(FIRST)
     # The same vehicle and time, at another speed.
     other = rows.head(1).with_columns(v_Vel=pl.lit(9.0))
-    parts = [
-        portal_csv(pl.concat((rows, rows.head(30), other))),
-        *(
-            portal_csv(rows.head(n), place).partition("\n")[2]
-            for place, n in (("lankershim", 7), ("peachtree", 5))
-        ),
-    ]
+    content = portal_csv(pl.concat((rows, rows.head(30), other)))
+    for place, number in (("lankershim", 7), ("peachtree", 5)):
+        _, _, lines = portal_csv(rows.head(number), place).partition("\n")
+        content += lines
     count = RowCount()
-    scenes = list(ngsim_scenes(portal_file(tmp_path, "".join(parts)), count=count))
+    scenes = list(ngsim_scenes(portal_file(content), count=count))
     same_driving(scenes[0].frame, FIRST)
     assert dict(count.dropped) == {
         "location lankershim": 7,
@@ -102,27 +95,27 @@ def test_duplicates_and_other_places_are_dropped_and_counted(tmp_path):
     assert (count.read, count.kept) == (540 + 43, 540)
 
 
-def test_ramps_are_left_out_and_end_a_track(tmp_path):
+def test_ramps_are_left_out_and_end_a_track():
     rows = ngsim_rows(FIRST)
     # NGSIM numbers ramps from 7 on.
     on_ramp = (pl.col("Vehicle_ID") == 2) & pl.col("Frame_ID").is_between(20, 29)
     rows = rows.with_columns(Lane_ID=pl.when(on_ramp).then(7).otherwise("Lane_ID"))
     count = RowCount()
-    (scene,) = ngsim_scenes(text_file(tmp_path, rows), count=count)
+    (scene,) = ngsim_scenes(text_file(rows), count=count)
     assert dict(count.dropped) == {"ramp": 10}
     frames = dict(scene.frame.group_by("vehicle").agg("frame").iter_rows())
     assert frames[2] == list(range(20))
     assert frames[10_002] == list(range(30, 60))
 
 
-def changed(folder, row: int, column: str, value: str):
+def changed(row: int, column: str, value: str):
     """The portal's file with one field changed; ``row`` counts from 0 below the header."""
     # Without quotes, so that fields can be split at commas.
     lines = portal_csv(ngsim_rows(FIRST), thousands=False).splitlines()
     fields = lines[row + 1].split(",")
     fields[lines[0].split(",").index(column)] = value
     lines[row + 1] = ",".join(fields)
-    return portal_file(folder, "\n".join(lines) + "\n")
+    return portal_file("\n".join(lines) + "\n")
 
 
 @pytest.mark.parametrize(
@@ -147,22 +140,22 @@ def changed(folder, row: int, column: str, value: str):
         ),
     ],
 )
-def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column, value, message):
-    path = changed(tmp_path, row, column, value)
+def test_a_damaged_field_is_named_by_file_line_and_column(row, column, value, message):
+    path = changed(row, column, value)
     with user_error(f"{path}, {message}"):
         read_recordings("ngsim", path, SMALL_BLOCKS)
 
 
-def test_a_truncated_file_is_refused_and_a_whole_one_read(tmp_path):
+def test_a_truncated_file_is_refused_and_a_whole_one_read():
     rows = ngsim_rows(FIRST)
     # A missing line break at the end does no harm, missing fields do.
     whole = portal_csv(rows, thousands=False)
-    path = portal_file(tmp_path, whole.rstrip("\n"))
+    path = portal_file(whole.rstrip("\n"))
     assert read_recordings("ngsim", path).height == 540
     path.write_text(whole.rpartition(",2,")[0])
     with user_error(r"line 541, column \w+: the row has .* fields, expected 19"):
         read_recordings("ngsim", path)
-    text = text_file(tmp_path, rows)
+    text = text_file(rows)
     text.write_bytes(text.read_bytes()[:-30])
     with user_error(r"line 540, column \w+: the row has .* fields, expected 18"):
         read_recordings("ngsim", text)
@@ -181,23 +174,23 @@ def test_a_truncated_file_is_refused_and_a_whole_one_read(tmp_path):
         (("v_length",), 30.48, "column v_length: .*they look like centimetres or inches"),
     ],
 )
-def test_units_that_cannot_be_feet_and_seconds_are_refused(tmp_path, columns, factor, message):
+def test_units_that_cannot_be_feet_and_seconds_are_refused(columns, factor, message):
     # All else stays in feet.
     rows = ngsim_rows(FIRST).with_columns(pl.col(name) * factor for name in columns)
     with user_error(f"line 1, {message}"):
-        read_recordings("ngsim", text_file(tmp_path, rows))
+        read_recordings("ngsim", text_file(rows))
 
 
-def test_files_of_other_columns_or_places_are_refused(tmp_path):
+def test_files_of_other_columns_or_places_are_refused():
     with user_error(r"line 1: 17 columns; expected the 18"):
-        read_recordings("ngsim", text_file(tmp_path, ngsim_rows(FIRST).drop("v_Class")))
+        read_recordings("ngsim", text_file(ngsim_rows(FIRST).drop("v_Class")))
     with user_error(r"no rows of us-101, i-80; check data.locations"):
-        read_recordings("ngsim", portal_file(tmp_path, portal_csv(ngsim_rows(FIRST), "peachtree")))
+        read_recordings("ngsim", portal_file(portal_csv(ngsim_rows(FIRST), "peachtree")))
 
 
-def test_temporary_files_are_removed_after_an_error(tmp_path):
-    path = changed(tmp_path, 500, "local_y", "far")
-    scratch = tmp_path / "scratch"
+def test_temporary_files_are_removed_after_an_error():
+    path = changed(500, "local_y", "far")
+    scratch = Path("scratch")
     # The damage is late in the file, when blocks are on the disk.
     scratch.mkdir()
     with user_error("'far' is not a number"):

@@ -29,14 +29,15 @@ def pairs_file(path):
 
 
 def test_pairs_have_a_driven_follower_at_the_recorded_gap(tmp_path):
-    for name, write, gap, speed in (
-        ("I-80, pairs", pairs_file, 20.0, 9.0),
-        ("I-80, following", following_file, 10.0, 7.0),
+    # 40 s and 20 s, less the first 3, in pieces of 15.
+    for name, write, pieces, gap, speed in (
+        ("I-80, pairs", pairs_file, 2, 20.0, 9.0),
+        ("I-80, following", following_file, 1, 10.0, 7.0),
     ):
-        write(tmp_path / ONE_LANE_FILES[name])
-        recordings = read_one_lane(name, tmp_path / ONE_LANE_FILES[name])
-        # 40 s and 20 s, less the first 3, in pieces of 15.
-        assert len(recordings) == {"I-80, pairs": 2, "I-80, following": 1}[name]
+        path = tmp_path / ONE_LANE_FILES[name]
+        write(path)
+        recordings = read_one_lane(name, path)
+        assert len(recordings) == pieces
         assert {piece.lanes for piece in recordings} == {1}
         assert all(piece.driven.sum() == 1 for piece in recordings)
         quantiles = measure_recordings(recordings).quantiles
@@ -46,8 +47,9 @@ def test_pairs_have_a_driven_follower_at_the_recorded_gap(tmp_path):
 
 
 def test_a_lane_is_driven_as_a_whole_in_stretches_of_their_own(tmp_path):
-    lane_file(tmp_path / ONE_LANE_FILES["I-80, lane_1"])
-    recordings = read_one_lane("I-80, lane_1", tmp_path / ONE_LANE_FILES["I-80, lane_1"])
+    path = tmp_path / ONE_LANE_FILES["I-80, lane_1"]
+    lane_file(path)
+    recordings = read_one_lane("I-80, lane_1", path)
     assert len({piece.unit for piece in recordings}) == len(recordings) == 2
     assert all(piece.driven.all() for piece in recordings)
     # 2 s apart at 18 m/s, cars of 4.5 m.

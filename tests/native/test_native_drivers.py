@@ -35,14 +35,8 @@ TRAFFICS = ["idm", "idm_mobil", "idm_faults", "idm_random", "human", *PRESETS]
 #: Parts of all kinds; no batch size here is a multiple of the sum of their shares.
 MIXED = {
     "name": "mixed",
-    "shares": {
-        "idm_mobil": 2,
-        "gan": 1,
-        "human": 1,
-        "idm_faults": 1,
-        "idm_random": 1,
-        "gan_calibrated": 1,
-    },
+    "shares": {"idm_mobil": 2}
+    | dict.fromkeys(("gan", "human", "idm_faults", "idm_random", "gan_calibrated"), 1),
 }
 #: Faults so often that a few decisions meet all of them.
 OFTEN = {
@@ -267,12 +261,8 @@ def test_the_first_memory_is_that_of_the_tensor_code(traffic):
     expected = env.reset()
     seed = torch.full((20,), 7)
     state = NativeScenes(env.scenes, 0, module.native_drivers()).start(seed, torch.arange(20))
-    memory = state[keys.TRAFFIC]
-    assert {name for name, _ in leaves(memory)} == {
-        name for name, _ in leaves(expected[keys.TRAFFIC])
-    }
-    for name, value in leaves(memory):
-        torch.testing.assert_close(value, expected[keys.TRAFFIC][name], atol=2e-5, rtol=1e-5)
+    memory, expected_memory = (dict(leaves(scenes[keys.TRAFFIC])) for scenes in (state, expected))
+    torch.testing.assert_close(memory, expected_memory, atol=2e-5, rtol=1e-5)
     desired = state[keys.VEHICLES, "desired_speed"]
     torch.testing.assert_close(desired, expected[keys.VEHICLES, "desired_speed"])
 

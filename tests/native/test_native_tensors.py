@@ -91,18 +91,17 @@ def by_kernel(kernel: Kernel, td: TensorDictBase, recycle: bool = False) -> Tens
     return kernel.decide(td["action"], td, recycles)
 
 
-def actions(env: HighwayEnv, generator: torch.Generator, change: float = 0.2) -> torch.Tensor:
+def actions(env: HighwayEnv, generator: torch.Generator) -> torch.Tensor:
     """Random actions [N], mostly to keep the lane."""
     if env.actions.form == "continuous":
         between = drawing(env.batch_size, generator, env.dtype)
-        wheel = between(-0.4, 0.4) + between(-1, 1) * (between(0, 1) < 2 * change)
+        wheel = between(-0.4, 0.4) + between(-1, 1) * (between(0, 1) < 0.4)
         return torch.stack((between(-1.1, 1.1), wheel), dim=1)
     drawn = torch.rand(env.batch_size, generator=generator)
     if env.actions.form == "lane_speed" and bool(drawn[0] < 0.5):
         return torch.randint(3, 5, env.batch_size, generator=generator)
-    return torch.where(
-        drawn < 0.5 * change, keys.LEFT, torch.where(drawn < change, keys.RIGHT, keys.KEEP)
-    )
+    changes = torch.where(drawn < 0.1, keys.LEFT, keys.RIGHT)
+    return torch.where(drawn < 0.2, changes, keys.KEEP)
 
 
 def events_apart(out: TensorDictBase, after: TensorDictBase) -> torch.Tensor:
@@ -131,6 +130,11 @@ def numbers_apart(out: TensorDictBase, after: TensorDictBase) -> torch.Tensor:
     return differs
 
 
+def in_double(value: torch.Tensor) -> torch.Tensor:
+    """A copy, in double precision if it is a number."""
+    return value.double() if value.is_floating_point() else value.clone()
+
+
 def within_rounding(
     env: HighwayEnv,
     td: TensorDictBase,
@@ -146,16 +150,10 @@ def within_rounding(
         env.traffic, copies, env.vehicles, env.spawn_parameters, env.ego, env.episode,
         dtype=torch.float64, recycle=env.recycle, actions=env.actions,
     )  # fmt: skip
-    state = td[row : row + 1].expand(copies).clone()
+    state = td[row : row + 1].expand(copies).apply(in_double)
     between = drawing((copies, env.vehicles), 0)
     for name, size in (("x", 2e-5), ("y", 2e-6), ("speed", 4e-6), ("heading", 2e-7)):
-        state[keys.VEHICLES, name] = state[keys.VEHICLES, name].double() + size * between(-1.0, 1.0)
-    for name in ("acceleration", "length", "width", "desired_speed"):
-        state[keys.VEHICLES, name] = state[keys.VEHICLES, name].double()
-    for group in (keys.TRAFFIC, keys.EGO):
-        state[group, "steering"] = state[group, "steering"].double()
-    if env.actions.form == "lane_speed":
-        state[keys.EGO, keys.SET_SPEED] = state[keys.EGO, keys.SET_SPEED].double()
+        state[keys.VEHICLES, name] += size * between(-1.0, 1.0)
     after = exact.step(state)["next"]
     first = after[:1].expand(copies)
     return bool(apart(after, first).any())
@@ -290,7 +288,6 @@ def test_what_goes_in_stays_as_it_is_and_need_not_be_contiguous():
 @pytest.mark.parametrize(
     "scenes",
     [
-        RandomScenes(),
         RandomScenes(parameters=SpawnParameters(truck_share=0.4)),
         RandomScenes(Road(lanes=1, lane_width_m=3.2), 5),
         RandomScenes(
@@ -301,7 +298,7 @@ def test_what_goes_in_stays_as_it_is_and_need_not_be_contiguous():
             Visibility.BODY,
         ),
     ],
-    ids=["the paper's", "lorries", "one lane", "a crowd"],
+    ids=["lorries", "one lane", "a crowd"],
 )
 def test_every_number_of_a_first_scene_is_that_of_the_tensor_code(scenes):
     seed = torch.full((200,), 7)

@@ -167,7 +167,7 @@ class NativeBatch:
             "reward_settings": filled(settings.Reward, vars(config.reward) | period_and_terms),
             "view": view,
             "view_inputs": self._pointers(_VIEWS),
-            "mask_settings": mask_settings(highway, drivers.idm, mask.safe_deceleration, abort),
+            "mask_settings": mask_settings(highway, drivers.idm, mask, abort),
             "mask_inputs": self._pointers(_MASKS),
             "mask_outputs": addresses([self._lane_mask, self._no_safe_action]),
             "scene": self._pointers(settings.STARTS),

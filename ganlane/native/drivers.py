@@ -67,6 +67,7 @@ from ganlane.settings.generator import (
     shipped_generator,
     stored_sizes,
 )
+from ganlane.settings.observation import MaskParameters
 from ganlane.settings.record import part_of
 from ganlane.settings.traffic import (
     GanCalibratedTrafficConfig,
@@ -412,6 +413,7 @@ def decision_settings(
         "timeout_steps": _steps(episode.timeout_s),
         # Of generated drivers only the limits of a lane change count.
         "mobil": isinstance(drivers, RuleDrivers) and drivers.mobil is not None,
+        "foresight": False,
         "stream": drivers.stream,
         "blind_share": drivers.blind_share,
         "courtesy": ego_mobil.courtesy,
@@ -425,12 +427,14 @@ def decision_settings(
 
 
 def mask_settings(
-    highway: Highway, idm: IdmParameters, safe_deceleration: float, abort: bool
+    highway: Highway, idm: IdmParameters, mask: MaskParameters, abort: bool
 ) -> Settings:
-    """The numbers of the mask ``safe``; ``safe_deceleration`` in m/s2."""
+    """The numbers of the masks ``safe`` and ``foresight``."""
     # The mask reads few of the decision's numbers; the others are defaults.
-    drivers = RuleDrivers(idm, mobil=MobilParameters(safe_deceleration=safe_deceleration))
-    return decision_settings(highway, drivers, ego=EgoParameters(abort_lane_change=abort))
+    drivers = RuleDrivers(idm, mobil=MobilParameters(safe_deceleration=mask.safe_deceleration))
+    settings = decision_settings(highway, drivers, ego=EgoParameters(abort_lane_change=abort))
+    settings.foresight = mask.form == "foresight"
+    return settings
 
 
 class _Faults(Structure):

@@ -40,7 +40,7 @@ struct Settings {
     float soft_crash_ttc, soft_crash_gap, goal;
     // road
     float lane_width, per_lane_width;
-    int32_t lanes, vehicles, substeps, timeout_steps, mobil, abort_lane_change;
+    int32_t lanes, vehicles, substeps, timeout_steps, mobil, abort_lane_change, foresight;
     int64_t stream;  // family of episodes that random numbers belong to
     double blind_share;  // of the episodes: nobody sees the ego
     const struct Generated* generated;  // generated.hpp; null: the others are rule-driven

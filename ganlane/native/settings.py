@@ -135,8 +135,8 @@ NATIVE_FORMS: Final = {
 CONTROL_NUMBERS: Final = {LANE: 0, LANE_SPEED: 1, CONTINUOUS: 2}
 #: Heading that counts as 1 there, rad: some 5 m/s to the side at 25 m/s.
 HEADING_RAD: Final = 0.2
-#: The action masks, in the order of step.cpp's numbers ``MASK_ROAD, MASK_LEGAL, MASK_SAFE``.
-MASK_FORMS: Final = ("none", "legal", "safe")
+#: The action masks, in the order of step.cpp's numbers ``MASK_ROAD, MASK_LEGAL, ...``.
+MASK_FORMS: Final = ("none", "legal", "safe", "foresight")
 
 
 def fields(kind: type, names: str) -> list[tuple[str, type]]:
@@ -196,7 +196,7 @@ class Settings(Structure):
             " per_near_s per_far_s gain_far gain_near gain_integral slow_mps max_angle_rad"
             " soft_crash_ttc_s soft_crash_gap_m goal_m lane_width_m per_lane_width",
         ),
-        *fields(c_int32, "lanes vehicles substeps timeout_steps mobil abort_lane_change"),
+        *fields(c_int32, "lanes vehicles substeps timeout_steps mobil abort_lane_change foresight"),
         *fields(c_int64, "stream"),
         *fields(c_double, "blind_share"),
         *fields(c_void_p, "generated human faults random ends actions flow"),

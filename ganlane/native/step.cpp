@@ -24,7 +24,7 @@ struct Reward {  // section V.C, see ganlane.transforms.reward
     int32_t literal_low_acceleration, terms;
 };
 
-enum { MASK_ROAD, MASK_LEGAL, MASK_SAFE };
+enum { MASK_ROAD, MASK_LEGAL, MASK_SAFE, MASK_FORESIGHT };
 
 struct Batch {
     const Settings* settings;
@@ -92,9 +92,9 @@ static int look(const Batch& b, long first, long last) {
             float low = i ? b.lowest : 0.0f, high = i ? b.highest : b.fastest;
             numbers[i] = numbers[i] < low ? low : numbers[i] > high ? high : numbers[i];
         }
-        if (b.mask_form != MASK_SAFE) allow(b, row);
+        if (b.mask_form < MASK_SAFE) allow(b, row);
     }
-    if (b.mask_form == MASK_SAFE) failed |= ganlane_mask(b.mask_settings, b.mask_inputs, b.mask_outputs, first, last);
+    if (b.mask_form >= MASK_SAFE) failed |= ganlane_mask(b.mask_settings, b.mask_inputs, b.mask_outputs, first, last);
     if (b.speed_mask)
         for (long row = first; row < last; row++) allow_speeds(b, row);
     return failed;

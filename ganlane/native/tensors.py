@@ -30,7 +30,7 @@ from ganlane.native.settings import Highway, Key, Layout
 from ganlane.settings.actions import ActionParameters
 from ganlane.settings.driving import EgoParameters, IdmParameters, MobilParameters
 from ganlane.settings.episode import EpisodeParameters
-from ganlane.settings.observation import ObservationScale
+from ganlane.settings.observation import MaskParameters, ObservationScale
 from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import VISIBILITY_OF_EPISODE, Road, Vehicles
 
@@ -346,22 +346,22 @@ class LaneView(_Function):
 
 
 class SafeActions(_Function):
-    """The mask ``safe`` (:class:`ganlane.transforms.ActionMaskTransform`).
+    """The masks ``safe`` and ``foresight`` (:class:`ganlane.transforms.ActionMaskTransform`).
 
-    It allows lane changes that have an effect and make no vehicle brake harder than is safe.
+    They allow lane changes that have an effect and make no vehicle brake harder than is safe.
 
     Args:
         road: straight, the same in all rows.
         vehicles: M, the ego included.
         idm: by which braking is judged.
-        safe_deceleration: m/s2.
+        mask: which of the two, and its deceleration.
         abort: whether the ego may turn back during a lane change.
     """
 
     def __init__(
-        self, road: Road, vehicles: int, idm: IdmParameters, safe_deceleration: float, abort: bool
+        self, road: Road, vehicles: int, idm: IdmParameters, mask: MaskParameters, abort: bool
     ) -> None:
-        numbers = mask_settings(_highway(road, vehicles), idm, safe_deceleration, abort)
+        numbers = mask_settings(_highway(road, vehicles), idm, mask, abort)
         super().__init__("ganlane_mask", numbers)
 
     def allowed(self, seen: Vehicles, direction: Tensor) -> tuple[Tensor, Tensor]:

@@ -32,7 +32,7 @@ OVERLAP_M = 1.0
 ROAD_SIGHT_M = 1000.0
 #: The masks, in the order of the kernel's numbers; see
 #: :class:`ganlane.transforms.ActionMaskTransform`.
-MASKS = ("none", "legal", "safe")
+MASKS = ("none", "legal", "safe", "foresight")
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class MaskParameters(Record):
 
     Attributes:
         form: one of :data:`MASKS`; ``none`` is the paper's literal form.
-        safe_deceleration: MOBIL's ``b_safe``, m/s2, above 0; read by ``safe`` alone.
+        safe_deceleration: MOBIL's ``b_safe``, m/s2, above 0; read by ``safe`` and ``foresight``.
     """
 
     group = "mask"

@@ -5,7 +5,9 @@ shielding, Alshiekh et al. 2018): computed by rules, never learnt, and the same 
 ``legal`` removes commands without an effect (off the road, or during a lane change). ``safe`` also
 removes lane changes that violate MOBIL's safety criterion (Kesting et al. 2007): after the change
 neither the new follower nor the ego itself would have to brake harder than ``safe_deceleration`` by
-IDM. Keeping the lane is always allowed, and so are faster and slower where they have an effect.
+IDM. ``foresight`` also removes those without room for the next seconds with a follower who does not
+react or a leader who brakes (:mod:`ganlane.sim.foresight`). Keeping the lane is always allowed, and
+so are faster and slower where they have an effect.
 
 The mask uses what the ego perceives: with sensor errors it can be wrong. It holds at the instant of
 the command; a lane change that has begun continues (or, with ``abort_lane_change``, can be turned
@@ -13,6 +15,8 @@ back if that is safe).
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -25,34 +29,53 @@ from ganlane.errors import UserError
 from ganlane.native.tensors import SafeActions
 from ganlane.settings.actions import LANE_SPEED, ActionParameters
 from ganlane.settings.driving import IdmParameters
+from ganlane.settings.observation import MaskParameters
 from ganlane.sim.actions import speed_changes
 from ganlane.sim.dynamics import SIDES, ego_scene, is_heard, stays_on_road
+from ganlane.sim.foresight import has_room
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import lane_accelerations
+from ganlane.sim.neighbours import Scene
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.torch_settings import constant
 from ganlane.transforms.sensors import PerceptionTransform
 
 #: What this transform computes; an environment without a mask (``none``) has no transform.
-FORMS = ("legal", "safe")
+FORMS = ("legal", "safe", "foresight")
+
+
+class BrakingDemand(NamedTuple):
+    """Accelerations by IDM, m/s2, [N, 3], for keeping the lane and going left and right.
+
+    Of the ego in those ``lanes`` and of its follower there, as the ego sees the ``scene``.
+    """
+
+    scene: Scene
+    lanes: Tensor
+    ego: Tensor
+    follower: Tensor
 
 
 def braking_demand(
     vehicles: Vehicles,
     road: Road,
     idm: IdmParameters = TABLE_V,
-) -> Tensor:
-    """Hardest braking that each action requires by IDM, as an acceleration in m/s2, [N, 3].
+) -> BrakingDemand:
+    """How hard the ego and its follower would have to brake after each action.
 
-    The actions are keep, left and right: of each the smaller of the ego's acceleration in that lane
-    and its follower's there. A lane that does not exist has no vehicles; the mask excludes it.
+    A lane that does not exist has no vehicles; the mask excludes it.
     """
     # IDM of the ego in each lane, and of who would follow it there.
     scene = ego_scene(vehicles, road)
     lane = scene.observers.target_lane.to(vehicles.x.dtype)
     lanes = torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1)
     accelerations = lane_accelerations(scene, lanes, idm)
-    return torch.minimum(accelerations.observer, accelerations.with_it)[:, 0]
+    return BrakingDemand(
+        scene,
+        lanes[:, 0],
+        accelerations.observer[:, 0],
+        accelerations.with_it[:, 0],
+    )
 
 
 def allowed_speeds(state: TensorDictBase, actions: ActionParameters) -> Tensor:
@@ -71,18 +94,18 @@ class ActionMaskTransform(PerceptionTransform):
     Belongs after a :class:`~ganlane.transforms.SensorTransform`. Append TorchRL's own
     ``ActionMask()`` to restrict the action spec, and with it ``env.rand_action``.
 
-    With ``form="safe"`` it also writes ``no_safe_action`` [N, 1] bool: no lane change is allowed,
-    and keeping the lane requires the ego or its follower to brake harder than is safe. The ego then
-    keeps its lane and brakes.
+    With ``form="safe"`` and ``foresight`` it also writes ``no_safe_action`` [N, 1] bool: no lane
+    change is allowed, and keeping the lane requires the ego or its follower to brake harder than is
+    safe. The ego then keeps its lane and brakes.
 
     Args:
         road: the environment's.
-        form: ``legal`` or ``safe``.
+        form: ``legal``, ``safe`` or ``foresight``.
         safe_deceleration: m/s2, above 0; MOBIL's ``b_safe``.
         idm: by which braking is judged.
         abort: whether the ego may turn back during a lane change (``env.ego.abort_lane_change``).
-        native_vehicles: M, where the native kernel computes ``safe`` (float32, CPU); None: the
-            tensor code does.
+        native_vehicles: M, where the native kernel computes ``safe`` and ``foresight`` (float32,
+            CPU); None: the tensor code does.
         actions: those of the environment.
 
     Raises:
@@ -112,7 +135,7 @@ class ActionMaskTransform(PerceptionTransform):
         self.actions.check_mask(form)
         # Behind legal there is nothing to report: keeping the lane is always legal.
         out_keys = [keys.ACTION_MASK]
-        if form == "safe":
+        if form != "legal":
             out_keys.append(keys.NO_SAFE_ACTION)
         super().__init__(in_keys=[keys.VEHICLES, keys.EGO], out_keys=out_keys)
         self.road = road
@@ -122,14 +145,9 @@ class ActionMaskTransform(PerceptionTransform):
         self.safe_deceleration = safe_deceleration
         # The kernel has no function for ``legal``, which is a comparison or two.
         self.native: SafeActions | None = None
-        if native_vehicles is not None and form == "safe":
-            self.native = SafeActions(
-                road,
-                native_vehicles,
-                idm,
-                safe_deceleration,
-                abort,
-            )
+        if native_vehicles is not None and form != "legal":
+            mask = MaskParameters(form, safe_deceleration)
+            self.native = SafeActions(road, native_vehicles, idm, mask, abort)
 
     def allowed(
         self,
@@ -148,11 +166,17 @@ class ActionMaskTransform(PerceptionTransform):
         legal = stays_on_road(vehicles, side, road) & obeyed
         if self.form == "legal":
             return legal, torch.zeros_like(legal[:, 0])
-        # Keeping the lane is always allowed: where nothing is safe, there is nothing better.
-        safe = braking_demand(vehicles, road, self.idm) >= -self.safe_deceleration
-        none = ~(safe & legal).any(1)
-        keep = torch.ones_like(safe[:, :1])
+        demand = braking_demand(vehicles, road, self.idm)
+        safe = torch.minimum(demand.ego, demand.follower) >= -self.safe_deceleration
         changes = legal[:, 1:] & safe[:, 1:]
+        if self.form == "foresight":
+            slowest = torch.minimum(demand.ego[:, :1], demand.ego[:, 1:])
+            lanes = demand.lanes[:, 1:]
+            room = has_room(demand.scene, lanes, slowest, self.safe_deceleration)
+            changes = changes & room
+        # Keeping the lane is always allowed: where nothing is safe, there is nothing better.
+        none = ~(safe[:, :1] | changes).any(1)
+        keep = torch.ones_like(safe[:, :1])
         return torch.cat((keep, changes), dim=1), none
 
     def write(
@@ -174,7 +198,7 @@ class ActionMaskTransform(PerceptionTransform):
         if self.actions.form == LANE_SPEED:
             mask = torch.cat((mask, allowed_speeds(state, self.actions)), dim=1)
         state.set(keys.ACTION_MASK, mask)
-        return state.set(keys.NO_SAFE_ACTION, none[:, None]) if self.form == "safe" else state
+        return state.set(keys.NO_SAFE_ACTION, none[:, None]) if self.form != "legal" else state
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the mask to the spec."""

@@ -51,7 +51,7 @@ def any_commands(rows, rng):
         ("idm_mobil", {"env": "merge", "observation": "road_view"}),
         ("idm_mobil", {"env": "exit", "observation": "road_view", "mask": "safe"}),
         ("idm_faults", {"env": "lane_drop", "observation": "lane_view", "mask": "legal"}),
-        ("idm", {"env": "cut_in", "actions": "lane_speed", "mask": "safe"}),
+        ("idm", {"env": "cut_in", "actions": "lane_speed", "mask": "foresight"}),
         ("idm_mobil", {"env": "merge", "observation": "road_view", "actions": "continuous"}),
         ("idm_mobil", {"goal_m": 300.0, "observation": "lane_view_overlap"}),
         (
@@ -61,7 +61,7 @@ def any_commands(rows, rng):
         ),
         (
             "idm_mobil",
-            {"recycle": True, "recycle_share": 0.5, "goal_m": 300.0, "mask": "safe", **LORRIES}
+            {"recycle": True, "recycle_share": 0.5, "goal_m": 300.0, "mask": "foresight", **LORRIES}
             | {"observation": "lane_view_drift", "reward": OTHER_REWARD},
         ),
         (

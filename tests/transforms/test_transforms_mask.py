@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from reference.worlds import environment, vehicles
+from reference.worlds import environment, random_scenes, vehicles
 from tensordict import TensorDict
 from torchrl.envs import ActionMask, Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -131,6 +131,34 @@ def test_keeping_the_lane_is_allowed_when_nothing_is_safe_and_that_is_reported()
     assert allowed(*BESIDE, {"x": 500.0, "lane": 1}) == (KEEP_ONLY, False)
 
 
+@pytest.fixture(scope="module")
+def crowd() -> Vehicles:
+    """4096 egos among eleven others each, in float32 as in the kernel."""
+    fields = random_scenes(4096, 12, 3, seed=5)
+    return Vehicles(*(field.float() if field.is_floating_point() else field for field in fields))
+
+
+IDLE = torch.zeros(4096, dtype=torch.int64)
+
+
+def test_foresight_forbids_what_safe_forbids_and_more(crowd):
+    safe, _ = ActionMaskTransform(Road(), "safe").allowed(crowd, IDLE, Road())
+    foresight, _ = ActionMaskTransform(Road(), "foresight").allowed(crowd, IDLE, Road())
+    assert not (foresight & ~safe).any()
+    share = foresight[:, 1:].sum() / safe[:, 1:].sum()
+    assert 0.5 < share < 0.98
+
+
+@pytest.mark.kernel
+@pytest.mark.parametrize("form", ["safe", "foresight"])
+def test_the_kernel_allows_what_the_tensor_code_allows(crowd, form):
+    transform = ActionMaskTransform(Road(), form, native_vehicles=12)
+    mask, none = transform.allowed(crowd, IDLE, Road())
+    by_kernel, none_by_kernel = transform.native.allowed(crowd, IDLE)
+    assert torch.equal(by_kernel, mask)
+    assert torch.equal(none_by_kernel, none)
+
+
 # --- in the environment
 
 
@@ -220,7 +248,7 @@ def test_a_suffix_puts_any_driver_behind_a_mask_or_takes_it_away():
 @pytest.mark.parametrize(
     ("make", "expected"),
     [
-        (lambda: ActionMaskTransform(Road(), "soft"), "expected one of legal, safe"),
+        (lambda: ActionMaskTransform(Road(), "soft"), "expected one of legal, safe, foresight"),
         (lambda: ActionMaskTransform(Road(), "safe", 0.0), "above 0"),
         (lambda: ganlane.make_env("idm", mask="save"), "did you mean"),
         (

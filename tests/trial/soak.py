@@ -88,7 +88,7 @@ def random_choice(rng: random.Random) -> dict[str, Any]:
     choice: dict[str, Any] = {
         "env": env,
         "observation": rng.choice(FORMS),
-        "mask": rng.choice(("none", "legal", "safe")),
+        "mask": rng.choice(("none", "legal", "safe", "foresight")),
         "seed": rng.randrange(2**40),
         "decision_period_s": rng.choice((0.1, 0.3, 0.5, 1.0, 1.0, 1.0, 2.0)),
         "goal_m": rng.choice((30.0, 200.0, 1000.0, 5000.0)),

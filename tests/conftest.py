@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import subprocess
@@ -46,6 +47,9 @@ def pytest_configure(config):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtestloop():
+    # The garbage collector need not look again and again at what was imported.
+    gc.collect()
+    gc.freeze()
     while "PYTEST_XDIST_WORKER" in os.environ and BUILDING.exists():
         time.sleep(0.1)
 

@@ -3,8 +3,6 @@
 Nothing of the package is touched.
 """
 
-from __future__ import annotations
-
 import torch
 from tensordict.nn import TensorDictModuleBase
 

@@ -1,7 +1,5 @@
 """The calls of a notebook do what the commands do."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import re
@@ -11,13 +9,12 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
-from reference.refusals import last_path
+from reference.refusals import last_path, user_error
 
 import ganlane
 from ganlane.__main__ import main
 from ganlane.agents.drivers import DRIVERS
 from ganlane.config.run import COMMANDS, function_of
-from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.traffic import GanTrafficConfig
 from ganlane.traffic import IdmTraffic
@@ -189,7 +186,7 @@ def api(name, *arguments, **keys):
     ],
 )
 def test_a_mistake_is_one_sentence_and_leaves_nothing(call, message, tmp_path):
-    with pytest.raises(UserError, match=re.escape(message)) as caught:
+    with user_error(re.escape(message)) as caught:
         call()
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []

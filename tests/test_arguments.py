@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import pytest
+from reference.refusals import user_error
 from tensordict.nn import TensorDictModuleBase
 
 from ganlane.arguments import call_with, signature_of
-from ganlane.errors import UserError
 
 
 class Anything:
@@ -53,7 +52,5 @@ def test_it_is_called_with_what_it_names_and_no_more():
     assert call_with(Inherits, offered, {"stream": 2}, "agents").given == (3, 2)
     assert call_with(Module, offered, {}, "agents").road == 3
     assert isinstance(call_with(Nothing, offered, {}, "agents"), Nothing)
-    with pytest.raises(
-        UserError, match=r"agents=.*Named: cannot be called with .*; it takes road, stream"
-    ):
+    with user_error(r"agents=.*Named: cannot be called with .*; it takes road, stream"):
         call_with(Named, {"idm": 5}, {}, "agents")

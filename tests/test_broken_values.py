@@ -1,7 +1,5 @@
 """A value of a wrong type is refused in one sentence, for every key of every command and option."""
 
-from __future__ import annotations
-
 import types
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass

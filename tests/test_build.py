@@ -1,14 +1,12 @@
 """Environments and drivers built from plain config dataclasses."""
 
-from __future__ import annotations
-
 import sys
 
 import pytest
+from reference.refusals import user_error
 
 from ganlane.agents.drivers import MobilDriver
 from ganlane.build import make_driver, make_traffic
-from ganlane.errors import UserError
 from ganlane.settings.driving import IdmParameters, MobilParameters
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.recordings import RealismConfig
@@ -50,13 +48,13 @@ def test_where_the_package_is_missing_a_sentence_names_the_extra(
     for name in [name for name in sys.modules if name.startswith(f"{module}.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(UserError, match=rf"pip install 'ganlane\[{extra}\]'"):
+    with user_error(rf"pip install 'ganlane\[{extra}\]'"):
         make_traffic(config, EnvConfig())
 
 
 @pytest.mark.parametrize("config", [SumoTrafficConfig(), HighwayEnvTrafficConfig()])
 def test_a_realism_card_has_no_ego_to_drive_around(config):
-    with pytest.raises(UserError, match="drives around an ego only"):
+    with user_error("drives around an ego only"):
         RealismConfig(traffic=config)
 
 

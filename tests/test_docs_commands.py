@@ -1,18 +1,15 @@
 """Every command in README and the pages is one that the records accept."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from functools import cache
-from pathlib import Path
 
 import pytest
+from reference.processes import ROOT
 
 from ganlane.config.run import COMMANDS, parsed, settings, single_runs
 from ganlane.sim import scenes
 
-ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 #: Between backquotes, or a line of a block of code; a backslash at its end goes on.
 COMMAND = re.compile(

@@ -1,7 +1,5 @@
 """``ganlane benchmark`` from end to end, with short episodes, in process."""
 
-from __future__ import annotations
-
 import json
 import re
 from functools import partial
@@ -9,6 +7,7 @@ from pathlib import Path
 
 import jsonschema
 import pytest
+from reference.processes import ROOT
 from reference.refusals import user_error
 
 import ganlane
@@ -19,7 +18,6 @@ from ganlane.suite import cells
 main = partial(run_command, "benchmark")
 SHORT = ["suite.env.goal_m=60", "hydra.run.dir=out", "suite.scored={idm: 2}"]
 ALONE = [*SHORT, "suite.shown={}", "suite.baselines=[]"]
-ROOT = Path(__file__).resolve().parents[1]
 SCHEMA = json.loads((ROOT / "docs" / "results.schema.json").read_text())
 pytestmark = pytest.mark.usefixtures("empty_folder")
 

@@ -3,8 +3,6 @@
 Dispatch, help, mistakes that the commands find, commands in a process of their own.
 """
 
-from __future__ import annotations
-
 import pytest
 import yaml
 from reference.refusals import refusal

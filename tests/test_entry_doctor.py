@@ -1,19 +1,16 @@
 """``ganlane doctor`` reports what is there, what is missing, and the command that mends it."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 
 import pytest
+from reference.processes import ROOT
+from reference.refusals import user_error
 
 from ganlane import doctor
 from ganlane.__main__ import commands, main
-from ganlane.errors import UserError
 from ganlane.native import library
 from ganlane.native.tensors import Kernel
 
-ROOT = Path(__file__).resolve().parents[1]
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
@@ -46,7 +43,7 @@ def test_help_is_printed_and_keys_are_refused(capsys):
 
 def test_recordings_are_found_or_asked_for(tmp_path, monkeypatch):
     monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
-    with pytest.raises(UserError, match="set GANLANE_DATA"):
+    with user_error("set GANLANE_DATA"):
         doctor.recordings()
     (tmp_path / "us101_scenes.csv").touch()
     assert doctor.recordings() == str(tmp_path / "us101_scenes.csv")
@@ -55,7 +52,7 @@ def test_recordings_are_found_or_asked_for(tmp_path, monkeypatch):
 def test_the_kernel_is_driven_and_without_one_a_compiler_asked_for(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("ganlane.native.library.compilers", lambda: ())
-        with pytest.raises(UserError, match=r"there is no C\+\+ compiler; install g"):
+        with user_error(r"there is no C\+\+ compiler; install g"):
             doctor.kernel()
     if library.why_not() is not None:
         return
@@ -64,7 +61,7 @@ def test_the_kernel_is_driven_and_without_one_a_compiler_asked_for(monkeypatch):
     assert doctor.kernel() == told
     # As the library of a compiler that is broken would.
     monkeypatch.setattr(Kernel, "decide", lambda self, action, state, recycles: state.clone())
-    with pytest.raises(UserError, match=r"its kernel drives .* m away from the tensor code"):
+    with user_error(r"its kernel drives .* m away from the tensor code"):
         doctor.kernel()
 
 

@@ -1,7 +1,5 @@
 """``ganlane evaluate`` from end to end, with tiny budgets, in process."""
 
-from __future__ import annotations
-
 import json
 from functools import partial
 

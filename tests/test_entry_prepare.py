@@ -3,8 +3,6 @@
 And on to a generator that drives.
 """
 
-from __future__ import annotations
-
 import json
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``ganlane record`` writes datasets that minari loads, and that can be driven again."""
 
-from __future__ import annotations
-
 import json
 import sys
 

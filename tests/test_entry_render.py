@@ -1,7 +1,5 @@
 """``ganlane render`` from end to end, in process."""
 
-from __future__ import annotations
-
 import json
 import re
 from functools import partial

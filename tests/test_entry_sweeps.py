@@ -1,17 +1,13 @@
 """Every run of a sweep has a folder of its own, whichever launcher starts it."""
 
-from __future__ import annotations
-
 import json
 import logging
-import os
-import subprocess
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 import entry_tiny
 import pytest
+from reference.processes import run
 from reference.refusals import is_one_sentence
 
 from ganlane.__main__ import main
@@ -25,16 +21,6 @@ LAUNCHERS = {
     "submitit_local": ("hydra_plugins.hydra_submitit_launcher", ["hydra.launcher.timeout_min=5"]),
     "ray": ("hydra_plugins.hydra_ray_launcher", []),
 }
-
-
-def sweep(folder, *arguments):
-    """Run a sweep over two seeds in a process of its own, in ``folder``."""
-    command = [sys.executable, "-m", "ganlane", "train", "-m", "seed=0,1", *TINY, *arguments]
-    variables = {"PYTHONPATH": str(Path(__file__).parent.parent), "OMP_NUM_THREADS": "1"}
-    environment = {**os.environ, **variables}
-    return subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=500
-    )
 
 
 def skip_without(launcher):
@@ -51,7 +37,8 @@ def skip_without(launcher):
 @pytest.mark.parametrize("launcher", LAUNCHERS)
 def test_the_runs_of_a_sweep_share_no_file(launcher, tmp_path):
     skip_without(launcher)
-    done = sweep(tmp_path, f"hydra/launcher={launcher}", *LAUNCHERS[launcher][1])
+    words = ["-m", "seed=0,1", *TINY, f"hydra/launcher={launcher}", *LAUNCHERS[launcher][1]]
+    done = run("-m", "ganlane", "train", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr[-3000:]
     (folder,) = (tmp_path / "outputs" / "train_sweeps").iterdir()
     runs = sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
@@ -78,9 +65,9 @@ def own_logging(monkeypatch):
 def test_a_sweep_of_evaluate_has_a_folder_for_each_run_and_ends_with_one_table(capsys):
     assert main([*EVALUATE, "agents=[mobil,keep_lane]"]) == 0
     (folder,) = Path("outputs/evaluate_sweeps").iterdir()
-    for run in (0, 1):
-        results = json.loads((folder / str(run) / "results.json").read_text())
-        assert results["config"]["seed"] == run
+    for seed in (0, 1):
+        results = json.loads((folder / str(seed) / "results.json").read_text())
+        assert results["config"]["seed"] == seed
     table = capsys.readouterr().out.rpartition("results: ")[2]
     assert table.count("keep_lane") == 2
     assert "seed=0" in table

@@ -1,7 +1,5 @@
 """``ganlane train`` from end to end, with tiny budgets, in process."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import signal

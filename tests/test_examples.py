@@ -1,17 +1,14 @@
 """Every example runs and prints its result, and the one shown in the docs is the one that runs."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import runpy
 import sys
-from pathlib import Path
 
 import pytest
 import torch
+from reference.processes import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 #: What a run must print, so that an example that does nothing fails.
 EXAMPLES = {
     "own_traffic.py": r"mean speed of the others \d+\.\d m/s, \d+ % look away",

@@ -3,8 +3,6 @@
 Damage to any byte is refused.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import sys
@@ -16,6 +14,7 @@ import polars as pl
 import pytest
 import torch
 from PIL import Image
+from reference.refusals import user_error
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from safetensors.torch import save_file
 
@@ -107,14 +106,11 @@ def test_an_error_about_something_else_is_passed_on_as_it_is(tmp_path):
 
 def test_what_is_no_file_is_not_replaced(tmp_path):
     (tmp_path / "folder").mkdir()
-    with pytest.raises(
-        UserError,
-        match="folder: a folder, where a file was to be written",
-    ):
+    with user_error("folder: a folder, where a file was to be written"):
         write_bytes(tmp_path / "folder", b"new")
     if sys.platform != "win32":
         os.mkfifo(tmp_path / "pipe")
-        with pytest.raises(UserError, match="pipe: a device or a pipe, where a file"):
+        with user_error("pipe: a device or a pipe, where a file"):
             write_bytes(tmp_path / "pipe", b"new")
         assert (tmp_path / "pipe").is_fifo()
 
@@ -184,7 +180,7 @@ def test_any_flipped_byte_is_refused_in_one_sentence(name, tmp_path, capsys):
     }
     for place in sorted(place for place in places if place < len(whole)):
         path.write_bytes(flipped(whole, place, place % 8))
-        with pytest.raises(UserError, match=f"{name}: (damaged{earlier})") as caught:
+        with user_error(f"{name}: (damaged{earlier})") as caught:
             read(path)
         assert "\n" not in str(caught.value)
     for length in (0, 1, len(whole) // 2, len(whole) - len(PLACE), len(whole) - 1):
@@ -204,7 +200,7 @@ def test_no_bit_of_a_content_can_change(seal):
     assert has_checksum(content, "file")
     for place in range(len(content)):
         for bit in range(8):
-            with pytest.raises(UserError, match="file: damaged"):
+            with user_error("file: damaged"):
                 has_checksum(flipped(content, place, bit), "file")
 
 
@@ -215,10 +211,7 @@ def test_a_file_that_lost_its_checksum_is_refused(tmp_path):
         path,
         metadata={"ganlane": '{"kind": "agent"}'},
     )
-    with pytest.raises(
-        UserError,
-        match="the checksum that was written with it is missing",
-    ):
+    with user_error("the checksum that was written with it is missing"):
         load_weights(path, "agent")
 
 
@@ -254,10 +247,7 @@ def test_weights_that_are_not_finite_are_refused(kind, value, tmp_path):
         },
         {},
     )
-    with pytest.raises(
-        UserError,
-        match=r"w\.safetensors: layer\.weight holds numbers that are not finite",
-    ):
+    with user_error(r"w\.safetensors: layer\.weight holds numbers that are not finite"):
         load_weights(path, kind)
 
 
@@ -277,5 +267,5 @@ def test_a_huge_file_is_refused_before_it_is_read(kind, tmp_path):
         "recordings": lambda: read_scenes(path),
         "checkpoint": lambda: load_checkpoint(path),
     }
-    with pytest.raises(UserError, match=r"huge\.parquet: (more than|not a readable)"):
+    with user_error(r"huge\.parquet: (more than|not a readable)"):
         read[kind]()

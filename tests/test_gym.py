@@ -1,11 +1,7 @@
 """The highway through gymnasium: one environment, a batch, and what gymnasium expects of them."""
 
-from __future__ import annotations
-
 import copy
 import pickle
-import subprocess
-import sys
 from dataclasses import replace
 
 import gymnasium
@@ -13,10 +9,11 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
-from reference.gym_env import ID, KEEP, LEFT, RIGHT, ROOT, make, make_vec, until_the_end
+from reference.gym_env import ID, KEEP, LEFT, RIGHT, make, make_vec, until_the_end
+from reference.processes import run
+from reference.refusals import user_error
 
 from ganlane.build import make_traffic
-from ganlane.errors import UserError
 from ganlane.gym import ENV_IDS
 from ganlane.native.drivers import NETWORKS, drivers_of
 from ganlane.settings.env import EnvConfig
@@ -63,7 +60,7 @@ def test_the_spec_says_when_an_episode_is_cut_off_and_nothing_else_cuts_it(
 def test_a_shorter_time_limit_is_gymnasiums_own_and_refused_for_a_batch():
     env = gymnasium.make(ID, max_episode_steps=5)
     assert env.spec.max_episode_steps == decisions_until_cut_off(env) == 5
-    with pytest.raises(UserError, match=r"max_episode_steps=5: .* give timeout_s=5\."):
+    with user_error(r"max_episode_steps=5: .* give timeout_s=5\."):
         gymnasium.make_vec(ID, num_envs=2, max_episode_steps=5)
 
 
@@ -121,8 +118,7 @@ def test_the_id_imports_the_package_which_drives_by_rules_without_torch_and_hydr
         "env.reset(seed=0); env.step(0); "
         "print({'torch', 'hydra', 'polars', 'PIL'} & sys.modules.keys())"
     )
-    told = subprocess.check_output([sys.executable, "-c", code], text=True, cwd=ROOT)
-    assert told == "set()\n"
+    assert run("-c", code).stdout == "set()\n"
 
 
 def test_episodes_follow_from_seed_and_number():
@@ -236,9 +232,9 @@ def test_a_row_that_is_over_is_not_stepped_where_resets_are_left_to_the_user():
     envs = make_vec(2, lanes=1, autoreset_mode="disabled")
     envs.reset(seed=0)
     envs.step(np.array([LEFT, KEEP]))
-    with pytest.raises(UserError, match=r"rows \[0\] are over; call reset"):
+    with user_error(r"rows \[0\] are over; call reset"):
         envs.step(np.array([KEEP, KEEP]))
-    with pytest.raises(UserError, match="expected one of next_step, same_step, disabled"):
+    with user_error("expected one of next_step, same_step, disabled"):
         make_vec(2, autoreset_mode="never")
 
 
@@ -314,7 +310,7 @@ def begun(env):
 )
 @pytest.mark.filterwarnings("ignore:.*render_mode")
 def test_a_wrong_argument_is_refused_in_a_sentence(call, message):
-    with pytest.raises(UserError, match=message):
+    with user_error(message):
         call()
 
 

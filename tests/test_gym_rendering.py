@@ -1,7 +1,5 @@
 """Pictures, videos and the window of the gymnasium environments."""
 
-from __future__ import annotations
-
 import itertools
 from unittest.mock import Mock
 
@@ -10,8 +8,8 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from reference.gym_env import ID, KEEP, make, make_vec, until_the_end
+from reference.refusals import user_error
 
-from ganlane.errors import UserError
 from ganlane.gym.window import FilmWindow
 
 
@@ -112,6 +110,6 @@ def test_without_a_display_the_window_is_refused_in_a_sentence(monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("sys.platform", "linux")
-    with pytest.raises(UserError, match=r"render_mode=human: needs pygame .* and a display"):
+    with user_error(r"render_mode=human: needs pygame .* and a display"):
         make(render_mode="human")
     assert make().unwrapped.metadata["render_modes"] == ["rgb_array", "rgb_array_list"]

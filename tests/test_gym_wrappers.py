@@ -1,15 +1,13 @@
 """What other libraries, and the documents, do with the gymnasium environments."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
-import warnings
 
 import gymnasium
 import numpy as np
 import pytest
-from reference.gym_env import KEEP, LEFT, ROOT, make, make_vec
+from reference.gym_env import KEEP, LEFT, make, make_vec
+from reference.processes import ROOT
 
 VECTOR = gymnasium.wrappers.vector
 MASKS_MAY_BE_ABSENT = tuple(map(int, re.findall(r"\d+", gymnasium.__version__)[:3])) >= (1, 2, 2)
@@ -28,6 +26,27 @@ def test_gymnasiums_own_vector_wrappers_take_the_batch(mode):
             lengths += info["episode"]["l"][info["_episode"]].tolist()
     assert len(lengths) >= 4
     assert all(1 <= length <= 6 for length in lengths)
+
+
+def test_cleanrls_ppo_finds_what_it_reads_of_environments_that_gymnasium_puts_together():
+    """Which has its script in its repository, not in its package."""
+
+    def make_env():
+        return gymnasium.wrappers.RecordEpisodeStatistics(make())
+
+    envs = gymnasium.vector.SyncVectorEnv([make_env, make_env])
+    random = np.random.default_rng(0)
+    returns = []
+    observation, _ = envs.reset(seed=1)
+    for _ in range(64):
+        assert observation.shape == (2, *envs.single_observation_space.shape)
+        action = random.integers(envs.single_action_space.n, size=2)
+        observation, *_, infos = envs.step(action)
+        if "episode" in infos:
+            returns += infos["episode"]["r"][infos["_episode"]].tolist()
+    # The goal's 100, or a crash's or the verge's -100.
+    assert len(returns) >= 10
+    assert {round(value, -2) for value in returns} <= {-100.0, 0.0, 100.0}
 
 
 @pytest.mark.skipif(not MASKS_MAY_BE_ABSENT, reason="DictInfoToList needs gymnasium 1.2.2 or newer")
@@ -60,12 +79,3 @@ def test_the_docs_list_every_info():
     assert set(re.search(r"`speed, (.*?)` \|", table).group(1).split(", ")) | {"speed"} == set(
         info["reward_terms"]
     )
-
-
-def test_the_check_of_stable_baselines3_finds_nothing():
-    checker = pytest.importorskip(
-        "stable_baselines3.common.env_checker", reason="the extra sb3 is not installed"
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        checker.check_env(make().unwrapped)

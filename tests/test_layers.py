@@ -1,7 +1,5 @@
 """No module imports one that stands later in the order of the package."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from pathlib import Path

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from reference.refusals import Bomb, refusal, run_folder
+from reference.refusals import Bomb, refusal, run_folder, user_error
 
 from ganlane.__main__ import main
 from ganlane.agents import load_agent
@@ -151,7 +151,7 @@ def test_a_pickle_in_the_place_of_another_file_is_refused(arguments, here, capsy
 
 def test_a_reference_of_recorded_driving_is_plain_numbers(here):
     (here / "reference.json").write_bytes(pickle.dumps(Bomb()))
-    with pytest.raises(UserError, match="not the histograms"):
+    with user_error("not the histograms"):
         Reference.load(here / "reference.json")
 
 
@@ -267,9 +267,7 @@ def annotated_with_text(road) -> "a traffic":  # noqa: F722
     ],
 )
 def test_what_is_named_is_called_only_if_it_makes_a_traffic(name, capsys):
-    with pytest.raises(
-        UserError, match=r"expected a subclass of ganlane\.traffic\.TrafficModule or a function"
-    ):
+    with user_error(r"expected a subclass of ganlane\.traffic\.TrafficModule or a function"):
         import_target(f"{__name__}.{name}", "traffic._target_", TrafficModule)
     assert "_target_" in refusal(
         capsys, "train", "traffic=idm", f"traffic._target_={__name__}.{name}"
@@ -314,7 +312,7 @@ def test_a_resumed_run_takes_what_this_command_line_repeats(foreign_run):
     ],
 )
 def test_a_resumed_run_takes_no_more_than_that(keys, missing, foreign_run):
-    with pytest.raises(UserError, match=r"the run's file names evil\.") as caught:
+    with user_error(r"the run's file names evil\.") as caught:
         refuse_stored_imports(foreign_run, keys)
     assert f"add {missing} to the command line" in str(caught.value)
 

@@ -2,18 +2,15 @@
 with are whole.
 """
 
-from __future__ import annotations
-
 import os
-from pathlib import Path
 
 import pytest
+from reference.processes import ROOT
 
 nbformat = pytest.importorskip("nbformat", reason="nbformat is not installed")
 nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed")
 pytest.importorskip("ipykernel", reason="ipykernel is not installed")
 
-ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOK = ROOT / "examples" / "quickstart.ipynb"
 
 

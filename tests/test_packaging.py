@@ -1,13 +1,12 @@
 """The contents of an installed package."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
 import pytest
+from reference.processes import ROOT
 
 import ganlane
 from ganlane.agents.checkpoint import SHIPPED
@@ -19,7 +18,6 @@ if sys.version_info >= (3, 11):
 else:  # pragma: no cover
     tomllib = pytest.importorskip("tomli")
 
-ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 

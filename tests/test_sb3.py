@@ -3,14 +3,13 @@
 Algorithms train on it unchanged, and their policies are evaluated.
 """
 
-from __future__ import annotations
-
 import json
 import warnings
 
 import numpy as np
 import pytest
 import torch
+from reference.refusals import user_error
 
 sb3_contrib = pytest.importorskip("sb3_contrib", reason="the extra sb3 is not installed")
 
@@ -29,7 +28,6 @@ from torchrl.envs.transforms import ObservationNorm
 import ganlane
 import ganlane.sb3
 from ganlane.build import make_driver
-from ganlane.errors import UserError
 from ganlane.evaluation import episodes as evaluation_of_episodes
 from ganlane.settings.env import EnvConfig
 
@@ -109,7 +107,7 @@ def test_pictures_of_all_rows_are_tiled():
     env.reset()
     height, width, _ = env.get_images()[0].shape
     assert env.render().shape == (2 * height, 2 * width, 3)
-    with pytest.raises(UserError, match="render_mode"):
+    with user_error("render_mode"):
         short_episodes().get_images()
 
 
@@ -119,11 +117,11 @@ def test_attributes_are_those_of_the_batch_and_cannot_be_set():
     assert not env.has_attr("no_such_thing")
     assert env.env_is_wrapped(Monitor) == [True] * ROWS
     assert env.env_is_wrapped(VecNormalize) == [False] * ROWS
-    with pytest.raises(UserError, match="make_vec_env"):
+    with user_error("make_vec_env"):
         env.set_attr("lanes", 4)
-    with pytest.raises(UserError, match="call one of them"):
+    with user_error("call one of them"):
         env.env_method("no_such_method")
-    with pytest.raises(UserError, match="seed=-1"):
+    with user_error("seed=-1"):
         env.seed(-1)
     env.close()
 
@@ -269,13 +267,13 @@ def halved():
 )
 def test_what_a_driver_cannot_repeat_is_refused_by_name(name, make):
     model = DQN("MlpPolicy", make(), device="cpu", **QUICK[DQN])
-    with pytest.raises(UserError, match=f"{name} stands between"):
+    with user_error(f"{name} stands between"):
         ganlane.sb3.driver(model)
 
 
 def test_a_masked_model_that_could_turn_back_without_a_mask_is_refused():
     env = short_episodes(env={"ego": {"abort_lane_change": True}})
-    with pytest.raises(UserError, match="train it with mask='legal'"):
+    with user_error("train it with mask='legal'"):
         ganlane.sb3.driver(untrained(sb3_contrib.MaskablePPO, env))
 
 
@@ -317,19 +315,19 @@ def test_a_model_of_which_nothing_says_what_it_reads_is_refused(tmp_path):
     model = untrained(PPO, short_episodes())
     ganlane.sb3.driver(model).save(tmp_path / "ppo.zip")
     loaded = PPO.load(tmp_path / "ppo.zip")
-    with pytest.raises(UserError, match=r"PPO has no environment.*PPO\.load\(path, env="):
+    with user_error(r"PPO has no environment.*PPO\.load\(path, env="):
         ganlane.sb3.driver(loaded)
-    with pytest.raises(UserError, match=r"none\.zip\.json: .*No such file"):
+    with user_error(r"none\.zip\.json: .*No such file"):
         ganlane.sb3.driver(loaded, stored=tmp_path / "none")
 
 
 def test_an_environment_that_does_not_fit_the_model_is_refused_in_one_sentence():
     table = {"observation": "table3"}
     driver = ganlane.sb3.driver(untrained(PPO, short_episodes(**table)))
-    with pytest.raises(UserError, match=r"PPO: it reads observations of shape \[\d+\], but"):
+    with user_error(r"PPO: it reads observations of shape \[\d+\], but"):
         ganlane.api.evaluate([driver], ["idm"], 2, vehicles=5, **SHORT)
     masked = ganlane.sb3.driver(untrained(sb3_contrib.MaskablePPO, short_episodes()))
-    with pytest.raises(UserError, match="no action_mask"):
+    with user_error("no action_mask"):
         ganlane.make_env("idm").rollout(2, masked.policy)
 
 

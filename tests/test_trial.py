@@ -1,7 +1,5 @@
 """The trial of the package: what breaks is seen, and what holds is counted."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

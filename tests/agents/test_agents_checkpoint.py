@@ -5,6 +5,7 @@ from copy import deepcopy
 import pytest
 import torch
 from agents_small import agent, same_weights, saved_in
+from reference.refusals import user_error
 from tensordict import TensorDict
 
 from ganlane.agents import (
@@ -16,7 +17,6 @@ from ganlane.agents import (
     save_agent,
     warm_start,
 )
-from ganlane.errors import UserError
 from ganlane.weights import load_weights, save_weights
 
 
@@ -47,15 +47,12 @@ def test_a_loaded_agent_drives_like_the_saved_one(saved):
 
 
 def test_another_observation_size_is_refused_naming_both(saved):
-    with pytest.raises(UserError, match=r"\[5\].*\[9\]"):
+    with user_error(r"\[5\].*\[9\]"):
         start_from(agent(size=9), saved)
 
 
 def test_an_unknown_agent_is_refused_with_the_names_there_are():
-    with pytest.raises(
-        UserError,
-        match="agents that ship are agent_exit, agent_gan, agent_general, agent_idm",
-    ):
+    with user_error("agents that ship are agent_exit, agent_gan, agent_general, agent_idm"):
         load_agent("agent_xyz")
 
 
@@ -90,10 +87,7 @@ def test_a_network_that_is_not_understood_is_refused(damage, saved):
     tensors, metadata = load_weights(saved, "agent")
     metadata["network"] |= damage
     save_weights(saved, metadata.pop("kind"), tensors, metadata)
-    with pytest.raises(
-        UserError,
-        match="its description of the network is not understood",
-    ):
+    with user_error("its description of the network is not understood"):
         read_agent(saved)
 
 
@@ -115,7 +109,7 @@ def test_another_network_or_support_is_refused_naming_the_ways_out(
     message,
     saved,
 ):
-    with pytest.raises(UserError, match=message):
+    with user_error(message):
         start_from(agent(**options), saved)
 
 
@@ -165,5 +159,5 @@ def test_weights_that_are_no_agents_are_refused(name, saved):
     described = load_weights(saved, "agent")[1]
     del described["kind"]
     save_weights(saved, kind, {"weight": torch.zeros(3)}, description(described))
-    with pytest.raises(UserError, match=saved.name):
+    with user_error(saved.name):
         load_agent(saved)

@@ -6,12 +6,12 @@ Exploration, updates, switches, saving, and no touch of the global random state.
 import pytest
 import torch
 from agents_small import same_weights, transitions
+from reference.refusals import user_error
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ganlane.agents import Rainbow, RainbowConfig
 from ganlane.agents.loss import loss_of
-from ganlane.errors import UserError
 
 SIZE = 4
 SMALL = {
@@ -235,13 +235,10 @@ def test_a_restored_agent_goes_on_to_the_same_weights(options, tmp_path):
     ],
 )
 def test_hyperparameters_that_do_not_fit_together_are_refused(options, told):
-    with pytest.raises(UserError, match=told):
+    with user_error(told):
         agent(**options)
 
 
 def test_the_state_of_an_agent_with_another_option_is_refused():
-    with pytest.raises(
-        UserError,
-        match=r"agent.kl_priority=False: the saved agent has True",
-    ):
+    with user_error(r"agent.kl_priority=False: the saved agent has True"):
         agent(kl_priority=False).load_state_dict(agent().state_dict())

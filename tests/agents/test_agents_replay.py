@@ -3,26 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from agents_small import transitions
 from scipy import stats  # scikit-learn, a dependency, brings it along
-from tensordict import TensorDict
 
 from ganlane.agents import RainbowConfig
 from ganlane.agents.replay import draw, make_replay
-
-
-def transitions(rows, first=0):
-    number = torch.arange(first, first + rows)
-    content = {
-        "observation": number[:, None].float(),
-        "action": number % 3,
-        "steps_to_next_obs": torch.ones(rows, 1),
-        "next": {
-            "observation": number[:, None] + 0.5,
-            "reward": torch.zeros(rows, 1),
-            "terminated": torch.zeros(rows, 1, dtype=torch.bool),
-        },
-    }
-    return TensorDict(content, [rows])
 
 
 def config(capacity=256, **options):
@@ -31,7 +16,7 @@ def config(capacity=256, **options):
 
 def buffer(rows=200, seed=0, **options):
     result = make_replay(config(**options), torch.Generator().manual_seed(seed))
-    result.extend(transitions(rows))
+    result.extend(transitions(1, rows))
     return result
 
 
@@ -75,7 +60,7 @@ def test_a_new_item_has_the_largest_priority_seen():
     replay.update_priority(torch.arange(100), torch.full((100,), 0.01))
     replay.update_priority(torch.tensor([3]), torch.tensor([7.0]))
     replay.update_priority(torch.tensor([3]), torch.tensor([0.01]))
-    replay.extend(transitions(100, first=100))
+    replay.extend(transitions(1, 100))
     flat = replay.sampler.priorities.view(-1)
     torch.testing.assert_close(flat[100:200], torch.full((100,), 7.0**0.5))
     torch.testing.assert_close(flat[:100], torch.full((100,), 0.1), atol=1e-5, rtol=1e-5)

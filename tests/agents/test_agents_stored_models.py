@@ -1,7 +1,5 @@
 """A stored model is its weights and a description; nothing else of the archive is read."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import zipfile

@@ -1,7 +1,5 @@
 """The dose experiment: what is trained, and what its table says of the held-out episodes."""
 
-from __future__ import annotations
-
 import polars as pl
 import pytest
 

@@ -3,8 +3,6 @@
 Shapes and weights are those of the loaded networks, courses those of the vehicles.
 """
 
-from __future__ import annotations
-
 import pytest
 
 from benchmarks.figures import generator_blocks

@@ -1,7 +1,5 @@
 """What passes a ramp and a weave at capacity."""
 
-from __future__ import annotations
-
 import pytest
 
 from benchmarks.flow import largest_flow, measure, table_of

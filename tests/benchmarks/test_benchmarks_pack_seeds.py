@@ -1,11 +1,10 @@
 """Several trainings of one recipe in one file: packed, named, driven and refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
 import torch
+from reference.refusals import user_error
 
 from benchmarks import pack_seeds
 from ganlane.agents import (
@@ -18,7 +17,6 @@ from ganlane.agents import (
     save_agent,
 )
 from ganlane.agents.checkpoint import with_seeds
-from ganlane.errors import UserError
 from ganlane.transforms import observation_size
 
 VEHICLES = 9
@@ -75,7 +73,7 @@ def test_what_a_greedy_agent_computes_with_is_kept_to_the_last_bit(seed, packed,
 def test_names_of_seeds_stand_for_their_agents(packed):
     assert with_seeds("agent_idm@all") == ["agent_idm@0", "agent_idm@1", "agent_idm@2"]
     assert with_seeds("agent_idm@all+safe")[1] == "agent_idm@1+safe"
-    with pytest.raises(UserError, match="only the training agent_gan@0 is installed"):
+    with user_error("only the training agent_gan@0 is installed"):
         with_seeds("agent_gan@all")
     assert with_seeds(f"{packed}@all") == [f"{packed}@1", f"{packed}@2"]
     assert with_seeds("mobil") == ["mobil"]
@@ -98,7 +96,7 @@ def test_a_seed_that_is_not_there_or_not_named_ends_in_a_sentence(
     name, said, packed, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError, match=said):
+    with user_error(said):
         load_agent(name)
 
 

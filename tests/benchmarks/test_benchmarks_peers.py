@@ -2,15 +2,13 @@
 (docs/peers.md).
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import cache
 from importlib.util import find_spec
-from pathlib import Path
 
 import pytest
+from reference.processes import ROOT
 
 from benchmarks.peers import compare, report, simulators
 from benchmarks.peers.scene import (
@@ -37,7 +35,6 @@ from benchmarks.peers.tolerance import (
 )
 from ganlane.sim.neighbours import FREE_GAP_M
 
-ROOT = Path(__file__).parents[2]
 EULERS = (Scheme.EXPLICIT_EULER, Scheme.SEMI_IMPLICIT_EULER)
 #: Where a peer reads IDM as ganlane does, it has to drive as ganlane does. HighwayEnv's missing
 #: floor of the desired gap shows in 'step' only, its reversing in 'standing obstacle' only, its

@@ -2,12 +2,10 @@
 them.
 """
 
-from __future__ import annotations
-
 import pytest
+from reference.refusals import user_error
 
 from benchmarks import printed
-from ganlane.errors import UserError
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +46,6 @@ def test_the_results_name_their_command_revision_seeds_and_machine(results):
 
 
 def test_a_section_that_is_gone_is_named():
-    with pytest.raises(UserError, match="## Results: no such section"):
+    with user_error("## Results: no such section"):
         printed.section("# Title\n\ntext\n", "## Results")
     assert printed.section("## Results\na\n### b\nc\n## Next\nd", "## Results") == "\na\n### b\nc\n"

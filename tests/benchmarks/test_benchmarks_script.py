@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from reference.refusals import user_error
 
 from benchmarks.script import (
     ReportSection,
@@ -61,10 +62,10 @@ def test_what_stands_between_the_markers_is_rewritten_and_the_rest_stays(tmp_pat
 def test_a_document_without_both_markers_once_and_in_order_is_refused_at_once(tmp_path, text):
     document = tmp_path / "page.md"
     document.write_text(text)
-    with pytest.raises(UserError, match=r"page\.md: expected the lines .* once each"):
+    with user_error(r"page\.md: expected the lines .* once each"):
         ReportSection(document, BEGIN, END)
     assert document.read_text() == text
-    with pytest.raises(UserError, match=r"gone\.md: no such file"):
+    with user_error(r"gone\.md: no such file"):
         ReportSection(tmp_path / "gone.md", BEGIN, END)
     assert list(tmp_path.iterdir()) == [document]
 

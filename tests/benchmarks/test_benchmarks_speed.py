@@ -1,7 +1,5 @@
 """The speed of the simulator: turns of cases, the rows they give, and what the systems count."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """The paper's Figure 4 from the committed learning curves."""
 
-from __future__ import annotations
-
 from benchmarks import transfer
 
 

@@ -4,28 +4,23 @@ half-written behind.
 A wrong value is reported without waiting for torch.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from unittest.mock import patch
 
 import pytest
-from reference.refusals import everything_below, is_one_sentence
+from reference.processes import ROOT, run
+from reference.refusals import everything_below, is_one_sentence, user_error
 
 from ganlane.__main__ import main
 from ganlane.config.compose import parsed
 from ganlane.config.run import Stopped, run_command, settings
-from ganlane.errors import UserError, is_users_matter
+from ganlane.errors import is_users_matter
 from ganlane.files import write_bytes
 from ganlane.settings.record import make
 from ganlane.settings.traffic import TrafficConfig
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize(
@@ -50,16 +45,7 @@ def test_a_signal_while_the_configuration_is_composed_is_no_error(
 def loaded(program: str, *names: str) -> str:
     """Which of the modules ``names`` a program has loaded in the end, and what else it prints."""
     program = f"import sys; {program}; print([name for name in {names} if name in sys.modules])"
-    environment = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PATH": "/usr/bin:/bin"}
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        env=environment,
-        check=True,
-    )
-    return done.stdout
+    return run("-c", program).stdout
 
 
 def test_parameters_are_declared_without_torch():
@@ -102,13 +88,13 @@ def test_an_escape_sequence_reaches_no_terminal(line, empty_folder, capsys):
 
 @pytest.mark.parametrize("override", ["seed=" + "9" * 6000, "agents=" + "[" * 500 + "]" * 500])
 def test_a_number_too_long_or_a_list_too_deep_for_python_is_one_sentence(override):
-    with pytest.raises(UserError, match=r"too long a number or too deep a list") as caught:
+    with user_error(r"too long a number or too deep a list") as caught:
         parsed("evaluate", [override])
     assert len(str(caught.value)) < 200
 
 
 def test_a_whole_number_that_no_float_can_hold_is_one_sentence():
-    with pytest.raises(UserError, match=r"expected a number of fewer digits"):
+    with user_error(r"expected a number of fewer digits"):
         settings("train", [f"env.goal_m=1{'0' * 400}"])
 
 

@@ -1,7 +1,5 @@
 """Every option composes, is explained, and hands its values on."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re
@@ -10,11 +8,11 @@ from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
+from reference.refusals import user_error
 
 from ganlane.__main__ import main
 from ganlane.config.help import help_text
 from ganlane.config.run import COMMANDS, settings
-from ganlane.errors import UserError
 from ganlane.files import conf_folder
 from ganlane.generator import load_generator, shipped_generator
 from ganlane.settings.generator import CalibratedConfig, PaperConfig
@@ -91,7 +89,7 @@ def test_considerate_is_the_paper_and_a_price_for_danger_behind():
     assert considerate.soft_crash_behind == considerate.soft_crash
     milder = config_of("evaluate", "reward.soft_crash_behind=-5").reward
     assert milder == RewardParameters(soft_crash_behind=-5.0)
-    with pytest.raises(UserError, match=r"reward\.soft_crash_behind=3: expected at most 0"):
+    with user_error(r"reward\.soft_crash_behind=3: expected at most 0"):
         settings("train", ["reward=considerate", "reward.soft_crash_behind=3"])
 
 

@@ -1,7 +1,5 @@
 """A record's constructor takes plain data, and says in one sentence what is wrong with it."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -3,13 +3,9 @@
 What a run has earned can be gone on with, however it ended.
 """
 
-from __future__ import annotations
-
 import csv
 import errno
 import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -17,6 +13,8 @@ from unittest.mock import patch
 import pytest
 import torch
 from hydra.core.override_parser.types import Quote, QuotedString
+from reference.processes import run, start
+from reference.refusals import user_error
 from training.small_runs import agent, road, train
 from training.small_runs import settings as schedule
 
@@ -34,7 +32,6 @@ from ganlane.config.run import (
 from ganlane.errors import UserError
 from ganlane.training.checkpoint import LAST, load_checkpoint
 
-ROOT = Path(__file__).resolve().parents[2]
 COLUMNS = ("decisions", "updates", "mean_return", "loss", "out_of_road_rate")
 
 
@@ -147,13 +144,10 @@ def test_the_lock_of_a_killed_run_stops_nobody_and_its_half_written_files_go(her
         "with held(Path('run')), atomic_path('run/checkpoints/last.pt') as part:\n"
         "    part.write_bytes(b'half'); print('at work', flush=True); time.sleep(60)"
     )
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, env=environment
-    ) as process:
-        assert process.stdout.readline() == b"at work\n"
+    with start("-c", script) as process:
+        assert process.stdout.readline() == "at work\n"
         with (
-            pytest.raises(UserError, match=rf"process {process.pid} on .*; wait for its end"),
+            user_error(rf"process {process.pid} on .*; wait for its end"),
             held(Path("run")),
         ):
             pass
@@ -250,20 +244,13 @@ def test_a_folder_that_the_locale_cannot_name_is_a_folder_like_others(tmp_path):
     """Such a locale is that of many containers and cron jobs."""
     folder = tmp_path / "ü"
     folder.mkdir()
-    line = [sys.executable, "-m", "ganlane", "evaluate", "agents=[mobil]", "traffics=[idm]"]
+    words = ["agents=[mobil]", "traffics=[idm]", "episodes=2", "threads=1", "env.goal_m=40"]
     locale = {"LC_ALL": "POSIX", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    environment = os.environ | locale | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        [*line, "episodes=2", "threads=1", "env.goal_m=40"],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr.decode(errors="replace")
+    done = run("-m", "ganlane", "evaluate", *words, cwd=folder, **locale)
+    assert done.returncode == 0, done.stderr
     assert list(folder.rglob("episodes.parquet"))
 
 
 def test_a_word_beyond_the_locale_is_refused_by_name():
-    with pytest.raises(UserError, match=r"characters that this locale does not know"):
+    with user_error(r"characters that this locale does not know"):
         parsed("render", ["out=film_\udcc3\udcbc.gif"])

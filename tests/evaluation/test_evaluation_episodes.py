@@ -3,8 +3,6 @@
 Each is what it is alone, whatever drives in the other rows.
 """
 
-from __future__ import annotations
-
 import polars as pl
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """How a crash came about, and how near to one an episode was."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from reference.worlds import vehicles

@@ -1,7 +1,5 @@
 """What stays in the run folder can be read back and says where it came from."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """An evaluation's numbers, entry by entry, from hand-made episodes."""
 
-from __future__ import annotations
-
 import warnings
 from itertools import product
 

@@ -1,7 +1,5 @@
 """Intervals against closed forms, SciPy, tables and hand-worked values."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import gymnasium
 
 import ganlane  # noqa: F401 - registers the environments
@@ -12,7 +10,6 @@ ID = "ganlane/Highway-v0"
 KEEP = 0
 LEFT = 1
 RIGHT = 2
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def make(**options):

@@ -4,6 +4,7 @@ import pickle
 
 import pytest
 import torch
+from reference.refusals import user_error
 
 pytest.importorskip(
     "highway_env",
@@ -15,7 +16,6 @@ from reference.worlds import vehicles as scene_of
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
-from ganlane.errors import UserError
 from ganlane.settings.driving import Visibility
 from ganlane.sim.random import Purpose, episode_key, uniform
 from ganlane.sim.state import Road, Vehicles
@@ -160,5 +160,5 @@ def test_a_copy_drives_on(traffic):
 
 
 def test_a_ring_is_refused():
-    with pytest.raises(UserError, match="ring of 500 m"):
+    with user_error("ring of 500 m"):
         HighwayEnvTraffic(Road(ring_m=500.0))

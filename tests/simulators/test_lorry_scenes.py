@@ -1,7 +1,5 @@
 """The first scenes of SUMO's traffic: lorries at the net gaps of cars."""
 
-from __future__ import annotations
-
 import torch
 
 from ganlane.settings.driving import Visibility

@@ -4,6 +4,7 @@ import pickle
 
 import pytest
 import torch
+from reference.refusals import user_error
 
 pytest.importorskip(
     "libsumo",
@@ -15,7 +16,6 @@ from reference.foreign import assert_same_alone, drive, overlaps, start, turns
 from ganlane import keys
 from ganlane.agents.drivers import DRIVERS
 from ganlane.env import EpisodeParameters, HighwayEnv
-from ganlane.errors import UserError
 from ganlane.evaluation import run_episodes
 from ganlane.settings.driving import Visibility
 from ganlane.sim.scenes import FixedScene, SceneVehicle
@@ -125,7 +125,7 @@ def test_a_state_that_sumo_did_not_leave_is_refused(traffic):
     first = env.step(start(env, [0]).set(keys.ACTION, KEEP))["next"].clone().set(keys.ACTION, KEEP)
     second = env.step(first.clone())["next"].clone()
     env.step(second.set(keys.ACTION, KEEP))
-    with pytest.raises(UserError, match="not the one that SUMO left"):
+    with user_error("not the one that SUMO left"):
         env.step(first)
 
 
@@ -134,7 +134,7 @@ def test_two_environments_cannot_take_turns_but_may_follow_each_other():
     other = HighwayEnv(SumoTraffic(), 1)
     first = one.step(start(one, [0]).set(keys.ACTION, KEEP))["next"]
     other.step(start(other, [0]).set(keys.ACTION, KEEP))
-    with pytest.raises(UserError, match="a process has one SUMO"):
+    with user_error("a process has one SUMO"):
         one.step(first.set(keys.ACTION, KEEP))
     one.step(start(one, [0]).set(keys.ACTION, KEEP))
 
@@ -147,7 +147,7 @@ def test_a_copy_starts_a_simulation_of_its_own(traffic):
 
 
 def test_a_ring_is_refused():
-    with pytest.raises(UserError, match="ring of 500 m"):
+    with user_error("ring of 500 m"):
         SumoTraffic(Road(ring_m=500.0))
 
 

@@ -1,7 +1,5 @@
 """The comparison on recorded scenes: the scene of each episode, and what the record holds."""
 
-from __future__ import annotations
-
 import json
 
 import polars as pl

@@ -1,7 +1,5 @@
 """What is made of the episodes of a matrix, on episodes made by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import polars as pl
 import pytest

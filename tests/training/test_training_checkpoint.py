@@ -2,10 +2,9 @@
 
 import pytest
 import torch
-from reference.refusals import Bomb
+from reference.refusals import Bomb, user_error
 from training.small_runs import agent, road, settings, train
 
-from ganlane.errors import UserError
 from ganlane.files import seal_archive
 from ganlane.training.checkpoint import (
     LAST,
@@ -51,7 +50,7 @@ def test_a_part_of_a_run_that_is_something_else_is_refused_in_one_sentence(
 ):
     value, told = DAMAGE[place]
     save_checkpoint(tmp_path / "last.pt", with_damage(stopped, place, value))
-    with pytest.raises(UserError, match=rf"^resume=[^\n]*last\.pt: [^\n]*{told}[^\n]*\.$"):
+    with user_error(rf"^resume=[^\n]*last\.pt: [^\n]*{told}[^\n]*\.$"):
         TrainingState(road(8), agent()).restore(tmp_path / "last.pt")
 
 
@@ -83,6 +82,6 @@ def test_what_is_no_state_of_a_run_is_refused(content, tmp_path, monkeypatch):
     else:
         torch.save(content, path)
         seal_archive(path)
-    with pytest.raises(UserError, match=r"^resume=[^\n]*last\.pt"):
+    with user_error(r"^resume=[^\n]*last\.pt"):
         TrainingState(road(8), agent()).restore(path)
     assert not (tmp_path / "executed").exists()

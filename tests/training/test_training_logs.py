@@ -5,8 +5,8 @@ import sys
 from unittest.mock import MagicMock
 
 import pytest
+from reference.refusals import user_error
 
-from ganlane.errors import UserError
 from ganlane.settings.train import LoggerConfig
 from ganlane.training.logs import (
     CsvLog,
@@ -74,9 +74,7 @@ def test_a_row_of_too_few_or_too_many_columns_is_left_out(tmp_path, torn):
 def test_a_log_that_is_none_is_refused_in_one_sentence(content, tmp_path):
     path = tmp_path / "metrics.csv"
     path.write_bytes(content)
-    with pytest.raises(
-        UserError, match=r"metrics\.csv: damaged \(.*\); repair it, or move it away"
-    ):
+    with user_error(r"metrics\.csv: damaged \(.*\); repair it, or move it away"):
         CsvLog(path, ["decisions", "loss"])
     assert path.read_bytes() == content
 
@@ -155,20 +153,14 @@ def test_a_missing_package_is_named_with_the_command_that_mends_it(
     log, module, extra, tmp_path, monkeypatch
 ):
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(
-        UserError,
-        match=rf"pip install 'ganlane\[{extra}\]'.*logger=csv\.$",
-    ):
+    with user_error(rf"pip install 'ganlane\[{extra}\]'.*logger=csv\.$"):
         log(tmp_path)
 
 
 def test_a_wandb_that_does_not_start_is_one_sentence(fake, tmp_path, monkeypatch):
     fake.init.side_effect = fake.Error("api_key not configured")
     monkeypatch.setenv("WANDB_MODE", "online")
-    with pytest.raises(
-        UserError,
-        match=r"WANDB_MODE=online.*api_key not configured.*WANDB_MODE=offline",
-    ):
+    with user_error(r"WANDB_MODE=online.*api_key not configured.*WANDB_MODE=offline"):
         WandbLog(tmp_path)
 
 

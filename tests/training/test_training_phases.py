@@ -3,20 +3,18 @@
 What a run starts from and takes over, what it may go on from, and what its agent is told of it.
 """
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import entry_tiny
 import pytest
 import torch
+from reference import processes
+from reference.refusals import user_error
 
 from ganlane.agents import read_agent, save_agent
 from ganlane.build import make_driver
 from ganlane.config.run import settings
-from ganlane.errors import UserError
 from ganlane.files import conf_folder
 from ganlane.runtime import has_compiler
 from ganlane.settings.env import EnvConfig
@@ -34,7 +32,6 @@ from ganlane.training.phases import (
     run_phase,
 )
 
-ROOT = Path(__file__).resolve().parents[2]
 TINY = [*entry_tiny.TINY, "logger.progress=false"]
 WITHOUT_INIT = [option for option in entry_tiny.TINY if option != "init=none"]
 
@@ -96,7 +93,7 @@ def test_a_run_whose_rate_has_fallen_is_prolonged_at_its_end(tmp_path):
     folder = run(tmp_path, *fall, "total_decisions=160")
     more = [*fall, "total_decisions=320"]
     told = r"agent\.learning_rate_decisions=320: the saved agent has 160"
-    with pytest.raises(UserError, match=told):
+    with user_error(told):
         run(folder, *more, resume=folder / LAST)
     run(folder, *more, "agent.learning_rate_decisions=160", resume=folder / LAST)
     state = load_checkpoint(folder / LAST)
@@ -106,7 +103,7 @@ def test_a_run_whose_rate_has_fallen_is_prolonged_at_its_end(tmp_path):
 
 def test_another_support_is_refused_with_the_options_to_set(trained, tmp_path):
     told = r"set agent\.atoms=101 agent\.v_min=-120"
-    with pytest.raises(UserError, match=told):
+    with user_error(told):
         start(tmp_path, trained, "agent.v_min=-50", "agent.v_max=60", "agent.atoms=21")
 
 
@@ -122,14 +119,14 @@ def test_a_run_goes_on_without_what_it_started_from(tmp_path):
 
 
 def test_another_observation_is_refused_from_a_checkpoint_too(trained, tmp_path):
-    with pytest.raises(UserError, match="give observation=table3_progress or start"):
+    with user_error("give observation=table3_progress or start"):
         start(tmp_path, trained, "observation=table3")
-    with pytest.raises(UserError, match=r"give observation\.range_m=200"):
+    with user_error(r"give observation\.range_m=200"):
         start(tmp_path, trained, "observation.range_m=100")
 
 
 def test_a_folder_without_an_agent_is_refused(tmp_path):
-    with pytest.raises(UserError, match=r"no such file .*agent\.safetensors"):
+    with user_error(r"no such file .*agent\.safetensors"):
         read_start(str(tmp_path))
 
 
@@ -175,7 +172,7 @@ def test_a_first_phase_that_is_over_must_be_the_one_asked_for(
         "on other traffic": {"traffic": config.traffic},
     }
     for told, other in others.items():
-        with pytest.raises(UserError, match=told):
+        with user_error(told):
             length_if_finished(replace(phase, config=replace(phase.config, **other)))
 
 
@@ -229,7 +226,7 @@ def test_a_masked_run_stopped_and_resumed_ends_with_the_same_bits(masked, tmp_pa
 
 @pytest.mark.parametrize("other", ["mask=legal", "mask.safe_deceleration=4"])
 def test_a_run_is_not_resumed_behind_another_mask(masked, other):
-    with pytest.raises(UserError, match="mask"):
+    with user_error("mask"):
         run(masked, *MASKED, other, resume=masked / LAST)
 
 
@@ -256,15 +253,10 @@ def test_a_compiled_run_stopped_and_resumed_in_a_process_of_its_own_ends_with_th
     tmp_path,
 ):
     """What the compiler leaves is shared by the runs."""
-    variables = {
-        **os.environ,
-        "PYTHONPATH": str(ROOT),
-        "TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "cache"),
-        "OMP_NUM_THREADS": "1",
-    }
+    cache = {"TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "cache")}
     parts, whole = tmp_path / "parts", tmp_path / "whole"
     for folder, resume, total in ((parts, "", 160), (parts, parts / LAST, 640), (whole, "", 640)):
         words = [*TINY, "compile=always", f"total_decisions={total}"]
-        line = [sys.executable, "-c", SCRIPT, str(folder), str(resume), *words]
-        subprocess.run(line, env=variables, check=True)
+        finished = processes.run("-c", SCRIPT, str(folder), str(resume), *words, **cache)
+        assert finished.returncode == 0, finished.stderr
     assert same_agent(parts, whole)

@@ -238,12 +238,11 @@ def train_lane_choice(
     under_way = choices.sides[choices.begins < 0]
     if not len(begun):
         return  # without a recorded change nobody changes lanes
-    last = policy.lane[-1]
-    assert isinstance(last, nn.Linear)
+    weight, bias = policy.lane[-1].parameters()
     with torch.no_grad():
         # From the recorded rate on.
-        last.bias.copy_(torch.tensor([math.log(len(begun) / len(not_begun)), -2.0]))
-        last.weight.mul_(0.1)
+        bias.copy_(torch.tensor([math.log(len(begun) / len(not_begun)), -2.0]))
+        weight.mul_(0.1)
     optimizer = torch.optim.AdamW(policy.lane.parameters(), lr=LANE_RATE, weight_decay=LANE_DECAY)
     for _ in range(LANE_UPDATES):
         rows = torch.randint(len(not_begun), (4096,), generator=random)
@@ -271,15 +270,14 @@ def match_rate(policy: HumanPolicy, choices: Choices) -> None:
     it. Only the level is moved: the bias of all beginnings.
     """
     wanted = begins_per_decision(choices)
-    last = policy.lane[-1]
-    assert isinstance(last, nn.Linear)
+    _, bias = policy.lane[-1].parameters()
     choice = choices.keeping(slice(None))
-    unmoved = last.bias[0].clone()
+    unmoved = bias[0].clone()
     low, high = -6.0, 6.0
     # Bisection: the rate grows with the bias.
     for _ in range(20):
         middle = 0.5 * (low + high)
-        last.bias[0] = unmoved + middle
+        bias[0] = unmoved + middle
         begins = float(policy.lane_chances(choice)[:, 1:].sum(-1).mean())
         low, high = (middle, high) if begins < wanted else (low, middle)
 

@@ -201,11 +201,8 @@ def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanCo
 
     # The forecasts that it corrects are without it.
     model.observer.requires_grad_(True)
-    with torch.no_grad():
-        last = model.observer.layers[-1]
-        assert isinstance(last, nn.Linear)
-        last.weight.zero_()
-        last.bias.zero_()
+    for parameter in model.observer.layers[-1].parameters():
+        nn.init.zeros_(parameter)
     noisy = [_with_noise(scene, share, config) for share in NOISE_SHARES for scene in scenes]
     with torch.no_grad():
         windows = driven_windows(recorded_and_driven, noisy, PREDICTED_STEPS, OBSERVER_STRIDE)[0]

@@ -103,33 +103,26 @@ def smooth(track: Floats, cutoff_hz: float) -> Floats:
 
 def smooth_scene(recording: Recording, config: HumanConfig, weight: float = 1.0) -> SmoothScene:
     """The recording smoothed, with the drivers' target lanes."""
-    shape = recording.x.shape
-    arrays = {name: np.zeros(shape) for name in ("x", "y", "speed", "lateral_speed")}
-    target = np.zeros(shape, np.int64)
-    for track in range(shape[1]):
+    lanes, lane_width_m = recording.lanes, recording.lane_width_m
+    x, y = recording.x.copy(), recording.y.copy()
+    speed, lateral_speed = np.zeros_like(x), np.zeros_like(y)
+    target = np.zeros(x.shape, np.int64)
+    for track in range(x.shape[1]):
         rows = np.flatnonzero(recording.present[:, track])
         part = slice(rows[0], rows[-1] + 1), track
-        if len(rows) < 3:
-            arrays["x"][part] = recording.x[part]
-            arrays["y"][part] = recording.y[part]
-        else:
-            x = smooth(recording.x[part], config.cutoff_hz)
-            y = smooth(recording.y[part], config.lateral_cutoff_hz)
-            arrays["x"][part] = x
-            arrays["y"][part] = y
-            arrays["speed"][part] = np.gradient(x, PHYSICS_STEP_S).clip(0.0)
-            arrays["lateral_speed"][part] = np.gradient(y, PHYSICS_STEP_S)
-        target[part] = target_lanes(
-            arrays["y"][part],
-            arrays["lateral_speed"][part],
-            recording.lane_width_m,
-            recording.lanes,
-        )
+        # A shorter track shows no motion.
+        if len(rows) >= 3:
+            x[part] = smooth(x[part], config.cutoff_hz)
+            y[part] = smooth(y[part], config.lateral_cutoff_hz)
+            speed[part] = np.gradient(x[part], PHYSICS_STEP_S).clip(0.0)
+            lateral_speed[part] = np.gradient(y[part], PHYSICS_STEP_S)
+        target[part] = target_lanes(y[part], lateral_speed[part], lane_width_m, lanes)
     same = {part.name: getattr(recording, part.name) for part in fields(Recording)}
     return SmoothScene(
-        **same | arrays,
+        **same | {"x": x, "y": y, "speed": speed},
         raw_x=recording.x,
         raw_y=recording.y,
+        lateral_speed=lateral_speed,
         target=target,
         weight=weight,
     )
@@ -267,16 +260,16 @@ def segments_of(stretches: Sequence[Cut]) -> Segments:
         middle = cut.scene.x[frames, cut.who].mean()
         for name in ("x", "raw_x"):
             arrays[name][number] = (arrays[name][number] - middle).astype(np.float32)
-    driven = [cut.scene.driven[cut.who] for cut in stretches]
-    # Finite sizes for those that fill the batch.
-    sizes = {
-        name: [getattr(cut.scene, name)[cut.who].astype(np.float32) for cut in stretches]
-        for name in ("length", "width")
-    }
+
+    def of_vehicles(name: str) -> list[np.ndarray]:
+        return [getattr(cut.scene, name)[cut.who] for cut in stretches]
+
     return Segments(
         **{name: side_by_side(parts) for name, parts in arrays.items()},
-        **{name: side_by_side(parts, 1.0) for name, parts in sizes.items()},
-        driven=side_by_side(driven),
+        # Finite sizes for those that fill the batch.
+        length=side_by_side(of_vehicles("length"), 1.0).float(),
+        width=side_by_side(of_vehicles("width"), 1.0).float(),
+        driven=side_by_side(of_vehicles("driven")),
         lanes=column("lanes"),
         lane_width_m=column("lane_width_m"),
         weight=column("weight"),

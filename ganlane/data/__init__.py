@@ -18,23 +18,9 @@ from ganlane.data.lanes import (
     tracks_of_frame,
 )
 from ganlane.data.prepared import PooledStatistics
-from ganlane.data.recordings import (
-    read_recordings,
-    read_scenes,
-    write_prepared,
-)
-from ganlane.data.schema import (
-    FRAME_S,
-    SCHEMA,
-    TRACK,
-    Scene,
-    sort,
-)
-from ganlane.data.sources import (
-    byte_progress,
-    default_scenes,
-    recordings_path,
-)
+from ganlane.data.recordings import read_recordings, read_scenes, write_prepared
+from ganlane.data.schema import FRAME_S, SCHEMA, TRACK, Scene, sort
+from ganlane.data.sources import byte_progress, default_scenes, recordings_path
 from ganlane.data.statistics import (
     Bins,
     DrivingStatistics,

@@ -52,11 +52,7 @@ class Recording:
     driven: Flags
 
     @classmethod
-    def of(
-        cls,
-        rows: pl.DataFrame,
-        lane_width_m: float,
-    ) -> Recording:
+    def of(cls, rows: pl.DataFrame, lane_width_m: float) -> Recording:
         """From one scene in the schema whose tracks have no gaps.
 
         With a column ``driven``, the other vehicles are replayed.
@@ -153,11 +149,7 @@ class Recording:
             lane_width=pl.lit(self.lane_width_m),
         )
 
-    def segments(
-        self,
-        seconds: float,
-        skip_s: float = 0.0,
-    ) -> list[Recording]:
+    def segments(self, seconds: float, skip_s: float = 0.0) -> list[Recording]:
         """Pieces of ``seconds`` from ``skip_s`` on, each with the vehicles present in it."""
         length = round(seconds / FRAME_S)
         first = round(skip_s / FRAME_S)
@@ -212,9 +204,7 @@ def recordings_of(
     return [Recording.of(scenes[key], lane_widths[str(key[0])]) for key in sorted(scenes)]
 
 
-def recorded_frame(
-    recordings: Sequence[Recording],
-) -> pl.DataFrame:
+def recorded_frame(recordings: Sequence[Recording]) -> pl.DataFrame:
     """The recordings in the form in which simulations are measured."""
     return pl.concat([recording.frame() for recording in recordings])
 

@@ -32,10 +32,7 @@ _TRACKS = "_tracks.csv"
 #: Columns of ``XX_tracks.csv`` that are read.
 COLUMNS = {
     **dict.fromkeys(("frame", "id", "laneid"), pl.Int64),
-    **dict.fromkeys(
-        ("x", "y", "width", "height", "xvelocity"),
-        pl.Float64,
-    ),
+    **dict.fromkeys(("x", "y", "width", "height", "xvelocity"), pl.Float64),
 }
 #: Columns of ``XX_recordingMeta.csv`` that are read.
 _META = {
@@ -120,11 +117,7 @@ def _read_recording_meta(path: Path) -> tuple[float, list[_Direction]]:
     return rate_hz, directions
 
 
-def _markings(
-    text: str,
-    path: Path,
-    column: str,
-) -> list[float]:
+def _markings(text: str, path: Path, column: str) -> list[float]:
     """``y`` of the lane markings in the image, m: ``8.51;12.59;16.43`` as numbers."""
     try:
         markings = [float(part) for part in text.split(";") if part.strip()]
@@ -138,11 +131,7 @@ def _markings(
     return markings
 
 
-def _read_rows(
-    path: Path,
-    meta: Path,
-    count: RowCount,
-) -> pl.DataFrame:
+def _read_rows(path: Path, meta: Path, count: RowCount) -> pl.DataFrame:
     """Rows of a recording, sorted by vehicle and frame.
 
     ``drivingdirection`` is its vehicle's in the ``meta`` file.

@@ -56,20 +56,14 @@ def scene_lane_widths(frame: pl.DataFrame) -> dict[str, float]:
     }
 
 
-def scene_lane_counts(
-    frame: pl.DataFrame,
-) -> dict[str, int]:
+def scene_lane_counts(frame: pl.DataFrame) -> dict[str, int]:
     """Number of lanes of every scene of a frame in the schema: its highest lane number plus one."""
     return dict(
         frame.group_by("scene", maintain_order=True).agg(pl.col("lane").max() + 1).iter_rows()
     )
 
 
-def lane_width(
-    y: Floats,
-    lane: Integers,
-    scene: str = "scene",
-) -> float:
+def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
     """Lane width, m, at which the nearest lanes agree best with the recorded ones ``lane`` [R].
 
     The first estimate is the median slope between the median positions of each pair of lanes (Theil
@@ -95,11 +89,7 @@ def lane_width(
     return guess if low <= guess <= high else 0.5 * (low + high)
 
 
-def lane_grid(
-    y: Floats,
-    lane: Integers,
-    scene: str,
-) -> tuple[float, float]:
+def lane_grid(y: Floats, lane: Integers, scene: str) -> tuple[float, float]:
     """Lane width (:func:`lane_width`) and position of lane 0's centre, both m, where ``y`` has any
     origin.
 
@@ -112,11 +102,7 @@ def lane_grid(
     return lane_width(y - centre, lane, scene), centre
 
 
-def _best_range(
-    y: Floats,
-    lane: Integers,
-    guess: float,
-) -> tuple[float, float]:
+def _best_range(y: Floats, lane: Integers, guess: float) -> tuple[float, float]:
     """Widths within 10 % of the guess that most rows agree with.
 
     Of several ranges, the nearest to the guess.

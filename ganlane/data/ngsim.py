@@ -37,10 +37,7 @@ from ganlane.data.tables import (
     read_blocks,
 )
 from ganlane.errors import UserError
-from ganlane.settings.generator import (
-    MOTORWAYS,
-    NgsimParameters,
-)
+from ganlane.settings.generator import MOTORWAYS, NgsimParameters
 
 FOOT_M = 0.3048
 FRAME_MS = 100

@@ -95,10 +95,7 @@ def _pairs(path: Path) -> pl.DataFrame:
 
 def _following(path: Path) -> pl.DataFrame:
     whole = dict.fromkeys(("follower", "leader", "frame"), pl.Int64)
-    numbers = dict.fromkeys(
-        ("x_follower", "x_leader", "leader_length"),
-        pl.Float64,
-    )
+    numbers = dict.fromkeys(("x_follower", "x_leader", "leader_length"), pl.Float64)
     # Both cars of a pair are in one row.
     table = read_table(
         path,
@@ -115,12 +112,7 @@ def _following(path: Path) -> pl.DataFrame:
     ):
         car = table.select(
             "frame",
-            scene=pl.concat_str(
-                "period",
-                "follower",
-                "leader",
-                separator="-",
-            ),
+            scene=pl.concat_str("period", "follower", "leader", separator="-"),
             vehicle=role,
             x=pl.col(f"x_{role}") - 0.5 * length,
             length=length,

@@ -9,11 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ganlane.data.lanes import (
-    LaneChanges,
-    find_lane_changes,
-    tracks_of_frame,
-)
+from ganlane.data.lanes import LaneChanges, find_lane_changes, tracks_of_frame
 from ganlane.data.recordings import (
     PARQUET,
     cut_into_scenes,

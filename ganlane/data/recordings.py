@@ -15,28 +15,10 @@ import polars as pl
 from ganlane.data.highd import highd_scenes
 from ganlane.data.lanes import lane_width, scene_lane_widths
 from ganlane.data.ngsim import ngsim_scenes
-from ganlane.data.schema import (
-    FRAME_S,
-    SCHEMA,
-    RowCount,
-    Scene,
-    sort,
-    validate,
-)
-from ganlane.data.tables import (
-    OnProgress,
-    raise_where,
-    read_table,
-    reason,
-)
+from ganlane.data.schema import FRAME_S, SCHEMA, RowCount, Scene, sort, validate
+from ganlane.data.tables import OnProgress, raise_where, read_table, reason
 from ganlane.errors import UserError
-from ganlane.files import (
-    LARGEST_BYTES,
-    PLACE,
-    has_checksum,
-    sealed,
-    write_bytes,
-)
+from ganlane.files import LARGEST_BYTES, PLACE, has_checksum, sealed, write_bytes
 from ganlane.settings.generator import NgsimParameters
 
 #: Columns of a scene CSV: the schema's, but the speed is ``v``; ``y`` is positive to the left and 0
@@ -67,11 +49,7 @@ def write_prepared(frame: pl.DataFrame, path: str | Path) -> None:
     """Write a frame in the schema as Parquet with a checksum, atomically."""
     # In memory first, since the checksum covers the whole content.
     file = io.BytesIO()
-    frame.write_parquet(
-        file,
-        compression="zstd",
-        metadata={"checksum": PLACE},
-    )
+    frame.write_parquet(file, compression="zstd", metadata={"checksum": PLACE})
     write_bytes(path, sealed(file.getvalue()))
 
 
@@ -109,22 +87,12 @@ def _read_files(path: Path) -> Iterator[pl.DataFrame]:
 
 def _read_csv(path: Path) -> pl.DataFrame:
     table = read_table(path, COLUMNS).rename({"v": "speed"})
-    raise_where(
-        table["lane"] < 1,
-        table,
-        "lane",
-        path,
-        "is below 1, the leftmost lane",
-    )
+    raise_where(table["lane"] < 1, table, "lane", path, "is below 1, the leftmost lane")
     scenes = []
     for (name,), scene in validate(table, str(path)).group_by("scene"):
         from_left = scene["lane"].to_numpy() - 1
         # The file does not say how wide its lanes are; the positions do.
-        width = lane_width(
-            -scene["y"].to_numpy(),
-            from_left,
-            f"{path}, scene {name}",
-        )
+        width = lane_width(-scene["y"].to_numpy(), from_left, f"{path}, scene {name}")
         # The rightmost lane in use becomes 0.
         last = int(from_left.max())
         scenes.append(
@@ -206,13 +174,7 @@ def read_recordings(
     # Sorted over all files already.
     if kind == "scenes":
         return read_scenes(path)
-    scenes = open_scenes(
-        kind,
-        path,
-        RowCount(),
-        parameters,
-        on_progress=on_progress,
-    )
+    scenes = open_scenes(kind, path, RowCount(), parameters, on_progress=on_progress)
     frames = [scene.frame for scene in scenes]
     if not frames:
         raise UserError(

@@ -73,11 +73,7 @@ class RowCount:
         """Rows read and not dropped."""
         return self.read - self.dropped.total()
 
-    def drop(
-        self,
-        reason: str,
-        rows: SupportsInt,
-    ) -> None:
+    def drop(self, reason: str, rows: SupportsInt) -> None:
         """Count ``rows`` dropped for ``reason``."""
         if int(rows):
             self.dropped[reason] += int(rows)

@@ -43,10 +43,7 @@ def data_folder() -> Path | None:
         checkout.parent / _FOLDER,
         Path.cwd().parent / _FOLDER,
     )
-    return next(
-        (folder for folder in candidates if folder.is_dir()),
-        None,
-    )
+    return next((folder for folder in candidates if folder.is_dir()), None)
 
 
 def default_scenes() -> Path:

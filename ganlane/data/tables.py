@@ -3,13 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import (
-    Callable,
-    Iterable,
-    Iterator,
-    Mapping,
-    Sequence,
-)
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -100,12 +94,7 @@ def converted(text: pl.DataFrame, columns: Mapping[str, Kind], path: Path) -> pl
     return pl.DataFrame([*series, text[LINE]])
 
 
-def convert(
-    text: pl.DataFrame,
-    column: str,
-    kind: Kind,
-    path: Path,
-) -> pl.Series:
+def convert(text: pl.DataFrame, column: str, kind: Kind, path: Path) -> pl.Series:
     """A ``column`` of text as ``String``, ``Int64`` (also of ``3.0``) or finite ``Float64``.
 
     Commas may separate thousands, as in NGSIM's portal.
@@ -201,11 +190,7 @@ def _whole_lines(table: TextTable, block_bytes: int) -> Iterator[bytes]:
             yield rest.rstrip() + (b"\n" if rest.endswith(b"\n") else b"")
 
 
-def _fields(
-    line: str,
-    place: str,
-    blanks: bool = False,
-) -> list[str]:
+def _fields(line: str, place: str, blanks: bool = False) -> list[str]:
     """The fields of one line."""
     try:
         return line.split() if blanks else next(csv.reader([line]), [])

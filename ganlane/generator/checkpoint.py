@@ -75,12 +75,7 @@ class FitResult:
             "code": code or {},
             "ganlane": __version__,
         }
-        save_weights(
-            path,
-            GENERATOR,
-            self.module.state_dict(),
-            metadata,
-        )
+        save_weights(path, GENERATOR, self.module.state_dict(), metadata)
 
 
 def load_generator(

@@ -31,11 +31,7 @@ import torch
 from torch import Tensor
 
 from ganlane.generator.networks import Generator, Observation
-from ganlane.generator.windows import (
-    OBSERVED_POSITIONS,
-    PRESENT,
-    Segments,
-)
+from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT, Segments
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.generated import (
     ANCHOR,
@@ -44,16 +40,8 @@ from ganlane.settings.generated import (
     AnchorParameters,
 )
 from ganlane.settings.generator import CalibratedConfig
-from ganlane.sim.idm import (
-    TABLE_V,
-    following_acceleration,
-)
-from ganlane.sim.neighbours import (
-    FREE_GAP_M,
-    Scene,
-    leader,
-    perceive,
-)
+from ganlane.sim.idm import TABLE_V, following_acceleration
+from ganlane.sim.neighbours import FREE_GAP_M, Scene, leader, perceive
 from ganlane.sim.state import ENTRY_M, Road, Vehicles, Visibility
 from ganlane.torch_settings import constant
 
@@ -144,11 +132,7 @@ def displacement_of(vehicles: Vehicles) -> Tensor:
     return torch.stack([length * torch.cos(heading), length * torch.sin(heading)], dim=-1)
 
 
-def moved_by(
-    vehicles: Vehicles,
-    velocity_x: Tensor,
-    velocity_y: Tensor,
-) -> Vehicles:
+def moved_by(vehicles: Vehicles, velocity_x: Tensor, velocity_y: Tensor) -> Vehicles:
     """The vehicles 0.1 s later at a new velocity (m/s, [N, M]).
 
     Nobody drives backwards or slides sideways: the lateral velocity is limited to :data:`STEEPEST`
@@ -168,11 +152,7 @@ def moved_by(
     )
 
 
-def wander(
-    noise: Tensor,
-    fresh: Tensor,
-    period_s: float,
-) -> Tensor:
+def wander(noise: Tensor, fresh: Tensor, period_s: float) -> Tensor:
     """``noise`` 0.1 s later, of unit variance and with the time constant ``period_s``.
 
     ``fresh`` are independent standard normal numbers of the same shape. A period of 0 draws anew at
@@ -211,11 +191,7 @@ class DriverMemory(NamedTuple):
     headway: Tensor
 
 
-def extra_inputs(
-    scene: Scene,
-    anchor: Tensor,
-    offset: Tensor,
-) -> Tensor:
+def extra_inputs(scene: Scene, anchor: Tensor, offset: Tensor) -> Tensor:
     """The further inputs [N, M, 4], each bounded and of order 1.
 
     Without a leader the gap input is 1. ``anchor`` is IDM's acceleration, m/s2, ``offset`` the
@@ -413,11 +389,7 @@ def headway_from_uniform(u: Tensor, quantiles_s: tuple[float, ...] = HEADWAY_QUA
     return values[upper - 1] + part * (values[upper] - values[upper - 1])
 
 
-def balanced_headway(
-    vehicles: Vehicles,
-    road: Road,
-    otherwise: Tensor,
-) -> Tensor:
+def balanced_headway(vehicles: Vehicles, road: Road, otherwise: Tensor) -> Tensor:
     """The headway [N, M] in s at which IDM neither speeds up nor brakes now.
 
     It follows from gap, speed and desired speed. For vehicles without a leader, or further behind

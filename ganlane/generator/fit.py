@@ -39,11 +39,7 @@ from ganlane.generator.windows import (
     count_windows,
     cut_windows,
 )
-from ganlane.settings.generator import (
-    CalibratedConfig,
-    HumanConfig,
-    PaperConfig,
-)
+from ganlane.settings.generator import CalibratedConfig, HumanConfig, PaperConfig
 from ganlane.weights import load_weights, save_weights
 
 Config = PaperConfig | CalibratedConfig | HumanConfig

@@ -225,11 +225,7 @@ def repeated(displacement: np.ndarray, steps: int) -> np.ndarray:
     return displacement[:, None] * np.arange(1.0, steps + 1.0)[:, None]
 
 
-def energy_score(
-    one: Tensor,
-    other: Tensor,
-    recorded: Tensor,
-) -> Tensor:
+def energy_score(one: Tensor, other: Tensor, recorded: Tensor) -> Tensor:
     """Energy score [...] of two samples: mean error minus half their distance, in m.
 
     All are positions [..., 2]. A proper score: least in expectation when the samples are drawn from

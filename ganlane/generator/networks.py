@@ -52,28 +52,14 @@ def dense(
     many = x.numel() >= _MANY_ROWS * x.shape[-1]
     # A fit needs gradients, which the fast product does not have.
     if many and has_fast_product(x) and not torch.is_grad_enabled():
-        return matrix_product(
-            x,
-            weight,
-            bias,
-            relu,
-        )
+        return matrix_product(x, weight, bias, relu)
     product = nn.functional.linear(x, weight, bias)
     return torch.relu(product) if relu else product
 
 
-def apply(
-    layer: nn.Linear,
-    x: Tensor,
-    relu: bool = False,
-) -> Tensor:
+def apply(layer: nn.Linear, x: Tensor, relu: bool = False) -> Tensor:
     """``layer(x)`` computed by :func:`dense`."""
-    return dense(
-        x,
-        layer.weight,
-        layer.bias,
-        relu,
-    )
+    return dense(x, layer.weight, layer.bias, relu)
 
 
 def motion_features(displacement: Tensor, difference: Tensor) -> Tensor:
@@ -97,12 +83,7 @@ class MotionLSTM(nn.Module):
     the state; without ``differences`` the displacements' differences are 0 as inputs (an ablation).
     """
 
-    def __init__(
-        self,
-        embedding: int,
-        hidden: int,
-        differences: bool = True,
-    ):
+    def __init__(self, embedding: int, hidden: int, differences: bool = True):
         super().__init__()
         self.hidden = hidden
         self.differences = differences
@@ -167,12 +148,7 @@ class MotionLSTM(nn.Module):
 
 def _times_tanh(factor: Tensor, x: Tensor) -> Tensor:
     """``factor * tanh(x)`` by the sigmoid: on a CPU a quarter of the time of ``torch.tanh``."""
-    return torch.addcmul(
-        -factor,
-        factor,
-        torch.sigmoid(x + x),
-        value=2.0,
-    )
+    return torch.addcmul(-factor, factor, torch.sigmoid(x + x), value=2.0)
 
 
 def nearest(
@@ -219,13 +195,7 @@ class PairPooling(nn.Module):
     ``neighbours`` is no pooling.
     """
 
-    def __init__(
-        self,
-        hidden: int,
-        inner: int,
-        pooled: int,
-        neighbours: int,
-    ):
+    def __init__(self, hidden: int, inner: int, pooled: int, neighbours: int):
         super().__init__()
         self.neighbours = neighbours
         # Only this layer has a bias, since the two terms are added.
@@ -335,12 +305,7 @@ class Generator(nn.Module):
         Its own motion, its neighbours, its further inputs.
         """
         hidden = self.encoder.encode(now.projections)
-        pooled = self.pooling(
-            hidden,
-            now.position,
-            now.displacement,
-            now.valid,
-        )
+        pooled = self.pooling(hidden, now.position, now.displacement, now.valid)
         inputs = torch.cat([hidden, pooled, now.extra], dim=-1)
         # The layers are applied by hand, through the fast product.
         first, second = (cast(nn.Linear, self.context[layer]) for layer in (0, 2))

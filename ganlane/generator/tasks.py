@@ -36,11 +36,7 @@ from ganlane.generator.forecasts import (
 from ganlane.generator.human_estimator import HumanModel
 from ganlane.generator.human_fit import fit_human, fit_steps
 from ganlane.generator.human_forecasts import fit_observer, human_forecasts, standard_width
-from ganlane.generator.networks import (
-    Discriminator,
-    Generator,
-    displacements_of,
-)
+from ganlane.generator.networks import Discriminator, Generator, displacements_of
 from ganlane.generator.windows import (
     Groups,
     Segments,

@@ -105,24 +105,13 @@ class Segments:
         y = self.positions[:, PRESENT : PRESENT + 1, :, 1]
         road = Road(self.lanes[..., None], self.lane_width[..., None])
         lane = road.lane_of(y).long()
-        return replace(
-            self,
-            target_lane=lane.expand_as(self.target_lane).contiguous(),
-        )
+        return replace(self, target_lane=lane.expand_as(self.target_lane).contiguous())
 
 
-def segment_starts(
-    scene: Recording,
-    horizon: int,
-    stride: int = 1,
-) -> list[int]:
+def segment_starts(scene: Recording, horizon: int, stride: int = 1) -> list[int]:
     """Rows where a segment of 9 + ``horizon`` frames with at least one driven vehicle starts."""
     # Empty for a scene that is shorter than a segment.
-    rows = range(
-        0,
-        len(scene.present) - OBSERVED_POSITIONS - horizon + 1,
-        stride,
-    )
+    rows = range(0, len(scene.present) - OBSERVED_POSITIONS - horizon + 1, stride)
     # Driven are those that are recorded in all observed frames.
     return [row for row in rows if scene.present[row : row + OBSERVED_POSITIONS].all(0).any()]
 
@@ -294,11 +283,7 @@ class Groups:
         )
 
 
-def kmeans_labels(
-    positions: np.ndarray,
-    size: int,
-    seed: int,
-) -> np.ndarray:
+def kmeans_labels(positions: np.ndarray, size: int, seed: int) -> np.ndarray:
     """Group number [n] of each of n positions [n, 2] in m, by k-means.
 
     Groups have about ``size`` members.
@@ -310,11 +295,7 @@ def kmeans_labels(
     return KMeans(groups, n_init=1, random_state=seed).fit_predict(positions)
 
 
-def group_windows(
-    windows: Windows,
-    size: int = 9,
-    seed: int = 0,
-) -> Groups:
+def group_windows(windows: Windows, size: int = 9, seed: int = 0) -> Groups:
     """Split the vehicles of every (scene, start) into k-means groups of about ``size``, padded.
 
     Uses the last observed positions only.

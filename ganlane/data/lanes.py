@@ -24,7 +24,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import ArrayLike, NDArray
 
-from ganlane.data.schema import FRAME_S
+from ganlane.data.schema import CONTINUES, FRAME_S
 from ganlane.errors import UserError
 
 #: 12 feet, the standard lane of a US freeway: used where a recording has one lane only.
@@ -181,12 +181,11 @@ def tracks_of_frame(
     """
     widths = scene_lane_widths(frame) if lane_widths is None else lane_widths
     # A track goes on where frame and vehicle say so, within one scene.
-    continues = (pl.col("frame").diff() == 1) & (pl.col("vehicle").diff() == 0)
     same_scene = pl.col("scene") == pl.col("scene").shift(1)
     columns = frame.select(
         "y",
         width=pl.col("scene").replace_strict(widths, return_dtype=pl.Float64),
-        begins=~(continues & same_scene).fill_null(False),
+        begins=~(CONTINUES & same_scene).fill_null(False),
     )
     return Tracks(*(column.to_numpy() for column in columns))
 

@@ -17,7 +17,7 @@ import polars as pl
 
 from ganlane.data.dense import Recording
 from ganlane.data.lanes import STANDARD_LANE_WIDTH_M
-from ganlane.data.schema import FRAME_S
+from ganlane.data.schema import CONTINUES, FRAME_S
 from ganlane.data.tables import read_table
 from ganlane.errors import UserError
 
@@ -166,9 +166,8 @@ def _one_lane(rows: pl.DataFrame) -> Recording:
     # The files are sorted by frame, or by pair.
     rows = rows.sort("vehicle", "frame")
     # A gap splits a track, since a recording's tracks have none.
-    starts = (pl.col("frame").diff() != 1) | (pl.col("vehicle").diff() != 0)
     rows = rows.with_columns(
-        vehicle=starts.fill_null(False).cum_sum(),
+        vehicle=(~CONTINUES).fill_null(False).cum_sum(),
         y=0.0,
         speed=0.0,
         width=_WIDTH_M,

@@ -59,10 +59,7 @@ class FitResult:
         ``folds`` are the scores of :func:`ganlane.generator.cross_validate`, if it was called;
         ``code`` the code's version in more detail than the package's number.
         """
-        fit = {
-            "updates": self.updates,
-            "seconds": round(self.seconds, 1),
-        }
+        fit = {"updates": self.updates, "seconds": round(self.seconds, 1)}
         # Plain data only: reading a file of weights never executes code.
         metadata = {
             "preset": self.config.preset,

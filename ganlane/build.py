@@ -29,7 +29,7 @@ from ganlane.settings.actions import ActionParameters
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MASKS, MaskParameters, ObservationConfig, RewardParameters
-from ganlane.settings.record import make
+from ganlane.settings.record import below, make
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.sim.dynamics import STEERING
 from ganlane.sim.random import Stream
@@ -160,12 +160,10 @@ def make_env(
         transforms.append(ActionMaskTransform(base.road, *parameters))
     sensors = observation.sensors
     errors = []
-    try:
-        # what the ego's sensors get wrong comes before the observation that is made of it
-        if sensors is not None:
+    # What the ego's sensors get wrong comes before the observation that is made of it.
+    if sensors is not None:
+        with below("observation.sensors"):
             errors = [SensorTransform(sensors, traffic.stream, env.decision_period_s)]
-    except ParameterError as error:
-        raise error.below("observation.sensors") from error
     return TransformedHighway(
         base,
         Compose(*errors, *transforms, RewardTransform(env.decision_period_s, reward)),

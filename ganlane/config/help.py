@@ -68,15 +68,16 @@ def _keys(record: Record, indent: int) -> Iterator[str]:
     """A line for every key of a record: its value, and what it means."""
     for name in key_names(type(record)):
         value, key = getattr(record, name), f"{' ' * indent}{name}:"
+        text = meaning(type(record), name)
+        # Of a mapping of records the names alone, since their keys would fill pages.
+        if isinstance(value, dict) and any(map(is_dataclass, value.values())):
+            value = list(value)
         # A record of its own: its line, then its keys below it.
         if is_dataclass(value):
-            yield from _lines(key, meaning(type(record), name))
+            yield from _lines(key, text)
             yield from _keys(value, indent + 2)  # type: ignore[arg-type]
-        # Of a mapping of records the names alone, since their keys would fill pages.
-        elif isinstance(value, dict) and any(map(is_dataclass, value.values())):
-            yield from _lines(f"{key} {as_typed(list(value))}", meaning(type(record), name))
         else:
-            yield from _lines(f"{key} {as_typed(value)}", meaning(type(record), name))
+            yield from _lines(f"{key} {as_typed(value)}", text)
 
 
 def _lines(key: str, text: str) -> Iterator[str]:
@@ -89,10 +90,8 @@ def _lines(key: str, text: str) -> Iterator[str]:
 def meaning(kind: type, name: str) -> str:
     """The first sentence on a field in the docstring of its class or of a base class."""
     # A subclass may say something else about an inherited key.
-    for base in kind.__mro__:
-        if name in _attributes(base):
-            return _attributes(base)[name]
-    return ""
+    described = (_attributes(base) for base in kind.__mro__)
+    return next((meanings[name] for meanings in described if name in meanings), "")
 
 
 def _attributes(kind: type) -> dict[str, str]:

@@ -24,6 +24,7 @@ from ganlane.settings.record import (
     Share,
     Text,
     assign,
+    below,
     between,
     key_names,
     one_of,
@@ -398,10 +399,8 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
             raise ParameterError(
                 "{recycle}=true: with a flow of vehicles nobody returns; leave it off."
             )
-        try:
+        with below("flow"):
             self.flow.check(self.stretches(), self.decision_period_s)
-        except ParameterError as error:
-            raise error.below("flow") from error
 
     def _check_start(self) -> None:
         """Refuse first scenes that do not fit on the road, or make a crash unavoidable."""

@@ -384,12 +384,6 @@ class DataConfig(Record):
     path: str | None = None
     held_out: tuple[Text, ...] | None = None
 
-    @classmethod
-    def kinds(cls) -> dict[str, type[Record]]:
-        """A class for each format."""
-        # This class is a format itself; its subclasses alone would miss it.
-        return {kind.format: kind for kind in (DataConfig, NgsimDataConfig, HighdDataConfig)}
-
     def parameters(self) -> NgsimParameters | None:
         """Further inputs of the reader; None where it takes nothing."""
         return None

@@ -187,9 +187,9 @@ class Record:
 
     @classmethod
     def kinds(cls) -> dict[str, type[Record]]:
-        """The subclasses, or the class alone, by the default of the field ``chosen_by``."""
-        # A class without subclasses is the only kind of itself.
-        return {getattr(kind, cls.chosen_by): kind for kind in (cls.__subclasses__() or [cls])}
+        """The class and its subclasses by the default of the field ``chosen_by``, if it has one."""
+        kinds = [kind for kind in (cls, *cls.__subclasses__()) if hasattr(kind, cls.chosen_by)]
+        return {getattr(kind, cls.chosen_by): kind for kind in kinds}
 
     @classmethod
     def chosen(cls, data: Any) -> tuple[type[Record], Any]:
@@ -201,7 +201,7 @@ class Record:
         if isinstance(data, Mapping) and cls.group and "name" in data:
             changes = {name: value for name, value in data.items() if name != "name"}
             data = merged(option(cls.group, data["name"]), changes)
-        if not isinstance(data, Mapping) or cls.chosen_by not in data:
+        if not cls.chosen_by or not isinstance(data, Mapping) or cls.chosen_by not in data:
             return cls, data
         kinds, choice = cls.kinds(), data[cls.chosen_by]
         if not isinstance(choice, str) or choice not in kinds:
@@ -221,7 +221,7 @@ def make(kind: type[Part], data: Any, key: str = "") -> Part:
     # A record was checked when it was made.
     if isinstance(data, kind):
         return data
-    with _below(key):
+    with below(key):
         chosen, values = kind.chosen(data)  # type: ignore[attr-defined]
     if not isinstance(values, Mapping):
         options = "the name of an option or " if chosen.group else ""
@@ -239,12 +239,12 @@ def make(kind: type[Part], data: Any, key: str = "") -> Part:
             raise ParameterError(
                 f"{{{whole}}}: no such key{hint}; {owner} {', '.join(sorted(names))}."
             )
-    with _below(key):
+    with below(key):
         return chosen(**values)
 
 
 @contextmanager
-def _below(key: str) -> Iterator[None]:
+def below(key: str) -> Iterator[None]:
     """Put ``key`` before the fields that an error names."""
     try:
         yield

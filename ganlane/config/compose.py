@@ -37,10 +37,6 @@ _HYDRA_PLUGIN = re.compile(r"hydra(/|\.)(launcher|sweeper)\b")
 ALIASES = {"render": {"agent": "agents", "episode": "episodes"}, "record": {"agent": "driver"}}
 
 
-#: The key of a command whose values words without = are.
-BARE = {"benchmark": "agents"}
-
-
 def parsed(command: str, words: Sequence[str]) -> list[Override]:
     """The words of a command line by Hydra's grammar, as :func:`composed` takes them.
 
@@ -50,16 +46,15 @@ def parsed(command: str, words: Sequence[str]) -> list[Override]:
     """
     for word in words:
         # Python reads bytes beyond the locale's characters as lone surrogates.
-        if not word.isprintable() and word != word.encode("utf-8", "ignore").decode():
+        if word != word.encode("utf-8", "ignore").decode():
             raise UserError(
                 f"{word!a}: has characters that this locale does not know; set LC_ALL=C.UTF-8."
             )
-    # A path may have an = in it, as the folders of a sweep do.
+    # Words without = are agents. A path may have an = in it, as the folders of a sweep do.
     bare = [word for word in words if "=" not in word or os.path.exists(word)]
-    if command in BARE and bare:
-        quoted = ",".join(json.dumps(word) for word in bare)
-        words = [word for word in words if word not in bare]
-        words.append(f"{BARE[command]}=[{quoted}]")
+    if command == "benchmark" and bare:
+        others = [word for word in words if word not in bare]
+        words = [*others, f"agents={json.dumps(bare)}"]
     # Hydra's own grammar, so that quotes, lists and sweeps mean what its users expect.
     try:
         overrides = OverridesParser.create().parse_overrides([_as_meant(command, w) for w in words])

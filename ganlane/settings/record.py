@@ -86,30 +86,25 @@ def _is_range(pair: tuple[float, float]) -> bool:
 DIFFERENT = Rule(
     lambda entries: len(entries) == len(set(entries)) > 0, "a list of different entries, not empty"
 )
-_ABOVE_0 = Rule(lambda value: _finite(value) and value > 0, "a number above 0")
-_BELOW_0 = Rule(lambda value: _finite(value) and value < 0, "a number below 0")
-_AT_MOST_0 = Rule(lambda value: _finite(value) and value <= 0, "at most 0")
-_SHARE_ABOVE_0 = Rule(lambda value: 0 < value <= 1, "a number above 0, at most 1")
-_RANGE = Rule(_is_range, "two numbers [low, high], 0 <= low <= high")
-_RANGE_ABOVE_0 = Rule(
-    lambda pair: _is_range(pair) and pair[0] > 0, "two numbers [low, high], 0 < low <= high"
-)
 
 Number = Annotated[float, Rule(_finite, "a finite number")]
-Positive = Annotated[float, _ABOVE_0]
-Negative = Annotated[float, _BELOW_0]
+Positive = Annotated[float, Rule(lambda value: _finite(value) and value > 0, "a number above 0")]
+Negative = Annotated[float, Rule(lambda value: _finite(value) and value < 0, "a number below 0")]
 NotNegative = Annotated[float, at_least(0)]
-NotPositive = Annotated[float, _AT_MOST_0]
+NotPositive = Annotated[float, Rule(lambda value: _finite(value) and value <= 0, "at most 0")]
 Share = Annotated[float, between(0, 1)]
-PositiveShare = Annotated[float, _SHARE_ABOVE_0]
+PositiveShare = Annotated[float, Rule(lambda value: 0 < value <= 1, "a number above 0, at most 1")]
 Count = Annotated[int, at_least(1)]
 CountOrZero = Annotated[int, at_least(0)]
 #: Up to 2**53 a whole number survives as a float, as in JSON.
 Seed = Annotated[int, between(0, 2**53)]
 Text = Annotated[str, Rule(bool, "a text that is not empty")]
 #: Lowest and highest value, from 0 on; or above 0.
-Range = Annotated[tuple[float, float], _RANGE]
-PositiveRange = Annotated[tuple[float, float], _RANGE_ABOVE_0]
+Range = Annotated[tuple[float, float], Rule(_is_range, "two numbers [low, high], 0 <= low <= high")]
+PositiveRange = Annotated[
+    tuple[float, float],
+    Rule(lambda pair: _is_range(pair) and pair[0] > 0, "two numbers [low, high], 0 < low <= high"),
+]
 
 
 # --- options: a YAML file each

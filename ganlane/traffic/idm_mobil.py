@@ -28,10 +28,9 @@ _LANE_MARGIN_M = 0.1
 #: A random driver's strongest braking is at least this many times what the initial scene requires
 #: of it.
 _START_MARGIN = 1.5
-#: Number of uniform numbers per random driver.
-_DRAWS = 12
-#: The column of the factor on the desired speed.
-_DESIRED_SPEED = 11
+#: Random numbers of a random driver's parameters, and of the factor on its desired speed.
+_DRAWS = range(Purpose.DRIVER, Purpose.DRIVER + 11)
+_DESIRED_SPEED = Purpose.DRIVER + 11
 #: Key of the random drivers' parameters in the memory, which stored training runs hold.
 _PARAMETERS = "traits"
 
@@ -246,17 +245,12 @@ class IdmRandomTraffic(IdmMobilTraffic):
             fields["past"] = (self.delay_steps,)
         self.memory_fields = {name: (shape, None) for name, shape in fields.items()}
 
-    def _drawn(self, vehicles: Vehicles, key: Tensor) -> tuple[Tensor, ...]:
-        """Uniform numbers [N, M] of every purpose."""
-        # Step -1 is no step of an episode, so nothing else draws these numbers.
-        purposes = range(Purpose.DRIVER, Purpose.DRIVER + _DRAWS)
-        return uniforms(vehicles, key, -1, *purposes)
-
     def driver_params(self, vehicles: Vehicles, key: Tensor) -> DriverParams:
         """The drivers at the start of the episodes with ``key`` [N]."""
         d = self.drivers
         # Each column has a fixed use: another order would change every episode.
-        u = self._drawn(vehicles, key)
+        # Step -1 is no step of an episode, so nothing else draws these numbers.
+        u = uniforms(vehicles, key, -1, *_DRAWS)
         # The scene may ask more of a driver than its range has: it then brakes as hard as that.
         reaction_s = in_range(u[5], d.reaction_s)
         required = start_braking(vehicles, self.road, reaction_s, self.idm.min_gap_m)
@@ -281,7 +275,7 @@ class IdmRandomTraffic(IdmMobilTraffic):
         self, vehicles: Vehicles, key: Tensor, episode: Tensor
     ) -> tuple[Vehicles, TensorDictBase]:
         """Gives every driver but the ego its own desired speed."""
-        u = self._drawn(vehicles, absorb(key, 0))[_DESIRED_SPEED]
+        (u,) = uniforms(vehicles, absorb(key, 0), -1, _DESIRED_SPEED)
         # The ego's is the environment's.
         desired = in_range(u, self.drivers.desired_speed) * vehicles.desired_speed
         desired[:, EGO_INDEX] = vehicles.desired_speed[:, EGO_INDEX]

@@ -19,12 +19,11 @@ from gymnasium.spaces import Box, Discrete
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.native.batch import SPEED_RATIO_LIMIT, Stepped
-from ganlane.native.settings import Array, Key
+from ganlane.native.settings import Array, Floats, Key
 from ganlane.settings.actions import CONTROLS, ActionParameters
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.episode import EpisodeParameters
 
-Floats = npt.NDArray[np.float32]
 Integers = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 #: Exclusive upper bound of the seeds that unseeded environments draw.

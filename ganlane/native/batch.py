@@ -32,7 +32,7 @@ from ganlane.settings.actions import CONTROLS, LANE, LANE_SPEED
 from ganlane.settings.commands import HighwayConfig
 from ganlane.settings.driving import Visibility
 from ganlane.settings.episode import Stream
-from ganlane.settings.observation import largest_number
+from ganlane.settings.observation import MASKS, largest_number
 
 #: Speed over desired speed beyond which the observation is cut off, for a space with bounds; IDM
 #: stays far below.
@@ -182,7 +182,7 @@ class NativeBatch:
             "highest": self.bounds[1],
             "fastest": SPEED_RATIO_LIMIT,
             "size": view.numbers(),
-            "mask_form": settings.MASK_FORMS.index(mask.form),
+            "mask_form": MASKS.index(mask.form),
             "abort_lane_change": abort,
         }
         recycle_share = env.recycle_share if env.recycle else None

@@ -135,8 +135,6 @@ NATIVE_FORMS: Final = {
 CONTROL_NUMBERS: Final = {LANE: 0, LANE_SPEED: 1, CONTINUOUS: 2}
 #: Heading that counts as 1 there, rad: some 5 m/s to the side at 25 m/s.
 HEADING_RAD: Final = 0.2
-#: The action masks, in the order of step.cpp's numbers ``MASK_ROAD, MASK_LEGAL, ...``.
-MASK_FORMS: Final = ("none", "legal", "safe", "foresight")
 
 
 def fields(kind: type, names: str) -> list[tuple[str, type]]:

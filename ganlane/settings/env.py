@@ -36,14 +36,8 @@ if TYPE_CHECKING:
     from ganlane.sim.scenes import FixedScene, SceneVehicle
     from ganlane.sim.state import Road
 
-#: The ego and at least one other.
-Vehicles = Annotated[int, between(2, 1000)]
 # 0 waits for the number of vehicles in the scene.
 _VEHICLES_OR_SCENE = Rule(lambda count: count == 0 or 2 <= count <= 1000, "a number from 2 to 1000")
-#: Keys of Table II, which do not apply to a given scene.
-TABLE_II_KEYS = tuple(
-    name for name in key_names(SpawnParameters) if name != "ego_desired_speed_mps"
-)
 
 
 @dataclass(frozen=True)
@@ -418,9 +412,9 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
 
     def _check_scene(self) -> None:
         # Table II draws scenes at random; on one set by hand its keys would do nothing.
-        for name in TABLE_II_KEYS:
+        for name in key_names(SpawnParameters):
             value = getattr(self, name)
-            if value != getattr(SpawnParameters, name):
+            if name != "ego_desired_speed_mps" and value != getattr(SpawnParameters, name):
                 raise ParameterError(
                     f"{{{name}}}={as_typed(value)}: has no effect on a scene set by hand; leave it "
                     "out, or take env=highway."

@@ -28,8 +28,6 @@ from ganlane.settings.record import (
 )
 
 Preset = Literal["paper", "calibrated"]
-#: The preset that is no Social-GAN but a policy.
-HUMAN = "human"
 #: Kind of their files; weights of another kind, such as an agent's, are refused by it.
 GENERATOR = "generator"
 #: Inputs of the calibrated preset in addition to the motion: IDM's acceleration, gap, closing
@@ -139,7 +137,7 @@ def human_sizes(path: object, metadata: Mapping[str, Any]) -> HumanSizes:
         UserError: another preset, or no sizes of such a policy; ``path`` is for the message.
     """
     stored = str(metadata.get("preset"))
-    if stored != HUMAN:
+    if stored != "human":
         raise UserError(f"{path}: a generator of preset {stored!r}, expected 'human'; give one.")
     return _sizes_in(path, metadata, HumanSizes)
 

@@ -30,7 +30,7 @@ NEARNESS_M = 15.0
 OVERLAP_M = 1.0
 #: How far the ego knows the lanes ahead, m.
 ROAD_SIGHT_M = 1000.0
-#: The masks, in the order of the kernel's numbers; see
+#: The masks, in the order of step.cpp's numbers ``MASK_ROAD, MASK_LEGAL, ...``; see
 #: :class:`ganlane.transforms.ActionMaskTransform`.
 MASKS = ("none", "legal", "safe", "foresight")
 

@@ -54,11 +54,14 @@ def _one_of(u: Tensor, left: Tensor, right: Tensor) -> Tensor:
     return torch.where(left & right, both, torch.where(left, 1, torch.where(right, -1, 0)))
 
 
-def side_on(ways: WaysOut, u: Tensor) -> Tensor:
-    """As :func:`random_side` where lanes end; the side to which a driver has to go, if there is
-    one.
+def _side(vehicles: Vehicles, road: Road, u: Tensor) -> tuple[Tensor, WaysOut | None]:
+    """As :func:`random_side`; where lanes end the side to which a driver has to go, if there is
+    one, and all ways out.
     """
-    return torch.where(ways.side != 0, ways.side, _one_of(u, ways.left, ways.right))
+    if not road.stretches:
+        return random_side(u, vehicles.target_lane, road.lanes), None
+    ways = ways_out(vehicles, road, TABLE_IV.mandatory_m)
+    return torch.where(ways.side != 0, ways.side, _one_of(u, ways.left, ways.right)), ways
 
 
 class LiteralLaneChange(Overlay):
@@ -97,11 +100,9 @@ class LiteralLaneChange(Overlay):
         gauss = normal(key, step, vehicles.x.shape[1], [Purpose.LANE_CHANGE_SPEED], dtype)[..., 0]
         # Blind: nobody looks for a gap, as in the paper.
         hazard = literal_hazard(memory["clock"].to(dtype), c.mean_steps)
-        side = random_side(u_side, vehicles.target_lane, self.road.lanes)
-        if self.road.stretches:
-            ways = ways_out(vehicles, self.road, TABLE_IV.mandatory_m)
+        side, ways = _side(vehicles, self.road, u_side)
+        if ways is not None:
             hazard = torch.maximum(hazard, ways.urgency)
-            side = side_on(ways, u_side)
         starts = (memory["lateral_speed"] == 0) & vehicles.valid & (u < hazard)
         side = torch.where(starts, side, 0)
         target = vehicles.target_lane + side
@@ -162,15 +163,12 @@ class CalibratedLaneChange(Overlay):
         # At a constant rate per kilometre driven: the probability of at least one event of a
         # Poisson process within the step.
         comes = u < 1.0 - torch.exp(-vehicles.speed * (self.dt * self.changes.per_km / 1000.0))
-        side = random_side(u_side, vehicles.target_lane, self.road.lanes)
-        if self.road.stretches:
-            ways = ways_out(vehicles, self.road, self._limits.mandatory_m)
-            side = side_on(ways, u_side)
+        side, ways = _side(vehicles, self.road, u_side)
         # Who is still changing does not wish for another change.
         free = lane_change_done(vehicles, self.road) & vehicles.valid
         new = torch.where(comes & free, side, 0)
         wish = torch.where(memory["wish"] != 0, memory["wish"], new)
-        if self.road.stretches:
+        if ways is not None:
             # Where lanes end, the side that one has to go to comes before what one would like.
             wish = torch.where(free & (ways.side != 0), ways.side, wish)
             there = torch.where(wish > 0, ways.left, ways.right)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ganlane import keys
-from ganlane.gym.rows import Flags, Floats, Integers, Rows, observation_space
+from ganlane.gym.rows import Flags, Floats, Integers, Rows, measure, observation_space
 from ganlane.native.batch import NativeBatch, Stepped
 from ganlane.native.drivers import drivers_of, pays
 from ganlane.native.library import why_not
@@ -28,10 +28,10 @@ class NativeRows(Rows):
         # No recorded scene is driven by the kernel, so none can end.
         self._no_end = np.zeros(self.count, np.bool_)
         # Made once, since all of it but the lane and the time are views of the kernel's arrays.
-        self._info = super().info()
+        self._info, self._driven = super().info(), self.driven()
 
     def info(self) -> dict[str, Any]:
-        self.measure(self._info)
+        measure(self._info, *self._driven)
         return self._info
 
     def __getstate__(self) -> tuple[NativeBatch, bool]:
@@ -66,7 +66,7 @@ class NativeRows(Rows):
         return array[:, keys.EGO_INDEX] if array.ndim > 1 else array
 
     def lanes(self) -> tuple[Any, Any]:
-        return self.config.env.lanes, self.config.env.lane_width_m
+        return self.config.env.lanes, np.float32(self.config.env.lane_width_m)
 
     def reward_terms(self) -> dict[str, Array]:
         return self.batch.reward_terms()

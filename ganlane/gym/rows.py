@@ -126,19 +126,22 @@ class Rows(ABC):
         if self.actions.names:
             info[ACTION_MASK] = self.mask().view(np.int8)
         info[keys.REWARD_TERMS] = self.reward_terms()
-        self.measure(info)
+        measure(info, *self.driven())
         return info
 
-    def measure(self, info: Mapping[str, Any]) -> None:
-        """Write the info's time in s and the ego's lane."""
-        # Simulated time is counted in physics steps, so it has no sum of rounding errors.
-        np.multiply(self.array(keys.STEP), keys.PHYSICS_STEP_S, out=info["time_s"])
-        # The road's own rounding, in the run's float type.
-        y = self.array((keys.VEHICLES, "y"))
-        lanes, width_m = self.lanes()
-        lane = np.rint(y / np.asarray(width_m, y.dtype))
-        # An ego that has left the road is beyond the outer lanes.
-        info["lane"][:] = np.minimum(np.maximum(lane, 0.0), lanes - 1)
+    def driven(self) -> tuple[Any, ...]:
+        """What :func:`measure` reads: physics steps, the ego's y in m, and :meth:`lanes`."""
+        return self.array(keys.STEP), self.array((keys.VEHICLES, "y")), *self.lanes()
+
+
+def measure(info: Mapping[str, Any], step: Integers, y: Array, lanes: Any, width_m: Any) -> None:
+    """Write the info's time in s and the ego's lane."""
+    # Simulated time is counted in physics steps, so it has no sum of rounding errors.
+    np.multiply(step, keys.PHYSICS_STEP_S, out=info["time_s"])
+    # The road's own rounding, in the run's float type.
+    lane = np.rint(y / np.asarray(width_m, y.dtype))
+    # An ego that has left the road is beyond the outer lanes.
+    info["lane"][:] = np.minimum(np.maximum(lane, 0.0), lanes - 1)
 
 
 def observation_space(size: int, largest: float) -> Box:

@@ -91,38 +91,29 @@ class RenderConfig(DrivingConfig):
         super().__post_init__()
         kind, count = self.kind, len(self.pairs())
         path = Path(self.out or "")
-        is_film = kind in FILMS
         endings = CHARTS if self.run else FILMS + PAGES
-        # Whether something is wrong, and the sentence about it.
-        checks = [
-            (
-                path.name and (path.is_dir() or not os.access(path.parent, os.W_OK)),
+        if path.name and (path.is_dir() or not os.access(path.parent, os.W_OK)):
+            raise UserError(
                 f"out={path}: expected a file in a folder that exists and can be written to; make "
-                "it first.",
-            ),
-            (
-                kind not in endings,
+                "it first."
+            )
+        if kind not in endings:
+            raise UserError(
                 f"out={path}: the ending is {kind}, expected one of {', '.join(endings)}; choose "
-                "one of these.",
-            ),
-            (
-                is_film and count > 1,
+                "one of these."
+            )
+        if kind in FILMS and count > 1:
+            raise UserError(
                 f"out={path}: a film shows one episode, not {count}; for several give a file "
-                "that ends in .html.",
-            ),
-            (
-                count > MOST_EPISODES,
-                f"agents x episodes: {count} episodes; choose at most {MOST_EPISODES}.",
-            ),
-            (
-                kind == "mp4" and find_spec("imageio_ffmpeg") is None,
+                "that ends in .html."
+            )
+        if count > MOST_EPISODES:
+            raise UserError(f"agents x episodes: {count} episodes; choose at most {MOST_EPISODES}.")
+        if kind == "mp4" and find_spec("imageio_ffmpeg") is None:
+            raise UserError(
                 f"out={path}: mp4 needs the extra 'video'; run `pip install \"ganlane[video]\"` or "
-                "choose a gif.",
-            ),
-        ]
-        for is_wrong, sentence in checks:
-            if is_wrong:
-                raise UserError(sentence)
+                "choose a gif."
+            )
 
     @property
     def kind(self) -> str:

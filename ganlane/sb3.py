@@ -129,10 +129,8 @@ class HighwayVecEnv(VecEnv):
     def _final_info(self, row: int, info: dict[str, Any]) -> dict[str, Any]:
         """What an ended row reports: gymnasium's info but for the terms of the reward."""
         # Whatever is nested, the terms of the reward, is left out.
-        final = {}
-        for name, values in info["final_info"].items():
-            if not isinstance(values, dict):
-                final[name] = values[row]
+        arrays = info["final_info"].items()
+        final = {name: array[row] for name, array in arrays if not isinstance(array, dict)}
         final["terminal_observation"] = info["final_obs"][row]
         final["episode"] = {
             "r": float(self._return[row]),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from copy import deepcopy
@@ -147,7 +146,8 @@ def _write(storage: Any, episodes: Iterator[EpisodeBuffer], count: int) -> dict[
     """Write the episodes in the order of their numbers, as Minari wants; what they were like."""
     waiting: dict[int | None, EpisodeBuffer] = {}
     written, decisions, total, ends = 0, 0, 0.0, Counter[str]()
-    for episode in tqdm(episodes, total=count, unit="episode", disable=not sys.stderr.isatty()):
+    # Without a terminal there is no bar.
+    for episode in tqdm(episodes, total=count, unit="episode", disable=None):
         decisions += len(episode)
         total += float(sum(episode.rewards))
         ends.update(event for event in END_EVENTS if episode.infos[event][-1])

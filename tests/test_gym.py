@@ -15,7 +15,7 @@ from reference.refusals import user_error
 
 from ganlane.build import make_traffic
 from ganlane.gym import ENV_IDS
-from ganlane.native.drivers import NETWORKS, drivers_of
+from ganlane.native.drivers import NetworkDrivers, drivers_of
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.episode import Stream
 from ganlane.settings.record import make as make_record
@@ -160,7 +160,7 @@ def test_option_and_module_give_one_answer_to_who_drives(traffic):
     of_module = make_traffic(config, env).native_drivers()
     of_option = drivers_of(config, env.idm, env.mobil, Stream.TRAIN)
     assert type(of_module) is type(of_option)
-    if isinstance(of_option, NETWORKS):
+    if isinstance(of_option, NetworkDrivers):
         for name, weights in of_option.weights.items():
             np.testing.assert_array_equal(weights, of_module.weights[name])
         of_module, of_option = (replace(drivers, weights={}) for drivers in (of_module, of_option))

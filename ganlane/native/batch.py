@@ -46,17 +46,12 @@ _ROW_ARRAYS: dict[Key, str] = {
 # What a function of the kernel reads, in the order of its structure in C++. The ego perceives all
 # vehicles as they are: of what it sees and of what there is the view reads the same arrays.
 _VIEWS = (
-    *within(keys.VEHICLES, "speed desired_speed length y x y speed valid"),
+    *within(keys.VEHICLES, f"{settings.VIEWED_EGO} {settings.VIEWED}"),
     *within(keys.EGO, "change_progress change_direction"),
     *within(keys.VEHICLES, "x heading"),
     settings.SET_SPEED,
 )
-_MASKS = (
-    *within(
-        keys.VEHICLES, "x y heading speed length width desired_speed target_lane visibility valid"
-    ),
-    (keys.EGO, "change_direction"),
-)
+_MASKS = (*within(keys.VEHICLES, settings.MASKED), (keys.EGO, "change_direction"))
 
 
 class _Batch(settings.Structure):

@@ -172,23 +172,40 @@ class RuleDrivers:
 
 
 @dataclass(frozen=True)
-class GeneratedDrivers:
+class NetworkDrivers:
+    """Drivers by a network.
+
+    Attributes:
+        idm: the ego's; also of a guard's bounds and of a gap check.
+        sizes, weights: of the network, by the names of its ``state_dict``.
+        stream: family of episodes that the random numbers belong to.
+        blind_share: of the episodes: nobody sees the ego.
+    """
+
+    idm: IdmParameters
+    sizes: Any
+    weights: Weights = field(repr=False)
+    stream: int
+    blind_share: float = field(default=0.0, kw_only=True)
+
+    #: Of the ego: the others do not steer.
+    steering: ClassVar[SteeringParameters] = SteeringParameters()
+    #: When others see a lane change.
+    visibility: ClassVar[Visibility] = Visibility.BODY
+
+
+@dataclass(frozen=True)
+class GeneratedDrivers(NetworkDrivers):
     """Drivers by a generator: ``gan``, or with an ``anchor`` ``gan_calibrated``.
 
     Attributes:
-        idm: of the guard's bounds and of the gap check; the ego's own.
-        sizes, weights: of the network, by the names of its ``state_dict``.
-        stream: family of episodes that the random numbers belong to.
         noise_scale, noise_period_s: of the latent vectors.
         sudden, changes, guard: of the paper's; without a guard vehicles leave the road.
         anchor, checked_changes, headways_s: of the calibrated ones; headways are the 5, 25, 50, 75
             and 95 % quantiles.
     """
 
-    idm: IdmParameters
     sizes: GeneratorSizes
-    weights: Weights = field(repr=False)
-    stream: int
     noise_scale: float
     noise_period_s: float
     sudden: SuddenAccelerations = SuddenAccelerations()
@@ -197,12 +214,6 @@ class GeneratedDrivers:
     anchor: AnchorParameters | None = None
     checked_changes: CalibratedChanges = CalibratedChanges()
     headways_s: tuple[float, ...] = (0.0,) * len(QUANTILE_LEVELS)
-    blind_share: float = 0.0
-
-    #: Of the ego: the others do not steer.
-    steering: ClassVar[SteeringParameters] = SteeringParameters()
-    #: When others see a lane change.
-    visibility: ClassVar[Visibility] = Visibility.BODY
 
     @property
     def mobil(self) -> MobilParameters:
@@ -238,26 +249,15 @@ class GeneratedDrivers:
 
 
 @dataclass(frozen=True)
-class HumanDrivers:
+class HumanDrivers(NetworkDrivers):
     """Drivers by a policy of ``human``.
 
     Attributes:
-        idm: the ego's.
-        sizes, weights: of the policy, by the names of its ``state_dict``.
-        stream: family of episodes that the random numbers belong to.
         variation: how they differ from the fitted ones.
-        blind_share: of the episodes: nobody sees the ego.
     """
 
-    idm: IdmParameters
     sizes: HumanSizes
-    weights: Weights = field(repr=False)
-    stream: int
     variation: HumanVariation
-    blind_share: float = 0.0
-
-    steering: ClassVar[SteeringParameters] = SteeringParameters()
-    visibility: ClassVar[Visibility] = Visibility.BODY
     #: Their lane changes are their own.
     mobil: ClassVar[None] = None
 
@@ -279,8 +279,6 @@ class HumanDrivers:
 
 #: Drivers of one kind.
 OneKind = RuleDrivers | GeneratedDrivers | HumanDrivers
-#: Those by a network.
-NETWORKS: Final = (GeneratedDrivers, HumanDrivers)
 
 
 @dataclass(frozen=True)
@@ -337,7 +335,7 @@ def parts_of(drivers: Drivers) -> list[Part]:
 
 def rows_per_thread(drivers: OneKind) -> int:
     """Rows from which on a further thread pays."""
-    return BLOCK if isinstance(drivers, NETWORKS) else ROWS_PER_THREAD
+    return BLOCK if isinstance(drivers, NetworkDrivers) else ROWS_PER_THREAD
 
 
 def turns_of(drivers: Drivers) -> tuple[int, ...]:
@@ -347,7 +345,7 @@ def turns_of(drivers: Drivers) -> tuple[int, ...]:
 
 def by_network(drivers: Drivers) -> bool:
     """Whether a network moves some of them."""
-    return any(isinstance(part.drivers, NETWORKS) for part in parts_of(drivers))
+    return any(isinstance(part.drivers, NetworkDrivers) for part in parts_of(drivers))
 
 
 def mixed_drivers(parts: Mapping[str, Drivers | None], shares: Mapping[str, int]) -> Drivers | None:

@@ -121,6 +121,11 @@ OUTPUTS: Final = (
 )
 #: Fields of ``vehicles`` that no decision changes: the start of an episode sets them.
 SCENE: Final = within(keys.VEHICLES, "length width desired_speed visibility valid")
+#: What the mask reads of the vehicles, and the view of the ego and of whom it sees; in the order of
+#: mask.cpp and observation.cpp.
+MASKED: Final = "x y heading speed length width desired_speed target_lane visibility valid"
+VIEWED_EGO: Final = "speed desired_speed length y"
+VIEWED: Final = "x y speed valid"
 #: What the start of an episode reads, and what it writes besides the outputs of a decision.
 STARTS: Final = (keys.SEED, keys.EPISODE, "fresh", *SCENE, "recycles")
 

@@ -338,10 +338,11 @@ class LaneView(_Function):
         """
         v = vehicles
         # In the order of observation.cpp: the ego as it is, the others as they are seen.
-        inputs = [v.speed, v.desired_speed, v.length, v.y, seen.x, seen.y, seen.speed, seen.valid]
-        inputs += [progress, direction, v.x, v.heading]
+        inputs = [getattr(v, name) for name in settings.VIEWED_EGO.split()]
+        inputs += [getattr(seen, name) for name in settings.VIEWED.split()]
+        inputs += [progress, direction, v.x, v.heading, None]
         out = torch.empty((len(v.x), self.size), dtype=torch.float32)
-        self.run(len(out), [*inputs, None], [out])
+        self.run(len(out), inputs, [out])
         return out
 
 
@@ -370,12 +371,9 @@ class SafeActions(_Function):
         ``seen`` are the vehicles as the ego perceives them, ``direction`` [N] that of its current
         lane change.
         """
-        v = seen
-        rows = len(v.x)
-        # In the order of the structure in C++.
-        inputs = [v.x, v.y, v.heading, v.speed, v.length, v.width, v.desired_speed]
-        inputs += [v.target_lane, v.visibility, v.valid, direction]
+        rows = len(seen.x)
+        inputs = [getattr(seen, name) for name in settings.MASKED.split()]
         mask = torch.empty(rows, 3, dtype=torch.bool)
         none = torch.empty(rows, dtype=torch.bool)
-        self.run(rows, inputs, [mask, none])
+        self.run(rows, [*inputs, direction], [mask, none])
         return mask, none

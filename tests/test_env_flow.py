@@ -6,15 +6,16 @@ import pytest
 import torch
 from reference.worlds import environment, placed, same_bits, step, vehicles
 
+import ganlane
 from ganlane import keys
-from ganlane.build import make_env, make_traffic
+from ganlane.build import make_highways
+from ganlane.env import HighwayEnv
 from ganlane.errors import ParameterError, UserError
 from ganlane.gym.native_rows import native_rows
-from ganlane.settings.commands import HighwayConfig
+from ganlane.settings.commands import highways
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
 from ganlane.settings.road import EXIT, FlowParameters, LaneStretch
-from ganlane.settings.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.sim.flow import let_in_and_out
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.state import Road, Vehicles
@@ -122,15 +123,17 @@ def test_as_many_leave_by_the_exit_as_should_also_of_those_who_enter():
 # In scenarios
 
 
-def scenario(name: str, kernel: str = "native", **flow: float) -> EnvConfig:
+def scenario(
+    name: str, traffic: str, rows: int, kernel: str = "native", **flow: float
+) -> HighwayEnv:
     """With a goal and a time limit far away."""
-    changes = {"kernel": kernel, "goal_m": 1e5, "timeout_s": 1e4, "flow": flow}
-    return make(EnvConfig, {"name": name, **changes})
+    far = {"goal_m": 1e5, "timeout_s": 1e4}
+    return ganlane.make_env(traffic, rows, env=name, kernel=kernel, flow=flow, **far).base_env
 
 
 def test_most_of_those_who_are_to_leave_by_the_exit_do_and_few_others():
-    config = scenario("weave", vph=700.0, ramp_vph=500.0, exit_share=0.3, slots=40)
-    env = make_env(make_traffic(IdmMobilTrafficConfig(), config), config, num_envs=16).base_env
+    flow = {"vph": 700.0, "ramp_vph": 500.0, "exit_share": 0.3, "slots": 40}
+    env = scenario("weave", "idm_mobil", 16, **flow)
     exits = torch.tensor(env.road.flow.exits(env.vehicles))
     td = env.reset()
     # Nobody meets the ego, and it ends nothing.
@@ -150,15 +153,14 @@ def test_most_of_those_who_are_to_leave_by_the_exit_do_and_few_others():
     assert left[True].sum() > 100
 
 
-@pytest.mark.parametrize("name", ["merge", "weave"])
-def test_gymnasium_drives_them_like_torchrl(name):
+@pytest.mark.parametrize(("name", "exit_share"), [("merge", 0.0), ("weave", 0.3)])
+def test_gymnasium_drives_them_like_torchrl(name, exit_share):
     """Bit for bit, through the starts of further episodes."""
-    share = 0.3 if name in ("weave", "exit") else 0.0
-    flow = {"vph": 1200.0, "ramp_vph": 600.0, "exit_share": share, "slots": 20}
-    config = make(EnvConfig, {"name": name, "kernel": "native", "timeout_s": 20.0, "flow": flow})
-    rows = native_rows(HighwayConfig(env=config, traffic=IdmMobilTrafficConfig(), num_envs=5))
+    flow = {"vph": 1200.0, "ramp_vph": 600.0, "exit_share": exit_share, "slots": 20}
+    config = highways(env=name, kernel="native", timeout_s=20.0, flow=flow, num_envs=5)
+    rows = native_rows(config)
     assert rows is not None
-    env = make_env(make_traffic(IdmMobilTrafficConfig(), config), config, num_envs=5)
+    env = make_highways(config)
     td = env.reset()
     rows.start(0, td[keys.EPISODE].numpy())
     for _ in range(25):
@@ -175,13 +177,12 @@ def test_gymnasium_drives_them_like_torchrl(name):
 
 def test_a_recorder_sees_the_steps_of_the_tensor_code():
     def seen(kernel: str) -> list[Vehicles]:
-        config = scenario("on_ramp", kernel, vph=1500.0, ramp_vph=600.0)
-        env = make_env(make_traffic(IdmTrafficConfig(), config), config, num_envs=3)
+        env = scenario("on_ramp", "idm", 3, kernel, vph=1500.0, ramp_vph=600.0)
         frames = []
-        env.base_env.recorder = lambda cars, running: frames.append(cars)
+        env.recorder = lambda cars, running: frames.append(cars)
         td = env.reset()
         for _ in range(8):
-            td = env.step(td.set("action", torch.zeros(3, dtype=torch.int64)))["next"]
+            td = step(env, td)
         return frames
 
     frames = list(zip(seen("native"), seen("torch")))
@@ -241,12 +242,11 @@ def test_a_flow_on_a_road_without_ends_is_refused():
 
 
 def test_without_a_flow_a_scenario_is_what_it_was():
-    plain = make(EnvConfig, "merge")
-    off = make(EnvConfig, {"name": "merge", "flow": {"slots": 5, "to_m": 900.0}})
+    plain, off = (
+        ganlane.make_env("idm", 4, env="merge", flow=flow).base_env
+        for flow in ({}, {"slots": 5, "to_m": 900.0})
+    )
     assert off.vehicles == plain.vehicles == 21
-    both = []
-    for config in (plain, off):
-        env = make_env(make_traffic(IdmTrafficConfig(), config), config, num_envs=4)
-        both.append(env.step(env.reset().set("action", torch.zeros(4, dtype=torch.int64)))["next"])
-    assert same_bits(*both) == []
-    assert both[0][keys.VEHICLES, "valid"].all()
+    after = step(plain, plain.reset())
+    assert same_bits(after, step(off, off.reset())) == []
+    assert after[keys.VEHICLES, "valid"].all()

@@ -6,8 +6,9 @@ import torch
 from tensordict import TensorDict
 
 from ganlane import keys
+from ganlane.env import HighwayEnv
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.state import Vehicles
+from ganlane.sim.state import Road, Vehicles, lateral_half_extent
 
 
 def start(env, episodes, seed=0):
@@ -44,6 +45,26 @@ def drive(env, episodes, decisions, command=lambda decision, episode: 0):
             break
     env.recorder = None
     return Vehicles(*(torch.stack(fields) for fields in zip(*steps))), torch.stack(running), state
+
+
+def others_of(traffic, rows, decisions, vehicles=9, kernel="torch"):
+    """The others [T + 1, N, M - 1] after every physics step beside a keep-lane ego, and the last
+    state.
+    """
+    env = HighwayEnv(traffic, rows, vehicles, kernel=kernel)
+    film, _, state = drive(env, range(rows), decisions)
+    return Vehicles(*(field[..., 1:] for field in film)), state
+
+
+def beyond_the_edge(vehicles):
+    """How far the outermost body reaches past the edge of a road of three lanes, m; negative
+    inside.
+    """
+    road = Road()
+    half = lateral_half_extent(vehicles)
+    left = vehicles.y + half - road.left_edge_m()
+    right = road.right_edge_m() - (vehicles.y - half)
+    return torch.maximum(left, right).max().item()
 
 
 def overlaps(vehicles):

@@ -6,12 +6,10 @@ import math
 
 import pytest
 import torch
-from reference.foreign import drive
-from tensordict import TensorDict
+from reference.foreign import beyond_the_edge, others_of, overlaps
 
 from ganlane.env import EpisodeParameters, HighwayEnv
-from ganlane.sim import Road, Vehicles, pair_overlaps
-from ganlane.sim.state import lateral_half_extent
+from ganlane.sim import Vehicles, pair_overlaps
 from ganlane.traffic import (
     AccelerationOverlay,
     CalibratedLaneChange,
@@ -40,17 +38,10 @@ class Drift(TrafficModule):
         return vehicles.with_(x=vehicles.x + speed * self.dt, y=y, speed=speed), memory
 
 
-def run(n, m, seconds, base, **overlays):
-    """The others [T + 1, N, M - 1] after every physics step beside a keep-lane ego, and the last
-    state.
-    """
-    env = HighwayEnv(TrafficSequential({"base": base, **overlays}), num_envs=n, vehicles=m)
-    all_vehicles, _, state = drive(env, range(n), seconds)
-    return Vehicles(*(field[..., 1:] for field in all_vehicles)), state
-
-
-def changes_started(others):
-    return (others.target_lane.diff(dim=0) != 0).sum().item()
+def run(rows, vehicles, seconds, base, **overlays):
+    """What :func:`reference.foreign.others_of` says of a chain."""
+    traffic = TrafficSequential({"base": base, **overlays})
+    return others_of(traffic, rows, seconds, vehicles)
 
 
 def test_the_mean_wait_of_equation_10_is_the_root_of_half_pi_t_m_and_not_t_m():
@@ -83,8 +74,8 @@ def test_literal_changes_end_on_a_lane_centre_at_their_own_lateral_speed_and_res
 
 def test_calibrated_changes_find_gaps_and_touch_nobody():
     others, _ = run(64, 12, 15, IdmTraffic(), change=CalibratedLaneChange())
-    assert changes_started(others) > 50
-    assert not any(pair_overlaps(Vehicles(*at)).any() for at in zip(*others))
+    assert (others.target_lane.diff(dim=0) != 0).sum() > 50
+    assert overlaps(others) == 0
 
 
 def test_sudden_accelerations_fill_a_third_of_the_time_with_the_spread_of_the_data():
@@ -92,15 +83,14 @@ def test_sudden_accelerations_fill_a_third_of_the_time_with_the_spread_of_the_da
     overlay = AccelerationOverlay(
         sudden=SuddenAccelerations(every_s=2.0, lasts_s=1.0, mean=0.0, sd=0.8)
     )
-    vehicles = HighwayEnv(IdmTraffic(), num_envs=200).reset()["vehicles"].clone()
-    vehicles["speed"][:] = 20.0
-    view = TensorDict({"vehicles": vehicles, "moved": vehicles.clone()}, [200])
-    view["seed"], view["episode"] = (torch.zeros(200, dtype=torch.int64), torch.arange(200))
-    view["traffic"] = overlay.init_memory(Vehicles.of(vehicles), view["episode"])
+    state = HighwayEnv(IdmTraffic(), num_envs=200).reset()
+    state["vehicles", "speed"][:] = 20.0
+    state["traffic"] = overlay.init_memory(Vehicles.of(state["vehicles"]), state["episode"])
     record = []
     for step in range(300):
-        view["step"], view["moved"] = (torch.full((200,), step), vehicles.clone())
-        record.append(overlay(view)["moved", "acceleration"])
+        state["step"] = torch.full((200,), step)
+        state["moved"] = state["vehicles"].clone()
+        record.append(overlay(state)["moved", "acceleration"])
     acceleration = torch.stack(record)
     active = acceleration.abs() > 1e-4
     assert active.float().mean().item() == pytest.approx(1 / 3, abs=0.02)
@@ -110,13 +100,8 @@ def test_sudden_accelerations_fill_a_third_of_the_time_with_the_spread_of_the_da
 
 
 def test_the_guard_keeps_a_drifting_network_on_the_road_and_at_a_speed_people_drive():
-    road = Road()
-    others, state = run(32, 9, 20, Drift(road), guard=Guard(road))
-    half = lateral_half_extent(others)
-    outside = torch.maximum(
-        others.y + half - road.left_edge_m(), road.right_edge_m() - (others.y - half)
-    )
-    assert outside[1:].max() <= 1e-4
+    others, state = run(32, 9, 20, Drift(), guard=Guard())
+    assert beyond_the_edge(others) <= 1e-4
     vehicles = state["vehicles"]
     assert (vehicles["speed"] <= vehicles["desired_speed"] + 0.1).all()
     assert pair_overlaps(Vehicles.of(vehicles)).sum() == 0

@@ -7,47 +7,23 @@ from dataclasses import replace
 
 import pytest
 import torch
-from reference.foreign import drive, start
+from reference.foreign import beyond_the_edge, drive, others_of, overlaps, start
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.generator import shipped_generator
 from ganlane.native.drivers import SIMULATED_ANCHOR
-from ganlane.sim import Road, Vehicles, pair_overlaps
-from ganlane.sim.state import lateral_half_extent
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
 from ganlane.weights import load_weights, save_weights
 
 
-def others_of(traffic, n, decisions):
-    """The others [T + 1, N, M - 1] after every physics step beside a keep-lane ego."""
-    return Vehicles(
-        *(
-            field[..., 1:]
-            for field in drive(HighwayEnv(traffic, n, kernel="auto"), range(n), decisions)[0]
-        )
-    )
-
-
-def beyond_the_edge(others: Vehicles) -> float:
-    """How far the outermost body reaches past the edge of the road, m; negative inside."""
-    road = Road()
-    half = lateral_half_extent(others)
-    return (
-        torch.maximum(others.y + half - road.left_edge_m(), road.right_edge_m() - (others.y - half))
-        .max()
-        .item()
-    )
-
-
-def overlaps(others: Vehicles) -> int:
-    return sum(pair_overlaps(Vehicles(*at)).sum().item() for at in zip(*others))
-
-
 def test_with_its_guard_gan_traffic_stays_on_the_road_and_without_it_leaves_it():
-    assert beyond_the_edge(others_of(gan_traffic(), 16, 40)) <= 1e-4
-    assert beyond_the_edge(others_of(gan_traffic(guard=False), 16, 40)) > 1.0
+    guarded, without = (
+        others_of(gan_traffic(guard=guard), 16, 40, kernel="auto")[0] for guard in (True, False)
+    )
+    assert beyond_the_edge(guarded) <= 1e-4
+    assert beyond_the_edge(without) > 1.0
 
 
 @pytest.mark.slow
@@ -78,7 +54,7 @@ def test_no_vehicle_leaves_the_road_in_1000_episodes_of_gan_traffic():
 
 
 def test_calibrated_traffic_neither_overlaps_nor_leaves_the_road_nor_stands_still():
-    others = others_of(gan_calibrated_traffic(), 16, 60)
+    others, _ = others_of(gan_calibrated_traffic(), 16, 60, kernel="auto")
     assert overlaps(others) == 0
     assert beyond_the_edge(others) <= 0.0
     assert others.speed[-1].min() > 5.0
@@ -89,7 +65,7 @@ def test_calibrated_traffic_neither_overlaps_nor_leaves_the_road_nor_stands_stil
 
 @pytest.mark.slow
 def test_calibrated_traffic_changes_lanes_as_often_as_recorded_and_touches_nobody():
-    others = others_of(gan_calibrated_traffic(), 96, 200)
+    others, _ = others_of(gan_calibrated_traffic(), 96, 200, kernel="auto")
     km = others.speed[1:].sum().item() * 1e-4
     changes = (others.target_lane[1:].diff(dim=0) != 0).sum().item()
     print(f"{changes / km:.2f} changes per vehicle-km in {km:.0f} km, {overlaps(others)} overlaps")

@@ -7,6 +7,13 @@ from tensordict import TensorDict
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
+from ganlane.settings.driving import (
+    AbortFaults,
+    BrakingFaults,
+    DriverFaults,
+    HesitationFaults,
+    ReactionFaults,
+)
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.state import Road, Vehicles, lateral_half_extent
 
@@ -65,6 +72,16 @@ def beyond_the_edge(vehicles):
     left = vehicles.y + half - road.left_edge_m()
     right = road.right_edge_m() - (vehicles.y - half)
     return torch.maximum(left, right).max().item()
+
+
+def all_faults(per_hour, share):
+    """All four: so many attacks an hour, so large a share of the lane changes."""
+    return DriverFaults(
+        BrakingFaults(per_hour),
+        ReactionFaults(per_hour),
+        HesitationFaults(share),
+        AbortFaults(share),
+    )
 
 
 def overlaps(vehicles):

@@ -6,19 +6,13 @@ from __future__ import annotations
 
 import pytest
 import torch
+from reference.foreign import all_faults
 from reference.worlds import environment, placed, same_bits, step, vehicles
 from scipy.stats import binomtest
 
 from ganlane import keys
 from ganlane.build import make_env, make_traffic
 from ganlane.errors import UserError
-from ganlane.settings.driving import (
-    AbortFaults,
-    BrakingFaults,
-    DriverFaults,
-    HesitationFaults,
-    ReactionFaults,
-)
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
 from ganlane.settings.traffic import IdmTrafficConfig, MixedTrafficConfig, ReplayTrafficConfig
@@ -36,12 +30,7 @@ from ganlane.traffic.mixed import interleaved
 from ganlane.traffic.presets import gan_traffic, idm_faults_traffic, with_faults
 
 #: So many faults that a few decisions hold some.
-OFTEN = DriverFaults(
-    BrakingFaults(per_hour=600.0),
-    ReactionFaults(per_hour=600.0),
-    HesitationFaults(0.5),
-    AbortFaults(0.5),
-)
+OFTEN = all_faults(600.0, 0.5)
 RULES = {"idm": 1, "idm_mobil": 2, "idm_random": 1, "idm_faults": 1}
 MAKE = {
     "idm": IdmTraffic,

@@ -7,7 +7,7 @@ from __future__ import annotations
 import pytest
 import torch
 from reference.foreign import all_faults
-from reference.worlds import environment, placed, same_bits, step, vehicles
+from reference.worlds import environment, few_changes, placed, same_bits, step, vehicles
 from scipy.stats import binomtest
 
 from ganlane import keys
@@ -50,7 +50,7 @@ def drive(traffic: TrafficModule, rows: int, decisions: int = 6) -> list:
     td = env.reset()
     seen = []
     for _ in range(decisions):
-        td = step(env, td, (td[keys.EPISODE] + td[keys.EGO, "decisions"]) % 5 % 3)
+        td = step(env, td, few_changes(td))
         seen.append(td)
     return seen
 
@@ -109,29 +109,30 @@ def test_scenes_set_by_hand_and_faults_laid_over_a_mixture_see_it_too():
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("shares", "told"),
     [
-        (lambda: MixedTrafficConfig(shares={"replay": 1}), "replay: it plays recordings"),
-        (lambda: MixedTrafficConfig(shares={"idm_mobli": 1}), "did you mean 'idm_mobil'"),
-        (lambda: MixedTrafficConfig(shares={}), "whole numbers of at least 1"),
-        (lambda: MixedTrafficConfig(shares={"idm": 2000}), "whole numbers of at least 1"),
-        (lambda: MixedTrafficConfig(shares={"idm": 0}), "expected at least 1"),
-        (lambda: MixedTrafficConfig(shares={"idm": 0.5}), "expected a whole number"),
-        (lambda: MixedTrafficConfig(shares=3), "expected names with values"),
-        (lambda: MixedTrafficConfig(shares={"mixed": 1}), "is a mixture itself"),
-        (
-            lambda: MixedTraffic(
-                {"a": IdmTraffic(), "b": IdmTraffic(Road(lanes=2))}, {"a": 1, "b": 1}
-            ),
-            "different roads or streams",
-        ),
-        (lambda: ReplayTrafficConfig(blind_share=0.5), "no ego anyway"),
-        (lambda: IdmTrafficConfig(blind_share=-1.0), r"blind_share=-1"),
+        ({"replay": 1}, "replay: it plays recordings"),
+        ({"idm_mobli": 1}, "did you mean 'idm_mobil'"),
+        ({}, "whole numbers of at least 1"),
+        ({"idm": 2000}, "whole numbers of at least 1"),
+        ({"idm": 0}, "expected at least 1"),
+        ({"idm": 0.5}, "expected a whole number"),
+        (3, "expected names with values"),
+        ({"mixed": 1}, "is a mixture itself"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_sentence(make, told):
+def test_shares_that_cannot_be_are_refused_in_one_sentence(shares, told):
     with pytest.raises(UserError, match=told):
-        make()
+        MixedTrafficConfig(shares=shares)
+
+
+def test_parts_on_different_roads_and_impossible_shares_of_blind_episodes_are_refused():
+    with pytest.raises(UserError, match="different roads or streams"):
+        MixedTraffic({"a": IdmTraffic(), "b": IdmTraffic(Road(lanes=2))}, {"a": 1, "b": 1})
+    with pytest.raises(UserError, match="no ego anyway"):
+        ReplayTrafficConfig(blind_share=0.5)
+    with pytest.raises(UserError, match="blind_share=-1"):
+        IdmTrafficConfig(blind_share=-1.0)
 
 
 def test_a_model_of_ones_own_is_mixed_by_its_import_path():

@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference.worlds import assert_same_tracks, same_bits, tracks, vehicles
+from reference.worlds import assert_same_tracks, few_changes, same_bits, tracks, vehicles
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -40,19 +40,13 @@ def world(sensors, num_envs=3, goal_m=5000.0, period_s=1.0, form="table3", seed=
     return TransformedEnv(base, Compose(*between, seen, RewardTransform(period_s)))
 
 
-def action(td):
-    """A fixed function of the episode and the decision: some lane changes, few of them legal."""
-    number = (td[keys.EPISODE] * 7 + td[keys.EGO, "decisions"] * 5) % 11
-    return torch.where(number == 1, keys.LEFT, torch.where(number == 2, keys.RIGHT, keys.KEEP))
-
-
 def drive(env, decisions, td=None):
     """The states of a run without resets, the first one included, and the rewards that led to the
     others.
     """
     states = [env.reset() if td is None else td]
     for _ in range(decisions):
-        states.append(env.step(states[-1].clone().set("action", action(states[-1])))["next"])
+        states.append(env.step(states[-1].clone().set("action", few_changes(states[-1])))["next"])
     return states
 
 
@@ -178,12 +172,12 @@ def test_a_state_without_the_delayed_measurements_is_refused():
     td = world(None).reset()
     env = world(EVERYTHING)
     with pytest.raises(UserError, match="start from a reset"):
-        env.step(td.set("action", action(td)))
+        env.step(td.set("action", few_changes(td)))
 
 
 def test_an_episode_is_seen_alike_in_any_batch_and_after_automatic_resets():
     in_32, in_5, alone = (
-        tracks(world(EVERYTHING, rows, goal_m=140.0), decisions, action)
+        tracks(world(EVERYTHING, rows, goal_m=140.0), decisions, few_changes)
         for rows, decisions in ((32, 12), (5, 20), (1, 26))
     )
     assert_same_tracks(in_5, in_32, at_least=7)

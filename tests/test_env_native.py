@@ -8,7 +8,7 @@ import pickle
 import pytest
 import torch
 from entry_own_parts import Cruise
-from reference.worlds import environment
+from reference.worlds import environment, few_changes
 from torchrl.envs import Transform
 
 import ganlane
@@ -41,11 +41,6 @@ def test_its_keys_specs_and_first_states_are_those_of_the_tensor_code():
     assert (ours.reset() == theirs.reset()).all()
     after = [set(env.rand_step(env.reset())["next"].keys(True, True)) for env in (ours, theirs)]
     assert after[0] == after[1]
-
-
-def action(state, decision):
-    """Now and then a change of lanes, in no order."""
-    return (state[keys.EPISODE] * 7 + decision * 5) % 11 % 3 * (decision % 3 == 0)
 
 
 class Threads(Transform):
@@ -128,9 +123,9 @@ def test_a_recorder_sees_every_physics_step_and_ends_where_the_decision_does(ker
     steps = []
     env.recorder = lambda vehicles, running: steps.append((vehicles, running))
     state = env.reset()
-    for decision in range(12):
+    for _ in range(12):
         steps.clear()
-        state["action"] = action(state, decision)
+        state["action"] = few_changes(state)
         stepped, following = env.step_and_maybe_reset(state)
         after = stepped["next"]
         assert (plain.step(state.clone())["next"] == after).all()
@@ -158,16 +153,6 @@ def test_an_environment_can_be_copied_and_sent_to_another_process(copied):
 NOISY = SensorParameters(position_noise_m=2.0, dropout=0.2)
 
 
-def driven(env, decisions):
-    """States of a drive with automatic resets and lane changes in a third of the rows."""
-    td = env.reset()
-    rows = torch.arange(env.batch_size[0])
-    for decision in range(decisions):
-        yield td
-        td["action"] = (rows + decision) % 20 % 3 * (rows % 3 == decision % 3)
-        td = env.step_and_maybe_reset(td)[1]
-
-
 @pytest.mark.parametrize("form", sorted(NATIVE_FORMS))
 @pytest.mark.parametrize(("abort", "sensors"), [(False, NOISY), (True, None)])
 def test_the_lane_view_and_the_safe_actions_are_those_of_the_tensor_code(form, abort, sensors):
@@ -189,12 +174,14 @@ def test_the_lane_view_and_the_safe_actions_are_those_of_the_tensor_code(form, a
     plain_mask = ActionMaskTransform(Road(), "safe", abort=abort)
     refused = 0
     hopeless = 0
-    for td in driven(env, 20):
+    td = env.reset()
+    for _ in range(20):
         expected = plain_mask(plain_view(td.clone()))
         assert torch.allclose(td[keys.OBSERVATION], expected[keys.OBSERVATION], atol=1e-6)
         for name in (keys.ACTION_MASK, keys.NO_SAFE_ACTION):
             assert torch.equal(td[name], expected[name])
         refused += int((~td[keys.ACTION_MASK]).sum())
         hopeless += int(td[keys.NO_SAFE_ACTION].sum())
+        td = env.step_and_maybe_reset(td.set("action", few_changes(td)))[1]
     assert refused > 500
     assert hopeless > 0

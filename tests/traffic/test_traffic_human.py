@@ -2,34 +2,38 @@
 
 import pytest
 import torch
+from reference.worlds import vehicles_at
 
 from ganlane import keys
 from ganlane.api import make_env
 from ganlane.errors import UserError
 from ganlane.generator import shipped_generator
 from ganlane.generator.human import STEPS
-from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.random import episode_key
 from ganlane.sim.spawn import spawn
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 from ganlane.traffic.presets import human_traffic
 
 
-def drive(episodes, steps, dtype=torch.float32, **variation):
+def course(traffic, vehicles, key, steps):
     """Vehicles and memory after every step."""
-    traffic = human_traffic(**variation)
-    episode = torch.tensor(episodes)
-    key = episode_key(traffic.stream, torch.zeros_like(episode), episode)
-    vehicles = spawn(key, 9, 3, 4.0, dtype=dtype)
     memory = traffic.fresh_memory(vehicles, key)
-    course = []
     for step in range(steps):
-        now = torch.full_like(episode, step)
-        vehicles, memory = traffic.move(vehicles, memory, key, now)
-        course.append((vehicles, memory))
-    return course
+        vehicles, memory = traffic.move(vehicles, memory, key, torch.full_like(key, step))
+        yield vehicles, memory
+
+
+def keys_of(traffic, episodes):
+    episode = torch.tensor(episodes)
+    return episode_key(traffic.stream, torch.zeros_like(episode), episode)
+
+
+def drive(episodes, steps, dtype=torch.float32, **variation):
+    traffic = human_traffic(**variation)
+    key = keys_of(traffic, episodes)
+    return list(course(traffic, spawn(key, 9, 3, 4.0, dtype=dtype), key, steps))
 
 
 def test_a_decision_holds_for_four_steps():
@@ -51,7 +55,7 @@ def test_an_episode_is_the_same_among_others_and_in_rows_that_decide_at_other_ti
         assert torch.equal(many.target_lane[1], one.target_lane[0])
     traffic = human_traffic()
     vehicles, memory = together[1]
-    key = episode_key(traffic.stream, torch.zeros(3, dtype=torch.int64), torch.arange(3))
+    key = keys_of(traffic, [0, 1, 2])
     # Rows at steps 2, 4 and 5: one of them decides.
     _, after = traffic.move(vehicles, memory, key, torch.tensor([2, 4, 5]))
     same = [torch.equal(after["age"][row], memory["age"][row]) for row in range(3)]
@@ -96,41 +100,26 @@ def test_who_is_behind_counts_the_less_the_less_polite_a_driver_is():
     )
 
 
-def on_a_ring(traffic, vehicles, seconds):
-    """Where the vehicles are after so many seconds on the traffic's road."""
-    rows = len(vehicles.x)
-    key = episode_key(traffic.stream, torch.zeros(rows, dtype=torch.int64), torch.arange(rows))
-    memory = traffic.fresh_memory(vehicles, key)
-    for step in range(round(seconds / PHYSICS_STEP_S)):
-        vehicles, memory = traffic.move(vehicles, memory, key, torch.full((rows,), step))
-    return vehicles
-
-
 @pytest.mark.slow
 def test_a_stop_and_go_wave_forms_on_a_ring_where_idm_drivers_flow_on():
     """22 cars on a ring, as in Sugiyama et al. 2008, here of 400 m."""
     road = Road(1, 4.0, ring_m=400.0)
     rows, cars = 4, 22
-    zero = torch.zeros(rows, cars)
     noise = 0.3 * torch.randn(rows, cars, generator=torch.Generator().manual_seed(0))
-    even = Vehicles(
-        x=torch.arange(cars) * road.ring_m / cars + noise,
-        y=zero,
-        heading=zero,
-        speed=zero + 5.0,
-        acceleration=zero,
-        length=zero + 4.5,
-        width=zero + 1.8,
-        desired_speed=zero + 15.0,
-        target_lane=zero.long(),
-        visibility=zero.long(),
-        valid=zero == 0.0,
+    even = vehicles_at(
+        torch.arange(cars) * road.ring_m / cars + noise,
+        torch.zeros(rows, cars, dtype=torch.int64),
+        speed=torch.full((rows, cars), 5.0),
+        width=torch.full((rows, cars), 1.8),
+        desired_speed=torch.full((rows, cars), 15.0),
     )
-    wave = on_a_ring(human_traffic(road), even, 100.0)
+    wave, flow = (
+        list(course(traffic, even, keys_of(traffic, range(rows)), 1000))[-1][0]
+        for traffic in (human_traffic(road), IdmTraffic(road))
+    )
     # Somebody nearly stands while others go on.
     assert wave.speed.min(1).values.mean() < 1.0
     assert wave.speed.max(1).values.mean() > 7.0
-    flow = on_a_ring(IdmTraffic(road), even, 100.0)
     assert flow.speed.std(1).mean() < 0.1 * wave.speed.std(1).mean()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from reference import scalar
 from reference.worlds import environment, random_scenes, vehicles
 from tensordict import TensorDict
 from torchrl.envs import ActionMask, Compose, TransformedEnv
@@ -16,7 +17,6 @@ from ganlane.build import make_driver
 from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MaskParameters
-from ganlane.sim.idm import TABLE_V
 from ganlane.sim.state import Road, Vehicles
 from ganlane.transforms import ActionMaskTransform
 
@@ -29,17 +29,6 @@ def allowed(*cars, form="safe", direction=0, lanes=3, abort=False, limit=4.0):
     transform = ActionMaskTransform(Road(lanes=lanes), form, limit, abort=abort)
     mask, none = transform.allowed(vehicles(*cars), torch.tensor([direction]), Road(lanes=lanes))
     return mask[0].tolist(), bool(none[0])
-
-
-def idm(speed, desired, gap, leader_speed):
-    """IDM by hand (Table V), m/s2."""
-    t = TABLE_V
-    root = 2.0 * (t.max_acceleration * t.comfortable_deceleration) ** 0.5
-    wanted = t.min_gap_m + max(0.0, speed * t.headway_s + speed * (speed - leader_speed) / root)
-    return max(
-        t.min_acceleration,
-        t.max_acceleration * (1.0 - (speed / desired) ** 4 - (wanted / gap) ** 2),
-    )
 
 
 # --- what is allowed
@@ -91,14 +80,14 @@ def test_turning_back_must_be_safe_too():
         (
             (0, 15.0),
             {"x": -60.0, "lane": 1, "speed": 24.0},
-            -idm(24.0, 25.0, 60.0 - 4.5, 15.0),
+            -scalar.idm(24.0, 25.0, 60.0 - 4.5, 15.0),
             LEFT_ONLY,
             KEEP_ONLY,
         ),
         (
             (1, 25.0),
             {"x": 65.0, "lane": 2, "speed": 15.0},
-            -idm(25.0, 25.0, 65.0 - 4.5, 15.0),
+            -scalar.idm(25.0, 25.0, 65.0 - 4.5, 15.0),
             ALL,
             RIGHT_ONLY,
         ),

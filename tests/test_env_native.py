@@ -13,15 +13,12 @@ from torchrl.envs import Transform
 
 import ganlane
 from ganlane import keys
-from ganlane.build import make_env
 from ganlane.env.highway import say_once
 from ganlane.errors import UserError
 from ganlane.native.library import ROWS_PER_THREAD, threads_allowed
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.runtime import kernel_threads
-from ganlane.settings.driving import EgoParameters, IdmParameters
-from ganlane.settings.env import EnvConfig
-from ganlane.settings.observation import MaskParameters, ObservationConfig, SensorParameters
+from ganlane.settings.driving import IdmParameters
 from ganlane.sim.state import Road
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 from ganlane.transforms import ActionMaskTransform, ObservationTransform
@@ -140,17 +137,12 @@ def test_a_recorder_sees_every_physics_step_and_ends_where_the_decision_does(ker
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 def test_an_environment_can_be_copied_and_sent_to_another_process(copied):
-    env = make_env(
-        IdmMobilTraffic(Road()),
-        EnvConfig(kernel="native"),
-        ObservationConfig(form="lane_view"),
-        num_envs=4,
-    )
+    env = ganlane.make_env("idm_mobil", 4, kernel="native", observation="lane_view")
     td = env.rand_action(env.reset())
     assert (copied(env).step(td.clone())["next"] == env.step(td)["next"]).all()
 
 
-NOISY = SensorParameters(position_noise_m=2.0, dropout=0.2)
+NOISY = {"position_noise_m": 2.0, "dropout": 0.2}
 
 
 @pytest.mark.parametrize("form", sorted(NATIVE_FORMS))
@@ -160,16 +152,17 @@ def test_the_lane_view_and_the_safe_actions_are_those_of_the_tensor_code(form, a
 
     With lorries, and with what the sensors deliver.
     """
-    config = EnvConfig(
+    env = ganlane.make_env(
+        "idm_mobil",
+        64,
+        observation={"name": form, "sensors": sensors},
+        mask="safe",
         kernel="native",
         vehicles=20,
         spread_m=200.0,
         truck_share=0.3,
-        ego=EgoParameters(abort_lane_change=abort),
+        ego={"abort_lane_change": abort},
     )
-    view = ObservationConfig(form=form, sensors=sensors)
-    mask = MaskParameters(form="safe")
-    env = make_env(IdmMobilTraffic(Road()), config, view, num_envs=64, mask=mask)
     plain_view = ObservationTransform(Road(), 20, form)
     plain_mask = ActionMaskTransform(Road(), "safe", abort=abort)
     refused = 0

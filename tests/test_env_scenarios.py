@@ -11,19 +11,18 @@ import pytest
 import torch
 from reference.foreign import overlaps
 
+import ganlane
 from ganlane import keys
-from ganlane.build import make_driver, make_env, make_traffic
+from ganlane.build import make_driver
 from ganlane.config.run import settings
 from ganlane.env import HighwayEnv
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
-from ganlane.settings.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.sim.scenes import FixedScene, SceneVehicle
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import IdmTraffic
 
 ROWS = 6
-TRAFFICS = {"idm": IdmTrafficConfig(), "idm_mobil": IdmMobilTrafficConfig()}
 
 
 def drive(scene: str | EnvConfig, driver: str, traffic: str, seconds: int) -> Vehicles:
@@ -32,7 +31,7 @@ def drive(scene: str | EnvConfig, driver: str, traffic: str, seconds: int) -> Ve
     """
     config = make(EnvConfig, scene) if isinstance(scene, str) else scene
     config = replace(config, goal_m=1e5)
-    env = make_env(make_traffic(TRAFFICS[traffic], config), config, num_envs=ROWS)
+    env = ganlane.make_env(traffic, ROWS, env=config)
     policy = make_driver(driver, config).policy
     frames: list[Vehicles] = []
     env.base_env.recorder = lambda vehicles, running: frames.append(vehicles)
@@ -150,7 +149,7 @@ def test_a_file_gives_vehicles_lanes_and_the_egos_desired_speed(tmp_path):
         4.0,
         30.0,
     )
-    td = make_env(make_traffic(TRAFFICS["idm"], config), config, num_envs=2).reset()
+    td = ganlane.make_env("idm", 2, env=config).reset()
     assert td[keys.VEHICLES, "x"].tolist() == [[0.0, 55.0]] * 2
     wider = settings("evaluate", ["env=scene", f"env.scene.path={path}", "env.lanes=4"]).env
     assert wider.lanes == 4

@@ -10,11 +10,11 @@ from reference.foreign import all_faults
 from reference.worlds import environment, few_changes, placed, same_bits, step, vehicles
 from scipy.stats import binomtest
 
+import ganlane
 from ganlane import keys
-from ganlane.build import make_env, make_traffic
+from ganlane.build import make_traffic
 from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig
-from ganlane.settings.record import make
 from ganlane.settings.traffic import IdmTrafficConfig, MixedTrafficConfig, ReplayTrafficConfig
 from ganlane.sim import Road, Vehicles
 from ganlane.traffic import (
@@ -101,9 +101,9 @@ def test_the_generator_drives_its_rows_as_it_does_alone_to_rounding():
 
 
 def test_scenes_set_by_hand_and_faults_laid_over_a_mixture_see_it_too():
-    scene = make(EnvConfig, "cut_in")
-    traffic = make_traffic(MixedTrafficConfig(shares={"gan": 1, "idm": 1}), scene)
-    assert (make_env(traffic, scene, num_envs=4).reset()[keys.VEHICLES, "visibility"] >= 0).all()
+    halves = {"name": "mixed", "shares": {"gan": 1, "idm": 1}}
+    start = ganlane.make_env(halves, 4, env="cut_in").reset()
+    assert (start[keys.VEHICLES, "visibility"] >= 0).all()
     chain = drive(with_faults(mixture(idm=1, gan=1)), 4, 2)[-1]
     assert chain[keys.VEHICLES, "visibility"][:, 1].tolist() == [2, 1, 2, 1]
 

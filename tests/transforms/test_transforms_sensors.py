@@ -14,12 +14,9 @@ from torchrl.envs.utils import check_env_specs
 
 import ganlane
 from ganlane import keys
-from ganlane.build import make_env, make_traffic
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
-from ganlane.settings.env import EnvConfig
-from ganlane.settings.observation import ObservationConfig, SensorParameters
-from ganlane.settings.traffic import IdmTrafficConfig
+from ganlane.settings.observation import SensorParameters
 from ganlane.sim import Vehicles
 from ganlane.sim.random import Stream, episode_key
 from ganlane.traffic import IdmMobilTraffic
@@ -196,9 +193,7 @@ LATE = SensorParameters(delay_s=1.0, dropout=0.1)
     ("sensors", "first"), [(None, []), (SensorParameters(), []), (LATE, ["SensorTransform"])]
 )
 def test_a_transform_with_the_traffics_stream_is_inserted_where_there_are_errors(sensors, first):
-    road = EnvConfig()
-    traffic = make_traffic(IdmTrafficConfig(), road, Stream.REPORT)
-    env = make_env(traffic, road, ObservationConfig(sensors=sensors), num_envs=2)
+    env = ganlane.make_env("idm", 2, stream="report", observation={"sensors": sensors})
     names = [type(transform).__name__ for transform in env.transform.transforms]
     assert names == [*first, "ObservationTransform", "RewardTransform"]
     if first:

@@ -122,11 +122,6 @@ def _mean_and_failures(row: Row) -> str:
     return f"({row['mean_reward']:.1f}); {row['hard_crash']}, {row['out_of_road']}"
 
 
-def _drivers(results: Results, among: Sequence[str]) -> list[str]:
-    there = {row["driver"] for row in results["rows"]}
-    return [driver for driver in among if driver in there]
-
-
 def _by_traffic(results: Results, first: str, lines: Sequence[Sequence[str]]) -> str:
     """Lines of a name and a cell for every traffic."""
     headings = [first, *(f"`{traffic}`" for traffic in _traffics(results))]
@@ -135,7 +130,7 @@ def _by_traffic(results: Results, first: str, lines: Sequence[Sequence[str]]) ->
 
 def leads(results: Results) -> str:
     """Drivers by traffics: paired lead over MOBIL."""
-    drivers = _drivers(results, [name for name in DRIVERS if name != "random_legal"])
+    drivers = [name for name in DRIVERS if name != "random_legal"]
     lines = [
         [
             DRIVERS[driver][0],
@@ -160,7 +155,7 @@ def failures(results: Results) -> str:
     names = {**DRIVERS, "mobil": ("MOBIL", frozenset[str]())}
     lines = [
         [names[driver][0], *(cell(driver, traffic) for traffic in _traffics(results))]
-        for driver in _drivers(results, ["mobil", *DRIVERS])
+        for driver in ("mobil", *DRIVERS)
     ]
     return _by_traffic(results, "hard crashes, departures", lines)
 
@@ -227,8 +222,7 @@ def controls(results: Results) -> str:
     Lead over MOBIL and failures, then their differences from the paper's agents.
     """
     part, lines = results["controls"], []
-    for driver in _drivers(part, list(CONTROLS)):
-        name, trained = CONTROLS[driver]
+    for driver, (name, trained) in CONTROLS.items():
         rows = [_at(part, driver, traffic) for traffic in _traffics(part)]
         lines.append(
             [
@@ -270,9 +264,7 @@ def readme(results: Results) -> str:
         ]
         return f"{_lead(row, DRIVERS[driver][1])}, {per_1000[0]:.0f} ({per_1000[1]:.0f})"
 
-    drivers = _drivers(
-        results, ["agent_general+safe", "agent_idm+none", "agent_gan+none", "mobil_egoistic"]
-    )
+    drivers = ["agent_general+safe", "agent_idm+none", "agent_gan+none", "mobil_egoistic"]
     lines = [
         [DRIVERS[driver][0], *(cell(driver, traffic) for traffic in _traffics(results))]
         for driver in drivers

@@ -45,20 +45,13 @@ def significant(value: float | None) -> str:
     return f"{rounded:.{max(0, 3 - whole)}f}" if abs(rounded) >= 1 else f"{rounded:.3g}"
 
 
-def count(value: float | None) -> str:
+def count(value: float) -> str:
     """Three significant digits, with k, M and G: ``612``, ``54.3 k``, ``1.23 M``."""
-    if value is None:
-        return "-"
     for limit, unit in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
         # What rounds up to the next unit is given in that unit: 1.00 M, not 1000 k.
         if abs(value) >= limit * 0.9995:
             return f"{significant(value / limit)}{unit}"
     return significant(value)
-
-
-def percent(share: float | None) -> str:
-    """A share as whole per cent."""
-    return "-" if share is None else f"{100 * share:.0f} %"
 
 
 def split_at_markers(path: Path, begin: str, end: str) -> tuple[str, str, str]:

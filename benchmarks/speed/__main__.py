@@ -33,12 +33,11 @@ from benchmarks.script import (
     count,
     make_parser,
     markdown,
-    percent,
     run_script,
     significant,
 )
 from benchmarks.speed import systems
-from benchmarks.speed.measure import Case, Labels, Row, best_rows, measure
+from benchmarks.speed.measure import Case, Labels, Row, measure
 from benchmarks.speed.sumo import start_on_ramp
 from benchmarks.speed.systems import Road, installed_version
 from ganlane.agents import RainbowConfig
@@ -46,7 +45,6 @@ from ganlane.evaluation import machine_sentence
 from ganlane.evaluation.table import Table
 from ganlane.files import write_json
 
-SUITES = ("sim", "gymnasium", "scenarios", "traffic", "train")
 #: Defaults of each suite: batches and traffics.
 BATCHES = {
     "sim": [1, 16, 64, 256, 1024, 4096],
@@ -68,8 +66,6 @@ EGOS = {"random actions": False, "keeping its lane": True}
 SCENES = {"merge": (21, 3), "exit": (24, 4), "on_ramp": (20, 3)}
 #: Suites that go through gymnasium.
 THROUGH_GYMNASIUM = ("gymnasium", "scenarios")
-#: What stands for the traffic of HighwayEnv.
-THEIR_TRAFFIC = "its IDM and MOBIL"
 #: Heading to cell of the tables' columns.
 COLUMNS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "system": lambda row: row["system"],
@@ -83,7 +79,7 @@ COLUMNS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "physics steps/CPU-s": lambda row: count(row["physics_steps_per_cpu_s"]),
     "times the peer": lambda row: significant(row["ratio"]),
     "in CPU time": lambda row: significant(row["ratio_cpu"]),
-    "spread": lambda row: percent(row["spread"]),
+    "spread": lambda row: f"{100 * row['spread']:.0f} %",
 }
 
 
@@ -133,7 +129,7 @@ def peers_of(
     options: argparse.Namespace, road: Road, threads: int, batch: int, ego: str
 ) -> list[Case]:
     """The peers of a group that are installed; ratios are to the first."""
-    theirs = replace(road, traffic=THEIR_TRAFFIC)
+    theirs = replace(road, traffic="its IDM and MOBIL")
     highway = installed_version("highway-env")
     envpool, learner = installed_version("envpool"), installed_version("stable-baselines3")
     peers: list[Case] = []
@@ -197,23 +193,19 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
     return rows
 
 
-def tables_of(rows: Sequence[Row]) -> list[Table]:
-    """Speed, and the best rows."""
+def table_of(rows: Sequence[Row]) -> Table:
+    """A line for every case."""
     places = {f"{row['vehicles']} vehicles on {row['lanes']} lanes": None for row in rows}
     place = ", ".join(places)
     note = "Medians; spread is the interquartile range of the wall time over its median."
-    short = {name: cell for name, cell in COLUMNS.items() if name != "spread"}
-    return [
-        Table.of(f"Speed, {place}", rows, COLUMNS, 4, [note]),
-        Table.of("The best of each", best_rows(rows), short, 4),
-    ]
+    return Table.of(f"Speed, {place}", rows, COLUMNS, 4, [note])
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = make_parser(__doc__)
     add = parser.add_argument
-    add("--suite", choices=SUITES, default="sim")
+    add("--suite", choices=tuple(BATCHES), default="sim")
     add("--quick", action="store_true", help="a check that it runs: small batches, short turns")
     add("--traffics", nargs="+", metavar="NAME", help="options of the group traffic")
     add("--batches", nargs="+", type=int, metavar="N", help="environments side by side")
@@ -246,18 +238,18 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def compare(options: argparse.Namespace) -> str:
-    """Measure all; the tables, in the document too where one is named."""
+    """Measure all; the table, in the document too where one is named."""
     name = options.suite if options.device == "cpu" else f"{options.suite} {options.device}"
     begin, end = f"<!-- begin bench {name} -->", f"<!-- end bench {name} -->"
     section = ReportSection(options.report, begin, end)
     rows = rows_of(options)
     if options.json is not None:
         write_json(options.json, {"rows": rows})
-    tables = tables_of(rows)
+    table = table_of(rows)
     taken = f"Taken on {date.today()}: {machine_sentence(options.threads)}"
     command = f"    python -m benchmarks.speed {options.told}".rstrip()
-    section.write("\n" + "\n\n".join([command, taken, *map(markdown, tables)]) + "\n")
-    return "\n\n".join(table.text() for table in tables)
+    section.write("\n" + "\n\n".join([command, taken, markdown(table)]) + "\n")
+    return table.text()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

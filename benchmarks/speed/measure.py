@@ -157,16 +157,3 @@ def measure(
     samples = take_turns(started, runners, repetitions, seconds)
     of_peer = samples[0] if peer is not None else []
     return [make_row(case.labels, turns, of_peer) for case, turns in zip(started, samples)]
-
-
-def best_rows(rows: Sequence[Row]) -> list[Row]:
-    """The row with most physics steps per second of each system and traffic, in the order of
-    ``rows``.
-    """
-    rate = "physics_steps_per_s"
-    best: dict[tuple[str, str], Row] = {}
-    for row in rows:
-        key = row["system"], row["traffic"]
-        if key not in best or row[rate] > best[key][rate]:
-            best[key] = row
-    return list(best.values())

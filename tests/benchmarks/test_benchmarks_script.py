@@ -9,7 +9,6 @@ from benchmarks.script import (
     count,
     make_parser,
     markdown,
-    percent,
     run_script,
 )
 from ganlane.errors import UserError
@@ -21,7 +20,6 @@ BEGIN, END = "<!-- begin -->", "<!-- end -->"
 @pytest.mark.parametrize(
     ("value", "shown"),
     [
-        (None, "-"),
         (612.4, "612"),
         (1234, "1.23 k"),
         (54321, "54.3 k"),
@@ -31,10 +29,6 @@ BEGIN, END = "<!-- begin -->", "<!-- end -->"
 )
 def test_counts_have_three_digits_and_a_unit(value, shown):
     assert count(value) == shown
-
-
-def test_shares_are_per_cent():
-    assert (percent(0.126), percent(None)) == ("13 %", "-")
 
 
 def test_a_table_in_markdown_has_its_title_as_a_heading_if_it_has_one():

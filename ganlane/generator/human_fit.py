@@ -183,14 +183,6 @@ def _gathered(
     return joined(parts)
 
 
-def move_losses(policy: HumanPolicy, moves: Moves) -> Tensor:
-    """Cross-entropies of the wanted changes along and across, weighted, [R]."""
-    along, across = policy(moves.features)
-    loss = -(ALONG.soft_target(moves.change) * along.log_softmax(-1)).sum(-1) * moves.weight
-    lateral = -(ACROSS.soft_target(moves.aside) * across.log_softmax(-1)).sum(-1)
-    return loss + lateral * moves.lateral_weight
-
-
 def train_moves(
     policy: HumanPolicy,
     moves: Moves,
@@ -199,7 +191,9 @@ def train_moves(
     rate: float,
     random: torch.Generator,
 ) -> None:
-    """Fit the distributions to ``moves``, with the prior's beside them."""
+    """Fit the distributions to ``moves``, with the prior's beside them, by the cross-entropies of
+    the wanted changes along and across.
+    """
     parts = (policy.trunk, policy.along, policy.across)
     parameters = [parameter for part in parts for parameter in part.parameters()]
     optimizer = torch.optim.AdamW(parameters, lr=rate, weight_decay=1e-3, fused=True)
@@ -217,7 +211,10 @@ def train_moves(
             also = torch.randint(len(prior.change), (beside,), generator=random)
             both = Moves(*map(torch.cat, zip(moves.rows(batch), prior.rows(also))))
             noise = INPUT_NOISE * torch.randn(both.features.shape, generator=random)
-            loss = move_losses(policy, both._replace(features=both.features + noise)).mean()
+            along, across = policy(both.features + noise)
+            losses = -(ALONG.soft_target(both.change) * along.log_softmax(-1)).sum(-1)
+            lateral = -(ACROSS.soft_target(both.aside) * across.log_softmax(-1)).sum(-1)
+            loss = (losses * both.weight + lateral * both.lateral_weight).mean()
             optimizer.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(parameters, 5.0)

@@ -11,7 +11,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import smooth_l1_loss
@@ -235,8 +234,3 @@ def _with_noise(scene: Recording, share: float, config: HumanConfig) -> Recordin
         x=smooth.x + share * (scene.x - smooth.x),
         y=smooth.y + share * (scene.y - smooth.y),
     )
-
-
-def standard_width(recording: Recording) -> Recording:
-    """The recording with cars that are all equally wide."""
-    return replace(recording, width=np.full(len(recording.width), WIDTH_M))

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -35,7 +35,7 @@ from ganlane.generator.forecasts import (
 )
 from ganlane.generator.human_estimator import HumanModel
 from ganlane.generator.human_fit import fit_human, fit_steps
-from ganlane.generator.human_forecasts import fit_observer, human_forecasts, standard_width
+from ganlane.generator.human_forecasts import WIDTH_M, fit_observer, human_forecasts
 from ganlane.generator.networks import Discriminator, Generator, displacements_of
 from ganlane.generator.windows import (
     Groups,
@@ -304,7 +304,8 @@ class HumanTask(nn.Module):
             best = best if cost is None else min(best, cost)
             on_progress(Progress(name, done, steps, {}, cost, best))
 
-        scenes = [standard_width(scene) for scene in self.scenes]
+        # In forecasts no width is known.
+        scenes = [replace(scene, width=np.full_like(scene.width, WIDTH_M)) for scene in self.scenes]
         self.generator = fit_human(self.config, scenes, self.following, report)
         fit_observer(self.generator, self.scenes, self.config)
         return steps

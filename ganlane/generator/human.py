@@ -153,27 +153,35 @@ def memory_of(accelerations: Tensor, lateral_speeds: Tensor, age: Tensor) -> Mem
 
 
 class View(NamedTuple):
-    """What drivers perceive.
+    """What drivers perceive of lanes, neighbours and their own motion.
 
     Attributes:
-        features: [N, M, FEATURES].
-        sides: of the lanes to the left and to the right, [N, M, 2, SIDE_FEATURES].
+        speed, aside: their own along and across the road, m/s, [N, M].
         lane: whose centre is nearest, [N, M], float.
         exists: whether there is a lane to the left, to the right, [N, M, 2].
-        closing: speed of the leader less the own one, m/s.
+        ahead, behind: the nearest in three lanes.
         log_headway: of drivers who follow, NaN for others.
         relative_speed: over the mean of the neighbours, m/s.
-        gap: to the leader in the own lane, m.
     """
 
-    features: Tensor
-    sides: Tensor
+    speed: Tensor
+    aside: Tensor
     lane: Tensor
     exists: Tensor
-    closing: Tensor
+    ahead: Near
+    behind: Near
     log_headway: Tensor
     relative_speed: Tensor
-    gap: Tensor
+
+    @property
+    def gap(self) -> Tensor:
+        """To the leader in the own lane, m."""
+        return self.ahead.gap[..., 1]
+
+    @property
+    def closing(self) -> Tensor:
+        """Speed of the leader less the own one, m/s."""
+        return self.ahead.closing[..., 1]
 
 
 class Near(NamedTuple):
@@ -206,10 +214,10 @@ def lane_after(y: Tensor, aside: Tensor, road: Road, seconds: float) -> Tensor:
     return road.lane_of(y + seconds * aside).clamp(lane - 1, lane + 1)
 
 
-def see(vehicles: Vehicles, road: Road, sides: bool) -> tuple[Tensor, Near, Near]:
-    """The lane of each vehicle, and its neighbours ahead and behind in three lanes.
+def perceive(vehicles: Vehicles, road: Road, sides: bool = True) -> View:
+    """What every driver perceives.
 
-    Without ``sides`` in the own lane alone.
+    Without ``sides`` a driver sees its own lane alone, as where only one lane was recorded.
     """
     speed, aside = velocity(vehicles)
     lane = road.lane_of(vehicles.y)
@@ -245,53 +253,42 @@ def see(vehicles: Vehicles, road: Road, sides: bool) -> tuple[Tensor, Near, Near
             index,
         )
 
-    return lane, nearest_on(1), nearest_on(-1)
-
-
-def look(vehicles: Vehicles, memory: Memory, road: Road) -> tuple[Memory, View]:
-    """The memory with this decision's style, and what drivers perceive before they decide."""
-    memory = with_style(memory, perceive(vehicles, memory, road))
-    return memory, perceive(vehicles, memory, road)
-
-
-def perceive(vehicles: Vehicles, memory: Memory, road: Road, sides: bool = True) -> View:
-    """What every driver perceives of its neighbours, its lane and itself.
-
-    Without ``sides`` a driver sees its own lane alone, as where only one lane was recorded.
-    """
-    lane, ahead, behind = see(vehicles, road, sides)
-    exists = torch.stack((lane + 1 < road.lanes, lane > 0), -1) & sides
-    speed, aside = velocity(vehicles)
+    ahead, behind = nearest_on(1), nearest_on(-1)
     gap = ahead.gap[..., 1]
-    features = [
-        *_own_state(vehicles, memory, road, lane, speed, aside),
-        *_leader_of_leader(ahead),
-        *exists.to(speed.dtype).unbind(-1),
-        *_room(vehicles, road, ahead, behind),
-        *_seen(ahead, speed).flatten(-2).unbind(-1),
-        *_seen(behind, speed).flatten(-2).unbind(-1),
-    ]
     # Followers within 80 m show their headway.
     follows = ahead.exists[..., 1] & (gap < 80.0)
     headway = (gap.clamp_min(0.5) / speed.clamp_min(2.0)).clamp(0.2, 6.0)
     seen = torch.cat((ahead.exists, behind.exists), -1)
     relative = -torch.cat((ahead.closing, behind.closing), -1)
     return View(
-        torch.stack(features, -1),
-        _sides(vehicles, memory, road, lane, aside, speed, ahead, behind),
+        speed,
+        aside,
         lane,
-        exists,
-        ahead.closing[..., 1],
+        torch.stack((lane + 1 < road.lanes, lane > 0), -1) & sides,
+        ahead,
+        behind,
         torch.where(follows, torch.log(headway), torch.nan),
         (relative * seen).sum(-1) / seen.sum(-1).clamp_min(1),
-        gap,
     )
 
 
-def _own_state(
-    vehicles: Vehicles, memory: Memory, road: Road, lane: Tensor, speed: Tensor, aside: Tensor
-) -> list[Tensor]:
+def features_of(vehicles: Vehicles, memory: Memory, road: Road, view: View) -> Tensor:
+    """What counts for the next move, [N, M, FEATURES]."""
+    ahead, behind, speed = view.ahead, view.behind, view.speed
+    features = [
+        *_own_state(vehicles, memory, road, view),
+        *_leader_of_leader(ahead),
+        *view.exists.to(speed.dtype).unbind(-1),
+        *_room(vehicles, road, ahead, behind),
+        *_seen(ahead, speed).flatten(-2).unbind(-1),
+        *_seen(behind, speed).flatten(-2).unbind(-1),
+    ]
+    return torch.stack(features, -1)
+
+
+def _own_state(vehicles: Vehicles, memory: Memory, road: Road, view: View) -> list[Tensor]:
     """22 numbers of the driver itself and its place in the lane."""
+    speed, aside, lane = view.speed, view.aside, view.lane
     target = vehicles.target_lane.to(speed.dtype)
     from_target = vehicles.y - target * road.lane_width_m
     from_centre = vehicles.y - lane * road.lane_width_m
@@ -364,17 +361,12 @@ def _seen(near: Near, speed: Tensor) -> Tensor:
     return torch.stack((distance, time_s, torch.asinh(near.closing), approach, exists), -2)
 
 
-def _sides(
-    vehicles: Vehicles,
-    memory: Memory,
-    road: Road,
-    lane: Tensor,
-    aside: Tensor,
-    speed: Tensor,
-    ahead: Near,
-    behind: Near,
-) -> Tensor:
-    """What counts for a lane change to the left and to the right, in the same order for both."""
+def sides_of(vehicles: Vehicles, memory: Memory, road: Road, view: View) -> Tensor:
+    """What counts for a lane change to the left and to the right, [N, M, 2, SIDE_FEATURES], in the
+    same order for both.
+    """
+    speed, aside, lane = view.speed, view.aside, view.lane
+    ahead, behind = view.ahead, view.behind
     pace = speed.clamp_min(3.0)
     own_gap = torch.log(ahead.gap[..., 1].clamp_min(0.5) / 10.0)
     # On a free lane one could be faster by 3 m/s.
@@ -480,11 +472,11 @@ class LaneChoice(NamedTuple):
     to_left: Tensor
 
 
-def lane_choice(vehicles: Vehicles, view: View) -> LaneChoice:
-    """The choice that each driver has."""
+def lane_choice(vehicles: Vehicles, view: View, sides: Tensor) -> LaneChoice:
+    """The choice that each driver has, by its ``sides`` (:func:`sides_of`)."""
     lane = view.lane.long()
     target = vehicles.target_lane
-    return LaneChoice(view.sides, view.exists, target == lane, target > lane)
+    return LaneChoice(sides, view.exists, target == lane, target > lane)
 
 
 def with_choice(

@@ -24,8 +24,10 @@ from ganlane.generator.human import (
     HumanPolicy,
     Memory,
     cars,
+    features_of,
     leaves_room,
     perceive,
+    sides_of,
 )
 from ganlane.generator.human_estimator import HumanModel, fit_estimator
 from ganlane.generator.human_samples import (
@@ -320,9 +322,9 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
     none = torch.zeros(*shape, 2)
     memory = Memory(history, lateral, none, style, 12.0 * rand(), 12.0 * rand())
     vehicles = vehicles.with_(acceleration=before)
-    view = perceive(vehicles, memory, road)
-    closing = view.closing[..., None] + 0.3 * randn(*shape, 2)
-    view = perceive(vehicles, memory._replace(closing=closing), road)
+    view = perceive(vehicles, road)
+    memory = memory._replace(closing=view.closing[..., None] + 0.3 * randn(*shape, 2))
+    sides = sides_of(vehicles, memory, road, view)
 
     time_to_collision = view.gap / (-view.closing).clamp_min(1e-3)
     silent = (speed > 19.0) | (speed < 1.5) | (view.gap > 80.0)
@@ -339,6 +341,6 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
     back = (-0.45 * (vehicles.y - lane * 3.6)).clamp(-0.9, 0.9)
     sideways = 0.4 * (back - aside) + 0.03 * randn()
     lateral_weight = torch.where(far_off, 0.5, 0.1)
-    moves = Moves(view.features, change, sideways, silent.float(), lateral_weight)
-    danger = view.sides[~leaves_room(view.sides) & view.exists]
-    return moves.rows(silent | far_off), danger
+    features = features_of(vehicles, memory, road, view)
+    moves = Moves(features, change, sideways, silent.float(), lateral_weight)
+    return moves.rows(silent | far_off), sides[~leaves_room(sides) & view.exists]

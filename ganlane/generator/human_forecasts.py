@@ -27,12 +27,13 @@ from ganlane.generator.human import (
     bounded,
     cars,
     chosen,
+    features_of,
     lane_after,
     lane_choice,
-    look,
     moved,
     perceive,
     remembered,
+    sides_of,
     velocity,
     with_choice,
     with_style,
@@ -101,7 +102,7 @@ def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memo
         valid=segments.present[:, PRESENT],
     )
     memory = present_memory(motion, torch.where(whole, trust(nine), 0.0))
-    view = perceive(vehicles, memory, road)
+    view = perceive(vehicles, road)
     return vehicles, with_style(memory, view, torch.ones_like(whole)), road
 
 
@@ -137,7 +138,7 @@ def _driven(
     # The first copy of the segments makes the expected moves, the others draw theirs.
     mean = torch.zeros_like(vehicles.valid)
     mean[:rows] = True
-    view = perceive(vehicles, memory, road)
+    view = perceive(vehicles, road)
     leads = view.gap >= SIGHT_M
     temperature = HumanVariation.temperature
     steps = torch.arange(1, STEPS + 1) * PHYSICS_STEP_S
@@ -145,14 +146,16 @@ def _driven(
     for decision in range(-(-horizon // STEPS)):
         # The present's style is that of the nine positions.
         if decision:
-            memory, view = look(vehicles, memory, road)
-        chances = policy.lane_chances(lane_choice(vehicles, view), HumanVariation.lane_changes)
+            view = perceive(vehicles, road)
+            memory = with_style(memory, view)
+        option = lane_choice(vehicles, view, sides_of(vehicles, memory, road, view))
+        chances = policy.lane_chances(option, HumanVariation.lane_changes)
         # The mean driver goes on as it does.
         choice = chosen(chances, torch.rand(mean.shape, generator=random)).masked_fill(mean, 0)
         vehicles, memory = with_choice(vehicles, memory, view, choice)
-        view = perceive(vehicles, memory, road)
         changes = []
-        for tokens, logits in zip((ALONG, ACROSS), policy(view.features)):
+        features = features_of(vehicles, memory, road, view)
+        for tokens, logits in zip((ALONG, ACROSS), policy(features)):
             u = torch.rand(mean.shape, generator=random)
             drawn = tokens.sample(logits, u, temperature)
             changes.append(torch.where(mean, tokens.mean(logits), drawn))

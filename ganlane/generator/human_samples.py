@@ -31,14 +31,15 @@ from ganlane.generator.human import (
     HumanPolicy,
     LaneChoice,
     Memory,
-    View,
     bounded,
     cars,
+    features_of,
     lane_choice,
     memory_of,
     moved,
     perceive,
     remembered,
+    sides_of,
     velocity,
     with_style,
     with_velocity,
@@ -420,22 +421,23 @@ def _samples(segments: Segments, options: Options, random: torch.Generator) -> S
         memory = _taken(memory, its_memory, replace)._replace(since=since)
         if options.estimator is not None and decision == 0:
             vehicles, memory = _estimated(s, vehicles, memory, options.estimator, random)
-        view = perceive(vehicles, memory, s.road, sides_seen)
+        view = perceive(vehicles, s.road, sides_seen)
         memory = with_style(memory, view, first)
-        view = perceive(vehicles, memory, s.road, sides_seen)
+        features = features_of(vehicles, memory, s.road, view)
         # What should follow: the recorded move, corrected towards the recording.
         change, aside = _led_back(s, now, vehicles, memory)
         follows = s.present[:, now + STEPS] & present & s.driven
         # A driver that has just come knows no acceleration of its own yet.
         counts = follows & (memory.age > 0) if options.policy is None else follows
         weight = s.weight.expand_as(change)
-        moves = Moves(view.features, change, aside, weight, weight * s.two_dimensional)
+        moves = Moves(features, change, aside, weight, weight * s.two_dimensional)
         step = s.target[:, now + STEPS] - vehicles.target_lane
-        choices = _choices(vehicles, view, follows & s.two_dimensional, step)
+        choice = lane_choice(vehicles, view, sides_of(vehicles, memory, s.road, view))
+        choices = _choices(choice, follows & s.two_dimensional, step)
         parts.append(Samples(moves.rows(counts), choices))
         # In closed loop the policy makes the move itself, so that it sees its own mistakes.
         if options.policy is not None:
-            change, aside = _nearest_move(options, view, change, aside, random)
+            change, aside = _nearest_move(options, features, change, aside, random)
             aside = torch.where(s.two_dimensional, aside, 0.0)
         acceleration, lateral = bounded(vehicles, memory, s.road, change, aside)
         memory = remembered(vehicles, memory, view, acceleration)
@@ -520,11 +522,11 @@ def _led_back(s: Segments, now: int, vehicles: Vehicles, memory: Memory) -> tupl
 
 
 def _nearest_move(
-    options: Options, view: View, change: Tensor, aside: Tensor, random: torch.Generator
+    options: Options, features: Tensor, change: Tensor, aside: Tensor, random: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Of several moves that the policy draws, the nearest ones to ``change`` and ``aside``."""
     assert options.policy is not None
-    logits = options.policy(view.features)
+    logits = options.policy(features)
     nearest = []
     for tokens, its_logits, wanted in zip((ALONG, ACROSS), logits, (change, aside)):
         shape = (options.samples, *wanted.shape)
@@ -537,21 +539,21 @@ def _nearest_move(
     return nearest[0], nearest[1]
 
 
-def _choices(vehicles: Vehicles, view: View, counts: Tensor, step: Tensor) -> Choices:
-    """The lane choices of one decision, of drivers who ``counts`` and who change to the left or
-    right by ``step`` until the next one.
+def _choices(choice: LaneChoice, counts: Tensor, step: Tensor) -> Choices:
+    """What was chosen at one decision by the drivers who count (``counts`` [N, M]), whose target
+    lanes change by ``step`` [N, M] until the next one.
     """
-    choice = lane_choice(vehicles, view)
+    sides = choice.sides
     # A change begins at the decision after which the target lane is another one.
     begins = torch.stack((step == 1, step == -1), -1)
     keeping = counts & choice.keeping
     could = choice.exists & keeping[..., None]
     under_way = counts & ~choice.keeping
-    side = torch.where(choice.to_left[..., None], view.sides[..., 0, :], view.sides[..., 1, :])
+    side = torch.where(choice.to_left[..., None], sides[..., 0, :], sides[..., 1, :])
     aside = side[under_way]
     return Choices(
-        torch.cat((view.sides[could], aside)),
+        torch.cat((sides[could], aside)),
         torch.cat((begins[could].float(), torch.full((len(aside),), -1.0))),
-        view.sides[keeping],
+        sides[keeping],
         choice.exists[keeping],
     )

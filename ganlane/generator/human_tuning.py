@@ -28,13 +28,14 @@ from ganlane.generator.human import (
     Memory,
     bounded,
     cars,
+    features_of,
     lane_choice,
     layers,
-    look,
     memory_of,
     moved,
     perceive,
     remembered,
+    sides_of,
     velocity,
     with_choice,
     with_style,
@@ -229,14 +230,15 @@ def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> De
     vehicles, memory, road = random_scenes(random)
     steps: list[Decisions] = []
     for _ in range(DECISIONS):
-        memory, view = look(vehicles, memory, road)
-        choice = lane_choice(vehicles, view)
+        view = perceive(vehicles, road)
+        memory = with_style(memory, view)
+        choice = lane_choice(vehicles, view, sides_of(vehicles, memory, road, view))
         chances = policy.lane_chances(choice)
         lane = torch.multinomial(chances.flatten(0, 1), 1, generator=random).view(vehicles.x.shape)
         vehicles, memory = with_choice(vehicles, memory, view, lane)
         # The moves follow the choice.
-        view = perceive(vehicles, memory, road)
-        logits = policy(view.features)
+        features = features_of(vehicles, memory, road, view)
+        logits = policy(features)
         tokens, changed = [], []
         for axis, its_logits in zip((ALONG, ACROSS), logits):
             chance = torch.softmax(its_logits / TEMPERATURE, -1)
@@ -251,16 +253,16 @@ def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> De
         cost, hit = costs(later, road, view.gap)
         # Who has collided leaves the scene.
         goes_on = vehicles.valid & ~hit
-        log_chances = _log_chances(policy, view.features, choice)
+        log_chances = _log_chances(policy, features, choice)
         decisions = Decisions(
-            features=view.features,
+            features=features,
             **choice._asdict(),
-            speed=velocity(vehicles)[0],
+            speed=view.speed,
             along=tokens[0],
             across=tokens[1],
             lane=lane,
             log_chance=_of_actions(log_chances, (*tokens, lane)),
-            value=_values(critic, view.features, choice.sides),
+            value=_values(critic, features, choice.sides),
             cost=cost,
             valid=vehicles.valid,
             goes_on=goes_on,
@@ -368,7 +370,7 @@ def entering_memory(vehicles: Vehicles, road: Road, drawn: Tensor) -> Memory:
     _, lateral = velocity(vehicles)
     steady = zero[..., None].repeat(1, 1, ACCELERATIONS)
     memory = memory_of(steady, torch.stack((lateral, lateral), -1), zero)
-    view = perceive(vehicles, memory, road)
+    view = perceive(vehicles, road)
     free = view.log_headway.isnan()
     log_headway = torch.where(free, math.log(1.4) + 0.35 * drawn, view.log_headway)
     view = view._replace(log_headway=log_headway)

@@ -17,16 +17,17 @@ from ganlane.generator.human import (
     REAR_BRAKING,
     STEPS,
     HumanPolicy,
-    View,
     bounded,
     chosen,
+    features_of,
     lane_choice,
     leaves_room,
-    look,
     perceive,
     remembered,
+    sides_of,
     velocity,
     with_choice,
+    with_style,
     with_velocity,
 )
 from ganlane.generator.human import Memory as DriverMemory
@@ -137,21 +138,22 @@ class HumanTraffic(TrafficModule):
         policy, variation = in_dtype(self.policy, vehicles.x.dtype), self.drivers.variation
         vehicles = vehicles.with_(target_lane=self.road.clamp_lane(vehicles.target_lane))
         driver = DriverMemory(*(memory[name] for name in DriverMemory._fields))
-        driver, view = look(vehicles, driver, self.road)
+        view = perceive(vehicles, self.road)
+        driver = with_style(driver, view)
         u = uniforms(vehicles, key, step, *_DRAWS)
+        sides = sides_of(vehicles, driver, self.road, view)
+        polite = sides.clone()
+        polite[..., REAR_BRAKING] *= variation.politeness
+        option = lane_choice(vehicles, view, polite)
         if self.road.stretches:
             ways = ways_out(vehicles, self.road, TABLE_IV.mandatory_m)
-            view = view._replace(exists=torch.stack((ways.left, ways.right), -1))
-        sides = view.sides.clone()
-        sides[..., REAR_BRAKING] *= variation.politeness
-        option = lane_choice(vehicles, view)._replace(sides=sides)
+            option = option._replace(exists=torch.stack((ways.left, ways.right), -1))
         choice = chosen(policy.lane_chances(option, variation.lane_changes), u[2])
         if self.road.stretches:
-            choice = _leaving(choice, ways, vehicles, view, u[3])
+            choice = _leaving(choice, option.keeping, ways, sides, u[3])
         vehicles, driver = with_choice(vehicles, driver, view, choice)
         # Its moves follow the driver's choice.
-        view = perceive(vehicles, driver, self.road)
-        along, across = policy(view.features)
+        along, across = policy(features_of(vehicles, driver, self.road, view))
         change = ALONG.sample(along, u[0], variation.temperature)
         aside = ACROSS.sample(across, u[1], variation.temperature)
         acceleration, lateral = bounded(vehicles, driver, self.road, change, aside)
@@ -161,7 +163,7 @@ class HumanTraffic(TrafficModule):
         return vehicles, {
             **driver._asdict(),
             "acceleration": driver.accelerations[..., variation.delayed],
-            "lateral_from": velocity(vehicles)[1],
+            "lateral_from": view.aside,
             "lateral_to": lateral,
         }
 
@@ -173,15 +175,14 @@ class HumanTraffic(TrafficModule):
         return acceleration_before_wall(scene, lanes, keeps, self.drivers.idm).amin(-1)
 
 
-def _leaving(choice: Tensor, ways: WaysOut, vehicles: Vehicles, view: View, u: Tensor) -> Tensor:
+def _leaving(choice: Tensor, keeping: Tensor, ways: WaysOut, sides: Tensor, u: Tensor) -> Tensor:
     """The choices of drivers whose lane ends: out of it, the sooner the nearer its end is.
 
     Recordings show no such lanes, so this is no part of the policy. Like its own changes these
     leave others room.
     """
-    keeping = vehicles.target_lane == view.lane.long()
     left = ways.side == 1
-    side = torch.where(left[..., None], view.sides[..., 0, :], view.sides[..., 1, :])
+    side = torch.where(left[..., None], sides[..., 0, :], sides[..., 1, :])
     wants = keeping & (ways.side != 0) & (u < ways.urgency)
     return torch.where(wants & leaves_room(side), torch.where(left, 1, 2), choice)
 

@@ -22,9 +22,11 @@ from ganlane.generator.human import (
     HumanPolicy,
     bounded,
     chosen,
+    features_of,
     lane_choice,
     moved,
     perceive,
+    sides_of,
     velocity,
     with_choice,
 )
@@ -68,8 +70,8 @@ def test_a_soft_target_is_around_its_value_and_samples_follow_the_distribution()
 
 def test_a_driver_sees_the_gap_to_its_leader_and_nobody_in_an_empty_lane():
     cars = scene({}, {"x": 34.5, "speed": 15.0}, {"x": -30.0, "lane": 2})
-    view = perceive(cars, memory_of(cars), ROAD)
-    assert view.features.shape == (1, 3, FEATURES)
+    view = perceive(cars, ROAD)
+    assert features_of(cars, memory_of(cars), ROAD, view).shape == (1, 3, FEATURES)
     assert float(view.gap[0, 0]) == pytest.approx(30.0)
     assert float(view.closing[0, 0]) == pytest.approx(-5.0)
     assert float(view.log_headway[0, 0]) == pytest.approx(np.log(30.0 / 20.0), abs=1e-5)
@@ -77,22 +79,25 @@ def test_a_driver_sees_the_gap_to_its_leader_and_nobody_in_an_empty_lane():
     assert view.log_headway[0, 1].isnan()
     assert float(view.gap[0, 1]) == 150.0
     assert view.exists[0].tolist() == [[True, True], [True, True], [False, True]]
-    alone = perceive(cars, memory_of(cars), ROAD, sides=False)
+    alone = perceive(cars, ROAD, sides=False)
     assert not alone.exists.any()
 
 
 def test_left_and_right_are_alike():
     cars = scene({}, {"x": 20.0, "lane": 2, "speed": 17.0}, {"x": -15.0, "lane": 0})
     mirrored = scene({}, {"x": 20.0, "lane": 0, "speed": 17.0}, {"x": -15.0, "lane": 2})
-    here = perceive(cars, memory_of(cars), ROAD)
-    there = perceive(mirrored, memory_of(mirrored), ROAD)
-    assert torch.equal(here.sides[:, 0], there.sides[:, 0].flip(1))
+    here, there = (
+        sides_of(road_users, memory_of(road_users), ROAD, perceive(road_users, ROAD))
+        for road_users in (cars, mirrored)
+    )
+    assert torch.equal(here[:, 0], there[:, 0].flip(1))
 
 
 def test_chances_add_up_nobody_changes_to_where_no_lane_is_and_a_change_can_be_broken_off():
     cars = scene({"lane": 2}, {"lane": 0, "x": 50.0}, {"x": 100.0, "lane": 1, "target_lane": 2})
-    view = perceive(cars, memory_of(cars), ROAD)
-    chances = policy().lane_chances(lane_choice(cars, view))
+    view = perceive(cars, ROAD)
+    sides = sides_of(cars, memory_of(cars), ROAD, view)
+    chances = policy().lane_chances(lane_choice(cars, view, sides))
     assert torch.allclose(chances.sum(-1), torch.ones(1, 3), atol=1e-5)
     left, right = chances[0, :, 1], chances[0, :, 2]
     assert left[0] < 1e-6

@@ -33,9 +33,9 @@ TIME = np.arange(80) * 0.1
 RAMP = np.clip(TIME - 2.05, 0.0, WIDTH)
 
 
-def changes_of(y, new_track_at=()):
-    begins = np.isin(np.arange(len(y)), [0, *new_track_at])
-    return find_lane_changes(Tracks(np.asarray(y), np.full(len(y), WIDTH), begins))
+def changes_of(y):
+    """The lane changes of one track."""
+    return find_lane_changes(Tracks(y, np.full(len(y), WIDTH), np.arange(len(y)) == 0))
 
 
 def test_a_ramp_is_timed_from_and_to_three_tenths_off_the_centres():

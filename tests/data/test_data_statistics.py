@@ -23,24 +23,21 @@ from ganlane.data.statistics import (
 from ganlane.errors import UserError
 
 
-def track(vehicle, x, lane=0, scene="s", y=None, length=4.0):
+def track(vehicle, x, lane=0, y=None):
     """One vehicle at positions ``x``, a sample every 0.1 s; its speed is the forward difference."""
-    x = np.asarray(x, float)
-    n = len(x)
-    speed = np.gradient(x, 0.1)
-    y = np.full(n, 3.5 * lane) if y is None else y
-    columns = [
-        [scene] * n,
-        [vehicle] * n,
-        range(n),
-        x,
-        y,
-        speed,
-        np.rint(y / 3.5),
-        [length] * n,
-        [2.0] * n,
-    ]
-    return pl.DataFrame(dict(zip(SCHEMA, columns)), schema=SCHEMA, strict=False)
+    y = np.full(len(x), 3.5 * lane) if y is None else y
+    columns = {
+        "scene": "s",
+        "vehicle": vehicle,
+        "frame": np.arange(len(x)),
+        "x": x,
+        "y": y,
+        "speed": np.gradient(x, 0.1),
+        "lane": np.rint(y / 3.5),
+        "length": 4.0,
+        "width": 2.0,
+    }
+    return pl.DataFrame(columns, schema=SCHEMA, strict=False)
 
 
 @pytest.mark.parametrize(
@@ -84,9 +81,8 @@ def test_the_headway_is_the_followers_own():
     leader = track(1, 26.0 + 10.0 * time)
     follower = track(2, 10.0 * time)  # gap 22 m at 10 m/s: (22 - 2) / 10 = 2 s
     beside = track(3, 13.0 + 10.0 * time, lane=1)
-    assert quantities(pl.concat((leader, follower, beside)))["headway"].tolist() == pytest.approx(
-        [2.0]
-    )
+    (headway,) = quantities(pl.concat((leader, follower, beside)))["headway"]
+    assert headway == pytest.approx(2.0)
     # Neither a leader further away nor a meeting of less than a second counts.
     far = track(1, 100.0 + 10.0 * time)
     short = pl.concat((leader, follower)).filter(pl.col("frame") < 9)
@@ -101,10 +97,9 @@ def recording():
     moves = np.clip(time - 10.05, 0.0, 3.5)
     one = track(1, 20.0 * time, y=moves)
     other = track(2, 20.0 * time, lane=1)
-    early, late = (
-        track(v, 20.0 * time[:51] + off, lane=2) for v, off in ((3, 0.0), (10_003, 400.0))
-    )
-    return pl.concat((one, other, early, late.with_columns(pl.col("frame") + 200)))
+    early = track(3, 20.0 * time[:51], lane=2)
+    late = track(10_003, 20.0 * time[:51] + 400.0, lane=2).with_columns(pl.col("frame") + 200)
+    return pl.concat((one, other, early, late))
 
 
 def test_a_recording_is_measured_as_by_hand():

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from reference.small_networks import recorded_scenes, silenced, small_generator
-from reference.worlds import vehicles as placed
+from reference.worlds import vehicles
 
 from ganlane.generator import closed_loop
 from ganlane.generator.networks import Generator
@@ -18,18 +18,11 @@ from ganlane.sim.state import Road, Visibility
 ROAD = Road(3, 4.0)
 
 
-def vehicles(x, y=None, speed=20.0, desired=25.0, target=None):
-    y = [0.0] * len(x) if y is None else y
-    target = [round(at / 4.0) for at in y] if target is None else target
-    same = {
-        "speed": speed,
-        "desired_speed": desired,
-        "width": 2.0,
-        "visibility": int(Visibility.BODY),
-    }
-    return placed(
-        *({"x": a, "y": b, "target_lane": lane, **same} for a, b, lane in zip(x, y, target))
-    )
+CAR = {"x": 0.0, "width": 2.0, "visibility": int(Visibility.BODY)}
+
+
+def scene(*cars):
+    return vehicles(*({**CAR, **car} for car in cars))
 
 
 def silent_generator() -> Generator:
@@ -37,29 +30,27 @@ def silent_generator() -> Generator:
     return silenced(small_generator(EXTRA_INPUTS)).double().requires_grad_(False)
 
 
-def drive(generator, state, seconds, headway=1.27, noise=0.0):
+def drive(generator, state, seconds):
+    """Typical drivers, whose headway is 1.27 s."""
     history = closed_loop.start(generator, closed_loop.displacement_of(state))
     zero = torch.zeros_like(history.displacement)
-    memory = closed_loop.DriverMemory(history, zero, torch.full_like(state.x, headway))
-    z = noise * torch.randn(*state.x.shape, generator.sizes.noise, dtype=state.x.dtype)
+    memory = closed_loop.DriverMemory(history, zero, torch.full_like(state.x, 1.27))
+    z = torch.zeros(*state.x.shape, generator.sizes.noise, dtype=state.x.dtype)
     for _ in range(round(seconds / 0.1)):
         state, memory = closed_loop.anchored_step(generator, state, ROAD, memory, z)
     return state, memory
 
 
 def test_without_a_residual_a_follower_settles_at_its_own_equilibrium_gap():
-    state = vehicles([0.0, 36.0], speed=18.0, desired=18.0)
-    state = state.with_(desired_speed=torch.tensor([[25.0, 18.0]]).double())
+    state = scene({"speed": 18.0}, {"x": 36.0, "speed": 18.0, "desired_speed": 18.0})
     state, _ = drive(silent_generator(), state, 25)
     gap = state.x[0, 1] - state.x[0, 0] - 4.5
-    idm = IdmParameters(headway_s=1.27)
-    assert gap.item() == pytest.approx(
-        equilibrium_gap(state.speed[0, 0], 25.0, idm).item(), rel=0.02
-    )
+    own = equilibrium_gap(state.speed[0, 0], 25.0, IdmParameters(headway_s=1.27))
+    assert gap.item() == pytest.approx(own.item(), rel=0.02)
 
 
 def test_without_a_residual_a_lane_change_arrives_and_does_not_overshoot():
-    state = vehicles([0.0], y=[0.0], target=[1])
+    state = scene({"target_lane": 1})
     generator = silent_generator()
     course = []
     for _ in range(20):
@@ -70,7 +61,7 @@ def test_without_a_residual_a_lane_change_arrives_and_does_not_overshoot():
 
 
 def test_the_first_step_is_idm_and_the_lateral_law():
-    state = vehicles([0.0, 30.0], y=[0.5, 0.0])
+    state = scene({"y": 0.5}, {"x": 30.0})
     after, _ = drive(silent_generator(), state, 0.1)
     gap = torch.tensor(30.0 - 4.5, dtype=torch.float64)
     speed = torch.tensor(20.0, dtype=torch.float64)
@@ -82,7 +73,7 @@ def test_the_first_step_is_idm_and_the_lateral_law():
 def test_a_network_that_always_pushes_changes_the_speed_for_a_while_only():
     generator = silent_generator()
     generator.head.bias.copy_(torch.tensor([3.0, 0.0]))
-    state, memory = drive(generator, vehicles([0.0], speed=20.0, desired=20.0), 32)
+    state, memory = drive(generator, scene({"desired_speed": 20.0}), 32)
     assert state.speed.item() == pytest.approx(20.0, abs=0.3)
     assert memory.mean[0, 0, 0].item() == pytest.approx(4 * math.tanh(0.75), abs=1e-4)
 
@@ -90,7 +81,7 @@ def test_a_network_that_always_pushes_changes_the_speed_for_a_while_only():
 def test_a_network_that_always_pushes_sideways_does_not_push_the_body_out_of_its_lane():
     generator = silent_generator()
     generator.head.bias.copy_(torch.tensor([0.0, 5.0]))
-    state, _ = drive(generator, vehicles([0.0]), 3)
+    state, _ = drive(generator, scene({}), 3)
     room = 0.5 * (4.0 - 2.0) - 0.1
     assert 0.2 < state.y.item() < room + 0.05
 
@@ -108,7 +99,7 @@ def test_the_latent_vector_stays_standard_normal_and_forgets_in_its_period():
 
 def test_the_paper_drives_the_first_predicted_displacement():
     generator = small_generator().double().requires_grad_(False)
-    state = vehicles([0.0, 25.0], y=[0.0, 4.0])
+    state = scene({}, {"x": 25.0, "lane": 1})
     history = closed_loop.start(generator, closed_loop.displacement_of(state))
     noise = torch.randn(1, 2, 4).double()
     past = closed_loop.displacement_of(state)[..., None, :].expand(1, 2, 8, 2)

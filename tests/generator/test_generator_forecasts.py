@@ -12,23 +12,6 @@ from ganlane.generator.windows import Windows, cut_windows
 from ganlane.settings.generator import EXTRA_INPUTS, CalibratedConfig
 
 
-def windows_of(positions: np.ndarray) -> Windows:
-    """Windows at ``positions`` [W, T, 2] or, where they stand still before, with that future.
-
-    Scenes a, b in turn.
-    """
-    if positions.shape[1] == 8:
-        positions = np.concatenate([np.zeros((len(positions), 9, 2)), positions], axis=1)
-    count = len(positions)
-    zero = np.zeros(count, dtype=np.int64)
-    return Windows(
-        positions=positions,
-        scene=np.array(["a", "b"])[np.arange(count) % 2],
-        start=zero,
-        vehicle=zero,
-    )
-
-
 def test_errors_by_hand():
     recorded = np.zeros((2, 2, 2))
     course = np.array([[[3.0, 4.0], [0.0, 1.0]], [[0.0, 0.0], [0.0, 3.0]]])
@@ -98,19 +81,13 @@ def test_without_noise_in_the_weights_all_samples_of_a_rollout_agree(scenes):
     np.testing.assert_allclose(driven["mean"][..., 0], idm[..., 0], atol=1e-3)
 
 
-def course(start_mps: float, acceleration: float, frames: int = 17) -> np.ndarray:
-    """Positions [1, frames, 2] of a vehicle whose displacement per 0.1 s changes by
-    ``acceleration / 100`` m.
-    """
-    steps = start_mps * 0.1 + 0.01 * acceleration * np.arange(frames - 1)
-    x = np.concatenate([[0.0], steps.cumsum()])
-    return np.stack([x, np.zeros(frames)], axis=-1)[None]
-
-
 def test_steady_driving_is_foreseen_by_constant_velocity():
-    windows = windows_of(course(20.0, 0.0))
-    positions = forecasts.repeated(windows.past[:, -1], 8)
-    np.testing.assert_allclose(positions, windows.future, atol=1e-9)
+    x = 2.0 * np.arange(17)
+    positions = np.stack([x, np.zeros(17)], axis=-1)[None]
+    zero = np.zeros(1, np.int64)
+    windows = Windows(positions, scene=np.array(["a"]), start=zero, vehicle=zero)
+    predicted = forecasts.repeated(windows.past[:, -1], 8)
+    np.testing.assert_allclose(predicted, windows.future, atol=1e-9)
     np.testing.assert_allclose(windows.future[0, :, 0], 2.0 * np.arange(1, 9))
 
 

@@ -45,8 +45,8 @@ def scene(*cars):
     return vehicles(*({**CAR, **car} for car in cars), dtype=FLOAT)
 
 
-def memory_of(cars, road=ROAD):
-    return entering_memory(cars, road, torch.zeros_like(cars.x))
+def memory_of(cars):
+    return entering_memory(cars, ROAD, torch.zeros_like(cars.x))
 
 
 def policy():

@@ -88,7 +88,7 @@ def test_desired_speeds_are_fitted_on_the_scenes_that_are_not_held_out(recording
 
 
 def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(capsys):
-    results, _, err = run(capsys, "traffic=idm_mobil", "against=[]")
+    results, _, err = run(capsys, "traffic=idm_mobil", "against=[]", "vehicle_km=0")
     assert (results["starts"], results["i80"]) == ("spawned", {})
     assert "no recordings here" in err
     speed = results["quantities"]["speed"]

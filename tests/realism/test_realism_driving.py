@@ -105,9 +105,10 @@ ROAD = Road()
 DRAWN = 9.0
 
 
-def queue(x, speed=10.0, desired=20.0):
-    """One row of vehicles of 4 m in the first lane; index 0 is nobody."""
-    cars = [{"x": at, "speed": speed, "desired_speed": desired, "length": 4.0} for at in x]
+def queue(x):
+    """One row of vehicles of 4 m at 10 m/s in the first lane; index 0 is nobody."""
+    same = {"speed": 10.0, "desired_speed": 20.0, "length": 4.0}
+    cars = [{"x": at, **same} for at in x]
     return vehicles_of({"x": -500.0, "valid": False}, *cars, dtype=torch.float32)
 
 

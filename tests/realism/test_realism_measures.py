@@ -131,7 +131,7 @@ def test_one_scene_gives_no_interval_and_no_verdict():
     assert distance(histograms(0.1, 0, 1), histograms(0.0, 1, 1)).interval is None
 
 
-def draws(shift, number, trials=40):
+def draws(shift, number):
     """Recordings, and two models that lie by ``shift`` beside them and are driven four times.
 
     Each is ``number`` histograms with means of their own.
@@ -142,7 +142,7 @@ def draws(shift, number, trials=40):
         scenes = [random.binomial(20, p, size) for p, size in zip(means, sizes)]
         return np.stack([np.bincount(scene, minlength=21) for scene in scenes]) * 1.0
 
-    for _ in range(trials):
+    for _ in range(40):
         means = random.normal(0.3, 0.05, number).clip(0.1, 0.6)
         size = random.integers(15, 60, number)
         model = means + shift

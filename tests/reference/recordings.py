@@ -27,8 +27,8 @@ def traffic(**more) -> pl.DataFrame:
     )
 
 
-def ngsim_rows(scene: pl.DataFrame, start_ms: int = START_MS, lanes: int = 3) -> pl.DataFrame:
-    """One scene of the schema in NGSIM's 18 columns.
+def ngsim_rows(scene: pl.DataFrame, start_ms: int = START_MS) -> pl.DataFrame:
+    """One scene of three lanes in NGSIM's 18 columns.
 
     Feet, front centres, lanes and positions from the left.
     """
@@ -37,7 +37,7 @@ def ngsim_rows(scene: pl.DataFrame, start_ms: int = START_MS, lanes: int = 3) ->
         pl.col("frame").alias("Frame_ID"),
         pl.len().over("vehicle").alias("Total_Frames"),
         (start_ms + 100 * pl.col("frame")).alias("Global_Time"),
-        (((lanes - 0.5) * LANE_M - pl.col("y")) / FOOT_M).round(6).alias("Local_X"),
+        ((2.5 * LANE_M - pl.col("y")) / FOOT_M).round(6).alias("Local_X"),
         ((pl.col("x") + 0.5 * pl.col("length")) / FOOT_M).round(6).alias("Local_Y"),
         (6_451_137.641 + pl.col("y")).round(3).alias("Global_X"),
         (1_873_344.962 + pl.col("x")).round(3).alias("Global_Y"),
@@ -46,7 +46,7 @@ def ngsim_rows(scene: pl.DataFrame, start_ms: int = START_MS, lanes: int = 3) ->
         pl.lit(2).alias("v_Class"),
         (pl.col("speed") / FOOT_M).round(6).alias("v_Vel"),
         pl.lit(0.0).alias("v_Acc"),
-        (lanes - pl.col("lane")).alias("Lane_ID"),
+        (3 - pl.col("lane")).alias("Lane_ID"),
         *(
             pl.lit(0).alias(name)
             for name in ("Preceding", "Following", "Space_Headway", "Time_Headway")

@@ -23,9 +23,9 @@ if BROWSER is None:
 CLOCK = "parseFloat(document.getElementById('time').textContent)"
 
 
-def learned(frames=60):
+def learned():
     """An episode with action values and rewards, as a trained agent leaves one."""
-    time = np.arange(frames) * 0.1
+    time = np.arange(60) * 0.1
     values = 10.0 + np.stack([np.sin(time), np.cos(time), -time], axis=1)
     told = {
         "reward": np.sin(time),
@@ -33,7 +33,7 @@ def learned(frames=60):
         "acceleration": np.sin(np.outer(time, [1.0, 2.0, 3.0])),
     }
     label = EpisodeLabel("agent </script><b>x", "idm", 3, 4)
-    return straight([0, 25, -20], [1, 2, 0], frames, outcome="hard_crash", label=label, **told)
+    return straight([0, 25, -20], [1, 2, 0], 60, outcome="hard_crash", label=label, **told)
 
 
 @pytest.fixture(scope="module")
@@ -52,21 +52,19 @@ def page(pages):
     assert opened.errors == []
 
 
-def ink(page, selector, colour, tolerance=12):
+def ink(page, selector, colour):
     """How many pixels of a canvas have (nearly) this colour."""
     script = """(() => {
         const canvas = document.querySelector(SELECTOR);
         const { width, height } = canvas;
         const data = canvas.getContext('2d').getImageData(0, 0, width, height).data;
-        const near = (k) => COLOUR.every((value, i) => Math.abs(data[k + i] - value) <= TOLERANCE);
+        const near = (k) => COLOUR.every((value, i) => Math.abs(data[k + i] - value) <= 12);
         let count = 0;
         for (let k = 0; k < data.length; k += 4) if (near(k)) count++;
         return count;
     })()"""
-    values = {"SELECTOR": selector, "COLOUR": list(colour), "TOLERANCE": tolerance}
-    for name, value in values.items():
-        script = script.replace(name, json.dumps(value))
-    return page.value(script)
+    script = script.replace("SELECTOR", json.dumps(selector))
+    return page.value(script.replace("COLOUR", json.dumps(colour)))
 
 
 def scrub(page, time_s):

@@ -29,10 +29,9 @@ from ganlane.traffic.idm_mobil import IdmMobilTraffic
 from ganlane.view import EpisodeLabel, record_episode, to_tracks, write_tracks
 
 
-def highway(goal_m=60.0, rows=1, lanes=3, vehicles=5):
-    episode = EpisodeParameters(goal_m=goal_m)
+def highway(rows=1, lanes=3):
     traffic = IdmMobilTraffic(Road(lanes=lanes))
-    return HighwayEnv(traffic, rows, vehicles=vehicles, episode=episode)
+    return HighwayEnv(traffic, rows, vehicles=5, episode=EpisodeParameters(goal_m=60.0))
 
 
 def recorded(env, action=0, **options):
@@ -67,13 +66,11 @@ def test_the_recording_has_a_frame_per_physics_step():
 
 def test_the_label_has_the_road_of_the_replayed_scene():
     """Three scenes of 2, 3 and 4 lanes: the environment's own road has the lanes of the widest."""
-    scenes = pl.concat(
-        synthetic_scenes(
-            SyntheticTraffic(scenes=1, lanes=lanes, seconds=7.0), seed=lanes - 2
-        ).with_columns(scene=pl.lit(f"{lanes} lanes"))
-        for lanes in (2, 3, 4)
-    )
-    traffic = ReplayTraffic(recordings=sort(scenes), least_s=5.0)
+    scenes = []
+    for lanes in (2, 3, 4):
+        scene = synthetic_scenes(SyntheticTraffic(scenes=1, lanes=lanes, seconds=7.0))
+        scenes.append(scene.with_columns(scene=pl.lit(f"{lanes} lanes")))
+    traffic = ReplayTraffic(recordings=sort(pl.concat(scenes)), least_s=5.0)
     names = traffic.scenes_of_episodes(0, range(10))
     env = HighwayEnv(traffic, 1, vehicles=5)
     for lanes in (2, 3, 4):

@@ -65,11 +65,11 @@ class Page:
         assert "exceptionDetails" not in told, told["exceptionDetails"]
         return told["result"].get("value")
 
-    def wait_for(self, expression, seconds=_PATIENCE_S):
+    def wait_for(self, expression):
         """Until an expression is true."""
-        end = time.monotonic() + seconds
+        end = time.monotonic() + _PATIENCE_S
         while not self.value(expression):
-            assert time.monotonic() < end, f"still not so after {seconds} s: {expression}"
+            assert time.monotonic() < end, f"still not so after {_PATIENCE_S} s: {expression}"
             time.sleep(0.05)
 
     def size(self, width, height):
@@ -82,14 +82,14 @@ class Page:
             mobile=False,
         )
 
-    def click(self, selector, share=0.5):
-        """A real click into an element, at this share of its width."""
+    def click(self, selector):
+        """A real click into the middle of an element."""
         x, y, width, height = self.value(
             f"(() => {{ const e = document.querySelector({json.dumps(selector)});"
             "e.scrollIntoView({block: 'center'}); const b = e.getBoundingClientRect();"
             "return [b.x, b.y, b.width, b.height]; })()"
         )
-        at = {"x": x + share * width, "y": y + height / 2, "button": "left", "clickCount": 1}
+        at = {"x": x + width / 2, "y": y + height / 2, "button": "left", "clickCount": 1}
         for kind in ("mousePressed", "mouseReleased"):
             self._send("Input.dispatchMouseEvent", type=kind, **at)
 

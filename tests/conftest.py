@@ -85,3 +85,16 @@ def empty_folder(tmp_path, monkeypatch):
     """The working folder: an empty one."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture(scope="session")
+def us101_scenes():
+    """The recordings of US-101, where they are."""
+    from ganlane.data import default_scenes, read_scenes
+    from ganlane.errors import UserError
+
+    try:
+        path = default_scenes()
+    except UserError as missing:
+        pytest.skip(str(missing))
+    return read_scenes(path)

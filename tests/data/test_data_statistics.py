@@ -10,7 +10,7 @@ import pytest
 from reference.refusals import user_error
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-from ganlane.data import SCHEMA, default_scenes, read_scenes, tracks_of_frame
+from ganlane.data import SCHEMA, tracks_of_frame
 from ganlane.data.lanes import find_lane_changes
 from ganlane.data.statistics import (
     DrivingStatistics,
@@ -20,7 +20,6 @@ from ganlane.data.statistics import (
     quantities,
     survival_curve,
 )
-from ganlane.errors import UserError
 
 
 def track(vehicle, x, lane=0, y=None):
@@ -182,20 +181,11 @@ def test_durations_that_are_all_censored_have_no_mean():
 
 
 @pytest.fixture(scope="module")
-def scenes():
-    try:
-        path = default_scenes()
-    except UserError as missing:
-        pytest.skip(str(missing))
-    return read_scenes(path)
+def measured(us101_scenes):
+    return driving_statistics(us101_scenes)
 
 
-@pytest.fixture(scope="module")
-def measured(scenes):
-    return driving_statistics(scenes)
-
-
-def test_the_lane_changes(scenes, measured):
+def test_the_lane_changes(us101_scenes, measured):
     changes = measured.lane_changes
     rates = (
         changes.srlc,
@@ -209,8 +199,8 @@ def test_the_lane_changes(scenes, measured):
     assert changes.duration.complete.mean < changes.duration.survival_mean_s
     assert 2.5 < changes.duration.survival_mean_s < 4.5
     # The scene of each change is that of its last row in the old lane.
-    rows = find_lane_changes(tracks_of_frame(scenes)).sample
-    counts = dict(scenes[rows]["scene"].value_counts().iter_rows())
+    rows = find_lane_changes(tracks_of_frame(us101_scenes)).sample
+    counts = dict(us101_scenes[rows]["scene"].value_counts().iter_rows())
     per_scene = [counts.get(f"us101-{letter}", 0) for letter in "abcdefghijk"]
     assert per_scene == [16, 5, 3, 21, 2, 0, 3, 3, 0, 3, 1]
 

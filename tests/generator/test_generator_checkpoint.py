@@ -9,9 +9,7 @@ import torch
 from reference.refusals import user_error
 from reference.small_networks import SIZES, small_generator
 
-from ganlane.data import default_scenes, read_scenes
 from ganlane.data.dense import recordings_of
-from ganlane.errors import UserError
 from ganlane.generator.checkpoint import FitResult, load_generator
 from ganlane.generator.fit import held_out_errors, split_for_fit
 from ganlane.generator.forecasts import displacement_errors, rollout_score
@@ -168,19 +166,11 @@ def test_pooled_over_folds_the_errors_stay_under_constant_velocitys_and_stand_in
         assert f"{scores['ade_change_percent'][kind]:+.1f} %" in row
 
 
-@pytest.fixture(scope="module")
-def recordings():
-    try:
-        return read_scenes(default_scenes())
-    except UserError as error:
-        pytest.skip(str(error))
-
-
 @pytest.mark.parametrize("preset", CONFIGS)
-def test_the_stated_errors_are_those_of_the_shipped_weights(preset, recordings):
+def test_the_stated_errors_are_those_of_the_shipped_weights(preset, us101_scenes):
     generator, metadata = load_generator(shipped_generator(preset), preset)
     config = CONFIGS[preset]
-    split = split_for_fit(recordings_of(recordings), tuple(metadata["data"]["held_out"]))
+    split = split_for_fit(recordings_of(us101_scenes), tuple(metadata["data"]["held_out"]))
     if preset == "calibrated":
         # The first, whose samples are those of the statement.
         scenes = split.held_out[:1]

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from reference.small_networks import recorded_scenes, silenced, small_generator
+from reference.small_networks import silenced, small_generator
 from reference.worlds import vehicles
 
 from ganlane.generator import closed_loop
@@ -109,11 +109,6 @@ def test_the_paper_drives_the_first_predicted_displacement():
     after, _ = closed_loop.paper_step(generator, state, history, noise)
     moved = torch.stack([after.x - state.x, after.y - state.y], -1)
     torch.testing.assert_close(moved, predicted[..., 0, :])
-
-
-@pytest.fixture(scope="module")
-def scenes():
-    return recorded_scenes()
 
 
 @pytest.fixture

@@ -145,15 +145,12 @@ def test_a_lane_change_is_meant_from_where_the_driver_sets_out():
     assert set(np.delete(target_lanes(touched, np.zeros(40), 3.5, 2), [20, 21])) == {0}
 
 
-def steady(speed=20.0, frames=140):
-    x = speed * 0.1 * np.arange(frames)[:, None] + np.array([0.0, 40.0])
-    return smooth_scene(made_by_hand(x, y=3.5), HumanConfig())
-
-
 def test_teacher_samples_of_steady_driving_ask_for_no_change():
     random = torch.Generator().manual_seed(0)
+    x = 2.0 * np.arange(140)[:, None] + np.array([0.0, 40.0])
+    steady = smooth_scene(made_by_hand(x, y=3.5), HumanConfig())
     options = Options(vary=False, blind=0.0)
-    moves, choices = samples_of(cuts([steady()], 10, 10), options, random)
+    moves, choices = samples_of(cuts([steady], 10, 10), options, random)
     assert len(moves.features) > 20
     assert moves.change.abs().max() < 1e-3
     assert moves.aside.abs().max() < 1e-3

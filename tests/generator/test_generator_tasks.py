@@ -8,15 +8,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from reference.small_networks import CALIBRATED, PAPER, recorded_scenes
+from reference.small_networks import CALIBRATED, PAPER
 
 from ganlane.generator import tasks
 from ganlane.settings.generator import LoopConfig
-
-
-@pytest.fixture(scope="module")
-def scenes():
-    return recorded_scenes()
 
 
 def paper_task(scenes, **changes) -> tasks.PaperTask:

@@ -7,7 +7,6 @@ import polars as pl
 import pytest
 import torch
 from reference.refusals import user_error
-from reference.small_networks import recorded_scenes
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
 from ganlane.data.dense import recordings_of
@@ -32,11 +31,6 @@ def recording() -> pl.DataFrame:
         tracks.append(track.filter(number.is_between(first, last) & (number != gap)))
     # Numbers that are no indices.
     return pl.concat(tracks).with_columns(pl.col("vehicle") + 999, pl.col("frame") + 100)
-
-
-@pytest.fixture(scope="module")
-def scenes():
-    return recorded_scenes()
 
 
 @pytest.fixture(scope="module")

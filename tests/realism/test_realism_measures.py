@@ -16,9 +16,8 @@ from reference.refusals import user_error
 from scipy.spatial.distance import jensenshannon
 from scipy.stats import binom
 
-from ganlane.data import default_scenes, read_scenes, scene_lane_widths
+from ganlane.data import scene_lane_widths
 from ganlane.data.dense import recorded_frame, recordings_of
-from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Estimate
 from ganlane.realism.card import verdict
 from ganlane.realism.measures import (
@@ -238,13 +237,8 @@ def test_what_ships_is_small_and_holds_no_trajectories():
     assert all(0.0 < ceiling(shipped.counts[name]) < 1.0 for name in QUANTITIES)
 
 
-def test_what_ships_is_what_the_recordings_show():
-    try:
-        path = default_scenes()
-    except UserError as missing:
-        pytest.skip(str(missing))
-    frame = read_scenes(path)
-    recordings = recordings_of(frame, scene_lane_widths(frame))
+def test_what_ships_is_what_the_recordings_show(us101_scenes):
+    recordings = recordings_of(us101_scenes, scene_lane_widths(us101_scenes))
     measured = measure_recordings(recordings)
     shipped = Reference.load(SHIPPED_REFERENCE)
     assert shipped.units == [recording.name for recording in recordings]

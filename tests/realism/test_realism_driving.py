@@ -54,10 +54,8 @@ def test_constant_velocity_repeats_a_recording_of_it_from_a_vehicles_first_frame
 
 
 def test_a_vehicle_waits_while_another_stands_in_its_place():
-    blocked = steady()
+    x, y = steady().x, steady().y
     # The third appears in the first lane, where a car driven at constant velocity is just then.
-    x = blocked.x.copy()
-    y = blocked.y.copy()
     y[:, 2] = 0.0
     x[:, 2] = x[:, 0] + 3.0 * (np.arange(100) * 0.1 - 4.0)
     there = drive_recordings(ConstantVelocity, [steady(x=x, y=y)], StartOptions())

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 from matplotlib.colors import to_hex
 from reference.refusals import user_error
-from view_scenes import panels, run_folder, words
+from view_scenes import legend_of, panels, run_folder
 
 from ganlane.view.curves import draw_runs, read_run, read_runs
 from ganlane.view.figures import COLOURS
@@ -31,7 +31,7 @@ def test_every_panel_shows_every_run_that_has_its_numbers_in_the_run_s_colour(ru
         title: tuple(to_hex(line.get_color()) for line in axes.lines)
         for title, axes in panels(figure).items()
     }
-    assert words(figure.legends[0].get_texts()) == ["a", "b"]
+    assert legend_of(figure) == ["a", "b"]
     a, b, *_ = COLOURS
     both = ("mean return", "crash rate", "lane changes", "mean Q (replayed)", "discounted return")
     evaluated = ("evaluation: mean return", "evaluation: crash rate")
@@ -89,7 +89,7 @@ def test_seeds_are_drawn_as_their_mean_in_a_band(tmp_path):
     lengths = {name: len(frames) for name, frames in runs.items()}
     assert lengths == {"traffic=gan": 2, "traffic=idm": 2}
     figure = draw_runs(runs)
-    assert words(figure.legends[0].get_texts())[0] == "traffic=gan (2 seeds: mean, range)"
+    assert legend_of(figure)[0] == "traffic=gan (2 seeds: mean, range)"
     axes = panels(figure)["mean return"]
     assert axes.lines[0].get_ydata() == pytest.approx(1.5 * np.arange(1.0, 31.0))
     assert axes.collections[0].get_paths()[0].vertices[:, 1].max() == pytest.approx(60.0)

@@ -24,14 +24,15 @@ def road_of(picture):
 
 
 def bare(scene, frame=0):
-    return FramePainter(scene, BARE).draw(frame)
+    """The road in a frame without trails and speeds."""
+    return road_of(FramePainter(scene, BARE).draw(frame))
 
 
 def test_the_ego_stays_at_its_column_and_others_stand_at_their_distance():
     tint = canvas.speed_tint(20.0)
-    painter = FramePainter(straight([0, 40], [1, 2], frames=50), BARE)
+    scene = straight([0, 40], [1, 2], frames=50)
     for frame in (0, 17, 49):
-        picture = road_of(painter.draw(frame))
+        picture = bare(scene, frame)
         ego, other = place(picture, canvas.EGO), place(picture, tint)
         assert ego[0] == pytest.approx(0.38 * 1280, abs=2)
         assert other[0] - ego[0] == pytest.approx(40 * 1280 / 160, abs=2)
@@ -42,12 +43,10 @@ def test_the_ego_stays_at_its_column_and_others_stand_at_their_distance():
 def test_every_end_is_written_on_the_last_frame_only_and_a_crash_has_a_ring():
     cut_off = FramePainter(straight([0], [1]))
     ended = {end: FramePainter(straight([0], [1], outcome=end)) for end in keys.END_EVENTS}
-    assert len({painter.draw(19).tobytes() for painter in (cut_off, *ended.values())}) == 1 + len(
-        keys.END_EVENTS
-    )
-    assert {painter.draw(18).tobytes() for painter in ended.values()} == {
-        cut_off.draw(18).tobytes()
-    }
+    last = {painter.draw(19).tobytes() for painter in (cut_off, *ended.values())}
+    assert len(last) == 1 + len(keys.END_EVENTS)
+    before = {painter.draw(18).tobytes() for painter in ended.values()}
+    assert before == {cut_off.draw(18).tobytes()}
     assert area(road_of(ended["hard_crash"].draw(19))[60:], canvas.CRASH) > 500
 
 
@@ -55,13 +54,13 @@ def test_lights_show_braking_and_the_lane_to_be_entered():
     calm = straight([0], [1])
     braking = replace(calm, acceleration=calm.acceleration - 3.0)
     signalling = replace(calm, target_lane=calm.target_lane + 1)
-    assert area(road_of(bare(calm)), canvas.BRAKE) == 0
-    assert area(road_of(bare(braking)), canvas.BRAKE) > 5
-    lit = road_of(bare(signalling))
+    assert area(bare(calm), canvas.BRAKE) == 0
+    assert area(bare(braking), canvas.BRAKE) > 5
+    lit = bare(signalling)
     assert area(lit, canvas.AMBER, 12) > 5
     assert place(lit, canvas.AMBER, 12)[1] < place(lit, canvas.EGO)[1]
     # Indicators blink: dark half a second later.
-    assert area(road_of(bare(signalling, 5)), canvas.AMBER, 12) == 0
+    assert area(bare(signalling, 5), canvas.AMBER, 12) == 0
 
 
 @pytest.mark.slow

@@ -80,6 +80,6 @@ def panels(figure):
     return {axes.get_title("left"): axes for axes in figure.axes}
 
 
-def words(texts):
-    """Texts of matplotlib as strings."""
-    return [text.get_text() for text in texts]
+def legend_of(figure):
+    """The names in a figure's legend."""
+    return [text.get_text() for text in figure.legends[0].get_texts()]

@@ -4,7 +4,6 @@ On recordings as they are published, with folds and resuming.
 """
 
 import json
-from functools import partial
 from pathlib import Path
 
 import polars as pl
@@ -17,17 +16,12 @@ from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from ganlane.config.run import run_command
 from ganlane.generator.checkpoint import load_generator
 
-prepare = partial(run_command, "prepare")
-main = partial(run_command, "train_generator")
-
 FEW = [
     "generator.loop.updates=2",
     "generator.loop.evaluate_every=1",
     "generator.batch=4",
     "generator.stride=6",
 ]
-
-
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
@@ -40,30 +34,25 @@ def recordings():
     return "data.path=recordings.csv"
 
 
-def run(*arguments: str, folder: str = "fit") -> dict:
-    """Results of a fit in ``folder``, whose weights can be loaded."""
-    assert main([*arguments, *FEW, f"hydra.run.dir={folder}"]) == 0
-    _, metadata = load_generator(Path(folder) / "generator_paper.safetensors", "paper")
-    results = json.loads((Path(folder) / "results.json").read_text())
+def run(*arguments):
+    """Results of a fit, and the metadata of its weights."""
+    assert run_command("train_generator", [*arguments, *FEW, "hydra.run.dir=fit"]) == 0
+    _, metadata = load_generator("fit/generator_paper.safetensors", "paper")
+    results = json.loads(Path("fit/results.json").read_text())
     assert metadata["data"] == results["data"]
-    assert (
-        results["ade_m"].keys()
-        == results["fde_m"].keys()
-        == {"mean", "single", "best_of_20", "constant_velocity", "idm_own_headway"}
-    )
-    return results
+    forecasts = {"mean", "single", "best_of_20", "constant_velocity", "idm_own_headway"}
+    assert results["ade_m"].keys() == results["fde_m"].keys() == forecasts
+    return results, metadata
 
 
-def test_folds_are_pooled_kept_and_not_fitted_again(recordings, capsys):
-    options = (recordings, "folds=2")
-    results = run(*options)
+def test_folds_are_pooled_and_stand_in_the_weights(recordings, capsys):
+    results, metadata = run(recordings, "folds=2")
     pooled = results["folds"]["open_loop"]
     assert set(pooled["folds"]) == {"0", "1"}
     assert len(pooled["scenes"]) == 4
     out = capsys.readouterr().out
     assert "idm_own_headway" in out
     assert list(results["scenes"]) == results["data"]["held_out"]
-    _, metadata = load_generator(Path("fit") / "generator_paper.safetensors", "paper")
     assert metadata["folds"]["open_loop"]["ade_m"]["mean"] == pytest.approx(pooled["ade_m"]["mean"])
     assert metadata["config"]["seed"] == 0
     assert metadata["code"]["version"]
@@ -74,7 +63,7 @@ def test_the_periods_of_an_ngsim_file_are_the_scenes_whether_raw_or_prepared():
     scenes = traffic(scenes=3).partition_by("scene", maintain_order=True)
     rows = pl.concat(ngsim_rows(scene, START_MS + 900_000 * k) for k, scene in enumerate(scenes))
     Path("got.csv").write_text(portal_csv(rows))
-    raw = run("data=ngsim", "data.path=got.csv")
+    raw, _ = run("data=ngsim", "data.path=got.csv")
     data = raw["data"]
     assert (data["fitted"], data["validation"], data["held_out"]) == (
         ["us-101-3"],
@@ -82,8 +71,8 @@ def test_the_periods_of_an_ngsim_file_are_the_scenes_whether_raw_or_prepared():
         ["us-101-2"],
     )
     assert (data["file"], data["rows"], data["tracks"]) == ("got.csv", 3 * 9 * 60, 27)
-    assert prepare(["data=ngsim", "data.path=got.csv", "out=prepared"]) == 0
-    prepared = run("data.path=prepared")
+    assert run_command("prepare", ["data=ngsim", "data.path=got.csv", "out=prepared"]) == 0
+    prepared, _ = run("data.path=prepared")
     for name in ("ade_m", "fde_m", "scenes"):
         assert raw[name] == prepared[name]
 

@@ -86,8 +86,6 @@ def test_every_scene_is_forecast_once_by_a_generator_that_never_saw_it(paper):
     for split in splits:
         assert not set(split["held_out"]) & {*split["fitted"], *split["validation"]}
     assert open_loop["windows"] == sum(row["windows"] for row in open_loop["folds"].values()) > 0
-    kinds = {"mean", "single", "best_of_20", "constant_velocity", "idm_own_headway"}
-    assert kinds == set(open_loop["ade_m"])
     assert "best_of_20" in fold_tables(paper)
 
 

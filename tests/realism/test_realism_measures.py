@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from reference.recordings import made_by_hand, recorded_cars
@@ -111,6 +111,7 @@ COUNTS = arrays(np.float64, (2, 7), elements=st.integers(0, 50)).filter(
 )
 
 
+@settings(max_examples=30)
 @given(COUNTS)
 def test_distance_is_that_of_scipy(rows):
     expected = jensenshannon(rows[0], rows[1], base=2)

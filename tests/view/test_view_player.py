@@ -10,7 +10,7 @@ from itertools import accumulate
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from view_scenes import straight
 
@@ -25,6 +25,7 @@ def data_of(page):
     )
 
 
+@settings(max_examples=30)
 @given(
     st.lists(st.floats(-5000, 5000), min_size=1, max_size=50), st.sampled_from([0.01, 0.001, 0.1])
 )

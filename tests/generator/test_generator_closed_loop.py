@@ -45,8 +45,8 @@ def test_without_a_residual_a_follower_settles_at_its_own_equilibrium_gap():
     state = scene({"speed": 18.0}, {"x": 36.0, "speed": 18.0, "desired_speed": 18.0})
     state, _ = drive(silent_generator(), state, 25)
     gap = state.x[0, 1] - state.x[0, 0] - 4.5
-    own = equilibrium_gap(state.speed[0, 0], 25.0, IdmParameters(headway_s=1.27))
-    assert gap.item() == pytest.approx(own.item(), rel=0.02)
+    expected = equilibrium_gap(state.speed[0, 0], 25.0, IdmParameters(headway_s=1.27))
+    assert gap.item() == pytest.approx(expected.item(), rel=0.02)
 
 
 def test_without_a_residual_a_lane_change_arrives_and_does_not_overshoot():

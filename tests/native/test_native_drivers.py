@@ -133,7 +133,7 @@ OTHER_OPTIONS = [
 ]
 
 
-@pytest.mark.parametrize("traffic", OTHER_OPTIONS, ids="-".join)
+@pytest.mark.parametrize("traffic", OTHER_OPTIONS, ids=str)
 def test_it_decides_as_the_tensor_code(traffic):
     differ, _ = compare(traffic, highways=2, rows=32, decisions=4, seed=3)
     # A random number at a threshold may fall on its other side.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 import pytest
-from reference.recordings import write_highd
+from reference.recordings import damage_field, write_highd
 from reference.refusals import user_error
 
 from ganlane.data import SCHEMA, read_recordings
@@ -71,13 +71,6 @@ def test_rows_off_the_lanes_are_dropped_and_end_a_track(recording):
     assert sorted(lower.frame["vehicle"].unique()) == [3, 4, 10_003]
 
 
-def damaged(path, column, row, value):
-    # As text, so that all other fields stay as they are.
-    table = pl.read_csv(path, infer_schema=False).with_row_index()
-    field = pl.when(pl.col("index") == row).then(pl.lit(value)).otherwise(column).alias(column)
-    table.with_columns(field).drop("index").write_csv(path)
-
-
 @pytest.mark.parametrize(
     ("column", "row", "value", "message"),
     [
@@ -88,7 +81,7 @@ def damaged(path, column, row, value):
     ],
 )
 def test_a_damaged_field_is_named(recording, column, row, value, message):
-    damaged(recording, column, row, value)
+    damage_field(recording, column, row, value)
     with user_error(f"01_tracks.csv, {message}"):
         read_recordings("highd", recording)
 
@@ -107,14 +100,14 @@ def test_units_that_cannot_be_are_refused(recording):
 def test_the_metadata_files_are_required_and_checked(recording):
     meta = recording.with_name("01_recordingMeta.csv")
     # First the markings, then files that are not there.
-    damaged(meta, "upperLaneMarkings", 0, "8.0;moon")
+    damage_field(meta, "upperLaneMarkings", 0, "8.0;moon")
     with user_error(r"recordingMeta.csv, line 2, column upperlanemarkings: '8.0;moon'"):
         read_recordings("highd", recording)
     meta.unlink()
     with user_error(r"01_recordingMeta.csv: no such file"):
         read_recordings("highd", recording)
     write_highd(recording.parent)
-    damaged(recording.with_name("01_tracksMeta.csv"), "drivingDirection", 1, "3")
+    damage_field(recording.with_name("01_tracksMeta.csv"), "drivingDirection", 1, "3")
     with user_error(r"01_tracksMeta.csv, line 3, column drivingdirection: 3 is neither"):
         read_recordings("highd", recording)
     with user_error(r"no XX_tracks.csv in this folder"):

@@ -9,7 +9,15 @@ from pathlib import Path
 
 import polars as pl
 import pytest
-from reference.recordings import LANE_M, START_MS, ngsim_rows, portal_csv, raw_text, traffic
+from reference.recordings import (
+    LANE_M,
+    START_MS,
+    damage_field,
+    ngsim_rows,
+    portal_csv,
+    raw_text,
+    traffic,
+)
 from reference.refusals import user_error
 
 from ganlane.data import SCHEMA, read_recordings
@@ -108,14 +116,11 @@ def test_ramps_are_left_out_and_end_a_track():
     assert frames[10_002] == list(range(30, 60))
 
 
-def changed(row: int, column: str, value: str):
-    """The portal's file with one field changed; ``row`` counts from 0 below the header."""
-    # Without quotes, so that fields can be split at commas.
-    lines = portal_csv(ngsim_rows(FIRST), thousands=False).splitlines()
-    fields = lines[row + 1].split(",")
-    fields[lines[0].split(",").index(column)] = value
-    lines[row + 1] = ",".join(fields)
-    return portal_file("\n".join(lines) + "\n")
+def changed(row, column, value):
+    """The portal's file with one field changed."""
+    path = portal_file(portal_csv(ngsim_rows(FIRST)))
+    damage_field(path, column, row, value)
+    return path
 
 
 @pytest.mark.parametrize(

@@ -110,6 +110,14 @@ def write_highd(folder: Path, name: str = "01", seconds: float = 8.0) -> None:
     pl.DataFrame(recording).write_csv(folder / f"{name}_recordingMeta.csv")
 
 
+def damage_field(path: Path, column: str, row: int, value: str) -> None:
+    """Change one field of a CSV file; ``row`` counts from 0 below the header."""
+    # As text, so that all other fields stay as they are.
+    table = pl.read_csv(path, infer_schema=False).with_row_index()
+    field = pl.when(pl.col("index") == row).then(pl.lit(value)).otherwise(column).alias(column)
+    table.with_columns(field).drop("index").write_csv(path)
+
+
 def recorded_cars(**size) -> list[Recording]:
     """Synthetic scenes as recordings."""
     frame = synthetic_scenes(SyntheticTraffic(**size))

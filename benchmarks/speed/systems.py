@@ -202,7 +202,7 @@ def start_training(
     state = TrainingState(env, agent)
     while not agent.ready:
         loop.advance(state)
-    transitions = agent.replay[:].select(*TRANSITION_KEYS).clone()
+    transitions = agent.replay[:].select(*TRANSITION_KEYS, strict=False).clone()
     while (missing := stored - len(agent.replay)) > 0:
         agent.store(transitions[:missing])
     # As different as those of a run, in parts that the sampler takes at once.

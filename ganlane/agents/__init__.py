@@ -9,13 +9,7 @@ holds it all together. :mod:`~ganlane.agents.checkpoint` writes the trained netw
 it back, and starts another agent from it.
 """
 
-from ganlane.agents.checkpoint import (
-    agent_file,
-    load_agent,
-    read_agent,
-    save_agent,
-    warm_start,
-)
+from ganlane.agents.checkpoint import agent_file, load_agent, read_agent, save_agent, warm_start
 from ganlane.agents.drivers import ExploringPolicy, GreedyPolicy
 from ganlane.agents.n_step import NStepWindow
 from ganlane.agents.network import NetworkConfig, QNetwork

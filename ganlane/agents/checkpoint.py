@@ -14,12 +14,7 @@ from torch import Tensor
 
 from ganlane._version import __version__
 from ganlane.agents.drivers import GreedyPolicy
-from ganlane.agents.network import (
-    SHAPE,
-    NetworkConfig,
-    QNetwork,
-    load_parameters,
-)
+from ganlane.agents.network import SHAPE, NetworkConfig, QNetwork, load_parameters
 from ganlane.agents.rainbow import Rainbow
 from ganlane.errors import UserError, as_typed
 from ganlane.files import CHECKPOINTS
@@ -48,10 +43,7 @@ def _place(name: str | Path) -> tuple[Path, int | None]:
             name = recipe
         elif recipe.endswith(".safetensors"):
             return Path(recipe), seed
-    return (
-        CHECKPOINTS / f"{name}.safetensors" if name in SHIPPED else Path(name),
-        None,
-    )
+    return CHECKPOINTS / f"{name}.safetensors" if name in SHIPPED else Path(name), None
 
 
 def _seeds_file(recipe: str) -> Path:
@@ -101,9 +93,7 @@ def with_seeds(name: str) -> list[str]:
     return [f"{recipe}@{seed}{mask}" for seed in seeds]
 
 
-def _read_several(
-    path: Path,
-) -> tuple[dict[str, Tensor], dict[int, dict[str, Any]]]:
+def _read_several(path: Path) -> tuple[dict[str, Tensor], dict[int, dict[str, Any]]]:
     """Tensors and, by seed, metadata of a file with several trainings."""
     tensors, metadata = load_weights(path, SEVERAL)
     agents = metadata.get("agents")
@@ -131,11 +121,7 @@ def agent_file(name: str | Path) -> Path:
     return path
 
 
-def save_agent(
-    path: str | Path,
-    agent: Rainbow,
-    metadata: Mapping[str, Any],
-) -> None:
+def save_agent(path: str | Path, agent: Rainbow, metadata: Mapping[str, Any]) -> None:
     """Write the agent's online network atomically, as a ``.safetensors`` file.
 
     ``metadata`` is JSON-serialisable; by convention ``observation`` (the name of the observation)
@@ -144,22 +130,11 @@ def save_agent(
     """
     # Enough to build the network again without the run that trained it.
     network = agent.network.config.description()
-    header = {
-        **metadata,
-        "network": network,
-        "code_version": __version__,
-    }
-    save_weights(
-        path,
-        "agent",
-        agent.weights(),
-        header,
-    )
+    header = {**metadata, "network": network, "code_version": __version__}
+    save_weights(path, "agent", agent.weights(), header)
 
 
-def read_agent(
-    name: str | Path,
-) -> tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]:
+def read_agent(name: str | Path) -> tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]:
     """Weights, network config and metadata of a shipped agent or an agent's file.
 
     Raises:
@@ -188,12 +163,7 @@ def read_agent(
     # The description comes from a file, so any part of it may be missing or of a wrong type.
     try:
         config = NetworkConfig.described(metadata["network"])
-    except (
-        AttributeError,
-        KeyError,
-        TypeError,
-        UserError,
-    ) as error:
+    except (AttributeError, KeyError, TypeError, UserError) as error:
         raise UserError(
             f"{path}: its description of the network is not understood ({error}); train the agent "
             "anew with this version of ganlane."
@@ -219,11 +189,7 @@ def load_agent(
     return GreedyPolicy(network.to(device)), metadata
 
 
-def check_observation_size(
-    name: str | Path,
-    config: NetworkConfig,
-    observation_size: int,
-) -> None:
+def check_observation_size(name: str | Path, config: NetworkConfig, observation_size: int) -> None:
     """Refuse an agent whose network takes another number of inputs."""
     if config.observation_size != observation_size:
         raise UserError(
@@ -234,10 +200,7 @@ def check_observation_size(
 
 
 def warm_start(
-    agent: Rainbow,
-    name: str | Path,
-    weights: Mapping[str, Tensor],
-    network: NetworkConfig,
+    agent: Rainbow, name: str | Path, weights: Mapping[str, Tensor], network: NetworkConfig
 ) -> None:
     """Start ``agent`` from the ``weights`` of the trained agent ``name``.
 
@@ -248,10 +211,7 @@ def warm_start(
     check_observation_size(name, network, agent.network.config.observation_size)
     here = agent.config
     trained = network.agent
-    ignored = {
-        "noisy_sigma",
-        *(() if here.distributional else SUPPORT),
-    }
+    ignored = ("noisy_sigma", *(() if here.distributional else SUPPORT))
     # what the weights mean must agree, not how they were learned
     differing = [
         option

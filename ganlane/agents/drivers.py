@@ -14,25 +14,14 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs.utils import (
-    ExplorationType,
-    exploration_type,
-    set_exploration_type,
-)
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from ganlane import keys
-from ganlane.agents.network import (
-    QNetwork,
-    allowed_values,
-    redraw_noise,
-)
+from ganlane.agents.network import QNetwork, allowed_values, redraw_noise
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, LEFT, RIGHT
 from ganlane.settings.actions import LANE_SPEED, ActionParameters
-from ganlane.settings.driving import (
-    IdmParameters,
-    MobilParameters,
-)
+from ganlane.settings.driving import IdmParameters, MobilParameters
 from ganlane.sim.dynamics import SIDES, ego_scene, stays_on_road
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV, mobil_wishes
@@ -90,10 +79,7 @@ class ExploringPolicy(TensorDictModuleBase):
     out_keys = [keys.ACTION, keys.CHOSEN_VALUE]  # noqa: RUF012
 
     def __init__(
-        self,
-        network: QNetwork,
-        generator: torch.Generator,
-        legal: LegalActions | None = None,
+        self, network: QNetwork, generator: torch.Generator, legal: LegalActions | None = None
     ) -> None:
         super().__init__()
         self.network = network
@@ -105,15 +91,11 @@ class ExploringPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` and ``chosen_action_value``."""
-        explore = exploration_type() in (
-            None,
-            ExplorationType.RANDOM,
-        )
+        explore = exploration_type() in (None, ExplorationType.RANDOM)
         if explore:
             redraw_noise(self.network, self.generator)
-        with set_exploration_type(
-            ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
-        ):
+        noise = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
+        with set_exploration_type(noise):
             values = self.network.values(tensordict.get(keys.OBSERVATION))
         mask = tensordict.get(keys.ACTION_MASK, None)
         action = allowed_values(values, mask).argmax(-1)
@@ -129,9 +111,7 @@ class ExploringPolicy(TensorDictModuleBase):
             # the largest of uniform numbers, 0 where not allowed, is a uniform draw
             lottery = torch.rand(mask.shape, **draw) * mask
             action = torch.where(
-                torch.rand(action.shape, **draw) < self.epsilon,
-                lottery.argmax(-1),
-                action,
+                torch.rand(action.shape, **draw) < self.epsilon, lottery.argmax(-1), action
             )
         # for the statistics: what the policy expects of its choice
         chosen = values.gather(-1, action[..., None])
@@ -234,9 +214,7 @@ class Driver(TensorDictModuleBase):
 
 
 def legal_actions(
-    tensordict: TensorDictBase,
-    road: Road,
-    actions: ActionParameters | None = None,
+    tensordict: TensorDictBase, road: Road, actions: ActionParameters | None = None
 ) -> Tensor:
     """Which actions stay on the road, bool [N, A]: keeping the lane always does.
 
@@ -259,17 +237,9 @@ class RandomDriver(Driver):
 
     def _uniform(self, tensordict: TensorDictBase) -> Tensor:
         # By counters, not by a generator: an episode draws the same actions in any batch.
-        key = episode_key(
-            self.stream,
-            tensordict.get(keys.SEED),
-            tensordict.get(keys.EPISODE),
-        )
-        return uniform(
-            key,
-            tensordict.get(keys.STEP),
-            1,
-            [Purpose.RANDOM_ACTION],
-        )[:, 0, 0]
+        seed, episode, step = map(tensordict.get, (keys.SEED, keys.EPISODE, keys.STEP))
+        key = episode_key(self.stream, seed, episode)
+        return uniform(key, step, 1, [Purpose.RANDOM_ACTION])[:, 0, 0]
 
     def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
         """Floor of three times a uniform number."""
@@ -329,9 +299,7 @@ class MobilDriver(Driver):
 def egoistic_mobil(road: Road, stream: int = Stream.TRAIN) -> MobilDriver:
     """MOBIL with politeness 0."""
     return MobilDriver(
-        road,
-        stream,
-        mobil=replace(TABLE_IV, politeness_rear=0.0, politeness_side=0.0),
+        road, stream, mobil=replace(TABLE_IV, politeness_rear=0.0, politeness_side=0.0)
     )
 
 

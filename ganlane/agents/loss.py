@@ -36,12 +36,12 @@ _BETA_2 = 0.999
 
 
 class Loss(NamedTuple):
-    """Of a batch: ``loss`` and ``priority`` [B]; 0-dim ``mean_q``, the mean value of the best next
+    """Of a batch: ``priority`` and ``loss`` [B]; 0-dim ``mean_q``, the mean value of the best next
     actions, and ``clamped_fraction``, the mass of the targets outside the support.
     """
 
-    loss: Tensor
     priority: Tensor
+    loss: Tensor
     mean_q: Tensor
     clamped_fraction: Tensor
 
@@ -76,7 +76,7 @@ def loss_of(
         target = bellman(batch, config.gamma, following_logits)
         loss = smooth_l1_loss(logits, target, reduction="none").squeeze(-1)
         error = (target - logits.detach()).abs().squeeze(-1)
-        return Loss(loss, error, mean_q, torch.zeros_like(mean_q))
+        return Loss(error, loss, mean_q, torch.zeros_like(mean_q))
     returns = bellman(batch, config.gamma, network.support)
     wanted, clamped = project(returns, following_logits.softmax(-1), network.support)
     loss = -(wanted * logits.log_softmax(-1)).sum(-1)
@@ -84,14 +84,10 @@ def loss_of(
     # the entropy of the target, the rest of the KL divergence, is not the network's fault
     if config.kl_priority:
         priority = (priority - torch.special.entr(wanted).sum(-1)).clamp_min(0.0)
-    return Loss(loss, priority, mean_q, clamped)
+    return Loss(priority, loss, mean_q, clamped)
 
 
-def bellman(
-    batch: TensorDictBase,
-    gamma: float,
-    value: Tensor,
-) -> Tensor:
+def bellman(batch: TensorDictBase, gamma: float, value: Tensor) -> Tensor:
     """Return of each transition plus the discounted ``value`` [B, K] or [K] of what follows.
 
     Nothing follows where it terminated.
@@ -102,11 +98,7 @@ def bellman(
     return batch.get(("next", "reward")).to(value.dtype) + alive * discount * value
 
 
-def project(
-    values: Tensor,
-    probabilities: Tensor,
-    support: Tensor,
-) -> tuple[Tensor, Tensor]:
+def project(values: Tensor, probabilities: Tensor, support: Tensor) -> tuple[Tensor, Tensor]:
     """Project the distribution with ``probabilities`` at ``values``, [B, K], onto ``support`` [K].
 
     Returns it, and the mass that is clamped, a mean over the batch, 0-dim.
@@ -154,7 +146,9 @@ class Batch(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """What an update gives: ``priority`` [B], the others 0-dim (``loss`` is weighted)."""
+    """What an update gives: the fields of :class:`Loss`, but a weighted mean ``loss``, 0-dim, and
+    ``gradient_norm``, 0-dim.
+    """
 
     priority: Tensor
     loss: Tensor
@@ -174,9 +168,7 @@ class Settings(NamedTuple):
 
 
 def composed_layers(
-    parameters: list[Tensor],
-    noise: Sequence[Sequence[Tensor]],
-    actions: int,
+    parameters: list[Tensor], noise: Sequence[Sequence[Tensor]], actions: int
 ) -> Weights:
     """Weight and bias of every layer of a network (Fortunato et al. 2017), the duel folded into the
     last.
@@ -203,26 +195,16 @@ def unfolded(gradient: Tensor, actions: int) -> Tensor:
     """Gradient of the head from that of the folded head: the transpose of :func:`folded`."""
     # V gets the sum of all, each A_a its own less the mean
     rows = gradient.unflatten(0, (actions, -1))
-    return torch.cat(
-        (
-            rows.sum(0, keepdim=True),
-            rows - rows.mean(0, keepdim=True),
-        )
-    ).flatten(0, 1)
+    of_value, of_advantages = rows.sum(0, keepdim=True), rows - rows.mean(0, keepdim=True)
+    return torch.cat((of_value, of_advantages)).flatten(0, 1)
 
 
 def forward(layers: Weights, x: Tensor) -> list[Tensor]:
     """The input of every layer, and the output of the last."""
     inputs = [x]
     for number, (weight, bias) in enumerate(layers):
-        inputs.append(
-            matrix_product(
-                inputs[-1],
-                weight,
-                bias,
-                relu=number < len(layers) - 1,
-            )
-        )
+        relu = number < len(layers) - 1
+        inputs.append(matrix_product(inputs[-1], weight, bias, relu))
     return inputs
 
 
@@ -311,13 +293,7 @@ def update(
     of_taken = (log_p.exp() * wanted.sum(-1, keepdim=True) - wanted) * share
     is_taken = batch.action[:, None] == torch.arange(actions, device=support.device)
     of_logits = torch.where(is_taken[..., None], of_taken[:, None, :], 0.0).flatten(1)
-    by_parameter = gradients(
-        layers,
-        noise,
-        [x[:rows] for x in inputs],
-        of_logits,
-        actions,
-    )
+    by_parameter = gradients(layers, noise, [x[:rows] for x in inputs], of_logits, actions)
 
     # clipping as by clip_grad_norm_, then Adam
     norm = torch.stack([(gradient * gradient).sum() for gradient in by_parameter]).sum().sqrt()
@@ -328,13 +304,7 @@ def update(
         second.mul_(_BETA_2).addcmul_(clipped, clipped, value=1.0 - _BETA_2)
         step = first * corrections[0] / ((second * corrections[1]).sqrt() + settings.adam_eps)
         parameter.sub_(rate * step)
-    return Learned(
-        priority,
-        (batch.weight * loss).mean(),
-        best.mean(),
-        clamped,
-        norm,
-    )
+    return Learned(priority, (batch.weight * loss).mean(), best.mean(), clamped, norm)
 
 
 class UpdateGraph:
@@ -356,11 +326,7 @@ class UpdateGraph:
         self.optimizer = optimizer
         (group,) = optimizer.param_groups
         self.settings = Settings(
-            network.config.actions,
-            config.atoms,
-            config.gamma,
-            config.gradient_clip,
-            group["eps"],
+            network.config.actions, config.atoms, config.gamma, config.gradient_clip, group["eps"]
         )
         self._update: Callable[..., Learned] = compiled(update) if compile else update
 
@@ -391,12 +357,7 @@ class UpdateGraph:
             self._batch(batch),
             # a tensor: a number would be a constant of the graph, compiled anew at each change
             torch.tensor(float(group["lr"])),
-            torch.tensor(
-                [
-                    1.0 / (1.0 - _BETA_1**step),
-                    1.0 / (1.0 - _BETA_2**step),
-                ]
-            ),
+            torch.tensor([1.0 / (1.0 - _BETA_1**step), 1.0 / (1.0 - _BETA_2**step)]),
         )
 
     def _batch(self, batch: TensorDictBase) -> Batch:
@@ -405,10 +366,7 @@ class UpdateGraph:
         following = batch.get("next")
         allowed = following.get(keys.ACTION_MASK, None)
         if allowed is None:
-            allowed = torch.ones(
-                (len(action), self.settings.actions),
-                dtype=torch.bool,
-            )
+            allowed = torch.ones((len(action), self.settings.actions), dtype=torch.bool)
         return Batch(
             batch.get("observation"),
             action,

@@ -56,11 +56,7 @@ class NStepWindow:
     not at all.
     """
 
-    def __init__(
-        self,
-        n: int,
-        gamma: float,
-    ) -> None:
+    def __init__(self, n: int, gamma: float) -> None:
         self.n = n
         self.gamma = gamma
         # Between two calls of push() at most n - 1.

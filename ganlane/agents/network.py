@@ -110,10 +110,7 @@ class QNetwork(nn.Module):
         widths = (config.observation_size, *options.hidden)
         self.trunk = nn.ModuleList(layer(*pair) for pair in pairwise(widths))
         # a dueling head has one row more, the value
-        self.head = layer(
-            widths[-1],
-            (config.actions + options.dueling) * config.outputs,
-        )
+        self.head = layer(widths[-1], (config.actions + options.dueling) * config.outputs)
         support = torch.linspace(options.v_min, options.v_max, options.atoms)
         # Not persistent: an agent's file has the bounds of the support in its description.
         self.register_buffer("support", support, persistent=False)
@@ -122,11 +119,7 @@ class QNetwork(nn.Module):
         """Weight and bias of every layer, the head last, with the present noise added."""
         return [(layer.weight, layer.bias) for layer in (*self.trunk, self.head)]
 
-    def logits(
-        self,
-        observation: Tensor,
-        weights: Weights | None = None,
-    ) -> Tensor:
+    def logits(self, observation: Tensor, weights: Weights | None = None) -> Tensor:
         """Unnormalised output [*, A, atoms] (atoms is 1 when not distributional) for observations
         [*, D].
 
@@ -138,12 +131,7 @@ class QNetwork(nn.Module):
         # observations may come in another precision
         hidden = observation.to(self.support.dtype)
         for weight, bias in hidden_layers:
-            hidden = linear(
-                hidden,
-                weight,
-                bias,
-                relu=True,
-            )
+            hidden = linear(hidden, weight, bias, relu=True)
         # [*, (1 +) A, atoms]
         rows = linear(hidden, *head).unflatten(-1, (-1, self.config.outputs))
         return duel(rows) if self.config.agent.dueling else rows
@@ -224,11 +212,7 @@ def noise_of(network: nn.Module, generator: torch.Generator) -> list[tuple[Tenso
         return []
     # one draw for all layers, which is faster than one for each
     sizes = [size for layer in layers for size in (layer.in_features, layer.out_features)]
-    normal = torch.randn(
-        sum(sizes),
-        generator=generator,
-        device=generator.device,
-    )
+    normal = torch.randn(sum(sizes), generator=generator, device=generator.device)
     # f(x) = sgn(x) sqrt(|x|), equation 11 of Fortunato et al.
     noise = (normal.sign() * normal.abs().sqrt()).split(sizes)
     return list(zip(noise[::2], noise[1::2]))

@@ -12,11 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from ganlane.agents.drivers import (
-    ExploringPolicy,
-    GreedyPolicy,
-    LegalActions,
-)
+from ganlane.agents.drivers import ExploringPolicy, GreedyPolicy, LegalActions
 from ganlane.agents.loss import Learned, UpdateGraph, loss_of
 from ganlane.agents.network import (
     NetworkConfig,
@@ -26,12 +22,7 @@ from ganlane.agents.network import (
     parameters_of,
     redraw_noise,
 )
-from ganlane.agents.replay import (
-    draw,
-    load_replay_state,
-    make_replay,
-    replay_state,
-)
+from ganlane.agents.replay import draw, load_replay_state, make_replay, replay_state
 from ganlane.errors import ParameterError, UserError
 from ganlane.settings.agent import RainbowConfig
 
@@ -85,19 +76,12 @@ class Rainbow:
         # Rainbow's 1.5e-4 is 0.005 over its batch of 32
         adam_eps = 0.005 / config.batch_size if config.adam_eps is None else config.adam_eps
         self.optimizer = torch.optim.Adam(
-            self.network.parameters(),
-            lr=config.learning_rate,
-            eps=adam_eps,
-            fused=True,
+            self.network.parameters(), lr=config.learning_rate, eps=adam_eps, fused=True
         )
         # which draws from a generator of its own
         self.replay = make_replay(config, self.generators["replay"])
         # one network, two ways to drive with it
-        self.policy = ExploringPolicy(
-            self.network,
-            self.generators["collect"],
-            legal,
-        )
+        self.policy = ExploringPolicy(self.network, self.generators["collect"], legal)
         self.greedy = GreedyPolicy(self.network)
         # since the start of the training
         self.updates = 0
@@ -106,12 +90,7 @@ class Rainbow:
         # by step.
         parts = ("distributional", "double", "dueling", "noisy", "prioritised", "kl_priority")
         if compile and all(getattr(config, part) for part in parts) and self.device.type == "cpu":
-            self.graph = UpdateGraph(
-                self.network,
-                self.target,
-                self.optimizer,
-                config,
-            )
+            self.graph = UpdateGraph(self.network, self.target, self.optimizer, config)
         self.anneal(0)
 
     @property
@@ -123,10 +102,7 @@ class Rainbow:
         """Set the share of random actions and the learning rate after ``decisions``."""
         config = self.config
         self.policy.epsilon = annealed(
-            config.epsilon_start,
-            config.epsilon,
-            decisions,
-            config.epsilon_decisions,
+            config.epsilon_start, config.epsilon, decisions, config.epsilon_decisions
         )
         if config.learning_rate_end is not None:
             (group,) = self.optimizer.param_groups
@@ -146,12 +122,8 @@ class Rainbow:
         """One step of gradient descent; gives 0-dim tensors to log, still on the device."""
         config = self.config
         if config.prioritised:
-            self.replay.sampler.beta = annealed(
-                config.beta_start,
-                1.0,
-                self.updates,
-                config.beta_updates,
-            )
+            beta = annealed(config.beta_start, 1.0, self.updates, config.beta_updates)
+            self.replay.sampler.beta = beta
         # one batch by priority
         batch = draw(self.replay)
         descend = self._descend if self.graph is None else self.graph
@@ -166,11 +138,7 @@ class Rainbow:
             load_parameters(self.target, self.weights())
         return {**learned._asdict(), "priority": learned.priority.mean()}
 
-    def _descend(
-        self,
-        batch: TensorDict,
-        generator: torch.Generator,
-    ) -> Learned:
+    def _descend(self, batch: TensorDict, generator: torch.Generator) -> Learned:
         """What :class:`~ganlane.agents.loss.UpdateGraph` does, for every ``config`` and device."""
         # both networks get new noise for every update
         for module in (self.network, self.target):
@@ -184,13 +152,7 @@ class Rainbow:
         objective.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
         self.optimizer.step()
-        return Learned(
-            terms.priority,
-            objective.detach(),
-            terms.mean_q,
-            terms.clamped_fraction,
-            norm,
-        )
+        return Learned(*terms._replace(loss=objective.detach()), norm)
 
     def sigma(self) -> Tensor:
         """Mean absolute noise parameter over the weights of the noisy layers, 0-dim.
@@ -278,11 +240,6 @@ class Rainbow:
             load_replay_state(self.replay, state["replay"])
 
 
-def annealed(
-    start: float,
-    end: float,
-    done: int,
-    total: int,
-) -> float:
+def annealed(start: float, end: float, done: int, total: int) -> float:
     """From ``start`` to ``end`` in a straight line over ``total``, then ``end``."""
     return end if done >= total else start + (end - start) * done / total

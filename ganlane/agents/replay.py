@@ -31,9 +31,9 @@ TRANSITION_KEYS = (
     ("next", "observation"),
     ("next", "reward"),
     ("next", "terminated"),
+    # where the environment has a mask
+    ("next", "action_mask"),
 )
-#: Further keys where the environment has a mask.
-MASK_KEY: tuple[str, ...] = ("next", "action_mask")
 #: Priorities per row: a sum tree of two levels, the lower one 64 wide.
 ROW = 64
 
@@ -44,12 +44,7 @@ def make_replay(config: RainbowConfig, generator: torch.Generator) -> TensorDict
     device = generator.device
     sampler = RandomSampler()
     if config.prioritised:
-        sampler = RowSampler(
-            capacity,
-            config.alpha,
-            config.beta_start,
-            device,
-        )
+        sampler = RowSampler(capacity, config.alpha, config.beta_start, device)
     return TensorDictReplayBuffer(
         storage=LazyTensorStorage(capacity, device=device),
         sampler=sampler,
@@ -75,7 +70,7 @@ def replay_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
     """Plain data: the transitions in use (by dotted key), the place of the next, the sampler."""
     # in the order of the storage, so that the indices of the sampler hold
     rows = buffer[:] if len(buffer) else TensorDict({}, [0])
-    tensors = dict(rows.select(*TRANSITION_KEYS, MASK_KEY, strict=False).flatten_keys(".").items())
+    tensors = dict(rows.select(*TRANSITION_KEYS, strict=False).flatten_keys(".").items())
     # a view would be saved with all of the storage behind it
     if len(buffer) < buffer.storage.max_size:
         tensors = {name: tensor.clone() for name, tensor in tensors.items()}
@@ -108,13 +103,7 @@ class RowSampler(PrioritizedSampler):
     construction) and from no other.
     """
 
-    def __init__(
-        self,
-        max_capacity: int,
-        alpha: float,
-        beta: float,
-        device: torch.device,
-    ) -> None:
+    def __init__(self, max_capacity: int, alpha: float, beta: float, device: torch.device) -> None:
         # not the parent's constructor: it warns of a missing C++ extension, not needed here
         self._max_capacity = max_capacity
         self._alpha = alpha
@@ -130,11 +119,7 @@ class RowSampler(PrioritizedSampler):
         # rounded up
         rows = -(-self._max_capacity // ROW)
         self.priorities = torch.zeros(rows, ROW, device=self._device)
-        self.row_sums = torch.zeros(
-            rows,
-            dtype=torch.float64,
-            device=self._device,
-        )
+        self.row_sums = torch.zeros(rows, dtype=torch.float64, device=self._device)
         self.largest = torch.ones((), device=self._device)
 
     @property
@@ -147,23 +132,9 @@ class RowSampler(PrioritizedSampler):
         """Raw priority of a new item, 0-dim: the largest seen, at least 1."""
         return self.largest
 
-    def _maybe_init_from_storage(self, storage: Storage | None) -> None:
-        """The device is the constructor's, not the storage's."""
-
-    def _retransform_priority_trees(
-        self,
-        old_alpha: float,
-        new_alpha: float,
-    ) -> None:
-        raise NotImplementedError("alpha is fixed for the life of a RowSampler")
-
     @torch.no_grad()
     def update_priority(
-        self,
-        index: Tensor | int,
-        priority: Tensor | float,
-        *,
-        storage: Storage | None = None,
+        self, index: Tensor | int, priority: Tensor | float, *, storage: Storage | None = None
     ) -> None:
         """Give the items at ``index`` [B] raw priorities of at least 0: [B], [B, 1] or a number."""
         index = torch.as_tensor(index, device=self.device).reshape(-1)
@@ -176,14 +147,8 @@ class RowSampler(PrioritizedSampler):
         self.row_sums[row] = self.priorities[row].sum(-1, dtype=torch.float64)
 
     @torch.no_grad()
-    def sample(
-        self,
-        storage: Storage,
-        batch_size: int,
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
         """Indices [B] and ``priority_weight`` [B], in (0, 1]."""
-        if len(storage) == 0:
-            raise RuntimeError("cannot sample from an empty replay buffer")
         # In double precision, since the sums run over all priorities.
         cumulated = self.row_sums.cumsum(0)
         # reading it would make a GPU wait
@@ -192,12 +157,8 @@ class RowSampler(PrioritizedSampler):
                 "training has diverged: its errors are not finite; lower agent.learning_rate and "
                 "start again, or go on from an earlier checkpoint."
             )
-        uniform = torch.rand(
-            batch_size,
-            generator=self._rng,
-            dtype=torch.float64,
-            device=self.device,
-        )
+        options: Any = {"dtype": torch.float64, "device": self.device}
+        uniform = torch.rand(batch_size, generator=self._rng, **options)
         # first the row in which the drawn mass lies, then the item within it
         mass = _below(uniform * cumulated[-1], cumulated[-1])
         row = torch.searchsorted(cumulated, mass, right=True)

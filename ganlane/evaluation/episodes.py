@@ -88,26 +88,11 @@ def run_episodes(
     numbers = list(episodes)
     # Noisy layers and epsilon-greedy stay off: a table is about the learnt policy.
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        driven = _Evaluation(
-            env,
-            policy,
-            numbers,
-            seed,
-            make_smaller,
-        ).run(on_progress)
-    return _episode_rows(
-        driven,
-        numbers,
-        seed,
-        getattr(env, "road", STRAIGHT),
-    )
+        driven = _Evaluation(env, policy, numbers, seed, make_smaller).run(on_progress)
+    return _episode_rows(driven, numbers, seed, getattr(env, "road", STRAIGHT))
 
 
-def start_of(
-    env: EnvBase,
-    numbers: Sequence[int],
-    seed: int,
-) -> TensorDict:
+def start_of(env: EnvBase, numbers: Sequence[int], seed: int) -> TensorDict:
     """The tensordict that makes ``env.reset`` start these episodes.
 
     The last one also fills the rows left over. :class:`UserError` for none.
@@ -117,17 +102,10 @@ def start_of(
             "episodes: none were asked for; expected at least one, give for instance episodes=100."
         )
     rows = env.batch_size[0]
-    padded = list(numbers) + [numbers[-1]] * (rows - len(numbers))
-    episode = torch.tensor(
-        padded,
-        dtype=torch.int64,
-        device=env.device,
-    )
-    return TensorDict(
-        {keys.SEED: torch.full_like(episode, seed), keys.EPISODE: episode},
-        [rows],
-        device=env.device,
-    )
+    padded = [*numbers, *[numbers[-1]] * (rows - len(numbers))]
+    episode = torch.tensor(padded, dtype=torch.int64, device=env.device)
+    counters = {keys.SEED: torch.full_like(episode, seed), keys.EPISODE: episode}
+    return TensorDict(counters, [rows], device=env.device)
 
 
 class _Evaluation:
@@ -149,39 +127,21 @@ class _Evaluation:
         self.total = len(numbers)
         # Who holds something per row outside the tensordict, a foreign simulator for instance,
         # loses it when rows move; a policy has to say that it does not.
-        rows_stay = getattr(
-            getattr(env, "traffic", None),
-            "rows_must_stay",
-            False,
-        )
-        may_move = not rows_stay and not getattr(
-            policy,
-            "rows_must_stay",
-            True,
-        )
+        rows_stay = getattr(getattr(env, "traffic", None), "rows_must_stay", False)
+        may_move = not (rows_stay or getattr(policy, "rows_must_stay", True))
         self.env = env
         self.policy = policy
         self.make_smaller = make_smaller if may_move else None
         # What holds something per row outside the tensordict might not stand being driven on after
         # an end.
         self.check_every = 1 if rows_stay else CHECK_EVERY
-        self.numbers = torch.tensor(
-            numbers,
-            dtype=torch.int64,
-            device=env.device,
-        )
+        self.numbers = torch.tensor(numbers, dtype=torch.int64, device=env.device)
         # Where the episode of a row stands in the list; the list's length in spare rows.
         self.place = torch.arange(rows, device=env.device).clamp_max(self.total)
         self.driving = self.place < self.total
         self.handed_out = min(rows, self.total)
         self.finished: list[TensorDictBase] = []
-        self.state: TensorDictBase = env.reset(
-            start_of(
-                env,
-                numbers[:rows],
-                seed,
-            )
-        )
+        self.state: TensorDictBase = env.reset(start_of(env, numbers[:rows], seed))
         # Sums over the decisions of each row's episode, the last state of it, and what is marked.
         self.sums: TensorDictBase | None = None
         self.last: TensorDictBase | None = None
@@ -219,10 +179,7 @@ class _Evaluation:
             self.sums = added.apply(torch.zeros_like)
             self.last = state
         # Rows whose episode has ended keep what they had.
-        self.sums = (self.sums + added).where(
-            self.driving,
-            self.sums,
-        )
+        self.sums = (self.sums + added).where(self.driving, self.sums)
         self.last = state.where(self.driving, self.last)
         marks = marks_after(after["next"], self.marks, self.road)
         self.marks = marks.where(self.driving, self.marks)
@@ -238,12 +195,7 @@ class _Evaluation:
         # A row is counted until its first end, even where it is driven on until the next look.
         ended = ((self.place < self.total) & ~self.driving).nonzero()[:, 0]
         if len(ended) > 0:
-            rows = {
-                "place": self.place,
-                "sums": self.sums,
-                "last": self.last,
-                "marks": self.marks,
-            }
+            rows = {name: getattr(self, name) for name in ("place", "sums", "last", "marks")}
             self.finished.append(TensorDict(rows, self.place.shape)[ended].cpu())
             self.place[ended] = self.total
         return len(ended)
@@ -279,15 +231,8 @@ class _Evaluation:
         if not bool(mask.any()):
             return
         number = self.numbers[self.place.clamp_max(self.total - 1)]
-        wanted = torch.where(
-            self.place < self.total,
-            number,
-            self.state[keys.EPISODE],
-        )
-        self.state = self.env.reset(
-            self.state.set("_reset", mask),
-            next_episode=wanted,
-        )
+        wanted = torch.where(self.place < self.total, number, self.state[keys.EPISODE])
+        self.state = self.env.reset(self.state.set("_reset", mask), next_episode=wanted)
         # An environment that goes on with numbers of its own would fill the table with episodes
         # that nobody asked for.
         if not torch.equal(self.state[keys.EPISODE], wanted):
@@ -312,19 +257,12 @@ def _added(state: TensorDictBase) -> TensorDict:
         values[f"reward_{name}"] = term
     for name in (keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND):
         values[name] = state[keys.EVENTS, name]
-    acceleration = state.get((keys.EGO, "mean_acceleration"), torch.zeros(()))
-    values["squared_acceleration"] = acceleration.double().square().expand(rows)
-    return TensorDict(
-        {name: value.reshape(rows).double() for name, value in values.items()},
-        rows,
-    )
+    values["squared_acceleration"] = state[keys.EGO, "mean_acceleration"].double().square()
+    return TensorDict({name: value.reshape(rows).double() for name, value in values.items()}, rows)
 
 
 def _episode_rows(
-    driven: TensorDictBase,
-    numbers: list[int],
-    seed: int,
-    road: Road,
+    driven: TensorDictBase, numbers: list[int], seed: int, road: Road
 ) -> pl.DataFrame:
     """What :func:`run_episodes` returns without being asked for more."""
     last = driven["last"]
@@ -338,14 +276,13 @@ def _episode_rows(
     marks = driven["marks"]
     columns |= {name: mark for name, mark in marks.items() if name != "change_s"}
     # A state without vehicles tells nothing about a crash.
-    at_fault = pl.lit(None, pl.Boolean)
-    crash: pl.Expr | pl.Series = pl.lit(None, pl.String)
+    at_fault: list[bool | None] = [None] * len(numbers)
+    crash: list[str | None] = [None] * len(numbers)
     if keys.VEHICLES in last:
         vehicles = Vehicles.of(last[keys.VEHICLES])
         since_s = columns["duration_s"] - marks["change_s"]
-        columns["at_fault"] = ego_at_fault(vehicles, road)
-        at_fault = pl.col("at_fault")
-        crash = pl.Series(crash_kinds(vehicles, since_s, road_in(last, road)), dtype=pl.String)
+        at_fault[:] = ego_at_fault(vehicles, road).tolist()
+        crash[:] = crash_kinds(vehicles, since_s, road_in(last, road))
     # The reward's terms are the environment's own, so their names are not known here.
     terms = [name for name in columns if name.startswith("reward_")]
     ends = [pl.when(pl.col(event)).then(pl.lit(event)) for event in keys.END_EVENTS]
@@ -360,17 +297,16 @@ def _episode_rows(
         # Onsets are counted; the paper asks whether there was one.
         (pl.col(keys.SOFT_CRASH) > 0).alias("had_soft_crash"),
         pl.col(keys.SOFT_CRASH_BEHIND).cast(pl.Int64),
-        pl.col("reward", *terms),
+        "reward",
+        *terms,
         pl.col("decisions").cast(pl.Int64),
         duration,
         distance.alias("distance_m"),
         # Null for an episode that ended before it drove (off the road at once).
         pl.when(duration > 0).then(distance / duration).alias("mean_speed_mps"),
         pl.col("lane_changes").cast(pl.Int64),
-        pl.when(pl.col("hard_crash")).then(at_fault).alias("at_fault"),
-        pl.when(pl.col("hard_crash")).then(crash).alias("crash"),
-        *(pl.col(name) for name in LEAST),
-        (pl.col("squared_acceleration") / pl.col("decisions"))
-        .sqrt()
-        .alias("rms_acceleration_mps2"),
+        pl.when("hard_crash").then(pl.Series("at_fault", at_fault, pl.Boolean)),
+        pl.when("hard_crash").then(pl.Series("crash", crash, pl.String)),
+        *LEAST,
+        rms_acceleration_mps2=(pl.col("squared_acceleration") / pl.col("decisions")).sqrt(),
     )

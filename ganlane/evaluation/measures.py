@@ -34,11 +34,7 @@ def first_marks(rows: Tensor) -> TensorDict:
     return TensorDict({**marks, "change_s": -endless}, rows.shape).clone()
 
 
-def marks_after(
-    state: TensorDictBase,
-    marks: TensorDictBase,
-    road: Road,
-) -> TensorDictBase:
+def marks_after(state: TensorDictBase, marks: TensorDictBase, road: Road) -> TensorDictBase:
     """``marks`` [N] after the decision that led to ``state`` [N].
 
     :data:`LEAST`, and ``change_s``, the time at which the last lane change began.
@@ -61,19 +57,11 @@ def marks_after(
     }
     least = {name: torch.minimum(marks[name], value.float()) for name, value in now.items()}
     time_s = state[keys.STEP] * keys.PHYSICS_STEP_S
-    change_s = torch.where(
-        ego["started_change"],
-        time_s.float(),
-        marks["change_s"],
-    )
+    change_s = torch.where(ego["started_change"], time_s.float(), marks["change_s"])
     return TensorDict({**least, "change_s": change_s}, marks.batch_size)
 
 
-def crash_kinds(
-    vehicles: Vehicles,
-    since_s: Tensor,
-    road: Road = STRAIGHT,
-) -> list[str]:
+def crash_kinds(vehicles: Vehicles, since_s: Tensor, road: Road = STRAIGHT) -> list[str]:
     """One of :data:`CRASHES` for every row [N], as if it had crashed; ``since_s`` [N] is the time
     since its last lane change began.
     """
@@ -93,24 +81,13 @@ def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     other: a rule of geometry, no law. A driver that cuts in and is struck from behind is not at
     fault by it.
     """
-    ahead = road.distance_ahead(
-        vehicles.x[:, :1],
-        vehicles.x[:, 1:],
-    )
+    ahead = road.distance_ahead(vehicles.x[:, :1], vehicles.x[:, 1:])
     along = vehicles.speed * torch.cos(vehicles.heading)
     across = vehicles.speed * torch.sin(vehicles.heading)
     # Two bodies met along the axis on which their extents began to overlap last. Headings are
     # small, so the axes are those of the road.
-    since_along = _time_since(
-        ahead,
-        _gain(along),
-        _reach(vehicles.length),
-    )
-    since_across = _time_since(
-        _gain(vehicles.y),
-        _gain(across),
-        _reach(vehicles.width),
-    )
+    since_along = _time_since(ahead, _gain(along), vehicles.length)
+    since_across = _time_since(_gain(vehicles.y), _gain(across), vehicles.width)
     # Signs as seen from the ego: who has the higher speed towards the other pushes.
     towards = torch.sign(_gain(vehicles.y))
     pushes = towards * across[:, :1] > -towards * across[:, 1:]
@@ -127,24 +104,14 @@ def _gain(values: Tensor) -> Tensor:
     return values[:, 1:] - values[:, :1]
 
 
-def _reach(sizes: Tensor) -> Tensor:
-    """Distance of two centres at which bodies of these sizes touch, m, [N, M - 1]."""
-    return 0.5 * (sizes[:, 1:] + sizes[:, :1])
+def _time_since(distance: Tensor, speed: Tensor, sizes: Tensor) -> Tensor:
+    """For how long (s) the extents of the ego and the others overlap, [N, M - 1].
 
-
-def _time_since(
-    distance: Tensor,
-    speed: Tensor,
-    reach: Tensor,
-) -> Tensor:
-    """For how long (s) extents that touch at ``reach`` (m) overlap.
-
-    Infinite where they do not close.
+    Infinite where they do not close. ``sizes`` [N, M] are of all bodies, m.
     """
-    # Both branches are computed, so the divisor is kept above 0.
+    # Distance of two centres at which the bodies touch.
+    reach = 0.5 * (sizes[:, 1:] + sizes[:, :1])
     closing = -torch.sign(distance) * speed
-    return torch.where(
-        closing > 0,
-        (reach - distance.abs()) / closing.clamp_min(1e-9),
-        torch.inf,
-    )
+    # Both branches are computed, so the divisor is kept above 0.
+    overlap_s = (reach - distance.abs()) / closing.clamp_min(1e-9)
+    return torch.where(closing > 0, overlap_s, torch.inf)

@@ -151,11 +151,7 @@ def _paired(*drivers: pl.DataFrame, what: pl.Expr = _RETURN) -> list[Array]:
     return [ordered[str(column)].cast(pl.Float64).to_numpy() for column in range(len(drivers))]
 
 
-def verdict(
-    lead: Estimate,
-    differences: Array,
-    one_failed: npt.NDArray[np.bool_],
-) -> str:
+def verdict(lead: Estimate, differences: Array, one_failed: npt.NDArray[np.bool_]) -> str:
     """``above``, ``below`` or ``undecided``: the sign of a ``lead``, where it is decided.
 
     Decided is what at least 30 episodes say, whose interval and sign-flip test both exclude that
@@ -239,9 +235,7 @@ def _score(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> tuple[Estimate | N
 
 
 def normalized_percent(
-    agent: npt.ArrayLike,
-    mobil: npt.ArrayLike,
-    random_legal: npt.ArrayLike,
+    agent: npt.ArrayLike, mobil: npt.ArrayLike, random_legal: npt.ArrayLike
 ) -> tuple[Estimate | None, str | None]:
     """The paper's '% of MOBIL': 0 for ``random_legal``, 100 for MOBIL.
 

@@ -65,11 +65,7 @@ class Estimate:
         """Whether there is an interval and 0 lies outside it."""
         return self.low is not None and self.high is not None and not self.low <= 0.0 <= self.high
 
-    def scaled(
-        self,
-        factor: float = 1.0,
-        per: float = 1.0,
-    ) -> Estimate:
+    def scaled(self, factor: float = 1.0, per: float = 1.0) -> Estimate:
         """Value and bounds times ``factor``, divided by ``per``; both are positive."""
         low, high = (
             None if bound is None else bound * factor / per for bound in (self.low, self.high)
@@ -90,10 +86,7 @@ def entries(name: str, estimate: Estimate | None) -> dict[str, Any]:
     }
 
 
-def resample_counts(
-    size: int,
-    resamples: int,
-) -> Iterator[Array]:
+def resample_counts(size: int, resamples: int) -> Iterator[Array]:
     """Chunks [R, size] of how often each of ``size`` episodes occurs in a resample of ``size`` with
     replacement.
     """
@@ -166,11 +159,7 @@ def mean_interval(values: npt.ArrayLike) -> Estimate:
 
 def paired_difference(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
     """Mean of ``first - second`` over the same episodes, in the same order, with its interval."""
-    a = np.asarray(first, dtype=np.float64)
-    b = np.asarray(second, dtype=np.float64)
-    if a.shape != b.shape:
-        raise ValueError(f"paired values must have one shape, found {a.shape} and {b.shape}")
-    return mean_interval(a - b)
+    return mean_interval(np.subtract(first, second, dtype=np.float64))
 
 
 def sign_flip_p(differences: npt.ArrayLike) -> float:
@@ -239,20 +228,7 @@ def over_trainings(scores: npt.ArrayLike, statistic: Callable[[Array], Array] = 
 
 def difference(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
     """Mean of ``first`` [S, E] minus mean of ``second`` [S', E], on the same episodes."""
-    return _estimate(
-        _pair(first, second),
-        lambda a, b: _mean(a) - _mean(b),
-    )
-
-
-def probability_of_improvement(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
-    """How likely a training of ``first`` [S, E] has a higher mean score than one of ``second`` [S',
-    E]; ties half.
-
-    Where all trainings at hand of one are above all of the other it is 1, from 1 to 1: it says
-    nothing of others.
-    """
-    return improvement_over_traffics([(first, second)])
+    return _estimate(_pair(first, second), lambda a, b: _mean(a) - _mean(b))
 
 
 def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate | None:
@@ -279,11 +255,7 @@ def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate |
         return rates
 
     # One table, so that a draw of trainings is one for events and kilometres.
-    resampled = _estimate(
-        [np.stack([happened, amount])],
-        ratio,
-        bounds=(0.0, np.inf),
-    )
+    resampled = _estimate([np.stack([happened, amount])], ratio, bounds=(0.0, np.inf))
     rate = resampled.value
     low, high = (bound / total for bound in poisson_bounds(round(happened.sum())))
     # One episode of one training has no spread to resample.
@@ -298,22 +270,6 @@ def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate |
         above = max(above, error * float(scipy.stats.t.ppf(TAIL_LEVELS[1], trainings - 1)))
         high = max(high, rate * math.exp(above / rate))
     return Estimate(rate, min(low, resampled.low), max(high, resampled.high))
-
-
-def normalized_over_trainings(
-    agent: npt.ArrayLike,
-    mobil: npt.ArrayLike,
-    random_legal: npt.ArrayLike,
-) -> Estimate | None:
-    """The normalised score (:func:`ganlane.evaluation.normalized_percent`) of several trainings,
-    each [S, E].
-
-    None where the interval of MOBIL's lead over the random driver includes 0: the scale would have
-    no length.
-    """
-    if not difference(mobil, random_legal).excludes_zero():
-        return None
-    return score_over_traffics([(agent, mobil, random_legal)])
 
 
 def score_over_traffics(traffics: Sequence[Sequence[npt.ArrayLike]]) -> Estimate:
@@ -335,8 +291,10 @@ def score_over_traffics(traffics: Sequence[Sequence[npt.ArrayLike]]) -> Estimate
 def improvement_over_traffics(
     traffics: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]],
 ) -> Estimate:
-    """:func:`probability_of_improvement`, its mean over traffics; rewards [S, E] and [S', E] of
-    each.
+    """How likely a training of one recipe has a higher mean score than one of another; ties half.
+
+    Its mean over ``traffics``, which are the scores [S, E] and [S', E] of each. Where all trainings
+    at hand of one are above all of the other it is 1, from 1 to 1: it says nothing of others.
     """
 
     def share(*means: Array) -> Array:
@@ -344,19 +302,10 @@ def improvement_over_traffics(
         return np.mean([_share_above(first, second) for first, second in pairs], axis=0)
 
     tables = [table for pair in traffics for table in _pair(*pair)]
-    return _estimate(
-        tables,
-        share,
-        bounds=(0.0, 1.0),
-        recipes=[0, 1] * len(traffics),
-    )
+    return _estimate(tables, share, bounds=(0.0, 1.0), recipes=[0, 1] * len(traffics))
 
 
-def percent_of_way(
-    value: Array,
-    top: Array,
-    bottom: Array,
-) -> Array:
+def percent_of_way(value: Array, top: Array, bottom: Array) -> Array:
     """How far ``value`` is on the way from ``bottom`` to ``top``, in per cent."""
     return np.asarray(100.0 * (value - bottom) / (top - bottom))
 
@@ -441,11 +390,7 @@ def _estimate(
         chosen = generator.integers(trainings, size=(FEWER_RESAMPLES, trainings))
         drawn = list(means)
         for place in places:
-            drawn[place] = np.moveaxis(
-                means[place][0][..., chosen],
-                -2,
-                0,
-            )
+            drawn[place] = np.moveaxis(means[place][0][..., chosen], -2, 0)
         parts.append(np.sqrt(trainings / (trainings - 1)) * (statistic(*drawn) - value))
         freedom.append(trainings - 1)
     # Satterthwaite: the degrees of freedom of a sum of variances that are known unequally well.
@@ -453,10 +398,7 @@ def _estimate(
     uncertainty = float((variances**2 / freedom).sum())
     degrees = variances.sum() ** 2 / uncertainty if uncertainty > 0.0 else np.inf
     wider = scipy.stats.t.ppf(TAIL_LEVELS[1], degrees) / scipy.stats.norm.ppf(TAIL_LEVELS[1])
-    low, high = np.clip(
-        value + wider * np.quantile(np.sum(parts, axis=0), TAIL_LEVELS),
-        *bounds,
-    )
+    low, high = np.clip(value + wider * np.quantile(np.sum(parts, axis=0), TAIL_LEVELS), *bounds)
     return Estimate(value, float(low), float(high))
 
 

@@ -71,18 +71,14 @@ def _narrowed(lines: Sequence[str], width: int) -> str:
         span = slice(*ruler.span())
         spans[lines[head][span].strip()] = span
     # Columns go one by one until the rest fits; the first, the name, stays.
-    gone: set[str] = set()
+    shown = dict(spans)
     for name in [*_FIRST_TO_GO, *reversed(list(spans)[1:])]:
-        left = [span.stop - span.start + 2 for other, span in spans.items() if other not in gone]
-        if name in spans and sum(left) > width + 2:
-            gone.add(name)
+        if sum(span.stop - span.start + 2 for span in shown.values()) > width + 2:
+            shown.pop(name, None)
     # Every line is cut at the same places.
-    rows = []
-    for line in lines[head:]:
-        cells = [line[span] for name, span in spans.items() if name not in gone]
-        rows.append("  ".join(cells).rstrip())
+    rows = ["  ".join(line[span] for span in shown.values()).rstrip() for line in lines[head:]]
     # In the order of the table, so that a reader knows where they would be.
-    hidden = ", ".join(name for name in spans if name in gone)
+    hidden = ", ".join(name for name in spans if name not in shown)
     return "\n".join([*lines[:head], *rows, f"(columns=all shows: {hidden})"])
 
 
@@ -91,11 +87,7 @@ def number(value: float | None, digits: int = 3) -> str:
     return NOTHING if value is None else f"{value:.{digits}f}"
 
 
-def with_interval(
-    row: Row,
-    key: str,
-    digits: int = 3,
-) -> str:
+def with_interval(row: Row, key: str, digits: int = 3) -> str:
     """A cell with ``row[key]``, and ``[low, high]`` where the row has its interval, ``key_ci``."""
     text = number(row.get(key), digits)
     interval = row.get(f"{key}_ci")
@@ -150,24 +142,13 @@ class Table:
             if heading not in optional or any(cell(row) not in ("0", NOTHING) for row in rows)
         }
         lines = [[cell(row) for cell in shown.values()] for row in rows]
-        return cls(
-            title,
-            list(shown),
-            lines,
-            names,
-            notes,
-        )
+        return cls(title, list(shown), lines, names, notes)
 
     def text(self) -> str:
         """Aligned columns, with the title above and the notes below."""
         # The tables of an evaluation have no title: the command is one.
         lines = [self.title, ""] if self.title else []
-        lines.append(
-            aligned(
-                [self.headings, *self.lines],
-                self.names,
-            )
-        )
+        lines.append(aligned([self.headings, *self.lines], self.names))
         if self.notes:
             lines += ["", *self.notes]
         return "\n".join(lines)
@@ -241,11 +222,7 @@ def paired_table(rows: Sequence[Row]) -> str:
     """The rows of :func:`ganlane.evaluation.paired_rows`, each lead with its sign."""
 
     def lead(row: Row) -> str:
-        return ("" if row["lead"] < 0.0 else "+") + with_interval(
-            row,
-            "lead",
-            1,
-        )
+        return ("" if row["lead"] < 0.0 else "+") + with_interval(row, "lead", 1)
 
     columns: Mapping[str, Cell] = {
         "paired lead": lambda row: f"{row['agent']} over {row['over']}",
@@ -255,10 +232,4 @@ def paired_table(rows: Sequence[Row]) -> str:
     }
     few = any(row["episodes"] < FEWEST_EPISODES for row in rows)
     notes = [f"no verdict below {FEWEST_EPISODES} episodes"] if few else []
-    return Table.of(
-        "",
-        rows,
-        columns,
-        2,
-        notes,
-    ).text()
+    return Table.of("", rows, columns, 2, notes).text()

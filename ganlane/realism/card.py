@@ -6,11 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from ganlane.evaluation.statistics import (
-    Array,
-    Estimate,
-    entries,
-)
+from ganlane.evaluation.statistics import Array, Estimate, entries
 from ganlane.realism.driving import FLOORS
 from ganlane.realism.long_runs import totals
 from ganlane.realism.measures import (
@@ -48,9 +44,7 @@ def card_numbers(
         alone = starts.restricted_to(starts.separately_held_out)
         held_out = card_rows(alone, traffic, resamples)
     # The recordings are the first line of the table.
-    driving = {"recorded": starts.recorded.summary()}
-    for name, measured in starts.driven.items():
-        driving[name] = measured.summary()
+    measured = {"recorded": starts.recorded, **starts.driven}
     runs = long_runs[traffic]
     return {
         "traffic": traffic,
@@ -58,7 +52,7 @@ def card_numbers(
         "recorded_spread_mps": starts.reference.spread_mps,
         "quantities": rows,
         "quantities_held_out": held_out,
-        "driving": driving,
+        "driving": {name: driving.summary() for name, driving in measured.items()},
         "i80": site,
         **totals(runs),
         "long_runs": runs,
@@ -66,20 +60,10 @@ def card_numbers(
     }
 
 
-def card_rows(
-    starts: Starts,
-    traffic: str,
-    resamples: int,
-) -> dict[str, Any]:
+def card_rows(starts: Starts, traffic: str, resamples: int) -> dict[str, Any]:
     """The rows of a traffic's card, compared with every other traffic from the same starts."""
-    return quantity_rows(
-        traffic,
-        starts.driven,
-        starts.recorded.counts,
-        starts.reference.floors,
-        starts.paired,
-        resamples,
-    )
+    recorded, floors = starts.recorded.counts, starts.reference.floors
+    return quantity_rows(traffic, starts.driven, recorded, floors, starts.paired, resamples)
 
 
 def quantity_rows(
@@ -110,37 +94,15 @@ def quantity_rows(
         against = {}
         for rival in rivals:
             theirs = driven[rival].counts[name]
-            difference = distance_difference(
-                ours,
-                theirs,
-                counts,
-                paired,
-                resamples,
-            )
+            difference = distance_difference(ours, theirs, counts, paired, resamples)
             against[rival] = {
-                **entries(
-                    "distance",
-                    distance(
-                        theirs,
-                        counts,
-                        paired,
-                        resamples,
-                    ),
-                ),
+                **entries("distance", distance(theirs, counts, paired, resamples)),
                 **entries("difference", difference),
                 "verdict": verdict(difference),
             }
         rows[name] = {
             "unit": UNITS[name],
-            **entries(
-                "distance",
-                distance(
-                    ours,
-                    counts,
-                    paired,
-                    resamples,
-                ),
-            ),
+            **entries("distance", distance(ours, counts, paired, resamples)),
             "ceiling": ceiling(counts),
             "floor": ends.get("random", {}).get(name),
             "constant_velocity": ends.get("constant_velocity", {}).get(name),
@@ -152,21 +114,18 @@ def quantity_rows(
 
 
 def floors_of(
-    driven: Mapping[str, Measured],
-    recorded: Mapping[str, Array],
+    driven: Mapping[str, Measured], recorded: Mapping[str, Array]
 ) -> dict[str, dict[str, float]]:
     """Finite distances of the reference drivers in ``driven`` to the recordings.
 
     By driver and quantity.
     """
-    floors: dict[str, dict[str, float]] = {}
+    floors = {}
     for driver in (name for name in FLOORS if name in driven):
-        floors[driver] = {}
-        for name, counts in recorded.items():
-            # A quantity without samples has no distance, and JSON no NaN.
-            value = pooled_distance(driven[driver].counts[name], counts)
-            if math.isfinite(value):
-                floors[driver][name] = value
+        counts = driven[driver].counts
+        distances = {name: pooled_distance(counts[name], recorded[name]) for name in recorded}
+        # A quantity without samples has no distance, and JSON no NaN.
+        floors[driver] = {name: at for name, at in distances.items() if math.isfinite(at)}
     return floors
 
 

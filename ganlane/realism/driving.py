@@ -33,18 +33,9 @@ from torch.nn.functional import pad
 from ganlane import keys
 from ganlane.data.dense import Recording
 from ganlane.generator.closed_loop import balanced_headway
-from ganlane.sim.random import (
-    Purpose,
-    absorb,
-    episode_key,
-    uniform,
-)
+from ganlane.sim.random import Purpose, absorb, episode_key, uniform
 from ganlane.sim.state import ENTRY_M, Road, Vehicles
-from ganlane.traffic.base import (
-    Memory,
-    Moved,
-    TrafficModule,
-)
+from ganlane.traffic.base import Memory, Moved, TrafficModule
 from ganlane.traffic.overlays import random_side
 
 #: Makes a traffic model for a road.
@@ -78,9 +69,7 @@ class StartOptions:
 
 
 def drive_recordings(
-    make: Factory,
-    recordings: Sequence[Recording],
-    options: StartOptions,
+    make: Factory, recordings: Sequence[Recording], options: StartOptions
 ) -> pl.DataFrame:
     """Drive every recording ``options.repeats`` times, as :meth:`Recording.frame` has it.
 
@@ -95,19 +84,12 @@ def drive_recordings(
     for road, rows in roads.items():
         for batch in _batches(rows):
             # Each row has an episode number of its own, whatever the batches are.
-            driven = _drive(
-                make(Road(*road)),
-                batch,
-                options,
-                first=len(frames),
-            )
+            driven = _drive(make(Road(*road)), batch, options, first=len(frames))
             frames += [recording.frame() for recording in driven]
     return pl.concat(frames)
 
 
-def _batches(
-    rows: list[Recording],
-) -> list[list[Recording]]:
+def _batches(rows: list[Recording]) -> list[list[Recording]]:
     """Rows of similar shapes together, at most :data:`_MOST_PAIRS` pairs of vehicles in a batch."""
     batches: list[list[Recording]] = []
     # Sorted by shape, so that little is padded.
@@ -123,10 +105,7 @@ def _batches(
 
 
 def _drive(
-    traffic: TrafficModule,
-    rows: list[Recording],
-    options: StartOptions,
-    first: int,
+    traffic: TrafficModule, rows: list[Recording], options: StartOptions, first: int
 ) -> list[Recording]:
     """Drives a batch of recordings on one road; ``first`` numbers the first of them."""
     recorded = StackedRecordings(rows)
@@ -137,12 +116,7 @@ def _drive(
     }
     key = episode_key(traffic.stream, *counters.values())
     # A uniform number with the wanted mean.
-    u = uniform(
-        key,
-        0,
-        recorded.x.shape[2],
-        [Purpose.SPAWN_DESIRED_SPEED],
-    )[..., 0]
+    u = uniform(key, 0, recorded.x.shape[2], [Purpose.SPAWN_DESIRED_SPEED])[..., 0]
     excess = 2.0 * options.desired_above_mps * u
     state = recorded.nobody(int(traffic.visibility))
     memory: TensorDictBase | None = None
@@ -152,34 +126,13 @@ def _drive(
     for step in range(len(recorded.x)):
         state = recorded.without_finished(state, step)
         # Who has entered once does not enter again.
-        enters = recorded.may_enter(
-            state,
-            waiting,
-            traffic.road,
-            step,
-        )
+        enters = recorded.may_enter(state, waiting, traffic.road, step)
         waiting = waiting & ~enters
-        state = recorded.entering(
-            step,
-            excess,
-            traffic.road,
-            state,
-        ).where(enters, state)
-        memory = _updated_memory(
-            traffic,
-            state,
-            memory,
-            enters,
-            absorb(key, 0),
-        )
+        entered = recorded.entering(step, excess, traffic.road, state)
+        state = entered.where(enters, state)
+        memory = _updated_memory(traffic, state, memory, enters, absorb(key, 0))
         course.append((state.x, state.y, state.valid))
-        state, memory = step_traffic(
-            traffic,
-            state,
-            memory,
-            counters,
-            step,
-        )
+        state, memory = step_traffic(traffic, state, memory, counters, step)
     x, y, valid = (torch.stack(values)[..., 1:].numpy() for values in zip(*course))
     driven = []
     for index, row in enumerate(rows):
@@ -187,15 +140,7 @@ def _drive(
         # Without what was padded.
         part = (slice(steps), index, slice(vehicles))
         name = f"{row.name}#{first + index}"
-        driven.append(
-            replace(
-                row,
-                name=name,
-                x=x[part],
-                y=y[part],
-                present=valid[part],
-            )
-        )
+        driven.append(replace(row, name=name, x=x[part], y=y[part], present=valid[part]))
     return driven
 
 
@@ -236,19 +181,10 @@ def _updated_memory(
     if memory is not None and not bool(enters.any()):
         return memory
     # Drawn for all, and taken for those who enter.
-    fresh = with_recorded_headways(
-        traffic.init_memory(state, key),
-        state,
-        traffic.road,
-        enters,
-    )
+    fresh = with_recorded_headways(traffic.init_memory(state, key), state, traffic.road, enters)
 
     def merged(new: Tensor, old: Tensor) -> Tensor:
-        return torch.where(
-            enters.reshape(*enters.shape, *[1] * (new.ndim - 2)),
-            new,
-            old,
-        )
+        return torch.where(enters.reshape(*enters.shape, *[1] * (new.ndim - 2)), new, old)
 
     return fresh if memory is None else fresh.apply(merged, memory)
 
@@ -269,12 +205,7 @@ class StackedRecordings:
                 value = torch.from_numpy(getattr(row, name))
                 # Index 0 of the vehicles is the ego's; later frames are empty.
                 below = [0, steps - len(value)] if value.ndim == 2 else []
-                padded.append(
-                    pad(
-                        value,
-                        [1, most - value.shape[-1], *below],
-                    )
-                )
+                padded.append(pad(value, [1, most - value.shape[-1], *below]))
             tensor = torch.stack(padded, dim=-2)
             return tensor.float() if tensor.is_floating_point() else tensor
 
@@ -304,11 +235,7 @@ class StackedRecordings:
             valid=zero > 0.0,
         )
 
-    def without_finished(
-        self,
-        state: Vehicles,
-        step: int,
-    ) -> Vehicles:
+    def without_finished(self, state: Vehicles, step: int) -> Vehicles:
         """Removes vehicles whose recording is over or that passed the end of the road.
 
         Moves replayed ones on.
@@ -325,13 +252,7 @@ class StackedRecordings:
             speed=torch.where(replayed, self.speed[step], state.speed),
         )
 
-    def may_enter(
-        self,
-        state: Vehicles,
-        waiting: Tensor,
-        road: Road,
-        step: int,
-    ) -> Tensor:
+    def may_enter(self, state: Vehicles, waiting: Tensor, road: Road, step: int) -> Tensor:
         """Vehicles that enter now, bool [N, M].
 
         Recorded in this frame, still waiting, and with room in their lane.
@@ -346,13 +267,7 @@ class StackedRecordings:
         room = between - 0.5 * (self.length[:, :, None] + state.length[:, None])
         return wants & ~(same & state.valid[:, None] & (room < ENTRY_GAP_M)).any(-1)
 
-    def entering(
-        self,
-        step: int,
-        excess: Tensor,
-        road: Road,
-        state: Vehicles,
-    ) -> Vehicles:
+    def entering(self, step: int, excess: Tensor, road: Road, state: Vehicles) -> Vehicles:
         """All vehicles in their recorded state, heading along the road."""
         y = self.y[step]
         speed = self.speed[step].clamp_min(0.0)
@@ -369,10 +284,7 @@ class StackedRecordings:
 
 
 def with_recorded_headways(
-    memory: TensorDictBase,
-    vehicles: Vehicles,
-    road: Road,
-    who: Tensor,
+    memory: TensorDictBase, vehicles: Vehicles, road: Road, who: Tensor
 ) -> TensorDictBase:
     """A traffic's ``memory`` with the headways that the drivers ``who`` [N, M] show as they enter.
 
@@ -382,11 +294,7 @@ def with_recorded_headways(
     def shown(name: str | tuple[str, ...], value: Tensor) -> Tensor:
         if name != "headway" and name[-1] != "headway":
             return value
-        return torch.where(
-            who,
-            balanced_headway(vehicles, road, value),
-            value,
-        )
+        return torch.where(who, balanced_headway(vehicles, road, value), value)
 
     return memory.named_apply(shown, nested_keys=True)
 
@@ -394,19 +302,10 @@ def with_recorded_headways(
 class ConstantVelocity(TrafficModule):
     """Every vehicle keeps its lane and the speed at which it entered."""
 
-    def move(
-        self,
-        vehicles: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
-    ) -> Moved:
+    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """One step along the road."""
         v = vehicles
-        return v.with_(
-            x=v.x + v.speed * self.dt,
-            acceleration=torch.zeros_like(v.speed),
-        ), memory
+        return v.with_(x=v.x + v.speed * self.dt, acceleration=torch.zeros_like(v.speed)), memory
 
 
 class RandomDriving(TrafficModule):
@@ -421,48 +320,20 @@ class RandomDriving(TrafficModule):
     every_s = 20.0
     change_s = 4.0
 
-    def move(
-        self,
-        vehicles: Vehicles,
-        memory: Memory,
-        key: Tensor,
-        step: Tensor,
-    ) -> Moved:
+    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """One step: the second's acceleration, and towards the target lane."""
         v = vehicles
         m = vehicles.x.shape[1]
         dtype = vehicles.x.dtype
         # One acceleration for the ten steps of a second.
         second = torch.div(step, 10, rounding_mode="floor")
-        pace = uniform(
-            key,
-            second,
-            m,
-            [Purpose.ACCELERATION],
-            dtype,
-        )[..., 0]
-        drawn = uniform(
-            key,
-            step,
-            m,
-            [
-                Purpose.LANE_CHANGE_HAZARD,
-                Purpose.LANE_CHANGE_SIDE,
-            ],
-            dtype,
-        )
+        pace = uniform(key, second, m, [Purpose.ACCELERATION], dtype)[..., 0]
+        purposes: list[int] = [Purpose.LANE_CHANGE_HAZARD, Purpose.LANE_CHANGE_SIDE]
+        hazard, chosen = uniform(key, step, m, purposes, dtype).unbind(-1)
         remaining = self.road.centre_of(v.target_lane, dtype) - v.y
         # Nobody starts a change during another one.
-        starts = (drawn[..., 0] < self.dt / self.every_s) & (remaining.abs() < 0.3)
-        side = torch.where(
-            starts,
-            random_side(
-                drawn[..., 1],
-                v.target_lane,
-                self.road.lanes,
-            ),
-            0,
-        )
+        starts = (hazard < self.dt / self.every_s) & (remaining.abs() < 0.3)
+        side = torch.where(starts, random_side(chosen, v.target_lane, self.road.lanes), 0)
         # Sideways at a constant speed, and no further than the lane's centre.
         stride = self.road.lane_width_m * self.dt / self.change_s
         aside = (remaining / stride).clamp(-1.0, 1.0) * stride

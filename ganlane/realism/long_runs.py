@@ -7,6 +7,7 @@ with exact intervals, speeds over time, and quantiles.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
@@ -17,25 +18,14 @@ from torch import Tensor
 
 from ganlane import keys
 from ganlane.data.lanes import lane_changes_of_arrays
-from ganlane.evaluation.statistics import (
-    entries,
-    poisson_interval,
-)
+from ganlane.evaluation.statistics import entries, poisson_interval
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.realism.driving import Factory, step_traffic
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.neighbours import leader, perceive
 from ganlane.sim.random import absorb, episode_key
-from ganlane.sim.spawn import (
-    TABLE_II,
-    SpawnParameters,
-    spawn,
-)
-from ganlane.sim.state import (
-    Road,
-    Vehicles,
-    lateral_half_extent,
-)
+from ganlane.sim.spawn import TABLE_II, SpawnParameters, spawn
+from ganlane.sim.state import Road, Vehicles, lateral_half_extent
 from ganlane.traffic import TrafficModule
 
 #: Times at which speeds are summarised, s; and the distance of the goal, m.
@@ -99,18 +89,11 @@ class EventCounter:
         #: The last state; empty where a new batch of episodes begins.
         self.before: dict[str, Tensor] = {}
 
-    def count(
-        self,
-        vehicles: Vehicles,
-        step: int,
-    ) -> None:
+    def count(self, vehicles: Vehicles, step: int) -> None:
         """Count the events of a physics step."""
         # Everything is counted without the ego's empty place.
         others = vehicles.columns(slice(1, None))
-        self.overlaps += self._onsets(
-            "overlap",
-            pair_overlaps(others).triu(1),
-        )
+        self.overlaps += self._onsets("overlap", pair_overlaps(others).triu(1))
         # Half the width of a body, turned with its heading.
         half = lateral_half_extent(others) - EDGE_M
         left = self.road.left_edge_m()
@@ -120,20 +103,11 @@ class EventCounter:
         if step % 10 == 9:  # once a second
             slow = (vehicles.speed < STANDING_MPS) & vehicles.valid
             # Standing behind somebody is queueing, no standstill.
-            ahead = leader(
-                perceive(vehicles, self.road),
-                self.road.lane_of(vehicles.y),
-            )
-            self.standstills += self._onsets(
-                "standstill",
-                (slow & (ahead.gap > FREE_M))[:, 1:],
-            )
+            ahead = leader(perceive(vehicles, self.road), self.road.lane_of(vehicles.y))
+            free = ahead.gap > FREE_M
+            self.standstills += self._onsets("standstill", (slow & free)[:, 1:])
 
-    def _onsets(
-        self,
-        name: str,
-        now: Tensor,
-    ) -> int:
+    def _onsets(self, name: str, now: Tensor) -> int:
         """Number of entries that are true now and were not at the last count."""
         # An event counts when it begins, however long it lasts.
         before = self.before.get(name, torch.zeros_like(now))
@@ -160,13 +134,7 @@ def long_run(
     # Ends early where nobody moves.
     while km < parameters.vehicle_km and not (parts and parts[-1]["vehicle_km"] <= 0.0):
         rows = _rows(parameters, parameters.vehicle_km - km)
-        driven = drive_spawned(
-            traffic,
-            parameters,
-            episodes,
-            rows,
-            events,
-        )
+        driven = drive_spawned(traffic, parameters, episodes, rows, events)
         parts.append(batch_statistics(driven, road))
         km += parts[-1]["vehicle_km"]
         episodes += rows
@@ -177,9 +145,9 @@ def long_run(
     durations = np.concatenate([part["durations"] for part in parts])
     acceleration = np.concatenate([part["acceleration"] for part in parts])
     # By time, from the episodes that lasted so long.
-    speeds = {}
-    for time in parts[0]["speeds"]:
-        speeds[time] = mean_speeds([part["speeds"][time] for part in parts])
+    speeds = {
+        time: mean_speeds([part["speeds"][time] for part in parts]) for time in parts[0]["speeds"]
+    }
     return {
         "vehicles": parameters.vehicles,
         "episodes": episodes,
@@ -205,50 +173,28 @@ def _rows(parameters: LongRunParameters, km: float) -> int:
     # 14 m/s is a slow traffic's mean speed: rather too many than too few.
     expected = parameters.vehicles * min(4.8, 0.014 * parameters.most_s)
     steps = round(parameters.most_s / PHYSICS_STEP_S)
-    most = max(
-        1,
-        min(
-            _MOST_ROWS,
-            _MOST_SAMPLES // (steps * parameters.vehicles),
-        ),
-    )
+    most = min(_MOST_ROWS, _MOST_SAMPLES // (steps * parameters.vehicles))
     # Not more rows than the remaining kilometres ask for.
-    return int(
-        np.clip(
-            np.ceil(km / expected),
-            1,
-            most,
-        )
-    )
+    return max(1, min(math.ceil(km / expected), most))
 
 
 def spawned_vehicles(
-    traffic: TrafficModule,
-    parameters: LongRunParameters,
-    key: Tensor,
+    traffic: TrafficModule, parameters: LongRunParameters, key: Tensor
 ) -> Vehicles:
     """The vehicles [N, M + 1] at the start of the episodes ``key`` [N].
 
     Index 0, an ego's, is not valid.
     """
-    lanes = traffic.road.lanes
-    width = traffic.road.lane_width_m
-    seen = int(traffic.visibility)
-    assert not isinstance(lanes, Tensor)
-    assert not isinstance(width, Tensor)
     # Table II's density, for the vehicles and an empty place for the ego.
     spread = parameters.spawn.spread_m * (parameters.vehicles + 1) / 9.0
-    start = replace(
-        parameters.spawn,
-        spread_m=max(parameters.spawn.spread_m, spread),
-    )
+    start = replace(parameters.spawn, spread_m=max(parameters.spawn.spread_m, spread))
     vehicles = spawn(
         key,
         parameters.vehicles + 1,
-        lanes,
-        float(width),
+        int(traffic.road.lanes),
+        float(traffic.road.lane_width_m),
         start,
-        others_visibility=seen,
+        others_visibility=int(traffic.visibility),
     )
     # Spawned with an ego, since Table II has one, and driven without it.
     index = torch.arange(parameters.vehicles + 1)
@@ -276,13 +222,7 @@ def drive_spawned(
     # Onsets do not carry over from the batch before.
     events.before.clear()
     for step in range(round(parameters.most_s / PHYSICS_STEP_S)):
-        state, memory = step_traffic(
-            traffic,
-            state,
-            memory,
-            counters,
-            step,
-        )
+        state, memory = step_traffic(traffic, state, memory, counters, step)
         events.count(state, step)
         course.append((state.x, state.y, state.speed))
         # Distances are tested once in ten seconds of driving: cheap, and exact enough.
@@ -290,22 +230,13 @@ def drive_spawned(
         if due and bool(((state.x - start)[:, 1:].mean(1) >= GOAL_M).all()):
             break
     x, y, speed = (torch.stack(values)[..., 1:].numpy() for values in zip(*course))
-    return Trajectories(
-        x,
-        y,
-        speed,
-        state.length[:, 1:].numpy(),
-        state.width[:, 1:].numpy(),
-    )
+    return Trajectories(x, y, speed, state.length[:, 1:].numpy(), state.width[:, 1:].numpy())
 
 
 def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
     """Counts, samples and speeds of one batch."""
     # Every vehicle of every episode is a track of its own.
-    y = trajectories.y.reshape(
-        len(trajectories.y),
-        -1,
-    )
+    y = trajectories.y.reshape(len(trajectories.y), -1)
     changes = lane_changes_of_arrays(y, float(road.lane_width_m))
     second = round(1.0 / PHYSICS_STEP_S)
     x = trajectories.x.astype(np.float64)
@@ -349,11 +280,7 @@ def mean_speeds(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, float | 
     return {**means, "episodes": len(joined["spread_mps"])}
 
 
-def rates(
-    lane_changes: int,
-    overlaps: int,
-    km: float,
-) -> dict[str, Any]:
+def rates(lane_changes: int, overlaps: int, km: float) -> dict[str, Any]:
     """Both counts per vehicle-km and per 1000 of them, with exact 95 % intervals.
 
     None where no vehicle moved.
@@ -366,24 +293,14 @@ def rates(
     }
 
 
-def totals(
-    runs: Sequence[Mapping[str, Any]],
-) -> dict[str, Any]:
+def totals(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Event counts and rates over all long runs, with exact 95 % intervals; None without any."""
-    names = (
-        "lane_changes",
-        "overlaps",
-        "vehicle_km",
-        "off_road",
-        "standstills_in_free_flow",
-    )
-    sums = {name: sum(run[name] for run in runs) for name in names}
+
+    def total(name: str) -> Any:
+        return sum(run[name] for run in runs)
+
     return {
-        "off_road": sums["off_road"] if runs else None,
-        "standstills_in_free_flow": sums["standstills_in_free_flow"] if runs else None,
-        **rates(
-            sums["lane_changes"],
-            sums["overlaps"],
-            sums["vehicle_km"],
-        ),
+        "off_road": total("off_road") if runs else None,
+        "standstills_in_free_flow": total("standstills_in_free_flow") if runs else None,
+        **rates(total("lane_changes"), total("overlaps"), total("vehicle_km")),
     }

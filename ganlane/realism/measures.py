@@ -17,15 +17,8 @@ import numpy as np
 import polars as pl
 from scipy.special import stdtrit
 
-from ganlane.data.dense import (
-    Recording,
-    recorded_frame,
-    units_of,
-)
-from ganlane.data.lanes import (
-    find_lane_changes,
-    tracks_of_frame,
-)
+from ganlane.data.dense import Recording, recorded_frame, units_of
+from ganlane.data.lanes import find_lane_changes, tracks_of_frame
 from ganlane.data.schema import FRAME_S, TRACK
 from ganlane.data.statistics import Bins, leader_gaps
 from ganlane.errors import UserError
@@ -95,43 +88,21 @@ def jensen_shannon(first: Array, second: Array) -> Array:
         p = first / first.sum(-1, keepdims=True)
         q = second / second.sum(-1, keepdims=True)
     # 0 log 0 is 0: tiny numbers stand in for empty bins.
-    log_middle = np.log2(
-        np.maximum(
-            0.5 * (p + q),
-            _TINY,
-        )
-    )
+    log_middle = np.log2(np.maximum(0.5 * (p + q), _TINY))
 
     def information(share: Array) -> Array:
-        return np.sum(
-            share * (np.log2(np.maximum(share, _TINY)) - log_middle),
-            axis=-1,
-        )
+        return np.sum(share * (np.log2(np.maximum(share, _TINY)) - log_middle), axis=-1)
 
-    return np.sqrt(
-        np.clip(
-            0.5 * (information(p) + information(q)),
-            0.0,
-            1.0,
-        )
-    )
+    return np.sqrt(np.clip(0.5 * (information(p) + information(q)), 0.0, 1.0))
 
 
 def pooled_distance(simulated: Array, recorded: Array) -> float:
     """Distance of two sets of histograms [units, bins], each added up over its units."""
-    return float(
-        jensen_shannon(
-            simulated.sum(0),
-            recorded.sum(0),
-        )
-    )
+    return float(jensen_shannon(simulated.sum(0), recorded.sum(0)))
 
 
 def distance(
-    simulated: Array,
-    recorded: Array,
-    paired: bool = True,
-    resamples: int = RESAMPLES,
+    simulated: Array, recorded: Array, paired: bool = True, resamples: int = RESAMPLES
 ) -> Estimate:
     """Distance with its 95 % bootstrap interval over units; both are [units, bins].
 
@@ -145,35 +116,17 @@ def distance(
     """
     # Units are pooled: a scene has too few samples of its own for a histogram.
     value = pooled_distance(simulated, recorded)
-    (drawn,) = _resampled(
-        [simulated],
-        recorded,
-        paired,
-        resamples,
-    )
+    (drawn,) = _resampled([simulated], recorded, paired, resamples)
     if not np.isfinite(value) or len(drawn) < 2:
         return Estimate(value)
     # Both tails are reflected about the estimate.
     tails = np.quantile(drawn**2, TAIL_LEVELS)
-    low, high = np.sqrt(
-        np.maximum(
-            2.0 * value**2 - tails[::-1],
-            0.0,
-        )
-    )
-    return Estimate(
-        value,
-        min(value, float(low)),
-        min(1.0, max(value, float(high))),
-    )
+    low, high = np.sqrt(np.maximum(2.0 * value**2 - tails[::-1], 0.0))
+    return Estimate(value, min(value, float(low)), min(1.0, max(value, float(high))))
 
 
 def distance_difference(
-    first: Array,
-    second: Array,
-    recorded: Array,
-    paired: bool = True,
-    resamples: int = RESAMPLES,
+    first: Array, second: Array, recorded: Array, paired: bool = True, resamples: int = RESAMPLES
 ) -> Estimate:
     """Distance of ``first`` less that of ``second`` to ``recorded``, with its 95 % interval.
 
@@ -185,12 +138,7 @@ def distance_difference(
     """
     one = pooled_distance(first, recorded)
     other = pooled_distance(second, recorded)
-    ours, theirs = _resampled(
-        [first, second],
-        recorded,
-        paired,
-        resamples,
-    )
+    ours, theirs = _resampled([first, second], recorded, paired, resamples)
     units = len(first)
     value = one - other
     if not np.isfinite(value) or len(ours) < 2:
@@ -198,19 +146,10 @@ def distance_difference(
     # S resampled units have (S - 1) / S of the variance that they should have.
     error = float((ours**2 - theirs**2).std()) * np.sqrt(units / (units - 1))
     reach = float(stdtrit(units - 1, TAIL_LEVELS[1])) * error / max(one + other, _TINY)
-    return Estimate(
-        value,
-        max(-1.0, value - reach),
-        min(1.0, value + reach),
-    )
+    return Estimate(value, max(-1.0, value - reach), min(1.0, value + reach))
 
 
-def _resampled(
-    models: Sequence[Array],
-    recorded: Array,
-    paired: bool,
-    resamples: int,
-) -> Array:
+def _resampled(models: Sequence[Array], recorded: Array, paired: bool, resamples: int) -> Array:
     """Distances [models, R] from the R resamples of the units in which all of them are known.
 
     None of a single unit.
@@ -270,10 +209,7 @@ class Measured:
 
     def restricted_to(self, rows: Sequence[int]) -> Measured:
         """The same with the counts of some units only; the rest remains that of all."""
-        return replace(
-            self,
-            counts={name: counts[rows] for name, counts in self.counts.items()},
-        )
+        return replace(self, counts={name: counts[rows] for name, counts in self.counts.items()})
 
 
 def lane_change_rate(changes: int, km: float) -> dict[str, Any]:
@@ -286,9 +222,7 @@ def lane_change_rate(changes: int, km: float) -> dict[str, Any]:
     }
 
 
-def measure_recordings(
-    recordings: Sequence[Recording],
-) -> Measured:
+def measure_recordings(recordings: Sequence[Recording]) -> Measured:
     """The recordings, measured as simulations are."""
     return measure(recorded_frame(recordings), units_of(recordings))
 
@@ -307,17 +241,10 @@ def measure(frame: pl.DataFrame, units: Sequence[str]) -> Measured:
     # In the order of the units, so that the sum is the same in every run.
     by_unit = motion.filter("counts").group_by("unit", maintain_order=True)
     km = by_unit.agg(km=pl.col("stride").sum() / 1000.0)["km"].to_list()
-    return Measured(
-        counts,
-        quantiles,
-        samples["lane_change_duration"].height,
-        sum(km),
-    )
+    return Measured(counts, quantiles, samples["lane_change_duration"].height, sum(km))
 
 
-def samples_of(
-    motion: pl.DataFrame,
-) -> dict[str, pl.DataFrame]:
+def samples_of(motion: pl.DataFrame) -> dict[str, pl.DataFrame]:
     """By quantity, columns ``unit`` and ``value``, of a frame :func:`with_motion`."""
     # Only rows that are driven and old enough.
     counted = motion.filter("counts")
@@ -358,23 +285,14 @@ def samples_of(
     return samples
 
 
-def _histograms(
-    table: pl.DataFrame,
-    units: Sequence[str],
-    bins: Bins,
-) -> Array:
+def _histograms(table: pl.DataFrame, units: Sequence[str], bins: Bins) -> Array:
     """Samples per unit and bin, [units, bins]."""
-    index = {unit: row for row, unit in enumerate(units)}
-    table = table.filter(pl.col("unit").is_in(list(units)))
     # Row and column of each sample in the table of counts.
-    row = table["unit"].replace_strict(index, return_dtype=pl.Int64).to_numpy()
+    row = table["unit"].cast(pl.Enum(units)).to_physical().cast(pl.Int64).to_numpy()
     share = (table["value"].to_numpy() - bins.low) / (bins.high - bins.low)
     column = np.clip(np.floor(share * bins.number), 0, bins.number - 1).astype(np.int64)
     # Two indices as one, counted at once.
-    flat = np.bincount(
-        row * bins.number + column,
-        minlength=len(units) * bins.number,
-    )
+    flat = np.bincount(row * bins.number + column, minlength=len(units) * bins.number)
     return flat.reshape(len(units), bins.number).astype(np.float64)
 
 
@@ -428,10 +346,7 @@ class Reference(Measured):
 
     def rate(self) -> dict[str, Any]:
         """Lane changes per vehicle-km of the whole recording, with its exact interval."""
-        return lane_change_rate(
-            int(self.whole["lane_changes"]),
-            self.whole["vehicle_km"],
-        )
+        return lane_change_rate(int(self.whole["lane_changes"]), self.whole["vehicle_km"])
 
     def save(self, path: Path) -> None:
         """Write as JSON, atomically."""

@@ -11,17 +11,9 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ganlane.evaluation.table import (
-    aligned,
-    number,
-    with_interval,
-)
+from ganlane.evaluation.table import aligned, number, with_interval
 from ganlane.realism.driving import FLOORS
-from ganlane.realism.measures import (
-    QUANTITIES,
-    UNITS,
-    Measured,
-)
+from ganlane.realism.measures import QUANTITIES, UNITS, Measured
 from ganlane.realism.starts import Starts
 from ganlane.view.figures import (
     FAINT,
@@ -49,10 +41,8 @@ def card_text(numbers: Mapping[str, Any]) -> list[str]:
     # A second site, to which nothing was fitted.
     for name, rows in numbers["i80"].items():
         tables.append(f"{name}\n{quantities_table(rows, traffic)}")
-    for name, runs in {
-        traffic: numbers["long_runs"],
-        **numbers["long_runs_against"],
-    }.items():
+    long_runs = {traffic: numbers["long_runs"], **numbers["long_runs_against"]}
+    for name, runs in long_runs.items():
         if runs:
             tables.append(long_table(runs, name))
     return tables
@@ -66,42 +56,22 @@ def quantities_table(quantities: Mapping[str, Any], traffic: str) -> str:
     # All rows have the same rivals.
     rivals = list(next(iter(quantities.values()))["against"])
     ours = f"{short_name(traffic)} [95 %]"
-    heading = [
-        "distance to recorded",
-        ours,
-        "ceiling",
-        "constant v",
-        "random",
-    ]
-    for rival in rivals:
-        heading += [
-            short_name(rival),
-            f"minus {short_name(rival)} [95 %]",
-            "",
-        ]
+    heading = ["distance to recorded", ours, "ceiling", "constant v", "random"]
+    for rival in map(short_name, rivals):
+        heading += [rival, f"minus {rival} [95 %]", ""]
     lines = [heading]
     for name, row in quantities.items():
-        line = [
-            f"{name}, {row['unit']}",
-            with_interval(row, "distance"),
-        ]
+        line = [f"{name}, {row['unit']}", with_interval(row, "distance")]
         # The scale: from the best that can be expected to random driving.
-        line += [
-            number(row[end])
-            for end in (
-                "ceiling",
-                "constant_velocity",
-                "floor",
-            )
-        ]
+        line += [number(row[end]) for end in ("ceiling", "constant_velocity", "floor")]
         for rival in rivals:
             # The difference is paired: both drove the same scenes.
             theirs = row["against"][rival]
             line += [
                 number(theirs["distance"]),
                 with_interval(theirs, "difference"),
+                theirs["verdict"],
             ]
-            line.append(theirs["verdict"])
         lines.append(line)
     return aligned(lines)
 
@@ -109,15 +79,7 @@ def quantities_table(quantities: Mapping[str, Any], traffic: str) -> str:
 def starts_table(driving: Mapping[str, Any]) -> str:
     """Lane changes and accelerations, one traffic per line, the recordings among them."""
     rate = "changes per vehicle-km [95 %]"
-    tails = "acceleration 5 %, 95 %"
-    lines = [
-        [
-            "from the same starts",
-            rate,
-            "vehicle-km",
-            tails,
-        ]
-    ]
+    lines = [["from the same starts", rate, "vehicle-km", "acceleration 5 %, 95 %"]]
     for name, row in driving.items():
         acceleration = row["quantiles"]["acceleration"]
         line = [
@@ -161,11 +123,7 @@ def short_name(traffic: str) -> str:
     return traffic.rpartition(".")[2]
 
 
-def draw(
-    numbers: Mapping[str, Any],
-    starts: Starts,
-    to: Path,
-) -> None:
+def draw(numbers: Mapping[str, Any], starts: Starts, to: Path) -> None:
     """The figures of a card, distributions and distances, into the folder ``to``."""
     # The reference drivers would hide the others.
     simulated = {name: starts.driven[name] for name in starts.driven if name not in FLOORS}
@@ -183,8 +141,7 @@ def _pooled(measured: Measured) -> dict[str, FloatArray]:
 
 @rc_context(STYLE)
 def draw_distributions(
-    recorded: Mapping[str, FloatArray],
-    simulated: Mapping[str, Mapping[str, FloatArray]],
+    recorded: Mapping[str, FloatArray], simulated: Mapping[str, Mapping[str, FloatArray]]
 ) -> Figure:
     """A panel per quantity.
 
@@ -197,47 +154,24 @@ def draw_distributions(
         edges = QUANTITIES[name].edges
         unit = UNITS[name].replace("s2", "s²").replace("s3", "s³")
         middle = 0.5 * (edges[1:] + edges[:-1])
-        axes.set(
-            title=name.replace("_", " "),
-            xlabel=unit,
-            ylabel=f"density, per {unit}",
-        )
+        axes.set(title=name.replace("_", " "), xlabel=unit, ylabel=f"density, per {unit}")
         axes.set_xlim(edges[0], edges[-1])
         # The recordings come last, on top.
-        for driver, counts in {
-            **simulated,
-            "recorded": recorded,
-        }.items():
-            total = float(counts[name].sum())
-            colour = colours[driver]
+        for driver, by_quantity in {**simulated, "recorded": recorded}.items():
+            counts = by_quantity[name]
+            total = float(counts.sum())
             if not total:
                 continue
             # Densities, so that traffics with more samples are not higher.
-            density = counts[name] / total / np.diff(edges)
-            plot_line(
-                axes,
-                middle,
-                density,
-                color=colour,
-            )
+            density = counts / total / np.diff(edges)
+            style: Any = {"color": colours[driver]}
+            plot_line(axes, middle, density, **style)
             # The bins at both ends hold all values beyond, too.
             for end, mark in ((0, "<"), (-1, ">")):
-                if counts[name][end]:
-                    axes.plot(
-                        middle[end],
-                        density[end],
-                        mark,
-                        color=colour,
-                        clip_on=False,
-                    )
-    beyond = Line2D(
-        [],
-        [],
-        color=FAINT,
-        label="and all values beyond",
-        marker=">",
-        ls="",
-    )
+                if counts[end]:
+                    axes.plot(middle[end], density[end], mark, clip_on=False, **style)
+    label = "and all values beyond"
+    beyond = Line2D([], [], color=FAINT, label=label, marker=">", ls="")
     add_legend(figure, colours, [beyond])
     return figure
 
@@ -249,88 +183,38 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
     ``quantities`` are the rows of :func:`ganlane.realism.card.quantity_rows`. Vertical lines are
     the ends of the scale: recordings against each other, and random driving.
     """
-    colours = palette(
-        [
-            traffic,
-            *next(iter(quantities.values()))["against"],
-        ]
-    )
+    colours = palette([traffic, *next(iter(quantities.values()))["against"]])
+    # The best that can be expected, and the worst that makes sense.
+    scale = {"ceiling": ("half against half", INK), "floor": ("random", FAINT)}
     # A line per traffic, and an empty one.
     block = len(colours) + 1
     figure = Figure(figsize=(7.5, 0.8 + 0.125 * block * len(quantities)))
     axes = figure.subplots()
-    axes.set(
-        xlim=(0, 1),
-        ylim=(block * len(quantities), 0),
-    )
+    axes.set(xlim=(0, 1), ylim=(block * len(quantities), 0))
     axes.set_xlabel("Jensen-Shannon distance to recorded driving")
     names = [name.replace("_", " ") for name in quantities]
     middles = [block * (index + 0.5) for index in range(len(names))]
-    axes.set_yticks(
-        middles,
-        names,
-        color=INK,
-        size=9,
-    )
+    axes.set_yticks(middles, names, color=INK, size=9)
     axes.tick_params("y", length=0)
     axes.grid(False, axis="y")
     for index, row in enumerate(quantities.values()):
         # Quantities from top to bottom, traffics within each in the order of the legend.
         top = block * index
-        axes.axhline(
-            top,
-            color=GRID,
-            lw=0.8,
-        )
-        # The best that can be expected, and the worst that makes sense.
-        for mark, colour in (
-            ("ceiling", INK),
-            ("floor", FAINT),
-        ):
+        axes.axhline(top, color=GRID, lw=0.8)
+        for mark, (_, colour) in scale.items():
             if row[mark] is not None:
-                axes.vlines(
-                    row[mark],
-                    top + 0.3,
-                    top + block - 0.3,
-                    color=colour,
-                    lw=1.6,
-                )
+                axes.vlines(row[mark], top + 0.3, top + block - 0.3, color=colour, lw=1.6)
         for y, (driver, colour) in enumerate(colours.items(), top + 1):
             shown = row if driver == traffic else row["against"][driver]
             # A quantity without samples has no mark.
             value = shown["distance"]
             if value is not None:
-                axes.plot(
-                    shown["distance_ci"] or [value, value],
-                    [y, y],
-                    color=colour,
-                )
-                axes.plot(
-                    value,
-                    y,
-                    "o",
-                    color=colour,
-                    ms=5,
-                )
+                axes.plot(shown["distance_ci"] or [value, value], [y, y], color=colour)
+                axes.plot(value, y, "o", color=colour, ms=5)
     # Marks of the scale, which no traffic has.
     marks = [
-        Line2D(
-            [],
-            [],
-            color=colour,
-            label=name,
-            marker="|",
-            ls="",
-            ms=10,
-        )
-        for name, colour in (
-            ("half against half", INK),
-            ("random", FAINT),
-        )
+        Line2D([], [], color=colour, label=name, marker="|", ls="", ms=10)
+        for name, colour in scale.values()
     ]
-    add_legend(
-        figure,
-        {short_name(name): colour for name, colour in colours.items()},
-        marks,
-    )
+    add_legend(figure, {short_name(name): colour for name, colour in colours.items()}, marks)
     return figure

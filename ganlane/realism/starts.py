@@ -14,26 +14,13 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from ganlane.data.dense import (
-    Recording,
-    recordings_of,
-    units_of,
-)
+from ganlane.data.dense import Recording, recordings_of, units_of
 from ganlane.data.lanes import scene_lane_widths
 from ganlane.data.schema import FRAME_S
 from ganlane.data.statistics import driving_statistics
 from ganlane.errors import UserError
-from ganlane.realism.driving import (
-    FLOORS,
-    Factory,
-    StartOptions,
-    drive_recordings,
-)
-from ganlane.realism.long_runs import (
-    EventCounter,
-    LongRunParameters,
-    drive_spawned,
-)
+from ganlane.realism.driving import FLOORS, Factory, StartOptions, drive_recordings
+from ganlane.realism.long_runs import EventCounter, LongRunParameters, drive_spawned
 from ganlane.realism.measures import (
     QUANTITIES,
     SHIPPED_REFERENCE,
@@ -61,16 +48,9 @@ def print_progress(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def simulate(
-    make: Factory,
-    recordings: Sequence[Recording],
-    options: StartOptions,
-) -> Measured:
+def simulate(make: Factory, recordings: Sequence[Recording], options: StartOptions) -> Measured:
     """Drive the recordings with a traffic and measure it."""
-    return measure(
-        drive_recordings(make, recordings, options),
-        units_of(recordings),
-    )
+    return measure(drive_recordings(make, recordings, options), units_of(recordings))
 
 
 def drive_all(
@@ -108,11 +88,8 @@ def fit_excess(
 
     def mean_distance(excess: float) -> float:
         # Once per scene is enough to compare candidates with each other.
-        driven = simulate(
-            make,
-            recordings,
-            replace(options, desired_above_mps=excess, repeats=1),
-        )
+        once = replace(options, desired_above_mps=excess, repeats=1)
+        driven = simulate(make, recordings, once)
         # Lane changes are too few to fit anything to.
         distances = [
             pooled_distance(driven.counts[name], recorded.counts[name])
@@ -162,12 +139,7 @@ class Starts:
         rows = [self.scenes.index(name) for name in scenes]
         driven = {name: measured.restricted_to(rows) for name, measured in self.driven.items()}
         recorded = self.recorded.restricted_to(rows)
-        return replace(
-            self,
-            scenes=list(scenes),
-            driven=driven,
-            recorded=recorded,
-        )
+        return replace(self, scenes=list(scenes), driven=driven, recorded=recorded)
 
     def description(self) -> dict[str, Any]:
         """The entries of ``results.json`` about starts and recordings."""
@@ -248,11 +220,7 @@ def recorded_starts(
 
 
 def spawned_starts(
-    factories: Mapping[str, Factory],
-    road: Road,
-    spawn: SpawnParameters,
-    repeats: int,
-    seed: int,
+    factories: Mapping[str, Factory], road: Road, spawn: SpawnParameters, repeats: int, seed: int
 ) -> Starts:
     """Drive every traffic from the same spawned scenes: 8 episodes per repeat, 30 vehicles, 30 s.
 
@@ -266,47 +234,20 @@ def spawned_starts(
         f"no recordings here: spawned starts against {SHIPPED_REFERENCE.name}; give data.path=FILE "
         "for the fair comparison"
     )
-    parameters = LongRunParameters(
-        _SPAWNED_VEHICLES,
-        most_s=_SPAWNED_S,
-        seed=seed,
-        spawn=spawn,
-    )
+    parameters = LongRunParameters(_SPAWNED_VEHICLES, most_s=_SPAWNED_S, seed=seed, spawn=spawn)
     driven = {}
     for name, make in factories.items():
         print_progress(f"{name} from {rows} spawned starts")
-        recordings = spawned_recordings(
-            make,
-            road,
-            parameters,
-            rows,
-        )
-        driven[name] = measure_recordings(recordings)
-    return Starts(
-        [],
-        [],
-        {},
-        driven,
-        reference,
-        reference,
-    )
+        driven[name] = measure_recordings(spawned_recordings(make, road, parameters, rows))
+    return Starts([], [], {}, driven, reference, reference)
 
 
 def spawned_recordings(
-    make: Factory,
-    road: Road,
-    parameters: LongRunParameters,
-    rows: int,
+    make: Factory, road: Road, parameters: LongRunParameters, rows: int
 ) -> list[Recording]:
     """``rows`` spawned episodes of ``parameters.most_s`` s, in the form of recordings."""
     # Events are counted because driving counts them; nobody reads them here.
-    paths = drive_spawned(
-        make(road),
-        parameters,
-        0,
-        rows,
-        EventCounter(road),
-    )
+    paths = drive_spawned(make(road), parameters, 0, rows, EventCounter(road))
     # Nobody enters late or leaves.
     everywhere = np.ones(paths.x[:, 0].shape, dtype=bool)
     return [

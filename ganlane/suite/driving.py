@@ -17,10 +17,7 @@ from ganlane.traffic import ReplayTraffic
 
 
 def compare(
-    drivers: Sequence[Driver],
-    config: EvaluateConfig,
-    quiet: bool = False,
-    once: bool = False,
+    drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = False, once: bool = False
 ) -> pl.DataFrame:
     """Run the episodes of ``config`` with each driver on each of its traffics.
 
@@ -48,12 +45,7 @@ def compare(
     tables = []
     current = None
     disabled = quiet or not sys.stderr.isatty()
-    with tqdm(
-        total=total,
-        unit="episode",
-        file=sys.stderr,
-        disable=disabled,
-    ) as bar:
+    with tqdm(total=total, unit="episode", file=sys.stderr, disable=disabled) as bar:
         for traffic, module in modules.items():
             numbers: Sequence[int] = range(episodes)
             if once and isinstance(module, ReplayTraffic):
@@ -80,14 +72,7 @@ def compare(
                     current = parts
                     batch = make(min(config.num_envs, len(numbers)))
                 report = None if quiet else _reporter(bar, f"{driver.name} on {traffic}")
-                table = evaluation.run_episodes(
-                    batch,
-                    policy,
-                    numbers,
-                    seed,
-                    report,
-                    make,
-                )
+                table = evaluation.run_episodes(batch, policy, numbers, seed, report, make)
                 table = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
                 # Episodes of one recorded scene are no independent observations.
                 if isinstance(module, ReplayTraffic):
@@ -112,10 +97,6 @@ def _reporter(bar: tqdm, title: str) -> Callable[[int, int], None]:
     def report(finished: int, wanted: int) -> None:
         bar.update(before + finished - bar.n)
         if bar.disable and finished == wanted:
-            print(
-                f"{title}: {wanted} episodes",
-                file=sys.stderr,
-                flush=True,
-            )
+            print(f"{title}: {wanted} episodes", file=sys.stderr, flush=True)
 
     return report

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ganlane.evaluation.measures import CRASHES
+from ganlane.evaluation.rows import SCALE_BOTTOM, SCALE_TOP
 from ganlane.evaluation.table import Cell, Table, number, number_of, text_of, with_interval
 from ganlane.files import write_bytes
 
@@ -65,12 +66,12 @@ def score_table(summaries: Sequence[Row], traffics: Sequence[str], notes: Sequen
         "off road": lambda row: number(row["departures_per_1000_km"], 1),
         "at fault": lambda row: number(row["at_fault_per_1000_km"], 1),
         "near misses": lambda row: number(row["near_misses_per_1000_km"], 1),
-        "m/s": lambda row: number(row["mean_speed_mps"], 1),
+        "m/s": number_of("mean_speed_mps", 1),
         "P(above MOBIL)": above_mobil,
-        "headway s": lambda row: number(row["least_headway_s"], 2),
-        "braking": lambda row: number(row["hardest_braking_mps2"], 1),
+        "headway s": number_of("least_headway_s", 2),
+        "braking": number_of("hardest_braking_mps2", 1),
         "/".join(CRASHES): _kinds,
-        "decisions/s": lambda row: number(row["decisions_per_s"], 0),
+        "decisions/s": number_of("decisions_per_s", 0),
         **{traffic: on(traffic) for traffic in traffics},
     }
     best_first = sorted(summaries, key=lambda row: -row["score"])
@@ -96,7 +97,7 @@ def matrix_table(rows: Sequence[Row]) -> Table:
         "both per 1000 km": number_of("failures_per_1000_km", 1),
         "/".join(CRASHES): _kinds,
         "near misses per 1000 km": number_of("near_misses_per_1000_km", 1),
-        "headway s": lambda row: number(row["least_headway_s"], 2),
+        "headway s": number_of("least_headway_s", 2),
         "m/s": number_of("mean_speed_mps", 1),
         "changes/km": number_of("lane_changes_per_km", 2),
         "close behind": number_of("soft_crash_behind_per_episode", 2),
@@ -132,11 +133,18 @@ def paper_tables(rows: Sequence[Row]) -> list[Table]:
     def each(key: str, digits: int) -> Cell:
         return lambda row: ", ".join(number(training[key], digits) for training in row["each"])
 
-    def ours(traffics: Sequence[str], drivers: Sequence[str]) -> list[Row]:
-        # Agents may say that they drive without a mask.
-        names = {name for driver in drivers for name in (driver, f"{driver}+none")}
-        return [row for row in rows if row["traffic"] in traffics and row["driver"] in names]
+    def beside(
+        title: str, paper: list[list[str]], traffics: list[str], columns: Mapping[str, Cell]
+    ) -> Table:
+        ours = [row for row in rows if row["traffic"] in traffics and row["driver"] in drivers]
+        table = Table.of(title, ours, {**names, **columns}, 3)
+        return replace(table, lines=[*paper, *table.lines])
 
+    # Agents may say that they drive without a mask.
+    agents = [name for agent in PAPER_VI for name in (agent, f"{agent}+none")]
+    drivers = [*agents, SCALE_TOP, SCALE_BOTTOM]
+    if not any(row["traffic"] == "gan" and row["driver"] in agents for row in rows):
+        return []
     names: Mapping[str, Cell] = {
         "source": lambda row: "here",
         "traffic": text_of("traffic"),
@@ -155,19 +163,6 @@ def paper_tables(rows: Sequence[Row]) -> list[Table]:
         "sd": number_of("reward_sd", 1),
         "each training": each("mean_reward", 1),
     }
-    drivers = [*PAPER_VI, "mobil", "random_legal"]
-    six = Table.of(
-        "Table VI: crashes on rule-driven traffic",
-        ours(["idm", "idm_mobil"], drivers),
-        {**names, **crashes},
-        3,
-    )
-    seven = Table.of(
-        "Table VII: performance on generated traffic",
-        ours(["gan"], drivers),
-        {**names, **rewards},
-        3,
-    )
     lines_vi = [
         ["paper", "Traffic_IDM", name, "not stated", *counts, "", ""]
         for name, counts in PAPER_VI.items()
@@ -175,11 +170,10 @@ def paper_tables(rows: Sequence[Row]) -> list[Table]:
     lines_vii = [
         ["paper", "Traffic_GAN", name, "1000", *values, ""] for name, values in PAPER_VII.items()
     ]
-    if not ours(["gan"], list(PAPER_VII)):
-        return []
+    traffics_vi = ["idm", "idm_mobil"]
     return [
-        replace(six, lines=[*lines_vi, *six.lines]),
-        replace(seven, lines=[*lines_vii, *seven.lines]),
+        beside("Table VI: crashes on rule-driven traffic", lines_vi, traffics_vi, crashes),
+        beside("Table VII: performance on generated traffic", lines_vii, ["gan"], rewards),
     ]
 
 

@@ -85,7 +85,12 @@ def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
     pairs += [(first, second) for first, second in suite.pairs]
     compared = scores.comparisons(by_recipe, list(dict.fromkeys(pairs)))
     title = f"{suite.version}{', quick' if config.quick else ''}, protocol {config.protocol()}"
-    table = report.score_table(entries, list(suite.scored), _notes(title, config))
+    scale = f"score 0 random_legal, 100 mobil; interquartile mean over {', '.join(suite.scored)}"
+    notes = [
+        f"{title}: {scale}.",
+        "crashes, off road, at fault, near misses: per 1000 km of all these traffics.",
+    ]
+    table = report.score_table(entries, list(suite.scored), notes)
     further = report.paper_tables(matrix) if suite.version == "paper" else []
     show(table.text(), *(paper.text() for paper in further), columns=config.columns)
     driven = {row["traffic"]: row["episodes"] for row in matrix}
@@ -129,15 +134,6 @@ def _sample(episodes: pl.DataFrame, traffics: Sequence[str]) -> dict[str, Any]:
             rewards = driven.sort("episode")["reward"].head(SAMPLE).to_list()
             sample.setdefault(str(driver), {})[str(traffic)] = rewards
     return sample
-
-
-def _notes(title: str, config: BenchmarkConfig) -> list[str]:
-    """What stands below the table."""
-    scored = ", ".join(config.suite.scored)
-    return [
-        f"{title}: score 0 random_legal, 100 mobil; interquartile mean over {scored}.",
-        "crashes, off road, at fault, near misses: per 1000 km of all these traffics.",
-    ]
 
 
 def _films(

@@ -27,9 +27,7 @@ from ganlane.evaluation.statistics import (
     improvement_over_traffics,
     interquartile_mean,
     mcnemar,
-    normalized_over_trainings,
     over_trainings,
-    probability_of_improvement,
     rate_over_trainings,
     score_over_traffics,
 )
@@ -88,11 +86,9 @@ def column(trainings: Mapping[str, pl.DataFrame], value: str | pl.Expr) -> Array
     """
     columns = []
     for frame in trainings.values():
-        expression = pl.col(value) if isinstance(value, str) else value
-        chosen = frame.select(expression.cast(pl.Float64).alias("value"))
+        chosen = frame.select(value=value).cast(pl.Float64)
         if "car" in frame.columns and frame["car"].null_count() == 0:
-            cars = chosen.with_columns(car=frame["car"]).group_by("car", maintain_order=True)
-            chosen = cars.agg(pl.col("value").mean())
+            chosen = chosen.group_by(frame["car"], maintain_order=True).mean()
         columns.append(chosen["value"].to_numpy())
     return np.stack(columns)
 
@@ -132,7 +128,9 @@ def _row(recipe: str, traffic: str, cells: Cells) -> Row:
     score = None
     if (SCALE_BOTTOM, traffic) in cells:
         random_legal = column(cells[SCALE_BOTTOM, traffic], "reward")
-        score = normalized_over_trainings(rewards, mobil, random_legal)
+        # Without a lead of MOBIL over the random driver the scale would have no length.
+        if difference(mobil, random_legal).excludes_zero():
+            score = score_over_traffics([(rewards, mobil, random_legal)])
     lead = None if is_mobil else difference(rewards, mobil)
     probability = None if is_mobil else _probability(rewards, mobil)
     # Counts and plain rates are of the episodes of all trainings.
@@ -151,12 +149,15 @@ def _row(recipe: str, traffic: str, cells: Cells) -> Row:
         **safety(trainings),
     }
     # Trainings one by one, so that a reader sees how far they lie apart.
-    row["each"] = []
-    for (name, frame), reward in zip(trainings.items(), rewards[:, None]):
-        lead = None if is_mobil else difference(reward, mobil)
-        training = {"driver": name, **entries("mean_reward", over_trainings(reward))}
-        training |= {**entries("minus_mobil", lead), **counts_of_ends(frame, FAILURES)}
-        row["each"].append(training)
+    row["each"] = [
+        {
+            "driver": name,
+            **entries("mean_reward", over_trainings(reward)),
+            **entries("minus_mobil", None if is_mobil else difference(reward, mobil)),
+            **counts_of_ends(frame, FAILURES),
+        }
+        for (name, frame), reward in zip(trainings.items(), rewards[:, None])
+    ]
     return row
 
 
@@ -204,7 +205,14 @@ def summaries(cells: Cells, matrix: Sequence[Row], suite: Suite) -> list[Row]:
     scored = list(suite.scored)
     summary = []
     names = ("normalized_percent", "normalized_percent_ci")
-    for recipe in dict.fromkeys(recipe for recipe, _ in cells):
+    recipes = dict.fromkeys(recipe for recipe, _ in cells)
+    # By traffic, the tables [S, E] of each recipe.
+    rewards = {
+        recipe: [column(cells[recipe, traffic], "reward") for traffic in scored]
+        for recipe in recipes
+    }
+    scale = rewards[SCALE_TOP], rewards[SCALE_BOTTOM]
+    for recipe, ours in rewards.items():
         scores = {
             row["traffic"]: {name: row[name] for name in names}
             for row in matrix
@@ -217,41 +225,25 @@ def summaries(cells: Cells, matrix: Sequence[Row], suite: Suite) -> list[Row]:
             name: pl.concat([cells[recipe, traffic][name] for traffic in scored])
             for name in cells[recipe, scored[0]]
         }
+        others = [name for name in suite.drivers() if name != recipe]
+        improvement = {
+            name: improvement_over_traffics(list(zip(ours, rewards[name]))) for name in others
+        }
         summary.append(
             {
                 "entry": recipe,
                 "trainings": len(together),
-                **entries("score", score_over_traffics(_rewards(cells, scored, recipe))),
+                **entries("score", score_over_traffics(list(zip(ours, *scale)))),
                 "by_traffic": scores,
                 "worst": None if worst is None else percent[worst],
                 "worst_traffic": worst,
-                "improvement": _improvement(cells, scored, recipe, suite),
+                "improvement": {
+                    name: entries("probability", estimate) for name, estimate in improvement.items()
+                },
                 **safety(together),
             }
         )
     return summary
-
-
-def _rewards(cells: Cells, traffics: Sequence[str], recipe: str) -> list[list[Array]]:
-    """By traffic the rewards of a recipe, MOBIL and the random driver."""
-    drivers = (recipe, SCALE_TOP, SCALE_BOTTOM)
-    return [[column(cells[name, traffic], "reward") for name in drivers] for traffic in traffics]
-
-
-def _improvement(
-    cells: Cells, traffics: Sequence[str], recipe: str, suite: Suite
-) -> dict[str, dict[str, Any]]:
-    """The probability of improvement over each driver of the suite."""
-    probabilities = {}
-    for other in suite.drivers():
-        if other == recipe:
-            continue
-        pairs = [
-            (column(cells[recipe, traffic], "reward"), column(cells[other, traffic], "reward"))
-            for traffic in traffics
-        ]
-        probabilities[other] = entries("probability", improvement_over_traffics(pairs))
-    return probabilities
 
 
 def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:
@@ -265,14 +257,12 @@ def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:
         crashed, and the exact probability.
     """
     compared = []
-    traffics = dict.fromkeys(traffic for _, traffic in cells)
     for one, other in pairs:
-        for traffic in traffics:
-            first = cells.get((one, traffic))
-            second = cells.get((other, traffic))
-            if first is not None and second is not None:
+        for recipe, traffic in cells:
+            if recipe == one and (other, traffic) in cells:
                 names = {"driver": one, "over": other, "traffic": traffic}
-                compared.append({**names, **_compared(first, second)})
+                both = _compared(cells[one, traffic], cells[other, traffic])
+                compared.append({**names, **both})
     return compared
 
 
@@ -317,4 +307,5 @@ def _crash_difference(first: Array, second: Array) -> Estimate:
 
 def _probability(first: Array, second: Array) -> Estimate | None:
     """None where neither has a second training: it says nothing then."""
-    return probability_of_improvement(first, second) if len(first) + len(second) > 2 else None
+    several = len(first) + len(second) > 2
+    return improvement_over_traffics([(first, second)]) if several else None

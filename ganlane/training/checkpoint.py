@@ -39,10 +39,7 @@ class TrainingState:
     """
 
     def __init__(
-        self,
-        env: EnvBase,
-        agent: Rainbow,
-        identity: Mapping[str, Any] | None = None,
+        self, env: EnvBase, agent: Rainbow, identity: Mapping[str, Any] | None = None
     ) -> None:
         # what the run consists of, in the order of a decision
         self.collector = Collector(env)
@@ -51,10 +48,7 @@ class TrainingState:
         self.environments = self.collector.environments
         self.window = NStepWindow(agent.config.n_step, agent.config.gamma)
         self.stats = EpisodeStats(
-            self.environments,
-            agent.network.config.actions,
-            agent.config.gamma,
-            agent.device,
+            self.environments, agent.network.config.actions, agent.config.gamma, agent.device
         )
         self.decisions = 0
         self.pending_decisions = 0
@@ -137,11 +131,7 @@ class TrainingState:
             return "the replay buffer: it is filled again before the next update"
         return None
 
-    def _take_over(
-        self,
-        state: Mapping[str, Any],
-        path: str | Path,
-    ) -> None:
+    def _take_over(self, state: Mapping[str, Any], path: str | Path) -> None:
         """Restore everything from ``state``; see :meth:`restore`."""
         # by dotted name, as on the command line
         before = flat(state["identity"])
@@ -211,17 +201,9 @@ class Checkpointer:
         # a slow disk must not slow down the training
         self.pause_s = max(self.every_s, PATIENCE * (self.saved_s - begun))
 
-    def save_weights(
-        self,
-        name: str,
-        figures: Mapping[str, Any],
-    ) -> None:
+    def save_weights(self, name: str, figures: Mapping[str, Any]) -> None:
         """Write the online network as ``NAME.safetensors``, with ``figures`` in its metadata."""
-        training = {
-            **self.metadata.get("training", {}),
-            **self.state.progress(),
-            **figures,
-        }
+        training = {**self.metadata.get("training", {}), **self.state.progress(), **figures}
         save_agent(
             self.path.with_name(f"{name}.safetensors"),
             self.state.agent,
@@ -250,10 +232,8 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> Any
         raise UserError(f"{option}: no such file; give a run's folder or its {LAST}.")
     with path.open("rb") as file:
         # Another file, however large, is not searched for a checksum; an empty one has no map.
-        archive = file.read(2) == b"PK"
-        sealed = archive and has_checksum(
-            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ),
-            option,
+        sealed = file.read(2) == b"PK" and has_checksum(
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), option
         )
     try:
         # weights_only: no pickled object is made, no code runs
@@ -264,15 +244,12 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> Any
             "another one."
         ) from error
     # First the kind: a file of another program has no checksum of ours either.
-    if (
-        not isinstance(content, dict)
-        or content.get("kind") != KIND
-        or content.get("version") != VERSION
-    ):
+    header = content if isinstance(content, dict) else {}
+    if (header.get("kind"), header.get("version")) != (KIND, VERSION):
         raise UserError(f"{option}: not a {KIND} of version {VERSION}; give a run's {LAST}.")
     if not sealed:
         refuse_without_checksum(option)
-    return content.get("state")  # :meth:`TrainingState.restore` checks the parts
+    return header.get("state")  # :meth:`TrainingState.restore` checks the parts
 
 
 def _finite(state: Any) -> bool:

@@ -63,9 +63,8 @@ class Collector:
 
     def state_dict(self, exact: bool) -> dict[str, Any]:
         """The state of the environments; unless ``exact``, only their episode numbers."""
-        if exact:
-            return pack(self.env_state)
-        return pack(self.env_state.select(keys.SEED, keys.EPISODE, strict=False))
+        numbers = self.env_state.select(keys.SEED, keys.EPISODE, strict=False)
+        return pack(self.env_state if exact else numbers)
 
     def load_state_dict(self, state: dict[str, Any], exact: bool) -> None:
         """Continue from :meth:`state_dict` of environments of the same shape.
@@ -90,10 +89,7 @@ def pack(tensordict: TensorDictBase) -> dict[str, Any]:
         key: pack(value) if isinstance(value, TensorDictBase) else value
         for key, value in tensordict.items()
     }
-    return {
-        "batch_size": list(tensordict.batch_size),
-        "items": leaves,
-    }
+    return {"batch_size": list(tensordict.batch_size), "items": leaves}
 
 
 def unpack(packed: dict[str, Any]) -> TensorDict:

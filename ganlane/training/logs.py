@@ -88,16 +88,10 @@ class Logs:
     ) -> None:
         self.evaluation_file = Path(folder) / "evaluation.csv"
         shares = [f"action_{i}_share" for i in range(actions)]
-        metrics = CsvLog(
-            Path(folder) / "metrics.csv",
-            [*COLUMNS, *shares],
-            decisions,
-        )
-        self.progress = None if total is None else Progress(total, decisions)
-        self.further = list(further)
-        self.of_metrics: list[Log] = [metrics, *further]
-        if self.progress is not None:
-            self.of_metrics.append(self.progress)
+        metrics = CsvLog(Path(folder) / "metrics.csv", [*COLUMNS, *shares], decisions)
+        self.progress = [] if total is None else [Progress(total, decisions)]
+        self.further = further
+        self.of_metrics: list[Log] = [metrics, *further, *self.progress]
         before = read_rows(self.evaluation_file)
         if before:  # a resumed run: remove rows beyond its checkpoint
             CsvLog(self.evaluation_file, list(before[0]), decisions).close()
@@ -125,14 +119,14 @@ class Logs:
         with closing(CsvLog(self.evaluation_file, list(row), last)) as evaluation:
             evaluation.write(row)
         # With a prefix, so that these figures are not mixed with those of the training.
+        figures = {f"evaluation/{name}": value for name, value in row.items()}
         for log in self.further:
-            figures = {f"evaluation/{name}": value for name, value in row.items()}
             log.write({**figures, "decisions": row["decisions"]})
 
     def advance(self, decisions: int) -> None:
         """Move the progress bar."""
-        if self.progress is not None:
-            self.progress.advance(decisions)
+        for progress in self.progress:
+            progress.advance(decisions)
 
     def say(self, text: str) -> None:
         """Print a line, above the bar if there is one."""
@@ -155,24 +149,12 @@ class CsvLog:
         decisions: already made.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        columns: Sequence[str],
-        decisions: int = 0,
-    ) -> None:
+    def __init__(self, path: str | Path, columns: Sequence[str], decisions: int = 0) -> None:
         self.path = Path(path)
         # rows after the checkpoint are made again
         rows = [row for row in read_rows(self.path) if float(row["decisions"]) <= decisions]
-        form: Any = {
-            "fieldnames": columns,
-            "extrasaction": "ignore",
-            "lineterminator": "\n",
-        }
-        with (
-            atomic_path(self.path) as part,
-            part.open("w", newline="") as file,
-        ):
+        form: Any = {"fieldnames": columns, "extrasaction": "ignore", "lineterminator": "\n"}
+        with atomic_path(self.path) as part, part.open("w", newline="") as file:
             # the columns of today, even if the old file had others
             writer = csv.DictWriter(file, **form)
             writer.writeheader()
@@ -213,10 +195,9 @@ def read_rows(path: Path) -> list[dict[str, str]]:
             whole = [line for line in file if line.endswith("\n")]
         # DictReader gives missing entries of a short row as None, and surplus ones of a long row
         # under the key None.
-        rows = [
-            row for row in csv.DictReader(whole) if None not in row and None not in row.values()
-        ]
-        if whole and "decisions" not in next(csv.reader(whole)):
+        reader = csv.DictReader(whole)
+        rows = [row for row in reader if None not in row and None not in row.values()]
+        if whole and "decisions" not in (reader.fieldnames or ()):
             raise ValueError("it has no column 'decisions'")
         rows = [row for row in rows if row["decisions"]]
         for row in rows:
@@ -239,41 +220,35 @@ class Progress:
     (default stderr) gets a bar, anything else a line per row.
     """
 
-    def __init__(
-        self,
-        total: int,
-        done: int = 0,
-        stream: TextIO | None = None,
-    ) -> None:
+    def __init__(self, total: int, done: int = 0, stream: TextIO | None = None) -> None:
         self.total = total
         self.stream = sys.stderr if stream is None else stream
         self.figures: dict[str, float] = {}
-        self._bar = None
-        if self.stream.isatty():
-            self._bar = tqdm(
-                total=total,
-                initial=done,
-                desc="train",
-                unit="",
-                unit_scale=True,
-                dynamic_ncols=True,
-                bar_format=BAR,
-                file=self.stream,
-            )
+        # Without a terminal its methods do nothing.
+        self._bar = tqdm(
+            total=total,
+            initial=done,
+            desc="train",
+            unit="",
+            unit_scale=True,
+            dynamic_ncols=True,
+            bar_format=BAR,
+            file=self.stream,
+            disable=not self.stream.isatty(),
+        )
 
     def advance(self, decisions: int) -> None:
         """Move the bar to ``decisions``."""
-        if self._bar is not None:
-            self._bar.update(decisions - self._bar.n)
+        self._bar.update(decisions - self._bar.n)
 
     def write(self, row: Mapping[str, float]) -> None:
         """Show a row of figures."""
         # a row without ended episodes lacks some of them
-        self.figures |= {name: row[name] for name in SHOWN if name in row}
+        self.figures |= row
         shown = [
             form.format(self.figures[name]) for name, form in SHOWN.items() if name in self.figures
         ]
-        if self._bar is not None:
+        if not self._bar.disable:
             self._bar.set_postfix_str(", ".join(shown))
             return
         # The bound avoids a division by 0 where there is no rate yet.
@@ -285,14 +260,11 @@ class Progress:
 
     def close(self) -> None:
         """Stop updating the bar and leave it on the screen."""
-        if self._bar is not None:
-            self._bar.close()
+        self._bar.close()
 
 
 def make_logs(
-    options: LoggerConfig,
-    folder: str | Path,
-    about: Mapping[str, Any] | None = None,
+    options: LoggerConfig, folder: str | Path, about: Mapping[str, Any] | None = None
 ) -> list[Log]:
     """The logs of ``logger=...`` beyond the CSV files; ``about``: JSON-serialisable settings of the
     run, for display.
@@ -350,10 +322,7 @@ class WandbLog:
     """
 
     def __init__(
-        self,
-        folder: str | Path,
-        project: str = "ganlane",
-        about: Mapping[str, Any] | None = None,
+        self, folder: str | Path, project: str = "ganlane", about: Mapping[str, Any] | None = None
     ) -> None:
         wandb = _module("wandb", "wandb")
         mode = os.environ.get("WANDB_MODE") or "offline"

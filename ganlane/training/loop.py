@@ -107,13 +107,7 @@ def train(
     # None: everything could be restored
     missing = None if resume is None else state.restore(resume)
     seconds, replay = config.checkpoint_every_s, config.checkpoint_replay
-    saver = Checkpointer(
-        state,
-        run_folder,
-        seconds,
-        replay,
-        metadata or {},
-    )
+    saver = Checkpointer(state, run_folder, seconds, replay, metadata or {})
     actions = agent.network.config.actions
     shown = config.total_decisions if config.logger.progress else None
     # logs are closed, and their last rows written, whatever ends the run
@@ -138,12 +132,7 @@ def train(
                 keep_best(state, evaluate, log, saver)
             saver.save()
     stopped_by = signals[-1] if signals else None
-    return TrainingResult(
-        state.progress(),
-        state.best,
-        stopped_by,
-        saver.path,
-    )
+    return TrainingResult(state.progress(), state.best, stopped_by, saver.path)
 
 
 def advance(state: TrainingState) -> TensorDictBase:
@@ -186,12 +175,7 @@ def metrics(state: TrainingState) -> dict[str, float]:
     }
 
 
-def keep_best(
-    state: TrainingState,
-    evaluate: Evaluate,
-    log: Logs,
-    saver: Checkpointer,
-) -> None:
+def keep_best(state: TrainingState, evaluate: Evaluate, log: Logs, saver: Checkpointer) -> None:
     """Evaluate the greedy policy; save it if it is the best so far."""
     # noted first: an evaluation is not repeated at the end
     state.evaluated_at = state.decisions

@@ -16,27 +16,13 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ganlane.agents import (
-    GreedyPolicy,
-    NetworkConfig,
-    Rainbow,
-)
-from ganlane.agents.checkpoint import (
-    SHIPPED,
-    read_agent,
-    save_agent,
-    warm_start,
-)
+from ganlane.agents import GreedyPolicy, Rainbow
+from ganlane.agents.checkpoint import SHIPPED, read_agent, save_agent, warm_start
 from ganlane.agents.drivers import legal_actions
 from ganlane.agents.network import load_parameters
-from ganlane.build import (
-    make_env,
-    make_traffic,
-    observation_of,
-)
+from ganlane.build import make_env, make_traffic, observation_of
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version, run_episodes
 from ganlane.evaluation.results import flat, plain
@@ -76,11 +62,7 @@ def phases_of(config: TrainConfig, folder: Path) -> list[Phase]:
     if before.total_decisions == 0 or before.traffic is None:
         return [Phase("train", folder, config, start)]
     # the second phase starts from the agent that the first one leaves
-    first = replace(
-        config,
-        traffic=before.traffic,
-        total_decisions=before.total_decisions,
-    )
+    first = replace(config, traffic=before.traffic, total_decisions=before.total_decisions)
     place = folder / "pretrain"
     return [
         Phase("pretrain", place, first, start),
@@ -167,20 +149,10 @@ def make_selection(config: TrainConfig) -> Evaluate:
     episodes = range(config.selection_episodes)
 
     def evaluate(policy: GreedyPolicy) -> dict[str, float]:
-        table = run_episodes(
-            env,
-            policy,
-            episodes,
-            config.seed,
-            make_smaller=make,
-        )
-        total = table.select(
-            "reward",
-            "lane_changes",
-            "distance_m",
-            crashes=pl.col("reason") == "hard_crash",
-        ).sum()
-        reward, changes, distance_m, crashes = (float(value) for value in total.row(0))
+        table = run_episodes(env, policy, episodes, config.seed, make_smaller=make)
+        crashed = pl.col("reason") == "hard_crash"
+        total = table.select("reward", "lane_changes", "distance_m", crashed).sum()
+        reward, changes, distance_m, crashes = map(float, total.row(0))
         # of the mean reward over the episodes
         spread = float(np.std(table["reward"].to_numpy()))
         return {
@@ -197,32 +169,10 @@ def make_selection(config: TrainConfig) -> Evaluate:
 # --- the agent
 
 
-@dataclass(frozen=True)
-class Start:
-    """A trained agent to start from."""
-
-    name: str
-    weights: Mapping[str, Tensor]
-    network: NetworkConfig
-    observation: ObservationConfig
-
-
-def read_start(name: str) -> Start:
-    """Read the agent of ``init.path``: a shipped one, a file, or that of a run's folder.
-
-    Raises:
-        UserError: the file is missing or cannot be read.
-    """
-    path = Path(name)
-    if path.is_dir() and name not in SHIPPED:
-        name = str(path / AGENT_FILE)
-    weights, network, metadata = read_agent(name)
-    return Start(
-        name,
-        weights,
-        network,
-        observation_of(metadata),
-    )
+def start_file(name: str) -> str:
+    """The agent behind ``init.path``: a shipped one, a file, or that of a run's folder."""
+    is_run = Path(name).is_dir() and name not in SHIPPED
+    return str(Path(name) / AGENT_FILE) if is_run else name
 
 
 def make_agent(phase: Phase) -> Rainbow:
@@ -251,46 +201,41 @@ def make_initial_agent(phase: Phase, resumes: bool) -> Rainbow:
     The file that a resumed run started from may no longer exist.
 
     Raises:
-        UserError: the agent to start from does not fit.
+        UserError: the agent to start from is missing, cannot be read, or does not fit.
     """
     agent = make_agent(phase)
     if phase.start is not None and not resumes:
-        start = read_start(phase.start)
-        check_observation(start, phase.config.observation)
-        warm_start(
-            agent,
-            start.name,
-            start.weights,
-            start.network,
-        )
+        name = start_file(phase.start)
+        weights, network, metadata = read_agent(name)
+        check_observation(name, observation_of(metadata), phase.config.observation)
+        warm_start(agent, name, weights, network)
     return agent
 
 
-def check_observation(start: Start, observation: ObservationConfig) -> None:
-    """Raise :class:`UserError` if the agent was trained on another observation."""
+def check_observation(
+    name: str, trained: ObservationConfig, observation: ObservationConfig
+) -> None:
+    """Raise :class:`UserError` if the agent ``name`` was ``trained`` on another observation."""
     # what the trained agent reads of this observation, key by key
     configured = asdict(observation)
-    for key, value in asdict(observation.read_by(start.observation)).items():
+    for key, value in asdict(observation.read_by(trained)).items():
         if value != configured[key]:
             option = f"observation={value}" if key == "form" else f"observation.{key}={value}"
             raise UserError(
-                f"init.path={start.name}: this agent was trained with {option}, the run has "
+                f"init.path={name}: this agent was trained with {option}, the run has "
                 f"{configured[key]}; give {option} or start with init=none."
             )
 
 
 def save_final_agent(
-    agent: Rainbow,
-    phase: Phase,
-    metadata: Mapping[str, Any],
-    result: TrainingResult,
+    agent: Rainbow, phase: Phase, metadata: Mapping[str, Any], result: TrainingResult
 ) -> None:
     """Write the agent of the phase: the best one by evaluation, or the last without evaluations.
 
     The metadata also hold the length of the run and, for the best agent, its figures on the
     selection stream.
     """
-    training = dict(metadata["training"])
+    training = metadata["training"]
     best = phase.folder / "checkpoints" / "best.safetensors"
     further = {}
     # the best agent replaces the last one
@@ -301,12 +246,8 @@ def save_final_agent(
         figures = {name: value for name, value in saved["training"].items() if name not in training}
         episodes = phase.config.selection_episodes
         further = {"selected": {**figures, "episodes": episodes, "stream": "select"}}
-    training |= result.progress
-    save_agent(
-        phase.folder / AGENT_FILE,
-        agent,
-        {**metadata, "training": training, **further},
-    )
+    metadata = {**metadata, "training": {**training, **result.progress}, **further}
+    save_agent(phase.folder / AGENT_FILE, agent, metadata)
 
 
 # --- metadata
@@ -334,10 +275,7 @@ def describe(phase: Phase) -> dict[str, Any]:
         "observation_scale": asdict(config.observation.scale()),
         "mask": asdict(config.mask),
         "sensors": asdict(config.observation)["sensors"],
-        "environment": {
-            "vehicles": config.env.vehicles,
-            "lanes": config.env.lanes,
-        },
+        "environment": {"vehicles": config.env.vehicles, "lanes": config.env.lanes},
         "env": plain(config.env),
         "num_envs": config.num_envs,
         "code": code_version(),

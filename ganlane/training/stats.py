@@ -43,11 +43,7 @@ class EpisodeStats:
     """
 
     def __init__(
-        self,
-        environments: int,
-        actions: int,
-        gamma: float,
-        device: torch.device | str = "cpu",
+        self, environments: int, actions: int, gamma: float, device: torch.device | str = "cpu"
     ) -> None:
         self.gamma = gamma
         self.running = {name: torch.zeros(environments, device=device) for name in RUNNING}
@@ -81,16 +77,16 @@ class EpisodeStats:
         taken = step.get(keys.ACTION)[:, None] == self.actions
         self._add("actions", taken.sum(0))
         self._add("episodes", done.sum())
-        for name, value in running.items():
-            if name != "values" or chosen is not None:
-                self._add(name, (value * done).sum())
+        at_end = dict(running)
+        if chosen is None:
+            del at_end["values"]
         events = after.get(keys.EVENTS, {})
-        for name in RATES.keys() & events.keys():
-            self._add(name, (events.get(name).squeeze(-1) & done).sum())
+        at_end |= {name: events.get(name).squeeze(-1) for name in RATES if name in events}
         ego = after.get(keys.EGO, None)
         if ego is not None:
-            for name in ("distance", "lane_changes"):
-                self._add(name, (ego.get(name) * done).sum())
+            at_end |= {name: ego.get(name) for name in ("distance", "lane_changes")}
+        for name, value in at_end.items():
+            self._add(name, (value * done).sum())
 
         # episodes that have ended begin anew
         going = ~done
@@ -120,9 +116,7 @@ class EpisodeStats:
         taken = sums.pop("actions", [])
         for i, count in enumerate(taken):
             row[f"action_{i}_share"] = count / max(sum(taken), 1)
-        self.sums = {}
-        self.updates = {}
-        self.update_count = 0
+        self.sums, self.updates, self.update_count = {}, {}, 0
         episodes = row["episodes"] = sums.get("episodes", 0.0)
         if episodes == 0.0:
             return row

@@ -64,16 +64,13 @@ def readable_on(colour: str) -> str:
     return "#101216" if is_bright else "white"
 
 
-#: Pillow's own letters at a size in pixels: no font has to be installed.
-_font = lru_cache(maxsize=16)(ImageFont.load_default)
-
-
 # A film writes the same numbers and headings in frame after frame: without the cache it is drawn at
 # two thirds of the speed.
 @lru_cache(maxsize=4096)
 def text_mask(text: str, size: int) -> Image.Image:
     """The text as a coverage mask (mode L), cut to its ink across, and as high as a line."""
-    letters = _font(size)
+    # Pillow's own letters: no font has to be installed.
+    letters = ImageFont.load_default(size)
     left, _, right, _ = letters.getbbox(text)
     mask = Image.new("L", (max(1, round(right - left) + 1), round(size * 1.25)))
     ImageDraw.Draw(mask).text((-left, 0), text, fill=255, font=letters)
@@ -107,12 +104,7 @@ class Window:
         edges: rows of the left (upper) and right (lower) edge of the road.
     """
 
-    def __init__(
-        self,
-        look: FilmConfig,
-        lanes: int,
-        lane_width_m: float,
-    ) -> None:
+    def __init__(self, look: FilmConfig, lanes: int, lane_width_m: float) -> None:
         self.width, self.height, self.length_m = look.width, look.height, look.road_m
         self.lanes, self.lane_width_m = lanes, lane_width_m
         room = look.height - HEADER_HEIGHT - FOOTER_HEIGHT
@@ -186,11 +178,7 @@ class Backdrop:
         return picture
 
     def _draw_ends(
-        self,
-        draw: ImageDraw.ImageDraw,
-        lane: int,
-        stretch: LaneStretch,
-        ego_x_m: float,
+        self, draw: ImageDraw.ImageDraw, lane: int, stretch: LaneStretch, ego_x_m: float
     ) -> None:
         """No road before an exit lane and behind a wall, which is red; a kerb beside a ramp."""
         window = self.window

@@ -91,7 +91,7 @@ def read_runs(paths: Sequence[str | Path]) -> dict[str, list[pl.DataFrame]]:
     files: list[Path] = []
     for path in map(Path, paths):
         # A folder without runs is refused when it is read.
-        files += (path.is_dir() and runs_below(path.resolve(), "metrics.csv")) or [path.resolve()]
+        files += runs_below(path.resolve(), "metrics.csv") or [path.resolve()]
     # Twice the same run would be drawn as two seeds that agree perfectly.
     if len(set(files)) < len(files):
         raise UserError(
@@ -142,10 +142,7 @@ def draw_runs(runs: Mapping[str, Sequence[pl.DataFrame]]) -> Figure:
     return figure
 
 
-def _lines(
-    frames: Sequence[pl.DataFrame],
-    column: str,
-) -> list[tuple[FloatArray, FloatArray]]:
+def _lines(frames: Sequence[pl.DataFrame], column: str) -> list[tuple[FloatArray, FloatArray]]:
     """Decisions and values of a column, of every run that has it."""
     lines = []
     for frame in frames:

@@ -100,11 +100,7 @@ def panel_grid(count: int) -> tuple[Figure, list[Axes]]:
     return figure, list(grid[:count])
 
 
-def add_legend(
-    figure: Figure,
-    colours: Mapping[str, str],
-    others: Sequence[Line2D] = (),
-) -> None:
+def add_legend(figure: Figure, colours: Mapping[str, str], others: Sequence[Line2D] = ()) -> None:
     """Names in their colours along the top, in several rows if needed."""
     handles = [
         *(Line2D([], [], color=colour, label=name, lw=2) for name, colour in colours.items()),
@@ -119,21 +115,10 @@ def add_legend(
     figure.legend(handles=handles, loc="outside upper left", ncols=columns)
 
 
-def plot_line(
-    axes: Axes,
-    x: npt.ArrayLike,
-    y: npt.ArrayLike,
-    **style: Any,
-) -> None:
+def plot_line(axes: Axes, x: npt.ArrayLike, y: npt.ArrayLike, **style: Any) -> None:
     """A line with gaps where ``y`` is NaN; a single value between two gaps is a dot."""
     finite = np.isfinite(np.asarray(y, dtype=np.float64))
     # A value is single if it is finite and neither neighbour is; the ends count as gaps.
     padded = np.concatenate(([False], finite, [False]))
     single = finite & ~padded[:-2] & ~padded[2:]
-    axes.plot(
-        x,
-        y,
-        marker="o",
-        markevery=single,
-        **style,
-    )  # type: ignore[arg-type]
+    axes.plot(x, y, marker="o", markevery=single, **style)  # type: ignore[arg-type]

@@ -47,11 +47,7 @@ def film_frames(trajectory: Trajectory, look: FilmConfig) -> list[int]:
     return frames + [last] * max(1, round(HOLD_S * look.fps))
 
 
-def write_film(
-    trajectory: Trajectory,
-    path: str | Path,
-    look: FilmConfig | None = None,
-) -> Path:
+def write_film(trajectory: Trajectory, path: str | Path, look: FilmConfig | None = None) -> Path:
     """Write an episode's film, whole or not at all, and return its path.
 
     Args:
@@ -114,11 +110,7 @@ def _gif(painter: FramePainter, frames: Sequence[int]) -> bytes:
     return file.getvalue()
 
 
-def _write_mp4(
-    painter: FramePainter,
-    frames: Sequence[int],
-    path: Path,
-) -> None:
+def _write_mp4(painter: FramePainter, frames: Sequence[int], path: Path) -> None:
     """H.264 through the ffmpeg that imageio-ffmpeg brings along.
 
     imageio-ffmpeg's own writer ignores the exit status: on a full disk it takes half a film for a

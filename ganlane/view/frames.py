@@ -42,12 +42,7 @@ def _symmetric(*left: tuple[float, float]) -> FloatArray:
     return np.concatenate((half, half[::-1] * _MIRROR))
 
 
-_BODY = _symmetric(
-    (-0.5, 0.42),
-    (-0.46, 0.5),
-    (0.38, 0.5),
-    (0.5, 0.34),
-)
+_BODY = _symmetric((-0.5, 0.42), (-0.46, 0.5), (0.38, 0.5), (0.5, 0.34))
 _EGO = _symmetric((-0.5, 0.5), (0.2, 0.5), (0.5, 0.08))
 # Lights of the left side.
 _BRAKE = np.array([(-0.5, 0.42), (-0.44, 0.42), (-0.44, 0.2), (-0.5, 0.2)])
@@ -107,13 +102,7 @@ class FramePainter:
         self._draw_header(picture, frame)
         return np.asarray(picture)
 
-    def _draw_vehicle(
-        self,
-        picture: Image.Image,
-        frame: int,
-        vehicle: int,
-        column: float,
-    ) -> None:
+    def _draw_vehicle(self, picture: Image.Image, frame: int, vehicle: int, column: float) -> None:
         """A box to scale, its centre in this column, with its speed in m/s on the roof."""
         t, at, window, is_ego = self.trajectory, (frame, vehicle), self.window, vehicle == 0
         middle = np.array([column, float(window.row(t.y[at]))])
@@ -161,12 +150,7 @@ class FramePainter:
             ink = canvas.readable_on(colour)
             put_text(picture, place, f"{t.speed[at]:.0f}", ink, anchor=0.5)
 
-    def _draw_trails(
-        self,
-        picture: Image.Image,
-        frame: int,
-        ego_x: float,
-    ) -> None:
+    def _draw_trails(self, picture: Image.Image, frame: int, ego_x: float) -> None:
         """Trails over the last seconds, as in the paper's Figure 3.
 
         The ego's is brighter.
@@ -227,11 +211,7 @@ class FramePainter:
         put_text(picture, (picture.width / 2, HEADER_HEIGHT + 11), text, colour, 24, 0.5)
 
 
-def _header(
-    label: EpisodeLabel,
-    window: Window,
-    values_at: int,
-) -> Image.Image:
+def _header(label: EpisodeLabel, window: Window, values_at: int) -> Image.Image:
     """What stays in the line above the picture: driver, traffic, episode, titles of the values."""
     picture = Image.new("RGB", (window.width, HEADER_HEIGHT), canvas.HEADER)
     title = f"{label.agent}  on  {label.traffic}"

@@ -31,15 +31,7 @@ from ganlane.settings.render import FilmConfig
 from ganlane.view.record import FloatArray, Trajectory
 
 #: Units of series: s, m, m, rad, m/s, m/s2, m/s3.
-UNITS = dict(
-    time=0.01,
-    x=0.01,
-    y=0.01,
-    heading=0.001,
-    speed=0.01,
-    acceleration=0.01,
-    jerk=0.1,
-)
+UNITS = dict(time=0.01, x=0.01, y=0.01, heading=0.001, speed=0.01, acceleration=0.01, jerk=0.1)
 
 
 def write_player(

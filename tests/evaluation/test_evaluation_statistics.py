@@ -9,12 +9,12 @@ from ganlane.evaluation.statistics import (
     clopper_pearson,
     difference,
     entries,
+    improvement_over_traffics,
     interquartile_mean,
     mcnemar,
     mean_interval,
     over_trainings,
     poisson_interval,
-    probability_of_improvement,
     rate_over_trainings,
     sign_flip_p,
 )
@@ -97,6 +97,10 @@ def test_an_interval_holds_the_truth_in_95_of_100_recipes(trainings, between):
     held = [estimate.low <= 0.0 <= estimate.high for estimate in map(over_trainings, tables)]
     # The plain bootstrap of three holds it in three quarters of them where trainings differ by 20.
     assert 0.91 <= np.mean(held) <= 0.99
+
+
+def probability_of_improvement(first, second):
+    return improvement_over_traffics([(first, second)])
 
 
 def test_the_probability_of_improvement_is_the_share_of_pairs():

@@ -13,7 +13,7 @@ from reference import processes
 from reference.refusals import user_error
 
 from ganlane.agents import read_agent, save_agent
-from ganlane.build import make_driver
+from ganlane.build import make_driver, observation_of
 from ganlane.config.run import settings
 from ganlane.files import conf_folder
 from ganlane.runtime import has_compiler
@@ -28,8 +28,8 @@ from ganlane.training.phases import (
     make_agent,
     make_initial_agent,
     phases_of,
-    read_start,
     run_phase,
+    start_file,
 )
 
 TINY = [*entry_tiny.TINY, "logger.progress=false"]
@@ -127,13 +127,13 @@ def test_another_observation_is_refused_from_a_checkpoint_too(trained, tmp_path)
 
 def test_a_folder_without_an_agent_is_refused(tmp_path):
     with user_error(r"no such file .*agent\.safetensors"):
-        read_start(str(tmp_path))
+        read_agent(start_file(str(tmp_path)))
 
 
 def test_a_shipped_name_means_the_shipped_agent_beside_a_folder_of_that_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("agent_idm").mkdir()
-    assert read_start("agent_idm").name == "agent_idm"
+    assert start_file("agent_idm") == "agent_idm"
 
 
 # --- experiments, lengths, learning rates
@@ -152,7 +152,9 @@ def test_every_experiment_composes_and_fits_the_agent_that_it_starts_from(
 ):
     config = settings("train", overrides)
     if config.init.path is not None:
-        check_observation(read_start(config.init.path), config.observation)
+        name = start_file(config.init.path)
+        trained = observation_of(read_agent(name)[2])
+        check_observation(name, trained, config.observation)
 
 
 def test_a_first_phase_that_is_over_must_be_the_one_asked_for(

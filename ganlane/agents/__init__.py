@@ -1,3 +1,4 @@
+# ruff: noqa: F401  (the names that other parts of the package and users import from here)
 """The agent: Rainbow (Hessel et al. 2018) from TorchRL parts.
 
 A decision flows through the files in this order: :mod:`~ganlane.agents.network` turns an
@@ -15,18 +16,3 @@ from ganlane.agents.n_step import NStepWindow
 from ganlane.agents.network import NetworkConfig, QNetwork
 from ganlane.agents.rainbow import Rainbow
 from ganlane.settings.agent import RainbowConfig
-
-__all__ = [
-    "ExploringPolicy",
-    "GreedyPolicy",
-    "NStepWindow",
-    "NetworkConfig",
-    "QNetwork",
-    "Rainbow",
-    "RainbowConfig",
-    "agent_file",
-    "load_agent",
-    "read_agent",
-    "save_agent",
-    "warm_start",
-]

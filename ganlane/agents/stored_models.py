@@ -39,9 +39,7 @@ _PLAIN = "MLP"
 #: Algorithms whose MlpPolicy is rebuilt here, and the layers of the network that acts, by the
 #: beginning of their names: hidden ones, and the last one.
 NETWORKS: Mapping[str, tuple[str, str]] = {
-    "PPO": ("mlp_extractor.policy_net.", "action_net."),
-    "A2C": ("mlp_extractor.policy_net.", "action_net."),
-    "MaskablePPO": ("mlp_extractor.policy_net.", "action_net."),
+    **dict.fromkeys(("PPO", "A2C", "MaskablePPO"), ("mlp_extractor.policy_net.", "action_net.")),
     "DQN": ("q_net.q_net.", ""),
     _PLAIN: ("", ""),
 }

@@ -1,3 +1,4 @@
+# ruff: noqa: F401  (the names that other parts of the package and users import from here)
 """Measuring drivers: episodes, intervals, tables, and where the numbers come from.
 
 :func:`run_episodes` drives the episodes 0 to E - 1 and gives one row for each;
@@ -24,19 +25,3 @@ from ganlane.evaluation.rows import (
     paired_rows,
 )
 from ganlane.evaluation.table import paired_table, text_table
-
-__all__ = [
-    "code_version",
-    "crashes_by_scene",
-    "evaluation_rows",
-    "failed_episodes",
-    "machine",
-    "machine_sentence",
-    "normalized_percent",
-    "paired_rows",
-    "paired_table",
-    "run_episodes",
-    "text_table",
-    "write_episodes",
-    "write_results",
-]

@@ -48,7 +48,12 @@ def card_numbers(
     runs = long_runs[traffic]
     return {
         "traffic": traffic,
-        **starts.description(),
+        "starts": "recorded" if starts.paired else "spawned",
+        "scenes": starts.scenes,
+        "held_out": starts.held_out,
+        "desired_above_mps": dict(starts.desired_above_mps),
+        "recordings": starts.reference.source,
+        "recorded_lane_changes_per_vehicle_km": starts.reference.rate(),
         "recorded_spread_mps": starts.reference.spread_mps,
         "quantities": rows,
         "quantities_held_out": held_out,

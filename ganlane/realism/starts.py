@@ -9,7 +9,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -140,17 +139,6 @@ class Starts:
         driven = {name: measured.restricted_to(rows) for name, measured in self.driven.items()}
         recorded = self.recorded.restricted_to(rows)
         return replace(self, scenes=list(scenes), driven=driven, recorded=recorded)
-
-    def description(self) -> dict[str, Any]:
-        """The entries of ``results.json`` about starts and recordings."""
-        return {
-            "starts": "recorded" if self.paired else "spawned",
-            "scenes": self.scenes,
-            "held_out": self.held_out,
-            "desired_above_mps": dict(self.desired_above_mps),
-            "recordings": self.reference.source,
-            "recorded_lane_changes_per_vehicle_km": self.reference.rate(),
-        }
 
 
 def recorded_starts(

@@ -113,8 +113,7 @@ class Trajectory:
     def overlapping(self) -> BoolArray:
         """Whether a vehicle's box overlaps another's, [T, M]."""
         fields: dict[str, Any] = dict.fromkeys(keys.VEHICLE_FIELDS, torch.zeros(self.x.shape))
-        for name in ("x", "y", "heading", "length", "width", "valid"):
-            fields[name] = torch.as_tensor(getattr(self, name))
+        fields |= {name: torch.as_tensor(getattr(self, name)) for name in _FIELDS}
         return pair_overlaps(Vehicles(**fields)).any(-1).numpy()
 
     def since(self, start_s: float) -> Trajectory:

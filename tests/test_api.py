@@ -172,7 +172,6 @@ def api(name, *arguments, **keys):
         (lambda: ganlane.load_agent("x" * 10**5), "unknown; choose one of"),
         (lambda: ganlane.load_agent("x" * 10**5 + ".safetensors"), "no such file"),
         (api("evaluate", [42], ["idm"]), "42: expected an agent's name"),
-        (api("evaluate", None, ["idm"]), "None: expected an agent's name"),
         (api("evaluate", ["mobil"], {}), "a list of different traffics, not empty"),
         (api("run", "evaluate", folder=3), "folder=3: expected a path"),
         (api("evaluate", generator={"path": "x"}), "env.generator: no such key"),

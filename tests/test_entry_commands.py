@@ -8,7 +8,7 @@ import yaml
 from reference.refusals import refusal
 
 from ganlane.__main__ import main
-from ganlane.config.run import COMMANDS, settings
+from ganlane.config.run import COMMANDS, call_settings
 from ganlane.settings.record import make
 
 
@@ -22,7 +22,7 @@ def test_usage_lists_every_command(capsys):
 def test_cfg_shows_the_config_and_leaves_nothing_behind(name, empty_folder, capsys):
     assert main([name, "--cfg", "job"]) == 0
     shown = capsys.readouterr()
-    assert make(COMMANDS[name], yaml.safe_load(shown.out)) == settings(name, [])
+    assert make(COMMANDS[name], yaml.safe_load(shown.out)) == call_settings(name, {})
     assert shown.err == ""
     assert list(empty_folder.iterdir()) == []
 

@@ -30,10 +30,10 @@ EXAMPLES = {
 #: Budgets that keep a run to seconds.
 SHORT = {
     "own_function.py": ["30"],
-    "own_reward.py": ["40"],
+    "own_reward.py": ["20"],
     "own_traffic.py": ["3"],
-    "torchrl_dqn.py": ["2048", "2", "60", "16"],
-    "torchrl_ppo.py": ["2048", "2", "60", "16"],
+    "torchrl_dqn.py": ["1024", "2", "60", "16"],
+    "torchrl_ppo.py": ["1024", "2", "60", "16"],
     "cleanrl_style.py": ["2048"],
     "sb3_dqn.py": ["300", "4", "200"],
     "sb3_ppo.py": ["4096", "safe", "MaskablePPO", "4", "200", "16"],

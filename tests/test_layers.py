@@ -88,19 +88,7 @@ def test_imports_point_down(path):
         assert other == part or is_below or (part, other) in LATE, f"{part} imports {other}"
 
 
-BELOW_CONFIG = [
-    "settings",
-    "sim",
-    "data",
-    "generator",
-    "native",
-    "traffic",
-    "env",
-    "transforms",
-    "agents",
-    "evaluation",
-    "view",
-]
+BELOW_CONFIG = [part for part, level in LEVEL.items() if 0 < level < LEVEL["config"]]
 
 
 @pytest.mark.parametrize("part", BELOW_CONFIG)

@@ -65,7 +65,6 @@ def test_shipped_agents_are_found_by_name(saved, monkeypatch):
 
 #: What a file may say of a network that is none.
 DAMAGES = [
-    {"encoder": "none"},
     {"wheels": 4},
     {"noisy": "yes"},
     {"hidden": 8},
@@ -74,7 +73,6 @@ DAMAGES = [
     {"hidden": [8, 10**9]},
     {"observation_size": None},
     {"actions": 0},
-    {"actions": 2.5},
     {"v_min": 200.0},
     {"atoms": True},
     {"atoms": -5},

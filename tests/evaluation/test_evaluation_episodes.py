@@ -35,7 +35,7 @@ SHORT = EnvConfig(goal_m=60.0, kernel="torch")
 
 @pytest.fixture(autouse=True)
 def smaller_batches(monkeypatch):
-    """Rows are left out of batches of 6, too."""
+    """Rows are left out of batches of 5, too."""
     monkeypatch.setattr("ganlane.evaluation.episodes.SMALL_BATCH", 4)
 
 
@@ -130,20 +130,8 @@ def sources(recordings):
     }
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "recycled",
-        "late sensors",
-        "replayed",
-        "cut short",
-    ],
-)
-def test_every_episode_is_bit_for_bit_what_it_is_alone(
-    name,
-    recordings,
-    monkeypatch,
-):
+@pytest.mark.parametrize("name", ["recycled", "late sensors", "replayed", "cut short"])
+def test_every_episode_is_bit_for_bit_what_it_is_alone(name, recordings, monkeypatch):
     monkeypatch.setattr("ganlane.evaluation.episodes.CHECK_EVERY", 2)
     make, driver = sources(recordings)[name], "agent_idm" if name == "late sensors" else "random"
     policy, episodes = make_driver(driver, make.env).policy, [*range(30, 34), 7, 3]
@@ -155,7 +143,7 @@ def test_every_episode_is_bit_for_bit_what_it_is_alone(
     make.sizes.clear()
     seen = []
     wide = run_episodes(
-        make(6), policy, episodes, SEED, lambda *counts: seen.append(counts), make_smaller=make
+        make(5), policy, episodes, SEED, lambda *counts: seen.append(counts), make_smaller=make
     )
     assert_as_alone(wide, expected)
     look.remove()
@@ -163,7 +151,7 @@ def test_every_episode_is_bit_for_bit_what_it_is_alone(
     assert modes == {(ExplorationType.DETERMINISTIC, False)}
     assert seen == sorted(seen)
     assert seen[-1] == (6, 6)
-    assert make.sizes[0] == 6
+    assert make.sizes[0] == 5
     assert (expected["reason"] == "other").any() == (name == "cut short")
 
 

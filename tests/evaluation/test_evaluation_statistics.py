@@ -50,9 +50,7 @@ def test_an_estimate_is_scaled_with_its_bounds_and_gives_a_rows_entries():
     assert entries("rate", None) == entries("rate", Estimate(float("nan"))) == nothing
 
 
-@pytest.mark.parametrize(
-    ("count", "trials"), [(0, 1), (0, 50), (1, 1), (3, 20), (50, 50), (700, 2000)]
-)
+@pytest.mark.parametrize(("count", "trials"), [(0, 50), (3, 20), (50, 50), (700, 2000)])
 def test_the_binomial_interval_agrees_with_scipy(count, trials):
     theirs = stats.binomtest(count, trials).proportion_ci(0.95, "exact")
     assert clopper_pearson(count, trials).interval == pytest.approx([theirs.low, theirs.high])

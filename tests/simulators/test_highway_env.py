@@ -31,8 +31,8 @@ def traffic():
 
 @pytest.fixture(scope="module")
 def driven(traffic):
-    """Six egos that keep their lanes, for 40 s: vehicles [401, 6, 9]."""
-    vehicles, running, state = drive(HighwayEnv(traffic, 6), range(6), 40)
+    """Four egos that keep their lanes, for 30 s: vehicles [301, 4, 9]."""
+    vehicles, running, state = drive(HighwayEnv(traffic, 4), range(4), 30)
     assert running.all()
     return vehicles, state
 
@@ -62,39 +62,30 @@ def test_a_step_is_that_of_highway_envs_own_road(traffic):
 
     # Drivers' exponents, in HighwayEnv's range.
     key = episode_key(traffic.stream, torch.tensor([0]), torch.tensor([2]))
-    exponent = (
-        3.5 + uniform(key, 0, 9, [Purpose.FOREIGN_DRIVER + 8], torch.float64)[0, :, 0]
-    ).tolist()
+    draws = uniform(key, 0, 9, [Purpose.FOREIGN_DRIVER + 8], torch.float64)[0, :, 0]
+    exponent = (3.5 + draws).tolist()
     road = TheirRoad(
         RoadNetwork.straight_road_network(3, start=-1000.0, length=9000.0, speed_limit=70.0)
     )
-
-    def where(i):
-        return [before.x[0, i].item(), before.y[0, i].item()]
-
-    def speeds(i):
-        target = before.desired_speed[0, i].item()
-        return {"speed": before.speed[0, i].item(), "target_speed": target}
-
-    ego = ControlledVehicle(road, where(0), **speeds(0))
-    road.vehicles.append(ego)
-    for i in range(1, 9):
-        timer = state[keys.TRAFFIC, "timer"][0, i].item()
-        vehicle = IDMVehicle(road, where(i), timer=timer, **speeds(i))
+    for i in range(9):
+        place = [before.x[0, i].item(), before.y[0, i].item()]
+        speeds = before.speed[0, i].item(), before.desired_speed[0, i].item()
+        kind = IDMVehicle if i else ControlledVehicle
+        vehicle = kind(road, place, speed=speeds[0], target_speed=speeds[1])
+        vehicle.timer = state[keys.TRAFFIC, "timer"][0, i].item()
         vehicle.LENGTH = 4.5
         vehicle.WIDTH = 2.5
         vehicle.DELTA = exponent[i]
         road.vehicles.append(vehicle)
+    ego, *others = road.vehicles
     for count, after in enumerate(seen[:8]):
-        ego.position = np.array(where(0))
+        ego.position = np.array([before.x[0, 0].item(), before.y[0, 0].item()])
         ego.heading = before.heading[0, 0].item()
         ego.speed = before.speed[0, 0].item()
         road.act()
-        for vehicle in road.vehicles[1:]:
+        for vehicle in others:
             vehicle.step(0.1)
-        theirs = [
-            [*vehicle.position, vehicle.heading, vehicle.speed] for vehicle in road.vehicles[1:]
-        ]
+        theirs = [[*vehicle.position, vehicle.heading, vehicle.speed] for vehicle in others]
         ours = torch.stack((after.x, after.y, after.heading, after.speed), dim=-1)[0, 1:]
         torch.testing.assert_close(
             ours, torch.tensor(theirs), rtol=1e-6, atol=1e-4, check_dtype=False, msg=f"step {count}"

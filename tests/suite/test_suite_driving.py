@@ -18,7 +18,7 @@ from ganlane.sim.random import Stream
 from ganlane.suite.driving import compare
 from ganlane.traffic import ReplayTraffic
 
-EPISODES = 12
+EPISODES = 7
 
 
 @pytest.fixture(scope="module")

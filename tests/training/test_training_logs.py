@@ -63,7 +63,6 @@ def test_a_row_of_too_few_or_too_many_columns_is_left_out(tmp_path, torn):
         b"decisions,loss\nmany,0.5\n",
         b"decisions,loss\n10,half\n",
         b"decisions,loss\nnan,0.5\n",
-        b"decisions,loss\n-1,0.5\n",
         b"loss,sigma\n10,0.5\n",
         b"\xff\xfe\x00\n",
         b"decisions,loss\n" + b"1" * 200_000 + b",1\n",

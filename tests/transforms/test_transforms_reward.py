@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from reference.worlds import packed
 from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 
@@ -10,8 +11,7 @@ from ganlane.agents.drivers import RandomDriver
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig, check_reward
-from ganlane.sim.scenes import FixedScene, SceneVehicle
-from ganlane.traffic import IdmMobilTraffic, IdmTraffic
+from ganlane.traffic import IdmMobilTraffic
 from ganlane.transforms import RewardParameters, RewardTransform
 from ganlane.transforms.reward import speed_reward
 
@@ -81,22 +81,29 @@ def test_each_event_has_its_price(what, term, value):
 
 @pytest.mark.parametrize("parameters", [RewardParameters(), CONSIDERATE])
 def test_the_reward_is_the_sum_of_its_terms_and_zero_after_a_reset(parameters):
-    base = HighwayEnv(IdmMobilTraffic(), num_envs=8)
+    """Dense traffic, in which some end, and some get close in front of others."""
+    base = HighwayEnv(IdmMobilTraffic(), num_envs=32, spawn_parameters=packed(60.0, 12.0))
     env = TransformedEnv(base, Compose(RewardTransform(1.0, parameters)))
     state = env.reset()
     driver = RandomDriver(base.road)
-    ended = 0
+    ended = close = 0
     names = parameters.term_names
     assert env.observation_spec.contains(state.select(*env.observation_spec.keys()))
     assert all((state[keys.REWARD_TERMS, name] == 0).all() for name in names)
-    for _ in range(12):
+    for _ in range(6):
         step, state = env.step_and_maybe_reset(driver(state))
-        total = sum(step["next", keys.REWARD_TERMS, name] for name in names)
-        torch.testing.assert_close(total, step["next", "reward"])
-        done = step["next", "done"][:, 0]
-        ended += int(done.sum())
-        assert all((state[keys.REWARD_TERMS, name][done] == 0).all() for name in names)
+        after = step["next"]
+        total = sum(after[keys.REWARD_TERMS, name] for name in names)
+        torch.testing.assert_close(total, after["reward"])
+        ended += int(after["done"].sum())
+        started = state[keys.REWARD_TERMS][after["done"][:, 0]]
+        assert all((started[name] == 0).all() for name in names)
+        if parameters is CONSIDERATE:
+            onsets = after[keys.EVENTS, "soft_crash_behind"]
+            close += int(onsets.sum())
+            assert torch.equal(after[keys.REWARD_TERMS, "soft_crash_behind"], -10.0 * onsets)
     assert ended > 0
+    assert close > 0 or parameters is not CONSIDERATE
 
 
 def test_the_paper_charges_nothing_for_danger_behind_and_has_no_such_term():
@@ -109,35 +116,6 @@ def test_considerate_charges_per_onset_behind_and_is_the_paper_otherwise():
     assert paid.pop("soft_crash_behind") == -20.0
     assert paid == terms(soft=1, started=True)
     assert terms(CONSIDERATE)["soft_crash_behind"] == 0.0
-
-
-def changes_left(behind_m, parameters=None):
-    """The rewards of an ego at 15 m/s that goes left at once, ``behind_m`` in front of a driver at
-    25 m/s there.
-    """
-    scene = FixedScene((SceneVehicle(0.0, 0, 15.0), SceneVehicle(-behind_m, 1, 25.0, 25.0)))
-    env = TransformedEnv(HighwayEnv(IdmTraffic(), scenes=scene), RewardTransform(1.0, parameters))
-    state = env.reset()
-    rewards = []
-    for action in (keys.LEFT, keys.KEEP, keys.KEEP, keys.KEEP):
-        after = env.step(state.set("action", torch.full((1,), action)))["next"]
-        rewards.append(after.select("reward", keys.REWARD_TERMS, keys.EVENTS))
-        state = after.exclude("reward")
-    return torch.stack(rewards)
-
-
-def test_who_cuts_in_before_a_fast_driver_pays_and_who_leaves_room_does_not():
-    """The other, 15.5 m behind the rear bumper, closes in at 10 m/s.
-
-    It is 1.55 s away, and nearer at every step.
-    """
-    cut_in = changes_left(20.0, CONSIDERATE)
-    onsets = cut_in[keys.EVENTS, "soft_crash_behind"]
-    assert onsets.sum() >= 1
-    assert torch.equal(cut_in[keys.REWARD_TERMS, "soft_crash_behind"], -10.0 * onsets)
-    assert not cut_in[keys.EVENTS, "hard_crash"].any()
-    room = changes_left(90.0, CONSIDERATE)
-    assert (room[keys.REWARD_TERMS, "soft_crash_behind"] == 0).all()
 
 
 def test_an_ego_meant_to_drive_no_faster_than_15_mps_would_be_paid_for_crawling_and_is_refused():

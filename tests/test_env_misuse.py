@@ -16,16 +16,12 @@ from ganlane import keys
 from ganlane.build import make_traffic
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
-from ganlane.native.library import why_not
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.traffic import IdmTraffic
 
-KERNELS = [
-    "torch",
-    pytest.param("native", marks=pytest.mark.skipif(bool(why_not()), reason="no C++ compiler")),
-]
+KERNELS = ["torch", pytest.param("native", marks=pytest.mark.kernel)]
 
 
 def idm_highways(**options):

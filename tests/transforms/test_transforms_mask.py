@@ -168,9 +168,9 @@ def test_the_specs_hold_and_torchrls_own_action_mask_draws_from_it():
 
 
 def test_a_random_driver_behind_the_legal_mask_never_leaves_the_road():
-    env = masked("legal", num_envs=48, stream=2)
+    env = masked("legal", num_envs=32, stream=2)
     policy = MaskedPolicy(RandomDriver(env.base_env.road, 2))
-    rollout = env.rollout(20, policy, break_when_any_done=False)
+    rollout = env.rollout(10, policy, break_when_any_done=False)
     assert not bool(rollout["next", "events", "out_of_road"].any())
     bare = environment(num_envs=16, stream=2).rollout(
         5, RandomDriver(Road(), 2), break_when_any_done=False

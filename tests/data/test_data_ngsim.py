@@ -157,8 +157,8 @@ def test_a_truncated_file_is_refused_and_a_whole_one_read():
     whole = portal_csv(rows, thousands=False)
     path = portal_file(whole.rstrip("\n"))
     assert read_recordings("ngsim", path).height == 540
-    path.write_text(whole.rpartition(",2,")[0])
-    with user_error(r"line 541, column \w+: the row has .* fields, expected 19"):
+    path.write_text(whole.rsplit(",", 5)[0])
+    with user_error(r"line 541, column lane_id: the row has 14 fields, expected 19"):
         read_recordings("ngsim", path)
     text = text_file(rows)
     text.write_bytes(text.read_bytes()[:-30])

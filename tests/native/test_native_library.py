@@ -82,9 +82,10 @@ def test_it_is_built_once(working):
 @pytest.mark.kernel
 def test_another_source_is_another_library(monkeypatch, tmp_path, working):
     library.load()
-    source = tmp_path / "kernel.cpp"
-    source.write_text("another")
-    monkeypatch.setattr(library, "SOURCES", (*library.SOURCES, source))
+    first, *others = library.SOURCES
+    changed = tmp_path / first.name
+    changed.write_text(first.read_text() + "\n")
+    monkeypatch.setattr(library, "SOURCES", (changed, *others))
     library._find.cache_clear()
     library.load()
     assert len(built()) == 2

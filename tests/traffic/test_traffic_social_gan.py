@@ -4,37 +4,29 @@ from __future__ import annotations
 
 import pytest
 import torch
-from reference.small_networks import anchored_drivers
-from tensordict import TensorDict
+from reference.small_networks import anchored_drivers, small_generator
+from reference.worlds import environment
 
 from ganlane.errors import UserError
-from ganlane.generator.networks import Generator
 from ganlane.native.drivers import GeneratedDrivers
 from ganlane.settings.driving import IdmParameters
 from ganlane.settings.generated import HEADWAY_QUANTILES_S
-from ganlane.settings.generator import EXTRA_INPUTS, GeneratorSizes
-from ganlane.sim.random import Stream, episode_key
-from ganlane.sim.spawn import spawn
-from ganlane.sim.state import Road, Vehicles
+from ganlane.settings.generator import EXTRA_INPUTS
+from ganlane.sim.random import Stream
+from ganlane.sim.state import Road
 from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
 
-SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
 ROAD = Road(3, 4.0)
 
 
-def generator(extra_inputs=0):
-    torch.manual_seed(0)
-    return Generator(GeneratorSizes(**SMALL, extra_inputs=extra_inputs)).requires_grad_(False)
-
-
 def paper(extra_inputs=0):
-    network = generator(extra_inputs)
+    network = small_generator(extra_inputs).requires_grad_(False)
     drivers = GeneratedDrivers(IdmParameters(), network.sizes, {}, Stream.TRAIN, 1.0, 5.0)
     return SocialGanTraffic(network, drivers, ROAD)
 
 
 def calibrated(extra_inputs=EXTRA_INPUTS, headways_s=HEADWAY_QUANTILES_S):
-    network = generator(extra_inputs)
+    network = small_generator(extra_inputs).requires_grad_(False)
     return AnchoredGanTraffic(network, anchored_drivers(network, headways_s), ROAD)
 
 
@@ -43,25 +35,9 @@ def module(request):
     return request.param()
 
 
-def begin(module, rows=4, vehicles=9, seed=5):
+def begin(module, rows=4, seed=5):
     """The first state of the episodes 0 to ``rows`` - 1."""
-    seed = torch.full((rows,), seed)
-    episode = torch.arange(rows)
-    key = episode_key(module.stream, seed, episode)
-    state = spawn(key, vehicles, 3, 4.0)
-    counters = {"seed": seed, "episode": episode, "step": torch.zeros_like(seed)}
-    memory = module.init_memory(state, key)
-    return TensorDict(
-        {"vehicles": TensorDict(state.as_dict(), [rows]), "traffic": memory, **counters}, [rows]
-    )
-
-
-def drive(module, td, steps):
-    for _ in range(steps):
-        td = module(td)
-        td["vehicles"] = td["moved"]
-        td["step"] = td["step"] + 1
-    return td
+    return environment(num_envs=rows, traffic=module, seed=seed, dtype=torch.float32).reset()
 
 
 def test_streams_seeds_and_episodes_give_other_drivers(module):
@@ -73,12 +49,11 @@ def test_streams_seeds_and_episodes_give_other_drivers(module):
 
 
 def test_a_vehicle_that_enters_has_driven_straight_at_its_present_speed(module):
-    td = drive(module, begin(module), 3)
-    key = episode_key(module.stream, td["seed"], td["episode"])
-    fresh = module.init_memory(Vehicles.of(td["vehicles"]), key)
-    assert all(leaf.shape[:2] == (4, 9) for leaf in fresh.values())
+    td = begin(module)
+    assert all(leaf.shape[:2] == (4, 9) for leaf in td["traffic"].values())
     speed = td["vehicles", "speed"][1, 4]
-    torch.testing.assert_close(fresh["displacement"][1, 4], torch.stack([0.1 * speed, 0.0 * speed]))
+    straight = torch.stack([0.1 * speed, 0.0 * speed])
+    torch.testing.assert_close(td["traffic", "displacement"][1, 4], straight)
 
 
 def test_who_is_not_valid_is_not_seen(module):

@@ -152,7 +152,7 @@ def test_the_kernel_allows_what_the_tensor_code_allows(crowd, form):
 
 
 def masked(form="safe", **options):
-    base = environment(**options)
+    base = environment(dtype=torch.float32, kernel="auto", **options)
     return TransformedEnv(base, Compose(ActionMaskTransform(base.road, form)))
 
 

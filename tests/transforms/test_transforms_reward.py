@@ -82,7 +82,9 @@ def test_each_event_has_its_price(what, term, value):
 @pytest.mark.parametrize("parameters", [RewardParameters(), CONSIDERATE])
 def test_the_reward_is_the_sum_of_its_terms_and_zero_after_a_reset(parameters):
     """Dense traffic, in which some end, and some get close in front of others."""
-    base = HighwayEnv(IdmMobilTraffic(), num_envs=32, spawn_parameters=packed(60.0, 12.0))
+    base = HighwayEnv(
+        IdmMobilTraffic(), num_envs=32, spawn_parameters=packed(60.0, 12.0), kernel="auto"
+    )
     env = TransformedEnv(base, Compose(RewardTransform(1.0, parameters)))
     state = env.reset()
     driver = RandomDriver(base.road)

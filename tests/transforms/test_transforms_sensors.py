@@ -8,18 +8,23 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference.worlds import assert_same_tracks, few_changes, same_bits, tracks, vehicles
+from reference.worlds import (
+    assert_same_tracks,
+    environment,
+    few_changes,
+    same_bits,
+    tracks,
+    vehicles,
+)
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 import ganlane
 from ganlane import keys
-from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.settings.observation import SensorParameters
 from ganlane.sim import Vehicles
 from ganlane.sim.random import Stream, episode_key
-from ganlane.traffic import IdmMobilTraffic
 from ganlane.transforms import ObservationTransform, RewardTransform, SensorTransform
 from ganlane.transforms.sensors import measure
 
@@ -30,8 +35,14 @@ OWN = 3
 
 def world(sensors, num_envs=3, goal_m=5000.0, period_s=1.0, form="table3", seed=11):
     """IDM-MOBIL traffic with these sensors; None: without the transform."""
-    episode = EpisodeParameters(decision_period_s=period_s, goal_m=goal_m)
-    base = HighwayEnv(IdmMobilTraffic(), num_envs=num_envs, episode=episode, seed=seed)
+    base = environment(
+        num_envs=num_envs,
+        period_s=period_s,
+        goal_m=goal_m,
+        seed=seed,
+        dtype=torch.float32,
+        kernel="auto",
+    )
     between = [] if sensors is None else [SensorTransform(sensors, base.stream, period_s)]
     seen = ObservationTransform(base.road, 9, form)
     return TransformedEnv(base, Compose(*between, seen, RewardTransform(period_s)))
@@ -113,7 +124,7 @@ def test_perfect_sensors_show_the_present_observation_bit_for_bit():
         assert same_bits(one, other.exclude("perceived")) == []
 
 
-@settings(max_examples=5)
+@settings(max_examples=10)
 @given(
     st.floats(0, 5),
     st.floats(0, 3),

@@ -46,7 +46,7 @@ from ganlane.generator.human_samples import (
 )
 from ganlane.generator.human_tuning import Report, begins_per_decision, tune
 from ganlane.settings.generator import HumanConfig
-from ganlane.sim.idm import DriverIdm, following_acceleration
+from ganlane.sim.idm import IdmParameters, following_acceleration
 from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.state import Road
 
@@ -312,8 +312,8 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
         desired_speed=desired.clamp(*DESIRED_MPS),
         target_lane=target,
     )
-    idm = DriverIdm(2.0, headway, 2.0 * whole, -8.0 * whole, 1.4 * whole)
-    wanted = following_acceleration(scene_of(vehicles, road), idm)
+    idm = IdmParameters(comfortable_deceleration=2.0, min_acceleration=-8.0, max_acceleration=1.4)
+    wanted = following_acceleration(scene_of(vehicles, road), idm, headway)
     before = torch.where(rand() < 0.5, 0.6 * randn(), (wanted * rand()).clamp(-6.0, 2.0))
     history = before[..., None] + 0.4 * randn(*shape, ACCELERATIONS)
     history[..., 0] = before

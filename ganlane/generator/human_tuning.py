@@ -278,16 +278,19 @@ def costs(vehicles: Vehicles, road: Road, gap: Tensor) -> tuple[Tensor, Tensor]:
     ``gap`` is that to the leader before the decision, m.
     """
     speed, lateral = velocity(vehicles)
+
     # Pairs [N, M, M]: the last index is the other vehicle.
-    along = vehicles.x[:, None, :] - vehicles.x[:, :, None]
-    across = vehicles.y[:, None, :] - vehicles.y[:, :, None]
-    count = vehicles.x.shape[1]
+    def apart(number: Tensor) -> Tensor:
+        return number[:, None, :] - number[:, :, None]
+
+    def mean(number: Tensor) -> Tensor:
+        return 0.5 * (number[:, None, :] + number[:, :, None])
+
+    along, across = apart(vehicles.x), apart(vehicles.y)
     both = vehicles.valid[:, :, None] & vehicles.valid[:, None, :]
-    both = both & ~torch.eye(count, dtype=torch.bool, device=along.device)
-    lengths = 0.5 * (vehicles.length[:, :, None] + vehicles.length[:, None, :])
-    widths = 0.5 * (vehicles.width[:, :, None] + vehicles.width[:, None, :])
-    bumpers = along.abs() - lengths
-    sides = across.abs() - widths
+    both = both & ~torch.eye(both.shape[1], dtype=torch.bool, device=along.device)
+    bumpers = along.abs() - mean(vehicles.length)
+    sides = across.abs() - mean(vehicles.width)
     # Bodies count as touching a little before they do.
     touches = both & (bumpers < 0.2) & (sides < 0.05)
     # To blame are the one behind, and the one who moves, or has moved, towards the other.
@@ -300,7 +303,7 @@ def costs(vehicles: Vehicles, road: Road, gap: Tensor) -> tuple[Tensor, Tensor]:
     cost = 5.0 * blame.any(-1) + 1.0 * hit
 
     # Close calls: a time to collision below 1.5 s, a gap below 0.25 s, sides within 0.35 m.
-    closing = speed[:, :, None] - speed[:, None, :]
+    closing = -apart(speed)
     ahead = both & (along > 0) & (sides < 0.15) & (bumpers > 0)
     time_s = torch.where(ahead & (closing > 0.1), bumpers / closing.clamp_min(0.1), 99.0).amin(-1)
     nearest = torch.where(ahead, bumpers, 99.0).amin(-1)

@@ -136,6 +136,17 @@ class QNetwork(nn.Module):
         rows = linear(hidden, *head).unflatten(-1, (-1, self.config.outputs))
         return duel(rows) if self.config.agent.dueling else rows
 
+    def forward(self, observation: Tensor) -> Tensor:
+        """What TorchRL's actors and losses expect.
+
+        Log-probabilities [*, atoms, A], or values [*, A].
+        """
+        logits = self.logits(observation)
+        # TorchRL wants log probabilities with the actions last.
+        if self.config.agent.distributional:
+            return logits.log_softmax(-1).transpose(-1, -2)
+        return logits.squeeze(-1)
+
     def expected(self, logits: Tensor) -> Tensor:
         """Action values [*, A] of the ``logits`` [*, A, atoms]."""
         if self.config.agent.distributional:

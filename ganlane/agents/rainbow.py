@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from copy import deepcopy
 from dataclasses import asdict
 from typing import Any
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ganlane.agents.drivers import ExploringPolicy, GreedyPolicy, LegalActions
-from ganlane.agents.loss import Learned, UpdateGraph, loss_of
+from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss, Learned, UpdateGraph
 from ganlane.agents.network import (
     NetworkConfig,
     QNetwork,
@@ -72,7 +70,9 @@ class Rainbow:
             torch.default_generator.manual_seed(seed)
             network = QNetwork(NetworkConfig(config, observation_size, actions))
         self.network = network.to(self.device)
-        self.target = deepcopy(self.network).requires_grad_(False)
+        loss = LeanDistributionalLoss if config.distributional else LeanDQNLoss
+        self.loss = loss(self.network)
+        self.target = self.loss.target_network
         # Rainbow's 1.5e-4 is 0.005 over its batch of 32
         adam_eps = 0.005 / config.batch_size if config.adam_eps is None else config.adam_eps
         self.optimizer = torch.optim.Adam(
@@ -135,7 +135,7 @@ class Rainbow:
         self.updates += 1
         # a hard copy, as in Rainbow
         if self.updates % config.target_period == 0:
-            load_parameters(self.target, self.weights())
+            self.loss.update_target()
         return {**learned._asdict(), "priority": learned.priority.mean()}
 
     def _descend(self, batch: TensorDict, generator: torch.Generator) -> Learned:
@@ -143,16 +143,20 @@ class Rainbow:
         # both networks get new noise for every update
         for module in (self.network, self.target):
             redraw_noise(module, generator)
-        # without exploration the noisy layers have no noise, and the sigmas never get a gradient
-        with set_exploration_type(ExplorationType.RANDOM):
-            terms = loss_of(self.network, self.target, batch, self.config)
+        terms = self.loss(batch)
         # Rainbow's mean of w * loss; TorchRL's own 'mean' divides by the sum of the weights.
-        objective = (batch.get("priority_weight", 1.0) * terms.loss).mean()
+        objective = (batch.get("priority_weight", 1.0) * terms["loss"]).mean()
         self.optimizer.zero_grad(set_to_none=True)
         objective.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
         self.optimizer.step()
-        return Learned(*terms._replace(loss=objective.detach()), norm)
+        return Learned(
+            batch.get("td_error")[:, 0],
+            objective.detach(),
+            terms["mean_q"],
+            terms["clamped_fraction"],
+            norm,
+        )
 
     def sigma(self) -> Tensor:
         """Mean absolute noise parameter over the weights of the noisy layers, 0-dim.
@@ -168,9 +172,9 @@ class Rainbow:
         return parameters_of(self.network)
 
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
-        """Start both networks from trained ``weights``."""
-        for network in (self.network, self.target):
-            load_parameters(network, weights)
+        """Start from trained ``weights``: load them first, then let the target follow."""
+        load_parameters(self.network, weights)
+        self.loss.update_target()
 
     def load_moments(self, moments: Mapping[int, Any]) -> None:
         """Let Adam go on from ``moments``, the part ``state`` of an optimiser's state.

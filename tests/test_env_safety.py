@@ -92,21 +92,13 @@ def drive(rng: random.Random, most_vehicles: int, duration_s: float) -> float:
     return km
 
 
-def drive_for(
-    vehicle_km: float, roads: int, most_vehicles: int, duration_s: float, seed: int
-) -> None:
-    """Until so many vehicle-km have been driven, on so many roads at least."""
-    rng = random.Random(seed)
+@pytest.mark.parametrize(
+    ("vehicle_km", "roads", "most_vehicles", "duration_s"),
+    [(100.0, 15, 30, 8.0), pytest.param(10_000.0, 30, 60, 60.0, marks=pytest.mark.slow)],
+)
+def test_no_overlap_in_so_many_km_on_so_many_roads(vehicle_km, roads, most_vehicles, duration_s):
+    rng = random.Random(0)
     km = 0.0
     while km < vehicle_km or roads > 0:
         km += drive(rng, most_vehicles, duration_s)
         roads -= 1
-
-
-def test_no_overlap_in_100_vehicle_km():
-    drive_for(100.0, roads=15, most_vehicles=30, duration_s=8.0, seed=0)
-
-
-@pytest.mark.slow
-def test_no_overlap_in_10_000_vehicle_km():
-    drive_for(10_000.0, roads=30, most_vehicles=60, duration_s=60.0, seed=1)

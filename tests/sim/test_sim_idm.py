@@ -61,9 +61,7 @@ def test_nobody_accelerates_at_the_equilibrium_gap():
     gap = equilibrium_gap(speed, 25.0)
     assert idm_acceleration(speed, 25.0, gap, speed).abs().max() < 1e-12
     # (2 + 15 * 1.6) / sqrt(1 - 0.6^4) = 26 / sqrt(0.8704)
-    assert equilibrium_gap(torch.tensor(15.0, dtype=DOUBLE), 25.0).item() == pytest.approx(
-        27.868520
-    )
+    assert equilibrium_gap(*doubles(15.0), 25.0).item() == pytest.approx(27.868520)
 
 
 # Braking
@@ -90,6 +88,7 @@ DESIRED = 25.0
 FOLLOWERS = 5
 LENGTH_M = 4.5
 SPEEDS = (1.0, 3.0, 6.0, 10.0, 15.0)
+EQUILIBRIUM_M = torch.tensor([[stability.equilibrium(v, DESIRED)] for v in SPEEDS], dtype=DOUBLE)
 #: Start of every platoon: bumper to bumper gap, m, and speed, m/s (or the leader's, if that is
 #: lower).
 START_GAP_M = 40.0
@@ -132,32 +131,23 @@ def settling_steps(speed: float) -> int:
     return steps
 
 
-@pytest.fixture(scope="module")
-def settled() -> Vehicles:
-    """The platoons after a minute, to come near, and the settling time of the slowest."""
+def test_every_car_of_a_platoon_settles_at_the_equilibrium_gap():
+    """After a minute, to come near, and the settling time of the slowest."""
     steps = 600 + max(settling_steps(speed) for speed in SPEEDS)
-    return list(moves(IdmTraffic(Road(lanes=1)), platoons(), steps))[-1]
-
-
-@pytest.mark.parametrize("row", range(len(SPEEDS)), ids=[f"{speed:g} m/s" for speed in SPEEDS])
-def test_every_car_of_a_platoon_settles_at_the_equilibrium_gap(settled, row):
-    gaps = settled.x[row, :-1] - settled.x[row, 1:] - LENGTH_M
-    expected = stability.equilibrium(SPEEDS[row], DESIRED)
-    assert (gaps - expected).abs().max() < TOLERANCE_M
-    assert (settled.speed[row] - SPEEDS[row]).abs().max() < TOLERANCE_M
+    *_, settled = moves(IdmTraffic(Road(lanes=1)), platoons(), steps)
+    gaps = settled.x[:, :-1] - settled.x[:, 1:] - LENGTH_M
+    assert (gaps - EQUILIBRIUM_M).abs().max() < TOLERANCE_M
+    assert (settled.speed - torch.tensor(SPEEDS)[:, None]).abs().max() < TOLERANCE_M
 
 
 def test_nobody_touches_the_car_ahead_on_the_way_there():
     """From far more than the equilibrium gap, and from far less: a tenth of it."""
     start = platoons()
-    gaps = torch.tensor([0.1 * stability.equilibrium(v, DESIRED) for v in SPEEDS], dtype=DOUBLE)[
-        :, None
-    ]
     order = torch.arange(1 + FOLLOWERS, dtype=DOUBLE)
-    start = start.with_(
-        x=-(gaps + LENGTH_M) * order, speed=start.speed[:, :1].expand_as(start.speed).clone()
+    close = start.with_(
+        x=-(0.1 * EQUILIBRIUM_M + LENGTH_M) * order, speed=start.speed[:, :1].expand_as(start.x)
     )
-    for cars in moves(IdmTraffic(Road(lanes=1)), start, 600):
+    for cars in moves(IdmTraffic(Road(lanes=1)), close, 600):
         assert (cars.x[:, :-1] - cars.x[:, 1:] - LENGTH_M).min() > 0.0
 
 

@@ -28,14 +28,11 @@ def keys(episodes: int, stream: int = 0, seed: int = 0) -> torch.Tensor:
     return episode_key(stream, torch.full((episodes,), seed), torch.arange(episodes))
 
 
-def unsigned(value: torch.Tensor) -> list[int]:
-    return [v % 2**64 for v in value.tolist()]
-
-
 def test_the_mixer_is_that_of_splitmix64():
     """The published test vector: the first three numbers from the state 1234567."""
     states = 1234567 + torch.tensor([1, 2, 3]) * _GOLDEN
-    assert unsigned(_mix(states)) == [6457827717110365317, 3203168211198807973, 9817491932198370423]
+    mixed = [number % 2**64 for number in _mix(states).tolist()]
+    assert mixed == [6457827717110365317, 3203168211198807973, 9817491932198370423]
 
 
 def test_fields_are_mixed_in_one_after_the_other():

@@ -35,7 +35,7 @@ def alone(form: str, *, stretches: Stretches = (), lanes: int = 3, **ego: float)
 def driven(env: HighwayEnv, td, action, decisions: int):
     for _ in range(decisions):
         td = step(env, td, action)
-        if td["done"].item():
+        if td["done"]:
             break
     return td
 
@@ -60,7 +60,7 @@ def test_an_ego_that_is_told_slower_slows_down_to_the_lowest_speed_and_faster_to
 def test_one_slower_sets_the_speed_one_step_below_and_it_stays():
     env, td = alone("lane_speed", speed=23.0)
     td = driven(env, step(env, td, SLOWER), KEEP, 20)
-    assert td[keys.EGO, "set_speed"].item() == 22.5
+    assert td[keys.EGO, "set_speed"] == 22.5
     assert ego(td, "speed") == pytest.approx(22.5, abs=0.1)
 
 
@@ -113,43 +113,43 @@ def test_the_ego_gets_no_faster_than_desired_and_brakes_to_a_stop():
 def test_who_does_not_brake_runs_into_the_car_ahead():
     env, td = alone("continuous")
     td = placed(env, vehicles({"x": 0.0}, {"x": 60.0, "speed": 0.0, "desired_speed": 0.001}))
-    assert driven(env, td, (0.0, 0.0), 10)[keys.EVENTS, "hard_crash"].item()
-    assert not driven(env, td, (-1.0, 0.0), 10)[keys.EVENTS, "hard_crash"].item()
+    assert driven(env, td, (0.0, 0.0), 10)[keys.EVENTS, "hard_crash"]
+    assert not driven(env, td, (-1.0, 0.0), 10)[keys.EVENTS, "hard_crash"]
 
 
 def test_a_wheel_of_one_leads_to_the_next_lane_and_of_zero_keeps_its_centre():
     env, td = alone("continuous")
     while ego(td, "y") < 2.0:
         td = step(env, td, (0.0, 1.0))
-    assert td[keys.EGO, "lane_changes"].item() == 1
+    assert td[keys.EGO, "lane_changes"] == 1
     td = driven(env, td, (0.0, 0.0), 6)
     assert ego(td, "y") == pytest.approx(4.0, abs=0.05)
-    assert td[keys.EGO, "lane_changes"].item() == 1
-    assert td[keys.EGO, "change_direction"].item() == 0
+    assert td[keys.EGO, "lane_changes"] == 1
+    assert td[keys.EGO, "change_direction"] == 0
 
 
 def test_a_line_within_the_lane_is_no_lane_change():
     env, td = alone("continuous")
     td = driven(env, td, (0.0, 0.25), 8)
     assert ego(td, "y") == pytest.approx(1.0, abs=0.05)
-    assert td[keys.EGO, "lane_changes"].item() == 0
+    assert td[keys.EGO, "lane_changes"] == 0
 
 
 def test_whose_centre_crosses_the_edge_has_left_the_road():
     env, td = alone("continuous")
     td = driven(env, td, (0.0, -1.0), 10)
-    assert td[keys.EVENTS, "out_of_road"].item()
-    assert td["terminated"].item()
+    assert td[keys.EVENTS, "out_of_road"]
+    assert td["terminated"]
     assert ego(td, "y") < -2.0
 
 
 def test_a_line_beside_which_there_is_no_lane_yet_must_not_be_crossed():
     ramp = (LaneStretch(200.0, 400.0, WALL), LaneStretch())
     env, td = alone("continuous", stretches=ramp, lanes=2)
-    assert driven(env, td, (0.0, 1.0), 10)[keys.EVENTS, "out_of_road"].item()
+    assert driven(env, td, (0.0, 1.0), 10)[keys.EVENTS, "out_of_road"]
     beside = placed(env, vehicles({"x": 210.0, "visibility": 1}, FAR))
     beside = driven(env, beside, (0.0, 1.0), 3)
-    assert not beside[keys.EVENTS, "out_of_road"].item()
+    assert not beside[keys.EVENTS, "out_of_road"]
     assert ego(beside, "y") > 2.0
 
 

@@ -53,13 +53,8 @@ def vehicles(*cars: dict, lane_width_m: float = 4.0, dtype: torch.dtype = DOUBLE
         for car in cars
     ]
     for name in keys.VEHICLE_FIELDS:
-        kind = (
-            dtype
-            if name in keys.VEHICLE_FLOATS
-            else torch.bool
-            if name in keys.VEHICLE_FLAGS
-            else torch.int64
-        )
+        # Whole numbers and flags tell their own types.
+        kind = dtype if name in keys.VEHICLE_FLOATS else None
         columns[name] = torch.tensor([[car[name] for car in filled]], dtype=kind)
     return Vehicles(**columns)
 

@@ -60,6 +60,7 @@ MISTAKES = {
     "evaluate traffics=[gann]": "traffic=gann: no such option (did you mean 'gan'?)",
     "render film.start_s=9 film.end_s=3": "expected more than film.start_s=9",
     "render out=nowhere/film.gif": "out=nowhere/film.gif: expected a file in a folder that exists",
+    "train_generator generator=gann": "choose one of calibrated, human, paper, social_gan",
     "train_generator folds=1": "one fold leaves nothing to fit to",
     "train env=scene": "env.scene.path: no file; give one",
     "evaluate env=cut_in env.vehicles=5": "env.vehicles=5: the scene has 6",
@@ -80,6 +81,7 @@ MISTAKES = {
         "gone: no such file; a checkpoint of kind generator"
     ),
     "prepare data.path=gone.csv": "gone.csv: no such file",
+    "prepare data=ngsim data.path=gone.csv": "gone.csv: no such file",
     "prepare data=highd data.path=gone.csv": "gone.csv: expected highD's XX_tracks.csv",
     "prepare data=ngsim": "data=ngsim: which file is missing; give data.path=FILE",
     "prepare data=scenes data.format=gpx": "data.format=gpx: expected one of scenes, ngsim, highd",

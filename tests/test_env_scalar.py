@@ -124,13 +124,11 @@ def compare(
     return seen
 
 
-def assert_same(
-    td, row: int, state: scalar.State, outcome: scalar.Outcome, tolerance: float = 1e-6
-) -> None:
+def assert_same(td, row: int, state: scalar.State, outcome: scalar.Outcome) -> None:
     for name in MOTION:
         expected = torch.tensor([getattr(car, name) for car in state.cars], dtype=DOUBLE)
         actual = td[keys.VEHICLES, name][row]
-        torch.testing.assert_close(actual, expected, rtol=0.0, atol=tolerance, msg=name)
+        torch.testing.assert_close(actual, expected, rtol=0.0, atol=1e-6, msg=name)
     assert td[keys.VEHICLES, "target_lane"][row].tolist() == [car.target_lane for car in state.cars]
     assert td[keys.VEHICLES, "valid"][row].tolist() == [car.valid for car in state.cars]
     assert td[keys.STEP][row] == state.step
@@ -155,7 +153,7 @@ def assert_same(
         "change_progress": outcome.progress,
     }
     remembered = {name: td[keys.EGO, name][row].item() for name in ego}
-    assert remembered == pytest.approx(ego, rel=0.0, abs=tolerance)
+    assert remembered == pytest.approx(ego, rel=0.0, abs=1e-6)
 
 
 #: Roads, and what the ego chooses among.

@@ -17,14 +17,14 @@ def number(value: float) -> torch.Tensor:
     return torch.tensor([value], dtype=DOUBLE)
 
 
-def drive(speed: float, steering: float, duration_s: float, dt: float, acceleration: float = 0.0):
+def drive(speed: float, steering: float, duration_s: float, acceleration: float = 0.0):
     x = ZERO
     y = ZERO
     heading = ZERO
     v = number(speed)
-    for _ in range(round(duration_s / dt)):
+    for _ in range(round(duration_s / 0.1)):
         pose = x, y, heading, v, _ = advance(
-            x, y, heading, v, number(acceleration), number(steering), dt
+            x, y, heading, v, number(acceleration), number(steering), 0.1
         )
     return pose
 
@@ -46,16 +46,14 @@ def circle(speed: float, steering: float, duration_s: float) -> tuple[float, flo
 )
 def test_a_constant_steering_angle_drives_a_circle(speed, steering):
     x, y, heading = circle(speed, steering, 10.0)
-    pose = drive(speed, steering, 10.0, dt=0.1)
+    pose = drive(speed, steering, 10.0)
     assert pose.heading.item() == pytest.approx(heading, abs=1e-12)
     assert math.hypot(pose.x.item() - x, pose.y.item() - y) < 2e-3 * speed
 
 
 def test_constant_acceleration_is_exact_and_braking_ends_at_rest():
-    assert drive(0.0, 0.0, 10.0, 0.1, acceleration=0.7).x.item() == pytest.approx(
-        0.5 * 0.7 * 10.0**2
-    )
-    pose = drive(1.0, 0.0, 0.1, 0.1, acceleration=-20.0)
+    assert drive(0.0, 0.0, 10.0, acceleration=0.7).x.item() == pytest.approx(0.5 * 0.7 * 10.0**2)
+    pose = drive(1.0, 0.0, 0.1, acceleration=-20.0)
     assert pose.speed.item() == 0.0
     assert pose.x.item() == pytest.approx(0.05)
     # what was realised, not what was asked for
@@ -67,11 +65,11 @@ def test_constant_acceleration_is_exact_and_braking_ends_at_rest():
 SPEEDS = torch.linspace(3.0, 35.0, 65, dtype=DOUBLE)
 
 
-def lane_change(speed: torch.Tensor, width: float, duration_s: float = 30.0) -> torch.Tensor:
-    """Lateral positions [steps, speeds] after the command to move ``width`` m to the left."""
+def lane_change(speed: torch.Tensor, width: float) -> torch.Tensor:
+    """Lateral positions [steps, speeds] in 30 s after the command to go ``width`` m to the left."""
     x = y = heading = wheel = torch.zeros_like(speed)
     track = []
-    for _ in range(round(duration_s / 0.1)):
+    for _ in range(300):
         wheel = steer(wheel, y, heading, speed, torch.full_like(speed, width), 0.1)
         x, y, heading, _, _ = advance(x, y, heading, speed, torch.zeros_like(speed), wheel, 0.1)
         track.append(y)

@@ -14,7 +14,6 @@ import pytest
 import torch
 from reference.worlds import DOUBLE, drawing, moves, random_scenes, vehicles, vehicles_at
 
-from ganlane import keys
 from ganlane.settings.driving import MobilParameters, Visibility
 from ganlane.sim import mobil as mobil_module
 from ganlane.sim.idm import TABLE_V, idm_acceleration
@@ -41,9 +40,9 @@ OWN = -1.371332  # IDM behind the slow one (test_sim_idm)
 FREE = 0.413272  # IDM on an empty lane
 
 
-def wish(*cars, lanes: int = 2, mobil: MobilParameters = TABLE_IV) -> int:
+def wish(*cars, mobil: MobilParameters = TABLE_IV) -> int:
     """Of the first car."""
-    road = Road(lanes=lanes)
+    road = Road(lanes=2)
     return mobil_wishes(perceive(vehicles(*cars), road), road, mobil=mobil)[0, 0].item()
 
 
@@ -202,13 +201,13 @@ ENTERS = 1
 FOLLOWS = 3
 
 
-def merges(rows: int, seed: int, mobil: MobilParameters = SELFISH) -> Vehicles:
+def merges(rows: int) -> Vehicles:
     """Scenes in which one has just decided to enter the lane of another, whatever their speeds and
     distances.
 
     The ego is far away; a slow car makes the one in front of it want the other lane.
     """
-    between = drawing((rows,), seed)
+    between = drawing((rows,), 2)
     x = torch.stack(
         (between(5000, 5001), between(0, 0), between(7.5, 85), between(-125, -5)), dim=1
     )
@@ -217,33 +216,28 @@ def merges(rows: int, seed: int, mobil: MobilParameters = SELFISH) -> Vehicles:
     lane = torch.tensor([0, 0, 0, 1]).expand(rows, -1)
     scene = vehicles_at(x, lane, speed=speed, desired_speed=desired)
     road = Road(lanes=2)
-    change = mobil_changes(perceive(scene, road), road, mobil=mobil)
+    change = mobil_changes(perceive(scene, road), road, mobil=SELFISH)
     scene = scene.with_(target_lane=lane + change * (torch.arange(4) == ENTERS))
     return Vehicles(*(value[change[:, ENTERS] == 1] for value in scene))
 
 
 def demand(scene: Vehicles) -> torch.Tensor:
     """What the one that enters asks of its new follower, m/s2, [N]."""
-    v = scene
-    gap = scene.x[:, ENTERS] - scene.x[:, FOLLOWS] - 4.5
-    return idm_acceleration(
-        v.speed[:, FOLLOWS], v.desired_speed[:, FOLLOWS], gap, v.speed[:, ENTERS]
-    )
+    enters, follows = scene.columns(ENTERS), scene.columns(FOLLOWS)
+    gap = enters.x - follows.x - 4.5
+    return idm_acceleration(follows.speed, follows.desired_speed, gap, enters.speed)
 
 
-def demands(scene: Vehicles, seconds: float, braking: float) -> torch.Tensor:
-    """:func:`demand` at every step of the change, [steps, N].
-
-    The one that enters drives like everybody else but never brakes, or brakes all the time, by
-    ``braking`` m/s2.
+def demands(scene: Vehicles) -> torch.Tensor:
+    """:func:`demand` at every step of 8 s, in which the one that enters drives like everybody else
+    but never brakes, [steps, N].
     """
 
     def drives(before: Vehicles, after: Vehicles) -> Vehicles:
-        braked = (before.speed - braking * keys.PHYSICS_STEP_S).clamp_min(0.0)
-        its_own = braked if braking else torch.maximum(after.speed, before.speed)
-        return after.with_(speed=torch.where(torch.arange(4) == ENTERS, its_own, after.speed))
+        no_slower = torch.maximum(after.speed, before.speed)
+        return after.with_(speed=torch.where(torch.arange(4) == ENTERS, no_slower, after.speed))
 
-    film = moves(IdmTraffic(Road(lanes=2)), scene, round(seconds / keys.PHYSICS_STEP_S), drives)
+    film = moves(IdmTraffic(Road(lanes=2)), scene, 80, drives)
     return torch.stack([demand(scene), *map(demand, film)])
 
 
@@ -252,7 +246,7 @@ def test_nor_is_the_new_follower_asked_for_more_than_b_safe_while_the_one_ahead_
 
     What is above that shrinks.
     """
-    film = demands(merges(rows=12_000, seed=2), seconds=8.0, braking=0.0)
+    film = demands(merges(rows=12_000))
     assert film.shape[1] > 3000
     assert film.min() >= -B_SAFE
     assert (film >= film[0].clamp_max(-TABLE_V.comfortable_deceleration) - 1e-9).all()

@@ -32,8 +32,8 @@ def episode_keys(count: int, seed: int = 0) -> torch.Tensor:
     return episode_key(0, torch.full((count,), seed), torch.arange(count))
 
 
-def scenes(count: int = 2000, vehicles: int = 9, lanes: int = 3, **others) -> Vehicles:
-    return spawn(episode_keys(count), vehicles, lanes, 4.0, dtype=DOUBLE, **others)
+def scenes(count: int = 2000, vehicles: int = 9, **others) -> Vehicles:
+    return spawn(episode_keys(count), vehicles, 3, 4.0, dtype=DOUBLE, **others)
 
 
 def smallest_spacing(s: Vehicles, gaps: bool = False) -> float:

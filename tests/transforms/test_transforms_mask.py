@@ -24,10 +24,10 @@ KEEP_ONLY = [True, False, False]
 ALL = [True, True, True]
 
 
-def allowed(*cars, form="safe", direction=0, lanes=3, abort=False, limit=4.0):
+def allowed(*cars, form="safe", direction=0, abort=False, limit=4.0):
     """The mask of the first of ``cars``, and whether no action is safe."""
-    transform = ActionMaskTransform(Road(lanes=lanes), form, limit, abort=abort)
-    mask, none = transform.allowed(vehicles(*cars), torch.tensor([direction]), Road(lanes=lanes))
+    transform = ActionMaskTransform(Road(), form, limit, abort=abort)
+    mask, none = transform.allowed(vehicles(*cars), torch.tensor([direction]), Road())
     return mask[0].tolist(), bool(none[0])
 
 

@@ -48,11 +48,11 @@ def world(sensors, num_envs=3, goal_m=5000.0, period_s=1.0, form="table3", seed=
     return TransformedEnv(base, Compose(*between, seen, RewardTransform(period_s)))
 
 
-def drive(env, decisions, td=None):
+def drive(env, decisions):
     """The states of a run without resets, the first one included, and the rewards that led to the
     others.
     """
-    states = [env.reset() if td is None else td]
+    states = [env.reset()]
     for _ in range(decisions):
         states.append(env.step(states[-1].clone().set("action", few_changes(states[-1])))["next"])
     return states
@@ -64,13 +64,13 @@ def scene(rows, count):
     return Vehicles(*(field.expand(rows, count) for field in one))
 
 
-def many(sensors, rows=5000, count=5):
+def many(sensors):
     """The errors of many measurements of one scene.
 
-    (along, across, speed) [rows, count], and who is seen.
+    (along, across, speed) [5000, 5], and who is seen.
     """
-    true = scene(rows, count)
-    numbers = torch.arange(rows)
+    true = scene(5000, 5)
+    numbers = torch.arange(5000)
     seen = measure(true, episode_key(Stream.TRAIN, numbers * 0, numbers), numbers % 10, sensors)
     return (seen["x"] - true.x, seen["y"] - true.y, seen["speed"] - true.speed), seen["valid"]
 

@@ -90,8 +90,16 @@ def test_peers_drive_our_road_and_the_baseline_has_our_network():
     assert systems.start_baseline(Road(vehicles=4), config)(2) == 2 * 8 * 10
 
 
+@pytest.fixture
+def sumo():
+    """A process has one: it is closed for the tests that follow."""
+    libsumo = pytest.importorskip("libsumo", reason="libsumo comes with the extra 'bench'")
+    yield
+    libsumo.close()
+
+
+@pytest.mark.usefixtures("sumo")
 def test_sumo_drives_our_on_ramp_until_its_ego_is_at_the_goal():
-    pytest.importorskip("libsumo", reason="libsumo comes with the extra 'bench'")
     ramp = OnRamp(seed=0)
     vehicle = ramp.sumo.vehicle
     state = ganlane.make_env(env="on_ramp", seed=0).reset()[keys.VEHICLES]

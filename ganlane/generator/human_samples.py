@@ -416,7 +416,7 @@ def _samples(segments: Segments, options: Options, random: torch.Generator) -> S
         replace = present if options.policy is None else first | (present & ~s.driven)
         changed = (as_recorded.target_lane != vehicles.target_lane) & present & ~first
         since = torch.where(changed, 0.0, torch.where(first, LONG_AGO, memory.since))
-        vehicles = vehicles.where(replace, as_recorded)
+        vehicles = as_recorded.where(replace, vehicles)
         vehicles = vehicles.with_(valid=present, target_lane=as_recorded.target_lane)
         memory = _taken(memory, its_memory, replace)._replace(since=since)
         if options.estimator is not None and decision == 0:
@@ -468,7 +468,7 @@ def _estimated(
     x, y = (last + motion[..., 5:]).unbind(-1)
     seen = vehicles.with_(x=x, y=y, acceleration=motion[..., 1])
     seen = with_velocity(seen, motion[..., 0].clamp_min(0.0), motion[..., 3])
-    return vehicles.where(whole, seen), _taken(memory, its_memory, whole)
+    return seen.where(whole, vehicles), _taken(memory, its_memory, whole)
 
 
 def varied(segments: Segments, options: Options, random: torch.Generator) -> Segments:

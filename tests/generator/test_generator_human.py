@@ -16,6 +16,7 @@ from reference.worlds import vehicles
 from ganlane.config.run import run_command
 from ganlane.generator import human_estimator, human_fit, human_tuning, load_generator, load_human
 from ganlane.generator.human import (
+    ACROSS,
     ALONG,
     FEATURES,
     HARDEST_BRAKING,
@@ -31,7 +32,14 @@ from ganlane.generator.human import (
     with_choice,
 )
 from ganlane.generator.human_fit import fit_human, fit_steps, prior_samples
-from ganlane.generator.human_samples import Options, cuts, samples_of, smooth_scene, target_lanes
+from ganlane.generator.human_samples import (
+    LATERAL_GAIN,
+    Options,
+    cuts,
+    samples_of,
+    smooth_scene,
+    target_lanes,
+)
 from ganlane.generator.human_tuning import costs, entering_memory
 from ganlane.settings.generator import HumanConfig, HumanSizes, shipped_generator
 from ganlane.sim.state import Road
@@ -145,16 +153,56 @@ def test_a_lane_change_is_meant_from_where_the_driver_sets_out():
     assert set(np.delete(target_lanes(touched, np.zeros(40), 3.5, 2), [20, 21])) == {0}
 
 
+def steady_driving() -> list:
+    """Stretches of two cars at 20 m/s, one 40 m behind the other, in the middle of three lanes."""
+    x = 2.0 * np.arange(140)[:, None] + np.array([0.0, 40.0])
+    return cuts([smooth_scene(made_by_hand(x, y=3.5), HumanConfig())], 10, 10)
+
+
 def test_teacher_samples_of_steady_driving_ask_for_no_change():
     random = torch.Generator().manual_seed(0)
-    x = 2.0 * np.arange(140)[:, None] + np.array([0.0, 40.0])
-    steady = smooth_scene(made_by_hand(x, y=3.5), HumanConfig())
     options = Options(vary=False, blind=0.0)
-    moves, choices = samples_of(cuts([steady], 10, 10), options, random)
+    moves, choices = samples_of(steady_driving(), options, random)
     assert len(moves.features) > 20
     assert moves.change.abs().max() < 1e-3
     assert moves.aside.abs().max() < 1e-3
     assert not (choices.begins == 1).any()
+
+
+def staying(features, across_token=ACROSS.number // 2):
+    """A policy that changes nothing."""
+    along = torch.zeros(*features.shape[:-1], ALONG.number)
+    across = torch.zeros(*features.shape[:-1], ACROSS.number)
+    along[..., ALONG.number // 2] = across[..., across_token] = 50.0
+    return along, across
+
+
+#: A policy that always goes to the left as fast as it can.
+drifting = partial(staying, across_token=-1)
+
+
+def test_in_the_closed_loop_a_driver_lives_with_its_own_moves_and_is_led_back():
+    random = torch.Generator().manual_seed(0)
+    options = Options(drifting, samples=1, vary=False, blind=0.0)
+    moves = samples_of(steady_driving(), options, random).moves
+    # At the first decisions it is as recorded, later it has to come back to its lane.
+    assert moves.aside.max().abs() < 1e-3
+    assert (moves.aside < -0.5).float().mean() > 0.5
+
+
+def test_the_drivers_of_a_closed_loop_begin_where_the_estimate_sees_them():
+    """Here half a metre to the left of where they were recorded, from where they are led back."""
+
+    def beside(positions):
+        motion = torch.zeros(*positions.shape[:-2], 7)
+        motion[..., 0] = 20.0
+        motion[..., 6] = 0.5
+        return motion
+
+    random = torch.Generator().manual_seed(0)
+    options = Options(staying, estimator=beside, samples=1, vary=False, blind=0.0)
+    moves = samples_of(steady_driving(), options, random).moves
+    assert float(moves.aside.min()) == pytest.approx(-0.5 * LATERAL_GAIN, abs=0.03)
 
 
 def test_accidents_the_edge_and_standing_cost():

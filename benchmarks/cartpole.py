@@ -18,7 +18,6 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -26,7 +25,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import EnvBase, GymEnv, SerialEnv
 
-from benchmarks.script import ReportSection, make_parser, markdown, run_script
+from benchmarks.script import ReportSection, add_report, make_parser, markdown, run_script
 from ganlane.agents import GreedyPolicy, Rainbow, RainbowConfig
 from ganlane.evaluation.table import Table
 from ganlane.settings.train import LoggerConfig, TrainConfig
@@ -161,7 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = make_parser(__doc__)
     parser.add_argument("--frames", type=int, default=300_000, help="at most, per seed")
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--report", type=Path, help=f"a document with the lines {BEGIN} and {END}")
+    add_report(parser, BEGIN, END)
     return run_script(measure, parser.parse_args(arguments))
 
 

@@ -29,8 +29,7 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "reproduce" / "results.json"
 #: Folders below it with further results: ``ganlane benchmark`` with the control trainings,
 #: agent_general over more episodes and on traffics that are not the project's own, and the missions
-#: (suite=exit-v1 and merge-v1); other roads and ablations are of scripts of revision 878329b, whose
-#: tables nothing makes again: of those the figures with intervals are looked up.
+#: (suite=exit-v1 and merge-v1); other roads and ablations are of scripts of revision 878329b.
 FURTHER = ("controls", "general", "roads", "elsewhere", "ablations", "exit", "merge")
 #: Driver of the matrix to its name in a document, and the traffics that it was trained on.
 DRIVERS: Mapping[str, tuple[str, frozenset[str]]] = {
@@ -113,9 +112,9 @@ def _lead(row: Row, trained: frozenset[str]) -> str:
     return f"*{text}*" if trained and row["traffic"] not in trained else text
 
 
-def _lead_and_failures(row: Row) -> str:
-    lead = _with_interval(row["minus_mobil"], row["minus_mobil_ci"])
-    return f"{lead}; {row['hard_crash']}, {row['out_of_road']}"
+def _lead_and_failures(row: Row, lead: str = "minus_mobil") -> str:
+    figure = _with_interval(row[lead], row[f"{lead}_ci"])
+    return f"{figure}; {row['hard_crash']}, {row['out_of_road']}"
 
 
 def _mean_and_failures(row: Row) -> str:
@@ -272,6 +271,24 @@ def readme(results: Results) -> str:
     return _by_traffic(results, "driver", lines)
 
 
+def roads(results: Results) -> str:
+    """Drivers by roads, traffic by traffic: lead over MOBIL, and failures."""
+    rows = results["roads"]["rows"]
+    places = list(dict.fromkeys((row["vehicles"], row["lanes"]) for row in rows))
+    by_place = {(row["driver"], row["traffic"], row["vehicles"], row["lanes"]): row for row in rows}
+    lines = []
+    for driver, traffic in dict.fromkeys(
+        (row["driver"], row["traffic"]) for row in rows if row["driver"] != "mobil"
+    ):
+        cells = [_lead_and_failures(by_place[(driver, traffic, *place)]) for place in places]
+        lines.append([f"{DRIVERS[driver][0]}, `{traffic}`", *cells])
+    headings = [
+        "lead; crashes, departures",
+        *(f"{vehicles} on {lanes}" for vehicles, lanes in places),
+    ]
+    return markdown(Table("", headings, lines))
+
+
 def elsewhere(results: Results) -> str:
     """Drivers by traffics that are not the project's own: lead over MOBIL, and failures."""
     part = results["elsewhere"]
@@ -323,6 +340,27 @@ def missions(results: Results, name: str) -> str:
     return _by_traffic(part, "lead; goal, crash, missed, time-out, %; s", lines)
 
 
+def ablations(results: Results) -> str:
+    """Trainings with one thing changed by traffics.
+
+    Lead over the one without a change, and failures.
+    """
+    part = results["ablations"]
+    leads = {(row["driver"], row["traffic"]): row for row in part["comparisons"]}
+    lines = []
+    for name, changed in part["changed"].items():
+        cells = []
+        for traffic in _traffics(part):
+            row = _at(part, name, traffic)
+            cells.append(
+                _lead_and_failures({**row, **leads[name, traffic]}, "lead")
+                if changed
+                else _mean_and_failures(row)
+            )
+        lines.append([f"`{' '.join(changed)}`" if changed else "nothing (its mean reward)", *cells])
+    return _by_traffic(part, "changed: lead; crashes, departures", lines)
+
+
 #: Document and name of the markers to the table between them.
 SECTIONS: Mapping[tuple[str, str], Callable[[Results], str]] = {
     ("README.md", "readme"): readme,
@@ -331,7 +369,9 @@ SECTIONS: Mapping[tuple[str, str], Callable[[Results], str]] = {
     ("docs/drivers.md", "paper"): paper,
     ("docs/drivers.md", "claims"): claims,
     ("docs/drivers.md", "controls"): controls,
+    ("docs/drivers.md", "roads"): roads,
     ("docs/drivers.md", "elsewhere"): elsewhere,
+    ("docs/drivers.md", "ablations"): ablations,
     ("docs/drivers.md", "trainings"): trainings,
     ("docs/scenarios.md", "exit"): partial(missions, name="exit"),
     ("docs/scenarios.md", "merge"): partial(missions, name="merge"),

@@ -23,6 +23,11 @@ def make_parser(description: str | None) -> argparse.ArgumentParser:
     )
 
 
+def add_report(parser: argparse.ArgumentParser, begin: str, end: str) -> None:
+    """Offer ``--report``, the document for a :class:`ReportSection` between these markers."""
+    parser.add_argument("--report", type=Path, help=f"a document with the lines {begin} and {end}")
+
+
 def markdown(table: Table) -> str:
     """A title as a heading, the table, and the notes below."""
     rulers = ["---"] * table.names + ["---:"] * (len(table.headings) - table.names)

@@ -99,7 +99,8 @@ class SumoRoads:
             folder = Path(name)
             (folder / "net.xml").write_text(_network(rows, lanes, lane_width_m))
             (folder / "routes.xml").write_text(_routes(rows, keep_right))
-            self.libsumo.start(_command(folder, change_s))
+            command = sumo_command(folder, PHYSICS_STEP_S)
+            self.libsumo.start([*command, f"--lanechange.duration={change_s}"])
         SumoRoads._current = self
         self._serial = 0
         #: Names of the others [row][index]; empty where there is no vehicle (any more).
@@ -303,14 +304,16 @@ def _routes(rows: int, keep_right: float) -> str:
     )
 
 
-def _command(folder: Path, change_s: float) -> list[str]:
-    """SUMO's command line. No vehicle is removed for standing still or for a crash."""
+def sumo_command(folder: Path, step_s: float, ballistic: bool = True) -> list[str]:
+    """SUMO's command line for ``net.xml`` and ``routes.xml`` in ``folder``.
+
+    No vehicle is removed for standing still or for a crash.
+    """
     options = {
         "net-file": folder / "net.xml",
         "route-files": folder / "routes.xml",
-        "step-length": PHYSICS_STEP_S,
-        "step-method.ballistic": "true",
-        "lanechange.duration": change_s,
+        "step-length": step_s,
+        "step-method.ballistic": str(ballistic).lower(),
         "default.speeddev": 0,
         "collision.action": "none",
         "time-to-teleport": -1,
@@ -319,7 +322,4 @@ def _command(folder: Path, change_s: float) -> list[str]:
         "duration-log.disable": "true",
         "no-warnings": "true",
     }
-    command = ["sumo"]
-    for name, value in options.items():
-        command += [f"--{name}", str(value)]
-    return command
+    return ["sumo", *(f"--{name}={value}" for name, value in options.items())]

@@ -47,6 +47,7 @@ from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.state import Road, Vehicles, Visibility
 from ganlane.traffic.idm_mobil import IdmTraffic
+from ganlane_simulators.sumo_roads import sumo_command
 
 
 def vehicles_of(scene: Scene) -> Vehicles:
@@ -238,24 +239,6 @@ def demand(scene: Scene, dt: float) -> str:
     return "<routes>\n" + "\n".join(lines) + "\n</routes>\n"
 
 
-def command(folder: Path, ballistic: bool, dt: float) -> list[str]:
-    """SUMO's command line for the files in ``folder``."""
-    options = {
-        "net-file": folder / "net.xml",
-        "route-files": folder / "routes.xml",
-        "step-length": dt,
-        "step-method.ballistic": str(ballistic).lower(),
-        "default.speeddev": 0,
-        "collision.action": "none",
-        "time-to-teleport": -1,
-        "xml-validation": "never",
-        "no-step-log": "true",
-        "duration-log.disable": "true",
-        "no-warnings": "true",
-    }
-    return ["sumo", *(f"--{name}={value}" for name, value in options.items())]
-
-
 def drive_sumo(scene: Scene, ballistic: bool = True, dt: float = PHYSICS_STEP_S) -> Trace:
     """Drive ``scene`` with SUMO at steps of ``dt`` seconds; positions in the trace are the bodies'
     centres.
@@ -269,7 +252,7 @@ def drive_sumo(scene: Scene, ballistic: bool = True, dt: float = PHYSICS_STEP_S)
         folder = Path(name)
         (folder / "net.xml").write_text(NETWORK)
         (folder / "routes.xml").write_text(demand(scene, dt))
-        libsumo.start(command(folder, ballistic, dt))
+        libsumo.start(sumo_command(folder, dt, ballistic))
         try:
             return _run_sumo(libsumo, scene, dt)
         finally:

@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 
 import ganlane
-from benchmarks.peers.simulators import command, vehicle_type
+from benchmarks.peers.simulators import vehicle_type
 from benchmarks.speed.measure import Runner
 from benchmarks.speed.systems import STEPS
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
+from ganlane_simulators.sumo_roads import sumo_command
 
 #: Road before x = 0, where the ego starts, and behind the goal, m.
 ROOM_M = 500.0
@@ -110,7 +111,7 @@ class OnRamp:
         write_vehicles(folder, env)
         if libsumo.isLoaded():
             libsumo.close()
-        libsumo.start([*command(folder, True, keys.PHYSICS_STEP_S), "--seed", str(seed)])
+        libsumo.start([*sumo_command(folder, keys.PHYSICS_STEP_S), "--seed", str(seed)])
         libsumo.simulationStep()
         self._start = str(folder / "start.xml")
         libsumo.simulation.saveState(self._start)

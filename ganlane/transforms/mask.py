@@ -29,7 +29,7 @@ from ganlane.errors import UserError
 from ganlane.native.tensors import SafeActions
 from ganlane.settings.actions import LANE_SPEED, ActionParameters
 from ganlane.settings.driving import IdmParameters
-from ganlane.settings.observation import MaskParameters
+from ganlane.settings.observation import MASKS, MaskParameters
 from ganlane.sim.actions import speed_changes
 from ganlane.sim.dynamics import SIDES, ego_scene, is_heard, stays_on_road
 from ganlane.sim.foresight import has_room
@@ -41,7 +41,7 @@ from ganlane.torch_settings import constant
 from ganlane.transforms.sensors import PerceptionTransform
 
 #: What this transform computes; an environment without a mask (``none``) has no transform.
-FORMS = ("legal", "safe", "foresight")
+FORMS = tuple(form for form in MASKS if form != "none")
 
 
 class BrakingDemand(NamedTuple):

@@ -21,7 +21,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from benchmarks.script import ReportSection, make_parser, run_script
+from benchmarks.script import ReportSection, add_report, make_parser, run_script
 
 from .damage import Trial, damage, good_files
 from .kill import kill
@@ -60,8 +60,7 @@ def parse() -> argparse.Namespace:
     add("--configurations", type=int, default=500, help="that soak drives")
     add("--input", metavar="KIND:NUMBER", help="one damaged file, as a failure names it")
     add("--configuration", type=int, help="one configuration, as a failure names it")
-    begin, end = MARKERS
-    parser.add_argument("--report", type=Path, help=f"a document with the lines {begin} and {end}")
+    add_report(parser, *MARKERS)
     return parser.parse_args()
 
 

@@ -22,7 +22,10 @@ from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
 from ganlane.settings.road import EXIT, WALL, LaneStretch, Stretches
 from ganlane.settings.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
+from ganlane.sim.dynamics import ego_scene
 from ganlane.sim.idm import TABLE_V
+from ganlane.sim.lane_ends import ways_out
+from ganlane.sim.mobil import TABLE_IV, letting_past
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import TrafficModule
@@ -141,6 +144,41 @@ def test_an_ego_beside_a_car_as_fast_as_it_falls_behind_and_takes_the_exit(kerne
     while not td["done"].any():
         td = step(env, td, driver(td)["action"])
     assert td[keys.EVENTS, end]
+
+
+@pytest.mark.parametrize("kernel", ["torch", "native"])
+@pytest.mark.parametrize("behind_m", [1.0, 5.0, 12.0])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_an_ego_just_ahead_of_a_car_as_fast_that_makes_no_room_lets_it_past_and_takes_the_exit(
+    kernel, behind_m, mirrored
+):
+    stretches = LEAVING[::-1] if mirrored else LEAVING
+    exit_lane = 1 if mirrored else 0
+    env = HighwayEnv(IdmTraffic(Road(2, stretches=stretches)), vehicles=2, kernel=kernel)
+    alike = {"speed": 20.0, "desired_speed": 20.0}
+    ego = {"x": 0.0, "lane": 1 - exit_lane, **alike}
+    cars = vehicles(ego, {"x": -behind_m, "lane": exit_lane, **alike}, dtype=torch.float32)
+    driver = MobilDriver(env.road)
+    td = placed(env, cars)
+    while not td["done"].any():
+        td = step(env, td, driver(td)["action"])
+    assert td[keys.EVENTS, "goal"]
+    assert td[keys.VEHICLES, "x"][0, 1] > td[keys.VEHICLES, "x"][0, 0]
+
+
+@pytest.mark.parametrize(
+    ("speed", "acceleration", "waits"),
+    [(20.0, 0.0, True), (20.0, -0.9, True), (20.0, -1.1, False), (0.0, 0.0, False)],
+)
+def test_an_ego_waits_for_nobody_who_brakes_or_stands(speed, acceleration, waits):
+    """Either may wait for the ego."""
+    road = Road(2, stretches=LEAVING)
+    alike = {"speed": speed, "desired_speed": 20.0}
+    ego = {"x": 300.0, "lane": 1, **alike}
+    cars = vehicles(ego, {"x": 299.0, "acceleration": acceleration, **alike})
+    scene = ego_scene(cars, road)
+    ways = ways_out(scene.observers, road, TABLE_IV.mandatory_m)
+    assert letting_past(scene, ways, TABLE_V, TABLE_IV)[0, 0] == (-2.0 if waits else torch.inf)
 
 
 @pytest.mark.parametrize(("courtesy", "braking"), [(2.0, 2.0), (0.0, 0.0)])
@@ -318,10 +356,12 @@ def test_all_who_come_from_the_ramp_find_their_way_onto_the_road():
     assert (td[keys.VEHICLES, "speed"] > 10.0).all()
 
 
-def test_where_a_ramp_becomes_an_exit_most_mobil_egos_leave_the_road_by_it():
-    ends = outcomes(make(EnvConfig, "weave"), "mobil", IdmMobilTrafficConfig())
-    assert ends.keys() <= {"goal", "missed_exit"}
-    assert ends["goal"] > 55
+@pytest.mark.parametrize("traffic", [IdmTrafficConfig(), IdmMobilTrafficConfig()])
+def test_where_a_ramp_becomes_an_exit_a_mobil_ego_leaves_the_road_by_it(traffic):
+    assert outcomes(make(EnvConfig, "weave"), "mobil", traffic) == {"goal": 64}
+
+
+def test_where_a_ramp_becomes_an_exit_an_ego_that_keeps_its_lane_misses_it():
     assert outcomes(make(EnvConfig, "weave"), "keep_lane", IdmTrafficConfig()) == {
         "missed_exit": 64
     }

@@ -36,7 +36,7 @@ from ganlane.sim.dynamics import (
 )
 from ganlane.sim.idm import following_acceleration
 from ganlane.sim.lane_ends import at_exit, hits_wall, leaves_road, ways_out
-from ganlane.sim.mobil import TABLE_IV, falling_behind
+from ganlane.sim.mobil import TABLE_IV, falling_behind, letting_past
 from ganlane.sim.neighbours import Scene
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
 from ganlane.traffic.base import TrafficModule, memory_of
@@ -148,8 +148,10 @@ def before_change(rules: Rules, scene: Scene, acceleration: Tensor) -> Tensor:
     if not rules.road.has_lane_ends or rules.mobil.courtesy == 0.0:
         return acceleration
     ways = ways_out(scene.observers, rules.road, rules.mobil.mandatory_m)
-    behind = falling_behind(scene, ways, rules.idm, rules.mobil)[:, 0]
-    return torch.minimum(acceleration, behind)
+    behind = falling_behind(scene, ways, rules.idm, rules.mobil)
+    # The ego cannot know whether those behind it make room.
+    past = letting_past(scene, ways, rules.idm, rules.mobil)
+    return torch.minimum(acceleration, torch.minimum(behind, past)[:, 0])
 
 
 def with_ego(number: Tensor, numbers: Tensor) -> Tensor:

@@ -145,14 +145,14 @@ INLINE void meet_from_front(const Settings& s, Rows& r, int i) {
 }
 
 // On the way from the rear; of two at the same gap the one with the lower index counts.
-INLINE void meet_from_rear(const Settings& s, Rows& r, int i) {
+INLINE void meet_from_rear(const Settings& s, Rows& r, int i, Float speed) {
     for (int lane = 0; lane < s.lanes; lane++) {
         Nearest& n = r.nearest[lane];
         Float nearer = (r.x[i] - n.x) + (r.half_length[i] - n.half_length);
         Mask here = seen_in(r, i, filled((float)lane)) & ((nearer > 0.0f) | ((nearer == 0.0f) & (r.index[i] < n.index)));
         n.x = choose(here, r.x[i], n.x);
         n.half_length = choose(here, r.half_length[i], n.half_length);
-        n.speed = choose(here, r.speed[i], n.speed);
+        n.speed = choose(here, speed, n.speed);
         n.per_desired = choose(here, r.per_desired[i], n.per_desired);
         n.index = choose(here, r.index[i], n.index);
     }
@@ -309,12 +309,12 @@ static __attribute__((noinline)) Float with_courtesy(const Settings& s, const Ro
 }
 
 // On the way from the front: vehicle i asks for room in a lane beside its own, and falls behind the leader there. The ego
-// does among all drivers, the others in traffic with MOBIL alone.
-static __attribute__((noinline)) void ask_from_front(const Settings& s, Rows& r, int i, const Idm& p) {
+// does among all drivers, the others in traffic with MOBIL alone. Whether the ego does in any row.
+static __attribute__((noinline)) bool ask_from_front(const Settings& s, Rows& r, int i, const Idm& p) {
     WaysOut ways = ways_out(s, r, i);
-    Mask asks = (ways.side != 0.0f) & (ways.urgency > ASKS_FROM) & (r.valid[i] != 0.0f);
-    if (!s.mobil) asks &= is_ego(r, i);
-    if (!any(asks)) return;
+    Mask asks = (ways.side != 0.0f) & (ways.urgency > ASKS_FROM) & (r.valid[i] != 0.0f), ego = asks & is_ego(r, i);
+    if (!s.mobil) asks = ego;
+    if (!any(asks)) return false;
     Nearest leader = nearest_in(s, r, r.target[i] + ways.side, nobody_at(NOBODY_M, r.speed[i]));
     Float gap = gap_ahead(r, i, leader.x, leader.half_length), free = free_road(r.speed[i], r.per_desired[i]);
     Float speed = choose(gap < FREE_GAP, leader.speed, r.speed[i]);
@@ -330,12 +330,26 @@ static __attribute__((noinline)) void ask_from_front(const Settings& s, Rows& r,
         n.half_length = choose(here, r.half_length[i], n.half_length);
         n.speed = choose(here, r.speed[i], n.speed);
     }
+    return any(ego);
+}
+
+// On the way from the rear: the ego, if it has to change its lane, lets the follower there go past
+// (ganlane.sim.mobil.letting_past).
+static __attribute__((noinline)) void let_past(const Settings& s, Rows& r, int i, const Idm& p) {
+    WaysOut ways = ways_out(s, r, i);
+    Mask asks = is_ego(r, i) & (ways.side != 0.0f) & (ways.urgency > ASKS_FROM) & (r.valid[i] != 0.0f);
+    if (!any(asks)) return;
+    Nearest n = nearest_in(s, r, r.target[i] + ways.side, nobody_at(-NOBODY_M, filled(0.0f)));
+    Float gap = smaller((r.x[i] - n.x) - (r.half_length[i] + n.half_length), filled(FREE_GAP));
+    Float demand = limited(p, free_road(n.speed, n.per_desired), interaction(p, s.min_gap, n.speed, gap, r.speed[i]));
+    Mask blocked = asks & (gap < FREE_GAP) & (n.speed > 0.0f) & (demand < -s.safe_deceleration);
+    r.following[i] = choose(blocked, smaller(r.following[i], filled(-s.courtesy)), r.following[i]);
 }
 
 template <class Drivers>
 static inline void follow(const Settings& s, Rows& r, const Drivers& drivers) {
     nobody_met(s, r, NOBODY_M);
-    bool courteous = s.ends && s.courtesy > 0.0f;
+    bool courteous = s.ends && s.courtesy > 0.0f, asked = false;
     for (int lane = 0; courteous && lane < s.lanes; lane++) r.asking[lane] = nobody_at(NOBODY_M, filled(0.0f));
     for (int i = 0; i < r.vehicles; i++) {
         Idm p = drivers.following(r, i);
@@ -344,9 +358,16 @@ static inline void follow(const Settings& s, Rows& r, const Drivers& drivers) {
         r.following[i] = limited(p, free_road(r.speed[i], r.per_desired[i]), strongest);
         if (courteous) {
             if (s.mobil) r.following[i] = with_courtesy(s, r, i, p, r.following[i]);
-            ask_from_front(s, r, i, p);
+            asked |= ask_from_front(s, r, i, p);
         }
         meet_from_front(s, r, i);
+    }
+    if (!asked) return;
+    nobody_met(s, r, -NOBODY_M);
+    for (int i = r.vehicles - 1; i >= 0; i--) {
+        if (any(is_ego(r, i))) let_past(s, r, i, drivers.following(r, i));
+        // It does not wait for one who brakes or stands.
+        meet_from_rear(s, r, i, choose(r.acceleration[i] > -0.5f * s.courtesy, r.speed[i], filled(0.0f)));
     }
 }
 
@@ -375,7 +396,7 @@ static inline void find_neighbours(const Settings& s, Rows& r) {
             r.speed_behind[side * r.vehicles + i] = n.speed;
             r.per_desired_behind[side * r.vehicles + i] = n.per_desired;
         }
-        meet_from_rear(s, r, i);
+        meet_from_rear(s, r, i, r.speed[i]);
     }
 }
 

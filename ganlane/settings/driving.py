@@ -94,8 +94,8 @@ class MobilParameters(Record):
             1000 m ahead on German motorways.
         courtesy: where lanes end, the deceleration with which a driver makes room for one ahead
             beside it who has to leave its lane, and with which one who has to falls behind whoever
-            blocks it, m/s2; 0: none does. About IDM's comfortable one, as in Schakel, Knoop and van
-            Arem (2012).
+            blocks it (the ego behind followers, too), m/s2; 0: none does. About IDM's comfortable
+            one, as in Schakel, Knoop and van Arem (2012).
     """
 
     # Table IV

@@ -21,7 +21,7 @@ from ganlane.sim.idm import (
     idm_acceleration,
 )
 from ganlane.sim.lane_ends import WaysOut, bias, exiting, may_change, ways_out
-from ganlane.sim.neighbours import FREE_GAP_M, Scene, compare, follower, leader
+from ganlane.sim.neighbours import FREE_GAP_M, Scene, compare, follower, leader, nearest
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
 
 TABLE_IV = MobilParameters()
@@ -238,6 +238,36 @@ def falling_behind(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParamet
     blocked = acceleration_behind(scene, ahead, idm)[..., 0] < -mobil.safe_deceleration
     asks = ways.asks & scene.observers.valid
     return torch.where(asks & blocked, -mobil.courtesy, torch.inf)
+
+
+def letting_past(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParameters) -> Tensor:
+    """Acceleration of each observer who has to change its lane soon, and for whom nobody there
+    makes room, m/s2, [N, K]; infinite for others.
+
+    It brakes with ``courtesy`` where the follower in the lane that it has to reach makes the change
+    unsafe, and so falls behind it. A follower who stands, or brakes with more than half of
+    ``courtesy``, makes room or waits itself: for that one the driver does not wait. Drivers who
+    have to change adapt their speed to the gap beside them so in Hidas (2005) and Schakel, Knoop
+    and van Arem (2012).
+
+    Args:
+        ways: of the observers.
+    """
+    wanted = (scene.observers.target_lane + ways.side).to(scene.observers.x.dtype)
+    gap, index = nearest(scene, wanted[..., None], -1)
+    gap, index = gap[..., 0], index[..., 0]
+    behind = Vehicles(*(field.gather(1, index) for field in scene.vehicles))
+    demand = idm_acceleration(
+        behind.speed[..., None],
+        behind.desired_speed[..., None],
+        gap[..., None],
+        scene.observers.speed[..., None],
+        idm.per_lane(),
+    )[..., 0]
+    goes_on = (behind.speed > 0.0) & (behind.acceleration > -0.5 * mobil.courtesy)
+    unsafe = (gap < FREE_GAP_M) & (demand < -mobil.safe_deceleration)
+    asks = ways.asks & scene.observers.valid
+    return torch.where(asks & unsafe & goes_on, -mobil.courtesy, torch.inf)
 
 
 def yielding(scene: Scene, idm: AnyIdm, mobil: MobilParameters) -> Tensor:

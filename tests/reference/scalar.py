@@ -215,12 +215,16 @@ class View:
     def making_room(self, i: int) -> float:
         """Behind the nearest ahead that has to change into its lane, with up to 2 m/s2; with
         2 m/s2 where the leader in the lane that it has to reach itself would make it brake hard.
+        The ego does that also where it would make the follower there brake hard, who goes on.
         """
         if not self.rules.stretches or not (self.rules.mobil or i == 0):
             return math.inf
         lane = self.cars[i].target_lane
         wanted = self.wanted_lanes[i]
-        blocked = wanted is not None and self.acceleration(i, self.leader(i, wanted)) < -4.0
+        blocked = wanted is not None and (
+            self.acceleration(i, self.leader(i, wanted)) < -4.0
+            or (i == 0 and self.follower_goes_on(wanted))
+        )
         slowest = -2.0 if blocked else math.inf
         asking = [
             j
@@ -232,6 +236,17 @@ class View:
         if i and nearest is not None and self.gap(i, nearest) > 1.0:
             slowest = min(slowest, self.acceleration(i, nearest))
         return max(-2.0, slowest)
+
+    def follower_goes_on(self, lane: int) -> bool:
+        """Whether the ego's follower in ``lane`` would have to brake hard behind it, but neither
+        stands nor brakes with more than 1 m/s2 now.
+        """
+        behind = self.follower(0, lane)
+        if behind is None:
+            return False
+        car = self.cars[behind]
+        goes_on = car.speed > 0.0 and car.acceleration > -1.0
+        return goes_on and self.acceleration(behind, 0) < -4.0
 
     def in_a_lane(self, i: int, lane: int) -> float:
         """What the car would accelerate with if it kept ``lane``."""

@@ -21,7 +21,7 @@ from ganlane.settings.driving import MobilParameters
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
 from ganlane.settings.road import EXIT, WALL, LaneStretch, Stretches
-from ganlane.settings.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
+from ganlane.settings.traffic import HumanTrafficConfig, IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.sim.dynamics import ego_scene
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.lane_ends import ways_out
@@ -167,15 +167,24 @@ def test_an_ego_just_ahead_of_a_car_as_fast_that_makes_no_room_lets_it_past_and_
 
 
 @pytest.mark.parametrize(
-    ("speed", "acceleration", "waits"),
-    [(20.0, 0.0, True), (20.0, -0.9, True), (20.0, -1.1, False), (0.0, 0.0, False)],
+    ("speed", "faster", "acceleration", "waits"),
+    [
+        (20.0, 0.0, 0.0, True),
+        (20.0, 1.9, 0.0, True),
+        (20.0, 2.1, 0.0, False),
+        (20.0, 0.0, -0.9, True),
+        (20.0, 0.0, -1.1, False),
+        (0.0, 0.0, 0.0, False),
+    ],
 )
-def test_an_ego_waits_for_nobody_who_brakes_or_stands(speed, acceleration, waits):
-    """Either may wait for the ego."""
+def test_an_ego_waits_for_nobody_who_is_faster_or_brakes_or_stands(
+    speed, faster, acceleration, waits
+):
+    """One who is faster goes past; one who brakes or stands may wait for the ego."""
     road = Road(2, stretches=LEAVING)
-    alike = {"speed": speed, "desired_speed": 20.0}
-    ego = {"x": 300.0, "lane": 1, **alike}
-    cars = vehicles(ego, {"x": 299.0, "acceleration": acceleration, **alike})
+    ego = {"x": 300.0, "lane": 1, "speed": speed}
+    other = {"x": 299.0, "speed": speed + faster, "acceleration": acceleration}
+    cars = vehicles(ego, other)
     scene = ego_scene(cars, road)
     ways = ways_out(scene.observers, road, TABLE_IV.mandatory_m)
     assert letting_past(scene, ways, TABLE_V, TABLE_IV)[0, 0] == (-2.0 if waits else torch.inf)
@@ -365,3 +374,8 @@ def test_where_a_ramp_becomes_an_exit_an_ego_that_keeps_its_lane_misses_it():
     assert outcomes(make(EnvConfig, "weave"), "keep_lane", IdmTrafficConfig()) == {
         "missed_exit": 64
     }
+
+
+def test_among_generated_drivers_who_make_no_room_an_ego_on_its_way_to_the_exit_is_not_hit():
+    """It does not stop for one after the other."""
+    assert "hard_crash" not in outcomes(make(EnvConfig, "exit"), "mobil", HumanTrafficConfig())

@@ -342,7 +342,9 @@ static __attribute__((noinline)) void let_past(const Settings& s, Rows& r, int i
     Nearest n = nearest_in(s, r, r.target[i] + ways.side, nobody_at(-NOBODY_M, filled(0.0f)));
     Float gap = smaller((r.x[i] - n.x) - (r.half_length[i] + n.half_length), filled(FREE_GAP));
     Float demand = limited(p, free_road(n.speed, n.per_desired), interaction(p, s.min_gap, n.speed, gap, r.speed[i]));
-    Mask blocked = asks & (gap < FREE_GAP) & (n.speed > 0.0f) & (demand < -s.safe_deceleration);
+    // It goes on, but is not faster than the ego by what a second of braking gives.
+    Mask beside = (gap < FREE_GAP) & (n.speed > 0.0f) & (n.speed - r.speed[i] < s.courtesy);
+    Mask blocked = asks & beside & (demand < -s.safe_deceleration);
     r.following[i] = choose(blocked, smaller(r.following[i], filled(-s.courtesy)), r.following[i]);
 }
 

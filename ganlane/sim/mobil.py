@@ -245,10 +245,10 @@ def letting_past(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParameter
     makes room, m/s2, [N, K]; infinite for others.
 
     It brakes with ``courtesy`` where the follower in the lane that it has to reach makes the change
-    unsafe, and so falls behind it. A follower who stands, or brakes with more than half of
-    ``courtesy``, makes room or waits itself: for that one the driver does not wait. Drivers who
-    have to change adapt their speed to the gap beside them so in Hidas (2005) and Schakel, Knoop
-    and van Arem (2012).
+    unsafe, until that one is so much faster as a second of this braking makes it, and goes past.
+    One who stands, or brakes with more than half of ``courtesy``, makes room or waits itself: for
+    that one the driver does not wait. Drivers who have to change adapt their speed to the gap
+    beside them so in Hidas (2005) and Schakel, Knoop and van Arem (2012).
 
     Args:
         ways: of the observers.
@@ -265,6 +265,8 @@ def letting_past(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParameter
         idm.per_lane(),
     )[..., 0]
     goes_on = (behind.speed > 0.0) & (behind.acceleration > -0.5 * mobil.courtesy)
+    # In a second.
+    goes_on = goes_on & (behind.speed - scene.observers.speed < mobil.courtesy)
     unsafe = (gap < FREE_GAP_M) & (demand < -mobil.safe_deceleration)
     asks = ways.asks & scene.observers.valid
     return torch.where(asks & unsafe & goes_on, -mobil.courtesy, torch.inf)

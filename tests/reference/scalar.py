@@ -239,13 +239,14 @@ class View:
 
     def follower_goes_on(self, lane: int) -> bool:
         """Whether the ego's follower in ``lane`` would have to brake hard behind it, but neither
-        stands nor brakes with more than 1 m/s2 now.
+        stands, nor brakes with more than 1 m/s2 now, nor is faster by 2 m/s.
         """
         behind = self.follower(0, lane)
         if behind is None:
             return False
         car = self.cars[behind]
-        goes_on = car.speed > 0.0 and car.acceleration > -1.0
+        faster = car.speed - self.cars[0].speed >= 2.0
+        goes_on = car.speed > 0.0 and car.acceleration > -1.0 and not faster
         return goes_on and self.acceleration(behind, 0) < -4.0
 
     def in_a_lane(self, i: int, lane: int) -> float:

@@ -30,6 +30,7 @@ from ganlane.config.run import LAST
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import difference, entries
 from ganlane.evaluation.table import Table, with_interval
+from ganlane.settings.generator import shipped_generator
 
 #: Values of each property; what is not named is as fitted.
 DOSES: dict[str, tuple[Any, ...]] = {
@@ -42,6 +43,8 @@ DOSES: dict[str, tuple[Any, ...]] = {
 }
 #: Properties of the scene rather than of the traffic.
 OF_SCENE = ("desired_speed_mps",)
+#: The drivers that all trainings meet, so that a table is of the same ones: the first weights.
+DRIVERS = {"name": "human", "path": str(shipped_generator("human_1")), "lane_changes": 1.8}
 UNCHANGED = "as fitted"
 MASKS = ("legal", "safe")
 #: Traffics that no training met.
@@ -67,8 +70,8 @@ class Training(NamedTuple):
         """What it changes of the experiment."""
         changed = {} if self.dose is None else {self.varied: self.dose}
         if self.varied in OF_SCENE:
-            return {"traffic": "human", **changed}
-        return {"traffic": {"name": "human", **changed}}
+            return {"traffic": DRIVERS, **changed}
+        return {"traffic": {**DRIVERS, **changed}}
 
 
 def trainings(seeds: int) -> Iterator[Training]:

@@ -406,13 +406,13 @@ def sides_of(vehicles: Vehicles, memory: Memory, road: Road, view: View) -> Tens
     return torch.stack(sides, 2)
 
 
-def leaves_room(side: Tensor) -> Tensor:
-    """Whether a change to a side [..., SIDE_FEATURES] leaves 2 m ahead and behind and makes nobody
-    brake harder than 2.5 m/s2; bool.
+def leaves_room(side: Tensor, room_m: float = 2.0, hardest: float = 2.5) -> Tensor:
+    """Whether a change to a side [..., SIDE_FEATURES] leaves ``room_m`` ahead and behind and makes
+    nobody brake harder than ``hardest`` m/s2; bool.
     """
-    nearest = math.log1p(2.0) - 2.5
+    nearest = math.log1p(room_m) - 2.5
     braking = torch.maximum(side[..., REAR_BRAKING], side[..., 10])
-    return (side[..., 0] > nearest) & (side[..., 1] > nearest) & (braking < 2.5)
+    return (side[..., 0] > nearest) & (side[..., 1] > nearest) & (braking < hardest)
 
 
 def _needed_braking(closing: Tensor, gap: Tensor) -> Tensor:

@@ -43,6 +43,7 @@ from ganlane.generator.human_samples import (
     joined,
     samples_of,
     smooth_scene,
+    without_noise,
 )
 from ganlane.generator.human_tuning import Report, begins_per_decision, tune
 from ganlane.settings.generator import HumanConfig
@@ -56,6 +57,8 @@ LONG_DECISIONS, SHORT_DECISIONS = 20, 5
 ONE_LANE_WEIGHT = 0.5
 #: Random scenes of the prior, and vehicles in each.
 PRIOR_SCENES, PRIOR_VEHICLES = 9000, 8
+#: How much more strongly the policy is pulled to what it is in the second fine-tuning.
+SETTLING_TIMES = 2.0
 #: Samples of an update, and of the prior beside them.
 BATCH = 1024
 PRIOR_SHARE = 0.15
@@ -66,8 +69,8 @@ LANE_UPDATES, LANE_RATE, LANE_DECAY = 300, 3e-3, 0.05
 
 
 def fit_steps(config: HumanConfig) -> int:
-    """Steps of a fit: cloning, the rounds in closed loop, and the iterations of fine-tuning."""
-    return 1 + config.rounds + config.tuning
+    """Steps of a fit: cloning, rounds in closed loop, and the iterations of both fine-tunings."""
+    return 1 + config.rounds + config.tuning + config.settling
 
 
 class Material(NamedTuple):
@@ -114,7 +117,8 @@ def fit_human(
         random = torch.Generator().manual_seed(config.seed)
         model = HumanModel(config.sizes)
         scenes = [smooth_scene(recording, config) for recording in recordings]
-        fit_estimator(model.estimator, scenes, random)
+        exact = [without_noise(recording, config) for recording in recordings]
+        fit_estimator(model.estimator, [*scenes, *exact], random)
         scenes += [smooth_scene(one, config, ONE_LANE_WEIGHT) for one in following]
         material = material_of(scenes, random)
         # Lane changes are few: none of them is hidden, as the sides are from some of the moves.
@@ -122,8 +126,12 @@ def fit_human(
         teacher = clone(model.policy, material, choices, config, random)
         report(None)
         close_the_loop(model, material, teacher, config, random, report)
-        tune(model.policy, choices, material.danger, config, random, report)
-        match_rate(model.policy, choices)
+        policy, danger = model.policy, material.danger
+        tune(policy, choices, danger, config.tuning, config.pull, random, report)
+        match_rate(policy, choices)
+        # More lane changes bring new accidents: it learns to do without them at this level.
+        pull = SETTLING_TIMES * config.pull
+        tune(policy, None, danger, config.settling, pull, random, report)
         return model.eval().requires_grad_(False)
 
 

@@ -9,7 +9,7 @@ first, since a camera's noise is no driver's wish (docs/generators.md).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -59,6 +59,8 @@ DESIRED_MPS = (5.0, 36.0)
 #: to its lane's centre than that, m.
 BEGUN_MPS = 0.1
 BEGUN_M = 0.3
+#: How much sharper than the recordings are smoothed an exact sensor shows them.
+EXACT_TIMES = 2.0
 #: Gains that lead a driver back to its recording: of speed, place along and place across.
 SPEED_GAIN = 0.5
 PLACE_GAIN = 0.08
@@ -127,6 +129,20 @@ def smooth_scene(recording: Recording, config: HumanConfig, weight: float = 1.0)
         target=target,
         weight=weight,
     )
+
+
+def without_noise(recording: Recording, config: HumanConfig) -> SmoothScene:
+    """The recording as an exact sensor might have shown it: less smooth, and nothing is noise.
+
+    Other sensors than the recordings' follow a driver's motion more closely.
+    """
+    sharper = replace(
+        config,
+        cutoff_hz=EXACT_TIMES * config.cutoff_hz,
+        lateral_cutoff_hz=EXACT_TIMES * config.lateral_cutoff_hz,
+    )
+    scene = smooth_scene(recording, sharper)
+    return replace(scene, raw_x=scene.x, raw_y=scene.y)
 
 
 def target_lanes(y: Floats, lateral_speed: Floats, width_m: float, lanes: int) -> np.ndarray:

@@ -1,9 +1,10 @@
 """Fine-tuning of ``human`` in simulation: nobody collides, leaves the road or stands without need.
 
 Proximal policy optimisation (Schulman et al. 2017) of all drivers at once in random scenes, for a
-cost that recordings cannot teach, since nobody in them has an accident. A pull to the cloned policy
-(the divergence of both) keeps everything else as recorded, and a penalty keeps the rate of lane
-changes, which carries over between roads per second rather than per kilometre.
+cost that recordings cannot teach, since nobody in them has an accident. Among them are strangers,
+whom the policy does not drive: slow ones, ones who brake, ones who push in, as an agent may. A pull
+to the cloned policy (the divergence of both) keeps everything else as recorded, and a penalty keeps
+the rate of lane changes, which carries over between roads per second rather than per kilometre.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from ganlane.generator.human import (
     ACCELERATIONS,
     ACROSS,
     ALONG,
+    DECISION_S,
     FEATURES,
+    HARDEST_BRAKING,
     SIDE_FEATURES,
     HumanPolicy,
     LaneChoice,
@@ -31,6 +34,7 @@ from ganlane.generator.human import (
     features_of,
     lane_choice,
     layers,
+    leaves_room,
     memory_of,
     moved,
     perceive,
@@ -41,7 +45,8 @@ from ganlane.generator.human import (
     with_style,
 )
 from ganlane.generator.human_samples import DESIRED_MPS, Choices, draws
-from ganlane.settings.generator import HumanConfig
+from ganlane.sim.idm import TABLE_V, following_acceleration
+from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.state import Road, Vehicles
 
 #: Called after every step of a fit, with its cost if it is one of the fine-tuning.
@@ -59,6 +64,49 @@ TEMPERATURE = 0.8
 RATE_PULL, LANE_PULL = 0.1, 5.0
 #: Bands of speed in each of which the rate is kept, m/s.
 BANDS_MPS = ((0.0, 9.0), (9.0, 16.0), (16.0, 40.0))
+#: Share of the scenes with strangers, and of strangers among their vehicles.
+WITH_STRANGERS, STRANGERS = 0.6, 0.12
+#: Of their decisions, those in which they want another lane; they take it where nobody has to brake
+#: harder than this, m/s2, and this much room is left, m.
+PUSHING, PUSHING_BRAKING, PUSHING_ROOM_M = 0.05, 5.0, 1.0
+#: Time in which a stranger takes its speed, and its lane, s; its lateral speed, m/s.
+STRANGER_S, PUSHING_S, PUSHING_MPS = 2.0, 1.2, 1.2
+
+
+class Strangers(NamedTuple):
+    """Whom the policy does not drive, [N, M].
+
+    Attributes:
+        there: which vehicles.
+        pace: the speed that they keep or take, m/s.
+        braking: at most, to take it, m/s2; they brake harder only behind others.
+    """
+
+    there: Tensor
+    pace: Tensor
+    braking: Tensor
+
+    def choices(self, choice: LaneChoice, wish: Tensor, side: Tensor) -> Tensor:
+        """A lane choice [N, M] (:func:`with_choice`) where a uniform ``wish`` asks for one; to the
+        left where ``side`` is below one half.
+        """
+        room = leaves_room(choice.sides, PUSHING_ROOM_M, PUSHING_BRAKING) & choice.exists
+        first = torch.where(side < 0.5, 1, 2)
+        can = room.gather(-1, (first - 1)[..., None])[..., 0]
+        return torch.where((wish < PUSHING) & can & choice.keeping, first, 0)
+
+    def moves(self, vehicles: Vehicles, road: Road) -> tuple[Tensor, Tensor]:
+        """Accelerations, m/s2, and lateral speeds, m/s: IDM behind others, at their own pace."""
+        behind = following_acceleration(
+            scene_of(vehicles.with_(desired_speed=torch.full_like(self.pace, 60.0)), road), TABLE_V
+        )
+        to_pace = (self.pace - vehicles.speed) / STRANGER_S
+        acceleration = torch.minimum(behind, torch.maximum(to_pace, -self.braking))
+        acceleration = acceleration.clamp(HARDEST_BRAKING, 1.5)
+        stops = -vehicles.speed / DECISION_S
+        target = vehicles.target_lane.to(vehicles.y.dtype) * road.lane_width_m
+        aside = ((target - vehicles.y) / PUSHING_S).clamp(-PUSHING_MPS, PUSHING_MPS)
+        return torch.maximum(acceleration, stops), aside
 
 
 class Decisions(NamedTuple):
@@ -91,9 +139,10 @@ class Decisions(NamedTuple):
 
 def tune(
     policy: HumanPolicy,
-    teacher: Choices,
+    teacher: Choices | None,
     danger: Tensor,
-    config: HumanConfig,
+    iterations: int,
+    pull: float,
     random: torch.Generator,
     report: Report,
 ) -> None:
@@ -101,8 +150,10 @@ def tune(
 
     Args:
         policy: cloned; what it is now is what it is pulled to.
-        teacher: recorded lane choices, whose rate is kept.
+        teacher: recorded lane choices, to whose rate it is pulled, too; None: to its own alone.
         danger: sides to which nobody changes, [D, SIDE_FEATURES].
+        iterations: of driving and learning.
+        pull: weight of the divergence from what it is now.
     """
     reference = deepcopy(policy).requires_grad_(False)
     critic = layers(FEATURES + 2 * SIDE_FEATURES, 64, 64, 1)
@@ -112,10 +163,11 @@ def tune(
             {"params": critic.parameters(), "lr": CRITIC_RATE},
         ]
     )
-    recorded = begins_per_decision(teacher)
-    for number in range(config.tuning):
+    # Recordings without a lane change say nothing about their rate.
+    recorded = begins_per_decision(teacher) if teacher is not None else 0.0
+    for number in range(iterations):
         # A warm-up of five iterations, then linearly down to a fifth.
-        rise, fall = min(1.0, (number + 1) / 5), 1.0 - 0.8 * number / config.tuning
+        rise, fall = min(1.0, (number + 1) / 5), 1.0 - 0.8 * number / iterations
         optimizer.param_groups[0]["lr"] = RATE * rise * fall
         decisions = drive(policy, critic, random)
         advantage, wanted = advantages(decisions)
@@ -125,11 +177,10 @@ def tune(
         for _ in range(PASSES):
             for rows in torch.randperm(len(wanted), generator=random).split(BATCH):
                 part = flat.rows(rows)
-                loss = _policy_loss(policy, reference, part, advantage[rows], config.pull)
+                loss = _policy_loss(policy, reference, part, advantage[rows], pull)
                 values = _values(critic, part.features, part.sides)
                 loss = loss + smooth_l1_loss(values, wanted[rows])
-                # Recordings without a lane change say nothing about their rate.
-                if recorded > 0.0:
+                if teacher is not None and recorded > 0.0:
                     off = _rate_loss(policy, part, teacher, recorded, random)
                     loss = loss + RATE_PULL * off
                 # Nobody begins a change into danger, and who is in one breaks it off.
@@ -227,7 +278,8 @@ def _rate_loss(
 @torch.no_grad()
 def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> Decisions:
     """Decisions [T, N, M] in random scenes."""
-    vehicles, memory, road = random_scenes(random)
+    vehicles, memory, road, strangers = random_scenes(random)
+    rand, _ = draws(vehicles.x.shape, random)
     steps: list[Decisions] = []
     for _ in range(DECISIONS):
         view = perceive(vehicles, road)
@@ -235,6 +287,8 @@ def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> De
         choice = lane_choice(vehicles, view, sides_of(vehicles, memory, road, view))
         chances = policy.lane_chances(choice)
         lane = torch.multinomial(chances.flatten(0, 1), 1, generator=random).view(vehicles.x.shape)
+        others = strangers.choices(choice, rand(), rand())
+        lane = torch.where(strangers.there, others, lane)
         vehicles, memory = with_choice(vehicles, memory, view, lane)
         # The moves follow the choice.
         features = features_of(vehicles, memory, road, view)
@@ -248,6 +302,9 @@ def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> De
             tokens.append(token)
             changed.append(axis.value(token + jitter))
         acceleration, aside = bounded(vehicles, memory, road, *changed)
+        theirs = strangers.moves(vehicles, road)
+        acceleration = torch.where(strangers.there, theirs[0], acceleration)
+        aside = torch.where(strangers.there, theirs[1], aside)
         memory = remembered(vehicles, memory, view, acceleration)
         later = moved(vehicles, acceleration, aside)
         cost, hit = costs(later, road, view.gap)
@@ -264,7 +321,7 @@ def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> De
             log_chance=_of_actions(log_chances, (*tokens, lane)),
             value=_values(critic, features, choice.sides),
             cost=cost,
-            valid=vehicles.valid,
+            valid=vehicles.valid & ~strangers.there,
             goes_on=goes_on,
         )
         steps.append(decisions)
@@ -327,7 +384,7 @@ def costs(vehicles: Vehicles, road: Road, gap: Tensor) -> tuple[Tensor, Tensor]:
     return cost * vehicles.valid, hit & vehicles.valid
 
 
-def random_scenes(random: torch.Generator) -> tuple[Vehicles, Memory, Road]:
+def random_scenes(random: torch.Generator) -> tuple[Vehicles, Memory, Road, Strangers]:
     """Scenes of 2 to 5 lanes, 3 to 28 m/s, people's headways, dense and sparse."""
     shape = (SCENES, VEHICLES)
     rand, randn = draws(shape, random)
@@ -360,7 +417,15 @@ def random_scenes(random: torch.Generator) -> tuple[Vehicles, Memory, Road]:
         target_lane=lane.long(),
     )
     memory = entering_memory(vehicles, road, randn())
-    return vehicles, memory, road
+    return vehicles, memory, road, random_strangers(random)
+
+
+def random_strangers(random: torch.Generator) -> Strangers:
+    """Some of the vehicles of some scenes: half of them slow, some brake hard."""
+    rand, _ = draws((SCENES, VEHICLES), random)
+    there = (rand() < STRANGERS) & (rand(SCENES, 1) < WITH_STRANGERS)
+    pace = torch.where(rand() < 0.5, 8.0 * rand(), 8.0 + 20.0 * rand())
+    return Strangers(there, pace, 1.0 + 4.0 * rand())
 
 
 def entering_memory(vehicles: Vehicles, road: Road, drawn: Tensor) -> Memory:

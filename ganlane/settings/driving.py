@@ -255,16 +255,15 @@ class HumanVariation(Record):
 
     Attributes:
         temperature: of the distributions along and across; 1 as fitted, lower is calmer.
-        lane_changes: factor of the probability to begin a lane change; with the default drivers
-            change lanes as often a second as recorded ones (0.012, US-101), with 1 as fitted, which
-            is less often: nobody changes into gaps below 2 m, as a quarter of the recorded do.
+        lane_changes: factor of the probability to begin a lane change; with 1 drivers change lanes
+            as often a second as recorded ones (0.012, US-101).
         politeness: factor of the braking that a lane change would ask of the driver behind, as the
             driver takes it to be: 0, and it does not count.
         delayed: decisions of 0.4 s by which accelerations come late.
     """
 
     temperature: Annotated[float, between(0.1, 2)] = 0.8
-    lane_changes: Annotated[float, between(0, 10)] = 1.8
+    lane_changes: Annotated[float, between(0, 10)] = 1.0
     politeness: Annotated[float, between(0, 10)] = 1.0
     delayed: Annotated[int, between(0, 4)] = 0
 

@@ -71,8 +71,8 @@ class GeneratorSizes(Record):
     differences: bool = True
 
 
-def shipped_generator(preset: Preset | Literal["human"]) -> Path:
-    """Path of the weights that come with the package."""
+def shipped_generator(preset: Preset | Literal["human", "human_1"]) -> Path:
+    """Path of the weights that come with the package; ``human_1``: those of the suite shift-v1."""
     return CHECKPOINTS / f"generator_{preset}.safetensors"
 
 
@@ -313,6 +313,7 @@ class HumanConfig(FitConfig):
         learning_rate: of Adam in cloning.
         tuning: iterations of the fine-tuning; 0: none.
         pull: weight of the divergence from the cloned policy in it.
+        settling: iterations of a second fine-tuning, once lane changes are as frequent as recorded.
         observing: updates of the observer, which adds a camera's errors to forecasts.
     """
 
@@ -330,6 +331,7 @@ class HumanConfig(FitConfig):
     # in simulation
     tuning: CountOrZero = 150
     pull: NotNegative = 0.15
+    settling: CountOrZero = 80
     # of forecasts alone
     observing: Count = 20_000
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
 from ganlane.errors import ParameterError
@@ -17,12 +18,18 @@ from ganlane.settings.commands import (
     RunConfig,
 )
 from ganlane.settings.env import EnvConfig
+from ganlane.settings.generator import shipped_generator
 from ganlane.settings.observation import MaskParameters, ObservationConfig, RewardParameters
 from ganlane.settings.record import DIFFERENT, Record, Rule, Text, between, plain
 from ganlane.settings.traffic import traffics_of
 
 #: Of the episodes, what ``quick=true`` drives.
 QUICK_SHARE = 0.2
+#: Settings that traffics had when a version was published, by version and name: where defaults have
+#: changed since, it keeps them.
+PUBLISHED: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
+    "shift-v1": {"human": {"path": str(shipped_generator("human_1")), "lane_changes": 1.8}}
+}
 _PAIR = Rule(lambda names: len(names) == 2, "two drivers, [first, second]")
 
 
@@ -67,7 +74,11 @@ class Suite(Record):
 
     def traffics(self) -> dict[str, Any]:
         """The settings of every traffic by its name, those of the score first."""
-        return traffics_of([*self.scored, *self.shown], "scored")
+        by_name = traffics_of([*self.scored, *self.shown], "scored")
+        for name, settings in PUBLISHED.get(self.version, {}).items():
+            if name in by_name:
+                by_name[name] = replace(by_name[name], **settings)
+        return by_name
 
     def drivers(self) -> list[str]:
         """Who drives beside the agents."""

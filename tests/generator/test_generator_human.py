@@ -40,8 +40,8 @@ from ganlane.generator.human_samples import (
     smooth_scene,
     target_lanes,
 )
-from ganlane.generator.human_tuning import costs, entering_memory
-from ganlane.settings.generator import HumanConfig, HumanSizes, shipped_generator
+from ganlane.generator.human_tuning import Strangers, costs, entering_memory
+from ganlane.settings.generator import SIDE_FEATURES, HumanConfig, HumanSizes, shipped_generator
 from ganlane.sim.state import Road
 
 ROAD = Road(3, 4.0)
@@ -205,6 +205,39 @@ def test_the_drivers_of_a_closed_loop_begin_where_the_estimate_sees_them():
     assert float(moves.aside.min()) == pytest.approx(-0.5 * LATERAL_GAIN, abs=0.03)
 
 
+def test_strangers_take_their_pace_stop_behind_others_and_push_in_where_there_is_room():
+    cars = scene({"lane": 1, "target_lane": 0}, {"x": -30.0, "speed": 25.0}, {"lane": 2})
+    pace = torch.tensor([[5.0, 25.0, 25.0]])
+    strangers = Strangers(torch.ones(1, 3, dtype=torch.bool), pace, torch.full((1, 3), 3.0))
+    acceleration, aside = strangers.moves(cars, ROAD)
+    # One brakes to its pace no harder than it wants to, one as hard as it must, one speeds up.
+    assert acceleration[0, 0] == -3.0
+    assert acceleration[0, 1] < -1.0
+    assert acceleration[0, 2] > 0.0
+    # On its way to the lane on the right.
+    assert aside[0, 0] < -0.5
+    assert aside[0, 2] == 0.0
+
+    here = scene({"lane": 1}, {"lane": 2, "x": 2.0}, {"lane": 0, "x": 60.0})
+    memory = memory_of(here)
+    view = perceive(here, ROAD)
+    choice = lane_choice(here, view, sides_of(here, memory, ROAD, view))
+    wish, left, right = torch.zeros(1, 3), torch.zeros(1, 3), torch.ones(1, 3)
+    # Somebody is beside it on the left; on the right there is room.
+    assert strangers.choices(choice, wish, left)[0, 0] == 0
+    assert strangers.choices(choice, wish, right)[0, 0] == 2
+    assert strangers.choices(choice, wish + 1.0, right)[0, 0] == 0
+
+
+def test_nobody_learns_from_what_strangers_do():
+    random = torch.Generator().manual_seed(0)
+    critic = torch.nn.Linear(FEATURES + 2 * SIDE_FEATURES, 1)
+    decisions = human_tuning.drive(policy(), critic, random)
+    share = decisions.valid[0].float().mean()
+    expected = 1.0 - human_tuning.STRANGERS * human_tuning.WITH_STRANGERS
+    assert share == pytest.approx(expected, abs=0.03)
+
+
 def test_accidents_the_edge_and_standing_cost():
     apart = scene({}, {"x": 60.0})
     free = torch.full((1, 2), 150.0)
@@ -228,7 +261,7 @@ def test_where_recordings_are_silent_the_prior_brakes_and_keeps_out_of_danger():
     assert moves.change.min() < -4.0
 
 
-SMALL = {"epochs": 1, "rounds": 1, "tuning": 1, "samples": 2, "observing": 1}
+SMALL = {"epochs": 1, "rounds": 1, "tuning": 1, "settling": 1, "samples": 2, "observing": 1}
 
 
 @pytest.fixture
@@ -250,9 +283,9 @@ def test_a_fit_is_the_same_for_the_same_seed_and_reports_its_steps(small_fits):
     first = fit_human(config, recordings, report=costs_of_steps.append)
     second = fit_human(config, recordings)
     assert torch.equal(torch.get_rng_state(), state)
-    assert len(costs_of_steps) == fit_steps(config) == 3
+    assert len(costs_of_steps) == fit_steps(config) == 4
     # Fine-tuning alone has a cost.
-    assert [cost is None for cost in costs_of_steps] == [True, True, False]
+    assert [cost is None for cost in costs_of_steps] == [True, True, False, False]
     for one, other in zip(first.state_dict().values(), second.state_dict().values()):
         assert torch.equal(one, other)
     assert all(tensor.isfinite().all() for tensor in first.state_dict().values())

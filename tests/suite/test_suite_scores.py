@@ -158,3 +158,10 @@ def test_replayed_episodes_of_one_recorded_car_are_one():
     assert row["minus_mobil"] == pytest.approx(10)
     assert row["crashes_per_1000_km"] == pytest.approx(1000 * (1 / 3) / (2 * KM))
     assert row["hard_crash"] == 1
+
+
+def test_a_published_suite_keeps_the_drivers_that_it_was_published_with():
+    published = Suite(version="shift-v1", scored={"human": 10}).traffics()["human"]
+    assert published.path.endswith("generator_human_1.safetensors")
+    assert published.lane_changes == 1.8
+    assert Suite(scored={"human": 10}).traffics()["human"].path is None

@@ -86,6 +86,32 @@ def changes(course):
     return int((lanes[1:] != lanes[:-1]).sum())
 
 
+def test_drivers_do_not_run_into_a_slow_car_far_ahead():
+    """Recordings show no such approach, so the fit's simulation has to teach it."""
+    road, rows = Road(1, 4.0), 100
+    places = torch.tensor([[0.0, -160.0, -220.0]]).repeat(rows, 1)
+    traffic = human_traffic(road)
+    key = keys_of(traffic, range(rows))
+    cars = vehicles_at(
+        places + 20.0 * torch.rand(rows, 3, generator=torch.Generator().manual_seed(0)),
+        torch.zeros(rows, 3, dtype=torch.int64),
+        speed=torch.tensor([[4.0, 22.0, 22.0]]).repeat(rows, 1),
+        width=torch.full((rows, 3), 1.8),
+        desired_speed=torch.full((rows, 3), 24.0),
+    )
+    memory = traffic.fresh_memory(cars, key)
+    struck = torch.zeros(rows, dtype=torch.bool)
+    slow = torch.tensor([True, False, False])
+    for step in range(300):
+        moved, memory = traffic.move(cars, memory, key, torch.full_like(key, step))
+        # The first car goes on at 4 m/s whatever its driver wants.
+        ahead = cars.with_(x=cars.x + 0.4)
+        cars = ahead.where(slow.expand(rows, 3), moved)
+        struck |= pair_overlaps(cars).flatten(1).any(1)
+    assert struck.float().mean() <= 0.02
+    assert cars.speed[:, 1].median() < 5.0
+
+
 def test_drivers_change_lanes_as_often_as_they_are_told():
     none, usual, more = (
         changes(drive(range(32), 100, lane_changes=factor)) for factor in (0.0, 1.0, 8.0)
@@ -102,14 +128,14 @@ def test_who_is_behind_counts_the_less_the_less_polite_a_driver_is():
 
 @pytest.mark.slow
 def test_a_stop_and_go_wave_forms_on_a_ring_where_idm_drivers_flow_on():
-    """22 cars on a ring, as in Sugiyama et al. 2008, here of 400 m."""
-    road = Road(1, 4.0, ring_m=400.0)
+    """22 cars on a ring, as in Sugiyama et al. 2008 (230 m), here of 300 m."""
+    road = Road(1, 4.0, ring_m=300.0)
     rows, cars = 4, 22
     noise = 0.3 * torch.randn(rows, cars, generator=torch.Generator().manual_seed(0))
     even = vehicles_at(
         torch.arange(cars) * road.ring_m / cars + noise,
         torch.zeros(rows, cars, dtype=torch.int64),
-        speed=torch.full((rows, cars), 5.0),
+        speed=torch.full((rows, cars), 4.0),
         width=torch.full((rows, cars), 1.8),
         desired_speed=torch.full((rows, cars), 15.0),
     )
@@ -119,7 +145,7 @@ def test_a_stop_and_go_wave_forms_on_a_ring_where_idm_drivers_flow_on():
     )
     # Somebody nearly stands while others go on.
     assert wave.speed.min(1).values.mean() < 1.0
-    assert wave.speed.max(1).values.mean() > 7.0
+    assert wave.speed.max(1).values.mean() > 6.0
     assert flow.speed.std(1).mean() < 0.1 * wave.speed.std(1).mean()
 
 

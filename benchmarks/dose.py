@@ -30,7 +30,7 @@ from ganlane.config.run import LAST
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import difference, entries
 from ganlane.evaluation.table import Table, with_interval
-from ganlane.settings.generator import shipped_generator
+from ganlane.settings.suite import PUBLISHED
 
 #: Values of each property; what is not named is as fitted.
 DOSES: dict[str, tuple[Any, ...]] = {
@@ -44,7 +44,7 @@ DOSES: dict[str, tuple[Any, ...]] = {
 #: Properties of the scene rather than of the traffic.
 OF_SCENE = ("desired_speed_mps",)
 #: The drivers that all trainings meet, so that a table is of the same ones: the first weights.
-DRIVERS = {"name": "human", "path": str(shipped_generator("human_1")), "lane_changes": 1.8}
+DRIVERS = {"name": "human", **PUBLISHED["shift-v1"]["human"]}
 UNCHANGED = "as fitted"
 MASKS = ("legal", "safe")
 #: Traffics that no training met.

@@ -69,8 +69,11 @@ WITH_STRANGERS, STRANGERS = 0.6, 0.12
 #: Of their decisions, those in which they want another lane; they take it where nobody has to brake
 #: harder than this, m/s2, and this much room is left, m.
 PUSHING, PUSHING_BRAKING, PUSHING_ROOM_M = 0.05, 5.0, 1.0
-#: Time in which a stranger takes its speed, and its lane, s; its lateral speed, m/s.
-STRANGER_S, PUSHING_S, PUSHING_MPS = 2.0, 1.2, 1.2
+#: Time in which a stranger takes its speed, and its lane, s; its lateral speed, m/s; its strongest
+#: acceleration, m/s2.
+STRANGER_S, PUSHING_S, PUSHING_MPS, STRANGER_ACCELERATION = 2.0, 1.2, 1.2, 1.5
+#: A desired speed with which IDM brakes for others alone, m/s: strangers have a pace of their own.
+NO_LIMIT_MPS = 60.0
 
 
 class Strangers(NamedTuple):
@@ -97,12 +100,11 @@ class Strangers(NamedTuple):
 
     def moves(self, vehicles: Vehicles, road: Road) -> tuple[Tensor, Tensor]:
         """Accelerations, m/s2, and lateral speeds, m/s: IDM behind others, at their own pace."""
-        behind = following_acceleration(
-            scene_of(vehicles.with_(desired_speed=torch.full_like(self.pace, 60.0)), road), TABLE_V
-        )
+        unlimited = vehicles.with_(desired_speed=torch.full_like(self.pace, NO_LIMIT_MPS))
+        behind = following_acceleration(scene_of(unlimited, road), TABLE_V)
         to_pace = (self.pace - vehicles.speed) / STRANGER_S
         acceleration = torch.minimum(behind, torch.maximum(to_pace, -self.braking))
-        acceleration = acceleration.clamp(HARDEST_BRAKING, 1.5)
+        acceleration = acceleration.clamp(HARDEST_BRAKING, STRANGER_ACCELERATION)
         stops = -vehicles.speed / DECISION_S
         target = vehicles.target_lane.to(vehicles.y.dtype) * road.lane_width_m
         aside = ((target - vehicles.y) / PUSHING_S).clamp(-PUSHING_MPS, PUSHING_MPS)

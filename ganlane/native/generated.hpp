@@ -79,6 +79,10 @@ INLINE int row_of(const Crowd& c, const Rows& r, int i, int lane) { return (int)
 
 // Copies a motion of a vehicle: gates of `hidden` numbers in the state, of whole vectors here.
 INLINE void copy_gates(int hidden, float* to, int to_width, const float* from, int from_width) {
+    if (to_width == from_width) {
+        __builtin_memcpy(to, from, 4 * (size_t)hidden * sizeof(float));
+        return;
+    }
     for (int gate = 0; gate < 4; gate++)
         __builtin_memcpy(to + gate * to_width, from + gate * from_width, hidden * sizeof(float));
 }

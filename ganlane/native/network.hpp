@@ -185,16 +185,17 @@ INLINE Float decay(Float x) {
     return (Float)((Mask)p + ((Mask)shifted << 23));
 }
 
-// Gates [input, forget, output, new] to the new cell and hidden state; the sigmoids and tanh over one divisor:
+// Gates [input, forget, output, new] to the new cell and hidden state; the FIRST step needs no forget gate, and `gates`
+// is 3 where there is none. The sigmoids and tanh over one divisor:
 // s(i) tanh(g) + s(f) c = ((1 - G)(1 + F) + c (1 + I)(1 + G)) / ((1 + I)(1 + G)(1 + F)), I = e^-i, G = e^-2g, F = e^-f.
 template <bool FIRST>
-INLINE void recur(int hidden, int rows, const float* gates, int stride, float* cell, float* state) {
+INLINE void recur(int hidden, int rows, const float* numbers, int gates, float* cell, float* state) {
     for (int row = 0; row < rows; row++) {
-        const float* gate = gates + (size_t)row * stride;
+        const float* gate = numbers + (size_t)row * gates * hidden;
         for (int k = 0; k < hidden; k += LANES) {
             float* c = cell + (size_t)row * hidden + k;
             const float* now = gate + k;
-            Float new_decay = decay<2>(read(now + (FIRST ? 2 : 3) * hidden));
+            Float new_decay = decay<2>(read(now + (gates - 1) * hidden));
             Float input = 1.0f + decay<1>(read(now)), both = input * (1.0f + new_decay), value;
             if (FIRST) {
                 value = (1.0f - new_decay) / both;
@@ -203,7 +204,7 @@ INLINE void recur(int hidden, int rows, const float* gates, int stride, float* c
                 value = fused(1.0f - new_decay, forget, read(c) * both) / (both * forget);
             }
             write(c, value);
-            Float output = 1.0f + decay<1>(read(now + (FIRST ? 1 : 2) * hidden)), tanh_decay = decay<2>(value);
+            Float output = 1.0f + decay<1>(read(now + (gates - 2) * hidden)), tanh_decay = decay<2>(value);
             write(state + (size_t)row * hidden + k,
                   (1.0f - tanh_decay) / (output * (1.0f + tanh_decay)));
         }
@@ -243,15 +244,11 @@ static void encode(const Network& n, const Layers& l, int rows, float* const* mo
         for (int t = 0; t < n.motions; t++) {
             const float* motion = motions[t] + (size_t)first * gates;
             if (t == 0) {
-                // The state of zeros adds nothing; the forget gate is skipped, so the others move up.
-                for (int row = 0; row < some; row++) {
-                    __builtin_memcpy(a.gates + row * gates, motion + row * gates, width * sizeof(float));
-                    __builtin_memcpy(a.gates + row * gates + width, motion + row * gates + 2 * width, 2 * width * sizeof(float));
-                }
-                recur<true>(width, some, a.gates, gates, cell, hidden);
+                // The state of zeros adds nothing.
+                recur<true>(width, some, motion, 4, cell, hidden);
             } else {
                 apply(l.recurrent, some, hidden, width, a.gates, gates, false, motion, gates);
-                recur<false>(width, some, a.gates, gates, cell, hidden);
+                recur<false>(width, some, a.gates, 4, cell, hidden);
             }
         }
     }
@@ -349,7 +346,7 @@ static void decode(const Network& n, const Layers& l, int begin, int rows, const
         apply(l.decoder_input, some, a.embedded, l.decoder_embed.width, a.gates, three);
         apply(l.decoder_recurrent, some, a.start + (size_t)first * n.hidden, n.hidden, a.gates, three, false, a.gates, three);
         float *hidden = a.hidden + (size_t)first * width, *cell = a.cell + (size_t)first * width;
-        recur<true>(width, some, a.gates, three, cell, hidden);
+        recur<true>(width, some, a.gates, 3, cell, hidden);
         apply(l.head, some, hidden, width, a.outputs + (size_t)WIDEST * first, WIDEST);
     }
 }

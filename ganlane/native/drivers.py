@@ -140,6 +140,11 @@ class RuleDrivers:
     #: When others see a lane change.
     visibility: Visibility = Visibility.SIGNALLED
 
+    @property
+    def courteous(self) -> bool:
+        """Whether they make room for those who have to leave a lane that ends."""
+        return self.mobil is not None
+
     def memory(self) -> MemoryArrays:
         """Their memory in the order of faults.hpp or random_drivers.hpp, after the steering."""
         if self.faults is not None:
@@ -220,6 +225,11 @@ class GeneratedDrivers(NetworkDrivers):
         """The limits of a lane change, as MOBIL has them."""
         return self.checked_changes.limits()
 
+    @property
+    def courteous(self) -> bool:
+        """As of :class:`RuleDrivers`; the paper's drivers heed nobody."""
+        return self.anchor is not None
+
     def memory(self) -> MemoryArrays:
         """Their memory in the order of generated.hpp."""
         sizes = self.sizes
@@ -260,6 +270,7 @@ class HumanDrivers(NetworkDrivers):
     variation: HumanVariation
     #: Their lane changes are their own.
     mobil: ClassVar[None] = None
+    courteous: ClassVar[bool] = True
 
     def memory(self) -> MemoryArrays:
         """Their memory in the order of human.hpp."""
@@ -411,10 +422,12 @@ def decision_settings(
         "timeout_steps": _steps(episode.timeout_s),
         # Of generated drivers only the limits of a lane change count.
         "mobil": isinstance(drivers, RuleDrivers) and drivers.mobil is not None,
+        "courteous": drivers.courteous,
         "foresight": False,
         "stream": drivers.stream,
         "blind_share": drivers.blind_share,
         "courtesy": ego_mobil.courtesy,
+        "safe_behind": ego_mobil.safe_deceleration,
     }
     pointed = drivers.structures() | ends_of(highway.stretches, ego_mobil)
     pointed |= actions_of(highway.actions, episode.decision_period_s)

@@ -335,6 +335,7 @@ static inline void find_anchor(const Settings& s, Rows& r, Crowd& c) {
         Float strongest = strongest_ahead(own, r, i, p);
         if (s.ends) strongest = larger(strongest, strongest_wall(own, r, i, p));
         r.lowest[i] = limited(p, free_road(speed, r.per_desired[i]), strongest);
+        if (s.ends) r.lowest[i] = smaller(r.lowest[i], r.following[i]);  // makes room
         Nearest n = nearest_in(s, r, r.target[i], nobody_at(NOBODY_M, speed));
         Float ahead = gap_ahead(r, i, n.x, n.half_length), gap = larger(ahead, filled(0.0f));
         Float closing = (speed - choose(ahead < FREE_GAP, n.speed, speed)) / 5.0f;

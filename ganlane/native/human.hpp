@@ -18,7 +18,7 @@ struct Human {
 const int DECISION_STEPS = 4, FEATURES = 65, SIDE_FEATURES = 17;
 const float DECISION_S = 0.4f, SIGHT = 150.0f, STYLE_S = 6.0f, ANTICIPATION_S = 1.0f, LONGEST_MEMORY = 12.0f;
 const float HARDEST_BRAKING = -8.0f, STRONGEST_ACCELERATION = 3.5f, STEEPEST_ASIDE = 0.12f, FASTEST_ASIDE = 2.0f;
-const float EDGE_S = 0.8f, EDGE_M = 0.15f, STEEPEST_PATH = 0.2f, MOST_LIKELY = 0.98f, LONG_AGO = 6.0f;
+const float EDGE_S = 0.8f, EDGE_M = 0.15f, STEEPEST_PATH = 0.2f, MOST_LIKELY = 0.98f, LONG_AGO = 6.0f, BESIDE_WALL = 0.4f;
 
 // Places in a driver's memory.
 enum {
@@ -353,13 +353,14 @@ static inline void look_at(const Settings& s, Rows& r, Humans& m, int i, Mask du
 
 INLINE Mask choose_mask(Mask mask, Mask yes, Mask no) { return (mask & yes) | (~mask & no); }
 
-// Whether a change of vehicle i leaves 2 m ahead and behind and makes nobody brake harder than 2.5 m/s2.
+// Whether a change of vehicle i leaves 1 m ahead and behind, as much as who makes room leaves at least, and makes nobody
+// brake harder than 2.5 m/s2.
 INLINE Mask leaves_room(const Humans& m, int i, Mask leftwards) {
     Mask room[2];
     for (int side = 0; side < 2; side++) {
         const Near &front = m.ahead[3 * i + 2 * side], &rear = m.behind[3 * i + 2 * side];
         Float braking = larger(needed_braking(rear.closing, rear.gap), needed_braking(-front.closing, front.gap));
-        room[side] = (front.gap > 2.0f) & (rear.gap > 2.0f) & (braking < 2.5f);
+        room[side] = (front.gap > 1.0f) & (rear.gap > 1.0f) & (braking < 2.5f);
     }
     return choose_mask(leftwards, room[1], room[0]);
 }
@@ -418,9 +419,10 @@ static inline void commit(const Settings& s, Rows& r, const Humans& m, int i, Ma
     acceleration = larger(acceleration, -speed / DECISION_S);
     if (s.ends) {
         Idm p = common(s);
-        Float wall = strongest_wall(s, r, i, p);
+        Float wall = strongest_wall(s, r, i, p, true);
         Float stopping = limited(p, free_road(r.speed[i], r.per_desired[i]), wall);
         acceleration = choose(wall > 0.0f, smaller(acceleration, stopping), acceleration);
+        acceleration = smaller(acceleration, r.following[i]);  // makes room
     }
     float left = ((float)s.lanes - 0.5f) * s.lane_width, right = -0.5f * s.lane_width;
     Float half = r.half_width[i] + EDGE_M;
@@ -435,6 +437,17 @@ static inline void commit(const Settings& s, Rows& r, const Humans& m, int i, Ma
     set(CLOSING + 1, r.memory[CLOSING][i]), set(CLOSING, m.ahead[3 * i + MIDDLE_LANE].closing);
     set(AGE, r.memory[AGE][i] + 1.0f), set(SINCE, r.memory[SINCE][i] + 1.0f);
     set(DECIDED_ALONG, r.memory[ACCELERATIONS + m.h->delayed][i]), set(LATERAL_FROM, lateral), set(LATERAL_TO, across);
+}
+
+// The lanes whose walls a driver heeds: its target lane, and those that its front reaches into by half a metre. Unlike
+// drivers by rules these do not keep to the centres of their lanes, and they would brake for the end of another's.
+static inline void find_lanes_of_fronts(const Settings& s, Rows& r) {
+    Float zero = filled(0.0f), one = filled(1.0f);
+    for (int i = 0; i < r.vehicles; i++) {
+        Float front = r.y[i] + r.half_length[i] * r.sine[i], half = r.half_width[i] - BESIDE_WALL;
+        LanesOf l = lanes_of(s, front, zero, one, r.half_length[i], half, r.target[i], r.visibility[i], visible(r, i));
+        r.low[i] = l.low, r.high[i] = l.high;
+    }
 }
 
 // The others' decisions in the environments that are `due`; the ego decides elsewhere.
@@ -455,8 +468,7 @@ static void decide_humans(const Settings& s, Rows& r, Humans& m, Mask due) {
     int count = for_drivers([&](int i, Mask decides, int before) { look_at(s, r, m, i, decides, before); });
     consider_lanes(m, count);
     for_drivers([&](int i, Mask decides, int before) { choose_lane(s, r, m, i, decides, before); });
-    // Who leaves its lane goes on up to the wall.
-    if (s.ends) find_lanes(s, r, false);
+    if (s.ends) find_lanes_of_fronts(s, r);
     decide_moves(m, count);
     for_drivers([&](int i, Mask decides, int before) { commit(s, r, m, i, decides, before); });
 }

@@ -33,14 +33,14 @@ struct Settings {
     // IDM, Table V
     float min_gap, headway, per_brake_scale, min_acceleration, max_acceleration;
     // MOBIL, Table IV
-    float threshold, politeness_rear, politeness_side, safe_deceleration, exclusive, courtesy;
+    float threshold, politeness_rear, politeness_side, safe_deceleration, exclusive, courtesy, safe_behind;
     // two-point steering
     float per_near_s, per_far_s, gain_far, gain_near, gain_integral, slow, max_angle;
     // ego and episode
     float soft_crash_ttc, soft_crash_gap, goal;
     // road
     float lane_width, per_lane_width;
-    int32_t lanes, vehicles, substeps, timeout_steps, mobil, abort_lane_change, foresight;
+    int32_t lanes, vehicles, substeps, timeout_steps, mobil, courteous, abort_lane_change, foresight;
     int64_t stream;  // family of episodes that random numbers belong to
     double blind_share;  // of the episodes: nobody sees the ego
     const struct Generated* generated;  // generated.hpp; null: the others are rule-driven

@@ -225,13 +225,16 @@ INLINE Float before_wall(const Settings& s, const Rows& r, int i, Float wall, Ma
     return interaction(p, s.min_gap, r.speed[i], choose(keeps, room - TURN_OUT, room), filled(0.0f));
 }
 
-// The strongest interaction with the walls of the lanes that vehicle i attends to.
-static __attribute__((noinline)) Float strongest_wall(const Settings& s, const Rows& r, int i, const Idm& p) {
+// The strongest interaction with the walls of the lanes that vehicle i attends to. A vehicle that `drifts` may reach into
+// a lane behind its wall.
+static __attribute__((noinline)) Float strongest_wall(const Settings& s, const Rows& r, int i, const Idm& p,
+                                                      bool drifts = false) {
     Float strongest = filled(0.0f), low = r.low[i], high = r.high[i], middle = smaller(low + 1.0f, high);
     for (int lane = 0; lane < s.lanes; lane++) {
         if (s.ends->wall[lane] >= NOBODY_M) continue;
         float number = (float)lane;
         Mask here = (low == number) | (middle == number) | (high == number);
+        if (drifts) here &= r.x[i] + r.half_length[i] <= s.ends->wall[lane];
         Float wall = before_wall(s, r, i, filled(s.ends->wall[lane]), r.target[i] == number, p);
         strongest = choose(here, larger(strongest, wall), strongest);
     }
@@ -290,6 +293,8 @@ static __attribute__((noinline)) WaysOut ways_out(const Settings& s, const Rows&
 
 // ---- Courtesy (ganlane.sim.mobil.yielding), where lanes end
 
+const float NO_LIMIT = 1e9f;  // stands for no bound on an acceleration
+
 // No more than the acceleration with which vehicle i makes room for the nearest ahead that has to change into its lane.
 static __attribute__((noinline)) Float with_courtesy(const Settings& s, const Rows& r, int i, const Idm& p, Float acceleration) {
     Nearest n = nobody_at(NOBODY_M, filled(0.0f));
@@ -309,16 +314,16 @@ static __attribute__((noinline)) Float with_courtesy(const Settings& s, const Ro
 }
 
 // On the way from the front: vehicle i asks for room in a lane beside its own, and falls behind the leader there. The ego
-// does among all drivers, the others in traffic with MOBIL alone. Whether the ego does in any row.
+// does among all drivers, the others where they are courteous. Whether the ego does in any row.
 static __attribute__((noinline)) bool ask_from_front(const Settings& s, Rows& r, int i, const Idm& p) {
     WaysOut ways = ways_out(s, r, i);
     Mask asks = (ways.side != 0.0f) & (ways.urgency > ASKS_FROM) & (r.valid[i] != 0.0f), ego = asks & is_ego(r, i);
-    if (!s.mobil) asks = ego;
+    if (!s.courteous) asks = ego;
     if (!any(asks)) return false;
     Nearest leader = nearest_in(s, r, r.target[i] + ways.side, nobody_at(NOBODY_M, r.speed[i]));
     Float gap = gap_ahead(r, i, leader.x, leader.half_length), free = free_road(r.speed[i], r.per_desired[i]);
     Float speed = choose(gap < FREE_GAP, leader.speed, r.speed[i]);
-    Mask blocked = limited(p, free, interaction(p, s.min_gap, r.speed[i], gap, speed)) < -s.safe_deceleration;
+    Mask blocked = limited(p, free, interaction(p, s.min_gap, r.speed[i], gap, speed)) < -s.safe_behind;
     r.following[i] = choose(asks & blocked, smaller(r.following[i], filled(-s.courtesy)), r.following[i]);
     asks &= visible(r, i);
     for (int lane = 0; lane < s.lanes; lane++) {
@@ -344,7 +349,7 @@ static __attribute__((noinline)) void let_past(const Settings& s, Rows& r, int i
     Float demand = limited(p, free_road(n.speed, n.per_desired), interaction(p, s.min_gap, n.speed, gap, r.speed[i]));
     // It goes on, but is not faster than the ego by what a second of braking gives.
     Mask beside = (gap < FREE_GAP) & (n.speed > 0.0f) & (n.speed - r.speed[i] < s.courtesy);
-    Mask blocked = asks & beside & (demand < -s.safe_deceleration);
+    Mask blocked = asks & beside & (demand < -s.safe_behind);
     r.following[i] = choose(blocked, smaller(r.following[i], filled(-s.courtesy)), r.following[i]);
 }
 
@@ -358,8 +363,10 @@ static inline void follow(const Settings& s, Rows& r, const Drivers& drivers) {
         Float strongest = strongest_ahead(s, r, i, p);
         if (s.ends) strongest = larger(strongest, strongest_wall(s, r, i, p));
         r.following[i] = limited(p, free_road(r.speed[i], r.per_desired[i]), strongest);
+        // Who does not drive by IDM makes room all the same.
+        if (s.generated || s.human) r.following[i] = choose(is_ego(r, i), r.following[i], filled(NO_LIMIT));
         if (courteous) {
-            if (s.mobil) r.following[i] = with_courtesy(s, r, i, p, r.following[i]);
+            if (s.courteous) r.following[i] = with_courtesy(s, r, i, p, r.following[i]);
             asked |= ask_from_front(s, r, i, p);
         }
         meet_from_front(s, r, i);

@@ -196,10 +196,14 @@ class Settings(Structure):
             c_float,
             "min_gap_m headway_s per_brake_scale min_acceleration max_acceleration"
             " threshold politeness_rear politeness_side safe_deceleration exclusive_m courtesy"
+            " safe_behind"
             " per_near_s per_far_s gain_far gain_near gain_integral slow_mps max_angle_rad"
             " soft_crash_ttc_s soft_crash_gap_m goal_m lane_width_m per_lane_width",
         ),
-        *fields(c_int32, "lanes vehicles substeps timeout_steps mobil abort_lane_change foresight"),
+        *fields(
+            c_int32,
+            "lanes vehicles substeps timeout_steps mobil courteous abort_lane_change foresight",
+        ),
         *fields(c_int64, "stream"),
         *fields(c_double, "blind_share"),
         *fields(c_void_p, "generated human faults random ends actions flow"),

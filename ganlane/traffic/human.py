@@ -33,15 +33,27 @@ from ganlane.generator.human import (
 from ganlane.generator.human import Memory as DriverMemory
 from ganlane.generator.human_tuning import entering_memory
 from ganlane.native.drivers import HumanDrivers
-from ganlane.settings.driving import Visibility
+from ganlane.settings.driving import MobilParameters, Visibility
 from ganlane.sim.idm import acceleration_before_wall
-from ganlane.sim.lane_ends import WaysOut, ways_out
-from ganlane.sim.mobil import TABLE_IV
+from ganlane.sim.lane_ends import WaysOut, room_before_wall, ways_out
+from ganlane.sim.mobil import TABLE_IV, yielding
 from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.random import Purpose, normal
-from ganlane.sim.state import Road, Vehicles, reads_are_cheap, spanned
+from ganlane.sim.state import (
+    Road,
+    Vehicles,
+    body_lanes,
+    reads_are_cheap,
+    spanned,
+    with_target,
+)
 from ganlane.traffic.base import Memory, Moved, TrafficModule, in_dtype, uniforms
 
+#: Ahead and behind of who leaves a lane that ends, m: who makes room leaves as much at least.
+LEAST_ROOM_M = 1.0
+#: By how much a body may reach into a lane, beyond what counts as touching it, without heeding its
+#: end, m.
+BESIDE_WALL_M = 0.4
 #: Random numbers of a decision: moves along and across, a lane change, and one where a lane ends.
 _DRAWS = (
     Purpose.ACCELERATION,
@@ -61,17 +73,23 @@ class HumanTraffic(TrafficModule):
         policy: the fitted policy (:func:`ganlane.generator.load_human`).
         drivers: the same for the native kernel: how they differ from the fitted ones, their stream.
         road: as for every traffic module.
+        mobil: how drivers leave a lane that ends, and make room for those who have to.
     """
 
     visibility = Visibility.BODY
     heeds_lane_ends = True
 
     def __init__(
-        self, policy: HumanPolicy, drivers: HumanDrivers, road: Road | None = None
+        self,
+        policy: HumanPolicy,
+        drivers: HumanDrivers,
+        road: Road | None = None,
+        mobil: MobilParameters = TABLE_IV,
     ) -> None:
         super().__init__(road, drivers.stream)
         self.policy = policy
         self.drivers = drivers
+        self.mobil = mobil
         # The same as the kernel's, in the run's float type.
         memory = drivers.memory().items()
         self.memory_fields = {key[-1]: (shape, None) for key, (_, shape) in memory}
@@ -136,6 +154,9 @@ class HumanTraffic(TrafficModule):
     def decide(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """Target lanes, and the memory with what every driver does for 0.4 s."""
         policy, variation = in_dtype(self.policy, vehicles.x.dtype), self.drivers.variation
+        if self.road.stretches:
+            scene = scene_of(vehicles, self.road)
+            makes_room = yielding(scene, self.drivers.idm, self.mobil)
         vehicles = vehicles.with_(target_lane=self.road.clamp_lane(vehicles.target_lane))
         driver = DriverMemory(*(memory[name] for name in DriverMemory._fields))
         view = perceive(vehicles, self.road)
@@ -146,7 +167,7 @@ class HumanTraffic(TrafficModule):
         polite[..., REAR_BRAKING] *= variation.politeness
         option = lane_choice(vehicles, view, polite)
         if self.road.stretches:
-            ways = ways_out(vehicles, self.road, TABLE_IV.mandatory_m)
+            ways = ways_out(vehicles, self.road, self.mobil.mandatory_m)
             option = option._replace(exists=torch.stack((ways.left, ways.right), -1))
         choice = chosen(policy.lane_chances(option, variation.lane_changes), u[2])
         if self.road.stretches:
@@ -159,6 +180,7 @@ class HumanTraffic(TrafficModule):
         acceleration, lateral = bounded(vehicles, driver, self.road, change, aside)
         if self.road.stretches:
             acceleration = torch.minimum(acceleration, self._before_walls(vehicles))
+            acceleration = torch.minimum(acceleration, makes_room)
         driver = remembered(vehicles, driver, view, acceleration)
         return vehicles, {
             **driver._asdict(),
@@ -168,11 +190,24 @@ class HumanTraffic(TrafficModule):
         }
 
     def _before_walls(self, vehicles: Vehicles) -> Tensor:
-        """IDM's acceleration before the walls of the lanes that drivers are in, m/s2; else inf."""
+        """IDM's acceleration before the walls of lanes, m/s2; else inf.
+
+        A driver heeds those of its target lane, and of the lanes that its front reaches into by
+        half a metre: unlike drivers by rules these do not keep to the centres of their lanes, and
+        they would brake for the end of another lane, or for one that lies behind them.
+        """
         scene = scene_of(vehicles, self.road)
-        lanes = spanned(scene.attention)
+        aside = 0.5 * vehicles.length * torch.sin(vehicles.heading)
+        front = vehicles.with_(
+            y=vehicles.y + aside,
+            heading=torch.zeros_like(aside),
+            width=vehicles.width - 2.0 * BESIDE_WALL_M,
+        )
+        lanes = spanned(with_target(body_lanes(front, self.road), vehicles))
         keeps = lanes == vehicles.target_lane[..., None]
-        return acceleration_before_wall(scene, lanes, keeps, self.drivers.idm).amin(-1)
+        acceleration = acceleration_before_wall(scene, lanes, keeps, self.drivers.idm)
+        ahead = room_before_wall(vehicles, lanes, self.road) >= 0.0
+        return torch.where(ahead, acceleration, torch.inf).amin(-1)
 
 
 def _leaving(choice: Tensor, keeping: Tensor, ways: WaysOut, sides: Tensor, u: Tensor) -> Tensor:
@@ -184,7 +219,7 @@ def _leaving(choice: Tensor, keeping: Tensor, ways: WaysOut, sides: Tensor, u: T
     left = ways.side == 1
     side = torch.where(left[..., None], sides[..., 0, :], sides[..., 1, :])
     wants = keeping & (ways.side != 0) & (u < ways.urgency)
-    return torch.where(wants & leaves_room(side), torch.where(left, 1, 2), choice)
+    return torch.where(wants & leaves_room(side, LEAST_ROOM_M), torch.where(left, 1, 2), choice)
 
 
 def _where(rows: Tensor, new: Mapping[str, Tensor], old: Mapping[str, Tensor]) -> Memory:

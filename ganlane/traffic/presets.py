@@ -71,6 +71,7 @@ def gan_calibrated_traffic(
     road: Road | None = None,
     stream: int = Stream.TRAIN,
     idm: IdmParameters = TABLE_V,
+    mobil: MobilParameters = TABLE_IV,
     **keys: Any,
 ) -> TrafficSequential:
     """``traffic=gan_calibrated``: anchored residual, per-driver headways, checked lane changes at
@@ -79,6 +80,7 @@ def gan_calibrated_traffic(
     Args:
         road, stream: as for every traffic module.
         idm: of the gap check; the anchor keeps its own (``SIMULATED_ANCHOR``).
+        mobil: how drivers make room for those who have to leave a lane that ends.
         keys: those of :class:`~ganlane.settings.traffic.GanCalibratedTrafficConfig`.
 
     Raises:
@@ -88,7 +90,7 @@ def gan_calibrated_traffic(
     drivers = calibrated_drivers(GanCalibratedTrafficConfig(**keys), idm, stream)
     generator = with_weights(Generator, drivers.sizes, drivers.weights)
     parts: dict[str, TrafficModule] = {
-        "generator": AnchoredGanTraffic(generator, drivers, road),
+        "generator": AnchoredGanTraffic(generator, drivers, road, mobil),
         "lane_change": CalibratedLaneChange(road, stream, drivers.checked_changes, idm),
     }
     return TrafficSequential(parts, drivers)
@@ -98,20 +100,23 @@ def human_traffic(
     road: Road | None = None,
     stream: int = Stream.TRAIN,
     idm: IdmParameters = TABLE_V,
+    mobil: MobilParameters = TABLE_IV,
     **keys: Any,
 ) -> HumanTraffic:
     """``traffic=human``: a policy fitted to recorded drivers (:mod:`ganlane.traffic.human`).
 
     Args:
         road, stream: as for every traffic module.
-        idm: the ego's, where the kernel drives.
+        idm: the ego's; also of drivers who make room.
+        mobil: how drivers leave a lane that ends, and make room for those who have to.
         keys: those of :class:`~ganlane.settings.traffic.HumanTrafficConfig`.
 
     Raises:
         UserError: the weights are missing or foreign.
     """
     drivers = human_drivers(HumanTrafficConfig(**keys), idm, stream)
-    return HumanTraffic(with_weights(HumanPolicy, drivers.sizes, drivers.weights), drivers, road)
+    policy = with_weights(HumanPolicy, drivers.sizes, drivers.weights)
+    return HumanTraffic(policy, drivers, road, mobil)
 
 
 def idm_faults_traffic(

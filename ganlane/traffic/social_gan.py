@@ -23,8 +23,10 @@ from ganlane.generator.closed_loop import (
 from ganlane.generator.networks import Generator
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.native.drivers import GeneratedDrivers
-from ganlane.settings.driving import Visibility
+from ganlane.settings.driving import MobilParameters, Visibility
 from ganlane.settings.generator import EXTRA_INPUTS
+from ganlane.sim.mobil import TABLE_IV, yielding
+from ganlane.sim.neighbours import perceive
 from ganlane.sim.random import Purpose, normal
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import Memory, Moved, TrafficModule, in_dtype, uniforms
@@ -125,9 +127,23 @@ class AnchoredGanTraffic(GeneratedTraffic):
 
     It follows ``vehicles.target_lane``, which an overlay sets, and ``vehicles.desired_speed``.
     Additional memory: ``residual_mean`` [N, M, 2] in m/s2 (the washout), ``headway`` [N, M] in s.
+
+    Args:
+        generator, drivers, road: as of the base.
+        mobil: how drivers make room for those who have to leave a lane that ends.
     """
 
     extra_inputs = EXTRA_INPUTS
+
+    def __init__(
+        self,
+        generator: Generator,
+        drivers: GeneratedDrivers,
+        road: Road | None = None,
+        mobil: MobilParameters = TABLE_IV,
+    ) -> None:
+        super().__init__(generator, drivers, road)
+        self.mobil = mobil
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """See :class:`GeneratedTraffic`; a headway for every driver, residual mean 0."""
@@ -149,6 +165,10 @@ class AnchoredGanTraffic(GeneratedTraffic):
         assert anchor is not None
         # Scaled for the network alone: the memory keeps unit variance.
         latent = self.drivers.noise_scale * noise
-        moved, driver = anchored_step(network, vehicles, self.road, driver, latent, anchor)
+        most = None
+        # Where lanes end, drivers make room for those who have to leave theirs.
+        if self.road.stretches:
+            most = yielding(perceive(vehicles, self.road), self.drivers.idm, self.mobil)
+        moved, driver = anchored_step(network, vehicles, self.road, driver, latent, anchor, most)
         new_memory = {"noise": noise, "residual_mean": driver.mean, "headway": driver.headway}
         return moved, {**self.remember(driver.history), **new_memory}

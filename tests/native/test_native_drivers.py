@@ -143,23 +143,40 @@ def test_it_decides_as_the_tensor_code(traffic):
 @pytest.mark.parametrize("scene", ["lane_drop", "weave"])
 def test_it_decides_as_the_tensor_code_where_lanes_end(scene):
     """Some 6 s and 180 m, so that those in an ending lane have to leave it."""
-    config = make(EnvConfig, {"name": scene, "kernel": "torch"})
-    module = make_traffic(make(TrafficConfig, MIXED), config)
-    env = make_highways(module, config, num_envs=10).base_env
+    differ, changed, _ = decide_side_by_side(scene, MIXED, rows=10, decisions=6)
+    assert differ <= 1
+    assert changed > 0
+
+
+@pytest.mark.parametrize("traffic", ["human", "gan_calibrated"])
+def test_and_where_drivers_make_room_on_a_ramp(traffic):
+    """Some 18 s, until those on the ramp have to merge."""
+    differ, changed, courteous = decide_side_by_side("on_ramp", {"name": traffic}, 4, 18)
+    assert differ <= 1
+    assert changed > 0
+    _, _, selfish = decide_side_by_side("on_ramp", {"name": traffic}, 4, 18, courtesy=0.0)
+    assert (courteous != selfish).any()
+
+
+def decide_side_by_side(scene, traffic, rows, decisions, courtesy=2.0):
+    """Rows that differ, lane changes of the tensor code, and its last positions."""
+    options = {"name": scene, "kernel": "torch", "mobil": {"courtesy": courtesy}}
+    config = make(EnvConfig, options)
+    module = make_traffic(make(TrafficConfig, traffic), config)
+    env = make_highways(module, config, num_envs=rows).base_env
     kernel = kernel_of(env)
     td = env.reset()
     differ = 0
     changed = 0
-    for _ in range(6):
-        td["action"] = torch.zeros(10, dtype=torch.int64)
+    for _ in range(decisions):
+        td["action"] = torch.zeros(rows, dtype=torch.int64)
         out = kernel.decide(td["action"], td)
         after = env.step(td)["next"].exclude("reward")
         differ += int(differing(out, after).sum())
         lanes = (after[keys.VEHICLES, "target_lane"], td[keys.VEHICLES, "target_lane"])
         changed += int((lanes[0] != lanes[1]).sum())
         td = after
-    assert differ <= 1
-    assert changed > 0
+    return differ, changed, td[keys.VEHICLES, "x"]
 
 
 @pytest.mark.parametrize("traffic", [*PRESETS, "human"])

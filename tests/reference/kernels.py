@@ -25,7 +25,8 @@ RUNNABLE = [
 def kernel_of(env: HighwayEnv, variant: str | None = None) -> Kernel:
     """The kernel for the environment's road, rules, traffic and actions."""
     drivers = env.traffic.native_drivers()
-    return Kernel(env.road, env.vehicles, env.episode, env.ego, drivers, variant, env.actions)
+    rules = env.road, env.vehicles, env.episode, env.ego
+    return Kernel(*rules, drivers, variant, env.actions, env.rules.mobil)
 
 
 def random_environment(

@@ -15,6 +15,7 @@ from reference.refusals import user_error
 
 from ganlane.build import make_traffic
 from ganlane.gym import ENV_IDS
+from ganlane.gym.rows import row_of
 from ganlane.native.drivers import NetworkDrivers, drivers_of
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.episode import Stream
@@ -163,6 +164,21 @@ def test_option_and_module_give_one_answer_to_who_drives(traffic):
         of_module, of_option = (replace(drivers, weights={}) for drivers in (of_module, of_option))
     assert of_module == of_option
     assert of_option is not None
+
+
+@pytest.mark.kernel
+@pytest.mark.parametrize("actions", ["lane", "lane_speed", "continuous"])
+def test_one_highway_tells_what_the_first_row_of_a_batch_does(actions):
+    """It reads its info from the kernel's arrays in a shorter way."""
+    env = make(actions=actions, lane_width_m=3.7)
+    env.reset(seed=3)
+    rows = env.unwrapped._rows
+    for _ in range(20):
+        *_, terminated, truncated, info = env.step(env.action_space.sample() * 0)
+        assert data_equivalence(info, row_of(rows.info(), 0))
+        assert list(info) == list(row_of(rows.info(), 0))
+        if terminated or truncated:
+            env.reset()
 
 
 @pytest.mark.kernel

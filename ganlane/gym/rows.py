@@ -129,6 +129,10 @@ class Rows(ABC):
         measure(info, *self.driven())
         return info
 
+    def first_info(self) -> dict[str, Any]:
+        """The info of the first row, with Python's numbers; valid for good."""
+        return row_of(self.info(), 0)
+
     def driven(self) -> tuple[Any, ...]:
         """What :func:`measure` reads: physics steps, the ego's y in m, and :meth:`lanes`."""
         return self.array(keys.STEP), self.array((keys.VEHICLES, "y")), *self.lanes()

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ganlane.arguments import seed_number, whole_number
 from ganlane.errors import UserError
 from ganlane.gym.base import OnRows, make_rows
-from ganlane.gym.rows import SEEDS, Floats, action_of, reset_options, row_of
+from ganlane.gym.rows import SEEDS, Floats, action_of, reset_options
 from ganlane.gym.window import FilmWindow, has_display
 from ganlane.keys import PHYSICS_STEP_S
 
@@ -111,7 +111,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
             self._pictures.clear()
             self._collect()
         # Copies: the arrays of the rows are overwritten by the next step.
-        return self._rows.observation()[0].copy(), row_of(self._rows.info(), 0)
+        return self._rows.observation()[0].copy(), self._rows.first_info()
 
     def step(self, action: Any) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """One decision: observation, reward, terminated, truncated, info."""
@@ -123,16 +123,17 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
             # Pictures name the numbered actions.
             self._view.before_step(int(commanded[0]) if self._actions.names else -1)
         stepped = self._rows.step(commanded)
-        reward = float(stepped.reward[0])
-        terminated = bool(stepped.terminated[0])
-        truncated = bool(stepped.truncated[0])
+        # item() is twice as fast as an index and a conversion.
+        reward = stepped.reward.item(0)
+        terminated = stepped.terminated.item(0)
+        truncated = stepped.truncated.item(0)
         # gymnasium leaves it open what a step after the end does; here it is refused.
         self._running = not (terminated or truncated)
         if self._view is not None:
             self._view.after_step(reward)
             self._collect()
         observation = stepped.observation[0].copy()
-        info = row_of(self._rows.info(), 0)
+        info = self._rows.first_info()
         return observation, reward, terminated, truncated, info
 
     def _collect(self) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,10 +90,9 @@ class _Part(NamedTuple):
 
     def call(self, function: Callable[..., int], count: int) -> None:
         """A function of a whole batch, on ``count`` rows."""
-        # One pointer is all that it passes.
-        address = ctypes.byref(self.batch)
-        # Rows are independent, so any split between threads gives the same numbers.
-        in_threads(count, lambda first, last: function(address, first, last), self.rows_per_thread)
+        # One pointer is all that it passes. Rows are independent, so any split between threads
+        # gives the same numbers.
+        in_threads(count, partial(function, ctypes.byref(self.batch)), self.rows_per_thread)
 
     def drive(self, decide: Callable[..., int], count: int) -> None:
         """The first ``count`` of ``rows``."""
@@ -148,6 +148,7 @@ class NativeBatch:
         if actions.form != LANE:
             self.mask = np.ones((rows, len(actions.names)), np.bool_)
         self._term_values = np.zeros((rows, len(self.terms)), np.float32)
+        self._first_terms = self._term_values[0]
         self._no_safe_action = np.zeros(rows, np.bool_)
         # A network fills the widest vectors with its own numbers.
         widest = variant or by_network(drivers)
@@ -264,6 +265,10 @@ class NativeBatch:
             part.drive(self._library.ganlane_decide, len(chosen))
         self._parts[0].call(self._library.ganlane_judge, self.rows)
         return self._stepped
+
+    def first_reward_terms(self) -> dict[str, float]:
+        """Those of the first row."""
+        return dict(zip(self.terms, self._first_terms.tolist()))
 
     def reward_terms(self) -> dict[str, Floats]:
         """The terms of the last reward by name, each [N]."""

@@ -408,7 +408,7 @@ def in_threads(
     if threads > 1:
         threads = min(threads_allowed(), threads)
     if threads <= 1:
-        codes = [call(0, rows)]
+        code = call(0, rows)
     else:
         # Rounded up to whole vectors, so that no two threads share one.
         share = -(-rows // (threads * BLOCK)) * BLOCK
@@ -418,10 +418,10 @@ def in_threads(
             for start in range(share, rows, share)
         ]
         # this thread does not wait idle
-        codes = [call(0, share), *(other.result() for other in others)]
-    if 2 in codes:
+        code = max(call(0, share), *(other.result() for other in others))
+    if code == 2:
         raise ValueError("an action is not 0, 1 or 2")
-    if any(codes):
+    if code:
         raise MemoryError("the kernel's scratch memory")
 
 

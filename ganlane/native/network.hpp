@@ -176,7 +176,7 @@ static Activations activations_in(Pieces& room, const Network& n, int rows, int 
 // relative error, 1.7e-7 (a linear programme over 4001 points). Cephes' takes half as long again.
 template <int TIMES>
 INLINE Float decay(Float x) {
-    Float z = between(x, -28.0f / TIMES, 28.0f / TIMES), shift = filled(12582912.0f);
+    Float z = within(x, 28.0f / TIMES), shift = filled(12582912.0f);
     Float to_base_2 = filled(-1.44269504088896341f * TIMES);
     Float shifted = fused(z, to_base_2, shift), r = fused(z, to_base_2, shift - shifted);
     Float p = fused(r, filled(1.3202981790527701e-3f), filled(9.674952365458012e-3f));

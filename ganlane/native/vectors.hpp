@@ -40,6 +40,14 @@ INLINE Float smaller(Float a, Float b) { return a < b ? a : b; }
 INLINE Float larger(Float a, Float b) { return a > b ? a : b; }
 #endif
 INLINE Float between(Float a, float low, float high) { return smaller(larger(a, filled(low)), filled(high)); }
+// -most to most; AVX-512 has an instruction for that.
+INLINE Float within(Float a, float most) {
+#if defined(__AVX512DQ__) && LANES == 16
+    return (Float)_mm512_range_ps((__m512)a, (__m512)filled(most), 2);  // the smaller of the sizes, with the sign of a
+#else
+    return between(a, -most, most);
+#endif
+}
 INLINE Float absolute(Float a) { return (Float)((Mask)a & 0x7fffffff); }
 
 // a b + c with one rounding, on every instruction set: where there is no such instruction, the product is exact in

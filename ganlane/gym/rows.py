@@ -186,15 +186,18 @@ def array_of(value: Any) -> npt.NDArray[Any]:
         return np.asarray(None)
 
 
-def action_of(action: Any, actions: ActionParameters) -> Integers | Floats:
+def action_of(action: Any, actions: ActionParameters, number: Integers) -> Integers | Floats:
     """A user's action of one environment, [1] or [1, 2]; of a number an array of one will do.
+
+    A plain number is written to ``number`` [1], which is given back.
 
     Raises:
         UserError: as :func:`actions_of`.
     """
-    # Plain numbers are most of them; to look at an array takes 3 of a step's 25 microseconds.
+    # Plain numbers are most of them; to look at an array takes 3 of a step's 20 microseconds.
     if type(action) in (int, np.int64) and 0 <= action < len(actions.names):
-        return np.array([action])
+        number[0] = action
+        return number
     array = array_of(action)
     return actions_of(array.reshape(-1) if actions.names else array[None], 1, actions)
 

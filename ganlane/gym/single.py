@@ -70,6 +70,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         self.observation_space: gymnasium.spaces.Box = self._rows.space  # type: ignore[assignment]
         self.action_space = self._rows.action_space()
         self._actions = self._rows.actions
+        self._number = np.zeros(1, np.int64)
         self.render_mode = render_mode
         fps = FPS
         if render_mode == "rgb_array":  # a picture per decision
@@ -117,7 +118,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         """One decision: observation, reward, terminated, truncated, info."""
         if not self._running:
             raise UserError("step(): no episode is under way; call reset() first.")
-        commanded = action_of(action, self._actions)
+        commanded = action_of(action, self._actions, self._number)
         # The view records the physics steps of the decision through the environment's recorder.
         if self._view is not None:
             # Pictures name the numbered actions.

@@ -85,6 +85,8 @@ class _Part(NamedTuple):
     """What drives the rows of one part of the drivers, and its rows."""
 
     batch: _Batch
+    #: To ``batch``.
+    pointer: Any
     rows: npt.NDArray[np.int64] | None
     rows_per_thread: int
 
@@ -92,7 +94,7 @@ class _Part(NamedTuple):
         """A function of a whole batch, on ``count`` rows."""
         # One pointer is all that it passes. Rows are independent, so any split between threads
         # gives the same numbers.
-        in_threads(count, partial(function, ctypes.byref(self.batch)), self.rows_per_thread)
+        in_threads(count, partial(function, self.pointer), self.rows_per_thread)
 
     def drive(self, decide: Callable[..., int], count: int) -> None:
         """The first ``count`` of ``rows``."""
@@ -203,7 +205,7 @@ class NativeBatch:
             }
             pointers = {name: ctypes.addressof(of_part[name]) for name in of_part}
             batch = filled(_Batch, pointers | numbers, of_part)
-            self._parts.append(_Part(batch, row_list, rows_per_thread(part.drivers)))
+            self._parts.append(_Part(batch, ctypes.byref(batch), row_list, rows_per_thread(part.drivers)))
         ends = (self.state["terminated"], self.state["truncated"])
         self._stepped = Stepped(self.observation, self.state[keys.REWARD], *ends)
 

@@ -205,7 +205,8 @@ class NativeBatch:
             }
             pointers = {name: ctypes.addressof(of_part[name]) for name in of_part}
             batch = filled(_Batch, pointers | numbers, of_part)
-            self._parts.append(_Part(batch, ctypes.byref(batch), row_list, rows_per_thread(part.drivers)))
+            per_thread = rows_per_thread(part.drivers)
+            self._parts.append(_Part(batch, ctypes.byref(batch), row_list, per_thread))
         ends = (self.state["terminated"], self.state["truncated"])
         self._stepped = Stepped(self.observation, self.state[keys.REWARD], *ends)
 

@@ -214,6 +214,13 @@ def test_agent_merge_merges_from_the_ramp_sooner_than_mobil():
     assert agent > mobil
 
 
+def test_agent_exit_takes_every_exit_and_is_faster_than_mobil():
+    table = ganlane.api.evaluate(["agent_exit", "mobil"], ["idm_mobil"], 30, env="exit")
+    assert table["goal"].to_list() == [30, 30]
+    agent, mobil = table["mean_speed_mps"].to_list()
+    assert agent > mobil
+
+
 # What is refused
 
 

@@ -21,6 +21,7 @@ EXAMPLES = {
         r"2048 decisions, \d+ episodes, loss \d+\.\d+\nmean return of the last \d+: -?\d+\.\d"
     ),
     "sb3_ppo.py": r"(?s)ppo .*mobil ",
+    "sb3_exit.py": r"(?s)maskableppo .*mobil ",
     "sb3_sac_merge.py": r"(?s)sac .*mobil ",
     "sb3_dqn.py": (
         r"(?s)300 decisions, mean return of the last \d+ episodes -?\d+\.\d.*sb3_dqn.*mobil"
@@ -37,12 +38,14 @@ SHORT = {
     "cleanrl_style.py": ["2048"],
     "sb3_dqn.py": ["300", "4", "200"],
     "sb3_ppo.py": ["4096", "safe", "MaskablePPO", "4", "200", "16"],
+    "sb3_exit.py": ["1024", "1024", "4", "16"],
     "sb3_sac_merge.py": ["64", "SAC", "2", "4"],
 }
 #: What an example needs beside ganlane.
 NEEDS = {
     "sb3_dqn.py": "stable_baselines3",
     "sb3_ppo.py": "sb3_contrib",
+    "sb3_exit.py": "sb3_contrib",
     "sb3_sac_merge.py": "stable_baselines3",
 }
 

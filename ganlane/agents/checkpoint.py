@@ -23,7 +23,7 @@ from ganlane.weights import load_weights, save_weights
 
 #: Agents that come with the package, and the seed of the training that each of them is; others are
 #: given by their path.
-SHIPPED = {"agent_general": 0, "agent_idm": 0, "agent_gan": 0, "agent_exit": 3}
+SHIPPED = {"agent_general": 0, "agent_idm": 0, "agent_gan": 0}
 #: Kind of a file with several agents.
 SEVERAL = "agents"
 #: What says which returns the outputs of a distributional network stand for.

@@ -52,7 +52,7 @@ def test_another_observation_size_is_refused_naming_both(saved):
 
 
 def test_an_unknown_agent_is_refused_with_the_names_there_are():
-    with user_error("agents that ship are agent_exit, agent_gan, agent_general, agent_idm"):
+    with user_error("agents that ship are agent_gan, agent_general, agent_idm"):
         load_agent("agent_xyz")
 
 

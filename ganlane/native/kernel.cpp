@@ -319,6 +319,13 @@ static inline void drive_ego(const Settings& s, Rows& r, Mover before) {
     }
 }
 
+// The ego's commanded speed holds within a decision; who enters behind it reckons with the desired one.
+static void restore_desired_speeds(const Settings& s, const Inputs& in, Rows& r, const Block& block) {
+    for (int i = 0; i < r.vehicles; i++)
+        for (int lane = 0; lane < LANES; lane++)
+            if (at(r.index, i, lane) == 0.0f) at(r.per_desired, i, lane) = 1.0f / in.desired_speed[block.row[lane] * s.vehicles];
+}
+
 // `ended(rows)` is called when rows of generated drivers end, before anything of them changes.
 template <class Ended>
 static inline void decide(const Settings& s, Rows& r, Networks& networks, Ended ended) {
@@ -572,6 +579,7 @@ extern "C" int ganlane_decide(const Settings* settings, const Inputs* in, const 
             Mask recycles = none();
             for (int lane = 0; lane < block.count; lane++) recycles[lane] = in->recycles[block.row[lane]] ? -1 : 0;
             recycles &= r.running;
+            if (in->set_speed) restore_desired_speeds(s, *in, r, block);
             if (s.flow) let_out(s, r, recycles), let_in(s, r, recycles);
             else recycle(s, r, recycles);
         }

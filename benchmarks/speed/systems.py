@@ -167,17 +167,14 @@ def start_gymnasium(road: Road, mode: str, device: str, batch: int, keep: bool =
             action = actions[decision % DRAWN]
             *_, terminated, truncated, info = env.step(int(action[0]) if batch == 1 else action)
             end_s = info["time_s"]
-            if batch == 1:  # plain numbers: a sum of NumPy would take a tenth of the step's time
-                driven_s += end_s - time_s
-                time_s = end_s
-                if terminated or truncated:
-                    env.reset()
-                    time_s = 0.0
-                continue
             if "_final_info" in info:  # of rows that were reset, the time at their ends
                 end_s = np.where(info["_final_info"], info["final_info"]["time_s"], end_s)
-            driven_s += float(np.sum(end_s - time_s))
+            # Of a plain number NumPy's sum would take a tenth of a step's time.
+            driven_s += end_s - time_s if batch == 1 else float(np.sum(end_s - time_s))
             time_s = info["time_s"]
+            if batch == 1 and (terminated or truncated):
+                env.reset()
+                time_s = 0.0
         return round(driven_s / keys.PHYSICS_STEP_S)
 
     return run

@@ -236,13 +236,13 @@ def anchored_step(
     memory: DriverMemory,
     noise: Tensor,
     parameters: AnchorParameters = ANCHOR,
-    most: Tensor | None = None,
+    bound: Callable[[Scene], Tensor] | None = None,
 ) -> tuple[Vehicles, DriverMemory]:
     """One step of the calibrated preset: vehicles [N, M] 0.1 s later and their new memory.
 
     The vehicles' ``target_lane`` is the lane to keep or to change to, ``desired_speed`` the
     driver's own; ``road`` is one per row in recorded scenes; latent vectors ``noise`` [N, M, Z] of
-    zeros give the mean driver. The anchor accelerates with no more than ``most`` [N, M], m/s2.
+    zeros give the mean driver. The anchor accelerates with no more than ``bound`` [N, M], m/s2.
     """
     p = parameters
     displacement = displacement_of(vehicles)
@@ -251,8 +251,8 @@ def anchored_step(
     # The anchor: IDM along the road; a spring and a damper to the target lane's centre across it.
     scene = perceive(vehicles, road)
     anchor_x = following_acceleration(scene, p.idm, memory.headway)
-    if most is not None:
-        anchor_x = torch.minimum(anchor_x, most)
+    if bound is not None:
+        anchor_x = torch.minimum(anchor_x, bound(scene))
     offset = road.centre_of(vehicles.target_lane, vehicles.y.dtype) - vehicles.y
     velocity = displacement / PHYSICS_STEP_S
     anchor_y = p.lane_stiffness * offset - p.lane_damping * velocity[..., 1]

@@ -363,8 +363,8 @@ static inline void follow(const Settings& s, Rows& r, const Drivers& drivers) {
         Float strongest = strongest_ahead(s, r, i, p);
         if (s.ends) strongest = larger(strongest, strongest_wall(s, r, i, p));
         r.following[i] = limited(p, free_road(r.speed[i], r.per_desired[i]), strongest);
-        // Who does not drive by IDM makes room all the same.
-        if (s.generated || s.human) r.following[i] = choose(is_ego(r, i), r.following[i], filled(NO_LIMIT));
+        // Where lanes end, who does not drive by IDM makes room all the same.
+        if (s.ends && (s.generated || s.human)) r.following[i] = choose(is_ego(r, i), r.following[i], filled(NO_LIMIT));
         if (courteous) {
             if (s.courteous) r.following[i] = with_courtesy(s, r, i, p, r.following[i]);
             asked |= ask_from_front(s, r, i, p);

@@ -25,7 +25,7 @@ INLINE Float filled(float number) { return number - Float{}; }
 INLINE Mask none() { return Mask{}; }
 INLINE Float choose(Mask mask, Float yes, Float no) { return mask ? yes : no; }
 // a < b ? a : b, and a > b ? a : b. x86 has instructions for exactly that, which GCC 12 makes a comparison and a choice
-// of: with them the Social-GAN's cells take a fifth less time.
+// of: with them, and fewer copies of gates, `gan` took 4 % less time.
 #if defined(__AVX512F__) && LANES == 16
 INLINE Float smaller(Float a, Float b) { return (Float)_mm512_min_ps((__m512)a, (__m512)b); }
 INLINE Float larger(Float a, Float b) { return (Float)_mm512_max_ps((__m512)a, (__m512)b); }

@@ -37,6 +37,7 @@ from ganlane.settings.driving import MobilParameters, Visibility
 from ganlane.sim.idm import acceleration_before_wall
 from ganlane.sim.lane_ends import WaysOut, room_before_wall, ways_out
 from ganlane.sim.mobil import TABLE_IV, yielding
+from ganlane.sim.neighbours import Scene
 from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.random import Purpose, normal
 from ganlane.sim.state import (
@@ -179,7 +180,7 @@ class HumanTraffic(TrafficModule):
         aside = ACROSS.sample(across, u[1], variation.temperature)
         acceleration, lateral = bounded(vehicles, driver, self.road, change, aside)
         if self.road.stretches:
-            acceleration = torch.minimum(acceleration, self._before_walls(vehicles))
+            acceleration = torch.minimum(acceleration, self._before_walls(vehicles, scene))
             acceleration = torch.minimum(acceleration, makes_room)
         driver = remembered(vehicles, driver, view, acceleration)
         return vehicles, {
@@ -189,14 +190,15 @@ class HumanTraffic(TrafficModule):
             "lateral_to": lateral,
         }
 
-    def _before_walls(self, vehicles: Vehicles) -> Tensor:
+    def _before_walls(self, vehicles: Vehicles, scene: Scene) -> Tensor:
         """IDM's acceleration before the walls of lanes, m/s2; else inf.
+
+        ``scene`` is theirs from before they chose their target lanes.
 
         A driver heeds those of its target lane, and of the lanes that its front reaches into by
         half a metre: unlike drivers by rules these do not keep to the centres of their lanes, and
         they would brake for the end of another lane, or for one that lies behind them.
         """
-        scene = scene_of(vehicles, self.road)
         aside = 0.5 * vehicles.length * torch.sin(vehicles.heading)
         front = vehicles.with_(
             y=vehicles.y + aside,

@@ -7,6 +7,8 @@ a neighbour like any other.
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -26,7 +28,6 @@ from ganlane.native.drivers import GeneratedDrivers
 from ganlane.settings.driving import MobilParameters, Visibility
 from ganlane.settings.generator import EXTRA_INPUTS
 from ganlane.sim.mobil import TABLE_IV, yielding
-from ganlane.sim.neighbours import perceive
 from ganlane.sim.random import Purpose, normal
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import Memory, Moved, TrafficModule, in_dtype, uniforms
@@ -165,10 +166,9 @@ class AnchoredGanTraffic(GeneratedTraffic):
         assert anchor is not None
         # Scaled for the network alone: the memory keeps unit variance.
         latent = self.drivers.noise_scale * noise
-        most = None
         # Where lanes end, drivers make room for those who have to leave theirs.
-        if self.road.stretches:
-            most = yielding(perceive(vehicles, self.road), self.drivers.idm, self.mobil)
-        moved, driver = anchored_step(network, vehicles, self.road, driver, latent, anchor, most)
+        makes_room = partial(yielding, idm=self.drivers.idm, mobil=self.mobil)
+        bound = makes_room if self.road.stretches else None
+        moved, driver = anchored_step(network, vehicles, self.road, driver, latent, anchor, bound)
         new_memory = {"noise": noise, "residual_mean": driver.mean, "headway": driver.headway}
         return moved, {**self.remember(driver.history), **new_memory}

@@ -19,15 +19,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from ganlane import keys
 from ganlane.arguments import seed_number, whole_number
-from ganlane.env.physics import (
-    Recorder,
-    Rules,
-    begin,
-    known_false,
-    outcome,
-    remember,
-    run_decision,
-)
+from ganlane.env.physics import Recorder, Rules, begin, known_false, outcome, remember, run_decision
 from ganlane.env.state import (
     check_counter,
     checked_action,
@@ -128,25 +120,10 @@ class HighwayEnv(EnvBase):
         if scenes is not None and not callable(scenes):
             raise UserError(f"scenes={scenes!r:.80}: expected scenes; give a FixedScene, say.")
         # The bounds of the settings lie within.
-        whole_number(
-            "num_envs",
-            num_envs,
-            1,
-            2**20,
-        )
-        whole_number(
-            "first_episode",
-            first_episode,
-            0,
-            2**62,
-        )
+        whole_number("num_envs", num_envs, 1, 2**20)
+        whole_number("first_episode", first_episode, 0, 2**62)
         if vehicles is not None:
-            whole_number(
-                "vehicles",
-                vehicles,
-                1,
-                1000,
-            )
+            whole_number("vehicles", vehicles, 1, 1000)
         # Checked before EnvBase allocates anything on it.
         device = usable_device(device, dtype)
         super().__init__(device=device, batch_size=torch.Size([int(num_envs)]))
@@ -165,15 +142,7 @@ class HighwayEnv(EnvBase):
         self.recycle_share = recycle_share
         self.recorder: Recorder | None = None
         # Constants of every episode, handed to the pure functions of physics.
-        self.rules = Rules(
-            self.road,
-            self.ego,
-            self.episode,
-            idm,
-            steering,
-            self.actions,
-            mobil,
-        )
+        self.rules = Rules(self.road, self.ego, self.episode, idm, steering, self.actions, mobil)
         self._seed = seed_number(seed)
         #: Seed and episode [N] of the rows in the last call; automatic resets continue from there.
         self.last_episodes: tuple[Tensor, Tensor] | None = None
@@ -195,13 +164,7 @@ class HighwayEnv(EnvBase):
         scenes = self.traffic.scenes(vehicles, visibility, spawn.ego_desired_speed_mps)
         if scenes is None:
             others = self.traffic.visibility
-            scenes = RandomScenes(
-                self.road,
-                vehicles,
-                spawn,
-                visibility,
-                others,
-            )
+            scenes = RandomScenes(self.road, vehicles, spawn, visibility, others)
         return scenes
 
     def _check_parts(self, vehicles: int | None) -> None:
@@ -248,14 +211,7 @@ class HighwayEnv(EnvBase):
             # Of any episode: the shapes are those of all.
             key = torch.zeros(1, dtype=torch.int64, device=device)
             row_road = self.traffic.road_of(key, self.dtype)
-        spec = state_spec(
-            n,
-            self.vehicles,
-            self.dtype,
-            memory,
-            row_road,
-            self.actions,
-        )
+        spec = state_spec(n, self.vehicles, self.dtype, memory, row_road, self.actions)
         self.observation_spec = spec.to(device)
         # A TransformedEnv passes to a reset only the keys of the state spec; without the counters a
         # reset to certain episodes would run the first ones.
@@ -297,12 +253,7 @@ class HighwayEnv(EnvBase):
             # In an automatic reset TorchRL passes the mask without the counters.
             seed, last = self.last_episodes
         else:
-            seed = torch.full(
-                (n,),
-                self._seed,
-                dtype=torch.int64,
-                device=self.device,
-            )
+            seed = torch.full((n,), self._seed, dtype=torch.int64, device=self.device)
             return seed, self.first_episode + torch.arange(n, device=self.device)
         # Without a mask the counters name the episodes; with one they are those that have ended.
         if mask is None:
@@ -346,13 +297,7 @@ class HighwayEnv(EnvBase):
         key = episode_key(self.stream, seed, episode)
         vehicles = self.scenes(key, self.dtype).with_finite_padding()
         vehicles, memory = self.traffic.enter(vehicles, key, episode)
-        state = first_state(
-            seed,
-            episode,
-            vehicles,
-            memory,
-            self.actions,
-        )
+        state = first_state(seed, episode, vehicles, memory, self.actions)
         if self.traffic.own_roads:
             fields = road_fields(self.traffic.road_of(key, self.dtype))
             state.set(keys.ROAD, TensorDict(fields, seed.shape))
@@ -387,28 +332,9 @@ class HighwayEnv(EnvBase):
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         ego = dict(state.get(keys.EGO).items())
         # The command, then traffic and ego step by step, then what the ego remembers of it.
-        start, command = begin(
-            rules,
-            action,
-            vehicles,
-            ego,
-            state.get(keys.STEP),
-        )
-        end, memory = run_decision(
-            self.traffic,
-            rules,
-            state,
-            start,
-            key,
-            self.recorder,
-        )
-        ego = remember(
-            rules,
-            ego,
-            start,
-            end,
-            command,
-        )
+        start, command = begin(rules, action, vehicles, ego, state.get(keys.STEP))
+        end, memory = run_decision(self.traffic, rules, state, start, key, self.recorder)
+        ego = remember(rules, ego, start, end, command)
         events, rest = outcome(rules, end)
         rest |= {name: state.get(name) for name in (keys.SEED, keys.EPISODE)}
         rest[keys.STEP] = end.step
@@ -426,13 +352,7 @@ class HighwayEnv(EnvBase):
             period_s = self.episode.decision_period_s
             flowed = let_in_and_out(vehicles, rules.road, rules.idm, key, end.step, period_s)
             vehicles = flowed.where(end.running, vehicles)
-        return pack(
-            vehicles,
-            ego,
-            memory,
-            events,
-            rest,
-        )
+        return pack(vehicles, ego, memory, events, rest)
 
     def _native_step(self, state: TensorDictBase) -> TensorDictBase:
         """One decision by the kernel; where a gradient is due, with ``auto`` by the tensor code."""
@@ -465,12 +385,7 @@ class HighwayEnv(EnvBase):
             self._show_steps(self.recorder, state, action)
         return after
 
-    def _show_steps(
-        self,
-        recorder: Recorder,
-        state: TensorDictBase,
-        action: Tensor,
-    ) -> None:
+    def _show_steps(self, recorder: Recorder, state: TensorDictBase, action: Tensor) -> None:
         """Show ``recorder`` the physics steps of the decision ``action`` [N] in ``state``.
 
         The kernel drives it once more, in decisions of one physics step, which gives the same bits.
@@ -567,13 +482,7 @@ class HighwayEnv(EnvBase):
         if self.recycle_share >= 1.0:
             return torch.ones_like(key, dtype=torch.bool)
         # Step -1, before the first, so that no other number is the same draw.
-        drawn = uniform(
-            key,
-            -1,
-            1,
-            [Purpose.RECYCLED_EPISODE],
-            torch.float64,
-        )
+        drawn = uniform(key, -1, 1, [Purpose.RECYCLED_EPISODE], torch.float64)
         return drawn[..., 0].reshape(key.shape) < self.recycle_share
 
 

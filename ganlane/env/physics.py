@@ -168,12 +168,7 @@ def arrived(rules: Rules, ego: Vehicles) -> tuple[Tensor, Tensor]:
     return goal, torch.zeros_like(goal)
 
 
-def advance(
-    rules: Rules,
-    before: Substep,
-    moved: Vehicles,
-    all_running: bool,
-) -> Substep:
+def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -> Substep:
     """One physics step in which the others have ``moved``: moves the ego and finds the events.
 
     A hard crash has precedence over leaving the road, that over goal and missed exit, and all over
@@ -323,11 +318,7 @@ class EndedRows:
         return _with_rows(memory, torch.cat(self.rows), torch.cat(self.memories))  # type: ignore[arg-type]
 
 
-def _with_rows(
-    memory: TensorDictBase,
-    rows: Tensor,
-    other: TensorDictBase,
-) -> TensorDict:
+def _with_rows(memory: TensorDictBase, rows: Tensor, other: TensorDictBase) -> TensorDict:
     """``memory`` with its ``rows`` replaced by ``other`` [R], leaf by leaf."""
 
     # Leaf by leaf, since the memory is nested like the traffic.
@@ -342,11 +333,7 @@ def _with_rows(
     return TensorDict._new_unsafe(restored, batch_size=memory.batch_size)
 
 
-def _where(
-    rows: Tensor,
-    new: Tensor,
-    old: Tensor,
-) -> Tensor:
+def _where(rows: Tensor, new: Tensor, old: Tensor) -> Tensor:
     """``new`` where ``rows`` [N] is true, ``old`` elsewhere."""
     further_axes = [1] * (new.ndim - 1)
     return torch.where(rows.reshape(-1, *further_axes), new, old)
@@ -396,12 +383,7 @@ def run_decision(
         after = traffic(TensorDict._new_unsafe(fields, batch_size=size))
         all_running = known_false((~before.running).any())
         moved = Vehicles.of(after.get(keys.MOVED))
-        now = advance(
-            rules,
-            before,
-            moved,
-            all_running,
-        )
+        now = advance(rules, before, moved, all_running)
         # The memory of ended rows: put aside when they end, or kept by a copy in every step.
         if can_read:
             memory = after.get(keys.TRAFFIC)

@@ -79,11 +79,7 @@ def done_spec(n: int) -> Composite:
     return Composite(_specs(DONE, (n, 1), torch.float32), shape=(n,))
 
 
-def _specs(
-    fields: Fields,
-    shape: tuple[int, ...],
-    dtype: torch.dtype,
-) -> dict[str, Any]:
+def _specs(fields: Fields, shape: tuple[int, ...], dtype: torch.dtype) -> dict[str, Any]:
     specs = {}
     for name, kind in fields.items():
         # TorchRL checks flags by a spec of their own.
@@ -125,13 +121,7 @@ def first_state(
     events = {name: column.to(kind) for name, kind in EVENTS.items()}
     done = {name: column.to(kind) for name, kind in DONE.items()}
     counters = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: torch.zeros_like(seed)}
-    return pack(
-        vehicles,
-        ego,
-        memory,
-        events,
-        {**counters, **done},
-    )
+    return pack(vehicles, ego, memory, events, {**counters, **done})
 
 
 def pack(
@@ -156,11 +146,7 @@ def pack(
 # Checks of what is handed in
 
 
-def check_counter(
-    name: str,
-    counter: Tensor | None,
-    rows: int,
-) -> Tensor:
+def check_counter(name: str, counter: Tensor | None, rows: int) -> Tensor:
     """``counter`` [N] int64 of a reset.
 
     Raises:
@@ -200,10 +186,7 @@ def usable_device(device: Any, dtype: Any) -> torch.device:
 
 
 def checked_action(
-    action: Tensor | None,
-    rows: int,
-    actions: ActionParameters,
-    values: bool = True,
+    action: Tensor | None, rows: int, actions: ActionParameters, values: bool = True
 ) -> Tensor:
     """``action`` [N] as int64, or [N, 2] for ``actions`` that are not numbered.
 

@@ -88,11 +88,7 @@ def pair_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     return hit & ~itself
 
 
-def _hits(
-    dx: Tensor,
-    one: Vehicles,
-    other: Vehicles,
-) -> Tensor:
+def _hits(dx: Tensor, one: Vehicles, other: Vehicles) -> Tensor:
     """Whether the boxes of ``other``, ``dx`` m ahead of ``one``, overlap its box."""
     return boxes_overlap(
         dx,

@@ -153,11 +153,7 @@ class Command(NamedTuple):
     off_road: Tensor
 
 
-def is_heard(
-    side: Tensor,
-    direction: Tensor,
-    abort: bool,
-) -> Tensor:
+def is_heard(side: Tensor, direction: Tensor, abort: bool) -> Tensor:
     """Whether a wish to go to ``side`` is obeyed during a lane change in ``direction`` (each -1, 0
     or 1).
 
@@ -167,11 +163,7 @@ def is_heard(
     return idle | (side == -direction) if abort else idle
 
 
-def stays_on_road(
-    vehicles: Vehicles,
-    side: Tensor,
-    road: Road,
-) -> Tensor:
+def stays_on_road(vehicles: Vehicles, side: Tensor, road: Road) -> Tensor:
     """Whether a change to each ``side`` [N, S] (-1, 0 or 1) leaves the ego on the road, [N, S].
 
     The lane is the one beside its target lane, where the ego is.
@@ -223,24 +215,8 @@ def move_ego(
     """
     ego = vehicles.at(EGO_INDEX)
     # The kinematics know no lanes: a lane change is another line to steer to.
-    steering = steer(
-        steering,
-        ego.y,
-        ego.heading,
-        ego.speed,
-        line,
-        dt,
-        wheel,
-    )
-    pose = advance(
-        ego.x,
-        ego.y,
-        ego.heading,
-        ego.speed,
-        acceleration,
-        steering,
-        dt,
-    )
+    steering = steer(steering, ego.y, ego.heading, ego.speed, line, dt, wheel)
+    pose = advance(ego.x, ego.y, ego.heading, ego.speed, acceleration, steering, dt)
     return ego.with_(**pose._asdict()), steering
 
 
@@ -273,11 +249,7 @@ def ego_surroundings(
     )
 
 
-def change_progress(
-    ego: Vehicles,
-    direction: Tensor,
-    road: Road,
-) -> Tensor:
+def change_progress(ego: Vehicles, direction: Tensor, road: Road) -> Tensor:
     """Progress [N] of the current lane change, 0 at its start to 1 at the target lane's centre.
 
     0 without one.

@@ -86,12 +86,7 @@ def _room(vehicles: Vehicles, comes: Tensor, road: Road, idm: IdmParameters) -> 
 
 
 def let_in_and_out(
-    vehicles: Vehicles,
-    road: Road,
-    idm: IdmParameters,
-    key: Tensor,
-    step: Tensor,
-    period_s: float,
+    vehicles: Vehicles, road: Road, idm: IdmParameters, key: Tensor, step: Tensor, period_s: float
 ) -> Vehicles:
     """``vehicles`` after some have left and others have entered.
 

@@ -85,12 +85,7 @@ def idm_acceleration(
     # The exponent 4 of the free-road term, without a power.
     ratio = speed / desired_speed
     square = ratio * ratio
-    wanted = desired_gap(
-        speed,
-        speed - leader_speed,
-        parameters,
-        headway_s,
-    )
+    wanted = desired_gap(speed, speed - leader_speed, parameters, headway_s)
     interaction = wanted / gap.clamp_min(SMALLEST_GAP_M)
     acceleration = parameters.max_acceleration * (1.0 - square * square - interaction * interaction)
     # Where they overlap the interaction term is huge: the bound makes it the hardest braking.
@@ -118,12 +113,7 @@ def acceleration_behind(
     desired = scene.observers.desired_speed[..., None]
     headway_s = headway_s[..., None] if isinstance(headway_s, Tensor) else headway_s
     return idm_acceleration(
-        speed,
-        desired,
-        ahead.gap,
-        ahead.speed,
-        parameters.per_lane(),
-        headway_s,
+        speed, desired, ahead.gap, ahead.speed, parameters.per_lane(), headway_s
     )
 
 
@@ -137,13 +127,7 @@ def following_acceleration(
     """
     lanes = spanned(scene.attention)
     ahead = leader(scene, lanes)
-    return acceleration_in(
-        scene,
-        lanes,
-        ahead,
-        parameters,
-        headway_s,
-    )
+    return acceleration_in(scene, lanes, ahead, parameters, headway_s)
 
 
 def acceleration_in(
@@ -188,11 +172,7 @@ def acceleration_before_wall(
 HORIZON_S = 60.0
 
 
-def needed_deceleration(
-    speed: Tensor,
-    leader_speed: Tensor,
-    gap: Tensor,
-) -> Tensor:
+def needed_deceleration(speed: Tensor, leader_speed: Tensor, gap: Tensor) -> Tensor:
     """Constant deceleration, m/s2, that avoids a leader of constant speed ``gap`` m ahead.
 
     Infinite at 0 m.
@@ -219,13 +199,7 @@ def _survives(
     smallest = start = gap
     # Trapezoids, as vehicles move in the simulation (dynamics.advance).
     for _ in range(round(HORIZON_S / PHYSICS_STEP_S)):
-        acceleration = idm_acceleration(
-            speed,
-            desired_speed,
-            gap,
-            leader_now,
-            idm,
-        )
+        acceleration = idm_acceleration(speed, desired_speed, gap, leader_now, idm)
         next_speed = (speed + acceleration * PHYSICS_STEP_S).clamp_min(0.0)
         next_leader = (leader_now + idm.min_acceleration * PHYSICS_STEP_S).clamp_min(0.0)
         gap = gap + 0.5 * PHYSICS_STEP_S * (leader_now + next_leader - speed - next_speed)

@@ -40,11 +40,7 @@ from ganlane.torch_settings import constant
 OfLanes = tuple[float, ...] | Tensor
 
 
-def of_lane(
-    numbers: OfLanes,
-    lane: Tensor,
-    like: Tensor,
-) -> Tensor:
+def of_lane(numbers: OfLanes, lane: Tensor, like: Tensor) -> Tensor:
     """The number of each ``lane``, in the type of ``like``; beyond the road, of the nearest one.
 
     Where every row has its own numbers, the first dimension of ``lane`` is that of the rows.
@@ -85,11 +81,7 @@ def on_road(road: Road, lane: Tensor) -> Tensor:
     return (lane >= 0) & (lane < lanes)
 
 
-def exists(
-    road: Road,
-    lane: Tensor,
-    x: Tensor,
-) -> Tensor:
+def exists(road: Road, lane: Tensor, x: Tensor) -> Tensor:
     """Whether the road has the ``lane`` at ``x``, m; bool."""
     inside = on_road(road, lane)
     if not road.has_lane_ends:
@@ -99,12 +91,7 @@ def exists(
     return inside & (begin <= x) & (x < end)
 
 
-def may_change(
-    road: Road,
-    lane: Tensor,
-    side: Tensor,
-    x: Tensor,
-) -> Tensor:
+def may_change(road: Road, lane: Tensor, side: Tensor, x: Tensor) -> Tensor:
     """Whether one may go from ``lane`` to the one at its ``side`` (1 left, -1 right, 0 none).
 
     Both have to exist at ``x``, m; keeping the lane is always possible. Bool.
@@ -115,12 +102,7 @@ def may_change(
     return (side == 0) | (there & exists(road, lane, x))
 
 
-def leaves_road(
-    road: Road,
-    y: Tensor,
-    new_y: Tensor,
-    x: Tensor,
-) -> Tensor:
+def leaves_road(road: Road, y: Tensor, new_y: Tensor, x: Tensor) -> Tensor:
     """Whether a body at ``x`` that moves from ``y`` to ``new_y`` has crossed a line beside which
     there is no lane to change into; m, [N, 1], bool.
     """
@@ -129,11 +111,7 @@ def leaves_road(
     return (side != 0) & ~may_change(road, lane, side, x)
 
 
-def room_before_wall(
-    vehicles: Vehicles,
-    lanes: Tensor,
-    road: Road,
-) -> Tensor:
+def room_before_wall(vehicles: Vehicles, lanes: Tensor, road: Road) -> Tensor:
     """From the front bumper of each vehicle [N, K] to the wall of ``lanes`` [N, K, L], m.
 
     Below 0 behind it.
@@ -281,10 +259,7 @@ def ways_out(vehicles: Vehicles, road: Road, reach_m: float) -> WaysOut:
 
 
 def stopping_room(
-    vehicles: Vehicles,
-    lanes: Tensor,
-    road: Road,
-    keeps: Tensor,
+    vehicles: Vehicles, lanes: Tensor, road: Road, keeps: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Room in which each driver [N, K] has to stop in ``lanes`` [N, K, L], m; whether it has to.
 

@@ -58,11 +58,7 @@ class LaneAccelerations(NamedTuple):
         return LaneAccelerations(*(number[..., lanes] for number in self))
 
 
-def lane_accelerations(
-    scene: Scene,
-    lanes: Tensor,
-    idm: AnyIdm,
-) -> LaneAccelerations:
+def lane_accelerations(scene: Scene, lanes: Tensor, idm: AnyIdm) -> LaneAccelerations:
     """The :class:`LaneAccelerations` of each observer in ``lanes`` [N, K, L] (float).
 
     With per-driver parameters, each driver predicts the others with its own parameters.
@@ -73,22 +69,12 @@ def lane_accelerations(
     length = scene.observers.length[..., None]
     # The new follower with the observer in front of it ...
     driver = (behind.speed, behind.desired_speed)
-    with_it = idm_acceleration(
-        *driver,
-        behind.gap,
-        speed,
-        idm.per_lane(),
-    )
+    with_it = idm_acceleration(*driver, behind.gap, speed, idm.per_lane())
     # Without the observer its follower is behind its leader, or alone.
     free = ahead.gap >= FREE_GAP_M
     leader_speed = torch.where(free, behind.speed, ahead.speed)
     gap = torch.where(free, FREE_GAP_M, behind.gap + length + ahead.gap)
-    without = idm_acceleration(
-        *driver,
-        gap,
-        leader_speed,
-        idm.per_lane(),
-    )
+    without = idm_acceleration(*driver, gap, leader_speed, idm.per_lane())
     # Nobody behind: nobody is hindered or relieved.
     nobody = ~behind.exists
     observer = acceleration_behind(scene, ahead, idm)
@@ -97,9 +83,7 @@ def lane_accelerations(
         keeps = torch.ones_like(lanes, dtype=torch.bool)
         observer = torch.minimum(observer, acceleration_before_wall(scene, lanes, keeps, idm))
     return LaneAccelerations(
-        observer,
-        with_it.masked_fill(nobody, 0.0),
-        without.masked_fill(nobody, 0.0),
+        observer, with_it.masked_fill(nobody, 0.0), without.masked_fill(nobody, 0.0)
     )
 
 
@@ -180,23 +164,13 @@ def _gives_way(
     speed = vehicles.speed[:, :, None]
     desired = vehicles.desired_speed[:, :, None]
     leader_speed = vehicles.speed[:, None, :]
-    demand = idm_acceleration(
-        speed,
-        desired,
-        pairs.ahead,
-        leader_speed,
-        idm.per_lane(),
-    )
+    demand = idm_acceleration(speed, desired, pairs.ahead, leader_speed, idm.per_lane())
     near = (pairs.distance < mobil.exclusive_m) | (demand < -mobil.safe_deceleration)
     return (same & near & (pairs.order > 0)).any(-1)
 
 
 def mandatory(
-    scene: Scene,
-    lanes: Tensor,
-    mobil: AnyMobil,
-    goal: int | None,
-    exits: Tensor | None = None,
+    scene: Scene, lanes: Tensor, mobil: AnyMobil, goal: int | None, exits: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """What the ends of lanes add to the incentives of changes into ``lanes`` [N, K, L], m/s2, and
     whether the changes are possible, bool.
@@ -205,15 +179,7 @@ def mandatory(
     urgently. ``goal`` and ``exits`` as of :func:`ganlane.sim.lane_ends.bias`.
     """
     x = scene.observers.x
-    leave = bias(
-        scene.road,
-        lanes,
-        x,
-        goal,
-        mobil.mandatory_bias,
-        mobil.mandatory_m,
-        exits,
-    )
+    leave = bias(scene.road, lanes, x, goal, mobil.mandatory_bias, mobil.mandatory_m, exits)
     here = leave[..., :1]
     there = leave[..., 1:]
     gain = torch.where(here > there, here, 0.0)
@@ -354,8 +320,5 @@ def mobil_changes(
     """
     exits = exiting(road, scene.observers.target_lane)
     return one_at_a_time(
-        scene,
-        without_ego(mobil_wishes(scene, road, idm, mobil, exits=exits)),
-        idm,
-        mobil,
+        scene, without_ego(mobil_wishes(scene, road, idm, mobil, exits=exits)), idm, mobil
     )

@@ -83,23 +83,14 @@ def absorb(key: Tensor, field: Tensor | int) -> Tensor:
     return _mix((key ^ field) + _GOLDEN)
 
 
-def episode_key(
-    stream: int,
-    seed: Tensor,
-    episode: Tensor,
-) -> Tensor:
+def episode_key(stream: int, seed: Tensor, episode: Tensor) -> Tensor:
     """Key of an episode, [N] int64, from the stream and the counters [N] int64."""
     # The 0 after the stream stays: without it all episodes so far would change.
     start = torch.full_like(seed, int(stream))
     return absorb(absorb(absorb(start, 0), seed), episode)
 
 
-def draw_keys(
-    key: Tensor,
-    step: Tensor | int,
-    vehicles: int,
-    purposes: list[int],
-) -> Tensor:
+def draw_keys(key: Tensor, step: Tensor | int, vehicles: int, purposes: list[int]) -> Tensor:
     """Keys [N, vehicles, len(purposes)] from episode keys [N] and physics steps [N] or one int."""
     # Field by field, from what all share to what is one number's own.
     at_step = absorb(key, step)
@@ -137,12 +128,7 @@ def normal(
 
     Independent of :func:`uniform` at the same place.
     """
-    keys = draw_keys(
-        key,
-        step,
-        vehicles,
-        purposes,
-    )
+    keys = draw_keys(key, step, vehicles, purposes)
     # 1 - u lies in (0, 1], so the logarithm is finite; a second key per number for the angle.
     radius = torch.sqrt(-2.0 * torch.log(1.0 - to_uniform(absorb(keys, 1), dtype)))
     return radius * torch.cos(2.0 * math.pi * to_uniform(absorb(keys, 2), dtype))

@@ -23,21 +23,13 @@ STALLED_MPS = 0.001
 ASKEW_M = 0.6
 
 
-def stalled(
-    x_m: float,
-    lane: int,
-    lane_width_m: float,
-) -> SceneVehicle:
+def stalled(x_m: float, lane: int, lane_width_m: float) -> SceneVehicle:
     """A vehicle that has broken down in ``lane``."""
     return SceneVehicle(x_m, y_m=lane * lane_width_m - ASKEW_M, desired_speed_mps=STALLED_MPS)
 
 
 def cut_in(
-    gap_m: float,
-    speed_mps: float,
-    cutter_speed_mps: float,
-    lanes: int,
-    desired_speed_mps: float,
+    gap_m: float, speed_mps: float, cutter_speed_mps: float, lanes: int, desired_speed_mps: float
 ) -> tuple[SceneVehicle, ...]:
     """A slower vehicle one lane to the left, ``gap_m`` ahead of the ego's bumper, moves into its
     lane at once.
@@ -50,11 +42,7 @@ def cut_in(
     # Next to the leftmost, from which the other vehicle comes.
     lane = lanes - 2  # the ego's
     cutter = SceneVehicle(
-        gap_m + LENGTH_M,
-        lane + 1,
-        cutter_speed_mps,
-        cutter_speed_mps,
-        target_lane=lane,
+        gap_m + LENGTH_M, lane + 1, cutter_speed_mps, cutter_speed_mps, target_lane=lane
     )
     cars = [
         SceneVehicle(0.0, lane, speed_mps, desired_speed_mps),
@@ -82,18 +70,7 @@ def stalled_car(
     A vehicle follows the ego, and five vehicles ``spacing_m`` apart pass in the next lane, if there
     is one.
     """
-    beside = (
-        ()
-        if lanes == 1
-        else _column(
-            1,
-            5,
-            0.5 * spacing_m,
-            spacing_m,
-            speed_mps,
-            22.0,
-        )
-    )
+    beside = () if lanes == 1 else _column(1, 5, 0.5 * spacing_m, spacing_m, speed_mps, 22.0)
     return (
         SceneVehicle(0.0, 0, speed_mps, desired_speed_mps),
         stalled(distance_m, 0, lane_width_m),
@@ -181,11 +158,7 @@ def stop_and_go(
 
 
 def merge(
-    ego_speed_mps: float,
-    speed_mps: float,
-    spacing_m: float,
-    lanes: int,
-    desired_speed_mps: float,
+    ego_speed_mps: float, speed_mps: float, spacing_m: float, lanes: int, desired_speed_mps: float
 ) -> tuple[SceneVehicle, ...]:
     """The ego alone on the rightmost lane, an on-ramp; ten vehicles ``spacing_m`` apart in each of
     the others, a third of them ahead of it.
@@ -214,10 +187,7 @@ def on_ramp(
 
 
 def lane_drop(
-    speed_mps: float,
-    spacing_m: float,
-    lanes: int,
-    desired_speed_mps: float,
+    speed_mps: float, spacing_m: float, lanes: int, desired_speed_mps: float
 ) -> tuple[SceneVehicle, ...]:
     """The ego in the leftmost lane, which ends; seven vehicles ``spacing_m`` apart in every other
     lane, and six in its own.
@@ -228,11 +198,7 @@ def lane_drop(
 
 
 def exit(
-    speed_mps: float,
-    faster_mps: float,
-    spacing_m: float,
-    lanes: int,
-    desired_speed_mps: float,
+    speed_mps: float, faster_mps: float, spacing_m: float, lanes: int, desired_speed_mps: float
 ) -> tuple[SceneVehicle, ...]:
     """The ego in the leftmost lane; eight vehicles ``spacing_m`` apart in every other lane and
     seven in its own, but none in the rightmost, the exit lane.
@@ -246,20 +212,11 @@ def exit(
 
 
 def _stream(
-    lane: int,
-    vehicles: int,
-    first_m: float,
-    spacing_m: float,
-    speed_mps: float,
+    lane: int, vehicles: int, first_m: float, spacing_m: float, speed_mps: float
 ) -> tuple[SceneVehicle, ...]:
     """As :func:`_column`, of drivers that would like to be as fast, 10 % or 20 % faster."""
     return tuple(
-        SceneVehicle(
-            first_m - spacing_m * k,
-            lane,
-            speed_mps,
-            speed_mps * (1.0 + 0.1 * (k % 3)),
-        )
+        SceneVehicle(first_m - spacing_m * k, lane, speed_mps, speed_mps * (1.0 + 0.1 * (k % 3)))
         for k in range(vehicles)
     )
 
@@ -289,11 +246,7 @@ def _around(
     return tuple(cars)
 
 
-def _at_least(
-    lanes: int,
-    needed: int,
-    name: str,
-) -> None:
+def _at_least(lanes: int, needed: int, name: str) -> None:
     if lanes < needed:
         raise UserError(
             f"env.lanes={lanes}: env={name} needs {needed} lanes or more; give env.lanes={needed}."

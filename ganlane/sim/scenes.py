@@ -174,17 +174,7 @@ class FixedScene:
         if self.jitter_m == 0 and self.jitter_mps == 0:
             return whole
         # From [0, 1) to [-1, 1).
-        u = (
-            2.0
-            * uniform(
-                key,
-                0,
-                m,
-                [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED],
-                dtype,
-            )
-            - 1.0
-        )
+        u = 2.0 * uniform(key, 0, m, [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED], dtype) - 1.0
         # Only the others are shifted: the ego stays at x = 0.
         is_ego = torch.arange(m, device=key.device) == 0
         x = torch.where(is_ego, whole.x, whole.x + self.jitter_m * u[..., 0])
@@ -408,23 +398,8 @@ def _first_overlap(scene: FixedScene, idm: IdmParameters) -> tuple[int, int, flo
     for step in range(1, round(DRIVE_S / PHYSICS_STEP_S) + 1):
         # Everybody follows and steers to its target lane; nobody decides anything.
         acceleration = following_acceleration(perceive(v, scene.road), idm)
-        steering = steer(
-            steering,
-            v.y,
-            v.heading,
-            v.speed,
-            centre,
-            PHYSICS_STEP_S,
-        )
-        pose = advance(
-            v.x,
-            v.y,
-            v.heading,
-            v.speed,
-            acceleration,
-            steering,
-            PHYSICS_STEP_S,
-        )
+        steering = steer(steering, v.y, v.heading, v.speed, centre, PHYSICS_STEP_S)
+        pose = advance(v.x, v.y, v.heading, v.speed, acceleration, steering, PHYSICS_STEP_S)
         v = v.with_(**pose._asdict())
         hits = pair_overlaps(v, scene.road)
         if bool(hits.any()):

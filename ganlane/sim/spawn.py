@@ -58,12 +58,7 @@ def check_start(
     for field, speed, leader, desired in p.worst_followers() if vehicles > 1 else ():
         if not can_brake(gap, speed, leader, desired, idm):
             spacing = p.length_m + least_gap(speed, leader, desired, idm)
-            slower = highest_speed(
-                gap,
-                leader,
-                desired,
-                idm,
-            )
+            slower = highest_speed(gap, leader, desired, idm)
             raise ParameterError(
                 f"{{min_spacing_m}}={p.min_spacing_m:g} is too little for {{{field}}} up to "
                 f"{speed:g} m/s: a gap of {gap:g} m is too short to avoid a leader of {leader:g} "
@@ -83,12 +78,7 @@ def _rank(value: Tensor, same: Tensor | None = None) -> Tensor:
     return (before if same is None else before & same).sum(-1)
 
 
-def draw_lanes(
-    key: Tensor,
-    vehicles: int,
-    lanes: int,
-    capacity: int,
-) -> Tensor:
+def draw_lanes(key: Tensor, vehicles: int, lanes: int, capacity: int) -> Tensor:
     """A random lane for each vehicle, [N, vehicles] int64, at most ``capacity`` in each.
 
     All places of all lanes are shuffled and the first ``vehicles`` of them taken.
@@ -98,12 +88,7 @@ def draw_lanes(
     return places.argsort(dim=1, stable=True)[:, :vehicles] // capacity
 
 
-def place_in_lanes(
-    lane: Tensor,
-    u: Tensor,
-    spread_m: float,
-    spacing_m: float,
-) -> Tensor:
+def place_in_lanes(lane: Tensor, u: Tensor, spread_m: float, spacing_m: float) -> Tensor:
     """Positions in m, [N, M].
 
     In a lane of k sorted uniforms on [0, spread - spacing (k - 1)] plus spacing * rank.
@@ -152,25 +137,9 @@ def spawn(
         Purpose.SPAWN_DESIRED_SPEED,
         Purpose.SPAWN_TRUCK,
     ]
-    u = uniform(
-        key,
-        0,
-        vehicles,
-        [int(purpose) for purpose in drawn],
-        dtype,
-    )
-    lane = draw_lanes(
-        key,
-        vehicles,
-        lanes,
-        p.lane_capacity(),
-    )
-    x = place_in_lanes(
-        lane,
-        u[..., 0],
-        p.spread_m,
-        p.spacing_m,
-    )
+    u = uniform(key, 0, vehicles, [int(purpose) for purpose in drawn], dtype)
+    lane = draw_lanes(key, vehicles, lanes, p.lane_capacity())
+    x = place_in_lanes(lane, u[..., 0], p.spread_m, p.spacing_m)
     x, lane = ego_first(x, lane)
     is_ego = torch.arange(vehicles, device=key.device) == 0
     # In Table II who is ahead of the ego is slower than who is behind it.
@@ -223,12 +192,7 @@ class RandomScenes:
                 f"scenes: laid out on {_described(self.road)}, the traffic drives on "
                 f"{_described(road)}; give both the same road."
             )
-        check_start(
-            p,
-            self.vehicles,
-            road.lanes,
-            idm,
-        )
+        check_start(p, self.vehicles, road.lanes, idm)
         if lane_width_m <= p.widest_m:
             wide = "width_m" if p.width_m == p.widest_m else "truck_width_m"
             raise UserError(
@@ -253,14 +217,7 @@ class RandomScenes:
         """One random scene per key."""
         road = (int(self.road.lanes), float(self.road.lane_width_m))
         visibility = (self.ego_visibility, self.others_visibility)
-        return spawn(
-            key,
-            self.vehicles,
-            *road,
-            self.parameters,
-            dtype,
-            *visibility,
-        )
+        return spawn(key, self.vehicles, *road, self.parameters, dtype, *visibility)
 
 
 def _described(road: Road) -> str:
@@ -271,21 +228,13 @@ def _described(road: Road) -> str:
 # Recycling
 
 
-def out_of_range(
-    vehicles: Vehicles,
-    road: Road,
-    range_m: float = RANGE_M,
-) -> Tensor:
+def out_of_range(vehicles: Vehicles, road: Road, range_m: float = RANGE_M) -> Tensor:
     """Whether a vehicle is more than ``range_m`` ahead of the ego or behind it, bool [N, M]."""
     distance = road.distance_ahead(vehicles.x[:, EGO_INDEX, None], vehicles.x)
     return (distance.abs() > range_m) & vehicles.valid
 
 
-def _room(
-    there: Scene,
-    idm: IdmParameters,
-    safe: float,
-) -> Tensor:
+def _room(there: Scene, idm: IdmParameters, safe: float) -> Tensor:
     """Whether each of the first M vehicles asks nobody for more than ``safe`` m/s2, bool [N, M].
 
     ``there`` holds 2 M vehicles: all at their new positions, then all at their current ones. So the
@@ -308,20 +257,8 @@ def _room(
     desired = one.desired_speed[..., None]
     its_speed = other.speed[:, None, :]
     its_desired = other.desired_speed[:, None, :]
-    behind = idm_acceleration(
-        speed,
-        desired,
-        pairs.ahead,
-        its_speed,
-        idm,
-    )
-    before = idm_acceleration(
-        its_speed,
-        its_desired,
-        pairs.behind,
-        speed,
-        idm,
-    )
+    behind = idm_acceleration(speed, desired, pairs.ahead, its_speed, idm)
+    before = idm_acceleration(its_speed, its_desired, pairs.behind, speed, idm)
     asked = torch.where(pairs.order > 0, behind, before)
     return (~counts | (asked >= -safe)).all(-1)
 

@@ -277,12 +277,7 @@ def with_target(lanes: LaneRange, vehicles: Vehicles) -> LaneRange:
     return LaneRange(torch.minimum(lanes.low, target), torch.maximum(lanes.high, target))
 
 
-def presence(
-    vehicles: Vehicles,
-    road: Road,
-    body: LaneRange,
-    attention: LaneRange,
-) -> LaneRange:
+def presence(vehicles: Vehicles, road: Road, body: LaneRange, attention: LaneRange) -> LaneRange:
     """Lanes in which others see each vehicle, by its visibility.
 
     An empty range for invalid vehicles.

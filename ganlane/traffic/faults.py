@@ -83,10 +83,7 @@ class Fault(Overlay, Generic[Faults]):
     purpose: Purpose
 
     def __init__(
-        self,
-        road: Road | None = None,
-        stream: int = Stream.TRAIN,
-        faults: Faults | None = None,
+        self, road: Road | None = None, stream: int = Stream.TRAIN, faults: Faults | None = None
     ) -> None:
         super().__init__(road, stream)
         self.faults: Faults = faults or self.kind()

@@ -40,14 +40,7 @@ from ganlane.sim.mobil import TABLE_IV, yielding
 from ganlane.sim.neighbours import Scene
 from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.random import Purpose, normal
-from ganlane.sim.state import (
-    Road,
-    Vehicles,
-    body_lanes,
-    reads_are_cheap,
-    spanned,
-    with_target,
-)
+from ganlane.sim.state import Road, Vehicles, body_lanes, reads_are_cheap, spanned, with_target
 from ganlane.traffic.base import Memory, Moved, TrafficModule, in_dtype, uniforms
 
 #: Ahead and behind of who leaves a lane that ends, m: who makes room leaves as much at least.

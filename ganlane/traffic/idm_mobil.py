@@ -176,10 +176,7 @@ class DriverParams(NamedTuple):
 
 
 def start_braking(
-    vehicles: Vehicles,
-    road: Road,
-    reaction_s: Tensor,
-    min_gap_m: float = TABLE_V.min_gap_m,
+    vehicles: Vehicles, road: Road, reaction_s: Tensor, min_gap_m: float = TABLE_V.min_gap_m
 ) -> Tensor:
     """Deceleration (m/s2, [N, M]) with which each driver stays behind all ahead in its lane.
 

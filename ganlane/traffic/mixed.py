@@ -146,9 +146,7 @@ class MixedTraffic(TrafficParts):
             of_episode = scene.visibility == VISIBILITY_OF_EPISODE
             visibility = torch.where(of_episode, int(part.visibility), scene.visibility)
             entered, memory = part.enter(
-                scene.with_(visibility=visibility),
-                key[rows],
-                episode[rows],
+                scene.with_(visibility=visibility), key[rows], episode[rows]
             )
             together = with_rows(together, rows, entered.as_dict())
             memories.set(name, with_rows(memories.get(name), rows, memory))

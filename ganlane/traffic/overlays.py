@@ -207,11 +207,7 @@ class CalibratedLaneChange(Overlay):
 
 
 def _accelerated(
-    vehicles: Vehicles,
-    moved: Vehicles,
-    who: Tensor,
-    acceleration: Tensor,
-    dt: float,
+    vehicles: Vehicles, moved: Vehicles, who: Tensor, acceleration: Tensor, dt: float
 ) -> Vehicles:
     """``moved``, where ``who`` [N, M] drives along the road at ``acceleration``, m/s2."""
     speed = (vehicles.speed + acceleration * dt).clamp_min(0.0)

@@ -109,8 +109,7 @@ def _starts(samples: pl.DataFrame, least: int) -> tuple[pl.DataFrame, Tensor]:
     there = (
         samples.with_columns(stays=stays, off_middle=(x - middle).abs())
         .with_columns(
-            ego=nearest.over(moment),
-            steps=pl.col("frame").max().over("scene") - pl.col("frame"),
+            ego=nearest.over(moment), steps=pl.col("frame").max().over("scene") - pl.col("frame")
         )
         .filter(pl.col("stays").any().over(moment))
     )

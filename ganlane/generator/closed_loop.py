@@ -40,7 +40,7 @@ from ganlane.settings.generated import (
     AnchorParameters,
 )
 from ganlane.settings.generator import CalibratedConfig
-from ganlane.sim.idm import TABLE_V, following_acceleration
+from ganlane.sim.idm import TABLE_V, following_acceleration, with_headways
 from ganlane.sim.neighbours import FREE_GAP_M, Scene, leader, perceive
 from ganlane.sim.state import ENTRY_M, Road, Vehicles, Visibility
 from ganlane.torch_settings import constant
@@ -250,7 +250,7 @@ def anchored_step(
 
     # The anchor: IDM along the road; a spring and a damper to the target lane's centre across it.
     scene = perceive(vehicles, road)
-    anchor_x = following_acceleration(scene, p.idm, memory.headway)
+    anchor_x = following_acceleration(scene, with_headways(p.idm, memory.headway))
     if bound is not None:
         anchor_x = torch.minimum(anchor_x, bound(scene))
     offset = road.centre_of(vehicles.target_lane, vehicles.y.dtype) - vehicles.y

@@ -37,7 +37,7 @@ from ganlane.generator.windows import (
 )
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.generator import CalibratedConfig
-from ganlane.sim.idm import TABLE_V, following_acceleration
+from ganlane.sim.idm import TABLE_V, following_acceleration, with_headways
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.state import Vehicles
 
@@ -210,7 +210,7 @@ def idm_forecast(scenes: list[Recording], horizon: int, stride: int) -> np.ndarr
 
         def move(vehicles: Vehicles, step: int) -> Vehicles:
             scene = perceive(vehicles, segments.road)
-            acceleration = following_acceleration(scene, TABLE_V, headway)
+            acceleration = following_acceleration(scene, with_headways(TABLE_V, headway))
             speed = displacement_of(vehicles)[..., 0] / PHYSICS_STEP_S
             velocity = speed + acceleration * PHYSICS_STEP_S
             return moved_by(vehicles, velocity, torch.zeros_like(velocity))

@@ -47,7 +47,7 @@ from ganlane.generator.human_samples import (
 )
 from ganlane.generator.human_tuning import Report, begins_per_decision, tune
 from ganlane.settings.generator import HumanConfig
-from ganlane.sim.idm import IdmParameters, following_acceleration
+from ganlane.sim.idm import IdmParameters, following_acceleration, with_headways
 from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.state import Road
 
@@ -321,7 +321,7 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
         target_lane=target,
     )
     idm = IdmParameters(comfortable_deceleration=2.0, min_acceleration=-8.0, max_acceleration=1.4)
-    wanted = following_acceleration(scene_of(vehicles, road), idm, headway)
+    wanted = following_acceleration(scene_of(vehicles, road), with_headways(idm, headway))
     before = torch.where(rand() < 0.5, 0.6 * randn(), (wanted * rand()).clamp(-6.0, 2.0))
     history = before[..., None] + 0.4 * randn(*shape, ACCELERATIONS)
     history[..., 0] = before

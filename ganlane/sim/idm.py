@@ -5,6 +5,7 @@ And whom it can save: whether a follower avoids a leader that brakes at the limi
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
@@ -19,48 +20,58 @@ from ganlane.sim.state import spanned
 
 
 class DriverIdm(NamedTuple):
-    """Per-driver IDM parameters: tensors [N, M] instead of Table V's numbers."""
+    """IDM parameters of which some are tensors [N, M], one number per driver."""
 
     min_gap_m: float
     headway_s: Tensor
-    comfortable_deceleration: Tensor
-    min_acceleration: Tensor
-    max_acceleration: Tensor
+    comfortable_deceleration: Tensor | float
+    min_acceleration: Tensor | float
+    max_acceleration: Tensor | float
 
     def per_lane(self) -> DriverIdm:
         """The parameters as [N, M, 1], to broadcast over lanes or pairs."""
-        return DriverIdm(self.min_gap_m, *(value[..., None] for value in self[1:]))
+        return DriverIdm(
+            *(number[..., None] if isinstance(number, Tensor) else number for number in self)
+        )
 
     def of(self, rows: Tensor, columns: Tensor) -> DriverIdm:
         """The parameters of some drivers: indices [R], and [R, W] in these rows."""
-        return DriverIdm(self.min_gap_m, *(value[rows].gather(1, columns) for value in self[1:]))
+        return DriverIdm(
+            *(
+                number[rows].gather(1, columns) if isinstance(number, Tensor) else number
+                for number in self
+            )
+        )
 
-    def brake_scale(self) -> Tensor:
+    def brake_scale(self) -> Tensor | float:
         """As :meth:`IdmParameters.brake_scale`."""
-        return 2.0 * torch.sqrt(self.max_acceleration * self.comfortable_deceleration)
+        product = self.max_acceleration * self.comfortable_deceleration
+        return 2.0 * (product.sqrt() if isinstance(product, Tensor) else math.sqrt(product))
 
 
 AnyIdm: TypeAlias = IdmParameters | DriverIdm
+
+
+def with_headways(idm: IdmParameters, headway_s: Tensor) -> DriverIdm:
+    """``idm`` with a time headway of each driver's own, s, [N, M]."""
+    return DriverIdm(**{**vars(idm), "headway_s": headway_s})
+
+
 TABLE_V = IdmParameters()
 #: Lower bound of the gap in the interaction term, m, which stays finite and gives the hardest
 #: braking.
 SMALLEST_GAP_M = 0.1
 
 
-def desired_gap(
-    speed: Tensor,
-    closing_speed: Tensor,
-    parameters: AnyIdm = TABLE_V,
-    headway_s: Tensor | float | None = None,
-) -> Tensor:
+def desired_gap(speed: Tensor, closing_speed: Tensor, parameters: AnyIdm = TABLE_V) -> Tensor:
     """Desired gap, m, at ``speed`` behind a leader approached at ``closing_speed``, m/s.
 
     The dynamic part is never negative, so a faster leader does not reduce the desired gap below the
     minimum.
     """
-    headway = parameters.headway_s if headway_s is None else headway_s
     # The last term is that of approaching a leader: v dv / (2 sqrt(a b)).
-    dynamic = speed * headway + speed * closing_speed / parameters.brake_scale()
+    approach = speed * closing_speed / parameters.brake_scale()
+    dynamic = speed * parameters.headway_s + approach
     return parameters.min_gap_m + dynamic.clamp_min(0.0)
 
 
@@ -70,7 +81,6 @@ def idm_acceleration(
     gap: Tensor,
     leader_speed: Tensor,
     parameters: AnyIdm = TABLE_V,
-    headway_s: Tensor | float | None = None,
 ) -> Tensor:
     """Acceleration in m/s2, within Table V's bounds; all tensors broadcast against each other.
 
@@ -80,12 +90,11 @@ def idm_acceleration(
             less (an overlap) gives the hardest braking.
         leader_speed: m/s; without a leader it only enters the (negligible) approach term.
         parameters: common to all drivers, or per driver (:class:`DriverIdm`).
-        headway_s: time headway per vehicle, s, instead of Table V's.
     """
     # The exponent 4 of the free-road term, without a power.
     ratio = speed / desired_speed
     square = ratio * ratio
-    wanted = desired_gap(speed, speed - leader_speed, parameters, headway_s)
+    wanted = desired_gap(speed, speed - leader_speed, parameters)
     interaction = wanted / gap.clamp_min(SMALLEST_GAP_M)
     acceleration = parameters.max_acceleration * (1.0 - square * square - interaction * interaction)
     # Where they overlap the interaction term is huge: the bound makes it the hardest braking.
@@ -101,59 +110,38 @@ def equilibrium_gap(
     return (parameters.min_gap_m + speed * parameters.headway_s) / torch.sqrt(1.0 - square * square)
 
 
-def acceleration_behind(
-    scene: Scene,
-    ahead: Neighbour,
-    parameters: AnyIdm = TABLE_V,
-    headway_s: Tensor | float | None = None,
-) -> Tensor:
+def acceleration_behind(scene: Scene, ahead: Neighbour, parameters: AnyIdm) -> Tensor:
     """IDM acceleration of each observer behind ``ahead`` [N, K, L] in L lanes, m/s2."""
     # [N, K, 1], to broadcast over the L lanes.
     speed = scene.observers.speed[..., None]
     desired = scene.observers.desired_speed[..., None]
-    headway_s = headway_s[..., None] if isinstance(headway_s, Tensor) else headway_s
-    return idm_acceleration(
-        speed, desired, ahead.gap, ahead.speed, parameters.per_lane(), headway_s
-    )
+    return idm_acceleration(speed, desired, ahead.gap, ahead.speed, parameters.per_lane())
 
 
-def following_acceleration(
-    scene: Scene, parameters: AnyIdm = TABLE_V, headway_s: Tensor | float | None = None
-) -> Tensor:
+def following_acceleration(scene: Scene, parameters: AnyIdm = TABLE_V) -> Tensor:
     """IDM acceleration of every observer, m/s2, [N, K].
 
     During a lane change a vehicle is in two lanes, or three; the smallest acceleration over the
     lanes is used. The wall at the end of a lane is a standing obstacle.
     """
     lanes = spanned(scene.attention)
-    ahead = leader(scene, lanes)
-    return acceleration_in(scene, lanes, ahead, parameters, headway_s)
+    return acceleration_in(scene, lanes, leader(scene, lanes), parameters)
 
 
-def acceleration_in(
-    scene: Scene,
-    lanes: Tensor,
-    ahead: Neighbour,
-    parameters: AnyIdm = TABLE_V,
-    headway_s: Tensor | float | None = None,
-) -> Tensor:
+def acceleration_in(scene: Scene, lanes: Tensor, ahead: Neighbour, parameters: AnyIdm) -> Tensor:
     """IDM acceleration of every observer, m/s2, [N, K], in all of its ``lanes`` [N, K, L]: behind
     ``ahead`` and before the lanes' walls.
     """
-    acceleration = acceleration_behind(scene, ahead, parameters, headway_s)
+    acceleration = acceleration_behind(scene, ahead, parameters)
     if scene.road.has_lane_ends:
         keeps = lanes == scene.observers.target_lane[..., None]
-        before = acceleration_before_wall(scene, lanes, keeps, parameters, headway_s)
+        before = acceleration_before_wall(scene, lanes, keeps, parameters)
         acceleration = torch.minimum(acceleration, before)
     return acceleration.amin(-1)
 
 
 def acceleration_before_wall(
-    scene: Scene,
-    lanes: Tensor,
-    keeps: Tensor,
-    parameters: AnyIdm = TABLE_V,
-    headway_s: Tensor | float | None = None,
+    scene: Scene, lanes: Tensor, keeps: Tensor, parameters: AnyIdm
 ) -> Tensor:
     """IDM acceleration of each observer before the walls of ``lanes`` [N, K, L], m/s2.
 
@@ -162,7 +150,7 @@ def acceleration_before_wall(
     """
     room, has_wall = stopping_room(scene.observers, lanes, scene.road, keeps)
     standing = Neighbour(room, torch.zeros_like(room))
-    acceleration = acceleration_behind(scene, standing, parameters, headway_s)
+    acceleration = acceleration_behind(scene, standing, parameters)
     return torch.where(has_wall, acceleration, torch.inf)
 
 

@@ -285,7 +285,7 @@ class MobilDriver(Driver):
         road = road_in(tensordict, self.road)
         # -1 right, 0 stay, 1 left, of the ego alone
         scene = ego_scene(vehicles, road)
-        wish = mobil_wishes(scene, road, self.idm, self.mobil, road.exit_lane)[:, 0]
+        wish = mobil_wishes(scene, self.idm, self.mobil)[:, 0]
         # MOBIL decides once a second; the decisions of the ego may come more often.
         step = tensordict.get(keys.STEP)
         decisions = tensordict.get(keys.EGO).get("decisions")

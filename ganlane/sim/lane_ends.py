@@ -148,21 +148,19 @@ def bias(
     road: Road,
     lanes: Tensor,
     x: Tensor,
-    goal: int | None,
     strongest: float,
     reach_m: float,
-    exits: Tensor | None = None,
 ) -> Tensor:
     """How much a driver at ``x`` [N, K], m, wants to leave each of ``lanes`` [N, K, L], m/s2.
 
+    The first driver is the ego; some want to reach the exit lane (:func:`exiting`).
+
     Args:
-        goal: the exit lane that the drivers want to reach; None: they stay on the road.
         strongest: at the end, m/s2.
         reach_m: distance from the end at which it begins, m per lane change.
-        exits: drivers [N, K] or [K] who want to reach the exit lane, whatever the goal; None:
-            nobody.
     """
-    urgency = _urgency(road, lanes, x, goal, reach_m)
+    urgency = _urgency(road, lanes, x, None, reach_m)
+    exits = exiting(road, lanes[..., 0])
     if exits is not None:
         to_exit = _urgency(road, lanes, x, road.exit_lane, reach_m)
         urgency = torch.where(exits[..., None], to_exit, urgency)
@@ -245,7 +243,7 @@ def ways_out(vehicles: Vehicles, road: Road, reach_m: float) -> WaysOut:
     lane = vehicles.target_lane
     sides = constant((0, 1, -1), lane)
     lanes = lane[..., None] + sides
-    urgency = bias(road, lanes, vehicles.x, None, 1.0, reach_m, exiting(road, lane))
+    urgency = bias(road, lanes, vehicles.x, 1.0, reach_m)
     here = urgency[..., :1]
     possible = may_change(road, lane[..., None], sides, vehicles.x[..., None])[..., 1:]
     possible = possible & (here >= urgency[..., 1:])

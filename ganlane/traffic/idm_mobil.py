@@ -15,7 +15,7 @@ from ganlane.settings.driving import IdmParameters, MobilParameters, RandomDrive
 from ganlane.settings.record import Range
 from ganlane.sim.dynamics import STEERING, SteeringParameters, advance, steer
 from ganlane.sim.idm import TABLE_V, AnyIdm, DriverIdm, following_acceleration, needed_deceleration
-from ganlane.sim.mobil import TABLE_IV, DriverMobil, mobil_changes, yielding
+from ganlane.sim.mobil import TABLE_IV, mobil_changes, yielding
 from ganlane.sim.neighbours import Scene, in_lane, perceive
 from ganlane.sim.random import Purpose, Stream, absorb
 from ganlane.sim.state import Road, Vehicles, reads_are_cheap
@@ -131,7 +131,7 @@ class IdmMobilTraffic(IdmTraffic):
 
     def changes(self, scene: Scene, memory: Memory) -> Tensor:
         """The side that each driver changes to, -1, 0 or 1, [N, M]."""
-        return mobil_changes(scene, self.road, self.idm, self.mobil)
+        return mobil_changes(scene, self.idm, self.mobil)
 
 
 class DriverParams(NamedTuple):
@@ -288,22 +288,12 @@ class IdmRandomTraffic(IdmMobilTraffic):
 
     def changes(self, scene: Scene, memory: Memory) -> Tensor:
         """As :class:`IdmMobilTraffic`, with each driver's parameters."""
-        m = self.mobil
         drivers = DriverParams.of(memory)
-        # [N, M, 1]: one weight for both sides that a driver looks at.
-        politeness = drivers.politeness[..., None]
-        mobil = DriverMobil(
-            m.threshold,
-            politeness * m.politeness_rear,
-            politeness * m.politeness_side,
-            m.safe_deceleration,
-            m.exclusive_m,
-            m.mandatory_bias,
-            m.mandatory_m,
-        )
         # Predictions are not limited by what this driver would brake itself.
         braking = torch.full_like(drivers.headway, -self.idm.min_acceleration)
-        return mobil_changes(scene, self.road, drivers.idm(self.idm.min_gap_m, braking), mobil)
+        idm = drivers.idm(self.idm.min_gap_m, braking)
+        # [N, M, 1]: one weight for both sides that a driver looks at.
+        return mobil_changes(scene, idm, self.mobil, drivers.politeness[..., None])
 
     def drive(self, scene: Scene, target: Tensor, memory: Memory, step: Tensor) -> Moved:
         """The vehicles at t + 0.1 s, with each driver's delay and sway."""

@@ -59,7 +59,7 @@ FACTS = {
     "sides to which lanes are left": lambda cars, road: ways_out(cars, road, 500.0).side[:, 1:],
     "urgency": lambda cars, road: ways_out(cars, road, 500.0).urgency[:, 1:],
     "accelerations": lambda cars, road: following_acceleration(perceive(cars, road)),
-    "wishes of MOBIL": lambda cars, road: mobil_wishes(perceive(cars, road), road),
+    "wishes of MOBIL": lambda cars, road: mobil_wishes(perceive(cars, road))[:, 1:],
 }
 
 

@@ -43,7 +43,7 @@ FREE = 0.413272  # IDM on an empty lane
 def wish(*cars, mobil: MobilParameters = TABLE_IV) -> int:
     """Of the first car."""
     road = Road(lanes=2)
-    return mobil_wishes(perceive(vehicles(*cars), road), road, mobil=mobil)[0, 0].item()
+    return mobil_wishes(perceive(vehicles(*cars), road), mobil=mobil)[0, 0].item()
 
 
 def change_to_the_left(scene) -> tuple[float, bool]:
@@ -149,7 +149,7 @@ def new_demands(
 def test_nobody_is_asked_for_more_not_even_one_who_enters_the_same_lane_in_the_same_second(mobil):
     road = Road(lanes=3)
     scene = random_scenes(rows=6000, cars=12, lanes=3, seed=1)
-    change = mobil_changes(perceive(scene, road), road, mobil=mobil)
+    change = mobil_changes(perceive(scene, road), mobil=mobil)
     asked, leads = new_demands(scene, change, road)
     assert (asked[leads] >= -B_SAFE - 1e-9).all()
     # Not for want of cases: thousands of new followers, hundreds near the limit, and pairs in one
@@ -167,7 +167,7 @@ def test_without_a_look_at_what_they_would_ask_of_each_other_hundreds_would_be_a
     road = Road(lanes=3)
     vehicles_there = random_scenes(rows=6000, cars=12, lanes=3, seed=1)
     scene = perceive(vehicles_there, road)
-    wish = without_ego(mobil_wishes(scene, road))
+    wish = without_ego(mobil_wishes(scene))
     monkeypatch.setattr(mobil_module, "idm_acceleration", lambda speed, *_: torch.zeros_like(speed))
     change = mobil_module.one_at_a_time(scene, wish)
     asked, leads = new_demands(vehicles_there, change, road)
@@ -191,7 +191,7 @@ def test_an_ego_that_is_seen_by_its_body_alone_can_be_asked_for_more():
     road = Road(lanes=3)
     for seen, goes in ((Visibility.BODY, -1), (Visibility.SIGNALLED, 0)):
         scene = vehicles({**ego, "visibility": int(seen)}, enters, slow)
-        assert mobil_changes(perceive(scene, road), road, mobil=SELFISH)[0, 1] == goes
+        assert mobil_changes(perceive(scene, road), mobil=SELFISH)[0, 1] == goes
 
 
 # Afterwards
@@ -216,7 +216,7 @@ def merges(rows: int) -> Vehicles:
     lane = torch.tensor([0, 0, 0, 1]).expand(rows, -1)
     scene = vehicles_at(x, lane, speed=speed, desired_speed=desired)
     road = Road(lanes=2)
-    change = mobil_changes(perceive(scene, road), road, mobil=SELFISH)
+    change = mobil_changes(perceive(scene, road), mobil=SELFISH)
     scene = scene.with_(target_lane=lane + change * (torch.arange(4) == ENTERS))
     return Vehicles(*(value[change[:, ENTERS] == 1] for value in scene))
 

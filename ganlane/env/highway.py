@@ -344,6 +344,8 @@ class HighwayEnv(EnvBase):
         if self.actions.form == LANE_SPEED:
             # The desired speed itself is the same in all of an episode.
             vehicles = vehicles.with_(desired_speed=state.get(keys.VEHICLES).get("desired_speed"))
+        # Mostly nobody is out of range: without this look a decision takes 2 % longer with 64 rows, 9
+        # with 1024.
         if self.recycle and not known_false(out_of_range(vehicles, rules.road).any()):
             # In running rows with recycling those left behind are moved.
             recycled = recycle(vehicles, rules.road, rules.idm)

@@ -30,9 +30,9 @@ from ganlane.sim.dynamics import (
     Command,
     apply_action,
     change_progress,
+    drive,
     ego_scene,
     ego_surroundings,
-    move_ego,
 )
 from ganlane.sim.idm import following_acceleration
 from ganlane.sim.lane_ends import at_exit, hits_wall, leaves_road, ways_out
@@ -175,13 +175,13 @@ def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -
     the time-out. With
     ``all_running`` no row has ended, which saves the copies that keep ended rows as they are.
     """
-    ego, steering = move_ego(
-        before.vehicles,
+    ego, steering = drive(
+        before.vehicles.at(EGO_INDEX),
         before.acceleration,
         before.steering,
         before.line,
-        rules.steering,
         PHYSICS_STEP_S,
+        rules.steering,
     )
     # The others moved while they saw the ego where it was: all move at once, from one state.
     running = before.running

@@ -67,8 +67,8 @@ def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
         if len(row) == 0:
             return torch.zeros_like(both)
         if dx.numel() >= FEW:
-            ego = Vehicles(*(field[row, 0] for field in v))
-            near = Vehicles(*(field[row, column + 1] for field in v))
+            ego = v.part((row, 0))
+            near = v.part((row, column + 1))
             # Only the near pairs are tested; all others are apart.
             hits = _hits(dx[row, column], ego, near)
             return torch.zeros_like(both).index_put((row, column), hits) & both
@@ -80,8 +80,8 @@ def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
 def pair_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     """Whether vehicles i and j overlap, bool [N, M, M], false on the diagonal."""
     # [N, M, 1] against [N, 1, M]: every vehicle with every other.
-    one = Vehicles(*(field.unsqueeze(2) for field in vehicles))
-    other = Vehicles(*(field.unsqueeze(1) for field in vehicles))
+    one = vehicles.part((..., None))
+    other = vehicles.part((slice(None), None))
     hit = _hits(road.distance_ahead(one.x, other.x), one, other)
     hit = hit & other.valid & one.valid
     itself = torch.eye(vehicles.x.shape[1], dtype=torch.bool, device=vehicles.x.device)

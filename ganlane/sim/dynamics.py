@@ -131,6 +131,26 @@ def steer(
     return at_rest((steering + gain * turn * dt).clamp(-p.max_angle_rad, p.max_angle_rad))
 
 
+def drive(
+    vehicles: Vehicles,
+    acceleration: Tensor,
+    steering: Tensor,
+    line: Tensor,
+    dt: float,
+    parameters: SteeringParameters = STEERING,
+) -> tuple[Vehicles, Tensor]:
+    """The vehicles ``dt`` seconds later, and their steering angles, rad.
+
+    They accelerate with ``acceleration``, m/s2, and steer to the lines at ``line``, m. All [N] or
+    [N, M].
+    """
+    # The kinematics know no lanes: a lane change is another line to steer to.
+    pose = (vehicles.y, vehicles.heading, vehicles.speed)
+    steering = steer(steering, *pose, line, dt, parameters)
+    moved = advance(vehicles.x, *pose, acceleration, steering, dt)
+    return vehicles.with_(**moved._asdict()), steering
+
+
 # The ego: vehicle 0 of every environment
 
 
@@ -199,25 +219,6 @@ def apply_action(
 def ego_scene(vehicles: Vehicles, road: Road) -> Scene:
     """The :class:`Scene` with the ego as the only observer."""
     return perceive(vehicles, road, slice(EGO_INDEX, EGO_INDEX + 1))
-
-
-def move_ego(
-    vehicles: Vehicles,
-    acceleration: Tensor,
-    steering: Tensor,
-    line: Tensor,
-    wheel: SteeringParameters,
-    dt: float,
-) -> tuple[Vehicles, Tensor]:
-    """The ego after ``dt`` seconds (fields [N]) and its steering angle (rad, [N]).
-
-    It accelerates with ``acceleration`` (m/s2, [N]) and steers to the line at ``line`` (m, [N]).
-    """
-    ego = vehicles.at(EGO_INDEX)
-    # The kinematics know no lanes: a lane change is another line to steer to.
-    steering = steer(steering, ego.y, ego.heading, ego.speed, line, dt, wheel)
-    pose = advance(ego.x, ego.y, ego.heading, ego.speed, acceleration, steering, dt)
-    return ego.with_(**pose._asdict()), steering
 
 
 def ego_surroundings(

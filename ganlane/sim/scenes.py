@@ -20,7 +20,7 @@ from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.driving import IdmParameters, Visibility
 from ganlane.settings.road import NOTHING
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.dynamics import advance, steer
+from ganlane.sim.dynamics import drive
 from ganlane.sim.idm import following_acceleration, needed_deceleration
 from ganlane.sim.neighbours import in_lane, perceive
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
@@ -398,9 +398,7 @@ def _first_overlap(scene: FixedScene, idm: IdmParameters) -> tuple[int, int, flo
     for step in range(1, round(DRIVE_S / PHYSICS_STEP_S) + 1):
         # Everybody follows and steers to its target lane; nobody decides anything.
         acceleration = following_acceleration(perceive(v, scene.road), idm)
-        steering = steer(steering, v.y, v.heading, v.speed, centre, PHYSICS_STEP_S)
-        pose = advance(v.x, v.y, v.heading, v.speed, acceleration, steering, PHYSICS_STEP_S)
-        v = v.with_(**pose._asdict())
+        v, steering = drive(v, acceleration, steering, centre, PHYSICS_STEP_S)
         hits = pair_overlaps(v, scene.road)
         if bool(hits.any()):
             _, one, other = hits.nonzero()[0].tolist()

@@ -67,15 +67,17 @@ class Vehicles(NamedTuple):
         """The same vehicles with some fields replaced."""
         return self._replace(**changed)
 
+    def part(self, index: Any) -> Vehicles:
+        """Some of the vehicles: ``field[index]`` of every field."""
+        return Vehicles(*(field[index] for field in self))
+
     def at(self, index: int) -> Vehicles:
         """Vehicle ``index`` of every row, fields [N]."""
-        return Vehicles(*(field[:, index] for field in self))
+        return self.part((slice(None), index))
 
     def columns(self, which: slice) -> Vehicles:
         """A slice of the vehicles of every row, fields [N, K]."""
-        if which == slice(None):
-            return self
-        return Vehicles(*(field[:, which] for field in self))
+        return self if which == slice(None) else self.part((slice(None), which))
 
     def with_first(self, first: Vehicles) -> Vehicles:
         """The same rows with vehicle 0 replaced by ``first`` (fields [N])."""
@@ -233,8 +235,6 @@ class LaneRange(NamedTuple):
 
     def columns(self, which: slice) -> LaneRange:
         """The ranges of a slice of the vehicles."""
-        if which == slice(None):
-            return self
         return LaneRange(self.low[:, which], self.high[:, which])
 
 

@@ -136,7 +136,7 @@ class HumanTraffic(TrafficModule):
             return self.decide(vehicles, memory, key, step)
         if not len(rows):
             return vehicles, memory
-        part = Vehicles(*(field[rows] for field in vehicles))
+        part = vehicles.part(rows)
         its_memory = {name: value[rows] for name, value in memory.items()}
         decided, new_memory = self.decide(part, its_memory, key[rows], step[rows])
         target = vehicles.target_lane.index_copy(0, rows, decided.target_lane)

@@ -13,7 +13,7 @@ from ganlane.keys import EGO_INDEX
 from ganlane.native.drivers import RuleDrivers
 from ganlane.settings.driving import IdmParameters, MobilParameters, RandomDrivers
 from ganlane.settings.record import Range
-from ganlane.sim.dynamics import STEERING, SteeringParameters, advance, steer
+from ganlane.sim.dynamics import STEERING, SteeringParameters, drive
 from ganlane.sim.idm import TABLE_V, AnyIdm, DriverIdm, following_acceleration, needed_deceleration
 from ganlane.sim.mobil import TABLE_IV, mobil_changes, yielding
 from ganlane.sim.neighbours import Scene, in_lane, perceive
@@ -88,11 +88,10 @@ class IdmTraffic(TrafficModule):
         self, scene: Scene, acceleration: Tensor, target: Tensor, line: Tensor, memory: Memory
     ) -> Moved:
         """Steered to the lines at ``line`` (m, [N, M])."""
-        v = scene.vehicles
-        pose = (v.y, v.heading, v.speed)
-        steering = steer(memory["steering"], *pose, line, self.dt, self.steering)
-        moved = advance(v.x, *pose, acceleration, steering, self.dt)
-        return v.with_(target_lane=target, **moved._asdict()), {"steering": steering}
+        moved, steering = drive(
+            scene.vehicles, acceleration, memory["steering"], line, self.dt, self.steering
+        )
+        return moved.with_(target_lane=target), {"steering": steering}
 
 
 class IdmMobilTraffic(IdmTraffic):

@@ -141,7 +141,7 @@ class MixedTraffic(TrafficParts):
         memories = _zeros(self.memory_spec(n, m, x.dtype), n, x.device)
         for name, part, rows in self.rows_of_parts(episode):
             # A traffic sees only its own rows of the scene.
-            scene = Vehicles(*(field[rows] for field in vehicles))
+            scene = vehicles.part(rows)
             # Here the part is known, so the placeholder becomes its visibility.
             of_episode = scene.visibility == VISIBILITY_OF_EPISODE
             visibility = torch.where(of_episode, int(part.visibility), scene.visibility)

@@ -22,7 +22,7 @@ from ganlane.settings.record import make
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.idm import TABLE_V, can_brake
 from ganlane.sim.random import episode_key
-from ganlane.sim.spawn import RandomScenes, check_start, draw_lanes, spawn
+from ganlane.sim.spawn import RandomScenes, check_start, draw_lanes
 from ganlane.sim.state import Road, Vehicles
 
 LORRIES = SpawnParameters(truck_share=0.3)
@@ -33,7 +33,7 @@ def episode_keys(count: int, seed: int = 0) -> torch.Tensor:
 
 
 def scenes(count: int = 2000, vehicles: int = 9, **others) -> Vehicles:
-    return spawn(episode_keys(count), vehicles, 3, 4.0, dtype=DOUBLE, **others)
+    return RandomScenes(Road(), vehicles, **others)(episode_keys(count), DOUBLE)
 
 
 def smallest_spacing(s: Vehicles, gaps: bool = False) -> float:
@@ -135,7 +135,7 @@ def test_a_scene_depends_on_its_key_alone(share):
     parameters = SpawnParameters(truck_share=share)
     together = scenes(20, parameters=parameters)
     for row in (0, 7, 19):
-        alone = spawn(episode_keys(20)[row : row + 1], 9, 3, 4.0, parameters, DOUBLE)
+        alone = RandomScenes(parameters=parameters)(episode_keys(20)[row : row + 1], DOUBLE)
         for name, one, all_ in zip(alone._fields, alone, together):
             assert torch.equal(one[0], all_[row]), name
 
@@ -151,9 +151,8 @@ def test_no_scene_starts_with_an_overlap(data, lanes, spacing, spread):
     p = packed(spread, spacing)
     vehicles = data.draw(st.integers(1, min(60, lanes * p.lane_capacity())))
     check_start(p, vehicles, lanes)
-    s = spawn(
-        episode_keys(4, seed=data.draw(st.integers(0, 2**40))), vehicles, lanes, 4.0, p, DOUBLE
-    )
+    keys = episode_keys(4, seed=data.draw(st.integers(0, 2**40)))
+    s = RandomScenes(Road(lanes), vehicles, p)(keys, DOUBLE)
     assert not pair_overlaps(s).any()
     assert smallest_spacing(s) >= spacing - 1e-9
     assert (s.x.amax(1) - s.x.amin(1)).max() <= spread + 1e-9

@@ -11,7 +11,7 @@ from ganlane.generator import shipped_generator
 from ganlane.generator.human import STEPS
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.random import episode_key
-from ganlane.sim.spawn import spawn
+from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 from ganlane.traffic.presets import human_traffic
@@ -33,7 +33,7 @@ def keys_of(traffic, episodes):
 def drive(episodes, steps, dtype=torch.float32, **variation):
     traffic = human_traffic(**variation)
     key = keys_of(traffic, episodes)
-    return list(course(traffic, spawn(key, 9, 3, 4.0, dtype=dtype), key, steps))
+    return list(course(traffic, RandomScenes()(key, dtype), key, steps))
 
 
 def test_a_decision_holds_for_four_steps():

@@ -23,10 +23,9 @@ from ganlane.env.physics import Recorder, Rules, begin, known_false, outcome, re
 from ganlane.env.state import (
     check_counter,
     checked_action,
-    done_spec,
     first_state,
     pack,
-    state_spec,
+    spec_of,
     usable_device,
 )
 from ganlane.errors import UserError
@@ -204,15 +203,10 @@ class HighwayEnv(EnvBase):
     def _make_specs(self) -> None:
         n = self.batch_size[0]
         device = self.device
-        # The traffic's memory travels in the state, so its shapes belong to the spec.
-        memory = self.traffic.memory_spec(n, self.vehicles, self.dtype)
-        row_road = None
-        if self.traffic.own_roads:
-            # Of any episode: the shapes are those of all.
-            key = torch.zeros(1, dtype=torch.int64, device=device)
-            row_road = self.traffic.road_of(key, self.dtype)
-        spec = state_spec(n, self.vehicles, self.dtype, memory, row_road, self.actions)
-        self.observation_spec = spec.to(device)
+        # Of any episode: the fields and shapes are those of all, the traffic's memory included.
+        episode = torch.zeros(1, dtype=torch.int64, device=device)
+        state = self._start(episode, episode)
+        self.observation_spec = spec_of(state.exclude(*keys.DONE_FLAGS), n).to(device)
         # A TransformedEnv passes to a reset only the keys of the state spec; without the counters a
         # reset to certain episodes would run the first ones.
         counters = {
@@ -227,7 +221,7 @@ class HighwayEnv(EnvBase):
             count = len(self.actions.names)
             self.action_spec = Categorical(count, shape=(n,), dtype=torch.int64, device=device)
         self.reward_spec = Unbounded(shape=(n, 1), dtype=self.dtype, device=device)
-        self.done_spec = done_spec(n).to(device)
+        self.done_spec = spec_of(state.select(*keys.DONE_FLAGS), n).to(device)
 
     def to(self, device: torch.device | str) -> HighwayEnv:
         """On another device; raises :class:`UserError` where there is none such."""
@@ -344,8 +338,8 @@ class HighwayEnv(EnvBase):
         if self.actions.form == LANE_SPEED:
             # The desired speed itself is the same in all of an episode.
             vehicles = vehicles.with_(desired_speed=state.get(keys.VEHICLES).get("desired_speed"))
-        # Mostly nobody is out of range: without this look a decision takes 2 % longer with 64 rows, 9
-        # with 1024.
+        # Mostly nobody is out of range: without this look a decision takes 2 % longer with 64 rows,
+        # 9 % with 1024.
         if self.recycle and not known_false(out_of_range(vehicles, rules.road).any()):
             # In running rows with recycling those left behind are moved.
             recycled = recycle(vehicles, rules.road, rules.idm)
@@ -401,15 +395,7 @@ class HighwayEnv(EnvBase):
         episode = replace(self.episode, decision_period_s=keys.PHYSICS_STEP_S)
         # Steps of 0.1 s instead of a decision period, after which nobody enters or leaves; nothing
         # else differs.
-        kernel = Kernel(
-            self.road,
-            self.vehicles,
-            episode,
-            self.ego,
-            drivers,
-            actions=self.actions,
-            mobil=self.rules.mobil,
-        )
+        kernel = self._kernel(drivers, episode)
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         running = torch.ones_like(action, dtype=torch.bool)
         for _ in range(self.episode.substeps()):
@@ -464,20 +450,16 @@ class HighwayEnv(EnvBase):
         # And whether there is a library at all, which may have to be built.
         missing = why_not() if reason is None else None
         if drivers is not None and reason is None and missing is None:
-            return Kernel(
-                self.road,
-                self.vehicles,
-                self.episode,
-                self.ego,
-                drivers,
-                actions=self.actions,
-                mobil=self.rules.mobil,
-            )
+            return self._kernel(drivers, self.episode)
         if wanted == "native":
             raise UserError(f"env.kernel=native {reason or missing}; set env.kernel=torch.")
         if reason is None:
             say_once(f"env.kernel=auto: the tensor code, since the native kernel {missing}.")
         return None
+
+    def _kernel(self, drivers: Drivers, episode: EpisodeParameters) -> Kernel:
+        options = {"actions": self.actions, "mobil": self.rules.mobil}
+        return Kernel(self.road, self.vehicles, episode, self.ego, drivers, **options)
 
     def _recycling_rows(self, key: Tensor) -> Tensor:
         """The rows [N] bool whose episodes, with ``key`` [N], recycle."""

@@ -11,7 +11,7 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from ganlane import keys
@@ -39,7 +39,7 @@ from ganlane.sim.lane_ends import at_exit, hits_wall, leaves_road, ways_out
 from ganlane.sim.mobil import TABLE_IV, falling_behind, letting_past
 from ganlane.sim.neighbours import Scene
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
-from ganlane.traffic.base import TrafficModule, memory_of
+from ganlane.traffic.base import TrafficModule, memory_of, new_tensordict, where_rows, with_rows
 
 #: Name to tensor [N]: the ego's memory (:mod:`ganlane.env.state`).
 EgoMemory = dict[str, Tensor]
@@ -315,28 +315,7 @@ class EndedRows:
         """``memory`` with the kept rows as they were; its tensors are not written to."""
         if not self.rows or memory.is_empty():
             return memory
-        return _with_rows(memory, torch.cat(self.rows), torch.cat(self.memories))  # type: ignore[arg-type]
-
-
-def _with_rows(memory: TensorDictBase, rows: Tensor, other: TensorDictBase) -> TensorDict:
-    """``memory`` with its ``rows`` replaced by ``other`` [R], leaf by leaf."""
-
-    # Leaf by leaf, since the memory is nested like the traffic.
-    restored = {}
-    for name, value in memory.items():
-        if isinstance(value, Tensor):
-            restored[name] = value.index_copy(0, rows, other.get(name))
-        elif value.is_empty():
-            restored[name] = value
-        else:
-            restored[name] = _with_rows(value, rows, other.get(name))
-    return TensorDict._new_unsafe(restored, batch_size=memory.batch_size)
-
-
-def _where(rows: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """``new`` where ``rows`` [N] is true, ``old`` elsewhere."""
-    further_axes = [1] * (new.ndim - 1)
-    return torch.where(rows.reshape(-1, *further_axes), new, old)
+        return with_rows(memory, torch.cat(self.rows), torch.cat(self.memories))  # type: ignore[arg-type]
 
 
 def run_decision(
@@ -363,7 +342,7 @@ def run_decision(
     ended = EndedRows()
     counters = {name: state.get(name) for name in (keys.SEED, keys.EPISODE)}
     counters[keys.EPISODE_KEY] = key
-    size = memory.batch_size
+    n = memory.batch_size[0]
     can_read = reads_are_cheap(now.running)
     if can_read:
         ended.keep(~now.running, memory)
@@ -375,12 +354,12 @@ def run_decision(
         # The traffic's clock continues in ended rows: stopped at a moment of decision it would make
         # these rows' drivers decide in all remaining steps, in vain.
         fields = {
-            keys.VEHICLES: TensorDict._new_unsafe(before.vehicles.as_dict(), batch_size=size),
+            keys.VEHICLES: new_tensordict(before.vehicles.as_dict(), n),
             keys.TRAFFIC: memory,
             **counters,
             keys.STEP: start.step + count,
         }
-        after = traffic(TensorDict._new_unsafe(fields, batch_size=size))
+        after = traffic(new_tensordict(fields, n))
         all_running = known_false((~before.running).any())
         moved = Vehicles.of(after.get(keys.MOVED))
         now = advance(rules, before, moved, all_running)
@@ -389,7 +368,7 @@ def run_decision(
             memory = after.get(keys.TRAFFIC)
             ended.keep(before.running & ~now.running, memory)
         else:
-            memory = after.get(keys.TRAFFIC).apply(partial(_where, before.running), memory)
+            memory = after.get(keys.TRAFFIC).apply(partial(where_rows, before.running), memory)
         if recorder is not None:
             recorder(now.vehicles, before.running)
     return now, ended.restore(memory)

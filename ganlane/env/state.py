@@ -18,90 +18,37 @@ from torchrl.data.tensor_specs import Binary
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.settings.actions import CONTROLS, LANE_SPEED, ActionParameters
-from ganlane.sim.state import Road, Vehicles, road_fields
+from ganlane.sim.state import Vehicles
 from ganlane.torch_settings import check_default_device
 
 #: Name of a field to its type; None: the run's float type.
 Fields: TypeAlias = Mapping[str, torch.dtype | None]
 
-VEHICLES: Fields = {
-    **dict.fromkeys(keys.VEHICLE_FLOATS),
-    **dict.fromkeys(keys.VEHICLE_INTEGERS, torch.int64),
-    **dict.fromkeys(keys.VEHICLE_FLAGS, torch.bool),
-}
 #: What is remembered of the ego from one decision to the next.
 EGO: Fields = {
     **dict.fromkeys(keys.EGO_FLOATS),
     **dict.fromkeys(keys.EGO_INTEGERS, torch.int64),
     **dict.fromkeys(keys.EGO_FLAGS, torch.bool),
 }
-#: And further with ``env.actions=lane_speed``: the speed aimed at, m/s.
-COMMANDED: Fields = {keys.SET_SPEED: None}
 EVENTS: Fields = {
     **dict.fromkeys(keys.END_EVENTS, torch.bool),
     **dict.fromkeys(keys.EVENT_COUNTS, torch.int64),
 }
 DONE: Fields = dict.fromkeys(keys.DONE_FLAGS, torch.bool)
-COUNTERS: Fields = dict.fromkeys((keys.SEED, keys.EPISODE, keys.STEP), torch.int64)
 
 
-def state_spec(
-    n: int,
-    m: int,
-    dtype: torch.dtype,
-    memory: dict[str, Any],
-    row_road: Road | None,
-    actions: ActionParameters,
-) -> Composite:
-    """Spec of everything that a step writes except done flags and reward.
-
-    ``memory`` is the traffic's, nested name to (shape, dtype); ``row_road`` is the road of a row
-    where each has its own.
-    """
-    ego = {**EGO, **COMMANDED} if actions.form == LANE_SPEED else EGO
-    parts = {
-        keys.VEHICLES: Composite(_specs(VEHICLES, (n, m), dtype), shape=(n,)),
-        keys.EGO: Composite(_specs(ego, (n,), dtype), shape=(n,)),
-        keys.EVENTS: Composite(_specs(EVENTS, (n, 1), dtype), shape=(n,)),
-        **_memory_spec({keys.TRAFFIC: memory}, n),
-        **_specs(COUNTERS, (n,), dtype),
-    }
-    if row_road is not None:
-        of_road = {}
-        for name, field in road_fields(row_road).items():
-            of_road[name] = Unbounded(shape=(n, field.shape[1]), dtype=field.dtype)
-        parts[keys.ROAD] = Composite(of_road, shape=(n,))
-    return Composite(parts, shape=(n,))
-
-
-def done_spec(n: int) -> Composite:
-    """Spec of the done flags."""
-    return Composite(_specs(DONE, (n, 1), torch.float32), shape=(n,))
-
-
-def _specs(fields: Fields, shape: tuple[int, ...], dtype: torch.dtype) -> dict[str, Any]:
-    specs = {}
-    for name, kind in fields.items():
-        # TorchRL checks flags by a spec of their own.
-        spec = Binary if kind is torch.bool else Unbounded
-        specs[name] = spec(shape=shape, dtype=kind or dtype)
-    return specs
-
-
-def _memory_spec(memory: dict[str, Any], n: int) -> dict[str, Any]:
-    """Specs of a traffic module's memory, nested like the modules."""
+def spec_of(state: TensorDictBase, n: int) -> Composite:
+    """Spec of states of ``n`` rows, nested as this ``state`` of one row."""
     specs: dict[str, Any] = {}
-    for name, value in memory.items():
-        # A traffic that is made of others has a group of each.
-        if isinstance(value, dict):
-            parts = _memory_spec(value, n)
-            # TorchRL's SerialEnv and ParallelEnv refuse empty groups.
-            if parts:
-                specs[name] = Composite(parts, shape=(n,))
-        else:
-            shape, dtype = value
-            specs[name] = Unbounded(shape=shape, dtype=dtype)
-    return specs
+    for name, value in state.items():
+        if isinstance(value, Tensor):
+            # TorchRL checks flags by a spec of their own.
+            spec = Binary if value.dtype == torch.bool else Unbounded
+            specs[name] = spec(shape=(n, *value.shape[1:]), dtype=value.dtype)
+        # TorchRL's SerialEnv and ParallelEnv refuse empty groups.
+        elif not value.is_empty():
+            specs[name] = spec_of(value, n)
+    return Composite(specs, shape=(n,))
 
 
 def first_state(

@@ -91,9 +91,9 @@ def let_in_and_out(
     assert flow is not None
     arrivals = flow.arrivals(road.stretches, period_s)
     vehicles = vehicles.with_(valid=vehicles.valid & ~has_left(vehicles, road, flow))
-    purposes = [int(Purpose.FLOW_ARRIVAL), int(Purpose.FLOW_EXIT)]
+    purposes = [Purpose.FLOW_ARRIVAL, Purpose.FLOW_EXIT]
     u = uniform(key, step, len(arrivals), purposes, torch.float64)
-    keys = draw_keys(key, step, vehicles.x.shape[1], [int(Purpose.FLOW_SLOT)])[..., 0]
+    keys = draw_keys(key, step, vehicles.x.shape[1], [Purpose.FLOW_SLOT])[..., 0]
     number = (keys >> (64 - _CHOICE_BITS)) & ((1 << _CHOICE_BITS) - 1)
     # Lane by lane, so that nobody enters beside one who has just done so without room.
     for lane, probability in enumerate(arrivals):

@@ -85,7 +85,7 @@ def draw_lanes(key: Tensor, vehicles: int, lanes: int, capacity: int) -> Tensor:
     All places of all lanes are shuffled and the first ``vehicles`` of them taken.
     """
     # A random key for every place; the lowest ones are taken.
-    places = draw_keys(key, 0, lanes * capacity, [int(Purpose.SPAWN_LANE)])[..., 0]
+    places = draw_keys(key, 0, lanes * capacity, [Purpose.SPAWN_LANE])[..., 0]
     return places.argsort(dim=1, stable=True)[:, :vehicles] // capacity
 
 

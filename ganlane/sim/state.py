@@ -235,6 +235,8 @@ class LaneRange(NamedTuple):
 
     def columns(self, which: slice) -> LaneRange:
         """The ranges of a slice of the vehicles."""
+        if which == slice(None):
+            return self
         return LaneRange(self.low[:, which], self.high[:, which])
 
 

@@ -24,8 +24,9 @@ from ganlane.torch_settings import outside_autocast
 Memory = dict[str, Tensor]
 #: The vehicles after a step, and the memory to keep.
 Moved = tuple[Vehicles, Memory]
-#: Name to (trailing shape after [N, M], dtype); the dtype None is the run's float type.
-MemoryFields = Mapping[str, tuple[tuple[int, ...], torch.dtype | None]]
+#: Name to (trailing shape after [N, M], dtype), the dtype None being the run's float type; of a
+#: traffic made of others by their names.
+MemoryFields = Mapping[str, Any]
 Network = TypeVar("Network", bound=nn.Module)
 
 
@@ -58,6 +59,11 @@ def with_rows(whole: TensorDictBase, rows: Tensor, part: Mapping[str, Any]) -> T
         elif name in fields:
             fields[name] = with_rows(fields[name], rows, value)
     return new_tensordict(fields, whole.batch_size[0])
+
+
+def where_rows(rows: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """``new`` where ``rows`` [N] is true, ``old`` elsewhere; both [N, ...]."""
+    return torch.where(rows.view(-1, *[1] * (new.ndim - 1)), new, old)
 
 
 def key_of(tensordict: TensorDictBase, stream: int) -> Tensor:
@@ -215,11 +221,18 @@ class TrafficModule(TensorDictModuleBase):
 
     def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
         """Nested name -> (shape, dtype) of the memory of ``n`` rows of ``m`` vehicles."""
-        # The dtype None stands for the run's float type.
-        return {
-            name: ((n, m, *shape), own_dtype or dtype)
-            for name, (shape, own_dtype) in self.memory_fields.items()
-        }
+        return _spec(self.memory_fields, n, m, dtype)
+
+
+def _spec(fields: MemoryFields, n: int, m: int, dtype: torch.dtype) -> dict[str, Any]:
+    spec: dict[str, Any] = {}
+    for name, field in fields.items():
+        if isinstance(field, Mapping):
+            spec[name] = _spec(field, n, m, dtype)
+        else:
+            shape, kind = field
+            spec[name] = ((n, m, *shape), kind or dtype)
+    return spec
 
 
 class Overlay(TrafficModule):
@@ -257,14 +270,11 @@ class TrafficParts(TrafficModule):
         self.parts = nn.ModuleDict(parts)
         self.rows_must_stay = any(part.rows_must_stay for part in parts.values())
         self.heeds_lane_ends = all(part.heeds_lane_ends for part in parts.values())
+        self.memory_fields = {name: part.memory_fields for name, part in parts.items()}
 
     def named_parts(self) -> list[tuple[str, TrafficModule]]:
         """Names and parts, in order."""
         return cast("list[tuple[str, TrafficModule]]", list(self.parts.items()))
-
-    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
-        """The parts' specs, by name."""
-        return {name: part.memory_spec(n, m, dtype) for name, part in self.named_parts()}
 
 
 class TrafficSequential(TrafficParts):

@@ -6,8 +6,6 @@ and goes over to its lateral speed evenly. The ego is a driver like any other to
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from torch import Tensor
 
@@ -41,7 +39,7 @@ from ganlane.sim.neighbours import Scene
 from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.random import Purpose, normal
 from ganlane.sim.state import Road, Vehicles, body_lanes, reads_are_cheap, spanned, with_target
-from ganlane.traffic.base import Memory, Moved, TrafficModule, in_dtype, uniforms
+from ganlane.traffic.base import Memory, Moved, TrafficModule, in_dtype, uniforms, where_rows
 
 #: Ahead and behind of who leaves a lane that ends, m: who makes room leaves as much at least.
 LEAST_ROOM_M = 1.0
@@ -130,7 +128,10 @@ class HumanTraffic(TrafficModule):
         """Decisions in the rows where one is ``due`` [N]."""
         if not reads_are_cheap(vehicles.x):
             decided, new_memory = self.decide(vehicles, memory, key, step)
-            return decided.where(due, vehicles), _where(due, new_memory, memory)
+            new_memory = {
+                name: where_rows(due, new_memory[name], value) for name, value in memory.items()
+            }
+            return decided.where(due, vehicles), new_memory
         rows = due.nonzero()[:, 0]
         if len(rows) == len(due):
             return self.decide(vehicles, memory, key, step)
@@ -215,11 +216,3 @@ def _leaving(choice: Tensor, keeping: Tensor, ways: WaysOut, sides: Tensor, u: T
     side = torch.where(left[..., None], sides[..., 0, :], sides[..., 1, :])
     wants = keeping & (ways.side != 0) & (u < ways.urgency)
     return torch.where(wants & leaves_room(side, LEAST_ROOM_M), torch.where(left, 1, 2), choice)
-
-
-def _where(rows: Tensor, new: Mapping[str, Tensor], old: Mapping[str, Tensor]) -> Memory:
-    """``new`` in the ``rows`` [N], ``old`` elsewhere."""
-    return {
-        name: torch.where(rows.view(-1, *[1] * (value.ndim - 1)), new[name], value)
-        for name, value in old.items()
-    }

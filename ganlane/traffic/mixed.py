@@ -198,6 +198,7 @@ class BlindTraffic(TrafficModule):
         self.visibility = model.visibility
         self.rows_must_stay = model.rows_must_stay
         self.heeds_lane_ends = model.heeds_lane_ends
+        self.memory_fields = model.memory_fields
 
     def native_drivers(self) -> Drivers | None:
         """Those of the model, blind."""
@@ -232,7 +233,3 @@ class BlindTraffic(TrafficModule):
     def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
         """As the model's."""
         return self.model.init_memory(vehicles, key)
-
-    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
-        """As the model's."""
-        return self.model.memory_spec(n, m, dtype)

@@ -249,10 +249,6 @@ class ReplayTraffic(TrafficModule):
         scene = _one_of(u[:, 0], torch.full_like(key, len(self.scene_names)))
         return self.first_start[scene] + _one_of(u[:, 1], self.starts_in[scene])
 
-    def scene_of(self, key: Tensor) -> Tensor:
-        """Number of the scene in :attr:`scene_names`, [N] int64."""
-        return self.scene[self.start_of(key)]
-
     def scenes_of_episodes(self, seed: int, episodes: Sequence[int]) -> list[str]:
         """Name of the scene of each of ``episodes``, for figures by scene."""
         scenes = self.scene[self._starts_of(seed, episodes)]
@@ -367,9 +363,9 @@ class RecordedScenes:
     """
 
     traffic: ReplayTraffic
-    vehicles: int = 9
-    ego_visibility: int = Visibility.BODY
-    ego_desired_speed_mps: float = 25.0
+    vehicles: int
+    ego_visibility: int
+    ego_desired_speed_mps: float
 
     @property
     def longest_m(self) -> float:

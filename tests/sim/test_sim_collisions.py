@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -27,9 +28,12 @@ def test_overlap_agrees_with_the_corners_of_the_scalar_simulator():
         return scalar.Car(x, y, heading, 0.0, 0.0, length, width, 25.0, 0, 0, True)
 
     pairs = random_pairs(2000)
-    for said, dx, dy, *boxes in zip(
-        boxes_overlap(*pairs).tolist(), *(value.tolist() for value in pairs)
-    ):
+    dx, dy, *sizes = pairs
+    fields = ("heading", "length", "width")
+    one = SimpleNamespace(y=torch.zeros_like(dy), **dict(zip(fields, sizes[:3])))
+    other = SimpleNamespace(y=dy, **dict(zip(fields, sizes[3:])))
+    overlaps = boxes_overlap(dx, one, other).tolist()
+    for said, dx, dy, *boxes in zip(overlaps, *(value.tolist() for value in pairs)):
         assert scalar.overlap(car(0.0, 0.0, *boxes[:3]), car(dx, dy, *boxes[3:])) == said
 
 

@@ -136,9 +136,9 @@ def test_every_scene_is_equally_likely_and_every_start_within_it():
     traffic = ReplayTraffic(recordings=recorded())
     episodes = range(20_000)
     starts = traffic.start_of(keys_of(episodes))
-    scenes = np.bincount(traffic.scene_of(keys_of(episodes)).numpy(), minlength=4)
+    scenes = np.bincount(traffic.scene[traffic.start_of(keys_of(episodes))].numpy(), minlength=4)
     assert chisquare(scenes).pvalue > 1e-3
-    within = np.bincount(starts[traffic.scene_of(keys_of(episodes)) == 2].numpy())
+    within = np.bincount(starts[traffic.scene[traffic.start_of(keys_of(episodes))] == 2].numpy())
     assert chisquare(within[within > 0]).pvalue > 1e-3
     assert len(starts.unique()) == starts.max() + 1
 
@@ -147,7 +147,7 @@ def test_lanes_and_their_width_are_the_scenes_own():
     traffic = ReplayTraffic(recordings=recorded())
     key = keys_of(range(100))
     road = traffic.road_of(key, torch.float64)
-    scene = traffic.scene_of(key)
+    scene = traffic.scene[traffic.start_of(key)]
     assert road.lanes.shape == road.lane_width_m.shape == (100, 1)
     assert torch.equal(road.lanes[:, 0], 2 + scene % 3)
     assert (road.lane_width_m - 3.5).abs().max() < 0.2
@@ -175,7 +175,7 @@ def test_every_step_is_what_a_search_through_the_rows_finds():
     key = keys_of(range(12))
     for row, (scene, steps) in enumerate(
         zip(
-            traffic.scene_of(key).tolist(),
+            traffic.scene[traffic.start_of(key)].tolist(),
             traffic.steps_of(key).tolist(),
         )
     ):
@@ -265,7 +265,7 @@ def us101() -> ReplayTraffic:
 def test_the_us101_scenes_can_all_be_replayed(us101):
     key = keys_of(range(2000), stream=2)
     assert len(us101.scene_names) == 11
-    assert set(us101.scene_of(key).tolist()) == set(range(11))
+    assert set(us101.scene[us101.start_of(key)].tolist()) == set(range(11))
     scene = us101.scenes(9)(key, torch.float32)
     # Nobody starts in a crash: the ego's size is that of the vehicle it replaces.
     assert not ego_overlaps(scene).any()

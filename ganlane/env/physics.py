@@ -325,7 +325,6 @@ def run_decision(
     start: Substep,
     key: Tensor,
     recorder: Recorder | None = None,
-    substeps: int | None = None,
 ) -> tuple[Substep, TensorDictBase]:
     """All physics steps of a decision: where they lead, and the traffic's memory after it.
 
@@ -335,7 +334,6 @@ def run_decision(
     Args:
         state, start: at the beginning of the decision, and its first moment.
         key: of the episodes, [N] int64.
-        substeps: number of physics steps; None: those of the decision period.
     """
     memory = memory_of(state)
     now = start
@@ -346,7 +344,7 @@ def run_decision(
     can_read = reads_are_cheap(now.running)
     if can_read:
         ended.keep(~now.running, memory)
-    for count in range(rules.episode.substeps() if substeps is None else substeps):
+    for count in range(rules.episode.substeps()):
         before = now
         # On a CPU the remaining steps are left out once every row has ended.
         if known_false(before.running.any()):

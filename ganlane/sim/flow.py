@@ -39,8 +39,7 @@ def has_left(vehicles: Vehicles, road: Road, flow: FlowParameters) -> Tensor:
     if road.exit_lane is not None:
         by_exit, _ = at_exit(vehicles, road)
         left = left | by_exit
-    others = torch.arange(vehicles.x.shape[1], device=vehicles.x.device) != EGO_INDEX
-    return left & others & vehicles.valid
+    return left & ~vehicles.is_ego() & vehicles.valid
 
 
 def _chosen(vehicles: Vehicles, road: Road, wanted: Tensor, number: Tensor) -> Tensor:

@@ -172,7 +172,11 @@ def needed_deceleration(speed: Tensor, leader_speed: Tensor, gap: Tensor) -> Ten
 
 
 def _survives(
-    gap: Tensor, speed: Tensor, leader_speed: float, desired_speed: float, idm: IdmParameters
+    gap: Tensor | float,
+    speed: Tensor | float,
+    leader_speed: float,
+    desired_speed: float,
+    idm: IdmParameters,
 ) -> Tensor:
     """Whether followers at ``speed``, m/s, avoid a leader that from now on brakes at the limit.
 
@@ -182,8 +186,8 @@ def _survives(
     this one also avoids crashes in a queue, where each leader may have to brake for its own.
     """
     # In float64, since 600 steps add up and the result decides whether a scene is refused.
-    leader_now = torch.tensor(leader_speed, dtype=torch.float64)
-    gap, speed, leader_now = torch.broadcast_tensors(gap, speed, leader_now)
+    numbers = (torch.as_tensor(number).double() for number in (gap, speed, leader_speed))
+    gap, speed, leader_now = torch.broadcast_tensors(*numbers)
     smallest = start = gap
     # Trapezoids, as vehicles move in the simulation (dynamics.advance).
     for _ in range(round(HORIZON_S / PHYSICS_STEP_S)):
@@ -207,9 +211,7 @@ def can_brake(
     idm: IdmParameters = TABLE_V,
 ) -> bool:
     """Whether a follower avoids a leader that brakes at the limit, with 0.1 m for rounding."""
-    gap = torch.tensor([gap_m], dtype=torch.float64)
-    speed = torch.tensor([speed_mps], dtype=torch.float64)
-    return bool(_survives(gap, speed, leader_speed_mps, desired_speed_mps, idm)[0])
+    return bool(_survives(gap_m, speed_mps, leader_speed_mps, desired_speed_mps, idm))
 
 
 def least_gap(
@@ -222,8 +224,7 @@ def least_gap(
     # From full speed to a stop; a fifth and 10 m more is surely enough.
     stopping_m = speed_mps * speed_mps / (-2.0 * idm.min_acceleration)
     gaps = torch.arange(1, int(10.0 * (1.2 * stopping_m + 10.0))).double() * 0.1
-    speed = torch.full_like(gaps, speed_mps)
-    crashes = ~_survives(gaps, speed, leader_speed_mps, desired_speed_mps, idm)
+    crashes = ~_survives(gaps, speed_mps, leader_speed_mps, desired_speed_mps, idm)
     if not bool(crashes.any()):
         return 0.1
     # One step beyond the largest gap that is too small.
@@ -236,8 +237,7 @@ def highest_speed(
     """Highest speed, m/s, in steps of 0.1 m/s, up to which :func:`can_brake` is true."""
     # 0 to 99.9 m/s, all in one simulation.
     speeds = torch.arange(0, 1000).double() * 0.1
-    gap = torch.full_like(speeds, gap_m)
-    crashes = ~_survives(gap, speeds, leader_speed_mps, desired_speed_mps, idm)
+    crashes = ~_survives(gap_m, speeds, leader_speed_mps, desired_speed_mps, idm)
     if not bool(crashes.any()):
         return float(speeds[-1])
     return 0.1 * max(0, int(crashes.nonzero().min()) - 1)

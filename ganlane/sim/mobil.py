@@ -172,11 +172,9 @@ def falling_behind(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParamet
     Args:
         ways: of the observers.
     """
-    wanted = scene.observers.target_lane + ways.side
-    ahead = leader(scene, wanted.to(scene.observers.x.dtype)[..., None])
-    blocked = acceleration_behind(scene, ahead, idm)[..., 0] < -mobil.safe_deceleration
-    asks = ways.asks & scene.observers.valid
-    return torch.where(asks & blocked, -mobil.courtesy, torch.inf)
+    ahead = leader(scene, _wanted_lane(scene, ways))
+    blocked = acceleration_behind(scene, ahead, idm) < -mobil.safe_deceleration
+    return _courteous(scene, ways, blocked, mobil)
 
 
 def letting_past(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParameters) -> Tensor:
@@ -192,23 +190,26 @@ def letting_past(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParameter
     Args:
         ways: of the observers.
     """
-    wanted = (scene.observers.target_lane + ways.side).to(scene.observers.x.dtype)
-    gap, index = nearest(scene, wanted[..., None], -1)
-    gap, index = gap[..., 0], index[..., 0]
-    behind = Vehicles(*(field.gather(1, index) for field in scene.vehicles))
-    demand = idm_acceleration(
-        behind.speed[..., None],
-        behind.desired_speed[..., None],
-        gap[..., None],
-        scene.observers.speed[..., None],
-        idm.per_lane(),
-    )[..., 0]
+    gap, index = nearest(scene, _wanted_lane(scene, ways), -1)
+    behind = Vehicles(*(field.gather(1, index[..., 0])[..., None] for field in scene.vehicles))
+    speed = scene.observers.speed[..., None]
+    demand = idm_acceleration(behind.speed, behind.desired_speed, gap, speed, idm.per_lane())
     goes_on = (behind.speed > 0.0) & (behind.acceleration > -0.5 * mobil.courtesy)
     # In a second.
-    goes_on = goes_on & (behind.speed - scene.observers.speed < mobil.courtesy)
+    goes_on = goes_on & (behind.speed - speed < mobil.courtesy)
     unsafe = (gap < FREE_GAP_M) & (demand < -mobil.safe_deceleration)
-    asks = ways.asks & scene.observers.valid
-    return torch.where(asks & unsafe & goes_on, -mobil.courtesy, torch.inf)
+    return _courteous(scene, ways, unsafe & goes_on, mobil)
+
+
+def _wanted_lane(scene: Scene, ways: WaysOut) -> Tensor:
+    """The lane that each observer has to reach, float [N, K, 1]."""
+    return (scene.observers.target_lane + ways.side).to(scene.observers.x.dtype)[..., None]
+
+
+def _courteous(scene: Scene, ways: WaysOut, hindered: Tensor, mobil: MobilParameters) -> Tensor:
+    """The braking [N, K] of who has to change its lane soon and is ``hindered`` [N, K, 1]."""
+    brakes = ways.asks & scene.observers.valid & hindered[..., 0]
+    return torch.where(brakes, -mobil.courtesy, torch.inf)
 
 
 def yielding(scene: Scene, idm: AnyIdm, mobil: MobilParameters) -> Tensor:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ganlane.settings.episode import Stream as Stream  # also known as ganlane.sim.Stream
+from ganlane.settings.record import Range
 from ganlane.torch_settings import constant
 
 # Constants of splitmix64; torch computes in signed integers.
@@ -115,6 +116,11 @@ def uniform(
 ) -> Tensor:
     """Uniform numbers in [0, 1), [N, vehicles, len(purposes)]: a step's purposes in one call."""
     return to_uniform(draw_keys(key, step, vehicles, purposes), dtype)
+
+
+def in_range(u: Tensor, bounds: Range) -> Tensor:
+    """Uniform numbers in [0, 1) scaled to ``bounds``."""
+    return bounds[0] + u * (bounds[1] - bounds[0])
 
 
 def normal(

@@ -176,8 +176,7 @@ class FixedScene:
         # From [0, 1) to [-1, 1).
         u = 2.0 * uniform(key, 0, m, [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED], dtype) - 1.0
         # Only the others are shifted: the ego stays at x = 0.
-        is_ego = torch.arange(m, device=key.device) == 0
-        x = torch.where(is_ego, whole.x, whole.x + self.jitter_m * u[..., 0])
+        x = torch.where(whole.is_ego(), whole.x, whole.x + self.jitter_m * u[..., 0])
         varied = (whole.speed + self.jitter_mps * u[..., 1]).clamp_min(0.0)
         # Who stands remains standing.
         speed = torch.where(whole.speed > 0, varied, whole.speed)
@@ -354,7 +353,7 @@ def check_braking(scene: FixedScene, idm: IdmParameters) -> None:
     ahead = shares & (vehicles.x[:, None, :] > vehicles.x[:, :, None])
     varied = (vehicles.speed > 0) * scene.jitter_mps
     # Two shifted vehicles come closer by twice the jitter, a shifted one and the ego by once.
-    slack = scene.jitter_m * (2.0 - (torch.arange(scene.vehicles) == 0).double())
+    slack = scene.jitter_m * (2.0 - vehicles.is_ego().double())
     gap = seen.pairs.ahead - torch.minimum(slack[:, None], slack[None, :])
     fastest = vehicles.speed + varied
     slowest = (vehicles.speed - varied).clamp_min(0.0)

@@ -18,10 +18,9 @@ from ganlane.errors import ParameterError, UserError
 from ganlane.keys import EGO_INDEX
 from ganlane.settings.driving import IdmParameters, Visibility
 from ganlane.settings.episode import SpawnParameters
-from ganlane.settings.record import Range
 from ganlane.sim.idm import TABLE_V, can_brake, highest_speed, idm_acceleration, least_gap
 from ganlane.sim.neighbours import FREE_GAP_M, compare
-from ganlane.sim.random import Purpose, draw_keys, uniform
+from ganlane.sim.random import Purpose, draw_keys, in_range, uniform
 from ganlane.sim.state import STRAIGHT, LaneRange, Road, Vehicles, body_lanes, with_target
 
 TABLE_II = SpawnParameters()
@@ -68,17 +67,6 @@ def check_start(
             )
 
 
-def _rank(value: Tensor, same: Tensor | None = None) -> Tensor:
-    """Rank of each by ``value`` [N, M] and then index, among the ``same`` [N, M, M]."""
-    index = torch.arange(value.shape[1], device=value.device)
-    # By counting, not by sorting: a few vehicles, and a fixed order for equal values.
-    mine = value[:, :, None]
-    other = value[:, None, :]
-    lower_index = index[None, :] < index[:, None]
-    before = (other < mine) | ((other == mine) & lower_index)
-    return (before if same is None else before & same).sum(-1)
-
-
 def draw_lanes(key: Tensor, vehicles: int, lanes: int, capacity: int) -> Tensor:
     """A random lane for each vehicle, [N, vehicles] int64, at most ``capacity`` in each.
 
@@ -99,7 +87,13 @@ def place_in_lanes(lane: Tensor, u: Tensor, spread_m: float, spacing_m: float) -
     # In the run's float type: whole numbers times a float would be in torch's default one.
     count = same.sum(-1).to(u.dtype)
     room = spread_m - spacing_m * (count - 1)
-    return u * room + spacing_m * _rank(u, same).to(u.dtype)
+    # By counting, not by sorting: a few vehicles, and a fixed order for equal values.
+    index = torch.arange(u.shape[1], device=u.device)
+    mine = u[:, :, None]
+    other = u[:, None, :]
+    before = (other < mine) | ((other == mine) & (index < index[:, None]))
+    rank = (before & same).sum(-1).to(u.dtype)
+    return u * room + spacing_m * rank
 
 
 def ego_first(x: Tensor, lane: Tensor) -> tuple[Tensor, Tensor]:
@@ -108,9 +102,10 @@ def ego_first(x: Tensor, lane: Tensor) -> tuple[Tensor, Tensor]:
     Shift the ego to x = 0.
     """
     # The vehicle in the middle becomes the ego, with as many ahead as behind.
-    rank = _rank(x)
+    order = x.argsort(dim=1, stable=True)
     middle = (x.shape[1] - 1) // 2
-    order = torch.where(rank == middle, -1, rank).argsort(dim=1)
+    behind, ego, ahead = order[:, :middle], order[:, middle : middle + 1], order[:, middle + 1 :]
+    order = torch.cat((ego, behind, ahead), dim=1)
     x = x.gather(1, order)
     lane = lane.gather(1, order)
     return x - x[:, :1], lane
@@ -173,21 +168,18 @@ class RandomScenes:
         ]
         u, u_speed, u_desired, u_truck = uniform(key, 0, self.vehicles, drawn, dtype).unbind(-1)
 
-        def between(number: Tensor, bounds: Range) -> Tensor:
-            return bounds[0] + number * (bounds[1] - bounds[0])
-
         lane = draw_lanes(key, self.vehicles, int(self.road.lanes), p.lane_capacity())
         x, lane = ego_first(place_in_lanes(lane, u, p.spread_m, p.spacing_m), lane)
         is_ego = torch.arange(self.vehicles, device=key.device) == 0
         # In Table II who is ahead of the ego is slower than who is behind it.
-        ahead = between(u_speed, p.front_speed_mps)
-        behind = between(u_speed, p.rear_speed_mps)
+        ahead = in_range(u_speed, p.front_speed_mps)
+        behind = in_range(u_speed, p.rear_speed_mps)
         speed = torch.where(x > 0, ahead, behind)
-        speed = torch.where(is_ego, between(u_speed, p.ego_speed_mps), speed)
+        speed = torch.where(is_ego, in_range(u_speed, p.ego_speed_mps), speed)
         is_truck = (u_truck < p.truck_share) & ~is_ego
-        others = between(u_desired, p.desired_speed_mps)
+        others = in_range(u_desired, p.desired_speed_mps)
         desired = torch.where(is_ego, p.ego_desired_speed_mps, others)
-        desired = torch.where(is_truck, between(u_desired, p.truck_desired_speed_mps), desired)
+        desired = torch.where(is_truck, in_range(u_desired, p.truck_desired_speed_mps), desired)
         visibility = torch.where(is_ego, int(self.ego_visibility), int(self.others_visibility))
         zero = torch.zeros_like(x)
         return Vehicles(

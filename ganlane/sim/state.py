@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ganlane.errors import UserError
-from ganlane.keys import VEHICLE_FIELDS
+from ganlane.keys import EGO_INDEX, VEHICLE_FIELDS
 from ganlane.settings.driving import Visibility
 from ganlane.settings.road import EXIT, NOTHING, FlowParameters, Stretches, exit_lane
 
@@ -79,13 +79,14 @@ class Vehicles(NamedTuple):
         """A slice of the vehicles of every row, fields [N, K]."""
         return self if which == slice(None) else self.part((slice(None), which))
 
+    def is_ego(self) -> Tensor:
+        """Which vehicles of a row are an ego: the first, bool [M]."""
+        return torch.arange(self.x.shape[1], device=self.x.device) == EGO_INDEX
+
     def with_first(self, first: Vehicles) -> Vehicles:
         """The same rows with vehicle 0 replaced by ``first`` (fields [N])."""
         # By where, not by writing in place: the tensors may belong to the caller.
-        is_first = torch.arange(self.x.shape[1], device=self.x.device) == 0
-        return Vehicles(
-            *(torch.where(is_first, one[:, None], all_) for one, all_ in zip(first, self))
-        )
+        return first.part((slice(None), None)).where(self.is_ego()[None], self)
 
     def with_finite_padding(self) -> Vehicles:
         """The same vehicles with finite numbers in invalid entries: NaN would spread in sums."""

@@ -24,6 +24,8 @@ from ganlane.torch_settings import outside_autocast
 Memory = dict[str, Tensor]
 #: The vehicles after a step, and the memory to keep.
 Moved = tuple[Vehicles, Memory]
+#: The initial scene of episodes, and the memory.
+Entered = tuple[Vehicles, TensorDictBase]
 #: Name to (trailing shape after [N, M], dtype), the dtype None being the run's float type; of a
 #: traffic made of others by their names.
 MemoryFields = Mapping[str, Any]
@@ -205,9 +207,7 @@ class TrafficModule(TensorDictModuleBase):
         """:meth:`fresh_memory` as a TensorDict [N]."""
         return new_tensordict(self.fresh_memory(vehicles, key), len(vehicles.x))
 
-    def enter(
-        self, vehicles: Vehicles, key: Tensor, episode: Tensor
-    ) -> tuple[Vehicles, TensorDictBase]:
+    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> Entered:
         """The start of episodes: the initial scene and the memory.
 
         A traffic that sets visibilities or desired speeds itself overrides this method.
@@ -322,9 +322,7 @@ class TrafficSequential(TrafficParts):
         memories = {name: part.init_memory(vehicles, key) for name, part in self.named_parts()}
         return new_tensordict(memories, len(key))
 
-    def enter(
-        self, vehicles: Vehicles, key: Tensor, episode: Tensor
-    ) -> tuple[Vehicles, TensorDictBase]:
+    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> Entered:
         """The vehicles after the parts' :meth:`TrafficModule.enter`, and the memories by name."""
         memories = {}
         # In order: a part sees the desired speeds and visibilities that the parts before it set.

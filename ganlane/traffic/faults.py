@@ -12,7 +12,6 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
-from ganlane.keys import EGO_INDEX
 from ganlane.native.drivers import chance_in_step, faulty_drivers
 from ganlane.settings.driving import (
     AbortFaults,
@@ -38,8 +37,7 @@ Timed = TypeVar("Timed", bound=BrakingFaults | ReactionFaults)
 def other_drivers(vehicles: Vehicles) -> Tensor:
     """Valid non-ego vehicles, bool [N, M]."""
     # The ego's motion is the environment's, so a fault of it would have no effect.
-    index = torch.arange(vehicles.x.shape[1], device=vehicles.x.device)
-    return vehicles.valid & (index != EGO_INDEX)
+    return vehicles.valid & ~vehicles.is_ego()
 
 
 def starting(vehicles: Vehicles, moved: Vehicles) -> Tensor:

@@ -6,20 +6,18 @@ import math
 from typing import NamedTuple
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
 from ganlane.native.drivers import RuleDrivers
 from ganlane.settings.driving import IdmParameters, MobilParameters, RandomDrivers
-from ganlane.settings.record import Range
 from ganlane.sim.dynamics import STEERING, SteeringParameters, drive
 from ganlane.sim.idm import TABLE_V, AnyIdm, DriverIdm, following_acceleration, needed_deceleration
 from ganlane.sim.mobil import TABLE_IV, mobil_changes, yielding
 from ganlane.sim.neighbours import Scene, in_lane, perceive
-from ganlane.sim.random import Purpose, Stream, absorb
+from ganlane.sim.random import Purpose, Stream, absorb, in_range
 from ganlane.sim.state import Road, Vehicles, reads_are_cheap
-from ganlane.traffic.base import Memory, Moved, TrafficModule, uniforms
+from ganlane.traffic.base import Entered, Memory, Moved, TrafficModule, uniforms
 
 #: MOBIL decides once a second of simulated time, whatever the ego's decision period.
 MOBIL_PERIOD_STEPS = 10
@@ -200,11 +198,6 @@ def start_braking(
     return torch.where(ahead, needed, 0.0).amax(-1)
 
 
-def in_range(u: Tensor, bounds: Range) -> Tensor:
-    """Uniform numbers in [0, 1) scaled to ``bounds``."""
-    return bounds[0] + u * (bounds[1] - bounds[0])
-
-
 class IdmRandomTraffic(IdmMobilTraffic):
     """``traffic=idm_random``: IDM and MOBIL, each driver with its own parameters for the whole
     episode.
@@ -267,9 +260,7 @@ class IdmRandomTraffic(IdmMobilTraffic):
             phase_two=2.0 * math.pi * u[10],
         )
 
-    def enter(
-        self, vehicles: Vehicles, key: Tensor, episode: Tensor
-    ) -> tuple[Vehicles, TensorDictBase]:
+    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> Entered:
         """Gives every driver but the ego its own desired speed."""
         (u,) = uniforms(vehicles, absorb(key, 0), -1, _DESIRED_SPEED)
         # The ego's is the environment's.

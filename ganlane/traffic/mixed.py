@@ -14,12 +14,12 @@ from torch import Tensor
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.keys import EGO_INDEX
 from ganlane.native.drivers import Drivers, blind, mixed_drivers
 from ganlane.settings.traffic import interleaved
 from ganlane.sim.random import Purpose, absorb, uniform
 from ganlane.sim.state import VISIBILITY_OF_EPISODE, Vehicles
 from ganlane.traffic.base import (
+    Entered,
     TrafficModule,
     TrafficParts,
     key_of,
@@ -132,9 +132,7 @@ class MixedTraffic(TrafficParts):
         tensordict.set(keys.MOVED, moved)
         return tensordict.set(keys.TRAFFIC, new_tensordict(new_memories, len(key)))
 
-    def enter(
-        self, vehicles: Vehicles, key: Tensor, episode: Tensor
-    ) -> tuple[Vehicles, TensorDictBase]:
+    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> Entered:
         """Every row by its part; the memory of the other parts is zero there."""
         (n, m), x = vehicles.x.shape, vehicles.x
         together = new_tensordict(vehicles.as_dict(), n)
@@ -221,12 +219,9 @@ class BlindTraffic(TrafficModule):
         # Drawn before the first step, by a key of its own. In float64, so that the same episodes
         # are blind in runs of either float type.
         u = uniform(absorb(key, 0), -1, 1, [Purpose.BLIND_EPISODE], torch.float64)[..., 0]
-        is_ego = torch.arange(vehicles.x.shape[1], device=key.device) == EGO_INDEX
-        return (u < self.blind_share) & is_ego
+        return (u < self.blind_share) & vehicles.is_ego()
 
-    def enter(
-        self, vehicles: Vehicles, key: Tensor, episode: Tensor
-    ) -> tuple[Vehicles, TensorDictBase]:
+    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> Entered:
         """As the model."""
         return self.model.enter(vehicles, key, episode)
 

@@ -381,7 +381,7 @@ class RecordedScenes:
         The ego at index 0 and x = 0.
         """
         scene = self.traffic.recorded(key, torch.zeros_like(key), self.vehicles, dtype)
-        is_ego = torch.arange(self.vehicles, device=key.device) == EGO_INDEX
+        is_ego = scene.is_ego()
         return scene.with_(
             desired_speed=torch.where(is_ego, self.ego_desired_speed_mps, scene.desired_speed),
             visibility=torch.where(is_ego, int(self.ego_visibility), scene.visibility),

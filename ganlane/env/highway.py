@@ -161,10 +161,8 @@ class HighwayEnv(EnvBase):
         spawn = self.spawn_parameters
         visibility = Visibility.named(self.ego.visibility)
         scenes = self.traffic.scenes(vehicles, visibility, spawn.ego_desired_speed_mps)
-        if scenes is None:
-            others = self.traffic.visibility
-            scenes = RandomScenes(self.road, vehicles, spawn, visibility, others)
-        return scenes
+        others = self.traffic.visibility
+        return scenes or RandomScenes(self.road, vehicles, spawn, visibility, others)
 
     def _check_parts(self, vehicles: int | None) -> None:
         """Raise :class:`UserError` for parts that do not fit; ``vehicles`` is as given by users."""
@@ -231,15 +229,14 @@ class HighwayEnv(EnvBase):
         self._seed = 0 if seed is None else seed_number(seed)
 
     def _episodes(
-        self, tensordict: TensorDictBase | None, next_episode: Tensor | None = None
+        self, tensordict: TensorDictBase | None, mask: Tensor | None, next_episode: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Seed and episode [N] of every row after this reset.
 
-        ``next_episode`` [N] applies to masked rows only.
+        ``next_episode`` [N] applies to rows of the ``mask`` [N] only.
         """
         # What TorchRL hands in: nothing, a mask, counters, or counters and a mask.
         n = self.batch_size[0]
-        mask = None if tensordict is None else tensordict.get("_reset", None)
         if tensordict is not None and keys.EPISODE in tensordict:
             seed = check_counter(keys.SEED, tensordict.get(keys.SEED, None), n)
             last = check_counter(keys.EPISODE, tensordict.get(keys.EPISODE), n)
@@ -256,7 +253,7 @@ class HighwayEnv(EnvBase):
         following = last + n
         if next_episode is not None:
             following = check_counter("next_episode", next_episode, n)
-        return seed, torch.where(mask.reshape(n), following, last)
+        return seed, torch.where(mask, following, last)
 
     def _reset(
         self,
@@ -265,9 +262,9 @@ class HighwayEnv(EnvBase):
         **kwargs: object,
     ) -> TensorDictBase:
         """All rows at the start of their episodes; EnvBase keeps the rows that go on."""
-        seed, episode = self.last_episodes = self._episodes(tensordict, next_episode)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = None if mask is None else mask.reshape(-1)
+        seed, episode = self.last_episodes = self._episodes(tensordict, mask, next_episode)
         if self._native_scenes is not None:
             # The kernel draws the masked rows alone.
             return self._native_scenes.start(seed, episode, mask)

@@ -41,8 +41,8 @@ from ganlane.sim.neighbours import Scene
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
 from ganlane.traffic.base import TrafficModule, memory_of, new_tensordict, where_rows, with_rows
 
-#: Name to tensor [N]: the ego's memory (:mod:`ganlane.env.state`).
-EgoMemory = dict[str, Tensor]
+#: Fields of the state by their names (:mod:`ganlane.env.state`), [N] or [N, 1].
+Fields = dict[str, Tensor]
 #: Called after every physics step with the vehicles and the rows [N] that were running in it.
 Recorder = Callable[[Vehicles, Tensor], None]
 
@@ -94,7 +94,7 @@ class Substep(NamedTuple):
 
 
 def begin(
-    rules: Rules, action: Tensor, vehicles: Vehicles, ego: EgoMemory, step: Tensor
+    rules: Rules, action: Tensor, vehicles: Vehicles, ego: Fields, step: Tensor
 ) -> tuple[Substep, Command]:
     """The first moment of a decision, before anything moves.
 
@@ -103,12 +103,11 @@ def begin(
     # The command sets the lane that the ego steers to; the motion itself takes several decisions.
     road = rules.road
     direction = ego["change_direction"]
-    line = acceleration = None
+    controls = None
     if rules.actions.form == CONTINUOUS:
         period_s = rules.episode.decision_period_s
-        command, line, acceleration = apply_controls(
-            action, vehicles, direction, road, rules.actions, period_s
-        )
+        controls = apply_controls(action, vehicles, direction, road, rules.actions, period_s)
+        command = controls.command
     else:
         command = apply_action(action, vehicles, direction, road, rules.ego.abort_lane_change)
     if rules.actions.form == LANE_SPEED:
@@ -117,9 +116,10 @@ def begin(
         speed = commanded_speed(action, ego[keys.SET_SPEED], desired[:, EGO_INDEX], rules.actions)
         vehicles = vehicles.with_(desired_speed=with_ego(speed, desired))
     vehicles = vehicles.with_(target_lane=with_ego(command.target_lane, vehicles.target_lane))
-    if line is None:
+    if controls is not None:
+        line, acceleration = controls.line, controls.acceleration
+    else:
         line = road.centre_of(command.target_lane[:, None], vehicles.y.dtype)[:, 0]
-    if acceleration is None:
         scene = ego_scene(vehicles, road)
         acceleration = following_acceleration(scene, rules.idm)[:, 0]
         acceleration = before_change(rules, scene, acceleration)
@@ -229,8 +229,8 @@ def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -
 
 
 def remember(
-    rules: Rules, before: EgoMemory, start: Substep, end: Substep, command: Command
-) -> EgoMemory:
+    rules: Rules, before: Fields, start: Substep, end: Substep, command: Command
+) -> Fields:
     """The ego's memory after a decision from ``start`` to ``end``."""
     # Over the whole decision, which may have ended early.
     ego = end.vehicles.at(EGO_INDEX)
@@ -257,7 +257,7 @@ def remember(
     return memory
 
 
-def outcome(rules: Rules, end: Substep) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+def outcome(rules: Rules, end: Substep) -> tuple[Fields, Fields]:
     """Events and done flags of a decision, each [N, 1]; every end has exactly one reason."""
     # Outcomes of the driving.
     terminated = end.goal | end.hard_crash | end.missed_exit | end.out_of_road
@@ -278,7 +278,7 @@ def outcome(rules: Rules, end: Substep) -> tuple[dict[str, Tensor], dict[str, Te
     return _columns(events), _columns(flags)
 
 
-def _columns(values: dict[str, Tensor]) -> dict[str, Tensor]:
+def _columns(values: Fields) -> Fields:
     return {name: value[:, None] for name, value in values.items()}
 
 

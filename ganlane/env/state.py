@@ -146,12 +146,20 @@ def checked_action(
     """
     if action is None:
         raise UserError(f"step(): no action; give 'action', {_expected(rows, actions)}.")
-    if not actions.names:
-        return _checked_controls(action, rows, actions)
-    count = len(actions.names)
+    numbered = bool(actions.names)
     # Flags and floats would be cast without a word.
-    if action.shape != (rows,) or action.is_floating_point() or action.dtype == torch.bool:
+    floating = action.is_floating_point()
+    fits = not (floating or action.dtype == torch.bool) if numbered else floating
+    if action.shape != ((rows,) if numbered else (rows, CONTROLS)) or not fits:
         raise _refused(f"of shape {list(action.shape)} in {action.dtype}", rows, actions)
+    if not numbered:
+        finite = torch.isfinite(action).all()
+        if torch.compiler.is_compiling():
+            torch._assert_async(finite, "action: each number must be finite")
+        elif not finite:
+            raise _refused("with a number that is not finite", rows, actions)
+        return action
+    count = len(actions.names)
     action = action.long()
     if torch.compiler.is_compiling():
         # A graph cannot branch on values.
@@ -163,17 +171,6 @@ def checked_action(
         wrong = numbers.view(np.uint64) >= count
         if wrong.any():
             raise _refused(str(numbers[wrong][0]), rows, actions)
-    return action
-
-
-def _checked_controls(action: Tensor, rows: int, actions: ActionParameters) -> Tensor:
-    if action.shape != (rows, CONTROLS) or not action.is_floating_point():
-        raise _refused(f"of shape {list(action.shape)} in {action.dtype}", rows, actions)
-    finite = torch.isfinite(action).all()
-    if torch.compiler.is_compiling():
-        torch._assert_async(finite, "action: each number must be finite")
-    elif not finite:
-        raise _refused("with a number that is not finite", rows, actions)
     return action
 
 

@@ -200,7 +200,7 @@ def leader(scene: Scene, lane: Tensor) -> Neighbour:
         its_speed = _unordered((key & 0xFFFFFFFF) + _INT32_MIN)
     gap = _gap(scene, rear, 1)
     its_speed = torch.where(gap < FREE_GAP_M, its_speed, scene.observers.speed[..., None])
-    return Neighbour(gap.view(lane.shape), its_speed.view(lane.shape))
+    return Neighbour(gap.view_as(lane), its_speed.view_as(lane))
 
 
 def follower(scene: Scene, lane: Tensor) -> Follower:
@@ -211,11 +211,11 @@ def follower(scene: Scene, lane: Tensor) -> Follower:
     lanes = lane[..., None] if lane.ndim == 2 else lane
     vehicles = scene.vehicles
     gap, index = nearest(scene, lanes, -1)
-    gap = gap.view(lane.shape)
+    gap = gap.view_as(lane)
     # What else is known of the vehicle that was found.
     flat = index.flatten(1)
-    speed = vehicles.speed.gather(1, flat).view(lane.shape)
-    desired_speed = vehicles.desired_speed.gather(1, flat).view(lane.shape)
+    speed = vehicles.speed.gather(1, flat).view_as(lane)
+    desired_speed = vehicles.desired_speed.gather(1, flat).view_as(lane)
     return Follower(gap, speed, desired_speed, gap < FREE_GAP_M)
 
 
@@ -304,7 +304,7 @@ def _nearest_key(
     nearest = before.cummin(-1).values.transpose(0, 1).flatten(1)
     # Place of the observer's entry: lane by lane, as many entries as vehicles.
     entry = lane.clamp(0, lanes - 1).long() * count + place[..., None]
-    neighbour = nearest.gather(1, entry.flatten(1)).view(lane.shape)
+    neighbour = nearest.gather(1, entry.flatten(1)).view_as(lane)
     return torch.where((lane >= 0) & (lane < lanes), neighbour, _NOBODY)
 
 

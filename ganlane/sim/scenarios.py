@@ -12,7 +12,7 @@ from itertools import accumulate
 
 from ganlane.errors import UserError
 from ganlane.settings.driving import IdmParameters
-from ganlane.sim.scenes import SceneVehicle
+from ganlane.sim.scenes import SceneVehicle, SceneVehicles
 
 #: Length of every vehicle here, m: that of a car in SpawnParameters.
 LENGTH_M = 4.5
@@ -30,7 +30,7 @@ def stalled(x_m: float, lane: int, lane_width_m: float) -> SceneVehicle:
 
 def cut_in(
     gap_m: float, speed_mps: float, cutter_speed_mps: float, lanes: int, desired_speed_mps: float
-) -> tuple[SceneVehicle, ...]:
+) -> SceneVehicles:
     """A slower vehicle one lane to the left, ``gap_m`` ahead of the ego's bumper, moves into its
     lane at once.
 
@@ -64,7 +64,7 @@ def stalled_car(
     lanes: int,
     desired_speed_mps: float,
     lane_width_m: float,
-) -> tuple[SceneVehicle, ...]:
+) -> SceneVehicles:
     """A broken-down vehicle ``distance_m`` ahead in the ego's lane, the rightmost.
 
     A vehicle follows the ego, and five vehicles ``spacing_m`` apart pass in the next lane, if there
@@ -87,7 +87,7 @@ def blocked_lane(
     lanes: int,
     desired_speed_mps: float,
     lane_width_m: float,
-) -> tuple[SceneVehicle, ...]:
+) -> SceneVehicles:
     """The rightmost lane is closed by ``standing`` vehicles in a row, from ``distance_m`` on; the
     others are open.
 
@@ -111,7 +111,7 @@ def _column(
     spacing_m: float,
     speed_mps: float,
     desired_speed_mps: float | None = None,
-) -> tuple[SceneVehicle, ...]:
+) -> SceneVehicles:
     """Vehicles in one lane, from ``first_m`` backwards.
 
     Without a desired speed they would like to be in turn as fast, 10 % and 20 % faster.
@@ -130,7 +130,7 @@ def stop_and_go(
     lanes: int,
     desired_speed_mps: float,
     idm: IdmParameters,
-) -> tuple[SceneVehicle, ...]:
+) -> SceneVehicles:
     """Columns in every lane, of alternately ``per_wave`` stopped and ``per_wave`` moving vehicles.
 
     From the head: two moving vehicles, then ``waves`` times a stopped queue at IDM's minimum gap
@@ -163,7 +163,7 @@ def stop_and_go(
 
 def merge(
     ego_speed_mps: float, speed_mps: float, spacing_m: float, lanes: int, desired_speed_mps: float
-) -> tuple[SceneVehicle, ...]:
+) -> SceneVehicles:
     """The ego alone on the rightmost lane, an on-ramp; ten vehicles ``spacing_m`` apart in each of
     the others, a third of them ahead of it.
     """
@@ -179,7 +179,7 @@ def on_ramp(
     spacing_m: float,
     lanes: int,
     desired_speed_mps: float,
-) -> tuple[SceneVehicle, ...]:
+) -> SceneVehicles:
     """Six vehicles ``ramp_spacing_m`` apart on the rightmost lane, an on-ramp, three of them ahead
     of the ego in the lane beside it; seven ``spacing_m`` apart in every other lane, and six in its
     own.
@@ -192,7 +192,7 @@ def on_ramp(
 
 def lane_drop(
     speed_mps: float, spacing_m: float, lanes: int, desired_speed_mps: float
-) -> tuple[SceneVehicle, ...]:
+) -> SceneVehicles:
     """The ego in the leftmost lane, which ends; seven vehicles ``spacing_m`` apart in every other
     lane, and six in its own.
     """
@@ -203,7 +203,7 @@ def lane_drop(
 
 def exit(
     speed_mps: float, faster_mps: float, spacing_m: float, lanes: int, desired_speed_mps: float
-) -> tuple[SceneVehicle, ...]:
+) -> SceneVehicles:
     """The ego in the leftmost lane; eight vehicles ``spacing_m`` apart in every other lane and
     seven in its own, but none in the rightmost, the exit lane.
 
@@ -223,7 +223,7 @@ def _around(
     spacing_m: float,
     speed_mps: float,
     faster_mps: float = 0.0,
-) -> tuple[SceneVehicle, ...]:
+) -> SceneVehicles:
     """A :func:`_column` in each of the ``lanes``, the first one ``ahead`` spacings before the ego.
 
     Neighbouring lanes are staggered by half of the spacing. In its own lane the ego has the place

@@ -104,6 +104,10 @@ class SceneVehicle:
         return int(road.lane_of(torch.tensor(self.y_on(road), dtype=torch.float64)))
 
 
+#: Those of a scene, the ego first.
+SceneVehicles = tuple[SceneVehicle, ...]
+
+
 @dataclass(frozen=True)
 class FixedScene:
     """The same scene in every episode, or with small variations; the first vehicle is the ego.
@@ -123,7 +127,7 @@ class FixedScene:
             :meth:`check` also raises it for scenes in which crashes are unavoidable.
     """
 
-    rows: tuple[SceneVehicle, ...]
+    rows: SceneVehicles
     road: Road = STRAIGHT
     jitter_m: float = 0.0
     jitter_mps: float = 0.0
@@ -222,7 +226,7 @@ class FixedScene:
         return f"{name} ({origin})" if origin else name
 
 
-def with_waiting(rows: tuple[SceneVehicle, ...], road: Road) -> tuple[SceneVehicle, ...]:
+def with_waiting(rows: SceneVehicles, road: Road) -> SceneVehicles:
     """``rows``, and with a flow its slots: drivers like the others of the scene in turn, beyond the
     end of the section at their desired speeds, in a lane that goes on.
     """

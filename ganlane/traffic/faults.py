@@ -86,10 +86,6 @@ class Fault(Overlay, Generic[Faults]):
         super().__init__(road, stream)
         self.faults: Faults = faults or self.kind()
 
-    def draw(self, vehicles: Vehicles, key: Tensor, step: Tensor) -> Tensor:
-        """A uniform number per vehicle, [N, M]."""
-        return uniforms(vehicles, key, step, self.purpose)[0]
-
 
 class TimedFault(Fault[Timed]):
     """A fault that lasts. Memory: ``left``, its remaining steps."""
@@ -99,7 +95,8 @@ class TimedFault(Fault[Timed]):
 
         A fault begins where there is none, at a constant hazard.
         """
-        comes = self.draw(vehicles, key, step) < chance_in_step(self.faults.per_hour)
+        (u,) = uniforms(vehicles, key, step, self.purpose)
+        comes = u < chance_in_step(self.faults.per_hour)
         # A fault that lasts is not prolonged by a second one.
         begins = (left == 0) & other_drivers(vehicles) & comes
         return torch.where(begins, round(self.faults.lasts_s / self.dt), left)
@@ -184,7 +181,7 @@ class HesitantLaneChange(Fault[HesitationFaults]):
     ) -> Moved:
         """Reduce the lateral motion of hesitant changes."""
         begins = starting(vehicles, moved)
-        u = self.draw(vehicles, key, step)
+        (u,) = uniforms(vehicles, key, step, self.purpose)
         # Decided once, when the change begins.
         hesitant = torch.where(begins, u < self.faults.share, memory["hesitant"])
         # From the position at t: only the step's lateral part shrinks.
@@ -214,7 +211,7 @@ class AbortedLaneChange(Fault[AbortFaults]):
     ) -> Moved:
         """Set the old lane as the target where the change has come far enough."""
         begins = starting(vehicles, moved)
-        u = self.draw(vehicles, key, step)
+        (u,) = uniforms(vehicles, key, step, self.purpose)
         # Where a change will be aborted, the lane to return to.
         chosen = torch.where(u < self.faults.share, vehicles.target_lane, _NO_LANE)
         origin = torch.where(begins, chosen, memory["origin"])

@@ -455,8 +455,10 @@ class HighwayEnv(EnvBase):
         return None
 
     def _kernel(self, drivers: Drivers, episode: EpisodeParameters) -> Kernel:
-        options = {"actions": self.actions, "mobil": self.rules.mobil}
-        return Kernel(self.road, self.vehicles, episode, self.ego, drivers, **options)
+        road, mobil = self.road, self.rules.mobil
+        return Kernel(
+            road, self.vehicles, episode, self.ego, drivers, actions=self.actions, mobil=mobil
+        )
 
     def _recycling_rows(self, key: Tensor) -> Tensor:
         """The rows [N] bool whose episodes, with ``key`` [N], recycle."""

@@ -64,6 +64,7 @@ def first_state(
     column = row[:, None]
     ego = {name: row.to(kind or row.dtype) for name, kind in EGO.items()}
     if actions.form == LANE_SPEED:
+        # The speed aimed at, m/s.
         ego[keys.SET_SPEED] = vehicles.desired_speed[:, keys.EGO_INDEX].clone()
     events = {name: column.to(kind) for name, kind in EVENTS.items()}
     done = {name: column.to(kind) for name, kind in DONE.items()}

@@ -30,17 +30,15 @@ class DriverIdm(NamedTuple):
 
     def per_lane(self) -> DriverIdm:
         """The parameters as [N, M, 1], to broadcast over lanes or pairs."""
-        return DriverIdm(
-            *(number[..., None] if isinstance(number, Tensor) else number for number in self)
+        return DriverIdm._make(
+            number[..., None] if isinstance(number, Tensor) else number for number in self
         )
 
     def of(self, rows: Tensor, columns: Tensor) -> DriverIdm:
         """The parameters of some drivers: indices [R], and [R, W] in these rows."""
-        return DriverIdm(
-            *(
-                number[rows].gather(1, columns) if isinstance(number, Tensor) else number
-                for number in self
-            )
+        return DriverIdm._make(
+            number[rows].gather(1, columns) if isinstance(number, Tensor) else number
+            for number in self
         )
 
     def brake_scale(self) -> Tensor | float:
@@ -172,13 +170,13 @@ def needed_deceleration(speed: Tensor, leader_speed: Tensor, gap: Tensor) -> Ten
 
 
 def _survives(
-    gap: Tensor | float,
-    speed: Tensor | float,
-    leader_speed: float,
-    desired_speed: float,
+    gap_m: Tensor | float,
+    speed_mps: Tensor | float,
+    leader_speed_mps: float,
+    desired_speed_mps: float,
     idm: IdmParameters,
 ) -> Tensor:
-    """Whether followers at ``speed``, m/s, avoid a leader that from now on brakes at the limit.
+    """Whether followers at ``speed_mps`` avoid a leader that from now on brakes at the limit.
 
     The limit is ``idm.min_acceleration``.
     Two vehicles, IDM, steps of 0.1 s. This leader is the worst of all that brake no harder than
@@ -186,12 +184,13 @@ def _survives(
     this one also avoids crashes in a queue, where each leader may have to brake for its own.
     """
     # In float64, since 600 steps add up and the result decides whether a scene is refused.
-    numbers = (torch.as_tensor(number).double() for number in (gap, speed, leader_speed))
+    start = (gap_m, speed_mps, leader_speed_mps)
+    numbers = [torch.as_tensor(number, dtype=torch.float64) for number in start]
     gap, speed, leader_now = torch.broadcast_tensors(*numbers)
-    smallest = start = gap
+    smallest = first = gap
     # Trapezoids, as vehicles move in the simulation (dynamics.advance).
     for _ in range(round(HORIZON_S / PHYSICS_STEP_S)):
-        acceleration = idm_acceleration(speed, desired_speed, gap, leader_now, idm)
+        acceleration = idm_acceleration(speed, desired_speed_mps, gap, leader_now, idm)
         next_speed = (speed + acceleration * PHYSICS_STEP_S).clamp_min(0.0)
         next_leader = (leader_now + idm.min_acceleration * PHYSICS_STEP_S).clamp_min(0.0)
         gap = gap + 0.5 * PHYSICS_STEP_S * (leader_now + next_leader - speed - next_speed)
@@ -199,7 +198,7 @@ def _survives(
         leader_now = next_leader
         smallest = torch.minimum(smallest, gap)
     # Where IDM's gap is cut off already at the start, it must only not shrink.
-    return smallest >= start.clamp(1e-9, SMALLEST_GAP_M)
+    return smallest >= first.clamp(1e-9, SMALLEST_GAP_M)
 
 
 @lru_cache(maxsize=1024)

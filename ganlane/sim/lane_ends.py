@@ -205,7 +205,7 @@ def from_start(stretches: RowStretches, start_m: Tensor, dtype: torch.dtype) -> 
 
     # All are places but the last, a number of lane changes.
     *places, changes = stretches
-    return RowStretches(*(moved(place_m) for place_m in places), changes.to(dtype))
+    return RowStretches._make([*(moved(place_m) for place_m in places), changes.to(dtype)])
 
 
 def stretches_of_row(stretches: RowStretches, row: int) -> Stretches:

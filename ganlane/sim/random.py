@@ -8,6 +8,7 @@ own with the finaliser of splitmix64 (Steele et al. 2014), so no two fields can 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from enum import IntEnum
 
 import torch
@@ -91,7 +92,7 @@ def episode_key(stream: int, seed: Tensor, episode: Tensor) -> Tensor:
     return absorb(absorb(absorb(start, 0), seed), episode)
 
 
-def draw_keys(key: Tensor, step: Tensor | int, vehicles: int, purposes: list[int]) -> Tensor:
+def draw_keys(key: Tensor, step: Tensor | int, vehicles: int, purposes: Sequence[int]) -> Tensor:
     """Keys [N, vehicles, len(purposes)] from episode keys [N] and physics steps [N] or one int."""
     # Field by field, from what all share to what is one number's own.
     at_step = absorb(key, step)
@@ -111,7 +112,7 @@ def uniform(
     key: Tensor,
     step: Tensor | int,
     vehicles: int,
-    purposes: list[int],
+    purposes: Sequence[int],
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
     """Uniform numbers in [0, 1), [N, vehicles, len(purposes)]: a step's purposes in one call."""
@@ -127,7 +128,7 @@ def normal(
     key: Tensor,
     step: Tensor | int,
     vehicles: int,
-    purposes: list[int],
+    purposes: Sequence[int],
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
     """Standard normal numbers, [N, vehicles, len(purposes)], by Box and Muller's transform.

@@ -167,7 +167,6 @@ class RandomScenes:
             Purpose.SPAWN_TRUCK,
         ]
         u, u_speed, u_desired, u_truck = uniform(key, 0, self.vehicles, drawn, dtype).unbind(-1)
-
         lane = draw_lanes(key, self.vehicles, int(self.road.lanes), p.lane_capacity())
         x, lane = ego_first(place_in_lanes(lane, u, p.spread_m, p.spacing_m), lane)
         is_ego = torch.arange(self.vehicles, device=key.device) == 0

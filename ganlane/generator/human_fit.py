@@ -23,11 +23,12 @@ from ganlane.generator.human import (
     ALONG,
     HumanPolicy,
     Memory,
+    Situation,
     cars,
     features_of,
+    lane_choice,
     leaves_room,
     perceive,
-    sides_of,
 )
 from ganlane.generator.human_estimator import HumanModel, fit_estimator
 from ganlane.generator.human_samples import (
@@ -332,23 +333,22 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
     vehicles = vehicles.with_(acceleration=before)
     view = perceive(vehicles, road)
     memory = memory._replace(closing=view.closing[..., None] + 0.3 * randn(*shape, 2))
-    sides = sides_of(vehicles, memory, road, view)
+    situation = Situation(vehicles, memory, road, view)
 
     time_to_collision = view.gap / (-view.closing).clamp_min(1e-3)
     silent = (speed > 19.0) | (speed < 1.5) | (view.gap > 80.0)
     silent |= (time_to_collision < 4.0) | (view.gap / speed.clamp_min(1.0) < 0.5)
     # Few overlap.
     silent &= ~((view.gap < 0.0) & (rand() < 0.8))
-    off_target = vehicles.y - target * 3.6
-    far_off = off_target.abs() > 0.75
+    far_off = (y - road.centre_of(target)).abs() > 0.75
 
     # Half of the way to IDM's acceleration, all of it where that is hard braking.
     hard = wanted < -2.0
     change = torch.where(hard, 1.0, 0.5) * (wanted - before)
     change = change + torch.where(hard, 0.05, 0.18) * randn()
-    back = (-0.45 * (vehicles.y - lane * 3.6)).clamp(-0.9, 0.9)
+    back = (-0.45 * (y - road.centre_of(lane))).clamp(-0.9, 0.9)
     sideways = 0.4 * (back - aside) + 0.03 * randn()
     lateral_weight = torch.where(far_off, 0.5, 0.1)
-    features = features_of(vehicles, memory, road, view)
-    moves = Moves(features, change, sideways, silent.float(), lateral_weight)
+    moves = Moves(features_of(situation), change, sideways, silent.float(), lateral_weight)
+    sides = lane_choice(situation).sides
     return moves.rows(silent | far_off), sides[~leaves_room(sides) & view.exists]

@@ -23,7 +23,7 @@ from ganlane.generator.human import (
     DECISION_S,
     SIGHT_M,
     STEPS,
-    Memory,
+    Situation,
     bounded,
     cars,
     chosen,
@@ -31,12 +31,9 @@ from ganlane.generator.human import (
     lane_after,
     lane_choice,
     moved,
-    perceive,
     remembered,
-    sides_of,
-    velocity,
+    situation_of,
     with_choice,
-    with_style,
 )
 from ganlane.generator.human_estimator import (
     DIFFERENCE_SCALE,
@@ -56,7 +53,6 @@ from ganlane.generator.windows import (
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.driving import HumanVariation
 from ganlane.settings.generator import HumanConfig
-from ganlane.sim.state import Road, Vehicles
 
 #: A driver's desired speed is its present one and this much, m/s.
 DESIRED_ABOVE_MPS = 4.0
@@ -72,8 +68,8 @@ NOISE_SHARES = (0.0, 0.5, 1.0, 1.2)
 OBSERVER_STRIDE, OBSERVER_BATCH, OBSERVER_RATE = 2, 512, 3e-3
 
 
-def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memory, Road]:
-    """Vehicles and memories at the present of segments [B, V].
+def present_of(estimator: Estimator, segments: Segments) -> Situation:
+    """The drivers at the present of segments [B, V].
 
     Who was not recorded in all of the nine frames goes on at constant velocity so far.
     """
@@ -85,10 +81,10 @@ def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memo
     speed = torch.where(whole, motion[..., 0], latest).clamp_min(0.0)
     aside = motion[..., 3]
     x, y = (last + motion[..., 5:]).unbind(-1)
-    road = Road(segments.lanes.float(), segments.lane_width)
+    road = segments.road
     lane = road.lane_of(y)
     # Who moves away from its lane's centre is on its way to the next lane.
-    leaving = (aside.abs() > CHANGING_MPS) & ((y - lane * road.lane_width_m) * aside > 0.1)
+    leaving = (aside.abs() > CHANGING_MPS) & ((y - road.centre_of(lane)) * aside > 0.1)
     vehicles = cars(
         x,
         y,
@@ -102,8 +98,7 @@ def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memo
         valid=segments.present[:, PRESENT],
     )
     memory = present_memory(motion, torch.where(whole, trust(nine), 0.0))
-    view = perceive(vehicles, road)
-    return vehicles, with_style(memory, view, torch.ones_like(whole)), road
+    return situation_of(vehicles, memory, road, first=torch.ones_like(whole))
 
 
 @torch.no_grad()
@@ -134,43 +129,36 @@ def _driven(
     """Positions [1 + samples, B, horizon, V, 2]; the first are the mean driver's."""
     policy = model.policy
     runs, rows = 1 + samples, len(segments.positions)
-    vehicles, memory, road = present_of(model.estimator, segments.repeated(runs))
+    situation = present_of(model.estimator, segments.repeated(runs))
     # The first copy of the segments makes the expected moves, the others draw theirs.
-    mean = torch.zeros_like(vehicles.valid)
+    mean = torch.zeros_like(situation.vehicles.valid)
     mean[:rows] = True
-    view = perceive(vehicles, road)
-    leads = view.gap >= SIGHT_M
+    leads = situation.view.gap >= SIGHT_M
     temperature = HumanVariation.temperature
-    steps = torch.arange(1, STEPS + 1) * PHYSICS_STEP_S
+    steps = (torch.arange(1, STEPS + 1) * PHYSICS_STEP_S)[:, None, None]
     course = []
-    for decision in range(-(-horizon // STEPS)):
-        # The present's style is that of the nine positions.
-        if decision:
-            view = perceive(vehicles, road)
-            memory = with_style(memory, view)
-        option = lane_choice(vehicles, view, sides_of(vehicles, memory, road, view))
-        chances = policy.lane_chances(option, HumanVariation.lane_changes)
+    for _ in range(-(-horizon // STEPS)):
+        chances = policy.lane_chances(lane_choice(situation), HumanVariation.lane_changes)
         # The mean driver goes on as it does.
         choice = chosen(chances, torch.rand(mean.shape, generator=random)).masked_fill(mean, 0)
-        vehicles, memory = with_choice(vehicles, memory, view, choice)
+        situation = with_choice(situation, choice)
         changes = []
-        features = features_of(vehicles, memory, road, view)
-        for tokens, logits in zip((ALONG, ACROSS), policy(features)):
+        for tokens, logits in zip((ALONG, ACROSS), policy(features_of(situation))):
             u = torch.rand(mean.shape, generator=random)
             drawn = tokens.sample(logits, u, temperature)
             changes.append(torch.where(mean, tokens.mean(logits), drawn))
+        vehicles, memory, road, view = situation
         # A policy that sees no leader would speed up.
         fading = (LEFT_OF_ACCELERATION - 1.0) * memory.accelerations[..., 0]
         changes[0] = torch.where(leads, fading, changes[0])
-        acceleration, aside = bounded(vehicles, memory, road, *changes)
-        speed, lateral = velocity(vehicles)
+        acceleration, aside = bounded(situation, *changes)
         # Within a decision: constant acceleration, the lateral speed changing evenly.
-        half = 0.5 * steps[:, None, None] ** 2
-        x = vehicles.x + speed * steps[:, None, None] + half * acceleration
-        y = vehicles.y + lateral * steps[:, None, None] + half * (aside - lateral) / DECISION_S
+        half = 0.5 * steps**2
+        x = vehicles.x + view.speed * steps + half * acceleration
+        y = vehicles.y + view.aside * steps + half * (aside - view.aside) / DECISION_S
         course.append(torch.stack((x, y), -1))
-        memory = remembered(vehicles, memory, view, acceleration)
-        vehicles = moved(vehicles, acceleration, aside)
+        later = moved(vehicles, acceleration, aside)
+        situation = situation_of(later, remembered(situation, acceleration), road)
     positions = torch.cat(course)[:horizon]
     positions = positions.transpose(0, 1).unflatten(0, (runs, rows))
     return positions + _seen_besides(model, segments, positions[0])

@@ -31,17 +31,15 @@ from ganlane.generator.human import (
     HumanPolicy,
     LaneChoice,
     Memory,
+    Situation,
     bounded,
     cars,
     features_of,
     lane_choice,
     memory_of,
     moved,
-    perceive,
     remembered,
-    sides_of,
-    velocity,
-    with_style,
+    situation_of,
     with_velocity,
 )
 from ganlane.generator.human_estimator import Estimator, present_memory, trust
@@ -437,26 +435,24 @@ def _samples(segments: Segments, options: Options, random: torch.Generator) -> S
         memory = _taken(memory, its_memory, replace)._replace(since=since)
         if options.estimator is not None and decision == 0:
             vehicles, memory = _estimated(s, vehicles, memory, options.estimator, random)
-        view = perceive(vehicles, s.road, sides_seen)
-        memory = with_style(memory, view, first)
-        features = features_of(vehicles, memory, s.road, view)
+        situation = situation_of(vehicles, memory, s.road, sides_seen, first)
+        features = features_of(situation)
         # What should follow: the recorded move, corrected towards the recording.
-        change, aside = _led_back(s, now, vehicles, memory)
+        change, aside = _led_back(s, now, situation)
         follows = s.present[:, now + STEPS] & present & s.driven
         # A driver that has just come knows no acceleration of its own yet.
         counts = follows & (memory.age > 0) if options.policy is None else follows
         weight = s.weight.expand_as(change)
         moves = Moves(features, change, aside, weight, weight * s.two_dimensional)
         step = s.target[:, now + STEPS] - vehicles.target_lane
-        choice = lane_choice(vehicles, view, sides_of(vehicles, memory, s.road, view))
-        choices = _choices(choice, follows & s.two_dimensional, step)
+        choices = _choices(lane_choice(situation), follows & s.two_dimensional, step)
         parts.append(Samples(moves.rows(counts), choices))
         # In closed loop the policy makes the move itself, so that it sees its own mistakes.
         if options.policy is not None:
             change, aside = _nearest_move(options, features, change, aside, random)
             aside = torch.where(s.two_dimensional, aside, 0.0)
-        acceleration, lateral = bounded(vehicles, memory, s.road, change, aside)
-        memory = remembered(vehicles, memory, view, acceleration)
+        acceleration, lateral = bounded(situation, change, aside)
+        memory = remembered(situation, acceleration)
         vehicles = moved(vehicles, acceleration, lateral)
     return joined(parts)
 
@@ -524,17 +520,17 @@ def _taken(memory: Memory, other: Memory, where: Tensor) -> Memory:
     )
 
 
-def _led_back(s: Segments, now: int, vehicles: Vehicles, memory: Memory) -> tuple[Tensor, Tensor]:
+def _led_back(s: Segments, now: int, situation: Situation) -> tuple[Tensor, Tensor]:
     """Changes of acceleration and lateral speed that follow the recording, or lead back to it."""
-    speed, lateral = velocity(vehicles)
+    vehicles, memory, _, view = situation
     recorded_acceleration = (s.speed[:, now + STEPS] - s.speed[:, now]) / DECISION_S
     wanted = (
         recorded_acceleration
-        + SPEED_GAIN * (s.speed[:, now] - speed)
+        + SPEED_GAIN * (s.speed[:, now] - view.speed)
         + PLACE_GAIN * (s.x[:, now] - vehicles.x)
     ).clamp(HARDEST_BRAKING, STRONGEST_ACCELERATION)
     wanted_aside = s.lateral_speed[:, now + STEPS] + LATERAL_GAIN * (s.y[:, now] - vehicles.y)
-    return wanted - memory.accelerations[..., 0], wanted_aside - lateral
+    return wanted - memory.accelerations[..., 0], wanted_aside - view.aside
 
 
 def _nearest_move(

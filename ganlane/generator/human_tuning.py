@@ -39,7 +39,7 @@ from ganlane.generator.human import (
     moved,
     perceive,
     remembered,
-    sides_of,
+    situation_of,
     velocity,
     with_choice,
     with_style,
@@ -284,16 +284,16 @@ def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> De
     rand, _ = draws(vehicles.x.shape, random)
     steps: list[Decisions] = []
     for _ in range(DECISIONS):
-        view = perceive(vehicles, road)
-        memory = with_style(memory, view)
-        choice = lane_choice(vehicles, view, sides_of(vehicles, memory, road, view))
+        situation = situation_of(vehicles, memory, road)
+        choice = lane_choice(situation)
         chances = policy.lane_chances(choice)
         lane = torch.multinomial(chances.flatten(0, 1), 1, generator=random).view(vehicles.x.shape)
         others = strangers.choices(choice, rand(), rand())
         lane = torch.where(strangers.there, others, lane)
-        vehicles, memory = with_choice(vehicles, memory, view, lane)
+        situation = with_choice(situation, lane)
+        vehicles, view = situation.vehicles, situation.view
         # The moves follow the choice.
-        features = features_of(vehicles, memory, road, view)
+        features = features_of(situation)
         logits = policy(features)
         tokens, changed = [], []
         for axis, its_logits in zip((ALONG, ACROSS), logits):
@@ -303,11 +303,11 @@ def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> De
             jitter = torch.rand(token.shape, generator=random) - 0.5
             tokens.append(token)
             changed.append(axis.value(token + jitter))
-        acceleration, aside = bounded(vehicles, memory, road, *changed)
+        acceleration, aside = bounded(situation, *changed)
         theirs = strangers.moves(vehicles, road)
         acceleration = torch.where(strangers.there, theirs[0], acceleration)
         aside = torch.where(strangers.there, theirs[1], aside)
-        memory = remembered(vehicles, memory, view, acceleration)
+        memory = remembered(situation, acceleration)
         later = moved(vehicles, acceleration, aside)
         cost, hit = costs(later, road, view.gap)
         # Who has collided leaves the scene.

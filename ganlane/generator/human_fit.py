@@ -13,10 +13,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import softplus
 
 from ganlane.data.dense import Recording
+from ganlane.generator.descent import descend, half_cosine
 from ganlane.generator.human import (
     ACCELERATIONS,
     ACROSS,
@@ -124,34 +125,20 @@ def fit_human(
         material = material_of(scenes, random)
         # Lane changes are few: none of them is hidden, as the sides are from some of the moves.
         choices = _gathered(material, Options(blind=0.0), config, random, times=2).choices
-        teacher = clone(model.policy, material, choices, config, random)
+        teacher = _gathered(material, Options(), config, random, times=3).moves
+        policy, danger = model.policy, material.danger
+        for rate in (config.learning_rate, 0.5 * config.learning_rate):
+            train_moves(policy, teacher, material.prior, max(1, config.epochs // 2), rate, random)
+        train_lane_choice(policy, choices, danger, random)
+        match_rate(policy, choices)
         report(None)
         close_the_loop(model, material, teacher, config, random, report)
-        policy, danger = model.policy, material.danger
         tune(policy, choices, danger, config.tuning, config.pull, random, report)
         match_rate(policy, choices)
         # More lane changes bring new accidents: it learns to do without them at this level.
         pull = SETTLING_TIMES * config.pull
         tune(policy, None, danger, config.settling, pull, random, report)
         return model.eval().requires_grad_(False)
-
-
-def clone(
-    policy: HumanPolicy,
-    material: Material,
-    choices: Choices,
-    config: HumanConfig,
-    random: torch.Generator,
-) -> Moves:
-    """Fit ``policy`` to what recorded drivers did, its lane choice to ``choices``; gives the
-    teacher samples of moves.
-    """
-    moves = _gathered(material, Options(), config, random, times=3).moves
-    for rate in (config.learning_rate, 0.5 * config.learning_rate):
-        train_moves(policy, moves, material.prior, max(1, config.epochs // 2), rate, random)
-    train_lane_choice(policy, choices, material.danger, random)
-    match_rate(policy, choices)
-    return moves
 
 
 def close_the_loop(
@@ -168,9 +155,8 @@ def close_the_loop(
     noisy = options._replace(estimator=model.estimator)
     for number in range(config.rounds):
         # Long stretches begin as recorded, short ones as nine noisy positions show drivers.
-        parts = _gathered(material, options, config, random, times=2)
-        short = samples_of(material.short, noisy, random)
-        latest = joined([parts, short]).moves
+        long = _gathered(material, options, config, random, times=2)
+        latest = joined([long, samples_of(material.short, noisy, random)]).moves
         bank = [*bank[-1:], latest]
         rows = torch.randperm(len(teacher.change), generator=random)[: len(latest.change)]
         moves = Moves(*map(torch.cat, zip(teacher.rows(rows), *bank)))
@@ -210,12 +196,7 @@ def train_moves(
     optimizer = torch.optim.AdamW(parameters, lr=rate, weight_decay=1e-3, fused=True)
     rows = len(moves.change)
     updates = max(1, epochs * (rows // BATCH))
-
-    def share(update: int) -> float:
-        # A short warm-up, then a half cosine to 0.
-        return min(1.0, (update + 1) / 100) * 0.5 * (1.0 + math.cos(math.pi * update / updates))
-
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, share)
+    update = 0
     for _ in range(epochs):
         for batch in torch.randperm(rows, generator=random).split(BATCH):
             beside = int(PRIOR_SHARE * len(batch))
@@ -226,11 +207,11 @@ def train_moves(
             losses = -(ALONG.soft_target(both.change) * along.log_softmax(-1)).sum(-1)
             lateral = -(ACROSS.soft_target(both.aside) * across.log_softmax(-1)).sum(-1)
             loss = (losses * both.weight + lateral * both.lateral_weight).mean()
-            optimizer.zero_grad()
-            loss.backward()
-            nn.utils.clip_grad_norm_(parameters, 5.0)
-            optimizer.step()
-            schedule.step()
+            # A short warm-up, then a half cosine to 0.
+            rise = min(1.0, (update + 1) / 100)
+            optimizer.param_groups[0]["lr"] = rate * (rise * half_cosine(update, updates))
+            descend(optimizer, loss, 5.0)
+            update += 1
 
 
 def train_lane_choice(
@@ -265,9 +246,7 @@ def train_lane_choice(
         loss = loss + softplus(-in_danger[:, 1]).mean()
         if len(under_way):
             loss = loss + 2.0 * softplus(policy.lane(under_way)[:, 1] + 1.0).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+        descend(optimizer, loss)
 
 
 @torch.no_grad()

@@ -7,16 +7,15 @@ on the policy drives everybody in the scene, by expected moves (the mean driver)
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import smooth_l1_loss
 
 from ganlane.data.dense import Recording
-from ganlane.generator.forecasts import SAMPLES, Forecasts, by_kind, driven_windows
+from ganlane.generator.descent import descend, half_cosine
+from ganlane.generator.forecasts import Forecasts, driven_forecasts, driven_windows
 from ganlane.generator.human import (
     ACROSS,
     ALONG,
@@ -39,7 +38,9 @@ from ganlane.generator.human_estimator import (
     DIFFERENCE_SCALE,
     Estimator,
     HumanModel,
+    error_in,
     present_memory,
+    random_sides,
     trust,
 )
 from ganlane.generator.human_samples import DESIRED_MPS, smooth_scene
@@ -48,7 +49,6 @@ from ganlane.generator.windows import (
     PREDICTED_STEPS,
     PRESENT,
     Segments,
-    cut_windows,
 )
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.driving import HumanVariation
@@ -103,11 +103,7 @@ def present_of(estimator: Estimator, segments: Segments) -> Situation:
 
 @torch.no_grad()
 def human_forecasts(
-    model: HumanModel,
-    scenes: list[Recording],
-    horizon: int,
-    stride: int,
-    samples: int = SAMPLES,
+    model: HumanModel, scenes: list[Recording], horizon: int, stride: int, samples: int
 ) -> Forecasts:
     """The mean driver's and drawn drivers' positions in all windows of the scenes."""
     random = torch.Generator().manual_seed(0)
@@ -115,8 +111,7 @@ def human_forecasts(
     def driver(segments: Segments) -> Tensor:
         return _driven(model, segments, horizon, samples, random)
 
-    forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
-    return by_kind(forecasts, cut_windows(scenes, stride, OBSERVED_POSITIONS + horizon).future)
+    return driven_forecasts(driver, scenes, horizon, stride, samples)
 
 
 def _driven(
@@ -159,8 +154,7 @@ def _driven(
         course.append(torch.stack((x, y), -1))
         later = moved(vehicles, acceleration, aside)
         situation = situation_of(later, remembered(situation, acceleration), road)
-    positions = torch.cat(course)[:horizon]
-    positions = positions.transpose(0, 1).unflatten(0, (runs, rows))
+    positions = torch.cat(course)[:horizon].transpose(0, 1).unflatten(0, (runs, rows))
     return positions + _seen_besides(model, segments, positions[0])
 
 
@@ -193,35 +187,24 @@ def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanCo
     model.observer.requires_grad_(True)
     for parameter in model.observer.layers[-1].parameters():
         nn.init.zeros_(parameter)
-    noisy = [_with_noise(scene, share, config) for share in NOISE_SHARES for scene in scenes]
+    smoothed = [smooth_scene(scene, config) for scene in scenes]
+    noisy = []
+    for share in NOISE_SHARES:
+        for scene, smooth in zip(scenes, smoothed):
+            x = smooth.x + share * (scene.x - smooth.x)
+            y = smooth.y + share * (scene.y - smooth.y)
+            noisy.append(replace(scene, x=x, y=y))
     with torch.no_grad():
         windows = driven_windows(recorded_and_driven, noisy, PREDICTED_STEPS, OBSERVER_STRIDE)[0]
     parts = (OBSERVED_POSITIONS, PREDICTED_STEPS, PREDICTED_STEPS)
     positions, wanted, forecast = torch.from_numpy(windows).float().split(parts, 1)
-    scale = torch.tensor(DIFFERENCE_SCALE)
     optimizer = torch.optim.AdamW(model.observer.parameters(), OBSERVER_RATE, weight_decay=1e-2)
     for update in range(config.observing):
-        share = 0.5 * (1.0 + math.cos(math.pi * update / config.observing))
-        optimizer.param_groups[0]["lr"] = OBSERVER_RATE * share
+        optimizer.param_groups[0]["lr"] = OBSERVER_RATE * half_cosine(update, config.observing)
         rows = torch.randint(len(wanted), (OBSERVER_BATCH,), generator=random)
-        # Left and right are alike.
-        side = torch.where(torch.rand(OBSERVER_BATCH, generator=random) < 0.5, -1.0, 1.0)
-        mirror = torch.stack((torch.ones_like(side), side), -1)[:, None]
+        side = random_sides(OBSERVER_BATCH, random)
+        mirror = torch.stack((torch.ones_like(side), side), -1)
         seen, ahead = mirror * positions[rows], mirror * forecast[rows]
         missed = mirror * wanted[rows] - ahead
-        error = (model.observer(seen, ahead) - missed) / scale
-        loss = smooth_l1_loss(error, torch.zeros_like(error))
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+        descend(optimizer, error_in(model.observer(seen, ahead) - missed, DIFFERENCE_SCALE))
     model.observer.requires_grad_(False)
-
-
-def _with_noise(scene: Recording, share: float, config: HumanConfig) -> Recording:
-    """The scene with a ``share`` of its camera's errors."""
-    smooth = smooth_scene(scene, config)
-    return replace(
-        scene,
-        x=smooth.x + share * (scene.x - smooth.x),
-        y=smooth.y + share * (scene.y - smooth.y),
-    )

@@ -87,7 +87,7 @@ def recorded(generator: Generator, displacements: Tensor) -> History:
 
     The oldest motion is repeated.
     """
-    motions = generator.encoder.project_course(displacements).unbind(dim=-2)
+    motions = generator.encoder.project_course(displacements)
     return History((motions[0], *motions), displacements[..., -1, :])
 
 
@@ -103,22 +103,10 @@ def push(
     return History((*history.motions[1:], new), displacement), difference
 
 
-def observe(
-    history: History,
-    difference: Tensor,
-    vehicles: Vehicles,
-    extra: Tensor,
-) -> Observation:
+def observe(history: History, difference: Tensor, vehicles: Vehicles, extra: Tensor) -> Observation:
     """The generator's input after :func:`push`."""
     position = torch.stack([vehicles.x, vehicles.y], dim=-1)
-    return Observation(
-        history.motions,
-        history.displacement,
-        difference,
-        position,
-        vehicles.valid,
-        extra,
-    )
+    return Observation(*history, difference, position, vehicles.valid, extra)
 
 
 def displacement_of(vehicles: Vehicles) -> Tensor:

@@ -101,39 +101,26 @@ class MotionLSTM(nn.Module):
         """Part of the gates [..., 4H] that depends on this motion alone, so it can be kept."""
         if not self.differences:
             difference = torch.zeros_like(difference)
-        embedded = apply(
-            self.embed,
-            motion_features(displacement, difference),
-            relu=True,
-        )
-        return apply(self.input, embedded)
+        features = motion_features(displacement, difference)
+        return apply(self.input, apply(self.embed, features, relu=True))
 
-    def project_course(self, displacements: Tensor) -> Tensor:
-        """Projections [..., T - 1, 4H] of T displacements [..., T, 2], one for every motion."""
-        return self.project(displacements[..., 1:, :], displacements.diff(dim=-2))
+    def project_course(self, displacements: Tensor) -> tuple[Tensor, ...]:
+        """Projections [..., 4H] of T displacements [..., T, 2], one for each of T - 1 motions."""
+        return self.project(displacements[..., 1:, :], displacements.diff(dim=-2)).unbind(dim=-2)
 
-    def step(
-        self,
-        projected: Tensor,
-        hidden: Tensor,
-        cell: Tensor,
-    ) -> tuple[Tensor, Tensor]:
+    def step(self, projected: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
         """One recurrence on a projection [..., 4H] and state ([..., H], [..., H]).
 
         Returns the new state.
         """
         return self._update(dense(hidden, self.recurrent).add_(projected), cell)
 
-    def encode(self, projections: Tensor | Sequence[Tensor]) -> Tensor:
-        """Last hidden state [..., H] after projections [..., T, 4H], or T of [..., 4H].
-
-        It begins with a state of zeros.
-        """
-        steps = projections.unbind(dim=-2) if isinstance(projections, Tensor) else projections
+    def encode(self, projections: Sequence[Tensor]) -> Tensor:
+        """Last hidden state [..., H] after projections [..., 4H], from a state of zeros on."""
         # The recurrence of a hidden state of zeros adds nothing, so the first step does without.
-        no_cell = torch.zeros_like(steps[0][..., : self.hidden])
-        hidden, cell = self._update(steps[0], no_cell)
-        for projected in steps[1:]:
+        no_cell = torch.zeros_like(projections[0][..., : self.hidden])
+        hidden, cell = self._update(projections[0], no_cell)
+        for projected in projections[1:]:
             hidden, cell = self.step(projected, hidden, cell)
         return hidden
 
@@ -236,16 +223,16 @@ class Observation(NamedTuple):
     """The generator's input for [B, G] vehicles.
 
     Attributes:
-        projections: [B, G, observed - 1, 4H] or a sequence of [B, G, 4H], input projections of the
-            observed motions (:meth:`MotionLSTM.project_course`), oldest first. A motion is a
-            displacement and its difference to the one before, so 8 displacements are 7 motions.
+        projections: observed - 1 tensors [B, G, 4H], input projections of the observed motions
+            (:meth:`MotionLSTM.project_course`), oldest first. A motion is a displacement and its
+            difference to the one before, so 8 displacements are 7 motions.
         displacement, difference: [B, G, 2], the last displacement, m per 0.1 s, and its difference
             to the one before.
         position: [B, G, 2], m, relative to any common point.
         valid, extra: [B, G] bool and [B, G, extra_inputs].
     """
 
-    projections: Tensor | Sequence[Tensor]
+    projections: tuple[Tensor, ...]
     displacement: Tensor
     difference: Tensor
     position: Tensor
@@ -287,17 +274,10 @@ class Generator(nn.Module):
     ) -> Observation:
         """The input from observed displacements [B, G, observed, 2], without further inputs."""
         last = displacements[..., -1, :]
-        before = displacements[..., -2, :]
-        # Width 0: the paper's preset has no further inputs.
-        extra = last.new_zeros((*last.shape[:-1], 0))
-        return Observation(
-            self.encoder.project_course(displacements),
-            last,
-            last - before,
-            position,
-            valid,
-            extra,
-        )
+        difference = last - displacements[..., -2, :]
+        projections = self.encoder.project_course(displacements)
+        # Further inputs of width 0: the paper's preset has none.
+        return Observation(projections, last, difference, position, valid, last[..., :0])
 
     def summarise(self, now: Observation) -> Tensor:
         """Context [B, G, H - Z] of every vehicle.
@@ -350,8 +330,7 @@ class Generator(nn.Module):
 
         All by default.
         """
-        steps = self.sizes.predicted if steps is None else steps
-        outputs = self.decode(self.summarise(now), noise, now, steps)
+        outputs = self.decode(self.summarise(now), noise, now, steps or self.sizes.predicted)
         return displacements_of(outputs, now.displacement)
 
 
@@ -380,5 +359,5 @@ class Discriminator(nn.Module):
 
     def forward(self, displacements: Tensor) -> Tensor:
         """Logits [...] that the observed and following displacements [..., T, 2] were recorded."""
-        projections = self.encoder.project_course(displacements)
-        return self.head(self.encoder.encode(projections)).squeeze(-1)
+        course = self.encoder.project_course(displacements)
+        return self.head(self.encoder.encode(course)).squeeze(-1)

@@ -282,11 +282,7 @@ class Situation(NamedTuple):
 
 
 def situation_of(
-    vehicles: Vehicles,
-    memory: Memory,
-    road: Road,
-    sides: bool = True,
-    first: Tensor | None = None,
+    vehicles: Vehicles, memory: Memory, road: Road, sides: bool = True, first: Tensor | None = None
 ) -> Situation:
     """What drivers perceive now (:func:`perceive`), with this decision's style in their memory
     (:func:`with_style`).

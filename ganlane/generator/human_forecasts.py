@@ -44,12 +44,7 @@ from ganlane.generator.human_estimator import (
     trust,
 )
 from ganlane.generator.human_samples import DESIRED_MPS, smooth_scene
-from ganlane.generator.windows import (
-    OBSERVED_POSITIONS,
-    PREDICTED_STEPS,
-    PRESENT,
-    Segments,
-)
+from ganlane.generator.windows import OBSERVED_POSITIONS, PREDICTED_STEPS, PRESENT, Segments
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.driving import HumanVariation
 from ganlane.settings.generator import HumanConfig
@@ -115,11 +110,7 @@ def human_forecasts(
 
 
 def _driven(
-    model: HumanModel,
-    segments: Segments,
-    horizon: int,
-    samples: int,
-    random: torch.Generator,
+    model: HumanModel, segments: Segments, horizon: int, samples: int, random: torch.Generator
 ) -> Tensor:
     """Positions [1 + samples, B, horizon, V, 2]; the first are the mean driver's."""
     policy = model.policy

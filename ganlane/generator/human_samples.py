@@ -453,11 +453,7 @@ def _samples(segments: Segments, options: Options, random: torch.Generator) -> S
 
 
 def _estimated(
-    s: Segments,
-    vehicles: Vehicles,
-    memory: Memory,
-    estimator: Estimator,
-    random: torch.Generator,
+    s: Segments, vehicles: Vehicles, memory: Memory, estimator: Estimator, random: torch.Generator
 ) -> tuple[Vehicles, Memory]:
     """Driven vehicles as nine positions show them, with less or more noise than recorded."""
     nine = slice(HISTORY - OBSERVED_POSITIONS + 1, HISTORY + 1)

@@ -39,12 +39,7 @@ RANGE_M = 100.0
 _MANY_ROWS = 512
 
 
-def dense(
-    x: Tensor,
-    weight: Tensor,
-    bias: Tensor | None = None,
-    relu: bool = False,
-) -> Tensor:
+def dense(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False) -> Tensor:
     """Linear layer [..., O] of ``x`` [..., I], ``weight`` [O, I] and ``bias`` [O].
 
     A ReLU follows if ``relu``.
@@ -138,11 +133,7 @@ def _times_tanh(factor: Tensor, x: Tensor) -> Tensor:
     return torch.addcmul(-factor, factor, torch.sigmoid(x + x), value=2.0)
 
 
-def nearest(
-    position: Tensor,
-    valid: Tensor,
-    neighbours: int,
-) -> tuple[Tensor | None, Tensor]:
+def nearest(position: Tensor, valid: Tensor, neighbours: int) -> tuple[Tensor | None, Tensor]:
     """Indices [B, G, K] of the ``neighbours`` nearest other vehicles of each, and a mask of them.
 
     ``position`` is [B, G, 2] in m, ``valid`` [B, G]. If there are not more vehicles than that, the
@@ -191,11 +182,7 @@ class PairPooling(nn.Module):
         self.second = nn.Linear(inner, pooled)
 
     def forward(
-        self,
-        hidden: Tensor,
-        position: Tensor,
-        displacement: Tensor,
-        valid: Tensor,
+        self, hidden: Tensor, position: Tensor, displacement: Tensor, valid: Tensor
     ) -> Tensor:
         """Pooled states [B, G, P] of the vehicles.
 
@@ -251,12 +238,7 @@ class Generator(nn.Module):
         super().__init__()
         self.sizes = sizes
         self.encoder = MotionLSTM(sizes.embedding, sizes.hidden, sizes.differences)
-        self.pooling = PairPooling(
-            sizes.hidden,
-            sizes.pooling,
-            sizes.pooled,
-            sizes.neighbours,
-        )
+        self.pooling = PairPooling(sizes.hidden, sizes.pooling, sizes.pooled, sizes.neighbours)
         inputs = sizes.hidden + sizes.pooled + sizes.extra_inputs
         self.context = nn.Sequential(
             nn.Linear(inputs, sizes.context),
@@ -266,12 +248,7 @@ class Generator(nn.Module):
         self.decoder = MotionLSTM(sizes.embedding, sizes.hidden, sizes.differences)
         self.head = nn.Linear(sizes.hidden, 2)
 
-    def observe(
-        self,
-        displacements: Tensor,
-        position: Tensor,
-        valid: Tensor,
-    ) -> Observation:
+    def observe(self, displacements: Tensor, position: Tensor, valid: Tensor) -> Observation:
         """The input from observed displacements [B, G, observed, 2], without further inputs."""
         last = displacements[..., -1, :]
         difference = last - displacements[..., -2, :]
@@ -291,13 +268,7 @@ class Generator(nn.Module):
         first, second = (cast(nn.Linear, self.context[layer]) for layer in (0, 2))
         return apply(second, apply(first, inputs, relu=True))
 
-    def decode(
-        self,
-        context: Tensor,
-        noise: Tensor,
-        now: Observation,
-        steps: int,
-    ) -> Tensor:
+    def decode(self, context: Tensor, noise: Tensor, now: Observation, steps: int) -> Tensor:
         """Output [..., steps, 2] of the decoder's first steps, in units of ``DIFFERENCE_SCALE_M``.
 
         ``context`` is [..., H - Z] and ``noise`` [..., Z]; leading dimensions broadcast, so that
@@ -320,12 +291,7 @@ class Generator(nn.Module):
             displacement = displacement + difference
         return torch.stack(outputs, dim=-2)
 
-    def forward(
-        self,
-        now: Observation,
-        noise: Tensor,
-        steps: int | None = None,
-    ) -> Tensor:
+    def forward(self, now: Observation, noise: Tensor, steps: int | None = None) -> Tensor:
         """Predicted displacements [..., steps, 2], m per 0.1 s, for ``noise`` [..., B, G, Z].
 
         All by default.
@@ -351,11 +317,7 @@ class Discriminator(nn.Module):
     def __init__(self, embedding: int, hidden: int):
         super().__init__()
         self.encoder = MotionLSTM(embedding, hidden)
-        self.head = nn.Sequential(
-            nn.Linear(hidden, hidden),
-            nn.ReLU(),
-            nn.Linear(hidden, 1),
-        )
+        self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 1))
 
     def forward(self, displacements: Tensor) -> Tensor:
         """Logits [...] that the observed and following displacements [..., T, 2] were recorded."""

@@ -208,8 +208,7 @@ class PaperTask(_Task):
 
         # [B, G, ...] -> [n, ...]: from here on without padding.
         vehicles = observation._replace(
-            displacement=observation.displacement[mask],
-            difference=observation.difference[mask],
+            displacement=observation.displacement[mask], difference=observation.difference[mask]
         )
         shape = (self.config.samples + 1, len(context), sizes.noise)
         noise = torch.randn(shape, generator=self.random)

@@ -109,12 +109,7 @@ def segment_starts(scene: Recording, horizon: int, stride: int = 1) -> list[int]
     return [row for row in rows if scene.present[row : row + OBSERVED_POSITIONS].all(0).any()]
 
 
-def segment_batches(
-    scene: Recording,
-    horizon: int,
-    stride: int,
-    size: int,
-) -> Iterator[Segments]:
+def segment_batches(scene: Recording, horizon: int, stride: int, size: int) -> Iterator[Segments]:
     """All segments that start every ``stride`` frames, ``size`` at a time."""
     cuts = [(scene, row) for row in segment_starts(scene, horizon, stride)]
     for first in range(0, len(cuts), size):
@@ -205,11 +200,7 @@ def count_windows(scene: Recording) -> int:
     return int(_present_throughout(scene, WINDOW_FRAMES).sum())
 
 
-def cut_windows(
-    scenes: list[Recording],
-    stride: int = 1,
-    frames: int = WINDOW_FRAMES,
-) -> Windows:
+def cut_windows(scenes: list[Recording], stride: int = 1, frames: int = WINDOW_FRAMES) -> Windows:
     """All windows of ``scenes`` that start at every ``stride``-th frame.
 
     A window never spans two scenes.
@@ -265,9 +256,7 @@ class Groups:
         sign = torch.ones(len(self), 1, 2)
         sign[..., 1] = torch.where(flip, -1.0, 1.0)[:, None]
         return replace(
-            self,
-            displacements=self.displacements * sign[:, :, None],
-            position=self.position * sign,
+            self, displacements=self.displacements * sign[:, :, None], position=self.position * sign
         )
 
 

@@ -136,8 +136,7 @@ def test_a_fresh_history_is_that_of_constant_velocity(generator):
     displacement = torch.tensor([[[1.7, 0.0], [0.9, 0.0]]])
     always = displacement[..., None, :].expand(1, 2, 8, 2)
     torch.testing.assert_close(
-        start(generator, displacement).motions,
-        generator.encoder.project_course(always),
+        start(generator, displacement).motions, generator.encoder.project_course(always)
     )
 
 

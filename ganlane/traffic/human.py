@@ -20,12 +20,10 @@ from ganlane.generator.human import (
     features_of,
     lane_choice,
     leaves_room,
-    perceive,
     remembered,
-    sides_of,
+    situation_of,
     velocity,
     with_choice,
-    with_style,
     with_velocity,
 )
 from ganlane.generator.human import Memory as DriverMemory
@@ -154,33 +152,33 @@ class HumanTraffic(TrafficModule):
             makes_room = yielding(scene, self.drivers.idm, self.mobil)
         vehicles = vehicles.with_(target_lane=self.road.clamp_lane(vehicles.target_lane))
         driver = DriverMemory(*(memory[name] for name in DriverMemory._fields))
-        view = perceive(vehicles, self.road)
-        driver = with_style(driver, view)
+        situation = situation_of(vehicles, driver, self.road)
         u = uniforms(vehicles, key, step, *_DRAWS)
-        sides = sides_of(vehicles, driver, self.road, view)
-        polite = sides.clone()
+        option = lane_choice(situation)
+        sides, polite = option.sides, option.sides.clone()
         polite[..., REAR_BRAKING] *= variation.politeness
-        option = lane_choice(vehicles, view, polite)
+        option = option._replace(sides=polite)
         if self.road.stretches:
             ways = ways_out(vehicles, self.road, self.mobil.mandatory_m)
             option = option._replace(exists=torch.stack((ways.left, ways.right), -1))
         choice = chosen(policy.lane_chances(option, variation.lane_changes), u[2])
         if self.road.stretches:
             choice = _leaving(choice, option.keeping, ways, sides, u[3])
-        vehicles, driver = with_choice(vehicles, driver, view, choice)
+        situation = with_choice(situation, choice)
+        vehicles = situation.vehicles
         # Its moves follow the driver's choice.
-        along, across = policy(features_of(vehicles, driver, self.road, view))
+        along, across = policy(features_of(situation))
         change = ALONG.sample(along, u[0], variation.temperature)
         aside = ACROSS.sample(across, u[1], variation.temperature)
-        acceleration, lateral = bounded(vehicles, driver, self.road, change, aside)
+        acceleration, lateral = bounded(situation, change, aside)
         if self.road.stretches:
             acceleration = torch.minimum(acceleration, self._before_walls(vehicles, scene))
             acceleration = torch.minimum(acceleration, makes_room)
-        driver = remembered(vehicles, driver, view, acceleration)
+        driver = remembered(situation, acceleration)
         return vehicles, {
             **driver._asdict(),
             "acceleration": driver.accelerations[..., variation.delayed],
-            "lateral_from": view.aside,
+            "lateral_from": situation.view.aside,
             "lateral_to": lateral,
         }
 

@@ -26,7 +26,6 @@ from ganlane.native.settings import (
     Settings,
     Structure,
     actions_of,
-    address,
     ends_of,
     fields,
     filled,
@@ -284,8 +283,8 @@ class HumanDrivers(NetworkDrivers):
     def structures(self) -> dict[str, Structure]:
         """As of :class:`RuleDrivers`."""
         packed = _packed(_human_layers(self.sizes), self.weights)
-        numbers = vars(self.sizes) | vars(self.variation) | {"weights": packed.ctypes.data}
-        return {"human": filled(Human, numbers, packed)}
+        numbers = vars(self.sizes) | vars(self.variation) | {"weights": packed}
+        return {"human": filled(Human, numbers)}
 
 
 #: Drivers of one kind.
@@ -408,10 +407,7 @@ def decision_settings(
     records = (episode, ego or EgoParameters(), idm, steering, mobil)
     numbers = {name: value for record in records for name, value in vars(record).items()}
     ego_mobil = ego_mobil or mobil
-    numbers |= {
-        "lanes": highway.lanes,
-        "lane_width_m": highway.lane_width_m,
-        "vehicles": highway.vehicles,
+    numbers |= highway._asdict() | {
         # The kernel multiplies where the model divides by a constant.
         "per_brake_scale": 1.0 / idm.brake_scale(),
         "per_near_s": 1.0 / steering.near_s,
@@ -428,13 +424,13 @@ def decision_settings(
         "blind_share": drivers.blind_share,
         "courtesy": ego_mobil.courtesy,
         "safe_behind": ego_mobil.safe_deceleration,
+        "ends": ends_of(highway.stretches, ego_mobil),
+        "actions": actions_of(highway.actions, episode.decision_period_s),
+        "flow": flow_of(highway, episode.decision_period_s),
+        **dict.fromkeys(("generated", "human", "faults", "random")),
+        **drivers.structures(),
     }
-    pointed = drivers.structures() | ends_of(highway.stretches, ego_mobil)
-    pointed |= actions_of(highway.actions, episode.decision_period_s)
-    pointed |= flow_of(highway, episode.decision_period_s)
-    for name in ("generated", "human", "faults", "random", "ends", "actions", "flow"):
-        numbers[name] = address(pointed.get(name))
-    return filled(Settings, numbers, list(pointed.values()))
+    return filled(Settings, numbers)
 
 
 def mask_settings(
@@ -549,14 +545,16 @@ def _generated_of(drivers: GeneratedDrivers) -> Generated:
     # As closed_loop.wander: what stays of a latent vector in a step.
     share = math.exp(-dt / period) if period > 0 else 0.0
     packed = _packed(_layers(sizes), drivers.weights)
-    widths = vars(sizes) | {"weights": packed.ctypes.data, "motions": sizes.observed - 1}
-    numbers: dict[str, Any] = {**vars(drivers.changes), **vars(anchor), **vars(anchor.idm)}
-    numbers |= vars(guard)
-    numbers |= {
+    widths = vars(sizes) | {"weights": packed, "motions": sizes.observed - 1}
+    numbers: dict[str, Any] = {
+        **vars(drivers),
+        **vars(drivers.changes),
+        **vars(anchor),
+        **vars(anchor.idm),
+        **vars(guard),
         "network": filled(Network, widths),
         "noise_share": share,
         "noise_fresh": math.sqrt(1.0 - share * share),
-        "noise_scale": drivers.noise_scale,
         "calibrated": drivers.anchor is not None,
         "guard": drivers.guard is not None,
         "sudden_chance": dt / sudden.every_s,
@@ -572,9 +570,8 @@ def _generated_of(drivers: GeneratedDrivers) -> Generated:
         "washout_share": dt / anchor.washout_s,
         "changes_per_m": dt * drivers.checked_changes.per_km / 1000.0,
         "patience_steps": _steps(drivers.checked_changes.patience_s),
-        "headways_s": drivers.headways_s,
     }
-    return filled(Generated, numbers, packed)
+    return filled(Generated, numbers)
 
 
 class _Layer(NamedTuple):

@@ -672,8 +672,7 @@ def gan_drivers(config: GanTrafficConfig, idm: IdmParameters, stream: int) -> Ge
         UserError: the weights are missing, foreign or of the other preset, or their recordings hold
             no complete lane change.
     """
-    source, weights, sizes, metadata = _fitted(config.path, "paper")
-    statistics = _statistics(metadata)
+    source, weights, sizes, _, statistics = _fitted(config.path, "paper")
     return GeneratedDrivers(
         idm,
         sizes,
@@ -696,8 +695,7 @@ def calibrated_drivers(
         UserError: the weights are missing, foreign, of the other preset, or fitted without
             per-driver parameters.
     """
-    source, weights, sizes, metadata = _fitted(config.path, "calibrated")
-    statistics = _statistics(metadata)
+    source, weights, sizes, metadata, statistics = _fitted(config.path, "calibrated")
     # Without a recorded change nobody changes lanes.
     recorded = statistics.lane_changes.per_vehicle_km or 0.0
     # Only None asks for the recorded rate; 0 is a rate.
@@ -714,13 +712,6 @@ def calibrated_drivers(
         checked_changes=CalibratedChanges(wishes),
         headways_s=tuple(statistics.headway.quantile(level) for level in QUANTILE_LEVELS),
     )
-
-
-def _statistics(metadata: Mapping[str, Any]) -> DrivingStatistics:
-    # Imports the readers of recordings, a third of a second that rule-driven traffic does without.
-    from ganlane.data.statistics import DrivingStatistics
-
-    return DrivingStatistics.from_dict(metadata["driving_statistics"])
 
 
 def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralChanges:
@@ -826,13 +817,17 @@ def drivers_of(
 
 def _fitted(
     path: str | None, preset: Any
-) -> tuple[Path, Weights, GeneratorSizes, Mapping[str, Any]]:
-    """A generator's file, weights, sizes and metadata."""
+) -> tuple[Path, Weights, GeneratorSizes, Mapping[str, Any], DrivingStatistics]:
+    """A generator's file, weights, sizes, metadata, and the statistics of its recordings."""
+    # Imports the readers of recordings, a third of a second that rule-driven traffic does without.
+    from ganlane.data.statistics import DrivingStatistics
+
     source = Path(path or shipped_generator(preset))
     weights, metadata = load_arrays(source, GENERATOR)
     sizes = stored_sizes(source, metadata, preset)
     _check_shapes(source, sizes, _layers(sizes), weights)
-    return source, weights, sizes, metadata
+    statistics = DrivingStatistics.from_dict(metadata["driving_statistics"])
+    return source, weights, sizes, metadata, statistics
 
 
 def human_drivers(config: HumanTrafficConfig, idm: IdmParameters, stream: int) -> HumanDrivers:

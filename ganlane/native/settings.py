@@ -324,7 +324,7 @@ def filled(kind: type[Kind], numbers: Mapping[str, Any]) -> Kind:
     A member that is a pointer is given what it points to: a structure, an array, or None.
     """
     members = {}
-    for name, member in kind._fields_:
+    for name, member, *_ in kind._fields_:
         # A missing number is a KeyError here instead of a 0 in the kernel.
         value = numbers[name]
         members[name] = _address(value) if member is c_void_p else value

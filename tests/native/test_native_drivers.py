@@ -22,7 +22,7 @@ from ganlane.native.batch import NativeBatch
 from ganlane.native.drivers import drivers_of
 from ganlane.native.tensors import NativeScenes
 from ganlane.runtime import kernel_threads
-from ganlane.settings.commands import highways
+from ganlane.settings.commands import DrivingConfig, highways
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.generator import EXTRA_INPUTS, GENERATOR, GeneratorSizes, HumanSizes
 from ganlane.settings.record import make
@@ -163,7 +163,7 @@ def decide_side_by_side(scene, traffic, rows, decisions, courtesy=2.0):
     options = {"name": scene, "kernel": "torch", "mobil": {"courtesy": courtesy}}
     config = make(EnvConfig, options)
     module = make_traffic(make(TrafficConfig, traffic), config)
-    env = make_highways(module, config, num_envs=rows).base_env
+    env = make_highways(module, DrivingConfig(env=config), rows).base_env
     kernel = kernel_of(env)
     td = env.reset()
     differ = 0

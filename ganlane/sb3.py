@@ -91,9 +91,7 @@ class HighwayVecEnv(VecEnv):
         # The constructor of VecEnv asks for render_mode through get_attr(), so highways is set
         # first.
         super().__init__(
-            highways.num_envs,
-            highways.single_observation_space,
-            highways.single_action_space,
+            highways.num_envs, highways.single_observation_space, highways.single_action_space
         )
 
     def reset(self) -> Floats:
@@ -316,10 +314,7 @@ class ModelDriver(Driver):
         if isinstance(normaliser, VecNormalize):
             statistics: Any = normaliser.obs_rms
             normaliser = Normaliser(
-                statistics.mean,
-                statistics.var,
-                normaliser.epsilon,
-                normaliser.clip_obs,
+                statistics.mean, statistics.var, normaliser.epsilon, normaliser.clip_obs
             )
         network = _network(self.policy.model)
         reading = Reading(self.observation, self.mask, normaliser, network, self.actions)
@@ -327,9 +322,7 @@ class ModelDriver(Driver):
 
 
 def driver(
-    model: BaseAlgorithm,
-    name: str | None = None,
-    stored: str | Path | None = None,
+    model: BaseAlgorithm, name: str | None = None, stored: str | Path | None = None
 ) -> ModelDriver:
     """A trained model as a driver for ``ganlane.api.evaluate``.
 

@@ -104,10 +104,7 @@ class ExploringPolicy(TensorDictModuleBase):
             if mask is None:
                 mask = torch.ones_like(values) if self.legal is None else self.legal(tensordict)
             # A fraction epsilon of the actions becomes a legal one, drawn uniformly.
-            draw: dict[str, Any] = {
-                "generator": self.generator,
-                "device": self.generator.device,
-            }
+            draw: dict[str, Any] = {"generator": self.generator, "device": self.generator.device}
             # the largest of uniform numbers, 0 where not allowed, is a uniform draw
             lottery = torch.rand(mask.shape, **draw) * mask
             action = torch.where(

@@ -96,12 +96,6 @@ def test_a_run_whose_rate_has_fallen_is_prolonged_at_its_end(tmp_path):
     assert state["agent"]["optimizer"]["param_groups"][0]["lr"] == 1e-5
 
 
-def test_another_support_is_refused_with_the_options_to_set(trained, tmp_path):
-    told = r"set agent\.atoms=101 agent\.v_min=-120"
-    with user_error(told):
-        start(tmp_path, trained, "agent.v_min=-50", "agent.v_max=60", "agent.atoms=21")
-
-
 def test_a_run_goes_on_without_what_it_started_from(tmp_path):
     """And ends as it would have in a piece."""
     first = run(tmp_path / "first", "total_decisions=160")

@@ -279,7 +279,7 @@ def gradients(
     actions: int,
 ) -> list[Tensor]:
     """Of all parameters, in the layers' order, from that of the folded head's output [B, A K]."""
-    by_parameter: list[Tensor] = []
+    all_gradients: list[Tensor] = []
     # from the last layer to the first, by the chain rule
     behind = of_logits
     for number in reversed(range(len(layers))):
@@ -292,17 +292,17 @@ def gradients(
             of_bias = unfolded(of_bias, actions)
         # A weight is mu + sigma * noise, so the gradient of sigma is the weight's times the noise.
         noise_in, noise_out = noise[number]
-        by_parameter = [
+        all_gradients = [
             of_weight,
             of_weight * torch.outer(noise_out, noise_in),
             of_bias,
             of_bias * noise_out,
-            *by_parameter,
+            *all_gradients,
         ]
         if number:  # back through the layer's weight and the ReLU before it
             product = matrix_product(behind, layers[number][0].t())
             behind = torch.where(inputs[number] > 0, product, 0.0)
-    return by_parameter
+    return all_gradients
 
 
 def update(
@@ -437,8 +437,9 @@ class UpdateGraph:
         """Adam's state of a parameter, made as Adam makes it at its first step."""
         state = self.optimizer.state[parameter]
         if not state:
-            moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
-            state |= {"step": torch.zeros(()), **moments}
+            state["step"] = torch.zeros(())
+            state["exp_avg"] = torch.zeros_like(parameter)
+            state["exp_avg_sq"] = torch.zeros_like(parameter)
         return state
 
 

@@ -73,8 +73,8 @@ class NStepWindow:
         self.steps.append(Step.copied(step))
         if len(self.steps) < self.n:
             return None
-        # Rewards of later steps are added as long as no episode has ended in between.
-        # The oldest step has its transition now and is not needed again.
+        # The oldest step gets its transition now and is not needed again. Rewards of later steps
+        # are added as long as no episode has ended in between.
         first = self.steps.pop(0)
         reward, following, terminated = first.reward, first.following, first.terminated
         mask = first.following_mask

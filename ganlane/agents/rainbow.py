@@ -106,8 +106,12 @@ class Rainbow:
         )
         if config.learning_rate_end is not None:
             (group,) = self.optimizer.param_groups
-            ends = (config.learning_rate, config.learning_rate_end)
-            group["lr"] = annealed(*ends, decisions, config.learning_rate_decisions)
+            group["lr"] = annealed(
+                config.learning_rate,
+                config.learning_rate_end,
+                decisions,
+                config.learning_rate_decisions,
+            )
 
     def store(self, transition: TensorDict | None) -> None:
         """Add the transitions of :meth:`NStepWindow.push`, batch [N]; None adds nothing."""
@@ -146,8 +150,13 @@ class Rainbow:
         objective.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
         self.optimizer.step()
-        figures = (objective.detach(), terms["mean_q"], terms["clamped_fraction"], norm)
-        return Learned(batch.get("td_error")[:, 0], *figures)
+        return Learned(
+            batch.get("td_error")[:, 0],
+            objective.detach(),
+            terms["mean_q"],
+            terms["clamped_fraction"],
+            norm,
+        )
 
     def sigma(self) -> Tensor:
         """Mean absolute noise parameter over the weights of the noisy layers, 0-dim.

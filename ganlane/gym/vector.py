@@ -191,8 +191,9 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
         if self._mode is AutoresetMode.SAME_STEP and ended.any():
             final = {
                 "final_obs": _where(ended, self._rows.observation()),
+                "_final_obs": ended,
                 "final_info": _copied(self._rows.info()),
-                **dict.fromkeys(("_final_obs", "_final_info"), ended),
+                "_final_info": ended,
             }
             self._rows.restart(ended)
             self._begun(ended)

@@ -86,7 +86,7 @@ class ActionMaskTransform(PerceptionTransform):
             raise UserError(
                 f"mask.form={form!r}: expected one of {', '.join(FORMS)}; choose one of them."
             )
-        self.parameters = MaskParameters(form, safe_deceleration)
+        self.mask = MaskParameters(form, safe_deceleration)
         self.actions = actions or ActionParameters()
         self.actions.check_mask(form)
         # Behind legal there is nothing to report: keeping the lane is always legal.
@@ -98,7 +98,7 @@ class ActionMaskTransform(PerceptionTransform):
         # The kernel has no function for ``legal``, which is a comparison or two.
         self.native: SafeActions | None = None
         if native_vehicles is not None and form != "legal":
-            self.native = SafeActions(road, native_vehicles, idm, self.parameters, abort)
+            self.native = SafeActions(road, native_vehicles, idm, self.mask, abort)
 
     def allowed(self, vehicles: Vehicles, direction: Tensor, road: Road) -> tuple[Tensor, Tensor]:
         """The mask [N, 3], and whether no action is safe [N].
@@ -110,7 +110,7 @@ class ActionMaskTransform(PerceptionTransform):
         # Keeping the lane is no command that the ego could fail to hear.
         obeyed = (side == 0) | is_heard(side, direction[:, None], self.abort)
         legal = stays_on_road(vehicles, side, road) & obeyed
-        form, safe_deceleration = self.parameters.form, self.parameters.safe_deceleration
+        form, safe_deceleration = self.mask.form, self.mask.safe_deceleration
         if form == "legal":
             return legal, torch.zeros_like(legal[:, 0])
         # How hard the ego, in its lane and in those beside it, and who would follow it there would

@@ -324,13 +324,13 @@ class ObservationTransform(PerceptionTransform):
         """Write ``observation``."""
         # Own state from the truth, the others as perceived.
         ego = state.get(keys.EGO)
-        change = (ego.get("change_progress"), ego.get("change_direction"))
+        progress, direction = ego.get("change_progress"), ego.get("change_direction")
         road = road_in(state, self.road)
         # The kernel computes the same numbers up to the rounding of the exponential function.
-        if self.native is not None and not wants_gradient([*vehicles, *seen, change[0]]):
-            observation = self.native.observe(vehicles, *change, seen)
+        if self.native is not None and not wants_gradient([*vehicles, *seen, progress]):
+            observation = self.native.observe(vehicles, progress, direction, seen)
         else:
-            observation = self.observe(vehicles, *change, road, seen)
+            observation = self.observe(vehicles, progress, direction, road, seen)
         if CONTROL_NUMBERS[self.actions.form]:
             set_speed = ego.get(keys.SET_SPEED) if self.actions.form == LANE_SPEED else None
             further = control_numbers(vehicles, set_speed, road)

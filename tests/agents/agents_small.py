@@ -16,15 +16,7 @@ def agent(size=5, seed=0, **options):
 
 def saved_in(folder: Path, **more) -> Path:
     path = folder / "agent.safetensors"
-    save_agent(
-        path,
-        agent(),
-        {
-            "observation": "table3",
-            "training": {"decisions": 7},
-            **more,
-        },
-    )
+    save_agent(path, agent(), {"observation": "table3", "training": {"decisions": 7}, **more})
     return path
 
 

@@ -25,11 +25,7 @@ def test_the_legal_random_driver_never_asks_for_a_lane_that_is_not_there():
     action = RandomLegalDriver(Road())(state)["action"]
     assert not ((lane == 2) & (action == LEFT)).any()
     assert not ((lane == 0) & (action == RIGHT)).any()
-    for current, legal in (
-        (0, (KEEP, LEFT)),
-        (1, (KEEP, LEFT, RIGHT)),
-        (2, (KEEP, RIGHT)),
-    ):
+    for current, legal in ((0, (KEEP, LEFT)), (1, (KEEP, LEFT, RIGHT)), (2, (KEEP, RIGHT))):
         shares = torch.bincount(action[lane == current], minlength=3) / (lane == current).sum()
         assert all(abs(shares[a] - 1 / len(legal)) < 0.06 for a in legal)
 

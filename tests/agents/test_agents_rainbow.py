@@ -49,16 +49,9 @@ def observations(rows=2000):
 
 
 @pytest.mark.parametrize(
-    "kind",
-    [
-        ExplorationType.DETERMINISTIC,
-        ExplorationType.MODE,
-        ExplorationType.MEAN,
-    ],
+    "kind", [ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN]
 )
-def test_under_deterministic_exploration_the_policy_is_greedy_and_greedy_has_no_noise(
-    kind,
-):
+def test_under_deterministic_exploration_the_policy_is_greedy_and_greedy_has_no_noise(kind):
     explorer = agent(noisy_sigma=3.0)
     data = observations()
     greedy = explorer.greedy(data.clone())["action"]
@@ -98,11 +91,7 @@ def test_a_share_epsilon_of_the_actions_is_random_and_legal():
 
 
 def test_the_learning_rate_falls_in_a_straight_line_and_stays():
-    falling = agent(
-        learning_rate=1e-3,
-        learning_rate_end=1e-4,
-        learning_rate_decisions=100,
-    )
+    falling = agent(learning_rate=1e-3, learning_rate_end=1e-4, learning_rate_decisions=100)
     rates = []
     for decisions in (0, 50, 100, 200):
         falling.anneal(decisions)
@@ -118,10 +107,7 @@ def test_the_target_is_copied_exactly_every_period():
     copied = []
     for _ in range(9):
         learner.update()
-        pairs = zip(
-            learner.network.parameters(),
-            learner.target.parameters(),
-        )
+        pairs = zip(learner.network.parameters(), learner.target.parameters())
         copied.append(all(torch.equal(a, b) for a, b in pairs))
     assert copied == [False, False, True] * 3
 
@@ -151,10 +137,7 @@ SWITCHES = ["noisy", "dueling", "distributional", "double", "prioritised"]
 @pytest.mark.parametrize("off", [[name] for name in SWITCHES] + [SWITCHES])
 def test_each_component_can_be_switched_off_and_the_rest_learns(off):
     learner = filled(
-        **dict.fromkeys(off, False),
-        learning_rate=3e-3,
-        target_period=1000,
-        noisy_sigma=0.1,
+        **dict.fromkeys(off, False), learning_rate=3e-3, target_period=1000, noisy_sigma=0.1
     )
     before = learner.loss(transitions(SIZE))["loss"].mean()
     for _ in range(80):

@@ -141,11 +141,7 @@ def test_a_plain_network_is_stored_and_acts_as_before():
     values = layers(observation)
     anything = [[True] * 3] * len(values)
     assert actions_of(driver.policy, observation.tolist(), anything) == values.argmax(-1).tolist()
-    masked = actions_of(
-        driver.policy,
-        observation.tolist(),
-        [[True, False, True]] * 50,
-    )
+    masked = actions_of(driver.policy, observation.tolist(), [[True, False, True]] * 50)
     assert set(masked) <= {0, 2}
 
 

@@ -170,7 +170,7 @@ def learn() -> dict[str, Any]:
     # A window of two steps fills the buffer from the second on, which then takes its shape.
     for _ in range(3):
         waits()
-        step = collector.step(agent)
+        step = collector.step(agent, lambda: None)
         collect = waits()
         agent.store(window.push(step))
         store = waits()

@@ -43,11 +43,7 @@ def agent(seed=0, **options):
 
 def settings(decisions, progress=False, **options):
     logger = LoggerConfig(progress=progress)
-    return TrainConfig(
-        total_decisions=decisions,
-        logger=logger,
-        **{"log_every": 400, **options},
-    )
+    return TrainConfig(total_decisions=decisions, logger=logger, **{"log_every": 400, **options})
 
 
 def train(*arguments, **options):

@@ -6,12 +6,7 @@ from reference.refusals import Bomb, user_error
 from training.small_runs import agent, road, settings, train
 
 from ganlane.files import seal_archive
-from ganlane.training.checkpoint import (
-    LAST,
-    TrainingState,
-    load_checkpoint,
-    save_checkpoint,
-)
+from ganlane.training.checkpoint import LAST, TrainingState, load_checkpoint, save_checkpoint
 
 
 @pytest.fixture(scope="module")

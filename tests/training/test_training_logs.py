@@ -8,14 +8,7 @@ import pytest
 from reference.refusals import user_error
 
 from ganlane.settings.train import LoggerConfig
-from ganlane.training.logs import (
-    CsvLog,
-    Progress,
-    TensorBoardLog,
-    WandbLog,
-    make_logs,
-    read_rows,
-)
+from ganlane.training.logs import CsvLog, Progress, TensorBoardLog, WandbLog, make_logs, read_rows
 
 # --- CSV
 
@@ -81,31 +74,26 @@ def test_a_log_that_is_none_is_refused_in_one_sentence(content, tmp_path):
 # --- progress
 
 
-def test_progress_off_a_terminal_is_a_line_per_row_with_the_last_known_figures():
-    stream = io.StringIO()
-    progress = Progress(1_000_000, stream=stream)
+def test_progress_off_a_terminal_is_a_line_per_row_with_the_last_known_figures(capsys):
+    progress = Progress(1_000_000)
     progress.advance(5)
     progress.write(
-        {
-            "decisions": 100_000,
-            "decisions_per_s": 5000.0,
-            "mean_return": 12.34,
-            "crash_rate": 0.125,
-        }
+        {"decisions": 100_000, "decisions_per_s": 5000.0, "mean_return": 12.34, "crash_rate": 0.125}
     )
     progress.write({"decisions": 200_000, "decisions_per_s": 10_000.0})
     progress.write({"decisions": 962_766, "decisions_per_s": 10.0})
-    assert stream.getvalue().splitlines() == [
+    assert capsys.readouterr().err.splitlines() == [
         "100,000 of 1,000,000 decisions, 5,000/s, 0:03:00 left, return 12.3, crashes 12.5%",
         "200,000 of 1,000,000 decisions, 10,000/s, 0:01:20 left, return 12.3, crashes 12.5%",
         "962,766 of 1,000,000 decisions, 10/s, 1:02:03 left, return 12.3, crashes 12.5%",
     ]
 
 
-def test_progress_on_a_terminal_is_a_bar_with_rate_time_left_return_and_crashes():
+def test_progress_on_a_terminal_is_a_bar_with_rate_time_left_return_and_crashes(monkeypatch):
     stream = io.StringIO()
     stream.isatty = lambda: True
-    progress = Progress(100_000, stream=stream)
+    monkeypatch.setattr(sys, "stderr", stream)
+    progress = Progress(100_000)
     progress.advance(10_000)
     progress.write({"decisions": 10_000, "mean_return": 3.0, "crash_rate": 0.25})
     progress.close()
@@ -143,10 +131,7 @@ def test_wandb_is_offline_unless_told_gets_every_figure_over_the_decisions_and_i
 
 @pytest.mark.parametrize(
     ("log", "module", "extra"),
-    [
-        (WandbLog, "wandb", "wandb"),
-        (TensorBoardLog, "torch.utils.tensorboard", "tensorboard"),
-    ],
+    [(WandbLog, "wandb", "wandb"), (TensorBoardLog, "torch.utils.tensorboard", "tensorboard")],
 )
 def test_a_missing_package_is_named_with_the_command_that_mends_it(
     log, module, extra, tmp_path, monkeypatch
@@ -176,10 +161,7 @@ def test_the_real_wandb_keeps_an_offline_run(tmp_path, monkeypatch):
 
 
 def test_the_option_chooses_the_logs(fake, tmp_path):
-    pytest.importorskip(
-        "tensorboard",
-        reason="the extra tensorboard is not installed",
-    )
+    pytest.importorskip("tensorboard", reason="the extra tensorboard is not installed")
     assert make_logs(LoggerConfig(), tmp_path) == []
     (board,) = make_logs(LoggerConfig(kind="tensorboard"), tmp_path)
     assert isinstance(board, TensorBoardLog)

@@ -243,10 +243,6 @@ def test_a_suffix_puts_any_driver_behind_a_mask_or_takes_it_away():
         (lambda: ActionMaskTransform(Road(), "soft"), "expected one of legal, safe, foresight"),
         (lambda: ActionMaskTransform(Road(), "safe", 0.0), "above 0"),
         (lambda: ganlane.make_env("idm", mask="save"), "did you mean"),
-        (
-            lambda: ganlane.make_env("idm", mask={"name": "safe", "safe_deceleration": -1}),
-            "safe_deceleration",
-        ),
     ],
 )
 def test_mistakes_end_in_one_sentence(make, expected):

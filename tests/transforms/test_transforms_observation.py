@@ -26,11 +26,11 @@ EGO = (0.0, 1, 20.0, 25.0)
 NOBODY = [1.0, 0.0, 0.0]
 
 
-def observed(scene, form, lanes=3, progress=0.0, direction=0, seen=None):
+def observed(scene, form, lanes=3, progress=0.0, direction=0):
     """The observation [D] of a scene of one row."""
     transform = ObservationTransform(Road(lanes), scene.x.shape[1], form)
     progress = torch.tensor([progress], dtype=DOUBLE)
-    return transform.observe(scene, progress, torch.tensor([direction]), transform.road, seen)[0]
+    return transform.observe(scene, progress, torch.tensor([direction]), transform.road, scene)[0]
 
 
 def observe(form, rows, valid=None, sideways=0.0, **options):
@@ -181,7 +181,7 @@ def road_numbers(x: float, lane: int, *stretches: LaneStretch) -> list[float]:
     cars = vehicles({"x": x - 2.25, "lane": lane}, {"x": -900.0, "lane": 0})
     zero = torch.zeros(1, dtype=DOUBLE)
     transform = ObservationTransform(road, 2, "road_view")
-    return transform.observe(cars, zero, zero.long(), road)[0, -8:].tolist()
+    return transform.observe(cars, zero, zero.long(), road, cars)[0, -8:].tolist()
 
 
 def test_the_road_view_tells_how_far_the_lanes_go_on_and_when_they_begin():

@@ -295,18 +295,19 @@ def _find_end(
     path = np.where(inside, path, limit)
     # Distance from the centre of the lane that is left or reached.
     offset = tracks.y[path] - (lane * tracks.lane_width[sample])[:, None]
-    pace = side[:, None] * _lateral_speed(tracks, path)
+    # Recorded positions are noisy.
+    pace = side[:, None] * mean_speed(tracks.y, tracks, path)
     done = inside & ((np.abs(offset) < _CENTRED_M) | (pace < _STILL_MPS))
     within = done.any(axis=1)
     at = np.where(within, done.argmax(axis=1), inside.sum(axis=1) - 1)
     return sample + direction * at, within
 
 
-def _lateral_speed(tracks: Tracks, at: Integers) -> Floats:
-    """Mean lateral speed over 1 s, centred at the samples ``at``, m/s.
+def mean_speed(position: Floats, tracks: Tracks, at: Integers) -> Floats:
+    """Mean speed over 1 s, centred at the samples ``at``, m/s, along the axis of ``position`` [R].
 
     The window is shorter at a track's ends.
     """
     before = np.maximum(at - _HALF_WINDOW, tracks.first[at])
     after = np.minimum(at + _HALF_WINDOW, tracks.last[at])
-    return (tracks.y[after] - tracks.y[before]) / (np.maximum(after - before, 1) * FRAME_S)
+    return (position[after] - position[before]) / (np.maximum(after - before, 1) * FRAME_S)

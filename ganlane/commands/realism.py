@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from ganlane.build import make_traffic
-from ganlane.data.dense import units_of
 from ganlane.data.one_lane import ONE_LANE_FILES, one_lane_files, read_one_lane
 from ganlane.data.recordings import read_scenes
 from ganlane.data.sources import data_folder, default_scenes
@@ -21,13 +20,13 @@ from ganlane.generator import HELD_OUT, Preset, shipped_generator
 from ganlane.realism.card import card_numbers, quantity_rows
 from ganlane.realism.driving import Factory, StartOptions
 from ganlane.realism.long_runs import LongRunParameters, long_run
-from ganlane.realism.measures import measure, measure_recordings
+from ganlane.realism.measures import measure_recordings
 from ganlane.realism.sheets import card_text, draw
 from ganlane.realism.starts import (
     Starts,
-    drive_all,
     print_progress,
     recorded_starts,
+    simulate_all,
     spawned_starts,
 )
 from ganlane.settings.env import EnvConfig
@@ -191,12 +190,11 @@ def one_lane_rows(
     # Once each: the site has many more segments than scenes.
     recordings = read_one_lane(name, path)
     options = StartOptions(seed=config.seed)
-    frames = drive_all(factories, recordings, options, starts.desired_above_mps)
-    units = units_of(recordings)
+    driven = simulate_all(factories, recordings, options, starts.desired_above_mps)
     recorded = measure_recordings(recordings).counts
     return quantity_rows(
         next(iter(factories)),
-        {driver: measure(frame, units) for driver, frame in frames.items()},
+        driven,
         {quantity: recorded[quantity] for quantity in ONE_LANE_QUANTITIES},
         floors={},
         resamples=config.resamples,

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ganlane.data.schema import CONTINUES, FRAME_S
+from ganlane.data.schema import FRAME_S
 from ganlane.errors import UserError
 
 #: 12 feet, the standard lane of a US freeway: used where a recording has one lane only.
@@ -180,12 +180,13 @@ def tracks_of_frame(
     Each scene's lane width in m is estimated where not given.
     """
     widths = scene_lane_widths(frame) if lane_widths is None else lane_widths
-    # A track goes on where frame and vehicle say so, within one scene.
-    same_scene = pl.col("scene") == pl.col("scene").shift(1)
+    # A track goes on where frame and vehicle say so, within one scene; null in the first row.
+    next_frame = (pl.col("frame").diff() == 1) & (pl.col("vehicle").diff() == 0)
+    goes_on = next_frame & (pl.col("scene") == pl.col("scene").shift(1))
     columns = frame.select(
         "y",
         width=pl.col("scene").replace_strict(widths, return_dtype=pl.Float64),
-        begins=~(CONTINUES & same_scene).fill_null(False),
+        begins=~goes_on.fill_null(False),
     )
     return Tracks(*(column.to_numpy() for column in columns))
 
@@ -247,20 +248,6 @@ def find_lane_changes(tracks: Tracks) -> LaneChanges:
     moved = side * (tracks.y[end] - tracks.y[start])
     speed = moved / (tau_s + tau_e)
     return LaneChanges(sample, old, new, tau_s, tau_e, ~start_seen, ~end_seen, speed)
-
-
-def lane_changes_of_arrays(y: ArrayLike, lane_width: float) -> LaneChanges:
-    """Lane changes of a simulation: ``y`` [T, K] are the lateral positions, m, of K vehicles every
-    0.1 s.
-
-    ``sample`` counts vehicle by vehicle.
-    """
-    columns = np.asarray(y, dtype=np.float64).T
-    # Every vehicle is a track of its own, present all the time.
-    begins = np.zeros(columns.shape, bool)
-    begins[:, 0] = True
-    widths = np.full(columns.size, lane_width)
-    return find_lane_changes(Tracks(columns.ravel(), widths, begins.ravel()))
 
 
 def _crossings(lane: Integers, tracks: Tracks) -> Integers:

@@ -39,8 +39,6 @@ SCHEMA = pl.Schema(
 )
 #: Columns that identify a track.
 TRACK = ("scene", "vehicle")
-#: Whether a row of one sorted scene goes on with the track of the row before; null in the first.
-CONTINUES = (pl.col("frame").diff() == 1) & (pl.col("vehicle").diff() == 0)
 #: Bounds that no recording of road traffic in SI units exceeds.
 MAX_MEDIAN_SPEED_MPS = 60.0
 MAX_MEDIAN_LENGTH_M = 12.0

@@ -227,7 +227,7 @@ def test_what_ships_is_small_and_holds_no_trajectories():
     # Published with the recordings: 57 changes in 61.7 vehicle-km.
     assert rate["lane_changes"] == 57
     assert rate["per_vehicle_km_ci"] == pytest.approx([0.70, 1.20], abs=0.01)
-    assert shipped.spread_mps == pytest.approx(2.8, abs=0.05)
+    assert shipped.whole["speed_spread_mps"] == pytest.approx(2.8, abs=0.05)
     for name in ("acceleration", "jerk", "time_headway", "time_to_collision"):
         assert ceiling(shipped.counts[name]) < shipped.floors["random"][name]
     assert all(0.0 < ceiling(shipped.counts[name]) < 1.0 for name in QUANTITIES)

@@ -141,9 +141,9 @@ def _instrumented(path: Path) -> pl.DataFrame:
         x=pl.col("x") + pl.col("gap") + _LENGTH_M,
         driven=False,
     )
-    names = ["scene", "vehicle", "frame", "x", "driven"]
-    cars = [part.select(names).cast({"vehicle": pl.Int64}) for part in (follower, leaders)]
-    return pl.concat(cars).with_columns(length=_LENGTH_M)
+    # Numbers of vehicles come in two types.
+    cars = pl.concat([follower, leaders], how="diagonal_relaxed")
+    return cars.with_columns(length=_LENGTH_M)
 
 
 _READERS = {

@@ -21,6 +21,7 @@ Two drivers mark the ends of the scale: random driving and constant velocity.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -67,6 +68,11 @@ class StartOptions:
     desired_above_mps: float = 6.0
     repeats: int = 1
     seed: int = 0
+
+
+def print_progress(text: str) -> None:
+    """Print a line of progress on stderr."""
+    print(text, file=sys.stderr, flush=True)
 
 
 def drive_recordings(

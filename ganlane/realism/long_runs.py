@@ -8,7 +8,7 @@ with exact intervals, speeds over time, and quantiles.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
@@ -19,7 +19,7 @@ from torch import Tensor
 from ganlane import keys
 from ganlane.data.lanes import Tracks, find_lane_changes
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.realism.driving import Factory, step_traffic
+from ganlane.realism.driving import Factory, print_progress, step_traffic
 from ganlane.realism.measures import rate_entries
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.neighbours import leader, perceive
@@ -119,12 +119,12 @@ def long_run(
     make: Factory,
     road: Road,
     parameters: LongRunParameters,
-    report: Callable[[float], None] | None = None,
+    name: str = "traffic",
 ) -> dict[str, Any]:
     """Drive ``parameters.vehicle_km``: counts, rates, speeds over time and quantiles.
 
-    Rates are per vehicle-km with exact 95 % intervals, None where no vehicle moved. ``report`` is
-    called with the vehicle-km driven so far.
+    Rates are per vehicle-km with exact 95 % intervals, None where no vehicle moved. Progress is
+    printed under the traffic's ``name``.
     """
     traffic = make(road)
     events = EventCounter(road)
@@ -141,8 +141,10 @@ def long_run(
         moving = batch_km > 0.0
         km += batch_km
         episodes += rows
-        if report is not None:
-            report(km)
+        print_progress(
+            f"{name}, long run of {parameters.vehicles} vehicles: {km:.0f} of "
+            f"{parameters.vehicle_km:g} vehicle-km"
+        )
     samples = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
     changes = len(samples["duration"])
     durations = samples["duration"][samples["complete"]]

@@ -6,7 +6,6 @@ every traffic. Without recordings everything is compared with the histograms tha
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -18,7 +17,13 @@ from ganlane.data.lanes import scene_lane_widths
 from ganlane.data.schema import FRAME_S
 from ganlane.data.statistics import driving_statistics
 from ganlane.errors import UserError
-from ganlane.realism.driving import FLOORS, Factory, StartOptions, drive_recordings
+from ganlane.realism.driving import (
+    FLOORS,
+    Factory,
+    StartOptions,
+    drive_recordings,
+    print_progress,
+)
 from ganlane.realism.long_runs import EventCounter, LongRunParameters, drive_spawned
 from ganlane.realism.measures import (
     QUANTITIES,
@@ -40,11 +45,6 @@ EXCESS_GRID = (2.0, 4.0, 6.0, 8.0, 11.0, 15.0, 20.0)
 _SPAWNED_VEHICLES = 30
 _SPAWNED_S = 30.0
 _SPAWNED_ROWS = 8
-
-
-def print_progress(text: str) -> None:
-    """Print a line of progress on stderr."""
-    print(text, file=sys.stderr, flush=True)
 
 
 def simulate(make: Factory, recordings: Sequence[Recording], options: StartOptions) -> Measured:

@@ -63,14 +63,14 @@ def short_report(prepared: PooledStatistics) -> str:
 
 def _lane_change_lines(prepared: PooledStatistics) -> list[str]:
     changes = prepared.lane_changes
-    complete = changes.duration.complete
     duration = changes.duration
+    complete = duration.complete
     lines = [
         f"lane changes: {changes.count:,}; {changes.srlc:.3f} per vehicle and km of road "
         f"(equation 9), {changes.per_vehicle_km:.3f} per driven vehicle-km (95 % interval "
         f"{changes.per_vehicle_km_low:.3f} to {changes.per_vehicle_km_high:.3f})"
     ]
-    if duration.survival_mean_s is not None and complete.mean is not None:
+    if complete.count:
         lines.append(
             f"their duration (equation 11): mean {duration.survival_mean_s:.2f} s by Kaplan and "
             f"Meier over {complete.count:,} complete and {duration.censored:,} censored ones; "
@@ -78,8 +78,9 @@ def _lane_change_lines(prepared: PooledStatistics) -> list[str]:
         )
     # A mean needs one change that was seen from start to end.
     elif changes.count:
-        unknown = f"unknown, all {duration.censored:,} are censored"
-        lines.append(f"their duration (equation 11): {unknown}")
+        lines.append(
+            f"their duration (equation 11): unknown, all {duration.censored:,} are censored"
+        )
     return lines
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from ganlane.build import make_traffic
-from ganlane.data.dense import units_of
 from ganlane.data.one_lane import ONE_LANE_FILES, one_lane_files, read_one_lane
 from ganlane.data.recordings import read_scenes
 from ganlane.data.sources import data_folder, default_scenes
@@ -21,13 +20,12 @@ from ganlane.generator import HELD_OUT, Preset, shipped_generator
 from ganlane.realism.card import card_numbers, quantity_rows
 from ganlane.realism.driving import Factory, StartOptions
 from ganlane.realism.long_runs import LongRunParameters, long_run
-from ganlane.realism.measures import measure, measure_recordings
+from ganlane.realism.measures import measure_recordings
 from ganlane.realism.sheets import card_text, draw
 from ganlane.realism.starts import (
     Starts,
-    drive_all,
-    print_progress,
     recorded_starts,
+    simulate_all,
     spawned_starts,
 )
 from ganlane.settings.env import EnvConfig
@@ -61,11 +59,8 @@ def realism(config: RealismConfig, folder: Path) -> str:
     set_threads(config.threads)
     path = scenes_path(config)
     # Everything that can be refused is refused before hours of driving.
-    # The card's traffic first, then its rivals.
-    traffics = {config.traffic.label(): config.traffic, **config.rivals()}
-    factories: dict[str, Factory] = {
-        name: partial(_make, traffic, config.env) for name, traffic in traffics.items()
-    }
+    traffics = traffics_on_card(config)
+    factories = {name: partial(_make, traffic, config.env) for name, traffic in traffics.items()}
     files = files_wanted(config, path)
     starts = drive_from_starts(config, factories, path)
     # Empty without files of one lane; the card then leaves these rows out.
@@ -81,6 +76,11 @@ def realism(config: RealismConfig, folder: Path) -> str:
     show(*card_text(numbers), columns=config.columns)
     seeds = {"stream": "report", "seed": config.seed}
     return f"results: {write_results(folder, numbers, asdict(config), seeds)}"
+
+
+def traffics_on_card(config: RealismConfig) -> dict[str, TrafficConfig]:
+    """The card's traffic first, then its rivals."""
+    return {config.traffic.label(): config.traffic, **config.rivals()}
 
 
 def scenes_path(config: RealismConfig) -> Path | None:
@@ -129,7 +129,7 @@ def _fits(config: RealismConfig, scenes: Sequence[str]) -> bool:
     # Desired speeds that are fitted need scenes of their own, too.
     if config.data.held_out is not None or config.desired_above_mps is None:
         return True
-    used = {**config.rivals(), config.traffic.label(): config.traffic}
+    used = traffics_on_card(config)
     for name in PRESETS.keys() & used.keys():
         # The file of weights tells what it was fitted to.
         path = getattr(used[name], "path", None) or shipped_generator(PRESETS[name])
@@ -191,12 +191,11 @@ def one_lane_rows(
     # Once each: the site has many more segments than scenes.
     recordings = read_one_lane(name, path)
     options = StartOptions(seed=config.seed)
-    frames = drive_all(factories, recordings, options, starts.desired_above_mps)
-    units = units_of(recordings)
+    driven = simulate_all(factories, recordings, options, starts.desired_above_mps)
     recorded = measure_recordings(recordings).counts
     return quantity_rows(
         next(iter(factories)),
-        {driver: measure(frame, units) for driver, frame in frames.items()},
+        driven,
         {quantity: recorded[quantity] for quantity in ONE_LANE_QUANTITIES},
         floors={},
         resamples=config.resamples,
@@ -205,11 +204,9 @@ def one_lane_rows(
 
 def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str, Any]]:
     """One long run of a traffic per number of vehicles."""
-    runs: list[dict[str, Any]] = []
-    if config.vehicle_km <= 0:
-        return runs
-    for vehicles in config.long_vehicles:
-        # Each number of vehicles is a density of its own, at the paper's spacing.
+    runs = []
+    # Each number of vehicles is a density of its own, at the paper's spacing.
+    for vehicles in config.long_vehicles if config.vehicle_km > 0 else ():
         parameters = LongRunParameters(
             vehicles,
             config.vehicle_km,
@@ -217,10 +214,5 @@ def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str,
             config.seed,
             config.env.spawn_parameters(),
         )
-        what = f"{name}, long run of {vehicles} vehicles"
-
-        def report(km: float, what: str = what) -> None:
-            print_progress(f"{what}: {km:.0f} of {config.vehicle_km:g} vehicle-km")
-
-        runs.append(long_run(make, config.env.road(), parameters, report))
+        runs.append(long_run(make, config.env.road(), parameters, name))
     return runs

@@ -21,6 +21,9 @@ from ganlane.errors import UserError
 
 #: In fitting, a recorded driver's target lane is its lane after this time, s.
 INTENTION_S = 2.0
+#: Arrays [T, V] of a recording, and those [V].
+_OF_SAMPLES = ("x", "y", "speed", "lane", "present")
+_OF_TRACKS = ("length", "width", "driven")
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,7 @@ class Recording:
 
         With a column ``driven``, the other vehicles are replayed.
         """
+        rows = rows.with_columns(present=True)
         # Without the column everybody is driven.
         if "driven" not in rows.columns:
             rows = rows.with_columns(driven=True)
@@ -65,18 +69,16 @@ class Recording:
         time = frame - frame.min()
         track = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)[1]
         shape = (int(time.max()) + 1, int(track.max()) + 1)
-        # Values per frame and track; 0 where the track is absent.
-        arrays: dict[str, Any] = {"present": np.zeros(shape, bool)}
-        arrays["present"][time, track] = True
-        for name in ("x", "y", "speed", "lane"):
+
+        def placed(name: str, shape: tuple[int, ...], at: Any) -> Any:
             column = rows[name].to_numpy()
-            arrays[name] = np.zeros(shape, column.dtype)
-            arrays[name][time, track] = column
-        # Values per track, the same in all of its rows.
-        for name in ("length", "width", "driven"):
-            column = rows[name].to_numpy()
-            arrays[name] = np.zeros(shape[1], column.dtype)
-            arrays[name][track] = column
+            array = np.zeros(shape, column.dtype)
+            array[at] = column
+            return array
+
+        # 0 where a track is absent; values per track are the same in all of its rows.
+        arrays = {name: placed(name, shape, (time, track)) for name in _OF_SAMPLES}
+        arrays |= {name: placed(name, shape[1:], track) for name in _OF_TRACKS}
         scene = str(rows["scene"][0])
         # Lane 0 is the rightmost; lanes beyond the leftmost one in use are not known.
         lanes = int(rows["lane"].to_numpy().max()) + 1
@@ -158,9 +160,8 @@ class Recording:
             # Vehicles that are absent all the time are left out.
             rows = slice(start, start + length)
             who = self.present[rows].any(0)
-            names = ("x", "y", "speed", "lane", "present")
-            arrays = {name: getattr(self, name)[rows, who] for name in names}
-            arrays |= {name: getattr(self, name)[who] for name in ("length", "width", "driven")}
+            arrays = {name: getattr(self, name)[rows, who] for name in _OF_SAMPLES}
+            arrays |= {name: getattr(self, name)[who] for name in _OF_TRACKS}
             # The unit stays that of the recording: pieces of one scene are not independent.
             pieces.append(replace(self, name=f"{self.name}@{start}", **arrays))
         return pieces

@@ -60,7 +60,7 @@ class _Direction:
     lane_width: float
 
 
-def highd_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Scene]:
+def highd_scenes(path: str | Path, count: RowCount) -> Iterator[Scene]:
     """Two scenes, ``highd-XX-upper`` and ``highd-XX-lower``, for each recording.
 
     ``path`` is an ``XX_tracks.csv`` next to its ``XX_tracksMeta.csv`` and ``XX_recordingMeta.csv``,
@@ -70,7 +70,6 @@ def highd_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Sc
         UserError: a missing or damaged file; the message names file, line and column.
     """
     path = Path(path)
-    count = count if count is not None else RowCount()
     # A folder holds up to 60 recordings; one file is one of them.
     recordings = sorted(path.glob(f"*{_TRACKS}")) if path.is_dir() else [path]
     if not recordings:

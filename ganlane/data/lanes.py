@@ -22,9 +22,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ganlane.data.schema import CONTINUES, FRAME_S
+from ganlane.data.schema import FRAME_S
 from ganlane.errors import UserError
 
 #: 12 feet, the standard lane of a US freeway: used where a recording has one lane only.
@@ -180,12 +180,13 @@ def tracks_of_frame(
     Each scene's lane width in m is estimated where not given.
     """
     widths = scene_lane_widths(frame) if lane_widths is None else lane_widths
-    # A track goes on where frame and vehicle say so, within one scene.
-    same_scene = pl.col("scene") == pl.col("scene").shift(1)
+    # A track goes on where frame and vehicle say so, within one scene; null in the first row.
+    next_frame = (pl.col("frame").diff() == 1) & (pl.col("vehicle").diff() == 0)
+    goes_on = next_frame & (pl.col("scene") == pl.col("scene").shift(1))
     columns = frame.select(
         "y",
         width=pl.col("scene").replace_strict(widths, return_dtype=pl.Float64),
-        begins=~(CONTINUES & same_scene).fill_null(False),
+        begins=~goes_on.fill_null(False),
     )
     return Tracks(*(column.to_numpy() for column in columns))
 
@@ -249,20 +250,6 @@ def find_lane_changes(tracks: Tracks) -> LaneChanges:
     return LaneChanges(sample, old, new, tau_s, tau_e, ~start_seen, ~end_seen, speed)
 
 
-def lane_changes_of_arrays(y: ArrayLike, lane_width: float) -> LaneChanges:
-    """Lane changes of a simulation: ``y`` [T, K] are the lateral positions, m, of K vehicles every
-    0.1 s.
-
-    ``sample`` counts vehicle by vehicle.
-    """
-    columns = np.asarray(y, dtype=np.float64).T
-    # Every vehicle is a track of its own, present all the time.
-    begins = np.zeros(columns.shape, bool)
-    begins[:, 0] = True
-    widths = np.full(columns.size, lane_width)
-    return find_lane_changes(Tracks(columns.ravel(), widths, begins.ravel()))
-
-
 def _crossings(lane: Integers, tracks: Tracks) -> Integers:
     """[C] last samples in an old lane, where both the old and the new lane are kept long enough."""
     # A run is a stretch of one lane within a track.
@@ -295,18 +282,19 @@ def _find_end(
     path = np.where(inside, path, limit)
     # Distance from the centre of the lane that is left or reached.
     offset = tracks.y[path] - (lane * tracks.lane_width[sample])[:, None]
-    pace = side[:, None] * _lateral_speed(tracks, path)
+    # Recorded positions are noisy.
+    pace = side[:, None] * mean_speed(tracks.y, tracks, path)
     done = inside & ((np.abs(offset) < _CENTRED_M) | (pace < _STILL_MPS))
     within = done.any(axis=1)
     at = np.where(within, done.argmax(axis=1), inside.sum(axis=1) - 1)
     return sample + direction * at, within
 
 
-def _lateral_speed(tracks: Tracks, at: Integers) -> Floats:
-    """Mean lateral speed over 1 s, centred at the samples ``at``, m/s.
+def mean_speed(position: Floats, tracks: Tracks, at: Integers) -> Floats:
+    """Mean speed over 1 s, centred at the samples ``at``, m/s, along the axis of ``position`` [R].
 
     The window is shorter at a track's ends.
     """
     before = np.maximum(at - _HALF_WINDOW, tracks.first[at])
     after = np.minimum(at + _HALF_WINDOW, tracks.last[at])
-    return (tracks.y[after] - tracks.y[before]) / (np.maximum(after - before, 1) * FRAME_S)
+    return (position[after] - position[before]) / (np.maximum(after - before, 1) * FRAME_S)

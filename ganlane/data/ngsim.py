@@ -89,8 +89,8 @@ _PACE_FT_S = 10.0
 
 def ngsim_scenes(
     path: str | Path,
-    parameters: NgsimParameters | None = None,
-    count: RowCount | None = None,
+    parameters: NgsimParameters,
+    count: RowCount,
     scratch: Path | None = None,
     on_progress: OnProgress | None = None,
 ) -> Iterator[Scene]:
@@ -105,8 +105,6 @@ def ngsim_scenes(
         UserError: a missing or damaged file; the message names file, line and column.
     """
     path = Path(path)
-    parameters = parameters or NgsimParameters()
-    count = count if count is not None else RowCount()
     # Nothing is read before the first period is asked for.
     rows = _read_rows(_layout(path), parameters, count, on_progress)
     with tempfile.TemporaryDirectory(dir=scratch, prefix="rows-") as folder:

@@ -16,8 +16,8 @@ import numpy as np
 import polars as pl
 
 from ganlane.data.dense import Recording
-from ganlane.data.lanes import STANDARD_LANE_WIDTH_M
-from ganlane.data.schema import CONTINUES, FRAME_S
+from ganlane.data.lanes import STANDARD_LANE_WIDTH_M, mean_speed, tracks_of_frame
+from ganlane.data.schema import FRAME_S
 from ganlane.data.tables import read_table
 from ganlane.errors import UserError
 
@@ -94,17 +94,13 @@ def _pairs(path: Path) -> pl.DataFrame:
 
 
 def _following(path: Path) -> pl.DataFrame:
-    whole = dict.fromkeys(("follower", "leader", "frame"), pl.Int64)
-    numbers = dict.fromkeys(("x_follower", "x_leader", "leader_length"), pl.Float64)
     # Both cars of a pair are in one row.
-    table = read_table(
-        path,
-        {
-            "period": pl.String,
-            **whole,
-            **numbers,
-        },
-    )
+    columns = {
+        "period": pl.String,
+        **dict.fromkeys(("follower", "leader", "frame"), pl.Int64),
+        **dict.fromkeys(("x_follower", "x_leader", "leader_length"), pl.Float64),
+    }
+    table = read_table(path, columns)
     cars = []
     for role, length in (
         ("follower", pl.lit(_LENGTH_M)),
@@ -145,9 +141,9 @@ def _instrumented(path: Path) -> pl.DataFrame:
         x=pl.col("x") + pl.col("gap") + _LENGTH_M,
         driven=False,
     )
-    names = ["scene", "vehicle", "frame", "x", "driven"]
-    cars = [part.select(names).cast({"vehicle": pl.Int64}) for part in (follower, leaders)]
-    return pl.concat(cars).with_columns(length=_LENGTH_M)
+    # Numbers of vehicles come in two types.
+    cars = pl.concat([follower, leaders], how="diagonal_relaxed")
+    return cars.with_columns(length=_LENGTH_M)
 
 
 _READERS = {
@@ -165,21 +161,10 @@ def _one_lane(rows: pl.DataFrame) -> Recording:
     """
     # The files are sorted by frame, or by pair.
     rows = rows.sort("vehicle", "frame")
-    # A gap splits a track, since a recording's tracks have none.
-    rows = rows.with_columns(
-        vehicle=(~CONTINUES).fill_null(False).cum_sum(),
-        y=0.0,
-        speed=0.0,
-        width=_WIDTH_M,
-        lane=0,
-    )
     # Positions across the road are not given, and all lanes are alike.
-    recording = Recording.of(rows, STANDARD_LANE_WIDTH_M)
-    # Half a second before and after, or as far as the track reaches.
-    frames = np.arange(len(recording.x))[:, None]
-    before = np.clip(frames - 5, *recording.ends)
-    after = np.clip(frames + 5, *recording.ends)
-    x = recording.x
-    moved = np.take_along_axis(x, after, 0) - np.take_along_axis(x, before, 0)
-    speed = moved / (np.maximum(after - before, 1) * FRAME_S)
-    return replace(recording, speed=np.where(recording.present, speed, 0.0))
+    rows = rows.with_columns(y=0.0, lane=0, width=_WIDTH_M)
+    tracks = tracks_of_frame(rows, {rows["scene"][0]: STANDARD_LANE_WIDTH_M})
+    speed = mean_speed(rows["x"].to_numpy(), tracks, np.arange(len(rows)))
+    # A gap splits a track, since a recording's tracks have none.
+    rows = rows.with_columns(vehicle=pl.Series(tracks.begins).cum_sum(), speed=pl.Series(speed))
+    return Recording.of(rows, STANDARD_LANE_WIDTH_M)

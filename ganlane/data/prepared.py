@@ -67,9 +67,8 @@ class PooledStatistics:
         # Numbers of their own, which do not hold on to the frame.
         samples = {name: values.copy() for name, values in quantities(frame).items()}
         self._samples.append(samples)
-        speed = float(samples["speed"].mean())
         # A scene's own rates, for the table.
-        rates = lane_change_statistics(changes, exposure, speed)
+        rates = lane_change_statistics(changes, exposure, samples["speed"])
         summary = {
             "name": scene.name,
             "rows": frame.height,
@@ -79,7 +78,7 @@ class PooledStatistics:
             "lane_width_m": scene.lane_width_m,
             "nearest_lane_share": float(np.mean(tracks.lane == frame["lane"].to_numpy())),
             "vehicle_km": exposure.vehicle_km,
-            "mean_speed_mps": speed,
+            "mean_speed_mps": float(samples["speed"].mean()),
             "lane_changes": rates.count,
             "srlc": rates.srlc,
             "per_vehicle_km": rates.per_vehicle_km,
@@ -106,8 +105,7 @@ class PooledStatistics:
     @property
     def lane_changes(self) -> LaneChangeStatistics:
         """Rates, durations and lateral speeds over all scenes."""
-        speed = float(self.sample("speed").mean())
-        return lane_change_statistics(self.changes, self.exposure, speed)
+        return lane_change_statistics(self.changes, self.exposure, self.sample("speed"))
 
     def sample(self, quantity: str) -> np.ndarray:
         """All values of one of the :func:`quantities`."""

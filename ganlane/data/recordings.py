@@ -147,6 +147,7 @@ def open_scenes(
     """
     # Each reader yields one scene after the other.
     if kind == "ngsim":
+        parameters = parameters or NgsimParameters()
         yield from ngsim_scenes(path, parameters, count, scratch, on_progress)
     elif kind == "highd":
         yield from highd_scenes(path, count)

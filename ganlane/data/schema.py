@@ -39,8 +39,6 @@ SCHEMA = pl.Schema(
 )
 #: Columns that identify a track.
 TRACK = ("scene", "vehicle")
-#: Whether a row of one sorted scene goes on with the track of the row before; null in the first.
-CONTINUES = (pl.col("frame").diff() == 1) & (pl.col("vehicle").diff() == 0)
 #: Bounds that no recording of road traffic in SI units exceeds.
 MAX_MEDIAN_SPEED_MPS = 60.0
 MAX_MEDIAN_LENGTH_M = 12.0
@@ -155,7 +153,13 @@ def _mistakes(frame: pl.DataFrame) -> Iterator[tuple[int, str]]:
     From the plainest damage to what single rows do not show. Later mistakes may come of earlier
     ones, so only the first one counts.
     """
-    step = pl.col("frame").diff().over(TRACK)
+    frame = frame.with_columns(step=pl.col("frame").diff().over(TRACK))
+    step = pl.col("step")
+
+    def first(bad: pl.Expr) -> Iterator[int]:
+        """The first row that is ``bad``, if there is one."""
+        yield from frame.select(bad.arg_true().first()).to_series().drop_nulls()
+
     bad: list[tuple[str, str, pl.Expr]] = []
     for name, kind in SCHEMA.items():
         if kind == pl.Float64():
@@ -167,21 +171,19 @@ def _mistakes(frame: pl.DataFrame) -> Iterator[tuple[int, str]]:
     bad.append(("frame", "comes twice in its track", step == 0))
     bad.append(("frame", "is before its track's last frame; frames must grow", step < 0))
     for column, what, is_bad in bad:
-        for row in frame.select(is_bad.arg_true()).to_series():
+        for row in first(is_bad):
             yield row, f"column {column}: {frame[column][row]} {what}"
     # With most rows further apart than a frame, nothing could be measured between them.
-    rows = frame.select("scene", step=step).with_row_index("row")
-    far = rows.filter((pl.col("step").median().over("scene") > 1) & (pl.col("step") > 1))
-    for row, scene, frames in far.iter_rows():
+    for row in first((step.median().over("scene") > 1) & (step > 1)):
         yield (
             row,
-            f"column frame: most rows of scene {scene} come {frames} frames after their track's "
-            f"last one; expected {1 / FRAME_S:.0f} frames a second, numbered one by one: resample "
-            "the recording",
+            f"column frame: most rows of scene {frame['scene'][row]} come {frame['step'][row]} "
+            f"frames after their track's last one; expected {1 / FRAME_S:.0f} frames a second, "
+            "numbered one by one: resample the recording",
         )
     # Noise moves a standing car back by decimetres; further back a whole track is turned round.
     track_m = (pl.col("x").last() - pl.col("x").first()).over(TRACK)
-    for row in frame.select((track_m < -BACKWARDS_M).arg_true().first()).to_series().drop_nulls():
+    for row in first(track_m < -BACKWARDS_M):
         yield (
             row,
             "column x: its track runs backwards, against the direction of growing x; turn x and y "
@@ -199,16 +201,15 @@ def _mistakes(frame: pl.DataFrame) -> Iterator[tuple[int, str]]:
         ("length", length, MAX_MEDIAN_LENGTH_M, "m; convert feet to m"),
     ):
         if median > bound:
-            row = frame.select((pl.col(column) > bound).arg_true().first()).item()
+            row = next(first(pl.col(column) > bound))
             yield row, f"column {column}: the median is {median:.1f}, which cannot be {unit}"
     # Standing traffic shows no ratio. Not even rounded positions give another one than about 1.
     moves = rate is not None and max(abs(rate), abs(speed)) >= 1.0
     if moves and not speed / MAX_SPEED_RATIO < rate < speed * MAX_SPEED_RATIO:
         low = pl.col("speed") / MAX_SPEED_RATIO
         high = pl.col("speed") * MAX_SPEED_RATIO
-        row = frame.select((~rates.is_between(low, high)).arg_true().first()).item()
         yield (
-            row or 0,
+            next(first(~rates.is_between(low, high)), 0),
             f"columns x and speed: x moves by {rate:.1f} m per second where speed says "
             f"{speed:.1f} m/s; expected metres along the direction of travel, m/s and "
             f"{1 / FRAME_S:.0f} frames a second",

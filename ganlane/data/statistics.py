@@ -271,13 +271,14 @@ class LaneChangeStatistics(Record):
 def lane_change_statistics(
     changes: LaneChanges,
     exposure: Exposure,
-    speed_mps: float,
+    speed: Floats,
 ) -> LaneChangeStatistics:
-    """Statistics of lane changes found in that much driving at that mean speed, m/s."""
+    """Statistics of lane changes found in that much driving at the speeds [R], m/s."""
     # Two rates: per car and km of road, and per km driven.
     n = len(changes)
     km = exposure.vehicle_km
     low, high = poisson_interval(n)
+    speed_mps = float(speed.mean())
     by_road = n / exposure.cars * 1000.0 / exposure.road_m
     by_distance = n / km
     return LaneChangeStatistics(
@@ -344,11 +345,10 @@ def driving_statistics(
     exposure = measure_exposure(frame)
     samples = quantities(frame)
     changes = find_lane_changes(tracks_of_frame(frame, lane_widths))
-    speed = float(samples["speed"].mean())
     described = ("speed", "acceleration_raw", "acceleration_smoothed", "headway")
     return DrivingStatistics(
         exposure=exposure,
-        lane_changes=lane_change_statistics(changes, exposure, speed),
+        lane_changes=lane_change_statistics(changes, exposure, samples["speed"]),
         speed_sd_in_frame=_mean_spread(frame, ["scene", "frame"]),
         speed_sd_in_lane=_mean_spread(frame, ["scene", "frame", "lane"]),
         **{name: describe(samples[name]) for name in described},

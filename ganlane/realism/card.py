@@ -54,7 +54,7 @@ def card_numbers(
         "desired_above_mps": dict(starts.desired_above_mps),
         "recordings": starts.reference.source,
         "recorded_lane_changes_per_vehicle_km": starts.reference.rate(),
-        "recorded_spread_mps": starts.reference.spread_mps,
+        "recorded_spread_mps": starts.reference.whole["speed_spread_mps"],
         "quantities": rows,
         "quantities_held_out": held_out,
         "driving": {name: driving.summary() for name, driving in measured.items()},

@@ -21,12 +21,14 @@ Two drivers mark the ends of the scale: random driving and constant velocity.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import polars as pl
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -35,7 +37,7 @@ from ganlane.data.dense import Recording
 from ganlane.generator.closed_loop import balanced_headway
 from ganlane.sim.random import Purpose, absorb, episode_key, uniform
 from ganlane.sim.state import ENTRY_M, Road, Vehicles
-from ganlane.traffic.base import Memory, Moved, TrafficModule
+from ganlane.traffic.base import Memory, Moved, TrafficModule, new_tensordict, uniforms
 from ganlane.traffic.overlays import random_side
 
 #: Makes a traffic model for a road.
@@ -66,6 +68,11 @@ class StartOptions:
     desired_above_mps: float = 6.0
     repeats: int = 1
     seed: int = 0
+
+
+def print_progress(text: str) -> None:
+    """Print a line of progress on stderr."""
+    print(text, file=sys.stderr, flush=True)
 
 
 def drive_recordings(
@@ -118,9 +125,11 @@ def _drive(
     # A uniform number with the wanted mean.
     u = uniform(key, 0, recorded.x.shape[2], [Purpose.SPAWN_DESIRED_SPEED])[..., 0]
     excess = 2.0 * options.desired_above_mps * u
-    state = recorded.nobody(int(traffic.visibility))
-    memory: TensorDictBase | None = None
-    waiting = torch.ones_like(state.valid)
+    # Nobody has entered.
+    state = recorded.entering(0, excess, traffic)
+    waiting = state.valid
+    state = state.with_(x=torch.full_like(state.x, _ABSENT_M), valid=~waiting)
+    memory: TensorDictBase = traffic.init_memory(state, absorb(key, 0))
     # Positions of every step, before the step is driven.
     course = []
     for step in range(len(recorded.x)):
@@ -128,9 +137,13 @@ def _drive(
         # Who has entered once does not enter again.
         enters = recorded.may_enter(state, waiting, traffic.road, step)
         waiting = waiting & ~enters
-        entered = recorded.entering(step, excess, traffic.road, state)
-        state = entered.where(enters, state)
-        memory = _updated_memory(traffic, state, memory, enters, absorb(key, 0))
+        state = recorded.entering(step, excess, traffic).where(enters, state)
+        if bool(enters.any()):
+            # Drawn for all, and taken for those who enter.
+            fresh = with_recorded_headways(
+                traffic.init_memory(state, absorb(key, 0)), state, traffic.road, enters
+            )
+            memory = fresh.apply(partial(_of_those, enters), memory)
         course.append((state.x, state.y, state.valid))
         state, memory = step_traffic(traffic, state, memory, counters, step)
     x, y, valid = (torch.stack(values)[..., 1:].numpy() for values in zip(*course))
@@ -155,38 +168,22 @@ def step_traffic(
 
     Invalid vehicles stay as they are.
     """
-    size = torch.Size([state.x.shape[0]])
+    n = len(state.x)
     # What an environment would hand to its traffic, without an ego.
-    view = TensorDict._new_unsafe(
-        {
-            keys.VEHICLES: TensorDict._new_unsafe(state.as_dict(), batch_size=size),
-            keys.TRAFFIC: memory,
-            **counters,
-            keys.STEP: torch.full(size, step),
-        },
-        batch_size=size,
-    )
+    fields = {
+        keys.VEHICLES: new_tensordict(state.as_dict(), n),
+        keys.TRAFFIC: memory,
+        **counters,
+        keys.STEP: torch.full((n,), step),
+    }
+    view = new_tensordict(fields, n)
     traffic(view)
     return Vehicles.of(view.get(keys.MOVED)).where(state.valid, state), view.get(keys.TRAFFIC)
 
 
-def _updated_memory(
-    traffic: TrafficModule,
-    state: Vehicles,
-    memory: TensorDictBase | None,
-    enters: Tensor,
-    key: Tensor,
-) -> TensorDictBase:
-    """The traffic's memory, fresh for the vehicles that enter, with their recorded headways."""
-    if memory is not None and not bool(enters.any()):
-        return memory
-    # Drawn for all, and taken for those who enter.
-    fresh = with_recorded_headways(traffic.init_memory(state, key), state, traffic.road, enters)
-
-    def merged(new: Tensor, old: Tensor) -> Tensor:
-        return torch.where(enters.reshape(*enters.shape, *[1] * (new.ndim - 2)), new, old)
-
-    return fresh if memory is None else fresh.apply(merged, memory)
+def _of_those(who: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """The ``new`` values [N, M, ...] of the vehicles ``who`` [N, M], the ``old`` of the others."""
+    return torch.where(who.reshape(*who.shape, *[1] * (new.ndim - 2)), new, old)
 
 
 class StackedRecordings:
@@ -217,24 +214,6 @@ class StackedRecordings:
         self.length = stacked("length")
         self.end_m = torch.tensor([[row.end_m] for row in rows])
 
-    def nobody(self, visibility: int) -> Vehicles:
-        """The state before any vehicle has entered."""
-        zero = torch.zeros_like(self.length)
-        lane = zero.long()
-        return Vehicles(
-            x=zero + _ABSENT_M,
-            y=zero,
-            heading=zero,
-            speed=zero + 10.0,
-            acceleration=zero,
-            length=self.length.clamp_min(1.0),
-            width=zero + 2.0 * ENTRY_M,
-            desired_speed=zero + 20.0,
-            target_lane=lane,
-            visibility=lane + visibility,
-            valid=zero > 0.0,
-        )
-
     def without_finished(self, state: Vehicles, step: int) -> Vehicles:
         """Removes vehicles whose recording is over or that passed the end of the road.
 
@@ -243,14 +222,9 @@ class StackedRecordings:
         # Replayed vehicles leave when their recording ends, no earlier.
         on_road = (state.x <= self.end_m + _ROUNDING_M) | ~self.driven
         stays = state.valid & self.present[step] & on_road
-        replayed = stays & ~self.driven
-        x = torch.where(stays, state.x, _ABSENT_M)
-        return state.with_(
-            valid=stays,
-            x=torch.where(replayed, self.x[step], x),
-            y=torch.where(replayed, self.y[step], state.y),
-            speed=torch.where(replayed, self.speed[step], state.speed),
-        )
+        state = state.with_(x=torch.where(stays, state.x, _ABSENT_M), valid=stays)
+        replayed = state.with_(x=self.x[step], y=self.y[step], speed=self.speed[step])
+        return replayed.where(stays & ~self.driven, state)
 
     def may_enter(self, state: Vehicles, waiting: Tensor, road: Road, step: int) -> Tensor:
         """Vehicles that enter now, bool [N, M].
@@ -267,19 +241,23 @@ class StackedRecordings:
         room = between - 0.5 * (self.length[:, :, None] + state.length[:, None])
         return wants & ~(same & state.valid[:, None] & (room < ENTRY_GAP_M)).any(-1)
 
-    def entering(self, step: int, excess: Tensor, road: Road, state: Vehicles) -> Vehicles:
+    def entering(self, step: int, excess: Tensor, traffic: TrafficModule) -> Vehicles:
         """All vehicles in their recorded state, heading along the road."""
         y = self.y[step]
         speed = self.speed[step].clamp_min(0.0)
-        return state.with_(
+        zero = torch.zeros_like(y)
+        return Vehicles(
             x=self.x[step],
             y=y,
+            heading=zero,
             speed=speed,
-            heading=torch.zeros_like(y),
-            acceleration=torch.zeros_like(y),
+            acceleration=zero,
+            length=self.length.clamp_min(1.0),
+            width=zero + 2.0 * ENTRY_M,
             desired_speed=(speed + excess).clamp(SLOWEST_DESIRED_MPS, FASTEST_DESIRED_MPS),
-            target_lane=road.lane_of(y).long(),
-            valid=torch.ones_like(state.valid),
+            target_lane=traffic.road.lane_of(y).long(),
+            visibility=zero.long() + int(traffic.visibility),
+            valid=zero == 0.0,
         )
 
 
@@ -323,14 +301,12 @@ class RandomDriving(TrafficModule):
     def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """One step: the second's acceleration, and towards the target lane."""
         v = vehicles
-        m = vehicles.x.shape[1]
-        dtype = vehicles.x.dtype
         # One acceleration for the ten steps of a second.
         second = torch.div(step, 10, rounding_mode="floor")
-        pace = uniform(key, second, m, [Purpose.ACCELERATION], dtype)[..., 0]
-        purposes: list[int] = [Purpose.LANE_CHANGE_HAZARD, Purpose.LANE_CHANGE_SIDE]
-        hazard, chosen = uniform(key, step, m, purposes, dtype).unbind(-1)
-        remaining = self.road.centre_of(v.target_lane, dtype) - v.y
+        (pace,) = uniforms(v, key, second, Purpose.ACCELERATION)
+        purposes = (Purpose.LANE_CHANGE_HAZARD, Purpose.LANE_CHANGE_SIDE)
+        hazard, chosen = uniforms(v, key, step, *purposes)
+        remaining = self.road.centre_of(v.target_lane, v.x.dtype) - v.y
         # Nobody starts a change during another one.
         starts = (hazard < self.dt / self.every_s) & (remaining.abs() < 0.3)
         side = torch.where(starts, random_side(chosen, v.target_lane, self.road.lanes), 0)

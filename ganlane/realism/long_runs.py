@@ -8,7 +8,7 @@ with exact intervals, speeds over time, and quantiles.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from ganlane import keys
-from ganlane.data.lanes import lane_changes_of_arrays
-from ganlane.evaluation.statistics import entries, poisson_interval
+from ganlane.data.lanes import Tracks, find_lane_changes
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.realism.driving import Factory, step_traffic
+from ganlane.realism.driving import Factory, print_progress, step_traffic
+from ganlane.realism.measures import rate_entries
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.neighbours import leader, perceive
 from ganlane.sim.random import absorb, episode_key
@@ -28,9 +28,9 @@ from ganlane.sim.spawn import TABLE_II, RandomScenes, SpawnParameters
 from ganlane.sim.state import Road, Vehicles, lateral_half_extent
 from ganlane.traffic import TrafficModule
 
-#: Times at which speeds are summarised, s; and the distance of the goal, m.
-SPEEDS_AT_S = (10.0, 60.0, 150.0, 300.0)
-GOAL_M = 5000.0
+#: Times at which speeds are summarised, s, by name; and the distance of the goal, m.
+SPEEDS_AT_S = {"10 s": 10.0, "60 s": 60.0, "150 s": 150.0, "300 s": 300.0}
+GOAL, GOAL_M = "5000 m", 5000.0
 #: Samples of one batch (times, rows, vehicles); bounds the memory.
 _MOST_SAMPLES = 12_000_000
 _MOST_ROWS = 64
@@ -119,35 +119,38 @@ def long_run(
     make: Factory,
     road: Road,
     parameters: LongRunParameters,
-    report: Callable[[float], None] | None = None,
+    name: str = "traffic",
 ) -> dict[str, Any]:
     """Drive ``parameters.vehicle_km``: counts, rates, speeds over time and quantiles.
 
-    Rates are per vehicle-km with exact 95 % intervals, None where no vehicle moved. ``report`` is
-    called with the vehicle-km driven so far.
+    Rates are per vehicle-km with exact 95 % intervals, None where no vehicle moved. Progress is
+    printed under the traffic's ``name``.
     """
     traffic = make(road)
     events = EventCounter(road)
-    parts: list[dict[str, Any]] = []
+    batches: list[dict[str, np.ndarray]] = []
     km = 0.0
     episodes = 0
+    moving = True
     # Ends early where nobody moves.
-    while km < parameters.vehicle_km and not (parts and parts[-1]["vehicle_km"] <= 0.0):
+    while km < parameters.vehicle_km and moving:
         rows = _rows(parameters, parameters.vehicle_km - km)
         driven = drive_spawned(traffic, parameters, episodes, rows, events)
-        parts.append(batch_statistics(driven, road))
-        km += parts[-1]["vehicle_km"]
+        batches.append(batch_samples(driven, road))
+        batch_km = float((driven.x[-1] - driven.x[0]).sum(dtype=np.float64)) / 1000.0
+        moving = batch_km > 0.0
+        km += batch_km
         episodes += rows
-        if report is not None:
-            report(km)
-    # Added up over the batches.
-    changes = sum(part["lane_changes"] for part in parts)
-    durations = np.concatenate([part["durations"] for part in parts])
-    acceleration = np.concatenate([part["acceleration"] for part in parts])
-    # By time, from the episodes that lasted so long.
-    speeds = {
-        time: mean_speeds([part["speeds"][time] for part in parts]) for time in parts[0]["speeds"]
-    }
+        print_progress(
+            f"{name}, long run of {parameters.vehicles} vehicles: {km:.0f} of "
+            f"{parameters.vehicle_km:g} vehicle-km"
+        )
+    samples = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
+    changes = len(samples["duration"])
+    durations = samples["duration"][samples["complete"]]
+    # From the episodes that lasted so long, or came so far.
+    speeds = {time: mean_speeds(samples[time]) for time in SPEEDS_AT_S}
+    speeds[GOAL] = mean_speeds(samples[GOAL], after_s=samples["after_s"])
     return {
         "vehicles": parameters.vehicles,
         "episodes": episodes,
@@ -159,7 +162,8 @@ def long_run(
         "off_road": events.off_road,
         "standstills_in_free_flow": events.standstills,
         "acceleration_quantiles": {
-            f"{level:g}": float(np.quantile(acceleration, level)) for level in (0.05, 0.95)
+            f"{level:g}": float(np.quantile(samples["acceleration"], level))
+            for level in (0.05, 0.95)
         },
         "speeds": speeds,
     }
@@ -225,58 +229,61 @@ def drive_spawned(
         events.count(state, step)
         course.append((state.x, state.y, state.speed))
         # Distances are tested once in ten seconds of driving: cheap, and exact enough.
-        due = step % 100 == 99 and step * PHYSICS_STEP_S >= SPEEDS_AT_S[-1]
+        due = step % 100 == 99 and step * PHYSICS_STEP_S >= max(SPEEDS_AT_S.values())
         if due and bool(((state.x - start)[:, 1:].mean(1) >= GOAL_M).all()):
             break
     x, y, speed = (torch.stack(values)[..., 1:].numpy() for values in zip(*course))
     return Trajectories(x, y, speed, state.length[:, 1:].numpy(), state.width[:, 1:].numpy())
 
 
-def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
-    """Counts, samples and speeds of one batch."""
-    # Every vehicle of every episode is a track of its own.
-    y = trajectories.y.reshape(len(trajectories.y), -1)
-    changes = lane_changes_of_arrays(y, float(road.lane_width_m))
+def batch_samples(trajectories: Trajectories, road: Road) -> dict[str, np.ndarray]:
+    """Samples of one batch.
+
+    Of every lane change its ``duration`` in s and whether it is ``complete``; ``acceleration``,
+    m/s2; speeds [R, K] of the R episodes that lasted so long (:data:`SPEEDS_AT_S`) or came so far
+    (:data:`GOAL`), m/s, and when the latter came there, ``after_s``.
+    """
+    # Every vehicle of every episode is a track of its own, present all the time.
+    y = trajectories.y.reshape(len(trajectories.y), -1).astype(np.float64)
+    begins = np.arange(y.size) % len(y) == 0
+    widths = np.full(y.size, float(road.lane_width_m))
+    changes = find_lane_changes(Tracks(y.T.ravel(), widths, begins))
     second = round(1.0 / PHYSICS_STEP_S)
     x = trajectories.x.astype(np.float64)
     # The same filter as for recordings; one sample a second is enough.
     bend = x[2 * second :: second] - 2.0 * x[second:-second:second] + x[: -2 * second : second]
-    # Speeds [R, K] of the R episodes that lasted so long, or came so far.
-    speeds: dict[str, dict[str, np.ndarray]] = {}
-    for seconds in SPEEDS_AT_S:
+    speeds = {}
+    for name, seconds in SPEEDS_AT_S.items():
         time = round(seconds / PHYSICS_STEP_S)
         # An episode that ended earlier says nothing about this time.
-        lasted = trajectories.speed[time : time + 1].reshape(-1, trajectories.speed.shape[-1])
-        speeds[f"{seconds:g} s"] = speeds_of(lasted)
-    # The first time at which the episode's vehicles have covered 5000 m on average.
-    driven_m = trajectories.x - trajectories.x[:1]
-    # [T, N].
-    there = driven_m.mean(-1) >= GOAL_M
+        lasted = trajectories.speed[time : time + 1]
+        speeds[name] = lasted.reshape(-1, lasted.shape[-1])
+    # The first time at which the episode's vehicles have covered 5000 m on average, [T, N].
+    there = (trajectories.x - trajectories.x[:1]).mean(-1) >= GOAL_M
     arrived = np.flatnonzero(there.any(0))
     times = there.argmax(0)[arrived]
-    at_goal = speeds_of(trajectories.speed[times, arrived])
-    speeds[f"{GOAL_M:g} m"] = {**at_goal, "after_s": times * PHYSICS_STEP_S}
     return {
-        "vehicle_km": float(driven_m[-1].sum(dtype=np.float64)) / 1000.0,
-        "lane_changes": len(changes),
-        "durations": changes.duration_s[changes.complete],
+        "duration": changes.duration_s,
+        "complete": changes.complete,
         "acceleration": bend.ravel(),
-        "speeds": speeds,
+        **speeds,
+        GOAL: trajectories.speed[times, arrived],
+        "after_s": times * PHYSICS_STEP_S,
     }
 
 
-def speeds_of(speed: np.ndarray) -> dict[str, np.ndarray]:
-    """Mean and standard deviation [R] of the speeds [R, K] of R episodes, m/s."""
+def mean_speeds(speed: np.ndarray, **others: np.ndarray) -> dict[str, float | int | None]:
+    """Means over R episodes of the mean and the standard deviation of their speeds [R, K], m/s.
+
+    Those of the ``others`` [R] too, and R; None without any.
+    """
     speed = speed.astype(np.float64)
     spread = speed.std(-1, ddof=1) if speed.shape[-1] > 1 else np.zeros(len(speed))
-    return {"mean_speed_mps": speed.mean(-1), "spread_mps": spread}
-
-
-def mean_speeds(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, float | int | None]:
-    """Means over the episodes of all batches, and their number; None without any."""
-    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    means = {name: float(values.mean()) if len(values) else None for name, values in joined.items()}
-    return {**means, "episodes": len(joined["spread_mps"])}
+    of_episodes = {"mean_speed_mps": speed.mean(-1), "spread_mps": spread, **others}
+    means = {
+        name: float(values.mean()) if len(values) else None for name, values in of_episodes.items()
+    }
+    return {**means, "episodes": len(speed)}
 
 
 def rates(lane_changes: int, overlaps: int, km: float) -> dict[str, Any]:
@@ -284,11 +291,9 @@ def rates(lane_changes: int, overlaps: int, km: float) -> dict[str, Any]:
 
     None where no vehicle moved.
     """
-    changes = poisson_interval(lane_changes).scaled(per=km) if km > 0.0 else None
-    pairs = poisson_interval(overlaps).scaled(1000.0, per=km) if km > 0.0 else None
     return {
-        **entries("lane_changes_per_vehicle_km", changes),
-        **entries("overlaps_per_1000_vehicle_km", pairs),
+        **rate_entries("lane_changes_per_vehicle_km", lane_changes, km),
+        **rate_entries("overlaps_per_1000_vehicle_km", overlaps, km, per_km=1000.0),
     }
 
 

@@ -212,13 +212,20 @@ class Measured:
         return replace(self, counts={name: counts[rows] for name, counts in self.counts.items()})
 
 
+def rate_entries(name: str, events: int, km: float, per_km: float = 1.0) -> dict[str, Any]:
+    """``events`` per ``per_km`` vehicle-km with their exact 95 % interval, by :func:`entries`.
+
+    None where no vehicle moved.
+    """
+    return entries(name, poisson_interval(events).scaled(per_km, per=km) if km > 0.0 else None)
+
+
 def lane_change_rate(changes: int, km: float) -> dict[str, Any]:
     """Lane changes, vehicle-km, and their ratio with its exact 95 % interval."""
-    ratio = poisson_interval(changes).scaled(per=km) if km else None
     return {
         "lane_changes": changes,
         "vehicle_km": km,
-        **entries("per_vehicle_km", ratio),
+        **rate_entries("per_vehicle_km", changes, km),
     }
 
 
@@ -262,15 +269,9 @@ def samples_of(motion: pl.DataFrame) -> dict[str, pl.DataFrame]:
         "speed_spread": (crowded, pl.col("speed")),
         "acceleration": (counted, pl.col("acceleration")),
         "jerk": (counted, pl.col("jerk")),
-        "time_headway": (
-            fast_enough,
-            pl.col("gap") / pl.col("speed"),
-        ),
+        "time_headway": (fast_enough, pl.col("gap") / pl.col("speed")),
         "gap": (followers, pl.col("gap")),
-        "time_to_collision": (
-            followers.filter(closing > CLOSING_MPS),
-            pl.col("gap") / closing,
-        ),
+        "time_to_collision": (followers.filter(closing > CLOSING_MPS), pl.col("gap") / closing),
     }
     samples = {
         name: rows.select("unit", value=value).drop_nulls().filter(pl.col("value").is_finite())
@@ -288,12 +289,12 @@ def samples_of(motion: pl.DataFrame) -> dict[str, pl.DataFrame]:
 def _histograms(table: pl.DataFrame, units: Sequence[str], bins: Bins) -> Array:
     """Samples per unit and bin, [units, bins]."""
     # Row and column of each sample in the table of counts.
-    row = table["unit"].cast(pl.Enum(units)).to_physical().cast(pl.Int64).to_numpy()
+    row = table["unit"].cast(pl.Enum(units)).to_physical().to_numpy()
     share = (table["value"].to_numpy() - bins.low) / (bins.high - bins.low)
     column = np.clip(np.floor(share * bins.number), 0, bins.number - 1).astype(np.int64)
-    # Two indices as one, counted at once.
-    flat = np.bincount(row * bins.number + column, minlength=len(units) * bins.number)
-    return flat.reshape(len(units), bins.number).astype(np.float64)
+    counts = np.zeros((len(units), bins.number))
+    np.add.at(counts, (row, column), 1.0)
+    return counts
 
 
 def with_motion(frame: pl.DataFrame) -> pl.DataFrame:
@@ -329,8 +330,8 @@ class Reference(Measured):
     Attributes:
         source: where it was recorded.
         units: names of the scenes.
-        whole: lane changes and vehicle-km of all frames, and ``speed_spread_mps``; long runs are
-            compared with these.
+        whole: lane changes and vehicle-km of all frames, and ``speed_spread_mps``, the spread of
+            speeds within a frame, its mean over the frames; long runs are compared with these.
         floors: by driver (``random``, ``constant_velocity``), by quantity: its distance from here.
     """
 
@@ -338,11 +339,6 @@ class Reference(Measured):
     units: list[str]
     whole: Mapping[str, float]
     floors: Mapping[str, Mapping[str, float]]
-
-    @property
-    def spread_mps(self) -> float:
-        """Recorded spread of speeds within a frame, its mean over the frames, m/s."""
-        return self.whole["speed_spread_mps"]
 
     def rate(self) -> dict[str, Any]:
         """Lane changes per vehicle-km of the whole recording, with its exact interval."""

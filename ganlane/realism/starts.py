@@ -6,7 +6,6 @@ every traffic. Without recordings everything is compared with the histograms tha
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -18,7 +17,13 @@ from ganlane.data.lanes import scene_lane_widths
 from ganlane.data.schema import FRAME_S
 from ganlane.data.statistics import driving_statistics
 from ganlane.errors import UserError
-from ganlane.realism.driving import FLOORS, Factory, StartOptions, drive_recordings
+from ganlane.realism.driving import (
+    FLOORS,
+    Factory,
+    StartOptions,
+    drive_recordings,
+    print_progress,
+)
 from ganlane.realism.long_runs import EventCounter, LongRunParameters, drive_spawned
 from ganlane.realism.measures import (
     QUANTITIES,
@@ -42,23 +47,18 @@ _SPAWNED_S = 30.0
 _SPAWNED_ROWS = 8
 
 
-def print_progress(text: str) -> None:
-    """Print a line of progress on stderr."""
-    print(text, file=sys.stderr, flush=True)
-
-
 def simulate(make: Factory, recordings: Sequence[Recording], options: StartOptions) -> Measured:
     """Drive the recordings with a traffic and measure it."""
     return measure(drive_recordings(make, recordings, options), units_of(recordings))
 
 
-def drive_all(
+def simulate_all(
     factories: Mapping[str, Factory],
     recordings: Sequence[Recording],
     options: StartOptions,
     desired_above_mps: Mapping[str, float],
-) -> dict[str, pl.DataFrame]:
-    """Drive every traffic and both reference drivers from the same starts, not yet measured.
+) -> dict[str, Measured]:
+    """Every traffic and both reference drivers from the same starts, measured.
 
     ``desired_above_mps`` by traffic takes the place of that of the ``options``.
     """
@@ -67,8 +67,7 @@ def drive_all(
         print_progress(f"{name} from {len(recordings)} recorded starts")
         # Reference drivers have no desired speed that matters.
         excess = desired_above_mps.get(name, options.desired_above_mps)
-        wishes = replace(options, desired_above_mps=excess)
-        driven[name] = drive_recordings(make, recordings, wishes)
+        driven[name] = simulate(make, recordings, replace(options, desired_above_mps=excess))
     return driven
 
 
@@ -87,8 +86,7 @@ def fit_excess(
 
     def mean_distance(excess: float) -> float:
         # Once per scene is enough to compare candidates with each other.
-        once = replace(options, desired_above_mps=excess, repeats=1)
-        driven = simulate(make, recordings, once)
+        driven = simulate(make, recordings, replace(options, desired_above_mps=excess, repeats=1))
         # Lane changes are too few to fit anything to.
         distances = [
             pooled_distance(driven.counts[name], recorded.counts[name])
@@ -182,7 +180,6 @@ def recorded_starts(
         for name, make in factories.items():
             print_progress(f"{name}: fitting desired speeds on {len(others)} scenes")
             excesses[name] = fit_excess(make, others, options)
-    driven = drive_all(factories, chosen, options, excesses)
     # Long runs are compared with all frames, not only with those that count.
     statistics = driving_statistics(frame, widths)
     reference = Reference(
@@ -196,12 +193,11 @@ def recorded_starts(
         },
         floors={},
     )
-    units = units_of(chosen)
     return Starts(
-        scenes=units,
+        scenes=units_of(chosen),
         held_out=list(held_out),
         desired_above_mps=excesses,
-        driven={name: measure(frames, units) for name, frames in driven.items()},
+        driven=simulate_all(factories, chosen, options, excesses),
         recorded=measure_recordings(chosen),
         reference=reference,
     )
@@ -238,20 +234,18 @@ def spawned_recordings(
     paths = drive_spawned(make(road), parameters, 0, rows, EventCounter(road))
     # Nobody enters late or leaves.
     everywhere = np.ones(paths.x[:, 0].shape, dtype=bool)
+    lane_width_m = float(road.lane_width_m)
     return [
         Recording(
             name=f"spawned-{row}",
             unit=f"spawned-{row}",
             lanes=int(road.lanes),
-            lane_width_m=float(road.lane_width_m),
-            x=paths.x[:, row],
-            y=paths.y[:, row],
-            speed=paths.speed[:, row],
-            lane=np.rint(paths.y[:, row] / float(road.lane_width_m)).astype(np.int64),
+            lane_width_m=lane_width_m,
+            lane=np.rint(paths.y[:, row] / lane_width_m).astype(np.int64),
             present=everywhere,
-            length=paths.length[row],
-            width=paths.width[row],
             driven=everywhere[0],
+            # Vehicles are the last dimension of all of them, rows the one before.
+            **{name: values[..., row, :] for name, values in paths._asdict().items()},
         )
         for row in range(rows)
     ]

@@ -23,7 +23,7 @@ def recording(tmp_path):
 
 
 def test_each_direction_is_a_scene_at_10_hz_with_x_forward_and_lane_0_rightmost(recording):
-    upper, lower = highd_scenes(recording)
+    upper, lower = highd_scenes(recording, RowCount())
     assert (upper.name, lower.name) == ("highd-01-upper", "highd-01-lower")
     assert upper.frame.schema == lower.frame.schema == SCHEMA
     assert upper.lane_width_m == lower.lane_width_m == 4.0

@@ -27,6 +27,7 @@ from ganlane.settings.generator import NgsimParameters
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 LATER_MS = START_MS + 900_000
+WHOLE = NgsimParameters()
 #: A file takes several.
 SMALL_BLOCKS = NgsimParameters(block_bytes=20_000)
 #: Two periods of one place: the same vehicle and frame numbers again.
@@ -57,7 +58,7 @@ def same_driving(read: pl.DataFrame, expected: pl.DataFrame) -> None:
 
 def test_raw_text_gives_back_the_recording_in_metres_from_centres_and_from_the_right():
     path = text_file(ngsim_rows(FIRST))
-    (scene,) = ngsim_scenes(path)
+    (scene,) = ngsim_scenes(path, WHOLE, RowCount())
     assert (scene.name, scene.lanes) == ("trajectories-0750am-0805am-1", 3)
     assert scene.frame.schema == SCHEMA
     assert scene.lane_width_m == pytest.approx(LANE_M, abs=0.1)
@@ -92,7 +93,7 @@ def test_duplicates_and_other_places_are_dropped_and_counted():
         _, _, lines = portal_csv(rows.head(number), place).partition("\n")
         content += lines
     count = RowCount()
-    scenes = list(ngsim_scenes(portal_file(content), count=count))
+    scenes = list(ngsim_scenes(portal_file(content), WHOLE, count))
     same_driving(scenes[0].frame, FIRST)
     assert dict(count.dropped) == {
         "location lankershim": 7,
@@ -109,7 +110,7 @@ def test_ramps_are_left_out_and_end_a_track():
     on_ramp = (pl.col("Vehicle_ID") == 2) & pl.col("Frame_ID").is_between(20, 29)
     rows = rows.with_columns(Lane_ID=pl.when(on_ramp).then(7).otherwise("Lane_ID"))
     count = RowCount()
-    (scene,) = ngsim_scenes(text_file(rows), count=count)
+    (scene,) = ngsim_scenes(text_file(rows), WHOLE, count)
     assert dict(count.dropped) == {"ramp": 10}
     frames = dict(scene.frame.group_by("vehicle").agg("frame").iter_rows())
     assert frames[2] == list(range(20))
@@ -199,5 +200,5 @@ def test_temporary_files_are_removed_after_an_error():
     # The damage is late in the file, when blocks are on the disk.
     scratch.mkdir()
     with user_error("'far' is not a number"):
-        list(ngsim_scenes(path, SMALL_BLOCKS, scratch=scratch))
+        list(ngsim_scenes(path, SMALL_BLOCKS, RowCount(), scratch))
     assert list(scratch.iterdir()) == []

@@ -120,10 +120,14 @@ def test_distance_is_that_of_scipy(rows):
     )
 
 
-def histograms(shift, seed, number=12):
-    random = np.random.default_rng(seed)
-    scenes = [random.binomial(20, 0.3 + shift, 200) for _ in range(number)]
+def sampled(random, means, sizes):
+    """Histograms of binomial numbers up to 20 with these means, one of each size."""
+    scenes = [random.binomial(20, mean, size) for mean, size in zip(means, sizes)]
     return np.stack([np.bincount(scene, minlength=21) for scene in scenes]) * 1.0
+
+
+def histograms(shift, seed, number=12):
+    return sampled(np.random.default_rng(seed), [0.3 + shift] * number, [200] * number)
 
 
 def test_one_scene_gives_no_interval_and_no_verdict():
@@ -137,17 +141,12 @@ def intervals_of_40(shift, number):
     Both are ``number`` histograms with means of their own.
     """
     random = np.random.default_rng(number)
-
-    def sampled(means, sizes):
-        scenes = [random.binomial(20, p, size) for p, size in zip(means, sizes)]
-        return np.stack([np.bincount(scene, minlength=21) for scene in scenes]) * 1.0
-
     intervals = []
     for _ in range(40):
         means = random.normal(0.3, 0.05, number).clip(0.1, 0.6)
         size = random.integers(15, 60, number)
-        recorded = sampled(means, size)
-        model = sampled(means + shift, 4 * size)
+        recorded = sampled(random, means, size)
+        model = sampled(random, means + shift, 4 * size)
         intervals.append(distance(model, recorded, resamples=300))
     return intervals
 
@@ -227,7 +226,7 @@ def test_what_ships_is_small_and_holds_no_trajectories():
     # Published with the recordings: 57 changes in 61.7 vehicle-km.
     assert rate["lane_changes"] == 57
     assert rate["per_vehicle_km_ci"] == pytest.approx([0.70, 1.20], abs=0.01)
-    assert shipped.spread_mps == pytest.approx(2.8, abs=0.05)
+    assert shipped.whole["speed_spread_mps"] == pytest.approx(2.8, abs=0.05)
     for name in ("acceleration", "jerk", "time_headway", "time_to_collision"):
         assert ceiling(shipped.counts[name]) < shipped.floors["random"][name]
     assert all(0.0 < ceiling(shipped.counts[name]) < 1.0 for name in QUANTITIES)

@@ -101,7 +101,8 @@ Row = Mapping[str, Any]
 Figure = tuple[float, ...]
 
 
-def _at(results: Results, driver: str, traffic: str) -> Row:
+def at(results: Results, driver: str, traffic: str) -> Row:
+    """The row of a driver on a traffic."""
     return next(
         row for row in results["rows"] if (row["driver"], row["traffic"]) == (driver, traffic)
     )
@@ -146,7 +147,7 @@ def _lines(
 ) -> list[list[str]]:
     """For every driver its name, and a cell for every traffic."""
     return [
-        [name, *(cell(_at(results, driver, traffic)) for traffic in _traffics(results))]
+        [name, *(cell(at(results, driver, traffic)) for traffic in _traffics(results))]
         for driver, name in names.items()
     ]
 
@@ -156,7 +157,7 @@ def leads(results: Results) -> str:
     names = {driver: name for driver, name in DRIVERS.items() if driver != "random_legal"}
     table = _by_traffic(results, "lead over MOBIL", _lines(results, names, _lead))
     means = ", ".join(
-        f"{_at(results, 'mobil', traffic)['mean_reward']:.1f} on `{traffic}`"
+        f"{at(results, 'mobil', traffic)['mean_reward']:.1f} on `{traffic}`"
         for traffic in _traffics(results)
     )
     return f"{table}\n\nMOBIL's own mean reward: {means}."
@@ -198,7 +199,7 @@ def paper(results: Results) -> str:
     """The paper's Tables VI and VII, each number beside ours."""
     lines = []
     for agent in ("agent_idm", "agent_gan"):
-        ours = [_at(results, f"{agent}+none", traffic) for traffic in ("idm", "idm_mobil", "gan")]
+        ours = [at(results, f"{agent}+none", traffic) for traffic in ("idm", "idm_mobil", "gan")]
         crashes = [f"{row['hard_crash']}, {row['soft_crash']} of {_episodes(row)}" for row in ours]
         percent, reward, spread = PAPER_VII[agent]
         row = ours[-1]
@@ -240,7 +241,7 @@ def controls(results: Results) -> str:
 def trainings(results: Results) -> str:
     """agent_general training by training, then all of them: lead over MOBIL, and failures."""
     part = results["general"]
-    together = [_at(part, "agent_general+safe", traffic) for traffic in _traffics(part)]
+    together = [at(part, "agent_general+safe", traffic) for traffic in _traffics(part)]
     lines = [
         [f"`{training[0]['driver'].removesuffix('+safe')}`", *map(_lead_and_failures, training)]
         for training in zip(*(row["each"] for row in together))
@@ -256,7 +257,7 @@ def readme(results: Results) -> str:
     def cell(row: Row) -> str:
         ours, mobils = (
             1000 * driven["hard_crash"] / _episodes(driven)
-            for driven in (row, _at(results, "mobil", row["traffic"]))
+            for driven in (row, at(results, "mobil", row["traffic"]))
         )
         return f"{_lead(row)}, {ours:.0f} ({mobils:.0f})"
 

@@ -153,10 +153,14 @@ def cells(results: Results, every: bool) -> list[tuple[Driver, str]]:
     traffics = list(config.suite.scored)
     drawn: list[tuple[Driver, str]] = []
     for entry, trainings in entries.items():
-        # The same for everybody, and another for another entry.
-        chance = random.Random(entry)
-        sample = [(chance.choice(trainings), name) for name in chance.sample(traffics, TRAFFICS)]
-        drawn += product(trainings, traffics) if every else sample
+        if every:
+            drawn += product(trainings, traffics)
+        else:
+            # The same for everybody, and another for another entry.
+            chance = random.Random(entry)
+            drawn += [
+                (chance.choice(trainings), name) for name in chance.sample(traffics, TRAFFICS)
+            ]
     return drawn
 
 

@@ -78,11 +78,11 @@ def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
     for entry in entries:
         trainings = [name for name in seconds if scores.recipe_of(name) == entry["entry"]]
         mine = episodes.filter(pl.col("agent").is_in(trainings))
-        decisions = int(mine["decisions"].sum())
-        entry["decisions_per_s"] = decisions / sum(seconds[name] for name in trainings)
+        took_s = sum(seconds[name] for name in trainings)
+        entry["decisions_per_s"] = int(mine["decisions"].sum()) / took_s
     recipes = list(dict.fromkeys(scores.recipe_of(driver.name) for driver in agents))
     pairs = [(one, other) for one in recipes for other in suite.drivers() if one != other]
-    pairs += map(tuple, suite.pairs)
+    pairs += [(first, second) for first, second in suite.pairs]
     compared = scores.comparisons(by_recipe, list(dict.fromkeys(pairs)))
     title = f"{suite.version}{', quick' if config.quick else ''}, protocol {config.protocol()}"
     scale = f"score 0 random_legal, 100 mobil; interquartile mean over {', '.join(suite.scored)}"

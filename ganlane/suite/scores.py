@@ -234,7 +234,7 @@ def summaries(cells: Cells, matrix: Sequence[Row], suite: Suite) -> list[Row]:
                 "trainings": len(together),
                 **entries("score", score_over_traffics(list(zip(ours, *scale)))),
                 "by_traffic": scores,
-                "worst": decided.get(worst),
+                "worst": None if worst is None else decided[worst],
                 "worst_traffic": worst,
                 "improvement": improvement,
                 **safety(together),

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 import statistics
 import sys
 import tempfile
@@ -68,7 +69,7 @@ class Outcome:
 
     seed: int
     best: float = 0.0
-    reached: int | None = None
+    reached: float = math.inf
     seconds: float = 0.0
 
     def write(self, row: Mapping[str, float]) -> None:
@@ -76,7 +77,7 @@ class Outcome:
         mean = row.get("evaluation/mean_reward", 0.0)
         self.best = max(self.best, mean)
         if mean >= GOAL:
-            self.reached = int(row["decisions"])
+            self.reached = row["decisions"]
             raise Solved
 
     def close(self) -> None:
@@ -84,8 +85,13 @@ class Outcome:
 
     def cells(self) -> list[str]:
         """A row of the table."""
-        reached = "not reached" if self.reached is None else f"{self.reached:,}"
+        reached = frames_text(self.reached)
         return [str(self.seed), reached, f"{self.best:.1f}", f"{self.seconds:.0f} s"]
+
+
+def frames_text(frames: float) -> str:
+    """Frames until the goal, infinite where it is not reached."""
+    return f"{frames:,.0f}" if frames < math.inf else "not reached"
 
 
 def make_env(seed: int) -> EnvBase:
@@ -101,10 +107,9 @@ def evaluate(policy: GreedyPolicy) -> dict[str, float]:
     observation, _ = envs.reset(seed=1_000_000)
     running, returns = np.ones(EPISODES, dtype=bool), np.zeros(EPISODES)
     while running.any():
-        chosen = policy(TensorDict({"observation": torch.from_numpy(observation)}, [EPISODES]))[
-            "action"
-        ]
-        observation, reward, terminated, truncated, _ = envs.step(chosen.numpy())
+        state = TensorDict({"observation": torch.from_numpy(observation)}, [EPISODES])
+        actions = policy(state)["action"].numpy()
+        observation, reward, terminated, truncated, _ = envs.step(actions)
         returns += reward * running
         running &= ~(terminated | truncated)
     envs.close()
@@ -130,29 +135,30 @@ def run(seed: int, frames: int) -> Outcome:
     return outcome
 
 
-def median(outcomes: Sequence[Outcome]) -> str:
-    """Of the frames to the goal; a seed that did not reach it counts as never."""
-    frames = statistics.median(
-        float("inf") if o.reached is None else float(o.reached) for o in outcomes
-    )
-    return f"{frames:,.0f}" if frames < float("inf") else "not reached"
-
-
 def table(outcomes: Sequence[Outcome]) -> str:
-    """All seeds and their median, as Markdown."""
-    lines = [*(outcome.cells() for outcome in outcomes), ["median", median(outcomes), "", ""]]
+    """All seeds and their median, as Markdown.
+
+    A seed that did not reach the goal counts as never.
+    """
+    median = statistics.median(outcome.reached for outcome in outcomes)
+    lines = [
+        *(outcome.cells() for outcome in outcomes),
+        ["median", frames_text(median), "", ""],
+    ]
     headings = ["seed", "frames to 475", "best mean return", "time"]
     return markdown(Table("", headings, lines, 4))
 
 
 def measure(options: argparse.Namespace) -> str:
     """Run all seeds; the table, in the document too where one is named."""
-    section, outcomes = ReportSection(options.report, BEGIN, END), []
+    section = ReportSection(options.report, BEGIN, END)
+    outcomes = []
     for seed in range(options.seeds):
         outcomes.append(run(seed, options.frames))
         print("seed {}: 475 at {} frames, best {}, {}".format(*outcomes[-1].cells()), flush=True)
-    section.write(table(outcomes))
-    return table(outcomes)
+    text = table(outcomes)
+    section.write(text)
+    return text
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

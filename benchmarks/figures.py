@@ -15,6 +15,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 import torch
@@ -28,6 +29,7 @@ from benchmarks.script import make_parser, run_script
 from ganlane.data import FRAME_S, default_scenes, read_scenes, scene_lane_widths
 from ganlane.data.dense import recorded_frame, recordings_of
 from ganlane.generator import Discriminator, Generator, load_generator, shipped_generator
+from ganlane.generator.networks import MotionLSTM
 from ganlane.realism.driving import StartOptions, drive_recordings
 from ganlane.sim.random import Stream
 from ganlane.sim.state import Road
@@ -54,8 +56,23 @@ class Block:
     parameters: int = 0
 
 
-def _count(*modules: nn.Module) -> int:
-    return sum(parameter.numel() for module in modules for parameter in module.parameters())
+def _block(title: str, first: str, second: str, output: Tensor, *modules: nn.Module) -> Block:
+    """Of a part with these ``modules`` and this ``output``, whose first axis is the batch."""
+    parameters = sum(p.numel() for module in modules for p in module.parameters())
+    return Block(title, (first, second), tuple(output.shape[1:]), parameters)
+
+
+def _encoder_blocks(encoder: MotionLSTM, projections: tuple[Tensor, ...]) -> list[Block]:
+    """Embedding and LSTM on the ``projections`` of displacements."""
+    projected = torch.stack(projections, dim=2)
+    embed = encoder.embed
+    sizes = f"{embed.in_features} to {embed.out_features}, ReLU,"
+    motions = f"{projected.shape[2]} motions,"
+    recurrent = nn.ParameterList([encoder.recurrent])
+    return [
+        _block("embedding", sizes, "to the LSTM's gates", projected, embed, encoder.input),
+        _block("LSTM encoder", motions, "last state", encoder.encode(projections), recurrent),
+    ]
 
 
 @torch.no_grad()
@@ -69,53 +86,41 @@ def generator_blocks(generator: Generator, vehicles: int = 9) -> list[Block]:
     seen = seen._replace(extra=torch.zeros(1, vehicles, sizes.extra_inputs))
     hidden = generator.encoder.encode(seen.projections)
     pooled = generator.pooling(hidden, seen.position, seen.displacement, seen.valid)
-    context, noise = generator.summarise(seen), torch.zeros(1, vehicles, sizes.noise)
+    noise = torch.zeros(1, vehicles, sizes.noise)
     outputs = generator(seen, noise)
-    encoder, decoder, pooling = generator.encoder, generator.decoder, generator.pooling
-    projected = torch.stack(seen.projections, dim=2)
+    decoder, pooling = generator.decoder, generator.pooling
     extra = f", {sizes.extra_inputs} further inputs" if sizes.extra_inputs else ""
-    width = encoder.embed.out_features
     return [
-        Block("observed displacements", ("of every vehicle,", "m per 0.1 s"), _shape(observed)),
-        Block(
-            "embedding",
-            (f"{encoder.embed.in_features} to {width}, ReLU,", "to the LSTM's gates"),
-            _shape(projected),
-            _count(encoder.embed, encoder.input),
-        ),
-        Block(
-            "LSTM encoder",
-            (f"{projected.shape[2]} motions,", "last state"),
-            _shape(hidden),
-            encoder.recurrent.numel(),
-        ),
-        Block(
+        _block("observed displacements", "of every vehicle,", "m per 0.1 s", observed),
+        *_encoder_blocks(generator.encoder, seen.projections),
+        _block(
             "pooling over pairs",
-            (
-                f"{pooling.neighbours} nearest, to {pooling.per_pair.out_features}, ReLU,",
-                f"to {pooling.second.out_features}, maximum",
-            ),
-            _shape(pooled),
-            _count(pooling),
+            f"{pooling.neighbours} nearest, to {pooling.per_pair.out_features}, ReLU,",
+            f"to {pooling.second.out_features}, maximum",
+            pooled,
+            pooling,
         ),
-        Block(
+        _block(
             "context",
-            ("of state and pooled", f"neighbours{extra}"),
-            _shape(context),
-            _count(generator.context),
+            "of state and pooled",
+            f"neighbours{extra}",
+            generator.summarise(seen),
+            generator.context,
         ),
-        Block("noise", ("a latent vector z a driver,", "joined to the context"), _shape(noise)),
-        Block(
+        _block("noise", "a latent vector z a driver,", "joined to the context", noise),
+        _block(
             "LSTM decoder",
-            (f"{sizes.predicted} steps from context", f"and noise ({decoder.hidden} numbers)"),
-            (vehicles, outputs.shape[-2], decoder.hidden),
-            _count(decoder),
+            f"{sizes.predicted} steps from context",
+            f"and noise ({decoder.hidden} numbers)",
+            torch.zeros(*outputs.shape[:-1], decoder.hidden),
+            decoder,
         ),
-        Block(
+        _block(
             "predicted displacements",
-            ("a residual on the", "last displacement"),
-            _shape(outputs),
-            _count(generator.head),
+            "a residual on the",
+            "last displacement",
+            outputs,
+            generator.head,
         ),
     ]
 
@@ -127,36 +132,11 @@ def discriminator_blocks(
     """The discriminator's parts, run on ``steps`` displacements of ``vehicles`` vehicles."""
     shown = torch.zeros(1, vehicles, steps, 2)
     encoder = discriminator.encoder
-    projected = encoder.project_course(shown)
     return [
-        Block("displacements", ("observed, then recorded", "or predicted"), _shape(shown)),
-        Block(
-            "embedding",
-            (
-                f"{encoder.embed.in_features} to {encoder.embed.out_features}, ReLU,",
-                "to the LSTM's gates",
-            ),
-            _shape(projected),
-            _count(encoder.embed, encoder.input),
-        ),
-        Block(
-            "LSTM encoder",
-            (f"{projected.shape[2]} motions,", "last state"),
-            _shape(encoder.encode(projected)),
-            encoder.recurrent.numel(),
-        ),
-        Block(
-            "logit",
-            ("recorded or", "predicted"),
-            _shape(discriminator(shown)),
-            _count(discriminator.head),
-        ),
+        _block("displacements", "observed, then recorded", "or predicted", shown),
+        *_encoder_blocks(encoder, encoder.project_course(shown)),
+        _block("logit", "recorded or", "predicted", discriminator(shown), discriminator.head),
     ]
-
-
-def _shape(tensor: Tensor) -> tuple[int, ...]:
-    """Without the batch."""
-    return tuple(tensor.shape[1:])
 
 
 @rc_context(STYLE)
@@ -178,12 +158,9 @@ def draw_architecture(networks: Mapping[str, Sequence[Block]]) -> Figure:
             left, top = place * _STEP_X + 0.12, row * _STEP_Y + 0.28
             _draw_block(axes, left, top, block, colour)
             if place + 1 < len(blocks):
-                ends = {"xy": (left + 1.98, top + 0.4), "xytext": (left + 1.68, top + 0.4)}
-                axes.annotate(
-                    "",
-                    **ends,
-                    arrowprops={"arrowstyle": "-|>", "color": FAINT, "shrinkA": 0, "shrinkB": 0},
-                )
+                arrow = {"arrowstyle": "-|>", "color": FAINT, "shrinkA": 0, "shrinkB": 0}
+                ends = (left + 1.98, top + 0.4), (left + 1.68, top + 0.4)
+                axes.annotate("", *ends, arrowprops=arrow)
     return figure
 
 
@@ -193,20 +170,16 @@ def _draw_block(axes: Axes, left: float, top: float, block: Block, colour: str) 
     axes.add_patch(
         FancyBboxPatch((left, top), 1.65, 0.8, boxstyle=style, fc="white", ec=colour, lw=1.5)
     )
-    axes.text(left + 0.08, top + 0.14, block.title, va="center", size=8.5)
+
+    def write(right: float, down: float, text: str, size: float, **style: Any) -> None:
+        axes.text(left + right, top + down, text, va="center", size=size, **style)
+
+    write(0.08, 0.14, block.title, 8.5)
     for line, text in enumerate(block.does):
-        axes.text(left + 0.08, top + 0.3 + 0.15 * line, text, va="center", color=FAINT, size=7)
-    axes.text(left + 0.08, top + 0.67, str(list(block.shape)), va="center", color=colour, size=8.5)
+        write(0.08, 0.3 + 0.15 * line, text, 7, color=FAINT)
+    write(0.08, 0.67, str(list(block.shape)), 8.5, color=colour)
     if block.parameters:
-        axes.text(
-            left + 1.57,
-            top + 0.67,
-            f"{block.parameters} weights",
-            va="center",
-            ha="right",
-            color=FAINT,
-            size=7,
-        )
+        write(1.57, 0.67, f"{block.parameters} weights", 7, color=FAINT, ha="right")
 
 
 @rc_context(STYLE)
@@ -237,14 +210,9 @@ def architecture() -> Figure:
     generator, metadata = load_generator(shipped_generator("paper"), "paper")
     sizes = generator.sizes
     discriminator = Discriminator(sizes.embedding, sizes.hidden)
-    return draw_architecture(
-        {
-            f"generator of the preset {metadata['preset']}, for 9 vehicles": generator_blocks(
-                generator
-            ),
-            "discriminator": discriminator_blocks(discriminator, sizes.observed + sizes.predicted),
-        }
-    )
+    title = f"generator of the preset {metadata['preset']}, for 9 vehicles"
+    blocks = discriminator_blocks(discriminator, sizes.observed + sizes.predicted)
+    return draw_architecture({title: generator_blocks(generator), "discriminator": blocks})
 
 
 def courses() -> Figure:
@@ -263,10 +231,11 @@ def courses() -> Figure:
 
 def draw(options: argparse.Namespace) -> str:
     """Draw and write; where the figures are."""
-    written = [options.folder / f"generator_{name}.png" for name in ("architecture", "courses")]
-    save_figure(architecture(), written[0])
-    save_figure(courses(), written[1])
-    return "\n".join(map(str, written))
+    figures = {"architecture": architecture, "courses": courses}
+    return "\n".join(
+        str(save_figure(make(), options.folder / f"generator_{name}.png"))
+        for name, make in figures.items()
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

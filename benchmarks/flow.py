@@ -16,8 +16,8 @@ import argparse
 import sys
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from tensordict import TensorDictBase
 
 from benchmarks.script import make_parser, run_script
 from ganlane import keys
@@ -28,7 +28,6 @@ from ganlane.settings.driving import IdmParameters, MobilParameters
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
 from ganlane.settings.traffic import TrafficConfig
-from ganlane.sim.state import Road
 
 #: Arrivals in each lane and on the ramp, veh/h: more than fit.
 VPH = 2400.0
@@ -73,9 +72,14 @@ class Passed:
     last_s: int = 0
 
     @property
+    def left(self) -> int:
+        """Vehicles that have left, on the road and by the exit."""
+        return self.downstream + self.by_exit
+
+    @property
     def vph_per_lane(self) -> float:
-        """Vehicles per hour and lane that leave, on the road and by the exit."""
-        return (self.downstream + self.by_exit) / self.hours / self.lanes
+        """Vehicles per hour and lane that leave."""
+        return self.left / self.hours / self.lanes
 
 
 def measure(
@@ -94,25 +98,31 @@ def measure(
     module = make_traffic(make(TrafficConfig, traffic), config)
     env = make_env(module, DrivingConfig(env=config), rows)
     base = env.base_env
+    road = base.road
     passed = Passed(scene, traffic, lanes=config.lanes - 1)
-    exits = torch.tensor(base.road.flow.exits(base.vehicles))
-    state = without_ego(base.reset())
+    exits = torch.tensor(road.flow.exits(base.vehicles))
+    state = base.reset()
+    # Nobody meets the ego.
+    state[keys.VEHICLES, "x"][:, keys.EGO_INDEX] = NOWHERE_M
+    state[keys.VEHICLES, "valid"][:, keys.EGO_INDEX] = False
     stood = torch.zeros(rows, base.vehicles, dtype=torch.int64)
     second = 0
     # No more than six times as long as at 1000 veh/h/lane, in case nobody gets through.
     most_s = WARM_UP_S + 6 * 3600 * vehicles // (1000 * passed.lanes * rows)
-    while passed.downstream + passed.by_exit < vehicles and second < most_s:
+    while passed.left < vehicles and second < most_s:
         before = state[keys.VEHICLES, "valid"]
         state = base.step(state.set("action", torch.zeros(rows, dtype=torch.int64)))["next"]
         assert not state["done"].any()
-        now = state[keys.VEHICLES, "valid"]
-        stands = now & (state[keys.VEHICLES, "speed"] < STANDING_MPS)
+        now = state[keys.VEHICLES]
+        stands = now["valid"] & (now["speed"] < STANDING_MPS)
         stood = torch.where(stands, stood + 1, 0)
         second += 1
         if second <= WARM_UP_S:
             continue
-        gone = before & ~now
-        by_exit = gone & at_exit(state, base.road)
+        gone = before & ~now["valid"]
+        by_exit = torch.zeros_like(gone)
+        if road.exit_lane is not None:
+            by_exit = gone & (road.lane_of(now["y"]) == road.exit_lane)
         passed.hours += rows / 3600.0
         passed.by_exit += int(by_exit.sum())
         passed.downstream += int((gone & ~by_exit).sum())
@@ -122,38 +132,20 @@ def measure(
     return passed
 
 
-def without_ego(state: TensorDictBase) -> TensorDictBase:
-    """The state with an ego that nobody meets."""
-    state[keys.VEHICLES, "x"][:, keys.EGO_INDEX] = NOWHERE_M
-    state[keys.VEHICLES, "valid"][:, keys.EGO_INDEX] = False
-    return state
-
-
-def at_exit(state: TensorDictBase, road: Road) -> torch.Tensor:
-    """Whether each vehicle is in the exit lane, of those who have left."""
-    if road.exit_lane is None:
-        return torch.zeros_like(state[keys.VEHICLES, "valid"])
-    return road.lane_of(state[keys.VEHICLES, "y"]) == road.exit_lane
-
-
 def largest_flow(idm: IdmParameters, desired_mps: float, length_m: float = 4.5) -> float:
     """Of a platoon in equilibrium, veh/h per lane."""
-    flows = []
-    for step in range(1, 1000):
-        speed = desired_mps * step / 1000
-        gap = (idm.min_gap_m + speed * idm.headway_s) / (1.0 - (speed / desired_mps) ** 4) ** 0.5
-        flows.append(3600.0 * speed / (gap + length_m))
-    return max(flows)
+    speed = desired_mps * np.arange(1, 1000) / 1000
+    gap = (idm.min_gap_m + speed * idm.headway_s) / np.sqrt(1.0 - (speed / desired_mps) ** 4)
+    return float((3600.0 * speed / (gap + length_m)).max())
 
 
 def table_of(results: list[Passed]) -> Table:
     """A line per scene and traffic."""
     lines = []
     for one in results:
-        left = one.downstream + one.by_exit
         missed = one.missed if one.scene == "weave" else "-"
-        numbers = (left, one.by_exit, missed, round(one.vph_per_lane), one.longest_s, one.last_s)
-        lines.append([one.scene, one.traffic, *map(str, numbers)])
+        numbers = (one.left, one.by_exit, missed, round(one.vph_per_lane))
+        lines.append([one.scene, one.traffic, *map(str, (*numbers, one.longest_s, one.last_s))])
     heads = ["scene", "traffic", "left", "by exit", "missed", "veh/h/lane", "stood, s", "last, s"]
     slow, fast = (largest_flow(IdmParameters(), speed) for speed in DESIRED_MPS)
     note = (

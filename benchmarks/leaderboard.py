@@ -82,16 +82,13 @@ def table(document: str) -> str:
     Of an entry that was driven with one training and with several the latter counts.
     """
     only, columns = PAGES[document]
-    results = stored() if only is None else {only: stored()[only]}
+    results = [content for name, content in stored().items() if only in (None, name)]
+    driven = [entry for content in results for entry in content["entries"]]
     entries: dict[str, Results] = {}
-    for name in results:
-        for entry in results[name]["entries"]:
-            before = entries.get(entry["entry"])
-            if before is None or entry["trainings"] > before["trainings"]:
-                entries[entry["entry"]] = entry
+    for entry in sorted(driven, key=lambda entry: -entry["trainings"]):
+        entries.setdefault(entry["entry"], {**entry, "decisions_per_s": None})
     traffics = list(settings("benchmark", []).suite.scored)
-    rows = [{**entry, "decisions_per_s": None} for entry in entries.values()]
-    whole = score_table(rows, traffics, [])
+    whole = score_table(list(entries.values()), traffics, [])
     # How fast one machine drove is no property of an agent.
     wanted = columns or [name for name in whole.headings if name != "decisions/s"]
     places = [whole.headings.index(name) for name in wanted]
@@ -132,11 +129,11 @@ def add_weights(folder: Path) -> str:
 
 def differences() -> list[str]:
     """Which documents are not as the stored results say."""
-    wrong = []
-    for document in PAGES:
-        if ReportSection(ROOT / document, *MARKERS).read() != table(document):
-            wrong.append(f"{document}: differs; run `python -m benchmarks.leaderboard --write`.")
-    return wrong
+    return [
+        f"{document}: differs; run `python -m benchmarks.leaderboard --write`."
+        for document in PAGES
+        if ReportSection(ROOT / document, *MARKERS).read() != table(document)
+    ]
 
 
 def cells(results: Results, every: bool) -> list[tuple[Driver, str]]:

@@ -72,14 +72,11 @@ def save_agents(path: Path, agents: Mapping[int, Agent]) -> None:
 def recipe_of(metadata: Mapping[str, Any]) -> dict[str, Any]:
     """What a training was, without its seed and its results."""
     shared = {name: metadata.get(name) for name in RECIPE}
-    if isinstance(shared["env"], dict):
-        shared["env"] = {
-            key: value for key, value in shared["env"].items() if key not in WITHOUT_EFFECT
-        }
-    return {
-        **shared,
-        **{name: metadata.get("training", {}).get(name) for name in ("phase", "traffic")},
-    }
+    env = shared["env"]
+    if isinstance(env, dict):
+        shared["env"] = {key: value for key, value in env.items() if key not in WITHOUT_EFFECT}
+    training = metadata.get("training", {})
+    return shared | {name: training.get(name) for name in ("phase", "traffic")}
 
 
 def of_no_machine(start: str | None) -> str | None:

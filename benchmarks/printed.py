@@ -22,7 +22,7 @@ from typing import Any
 
 from benchmarks.script import ReportSection, make_parser, markdown, run_script
 from ganlane.errors import UserError
-from ganlane.evaluation.table import Table
+from ganlane.evaluation.table import Table, with_interval, with_sign
 from ganlane.suite.report import PAPER_VI, PAPER_VII
 
 ROOT = Path(__file__).parents[1]
@@ -31,17 +31,33 @@ RESULTS = ROOT / "docs" / "reproduce" / "results.json"
 #: agent_general over more episodes and on traffics that are not the project's own, and the missions
 #: (suite=exit-v1 and merge-v1); other roads and ablations are of scripts of revision 878329b.
 FURTHER = ("controls", "general", "roads", "elsewhere", "ablations", "exit", "merge")
-#: Driver of the matrix to its name in a document, and the traffics that it was trained on.
-DRIVERS: Mapping[str, tuple[str, frozenset[str]]] = {
-    "agent_general+safe": ("agent_general", frozenset({"idm", "idm_mobil", "idm_random", "gan"})),
-    "agent_idm+none": ("Agent_IDM", frozenset({"idm_mobil"})),
-    "agent_gan+none": ("Agent_GAN", frozenset({"idm_mobil", "gan"})),
-    "agent_idm_long+none": ("Agent_IDM, 3 M longer", frozenset({"idm_mobil"})),
-    "agent_idm+safe": ("Agent_IDM behind `safe`", frozenset({"idm_mobil"})),
-    "agent_gan+safe": ("Agent_GAN behind `safe`", frozenset({"idm_mobil", "gan"})),
-    "mobil_egoistic": ("egoistic MOBIL", frozenset()),
-    "keep_lane": ("keeping the lane", frozenset()),
-    "random_legal": ("random legal", frozenset()),
+#: Drivers of the matrix by their names in a document.
+DRIVERS: Mapping[str, str] = {
+    "agent_general+safe": "agent_general",
+    "agent_idm+none": "Agent_IDM",
+    "agent_gan+none": "Agent_GAN",
+    "agent_idm_long+none": "Agent_IDM, 3 M longer",
+    "agent_idm+safe": "Agent_IDM behind `safe`",
+    "agent_gan+safe": "Agent_GAN behind `safe`",
+    "mobil_egoistic": "egoistic MOBIL",
+    "keep_lane": "keeping the lane",
+    "random_legal": "random legal",
+}
+#: Control trainings.
+CONTROLS: Mapping[str, str] = {
+    "agent_gan_only+none": "`gan` alone, 13 M",
+    "agent_idm_table3+none": "Agent_IDM with Table III",
+    "agent_gan_table3+none": "Agent_GAN with Table III",
+}
+#: Traffics that the recipes of learning drivers were trained on.
+TRAINED_ON: Mapping[str, Sequence[str]] = {
+    "agent_general": ("idm", "idm_mobil", "idm_random", "gan"),
+    "agent_idm": ("idm_mobil",),
+    "agent_gan": ("idm_mobil", "gan"),
+    "agent_idm_long": ("idm_mobil",),
+    "agent_gan_only": ("gan",),
+    "agent_idm_table3": ("idm_mobil",),
+    "agent_gan_table3": ("idm_mobil", "gan"),
 }
 #: Differences of the page on the paper's claim: first, second, and what the line is called.
 CLAIMS = (
@@ -54,12 +70,6 @@ CLAIMS = (
     ("agent_general+safe", "agent_idm+safe", "agent_general over Agent_IDM behind `safe`"),
     ("agent_general+safe", "agent_gan+safe", "agent_general over Agent_GAN behind `safe`"),
 )
-#: Control trainings: name in a document, and the traffics that they were trained on.
-CONTROLS: Mapping[str, tuple[str, frozenset[str]]] = {
-    "agent_gan_only+none": ("`gan` alone, 13 M", frozenset({"gan"})),
-    "agent_idm_table3+none": ("Agent_IDM with Table III", frozenset({"idm_mobil"})),
-    "agent_gan_table3+none": ("Agent_GAN with Table III", frozenset({"idm_mobil", "gan"})),
-}
 #: Differences between these and the paper's agents, as :data:`CLAIMS`.
 CONTROL_CLAIMS = (
     ("agent_gan+none", "agent_gan_only+none", "Agent_GAN over `gan` alone"),
@@ -91,7 +101,8 @@ Row = Mapping[str, Any]
 Figure = tuple[float, ...]
 
 
-def _at(results: Results, driver: str, traffic: str) -> Row:
+def at(results: Results, driver: str, traffic: str) -> Row:
+    """The row of a driver on a traffic."""
     return next(
         row for row in results["rows"] if (row["driver"], row["traffic"]) == (driver, traffic)
     )
@@ -101,24 +112,28 @@ def _traffics(results: Results) -> list[str]:
     return list(results["seeds"]["episodes"])
 
 
-def _with_interval(value: float, interval: Sequence[float] | None, sign: str = "+") -> str:
-    text = f"{value:{sign}.1f}"
-    return text if interval is None else f"{text} [{interval[0]:.1f}, {interval[1]:.1f}]"
+def _episodes(row: Row) -> int:
+    """Of all trainings."""
+    return int(row["trainings"] * row["episodes"])
 
 
-def _lead(row: Row, trained: frozenset[str]) -> str:
+def _lead(row: Row) -> str:
     """Lead over MOBIL; italics: a learning driver's on traffic that it was not trained on."""
-    text = _with_interval(row["minus_mobil"], row["minus_mobil_ci"])
-    return f"*{text}*" if trained and row["traffic"] not in trained else text
+    text = with_sign(row, "minus_mobil", 1)
+    trained_on = TRAINED_ON.get(row["driver"].partition("+")[0])
+    return text if trained_on is None or row["traffic"] in trained_on else f"*{text}*"
+
+
+def _failures(row: Row) -> str:
+    return f"{row['hard_crash']}, {row['out_of_road']}"
 
 
 def _lead_and_failures(row: Row, lead: str = "minus_mobil") -> str:
-    figure = _with_interval(row[lead], row[f"{lead}_ci"])
-    return f"{figure}; {row['hard_crash']}, {row['out_of_road']}"
+    return f"{with_sign(row, lead, 1)}; {_failures(row)}"
 
 
 def _mean_and_failures(row: Row) -> str:
-    return f"({row['mean_reward']:.1f}); {row['hard_crash']}, {row['out_of_road']}"
+    return f"({row['mean_reward']:.1f}); {_failures(row)}"
 
 
 def _by_traffic(results: Results, first: str, lines: Sequence[Sequence[str]]) -> str:
@@ -127,19 +142,23 @@ def _by_traffic(results: Results, first: str, lines: Sequence[Sequence[str]]) ->
     return markdown(Table("", headings, lines))
 
 
+def _lines(
+    results: Results, names: Mapping[str, str], cell: Callable[[Row], str]
+) -> list[list[str]]:
+    """For every driver its name, and a cell for every traffic."""
+    return [
+        [name, *(cell(at(results, driver, traffic)) for traffic in _traffics(results))]
+        for driver, name in names.items()
+    ]
+
+
 def leads(results: Results) -> str:
     """Drivers by traffics: paired lead over MOBIL."""
-    drivers = [name for name in DRIVERS if name != "random_legal"]
-    lines = [
-        [
-            DRIVERS[driver][0],
-            *(_lead(_at(results, driver, t), DRIVERS[driver][1]) for t in _traffics(results)),
-        ]
-        for driver in drivers
-    ]
-    table = _by_traffic(results, "lead over MOBIL", lines)
+    names = {driver: name for driver, name in DRIVERS.items() if driver != "random_legal"}
+    table = _by_traffic(results, "lead over MOBIL", _lines(results, names, _lead))
     means = ", ".join(
-        f"{_at(results, 'mobil', t)['mean_reward']:.1f} on `{t}`" for t in _traffics(results)
+        f"{at(results, 'mobil', traffic)['mean_reward']:.1f} on `{traffic}`"
+        for traffic in _traffics(results)
     )
     return f"{table}\n\nMOBIL's own mean reward: {means}."
 
@@ -147,15 +166,10 @@ def leads(results: Results) -> str:
 def failures(results: Results) -> str:
     """Drivers by traffics: crashes and departures in all episodes of all trainings."""
 
-    def cell(driver: str, traffic: str) -> str:
-        row = _at(results, driver, traffic)
-        return f"{row['hard_crash']}, {row['out_of_road']} of {row['trainings'] * row['episodes']}"
+    def cell(row: Row) -> str:
+        return f"{_failures(row)} of {_episodes(row)}"
 
-    names = {**DRIVERS, "mobil": ("MOBIL", frozenset[str]())}
-    lines = [
-        [names[driver][0], *(cell(driver, traffic) for traffic in _traffics(results))]
-        for driver in ("mobil", *DRIVERS)
-    ]
+    lines = _lines(results, {"mobil": "MOBIL", **DRIVERS}, cell)
     return _by_traffic(results, "hard crashes, departures", lines)
 
 
@@ -164,16 +178,15 @@ def _differences(results: Results, pairs: Sequence[tuple[str, str, str]]) -> lis
 
     Pairs that are not in the results are left out.
     """
-    by_pair = {(row["driver"], row["over"], row["traffic"]): row for row in results["comparisons"]}
     lines = []
     for first, second, name in pairs:
-        rows = [
-            by_pair[first, second, traffic]
-            for traffic in _traffics(results)
-            if (first, second, traffic) in by_pair
-        ]
-        if rows:
-            lines.append([name, *(_with_interval(row["lead"], row["lead_ci"]) for row in rows)])
+        leads = {
+            row["traffic"]: with_sign(row, "lead", 1)
+            for row in results["comparisons"]
+            if (row["driver"], row["over"]) == (first, second)
+        }
+        if leads:
+            lines.append([name, *(leads[traffic] for traffic in _traffics(results))])
     return lines
 
 
@@ -185,23 +198,19 @@ def claims(results: Results) -> str:
 def paper(results: Results) -> str:
     """The paper's Tables VI and VII, each number beside ours."""
     lines = []
-    for agent, name in (("agent_idm", "Agent_IDM"), ("agent_gan", "Agent_GAN")):
+    for agent in ("agent_idm", "agent_gan"):
+        ours = [at(results, f"{agent}+none", traffic) for traffic in ("idm", "idm_mobil", "gan")]
+        crashes = [f"{row['hard_crash']}, {row['soft_crash']} of {_episodes(row)}" for row in ours]
         percent, reward, spread = PAPER_VII[agent]
-        on_idm, on_mobil, on_gan = (
-            _at(results, f"{agent}+none", traffic) for traffic in ("idm", "idm_mobil", "gan")
-        )
-        crashes = [
-            f"{row['hard_crash']}, {row['soft_crash']} of {row['trainings'] * row['episodes']}"
-            for row in (on_idm, on_mobil)
-        ]
-        score = _with_interval(on_gan["normalized_percent"], on_gan["normalized_percent_ci"], "")
+        row = ours[-1]
+        score = with_interval(row, "normalized_percent", 1)
         lines.append(
             [
-                name,
-                "{}, {}".format(*PAPER_VI[agent]),
-                *crashes,
+                DRIVERS[f"{agent}+none"],
+                ", ".join(PAPER_VI[agent]),
+                *crashes[:-1],
                 f"{percent} %; {reward} ({spread})",
-                f"{score} %; {on_gan['mean_reward']:.1f} ({on_gan['reward_sd']:.1f})",
+                f"{score} %; {row['mean_reward']:.1f} ({row['reward_sd']:.1f})",
             ]
         )
     headings = [
@@ -220,98 +229,66 @@ def controls(results: Results) -> str:
 
     Lead over MOBIL and failures, then their differences from the paper's agents.
     """
-    part, lines = results["controls"], []
-    for driver, (name, trained) in CONTROLS.items():
-        rows = [_at(part, driver, traffic) for traffic in _traffics(part)]
-        lines.append(
-            [
-                name,
-                *(
-                    f"{_lead(row, trained)}; {row['hard_crash']}, {row['out_of_road']}"
-                    for row in rows
-                ),
-            ]
-        )
-    return _by_traffic(
-        part, "lead; crashes, departures", lines + _differences(part, CONTROL_CLAIMS)
-    )
+    part = results["controls"]
+
+    def cell(row: Row) -> str:
+        return f"{_lead(row)}; {_failures(row)}"
+
+    lines = _lines(part, CONTROLS, cell) + _differences(part, CONTROL_CLAIMS)
+    return _by_traffic(part, "lead; crashes, departures", lines)
 
 
 def trainings(results: Results) -> str:
     """agent_general training by training, then all of them: lead over MOBIL, and failures."""
     part = results["general"]
-    traffics = _traffics(part)
-    together = [_at(part, "agent_general+safe", traffic) for traffic in traffics]
-    lines = []
-    for place, training in enumerate(together[0]["each"]):
-        cells = [_lead_and_failures(row["each"][place]) for row in together]
-        lines.append([f"`{training['driver'].removesuffix('+safe')}`", *cells])
+    together = [at(part, "agent_general+safe", traffic) for traffic in _traffics(part)]
+    lines = [
+        [f"`{training[0]['driver'].removesuffix('+safe')}`", *map(_lead_and_failures, training)]
+        for training in zip(*(row["each"] for row in together))
+    ]
     lines.append(["together", *map(_lead_and_failures, together)])
-    mobil = [_mean_and_failures(_at(part, "mobil", traffic)) for traffic in traffics]
-    lines.append(["MOBIL (its mean reward)", *mobil])
+    lines += _lines(part, {"mobil": "MOBIL (its mean reward)"}, _mean_and_failures)
     return _by_traffic(part, "lead; crashes, departures", lines)
 
 
 def readme(results: Results) -> str:
     """README's table: lead over MOBIL and hard crashes per 1000 episodes."""
 
-    def cell(driver: str, traffic: str) -> str:
-        row, mobil = _at(results, driver, traffic), _at(results, "mobil", traffic)
-        per_1000 = [
-            1000 * driven["hard_crash"] / (driven["trainings"] * driven["episodes"])
-            for driven in (row, mobil)
-        ]
-        return f"{_lead(row, DRIVERS[driver][1])}, {per_1000[0]:.0f} ({per_1000[1]:.0f})"
+    def cell(row: Row) -> str:
+        ours, mobils = (
+            1000 * driven["hard_crash"] / _episodes(driven)
+            for driven in (row, at(results, "mobil", row["traffic"]))
+        )
+        return f"{_lead(row)}, {ours:.0f} ({mobils:.0f})"
 
     drivers = ["agent_general+safe", "agent_idm+none", "agent_gan+none", "mobil_egoistic"]
-    lines = [
-        [DRIVERS[driver][0], *(cell(driver, traffic) for traffic in _traffics(results))]
-        for driver in drivers
-    ]
-    return _by_traffic(results, "driver", lines)
+    names = {driver: DRIVERS[driver] for driver in drivers}
+    return _by_traffic(results, "driver", _lines(results, names, cell))
 
 
 def roads(results: Results) -> str:
     """Drivers by roads, traffic by traffic: lead over MOBIL, and failures."""
-    rows = results["roads"]["rows"]
-    places = list(dict.fromkeys((row["vehicles"], row["lanes"]) for row in rows))
-    by_place = {(row["driver"], row["traffic"], row["vehicles"], row["lanes"]): row for row in rows}
-    lines = []
-    for driver, traffic in dict.fromkeys(
-        (row["driver"], row["traffic"]) for row in rows if row["driver"] != "mobil"
-    ):
-        cells = [_lead_and_failures(by_place[(driver, traffic, *place)]) for place in places]
-        lines.append([f"{DRIVERS[driver][0]}, `{traffic}`", *cells])
-    headings = [
-        "lead; crashes, departures",
-        *(f"{vehicles} on {lanes}" for vehicles, lanes in places),
-    ]
-    return markdown(Table("", headings, lines))
+    places: dict[str, None] = {}
+    lines: dict[str, list[str]] = {}
+    for row in results["roads"]["rows"]:
+        places[f"{row['vehicles']} on {row['lanes']}"] = None
+        if row["driver"] != "mobil":
+            name = f"{DRIVERS[row['driver']]}, `{row['traffic']}`"
+            lines.setdefault(name, [name]).append(_lead_and_failures(row))
+    return markdown(Table("", ["lead; crashes, departures", *places], list(lines.values())))
 
 
 def elsewhere(results: Results) -> str:
     """Drivers by traffics that are not the project's own: lead over MOBIL, and failures."""
     part = results["elsewhere"]
-
-    def cell(driver: str, traffic: str) -> str:
-        row = _at(part, driver, traffic)
-        return _mean_and_failures(row) if driver == "mobil" else _lead_and_failures(row)
-
-    names = {
-        "mobil": "MOBIL (its mean reward)",
-        **{driver: name for driver, (name, _) in DRIVERS.items()},
-    }
-    there, traffics = {row["driver"] for row in part["rows"]}, _traffics(part)
+    there = {row["driver"] for row in part["rows"]}
+    names = {driver: name for driver, name in DRIVERS.items() if driver in there}
     lines = [
-        [names[driver], *(cell(driver, traffic) for traffic in traffics)]
-        for driver in names
-        if driver in there
+        ["episodes of each training", *map(str, part["seeds"]["episodes"].values())],
+        *_lines(part, {"mobil": "MOBIL (its mean reward)"}, _mean_and_failures),
+        *_lines(part, names, _lead_and_failures),
     ]
-    episodes = [
-        "episodes of each training",
-        *(str(part["seeds"]["episodes"][traffic]) for traffic in traffics),
-    ]
-    return _by_traffic(part, "lead; crashes, departures", [episodes, *lines])
+    return _by_traffic(part, "lead; crashes, departures", lines)
 
 
 def missions(results: Results, name: str) -> str:
@@ -323,20 +300,19 @@ def missions(results: Results, name: str) -> str:
     part = results[name]
 
     def cell(row: Row) -> str:
-        episodes = row["trainings"] * row["episodes"]
         ends = ("goal", "hard_crash", "missed_exit", "timeout")
-        shares = ", ".join(f"{100 * row[end] / episodes:.1f}" for end in ends)
+        shares = ", ".join(f"{100 * row[end] / _episodes(row):.1f}" for end in ends)
         is_mobil = row["minus_mobil"] is None
-        lead = f"({row['mean_reward']:.1f})" if is_mobil else _lead(row, frozenset())
+        lead = f"({row['mean_reward']:.1f})" if is_mobil else with_sign(row, "minus_mobil", 1)
         return f"{lead}; {shares}; {row['goal_s']:.0f}" if row["goal"] else f"{lead}; {shares}"
 
-    drivers = dict.fromkeys(row["driver"] for row in part["rows"])
     # How random drivers and those without a mission end is told in a sentence.
-    shown = [driver for driver in drivers if driver not in ("random_legal", "keep_lane")]
-    lines = [
-        [f"`{driver}`", *(cell(_at(part, driver, traffic)) for traffic in _traffics(part))]
-        for driver in shown
-    ]
+    names = {
+        row["driver"]: f"`{row['driver']}`"
+        for row in part["rows"]
+        if row["driver"] not in ("random_legal", "keep_lane")
+    }
+    lines = _lines(part, names, cell)
     return _by_traffic(part, "lead; goal, crash, missed, time-out, %; s", lines)
 
 
@@ -347,17 +323,18 @@ def ablations(results: Results) -> str:
     """
     part = results["ablations"]
     leads = {(row["driver"], row["traffic"]): row for row in part["comparisons"]}
-    lines = []
-    for name, changed in part["changed"].items():
-        cells = []
-        for traffic in _traffics(part):
-            row = _at(part, name, traffic)
-            cells.append(
-                _lead_and_failures({**row, **leads[name, traffic]}, "lead")
-                if changed
-                else _mean_and_failures(row)
-            )
-        lines.append([f"`{' '.join(changed)}`" if changed else "nothing (its mean reward)", *cells])
+
+    def cell(row: Row) -> str:
+        lead = leads.get((row["driver"], row["traffic"]))
+        return (
+            _mean_and_failures(row) if lead is None else _lead_and_failures({**row, **lead}, "lead")
+        )
+
+    names = {
+        name: f"`{' '.join(changed)}`" if changed else "nothing (its mean reward)"
+        for name, changed in part["changed"].items()
+    }
+    lines = _lines(part, names, cell)
     return _by_traffic(part, "changed: lead; crashes, departures", lines)
 
 
@@ -456,11 +433,13 @@ def differences(results: Results) -> list[str]:
 
 def load(path: Path = RESULTS) -> Results:
     """The results of the matrix, with those of :data:`FURTHER` by name."""
-    further = {name: RESULTS.parent / name / RESULTS.name for name in FURTHER}
-    matrix, *others = (
-        json.loads(file.read_text(encoding="utf-8")) for file in (path, *further.values())
-    )
-    return {**matrix, **dict(zip(further, others))}
+    further = {name: _read(RESULTS.parent / name / RESULTS.name) for name in FURTHER}
+    return {**_read(path), **further}
+
+
+def _read(path: Path) -> Results:
+    results: Results = json.loads(path.read_text(encoding="utf-8"))
+    return results
 
 
 def compare_or_write(options: argparse.Namespace) -> str:

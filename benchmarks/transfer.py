@@ -9,7 +9,6 @@ from Agent_IDM's rewards in ``docs/reproduce/results.json``.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +19,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from benchmarks import printed
 from benchmarks.script import make_parser, run_script
 from ganlane.view.curves import plot_middle, read_metrics
 from ganlane.view.figures import COLOURS, FAINT, STYLE, add_legend, save_figure
@@ -42,14 +42,8 @@ def read_curves(folders: Sequence[Path]) -> pl.DataFrame:
         before = 0
         for phase, path in (("first", folder / "pretrain"), ("second", folder)):
             curve = read_metrics(path / "evaluation.csv")
-            parts.append(
-                curve.select(
-                    pl.lit(folder.name).alias("run"),
-                    pl.col("decisions") + before,
-                    "mean_reward",
-                    pl.lit(phase).alias("phase"),
-                )
-            )
+            labels = {"run": pl.lit(folder.name), "phase": pl.lit(phase)}
+            parts.append(curve.select(pl.col("decisions") + before, "mean_reward", **labels))
             # The second phase goes on counting where the first one ended.
             before = curve["decisions"][-1]
     return pl.concat(parts, how="vertical_relaxed")
@@ -82,12 +76,7 @@ def draw_transfer(curves: pl.DataFrame, before: Sequence[float]) -> Figure:
 
 def draw(options: argparse.Namespace) -> str:
     """Draw the figure; the line that names it."""
-    results = json.loads((DOCS / "reproduce" / "results.json").read_text(encoding="utf-8"))
-    row = next(
-        row
-        for row in results["rows"]
-        if (row["driver"], row["traffic"]) == ("agent_idm+none", "gan")
-    )
+    row = printed.at(printed.load(), "agent_idm+none", "gan")
     before = [training["mean_reward"] for training in row["each"]]
     curves = read_curves(sorted((DOCS / "learning_curves").glob("seed_*")))
     return f"figure: {save_figure(draw_transfer(curves, before), options.out)}"

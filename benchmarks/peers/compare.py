@@ -101,11 +101,23 @@ def collect() -> tuple[dict[str, Any], dict[str, dict[str, Trace]]]:
             apart = take_apart(scene, peer, mine, traces[scene.name][peer.name])._asdict()
             pieces = {name: piece._asdict() for name, piece in apart.items()}
             rows.append({"scene": scene.name, "peer": peer.name, **pieces})
+    drivers = [("ganlane", drive_ours, LAW), *((peer.name, peer.drive, peer.law) for peer in PEERS)]
     figures = {
         "versions": versions(),
         "traces": rows,
-        "settled": _settled(),
-        "stops": _stops(traces),
+        "settled": [
+            {"speed_mps": speed, "simulator": name, **settled(speed, drive, law)}
+            for speed in SETTLED_MPS
+            for name, drive, law in drivers
+        ],
+        "stops": [
+            {
+                "simulator": name,
+                "final_gap_m": float(trace.gap[-1, 0]),
+                "lowest_mps": float(trace.speed[:, 1].min()),
+            }
+            for name, trace in traces[OBSTACLE.name].items()
+        ],
         "steps": _steps(),
         # At steps of a millisecond the final gap is the model's own.
         "final_gap_at_1_ms_m": float(integrate(OBSTACLE, Scheme.BALLISTIC, dt=0.001).gap[-1, 0]),
@@ -113,47 +125,23 @@ def collect() -> tuple[dict[str, Any], dict[str, dict[str, Trace]]]:
     return figures, traces
 
 
-def _settled() -> list[dict[str, Any]]:
-    drivers = [("ganlane", drive_ours, LAW), *((peer.name, peer.drive, peer.law) for peer in PEERS)]
-    return [
-        {"speed_mps": speed, "simulator": name, **settled(speed, drive, law)}
-        for speed in SETTLED_MPS
-        for name, drive, law in drivers
-    ]
-
-
-def _stops(traces: dict[str, dict[str, Trace]]) -> list[dict[str, Any]]:
-    return [
-        {
-            "simulator": name,
-            "final_gap_m": float(trace.gap[-1, 0]),
-            "lowest_mps": float(trace.speed[:, 1].min()),
-        }
-        for name, trace in traces[OBSTACLE.name].items()
-    ]
-
-
 def _steps() -> list[dict[str, Any]]:
     """What the step itself does in the scene 'slow and go'.
 
     Every simulator against ganlane at 0.1 s.
     """
-    mine = drive_ours(SLOW_AND_GO)
+    scene = SLOW_AND_GO
+    mine = drive_ours(scene)
+    # A trace, and every how many of its moments and of ganlane's they are at one time.
     others = {
-        "its own equations at 0.01 s": (
-            every(integrate(SLOW_AND_GO, Scheme.BALLISTIC, dt=0.01), 10),
-            1,
-        ),
-        "HighwayEnv at its default 1/15 s": (
-            every(drive_highway_env(SLOW_AND_GO, dt=1 / 15), 3),
-            2,
-        ),
-        "SUMO at its default 1 s, Euler": (drive_sumo(SLOW_AND_GO, ballistic=False, dt=1.0), 10),
-        "SUMO at 1 s, ballistic": (drive_sumo(SLOW_AND_GO, dt=1.0), 10),
+        "its own equations at 0.01 s": (integrate(scene, Scheme.BALLISTIC, dt=0.01), 10, 1),
+        "HighwayEnv at its default 1/15 s": (drive_highway_env(scene, dt=1 / 15), 3, 2),
+        "SUMO at its default 1 s, Euler": (drive_sumo(scene, ballistic=False, dt=1.0), 1, 10),
+        "SUMO at 1 s, ballistic": (drive_sumo(scene, dt=1.0), 1, 10),
     }
     return [
-        {"other": name, **between(other, every(mine, stride))._asdict()}
-        for name, (other, stride) in others.items()
+        {"other": name, **between(every(other, its), every(mine, ours))._asdict()}
+        for name, (other, its, ours) in others.items()
     ]
 
 

@@ -153,8 +153,9 @@ def draw(traces: dict[str, dict[str, Trace]], figures: dict[str, Any], path: Pat
     save_figure(figure, path)
 
 
-def _times(trace: Trace) -> np.ndarray:
-    return np.arange(len(trace.speed)) * PHYSICS_STEP_S
+def _plot(axes: Axes, values: np.ndarray, *form: str, **style: Any) -> None:
+    """Values of consecutive physics steps over time."""
+    axes.plot(np.arange(len(values)) * PHYSICS_STEP_S, values, *form, **style)
 
 
 def _label(axes: Axes, title: str, x: str, y: str) -> None:
@@ -163,37 +164,26 @@ def _label(axes: Axes, title: str, x: str, y: str) -> None:
 
 
 def _speeds(axes: Axes, traces: dict[str, Trace]) -> None:
-    mine = traces["ganlane"]
     for rank in (0, 1, 4, 8):
-        axes.plot(
-            _times(mine), mine.speed[:, rank], color=str(0.07 * rank), label=f"ganlane, car {rank}"
-        )
+        shade = str(0.07 * rank)
+        _plot(axes, traces["ganlane"].speed[:, rank], color=shade, label=f"ganlane, car {rank}")
     for start, (name, (marker, colour)) in enumerate(MARKERS.items()):
-        every = slice(20 * start, None, 60)
+        style: dict[str, Any] = {"color": colour, "ms": 4, "fillstyle": "none"}
         for rank in (1, 4, 8):
+            speed = traces[name].speed[:, rank]
             label = name if rank == 1 else None
-            at, speed = _times(mine)[every], traces[name].speed[every, rank]
-            axes.plot(at, speed, marker, color=colour, ms=4, fillstyle="none", label=label)
+            _plot(axes, speed, marker, markevery=(20 * start, 60), label=label, **style)
     _label(axes, "slow and go: speeds of the leader (0) and its followers", "time, s", "speed, m/s")
 
 
 def _apart(axes: Axes, traces: dict[str, Trace]) -> None:
     mine = traces["ganlane"]
-    for name, scheme in SCHEMES.items():
-        colour = MARKERS[name][1]
-        expected = difference(mine, SLOW_AND_GO, scheme).speed[:, 8]
-        axes.plot(
-            _times(mine), traces[name].speed[:, 8] - mine.speed[:, 8], color=colour, label=name
-        )
-        axes.plot(
-            _times(mine),
-            expected,
-            "--",
-            color=INK,
-            label=None if name == "HighwayEnv" else "derived",
-        )
-    left = traces["SUMO, ballistic"].speed[:, 8] - mine.speed[:, 8]
-    axes.plot(_times(mine), left, color=MARKERS["SUMO, ballistic"][1], label="SUMO, ballistic")
+    for name in ("HighwayEnv", "SUMO, Euler", "SUMO, ballistic"):
+        _plot(axes, (traces[name].speed - mine.speed)[:, 8], color=MARKERS[name][1], label=name)
+        if name in SCHEMES:
+            derived = difference(mine, SLOW_AND_GO, SCHEMES[name]).speed[:, 8]
+            label = None if name == "HighwayEnv" else "derived"
+            _plot(axes, derived, "--", color=INK, label=label)
     _label(axes, "slow and go, car 8: speed less ganlane's", "time, s", "difference, m/s")
 
 
@@ -207,12 +197,9 @@ def _gaps(axes: Axes, rows: list[dict[str, Any]]) -> None:
 
 
 def _stop(axes: Axes, traces: dict[str, Trace]) -> None:
-    for name, colour in {
-        "ganlane": INK,
-        **{name: colour for name, (_, colour) in MARKERS.items()},
-    }.items():
+    for name, (_, colour) in {"ganlane": ("", INK), **MARKERS}.items():
         style = "--" if name == "SUMO, ballistic" else "-"
-        axes.plot(_times(traces[name]), traces[name].gap[:, 0], style, color=colour, label=name)
+        _plot(axes, traces[name].gap[:, 0], style, color=colour, label=name)
     axes.axhline(TABLE_V.min_gap_m, color="grey", lw=0.8)
     axes.set(xlim=(20.0, 45.0), ylim=(1.5, 6.0))
     _label(axes, "standing obstacle: the last metres", "time, s", "gap, m")

@@ -178,16 +178,14 @@ def ahead(trace: Trace, law: Law = LAW) -> tuple[Array, Array]:
 def integrate(scene: Scene, scheme: Scheme, law: Law = LAW, dt: float = PHYSICS_STEP_S) -> Trace:
     """Drive ``scene`` with ``law`` and ``scheme`` at steps of ``dt`` seconds."""
     leader = scene.leader_speeds(dt) if scene.leader else None
-    speed, position = np.array(scene.speeds_mps), scene.positions_m()
-    speeds, positions = [speed], [position]
+    speeds, positions = [np.array(scene.speeds_mps)], [scene.positions_m()]
     for step in range(scene.steps(dt)):
+        speed, position = speeds[-1], positions[-1]
         gap, leader_speed = ahead(Trace(speed[None], position[None]), law)
         new = speed + acceleration(speed, gap[0], leader_speed[0], law) * dt
         new = new if law.reverses else np.maximum(new, 0.0)
         if leader is not None:
             new[0] = leader[step + 1]
-        position = position + dt * ((1.0 - scheme.value) * speed + scheme.value * new)
-        speed = new
-        speeds.append(speed)
-        positions.append(position)
+        speeds.append(new)
+        positions.append(position + dt * ((1.0 - scheme.value) * speed + scheme.value * new))
     return Trace(np.stack(speeds), np.stack(positions))

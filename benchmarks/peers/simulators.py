@@ -30,7 +30,6 @@ import math
 import platform
 import tempfile
 from collections.abc import Callable
-from enum import Enum
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -38,7 +37,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from benchmarks.peers.scene import DESIRED_SPEED_MPS, LENGTH_M, ROAD_M, Law, Scene, Scheme, Trace
 from ganlane._version import __version__
@@ -85,112 +83,80 @@ def drive_ours(scene: Scene) -> Trace:
     vehicles = vehicles_of(scene)
     key = torch.zeros(1, dtype=torch.int64)
     memory = traffic.fresh_memory(vehicles, key)
-    speeds, positions = [vehicles.speed], [vehicles.x]
+    driven = [vehicles]
     for step in range(scene.steps()):
         moved, memory = traffic.move(vehicles, memory, key, key + step)
         if scene.leader:
             moved = led(vehicles, moved, scene.leader_speeds()[step + 1])
         vehicles = moved
-        speeds.append(vehicles.speed)
-        positions.append(vehicles.x)
-    return Trace(_stack(speeds), _stack(positions))
+        driven.append(vehicles)
+    speeds, positions = (
+        torch.cat([getattr(moment, name) for moment in driven]).numpy() for name in ("speed", "x")
+    )
+    return Trace(speeds, positions)
 
 
-def _stack(rows: list[Tensor]) -> np.ndarray:
-    return torch.cat(rows).double().numpy()
-
-
-class Distances(Enum):
-    """What HighwayEnv's drivers take for the distance to their leader."""
-
-    #: As it comes: from centre to centre, with one vehicle's length in the minimum gap.
-    CENTRES = LENGTH_M
-    #: Points instead of bodies, as far apart as the bumpers are: HighwayEnv's equations see the net
-    #: gap.
-    BUMPERS = 0.0
-
-
-def driver_class(distances: Distances) -> Any:
-    """``IDMVehicle`` with Table V and vehicles of 4.5 m."""
+def highway_env_road(scene: Scene, offset_m: float) -> Any:
+    """A HighwayEnv road with the vehicles of ``scene``, the foremost first, each drawn forward by
+    :func:`squeeze`.
+    """
+    from highway_env.road.road import Road, RoadNetwork
     from highway_env.vehicle.behavior import IDMVehicle
+    from highway_env.vehicle.kinematics import Vehicle
 
     class Driver(IDMVehicle):
         LENGTH = LENGTH_M
         ACC_MAX = -TABLE_V.min_acceleration
         COMFORT_ACC_MAX = TABLE_V.max_acceleration
         COMFORT_ACC_MIN = -TABLE_V.comfortable_deceleration
-        DISTANCE_WANTED = TABLE_V.min_gap_m + distances.value
+        DISTANCE_WANTED = TABLE_V.min_gap_m + offset_m
         TIME_WANTED = TABLE_V.headway_s
         DELTA = 4.0
 
-    return Driver
-
-
-def highway_env_road(scene: Scene, distances: Distances) -> Any:
-    """A HighwayEnv road with the vehicles of ``scene`` at their places, the foremost first."""
-    from highway_env.road.road import Road, RoadNetwork
-    from highway_env.vehicle.kinematics import Vehicle
-
-    network = RoadNetwork.straight_road_network(
-        lanes=1, length=ROAD_M, speed_limit=2.0 * DESIRED_SPEED_MPS
-    )
+    limit_mps = 2.0 * DESIRED_SPEED_MPS
+    network = RoadNetwork.straight_road_network(lanes=1, length=ROAD_M, speed_limit=limit_mps)
     road = Road(network, np_random=np.random.RandomState(0))
-    driver = driver_class(distances)
-    squeezed = scene.positions_m() + squeeze(scene, distances)
+    free = {"target_speed": DESIRED_SPEED_MPS, "enable_lane_change": False, "timer": 1.0}
+    squeezed = scene.positions_m() + squeeze(scene, offset_m)
     for rank, (x, speed) in enumerate(zip(squeezed, scene.speeds_mps)):
-        if rank == 0 and scene.leader:
-            vehicle = Vehicle(road, [x, 0.0], speed=speed)
-        else:
-            vehicle = driver(
-                road,
-                [x, 0.0],
-                speed=speed,
-                target_speed=DESIRED_SPEED_MPS,
-                enable_lane_change=False,
-                timer=1.0,
-            )
+        is_led = rank == 0 and scene.leader
+        kind, more = (Vehicle, {}) if is_led else (Driver, free)
+        vehicle = kind(road, [x, 0.0], speed=speed, **more)
         # Its crash physics would push the points apart that stand for bodies.
-        vehicle.check_collisions = distances is Distances.CENTRES
+        vehicle.check_collisions = offset_m > 0.0
         road.vehicles.append(vehicle)
     return road
 
 
-def squeeze(scene: Scene, distances: Distances) -> np.ndarray:
-    """How far forward each vehicle is drawn so that centres are as far apart as bumpers should be,
-    m, [M].
+def squeeze(scene: Scene, offset_m: float) -> np.ndarray:
+    """How far forward each vehicle is drawn, m, [M].
+
+    HighwayEnv's distances are those of centres: to be the net gaps (plus ``offset_m``), centres
+    have to be as far apart as bumpers should be.
     """
-    rank = np.arange(len(scene.speeds_mps))
-    return rank * (LENGTH_M - distances.value)
+    return np.arange(len(scene.speeds_mps)) * (LENGTH_M - offset_m)
 
 
-def drive_highway_env(
-    scene: Scene, distances: Distances = Distances.BUMPERS, dt: float = PHYSICS_STEP_S
-) -> Trace:
+def drive_highway_env(scene: Scene, offset_m: float = 0.0, dt: float = PHYSICS_STEP_S) -> Trace:
     """Drive ``scene`` with HighwayEnv at steps of ``dt`` seconds.
 
-    Positions in the trace are the bodies' centres.
+    Its drivers take the net gap plus ``offset_m`` for the distance to their leader, and as much
+    more for their minimum gap: 0 for points instead of bodies, as far apart as the bumpers are; the
+    length of a vehicle for HighwayEnv as it comes. Positions in the trace are the bodies' centres.
     """
-    road = highway_env_road(scene, distances)
+    road = highway_env_road(scene, offset_m)
     leader = scene.leader_speeds(dt) if scene.leader else None
-    speeds, positions = [_speeds(road)], [_positions(road)]
-    for step in range(scene.steps(dt)):
-        road.act()
-        if leader is not None:
-            road.vehicles[0].act(
-                {"steering": 0.0, "acceleration": (leader[step + 1] - leader[step]) / dt}
-            )
-        road.step(dt)
-        speeds.append(_speeds(road))
-        positions.append(_positions(road))
-    return Trace(np.array(speeds), np.array(positions) - squeeze(scene, distances))
-
-
-def _speeds(road: Any) -> list[float]:
-    return [vehicle.speed for vehicle in road.vehicles]
-
-
-def _positions(road: Any) -> list[float]:
-    return [vehicle.position[0] for vehicle in road.vehicles]
+    speeds, positions = [], []
+    for step in range(scene.steps(dt) + 1):
+        if step:
+            road.act()
+            if leader is not None:
+                pushed = (leader[step] - leader[step - 1]) / dt
+                road.vehicles[0].act({"steering": 0.0, "acceleration": pushed})
+            road.step(dt)
+        speeds.append([vehicle.speed for vehicle in road.vehicles])
+        positions.append([vehicle.position[0] for vehicle in road.vehicles])
+    return Trace(np.array(speeds), np.array(positions) - squeeze(scene, offset_m))
 
 
 #: SUMO's own ``stepping``, for steps longer than that.
@@ -271,13 +237,12 @@ def _run_sumo(libsumo: Any, scene: Scene, dt: float) -> Trace:
         raise UserError(
             f"SUMO put {libsumo.vehicle.getIDList()} on the road; expected the vehicles {names}."
         )
-    if leader is not None:
-        libsumo.vehicle.setSpeedMode("0", 0)
     speeds, positions = [], []
     for step in range(scene.steps(dt) + 1):
-        if step and leader is not None:
-            libsumo.vehicle.setSpeed("0", leader[step])
         if step:
+            if leader is not None:
+                libsumo.vehicle.setSpeedMode("0", 0)
+                libsumo.vehicle.setSpeed("0", leader[step])
             libsumo.simulationStep()
         speeds.append([libsumo.vehicle.getSpeed(vehicle) for vehicle in names])
         positions.append([libsumo.vehicle.getLanePosition(vehicle) for vehicle in names])
@@ -302,7 +267,7 @@ PEERS = (
     Peer(
         "HighwayEnv, centres",
         "highway_env",
-        partial(drive_highway_env, distances=Distances.CENTRES),
+        partial(drive_highway_env, offset_m=LENGTH_M),
         Scheme.EXPLICIT_EULER,
         Law(LENGTH_M, floored=False, reverses=True, free_gap_m=math.inf),
     ),
@@ -334,4 +299,4 @@ def require_peers() -> None:
 def versions() -> dict[str, str]:
     """Versions of everything that the figures depend on."""
     ours = {"ganlane": __version__, "python": platform.python_version()}
-    return {**ours, **{name: importlib.metadata.version(name) for name in PACKAGES}}
+    return ours | {name: importlib.metadata.version(name) for name in PACKAGES}

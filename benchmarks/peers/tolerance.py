@@ -38,10 +38,6 @@ from ganlane.sim.idm import TABLE_V
 #: Room for the terms of second order: products of two differences, each of them small beside gap
 #: and speed.
 MARGIN = 1.1
-#: What double precision may leave after minutes at positions of kilometres, m/s and m. SUMO's
-#: "nobody ahead" is a leader 1000 km away, worth ``v0/4 (v0 T / 10^6 m)^2`` = 1e-8 m/s, and is in
-#: it too.
-ROUNDING_MPS, ROUNDING_M = 2e-8, 2e-6
 
 
 class Slopes(NamedTuple):
@@ -106,7 +102,10 @@ class Largest(NamedTuple):
     position_m: float
 
 
-ROUNDING = Largest(ROUNDING_MPS, ROUNDING_M, ROUNDING_M)
+#: What double precision may leave after minutes at positions of kilometres. SUMO's
+#: "nobody ahead" is a leader 1000 km away, worth ``v0/4 (v0 T / 10^6 m)^2`` = 1e-8 m/s, and is in
+#: it too.
+ROUNDING = Largest(speed_mps=2e-8, gap_m=2e-6, position_m=2e-6)
 
 
 def between(one: Trace, other: Trace) -> Largest:
@@ -129,17 +128,6 @@ def tolerance(trace: Trace, scene: Scene, scheme: Scheme, law: Law = LAW) -> Lar
     return Largest(*(MARGIN * size + rest for size, rest in zip(sizes, ROUNDING)))
 
 
-def free_road_speed_mps(free_gap_m: float) -> float:
-    """How much below its desired speed a driver settles whose empty road is a gap of
-    ``free_gap_m``, m/s.
-
-    To first order ``v0/4 (s*/d)^2``: the slope of the free term, ``4 a / v0``, against the
-    interaction that is left.
-    """
-    wanted = TABLE_V.min_gap_m + DESIRED_SPEED_MPS * TABLE_V.headway_s
-    return 0.25 * DESIRED_SPEED_MPS * (wanted / free_gap_m) ** 2
-
-
 def largest(values: Array) -> float:
     """Largest absolute value; 0 of nothing."""
     return float(np.abs(values).max(initial=0.0))
@@ -153,10 +141,8 @@ def unsettled_gap_m(trace: Trace, law: Law = LAW) -> float:
     and its leader's speed, at their slopes.
     """
     end = Trace(trace.speed[-2:], trace.position[-2:])
-    left = np.diff(end.speed, axis=0)[0, 1:] / PHYSICS_STEP_S
-    by = slopes(end.speed, *ahead(end, law), law)
+    left = np.abs(np.diff(end.speed, axis=0)[0, 1:]) / PHYSICS_STEP_S
+    by_gap, by_speed, by_leader = np.abs(slopes(end.speed, *ahead(end, law), law))[:, -1, 1:]
     away = np.abs(end.speed[-1] - end.speed[-1, 0])
-    asked = (
-        np.abs(left) + np.abs(by.speed[-1, 1:]) * away[1:] + np.abs(by.leader[-1, 1:]) * away[:-1]
-    )
-    return MARGIN * largest(asked / by.gap[-1, 1:]) + ROUNDING_M
+    asked = left + by_speed * away[1:] + by_leader * away[:-1]
+    return MARGIN * largest(asked / by_gap) + ROUNDING.gap_m

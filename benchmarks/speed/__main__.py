@@ -21,12 +21,11 @@ import argparse
 import itertools
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import date
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from benchmarks.script import (
     ReportSection,
@@ -37,12 +36,12 @@ from benchmarks.script import (
     significant,
 )
 from benchmarks.speed import systems
-from benchmarks.speed.measure import Case, Labels, Row, measure
+from benchmarks.speed.measure import Case, Labels, Row, Runner, measure
 from benchmarks.speed.sumo import start_on_ramp
 from benchmarks.speed.systems import Road, installed_version
 from ganlane.agents import RainbowConfig
 from ganlane.evaluation import machine_sentence
-from ganlane.evaluation.table import Table
+from ganlane.evaluation.table import Cell, Table, text_of
 from ganlane.files import write_json
 
 #: Defaults of each suite: batches and traffics.
@@ -67,13 +66,8 @@ SCENES = {"merge": (21, 3), "exit": (24, 4), "on_ramp": (20, 3)}
 #: Suites that go through gymnasium.
 THROUGH_GYMNASIUM = ("gymnasium", "scenarios")
 #: Heading to cell of the tables' columns.
-COLUMNS: dict[str, Callable[[Mapping[str, Any]], str]] = {
-    "system": lambda row: row["system"],
-    "traffic": lambda row: row["traffic"],
-    "mode": lambda row: row["mode"],
-    "device": lambda row: row["device"],
-    "threads": lambda row: str(row["threads"]),
-    "batch": lambda row: str(row["batch"]),
+COLUMNS: dict[str, Cell] = {
+    **{name: text_of(name) for name in ("system", "traffic", "mode", "device", "threads", "batch")},
     "physics steps/s": lambda row: count(row["physics_steps_per_s"]),
     "decisions/s": lambda row: count(row["decisions_per_s"]),
     "physics steps/CPU-s": lambda row: count(row["physics_steps_per_cpu_s"]),
@@ -87,87 +81,81 @@ def cases_of(
     options: argparse.Namespace, road: Road, threads: int, batch: int, ego: str
 ) -> list[Case]:
     """What takes turns in one group: every system, traffic and mode of the suite."""
+    starts: dict[str, Callable[..., Runner]]
+    if options.suite == "sim":
+        starts = {
+            "ganlane physics": systems.start_physics,
+            "ganlane environment": systems.start_environment,
+        }
+    elif options.suite == "traffic":
+        starts = {"ganlane traffic": systems.start_traffic}
+    elif options.suite == "train":
+        agent = {"config": RainbowConfig(), "stored": options.stored}
+        starts = {"ganlane training": partial(systems.start_training, **agent)}
+    else:
+        start = partial(systems.start_gymnasium, keep=EGOS[ego])
+        starts = {f"ganlane{_scene_and_ego(road, ego)}": start}
+        if options.suite == "scenarios":
+            # What the ends of lanes cost.
+            name = f"ganlane highway with as many vehicles, {ego}"
+            starts[name] = partial(systems.start_without_ends, start)
     cases = []
-    for traffic in options.traffics:
-        here = replace(road, traffic=traffic)
-        starts: dict[str, Callable[..., Any]]
-        if options.suite == "sim":
-            starts = {
-                "ganlane physics": systems.start_physics,
-                "ganlane environment": systems.start_environment,
-            }
-        elif options.suite in THROUGH_GYMNASIUM:
-            start = partial(systems.start_gymnasium, keep=EGOS[ego])
-            starts = {f"ganlane{_scene_of(road)}, {ego}": start}
-            if options.suite == "scenarios":
-                # What the ends of lanes cost.
-                name = f"ganlane highway with as many vehicles, {ego}"
-                starts[name] = partial(systems.start_without_ends, start)
-        elif options.suite == "traffic":
-            starts = {"ganlane traffic": systems.start_traffic}
-        else:
-            agent = {"config": RainbowConfig(), "stored": options.stored}
-            starts = {"ganlane training": partial(systems.start_training, **agent)}
-        for system, start in starts.items():
-            for mode in options.modes:
-                labels = labels_of(here, system, mode, options.device, threads, batch)
-                cases.append(Case(labels, partial(start, here, mode, options.device, batch), batch))
+    for traffic, system, mode in itertools.product(options.traffics, starts, options.modes):
+        place = mode, options.device, batch
+        labels = Labels(
+            system, traffic, road.vehicles, road.lanes, mode, options.device, threads, batch
+        )
+        start = partial(starts[system], replace(road, traffic=traffic), *place)
+        cases.append(Case(labels, start, batch))
     return cases
 
 
-def _scene_of(road: Road) -> str:
+def _scene_and_ego(road: Road, ego: str) -> str:
     """For the name of a system."""
-    return "" if road.scene == "highway" else f" {road.scene}"
-
-
-def labels_of(road: Road, system: str, *place: Any) -> Labels:
-    """Labels of a case; ``place`` is mode, device, threads and batch."""
-    return Labels(system, road.traffic, road.vehicles, road.lanes, *place)
+    scene = "" if road.scene == "highway" else f" {road.scene}"
+    return f"{scene}, {ego}" if ego else scene
 
 
 def peers_of(
     options: argparse.Namespace, road: Road, threads: int, batch: int, ego: str
 ) -> list[Case]:
     """The peers of a group that are installed; ratios are to the first."""
-    theirs = replace(road, traffic="its IDM and MOBIL")
-    highway = installed_version("highway-env")
-    envpool, learner = installed_version("envpool"), installed_version("stable-baselines3")
-    peers: list[Case] = []
     if options.no_peers or options.suite == "traffic":
-        return peers
+        return []
+    # Neither HighwayEnv nor EnvPool has an on-ramp where others merge.
+    name, package = "HighwayEnv", "highway-env"
     if road.scene == "on_ramp":
-        # Neither HighwayEnv nor EnvPool has one where others merge.
-        simulator = installed_version("libsumo")
-        if simulator is None:
-            print("left out, SUMO: pip install 'ganlane[bench]' brings it.", file=sys.stderr)
-            return peers
-        name = f"SUMO {simulator} on_ramp, {ego}"
-        its_road = replace(road, traffic="its IDM and LC2013")
-        labels = labels_of(its_road, name, "native", "cpu", threads, 1)
-        peers.append(Case(labels, partial(start_on_ramp, road.seed, EGOS[ego]), 1))
-    elif highway is None:
-        print("left out, HighwayEnv: pip install 'ganlane[bench]' brings it.", file=sys.stderr)
-    elif options.suite == "sim":
-        name = f"HighwayEnv {highway}"
-        labels = labels_of(theirs, name, "eager", "cpu", threads, 1)
-        peers.append(Case(labels, partial(systems.start_highway, road), 1))
-    elif options.suite in THROUGH_GYMNASIUM:
-        keep = EGOS[ego]
-        if envpool is not None:
-            name = f"EnvPool {envpool}{_scene_of(road)}, {ego}"
-            labels = labels_of(theirs, name, "native", "cpu", threads, batch)
-            peers.append(
-                Case(labels, partial(systems.start_envpool, road, batch, threads, keep), batch)
-            )
-        name = f"HighwayEnv {highway}{_scene_of(road)}, {ego}"
-        labels = labels_of(theirs, name, "eager", "cpu", threads, 1)
-        peers.append(Case(labels, partial(systems.start_highway, road, keep), 1))
-    elif options.suite == "train" and learner is not None:
+        name, package = "SUMO", "libsumo"
+    installed = installed_version(package)
+    if installed is None:
+        print(f"left out, {name}: pip install 'ganlane[bench]' brings it.", file=sys.stderr)
+        return []
+    driven = _scene_and_ego(road, ego)
+    keep = EGOS.get(ego, False)
+
+    def case(
+        system: str, start: Callable[[], Runner], mode: str, rows: int = 1, changes: str = "MOBIL"
+    ) -> Case:
+        place = road.vehicles, road.lanes, mode, "cpu", threads, rows
+        return Case(Labels(system, f"its IDM and {changes}", *place), start, rows)
+
+    system = f"{name} {installed}{driven}"
+    if road.scene == "on_ramp":
+        start = partial(start_on_ramp, road.seed, keep)
+        return [case(system, start, "native", changes="LC2013")]
+    if options.suite == "train":
+        learner = installed_version("stable-baselines3")
+        if learner is None:
+            return []
         agent = RainbowConfig()
-        name = f"stable-baselines3 {learner} DQN on HighwayEnv {highway}"
-        labels = labels_of(theirs, name, "eager", "cpu", threads, 1)
-        start = partial(systems.start_baseline, road, agent)
-        peers.append(Case(labels, start, agent.decisions_per_update))
+        name = f"stable-baselines3 {learner} DQN on {system}"
+        baseline = case(name, partial(systems.start_baseline, road, agent), "eager")
+        return [baseline._replace(decisions_per_call=agent.decisions_per_update)]
+    peers = [case(system, partial(systems.start_highway, road, keep), "eager")]
+    envpool = installed_version("envpool")
+    if options.suite in THROUGH_GYMNASIUM and envpool is not None:
+        start = partial(systems.start_envpool, road, batch, threads, keep)
+        peers.insert(0, case(f"EnvPool {envpool}{driven}", start, "native", batch))
     return peers
 
 
@@ -188,7 +176,7 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
         peers = peers_of(options, road, threads, batch, ego)
         first = peers[0] if peers else None
         rows += measure([*peers[1:], *cases], first, options.repetitions, options.seconds)
-        where = f"threads {threads}, batch {batch}{_scene_of(road)} {ego}"
+        where = f"threads {threads}, batch {batch}{_scene_and_ego(road, ego)}"
         print(f"{where}: done", file=sys.stderr, flush=True)
     return rows
 

@@ -130,13 +130,9 @@ class OnRamp:
             self.sumo.vehicle.changeLaneRelative(EGO, aside, 1.0)
         for _ in range(STEPS):
             self.sumo.simulationStep()
-        if self._is_over():
-            self.reset()
-
-    def _is_over(self) -> bool:
-        vehicle = self.sumo.vehicle
         driven_s = self.sumo.simulation.getTime() - self._started_s
-        return vehicle.getDistance(EGO) > self.goal_m or driven_s > self.timeout_s
+        if self.sumo.vehicle.getDistance(EGO) > self.goal_m or driven_s > self.timeout_s:
+            self.reset()
 
 
 def start_on_ramp(seed: int, keep: bool = False) -> Runner:
@@ -145,9 +141,8 @@ def start_on_ramp(seed: int, keep: bool = False) -> Runner:
     random = np.random.default_rng(seed)
 
     def run(decisions: int) -> int:
-        drawn = random.integers(3, size=decisions)
-        for action in drawn:
-            ramp.step(keys.KEEP if keep else int(action))
+        for action in random.integers(3, size=decisions).tolist():
+            ramp.step(keys.KEEP if keep else action)
         return decisions * STEPS
 
     return run

@@ -36,7 +36,7 @@ OBSERVATION = "lane_view"
 #: HighwayEnv's action that keeps lane and speed.
 THEIR_KEEP = 1
 #: Its ``highway-v0`` ends an episode after so many seconds, as ours does.
-TIMEOUT_S = 1000.0
+TIMEOUT_S = 1000
 
 
 @dataclass(frozen=True)
@@ -87,17 +87,16 @@ def start_physics(road: Road, mode: str, device: str, batch: int) -> Runner:
     keep = torch.full((batch,), keys.KEEP, device=device)
 
     def run(decisions: int) -> int:
-        state = first
         simulated = 0
         with torch.inference_mode():
-            for decision in range(decisions):
-                # 20 km a thousand decisions at most: far from the goal.
-                if decision % 1000 == 0:
-                    simulated += int((state.get(keys.STEP) - first.get(keys.STEP)).sum())
-                    state = first
-                # Past TorchRL's own part of a step, which `environment` has.
-                state = env.base_env._step(state.set(keys.ACTION, keep))
-        return simulated + int((state.get(keys.STEP) - first.get(keys.STEP)).sum())
+            # 20 km a thousand decisions at most: far from the goal.
+            for begin in range(0, decisions, 1000):
+                state = first
+                for _ in range(min(1000, decisions - begin)):
+                    # Past TorchRL's own part of a step, which `environment` has.
+                    state = env.base_env._step(state.set(keys.ACTION, keep))
+                simulated += int((state.get(keys.STEP) - first.get(keys.STEP)).sum())
+        return simulated
 
     return run
 
@@ -242,15 +241,11 @@ def _highway_settings(road: Road) -> dict[str, Any]:
 
     Its ``merge-v0`` and ``exit-v0`` have roads and vehicles of their own.
     """
-    frequencies = {"simulation_frequency": STEPS, "policy_frequency": 1}
-    if road.scene != "highway":
-        return frequencies
-    return {
-        **frequencies,
-        "lanes_count": road.lanes,
-        "vehicles_count": road.vehicles - 1,  # the others
-        "duration": round(TIMEOUT_S),
-    }
+    chosen = {"simulation_frequency": STEPS, "policy_frequency": 1}
+    if road.scene == "highway":
+        others = road.vehicles - 1
+        chosen |= {"lanes_count": road.lanes, "vehicles_count": others, "duration": TIMEOUT_S}
+    return chosen
 
 
 def make_highway(road: Road) -> Any:
@@ -292,7 +287,7 @@ def start_envpool(road: Road, batch: int, threads: int, keep: bool = False) -> R
         f"{road.scene.capitalize()}-v0",
         num_envs=batch,
         num_threads=min(threads, batch),
-        max_episode_steps=round(TIMEOUT_S),
+        max_episode_steps=TIMEOUT_S,
         seed=road.seed,
         **_highway_settings(road),
     )

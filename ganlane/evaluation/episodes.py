@@ -17,7 +17,6 @@ import polars as pl
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
@@ -111,8 +110,7 @@ def start_of(env: EnvBase, numbers: Sequence[int], seed: int) -> TensorDict:
 class _Evaluation:
     """Episodes on their way through the rows of an environment.
 
-    Arguments as in :func:`run_episodes`. All attributes named in :meth:`_keep` have the batch size
-    [N].
+    Arguments as in :func:`run_episodes`.
     """
 
     def __init__(
@@ -136,22 +134,21 @@ class _Evaluation:
         # an end.
         self.check_every = 1 if rows_stay else CHECK_EVERY
         self.numbers = torch.tensor(numbers, dtype=torch.int64, device=env.device)
-        # Where the episode of a row stands in the list; the list's length in spare rows.
-        self.place = torch.arange(rows, device=env.device).clamp_max(self.total)
-        self.driving = self.place < self.total
+        # Of each row where its episode stands in the list (the list's length in spare rows) and
+        # what is marked; from the first decision on also the sums over the decisions of its
+        # episode, and the last state of it.
+        place = torch.arange(rows, device=env.device).clamp_max(self.total)
+        self.rows = TensorDict({"place": place, "marks": first_marks(place)}, [rows])
+        self.driving = place < self.total
         self.handed_out = min(rows, self.total)
         self.finished: list[TensorDictBase] = []
         self.state: TensorDictBase = env.reset(start_of(env, numbers[:rows], seed))
-        # Sums over the decisions of each row's episode, the last state of it, and what is marked.
-        self.sums: TensorDictBase | None = None
-        self.last: TensorDictBase | None = None
-        self.marks: TensorDictBase = first_marks(self.driving)
         self.road = getattr(env, "road", STRAIGHT)
 
     def run(self, on_progress: Callable[[int, int], None] | None) -> TensorDictBase:
         """Drive all episodes to their ends.
 
-        Returns ``sums`` and ``last`` [E] in the order of the episodes, on the CPU.
+        Returns ``sums``, ``last`` and ``marks`` [E] in the order of the episodes, on the CPU.
         """
         # Decisions are driven in stretches; between two of them rows are collected and handed out.
         done = 0
@@ -174,15 +171,18 @@ class _Evaluation:
         # The policy writes into the tensordict that it reads.
         after = self.env.step(self.policy(self.state))
         added = _added(after["next"])
-        state = after["next"].select(*_LAST, strict=False)
-        if self.sums is None or self.last is None:
-            self.sums = added.apply(torch.zeros_like)
-            self.last = state
+        last = after["next"].select(*_LAST, strict=False)
+        before = self.rows
+        if "sums" not in before:
+            before.update({"sums": added.apply(torch.zeros_like), "last": last})
+        counted = {
+            "place": before["place"],
+            "marks": marks_after(after["next"], before["marks"], self.road),
+            "sums": before["sums"] + added,
+            "last": last,
+        }
         # Rows whose episode has ended keep what they had.
-        self.sums = (self.sums + added).where(self.driving, self.sums)
-        self.last = state.where(self.driving, self.last)
-        marks = marks_after(after["next"], self.marks, self.road)
-        self.marks = marks.where(self.driving, self.marks)
+        self.rows = TensorDict(counted, before.batch_size).where(self.driving, before)
         # From its first end on a row counts no more, whatever it drives.
         self.driving = self.driving & ~after["next", "done"].squeeze(-1)
         self.state = step_mdp(after)
@@ -193,11 +193,10 @@ class _Evaluation:
         Their rows are spare then.
         """
         # A row is counted until its first end, even where it is driven on until the next look.
-        ended = ((self.place < self.total) & ~self.driving).nonzero()[:, 0]
+        ended = ((self.rows["place"] < self.total) & ~self.driving).nonzero()[:, 0]
         if len(ended) > 0:
-            rows = {name: getattr(self, name) for name in ("place", "sums", "last", "marks")}
-            self.finished.append(TensorDict(rows, self.place.shape)[ended].cpu())
-            self.place[ended] = self.total
+            self.finished.append(self.rows[ended].cpu())
+            self.rows["place"][ended] = self.total
         return len(ended)
 
     def _go_on(self) -> None:
@@ -211,27 +210,26 @@ class _Evaluation:
         wide = rows > SMALL_BATCH and len(driving) <= LARGEST_SHARE * rows
         if wide and self.handed_out == self.total and self.make_smaller is not None:
             self.env = self.make_smaller(len(driving))
-            self._keep(driving)
+            for name in ("state", "rows", "driving"):
+                setattr(self, name, getattr(self, name)[driving])
             return
         # Spare rows take the next numbers of the list, in order.
         new = (~self.driving).nonzero()[: self.total - self.handed_out, 0]
-        self.place[new] = torch.arange(
-            self.handed_out, self.handed_out + len(new), device=self.place.device
-        )
+        place = self.rows["place"]
+        place[new] = torch.arange(len(new), device=place.device) + self.handed_out
         self.handed_out += len(new)
         self.driving[new] = True
-        assert self.sums is not None  # a decision has been driven
         # The sums of a row begin anew with its episode.
-        for total in self.sums.values():
+        for total in self.rows["sums"].values():
             total[new] = 0.0
-        self.marks[new] = first_marks(self.driving[new])
+        self.rows["marks"][new] = first_marks(new)
         # Spare rows that have ended start theirs again, uncounted.
-        mask = self.state["done"] & (self.place == self.total)[:, None]
+        mask = self.state["done"] & (place == self.total)[:, None]
         mask[new] = True
         if not bool(mask.any()):
             return
-        number = self.numbers[self.place.clamp_max(self.total - 1)]
-        wanted = torch.where(self.place < self.total, number, self.state[keys.EPISODE])
+        number = self.numbers[place.clamp_max(self.total - 1)]
+        wanted = torch.where(place < self.total, number, self.state[keys.EPISODE])
         self.state = self.env.reset(self.state.set("_reset", mask), next_episode=wanted)
         # An environment that goes on with numbers of its own would fill the table with episodes
         # that nobody asked for.
@@ -241,11 +239,6 @@ class _Evaluation:
                 "[N] in _reset and start it in the rows of the _reset mask, as "
                 "ganlane.env.HighwayEnv does."
             )
-
-    def _keep(self, rows: Tensor) -> None:
-        """Continue with ``rows`` [K] (int64) alone, in that order."""
-        for name in ("state", "place", "driving", "sums", "last", "marks"):
-            setattr(self, name, getattr(self, name)[rows])
 
 
 def _added(state: TensorDictBase) -> TensorDict:

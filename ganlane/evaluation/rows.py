@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import (
     RESAMPLES,
@@ -23,7 +22,6 @@ from ganlane.evaluation.statistics import (
     clopper_pearson,
     entries,
     mean_interval,
-    no_events,
     paired_difference,
     percent_of_way,
     poisson_interval,
@@ -77,8 +75,7 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
 
     ``same_traffic`` also holds the drivers that give the scale.
     """
-    # Every end has its column, also one that never happened.
-    ended = counts_of_ends(pair, keys.END_EVENTS)
+    ended = counts_of_ends(pair, FAILURES)
     returns = pair["reward"].to_numpy()
     distance_m = float(pair["distance_m"].sum())
     crashes = lead = None
@@ -91,17 +88,17 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
     # Someone close behind is no end of an episode, so it is counted by episode.
     behind = mean_interval(pair["soft_crash_behind"].to_numpy())
     score, reason = _score(pair, same_traffic)
+    shares: Row = {}
+    for end, count in ended.items():
+        shares |= entries(f"{end}_share", clopper_pearson(count, pair.height))
     return {
         "agent": pair["agent"][0],
         "traffic": pair["traffic"][0],
         "episodes": pair.height,
-        "goal": ended["goal"],
-        "hard_crash": ended["hard_crash"],
+        # Every end has its column, also one that never happened.
+        **counts_of_ends(pair, ("goal", "hard_crash")),
         "soft_crash": int(pair["had_soft_crash"].sum()),
-        "out_of_road": ended["out_of_road"],
-        "missed_exit": ended["missed_exit"],
-        "timeout": ended["timeout"],
-        "scene_end": ended["scene_end"],
+        **counts_of_ends(pair, ("out_of_road", "missed_exit", "timeout", "scene_end")),
         "soft_crash_onsets": int(pair["soft_crash"].sum()),
         "soft_crash_behind_onsets": int(pair["soft_crash_behind"].sum()),
         **entries("soft_crash_behind_per_episode", behind),
@@ -109,8 +106,7 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
         "reward_sd": float(np.std(returns, ddof=1)) if len(returns) > 1 else None,
         **speed_and_lane_changes(pair),
         "distance_km": distance_m / 1000.0,
-        **entries("hard_crash_share", clopper_pearson(ended["hard_crash"], pair.height)),
-        **entries("out_of_road_share", clopper_pearson(ended["out_of_road"], pair.height)),
+        **shares,
         **entries("crashes_per_1000_km", crashes),
         **entries("minus_mobil", lead),
         **entries("normalized_percent", score),
@@ -321,7 +317,7 @@ def crashes_by_scene(episodes: pl.DataFrame, scenes: Sequence[str]) -> tuple[Est
     if len(driven) < 2:
         return Estimate(rate_of_all), rows
     if crashes.sum() == 0:
-        return no_events(total), rows
+        return poisson_interval(0).scaled(per=total), rows
     # A resample may hold nothing but scenes in which nobody drove.
     driven = driven.clip(min=np.finfo(np.float64).tiny)
     ratios = [

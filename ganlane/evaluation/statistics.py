@@ -195,14 +195,6 @@ def poisson_interval(count: int) -> Estimate:
     return Estimate(float(count), *poisson_bounds(count))
 
 
-def no_events(amount: float) -> Estimate:
-    """The rate where nothing happened in ``amount`` (km, say), with Poisson's exact upper bound.
-
-    Resampling zeros would leave no doubt.
-    """
-    return poisson_interval(0).scaled(per=amount)
-
-
 # The training as the unit: several trainings of one recipe (seeds) on the same episodes.
 #
 # An interval over episodes says what other episodes would give; it says nothing about another
@@ -244,7 +236,8 @@ def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate |
     if not total > 0.0:
         return None
     if not happened.any():
-        return no_events(total)
+        # Resampling zeros would leave no doubt.
+        return poisson_interval(0).scaled(per=total)
 
     def ratio(both: Array) -> Array:
         sums = both.sum(axis=-1)

@@ -97,6 +97,11 @@ def with_interval(row: Row, key: str, digits: int = 3) -> str:
     return f"{text} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
+def with_sign(row: Row, key: str, digits: int) -> str:
+    """:func:`with_interval` of a difference: ``+`` before what is not negative."""
+    return ("" if row[key] < 0.0 else "+") + with_interval(row, key, digits)
+
+
 def text_of(key: str) -> Cell:
     """Makes the cell with ``row[key]`` as it is."""
     return lambda row: str(row.get(key, NOTHING))
@@ -221,13 +226,10 @@ def text_table(rows: Sequence[Row]) -> str:
 def paired_table(rows: Sequence[Row]) -> str:
     """The rows of :func:`ganlane.evaluation.paired_rows`, each lead with its sign."""
 
-    def lead(row: Row) -> str:
-        return ("" if row["lead"] < 0.0 else "+") + with_interval(row, "lead", 1)
-
     columns: Mapping[str, Cell] = {
         "paired lead": lambda row: f"{row['agent']} over {row['over']}",
         "traffic": text_of("traffic"),
-        "reward [95 %]": lead,
+        "reward [95 %]": lambda row: with_sign(row, "lead", 1),
         "verdict": text_of("verdict"),
     }
     few = any(row["episodes"] < FEWEST_EPISODES for row in rows)

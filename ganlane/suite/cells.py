@@ -50,19 +50,18 @@ class Cell:
 
 def available(config: BenchmarkConfig) -> tuple[list[str], dict[str, str]]:
     """The traffics that can be driven on here, and the others with the reason why not."""
-    at_hand = []
+    traffics = config.suite.traffics()
     missing = {}
-    for name, option in config.suite.traffics().items():
+    for name, option in traffics.items():
         try:
             # Made and thrown away: only now a missing package or recording shows.
             make_traffic(option, config.suite.env)
-            at_hand.append(name)
         except UserError as error:
             # The score needs all of its traffics.
             if name in config.suite.scored:
                 raise
             missing[name] = str(error)
-    return at_hand, missing
+    return [name for name in traffics if name not in missing], missing
 
 
 def cells_of(
@@ -94,10 +93,11 @@ def _settings(driver: Driver, config: EvaluateConfig) -> dict[str, Any]:
     driven, _ = driver.driving(config)
     settings = asdict(driven)
     # They change how fast the cell is driven, not what happens.
-    for name in ("threads", "columns", "num_envs", "agents", "traffics"):
+    for name in ("threads", "columns", "num_envs", "agents"):
         del settings[name]
     return {
         **settings,
+        "env": asdict(driver.env(config.env)),
         "driver": driver.name,
         "weights": weights.hexdigest(),
         "traffics": {name: item.description() for name, item in config.traffics.items()},

@@ -40,10 +40,8 @@ def compare(
     # All traffics are made first, so that one that cannot be made shows before any driving.
     modules = {name: make_traffic(option, env, stream) for name, option in config.traffics.items()}
     total = len(modules) * len(drivers) * episodes
-    # One table per driver and traffic, concatenated at the end; current is what the environment at
-    # hand was built for.
+    # One table per driver and traffic, concatenated at the end.
     tables = []
-    current = None
     disabled = quiet or not sys.stderr.isatty()
     with tqdm(total=total, unit="episode", file=sys.stderr, disable=disabled) as bar:
         for traffic, module in modules.items():
@@ -54,12 +52,7 @@ def compare(
                 of_driver, policy = driver.driving(config)
                 # All but the number of rows, which shrinks towards the end.
                 make = partial(make_env, module, of_driver)
-                parts = (traffic, of_driver.observation, of_driver.mask, of_driver.env.actions)
-                if current != parts:
-                    # Drivers with the same observation, mask and actions share an environment, so
-                    # that it is compiled once.
-                    current = parts
-                    batch = make(min(config.num_envs, len(numbers)))
+                batch = make(min(config.num_envs, len(numbers)))
                 report = None if quiet else _reporter(bar, f"{driver.name} on {traffic}")
                 table = evaluation.run_episodes(batch, policy, numbers, seed, report, make)
                 table = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))

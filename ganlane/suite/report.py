@@ -204,15 +204,14 @@ def write_report(
 
 
 def _html(table: Table) -> str:
-    # The columns with names are headings of their line.
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in table.headings)
-    lines = [f"<tr>{head}</tr>"]
     # Everything is escaped: names of drivers and traffics come from the user.
+    def cells(before: str, texts: Sequence[str], after: str) -> str:
+        return "".join(f"{before}{html.escape(text)}{after}" for text in texts)
+
+    lines = cells("<th>", table.headings, "</th>")
     for line in table.lines:
-        cells = [html.escape(cell) for cell in line]
-        names = "".join(f'<th scope="row">{cell}</th>' for cell in cells[: table.names])
-        numbers = "".join(f"<td>{cell}</td>" for cell in cells[table.names :])
-        lines.append(f"<tr>{names}{numbers}</tr>")
-    notes = "".join(f"<p>{html.escape(note)}</p>" for note in table.notes)
-    body = f'<div class="wide"><table>{"".join(lines)}</table></div>'
-    return f"<h2>{html.escape(table.title)}</h2>{body}{notes}"
+        # The columns with names are headings of their line.
+        names = cells('<th scope="row">', line[: table.names], "</th>")
+        lines += f"</tr><tr>{names}{cells('<td>', line[table.names :], '</td>')}"
+    body = f'<div class="wide"><table><tr>{lines}</tr></table></div>'
+    return f"<h2>{html.escape(table.title)}</h2>{body}{cells('<p>', table.notes, '</p>')}"

@@ -103,12 +103,7 @@ def run(agents: Sequence[Driver], config: BenchmarkConfig, folder: Path) -> str:
         machine_sentence([config.threads or 1]),
     ]
     films = _films(agents, episodes, config) if config.films else {}
-    tables = [
-        table,
-        *further,
-        report.matrix_table(matrix),
-        report.comparison_table(compared),
-    ]
+    tables = [table, *further, report.matrix_table(matrix), report.comparison_table(compared)]
     page = report.write_report(folder, f"ganlane benchmark: {title}", tables, intro, films)
     record = {
         "schema": SCHEMA,
@@ -143,16 +138,14 @@ def _films(
     traffics = config.suite.traffics()
     pages = {}
     for driver in agents:
-        mine = episodes.filter(pl.col("agent") == driver.name)
-        failed = failed_episodes(mine)
-        # One traffic after the other, so that a film of each comes first.
+        # One traffic after the other.
         listed = [
             (number, row["traffic"])
-            for row in failed
-            for number in [*row["hard_crash"], *row["out_of_road"]][: config.films]
-        ][: config.films]
+            for row in failed_episodes(episodes.filter(pl.col("agent") == driver.name))
+            for number in [*row["hard_crash"], *row["out_of_road"]]
+        ]
         shown: list[Trajectory] = []
-        for number, traffic in listed:
+        for number, traffic in listed[: config.films]:
             film = drive_episode(driver, traffics[traffic], config.on(traffic), number)
             shown.append(film.since(max(0.0, float(film.time_s[-1]) - _SHOWN_S)))
         if shown:

@@ -131,8 +131,6 @@ def _row(recipe: str, traffic: str, cells: Cells) -> Row:
         # Without a lead of MOBIL over the random driver the scale would have no length.
         if difference(mobil, random_legal).excludes_zero():
             score = score_over_traffics([(rewards, mobil, random_legal)])
-    lead = None if is_mobil else difference(rewards, mobil)
-    probability = None if is_mobil else _probability(rewards, mobil)
     # Counts and plain rates are of the episodes of all trainings.
     together = pl.concat(trainings.values())
     row: Row = {
@@ -143,8 +141,8 @@ def _row(recipe: str, traffic: str, cells: Cells) -> Row:
         **entries("mean_reward", over_trainings(rewards)),
         **entries("interquartile_mean", over_trainings(rewards, interquartile_mean)),
         "reward_sd": float(together["reward"].to_numpy().std(ddof=1)),
-        **entries("minus_mobil", lead),
-        **entries("probability_above_mobil", probability),
+        **entries("minus_mobil", None if is_mobil else difference(rewards, mobil)),
+        **entries("probability_above_mobil", None if is_mobil else _probability(rewards, mobil)),
         **entries("normalized_percent", score),
         **safety(trainings),
     }
@@ -218,16 +216,17 @@ def summaries(cells: Cells, matrix: Sequence[Row], suite: Suite) -> list[Row]:
             for row in matrix
             if row["driver"] == recipe
         }
-        percent = {name: scores[name]["normalized_percent"] for name in scored}
-        decided = [name for name in scored if percent[name] is not None]
-        worst = min(decided, key=lambda name: percent[name], default=None)
+        percents = {name: scores[name]["normalized_percent"] for name in scored}
+        decided = {name: value for name, value in percents.items() if value is not None}
+        worst = min(decided, key=lambda name: decided[name], default=None)
         together = {
             name: pl.concat([cells[recipe, traffic][name] for traffic in scored])
             for name in cells[recipe, scored[0]]
         }
-        others = [name for name in suite.drivers() if name != recipe]
         improvement = {
-            name: improvement_over_traffics(list(zip(ours, rewards[name]))) for name in others
+            name: entries("probability", improvement_over_traffics(list(zip(ours, rewards[name]))))
+            for name in suite.drivers()
+            if name != recipe
         }
         summary.append(
             {
@@ -235,11 +234,9 @@ def summaries(cells: Cells, matrix: Sequence[Row], suite: Suite) -> list[Row]:
                 "trainings": len(together),
                 **entries("score", score_over_traffics(list(zip(ours, *scale)))),
                 "by_traffic": scores,
-                "worst": None if worst is None else percent[worst],
+                "worst": None if worst is None else decided[worst],
                 "worst_traffic": worst,
-                "improvement": {
-                    name: entries("probability", estimate) for name, estimate in improvement.items()
-                },
+                "improvement": improvement,
                 **safety(together),
             }
         )
@@ -256,20 +253,22 @@ def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:
         has a namesake of the second (same seed, or the only one) the episodes in which one alone
         crashed, and the exact probability.
     """
-    compared = []
-    for one, other in pairs:
-        for recipe, traffic in cells:
-            if recipe == one and (other, traffic) in cells:
-                names = {"driver": one, "over": other, "traffic": traffic}
-                both = _compared(cells[one, traffic], cells[other, traffic])
-                compared.append({**names, **both})
-    return compared
+    return [
+        {
+            "driver": one,
+            "over": other,
+            "traffic": traffic,
+            **_compared(cells[one, traffic], cells[other, traffic]),
+        }
+        for one, other in pairs
+        for recipe, traffic in cells
+        if recipe == one and (other, traffic) in cells
+    ]
 
 
 def _compared(first: Mapping[str, pl.DataFrame], second: Mapping[str, pl.DataFrame]) -> Row:
     """The numbers of a row of :func:`comparisons`."""
-    rewards = column(first, "reward")
-    other_rewards = column(second, "reward")
+    rewards = [column(cell, "reward") for cell in (first, second)]
     crashed, other_crashed = (column(cell, _RATES["crashes"]) for cell in (first, second))
     # Per 1000 episodes, which is easier to read than a share.
     more_crashes = _crash_difference(crashed, other_crashed).scaled(1000.0)
@@ -285,8 +284,8 @@ def _compared(first: Mapping[str, pl.DataFrame], second: Mapping[str, pl.DataFra
             test = mcnemar(crashes > 0, namesakes[seed_of(name)] > 0)
             tests.append({"driver": name, **vars(test)})
     return {
-        **entries("lead", difference(rewards, other_rewards)),
-        **entries("probability", _probability(rewards, other_rewards)),
+        **entries("lead", difference(*rewards)),
+        **entries("probability", _probability(*rewards)),
         **entries("crash_difference_per_1000_episodes", more_crashes),
         "mcnemar": tests,
     }

@@ -13,6 +13,7 @@ from reference.processes import ROOT
 from benchmarks.peers import compare, report, simulators
 from benchmarks.peers.scene import (
     CONSTANT,
+    DESIRED_SPEED_MPS,
     FREE_ROAD,
     LAW,
     OBSTACLE,
@@ -30,9 +31,9 @@ from benchmarks.peers.tolerance import (
     ROUNDING,
     Largest,
     between,
-    free_road_speed_mps,
     tolerance,
 )
+from ganlane.sim.idm import TABLE_V
 from ganlane.sim.neighbours import FREE_GAP_M
 
 EULERS = (Scheme.EXPLICIT_EULER, Scheme.SEMI_IMPLICIT_EULER)
@@ -47,6 +48,17 @@ SAME_LAW = [
     or scene is FREE_ROAD
     or (peer.name == "HighwayEnv" and scene not in (STEP, OBSTACLE))
 ]
+
+
+def free_road_speed_mps(free_gap_m: float) -> float:
+    """How much below its desired speed a driver settles whose empty road is a gap of
+    ``free_gap_m``, m/s.
+
+    To first order ``v0/4 (s*/d)^2``: the slope of the free term, ``4 a / v0``, against the
+    interaction that is left.
+    """
+    wanted = TABLE_V.min_gap_m + DESIRED_SPEED_MPS * TABLE_V.headway_s
+    return 0.25 * DESIRED_SPEED_MPS * (wanted / free_gap_m) ** 2
 
 
 def within(sizes: Largest, allowed: Largest) -> bool:

@@ -202,7 +202,7 @@ class HighwayEnv(EnvBase):
         n = self.batch_size[0]
         device = self.device
         # Of any episode: the fields and shapes are those of all, the traffic's memory included.
-        episode = torch.zeros(1, dtype=torch.int64, device=device)
+        episode = torch.zeros(n, dtype=torch.int64, device=device)
         state = self._start(episode, episode)
         self.observation_spec = spec_of(state.exclude(*keys.DONE_FLAGS), n).to(device)
         # A TransformedEnv passes to a reset only the keys of the state spec; without the counters a

@@ -97,7 +97,6 @@ def _settings(driver: Driver, config: EvaluateConfig) -> dict[str, Any]:
         del settings[name]
     return {
         **settings,
-        "env": asdict(driver.env(config.env)),
         "driver": driver.name,
         "weights": weights.hexdigest(),
         "traffics": {name: item.description() for name, item in config.traffics.items()},

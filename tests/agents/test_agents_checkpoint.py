@@ -36,10 +36,7 @@ def start_from(learner, path):
 def test_a_loaded_agent_drives_like_the_saved_one(saved):
     policy, metadata = load_agent(saved)
     data = TensorDict({"observation": torch.randn(100, 5)}, [100])
-    assert torch.equal(
-        policy(data.clone())["action"],
-        agent().greedy(data.clone())["action"],
-    )
+    assert torch.equal(policy(data.clone())["action"], agent().greedy(data)["action"])
     assert metadata["observation"] == "table3"
     assert metadata["training"] == {"decisions": 7}
     assert metadata["network"]["v_max"] == RainbowConfig().v_max
@@ -98,15 +95,11 @@ def test_a_network_that_is_not_understood_is_refused(damage, saved):
         ({"v_min": -10.0}, r"here: agent.v_min=-10\); set agent.v_min=-120,"),
         (
             {"hidden": (8,), "atoms": 51},
-            r"atoms=51\); set agent.hidden=\[8,8\] agent.atoms=101, or start",
+            r"atoms=51\); set agent.hidden=\[8,8\] agent.atoms=101, or",
         ),
     ],
 )
-def test_another_network_or_support_is_refused_naming_the_ways_out(
-    options,
-    message,
-    saved,
-):
+def test_another_network_or_support_is_refused_naming_the_ways_out(options, message, saved):
     with user_error(message):
         start_from(agent(**options), saved)
 
@@ -127,9 +120,7 @@ def descend(learner, seed):
 
 
 def test_adam_goes_on_from_the_moments_that_it_is_given():
-    trained = agent()
-    warm = agent(seed=1)
-    cold = agent(seed=2)
+    trained, warm, cold = (agent(seed=seed) for seed in range(3))
     for seed in (1, 2, 3):
         descend(trained, seed)
     for fresh in (warm, cold):
@@ -143,19 +134,14 @@ def test_adam_goes_on_from_the_moments_that_it_is_given():
     assert not same_weights(trained, cold)
 
 
-#: What is saved in the place of an agent: the kind of the weights, and how they are described.
-NO_AGENTS = {
-    "another kind": ("something else", lambda described: {}),
-    "no description": ("agent", lambda described: {}),
-    "other weights": ("agent", lambda described: described),
-}
-
-
-@pytest.mark.parametrize("name", NO_AGENTS)
-def test_weights_that_are_no_agents_are_refused(name, saved):
-    kind, description = NO_AGENTS[name]
-    described = load_weights(saved, "agent")[1]
-    del described["kind"]
-    save_weights(saved, kind, {"weight": torch.zeros(3)}, description(described))
+@pytest.mark.parametrize(
+    ("kind", "described"),
+    [("something else", False), ("agent", False), ("agent", True)],
+    ids=["another kind", "no description", "other weights"],
+)
+def test_weights_that_are_no_agents_are_refused(kind, described, saved):
+    _, metadata = load_weights(saved, "agent")
+    del metadata["kind"]
+    save_weights(saved, kind, {"weight": torch.zeros(3)}, metadata if described else {})
     with user_error(saved.name):
         load_agent(saved)

@@ -139,13 +139,9 @@ def test_a_plain_network_is_stored_and_acts_as_before():
     assert driver.mask == MaskParameters("safe")
     observation = torch.randn(50, SIZE, generator=torch.Generator().manual_seed(0))
     values = layers(observation)
-    anything = [[True] * 3] * len(values)
+    anything = [[True] * 3] * 50
     assert actions_of(driver.policy, observation.tolist(), anything) == values.argmax(-1).tolist()
-    masked = actions_of(
-        driver.policy,
-        observation.tolist(),
-        [[True, False, True]] * 50,
-    )
+    masked = actions_of(driver.policy, observation.tolist(), [[True, False, True]] * 50)
     assert set(masked) <= {0, 2}
 
 

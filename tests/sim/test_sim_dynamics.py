@@ -18,14 +18,9 @@ def number(value: float) -> torch.Tensor:
 
 
 def drive(speed: float, steering: float, duration_s: float, acceleration: float = 0.0):
-    x = ZERO
-    y = ZERO
-    heading = ZERO
-    v = number(speed)
+    pose = (ZERO, ZERO, ZERO, number(speed))
     for _ in range(round(duration_s / 0.1)):
-        pose = x, y, heading, v, _ = advance(
-            x, y, heading, v, number(acceleration), number(steering), 0.1
-        )
+        pose = advance(*pose[:4], number(acceleration), number(steering), 0.1)
     return pose
 
 

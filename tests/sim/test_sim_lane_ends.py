@@ -6,7 +6,7 @@ import random
 
 import pytest
 import torch
-from reference.worlds import random_scenes, random_stretches
+from reference.worlds import random_scenes, random_stretches, rows_of
 
 from ganlane.settings.road import EXIT, FAR_M, NOTHING, WALL, LaneStretch, Stretches
 from ganlane.sim.idm import following_acceleration
@@ -40,9 +40,7 @@ def roads() -> list[Stretches]:
 @pytest.fixture(scope="module")
 def cars() -> Vehicles:
     """Some on each road, which drive in all of its lanes and on both sides of its ends."""
-    rows = []
-    for row, lanes in enumerate(LANES):
-        rows.append(random_scenes(1, 24, lanes, seed=row))
+    rows = [random_scenes(1, 24, lanes, seed=row) for row, lanes in enumerate(LANES)]
     return Vehicles(*(torch.cat(fields) for fields in zip(*rows)))
 
 
@@ -73,7 +71,7 @@ def test_a_row_on_its_own_road_is_as_alone_on_that_road(fact, roads, cars):
     together = FACTS[fact](cars, of_rows)
     differ = 0
     for row, lanes in enumerate(LANES):
-        alone = Vehicles(*(field[row : row + 1] for field in cars))
+        alone = rows_of(cars, slice(row, row + 1))
         expected = FACTS[fact](alone, Road(lanes, WIDTH_M, stretches=roads[row]))
         assert torch.equal(together[row : row + 1], expected)
         # And the lanes' ends matter.

@@ -5,7 +5,8 @@ import signal
 import time
 
 import pytest
-from training.small_runs import agent, road, same, settings, train
+from agents.agents_small import same_weights
+from training.small_runs import agent, road, settings, train
 
 from ganlane.training import checkpoint
 from ganlane.training.checkpoint import LAST, load_checkpoint
@@ -40,4 +41,4 @@ def test_a_run_killed_at_any_moment_is_resumed_to_the_same_weights(tmp_path):
     whole = agent()
     train(road(8), resumed, more, folder, resume=last)
     train(road(8), whole, more, tmp_path / "whole")
-    assert same(whole, resumed)
+    assert same_weights(whole, resumed)

@@ -4,13 +4,12 @@ import signal
 
 import pytest
 import torch
-from agents.agents_small import transitions
+from agents.agents_small import same_weights, transitions
 from training.small_runs import (
     OBSERVATION_SIZE,
     agent,
     road,
     rows,
-    same,
     settings,
     signal_at,
     train,
@@ -78,7 +77,7 @@ def test_an_interrupted_and_resumed_run_gives_the_same_weights(
     torch.manual_seed(99)
     resumed = agent(seed=5)
     result = train(road(8), resumed, WHOLE, tmp_path, resume=first.checkpoint)
-    assert same(whole[0], resumed)
+    assert same_weights(whole[0], resumed)
     assert "bit-exact" not in capsys.readouterr().err
     assert result.progress["decisions"] == 480
     assert result.progress["updates"] == whole[0].updates
@@ -124,7 +123,7 @@ def test_a_signal_ends_the_run_after_its_step_with_a_checkpoint(whole, tmp_path)
     assert signal.getsignal(number) == handler
     resumed = agent()
     train(road(8), resumed, WHOLE, tmp_path, resume=stopped.checkpoint)
-    assert same(whole[0], resumed)
+    assert same_weights(whole[0], resumed)
 
 
 def test_the_best_evaluated_agent_is_kept_and_the_last_one_too(tmp_path):

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from reference.refusals import user_error
 from reference.worlds import packed
 from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
@@ -9,7 +10,6 @@ from torchrl.envs import Compose, TransformedEnv
 from ganlane import keys
 from ganlane.agents.drivers import RandomDriver
 from ganlane.env import HighwayEnv
-from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig, check_reward
 from ganlane.traffic import IdmMobilTraffic
 from ganlane.transforms import RewardParameters, RewardTransform
@@ -20,24 +20,19 @@ CONSIDERATE = RewardParameters(soft_crash_behind=-10.0)
 
 def outcome(speed=20.0, mean_acceleration=0.0, started=False, soft=0, behind=0, **events):
     """The state after a decision of one ego with a desired speed of 25 m/s."""
-    flags = {name: torch.tensor([[events.get(name, False)]]) for name in keys.END_EVENTS}
-    vehicles = {
-        "speed": torch.tensor([[speed, 0.0]]),
-        "desired_speed": torch.tensor([[25.0, 20.0]]),
+    events = {**dict.fromkeys(keys.END_EVENTS, False), **events}
+    events |= {"soft_crash": soft, "soft_crash_behind": behind}
+    content = {
+        "vehicles": {"speed": [speed, 0.0], "desired_speed": [25.0, 20.0]},
+        "ego": {"mean_acceleration": mean_acceleration, "started_change": started},
+        "events": {name: [value] for name, value in events.items()},
     }
-    ego = {
-        "mean_acceleration": torch.tensor([mean_acceleration]),
-        "started_change": torch.tensor([started]),
-    }
-    onsets = {"soft_crash": torch.tensor([[soft]]), "soft_crash_behind": torch.tensor([[behind]])}
-    content = {"vehicles": vehicles, "ego": ego, "events": {**flags, **onsets}}
-    return TensorDict({k: TensorDict(v, [1]) for k, v in content.items()}, [1])
+    return TensorDict(content).unsqueeze(0)
 
 
-def terms(parameters=None, period=1.0, **what):
-    return {
-        k: v.item() for k, v in RewardTransform(period, parameters).terms(outcome(**what)).items()
-    }
+def terms(parameters=None, **what):
+    paid = RewardTransform(1.0, parameters).terms(outcome(**what))
+    return {name: value.item() for name, value in paid.items()}
 
 
 @pytest.mark.parametrize(
@@ -58,9 +53,8 @@ def terms(parameters=None, period=1.0, **what):
 )
 def test_the_speed_reward(speed, mean_acceleration, literal, reward):
     parameters = RewardParameters(literal_low_acceleration=literal)
-    assert terms(parameters, speed=speed, mean_acceleration=mean_acceleration)[
-        "speed"
-    ] == pytest.approx(reward)
+    paid = terms(parameters, speed=speed, mean_acceleration=mean_acceleration)
+    assert paid["speed"] == pytest.approx(reward)
 
 
 @pytest.mark.parametrize(
@@ -123,5 +117,5 @@ def test_considerate_charges_per_onset_behind_and_is_the_paper_otherwise():
 def test_an_ego_meant_to_drive_no_faster_than_15_mps_would_be_paid_for_crawling_and_is_refused():
     standing = torch.zeros(1)
     assert speed_reward(standing + 1.0, standing + 1.0, standing).item() == pytest.approx(1.0)
-    with pytest.raises(UserError, match="ego_desired_speed_mps=1"):
+    with user_error("ego_desired_speed_mps=1"):
         check_reward(EnvConfig(ego_desired_speed_mps=1.0), RewardParameters())

@@ -95,7 +95,7 @@ def test_a_network_that_is_not_understood_is_refused(damage, saved):
         ({"v_min": -10.0}, r"here: agent.v_min=-10\); set agent.v_min=-120,"),
         (
             {"hidden": (8,), "atoms": 51},
-            r"atoms=51\); set agent.hidden=\[8,8\] agent.atoms=101, or",
+            r"atoms=51\); set agent.hidden=\[8,8\] agent.atoms=101, or start",
         ),
     ],
 )

@@ -6,12 +6,10 @@ import pytest
 import torch
 from reference.refusals import user_error
 
-pytest.importorskip(
-    "libsumo",
-    reason="SUMO is not installed: pip install 'ganlane[sumo]'",
-)
+pytest.importorskip("libsumo", reason="SUMO is not installed: pip install 'ganlane[sumo]'")
 
 from reference.foreign import assert_same_alone, drive, overlaps, start, turns
+from reference.worlds import rows_of
 
 from ganlane import keys
 from ganlane.agents.drivers import DRIVERS
@@ -19,7 +17,7 @@ from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.evaluation import run_episodes
 from ganlane.settings.driving import Visibility
 from ganlane.sim.scenes import FixedScene, SceneVehicle
-from ganlane.sim.state import Road, Vehicles, body_lanes
+from ganlane.sim.state import Road, body_lanes
 from ganlane_simulators import SumoTraffic
 
 LEFT = 1
@@ -39,16 +37,7 @@ def driven(traffic):
     return vehicles, state
 
 
-def scene(road, *cars):
-    """Always the same first scene of ``cars`` (x, lane, speed, desired speed, length)."""
-    names = ("x_m", "lane", "speed_mps", "desired_speed_mps", "length_m")
-    rows = tuple(SceneVehicle(**dict(zip(names, car))) for car in cars)
-    return FixedScene(rows, road, others_visibility=Visibility.BODY)
-
-
-def test_an_ego_that_keeps_its_lane_crashes_with_nobody_and_nobody_with_another(
-    driven,
-):
+def test_an_ego_that_keeps_its_lane_crashes_with_nobody_and_nobody_with_another(driven):
     vehicles, state = driven
     assert not state[keys.EVENTS]["hard_crash"].any()
     assert overlaps(vehicles) == 0
@@ -70,9 +59,7 @@ def test_nobody_jumps_and_speeds_are_differences_of_positions(driven):
     assert vehicles.heading.abs().max() <= 0.2
 
 
-def test_an_episode_is_the_same_alone_and_beside_others_whatever_was_driven_before(
-    traffic,
-):
+def test_an_episode_is_the_same_alone_and_beside_others_whatever_was_driven_before(traffic):
     # In the middle of this the same roads have to be cleared, vehicles on their way across lanes
     # among them.
     drive(HighwayEnv(traffic, 3), [11, 12, 13], 17, turns)
@@ -81,19 +68,12 @@ def test_an_episode_is_the_same_alone_and_beside_others_whatever_was_driven_befo
 
 def follower_of(traffic, lane_of_ego, action):
     """Speeds of a fast driver 30 m behind a slow ego's place in lane 1, over 6 s."""
-    # Somebody slow ahead keeps the ego slow, far enough away for the driver behind not to mind.
-    first = scene(
-        Road(),
-        (0.0, lane_of_ego, 12.0, 12.0),
-        (-32.0, 1, 20.0, 20.0),
-        (2000.0, 2, 20.0, 20.0),
-    )
-    driven, running, _ = drive(
-        HighwayEnv(traffic, 1, scenes=first),
-        [0],
-        6,
-        lambda decision, _: action if decision == 0 else 0,
-    )
+    # Somebody ahead keeps out of the ego's way, far enough away for the driver behind not to mind.
+    cars = ((0.0, lane_of_ego, 12.0, 12.0), (-32.0, 1, 20.0, 20.0), (2000.0, 2, 20.0, 20.0))
+    rows = tuple(SceneVehicle(*car) for car in cars)
+    first = FixedScene(rows, Road(), others_visibility=Visibility.BODY)
+    env = HighwayEnv(traffic, 1, scenes=first)
+    driven, running, _ = drive(env, [0], 6, lambda decision, _: 0 if decision else action)
     assert running.all()
     return driven
 
@@ -103,7 +83,7 @@ def test_a_follower_brakes_for_an_ego_that_moves_in_front_and_only_then():
     free = follower_of(keeps, 0, 0)
     cut_off = follower_of(keeps, 0, LEFT)
     assert free.speed[:, 0, 1].amin() > 19.0
-    ego = Vehicles(*(field[:, 0, :1] for field in cut_off))
+    ego = rows_of(cut_off, (slice(None), 0, slice(1)))
     enters = int((body_lanes(ego, Road()).high[:, 0] > 0).nonzero()[0])
     # The stand-in comes in at the start of the step at whose end the ego's body does.
     assert torch.equal(free.speed[:enters, 0, 1], cut_off.speed[:enters, 0, 1])
@@ -151,14 +131,10 @@ def test_a_ring_is_refused():
         SumoTraffic(Road(ring_m=500.0))
 
 
-def test_episodes_that_take_the_rows_of_others_are_evaluated_as_in_a_batch_of_their_own(
-    traffic,
-):
+def test_episodes_that_take_the_rows_of_others_are_evaluated_as_in_a_batch_of_their_own(traffic):
     keep = DRIVERS["keep_lane"](Road())
-    tables = [
-        run_episodes(
-            HighwayEnv(traffic, rows, episode=EpisodeParameters(goal_m=300.0)), keep, range(4), 0
-        )
-        for rows in (4, 2)
-    ]
-    assert tables[0].equals(tables[1])
+    short = EpisodeParameters(goal_m=300.0)
+    one, other = (
+        run_episodes(HighwayEnv(traffic, rows, episode=short), keep, range(4), 0) for rows in (4, 2)
+    )
+    assert one.equals(other)

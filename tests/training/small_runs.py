@@ -74,5 +74,9 @@ def signal_at(decisions, number):
 
 
 def rows(path):
+    """The rows of a CSV of figures."""
     with path.open() as file:
-        return list(csv.DictReader(file))
+        return [
+            {name: float(figure or "nan") for name, figure in row.items()}
+            for row in csv.DictReader(file)
+        ]

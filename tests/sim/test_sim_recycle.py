@@ -90,13 +90,9 @@ def test_positions_change_by_twice_the_range_the_ego_and_padding_never_move(seed
     moved = after.x - before.x
     distance = before.x - before.x[:, :1]
     across = -2.0 * RANGE_M * torch.sign(distance)
-    assert ((moved == 0) | ((moved - across).abs() < 1e-9)).all()
-    assert (moved[:, keys.EGO_INDEX] == 0).all()
-    assert (moved[~before.valid] == 0).all()
-    assert (moved[distance.abs() <= RANGE_M] == 0).all()
-    # And a row comes out the same alone.
-    alone = recycle(rows_of(before, slice(7, 8)), Road(lanes), TABLE_V)
-    assert torch.equal(alone.x[0], after.x[7])
+    may_go = before.valid & (distance.abs() > RANGE_M)
+    may_go[:, keys.EGO_INDEX] = False
+    assert ((moved == 0) | (may_go & ((moved - across).abs() < 1e-9))).all()
 
 
 def burdened(before: Vehicles, after: Vehicles, road: Road) -> torch.Tensor:

@@ -14,7 +14,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.refusals import user_error
-from reference.worlds import DOUBLE, episode_keys, packed, rows_of
+from reference.worlds import DOUBLE, episode_keys, packed
 
 from ganlane.settings.driving import Visibility
 from ganlane.settings.env import EnvConfig
@@ -108,15 +108,6 @@ def test_every_lane_is_as_likely_as_the_others():
     lanes = draw_lanes(episode_keys(range(9000)), 9, 3, 9)[:, 4]
     counts = torch.bincount(lanes, minlength=3).double()
     assert ((counts - 3000) ** 2 / 3000).sum() < 13.8
-
-
-@pytest.mark.parametrize("share", [0.0, 0.3])
-def test_a_scene_depends_on_its_key_alone(share):
-    parameters = SpawnParameters(truck_share=share)
-    together = scenes(20, parameters=parameters)
-    for row in (0, 7, 19):
-        alone = spawn(KEYS[row : row + 1], 9, 3, 4.0, parameters, DOUBLE)
-        assert all(map(torch.equal, alone, rows_of(together, slice(row, row + 1))))
 
 
 @settings(max_examples=20)

@@ -1,7 +1,5 @@
 """All drivers by the kernel: as the tensor code drives them, and the same bits everywhere."""
 
-from __future__ import annotations
-
 import random
 from contextvars import copy_context
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """The kernel is built once, wherever a compiler works, and says in one sentence what fails."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from pathlib import Path
@@ -62,15 +60,15 @@ def working(compiler, plain):
     return compiler(WORKS, plain)
 
 
-def built() -> list[Path]:
+def built():
     return sorted(library.libraries_folder().glob("*.so"))
 
 
-def calls(program: Path) -> int:
+def calls(program):
     return Path(f"{program}.calls").read_text().count("kernel.so")
 
 
-def load_again() -> None:
+def load_again():
     """As another process would."""
     library._find.cache_clear()
     library.load()
@@ -94,7 +92,7 @@ def test_another_source_is_another_library(monkeypatch, tmp_path, working):
     assert len(built()) == 2
 
 
-def damaged(content: bytes) -> list[bytes]:
+def damaged(content):
     """Shorter, without its checksum, with a bit flipped in the code or in the checksum, longer."""
     middle = len(content) // 2
     damages = [content[:middle], content[: -len(PLACE)], content + b"more", b""]

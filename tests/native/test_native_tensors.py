@@ -3,10 +3,7 @@
 Against the tensor code, and against itself.
 """
 
-from __future__ import annotations
-
 import random
-from collections.abc import Sequence
 
 import pytest
 import torch
@@ -21,7 +18,7 @@ from reference.worlds import (
     random_stretches,
     same_bits,
 )
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
@@ -38,9 +35,7 @@ from ganlane.sim.state import Road, Vehicles
 pytestmark = pytest.mark.kernel
 
 
-def random_highway(
-    rng: random.Random, rows: int, most_vehicles: int, road: str, form: str
-) -> HighwayEnv:
+def random_highway(rng, rows, most_vehicles, road, form):
     """1 to 6 lanes, with and without MOBIL.
 
     On a ``road`` of "lanes that end" some begin late and end at a wall; where there is a "flow",
@@ -63,7 +58,7 @@ def random_highway(
     )
 
 
-def disturbed_start(env: HighwayEnv, generator: torch.Generator) -> TensorDictBase:
+def disturbed_start(env, generator):
     """A first state with everything a little off.
 
     In mid-change, at angles, wheels turned, some of all kinds.
@@ -85,13 +80,13 @@ def disturbed_start(env: HighwayEnv, generator: torch.Generator) -> TensorDictBa
     return td
 
 
-def by_kernel(kernel: Kernel, td: TensorDictBase, recycle: bool = False) -> TensorDictBase:
+def by_kernel(kernel, td, recycle=False):
     """The decision ``td["action"]`` from the state ``td``."""
     recycles = torch.ones(len(td), dtype=torch.bool) if recycle else None
     return kernel.decide(td["action"], td, recycles)
 
 
-def actions(env: HighwayEnv, generator: torch.Generator) -> torch.Tensor:
+def actions(env, generator):
     """Random actions [N], mostly to keep the lane."""
     if env.actions.form == "continuous":
         between = drawing(env.batch_size, generator, env.dtype)
@@ -104,17 +99,17 @@ def actions(env: HighwayEnv, generator: torch.Generator) -> torch.Tensor:
     return torch.where(drawn < 0.2, changes, keys.KEEP)
 
 
-def in_double(value: torch.Tensor) -> torch.Tensor:
+def in_double(value):
     """A copy, in double precision if it is a number."""
     return value.double() if value.is_floating_point() else value.clone()
 
 
 def within_rounding(
-    env: HighwayEnv,
-    td: TensorDictBase,
-    row: int,
-    measure: int,
-) -> bool:
+    env,
+    td,
+    row,
+    measure,
+):
     """Whether the decision of ``row`` hangs by a rounding.
 
     64 states a rounding beside it lead to different ones, by the same ``measure`` of :func:`apart`.
@@ -135,9 +130,7 @@ def within_rounding(
 # As the tensor code
 
 
-def compare_random_highways(
-    kinds: Sequence[tuple[str, str]], highways: int, rows: int, decisions: int, vehicles: int
-) -> set[str]:
+def compare_random_highways(kinds, highways, rows, decisions, vehicles):
     """Both decide from every state of the tensor code's episodes, on highways of all kinds in
     turn; what there was of events, and of drivers who changed, entered, left or came back.
     """
@@ -166,7 +159,7 @@ def compare_random_highways(
     return seen
 
 
-def happened(road: str, before: TensorDictBase, after: TensorDictBase) -> set[str]:
+def happened(road, before, after):
     """Events of a decision, and what drivers other than the ego did."""
     was, now = (
         Vehicles.of(state[keys.VEHICLES]).columns(slice(1, None)) for state in (before, after)

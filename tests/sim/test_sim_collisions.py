@@ -1,7 +1,5 @@
 """Box overlap against the corners of the scalar simulator, and cases by hand."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Room for a lane change over the next seconds, worked out by hand; cars are 4.5 m long."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from reference.worlds import vehicles
@@ -14,7 +12,7 @@ from ganlane.sim.state import Road
 CAR_M = 4.5
 
 
-def room(ego: dict, other: dict, acceleration: float) -> bool:
+def room(ego, other, acceleration):
     """Whether the ego has it in lane 1, where leader and ego brake at 4 m/s2."""
     scene = perceive(vehicles({"x": 0.0} | ego, other), Road(3), slice(0, 1))
     lanes = torch.ones(1, 1, dtype=torch.float64)

@@ -4,8 +4,6 @@ and rings.
 The theory is that of ``tests/reference/stability.py``; the simulation is the package's own traffic.
 """
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 
@@ -26,7 +24,7 @@ from ganlane.sim.idm import (
     needed_deceleration,
 )
 from ganlane.sim.neighbours import FREE_GAP_M
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road
 from ganlane.traffic.idm_mobil import IdmTraffic
 
 # 2 sqrt(a b) = 2 sqrt(0.7 * 1.7) = 2.181742423; (20 / 25)^4 = 0.4096
@@ -46,7 +44,7 @@ BY_HAND = [
 ]
 
 
-def doubles(*values: float) -> list[torch.Tensor]:
+def doubles(*values):
     return [torch.tensor(value, dtype=DOUBLE) for value in values]
 
 
@@ -96,7 +94,7 @@ START_SPEED = 12.0
 TOLERANCE_M = 1e-6
 
 
-def leaders_wish(speed: torch.Tensor) -> torch.Tensor:
+def leaders_wish(speed):
     """Desired speed with which IDM on an empty lane holds ``speed``.
 
     ``1 = (v/v0)^4 + (s*/10 000 m)^2``.
@@ -105,7 +103,7 @@ def leaders_wish(speed: torch.Tensor) -> torch.Tensor:
     return speed / (1.0 - interaction * interaction) ** 0.25
 
 
-def platoons() -> Vehicles:
+def platoons():
     """One platoon per speed, [len(SPEEDS), 1 + FOLLOWERS]; the leader already drives its speed."""
     speed = torch.tensor(SPEEDS, dtype=DOUBLE)[:, None]
     order = torch.arange(1 + FOLLOWERS).expand(len(SPEEDS), -1)
@@ -147,7 +145,7 @@ CASES = [(v0, stability.critical_speed(v0) + side) for v0 in (18.0, 25.0) for si
 RING = IdmTraffic(Road(lanes=1, ring_m=CARS * SPACING_M))
 
 
-def disturbed_rings(displacement: np.ndarray, speed: np.ndarray) -> Vehicles:
+def disturbed_rings(displacement, speed):
     """The four cases, [4, CARS], each in equilibrium but for a displacement (m) and a speed (m/s).
 
     All rings are of the same length: where the gap is smaller the cars are longer. Only gaps enter
@@ -164,7 +162,7 @@ def disturbed_rings(displacement: np.ndarray, speed: np.ndarray) -> Vehicles:
     )
 
 
-def deviations(cars: Vehicles, steps: int) -> list[np.ndarray]:
+def deviations(cars, steps):
     """(displacement, speed) from the equilibrium after every one of the steps, [4, 2 CARS]."""
     cruise = torch.tensor([[v] for _, v in CASES], dtype=DOUBLE)
     steps_away = []
@@ -186,7 +184,7 @@ def test_the_critical_speed_of_linear_theory(desired, critical):
     # lower.
     for cars, tolerance in ((400, 0.01), (CARS, 0.35)):
 
-        def growth(v: float, cars: int = cars) -> float:
+        def growth(v, cars=cars):
             return stability.growth_rate(v, desired, cars, PHYSICS_STEP_S)[0]
 
         assert stability.zero_of(growth, threshold - 1.5, threshold + 1.5) == pytest.approx(

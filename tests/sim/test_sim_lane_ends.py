@@ -1,14 +1,12 @@
 """Lanes that end, of roads that differ between the rows of a batch."""
 
-from __future__ import annotations
-
 import random
 
 import pytest
 import torch
 from reference.worlds import random_scenes, random_stretches, rows_of
 
-from ganlane.settings.road import EXIT, FAR_M, NOTHING, WALL, LaneStretch, Stretches
+from ganlane.settings.road import EXIT, FAR_M, NOTHING, WALL, LaneStretch
 from ganlane.sim.idm import following_acceleration
 from ganlane.sim.lane_ends import (
     exists,
@@ -28,7 +26,7 @@ WIDTH_M = 3.6
 
 
 @pytest.fixture(scope="module")
-def roads() -> list[Stretches]:
+def roads():
     """Of as many lanes as ``LANES`` says; drivers of the second one may stay where they are."""
     rng = random.Random(3)
     drawn = [random_stretches(lanes, rng) for lanes in LANES]
@@ -38,7 +36,7 @@ def roads() -> list[Stretches]:
 
 
 @pytest.fixture(scope="module")
-def cars() -> Vehicles:
+def cars():
     """Some on each road, which drive in all of its lanes and on both sides of its ends."""
     rows = [random_scenes(1, 24, lanes, seed=row) for row, lanes in enumerate(LANES)]
     return Vehicles(*(torch.cat(fields) for fields in zip(*rows)))

@@ -6,8 +6,6 @@ the same second, is asked for no more than ``b_safe`` by the vehicle that enters
 promise does not cover one whom nobody sees coming, an ego that is not ``signalled``.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -26,7 +24,7 @@ from ganlane.sim.mobil import (
     without_ego,
 )
 from ganlane.sim.neighbours import FREE_GAP_M, perceive
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road
 from ganlane.traffic.idm_mobil import IdmTraffic
 
 B_SAFE = TABLE_IV.safe_deceleration
@@ -37,13 +35,13 @@ SUBJECT = {"x": 0.0, "lane": 0, "speed": 20.0, "desired_speed": 25.0}
 SLOW = {"x": 54.5, "lane": 0, "speed": 15.0, "desired_speed": 15.0}
 
 
-def wish(*cars, mobil: MobilParameters = TABLE_IV) -> int:
+def wish(*cars, mobil=TABLE_IV):
     """Of the first car."""
     road = Road(lanes=2)
     return mobil_wishes(perceive(vehicles(*cars), road), road, mobil=mobil)[0, 0].item()
 
 
-def incentive_to_the_left(*cars) -> float:
+def incentive_to_the_left(*cars):
     """For the first car, to change from lane 0 to lane 1."""
     scene = perceive(vehicles(*cars), Road(lanes=2))
     lanes = torch.tensor([0.0, 1.0]).expand(1, len(cars), 2)
@@ -52,7 +50,7 @@ def incentive_to_the_left(*cars) -> float:
     return incentive[0, 0, 0].item()
 
 
-def fast_follower(gap: float) -> dict:
+def fast_follower(gap):
     """On the other lane, at its desired speed of 25 m/s."""
     return {"x": -4.5 - gap, "lane": 1, "speed": 25.0, "desired_speed": 25.0}
 
@@ -92,7 +90,7 @@ def test_nobody_changes_in_front_of_somebody_who_would_have_to_brake_too_hard():
 # The promise, at the decision
 
 
-def new_demands(before: Vehicles, change: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def new_demands(before, change):
     """What every driver is asked for by one that has just decided to enter a lane it attends to,
     [N, M, M] (i by j).
 
@@ -123,7 +121,7 @@ ROAD = Road(lanes=3)
 
 
 @pytest.fixture(scope="module")
-def crowd() -> Vehicles:
+def crowd():
     return random_scenes(rows=6000, cars=12, lanes=3, seed=1)
 
 
@@ -178,7 +176,7 @@ ENTERS = 1
 FOLLOWS = 3
 
 
-def merges(rows: int) -> Vehicles:
+def merges(rows):
     """Scenes in which one has just decided to enter the lane of another, whatever their speeds and
     distances.
 
@@ -198,19 +196,19 @@ def merges(rows: int) -> Vehicles:
     return rows_of(scene, change[:, ENTERS] == 1)
 
 
-def demand(scene: Vehicles) -> torch.Tensor:
+def demand(scene):
     """What the one that enters asks of its new follower, m/s2, [N]."""
     enters, follows = scene.columns(ENTERS), scene.columns(FOLLOWS)
     gap = enters.x - follows.x - 4.5
     return idm_acceleration(follows.speed, follows.desired_speed, gap, enters.speed)
 
 
-def demands(scene: Vehicles) -> torch.Tensor:
+def demands(scene):
     """:func:`demand` at every step of 8 s, in which the one that enters drives like everybody else
     but never brakes, [steps, N].
     """
 
-    def drives(before: Vehicles, after: Vehicles) -> Vehicles:
+    def drives(before, after):
         no_slower = torch.maximum(after.speed, before.speed)
         return after.with_(speed=torch.where(torch.arange(4) == ENTERS, no_slower, after.speed))
 

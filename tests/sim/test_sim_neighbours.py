@@ -3,8 +3,6 @@
 Against the scalar simulator, and by sorting bit for bit as by comparing pairs.
 """
 
-from __future__ import annotations
-
 import itertools
 
 import pytest
@@ -17,14 +15,14 @@ from reference.worlds import DOUBLE, drawing, scalar_cars, vehicles_at
 from ganlane.settings.driving import Visibility
 from ganlane.sim import neighbours
 from ganlane.sim.neighbours import FREE_GAP_M, follower, leader, perceive
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road
 
 ROWS = 20
 SORT = 0
 PAIRS = 10**12
 
 
-def scenes(cars: int, lanes: int, seed: int, grid_m: float, dtype: torch.dtype) -> Vehicles:
+def scenes(cars, lanes, seed, grid_m, dtype):
     """Cars, lorries and empty places, every third in a lane change.
 
     On a coarse grid many stand level.

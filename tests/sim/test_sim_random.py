@@ -1,7 +1,5 @@
 """Random numbers as pure functions of (stream, seed, episode, vehicle, step, purpose)."""
 
-from __future__ import annotations
-
 import itertools
 import math
 
@@ -31,7 +29,7 @@ def test_fields_are_mixed_in_one_after_the_other_by_the_finaliser_of_splitmix64(
         assert drawn[0, vehicle, column].item() % 2**64 == expected
 
 
-def chi_square(u: torch.Tensor) -> float:
+def chi_square(u):
     """Of 64 equal bins, as a standard score."""
     bins = 64
     counts = torch.bincount((u.flatten() * bins).long(), minlength=bins).double()

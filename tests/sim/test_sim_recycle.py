@@ -1,7 +1,5 @@
 """Recycling: who falls out of the ego's range comes back on its other side, where there is room."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given, settings
@@ -24,7 +22,7 @@ from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.idm import TABLE_V, following_acceleration
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.spawn import RANGE_M, SAFE_DECELERATION, recycle
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road
 
 # Recycling, by hand
 
@@ -73,7 +71,7 @@ def test_nobody_is_put_beside_one_that_has_hardly_left_the_lane():
 # Recycling, any scene
 
 
-def scenes_around(rows: int, cars: int, lanes: int, seed: int) -> Vehicles:
+def scenes_around(rows, cars, lanes, seed):
     """On 1000 m around the ego, some in the middle of a change, some padding."""
     scene = random_scenes(rows, cars, lanes, seed)
     is_ego = torch.arange(cars) == keys.EGO_INDEX
@@ -95,7 +93,7 @@ def test_positions_change_by_twice_the_range_the_ego_and_padding_never_move(seed
     assert ((moved == 0) | (may_go & ((moved - across).abs() < 1e-9))).all()
 
 
-def burdened(before: Vehicles, after: Vehicles, road: Road) -> torch.Tensor:
+def burdened(before, after, road):
     """Who brakes harder than is safe because of one that came, or came and has to, bool [N, M].
 
     Compared with the scene that those who left have left, and in which they have not come back.
@@ -119,9 +117,7 @@ def test_several_that_return_at_once_burden_nobody():
 # Recycling in the environment
 
 
-def in_range_by_km(
-    monkeypatch: pytest.MonkeyPatch, on: bool, cars: int, rows: int, goal_m: float
-) -> tuple[list[float], int]:
+def in_range_by_km(monkeypatch, on, cars, rows, goal_m):
     """Mean number of others within 200 m of a MOBIL ego, in each kilometre; and how often one of
     them was moved.
 
@@ -132,14 +128,14 @@ def in_range_by_km(
     driver = MobilDriver(env.road)
     moved = 0
 
-    def spied(before: Vehicles, road: Road, idm: object) -> Vehicles:
+    def spied(before, road, idm):
         nonlocal moved
         after = recycle(before, road, TABLE_V)
         moved += int((after.x != before.x).sum())
         assert not burdened(before, after, road).any()
         return after
 
-    def record(cars: Vehicles, running: torch.Tensor) -> None:
+    def record(cars, running):
         assert not pair_overlaps(cars)[running].any()
 
     monkeypatch.setattr("ganlane.env.highway.recycle", spied)
@@ -197,7 +193,7 @@ def test_rows_that_ended_are_not_recycled(on):
     assert distance[1] == pytest.approx(150.0 if on else -250.0, abs=2.0)
 
 
-def far_behind(share: float, num_envs: int = 32, first_episode: int = 0) -> torch.Tensor:
+def far_behind(share, num_envs=32, first_episode=0):
     """Episodes [N] with somebody behind the range after 60 decisions at up to 35 m/s; a ``share``
     of them is recycled.
     """

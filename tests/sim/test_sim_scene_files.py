@@ -1,7 +1,5 @@
 """Scenes from files; what drivers do in the scenarios stands in tests/test_env_scenarios.py."""
 
-from __future__ import annotations
-
 import json
 import re
 

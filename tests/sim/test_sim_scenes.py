@@ -2,8 +2,6 @@
 refused by name.
 """
 
-from __future__ import annotations
-
 import math
 import re
 
@@ -24,11 +22,11 @@ ROAD = Road(2)
 KEYS = episode_keys(range(1000), Stream.REPORT)
 
 
-def scene(*rows: SceneVehicle, **options: float) -> FixedScene:
+def scene(*rows, **options):
     return FixedScene(rows, ROAD, **options)  # type: ignore[arg-type]
 
 
-def pair(gap_m: float, speed: float, leader: float, **options: float) -> FixedScene:
+def pair(gap_m, speed, leader, **options):
     """The ego behind one vehicle, bumper to bumper so far apart."""
     return scene(SceneVehicle(0.0, 0, speed), SceneVehicle(gap_m + 4.5, 0, leader), **options)
 

@@ -3,8 +3,6 @@
 Table II, no overlap, the ego in the middle, lorries, and everybody can still brake.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace
@@ -23,17 +21,17 @@ from ganlane.settings.record import make
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.idm import TABLE_V, can_brake
 from ganlane.sim.spawn import RandomScenes, check_start, draw_lanes, spawn
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road
 
 LORRIES = SpawnParameters(truck_share=0.3)
 KEYS = episode_keys(range(2000))
 
 
-def scenes(count: int = 2000, vehicles: int = 9, **others) -> Vehicles:
+def scenes(count=2000, vehicles=9, **others):
     return spawn(KEYS[:count], vehicles, 3, 4.0, dtype=DOUBLE, **others)
 
 
-def smallest_spacing(s: Vehicles, gaps: bool = False) -> float:
+def smallest_spacing(s, gaps=False):
     """Between centres in one lane, or bumper to bumper, m."""
     apart = (s.x[:, :, None] - s.x[:, None, :]).abs()
     same = (s.target_lane[:, :, None] == s.target_lane[:, None, :]) & (apart > 0)
@@ -41,7 +39,7 @@ def smallest_spacing(s: Vehicles, gaps: bool = False) -> float:
     return torch.where(same, apart - bumpers, torch.inf).min().item()
 
 
-def fills(value: torch.Tensor, low: float, high: float) -> bool:
+def fills(value, low, high):
     """Whether values stay in a range and reach from end to end of it."""
     ends = torch.stack((value.min() - low, high - value.max()))
     return bool(((ends >= 0.0) & (ends <= 0.01 * (high - low))).all())

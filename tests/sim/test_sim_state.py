@@ -3,8 +3,6 @@
 And bodies that stand in three lanes at once.
 """
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -18,7 +16,6 @@ from ganlane.sim.idm import idm_acceleration
 from ganlane.sim.state import (
     ARRIVED_M,
     Road,
-    Vehicles,
     body_lanes,
     presence,
     with_target,
@@ -28,7 +25,7 @@ from ganlane.traffic.idm_mobil import IdmTraffic
 ROAD = Road(lanes=3)
 
 
-def seen_in(**car) -> tuple[float, float]:
+def seen_in(**car):
     """Lowest and highest lane in which the others see a car, by its body unless told otherwise."""
     scene = vehicles({"x": 0.0, "visibility": Visibility.BODY, **car})
     body = body_lanes(scene, ROAD)
@@ -87,7 +84,7 @@ SLOWER = 1
 DESIRED_MPS = 25.0
 
 
-def first_changes(lane_width_m: float, length_m: float) -> Vehicles:
+def first_changes(lane_width_m, length_m):
     """One changes from lane 0 to lane 1, where a slower one is 2 to 32 m ahead.
 
     IDM asks for less than 4 m/s2.
@@ -110,13 +107,13 @@ def first_changes(lane_width_m: float, length_m: float) -> Vehicles:
     return rows_of(scene, calm)
 
 
-def drive(lane_width_m: float, length_m: float) -> tuple[int, int, int]:
+def drive(lane_width_m, length_m):
     """Over 15 s.
 
     Scenes, those in which the two overlap, those in which the first stands in three lanes at once.
     """
 
-    def on_to_lane_2(before: Vehicles, cars: Vehicles) -> Vehicles:
+    def on_to_lane_2(before, cars):
         """In the moment that the change to lane 1 counts as complete."""
         arrived = (cars.y - lane_width_m).abs() < ARRIVED_M
         goes_on = arrived & (cars.target_lane == 1) & (torch.arange(2) == CHANGES)

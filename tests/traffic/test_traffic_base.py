@@ -1,7 +1,5 @@
 """The contract of all traffic models: what is written, in which shapes, and what is not."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
@@ -24,7 +22,7 @@ from ganlane.traffic import (
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic, idm_faults_traffic
 
 
-def replay() -> ReplayTraffic:
+def replay():
     scenes = sort(synthetic_scenes(SyntheticTraffic(scenes=2, lanes=3, seconds=8.0)))
     return ReplayTraffic(recordings=scenes)
 
@@ -44,7 +42,7 @@ MAKE = {
 }
 
 
-def shapes(memory: TensorDict) -> dict:
+def shapes(memory):
     """As :meth:`TrafficModule.memory_spec`."""
     return {
         name: shapes(value) if isinstance(value, TensorDict) else (tuple(value.shape), value.dtype)

@@ -3,8 +3,6 @@
 None of them, and nothing changes.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise

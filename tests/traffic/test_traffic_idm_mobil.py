@@ -1,7 +1,5 @@
 """Rule-driven traffic whose drivers differ: within their ranges, and obeyed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -24,7 +22,7 @@ ALIKE = RandomDrivers(
 )
 
 
-def params_of(td) -> DriverParams:
+def params_of(td):
     return DriverParams(*td[keys.TRAFFIC, "traits"].unbind(-1))
 
 

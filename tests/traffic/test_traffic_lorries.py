@@ -1,7 +1,5 @@
 """Traffic with lorries does not run into itself, nor into an ego that keeps its lane."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -2,8 +2,6 @@
 the ego.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 from reference.foreign import all_faults, assert_close
@@ -31,7 +29,6 @@ from ganlane.traffic import (
     IdmRandomTraffic,
     IdmTraffic,
     MixedTraffic,
-    TrafficModule,
 )
 from ganlane.traffic.mixed import interleaved
 from ganlane.traffic.presets import gan_traffic, idm_faults_traffic, with_faults
@@ -48,11 +45,11 @@ MAKE = {
 }
 
 
-def mixture(**shares: int) -> MixedTraffic:
+def mixture(**shares):
     return MixedTraffic({name: MAKE[name]() for name in shares}, shares)
 
 
-def drive(traffic: TrafficModule, rows: int, decisions: int = 6) -> list:
+def drive(traffic, rows, decisions=6):
     env = environment(num_envs=rows, traffic=traffic, dtype=torch.float32)
     td = env.reset()
     return [td := step(env, td, few_changes(td)) for _ in range(decisions)]
@@ -73,7 +70,7 @@ def test_the_turns_of_a_period_are_spread(shares, turns):
 
 
 @pytest.fixture(scope="module")
-def wide() -> list:
+def wide():
     """States of 64 episodes."""
     return drive(mixture(**RULES), 64)
 

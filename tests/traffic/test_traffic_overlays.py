@@ -1,7 +1,5 @@
 """Overlays on traffic: lane changes, accelerations, guard."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

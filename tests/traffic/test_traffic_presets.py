@@ -1,7 +1,5 @@
 """The generated traffics that ship, with the weights that ship."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

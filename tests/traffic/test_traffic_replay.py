@@ -1,7 +1,5 @@
 """Replay: recorded scenes around the ego, the same for everybody who asks for the same episode."""
 
-from __future__ import annotations
-
 import numpy as np
 import polars as pl
 import pytest

@@ -1,7 +1,5 @@
 """Traffic driven by a generator, with small random networks."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from reference.refusals import user_error

@@ -1,7 +1,5 @@
 """The action mask: what is allowed, for whom, and that policies, replay and losses respect it."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from reference import scalar
@@ -103,7 +101,7 @@ def test_keeping_the_lane_is_allowed_when_nothing_is_safe_and_that_is_reported()
 
 
 @pytest.fixture(scope="module")
-def crowd() -> Vehicles:
+def crowd():
     """4096 egos among eleven others each, in float32 as in the kernel."""
     fields = random_scenes(4096, 12, 3, seed=5)
     return Vehicles(*(field.float() if field.is_floating_point() else field for field in fields))

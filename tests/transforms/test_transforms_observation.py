@@ -3,8 +3,6 @@
 Table III entry by entry, the lane view, the fixed order, lengths.
 """
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest
@@ -149,7 +147,7 @@ def test_the_bounds_of_the_gymnasium_space_know_of_lorries(share, largest):
 # Where lanes begin and end
 
 
-def road_numbers(x: float, lane: int, *stretches: LaneStretch) -> list[float]:
+def road_numbers(x, lane, *stretches):
     """The last 8 numbers of ``road_view``, of an ego with its front at ``x``."""
     road = Road(len(stretches), stretches=stretches)
     return observed(scene_of((x - 2.25, lane), (-900.0, 0)), "road_view", road)[-8:].tolist()

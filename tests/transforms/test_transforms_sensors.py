@@ -1,7 +1,5 @@
 """Sensor errors reach what the agent sees of the others, and nothing else."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

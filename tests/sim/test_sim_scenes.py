@@ -32,10 +32,8 @@ def pair(gap_m, speed, leader, **options):
 
 
 def test_the_ego_is_moved_to_zero_and_the_others_keep_their_distance():
-    s = scene(
-        SceneVehicle(100.0, 1, 20.0), SceneVehicle(140.0, 0, 10.0), SceneVehicle(60.0, 1, 15.0)
-    )
-    v = s(KEYS[:3], DOUBLE)
+    rows = ((100.0, 1, 20.0), (140.0, 0, 10.0), (60.0, 1, 15.0))
+    v = scene(*(SceneVehicle(*row) for row in rows))(KEYS[:3], DOUBLE)
     assert v.x.tolist() == [[0.0, 40.0, -40.0]] * 3
     assert v.y[0].tolist() == [4.0, 0.0, 4.0]
     assert v.speed[0].tolist() == [20.0, 10.0, 15.0]
@@ -44,20 +42,16 @@ def test_the_ego_is_moved_to_zero_and_the_others_keep_their_distance():
 
 
 def test_jitter_follows_from_the_episode_alone_and_keeps_its_bounds():
-    s = scene(
-        SceneVehicle(0.0, 0, 20.0),
-        SceneVehicle(90.0, 0, 0.0),
-        SceneVehicle(-60.0, 1, 0.2),
-        jitter_m=2.0,
-        jitter_mps=0.5,
-    )
+    cars = (SceneVehicle(*row) for row in ((0.0, 0, 20.0), (90.0, 0, 0.0), (-60.0, 1, 0.2)))
+    s = scene(*cars, jitter_m=2.0, jitter_mps=0.5)
     v = s(KEYS, DOUBLE)
-    assert (v.x[:, 0] == 0).all()
-    assert 1.9 < (v.x[:, 1] - 90.0).abs().max() <= 2.0
-    assert len(set(v.x[:, 1].tolist())) == 1000
-    assert 0.45 < (v.speed[:, 0] - 20.0).abs().max() <= 0.5
-    assert (v.speed[:, 1] == 0).all()
-    assert (v.speed[:, 2] >= 0).all()
+    ego, ahead, behind = map(v.at, range(3))
+    assert (ego.x == 0).all()
+    assert 1.9 < (ahead.x - 90.0).abs().max() <= 2.0
+    assert len(ahead.x.unique()) == 1000
+    assert 0.45 < (ego.speed - 20.0).abs().max() <= 0.5
+    assert (ahead.speed == 0).all()
+    assert (behind.speed >= 0).all()
     alone = s(KEYS[700:701], DOUBLE)
     assert torch.equal(alone.x[0], v.x[700])
     assert torch.equal(alone.speed[0], v.speed[700])

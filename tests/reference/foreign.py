@@ -16,6 +16,8 @@ from ganlane.settings.driving import (
 )
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.state import Vehicles, lateral_half_extent
+from ganlane.traffic import IdmMobilTraffic, IdmRandomTraffic, IdmTraffic
+from ganlane.traffic.presets import gan_traffic, idm_faults_traffic
 
 
 def start(env, episodes, seed=0):
@@ -131,3 +133,14 @@ def assert_same_alone(make, traffic, episodes, decisions):
 def turns(decision, episode):
     """Now and then a change of lanes, in no order."""
     return (decision * 7 + episode) % 3 if decision % 4 == 0 else 0
+
+
+#: Makers of the traffics that run on all their rows alike; faults are so frequent that a few
+#: decisions hold some.
+MAKE = {
+    "idm": IdmTraffic,
+    "idm_mobil": IdmMobilTraffic,
+    "idm_random": IdmRandomTraffic,
+    "idm_faults": lambda: idm_faults_traffic(faults=all_faults(600.0, 0.5)),
+    "gan": gan_traffic,
+}

@@ -4,7 +4,7 @@ the ego.
 
 import pytest
 import torch
-from reference.foreign import all_faults, assert_close
+from reference.foreign import MAKE, assert_close
 from reference.refusals import user_error
 from reference.worlds import (
     environment,
@@ -25,24 +25,13 @@ from ganlane.settings.traffic import IdmTrafficConfig, MixedTrafficConfig, Repla
 from ganlane.sim import Road, Vehicles
 from ganlane.traffic import (
     BlindTraffic,
-    IdmMobilTraffic,
-    IdmRandomTraffic,
     IdmTraffic,
     MixedTraffic,
 )
 from ganlane.traffic.mixed import interleaved
-from ganlane.traffic.presets import gan_traffic, idm_faults_traffic, with_faults
+from ganlane.traffic.presets import gan_traffic, with_faults
 
-#: So many faults that a few decisions hold some.
-OFTEN = all_faults(600.0, 0.5)
 RULES = {"idm": 1, "idm_mobil": 2, "idm_random": 1, "idm_faults": 1}
-MAKE = {
-    "idm": IdmTraffic,
-    "idm_mobil": IdmMobilTraffic,
-    "idm_random": IdmRandomTraffic,
-    "idm_faults": lambda: idm_faults_traffic(faults=OFTEN),
-    "gan": gan_traffic,
-}
 
 
 def mixture(**shares):

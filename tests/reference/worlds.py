@@ -201,7 +201,9 @@ def rules_of(env: HighwayEnv) -> scalar.Rules:
         goal=env.episode.goal_m,
         timeout_steps=round(env.episode.timeout_s / 0.1),
         ring=env.road.ring_m,
-        stretches=tuple((its.begin_m, its.end_m, its.end) for its in env.road.stretches),
+        stretches=tuple(
+            scalar.Stretch(its.begin_m, its.end_m, its.end) for its in env.road.stretches
+        ),
         actions=env.actions.form,
         flow=flow,
     )

@@ -53,8 +53,8 @@ FACTS = {
     "walls that are hit": lambda cars, road: hits_wall(cars, body_lanes(cars, road), road),
     # The ego's are others: with one road for all rows an exit is its mission.
     "sides to which lanes are left, and urgency": lambda cars, road: torch.stack(
-        ways_out(cars, road, 500.0)
-    )[..., 1:],
+        ways_out(cars, road, 500.0), dim=-1
+    )[:, 1:],
     "accelerations": lambda cars, road: following_acceleration(perceive(cars, road)),
     "wishes of MOBIL": lambda cars, road: mobil_wishes(perceive(cars, road), road),
 }

@@ -75,14 +75,14 @@ def test_each_event_has_its_price(what, term, value):
 
 @pytest.mark.parametrize("parameters", [RewardParameters(), CONSIDERATE])
 def test_the_reward_is_the_sum_of_its_terms_and_zero_after_a_reset(parameters):
-    """Dense traffic, in which some end, and some get close in front of others."""
+    """Dense traffic, in which some end."""
     base = HighwayEnv(
         IdmMobilTraffic(), num_envs=32, spawn_parameters=packed(60.0, 12.0), kernel="auto"
     )
     env = TransformedEnv(base, Compose(RewardTransform(1.0, parameters)))
     state = env.reset()
     driver = RandomDriver(base.road)
-    ended = close = 0
+    ended = 0
     names = parameters.term_names
     assert env.observation_spec.contains(state.select(*env.observation_spec.keys()))
     assert all((state[keys.REWARD_TERMS, name] == 0).all() for name in names)
@@ -94,12 +94,7 @@ def test_the_reward_is_the_sum_of_its_terms_and_zero_after_a_reset(parameters):
         ended += int(after["done"].sum())
         started = state[keys.REWARD_TERMS][after["done"][:, 0]]
         assert all((started[name] == 0).all() for name in names)
-        if parameters is CONSIDERATE:
-            onsets = after[keys.EVENTS, "soft_crash_behind"]
-            close += int(onsets.sum())
-            assert torch.equal(after[keys.REWARD_TERMS, "soft_crash_behind"], -10.0 * onsets)
     assert ended > 0
-    assert close > 0 or parameters is not CONSIDERATE
 
 
 def test_the_paper_charges_nothing_for_danger_behind_and_has_no_such_term():

@@ -41,31 +41,31 @@ def unlike_target(loss):
     return loss
 
 
+def assert_same_loss(loss, theirs, rows, power=1):
+    """That a loss gives TorchRL's figures and gradients; TorchRL's error may be a ``power`` of
+    ours.
+    """
+    data, twin = batch(rows=rows), batch(rows=rows)
+    values = [loss(data)["loss"], theirs.forward(loss, twin)["loss"]]
+    errors = [data["td_error"] ** power, twin["td_error"]]
+    parameters = list(loss.network.parameters())
+    gradients = [torch.autograd.grad(value.mean(), parameters) for value in values]
+    for ours, expected in (values, errors, gradients):
+        torch.testing.assert_close(ours, expected, atol=1e-6, rtol=1e-5)
+
+
 @pytest.mark.parametrize("rows", [64, 11])
 @pytest.mark.parametrize("noisy", [True, False])
 def test_the_distributional_loss_equals_torchrls(noisy, rows):
     """Also with as many rows as there are atoms, where a wrong shape would broadcast."""
     loss = unlike_target(LeanDistributionalLoss(network(noisy=noisy, kl_priority=False)))
-    theirs = batch(rows=rows)
-    ours = batch(rows=rows)
-    parameters = list(loss.network.parameters())
-    expected = DistributionalDQNLoss.forward(loss, theirs)["loss"]
-    actual = loss(ours)["loss"]
-    torch.testing.assert_close(
-        (actual, ours["td_error"]), (expected, theirs["td_error"]), atol=1e-6, rtol=1e-6
-    )
-    gradients = [torch.autograd.grad(value.mean(), parameters) for value in (actual, expected)]
-    torch.testing.assert_close(*gradients, atol=1e-6, rtol=1e-5)
+    assert_same_loss(loss, DistributionalDQNLoss, rows)
 
 
 @pytest.mark.parametrize("double", [True, False])
 def test_the_plain_loss_equals_torchrls(double):
     loss = unlike_target(LeanDQNLoss(network(distributional=False, double=double)))
-    theirs = batch()
-    ours = batch()
-    expected = DQNLoss.forward(loss, theirs)["loss"]
-    torch.testing.assert_close(loss(ours)["loss"], expected, atol=1e-6, rtol=1e-6)
-    torch.testing.assert_close(ours["td_error"] ** 2, theirs["td_error"], atol=1e-5, rtol=1e-5)
+    assert_same_loss(loss, DQNLoss, 64, power=2)
 
 
 def test_the_loss_reports_the_share_of_the_returns_that_its_support_does_not_cover():

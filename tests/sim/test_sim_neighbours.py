@@ -84,8 +84,8 @@ def test_leader_and_follower_are_those_that_the_scalar_simulator_finds():
         for i, lane in itertools.product(range(12), range(3)):
             j = view.leader(i, lane)
             expected = (FREE_GAP_M, cars[i].speed) if j is None else (view.gap(i, j), cars[j].speed)
-            found = ahead.gap[row, i, lane].item(), ahead.speed[row, i, lane].item()
-            assert found == pytest.approx(expected)
+            seen = ahead.gap[row, i, lane].item(), ahead.speed[row, i, lane].item()
+            assert seen == pytest.approx(expected)
             j = view.follower(i, lane)
             assert behind.exists[row, i, lane].item() == (j is not None)
             if j is not None:

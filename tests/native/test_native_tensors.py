@@ -104,12 +104,7 @@ def in_double(value):
     return value.double() if value.is_floating_point() else value.clone()
 
 
-def within_rounding(
-    env,
-    td,
-    row,
-    measure,
-):
+def within_rounding(env, td, row, measure):
     """Whether the decision of ``row`` hangs by a rounding.
 
     64 states a rounding beside it lead to different ones, by the same ``measure`` of :func:`apart`.

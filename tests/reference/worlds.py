@@ -56,7 +56,7 @@ def field_of(car: dict, name: str) -> float:
     return {**DEFAULTS, "y": 4.0 * lane, "target_lane": lane, **car}[name]
 
 
-def rows_of(scene: Vehicles, rows: int | slice | torch.Tensor) -> Vehicles:
+def rows_of(scene: Vehicles, rows: slice | Sequence[int] | torch.Tensor) -> Vehicles:
     """Some rows of a scene."""
     return Vehicles(*(field[rows] for field in scene))
 

@@ -90,6 +90,5 @@ def test_leader_and_follower_are_those_that_the_scalar_simulator_finds():
             assert behind.exists[row, i, lane].item() == (j is not None)
             if j is not None:
                 expected = view.gap(j, i), cars[j].speed, cars[j].desired_speed
-                assert [number[row, i, lane].item() for number in behind[:3]] == pytest.approx(
-                    expected
-                )
+                seen = [field[row, i, lane].item() for field in behind[:3]]
+                assert seen == pytest.approx(expected)

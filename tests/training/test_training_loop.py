@@ -53,7 +53,7 @@ def test_there_is_one_update_per_decisions_per_update_whatever_the_batch(environ
     assert abs(learner.updates - (480 - 96) // 16) <= 2
 
 
-@pytest.mark.parametrize("decisions", [40, 400])  # before the buffer is full, and after
+@pytest.mark.parametrize("decisions", [8, 400])  # while the buffer is empty, and when it is full
 def test_an_interrupted_and_resumed_run_gives_the_same_weights(decisions, whole, tmp_path, capsys):
     first = train(road(8), agent(), settings(decisions, log_every=240), tmp_path)
     torch.manual_seed(99)

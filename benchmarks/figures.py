@@ -72,8 +72,7 @@ def generator_blocks(generator: Generator, vehicles: int = 9) -> list[Block]:
     context, noise = generator.summarise(seen), torch.zeros(1, vehicles, sizes.noise)
     outputs = generator(seen, noise)
     encoder, decoder, pooling = generator.encoder, generator.decoder, generator.pooling
-    projected = seen.projections
-    assert isinstance(projected, Tensor)
+    projected = torch.stack(seen.projections, dim=2)
     extra = f", {sizes.extra_inputs} further inputs" if sizes.extra_inputs else ""
     width = encoder.embed.out_features
     return [

@@ -23,6 +23,7 @@ from benchmarks.script import make_parser, run_script
 from ganlane import keys
 from ganlane.build import make_env, make_traffic
 from ganlane.evaluation.table import Table
+from ganlane.settings.commands import DrivingConfig
 from ganlane.settings.driving import IdmParameters, MobilParameters
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
@@ -90,7 +91,8 @@ def measure(
     flow |= {"from_m": FROM_M, "to_m": TO_M, "slots": SLOTS}
     drivers = {"courtesy": courtesy}
     config = make(EnvConfig, {"name": scene, "flow": flow, "mobil": drivers, "timeout_s": 1e6})
-    env = make_env(make_traffic(make(TrafficConfig, traffic), config), config, num_envs=rows)
+    module = make_traffic(make(TrafficConfig, traffic), config)
+    env = make_env(module, DrivingConfig(env=config), rows)
     base = env.base_env
     passed = Passed(scene, traffic, lanes=config.lanes - 1)
     exits = torch.tensor(base.road.flow.exits(base.vehicles))

@@ -167,8 +167,7 @@ def evaluate(
     )
     with _torch_threads(config.threads):
         drivers = _drivers(
-            agents,
-            lambda name: build.make_drivers([name], config.env, config.device),
+            agents, lambda name: build.make_drivers([name], config.env, config.device)
         )
         # Two of one name would share a row of the table.
         config = replace(config, agents=[driver.name for driver in drivers])
@@ -216,10 +215,12 @@ def _drivers(policies: Any, load: Callable[[str], list[Driver]]) -> list[Driver]
     """One policy, a list or a mapping of them as drivers; ``load`` gives those of a name."""
     if not isinstance(policies, Mapping | list | tuple):
         policies = [policies]
-    names = list(policies) if isinstance(policies, Mapping) else [None] * len(policies)
-    listed = policies.values() if isinstance(policies, Mapping) else policies
+    if isinstance(policies, Mapping):
+        named = list(policies.items())
+    else:
+        named = [(None, policy) for policy in policies]
     drivers: list[Driver] = []
-    for name, policy in zip(names, listed):
+    for name, policy in named:
         if isinstance(policy, str | Path):
             several = load(str(policy))
         elif isinstance(policy, Driver):

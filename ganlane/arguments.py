@@ -16,51 +16,32 @@ F = TypeVar("F", bound=Callable)
 Made = TypeVar("Made")
 
 
-def whole_number(
-    name: str,
-    value: Any,
-    low: int,
-    high: int,
-) -> int:
+def whole_number(name: str, value: Any, low: int, high: int) -> int:
     """``value`` as an int; NumPy's integers are allowed.
 
     Raises:
         UserError: not an integer, or not from ``low`` to ``high``.
     """
-    if not _is_whole(value) or not low <= int(value) <= high:
+    try:
+        # Takes NumPy's integers, and refuses arrays and floats that happen to be whole.
+        number = operator.index(value)
+    except TypeError:
+        number = low - 1  # out of range, so refused
+    # Python counts True as 1; as a seed or a number it is a mistake.
+    if isinstance(value, bool) or not low <= number <= high:
         # Written as a power, since nobody recognises 9223372036854775807.
         most = "2**63 - 1" if high == 2**63 - 1 else f"{high}"
+        shown = " ".join(repr(value).split())
         raise UserError(
-            f"{name}={_shown(value)}: expected a whole number from {low} to {most}; give for "
+            f"{name}={shown:.80}: expected a whole number from {low} to {most}; give for "
             f"instance {name}={low}."
         )
-    return int(value)
-
-
-def _is_whole(value: Any) -> bool:
-    """Whether ``value`` counts as an int: NumPy's integers do, booleans and arrays do not."""
-    # operator.index() takes NumPy's integers, and refuses floats that happen to be whole.
-    try:
-        operator.index(value)
-    except TypeError:
-        return False
-    # Python counts True as 1; as a seed or a number it is a mistake.
-    return not isinstance(value, bool)
-
-
-def _shown(value: Any) -> str:
-    """``value`` on one line of at most 80 characters."""
-    return f"{' '.join(repr(value).split()):.80}"
+    return number
 
 
 def seed_number(seed: Any) -> int:
     """A seed, checked: the counters of the environment hold 63 bits."""
-    return whole_number(
-        "seed",
-        seed,
-        0,
-        2**63 - 1,
-    )
+    return whole_number("seed", seed, 0, 2**63 - 1)
 
 
 def is_import_path(name: str) -> bool:
@@ -98,17 +79,12 @@ def imported(path: str, key: str) -> Any:
     except Exception as error:  # a user's module can raise anything when imported
         raise UserError(
             f"{key}={path}: {module or path!r} cannot be imported ({type(error).__name__}: "
-            f"{error}); give the import "
-            "path of a class or function, and start the command in the folder that holds its "
-            "module."
+            f"{error}); give the import path of a class or function, and start the command in the "
+            "folder that holds its module."
         ) from error
 
 
-def import_target(
-    path: str,
-    key: str,
-    base: type[Made],
-) -> Callable[..., Made]:
+def import_target(path: str, key: str, base: type[Made]) -> Callable[..., Made]:
     """The subclass of ``base``, or the function annotated to return one, at import path ``path``.
 
     Raises:
@@ -159,10 +135,7 @@ def signature_of(target: Callable[..., Any]) -> inspect.Signature:
 
 
 def call_with(
-    target: Callable[..., Any],
-    offered: Mapping[str, Any],
-    required: Mapping[str, Any],
-    key: str,
+    target: Callable[..., Any], offered: Mapping[str, Any], required: Mapping[str, Any], key: str
 ) -> Any:
     """Call ``target`` with all of ``required`` and those of ``offered`` that its signature names.
 
@@ -182,7 +155,6 @@ def call_with(
         name = f"{target.__module__}.{getattr(target, '__qualname__', target)}"
         raise UserError(
             f"{key}={name}: cannot be called with {', '.join(sorted(arguments)) or 'nothing'} "
-            f"({error}); "
-            f"it takes {', '.join(parameters) or 'nothing'}."
+            f"({error}); it takes {', '.join(parameters) or 'nothing'}."
         ) from error
     return target(**arguments)

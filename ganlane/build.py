@@ -2,8 +2,9 @@
 
 ::
 
-    road = make_env(make_traffic(GanTrafficConfig(), EnvConfig()), EnvConfig(), num_envs=256)
-    driver = make_driver("mobil", EnvConfig())
+    config = DrivingConfig(env=EnvConfig(lanes=4))
+    road = make_env(make_traffic(GanTrafficConfig(), config.env), config, num_envs=256)
+    driver = make_driver("mobil", config.env)
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose
@@ -26,9 +27,9 @@ from ganlane.env import HighwayEnv, TransformedHighway
 from ganlane.errors import ParameterError, UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.settings.actions import ActionParameters
-from ganlane.settings.commands import HighwayConfig
+from ganlane.settings.commands import DrivingConfig, HighwayConfig
 from ganlane.settings.env import EnvConfig
-from ganlane.settings.observation import MASKS, MaskParameters, ObservationConfig, RewardParameters
+from ganlane.settings.observation import MASKS, MaskParameters, ObservationConfig
 from ganlane.settings.record import below, make
 from ganlane.settings.traffic import TrafficConfig
 from ganlane.sim.dynamics import STEERING
@@ -42,6 +43,8 @@ from ganlane.transforms import (
     observation_size,
 )
 
+Driving = TypeVar("Driving", bound=DrivingConfig)
+
 
 def make_highways(config: HighwayConfig) -> TransformedHighway:
     """The environments of a call: traffic, road, observation, reward and mask.
@@ -50,16 +53,8 @@ def make_highways(config: HighwayConfig) -> TransformedHighway:
         UserError: see :func:`make_traffic` and :class:`ganlane.env.HighwayEnv`.
     """
     # The random numbers of the traffic come from the same stream as those of the episodes.
-    return make_env(
-        make_traffic(config.traffic, config.env, Stream.named(config.stream)),
-        config.env,
-        config.observation,
-        config.reward,
-        config.num_envs,
-        config.seed,
-        config.device,
-        mask=config.mask,
-    )
+    traffic = make_traffic(config.traffic, config.env, Stream.named(config.stream))
+    return make_env(traffic, config, config.num_envs)
 
 
 def _constructor_arguments(env: EnvConfig, stream: int) -> dict[str, Any]:
@@ -105,15 +100,7 @@ def make_traffic(
 
 
 def make_env(
-    traffic: TrafficModule,
-    env: EnvConfig,
-    observation: ObservationConfig | None = None,
-    reward: RewardParameters | None = None,
-    num_envs: int = 1,
-    seed: int = 0,
-    device: str = "cpu",
-    first_episode: int = 0,
-    mask: MaskParameters | None = None,
+    traffic: TrafficModule, config: DrivingConfig, num_envs: int = 1
 ) -> TransformedHighway:
     """A batched environment with observation, reward and optionally action mask; its stream is that
     of the traffic.
@@ -121,7 +108,7 @@ def make_env(
     Raises:
         UserError: see :class:`ganlane.env.HighwayEnv`.
     """
-    observation, reward = observation or ObservationConfig(), reward or RewardParameters()
+    env, observation, mask = config.env, config.observation, config.mask
     base = HighwayEnv(
         traffic,
         num_envs,
@@ -130,9 +117,8 @@ def make_env(
         env.ego,
         env.episode_parameters(),
         env.idm,
-        seed=seed,
-        first_episode=first_episode,
-        device=device,
+        seed=config.seed,
+        device=config.device,
         # By kind of traffic, others notice earlier or later who enters their lane.
         scenes=env.scenes(traffic.visibility),
         recycle=env.recycle,
@@ -145,16 +131,11 @@ def make_env(
     native = base.kernel is not None
     transforms: list[ObservationTransform | ActionMaskTransform] = [
         ObservationTransform(
-            base.road,
-            env.vehicles,
-            observation.form,
-            observation.scale(),
-            native,
-            env.actions,
+            base.road, env.vehicles, observation.form, observation.scale(), native, env.actions
         )
     ]
     # The mask needs to know whether a lane change under way may be called off.
-    if mask is not None and mask.form != "none":
+    if mask.form != "none":
         abort, vehicles = env.ego.abort_lane_change, env.vehicles if native else None
         parameters = (mask.form, mask.safe_deceleration, env.idm, abort, vehicles, env.actions)
         transforms.append(ActionMaskTransform(base.road, *parameters))
@@ -164,10 +145,8 @@ def make_env(
     if sensors is not None:
         with below("observation.sensors"):
             errors = [SensorTransform(sensors, traffic.stream, env.decision_period_s)]
-    return TransformedHighway(
-        base,
-        Compose(*errors, *transforms, RewardTransform(env.decision_period_s, reward)),
-    )
+    reward = RewardTransform(env.decision_period_s, config.reward)
+    return TransformedHighway(base, Compose(*errors, *transforms, reward))
 
 
 @dataclass(frozen=True)
@@ -188,19 +167,24 @@ class Driver:
     mask: MaskParameters | None = None
     actions: ActionParameters | None = None
 
-    def env(self, env: EnvConfig) -> EnvConfig:
-        """``env`` with the actions that it commands."""
-        return env if self.actions in (None, env.actions) else replace(env, actions=self.actions)
-
     def renamed(self, name: str) -> Driver:
         """The same driver under another name."""
         return replace(self, name=name)
 
-    def behind(self, mask: MaskParameters | None) -> tuple[MaskParameters, TensorDictModuleBase]:
-        """The mask in force, where ``mask`` is the default, and the policy with that mask."""
-        # The driver's own mask goes before that of the command.
-        chosen = self.mask or mask or MaskParameters()
-        return chosen, self.policy if chosen.form == "none" else MaskedPolicy(self.policy)
+    def driving(self, config: Driving) -> tuple[Driving, TensorDictModuleBase]:
+        """``config`` for this driver, and the policy behind the mask in force.
+
+        The driver's own observation, mask and actions, if it has any, go before those of
+        ``config``.
+        """
+        mask = self.mask or config.mask
+        driven = replace(
+            config,
+            env=replace(config.env, actions=self.actions or config.env.actions),
+            observation=config.observation.read_by(self.observation),
+            mask=mask,
+        )
+        return driven, self.policy if mask.form == "none" else MaskedPolicy(self.policy)
 
 
 def make_driver(
@@ -269,16 +253,12 @@ def make_driver(
     names = ", ".join([*DRIVERS, *shipped, *SHIPPED_MODELS])
     raise UserError(
         f"agent {name:.100}: unknown; choose one of {names}, or give a checkpoint's path "
-        "(.safetensors) or the "
-        "import path of a policy."
+        "(.safetensors) or the import path of a policy."
     )
 
 
 def make_drivers(
-    names: Sequence[str],
-    env: EnvConfig,
-    device: str = "cpu",
-    stream: int = Stream.REPORT,
+    names: Sequence[str], env: EnvConfig, device: str = "cpu", stream: int = Stream.REPORT
 ) -> list[Driver]:
     """:func:`make_driver` for several names.
 

@@ -103,10 +103,7 @@ def numbered_refusals() -> Iterator[None]:
         yield
     except Exception as error:
         code = re.search(r"\(os error (\d+)\)", str(error))
-        if (
-            code is None
-            or getattr(error, "errno", None) is not None
-            or isinstance(error, UserError)
-        ):
+        numbered = getattr(error, "errno", None) is not None
+        if code is None or numbered or isinstance(error, UserError):
             raise
         raise OSError(int(code[1]), os.strerror(int(code[1]))) from error

@@ -153,11 +153,8 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
         name = str(error.filename)
         if not name.startswith(str(part)):
             raise
-        raise OSError(
-            error.errno,
-            error.strerror,
-            str(path) + name.removeprefix(str(part)),
-        ) from error
+        whole_name = str(path) + name.removeprefix(str(part))
+        raise OSError(error.errno, error.strerror, whole_name) from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
 
@@ -224,13 +221,11 @@ def sealed(content: bytes) -> bytes:
     return content[:begin] + _digits(content, begin) + content[begin + len(_ZEROS) :]
 
 
-def sealed_archive(content: bytes) -> bytes:
-    """A zip archive without a comment (.npz, .pt) with its checksum as comment."""
-    return sealed(content[:-2] + _COMMENT)
-
-
 def seal_archive(path: Path) -> None:
-    """:func:`sealed_archive` in place, for files too large to be held in memory."""
+    """Give a zip archive without a comment (.pt) its checksum as comment.
+
+    In place, for files too large to be held in memory.
+    """
     with path.open("rb+") as file:
         # The last two bytes of a zip archive without a comment are the comment's length, 0.
         file.seek(-2, 2)
@@ -255,8 +250,7 @@ def has_checksum(content: bytes | mmap, path: str | Path) -> bool:
     if end != begin + len(_ZEROS) or content[begin:end] != _digits(content, begin):
         raise UserError(
             f"{path}: damaged, its content does not have the checksum that was written with it; "
-            "take a copy that is "
-            "whole, or make it again."
+            "take a copy that is whole, or make it again."
         )
     return True
 

@@ -70,18 +70,12 @@ VEHICLE_INTEGERS: Final = ("target_lane", "visibility")
 VEHICLE_FLAGS: Final = ("valid",)
 VEHICLE_FIELDS: Final = VEHICLE_FLOATS + VEHICLE_INTEGERS + VEHICLE_FLAGS
 
-#: Boolean events; a decision ends for at most one of them.
-END_EVENTS: Final = (
-    "goal",
-    "hard_crash",
-    "out_of_road",
-    "missed_exit",
-    "timeout",
-    "scene_end",
-)
-#: Ends that are outcomes of the driving; the others are cut-offs.
+#: Boolean events that are outcomes of the driving.
 TERMINAL_EVENTS: Final = ("goal", "hard_crash", "out_of_road", "missed_exit")
+#: And cut-offs.
 TRUNCATING_EVENTS: Final = ("timeout", "scene_end")
+#: A decision ends for at most one of them.
+END_EVENTS: Final = TERMINAL_EVENTS + TRUNCATING_EVENTS
 #: Number of soft-crash onsets in the decision, int64.
 SOFT_CRASH: Final = "soft_crash"
 #: The same behind the ego: reported, and penalised by ``reward=considerate`` alone.

@@ -23,12 +23,7 @@ _LIBRARY.define("linear(Tensor x, Tensor weight, Tensor? bias, bool relu) -> Ten
 
 
 @torch.library.impl(_LIBRARY, "linear", "CPU")
-def _operator(
-    x: Tensor,
-    weight: Tensor,
-    bias: Tensor | None,
-    relu: bool,
-) -> Tensor:
+def _operator(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
     if ONEDNN:
         return torch.ops.mkldnn._linear_pointwise(
             x, weight, bias, "relu" if relu else "none", [], ""
@@ -38,12 +33,7 @@ def _operator(
 
 
 @torch.library.register_fake("ganlane::linear")
-def _shape(
-    x: Tensor,
-    weight: Tensor,
-    bias: Tensor | None,
-    relu: bool,
-) -> Tensor:
+def _shape(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
     return x.new_empty((*x.shape[:-1], weight.shape[0]))
 
 
@@ -53,38 +43,20 @@ def has_fast_product(x: Tensor) -> bool:
 
 
 def matrix_product(
-    x: Tensor,
-    weight: Tensor,
-    bias: Tensor | None = None,
-    relu: bool = False,
+    x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False
 ) -> Tensor:
     """:func:`linear` in float32 on a CPU, without a gradient, in eager and in compiled graphs."""
-    return torch.ops.ganlane.linear(
-        x,
-        weight,
-        bias,
-        relu,
-    )
+    return torch.ops.ganlane.linear(x, weight, bias, relu)
 
 
-def linear(
-    x: Tensor,
-    weight: Tensor,
-    bias: Tensor,
-    relu: bool = False,
-) -> Tensor:
+def linear(x: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> Tensor:
     """``x @ weight.T + bias``, then a ReLU if asked for, with gradients.
 
     ``x`` is [..., I], ``weight`` [O, I] and ``bias`` [O]; by oneDNN where ``x`` has two dimensions.
     """
     fast = has_fast_product(x) and x.dim() == 2
     if fast and not torch.is_grad_enabled():
-        return matrix_product(
-            x,
-            weight,
-            bias,
-            relu,
-        )
+        return matrix_product(x, weight, bias, relu)
     product = _OneDnnLinear.apply(x, weight, bias) if fast else functional.linear(x, weight, bias)
     return torch.relu(product) if relu else product
 
@@ -93,12 +65,7 @@ class _OneDnnLinear(torch.autograd.Function):
     """oneDNN's operator has no gradient of its own: it is two more products."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        x: Tensor,
-        weight: Tensor,
-        bias: Tensor,
-    ) -> Tensor:
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         ctx.save_for_backward(x, weight)
         return matrix_product(x, weight, bias)
 
@@ -106,8 +73,4 @@ class _OneDnnLinear(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
         (gradient,), (x, weight) = gradients, ctx.saved_tensors
         to_x = matrix_product(gradient, weight.t()) if ctx.needs_input_grad[0] else None
-        return (
-            to_x,
-            matrix_product(gradient.t(), x.t()),
-            gradient.sum(0),
-        )
+        return to_x, matrix_product(gradient.t(), x.t()), gradient.sum(0)

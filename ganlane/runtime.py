@@ -72,21 +72,16 @@ def register_envs() -> None:
             )
 
 
-def find_compiler() -> tuple[str | None, str]:
-    """Path of the C++ compiler that torch would find, and the names looked for.
-
-    ``CXX``'s, or :data:`COMPILERS`.
-    """
+def find_compiler() -> str | None:
+    """Path of the C++ compiler that torch would find: ``CXX``'s, or one of :data:`COMPILERS`."""
     named = os.environ.get("CXX")
     names = (named,) if named else COMPILERS
-    return next(
-        filter(None, map(shutil.which, names)), None
-    ), f"CXX={named}" if named else ", ".join(names)
+    return next(filter(None, map(shutil.which, names)), None)
 
 
 def has_compiler() -> bool:
     """Whether torch would find a C++ compiler, and it works."""
-    path, _ = find_compiler()
+    path = find_compiler()
     return path is not None and _compiles(path)
 
 
@@ -168,9 +163,7 @@ def keep_freed_memory() -> bool:
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None:
         return False
-    return bool(mallopt(_M_MMAP_THRESHOLD, KEPT_BYTES)) and bool(
-        mallopt(_M_TRIM_THRESHOLD, KEPT_BYTES)
-    )
+    return all(mallopt(size, KEPT_BYTES) for size in (_M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD))
 
 
 def worker_number() -> int:

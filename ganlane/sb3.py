@@ -24,11 +24,12 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 import torch
+from gymnasium import wrappers
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 from ganlane import keys
-from ganlane.agents.drivers import mask_in
+from ganlane.agents.drivers import ObservationPolicy, mask_in
 from ganlane.agents.stored_models import (
     Floats,
     Network,
@@ -91,9 +92,7 @@ class HighwayVecEnv(VecEnv):
         # The constructor of VecEnv asks for render_mode through get_attr(), so highways is set
         # first.
         super().__init__(
-            highways.num_envs,
-            highways.single_observation_space,
-            highways.single_action_space,
+            highways.num_envs, highways.single_observation_space, highways.single_action_space
         )
 
     def reset(self) -> Floats:
@@ -223,18 +222,18 @@ _TRANSPARENT = (
     VecVideoRecorder,
     Monitor,
     gymnasium.RewardWrapper,
-    gymnasium.wrappers.HumanRendering,
-    gymnasium.wrappers.NormalizeReward,
-    gymnasium.wrappers.OrderEnforcing,
-    gymnasium.wrappers.PassiveEnvChecker,
-    gymnasium.wrappers.RecordEpisodeStatistics,
-    gymnasium.wrappers.RecordVideo,
-    gymnasium.wrappers.RenderCollection,
-    gymnasium.wrappers.TimeLimit,
+    wrappers.HumanRendering,
+    wrappers.NormalizeReward,
+    wrappers.OrderEnforcing,
+    wrappers.PassiveEnvChecker,
+    wrappers.RecordEpisodeStatistics,
+    wrappers.RecordVideo,
+    wrappers.RenderCollection,
+    wrappers.TimeLimit,
 )
 
 
-class ModelPolicy(TensorDictModuleBase):
+class ModelPolicy(ObservationPolicy):
     """The deterministic policy of a stable-baselines3 model, for one environment at a time.
 
     It writes ``action`` [N] for ``observation`` [N, D].
@@ -244,8 +243,6 @@ class ModelPolicy(TensorDictModuleBase):
             (``RecurrentPPO``) keeps it for every row until the row's episode is over.
         normaliser: of the observations; its statistics are not updated.
     """
-
-    out_keys = [keys.ACTION]  # noqa: RUF012
 
     def __init__(
         self, model: BaseAlgorithm, normaliser: VecNormalize | Normaliser | None = None
@@ -262,9 +259,8 @@ class ModelPolicy(TensorDictModuleBase):
         if self.rows_must_stay:
             self.in_keys.append(keys.EGO)
 
-    @torch.no_grad()
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action``."""
+    def act(self, tensordict: TensorDictBase) -> Tensor:
+        """What the model predicts, a number [N] or controls [N, 2]."""
         # stable-baselines3 takes NumPy arrays in main memory, whatever device the model is on.
         observation = tensordict.get(keys.OBSERVATION).cpu().numpy()
         shape = self.model.observation_space.shape
@@ -290,7 +286,7 @@ class ModelPolicy(TensorDictModuleBase):
         # Whole numbers of several types; floats are controls as they are.
         action = torch.as_tensor(chosen, device=tensordict.device)
         numbered = isinstance(self.model.action_space, gymnasium.spaces.Discrete)
-        return tensordict.set(keys.ACTION, action.long() if numbered else action)
+        return action.long() if numbered else action
 
 
 class ModelDriver(Driver):
@@ -316,10 +312,7 @@ class ModelDriver(Driver):
         if isinstance(normaliser, VecNormalize):
             statistics: Any = normaliser.obs_rms
             normaliser = Normaliser(
-                statistics.mean,
-                statistics.var,
-                normaliser.epsilon,
-                normaliser.clip_obs,
+                statistics.mean, statistics.var, normaliser.epsilon, normaliser.clip_obs
             )
         network = _network(self.policy.model)
         reading = Reading(self.observation, self.mask, normaliser, network, self.actions)
@@ -327,9 +320,7 @@ class ModelDriver(Driver):
 
 
 def driver(
-    model: BaseAlgorithm,
-    name: str | None = None,
-    stored: str | Path | None = None,
+    model: BaseAlgorithm, name: str | None = None, stored: str | Path | None = None
 ) -> ModelDriver:
     """A trained model as a driver for ``ganlane.api.evaluate``.
 

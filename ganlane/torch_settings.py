@@ -54,11 +54,7 @@ def constant(values: Sequence[float], like: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=256)
-def _constant(
-    values: tuple[float, ...],
-    dtype: torch.dtype,
-    device: torch.device,
-) -> Tensor:
+def _constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     # A tensor made in inference mode could not be used outside of it.
     with torch.inference_mode(False):
         return torch.tensor(values, dtype=dtype, device=device)

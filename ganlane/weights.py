@@ -27,10 +27,7 @@ if TYPE_CHECKING:
 
 
 def save_weights(
-    path: str | Path,
-    kind: str,
-    tensors: Mapping[str, Tensor],
-    metadata: Mapping[str, Any],
+    path: str | Path, kind: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]
 ) -> None:
     """Save ``tensors`` and plain ``metadata`` as safetensors, atomically.
 
@@ -44,10 +41,7 @@ def save_weights(
 
     # On the CPU: a file from a GPU must load anywhere.
     flat = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    header = {
-        "ganlane": json.dumps({"kind": kind, **metadata}),
-        "checksum": PLACE,
-    }
+    header = {"ganlane": json.dumps({"kind": kind, **metadata}), "checksum": PLACE}
     write_bytes(path, sealed(save(flat, metadata=header)))
 
 
@@ -77,17 +71,11 @@ def load_arrays(path: str | Path, kind: str) -> tuple[dict[str, npt.NDArray[Any]
         arrays = load(content)
         # The format begins with the header's length and the header, JSON. The library's reader of
         # bytes leaves the metadata out.
-        begin = 8
         end = 8 + int.from_bytes(content[:8], "little")
-        header = json.loads(content[begin:end]).get("__metadata__") or {}
+        header = json.loads(content[8:end]).get("__metadata__") or {}
         metadata = json.loads(header.get("ganlane", "{}"))
     # KeyError: a number type that NumPy lacks
-    except (
-        SafetensorError,
-        ValueError,
-        KeyError,
-        RecursionError,
-    ) as error:
+    except (SafetensorError, ValueError, KeyError, RecursionError) as error:
         raise UserError(
             f"{path}: not a readable safetensors file ({error}); "
             f"give a checkpoint of kind {kind} that ganlane wrote."

@@ -18,8 +18,8 @@ from ganlane.settings.traffic import SumoTrafficConfig
 from ganlane.sim.dynamics import (
     STEERING,
     SteeringParameters,
+    drive,
     ego_scene,
-    move_ego,
 )
 from ganlane.sim.idm import TABLE_V, following_acceleration
 from ganlane.sim.random import Purpose, Stream, uniform
@@ -236,13 +236,13 @@ class SumoTraffic(TrafficModule):
         acceleration = following_acceleration(ego_scene(vehicles, self.road), self.idm)[:, 0]
         line = self.road.centre_of(vehicles.target_lane[:, :1], vehicles.y.dtype)[:, 0]
         steering = memory["steering"]
-        ego, wheels = move_ego(
-            vehicles,
+        ego, wheels = drive(
+            vehicles.at(EGO_INDEX),
             acceleration,
             steering[:, 0],
             line,
-            self.steering,
             self.dt,
+            self.steering,
         )
         self._lead_egos(now.roads, driving, ego, before)
         self._wander(
@@ -371,7 +371,7 @@ class SumoTraffic(TrafficModule):
     ) -> None:
         """The stand-ins, ordinary cars for SUMO's drivers, follow the egos."""
         # [N, 1]: the environment's functions on a batch of single vehicles.
-        one = Vehicles(*(field[:, None] for field in ego))
+        one = ego.part((slice(None), None))
         body = body_lanes(one, self.road)
         lanes = presence(one, self.road, body, with_target(body, one))
         low, high, next_x = (field[:, 0].tolist() for field in (lanes.low, lanes.high, one.x))

@@ -72,7 +72,8 @@ def test_an_episode_is_truncated_at_the_step_where_its_scene_ends(recordings):
 def test_every_row_has_the_lanes_of_its_scene(recordings):
     env = make(recordings, 64)
     td = env.reset()
-    lanes = 2 + env.traffic.scene_of(episode_key(0, td[keys.SEED], td[keys.EPISODE]))
+    key = episode_key(0, td[keys.SEED], td[keys.EPISODE])
+    lanes = 2 + env.traffic.scene[env.traffic.start_of(key)]
     assert torch.equal(td[keys.ROAD, "lanes"][:, 0], lanes)
     width = td[keys.ROAD, "lane_width_m"][:, 0]
     for _ in range(2):
@@ -134,7 +135,7 @@ def test_lanes_end_where_the_roads_say_seen_from_the_start_of_each_episode(recor
     check_env_specs(env)
     td = env.reset()
     key = episode_key(0, td[keys.SEED], td[keys.EPISODE])
-    ends = traffic.scene_of(key) == 2
+    ends = traffic.scene[traffic.start_of(key)] == 2
     assert 0 < ends.sum() < 64
     start_m = traffic.samples[traffic.starts[traffic.start_of(key), 0], 0]
     road = td[keys.ROAD]

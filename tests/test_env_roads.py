@@ -17,6 +17,7 @@ from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.env import HighwayEnv
 from ganlane.errors import ParameterError, UserError
 from ganlane.evaluation.episodes import ego_at_fault
+from ganlane.settings.commands import DrivingConfig
 from ganlane.settings.driving import MobilParameters
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
@@ -239,7 +240,7 @@ def test_traffic_that_does_not_heed_the_ends_of_lanes_is_refused():
 def test_recycling_is_refused():
     config = make(EnvConfig, {"name": "merge", "recycle": True})
     with pytest.raises(UserError, match=r"env.recycle=true on a road with lanes that end"):
-        make_env(make_traffic(IdmTrafficConfig(), config), config)
+        make_env(make_traffic(IdmTrafficConfig(), config), DrivingConfig(env=config))
 
 
 @pytest.mark.parametrize(
@@ -274,7 +275,7 @@ def test_an_impossible_stretch_is_refused(stretch, wrong):
 
 def outcomes(config: EnvConfig, driver: str, traffic: object, rows: int = 64) -> dict[str, int]:
     """How so many episodes end."""
-    env = make_env(make_traffic(traffic, config), config, num_envs=rows)
+    env = make_env(make_traffic(traffic, config), DrivingConfig(env=config), rows)
     policy = make_driver(driver, config).policy
     td = env.reset()
     ended = torch.zeros(rows, dtype=torch.bool)
@@ -308,7 +309,7 @@ def test_an_ego_that_keeps_its_lane_does_not(scene, end):
 def test_nobody_is_left_standing_at_a_lane_drop():
     """All of the ending lane have found their way into the others within three minutes."""
     config = replace(make(EnvConfig, "lane_drop"), goal_m=1e5, timeout_s=300.0)
-    env = make_env(make_traffic(IdmMobilTrafficConfig(), config), config, num_envs=32)
+    env = make_env(make_traffic(IdmMobilTrafficConfig(), config), DrivingConfig(env=config), 32)
     policy = make_driver("mobil", config).policy
     td = env.reset()
     for _ in range(180):
@@ -360,7 +361,7 @@ def test_an_ego_beside_an_on_ramp_lets_the_others_merge(driver):
 
 def test_all_who_come_from_the_ramp_find_their_way_onto_the_road():
     config = replace(make(EnvConfig, "on_ramp"), goal_m=1e5, timeout_s=300.0)
-    env = make_env(make_traffic(IdmMobilTrafficConfig(), config), config, num_envs=32)
+    env = make_env(make_traffic(IdmMobilTrafficConfig(), config), DrivingConfig(env=config), 32)
     policy = make_driver("mobil", config).policy
     td = env.reset()
     assert ((td[keys.VEHICLES, "target_lane"] == 0).sum(1) == 6).all()

@@ -28,8 +28,8 @@ from ganlane.files import (
     PLACE,
     atomic_path,
     has_checksum,
+    seal_archive,
     sealed,
-    sealed_archive,
     write_bytes,
 )
 from ganlane.generator import load_generator
@@ -190,13 +190,16 @@ def test_any_flipped_byte_is_refused_in_one_sentence(name, tmp_path, capsys):
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.parametrize(
-    "seal",
-    [lambda text: sealed(text + PLACE.encode() + text), sealed_archive],
-    ids=["in", "at"],
-)
-def test_no_bit_of_a_content_can_change(seal):
-    content = seal(b"some content of a file, and two bytes\0\0")
+@pytest.mark.parametrize("where", ["in", "at"])
+def test_no_bit_of_a_content_can_change(where, tmp_path):
+    content = b"some content of a file, and two bytes\0\0"
+    if where == "in":
+        content = sealed(content + PLACE.encode() + content)
+    else:
+        archive = tmp_path / "archive"
+        archive.write_bytes(content)
+        seal_archive(archive)
+        content = archive.read_bytes()
     assert has_checksum(content, "file")
     for place in range(len(content)):
         for bit in range(8):

@@ -18,11 +18,7 @@ import gymnasium
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import (
-    VecCheckNan,
-    VecFrameStack,
-    VecNormalize,
-)
+from stable_baselines3.common.vec_env import VecCheckNan, VecFrameStack, VecNormalize
 from torchrl.envs.transforms import ObservationNorm
 
 import ganlane
@@ -51,11 +47,7 @@ BUSY = {"goal_m": 250.0, "stream": "report", "seed": 3}
 
 
 def short_episodes(**options):
-    return ganlane.sb3.make_vec_env(
-        "idm",
-        num_envs=ROWS,
-        **{"seed": 0, **SHORT, **options},
-    )
+    return ganlane.sb3.make_vec_env("idm", num_envs=ROWS, **{"seed": 0, **SHORT, **options})
 
 
 def untrained(algorithm, env):
@@ -139,24 +131,14 @@ def test_the_algorithm_trains_unchanged_and_its_policy_can_be_evaluated(algorith
             assert len(returns) == len(lengths) == 4
     assert model.ep_info_buffer
     driver = ganlane.sb3.driver(model)
-    table = ganlane.api.evaluate(
-        [driver, "mobil"],
-        ["idm"],
-        3,
-        mask="safe",
-        **SHORT,
-    )
+    table = ganlane.api.evaluate([driver, "mobil"], ["idm"], 3, mask="safe", **SHORT)
     assert table["agent"].to_list() == [algorithm.__name__.lower(), "mobil"]
     assert table["episodes"].to_list() == [3, 3]
     assert table["out_of_road"].to_list() == [0, 0]
 
 
 def busy_highways(**options):
-    return ganlane.sb3.make_vec_env(
-        "idm_mobil",
-        num_envs=ROWS,
-        **{**BUSY, **options},
-    )
+    return ganlane.sb3.make_vec_env("idm_mobil", num_envs=ROWS, **{**BUSY, **options})
 
 
 def sharp(model):
@@ -180,13 +162,7 @@ def returns_in_the_own_loop(model, env):
         masks = {}
         if isinstance(model, sb3_contrib.MaskablePPO):
             masks["action_masks"] = np.stack(env.env_method("action_masks"))
-        action, state = model.predict(
-            observation,
-            state,
-            start,
-            deterministic=True,
-            **masks,
-        )
+        action, state = model.predict(observation, state, start, deterministic=True, **masks)
         observation, _, start, infos = env.step(action)
         for info in infos:
             if info:
@@ -196,13 +172,7 @@ def returns_in_the_own_loop(model, env):
 
 def returns_in_the_evaluation(driver, **options):
     keys = {**BUSY, "num_envs": ROWS, **options}
-    table = ganlane.api.evaluate(
-        [driver],
-        ["idm_mobil"],
-        EPISODES,
-        per_episode=True,
-        **keys,
-    )
+    table = ganlane.api.evaluate([driver], ["idm_mobil"], EPISODES, per_episode=True, **keys)
     return table.sort("episode")["reward"].to_list()
 
 
@@ -281,11 +251,7 @@ def test_a_masked_model_that_could_turn_back_without_a_mask_is_refused():
     ("algorithm", "options", "wrap"),
     [
         (PPO, {"observation": "table3_progress"}, normalised),
-        (
-            sb3_contrib.MaskablePPO,
-            {"mask": {"name": "safe", "safe_deceleration": 3.0}},
-            None,
-        ),
+        (sb3_contrib.MaskablePPO, {"mask": {"name": "safe", "safe_deceleration": 3.0}}, None),
         (DQN, {}, None),
     ],
     ids=["normalised", "masked", "dqn"],
@@ -347,13 +313,7 @@ def test_a_model_of_continuous_actions_drives_in_a_table_beside_mobil(tmp_path):
     from stable_baselines3 import SAC
 
     options = {"env": "merge", "goal_m": 300.0}
-    env = ganlane.sb3.make_vec_env(
-        "idm",
-        num_envs=2,
-        seed=0,
-        actions="continuous",
-        **options,
-    )
+    env = ganlane.sb3.make_vec_env("idm", num_envs=2, seed=0, actions="continuous", **options)
     model = SAC("MlpPolicy", env, learning_starts=10, batch_size=8, seed=0).learn(20)
     driver = ganlane.sb3.driver(model)
     table = ganlane.api.evaluate([driver, "mobil"], ["idm"], 2, **options)

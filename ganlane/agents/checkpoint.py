@@ -21,9 +21,8 @@ from ganlane.files import CHECKPOINTS
 from ganlane.settings.agent import RainbowConfig
 from ganlane.weights import load_weights, save_weights
 
-#: Agents that come with the package, and the seed of the training that each of them is; others are
-#: given by their path.
-SHIPPED = {"agent_general": 0, "agent_idm": 0, "agent_gan": 0}
+#: Agents that come with the package, each the training with seed 0; others are given by their path.
+SHIPPED = ("agent_general", "agent_idm", "agent_gan")
 #: Kind of a file with several agents.
 SEVERAL = "agents"
 #: What says which returns the outputs of a distributional network stand for.
@@ -37,7 +36,7 @@ def _place(name: str | Path) -> tuple[Path, int | None]:
         seed = int(digits)
         # Further trainings of a shipped recipe lie in a file of their own, which a light wheel
         # lacks.
-        if recipe in SHIPPED and seed != SHIPPED[recipe]:
+        if recipe in SHIPPED and seed > 0:
             return _seeds_file(recipe), seed
         if recipe in SHIPPED:
             name = recipe
@@ -56,15 +55,10 @@ def names_agent(name: str) -> bool:
 
     ``@SEED`` may follow.
     """
-    recipe, _, digits = name.rpartition("@")
+    file = str(_place(name)[0])
     # a file's own name may end in @ and digits
-    places = (name, recipe) if digits.isdecimal() else (name,)
-    if name.endswith(".zip"):
-        return False
-    return any(
-        place in SHIPPED or place.endswith(".safetensors") or os.path.isfile(place)
-        for place in places
-    )
+    is_agent = file.endswith(".safetensors") or os.path.isfile(file)
+    return is_agent and not name.endswith(".zip")
 
 
 def with_seeds(name: str) -> list[str]:
@@ -84,11 +78,11 @@ def with_seeds(name: str) -> list[str]:
         seeds = sorted(_read_several(Path(recipe))[1])
     elif _seeds_file(recipe).is_file():
         # One training is the shipped agent itself; the others are packed together.
-        seeds = sorted([SHIPPED[recipe], *_read_several(_seeds_file(recipe))[1]])
+        seeds = sorted([0, *_read_several(_seeds_file(recipe))[1]])
     else:
         raise UserError(
-            f"{name}: only the training {recipe}@{SHIPPED[recipe]} is installed (a light wheel); "
-            "give that, or run pip install -e . in a clone."
+            f"{name}: only the training {recipe}@0 is installed (a light wheel); give that, or run "
+            "pip install -e . in a clone."
         )
     return [f"{recipe}@{seed}{mask}" for seed in seeds]
 
@@ -113,7 +107,7 @@ def agent_file(name: str | Path) -> Path:
     path, seed = _place(name)
     if not os.path.isfile(path):  # which takes names that are too long for a file
         shipped = sorted(file.stem for file in CHECKPOINTS.glob("agent_*.safetensors"))
-        which = "training" if seed is not None and str(name).startswith(tuple(SHIPPED)) else "file"
+        which = "training" if seed is not None and str(name).startswith(SHIPPED) else "file"
         raise UserError(
             f"agent {name!s:.100}: no such {which} ({path!s:.200}); the agents that ship are "
             f"{', '.join(shipped)}; or give a path."

@@ -35,30 +35,41 @@ from ganlane.transforms.mask import allowed_speeds
 LegalActions = Callable[[TensorDictBase], Tensor]
 
 
-class GreedyPolicy(TensorDictModuleBase):
-    """Writes the best ``action`` [N] int64 for ``observation`` [N, D].
-
-    There is never any noise, whatever the context says. Where the environment writes
-    ``action_mask`` [N, A], it is the best of the allowed actions.
-    """
+class ObservationPolicy(TensorDictModuleBase):
+    """Base of policies that write ``action`` [N] for ``observation`` [N, D] through :meth:`act`."""
 
     in_keys = [keys.OBSERVATION]  # noqa: RUF012
     out_keys = [keys.ACTION]  # noqa: RUF012
     #: Nothing is held per row, so an evaluation may move running episodes to other rows.
     rows_must_stay = False
 
-    def __init__(self, network: QNetwork) -> None:
-        super().__init__()
-        self.network = network
+    def act(self, tensordict: TensorDictBase) -> Tensor:
+        """The action of every row."""
+        raise NotImplementedError
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action``."""
+        return tensordict.set(keys.ACTION, self.act(tensordict))
+
+
+class GreedyPolicy(ObservationPolicy):
+    """Writes the best ``action`` [N] int64 for ``observation`` [N, D].
+
+    There is never any noise, whatever the context says. Where the environment writes
+    ``action_mask`` [N, A], it is the best of the allowed actions.
+    """
+
+    def __init__(self, network: QNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def act(self, tensordict: TensorDictBase) -> Tensor:
+        """The best action of every row."""
         # Without the noise of the layers: the same observation always gives the same action.
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             values = self.network.values(tensordict.get(keys.OBSERVATION))
-        values = allowed_values(values, tensordict.get(keys.ACTION_MASK, None))
-        return tensordict.set(keys.ACTION, values.argmax(-1))
+        return allowed_values(values, tensordict.get(keys.ACTION_MASK, None)).argmax(-1)
 
 
 class ExploringPolicy(TensorDictModuleBase):
@@ -104,10 +115,7 @@ class ExploringPolicy(TensorDictModuleBase):
             if mask is None:
                 mask = torch.ones_like(values) if self.legal is None else self.legal(tensordict)
             # A fraction epsilon of the actions becomes a legal one, drawn uniformly.
-            draw: dict[str, Any] = {
-                "generator": self.generator,
-                "device": self.generator.device,
-            }
+            draw: dict[str, Any] = {"generator": self.generator, "device": self.generator.device}
             # the largest of uniform numbers, 0 where not allowed, is a uniform draw
             lottery = torch.rand(mask.shape, **draw) * mask
             action = torch.where(
@@ -118,7 +126,7 @@ class ExploringPolicy(TensorDictModuleBase):
         return tensordict.set(keys.ACTION, action).set(keys.CHOSEN_VALUE, chosen)
 
 
-class FunctionPolicy(TensorDictModuleBase):
+class FunctionPolicy(ObservationPolicy):
     """A plain function of observations as a policy, for ``ganlane benchmark`` and others.
 
     Args:
@@ -127,17 +135,12 @@ class FunctionPolicy(TensorDictModuleBase):
             change their rows.
     """
 
-    in_keys = [keys.OBSERVATION]  # noqa: RUF012
-    out_keys = [keys.ACTION]  # noqa: RUF012
-    rows_must_stay = False
-
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__()
         self.function = function
 
-    @torch.no_grad()
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action``."""
+    def act(self, tensordict: TensorDictBase) -> Tensor:
+        """What the function returns."""
         observation = tensordict.get(keys.OBSERVATION)
         chosen = torch.as_tensor(self.function(observation.cpu().numpy()))
         if chosen.shape != observation.shape[:1] or chosen.is_floating_point():
@@ -146,7 +149,7 @@ class FunctionPolicy(TensorDictModuleBase):
                 f"{name}: returned {chosen.dtype} {list(chosen.shape)} for observations "
                 f"{list(observation.shape)}; return a whole number 0, 1 or 2 for each row."
             )
-        return tensordict.set(keys.ACTION, chosen.long().to(observation.device))
+        return chosen.long().to(observation.device)
 
 
 class MaskedPolicy(TensorDictModuleBase):
@@ -285,7 +288,7 @@ class MobilDriver(Driver):
         road = road_in(tensordict, self.road)
         # -1 right, 0 stay, 1 left, of the ego alone
         scene = ego_scene(vehicles, road)
-        wish = mobil_wishes(scene, road, self.idm, self.mobil, road.exit_lane)[:, 0]
+        wish = mobil_wishes(scene, self.idm, self.mobil)[:, 0]
         # MOBIL decides once a second; the decisions of the ego may come more often.
         step = tensordict.get(keys.STEP)
         decisions = tensordict.get(keys.EGO).get("decisions")

@@ -42,6 +42,12 @@ from ganlane.torch_settings import compiled
 
 #: Parameters of a noisy layer.
 _PARAMETERS = ("weight_mu", "weight_sigma", "bias_mu", "bias_sigma")
+#: Of TorchRL's losses.
+_OPTIONS: dict[str, Any] = {
+    "delay_value": True,
+    "reduction": "none",
+    "use_prioritized_weights": False,
+}
 # Adam's usual decay rates, of the first and of the second moment.
 _BETA_1 = 0.9
 _BETA_2 = 0.999
@@ -129,13 +135,7 @@ class LeanDistributionalLoss(_OfRainbow, DistributionalDQNLoss):
             action_space="categorical",
             make_log_softmax=False,
         )
-        super().__init__(
-            actor,
-            gamma=network.config.agent.gamma,
-            delay_value=True,
-            reduction="none",
-            use_prioritized_weights=False,
-        )
+        super().__init__(actor, gamma=network.config.agent.gamma, **_OPTIONS)
         self._attach(network, actor)
 
 
@@ -147,14 +147,10 @@ class LeanDQNLoss(_OfRainbow, DQNLoss):
         super().__init__(
             actor,
             loss_function="smooth_l1",
-            delay_value=True,
             double_dqn=network.config.agent.double,
             action_space="categorical",
-            reduction="none",
-            use_prioritized_weights=False,
+            **_OPTIONS,
         )
-        # for TorchRL's own forward
-        self.make_value_estimator(gamma=network.config.agent.gamma)
         self._attach(network, actor)
 
 
@@ -229,8 +225,6 @@ class Learned(NamedTuple):
 class Settings(NamedTuple):
     """What does not change during a training."""
 
-    actions: int
-    atoms: int
     gamma: float
     gradient_clip: float
     adam_eps: float
@@ -336,18 +330,16 @@ def update(
         rate: learning rate, 0-dim.
         corrections: of Adam's two moments for their start at zero, [2].
     """
-    actions = settings.actions
-    atoms = settings.atoms
+    rows, actions = batch.allowed.shape
     layers = composed_layers(online, noise, actions)
     target_layers = composed_layers(target, target_noise, actions)
-    rows = len(batch.action)
     # the online network sees both observations in one product
     inputs = forward(layers, torch.cat((batch.observation, batch.following)))
-    logits = inputs.pop().unflatten(-1, (actions, atoms))
+    logits = inputs.pop().unflatten(-1, (actions, -1))
 
     # the targets: the online network chooses the next action, the target network values it
     best, chosen = allowed_values(logits[rows:].softmax(-1) @ support, batch.allowed).max(-1)
-    target_logits = forward(target_layers, batch.following)[-1].unflatten(-1, (actions, atoms))
+    target_logits = forward(target_layers, batch.following)[-1].unflatten(-1, (actions, -1))
     discount = torch.pow(settings.gamma, batch.steps)
     values = batch.reward[:, None] + (batch.alive * discount)[:, None] * support
     wanted, clamped = project(values, pick(target_logits, chosen).softmax(-1), support)
@@ -377,10 +369,7 @@ def update(
 
 
 class UpdateGraph:
-    """The compiled update of an agent (or, without ``compile``, the same function, eager).
-
-    It works on the tensors of the agent's networks and of its optimiser.
-    """
+    """The compiled :func:`update` of an agent, on the tensors of its networks and its optimiser."""
 
     def __init__(
         self,
@@ -388,16 +377,13 @@ class UpdateGraph:
         target: QNetwork,
         optimizer: torch.optim.Adam,
         config: RainbowConfig,
-        compile: bool = True,
     ) -> None:
         self.network = network
         self.target = target
         self.optimizer = optimizer
         (group,) = optimizer.param_groups
-        self.settings = Settings(
-            network.config.actions, config.atoms, config.gamma, config.gradient_clip, group["eps"]
-        )
-        self._update: Callable[..., Learned] = compiled(update) if compile else update
+        self.settings = Settings(config.gamma, config.gradient_clip, group["eps"])
+        self.update: Callable[..., Learned] = compiled(update)
 
     @torch.no_grad()
     def __call__(self, batch: TensorDictBase, generator: torch.Generator) -> Learned:
@@ -414,7 +400,7 @@ class UpdateGraph:
         for state in moments:
             state["step"].fill_(step)
         (group,) = self.optimizer.param_groups
-        return self._update(
+        return self.update(
             self.settings,
             self.network.support,
             [parameter.detach() for parameter in online],
@@ -435,7 +421,7 @@ class UpdateGraph:
         following = batch.get("next")
         allowed = following.get(keys.ACTION_MASK, None)
         if allowed is None:
-            allowed = torch.ones((len(action), self.settings.actions), dtype=torch.bool)
+            allowed = torch.ones((len(action), self.network.config.actions), dtype=torch.bool)
         return Batch(
             batch.get("observation"),
             action,
@@ -451,7 +437,7 @@ class UpdateGraph:
         """Adam's state of a parameter, made as Adam makes it at its first step."""
         state = self.optimizer.state[parameter]
         if not state:
-            state["step"] = torch.zeros((), dtype=torch.float32)
+            state["step"] = torch.zeros(())
             state["exp_avg"] = torch.zeros_like(parameter)
             state["exp_avg_sq"] = torch.zeros_like(parameter)
         return state

@@ -35,16 +35,11 @@ class Step(NamedTuple):
     def copied(cls, step: TensorDictBase) -> Step:
         """The tensors of a step, copied: the environment may write into its own afterwards."""
         after = step.get("next")
-        mask = after.get(keys.ACTION_MASK, None)
-        return cls(
-            step.get("observation").clone(),
-            step.get("action").clone(),
-            after.get("reward").clone(),
-            after.get("observation").clone(),
-            after.get("terminated").clone(),
-            after.get("done").clone(),
-            None if mask is None else mask.clone(),
-        )
+        names = ("reward", "observation", "terminated", "done")
+        tensors = [step.get("observation"), step.get("action"), *map(after.get, names)]
+        if keys.ACTION_MASK in after:
+            tensors.append(after.get(keys.ACTION_MASK))
+        return cls(*(tensor.clone() for tensor in tensors))
 
 
 class NStepWindow:
@@ -78,16 +73,15 @@ class NStepWindow:
         self.steps.append(Step.copied(step))
         if len(self.steps) < self.n:
             return None
-        # Rewards of later steps are added as long as no episode has ended in between.
-        first, *later = self.steps
-        reward = first.reward
-        following = first.following
-        terminated = first.terminated
+        # The oldest step gets its transition now and is not needed again. Rewards of later steps
+        # are added as long as no episode has ended in between.
+        first = self.steps.pop(0)
+        reward, following, terminated = first.reward, first.following, first.terminated
         mask = first.following_mask
         # Number of decisions whose rewards are summed, [N, 1].
         length = torch.ones_like(reward)
         running = ~first.done
-        for power, after in enumerate(later, start=1):
+        for power, after in enumerate(self.steps, start=1):
             # ``running``: no episode has ended between the oldest step and this one
             reward = reward + running * (self.gamma**power * after.reward)
             # what follows is the end of the last step that still belongs to it
@@ -97,8 +91,6 @@ class NStepWindow:
             terminated = torch.where(running, after.terminated, terminated)
             length = length + running
             running = running & ~after.done
-        # The oldest step has its transition now and is not needed again.
-        del self.steps[0]
         size = reward.shape[:1]
         end = {"observation": following, "reward": reward, "terminated": terminated}
         if mask is not None:

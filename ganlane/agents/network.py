@@ -26,16 +26,7 @@ from ganlane.settings.agent import RainbowConfig
 #: Weight and bias of each layer.
 Weights = list[tuple[Tensor, Tensor]]
 #: Options of an agent that shape its network; the support is ignored unless it is distributional.
-SHAPE = (
-    "hidden",
-    "noisy",
-    "dueling",
-    "distributional",
-    "atoms",
-    "v_min",
-    "v_max",
-    "noisy_sigma",
-)
+SHAPE = ("hidden", "noisy", "dueling", "distributional", "atoms", "v_min", "v_max", "noisy_sigma")
 #: Largest width of a layer: a damaged file must not ask for all memory.
 LARGEST = 65536
 

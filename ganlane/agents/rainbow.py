@@ -20,7 +20,7 @@ from ganlane.agents.network import (
     parameters_of,
     redraw_noise,
 )
-from ganlane.agents.replay import draw, load_replay_state, make_replay, replay_state
+from ganlane.agents.replay import load_replay_state, make_replay, replay_state
 from ganlane.errors import ParameterError, UserError
 from ganlane.settings.agent import RainbowConfig
 
@@ -125,7 +125,7 @@ class Rainbow:
             beta = annealed(config.beta_start, 1.0, self.updates, config.beta_updates)
             self.replay.sampler.beta = beta
         # one batch by priority
-        batch = draw(self.replay)
+        batch = self.replay.sample()
         descend = self._descend if self.graph is None else self.graph
         # both change the same parameters and the same state of Adam
         learned = descend(batch, self.generators["learn"])
@@ -176,22 +176,6 @@ class Rainbow:
         load_parameters(self.network, weights)
         self.loss.update_target()
 
-    def load_moments(self, moments: Mapping[int, Any]) -> None:
-        """Let Adam go on from ``moments``, the part ``state`` of an optimiser's state.
-
-        The learning rate and the other options are those of this agent.
-
-        Raises:
-            ValueError: they are of other weights.
-        """
-        # Adam would write beyond moments that are too short.
-        shapes = [parameter.shape for parameter in self.network.parameters()]
-        for name in ("exp_avg", "exp_avg_sq"):
-            if moments and [moments[row][name].shape for row in moments] != shapes:
-                raise ValueError("the optimiser's moments are of other weights")
-        # Learning rate and eps stay those of this run.
-        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": moments})
-
     def state_dict(self, with_replay: bool = True) -> dict[str, Any]:
         """Tensors and plain data for a bit-exact resume; noise is redrawn before use, so it is not
         among them.
@@ -223,6 +207,7 @@ class Rainbow:
         Raises:
             UserError: it is the state of an agent with other hyperparameters or another
                 observation.
+            ValueError: Adam's moments are of other weights.
         """
         for name, value in asdict(self.config).items():
             saved = state["config"][name]
@@ -234,7 +219,14 @@ class Rainbow:
         # in place: policies, losses and optimiser keep their references
         load_parameters(self.network, state["network"])
         load_parameters(self.target, state["target"])
-        self.load_moments(state["optimizer"]["state"])
+        moments = state["optimizer"]["state"]
+        # Adam would write beyond moments that are too short.
+        shapes = [parameter.shape for parameter in self.network.parameters()]
+        for name in ("exp_avg", "exp_avg_sq"):
+            if moments and [moments[row][name].shape for row in moments] != shapes:
+                raise ValueError("the optimiser's moments are of other weights")
+        # Learning rate and eps stay those of this run.
+        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": moments})
         for name, generator in self.generators.items():
             generator.set_state(state["generators"][name].cpu())
         self.updates = state["updates"]

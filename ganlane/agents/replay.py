@@ -54,18 +54,6 @@ def make_replay(config: RainbowConfig, generator: torch.Generator) -> TensorDict
     )
 
 
-def draw(buffer: TensorDictReplayBuffer) -> TensorDict:
-    """The batch that ``buffer.sample()`` would give, without its locks, transforms and checks.
-
-    Keys as stored, with ``index`` [B] and, where there are priorities, ``priority_weight`` [B].
-    """
-    index, info = buffer.sampler.sample(buffer.storage, buffer._batch_size)
-    batch = buffer.storage.get(index)
-    for name, value in {**info, "index": index}.items():
-        batch.set(name, value)
-    return batch
-
-
 def replay_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
     """Plain data: the transitions in use (by dotted key), the place of the next, the sampler."""
     # in the order of the storage, so that the indices of the sampler hold

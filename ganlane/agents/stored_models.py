@@ -22,11 +22,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torch import nn
+from torch import Tensor, nn
 
 from ganlane import keys
-from ganlane.agents.drivers import mask_in
+from ganlane.agents.drivers import ObservationPolicy, mask_in
+from ganlane.agents.network import allowed_values
 from ganlane.errors import ParameterError, UserError
 from ganlane.files import PLACE, atomic_path, has_checksum, refuse_without_checksum, write_json
 from ganlane.settings.actions import CONTROLS, ActionParameters
@@ -103,7 +103,7 @@ class Reading(Record):
     actions: ActionParameters = field(default_factory=ActionParameters)
 
 
-class StoredModel(TensorDictModuleBase):
+class StoredModel(ObservationPolicy):
     """The deterministic policy of a stored model: writes ``action`` for ``observation`` [N, D].
 
     The action is the number [N] of the largest output, or outputs [N, 2] from -1 to 1.
@@ -113,9 +113,6 @@ class StoredModel(TensorDictModuleBase):
         reading: what it reads and commands.
     """
 
-    out_keys = [keys.ACTION]  # noqa: RUF012
-    rows_must_stay = False
-
     def __init__(self, layers: nn.Sequential, reading: Reading) -> None:
         super().__init__()
         self.layers = layers
@@ -124,9 +121,8 @@ class StoredModel(TensorDictModuleBase):
         self.is_numbered = bool(reading.actions.names)
         self.in_keys = [keys.OBSERVATION, *([keys.ACTION_MASK] if self.is_masked else [])]
 
-    @torch.no_grad()
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action``."""
+    def act(self, tensordict: TensorDictBase) -> Tensor:
+        """The largest output of every row, or the outputs."""
         observation = tensordict.get(keys.OBSERVATION)
         expected = self.layers[0].in_features
         if observation.shape[-1] != expected:
@@ -139,10 +135,10 @@ class StoredModel(TensorDictModuleBase):
             observation = torch.from_numpy(normalised).to(observation.device)
         values = self.layers(observation)
         if not self.is_numbered:
-            return tensordict.set(keys.ACTION, values.clamp(-1.0, 1.0))
+            return values.clamp(-1.0, 1.0)
         if self.is_masked:
-            values = values.masked_fill(~mask_in(tensordict), -torch.inf)
-        return tensordict.set(keys.ACTION, values.argmax(-1))
+            values = allowed_values(values, mask_in(tensordict))
+        return values.argmax(-1)
 
 
 def description_of(file: Path) -> Path:

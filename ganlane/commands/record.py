@@ -50,16 +50,10 @@ def record(config: RecordConfig, folder: Path) -> str:
     set_threads(config.threads)
     # The stream decides which episodes are driven; a random driver draws from it, too.
     driver = make_driver(config.driver, config.env, Stream.named(config.stream), config.device)
-    mask, policy = driver.behind(config.mask)
-    driven = replace(
-        config,
-        env=driver.env(config.env),
-        # A trained agent reads the observation that it was trained with, whatever the command says.
-        observation=config.observation.read_by(driver.observation),
-        mask=mask,
-        # More rows than episodes would drive some that nobody asked for.
-        num_envs=min(config.num_envs, config.episodes),
-    )
+    # A trained agent reads the observation that it was trained with, whatever the command says.
+    driven, policy = driver.driving(config)
+    # More rows than episodes would drive some that nobody asked for.
+    driven = replace(driven, num_envs=min(config.num_envs, config.episodes))
     rows = TensorRows(driven)
     # What minari's recover_environment() makes.
     # The specification is shared by the whole process, so a copy is changed.

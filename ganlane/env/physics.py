@@ -11,7 +11,7 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from ganlane import keys
@@ -30,19 +30,19 @@ from ganlane.sim.dynamics import (
     Command,
     apply_action,
     change_progress,
+    drive,
     ego_scene,
     ego_surroundings,
-    move_ego,
 )
 from ganlane.sim.idm import following_acceleration
 from ganlane.sim.lane_ends import at_exit, hits_wall, leaves_road, ways_out
 from ganlane.sim.mobil import TABLE_IV, falling_behind, letting_past
 from ganlane.sim.neighbours import Scene
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
-from ganlane.traffic.base import TrafficModule, memory_of
+from ganlane.traffic.base import TrafficModule, memory_of, new_tensordict, where_rows, with_rows
 
-#: Name to tensor [N]: the ego's memory (:mod:`ganlane.env.state`).
-EgoMemory = dict[str, Tensor]
+#: Fields of the state by their names (:mod:`ganlane.env.state`), [N] or [N, 1].
+Fields = dict[str, Tensor]
 #: Called after every physics step with the vehicles and the rows [N] that were running in it.
 Recorder = Callable[[Vehicles, Tensor], None]
 
@@ -94,7 +94,7 @@ class Substep(NamedTuple):
 
 
 def begin(
-    rules: Rules, action: Tensor, vehicles: Vehicles, ego: EgoMemory, step: Tensor
+    rules: Rules, action: Tensor, vehicles: Vehicles, ego: Fields, step: Tensor
 ) -> tuple[Substep, Command]:
     """The first moment of a decision, before anything moves.
 
@@ -103,12 +103,11 @@ def begin(
     # The command sets the lane that the ego steers to; the motion itself takes several decisions.
     road = rules.road
     direction = ego["change_direction"]
-    line = acceleration = None
+    controls = None
     if rules.actions.form == CONTINUOUS:
         period_s = rules.episode.decision_period_s
-        command, line, acceleration = apply_controls(
-            action, vehicles, direction, road, rules.actions, period_s
-        )
+        controls = apply_controls(action, vehicles, direction, road, rules.actions, period_s)
+        command = controls.command
     else:
         command = apply_action(action, vehicles, direction, road, rules.ego.abort_lane_change)
     if rules.actions.form == LANE_SPEED:
@@ -117,9 +116,10 @@ def begin(
         speed = commanded_speed(action, ego[keys.SET_SPEED], desired[:, EGO_INDEX], rules.actions)
         vehicles = vehicles.with_(desired_speed=with_ego(speed, desired))
     vehicles = vehicles.with_(target_lane=with_ego(command.target_lane, vehicles.target_lane))
-    if line is None:
+    if controls is not None:
+        line, acceleration = controls.line, controls.acceleration
+    else:
         line = road.centre_of(command.target_lane[:, None], vehicles.y.dtype)[:, 0]
-    if acceleration is None:
         scene = ego_scene(vehicles, road)
         acceleration = following_acceleration(scene, rules.idm)[:, 0]
         acceleration = before_change(rules, scene, acceleration)
@@ -168,25 +168,20 @@ def arrived(rules: Rules, ego: Vehicles) -> tuple[Tensor, Tensor]:
     return goal, torch.zeros_like(goal)
 
 
-def advance(
-    rules: Rules,
-    before: Substep,
-    moved: Vehicles,
-    all_running: bool,
-) -> Substep:
+def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -> Substep:
     """One physics step in which the others have ``moved``: moves the ego and finds the events.
 
     A hard crash has precedence over leaving the road, that over goal and missed exit, and all over
     the time-out. With
     ``all_running`` no row has ended, which saves the copies that keep ended rows as they are.
     """
-    ego, steering = move_ego(
-        before.vehicles,
+    ego, steering = drive(
+        before.vehicles.at(EGO_INDEX),
         before.acceleration,
         before.steering,
         before.line,
-        rules.steering,
         PHYSICS_STEP_S,
+        rules.steering,
     )
     # The others moved while they saw the ego where it was: all move at once, from one state.
     running = before.running
@@ -234,8 +229,8 @@ def advance(
 
 
 def remember(
-    rules: Rules, before: EgoMemory, start: Substep, end: Substep, command: Command
-) -> EgoMemory:
+    rules: Rules, before: Fields, start: Substep, end: Substep, command: Command
+) -> Fields:
     """The ego's memory after a decision from ``start`` to ``end``."""
     # Over the whole decision, which may have ended early.
     ego = end.vehicles.at(EGO_INDEX)
@@ -262,7 +257,7 @@ def remember(
     return memory
 
 
-def outcome(rules: Rules, end: Substep) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+def outcome(rules: Rules, end: Substep) -> tuple[Fields, Fields]:
     """Events and done flags of a decision, each [N, 1]; every end has exactly one reason."""
     # Outcomes of the driving.
     terminated = end.goal | end.hard_crash | end.missed_exit | end.out_of_road
@@ -283,7 +278,7 @@ def outcome(rules: Rules, end: Substep) -> tuple[dict[str, Tensor], dict[str, Te
     return _columns(events), _columns(flags)
 
 
-def _columns(values: dict[str, Tensor]) -> dict[str, Tensor]:
+def _columns(values: Fields) -> Fields:
     return {name: value[:, None] for name, value in values.items()}
 
 
@@ -320,36 +315,7 @@ class EndedRows:
         """``memory`` with the kept rows as they were; its tensors are not written to."""
         if not self.rows or memory.is_empty():
             return memory
-        return _with_rows(memory, torch.cat(self.rows), torch.cat(self.memories))  # type: ignore[arg-type]
-
-
-def _with_rows(
-    memory: TensorDictBase,
-    rows: Tensor,
-    other: TensorDictBase,
-) -> TensorDict:
-    """``memory`` with its ``rows`` replaced by ``other`` [R], leaf by leaf."""
-
-    # Leaf by leaf, since the memory is nested like the traffic.
-    restored = {}
-    for name, value in memory.items():
-        if isinstance(value, Tensor):
-            restored[name] = value.index_copy(0, rows, other.get(name))
-        elif value.is_empty():
-            restored[name] = value
-        else:
-            restored[name] = _with_rows(value, rows, other.get(name))
-    return TensorDict._new_unsafe(restored, batch_size=memory.batch_size)
-
-
-def _where(
-    rows: Tensor,
-    new: Tensor,
-    old: Tensor,
-) -> Tensor:
-    """``new`` where ``rows`` [N] is true, ``old`` elsewhere."""
-    further_axes = [1] * (new.ndim - 1)
-    return torch.where(rows.reshape(-1, *further_axes), new, old)
+        return with_rows(memory, torch.cat(self.rows), torch.cat(self.memories))  # type: ignore[arg-type]
 
 
 def run_decision(
@@ -359,7 +325,6 @@ def run_decision(
     start: Substep,
     key: Tensor,
     recorder: Recorder | None = None,
-    substeps: int | None = None,
 ) -> tuple[Substep, TensorDictBase]:
     """All physics steps of a decision: where they lead, and the traffic's memory after it.
 
@@ -369,18 +334,17 @@ def run_decision(
     Args:
         state, start: at the beginning of the decision, and its first moment.
         key: of the episodes, [N] int64.
-        substeps: number of physics steps; None: those of the decision period.
     """
     memory = memory_of(state)
     now = start
     ended = EndedRows()
     counters = {name: state.get(name) for name in (keys.SEED, keys.EPISODE)}
     counters[keys.EPISODE_KEY] = key
-    size = memory.batch_size
+    n = memory.batch_size[0]
     can_read = reads_are_cheap(now.running)
     if can_read:
         ended.keep(~now.running, memory)
-    for count in range(rules.episode.substeps() if substeps is None else substeps):
+    for count in range(rules.episode.substeps()):
         before = now
         # On a CPU the remaining steps are left out once every row has ended.
         if known_false(before.running.any()):
@@ -388,26 +352,21 @@ def run_decision(
         # The traffic's clock continues in ended rows: stopped at a moment of decision it would make
         # these rows' drivers decide in all remaining steps, in vain.
         fields = {
-            keys.VEHICLES: TensorDict._new_unsafe(before.vehicles.as_dict(), batch_size=size),
+            keys.VEHICLES: new_tensordict(before.vehicles.as_dict(), n),
             keys.TRAFFIC: memory,
             **counters,
             keys.STEP: start.step + count,
         }
-        after = traffic(TensorDict._new_unsafe(fields, batch_size=size))
+        after = traffic(new_tensordict(fields, n))
         all_running = known_false((~before.running).any())
         moved = Vehicles.of(after.get(keys.MOVED))
-        now = advance(
-            rules,
-            before,
-            moved,
-            all_running,
-        )
+        now = advance(rules, before, moved, all_running)
         # The memory of ended rows: put aside when they end, or kept by a copy in every step.
         if can_read:
             memory = after.get(keys.TRAFFIC)
             ended.keep(before.running & ~now.running, memory)
         else:
-            memory = after.get(keys.TRAFFIC).apply(partial(_where, before.running), memory)
+            memory = after.get(keys.TRAFFIC).apply(partial(where_rows, before.running), memory)
         if recorder is not None:
             recorder(now.vehicles, before.running)
     return now, ended.restore(memory)

@@ -18,94 +18,37 @@ from torchrl.data.tensor_specs import Binary
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.settings.actions import CONTROLS, LANE_SPEED, ActionParameters
-from ganlane.sim.state import Road, Vehicles, road_fields
+from ganlane.sim.state import Vehicles
 from ganlane.torch_settings import check_default_device
 
 #: Name of a field to its type; None: the run's float type.
 Fields: TypeAlias = Mapping[str, torch.dtype | None]
 
-VEHICLES: Fields = {
-    **dict.fromkeys(keys.VEHICLE_FLOATS),
-    **dict.fromkeys(keys.VEHICLE_INTEGERS, torch.int64),
-    **dict.fromkeys(keys.VEHICLE_FLAGS, torch.bool),
-}
 #: What is remembered of the ego from one decision to the next.
 EGO: Fields = {
     **dict.fromkeys(keys.EGO_FLOATS),
     **dict.fromkeys(keys.EGO_INTEGERS, torch.int64),
     **dict.fromkeys(keys.EGO_FLAGS, torch.bool),
 }
-#: And further with ``env.actions=lane_speed``: the speed aimed at, m/s.
-COMMANDED: Fields = {keys.SET_SPEED: None}
 EVENTS: Fields = {
     **dict.fromkeys(keys.END_EVENTS, torch.bool),
     **dict.fromkeys(keys.EVENT_COUNTS, torch.int64),
 }
 DONE: Fields = dict.fromkeys(keys.DONE_FLAGS, torch.bool)
-COUNTERS: Fields = dict.fromkeys((keys.SEED, keys.EPISODE, keys.STEP), torch.int64)
 
 
-def state_spec(
-    n: int,
-    m: int,
-    dtype: torch.dtype,
-    memory: dict[str, Any],
-    row_road: Road | None,
-    actions: ActionParameters,
-) -> Composite:
-    """Spec of everything that a step writes except done flags and reward.
-
-    ``memory`` is the traffic's, nested name to (shape, dtype); ``row_road`` is the road of a row
-    where each has its own.
-    """
-    ego = {**EGO, **COMMANDED} if actions.form == LANE_SPEED else EGO
-    parts = {
-        keys.VEHICLES: Composite(_specs(VEHICLES, (n, m), dtype), shape=(n,)),
-        keys.EGO: Composite(_specs(ego, (n,), dtype), shape=(n,)),
-        keys.EVENTS: Composite(_specs(EVENTS, (n, 1), dtype), shape=(n,)),
-        **_memory_spec({keys.TRAFFIC: memory}, n),
-        **_specs(COUNTERS, (n,), dtype),
-    }
-    if row_road is not None:
-        of_road = {}
-        for name, field in road_fields(row_road).items():
-            of_road[name] = Unbounded(shape=(n, field.shape[1]), dtype=field.dtype)
-        parts[keys.ROAD] = Composite(of_road, shape=(n,))
-    return Composite(parts, shape=(n,))
-
-
-def done_spec(n: int) -> Composite:
-    """Spec of the done flags."""
-    return Composite(_specs(DONE, (n, 1), torch.float32), shape=(n,))
-
-
-def _specs(
-    fields: Fields,
-    shape: tuple[int, ...],
-    dtype: torch.dtype,
-) -> dict[str, Any]:
-    specs = {}
-    for name, kind in fields.items():
-        # TorchRL checks flags by a spec of their own.
-        spec = Binary if kind is torch.bool else Unbounded
-        specs[name] = spec(shape=shape, dtype=kind or dtype)
-    return specs
-
-
-def _memory_spec(memory: dict[str, Any], n: int) -> dict[str, Any]:
-    """Specs of a traffic module's memory, nested like the modules."""
+def spec_of(state: TensorDictBase, n: int) -> Composite:
+    """Spec of states of ``n`` rows, nested as this ``state`` of one row."""
     specs: dict[str, Any] = {}
-    for name, value in memory.items():
-        # A traffic that is made of others has a group of each.
-        if isinstance(value, dict):
-            parts = _memory_spec(value, n)
-            # TorchRL's SerialEnv and ParallelEnv refuse empty groups.
-            if parts:
-                specs[name] = Composite(parts, shape=(n,))
-        else:
-            shape, dtype = value
-            specs[name] = Unbounded(shape=shape, dtype=dtype)
-    return specs
+    for name, value in state.items():
+        if isinstance(value, Tensor):
+            # TorchRL checks flags by a spec of their own.
+            spec = Binary if value.dtype == torch.bool else Unbounded
+            specs[name] = spec(shape=(n, *value.shape[1:]), dtype=value.dtype)
+        # TorchRL's SerialEnv and ParallelEnv refuse empty groups.
+        elif not value.is_empty():
+            specs[name] = spec_of(value, n)
+    return Composite(specs, shape=(n,))
 
 
 def first_state(
@@ -121,17 +64,12 @@ def first_state(
     column = row[:, None]
     ego = {name: row.to(kind or row.dtype) for name, kind in EGO.items()}
     if actions.form == LANE_SPEED:
+        # The speed aimed at, m/s.
         ego[keys.SET_SPEED] = vehicles.desired_speed[:, keys.EGO_INDEX].clone()
     events = {name: column.to(kind) for name, kind in EVENTS.items()}
     done = {name: column.to(kind) for name, kind in DONE.items()}
     counters = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: torch.zeros_like(seed)}
-    return pack(
-        vehicles,
-        ego,
-        memory,
-        events,
-        {**counters, **done},
-    )
+    return pack(vehicles, ego, memory, events, {**counters, **done})
 
 
 def pack(
@@ -156,11 +94,7 @@ def pack(
 # Checks of what is handed in
 
 
-def check_counter(
-    name: str,
-    counter: Tensor | None,
-    rows: int,
-) -> Tensor:
+def check_counter(name: str, counter: Tensor | None, rows: int) -> Tensor:
     """``counter`` [N] int64 of a reset.
 
     Raises:
@@ -200,10 +134,7 @@ def usable_device(device: Any, dtype: Any) -> torch.device:
 
 
 def checked_action(
-    action: Tensor | None,
-    rows: int,
-    actions: ActionParameters,
-    values: bool = True,
+    action: Tensor | None, rows: int, actions: ActionParameters, values: bool = True
 ) -> Tensor:
     """``action`` [N] as int64, or [N, 2] for ``actions`` that are not numbered.
 
@@ -216,12 +147,20 @@ def checked_action(
     """
     if action is None:
         raise UserError(f"step(): no action; give 'action', {_expected(rows, actions)}.")
-    if not actions.names:
-        return _checked_controls(action, rows, actions)
-    count = len(actions.names)
+    numbered = bool(actions.names)
     # Flags and floats would be cast without a word.
-    if action.shape != (rows,) or action.is_floating_point() or action.dtype == torch.bool:
+    floating = action.is_floating_point()
+    fits = not (floating or action.dtype == torch.bool) if numbered else floating
+    if action.shape != ((rows,) if numbered else (rows, CONTROLS)) or not fits:
         raise _refused(f"of shape {list(action.shape)} in {action.dtype}", rows, actions)
+    if not numbered:
+        finite = torch.isfinite(action).all()
+        if torch.compiler.is_compiling():
+            torch._assert_async(finite, "action: each number must be finite")
+        elif not finite:
+            raise _refused("with a number that is not finite", rows, actions)
+        return action
+    count = len(actions.names)
     action = action.long()
     if torch.compiler.is_compiling():
         # A graph cannot branch on values.
@@ -233,17 +172,6 @@ def checked_action(
         wrong = numbers.view(np.uint64) >= count
         if wrong.any():
             raise _refused(str(numbers[wrong][0]), rows, actions)
-    return action
-
-
-def _checked_controls(action: Tensor, rows: int, actions: ActionParameters) -> Tensor:
-    if action.shape != (rows, CONTROLS) or not action.is_floating_point():
-        raise _refused(f"of shape {list(action.shape)} in {action.dtype}", rows, actions)
-    finite = torch.isfinite(action).all()
-    if torch.compiler.is_compiling():
-        torch._assert_async(finite, "action: each number must be finite")
-    elif not finite:
-        raise _refused("with a number that is not finite", rows, actions)
     return action
 
 

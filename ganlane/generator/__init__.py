@@ -8,7 +8,8 @@ Read in this order:
 - ``closed_loop``: one step of each preset, in fitting and in simulation, and rollouts of whole
   scenes;
 - ``forecasts``: of networks and IDM, and their scores;
-- ``tasks``: what each preset fits, and the loop; ``fit``: splits, one call, folds by scene.
+- ``tasks``: what each preset fits, and the loop (``descent``: what all updates have in common);
+  ``fit``: splits, one call, folds by scene.
 """
 
 from ganlane.generator.checkpoint import FitResult, load_generator, load_human

@@ -40,7 +40,7 @@ from ganlane.settings.generated import (
     AnchorParameters,
 )
 from ganlane.settings.generator import CalibratedConfig
-from ganlane.sim.idm import TABLE_V, following_acceleration
+from ganlane.sim.idm import TABLE_V, following_acceleration, with_headways
 from ganlane.sim.neighbours import FREE_GAP_M, Scene, leader, perceive
 from ganlane.sim.state import ENTRY_M, Road, Vehicles, Visibility
 from ganlane.torch_settings import constant
@@ -87,15 +87,11 @@ def recorded(generator: Generator, displacements: Tensor) -> History:
 
     The oldest motion is repeated.
     """
-    motions = generator.encoder.project_course(displacements).unbind(dim=-2)
+    motions = generator.encoder.project_course(displacements)
     return History((motions[0], *motions), displacements[..., -1, :])
 
 
-def push(
-    generator: Generator,
-    history: History,
-    displacement: Tensor,
-) -> tuple[History, Tensor]:
+def push(generator: Generator, history: History, displacement: Tensor) -> tuple[History, Tensor]:
     """The history with the new motion, and its difference [N, M, 2] to the last one, m."""
     difference = displacement - history.displacement
     # Only the new motion is projected; those of the older ones are kept.
@@ -103,22 +99,10 @@ def push(
     return History((*history.motions[1:], new), displacement), difference
 
 
-def observe(
-    history: History,
-    difference: Tensor,
-    vehicles: Vehicles,
-    extra: Tensor,
-) -> Observation:
+def observe(history: History, difference: Tensor, vehicles: Vehicles, extra: Tensor) -> Observation:
     """The generator's input after :func:`push`."""
     position = torch.stack([vehicles.x, vehicles.y], dim=-1)
-    return Observation(
-        history.motions,
-        history.displacement,
-        difference,
-        position,
-        vehicles.valid,
-        extra,
-    )
+    return Observation(*history, difference, position, vehicles.valid, extra)
 
 
 def displacement_of(vehicles: Vehicles) -> Tensor:
@@ -164,10 +148,7 @@ def wander(noise: Tensor, fresh: Tensor, period_s: float) -> Tensor:
 
 
 def paper_step(
-    generator: Generator,
-    vehicles: Vehicles,
-    history: History,
-    noise: Tensor,
+    generator: Generator, vehicles: Vehicles, history: History, noise: Tensor
 ) -> tuple[Vehicles, History]:
     """One step of the paper's preset: vehicles 0.1 s later, and their history.
 
@@ -211,11 +192,7 @@ def extra_inputs(scene: Scene, anchor: Tensor, offset: Tensor) -> Tensor:
 
 
 def inside_lane(
-    residual: Tensor,
-    offset: Tensor,
-    velocity: Tensor,
-    room: Tensor,
-    damping: float,
+    residual: Tensor, offset: Tensor, velocity: Tensor, room: Tensor, damping: float
 ) -> Tensor:
     """Lateral ``residual`` [N, M] in m/s2 without what would move the body out of its lane.
 
@@ -250,7 +227,7 @@ def anchored_step(
 
     # The anchor: IDM along the road; a spring and a damper to the target lane's centre across it.
     scene = perceive(vehicles, road)
-    anchor_x = following_acceleration(scene, p.idm, memory.headway)
+    anchor_x = following_acceleration(scene, with_headways(p.idm, memory.headway))
     if bound is not None:
         anchor_x = torch.minimum(anchor_x, bound(scene))
     offset = road.centre_of(vehicles.target_lane, vehicles.y.dtype) - vehicles.y
@@ -278,11 +255,7 @@ def anchored_step(
     return moved_by(vehicles, velocity_x, velocity_y), DriverMemory(history, mean, memory.headway)
 
 
-def recorded_vehicles(
-    segments: Segments,
-    frame: int,
-    desired_speed: Tensor,
-) -> Vehicles:
+def recorded_vehicles(segments: Segments, frame: int, desired_speed: Tensor) -> Vehicles:
     """The recorded vehicles [B, V] at ``frame`` (1 or later).
 
     Their velocity is that of the last displacement. Each occupies the lane of its centre only, with
@@ -311,9 +284,7 @@ def recorded_vehicles(
 
 
 def driven_positions(
-    segments: Segments,
-    desired_speed: Tensor,
-    move: Callable[[Vehicles, int], Vehicles],
+    segments: Segments, desired_speed: Tensor, move: Callable[[Vehicles, int], Vehicles]
 ) -> Tensor:
     """Positions [B, H, V, 2] in m when ``move`` drives all vehicles of the segments jointly.
 
@@ -409,8 +380,7 @@ def balanced_headway(vehicles: Vehicles, road: Road, otherwise: Tensor) -> Tenso
 
 
 def driver_params(
-    segments: Segments,
-    random: torch.Generator | None = None,
+    segments: Segments, random: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
     """Headways in s and desired speeds in m/s of the drivers, [B, V] each.
 

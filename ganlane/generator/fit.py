@@ -43,6 +43,7 @@ from ganlane.settings.generator import CalibratedConfig, HumanConfig, PaperConfi
 from ganlane.weights import load_weights, save_weights
 
 Config = PaperConfig | CalibratedConfig | HumanConfig
+Task = PaperTask | CalibratedTask | HumanTask
 #: Kind of the files of finished fits.
 FIT = "fit"
 #: Frames between the starts of two scored windows, the same for all presets.
@@ -157,14 +158,6 @@ def fit_key(config: Config, split: Split, following: Sequence[Recording]) -> str
     return digest.hexdigest()[:12]
 
 
-class Fitted(NamedTuple):
-    """A finished fit: its networks, the updates until they were best, and how long it took, s."""
-
-    task: PaperTask | CalibratedTask | HumanTask
-    updates: int
-    seconds: float
-
-
 def run_fit(
     config: Config,
     split: Split,
@@ -172,9 +165,13 @@ def run_fit(
     on_progress: OnProgress,
     name: str,
     following: Sequence[Recording],
-) -> Fitted:
-    """Fit to ``split``; what was fitted with ``folder`` before is taken from there."""
-    task: PaperTask | CalibratedTask | HumanTask
+) -> tuple[Task, int, float]:
+    """Fit to ``split``; what was fitted with ``folder`` before is taken from there.
+
+    Returns:
+        The networks, the updates until they were best, and how long it took, s.
+    """
+    task: Task
     if isinstance(config, HumanConfig):
         # No scene stops it early, so those for validation are fitted to, too.
         scenes = {scene.name: scene for scene in (*split.fitted, *split.validation)}
@@ -190,14 +187,13 @@ def run_fit(
         if path.is_file():
             weights, description = load_weights(path, FIT)
             task.load_state_dict(weights)
-            return Fitted(task, description["updates"], description["seconds"])
+            return task, description["updates"], description["seconds"]
     begun = time.monotonic()
     updates = task.fit(name, on_progress)
     seconds = time.monotonic() - begun
     if path is not None:
-        numbers = {"updates": updates, "seconds": seconds}
-        save_weights(path, FIT, task.state_dict(), numbers)
-    return Fitted(task, updates, seconds)
+        save_weights(path, FIT, task.state_dict(), {"updates": updates, "seconds": seconds})
+    return task, updates, seconds
 
 
 def fit_generator(
@@ -258,7 +254,7 @@ def predicted_steps(config: Config) -> int:
 HeldOut = tuple[np.ndarray, Forecasts]
 
 
-def held_out_errors(task: Any, scenes: list[Recording], steps: int, stride: int) -> HeldOut:
+def held_out_errors(task: Task, scenes: list[Recording], steps: int, stride: int) -> HeldOut:
     """Errors of forecasts of held-out ``scenes``: by the fit, constant velocity and IDM."""
     # The best of 20 is for short forecasts only; the policy draws many in any case.
     few = steps == LONG_STEPS and isinstance(task, CalibratedTask)
@@ -307,7 +303,7 @@ def cross_validate(
     short, long = [], []
     for number, split in enumerate(splits, start=1):
         name = f"fold {number} of {folds}"
-        task = run_fit(config, split, folder, on_progress, name, following).task
+        task, _, _ = run_fit(config, split, folder, on_progress, name, following)
         short.append(held_out_errors(task, split.held_out, predicted_steps(config), STRIDE))
         # A window of 5 s needs the observed positions before it as well.
         frames = OBSERVED_POSITIONS + LONG_STEPS

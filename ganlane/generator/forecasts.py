@@ -37,7 +37,7 @@ from ganlane.generator.windows import (
 )
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.generator import CalibratedConfig
-from ganlane.sim.idm import TABLE_V, following_acceleration
+from ganlane.sim.idm import TABLE_V, following_acceleration, with_headways
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.state import Vehicles
 
@@ -124,11 +124,7 @@ def by_kind(samples: np.ndarray, recorded: np.ndarray) -> Forecasts:
 
 @torch.no_grad()
 def paper_forecasts(
-    generator: Generator,
-    windows: Windows,
-    groups: Groups,
-    seed: int,
-    samples: int,
+    generator: Generator, windows: Windows, groups: Groups, seed: int, samples: int
 ) -> Forecasts:
     """The paper's preset, open loop, on the windows in ``groups``."""
     random = torch.Generator().manual_seed(seed)
@@ -173,6 +169,21 @@ def driven_windows(
     return np.concatenate(forecasts, axis=1)
 
 
+def driven_forecasts(
+    driver: Callable[[Segments], Tensor],
+    scenes: list[Recording],
+    horizon: int,
+    stride: int,
+    samples: int,
+) -> Forecasts:
+    """The kinds of forecasts (:func:`by_kind`) in all windows of 9 + ``horizon`` frames.
+
+    ``driver`` gives the mean prediction, then so many samples, as for :func:`driven_windows`.
+    """
+    forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
+    return by_kind(forecasts, cut_windows(scenes, stride, OBSERVED_POSITIONS + horizon).future)
+
+
 @torch.no_grad()
 def calibrated_forecasts(
     generator: Generator,
@@ -180,7 +191,7 @@ def calibrated_forecasts(
     horizon: int,
     stride: int,
     config: CalibratedConfig,
-    samples: int = SAMPLES,
+    samples: int,
 ) -> Forecasts:
     """The calibrated preset, rolled out through whole scenes.
 
@@ -193,8 +204,7 @@ def calibrated_forecasts(
         noise[:, 0] = 0.0
         return rollout(generator, segments, driver_params(segments), noise, config)
 
-    forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
-    return by_kind(forecasts, cut_windows(scenes, stride, OBSERVED_POSITIONS + horizon).future)
+    return driven_forecasts(driver, scenes, horizon, stride, samples)
 
 
 @torch.no_grad()
@@ -210,7 +220,7 @@ def idm_forecast(scenes: list[Recording], horizon: int, stride: int) -> np.ndarr
 
         def move(vehicles: Vehicles, step: int) -> Vehicles:
             scene = perceive(vehicles, segments.road)
-            acceleration = following_acceleration(scene, TABLE_V, headway)
+            acceleration = following_acceleration(scene, with_headways(TABLE_V, headway))
             speed = displacement_of(vehicles)[..., 0] / PHYSICS_STEP_S
             velocity = speed + acceleration * PHYSICS_STEP_S
             return moved_by(vehicles, velocity, torch.zeros_like(velocity))
@@ -236,11 +246,7 @@ def energy_score(one: Tensor, other: Tensor, recorded: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def rollout_score(
-    generator: Generator,
-    scenes: list[Recording],
-    config: CalibratedConfig,
-) -> float:
+def rollout_score(generator: Generator, scenes: list[Recording], config: CalibratedConfig) -> float:
     """Score of the calibrated preset's rollouts through scenes; 1 is constant velocity, 0 is best.
 
     The mean of the error for z = 0 and of the energy score of two samples, both over constant

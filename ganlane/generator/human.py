@@ -272,26 +272,46 @@ def perceive(vehicles: Vehicles, road: Road, sides: bool = True) -> View:
     )
 
 
-def features_of(vehicles: Vehicles, memory: Memory, road: Road, view: View) -> Tensor:
+class Situation(NamedTuple):
+    """Drivers at a decision, [N, M]: their vehicles, what they remember, and what they perceive."""
+
+    vehicles: Vehicles
+    memory: Memory
+    road: Road
+    view: View
+
+
+def situation_of(
+    vehicles: Vehicles, memory: Memory, road: Road, sides: bool = True, first: Tensor | None = None
+) -> Situation:
+    """What drivers perceive now (:func:`perceive`), with this decision's style in their memory
+    (:func:`with_style`).
+    """
+    view = perceive(vehicles, road, sides)
+    return Situation(vehicles, with_style(memory, view, first), road, view)
+
+
+def features_of(situation: Situation) -> Tensor:
     """What counts for the next move, [N, M, FEATURES]."""
-    ahead, behind, speed = view.ahead, view.behind, view.speed
+    view = situation.view
     features = [
-        *_own_state(vehicles, memory, road, view),
-        *_leader_of_leader(ahead),
-        *view.exists.to(speed.dtype).unbind(-1),
-        *_room(vehicles, road, ahead, behind),
-        *_seen(ahead, speed).flatten(-2).unbind(-1),
-        *_seen(behind, speed).flatten(-2).unbind(-1),
+        *_own_state(situation),
+        *_leader_of_leader(view.ahead),
+        *view.exists.to(view.speed.dtype).unbind(-1),
+        *_room(situation),
+        *_seen(view.ahead, view.speed).flatten(-2).unbind(-1),
+        *_seen(view.behind, view.speed).flatten(-2).unbind(-1),
     ]
     return torch.stack(features, -1)
 
 
-def _own_state(vehicles: Vehicles, memory: Memory, road: Road, view: View) -> list[Tensor]:
+def _own_state(situation: Situation) -> list[Tensor]:
     """22 numbers of the driver itself and its place in the lane."""
-    speed, aside, lane = view.speed, view.aside, view.lane
+    vehicles, memory, road, view = situation
+    speed, lane = view.speed, view.lane
     target = vehicles.target_lane.to(speed.dtype)
-    from_target = vehicles.y - target * road.lane_width_m
-    from_centre = vehicles.y - lane * road.lane_width_m
+    from_target = vehicles.y - road.centre_of(target)
+    from_centre = vehicles.y - road.centre_of(lane)
     return [
         speed / 10.0,
         ((vehicles.desired_speed - speed) / 5.0).clamp(-2.0, 2.0),
@@ -302,7 +322,7 @@ def _own_state(vehicles: Vehicles, memory: Memory, road: Road, view: View) -> li
         from_target.clamp(-4.0, 4.0),
         from_centre / road.lane_width_m * 2.0,
         (target - lane).clamp(-1.0, 1.0),
-        aside * 2.0,
+        view.aside * 2.0,
         *(memory.lateral_speeds * 2.0).unbind(-1),
         (vehicles.length > 7.0).to(speed.dtype),
         memory.age.clamp_max(LONGEST) / LONGEST,
@@ -326,14 +346,15 @@ def _leader_of_leader(ahead: Near) -> list[Tensor]:
     ]
 
 
-def _room(vehicles: Vehicles, road: Road, ahead: Near, behind: Near) -> list[Tensor]:
+def _room(situation: Situation) -> list[Tensor]:
     """8 numbers: room to those alongside, to the edges of the road, and where the leader is."""
-    width = vehicles.width
+    vehicles, _, road, view = situation
+    ahead, width = view.ahead, vehicles.width
     numbers = []
     for side, sign in ((2, 1.0), (0, -1.0)):
         nearest_aside = torch.full_like(width, 9.0)
         alongside = torch.zeros_like(vehicles.valid)
-        for near in (ahead, behind):
+        for near in (ahead, view.behind):
             beside = near.exists[..., side] & (near.gap[..., side] < 1.0)
             distance = torch.where(beside, sign * near.aside[..., side], 9.0)
             nearest_aside = torch.minimum(nearest_aside, distance)
@@ -361,20 +382,20 @@ def _seen(near: Near, speed: Tensor) -> Tensor:
     return torch.stack((distance, time_s, torch.asinh(near.closing), approach, exists), -2)
 
 
-def sides_of(vehicles: Vehicles, memory: Memory, road: Road, view: View) -> Tensor:
+def _sides_of(situation: Situation) -> Tensor:
     """What counts for a lane change to the left and to the right, [N, M, 2, SIDE_FEATURES], in the
     same order for both.
     """
-    speed, aside, lane = view.speed, view.aside, view.lane
-    ahead, behind = view.ahead, view.behind
+    vehicles, memory, road, view = situation
+    speed, ahead, behind = view.speed, view.ahead, view.behind
     pace = speed.clamp_min(3.0)
     own_gap = torch.log(ahead.gap[..., 1].clamp_min(0.5) / 10.0)
     # On a free lane one could be faster by 3 m/s.
     here = torch.where(ahead.exists[..., 1], ahead.closing[..., 1], 3.0).clamp(-5.0, 5.0)
-    from_centre = vehicles.y - lane * road.lane_width_m
+    from_centre = vehicles.y - road.centre_of(view.lane)
     # A change begins with a decision, not with the drift of a driver who keeps its lane: recorded
     # ones are found by how they move, which a choice of when to begin must not see.
-    under_way = (vehicles.target_lane != lane).to(speed.dtype)
+    under_way = (vehicles.target_lane != view.lane).to(speed.dtype)
     since = memory.since.clamp_max(LONGEST) / LONGEST
     sides = []
     for side, sign in ((2, 1.0), (0, -1.0)):
@@ -398,7 +419,7 @@ def sides_of(vehicles: Vehicles, memory: Memory, road: Road, view: View) -> Tens
             (1.5 - front).clamp(0.0, 2.0),
             (1.5 - rear).clamp(0.0, 2.0),
             (sign * towards).clamp(-1.0, 1.0),
-            (sign * aside * 3.0).clamp(-3.0, 3.0) * under_way,
+            (sign * view.aside * 3.0).clamp(-3.0, 3.0) * under_way,
             (sign * from_centre).clamp(-1.5, 1.5) * under_way,
             since,
         ]
@@ -462,8 +483,9 @@ class HumanPolicy(nn.Module):
 
 
 class LaneChoice(NamedTuple):
-    """What a lane choice depends on: ``sides`` [..., 2, S], whether lanes exist [..., 2], whether
-    the driver is in its target lane, and whether a change under way goes to the left, [...].
+    """What a lane choice depends on: ``sides`` [..., 2, SIDE_FEATURES], left and right in the same
+    order; whether lanes exist [..., 2]; whether the driver is in its target lane, and whether a
+    change under way goes to the left, [...].
     """
 
     sides: Tensor
@@ -472,24 +494,25 @@ class LaneChoice(NamedTuple):
     to_left: Tensor
 
 
-def lane_choice(vehicles: Vehicles, view: View, sides: Tensor) -> LaneChoice:
-    """The choice that each driver has, by its ``sides`` (:func:`sides_of`)."""
+def lane_choice(situation: Situation) -> LaneChoice:
+    """The choice that each driver has."""
+    view, target = situation.view, situation.vehicles.target_lane
     lane = view.lane.long()
-    target = vehicles.target_lane
-    return LaneChoice(sides, view.exists, target == lane, target > lane)
+    return LaneChoice(_sides_of(situation), view.exists, target == lane, target > lane)
 
 
-def with_choice(
-    vehicles: Vehicles, memory: Memory, view: View, choice: Tensor
-) -> tuple[Vehicles, Memory]:
-    """Vehicles and memory after a ``choice`` [N, M] of 0, 1 or 2
-    (:meth:`HumanPolicy.lane_chances`): who has chosen another lane heads for it and counts anew.
+def with_choice(situation: Situation, choice: Tensor) -> Situation:
+    """The situation after a ``choice`` [N, M] of 0, 1 or 2 (:meth:`HumanPolicy.lane_chances`): who
+    has chosen another lane heads for it and counts anew.
     """
+    vehicles, memory, _, view = situation
     old, lane = vehicles.target_lane, view.lane.long()
     step = (choice == 1).long() - (choice == 2).long()
     target = torch.where(old == lane, old + step, torch.where(choice == 1, lane, old))
     since = torch.where(target != old, 0.0, memory.since)
-    return vehicles.with_(target_lane=target), memory._replace(since=since)
+    return situation._replace(
+        vehicles=vehicles.with_(target_lane=target), memory=memory._replace(since=since)
+    )
 
 
 def chosen(chances: Tensor, u: Tensor) -> Tensor:
@@ -521,32 +544,30 @@ def with_style(memory: Memory, view: View, first: Tensor | None = None) -> Memor
     )
 
 
-def bounded(
-    vehicles: Vehicles, memory: Memory, road: Road, change: Tensor, aside: Tensor
-) -> tuple[Tensor, Tensor]:
+def bounded(situation: Situation, change: Tensor, aside: Tensor) -> tuple[Tensor, Tensor]:
     """Acceleration and lateral speed at the end of the decision, from their drawn changes.
 
     Nobody rolls back, moves aside faster than a car can, or steers off the road: a body reaches the
     edge in :data:`EDGE_S` at the soonest, and comes back from beyond it.
     """
-    speed, lateral = velocity(vehicles)
+    vehicles, memory, road, view = situation
     acceleration = memory.accelerations[..., 0] + change
     acceleration = acceleration.clamp(HARDEST_BRAKING, STRONGEST_ACCELERATION)
-    acceleration = torch.maximum(acceleration, -speed / DECISION_S)
+    acceleration = torch.maximum(acceleration, -view.speed / DECISION_S)
     half = 0.5 * vehicles.width + EDGE_M
     to_left = (road.left_edge_m() - vehicles.y - half) / EDGE_S
     to_right = (vehicles.y - road.right_edge_m() - half) / EDGE_S
-    lateral = torch.maximum(torch.minimum(lateral + aside, to_left), -to_right)
-    most = (STEEPEST * speed).clamp_max(FASTEST_ASIDE_MPS)
+    lateral = torch.maximum(torch.minimum(view.aside + aside, to_left), -to_right)
+    most = (STEEPEST * view.speed).clamp_max(FASTEST_ASIDE_MPS)
     return acceleration, lateral.clamp(-most, most)
 
 
-def remembered(vehicles: Vehicles, memory: Memory, view: View, acceleration: Tensor) -> Memory:
-    """The memory a decision later; ``vehicles`` have not moved yet."""
-    _, lateral = velocity(vehicles)
+def remembered(situation: Situation, acceleration: Tensor) -> Memory:
+    """The memory a decision later."""
+    _, memory, _, view = situation
     return Memory(
         torch.cat((acceleration[..., None], memory.accelerations[..., :-1]), -1),
-        torch.stack((lateral, memory.lateral_speeds[..., 0]), -1),
+        torch.stack((view.aside, memory.lateral_speeds[..., 0]), -1),
         torch.stack((view.closing, memory.closing[..., 0]), -1),
         memory.style,
         memory.age + 1.0,

@@ -5,7 +5,6 @@ A small network, fitted to pairs of recorded and smoothed tracks.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -14,6 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad, smooth_l1_loss
 
+from ganlane.generator.descent import descend, half_cosine
 from ganlane.generator.human import (
     ACCELERATIONS,
     DECISION_S,
@@ -133,28 +133,41 @@ def fit_estimator(
     """Fit the estimator to these scenes, which hold the recorded and the smoothed positions."""
     raw, smooth, motion = _tracks(scenes)
     optimizer = torch.optim.Adam(estimator.parameters(), RATE)
-    scales = torch.tensor(SCALES)
     for update in range(UPDATES):
-        optimizer.param_groups[0]["lr"] = RATE * 0.5 * (1 + math.cos(math.pi * update / UPDATES))
+        optimizer.param_groups[0]["lr"] = RATE * half_cosine(update, UPDATES)
         rows = torch.randint(len(raw), (BATCH,), generator=random)
-        # From no noise to a little more than the recorded one.
-        noise = 1.2 * torch.rand((BATCH, 1, 1), generator=random)
-        draw = torch.rand((BATCH, 1, 1), generator=random)
-        noise = torch.where(draw < 0.25, 0.0, torch.where(draw < 0.65, 1.0, noise))
+        noise = noise_shares(BATCH, 0.25, 0.65, random)
         positions = smooth[rows] + noise * (raw[rows] - smooth[rows])
         # The last two numbers are the error of the last position.
         wanted = motion[rows].clone()
         wanted[:, 5:] -= positions[:, -1]
-        side = torch.where(torch.rand(BATCH, generator=random) < 0.5, -1.0, 1.0)
+        side = random_sides(BATCH, random)
         positions = positions - positions[:, -1:]
-        positions[..., 1] *= side[:, None]
-        wanted[:, [3, 4, 6]] *= side[:, None]
-        error = (estimator(positions.float()) - wanted.float()) / scales
-        loss = smooth_l1_loss(error, torch.zeros_like(error))
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+        positions[..., 1] *= side
+        wanted[:, [3, 4, 6]] *= side
+        descend(optimizer, error_in(estimator(positions.float()) - wanted.float(), SCALES))
     estimator.requires_grad_(False)
+
+
+def noise_shares(rows: int, without: float, as_recorded: float, random: torch.Generator) -> Tensor:
+    """Shares [rows, 1, 1] of the recorded noise: none, all, or a little more than that at most.
+
+    ``without`` is the chance of none, ``as_recorded`` that of none or all.
+    """
+    share = 1.2 * torch.rand((rows, 1, 1), generator=random)
+    draw = torch.rand((rows, 1, 1), generator=random)
+    return torch.where(draw < without, 0.0, torch.where(draw < as_recorded, 1.0, share))
+
+
+def random_sides(rows: int, random: torch.Generator) -> Tensor:
+    """Signs [rows, 1] of numbers across the road: left and right are alike."""
+    return torch.where(torch.rand((rows, 1), generator=random) < 0.5, -1.0, 1.0)
+
+
+def error_in(difference: Tensor, scales: tuple[float, ...]) -> Tensor:
+    """The mean smooth absolute error of a ``difference`` in units of ``scales``."""
+    error = difference / torch.tensor(scales)
+    return smooth_l1_loss(error, torch.zeros_like(error))
 
 
 def _tracks(scenes: Sequence[SmoothScene]) -> tuple[Tensor, Tensor, Tensor]:

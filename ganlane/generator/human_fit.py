@@ -13,21 +13,23 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import softplus
 
 from ganlane.data.dense import Recording
+from ganlane.generator.descent import descend, half_cosine
 from ganlane.generator.human import (
     ACCELERATIONS,
     ACROSS,
     ALONG,
     HumanPolicy,
     Memory,
+    Situation,
     cars,
     features_of,
+    lane_choice,
     leaves_room,
     perceive,
-    sides_of,
 )
 from ganlane.generator.human_estimator import HumanModel, fit_estimator
 from ganlane.generator.human_samples import (
@@ -47,7 +49,7 @@ from ganlane.generator.human_samples import (
 )
 from ganlane.generator.human_tuning import Report, begins_per_decision, tune
 from ganlane.settings.generator import HumanConfig
-from ganlane.sim.idm import IdmParameters, following_acceleration
+from ganlane.sim.idm import IdmParameters, following_acceleration, with_headways
 from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.state import Road
 
@@ -123,34 +125,20 @@ def fit_human(
         material = material_of(scenes, random)
         # Lane changes are few: none of them is hidden, as the sides are from some of the moves.
         choices = _gathered(material, Options(blind=0.0), config, random, times=2).choices
-        teacher = clone(model.policy, material, choices, config, random)
+        teacher = _gathered(material, Options(), config, random, times=3).moves
+        policy, danger = model.policy, material.danger
+        for rate in (config.learning_rate, 0.5 * config.learning_rate):
+            train_moves(policy, teacher, material.prior, max(1, config.epochs // 2), rate, random)
+        train_lane_choice(policy, choices, danger, random)
+        match_rate(policy, choices)
         report(None)
         close_the_loop(model, material, teacher, config, random, report)
-        policy, danger = model.policy, material.danger
         tune(policy, choices, danger, config.tuning, config.pull, random, report)
         match_rate(policy, choices)
         # More lane changes bring new accidents: it learns to do without them at this level.
         pull = SETTLING_TIMES * config.pull
         tune(policy, None, danger, config.settling, pull, random, report)
         return model.eval().requires_grad_(False)
-
-
-def clone(
-    policy: HumanPolicy,
-    material: Material,
-    choices: Choices,
-    config: HumanConfig,
-    random: torch.Generator,
-) -> Moves:
-    """Fit ``policy`` to what recorded drivers did, its lane choice to ``choices``; gives the
-    teacher samples of moves.
-    """
-    moves = _gathered(material, Options(), config, random, times=3).moves
-    for rate in (config.learning_rate, 0.5 * config.learning_rate):
-        train_moves(policy, moves, material.prior, max(1, config.epochs // 2), rate, random)
-    train_lane_choice(policy, choices, material.danger, random)
-    match_rate(policy, choices)
-    return moves
 
 
 def close_the_loop(
@@ -167,9 +155,8 @@ def close_the_loop(
     noisy = options._replace(estimator=model.estimator)
     for number in range(config.rounds):
         # Long stretches begin as recorded, short ones as nine noisy positions show drivers.
-        parts = _gathered(material, options, config, random, times=2)
-        short = samples_of(material.short, noisy, random)
-        latest = joined([parts, short]).moves
+        long = _gathered(material, options, config, random, times=2)
+        latest = joined([long, samples_of(material.short, noisy, random)]).moves
         bank = [*bank[-1:], latest]
         rows = torch.randperm(len(teacher.change), generator=random)[: len(latest.change)]
         moves = Moves(*map(torch.cat, zip(teacher.rows(rows), *bank)))
@@ -209,12 +196,7 @@ def train_moves(
     optimizer = torch.optim.AdamW(parameters, lr=rate, weight_decay=1e-3, fused=True)
     rows = len(moves.change)
     updates = max(1, epochs * (rows // BATCH))
-
-    def share(update: int) -> float:
-        # A short warm-up, then a half cosine to 0.
-        return min(1.0, (update + 1) / 100) * 0.5 * (1.0 + math.cos(math.pi * update / updates))
-
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, share)
+    update = 0
     for _ in range(epochs):
         for batch in torch.randperm(rows, generator=random).split(BATCH):
             beside = int(PRIOR_SHARE * len(batch))
@@ -225,11 +207,11 @@ def train_moves(
             losses = -(ALONG.soft_target(both.change) * along.log_softmax(-1)).sum(-1)
             lateral = -(ACROSS.soft_target(both.aside) * across.log_softmax(-1)).sum(-1)
             loss = (losses * both.weight + lateral * both.lateral_weight).mean()
-            optimizer.zero_grad()
-            loss.backward()
-            nn.utils.clip_grad_norm_(parameters, 5.0)
-            optimizer.step()
-            schedule.step()
+            # A short warm-up, then a half cosine to 0.
+            rise = min(1.0, (update + 1) / 100)
+            optimizer.param_groups[0]["lr"] = rate * (rise * half_cosine(update, updates))
+            descend(optimizer, loss, 5.0)
+            update += 1
 
 
 def train_lane_choice(
@@ -264,9 +246,7 @@ def train_lane_choice(
         loss = loss + softplus(-in_danger[:, 1]).mean()
         if len(under_way):
             loss = loss + 2.0 * softplus(policy.lane(under_way)[:, 1] + 1.0).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+        descend(optimizer, loss)
 
 
 @torch.no_grad()
@@ -321,7 +301,7 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
         target_lane=target,
     )
     idm = IdmParameters(comfortable_deceleration=2.0, min_acceleration=-8.0, max_acceleration=1.4)
-    wanted = following_acceleration(scene_of(vehicles, road), idm, headway)
+    wanted = following_acceleration(scene_of(vehicles, road), with_headways(idm, headway))
     before = torch.where(rand() < 0.5, 0.6 * randn(), (wanted * rand()).clamp(-6.0, 2.0))
     history = before[..., None] + 0.4 * randn(*shape, ACCELERATIONS)
     history[..., 0] = before
@@ -332,23 +312,22 @@ def prior_samples(random: torch.Generator, scenes: int = PRIOR_SCENES) -> tuple[
     vehicles = vehicles.with_(acceleration=before)
     view = perceive(vehicles, road)
     memory = memory._replace(closing=view.closing[..., None] + 0.3 * randn(*shape, 2))
-    sides = sides_of(vehicles, memory, road, view)
+    situation = Situation(vehicles, memory, road, view)
 
     time_to_collision = view.gap / (-view.closing).clamp_min(1e-3)
     silent = (speed > 19.0) | (speed < 1.5) | (view.gap > 80.0)
     silent |= (time_to_collision < 4.0) | (view.gap / speed.clamp_min(1.0) < 0.5)
     # Few overlap.
     silent &= ~((view.gap < 0.0) & (rand() < 0.8))
-    off_target = vehicles.y - target * 3.6
-    far_off = off_target.abs() > 0.75
+    far_off = (y - road.centre_of(target)).abs() > 0.75
 
     # Half of the way to IDM's acceleration, all of it where that is hard braking.
     hard = wanted < -2.0
     change = torch.where(hard, 1.0, 0.5) * (wanted - before)
     change = change + torch.where(hard, 0.05, 0.18) * randn()
-    back = (-0.45 * (vehicles.y - lane * 3.6)).clamp(-0.9, 0.9)
+    back = (-0.45 * (y - road.centre_of(lane))).clamp(-0.9, 0.9)
     sideways = 0.4 * (back - aside) + 0.03 * randn()
     lateral_weight = torch.where(far_off, 0.5, 0.1)
-    features = features_of(vehicles, memory, road, view)
-    moves = Moves(features, change, sideways, silent.float(), lateral_weight)
+    moves = Moves(features_of(situation), change, sideways, silent.float(), lateral_weight)
+    sides = lane_choice(situation).sides
     return moves.rows(silent | far_off), sides[~leaves_room(sides) & view.exists]

@@ -7,23 +7,22 @@ on the policy drives everybody in the scene, by expected moves (the mean driver)
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import smooth_l1_loss
 
 from ganlane.data.dense import Recording
-from ganlane.generator.forecasts import SAMPLES, Forecasts, by_kind, driven_windows
+from ganlane.generator.descent import descend, half_cosine
+from ganlane.generator.forecasts import Forecasts, driven_forecasts, driven_windows
 from ganlane.generator.human import (
     ACROSS,
     ALONG,
     DECISION_S,
     SIGHT_M,
     STEPS,
-    Memory,
+    Situation,
     bounded,
     cars,
     chosen,
@@ -31,32 +30,24 @@ from ganlane.generator.human import (
     lane_after,
     lane_choice,
     moved,
-    perceive,
     remembered,
-    sides_of,
-    velocity,
+    situation_of,
     with_choice,
-    with_style,
 )
 from ganlane.generator.human_estimator import (
     DIFFERENCE_SCALE,
     Estimator,
     HumanModel,
+    error_in,
     present_memory,
+    random_sides,
     trust,
 )
 from ganlane.generator.human_samples import DESIRED_MPS, smooth_scene
-from ganlane.generator.windows import (
-    OBSERVED_POSITIONS,
-    PREDICTED_STEPS,
-    PRESENT,
-    Segments,
-    cut_windows,
-)
+from ganlane.generator.windows import OBSERVED_POSITIONS, PREDICTED_STEPS, PRESENT, Segments
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.driving import HumanVariation
 from ganlane.settings.generator import HumanConfig
-from ganlane.sim.state import Road, Vehicles
 
 #: A driver's desired speed is its present one and this much, m/s.
 DESIRED_ABOVE_MPS = 4.0
@@ -72,8 +63,8 @@ NOISE_SHARES = (0.0, 0.5, 1.0, 1.2)
 OBSERVER_STRIDE, OBSERVER_BATCH, OBSERVER_RATE = 2, 512, 3e-3
 
 
-def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memory, Road]:
-    """Vehicles and memories at the present of segments [B, V].
+def present_of(estimator: Estimator, segments: Segments) -> Situation:
+    """The drivers at the present of segments [B, V].
 
     Who was not recorded in all of the nine frames goes on at constant velocity so far.
     """
@@ -85,10 +76,10 @@ def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memo
     speed = torch.where(whole, motion[..., 0], latest).clamp_min(0.0)
     aside = motion[..., 3]
     x, y = (last + motion[..., 5:]).unbind(-1)
-    road = Road(segments.lanes.float(), segments.lane_width)
+    road = segments.road
     lane = road.lane_of(y)
     # Who moves away from its lane's centre is on its way to the next lane.
-    leaving = (aside.abs() > CHANGING_MPS) & ((y - lane * road.lane_width_m) * aside > 0.1)
+    leaving = (aside.abs() > CHANGING_MPS) & ((y - road.centre_of(lane)) * aside > 0.1)
     vehicles = cars(
         x,
         y,
@@ -102,17 +93,12 @@ def present_of(estimator: Estimator, segments: Segments) -> tuple[Vehicles, Memo
         valid=segments.present[:, PRESENT],
     )
     memory = present_memory(motion, torch.where(whole, trust(nine), 0.0))
-    view = perceive(vehicles, road)
-    return vehicles, with_style(memory, view, torch.ones_like(whole)), road
+    return situation_of(vehicles, memory, road, first=torch.ones_like(whole))
 
 
 @torch.no_grad()
 def human_forecasts(
-    model: HumanModel,
-    scenes: list[Recording],
-    horizon: int,
-    stride: int,
-    samples: int = SAMPLES,
+    model: HumanModel, scenes: list[Recording], horizon: int, stride: int, samples: int
 ) -> Forecasts:
     """The mean driver's and drawn drivers' positions in all windows of the scenes."""
     random = torch.Generator().manual_seed(0)
@@ -120,59 +106,46 @@ def human_forecasts(
     def driver(segments: Segments) -> Tensor:
         return _driven(model, segments, horizon, samples, random)
 
-    forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
-    return by_kind(forecasts, cut_windows(scenes, stride, OBSERVED_POSITIONS + horizon).future)
+    return driven_forecasts(driver, scenes, horizon, stride, samples)
 
 
 def _driven(
-    model: HumanModel,
-    segments: Segments,
-    horizon: int,
-    samples: int,
-    random: torch.Generator,
+    model: HumanModel, segments: Segments, horizon: int, samples: int, random: torch.Generator
 ) -> Tensor:
     """Positions [1 + samples, B, horizon, V, 2]; the first are the mean driver's."""
     policy = model.policy
     runs, rows = 1 + samples, len(segments.positions)
-    vehicles, memory, road = present_of(model.estimator, segments.repeated(runs))
+    situation = present_of(model.estimator, segments.repeated(runs))
     # The first copy of the segments makes the expected moves, the others draw theirs.
-    mean = torch.zeros_like(vehicles.valid)
+    mean = torch.zeros_like(situation.vehicles.valid)
     mean[:rows] = True
-    view = perceive(vehicles, road)
-    leads = view.gap >= SIGHT_M
+    leads = situation.view.gap >= SIGHT_M
     temperature = HumanVariation.temperature
-    steps = torch.arange(1, STEPS + 1) * PHYSICS_STEP_S
+    steps = (torch.arange(1, STEPS + 1) * PHYSICS_STEP_S)[:, None, None]
     course = []
-    for decision in range(-(-horizon // STEPS)):
-        # The present's style is that of the nine positions.
-        if decision:
-            view = perceive(vehicles, road)
-            memory = with_style(memory, view)
-        option = lane_choice(vehicles, view, sides_of(vehicles, memory, road, view))
-        chances = policy.lane_chances(option, HumanVariation.lane_changes)
+    for _ in range(-(-horizon // STEPS)):
+        chances = policy.lane_chances(lane_choice(situation), HumanVariation.lane_changes)
         # The mean driver goes on as it does.
         choice = chosen(chances, torch.rand(mean.shape, generator=random)).masked_fill(mean, 0)
-        vehicles, memory = with_choice(vehicles, memory, view, choice)
+        situation = with_choice(situation, choice)
         changes = []
-        features = features_of(vehicles, memory, road, view)
-        for tokens, logits in zip((ALONG, ACROSS), policy(features)):
+        for tokens, logits in zip((ALONG, ACROSS), policy(features_of(situation))):
             u = torch.rand(mean.shape, generator=random)
             drawn = tokens.sample(logits, u, temperature)
             changes.append(torch.where(mean, tokens.mean(logits), drawn))
+        vehicles, memory, road, view = situation
         # A policy that sees no leader would speed up.
         fading = (LEFT_OF_ACCELERATION - 1.0) * memory.accelerations[..., 0]
         changes[0] = torch.where(leads, fading, changes[0])
-        acceleration, aside = bounded(vehicles, memory, road, *changes)
-        speed, lateral = velocity(vehicles)
+        acceleration, aside = bounded(situation, *changes)
         # Within a decision: constant acceleration, the lateral speed changing evenly.
-        half = 0.5 * steps[:, None, None] ** 2
-        x = vehicles.x + speed * steps[:, None, None] + half * acceleration
-        y = vehicles.y + lateral * steps[:, None, None] + half * (aside - lateral) / DECISION_S
+        half = 0.5 * steps**2
+        x = vehicles.x + view.speed * steps + half * acceleration
+        y = vehicles.y + view.aside * steps + half * (aside - view.aside) / DECISION_S
         course.append(torch.stack((x, y), -1))
-        memory = remembered(vehicles, memory, view, acceleration)
-        vehicles = moved(vehicles, acceleration, aside)
-    positions = torch.cat(course)[:horizon]
-    positions = positions.transpose(0, 1).unflatten(0, (runs, rows))
+        later = moved(vehicles, acceleration, aside)
+        situation = situation_of(later, remembered(situation, acceleration), road)
+    positions = torch.cat(course)[:horizon].transpose(0, 1).unflatten(0, (runs, rows))
     return positions + _seen_besides(model, segments, positions[0])
 
 
@@ -205,35 +178,24 @@ def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanCo
     model.observer.requires_grad_(True)
     for parameter in model.observer.layers[-1].parameters():
         nn.init.zeros_(parameter)
-    noisy = [_with_noise(scene, share, config) for share in NOISE_SHARES for scene in scenes]
+    smoothed = [smooth_scene(scene, config) for scene in scenes]
+    noisy = []
+    for share in NOISE_SHARES:
+        for scene, smooth in zip(scenes, smoothed):
+            x = smooth.x + share * (scene.x - smooth.x)
+            y = smooth.y + share * (scene.y - smooth.y)
+            noisy.append(replace(scene, x=x, y=y))
     with torch.no_grad():
         windows = driven_windows(recorded_and_driven, noisy, PREDICTED_STEPS, OBSERVER_STRIDE)[0]
     parts = (OBSERVED_POSITIONS, PREDICTED_STEPS, PREDICTED_STEPS)
     positions, wanted, forecast = torch.from_numpy(windows).float().split(parts, 1)
-    scale = torch.tensor(DIFFERENCE_SCALE)
     optimizer = torch.optim.AdamW(model.observer.parameters(), OBSERVER_RATE, weight_decay=1e-2)
     for update in range(config.observing):
-        share = 0.5 * (1.0 + math.cos(math.pi * update / config.observing))
-        optimizer.param_groups[0]["lr"] = OBSERVER_RATE * share
+        optimizer.param_groups[0]["lr"] = OBSERVER_RATE * half_cosine(update, config.observing)
         rows = torch.randint(len(wanted), (OBSERVER_BATCH,), generator=random)
-        # Left and right are alike.
-        side = torch.where(torch.rand(OBSERVER_BATCH, generator=random) < 0.5, -1.0, 1.0)
-        mirror = torch.stack((torch.ones_like(side), side), -1)[:, None]
+        side = random_sides(OBSERVER_BATCH, random)
+        mirror = torch.stack((torch.ones_like(side), side), -1)
         seen, ahead = mirror * positions[rows], mirror * forecast[rows]
         missed = mirror * wanted[rows] - ahead
-        error = (model.observer(seen, ahead) - missed) / scale
-        loss = smooth_l1_loss(error, torch.zeros_like(error))
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+        descend(optimizer, error_in(model.observer(seen, ahead) - missed, DIFFERENCE_SCALE))
     model.observer.requires_grad_(False)
-
-
-def _with_noise(scene: Recording, share: float, config: HumanConfig) -> Recording:
-    """The scene with a ``share`` of its camera's errors."""
-    smooth = smooth_scene(scene, config)
-    return replace(
-        scene,
-        x=smooth.x + share * (scene.x - smooth.x),
-        y=smooth.y + share * (scene.y - smooth.y),
-    )

@@ -31,20 +31,18 @@ from ganlane.generator.human import (
     HumanPolicy,
     LaneChoice,
     Memory,
+    Situation,
     bounded,
     cars,
     features_of,
     lane_choice,
     memory_of,
     moved,
-    perceive,
     remembered,
-    sides_of,
-    velocity,
-    with_style,
+    situation_of,
     with_velocity,
 )
-from ganlane.generator.human_estimator import Estimator, present_memory, trust
+from ganlane.generator.human_estimator import Estimator, noise_shares, present_memory, trust
 from ganlane.generator.windows import OBSERVED_POSITIONS, side_by_side
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.generator import HumanConfig
@@ -212,9 +210,9 @@ class Segments(NamedTuple):
 
     def scaled(self, factor: Tensor) -> Segments:
         """Lengths along the road times ``factor`` [B, 1]; cars keep theirs, headways stay."""
-        x = self.x * factor[:, None]
-        noise = self.raw_x - self.x
-        return self._replace(x=x, raw_x=x + noise, speed=self.speed * factor[:, None])
+        by = factor[:, None]
+        x = self.x * by
+        return self._replace(x=x, raw_x=x + (self.raw_x - self.x), speed=self.speed * by)
 
     def widened(self, factor: Tensor) -> Segments:
         """Lanes and lateral moves times ``factor`` [B, 1]."""
@@ -234,6 +232,25 @@ class Cut(NamedTuple):
     start: int
     frames: int
     who: np.ndarray
+
+    def field(self, name: str) -> np.ndarray:
+        """A field of the scene in the frames of the stretch, [T, M]; 0 outside of the scene."""
+        first = max(self.start, 0)
+        frames = slice(first, self.start + self.frames)
+        inside = getattr(self.scene, name)[frames, self.who]
+        before = first - self.start
+        after = self.frames - before - len(inside)
+        field = np.pad(inside, ((before, after), (0, 0)))
+        if field.dtype == np.float64:
+            field = field.astype(np.float32)
+        if name in ("x", "raw_x"):
+            # Near 0, where float32 is exact to micrometres.
+            field -= self.scene.x[frames, self.who].mean()
+        return field
+
+
+#: What a stretch holds in every frame.
+IN_FRAMES = ("x", "y", "raw_x", "raw_y", "speed", "lateral_speed", "target", "present")
 
 
 def cuts(scenes: Sequence[SmoothScene], decisions: int, stride: int) -> list[Cut]:
@@ -263,48 +280,24 @@ def batches(stretches: Sequence[Cut]) -> Iterator[Segments]:
 
 def segments_of(stretches: Sequence[Cut]) -> Segments:
     """The stretches as one batch; frames outside of their scenes are absent."""
-    scenes = [cut.scene for cut in stretches]
 
     def column(name: str) -> Tensor:
-        return torch.tensor([[getattr(scene, name)] for scene in scenes], dtype=torch.float32)
+        return torch.tensor([[getattr(cut.scene, name)] for cut in stretches], dtype=torch.float32)
 
-    arrays: dict[str, list[np.ndarray]] = {
-        name: [stretch_of(cut, name) for cut in stretches] for name in IN_FRAMES
-    }
-    for number, cut in enumerate(stretches):
-        # Near 0, where float32 is exact to micrometres.
-        frames = slice(max(cut.start, 0), cut.start + cut.frames)
-        middle = cut.scene.x[frames, cut.who].mean()
-        for name in ("x", "raw_x"):
-            arrays[name][number] = (arrays[name][number] - middle).astype(np.float32)
+    def of_vehicles(name: str, filler: float) -> Tensor:
+        return side_by_side([getattr(cut.scene, name)[cut.who] for cut in stretches], filler)
 
-    def of_vehicles(name: str) -> list[np.ndarray]:
-        return [getattr(cut.scene, name)[cut.who] for cut in stretches]
-
+    in_frames = {name: side_by_side([cut.field(name) for cut in stretches]) for name in IN_FRAMES}
     return Segments(
-        **{name: side_by_side(parts) for name, parts in arrays.items()},
+        **in_frames,
         # Finite sizes for those that fill the batch.
-        length=side_by_side(of_vehicles("length"), 1.0).float(),
-        width=side_by_side(of_vehicles("width"), 1.0).float(),
-        driven=side_by_side(of_vehicles("driven")),
+        length=of_vehicles("length", 1.0).float(),
+        width=of_vehicles("width", 1.0).float(),
+        driven=of_vehicles("driven", 0.0),
         lanes=column("lanes"),
         lane_width_m=column("lane_width_m"),
         weight=column("weight"),
     )
-
-
-#: What a stretch holds in every frame.
-IN_FRAMES = ("x", "y", "raw_x", "raw_y", "speed", "lateral_speed", "target", "present")
-
-
-def stretch_of(cut: Cut, name: str) -> np.ndarray:
-    """A field of the stretch's scene, [T, M], of its vehicles; 0 in frames outside of the scene."""
-    numbers = getattr(cut.scene, name)
-    frames = cut.start + np.arange(cut.frames)
-    outside = (frames < 0) | (frames >= len(numbers))
-    taken = numbers[np.ix_(frames.clip(0, len(numbers) - 1), cut.who)]
-    taken[outside] = 0
-    return taken.astype(np.float32) if taken.dtype == np.float64 else taken
 
 
 def recorded(s: Segments, decision: int, desired: Tensor) -> tuple[Vehicles, Memory]:
@@ -437,44 +430,35 @@ def _samples(segments: Segments, options: Options, random: torch.Generator) -> S
         memory = _taken(memory, its_memory, replace)._replace(since=since)
         if options.estimator is not None and decision == 0:
             vehicles, memory = _estimated(s, vehicles, memory, options.estimator, random)
-        view = perceive(vehicles, s.road, sides_seen)
-        memory = with_style(memory, view, first)
-        features = features_of(vehicles, memory, s.road, view)
+        situation = situation_of(vehicles, memory, s.road, sides_seen, first)
+        features = features_of(situation)
         # What should follow: the recorded move, corrected towards the recording.
-        change, aside = _led_back(s, now, vehicles, memory)
+        change, aside = _led_back(s, now, situation)
         follows = s.present[:, now + STEPS] & present & s.driven
         # A driver that has just come knows no acceleration of its own yet.
         counts = follows & (memory.age > 0) if options.policy is None else follows
         weight = s.weight.expand_as(change)
         moves = Moves(features, change, aside, weight, weight * s.two_dimensional)
         step = s.target[:, now + STEPS] - vehicles.target_lane
-        choice = lane_choice(vehicles, view, sides_of(vehicles, memory, s.road, view))
-        choices = _choices(choice, follows & s.two_dimensional, step)
+        choices = _choices(lane_choice(situation), follows & s.two_dimensional, step)
         parts.append(Samples(moves.rows(counts), choices))
         # In closed loop the policy makes the move itself, so that it sees its own mistakes.
         if options.policy is not None:
             change, aside = _nearest_move(options, features, change, aside, random)
             aside = torch.where(s.two_dimensional, aside, 0.0)
-        acceleration, lateral = bounded(vehicles, memory, s.road, change, aside)
-        memory = remembered(vehicles, memory, view, acceleration)
+        acceleration, lateral = bounded(situation, change, aside)
+        memory = remembered(situation, acceleration)
         vehicles = moved(vehicles, acceleration, lateral)
     return joined(parts)
 
 
 def _estimated(
-    s: Segments,
-    vehicles: Vehicles,
-    memory: Memory,
-    estimator: Estimator,
-    random: torch.Generator,
+    s: Segments, vehicles: Vehicles, memory: Memory, estimator: Estimator, random: torch.Generator
 ) -> tuple[Vehicles, Memory]:
     """Driven vehicles as nine positions show them, with less or more noise than recorded."""
     nine = slice(HISTORY - OBSERVED_POSITIONS + 1, HISTORY + 1)
     whole = s.present[:, nine].all(1) & s.driven
-    shape = (len(s.x), 1, 1)
-    noise = 1.2 * torch.rand(shape, generator=random)
-    draw = torch.rand(shape, generator=random)
-    noise = torch.where(draw < 0.2, 0.0, torch.where(draw < 0.7, 1.0, noise))
+    noise = noise_shares(len(s.x), 0.2, 0.7, random)
     x = s.x[:, nine] + noise * (s.raw_x - s.x)[:, nine]
     y = s.y[:, nine] + noise * (s.raw_y - s.y)[:, nine]
     positions = torch.stack((x, y), -1).transpose(1, 2)
@@ -489,15 +473,14 @@ def _estimated(
 
 def varied(segments: Segments, options: Options, random: torch.Generator) -> Segments:
     """The segments mirrored, widened and lengthened at random."""
-    s = segments
-    rows = len(s.x)
+    rand, _ = draws((len(segments.x), 1), random)
     if options.vary:
         if torch.rand((), generator=random) < 0.5:
-            s = s.mirrored()
-        s = s.widened(0.95 + 0.25 * torch.rand((rows, 1), generator=random))
+            segments = segments.mirrored()
+        segments = segments.widened(0.95 + 0.25 * rand())
     if options.scale:
-        s = s.scaled(1.0 + options.scale * torch.rand((rows, 1), generator=random))
-    return s
+        segments = segments.scaled(1.0 + options.scale * rand())
+    return segments
 
 
 def draws(
@@ -524,17 +507,17 @@ def _taken(memory: Memory, other: Memory, where: Tensor) -> Memory:
     )
 
 
-def _led_back(s: Segments, now: int, vehicles: Vehicles, memory: Memory) -> tuple[Tensor, Tensor]:
+def _led_back(s: Segments, now: int, situation: Situation) -> tuple[Tensor, Tensor]:
     """Changes of acceleration and lateral speed that follow the recording, or lead back to it."""
-    speed, lateral = velocity(vehicles)
+    vehicles, memory, _, view = situation
     recorded_acceleration = (s.speed[:, now + STEPS] - s.speed[:, now]) / DECISION_S
     wanted = (
         recorded_acceleration
-        + SPEED_GAIN * (s.speed[:, now] - speed)
+        + SPEED_GAIN * (s.speed[:, now] - view.speed)
         + PLACE_GAIN * (s.x[:, now] - vehicles.x)
     ).clamp(HARDEST_BRAKING, STRONGEST_ACCELERATION)
     wanted_aside = s.lateral_speed[:, now + STEPS] + LATERAL_GAIN * (s.y[:, now] - vehicles.y)
-    return wanted - memory.accelerations[..., 0], wanted_aside - lateral
+    return wanted - memory.accelerations[..., 0], wanted_aside - view.aside
 
 
 def _nearest_move(
@@ -545,11 +528,8 @@ def _nearest_move(
     logits = options.policy(features)
     nearest = []
     for tokens, its_logits, wanted in zip((ALONG, ACROSS), logits, (change, aside)):
-        shape = (options.samples, *wanted.shape)
-        drawn = tokens.sample(
-            its_logits.expand(options.samples, *its_logits.shape),
-            torch.rand(shape, generator=random),
-        )
+        u = torch.rand((options.samples, *wanted.shape), generator=random)
+        drawn = tokens.sample(its_logits.expand(options.samples, *its_logits.shape), u)
         best = (drawn - wanted).abs().argmin(0, keepdim=True)
         nearest.append(drawn.gather(0, best)[0])
     return nearest[0], nearest[1]
@@ -559,17 +539,16 @@ def _choices(choice: LaneChoice, counts: Tensor, step: Tensor) -> Choices:
     """What was chosen at one decision by the drivers who count (``counts`` [N, M]), whose target
     lanes change by ``step`` [N, M] until the next one.
     """
-    sides = choice.sides
     # A change begins at the decision after which the target lane is another one.
     begins = torch.stack((step == 1, step == -1), -1)
     keeping = counts & choice.keeping
     could = choice.exists & keeping[..., None]
     under_way = counts & ~choice.keeping
-    side = torch.where(choice.to_left[..., None], sides[..., 0, :], sides[..., 1, :])
-    aside = side[under_way]
+    left, right = choice.sides.unbind(-2)
+    aside = torch.where(choice.to_left[..., None], left, right)[under_way]
     return Choices(
-        torch.cat((sides[could], aside)),
+        torch.cat((choice.sides[could], aside)),
         torch.cat((begins[could].float(), torch.full((len(aside),), -1.0))),
-        sides[keeping],
+        choice.sides[keeping],
         choice.exists[keeping],
     )

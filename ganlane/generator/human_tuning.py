@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import smooth_l1_loss, softplus
 
+from ganlane.generator.descent import descend
 from ganlane.generator.human import (
     ACCELERATIONS,
     ACROSS,
@@ -39,13 +40,14 @@ from ganlane.generator.human import (
     moved,
     perceive,
     remembered,
-    sides_of,
+    situation_of,
     velocity,
     with_choice,
     with_style,
 )
 from ganlane.generator.human_samples import DESIRED_MPS, Choices, draws
 from ganlane.sim.idm import TABLE_V, following_acceleration
+from ganlane.sim.neighbours import compare
 from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.state import Road, Vehicles
 
@@ -106,7 +108,7 @@ class Strangers(NamedTuple):
         acceleration = torch.minimum(behind, torch.maximum(to_pace, -self.braking))
         acceleration = acceleration.clamp(HARDEST_BRAKING, STRANGER_ACCELERATION)
         stops = -vehicles.speed / DECISION_S
-        target = vehicles.target_lane.to(vehicles.y.dtype) * road.lane_width_m
+        target = road.centre_of(vehicles.target_lane, vehicles.y.dtype)
         aside = ((target - vehicles.y) / PUSHING_S).clamp(-PUSHING_MPS, PUSHING_MPS)
         return torch.maximum(acceleration, stops), aside
 
@@ -120,9 +122,7 @@ class Decisions(NamedTuple):
     keeping: Tensor
     to_left: Tensor
     speed: Tensor
-    along: Tensor
-    across: Tensor
-    lane: Tensor
+    actions: Tensor
     log_chance: Tensor
     value: Tensor
     cost: Tensor
@@ -190,10 +190,7 @@ def tune(
                 lane = policy.lane(shown)
                 loss = loss + RATE_PULL * softplus(lane[:, 0] + 10.0).mean()
                 loss = loss + 0.2 * RATE_PULL * softplus(-lane[:, 1]).mean()
-                optimizer.zero_grad()
-                loss.backward()
-                nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
-                optimizer.step()
+                descend(optimizer, loss, 1.0)
         report(float(decisions.cost.sum()) / float(decisions.valid.sum()))
 
 
@@ -232,9 +229,9 @@ def _log_chances(policy: HumanPolicy, features: Tensor, choice: LaneChoice) -> t
     )
 
 
-def _of_actions(chances: tuple[Tensor, ...], actions: tuple[Tensor, ...]) -> Tensor:
-    """Logarithm of the chance of what was done."""
-    taken = [log.gather(-1, action[..., None])[..., 0] for log, action in zip(chances, actions)]
+def _of_actions(chances: tuple[Tensor, ...], actions: Tensor) -> Tensor:
+    """Logarithm of the chance of the ``actions`` [..., 3]: tokens along and across, lane choice."""
+    taken = [log.gather(-1, actions[..., [kind]])[..., 0] for kind, log in enumerate(chances)]
     return torch.stack(taken).sum(0)
 
 
@@ -247,8 +244,8 @@ def _policy_loss(
 ) -> Tensor:
     """The clipped objective, and the divergence from the reference."""
     chances = _log_chances(policy, decisions.features, decisions.choice)
-    actions = (decisions.along, decisions.across, decisions.lane)
-    ratio = torch.exp((_of_actions(chances, actions) - decisions.log_chance).clamp(-5.0, 5.0))
+    log_chance = _of_actions(chances, decisions.actions)
+    ratio = torch.exp((log_chance - decisions.log_chance).clamp(-5.0, 5.0))
     bounded_ratio = ratio.clamp(1.0 - RATIO, 1.0 + RATIO)
     gain = torch.minimum(ratio * advantage, bounded_ratio * advantage).mean()
     with torch.no_grad():
@@ -284,43 +281,36 @@ def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> De
     rand, _ = draws(vehicles.x.shape, random)
     steps: list[Decisions] = []
     for _ in range(DECISIONS):
-        view = perceive(vehicles, road)
-        memory = with_style(memory, view)
-        choice = lane_choice(vehicles, view, sides_of(vehicles, memory, road, view))
-        chances = policy.lane_chances(choice)
-        lane = torch.multinomial(chances.flatten(0, 1), 1, generator=random).view(vehicles.x.shape)
+        situation = situation_of(vehicles, memory, road)
+        choice = lane_choice(situation)
+        lane = _drawn(policy.lane_chances(choice), random)
         others = strangers.choices(choice, rand(), rand())
         lane = torch.where(strangers.there, others, lane)
-        vehicles, memory = with_choice(vehicles, memory, view, lane)
+        situation = with_choice(situation, lane)
+        vehicles, view = situation.vehicles, situation.view
         # The moves follow the choice.
-        features = features_of(vehicles, memory, road, view)
-        logits = policy(features)
-        tokens, changed = [], []
-        for axis, its_logits in zip((ALONG, ACROSS), logits):
-            chance = torch.softmax(its_logits / TEMPERATURE, -1)
-            drawn = torch.multinomial(chance.flatten(0, 1), 1, generator=random)
-            token = drawn.view(vehicles.x.shape)
-            jitter = torch.rand(token.shape, generator=random) - 0.5
+        features = features_of(situation)
+        tokens, changes = [], []
+        for axis, logits in zip((ALONG, ACROSS), policy(features)):
+            token = _drawn(torch.softmax(logits / TEMPERATURE, -1), random)
             tokens.append(token)
-            changed.append(axis.value(token + jitter))
-        acceleration, aside = bounded(vehicles, memory, road, *changed)
+            changes.append(axis.value(token + (rand() - 0.5)))
+        acceleration, aside = bounded(situation, *changes)
         theirs = strangers.moves(vehicles, road)
         acceleration = torch.where(strangers.there, theirs[0], acceleration)
         aside = torch.where(strangers.there, theirs[1], aside)
-        memory = remembered(vehicles, memory, view, acceleration)
+        memory = remembered(situation, acceleration)
         later = moved(vehicles, acceleration, aside)
         cost, hit = costs(later, road, view.gap)
         # Who has collided leaves the scene.
         goes_on = vehicles.valid & ~hit
-        log_chances = _log_chances(policy, features, choice)
+        actions = torch.stack((*tokens, lane), -1)
         decisions = Decisions(
             features=features,
             **choice._asdict(),
             speed=view.speed,
-            along=tokens[0],
-            across=tokens[1],
-            lane=lane,
-            log_chance=_of_actions(log_chances, (*tokens, lane)),
+            actions=actions,
+            log_chance=_of_actions(_log_chances(policy, features, choice), actions),
             value=_values(critic, features, choice.sides),
             cost=cost,
             valid=vehicles.valid & ~strangers.there,
@@ -331,6 +321,11 @@ def drive(policy: HumanPolicy, critic: nn.Module, random: torch.Generator) -> De
     return Decisions(*map(torch.stack, zip(*steps)))
 
 
+def _drawn(chances: Tensor, random: torch.Generator) -> Tensor:
+    """Numbers [N, M] below K, drawn by their ``chances`` [N, M, K]."""
+    return torch.multinomial(chances.flatten(0, 1), 1, generator=random).view(chances.shape[:-1])
+
+
 def costs(vehicles: Vehicles, road: Road, gap: Tensor) -> tuple[Tensor, Tensor]:
     """Cost of every driver after a decision, and who has collided, [N, M].
 
@@ -339,22 +334,17 @@ def costs(vehicles: Vehicles, road: Road, gap: Tensor) -> tuple[Tensor, Tensor]:
     speed, lateral = velocity(vehicles)
 
     # Pairs [N, M, M]: the last index is the other vehicle.
-    def apart(number: Tensor) -> Tensor:
-        return number[:, None, :] - number[:, :, None]
-
-    def mean(number: Tensor) -> Tensor:
-        return 0.5 * (number[:, None, :] + number[:, :, None])
-
-    along, across = apart(vehicles.x), apart(vehicles.y)
-    both = vehicles.valid[:, :, None] & vehicles.valid[:, None, :]
-    both = both & ~torch.eye(both.shape[1], dtype=torch.bool, device=along.device)
-    bumpers = along.abs() - mean(vehicles.length)
-    sides = across.abs() - mean(vehicles.width)
+    along, bumpers, order = compare(vehicles, road)
+    across = vehicles.y[:, None, :] - vehicles.y[:, :, None]
+    mean_width = 0.5 * (vehicles.width[:, None, :] + vehicles.width[:, :, None])
+    sides = across.abs() - mean_width
+    # Nobody is a pair with itself.
+    both = vehicles.valid[:, :, None] & vehicles.valid[:, None, :] & (order != 0)
     # Bodies count as touching a little before they do.
     touches = both & (bumpers < 0.2) & (sides < 0.05)
     # To blame are the one behind, and the one who moves, or has moved, towards the other.
     towards = torch.sign(across)
-    off_target = vehicles.y - vehicles.target_lane.to(lateral.dtype) * road.lane_width_m
+    off_target = vehicles.y - road.centre_of(vehicles.target_lane, lateral.dtype)
     sideways = (lateral[:, :, None] * towards > 0.15) | (off_target[:, :, None] * towards > 0.6)
     behind = (along > 0) & (sides < -0.4)
     blame = touches & (sideways | behind)
@@ -362,7 +352,7 @@ def costs(vehicles: Vehicles, road: Road, gap: Tensor) -> tuple[Tensor, Tensor]:
     cost = 5.0 * blame.any(-1) + 1.0 * hit
 
     # Close calls: a time to collision below 1.5 s, a gap below 0.25 s, sides within 0.35 m.
-    closing = -apart(speed)
+    closing = speed[:, :, None] - speed[:, None, :]
     ahead = both & (along > 0) & (sides < 0.15) & (bumpers > 0)
     time_s = torch.where(ahead & (closing > 0.1), bumpers / closing.clamp_min(0.1), 99.0).amin(-1)
     nearest = torch.where(ahead, bumpers, 99.0).amin(-1)
@@ -387,7 +377,9 @@ def costs(vehicles: Vehicles, road: Road, gap: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def random_scenes(random: torch.Generator) -> tuple[Vehicles, Memory, Road, Strangers]:
-    """Scenes of 2 to 5 lanes, 3 to 28 m/s, people's headways, dense and sparse."""
+    """Scenes of 2 to 5 lanes, 3 to 28 m/s, people's headways, dense and sparse; in some of them
+    some of the vehicles are strangers.
+    """
     shape = (SCENES, VEHICLES)
     rand, randn = draws(shape, random)
     lanes = torch.randint(2, 6, (SCENES, 1), generator=random).float()
@@ -419,15 +411,10 @@ def random_scenes(random: torch.Generator) -> tuple[Vehicles, Memory, Road, Stra
         target_lane=lane.long(),
     )
     memory = entering_memory(vehicles, road, randn())
-    return vehicles, memory, road, random_strangers(random)
-
-
-def random_strangers(random: torch.Generator) -> Strangers:
-    """Some of the vehicles of some scenes: half of them slow, some brake hard."""
-    rand, _ = draws((SCENES, VEHICLES), random)
+    # Half of the strangers are slow, some brake hard.
     there = (rand() < STRANGERS) & (rand(SCENES, 1) < WITH_STRANGERS)
     pace = torch.where(rand() < 0.5, 8.0 * rand(), 8.0 + 20.0 * rand())
-    return Strangers(there, pace, 1.0 + 4.0 * rand())
+    return vehicles, memory, road, Strangers(there, pace, 1.0 + 4.0 * rand())
 
 
 def entering_memory(vehicles: Vehicles, road: Road, drawn: Tensor) -> Memory:
@@ -436,11 +423,10 @@ def entering_memory(vehicles: Vehicles, road: Road, drawn: Tensor) -> Memory:
     Who follows somebody keeps the present headway; the others' are drawn by the standard normal
     numbers ``drawn`` [N, M]: 1.4 s in the middle, spread by a third.
     """
-    zero = torch.zeros_like(vehicles.x)
-    _, lateral = velocity(vehicles)
-    steady = zero[..., None].repeat(1, 1, ACCELERATIONS)
-    memory = memory_of(steady, torch.stack((lateral, lateral), -1), zero)
     view = perceive(vehicles, road)
+    steady = vehicles.x.new_zeros(*vehicles.x.shape, ACCELERATIONS)
+    lateral_speeds = torch.stack((view.aside, view.aside), -1)
+    memory = memory_of(steady, lateral_speeds, torch.zeros_like(vehicles.x))
     free = view.log_headway.isnan()
     log_headway = torch.where(free, math.log(1.4) + 0.35 * drawn, view.log_headway)
     view = view._replace(log_headway=log_headway)

@@ -39,12 +39,7 @@ RANGE_M = 100.0
 _MANY_ROWS = 512
 
 
-def dense(
-    x: Tensor,
-    weight: Tensor,
-    bias: Tensor | None = None,
-    relu: bool = False,
-) -> Tensor:
+def dense(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False) -> Tensor:
     """Linear layer [..., O] of ``x`` [..., I], ``weight`` [O, I] and ``bias`` [O].
 
     A ReLU follows if ``relu``.
@@ -101,39 +96,26 @@ class MotionLSTM(nn.Module):
         """Part of the gates [..., 4H] that depends on this motion alone, so it can be kept."""
         if not self.differences:
             difference = torch.zeros_like(difference)
-        embedded = apply(
-            self.embed,
-            motion_features(displacement, difference),
-            relu=True,
-        )
-        return apply(self.input, embedded)
+        features = motion_features(displacement, difference)
+        return apply(self.input, apply(self.embed, features, relu=True))
 
-    def project_course(self, displacements: Tensor) -> Tensor:
-        """Projections [..., T - 1, 4H] of T displacements [..., T, 2], one for every motion."""
-        return self.project(displacements[..., 1:, :], displacements.diff(dim=-2))
+    def project_course(self, displacements: Tensor) -> tuple[Tensor, ...]:
+        """Projections [..., 4H] of T displacements [..., T, 2], one for each of T - 1 motions."""
+        return self.project(displacements[..., 1:, :], displacements.diff(dim=-2)).unbind(dim=-2)
 
-    def step(
-        self,
-        projected: Tensor,
-        hidden: Tensor,
-        cell: Tensor,
-    ) -> tuple[Tensor, Tensor]:
+    def step(self, projected: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
         """One recurrence on a projection [..., 4H] and state ([..., H], [..., H]).
 
         Returns the new state.
         """
         return self._update(dense(hidden, self.recurrent).add_(projected), cell)
 
-    def encode(self, projections: Tensor | Sequence[Tensor]) -> Tensor:
-        """Last hidden state [..., H] after projections [..., T, 4H], or T of [..., 4H].
-
-        It begins with a state of zeros.
-        """
-        steps = projections.unbind(dim=-2) if isinstance(projections, Tensor) else projections
+    def encode(self, projections: Sequence[Tensor]) -> Tensor:
+        """Last hidden state [..., H] after projections [..., 4H], from a state of zeros on."""
         # The recurrence of a hidden state of zeros adds nothing, so the first step does without.
-        no_cell = torch.zeros_like(steps[0][..., : self.hidden])
-        hidden, cell = self._update(steps[0], no_cell)
-        for projected in steps[1:]:
+        no_cell = torch.zeros_like(projections[0][..., : self.hidden])
+        hidden, cell = self._update(projections[0], no_cell)
+        for projected in projections[1:]:
             hidden, cell = self.step(projected, hidden, cell)
         return hidden
 
@@ -151,11 +133,7 @@ def _times_tanh(factor: Tensor, x: Tensor) -> Tensor:
     return torch.addcmul(-factor, factor, torch.sigmoid(x + x), value=2.0)
 
 
-def nearest(
-    position: Tensor,
-    valid: Tensor,
-    neighbours: int,
-) -> tuple[Tensor | None, Tensor]:
+def nearest(position: Tensor, valid: Tensor, neighbours: int) -> tuple[Tensor | None, Tensor]:
     """Indices [B, G, K] of the ``neighbours`` nearest other vehicles of each, and a mask of them.
 
     ``position`` is [B, G, 2] in m, ``valid`` [B, G]. If there are not more vehicles than that, the
@@ -204,11 +182,7 @@ class PairPooling(nn.Module):
         self.second = nn.Linear(inner, pooled)
 
     def forward(
-        self,
-        hidden: Tensor,
-        position: Tensor,
-        displacement: Tensor,
-        valid: Tensor,
+        self, hidden: Tensor, position: Tensor, displacement: Tensor, valid: Tensor
     ) -> Tensor:
         """Pooled states [B, G, P] of the vehicles.
 
@@ -236,16 +210,16 @@ class Observation(NamedTuple):
     """The generator's input for [B, G] vehicles.
 
     Attributes:
-        projections: [B, G, observed - 1, 4H] or a sequence of [B, G, 4H], input projections of the
-            observed motions (:meth:`MotionLSTM.project_course`), oldest first. A motion is a
-            displacement and its difference to the one before, so 8 displacements are 7 motions.
+        projections: observed - 1 tensors [B, G, 4H], input projections of the observed motions
+            (:meth:`MotionLSTM.project_course`), oldest first. A motion is a displacement and its
+            difference to the one before, so 8 displacements are 7 motions.
         displacement, difference: [B, G, 2], the last displacement, m per 0.1 s, and its difference
             to the one before.
         position: [B, G, 2], m, relative to any common point.
         valid, extra: [B, G] bool and [B, G, extra_inputs].
     """
 
-    projections: Tensor | Sequence[Tensor]
+    projections: tuple[Tensor, ...]
     displacement: Tensor
     difference: Tensor
     position: Tensor
@@ -264,12 +238,7 @@ class Generator(nn.Module):
         super().__init__()
         self.sizes = sizes
         self.encoder = MotionLSTM(sizes.embedding, sizes.hidden, sizes.differences)
-        self.pooling = PairPooling(
-            sizes.hidden,
-            sizes.pooling,
-            sizes.pooled,
-            sizes.neighbours,
-        )
+        self.pooling = PairPooling(sizes.hidden, sizes.pooling, sizes.pooled, sizes.neighbours)
         inputs = sizes.hidden + sizes.pooled + sizes.extra_inputs
         self.context = nn.Sequential(
             nn.Linear(inputs, sizes.context),
@@ -279,25 +248,13 @@ class Generator(nn.Module):
         self.decoder = MotionLSTM(sizes.embedding, sizes.hidden, sizes.differences)
         self.head = nn.Linear(sizes.hidden, 2)
 
-    def observe(
-        self,
-        displacements: Tensor,
-        position: Tensor,
-        valid: Tensor,
-    ) -> Observation:
+    def observe(self, displacements: Tensor, position: Tensor, valid: Tensor) -> Observation:
         """The input from observed displacements [B, G, observed, 2], without further inputs."""
         last = displacements[..., -1, :]
-        before = displacements[..., -2, :]
-        # Width 0: the paper's preset has no further inputs.
-        extra = last.new_zeros((*last.shape[:-1], 0))
-        return Observation(
-            self.encoder.project_course(displacements),
-            last,
-            last - before,
-            position,
-            valid,
-            extra,
-        )
+        difference = last - displacements[..., -2, :]
+        projections = self.encoder.project_course(displacements)
+        # Further inputs of width 0: the paper's preset has none.
+        return Observation(projections, last, difference, position, valid, last[..., :0])
 
     def summarise(self, now: Observation) -> Tensor:
         """Context [B, G, H - Z] of every vehicle.
@@ -311,13 +268,7 @@ class Generator(nn.Module):
         first, second = (cast(nn.Linear, self.context[layer]) for layer in (0, 2))
         return apply(second, apply(first, inputs, relu=True))
 
-    def decode(
-        self,
-        context: Tensor,
-        noise: Tensor,
-        now: Observation,
-        steps: int,
-    ) -> Tensor:
+    def decode(self, context: Tensor, noise: Tensor, now: Observation, steps: int) -> Tensor:
         """Output [..., steps, 2] of the decoder's first steps, in units of ``DIFFERENCE_SCALE_M``.
 
         ``context`` is [..., H - Z] and ``noise`` [..., Z]; leading dimensions broadcast, so that
@@ -340,18 +291,12 @@ class Generator(nn.Module):
             displacement = displacement + difference
         return torch.stack(outputs, dim=-2)
 
-    def forward(
-        self,
-        now: Observation,
-        noise: Tensor,
-        steps: int | None = None,
-    ) -> Tensor:
+    def forward(self, now: Observation, noise: Tensor, steps: int | None = None) -> Tensor:
         """Predicted displacements [..., steps, 2], m per 0.1 s, for ``noise`` [..., B, G, Z].
 
         All by default.
         """
-        steps = self.sizes.predicted if steps is None else steps
-        outputs = self.decode(self.summarise(now), noise, now, steps)
+        outputs = self.decode(self.summarise(now), noise, now, steps or self.sizes.predicted)
         return displacements_of(outputs, now.displacement)
 
 
@@ -372,13 +317,9 @@ class Discriminator(nn.Module):
     def __init__(self, embedding: int, hidden: int):
         super().__init__()
         self.encoder = MotionLSTM(embedding, hidden)
-        self.head = nn.Sequential(
-            nn.Linear(hidden, hidden),
-            nn.ReLU(),
-            nn.Linear(hidden, 1),
-        )
+        self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 1))
 
     def forward(self, displacements: Tensor) -> Tensor:
         """Logits [...] that the observed and following displacements [..., T, 2] were recorded."""
-        projections = self.encoder.project_course(displacements)
-        return self.head(self.encoder.encode(projections)).squeeze(-1)
+        course = self.encoder.project_course(displacements)
+        return self.head(self.encoder.encode(course)).squeeze(-1)

@@ -24,6 +24,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from ganlane.data.dense import Recording
 from ganlane.generator.closed_loop import driver_params, noise_shape, rollout
+from ganlane.generator.descent import descend, half_cosine
 from ganlane.generator.forecasts import (
     Forecasts,
     calibrated_forecasts,
@@ -46,14 +47,7 @@ from ganlane.generator.windows import (
     group_windows,
     segment_starts,
 )
-from ganlane.settings.generator import (
-    CalibratedConfig,
-    HumanConfig,
-    LoopConfig,
-    PaperConfig,
-)
-
-Config = PaperConfig | CalibratedConfig
+from ganlane.settings.generator import CalibratedConfig, HumanConfig, PaperConfig
 
 
 def cross_entropy(logits: Tensor, recorded: float) -> Tensor:
@@ -78,7 +72,7 @@ class _Task(nn.Module):
     Every network has an optimiser of its own.
     """
 
-    def __init__(self, config: Config):
+    def __init__(self, config: PaperConfig | CalibratedConfig):
         super().__init__()
         # The networks' first weights come from torch's own generator, all else from ``random``.
         torch.manual_seed(config.seed)
@@ -86,34 +80,56 @@ class _Task(nn.Module):
         # Adam's default rate is a placeholder: the loop sets the rate before every update.
         self.optimisers = {"generator": torch.optim.Adam(self.generator.parameters())}
         self.random = torch.Generator().manual_seed(config.seed)
-        self.largest_gradient = config.loop.largest_gradient
+        self.loop = config.loop
+
+    def update(self, number: int) -> dict[str, float]:
+        """One update; its losses."""
+        raise NotImplementedError
+
+    def evaluate(self) -> float:
+        """The score on the validation scenes; lower is better."""
+        raise NotImplementedError
 
     def fit(self, name: str, on_progress: OnProgress) -> int:
-        """Fit the generator; the updates that were made until it was best."""
-        return improve(self, name, on_progress)  # type: ignore[arg-type]
+        """Update until the score improves no more, and take the best weights.
+
+        Returns:
+            Updates until the best evaluation on the validation scenes.
+        """
+        loop = self.loop
+        best, best_update, waited = math.inf, 0, 0
+        best_weights: dict[str, Tensor] = {}
+        score = None
+        for done in range(1, loop.updates + 1):
+            # A linear warm-up, then a half cosine to 0.
+            rate = loop.learning_rate * min(1.0, done / max(1, loop.warmup))
+            for optimiser in self.optimisers.values():
+                optimiser.param_groups[0]["lr"] = rate * half_cosine(done - 1, loop.updates)
+            losses = self.update(done - 1)
+            if done % loop.evaluate_every == 0 or done == loop.updates:
+                score = self.evaluate()
+                waited += 1
+                if score < best:
+                    best, best_update, waited = score, done, 0
+                    # A copy, since the next updates change the networks' own tensors.
+                    best_weights = deepcopy(self.state_dict())
+            on_progress(Progress(name, done, loop.updates, losses, score, best))
+            if waited >= loop.patience:
+                break
+        # Empty if no evaluation gave a finite score.
+        if best_weights:
+            self.load_state_dict(best_weights)
+        return best_update
 
     def descend(self, network: str, loss: Tensor) -> float:
-        """One step of a network down its ``loss``, whose value is returned.
-
-        The gradient's norm is clipped.
-        """
-        optimiser = self.optimisers[network]
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        nn.utils.clip_grad_norm_(optimiser.param_groups[0]["params"], self.largest_gradient)
-        optimiser.step()
-        return float(loss.detach())
+        """One step of a network down its ``loss``, whose value is returned."""
+        return descend(self.optimisers[network], loss, self.loop.largest_gradient)
 
 
 class PaperTask(_Task):
     """The Social-GAN on windows."""
 
-    def __init__(
-        self,
-        fitted: list[Recording],
-        validation: list[Recording],
-        config: PaperConfig,
-    ):
+    def __init__(self, fitted: list[Recording], validation: list[Recording], config: PaperConfig):
         super().__init__(config)
         self.config = config
         self.discriminator = Discriminator(config.sizes.embedding, config.sizes.hidden)
@@ -192,8 +208,7 @@ class PaperTask(_Task):
 
         # [B, G, ...] -> [n, ...]: from here on without padding.
         vehicles = observation._replace(
-            displacement=observation.displacement[mask],
-            difference=observation.difference[mask],
+            displacement=observation.displacement[mask], difference=observation.difference[mask]
         )
         shape = (self.config.samples + 1, len(context), sizes.noise)
         noise = torch.randn(shape, generator=self.random)
@@ -208,10 +223,7 @@ class CalibratedTask(_Task):
     """The anchored generator on whole scenes."""
 
     def __init__(
-        self,
-        fitted: list[Recording],
-        validation: list[Recording],
-        config: CalibratedConfig,
+        self, fitted: list[Recording], validation: list[Recording], config: CalibratedConfig
     ):
         super().__init__(config)
         self.config = config
@@ -334,39 +346,3 @@ class Progress:
 
 
 OnProgress = Callable[[Progress], None]
-
-
-def improve(task: PaperTask | CalibratedTask, name: str, on_progress: OnProgress) -> int:
-    """Update a task until it stops improving, and put the best weights into its networks.
-
-    Returns:
-        Updates until the best evaluation on the validation scenes.
-    """
-    config = task.config.loop
-    best, best_update, waited = math.inf, 0, 0
-    best_weights: dict[str, Tensor] = {}
-    score = None
-    for done in range(1, config.updates + 1):
-        for optimiser in task.optimisers.values():
-            optimiser.param_groups[0]["lr"] = learning_rate(config, done - 1)
-        losses = task.update(done - 1)
-        if done % config.evaluate_every == 0 or done == config.updates:
-            score = task.evaluate()
-            waited += 1
-            if score < best:
-                best, best_update, waited = score, done, 0
-                # A copy, since the next updates change the networks' own tensors.
-                best_weights = deepcopy(task.state_dict())
-        on_progress(Progress(name, done, config.updates, losses, score, best))
-        if waited >= config.patience:
-            break
-    # Empty if no evaluation gave a finite score.
-    if best_weights:
-        task.load_state_dict(best_weights)
-    return best_update
-
-
-def learning_rate(config: LoopConfig, number: int) -> float:
-    """Linear warm-up, then a half cosine to 0."""
-    rise = min(1.0, (number + 1) / max(1, config.warmup))
-    return config.learning_rate * rise * 0.5 * (1.0 + math.cos(math.pi * number / config.updates))

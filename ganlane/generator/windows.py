@@ -58,9 +58,8 @@ class Segments:
         The model drives those that are present in all of the first 9 frames.
         """
         # A vehicle that enters later is shown to the others but not scored.
-        observed = self.present[:, :OBSERVED_POSITIONS]
-        after = self.present[:, OBSERVED_POSITIONS:]
-        return observed.all(dim=1, keepdim=True) & after
+        observed = self.present[:, :OBSERVED_POSITIONS].all(dim=1, keepdim=True)
+        return observed & self.present[:, OBSERVED_POSITIONS:]
 
     @property
     def future(self) -> Tensor:
@@ -70,8 +69,7 @@ class Segments:
     @property
     def constant_velocity(self) -> Tensor:
         """Positions [B, H, V, 2] when the last observed displacement is repeated."""
-        now = self.positions[:, PRESENT, None]
-        before = self.positions[:, PRESENT - 1, None]
+        before, now = self.positions[:, PRESENT - 1 : PRESENT + 1, None].unbind(1)
         # 1 at the first step after the present.
         steps = torch.arange(1, self.positions.shape[1] - PRESENT, dtype=now.dtype)
         return now + (now - before) * steps[:, None, None]
@@ -91,20 +89,15 @@ class Segments:
         # The leftmost lane becomes lane 0; its centre is then at y = 0.
         last = self.lanes - 1
         positions[..., 1] = (last * self.lane_width)[..., None] - positions[..., 1]
-        return replace(
-            self,
-            positions=positions,
-            target_lane=last[..., None] - self.target_lane,
-        )
+        target_lane = last[..., None] - self.target_lane
+        return replace(self, positions=positions, target_lane=target_lane)
 
     def without_intentions(self) -> Segments:
         """The segments with the present lanes as target lanes, for evaluation.
 
         So no information of the future is used.
         """
-        y = self.positions[:, PRESENT : PRESENT + 1, :, 1]
-        road = Road(self.lanes[..., None], self.lane_width[..., None])
-        lane = road.lane_of(y).long()
+        lane = self.road.lane_of(self.positions[:, PRESENT, :, 1]).long()[:, None]
         return replace(self, target_lane=lane.expand_as(self.target_lane).contiguous())
 
 
@@ -116,19 +109,11 @@ def segment_starts(scene: Recording, horizon: int, stride: int = 1) -> list[int]
     return [row for row in rows if scene.present[row : row + OBSERVED_POSITIONS].all(0).any()]
 
 
-def segment_batches(
-    scene: Recording,
-    horizon: int,
-    stride: int,
-    size: int,
-) -> Iterator[Segments]:
+def segment_batches(scene: Recording, horizon: int, stride: int, size: int) -> Iterator[Segments]:
     """All segments that start every ``stride`` frames, ``size`` at a time."""
-    rows = segment_starts(scene, horizon, stride)
-    for first in range(0, len(rows), size):
-        yield cut_segments(
-            [(scene, row) for row in rows[first : first + size]],
-            horizon,
-        )
+    cuts = [(scene, row) for row in segment_starts(scene, horizon, stride)]
+    for first in range(0, len(cuts), size):
+        yield cut_segments(cuts[first : first + size], horizon)
 
 
 def cut_segments(cuts: list[tuple[Recording, int]], horizon: int) -> Segments:
@@ -153,16 +138,14 @@ def cut_segments(cuts: list[tuple[Recording, int]], horizon: int) -> Segments:
         middle = np.array([places[PRESENT, :, 0].mean(), 0.0])
         positions.append((places - middle).astype(np.float32))
     lengths = [scene.length[who].astype(np.float32) for (scene, _), who in zip(cuts, members)]
+    widths = [[scene.lane_width_m] for scene, _ in cuts]
     return Segments(
         positions=side_by_side(positions),
         present=side_by_side(taken("present")),
         target_lane=side_by_side(taken("target_lane")),
         length=side_by_side(lengths, 1.0),
         lanes=torch.tensor([[scene.lanes] for scene, _ in cuts]),
-        lane_width=torch.tensor(
-            [[scene.lane_width_m] for scene, _ in cuts],
-            dtype=torch.float32,
-        ),
+        lane_width=torch.tensor(widths, dtype=torch.float32),
     )
 
 
@@ -217,11 +200,7 @@ def count_windows(scene: Recording) -> int:
     return int(_present_throughout(scene, WINDOW_FRAMES).sum())
 
 
-def cut_windows(
-    scenes: list[Recording],
-    stride: int = 1,
-    frames: int = WINDOW_FRAMES,
-) -> Windows:
+def cut_windows(scenes: list[Recording], stride: int = 1, frames: int = WINDOW_FRAMES) -> Windows:
     """All windows of ``scenes`` that start at every ``stride``-th frame.
 
     A window never spans two scenes.
@@ -277,9 +256,7 @@ class Groups:
         sign = torch.ones(len(self), 1, 2)
         sign[..., 1] = torch.where(flip, -1.0, 1.0)[:, None]
         return replace(
-            self,
-            displacements=self.displacements * sign[:, :, None],
-            position=self.position * sign,
+            self, displacements=self.displacements * sign[:, :, None], position=self.position * sign
         )
 
 
@@ -303,8 +280,7 @@ def group_windows(windows: Windows, size: int = 9, seed: int = 0) -> Groups:
     now = windows.positions[:, PRESENT]
     # Windows are ordered by scene and start, so those of one start are neighbours.
     other_scene = windows.scene[1:] != windows.scene[:-1]
-    other_start = np.diff(windows.start) != 0
-    begins = np.flatnonzero(other_scene | other_start) + 1
+    begins = np.flatnonzero(other_scene | (np.diff(windows.start) != 0)) + 1
 
     groups = []
     for rows in np.split(np.arange(len(windows)), begins):

@@ -119,9 +119,7 @@ class BatchView:
         # A film of one frame.
         state = self.rows.now()
         recorder = Recorder(
-            row,
-            current_action=int(self._actions[row]),
-            current_return=float(self._returns[row]),
+            row, current_action=int(self._actions[row]), current_return=float(self._returns[row])
         )
         seconds = float(state.get(keys.STEP)[row]) * PHYSICS_STEP_S
         recorder.add(state.get(keys.VEHICLES), seconds)

@@ -181,17 +181,20 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
         # NEXT_STEP: these rows ended one step ago. They were stepped with the others, which is
         # discarded here.
         if waiting.any():
-            reward[waiting] = 0.0
-            terminated[waiting] = False
-            truncated[waiting] = False
+            for numbers in (reward, terminated, truncated):
+                numbers[waiting] = 0
             self._rows.restart(waiting)
             self._begun(waiting)
         ended = self._ended = terminated | truncated
         final: dict[str, Any] = {}
         # SAME_STEP: the last observation and info go into the info, before the rows are reset.
         if self._mode is AutoresetMode.SAME_STEP and ended.any():
-            final = {"final_obs": _where(ended, self._rows.observation()), "_final_obs": ended}
-            final |= {"final_info": _copied(self._rows.info()), "_final_info": ended}
+            final = {
+                "final_obs": _where(ended, self._rows.observation()),
+                "_final_obs": ended,
+                "final_info": _copied(self._rows.info()),
+                "_final_info": ended,
+            }
             self._rows.restart(ended)
             self._begun(ended)
         observation = self._rows.observation().copy()
@@ -214,12 +217,12 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[Any], npt.NDArray[A
 
 def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
     """gymnasium's mode, given as such or by name."""
-    names = [choice.name.lower() for choice in AutoresetMode]
-    for choice, name in zip(AutoresetMode, names):
+    choices = {choice.name.lower(): choice for choice in AutoresetMode}
+    for name, choice in choices.items():
         if mode is choice or str(mode).lower() in (name, choice.value.lower()):
             return choice
     raise UserError(
-        f"autoreset_mode={mode}: expected one of {', '.join(names)}; choose one of them."
+        f"autoreset_mode={mode}: expected one of {', '.join(choices)}; choose one of them."
     )
 
 

@@ -157,25 +157,23 @@ class NativeBatch:
         self._library = load(variant) if widest else load_for(rows)
         abort = env.ego.abort_lane_change
         # The kernel's structures, filled once.
-        period_and_terms = {
+        reward = vars(config.reward) | {
             "decision_period_s": episode.decision_period_s,
             "terms": len(self.terms),
         }
-        pointed: dict[str, Any] = {
-            "reward_settings": filled(settings.Reward, vars(config.reward) | period_and_terms),
+        numbers = highway._asdict() | {
+            "reward_settings": filled(settings.Reward, reward),
             "view": view,
             "view_inputs": self._pointers(_VIEWS),
             "mask_settings": mask_settings(highway, drivers.idm, mask, abort),
             "mask_inputs": self._pointers(_MASKS),
             "mask_outputs": addresses([self._lane_mask, self._no_safe_action]),
             "scene": self._pointers(settings.STARTS),
-        }
-        numbers = highway._asdict() | {
-            "reward": self.state[keys.REWARD].ctypes.data,
-            "terms": self._term_values.ctypes.data,
-            "observation": self.observation.ctypes.data,
-            "mask": self._lane_mask.ctypes.data,
-            "speed_mask": self.mask.ctypes.data if actions.form == LANE_SPEED else None,
+            "reward": self.state[keys.REWARD],
+            "terms": self._term_values,
+            "observation": self.observation,
+            "mask": self._lane_mask,
+            "speed_mask": self.mask if actions.form == LANE_SPEED else None,
             "lowest": self.bounds[0],
             "highest": self.bounds[1],
             "fastest": SPEED_RATIO_LIMIT,
@@ -197,14 +195,13 @@ class NativeBatch:
             others = part.drivers.visibility
             visible = (Visibility.named(env.ego.visibility), others)
             start = (Stream.named(config.stream), *visible, recycle_share, env.scenes(others))
-            of_part = pointed | {
+            of_part = {
                 "settings": decision_settings(highway, part.drivers, episode, env.ego, env.mobil),
                 "inputs": self._pointers(layout.inputs, row_list),
                 "outputs": self._pointers(layout.outputs),
                 "spawn": settings.spawn_of(highway, spawn, *start),
             }
-            pointers = {name: ctypes.addressof(of_part[name]) for name in of_part}
-            batch = filled(_Batch, pointers | numbers, of_part)
+            batch = filled(_Batch, numbers | of_part)
             per_thread = rows_per_thread(part.drivers)
             self._parts.append(_Part(batch, ctypes.byref(batch), row_list, per_thread))
         ends = (self.state["terminated"], self.state["truncated"])

@@ -26,7 +26,6 @@ from ganlane.native.settings import (
     Settings,
     Structure,
     actions_of,
-    address,
     ends_of,
     fields,
     filled,
@@ -284,8 +283,8 @@ class HumanDrivers(NetworkDrivers):
     def structures(self) -> dict[str, Structure]:
         """As of :class:`RuleDrivers`."""
         packed = _packed(_human_layers(self.sizes), self.weights)
-        numbers = vars(self.sizes) | vars(self.variation) | {"weights": packed.ctypes.data}
-        return {"human": filled(Human, numbers, packed)}
+        numbers = vars(self.sizes) | vars(self.variation) | {"weights": packed}
+        return {"human": filled(Human, numbers)}
 
 
 #: Drivers of one kind.
@@ -408,10 +407,7 @@ def decision_settings(
     records = (episode, ego or EgoParameters(), idm, steering, mobil)
     numbers = {name: value for record in records for name, value in vars(record).items()}
     ego_mobil = ego_mobil or mobil
-    numbers |= {
-        "lanes": highway.lanes,
-        "lane_width_m": highway.lane_width_m,
-        "vehicles": highway.vehicles,
+    numbers |= highway._asdict() | {
         # The kernel multiplies where the model divides by a constant.
         "per_brake_scale": 1.0 / idm.brake_scale(),
         "per_near_s": 1.0 / steering.near_s,
@@ -428,13 +424,13 @@ def decision_settings(
         "blind_share": drivers.blind_share,
         "courtesy": ego_mobil.courtesy,
         "safe_behind": ego_mobil.safe_deceleration,
+        "ends": ends_of(highway.stretches, ego_mobil),
+        "actions": actions_of(highway.actions, episode.decision_period_s),
+        "flow": flow_of(highway, episode.decision_period_s),
+        **dict.fromkeys(("generated", "human", "faults", "random")),
+        **drivers.structures(),
     }
-    pointed = drivers.structures() | ends_of(highway.stretches, ego_mobil)
-    pointed |= actions_of(highway.actions, episode.decision_period_s)
-    pointed |= flow_of(highway, episode.decision_period_s)
-    for name in ("generated", "human", "faults", "random", "ends", "actions", "flow"):
-        numbers[name] = address(pointed.get(name))
-    return filled(Settings, numbers, list(pointed.values()))
+    return filled(Settings, numbers)
 
 
 def mask_settings(
@@ -549,14 +545,16 @@ def _generated_of(drivers: GeneratedDrivers) -> Generated:
     # As closed_loop.wander: what stays of a latent vector in a step.
     share = math.exp(-dt / period) if period > 0 else 0.0
     packed = _packed(_layers(sizes), drivers.weights)
-    widths = vars(sizes) | {"weights": packed.ctypes.data, "motions": sizes.observed - 1}
-    numbers: dict[str, Any] = {**vars(drivers.changes), **vars(anchor), **vars(anchor.idm)}
-    numbers |= vars(guard)
-    numbers |= {
+    widths = vars(sizes) | {"weights": packed, "motions": sizes.observed - 1}
+    numbers: dict[str, Any] = {
+        **vars(drivers),
+        **vars(drivers.changes),
+        **vars(anchor),
+        **vars(anchor.idm),
+        **vars(guard),
         "network": filled(Network, widths),
         "noise_share": share,
         "noise_fresh": math.sqrt(1.0 - share * share),
-        "noise_scale": drivers.noise_scale,
         "calibrated": drivers.anchor is not None,
         "guard": drivers.guard is not None,
         "sudden_chance": dt / sudden.every_s,
@@ -572,9 +570,8 @@ def _generated_of(drivers: GeneratedDrivers) -> Generated:
         "washout_share": dt / anchor.washout_s,
         "changes_per_m": dt * drivers.checked_changes.per_km / 1000.0,
         "patience_steps": _steps(drivers.checked_changes.patience_s),
-        "headways_s": drivers.headways_s,
     }
-    return filled(Generated, numbers, packed)
+    return filled(Generated, numbers)
 
 
 class _Layer(NamedTuple):
@@ -675,8 +672,7 @@ def gan_drivers(config: GanTrafficConfig, idm: IdmParameters, stream: int) -> Ge
         UserError: the weights are missing, foreign or of the other preset, or their recordings hold
             no complete lane change.
     """
-    source, weights, sizes, metadata = _fitted(config.path, "paper")
-    statistics = _statistics(metadata)
+    source, weights, sizes, _, statistics = _fitted(config.path, "paper")
     return GeneratedDrivers(
         idm,
         sizes,
@@ -699,8 +695,7 @@ def calibrated_drivers(
         UserError: the weights are missing, foreign, of the other preset, or fitted without
             per-driver parameters.
     """
-    source, weights, sizes, metadata = _fitted(config.path, "calibrated")
-    statistics = _statistics(metadata)
+    source, weights, sizes, metadata, statistics = _fitted(config.path, "calibrated")
     # Without a recorded change nobody changes lanes.
     recorded = statistics.lane_changes.per_vehicle_km or 0.0
     # Only None asks for the recorded rate; 0 is a rate.
@@ -717,13 +712,6 @@ def calibrated_drivers(
         checked_changes=CalibratedChanges(wishes),
         headways_s=tuple(statistics.headway.quantile(level) for level in QUANTILE_LEVELS),
     )
-
-
-def _statistics(metadata: Mapping[str, Any]) -> DrivingStatistics:
-    # Imports the readers of recordings, a third of a second that rule-driven traffic does without.
-    from ganlane.data.statistics import DrivingStatistics
-
-    return DrivingStatistics.from_dict(metadata["driving_statistics"])
 
 
 def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralChanges:
@@ -829,13 +817,17 @@ def drivers_of(
 
 def _fitted(
     path: str | None, preset: Any
-) -> tuple[Path, Weights, GeneratorSizes, Mapping[str, Any]]:
-    """A generator's file, weights, sizes and metadata."""
+) -> tuple[Path, Weights, GeneratorSizes, Mapping[str, Any], DrivingStatistics]:
+    """A generator's file, weights, sizes, metadata, and the statistics of its recordings."""
+    # Imports the readers of recordings, a third of a second that rule-driven traffic does without.
+    from ganlane.data.statistics import DrivingStatistics
+
     source = Path(path or shipped_generator(preset))
     weights, metadata = load_arrays(source, GENERATOR)
     sizes = stored_sizes(source, metadata, preset)
     _check_shapes(source, sizes, _layers(sizes), weights)
-    return source, weights, sizes, metadata
+    statistics = DrivingStatistics.from_dict(metadata["driving_statistics"])
+    return source, weights, sizes, metadata, statistics
 
 
 def human_drivers(config: HumanTrafficConfig, idm: IdmParameters, stream: int) -> HumanDrivers:

@@ -113,7 +113,7 @@ def best_variant() -> str:
 
 def compilers() -> tuple[tuple[str, ...], ...]:
     """Commands of the C++ compilers to try: that of the system, that of ``ziglang``."""
-    path, _ = runtime.find_compiler()
+    path = runtime.find_compiler()
     commands: list[tuple[str, ...]] = [] if path is None else [(path,)]
     if importlib.util.find_spec("ziglang"):
         commands.append((sys.executable, "-m", "ziglang", "c++"))

@@ -184,8 +184,9 @@ class Layout:
 class Structure(ctypes.Structure):
     """A structure of the kernel."""
 
-    #: What its members point to, which has to live as long; ctypes holds the addresses alone.
-    pointed: Any
+    #: By member what it was given. What a member points to has to live as long: ctypes holds the
+    #: address alone.
+    pointed: Mapping[str, Any] = {}
 
 
 class Settings(Structure):
@@ -317,17 +318,26 @@ class Reward(Structure):
 Kind = TypeVar("Kind", bound=Structure)
 
 
-def filled(kind: type[Kind], numbers: Mapping[str, Any], pointed: Any = None) -> Kind:
-    """A structure with those of the ``numbers`` that it has."""
-    # A missing number is a KeyError here instead of a 0 in the kernel.
-    structure = kind(**{member[0]: numbers[member[0]] for member in kind._fields_})
-    structure.pointed = pointed
+def filled(kind: type[Kind], numbers: Mapping[str, Any]) -> Kind:
+    """A structure with those of the ``numbers`` that it has.
+
+    A member that is a pointer is given what it points to: a structure, an array, or None.
+    """
+    members = {}
+    for name, member, *_ in kind._fields_:
+        # A missing number is a KeyError here instead of a 0 in the kernel.
+        value = numbers[name]
+        members[name] = _address(value) if member is c_void_p else value
+    structure = kind(**members)
+    structure.pointed = numbers
     return structure
 
 
-def address(structure: ctypes.Structure | None) -> int | None:
-    """Where a structure is; None: a null pointer."""
-    return None if structure is None else ctypes.addressof(structure)
+def _address(target: ctypes.Structure | ctypes.Array[Any] | Array | None) -> int | None:
+    """Where a structure or an array is; None: a null pointer."""
+    if target is None:
+        return None
+    return target.ctypes.data if isinstance(target, np.ndarray) else ctypes.addressof(target)
 
 
 def range_of(bounds: tuple[float, float]) -> Range:
@@ -336,26 +346,25 @@ def range_of(bounds: tuple[float, float]) -> Range:
     return Range(low, high - low)
 
 
-def actions_of(actions: ActionParameters, decision_period_s: float) -> dict[str, Structure]:
-    """What the ego is commanded, by the name in :class:`Settings`; empty for lanes alone."""
+def actions_of(actions: ActionParameters, decision_period_s: float) -> Actions | None:
+    """What the ego is commanded; None: lanes alone."""
     if actions.form == LANE:
-        return {}
+        return None
     form = (LANE_SPEED, CONTINUOUS).index(actions.form)
-    numbers = vars(actions) | {"form": form, "decision_period_s": decision_period_s}
-    return {"actions": filled(Actions, numbers)}
+    return filled(Actions, {**vars(actions), "form": form, "decision_period_s": decision_period_s})
 
 
 def ends_of(
     stretches: Stretches,
     mobil: MobilParameters = MobilParameters(),  # noqa: B008 - frozen
-) -> dict[str, Structure]:
-    """Where lanes begin and end, by the name in :class:`Settings`; empty if all go on.
+) -> Ends | None:
+    """Where lanes begin and end; None: all go on.
 
     Raises:
         UserError: more lanes than the kernel has room for.
     """
     if not stretches:
-        return {}
+        return None
     if len(stretches) > _MOST_LANES:
         raise UserError(
             f"lanes={len(stretches)}: the native kernel has at most {_MOST_LANES} lanes on roads "
@@ -364,7 +373,7 @@ def ends_of(
     goal = exit_lane(stretches)
     leave_by, changes = leaving(stretches)
     exit_by, exit_changes = leaving(stretches, goal)
-    ends = Ends(
+    return Ends(
         begin=tuple(its.begin_m for its in stretches),
         end=tuple(its.end_m for its in stretches),
         wall=tuple(its.end_m if its.end == WALL else FAR_M for its in stretches),
@@ -375,34 +384,28 @@ def ends_of(
         mandatory_bias=mobil.mandatory_bias,
         exit_lane=-1 if goal is None else goal,
     )
-    return {"ends": ends}
 
 
-def flow_of(highway: Highway, period_s: float) -> dict[str, Structure]:
-    """Who enters and leaves, by the name in :class:`Settings`; empty if nobody does."""
+def flow_of(highway: Highway, period_s: float) -> Flow | None:
+    """Who enters and leaves; None: nobody does."""
     flow = highway.flow
     if flow is None:
-        return {}
-    arrivals = flow.arrivals(highway.stretches, period_s)
-    return {"flow": Flow(arrivals, flow.exit_share, flow.from_m, flow.to_m)}
+        return None
+    return filled(Flow, {**vars(flow), "arrival": flow.arrivals(highway.stretches, period_s)})
 
 
 def view_of(highway: Highway, scale: ObservationScale, form: str) -> View:
     """The numbers of an observation in :data:`NATIVE_FORMS`."""
-    ends = ends_of(highway.stretches).get("ends")
-    # By position, in the order of the members of View.
-    view = View(
-        scale.range_m,
-        scale.speed_mps,
-        highway.lane_width_m,
-        *(NEARNESS_M, OVERLAP_M, ROAD_SIGHT_M, HEADING_RAD),
-        *(highway.lanes, highway.vehicles),
-        *NATIVE_FORMS[form],
-        CONTROL_NUMBERS[highway.actions.form],
-        address(ends),
-    )
-    view.pointed = ends
-    return view
+    numbers = {
+        "nearness_m": NEARNESS_M,
+        "overlap_m": OVERLAP_M,
+        "sight_m": ROAD_SIGHT_M,
+        "heading_rad": HEADING_RAD,
+        "control": CONTROL_NUMBERS[highway.actions.form],
+        "ends": ends_of(highway.stretches),
+        **dict(zip(("drift", "overlap", "road"), NATIVE_FORMS[form])),
+    }
+    return filled(View, vars(scale) | highway._asdict() | numbers)
 
 
 def spawn_of(
@@ -417,7 +420,6 @@ def spawn_of(
     """The numbers of Table II, or of a ``scene``; ``recycle_share`` of the episodes recycle, None:
     none does.
     """
-    fixed = None if scene is None else _fixed_of(scene)
     numbers: dict[str, Any] = {}
     for name, value in vars(spawn).items():
         numbers[name] = range_of(value) if isinstance(value, tuple) else value
@@ -429,9 +431,9 @@ def spawn_of(
         "capacity": spawn.lane_capacity(),
         "recycle": recycle_share is not None,
         "recycle_share": recycle_share or 0.0,
-        "fixed": address(fixed),
+        "fixed": None if scene is None else _fixed_of(scene),
     }
-    return filled(Spawn, numbers, fixed)
+    return filled(Spawn, numbers)
 
 
 def _fixed_of(scene: FixedScene) -> Fixed:
@@ -442,5 +444,4 @@ def _fixed_of(scene: FixedScene) -> Fixed:
     for name in _FIXED_ARRAYS.split():
         kind = np.float32 if base[name].dtype == np.float64 else np.int64
         arrays[name] = np.ascontiguousarray(base[name].astype(kind))
-    pointers = {name: array.ctypes.data for name, array in arrays.items()}
-    return filled(Fixed, vars(scene) | pointers, arrays)
+    return filled(Fixed, vars(scene) | arrays)

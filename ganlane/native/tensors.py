@@ -231,31 +231,22 @@ class Kernel(_Parts):
             arrays[name] = number
         # New tensors: the state before the decision belongs to the caller.
         after = _room(layout, layout.written, rows, self.vehicles, torch.empty)
-        if len(self.parts) == 1:
-            self._run(0, rows, arrays, after)
-        else:
+        several = len(self.parts) > 1
+        if several:
             # What a part does not write is as it was.
             for name in layout.written:
                 if name[0] == keys.TRAFFIC:
                     after[name] = arrays[name].clone()  # type: ignore[union-attr]
-            for number in range(len(self.parts)):
-                of_part = self.of_part(number, state.get(keys.EPISODE))
-                arrays["rows"] = chosen = of_part.nonzero()[:, 0]
-                self._run(number, len(chosen), arrays, after)
+        for number, (function, of_part) in enumerate(zip(self._functions, self.layouts)):
+            if several:
+                chosen = self.of_part(number, state.get(keys.EPISODE))
+                arrays["rows"] = numbers = chosen.nonzero()[:, 0]
+                rows = len(numbers)
+            outputs = [after.get(name) for name in of_part.outputs]
+            function.run(rows, map(arrays.get, of_part.inputs), outputs)
         # What no decision changes is shared with the state before, not copied.
         lasting = {name: arrays[name] for name in (*settings.SCENE, keys.SEED, keys.EPISODE)}
         return _state(lasting | after)  # type: ignore[arg-type]
-
-    def _run(
-        self,
-        number: int,
-        rows: int,
-        arrays: Mapping[Key, Tensor | None],
-        after: Mapping[Key, Tensor],
-    ) -> None:
-        layout = self.layouts[number]
-        inputs, outputs = map(arrays.get, layout.inputs), list(map(after.get, layout.outputs))
-        self._functions[number].run(rows, inputs, outputs)
 
 
 class NativeScenes(_Parts):

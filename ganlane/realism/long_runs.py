@@ -24,7 +24,7 @@ from ganlane.realism.driving import Factory, step_traffic
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.neighbours import leader, perceive
 from ganlane.sim.random import absorb, episode_key
-from ganlane.sim.spawn import TABLE_II, SpawnParameters, spawn
+from ganlane.sim.spawn import TABLE_II, RandomScenes, SpawnParameters
 from ganlane.sim.state import Road, Vehicles, lateral_half_extent
 from ganlane.traffic import TrafficModule
 
@@ -188,14 +188,13 @@ def spawned_vehicles(
     # Table II's density, for the vehicles and an empty place for the ego.
     spread = parameters.spawn.spread_m * (parameters.vehicles + 1) / 9.0
     start = replace(parameters.spawn, spread_m=max(parameters.spawn.spread_m, spread))
-    vehicles = spawn(
-        key,
+    scenes = RandomScenes(
+        traffic.road,
         parameters.vehicles + 1,
-        int(traffic.road.lanes),
-        float(traffic.road.lane_width_m),
         start,
         others_visibility=int(traffic.visibility),
     )
+    vehicles = scenes(key, torch.float32)
     # Spawned with an ego, since Table II has one, and driven without it.
     index = torch.arange(parameters.vehicles + 1)
     return vehicles.with_(valid=vehicles.valid & (index > 0))

@@ -30,7 +30,7 @@ from ganlane.settings.record import (
     one_of,
     part_of,
 )
-from ganlane.settings.road import EXIT, WALL, FlowParameters, LaneStretch, Stretches
+from ganlane.settings.road import EXIT, WALL, FlowParameters, LaneStretch, Stretches, with_side_lane
 
 if TYPE_CHECKING:
     from ganlane.sim.scenes import FixedScene, SceneVehicle
@@ -171,8 +171,7 @@ class MergeScene(SceneConfig):
 
     def stretches(self, lanes: int) -> Stretches:
         """The rightmost lane ends, the others go on."""
-        ramp = LaneStretch(self.ramp_m, self.ramp_m + self.merge_m, WALL)
-        return (ramp, *[LaneStretch()] * (lanes - 1))
+        return with_side_lane(lanes, self.ramp_m, self.merge_m, WALL)
 
 
 @dataclass(frozen=True)
@@ -221,8 +220,7 @@ class ExitScene(SceneConfig):
 
     def stretches(self, lanes: int) -> Stretches:
         """The rightmost lane is there for a while, the others go on."""
-        leaving = LaneStretch(self.distance_m, self.distance_m + self.exit_m, EXIT)
-        return (leaving, *[LaneStretch()] * (lanes - 1))
+        return with_side_lane(lanes, self.distance_m, self.exit_m, EXIT)
 
 
 @dataclass(frozen=True)
@@ -253,8 +251,7 @@ class OnRampScene(SceneConfig):
 
     def stretches(self, lanes: int) -> Stretches:
         """The rightmost lane ends, the others go on."""
-        ramp = LaneStretch(self.ramp_m, self.ramp_m + self.merge_m, EXIT if self.exit else WALL)
-        return (ramp, *[LaneStretch()] * (lanes - 1))
+        return with_side_lane(lanes, self.ramp_m, self.merge_m, EXIT if self.exit else WALL)
 
 
 @dataclass(frozen=True)

@@ -8,28 +8,19 @@ from typing import Annotated
 
 from ganlane.errors import ParameterError, UserError
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.settings.record import Positive, PositiveRange, Range, Record, Rule, Share
+from ganlane.settings.record import Positive, PositiveRange, Range, Record, Share, up_to
 
 #: What drives a decision: the tensor code, the native kernel, or the latter where it can.
 KERNELS = ("torch", "native", "auto")
 
 #: Positions are float32. After 60 s the median error, relative to a float64 run, is 0.002 m where a
-#: drive starts at 5 km, 0.06 m at 100 km, 1.8 m at
-#: 1000 km.
+#: drive starts at 5 km, 0.06 m at 100 km, 1.8 m at 1000 km.
 FARTHEST_GOAL_M = 100_000.0
 #: float32 counts physics steps up to 2**24, 1.7e6 s; far larger numbers overflow int64, and every
 #: episode would end after one decision.
 LATEST_TIMEOUT_S = 1_000_000.0
-_GOAL = Rule(
-    lambda value: 0 < value <= FARTHEST_GOAL_M,
-    f"a number above 0, at most {FARTHEST_GOAL_M:.0f}, since positions are float32 and coarse "
-    "beyond",
-)
-_TIMEOUT = Rule(
-    lambda value: 0 < value <= LATEST_TIMEOUT_S,
-    f"a number above 0, at most {LATEST_TIMEOUT_S:.0f}, since physics steps are counted exactly up "
-    "to there",
-)
+_GOAL = up_to(FARTHEST_GOAL_M, ", since positions are float32 and coarse beyond")
+_TIMEOUT = up_to(LATEST_TIMEOUT_S, ", since physics steps are counted exactly up to there")
 
 
 class Stream(IntEnum):
@@ -77,14 +68,11 @@ class EpisodeParameters(Record):
     def __post_init__(self) -> None:
         super().__post_init__()
         # 0.3 / 0.1 is not exactly 3, so a whole number is tested with a tolerance.
-        if (
-            self.substeps() < 1
-            or abs(self.substeps() * PHYSICS_STEP_S - self.decision_period_s) > 1e-9
-        ):
+        whole_s = self.substeps() * PHYSICS_STEP_S
+        if whole_s == 0 or abs(whole_s - self.decision_period_s) > 1e-9:
             raise ParameterError(
                 f"{{decision_period_s}}={self.decision_period_s:g} is not a multiple of "
-                f"{PHYSICS_STEP_S:g} s; "
-                "choose 0.1, 0.2, ... 1.0 or more."
+                f"{PHYSICS_STEP_S:g} s; choose 0.1, 0.2, ... 1.0 or more."
             )
 
     def substeps(self) -> int:
@@ -170,10 +158,9 @@ class SpawnParameters(Record):
         Key, highest speed, the leader's lowest speed, highest desired speed, m/s.
         """
         front, rear, ego = self.front_speed_mps, self.rear_speed_mps, self.ego_speed_mps
-        others = max(
-            self.desired_speed_mps[1],
-            self.truck_desired_speed_mps[1] if self.truck_share > 0 else 0.0,
-        )
+        others = self.desired_speed_mps[1]
+        if self.truck_share > 0:
+            others = max(others, self.truck_desired_speed_mps[1])
         # By group of followers: the fastest one behind the slowest leader that Table II allows.
         return (
             ("rear_speed_mps", rear[1], min(rear[0], ego[0], front[0]), others),

@@ -72,6 +72,11 @@ def between(low: float, high: float) -> Rule:
     return Rule(lambda value: low <= value <= high, expected)
 
 
+def up_to(high: float, reason: str = "") -> Rule:
+    """Above 0 and not above ``high``; ``reason`` ends the sentence."""
+    return Rule(lambda value: 0 < value <= high, f"a number above 0, at most {high:.0f}{reason}")
+
+
 def one_of(names: Iterable[str]) -> Rule:
     """One of ``names``."""
     allowed = tuple(names)
@@ -93,7 +98,7 @@ Negative = Annotated[float, Rule(lambda value: _finite(value) and value < 0, "a 
 NotNegative = Annotated[float, at_least(0)]
 NotPositive = Annotated[float, Rule(lambda value: _finite(value) and value <= 0, "at most 0")]
 Share = Annotated[float, between(0, 1)]
-PositiveShare = Annotated[float, Rule(lambda value: 0 < value <= 1, "a number above 0, at most 1")]
+PositiveShare = Annotated[float, up_to(1)]
 Count = Annotated[int, at_least(1)]
 CountOrZero = Annotated[int, at_least(0)]
 #: Up to 2**53 a whole number survives as a float, as in JSON.
@@ -350,7 +355,7 @@ def _scalar(kind: Any, value: Any, key: str) -> Any:
     # bool is a subclass of int, but true is no number.
     if isinstance(value, bool) and kind is not bool:
         raise _Refusal(key, value, _WORDS[kind])
-    is_number = isinstance(value, Real) and not isinstance(value, bool)
+    is_number = isinstance(value, Real)
     if kind is float and is_number:
         try:
             return float(value)

@@ -69,6 +69,12 @@ class LaneStretch(Record):
 Stretches = tuple[LaneStretch, ...]
 
 
+def with_side_lane(lanes: int, begin_m: float, length_m: float, end: str) -> Stretches:
+    """The rightmost of the ``lanes`` begins and ends, the others go on."""
+    side = LaneStretch(begin_m, begin_m + length_m, end)
+    return (side, *[LaneStretch()] * (lanes - 1))
+
+
 def exit_lane(stretches: Stretches) -> int | None:
     """The lane that ends in an exit; None without one."""
     return next((lane for lane, its in enumerate(stretches) if its.end == EXIT), None)

@@ -130,10 +130,7 @@ class BenchmarkConfig(RunConfig):
         """
         suite = self.suite
         fixed: dict[str, Any] = {
-            "version": suite.version,
-            "stream": suite.stream,
-            "scored": suite.scored,
-            "shown": suite.shown,
+            **{name: getattr(suite, name) for name in ("version", "stream", "scored", "shown")},
             "env": _changed(suite.env),
             "reward": _changed(suite.reward),
             "seed": self.seed,

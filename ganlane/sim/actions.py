@@ -24,10 +24,7 @@ SPEED_STEPS = (0.0, 0.0, 0.0, 1.0, -1.0)
 
 
 def commanded_speed(
-    action: Tensor,
-    speed: Tensor,
-    desired: Tensor,
-    actions: ActionParameters,
+    action: Tensor, speed: Tensor, desired: Tensor, actions: ActionParameters
 ) -> Tensor:
     """The speed that the ego aims at after ``action`` [N] of ``lane_speed``, m/s.
 
@@ -39,11 +36,7 @@ def commanded_speed(
     return torch.minimum(torch.maximum(speed + step, lowest), desired)
 
 
-def speed_changes(
-    speed: Tensor,
-    desired: Tensor,
-    actions: ActionParameters,
-) -> Tensor:
+def speed_changes(speed: Tensor, desired: Tensor, actions: ActionParameters) -> Tensor:
     """Whether ``faster`` and ``slower`` have an effect, bool [N, 2]; arguments as above."""
     return torch.stack((speed < desired, speed > actions.lowest_speed_mps), dim=1)
 
@@ -84,10 +77,7 @@ def apply_controls(
     shift = torch.sign(target - ego.target_lane)[:, 0]
     starts = shift != 0
     command = Command(
-        target[:, 0],
-        torch.where(starts, shift, direction),
-        starts,
-        torch.zeros_like(starts),
+        target[:, 0], torch.where(starts, shift, direction), starts, torch.zeros_like(starts)
     )
     strongest = torch.where(pedal > 0, actions.strongest_acceleration, actions.strongest_braking)
     room = ((ego.desired_speed - ego.speed) / period_s).clamp_min(0.0)

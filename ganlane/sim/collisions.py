@@ -15,38 +15,27 @@ from ganlane.sim.state import STRAIGHT, Road, Vehicles, reads_are_cheap
 FEW = 1000
 
 
-def boxes_overlap(
-    dx: Tensor,
-    dy: Tensor,
-    heading: Tensor,
-    length: Tensor,
-    width: Tensor,
-    other_heading: Tensor,
-    other_length: Tensor,
-    other_width: Tensor,
-) -> Tensor:
-    """Whether two oriented boxes overlap (touching does not count), elementwise.
-
-    Args:
-        dx, dy: from the centre of the first box to the centre of the other, m.
-        heading, length, width: of the first box, rad and m; ``other_*``: of the other.
+def boxes_overlap(dx: Tensor, one: Vehicles, other: Vehicles) -> Tensor:
+    """Whether the boxes of ``other``, ``dx`` m ahead of ``one``, overlap its box (touching does not
+    count), elementwise.
     """
-    c = torch.cos(heading)
-    s = torch.sin(heading)
-    oc = torch.cos(other_heading)
-    os = torch.sin(other_heading)
+    dy = other.y - one.y
+    c = torch.cos(one.heading)
+    s = torch.sin(one.heading)
+    oc = torch.cos(other.heading)
+    os = torch.sin(other.heading)
     # Of the angle between the two boxes.
     cos = (c * oc + s * os).abs()
     sin = (c * os - s * oc).abs()
     # Separating axes: two rectangles are apart where the axis along or across one of them says so.
-    boxes = [(0.5 * length, 0.5 * width), (0.5 * other_length, 0.5 * other_width)]
+    boxes = [(0.5 * box.length, 0.5 * box.width) for box in (one, other)]
 
     def separated(
-        along: Tensor, across: Tensor, box: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]
+        along: Tensor, across: Tensor, box: tuple[Tensor, Tensor], against: tuple[Tensor, Tensor]
     ) -> Tensor:
         """Whether an axis of a box separates it from the other; half lengths and widths."""
-        reach_along = box[0] + other[0] * cos + other[1] * sin
-        reach_across = box[1] + other[0] * sin + other[1] * cos
+        reach_along = box[0] + against[0] * cos + against[1] * sin
+        reach_across = box[1] + against[0] * sin + against[1] * cos
         return (along.abs() >= reach_along) | (across.abs() >= reach_across)
 
     by_own = separated(dx * c + dy * s, dy * c - dx * s, *boxes)
@@ -67,43 +56,25 @@ def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
         if len(row) == 0:
             return torch.zeros_like(both)
         if dx.numel() >= FEW:
-            ego = Vehicles(*(field[row, 0] for field in v))
-            near = Vehicles(*(field[row, column + 1] for field in v))
+            ego = v.part((row, 0))
+            near = v.part((row, column + 1))
             # Only the near pairs are tested; all others are apart.
-            hits = _hits(dx[row, column], ego, near)
+            hits = boxes_overlap(dx[row, column], ego, near)
             return torch.zeros_like(both).index_put((row, column), hits) & both
     ego = v.columns(slice(0, 1))
     others = v.columns(slice(1, None))
-    return _hits(dx, ego, others) & both
+    return boxes_overlap(dx, ego, others) & both
 
 
 def pair_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     """Whether vehicles i and j overlap, bool [N, M, M], false on the diagonal."""
     # [N, M, 1] against [N, 1, M]: every vehicle with every other.
-    one = Vehicles(*(field.unsqueeze(2) for field in vehicles))
-    other = Vehicles(*(field.unsqueeze(1) for field in vehicles))
-    hit = _hits(road.distance_ahead(one.x, other.x), one, other)
+    one = vehicles.part((..., None))
+    other = vehicles.part((slice(None), None))
+    hit = boxes_overlap(road.distance_ahead(one.x, other.x), one, other)
     hit = hit & other.valid & one.valid
     itself = torch.eye(vehicles.x.shape[1], dtype=torch.bool, device=vehicles.x.device)
     return hit & ~itself
-
-
-def _hits(
-    dx: Tensor,
-    one: Vehicles,
-    other: Vehicles,
-) -> Tensor:
-    """Whether the boxes of ``other``, ``dx`` m ahead of ``one``, overlap its box."""
-    return boxes_overlap(
-        dx,
-        other.y - one.y,
-        one.heading,
-        one.length,
-        one.width,
-        other.heading,
-        other.length,
-        other.width,
-    )
 
 
 def dangerously_close(

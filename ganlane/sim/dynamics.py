@@ -131,6 +131,26 @@ def steer(
     return at_rest((steering + gain * turn * dt).clamp(-p.max_angle_rad, p.max_angle_rad))
 
 
+def drive(
+    vehicles: Vehicles,
+    acceleration: Tensor,
+    steering: Tensor,
+    line: Tensor,
+    dt: float,
+    parameters: SteeringParameters = STEERING,
+) -> tuple[Vehicles, Tensor]:
+    """The vehicles ``dt`` seconds later, and their steering angles, rad.
+
+    They accelerate with ``acceleration``, m/s2, and steer to the lines at ``line``, m. All [N] or
+    [N, M].
+    """
+    # The kinematics know no lanes: a lane change is another line to steer to.
+    pose = (vehicles.y, vehicles.heading, vehicles.speed)
+    steering = steer(steering, *pose, line, dt, parameters)
+    moved = advance(vehicles.x, *pose, acceleration, steering, dt)
+    return vehicles.with_(**moved._asdict()), steering
+
+
 # The ego: vehicle 0 of every environment
 
 
@@ -153,11 +173,7 @@ class Command(NamedTuple):
     off_road: Tensor
 
 
-def is_heard(
-    side: Tensor,
-    direction: Tensor,
-    abort: bool,
-) -> Tensor:
+def is_heard(side: Tensor, direction: Tensor, abort: bool) -> Tensor:
     """Whether a wish to go to ``side`` is obeyed during a lane change in ``direction`` (each -1, 0
     or 1).
 
@@ -167,11 +183,7 @@ def is_heard(
     return idle | (side == -direction) if abort else idle
 
 
-def stays_on_road(
-    vehicles: Vehicles,
-    side: Tensor,
-    road: Road,
-) -> Tensor:
+def stays_on_road(vehicles: Vehicles, side: Tensor, road: Road) -> Tensor:
     """Whether a change to each ``side`` [N, S] (-1, 0 or 1) leaves the ego on the road, [N, S].
 
     The lane is the one beside its target lane, where the ego is.
@@ -209,41 +221,6 @@ def ego_scene(vehicles: Vehicles, road: Road) -> Scene:
     return perceive(vehicles, road, slice(EGO_INDEX, EGO_INDEX + 1))
 
 
-def move_ego(
-    vehicles: Vehicles,
-    acceleration: Tensor,
-    steering: Tensor,
-    line: Tensor,
-    wheel: SteeringParameters,
-    dt: float,
-) -> tuple[Vehicles, Tensor]:
-    """The ego after ``dt`` seconds (fields [N]) and its steering angle (rad, [N]).
-
-    It accelerates with ``acceleration`` (m/s2, [N]) and steers to the line at ``line`` (m, [N]).
-    """
-    ego = vehicles.at(EGO_INDEX)
-    # The kinematics know no lanes: a lane change is another line to steer to.
-    steering = steer(
-        steering,
-        ego.y,
-        ego.heading,
-        ego.speed,
-        line,
-        dt,
-        wheel,
-    )
-    pose = advance(
-        ego.x,
-        ego.y,
-        ego.heading,
-        ego.speed,
-        acceleration,
-        steering,
-        dt,
-    )
-    return ego.with_(**pose._asdict()), steering
-
-
 def ego_surroundings(
     scene: Scene, idm: IdmParameters, ego: EgoParameters
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -273,11 +250,7 @@ def ego_surroundings(
     )
 
 
-def change_progress(
-    ego: Vehicles,
-    direction: Tensor,
-    road: Road,
-) -> Tensor:
+def change_progress(ego: Vehicles, direction: Tensor, road: Road) -> Tensor:
     """Progress [N] of the current lane change, 0 at its start to 1 at the target lane's centre.
 
     0 without one.

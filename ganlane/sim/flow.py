@@ -16,12 +16,11 @@ from torch import Tensor
 from ganlane.keys import EGO_INDEX
 from ganlane.settings.driving import IdmParameters
 from ganlane.settings.road import FlowParameters
-from ganlane.sim.idm import idm_acceleration
 from ganlane.sim.lane_ends import at_exit, exiting
-from ganlane.sim.neighbours import FREE_GAP_M
 from ganlane.sim.random import Purpose, draw_keys, uniform
-from ganlane.sim.spawn import SAFE_DECELERATION, SIDE_M
+from ganlane.sim.spawn import leave_room
 from ganlane.sim.state import (
+    LaneRange,
     Road,
     Vehicles,
     body_lanes,
@@ -40,8 +39,7 @@ def has_left(vehicles: Vehicles, road: Road, flow: FlowParameters) -> Tensor:
     if road.exit_lane is not None:
         by_exit, _ = at_exit(vehicles, road)
         left = left | by_exit
-    others = torch.arange(vehicles.x.shape[1], device=vehicles.x.device) != EGO_INDEX
-    return left & others & vehicles.valid
+    return left & ~vehicles.is_ego() & vehicles.valid
 
 
 def _chosen(vehicles: Vehicles, road: Road, wanted: Tensor, number: Tensor) -> Tensor:
@@ -69,29 +67,16 @@ def _room(vehicles: Vehicles, comes: Tensor, road: Road, idm: IdmParameters) -> 
     """
     slot = torch.arange(vehicles.x.shape[1], device=vehicles.x.device)
     its = comes.to(torch.uint8).argmax(1, keepdim=True)
-    low, high = with_target(body_lanes(vehicles, road), vehicles)
-    sides = 0.5 * vehicles.width.gather(1, its) + 0.5 * vehicles.width + SIDE_M
-    shares = (low.gather(1, its) <= high) & (low <= high.gather(1, its))
-    shares = shares | ((vehicles.y.gather(1, its) - vehicles.y).abs() < sides)
-    distance = vehicles.x - vehicles.x.gather(1, its)
+    one = Vehicles(*(field.gather(1, its) for field in vehicles))
+    lanes = with_target(body_lanes(vehicles, road), vehicles)
+    its_lanes = LaneRange(*(lane.gather(1, its) for lane in lanes))
+    distance = vehicles.x - one.x
     ahead = (distance > 0.0) | ((distance == 0.0) & (slot < its))
-    bumpers = 0.5 * vehicles.length.gather(1, its) + 0.5 * vehicles.length
-    gap = (distance.abs() - bumpers).clamp_max(FREE_GAP_M)
-    speed = vehicles.speed.gather(1, its)
-    desired = vehicles.desired_speed.gather(1, its)
-    behind_it = idm_acceleration(speed, desired, gap, vehicles.speed, idm)
-    before_it = idm_acceleration(vehicles.speed, vehicles.desired_speed, gap, speed, idm)
-    asked = torch.where(ahead, behind_it, before_it)
-    return (~(shares & vehicles.valid) | (asked >= -SAFE_DECELERATION)).all(1)
+    return leave_room(one, vehicles, (its_lanes, lanes), distance, ahead, idm).all(1)
 
 
 def let_in_and_out(
-    vehicles: Vehicles,
-    road: Road,
-    idm: IdmParameters,
-    key: Tensor,
-    step: Tensor,
-    period_s: float,
+    vehicles: Vehicles, road: Road, idm: IdmParameters, key: Tensor, step: Tensor, period_s: float
 ) -> Vehicles:
     """``vehicles`` after some have left and others have entered.
 
@@ -105,9 +90,9 @@ def let_in_and_out(
     assert flow is not None
     arrivals = flow.arrivals(road.stretches, period_s)
     vehicles = vehicles.with_(valid=vehicles.valid & ~has_left(vehicles, road, flow))
-    purposes = [int(Purpose.FLOW_ARRIVAL), int(Purpose.FLOW_EXIT)]
+    purposes = [Purpose.FLOW_ARRIVAL, Purpose.FLOW_EXIT]
     u = uniform(key, step, len(arrivals), purposes, torch.float64)
-    keys = draw_keys(key, step, vehicles.x.shape[1], [int(Purpose.FLOW_SLOT)])[..., 0]
+    keys = draw_keys(key, step, vehicles.x.shape[1], [Purpose.FLOW_SLOT])[..., 0]
     number = (keys >> (64 - _CHOICE_BITS)) & ((1 << _CHOICE_BITS) - 1)
     # Lane by lane, so that nobody enters beside one who has just done so without room.
     for lane, probability in enumerate(arrivals):

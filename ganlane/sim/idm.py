@@ -5,6 +5,7 @@ And whom it can save: whether a follower avoids a leader that brakes at the limi
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
@@ -19,48 +20,56 @@ from ganlane.sim.state import spanned
 
 
 class DriverIdm(NamedTuple):
-    """Per-driver IDM parameters: tensors [N, M] instead of Table V's numbers."""
+    """IDM parameters of which some are tensors [N, M], one number per driver."""
 
     min_gap_m: float
     headway_s: Tensor
-    comfortable_deceleration: Tensor
-    min_acceleration: Tensor
-    max_acceleration: Tensor
+    comfortable_deceleration: Tensor | float
+    min_acceleration: Tensor | float
+    max_acceleration: Tensor | float
 
     def per_lane(self) -> DriverIdm:
         """The parameters as [N, M, 1], to broadcast over lanes or pairs."""
-        return DriverIdm(self.min_gap_m, *(value[..., None] for value in self[1:]))
+        return DriverIdm._make(
+            number[..., None] if isinstance(number, Tensor) else number for number in self
+        )
 
     def of(self, rows: Tensor, columns: Tensor) -> DriverIdm:
         """The parameters of some drivers: indices [R], and [R, W] in these rows."""
-        return DriverIdm(self.min_gap_m, *(value[rows].gather(1, columns) for value in self[1:]))
+        return DriverIdm._make(
+            number[rows].gather(1, columns) if isinstance(number, Tensor) else number
+            for number in self
+        )
 
-    def brake_scale(self) -> Tensor:
+    def brake_scale(self) -> Tensor | float:
         """As :meth:`IdmParameters.brake_scale`."""
-        return 2.0 * torch.sqrt(self.max_acceleration * self.comfortable_deceleration)
+        product = self.max_acceleration * self.comfortable_deceleration
+        return 2.0 * (product.sqrt() if isinstance(product, Tensor) else math.sqrt(product))
 
 
 AnyIdm: TypeAlias = IdmParameters | DriverIdm
+
+
+def with_headways(idm: IdmParameters, headway_s: Tensor) -> DriverIdm:
+    """``idm`` with a time headway of each driver's own, s, [N, M]."""
+    return DriverIdm(**{**vars(idm), "headway_s": headway_s})
+
+
 TABLE_V = IdmParameters()
 #: Lower bound of the gap in the interaction term, m, which stays finite and gives the hardest
 #: braking.
 SMALLEST_GAP_M = 0.1
 
 
-def desired_gap(
-    speed: Tensor,
-    closing_speed: Tensor,
-    parameters: AnyIdm = TABLE_V,
-    headway_s: Tensor | float | None = None,
-) -> Tensor:
+def desired_gap(speed: Tensor, closing_speed: Tensor, parameters: AnyIdm = TABLE_V) -> Tensor:
     """Desired gap, m, at ``speed`` behind a leader approached at ``closing_speed``, m/s.
 
     The dynamic part is never negative, so a faster leader does not reduce the desired gap below the
     minimum.
     """
-    headway = parameters.headway_s if headway_s is None else headway_s
     # The last term is that of approaching a leader: v dv / (2 sqrt(a b)).
-    dynamic = speed * headway + speed * closing_speed / parameters.brake_scale()
+    approach = speed * closing_speed / parameters.brake_scale()
+    dynamic = speed * parameters.headway_s + approach
     return parameters.min_gap_m + dynamic.clamp_min(0.0)
 
 
@@ -70,7 +79,6 @@ def idm_acceleration(
     gap: Tensor,
     leader_speed: Tensor,
     parameters: AnyIdm = TABLE_V,
-    headway_s: Tensor | float | None = None,
 ) -> Tensor:
     """Acceleration in m/s2, within Table V's bounds; all tensors broadcast against each other.
 
@@ -80,17 +88,11 @@ def idm_acceleration(
             less (an overlap) gives the hardest braking.
         leader_speed: m/s; without a leader it only enters the (negligible) approach term.
         parameters: common to all drivers, or per driver (:class:`DriverIdm`).
-        headway_s: time headway per vehicle, s, instead of Table V's.
     """
     # The exponent 4 of the free-road term, without a power.
     ratio = speed / desired_speed
     square = ratio * ratio
-    wanted = desired_gap(
-        speed,
-        speed - leader_speed,
-        parameters,
-        headway_s,
-    )
+    wanted = desired_gap(speed, speed - leader_speed, parameters)
     interaction = wanted / gap.clamp_min(SMALLEST_GAP_M)
     acceleration = parameters.max_acceleration * (1.0 - square * square - interaction * interaction)
     # Where they overlap the interaction term is huge: the bound makes it the hardest braking.
@@ -106,70 +108,38 @@ def equilibrium_gap(
     return (parameters.min_gap_m + speed * parameters.headway_s) / torch.sqrt(1.0 - square * square)
 
 
-def acceleration_behind(
-    scene: Scene,
-    ahead: Neighbour,
-    parameters: AnyIdm = TABLE_V,
-    headway_s: Tensor | float | None = None,
-) -> Tensor:
+def acceleration_behind(scene: Scene, ahead: Neighbour, parameters: AnyIdm) -> Tensor:
     """IDM acceleration of each observer behind ``ahead`` [N, K, L] in L lanes, m/s2."""
     # [N, K, 1], to broadcast over the L lanes.
     speed = scene.observers.speed[..., None]
     desired = scene.observers.desired_speed[..., None]
-    headway_s = headway_s[..., None] if isinstance(headway_s, Tensor) else headway_s
-    return idm_acceleration(
-        speed,
-        desired,
-        ahead.gap,
-        ahead.speed,
-        parameters.per_lane(),
-        headway_s,
-    )
+    return idm_acceleration(speed, desired, ahead.gap, ahead.speed, parameters.per_lane())
 
 
-def following_acceleration(
-    scene: Scene, parameters: AnyIdm = TABLE_V, headway_s: Tensor | float | None = None
-) -> Tensor:
+def following_acceleration(scene: Scene, parameters: AnyIdm = TABLE_V) -> Tensor:
     """IDM acceleration of every observer, m/s2, [N, K].
 
     During a lane change a vehicle is in two lanes, or three; the smallest acceleration over the
     lanes is used. The wall at the end of a lane is a standing obstacle.
     """
     lanes = spanned(scene.attention)
-    ahead = leader(scene, lanes)
-    return acceleration_in(
-        scene,
-        lanes,
-        ahead,
-        parameters,
-        headway_s,
-    )
+    return acceleration_in(scene, lanes, leader(scene, lanes), parameters)
 
 
-def acceleration_in(
-    scene: Scene,
-    lanes: Tensor,
-    ahead: Neighbour,
-    parameters: AnyIdm = TABLE_V,
-    headway_s: Tensor | float | None = None,
-) -> Tensor:
+def acceleration_in(scene: Scene, lanes: Tensor, ahead: Neighbour, parameters: AnyIdm) -> Tensor:
     """IDM acceleration of every observer, m/s2, [N, K], in all of its ``lanes`` [N, K, L]: behind
     ``ahead`` and before the lanes' walls.
     """
-    acceleration = acceleration_behind(scene, ahead, parameters, headway_s)
+    acceleration = acceleration_behind(scene, ahead, parameters)
     if scene.road.has_lane_ends:
         keeps = lanes == scene.observers.target_lane[..., None]
-        before = acceleration_before_wall(scene, lanes, keeps, parameters, headway_s)
+        before = acceleration_before_wall(scene, lanes, keeps, parameters)
         acceleration = torch.minimum(acceleration, before)
     return acceleration.amin(-1)
 
 
 def acceleration_before_wall(
-    scene: Scene,
-    lanes: Tensor,
-    keeps: Tensor,
-    parameters: AnyIdm = TABLE_V,
-    headway_s: Tensor | float | None = None,
+    scene: Scene, lanes: Tensor, keeps: Tensor, parameters: AnyIdm
 ) -> Tensor:
     """IDM acceleration of each observer before the walls of ``lanes`` [N, K, L], m/s2.
 
@@ -178,7 +148,7 @@ def acceleration_before_wall(
     """
     room, has_wall = stopping_room(scene.observers, lanes, scene.road, keeps)
     standing = Neighbour(room, torch.zeros_like(room))
-    acceleration = acceleration_behind(scene, standing, parameters, headway_s)
+    acceleration = acceleration_behind(scene, standing, parameters)
     return torch.where(has_wall, acceleration, torch.inf)
 
 
@@ -188,11 +158,7 @@ def acceleration_before_wall(
 HORIZON_S = 60.0
 
 
-def needed_deceleration(
-    speed: Tensor,
-    leader_speed: Tensor,
-    gap: Tensor,
-) -> Tensor:
+def needed_deceleration(speed: Tensor, leader_speed: Tensor, gap: Tensor) -> Tensor:
     """Constant deceleration, m/s2, that avoids a leader of constant speed ``gap`` m ahead.
 
     Infinite at 0 m.
@@ -204,9 +170,13 @@ def needed_deceleration(
 
 
 def _survives(
-    gap: Tensor, speed: Tensor, leader_speed: float, desired_speed: float, idm: IdmParameters
+    gap_m: Tensor | float,
+    speed_mps: Tensor | float,
+    leader_speed_mps: float,
+    desired_speed_mps: float,
+    idm: IdmParameters,
 ) -> Tensor:
-    """Whether followers at ``speed``, m/s, avoid a leader that from now on brakes at the limit.
+    """Whether followers at ``speed_mps`` avoid a leader that from now on brakes at the limit.
 
     The limit is ``idm.min_acceleration``.
     Two vehicles, IDM, steps of 0.1 s. This leader is the worst of all that brake no harder than
@@ -214,18 +184,13 @@ def _survives(
     this one also avoids crashes in a queue, where each leader may have to brake for its own.
     """
     # In float64, since 600 steps add up and the result decides whether a scene is refused.
-    leader_now = torch.tensor(leader_speed, dtype=torch.float64)
-    gap, speed, leader_now = torch.broadcast_tensors(gap, speed, leader_now)
-    smallest = start = gap
+    start = (gap_m, speed_mps, leader_speed_mps)
+    numbers = [torch.as_tensor(number, dtype=torch.float64) for number in start]
+    gap, speed, leader_now = torch.broadcast_tensors(*numbers)
+    smallest = first = gap
     # Trapezoids, as vehicles move in the simulation (dynamics.advance).
     for _ in range(round(HORIZON_S / PHYSICS_STEP_S)):
-        acceleration = idm_acceleration(
-            speed,
-            desired_speed,
-            gap,
-            leader_now,
-            idm,
-        )
+        acceleration = idm_acceleration(speed, desired_speed_mps, gap, leader_now, idm)
         next_speed = (speed + acceleration * PHYSICS_STEP_S).clamp_min(0.0)
         next_leader = (leader_now + idm.min_acceleration * PHYSICS_STEP_S).clamp_min(0.0)
         gap = gap + 0.5 * PHYSICS_STEP_S * (leader_now + next_leader - speed - next_speed)
@@ -233,7 +198,7 @@ def _survives(
         leader_now = next_leader
         smallest = torch.minimum(smallest, gap)
     # Where IDM's gap is cut off already at the start, it must only not shrink.
-    return smallest >= start.clamp(1e-9, SMALLEST_GAP_M)
+    return smallest >= first.clamp(1e-9, SMALLEST_GAP_M)
 
 
 @lru_cache(maxsize=1024)
@@ -245,9 +210,7 @@ def can_brake(
     idm: IdmParameters = TABLE_V,
 ) -> bool:
     """Whether a follower avoids a leader that brakes at the limit, with 0.1 m for rounding."""
-    gap = torch.tensor([gap_m], dtype=torch.float64)
-    speed = torch.tensor([speed_mps], dtype=torch.float64)
-    return bool(_survives(gap, speed, leader_speed_mps, desired_speed_mps, idm)[0])
+    return bool(_survives(gap_m, speed_mps, leader_speed_mps, desired_speed_mps, idm))
 
 
 def least_gap(
@@ -260,8 +223,7 @@ def least_gap(
     # From full speed to a stop; a fifth and 10 m more is surely enough.
     stopping_m = speed_mps * speed_mps / (-2.0 * idm.min_acceleration)
     gaps = torch.arange(1, int(10.0 * (1.2 * stopping_m + 10.0))).double() * 0.1
-    speed = torch.full_like(gaps, speed_mps)
-    crashes = ~_survives(gaps, speed, leader_speed_mps, desired_speed_mps, idm)
+    crashes = ~_survives(gaps, speed_mps, leader_speed_mps, desired_speed_mps, idm)
     if not bool(crashes.any()):
         return 0.1
     # One step beyond the largest gap that is too small.
@@ -274,8 +236,7 @@ def highest_speed(
     """Highest speed, m/s, in steps of 0.1 m/s, up to which :func:`can_brake` is true."""
     # 0 to 99.9 m/s, all in one simulation.
     speeds = torch.arange(0, 1000).double() * 0.1
-    gap = torch.full_like(speeds, gap_m)
-    crashes = ~_survives(gap, speeds, leader_speed_mps, desired_speed_mps, idm)
+    crashes = ~_survives(gap_m, speeds, leader_speed_mps, desired_speed_mps, idm)
     if not bool(crashes.any()):
         return float(speeds[-1])
     return 0.1 * max(0, int(crashes.nonzero().min()) - 1)

@@ -40,11 +40,7 @@ from ganlane.torch_settings import constant
 OfLanes = tuple[float, ...] | Tensor
 
 
-def of_lane(
-    numbers: OfLanes,
-    lane: Tensor,
-    like: Tensor,
-) -> Tensor:
+def of_lane(numbers: OfLanes, lane: Tensor, like: Tensor) -> Tensor:
     """The number of each ``lane``, in the type of ``like``; beyond the road, of the nearest one.
 
     Where every row has its own numbers, the first dimension of ``lane`` is that of the rows.
@@ -85,11 +81,7 @@ def on_road(road: Road, lane: Tensor) -> Tensor:
     return (lane >= 0) & (lane < lanes)
 
 
-def exists(
-    road: Road,
-    lane: Tensor,
-    x: Tensor,
-) -> Tensor:
+def exists(road: Road, lane: Tensor, x: Tensor) -> Tensor:
     """Whether the road has the ``lane`` at ``x``, m; bool."""
     inside = on_road(road, lane)
     if not road.has_lane_ends:
@@ -99,12 +91,7 @@ def exists(
     return inside & (begin <= x) & (x < end)
 
 
-def may_change(
-    road: Road,
-    lane: Tensor,
-    side: Tensor,
-    x: Tensor,
-) -> Tensor:
+def may_change(road: Road, lane: Tensor, side: Tensor, x: Tensor) -> Tensor:
     """Whether one may go from ``lane`` to the one at its ``side`` (1 left, -1 right, 0 none).
 
     Both have to exist at ``x``, m; keeping the lane is always possible. Bool.
@@ -115,12 +102,7 @@ def may_change(
     return (side == 0) | (there & exists(road, lane, x))
 
 
-def leaves_road(
-    road: Road,
-    y: Tensor,
-    new_y: Tensor,
-    x: Tensor,
-) -> Tensor:
+def leaves_road(road: Road, y: Tensor, new_y: Tensor, x: Tensor) -> Tensor:
     """Whether a body at ``x`` that moves from ``y`` to ``new_y`` has crossed a line beside which
     there is no lane to change into; m, [N, 1], bool.
     """
@@ -129,11 +111,7 @@ def leaves_road(
     return (side != 0) & ~may_change(road, lane, side, x)
 
 
-def room_before_wall(
-    vehicles: Vehicles,
-    lanes: Tensor,
-    road: Road,
-) -> Tensor:
+def room_before_wall(vehicles: Vehicles, lanes: Tensor, road: Road) -> Tensor:
     """From the front bumper of each vehicle [N, K] to the wall of ``lanes`` [N, K, L], m.
 
     Below 0 behind it.
@@ -170,21 +148,19 @@ def bias(
     road: Road,
     lanes: Tensor,
     x: Tensor,
-    goal: int | None,
     strongest: float,
     reach_m: float,
-    exits: Tensor | None = None,
 ) -> Tensor:
     """How much a driver at ``x`` [N, K], m, wants to leave each of ``lanes`` [N, K, L], m/s2.
 
+    The first driver is the ego; some want to reach the exit lane (:func:`exiting`).
+
     Args:
-        goal: the exit lane that the drivers want to reach; None: they stay on the road.
         strongest: at the end, m/s2.
         reach_m: distance from the end at which it begins, m per lane change.
-        exits: drivers [N, K] or [K] who want to reach the exit lane, whatever the goal; None:
-            nobody.
     """
-    urgency = _urgency(road, lanes, x, goal, reach_m)
+    urgency = _urgency(road, lanes, x, None, reach_m)
+    exits = exiting(road, lanes[..., 0])
     if exits is not None:
         to_exit = _urgency(road, lanes, x, road.exit_lane, reach_m)
         urgency = torch.where(exits[..., None], to_exit, urgency)
@@ -227,13 +203,9 @@ def from_start(stretches: RowStretches, start_m: Tensor, dtype: torch.dtype) -> 
         # What is far away stays where the others expect it.
         return torch.where(place_m.abs() < FAR_M, place_m - start_m, place_m).to(dtype)
 
-    return RowStretches(
-        begin_m=moved(stretches.begin_m),
-        end_m=moved(stretches.end_m),
-        wall_m=moved(stretches.wall_m),
-        leave_by_m=moved(stretches.leave_by_m),
-        changes=stretches.changes.to(dtype),
-    )
+    # All are places but the last, a number of lane changes.
+    *places, changes = stretches
+    return RowStretches._make([*(moved(place_m) for place_m in places), changes.to(dtype)])
 
 
 def stretches_of_row(stretches: RowStretches, row: int) -> Stretches:
@@ -267,7 +239,7 @@ def ways_out(vehicles: Vehicles, road: Road, reach_m: float) -> WaysOut:
     lane = vehicles.target_lane
     sides = constant((0, 1, -1), lane)
     lanes = lane[..., None] + sides
-    urgency = bias(road, lanes, vehicles.x, None, 1.0, reach_m, exiting(road, lane))
+    urgency = bias(road, lanes, vehicles.x, 1.0, reach_m)
     here = urgency[..., :1]
     possible = may_change(road, lane[..., None], sides, vehicles.x[..., None])[..., 1:]
     possible = possible & (here >= urgency[..., 1:])
@@ -281,10 +253,7 @@ def ways_out(vehicles: Vehicles, road: Road, reach_m: float) -> WaysOut:
 
 
 def stopping_room(
-    vehicles: Vehicles,
-    lanes: Tensor,
-    road: Road,
-    keeps: Tensor,
+    vehicles: Vehicles, lanes: Tensor, road: Road, keeps: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Room in which each driver [N, K] has to stop in ``lanes`` [N, K, L], m; whether it has to.
 

@@ -5,7 +5,7 @@ Where lanes end, changes out of them are mandatory (:mod:`ganlane.sim.lane_ends`
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,26 +20,12 @@ from ganlane.sim.idm import (
     acceleration_behind,
     idm_acceleration,
 )
-from ganlane.sim.lane_ends import WaysOut, bias, exiting, may_change, ways_out
+from ganlane.sim.lane_ends import WaysOut, bias, may_change, ways_out
 from ganlane.sim.neighbours import FREE_GAP_M, Scene, compare, follower, leader, nearest
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
+from ganlane.torch_settings import constant
 
 TABLE_IV = MobilParameters()
-
-
-class DriverMobil(NamedTuple):
-    """Per-driver politeness: tensors [N, M, 1] instead of Table IV's numbers."""
-
-    threshold: float
-    politeness_rear: Tensor
-    politeness_side: Tensor
-    safe_deceleration: float
-    exclusive_m: float
-    mandatory_bias: float = TABLE_IV.mandatory_bias
-    mandatory_m: float = TABLE_IV.mandatory_m
-
-
-AnyMobil: TypeAlias = MobilParameters | DriverMobil
 
 
 class LaneAccelerations(NamedTuple):
@@ -58,11 +44,7 @@ class LaneAccelerations(NamedTuple):
         return LaneAccelerations(*(number[..., lanes] for number in self))
 
 
-def lane_accelerations(
-    scene: Scene,
-    lanes: Tensor,
-    idm: AnyIdm,
-) -> LaneAccelerations:
+def lane_accelerations(scene: Scene, lanes: Tensor, idm: AnyIdm) -> LaneAccelerations:
     """The :class:`LaneAccelerations` of each observer in ``lanes`` [N, K, L] (float).
 
     With per-driver parameters, each driver predicts the others with its own parameters.
@@ -73,22 +55,12 @@ def lane_accelerations(
     length = scene.observers.length[..., None]
     # The new follower with the observer in front of it ...
     driver = (behind.speed, behind.desired_speed)
-    with_it = idm_acceleration(
-        *driver,
-        behind.gap,
-        speed,
-        idm.per_lane(),
-    )
+    with_it = idm_acceleration(*driver, behind.gap, speed, idm.per_lane())
     # Without the observer its follower is behind its leader, or alone.
     free = ahead.gap >= FREE_GAP_M
     leader_speed = torch.where(free, behind.speed, ahead.speed)
     gap = torch.where(free, FREE_GAP_M, behind.gap + length + ahead.gap)
-    without = idm_acceleration(
-        *driver,
-        gap,
-        leader_speed,
-        idm.per_lane(),
-    )
+    without = idm_acceleration(*driver, gap, leader_speed, idm.per_lane())
     # Nobody behind: nobody is hindered or relieved.
     nobody = ~behind.exists
     observer = acceleration_behind(scene, ahead, idm)
@@ -97,30 +69,34 @@ def lane_accelerations(
         keeps = torch.ones_like(lanes, dtype=torch.bool)
         observer = torch.minimum(observer, acceleration_before_wall(scene, lanes, keeps, idm))
     return LaneAccelerations(
-        observer,
-        with_it.masked_fill(nobody, 0.0),
-        without.masked_fill(nobody, 0.0),
+        observer, with_it.masked_fill(nobody, 0.0), without.masked_fill(nobody, 0.0)
     )
 
 
 def mobil_criterion(
-    there: LaneAccelerations, here: LaneAccelerations, mobil: AnyMobil
+    there: LaneAccelerations,
+    here: LaneAccelerations,
+    mobil: MobilParameters,
+    politeness: Tensor | float = 1.0,
 ) -> tuple[Tensor, Tensor]:
-    """Incentive of a change from ``here`` [N, K, 1] to ``there`` [N, K, L], m/s2; whether safe."""
+    """Incentive of a change from ``here`` [N, K, 1] to ``there`` [N, K, L], m/s2; whether safe.
+
+    ``politeness`` is a factor on both weights, [N, K, 1].
+    """
     # What the new follower loses, and what the old one gains.
     burden = there.with_it - there.without
     relief = here.without - here.with_it
     incentive = (
         there.observer
         - here.observer
-        + mobil.politeness_side * burden
-        + mobil.politeness_rear * relief
+        + politeness * mobil.politeness_side * burden
+        + politeness * mobil.politeness_rear * relief
     )
     return incentive, torch.minimum(there.with_it, there.observer) >= -mobil.safe_deceleration
 
 
 def safe_change(
-    scene: Scene, lane: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV
+    scene: Scene, lane: Tensor, idm: AnyIdm = TABLE_V, mobil: MobilParameters = TABLE_IV
 ) -> Tensor:
     """MOBIL's safety criterion for a change into ``lane`` [N, K] (float), bool."""
     # Safety does not depend on where the vehicle is now: that lane stands in for it.
@@ -137,7 +113,7 @@ def without_ego(wish: Tensor) -> Tensor:
 
 
 def one_at_a_time(
-    scene: Scene, wish: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV
+    scene: Scene, wish: Tensor, idm: AnyIdm = TABLE_V, mobil: MobilParameters = TABLE_IV
 ) -> Tensor:
     """``wish`` (-1, 0, +1 lanes, [N, M]), 0 where a vehicle ahead that wants the same lane is too
     close.
@@ -167,7 +143,7 @@ def one_at_a_time(
 
 
 def _gives_way(
-    vehicles: Vehicles, road: Road, wish: Tensor, idm: AnyIdm, mobil: AnyMobil
+    vehicles: Vehicles, road: Road, wish: Tensor, idm: AnyIdm, mobil: MobilParameters
 ) -> Tensor:
     """Whether a vehicle ahead that wants the same lane is too close, bool [N, M]."""
     # Two that want the same lane from its two sides do not see each other in it yet.
@@ -180,46 +156,9 @@ def _gives_way(
     speed = vehicles.speed[:, :, None]
     desired = vehicles.desired_speed[:, :, None]
     leader_speed = vehicles.speed[:, None, :]
-    demand = idm_acceleration(
-        speed,
-        desired,
-        pairs.ahead,
-        leader_speed,
-        idm.per_lane(),
-    )
+    demand = idm_acceleration(speed, desired, pairs.ahead, leader_speed, idm.per_lane())
     near = (pairs.distance < mobil.exclusive_m) | (demand < -mobil.safe_deceleration)
     return (same & near & (pairs.order > 0)).any(-1)
-
-
-def mandatory(
-    scene: Scene,
-    lanes: Tensor,
-    mobil: AnyMobil,
-    goal: int | None,
-    exits: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """What the ends of lanes add to the incentives of changes into ``lanes`` [N, K, L], m/s2, and
-    whether the changes are possible, bool.
-
-    The first of the lanes is the driver's. Nobody changes into a lane that it has to leave more
-    urgently. ``goal`` and ``exits`` as of :func:`ganlane.sim.lane_ends.bias`.
-    """
-    x = scene.observers.x
-    leave = bias(
-        scene.road,
-        lanes,
-        x,
-        goal,
-        mobil.mandatory_bias,
-        mobil.mandatory_m,
-        exits,
-    )
-    here = leave[..., :1]
-    there = leave[..., 1:]
-    gain = torch.where(here > there, here, 0.0)
-    lane = lanes[..., :1]
-    possible = may_change(scene.road, lane, lanes[..., 1:] - lane, x[..., None])
-    return gain, possible & (here >= there)
 
 
 def falling_behind(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParameters) -> Tensor:
@@ -233,11 +172,9 @@ def falling_behind(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParamet
     Args:
         ways: of the observers.
     """
-    wanted = scene.observers.target_lane + ways.side
-    ahead = leader(scene, wanted.to(scene.observers.x.dtype)[..., None])
-    blocked = acceleration_behind(scene, ahead, idm)[..., 0] < -mobil.safe_deceleration
-    asks = ways.asks & scene.observers.valid
-    return torch.where(asks & blocked, -mobil.courtesy, torch.inf)
+    ahead = leader(scene, _wanted_lane(scene, ways))
+    blocked = acceleration_behind(scene, ahead, idm) < -mobil.safe_deceleration
+    return _courteous(scene, ways, blocked, mobil)
 
 
 def letting_past(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParameters) -> Tensor:
@@ -253,23 +190,26 @@ def letting_past(scene: Scene, ways: WaysOut, idm: AnyIdm, mobil: MobilParameter
     Args:
         ways: of the observers.
     """
-    wanted = (scene.observers.target_lane + ways.side).to(scene.observers.x.dtype)
-    gap, index = nearest(scene, wanted[..., None], -1)
-    gap, index = gap[..., 0], index[..., 0]
-    behind = Vehicles(*(field.gather(1, index) for field in scene.vehicles))
-    demand = idm_acceleration(
-        behind.speed[..., None],
-        behind.desired_speed[..., None],
-        gap[..., None],
-        scene.observers.speed[..., None],
-        idm.per_lane(),
-    )[..., 0]
+    gap, index = nearest(scene, _wanted_lane(scene, ways), -1)
+    behind = Vehicles(*(field.gather(1, index[..., 0])[..., None] for field in scene.vehicles))
+    speed = scene.observers.speed[..., None]
+    demand = idm_acceleration(behind.speed, behind.desired_speed, gap, speed, idm.per_lane())
     goes_on = (behind.speed > 0.0) & (behind.acceleration > -0.5 * mobil.courtesy)
     # In a second.
-    goes_on = goes_on & (behind.speed - scene.observers.speed < mobil.courtesy)
+    goes_on = goes_on & (behind.speed - speed < mobil.courtesy)
     unsafe = (gap < FREE_GAP_M) & (demand < -mobil.safe_deceleration)
-    asks = ways.asks & scene.observers.valid
-    return torch.where(asks & unsafe & goes_on, -mobil.courtesy, torch.inf)
+    return _courteous(scene, ways, unsafe & goes_on, mobil)
+
+
+def _wanted_lane(scene: Scene, ways: WaysOut) -> Tensor:
+    """The lane that each observer has to reach, float [N, K, 1]."""
+    return (scene.observers.target_lane + ways.side).to(scene.observers.x.dtype)[..., None]
+
+
+def _courteous(scene: Scene, ways: WaysOut, hindered: Tensor, mobil: MobilParameters) -> Tensor:
+    """The braking [N, K] of who has to change its lane soon and is ``hindered`` [N, K, 1]."""
+    brakes = ways.asks & scene.observers.valid & hindered[..., 0]
+    return torch.where(brakes, -mobil.courtesy, torch.inf)
 
 
 def yielding(scene: Scene, idm: AnyIdm, mobil: MobilParameters) -> Tensor:
@@ -309,53 +249,47 @@ def yielding(scene: Scene, idm: AnyIdm, mobil: MobilParameters) -> Tensor:
 
 def mobil_wishes(
     scene: Scene,
-    road: Road,
     idm: AnyIdm = TABLE_V,
-    mobil: AnyMobil = TABLE_IV,
-    goal: int | None = None,
-    exits: Tensor | None = None,
+    mobil: MobilParameters = TABLE_IV,
+    politeness: Tensor | float = 1.0,
 ) -> Tensor:
     """Lane change that MOBIL proposes to each driver: -1 right, 0 none, +1 left, int64 [N, K].
 
     None during a lane change. If both sides qualify, the one with the larger incentive, left if
-    equal. ``goal`` is the exit lane that the drivers want to reach; None: they stay on the road.
-    ``exits`` are those of them who want to reach it all the same.
+    equal. Where lanes end, nobody changes into a lane that it has to leave more urgently.
+    ``politeness`` as of :func:`mobil_criterion`.
     """
     vehicles = scene.observers
-    lane = vehicles.target_lane.to(vehicles.x.dtype)
+    lane = vehicles.target_lane.to(vehicles.x.dtype)[..., None]
     # Own lane first, then left and right; all three in one search.
-    lanes = torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1)
+    lanes = lane + constant((0.0, 1.0, -1.0), lane)
     accelerations = lane_accelerations(scene, lanes, idm)
     here = accelerations.of(slice(0, 1))
     there = accelerations.of(slice(1, None))
-    incentive, safe = mobil_criterion(there, here, mobil)
-    # The road may have no such lane.
-    to_the_left = lane + 1.0 <= road.lanes - 1
-    to_the_right = lane - 1.0 >= 0
-    exists = torch.stack((to_the_left, to_the_right), dim=-1)
-    if road.has_lane_ends:
-        gain, possible = mandatory(scene, lanes, mobil, goal, exits)
-        incentive = incentive + gain
-        exists = exists & possible
-    pays = exists & safe & (incentive > mobil.threshold)
+    incentive, safe = mobil_criterion(there, here, mobil, politeness)
+    possible = may_change(scene.road, lane, lanes[..., 1:] - lane, vehicles.x[..., None])
+    if scene.road.has_lane_ends:
+        leave = bias(scene.road, lanes, vehicles.x, mobil.mandatory_bias, mobil.mandatory_m)
+        its, beside = leave[..., :1], leave[..., 1:]
+        incentive = incentive + torch.where(its > beside, its, 0.0)
+        possible = possible & (its >= beside)
+    pays = possible & safe & (incentive > mobil.threshold)
     left, right = torch.where(pays, incentive, -torch.inf).unbind(-1)
     # A driver decides anew only when its last change is complete.
-    free = lane_change_done(vehicles, road) & vehicles.valid
+    free = lane_change_done(vehicles, scene.road) & vehicles.valid
     wish = torch.where(left >= right, 1, -1)
     return torch.where(free & torch.isfinite(torch.maximum(left, right)), wish, 0)
 
 
 def mobil_changes(
-    scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV
+    scene: Scene,
+    idm: AnyIdm = TABLE_V,
+    mobil: MobilParameters = TABLE_IV,
+    politeness: Tensor | float = 1.0,
 ) -> Tensor:
     """Lane change that each driver starts: :func:`mobil_wishes` filtered by :func:`one_at_a_time`.
 
     The ego (vehicle 0) is controlled by the agent: its column is 0, and it blocks no other change.
     """
-    exits = exiting(road, scene.observers.target_lane)
-    return one_at_a_time(
-        scene,
-        without_ego(mobil_wishes(scene, road, idm, mobil, exits=exits)),
-        idm,
-        mobil,
-    )
+    wish = without_ego(mobil_wishes(scene, idm, mobil, politeness))
+    return one_at_a_time(scene, wish, idm, mobil)

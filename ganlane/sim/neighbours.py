@@ -126,11 +126,7 @@ def _beyond(number: Tensor, where: Tensor) -> Tensor:
     return torch.add(number, where, alpha=_BEYOND)
 
 
-def compare(
-    vehicles: Vehicles,
-    road: Road,
-    which: slice = slice(None),
-) -> Pairs:
+def compare(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Pairs:
     """The :class:`Pairs` of all vehicles as observers, or of a slice of them."""
     distance = road.distance_ahead(vehicles.x[:, which, None], vehicles.x[:, None, :])
     # Between the bumpers: the distance of the centres less half of both lengths.
@@ -142,11 +138,7 @@ def compare(
     return Pairs(distance, gap, distance + order * _TIE_M)
 
 
-def perceive(
-    vehicles: Vehicles,
-    road: Road,
-    which: slice = slice(None),
-) -> Scene:
+def perceive(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Scene:
     """The :class:`Scene` of ``vehicles`` as seen by all of them or by a slice of them."""
     body = body_lanes(vehicles, road)
     attention = with_target(body, vehicles)
@@ -203,18 +195,12 @@ def leader(scene: Scene, lane: Tensor) -> Neighbour:
         farther = ends > rear[..., None]
         its_speed = _beyond(speed[:, None, None, :], farther).amin(-1)
     else:
-        key = _nearest_key(
-            scene,
-            scene.queue,
-            lanes,
-            1,
-            _ordered(speed) - _INT32_MIN,
-        )
+        key = _nearest_key(scene, scene.queue, lanes, 1, _ordered(speed) - _INT32_MIN)
         rear = _unordered(key >> 32)
         its_speed = _unordered((key & 0xFFFFFFFF) + _INT32_MIN)
     gap = _gap(scene, rear, 1)
     its_speed = torch.where(gap < FREE_GAP_M, its_speed, scene.observers.speed[..., None])
-    return Neighbour(gap.view(lane.shape), its_speed.view(lane.shape))
+    return Neighbour(gap.view_as(lane), its_speed.view_as(lane))
 
 
 def follower(scene: Scene, lane: Tensor) -> Follower:
@@ -225,17 +211,12 @@ def follower(scene: Scene, lane: Tensor) -> Follower:
     lanes = lane[..., None] if lane.ndim == 2 else lane
     vehicles = scene.vehicles
     gap, index = nearest(scene, lanes, -1)
-    gap = gap.view(lane.shape)
+    gap = gap.view_as(lane)
     # What else is known of the vehicle that was found.
     flat = index.flatten(1)
-    speed = vehicles.speed.gather(1, flat).view(lane.shape)
-    desired_speed = vehicles.desired_speed.gather(1, flat).view(lane.shape)
-    return Follower(
-        gap,
-        speed,
-        desired_speed,
-        gap < FREE_GAP_M,
-    )
+    speed = vehicles.speed.gather(1, flat).view_as(lane)
+    desired_speed = vehicles.desired_speed.gather(1, flat).view_as(lane)
+    return Follower(gap, speed, desired_speed, gap < FREE_GAP_M)
 
 
 def nearest(scene: Scene, lanes: Tensor, side: int) -> tuple[Tensor, Tensor]:
@@ -248,24 +229,14 @@ def nearest(scene: Scene, lanes: Tensor, side: int) -> tuple[Tensor, Tensor]:
         end, index = _candidates(scene, lanes, side).min(-1)
     else:
         numbers = torch.arange(scene.vehicles.x.shape[1], device=lanes.device)
-        key = _nearest_key(
-            scene,
-            scene.queue,
-            lanes,
-            side,
-            numbers,
-        )
+        key = _nearest_key(scene, scene.queue, lanes, side, numbers)
         end = _unordered(key >> 32)
         # Nobody's key has no number in it.
         index = key & 0xFFFFFFFF
     return _gap(scene, end, side), index
 
 
-def _candidates(
-    scene: Scene,
-    lanes: Tensor,
-    side: int,
-) -> Tensor:
+def _candidates(scene: Scene, lanes: Tensor, side: int) -> Tensor:
     """Where the near end of each vehicle ahead (``side`` 1) or behind (-1) in each lane is, m,
     [N, K, L, M].
 
@@ -285,11 +256,7 @@ def _candidates(
     return _beyond(ends, ~in_lane(scene, lanes))
 
 
-def _gap(
-    scene: Scene,
-    end: Tensor,
-    side: int,
-) -> Tensor:
+def _gap(scene: Scene, end: Tensor, side: int) -> Tensor:
     """Gap from each observer's bumper to ``end``, m; :data:`FREE_GAP_M` where nobody is."""
     o = scene.observers
     distance = end
@@ -337,7 +304,7 @@ def _nearest_key(
     nearest = before.cummin(-1).values.transpose(0, 1).flatten(1)
     # Place of the observer's entry: lane by lane, as many entries as vehicles.
     entry = lane.clamp(0, lanes - 1).long() * count + place[..., None]
-    neighbour = nearest.gather(1, entry.flatten(1)).view(lane.shape)
+    neighbour = nearest.gather(1, entry.flatten(1)).view_as(lane)
     return torch.where((lane >= 0) & (lane < lanes), neighbour, _NOBODY)
 
 

@@ -8,12 +8,14 @@ own with the finaliser of splitmix64 (Steele et al. 2014), so no two fields can 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from enum import IntEnum
 
 import torch
 from torch import Tensor
 
 from ganlane.settings.episode import Stream as Stream  # also known as ganlane.sim.Stream
+from ganlane.settings.record import Range
 from ganlane.torch_settings import constant
 
 # Constants of splitmix64; torch computes in signed integers.
@@ -83,23 +85,14 @@ def absorb(key: Tensor, field: Tensor | int) -> Tensor:
     return _mix((key ^ field) + _GOLDEN)
 
 
-def episode_key(
-    stream: int,
-    seed: Tensor,
-    episode: Tensor,
-) -> Tensor:
+def episode_key(stream: int, seed: Tensor, episode: Tensor) -> Tensor:
     """Key of an episode, [N] int64, from the stream and the counters [N] int64."""
     # The 0 after the stream stays: without it all episodes so far would change.
     start = torch.full_like(seed, int(stream))
     return absorb(absorb(absorb(start, 0), seed), episode)
 
 
-def draw_keys(
-    key: Tensor,
-    step: Tensor | int,
-    vehicles: int,
-    purposes: list[int],
-) -> Tensor:
+def draw_keys(key: Tensor, step: Tensor | int, vehicles: int, purposes: Sequence[int]) -> Tensor:
     """Keys [N, vehicles, len(purposes)] from episode keys [N] and physics steps [N] or one int."""
     # Field by field, from what all share to what is one number's own.
     at_step = absorb(key, step)
@@ -119,30 +112,30 @@ def uniform(
     key: Tensor,
     step: Tensor | int,
     vehicles: int,
-    purposes: list[int],
+    purposes: Sequence[int],
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
     """Uniform numbers in [0, 1), [N, vehicles, len(purposes)]: a step's purposes in one call."""
     return to_uniform(draw_keys(key, step, vehicles, purposes), dtype)
 
 
+def in_range(u: Tensor, bounds: Range) -> Tensor:
+    """Uniform numbers in [0, 1) scaled to ``bounds``."""
+    return bounds[0] + u * (bounds[1] - bounds[0])
+
+
 def normal(
     key: Tensor,
     step: Tensor | int,
     vehicles: int,
-    purposes: list[int],
+    purposes: Sequence[int],
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
     """Standard normal numbers, [N, vehicles, len(purposes)], by Box and Muller's transform.
 
     Independent of :func:`uniform` at the same place.
     """
-    keys = draw_keys(
-        key,
-        step,
-        vehicles,
-        purposes,
-    )
+    keys = draw_keys(key, step, vehicles, purposes)
     # 1 - u lies in (0, 1], so the logarithm is finite; a second key per number for the angle.
     radius = torch.sqrt(-2.0 * torch.log(1.0 - to_uniform(absorb(keys, 1), dtype)))
     return radius * torch.cos(2.0 * math.pi * to_uniform(absorb(keys, 2), dtype))

@@ -12,7 +12,7 @@ from itertools import accumulate
 
 from ganlane.errors import UserError
 from ganlane.settings.driving import IdmParameters
-from ganlane.sim.scenes import SceneVehicle
+from ganlane.sim.scenes import SceneVehicle, SceneVehicles
 
 #: Length of every vehicle here, m: that of a car in SpawnParameters.
 LENGTH_M = 4.5
@@ -23,22 +23,14 @@ STALLED_MPS = 0.001
 ASKEW_M = 0.6
 
 
-def stalled(
-    x_m: float,
-    lane: int,
-    lane_width_m: float,
-) -> SceneVehicle:
+def stalled(x_m: float, lane: int, lane_width_m: float) -> SceneVehicle:
     """A vehicle that has broken down in ``lane``."""
     return SceneVehicle(x_m, y_m=lane * lane_width_m - ASKEW_M, desired_speed_mps=STALLED_MPS)
 
 
 def cut_in(
-    gap_m: float,
-    speed_mps: float,
-    cutter_speed_mps: float,
-    lanes: int,
-    desired_speed_mps: float,
-) -> tuple[SceneVehicle, ...]:
+    gap_m: float, speed_mps: float, cutter_speed_mps: float, lanes: int, desired_speed_mps: float
+) -> SceneVehicles:
     """A slower vehicle one lane to the left, ``gap_m`` ahead of the ego's bumper, moves into its
     lane at once.
 
@@ -46,15 +38,11 @@ def cut_in(
     that cuts in, and (on three lanes) one on the ego's right, so that braking is the obvious
     reaction.
     """
-    _at_least(lanes, 2, "cut_in")
+    _needs_two(lanes, "cut_in")
     # Next to the leftmost, from which the other vehicle comes.
     lane = lanes - 2  # the ego's
     cutter = SceneVehicle(
-        gap_m + LENGTH_M,
-        lane + 1,
-        cutter_speed_mps,
-        cutter_speed_mps,
-        target_lane=lane,
+        gap_m + LENGTH_M, lane + 1, cutter_speed_mps, cutter_speed_mps, target_lane=lane
     )
     cars = [
         SceneVehicle(0.0, lane, speed_mps, desired_speed_mps),
@@ -76,24 +64,13 @@ def stalled_car(
     lanes: int,
     desired_speed_mps: float,
     lane_width_m: float,
-) -> tuple[SceneVehicle, ...]:
+) -> SceneVehicles:
     """A broken-down vehicle ``distance_m`` ahead in the ego's lane, the rightmost.
 
     A vehicle follows the ego, and five vehicles ``spacing_m`` apart pass in the next lane, if there
     is one.
     """
-    beside = (
-        ()
-        if lanes == 1
-        else _column(
-            1,
-            5,
-            0.5 * spacing_m,
-            spacing_m,
-            speed_mps,
-            22.0,
-        )
-    )
+    beside = () if lanes == 1 else _column(1, 5, 0.5 * spacing_m, spacing_m, speed_mps, 22.0)
     return (
         SceneVehicle(0.0, 0, speed_mps, desired_speed_mps),
         stalled(distance_m, 0, lane_width_m),
@@ -110,13 +87,13 @@ def blocked_lane(
     lanes: int,
     desired_speed_mps: float,
     lane_width_m: float,
-) -> tuple[SceneVehicle, ...]:
+) -> SceneVehicles:
     """The rightmost lane is closed by ``standing`` vehicles in a row, from ``distance_m`` on; the
     others are open.
 
     In each open lane drive six vehicles, ``spacing_m`` apart: the ego has to find a gap.
     """
-    _at_least(lanes, 2, "blocked_lane")
+    _needs_two(lanes, "blocked_lane")
     cars = [SceneVehicle(0.0, 0, speed_mps, desired_speed_mps)]
     for number in range(standing):
         # 1.5 m from bumper to bumper: no gap to slip into.
@@ -133,13 +110,17 @@ def _column(
     first_m: float,
     spacing_m: float,
     speed_mps: float,
-    desired_speed_mps: float,
-) -> tuple[SceneVehicle, ...]:
-    """Vehicles in one lane, from ``first_m`` backwards."""
-    return tuple(
-        SceneVehicle(first_m - spacing_m * k, lane, speed_mps, desired_speed_mps)
-        for k in range(vehicles)
-    )
+    desired_speed_mps: float | None = None,
+) -> SceneVehicles:
+    """Vehicles in one lane, from ``first_m`` backwards.
+
+    Without a desired speed they would like to be in turn as fast, 10 % and 20 % faster.
+    """
+    cars = []
+    for k in range(vehicles):
+        desired_mps = desired_speed_mps or speed_mps * (1.0 + 0.1 * (k % 3))
+        cars.append(SceneVehicle(first_m - spacing_m * k, lane, speed_mps, desired_mps))
+    return tuple(cars)
 
 
 def stop_and_go(
@@ -149,7 +130,7 @@ def stop_and_go(
     lanes: int,
     desired_speed_mps: float,
     idm: IdmParameters,
-) -> tuple[SceneVehicle, ...]:
+) -> SceneVehicles:
     """Columns in every lane, of alternately ``per_wave`` stopped and ``per_wave`` moving vehicles.
 
     From the head: two moving vehicles, then ``waves`` times a stopped queue at IDM's minimum gap
@@ -181,16 +162,12 @@ def stop_and_go(
 
 
 def merge(
-    ego_speed_mps: float,
-    speed_mps: float,
-    spacing_m: float,
-    lanes: int,
-    desired_speed_mps: float,
-) -> tuple[SceneVehicle, ...]:
+    ego_speed_mps: float, speed_mps: float, spacing_m: float, lanes: int, desired_speed_mps: float
+) -> SceneVehicles:
     """The ego alone on the rightmost lane, an on-ramp; ten vehicles ``spacing_m`` apart in each of
     the others, a third of them ahead of it.
     """
-    _at_least(lanes, 2, "merge")
+    _needs_two(lanes, "merge")
     ego = SceneVehicle(0.0, 0, ego_speed_mps, desired_speed_mps)
     return (ego, *_around(ego, range(1, lanes), 10, 3.0, spacing_m, speed_mps))
 
@@ -202,66 +179,40 @@ def on_ramp(
     spacing_m: float,
     lanes: int,
     desired_speed_mps: float,
-) -> tuple[SceneVehicle, ...]:
+) -> SceneVehicles:
     """Six vehicles ``ramp_spacing_m`` apart on the rightmost lane, an on-ramp, three of them ahead
     of the ego in the lane beside it; seven ``spacing_m`` apart in every other lane, and six in its
     own.
     """
-    _at_least(lanes, 2, "on_ramp")
+    _needs_two(lanes, "on_ramp")
     ego = SceneVehicle(0.0, 1, speed_mps, desired_speed_mps)
-    ramp = _stream(0, 6, 2.5 * ramp_spacing_m, ramp_spacing_m, ramp_speed_mps)
+    ramp = _column(0, 6, 2.5 * ramp_spacing_m, ramp_spacing_m, ramp_speed_mps)
     return (ego, *ramp, *_around(ego, range(1, lanes), 7, 2.0, spacing_m, speed_mps))
 
 
 def lane_drop(
-    speed_mps: float,
-    spacing_m: float,
-    lanes: int,
-    desired_speed_mps: float,
-) -> tuple[SceneVehicle, ...]:
+    speed_mps: float, spacing_m: float, lanes: int, desired_speed_mps: float
+) -> SceneVehicles:
     """The ego in the leftmost lane, which ends; seven vehicles ``spacing_m`` apart in every other
     lane, and six in its own.
     """
-    _at_least(lanes, 2, "lane_drop")
+    _needs_two(lanes, "lane_drop")
     ego = SceneVehicle(0.0, lanes - 1, speed_mps, desired_speed_mps)
     return (ego, *_around(ego, range(lanes), 7, 2.0, spacing_m, speed_mps))
 
 
 def exit(
-    speed_mps: float,
-    faster_mps: float,
-    spacing_m: float,
-    lanes: int,
-    desired_speed_mps: float,
-) -> tuple[SceneVehicle, ...]:
+    speed_mps: float, faster_mps: float, spacing_m: float, lanes: int, desired_speed_mps: float
+) -> SceneVehicles:
     """The ego in the leftmost lane; eight vehicles ``spacing_m`` apart in every other lane and
     seven in its own, but none in the rightmost, the exit lane.
 
     Each lane is ``faster_mps`` faster than the one on its right.
     """
-    _at_least(lanes, 2, "exit")
+    _needs_two(lanes, "exit")
     ego_speed = speed_mps + faster_mps * (lanes - 2)
     ego = SceneVehicle(0.0, lanes - 1, ego_speed, desired_speed_mps)
     return (ego, *_around(ego, range(1, lanes), 8, 3.0, spacing_m, speed_mps, faster_mps))
-
-
-def _stream(
-    lane: int,
-    vehicles: int,
-    first_m: float,
-    spacing_m: float,
-    speed_mps: float,
-) -> tuple[SceneVehicle, ...]:
-    """As :func:`_column`, of drivers that would like to be as fast, 10 % or 20 % faster."""
-    return tuple(
-        SceneVehicle(
-            first_m - spacing_m * k,
-            lane,
-            speed_mps,
-            speed_mps * (1.0 + 0.1 * (k % 3)),
-        )
-        for k in range(vehicles)
-    )
 
 
 def _around(
@@ -272,8 +223,8 @@ def _around(
     spacing_m: float,
     speed_mps: float,
     faster_mps: float = 0.0,
-) -> tuple[SceneVehicle, ...]:
-    """A :func:`_stream` in each of the ``lanes``, the first one ``ahead`` spacings before the ego.
+) -> SceneVehicles:
+    """A :func:`_column` in each of the ``lanes``, the first one ``ahead`` spacings before the ego.
 
     Neighbouring lanes are staggered by half of the spacing. In its own lane the ego has the place
     of one of them. Each lane is ``faster_mps`` faster than the one on its right, from
@@ -284,17 +235,11 @@ def _around(
     for lane in lanes:
         first_m = (ahead + 0.5 * (abs(lane - ego.lane) % 2)) * spacing_m
         speed = speed_mps + faster_mps * (lane - 1)
-        stream = _stream(lane, vehicles, first_m, spacing_m, speed)
+        stream = _column(lane, vehicles, first_m, spacing_m, speed)
         cars += [car for car in stream if car.x_m or lane != ego.lane]
     return tuple(cars)
 
 
-def _at_least(
-    lanes: int,
-    needed: int,
-    name: str,
-) -> None:
-    if lanes < needed:
-        raise UserError(
-            f"env.lanes={lanes}: env={name} needs {needed} lanes or more; give env.lanes={needed}."
-        )
+def _needs_two(lanes: int, name: str) -> None:
+    if lanes < 2:
+        raise UserError(f"env.lanes={lanes}: env={name} needs 2 lanes or more; give env.lanes=2.")

@@ -138,12 +138,7 @@ def _stretches(lanes: Any, where: str) -> Stretches:
     return tuple(stretches)
 
 
-def _agreed(
-    path: Path,
-    name: str,
-    road: Mapping[str, Any],
-    wanted: float | None,
-) -> Any:
+def _agreed(path: Path, name: str, road: Mapping[str, Any], wanted: float | None) -> Any:
     """The value of the file or of the caller; an error if they differ."""
     in_file = road.get(name)
     if in_file is not None and wanted is not None and in_file != wanted:
@@ -258,11 +253,7 @@ def _check_names(names: Sequence[str], where: str) -> None:
             raise UserError(f"{where}: column {name} is given twice; remove one.")
 
 
-def _row(
-    values: Mapping[str, Any],
-    where: str,
-    origin: str,
-) -> SceneVehicle:
+def _row(values: Mapping[str, Any], where: str, origin: str) -> SceneVehicle:
     """A vehicle from its values in a file."""
     if "x_m" not in values:
         raise UserError(f"{where}: column x_m: no value; give the position along the road in m.")
@@ -272,11 +263,7 @@ def _row(
     return SceneVehicle(**numbers, origin=origin)
 
 
-def _value(
-    name: str,
-    value: Any,
-    where: str,
-) -> Any:
+def _value(name: str, value: Any, where: str) -> Any:
     """A number, or a :class:`Visibility`, from what stands in a file."""
     if name == "visibility":
         kinds = {kind.name.lower(): kind for kind in Visibility}

@@ -20,7 +20,7 @@ from ganlane.keys import PHYSICS_STEP_S
 from ganlane.settings.driving import IdmParameters, Visibility
 from ganlane.settings.road import NOTHING
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.dynamics import advance, steer
+from ganlane.sim.dynamics import drive
 from ganlane.sim.idm import following_acceleration, needed_deceleration
 from ganlane.sim.neighbours import in_lane, perceive
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
@@ -104,6 +104,10 @@ class SceneVehicle:
         return int(road.lane_of(torch.tensor(self.y_on(road), dtype=torch.float64)))
 
 
+#: Those of a scene, the ego first.
+SceneVehicles = tuple[SceneVehicle, ...]
+
+
 @dataclass(frozen=True)
 class FixedScene:
     """The same scene in every episode, or with small variations; the first vehicle is the ego.
@@ -123,7 +127,7 @@ class FixedScene:
             :meth:`check` also raises it for scenes in which crashes are unavoidable.
     """
 
-    rows: tuple[SceneVehicle, ...]
+    rows: SceneVehicles
     road: Road = STRAIGHT
     jitter_m: float = 0.0
     jitter_mps: float = 0.0
@@ -174,20 +178,9 @@ class FixedScene:
         if self.jitter_m == 0 and self.jitter_mps == 0:
             return whole
         # From [0, 1) to [-1, 1).
-        u = (
-            2.0
-            * uniform(
-                key,
-                0,
-                m,
-                [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED],
-                dtype,
-            )
-            - 1.0
-        )
+        u = 2.0 * uniform(key, 0, m, [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED], dtype) - 1.0
         # Only the others are shifted: the ego stays at x = 0.
-        is_ego = torch.arange(m, device=key.device) == 0
-        x = torch.where(is_ego, whole.x, whole.x + self.jitter_m * u[..., 0])
+        x = torch.where(whole.is_ego(), whole.x, whole.x + self.jitter_m * u[..., 0])
         varied = (whole.speed + self.jitter_mps * u[..., 1]).clamp_min(0.0)
         # Who stands remains standing.
         speed = torch.where(whole.speed > 0, varied, whole.speed)
@@ -233,7 +226,7 @@ class FixedScene:
         return f"{name} ({origin})" if origin else name
 
 
-def with_waiting(rows: tuple[SceneVehicle, ...], road: Road) -> tuple[SceneVehicle, ...]:
+def with_waiting(rows: SceneVehicles, road: Road) -> SceneVehicles:
     """``rows``, and with a flow its slots: drivers like the others of the scene in turn, beyond the
     end of the section at their desired speeds, in a lane that goes on.
     """
@@ -364,7 +357,7 @@ def check_braking(scene: FixedScene, idm: IdmParameters) -> None:
     ahead = shares & (vehicles.x[:, None, :] > vehicles.x[:, :, None])
     varied = (vehicles.speed > 0) * scene.jitter_mps
     # Two shifted vehicles come closer by twice the jitter, a shifted one and the ego by once.
-    slack = scene.jitter_m * (2.0 - (torch.arange(scene.vehicles) == 0).double())
+    slack = scene.jitter_m * (2.0 - vehicles.is_ego().double())
     gap = seen.pairs.ahead - torch.minimum(slack[:, None], slack[None, :])
     fastest = vehicles.speed + varied
     slowest = (vehicles.speed - varied).clamp_min(0.0)
@@ -408,24 +401,7 @@ def _first_overlap(scene: FixedScene, idm: IdmParameters) -> tuple[int, int, flo
     for step in range(1, round(DRIVE_S / PHYSICS_STEP_S) + 1):
         # Everybody follows and steers to its target lane; nobody decides anything.
         acceleration = following_acceleration(perceive(v, scene.road), idm)
-        steering = steer(
-            steering,
-            v.y,
-            v.heading,
-            v.speed,
-            centre,
-            PHYSICS_STEP_S,
-        )
-        pose = advance(
-            v.x,
-            v.y,
-            v.heading,
-            v.speed,
-            acceleration,
-            steering,
-            PHYSICS_STEP_S,
-        )
-        v = v.with_(**pose._asdict())
+        v, steering = drive(v, acceleration, steering, centre, PHYSICS_STEP_S)
         hits = pair_overlaps(v, scene.road)
         if bool(hits.any()):
             _, one, other = hits.nonzero()[0].tolist()

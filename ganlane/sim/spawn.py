@@ -19,9 +19,9 @@ from ganlane.keys import EGO_INDEX
 from ganlane.settings.driving import IdmParameters, Visibility
 from ganlane.settings.episode import SpawnParameters
 from ganlane.sim.idm import TABLE_V, can_brake, highest_speed, idm_acceleration, least_gap
-from ganlane.sim.neighbours import Scene, perceive
-from ganlane.sim.random import Purpose, draw_keys, uniform
-from ganlane.sim.state import STRAIGHT, Road, Vehicles, reads_are_cheap
+from ganlane.sim.neighbours import FREE_GAP_M, compare
+from ganlane.sim.random import Purpose, draw_keys, in_range, uniform
+from ganlane.sim.state import STRAIGHT, LaneRange, Road, Vehicles, body_lanes, with_target
 
 TABLE_II = SpawnParameters()
 #: Range of the positions in Table III, m.
@@ -58,12 +58,7 @@ def check_start(
     for field, speed, leader, desired in p.worst_followers() if vehicles > 1 else ():
         if not can_brake(gap, speed, leader, desired, idm):
             spacing = p.length_m + least_gap(speed, leader, desired, idm)
-            slower = highest_speed(
-                gap,
-                leader,
-                desired,
-                idm,
-            )
+            slower = highest_speed(gap, leader, desired, idm)
             raise ParameterError(
                 f"{{min_spacing_m}}={p.min_spacing_m:g} is too little for {{{field}}} up to "
                 f"{speed:g} m/s: a gap of {gap:g} m is too short to avoid a leader of {leader:g} "
@@ -72,38 +67,17 @@ def check_start(
             )
 
 
-def _rank(value: Tensor, same: Tensor | None = None) -> Tensor:
-    """Rank of each by ``value`` [N, M] and then index, among the ``same`` [N, M, M]."""
-    index = torch.arange(value.shape[1], device=value.device)
-    # By counting, not by sorting: a few vehicles, and a fixed order for equal values.
-    mine = value[:, :, None]
-    other = value[:, None, :]
-    lower_index = index[None, :] < index[:, None]
-    before = (other < mine) | ((other == mine) & lower_index)
-    return (before if same is None else before & same).sum(-1)
-
-
-def draw_lanes(
-    key: Tensor,
-    vehicles: int,
-    lanes: int,
-    capacity: int,
-) -> Tensor:
+def draw_lanes(key: Tensor, vehicles: int, lanes: int, capacity: int) -> Tensor:
     """A random lane for each vehicle, [N, vehicles] int64, at most ``capacity`` in each.
 
     All places of all lanes are shuffled and the first ``vehicles`` of them taken.
     """
     # A random key for every place; the lowest ones are taken.
-    places = draw_keys(key, 0, lanes * capacity, [int(Purpose.SPAWN_LANE)])[..., 0]
+    places = draw_keys(key, 0, lanes * capacity, [Purpose.SPAWN_LANE])[..., 0]
     return places.argsort(dim=1, stable=True)[:, :vehicles] // capacity
 
 
-def place_in_lanes(
-    lane: Tensor,
-    u: Tensor,
-    spread_m: float,
-    spacing_m: float,
-) -> Tensor:
+def place_in_lanes(lane: Tensor, u: Tensor, spread_m: float, spacing_m: float) -> Tensor:
     """Positions in m, [N, M].
 
     In a lane of k sorted uniforms on [0, spread - spacing (k - 1)] plus spacing * rank.
@@ -113,7 +87,13 @@ def place_in_lanes(
     # In the run's float type: whole numbers times a float would be in torch's default one.
     count = same.sum(-1).to(u.dtype)
     room = spread_m - spacing_m * (count - 1)
-    return u * room + spacing_m * _rank(u, same).to(u.dtype)
+    # By counting, not by sorting: a few vehicles, and a fixed order for equal values.
+    index = torch.arange(u.shape[1], device=u.device)
+    mine = u[:, :, None]
+    other = u[:, None, :]
+    before = (other < mine) | ((other == mine) & (index < index[:, None]))
+    rank = (before & same).sum(-1).to(u.dtype)
+    return u * room + spacing_m * rank
 
 
 def ego_first(x: Tensor, lane: Tensor) -> tuple[Tensor, Tensor]:
@@ -122,85 +102,18 @@ def ego_first(x: Tensor, lane: Tensor) -> tuple[Tensor, Tensor]:
     Shift the ego to x = 0.
     """
     # The vehicle in the middle becomes the ego, with as many ahead as behind.
-    rank = _rank(x)
+    order = x.argsort(dim=1, stable=True)
     middle = (x.shape[1] - 1) // 2
-    order = torch.where(rank == middle, -1, rank).argsort(dim=1)
+    behind, ego, ahead = order[:, :middle], order[:, middle : middle + 1], order[:, middle + 1 :]
+    order = torch.cat((ego, behind, ahead), dim=1)
     x = x.gather(1, order)
     lane = lane.gather(1, order)
     return x - x[:, :1], lane
 
 
-def spawn(
-    key: Tensor,
-    vehicles: int,
-    lanes: int,
-    lane_width_m: float,
-    parameters: SpawnParameters = TABLE_II,
-    dtype: torch.dtype = torch.float32,
-    ego_visibility: int = Visibility.BODY,
-    others_visibility: int = Visibility.SIGNALLED,
-) -> Vehicles:
-    """A random scene per episode key [N]; the ego is at index 0, the others follow by position."""
-
-    def between(column: int, bounds: tuple[float, float]) -> Tensor:
-        return bounds[0] + u[..., column] * (bounds[1] - bounds[0])
-
-    p = parameters
-    drawn = [
-        Purpose.SPAWN_POSITION,
-        Purpose.SPAWN_SPEED,
-        Purpose.SPAWN_DESIRED_SPEED,
-        Purpose.SPAWN_TRUCK,
-    ]
-    u = uniform(
-        key,
-        0,
-        vehicles,
-        [int(purpose) for purpose in drawn],
-        dtype,
-    )
-    lane = draw_lanes(
-        key,
-        vehicles,
-        lanes,
-        p.lane_capacity(),
-    )
-    x = place_in_lanes(
-        lane,
-        u[..., 0],
-        p.spread_m,
-        p.spacing_m,
-    )
-    x, lane = ego_first(x, lane)
-    is_ego = torch.arange(vehicles, device=key.device) == 0
-    # In Table II who is ahead of the ego is slower than who is behind it.
-    ahead = between(1, p.front_speed_mps)
-    behind = between(1, p.rear_speed_mps)
-    speed = torch.where(x > 0, ahead, behind)
-    speed = torch.where(is_ego, between(1, p.ego_speed_mps), speed)
-    is_truck = (u[..., 3] < p.truck_share) & ~is_ego
-    desired = torch.where(is_ego, p.ego_desired_speed_mps, between(2, p.desired_speed_mps))
-    desired = torch.where(is_truck, between(2, p.truck_desired_speed_mps), desired)
-    visibility = torch.where(is_ego, int(ego_visibility), int(others_visibility))
-    zero = torch.zeros_like(x)
-    return Vehicles(
-        x=x,
-        y=lane.to(dtype) * lane_width_m,
-        heading=zero,
-        speed=speed,
-        acceleration=zero,
-        length=torch.where(is_truck, p.truck_length_m, zero + p.length_m),
-        width=torch.where(is_truck, p.truck_width_m, zero + p.width_m),
-        desired_speed=desired,
-        target_lane=lane,
-        visibility=visibility.expand(x.shape).clone(),
-        valid=torch.ones_like(lane, dtype=torch.bool),
-    )
-
-
 @dataclass(frozen=True)
 class RandomScenes:
-    """Table II: random positions and speeds (:func:`spawn`)."""
+    """Table II: random positions and speeds."""
 
     road: Road = STRAIGHT
     vehicles: int = 9
@@ -223,12 +136,7 @@ class RandomScenes:
                 f"scenes: laid out on {_described(self.road)}, the traffic drives on "
                 f"{_described(road)}; give both the same road."
             )
-        check_start(
-            p,
-            self.vehicles,
-            road.lanes,
-            idm,
-        )
+        check_start(p, self.vehicles, road.lanes, idm)
         if lane_width_m <= p.widest_m:
             wide = "width_m" if p.width_m == p.widest_m else "truck_width_m"
             raise UserError(
@@ -250,16 +158,41 @@ class RandomScenes:
         return self.parameters.longest_m
 
     def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:
-        """One random scene per key."""
-        road = (int(self.road.lanes), float(self.road.lane_width_m))
-        visibility = (self.ego_visibility, self.others_visibility)
-        return spawn(
-            key,
-            self.vehicles,
-            *road,
-            self.parameters,
-            dtype,
-            *visibility,
+        """One random scene per key; behind the ego, at index 0, the others follow by position."""
+        p = self.parameters
+        drawn = [
+            Purpose.SPAWN_POSITION,
+            Purpose.SPAWN_SPEED,
+            Purpose.SPAWN_DESIRED_SPEED,
+            Purpose.SPAWN_TRUCK,
+        ]
+        u, u_speed, u_desired, u_truck = uniform(key, 0, self.vehicles, drawn, dtype).unbind(-1)
+        lane = draw_lanes(key, self.vehicles, int(self.road.lanes), p.lane_capacity())
+        x, lane = ego_first(place_in_lanes(lane, u, p.spread_m, p.spacing_m), lane)
+        is_ego = torch.arange(self.vehicles, device=key.device) == 0
+        # In Table II who is ahead of the ego is slower than who is behind it.
+        ahead = in_range(u_speed, p.front_speed_mps)
+        behind = in_range(u_speed, p.rear_speed_mps)
+        speed = torch.where(x > 0, ahead, behind)
+        speed = torch.where(is_ego, in_range(u_speed, p.ego_speed_mps), speed)
+        is_truck = (u_truck < p.truck_share) & ~is_ego
+        others = in_range(u_desired, p.desired_speed_mps)
+        desired = torch.where(is_ego, p.ego_desired_speed_mps, others)
+        desired = torch.where(is_truck, in_range(u_desired, p.truck_desired_speed_mps), desired)
+        visibility = torch.where(is_ego, int(self.ego_visibility), int(self.others_visibility))
+        zero = torch.zeros_like(x)
+        return Vehicles(
+            x=x,
+            y=lane.to(dtype) * float(self.road.lane_width_m),
+            heading=zero,
+            speed=speed,
+            acceleration=zero,
+            length=torch.where(is_truck, p.truck_length_m, zero + p.length_m),
+            width=torch.where(is_truck, p.truck_width_m, zero + p.width_m),
+            desired_speed=desired,
+            target_lane=lane,
+            visibility=visibility.expand(x.shape).clone(),
+            valid=torch.ones_like(lane, dtype=torch.bool),
         )
 
 
@@ -271,81 +204,68 @@ def _described(road: Road) -> str:
 # Recycling
 
 
-def out_of_range(
-    vehicles: Vehicles,
-    road: Road,
-    range_m: float = RANGE_M,
-) -> Tensor:
-    """Whether a vehicle is more than ``range_m`` ahead of the ego or behind it, bool [N, M]."""
+def out_of_range(vehicles: Vehicles, road: Road) -> Tensor:
+    """Whether a vehicle is more than :data:`RANGE_M` ahead of the ego or behind it, bool [N, M]."""
     distance = road.distance_ahead(vehicles.x[:, EGO_INDEX, None], vehicles.x)
-    return (distance.abs() > range_m) & vehicles.valid
+    return (distance.abs() > RANGE_M) & vehicles.valid
 
 
-def _room(
-    there: Scene,
+def leave_room(
+    one: Vehicles,
+    other: Vehicles,
+    lanes: tuple[LaneRange, LaneRange],
+    distance: Tensor,
+    ahead: Tensor,
     idm: IdmParameters,
-    safe: float,
 ) -> Tensor:
-    """Whether each of the first M vehicles asks nobody for more than ``safe`` m/s2, bool [N, M].
+    """Whether of two vehicles neither makes the other brake harder than is safe, elementwise.
 
-    ``there`` holds 2 M vehicles: all at their new positions, then all at their current ones. So the
-    result holds whichever of the others move too.
+    Args:
+        lanes: that the drivers of the two attend to.
+        distance: from the centre of the one to that of the other, m.
+        ahead: whether the other is ahead, bool.
     """
-    one, other, (low, high) = there.observers, there.vehicles, there.attention
-    their_low = low.repeat(1, 2)[:, None, :]
-    their_high = high.repeat(1, 2)[:, None, :]
-    shares = (low[..., None] <= their_high) & (their_low <= high[..., None])
+    its, theirs = lanes
+    shares = (its.low <= theirs.high) & (theirs.low <= its.high)
     # Sharing a lane, or nearly touching sides.
-    sides = 0.5 * one.width[..., None] + 0.5 * other.width[:, None, :] + SIDE_M
-    shares |= (one.y[..., None] - other.y[:, None, :]).abs() < sides
-    pairs = there.pairs
-    # Nobody is in its own way, at neither of its positions.
-    itself = torch.eye(one.x.shape[1], dtype=torch.bool, device=one.x.device)
-    itself = itself.repeat(1, 2)
-    counts = shares & other.valid[:, None, :] & ~itself
-    # Braking of the moved one behind the other, and of the other behind the moved one.
-    speed = one.speed[..., None]
-    desired = one.desired_speed[..., None]
-    its_speed = other.speed[:, None, :]
-    its_desired = other.desired_speed[:, None, :]
-    behind = idm_acceleration(
-        speed,
-        desired,
-        pairs.ahead,
-        its_speed,
-        idm,
-    )
-    before = idm_acceleration(
-        its_speed,
-        its_desired,
-        pairs.behind,
-        speed,
-        idm,
-    )
-    asked = torch.where(pairs.order > 0, behind, before)
-    return (~counts | (asked >= -safe)).all(-1)
+    sides = 0.5 * one.width + 0.5 * other.width + SIDE_M
+    shares = shares | ((one.y - other.y).abs() < sides)
+    bumpers = 0.5 * one.length + 0.5 * other.length
+    gap = (distance.abs() - bumpers).clamp_max(FREE_GAP_M)
+    behind = idm_acceleration(one.speed, one.desired_speed, gap, other.speed, idm)
+    before = idm_acceleration(other.speed, other.desired_speed, gap, one.speed, idm)
+    asked = torch.where(ahead, behind, before)
+    return ~(shares & other.valid) | (asked >= -SAFE_DECELERATION)
 
 
-def recycle(
-    vehicles: Vehicles,
-    road: Road,
-    idm: IdmParameters,
-    range_m: float = RANGE_M,
-    safe_deceleration: float = SAFE_DECELERATION,
-) -> Vehicles:
+def recycle(vehicles: Vehicles, road: Road, idm: IdmParameters) -> Vehicles:
     """``vehicles`` with those out of range moved to the other side of the ego, where there is room.
 
-    Room is tested against every other vehicle at its current *and* at its new position.
+    Room is tested against every other vehicle at its current *and* at its new position, so it is
+    there whichever of the others move too.
     """
-    away = out_of_range(vehicles, road, range_m)
-    # Mostly nobody is: without this look a decision takes 2 % longer with 64 rows, 9 with 1024.
-    if reads_are_cheap(away) and not bool(away.any()):
-        return vehicles
+    away = out_of_range(vehicles, road)
     # By twice the range, so that the distance to the ego only changes its sign.
     distance = road.distance_ahead(vehicles.x[:, EGO_INDEX, None], vehicles.x)
-    across = vehicles.x - 2.0 * range_m * torch.sign(distance)
+    across = vehicles.x - 2.0 * RANGE_M * torch.sign(distance)
     moved = vehicles.with_(x=torch.where(away, across, vehicles.x))
+    # All at their new positions, then all at their current ones: [N, M] against [N, 2 M].
     both = Vehicles(*(torch.cat(pair, dim=1) for pair in zip(moved, vehicles)))
-    there = perceive(both, road, slice(0, vehicles.x.shape[1]))
-    room = _room(there, idm, safe_deceleration)
-    return vehicles.with_(x=torch.where(away & room, moved.x, vehicles.x))
+    count = vehicles.x.shape[1]
+    pairs = compare(both, road, slice(0, count))
+    low, high = with_target(body_lanes(both, road), both)
+    room = leave_room(
+        moved.part((..., None)),
+        both.part((slice(None), None)),
+        (
+            LaneRange(low[:, :count, None], high[:, :count, None]),
+            LaneRange(low[:, None], high[:, None]),
+        ),
+        pairs.distance,
+        pairs.order > 0,
+        idm,
+    )
+    # Nobody is in its own way, at neither of its positions.
+    itself = torch.eye(count, dtype=torch.bool, device=away.device).repeat(1, 2)
+    goes = away & (room | itself).all(-1)
+    return vehicles.with_(x=torch.where(goes, moved.x, vehicles.x))

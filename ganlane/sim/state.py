@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ganlane.errors import UserError
-from ganlane.keys import VEHICLE_FIELDS
+from ganlane.keys import EGO_INDEX, VEHICLE_FIELDS
 from ganlane.settings.driving import Visibility
 from ganlane.settings.road import EXIT, NOTHING, FlowParameters, Stretches, exit_lane
 
@@ -67,23 +67,26 @@ class Vehicles(NamedTuple):
         """The same vehicles with some fields replaced."""
         return self._replace(**changed)
 
+    def part(self, index: Any) -> Vehicles:
+        """Some of the vehicles: ``field[index]`` of every field."""
+        return Vehicles(*(field[index] for field in self))
+
     def at(self, index: int) -> Vehicles:
         """Vehicle ``index`` of every row, fields [N]."""
-        return Vehicles(*(field[:, index] for field in self))
+        return self.part((slice(None), index))
 
     def columns(self, which: slice) -> Vehicles:
         """A slice of the vehicles of every row, fields [N, K]."""
-        if which == slice(None):
-            return self
-        return Vehicles(*(field[:, which] for field in self))
+        return self if which == slice(None) else self.part((slice(None), which))
+
+    def is_ego(self) -> Tensor:
+        """Which vehicles of a row are an ego: the first, bool [M]."""
+        return torch.arange(self.x.shape[1], device=self.x.device) == EGO_INDEX
 
     def with_first(self, first: Vehicles) -> Vehicles:
         """The same rows with vehicle 0 replaced by ``first`` (fields [N])."""
         # By where, not by writing in place: the tensors may belong to the caller.
-        is_first = torch.arange(self.x.shape[1], device=self.x.device) == 0
-        return Vehicles(
-            *(torch.where(is_first, one[:, None], all_) for one, all_ in zip(first, self))
-        )
+        return first.part((slice(None), None)).where(self.is_ego()[None], self)
 
     def with_finite_padding(self) -> Vehicles:
         """The same vehicles with finite numbers in invalid entries: NaN would spread in sums."""
@@ -277,12 +280,7 @@ def with_target(lanes: LaneRange, vehicles: Vehicles) -> LaneRange:
     return LaneRange(torch.minimum(lanes.low, target), torch.maximum(lanes.high, target))
 
 
-def presence(
-    vehicles: Vehicles,
-    road: Road,
-    body: LaneRange,
-    attention: LaneRange,
-) -> LaneRange:
+def presence(vehicles: Vehicles, road: Road, body: LaneRange, attention: LaneRange) -> LaneRange:
     """Lanes in which others see each vehicle, by its visibility.
 
     An empty range for invalid vehicles.

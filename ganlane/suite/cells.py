@@ -91,18 +91,15 @@ def _settings(driver: Driver, config: EvaluateConfig) -> dict[str, Any]:
         # Noise for exploring is drawn anew by every process.
         if not name.endswith("_epsilon"):
             weights.update(value.cpu().numpy().tobytes())
-    mask, _ = driver.behind(config.mask)
-    settings = asdict(config)
+    driven, _ = driver.driving(config)
+    settings = asdict(driven)
     # They change how fast the cell is driven, not what happens.
     for name in ("threads", "columns", "num_envs", "agents", "traffics"):
         del settings[name]
-    settings["env"] = asdict(driver.env(config.env))
     return {
         **settings,
         "driver": driver.name,
         "weights": weights.hexdigest(),
-        "mask": asdict(mask),
-        "observation": asdict(config.observation.read_by(driver.observation)),
         "traffics": {name: item.description() for name, item in config.traffics.items()},
     }
 

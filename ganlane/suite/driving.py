@@ -51,21 +51,10 @@ def compare(
             if once and isinstance(module, ReplayTraffic):
                 numbers = module.episodes_once(seed, env.idm)[:episodes]
             for driver in drivers:
-                observation = config.observation.read_by(driver.observation)
-                mask, policy = driver.behind(config.mask)
-                of_driver = driver.env(env)
+                of_driver, policy = driver.driving(config)
                 # All but the number of rows, which shrinks towards the end.
-                make = partial(
-                    make_env,
-                    module,
-                    of_driver,
-                    observation,
-                    config.reward,
-                    seed=seed,
-                    device=config.device,
-                    mask=mask,
-                )
-                parts = (traffic, observation, mask, of_driver.actions)
+                make = partial(make_env, module, of_driver)
+                parts = (traffic, of_driver.observation, of_driver.mask, of_driver.env.actions)
                 if current != parts:
                     # Drivers with the same observation, mask and actions share an environment, so
                     # that it is compiled once.

@@ -23,13 +23,6 @@ def drive_episode(
         UserError: see :func:`ganlane.build.make_traffic`.
     """
     # A trained agent brings the mask and the observation that it was trained with.
-    mask, policy = driver.behind(config.mask)
-    env = make_env(
-        make_traffic(traffic, config.env, Stream.named(config.stream)),
-        driver.env(config.env),
-        config.observation.read_by(driver.observation),
-        config.reward,
-        device=config.device,
-        mask=mask,
-    )
+    driven, policy = driver.driving(config)
+    env = make_env(make_traffic(traffic, config.env, Stream.named(config.stream)), driven)
     return record_episode(env, policy, config.seed, episode, driver.name, traffic.label(), end_s)

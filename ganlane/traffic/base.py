@@ -24,8 +24,11 @@ from ganlane.torch_settings import outside_autocast
 Memory = dict[str, Tensor]
 #: The vehicles after a step, and the memory to keep.
 Moved = tuple[Vehicles, Memory]
-#: Name to (trailing shape after [N, M], dtype); the dtype None is the run's float type.
-MemoryFields = Mapping[str, tuple[tuple[int, ...], torch.dtype | None]]
+#: The initial scene of episodes, and the memory.
+Entered = tuple[Vehicles, TensorDictBase]
+#: Name to (trailing shape after [N, M], dtype), the dtype None being the run's float type; of a
+#: traffic made of others by their names.
+MemoryFields = Mapping[str, Any]
 Network = TypeVar("Network", bound=nn.Module)
 
 
@@ -58,6 +61,11 @@ def with_rows(whole: TensorDictBase, rows: Tensor, part: Mapping[str, Any]) -> T
         elif name in fields:
             fields[name] = with_rows(fields[name], rows, value)
     return new_tensordict(fields, whole.batch_size[0])
+
+
+def where_rows(rows: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """``new`` where ``rows`` [N] is true, ``old`` elsewhere; both [N, ...]."""
+    return torch.where(rows.view(-1, *[1] * (new.ndim - 1)), new, old)
 
 
 def key_of(tensordict: TensorDictBase, stream: int) -> Tensor:
@@ -199,9 +207,7 @@ class TrafficModule(TensorDictModuleBase):
         """:meth:`fresh_memory` as a TensorDict [N]."""
         return new_tensordict(self.fresh_memory(vehicles, key), len(vehicles.x))
 
-    def enter(
-        self, vehicles: Vehicles, key: Tensor, episode: Tensor
-    ) -> tuple[Vehicles, TensorDictBase]:
+    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> Entered:
         """The start of episodes: the initial scene and the memory.
 
         A traffic that sets visibilities or desired speeds itself overrides this method.
@@ -215,11 +221,18 @@ class TrafficModule(TensorDictModuleBase):
 
     def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
         """Nested name -> (shape, dtype) of the memory of ``n`` rows of ``m`` vehicles."""
-        # The dtype None stands for the run's float type.
-        return {
-            name: ((n, m, *shape), own_dtype or dtype)
-            for name, (shape, own_dtype) in self.memory_fields.items()
-        }
+        return _spec(self.memory_fields, n, m, dtype)
+
+
+def _spec(fields: MemoryFields, n: int, m: int, dtype: torch.dtype) -> dict[str, Any]:
+    spec: dict[str, Any] = {}
+    for name, field in fields.items():
+        if isinstance(field, Mapping):
+            spec[name] = _spec(field, n, m, dtype)
+        else:
+            shape, kind = field
+            spec[name] = ((n, m, *shape), kind or dtype)
+    return spec
 
 
 class Overlay(TrafficModule):
@@ -257,14 +270,11 @@ class TrafficParts(TrafficModule):
         self.parts = nn.ModuleDict(parts)
         self.rows_must_stay = any(part.rows_must_stay for part in parts.values())
         self.heeds_lane_ends = all(part.heeds_lane_ends for part in parts.values())
+        self.memory_fields = {name: part.memory_fields for name, part in parts.items()}
 
     def named_parts(self) -> list[tuple[str, TrafficModule]]:
         """Names and parts, in order."""
         return cast("list[tuple[str, TrafficModule]]", list(self.parts.items()))
-
-    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
-        """The parts' specs, by name."""
-        return {name: part.memory_spec(n, m, dtype) for name, part in self.named_parts()}
 
 
 class TrafficSequential(TrafficParts):
@@ -312,9 +322,7 @@ class TrafficSequential(TrafficParts):
         memories = {name: part.init_memory(vehicles, key) for name, part in self.named_parts()}
         return new_tensordict(memories, len(key))
 
-    def enter(
-        self, vehicles: Vehicles, key: Tensor, episode: Tensor
-    ) -> tuple[Vehicles, TensorDictBase]:
+    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> Entered:
         """The vehicles after the parts' :meth:`TrafficModule.enter`, and the memories by name."""
         memories = {}
         # In order: a part sees the desired speeds and visibilities that the parts before it set.

@@ -12,7 +12,6 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
-from ganlane.keys import EGO_INDEX
 from ganlane.native.drivers import chance_in_step, faulty_drivers
 from ganlane.settings.driving import (
     AbortFaults,
@@ -38,8 +37,7 @@ Timed = TypeVar("Timed", bound=BrakingFaults | ReactionFaults)
 def other_drivers(vehicles: Vehicles) -> Tensor:
     """Valid non-ego vehicles, bool [N, M]."""
     # The ego's motion is the environment's, so a fault of it would have no effect.
-    index = torch.arange(vehicles.x.shape[1], device=vehicles.x.device)
-    return vehicles.valid & (index != EGO_INDEX)
+    return vehicles.valid & ~vehicles.is_ego()
 
 
 def starting(vehicles: Vehicles, moved: Vehicles) -> Tensor:
@@ -83,17 +81,10 @@ class Fault(Overlay, Generic[Faults]):
     purpose: Purpose
 
     def __init__(
-        self,
-        road: Road | None = None,
-        stream: int = Stream.TRAIN,
-        faults: Faults | None = None,
+        self, road: Road | None = None, stream: int = Stream.TRAIN, faults: Faults | None = None
     ) -> None:
         super().__init__(road, stream)
         self.faults: Faults = faults or self.kind()
-
-    def draw(self, vehicles: Vehicles, key: Tensor, step: Tensor) -> Tensor:
-        """A uniform number per vehicle, [N, M]."""
-        return uniforms(vehicles, key, step, self.purpose)[0]
 
 
 class TimedFault(Fault[Timed]):
@@ -104,7 +95,8 @@ class TimedFault(Fault[Timed]):
 
         A fault begins where there is none, at a constant hazard.
         """
-        comes = self.draw(vehicles, key, step) < chance_in_step(self.faults.per_hour)
+        (u,) = uniforms(vehicles, key, step, self.purpose)
+        comes = u < chance_in_step(self.faults.per_hour)
         # A fault that lasts is not prolonged by a second one.
         begins = (left == 0) & other_drivers(vehicles) & comes
         return torch.where(begins, round(self.faults.lasts_s / self.dt), left)
@@ -189,7 +181,7 @@ class HesitantLaneChange(Fault[HesitationFaults]):
     ) -> Moved:
         """Reduce the lateral motion of hesitant changes."""
         begins = starting(vehicles, moved)
-        u = self.draw(vehicles, key, step)
+        (u,) = uniforms(vehicles, key, step, self.purpose)
         # Decided once, when the change begins.
         hesitant = torch.where(begins, u < self.faults.share, memory["hesitant"])
         # From the position at t: only the step's lateral part shrinks.
@@ -219,7 +211,7 @@ class AbortedLaneChange(Fault[AbortFaults]):
     ) -> Moved:
         """Set the old lane as the target where the change has come far enough."""
         begins = starting(vehicles, moved)
-        u = self.draw(vehicles, key, step)
+        (u,) = uniforms(vehicles, key, step, self.purpose)
         # Where a change will be aborted, the lane to return to.
         chosen = torch.where(u < self.faults.share, vehicles.target_lane, _NO_LANE)
         origin = torch.where(begins, chosen, memory["origin"])

@@ -6,8 +6,6 @@ and goes over to its lateral speed evenly. The ego is a driver like any other to
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from torch import Tensor
 
@@ -22,12 +20,10 @@ from ganlane.generator.human import (
     features_of,
     lane_choice,
     leaves_room,
-    perceive,
     remembered,
-    sides_of,
+    situation_of,
     velocity,
     with_choice,
-    with_style,
     with_velocity,
 )
 from ganlane.generator.human import Memory as DriverMemory
@@ -40,15 +36,8 @@ from ganlane.sim.mobil import TABLE_IV, yielding
 from ganlane.sim.neighbours import Scene
 from ganlane.sim.neighbours import perceive as scene_of
 from ganlane.sim.random import Purpose, normal
-from ganlane.sim.state import (
-    Road,
-    Vehicles,
-    body_lanes,
-    reads_are_cheap,
-    spanned,
-    with_target,
-)
-from ganlane.traffic.base import Memory, Moved, TrafficModule, in_dtype, uniforms
+from ganlane.sim.state import Road, Vehicles, body_lanes, reads_are_cheap, spanned, with_target
+from ganlane.traffic.base import Memory, Moved, TrafficModule, in_dtype, uniforms, where_rows
 
 #: Ahead and behind of who leaves a lane that ends, m: who makes room leaves as much at least.
 LEAST_ROOM_M = 1.0
@@ -137,13 +126,16 @@ class HumanTraffic(TrafficModule):
         """Decisions in the rows where one is ``due`` [N]."""
         if not reads_are_cheap(vehicles.x):
             decided, new_memory = self.decide(vehicles, memory, key, step)
-            return decided.where(due, vehicles), _where(due, new_memory, memory)
+            new_memory = {
+                name: where_rows(due, new_memory[name], value) for name, value in memory.items()
+            }
+            return decided.where(due, vehicles), new_memory
         rows = due.nonzero()[:, 0]
         if len(rows) == len(due):
             return self.decide(vehicles, memory, key, step)
         if not len(rows):
             return vehicles, memory
-        part = Vehicles(*(field[rows] for field in vehicles))
+        part = vehicles.part(rows)
         its_memory = {name: value[rows] for name, value in memory.items()}
         decided, new_memory = self.decide(part, its_memory, key[rows], step[rows])
         target = vehicles.target_lane.index_copy(0, rows, decided.target_lane)
@@ -160,33 +152,33 @@ class HumanTraffic(TrafficModule):
             makes_room = yielding(scene, self.drivers.idm, self.mobil)
         vehicles = vehicles.with_(target_lane=self.road.clamp_lane(vehicles.target_lane))
         driver = DriverMemory(*(memory[name] for name in DriverMemory._fields))
-        view = perceive(vehicles, self.road)
-        driver = with_style(driver, view)
+        situation = situation_of(vehicles, driver, self.road)
         u = uniforms(vehicles, key, step, *_DRAWS)
-        sides = sides_of(vehicles, driver, self.road, view)
-        polite = sides.clone()
+        option = lane_choice(situation)
+        sides, polite = option.sides, option.sides.clone()
         polite[..., REAR_BRAKING] *= variation.politeness
-        option = lane_choice(vehicles, view, polite)
+        option = option._replace(sides=polite)
         if self.road.stretches:
             ways = ways_out(vehicles, self.road, self.mobil.mandatory_m)
             option = option._replace(exists=torch.stack((ways.left, ways.right), -1))
         choice = chosen(policy.lane_chances(option, variation.lane_changes), u[2])
         if self.road.stretches:
             choice = _leaving(choice, option.keeping, ways, sides, u[3])
-        vehicles, driver = with_choice(vehicles, driver, view, choice)
+        situation = with_choice(situation, choice)
+        vehicles = situation.vehicles
         # Its moves follow the driver's choice.
-        along, across = policy(features_of(vehicles, driver, self.road, view))
+        along, across = policy(features_of(situation))
         change = ALONG.sample(along, u[0], variation.temperature)
         aside = ACROSS.sample(across, u[1], variation.temperature)
-        acceleration, lateral = bounded(vehicles, driver, self.road, change, aside)
+        acceleration, lateral = bounded(situation, change, aside)
         if self.road.stretches:
             acceleration = torch.minimum(acceleration, self._before_walls(vehicles, scene))
             acceleration = torch.minimum(acceleration, makes_room)
-        driver = remembered(vehicles, driver, view, acceleration)
+        driver = remembered(situation, acceleration)
         return vehicles, {
             **driver._asdict(),
             "acceleration": driver.accelerations[..., variation.delayed],
-            "lateral_from": view.aside,
+            "lateral_from": situation.view.aside,
             "lateral_to": lateral,
         }
 
@@ -222,11 +214,3 @@ def _leaving(choice: Tensor, keeping: Tensor, ways: WaysOut, sides: Tensor, u: T
     side = torch.where(left[..., None], sides[..., 0, :], sides[..., 1, :])
     wants = keeping & (ways.side != 0) & (u < ways.urgency)
     return torch.where(wants & leaves_room(side, LEAST_ROOM_M), torch.where(left, 1, 2), choice)
-
-
-def _where(rows: Tensor, new: Mapping[str, Tensor], old: Mapping[str, Tensor]) -> Memory:
-    """``new`` in the ``rows`` [N], ``old`` elsewhere."""
-    return {
-        name: torch.where(rows.view(-1, *[1] * (value.ndim - 1)), new[name], value)
-        for name, value in old.items()
-    }

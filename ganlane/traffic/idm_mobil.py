@@ -6,20 +6,18 @@ import math
 from typing import NamedTuple
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
 from ganlane.native.drivers import RuleDrivers
 from ganlane.settings.driving import IdmParameters, MobilParameters, RandomDrivers
-from ganlane.settings.record import Range
-from ganlane.sim.dynamics import STEERING, SteeringParameters, advance, steer
+from ganlane.sim.dynamics import STEERING, SteeringParameters, drive
 from ganlane.sim.idm import TABLE_V, AnyIdm, DriverIdm, following_acceleration, needed_deceleration
-from ganlane.sim.mobil import TABLE_IV, DriverMobil, mobil_changes, yielding
+from ganlane.sim.mobil import TABLE_IV, mobil_changes, yielding
 from ganlane.sim.neighbours import Scene, in_lane, perceive
-from ganlane.sim.random import Purpose, Stream, absorb
+from ganlane.sim.random import Purpose, Stream, absorb, in_range
 from ganlane.sim.state import Road, Vehicles, reads_are_cheap
-from ganlane.traffic.base import Memory, Moved, TrafficModule, uniforms
+from ganlane.traffic.base import Entered, Memory, Moved, TrafficModule, uniforms
 
 #: MOBIL decides once a second of simulated time, whatever the ego's decision period.
 MOBIL_PERIOD_STEPS = 10
@@ -88,11 +86,10 @@ class IdmTraffic(TrafficModule):
         self, scene: Scene, acceleration: Tensor, target: Tensor, line: Tensor, memory: Memory
     ) -> Moved:
         """Steered to the lines at ``line`` (m, [N, M])."""
-        v = scene.vehicles
-        pose = (v.y, v.heading, v.speed)
-        steering = steer(memory["steering"], *pose, line, self.dt, self.steering)
-        moved = advance(v.x, *pose, acceleration, steering, self.dt)
-        return v.with_(target_lane=target, **moved._asdict()), {"steering": steering}
+        moved, steering = drive(
+            scene.vehicles, acceleration, memory["steering"], line, self.dt, self.steering
+        )
+        return moved.with_(target_lane=target), {"steering": steering}
 
 
 class IdmMobilTraffic(IdmTraffic):
@@ -131,7 +128,7 @@ class IdmMobilTraffic(IdmTraffic):
 
     def changes(self, scene: Scene, memory: Memory) -> Tensor:
         """The side that each driver changes to, -1, 0 or 1, [N, M]."""
-        return mobil_changes(scene, self.road, self.idm, self.mobil)
+        return mobil_changes(scene, self.idm, self.mobil)
 
 
 class DriverParams(NamedTuple):
@@ -176,10 +173,7 @@ class DriverParams(NamedTuple):
 
 
 def start_braking(
-    vehicles: Vehicles,
-    road: Road,
-    reaction_s: Tensor,
-    min_gap_m: float = TABLE_V.min_gap_m,
+    vehicles: Vehicles, road: Road, reaction_s: Tensor, min_gap_m: float = TABLE_V.min_gap_m
 ) -> Tensor:
     """Deceleration (m/s2, [N, M]) with which each driver stays behind all ahead in its lane.
 
@@ -202,11 +196,6 @@ def start_braking(
     gap = pairs.ahead - between * space - closing * reaction_s[..., None]
     needed = needed_deceleration(speed, leader_speed, gap.clamp_min(1.0))
     return torch.where(ahead, needed, 0.0).amax(-1)
-
-
-def in_range(u: Tensor, bounds: Range) -> Tensor:
-    """Uniform numbers in [0, 1) scaled to ``bounds``."""
-    return bounds[0] + u * (bounds[1] - bounds[0])
 
 
 class IdmRandomTraffic(IdmMobilTraffic):
@@ -271,9 +260,7 @@ class IdmRandomTraffic(IdmMobilTraffic):
             phase_two=2.0 * math.pi * u[10],
         )
 
-    def enter(
-        self, vehicles: Vehicles, key: Tensor, episode: Tensor
-    ) -> tuple[Vehicles, TensorDictBase]:
+    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> Entered:
         """Gives every driver but the ego its own desired speed."""
         (u,) = uniforms(vehicles, absorb(key, 0), -1, _DESIRED_SPEED)
         # The ego's is the environment's.
@@ -291,22 +278,12 @@ class IdmRandomTraffic(IdmMobilTraffic):
 
     def changes(self, scene: Scene, memory: Memory) -> Tensor:
         """As :class:`IdmMobilTraffic`, with each driver's parameters."""
-        m = self.mobil
         drivers = DriverParams.of(memory)
-        # [N, M, 1]: one weight for both sides that a driver looks at.
-        politeness = drivers.politeness[..., None]
-        mobil = DriverMobil(
-            m.threshold,
-            politeness * m.politeness_rear,
-            politeness * m.politeness_side,
-            m.safe_deceleration,
-            m.exclusive_m,
-            m.mandatory_bias,
-            m.mandatory_m,
-        )
         # Predictions are not limited by what this driver would brake itself.
         braking = torch.full_like(drivers.headway, -self.idm.min_acceleration)
-        return mobil_changes(scene, self.road, drivers.idm(self.idm.min_gap_m, braking), mobil)
+        idm = drivers.idm(self.idm.min_gap_m, braking)
+        # [N, M, 1]: one weight for both sides that a driver looks at.
+        return mobil_changes(scene, idm, self.mobil, drivers.politeness[..., None])
 
     def drive(self, scene: Scene, target: Tensor, memory: Memory, step: Tensor) -> Moved:
         """The vehicles at t + 0.1 s, with each driver's delay and sway."""

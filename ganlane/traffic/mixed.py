@@ -14,12 +14,12 @@ from torch import Tensor
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.keys import EGO_INDEX
 from ganlane.native.drivers import Drivers, blind, mixed_drivers
 from ganlane.settings.traffic import interleaved
 from ganlane.sim.random import Purpose, absorb, uniform
 from ganlane.sim.state import VISIBILITY_OF_EPISODE, Vehicles
 from ganlane.traffic.base import (
+    Entered,
     TrafficModule,
     TrafficParts,
     key_of,
@@ -132,23 +132,19 @@ class MixedTraffic(TrafficParts):
         tensordict.set(keys.MOVED, moved)
         return tensordict.set(keys.TRAFFIC, new_tensordict(new_memories, len(key)))
 
-    def enter(
-        self, vehicles: Vehicles, key: Tensor, episode: Tensor
-    ) -> tuple[Vehicles, TensorDictBase]:
+    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> Entered:
         """Every row by its part; the memory of the other parts is zero there."""
         (n, m), x = vehicles.x.shape, vehicles.x
         together = new_tensordict(vehicles.as_dict(), n)
         memories = _zeros(self.memory_spec(n, m, x.dtype), n, x.device)
         for name, part, rows in self.rows_of_parts(episode):
             # A traffic sees only its own rows of the scene.
-            scene = Vehicles(*(field[rows] for field in vehicles))
+            scene = vehicles.part(rows)
             # Here the part is known, so the placeholder becomes its visibility.
             of_episode = scene.visibility == VISIBILITY_OF_EPISODE
             visibility = torch.where(of_episode, int(part.visibility), scene.visibility)
             entered, memory = part.enter(
-                scene.with_(visibility=visibility),
-                key[rows],
-                episode[rows],
+                scene.with_(visibility=visibility), key[rows], episode[rows]
             )
             together = with_rows(together, rows, entered.as_dict())
             memories.set(name, with_rows(memories.get(name), rows, memory))
@@ -200,6 +196,7 @@ class BlindTraffic(TrafficModule):
         self.visibility = model.visibility
         self.rows_must_stay = model.rows_must_stay
         self.heeds_lane_ends = model.heeds_lane_ends
+        self.memory_fields = model.memory_fields
 
     def native_drivers(self) -> Drivers | None:
         """Those of the model, blind."""
@@ -222,19 +219,12 @@ class BlindTraffic(TrafficModule):
         # Drawn before the first step, by a key of its own. In float64, so that the same episodes
         # are blind in runs of either float type.
         u = uniform(absorb(key, 0), -1, 1, [Purpose.BLIND_EPISODE], torch.float64)[..., 0]
-        is_ego = torch.arange(vehicles.x.shape[1], device=key.device) == EGO_INDEX
-        return (u < self.blind_share) & is_ego
+        return (u < self.blind_share) & vehicles.is_ego()
 
-    def enter(
-        self, vehicles: Vehicles, key: Tensor, episode: Tensor
-    ) -> tuple[Vehicles, TensorDictBase]:
+    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> Entered:
         """As the model."""
         return self.model.enter(vehicles, key, episode)
 
     def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
         """As the model's."""
         return self.model.init_memory(vehicles, key)
-
-    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
-        """As the model's."""
-        return self.model.memory_spec(n, m, dtype)

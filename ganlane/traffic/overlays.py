@@ -7,6 +7,8 @@ relative positions as its only input drifts off the road within a minute, and to
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -207,11 +209,7 @@ class CalibratedLaneChange(Overlay):
 
 
 def _accelerated(
-    vehicles: Vehicles,
-    moved: Vehicles,
-    who: Tensor,
-    acceleration: Tensor,
-    dt: float,
+    vehicles: Vehicles, moved: Vehicles, who: Tensor, acceleration: Tensor, dt: float
 ) -> Vehicles:
     """``moved``, where ``who`` [N, M] drives along the road at ``acceleration``, m/s2."""
     speed = (vehicles.speed + acceleration * dt).clamp_min(0.0)
@@ -276,6 +274,8 @@ class Guard(Overlay):
         super().__init__(road, stream)
         self.guard = guard or GuardParameters()
         self.idm = idm
+        # A shorter headway than IDM's: the network may follow more closely than the model would.
+        self.closest = replace(idm, headway_s=self.guard.headway_s)
 
     def along(self, vehicles: Vehicles, moved: Vehicles) -> Vehicles:
         """``moved`` with its acceleration between the bounds by IDM."""
@@ -284,8 +284,7 @@ class Guard(Overlay):
         scene = perceive(vehicles.with_(target_lane=moved.target_lane), self.road)
         lanes = spanned(scene.attention)
         ahead = leader(scene, lanes)
-        # A shorter headway than IDM's: the network may follow more closely than the model would.
-        highest = acceleration_in(scene, lanes, ahead, self.idm, g.headway_s)
+        highest = acceleration_in(scene, lanes, ahead, self.closest)
         lowest = acceleration_in(scene, lanes, ahead, self.idm)
         lowest = lowest - g.slack * vehicles.speed / vehicles.desired_speed
         highest, lowest = (bound.clamp_min(g.hardest_braking) for bound in (highest, lowest))

@@ -36,10 +36,7 @@ from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
 
 
 def gan_traffic(
-    road: Road | None = None,
-    stream: int = Stream.TRAIN,
-    idm: IdmParameters = TABLE_V,
-    **keys: Any,
+    road: Road | None = None, stream: int = Stream.TRAIN, idm: IdmParameters = TABLE_V, **keys: Any
 ) -> TrafficSequential:
     """``traffic=gan``, the paper's: positions only, literal blind lane changes, sudden
     accelerations.

@@ -109,8 +109,7 @@ def _starts(samples: pl.DataFrame, least: int) -> tuple[pl.DataFrame, Tensor]:
     there = (
         samples.with_columns(stays=stays, off_middle=(x - middle).abs())
         .with_columns(
-            ego=nearest.over(moment),
-            steps=pl.col("frame").max().over("scene") - pl.col("frame"),
+            ego=nearest.over(moment), steps=pl.col("frame").max().over("scene") - pl.col("frame")
         )
         .filter(pl.col("stays").any().over(moment))
     )
@@ -250,10 +249,6 @@ class ReplayTraffic(TrafficModule):
         scene = _one_of(u[:, 0], torch.full_like(key, len(self.scene_names)))
         return self.first_start[scene] + _one_of(u[:, 1], self.starts_in[scene])
 
-    def scene_of(self, key: Tensor) -> Tensor:
-        """Number of the scene in :attr:`scene_names`, [N] int64."""
-        return self.scene[self.start_of(key)]
-
     def scenes_of_episodes(self, seed: int, episodes: Sequence[int]) -> list[str]:
         """Name of the scene of each of ``episodes``, for figures by scene."""
         scenes = self.scene[self._starts_of(seed, episodes)]
@@ -368,9 +363,9 @@ class RecordedScenes:
     """
 
     traffic: ReplayTraffic
-    vehicles: int = 9
-    ego_visibility: int = Visibility.BODY
-    ego_desired_speed_mps: float = 25.0
+    vehicles: int
+    ego_visibility: int
+    ego_desired_speed_mps: float
 
     @property
     def longest_m(self) -> float:
@@ -386,7 +381,7 @@ class RecordedScenes:
         The ego at index 0 and x = 0.
         """
         scene = self.traffic.recorded(key, torch.zeros_like(key), self.vehicles, dtype)
-        is_ego = torch.arange(self.vehicles, device=key.device) == EGO_INDEX
+        is_ego = scene.is_ego()
         return scene.with_(
             desired_speed=torch.where(is_ego, self.ego_desired_speed_mps, scene.desired_speed),
             visibility=torch.where(is_ego, int(self.ego_visibility), scene.visibility),

@@ -17,6 +17,7 @@ from ganlane.config.run import LAST
 from ganlane.errors import UserError
 from ganlane.evaluation.results import flat
 from ganlane.files import atomic_path, has_checksum, refuse_without_checksum, seal_archive
+from ganlane.settings.train import TrainConfig
 from ganlane.training.collectors import Collector
 from ganlane.training.stats import EpisodeStats
 
@@ -46,10 +47,9 @@ class TrainingState:
         self.agent = agent
         self.identity = dict(identity or {})
         self.environments = self.collector.environments
-        self.window = NStepWindow(agent.config.n_step, agent.config.gamma)
-        self.stats = EpisodeStats(
-            self.environments, agent.network.config.actions, agent.config.gamma, agent.device
-        )
+        gamma, actions = agent.config.gamma, agent.network.config.actions
+        self.window = NStepWindow(agent.config.n_step, gamma)
+        self.stats = EpisodeStats(self.environments, actions, gamma, agent.device)
         self.decisions = 0
         self.pending_decisions = 0
         self.evaluated_at = 0
@@ -65,11 +65,7 @@ class TrainingState:
 
     def progress(self) -> dict[str, Any]:
         """How far the run has come."""
-        return {
-            "decisions": self.decisions,
-            "updates": self.agent.updates,
-            "wall_s": self.wall_s,
-        }
+        return {"decisions": self.decisions, "updates": self.agent.updates, "wall_s": self.wall_s}
 
     def passed(self, every: int) -> bool:
         """Whether the last step passed a multiple of ``every`` decisions; never, for 0."""
@@ -107,31 +103,31 @@ class TrainingState:
             UserError: the checkpoint is unreadable, or of another run.
         """
         state = load_checkpoint(path, self.agent.device)
+        option = f"resume={path}"
         if not isinstance(state, dict) or not state.keys() >= {*PARTS}:
             raise UserError(
-                f"resume={path}: parts of the run are missing in it; give another checkpoint."
+                f"{option}: parts of the run are missing in it; give another checkpoint."
             )
         for name in FINITE:
             if not _finite(state[name]):
                 raise UserError(
-                    f"resume={path}: numbers of its {name} are not finite; give a checkpoint of "
+                    f"{option}: numbers of its {name} are not finite; give a checkpoint of "
                     "another run."
                 )
         try:
-            self._take_over(state, path)
+            self._take_over(state, option)
         except UserError:
             raise
         except Exception as error:  # damaged parts can fail in any way
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise UserError(
-                f"resume={path}: a part of the run is damaged in it ({reason}); give another "
-                "checkpoint."
+                f"{option}: a part of the run is damaged in it ({reason}); give another checkpoint."
             ) from error
         if state["agent"]["replay"] is None:
             return "the replay buffer: it is filled again before the next update"
         return None
 
-    def _take_over(self, state: Mapping[str, Any], path: str | Path) -> None:
+    def _take_over(self, state: Mapping[str, Any], option: str) -> None:
         """Restore everything from ``state``; see :meth:`restore`."""
         # by dotted name, as on the command line
         before = flat(state["identity"])
@@ -140,18 +136,18 @@ class TrainingState:
         for name in (*now, *before):
             if before.get(name) != now.get(name):
                 raise UserError(
-                    f"resume={path}: {name}={now.get(name)}, but the run was started with "
+                    f"{option}: {name}={now.get(name)}, but the run was started with "
                     f"{before.get(name)}; go on with that, or start a new run."
                 )
-        # with the window and the buffer everything goes on where it stopped
-        exact = state["window"] is not None
         shape = state["env_state"]["batch_size"]
         if shape != [self.environments]:
             raise UserError(
-                f"resume={path}: saved with environments of shape {shape}, this run has "
+                f"{option}: saved with environments of shape {shape}, this run has "
                 f"[{self.environments}]; use the same number."
             )
         self.agent.load_state_dict(state["agent"])
+        # with the window and the buffer everything goes on where it stopped
+        exact = state["window"] is not None
         self.collector.load_state_dict(state["env_state"], exact)
         if exact:
             self.window.load_state_dict(state["window"])
@@ -166,49 +162,42 @@ class TrainingState:
 class Checkpointer:
     """Writes ``checkpoints/last.pt`` (to resume), ``last`` and ``best.safetensors`` (to drive).
 
-    ``every_s`` are the least seconds between two checkpoints. To the ``metadata`` of the agent's
-    files the progress of the training is added, under ``training``.
+    ``config`` says how often, and whether with the replay buffer. To the ``metadata`` of the
+    agent's files the progress of the training is added, under ``training``.
     """
 
     def __init__(
         self,
         state: TrainingState,
         folder: str | Path,
-        every_s: float,
-        with_replay: bool,
+        config: TrainConfig,
         metadata: Mapping[str, Any],
     ) -> None:
         self.state = state
         self.path = Path(folder) / LAST
+        self.config = config
         self.metadata = metadata
-        self.every_s = every_s
-        self.with_replay = with_replay
-        self.saved_s = time.monotonic()
-        # Longer than every_s where writing takes long.
-        self.pause_s = every_s
+        self.next_s = time.monotonic() + config.checkpoint_every_s
 
     def due(self) -> bool:
         """Whether the next checkpoint is due."""
-        return time.monotonic() - self.saved_s > self.pause_s
+        return time.monotonic() > self.next_s
 
     def save(self) -> None:
         """Write the checkpoint and the current weights."""
         begun = time.monotonic()
-        save_checkpoint(self.path, self.state.state_dict(self.with_replay))
+        save_checkpoint(self.path, self.state.state_dict(self.config.checkpoint_replay))
         # Weights alone, as an agent's file: it can be driven while the training goes on.
         self.save_weights("last", {})
-        self.saved_s = time.monotonic()
+        now = time.monotonic()
         # a slow disk must not slow down the training
-        self.pause_s = max(self.every_s, PATIENCE * (self.saved_s - begun))
+        self.next_s = now + max(self.config.checkpoint_every_s, PATIENCE * (now - begun))
 
     def save_weights(self, name: str, figures: Mapping[str, Any]) -> None:
         """Write the online network as ``NAME.safetensors``, with ``figures`` in its metadata."""
         training = {**self.metadata.get("training", {}), **self.state.progress(), **figures}
-        save_agent(
-            self.path.with_name(f"{name}.safetensors"),
-            self.state.agent,
-            {**self.metadata, "training": training},
-        )
+        metadata = {**self.metadata, "training": training}
+        save_agent(self.path.with_name(f"{name}.safetensors"), self.state.agent, metadata)
 
 
 def save_checkpoint(path: str | Path, state: Any) -> None:

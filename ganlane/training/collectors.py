@@ -32,7 +32,7 @@ class Collector:
         threads = torch.get_num_threads()
         self._driver = ThreadPoolExecutor(1, "driving", torch.set_num_threads, (threads,))
 
-    def step(self, agent: Rainbow, meanwhile: Callable[[], None] | None = None) -> TensorDictBase:
+    def step(self, agent: Rainbow, meanwhile: Callable[[], None]) -> TensorDictBase:
         """One decision of every environment, batch [N].
 
         Row i continues row i of the last step. ``next`` is the outcome before any reset: ended
@@ -51,8 +51,7 @@ class Collector:
         else:
             # A GPU computes on its own while the next calls are made.
             outcome = partial(self._drive, decided)
-        if meanwhile is not None:
-            meanwhile()
+        meanwhile()
         # The step holds each row as it ended; in env_state such rows are reset already.
         step, self.env_state = outcome()
         return step

@@ -11,7 +11,7 @@ from datetime import timedelta
 from importlib import import_module
 from pathlib import Path
 from time import monotonic
-from typing import Any, Protocol, TextIO
+from typing import Any, Protocol
 
 from tqdm import tqdm
 
@@ -216,13 +216,12 @@ class Progress:
     """Shows decisions per second, remaining time and the figures :data:`SHOWN`.
 
     Figures that a row lacks, because no episode ended in its interval, keep their last value. Of
-    the ``total`` decisions of the run, ``done`` have been made before. A terminal as ``stream``
-    (default stderr) gets a bar, anything else a line per row.
+    the ``total`` decisions of the run, ``done`` have been made before. If stderr is a terminal it
+    gets a bar, else a line per row.
     """
 
-    def __init__(self, total: int, done: int = 0, stream: TextIO | None = None) -> None:
+    def __init__(self, total: int, done: int = 0) -> None:
         self.total = total
-        self.stream = sys.stderr if stream is None else stream
         self.figures: dict[str, float] = {}
         # Without a terminal its methods do nothing.
         self._bar = tqdm(
@@ -233,8 +232,7 @@ class Progress:
             unit_scale=True,
             dynamic_ncols=True,
             bar_format=BAR,
-            file=self.stream,
-            disable=not self.stream.isatty(),
+            disable=not sys.stderr.isatty(),
         )
 
     def advance(self, decisions: int) -> None:
@@ -256,7 +254,7 @@ class Progress:
         # remaining time at the rate of the last interval
         left = timedelta(seconds=round(max(self.total - row["decisions"], 0.0) / rate))
         head = f"{int(row['decisions']):,} of {self.total:,} decisions, {rate:,.0f}/s, {left} left"
-        print(", ".join([head, *shown]), file=self.stream, flush=True)
+        print(", ".join([head, *shown]), file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Stop updating the bar and leave it on the screen."""

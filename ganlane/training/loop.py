@@ -106,8 +106,7 @@ def train(
     state = TrainingState(env, agent, identity)
     # None: everything could be restored
     missing = None if resume is None else state.restore(resume)
-    seconds, replay = config.checkpoint_every_s, config.checkpoint_replay
-    saver = Checkpointer(state, run_folder, seconds, replay, metadata or {})
+    saver = Checkpointer(state, run_folder, config, metadata or {})
     actions = agent.network.config.actions
     shown = config.total_decisions if config.logger.progress else None
     # logs are closed, and their last rows written, whatever ends the run

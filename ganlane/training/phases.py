@@ -129,16 +129,7 @@ def run_phase(phase: Phase, resume: str | Path | None = None) -> TrainingResult:
 
 def env_maker(config: TrainConfig, stream: Stream) -> Callable[..., EnvBase]:
     """What makes any number of environments, on the episodes of ``stream``."""
-    return partial(
-        make_env,
-        make_traffic(config.traffic, config.env, stream),
-        config.env,
-        config.observation,
-        config.reward,
-        seed=config.seed,
-        device=config.device,
-        mask=config.mask,
-    )
+    return partial(make_env, make_traffic(config.traffic, config.env, stream), config)
 
 
 def make_selection(config: TrainConfig) -> Evaluate:

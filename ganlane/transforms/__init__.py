@@ -11,11 +11,7 @@ in the same way::
 """
 
 from ganlane.transforms.mask import ActionMaskTransform
-from ganlane.transforms.observation import (
-    OBSERVATIONS,
-    ObservationTransform,
-    observation_size,
-)
+from ganlane.transforms.observation import OBSERVATIONS, ObservationTransform, observation_size
 from ganlane.transforms.reward import RewardParameters, RewardTransform
 from ganlane.transforms.sensors import SensorParameters, SensorTransform
 

@@ -16,8 +16,6 @@ back if that is safe).
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -35,7 +33,6 @@ from ganlane.sim.dynamics import SIDES, ego_scene, is_heard, stays_on_road
 from ganlane.sim.foresight import has_room
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import lane_accelerations
-from ganlane.sim.neighbours import Scene
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.torch_settings import constant
 from ganlane.transforms.sensors import PerceptionTransform
@@ -44,48 +41,10 @@ from ganlane.transforms.sensors import PerceptionTransform
 FORMS = tuple(form for form in MASKS if form != "none")
 
 
-class BrakingDemand(NamedTuple):
-    """Accelerations by IDM, m/s2, [N, 3], for keeping the lane and going left and right.
-
-    Of the ego in those ``lanes`` and of its follower there, as the ego sees the ``scene``.
-    """
-
-    scene: Scene
-    lanes: Tensor
-    ego: Tensor
-    follower: Tensor
-
-
-def braking_demand(
-    vehicles: Vehicles,
-    road: Road,
-    idm: IdmParameters = TABLE_V,
-) -> BrakingDemand:
-    """How hard the ego and its follower would have to brake after each action.
-
-    A lane that does not exist has no vehicles; the mask excludes it.
-    """
-    # IDM of the ego in each lane, and of who would follow it there.
-    scene = ego_scene(vehicles, road)
-    lane = scene.observers.target_lane.to(vehicles.x.dtype)
-    lanes = torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1)
-    accelerations = lane_accelerations(scene, lanes, idm)
-    return BrakingDemand(
-        scene,
-        lanes[:, 0],
-        accelerations.observer[:, 0],
-        accelerations.with_it[:, 0],
-    )
-
-
 def allowed_speeds(state: TensorDictBase, actions: ActionParameters) -> Tensor:
     """Whether ``faster`` and ``slower`` have an effect in ``state``, bool [N, 2]."""
     desired = state.get(keys.VEHICLES).get("desired_speed")[:, keys.EGO_INDEX]
-    return speed_changes(
-        state.get(keys.EGO).get(keys.SET_SPEED),
-        desired,
-        actions,
-    )
+    return speed_changes(state.get(keys.EGO).get(keys.SET_SPEED), desired, actions)
 
 
 class ActionMaskTransform(PerceptionTransform):
@@ -127,34 +86,21 @@ class ActionMaskTransform(PerceptionTransform):
             raise UserError(
                 f"mask.form={form!r}: expected one of {', '.join(FORMS)}; choose one of them."
             )
-        if safe_deceleration <= 0:
-            raise UserError(
-                f"mask.safe_deceleration={safe_deceleration:g}: expected a number above 0, in m/s2."
-            )
+        self.mask = MaskParameters(form, safe_deceleration)
         self.actions = actions or ActionParameters()
         self.actions.check_mask(form)
         # Behind legal there is nothing to report: keeping the lane is always legal.
-        out_keys = [keys.ACTION_MASK]
-        if form != "legal":
-            out_keys.append(keys.NO_SAFE_ACTION)
-        super().__init__(in_keys=[keys.VEHICLES, keys.EGO], out_keys=out_keys)
+        further = [] if form == "legal" else [keys.NO_SAFE_ACTION]
+        super().__init__(in_keys=[keys.VEHICLES, keys.EGO], out_keys=[keys.ACTION_MASK, *further])
         self.road = road
-        self.form = form
         self.idm = idm
         self.abort = abort
-        self.safe_deceleration = safe_deceleration
         # The kernel has no function for ``legal``, which is a comparison or two.
         self.native: SafeActions | None = None
         if native_vehicles is not None and form != "legal":
-            mask = MaskParameters(form, safe_deceleration)
-            self.native = SafeActions(road, native_vehicles, idm, mask, abort)
+            self.native = SafeActions(road, native_vehicles, idm, self.mask, abort)
 
-    def allowed(
-        self,
-        vehicles: Vehicles,
-        direction: Tensor,
-        road: Road,
-    ) -> tuple[Tensor, Tensor]:
+    def allowed(self, vehicles: Vehicles, direction: Tensor, road: Road) -> tuple[Tensor, Tensor]:
         """The mask [N, 3], and whether no action is safe [N].
 
         ``vehicles`` are as the ego perceives them; ``direction`` [N] is that of its current lane
@@ -164,50 +110,44 @@ class ActionMaskTransform(PerceptionTransform):
         # Keeping the lane is no command that the ego could fail to hear.
         obeyed = (side == 0) | is_heard(side, direction[:, None], self.abort)
         legal = stays_on_road(vehicles, side, road) & obeyed
-        if self.form == "legal":
+        form, safe_deceleration = self.mask.form, self.mask.safe_deceleration
+        if form == "legal":
             return legal, torch.zeros_like(legal[:, 0])
-        demand = braking_demand(vehicles, road, self.idm)
-        safe = torch.minimum(demand.ego, demand.follower) >= -self.safe_deceleration
+        # How hard the ego, in its lane and in those beside it, and who would follow it there would
+        # have to brake by IDM. A lane that does not exist has no vehicles, and is not legal.
+        scene = ego_scene(vehicles, road)
+        lanes = scene.observers.target_lane[..., None] + side.to(vehicles.x.dtype)
+        accelerations = lane_accelerations(scene, lanes, self.idm)
+        ego = accelerations.observer[:, 0]
+        safe = torch.minimum(ego, accelerations.with_it[:, 0]) >= -safe_deceleration
         changes = legal[:, 1:] & safe[:, 1:]
-        if self.form == "foresight":
-            slowest = torch.minimum(demand.ego[:, :1], demand.ego[:, 1:])
-            lanes = demand.lanes[:, 1:]
-            room = has_room(demand.scene, lanes, slowest, self.safe_deceleration)
-            changes = changes & room
+        if form == "foresight":
+            slowest = torch.minimum(ego[:, :1], ego[:, 1:])
+            changes = changes & has_room(scene, lanes[:, 0, 1:], slowest, safe_deceleration)
         # Keeping the lane is always allowed: where nothing is safe, there is nothing better.
         none = ~(safe[:, :1] | changes).any(1)
         keep = torch.ones_like(safe[:, :1])
         return torch.cat((keep, changes), dim=1), none
 
-    def write(
-        self,
-        state: TensorDictBase,
-        vehicles: Vehicles,
-        seen: Vehicles,
-    ) -> TensorDictBase:
+    def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
         """Write ``action_mask``, and with ``safe`` ``no_safe_action``."""
         direction = state.get(keys.EGO).get("change_direction")
         if self.native is not None:
             mask, none = self.native.allowed(seen, direction)
         else:
-            mask, none = self.allowed(
-                seen,
-                direction,
-                road_in(state, self.road),
-            )
+            mask, none = self.allowed(seen, direction, road_in(state, self.road))
         if self.actions.form == LANE_SPEED:
             mask = torch.cat((mask, allowed_speeds(state, self.actions)), dim=1)
-        state.set(keys.ACTION_MASK, mask)
-        return state.set(keys.NO_SAFE_ACTION, none[:, None]) if self.form != "legal" else state
+        for name, flags in zip(self.out_keys, (mask, none[:, None])):
+            state.set(name, flags)
+        return state
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the mask to the spec."""
         assert isinstance(observation_spec, Composite)
-        for name in self.out_keys:
-            size = len(self.actions.names) if name == keys.ACTION_MASK else 1
+        for name, size in zip(self.out_keys, (len(self.actions.names), 1)):
+            shape = (*observation_spec.shape, size)
             observation_spec[name] = Binary(
-                shape=(*observation_spec.shape, size),
-                dtype=torch.bool,
-                device=observation_spec.device,
+                shape=shape, dtype=torch.bool, device=observation_spec.device
             )
         return observation_spec

@@ -69,11 +69,7 @@ class View(NamedTuple):
     direction: Tensor
 
 
-def other_vehicles(
-    vehicles: Vehicles,
-    road: Road,
-    scale: ObservationScale,
-) -> Others:
+def other_vehicles(vehicles: Vehicles, road: Road, scale: ObservationScale) -> Others:
     """The others, ordered by the vehicles' indices; an invalid one is (1, 0, 0), far ahead."""
     ego = vehicles.columns(slice(0, 1))
     others = vehicles.columns(slice(1, None))
@@ -89,14 +85,11 @@ def other_vehicles(
     drift = (2.0 * offset / road.lane_width_m).clamp(-1.0, 1.0)
     bumpers_m = 0.5 * ego.length + 0.5 * others.length
     valid = others.valid
-    return Others(
-        torch.where(valid, position, 1.0),
-        torch.where(valid, speed, 0.0),
-        torch.where(valid, lane, 0.0),
-        valid,
-        torch.where(valid, drift, 0.0),
-        torch.where(valid, bumpers_m, 0.0),
+    position = torch.where(valid, position, 1.0)
+    speed, lane, drift, bumpers_m = (
+        torch.where(valid, number, 0.0) for number in (speed, lane, drift, bumpers_m)
     )
+    return Others(position, speed, lane, valid, drift, bumpers_m)
 
 
 def _widest(lanes: int | Tensor) -> int | Tensor:
@@ -135,11 +128,7 @@ def vehicle_list(view: View) -> Tensor:
     return torch.stack(columns, dim=-1).flatten(1)
 
 
-def lane_view(
-    view: View,
-    drift: bool = False,
-    overlap: bool = False,
-) -> Tensor:
+def lane_view(view: View, drift: bool = False, overlap: bool = False) -> Tensor:
     """The nearest vehicle in each lane and direction, [N, 18].
 
     Left, own and right lane x ahead and behind x (gap, nearness, relative speed); (1, 0, 0) if
@@ -160,11 +149,8 @@ def lane_view(
     in_sight = (others.valid & (others.position.abs() < 1.0))[:, None, :]
     on_that_end = (distance > 0) | ((distance == 0) & (ahead < 0))
     lanes_apart = torch.round(others.lane * _widest(view.road.lanes))[:, None, :]
-    distance = torch.add(
-        distance,
-        ~(in_sight & on_that_end & (lanes_apart == side)),
-        alpha=_MASKED,
-    )
+    absent = ~(in_sight & on_that_end & (lanes_apart == side))
+    distance = torch.add(distance, absent, alpha=_MASKED)
     nearest = distance.amin(-1, keepdim=True)
     # Several vehicles can be equally near: the minimum over all of them is taken below.
     farther = distance > nearest
@@ -208,23 +194,17 @@ def road_ahead(view: View) -> Tensor:
     lanes = lane + constant((1.0, 0.0, -1.0), lane)
     there = on_road(road, lanes)
     far = torch.ones_like(lanes)
-    goes_on = far
-    begins_in = far - 1.0
-    ahead = lane - lane
-    distance = far[:, :1]
+    goes_on, begins_in = far, far - 1.0
+    ahead, distance = lane - lane, far[:, :1]
     if road.has_lane_ends:
         goes_on = _in_sight(of_lane(ends(road), lanes, front) - front)
         begins_in = _in_sight(of_lane(begins(road), lanes, front) - front)
     if road.exit_lane is not None:
         ahead = (road.exit_lane - lane) / _widest(road.lanes)
         distance = _in_sight(ends(road)[road.exit_lane] - front)
-    numbers = [
-        torch.where(there, goes_on, 0.0),
-        torch.where(there, begins_in, 1.0),
-        ahead,
-        distance,
-    ]
-    return torch.cat(numbers, dim=1)
+    goes_on = torch.where(there, goes_on, 0.0)
+    begins_in = torch.where(there, begins_in, 1.0)
+    return torch.cat((goes_on, begins_in, ahead, distance), dim=1)
 
 
 def _in_sight(distance_m: Tensor) -> Tensor:
@@ -232,20 +212,22 @@ def _in_sight(distance_m: Tensor) -> Tensor:
 
 
 class Part(NamedTuple):
-    """A part of an observation: its size, given the number of others, and its numbers [N, size]."""
+    """A part of an observation: its numbers [N, size], and its size, all in all or per vehicle."""
 
-    size: Callable[[int], int]
     numbers: Callable[[View], Tensor]
+    size: int
+    #: Whether ``size`` is that of each of the others.
+    each_vehicle: bool = False
 
 
-OWN = Part(lambda others: 3, own_state)
-OWN_HERE = Part(lambda others: 3, partial(own_state, here=True))
-LIST = Part(lambda others: 3 * others, vehicle_list)
-VIEW = Part(lambda others: 18, lane_view)
-DRIFT_VIEW = Part(lambda others: 24, partial(lane_view, drift=True))
-OVERLAP_VIEW = Part(lambda others: 24, partial(lane_view, drift=True, overlap=True))
-CHANGE = Part(lambda others: 2, lane_change)
-ROAD = Part(lambda others: 8, road_ahead)
+OWN = Part(own_state, 3)
+OWN_HERE = Part(partial(own_state, here=True), 3)
+LIST = Part(vehicle_list, 3, each_vehicle=True)
+VIEW = Part(lane_view, 18)
+DRIFT_VIEW = Part(partial(lane_view, drift=True), 24)
+OVERLAP_VIEW = Part(partial(lane_view, drift=True, overlap=True), 24)
+CHANGE = Part(lane_change, 2)
+ROAD = Part(road_ahead, 8)
 
 #: The forms by name; ``table3`` is the paper's literal 3 + 3 (M - 1) numbers.
 OBSERVATIONS: Final[dict[str, tuple[Part, ...]]] = {
@@ -259,11 +241,7 @@ OBSERVATIONS: Final[dict[str, tuple[Part, ...]]] = {
 }
 
 
-def control_numbers(
-    vehicles: Vehicles,
-    set_speed: Tensor | None,
-    road: Road,
-) -> Tensor:
+def control_numbers(vehicles: Vehicles, set_speed: Tensor | None, road: Road) -> Tensor:
     """What the driver needs to command more than the lane, [N, 1] or [N, 2].
 
     With a ``set_speed`` [N], m/s, that over the desired speed; without one, for ``continuous``, the
@@ -278,14 +256,12 @@ def control_numbers(
     return torch.cat((offset, ego.heading / HEADING_RAD), dim=1).clamp(-1.0, 1.0)
 
 
-def observation_size(
-    name: str,
-    vehicles: int,
-    actions: ActionParameters | None = None,
-) -> int:
+def observation_size(name: str, vehicles: int, actions: ActionParameters | None = None) -> int:
     """Length D of observation ``name`` for ``vehicles`` vehicles, the ego included."""
-    parts = sum(part.size(vehicles - 1) for part in OBSERVATIONS[name])
-    return parts + (0 if actions is None else CONTROL_NUMBERS[actions.form])
+    size = 0 if actions is None else CONTROL_NUMBERS[actions.form]
+    for part in OBSERVATIONS[name]:
+        size += part.size * (vehicles - 1 if part.each_vehicle else 1)
+    return size
 
 
 class ObservationTransform(PerceptionTransform):
@@ -329,12 +305,7 @@ class ObservationTransform(PerceptionTransform):
         self.scale = scale or ObservationScale()
         self.native: LaneView | None = None
         if native and form in NATIVE_FORMS:
-            self.native = LaneView(
-                road,
-                vehicles,
-                self.scale,
-                form,
-            )
+            self.native = LaneView(road, vehicles, self.scale, form)
 
     def observe(
         self,
@@ -342,61 +313,27 @@ class ObservationTransform(PerceptionTransform):
         progress: Tensor,
         direction: Tensor,
         road: Road,
-        seen: Vehicles | None = None,
-    ) -> Tensor:
-        """The observation [N, D].
-
-        Arguments as the fields of :class:`View`; ``seen=None``: the vehicles as they are.
-        """
-        seen = vehicles if seen is None else seen
-        others = other_vehicles(seen, road, self.scale)
-        view = View(
-            vehicles,
-            seen,
-            others,
-            road,
-            self.scale,
-            progress,
-            direction,
-        )
-        parts = [part.numbers(view) for part in OBSERVATIONS[self.form]]
-        return torch.cat(parts, dim=1)
-
-    def write(
-        self,
-        state: TensorDictBase,
-        vehicles: Vehicles,
         seen: Vehicles,
-    ) -> TensorDictBase:
+    ) -> Tensor:
+        """The observation [N, D]; arguments as the fields of :class:`View`."""
+        others = other_vehicles(seen, road, self.scale)
+        view = View(vehicles, seen, others, road, self.scale, progress, direction)
+        return torch.cat([part.numbers(view) for part in OBSERVATIONS[self.form]], dim=1)
+
+    def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
         """Write ``observation``."""
         # Own state from the truth, the others as perceived.
         ego = state.get(keys.EGO)
-        progress = ego.get("change_progress")
-        direction = ego.get("change_direction")
+        progress, direction = ego.get("change_progress"), ego.get("change_direction")
+        road = road_in(state, self.road)
         # The kernel computes the same numbers up to the rounding of the exponential function.
         if self.native is not None and not wants_gradient([*vehicles, *seen, progress]):
-            observation = self.native.observe(
-                vehicles,
-                progress,
-                direction,
-                seen,
-            )
+            observation = self.native.observe(vehicles, progress, direction, seen)
         else:
-            road = road_in(state, self.road)
-            observation = self.observe(
-                vehicles,
-                progress,
-                direction,
-                road,
-                seen,
-            )
+            observation = self.observe(vehicles, progress, direction, road, seen)
         if CONTROL_NUMBERS[self.actions.form]:
             set_speed = ego.get(keys.SET_SPEED) if self.actions.form == LANE_SPEED else None
-            further = control_numbers(
-                vehicles,
-                set_speed,
-                road_in(state, self.road),
-            )
+            further = control_numbers(vehicles, set_speed, road)
             observation = torch.cat((observation, further), dim=1)
         return state.set(keys.OBSERVATION, observation)
 
@@ -405,9 +342,6 @@ class ObservationTransform(PerceptionTransform):
         assert isinstance(observation_spec, Composite)
         shape = (*observation_spec.shape, observation_size(self.form, self.vehicles, self.actions))
         true = observation_spec[keys.VEHICLES, "x"]
-        observation_spec[keys.OBSERVATION] = Unbounded(
-            shape=shape,
-            dtype=true.dtype,
-            device=true.device,
-        )
+        spec = Unbounded(shape=shape, dtype=true.dtype, device=true.device)
+        observation_spec[keys.OBSERVATION] = spec
         return observation_spec

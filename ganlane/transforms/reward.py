@@ -19,21 +19,16 @@ def speed_reward(
     speed: Tensor,
     desired_speed: Tensor,
     mean_acceleration: Tensor,
-    parameters: RewardParameters | None = None,
+    p: RewardParameters,
 ) -> Tensor:
     """``(v - 15) / (v_des - 15)``, or its negation where the ego braked hard.
 
     Hard is what is below ``low_acceleration`` on average over the decision.
     """
-    p = parameters or RewardParameters()
     reward = (speed - p.base_speed_mps) / (desired_speed - p.base_speed_mps)
     # The paper negates the reward, which below the base speed would pay for hard braking.
     punished = -reward if p.literal_low_acceleration else -reward.abs()
-    return torch.where(
-        mean_acceleration < p.low_acceleration,
-        punished,
-        reward,
-    )
+    return torch.where(mean_acceleration < p.low_acceleration, punished, reward)
 
 
 class RewardTransform(Transform):
@@ -63,21 +58,19 @@ class RewardTransform(Transform):
         speed = vehicles.get("speed")[:, EGO_INDEX, None]
         desired = vehicles.get("desired_speed")[:, EGO_INDEX, None]
         acceleration = ego.get("mean_acceleration")[:, None]
+        started = ego.get("started_change")[:, None]
         # Every other term is a price times how often its event happened in the decision. They are
         # added up in the order of term_names, which floating-point sums depend on.
-        counts = {"lane_change": ego.get("started_change")[:, None]}
-        for name in self.parameters.term_names[2:]:
-            counts[name] = events.get(name)
         terms = {"speed": self.period * speed_reward(speed, desired, acceleration, p)}
-        for name, count in counts.items():
+        for name in p.term_names[1:]:
+            count = started if name == "lane_change" else events.get(name)
             terms[name] = getattr(p, name) * count.to(speed.dtype)
         return terms
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        terms = self.terms(next_tensordict)
         # Terms for tables and logs, their sum for the agent.
-        nested = TensorDict._new_unsafe(terms, batch_size=next_tensordict.batch_size)
-        next_tensordict.set(keys.REWARD_TERMS, nested)
+        terms = self.terms(next_tensordict)
+        _write_terms(next_tensordict, terms)
         return next_tensordict.set(keys.REWARD, reduce(torch.add, terms.values()))
 
     def _reset(
@@ -85,20 +78,19 @@ class RewardTransform(Transform):
     ) -> TensorDictBase:
         # A reset has driven nothing, yet its keys must be those of a step.
         zero = torch.zeros_like(tensordict_reset.get(keys.VEHICLES).get("x")[:, :1])
-        terms = dict.fromkeys(self.parameters.term_names, zero)
-        nested = TensorDict._new_unsafe(terms, batch_size=tensordict_reset.batch_size)
-        return tensordict_reset.set(keys.REWARD_TERMS, nested)
+        return _write_terms(tensordict_reset, dict.fromkeys(self.parameters.term_names, zero))
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the terms to the observation spec; they are zero after a reset."""
         assert isinstance(observation_spec, Composite)
         shape = observation_spec.shape
         true = observation_spec[keys.VEHICLES, "x"]
-        term = Unbounded(
-            shape=(*shape, 1),
-            dtype=true.dtype,
-            device=true.device,
-        )
+        term = Unbounded(shape=(*shape, 1), dtype=true.dtype, device=true.device)
         terms = dict.fromkeys(self.parameters.term_names, term)
         observation_spec[keys.REWARD_TERMS] = Composite(terms, shape=shape).to(true.device)
         return observation_spec
+
+
+def _write_terms(state: TensorDictBase, terms: dict[str, Tensor]) -> TensorDictBase:
+    nested = TensorDict._new_unsafe(terms, batch_size=state.batch_size)
+    return state.set(keys.REWARD_TERMS, nested)

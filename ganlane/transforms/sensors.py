@@ -33,6 +33,8 @@ from ganlane.sim.state import Vehicles
 
 PERCEIVED: Final = "perceived"
 SENSORS: Final = "sensors"
+#: Purposes of the errors of x, y and speed.
+_SENSED: list[int] = [Purpose.SENSED_POSITION, Purpose.SENSED_LATERAL, Purpose.SENSED_SPEED]
 
 
 def measure(
@@ -45,20 +47,13 @@ def measure(
     """
     values = {"x": vehicles.x, "y": vehicles.y, "speed": vehicles.speed}
     valid = vehicles.valid
-    shape = vehicles.x.shape
+    count = valid.shape[1]
     dtype = vehicles.x.dtype
-    # Column 0 stays exact.
-    count = shape[1]
-    other = torch.arange(count, device=vehicles.x.device) != keys.EGO_INDEX
+    # Column 0 stays exact: the ego knows itself.
+    other = torch.arange(count, device=valid.device) != keys.EGO_INDEX
     scales = (parameters.position_noise_m, parameters.lateral_noise_m, parameters.speed_noise_mps)
-    # The ego knows itself: errors reach the others alone.
     if any(scales):
-        purposes: list[int] = [
-            Purpose.SENSED_POSITION,
-            Purpose.SENSED_LATERAL,
-            Purpose.SENSED_SPEED,
-        ]
-        noise = normal(key, step, count, purposes, dtype).unbind(-1)
+        noise = normal(key, step, count, _SENSED, dtype).unbind(-1)
         for (name, value), scale, error in zip(values.items(), scales, noise):
             values[name] = torch.where(other, value + scale * error, value)
     # A vehicle that drops out is as one that is not there.
@@ -66,22 +61,13 @@ def measure(
         drawn = uniform(key, step, count, [Purpose.SENSED_DROPOUT], dtype)[..., 0]
         valid = valid & ~((drawn < parameters.dropout) & other)
     values["valid"] = valid
-    return TensorDict._new_unsafe(
-        values,
-        batch_size=shape[:1],
-        device=valid.device,
-    )
+    return TensorDict._new_unsafe(values, batch_size=valid.shape[:1], device=valid.device)
 
 
 class PerceptionTransform(Transform):
     """Base of the transforms of what the ego perceives; subclasses implement :meth:`write`."""
 
-    def write(
-        self,
-        state: TensorDictBase,
-        vehicles: Vehicles,
-        seen: Vehicles,
-    ) -> TensorDictBase:
+    def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
         """Write the out keys into ``state``.
 
         ``vehicles`` are true, ``seen`` as the ego perceives them.
@@ -138,23 +124,10 @@ class SensorTransform(Transform):
         """The measurement of the true state in ``state``."""
         vehicles = Vehicles.of(state.get(keys.VEHICLES))
         # The traffic's key: purposes of their own keep the numbers apart.
-        key = episode_key(
-            self.stream,
-            state.get(keys.SEED),
-            state.get(keys.EPISODE),
-        )
-        return measure(
-            vehicles,
-            key,
-            state.get(keys.STEP),
-            self.parameters,
-        )
+        key = episode_key(self.stream, state.get(keys.SEED), state.get(keys.EPISODE))
+        return measure(vehicles, key, state.get(keys.STEP), self.parameters)
 
-    def _step(
-        self,
-        tensordict: TensorDictBase,
-        next_tensordict: TensorDictBase,
-    ) -> TensorDictBase:
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         # One measurement in per decision, one out: the queue keeps its length.
         newest = self._measured(next_tensordict)
         if self.delay == 0:

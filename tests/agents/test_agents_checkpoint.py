@@ -1,10 +1,8 @@
 """Trained agents as files, and agents that start from them."""
 
-from copy import deepcopy
-
 import pytest
 import torch
-from agents_small import agent, same_weights, saved_in
+from agents_small import agent, saved_in
 from reference.refusals import user_error
 from tensordict import TensorDict
 
@@ -109,29 +107,6 @@ def test_without_a_distribution_the_support_means_nothing(tmp_path):
     plain = {"distributional": False}
     save_agent(path, agent(**plain), {})
     start_from(agent(seed=1, v_min=-10.0, atoms=51, **plain), path)
-
-
-def descend(learner, seed):
-    """One step of its optimiser along a random gradient."""
-    generator = torch.Generator().manual_seed(seed)
-    for value in learner.network.parameters():
-        value.grad = torch.randn(value.shape, generator=generator)
-    learner.optimizer.step()
-
-
-def test_adam_goes_on_from_the_moments_that_it_is_given():
-    trained, warm, cold = (agent(seed=seed) for seed in range(3))
-    for seed in (1, 2, 3):
-        descend(trained, seed)
-    for fresh in (warm, cold):
-        fresh.load_weights(trained.weights())
-    warm.load_moments(deepcopy(trained.optimizer.state_dict()["state"]))
-    # In this order: the two must not share what they change.
-    for learner in (trained, warm, cold):
-        descend(learner, 4)
-        descend(learner, 5)
-    assert same_weights(trained, warm)
-    assert not same_weights(trained, cold)
 
 
 @pytest.mark.parametrize(

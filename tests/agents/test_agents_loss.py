@@ -16,6 +16,7 @@ from ganlane.agents.loss import (
     bellman,
     pick,
     project,
+    update,
 )
 from ganlane.agents.network import redraw_noise
 from ganlane.runtime import has_compiler
@@ -65,6 +66,7 @@ def test_the_distributional_loss_equals_torchrls(noisy, rows):
 @pytest.mark.parametrize("double", [True, False])
 def test_the_plain_loss_equals_torchrls(double):
     loss = unlike_target(LeanDQNLoss(network(distributional=False, double=double)))
+    loss.make_value_estimator(gamma=0.97)
     assert_same_loss(loss, DQNLoss, 64, power=2)
 
 
@@ -140,7 +142,9 @@ def agent(graph=None, masked=False, **options):
     learner.store(data)
     if graph is not None:
         parts = (learner.network, learner.target, learner.optimizer, learner.config)
-        learner.graph = UpdateGraph(*parts, compile=graph)
+        learner.graph = UpdateGraph(*parts)
+        if not graph:
+            learner.graph.update = update
     return learner
 
 

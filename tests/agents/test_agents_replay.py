@@ -7,7 +7,7 @@ from agents_small import transitions
 from scipy import stats  # scikit-learn, a dependency, brings it along
 
 from ganlane.agents import RainbowConfig
-from ganlane.agents.replay import draw, make_replay
+from ganlane.agents.replay import make_replay
 
 
 def config(capacity=256, **options):
@@ -77,13 +77,3 @@ def test_draws_come_from_the_buffers_own_generator(prioritised):
     assert not torch.equal(first, other)
     assert torch.equal(torch.get_rng_state(), state)
     assert (np.random.get_state()[1] == numpy_state).all()  # noqa: NPY002
-
-
-@pytest.mark.parametrize("prioritised", [True, False])
-def test_drawing_gives_the_batch_of_torchrls_own_way(prioritised):
-    first, second = (buffer(prioritised=prioritised, seed=4) for _ in range(2))
-    for _ in range(3):
-        ours = draw(first)
-        theirs = second.sample()
-        assert ours.keys() == theirs.keys()
-        assert all(torch.equal(ours[key], theirs[key]) for key in theirs.keys(True, True))

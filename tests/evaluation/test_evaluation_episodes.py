@@ -19,6 +19,7 @@ from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.env import HighwayEnv
 from ganlane.evaluation import run_episodes
 from ganlane.evaluation.measures import ego_at_fault
+from ganlane.settings.commands import DrivingConfig
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import ObservationConfig, SensorParameters
 from ganlane.settings.traffic import (
@@ -43,20 +44,13 @@ class Remade:
     """Makes an environment of any size, and remembers the sizes that were asked for."""
 
     def __init__(self, traffic, env=SHORT, sensors=None, wrap=lambda env: env):
-        self.traffic, self.env, self.wrap = make_traffic(traffic, env), env, wrap
-        self.observation = ObservationConfig(sensors=sensors)
+        self.traffic, self.wrap = make_traffic(traffic, env), wrap
+        self.config = DrivingConfig(env=env, observation=ObservationConfig(sensors=sensors))
         self.sizes = []
 
     def __call__(self, rows):
         self.sizes.append(rows)
-        return self.wrap(
-            make_env(
-                self.traffic,
-                self.env,
-                self.observation,
-                num_envs=rows,
-            )
-        )
+        return self.wrap(make_env(self.traffic, self.config, rows))
 
 
 #: Sums over an episode, as its decisions give them.
@@ -134,7 +128,7 @@ def sources(recordings):
 def test_every_episode_is_bit_for_bit_what_it_is_alone(name, recordings, monkeypatch):
     monkeypatch.setattr("ganlane.evaluation.episodes.CHECK_EVERY", 2)
     make, driver = sources(recordings)[name], "agent_idm" if name == "late sensors" else "random"
-    policy, episodes = make_driver(driver, make.env).policy, [*range(30, 34), 7, 3]
+    policy, episodes = make_driver(driver, make.config.env).policy, [*range(30, 34), 7, 3]
     expected, modes = alone(make, policy, episodes), set()
     look = policy.register_forward_hook(
         lambda *_: modes.add((exploration_type(), torch.is_grad_enabled()))
@@ -185,7 +179,7 @@ class Watchful(IdmTraffic):
 
 def test_rows_stay_and_are_never_driven_on_where_the_traffic_holds_something_per_row():
     traffic, make = Watchful(), Remade(IdmTrafficConfig())
-    env, policy = make_env(traffic, SHORT, num_envs=6), make_driver("random", SHORT).policy
+    env, policy = make_env(traffic, make.config, 6), make_driver("random", SHORT).policy
 
     def never(rows):
         pytest.fail("moved")

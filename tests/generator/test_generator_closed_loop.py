@@ -65,7 +65,8 @@ def test_the_first_step_is_idm_and_the_lateral_law():
     after, _ = drive(silent_generator(), state, 0.1)
     gap = torch.tensor(30.0 - 4.5, dtype=torch.float64)
     speed = torch.tensor(20.0, dtype=torch.float64)
-    expected = idm_acceleration(speed, 25.0, gap, speed, closed_loop.ANCHOR.idm, 1.27)
+    idm = replace(closed_loop.ANCHOR.idm, headway_s=1.27)
+    expected = idm_acceleration(speed, 25.0, gap, speed, idm)
     assert after.x[0, 0].item() == pytest.approx(2.0 + 0.01 * expected.item(), abs=1e-9)
     assert after.y[0, 0].item() == pytest.approx(0.5 + 0.01 * 0.3 * -0.5, abs=1e-9)
 

@@ -21,13 +21,13 @@ from ganlane.generator.human import (
     FEATURES,
     HARDEST_BRAKING,
     HumanPolicy,
+    Situation,
     bounded,
     chosen,
     features_of,
     lane_choice,
     moved,
     perceive,
-    sides_of,
     velocity,
     with_choice,
 )
@@ -53,8 +53,9 @@ def scene(*cars):
     return vehicles(*({**CAR, **car} for car in cars), dtype=FLOAT)
 
 
-def memory_of(cars):
-    return entering_memory(cars, ROAD, torch.zeros_like(cars.x))
+def situation(cars):
+    memory = entering_memory(cars, ROAD, torch.zeros_like(cars.x))
+    return Situation(cars, memory, ROAD, perceive(cars, ROAD))
 
 
 def policy():
@@ -79,7 +80,7 @@ def test_a_soft_target_is_around_its_value_and_samples_follow_the_distribution()
 def test_a_driver_sees_the_gap_to_its_leader_and_nobody_in_an_empty_lane():
     cars = scene({}, {"x": 34.5, "speed": 15.0}, {"x": -30.0, "lane": 2})
     view = perceive(cars, ROAD)
-    assert features_of(cars, memory_of(cars), ROAD, view).shape == (1, 3, FEATURES)
+    assert features_of(situation(cars)).shape == (1, 3, FEATURES)
     assert float(view.gap[0, 0]) == pytest.approx(30.0)
     assert float(view.closing[0, 0]) == pytest.approx(-5.0)
     assert float(view.log_headway[0, 0]) == pytest.approx(np.log(30.0 / 20.0), abs=1e-5)
@@ -94,18 +95,14 @@ def test_a_driver_sees_the_gap_to_its_leader_and_nobody_in_an_empty_lane():
 def test_left_and_right_are_alike():
     cars = scene({}, {"x": 20.0, "lane": 2, "speed": 17.0}, {"x": -15.0, "lane": 0})
     mirrored = scene({}, {"x": 20.0, "lane": 0, "speed": 17.0}, {"x": -15.0, "lane": 2})
-    here, there = (
-        sides_of(road_users, memory_of(road_users), ROAD, perceive(road_users, ROAD))
-        for road_users in (cars, mirrored)
-    )
+    here, there = (lane_choice(situation(road_users)).sides for road_users in (cars, mirrored))
     assert torch.equal(here[:, 0], there[:, 0].flip(1))
 
 
 def test_chances_add_up_nobody_changes_to_where_no_lane_is_and_a_change_can_be_broken_off():
     cars = scene({"lane": 2}, {"lane": 0, "x": 50.0}, {"x": 100.0, "lane": 1, "target_lane": 2})
-    view = perceive(cars, ROAD)
-    sides = sides_of(cars, memory_of(cars), ROAD, view)
-    chances = policy().lane_chances(lane_choice(cars, view, sides))
+    now = situation(cars)
+    chances = policy().lane_chances(lane_choice(now))
     assert torch.allclose(chances.sum(-1), torch.ones(1, 3), atol=1e-5)
     left, right = chances[0, :, 1], chances[0, :, 2]
     assert left[0] < 1e-6
@@ -115,8 +112,7 @@ def test_chances_add_up_nobody_changes_to_where_no_lane_is_and_a_change_can_be_b
     low, high = (chosen(chances, torch.full((1, 3), u)) for u in (0.0, 0.999999))
     assert low[0, 2] == 1
     after_low, after_high = (
-        with_choice(cars, memory_of(cars), view, choice)[0].target_lane[0].tolist()
-        for choice in (low, high)
+        with_choice(now, choice).vehicles.target_lane[0].tolist() for choice in (low, high)
     )
     assert after_low[1:] == [1, 1]
     assert after_high[0] == 1
@@ -124,9 +120,8 @@ def test_chances_add_up_nobody_changes_to_where_no_lane_is_and_a_change_can_be_b
 
 def test_nobody_rolls_back_brakes_harder_than_a_car_or_steers_off_the_road():
     cars = scene({"speed": 1.0}, {"lane": 2, "x": 50.0}, {"y": -1.5, "lane": 0, "x": 100.0})
-    memory = memory_of(cars)
     wild = torch.tensor([[-20.0, -20.0, 0.0]]), torch.tensor([[0.0, 5.0, 0.0]])
-    acceleration, aside = bounded(cars, memory, ROAD, *wild)
+    acceleration, aside = bounded(situation(cars), *wild)
     assert float(acceleration[0, 0]) == pytest.approx(-2.5)
     assert float(acceleration[0, 1]) == HARDEST_BRAKING
     # 10 m less the lane's centre, half a body and a margin, in 0.8 s.
@@ -219,9 +214,7 @@ def test_strangers_take_their_pace_stop_behind_others_and_push_in_where_there_is
     assert aside[0, 2] == 0.0
 
     here = scene({"lane": 1}, {"lane": 2, "x": 2.0}, {"lane": 0, "x": 60.0})
-    memory = memory_of(here)
-    view = perceive(here, ROAD)
-    choice = lane_choice(here, view, sides_of(here, memory, ROAD, view))
+    choice = lane_choice(situation(here))
     wish, left, right = torch.zeros(1, 3), torch.zeros(1, 3), torch.ones(1, 3)
     # Somebody is beside it on the left; on the right there is room.
     assert strangers.choices(choice, wish, left)[0, 0] == 0

@@ -24,7 +24,7 @@ def paper_task(scenes, **changes) -> tasks.PaperTask:
 
 def test_fitting_the_papers_preset_lowers_its_error(scenes):
     seen = []
-    tasks.improve(paper_task(scenes, updates=25), "fit", seen.append)
+    paper_task(scenes, updates=25).fit("fit", seen.append)
     losses = [progress.losses["mean"] for progress in seen]
     assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
     assert set(seen[-1].losses) == {"variety", "single", "mean", "adversarial", "discriminator"}

@@ -20,7 +20,7 @@ from ganlane.native.batch import NativeBatch
 from ganlane.native.drivers import drivers_of
 from ganlane.native.tensors import NativeScenes
 from ganlane.runtime import kernel_threads
-from ganlane.settings.commands import highways
+from ganlane.settings.commands import DrivingConfig, highways
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.generator import EXTRA_INPUTS, GENERATOR, GeneratorSizes, HumanSizes
 from ganlane.settings.record import make
@@ -133,7 +133,7 @@ def test_it_decides_as_the_tensor_code(traffic):
 def test_it_decides_as_the_tensor_code_where_lanes_end(scene, traffic, rows, decisions):
     config = make(EnvConfig, {"name": scene, "kernel": "torch"})
     module = make_traffic(make(TrafficConfig, traffic), config)
-    env = make_highways(module, config, num_envs=rows).base_env
+    env = make_highways(module, DrivingConfig(env=config), rows).base_env
     keep = torch.zeros(decisions, rows, dtype=torch.int64)
     differ, first, last = decide_side_by_side(env, keep)
     assert differ <= 1

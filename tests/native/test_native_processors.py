@@ -83,14 +83,13 @@ def described(batch, layout):
     parts = [struct.pack("qqq", ROWS, DECISIONS, len(names))]
     kind = type(settings)
     parts += [struct.pack("q", ctypes.sizeof(kind)), bytes(settings)]
-    structures = {ctypes.addressof(structure): structure for structure in settings.pointed}
     for name in POINTED:
-        address = getattr(settings, name)
-        if address is None:
+        structure = settings.pointed[name]
+        if structure is None:
             parts.append(struct.pack("qq", 0, 0))
             continue
-        structure = structures[address]
-        weights = getattr(structure, "packed", None)
+        network = structure.pointed.get("network", structure)
+        weights = network.pointed.get("weights")
         count = 0 if weights is None else len(weights)
         parts += [struct.pack("qq", ctypes.sizeof(structure), count), bytes(structure)]
         if weights is not None:
@@ -112,9 +111,9 @@ def test_another_processor_drives_the_same_episodes(traffic, ends, program, tmp_
     drivers = drivers_of(make(TrafficConfig, traffic), IdmParameters(), MobilParameters(), 0)
     batch = NativeBatch(highways(num_envs=ROWS), drivers)
     settings = batch._parts[0].batch.pointed["settings"]
-    for name, structure in ends_of(ends).items():
-        setattr(settings, name, ctypes.addressof(structure))
-        settings.pointed.append(structure)
+    if ends:
+        settings.pointed["ends"] = ends_of(ends)
+        settings.ends = ctypes.addressof(settings.pointed["ends"])
     batch.start(0, np.arange(ROWS))
     batch.state["action"][:] = [0, 1, 2, 0, 0, 1]
     # Rows that end stay as they are, here and there.

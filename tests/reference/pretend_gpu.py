@@ -146,8 +146,8 @@ def drive() -> dict[str, Any]:
     # Weights are read from files, with their numbers.
     with _disable_current_modes():
         model = make_traffic(config.traffic, config.env)
-    parts = (config.env, config.observation, config.reward, ROWS)
-    env = make_env(model, *parts, device="gpu", mask=config.mask)
+    assign(config, device="gpu")
+    env = make_env(model, config, ROWS)
     waits()
     state = env.reset()
     reset = waits()
@@ -161,7 +161,8 @@ def learn() -> dict[str, Any]:
     """Steps of a training: policy, environment, window, buffer, loss and update."""
     config = highways(traffic="idm", num_envs=ROWS, **OPTIONS)
     traffic = make_traffic(config.traffic, config.env)
-    env = make_env(traffic, config.env, num_envs=ROWS, device="gpu")
+    assign(config, device="gpu")
+    env = make_env(traffic, config, ROWS)
     small = RainbowConfig(hidden=[8], capacity=256, batch_size=4, warmup=4, n_step=2)
     agent = Rainbow(small, 29, device=GPU)
     collector = Collector(env)
@@ -169,7 +170,7 @@ def learn() -> dict[str, Any]:
     # A window of two steps fills the buffer from the second on, which then takes its shape.
     for _ in range(3):
         waits()
-        step = collector.step(agent)
+        step = collector.step(agent, lambda: None)
         collect = waits()
         agent.store(window.push(step))
         store = waits()
@@ -182,6 +183,7 @@ if __name__ == "__main__":
     from ganlane.agents import NStepWindow, Rainbow, RainbowConfig
     from ganlane.build import make_env, make_traffic
     from ganlane.settings.commands import highways
+    from ganlane.settings.record import assign
     from ganlane.sim.spawn import RandomScenes
     from ganlane.training.collectors import Collector
 

@@ -56,7 +56,7 @@ FACTS = {
         ways_out(cars, road, 500.0), dim=-1
     )[:, 1:],
     "accelerations": lambda cars, road: following_acceleration(perceive(cars, road)),
-    "wishes of MOBIL": lambda cars, road: mobil_wishes(perceive(cars, road), road),
+    "wishes of MOBIL": lambda cars, road: mobil_wishes(perceive(cars, road))[:, 1:],
 }
 
 

@@ -38,7 +38,7 @@ SLOW = {"x": 54.5, "lane": 0, "speed": 15.0, "desired_speed": 15.0}
 def wish(*cars, mobil=TABLE_IV):
     """Of the first car."""
     road = Road(lanes=2)
-    return mobil_wishes(perceive(vehicles(*cars), road), road, mobil=mobil)[0, 0].item()
+    return mobil_wishes(perceive(vehicles(*cars), road), mobil=mobil)[0, 0].item()
 
 
 def incentive_to_the_left(*cars):
@@ -129,7 +129,7 @@ def crowd():
 def test_nobody_is_asked_for_more_not_even_one_who_enters_the_same_lane_in_the_same_second(
     mobil, crowd
 ):
-    change = mobil_changes(perceive(crowd, ROAD), ROAD, mobil=mobil)
+    change = mobil_changes(perceive(crowd, ROAD), mobil=mobil)
     asked, leads = new_demands(crowd, change)
     assert (asked[leads] >= -B_SAFE - 1e-9).all()
     # Not for want of cases: thousands of new followers, hundreds near the limit, and pairs in one
@@ -145,7 +145,7 @@ def test_without_a_look_at_what_they_would_ask_of_each_other_hundreds_would_be_a
 ):
     """So the test above can fail: with the 60 m alone both go, however fast the rear one is."""
     scene = perceive(crowd, ROAD)
-    wish = without_ego(mobil_wishes(scene, ROAD))
+    wish = without_ego(mobil_wishes(scene))
     monkeypatch.setattr(mobil_module, "idm_acceleration", lambda speed, *_: torch.zeros_like(speed))
     change = mobil_module.one_at_a_time(scene, wish)
     asked, leads = new_demands(crowd, change)
@@ -166,7 +166,7 @@ def test_an_ego_that_is_seen_by_its_body_alone_can_be_asked_for_more():
     slow = {"x": 45.0, "lane": 2, "speed": 2.0}
     for seen, goes in ((Visibility.BODY, -1), (Visibility.SIGNALLED, 0)):
         scene = vehicles({**ego, "visibility": int(seen)}, enters, slow)
-        assert mobil_changes(perceive(scene, ROAD), ROAD, mobil=SELFISH)[0, 1] == goes
+        assert mobil_changes(perceive(scene, ROAD), mobil=SELFISH)[0, 1] == goes
 
 
 # Afterwards
@@ -191,7 +191,7 @@ def merges(rows):
     lane = torch.tensor([0, 0, 0, 1]).expand(rows, -1)
     scene = vehicles_at(x, lane, speed=speed, desired_speed=desired)
     road = Road(lanes=2)
-    change = mobil_changes(perceive(scene, road), road, mobil=SELFISH)
+    change = mobil_changes(perceive(scene, road), mobil=SELFISH)
     scene = scene.with_(target_lane=lane + change * (torch.arange(4) == ENTERS))
     return rows_of(scene, change[:, ENTERS] == 1)
 

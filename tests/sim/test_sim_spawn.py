@@ -21,7 +21,7 @@ from ganlane.settings.episode import SpawnParameters
 from ganlane.settings.record import make
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.idm import TABLE_V, can_brake
-from ganlane.sim.spawn import RandomScenes, check_start, draw_lanes, spawn
+from ganlane.sim.spawn import RandomScenes, check_start, draw_lanes
 from ganlane.sim.state import Road
 
 LORRIES = SpawnParameters(truck_share=0.3)
@@ -29,7 +29,7 @@ KEYS = episode_keys(range(2000))
 
 
 def scenes(count=2000, vehicles=9, **others):
-    return spawn(KEYS[:count], vehicles, 3, 4.0, dtype=DOUBLE, **others)
+    return RandomScenes(Road(), vehicles, **others)(KEYS[:count], DOUBLE)
 
 
 def smallest_spacing(s, gaps=False):
@@ -121,7 +121,7 @@ def test_no_scene_starts_with_an_overlap(data, lanes, spacing, spread):
     vehicles = data.draw(st.integers(1, min(60, lanes * p.lane_capacity())))
     check_start(p, vehicles, lanes)
     key = episode_keys(range(4), seed=data.draw(st.integers(0, 2**40)))
-    s = spawn(key, vehicles, lanes, 4.0, p, DOUBLE)
+    s = RandomScenes(Road(lanes), vehicles, p)(key, DOUBLE)
     assert not pair_overlaps(s).any()
     assert smallest_spacing(s) >= spacing - 1e-9
     assert (s.x.amax(1) - s.x.amin(1)).max() <= spread + 1e-9

@@ -10,7 +10,7 @@ from ganlane.api import make_env
 from ganlane.generator import shipped_generator
 from ganlane.generator.human import STEPS
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.spawn import spawn
+from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 from ganlane.traffic.presets import human_traffic
@@ -27,8 +27,7 @@ def course(traffic, vehicles, key, steps, change=lambda before, after: after):
 
 def drive(episodes, steps, dtype=torch.float32, **variation):
     key = episode_keys(episodes)
-    scene = spawn(key, 9, 3, 4.0, dtype=dtype)
-    return list(course(human_traffic(**variation), scene, key, steps))
+    return list(course(human_traffic(**variation), RandomScenes()(key, dtype), key, steps))
 
 
 def column(x, speed, desired_mps):

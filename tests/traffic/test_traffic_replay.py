@@ -85,7 +85,8 @@ def recorded(scenes=4):
 def test_every_scene_is_equally_likely_and_every_start_within_it():
     traffic = ReplayTraffic(recordings=recorded())
     key = episode_keys(range(20_000))
-    scenes, starts = traffic.scene_of(key), traffic.start_of(key)
+    starts = traffic.start_of(key)
+    scenes = traffic.scene[starts]
     assert chisquare(np.bincount(scenes.numpy(), minlength=4)).pvalue > 1e-3
     within = np.bincount(starts[scenes == 2].numpy())
     assert chisquare(within[within > 0]).pvalue > 1e-3
@@ -96,7 +97,7 @@ def test_lanes_and_their_width_are_the_scenes_own():
     traffic = ReplayTraffic(recordings=recorded())
     key = episode_keys(range(100))
     road = traffic.road_of(key, torch.float64)
-    scene = traffic.scene_of(key)
+    scene = traffic.scene[traffic.start_of(key)]
     assert road.lanes.shape == road.lane_width_m.shape == (100, 1)
     assert torch.equal(road.lanes[:, 0], 2 + scene % 3)
     assert (road.lane_width_m - 3.5).abs().max() < 0.2
@@ -115,7 +116,8 @@ def test_every_step_is_what_a_search_through_the_rows_finds():
     )
     traffic = ReplayTraffic(recordings=sort(frame), least_s=3.0)
     key = episode_keys(range(12))
-    for row, (scene, steps) in enumerate(zip(traffic.scene_of(key), traffic.steps_of(key))):
+    scenes = traffic.scene[traffic.start_of(key)]
+    for row, (scene, steps) in enumerate(zip(scenes, traffic.steps_of(key))):
         rows = frame.filter(pl.col("scene") == traffic.scene_names[scene])
         first = rows["frame"].max() - int(steps)
         at = {
@@ -190,7 +192,7 @@ def test_the_us101_scenes_can_all_be_replayed():
     us101 = ReplayTraffic(stream=2)
     key = episode_keys(range(2000), stream=2)
     assert len(us101.scene_names) == 11
-    assert set(us101.scene_of(key).tolist()) == set(range(11))
+    assert set(us101.scene[us101.start_of(key)].tolist()) == set(range(11))
     # Nobody starts in a crash: the ego's size is that of the vehicle it replaces.
     assert not ego_overlaps(us101.scenes(9)(key, torch.float32)).any()
     assert set(us101.road_of(key).lanes.unique().tolist()) == {5, 6, 7}

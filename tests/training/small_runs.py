@@ -8,6 +8,7 @@ import pytest
 
 from ganlane.agents import Rainbow, RainbowConfig
 from ganlane.build import make_env, make_traffic
+from ganlane.settings.commands import DrivingConfig
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.traffic import IdmTrafficConfig
 from ganlane.settings.train import LoggerConfig, TrainConfig
@@ -32,7 +33,7 @@ SMALL = {
 
 
 def road(rows=8):
-    return make_env(make_traffic(IdmTrafficConfig(), ROAD), ROAD, num_envs=rows)
+    return make_env(make_traffic(IdmTrafficConfig(), ROAD), DrivingConfig(env=ROAD), rows)
 
 
 def agent(seed=0, **options):

@@ -77,25 +77,25 @@ def test_a_log_that_is_none_is_refused_in_one_sentence(content, path):
 # --- progress
 
 
-def test_progress_off_a_terminal_is_a_line_per_row_with_the_last_known_figures():
-    stream = io.StringIO()
-    progress = Progress(1_000_000, stream=stream)
+def test_progress_off_a_terminal_is_a_line_per_row_with_the_last_known_figures(capsys):
+    progress = Progress(1_000_000)
     progress.advance(5)
     outcome = {"mean_return": 12.34, "crash_rate": 0.125}
     progress.write({"decisions": 100_000, "decisions_per_s": 5000.0, **outcome})
     progress.write({"decisions": 200_000, "decisions_per_s": 10_000.0})
     progress.write({"decisions": 962_766, "decisions_per_s": 10.0})
-    assert stream.getvalue().splitlines() == [
+    assert capsys.readouterr().err.splitlines() == [
         "100,000 of 1,000,000 decisions, 5,000/s, 0:03:00 left, return 12.3, crashes 12.5%",
         "200,000 of 1,000,000 decisions, 10,000/s, 0:01:20 left, return 12.3, crashes 12.5%",
         "962,766 of 1,000,000 decisions, 10/s, 1:02:03 left, return 12.3, crashes 12.5%",
     ]
 
 
-def test_progress_on_a_terminal_is_a_bar_with_rate_time_left_return_and_crashes():
+def test_progress_on_a_terminal_is_a_bar_with_rate_time_left_return_and_crashes(monkeypatch):
     stream = io.StringIO()
     stream.isatty = lambda: True
-    progress = Progress(100_000, stream=stream)
+    monkeypatch.setattr(sys, "stderr", stream)
+    progress = Progress(100_000)
     progress.advance(10_000)
     progress.write({"decisions": 10_000, "mean_return": 3.0, "crash_rate": 0.25})
     progress.close()

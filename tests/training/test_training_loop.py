@@ -89,7 +89,8 @@ def test_a_light_checkpoint_of_the_full_sized_network_is_under_5_mb(tmp_path):
     learner = Rainbow(config, OBSERVATION_SIZE)
     learner.store(transitions(OBSERVATION_SIZE))
     learner.update()
-    Checkpointer(TrainingState(road(8), learner), tmp_path, 20.0, False, {}).save()
+    light = settings(480, checkpoint_replay=False)
+    Checkpointer(TrainingState(road(8), learner), tmp_path, light, {}).save()
     assert 3e6 < (tmp_path / "checkpoints" / "last.pt").stat().st_size < 5e6
 
 

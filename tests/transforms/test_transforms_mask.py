@@ -13,6 +13,7 @@ import ganlane
 from ganlane import keys
 from ganlane.agents.drivers import ExploringPolicy, GreedyPolicy, MaskedPolicy, RandomDriver
 from ganlane.build import make_driver
+from ganlane.settings.commands import DrivingConfig
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MaskParameters
 from ganlane.sim.state import Road, Vehicles
@@ -205,10 +206,12 @@ def test_a_masked_driver_in_an_environment_without_a_mask_is_refused():
 def test_a_suffix_puts_any_driver_behind_a_mask_or_takes_it_away():
     driver = make_driver("mobil_egoistic+safe", EnvConfig())
     assert (driver.name, driver.mask) == ("mobil_egoistic+safe", MaskParameters("safe"))
-    mask, policy = driver.behind(None)
-    assert mask.form == "safe"
+    driven, policy = driver.driving(DrivingConfig())
+    assert driven.mask.form == "safe"
     assert isinstance(policy, MaskedPolicy)
-    assert make_driver("mobil+none", EnvConfig()).behind(MaskParameters("safe"))[0].form == "none"
+    unmasked = make_driver("mobil+none", EnvConfig())
+    driven, _ = unmasked.driving(DrivingConfig(mask=MaskParameters("safe")))
+    assert driven.mask.form == "none"
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ def observed(scene, form, road=ROAD, progress=0.0, direction=0):
     """The observation [D] of a scene of one row."""
     transform = ObservationTransform(road, scene.x.shape[1], form)
     progress = torch.tensor([progress], dtype=DOUBLE)
-    return transform.observe(scene, progress, torch.tensor([direction]), road)[0]
+    return transform.observe(scene, progress, torch.tensor([direction]), road, scene)[0]
 
 
 def scene_of(*rows):

@@ -20,6 +20,7 @@ from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.data import read_scenes, sort
 from ganlane.data.schema import SCHEMA, TRACK_STRIDE
 from ganlane.env import EpisodeParameters, HighwayEnv
+from ganlane.settings.commands import DrivingConfig
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.record import make
 from ganlane.settings.traffic import IdmMobilTrafficConfig
@@ -99,7 +100,8 @@ def test_a_network_tells_its_values_and_the_rewards_add_up(short):
     """A policy of a Q-network leaves what it expected at each decision; others leave nothing."""
     config = EnvConfig(goal_m=60.0)
     driver = make_driver("agent_idm", config)
-    env = make_env(make_traffic(IdmMobilTrafficConfig(), config), config, driver.observation)
+    driven, _ = driver.driving(DrivingConfig(env=config))
+    env = make_env(make_traffic(IdmMobilTrafficConfig(), config), driven)
     trajectory = record_episode(env, driver.policy, seed=0, episode=0)
     values, reward = trajectory.action_values, trajectory.reward
     assert values.shape == (len(trajectory), 3)
@@ -117,7 +119,8 @@ def test_an_agent_with_the_pedals_is_recorded_too():
     config = make(EnvConfig, {"name": "merge", "goal_m": 100.0})
     driver = make_driver("agent_merge", config)
     traffic = make_traffic(IdmMobilTrafficConfig(), config)
-    env = make_env(traffic, driver.env(config), driver.observation)
+    driven, _ = driver.driving(DrivingConfig(env=config))
+    env = make_env(traffic, driven)
     trajectory = record_episode(env, driver.policy, seed=0, episode=0)
     assert (trajectory.action == -1).all()
     assert trajectory.x[-1, 0] >= 100.0

@@ -7,11 +7,11 @@ from tensordict import TensorDict
 
 from ganlane.agents import Rainbow, RainbowConfig, save_agent
 
-SMALL = {"hidden": (8, 8), "batch_size": 8, "warmup": 8, "capacity": 100}
+SMALL = {"hidden": (8, 8), "batch_size": 32, "warmup": 32, "capacity": 500}
 
 
-def agent(size=5, seed=0, **options):
-    return Rainbow(RainbowConfig(**{**SMALL, **options}), size, seed=seed)
+def agent(size=5, seed=0, legal=None, **options):
+    return Rainbow(RainbowConfig(**{**SMALL, **options}), size, seed=seed, legal=legal)
 
 
 def saved_in(folder: Path, **more) -> Path:
@@ -48,6 +48,6 @@ def transitions(size, rows=64, seed=0, scale=1.0, most_steps=1):
 
 
 def same_weights(first, second):
-    return all(
-        torch.equal(a, b) for a, b in zip(first.weights().values(), second.weights().values())
-    )
+    """Whether two agents have the same weights, bit for bit."""
+    pairs = zip(first.weights().values(), second.weights().values(), strict=True)
+    return all(torch.equal(one, other) for one, other in pairs)

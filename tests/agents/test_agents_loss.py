@@ -2,6 +2,7 @@
 
 from copy import deepcopy
 
+import agents_small
 import pytest
 import torch
 from agents_small import transitions
@@ -41,31 +42,32 @@ def unlike_target(loss):
     return loss
 
 
+def assert_same_loss(loss, theirs, rows, power=1):
+    """That a loss gives TorchRL's figures and gradients; TorchRL's error may be a ``power`` of
+    ours.
+    """
+    data, twin = batch(rows=rows), batch(rows=rows)
+    values = [loss(data)["loss"], theirs.forward(loss, twin)["loss"]]
+    errors = [data["td_error"] ** power, twin["td_error"]]
+    parameters = list(loss.network.parameters())
+    gradients = [torch.autograd.grad(value.mean(), parameters) for value in values]
+    for ours, expected in (values, errors, gradients):
+        torch.testing.assert_close(ours, expected, atol=1e-6, rtol=1e-5)
+
+
 @pytest.mark.parametrize("rows", [64, 11])
 @pytest.mark.parametrize("noisy", [True, False])
 def test_the_distributional_loss_equals_torchrls(noisy, rows):
     """Also with as many rows as there are atoms, where a wrong shape would broadcast."""
     loss = unlike_target(LeanDistributionalLoss(network(noisy=noisy, kl_priority=False)))
-    theirs = batch(rows=rows)
-    ours = batch(rows=rows)
-    parameters = list(loss.network.parameters())
-    expected = DistributionalDQNLoss.forward(loss, theirs)["loss"]
-    actual = loss(ours)["loss"]
-    torch.testing.assert_close(actual, expected, atol=1e-6, rtol=1e-6)
-    torch.testing.assert_close(ours["td_error"], theirs["td_error"], atol=1e-6, rtol=1e-6)
-    gradients = [torch.autograd.grad(value.mean(), parameters) for value in (actual, expected)]
-    torch.testing.assert_close(*gradients, atol=1e-6, rtol=1e-5)
+    assert_same_loss(loss, DistributionalDQNLoss, rows)
 
 
 @pytest.mark.parametrize("double", [True, False])
 def test_the_plain_loss_equals_torchrls(double):
     loss = unlike_target(LeanDQNLoss(network(distributional=False, double=double)))
     loss.make_value_estimator(gamma=0.97)
-    theirs = batch()
-    ours = batch()
-    expected = DQNLoss.forward(loss, theirs)["loss"]
-    torch.testing.assert_close(loss(ours)["loss"], expected, atol=1e-6, rtol=1e-6)
-    torch.testing.assert_close(ours["td_error"] ** 2, theirs["td_error"], atol=1e-5, rtol=1e-5)
+    assert_same_loss(loss, DQNLoss, 64, power=2)
 
 
 def test_the_loss_reports_the_share_of_the_returns_that_its_support_does_not_cover():
@@ -89,9 +91,8 @@ def test_the_kl_priority_is_the_cross_entropy_less_the_targets_entropy():
     probabilities = pick(loss.target_network.logits(following), best).softmax(-1)
     wanted, _ = project(bellman(data, 0.97, support), probabilities, support)
     entropy = -(wanted * wanted.clamp_min(1e-30).log()).sum(-1)
-    torch.testing.assert_close(
-        data["td_error"].squeeze(-1), cross_entropy - entropy, atol=1e-5, rtol=1e-5
-    )
+    priority = data["td_error"].squeeze(-1)
+    torch.testing.assert_close(priority, cross_entropy - entropy, atol=1e-5, rtol=1e-5)
     assert (data["td_error"] >= 0).all()
 
 
@@ -114,8 +115,8 @@ def test_the_next_action_is_one_that_the_mask_allows(kind, double):
     loss = unlike_target(kind(net))
     data = batch(scale=1.0)  # no target may lie wholly outside the support
     unmasked = loss(data.clone())["loss"]
-    only = torch.randint(0, 3, (64,), generator=torch.Generator().manual_seed(1))
-    data["next", "action_mask"] = torch.nn.functional.one_hot(only, 3).bool()
+    only = torch.arange(64) % 3
+    data["next", "action_mask"] = only[:, None] == torch.arange(3)
     masked = loss(data)["loss"]
     choosing = loss.network if double else loss.target_network
     agree = choosing.values(data["next", "observation"]).argmax(-1) == only
@@ -128,19 +129,11 @@ def test_the_next_action_is_one_that_the_mask_allows(kind, double):
 # --- the whole update as one function
 
 
+USUAL = {"hidden": (16, 24), "atoms": 7, "v_min": -20.0, "v_max": 20.0, "target_period": 3}
+
+
 def agent(graph=None, masked=False, **options):
-    usual = {
-        "hidden": (16, 24),
-        "atoms": 7,
-        "v_min": -20.0,
-        "v_max": 20.0,
-        "batch_size": 32,
-        "warmup": 100,
-        "capacity": 1000,
-        "target_period": 3,
-    }
-    config = RainbowConfig(**{**usual, **options})
-    learner = Rainbow(config, SIZE, seed=0)
+    learner = agents_small.agent(SIZE, capacity=1000, **{**USUAL, **options})
     data = batch(rows=600, scale=30.0)  # some targets lie outside the support
     if masked:
         mask = torch.rand(600, 3, generator=torch.Generator().manual_seed(1)) < 0.6
@@ -148,7 +141,8 @@ def agent(graph=None, masked=False, **options):
         data["next", "action_mask"] = mask
     learner.store(data)
     if graph is not None:
-        learner.graph = UpdateGraph(learner.network, learner.target, learner.optimizer, config)
+        parts = (learner.network, learner.target, learner.optimizer, learner.config)
+        learner.graph = UpdateGraph(*parts)
         if not graph:
             learner.graph.update = update
     return learner
@@ -196,12 +190,12 @@ def test_training_can_change_from_one_way_to_the_other_and_be_resumed(before, af
     assert_close(learners[0], resumed)
 
 
-@pytest.mark.parametrize(
-    "part", ["distributional", "double", "dueling", "noisy", "prioritised", "kl_priority"]
-)
+PARTS = ["distributional", "double", "dueling", "noisy", "prioritised", "kl_priority"]
+
+
+@pytest.mark.parametrize("part", PARTS)
 def test_an_agent_without_one_of_the_components_keeps_the_other_way(part):
-    config = RainbowConfig(**{part: False})
-    assert Rainbow(config, SIZE, compile=True).graph is None
+    assert Rainbow(RainbowConfig(**{part: False}), SIZE, compile=True).graph is None
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 Exploration, updates, switches, saving, and no touch of the global random state.
 """
 
+import agents_small
 import pytest
 import torch
 from agents_small import same_weights, transitions
@@ -10,21 +11,13 @@ from reference.refusals import user_error
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from ganlane.agents import Rainbow, RainbowConfig
+from ganlane.agents import RainbowConfig
 
 SIZE = 4
-SMALL = {
-    "hidden": (16, 16),
-    "batch_size": 32,
-    "warmup": 32,
-    "capacity": 500,
-    "v_min": -5.0,
-    "v_max": 5.0,
-}
 
 
-def agent(seed=0, **options):
-    return Rainbow(RainbowConfig(**{**SMALL, **options}), SIZE, seed=seed)
+def agent(**options):
+    return agents_small.agent(SIZE, **{"hidden": (16, 16), "v_min": -5.0, "v_max": 5.0, **options})
 
 
 def filled(**options):
@@ -48,15 +41,13 @@ def observations(rows=2000):
 # --- exploration
 
 
-@pytest.mark.parametrize(
-    "kind", [ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN]
-)
+@pytest.mark.parametrize("kind", ["DETERMINISTIC", "MODE", "MEAN"])
 def test_under_deterministic_exploration_the_policy_is_greedy_and_greedy_has_no_noise(kind):
     explorer = agent(noisy_sigma=3.0)
     data = observations()
     greedy = explorer.greedy(data.clone())["action"]
     explorer.policy(data.clone())  # leaves its noise in the network
-    with set_exploration_type(kind):
+    with set_exploration_type(ExplorationType[kind]):
         assert all(torch.equal(explorer.policy(data.clone())["action"], greedy) for _ in range(2))
     with set_exploration_type(ExplorationType.RANDOM):
         assert torch.equal(explorer.greedy(data.clone())["action"], greedy)
@@ -78,8 +69,7 @@ def test_a_share_epsilon_of_the_actions_is_random_and_legal():
         mask[:, 1] = False
         return mask
 
-    config = RainbowConfig(**SMALL, noisy=False, epsilon_start=0.5)
-    explorer = Rainbow(config, SIZE, legal=legal)
+    explorer = agent(noisy=False, epsilon_start=0.5, legal=legal)
     explorer.network.head.bias.data[:] = 0.0
     greedy = explorer.greedy(observations())["action"]
     drawn = explorer.policy(observations())["action"]
@@ -136,9 +126,8 @@ SWITCHES = ["noisy", "dueling", "distributional", "double", "prioritised"]
 
 @pytest.mark.parametrize("off", [[name] for name in SWITCHES] + [SWITCHES])
 def test_each_component_can_be_switched_off_and_the_rest_learns(off):
-    learner = filled(
-        **dict.fromkeys(off, False), learning_rate=3e-3, target_period=1000, noisy_sigma=0.1
-    )
+    slowly = {"learning_rate": 3e-3, "target_period": 1000, "noisy_sigma": 0.1}
+    learner = filled(**dict.fromkeys(off, False), **slowly)
     before = learner.loss(transitions(SIZE))["loss"].mean()
     for _ in range(80):
         learner.update()
@@ -151,22 +140,14 @@ def test_the_agent_learns_the_values_of_a_known_chain():
     Worth gamma^0 * 2 at best, and the first gamma * 2.
     """
     learner = agent(learning_rate=3e-3, target_period=20, gamma=0.5, n_step=1, noisy=False)
-    rows = 300
-    state = torch.arange(rows) % 2
-    action = torch.randint(0, 3, (rows,), generator=torch.Generator().manual_seed(0))
+    data = transitions(SIZE, 300)
+    state = torch.arange(300) % 2
     one_hot = torch.eye(SIZE)
-    after = {
-        "observation": one_hot[1].expand(rows, SIZE),
-        "reward": (state * action).float()[:, None],
-        "terminated": (state == 1)[:, None],
-    }
-    content = {
-        "observation": one_hot[state],
-        "action": action,
-        "next": after,
-        "steps_to_next_obs": torch.ones(rows, 1),
-    }
-    learner.store(TensorDict(content, [rows]))
+    data["observation"] = one_hot[state]
+    data["next", "observation"] = one_hot[1].expand(300, SIZE)
+    data["next", "reward"] = (state * data["action"]).float()[:, None]
+    data["next", "terminated"] = (state == 1)[:, None]
+    learner.store(data)
     for _ in range(300):
         learner.update()
     expected = torch.tensor([[1.0, 1.0, 1.0], [0.0, 1.0, 2.0]])

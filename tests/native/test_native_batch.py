@@ -2,28 +2,23 @@
 environment does.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from ganlane.gym.base import make_rows
 from ganlane.gym.native_rows import NativeRows
 from ganlane.gym.tensor_rows import TensorRows
+from ganlane.keys import END_EVENTS
 from ganlane.settings.commands import highways
 
 pytestmark = pytest.mark.kernel
 ROWS = 37
 
 
-ENDS = ("hard_crash", "out_of_road", "goal", "missed_exit", "timeout")
 LORRIES = {"truck_share": 0.3, "truck_desired_speed_mps": (20.0, 22.0)}
 MIXED = {"name": "mixed", "shares": {"idm_mobil": 2, "gan": 1, "human": 1, "idm_faults": 1}}
-OTHER_REWARD = {
-    "soft_crash_behind": -5.0,
-    "literal_low_acceleration": True,
-    "low_acceleration": -0.2,
-}
+OTHER_REWARD = {"soft_crash_behind": -5.0, "literal_low_acceleration": True}
+OTHER_REWARD |= {"low_acceleration": -0.2}
 
 
 def both_ways(traffic, rows, **options):
@@ -84,7 +79,7 @@ def test_scenes_and_other_commands_are_driven_like_behind_torchrl(traffic, optio
         np.testing.assert_equal(info, other.info())
         for name, value in other.now()["vehicles"].items():
             np.testing.assert_array_equal(one.batch.state["vehicles", name], value.numpy(), name)
-        over = np.any([info[name] for name in ENDS], axis=0)
+        over = np.any([info[name] for name in END_EVENTS[:-1]], axis=0)
         ended += int(over.sum())
         if over.any():
             one.restart(over)

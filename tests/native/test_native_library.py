@@ -1,17 +1,14 @@
 """The kernel is built once, wherever a compiler works, and says in one sentence what fails."""
 
-from __future__ import annotations
-
-import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from reference import processes
+from reference.refusals import user_error
 
 from ganlane import make_env
-from ganlane.errors import UserError
 from ganlane.files import PLACE
 from ganlane.native import library
 
@@ -63,19 +60,24 @@ def working(compiler, plain):
     return compiler(WORKS, plain)
 
 
-def built() -> list[Path]:
+def built():
     return sorted(library.libraries_folder().glob("*.so"))
 
 
-def calls(program: Path) -> int:
+def calls(program):
     return Path(f"{program}.calls").read_text().count("kernel.so")
+
+
+def load_again():
+    """As another process would."""
+    library._find.cache_clear()
+    library.load()
 
 
 @pytest.mark.kernel
 def test_it_is_built_once(working):
     library.load()
-    library._find.cache_clear()
-    library.load()
+    load_again()
     assert len(built()) == calls(working) == 1
 
 
@@ -86,18 +88,19 @@ def test_another_source_is_another_library(monkeypatch, tmp_path, working):
     changed = tmp_path / first.name
     changed.write_text(first.read_text() + "\n")
     monkeypatch.setattr(library, "SOURCES", (changed, *others))
-    library._find.cache_clear()
-    library.load()
+    load_again()
     assert len(built()) == 2
 
 
-def damaged(content: bytes) -> list[bytes]:
+def damaged(content):
     """Shorter, without its checksum, with a bit flipped in the code or in the checksum, longer."""
     middle = len(content) // 2
-    flipped = []
+    damages = [content[:middle], content[: -len(PLACE)], content + b"more", b""]
     for place in (middle, len(content) - 30):
-        flipped.append(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
-    return [content[:middle], content[: -len(PLACE)], *flipped, content + b"more", b""]
+        flipped = bytearray(content)
+        flipped[place] ^= 1
+        damages.append(bytes(flipped))
+    return damages
 
 
 @pytest.mark.kernel
@@ -108,8 +111,7 @@ def test_a_damaged_library_is_built_anew_and_never_loaded(working):
     for count, content in enumerate(damaged(whole), 2):
         path.unlink()  # this process has it in its memory
         path.write_bytes(content)
-        library._find.cache_clear()
-        library.load()
+        load_again()
         assert path.read_bytes() == whole
         assert calls(working) == count
 
@@ -186,26 +188,21 @@ def test_a_library_that_cannot_be_loaded_from_the_cache_is_loaded_from_elsewhere
 @pytest.mark.slow
 def test_processes_that_build_at_once_do_not_disturb_each_other():
     script = "from ganlane.native import library; library.load('default'); print('loaded')"
-    processes = [
-        subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, env=os.environ)
-        for _ in range(3)
-    ]
-    assert [process.communicate()[0] for process in processes] == [b"loaded\n"] * 3
+    started = [processes.start("-c", script) for _ in range(3)]
+    assert [process.communicate()[0] for process in started] == ["loaded\n"] * 3
     assert len(built()) == 1
-    assert [path.name for path in library.libraries_folder().iterdir()] == [built()[0].name]
+    assert list(library.libraries_folder().iterdir()) == built()
 
 
 def test_without_a_compiler_one_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setattr(library, "compilers", lambda: ())
-    with pytest.raises(
-        UserError, match=r"there is no C\+\+ compiler.*g\+\+.*ganlane\[native\].*env\.kernel=torch"
-    ):
+    with user_error(r"there is no C\+\+ compiler.*g\+\+.*ganlane\[native\].*env\.kernel=torch"):
         library.load()
 
 
 def test_without_a_compiler_that_works_the_sentence_names_it_and_auto_drives(compiler, capsys):
     program = compiler(FAILS)
-    with pytest.raises(UserError, match=r"compiler failed for default .x\.cpp:1: .* full of stars"):
+    with user_error(r"compiler failed for default .x\.cpp:1: .* full of stars"):
         library.load()
     assert built() == []
     env = make_env("idm", num_envs=2)

@@ -1,7 +1,5 @@
 """Emulated processors drive the same episodes as this one, bit for bit: Arm, older x86."""
 
-from __future__ import annotations
-
 import ctypes
 import importlib.util
 import shutil
@@ -40,7 +38,7 @@ class Processor(NamedTuple):
     variant: str
     emulator: tuple[str, ...]
 
-    def command(self) -> list[str] | None:
+    def command(self):
         """The emulator, by its usual or by its statically linked name; None if not installed."""
         name, *options = self.emulator
         path = shutil.which(name) or shutil.which(f"{name}-static")

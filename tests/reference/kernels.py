@@ -7,8 +7,10 @@ from collections.abc import Sequence
 
 import pytest
 import torch
-from reference.worlds import environment, packed
+from reference.worlds import environment, leaves, packed
+from tensordict import TensorDictBase
 
+from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.native.library import VARIANTS, best_variant
 from ganlane.native.tensors import Kernel
@@ -57,3 +59,31 @@ def random_environment(
         kernel="torch",
         **others,
     )
+
+
+def apart(
+    out: TensorDictBase, after: TensorDictBase, limit: float = 1e-3
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rows [N] in which an event, a flag, a counter or a lane differs, and rows in which a number
+    of a valid vehicle does, by more than the ``limit``.
+
+    The traffic's memory of the ego, which it does not drive, is nobody's concern.
+    """
+    events = torch.zeros(len(out), dtype=torch.bool)
+    numbers = events.clone()
+    for name, value in leaves(out):
+        other, valid = after[name], after[keys.VEHICLES, "valid"]
+        if name[0] == keys.TRAFFIC:
+            value, other, valid = (field[:, 1:] for field in (value, other, valid))
+        if value.is_floating_point():
+            # A speed's rounding is ten times as large in an acceleration, its difference over
+            # 0.1 s, and within a second the generator's network makes millimetres of it.
+            amplified = name[:2] == (keys.TRAFFIC, "generator") or name[-1] == "acceleration"
+            # Not "above the limit": what is no number differs, too.
+            differs = ~((value - other).abs() < (10.0 if amplified else 1.0) * limit)
+            if value.shape == valid.shape:
+                differs &= valid
+            numbers |= differs.reshape(len(out), -1).any(1)
+        else:
+            events |= (value != other).reshape(len(out), -1).any(1)
+    return events, numbers

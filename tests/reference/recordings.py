@@ -27,30 +27,35 @@ def traffic(**more) -> pl.DataFrame:
     )
 
 
+def feet(metres: pl.Expr) -> pl.Expr:
+    return (metres / FOOT_M).round(6)
+
+
 def ngsim_rows(scene: pl.DataFrame, start_ms: int = START_MS) -> pl.DataFrame:
     """One scene of three lanes in NGSIM's 18 columns.
 
     Feet, front centres, lanes and positions from the left.
     """
+    nobody = pl.lit(0)
     return scene.sort("vehicle", "frame").select(
-        pl.col("vehicle").alias("Vehicle_ID"),
-        pl.col("frame").alias("Frame_ID"),
-        pl.len().over("vehicle").alias("Total_Frames"),
-        (start_ms + 100 * pl.col("frame")).alias("Global_Time"),
-        ((2.5 * LANE_M - pl.col("y")) / FOOT_M).round(6).alias("Local_X"),
-        ((pl.col("x") + 0.5 * pl.col("length")) / FOOT_M).round(6).alias("Local_Y"),
-        (6_451_137.641 + pl.col("y")).round(3).alias("Global_X"),
-        (1_873_344.962 + pl.col("x")).round(3).alias("Global_Y"),
-        (pl.col("length") / FOOT_M).round(6).alias("v_length"),
-        (pl.col("width") / FOOT_M).round(6).alias("v_Width"),
-        pl.lit(2).alias("v_Class"),
-        (pl.col("speed") / FOOT_M).round(6).alias("v_Vel"),
-        pl.lit(0.0).alias("v_Acc"),
-        (3 - pl.col("lane")).alias("Lane_ID"),
-        *(
-            pl.lit(0).alias(name)
-            for name in ("Preceding", "Following", "Space_Headway", "Time_Headway")
-        ),
+        Vehicle_ID="vehicle",
+        Frame_ID="frame",
+        Total_Frames=pl.len().over("vehicle"),
+        Global_Time=start_ms + 100 * pl.col("frame"),
+        Local_X=feet(2.5 * LANE_M - pl.col("y")),
+        Local_Y=feet(pl.col("x") + 0.5 * pl.col("length")),
+        Global_X=(6_451_137.641 + pl.col("y")).round(3),
+        Global_Y=(1_873_344.962 + pl.col("x")).round(3),
+        v_length=feet(pl.col("length")),
+        v_Width=feet(pl.col("width")),
+        v_Class=pl.lit(2),
+        v_Vel=feet(pl.col("speed")),
+        v_Acc=pl.lit(0.0),
+        Lane_ID=3 - pl.col("lane"),
+        Preceding=nobody,
+        Following=nobody,
+        Space_Headway=nobody,
+        Time_Headway=nobody,
     )
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 DT = 0.1
 REST = 1e-12  # a heading, steering angle or lateral position of at most this is 0
@@ -43,6 +44,14 @@ class Car:
     exits: bool = False
 
 
+class Stretch(NamedTuple):
+    """Where a lane begins and ends, m, and in what: a wall, an exit or nothing."""
+
+    begin: float = -math.inf
+    end: float = math.inf
+    kind: str = "nothing"
+
+
 @dataclass(frozen=True)
 class Rules:
     """What of a run can be chosen."""
@@ -55,8 +64,8 @@ class Rules:
     goal: float = 5000.0
     timeout_steps: int = 10_000
     ring: float | None = None
-    # of every lane: beginning, end, and what is there (wall, exit or nothing); none: all go on
-    stretches: tuple[tuple[float, float, str], ...] = ()
+    # of every lane; none: all go on
+    stretches: tuple[Stretch, ...] = ()
     # what the ego is commanded: lane, lane_speed or continuous
     actions: str = "lane"
     flow: Flow | None = None
@@ -64,8 +73,11 @@ class Rules:
     @cached_property
     def exit_lane(self) -> int | None:
         """The lane that ends in an exit."""
-        exits = [lane for lane, stretch in enumerate(self.stretches) if stretch[2] == "exit"]
+        exits = [lane for lane, stretch in enumerate(self.stretches) if stretch.kind == "exit"]
         return exits[0] if exits else None
+
+    def stretch(self, lane: int) -> Stretch:
+        return self.stretches[lane] if self.stretches else Stretch()
 
 
 @dataclass(frozen=True)
@@ -217,7 +229,7 @@ class View:
         2 m/s2 where the leader in the lane that it has to reach itself would make it brake hard.
         The ego does that also where it would make the follower there brake hard, who goes on.
         """
-        if not self.rules.stretches or not (self.rules.mobil or i == 0):
+        if not (self.rules.mobil or i == 0):
             return math.inf
         lane = self.cars[i].target_lane
         wanted = self.wanted_lanes[i]
@@ -264,9 +276,10 @@ def front(car: Car) -> float:
 
 def before_wall(car: Car, lane: int, rules: Rules, margin: float) -> float:
     """IDM behind a standing obstacle ``margin`` m before the lane's wall; infinite without one."""
-    if not rules.stretches or rules.stretches[lane][2] != "wall":
+    stretch = rules.stretch(lane)
+    if stretch.kind != "wall":
         return math.inf
-    gap = rules.stretches[lane][1] - margin - front(car)
+    gap = stretch.end - margin - front(car)
     return idm(car.speed, car.desired_speed, gap, 0.0)
 
 
@@ -274,34 +287,31 @@ def there_is(lane: int, x: float, rules: Rules) -> bool:
     """Whether the road has the lane at x."""
     if not 0 <= lane < rules.lanes:
         return False
-    return not rules.stretches or rules.stretches[lane][0] <= x < rules.stretches[lane][1]
+    return rules.stretch(lane).begin <= x < rules.stretch(lane).end
 
 
 def urge(car: Car, lane: int, rules: Rules) -> float:
     """How much the driver wants to leave the lane: from 500 m a change before its end up to 8 m/s2
     at it. Who leaves by the exit has to leave every other lane before the exit's end.
     """
-    way_out = rules.exit_lane
-    if car.exits and way_out is not None:
-        remaining = rules.stretches[way_out][1] - car.x
-        changes = abs(lane - way_out)
-        return 8.0 * min(1.0, max(0.0, 1.0 - remaining / (500.0 * changes))) if changes else 0.0
-    if not rules.stretches or rules.stretches[lane][2] == "nothing":
+    if car.exits and rules.exit_lane is not None:
+        ways_out = [rules.exit_lane]
+        end = rules.stretch(rules.exit_lane).end
+    else:
+        ways_out = [k for k in range(rules.lanes) if rules.stretch(k).kind == "nothing"]
+        end = rules.stretch(lane).end
+    changes = min(abs(k - lane) for k in ways_out)
+    if changes == 0:
         return 0.0
-    lasting = [k for k in range(rules.lanes) if rules.stretches[k][2] == "nothing"]
-    changes = min(abs(k - lane) for k in lasting)
-    remaining = rules.stretches[lane][1] - car.x
-    return 8.0 * min(1.0, max(0.0, 1.0 - remaining / (500.0 * changes)))
+    return 8.0 * min(1.0, max(0.0, 1.0 - (end - car.x) / (500.0 * changes)))
 
 
 def possible(car: Car, lane: int, rules: Rules) -> bool:
     """Whether the driver may change into the lane and would not be worse off there."""
-    if not there_is(lane, car.x, rules):
-        return False
-    if not rules.stretches:
-        return True
     here = car.target_lane
-    return there_is(here, car.x, rules) and urge(car, lane, rules) <= urge(car, here, rules)
+    if not (there_is(lane, car.x, rules) and there_is(here, car.x, rules)):
+        return False
+    return urge(car, lane, rules) <= urge(car, here, rules)
 
 
 def asked(car: Car, rules: Rules) -> int | None:
@@ -325,19 +335,15 @@ def arrival(ego: Car, rules: Rules) -> str:
     way_out = rules.exit_lane
     if way_out is None:
         return "goal" if ego.x >= rules.goal else ""
-    if ego.x < rules.stretches[way_out][1]:
+    if ego.x < rules.stretch(way_out).end:
         return ""
     return "goal" if nearest_lane(ego, rules) == way_out else "missed_exit"
 
 
 def in_the_wall(car: Car, rules: Rules) -> bool:
     """Whether its body is in a lane whose wall its front has passed."""
-    if not rules.stretches:
-        return False
-    return any(
-        rules.stretches[lane][2] == "wall" and front(car) > rules.stretches[lane][1]
-        for lane in lanes_entered(car, rules)
-    )
+    walls = [rules.stretch(lane) for lane in lanes_entered(car, rules)]
+    return any(wall.kind == "wall" and front(car) > wall.end for wall in walls)
 
 
 # Across the road: MOBIL, Table IV
@@ -593,7 +599,7 @@ def let_in_and_out(state: State, rules: Rules) -> None:
     way_out = rules.exit_lane
     for number, car in enumerate(state.cars):
         by_exit = way_out is not None and nearest_lane(car, rules) == way_out
-        past = by_exit and car.x >= rules.stretches[way_out][1]
+        past = by_exit and car.x >= rules.stretch(way_out).end
         if number and (past or car.x > flow.end):
             state.cars[number] = replace(car, valid=False)
     for lane, probability in enumerate(flow.arrivals):

@@ -37,26 +37,34 @@ DEFAULTS = {
 }
 
 
-def vehicles(*cars: dict, lane_width_m: float = 4.0, dtype: torch.dtype = DOUBLE) -> Vehicles:
+def vehicles(*cars: dict, dtype: torch.dtype = DOUBLE) -> Vehicles:
     """One row of cars, each a dict of fields.
 
-    ``lane`` gives y and target lane unless they are named.
+    ``lane`` gives y and target lane, of lanes of 4 m, unless they are named.
     """
-    columns: dict[str, torch.Tensor] = {}
-    filled = [
-        {
-            **DEFAULTS,
-            "y": car.get("lane", 0) * lane_width_m,
-            "target_lane": car.get("lane", 0),
-            **car,
-        }
-        for car in cars
-    ]
+    columns = []
     for name in keys.VEHICLE_FIELDS:
         # Whole numbers and flags tell their own types.
         kind = dtype if name in keys.VEHICLE_FLOATS else None
-        columns[name] = torch.tensor([[car[name] for car in filled]], dtype=kind)
-    return Vehicles(**columns)
+        columns.append(torch.tensor([[field_of(car, name) for car in cars]], dtype=kind))
+    return Vehicles(*columns)
+
+
+def field_of(car: dict, name: str) -> float:
+    """What a car says of itself, or else its lane, or else :data:`DEFAULTS`."""
+    lane = car.get("lane", 0)
+    return {**DEFAULTS, "y": 4.0 * lane, "target_lane": lane, **car}[name]
+
+
+def rows_of(scene: Vehicles, rows: slice | Sequence[int] | torch.Tensor) -> Vehicles:
+    """Some rows of a scene."""
+    return Vehicles(*(field[rows] for field in scene))
+
+
+def episode_keys(episodes: Sequence[int], stream: int = 0, seed: int = 0) -> torch.Tensor:
+    """The keys of these episodes of a seed."""
+    number = torch.as_tensor(episodes)
+    return episode_key(stream, torch.full_like(number, seed), number)
 
 
 def drawing(
@@ -73,14 +81,13 @@ def vehicles_at(x: torch.Tensor, target_lane: torch.Tensor, **others: torch.Tens
     """Cars [N, M] in the middle of their target lanes, straight ahead and signalled, but for the
     ``others``.
     """
-    zero = torch.zeros_like(x)
-    fields = {
-        **{"x": x, "y": 4.0 * target_lane.to(x.dtype), "heading": zero, "acceleration": zero},
-        **{"length": zero + 4.5, "width": zero + 2.5, "target_lane": target_lane},
-        **{
-            "visibility": torch.full_like(target_lane, int(Visibility.SIGNALLED)),
-            "valid": target_lane >= 0,
-        },
+    fields = {name: torch.full_like(x, DEFAULTS.get(name, 0.0)) for name in keys.VEHICLE_FLOATS}
+    fields |= {
+        "x": x,
+        "y": 4.0 * target_lane.to(x.dtype),
+        "target_lane": target_lane,
+        "visibility": torch.full_like(target_lane, DEFAULTS["visibility"]),
+        "valid": target_lane >= 0,
     }
     return Vehicles(**{**fields, **others})
 
@@ -194,7 +201,9 @@ def rules_of(env: HighwayEnv) -> scalar.Rules:
         goal=env.episode.goal_m,
         timeout_steps=round(env.episode.timeout_s / 0.1),
         ring=env.road.ring_m,
-        stretches=tuple((its.begin_m, its.end_m, its.end) for its in env.road.stretches),
+        stretches=tuple(
+            scalar.Stretch(its.begin_m, its.end_m, its.end) for its in env.road.stretches
+        ),
         actions=env.actions.form,
         flow=flow,
     )
@@ -220,40 +229,35 @@ def step(
     return env.step(td)["next"]
 
 
-def scalar_state(td: TensorDictBase, row: int, env: HighwayEnv | None = None) -> scalar.State:
+def scalar_cars(scene: Vehicles, row: int) -> list[scalar.Car]:
+    """One row of a scene, with straight wheels."""
+    return [scalar.Car(*numbers) for numbers in zip(*(field[row].tolist() for field in scene))]
+
+
+def scalar_state(td: TensorDictBase, row: int, env: HighwayEnv) -> scalar.State:
     """Row ``row`` of an environment's state as scalar cars.
 
-    Wheels are straight in traffic that has none. ``env`` knows who leaves by the exit.
+    Wheels are straight in traffic that has none.
     """
-    fields = {name: td[keys.VEHICLES, name][row].tolist() for name in keys.VEHICLE_FIELDS}
-    count = len(fields["x"])
+    cars = scalar_cars(Vehicles.of(td[keys.VEHICLES]), row)
     wheels = td.get((keys.TRAFFIC, "steering"), None)
-    steering = [0.0] * count if wheels is None else wheels[row].tolist()
-    steering[0] = td[keys.EGO, "steering"][row].item()
-    has_exit = env is not None and env.road.exit_lane is not None
-    exits = [has_exit] + [False] * (count - 1)
-    if env is not None and env.road.flow is not None:
-        exits = list(env.road.flow.exits(count))
-    cars = []
-    for i in range(count):
-        numbers = {name: value[i] for name, value in fields.items()}
-        cars.append(scalar.Car(**numbers, steering=steering[i], exits=exits[i]))
-    set_speed = td.get((keys.EGO, "set_speed"), None)
+    flow = env.road.flow
+    for i, car in enumerate(cars):
+        car.steering = 0.0 if wheels is None else wheels[row, i].item()
+        car.exits = flow is not None and flow.exits(len(cars))[i]
+    ego = {name: value[row].item() for name, value in td[keys.EGO].items()}
+    cars[0].steering = ego["steering"]
+    cars[0].exits = env.road.exit_lane is not None
     return scalar.State(
         cars,
-        step=td[keys.STEP][row].item(),
-        direction=td[keys.EGO, "change_direction"][row].item(),
-        close_ahead=td[keys.EGO, "soft_crash"][row].item(),
-        close_behind=td[keys.EGO, "soft_crash_behind"][row].item(),
-        lane_changes=td[keys.EGO, "lane_changes"][row].item(),
-        key=0 if env is None else key_of(env, td, row),
-        set_speed=25.0 if set_speed is None else set_speed[row].item(),
+        td[keys.STEP][row].item(),
+        ego["change_direction"],
+        ego["soft_crash"],
+        ego["soft_crash_behind"],
+        ego["lane_changes"],
+        key=int(episode_key(env.stream, td[keys.SEED], td[keys.EPISODE])[row]),
+        set_speed=ego.get("set_speed", 25.0),
     )
-
-
-def key_of(env: HighwayEnv, td: TensorDictBase, row: int) -> int:
-    """The key of the row's episode, of random numbers."""
-    return int(episode_key(env.stream, td[keys.SEED], td[keys.EPISODE])[row])
 
 
 def leaves(td: TensorDictBase) -> Iterator[tuple[str | tuple[str, ...], torch.Tensor]]:

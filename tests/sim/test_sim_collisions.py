@@ -1,40 +1,27 @@
 """Box overlap against the corners of the scalar simulator, and cases by hand."""
 
-from __future__ import annotations
-
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
 from reference import scalar
-from reference.worlds import drawing, vehicles
+from reference.worlds import drawing, scalar_cars, vehicles, vehicles_at
 
-from ganlane.sim.collisions import boxes_overlap, dangerously_close, ego_overlaps, pair_overlaps
-
-
-def random_pairs(count: int) -> tuple[torch.Tensor, ...]:
-    """dx, dy, heading, length, width, and the other's heading, length, width."""
-    between = drawing((count,), 11)
-    angle = (-math.pi, math.pi)
-    sizes = ((3.0, 6.0), (1.6, 2.6))
-    one = between(*angle), *(between(*size) for size in sizes)
-    other = between(*angle), *(between(*size) for size in sizes)
-    return between(-6, 6), between(-6, 6), *one, *other
+from ganlane.sim.collisions import dangerously_close, ego_overlaps, pair_overlaps
 
 
 def test_overlap_agrees_with_the_corners_of_the_scalar_simulator():
-    def car(x: float, y: float, heading: float, length: float, width: float) -> scalar.Car:
-        return scalar.Car(x, y, heading, 0.0, 0.0, length, width, 25.0, 0, 0, True)
-
-    pairs = random_pairs(2000)
-    dx, dy, *sizes = pairs
-    fields = ("heading", "length", "width")
-    one = SimpleNamespace(y=torch.zeros_like(dy), **dict(zip(fields, sizes[:3])))
-    other = SimpleNamespace(y=dy, **dict(zip(fields, sizes[3:])))
-    overlaps = boxes_overlap(dx, one, other).tolist()
-    for said, dx, dy, *boxes in zip(overlaps, *(value.tolist() for value in pairs)):
-        assert scalar.overlap(car(0.0, 0.0, *boxes[:3]), car(dx, dy, *boxes[3:])) == said
+    between = drawing((2000, 2), 11)
+    pairs = vehicles_at(
+        between(-3, 3),
+        torch.zeros(2000, 2, dtype=torch.int64),
+        y=between(-3, 3),
+        heading=between(-math.pi, math.pi),
+        length=between(3.0, 6.0),
+        width=between(1.6, 2.6),
+    )
+    expected = [scalar.overlap(*scalar_cars(pairs, row)) for row in range(2000)]
+    assert pair_overlaps(pairs)[:, 0, 1].tolist() == expected
 
 
 @pytest.mark.parametrize(
@@ -53,15 +40,13 @@ def test_overlap_agrees_with_the_corners_of_the_scalar_simulator():
     ],
 )
 def test_overlap_by_hand(x, y, heading, hit):
-    scene = vehicles({"x": 0.0, "y": 0.0}, {"x": x, "y": y, "heading": heading})
+    scene = vehicles({"x": 0.0}, {"x": x, "y": y, "heading": heading})
     assert ego_overlaps(scene).tolist() == [[hit]]
     assert pair_overlaps(scene).tolist() == [[[False, hit], [hit, False]]]
 
 
 def test_an_invalid_vehicle_hits_nobody():
-    scene = vehicles(
-        {"x": 0.0, "y": 0.0}, {"x": 1.0, "y": 0.0, "valid": False}, {"x": 2.0, "y": 0.0}
-    )
+    scene = vehicles({"x": 0.0}, {"x": 1.0, "valid": False}, {"x": 2.0})
     assert ego_overlaps(scene).tolist() == [[False, True]]
     assert pair_overlaps(scene)[0].nonzero().tolist() == [[0, 2], [2, 0]]
 

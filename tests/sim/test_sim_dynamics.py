@@ -1,7 +1,5 @@
 """Bicycle model and two-point steering."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -13,23 +11,18 @@ from ganlane.sim.dynamics import WHEELBASE_M, advance, steer
 ZERO = torch.zeros(1, dtype=DOUBLE)
 
 
-def number(value: float) -> torch.Tensor:
+def number(value):
     return torch.tensor([value], dtype=DOUBLE)
 
 
-def drive(speed: float, steering: float, duration_s: float, acceleration: float = 0.0):
-    x = ZERO
-    y = ZERO
-    heading = ZERO
-    v = number(speed)
+def drive(speed, steering, duration_s, acceleration=0.0):
+    pose = (ZERO, ZERO, ZERO, number(speed))
     for _ in range(round(duration_s / 0.1)):
-        pose = x, y, heading, v, _ = advance(
-            x, y, heading, v, number(acceleration), number(steering), 0.1
-        )
+        pose = advance(*pose[:4], number(acceleration), number(steering), 0.1)
     return pose
 
 
-def circle(speed: float, steering: float, duration_s: float) -> tuple[float, float, float]:
+def circle(speed, steering, duration_s):
     """Closed form: the centre of gravity runs on a circle of radius ``l_r / sin(beta)``."""
     beta = math.atan(0.5 * math.tan(steering))
     radius = 0.5 * WHEELBASE_M / math.sin(beta)
@@ -65,7 +58,7 @@ def test_constant_acceleration_is_exact_and_braking_ends_at_rest():
 SPEEDS = torch.linspace(3.0, 35.0, 65, dtype=DOUBLE)
 
 
-def lane_change(speed: torch.Tensor, width: float) -> torch.Tensor:
+def lane_change(speed, width):
     """Lateral positions [steps, speeds] in 30 s after the command to go ``width`` m to the left."""
     x = y = heading = wheel = torch.zeros_like(speed)
     track = []

@@ -1,14 +1,12 @@
 """Lanes that end, of roads that differ between the rows of a batch."""
 
-from __future__ import annotations
-
 import random
 
 import pytest
 import torch
-from reference.worlds import random_scenes, random_stretches
+from reference.worlds import random_scenes, random_stretches, rows_of
 
-from ganlane.settings.road import EXIT, FAR_M, NOTHING, WALL, LaneStretch, Stretches
+from ganlane.settings.road import EXIT, FAR_M, NOTHING, WALL, LaneStretch
 from ganlane.sim.idm import following_acceleration
 from ganlane.sim.lane_ends import (
     exists,
@@ -28,7 +26,7 @@ WIDTH_M = 3.6
 
 
 @pytest.fixture(scope="module")
-def roads() -> list[Stretches]:
+def roads():
     """Of as many lanes as ``LANES`` says; drivers of the second one may stay where they are."""
     rng = random.Random(3)
     drawn = [random_stretches(lanes, rng) for lanes in LANES]
@@ -38,11 +36,9 @@ def roads() -> list[Stretches]:
 
 
 @pytest.fixture(scope="module")
-def cars() -> Vehicles:
+def cars():
     """Some on each road, which drive in all of its lanes and on both sides of its ends."""
-    rows = []
-    for row, lanes in enumerate(LANES):
-        rows.append(random_scenes(1, 24, lanes, seed=row))
+    rows = [random_scenes(1, 24, lanes, seed=row) for row, lanes in enumerate(LANES)]
     return Vehicles(*(torch.cat(fields) for fields in zip(*rows)))
 
 
@@ -56,8 +52,9 @@ FACTS = {
     ),
     "walls that are hit": lambda cars, road: hits_wall(cars, body_lanes(cars, road), road),
     # The ego's are others: with one road for all rows an exit is its mission.
-    "sides to which lanes are left": lambda cars, road: ways_out(cars, road, 500.0).side[:, 1:],
-    "urgency": lambda cars, road: ways_out(cars, road, 500.0).urgency[:, 1:],
+    "sides to which lanes are left, and urgency": lambda cars, road: torch.stack(
+        ways_out(cars, road, 500.0), dim=-1
+    )[:, 1:],
     "accelerations": lambda cars, road: following_acceleration(perceive(cars, road)),
     "wishes of MOBIL": lambda cars, road: mobil_wishes(perceive(cars, road))[:, 1:],
 }
@@ -73,7 +70,7 @@ def test_a_row_on_its_own_road_is_as_alone_on_that_road(fact, roads, cars):
     together = FACTS[fact](cars, of_rows)
     differ = 0
     for row, lanes in enumerate(LANES):
-        alone = Vehicles(*(field[row : row + 1] for field in cars))
+        alone = rows_of(cars, slice(row, row + 1))
         expected = FACTS[fact](alone, Road(lanes, WIDTH_M, stretches=roads[row]))
         assert torch.equal(together[row : row + 1], expected)
         # And the lanes' ends matter.

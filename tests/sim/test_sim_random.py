@@ -1,19 +1,16 @@
 """Random numbers as pure functions of (stream, seed, episode, vehicle, step, purpose)."""
 
-from __future__ import annotations
-
 import itertools
 import math
 
 import pytest
 import torch
 from reference import scalar
+from reference.worlds import episode_keys
 
 from ganlane.sim.random import (
-    _GOLDEN,
     Purpose,
     Stream,
-    _mix,
     draw_keys,
     episode_key,
     normal,
@@ -22,27 +19,17 @@ from ganlane.sim.random import (
 )
 
 PURPOSES = [int(p) for p in Purpose]
+KEYS = episode_keys(range(20_000))
 
 
-def keys(episodes: int) -> torch.Tensor:
-    return episode_key(0, torch.zeros(episodes, dtype=torch.int64), torch.arange(episodes))
-
-
-def test_the_mixer_is_that_of_splitmix64():
-    """The published test vector: the first three numbers from the state 1234567."""
-    states = 1234567 + torch.tensor([1, 2, 3]) * _GOLDEN
-    mixed = [number % 2**64 for number in _mix(states).tolist()]
-    assert mixed == [6457827717110365317, 3203168211198807973, 9817491932198370423]
-
-
-def test_fields_are_mixed_in_one_after_the_other():
+def test_fields_are_mixed_in_one_after_the_other_by_the_finaliser_of_splitmix64():
     drawn = draw_keys(episode_key(2, torch.tensor([5]), torch.tensor([2**40])), 17, 3, [4, 9])
     for vehicle, (column, purpose) in itertools.product(range(3), enumerate([4, 9])):
         expected = scalar.drawn(2, 0, 5, 2**40, 17, vehicle, purpose)
         assert drawn[0, vehicle, column].item() % 2**64 == expected
 
 
-def chi_square(u: torch.Tensor) -> float:
+def chi_square(u):
     """Of 64 equal bins, as a standard score."""
     bins = 64
     counts = torch.bincount((u.flatten() * bins).long(), minlength=bins).double()
@@ -53,14 +40,11 @@ def chi_square(u: torch.Tensor) -> float:
 
 def test_numbers_are_uniform_along_every_field():
     """Each slice of the numbers fills 64 bins evenly (4.5 standard deviations, some 90 slices)."""
-    by_episode = uniform(keys(4000), 3, 4, PURPOSES)
+    by_episode = uniform(KEYS[:4000], 3, 4, PURPOSES)
     by_step = uniform(torch.full((4000,), 42), torch.arange(4000), 4, PURPOSES)
-    by_vehicle = uniform(keys(2), 0, 8000, [Purpose.NOISE])
+    by_vehicle = uniform(KEYS[:2], 0, 8000, [Purpose.NOISE])
     by_seed = uniform(episode_key(1, torch.arange(16000), torch.zeros(16000).long()), 0, 1, [0])
-    slices = [by_episode[..., k] for k in range(len(PURPOSES))] + [
-        by_step[..., k] for k in range(len(PURPOSES))
-    ]
-    slices += [by_episode[:, v] for v in range(4)] + [by_vehicle, by_seed]
+    slices = [*by_episode.unbind(2), *by_step.unbind(2), *by_episode.unbind(1), by_vehicle, by_seed]
     assert max(abs(chi_square(u)) for u in slices) < 4.5
     assert by_episode.min() >= 0.0
     assert by_episode.max() < 1.0
@@ -80,8 +64,8 @@ def test_no_two_places_share_a_number():
 
 
 def test_float32_and_float64_numbers_agree_to_24_bits():
-    single = uniform(keys(1000), 5, 3, [1, 2], torch.float32)
-    double = uniform(keys(1000), 5, 3, [1, 2], torch.float64)
+    single = uniform(KEYS[:1000], 5, 3, [1, 2], torch.float32)
+    double = uniform(KEYS[:1000], 5, 3, [1, 2], torch.float64)
     assert torch.equal((double * 2**24).floor(), single.double() * 2**24)
 
 
@@ -97,18 +81,17 @@ def test_the_extreme_keys_stay_within_the_unit_interval():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_number_does_not_depend_on_the_batch_the_row_or_what_else_is_drawn(dtype):
     steps = torch.arange(64) * 7
-    together = uniform(keys(64), steps, 9, PURPOSES, dtype)
+    together = uniform(KEYS[:64], steps, 9, PURPOSES, dtype)
     for row in (0, 13, 63):
-        alone = uniform(keys(64)[row : row + 1], int(steps[row]), 9, PURPOSES, dtype)
+        alone = uniform(KEYS[row : row + 1], int(steps[row]), 9, PURPOSES, dtype)
         assert torch.equal(alone[0], together[row])
-    fewer = uniform(keys(64), steps, 4, [Purpose.FAULT], dtype)
+    fewer = uniform(KEYS[:64], steps, 4, [Purpose.FAULT], dtype)
     assert torch.equal(fewer[..., 0], together[:, :4, PURPOSES.index(Purpose.FAULT)])
 
 
 def test_normal_numbers_have_the_moments_of_the_normal_distribution():
-    z = normal(
-        keys(20_000), 0, 2, [int(Purpose.NOISE), int(Purpose.NOISE) + 1], torch.float64
-    ).flatten()
+    noise = int(Purpose.NOISE)
+    z = normal(KEYS, 0, 2, [noise, noise + 1], torch.float64).flatten()
     error = 1.0 / math.sqrt(z.numel())
     assert abs(z.mean()) < 5 * error
     assert abs(z.var() - 1.0) < 5 * math.sqrt(2.0) * error

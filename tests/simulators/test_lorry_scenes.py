@@ -1,19 +1,14 @@
 """The first scenes of SUMO's traffic: lorries at the net gaps of cars."""
 
 import torch
+from reference.worlds import episode_keys
 
 from ganlane.settings.driving import Visibility
 from ganlane.sim import Road
-from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.spawn import RandomScenes
 from ganlane_simulators.sumo import LorryScenes
 
 CARS = RandomScenes(Road(), 9, others_visibility=Visibility.SIGNALLED)
-
-
-def keys_of(count):
-    episodes = torch.arange(count)
-    return episode_key(Stream.TRAIN, torch.zeros_like(episodes), episodes)
 
 
 def net_gaps(scene, row):
@@ -29,7 +24,7 @@ def net_gaps(scene, row):
 
 
 def test_so_many_of_the_others_are_lorries_of_twelve_metres_and_the_ego_never_is():
-    scene = LorryScenes(CARS, share=0.3)(keys_of(500), torch.float32)
+    scene = LorryScenes(CARS, share=0.3)(episode_keys(range(500)), torch.float32)
     lorry = scene.length == 12.0
     assert not lorry[:, 0].any()
     # 4000 draws with probability 0.3: a standard deviation of 0.0072.
@@ -38,15 +33,11 @@ def test_so_many_of_the_others_are_lorries_of_twelve_metres_and_the_ego_never_is
 
 
 def test_net_gaps_are_those_of_the_scene_of_cars():
-    episodes = keys_of(50)
+    episodes = episode_keys(range(50))
     cars = CARS(episodes, torch.float64)
     lorries = LorryScenes(CARS, share=0.5)(episodes, torch.float64)
     assert (lorries.length > 4.5).any()
     assert (lorries.x[:, 0] == 0.0).all()
     for row in range(50):
-        torch.testing.assert_close(
-            net_gaps(lorries, row),
-            net_gaps(cars, row),
-            rtol=0.0,
-            atol=1e-9,
-        )
+        gaps = net_gaps(lorries, row), net_gaps(cars, row)
+        torch.testing.assert_close(*gaps, rtol=0.0, atol=1e-9)

@@ -1,50 +1,43 @@
 """The contract of all traffic models: what is written, in which shapes, and what is not."""
 
-from __future__ import annotations
-
 import pytest
 import torch
+from reference.foreign import MAKE
+from reference.refusals import user_error
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from reference.worlds import environment, same_bits
 from tensordict import TensorDict
 
 from ganlane import keys
 from ganlane.data import sort
-from ganlane.errors import UserError
 from ganlane.sim import Vehicles
 from ganlane.traffic import (
     BlindTraffic,
     IdmMobilTraffic,
-    IdmRandomTraffic,
-    IdmTraffic,
     MixedTraffic,
     ReplayTraffic,
     TrafficSequential,
 )
-from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic, idm_faults_traffic
+from ganlane.traffic.presets import gan_calibrated_traffic
+
+SHARES = {"idm": 1, "idm_faults": 1}
 
 
-def replay() -> ReplayTraffic:
+def replay():
     scenes = sort(synthetic_scenes(SyntheticTraffic(scenes=2, lanes=3, seconds=8.0)))
     return ReplayTraffic(recordings=scenes)
 
 
-MAKE = {
-    "idm": IdmTraffic,
-    "idm_mobil": IdmMobilTraffic,
-    "idm_random": IdmRandomTraffic,
-    "idm_faults": idm_faults_traffic,
-    "gan": gan_traffic,
+MODELS = {
+    **MAKE,
     "gan_calibrated": gan_calibrated_traffic,
-    "mixed": lambda: MixedTraffic(
-        {"idm": IdmTraffic(), "faults": idm_faults_traffic()}, {"idm": 1, "faults": 1}
-    ),
+    "mixed": lambda: MixedTraffic({name: MAKE[name]() for name in SHARES}, SHARES),
     "blind": lambda: BlindTraffic(IdmMobilTraffic(), 0.5),
     "replay": replay,
 }
 
 
-def shapes(memory: TensorDict) -> dict:
+def shapes(memory):
     """As :meth:`TrafficModule.memory_spec`."""
     return {
         name: shapes(value) if isinstance(value, TensorDict) else (tuple(value.shape), value.dtype)
@@ -52,9 +45,9 @@ def shapes(memory: TensorDict) -> dict:
     }
 
 
-@pytest.mark.parametrize("name", MAKE)
+@pytest.mark.parametrize("name", MODELS)
 def test_memory_and_moved_are_as_declared_and_the_state_at_t_is_never_written(name):
-    traffic = MAKE[name]()
+    traffic = MODELS[name]()
     state = environment(num_envs=4, traffic=traffic, dtype=torch.float32).reset()
     for step in range(2):
         before = state.clone()
@@ -72,5 +65,5 @@ def test_memory_and_moved_are_as_declared_and_the_state_at_t_is_never_written(na
 
 
 def test_a_chain_begins_with_a_model_that_reacts():
-    with pytest.raises(UserError, match="overlays behind replayed traffic"):
+    with user_error("overlays behind replayed traffic"):
         TrafficSequential({"base": replay()})

@@ -1,7 +1,5 @@
 """Traffic with lorries does not run into itself, nor into an ego that keeps its lane."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -9,7 +7,6 @@ from reference.foreign import overlaps_of_the_others
 from reference.worlds import vehicles
 
 import ganlane
-from ganlane import keys
 from ganlane.generator.closed_loop import extra_inputs
 from ganlane.realism.long_runs import LongRunParameters
 from ganlane.realism.starts import spawned_recordings
@@ -36,9 +33,6 @@ from ganlane.traffic import IdmTraffic
 )
 def test_nobody_overlaps_a_lorry(traffic, rows, recycle, vehicle_km):
     env = ganlane.make_env(traffic, rows, truck_share=0.4, recycle=recycle).base_env
-    lorries = env.reset()[keys.VEHICLES, "length"][:, 1:] == 12.0
-    three_sigma = 3.0 * (0.4 * 0.6 / lorries.numel()) ** 0.5
-    assert lorries.double().mean().item() == pytest.approx(0.4, abs=three_sigma)
     assert overlaps_of_the_others(env, vehicle_km, ego=True) == 0
 
 

@@ -2,57 +2,46 @@
 the ego.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
-from reference.foreign import all_faults
-from reference.worlds import environment, few_changes, placed, same_bits, step, vehicles
+from reference.foreign import MAKE, assert_close
+from reference.refusals import user_error
+from reference.worlds import (
+    environment,
+    episode_keys,
+    few_changes,
+    placed,
+    same_bits,
+    step,
+    vehicles,
+)
 from scipy.stats import binomtest
 
 import ganlane
 from ganlane import keys
 from ganlane.build import make_traffic
-from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.traffic import IdmTrafficConfig, MixedTrafficConfig, ReplayTrafficConfig
 from ganlane.sim import Road, Vehicles
 from ganlane.traffic import (
     BlindTraffic,
-    IdmMobilTraffic,
-    IdmRandomTraffic,
     IdmTraffic,
     MixedTraffic,
-    TrafficModule,
 )
-from ganlane.traffic.base import key_of
 from ganlane.traffic.mixed import interleaved
-from ganlane.traffic.presets import gan_traffic, idm_faults_traffic, with_faults
+from ganlane.traffic.presets import gan_traffic, with_faults
 
-#: So many faults that a few decisions hold some.
-OFTEN = all_faults(600.0, 0.5)
 RULES = {"idm": 1, "idm_mobil": 2, "idm_random": 1, "idm_faults": 1}
-MAKE = {
-    "idm": IdmTraffic,
-    "idm_mobil": IdmMobilTraffic,
-    "idm_random": IdmRandomTraffic,
-    "idm_faults": lambda: idm_faults_traffic(faults=OFTEN),
-    "gan": gan_traffic,
-}
 
 
-def mixture(**shares: int) -> MixedTraffic:
+def mixture(**shares):
     return MixedTraffic({name: MAKE[name]() for name in shares}, shares)
 
 
-def drive(traffic: TrafficModule, rows: int, decisions: int = 6) -> list:
+def drive(traffic, rows, decisions=6):
     env = environment(num_envs=rows, traffic=traffic, dtype=torch.float32)
     td = env.reset()
-    seen = []
-    for _ in range(decisions):
-        td = step(env, td, few_changes(td))
-        seen.append(td)
-    return seen
+    return [td := step(env, td, few_changes(td)) for _ in range(decisions)]
 
 
 @pytest.mark.parametrize(
@@ -70,7 +59,7 @@ def test_the_turns_of_a_period_are_spread(shares, turns):
 
 
 @pytest.fixture(scope="module")
-def wide() -> list:
+def wide():
     """States of 64 episodes."""
     return drive(mixture(**RULES), 64)
 
@@ -93,11 +82,12 @@ def test_a_part_drives_its_episodes_to_the_bit_as_it_does_alone(name, wide):
 
 
 def test_the_generator_drives_its_rows_as_it_does_alone_to_rounding():
-    mixed = drive(mixture(idm_mobil=1, gan=1), 8, 3)[-1]
-    alone = drive(gan_traffic(), 8, 3)[-1]
-    for name in ("x", "y", "speed"):
-        one, other = (td[1::2][keys.VEHICLES, name] for td in (mixed, alone))
-        torch.testing.assert_close(one, other, atol=2e-3, rtol=1e-4)
+    assert_close(
+        *(
+            drive(traffic, 8, 3)[-1][1::2][keys.VEHICLES]
+            for traffic in (mixture(idm_mobil=1, gan=1), gan_traffic())
+        )
+    )
 
 
 def test_scenes_set_by_hand_and_faults_laid_over_a_mixture_see_it_too():
@@ -122,16 +112,16 @@ def test_scenes_set_by_hand_and_faults_laid_over_a_mixture_see_it_too():
     ],
 )
 def test_shares_that_cannot_be_are_refused_in_one_sentence(shares, told):
-    with pytest.raises(UserError, match=told):
+    with user_error(told):
         MixedTrafficConfig(shares=shares)
 
 
 def test_parts_on_different_roads_and_impossible_shares_of_blind_episodes_are_refused():
-    with pytest.raises(UserError, match="different roads or streams"):
+    with user_error("different roads or streams"):
         MixedTraffic({"a": IdmTraffic(), "b": IdmTraffic(Road(lanes=2))}, {"a": 1, "b": 1})
-    with pytest.raises(UserError, match="no ego anyway"):
+    with user_error("no ego anyway"):
         ReplayTrafficConfig(blind_share=0.5)
-    with pytest.raises(UserError, match="blind_share=-1"):
+    with user_error("blind_share=-1"):
         IdmTrafficConfig(blind_share=-1.0)
 
 
@@ -139,40 +129,25 @@ def test_a_model_of_ones_own_is_mixed_by_its_import_path():
     traffic = make_traffic(
         MixedTrafficConfig(shares={"ganlane.traffic.IdmTraffic": 1, "idm_mobil": 1}), EnvConfig()
     )
-    assert isinstance(traffic, MixedTraffic)
-    assert [name for name, _ in traffic.named_parts()] == [
-        "ganlane_traffic_IdmTraffic",
-        "idm_mobil",
-    ]
-    one, other = (
-        drive(model, 4)[-1].exclude(keys.TRAFFIC)
-        for model in (traffic, mixture(idm=1, idm_mobil=1))
-    )
-    assert same_bits(one, other) == []
+    names = [name for name, _ in traffic.named_parts()]
+    assert names == ["ganlane_traffic_IdmTraffic", "idm_mobil"]
+    models = (traffic, mixture(idm=1, idm_mobil=1))
+    assert same_bits(*(drive(model, 4)[-1].exclude(keys.TRAFFIC) for model in models)) == []
 
 
 # Blind episodes: the others do not see the ego, the environment does
-
-
-CHASE = vehicles(
-    {"x": 0.0, "speed": 10.0, "desired_speed": 10.0},
-    {"x": -60.0, "speed": 25.0, "desired_speed": 25.0},
-)
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_a_follower_brakes_for_an_ego_unless_it_does_not_see_it_and_the_environment_says_so(share):
     """A fast driver behind a slow ego, second by second."""
     env = environment(vehicles=2, traffic=BlindTraffic(IdmTraffic(), share))
-    td = placed(env, CHASE)
-    speeds = []
-    crashes = []
-    for _ in range(8):
-        td = step(env, td)
-        speeds.append(td[keys.VEHICLES, "speed"][0, 1].item())
-        crashes.append(bool(td[keys.EVENTS, "hard_crash"]))
-    assert any(crashes) == (share == 1.0)
-    assert min(speeds) > 24.9 if share else min(speeds) < 15.0
+    slow, fast = ({"speed": speed, "desired_speed": speed} for speed in (10.0, 25.0))
+    td = placed(env, vehicles({"x": 0.0, **slow}, {"x": -60.0, **fast}))
+    track = [td := step(env, td) for _ in range(8)]
+    slowest = min(td[keys.VEHICLES, "speed"][0, 1].item() for td in track)
+    assert any(bool(td[keys.EVENTS, "hard_crash"]) for td in track) == (share == 1.0)
+    assert slowest > 24.9 if share else slowest < 15.0
 
 
 def test_as_many_episodes_are_blind_as_asked_for_whatever_the_batch_and_the_part():
@@ -181,7 +156,7 @@ def test_as_many_episodes_are_blind_as_asked_for_whatever_the_batch_and_the_part
     for n in (4000, 7):
         td = environment(num_envs=n, traffic=traffic).reset()
         vehicles = Vehicles.of(td[keys.VEHICLES])
-        unseen.append(traffic.unseen(vehicles, key_of(td, traffic.stream)))
+        unseen.append(traffic.unseen(vehicles, episode_keys(range(n))))
     wide, narrow = unseen
     assert torch.equal(wide[:7], narrow)
     assert not wide[:, 1:].any()

@@ -1,7 +1,5 @@
 """Overlays on traffic: lane changes, accelerations, guard."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -27,8 +25,8 @@ from ganlane.traffic.overlays import literal_hazard
 class Drift(TrafficModule):
     """A network gone wrong: drifts to the left and accelerates for ever."""
 
-    def __init__(self, road=None, lateral=1.0, acceleration=2.0):
-        super().__init__(road)
+    def __init__(self, lateral=1.0, acceleration=2.0):
+        super().__init__()
         self.lateral = lateral
         self.acceleration = acceleration
 
@@ -47,15 +45,11 @@ def run(rows, vehicles, seconds, base, **overlays):
 def test_the_mean_wait_of_equation_10_is_the_root_of_half_pi_t_m_and_not_t_m():
     t_m = 2218.0
     draws = torch.Generator().manual_seed(0)
-    waiting = torch.ones(20_000, dtype=torch.bool)
-    wait = torch.zeros(20_000)
-    for clock in range(400):
-        starts = torch.rand(20_000, generator=draws) < literal_hazard(
-            torch.tensor(float(clock)), t_m
-        )
-        wait = torch.where(waiting & starts, float(clock), wait)
-        waiting &= ~starts
-    assert not waiting.any()
+    wait = torch.full((20_000,), torch.nan)
+    for clock in torch.arange(400.0):
+        starts = torch.rand(20_000, generator=draws) < literal_hazard(clock, t_m)
+        wait = torch.where(wait.isnan() & starts, clock, wait)
+    assert not wait.isnan().any()
     assert wait.mean().item() == pytest.approx(math.sqrt(math.pi * t_m / 2), rel=0.02)
 
 
@@ -80,9 +74,8 @@ def test_calibrated_changes_find_gaps_and_touch_nobody():
 
 def test_sudden_accelerations_fill_a_third_of_the_time_with_the_spread_of_the_data():
     # 2 s of waiting and 1 s of acceleration, in turn.
-    overlay = AccelerationOverlay(
-        sudden=SuddenAccelerations(every_s=2.0, lasts_s=1.0, mean=0.0, sd=0.8)
-    )
+    sudden = SuddenAccelerations(every_s=2.0, lasts_s=1.0, mean=0.0, sd=0.8)
+    overlay = AccelerationOverlay(sudden=sudden)
     state = HighwayEnv(IdmTraffic(), num_envs=200).reset()
     state["vehicles", "speed"][:] = 20.0
     state["traffic"] = overlay.init_memory(Vehicles.of(state["vehicles"]), state["episode"])
@@ -112,10 +105,11 @@ def test_the_guard_does_not_let_a_network_that_always_brakes_stand_still():
     assert others.speed[-1].min() > 4.0
 
 
-@pytest.mark.parametrize("overlays", [{}, {"guard": Guard()}])
-def test_a_model_without_memory_drives_through_rollouts_and_resets(overlays):
-    model = Drift(lateral=0.0)
-    traffic = TrafficSequential({"base": model, **overlays}) if overlays else model
+DRIFT = Drift(lateral=0.0)
+
+
+@pytest.mark.parametrize("traffic", [DRIFT, TrafficSequential({"base": DRIFT, "guard": Guard()})])
+def test_a_model_without_memory_drives_through_rollouts_and_resets(traffic):
     env = HighwayEnv(traffic, num_envs=3, episode=EpisodeParameters(goal_m=60.0))
     assert env.rollout(12, break_when_any_done=False)["next", "done"].any()
     again = env.rollout(3, tensordict=env.reset(), auto_reset=False, break_when_any_done=False)

@@ -1,63 +1,45 @@
 """Replay: recorded scenes around the ego, the same for everybody who asks for the same episode."""
 
-from __future__ import annotations
-
 import numpy as np
 import polars as pl
 import pytest
 import torch
+from reference.refusals import user_error
 from reference.scene_csv import write_scene_csv
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.worlds import episode_keys
 from scipy.stats import chisquare
 
 from ganlane import keys
-from ganlane.data import default_scenes, sort
-from ganlane.errors import UserError
+from ganlane.data import sort
 from ganlane.settings.driving import IdmParameters, Visibility
-from ganlane.sim import Vehicles
 from ganlane.sim.collisions import ego_overlaps
-from ganlane.sim.random import episode_key
 from ganlane.traffic import ReplayTraffic
 
 WIDTH = 3.5
 
 
-def track(vehicle, frames, x, speed, lane, scene="s", length=4.0, width=2.0) -> pl.DataFrame:
+def track(vehicle, frames, x, speed, lane, scene="s", length=4.0, width=2.0):
     """A vehicle at a steady speed on a lane's centre."""
-    frame = pl.DataFrame({"frame": list(frames)})
-    same = {
-        "vehicle": vehicle,
-        "y": lane * WIDTH,
-        "speed": float(speed),
-        "lane": lane,
-    }
+    frame = np.array(frames)
+    same = {"vehicle": vehicle, "y": lane * WIDTH, "speed": float(speed), "lane": lane}
     same |= {"length": length, "width": width, "scene": scene}
-    constants = (pl.lit(value).alias(name) for name, value in same.items())
-    return frame.select("frame", *constants, x=x + speed * 0.1 * pl.col("frame"))
+    return pl.DataFrame({"frame": frame, "x": x + speed * 0.1 * frame}).with_columns(
+        pl.lit(value).alias(name) for name, value in same.items()
+    )
 
 
-def replay(*tracks: pl.DataFrame, least_s: float = 2.0, stream: int = 0) -> ReplayTraffic:
-    return ReplayTraffic(stream, recordings=sort(pl.concat(tracks)), least_s=least_s)
+def replay(*tracks, least_s=2.0):
+    return ReplayTraffic(recordings=sort(pl.concat(tracks)), least_s=least_s)
 
 
-def keys_of(episodes, stream: int = 0, seed: int = 0) -> torch.Tensor:
-    number = torch.as_tensor(episodes, dtype=torch.int64)
-    return episode_key(stream, torch.full_like(number, seed), number)
+def start(traffic, key):
+    return traffic.scenes(9)(key, torch.float64)
 
 
-def start(traffic: ReplayTraffic, key: torch.Tensor, vehicles: int = 9) -> Vehicles:
-    return traffic.scenes(vehicles)(key, torch.float64)
-
-
-def play(
-    traffic: ReplayTraffic,
-    key: torch.Tensor,
-    step: int,
-    vehicles: int = 9,
-) -> Vehicles:
+def play(traffic, key, step):
     """The vehicles that ``move`` gives ``step`` steps after the start."""
-    scene = start(traffic, key, vehicles)
-    return traffic.move(scene, {}, key, torch.full_like(key, step - 1))[0]
+    return traffic.move(start(traffic, key), {}, key, torch.full_like(key, step - 1))[0]
 
 
 # 2.1 s: an episode can only start at frame 0, where five cars stand at 0, 20, 30, 45 and 100 m.
@@ -70,158 +52,113 @@ FIVE = (
 )
 
 
-def test_the_ego_takes_the_place_of_the_vehicle_nearest_the_middle():
-    scene = start(replay(*FIVE), keys_of([0]))
-    # Positions 0, 20, 30, 45, 100: their median is 30.
-    names = (
-        "x",
-        "y",
-        "speed",
-        "length",
-        "width",
-        "target_lane",
-        "desired_speed",
-    )
-    assert [getattr(scene, name)[0, 0].item() for name in names] == [
-        0.0,
-        WIDTH,
-        12.0,
-        5.0,
-        1.8,
-        1,
-        25.0,
-    ]
-    assert scene.visibility[0].tolist() == [Visibility.BODY] * 9
-
-
 def test_a_track_with_a_missing_frame_ends_there():
     holes = [frame for frame in range(21) if frame != 10]
     traffic = replay(*FIVE[1:3], track(9, holes, 33.0, 12.0, 2))
-    valid = [play(traffic, keys_of([0]), step).valid[0, :3].tolist() for step in (9, 12)]
+    valid = [play(traffic, episode_keys([0]), step).valid[0, :3].tolist() for step in (9, 12)]
     assert valid == [[True, True, True], [True, False, True]]
 
 
 def test_nobody_reacts_to_the_ego():
     traffic = ReplayTraffic(recordings=recorded(3))
-    key = keys_of(range(16))
+    key = episode_keys(range(16))
     scene = start(traffic, key)
     elsewhere = scene.with_(x=scene.x + 5.0, y=scene.y + 1.0, speed=scene.speed * 0.0)
     one, other = (
         traffic.move(at, {}, key, torch.full_like(key, 7))[0] for at in (scene, elsewhere)
     )
-    assert all(
-        map(
-            torch.equal,
-            one.columns(slice(1, None)),
-            other.columns(slice(1, None)),
-        )
-    )
+    others = slice(1, None)
+    assert all(map(torch.equal, one.columns(others), other.columns(others)))
     assert all(map(torch.equal, other.at(0), elsewhere.at(0)))
 
 
-def recorded(scenes: int = 4, seconds: float = 8.0, **others) -> pl.DataFrame:
-    """Synthetic scenes of which the k-th has 2 + k % 3 lanes and loses its last k seconds."""
+def recorded(scenes=4):
+    """Synthetic scenes of which the k-th has 2 + k % 3 lanes and loses its last k half seconds."""
     parts = []
     for k in range(scenes):
-        frame = synthetic_scenes(
-            SyntheticTraffic(scenes=1, lanes=2 + k % 3, seconds=seconds, **others),
-            seed=k,
-        )
-        cut = frame.filter(pl.col("frame") < round((seconds - 0.5 * k) * 10))
+        frame = synthetic_scenes(SyntheticTraffic(scenes=1, lanes=2 + k % 3, seconds=8.0), seed=k)
+        cut = frame.filter(pl.col("frame") < 80 - 5 * k)
         parts.append(cut.with_columns(scene=pl.lit(f"scene-{k}")))
     return sort(pl.concat(parts))
 
 
 def test_every_scene_is_equally_likely_and_every_start_within_it():
     traffic = ReplayTraffic(recordings=recorded())
-    episodes = range(20_000)
-    starts = traffic.start_of(keys_of(episodes))
-    scenes = np.bincount(traffic.scene[traffic.start_of(keys_of(episodes))].numpy(), minlength=4)
-    assert chisquare(scenes).pvalue > 1e-3
-    within = np.bincount(starts[traffic.scene[traffic.start_of(keys_of(episodes))] == 2].numpy())
+    key = episode_keys(range(20_000))
+    starts = traffic.start_of(key)
+    scenes = traffic.scene[starts]
+    assert chisquare(np.bincount(scenes.numpy(), minlength=4)).pvalue > 1e-3
+    within = np.bincount(starts[scenes == 2].numpy())
     assert chisquare(within[within > 0]).pvalue > 1e-3
     assert len(starts.unique()) == starts.max() + 1
 
 
 def test_lanes_and_their_width_are_the_scenes_own():
     traffic = ReplayTraffic(recordings=recorded())
-    key = keys_of(range(100))
+    key = episode_keys(range(100))
     road = traffic.road_of(key, torch.float64)
     scene = traffic.scene[traffic.start_of(key)]
     assert road.lanes.shape == road.lane_width_m.shape == (100, 1)
     assert torch.equal(road.lanes[:, 0], 2 + scene % 3)
     assert (road.lane_width_m - 3.5).abs().max() < 0.2
-    now = start(traffic, key)
-    assert (now.target_lane < road.lanes).all()
+    assert (start(traffic, key).target_lane < road.lanes).all()
     assert traffic.road.lanes == 4
-    assert traffic.scenes_of_episodes(0, range(100)) == [
-        f"scene-{number}" for number in scene.tolist()
-    ]
+    names = [f"scene-{number}" for number in scene.tolist()]
+    assert traffic.scenes_of_episodes(0, range(100)) == names
 
 
 def test_every_step_is_what_a_search_through_the_rows_finds():
-    frame = sort(
-        synthetic_scenes(
-            SyntheticTraffic(scenes=2, vehicles=14, seconds=7.0, changing_share=0.6),
-            seed=3,
-        )
-    )
+    size = SyntheticTraffic(scenes=2, vehicles=14, seconds=7.0, changing_share=0.6)
     # Some come later and some leave early.
-    frame = frame.filter(
+    frame = synthetic_scenes(size, seed=3).filter(
         (pl.col("frame") >= 2 * (pl.col("vehicle") % 4))
         & (pl.col("frame") < 70 - pl.col("vehicle"))
     )
-    traffic = ReplayTraffic(recordings=frame, least_s=3.0)
-    key = keys_of(range(12))
-    for row, (scene, steps) in enumerate(
-        zip(
-            traffic.scene[traffic.start_of(key)].tolist(),
-            traffic.steps_of(key).tolist(),
-        )
-    ):
+    traffic = ReplayTraffic(recordings=sort(frame), least_s=3.0)
+    key = episode_keys(range(12))
+    scenes = traffic.scene[traffic.start_of(key)]
+    for row, (scene, steps) in enumerate(zip(scenes, traffic.steps_of(key))):
         rows = frame.filter(pl.col("scene") == traffic.scene_names[scene])
-        first = rows["frame"].max() - steps
-        here = rows.filter(pl.col("frame") == first)
-        ending = rows.group_by("vehicle").agg(pl.col("frame").max().alias("end"))
-        middle = here["x"].median()
-        stays = here.join(ending, on="vehicle").filter(pl.col("end") >= first + 30)
+        first = rows["frame"].max() - int(steps)
+        at = {
+            number: {car["vehicle"]: car for car in now.to_dicts()}
+            for (number,), now in rows.group_by("frame")
+        }
+        middle = np.median([car["x"] for car in at[first].values()])
+        # The ego takes the place of the vehicle nearest the middle that stays for long enough.
         ego = min(
-            stays.to_dicts(),
+            (car for number, car in at[first].items() if number in at[first + 30]),
             key=lambda car: (abs(car["x"] - middle), car["vehicle"]),
         )
-        others = [car for car in here.to_dicts() if car["vehicle"] != ego["vehicle"]]
-        others.sort(
-            key=lambda car: (
-                np.hypot(car["x"] - ego["x"], car["y"] - ego["y"]),
-                car["vehicle"],
-            )
+        others = sorted(
+            (car for car in at[first].values() if car is not ego),
+            key=lambda car: (np.hypot(car["x"] - ego["x"], car["y"] - ego["y"]), car["vehicle"]),
         )
-        for step in (1, 17, steps):
-            now = play(traffic, key[row : row + 1], step)
-            for slot, car in enumerate(others[:8], start=1):
-                samples = rows.filter(
-                    (pl.col("vehicle") == car["vehicle"]) & (pl.col("frame") == first + step)
-                ).to_dicts()
-                assert now.valid[0, slot].item() == bool(samples)
-                if samples:
-                    seen = (
-                        now.x[0, slot] + ego["x"],
-                        now.y[0, slot],
-                        now.speed[0, slot],
-                        now.length[0, slot],
-                    )
-                    expected = [samples[0][name] for name in ("x", "y", "speed", "length")]
-                    assert [value.item() for value in seen] == pytest.approx(expected)
+        slots = [car["vehicle"] for car in (ego, *others)][:9]
+        scene_at = {0: start(traffic, key[row : row + 1])}
+        scene_at |= {step: play(traffic, key[row : row + 1], step) for step in (1, 17, int(steps))}
+        for step, scene in scene_at.items():
+            # The ego is not replayed.
+            for slot in range(1 if step else 0, 9):
+                sample = at[first + step].get(slots[slot])
+                assert scene.valid[0, slot].item() == (sample is not None)
+                if sample is not None:
+                    names = ("x", "y", "speed", "length", "width")
+                    seen = {name: getattr(scene, name)[0, slot].item() for name in names}
+                    expected = {name: sample[name] for name in names}
+                    assert seen == pytest.approx({**expected, "x": sample["x"] - ego["x"]})
+    ego = scene_at[0].at(0)
+    assert (ego.desired_speed, ego.visibility) == (25.0, Visibility.BODY)
 
 
 def test_heading_and_acceleration_are_those_of_the_path():
-    frame = np.arange(60)
-    time = frame * 0.1
+    time = np.arange(60) * 0.1
     path = 10.0 * time + 0.5 * time**2
     # Accelerating at 1 m/s2 along a line that rises by one in two hundred; beside it somebody
     # stands.
-    moving = track(1, frame, 0.0, 10.0, 0).with_columns(x=path, y=path / 200.0, speed=10.0 + time)
-    samples = replay(moving, track(2, frame, 30.0, 0.0, 1), least_s=3.0).samples
+    moving, standing = (track(number, range(60), 30.0, 0.0, 1) for number in (1, 2))
+    moving = moving.with_columns(x=path, y=path / 200.0, speed=10.0 + time)
+    samples = replay(moving, standing, least_s=3.0).samples
     heading, acceleration = (
         samples[:, keys.VEHICLE_FLOATS.index(name)] for name in ("heading", "acceleration")
     )
@@ -241,64 +178,51 @@ def test_a_scene_file_is_read(tmp_path):
 
 def test_without_recordings_it_says_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
-    with pytest.raises(
-        UserError,
-        match=r"no recordings found.*traffic.path=FILE.*GANLANE_DATA",
-    ):
+    with user_error(r"no recordings found.*traffic.path=FILE.*GANLANE_DATA"):
         ReplayTraffic()
 
 
 def test_recordings_that_are_too_short_are_refused():
-    with pytest.raises(UserError, match="no vehicle is recorded for 3 s"):
+    with user_error("no vehicle is recorded for 3 s"):
         replay(*FIVE, least_s=3.0)
 
 
-@pytest.fixture(scope="module")
-def us101() -> ReplayTraffic:
-    try:
-        default_scenes()
-    except UserError as missing:
-        pytest.skip(str(missing))
-    return ReplayTraffic(stream=2)
-
-
-def test_the_us101_scenes_can_all_be_replayed(us101):
-    key = keys_of(range(2000), stream=2)
+@pytest.mark.usefixtures("us101_scenes")  # skips where they are not
+def test_the_us101_scenes_can_all_be_replayed():
+    us101 = ReplayTraffic(stream=2)
+    key = episode_keys(range(2000), stream=2)
     assert len(us101.scene_names) == 11
     assert set(us101.scene[us101.start_of(key)].tolist()) == set(range(11))
-    scene = us101.scenes(9)(key, torch.float32)
     # Nobody starts in a crash: the ego's size is that of the vehicle it replaces.
-    assert not ego_overlaps(scene).any()
+    assert not ego_overlaps(us101.scenes(9)(key, torch.float32)).any()
     assert set(us101.road_of(key).lanes.unique().tolist()) == {5, 6, 7}
 
 
 # Starts that are driven once each
 
-STEADY = [
-    track(1, range(30), 0.0, 20.0, 0, scene="long"),
-    track(2, range(30), 60.0, 20.0, 0, scene="long"),
-    track(1, range(25), 0.0, 20.0, 0, scene="short"),
-    track(2, range(25), 60.0, 20.0, 0, scene="short"),
-]
+
+def two(scene, frames, second_x, second_speed):
+    """The first of the cars in a lane drives 20 m/s."""
+    first = track(1, range(frames), 0.0, 20.0, 0, scene)
+    return first, track(2, range(frames), second_x, second_speed, 0, scene)
+
+
+STEADY = (*two("long", 30, 60.0, 20.0), *two("short", 25, 60.0, 20.0))
 
 
 def test_every_start_is_driven_once_by_its_first_episode():
     traffic = replay(*STEADY)
     episodes = traffic.episodes_once(3, IdmParameters())
-    starts = traffic.start_of(keys_of(episodes, seed=3)).tolist()
+    starts = traffic.start_of(episode_keys(episodes, seed=3)).tolist()
     assert sorted(starts) == list(range(10 + 5))
     assert episodes == sorted(episodes)
-    before = traffic.start_of(keys_of(range(max(episodes)), seed=3)).tolist()
+    before = traffic.start_of(episode_keys(range(max(episodes)), seed=3)).tolist()
     for episode, first in zip(episodes, starts):
         assert first not in before[:episode]
 
 
 def test_starts_at_which_the_ego_would_brake_hard_at_once_are_left_out():
-    close = [
-        track(1, range(30), 0.0, 20.0, 0, scene="close"),
-        track(2, range(30), 7.0, 15.0, 0, scene="close"),
-    ]
-    traffic = replay(*STEADY, *close)
+    traffic = replay(*STEADY, *two("close", 30, 7.0, 15.0))
     episodes = traffic.episodes_once(0, IdmParameters())
     assert set(traffic.scenes_of_episodes(0, episodes)) == {"long", "short"}
 

@@ -1,13 +1,11 @@
 """Traffic driven by a generator, with small random networks."""
 
-from __future__ import annotations
-
 import pytest
 import torch
+from reference.refusals import user_error
 from reference.small_networks import anchored_drivers, small_generator
 from reference.worlds import environment
 
-from ganlane.errors import UserError
 from ganlane.native.drivers import GeneratedDrivers
 from ganlane.settings.driving import IdmParameters
 from ganlane.settings.generated import HEADWAY_QUANTILES_S
@@ -56,24 +54,28 @@ def test_a_vehicle_that_enters_has_driven_straight_at_its_present_speed(module):
     torch.testing.assert_close(td["traffic", "displacement"][1, 4], straight)
 
 
+def moved_with(module, td, index, **changed):
+    """What becomes of the vehicles if the one of this index is somewhere else."""
+    other = td.clone()
+    for name, value in changed.items():
+        other["vehicles", name][:, index] = value
+    return module(other)["moved"]
+
+
 def test_who_is_not_valid_is_not_seen(module):
     td = begin(module)
     td["vehicles", "valid"][:, 3] = False
-    other = td.clone()
-    other["vehicles", "x"][:, 3] += 5.0
-    other["vehicles", "speed"][:, 3] = 1.0
-    one = module(td)["moved"]
-    two = module(other)["moved"]
-    rest = [index for index in range(9) if index != 3]
-    torch.testing.assert_close(one["x"][:, rest], two["x"][:, rest])
+    one = module(td.clone())["moved", "x"]
+    two = moved_with(module, td, 3, x=5.0, speed=1.0)["x"]
+    rest = torch.arange(9) != 3
+    torch.testing.assert_close(one[:, rest], two[:, rest])
 
 
 def test_the_ego_is_a_neighbour_of_the_calibrated_drivers():
     module = calibrated()
     td = begin(module)
-    other = td.clone()
-    other["vehicles", "x"][:, 0] += 10.0
-    assert (module(td)["moved", "speed"][:, 1:] != module(other)["moved", "speed"][:, 1:]).any()
+    away = moved_with(module, td, 0, x=10.0)
+    assert (module(td)["moved", "speed"][:, 1:] != away["speed"][:, 1:]).any()
 
 
 def test_headways_come_from_the_quantiles_given():
@@ -84,7 +86,7 @@ def test_headways_come_from_the_quantiles_given():
 
 
 def test_the_other_presets_weights_are_refused():
-    with pytest.raises(UserError, match="expected 4"):
+    with user_error("expected 4"):
         calibrated(extra_inputs=0)
-    with pytest.raises(UserError, match="expected 0"):
+    with user_error("expected 0"):
         paper(extra_inputs=EXTRA_INPUTS)

@@ -5,7 +5,6 @@ import os
 from contextlib import contextmanager
 
 import pytest
-import torch
 
 from ganlane.agents import Rainbow, RainbowConfig
 from ganlane.build import make_env, make_traffic
@@ -43,7 +42,8 @@ def agent(seed=0, **options):
 
 def settings(decisions, progress=False, **options):
     logger = LoggerConfig(progress=progress)
-    return TrainConfig(total_decisions=decisions, logger=logger, **{"log_every": 400, **options})
+    options = {"log_every": 400, **options}
+    return TrainConfig(total_decisions=decisions, logger=logger, **options)
 
 
 def train(*arguments, **options):
@@ -75,11 +75,9 @@ def signal_at(decisions, number):
 
 
 def rows(path):
+    """The rows of a CSV of figures."""
     with path.open() as file:
-        return list(csv.DictReader(file))
-
-
-def same(first, second):
-    """Whether two agents have the same weights, bit for bit."""
-    pairs = zip(first.weights().values(), second.weights().values(), strict=True)
-    return all(torch.equal(one, other) for one, other in pairs)
+        return [
+            {name: float(figure or "nan") for name, figure in row.items()}
+            for row in csv.DictReader(file)
+        ]

@@ -63,15 +63,13 @@ KIND = "ganlane training checkpoint"
         b"",
         b"weights: none\n",
         3,
-        {"kind": KIND, "version": 1, "state": {}},
-        {"kind": KIND, "version": 2, "state": {}},
+        *({"kind": KIND, "version": version, "state": {}} for version in (1, 2)),
         {"kind": KIND, "version": 2, "state": Bomb()},
     ],
     ids=("empty", "text", "number", "old version", "no state", "pickle"),
 )
-def test_what_is_no_state_of_a_run_is_refused(content, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / "last.pt"
+def test_what_is_no_state_of_a_run_is_refused(content, empty_folder):
+    path = empty_folder / "last.pt"
     if isinstance(content, bytes):
         path.write_bytes(content)
     else:
@@ -79,4 +77,4 @@ def test_what_is_no_state_of_a_run_is_refused(content, tmp_path, monkeypatch):
         seal_archive(path)
     with user_error(r"^resume=[^\n]*last\.pt"):
         TrainingState(road(8), agent()).restore(path)
-    assert not (tmp_path / "executed").exists()
+    assert not (empty_folder / "executed").exists()

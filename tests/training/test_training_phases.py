@@ -4,7 +4,6 @@ What a run starts from and takes over, what it may go on from, and what its agen
 """
 
 from dataclasses import replace
-from pathlib import Path
 
 import entry_tiny
 import pytest
@@ -119,23 +118,18 @@ def test_a_folder_without_an_agent_is_refused(tmp_path):
         read_agent(start_file(str(tmp_path)))
 
 
-def test_a_shipped_name_means_the_shipped_agent_beside_a_folder_of_that_name(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("agent_idm").mkdir()
+def test_a_shipped_name_means_the_shipped_agent_beside_a_folder_of_that_name(empty_folder):
+    (empty_folder / "agent_idm").mkdir()
     assert start_file("agent_idm") == "agent_idm"
 
 
 # --- experiments, lengths, learning rates
 
-EXPERIMENTS = sorted(
-    str(path.relative_to(conf_folder() / "experiment").with_suffix(""))
-    for path in (conf_folder() / "experiment").rglob("*.yaml")
-)
+FOLDER = conf_folder() / "experiment"
+EXPERIMENTS = sorted(str(path.relative_to(FOLDER))[:-5] for path in FOLDER.rglob("*.yaml"))
 
 
-@pytest.mark.parametrize(
-    "overrides", [[], *([f"experiment={name}"] for name in EXPERIMENTS)], ids=str
-)
+@pytest.mark.parametrize("overrides", [[], *([f"experiment={name}"] for name in EXPERIMENTS)])
 def test_every_experiment_composes_and_fits_the_agent_that_it_starts_from(overrides):
     config = settings("train", overrides)
     if config.init.path is not None:
@@ -161,19 +155,11 @@ def test_a_first_phase_that_is_over_must_be_the_one_asked_for(tmp_path):
 
 
 def test_a_falling_learning_rate_has_reached_its_end_when_its_phase_is_over(tmp_path):
-    told = [
-        "experiment=paper",
-        "agent.learning_rate_end=1e-5",
-        "pretrain.total_decisions=5000",
-        "total_decisions=90",
-    ]
-    config = settings("train", told)
-    lengths = [
-        make_agent(phase).config.learning_rate_decisions for phase in phases_of(config, tmp_path)
-    ]
-    assert lengths == [5000, 90]
-    config = replace(config, agent=replace(config.agent, learning_rate_decisions=300))
-    assert make_agent(phases_of(config, tmp_path)[0]).config.learning_rate_decisions == 300
+    words = ["experiment=paper", "agent.learning_rate_end=1e-5", "pretrain.total_decisions=5000"]
+    for more, lengths in (([], [5000, 90]), (["agent.learning_rate_decisions=300"], [300, 300])):
+        phases = phases_of(settings("train", [*words, "total_decisions=90", *more]), tmp_path)
+        agents = [make_agent(phase).config for phase in phases]
+        assert [agent.learning_rate_decisions for agent in agents] == lengths
 
 
 # --- masks

@@ -8,19 +8,21 @@ from ganlane.training.stats import EpisodeStats
 
 
 def step(reward, done, distance=0.0, lane_changes=0, action=0, value=None, **events):
-    rows = len(reward)
-    no = [False] * rows
-    td = TensorDict(batch_size=[rows])
-    td["action"] = torch.full((rows,), action)
-    td["next", "reward"] = torch.tensor(reward)[:, None]
-    td["next", "done"] = torch.tensor(done)[:, None]
-    for name in ("hard_crash", "goal"):
-        td["next", "events", name] = torch.tensor(events.get(name, no))[:, None]
-    td["next", "ego", "distance"] = torch.full((rows,), distance)
-    td["next", "ego", "lane_changes"] = torch.full((rows,), lane_changes)
-    if value is not None:
-        td["chosen_action_value"] = torch.tensor(value)[:, None]
-    return td
+    no = [False] * len(reward)
+    after = {
+        "reward": torch.tensor(reward)[:, None],
+        "done": torch.tensor(done)[:, None],
+        "events": {
+            name: torch.tensor(events.get(name, no))[:, None] for name in ("hard_crash", "goal")
+        },
+        "ego": {
+            "distance": torch.full((len(reward),), distance),
+            "lane_changes": torch.full((len(reward),), lane_changes),
+        },
+    }
+    written = {} if value is None else {"chosen_action_value": torch.tensor(value)[:, None]}
+    written |= {"action": torch.full((len(reward),), action), "next": after}
+    return TensorDict(written, [len(reward)])
 
 
 def test_returns_and_rates_are_those_of_the_finished_episodes():

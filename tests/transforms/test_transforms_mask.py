@@ -1,11 +1,10 @@
 """The action mask: what is allowed, for whom, and that policies, replay and losses respect it."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from reference import scalar
-from reference.worlds import environment, random_scenes, vehicles
+from reference.refusals import user_error
+from reference.worlds import environment, random_scenes, rows_of, vehicles
 from tensordict import TensorDict
 from torchrl.envs import ActionMask, Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -14,7 +13,6 @@ import ganlane
 from ganlane import keys
 from ganlane.agents.drivers import ExploringPolicy, GreedyPolicy, MaskedPolicy, RandomDriver
 from ganlane.build import make_driver
-from ganlane.errors import UserError
 from ganlane.settings.commands import DrivingConfig
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import MaskParameters
@@ -34,6 +32,7 @@ def allowed(*cars, form="safe", direction=0, abort=False, limit=4.0):
 
 # --- what is allowed
 
+ALONE = ({"x": 0.0, "lane": 1}, {"x": 500.0, "lane": 0})
 LEFT_ONLY = [True, True, False]
 RIGHT_ONLY = [True, False, True]
 BESIDE = [{"x": 0.0, "lane": 1}, {"x": 1.0, "lane": 2}, {"x": -1.0, "lane": 0}]
@@ -47,23 +46,19 @@ def test_commands_off_the_road_are_never_allowed(lane, expected):
 def test_every_row_has_the_lanes_of_its_own_road():
     road = Road(lanes=torch.tensor([[2], [3]]), lane_width_m=torch.tensor([[4.0], [4.0]]))
     middle = vehicles({"x": 0.0, "lane": 1})
-    both = Vehicles(*(field.repeat(2, 1) for field in middle))
+    both = rows_of(middle, [0, 0])
     mask, _ = ActionMaskTransform(road, "legal").allowed(both, torch.zeros(2).long(), road)
     assert mask.tolist() == [RIGHT_ONLY, ALL]
 
 
 @pytest.mark.parametrize("form", ["legal", "safe"])
 def test_during_a_lane_change_nothing_but_keeping_is_allowed(form):
-    assert (
-        allowed({"x": 0.0, "lane": 1}, {"x": 500.0, "lane": 0}, form=form, direction=1)[0]
-        == KEEP_ONLY
-    )
+    assert allowed(*ALONE, form=form, direction=1)[0] == KEEP_ONLY
 
 
 @pytest.mark.parametrize(("direction", "expected"), [(0, ALL), (1, RIGHT_ONLY), (-1, LEFT_ONLY)])
 def test_who_may_turn_back_may_give_the_opposite_command_alone(direction, expected):
-    turning = {"form": "legal", "abort": True, "direction": direction}
-    assert allowed({"x": 0.0, "lane": 1}, {"x": 500.0, "lane": 0}, **turning)[0] == expected
+    assert allowed(*ALONE, form="legal", abort=True, direction=direction)[0] == expected
 
 
 def test_turning_back_must_be_safe_too():
@@ -75,34 +70,19 @@ def test_turning_back_must_be_safe_too():
 
 
 @pytest.mark.parametrize(
-    ("ego", "other", "braking", "with_it", "without"),
+    ("ego", "other", "with_it", "without"),
     [
-        # Of the new follower, and of the ego behind its new leader.
-        (
-            (0, 15.0),
-            {"x": -60.0, "lane": 1, "speed": 24.0},
-            -scalar.idm(24.0, 25.0, 60.0 - 4.5, 15.0),
-            LEFT_ONLY,
-            KEEP_ONLY,
-        ),
-        (
-            (1, 25.0),
-            {"x": 65.0, "lane": 2, "speed": 15.0},
-            -scalar.idm(25.0, 25.0, 65.0 - 4.5, 15.0),
-            ALL,
-            RIGHT_ONLY,
-        ),
+        # Of the new follower, and of the ego behind its new leader; both are behind one at 15 m/s.
+        ({"lane": 0, "speed": 15.0}, {"x": -60.0, "lane": 1, "speed": 24.0}, LEFT_ONLY, KEEP_ONLY),
+        ({"lane": 1, "speed": 25.0}, {"x": 65.0, "lane": 2, "speed": 15.0}, ALL, RIGHT_ONLY),
     ],
 )
-def test_a_change_is_allowed_up_to_the_braking_that_it_asks_for(
-    ego, other, braking, with_it, without
-):
-    """The deceleration is worked out by hand.
-
-    A limit a little above it allows, a little below forbids.
-    """
-    car = {"x": 0.0, "lane": ego[0], "speed": ego[1]}
+def test_a_change_is_allowed_up_to_the_braking_that_it_asks_for(ego, other, with_it, without):
+    """A limit a little above the deceleration allows, a little below forbids."""
+    gap = abs(other["x"]) - 4.5
+    braking = -scalar.idm(max(ego["speed"], other["speed"]), 25.0, gap, 15.0)
     assert 4.0 < braking < 20.0
+    car = {"x": 0.0, **ego}
     assert allowed(car, other, limit=braking + 1e-6)[0] == with_it
     assert allowed(car, other, limit=braking - 1e-6)[0] == without
 
@@ -122,7 +102,7 @@ def test_keeping_the_lane_is_allowed_when_nothing_is_safe_and_that_is_reported()
 
 
 @pytest.fixture(scope="module")
-def crowd() -> Vehicles:
+def crowd():
     """4096 egos among eleven others each, in float32 as in the kernel."""
     fields = random_scenes(4096, 12, 3, seed=5)
     return Vehicles(*(field.float() if field.is_floating_point() else field for field in fields))
@@ -132,8 +112,10 @@ IDLE = torch.zeros(4096, dtype=torch.int64)
 
 
 def test_foresight_forbids_what_safe_forbids_and_more(crowd):
-    safe, _ = ActionMaskTransform(Road(), "safe").allowed(crowd, IDLE, Road())
-    foresight, _ = ActionMaskTransform(Road(), "foresight").allowed(crowd, IDLE, Road())
+    safe, foresight = (
+        ActionMaskTransform(Road(), form).allowed(crowd, IDLE, Road())[0]
+        for form in ("safe", "foresight")
+    )
     assert not (foresight & ~safe).any()
     share = foresight[:, 1:].sum() / safe[:, 1:].sum()
     assert 0.5 < share < 0.98
@@ -143,10 +125,8 @@ def test_foresight_forbids_what_safe_forbids_and_more(crowd):
 @pytest.mark.parametrize("form", ["safe", "foresight"])
 def test_the_kernel_allows_what_the_tensor_code_allows(crowd, form):
     transform = ActionMaskTransform(Road(), form, native_vehicles=12)
-    mask, none = transform.allowed(crowd, IDLE, Road())
-    by_kernel, none_by_kernel = transform.native.allowed(crowd, IDLE)
-    assert torch.equal(by_kernel, mask)
-    assert torch.equal(none_by_kernel, none)
+    by_kernel = transform.native.allowed(crowd, IDLE)
+    assert all(map(torch.equal, by_kernel, transform.allowed(crowd, IDLE, Road())))
 
 
 # --- in the environment
@@ -169,14 +149,13 @@ def test_the_specs_hold_and_torchrls_own_action_mask_draws_from_it():
 
 
 def test_a_random_driver_behind_the_legal_mask_never_leaves_the_road():
-    env = masked("legal", num_envs=32, stream=2)
-    policy = MaskedPolicy(RandomDriver(env.base_env.road, 2))
-    rollout = env.rollout(10, policy, break_when_any_done=False)
-    assert not bool(rollout["next", "events", "out_of_road"].any())
-    bare = environment(num_envs=16, stream=2).rollout(
-        5, RandomDriver(Road(), 2), break_when_any_done=False
-    )
-    assert bool(bare["next", "events", "out_of_road"].any())
+    driver = RandomDriver(Road(), 2)
+    for env, policy, leaves_it in (
+        (masked("legal", num_envs=32, stream=2), MaskedPolicy(driver), False),
+        (environment(num_envs=16, stream=2), driver, True),
+    ):
+        after = env.rollout(10, policy, break_when_any_done=False)["next"]
+        assert bool(after["events", "out_of_road"].any()) == leaves_it
 
 
 def test_the_mask_sees_what_the_ego_perceives_and_not_the_truth():
@@ -212,14 +191,12 @@ def test_exploration_draws_allowed_actions_alone():
     policy = ExploringPolicy(Values(), torch.Generator().manual_seed(0), legal=lambda state: 1 / 0)
     policy.epsilon = 1.0
     mask = torch.tensor([LEFT_ONLY]).expand(300, 3)
-    drawn = policy(TensorDict({"observation": torch.zeros(300, 4), "action_mask": mask}, [300]))[
-        "action"
-    ]
-    assert set(drawn.tolist()) == {0, 1}
+    state = TensorDict({"observation": torch.zeros(300, 4), "action_mask": mask}, [300])
+    assert set(policy(state)["action"].tolist()) == {0, 1}
 
 
 def test_a_masked_driver_in_an_environment_without_a_mask_is_refused():
-    with pytest.raises(UserError, match="no action_mask"):
+    with user_error("no action_mask"):
         MaskedPolicy(RandomDriver(Road(), 2))(environment().reset())
 
 
@@ -246,5 +223,5 @@ def test_a_suffix_puts_any_driver_behind_a_mask_or_takes_it_away():
     ],
 )
 def test_mistakes_end_in_one_sentence(make, expected):
-    with pytest.raises(UserError, match=expected):
+    with user_error(expected):
         make()

@@ -3,18 +3,16 @@
 Table III entry by entry, the lane view, the fixed order, lengths.
 """
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest
 import torch
+from reference.refusals import user_error
 from reference.worlds import DOUBLE, vehicles
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from ganlane.env import HighwayEnv
-from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.observation import largest_number
 from ganlane.settings.road import EXIT, WALL, LaneStretch
@@ -22,25 +20,21 @@ from ganlane.sim import Road
 from ganlane.traffic import IdmMobilTraffic
 from ganlane.transforms import OBSERVATIONS, ObservationTransform, RewardTransform, observation_size
 
-EGO = (0.0, 1, 20.0, 25.0)
+ROAD = Road(3)
+EGO = (0.0, 1, 20.0)
 NOBODY = [1.0, 0.0, 0.0]
 
 
-def observed(scene, form, lanes=3, progress=0.0, direction=0):
+def observed(scene, form, road=ROAD, progress=0.0, direction=0):
     """The observation [D] of a scene of one row."""
-    transform = ObservationTransform(Road(lanes), scene.x.shape[1], form)
+    transform = ObservationTransform(road, scene.x.shape[1], form)
     progress = torch.tensor([progress], dtype=DOUBLE)
-    return transform.observe(scene, progress, torch.tensor([direction]), transform.road, scene)[0]
+    return transform.observe(scene, progress, torch.tensor([direction]), road, scene)[0]
 
 
-def observe(form, rows, valid=None, sideways=0.0, **options):
-    """The same of (x, lane, speed, desired speed or 25 m/s) per vehicle, the ego first."""
-    names = ("x", "lane", "speed", "desired_speed")
-    cars = [
-        {**dict(zip(names, row)), "valid": valid is None or valid[i]} for i, row in enumerate(rows)
-    ]
-    scene = vehicles(*cars)
-    return observed(scene.with_(y=scene.y + sideways), form, **options)
+def scene_of(*rows):
+    """(x, lane, speed) of every vehicle, the ego first; all would like 25 m/s."""
+    return vehicles(*(dict(zip(("x", "lane", "speed"), row)) for row in rows))
 
 
 def neighbours_in(values, numbers=4):
@@ -48,54 +42,47 @@ def neighbours_in(values, numbers=4):
     return values[3:-2].reshape(6, numbers)
 
 
-FAR = [EGO, (900.0, 1, 60.0, 20.0), (-900.0, 1, 0.0, 20.0)]
-ONE_LANE = [(0.0, 0, 20.0, 25.0), (50.0, 0, 20.0, 20.0)]
-
-
 @pytest.mark.parametrize(
-    ("rows", "options", "where", "expected"),
+    ("rows", "expected"),
     [
-        # The ego's speed over its desired speed, not clipped, and the lanes beside it.
-        ([EGO, (50.0, 1, 20.0, 20.0)], {}, slice(3), [0.8, 1.0, 1.0]),
-        ([(0.0, 2, 20.0, 25.0), (50.0, 1, 20.0, 20.0)], {}, slice(3), [0.8, 0.0, 1.0]),
-        ([(0.0, 0, 20.0, 25.0), (50.0, 1, 20.0, 20.0)], {}, slice(3), [0.8, 1.0, 0.0]),
-        ([(0.0, 1, 30.0, 25.0), (50.0, 1, 20.0, 20.0)], {}, slice(1), [1.2]),
-        # Another vehicle: position over 200 m, speed over 30 m/s, half a unit per lane.
-        ([EGO, (50.0, 2, 26.0, 20.0)], {}, slice(3, None), [0.25, 0.2, 0.5]),
-        ([(0.0, 2, 20.0, 25.0), (-20.0, 0, 14.0, 20.0)], {}, slice(3, None), [-0.1, -0.2, -1.0]),
+        # The ego's speed over its desired speed, not clipped, and the lanes beside it. Then another
+        # vehicle: position over 200 m, speed over 30 m/s, half a unit per lane.
+        ([EGO, (50.0, 2, 26.0)], [0.8, 1.0, 1.0, 0.25, 0.2, 0.5]),
+        ([(0.0, 2, 20.0), (-20.0, 0, 14.0)], [0.8, 0.0, 1.0, -0.1, -0.2, -1.0]),
+        ([(0.0, 0, 30.0), (50.0, 1, 30.0)], [1.2, 1.0, 0.0, 0.25, 0.0, 0.5]),
         # The nearest first, whatever their index; far ones are clipped to one.
         (
-            [EGO, (90.0, 1, 20.0), (-30.0, 1, 20.0), (60.0, 1, 20.0)],
-            {},
-            slice(3, None, 3),
-            [-0.15, 0.3, 0.45],
+            [EGO, (90.0, 1, 20.0), (-30.0, 1, 20.0), (900.0, 1, 60.0), (-901.0, 1, 0.0)],
+            [0.8, 1.0, 1.0, -0.15, 0.0, 0.0, 0.45, 0.0, 0.0, 1.0, 1.0, 0.0, -1.0, -2 / 3, 0.0],
         ),
-        (FAR, {}, slice(3, None, 3), [1.0, -1.0]),
-        (FAR, {}, slice(4, 5), [1.0]),
-        # One that is not valid reads far ahead and comes last.
-        (
-            [EGO, (10.0, 1, 26.0, 20.0), (50.0, 1, 26.0, 20.0)],
-            {"valid": [True, False, True]},
-            slice(3, None),
-            [0.25, 0.2, 0.0, 1.0, 0.0, 0.0],
-        ),
-        # On a road of one lane there is none beside the ego, and the lane difference is zero.
-        (ONE_LANE, {"lanes": 1}, slice(1, 3), [0.0, 0.0]),
-        (ONE_LANE, {"lanes": 1}, slice(5, 6), [0.0]),
     ],
 )
-def test_table_3(rows, options, where, expected):
-    assert observe("table3", rows, **options)[where].tolist() == pytest.approx(expected)
+def test_table_3(rows, expected):
+    assert observed(scene_of(*rows), "table3").tolist() == pytest.approx(expected)
+
+
+def test_in_table_3_one_that_is_not_valid_reads_far_ahead_and_comes_last():
+    scene = scene_of(EGO, (10.0, 1, 26.0), (50.0, 1, 26.0))
+    scene.valid[0, 1] = False
+    expected = [0.25, 0.2, 0.0, *NOBODY]
+    assert observed(scene, "table3")[3:].tolist() == pytest.approx(expected)
+
+
+def test_in_table_3_a_road_of_one_lane_has_none_beside_the_ego_and_no_lane_difference():
+    scene = scene_of((0.0, 0, 20.0), (50.0, 0, 20.0))
+    expected = [0.8, 0.0, 0.0, 0.25, 0.0, 0.0]
+    assert observed(scene, "table3", Road(1)).tolist() == pytest.approx(expected)
 
 
 def test_progress_adds_the_egos_own_lane_change():
-    values = observe("table3_progress", [EGO, (50.0, 1, 20.0, 20.0)], progress=0.25, direction=-1)
+    scene = scene_of(EGO, (50.0, 1, 20.0))
+    values = observed(scene, "table3_progress", progress=0.25, direction=-1)
     assert values[-2:].tolist() == [0.25, -1.0]
 
 
 def test_the_lane_view_holds_the_nearest_ahead_and_behind_in_three_lanes():
-    rows = [EGO, (50.0, 2, 26.0, 20.0), (90.0, 2, 20.0, 20.0), (-34.5, 1, 14.0, 20.0)]
-    view = neighbours_in(observe("lane_view", rows), 3)
+    scene = scene_of(EGO, (50.0, 2, 26.0), (90.0, 2, 20.0), (-34.5, 1, 14.0))
+    view = neighbours_in(observed(scene, "lane_view"), 3)
     gap = 45.5
     assert view[0].tolist() == pytest.approx([gap / 200, np.exp(-gap / 15.0), 0.2])
     assert view[3].tolist() == pytest.approx([30.0 / 200, np.exp(-2.0), -0.2])
@@ -103,23 +90,23 @@ def test_the_lane_view_holds_the_nearest_ahead_and_behind_in_three_lanes():
 
 
 def test_a_lane_change_shows_in_the_drift_before_its_middle():
-    rows = [EGO, (50.0, 2, 26.0, 20.0), (-34.5, 1, 14.0, 20.0)]
-    sideways = torch.tensor([[0.0, -1.2, 0.5]])
-    view = neighbours_in(observe("lane_view_drift", rows, sideways=sideways))
+    scene = scene_of(EGO, (50.0, 2, 26.0), (-34.5, 1, 14.0))
+    moved = scene.with_(y=scene.y + torch.tensor([[0.0, -1.2, 0.5]]))
+    view = neighbours_in(observed(moved, "lane_view_drift"))
     assert view[:, 3].tolist() == pytest.approx([-0.6, 0.0, 0.0, 0.25, 0.0, 0.0])
-    assert torch.equal(view[:, :3], neighbours_in(observe("lane_view", rows), 3))
+    assert torch.equal(view[:, :3], neighbours_in(observed(scene, "lane_view"), 3))
 
 
 @pytest.mark.parametrize(("ahead_m", "gap_m"), [(0.0, -4.5), (1.5, -3.0), (4.5, 0.0), (30.0, 25.5)])
 @pytest.mark.parametrize("way", [1, -1])
 def test_gaps_below_zero_tell_how_far_beside_somebody_is(ahead_m, gap_m, way):
-    rows = [EGO, (way * ahead_m, 2, 26.0, 20.0)]
+    scene = scene_of(EGO, (way * ahead_m, 2, 26.0))
     row = 0 if way * ahead_m > 0 else 1
-    view = neighbours_in(observe("lane_view_overlap", rows))
+    view = neighbours_in(observed(scene, "lane_view_overlap"))
     assert view[row, 0].item() == pytest.approx(gap_m / 200)
     assert view[row, 1].item() == pytest.approx(1 - gap_m if gap_m <= 0 else np.exp(-gap_m / 15))
     assert view[1 - row].tolist() == [*NOBODY, 0.0]
-    flat = neighbours_in(observe("lane_view_drift", rows))
+    flat = neighbours_in(observed(scene, "lane_view_drift"))
     assert flat[row, 0].item() == pytest.approx(max(gap_m, 0.0) / 200)
 
 
@@ -133,7 +120,7 @@ def test_every_form_has_the_size_it_says_and_a_spec_that_holds(form):
 
 
 def test_an_unknown_form_is_refused_with_the_known_ones():
-    with pytest.raises(UserError, match="table3_progress"):
+    with user_error("table3_progress"):
         ObservationTransform(Road(), 9, "pixels")
 
 
@@ -151,21 +138,6 @@ def test_no_number_but_the_first_exceeds_the_largest_of_its_form(form, length_m)
         assert largest == 1.0
 
 
-# Lengths
-
-
-@pytest.mark.parametrize(("row", "x_m", "lane"), [(0, 30.0, 2), (5, -30.0, 0)])
-def test_the_gap_to_a_lorry_is_bumper_to_bumper_ahead_and_behind(row, x_m, lane):
-    """Centres 30 m apart.
-
-    2.25 m of the car and 6 m of the lorry lie between them, so 21.75 m are free.
-    """
-    lorry = {"x": x_m, "lane": lane, "length": 12.0}
-    view = neighbours_in(observed(vehicles({"x": 0.0, "lane": 1}, lorry), "lane_view"), 3)
-    assert view[row, 0].item() == pytest.approx(21.75 / 200)
-    assert view[row, 1].item() == pytest.approx(np.exp(-21.75 / 15.0))
-
-
 @pytest.mark.parametrize(("share", "largest"), [(0.0, 5.5), (0.5, 13.0)])
 def test_the_bounds_of_the_gymnasium_space_know_of_lorries(share, largest):
     space = gymnasium.make("ganlane/Highway-v0", env=EnvConfig(truck_share=share)).observation_space
@@ -175,13 +147,10 @@ def test_the_bounds_of_the_gymnasium_space_know_of_lorries(share, largest):
 # Where lanes begin and end
 
 
-def road_numbers(x: float, lane: int, *stretches: LaneStretch) -> list[float]:
+def road_numbers(x, lane, *stretches):
     """The last 8 numbers of ``road_view``, of an ego with its front at ``x``."""
     road = Road(len(stretches), stretches=stretches)
-    cars = vehicles({"x": x - 2.25, "lane": lane}, {"x": -900.0, "lane": 0})
-    zero = torch.zeros(1, dtype=DOUBLE)
-    transform = ObservationTransform(road, 2, "road_view")
-    return transform.observe(cars, zero, zero.long(), road, cars)[0, -8:].tolist()
+    return observed(scene_of((x - 2.25, lane), (-900.0, 0)), "road_view", road)[-8:].tolist()
 
 
 def test_the_road_view_tells_how_far_the_lanes_go_on_and_when_they_begin():

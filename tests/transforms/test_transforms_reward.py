@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from reference.refusals import user_error
 from reference.worlds import packed
 from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
@@ -9,7 +10,6 @@ from torchrl.envs import Compose, TransformedEnv
 from ganlane import keys
 from ganlane.agents.drivers import RandomDriver
 from ganlane.env import HighwayEnv
-from ganlane.errors import UserError
 from ganlane.settings.env import EnvConfig, check_reward
 from ganlane.traffic import IdmMobilTraffic
 from ganlane.transforms import RewardParameters, RewardTransform
@@ -20,24 +20,19 @@ CONSIDERATE = RewardParameters(soft_crash_behind=-10.0)
 
 def outcome(speed=20.0, mean_acceleration=0.0, started=False, soft=0, behind=0, **events):
     """The state after a decision of one ego with a desired speed of 25 m/s."""
-    flags = {name: torch.tensor([[events.get(name, False)]]) for name in keys.END_EVENTS}
-    vehicles = {
-        "speed": torch.tensor([[speed, 0.0]]),
-        "desired_speed": torch.tensor([[25.0, 20.0]]),
+    events = {**dict.fromkeys(keys.END_EVENTS, False), **events}
+    events |= {"soft_crash": soft, "soft_crash_behind": behind}
+    content = {
+        "vehicles": {"speed": [speed, 0.0], "desired_speed": [25.0, 20.0]},
+        "ego": {"mean_acceleration": mean_acceleration, "started_change": started},
+        "events": {name: [value] for name, value in events.items()},
     }
-    ego = {
-        "mean_acceleration": torch.tensor([mean_acceleration]),
-        "started_change": torch.tensor([started]),
-    }
-    onsets = {"soft_crash": torch.tensor([[soft]]), "soft_crash_behind": torch.tensor([[behind]])}
-    content = {"vehicles": vehicles, "ego": ego, "events": {**flags, **onsets}}
-    return TensorDict({k: TensorDict(v, [1]) for k, v in content.items()}, [1])
+    return TensorDict(content).unsqueeze(0)
 
 
-def terms(parameters=None, period=1.0, **what):
-    return {
-        k: v.item() for k, v in RewardTransform(period, parameters).terms(outcome(**what)).items()
-    }
+def terms(parameters=None, **what):
+    paid = RewardTransform(1.0, parameters).terms(outcome(**what))
+    return {name: value.item() for name, value in paid.items()}
 
 
 @pytest.mark.parametrize(
@@ -58,9 +53,8 @@ def terms(parameters=None, period=1.0, **what):
 )
 def test_the_speed_reward(speed, mean_acceleration, literal, reward):
     parameters = RewardParameters(literal_low_acceleration=literal)
-    assert terms(parameters, speed=speed, mean_acceleration=mean_acceleration)[
-        "speed"
-    ] == pytest.approx(reward)
+    paid = terms(parameters, speed=speed, mean_acceleration=mean_acceleration)
+    assert paid["speed"] == pytest.approx(reward)
 
 
 @pytest.mark.parametrize(
@@ -81,14 +75,14 @@ def test_each_event_has_its_price(what, term, value):
 
 @pytest.mark.parametrize("parameters", [RewardParameters(), CONSIDERATE])
 def test_the_reward_is_the_sum_of_its_terms_and_zero_after_a_reset(parameters):
-    """Dense traffic, in which some end, and some get close in front of others."""
+    """Dense traffic, in which some end."""
     base = HighwayEnv(
         IdmMobilTraffic(), num_envs=32, spawn_parameters=packed(60.0, 12.0), kernel="auto"
     )
     env = TransformedEnv(base, Compose(RewardTransform(1.0, parameters)))
     state = env.reset()
     driver = RandomDriver(base.road)
-    ended = close = 0
+    ended = 0
     names = parameters.term_names
     assert env.observation_spec.contains(state.select(*env.observation_spec.keys()))
     assert all((state[keys.REWARD_TERMS, name] == 0).all() for name in names)
@@ -100,12 +94,7 @@ def test_the_reward_is_the_sum_of_its_terms_and_zero_after_a_reset(parameters):
         ended += int(after["done"].sum())
         started = state[keys.REWARD_TERMS][after["done"][:, 0]]
         assert all((started[name] == 0).all() for name in names)
-        if parameters is CONSIDERATE:
-            onsets = after[keys.EVENTS, "soft_crash_behind"]
-            close += int(onsets.sum())
-            assert torch.equal(after[keys.REWARD_TERMS, "soft_crash_behind"], -10.0 * onsets)
     assert ended > 0
-    assert close > 0 or parameters is not CONSIDERATE
 
 
 def test_the_paper_charges_nothing_for_danger_behind_and_has_no_such_term():
@@ -123,5 +112,5 @@ def test_considerate_charges_per_onset_behind_and_is_the_paper_otherwise():
 def test_an_ego_meant_to_drive_no_faster_than_15_mps_would_be_paid_for_crawling_and_is_refused():
     one = torch.ones(1)
     assert speed_reward(one, one, 0.0 * one, RewardParameters()).item() == pytest.approx(1.0)
-    with pytest.raises(UserError, match="ego_desired_speed_mps=1"):
+    with user_error("ego_desired_speed_mps=1"):
         check_reward(EnvConfig(ego_desired_speed_mps=1.0), RewardParameters())

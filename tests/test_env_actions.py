@@ -1,14 +1,9 @@
 """Egos that are commanded more than a lane: `lane_speed` and `continuous`."""
 
-from __future__ import annotations
-
-import warnings
-
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
 from reference.refusals import user_error
 from reference.worlds import environment, placed, same_bits, step, vehicles
 from torchrl.envs.utils import check_env_specs
@@ -155,16 +150,8 @@ def test_a_line_beside_which_there_is_no_lane_yet_must_not_be_crossed():
 @pytest.mark.parametrize(
     ("actions", "env"), [("lane", "highway"), ("lane_speed", "merge"), ("continuous", "exit")]
 )
-def test_torchrl_and_gymnasium_find_nothing_wrong(actions, env):
+def test_torchrl_finds_nothing_wrong(actions, env):
     check_env_specs(ganlane.make_env(num_envs=3, env=env, actions=actions))
-    highway = gymnasium.make(
-        "ganlane/Highway-v0", env=env, actions=actions, render_mode="rgb_array"
-    ).unwrapped
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(highway, skip_render_check=True)
-    highway.step(highway.action_space.sample())
-    assert highway.render().ndim == 3
 
 
 @pytest.mark.parametrize(

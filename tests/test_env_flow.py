@@ -1,7 +1,5 @@
 """Vehicles that enter a road and leave it."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from reference.refusals import user_error

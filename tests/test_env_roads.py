@@ -1,7 +1,5 @@
 """Roads whose lanes begin and end: what drivers do there, and what the ego may."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from entry_own_parts import Cruise

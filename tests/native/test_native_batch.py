@@ -49,6 +49,7 @@ def any_commands(rows, rng):
     ("traffic", "options"),
     [
         *((traffic, {}) for traffic in ("idm_random", "human", "gan", "gan_calibrated", MIXED)),
+        *(({"name": name, "blind_share": 0.5}, {}) for name in ("gan", "idm")),
         ("idm_mobil", {"env": "merge", "observation": "road_view"}),
         ("idm_mobil", {"env": "exit", "observation": "road_view", "mask": "safe"}),
         ("idm_faults", {"env": "lane_drop", "observation": "lane_view", "mask": "legal"}),

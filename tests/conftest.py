@@ -1,7 +1,5 @@
 """Settings of the whole suite; makes the plain helper modules of ``tests/reference`` importable."""
 
-from __future__ import annotations
-
 import gc
 import os
 import shutil
@@ -85,6 +83,26 @@ def empty_folder(tmp_path, monkeypatch):
     """The working folder: an empty one."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture(scope="session")
+def three_scenes(tmp_path_factory):
+    """A scene CSV of three made-up scenes of 7 s."""
+    from reference.scene_csv import write_scene_csv
+    from reference.synthetic import SyntheticTraffic, synthetic_scenes
+
+    path = tmp_path_factory.mktemp("recordings") / "scenes.csv"
+    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=3, seconds=7.0), seed=0), path)
+    return path
+
+
+@pytest.fixture
+def room_on_disk():
+    """No file may grow beyond a size: the same errors as on a full disk, with another errno."""
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from functools import partial
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from reference.processes import ROOT
 from reference.refusals import user_error
 
 import ganlane
+from ganlane.agents.checkpoint import agent_file
 from ganlane.config.run import run_command, settings
 from ganlane.evaluation.rows import FAILURES
 from ganlane.suite import cells
@@ -39,6 +41,10 @@ def results():
     return json.loads(Path("out/results.json").read_text())
 
 
+def entries(told):
+    return {entry["entry"]: entry for entry in told["entries"]}
+
+
 def test_one_command_leaves_a_table_results_and_a_page_with_films_of_failures(cells_driven, capsys):
     # Who drives at random leaves the road in the first seconds.
     scored = [*ALONE, "suite.scored={idm_mobil: 3, gan: 2}"]
@@ -50,13 +56,9 @@ def test_one_command_leaves_a_table_results_and_a_page_with_films_of_failures(ce
     assert len(cells_driven) == len(set(cells_driven)) == 2 * (3 + 5)
     told = results()
     assert told["protocol"] == protocol
-    assert {entry["entry"]: entry["trainings"] for entry in told["entries"]} == {
-        "random_legal": 1,
-        "mobil": 1,
-        "agent_idm+none": 5,
-        "random": 1,
-    }
-    by_name = {entry["entry"]: entry for entry in told["entries"]}
+    by_name = entries(told)
+    trainings = {"random_legal": 1, "mobil": 1, "agent_idm+none": 5, "random": 1}
+    assert {name: entry["trainings"] for name, entry in by_name.items()} == trainings
     assert (by_name["random_legal"]["score"], by_name["mobil"]["score"]) == (0.0, 100.0)
     jsonschema.validate(told, SCHEMA)
     page = Path("out/report.html").read_text()
@@ -125,17 +127,13 @@ def test_a_function_that_returns_something_else_is_refused_in_one_sentence(retur
     assert "drive: returned" in capsys.readouterr().err
 
 
-def test_a_folder_of_trainings_is_one_entry(cells_driven):
-    from ganlane.agents.checkpoint import agent_file
-
+def test_a_folder_of_trainings_is_one_entry():
     for number in range(2):
         folder = Path(f"sweep/{number}")
         folder.mkdir(parents=True)
-        agent = agent_file("agent_idm").read_bytes()
-        (folder / "agent.safetensors").write_bytes(agent)
+        shutil.copy(agent_file("agent_idm"), folder / "agent.safetensors")
     assert main([*ALONE, "sweep"]) == 0
-    by_name = {entry["entry"]: entry for entry in results()["entries"]}
-    assert by_name["sweep"]["trainings"] == 2
+    assert entries(results())["sweep"]["trainings"] == 2
 
 
 def test_the_protocol_is_that_of_everybody_and_changes_with_whatever_changes_a_result():
@@ -155,14 +153,11 @@ def test_python_takes_a_function_a_driver_and_names_of_your_own():
     suite = {"name": "shift-v1", "scored": {"idm": 3}, "shown": {}, "baselines": []}
     suite["env"] = {"goal_m": 60}
     driver = ganlane.load_agent("agent_idm")
-    run = ganlane.benchmark(
-        {"mine": straight_on, "theirs": driver, "rule": "keep_lane"},
-        suite=suite,
-        folder="out",
-    )
-    scores = {entry["entry"]: entry["score"] for entry in run.results["entries"]}
+    agents = {"mine": straight_on, "theirs": driver, "rule": "keep_lane"}
+    run = ganlane.benchmark(agents, suite=suite, folder="out")
+    scores = {name: entry["score"] for name, entry in entries(run.results).items()}
     assert {row["traffic"] for row in run.results["rows"]} == {"idm"}
-    assert scores.keys() == {"random_legal", "mobil", "mine", "theirs", "rule"}
+    assert scores.keys() == {"random_legal", "mobil", *agents}
     assert scores["mine"] == scores["rule"]
     with user_error("expected an agent's name, a policy or a function"):
         ganlane.benchmark(3, suite=suite)

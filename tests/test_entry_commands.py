@@ -44,6 +44,8 @@ MISTAKES = {
     "train ++env.wheels=3": "env.wheels: no such key",
     "train ~env.lanes": "keys cannot be deleted",
     "train lanes": "not of the form key=value",
+    "train env.lanes=0": "expected a number above 0; 0 means what a scene's file says",
+    "train reward=considerate reward.soft_crash_behind=3": "expected at most 0",
     "train --quick": "--quick: no such flag; run the command with --help",
     "train seed=0,1": "add -m for a sweep",
     "train -m seed=0,-1": "seed=-1: expected a number from 0",

@@ -34,58 +34,49 @@ def test_a_dataset_is_listed_loaded_split_and_driven_again_by_minari(capsys):
     assert [part.total_episodes for part in minari.split_dataset(dataset, [4, 2], seed=0)] == [4, 2]
     env = dataset.recover_environment()
     assert env.spec.max_episode_steps == dataset.env_spec.max_episode_steps == 1000
-    assert (dataset.observation_space, dataset.action_space) == (
-        env.observation_space,
-        env.action_space,
-    )
-    for number, (episode, about) in enumerate(
-        zip(dataset, dataset.storage.get_episode_metadata(range(6)))
-    ):
-        assert (int(about["seed"]), int(about["options"]["episode"]), episode.id) == (
-            3,
-            number,
-            number,
-        )
+    assert dataset.observation_space == env.observation_space
+    assert dataset.action_space == env.action_space
+    about = dataset.storage.get_episode_metadata(range(6))
+    for number, (episode, its) in enumerate(zip(dataset, about)):
+        assert episode.id == number
+        assert (int(its["seed"]), int(its["options"]["episode"])) == (3, number)
         observation, info = env.reset(seed=3, options={"episode": number})
-        for step, action in enumerate(episode.actions):
-            np.testing.assert_allclose(observation, episode.observations[step], atol=1e-5)
-            np.testing.assert_array_equal(info["action_mask"], episode.infos["action_mask"][step])
-            observation, reward, terminated, truncated, info = env.step(action)
-            assert reward == pytest.approx(episode.rewards[step], abs=1e-4)
-            assert (terminated, truncated) == (
-                episode.terminations[step],
-                episode.truncations[step],
-            )
-        assert terminated or truncated
-        assert len(episode.observations) == len(episode.infos["time_s"]) == len(episode.actions) + 1
+        states, masks, outcomes = [observation], [info["action_mask"]], []
+        for action in episode.actions:
+            observation, *outcome, info = env.step(action)
+            states.append(observation)
+            masks.append(info["action_mask"])
+            outcomes.append(outcome)
+        np.testing.assert_allclose(episode.observations, states, atol=1e-5)
+        np.testing.assert_array_equal(episode.infos["action_mask"], masks)
+        stored = zip(episode.rewards, episode.terminations, episode.truncations)
+        np.testing.assert_allclose(list(stored), outcomes, atol=1e-4)
+        assert any(outcomes[-1][1:])
+        assert len(episode.infos["time_s"]) == len(states)
         terms = sum(term[-1] for term in episode.infos["reward_terms"].values())
         assert terms == pytest.approx(episode.rewards[-1], abs=1e-4)
 
 
-def test_the_call_from_python_names_the_dataset_and_says_how_the_episodes_ended(here):
-    done = ganlane.api.run(
-        "record",
-        agent="keep_lane",
-        episodes=3,
-        goal_m=30.0,
-        dataset="mine/first-v2",
-        out="datasets",
-    )
-    assert done.results["dataset"] == "mine/first-v2"
+def test_the_call_from_python_names_the_dataset_and_says_how_the_episodes_ended():
+    name = "mine/first-v2"
+    options = {"agent": "keep_lane", "episodes": 3, "goal_m": 30.0, "out": "datasets"}
+    done = ganlane.api.run("record", dataset=name, **options)
+    assert done.results["dataset"] == name
     assert done.results["episodes"] == sum(done.results["ends"].values()) == 3
-    assert done.results["decisions"] == minari.load_dataset("mine/first-v2").total_steps
+    assert done.results["decisions"] == minari.load_dataset(name).total_steps
     assert json.loads((done.folder / "results.json").read_text())["seeds"]["stream"] == "train"
 
 
-def test_a_mistake_ends_in_one_sentence_and_leaves_nothing(capsys):
-    told = refusal(capsys, "record", *TINY, "dataset=first")
-    assert "dataset=first: expected a name such as highway/mobil-v0" in told
-
-
-def test_a_dataset_that_is_there_is_kept(here, capsys):
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("first", "dataset=first: expected a name such as highway/mobil-v0"),
+        ("mine/first-v0", "mine/first-v0: a dataset is there already; give another"),
+    ],
+)
+def test_a_wrong_name_is_refused_and_a_dataset_that_is_there_kept(name, told, here, capsys):
     (here / "datasets" / "mine" / "first-v0").mkdir(parents=True)
-    err = refusal(capsys, "record", *TINY, "dataset=mine/first-v0")
-    assert "mine/first-v0: a dataset is there already; give another" in err
+    assert told in refusal(capsys, "record", *TINY, f"dataset={name}")
 
 
 def test_without_minari_the_extra_is_named(capsys, monkeypatch):

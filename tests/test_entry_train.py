@@ -38,28 +38,20 @@ def train(capsys, *arguments):
     return path.parent, json.loads(path.read_text())
 
 
-def decisions(folder, name="metrics.csv"):
-    return [int(row["decisions"]) for row in rows(folder / name)]
-
-
 def test_a_run_leaves_agent_metrics_config_and_table(finished):
-    folder = finished
     results = json.loads((finished / "results.json").read_text())
-    assert [row["agent"] for row in results["rows"]] == [
-        "trained",
-        "mobil",
-        "random_legal",
-    ]
+    agents = [row["agent"] for row in results["rows"]]
+    assert agents == ["trained", "mobil", "random_legal"]
     assert results["decisions"] == 320
     assert results["updates"] > 0
-    assert decisions(folder) == [160, 320]
-    assert decisions(folder, "evaluation.csv") == [160, 320]
-    weights, config, metadata = read_agent(folder / "agent.safetensors")
+    for name in ("metrics.csv", "evaluation.csv"):
+        assert [int(row["decisions"]) for row in rows(finished / name)] == [160, 320]
+    weights, config, metadata = read_agent(finished / "agent.safetensors")
     assert weights
     assert config.agent.hidden == (16, 16)
     assert metadata["observation"] == "table3_progress"
     assert metadata["training"]["decisions"] == 320
-    assert (folder / "config.yaml").is_file()
+    assert (finished / "config.yaml").is_file()
 
 
 def test_a_new_run_in_the_folder_of_another_is_refused(finished, capsys, tmp_path):
@@ -77,7 +69,7 @@ def test_a_signal_saves_and_the_run_can_be_resumed(capsys, tmp_path):
     assert "go on with: ganlane train resume=" in capsys.readouterr().err
     (checkpoint,) = tmp_path.rglob("last.pt")
     assert main(["resume=auto", "total_decisions=320"]) == 0
-    assert decisions(checkpoint.parents[1])[-1] == 320
+    assert rows(checkpoint.parents[1] / "metrics.csv")[-1]["decisions"] == "320"
 
 
 def test_the_second_phase_starts_from_the_first_ones_agent(capsys):
@@ -89,18 +81,8 @@ def test_the_second_phase_starts_from_the_first_ones_agent(capsys):
     assert metadata["training"]["init"] == str(folder / "pretrain" / "agent.safetensors")
 
 
-@pytest.mark.parametrize(
-    ("traffic", "init"),
-    [
-        ("gan", "idm_ckpt"),
-        ("gan_calibrated", "none"),
-    ],
-)
-def test_every_traffic_and_every_start_runs(
-    traffic,
-    init,
-    capsys,
-):
+@pytest.mark.parametrize(("traffic", "init"), [("gan", "idm_ckpt"), ("gan_calibrated", "none")])
+def test_every_traffic_and_every_start_runs(traffic, init, capsys):
     words = (
         "total_decisions=64 num_envs=16 env.goal_m=40 agent.warmup=256 log_every=64 "
         "evaluation.agents=[keep_lane] evaluation.episodes=1 agent.capacity=1000"
@@ -111,17 +93,12 @@ def test_every_traffic_and_every_start_runs(
 
 
 def test_an_agent_that_sets_its_speed_does_so_wherever_it_drives(capsys):
-    folder, results = train(
-        capsys,
-        "env.actions=lane_speed",
-        "observation=lane_view",
-    )
+    folder, results = train(capsys, "env.actions=lane_speed", "observation=lane_view")
     shares = [name for name in rows(folder / "metrics.csv")[0] if name.endswith("_share")]
     assert len([name for name in shares if name.startswith("action_")]) == 5
     # Elsewhere the environment takes its actions, and MOBIL's beside it are those of the lane.
-    table = ganlane.api.evaluate(
-        [str(folder / "agent.safetensors"), "mobil"], ["idm"], 2, goal_m=40.0
-    )
+    drivers = [str(folder / "agent.safetensors"), "mobil"]
+    table = ganlane.api.evaluate(drivers, ["idm"], 2, goal_m=40.0)
     assert table["goal"].to_list() == [2, 2]
     assert results["rows"][0]["mean_reward"] == table["mean_reward"][0]
 

@@ -1,7 +1,5 @@
 """The environment as its users meet it: specs, resets, commands, events and ends."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from reference.worlds import environment, placed, same_bits, step, vehicles

@@ -1,7 +1,5 @@
 """A GPU, seen on a pretended one: where the tensors are, and for what the host waits."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -2,8 +2,6 @@
 number.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 from reference.worlds import Track, assert_same_tracks, environment, few_changes, same_bits, tracks

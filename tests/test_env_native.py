@@ -1,20 +1,18 @@
 """``env.kernel=native``: the same environment, driven by the native kernel."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 
 import pytest
 import torch
 from entry_own_parts import Cruise
+from reference.refusals import user_error
 from reference.worlds import environment, few_changes
 from torchrl.envs import Transform
 
 import ganlane
 from ganlane import keys
 from ganlane.env.highway import say_once
-from ganlane.errors import UserError
 from ganlane.native.library import ROWS_PER_THREAD, threads_allowed
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.runtime import kernel_threads
@@ -75,9 +73,7 @@ def test_two_threads_are_the_kernels_alone(threads):
 def test_episodes_that_are_no_whole_numbers_in_a_row_are_refused(wrong):
     env = native(2)
     state = env.reset().set("_reset", torch.tensor([[True], [False]]))
-    with pytest.raises(
-        UserError, match=r"next_episode is \[.*; give next_episode as int64 of shape \[2\]"
-    ):
+    with user_error(r"next_episode is \[.*; give next_episode as int64 of shape \[2\]"):
         env.reset(state, next_episode=wrong)
 
 
@@ -95,7 +91,7 @@ def test_episodes_that_are_no_whole_numbers_in_a_row_are_refused(wrong):
     ],
 )
 def test_what_the_kernel_cannot_do_it_refuses_in_one_sentence(settings, sentence):
-    with pytest.raises(UserError, match=sentence):
+    with user_error(sentence):
         environment(**{"dtype": torch.float32, "kernel": "native", **settings})
 
 

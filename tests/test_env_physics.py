@@ -1,7 +1,5 @@
 """The physics of a decision: what is remembered of rows that have ended, and compiled graphs."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from reference.worlds import environment, same_bits, step

@@ -1,7 +1,5 @@
 """What holds in every environment, whatever the configuration, the scene and the actions."""
 
-from __future__ import annotations
-
 import itertools
 import random
 from pathlib import Path

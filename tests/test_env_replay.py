@@ -3,14 +3,13 @@
 Its roads, its ends, and vehicles that leave within a decision.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
 import polars as pl
 import pytest
 import torch
+from reference.refusals import user_error
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from reference.worlds import Track, assert_same_tracks, step, tracks
 from torchrl.envs.utils import check_env_specs
@@ -18,8 +17,7 @@ from torchrl.envs.utils import check_env_specs
 from ganlane import keys
 from ganlane.agents.drivers import KeepLaneDriver, MobilDriver, RandomLegalDriver
 from ganlane.data import sort
-from ganlane.env import EpisodeParameters, HighwayEnv
-from ganlane.errors import UserError
+from ganlane.env import HighwayEnv
 from ganlane.settings.road import FAR_M, WALL
 from ganlane.sim.random import episode_key
 from ganlane.traffic import ReplayTraffic
@@ -40,11 +38,12 @@ def recordings() -> pl.DataFrame:
     return sort(pl.concat(parts))
 
 
-def make(recordings: pl.DataFrame, rows: int, period_s: float = 1.0, **others) -> HighwayEnv:
-    traffic = ReplayTraffic(recordings=recordings, least_s=5.0)
-    return HighwayEnv(
-        traffic, rows, episode=EpisodeParameters(decision_period_s=period_s), **others
-    )
+def make(recordings: pl.DataFrame, rows: int, roads: Path | None = None) -> HighwayEnv:
+    return HighwayEnv(ReplayTraffic(recordings=recordings, least_s=5.0, roads=roads), rows)
+
+
+def random_keys(td) -> torch.Tensor:
+    return episode_key(0, td[keys.SEED], td[keys.EPISODE])
 
 
 def test_the_specs_hold(recordings):
@@ -54,7 +53,7 @@ def test_the_specs_hold(recordings):
 def test_an_episode_is_truncated_at_the_step_where_its_scene_ends(recordings):
     env = make(recordings, 32)
     td = env.reset()
-    steps = env.traffic.steps_of(episode_key(0, td[keys.SEED], td[keys.EPISODE]))
+    steps = env.traffic.steps_of(random_keys(td))
     driver = KeepLaneDriver(env.road)
     running = torch.ones(32, dtype=torch.bool)
     for _ in range(10):
@@ -72,8 +71,7 @@ def test_an_episode_is_truncated_at_the_step_where_its_scene_ends(recordings):
 def test_every_row_has_the_lanes_of_its_scene(recordings):
     env = make(recordings, 64)
     td = env.reset()
-    key = episode_key(0, td[keys.SEED], td[keys.EPISODE])
-    lanes = 2 + env.traffic.scene[env.traffic.start_of(key)]
+    lanes = 2 + env.traffic.scene[env.traffic.start_of(random_keys(td))]
     assert torch.equal(td[keys.ROAD, "lanes"][:, 0], lanes)
     width = td[keys.ROAD, "lane_width_m"][:, 0]
     for _ in range(2):
@@ -120,29 +118,31 @@ def test_an_episode_is_the_same_bits_in_every_batch_and_after_automatic_resets(r
 # Roads whose lanes end
 
 
-@pytest.fixture(scope="module")
-def roads(tmp_path_factory) -> Path:
-    """The right lane of the widest scene begins 50 m down the recorded road and has a wall."""
-    file = tmp_path_factory.mktemp("roads") / "roads.json"
-    ramp = {"begin_m": 50, "end_m": 250, "end": "wall"}
-    file.write_text(json.dumps({"scene-2": [ramp, {}, {}, {}]}))
+def roads_of(folder: Path, content: dict) -> Path:
+    file = folder / "roads.json"
+    file.write_text(json.dumps(content))
     return file
 
 
+@pytest.fixture(scope="module")
+def roads(tmp_path_factory) -> Path:
+    """The right lane of the widest scene begins 50 m down the recorded road and has a wall."""
+    ramp = {"begin_m": 50, "end_m": 250, "end": "wall"}
+    return roads_of(tmp_path_factory.mktemp("roads"), {"scene-2": [ramp, {}, {}, {}]})
+
+
 def test_lanes_end_where_the_roads_say_seen_from_the_start_of_each_episode(recordings, roads):
-    traffic = ReplayTraffic(recordings=recordings, least_s=5.0, roads=roads)
-    env = HighwayEnv(traffic, 64)
+    env = make(recordings, 64, roads)
     check_env_specs(env)
     td = env.reset()
-    key = episode_key(0, td[keys.SEED], td[keys.EPISODE])
+    key, traffic, road = random_keys(td), env.traffic, td[keys.ROAD]
     ends = traffic.scene[traffic.start_of(key)] == 2
     assert 0 < ends.sum() < 64
     start_m = traffic.samples[traffic.starts[traffic.start_of(key), 0], 0]
-    road = td[keys.ROAD]
-    torch.testing.assert_close(road["begin_m"][ends, 0], (50.0 - start_m[ends]).float())
-    torch.testing.assert_close(road["wall_m"][ends, 0], (250.0 - start_m[ends]).float())
-    assert (road["begin_m"][~ends] == -FAR_M).all()
-    assert (road["wall_m"][~ends] == FAR_M).all()
+    for name, place_m, nowhere in (("begin_m", 50.0, -FAR_M), ("wall_m", 250.0, FAR_M)):
+        expected = (place_m - start_m[ends]).float()
+        torch.testing.assert_close(road[name][ends, 0], expected)
+        assert (road[name][~ends] == nowhere).all()
     # A state of each step still has them.
     assert torch.equal(step(env, td)[keys.ROAD, "wall_m"], road["wall_m"])
 
@@ -150,16 +150,15 @@ def test_lanes_end_where_the_roads_say_seen_from_the_start_of_each_episode(recor
 @pytest.mark.parametrize(("before_m", "crashes"), [(60.0, False), (1.5, True)])
 def test_the_ego_brakes_for_the_wall_of_its_own_row(recordings, tmp_path, before_m, crashes):
     """From 10 m/s it needs 2.5 m at 20 m/s2; where nobody else has ever been."""
-    file = tmp_path / "roads.json"
     wall = {"end_m": 5000, "end": "wall"}
-    file.write_text(json.dumps({"scene-2": [wall, {}, {}, {}]}))
-    env = HighwayEnv(ReplayTraffic(recordings=recordings, least_s=5.0, roads=file), 32)
+    env = make(recordings, 32, roads_of(tmp_path, {"scene-2": [wall, {}, {}, {}]}))
     td = env.reset()
     wall_m = td[keys.ROAD, "wall_m"][:, 0]
     ends = wall_m < FAR_M
     front_m = 0.5 * td[keys.VEHICLES, "length"][:, 0]
-    place = {"x": torch.where(ends, wall_m, 6000.0) - before_m - front_m, "target_lane": 0}
-    for name, value in (place | {"y": 0.0, "heading": 0.0, "speed": 10.0}).items():
+    x = torch.where(ends, wall_m, 6000.0) - before_m - front_m
+    place = {"x": x, "target_lane": 0, "y": 0.0, "heading": 0.0, "speed": 10.0}
+    for name, value in place.items():
         td[keys.VEHICLES, name][:, 0] = value
     after = step(env, td)
     assert torch.equal(after[keys.EVENTS, "hard_crash"][:, 0], ends & crashes)
@@ -175,18 +174,15 @@ def test_the_ego_brakes_for_the_wall_of_its_own_row(recordings, tmp_path, before
     ],
 )
 def test_roads_of_other_scenes_are_refused(recordings, tmp_path, content, what):
-    file = tmp_path / "roads.json"
-    file.write_text(json.dumps(content))
-    with pytest.raises(UserError, match=what):
-        ReplayTraffic(recordings=recordings, least_s=5.0, roads=file)
+    with user_error(what):
+        make(recordings, 1, roads_of(tmp_path, content))
 
 
 def test_a_film_shows_where_the_lanes_of_a_recorded_scene_end(recordings, roads):
-    env = HighwayEnv(ReplayTraffic(recordings=recordings, least_s=5.0, roads=roads), 32)
+    env = make(recordings, 32, roads)
     td = env.reset()
-    labels = [EpisodeLabel.of(td, env.road, "ego", "replay", row) for row in range(32)]
-    shown = [(label.lanes, label.lane_width_m, label.stretches) for label in labels]
     walls = td[keys.ROAD, "wall_m"][:, 0] < FAR_M
-    for (lanes, _, stretches), has_wall in zip(shown, walls.tolist()):
-        assert len(stretches) == lanes
-        assert (stretches[0].end == WALL) == has_wall
+    for row, has_wall in enumerate(walls.tolist()):
+        label = EpisodeLabel.of(td, env.road, "ego", "replay", row)
+        assert len(label.stretches) == label.lanes
+        assert (label.stretches[0].end == WALL) == has_wall

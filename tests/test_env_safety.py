@@ -3,8 +3,6 @@
 Alone, or with an ego that keeps its lane or signals.
 """
 
-from __future__ import annotations
-
 import random
 from dataclasses import replace
 

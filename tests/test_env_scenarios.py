@@ -3,21 +3,13 @@
 Cut-in, stalled car, blocked lane, stop-and-go, dense traffic.
 """
 
-from __future__ import annotations
-
-from dataclasses import replace
-
 import pytest
 import torch
 from reference.foreign import overlaps
 
 import ganlane
 from ganlane import keys
-from ganlane.build import make_driver
-from ganlane.config.run import settings
 from ganlane.env import HighwayEnv
-from ganlane.settings.env import EnvConfig
-from ganlane.settings.record import make
 from ganlane.sim.scenes import FixedScene, SceneVehicle
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import IdmTraffic
@@ -25,14 +17,12 @@ from ganlane.traffic import IdmTraffic
 ROWS = 6
 
 
-def drive(scene: str | EnvConfig, driver: str, traffic: str, seconds: int) -> Vehicles:
+def drive(scene: str | dict, driver: str, traffic: str, seconds: int) -> Vehicles:
     """Every physics step [T, N, M] of ``ROWS`` episodes side by side, without a goal, until one of
     them ends; nobody is touched.
     """
-    config = make(EnvConfig, scene) if isinstance(scene, str) else scene
-    config = replace(config, goal_m=1e5)
-    env = ganlane.make_env(traffic, ROWS, env=config)
-    policy = make_driver(driver, config).policy
+    env = ganlane.make_env(traffic, ROWS, env=scene, goal_m=1e5)
+    policy = ganlane.load_agent(driver, env=scene).policy
     frames: list[Vehicles] = []
     env.base_env.recorder = lambda vehicles, running: frames.append(vehicles)
     td = env.reset()
@@ -93,8 +83,8 @@ def test_polite_mobil_strands_at_the_closed_lane_and_egoistic_mobil_finds_a_gap(
 
 def test_the_wave_travels_backwards_while_everybody_drives_forwards():
     """One wave: cars leave it at its head and join at its tail."""
-    config = make(EnvConfig, {"name": "stop_and_go", "scene": {"waves": 1, "per_wave": 8}})
-    seen = drive(config, "keep_lane", "idm", 24)
+    scene = {"name": "stop_and_go", "scene": {"waves": 1, "per_wave": 8}}
+    seen = drive(scene, "keep_lane", "idm", 24)
     in_the_jam = (seen.speed < 2.0) & (seen.target_lane == 0)
     jam_m = torch.where(in_the_jam, seen.x, 0.0).sum(2) / in_the_jam.sum(2)
     speed = (jam_m[199] - jam_m[79]) / 12.0
@@ -114,8 +104,7 @@ def test_the_ego_stops_for_the_wave_and_drives_on_and_the_scene_brakes_gently():
 
 @pytest.mark.slow
 def test_the_mobil_ego_gets_through_dense_traffic_and_faster_than_one_that_keeps_its_lane():
-    config = make(EnvConfig, "dense")
-    mobil, keeping = (drive(config, driver, "idm_mobil", 60) for driver in ("mobil", "keep_lane"))
+    mobil, keeping = (drive("dense", driver, "idm_mobil", 60) for driver in ("mobil", "keep_lane"))
     assert mobil.x[-1, :, 0].mean() > keeping.x[-1, :, 0].mean()
 
 
@@ -142,18 +131,12 @@ def test_any_callable_with_a_check_makes_the_scene():
 def test_a_file_gives_vehicles_lanes_and_the_egos_desired_speed(tmp_path):
     path = tmp_path / "mine.csv"
     path.write_text("x_m,lane,speed_mps,desired_speed_mps\n5,1,20,30\n60,2,20,22\n")
-    config = settings("evaluate", ["env=scene", f"env.scene.path={path}"]).env
-    assert (config.vehicles, config.lanes, config.lane_width_m, config.ego_desired_speed_mps) == (
-        2,
-        3,
-        4.0,
-        30.0,
-    )
-    td = ganlane.make_env("idm", 2, env=config).reset()
-    assert td[keys.VEHICLES, "x"].tolist() == [[0.0, 55.0]] * 2
-    wider = settings("evaluate", ["env=scene", f"env.scene.path={path}", "env.lanes=4"]).env
-    assert wider.lanes == 4
-    slower = settings(
-        "evaluate", ["env=scene", f"env.scene.path={path}", "env.ego_desired_speed_mps=20"]
-    ).env
-    assert slower.scenes().rows[0].desired_speed_mps == 20.0
+    mine = {"env": {"name": "scene", "scene": {"path": path}}}
+    env = ganlane.make_env("idm", 2, **mine)
+    state = env.reset()[keys.VEHICLES]
+    assert state["x"].tolist() == [[0.0, 55.0]] * 2
+    assert state["desired_speed"].tolist() == [[30.0, 22.0]] * 2
+    assert env.base_env.road == Road(3, 4.0)
+    assert ganlane.make_env(**mine, lanes=4).base_env.road.lanes == 4
+    slower = ganlane.make_env(**mine, ego_desired_speed_mps=20).reset()[keys.VEHICLES]
+    assert slower["desired_speed"][0, 0] == 20.0

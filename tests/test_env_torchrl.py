@@ -1,12 +1,11 @@
 """The environment inside TorchRL's loops, and in programs with torch's other settings."""
 
-from __future__ import annotations
-
 import multiprocessing
 from functools import partial
 
 import pytest
 import torch
+from reference.refusals import user_error
 from reference.worlds import same_bits
 from torchrl.collectors import MultiSyncCollector
 from torchrl.envs import ExcludeTransform, ParallelEnv, RemoveEmptySpecs, SerialEnv
@@ -15,7 +14,6 @@ from torchrl.envs.utils import check_env_specs
 import ganlane
 from ganlane import keys
 from ganlane.env.state import checked_action
-from ganlane.errors import UserError
 from ganlane.settings.actions import ActionParameters
 
 TRAFFICS = ("idm_random", "idm_faults", "gan_calibrated", "mixed")
@@ -117,7 +115,7 @@ def test_gradients_pass_through_a_decision(kernel):
 def test_the_kernel_alone_refuses_gradients():
     env = ganlane.make_env("idm_mobil", 2, kernel="native")
     speed = env.reset()[keys.VEHICLES, "speed"].requires_grad_()
-    with pytest.raises(UserError, match=r"under torch\.no_grad"):
+    with user_error(r"under torch\.no_grad"):
         decided(env, vehicles={"speed": speed})
     with torch.no_grad():
         decided(env, vehicles={"speed": speed})

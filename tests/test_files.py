@@ -57,26 +57,14 @@ WRITERS = {
 }
 
 
-@pytest.fixture
-def small_disk():
-    """No file may grow beyond 32 KiB: the same errors as on a full disk, with another errno."""
-    resource = pytest.importorskip("resource")
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2**15, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 @pytest.mark.parametrize("writer", WRITERS)
 def test_a_full_disk_is_told_of_in_the_systems_words_and_leaves_the_old_file(
-    writer, tmp_path, small_disk
+    writer, tmp_path, room_on_disk
 ):
     path = tmp_path / "kept"
     write_bytes(path, b"old")
-    with (
-        pytest.raises(OSError, match="File too large") as caught,
-        atomic_path(path) as part,
-    ):
+    room_on_disk(2**15)
+    with pytest.raises(OSError, match="File too large") as caught, atomic_path(path) as part:
         WRITERS[writer](part)
     assert (caught.value.errno, caught.value.filename) == (errno.EFBIG, str(path))
     assert path.read_bytes() == b"old"

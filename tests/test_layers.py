@@ -59,21 +59,14 @@ def part_of(path: Path) -> str:
 
 def imported(path: Path) -> set[str]:
     """Parts of the package that a module imports anywhere, in functions too."""
-    parts = set()
+    names = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            if node.module == "ganlane":
-                parts |= {alias.name for alias in node.names}
-            elif node.module and node.module.startswith("ganlane."):
-                parts.add(node.module.split(".")[1])
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.Import):
-            parts |= {
-                alias.name.split(".")[1]
-                for alias in node.names
-                if alias.name.startswith("ganlane.")
-            }
-    return parts - {"__version__"}
+            names |= {alias.name for alias in node.names}
+    return {name.split(".")[1] for name in names if name.startswith("ganlane.")} - {"__version__"}
 
 
 def test_every_part_has_its_place():

@@ -15,16 +15,15 @@ def test_values_and_gradients_are_those_of_torch(rows, inputs, outputs, relu):
     shapes = ((rows, inputs), (outputs, inputs), (outputs,))
     tensors = [torch.randn(shape, requires_grad=True) for shape in shapes]
     gradient = torch.randn(rows, outputs)
-    ours = linear(*tensors, relu=relu)
     theirs = functional.linear(*tensors)
     theirs = theirs.relu() if relu else theirs
-    for output, expected in zip(
-        [ours, *torch.autograd.grad(ours, tensors, gradient)],
-        [theirs, *torch.autograd.grad(theirs, tensors, gradient)],
-    ):
-        torch.testing.assert_close(output, expected, atol=1e-4, rtol=1e-5)
+    ours = linear(*tensors, relu=relu)
     with torch.no_grad():
-        torch.testing.assert_close(linear(*tensors, relu=relu), theirs, atol=1e-4, rtol=1e-5)
+        alone = linear(*tensors, relu=relu)
+    close = {"atol": 1e-4, "rtol": 1e-5}
+    torch.testing.assert_close([ours, alone], [theirs, theirs], **close)
+    of_ours, of_theirs = (torch.autograd.grad(y, tensors, gradient) for y in (ours, theirs))
+    torch.testing.assert_close(of_ours, of_theirs, **close)
 
 
 def test_without_onednn_it_is_torchs_own(monkeypatch):

@@ -16,18 +16,17 @@ import pytest
 import torch
 from reference.refusals import Bomb, refusal, run_folder, user_error
 
+import ganlane
 from ganlane.__main__ import main
 from ganlane.agents import load_agent
 from ganlane.api import train
 from ganlane.arguments import import_target
-from ganlane.build import make_driver
 from ganlane.config.compose import parsed
 from ganlane.config.run import refuse_stored_imports
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator import load_generator
 from ganlane.realism.measures import Reference
-from ganlane.settings.env import EnvConfig
 from ganlane.settings.traffic import IdmTrafficConfig
 from ganlane.settings.train import FinalEvaluationConfig, TrainConfig
 from ganlane.traffic import TrafficModule
@@ -159,33 +158,23 @@ def test_a_reference_of_recorded_driving_is_plain_numbers(here):
 def test_an_agents_description_is_not_instantiated(key):
     weights, metadata = load_weights(CHECKPOINTS / "agent_idm.safetensors", "agent")
     del metadata["kind"]
-    called = {"_target_": "evil.make", "_partial_": False}
-    save_weights(
-        "agent.safetensors",
-        "agent",
-        weights,
-        {**metadata, key: {**metadata.get(key, {}), **called}},
-    )
+    called = {**metadata.get(key, {}), "_target_": "evil.make", "_partial_": False}
+    save_weights("agent.safetensors", "agent", weights, {**metadata, key: called})
     with pytest.raises(UserError):
-        make_driver("agent.safetensors", EnvConfig())
-    save_weights(
-        "agent.safetensors",
-        "agent",
-        weights,
-        {**metadata, "_target_": "evil.make"},
-    )
+        ganlane.load_agent("agent.safetensors")
+    save_weights("agent.safetensors", "agent", weights, {**metadata, "_target_": "evil.make"})
     assert load_agent("agent.safetensors")[1]["_target_"] == "evil.make"
 
 
-def test_a_generators_description_is_not_instantiated():
+@pytest.mark.parametrize("key", ["sizes", "preset"])
+def test_a_generators_description_is_not_instantiated(key):
     weights, metadata = load_weights(CHECKPOINTS / "generator_paper.safetensors", "generator")
     del metadata["kind"]
-    for key in ("sizes", "preset"):
-        save_weights(
-            "g.safetensors", "generator", weights, {**metadata, key: {"_target_": "evil.make"}}
-        )
-        with pytest.raises(UserError):
-            load_generator("g.safetensors")
+    save_weights(
+        "g.safetensors", "generator", weights, {**metadata, key: {"_target_": "evil.make"}}
+    )
+    with pytest.raises(UserError):
+        load_generator("g.safetensors")
 
 
 #: Command lines that would have Hydra import something, or read another configuration.
@@ -205,11 +194,7 @@ COMMAND_LINES = [
 
 
 @pytest.mark.parametrize("arguments", COMMAND_LINES, ids=" ".join)
-def test_hydra_imports_nothing_and_reads_no_other_configuration(
-    arguments,
-    here,
-    capsys,
-):
+def test_hydra_imports_nothing_and_reads_no_other_configuration(arguments, here, capsys):
     (here / "evil.pickle").write_bytes(pickle.dumps(Bomb()))
     refusal(capsys, "train", *arguments)
 
@@ -267,20 +252,24 @@ def annotated_with_text(road) -> "a traffic":  # noqa: F722
     ],
 )
 def test_what_is_named_is_called_only_if_it_makes_a_traffic(name, capsys):
+    path = f"{__name__}.{name}"
     with user_error(r"expected a subclass of ganlane\.traffic\.TrafficModule or a function"):
-        import_target(f"{__name__}.{name}", "traffic._target_", TrafficModule)
-    assert "_target_" in refusal(
-        capsys, "train", "traffic=idm", f"traffic._target_={__name__}.{name}"
-    )
+        import_target(path, "traffic._target_", TrafficModule)
+    told = refusal(capsys, "train", "traffic=idm", f"traffic._target_={path}")
+    assert "_target_" in told
 
 
-def test_a_class_or_an_annotated_function_is_taken():
-    for name in ("ganlane.traffic.IdmTraffic", "ganlane.traffic.presets.gan_traffic"):
-        import_target(name, "traffic._target_", TrafficModule)
-    assert (
-        import_target(f"{__name__}.traffic_by_annotation", "", TrafficModule)
-        is traffic_by_annotation
-    )
+@pytest.mark.parametrize(
+    "name",
+    [
+        "ganlane.traffic.IdmTraffic",
+        "ganlane.traffic.presets.gan_traffic",
+        f"{__name__}.traffic_by_annotation",
+    ],
+)
+def test_a_class_or_an_annotated_function_is_taken(name):
+    target = import_target(name, "traffic._target_", TrafficModule)
+    assert target.__name__ == name.rpartition(".")[2]
 
 
 @pytest.fixture
@@ -294,12 +283,11 @@ def foreign_run():
     )
 
 
-def test_a_resumed_run_takes_what_this_command_line_repeats(foreign_run):
-    for keys in (
-        ["traffic._target_", "evaluation.agents"],
-        ["traffic", "evaluation"],
-    ):
-        refuse_stored_imports(foreign_run, keys)
+@pytest.mark.parametrize(
+    "keys", [["traffic._target_", "evaluation.agents"], ["traffic", "evaluation"]]
+)
+def test_a_resumed_run_takes_what_this_command_line_repeats(keys, foreign_run):
+    refuse_stored_imports(foreign_run, keys)
 
 
 @pytest.mark.parametrize(

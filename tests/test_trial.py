@@ -10,7 +10,7 @@ from trial import damages
 from trial.damage import READERS, SCENE, Reader, Trial
 from trial.kill import TINY, differences, torn_write, train
 from trial.soak import actions, violations
-from trial.tally import forked
+from trial.tally import FORK, forked
 
 import ganlane
 from ganlane import keys
@@ -33,7 +33,7 @@ def work(item):
 def test_an_item_that_ends_or_hangs_its_process_is_reported_and_the_others_are_done():
     done = dict(forked(work, ["a", "dies", "b", "hangs", "c"], at_most_s=1.0, memory_gib=64.0))
     assert (done["a"], done["b"], done["c"]) == ("A", "B", "C")
-    assert done["dies"] == "LOST: the process ended (status 9)"
+    assert done["dies"] == "LOST: the process ended (status -9)"
     assert done["hangs"].startswith("LOST: more than 1 s")
 
 
@@ -81,15 +81,15 @@ def test_other_weights_figures_and_parts_of_files_are_seen(tmp_path):
 
 
 def test_the_second_write_is_torn_and_the_file_before_stays(tmp_path):
-    child = os.fork()
-    if child == 0:
-        try:
-            torn_write(1, 0.5)()
-            for content in (b"first", b"second"):
-                write_bytes(tmp_path / "file", content)
-        finally:
-            os._exit(1)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+    def write_twice():
+        torn_write(1, 0.5)()
+        for content in (b"first", b"second"):
+            write_bytes(tmp_path / "file", content)
+
+    child = FORK.Process(target=write_twice)
+    child.start()
+    child.join()
+    assert child.exitcode == -signal.SIGKILL
     assert (tmp_path / "file").read_bytes() == b"first"
 
 

@@ -24,6 +24,18 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.fixture
+def store(folder, shipped):
+    """Stores the shipped results with changes under another name; gives the file."""
+
+    def stored(name, **changes):
+        file = folder / f"{name}.json"
+        file.write_text(json.dumps({**shipped, **changes}))
+        return file
+
+    return stored
+
+
 def test_the_page_is_made_from_the_stored_results():
     assert leaderboard.differences() == []
 
@@ -60,16 +72,14 @@ def as_stored(monkeypatch, shipped):
 
 @pytest.mark.usefixtures("as_stored")
 @pytest.mark.parametrize("change", [1e-9, None])
-def test_a_falsified_or_missing_sample_is_refused_in_one_sentence(folder, capsys, shipped, change):
-    sample = json.loads(json.dumps(shipped["sample"]))
-    file = folder / "mine.json"
-    file.write_text(json.dumps({**shipped, "sample": sample}))
+def test_a_falsified_or_missing_sample_is_refused_in_one_sentence(capsys, shipped, store, change):
+    store("mine")
     assert leaderboard.main(["--check"]) == 0
-    for traffic, rewards in sample["agent_general"].items():
-        sample["agent_general"][traffic] = (
-            [] if change is None else [rewards[0], rewards[1] + change]
-        )
-    file.write_text(json.dumps({**shipped, "sample": sample}))
+    changed = {
+        traffic: [] if change is None else [rewards[0], rewards[1] + change]
+        for traffic, rewards in shipped["sample"]["agent_general"].items()
+    }
+    store("mine", sample={**shipped["sample"], "agent_general": changed})
     capsys.readouterr()
     assert leaderboard.main(["--check"]) == 2
     (told,) = capsys.readouterr().err.strip().splitlines()
@@ -79,14 +89,13 @@ def test_a_falsified_or_missing_sample_is_refused_in_one_sentence(folder, capsys
 
 
 def test_of_a_run_what_the_page_needs_is_stored_and_of_its_models_the_layers_that_act(
-    folder, shipped
+    folder, shipped, store
 ):
     layers = torch.nn.Sequential(torch.nn.Linear(29, 8), torch.nn.ReLU(), torch.nn.Linear(8, 3))
     save_network(folder / "runs/mine/0.zip", layers)
     config = {"agents": [str(folder / "runs/mine"), "mobil"]}
-    run = {**shipped, "config": config, "rows": ["many"], "failures": ["many"]}
-    (folder / "results.json").write_text(json.dumps(run))
-    leaderboard.main(["--add", str(folder / "results.json"), "--name", "mine"])
+    results = store("results", config=config, rows=["many"], failures=["many"])
+    leaderboard.main(["--add", str(results), "--name", "mine"])
     stored = json.loads((folder / "mine.json").read_text())
     assert stored["agents"] == ["mine", "mobil"]
     assert stored["entries"] == shipped["entries"]
@@ -95,17 +104,17 @@ def test_of_a_run_what_the_page_needs_is_stored_and_of_its_models_the_layers_tha
     assert torch.equal(model.layers[0].weight, layers[0].weight)
 
 
-def test_an_entry_with_more_trainings_takes_the_place_of_one(folder, shipped):
-    several = [{**entry, "trainings": 7} for entry in shipped["entries"]]
-    for name, entries in (("a", shipped["entries"]), ("b", several), ("c", shipped["entries"])):
-        (folder / f"{name}.json").write_text(json.dumps({**shipped, "entries": entries}))
+def test_an_entry_with_more_trainings_takes_the_place_of_one(shipped, store):
+    store("a")
+    store("b", entries=[{**entry, "trainings": 7} for entry in shipped["entries"]])
+    store("c")
     lines = leaderboard.table("docs/leaderboard.md").splitlines()[2:]
     assert len(lines) == len(shipped["entries"])
     assert {line.split("|")[2].strip() for line in lines} == {"7"}
 
 
-def test_results_of_another_protocol_are_refused(folder, shipped):
-    (folder / "mine.json").write_text(json.dumps({**shipped, "protocol": "0" * 12}))
+def test_results_of_another_protocol_are_refused(store):
+    store("mine", protocol="0" * 12)
     with user_error("protocol 000000000000, expected"):
         leaderboard.stored()
 

@@ -7,8 +7,9 @@ A wrong value is reported without waiting for torch.
 import errno
 import os
 import signal
+from operator import attrgetter
 from pathlib import Path
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 import pytest
 from reference.processes import ROOT, run
@@ -24,20 +25,15 @@ from ganlane.settings.traffic import TrafficConfig
 
 
 @pytest.mark.parametrize(
-    "stop", [KeyboardInterrupt(), Stopped(signal.SIGTERM)], ids=["SIGINT", "SIGTERM"]
+    ("stop", "number"),
+    [(KeyboardInterrupt(), signal.SIGINT), (Stopped(signal.SIGTERM), signal.SIGTERM)],
+    ids=["SIGINT", "SIGTERM"],
 )
 def test_a_signal_while_the_configuration_is_composed_is_no_error(
-    stop, empty_folder, monkeypatch, capsys
+    stop, number, empty_folder, capsys
 ):
-    def interrupted(*_):
-        raise stop
-
-    monkeypatch.setattr("ganlane.config.run.composed", interrupted)
-    assert main(["train", "traffic=idm"]) == 128 + getattr(
-        stop,
-        "number",
-        signal.SIGINT,
-    )
+    with patch("ganlane.config.run.composed", side_effect=stop):
+        assert main(["train", "traffic=idm"]) == 128 + number
     assert capsys.readouterr().err in ("", "ganlane train: stopped by Ctrl-C.\n")
     assert list(empty_folder.iterdir()) == []
 
@@ -133,19 +129,11 @@ def test_a_refusal_while_a_command_writes(empty_folder, capsys):
 
 
 @pytest.mark.parametrize("kind", [OSError, RuntimeError])
-def test_a_library_that_gives_the_number_in_its_text_alone(
-    kind,
-    empty_folder,
-    capsys,
-):
+def test_a_library_that_gives_the_number_in_its_text_alone(kind, empty_folder, capsys):
     """So does polars."""
-
-    def task(config, folder):
-        raise kind("underlying IO error: No space left on device (os error 28)")
-
-    assert "a file or standard output: No space left on device; check the path" in refused(
-        capsys, task
-    )
+    error = kind("underlying IO error: No space left on device (os error 28)")
+    told = refused(capsys, Mock(side_effect=error))
+    assert "a file or standard output: No space left on device; check the path" in told
 
 
 def test_what_was_earned_before_the_disk_was_full_stays(empty_folder, capsys):
@@ -163,16 +151,14 @@ def test_what_was_earned_before_the_disk_was_full_stays(empty_folder, capsys):
 
 def test_a_run_folder_below_a_file(empty_folder, capsys):
     (empty_folder / "file").write_text("no folder")
-    err = refused(capsys, lambda config, folder: None, "hydra.run.dir=file/run")
+    err = refused(capsys, Mock(), "hydra.run.dir=file/run")
     assert "file/run: Not a directory; check the path" in err
 
 
 def test_what_no_user_can_mend_keeps_its_traceback(empty_folder):
-    def task(config, folder):
-        raise ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
-
+    refused_connection = ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
     with pytest.raises(ConnectionRefusedError):
-        run_task(task)
+        run_task(Mock(side_effect=refused_connection))
     assert list(empty_folder.rglob("*")) == []
     assert not is_users_matter(OSError("libfile.so: undefined symbol"))
     assert not is_users_matter(ValueError(errno.ENOSPC))
@@ -210,7 +196,4 @@ def test_what_no_user_can_mend_keeps_its_traceback(empty_folder):
 )
 def test_a_word_sets_what_it_says(line, key, value):
     command, *words = line.split()
-    found_value = settings(command, words)
-    for name in key.split("."):
-        found_value = getattr(found_value, name)
-    assert found_value == value
+    assert attrgetter(key)(settings(command, words)) == value

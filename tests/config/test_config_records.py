@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.refusals import user_error
 
 from ganlane.errors import ParameterError, UserError
 from ganlane.settings.agent import RainbowConfig
@@ -129,7 +130,7 @@ def test_an_option_is_its_name_or_a_mapping_with_changes():
     plainly = make(RainbowConfig, "dqn")
     assert not any((plainly.noisy, plainly.dueling, plainly.double))
     assert make(RainbowConfig, {"name": "dqn", "gamma": 0.9}) == replace(plainly, gamma=0.9)
-    with pytest.raises(ParameterError, match=r"agent=dqm: no such option \(did you mean 'dqn'\?\)"):
+    with user_error(r"agent=dqm: no such option \(did you mean 'dqn'\?\)"):
         make(RainbowConfig, "dqm")
 
 
@@ -150,6 +151,6 @@ def test_an_episode_ends_where_float32_still_counts():
         ("timeout_s=1e+18: expected a number above 0, at most 1000000, ", {"timeout_s": 1e18}),
         ("goal_m=100001: expected a number above 0, at most 100000, ", {"goal_m": 100_001.0}),
     ):
-        with pytest.raises(ParameterError, match=re.escape(told)):
+        with user_error(re.escape(told)):
             EpisodeParameters(**values)
     assert EpisodeParameters(timeout_s=1e6, goal_m=1e5).most_decisions() == 1_000_000

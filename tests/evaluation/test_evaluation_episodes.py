@@ -8,30 +8,21 @@ import pytest
 import torch
 from polars.testing import assert_frame_equal
 from reference.refusals import user_error
-from reference.scene_csv import write_scene_csv
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from reference.worlds import vehicles
 from torchrl.envs import StepCounter
-from torchrl.envs.utils import ExplorationType, exploration_type, step_mdp
+from torchrl.envs.utils import ExplorationType, exploration_type
 
+import ganlane
 from ganlane import keys
-from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.env import HighwayEnv
 from ganlane.evaluation import run_episodes
 from ganlane.evaluation.measures import ego_at_fault
-from ganlane.settings.commands import DrivingConfig
-from ganlane.settings.env import EnvConfig
-from ganlane.settings.observation import ObservationConfig, SensorParameters
-from ganlane.settings.traffic import (
-    IdmMobilTrafficConfig,
-    IdmTrafficConfig,
-    ReplayTrafficConfig,
-)
 from ganlane.traffic import IdmTraffic
 
 SEED = 4
 #: Short and of different lengths: who drives at random also leaves the road and crashes.
-SHORT = EnvConfig(goal_m=60.0, kernel="torch")
+#: Short and of different lengths: who drives at random also leaves the road and crashes.
+SHORT = {"goal_m": 60.0, "kernel": "torch"}
 
 
 @pytest.fixture(autouse=True)
@@ -43,23 +34,25 @@ def smaller_batches(monkeypatch):
 class Remade:
     """Makes an environment of any size, and remembers the sizes that were asked for."""
 
-    def __init__(self, traffic, env=SHORT, sensors=None, wrap=lambda env: env):
-        self.traffic, self.wrap = make_traffic(traffic, env), wrap
-        self.config = DrivingConfig(env=env, observation=ObservationConfig(sensors=sensors))
-        self.sizes = []
+    def __init__(self, traffic="idm", wrap=lambda env: env, **options):
+        self.options, self.wrap, self.sizes = {"traffic": traffic, **SHORT, **options}, wrap, []
 
     def __call__(self, rows):
         self.sizes.append(rows)
-        return self.wrap(make_env(self.traffic, self.config, rows))
+        return self.wrap(ganlane.make_env(num_envs=rows, **self.options))
+
+
+def policy_of(name="random"):
+    return ganlane.load_agent(name).policy
 
 
 #: Sums over an episode, as its decisions give them.
+#: Sums over an episode, as its decisions give them.
 SUMS = {
-    "reward": lambda after: after["reward"],
-    "reward_speed": lambda after: after["reward_terms", "speed"],
-    "soft_crash": lambda after: after["events", "soft_crash"],
-    "soft_crash_behind": lambda after: after["events", "soft_crash_behind"],
-    "decisions": lambda after: torch.ones(1),
+    "reward": "reward",
+    "reward_speed": ("reward_terms", "speed"),
+    "soft_crash": ("events", "soft_crash"),
+    "soft_crash_behind": ("events", "soft_crash_behind"),
 }
 
 
@@ -69,13 +62,12 @@ def alone(make, policy, episodes):
     for episode in episodes:
         counters = {keys.SEED: torch.tensor([SEED]), keys.EPISODE: torch.tensor([episode])}
         state = env.reset(env.reset().empty().update(counters))
-        sums, done = dict.fromkeys(SUMS, 0.0), False
-        while not done:
-            after = env.step(policy(state))
-            state, done = step_mdp(after), bool(after["next", "done"])
-            for name, of in SUMS.items():
-                sums[name] += float(of(after["next"]))
-        ends = [name for name in keys.END_EVENTS if bool(state["events", name])]
+        sums, decisions = dict.fromkeys(SUMS, 0.0), 0
+        while decisions == 0 or not state["done"]:
+            after = env.step(policy(state))["next"]
+            sums = {name: total + float(after[SUMS[name]]) for name, total in sums.items()}
+            state, decisions = after, decisions + 1
+        ends = [name for name in keys.END_EVENTS if state["events", name]]
         distance_m, seconds = float(state["ego", "distance"]), 0.1 * int(state[keys.STEP])
         rows.append(
             {
@@ -87,6 +79,7 @@ def alone(make, policy, episodes):
                 "distance_m": distance_m,
                 "duration_s": seconds,
                 "mean_speed_mps": distance_m / seconds if seconds else None,
+                "decisions": decisions,
                 **sums,
             }
         )
@@ -95,40 +88,28 @@ def alone(make, policy, episodes):
 
 def assert_as_alone(table, expected):
     """Bit for bit but for what is divided here in another order."""
-    exact = expected.columns
-    for name in ("mean_speed_mps", "duration_s"):
-        exact = [column for column in exact if column != name]
-        assert table[name].to_list() == pytest.approx(expected[name].to_list())
-    assert_frame_equal(
-        table.select(exact), expected.select(exact), check_exact=True, check_dtypes=False
-    )
-
-
-@pytest.fixture(scope="module")
-def recordings(tmp_path_factory):
-    path = tmp_path_factory.mktemp("recordings") / "scenes.csv"
-    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=3, seconds=7.0), seed=0), path)
-    return ReplayTrafficConfig(path=str(path))
+    rounded = ["mean_speed_mps", "duration_s"]
+    table = table.select(expected.columns)
+    assert_frame_equal(table.select(rounded), expected.select(rounded))
+    exact = {"check_exact": True, "check_dtypes": False}
+    assert_frame_equal(table.drop(rounded), expected.drop(rounded), **exact)
 
 
 def sources(recordings):
+    late = {"sensors": {"position_noise_m": 2.0, "delay_s": 2.0}}
     return {
-        "recycled": Remade(IdmTrafficConfig(), EnvConfig(goal_m=90.0, recycle=True)),
-        "late sensors": Remade(
-            IdmMobilTrafficConfig(), sensors=SensorParameters(position_noise_m=2.0, delay_s=2.0)
-        ),
-        "replayed": Remade(recordings),
-        "cut short": Remade(
-            IdmTrafficConfig(), wrap=lambda env: env.append_transform(StepCounter(max_steps=3))
-        ),
+        "recycled": Remade(goal_m=90.0, recycle=True, kernel="auto"),
+        "late sensors": Remade("idm_mobil", observation=late),
+        "replayed": Remade({"name": "replay", "path": str(recordings)}),
+        "cut short": Remade(wrap=lambda env: env.append_transform(StepCounter(max_steps=3))),
     }
 
 
 @pytest.mark.parametrize("name", ["recycled", "late sensors", "replayed", "cut short"])
-def test_every_episode_is_bit_for_bit_what_it_is_alone(name, recordings, monkeypatch):
+def test_every_episode_is_bit_for_bit_what_it_is_alone(name, three_scenes, monkeypatch):
     monkeypatch.setattr("ganlane.evaluation.episodes.CHECK_EVERY", 2)
-    make, driver = sources(recordings)[name], "agent_idm" if name == "late sensors" else "random"
-    policy, episodes = make_driver(driver, make.config.env).policy, [*range(30, 34), 7, 3]
+    make, driver = sources(three_scenes)[name], "agent_idm" if name == "late sensors" else "random"
+    policy, episodes = policy_of(driver), [*range(30, 34), 7, 3]
     expected, modes = alone(make, policy, episodes), set()
     look = policy.register_forward_hook(
         lambda *_: modes.add((exploration_type(), torch.is_grad_enabled()))
@@ -150,7 +131,7 @@ def test_every_episode_is_bit_for_bit_what_it_is_alone(name, recordings, monkeyp
 
 
 def test_episodes_stay_in_their_rows_unless_the_policy_says_that_they_may_move():
-    make, policy = Remade(IdmTrafficConfig()), make_driver("random", SHORT).policy
+    make, policy = Remade(), policy_of()
     policy.rows_must_stay = True
     run_episodes(make(6), policy, range(6), SEED, make_smaller=make)
     assert make.sizes == [6]
@@ -178,16 +159,13 @@ class Watchful(IdmTraffic):
 
 
 def test_rows_stay_and_are_never_driven_on_where_the_traffic_holds_something_per_row():
-    traffic, make = Watchful(), Remade(IdmTrafficConfig())
-    env, policy = make_env(traffic, make.config, 6), make_driver("random", SHORT).policy
-
-    def never(rows):
-        pytest.fail("moved")
-
-    table = run_episodes(env, policy, range(12), SEED, make_smaller=never)
+    make = Remade(Watchful)
+    env = make(6)
+    table = run_episodes(env, policy_of(), range(12), SEED, make_smaller=make)
+    assert make.sizes == [6]
     moved = table.filter(pl.col("duration_s") > 0)["episode"]
-    assert set(moved) <= set(traffic.begun) <= set(range(12))
-    expected = run_episodes(make(6), policy, range(12), SEED)
+    assert set(moved) <= set(env.base_env.traffic.begun) <= set(range(12))
+    expected = run_episodes(Remade()(6), policy_of(), range(12), SEED)
     assert_frame_equal(table, expected, check_exact=True)
 
 
@@ -199,11 +177,12 @@ class Stubborn(HighwayEnv):
 
 
 def test_no_episodes_and_an_environment_that_ignores_those_it_is_given_are_refused():
-    traffic, policy = IdmTraffic(), make_driver("random", SHORT).policy
-    with user_error("next_episode"):
-        run_episodes(Stubborn(traffic, 2), policy, [0, 1, 5, 9], seed=0)
-    with user_error("episodes"):
-        run_episodes(HighwayEnv(traffic, 2), policy, [], seed=0)
+    for kind, episodes, told in (
+        (Stubborn, [0, 1, 5, 9], "next_episode"),
+        (HighwayEnv, [], "episodes"),
+    ):
+        with user_error(told):
+            run_episodes(kind(IdmTraffic(), 2), policy_of(), episodes, seed=0)
 
 
 @pytest.mark.parametrize(
@@ -212,25 +191,9 @@ def test_no_episodes_and_an_environment_that_ignores_those_it_is_given_are_refus
         ({"speed": 20.0}, {"x": 4.4, "speed": 10.0}, True),  # into the one ahead
         ({}, {"x": -4.4, "speed": 30.0}, False),  # struck from behind
         ({}, {"y": 2.4, "heading": -0.1}, False),  # the other changes lanes into the ego
-        (
-            {},
-            {
-                "x": 4.0,
-                "y": 2.2,
-                "heading": -0.1,
-            },
-            False,
-        ),  # and ahead of it, too
-        (
-            {},
-            {
-                "x": -4.2,
-                "y": 1.0,
-                "speed": 30.0,
-                "heading": 0.1,
-            },
-            False,
-        ),  # moving away, faster
+        ({}, {"x": 4.0, "y": 2.2, "heading": -0.1}, False),  # and ahead of it, too
+        # moving away, faster
+        ({}, {"x": -4.2, "y": 1.0, "speed": 30.0, "heading": 0.1}, False),
         ({"heading": 0.1}, {"y": 2.4}, True),  # the ego into the other
         ({"heading": 0.1}, {"y": 2.4, "heading": -0.05}, True),  # both, the ego faster
         ({"heading": -0.05}, {"y": -2.4, "heading": 0.1}, False),  # both, the other faster

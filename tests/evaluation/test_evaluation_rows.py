@@ -97,13 +97,17 @@ def test_drivers_are_paired_by_episode_whatever_their_order():
     mobil = driven("mobil", [30, 32, 34, 36])
     random_legal = driven("random_legal", [0, 2, 4, 6])
     agent = driven("a", [15, 17, 19, 21])
+    # The agent stands half-way in every single episode: no doubt is left.
+    expected = {
+        "normalized_percent": 50.0,
+        "normalized_percent_ci": [50.0, 50.0],
+        "minus_mobil": -15.0,
+        "minus_mobil_ci": [-15.0, -15.0],
+    }
     for order in (agent, agent.reverse()):
         row, mobils, _ = evaluation_rows(pl.concat([order, mobil, random_legal.reverse()]))
-        # The agent stands half-way in every single episode: no doubt is left.
-        assert row["normalized_percent"] == pytest.approx(50.0)
-        assert row["normalized_percent_ci"] == pytest.approx([50.0, 50.0])
-        assert row["minus_mobil"] == pytest.approx(-15.0)
-        assert row["minus_mobil_ci"] == pytest.approx([-15.0, -15.0])
+        for name, value in expected.items():
+            assert row[name] == pytest.approx(value)
         assert mobils["minus_mobil"] is None
 
 
@@ -135,22 +139,27 @@ def test_the_first_driver_is_held_against_every_other_on_every_traffic():
         for traffic in ("idm", "gan")
         for agent, base in (("trained", 5.0), ("mobil", 7.0), ("keep_lane", 1.0))
     ]
-    rows = paired_rows(pl.concat(tables))
-    assert {(row["agent"], row["episodes"]) for row in rows} == {("trained", 30)}
-    assert [(row["traffic"], row["over"], row["lead"], row["verdict"]) for row in rows] == [
-        ("idm", "mobil", -2.0, "below"),
-        ("idm", "keep_lane", 4.0, "above"),
-        ("gan", "mobil", -2.0, "below"),
-        ("gan", "keep_lane", 4.0, "above"),
+    names = ("agent", "episodes", "traffic", "over", "lead", "verdict")
+    told = [tuple(row[name] for name in names) for row in paired_rows(pl.concat(tables))]
+    assert told == [
+        ("trained", 30, traffic, *lead)
+        for traffic in ("idm", "gan")
+        for lead in (("mobil", -2.0, "below"), ("keep_lane", 4.0, "above"))
     ]
 
 
-def verdict_of(differences, failed=0):
-    """The verdict on ``differences`` over a driver of return 0; the first ``failed`` crashed."""
+def lead_of(differences, failed=0):
+    """The row of a driver that leads one of return 0 by ``differences``; the first ``failed``
+    crashed.
+    """
     reasons = ["hard_crash"] * failed + ["goal"] * (len(differences) - failed)
     ours = driven("a", differences, reasons)
     (row,) = paired_rows(pl.concat([ours, driven("b", [0.0] * len(differences))]))
-    return row["verdict"]
+    return row
+
+
+def verdict_of(differences, failed=0):
+    return lead_of(differences, failed)["verdict"]
 
 
 def test_there_is_no_verdict_below_30_episodes():
@@ -162,11 +171,9 @@ def test_there_is_no_verdict_below_30_episodes():
 def test_a_verdict_does_not_hang_on_few_crashes():
     rest = [3.0, -3.0] * 60
     # Four crashes move the whole interval to one side, and are no evidence.
-    (row,) = paired_rows(
-        pl.concat([driven("a", [-240.0] * 4 + rest), driven("b", [0.0] * (4 + len(rest)))])
-    )
-    assert row["lead_ci"][1] < 0.0
-    assert verdict_of([-240.0] * 4 + rest, failed=4) == "undecided"
+    four = [-240.0] * 4 + rest
+    assert lead_of(four)["lead_ci"][1] < 0.0
+    assert verdict_of(four, failed=4) == "undecided"
     assert verdict_of([-240.0] * 9 + rest, failed=9) == "below"
     # Nor do few crashes that say nothing new take a verdict away.
     assert verdict_of([-10.0] * 3 + [-3.0, -4.0] * 60, failed=3) == "below"
@@ -229,14 +236,11 @@ def by_scene(*scenes):
 def test_the_rate_is_all_crashes_over_all_kilometres():
     per_km, rows = by_scene(("b", 10, 1, 100.0), ("a", 5, 3, 400.0))
     assert per_km.value == pytest.approx(4 / 3.0)
-    assert [(row["scene"], row["episodes"], row["hard_crash"]) for row in rows] == [
-        ("a", 5, 3),
-        ("b", 10, 1),
-    ]
-    assert [row["distance_km"] for row in rows] == pytest.approx([2.0, 1.0])
-    assert [row["crashes_per_km"] for row in rows] == pytest.approx([1.5, 1.0])
     # Garwood's exact bounds for one event.
     assert rows[1]["crashes_per_km_ci"] == pytest.approx([0.0253, 5.572], abs=1e-3)
+    names = ("scene", "episodes", "hard_crash", "distance_km", "crashes_per_km")
+    told = [tuple(row[name] for name in names) for row in rows]
+    assert told == [("a", 5, 3, 2.0, 1.5), ("b", 10, 1, 1.0, 1.0)]
 
 
 @pytest.mark.parametrize("times", [1, 10])

@@ -17,6 +17,7 @@ ROWS = 37
 
 LORRIES = {"truck_share": 0.3, "truck_desired_speed_mps": (20.0, 22.0)}
 MIXED = {"name": "mixed", "shares": {"idm_mobil": 2, "gan": 1, "human": 1, "idm_faults": 1}}
+FLOW = {"vph": 1200.0, "ramp_vph": 600.0, "slots": 20}
 OTHER_REWARD = {"soft_crash_behind": -5.0, "literal_low_acceleration": True}
 OTHER_REWARD |= {"low_acceleration": -0.2}
 
@@ -43,9 +44,14 @@ def any_commands(rows, rng):
     ("traffic", "options"),
     [
         *((traffic, {}) for traffic in ("idm_random", "human", "gan", "gan_calibrated", MIXED)),
+        *(({"name": name, "blind_share": 0.5}, {}) for name in ("gan", "idm")),
         ("idm_mobil", {"env": "merge", "observation": "road_view"}),
         ("idm_mobil", {"env": "exit", "observation": "road_view", "mask": "safe"}),
         ("idm_faults", {"env": "lane_drop", "observation": "lane_view", "mask": "legal"}),
+        *(
+            ("idm", {"env": env, "timeout_s": 9.0, "flow": {**FLOW, "exit_share": exit_share}})
+            for env, exit_share in (("merge", 0.0), ("weave", 0.3))
+        ),
         ("idm", {"env": "cut_in", "actions": "lane_speed", "mask": "foresight"}),
         ("idm_mobil", {"env": "merge", "observation": "road_view", "actions": "continuous"}),
         ("idm_mobil", {"goal_m": 300.0, "observation": "lane_view_overlap"}),

@@ -2,54 +2,30 @@
 
 import json
 
-import polars as pl
 import pytest
-from reference.scene_csv import write_scene_csv
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-from ganlane.build import make_driver
+import ganlane
 from ganlane.commands.evaluate import publish
 from ganlane.evaluation import crashes_by_scene, evaluation_rows, failed_episodes, paired_rows
 from ganlane.evaluation.results import plain
-from ganlane.settings.commands import EvaluateConfig
-from ganlane.settings.env import EnvConfig
-from ganlane.settings.traffic import IdmTrafficConfig, ReplayTrafficConfig
 from ganlane.sim.random import Stream
-from ganlane.suite.driving import compare
 from ganlane.traffic import ReplayTraffic
 
-EPISODES = 7
-
 
 @pytest.fixture(scope="module")
-def recordings(tmp_path_factory):
-    path = tmp_path_factory.mktemp("recordings") / "scenes.csv"
-    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=3, seconds=7.0), seed=0), path)
-    return path
+def table(three_scenes):
+    traffics = {"idm": "idm", "replay": {"name": "replay", "path": str(three_scenes)}}
+    options = {"per_episode": True, "seed": 5, "goal_m": 60.0, "num_envs": 4}
+    return ganlane.api.evaluate(["keep_lane", "random_legal"], traffics, 7, **options)
 
 
-@pytest.fixture(scope="module")
-def table(recordings):
-    env = EnvConfig(goal_m=60.0)
-    traffics = {"idm": IdmTrafficConfig(), "replay": ReplayTrafficConfig(path=str(recordings))}
-    drivers = [make_driver(name, env) for name in ("keep_lane", "random_legal")]
-    config = EvaluateConfig(
-        env=env,
-        traffics=traffics,
-        seed=5,
-        episodes=EPISODES,
-        num_envs=4,
-    )
-    return compare(drivers, config)
-
-
-def test_every_replayed_episode_has_the_scene_that_it_ran_in(table, recordings):
-    scenes = ReplayTraffic(Stream.REPORT, recordings).scenes_of_episodes(5, range(EPISODES))
+def test_every_replayed_episode_has_the_scene_that_it_ran_in(table, three_scenes):
+    scenes = ReplayTraffic(Stream.REPORT, three_scenes).scenes_of_episodes(5, range(7))
     assert len(set(scenes)) == 3
-    replayed = table.filter(pl.col("traffic") == "replay")
-    for _, episodes in replayed.group_by("agent"):
-        assert episodes.sort("episode")["scene"].to_list() == scenes
-    assert table.filter(pl.col("traffic") == "idm")["scene"].is_null().all()
+    for agent in ("keep_lane", "random_legal"):
+        episodes = table.filter(traffic="replay", agent=agent).sort("episode")
+        assert episodes["scene"].to_list() == scenes
+    assert table.filter(traffic="idm")["scene"].is_null().all()
 
 
 def test_the_record_holds_rows_paired_leads_failures_and_crashes_by_scene(table, tmp_path, capsys):
@@ -68,10 +44,5 @@ def test_the_record_holds_rows_paired_leads_failures_and_crashes_by_scene(table,
 
 
 def test_other_traffics_have_no_scenes(table, tmp_path):
-    publish(
-        table.filter(pl.col("traffic") == "idm").drop("scene"),
-        tmp_path,
-        {},
-        {},
-    )
+    publish(table.filter(traffic="idm").drop("scene"), tmp_path, {}, {})
     assert "crashes_by_scene" not in json.loads((tmp_path / "results.json").read_text())

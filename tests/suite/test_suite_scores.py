@@ -11,32 +11,23 @@ from ganlane.settings.suite import Suite
 from ganlane.suite.scores import by_recipe, comparisons, recipe_of, rows, summaries
 
 
+def table_of(*episodes):
+    return by_recipe(pl.concat(episodes))
+
+
 @pytest.fixture(scope="module")
 def matrix():
     """Two trainings of a recipe, MOBIL and the random driver.
 
     The first training crashes and leaves the road once.
     """
-    goal = ["goal"] * 2
-    return by_recipe(
-        pl.concat(
-            [
-                driven("random_legal", [0, 0, 1, 0]),
-                driven(
-                    "mobil",
-                    [100, 100, 101, 100],
-                    [*goal, "goal", "hard_crash"],
-                    at_fault=False,
-                ),
-                driven(
-                    "agent_idm@0",
-                    [120, 120, 121, 120],
-                    ["hard_crash", "out_of_road", *goal],
-                    at_fault=True,
-                ),
-                driven("agent_idm@1", [140, 140, 141, 140]),
-            ]
-        )
+    mobil = ["goal", "goal", "goal", "hard_crash"]
+    idm = ["hard_crash", "out_of_road", "goal", "goal"]
+    return table_of(
+        driven("random_legal", [0, 0, 1, 0]),
+        driven("mobil", [100, 100, 101, 100], mobil, at_fault=False),
+        driven("agent_idm@0", [120, 120, 121, 120], idm, at_fault=True),
+        driven("agent_idm@1", [140, 140, 141, 140]),
     )
 
 
@@ -54,21 +45,24 @@ def test_a_recipe_is_its_drivers_without_their_seeds():
 def test_a_row_holds_the_trainings_together_and_each_alone(matrix):
     row = row_of(matrix, "agent_idm")
     assert (row["trainings"], row["episodes"]) == (2, 4)
-    assert row["mean_reward"] == pytest.approx(130.25)
-    assert row["minus_mobil"] == pytest.approx(30.0)
     # Two trainings that lead by 20 and 40: resampled, one of them twice at the most, as wide as two
     # tell of others.
     width = 10.0 * np.sqrt(2 / 1) * stats.t.ppf(0.975, 1) / stats.norm.ppf(0.975)
     assert row["minus_mobil_ci"] == pytest.approx([30.0 - width, 30.0 + width])
-    assert row["probability_above_mobil"] == 1.0
-    assert row["normalized_percent"] == pytest.approx(130.0)
-    assert [training["mean_reward"] for training in row["each"]] == pytest.approx([120.25, 140.25])
-    assert [training["hard_crash"] for training in row["each"]] == [1, 0]
-    assert row["mean_speed_mps"] == pytest.approx(25.0)
-    assert row["lane_changes_per_km"] == pytest.approx(2.0)
-    assert row["crashes_per_1000_km"] == pytest.approx(1000 / (8 * KM))
-    assert row["departures_per_1000_km"] == pytest.approx(1000 / (8 * KM))
-    assert row["failures_per_1000_km"] == pytest.approx(2000 / (8 * KM))
+    expected = {
+        "mean_reward": 130.25,
+        "minus_mobil": 30.0,
+        "probability_above_mobil": 1.0,
+        "normalized_percent": 130.0,
+        "mean_speed_mps": 25.0,
+        "lane_changes_per_km": 2.0,
+        "crashes_per_1000_km": 1000 / (8 * KM),
+        "departures_per_1000_km": 1000 / (8 * KM),
+        "failures_per_1000_km": 2000 / (8 * KM),
+    }
+    assert {name: row[name] for name in expected} == pytest.approx(expected)
+    alone = [(training["mean_reward"], training["hard_crash"]) for training in row["each"]]
+    assert alone == [(120.25, 1), (140.25, 0)]
 
 
 def test_what_is_not_known_is_none(matrix):
@@ -90,19 +84,23 @@ def test_drivers_are_compared_on_the_same_episodes_training_by_training(matrix):
 
 def test_trainings_are_matched_by_their_seed():
     crash, goal = ["hard_crash", "goal"], ["goal", "goal"]
-    ours = [
-        driven(f"agent_gan@{seed}", [0, 0], ends)
-        for seed, ends in ((0, goal), (1, crash), (4, goal))
+    trainings = {
+        "agent_gan": {0: goal, 1: crash, 4: goal},
+        "agent_idm": {2: goal, 1: crash},
+    }
+    frames = [
+        driven(f"{agent}@{seed}", [0, 0], ends)
+        for agent, by_seed in trainings.items()
+        for seed, ends in by_seed.items()
     ]
-    theirs = [driven(f"agent_idm@{seed}", [0, 0], ends) for seed, ends in ((2, goal), (1, crash))]
-    (row,) = comparisons(by_recipe(pl.concat([*ours, *theirs])), [("agent_gan", "agent_idm")])
+    (row,) = comparisons(table_of(*frames), [("agent_gan", "agent_idm")])
     assert row["mcnemar"] == [
         {"driver": "agent_gan@1", "only_first": 0, "only_second": 0, "p_value": 1.0}
     ]
 
 
 def test_two_drivers_that_never_crashed_may_still_differ():
-    both = by_recipe(pl.concat([driven("mobil", [0] * 50), driven("keep_lane", [0] * 50)]))
+    both = table_of(driven("mobil", [0] * 50), driven("keep_lane", [0] * 50))
     (row,) = comparisons(both, [("mobil", "keep_lane")])
     most = 1000 * (1 - 0.025 ** (1 / 50))  # the exact bound of 0 in 50
     assert row["crash_difference_per_1000_episodes_ci"] == pytest.approx([-most, most])
@@ -110,9 +108,8 @@ def test_two_drivers_that_never_crashed_may_still_differ():
 
 @pytest.mark.parametrize("other", ["mine/agent_idm.safetensors@0", "agent_idm"])
 def test_two_agents_of_one_name_and_seed_are_not_mixed(other):
-    both = pl.concat([driven("agent_idm@0", [0, 0]), driven(other, [0, 0])])
     with user_error("two of one seed are called agent_idm"):
-        by_recipe(both)
+        table_of(driven("agent_idm@0", [0, 0]), driven(other, [0, 0]))
 
 
 def test_the_score_is_the_interquartile_mean_over_traffics_and_the_worst_is_named():
@@ -129,7 +126,7 @@ def test_the_score_is_the_interquartile_mean_over_traffics_and_the_worst_is_name
             driven("mine@0", [reward - 4, reward], traffic=traffic, least_ttc_s=1.0),
             driven("mine@1", [reward, reward + 4], ["goal", "hard_crash"], traffic=traffic),
         ]
-    cells = by_recipe(pl.concat(parts))
+    cells = table_of(*parts)
     by_name = {entry["entry"]: entry for entry in summaries(cells, rows(cells), suite)}
     mine = by_name["mine"]
     assert mine["score"] == pytest.approx((110 + 120) / 2)
@@ -149,10 +146,9 @@ def test_the_score_is_the_interquartile_mean_over_traffics_and_the_worst_is_name
 
 def test_replayed_episodes_of_one_recorded_car_are_one():
     # Of car 1 three episodes, of which one crashed; of car 2 one.
-    ends = ["hard_crash", "goal", "goal", "goal"]
-    episodes = [driven("mobil", [0, 30, 60, 100]), driven("mine", [0, 30, 60, 120], ends)]
-    cars = [frame.with_columns(car=pl.Series([1, 1, 1, 2])) for frame in episodes]
-    (_, row) = rows(by_recipe(pl.concat(cars)))
+    ends, car = ["hard_crash", "goal", "goal", "goal"], [1, 1, 1, 2]
+    mobil = driven("mobil", [0, 30, 60, 100], car=car)
+    (_, row) = rows(table_of(mobil, driven("mine", [0, 30, 60, 120], ends, car=car)))
     assert row["episodes"] == 4
     assert row["mean_reward"] == pytest.approx((30 + 120) / 2)
     assert row["minus_mobil"] == pytest.approx(10)

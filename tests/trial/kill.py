@@ -12,8 +12,8 @@ import json
 import os
 import random
 import signal
+import sys
 import time
-import traceback
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -28,7 +28,7 @@ import ganlane.generator.checkpoint
 import ganlane.training.phases  # noqa: F401
 from ganlane.config.run import run_command
 
-from .tally import Tally
+from .tally import FORK, Tally
 
 train = partial(run_command, "train")
 #: Seconds that an attempt may take; then it hangs.
@@ -136,39 +136,26 @@ def run(
 
     It is killed after ``after_s`` seconds, unless it has ended before.
     """
-    child = os.fork()
-    if child == 0:
-        _train(arguments, log, prepare)
-    begun = time.monotonic()
-    ended = 0
-    while ended == 0 and time.monotonic() < begun + AT_MOST_S:
-        time.sleep(0.002)
-        ended, code = os.waitpid(child, os.WNOHANG)
-        if ended == 0 and after_s is not None and time.monotonic() > begun + after_s:
-            os.kill(child, signal.SIGKILL)
-            after_s = None
+    child = FORK.Process(target=_train, args=(arguments, log, prepare))
+    child.start()
+    child.join(AT_MOST_S if after_s is None else after_s)
+    hangs = child.is_alive() and after_s is None
+    child.kill()
+    child.join()
     said = log.read_text(errors="replace")
-    if ended == 0:
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
+    if hangs:
         return Attempt(None, f"hung for {AT_MOST_S:g} s: {said}")
-    return Attempt(os.waitstatus_to_exitcode(code), said)
+    return Attempt(child.exitcode, said)
 
 
 def _train(arguments: list[str], log: Path, prepare: Callable[[], None] | None) -> None:
     """Run the command in this child, and end it."""
-    status = 1
-    try:
-        with log.open("w") as file:
-            os.dup2(file.fileno(), 1)
-            os.dup2(file.fileno(), 2)
-        if prepare is not None:
-            prepare()
-        status = train(arguments)
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        os._exit(status)
+    with log.open("w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    if prepare is not None:
+        prepare()
+    sys.exit(train(arguments))
 
 
 def torn_write(number: int, share: float) -> Callable[[], None]:

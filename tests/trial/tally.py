@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import os
-import pickle
+import multiprocessing
 import resource
-import select
-import signal
 import time
-import traceback
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
 from typing import Any
+
+#: A child is a copy of this process, which has imported everything.
+FORK = multiprocessing.get_context("fork")
 
 
 @dataclass
@@ -44,45 +44,32 @@ def forked(
     """
     waiting = list(items)
     while waiting:
-        reading, writing = os.pipe()
-        child = os.fork()
-        if child == 0:
-            os.close(reading)
-            _serve(work, waiting, writing, int(memory_gib * 2**30))
-        os.close(writing)
-        done = 0
+        results, sender = FORK.Pipe(duplex=False)
+        memory = int(memory_gib * 2**30)
+        child = FORK.Process(target=_serve, args=(work, waiting, sender, memory))
+        child.start()
+        sender.close()
         lost = ""
         try:
-            with os.fdopen(reading, "rb") as results:
-                while done < len(waiting) and not lost:
-                    if not select.select([results], [], [], at_most_s)[0]:
+            while waiting and not lost:
+                try:
+                    if results.poll(at_most_s):
+                        result = results.recv()
+                        yield waiting.pop(0), result
+                    else:
                         lost = f"LOST: more than {at_most_s:g} s"
-                        continue
-                    try:
-                        result = pickle.load(results)  # our own child's
-                    except EOFError:
-                        lost = "LOST: the process ended"
-                        continue
-                    yield waiting[done], result
-                    done += 1
+                except EOFError:
+                    lost = "LOST: the process ended"
         finally:  # also where the caller has had enough
-            os.kill(child, signal.SIGKILL)
-            _, status = os.waitpid(child, 0)
+            child.kill()
+            child.join()
         if lost:
-            yield waiting[done], f"{lost} (status {status})"
-            done += 1
-        waiting = waiting[done:]
+            yield waiting.pop(0), f"{lost} (status {child.exitcode})"
 
 
-def _serve(work: Callable[[Any], Any], items: list[Any], writing: int, memory: int) -> None:
-    """Do the work and write the results, then end this process."""
+def _serve(work: Callable[[Any], Any], items: list[Any], sender: Connection, memory: int) -> None:
+    """Do the work and send the results, then wait for the end of this process."""
     resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
-    try:
-        # Unbuffered, and one write for each result: what select sees is all there is.
-        for item in items:
-            os.write(writing, pickle.dumps(work(item)))
-        time.sleep(1e6)  # the parent ends it, once it has read everything
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        os._exit(1)
+    for item in items:
+        sender.send(work(item))
+    time.sleep(1e6)  # the parent ends it, once it has read everything

@@ -1,7 +1,5 @@
 """The common style: rows of panels, legends, and files that come whole in their format."""
 
-from __future__ import annotations
-
 import matplotlib
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Films have the frames and the size that were asked for, and are whole or absent."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from importlib.util import find_spec
@@ -78,12 +76,8 @@ def test_an_mp4_has_all_frames(episode, tmp_path):
     import imageio_ffmpeg
 
     path = write_film(episode, tmp_path / "a.mp4", SHORT)
-    reader = imageio_ffmpeg.read_frames(str(path))
-    meta = next(reader)
-    assert meta["size"] == (640, 160)
-    assert meta["fps"] == 10
-    frames = list(reader)
-    assert len(frames) == 10 + 15
+    meta, *frames = imageio_ffmpeg.read_frames(str(path))
+    assert (meta["size"], meta["fps"], len(frames)) == ((640, 160), 10, 10 + 15)
     shown = np.frombuffer(frames[3], np.uint8).reshape(160, 640, 3).astype(int)
     assert np.abs(shown - frame(episode, 3, SHORT)).mean() < 6.0
 
@@ -96,16 +90,11 @@ def empty(tmp_path):
 
 
 @needs_video
-def test_half_an_mp4_on_a_full_disk_is_none(episode, empty):
+def test_half_an_mp4_on_a_full_disk_is_none(episode, empty, room_on_disk):
     """ffmpeg fails, and only its exit status says so."""
-    resource = pytest.importorskip("resource")
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2**12, before[1]))
-    try:
-        with pytest.raises(OSError, match="File too large") as caught:
-            write_film(episode, empty / "a.mp4", SHORT)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    room_on_disk(2**12)
+    with pytest.raises(OSError, match="File too large") as caught:
+        write_film(episode, empty / "a.mp4", SHORT)
     assert caught.value.filename == str(empty / "a.mp4")
 
 

@@ -1,7 +1,5 @@
 """Frames show what the trajectory says, where it says it."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 
@@ -82,6 +80,14 @@ def test_nine_vehicles_are_drawn_fast_enough_for_60_frames_a_second():
 # Where lanes begin and end
 
 
+def two_lanes(stretch):
+    """The picture of an ego in the left one, its window, and the row of the right one's middle."""
+    label = EpisodeLabel(lanes=2, stretches=(stretch, LaneStretch()))
+    window = Window(FilmConfig(), 2, 4.0)
+    picture = FramePainter(straight([0.0], [1], lanes=2, label=label)).draw(0)
+    return picture, window, int(window.row(0.0))
+
+
 @pytest.mark.parametrize(
     ("stretch", "road"),
     [
@@ -93,20 +99,13 @@ def test_nine_vehicles_are_drawn_fast_enough_for_60_frames_a_second():
 )
 def test_there_is_asphalt_where_the_lane_is_and_a_ramp_before_or_behind_it(stretch, road):
     """In the middle of the right lane, 30 m behind the ego, beside it, and 30 m ahead of it."""
-    label = EpisodeLabel(lanes=2, stretches=(stretch, LaneStretch()))
-    trajectory = straight([0.0], [1], lanes=2, label=label)
-    picture = FramePainter(trajectory, FilmConfig()).draw(0)
-    window = Window(FilmConfig(), 2, 4.0)
-    row = int(window.row(0.0))
+    picture, window, row = two_lanes(stretch)
     columns = window.column([-30.0, 0.0, 30.0], 0.0).astype(int).tolist()
     assert near(picture, canvas.ASPHALT)[row, columns].tolist() == road
 
 
 def test_a_wall_is_red():
-    wall = LaneStretch(end_m=20.0, end=WALL)
-    label = EpisodeLabel(lanes=2, stretches=(wall, LaneStretch()))
-    picture = FramePainter(straight([0.0], [1], lanes=2, label=label)).draw(0)
-    window = Window(FilmConfig(), 2, 4.0)
-    column, row = place(picture, canvas.CRASH)
-    assert column == pytest.approx(window.column(20.5, 0.0), abs=2.0)
-    assert row == pytest.approx(window.row(0.0), abs=4.0)
+    picture, window, row = two_lanes(LaneStretch(end_m=20.0, end=WALL))
+    place_of_wall = place(picture, canvas.CRASH)
+    assert place_of_wall[0] == pytest.approx(window.column(20.5, 0.0), abs=2.0)
+    assert place_of_wall[1] == pytest.approx(row, abs=4.0)

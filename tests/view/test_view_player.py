@@ -1,7 +1,5 @@
 """The player's page holds the episodes, and nothing that could load or run anything else."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -3,8 +3,6 @@
 It plays, scrubs, follows and draws, without an error and without a request.
 """
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The pages of the documentation in a real browser: no page is wider than the window."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 No driver, no port, no package.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import select

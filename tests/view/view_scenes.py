@@ -1,7 +1,5 @@
 """Hand-made trajectories for the tests of the view."""
 
-from __future__ import annotations
-
 import numpy as np
 import polars as pl
 from PIL.ImageColor import getrgb

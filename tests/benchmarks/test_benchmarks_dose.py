@@ -9,22 +9,38 @@ from ganlane.config.run import call_settings
 
 def driven(folder, training, rewards, failed):
     """Held-out episodes of a finished training."""
-    home = folder / training.name
-    home.mkdir(parents=True)
     columns = {"traffic": "idm_faults", "episode": range(len(rewards))}
     frame = pl.DataFrame({**columns, "reward": rewards, "failed": failed})
-    frame.write_parquet(home / "held_out.parquet")
+    frame.write_parquet(folder / training.file)
 
 
-def test_every_training_is_one_that_the_command_takes_and_has_a_folder_of_its_own():
+def test_every_training_is_one_that_an_environment_takes_and_has_a_file_of_its_own():
     chosen = list(dose.trainings(2))
-    assert len({training.name for training in chosen}) == len(chosen)
+    assert len({training.file for training in chosen}) == len(chosen)
     # One mask after the other, and the first seeds of all doses first.
     order = [(dose.MASKS.index(training.mask), training.seed) for training in chosen]
     assert order == sorted(order)
     for training in (one for one in chosen if one.seed == 0):
-        config = call_settings("train", {"experiment": "dose", **training.settings()})
+        config = call_settings("train", training.settings())
         assert config.traffic.label() == "human"
+
+
+def test_a_training_drives_on_traffics_that_it_never_met_and_is_not_made_twice(
+    tmp_path, monkeypatch, capsys
+):
+    pytest.importorskip("sb3_contrib")
+    for name, value in (("DECISIONS", 128), ("ROWS", 2), ("EPISODES", 2)):
+        monkeypatch.setattr(dose, name, value)
+    monkeypatch.setattr(dose, "MASKS", ("legal",))
+    monkeypatch.setattr(dose, "DOSES", {})
+    arguments = ["train", "--folder", str(tmp_path), "--seeds", "1"]
+    assert dose.main(arguments) == 0
+    episodes = pl.read_parquet(tmp_path / "legal_as_fitted_0.parquet")
+    assert set(episodes["traffic"]) == set(dose.HELD_OUT)
+    assert len(episodes) == 2 * len(dose.HELD_OUT)
+    assert "done" in capsys.readouterr().out
+    assert dose.main(arguments) == 0
+    assert "done" not in capsys.readouterr().out
 
 
 def test_the_table_tells_each_doses_difference_to_unchanged_drivers(tmp_path, capsys):

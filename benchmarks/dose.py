@@ -2,15 +2,16 @@
 
     python -m benchmarks.dose train
     python -m benchmarks.dose table
+    python -m benchmarks.dose figure
 
 The first takes hours on one core and goes on where it ended. For two cores: `train --part 0/2`
 beside `train --part 1/2`.
 
 Every training is the same: MaskablePPO of sb3-contrib, from random weights, among `human` drivers
-with one property changed. Its agent then drives on traffics that no training met. The table has,
-for each dose, the difference to the trainings among unchanged drivers: reward, and failures
-(crashes and departures) per 1000 episodes; the unit of the intervals is the training. It needs
-`pip install 'ganlane[sb3]'` and no recordings.
+with one property changed, or among other drivers altogether. Its agent then drives on traffics that
+no training met. The table has, for each dose, the difference to the trainings among unchanged
+drivers: reward, and failures (crashes and departures) per 1000 episodes; the unit of the intervals
+is the training. It needs `pip install 'ganlane[sb3]'` and no recordings.
 """
 
 from __future__ import annotations
@@ -25,14 +26,17 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 import torch
+from matplotlib import rc_context
+from matplotlib.figure import Figure
 
 from benchmarks.script import make_parser, run_script
 from ganlane import api
 from ganlane.errors import UserError
-from ganlane.evaluation.statistics import difference, entries
+from ganlane.evaluation.statistics import Estimate, difference, entries
 from ganlane.evaluation.table import Table, with_interval
 from ganlane.files import atomic_path
 from ganlane.settings.suite import PUBLISHED
+from ganlane.view.figures import COLOURS, FAINT, STYLE, add_legend, save_figure
 
 #: Values of each property; what is not named is as fitted.
 DOSES: dict[str, tuple[Any, ...]] = {
@@ -42,9 +46,10 @@ DOSES: dict[str, tuple[Any, ...]] = {
     "delayed": (1, 2),
     "blind_share": (0.1, 0.3, 1.0),
     "desired_speed_mps": ((21.0, 23.0), (14.0, 30.0)),
+    "traffic": ("idm_mobil", "gan"),
 }
-#: Properties of the scene rather than of the traffic.
-OF_SCENE = ("desired_speed_mps",)
+#: Properties of the environment rather than of its drivers.
+OF_ENVIRONMENT = ("desired_speed_mps", "traffic")
 #: The drivers that all trainings meet, so that a table is of the same ones: the first weights.
 DRIVERS = {"name": "human", **PUBLISHED["shift-v1"]["human"]}
 UNCHANGED = "as fitted"
@@ -52,8 +57,10 @@ MASKS = ("legal", "safe")
 #: Traffics that no training met.
 HELD_OUT = ("idm_faults", "idm_random", "gan_calibrated")
 EPISODES = 300
+SCORES = ("reward", "failures")
 DECISIONS = 1_500_000
 ROWS = 256
+FIGURE = Path(__file__).parents[1] / "docs" / "figures" / "dose.png"
 
 
 class Training(NamedTuple):
@@ -73,7 +80,7 @@ class Training(NamedTuple):
     def settings(self) -> dict[str, Any]:
         """Options of its environment."""
         changed = {} if self.dose is None else {self.varied: self.dose}
-        if self.varied in OF_SCENE:
+        if self.varied in OF_ENVIRONMENT:
             return {"traffic": DRIVERS, **changed}
         return {"traffic": {**DRIVERS, **changed}}
 
@@ -151,43 +158,91 @@ def scores(folder: Path, training: Training, seeds: int) -> dict[str, npt.NDArra
     return {"reward": np.array(rewards), "failures": np.array(failures, np.float64)}
 
 
-def dose_table(folder: Path, seeds: int) -> str:
-    """The table of all doses that were tried.
+class Effect(NamedTuple):
+    """What a dose changed: the difference to trainings among unchanged drivers."""
+
+    training: Training
+    seeds: int
+    reward: Estimate
+    failures: Estimate  # per 1000 episodes
+
+
+def effects(folder: Path, seeds: int) -> Iterator[Effect]:
+    """Of all doses that were tried; of unchanged drivers themselves the means, without interval.
 
     Raises:
         UserError: there are no trainings among unchanged drivers to compare with.
     """
-    rows = []
+    tried = False
     for mask in MASKS:
-        baseline = scores(folder, Training(mask, UNCHANGED, None, 0), seeds)
+        unchanged = Training(mask, UNCHANGED, None, 0)
+        baseline = scores(folder, unchanged, seeds)
         if not baseline:
             continue
-        mean, rate = baseline["reward"].mean(), baseline["failures"].mean()
-        rows.append(
-            [mask, UNCHANGED, "", str(len(baseline["reward"])), f"{mean:.1f}", f"{rate:.1f}"]
-        )
+        tried = True
+        reward, failures = (Estimate(float(baseline[name].mean()), None) for name in SCORES)
+        yield Effect(unchanged, len(baseline["reward"]), reward, failures)
         for name, doses in DOSES.items():
             for dose in doses:
-                changed = scores(folder, Training(mask, name, dose, 0), seeds)
-                if not changed:
-                    continue
-                cells = []
-                for score in ("reward", "failures"):
-                    row = entries(score, difference(changed[score], baseline[score]))
-                    cells.append(with_interval(row, score, 1))
-                rows.append([mask, name, str(dose), str(len(changed["reward"])), *cells])
-    if not rows:
+                training = Training(mask, name, dose, 0)
+                changed = scores(folder, training, seeds)
+                if changed:
+                    reward, failures = (difference(changed[n], baseline[n]) for n in SCORES)
+                    yield Effect(training, len(changed["reward"]), reward, failures)
+    if not tried:
         raise UserError(f"--folder {folder}: no finished trainings; run 'train' first.")
+
+
+def dose_table(folder: Path, seeds: int) -> str:
+    """The table of :func:`effects`."""
+    rows = []
+    for effect in effects(folder, seeds):
+        mask, varied, dose, _ = effect.training
+        reward, failures = (
+            with_interval(entries(name, getattr(effect, name)), name, 1) for name in SCORES
+        )
+        dose = "" if dose is None else str(dose)
+        rows.append([mask, varied, dose, str(effect.seeds), reward, failures])
     heads = ["mask", "property", "dose", "trainings", "reward", "failures/1000 episodes"]
     return Table("", heads, rows, names=3).text()
 
 
+@rc_context(STYLE)
+def draw_effects(changes: Sequence[Effect]) -> Figure:
+    """A panel for each property: what each dose changed in reward, with its 95 % interval."""
+    figure = Figure(figsize=(9.0, 4.6))
+    panels = figure.subplots(2, -(-len(DOSES) // 2), sharey=True).ravel()
+    colours = dict(zip(MASKS, COLOURS))
+    for panel, (name, doses) in zip(panels, DOSES.items()):
+        panel.axhline(0.0, color=FAINT, ls=":")
+        panel.set(title=name, xticks=range(len(doses)), xticklabels=[str(dose) for dose in doses])
+        panel.set_xlim(-0.5, len(doses) - 0.5)
+        for effect in changes:
+            mask, varied, dose, _ = effect.training
+            if varied != name or effect.reward.interval is None:
+                continue
+            low, high = effect.reward.interval
+            # Beside each other where there are several masks.
+            place = doses.index(dose) + 0.15 * MASKS.index(mask)
+            panel.plot([place, place], [low, high], color=colours[mask])
+            panel.plot(place, effect.reward.value, "o", color=colours[mask])
+    for panel in panels[len(DOSES) :]:
+        panel.set_axis_off()
+    figure.supylabel("reward, difference to drivers as fitted")
+    shown = {effect.training.mask for effect in changes}
+    add_legend(figure, {f"mask={mask}": colours[mask] for mask in MASKS if mask in shown})
+    return figure
+
+
 def measure(arguments: argparse.Namespace) -> str:
-    """Either of the two."""
+    """One of the three."""
+    folder, seeds = arguments.folder, arguments.seeds
     if arguments.action == "table":
-        return dose_table(arguments.folder, arguments.seeds)
+        return dose_table(folder, seeds)
+    if arguments.action == "figure":
+        return f"figure: {save_figure(draw_effects(list(effects(folder, seeds))), arguments.out)}"
     part, parts = arguments.part
-    return train(arguments.folder, arguments.seeds, part, parts)
+    return train(folder, seeds, part, parts)
 
 
 def part_of_many(text: str) -> tuple[int, int]:
@@ -201,9 +256,10 @@ def part_of_many(text: str) -> tuple[int, int]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The script."""
     parser = make_parser(__doc__)
-    parser.add_argument("action", choices=("train", "table"))
+    parser.add_argument("action", choices=("train", "table", "figure"))
     parser.add_argument("--folder", type=Path, default=Path("outputs/dose"))
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--out", type=Path, default=FIGURE, help="the figure's file")
     parser.add_argument(
         "--part",
         type=part_of_many,

@@ -38,7 +38,7 @@ DONE: Fields = dict.fromkeys(keys.DONE_FLAGS, torch.bool)
 
 
 def spec_of(state: TensorDictBase, n: int) -> Composite:
-    """Spec of states of ``n`` rows, nested as this ``state`` of one row."""
+    """Spec of states of ``n`` rows, nested as this ``state``."""
     specs: dict[str, Any] = {}
     for name, value in state.items():
         if isinstance(value, Tensor):

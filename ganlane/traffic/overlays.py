@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ganlane.settings.driving import IdmParameters
+from ganlane.settings.driving import IdmParameters, MobilParameters
 from ganlane.settings.generated import (
     CalibratedChanges,
     GuardParameters,
@@ -56,13 +56,15 @@ def _one_of(u: Tensor, left: Tensor, right: Tensor) -> Tensor:
     return torch.where(left & right, both, torch.where(left, 1, torch.where(right, -1, 0)))
 
 
-def _side(vehicles: Vehicles, road: Road, u: Tensor) -> tuple[Tensor, WaysOut | None]:
+def _side(
+    vehicles: Vehicles, road: Road, u: Tensor, mobil: MobilParameters
+) -> tuple[Tensor, WaysOut | None]:
     """As :func:`random_side`; where lanes end the side to which a driver has to go, if there is
     one, and all ways out.
     """
     if not road.stretches:
         return random_side(u, vehicles.target_lane, road.lanes), None
-    ways = ways_out(vehicles, road, TABLE_IV.mandatory_m)
+    ways = ways_out(vehicles, road, mobil.mandatory_m)
     return torch.where(ways.side != 0, ways.side, _one_of(u, ways.left, ways.right)), ways
 
 
@@ -84,9 +86,11 @@ class LiteralLaneChange(Overlay):
         road: Road | None = None,
         stream: int = Stream.TRAIN,
         changes: LiteralChanges | None = None,
+        mobil: MobilParameters = TABLE_IV,
     ) -> None:
         super().__init__(road, stream)
         self.changes = changes or LiteralChanges()
+        self.mobil = mobil
 
     def rewrite(
         self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
@@ -102,7 +106,7 @@ class LiteralLaneChange(Overlay):
         gauss = normal(key, step, vehicles.x.shape[1], [Purpose.LANE_CHANGE_SPEED], dtype)[..., 0]
         # Blind: nobody looks for a gap, as in the paper.
         hazard = literal_hazard(memory["clock"].to(dtype), c.mean_steps)
-        side, ways = _side(vehicles, self.road, u_side)
+        side, ways = _side(vehicles, self.road, u_side, self.mobil)
         if ways is not None:
             hazard = torch.maximum(hazard, ways.urgency)
         starts = (memory["lateral_speed"] == 0) & vehicles.valid & (u < hazard)
@@ -153,10 +157,12 @@ class CalibratedLaneChange(Overlay):
         stream: int = Stream.TRAIN,
         changes: CalibratedChanges | None = None,
         idm: IdmParameters = TABLE_V,
+        mobil: MobilParameters = TABLE_IV,
     ) -> None:
         super().__init__(road, stream)
         self.changes = changes or CalibratedChanges()
         self.idm = idm
+        self.mobil = mobil
         self._limits = self.changes.limits()
 
     def _wishes(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Tensor:
@@ -165,7 +171,7 @@ class CalibratedLaneChange(Overlay):
         # At a constant rate per kilometre driven: the probability of at least one event of a
         # Poisson process within the step.
         comes = u < 1.0 - torch.exp(-vehicles.speed * (self.dt * self.changes.per_km / 1000.0))
-        side, ways = _side(vehicles, self.road, u_side)
+        side, ways = _side(vehicles, self.road, u_side, self.mobil)
         # Who is still changing does not wish for another change.
         free = lane_change_done(vehicles, self.road) & vehicles.valid
         new = torch.where(comes & free, side, 0)

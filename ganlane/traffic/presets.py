@@ -36,7 +36,11 @@ from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
 
 
 def gan_traffic(
-    road: Road | None = None, stream: int = Stream.TRAIN, idm: IdmParameters = TABLE_V, **keys: Any
+    road: Road | None = None,
+    stream: int = Stream.TRAIN,
+    idm: IdmParameters = TABLE_V,
+    mobil: MobilParameters = TABLE_IV,
+    **keys: Any,
 ) -> TrafficSequential:
     """``traffic=gan``, the paper's: positions only, literal blind lane changes, sudden
     accelerations.
@@ -44,6 +48,7 @@ def gan_traffic(
     Args:
         road, stream: as for every traffic module.
         idm: of the guard's bounds on acceleration.
+        mobil: how drivers leave a lane that ends.
         keys: those of :class:`~ganlane.settings.traffic.GanTrafficConfig`.
 
     Raises:
@@ -56,7 +61,7 @@ def gan_traffic(
     parts: dict[str, TrafficModule] = {
         "generator": SocialGanTraffic(generator, drivers, road),
         "acceleration": AccelerationOverlay(road, stream, drivers.sudden),
-        "lane_change": LiteralLaneChange(road, stream, drivers.changes),
+        "lane_change": LiteralLaneChange(road, stream, drivers.changes, mobil),
     }
     # Last, so that nothing moves a vehicle after it.
     if drivers.guard is not None:
@@ -77,7 +82,7 @@ def gan_calibrated_traffic(
     Args:
         road, stream: as for every traffic module.
         idm: of the gap check; the anchor keeps its own (``SIMULATED_ANCHOR``).
-        mobil: how drivers make room for those who have to leave a lane that ends.
+        mobil: how drivers leave a lane that ends, and make room for those who have to.
         keys: those of :class:`~ganlane.settings.traffic.GanCalibratedTrafficConfig`.
 
     Raises:
@@ -88,7 +93,7 @@ def gan_calibrated_traffic(
     generator = with_weights(Generator, drivers.sizes, drivers.weights)
     parts: dict[str, TrafficModule] = {
         "generator": AnchoredGanTraffic(generator, drivers, road, mobil),
-        "lane_change": CalibratedLaneChange(road, stream, drivers.checked_changes, idm),
+        "lane_change": CalibratedLaneChange(road, stream, drivers.checked_changes, idm, mobil),
     }
     return TrafficSequential(parts, drivers)
 

@@ -131,7 +131,9 @@ def test_it_decides_as_the_tensor_code(traffic):
     ],
 )
 def test_it_decides_as_the_tensor_code_where_lanes_end(scene, traffic, rows, decisions):
-    config = make(EnvConfig, {"name": scene, "kernel": "torch"})
+    # Not Table IV's distance, so that whoever does not ask the environment is found out.
+    mobil = {"mandatory_m": 150.0}
+    config = make(EnvConfig, {"name": scene, "kernel": "torch", "mobil": mobil})
     module = make_traffic(make(TrafficConfig, traffic), config)
     env = make_highways(module, DrivingConfig(env=config), rows).base_env
     keep = torch.zeros(decisions, rows, dtype=torch.int64)

@@ -29,7 +29,7 @@ import torch
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from benchmarks.script import make_parser, run_script
+from benchmarks.script import ReportSection, add_report, make_parser, markdown, run_script
 from ganlane import api
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Estimate, difference, entries
@@ -60,6 +60,8 @@ EPISODES = 300
 SCORES = ("reward", "failures")
 DECISIONS = 1_500_000
 ROWS = 256
+#: Around the table in a document.
+MARKERS = ("<!-- begin dose -->", "<!-- end dose -->")
 FIGURE = Path(__file__).parents[1] / "docs" / "figures" / "dose.png"
 
 
@@ -193,7 +195,7 @@ def effects(folder: Path, seeds: int) -> Iterator[Effect]:
         raise UserError(f"--folder {folder}: no finished trainings; run 'train' first.")
 
 
-def dose_table(folder: Path, seeds: int) -> str:
+def dose_table(folder: Path, seeds: int) -> Table:
     """The table of :func:`effects`."""
     rows = []
     for effect in effects(folder, seeds):
@@ -204,7 +206,7 @@ def dose_table(folder: Path, seeds: int) -> str:
         dose = "" if dose is None else str(dose)
         rows.append([mask, varied, dose, str(effect.seeds), reward, failures])
     heads = ["mask", "property", "dose", "trainings", "reward", "failures/1000 episodes"]
-    return Table("", heads, rows, names=3).text()
+    return Table("", heads, rows, names=3)
 
 
 @rc_context(STYLE)
@@ -238,7 +240,10 @@ def measure(arguments: argparse.Namespace) -> str:
     """One of the three."""
     folder, seeds = arguments.folder, arguments.seeds
     if arguments.action == "table":
-        return dose_table(folder, seeds)
+        section = ReportSection(arguments.report, *MARKERS)
+        table = dose_table(folder, seeds)
+        section.write(f"\n{markdown(table)}\n")
+        return table.text()
     if arguments.action == "figure":
         return f"figure: {save_figure(draw_effects(list(effects(folder, seeds))), arguments.out)}"
     part, parts = arguments.part
@@ -259,6 +264,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("action", choices=("train", "table", "figure"))
     parser.add_argument("--folder", type=Path, default=Path("outputs/dose"))
     parser.add_argument("--seeds", type=int, default=3)
+    add_report(parser, *MARKERS)
     parser.add_argument("--out", type=Path, default=FIGURE, help="the figure's file")
     parser.add_argument(
         "--part",

@@ -1,10 +1,15 @@
 """The dose experiment: what is trained, and what its table says of the held-out episodes."""
 
+from pathlib import Path
+
 import polars as pl
 import pytest
 
 from benchmarks import dose
+from benchmarks.script import markdown
 from ganlane.config.run import call_settings
+
+ROOT = Path(__file__).parents[2]
 
 
 def driven(folder, training, rewards, failed):
@@ -54,6 +59,27 @@ def test_the_table_tells_each_doses_difference_to_unchanged_drivers(tmp_path, ca
     row = next(line for line in told.splitlines() if "politeness" in line)
     assert "10.0 [" in row
     assert "-500.0 [" in row
+
+
+def test_the_table_in_the_documents_is_that_of_the_stored_episodes():
+    text = (ROOT / "docs" / "generators.md").read_text()
+    table = markdown(dose.dose_table(ROOT / "docs" / "reproduce" / "dose", 3))
+    begin, end = dose.MARKERS
+    assert f"{begin}\n\n{table}\n\n{end}" in text
+
+
+def test_the_figure_has_a_panel_for_every_property(tmp_path):
+    for training in (
+        dose.Training("legal", dose.UNCHANGED, None, 0),
+        dose.Training("legal", "delayed", 1, 0),
+    ):
+        driven(tmp_path, training, [100.0, 102.0], [False, False])
+    figure = dose.draw_effects(list(dose.effects(tmp_path, 1)))
+    panels = {axes.get_title(loc="left") or axes.get_title(): axes for axes in figure.axes}
+    assert set(dose.DOSES) <= set(panels)
+    # Zero, the interval and the mean of the one dose; zero alone elsewhere.
+    assert len(panels["delayed"].lines) == 3
+    assert len(panels["politeness"].lines) == 1
 
 
 def test_without_trainings_it_says_what_to_run(tmp_path, capsys):

@@ -33,7 +33,7 @@ from benchmarks.script import ReportSection, add_report, make_parser, markdown, 
 from ganlane import api
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Estimate, difference, entries
-from ganlane.evaluation.table import Table, with_interval
+from ganlane.evaluation.table import Table, with_interval, with_sign
 from ganlane.files import atomic_path
 from ganlane.settings.suite import PUBLISHED
 from ganlane.view.figures import COLOURS, FAINT, STYLE, add_legend, save_figure
@@ -56,12 +56,16 @@ UNCHANGED = "as fitted"
 MASKS = ("legal", "safe")
 #: Traffics that no training met.
 HELD_OUT = ("idm_faults", "idm_random", "gan_calibrated")
+#: Those on which some were trained; the agents of these drive on all of them.
+MET = ("idm_mobil", "human", "gan")
 EPISODES = 300
+MOST_SEEDS = 10
 SCORES = ("reward", "failures")
 DECISIONS = 1_500_000
 ROWS = 256
-#: Around the table in a document.
+#: Around the two tables in a document.
 MARKERS = ("<!-- begin dose -->", "<!-- end dose -->")
+TRANSFER = ("<!-- begin dose traffics -->", "<!-- end dose traffics -->")
 FIGURE = Path(__file__).parents[1] / "docs" / "figures" / "dose.png"
 
 
@@ -72,6 +76,16 @@ class Training(NamedTuple):
     varied: str
     dose: Any
     seed: int
+
+    @property
+    def traffic(self) -> str:
+        """The drivers that it met, by their name."""
+        return self.dose if self.varied == "traffic" else "human"
+
+    def driven(self) -> tuple[str, ...]:
+        """The traffics that its agent drives on."""
+        compares_traffics = self.varied in (UNCHANGED, "traffic")
+        return HELD_OUT + MET if compares_traffics else HELD_OUT
 
     @property
     def file(self) -> str:
@@ -87,13 +101,15 @@ class Training(NamedTuple):
         return {"traffic": {**DRIVERS, **changed}}
 
 
-def trainings(seeds: int) -> Iterator[Training]:
-    """All of them; all seeds of a mask come first, so that one whole table is soon there."""
+def trainings(seeds: int, properties: Sequence[str] = tuple(DOSES)) -> Iterator[Training]:
+    """All of these ``properties``; all seeds of a mask come first, so that one whole table is soon
+    there.
+    """
     for mask in MASKS:
         for seed in range(seeds):
             yield Training(mask, UNCHANGED, None, seed)
-            for name, doses in DOSES.items():
-                for dose in doses:
+            for name in properties:
+                for dose in DOSES[name]:
                     yield Training(mask, name, dose, seed)
 
 
@@ -127,16 +143,16 @@ def trained(training: Training) -> api.Driver:
     return sb3.driver(model.learn(DECISIONS))
 
 
-def train(folder: Path, seeds: int, part: int, parts: int) -> str:
-    """Make the trainings that are missing, and drive the agents on the held-out traffics."""
+def train(folder: Path, chosen: Sequence[Training]) -> str:
+    """Make the trainings that are missing, and drive their agents."""
     torch.set_num_threads(1)  # small networks: a second thread only costs
-    chosen = list(trainings(seeds))[part::parts]
     for training in chosen:
         episodes = folder / training.file
         if episodes.is_file():
             continue
+        traffics = [DRIVERS if name == "human" else name for name in training.driven()]
         table = api.evaluate(
-            [trained(training)], list(HELD_OUT), episodes=EPISODES, per_episode=True, threads=1
+            [trained(training)], traffics, episodes=EPISODES, per_episode=True, threads=1
         )
         failed = pl.col("reason").is_in(["hard_crash", "out_of_road"])
         table = table.select("traffic", "episode", pl.col("reward").cast(pl.Float32), failed=failed)
@@ -146,13 +162,18 @@ def train(folder: Path, seeds: int, part: int, parts: int) -> str:
     return f"{len(chosen)} trainings in {folder}"
 
 
-def scores(folder: Path, training: Training, seeds: int) -> dict[str, npt.NDArray[np.float64]]:
-    """Rewards and failures [S, E] of a dose on all held-out traffics; empty where none is made."""
+def scores(
+    folder: Path, training: Training, traffics: Sequence[str] = HELD_OUT
+) -> dict[str, npt.NDArray[np.float64]]:
+    """Rewards and failures [S, E] of all seeds of a dose on ``traffics``; empty where there are
+    none.
+    """
     rewards, failures = [], []
-    for seed in range(seeds):
+    for seed in range(MOST_SEEDS):
         path = folder / training._replace(seed=seed).file
         if path.is_file():
-            table = pl.read_parquet(path).sort("traffic", "episode")
+            table = pl.read_parquet(path).filter(pl.col("traffic").is_in(traffics))
+            table = table.sort("traffic", "episode")
             rewards.append(table["reward"].to_numpy())
             failures.append(1000.0 * table["failed"].to_numpy())
     if not rewards:
@@ -169,7 +190,7 @@ class Effect(NamedTuple):
     failures: Estimate  # per 1000 episodes
 
 
-def effects(folder: Path, seeds: int) -> Iterator[Effect]:
+def effects(folder: Path) -> Iterator[Effect]:
     """Of all doses that were tried; of unchanged drivers themselves the means, without interval.
 
     Raises:
@@ -178,7 +199,7 @@ def effects(folder: Path, seeds: int) -> Iterator[Effect]:
     tried = False
     for mask in MASKS:
         unchanged = Training(mask, UNCHANGED, None, 0)
-        baseline = scores(folder, unchanged, seeds)
+        baseline = scores(folder, unchanged)
         if not baseline:
             continue
         tried = True
@@ -187,7 +208,7 @@ def effects(folder: Path, seeds: int) -> Iterator[Effect]:
         for name, doses in DOSES.items():
             for dose in doses:
                 training = Training(mask, name, dose, 0)
-                changed = scores(folder, training, seeds)
+                changed = scores(folder, training)
                 if changed:
                     reward, failures = (difference(changed[n], baseline[n]) for n in SCORES)
                     yield Effect(training, len(changed["reward"]), reward, failures)
@@ -195,10 +216,10 @@ def effects(folder: Path, seeds: int) -> Iterator[Effect]:
         raise UserError(f"--folder {folder}: no finished trainings; run 'train' first.")
 
 
-def dose_table(folder: Path, seeds: int) -> Table:
+def dose_table(folder: Path) -> Table:
     """The table of :func:`effects`."""
     rows = []
-    for effect in effects(folder, seeds):
+    for effect in effects(folder):
         mask, varied, dose, _ = effect.training
         reward, failures = (
             with_interval(entries(name, getattr(effect, name)), name, 1) for name in SCORES
@@ -207,6 +228,32 @@ def dose_table(folder: Path, seeds: int) -> Table:
         rows.append([mask, varied, dose, str(effect.seeds), reward, failures])
     heads = ["mask", "property", "dose", "trainings", "reward", "failures/1000 episodes"]
     return Table("", heads, rows, names=3)
+
+
+def transfer_table(folder: Path, mask: str = MASKS[0]) -> Table:
+    """Mean reward, and what it is over drivers as fitted, of each traffic of training on each
+    traffic; italics: met in training.
+    """
+    rows = []
+    unchanged = Training(mask, UNCHANGED, None, 0)
+    for training in (unchanged, *(Training(mask, "traffic", name, 0) for name in DOSES["traffic"])):
+        cells = []
+        seeds = 0
+        for traffic in training.driven():
+            rewards = scores(folder, training, [traffic]).get("reward")
+            if rewards is None:
+                break
+            seeds = len(rewards)
+            text = f"{rewards.mean():.1f}"
+            if training != unchanged:
+                baseline = scores(folder, unchanged, [traffic])["reward"]
+                change = entries("reward", difference(rewards, baseline))
+                text = f"{text}; {with_sign(change, 'reward', 1)}"
+            cells.append(f"*{text}*" if traffic == training.traffic else text)
+        if cells:
+            rows.append([f"`{training.traffic}`", str(seeds), *cells])
+    heads = ["trained on", "trainings", *(f"`{name}`" for name in unchanged.driven())]
+    return Table("", heads, rows, names=1)
 
 
 @rc_context(STYLE)
@@ -238,16 +285,17 @@ def draw_effects(changes: Sequence[Effect]) -> Figure:
 
 def measure(arguments: argparse.Namespace) -> str:
     """One of the three."""
-    folder, seeds = arguments.folder, arguments.seeds
+    folder = arguments.folder
     if arguments.action == "table":
-        section = ReportSection(arguments.report, *MARKERS)
-        table = dose_table(folder, seeds)
-        section.write(f"\n{markdown(table)}\n")
-        return table.text()
+        sections = [ReportSection(arguments.report, *markers) for markers in (MARKERS, TRANSFER)]
+        tables = [dose_table(folder), transfer_table(folder)]
+        for section, table in zip(sections, tables):
+            section.write(f"\n{markdown(table)}\n")
+        return "\n\n".join(table.text() for table in tables)
     if arguments.action == "figure":
-        return f"figure: {save_figure(draw_effects(list(effects(folder, seeds))), arguments.out)}"
+        return f"figure: {save_figure(draw_effects(list(effects(folder))), arguments.out)}"
     part, parts = arguments.part
-    return train(folder, seeds, part, parts)
+    return train(folder, list(trainings(arguments.seeds, arguments.properties))[part::parts])
 
 
 def part_of_many(text: str) -> tuple[int, int]:
@@ -264,6 +312,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("action", choices=("train", "table", "figure"))
     parser.add_argument("--folder", type=Path, default=Path("outputs/dose"))
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument(
+        "--properties", nargs="+", choices=tuple(DOSES), default=tuple(DOSES), help="of training"
+    )
     add_report(parser, *MARKERS)
     parser.add_argument("--out", type=Path, default=FIGURE, help="the figure's file")
     parser.add_argument(

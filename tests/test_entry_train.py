@@ -69,7 +69,7 @@ def test_a_signal_saves_and_the_run_can_be_resumed(capsys, tmp_path):
     assert "go on with: ganlane train resume=" in capsys.readouterr().err
     (checkpoint,) = tmp_path.rglob("last.pt")
     assert main(["resume=auto", "total_decisions=320"]) == 0
-    assert rows(checkpoint.parents[1] / "metrics.csv")[-1]["decisions"] == "320"
+    assert rows(checkpoint.parents[1] / "metrics.csv")[-1]["decisions"] == 320
 
 
 def test_the_second_phase_starts_from_the_first_ones_agent(capsys):

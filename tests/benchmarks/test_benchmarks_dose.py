@@ -14,9 +14,9 @@ ROOT = Path(__file__).parents[2]
 
 def driven(folder, training, rewards, failed):
     """Held-out episodes of a finished training."""
-    columns = {"traffic": "idm_faults", "episode": range(len(rewards))}
-    frame = pl.DataFrame({**columns, "reward": rewards, "failed": failed})
-    frame.write_parquet(folder / training.file)
+    columns = {"episode": range(len(rewards)), "reward": rewards, "failed": failed}
+    parts = [pl.DataFrame({"traffic": traffic, **columns}) for traffic in training.driven()]
+    pl.concat(parts).write_parquet(folder / training.file)
 
 
 def test_every_training_is_one_that_an_environment_takes_and_has_a_file_of_its_own():
@@ -27,7 +27,7 @@ def test_every_training_is_one_that_an_environment_takes_and_has_a_file_of_its_o
     assert order == sorted(order)
     for training in (one for one in chosen if one.seed == 0):
         config = call_settings("train", training.settings())
-        assert config.traffic.label() == "human"
+        assert config.traffic.label() == training.traffic
 
 
 def test_a_training_drives_on_traffics_that_it_never_met_and_is_not_made_twice(
@@ -41,8 +41,8 @@ def test_a_training_drives_on_traffics_that_it_never_met_and_is_not_made_twice(
     arguments = ["train", "--folder", str(tmp_path), "--seeds", "1"]
     assert dose.main(arguments) == 0
     episodes = pl.read_parquet(tmp_path / "legal_as_fitted_0.parquet")
-    assert set(episodes["traffic"]) == set(dose.HELD_OUT)
-    assert len(episodes) == 2 * len(dose.HELD_OUT)
+    assert set(episodes["traffic"]) == {*dose.HELD_OUT, *dose.MET}
+    assert len(episodes) == 2 * episodes["traffic"].n_unique()
     assert "done" in capsys.readouterr().out
     assert dose.main(arguments) == 0
     assert "done" not in capsys.readouterr().out
@@ -61,11 +61,23 @@ def test_the_table_tells_each_doses_difference_to_unchanged_drivers(tmp_path, ca
     assert "-500.0 [" in row
 
 
+def test_the_traffics_of_training_are_compared_on_each_of_them_and_on_others(tmp_path):
+    unchanged = dose.Training("legal", dose.UNCHANGED, None, 0)
+    driven(tmp_path, unchanged, [100.0, 102.0], [False, False])
+    driven(tmp_path, unchanged._replace(varied="traffic", dose="gan"), [90.0, 96.0], [True, False])
+    table = dose.transfer_table(tmp_path)
+    human, gan = (dict(zip(table.headings, line)) for line in table.lines)
+    assert (human["trained on"], human["`human`"]) == ("`human`", "*101.0*")
+    assert gan["`idm_faults`"].startswith("93.0; -8.0 [")
+    assert gan["`gan`"].startswith("*93.0")
+
+
 def test_the_table_in_the_documents_is_that_of_the_stored_episodes():
     text = (ROOT / "docs" / "generators.md").read_text()
-    table = markdown(dose.dose_table(ROOT / "docs" / "reproduce" / "dose", 3))
-    begin, end = dose.MARKERS
-    assert f"{begin}\n\n{table}\n\n{end}" in text
+    folder = ROOT / "docs" / "reproduce" / "dose"
+    tables = (dose.dose_table(folder), dose.transfer_table(folder))
+    for (begin, end), table in zip((dose.MARKERS, dose.TRANSFER), tables):
+        assert f"{begin}\n\n{markdown(table)}\n\n{end}" in text
 
 
 def test_the_figure_has_a_panel_for_every_property(tmp_path):
@@ -74,7 +86,7 @@ def test_the_figure_has_a_panel_for_every_property(tmp_path):
         dose.Training("legal", "delayed", 1, 0),
     ):
         driven(tmp_path, training, [100.0, 102.0], [False, False])
-    figure = dose.draw_effects(list(dose.effects(tmp_path, 1)))
+    figure = dose.draw_effects(list(dose.effects(tmp_path)))
     panels = {axes.get_title(loc="left") or axes.get_title(): axes for axes in figure.axes}
     assert set(dose.DOSES) <= set(panels)
     # Zero, the interval and the mean of the one dose; zero alone elsewhere.

@@ -36,7 +36,7 @@ from ganlane.evaluation.statistics import Estimate, difference, entries
 from ganlane.evaluation.table import Table, with_interval, with_sign
 from ganlane.files import atomic_path
 from ganlane.settings.suite import PUBLISHED
-from ganlane.view.figures import COLOURS, FAINT, STYLE, add_legend, save_figure
+from ganlane.view.figures import COLOURS, FAINT, STYLE, save_figure
 
 #: Values of each property; what is not named is as fitted.
 DOSES: dict[str, tuple[Any, ...]] = {
@@ -53,7 +53,7 @@ OF_ENVIRONMENT = ("desired_speed_mps", "traffic")
 #: The drivers that all trainings meet, so that a table is of the same ones: the first weights.
 DRIVERS = {"name": "human", **PUBLISHED["shift-v1"]["human"]}
 UNCHANGED = "as fitted"
-MASKS = ("legal", "safe")
+MASK = "legal"
 #: Traffics that no training met.
 HELD_OUT = ("idm_faults", "idm_random", "gan_calibrated")
 #: Those on which some were trained; the agents of these drive on all of them.
@@ -70,12 +70,11 @@ FIGURE = Path(__file__).parents[1] / "docs" / "figures" / "dose.png"
 
 
 class Training(NamedTuple):
-    """A training: mask, varied property and its dose (None: unchanged drivers), seed."""
+    """A training: varied property and its dose, seed."""
 
-    mask: str
-    varied: str
-    dose: Any
-    seed: int
+    varied: str = UNCHANGED
+    dose: Any = None
+    seed: int = 0
 
     @property
     def traffic(self) -> str:
@@ -91,7 +90,7 @@ class Training(NamedTuple):
     def file(self) -> str:
         """Where its agent's held-out episodes are."""
         dose = "" if self.dose is None else f"_{self.dose}".replace(" ", "")
-        return f"{self.mask}_{self.varied.replace(' ', '_')}{dose}_{self.seed}.parquet"
+        return f"{self.varied.replace(' ', '_')}{dose}_{self.seed}.parquet"
 
     def settings(self) -> dict[str, Any]:
         """Options of its environment."""
@@ -102,15 +101,12 @@ class Training(NamedTuple):
 
 
 def trainings(seeds: int, properties: Sequence[str] = tuple(DOSES)) -> Iterator[Training]:
-    """All of these ``properties``; all seeds of a mask come first, so that one whole table is soon
-    there.
-    """
-    for mask in MASKS:
-        for seed in range(seeds):
-            yield Training(mask, UNCHANGED, None, seed)
-            for name in properties:
-                for dose in DOSES[name]:
-                    yield Training(mask, name, dose, seed)
+    """All of these ``properties``, seed by seed, so that one whole table is soon there."""
+    for seed in range(seeds):
+        yield Training(seed=seed)
+        for name in properties:
+            for dose in DOSES[name]:
+                yield Training(name, dose, seed)
 
 
 def trained(training: Training) -> api.Driver:
@@ -124,7 +120,7 @@ def trained(training: Training) -> api.Driver:
         num_envs=ROWS,
         seed=training.seed,
         observation="road_view",
-        mask=training.mask,
+        mask=MASK,
         **training.settings(),
     )
     model = MaskablePPO(
@@ -196,47 +192,40 @@ def effects(folder: Path) -> Iterator[Effect]:
     Raises:
         UserError: there are no trainings among unchanged drivers to compare with.
     """
-    tried = False
-    for mask in MASKS:
-        unchanged = Training(mask, UNCHANGED, None, 0)
-        baseline = scores(folder, unchanged)
-        if not baseline:
-            continue
-        tried = True
-        reward, failures = (Estimate(float(baseline[name].mean()), None) for name in SCORES)
-        yield Effect(unchanged, len(baseline["reward"]), reward, failures)
-        for name, doses in DOSES.items():
-            for dose in doses:
-                training = Training(mask, name, dose, 0)
-                changed = scores(folder, training)
-                if changed:
-                    reward, failures = (difference(changed[n], baseline[n]) for n in SCORES)
-                    yield Effect(training, len(changed["reward"]), reward, failures)
-    if not tried:
+    baseline = scores(folder, Training())
+    if not baseline:
         raise UserError(f"--folder {folder}: no finished trainings; run 'train' first.")
+    reward, failures = (Estimate(float(baseline[name].mean())) for name in SCORES)
+    yield Effect(Training(), len(baseline["reward"]), reward, failures)
+    for name, doses in DOSES.items():
+        for dose in doses:
+            changed = scores(folder, Training(name, dose))
+            if changed:
+                reward, failures = (difference(changed[n], baseline[n]) for n in SCORES)
+                yield Effect(Training(name, dose), len(changed["reward"]), reward, failures)
 
 
 def dose_table(folder: Path) -> Table:
     """The table of :func:`effects`."""
     rows = []
     for effect in effects(folder):
-        mask, varied, dose, _ = effect.training
+        varied, dose, _ = effect.training
         reward, failures = (
             with_interval(entries(name, getattr(effect, name)), name, 1) for name in SCORES
         )
         dose = "" if dose is None else str(dose)
-        rows.append([mask, varied, dose, str(effect.seeds), reward, failures])
-    heads = ["mask", "property", "dose", "trainings", "reward", "failures/1000 episodes"]
-    return Table("", heads, rows, names=3)
+        rows.append([varied, dose, str(effect.seeds), reward, failures])
+    heads = ["property", "dose", "trainings", "reward", "failures/1000 episodes"]
+    return Table("", heads, rows, names=2)
 
 
-def transfer_table(folder: Path, mask: str = MASKS[0]) -> Table:
+def transfer_table(folder: Path) -> Table:
     """Mean reward, and what it is over drivers as fitted, of each traffic of training on each
     traffic; italics: met in training.
     """
     rows = []
-    unchanged = Training(mask, UNCHANGED, None, 0)
-    for training in (unchanged, *(Training(mask, "traffic", name, 0) for name in DOSES["traffic"])):
+    unchanged = Training()
+    for training in (unchanged, *(Training("traffic", name) for name in DOSES["traffic"])):
         cells = []
         seeds = 0
         for traffic in training.driven():
@@ -261,25 +250,20 @@ def draw_effects(changes: Sequence[Effect]) -> Figure:
     """A panel for each property: what each dose changed in reward, with its 95 % interval."""
     figure = Figure(figsize=(9.0, 4.6))
     panels = figure.subplots(2, -(-len(DOSES) // 2), sharey=True).ravel()
-    colours = dict(zip(MASKS, COLOURS))
     for panel, (name, doses) in zip(panels, DOSES.items()):
         panel.axhline(0.0, color=FAINT, ls=":")
         panel.set(title=name, xticks=range(len(doses)), xticklabels=[str(dose) for dose in doses])
         panel.set_xlim(-0.5, len(doses) - 0.5)
         for effect in changes:
-            mask, varied, dose, _ = effect.training
+            varied, dose, _ = effect.training
             if varied != name or effect.reward.interval is None:
                 continue
-            low, high = effect.reward.interval
-            # Beside each other where there are several masks.
-            place = doses.index(dose) + 0.15 * MASKS.index(mask)
-            panel.plot([place, place], [low, high], color=colours[mask])
-            panel.plot(place, effect.reward.value, "o", color=colours[mask])
+            place = doses.index(dose)
+            panel.plot([place, place], effect.reward.interval, color=COLOURS[0])
+            panel.plot(place, effect.reward.value, "o", color=COLOURS[0])
     for panel in panels[len(DOSES) :]:
         panel.set_axis_off()
     figure.supylabel("reward, difference to drivers as fitted")
-    shown = {effect.training.mask for effect in changes}
-    add_legend(figure, {f"mask={mask}": colours[mask] for mask in MASKS if mask in shown})
     return figure
 
 

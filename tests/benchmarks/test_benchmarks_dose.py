@@ -22,9 +22,8 @@ def driven(folder, training, rewards, failed):
 def test_every_training_is_one_that_an_environment_takes_and_has_a_file_of_its_own():
     chosen = list(dose.trainings(2))
     assert len({training.file for training in chosen}) == len(chosen)
-    # One mask after the other, and the first seeds of all doses first.
-    order = [(dose.MASKS.index(training.mask), training.seed) for training in chosen]
-    assert order == sorted(order)
+    # The first seeds of all doses first.
+    assert [training.seed for training in chosen] == sorted(training.seed for training in chosen)
     for training in (one for one in chosen if one.seed == 0):
         config = call_settings("train", training.settings())
         assert config.traffic.label() == training.traffic
@@ -36,11 +35,10 @@ def test_a_training_drives_on_traffics_that_it_never_met_and_is_not_made_twice(
     pytest.importorskip("sb3_contrib")
     for name, value in (("DECISIONS", 128), ("ROWS", 2), ("EPISODES", 2)):
         monkeypatch.setattr(dose, name, value)
-    monkeypatch.setattr(dose, "MASKS", ("legal",))
     monkeypatch.setattr(dose, "DOSES", {})
     arguments = ["train", "--folder", str(tmp_path), "--seeds", "1"]
     assert dose.main(arguments) == 0
-    episodes = pl.read_parquet(tmp_path / "legal_as_fitted_0.parquet")
+    episodes = pl.read_parquet(tmp_path / "as_fitted_0.parquet")
     assert set(episodes["traffic"]) == {*dose.HELD_OUT, *dose.MET}
     assert len(episodes) == 2 * episodes["traffic"].n_unique()
     assert "done" in capsys.readouterr().out
@@ -50,9 +48,9 @@ def test_a_training_drives_on_traffics_that_it_never_met_and_is_not_made_twice(
 
 def test_the_table_tells_each_doses_difference_to_unchanged_drivers(tmp_path, capsys):
     for seed in range(2):
-        unchanged = dose.Training("legal", dose.UNCHANGED, None, seed)
+        unchanged = dose.Training(seed=seed)
         driven(tmp_path, unchanged, [100.0, 102.0 + seed], [False, True])
-        changed = dose.Training("legal", "politeness", 0.0, seed)
+        changed = dose.Training("politeness", 0.0, seed)
         driven(tmp_path, changed, [110.0, 112.0 + seed], [False, False])
     assert dose.main(["table", "--folder", str(tmp_path)]) == 0
     told = capsys.readouterr().out
@@ -62,7 +60,7 @@ def test_the_table_tells_each_doses_difference_to_unchanged_drivers(tmp_path, ca
 
 
 def test_the_traffics_of_training_are_compared_on_each_of_them_and_on_others(tmp_path):
-    unchanged = dose.Training("legal", dose.UNCHANGED, None, 0)
+    unchanged = dose.Training()
     driven(tmp_path, unchanged, [100.0, 102.0], [False, False])
     driven(tmp_path, unchanged._replace(varied="traffic", dose="gan"), [90.0, 96.0], [True, False])
     table = dose.transfer_table(tmp_path)
@@ -82,8 +80,8 @@ def test_the_table_in_the_documents_is_that_of_the_stored_episodes():
 
 def test_the_figure_has_a_panel_for_every_property(tmp_path):
     for training in (
-        dose.Training("legal", dose.UNCHANGED, None, 0),
-        dose.Training("legal", "delayed", 1, 0),
+        dose.Training(),
+        dose.Training("delayed", 1),
     ):
         driven(tmp_path, training, [100.0, 102.0], [False, False])
     figure = dose.draw_effects(list(dose.effects(tmp_path)))

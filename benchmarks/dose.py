@@ -7,11 +7,11 @@
 The first takes hours on one core and goes on where it ended. For two cores: `train --part 0/2`
 beside `train --part 1/2`.
 
-Every training is the same: MaskablePPO of sb3-contrib, from random weights, among `human` drivers
-with one property changed, or among other drivers altogether. Its agent then drives on traffics that
-no training met. The table has, for each dose, the difference to the trainings among unchanged
-drivers: reward, and failures (crashes and departures) per 1000 episodes; the unit of the intervals
-is the training. It needs `pip install 'ganlane[sb3]'` and no recordings.
+Every training is the same: MaskablePPO as in `examples/sb3_ppo.py`, from random weights, among
+`human` drivers with one property changed, or among other drivers altogether. Its agent then drives
+on traffics that no training met. The table has, for each dose, the difference to the trainings
+among unchanged drivers: reward, and failures (crashes and departures) per 1000 episodes; the unit
+of the intervals is the training. It needs `pip install 'ganlane[sb3]'` and no recordings.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import polars as pl
-import torch
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
@@ -110,10 +109,11 @@ def trainings(seeds: int, properties: Sequence[str] = tuple(DOSES)) -> Iterator[
 
 
 def trained(training: Training) -> api.Driver:
-    """The agent of a training; the settings are those of ``examples/sb3_ppo.py``."""
+    """The agent of a training."""
     # Only here: the table is made without stable-baselines3.
     from sb3_contrib import MaskablePPO
 
+    from examples.sb3_ppo import learner
     from ganlane import sb3
 
     env = sb3.make_vec_env(
@@ -123,25 +123,12 @@ def trained(training: Training) -> api.Driver:
         mask=MASK,
         **training.settings(),
     )
-    model = MaskablePPO(
-        "MlpPolicy",
-        env,
-        learning_rate=lambda left: 1e-3 * left,
-        n_steps=64,
-        batch_size=2048,
-        n_epochs=5,
-        gamma=0.98,
-        gae_lambda=0.9,
-        ent_coef=0.01,
-        policy_kwargs={"net_arch": [128, 128]},
-        seed=training.seed,
-    )
+    model = learner(MaskablePPO, env, training.seed)
     return sb3.driver(model.learn(DECISIONS))
 
 
 def train(folder: Path, chosen: Sequence[Training]) -> str:
     """Make the trainings that are missing, and drive their agents."""
-    torch.set_num_threads(1)  # small networks: a second thread only costs
     for training in chosen:
         episodes = folder / training.file
         if episodes.is_file():
@@ -225,6 +212,7 @@ def transfer_table(folder: Path) -> Table:
     """
     rows = []
     unchanged = Training()
+    baseline = {name: scores(folder, unchanged, [name]) for name in unchanged.driven()}
     for training in (unchanged, *(Training("traffic", name) for name in DOSES["traffic"])):
         cells = []
         seeds = 0
@@ -235,8 +223,7 @@ def transfer_table(folder: Path) -> Table:
             seeds = len(rewards)
             text = f"{rewards.mean():.1f}"
             if training != unchanged:
-                baseline = scores(folder, unchanged, [traffic])["reward"]
-                change = entries("reward", difference(rewards, baseline))
+                change = entries("reward", difference(rewards, baseline[traffic]["reward"]))
                 text = f"{text}; {with_sign(change, 'reward', 1)}"
             cells.append(f"*{text}*" if traffic == training.traffic else text)
         if cells:

@@ -18,6 +18,23 @@ import ganlane
 import ganlane.sb3
 
 
+def learner(algorithm, env, seed):
+    """PPO or MaskablePPO on ``env``, with a learning rate that falls to 0."""
+    return algorithm(
+        "MlpPolicy",
+        env,
+        learning_rate=lambda left: 1e-3 * left,
+        n_steps=64,
+        batch_size=2048,
+        n_epochs=5,
+        gamma=0.98,
+        gae_lambda=0.9,
+        ent_coef=0.01,
+        policy_kwargs={"net_arch": [128, 128]},
+        seed=seed,
+    )
+
+
 def main(
     decisions="3000000",
     mask="safe",
@@ -34,19 +51,7 @@ def main(
     if algorithm == "PPO":
         # crashes make the rewards' scale large
         env = VecNormalize(env, norm_obs=False, gamma=0.98, clip_reward=1e9)
-    model = {"PPO": PPO, "MaskablePPO": MaskablePPO}[algorithm](
-        "MlpPolicy",
-        env,
-        learning_rate=lambda left: 1e-3 * left,
-        n_steps=64,
-        batch_size=2048,
-        n_epochs=5,
-        gamma=0.98,
-        gae_lambda=0.9,
-        ent_coef=0.01,
-        policy_kwargs={"net_arch": [128, 128]},
-        seed=int(seed),
-    )
+    model = learner({"PPO": PPO, "MaskablePPO": MaskablePPO}[algorithm], env, int(seed))
     model.learn(int(decisions))
     driver = ganlane.sb3.driver(model)
     # For `ganlane benchmark outputs/sb3/MaskablePPO_0.zip`.

@@ -237,11 +237,12 @@ def _run_sumo(libsumo: Any, scene: Scene, dt: float) -> Trace:
         raise UserError(
             f"SUMO put {libsumo.vehicle.getIDList()} on the road; expected the vehicles {names}."
         )
+    if leader is not None:
+        libsumo.vehicle.setSpeedMode("0", 0)
     speeds, positions = [], []
     for step in range(scene.steps(dt) + 1):
         if step:
             if leader is not None:
-                libsumo.vehicle.setSpeedMode("0", 0)
                 libsumo.vehicle.setSpeed("0", leader[step])
             libsumo.simulationStep()
         speeds.append([libsumo.vehicle.getSpeed(vehicle) for vehicle in names])

@@ -151,6 +151,8 @@ class LeanDQNLoss(_OfRainbow, DQNLoss):
             action_space="categorical",
             **_OPTIONS,
         )
+        # For TorchRL's own forward, which would take a discount of its own.
+        self.make_value_estimator(gamma=network.config.agent.gamma)
         self._attach(network, actor)
 
 

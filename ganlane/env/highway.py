@@ -161,8 +161,10 @@ class HighwayEnv(EnvBase):
         spawn = self.spawn_parameters
         visibility = Visibility.named(self.ego.visibility)
         scenes = self.traffic.scenes(vehicles, visibility, spawn.ego_desired_speed_mps)
-        others = self.traffic.visibility
-        return scenes or RandomScenes(self.road, vehicles, spawn, visibility, others)
+        if scenes is None:
+            others = self.traffic.visibility
+            scenes = RandomScenes(self.road, vehicles, spawn, visibility, others)
+        return scenes
 
     def _check_parts(self, vehicles: int | None) -> None:
         """Raise :class:`UserError` for parts that do not fit; ``vehicles`` is as given by users."""
@@ -204,7 +206,7 @@ class HighwayEnv(EnvBase):
         # Of any episode: the fields and shapes are those of all, the traffic's memory included.
         episode = torch.zeros(n, dtype=torch.int64, device=device)
         state = self._start(episode, episode)
-        self.observation_spec = spec_of(state.exclude(*keys.DONE_FLAGS), n).to(device)
+        self.observation_spec = spec_of(state.exclude(*keys.DONE_FLAGS)).to(device)
         # A TransformedEnv passes to a reset only the keys of the state spec; without the counters a
         # reset to certain episodes would run the first ones.
         counters = {
@@ -219,7 +221,7 @@ class HighwayEnv(EnvBase):
             count = len(self.actions.names)
             self.action_spec = Categorical(count, shape=(n,), dtype=torch.int64, device=device)
         self.reward_spec = Unbounded(shape=(n, 1), dtype=self.dtype, device=device)
-        self.done_spec = spec_of(state.select(*keys.DONE_FLAGS), n).to(device)
+        self.done_spec = spec_of(state.select(*keys.DONE_FLAGS)).to(device)
 
     def to(self, device: torch.device | str) -> HighwayEnv:
         """On another device; raises :class:`UserError` where there is none such."""

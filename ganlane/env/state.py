@@ -37,18 +37,18 @@ EVENTS: Fields = {
 DONE: Fields = dict.fromkeys(keys.DONE_FLAGS, torch.bool)
 
 
-def spec_of(state: TensorDictBase, n: int) -> Composite:
-    """Spec of states of ``n`` rows, nested as this ``state``."""
+def spec_of(state: TensorDictBase) -> Composite:
+    """Spec of such states, nested as this one."""
     specs: dict[str, Any] = {}
     for name, value in state.items():
         if isinstance(value, Tensor):
             # TorchRL checks flags by a spec of their own.
             spec = Binary if value.dtype == torch.bool else Unbounded
-            specs[name] = spec(shape=(n, *value.shape[1:]), dtype=value.dtype)
+            specs[name] = spec(shape=value.shape, dtype=value.dtype)
         # TorchRL's SerialEnv and ParallelEnv refuse empty groups.
         elif not value.is_empty():
-            specs[name] = spec_of(value, n)
-    return Composite(specs, shape=(n,))
+            specs[name] = spec_of(value)
+    return Composite(specs, shape=state.batch_size)
 
 
 def first_state(
@@ -147,20 +147,12 @@ def checked_action(
     """
     if action is None:
         raise UserError(f"step(): no action; give 'action', {_expected(rows, actions)}.")
-    numbered = bool(actions.names)
-    # Flags and floats would be cast without a word.
-    floating = action.is_floating_point()
-    fits = not (floating or action.dtype == torch.bool) if numbered else floating
-    if action.shape != ((rows,) if numbered else (rows, CONTROLS)) or not fits:
-        raise _refused(f"of shape {list(action.shape)} in {action.dtype}", rows, actions)
-    if not numbered:
-        finite = torch.isfinite(action).all()
-        if torch.compiler.is_compiling():
-            torch._assert_async(finite, "action: each number must be finite")
-        elif not finite:
-            raise _refused("with a number that is not finite", rows, actions)
-        return action
+    if not actions.names:
+        return _checked_controls(action, rows, actions)
     count = len(actions.names)
+    # Flags and floats would be cast without a word.
+    if action.shape != (rows,) or action.is_floating_point() or action.dtype == torch.bool:
+        raise _refused(f"of shape {list(action.shape)} in {action.dtype}", rows, actions)
     action = action.long()
     if torch.compiler.is_compiling():
         # A graph cannot branch on values.
@@ -172,6 +164,17 @@ def checked_action(
         wrong = numbers.view(np.uint64) >= count
         if wrong.any():
             raise _refused(str(numbers[wrong][0]), rows, actions)
+    return action
+
+
+def _checked_controls(action: Tensor, rows: int, actions: ActionParameters) -> Tensor:
+    if action.shape != (rows, CONTROLS) or not action.is_floating_point():
+        raise _refused(f"of shape {list(action.shape)} in {action.dtype}", rows, actions)
+    finite = torch.isfinite(action).all()
+    if torch.compiler.is_compiling():
+        torch._assert_async(finite, "action: each number must be finite")
+    elif not finite:
+        raise _refused("with a number that is not finite", rows, actions)
     return action
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import (
     RESAMPLES,
@@ -75,7 +76,8 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
 
     ``same_traffic`` also holds the drivers that give the scale.
     """
-    ended = counts_of_ends(pair, FAILURES)
+    # Every end has its column, also one that never happened.
+    ended = counts_of_ends(pair, keys.END_EVENTS)
     returns = pair["reward"].to_numpy()
     distance_m = float(pair["distance_m"].sum())
     crashes = lead = None
@@ -88,17 +90,17 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
     # Someone close behind is no end of an episode, so it is counted by episode.
     behind = mean_interval(pair["soft_crash_behind"].to_numpy())
     score, reason = _score(pair, same_traffic)
-    shares: Row = {}
-    for end, count in ended.items():
-        shares |= entries(f"{end}_share", clopper_pearson(count, pair.height))
     return {
         "agent": pair["agent"][0],
         "traffic": pair["traffic"][0],
         "episodes": pair.height,
-        # Every end has its column, also one that never happened.
-        **counts_of_ends(pair, ("goal", "hard_crash")),
+        "goal": ended["goal"],
+        "hard_crash": ended["hard_crash"],
         "soft_crash": int(pair["had_soft_crash"].sum()),
-        **counts_of_ends(pair, ("out_of_road", "missed_exit", "timeout", "scene_end")),
+        "out_of_road": ended["out_of_road"],
+        "missed_exit": ended["missed_exit"],
+        "timeout": ended["timeout"],
+        "scene_end": ended["scene_end"],
         "soft_crash_onsets": int(pair["soft_crash"].sum()),
         "soft_crash_behind_onsets": int(pair["soft_crash_behind"].sum()),
         **entries("soft_crash_behind_per_episode", behind),
@@ -106,7 +108,8 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
         "reward_sd": float(np.std(returns, ddof=1)) if len(returns) > 1 else None,
         **speed_and_lane_changes(pair),
         "distance_km": distance_m / 1000.0,
-        **shares,
+        **entries("hard_crash_share", clopper_pearson(ended["hard_crash"], pair.height)),
+        **entries("out_of_road_share", clopper_pearson(ended["out_of_road"], pair.height)),
         **entries("crashes_per_1000_km", crashes),
         **entries("minus_mobil", lead),
         **entries("normalized_percent", score),

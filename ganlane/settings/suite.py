@@ -130,7 +130,10 @@ class BenchmarkConfig(RunConfig):
         """
         suite = self.suite
         fixed: dict[str, Any] = {
-            **{name: getattr(suite, name) for name in ("version", "stream", "scored", "shown")},
+            "version": suite.version,
+            "stream": suite.stream,
+            "scored": suite.scored,
+            "shown": suite.shown,
             "env": _changed(suite.env),
             "reward": _changed(suite.reward),
             "seed": self.seed,

@@ -203,9 +203,13 @@ def from_start(stretches: RowStretches, start_m: Tensor, dtype: torch.dtype) -> 
         # What is far away stays where the others expect it.
         return torch.where(place_m.abs() < FAR_M, place_m - start_m, place_m).to(dtype)
 
-    # All are places but the last, a number of lane changes.
-    *places, changes = stretches
-    return RowStretches._make([*(moved(place_m) for place_m in places), changes.to(dtype)])
+    return RowStretches(
+        begin_m=moved(stretches.begin_m),
+        end_m=moved(stretches.end_m),
+        wall_m=moved(stretches.wall_m),
+        leave_by_m=moved(stretches.leave_by_m),
+        changes=stretches.changes.to(dtype),
+    )
 
 
 def stretches_of_row(stretches: RowStretches, row: int) -> Stretches:

@@ -208,10 +208,11 @@ def _html(table: Table) -> str:
     def cells(before: str, texts: Sequence[str], after: str) -> str:
         return "".join(f"{before}{html.escape(text)}{after}" for text in texts)
 
-    lines = cells("<th>", table.headings, "</th>")
+    lines = [f"<tr>{cells('<th>', table.headings, '</th>')}</tr>"]
     for line in table.lines:
         # The columns with names are headings of their line.
         names = cells('<th scope="row">', line[: table.names], "</th>")
-        lines += f"</tr><tr>{names}{cells('<td>', line[table.names :], '</td>')}"
-    body = f'<div class="wide"><table><tr>{lines}</tr></table></div>'
+        numbers = cells("<td>", line[table.names :], "</td>")
+        lines.append(f"<tr>{names}{numbers}</tr>")
+    body = f'<div class="wide"><table>{"".join(lines)}</table></div>'
     return f"<h2>{html.escape(table.title)}</h2>{body}{cells('<p>', table.notes, '</p>')}"

@@ -66,7 +66,6 @@ def test_the_distributional_loss_equals_torchrls(noisy, rows):
 @pytest.mark.parametrize("double", [True, False])
 def test_the_plain_loss_equals_torchrls(double):
     loss = unlike_target(LeanDQNLoss(network(distributional=False, double=double)))
-    loss.make_value_estimator(gamma=0.97)
     assert_same_loss(loss, DQNLoss, 64, power=2)
 
 

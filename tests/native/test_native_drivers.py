@@ -80,7 +80,7 @@ def decide_side_by_side(env, actions):
         td["action"] = action
         out = kernel.decide(action, td)
         stepped, following = env.step_and_maybe_reset(td.clone())
-        events, numbers = apart(out, stepped["next"], limit=2e-3)
+        events, numbers = apart(out, stepped["next"], limit=2e-3, of_ego=False)
         differ += int((events | numbers).sum())
         td = following
     return differ, first, td
@@ -141,6 +141,20 @@ def test_it_decides_as_the_tensor_code_where_lanes_end(scene, traffic, rows, dec
     assert differ <= 1
     lane = keys.VEHICLES, "target_lane"
     assert (last[lane] != first[lane]).any()
+
+
+@pytest.mark.parametrize("traffic", ["human", "gan_calibrated"])
+def test_drivers_make_room_on_a_ramp(traffic):
+    """Some 18 s, until those on the ramp have to merge."""
+    places = []
+    for courtesy in (2.0, 0.0):
+        options = {"kernel": "torch", "mobil": {"courtesy": courtesy}}
+        env = make_env(traffic, num_envs=4, env="on_ramp", **options).base_env
+        td = env.reset()
+        for _ in range(18):
+            td = env.step(td.set("action", torch.zeros(4, dtype=torch.int64)))["next"]
+        places.append(td[keys.VEHICLES, "x"])
+    assert (places[0] != places[1]).any()
 
 
 @pytest.mark.parametrize("traffic", [*PRESETS, "human"])

@@ -62,18 +62,18 @@ def random_environment(
 
 
 def apart(
-    out: TensorDictBase, after: TensorDictBase, limit: float = 1e-3
+    out: TensorDictBase, after: TensorDictBase, limit: float = 1e-3, of_ego: bool = True
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Rows [N] in which an event, a flag, a counter or a lane differs, and rows in which a number
     of a valid vehicle does, by more than the ``limit``.
 
-    The traffic's memory of the ego, which it does not drive, is nobody's concern.
+    Without ``of_ego`` the traffic's memory of the ego, which it does not drive, does not count.
     """
     events = torch.zeros(len(out), dtype=torch.bool)
     numbers = events.clone()
     for name, value in leaves(out):
         other, valid = after[name], after[keys.VEHICLES, "valid"]
-        if name[0] == keys.TRAFFIC:
+        if name[0] == keys.TRAFFIC and not of_ego:
             value, other, valid = (field[:, 1:] for field in (value, other, valid))
         if value.is_floating_point():
             # A speed's rounding is ten times as large in an acceleration, its difference over

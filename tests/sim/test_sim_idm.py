@@ -172,6 +172,18 @@ def deviations(cars, steps):
     return steps_away
 
 
+@pytest.mark.parametrize(("desired", "speed"), CASES)
+def test_the_slopes_of_the_theory_are_those_of_the_package(desired, speed):
+    values = (stability.equilibrium(speed, desired), speed, speed)
+    gap, its_speed, leader = (
+        torch.tensor(value, dtype=DOUBLE, requires_grad=True) for value in values
+    )
+    idm_acceleration(its_speed, desired, gap, leader).backward()
+    assert (gap.grad.item(), its_speed.grad.item(), leader.grad.item()) == pytest.approx(
+        stability.slopes(speed, desired)
+    )
+
+
 @pytest.mark.parametrize(("desired", "critical"), [(18.0, 12.1), (25.0, 17.3)])
 def test_the_critical_speed_of_linear_theory(desired, critical):
     """Neither the time step nor the size of the ring moves it by as much as is tested below."""
@@ -216,9 +228,17 @@ def test_every_ring_grows_or_decays_at_the_rate_of_the_linear_theory():
 
 @pytest.mark.slow
 def test_in_1500_s_a_small_disturbance_grows_below_the_critical_speed_and_dies_above_it():
-    """Random displacements of all cars."""
+    """Random displacements of all cars; the outcome is the linear theory's, car by car."""
+    steps = 15_000
     displacement = 1e-4 * np.random.default_rng(0).standard_normal((4, CARS))
-    away = deviations(disturbed_rings(displacement, np.zeros_like(displacement)), 15_000)
+    away = deviations(disturbed_rings(displacement, np.zeros_like(displacement)), steps)
+    for case, (desired, speed) in enumerate(CASES):
+        matrix = stability.step_matrix(speed, desired, CARS, PHYSICS_STEP_S, ring=True)
+        expected = np.linalg.matrix_power(matrix, steps) @ np.append(
+            displacement[case], np.zeros(CARS)
+        )
+        error = np.abs(away[-1][case] - expected).max()
+        assert error < 0.01 * np.abs(expected).max()
     growth = away[-1][:, CARS:].std(axis=1) / away[2999][:, CARS:].std(axis=1)
     assert (growth[[0, 2]] > 2.0).all()
     assert (growth[[1, 3]] < 0.5).all()

@@ -4,29 +4,51 @@ import math
 from dataclasses import replace
 
 import pytest
-from reference.foreign import (
-    beyond_the_edge,
-    others_of,
-    overlaps,
-)
+import torch
+from reference.foreign import beyond_the_edge, drive, others_of, overlaps, start
 from reference.refusals import user_error
 
+from ganlane import keys
+from ganlane.env import HighwayEnv
 from ganlane.generator import shipped_generator
 from ganlane.native.drivers import SIMULATED_ANCHOR
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
 from ganlane.weights import load_weights, save_weights
 
 
-@pytest.mark.parametrize(
-    ("rows", "seconds"), [(16, 40), pytest.param(250, 200, marks=pytest.mark.slow)]
-)
-def test_with_its_guard_gan_traffic_stays_on_the_road_and_without_it_leaves_it(rows, seconds):
+def test_with_its_guard_gan_traffic_stays_on_the_road_and_without_it_leaves_it():
     guarded, without = (
-        others_of(gan_traffic(guard=guard), rows, seconds, kernel="auto")[0]
-        for guard in (True, False)
+        others_of(gan_traffic(guard=guard), 16, 40, kernel="auto")[0] for guard in (True, False)
     )
     assert beyond_the_edge(guarded) <= 1e-4
     assert beyond_the_edge(without) > 1.0
+
+
+@pytest.mark.slow
+def test_no_vehicle_leaves_the_road_in_1000_episodes_of_gan_traffic():
+    worst = -9.0
+    ended = 0
+    for chunk in range(4):
+        env = HighwayEnv(gan_traffic(), num_envs=250)
+        state = start(env, range(250 * chunk, 250 * (chunk + 1)))
+        done = state["done"]
+
+        def record(vehicles, running):
+            nonlocal worst
+            worst = max(worst, beyond_the_edge(vehicles.columns(slice(1, None))))
+
+        env.recorder = record
+        for _ in range(1000):
+            state = env.step(state.set(keys.ACTION, torch.zeros(250, dtype=torch.int64)))["next"]
+            done = done | state["done"]
+            if done.all():
+                break
+        ended += int(done.sum())
+    print(
+        f"{ended} episodes to their end; the outermost body stayed {-worst:.2f} m inside the edge"
+    )
+    assert ended == 1000
+    assert worst <= 1e-4
 
 
 def test_calibrated_traffic_neither_overlaps_nor_leaves_the_road_nor_stands_still():
@@ -48,6 +70,15 @@ def test_calibrated_traffic_changes_lanes_as_often_as_recorded_and_touches_nobod
     assert overlaps(others) == 0
     # Recorded: 0.92 per vehicle-km, 95 % interval 0.70 to 1.20.
     assert 0.70 < changes / km < 1.20
+
+
+@pytest.mark.parametrize("preset", [gan_traffic, gan_calibrated_traffic])
+def test_generated_traffic_is_the_same_in_every_batch_up_to_rounding(preset):
+    many, alone = (
+        drive(HighwayEnv(preset(), len(rows)), rows, 2)[2]["vehicles"] for rows in (range(6), [4])
+    )
+    for name in ("x", "y", "speed"):
+        torch.testing.assert_close(many[name][4], alone[name][0], atol=2e-3, rtol=1e-4)
 
 
 def fitted_with(folder, *without, **settings):

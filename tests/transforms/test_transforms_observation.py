@@ -138,6 +138,18 @@ def test_no_number_but_the_first_exceeds_the_largest_of_its_form(form, length_m)
         assert largest == 1.0
 
 
+@pytest.mark.parametrize(("row", "x_m", "lane"), [(0, 30.0, 2), (5, -30.0, 0)])
+def test_the_gap_to_a_lorry_is_bumper_to_bumper_ahead_and_behind(row, x_m, lane):
+    """Centres 30 m apart.
+
+    2.25 m of the car and 6 m of the lorry lie between them, so 21.75 m are free.
+    """
+    lorry = {"x": x_m, "lane": lane, "length": 12.0}
+    view = neighbours_in(observed(vehicles({"x": 0.0, "lane": 1}, lorry), "lane_view"), 3)
+    assert view[row, 0].item() == pytest.approx(21.75 / 200)
+    assert view[row, 1].item() == pytest.approx(np.exp(-21.75 / 15.0))
+
+
 @pytest.mark.parametrize(("share", "largest"), [(0.0, 5.5), (0.5, 13.0)])
 def test_the_bounds_of_the_gymnasium_space_know_of_lorries(share, largest):
     space = gymnasium.make("ganlane/Highway-v0", env=EnvConfig(truck_share=share)).observation_space

@@ -88,3 +88,19 @@ def growth_rate(speed: float, desired: float, cars: int, dt: float) -> tuple[flo
         for j in range(1, cars // 2)
     ]
     return max(rates)
+
+
+def step_matrix(speed: float, desired: float, cars: int, dt: float, ring: bool) -> np.ndarray:
+    """One step of (displacements, speeds) [2 cars].
+
+    The first follows the last on a ring, else an undisturbed one.
+    """
+    f = slopes(speed, desired)
+    one = np.eye(cars)
+    ahead = np.eye(cars, k=-1)
+    ahead[0, -1] = float(ring)
+    by_x = f.gap * (ahead - one)
+    by_v = f.speed * one + f.leader * ahead
+    return np.block(
+        [[one + 0.5 * dt**2 * by_x, dt * one + 0.5 * dt**2 * by_v], [dt * by_x, one + dt * by_v]]
+    )

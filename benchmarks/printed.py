@@ -30,7 +30,7 @@ RESULTS = ROOT / "docs" / "reproduce" / "results.json"
 #: Folders below it with further results: ``ganlane benchmark`` with the control trainings,
 #: agent_general over more episodes and on traffics that are not the project's own, and the missions
 #: (suite=exit-v1 and merge-v1); other roads and ablations are of scripts of revision 878329b.
-FURTHER = ("controls", "general", "roads", "elsewhere", "ablations", "exit", "merge")
+FURTHER = ("controls", "general", "human", "roads", "elsewhere", "ablations", "exit", "merge")
 #: Drivers of the matrix by their names in a document.
 DRIVERS: Mapping[str, str] = {
     "agent_general+safe": "agent_general",
@@ -39,6 +39,7 @@ DRIVERS: Mapping[str, str] = {
     "agent_idm_long+none": "Agent_IDM, 3 M longer",
     "agent_idm+safe": "Agent_IDM behind `safe`",
     "agent_gan+safe": "Agent_GAN behind `safe`",
+    "agent_human": "agent_human",
     "mobil_egoistic": "egoistic MOBIL",
     "keep_lane": "keeping the lane",
     "random_legal": "random legal",
@@ -52,6 +53,7 @@ CONTROLS: Mapping[str, str] = {
 #: Traffics that the recipes of learning drivers were trained on.
 TRAINED_ON: Mapping[str, Sequence[str]] = {
     "agent_general": ("idm", "idm_mobil", "idm_random", "gan"),
+    "agent_human": ("idm_mobil", "idm_random", "human", "gan_calibrated"),
     "agent_idm": ("idm_mobil",),
     "agent_gan": ("idm_mobil", "gan"),
     "agent_idm_long": ("idm_mobil",),
@@ -69,6 +71,7 @@ CLAIMS = (
     ("agent_gan+none", "agent_idm_long+none", "Agent_GAN over Agent_IDM 3 M longer"),
     ("agent_general+safe", "agent_idm+safe", "agent_general over Agent_IDM behind `safe`"),
     ("agent_general+safe", "agent_gan+safe", "agent_general over Agent_GAN behind `safe`"),
+    ("agent_human", "mobil_egoistic", "agent_human over the egoistic MOBIL"),
 )
 #: Differences between these and the paper's agents, as :data:`CLAIMS`.
 CONTROL_CLAIMS = (
@@ -91,6 +94,7 @@ CHECKED = (
     ("docs/drivers.md", "## Recordings, other simulators, individual drivers"),
     ("docs/drivers.md", "## What each part is worth"),
     ("docs/drivers.md", "## agent_general over trainings"),
+    ("docs/drivers.md", "## agent_human"),
     ("docs/scenarios.md", "## Trained agents"),
 )
 _INTERVAL = re.compile(r"([-+]?\d+(?:\.\d+)?) \[(-?\d+(?:\.\d+)?), (-?\d+(?:\.\d+)?)\]")
@@ -145,10 +149,12 @@ def _by_traffic(results: Results, first: str, lines: Sequence[Sequence[str]]) ->
 def _lines(
     results: Results, names: Mapping[str, str], cell: Callable[[Row], str]
 ) -> list[list[str]]:
-    """For every driver its name, and a cell for every traffic."""
+    """For every driver in the results its name, and a cell for every traffic."""
+    there = {row["driver"] for row in results["rows"]}
     return [
         [name, *(cell(at(results, driver, traffic)) for traffic in _traffics(results))]
         for driver, name in names.items()
+        if driver in there
     ]
 
 
@@ -278,15 +284,14 @@ def roads(results: Results) -> str:
     return markdown(Table("", ["lead; crashes, departures", *places], list(lines.values())))
 
 
-def elsewhere(results: Results) -> str:
-    """Drivers by traffics that are not the project's own: lead over MOBIL, and failures."""
-    part = results["elsewhere"]
-    there = {row["driver"] for row in part["rows"]}
-    names = {driver: name for driver, name in DRIVERS.items() if driver in there}
+def elsewhere(results: Results, name: str = "elsewhere") -> str:
+    """Drivers by further traffics: lead over MOBIL, and failures."""
+    part = results[name]
     lines = [
         ["episodes of each training", *map(str, part["seeds"]["episodes"].values())],
         *_lines(part, {"mobil": "MOBIL (its mean reward)"}, _mean_and_failures),
-        *_lines(part, names, _lead_and_failures),
+        *_lines(part, DRIVERS, _lead_and_failures),
+        *_differences(part, CLAIMS[-1:]),
     ]
     return _by_traffic(part, "lead; crashes, departures", lines)
 
@@ -350,6 +355,7 @@ SECTIONS: Mapping[tuple[str, str], Callable[[Results], str]] = {
     ("docs/drivers.md", "elsewhere"): elsewhere,
     ("docs/drivers.md", "ablations"): ablations,
     ("docs/drivers.md", "trainings"): trainings,
+    ("docs/drivers.md", "human"): partial(elsewhere, name="human"),
     ("docs/scenarios.md", "exit"): partial(missions, name="exit"),
     ("docs/scenarios.md", "merge"): partial(missions, name="merge"),
 }

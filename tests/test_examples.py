@@ -22,6 +22,7 @@ EXAMPLES = {
     ),
     "sb3_ppo.py": r"(?s)ppo .*mobil ",
     "sb3_exit.py": r"(?s)maskableppo .*mobil ",
+    "sb3_human.py": r"(?s)maskableppo .*mobil_egoistic ",
     "sb3_sac_merge.py": r"(?s)sac .*mobil ",
     "sb3_dqn.py": (
         r"(?s)300 decisions, mean return of the last \d+ episodes -?\d+\.\d.*sb3_dqn.*mobil"
@@ -39,6 +40,7 @@ SHORT = {
     "sb3_dqn.py": ["300", "4", "200"],
     "sb3_ppo.py": ["4096", "safe", "MaskablePPO", "4", "200", "16"],
     "sb3_exit.py": ["1024", "1024", "4", "16"],
+    "sb3_human.py": ["1024", "1024", "2", "5"],
     "sb3_sac_merge.py": ["64", "SAC", "2", "4"],
 }
 #: What an example needs beside ganlane.
@@ -46,6 +48,7 @@ NEEDS = {
     "sb3_dqn.py": "stable_baselines3",
     "sb3_ppo.py": "sb3_contrib",
     "sb3_exit.py": "sb3_contrib",
+    "sb3_human.py": "sb3_contrib",
     "sb3_sac_merge.py": "stable_baselines3",
 }
 

@@ -44,7 +44,7 @@ NETWORKS: Mapping[str, tuple[str, str]] = {
     _PLAIN: ("", ""),
 }
 #: Models that come with the package.
-SHIPPED_MODELS = ("agent_exit", "agent_merge")
+SHIPPED_MODELS = ("agent_exit", "agent_human", "agent_merge")
 #: What does not act: layers of critics and of target networks, and the spread of controls.
 _OTHERS = ("mlp_extractor.value_net.", "value_net.", "q_net_target.", "log_std")
 _ACTIVATIONS = ("Tanh", "ReLU", "ELU", "SiLU", "GELU")

@@ -2,8 +2,8 @@
 
 ``python examples/sb3_human.py`` trains it behind the mask that looks ahead for 4,000,000 decisions
 on ``idm_mobil``, then for 8,000,000 among a mixture of drivers, a tenth of whom do not see it, in
-some seventeen minutes of one core, and compares it with the egoistic MOBIL on the same episodes. Its
-model goes to ``outputs/sb3/human``. Needs ``pip install 'ganlane[sb3]'``.
+some seventeen minutes of one core, and compares it with the egoistic MOBIL on the same episodes.
+Its model goes to ``outputs/sb3/human``. Needs ``pip install 'ganlane[sb3]'``.
 """
 
 import sys

@@ -16,28 +16,29 @@ import argparse
 import sys
 from pathlib import Path
 
-import numpy as np
-
 from benchmarks.script import make_parser, markdown, run_script
 from ganlane.data import default_scenes
 from ganlane.data.one_lane import one_lane_files, read_one_lane
 from ganlane.evaluation.table import Table
 from ganlane.generator import load_generator, shipped_generator
 from ganlane.generator.checkpoint import load_human
+from ganlane.generator.fit import LONG_STEPS
 from ganlane.generator.forecasts import (
     BASELINE,
     calibrated_forecasts,
+    displacement_errors,
     errors_of,
     idm_forecast,
+    long_errors,
     repeated,
 )
 from ganlane.generator.human_forecasts import human_forecasts
-from ganlane.generator.windows import OBSERVED_POSITIONS, cut_windows
+from ganlane.generator.windows import OBSERVED_POSITIONS, PREDICTED_STEPS, cut_windows
 from ganlane.settings.generator import CalibratedConfig
 
 SEGMENTS = 400
 #: Steps of the forecasts, and frames between the starts of two windows.
-HORIZONS = ((8, 10), (50, 25))
+HORIZONS = ((PREDICTED_STEPS, 10), (LONG_STEPS, 25))
 
 
 def judged(options: argparse.Namespace) -> str:
@@ -59,13 +60,18 @@ def judged(options: argparse.Namespace) -> str:
                 "idm": idm_forecast(scenes, steps, stride),
             }
             rows = [driven[scene][car] for scene, car in zip(windows.scene, windows.vehicle)]
-            scores = []
-            for errors in errors_of(forecasts, windows.future).values():
-                last = np.sqrt((errors[rows, -1] ** 2).mean())
-                scores.append(errors[rows].mean() if steps == HORIZONS[0][0] else last)
-            ratios = [f"{score / scores[0]:.2f}" for score in scores[1:]]
-            lines.append([name, f"{steps / 10:g}", str(sum(rows)), f"{scores[0]:.2f}", *ratios])
-    headings = ["file", "s", "windows", f"{BASELINE}, m", *list(forecasts)[1:]]
+            errors = {
+                kind: values[rows] for kind, values in errors_of(forecasts, windows.future).items()
+            }
+            if steps == PREDICTED_STEPS:
+                scores = displacement_errors(errors)["ade_m"]
+            else:
+                rmse = long_errors(errors)["rmse_m"]
+                scores = {kind: values["5 s"] for kind, values in rmse.items()}
+            baseline = scores.pop(BASELINE)
+            ratios = [f"{score / baseline:.2f}" for score in scores.values()]
+            lines.append([name, f"{steps / 10:g}", str(sum(rows)), f"{baseline:.2f}", *ratios])
+    headings = ["file", "s", "windows", f"{BASELINE}, m", *scores]
     return markdown(Table("", headings, lines))
 
 

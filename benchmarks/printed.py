@@ -28,8 +28,9 @@ from ganlane.suite.report import PAPER_VI, PAPER_VII
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "reproduce" / "results.json"
 #: Folders below it with further results: ``ganlane benchmark`` with the control trainings,
-#: agent_general over more episodes and on traffics that are not the project's own, and the missions
-#: (suite=exit-v1 and merge-v1); other roads and ablations are of scripts of revision 878329b.
+#: agent_general over more episodes and on traffics that are not the project's own, agent_human, and
+#: the missions (suite=exit-v1 and merge-v1); other roads and ablations are of scripts of revision
+#: 878329b.
 FURTHER = ("controls", "general", "human", "roads", "elsewhere", "ablations", "exit", "merge")
 #: Drivers of the matrix by their names in a document.
 DRIVERS: Mapping[str, str] = {
@@ -39,7 +40,6 @@ DRIVERS: Mapping[str, str] = {
     "agent_idm_long+none": "Agent_IDM, 3 M longer",
     "agent_idm+safe": "Agent_IDM behind `safe`",
     "agent_gan+safe": "Agent_GAN behind `safe`",
-    "agent_human": "agent_human",
     "mobil_egoistic": "egoistic MOBIL",
     "keep_lane": "keeping the lane",
     "random_legal": "random legal",
@@ -53,7 +53,6 @@ CONTROLS: Mapping[str, str] = {
 #: Traffics that the recipes of learning drivers were trained on.
 TRAINED_ON: Mapping[str, Sequence[str]] = {
     "agent_general": ("idm", "idm_mobil", "idm_random", "gan"),
-    "agent_human": ("idm_mobil", "idm_random", "human", "gan_calibrated"),
     "agent_idm": ("idm_mobil",),
     "agent_gan": ("idm_mobil", "gan"),
     "agent_idm_long": ("idm_mobil",),
@@ -71,7 +70,6 @@ CLAIMS = (
     ("agent_gan+none", "agent_idm_long+none", "Agent_GAN over Agent_IDM 3 M longer"),
     ("agent_general+safe", "agent_idm+safe", "agent_general over Agent_IDM behind `safe`"),
     ("agent_general+safe", "agent_gan+safe", "agent_general over Agent_GAN behind `safe`"),
-    ("agent_human", "mobil_egoistic", "agent_human over the egoistic MOBIL"),
 )
 #: Differences between these and the paper's agents, as :data:`CLAIMS`.
 CONTROL_CLAIMS = (
@@ -84,6 +82,8 @@ CONTROL_CLAIMS = (
         "Agent_GAN over Agent_IDM, both with Table III",
     ),
 )
+#: The difference that is shown beside agent_human, as :data:`CLAIMS`.
+HUMAN_CLAIMS = (("agent_human", "mobil_egoistic", "agent_human over the egoistic MOBIL"),)
 #: Sections whose figures are looked up: document, and the heading of the section (None: all of it).
 CHECKED = (
     ("README.md", "## Results"),
@@ -149,12 +149,10 @@ def _by_traffic(results: Results, first: str, lines: Sequence[Sequence[str]]) ->
 def _lines(
     results: Results, names: Mapping[str, str], cell: Callable[[Row], str]
 ) -> list[list[str]]:
-    """For every driver in the results its name, and a cell for every traffic."""
-    there = {row["driver"] for row in results["rows"]}
+    """For every driver its name, and a cell for every traffic."""
     return [
         [name, *(cell(at(results, driver, traffic)) for traffic in _traffics(results))]
         for driver, name in names.items()
-        if driver in there
     ]
 
 
@@ -287,11 +285,14 @@ def roads(results: Results) -> str:
 def elsewhere(results: Results, name: str = "elsewhere") -> str:
     """Drivers by further traffics: lead over MOBIL, and failures."""
     part = results[name]
+    there = {row["driver"] for row in part["rows"]}
+    names = {"agent_human": "agent_human", **DRIVERS}
+    names = {driver: named for driver, named in names.items() if driver in there}
     lines = [
         ["episodes of each training", *map(str, part["seeds"]["episodes"].values())],
         *_lines(part, {"mobil": "MOBIL (its mean reward)"}, _mean_and_failures),
-        *_lines(part, DRIVERS, _lead_and_failures),
-        *_differences(part, CLAIMS[-1:]),
+        *_lines(part, names, _lead_and_failures),
+        *_differences(part, HUMAN_CLAIMS),
     ]
     return _by_traffic(part, "lead; crashes, departures", lines)
 

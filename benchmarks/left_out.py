@@ -25,14 +25,15 @@ from ganlane.generator.checkpoint import load_human
 from ganlane.generator.fit import LONG_STEPS
 from ganlane.generator.forecasts import (
     BASELINE,
-    calibrated_forecasts,
+    calibrated_driver,
     displacement_errors,
+    driven_windows,
     errors_of,
-    idm_forecast,
+    idm_driver,
     long_errors,
     repeated,
 )
-from ganlane.generator.human_forecasts import human_forecasts
+from ganlane.generator.human_forecasts import human_driver
 from ganlane.generator.windows import OBSERVED_POSITIONS, PREDICTED_STEPS, cut_windows
 from ganlane.settings.generator import CalibratedConfig
 
@@ -51,14 +52,14 @@ def judged(options: argparse.Namespace) -> str:
         driven = {scene.name: scene.driven for scene in scenes}
         for steps, stride in HORIZONS:
             windows = cut_windows(scenes, stride, OBSERVED_POSITIONS + steps)
-            forecasts = {
-                BASELINE: repeated(windows.past[:, -1], steps),
-                "human": human_forecasts(policy, scenes, steps, stride, 0)["mean"],
-                "gan_calibrated": calibrated_forecasts(
-                    calibrated, scenes, steps, stride, CalibratedConfig(), 0
-                )["mean"],
-                "idm": idm_forecast(scenes, steps, stride),
+            drivers = {
+                "human": human_driver(policy, 0),
+                "gan_calibrated": calibrated_driver(calibrated, CalibratedConfig(), 0),
+                "idm": idm_driver,
             }
+            forecasts = {BASELINE: repeated(windows.past[:, -1], steps)}
+            for kind, driver in drivers.items():
+                (forecasts[kind],) = driven_windows(driver, scenes, steps, stride)
             rows = [driven[scene][car] for scene, car in zip(windows.scene, windows.vehicle)]
             errors = {
                 kind: values[rows] for kind, values in errors_of(forecasts, windows.future).items()

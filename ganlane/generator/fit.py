@@ -26,9 +26,11 @@ from ganlane.generator.forecasts import (
     BASELINE,
     SAMPLES,
     Forecasts,
+    by_kind,
     displacement_errors,
+    driven_windows,
     errors_of,
-    idm_forecast,
+    idm_driver,
     long_errors,
     repeated,
 )
@@ -258,11 +260,12 @@ def held_out_errors(task: Task, scenes: list[Recording], steps: int, stride: int
     """Errors of forecasts of held-out ``scenes``: by the fit, constant velocity and IDM."""
     # The best of 20 is for short forecasts only; the policy draws many in any case.
     few = steps == LONG_STEPS and isinstance(task, CalibratedTask)
-    forecasts = task.forecasts(scenes, steps, stride, 1 if few else SAMPLES)
     # The same windows for every forecaster, in the same order.
     windows = cut_windows(scenes, stride, OBSERVED_POSITIONS + steps)
+    samples = task.forecasts(scenes, steps, stride, 1 if few else SAMPLES)
+    forecasts = by_kind(samples, windows.future)
     forecasts[BASELINE] = repeated(windows.past[:, -1], steps)
-    forecasts["idm_own_headway"] = idm_forecast(scenes, steps, stride)
+    (forecasts["idm_own_headway"],) = driven_windows(idm_driver, scenes, steps, stride)
     return windows.scene, errors_of(forecasts, windows.future)
 
 

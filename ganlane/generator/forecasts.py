@@ -2,9 +2,10 @@
 
 Forecasters are the Social-GAN's presets, IDM, and constant velocity.
 Every forecast is positions [W, T, 2] in m relative to the present, for the windows of
-:func:`~ganlane.generator.windows.cut_windows` in the same order. Kinds of forecasts by a generator:
-``mean`` (z = 0), ``single`` (one sample), ``best_of_20`` (by ADE). ADE is the mean error over the
-predicted steps, FDE the error at the last of them, both in m.
+:func:`~ganlane.generator.windows.cut_windows` in the same order. All but the paper's preset and
+constant velocity are drivers (:data:`Driver`), which drive whole segments. Kinds of forecasts by a
+generator (:func:`by_kind`): ``mean`` (z = 0), ``single`` (one sample), ``best_of_20`` (by ADE).
+ADE is the mean error over the predicted steps, FDE the error at the last of them, both in m.
 """
 
 from __future__ import annotations
@@ -27,12 +28,10 @@ from ganlane.generator.closed_loop import (
 )
 from ganlane.generator.networks import Generator
 from ganlane.generator.windows import (
-    OBSERVED_POSITIONS,
     PRESENT,
     Groups,
     Segments,
     Windows,
-    cut_windows,
     segment_batches,
 )
 from ganlane.keys import PHYSICS_STEP_S
@@ -49,6 +48,8 @@ BASELINE = "constant_velocity"
 _SMALLEST_DISTANCE_M = 1e-4
 #: Name of a forecast to positions [W, T, 2] in m relative to the present, or to errors [W, T] in m.
 Forecasts = dict[str, np.ndarray]
+#: Drives all vehicles of B segments jointly: K times their positions [K, B, H, V, 2] in m.
+Driver = Callable[[Segments], Tensor]
 #: Scores as plain data, for JSON and tables.
 Row = dict[str, Any]
 # What goes through a network in one pass; bounds the memory.
@@ -125,8 +126,11 @@ def by_kind(samples: np.ndarray, recorded: np.ndarray) -> Forecasts:
 @torch.no_grad()
 def paper_forecasts(
     generator: Generator, windows: Windows, groups: Groups, seed: int, samples: int
-) -> Forecasts:
-    """The paper's preset, open loop, on the windows in ``groups``."""
+) -> np.ndarray:
+    """Forecasts [1 + K, W, T, 2] by the paper's preset, open loop, on the windows in ``groups``.
+
+    The first has z = 0, the K = ``samples`` others are drawn.
+    """
     random = torch.Generator().manual_seed(seed)
     positions = np.empty((1 + samples, *windows.future.shape))
     for rows in torch.arange(len(groups)).split(_GROUPS):
@@ -141,23 +145,19 @@ def paper_forecasts(
         # From groups back to the order of the windows.
         row = chunk.window[chunk.mask].numpy()
         positions[:, row] = predicted[:, chunk.mask].double().numpy()
-    return by_kind(positions, windows.future)
+    return positions
 
 
+@torch.no_grad()
 def driven_windows(
-    driver: Callable[[Segments], Tensor],
-    scenes: list[Recording],
-    horizon: int,
-    stride: int,
-    samples: int = 1,
+    driver: Driver, scenes: list[Recording], horizon: int, stride: int, times: int = 1
 ) -> np.ndarray:
-    """Forecasts [K, W, H, 2] of all windows of 9 + ``horizon`` frames.
+    """Forecasts [K, W, H, 2] by a ``driver`` of K = ``times`` of all windows of 9 + H frames.
 
-    These are of the vehicles recorded throughout a segment, whose vehicles ``driver`` drives all
-    jointly: positions [K, B, H, V, 2] of K = ``samples``.
+    These are of the vehicles recorded throughout a segment; H is the ``horizon``.
     """
-    # Samples multiply the rows, so fewer segments go through in one pass.
-    size = max(1, _ROLLOUTS // samples)
+    # Each time multiplies the rows, so fewer segments go through in one pass.
+    size = max(1, _ROLLOUTS // times)
     forecasts = []
     for scene in scenes:
         for segments in segment_batches(scene, horizon, stride, size):
@@ -169,33 +169,10 @@ def driven_windows(
     return np.concatenate(forecasts, axis=1)
 
 
-def driven_forecasts(
-    driver: Callable[[Segments], Tensor],
-    scenes: list[Recording],
-    horizon: int,
-    stride: int,
-    samples: int,
-) -> Forecasts:
-    """The kinds of forecasts (:func:`by_kind`) in all windows of 9 + ``horizon`` frames.
+def calibrated_driver(generator: Generator, config: CalibratedConfig, samples: int) -> Driver:
+    """The calibrated preset: its mean prediction, then so many samples.
 
-    ``driver`` gives the mean prediction, then so many samples, as for :func:`driven_windows`.
-    """
-    forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
-    return by_kind(forecasts, cut_windows(scenes, stride, OBSERVED_POSITIONS + horizon).future)
-
-
-@torch.no_grad()
-def calibrated_forecasts(
-    generator: Generator,
-    scenes: list[Recording],
-    horizon: int,
-    stride: int,
-    config: CalibratedConfig,
-    samples: int,
-) -> Forecasts:
-    """The calibrated preset, rolled out through whole scenes.
-
-    Target lanes and drivers are those of the present.
+    Drivers are those of the present.
     """
     random = torch.Generator().manual_seed(0)
 
@@ -204,30 +181,25 @@ def calibrated_forecasts(
         noise[:, 0] = 0.0
         return rollout(generator, segments, driver_params(segments), noise, config)
 
-    return driven_forecasts(driver, scenes, horizon, stride, samples)
+    return driver
 
 
-@torch.no_grad()
-def idm_forecast(scenes: list[Recording], horizon: int, stride: int) -> np.ndarray:
-    """Positions [W, H, 2] in m by IDM along the road, with constant lateral positions.
+def idm_driver(segments: Segments) -> Tensor:
+    """IDM along the road, once, with constant lateral positions: a :data:`Driver`.
 
     Every driver has the headway at which it is in balance at present: the calibrated preset's
     anchor.
     """
+    headway, desired = driver_params(segments)
 
-    def driver(segments: Segments) -> Tensor:
-        headway, desired = driver_params(segments)
+    def move(vehicles: Vehicles, step: int) -> Vehicles:
+        scene = perceive(vehicles, segments.road)
+        acceleration = following_acceleration(scene, with_headways(TABLE_V, headway))
+        speed = displacement_of(vehicles)[..., 0] / PHYSICS_STEP_S
+        velocity = speed + acceleration * PHYSICS_STEP_S
+        return moved_by(vehicles, velocity, torch.zeros_like(velocity))
 
-        def move(vehicles: Vehicles, step: int) -> Vehicles:
-            scene = perceive(vehicles, segments.road)
-            acceleration = following_acceleration(scene, with_headways(TABLE_V, headway))
-            speed = displacement_of(vehicles)[..., 0] / PHYSICS_STEP_S
-            velocity = speed + acceleration * PHYSICS_STEP_S
-            return moved_by(vehicles, velocity, torch.zeros_like(velocity))
-
-        return driven_positions(segments, desired, move)[None]
-
-    return driven_windows(driver, scenes, horizon, stride)[0]
+    return driven_positions(segments, desired, move)[None]
 
 
 def repeated(displacement: np.ndarray, steps: int) -> np.ndarray:

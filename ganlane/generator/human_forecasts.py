@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 
 from ganlane.data.dense import Recording
 from ganlane.generator.descent import descend, half_cosine
-from ganlane.generator.forecasts import Forecasts, driven_forecasts, driven_windows
+from ganlane.generator.forecasts import Driver, driven_windows
 from ganlane.generator.human import (
     ACROSS,
     ALONG,
@@ -96,24 +97,16 @@ def present_of(estimator: Estimator, segments: Segments) -> Situation:
     return situation_of(vehicles, memory, road, first=torch.ones_like(whole))
 
 
-@torch.no_grad()
-def human_forecasts(
-    model: HumanModel, scenes: list[Recording], horizon: int, stride: int, samples: int
-) -> Forecasts:
-    """The mean driver's and drawn drivers' positions in all windows of the scenes."""
+def human_driver(model: HumanModel, samples: int) -> Driver:
+    """The mean driver, then so many drawn ones."""
     random = torch.Generator().manual_seed(0)
-
-    def driver(segments: Segments) -> Tensor:
-        return _driven(model, segments, horizon, samples, random)
-
-    return driven_forecasts(driver, scenes, horizon, stride, samples)
+    return partial(_driven, model, samples, random)
 
 
-def _driven(
-    model: HumanModel, segments: Segments, horizon: int, samples: int, random: torch.Generator
-) -> Tensor:
-    """Positions [1 + samples, B, horizon, V, 2]; the first are the mean driver's."""
+def _driven(model: HumanModel, samples: int, random: torch.Generator, segments: Segments) -> Tensor:
+    """Positions [1 + samples, B, H, V, 2]; the first are the mean driver's."""
     policy = model.policy
+    horizon = segments.future.shape[1]
     runs, rows = 1 + samples, len(segments.positions)
     situation = present_of(model.estimator, segments.repeated(runs))
     # The first copy of the segments makes the expected moves, the others draw theirs.
@@ -171,7 +164,7 @@ def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanCo
     random = torch.Generator().manual_seed(config.seed)
 
     def recorded_and_driven(segments: Segments) -> Tensor:
-        mean = _driven(model, segments, PREDICTED_STEPS, 0, random)
+        mean = _driven(model, 0, random, segments)
         return torch.cat((segments.positions[None], mean), 2)
 
     # The forecasts that it corrects are without it.
@@ -185,8 +178,7 @@ def fit_observer(model: HumanModel, scenes: Sequence[Recording], config: HumanCo
             x = smooth.x + share * (scene.x - smooth.x)
             y = smooth.y + share * (scene.y - smooth.y)
             noisy.append(replace(scene, x=x, y=y))
-    with torch.no_grad():
-        windows = driven_windows(recorded_and_driven, noisy, PREDICTED_STEPS, OBSERVER_STRIDE)[0]
+    (windows,) = driven_windows(recorded_and_driven, noisy, PREDICTED_STEPS, OBSERVER_STRIDE)
     parts = (OBSERVED_POSITIONS, PREDICTED_STEPS, PREDICTED_STEPS)
     positions, wanted, forecast = torch.from_numpy(windows).float().split(parts, 1)
     optimizer = torch.optim.AdamW(model.observer.parameters(), OBSERVER_RATE, weight_decay=1e-2)

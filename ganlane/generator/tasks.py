@@ -26,9 +26,9 @@ from ganlane.data.dense import Recording
 from ganlane.generator.closed_loop import driver_params, noise_shape, rollout
 from ganlane.generator.descent import descend, half_cosine
 from ganlane.generator.forecasts import (
-    Forecasts,
-    calibrated_forecasts,
+    calibrated_driver,
     distance,
+    driven_windows,
     energy_score,
     mean_by_step,
     paper_forecasts,
@@ -36,7 +36,7 @@ from ganlane.generator.forecasts import (
 )
 from ganlane.generator.human_estimator import HumanModel
 from ganlane.generator.human_fit import fit_human, fit_steps
-from ganlane.generator.human_forecasts import WIDTH_M, fit_observer, human_forecasts
+from ganlane.generator.human_forecasts import WIDTH_M, fit_observer, human_driver
 from ganlane.generator.networks import Discriminator, Generator, displacements_of
 from ganlane.generator.windows import (
     Groups,
@@ -177,13 +177,13 @@ class PaperTask(_Task):
     def evaluate(self) -> float:
         """ADE of the mean prediction on the validation scenes, m."""
         windows, groups = self.validation
-        mean = paper_forecasts(self.generator, windows, groups, self.config.seed, 0)["mean"]
+        (mean,) = paper_forecasts(self.generator, windows, groups, self.config.seed, 0)
         return float(np.linalg.norm(mean - windows.future, axis=-1).mean())
 
     def forecasts(
         self, scenes: list[Recording], steps: int, stride: int, samples: int
-    ) -> Forecasts:
-        """Forecasts of the windows of ``scenes``, by kind."""
+    ) -> np.ndarray:
+        """Forecasts [1 + K, W, T, 2] of the windows of ``scenes``; the first is the mean one."""
         windows, groups = self._grouped_windows(scenes, stride)
         return paper_forecasts(self.generator, windows, groups, self.config.seed, samples)
 
@@ -266,9 +266,10 @@ class CalibratedTask(_Task):
 
     def forecasts(
         self, scenes: list[Recording], steps: int, stride: int, samples: int
-    ) -> Forecasts:
-        """Forecasts of the windows of ``scenes``, by kind."""
-        return calibrated_forecasts(self.generator, scenes, steps, stride, self.config, samples)
+    ) -> np.ndarray:
+        """Forecasts [1 + K, W, T, 2] of the windows of ``scenes``; the first is the mean one."""
+        driver = calibrated_driver(self.generator, self.config, samples)
+        return driven_windows(driver, scenes, steps, stride, 1 + samples)
 
     def _batch(self) -> Segments:
         """Segments with similar numbers of vehicles over a random horizon.
@@ -324,9 +325,10 @@ class HumanTask(nn.Module):
 
     def forecasts(
         self, scenes: list[Recording], steps: int, stride: int, samples: int
-    ) -> Forecasts:
-        """Forecasts of the windows of ``scenes``, by kind."""
-        return human_forecasts(self.generator, scenes, steps, stride, samples)
+    ) -> np.ndarray:
+        """Forecasts [1 + K, W, T, 2] of the windows of ``scenes``; the first is the mean one."""
+        driver = human_driver(self.generator, samples)
+        return driven_windows(driver, scenes, steps, stride, 1 + samples)
 
 
 @dataclass(frozen=True)

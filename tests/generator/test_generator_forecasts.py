@@ -71,14 +71,13 @@ def test_the_best_of_the_samples_is_the_nearest_on_average():
 
 def test_without_noise_in_the_weights_all_samples_of_a_rollout_agree(scenes):
     generator = silenced(small_generator(EXTRA_INPUTS))
-    driven = forecasts.calibrated_forecasts(
-        generator, scenes, 8, STRIDE, CalibratedConfig(), samples=3
-    )
-    np.testing.assert_allclose(driven["single"], driven["mean"], atol=1e-5)
+    driver = forecasts.calibrated_driver(generator, CalibratedConfig(), samples=3)
+    mean, single, *_ = forecasts.driven_windows(driver, scenes, 8, STRIDE, 4)
+    np.testing.assert_allclose(single, mean, atol=1e-5)
     # without a residual the anchor alone drives: along the road that is IDM with the driver's own
     # headway
-    idm = forecasts.idm_forecast(scenes, 8, STRIDE)
-    np.testing.assert_allclose(driven["mean"][..., 0], idm[..., 0], atol=1e-3)
+    (idm,) = forecasts.driven_windows(forecasts.idm_driver, scenes, 8, STRIDE)
+    np.testing.assert_allclose(mean[..., 0], idm[..., 0], atol=1e-3)
 
 
 def test_steady_driving_is_foreseen_by_constant_velocity():

@@ -26,8 +26,8 @@ from matplotlib.patches import FancyBboxPatch
 from torch import Tensor, nn
 
 from benchmarks.script import make_parser, run_script
-from ganlane.data import FRAME_S, default_scenes, read_scenes, scene_lane_widths
-from ganlane.data.dense import recorded_frame, recordings_of
+from ganlane.data import FRAME_S, default_scenes, read_scenes
+from ganlane.data.dense import recordings_of
 from ganlane.generator import Discriminator, Generator, load_generator, shipped_generator
 from ganlane.generator.networks import MotionLSTM
 from ganlane.realism.driving import StartOptions, drive_recordings
@@ -224,9 +224,9 @@ def courses() -> Figure:
         return gan_calibrated_traffic(road, Stream.REPORT)
 
     frame = read_scenes(default_scenes()).filter(pl.col("scene") == SCENE)
-    (recording,) = recordings_of(frame, scene_lane_widths(frame))
-    driven = drive_recordings(make, [recording], StartOptions(desired_above_mps=11.0))
-    return draw_space_time({"recorded": recorded_frame([recording]), "gan_calibrated": driven})
+    (recording,) = recordings_of(frame)
+    (driven,) = drive_recordings(make, [recording], StartOptions(desired_above_mps=11.0))
+    return draw_space_time({"recorded": recording.frame(), "gan_calibrated": driven.frame()})
 
 
 def draw(options: argparse.Namespace) -> str:

@@ -20,8 +20,7 @@ def main() -> None:
     frame = read_scenes(path)
     scenes = frame["scene"].unique().sort().to_list()
     starts = recorded_starts({}, scenes, (), frame, StartOptions(repeats=4), False, path.name)
-    floors = floors_of(starts.driven, starts.recorded.counts)
-    replace(starts.reference, floors=floors).save(SHIPPED_REFERENCE)
+    replace(starts.reference, floors=floors_of(starts)).save(SHIPPED_REFERENCE)
     print(f"wrote {SHIPPED_REFERENCE}")
 
 

@@ -17,10 +17,10 @@ from ganlane.errors import UserError
 from ganlane.evaluation import write_results
 from ganlane.evaluation.table import show
 from ganlane.generator import HELD_OUT, Preset, shipped_generator
-from ganlane.realism.card import card_numbers, quantity_rows
+from ganlane.realism.card import card_numbers, card_rows
 from ganlane.realism.driving import Factory, StartOptions
 from ganlane.realism.long_runs import LongRunParameters, long_run
-from ganlane.realism.measures import measure_recordings
+from ganlane.realism.measures import measure
 from ganlane.realism.sheets import card_text, draw
 from ganlane.realism.starts import (
     Starts,
@@ -192,14 +192,10 @@ def one_lane_rows(
     recordings = read_one_lane(name, path)
     options = StartOptions(seed=config.seed)
     driven = simulate_all(factories, recordings, options, starts.desired_above_mps)
-    recorded = measure_recordings(recordings).counts
-    return quantity_rows(
-        next(iter(factories)),
-        driven,
-        {quantity: recorded[quantity] for quantity in ONE_LANE_QUANTITIES},
-        floors={},
-        resamples=config.resamples,
-    )
+    recorded = measure(recordings)
+    counts = {quantity: recorded.counts[quantity] for quantity in ONE_LANE_QUANTITIES}
+    site = replace(starts, driven=driven, recorded=replace(recorded, counts=counts))
+    return card_rows(site, config.resamples)
 
 
 def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str, Any]]:

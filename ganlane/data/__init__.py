@@ -22,7 +22,6 @@ from ganlane.data.recordings import read_recordings, read_scenes, write_prepared
 from ganlane.data.schema import FRAME_S, SCHEMA, TRACK, Scene, sort
 from ganlane.data.sources import byte_progress, default_scenes, recordings_path
 from ganlane.data.statistics import (
-    Bins,
     DrivingStatistics,
     driving_statistics,
     survival_curve,

@@ -6,7 +6,7 @@ by frame: the starts of simulations, and what they drove.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -182,12 +182,8 @@ def track_table(scene: str, present: Flags, **values: ArrayLike) -> pl.DataFrame
     return pl.DataFrame({name: columns[name] for name in SCHEMA}, schema=SCHEMA)
 
 
-def recordings_of(
-    frame: pl.DataFrame, lane_widths: Mapping[str, float] | None = None
-) -> list[Recording]:
+def recordings_of(frame: pl.DataFrame) -> list[Recording]:
     """The scenes of a frame in the schema, by name.
-
-    ``lane_widths`` in m are estimated where not given.
 
     Raises:
         UserError: a column is missing, there is no row, or lanes are implausibly wide or narrow.
@@ -198,16 +194,10 @@ def recordings_of(
             f"a frame without {missing or 'rows'}: expected {list(SCHEMA)}; read recordings with "
             "ganlane.data.read_scenes."
         )
-    if lane_widths is None:
-        lane_widths = scene_lane_widths(frame)
+    lane_widths = scene_lane_widths(frame)
     # Sorted by name, so that the order of the file has no effect.
     scenes = frame.partition_by("scene", as_dict=True)
     return [Recording.of(scenes[key], lane_widths[str(key[0])]) for key in sorted(scenes)]
-
-
-def recorded_frame(recordings: Sequence[Recording]) -> pl.DataFrame:
-    """The recordings in the form in which simulations are measured."""
-    return pl.concat([recording.frame() for recording in recordings])
 
 
 def units_of(recordings: Sequence[Recording]) -> list[str]:

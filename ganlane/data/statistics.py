@@ -116,23 +116,6 @@ def survival_curve(duration_s: Floats, complete: Flags) -> tuple[np.ndarray, np.
 
 
 @dataclass(frozen=True)
-class Bins:
-    """Bins of equal width from ``low`` to ``high``.
-
-    Values beyond are counted in the outermost ones.
-    """
-
-    low: float
-    high: float
-    number: int
-
-    @property
-    def edges(self) -> np.ndarray:
-        """The bins' limits [number + 1]."""
-        return np.linspace(self.low, self.high, self.number + 1)
-
-
-@dataclass(frozen=True)
 class Exposure(Record):
     """Amount of driving.
 
@@ -334,17 +317,11 @@ class DrivingStatistics(Record):
             ) from error
 
 
-def driving_statistics(
-    frame: pl.DataFrame,
-    lane_widths: dict[str, float] | None = None,
-) -> DrivingStatistics:
-    """Measure a frame in the schema, sorted.
-
-    Each scene's lane width in m is estimated where not given.
-    """
+def driving_statistics(frame: pl.DataFrame) -> DrivingStatistics:
+    """Measure a frame in the schema, sorted; each scene's lane width is estimated."""
     exposure = measure_exposure(frame)
     samples = quantities(frame)
-    changes = find_lane_changes(tracks_of_frame(frame, lane_widths))
+    changes = find_lane_changes(tracks_of_frame(frame))
     described = ("speed", "acceleration_raw", "acceleration_smoothed", "headway")
     return DrivingStatistics(
         exposure=exposure,

@@ -6,13 +6,11 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from ganlane.evaluation.statistics import Array, Estimate, entries
+from ganlane.evaluation.statistics import Estimate, entries
 from ganlane.realism.driving import FLOORS
 from ganlane.realism.long_runs import totals
 from ganlane.realism.measures import (
-    RESAMPLES,
-    UNITS,
-    Measured,
+    QUANTITIES,
     ceiling,
     distance,
     distance_difference,
@@ -37,12 +35,8 @@ def card_numbers(
     """
     # The card's own traffic comes first everywhere.
     traffic = next(iter(starts.driven))
-    rows = card_rows(starts, traffic, resamples)
-    held_out = None
-    if starts.separately_held_out:
-        # What was fitted to the other scenes cannot help here.
-        alone = starts.restricted_to(starts.separately_held_out)
-        held_out = card_rows(alone, traffic, resamples)
+    # What was fitted to the other scenes cannot help on these.
+    held_out = starts.held_out_alone()
     # The recordings are the first line of the table.
     measured = {"recorded": starts.recorded, **starts.driven}
     runs = long_runs[traffic]
@@ -55,8 +49,8 @@ def card_numbers(
         "recordings": starts.reference.source,
         "recorded_lane_changes_per_vehicle_km": starts.reference.rate(),
         "recorded_spread_mps": starts.reference.whole["speed_spread_mps"],
-        "quantities": rows,
-        "quantities_held_out": held_out,
+        "quantities": card_rows(starts, resamples),
+        "quantities_held_out": card_rows(held_out, resamples) if held_out else None,
         "driving": {name: driving.summary() for name, driving in measured.items()},
         "i80": site,
         **totals(runs),
@@ -65,36 +59,20 @@ def card_numbers(
     }
 
 
-def card_rows(starts: Starts, traffic: str, resamples: int) -> dict[str, Any]:
-    """The rows of a traffic's card, compared with every other traffic from the same starts."""
-    recorded, floors = starts.recorded.counts, starts.reference.floors
-    return quantity_rows(traffic, starts.driven, recorded, floors, starts.paired, resamples)
+def card_rows(starts: Starts, resamples: int) -> dict[str, Any]:
+    """The rows of the first traffic from the same starts, by quantity that was recorded.
 
-
-def quantity_rows(
-    traffic: str,
-    driven: Mapping[str, Measured],
-    recorded: Mapping[str, Array],
-    floors: Mapping[str, Mapping[str, float]],
-    paired: bool = True,
-    resamples: int = RESAMPLES,
-) -> dict[str, Any]:
-    """By quantity: distance, ceiling, floor, constant velocity, and the difference to each rival.
-
-    Args:
-        traffic: whose rows.
-        driven: it and others from the same starts; all but :data:`FLOORS` are rivals.
-        recorded: by quantity, [units, bins]; its quantities are the rows. Their halves give the
-            ceilings.
-        floors: by driver and quantity, where ``driven`` does not hold the driver.
-        paired: whether the recorded units are those that were driven.
+    Each holds its distance, ceiling (of the recordings' halves), floor, constant velocity, and the
+    difference to each rival.
     """
+    driven, paired = starts.driven, starts.paired
+    traffic, *others = driven
     # The reference drivers are the scale, not rivals.
-    rivals = [name for name in driven if name != traffic and name not in FLOORS]
+    rivals = [name for name in others if name not in FLOORS]
     # What was driven now comes before what ships.
-    ends = {**floors, **floors_of(driven, recorded)}
+    ends = {**starts.reference.floors, **floors_of(starts)}
     rows = {}
-    for name, counts in recorded.items():
+    for name, counts in starts.recorded.counts.items():
         ours = driven[traffic].counts[name]
         against = {}
         for rival in rivals:
@@ -106,7 +84,7 @@ def quantity_rows(
                 "verdict": verdict(difference),
             }
         rows[name] = {
-            "unit": UNITS[name],
+            "unit": QUANTITIES[name].unit,
             **entries("distance", distance(ours, counts, paired, resamples)),
             "ceiling": ceiling(counts),
             "floor": ends.get("random", {}).get(name),
@@ -118,16 +96,15 @@ def quantity_rows(
     return rows
 
 
-def floors_of(
-    driven: Mapping[str, Measured], recorded: Mapping[str, Array]
-) -> dict[str, dict[str, float]]:
-    """Finite distances of the reference drivers in ``driven`` to the recordings.
+def floors_of(starts: Starts) -> dict[str, dict[str, float]]:
+    """Finite distances to the recordings of the reference drivers that were driven.
 
     By driver and quantity.
     """
     floors = {}
-    for driver in (name for name in FLOORS if name in driven):
-        counts = driven[driver].counts
+    recorded = starts.recorded.counts
+    for driver in (name for name in FLOORS if name in starts.driven):
+        counts = starts.driven[driver].counts
         distances = {name: pooled_distance(counts[name], recorded[name]) for name in recorded}
         # A quantity without samples has no distance, and JSON no NaN.
         floors[driver] = {name: at for name, at in distances.items() if math.isfinite(at)}

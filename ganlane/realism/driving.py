@@ -26,7 +26,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-import polars as pl
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -77,8 +76,8 @@ def print_progress(text: str) -> None:
 
 def drive_recordings(
     make: Factory, recordings: Sequence[Recording], options: StartOptions
-) -> pl.DataFrame:
-    """Drive every recording ``options.repeats`` times, as :meth:`Recording.frame` has it.
+) -> list[Recording]:
+    """What was driven from every recording, ``options.repeats`` times, in any order.
 
     Those on equal roads go side by side.
     """
@@ -87,13 +86,12 @@ def drive_recordings(
     for recording in recordings:
         same_road = roads.setdefault((recording.lanes, recording.lane_width_m), [])
         same_road += [recording] * options.repeats
-    frames: list[pl.DataFrame] = []
+    driven: list[Recording] = []
     for road, rows in roads.items():
         for batch in _batches(rows):
             # Each row has an episode number of its own, whatever the batches are.
-            driven = _drive(make(Road(*road)), batch, options, first=len(frames))
-            frames += [recording.frame() for recording in driven]
-    return pl.concat(frames)
+            driven += _drive(make(Road(*road)), batch, options, first=len(driven))
+    return driven
 
 
 def _batches(rows: list[Recording]) -> list[list[Recording]]:

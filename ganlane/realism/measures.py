@@ -17,10 +17,10 @@ import numpy as np
 import polars as pl
 from scipy.special import stdtrit
 
-from ganlane.data.dense import Recording, recorded_frame, units_of
+from ganlane.data.dense import Recording, units_of
 from ganlane.data.lanes import find_lane_changes, tracks_of_frame
 from ganlane.data.schema import FRAME_S, TRACK
-from ganlane.data.statistics import Bins, leader_gaps
+from ganlane.data.statistics import leader_gaps
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import (
     TAIL_LEVELS,
@@ -62,19 +62,36 @@ FEWEST_IN_FRAME: Final = 3
 #: Levels of the quantiles.
 LEVELS: Final = (0.05, 0.5, 0.95)
 
-_QUANTITIES: Final = {
-    "speed": ("m/s", Bins(0.0, 40.0, 40)),
-    "speed_spread": ("m/s", Bins(0.0, 10.0, 20)),
-    "acceleration": ("m/s2", Bins(-5.0, 5.0, 50)),
-    "jerk": ("m/s3", Bins(-5.0, 5.0, 50)),
-    "time_headway": ("s", Bins(0.0, 8.0, 40)),
-    "gap": ("m", Bins(0.0, 100.0, 40)),
-    "time_to_collision": ("s", Bins(0.0, 30.0, 30)),
-    "lane_change_duration": ("s", Bins(0.0, 10.0, 10)),
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity's ``unit``, and its bins of equal width from ``low`` to ``high``.
+
+    Values beyond are counted in the outermost bins.
+    """
+
+    unit: str
+    low: float
+    high: float
+    bins: int
+
+    @property
+    def edges(self) -> np.ndarray:
+        """The bins' limits [bins + 1]."""
+        return np.linspace(self.low, self.high, self.bins + 1)
+
+
+#: By name.
+QUANTITIES: Final = {
+    "speed": Quantity("m/s", 0.0, 40.0, 40),
+    "speed_spread": Quantity("m/s", 0.0, 10.0, 20),
+    "acceleration": Quantity("m/s2", -5.0, 5.0, 50),
+    "jerk": Quantity("m/s3", -5.0, 5.0, 50),
+    "time_headway": Quantity("s", 0.0, 8.0, 40),
+    "gap": Quantity("m", 0.0, 100.0, 40),
+    "time_to_collision": Quantity("s", 0.0, 30.0, 30),
+    "lane_change_duration": Quantity("s", 0.0, 10.0, 10),
 }
-#: By quantity, its unit, and its bins; values beyond count in the outermost ones.
-UNITS: Final = {name: unit for name, (unit, _) in _QUANTITIES.items()}
-QUANTITIES: Final = {name: bins for name, (_, bins) in _QUANTITIES.items()}
 
 
 def jensen_shannon(first: Array, second: Array) -> Array:
@@ -229,14 +246,13 @@ def lane_change_rate(changes: int, km: float) -> dict[str, Any]:
     }
 
 
-def measure_recordings(recordings: Sequence[Recording]) -> Measured:
-    """The recordings, measured as simulations are."""
-    return measure(recorded_frame(recordings), units_of(recordings))
+def measure(recordings: Sequence[Recording], units: Sequence[str] | None = None) -> Measured:
+    """Measure recordings, or what was driven from them.
 
-
-def measure(frame: pl.DataFrame, units: Sequence[str]) -> Measured:
-    """Measure trajectories (:meth:`ganlane.data.dense.Recording.frame`) of the ``units``."""
-    motion = with_motion(frame)
+    ``units``: those of the counts, in this order; by default those of the ``recordings``.
+    """
+    units = units or units_of(recordings)
+    motion = with_motion(pl.concat([recording.frame() for recording in recordings]))
     # Samples are dropped once they are counted.
     samples = samples_of(motion)
     counts = {}
@@ -286,13 +302,13 @@ def samples_of(motion: pl.DataFrame) -> dict[str, pl.DataFrame]:
     return samples
 
 
-def _histograms(table: pl.DataFrame, units: Sequence[str], bins: Bins) -> Array:
+def _histograms(table: pl.DataFrame, units: Sequence[str], quantity: Quantity) -> Array:
     """Samples per unit and bin, [units, bins]."""
     # Row and column of each sample in the table of counts.
     row = table["unit"].cast(pl.Enum(units)).to_physical().to_numpy()
-    share = (table["value"].to_numpy() - bins.low) / (bins.high - bins.low)
-    column = np.clip(np.floor(share * bins.number), 0, bins.number - 1).astype(np.int64)
-    counts = np.zeros((len(units), bins.number))
+    share = (table["value"].to_numpy() - quantity.low) / (quantity.high - quantity.low)
+    column = np.clip(np.floor(share * quantity.bins), 0, quantity.bins - 1).astype(np.int64)
+    counts = np.zeros((len(units), quantity.bins))
     np.add.at(counts, (row, column), 1.0)
     return counts
 
@@ -394,4 +410,4 @@ class Reference(Measured):
 
 def _bins() -> dict[str, list[float]]:
     """Low edge, high edge and number of the bins, by quantity."""
-    return {name: [bins.low, bins.high, bins.number] for name, bins in QUANTITIES.items()}
+    return {name: [one.low, one.high, one.bins] for name, one in QUANTITIES.items()}

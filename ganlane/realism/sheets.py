@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 
 from ganlane.evaluation.table import aligned, number, with_interval
 from ganlane.realism.driving import FLOORS
-from ganlane.realism.measures import QUANTITIES, UNITS, Measured
+from ganlane.realism.measures import QUANTITIES, Measured
 from ganlane.realism.starts import Starts
 from ganlane.view.figures import (
     FAINT,
@@ -152,7 +152,7 @@ def draw_distributions(
     colours = {"recorded": INK, **palette(list(simulated))}
     for axes, name in zip(grid, recorded):
         edges = QUANTITIES[name].edges
-        unit = UNITS[name].replace("s2", "s²").replace("s3", "s³")
+        unit = QUANTITIES[name].unit.replace("s2", "s²").replace("s3", "s³")
         middle = 0.5 * (edges[1:] + edges[:-1])
         axes.set(title=name.replace("_", " "), xlabel=unit, ylabel=f"density, per {unit}")
         axes.set_xlim(edges[0], edges[-1])
@@ -180,7 +180,7 @@ def draw_distributions(
 def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
     """A block per quantity with a line per traffic: distances with their intervals.
 
-    ``quantities`` are the rows of :func:`ganlane.realism.card.quantity_rows`. Vertical lines are
+    ``quantities`` are the rows of :func:`ganlane.realism.card.card_rows`. Vertical lines are
     the ends of the scale: recordings against each other, and random driving.
     """
     colours = palette([traffic, *next(iter(quantities.values()))["against"]])

@@ -13,7 +13,6 @@ import numpy as np
 import polars as pl
 
 from ganlane.data.dense import Recording, recordings_of, units_of
-from ganlane.data.lanes import scene_lane_widths
 from ganlane.data.schema import FRAME_S
 from ganlane.data.statistics import driving_statistics
 from ganlane.errors import UserError
@@ -31,7 +30,6 @@ from ganlane.realism.measures import (
     Measured,
     Reference,
     measure,
-    measure_recordings,
     pooled_distance,
 )
 from ganlane.sim.spawn import SpawnParameters
@@ -82,7 +80,7 @@ def fit_excess(
     Nearest to the ``recordings`` by the mean distance over all quantities that need no lane change.
     Every traffic is fitted, so that none suffers from desired speeds chosen for another.
     """
-    recorded = measure_recordings(recordings)
+    recorded = measure(recordings)
 
     def mean_distance(excess: float) -> float:
         # Once per scene is enough to compare candidates with each other.
@@ -124,19 +122,20 @@ class Starts:
         """Whether the recorded units are those that were driven."""
         return bool(self.scenes)
 
-    @property
-    def separately_held_out(self) -> list[str]:
-        """The held-out scenes, if other scenes were driven too; else empty."""
-        held_out = [name for name in self.scenes if name in self.held_out]
-        return held_out if len(held_out) < len(self.scenes) else []
+    def held_out_alone(self) -> Starts | None:
+        """The same driving from the held-out scenes, compared with these alone.
 
-    def restricted_to(self, scenes: Sequence[str]) -> Starts:
-        """The same driving from some of its recorded scenes, compared with these alone."""
+        None where no other scenes were driven, or none is held out.
+        """
         # Units are the scenes, in this order.
-        rows = [self.scenes.index(name) for name in scenes]
+        rows = [row for row, name in enumerate(self.scenes) if name in self.held_out]
+        if not 0 < len(rows) < len(self.scenes):
+            return None
+        scenes = [self.scenes[row] for row in rows]
         driven = {name: measured.restricted_to(rows) for name, measured in self.driven.items()}
-        recorded = self.recorded.restricted_to(rows)
-        return replace(self, scenes=list(scenes), driven=driven, recorded=recorded)
+        return replace(
+            self, scenes=scenes, driven=driven, recorded=self.recorded.restricted_to(rows)
+        )
 
 
 def recorded_starts(
@@ -156,8 +155,7 @@ def recorded_starts(
     Raises:
         UserError: an unknown scene is held out, or no scene is long enough.
     """
-    widths = scene_lane_widths(frame)
-    recordings = recordings_of(frame, widths)
+    recordings = recordings_of(frame)
     names = [recording.name for recording in recordings]
     # A mistyped scene would be fitted to in silence.
     for name in held_out:
@@ -181,9 +179,9 @@ def recorded_starts(
             print_progress(f"{name}: fitting desired speeds on {len(others)} scenes")
             excesses[name] = fit_excess(make, others, options)
     # Long runs are compared with all frames, not only with those that count.
-    statistics = driving_statistics(frame, widths)
+    statistics = driving_statistics(frame)
     reference = Reference(
-        **vars(measure_recordings(recordings)),
+        **vars(measure(recordings)),
         source=source,
         units=names,
         whole={
@@ -198,7 +196,7 @@ def recorded_starts(
         held_out=list(held_out),
         desired_above_mps=excesses,
         driven=simulate_all(factories, chosen, options, excesses),
-        recorded=measure_recordings(chosen),
+        recorded=measure(chosen),
         reference=reference,
     )
 
@@ -222,7 +220,7 @@ def spawned_starts(
     driven = {}
     for name, make in factories.items():
         print_progress(f"{name} from {rows} spawned starts")
-        driven[name] = measure_recordings(spawned_recordings(make, road, parameters, rows))
+        driven[name] = measure(spawned_recordings(make, road, parameters, rows))
     return Starts([], [], {}, driven, reference, reference)
 
 

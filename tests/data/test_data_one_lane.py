@@ -6,7 +6,7 @@ from reference.recordings import following_file
 from reference.refusals import user_error
 
 from ganlane.data.one_lane import ONE_LANE_FILES, read_one_lane
-from ganlane.realism.measures import measure_recordings
+from ganlane.realism.measures import measure
 
 
 def lane_file(path):
@@ -40,7 +40,7 @@ def test_pairs_have_a_driven_follower_at_the_recorded_gap(tmp_path):
         assert len(recordings) == pieces
         assert {piece.lanes for piece in recordings} == {1}
         assert all(piece.driven.sum() == 1 for piece in recordings)
-        quantiles = measure_recordings(recordings).quantiles
+        quantiles = measure(recordings).quantiles
         assert quantiles["gap"]["0.5"] == pytest.approx(gap, abs=1e-6)
         assert quantiles["speed"]["0.5"] == pytest.approx(speed, abs=1e-6)
         assert recordings[0].speed[recordings[0].present] == pytest.approx(speed)
@@ -53,7 +53,7 @@ def test_a_lane_is_driven_as_a_whole_in_stretches_of_their_own(tmp_path):
     assert len({piece.unit for piece in recordings}) == len(recordings) == 2
     assert all(piece.driven.all() for piece in recordings)
     # 2 s apart at 18 m/s, cars of 4.5 m.
-    assert measure_recordings(recordings).quantiles["gap"]["0.5"] == pytest.approx(31.5, abs=1e-6)
+    assert measure(recordings).quantiles["gap"]["0.5"] == pytest.approx(31.5, abs=1e-6)
 
 
 def test_damaged_files_are_named(tmp_path):

@@ -102,7 +102,7 @@ def recording():
 
 
 def test_a_recording_is_measured_as_by_hand():
-    measured = driving_statistics(recording(), {"s": 3.5})
+    measured = driving_statistics(recording())
     exposure = measured.exposure
     changes = measured.lane_changes
     assert (exposure.scenes, exposure.tracks, exposure.cars, exposure.samples) == (1, 4, 3, 604)

@@ -1,16 +1,19 @@
 """The rows of a card; a card as text and figures."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 from reference.recordings import recorded_cars
 
-from ganlane.realism.card import quantity_rows
+from ganlane.data.dense import units_of
+from ganlane.realism.card import card_rows
 from ganlane.realism.driving import ConstantVelocity, RandomDriving, StartOptions
 from ganlane.realism.long_runs import LongRunParameters, long_run, totals
-from ganlane.realism.measures import QUANTITIES, ceiling, measure_recordings
+from ganlane.realism.measures import QUANTITIES, Reference, ceiling, measure
 from ganlane.realism.sheets import draw_distributions, long_table
-from ganlane.realism.starts import simulate
+from ganlane.realism.starts import Starts, simulate
 from ganlane.sim.state import Road
 from ganlane.view.figures import COLOURS, INK
 
@@ -19,21 +22,25 @@ WITHOUT_CHANGES = [name for name in QUANTITIES if name != "lane_change_duration"
 
 def test_a_card_puts_the_model_between_its_ceiling_and_its_floors_driven_or_measured_before():
     recordings = recorded_cars(scenes=4, vehicles=10, seconds=8.0, speed_swing_mps=0.2)
-    recorded = measure_recordings(recordings).counts
+    measured = measure(recordings)
+    recorded = measured.counts
     cruise, random = (
         simulate(make, recordings, StartOptions()) for make in (ConstantVelocity, RandomDriving)
     )
     driven = {"cruise": cruise, "random": random, "constant_velocity": cruise, "rival": random}
-    rows = quantity_rows("cruise", driven, recorded, {}, resamples=100)
+    whole = Reference(**vars(measured), source="", units=[], whole={}, floors={})
+    starts = Starts(units_of(recordings), [], {}, driven, measured, whole)
+    rows = card_rows(starts, 100)
     assert rows["speed"]["distance"] == rows["speed"]["constant_velocity"] < rows["speed"]["floor"]
     assert rows["acceleration"]["against"]["rival"]["verdict"] == "closer"
     assert rows["speed"]["against"].keys() == {"rival"}
     assert all(rows[name]["samples"] > 0 for name in WITHOUT_CHANGES)
     assert all(rows[name]["ceiling"] == ceiling(recorded[name]) for name in WITHOUT_CHANGES)
     # Without reference drivers in the run, what was measured before counts.
-    speeds = {"speed": recorded["speed"]}
-    floors = {"random": {"speed": 0.5}}
-    rows = quantity_rows("cruise", {"cruise": cruise}, speeds, floors, resamples=100)
+    speeds = replace(measured, counts={"speed": recorded["speed"]})
+    before = replace(whole, floors={"random": {"speed": 0.5}})
+    alone = replace(starts, driven={"cruise": cruise}, recorded=speeds, reference=before)
+    rows = card_rows(alone, 100)
     assert rows.keys() == {"speed"}
     assert rows["speed"]["floor"] == 0.5
     assert rows["speed"]["constant_velocity"] is None
@@ -70,7 +77,7 @@ def in_colour(axes, colour):
 
 
 def test_densities_have_area_one_and_the_quantitys_unit():
-    counts = np.zeros(QUANTITIES["jerk"].number)
+    counts = np.zeros(QUANTITIES["jerk"].bins)
     # Both outermost bins, and one more.
     counts[[0, 1, 49]] = 1, 2, 1
     rule = np.eye(len(counts))[0] * 4

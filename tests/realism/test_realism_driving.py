@@ -11,7 +11,6 @@ from reference.small_networks import anchored_drivers, silenced, small_generator
 from reference.worlds import vehicles as vehicles_of
 from tensordict import TensorDict
 
-from ganlane.data.dense import recorded_frame
 from ganlane.generator.closed_loop import balanced_headway
 from ganlane.realism.driving import (
     ConstantVelocity,
@@ -40,9 +39,15 @@ def steady(**changed):
     return made_by_hand(**fields, lanes=2, name="steady")
 
 
+def driven_frame(make, recording, **options):
+    """The trajectories that a traffic drives from a recording."""
+    driven = drive_recordings(make, [recording], StartOptions(**options))
+    return pl.concat([one.frame() for one in driven])
+
+
 def test_constant_velocity_repeats_a_recording_of_it_from_a_vehicles_first_frame_to_its_last():
-    there = drive_recordings(ConstantVelocity, [steady()], StartOptions())
-    recorded = recorded_frame([steady()])
+    there = driven_frame(ConstantVelocity, steady())
+    recorded = steady().frame()
     joined = there.join(recorded, on=["vehicle", "frame"], suffix="_recorded")
     assert joined.height == there.height == recorded.height
     assert (joined["x"] - joined["x_recorded"]).abs().max() < 1e-3
@@ -58,7 +63,7 @@ def test_a_vehicle_waits_while_another_stands_in_its_place():
     # The third appears in the first lane, where a car driven at constant velocity is just then.
     y[:, 2] = 0.0
     x[:, 2] = x[:, 0] + 3.0 * (np.arange(100) * 0.1 - 4.0)
-    there = drive_recordings(ConstantVelocity, [steady(x=x, y=y)], StartOptions())
+    there = driven_frame(ConstantVelocity, steady(x=x, y=y))
     first = there.filter(pl.col("vehicle") == 2)["frame"].min()
     # 4 m of length and 2 m of room at 3 m/s of difference: 2 s later.
     assert first == pytest.approx(60, abs=1)
@@ -70,14 +75,14 @@ def test_nobody_drives_beyond_the_end_of_the_recorded_road():
             return super().move(vehicles.with_(speed=vehicles.speed + 1.0), memory, key, step)
 
     recording = steady()
-    there = drive_recordings(Fast, [recording], StartOptions())
+    there = driven_frame(Fast, recording)
     assert there["x"].max() <= recording.end_m + 0.02
-    assert there.height < recorded_frame([recording]).height
+    assert there.height < recording.frame().height
 
 
 def test_replayed_vehicles_drive_as_recorded_whatever_the_model_does():
     recording = steady(driven=np.array([True, False, True]))
-    there = drive_recordings(RandomDriving, [recording], StartOptions())
+    there = driven_frame(RandomDriving, recording)
     replayed = there.filter(pl.col("vehicle") == 1)
     assert replayed["x"].to_numpy() == pytest.approx(recording.x[:, 1], abs=1e-3)
     assert not replayed["driven"].any()
@@ -144,11 +149,11 @@ def test_a_recorded_platoon_keeps_its_gaps_behind_a_leader_at_constant_speed():
     x = np.array([0.0, 12.0, 40.0, 55.0]) + 10.0 * time
     scene = made_by_hand(x, speed=10.0, lanes=1, driven=np.array([True, True, True, False]))
     network = silenced(small_generator(EXTRA_INPUTS))
-    there = drive_recordings(
+    there = driven_frame(
         # Without a residual there are only IDM and each driver's headway.
         lambda road: AnchoredGanTraffic(network, anchored_drivers(network), road),
-        [scene],
-        StartOptions(desired_above_mps=5.0),
+        scene,
+        desired_above_mps=5.0,
     )
     ends = there.filter(there["frame"] == 59).sort("vehicle")["x"].to_numpy()
     assert np.abs(ends - x[59]).max() < 0.01

@@ -16,8 +16,7 @@ from reference.refusals import user_error
 from scipy.spatial.distance import jensenshannon
 from scipy.stats import binom
 
-from ganlane.data import scene_lane_widths
-from ganlane.data.dense import recorded_frame, recordings_of
+from ganlane.data.dense import recordings_of
 from ganlane.evaluation.statistics import Estimate
 from ganlane.realism.card import verdict
 from ganlane.realism.measures import (
@@ -28,7 +27,7 @@ from ganlane.realism.measures import (
     distance,
     distance_difference,
     jensen_shannon,
-    measure_recordings,
+    measure,
     samples_of,
     with_motion,
 )
@@ -36,7 +35,7 @@ from ganlane.realism.measures import (
 
 def values(recording, quantity):
     """The samples of a quantity."""
-    motion = with_motion(recorded_frame([recording]))
+    motion = with_motion(recording.frame())
     return samples_of(motion)[quantity]["value"].to_numpy()
 
 
@@ -61,7 +60,7 @@ def test_the_first_three_seconds_of_a_vehicle_do_not_count():
     result = made_by_hand(np.hstack([20.0 * TIME, 20.0 * TIME + 30.0]), present=present)
     # The first: samples 30 to 94. The second appears at 50: samples 80 to 94.
     assert len(values(result, "speed")) == 65 + 15
-    assert measure_recordings([result]).vehicle_km == pytest.approx((70 + 20) * 2.0 / 1000.0)
+    assert measure([result]).vehicle_km == pytest.approx((70 + 20) * 2.0 / 1000.0)
 
 
 CLOSING_IN = np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME])
@@ -77,7 +76,7 @@ def test_gap_headway_and_time_to_collision_of_two_cars_whether_or_not_the_leader
         assert len(values(result, "speed")) == 65 * (1 + driven)
     # A leader in another lane is none.
     beside = made_by_hand(CLOSING_IN, np.hstack([0.0 * TIME, 0.0 * TIME + 3.5]))
-    assert measure_recordings([beside]).quantiles["gap"]["0.5"] is None
+    assert measure([beside]).quantiles["gap"]["0.5"] is None
 
 
 def test_spread_of_speeds_is_that_within_a_frame():
@@ -93,15 +92,15 @@ def test_a_lane_change_counts_once_with_its_duration_unless_it_comes_too_early()
         # Along half a cosine, in 4 s.
         y = 3.5 * 0.5 * (1.0 - np.cos(np.pi * part))
         result = made_by_hand(20.0 * TIME, y)
-        assert measure_recordings([result]).lane_changes == expected
+        assert measure([result]).lane_changes == expected
         assert all(2.0 < duration < 4.0 for duration in values(result, "lane_change_duration"))
 
 
 def test_histograms_keep_scenes_apart_and_everything_in_the_outermost_bins():
     slow = made_by_hand(10.5 * TIME, name="slow")
     fast = made_by_hand(55.0 * TIME, name="fast")
-    counts = measure_recordings([slow, fast]).counts["speed"]
-    assert counts.shape == (2, QUANTITIES["speed"].number)
+    counts = measure([slow, fast]).counts["speed"]
+    assert counts.shape == (2, QUANTITIES["speed"].bins)
     assert counts[0, 10] == counts[0].sum() == 65
     assert counts[1, -1] == counts[1].sum() == 65
 
@@ -186,7 +185,7 @@ def reference():
     whole = {"lane_changes": 3, "vehicle_km": 2.0, "speed_spread_mps": 1.0}
     floors = {"random": {"speed": 0.5}, "constant_velocity": {"speed": 0.2}}
     return Reference(
-        **vars(measure_recordings(recordings)),
+        **vars(measure(recordings)),
         source="made up",
         units=[recording.name for recording in recordings],
         whole=whole,
@@ -233,8 +232,8 @@ def test_what_ships_is_small_and_holds_no_trajectories():
 
 
 def test_what_ships_is_what_the_recordings_show(us101_scenes):
-    recordings = recordings_of(us101_scenes, scene_lane_widths(us101_scenes))
-    measured = measure_recordings(recordings)
+    recordings = recordings_of(us101_scenes)
+    measured = measure(recordings)
     shipped = Reference.load(SHIPPED_REFERENCE)
     assert shipped.units == [recording.name for recording in recordings]
     for name in QUANTITIES:

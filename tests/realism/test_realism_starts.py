@@ -27,12 +27,14 @@ def starts_of(frame, starts, held_out):
 def test_scenes_alone_have_the_ceiling_of_their_own_halves(frame):
     starts = starts_of(frame, NAMES[:3], NAMES[1:3])
     assert starts.scenes == NAMES[:3]
-    assert starts.separately_held_out == NAMES[1:3]
+    held_out = starts.held_out_alone()
+    assert held_out.scenes == NAMES[1:3]
+    assert held_out.held_out_alone() is None
     # The ceiling is that of two scenes, no longer of three.
-    alone = card_rows(starts.restricted_to(starts.separately_held_out), "cruise", 100)
+    alone = card_rows(held_out, 100)
     for name in ("speed", "gap"):
         assert alone[name]["ceiling"] == ceiling(starts.recorded.counts[name][1:3])
-        assert alone[name]["ceiling"] != card_rows(starts, "cruise", 100)[name]["ceiling"]
+        assert alone[name]["ceiling"] != card_rows(starts, 100)[name]["ceiling"]
         assert alone[name]["recorded_samples"] == starts.recorded.counts[name][1:3].sum()
 
 

@@ -11,7 +11,6 @@ import numpy as np
 import polars as pl
 from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-from ganlane.data import scene_lane_widths
 from ganlane.data.dense import Recording, recordings_of
 
 FOOT_M = 0.3048
@@ -125,8 +124,7 @@ def damage_field(path: Path, column: str, row: int, value: str) -> None:
 
 def recorded_cars(**size) -> list[Recording]:
     """Synthetic scenes as recordings."""
-    frame = synthetic_scenes(SyntheticTraffic(**size))
-    return recordings_of(frame, scene_lane_widths(frame))
+    return recordings_of(synthetic_scenes(SyntheticTraffic(**size)))
 
 
 def made_by_hand(x, y=None, speed=0.0, lanes=3, name="scene", **changed) -> Recording:

@@ -89,10 +89,10 @@ def empty_folder(tmp_path, monkeypatch):
 def three_scenes(tmp_path_factory):
     """A scene CSV of three made-up scenes of 7 s."""
     from reference.scene_csv import write_scene_csv
-    from reference.synthetic import SyntheticTraffic, synthetic_scenes
+    from reference.synthetic import synthetic_scenes
 
     path = tmp_path_factory.mktemp("recordings") / "scenes.csv"
-    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=3, seconds=7.0), seed=0), path)
+    write_scene_csv(synthetic_scenes(scenes=3, seconds=7.0), path)
     return path
 
 

@@ -13,7 +13,7 @@ import pytest
 from reference.recordings import ngsim_rows, portal_csv, traffic, write_highd
 from reference.refusals import user_error
 from reference.scene_csv import write_scene_csv
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 
 from ganlane.commands.prepare import short_report
 from ganlane.data import (
@@ -137,7 +137,7 @@ def test_absent_files_are_refused(name):
 def test_a_scene_in_two_files_is_refused():
     # Two scenes in one file, one of them in the other, too.
     write_prepared(synthetic_scenes(), "a.parquet")
-    write_prepared(synthetic_scenes(SyntheticTraffic(scenes=1)), "b.parquet")
+    write_prepared(synthetic_scenes(scenes=1), "b.parquet")
     with user_error(r"b.parquet: scene synthetic-0 is in .*a.parquet too; remove one"):
         read_scenes(".")
 
@@ -159,7 +159,7 @@ def test_damaged_parquet_is_refused():
 
 @pytest.mark.parametrize(("every", "renumbered"), [(2, False), (3, True)])
 def test_recordings_with_frames_missing_throughout_are_refused(every, renumbered):
-    frame = synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=6, seconds=8.0))
+    frame = synthetic_scenes(scenes=2, vehicles=6, seconds=8.0)
     # One scene is whole; the other one has every second frame alone, or so.
     sparse = (pl.col("scene") == frame["scene"].max()) | renumbered
     frame = frame.filter(~sparse | (pl.col("frame") % every == 0))

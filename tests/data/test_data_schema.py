@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.refusals import user_error
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 
 from ganlane.data.schema import validate
 from ganlane.data.tables import LINE, TextTable, convert, csv_table, read_blocks
@@ -111,7 +111,7 @@ def test_a_header_is_read_in_any_case_with_quotes_and_a_byte_order_mark(tmp_path
 
 
 def test_the_validator_checks_frames_that_come_from_nowhere():
-    frame = synthetic_scenes(SyntheticTraffic(scenes=1))
+    frame = synthetic_scenes(scenes=1)
     assert validate(frame, "made").equals(frame)
     # A row without a position.
     holed = frame.with_columns(x=pl.when(pl.int_range(pl.len()) == 7).then(None).otherwise("x"))

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 from reference.refusals import user_error
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 
 from ganlane.data import SCHEMA, tracks_of_frame
 from ganlane.data.lanes import find_lane_changes
@@ -123,9 +123,7 @@ def test_a_recording_is_measured_as_by_hand():
     assert measured.speed_sd_in_frame == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    "frame", [recording(), synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=1))]
-)
+@pytest.mark.parametrize("frame", [recording(), synthetic_scenes(scenes=1, vehicles=1)])
 def test_statistics_survive_json(frame):
     measured = driving_statistics(frame)
     stored = json.dumps(measured.to_dict(), allow_nan=False)
@@ -143,9 +141,7 @@ def test_foreign_statistics_are_refused():
 
 
 def test_a_lone_lane_keeper_leaves_the_rest_open():
-    measured = driving_statistics(
-        synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=1, changing_share=0.0))
-    )
+    measured = driving_statistics(synthetic_scenes(scenes=1, vehicles=1, changing_share=0.0))
     changes = measured.lane_changes
     assert (changes.count, changes.t_m_srlc_steps, changes.per_vehicle_km_low) == (0, None, 0.0)
     assert changes.per_vehicle_km_high > 0.0

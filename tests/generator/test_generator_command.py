@@ -11,7 +11,7 @@ import pytest
 from reference.recordings import START_MS, ngsim_rows, portal_csv, raw_text, traffic
 from reference.refusals import refusal
 from reference.scene_csv import write_scene_csv
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 
 from ganlane.config.run import run_command
 from ganlane.generator.checkpoint import load_generator
@@ -28,9 +28,7 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
 @pytest.fixture
 def recordings():
     """A scene CSV in the current folder."""
-    write_scene_csv(
-        synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=5, seconds=4.0)), "recordings.csv"
-    )
+    write_scene_csv(synthetic_scenes(scenes=4, vehicles=5, seconds=4.0), "recordings.csv")
     return "data.path=recordings.csv"
 
 

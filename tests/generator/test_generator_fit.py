@@ -6,7 +6,7 @@ import pytest
 from reference.recordings import recorded_cars
 from reference.refusals import user_error
 from reference.small_networks import CALIBRATED, LOOP, PAPER
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 
 from ganlane.commands.train_generator import fold_tables
 from ganlane.data.statistics import measure_exposure
@@ -58,7 +58,7 @@ def test_more_folds_than_scenes_and_splits_without_two_parts_are_refused(scenes)
 
 @pytest.fixture(scope="module")
 def frame():
-    return synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=5, seconds=6.5))
+    return synthetic_scenes(scenes=3, vehicles=5, seconds=6.5)
 
 
 @pytest.fixture(scope="module")

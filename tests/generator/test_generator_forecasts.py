@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from reference.small_networks import silenced, small_generator
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 
 from ganlane.data.dense import recordings_of
 from ganlane.generator import forecasts
@@ -43,7 +43,7 @@ STRIDE = 7
 @pytest.fixture(scope="module")
 def scenes():
     """Two scenes; in the first a vehicle leaves early and another comes late."""
-    every = recordings_of(synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=7, seconds=6.0)))
+    every = recordings_of(synthetic_scenes(scenes=2, vehicles=7, seconds=6.0))
     every[0].present[25:, 1] = False
     every[0].present[:12, 3] = False
     return every

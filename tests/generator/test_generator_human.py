@@ -10,7 +10,7 @@ import torch
 from reference.recordings import made_by_hand, recorded_cars
 from reference.refusals import user_error
 from reference.scene_csv import write_scene_csv
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 from reference.worlds import vehicles
 
 from ganlane.config.run import run_command
@@ -287,9 +287,7 @@ def test_a_fit_is_the_same_for_the_same_seed_and_reports_its_steps(small_fits):
 def test_the_command_fits_folds_keeps_what_is_finished_and_its_weights_load(
     small_fits, empty_folder, monkeypatch
 ):
-    write_scene_csv(
-        synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=4, seconds=6.5)), "recordings.csv"
-    )
+    write_scene_csv(synthetic_scenes(scenes=3, vehicles=4, seconds=6.5), "recordings.csv")
     options = [f"generator.{name}={value}" for name, value in SMALL.items()]
     arguments = ["generator=human", "data.path=recordings.csv", *options]
     assert run_command("train_generator", [*arguments, "folds=2", "hydra.run.dir=fit"]) == 0

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 import torch
 from reference.refusals import user_error
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 
 from ganlane.data.dense import recordings_of
 from ganlane.generator.windows import (
@@ -22,7 +22,7 @@ from ganlane.generator.windows import (
 
 def recording() -> pl.DataFrame:
     """Three scenes of vehicles that come and go at random, some with a gap in their track."""
-    frame = synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=14, seconds=4.0))
+    frame = synthetic_scenes(scenes=3, vehicles=14, seconds=4.0)
     random = np.random.default_rng(0)
     tracks = []
     for _, track in frame.group_by("scene", "vehicle", maintain_order=True):

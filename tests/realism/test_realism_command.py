@@ -11,7 +11,7 @@ from PIL import Image
 from reference.recordings import following_file
 from reference.refusals import everything_below, last_path, refusal
 from reference.scene_csv import write_scene_csv
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 
 from ganlane.config.run import run_command
 from ganlane.realism.measures import QUANTITIES
@@ -31,7 +31,7 @@ def _without_recordings_of_this_machine(empty_folder, monkeypatch):
 def recordings(empty_folder):
     path = empty_folder / "recordings" / "scenes.csv"
     path.parent.mkdir()
-    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=6, seconds=6.0)), path)
+    write_scene_csv(synthetic_scenes(scenes=3, vehicles=6, seconds=6.0), path)
     return path
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 
 from ganlane.data import scene_lane_widths
 from ganlane.data.dense import Recording, recordings_of
@@ -22,9 +22,7 @@ START_MS = 1_118_847_000_000
 
 def traffic(**more) -> pl.DataFrame:
     """Six seconds of nine vehicles on three lanes in two scenes."""
-    return synthetic_scenes(
-        SyntheticTraffic(vehicles=9, seconds=6.0, changing_share=0.0, **more), seed=4
-    )
+    return synthetic_scenes(vehicles=9, seconds=6.0, changing_share=0.0, **more, seed=4)
 
 
 def feet(metres: pl.Expr) -> pl.Expr:
@@ -125,7 +123,7 @@ def damage_field(path: Path, column: str, row: int, value: str) -> None:
 
 def recorded_cars(**size) -> list[Recording]:
     """Synthetic scenes as recordings."""
-    frame = synthetic_scenes(SyntheticTraffic(**size))
+    frame = synthetic_scenes(**size)
     return recordings_of(frame, scene_lane_widths(frame))
 
 

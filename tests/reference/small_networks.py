@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 
 from ganlane.data.dense import Recording, recordings_of
 from ganlane.generator.networks import Generator
@@ -60,5 +60,5 @@ def silenced(generator: Generator) -> Generator:
 
 def recorded_scenes() -> list[Recording]:
     """Two synthetic scenes of 8 s with seven vehicles on three lanes of 3.5 m."""
-    frame = synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=7, seconds=8.0))
+    frame = synthetic_scenes(scenes=2, vehicles=7, seconds=8.0)
     return [replace(scene, lane_width_m=3.5) for scene in recordings_of(frame)]

@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 import torch
 from reference.refusals import user_error
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 from tensordict.nn import TensorDictModule
 from torchrl.envs import GymEnv
 from view_scenes import straight
@@ -61,7 +61,7 @@ def test_the_label_has_the_road_of_the_replayed_scene():
     """Three scenes of 2, 3 and 4 lanes: the environment's own road has the lanes of the widest."""
     scenes = []
     for lanes in (2, 3, 4):
-        scene = synthetic_scenes(SyntheticTraffic(scenes=1, lanes=lanes, seconds=7.0))
+        scene = synthetic_scenes(scenes=1, lanes=lanes, seconds=7.0)
         scenes.append(scene.with_columns(scene=pl.lit(str(lanes))))
     traffic = ReplayTraffic(recordings=sort(pl.concat(scenes)), least_s=5.0)
     env = HighwayEnv(traffic, 1, vehicles=5)

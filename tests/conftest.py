@@ -1,4 +1,4 @@
-"""Settings of the whole suite; makes the plain helper modules of ``tests/reference`` importable."""
+"""Settings of the whole suite."""
 
 import gc
 import os
@@ -12,8 +12,6 @@ from pathlib import Path
 import pytest
 import torch
 from hypothesis import settings
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 # Nothing is left in the user's cache; all processes of a run have one, for one built kernel.
 if "PYTEST_XDIST_WORKER" not in os.environ:

@@ -12,7 +12,6 @@ from ganlane.realism.measures import ceiling
 from ganlane.realism.starts import fit_excess, recorded_starts
 
 NAMES = [f"synthetic-{number}" for number in range(4)]
-MAKERS = {"cruise": ConstantVelocity}
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +20,8 @@ def frame():
 
 
 def starts_of(frame, starts, held_out):
-    return recorded_starts(MAKERS, starts, held_out, frame, StartOptions(), False, "made up")
+    cruise = {"cruise": ConstantVelocity}
+    return recorded_starts(cruise, starts, held_out, frame, StartOptions(), False, "made up")
 
 
 def test_scenes_alone_have_the_ceiling_of_their_own_halves(frame):

@@ -1,4 +1,4 @@
-"""Settings of the whole suite; makes the plain helper modules of ``tests/reference`` importable."""
+"""Settings of the whole suite."""
 
 import gc
 import os
@@ -12,8 +12,6 @@ from pathlib import Path
 import pytest
 import torch
 from hypothesis import settings
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 # Nothing is left in the user's cache; all processes of a run have one, for one built kernel.
 if "PYTEST_XDIST_WORKER" not in os.environ:
@@ -89,10 +87,10 @@ def empty_folder(tmp_path, monkeypatch):
 def three_scenes(tmp_path_factory):
     """A scene CSV of three made-up scenes of 7 s."""
     from reference.scene_csv import write_scene_csv
-    from reference.synthetic import SyntheticTraffic, synthetic_scenes
+    from reference.synthetic import synthetic_scenes
 
     path = tmp_path_factory.mktemp("recordings") / "scenes.csv"
-    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=3, seconds=7.0), seed=0), path)
+    write_scene_csv(synthetic_scenes(scenes=3, seconds=7.0), path)
     return path
 
 

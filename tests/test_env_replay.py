@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 import torch
 from reference.refusals import user_error
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 from reference.worlds import Track, assert_same_tracks, step, tracks
 from torchrl.envs.utils import check_env_specs
 
@@ -32,7 +32,7 @@ def recordings() -> pl.DataFrame:
     """
     parts = []
     for k in range(3):
-        scene = synthetic_scenes(SyntheticTraffic(scenes=1, lanes=2 + k, seconds=9.0 - k), seed=k)
+        scene = synthetic_scenes(scenes=1, lanes=2 + k, seconds=9.0 - k, seed=k)
         scene = scene.filter((pl.col("vehicle") % 3 > 0) | (pl.col("frame") <= 45))
         parts.append(scene.with_columns(scene=pl.lit(f"scene-{k}")))
     return sort(pl.concat(parts))

@@ -15,7 +15,7 @@ import pytest
 import torch
 from PIL import Image
 from reference.refusals import user_error
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 from safetensors.torch import save_file
 
 from ganlane.agents import read_agent
@@ -111,7 +111,7 @@ def copied(source: Path) -> Callable[[Path], object]:
 
 
 def synthetic_frame() -> pl.DataFrame:
-    return synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=4))
+    return synthetic_scenes(scenes=1, vehicles=4)
 
 
 #: How every kind of file is written and read.

@@ -59,20 +59,16 @@ def test_every_sampled_episode_comes_out_as_stored():
     assert leaderboard.main(["--check", "--all"]) == 0
 
 
-@pytest.fixture
-def as_stored(monkeypatch, shipped):
-    """Driving again takes no time and gives what is stored."""
-
-    def compare(drivers, config, **_):
+@pytest.mark.parametrize("change", [1e-9, None])
+def test_a_falsified_or_missing_sample_is_refused_in_one_sentence(
+    capsys, shipped, store, change, monkeypatch
+):
+    def as_stored(drivers, config, **_):
         (traffic,) = config.traffics
         return pl.DataFrame({"reward": shipped["sample"][drivers[0].name][traffic]})
 
-    monkeypatch.setattr(leaderboard, "compare", compare)
-
-
-@pytest.mark.usefixtures("as_stored")
-@pytest.mark.parametrize("change", [1e-9, None])
-def test_a_falsified_or_missing_sample_is_refused_in_one_sentence(capsys, shipped, store, change):
+    # Driving again takes no time.
+    monkeypatch.setattr(leaderboard, "compare", as_stored)
     store("mine")
     assert leaderboard.main(["--check"]) == 0
     changed = {
@@ -120,10 +116,9 @@ def test_results_of_another_protocol_are_refused(store):
 
 
 @pytest.mark.parametrize("text", [None, "no JSON", "[]", '{"config": {}}'])
-def test_what_is_no_result_of_a_benchmark_is_refused_in_one_sentence(tmp_path, capsys, text):
+def test_what_is_no_result_of_a_benchmark_is_refused(tmp_path, text):
     file = tmp_path / "results.json"
     if text is not None:
         file.write_text(text)
-    assert leaderboard.main(["--add", str(file)]) == 2
-    (told,) = capsys.readouterr().err.strip().splitlines()
-    assert "not the results.json of ganlane benchmark" in told
+    with user_error(r"not the results\.json of ganlane benchmark"):
+        leaderboard.add(file, "mine")

@@ -20,9 +20,7 @@ from benchmarks.peers.scene import (
     SCENES,
     SETTLED_MPS,
     STEP,
-    Scene,
     Scheme,
-    Trace,
     equilibrium_gap,
     integrate,
 )
@@ -36,7 +34,6 @@ from benchmarks.peers.tolerance import (
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.neighbours import FREE_GAP_M
 
-EULERS = (Scheme.EXPLICIT_EULER, Scheme.SEMI_IMPLICIT_EULER)
 #: Where a peer reads IDM as ganlane does, it has to drive as ganlane does. HighwayEnv's missing
 #: floor of the desired gap shows in 'step' only, its reversing in 'standing obstacle' only, its
 #: centres everywhere but on a free road.
@@ -50,7 +47,7 @@ SAME_LAW = [
 ]
 
 
-def free_road_speed_mps(free_gap_m: float) -> float:
+def free_road_speed_mps(free_gap_m):
     """How much below its desired speed a driver settles whose empty road is a gap of
     ``free_gap_m``, m/s.
 
@@ -61,11 +58,11 @@ def free_road_speed_mps(free_gap_m: float) -> float:
     return 0.25 * DESIRED_SPEED_MPS * (wanted / free_gap_m) ** 2
 
 
-def within(sizes: Largest, allowed: Largest) -> bool:
+def within(sizes, allowed):
     return all(value <= limit for value, limit in zip(sizes, allowed))
 
 
-def need(module: str) -> None:
+def need(module):
     if find_spec(module) is None:
         pytest.skip(f"{module} is not installed; pip install 'ganlane[bench]' brings it")
 
@@ -78,7 +75,7 @@ def test_the_plain_equations_drive_as_the_traffic_module_does(scene):
     assert within(between(plain, simulators.drive_ours(scene)), ROUNDING)
 
 
-@pytest.mark.parametrize("scheme", EULERS)
+@pytest.mark.parametrize("scheme", [Scheme.EXPLICIT_EULER, Scheme.SEMI_IMPLICIT_EULER])
 @pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.name)
 def test_the_derived_tolerance_covers_the_other_scheme_and_no_more_than_a_fifth_beyond(
     scene, scheme
@@ -98,18 +95,16 @@ def test_the_page_shows_the_figures_that_stand_beside_it():
     assert (ROOT / "docs/figures/peers.png").stat().st_size < 150_000
 
 
-@cache
-def mine(scene: Scene) -> Trace:
-    return simulators.drive_ours(scene)
+mine = cache(simulators.drive_ours)
 
 
 @cache
-def theirs(scene: Scene, peer: simulators.Peer) -> Trace:
+def theirs(scene, peer):
     need(peer.module)
     return peer.drive(scene)
 
 
-def title(value: Scene | simulators.Peer) -> str:
+def title(value):
     return value.name.replace(" ", "_")
 
 

@@ -31,13 +31,9 @@ def test_counts_have_three_digits_and_a_unit(value, shown):
     assert count(value) == shown
 
 
-def test_a_table_in_markdown_has_its_title_as_a_heading_if_it_has_one():
-    table = "| who | n |\n| --- | ---: |\n| a | 10 |\n| long | 2 |"
-    lines = [["a", "10"], ["long", "2"]]
-    assert markdown(Table("Speed", ["who", "n"], lines, 1, ["Said."])) == (
-        f"### Speed\n\n{table}\n\nSaid."
-    )
-    assert markdown(Table("", ["who", "n"], lines)) == table
+def test_a_table_in_markdown_has_its_title_as_a_heading_and_notes_below():
+    table = Table("Speed", ["who", "n"], [["a", "10"]], 1, ["Said."])
+    assert markdown(table) == "### Speed\n\n| who | n |\n| --- | ---: |\n| a | 10 |\n\nSaid."
 
 
 def test_what_stands_between_the_markers_is_rewritten_and_the_rest_stays(tmp_path):

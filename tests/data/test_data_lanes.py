@@ -28,9 +28,8 @@ def test_a_single_lane_gets_the_standard_width_and_one_stray_row_does_not_make_a
 
 
 WIDTH = 3.6
-TIME = np.arange(80) * 0.1
 #: Keeps lane 0, moves left at 1 m/s from 2.05 s to 5.65 s, keeps lane 1.
-RAMP = np.clip(TIME - 2.05, 0.0, WIDTH)
+RAMP = np.clip(np.arange(80) * 0.1 - 2.05, 0.0, WIDTH)
 
 
 def changes_of(y):
@@ -68,15 +67,10 @@ def test_a_track_that_ends_in_the_middle_of_the_change_is_censored():
     assert not late.complete[0]
 
 
-@pytest.mark.parametrize(("samples", "changes"), [(4, 0), (5, 2)])
-def test_a_flicker_shorter_than_half_a_second_is_no_change(samples, changes):
-    # 0.1 m off the boundary, first on one side, then on the other.
-    y = np.full(40, 1.7)
-    y[20 : 20 + samples] = 1.9
-    assert len(changes_of(y)) == changes
-
-
-@pytest.mark.parametrize(("after", "changes"), [(4, 0), (5, 1)])
-def test_the_new_lane_must_be_seen_for_half_a_second(after, changes):
-    assert len(changes_of(np.r_[np.full(20, 1.7), np.full(after, 1.9)])) == changes
-    assert len(changes_of(np.r_[np.full(after, 1.7), np.full(20, 1.9)])) == changes
+@pytest.mark.parametrize(("samples", "changes"), [(4, 0), (5, 1)])
+def test_a_lane_must_be_seen_for_half_a_second(samples, changes):
+    # 0.1 m off the boundary, on one side and on the other.
+    long, short = np.full(20, 1.7), np.full(samples, 1.9)
+    assert len(changes_of(np.r_[long, short])) == changes
+    assert len(changes_of(np.r_[short, long])) == changes
+    assert len(changes_of(np.r_[long, short, long])) == 2 * changes

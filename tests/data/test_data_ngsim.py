@@ -3,10 +3,9 @@
 What is read, in how many blocks, and errors in damaged files.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 import pytest
 from reference.recordings import (
@@ -22,16 +21,15 @@ from reference.refusals import user_error
 
 from ganlane.data import SCHEMA, read_recordings
 from ganlane.data.ngsim import ngsim_scenes
-from ganlane.data.schema import RowCount, validate
+from ganlane.data.schema import RowCount
 from ganlane.settings.generator import NgsimParameters
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
-LATER_MS = START_MS + 900_000
 WHOLE = NgsimParameters()
 #: A file takes several.
 SMALL_BLOCKS = NgsimParameters(block_bytes=20_000)
 #: Two periods of one place: the same vehicle and frame numbers again.
-FIRST, SECOND = (scene for _, scene in traffic().group_by("scene", maintain_order=True))
+FIRST, SECOND = traffic().partition_by("scene", maintain_order=True)
 
 
 def text_file(rows):
@@ -46,14 +44,12 @@ def portal_file(content):
     return path
 
 
-def same_driving(read: pl.DataFrame, expected: pl.DataFrame) -> None:
+def same_driving(read, expected):
     expected = expected.sort("vehicle", "frame")
-    same = ["vehicle", "frame", "lane"]
-    assert read.select(same).equals(expected.select(same))
+    numbers = expected.drop("scene", "y")
+    np.testing.assert_allclose(read.select(numbers.columns), numbers, atol=1e-5)
     # Lane width and the first lane's centre are estimated from positions that wander by 0.15 m.
-    for name in ("x", "speed", "length", "width", "y"):
-        tolerance = 0.2 if name == "y" else 1e-5
-        assert (read[name] - expected[name]).abs().max() < tolerance, name
+    np.testing.assert_allclose(read["y"], expected["y"], atol=0.2)
 
 
 def test_raw_text_gives_back_the_recording_in_metres_from_centres_and_from_the_right():
@@ -63,19 +59,18 @@ def test_raw_text_gives_back_the_recording_in_metres_from_centres_and_from_the_r
     assert scene.frame.schema == SCHEMA
     assert scene.lane_width_m == pytest.approx(LANE_M, abs=0.1)
     same_driving(scene.frame, FIRST)
-    validate(scene.frame, "read")
     assert read_recordings("ngsim", path).equals(scene.frame)
     with user_error("moon: no such kind of recordings; expected scenes, ngsim or highd"):
         read_recordings("moon", path)
 
 
-@pytest.mark.parametrize(("block_bytes", "thousands"), [(10_000, True), (2**25, False)])
-def test_the_portals_periods_are_separated_by_time_in_any_order_and_blocks(block_bytes, thousands):
+@pytest.mark.parametrize("block_bytes", [10_000, 2**25])
+def test_the_portals_periods_are_separated_by_time_in_any_order_and_blocks(block_bytes):
     # In any order, since the portal does not promise one.
-    rows = pl.concat((ngsim_rows(FIRST), ngsim_rows(SECOND, LATER_MS))).sample(
+    rows = pl.concat((ngsim_rows(FIRST), ngsim_rows(SECOND, START_MS + 900_000))).sample(
         fraction=1.0, shuffle=True, seed=1
     )
-    path = portal_file(portal_csv(rows, thousands=thousands))
+    path = portal_file(portal_csv(rows))
     count = RowCount()
     scenes = list(ngsim_scenes(path, NgsimParameters(block_bytes=block_bytes), count))
     assert [scene.name for scene in scenes] == ["us-101-1", "us-101-2"]
@@ -89,19 +84,16 @@ def test_duplicates_and_other_places_are_dropped_and_counted():
     # The same vehicle and time, at another speed.
     other = rows.head(1).with_columns(v_Vel=pl.lit(9.0))
     content = portal_csv(pl.concat((rows, rows.head(30), other)))
-    for place, number in (("lankershim", 7), ("peachtree", 5)):
-        _, _, lines = portal_csv(rows.head(number), place).partition("\n")
-        content += lines
+    _, _, elsewhere = portal_csv(rows.head(7), "lankershim").partition("\n")
     count = RowCount()
-    scenes = list(ngsim_scenes(portal_file(content), WHOLE, count))
+    scenes = list(ngsim_scenes(portal_file(content + elsewhere), WHOLE, count))
     same_driving(scenes[0].frame, FIRST)
     assert dict(count.dropped) == {
         "location lankershim": 7,
-        "location peachtree": 5,
         "duplicate": 30,
         "same vehicle and time, other values": 1,
     }
-    assert (count.read, count.kept) == (540 + 43, 540)
+    assert (count.read, count.kept) == (540 + 38, 540)
 
 
 def test_ramps_are_left_out_and_end_a_track():
@@ -127,8 +119,7 @@ def changed(row, column, value):
 @pytest.mark.parametrize(
     ("row", "column", "value", "message"),
     [
-        (400, "local_x", "NaN", r"line 402, column local_x: 'NaN' is not a finite number"),
-        (7, "v_vel", "-3.0", r"line 9, column v_vel: -3.0 is below 0"),
+        (400, "v_vel", "-3.0", r"line 402, column v_vel: -3.0 is below 0"),
         (8, "v_length", "0", r"line 10, column v_length: 0.0 is not above 0"),
         (6, "location", "us-10", r"line 8, column location: 'us-10' is no known place"),
         (
@@ -152,19 +143,11 @@ def test_a_damaged_field_is_named_by_file_line_and_column(row, column, value, me
         read_recordings("ngsim", path, SMALL_BLOCKS)
 
 
-def test_a_truncated_file_is_refused_and_a_whole_one_read():
-    rows = ngsim_rows(FIRST)
-    # A missing line break at the end does no harm, missing fields do.
-    whole = portal_csv(rows, thousands=False)
-    path = portal_file(whole.rstrip("\n"))
-    assert read_recordings("ngsim", path).height == 540
-    path.write_text(whole.rsplit(",", 5)[0])
-    with user_error(r"line 541, column lane_id: the row has 14 fields, expected 19"):
-        read_recordings("ngsim", path)
-    text = text_file(rows)
-    text.write_bytes(text.read_bytes()[:-30])
+def test_a_truncated_text_is_refused():
+    path = text_file(ngsim_rows(FIRST))
+    path.write_bytes(path.read_bytes()[:-30])
     with user_error(r"line 540, column \w+: the row has .* fields, expected 18"):
-        read_recordings("ngsim", text)
+        read_recordings("ngsim", path)
 
 
 @pytest.mark.parametrize(

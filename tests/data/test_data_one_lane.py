@@ -1,5 +1,6 @@
 """Files of one lane."""
 
+import numpy as np
 import polars as pl
 import pytest
 from reference.recordings import following_file
@@ -8,24 +9,15 @@ from reference.refusals import user_error
 from ganlane.data.one_lane import ONE_LANE_FILES, read_one_lane
 from ganlane.realism.measures import measure
 
-
-def lane_file(path):
-    rows = [
-        (car, frame, 20.0 + 1.8 * (frame - 20 * car), 0.0)
-        for car in range(12)
-        for frame in range(20 * car, 320)
-    ]
-    pl.DataFrame(rows, schema=["vehicle", "frame", "x", "x_raw"], orient="row").write_csv(path)
+FRAME = np.arange(400)
 
 
 def pairs_file(path):
-    rows = [
-        ("2-1", role, number, float(frame), 10.0 + start + 0.9 * frame, None, 9.0, 2, 5.0, 2.0)
-        for frame in range(400)
-        for role, number, start in (("follower", 2, 0.0), ("leader", 1, 25.0))
-    ]
-    names = ["pair", "role", "vehicle", "frame", "x", "y_right", "v", "lane", "length", "width"]
-    pl.DataFrame(rows, schema=names, orient="row").write_csv(path)
+    """A follower 25 m behind its leader, both at 9 m/s."""
+    pair = {"pair": "2-1", "frame": FRAME, "length": 5.0}
+    follower = pl.DataFrame(pair | {"role": "follower", "vehicle": 2, "x": 10.0 + 0.9 * FRAME})
+    leader = pl.DataFrame(pair | {"role": "leader", "vehicle": 1, "x": 35.0 + 0.9 * FRAME})
+    pl.concat((follower, leader)).write_csv(path)
 
 
 def test_pairs_have_a_driven_follower_at_the_recorded_gap(tmp_path):
@@ -48,7 +40,12 @@ def test_pairs_have_a_driven_follower_at_the_recorded_gap(tmp_path):
 
 def test_a_lane_is_driven_as_a_whole_in_stretches_of_their_own(tmp_path):
     path = tmp_path / ONE_LANE_FILES["I-80, lane_1"]
-    lane_file(path)
+    cars = []
+    for car in range(12):
+        # They enter one after the other.
+        frame = np.arange(20 * car, 320)
+        cars.append(pl.DataFrame({"vehicle": car, "frame": frame, "x": 1.8 * (frame - 20 * car)}))
+    pl.concat(cars).write_csv(path)
     recordings = read_one_lane("I-80, lane_1", path)
     assert len({piece.unit for piece in recordings}) == len(recordings) == 2
     assert all(piece.driven.all() for piece in recordings)
@@ -56,11 +53,8 @@ def test_a_lane_is_driven_as_a_whole_in_stretches_of_their_own(tmp_path):
     assert measure(recordings).quantiles["gap"]["0.5"] == pytest.approx(31.5, abs=1e-6)
 
 
-def test_damaged_files_are_named(tmp_path):
+def test_a_file_without_a_whole_segment_is_refused(tmp_path):
     path = tmp_path / ONE_LANE_FILES["I-80, lane_1"]
-    path.write_text("vehicle,frame,x\n1,2,three\n")
-    with user_error("line 2, column x"):
-        read_one_lane("I-80, lane_1", path)
     path.write_text("vehicle,frame,x\n1,2,3.0\n1,3,4.0\n")
     with user_error("nothing in it lasts 15 s"):
         read_one_lane("I-80, lane_1", path)
@@ -69,14 +63,10 @@ def test_damaged_files_are_named(tmp_path):
 def test_a_car_that_measured_itself_follows_at_the_measured_gap_and_each_leader_is_another_car(
     tmp_path,
 ):
-    rows = []
-    for frame in range(400):
-        # Nobody is seen for a second; then somebody else, nearer.
-        gap = None if 200 <= frame < 210 else 30.0 if frame < 200 else 20.0
-        rows.append((1, frame / 10, 25.0, 0.0, gap))
-    names = ["drive", "time_s", "v", "a", "gap"]
+    # Nobody is seen for a second; then somebody else, nearer.
+    gap = [30.0] * 200 + [None] * 10 + [20.0] * 190
     path = tmp_path / "instrumented.csv"
-    pl.DataFrame(rows, schema=names, orient="row").write_csv(path)
+    pl.DataFrame({"drive": 1, "time_s": FRAME / 10, "v": 25.0, "gap": gap}).write_csv(path)
     first, second = read_one_lane("I-24", path)
     assert first.speed[first.present] == pytest.approx(25.0)
     # From second 3 to 18 one leader, from there to 33 both.

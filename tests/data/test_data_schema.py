@@ -2,20 +2,19 @@
 validator.
 """
 
-from __future__ import annotations
-
 import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.refusals import user_error
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 
 from ganlane.data.schema import validate
 from ganlane.data.tables import LINE, TextTable, convert, csv_table, read_blocks
 
 
-def read(path, content: bytes, blanks: bool = False, block_bytes: int = 2**20) -> pl.DataFrame:
+def read(folder, content, blanks=False, block_bytes=2**20):
+    path = folder / "t.csv"
     path.write_bytes(content)
     table = TextTable(path, ("a", "b", "c"), blanks=blanks)
     return pl.concat(read_blocks(table, ["c", "a"], block_bytes))
@@ -36,7 +35,7 @@ def test_the_size_of_a_block_changes_nothing(
     lines = [("  {}   {}\t{} " if blanks else "{},{},{}").format(*row) for row in rows]
     end = "\r\n" if windows else "\n"
     content = end.join([*([] if blanks else ["a,b,c"]), *lines]) + (end if ended else "")
-    parsed = read(tmp_path_factory.mktemp("blocks") / "t", content.encode(), blanks, block_bytes)
+    parsed = read(tmp_path_factory.mktemp("blocks"), content.encode(), blanks, block_bytes)
     first = 1 if blanks else 2
     numbers = [tuple(map(int, (c, a))) for c, a, _ in parsed.select("c", "a", LINE).iter_rows()]
     assert numbers == [(c, a) for a, _, c in rows]
@@ -49,7 +48,6 @@ def test_the_size_of_a_block_changes_nothing(
     [
         (["1,2,3", "4,5", "7,8,9"], r"line 3, column b: the row has 2 fields, expected 3"),
         (["1,2,3", "4,5,6,6", "7,8,9"], r"line 3, column c: the row has 4 fields, expected 3"),
-        (["1,2,3", "4,1,234.5,6", "7,8,9"], r"line 3, column c: the row has 4 fields, expected 3"),
         (["1,2,3", "", "7,8,9"], r"line 3: the line is empty"),
         (["1,2,3", '4,"5,6', "7,8,9"], r"line 3: a quotation mark without its counterpart"),
         (["1,2,3", "4,5,6", "7,8"], r"line 4, column b: the row has 2 fields, expected 3"),
@@ -60,37 +58,34 @@ def test_a_row_that_does_not_fit_is_named_by_its_line(tmp_path, lines, message, 
     # Bytes that are no UTF-8 get through as latin-1.
     content = "\n".join(["a,b,c", *lines, ""]).encode("latin-1")
     with user_error(message):
-        read(tmp_path / "t.csv", content, block_bytes=block_bytes)
+        read(tmp_path, content, block_bytes=block_bytes)
 
 
 @pytest.mark.parametrize("content", [b"\xef\xbb\xbf", b"\xef\xbb\xbf\n1,2,3\n", b"\x1c\n"])
 def test_a_first_line_of_invisible_characters_is_an_empty_file(tmp_path, content):
     (tmp_path / "t.csv").write_bytes(content)
     with user_error(r"t.csv: the file is empty"):
-        csv_table(tmp_path / "t.csv", {"a": pl.Int64})
+        csv_table(tmp_path / "t.csv", ["a"])
 
 
 def test_foreign_line_breaks_are_refused_with_their_line(tmp_path):
     with user_error(r"t.csv, line 3: not a line of CSV"):
-        read(tmp_path / "t.csv", b"a,b,c\n1,2,3\n4,5\r6,7,8\n")
+        read(tmp_path, b"a,b,c\n1,2,3\n4,5\r6,7,8\n")
     # Line breaks of an old Macintosh make one line of the whole file.
     (tmp_path / "t.csv").write_bytes(b"a,b,c\r1,2,3\r4,5,6\r")
     with user_error(r"t.csv, line 1: not a line of CSV"):
-        csv_table(tmp_path / "t.csv", {"a": pl.Int64})
+        csv_table(tmp_path / "t.csv", ["a"])
 
 
 def test_quoted_fields_may_hold_commas(tmp_path):
-    parsed = read(tmp_path / "t.csv", b'a,b,c\n"1,234",2,"5,678.25"\n7,8,9\n')
+    parsed = read(tmp_path, b'a,b,c\n"1,234",2,"5,678.25"\n7,8,9\n')
     assert convert(parsed, "c", pl.Float64, tmp_path).to_list() == [5678.25, 9.0]
 
 
 @pytest.mark.parametrize(
     ("text", "kind", "message"),
     [
-        *(
-            (text, pl.Float64, "is not a number")
-            for text in ("1,23", "12,34,567", "1,2345", "1.234,5", ",5", "far")
-        ),
+        *((text, pl.Float64, "is not a number") for text in ("1,23", "1,2345", "1.234,5")),
         ("NaN", pl.Float64, "'NaN' is not a finite number"),
         ("", pl.String, "the field is empty; the row is incomplete"),
         ("5.5", pl.Int64, "'5.5' is not a whole number"),
@@ -107,11 +102,11 @@ def test_a_wrong_field_is_named_by_file_line_and_column(tmp_path, text, kind, me
 def test_a_header_is_read_in_any_case_with_quotes_and_a_byte_order_mark(tmp_path):
     path = tmp_path / "t.csv"
     path.write_bytes(b'\xef\xbb\xbf"A", B,c\n1,2,3\n')
-    assert csv_table(path, {"a": pl.Int64, "c": pl.Int64}).names == ("a", "b", "c")
+    assert csv_table(path, ["a", "c"]).names == ("a", "b", "c")
 
 
 def test_the_validator_checks_frames_that_come_from_nowhere():
-    frame = synthetic_scenes(SyntheticTraffic(scenes=1))
+    frame = synthetic_scenes(scenes=1)
     assert validate(frame, "made").equals(frame)
     # A row without a position.
     holed = frame.with_columns(x=pl.when(pl.int_range(pl.len()) == 7).then(None).otherwise("x"))

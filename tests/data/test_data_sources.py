@@ -1,7 +1,5 @@
 """Where recordings are, and how far reading them is."""
 
-from __future__ import annotations
-
 import sys
 
 import pytest
@@ -39,11 +37,9 @@ def test_the_recordings_are_found_through_the_variable(tmp_path, monkeypatch):
 
 def test_the_recordings_are_found_beside_the_current_folder(tmp_path, monkeypatch):
     monkeypatch.delenv("GANLANE_DATA", raising=False)
-    module = sys.modules["ganlane.data.sources"]
     # As if the package were installed elsewhere.
-    monkeypatch.setattr(
-        module, "__file__", str(tmp_path / "site" / "ganlane" / "data" / "sources.py")
-    )
+    elsewhere = tmp_path / "site/ganlane/data/sources.py"
+    monkeypatch.setattr("ganlane.data.sources.__file__", str(elsewhere))
     work = tmp_path / "work"
     work.mkdir()
     monkeypatch.chdir(work)

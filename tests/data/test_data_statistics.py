@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 from reference.refusals import user_error
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 
 from ganlane.data import SCHEMA, tracks_of_frame
 from ganlane.data.lanes import find_lane_changes
@@ -16,7 +16,6 @@ from ganlane.data.statistics import (
     DrivingStatistics,
     describe_durations,
     driving_statistics,
-    poisson_interval,
     quantities,
     survival_curve,
 )
@@ -37,15 +36,6 @@ def track(vehicle, x, lane=0, y=None):
         "width": 2.0,
     }
     return pl.DataFrame(columns, schema=SCHEMA, strict=False)
-
-
-@pytest.mark.parametrize(
-    ("count", "low", "high"),
-    [(0, 0.0, 3.689), (1, 0.0253, 5.572), (10, 4.795, 18.39), (57, 43.17, 73.85)],
-)
-def test_the_exact_interval_of_a_count_is_the_tabled_one(count, low, high):
-    # Garwood's limits as tabled in textbooks of epidemiology.
-    assert poisson_interval(count) == pytest.approx((low, high), rel=2e-3)
 
 
 def accelerations(frame):
@@ -113,6 +103,7 @@ def test_a_recording_is_measured_as_by_hand():
     assert changes.count == 1
     assert changes.srlc == pytest.approx(1 / 3 * 1000 / 500)
     assert changes.per_vehicle_km == pytest.approx(1 / 1.2, rel=1e-3)
+    # Garwood's bounds for one event, as tabled in textbooks of epidemiology.
     bounds = (changes.per_vehicle_km_low, changes.per_vehicle_km_high)
     assert bounds == pytest.approx((0.0253 / 1.2, 5.572 / 1.2), rel=1e-2)
     assert changes.t_m_srlc_steps == pytest.approx(750.0)
@@ -123,9 +114,7 @@ def test_a_recording_is_measured_as_by_hand():
     assert measured.speed_sd_in_frame == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    "frame", [recording(), synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=1))]
-)
+@pytest.mark.parametrize("frame", [recording(), synthetic_scenes(scenes=1, vehicles=1)])
 def test_statistics_survive_json(frame):
     measured = driving_statistics(frame)
     stored = json.dumps(measured.to_dict(), allow_nan=False)
@@ -143,9 +132,7 @@ def test_foreign_statistics_are_refused():
 
 
 def test_a_lone_lane_keeper_leaves_the_rest_open():
-    measured = driving_statistics(
-        synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=1, changing_share=0.0))
-    )
+    measured = driving_statistics(synthetic_scenes(scenes=1, vehicles=1, changing_share=0.0))
     changes = measured.lane_changes
     assert (changes.count, changes.t_m_srlc_steps, changes.per_vehicle_km_low) == (0, None, 0.0)
     assert changes.per_vehicle_km_high > 0.0

@@ -21,7 +21,6 @@ from ganlane.traffic import IdmTraffic
 
 SEED = 4
 #: Short and of different lengths: who drives at random also leaves the road and crashes.
-#: Short and of different lengths: who drives at random also leaves the road and crashes.
 SHORT = {"goal_m": 60.0, "kernel": "torch"}
 
 
@@ -46,7 +45,6 @@ def policy_of(name="random"):
     return ganlane.load_agent(name).policy
 
 
-#: Sums over an episode, as its decisions give them.
 #: Sums over an episode, as its decisions give them.
 SUMS = {
     "reward": "reward",
@@ -201,5 +199,4 @@ def test_no_episodes_and_an_environment_that_ignores_those_it_is_given_are_refus
     ],
 )
 def test_who_moved_into_whom(ego, other, at_fault):
-    same = {"x": 0.0, "y": 0.0, "target_lane": 0}
-    assert bool(ego_at_fault(vehicles({**same, **ego}, {**same, **other}))) == at_fault
+    assert bool(ego_at_fault(vehicles(ego, other))) == at_fault

@@ -105,17 +105,13 @@ def test_the_probability_of_improvement_is_the_share_of_pairs():
     table = scores(5, 50, between=1.0, rest=1.0)
     assert probability_of_improvement(table, table).value == 0.5
     assert probability_of_improvement(table + 100.0, table).interval == [1.0, 1.0]
-    first, second = [[1.0], [3.0], [2.0]], [[2.0], [0.0]]
-    # Above 2: the 3, and half of the tie; above 0: all three.
-    assert probability_of_improvement(first, second).value == pytest.approx((1.5 + 3) / 6)
-    a, b = (np.random.default_rng(seed).normal(size=(7 + seed, 3)) for seed in (0, 2))
-    u = stats.mannwhitneyu(a.mean(axis=1), b.mean(axis=1)).statistic
-    assert probability_of_improvement(a, b).value == pytest.approx(u / 63)
+    # Some means are equal.
+    first, second = np.arange(14).reshape(7, 2) % 4, np.arange(18).reshape(9, 2) % 5
+    u = stats.mannwhitneyu(first.mean(axis=1), second.mean(axis=1)).statistic
+    assert probability_of_improvement(first, second).value == pytest.approx(u / 63)
 
 
 def test_the_sign_flip_test_counts_how_many_signs_are_as_far_from_zero():
-    # Of the 2^6 signs of six equal differences two are as far.
-    assert sign_flip_p([3.0] * 6) == pytest.approx(2 / 64, abs=0.006)
     differences = [4.0, -1.0, 2.5, 3.0, 0.5, 6.0, -2.0, 1.0]
     theirs = stats.permutation_test((differences,), np.sum, permutation_type="samples")
     assert sign_flip_p(differences) == pytest.approx(theirs.pvalue, abs=0.015)

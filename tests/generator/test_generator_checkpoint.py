@@ -2,10 +2,10 @@
 
 import json
 from dataclasses import asdict
-from pathlib import Path
 
 import pytest
 import torch
+from reference.processes import ROOT
 from reference.refusals import user_error
 from reference.small_networks import SIZES, small_generator
 
@@ -25,7 +25,7 @@ from ganlane.weights import save_weights
 CONFIGS = {"paper": PaperConfig(), "calibrated": CalibratedConfig()}
 
 
-def plain(record) -> dict:
+def plain(record):
     """Settings as a file holds them."""
     return json.loads(json.dumps(asdict(record)))
 
@@ -46,20 +46,14 @@ def test_save_and_load_give_the_same_network_and_its_description(tmp_path):
     for name, tensor in fitted.module.state_dict().items():
         assert (generator.state_dict()[name] == tensor).all(), name
     assert not any(parameter.requires_grad for parameter in generator.parameters())
-    assert metadata["metrics"] == {**fitted.metrics, "fit": {"updates": 7, "seconds": 1.2}}
-    assert metadata["config"] == plain(fitted.config)
-    assert metadata["data"] == fitted.data
-    assert metadata["driving_statistics"] == fitted.statistics
-    assert metadata["folds"] == {"splits": []}
-
-
-def test_a_file_that_is_absent_or_foreign_is_refused(tmp_path):
-    path = tmp_path / "generator.safetensors"
-    with user_error("no such file"):
-        load_generator(path)
-    path.write_bytes(b"\x10\x00\x00")
-    with user_error("not a readable safetensors"):
-        load_generator(path)
+    described = {
+        "metrics": {**fitted.metrics, "fit": {"updates": 7, "seconds": 1.2}},
+        "config": plain(fitted.config),
+        "data": fitted.data,
+        "driving_statistics": fitted.statistics,
+        "folds": {"splits": []},
+    }
+    assert described.items() <= metadata.items()
 
 
 PLAIN_SIZES = asdict(SIZES)
@@ -71,7 +65,7 @@ MISFIT = "do not fit the sizes"
     [
         ({"kind": "agent"}, None, "expected a ganlane checkpoint of kind generator"),
         ({}, "calibrated", "expected 'calibrated'"),
-        ({"preset": "own"}, None, "preset 'own'"),
+        ({"preset": "human"}, None, "preset 'human'"),
         # Of no network, of one that cannot be, of another, and no sizes or tensors at all.
         ({"sizes": None}, None, MISFIT),
         ({"sizes": PLAIN_SIZES | {"hidden": 10**9}}, None, MISFIT),
@@ -113,23 +107,17 @@ def test_wrong_checkpoints_are_refused_in_one_sentence(wrong, preset, message, t
 def test_the_shipped_weights_are_of_the_default_settings_and_beat_constant_velocity(preset, most):
     path = shipped_generator(preset)
     _, metadata = load_generator(path, preset)
+    stored = {**metadata["config"], "preset": metadata["preset"]}
     # Options that went since then were at what the fit does now.
+    assert stored["loop"].pop("max_seconds") is None
     gone = {
         "history_noise": 0.0,
         "mirror": True,
         "traits": True,
         "washout_s": 3.0,
         "further_inputs": True,
-        "loop": {"max_seconds": None},
     }
-    settings = plain(CONFIGS[preset])
-    assert settings.pop("preset") == metadata["preset"]
-    for name, value in metadata["config"].items():
-        expected = settings.get(name, gone.get(name))
-        if name == "loop":
-            expected = expected | gone["loop"]
-        assert value == expected, name
-    assert path.stat().st_size < 5_000_000
+    assert gone | stored == gone | plain(CONFIGS[preset])
     assert 0 < metadata["metrics"]["fit"]["seconds"] < 1800
     errors = metadata["metrics"]["all"]
     for name, share in most.items():
@@ -156,7 +144,7 @@ def test_pooled_over_folds_the_errors_stay_under_constant_velocitys_and_stand_in
     if preset == "calibrated":
         assert folds["rollout"]["tracks"] > 400
         assert folds["rollout"]["ratio_to_constant_velocity"]["mean"] <= 0.75
-    page = (Path(__file__).parents[2] / "docs" / "generators.md").read_text()
+    page = (ROOT / "docs" / "generators.md").read_text()
     texts = {"mean": "mean prediction", "single": "a single sample", "best_of_20": "best of 20"}
     for kind, text in texts.items():
         begin = f"| `generator_{preset}`, {text}"

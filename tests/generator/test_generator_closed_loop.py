@@ -9,25 +9,19 @@ from reference.small_networks import silenced, small_generator
 from reference.worlds import vehicles
 
 from ganlane.generator import closed_loop
-from ganlane.generator.networks import Generator
 from ganlane.generator.windows import cut_segments
 from ganlane.settings.generator import EXTRA_INPUTS, CalibratedConfig
-from ganlane.sim.idm import IdmParameters, equilibrium_gap, idm_acceleration
-from ganlane.sim.state import Road, Visibility
+from ganlane.sim.idm import idm_acceleration
+from ganlane.sim.state import Road
 
 ROAD = Road(3, 4.0)
 
 
-CAR = {"x": 0.0, "width": 2.0, "visibility": int(Visibility.BODY)}
-
-
-def scene(*cars):
-    return vehicles(*({**CAR, **car} for car in cars))
-
-
-def silent_generator() -> Generator:
-    """A network whose residual is 0."""
-    return silenced(small_generator(EXTRA_INPUTS)).double().requires_grad_(False)
+def steady_generator(along=0.0, aside=0.0):
+    """A network whose residual is always the same."""
+    generator = silenced(small_generator(EXTRA_INPUTS)).double().requires_grad_(False)
+    generator.head.bias.copy_(torch.tensor([along, aside]))
+    return generator
 
 
 def drive(generator, state, seconds):
@@ -41,17 +35,9 @@ def drive(generator, state, seconds):
     return state, memory
 
 
-def test_without_a_residual_a_follower_settles_at_its_own_equilibrium_gap():
-    state = scene({"speed": 18.0}, {"x": 36.0, "speed": 18.0, "desired_speed": 18.0})
-    state, _ = drive(silent_generator(), state, 25)
-    gap = state.x[0, 1] - state.x[0, 0] - 4.5
-    expected = equilibrium_gap(state.speed[0, 0], 25.0, IdmParameters(headway_s=1.27))
-    assert gap.item() == pytest.approx(expected.item(), rel=0.02)
-
-
 def test_without_a_residual_a_lane_change_arrives_and_does_not_overshoot():
-    state = scene({"target_lane": 1})
-    generator = silent_generator()
+    state = vehicles({"target_lane": 1})
+    generator = steady_generator()
     course = []
     for _ in range(20):
         state, _ = drive(generator, state, 0.5)
@@ -61,10 +47,9 @@ def test_without_a_residual_a_lane_change_arrives_and_does_not_overshoot():
 
 
 def test_the_first_step_is_idm_and_the_lateral_law():
-    state = scene({"y": 0.5}, {"x": 30.0})
-    after, _ = drive(silent_generator(), state, 0.1)
-    gap = torch.tensor(30.0 - 4.5, dtype=torch.float64)
-    speed = torch.tensor(20.0, dtype=torch.float64)
+    state = vehicles({"y": 0.5}, {"x": 30.0})
+    after, _ = drive(steady_generator(), state, 0.1)
+    gap, speed = torch.tensor([30.0 - 4.5, 20.0], dtype=torch.float64)
     idm = replace(closed_loop.ANCHOR.idm, headway_s=1.27)
     expected = idm_acceleration(speed, 25.0, gap, speed, idm)
     assert after.x[0, 0].item() == pytest.approx(2.0 + 0.01 * expected.item(), abs=1e-9)
@@ -72,18 +57,14 @@ def test_the_first_step_is_idm_and_the_lateral_law():
 
 
 def test_a_network_that_always_pushes_changes_the_speed_for_a_while_only():
-    generator = silent_generator()
-    generator.head.bias.copy_(torch.tensor([3.0, 0.0]))
-    state, memory = drive(generator, scene({"desired_speed": 20.0}), 32)
+    state, memory = drive(steady_generator(along=3.0), vehicles({"desired_speed": 20.0}), 32)
     assert state.speed.item() == pytest.approx(20.0, abs=0.3)
     assert memory.mean[0, 0, 0].item() == pytest.approx(4 * math.tanh(0.75), abs=1e-4)
 
 
 def test_a_network_that_always_pushes_sideways_does_not_push_the_body_out_of_its_lane():
-    generator = silent_generator()
-    generator.head.bias.copy_(torch.tensor([0.0, 5.0]))
-    state, _ = drive(generator, scene({}), 3)
-    room = 0.5 * (4.0 - 2.0) - 0.1
+    state, _ = drive(steady_generator(aside=5.0), vehicles({}), 3)
+    room = 0.5 * (4.0 - 2.5) - 0.1
     assert 0.2 < state.y.item() < room + 0.05
 
 
@@ -100,7 +81,7 @@ def test_the_latent_vector_stays_standard_normal_and_forgets_in_its_period():
 
 def test_the_paper_drives_the_first_predicted_displacement():
     generator = small_generator().double().requires_grad_(False)
-    state = scene({}, {"x": 25.0, "lane": 1})
+    state = vehicles({}, {"x": 25.0, "lane": 1})
     history = closed_loop.start(generator, closed_loop.displacement_of(state))
     noise = torch.randn(1, 2, 4).double()
     past = closed_loop.displacement_of(state)[..., None, :].expand(1, 2, 8, 2)
@@ -113,12 +94,6 @@ def test_the_paper_drives_the_first_predicted_displacement():
 
 
 @pytest.fixture
-def segments(scenes):
-    """The first scene from its closed_loop.start, for half a second."""
-    return cut_segments([(scenes[0], 0)], horizon=5)
-
-
-@pytest.fixture
 def generator():
     return small_generator(EXTRA_INPUTS)
 
@@ -128,20 +103,6 @@ def typical_rollout(generator, segments):
     drivers = closed_loop.driver_params(segments)
     noise = torch.zeros(1 + segments.future.shape[1], 1, *segments.length.shape, 4)
     return closed_loop.rollout(generator, segments, drivers, noise, CalibratedConfig())[0]
-
-
-def test_a_rollout_is_the_same_with_more_padding(segments, generator):
-    pad = torch.nn.functional.pad
-    wide = replace(
-        segments,
-        positions=pad(segments.positions, (0, 0, 0, 4)),
-        present=pad(segments.present, (0, 4)),
-        target_lane=pad(segments.target_lane, (0, 4)),
-        length=pad(segments.length, (0, 4), value=1.0),
-    )
-    torch.testing.assert_close(
-        typical_rollout(generator, wide)[:, :, :7], typical_rollout(generator, segments)
-    )
 
 
 def test_vehicles_that_come_later_start_when_they_appear_and_are_not_scored(scenes, generator):
@@ -164,12 +125,11 @@ def test_gradient_of_a_rollout_is_finite_and_reaches_every_parameter(scenes, gen
     )
     (positions - segments.future).abs()[:, segments.scored].sum().backward()
     for name, parameter in generator.named_parameters():
-        assert parameter.grad is not None, name
-        assert parameter.grad.isfinite().all(), name
-        assert parameter.grad.abs().sum() > 0, name
+        assert 0 < parameter.grad.abs().sum() < math.inf, name
 
 
-def test_nothing_of_the_future_enters_an_evaluation(segments, generator):
+def test_nothing_of_the_future_enters_an_evaluation(scenes, generator):
+    segments = cut_segments([(scenes[0], 0)], horizon=5)
     before = typical_rollout(generator, segments.without_intentions())
     segments.positions[:, 9:] += 7.0
     segments.target_lane[:, 9:] = 0

@@ -6,12 +6,10 @@ import pytest
 from reference.recordings import recorded_cars
 from reference.refusals import user_error
 from reference.small_networks import CALIBRATED, LOOP, PAPER
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 
 from ganlane.commands.train_generator import fold_tables
-from ganlane.data.statistics import measure_exposure
-from ganlane.generator.checkpoint import load_generator
-from ganlane.generator.fit import assign_folds, cross_validate, fit_generator, split_for_fit
+from ganlane.generator.fit import assign_folds, cross_validate, split_for_fit
 from ganlane.generator.windows import count_windows
 
 
@@ -58,7 +56,7 @@ def test_more_folds_than_scenes_and_splits_without_two_parts_are_refused(scenes)
 
 @pytest.fixture(scope="module")
 def frame():
-    return synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=5, seconds=6.5))
+    return synthetic_scenes(scenes=3, vehicles=5, seconds=6.5)
 
 
 @pytest.fixture(scope="module")
@@ -70,12 +68,6 @@ def folder(tmp_path_factory):
 def paper(frame, folder):
     """Scores of two folds."""
     return cross_validate(PAPER, frame, 2, folder)
-
-
-@pytest.fixture(scope="module")
-def calibrated(frame, folder):
-    """The same of the other preset."""
-    return cross_validate(CALIBRATED, frame, 2, folder)
 
 
 def test_every_scene_is_forecast_once_by_a_generator_that_never_saw_it(paper):
@@ -97,22 +89,11 @@ def test_what_is_fitted_is_not_fitted_again_and_gives_the_same(frame, folder, pa
     assert len(updates) == 2 * LOOP.updates
 
 
-def test_the_calibrated_preset_is_also_rolled_out_for_five_seconds(calibrated):
+def test_the_calibrated_preset_is_also_rolled_out_for_five_seconds(frame, folder):
+    calibrated = cross_validate(CALIBRATED, frame, 2, folder)
     rollout = calibrated["rollout"]
     assert rollout["windows"] >= 15
     assert list(rollout["rmse_m"]["mean"]) == ["1 s", "2 s", "3 s", "4 s", "5 s"]
     assert rollout["ratio_to_constant_velocity"]["constant_velocity"] == 1.0
     assert calibrated["open_loop"]["windows"] > rollout["windows"]
     assert "idm_own_headway" in fold_tables(calibrated)
-
-
-def test_a_fit_names_its_recordings_and_holds_their_driving_statistics(frame, folder, tmp_path):
-    fit = fit_generator(PAPER, frame, ("synthetic-1",), folder, source="folder/made.csv")
-    fit.save(tmp_path / "fit.safetensors")
-    _, metadata = load_generator(tmp_path / "fit.safetensors", "paper")
-    assert metadata["data"]["held_out"] == ["synthetic-1"]
-    assert metadata["data"]["file"] == "made.csv"
-    driven = metadata["driving_statistics"]["exposure"]["vehicle_km"]
-    assert driven == measure_exposure(frame).vehicle_km
-    errors = metadata["metrics"]
-    assert errors["all"] == errors["synthetic-1"]

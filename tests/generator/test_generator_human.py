@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 import torch
 from reference.recordings import made_by_hand, recorded_cars
-from reference.refusals import user_error
-from reference.scene_csv import write_scene_csv
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
 from reference.worlds import vehicles
 
 from ganlane.config.run import run_command
-from ganlane.generator import human_estimator, human_fit, human_tuning, load_generator, load_human
+from ganlane.generator import human_estimator, human_fit, human_tuning, load_human
 from ganlane.generator.human import (
     ACROSS,
     ALONG,
@@ -41,16 +38,15 @@ from ganlane.generator.human_samples import (
     target_lanes,
 )
 from ganlane.generator.human_tuning import Strangers, costs, entering_memory
-from ganlane.settings.generator import SIDE_FEATURES, HumanConfig, HumanSizes, shipped_generator
+from ganlane.settings.generator import SIDE_FEATURES, HumanConfig, HumanSizes
 from ganlane.sim.state import Road
 
 ROAD = Road(3, 4.0)
-FLOAT = torch.float32
-CAR = {"x": 0.0, "lane": 1, "speed": 20.0, "width": 2.0}
+CAR = {"lane": 1, "width": 2.0}
 
 
 def scene(*cars):
-    return vehicles(*({**CAR, **car} for car in cars), dtype=FLOAT)
+    return vehicles(*({**CAR, **car} for car in cars), dtype=torch.float32)
 
 
 def situation(cars):
@@ -105,10 +101,8 @@ def test_chances_add_up_nobody_changes_to_where_no_lane_is_and_a_change_can_be_b
     chances = policy().lane_chances(lane_choice(now))
     assert torch.allclose(chances.sum(-1), torch.ones(1, 3), atol=1e-5)
     left, right = chances[0, :, 1], chances[0, :, 2]
-    assert left[0] < 1e-6
-    assert right[1] < 1e-6
     # Under way to the left, there is only going on and breaking off.
-    assert right[2] < 1e-6
+    assert max(left[0], right[1], right[2]) < 1e-6
     low, high = (chosen(chances, torch.full((1, 3), u)) for u in (0.0, 0.999999))
     assert low[0, 2] == 1
     after_low, after_high = (
@@ -148,16 +142,16 @@ def test_a_lane_change_is_meant_from_where_the_driver_sets_out():
     assert set(np.delete(target_lanes(touched, np.zeros(40), 3.5, 2), [20, 21])) == {0}
 
 
-def steady_driving() -> list:
-    """Stretches of two cars at 20 m/s, one 40 m behind the other, in the middle of three lanes."""
+def steady_samples(*driver, **options):
+    """Of two cars at 20 m/s, one 40 m behind the other, in the middle of three lanes."""
     x = 2.0 * np.arange(140)[:, None] + np.array([0.0, 40.0])
-    return cuts([smooth_scene(made_by_hand(x, y=3.5), HumanConfig())], 10, 10)
+    stretches = cuts([smooth_scene(made_by_hand(x, y=3.5), HumanConfig())], 10, 10)
+    options = Options(*driver, vary=False, blind=0.0, **options)
+    return samples_of(stretches, options, torch.Generator().manual_seed(0))
 
 
 def test_teacher_samples_of_steady_driving_ask_for_no_change():
-    random = torch.Generator().manual_seed(0)
-    options = Options(vary=False, blind=0.0)
-    moves, choices = samples_of(steady_driving(), options, random)
+    moves, choices = steady_samples()
     assert len(moves.features) > 20
     assert moves.change.abs().max() < 1e-3
     assert moves.aside.abs().max() < 1e-3
@@ -172,14 +166,10 @@ def staying(features, across_token=ACROSS.number // 2):
     return along, across
 
 
-#: A policy that always goes to the left as fast as it can.
-drifting = partial(staying, across_token=-1)
-
-
 def test_in_the_closed_loop_a_driver_lives_with_its_own_moves_and_is_led_back():
-    random = torch.Generator().manual_seed(0)
-    options = Options(drifting, samples=1, vary=False, blind=0.0)
-    moves = samples_of(steady_driving(), options, random).moves
+    # A policy that always goes to the left as fast as it can.
+    drifting = partial(staying, across_token=-1)
+    moves = steady_samples(drifting, samples=1).moves
     # At the first decisions it is as recorded, later it has to come back to its lane.
     assert moves.aside.max().abs() < 1e-3
     assert (moves.aside < -0.5).float().mean() > 0.5
@@ -194,9 +184,7 @@ def test_the_drivers_of_a_closed_loop_begin_where_the_estimate_sees_them():
         motion[..., 6] = 0.5
         return motion
 
-    random = torch.Generator().manual_seed(0)
-    options = Options(staying, estimator=beside, samples=1, vary=False, blind=0.0)
-    moves = samples_of(steady_driving(), options, random).moves
+    moves = steady_samples(staying, estimator=beside, samples=1).moves
     assert float(moves.aside.min()) == pytest.approx(-0.5 * LATERAL_GAIN, abs=0.03)
 
 
@@ -285,29 +273,18 @@ def test_a_fit_is_the_same_for_the_same_seed_and_reports_its_steps(small_fits):
 
 
 def test_the_command_fits_folds_keeps_what_is_finished_and_its_weights_load(
-    small_fits, empty_folder, monkeypatch
+    small_fits, recordings, monkeypatch
 ):
-    write_scene_csv(
-        synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=4, seconds=6.5)), "recordings.csv"
-    )
     options = [f"generator.{name}={value}" for name, value in SMALL.items()]
-    arguments = ["generator=human", "data.path=recordings.csv", *options]
+    arguments = ["generator=human", recordings, *options]
     assert run_command("train_generator", [*arguments, "folds=2", "hydra.run.dir=fit"]) == 0
     results = json.loads(Path("fit/results.json").read_text())
     assert {"mean", "single", "best_of_20", "constant_velocity"} < results["ade_m"].keys()
     assert "rollout" in results["folds"]
     model, metadata = load_human("fit/generator_human.safetensors")
-    assert metadata["preset"] == "human"
     assert metadata["data"]["held_out"] == results["data"]["held_out"]
     # What is finished is not fitted again.
     monkeypatch.setattr("ganlane.generator.tasks.fit_human", None)
     assert run_command("train_generator", [*arguments, "resume=fit", "hydra.run.dir=again"]) == 0
     again, _ = load_human("again/generator_human.safetensors")
     assert torch.equal(model.policy.along.weight, again.policy.along.weight)
-
-
-def test_weights_of_another_kind_are_refused():
-    with user_error("human"):
-        load_human(shipped_generator("paper"))
-    with user_error("generator"):
-        load_generator(shipped_generator("human"))

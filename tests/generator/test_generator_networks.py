@@ -6,7 +6,7 @@ from reference.small_networks import silenced, small_generator
 from torch import nn
 
 from ganlane.generator import networks
-from ganlane.generator.closed_loop import push, recorded, start
+from ganlane.generator.closed_loop import push, recorded
 
 
 @pytest.fixture
@@ -36,25 +36,14 @@ def generator():
     return small_generator(seed=1)
 
 
-@pytest.fixture
-def now(scene, generator):
-    """The generator's input in that scene."""
-    return generator.observe(*scene)
-
-
-@pytest.mark.parametrize("relu", [False, True])
-@pytest.mark.parametrize("shape", [(3, 5), (700, 5), (80, 9, 5)])
-def test_it_is_a_linear_layer_for_few_rows_and_for_many(shape, relu):
+@pytest.mark.parametrize("shape", [(3, 5), (80, 9, 5)])
+def test_it_is_a_linear_layer_for_few_rows_and_for_many(shape):
     torch.manual_seed(0)
     layer = nn.Linear(5, 7)
     x = torch.randn(*shape)
-    expected = layer(x).relu() if relu else layer(x)
     with torch.no_grad():
-        torch.testing.assert_close(networks.apply(layer, x, relu), expected)
+        torch.testing.assert_close(networks.apply(layer, x, relu=True), layer(x).relu())
         torch.testing.assert_close(networks.dense(x, layer.weight), x @ layer.weight.T)
-        torch.testing.assert_close(
-            networks.apply(layer.double(), x.double(), relu).float(), expected
-        )
 
 
 def test_the_recurrence_is_torchs_own_lstm():
@@ -63,11 +52,13 @@ def test_the_recurrence_is_torchs_own_lstm():
     reference = nn.LSTM(5, 7, batch_first=True)
     # torch's: input, forget, new, output
     order = torch.arange(28).reshape(4, 7)[[0, 1, 3, 2]].flatten()
-    with torch.no_grad():
-        reference.weight_ih_l0.copy_(lstm.input.weight[order])
-        reference.bias_ih_l0.copy_(lstm.input.bias[order])
-        reference.weight_hh_l0.copy_(lstm.recurrent[order])
-        reference.bias_hh_l0.zero_()
+    weights = {
+        "weight_ih_l0": lstm.input.weight[order],
+        "bias_ih_l0": lstm.input.bias[order],
+        "weight_hh_l0": lstm.recurrent[order],
+        "bias_hh_l0": torch.zeros(28),
+    }
+    reference.load_state_dict(weights)
     displacement = torch.randn(4, 6, 2)
     difference = 0.05 * torch.randn(4, 6, 2)
     embedded = torch.relu(lstm.embed(networks.motion_features(displacement, difference)))
@@ -86,37 +77,29 @@ def test_pooling_does_not_depend_on_the_order_of_vehicles(pooled):
 @pytest.mark.parametrize("count", [9, 13])
 def test_pooling_ignores_padding(pooled, count):
     pooling, whole = pooled
-    hidden, position, motion, mask = arguments = [part[:, :count] for part in whole]
-    expected = pooling(*arguments)
-    real = mask[..., None]
-    noisy = pooling(
-        torch.where(real, hidden, 99.0), torch.where(real, position, -3.0), motion, mask
-    )
-    torch.testing.assert_close(noisy[mask], expected[mask])
-    torch.testing.assert_close(pooling(*(part[1:2, :7] for part in arguments)), expected[1:2, :7])
+    padded = pooling(*(part[:, :count] for part in whole))
+    # Seven vehicles are real in this row.
+    alone = pooling(*(part[1:2, :7] for part in whole))
+    torch.testing.assert_close(alone, padded[1:2, :7])
 
 
-def test_the_nearest_are_found_as_by_sorting(scene):
+def test_the_nearest_in_range_are_found_as_by_sorting(scene):
     _, position, mask = scene
+    # Some are out of range.
+    position *= torch.tensor([2.5, 1.0])
     index, seen = networks.nearest(position, mask, 8)
     for row in range(3):
         for vehicle in range(13):
-            others = [j for j in range(13) if j != vehicle and mask[row, j]]
-            others.sort(key=lambda j: float((position[row, j] - position[row, vehicle]).norm()))
+            offset = position[row] - position[row, vehicle]
+            in_range = mask[row] & (offset[:, 0].abs() < networks.RANGE_M)
+            others = [j for j in range(13) if j != vehicle and in_range[j]]
+            others.sort(key=lambda j: float(offset[j].norm()))
             assert set(index[row, vehicle][seen[row, vehicle]].tolist()) == set(others[:8])
 
 
-def test_vehicles_out_of_range_have_no_influence():
-    position = torch.tensor(
-        [[[0.0, 0.0], [networks.RANGE_M + 1.0, 0.0], [networks.RANGE_M - 1.0, 0.0]]]
-    )
-    _, seen = networks.nearest(position, torch.ones(1, 3, dtype=torch.bool), 8)
-    assert seen[0, 0].tolist() == [False, False, True]
-
-
-def test_with_a_head_of_zeros_the_prediction_is_constant_velocity(scene, generator, now):
+def test_with_a_head_of_zeros_the_prediction_is_constant_velocity(scene, generator):
     displacements = scene[0]
-    predicted = silenced(generator)(now, torch.randn(3, 13, 4))
+    predicted = silenced(generator)(generator.observe(*scene), torch.randn(3, 13, 4))
     torch.testing.assert_close(predicted, displacements[..., -1:, :].expand_as(predicted))
 
 
@@ -124,28 +107,14 @@ def test_kept_projections_equal_those_computed_anew(generator):
     displacements = torch.tensor([1.3, 0.0]) + 0.05 * torch.randn(2, 4, 20, 2)
     history = recorded(generator, displacements[..., :7, :])
     for step in range(7, 20):
-        history, difference = push(generator, history, displacements[..., step, :])
+        history, _ = push(generator, history, displacements[..., step, :])
         anew = generator.encoder.project_course(displacements[..., step - 7 : step + 1, :])
         torch.testing.assert_close(history.motions, anew)
-        torch.testing.assert_close(
-            difference, displacements[..., step, :] - displacements[..., step - 1, :]
-        )
 
 
-def test_a_fresh_history_is_that_of_constant_velocity(generator):
-    displacement = torch.tensor([[[1.7, 0.0], [0.9, 0.0]]])
-    always = displacement[..., None, :].expand(1, 2, 8, 2)
-    torch.testing.assert_close(
-        start(generator, displacement).motions, generator.encoder.project_course(always)
-    )
-
-
-def test_gradient_reaches_every_parameter_of_both_networks(scene, generator, now):
+def test_gradient_reaches_every_parameter_of_the_discriminator(scene):
     displacements, _, mask = scene
     discriminator = networks.Discriminator(16, 12)
-    predicted = generator(now, torch.randn(3, 13, 4))
-    discriminator(torch.cat([displacements, predicted], dim=-2))[mask].sum().backward()
-    for module in (generator, discriminator):
-        for name, parameter in module.named_parameters():
-            assert parameter.grad is not None, name
-            assert parameter.grad.abs().sum() > 0, name
+    discriminator(displacements)[mask].sum().backward()
+    for name, parameter in discriminator.named_parameters():
+        assert parameter.grad.abs().sum() > 0, name

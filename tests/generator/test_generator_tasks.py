@@ -14,7 +14,7 @@ from ganlane.generator import tasks
 from ganlane.settings.generator import LoopConfig
 
 
-def paper_task(scenes, **changes) -> tasks.PaperTask:
+def paper_task(scenes, **changes):
     loop = LoopConfig(evaluate_every=5, learning_rate=1e-2, warmup=1, **changes)
     fitted, validation = scenes
     return tasks.PaperTask(

@@ -1,13 +1,11 @@
 """Recorded scenes as arrays, segments and windows cut from them, and k-means groups of windows."""
 
-from __future__ import annotations
-
 import numpy as np
 import polars as pl
 import pytest
 import torch
 from reference.refusals import user_error
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 
 from ganlane.data.dense import recordings_of
 from ganlane.generator.windows import (
@@ -20,17 +18,13 @@ from ganlane.generator.windows import (
 )
 
 
-def recording() -> pl.DataFrame:
-    """Three scenes of vehicles that come and go at random, some with a gap in their track."""
-    frame = synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=14, seconds=4.0))
-    random = np.random.default_rng(0)
-    tracks = []
-    for _, track in frame.group_by("scene", "vehicle", maintain_order=True):
-        first, last, gap = random.integers([0, 20, 0], [12, 40, 60])
-        number = pl.col("frame")
-        tracks.append(track.filter(number.is_between(first, last) & (number != gap)))
+def recording():
+    """Three scenes of vehicles that come and go, some with a gap in their track."""
+    frame = synthetic_scenes(scenes=3, vehicles=14, seconds=4.0)
+    vehicle, number = pl.col("vehicle"), pl.col("frame")
+    there = number.is_between(vehicle % 12, 40 - vehicle) & (number != 4 * vehicle)
     # Numbers that are no indices.
-    return pl.concat(tracks).with_columns(pl.col("vehicle") + 999, pl.col("frame") + 100)
+    return frame.filter(there).with_columns(vehicle + 999, number + 100)
 
 
 @pytest.fixture(scope="module")
@@ -39,26 +33,26 @@ def windows():
 
 
 def test_a_changer_intends_its_new_lane_two_seconds_before_it_is_there(scenes):
-    lanes = scenes[0].lane
-    changer = next(v for v in range(lanes.shape[1]) if len(set(lanes[:, v])) == 2)
-    crossed = int((lanes[:, changer] != lanes[0, changer]).argmax())
-    first = int((scenes[0].target_lane[:, changer] == lanes[crossed, changer]).argmax())
+    tracks = zip(scenes[0].lane.T, scenes[0].target_lane.T)
+    lane, target = next((lane, target) for lane, target in tracks if len(set(lane)) == 2)
+    crossed = int((lane != lane[0]).argmax())
+    first = int((target != lane[0]).argmax())
     assert first == max(0, crossed - 20)
 
 
-def brute_force_windows(frame: pl.DataFrame, stride: int) -> dict[tuple[str, int, int], np.ndarray]:
+def brute_force_windows(frame, stride):
     """(scene, start row, vehicle number) -> positions, by looking every frame up in a
     dictionary.
     """
-    columns = ("scene", "vehicle", "frame", "x", "y")
     windows = {}
-    rows = {row[:3]: row[3:] for row in frame.select(columns).iter_rows()}
-    begins = dict(frame.group_by("scene").agg(pl.col("frame").min()).iter_rows())
-    for scene, vehicle, first in rows:
-        course = [rows.get((scene, vehicle, first + step)) for step in range(WINDOW_FRAMES)]
-        row = first - begins[scene]
-        if None not in course and row % stride == 0:
-            windows[scene, row, vehicle] = np.array(course)
+    for (scene,), cars in frame.group_by("scene"):
+        rows = cars.select("vehicle", "frame", "x", "y").iter_rows()
+        places = {(vehicle, number): place for vehicle, number, *place in rows}
+        begin = cars["frame"].min()
+        for vehicle, first in places:
+            course = [places.get((vehicle, first + step)) for step in range(WINDOW_FRAMES)]
+            if None not in course and (first - begin) % stride == 0:
+                windows[scene, first - begin, vehicle] = course
     return windows
 
 
@@ -71,7 +65,7 @@ def test_windows_are_those_of_a_brute_force_search(stride):
     # Columns of a scene are its vehicles in the order of their numbers, which begin at 1000.
     keys = list(zip(windows.scene, windows.start, 1000 + windows.vehicle))
     assert sorted(keys) == sorted(expected)
-    np.testing.assert_array_equal(windows.positions, np.stack([expected[key] for key in keys]))
+    np.testing.assert_array_equal(windows.positions, [expected[key] for key in keys])
     if stride == 1:
         assert [count_windows(scene) for scene in scenes] == [
             len(cut_windows([scene])) for scene in scenes
@@ -114,9 +108,7 @@ def test_kmeans_puts_two_distant_platoons_into_two_groups():
 def test_mirroring_flips_only_the_chosen_groups(windows):
     groups = group_windows(windows, size=4).select(slice(0, 2))
     flipped = groups.mirrored(torch.tensor([False, True]))
-    for now, before in (
-        (flipped.displacements, groups.displacements),
-        (flipped.position, groups.position),
-    ):
+    for name in ("displacements", "position"):
+        now, before = getattr(flipped, name), getattr(groups, name)
         assert (now[0] == before[0]).all()
         assert (now[1] == before[1] * torch.tensor([1.0, -1.0])).all()

@@ -1,17 +1,14 @@
 """``ganlane realism`` from end to end, with tiny budgets, in process."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import polars as pl
 import pytest
 from PIL import Image
 from reference.recordings import following_file
-from reference.refusals import everything_below, last_path, refusal
+from reference.refusals import last_path, refusal
 from reference.scene_csv import write_scene_csv
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 
 from ganlane.config.run import run_command
 from ganlane.realism.measures import QUANTITIES
@@ -22,16 +19,13 @@ QUICK = ["quick=true", "vehicle_km=0.5", "long_s=10", "long_vehicles=[4]"]
 
 @pytest.fixture(autouse=True)
 def _without_recordings_of_this_machine(empty_folder, monkeypatch):
-    nothing = empty_folder / "nothing"
-    nothing.mkdir()
-    monkeypatch.setenv("GANLANE_DATA", str(nothing))
+    monkeypatch.setenv("GANLANE_DATA", str(empty_folder))
 
 
 @pytest.fixture
 def recordings(empty_folder):
-    path = empty_folder / "recordings" / "scenes.csv"
-    path.parent.mkdir()
-    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=6, seconds=6.0)), path)
+    path = empty_folder / "scenes.csv"
+    write_scene_csv(synthetic_scenes(scenes=3, vehicles=6, seconds=6.0), path)
     return path
 
 
@@ -54,17 +48,11 @@ def test_a_users_own_traffic_gets_a_card_of_every_quantity_and_one_of_i80_beside
     assert results["traffic"] == "entry_own_parts.Cruise"
     assert len(results["scenes"]) == 3
     assert results["quantities"].keys() == QUANTITIES.keys()
-    # A row holds distance, interval, scale and rivals.
     row = results["quantities"]["speed"]
-    assert 0.0 <= row["distance_ci"][0] <= row["distance"] <= 1.0
-    assert None not in (row["ceiling"], row["floor"])
     assert row["against"].keys() == {"idm_mobil"}
-    assert row["against"]["idm_mobil"]["verdict"] in ("closer", "farther", "undecided")
     assert results["quantities_held_out"]["speed"]["samples"] < row["samples"]
     assert results["i80"]["I-80, following"].keys() == {"speed", "acceleration", "time_headway"}
-    for key in ("lane_changes_per_vehicle_km", "overlaps_per_1000_vehicle_km_ci", "off_road"):
-        assert results[key] is not None
-    assert results["machine"]
+    assert results["off_road"] is not None
     assert results["long_runs"][0]["vehicle_km"] >= 0.5
     assert results["long_runs_against"].keys() == {"idm_mobil"}
     parts = ("changes per vehicle-km", "held-out scenes alone", "idm_mobil, long runs")
@@ -99,27 +87,19 @@ def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(capsy
     ("arguments", "part"),
     [
         (["data.path=gone.csv"], "gone.csv: no such file"),
-        (["data.held_out=[moon]"], "moon"),
         (["against=[idm_mobli]"], "did you mean 'idm_mobil'"),
         (["against=[random]"], "leave it out"),
-        (["traffic=replay"], "recordings themselves"),
         (["data=ngsim"], "ganlane prepare"),
         (["i80=true"], "i80=true"),
-        (["scenes=some"], "held_out, all"),
-        (["device=cuda"], "device=cuda"),
+        (
+            ["traffic=gan", "traffic.path=gone.tensors", "desired_above_mps=5", "scenes=all"],
+            "gone.tensors: no such file",
+        ),
     ],
 )
 def test_mistakes_are_told_in_a_sentence_and_leave_nothing(arguments, part, recordings, capsys):
     driven = ["traffic=idm", f"data.path={recordings}", "vehicle_km=0"]
     assert part in refusal(capsys, "realism", *QUICK, *driven, *arguments)
-
-
-def test_weights_that_are_not_there_are_told_too_and_leave_nothing(recordings, capsys):
-    before = everything_below(Path.cwd())
-    gone = ["traffic=gan", "traffic.path=gone.safetensors", f"data.path={recordings}"]
-    assert run_command("realism", [*QUICK, *gone]) == 2
-    assert "realism: gone.safetensors: no such file" in capsys.readouterr().err
-    assert everything_below(Path.cwd()) == before
 
 
 def test_one_scene_is_refused_with_what_to_do_and_driven_whole_when_asked(recordings, capsys):

@@ -20,7 +20,7 @@ from ganlane.realism.driving import (
     with_recorded_headways,
 )
 from ganlane.settings.generator import EXTRA_INPUTS
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road
 from ganlane.traffic import TrafficModule
 from ganlane.traffic.social_gan import AnchoredGanTraffic
 
@@ -93,7 +93,7 @@ def test_index_0_is_nobody_and_models_see_desired_speeds_above_the_speed_at_entr
 
     # Keeps what a traffic is given at each step.
     class Watcher(TrafficModule):
-        def move(self, vehicles: Vehicles, memory, key, step):
+        def move(self, vehicles, memory, key, step):
             seen.append(vehicles)
             return vehicles, memory
 

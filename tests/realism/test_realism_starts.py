@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from reference.recordings import made_by_hand
 from reference.refusals import user_error
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 
 from ganlane.realism.card import card_rows
 from ganlane.realism.driving import ConstantVelocity, StartOptions
@@ -12,16 +12,16 @@ from ganlane.realism.measures import ceiling
 from ganlane.realism.starts import fit_excess, recorded_starts
 
 NAMES = [f"synthetic-{number}" for number in range(4)]
-MAKERS = {"cruise": ConstantVelocity}
 
 
 @pytest.fixture(scope="module")
 def frame():
-    return synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=8, seconds=6.0))
+    return synthetic_scenes(scenes=4, vehicles=8, seconds=6.0)
 
 
 def starts_of(frame, starts, held_out):
-    return recorded_starts(MAKERS, starts, held_out, frame, StartOptions(), False, "made up")
+    cruise = {"cruise": ConstantVelocity}
+    return recorded_starts(cruise, starts, held_out, frame, StartOptions(), False, "made up")
 
 
 def test_scenes_alone_have_the_ceiling_of_their_own_halves(frame):

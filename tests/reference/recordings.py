@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 
 from ganlane.data.dense import Recording, recordings_of
 
@@ -21,9 +21,7 @@ START_MS = 1_118_847_000_000
 
 def traffic(**more) -> pl.DataFrame:
     """Six seconds of nine vehicles on three lanes in two scenes."""
-    return synthetic_scenes(
-        SyntheticTraffic(vehicles=9, seconds=6.0, changing_share=0.0, **more), seed=4
-    )
+    return synthetic_scenes(vehicles=9, seconds=6.0, changing_share=0.0, **more, seed=4)
 
 
 def feet(metres: pl.Expr) -> pl.Expr:
@@ -35,7 +33,6 @@ def ngsim_rows(scene: pl.DataFrame, start_ms: int = START_MS) -> pl.DataFrame:
 
     Feet, front centres, lanes and positions from the left.
     """
-    nobody = pl.lit(0)
     return scene.sort("vehicle", "frame").select(
         Vehicle_ID="vehicle",
         Frame_ID="frame",
@@ -51,10 +48,7 @@ def ngsim_rows(scene: pl.DataFrame, start_ms: int = START_MS) -> pl.DataFrame:
         v_Vel=feet(pl.col("speed")),
         v_Acc=pl.lit(0.0),
         Lane_ID=3 - pl.col("lane"),
-        Preceding=nobody,
-        Following=nobody,
-        Space_Headway=nobody,
-        Time_Headway=nobody,
+        **dict.fromkeys(("Preceding", "Following", "Space_Headway", "Time_Headway"), pl.lit(0)),
     )
 
 
@@ -63,11 +57,11 @@ def raw_text(rows: pl.DataFrame) -> str:
     return "".join(" " + "  ".join(map(str, row)) + " \t\r\n" for row in rows.iter_rows())
 
 
-def portal_csv(rows: pl.DataFrame, location: str = "us-101", thousands: bool = True) -> str:
+def portal_csv(rows: pl.DataFrame, location: str = "us-101") -> str:
     """The portal's CSV: lower-case names, a location, numbers with commas between thousands."""
 
     def field(value) -> str:
-        if thousands and not isinstance(value, str) and abs(value) >= 1000:
+        if not isinstance(value, str) and abs(value) >= 1000:
             whole, dot, rest = str(value).partition(".")
             return f'"{int(whole):,}{dot}{rest}"'
         return str(value)
@@ -84,27 +78,23 @@ def write_highd(folder: Path, name: str = "01", seconds: float = 8.0) -> None:
     the lower outer lane.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    rows = [
-        (
-            frame,
-            vehicle,
-            centre_x + speed * (frame - 1) / 25.0 - 2.5,
-            centre_y - 1.0,
-            5.0,
-            2.0,
-            speed,
-            0.0,
-            lane,
-        )
-        for vehicle, (centre_x, speed, centre_y, lane) in HIGHD_CARS.items()
-        for frame in range(1, int(25 * seconds) + 1)
-    ]
-    names = ["frame", "id", "x", "y", "width", "height", "xVelocity", "yVelocity", "laneId"]
-    pl.DataFrame(rows, schema=names, orient="row").write_csv(folder / f"{name}_tracks.csv")
-    meta = [(vehicle, 1 if speed < 0 else 2) for vehicle, (_, speed, _, _) in HIGHD_CARS.items()]
-    pl.DataFrame(meta, schema=["id", "drivingDirection"], orient="row").write_csv(
-        folder / f"{name}_tracksMeta.csv"
-    )
+    frame = np.arange(1, int(25 * seconds) + 1)
+    tracks = []
+    for vehicle, (centre_x, speed, centre_y, lane) in HIGHD_CARS.items():
+        track = {
+            "frame": frame,
+            "id": vehicle,
+            "x": centre_x + speed * (frame - 1) / 25.0 - 2.5,
+            "y": centre_y - 1.0,
+            "width": 5.0,
+            "height": 2.0,
+            "xVelocity": speed,
+            "laneId": lane,
+        }
+        tracks.append(pl.DataFrame(track))
+    pl.concat(tracks).write_csv(folder / f"{name}_tracks.csv")
+    cars = {"id": list(HIGHD_CARS), "drivingDirection": [1, 1, 2, 2]}
+    pl.DataFrame(cars).write_csv(folder / f"{name}_tracksMeta.csv")
     recording = {
         "id": 1,
         "frameRate": 25,
@@ -124,7 +114,7 @@ def damage_field(path: Path, column: str, row: int, value: str) -> None:
 
 def recorded_cars(**size) -> list[Recording]:
     """Synthetic scenes as recordings."""
-    return recordings_of(synthetic_scenes(SyntheticTraffic(**size)))
+    return recordings_of(synthetic_scenes(**size))
 
 
 def made_by_hand(x, y=None, speed=0.0, lanes=3, name="scene", **changed) -> Recording:
@@ -148,9 +138,17 @@ def made_by_hand(x, y=None, speed=0.0, lanes=3, name="scene", **changed) -> Reco
 
 def following_file(path: Path) -> None:
     """An I-80 file of one follower behind its leader: 20 s at 7 m/s, a gap of 10 m."""
-    rows = [("0400pm", 2, 1, frame, 0.7 * frame, 0.7 * frame + 16.0, 6.0) for frame in range(200)]
-    names = ["period", "follower", "leader", "frame", "x_follower", "x_leader", "leader_length"]
-    pl.DataFrame(rows, schema=names, orient="row").write_csv(path)
+    frame = np.arange(200)
+    rows = {
+        "period": "0400pm",
+        "follower": 2,
+        "leader": 1,
+        "frame": frame,
+        "x_follower": 0.7 * frame,
+        "x_leader": 0.7 * frame + 16.0,
+        "leader_length": 6.0,
+    }
+    pl.DataFrame(rows).write_csv(path)
 
 
 #: Vehicle: first centre along the picture, speed, centre across the picture (downwards), highD's

@@ -1,13 +1,11 @@
-"""Small generators, quick settings of fits, and scenes to fit to."""
+"""Small generators, and quick settings of fits."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import torch
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
 
-from ganlane.data.dense import Recording, recordings_of
 from ganlane.generator.networks import Generator
 from ganlane.native.drivers import GeneratedDrivers
 from ganlane.settings.driving import IdmParameters
@@ -56,9 +54,3 @@ def silenced(generator: Generator) -> Generator:
     torch.nn.init.zeros_(generator.head.weight)
     torch.nn.init.zeros_(generator.head.bias)
     return generator
-
-
-def recorded_scenes() -> list[Recording]:
-    """Two synthetic scenes of 8 s with seven vehicles on three lanes of 3.5 m."""
-    frame = synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=7, seconds=8.0))
-    return [replace(scene, lane_width_m=3.5) for scene in recordings_of(frame)]

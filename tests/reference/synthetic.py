@@ -37,9 +37,12 @@ class SyntheticTraffic:
     changing_share: float = 0.3
 
 
-def synthetic_scenes(traffic: SyntheticTraffic | None = None, seed: int = 0) -> pl.DataFrame:
-    """A frame in the schema with the scenes ``synthetic-0``, ``synthetic-1`` and so on."""
-    traffic = traffic or SyntheticTraffic()
+def synthetic_scenes(seed: int = 0, **size: float) -> pl.DataFrame:
+    """A frame in the schema with the scenes ``synthetic-0``, ``synthetic-1`` and so on.
+
+    ``size`` is :class:`SyntheticTraffic`'s.
+    """
+    traffic = SyntheticTraffic(**size)
     return sort(pl.concat(_scene(traffic, number, seed) for number in range(traffic.scenes)))
 
 

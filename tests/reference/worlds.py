@@ -26,6 +26,7 @@ from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
 
 DOUBLE = torch.float64
 DEFAULTS = {
+    "x": 0.0,
     "heading": 0.0,
     "speed": 20.0,
     "acceleration": 0.0,

@@ -85,14 +85,13 @@ def test_drivers_are_compared_on_the_same_episodes_training_by_training(matrix):
 def test_trainings_are_matched_by_their_seed():
     crash, goal = ["hard_crash", "goal"], ["goal", "goal"]
     trainings = {
-        "agent_gan": {0: goal, 1: crash, 4: goal},
-        "agent_idm": {2: goal, 1: crash},
+        "agent_gan@0": goal,
+        "agent_gan@1": crash,
+        "agent_gan@4": goal,
+        "agent_idm@2": goal,
+        "agent_idm@1": crash,
     }
-    frames = [
-        driven(f"{agent}@{seed}", [0, 0], ends)
-        for agent, by_seed in trainings.items()
-        for seed, ends in by_seed.items()
-    ]
+    frames = [driven(name, [0, 0], ends) for name, ends in trainings.items()]
     (row,) = comparisons(table_of(*frames), [("agent_gan", "agent_idm")])
     assert row["mcnemar"] == [
         {"driver": "agent_gan@1", "only_first": 0, "only_second": 0, "p_value": 1.0}

@@ -4,7 +4,7 @@ import pytest
 import torch
 from reference.foreign import MAKE
 from reference.refusals import user_error
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 from reference.worlds import environment, same_bits
 from tensordict import TensorDict
 
@@ -24,7 +24,7 @@ SHARES = {"idm": 1, "idm_faults": 1}
 
 
 def replay():
-    scenes = sort(synthetic_scenes(SyntheticTraffic(scenes=2, lanes=3, seconds=8.0)))
+    scenes = sort(synthetic_scenes(scenes=2, lanes=3, seconds=8.0))
     return ReplayTraffic(recordings=scenes)
 
 

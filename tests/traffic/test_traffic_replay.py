@@ -6,7 +6,7 @@ import pytest
 import torch
 from reference.refusals import user_error
 from reference.scene_csv import write_scene_csv
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 from reference.worlds import episode_keys
 from scipy.stats import chisquare
 
@@ -76,7 +76,7 @@ def recorded(scenes=4):
     """Synthetic scenes of which the k-th has 2 + k % 3 lanes and loses its last k half seconds."""
     parts = []
     for k in range(scenes):
-        frame = synthetic_scenes(SyntheticTraffic(scenes=1, lanes=2 + k % 3, seconds=8.0), seed=k)
+        frame = synthetic_scenes(scenes=1, lanes=2 + k % 3, seconds=8.0, seed=k)
         cut = frame.filter(pl.col("frame") < 80 - 5 * k)
         parts.append(cut.with_columns(scene=pl.lit(f"scene-{k}")))
     return sort(pl.concat(parts))
@@ -108,9 +108,9 @@ def test_lanes_and_their_width_are_the_scenes_own():
 
 
 def test_every_step_is_what_a_search_through_the_rows_finds():
-    size = SyntheticTraffic(scenes=2, vehicles=14, seconds=7.0, changing_share=0.6)
+    frame = synthetic_scenes(seed=3, scenes=2, vehicles=14, seconds=7.0, changing_share=0.6)
     # Some come later and some leave early.
-    frame = synthetic_scenes(size, seed=3).filter(
+    frame = frame.filter(
         (pl.col("frame") >= 2 * (pl.col("vehicle") % 4))
         & (pl.col("frame") < 70 - pl.col("vehicle"))
     )
@@ -168,7 +168,7 @@ def test_heading_and_acceleration_are_those_of_the_path():
 
 
 def test_a_scene_file_is_read(tmp_path):
-    frame = synthetic_scenes(SyntheticTraffic(scenes=2, seconds=6.0))
+    frame = synthetic_scenes(scenes=2, seconds=6.0)
     write_scene_csv(frame, tmp_path / "mine.csv")
     assert ReplayTraffic(path=tmp_path / "mine.csv").scene_names == (
         "synthetic-0",

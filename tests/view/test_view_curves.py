@@ -17,12 +17,6 @@ def runs(tmp_path):
     return read_runs(folders)
 
 
-def test_a_line_is_the_metric_over_the_decisions(runs):
-    (line,) = panels(draw_runs({"a": runs["a"]}))["crash rate"].lines
-    assert line.get_xdata().tolist() == [10_000 * k for k in range(1, 31)]
-    assert line.get_ydata() == pytest.approx(0.5 - 0.01 * np.arange(30))
-
-
 def test_every_panel_shows_every_run_that_has_its_numbers_in_the_run_s_colour(runs):
     figure = draw_runs(runs)
     drawn = panels(figure)
@@ -40,11 +34,18 @@ def test_every_panel_shows_every_run_that_has_its_numbers_in_the_run_s_colour(ru
     assert drawn["crash rate"].xaxis.get_major_formatter()(250_000) == "250 k"
 
 
-def test_missing_values_are_left_out_and_runs_without_numbers_are_refused(runs):
-    (line,) = panels(draw_runs({"a": runs["a"]}))["mean Q (replayed)"].lines
-    # the first three rows have no Q-value
+def test_a_line_is_the_metric_over_the_decisions_without_missing_values(runs):
+    drawn = panels(draw_runs({"a": runs["a"]}))
+    (line,) = drawn["crash rate"].lines
+    assert line.get_xdata().tolist() == [10_000 * k for k in range(1, 31)]
+    assert line.get_ydata() == pytest.approx(0.5 - 0.01 * np.arange(30))
+    # The first three rows have no Q-value.
+    (line,) = drawn["mean Q (replayed)"].lines
     assert line.get_ydata()[0] == pytest.approx(0.3)
     assert len(line.get_xdata()) == 27
+
+
+def test_runs_without_numbers_are_refused():
     with user_error("foreign: no numbers"):
         draw_runs({"foreign": [pl.DataFrame({"decisions": [1], "other": [2.0]})]})
 

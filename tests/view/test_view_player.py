@@ -45,8 +45,7 @@ def test_the_page_says_where_everybody_is():
     assert (shown["agent"], shown["traffic"], shown["lanes"]) == ("mobil", "idm", 3)
     x = np.array(list(accumulate(shown["x"][1]))) * data["units"]["x"]
     assert x == pytest.approx(episode.x[:, 1], abs=0.006)
-    assert shown["action_values"] == []
-    assert shown["reward"] == []
+    assert shown["action_values"] == shown["reward"] == []
 
 
 def test_reward_and_values_belong_to_the_decision_that_begins():

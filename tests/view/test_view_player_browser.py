@@ -7,16 +7,10 @@ import json
 
 import numpy as np
 import pytest
-from view_browser import browser_page, find_browser
+from view_browser import browser_page
 from view_scenes import straight
 
 from ganlane.view import EpisodeLabel, write_player
-
-BROWSER = find_browser()
-if BROWSER is None:
-    pytest.skip(
-        "no chromium found; CI installs it: apt-get install chromium", allow_module_level=True
-    )
 
 CLOCK = "parseFloat(document.getElementById('time').textContent)"
 
@@ -38,7 +32,7 @@ def learned():
 def pages(tmp_path_factory):
     folder = tmp_path_factory.mktemp("player")
     path = write_player([straight([0, 40], [1, 2], 100), learned()], folder / "player.html")
-    with browser_page(BROWSER, folder / "profile") as page:
+    with browser_page(folder / "profile") as page:
         yield page, path
 
 

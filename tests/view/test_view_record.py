@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 import torch
 from reference.refusals import user_error
-from reference.synthetic import SyntheticTraffic, synthetic_scenes
+from reference.synthetic import synthetic_scenes
 from tensordict.nn import TensorDictModule
 from torchrl.envs import GymEnv
 from view_scenes import straight
@@ -43,13 +43,12 @@ def test_the_recording_has_a_frame_per_physics_step():
     env = highway()
     trajectory = recorded(env, seed=4, episode=7, agent="keep_lane", traffic="idm_mobil")
     state = env.reset(env.reset().update({"seed": torch.tensor([4]), "episode": torch.tensor([7])}))
-    places = [state["vehicles", "x"][0].double().numpy()]
+    assert trajectory.x[0] == pytest.approx(state["vehicles", "x"][0].numpy())
     while not state["done"].any():
         state = env.step_mdp(env.step(state.set("action", torch.tensor([0]))))
-        places.append(state["vehicles", "x"][0].double().numpy())
+    assert trajectory.x[-1] == pytest.approx(state["vehicles", "x"][0].numpy())
     assert len(trajectory) == int(state["step"]) + 1
     assert trajectory.time_s[-1] == pytest.approx(0.1 * int(state["step"]))
-    assert trajectory.x[[0, -1]] == pytest.approx(np.stack(places)[[0, -1]])
     assert trajectory.x[-1, 0] >= 60.0 > trajectory.x[-2, 0]
     assert trajectory.outcome == "goal"
     assert trajectory.action.tolist() == [-1] + [0] * (len(trajectory) - 1)
@@ -61,7 +60,7 @@ def test_the_label_has_the_road_of_the_replayed_scene():
     """Three scenes of 2, 3 and 4 lanes: the environment's own road has the lanes of the widest."""
     scenes = []
     for lanes in (2, 3, 4):
-        scene = synthetic_scenes(SyntheticTraffic(scenes=1, lanes=lanes, seconds=7.0))
+        scene = synthetic_scenes(scenes=1, lanes=lanes, seconds=7.0)
         scenes.append(scene.with_columns(scene=pl.lit(str(lanes))))
     traffic = ReplayTraffic(recordings=sort(pl.concat(scenes)), least_s=5.0)
     env = HighwayEnv(traffic, 1, vehicles=5)
@@ -127,7 +126,6 @@ def test_parquet_comes_back_exactly(tmp_path):
         one = scene.filter(vehicle=3)
         assert one["x"].to_numpy() == pytest.approx(episode.x[:, 3])
         assert one["speed"].to_numpy() == pytest.approx(episode.speed[:, 3])
-    assert read["scene"].n_unique() == 2
 
 
 def test_episodes_that_would_share_a_name_are_numbered(tmp_path):

@@ -7,17 +7,15 @@ from PIL.ImageColor import getrgb
 from ganlane.view import EpisodeLabel, Trajectory
 
 
-def straight(positions, lanes_of, frames=20, lanes=3, speed=20.0, outcome="", **changed):
-    """Vehicles that start at ``positions`` (m) in ``lanes_of`` and all drive at ``speed`` for
-    ``frames`` frames.
-    """
+def straight(positions, lanes_of, frames=20, **changed):
+    """Vehicles that start at ``positions`` (m) in ``lanes_of`` and drive at 20 m/s."""
     time = np.arange(frames) * 0.1
     full = np.ones((frames, len(positions)))
-    constant = {"heading": 0.0, "speed": speed, "acceleration": 0.0, "length": 4.5, "width": 2.5}
+    constant = {"heading": 0.0, "speed": 20.0, "acceleration": 0.0, "length": 4.5, "width": 2.5}
     fields = {
-        "label": EpisodeLabel("mobil", "idm", 1, 2, lanes, 4.0),
+        "label": EpisodeLabel("mobil", "idm", 1, 2, 3, 4.0),
         "time_s": time,
-        "x": np.asarray(positions, float) + speed * time[:, None],
+        "x": np.asarray(positions, float) + 20.0 * time[:, None],
         "y": full * np.asarray(lanes_of, float) * 4.0,
         **{name: value * full for name, value in constant.items()},
         "target_lane": (full * np.asarray(lanes_of)).astype(np.int64),
@@ -27,8 +25,9 @@ def straight(positions, lanes_of, frames=20, lanes=3, speed=20.0, outcome="", **
         "action_values": np.full((frames, 3), np.nan),
         "reward": np.full(frames, np.nan),
         "soft_crash_s": np.empty(0),
+        "outcome": "",
     }
-    return Trajectory(**{**fields, "outcome": outcome, **changed})
+    return Trajectory(**{**fields, **changed})
 
 
 def near(picture, colour, tolerance=6):

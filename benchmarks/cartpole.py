@@ -32,7 +32,7 @@ from ganlane.evaluation.table import Table
 from ganlane.settings.train import LoggerConfig, TrainConfig
 from ganlane.training.loop import train
 
-BEGIN, END = "<!-- cartpole: begin -->", "<!-- cartpole: end -->"
+SECTION = "cartpole"
 #: CartPole ends after 500 steps; with a discount of 0.99 a perfect policy's return is 99.3. Noise
 #: alone explores.
 CONFIG = RainbowConfig(
@@ -151,7 +151,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
 
 def measure(options: argparse.Namespace) -> str:
     """Run all seeds; the table, in the document too where one is named."""
-    section = ReportSection(options.report, BEGIN, END)
+    section = ReportSection(options.report, SECTION)
     outcomes = []
     for seed in range(options.seeds):
         outcomes.append(run(seed, options.frames))
@@ -166,7 +166,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = make_parser(__doc__)
     parser.add_argument("--frames", type=int, default=300_000, help="at most, per seed")
     parser.add_argument("--seeds", type=int, default=5)
-    add_report(parser, BEGIN, END)
+    add_report(parser, SECTION)
     return run_script(measure, parser.parse_args(arguments))
 
 

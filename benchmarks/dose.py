@@ -28,7 +28,7 @@ import polars as pl
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from benchmarks.script import ReportSection, add_report, make_parser, markdown, run_script
+from benchmarks.script import ROOT, ReportSection, add_report, make_parser, markdown, run_script
 from ganlane import api
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Estimate, difference, entries
@@ -62,10 +62,9 @@ MOST_SEEDS = 10
 SCORES = ("reward", "failures")
 DECISIONS = 1_500_000
 ROWS = 256
-#: Around the two tables in a document.
-MARKERS = ("<!-- begin dose -->", "<!-- end dose -->")
-TRANSFER = ("<!-- begin dose traffics -->", "<!-- end dose traffics -->")
-FIGURE = Path(__file__).parents[1] / "docs" / "figures" / "dose.png"
+#: Of the two tables in a document.
+SECTIONS = ("dose", "dose traffics")
+FIGURE = ROOT / "docs" / "figures" / "dose.png"
 
 
 class Training(NamedTuple):
@@ -258,10 +257,10 @@ def measure(arguments: argparse.Namespace) -> str:
     """One of the three."""
     folder = arguments.folder
     if arguments.action == "table":
-        sections = [ReportSection(arguments.report, *markers) for markers in (MARKERS, TRANSFER)]
+        sections = [ReportSection(arguments.report, name) for name in SECTIONS]
         tables = [dose_table(folder), transfer_table(folder)]
         for section, table in zip(sections, tables):
-            section.write(f"\n{markdown(table)}\n")
+            section.write(markdown(table))
         return "\n\n".join(table.text() for table in tables)
     if arguments.action == "figure":
         return f"figure: {save_figure(draw_effects(list(effects(folder))), arguments.out)}"
@@ -286,7 +285,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--properties", nargs="+", choices=tuple(DOSES), default=tuple(DOSES), help="of training"
     )
-    add_report(parser, *MARKERS)
+    add_report(parser, SECTIONS[0])
     parser.add_argument("--out", type=Path, default=FIGURE, help="the figure's file")
     parser.add_argument(
         "--part",

@@ -22,13 +22,12 @@ from typing import Any
 import torch
 from safetensors.torch import load_file
 
-from benchmarks.script import make_parser, run_script
+from benchmarks.script import ROOT, make_parser, run_script
 from ganlane import api, keys
 from ganlane.errors import UserError
 from ganlane.evaluation.table import Table
 from ganlane.files import write_json
 
-ROOT = Path(__file__).resolve().parents[1]
 ROWS = 64
 DECISIONS = 20
 #: What only some machines have, or needs a file.

@@ -20,11 +20,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from benchmarks import printed
-from benchmarks.script import make_parser, run_script
+from benchmarks.script import ROOT, make_parser, run_script
 from ganlane.view.curves import plot_middle, read_metrics
 from ganlane.view.figures import COLOURS, FAINT, STYLE, add_legend, save_figure
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = ROOT / "docs"
 
 
 def read_curves(folders: Sequence[Path]) -> pl.DataFrame:

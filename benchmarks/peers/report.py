@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,24 +20,6 @@ from ganlane.sim.idm import TABLE_V
 from ganlane.view.figures import COLOURS, INK, STYLE, save_figure
 
 Figures = dict[str, Any]
-
-
-def page(figures: Figures) -> str:
-    """All tables, one below the other."""
-    return "\n\n".join(part(figures) for part in PARTS.values())
-
-
-def fill(text: str, figures: Figures) -> str:
-    """``text`` with a new table between every ``<!-- NAME -->`` of :data:`PARTS` and the next
-    ``<!-- end -->``.
-    """
-
-    def replaced(match: re.Match[str]) -> str:
-        return f"<!-- {match[1]} -->\n\n{PARTS[match[1]](figures)}\n\n<!-- end -->"
-
-    return re.sub(
-        rf"<!-- ({'|'.join(PARTS)}) -->\n.*?<!-- end -->", replaced, text, flags=re.DOTALL
-    )
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
@@ -125,6 +106,7 @@ def versions_line(figures: Figures) -> str:
     return ", ".join(f"{name} {version}" for name, version in figures["versions"].items())
 
 
+#: Of the page, by name.
 PARTS: dict[str, Callable[[Figures], str]] = {
     "traces": traces_table,
     "settled": settled_table,

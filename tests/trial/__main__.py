@@ -28,7 +28,7 @@ from .kill import kill
 from .soak import once, soak
 from .tally import Tally
 
-MARKERS = "<!-- begin trial -->", "<!-- end trial -->"
+SECTION = "trial"
 #: Parts, and their shares of the minutes.
 SHARES = {"kill": 6, "damage": 4, "soak": 8}
 HEAD = "| part | tried | failed | minutes |\n|---|---|---|---|"
@@ -60,7 +60,7 @@ def parse() -> argparse.Namespace:
     add("--configurations", type=int, default=500, help="that soak drives")
     add("--input", metavar="KIND:NUMBER", help="one damaged file, as a failure names it")
     add("--configuration", type=int, help="one configuration, as a failure names it")
-    add_report(parser, *MARKERS)
+    add_report(parser, SECTION)
     return parser.parse_args()
 
 
@@ -68,7 +68,7 @@ def attempt(options: argparse.Namespace) -> str:
     """The chosen parts one after the other, and their table; a failure ends the process with 1."""
     # Before the folder changes, which a relative path would not survive.
     document = None if options.report is None else options.report.absolute()
-    report = ReportSection(document, *MARKERS)
+    report = ReportSection(document, SECTION)
     whole = sum(SHARES[part] for part in options.parts)
     with tempfile.TemporaryDirectory(prefix="trial-") as name:
         scratch = Path(name)

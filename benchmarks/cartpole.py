@@ -161,14 +161,9 @@ def measure(options: argparse.Namespace) -> str:
     return text
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure; the exit status."""
+if __name__ == "__main__":
     parser = make_parser(__doc__)
     parser.add_argument("--frames", type=int, default=300_000, help="at most, per seed")
     parser.add_argument("--seeds", type=int, default=5)
     add_report(parser, SECTION)
-    return run_script(measure, parser.parse_args(arguments))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_script(measure, parser.parse_args()))

@@ -263,7 +263,7 @@ def measure(arguments: argparse.Namespace) -> str:
             section.write(markdown(table))
         return "\n\n".join(table.text() for table in tables)
     if arguments.action == "figure":
-        return f"figure: {save_figure(draw_effects(list(effects(folder))), arguments.out)}"
+        return f"figure: {save_figure(draw_effects(list(effects(folder))), FIGURE)}"
     part, parts = arguments.part
     return train(folder, list(trainings(arguments.seeds, arguments.properties))[part::parts])
 
@@ -286,7 +286,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--properties", nargs="+", choices=tuple(DOSES), default=tuple(DOSES), help="of training"
     )
     add_report(parser, SECTIONS[0])
-    parser.add_argument("--out", type=Path, default=FIGURE, help="the figure's file")
     parser.add_argument(
         "--part",
         type=part_of_many,

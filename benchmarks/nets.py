@@ -15,7 +15,7 @@ import hashlib
 import json
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -133,13 +133,8 @@ def run(arguments: argparse.Namespace) -> str:
     return compare(json.loads(arguments.file.read_text(encoding="utf-8")), digests())
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The script."""
+if __name__ == "__main__":
     parser = make_parser(__doc__)
     parser.add_argument("task", choices=("make", "compare"))
     parser.add_argument("file", type=Path)
-    return run_script(run, parser.parse_args(arguments))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_script(run, parser.parse_args()))

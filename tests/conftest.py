@@ -1,4 +1,6 @@
-"""Settings of the whole suite; makes the plain helper modules of ``tests/reference`` importable."""
+"""Settings of the whole suite; makes the helper modules of ``tests/reference`` and the scripts of
+``benchmarks/`` importable.
+"""
 
 import gc
 import os
@@ -13,7 +15,7 @@ import pytest
 import torch
 from hypothesis import settings
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path[:0] = [str(place) for place in Path(__file__).parents[:2]]
 
 # Nothing is left in the user's cache; all processes of a run have one, for one built kernel.
 if "PYTEST_XDIST_WORKER" not in os.environ:

@@ -14,7 +14,6 @@ from reference.refusals import last_path, user_error
 import ganlane
 from ganlane.__main__ import main
 from ganlane.agents.drivers import DRIVERS
-from ganlane.config.run import COMMANDS, function_of
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.traffic import GanTrafficConfig
 from ganlane.traffic import IdmTraffic
@@ -113,13 +112,6 @@ def test_a_run_is_trained_resumed_and_evaluated():
     assert table["mean_reward"][0] == run.table["mean_reward"][0]
     more = ganlane.api.train(total_decisions=512, folder="run", resume=True)
     assert more.results["decisions"] >= 512
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_its_function(command):
-    if command == "record":
-        pytest.importorskip("minari")
-    assert function_of(command).__name__ == command
 
 
 def test_the_short_blocks_in_the_docs_run(capsys):

@@ -178,8 +178,8 @@ HIGHWAYS = [(traffic, {}) for traffic in [*TRAFFICS[1:], MIXED]]
 HIGHWAYS += [("idm", {"actions": form}) for form in ("lane_speed", "continuous")]
 HIGHWAYS += [("idm_mobil", {"env": "lane_drop", "recycle": False})]
 #: Some enter and some leave.
-FLOW = {"vph": 1200.0, "ramp_vph": 900.0, "exit_share": 0.3, "slots": 20}
-HIGHWAYS += [("idm_mobil", {"env": "weave", "flow": FLOW})]
+FLOW = {"vph": 1200.0, "ramp_vph": 900.0, "exit_share": 0.3, "slots": 20, "to_m": 210.0}
+HIGHWAYS += [("idm_mobil", {"env": "weave", "scene": {"merge_m": 50.0}, "flow": FLOW})]
 
 
 @pytest.fixture(scope="module", params=HIGHWAYS, ids=str)

@@ -59,6 +59,7 @@ HELD_OUT = ("idm_faults", "idm_random", "gan_calibrated")
 MET = ("idm_mobil", "human", "gan")
 EPISODES = 300
 MOST_SEEDS = 10
+#: The second per 1000 episodes.
 SCORES = ("reward", "failures")
 DECISIONS = 1_500_000
 ROWS = 256
@@ -168,8 +169,7 @@ class Effect(NamedTuple):
 
     training: Training
     seeds: int
-    reward: Estimate
-    failures: Estimate  # per 1000 episodes
+    scores: dict[str, Estimate]  # by :data:`SCORES`
 
 
 def effects(folder: Path) -> Iterator[Effect]:
@@ -181,14 +181,14 @@ def effects(folder: Path) -> Iterator[Effect]:
     baseline = scores(folder, Training())
     if not baseline:
         raise UserError(f"--folder {folder}: no finished trainings; run 'train' first.")
-    reward, failures = (Estimate(float(baseline[name].mean())) for name in SCORES)
-    yield Effect(Training(), len(baseline["reward"]), reward, failures)
+    means = {name: Estimate(float(values.mean())) for name, values in baseline.items()}
+    yield Effect(Training(), len(baseline["reward"]), means)
     for name, doses in DOSES.items():
         for dose in doses:
             changed = scores(folder, Training(name, dose))
             if changed:
-                reward, failures = (difference(changed[n], baseline[n]) for n in SCORES)
-                yield Effect(Training(name, dose), len(changed["reward"]), reward, failures)
+                changes = {score: difference(changed[score], baseline[score]) for score in SCORES}
+                yield Effect(Training(name, dose), len(changed["reward"]), changes)
 
 
 def dose_table(folder: Path) -> Table:
@@ -196,11 +196,11 @@ def dose_table(folder: Path) -> Table:
     rows = []
     for effect in effects(folder):
         varied, dose, _ = effect.training
-        reward, failures = (
-            with_interval(entries(name, getattr(effect, name)), name, 1) for name in SCORES
-        )
         dose = "" if dose is None else str(dose)
-        rows.append([varied, dose, str(effect.seeds), reward, failures])
+        cells = [
+            with_interval(entries(name, value), name, 1) for name, value in effect.scores.items()
+        ]
+        rows.append([varied, dose, str(effect.seeds), *cells])
     heads = ["property", "dose", "trainings", "reward", "failures/1000 episodes"]
     return Table("", heads, rows, names=2)
 
@@ -242,11 +242,12 @@ def draw_effects(changes: Sequence[Effect]) -> Figure:
         panel.set_xlim(-0.5, len(doses) - 0.5)
         for effect in changes:
             varied, dose, _ = effect.training
-            if varied != name or effect.reward.interval is None:
+            reward = effect.scores["reward"]
+            if varied != name or reward.interval is None:
                 continue
             place = doses.index(dose)
-            panel.plot([place, place], effect.reward.interval, color=COLOURS[0])
-            panel.plot(place, effect.reward.value, "o", color=COLOURS[0])
+            panel.plot([place, place], reward.interval, color=COLOURS[0])
+            panel.plot(place, reward.value, "o", color=COLOURS[0])
     for panel in panels[len(DOSES) :]:
         panel.set_axis_off()
     figure.supylabel("reward, difference to drivers as fitted")

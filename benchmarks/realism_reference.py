@@ -13,9 +13,7 @@ from ganlane.realism.driving import StartOptions
 from ganlane.realism.measures import SHIPPED_REFERENCE
 from ganlane.realism.starts import recorded_starts
 
-
-def main() -> None:
-    """Drive the reference drivers from all scenes, and write the file."""
+if __name__ == "__main__":
     path = default_scenes()
     frame = read_scenes(path)
     scenes = frame["scene"].unique().sort().to_list()
@@ -23,7 +21,3 @@ def main() -> None:
     floors = floors_of(starts.driven, starts.recorded.counts)
     replace(starts.reference, floors=floors).save(SHIPPED_REFERENCE)
     print(f"wrote {SHIPPED_REFERENCE}")
-
-
-if __name__ == "__main__":
-    main()

@@ -74,7 +74,7 @@ class Reader(NamedTuple):
 def make_files(folder: Path) -> None:
     """One good file of each kind."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name in ("agent_idm", "generator_paper", "generator_calibrated"):
+    for name in ("agent_idm", "generator_paper"):
         shutil.copy(CHECKPOINTS / f"{name}.safetensors", folder)
     shutil.copy(SHIPPED_REFERENCE, folder / "reference.json")
     (folder / "scene.csv").write_text(SCENE)
@@ -133,7 +133,6 @@ JSON = (*TEXT, damages.in_json, damages.in_json)
 READERS = {
     "agent": Reader("agent_idm.safetensors", read_agent, WEIGHTS, True),
     "generator": Reader("generator_paper.safetensors", _generator, WEIGHTS, True),
-    "calibrated generator": Reader("generator_calibrated.safetensors", _generator, WEIGHTS, True),
     "last.pt": Reader("run/checkpoints/last.pt", _resumed, STATE, True, 1),
     "config.yaml": Reader("run/config.yaml", _resumed, TEXT, share=1),
     "metrics.csv, resumed": Reader("run/metrics.csv", read_rows, TEXT),
@@ -208,7 +207,9 @@ class Trial:
         except UserError as error:
             result = f"REFUSED {error}"
         except BaseException as error:
-            result = f"TRACEBACK after {way.__name__}: {traceback_of(error)}"
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            told = f"{type(error).__name__}: {error} ({place})"
+            result = f"TRACEBACK after {way.__name__}: {told}"
             if isinstance(error, OSError) and error.errno is not None:
                 result = f"REFUSED {error}"
         if Path("executed").exists():
@@ -233,14 +234,6 @@ def quietly(reader: Reader, path: Path, said: io.StringIO) -> Any:
     with redirect_stdout(said), redirect_stderr(said), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return reader.read(path)
-
-
-def traceback_of(error: BaseException) -> str:
-    """Where an error came from, in a line."""
-    place = traceback.extract_tb(error.__traceback__)
-    ours = next((frame for frame in reversed(place) if "/ganlane/" in frame.filename), place[-1])
-    where = f"{Path(ours.filename).name}:{ours.lineno}"
-    return f"{type(error).__name__} at {where}: {str(error)[:200]!r}"
 
 
 def bits(content: Any) -> bytes:

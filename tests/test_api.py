@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from reference.processes import python_blocks
 from reference.refusals import last_path, user_error
 
 import ganlane
@@ -115,10 +116,7 @@ def test_a_run_is_trained_resumed_and_evaluated():
 
 
 def test_the_short_blocks_in_the_docs_run(capsys):
-    page = (Path(__file__).parents[1] / "docs" / "python_api.md").read_text()
-    code = [
-        block for block in re.findall(r"```python\n(.*?)```", page, re.S) if not LONG.search(block)
-    ]
+    code = [block for block in python_blocks("python_api.md") if not LONG.search(block)]
     assert len(code) == 5
     names, text = {}, "\n".join(code)
     exec(

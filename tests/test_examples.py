@@ -6,7 +6,7 @@ import sys
 
 import pytest
 import torch
-from reference.processes import ROOT
+from reference.processes import ROOT, python_blocks
 
 #: Command line, with a budget that keeps a run to seconds, and what it must print, so that an
 #: example that does nothing fails.
@@ -52,10 +52,8 @@ def test_the_example_runs_and_prints_its_result(line, monkeypatch, capsys, empty
 
 
 def test_the_traffic_model_in_the_docs_is_the_one_that_runs():
-    shown = re.search(
-        r"```python\n(class Daydreamers.*?)```", (ROOT / "docs" / "traffic.md").read_text(), re.S
-    )
-    assert shown.group(1).strip() in (ROOT / "examples" / "own_traffic.py").read_text()
+    (shown,) = (block for block in python_blocks("traffic.md") if "class Daydreamers" in block)
+    assert shown.strip() in (ROOT / "examples" / "own_traffic.py").read_text()
 
 
 @pytest.mark.parametrize(

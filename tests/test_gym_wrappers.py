@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 from reference.gym_env import KEEP, LEFT, make, make_vec
-from reference.processes import ROOT
+from reference.processes import ROOT, python_blocks
 
 VECTOR = gymnasium.wrappers.vector
 MASKS_MAY_BE_ABSENT = tuple(map(int, re.findall(r"\d+", gymnasium.__version__)[:3])) >= (1, 2, 2)
@@ -40,7 +40,7 @@ def test_infos_of_a_batch_can_be_had_row_by_row():
 
 def test_the_code_in_the_docs_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "gymnasium.md").read_text(), re.S)
+    blocks = python_blocks("gymnasium.md")
     films = importlib.util.find_spec("moviepy") is not None
     names = {"np": np}
     exec("\n".join(block for block in blocks if films or "RecordVideo" not in block), names)

@@ -60,8 +60,8 @@ TRAFFICS = {
 }
 #: What the egos of the suite gymnasium do, and whether they keep their lanes.
 EGOS = {"random actions": False, "keeping its lane": True}
-#: Scenes of the suite scenarios: vehicles and lanes of each.
-SCENES = {"merge": (21, 3), "exit": (24, 4), "on_ramp": (20, 3)}
+#: Of the suite scenarios.
+SCENES = ("merge", "exit", "on_ramp")
 #: Suites that go through gymnasium.
 THROUGH_GYMNASIUM = ("gymnasium", "scenarios")
 #: Heading to cell of the tables' columns.
@@ -163,10 +163,7 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
     road = Road(options.traffics[0], options.vehicles, options.lanes)
     roads = [road]
     if options.suite == "scenarios":
-        roads = [
-            replace(road, scene=scene, vehicles=vehicles, lanes=lanes)
-            for scene, (vehicles, lanes) in SCENES.items()
-        ]
+        roads = [road.with_scene(scene) for scene in SCENES]
     rows = []
     egos = list(EGOS) if options.suite in THROUGH_GYMNASIUM else [""]
     groups = itertools.product(options.threads, options.batches, roads, egos)

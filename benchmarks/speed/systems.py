@@ -50,6 +50,11 @@ class Road:
     lanes: int = 3
     scene: str = "highway"
 
+    def with_scene(self, scene: str) -> Road:
+        """The road of a scene, which sets vehicles and lanes itself."""
+        env = ganlane.make_env(env=scene).base_env
+        return replace(self, scene=scene, vehicles=env.vehicles, lanes=env.road.lanes)
+
     def keys_of(self, mode: str) -> dict[str, Any]:
         """Keywords of :func:`ganlane.make_env` and of ``gymnasium.make`` for a mode."""
         shared = {
@@ -59,7 +64,6 @@ class Road:
             "kernel": "native" if mode == "native" else "torch",
         }
         if self.scene != "highway":
-            # It sets vehicles and lanes itself.
             return {**shared, "env": self.scene}
         return {
             **shared,

@@ -32,7 +32,7 @@ from ganlane.evaluation.table import Table
 from ganlane.settings.train import LoggerConfig, TrainConfig
 from ganlane.training.loop import train
 
-BEGIN, END = "<!-- cartpole: begin -->", "<!-- cartpole: end -->"
+SECTION = "cartpole"
 #: CartPole ends after 500 steps; with a discount of 0.99 a perfect policy's return is 99.3. Noise
 #: alone explores.
 CONFIG = RainbowConfig(
@@ -53,6 +53,8 @@ CONFIG = RainbowConfig(
     epsilon=0.0,
 )
 ENVIRONMENTS, EPISODES, EVERY, GOAL = 8, 100, 5_000, 475.0
+#: At most, of each seed.
+FRAMES = 300_000
 
 
 class Solved(Exception):
@@ -116,12 +118,12 @@ def evaluate(policy: GreedyPolicy) -> dict[str, float]:
     return {"mean_reward": float(returns.mean())}
 
 
-def run(seed: int, frames: int) -> Outcome:
+def run(seed: int) -> Outcome:
     """Train one seed."""
     outcome, begun = Outcome(seed), time.monotonic()
     agent = Rainbow(CONFIG, observation_size=4, actions=2, seed=seed)
     config = TrainConfig(
-        total_decisions=frames,
+        total_decisions=FRAMES,
         log_every=EVERY,
         evaluate_every=EVERY,
         checkpoint_every_s=1e9,
@@ -151,24 +153,18 @@ def table(outcomes: Sequence[Outcome]) -> str:
 
 def measure(options: argparse.Namespace) -> str:
     """Run all seeds; the table, in the document too where one is named."""
-    section = ReportSection(options.report, BEGIN, END)
+    section = ReportSection(options.report, SECTION)
     outcomes = []
     for seed in range(options.seeds):
-        outcomes.append(run(seed, options.frames))
+        outcomes.append(run(seed))
         print("seed {}: 475 at {} frames, best {}, {}".format(*outcomes[-1].cells()), flush=True)
     text = table(outcomes)
     section.write(text)
     return text
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure; the exit status."""
-    parser = make_parser(__doc__)
-    parser.add_argument("--frames", type=int, default=300_000, help="at most, per seed")
-    parser.add_argument("--seeds", type=int, default=5)
-    add_report(parser, BEGIN, END)
-    return run_script(measure, parser.parse_args(arguments))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = make_parser(__doc__)
+    parser.add_argument("--seeds", type=int, default=5)
+    add_report(parser, SECTION)
+    sys.exit(run_script(measure, parser.parse_args()))

@@ -28,7 +28,7 @@ import polars as pl
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from benchmarks.script import ReportSection, add_report, make_parser, markdown, run_script
+from benchmarks.script import ROOT, ReportSection, add_report, make_parser, markdown, run_script
 from ganlane import api
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Estimate, difference, entries
@@ -59,13 +59,13 @@ HELD_OUT = ("idm_faults", "idm_random", "gan_calibrated")
 MET = ("idm_mobil", "human", "gan")
 EPISODES = 300
 MOST_SEEDS = 10
+#: The second per 1000 episodes.
 SCORES = ("reward", "failures")
 DECISIONS = 1_500_000
 ROWS = 256
-#: Around the two tables in a document.
-MARKERS = ("<!-- begin dose -->", "<!-- end dose -->")
-TRANSFER = ("<!-- begin dose traffics -->", "<!-- end dose traffics -->")
-FIGURE = Path(__file__).parents[1] / "docs" / "figures" / "dose.png"
+#: Of the two tables in a document.
+SECTIONS = ("dose", "dose traffics")
+FIGURE = ROOT / "docs" / "figures" / "dose.png"
 
 
 class Training(NamedTuple):
@@ -169,8 +169,7 @@ class Effect(NamedTuple):
 
     training: Training
     seeds: int
-    reward: Estimate
-    failures: Estimate  # per 1000 episodes
+    scores: dict[str, Estimate]  # by :data:`SCORES`
 
 
 def effects(folder: Path) -> Iterator[Effect]:
@@ -182,14 +181,14 @@ def effects(folder: Path) -> Iterator[Effect]:
     baseline = scores(folder, Training())
     if not baseline:
         raise UserError(f"--folder {folder}: no finished trainings; run 'train' first.")
-    reward, failures = (Estimate(float(baseline[name].mean())) for name in SCORES)
-    yield Effect(Training(), len(baseline["reward"]), reward, failures)
+    means = {name: Estimate(float(values.mean())) for name, values in baseline.items()}
+    yield Effect(Training(), len(baseline["reward"]), means)
     for name, doses in DOSES.items():
         for dose in doses:
             changed = scores(folder, Training(name, dose))
             if changed:
-                reward, failures = (difference(changed[n], baseline[n]) for n in SCORES)
-                yield Effect(Training(name, dose), len(changed["reward"]), reward, failures)
+                changes = {score: difference(changed[score], baseline[score]) for score in SCORES}
+                yield Effect(Training(name, dose), len(changed["reward"]), changes)
 
 
 def dose_table(folder: Path) -> Table:
@@ -197,11 +196,11 @@ def dose_table(folder: Path) -> Table:
     rows = []
     for effect in effects(folder):
         varied, dose, _ = effect.training
-        reward, failures = (
-            with_interval(entries(name, getattr(effect, name)), name, 1) for name in SCORES
-        )
         dose = "" if dose is None else str(dose)
-        rows.append([varied, dose, str(effect.seeds), reward, failures])
+        cells = [
+            with_interval(entries(name, value), name, 1) for name, value in effect.scores.items()
+        ]
+        rows.append([varied, dose, str(effect.seeds), *cells])
     heads = ["property", "dose", "trainings", "reward", "failures/1000 episodes"]
     return Table("", heads, rows, names=2)
 
@@ -243,11 +242,12 @@ def draw_effects(changes: Sequence[Effect]) -> Figure:
         panel.set_xlim(-0.5, len(doses) - 0.5)
         for effect in changes:
             varied, dose, _ = effect.training
-            if varied != name or effect.reward.interval is None:
+            reward = effect.scores["reward"]
+            if varied != name or reward.interval is None:
                 continue
             place = doses.index(dose)
-            panel.plot([place, place], effect.reward.interval, color=COLOURS[0])
-            panel.plot(place, effect.reward.value, "o", color=COLOURS[0])
+            panel.plot([place, place], reward.interval, color=COLOURS[0])
+            panel.plot(place, reward.value, "o", color=COLOURS[0])
     for panel in panels[len(DOSES) :]:
         panel.set_axis_off()
     figure.supylabel("reward, difference to drivers as fitted")
@@ -258,13 +258,13 @@ def measure(arguments: argparse.Namespace) -> str:
     """One of the three."""
     folder = arguments.folder
     if arguments.action == "table":
-        sections = [ReportSection(arguments.report, *markers) for markers in (MARKERS, TRANSFER)]
+        sections = [ReportSection(arguments.report, name) for name in SECTIONS]
         tables = [dose_table(folder), transfer_table(folder)]
         for section, table in zip(sections, tables):
-            section.write(f"\n{markdown(table)}\n")
+            section.write(markdown(table))
         return "\n\n".join(table.text() for table in tables)
     if arguments.action == "figure":
-        return f"figure: {save_figure(draw_effects(list(effects(folder))), arguments.out)}"
+        return f"figure: {save_figure(draw_effects(list(effects(folder))), FIGURE)}"
     part, parts = arguments.part
     return train(folder, list(trainings(arguments.seeds, arguments.properties))[part::parts])
 
@@ -286,8 +286,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--properties", nargs="+", choices=tuple(DOSES), default=tuple(DOSES), help="of training"
     )
-    add_report(parser, *MARKERS)
-    parser.add_argument("--out", type=Path, default=FIGURE, help="the figure's file")
+    add_report(parser, SECTIONS[0])
     parser.add_argument(
         "--part",
         type=part_of_many,

@@ -238,12 +238,7 @@ def draw(options: argparse.Namespace) -> str:
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw; the exit status."""
+if __name__ == "__main__":
     parser = make_parser(__doc__)
     parser.add_argument("--folder", type=Path, default=Path("docs/figures"))
-    return run_script(draw, parser.parse_args(arguments))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_script(draw, parser.parse_args()))

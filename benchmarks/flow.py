@@ -165,15 +165,10 @@ def report(arguments: argparse.Namespace) -> str:
     return table_of(results).text()
 
 
-def main() -> int:
-    """The script."""
+if __name__ == "__main__":
     parser = make_parser(__doc__)
     parser.add_argument("--vehicles", type=int, default=10_000, help="that leave, of a line")
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
     parser.add_argument("--traffics", nargs="+", default=list(TRAFFICS))
     parser.add_argument("--courtesy", type=float, default=MobilParameters.courtesy, help="m/s2")
-    return run_script(report, parser.parse_args())
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_script(report, parser.parse_args()))

@@ -24,7 +24,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from benchmarks.script import ReportSection, make_parser, markdown, run_script
+from benchmarks.script import ROOT, ReportSection, make_parser, markdown, run_script
 from ganlane.agents.stored_models import load_model, save_network
 from ganlane.build import Driver
 from ganlane.config.run import settings
@@ -37,7 +37,6 @@ from ganlane.suite.report import score_table
 from ganlane.suite.run import SCHEMA, drivers_of
 from ganlane.suite.scores import recipe_of
 
-ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "leaderboard"
 #: Documents, the stored results behind the table in each (None: all), and its columns (None: all).
 PAGES: Mapping[str, tuple[str | None, tuple[str, ...] | None]] = {
@@ -47,7 +46,8 @@ PAGES: Mapping[str, tuple[str | None, tuple[str, ...] | None]] = {
         ("entry", "score [95 %]", "worst traffic", "crashes", "near misses", "P(above MOBIL)"),
     ),
 }
-MARKERS = ("<!-- leaderboard: begin -->", "<!-- leaderboard: end -->")
+#: Of the table in a document.
+SECTION = "leaderboard"
 #: What is stored of a run's results.
 PARTS = ("schema", "suite", "protocol", "quick", "entries", "sample", "code", "machine", "written")
 #: Of each entry ``--check`` drives again so many episodes on so many traffics.
@@ -132,7 +132,7 @@ def differences() -> list[str]:
     return [
         f"{document}: differs; run `python -m benchmarks.leaderboard --write`."
         for document in PAGES
-        if ReportSection(ROOT / document, *MARKERS).read() != table(document)
+        if ReportSection(ROOT / document, SECTION).read() != table(document)
     ]
 
 
@@ -210,7 +210,7 @@ def work(options: argparse.Namespace) -> str:
             raise UserError(f"{wrong[0]}{more}; store what this code drives, or mend the code.")
         return f"{sum(map(len, rewards.values()))} sampled episodes came out as stored"
     for document in PAGES if options.write else ():
-        ReportSection(ROOT / document, *MARKERS).write(f"\n{table(document)}\n")
+        ReportSection(ROOT / document, SECTION).write(table(document))
     return "\n".join(differences()) or "the documents are as the stored results say"
 
 

@@ -15,20 +15,19 @@ import hashlib
 import json
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors.torch import load_file
 
-from benchmarks.script import make_parser, run_script
+from benchmarks.script import ROOT, make_parser, run_script
 from ganlane import api, keys
 from ganlane.errors import UserError
 from ganlane.evaluation.table import Table
 from ganlane.files import write_json
 
-ROOT = Path(__file__).resolve().parents[1]
 ROWS = 64
 DECISIONS = 20
 #: What only some machines have, or needs a file.
@@ -134,13 +133,8 @@ def run(arguments: argparse.Namespace) -> str:
     return compare(json.loads(arguments.file.read_text(encoding="utf-8")), digests())
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The script."""
+if __name__ == "__main__":
     parser = make_parser(__doc__)
     parser.add_argument("task", choices=("make", "compare"))
     parser.add_argument("file", type=Path)
-    return run_script(run, parser.parse_args(arguments))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_script(run, parser.parse_args()))

@@ -49,24 +49,17 @@ RECIPE = (
 WITHOUT_EFFECT = ("compile", "kernel")
 
 
-def save_agents(path: Path, agents: Mapping[int, Agent]) -> None:
-    """Write several trainings of one recipe into one file; ``path@SEED`` names each of them.
+def tensors_of(agents: Mapping[int, Agent]) -> dict[str, Tensor]:
+    """The weights of several trainings; the names of each begin with its seed.
 
     ``agents`` holds by seed what :func:`read_agent` gives. The scales of the noise are kept in half
     precision, everything that a greedy agent computes with as it is.
     """
-    # the names of a training's tensors begin with its seed
-    tensors = {
+    return {
         f"{seed}/{name}": value.half() if name.endswith("_sigma") else value
         for seed, (weights, _, _) in agents.items()
         for name, value in weights.items()
     }
-    described = {
-        str(seed): {**metadata, "network": network.description()}
-        for seed, (_, network, metadata) in agents.items()
-    }
-    # each agent's metadata by its seed, as text: JSON has no other keys
-    save_weights(path, SEVERAL, tensors, {"agents": described})
 
 
 def recipe_of(metadata: Mapping[str, Any]) -> dict[str, Any]:
@@ -127,21 +120,23 @@ def collect(folders: Sequence[str | Path]) -> dict[int, Agent]:
 
 
 def pack(options: argparse.Namespace) -> str:
-    """Write the file; the line that names it."""
+    """Write the agents into one file, ``FILE@SEED`` for each; the line that names it."""
     if options.out.suffix != ".safetensors":
         raise UserError(f"--out {options.out}: the name must end in .safetensors.")
     agents = collect(options.folders)
-    size = sum(
-        value.numel() * (2 if name.endswith("_sigma") else 4)
-        for agent in agents.values()
-        for name, value in agent[0].items()
-    )
+    tensors = tensors_of(agents)
+    size = sum(value.nbytes for value in tensors.values())
     if size > MOST_BYTES:
         raise UserError(
             f"--out {options.out}: {size / 1e6:.1f} MB, above {MOST_BYTES / 1e6:.0f}; "
             "give fewer runs."
         )
-    save_agents(options.out, agents)
+    # each agent's metadata by its seed, as text: JSON has no other keys
+    described = {
+        str(seed): {**metadata, "network": network.description()}
+        for seed, (_, network, metadata) in agents.items()
+    }
+    save_weights(options.out, SEVERAL, tensors, {"agents": described})
     written_mb = options.out.stat().st_size / 1e6
     return f"{options.out}: seeds {', '.join(map(str, agents))}; {written_mb:.1f} MB"
 

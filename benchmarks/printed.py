@@ -4,7 +4,7 @@ them.
     python -m benchmarks.printed          # print what is not as the results say
     python -m benchmarks.printed outputs/benchmark/RUN/results.json --write
 
-Tables stand between ``<!-- matrix NAME: begin -->`` and ``<!-- matrix NAME: end -->``. A test makes
+Tables stand between ``<!-- begin matrix NAME -->`` and ``<!-- end matrix NAME -->``. A test makes
 them again from ``docs/reproduce/results.json`` and from those of :data:`FURTHER`; it also looks up
 every figure with an interval, such as ``14.0 [3.2, 25.6]``, in the sections of :data:`CHECKED`.
 """
@@ -20,12 +20,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.script import ReportSection, make_parser, markdown, run_script
+from benchmarks.script import ROOT, ReportSection, make_parser, markdown, run_script
 from ganlane.errors import UserError
 from ganlane.evaluation.table import Table, with_interval, with_sign
 from ganlane.suite.report import PAPER_VI, PAPER_VII
 
-ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "reproduce" / "results.json"
 #: Folders below it with further results: ``ganlane benchmark`` with the control trainings,
 #: agent_general over more episodes and on traffics that are not the project's own, agent_human, and
@@ -362,11 +361,6 @@ SECTIONS: Mapping[tuple[str, str], Callable[[Results], str]] = {
 }
 
 
-def markers(name: str) -> tuple[str, str]:
-    """The lines around a table."""
-    return f"<!-- matrix {name}: begin -->", f"<!-- matrix {name}: end -->"
-
-
 def section(text: str, heading: str) -> str:
     """The part of a document from a heading to the next one of its level.
 
@@ -424,7 +418,7 @@ def differences(results: Results) -> list[str]:
     """What in the documents is not as the results say, one line each."""
     wrong = []
     for (document, name), table in SECTIONS.items():
-        if ReportSection(ROOT / document, *markers(name)).read() != table(results):
+        if ReportSection(ROOT / document, f"matrix {name}").read() != table(results):
             wrong.append(
                 f"{document}: the table {name} differs; run `python -m benchmarks.printed --write`."
             )
@@ -453,7 +447,7 @@ def compare_or_write(options: argparse.Namespace) -> str:
     """What differs, after writing the tables if that is asked for."""
     results = load(options.results)
     for (document, name), table in SECTIONS.items() if options.write else ():
-        ReportSection(ROOT / document, *markers(name)).write(f"\n{table(results)}\n")
+        ReportSection(ROOT / document, f"matrix {name}").write(table(results))
     return "\n".join(differences(results)) or "everything printed is as the results say"
 
 

@@ -13,16 +13,10 @@ from ganlane.realism.driving import StartOptions
 from ganlane.realism.measures import SHIPPED_REFERENCE
 from ganlane.realism.starts import recorded_starts
 
-
-def main() -> None:
-    """Drive the reference drivers from all scenes, and write the file."""
+if __name__ == "__main__":
     path = default_scenes()
     frame = read_scenes(path)
     scenes = frame["scene"].unique().sort().to_list()
     starts = recorded_starts({}, scenes, (), frame, StartOptions(repeats=4), False, path.name)
     replace(starts.reference, floors=floors_of(starts)).save(SHIPPED_REFERENCE)
     print(f"wrote {SHIPPED_REFERENCE}")
-
-
-if __name__ == "__main__":
-    main()

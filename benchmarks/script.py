@@ -15,6 +15,9 @@ from ganlane.errors import UserError
 from ganlane.evaluation.table import Table
 from ganlane.files import write_bytes
 
+#: Of the repository.
+ROOT = Path(__file__).parents[1]
+
 
 def make_parser(description: str | None) -> argparse.ArgumentParser:
     """A command line whose help begins with ``description``, the docstring of the script."""
@@ -23,9 +26,10 @@ def make_parser(description: str | None) -> argparse.ArgumentParser:
     )
 
 
-def add_report(parser: argparse.ArgumentParser, begin: str, end: str) -> None:
-    """Offer ``--report``, the document for a :class:`ReportSection` between these markers."""
-    parser.add_argument("--report", type=Path, help=f"a document with the lines {begin} and {end}")
+def add_report(parser: argparse.ArgumentParser, name: str) -> None:
+    """Offer ``--report``, the document for a :class:`ReportSection` of this ``name``."""
+    told = f"a document with the lines <!-- begin {name} --> and <!-- end {name} -->"
+    parser.add_argument("--report", type=Path, help=told)
 
 
 def markdown(table: Table) -> str:
@@ -59,59 +63,54 @@ def count(value: float) -> str:
     return significant(value)
 
 
-def split_at_markers(path: Path, begin: str, end: str) -> tuple[str, str, str]:
-    """The text of a document up to the marker ``begin``, between the two, and from ``end`` on.
-
-    Raises:
-        UserError: there is no such file, or it does not hold the two markers once each and in
-            order.
-    """
-    if not path.is_file():
-        raise UserError(
-            f"report={path}: no such file; expected a document with the lines {begin} and {end} in "
-            "it."
-        )
-    text = path.read_text(encoding="utf-8")
-    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
-        raise UserError(
-            f"report={path}: expected the lines {begin} and {end} in it, once each; add them."
-        )
-    before, _, rest = text.partition(begin)
-    between, _, after = rest.partition(end)
-    return before + begin, between, end + after
-
-
 class ReportSection:
-    """The part of a document that a script writes, between two markers.
+    """The part of a document that a script writes: between the lines ``<!-- begin NAME -->`` and
+    ``<!-- end NAME -->``.
 
-    Made before anything is measured, so that a document without the markers is refused at once, not
+    Made before anything is measured, so that a document without the lines is refused at once, not
     hours later.
 
     Args:
         document: as ``--report`` gives it; None: nothing is written anywhere.
-        begin, end: the markers.
+        name: of the part.
 
     Raises:
-        UserError: see :func:`split_at_markers`.
+        UserError: there is no such document, or it does not hold the two lines once each and in
+            order.
     """
 
-    def __init__(self, document: Path | None, begin: str, end: str) -> None:
+    def __init__(self, document: Path | None, name: str) -> None:
         self.document = document
-        self.markers = begin, end
-        if document is not None:
-            split_at_markers(document, begin, end)
+        self.name = name
+        self.read()
 
     def read(self) -> str:
-        """What stands between the markers now; without a document nothing."""
-        if self.document is None:
-            return ""
-        return split_at_markers(self.document, *self.markers)[1].strip()
+        """What stands there now; without a document nothing."""
+        return "" if self.document is None else self._split(self.document)[1].strip()
 
     def write(self, content: str) -> None:
-        """Put ``content`` between the markers, on lines of its own."""
+        """Put ``content`` there, with an empty line before and after it."""
         if self.document is not None:
-            before, _, after = split_at_markers(self.document, *self.markers)
-            write_bytes(self.document, f"{before}\n{content}\n{after}".encode())
+            before, _, after = self._split(self.document)
+            write_bytes(self.document, f"{before}\n\n{content}\n\n{after}".encode())
+
+    def _split(self, document: Path) -> tuple[str, str, str]:
+        """The text of a document up to the first line, between the two, and from the second on."""
+        begin, end = (f"<!-- {side} {self.name} -->" for side in ("begin", "end"))
+        if not document.is_file():
+            raise UserError(
+                f"report={document}: no such file; expected a document with the lines {begin} and "
+                f"{end} in it."
+            )
+        text = document.read_text(encoding="utf-8")
+        if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+            raise UserError(
+                f"report={document}: expected the lines {begin} and {end} in it, once each; add "
+                "them."
+            )
+        before, _, rest = text.partition(begin)
+        between, _, after = rest.partition(end)
+        return before + begin, between, end + after
 
 
 def run_script(measure: Callable[[argparse.Namespace], str], arguments: argparse.Namespace) -> int:

@@ -20,11 +20,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from benchmarks import printed
-from benchmarks.script import make_parser, run_script
+from benchmarks.script import ROOT, make_parser, run_script
 from ganlane.view.curves import plot_middle, read_metrics
 from ganlane.view.figures import COLOURS, FAINT, STYLE, add_legend, save_figure
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = ROOT / "docs"
+FIGURE = DOCS / "reproduce" / "figure_4.png"
 
 
 def read_curves(folders: Sequence[Path]) -> pl.DataFrame:
@@ -79,15 +80,8 @@ def draw(options: argparse.Namespace) -> str:
     row = printed.at(printed.load(), "agent_idm+none", "gan")
     before = [training["mean_reward"] for training in row["each"]]
     curves = read_curves(sorted((DOCS / "learning_curves").glob("seed_*")))
-    return f"figure: {save_figure(draw_transfer(curves, before), options.out)}"
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw; the exit status."""
-    parser = make_parser(__doc__)
-    parser.add_argument("--out", type=Path, default=DOCS / "reproduce" / "figure_4.png")
-    return run_script(draw, parser.parse_args(arguments))
+    return f"figure: {save_figure(draw_transfer(curves, before), FIGURE)}"
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_script(draw, make_parser(__doc__).parse_args()))

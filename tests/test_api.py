@@ -9,12 +9,12 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from reference.processes import python_blocks
 from reference.refusals import last_path, user_error
 
 import ganlane
 from ganlane.__main__ import main
 from ganlane.agents.drivers import DRIVERS
-from ganlane.config.run import COMMANDS, function_of
 from ganlane.settings.env import EnvConfig
 from ganlane.settings.traffic import GanTrafficConfig
 from ganlane.traffic import IdmTraffic
@@ -115,18 +115,8 @@ def test_a_run_is_trained_resumed_and_evaluated():
     assert more.results["decisions"] >= 512
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_its_function(command):
-    if command == "record":
-        pytest.importorskip("minari")
-    assert function_of(command).__name__ == command
-
-
 def test_the_short_blocks_in_the_docs_run(capsys):
-    page = (Path(__file__).parents[1] / "docs" / "python_api.md").read_text()
-    code = [
-        block for block in re.findall(r"```python\n(.*?)```", page, re.S) if not LONG.search(block)
-    ]
+    code = [block for block in python_blocks("python_api.md") if not LONG.search(block)]
     assert len(code) == 5
     names, text = {}, "\n".join(code)
     exec(

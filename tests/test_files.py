@@ -147,14 +147,9 @@ def flipped(content: bytes, place: int, bit: int) -> bytes:
     return content[:place] + bytes([content[place] ^ (1 << bit)]) + content[place + 1 :]
 
 
-#: What is said where the damage is found before the checksum is compared.
-FOUND_EARLIER = {"last.pt": "|not a readable checkpoint"}
-
-
 @pytest.mark.parametrize("name", FILES)
 def test_any_flipped_byte_is_refused_in_one_sentence(name, tmp_path, capsys):
     write, read = FILES[name]
-    earlier = FOUND_EARLIER.get(name, "")
     path = tmp_path / name
     write(path)
     read(path)
@@ -168,7 +163,8 @@ def test_any_flipped_byte_is_refused_in_one_sentence(name, tmp_path, capsys):
     }
     for place in sorted(place for place in places if place < len(whole)):
         path.write_bytes(flipped(whole, place, place % 8))
-        with user_error(f"{name}: (damaged{earlier})") as caught:
+        # Of an archive some damage is seen before its checksum is compared.
+        with user_error(f"{name}: (damaged|not a readable checkpoint)") as caught:
             read(path)
         assert "\n" not in str(caught.value)
     for length in (0, 1, len(whole) // 2, len(whole) - len(PLACE), len(whole) - 1):

@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 from reference.gym_env import KEEP, LEFT, make, make_vec
-from reference.processes import ROOT
+from reference.processes import ROOT, python_blocks
 
 VECTOR = gymnasium.wrappers.vector
 MASKS_MAY_BE_ABSENT = tuple(map(int, re.findall(r"\d+", gymnasium.__version__)[:3])) >= (1, 2, 2)
@@ -28,26 +28,6 @@ def test_gymnasiums_own_vector_wrappers_take_the_batch(mode):
     assert all(1 <= length <= 6 for length in lengths)
 
 
-def test_cleanrls_ppo_finds_what_it_reads_of_environments_that_gymnasium_puts_together():
-    """Which has its script in its repository, not in its package."""
-
-    def make_one():
-        return gymnasium.wrappers.RecordEpisodeStatistics(make())
-
-    envs = gymnasium.vector.SyncVectorEnv([make_one] * 2)
-    envs.action_space.seed(0)
-    envs.reset(seed=1)
-    returns = []
-    for _ in range(64):
-        observation, *_, infos = envs.step(envs.action_space.sample())
-        assert observation.shape == (2, *envs.single_observation_space.shape)
-        if "episode" in infos:
-            returns += infos["episode"]["r"][infos["_episode"]].tolist()
-    # The goal's 100, or a crash's or the verge's -100.
-    assert len(returns) >= 10
-    assert {round(value, -2) for value in returns} <= {-100.0, 0.0, 100.0}
-
-
 @pytest.mark.skipif(not MASKS_MAY_BE_ABSENT, reason="DictInfoToList needs gymnasium 1.2.2 or newer")
 def test_infos_of_a_batch_can_be_had_row_by_row():
     envs = VECTOR.DictInfoToList(make_vec(2, lanes=1, goal_m=500.0))
@@ -60,7 +40,7 @@ def test_infos_of_a_batch_can_be_had_row_by_row():
 
 def test_the_code_in_the_docs_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "gymnasium.md").read_text(), re.S)
+    blocks = python_blocks("gymnasium.md")
     films = importlib.util.find_spec("moviepy") is not None
     names = {"np": np}
     exec("\n".join(block for block in blocks if films or "RecordVideo" not in block), names)

@@ -127,12 +127,10 @@ def test_the_algorithm_trains_unchanged_and_its_policy_can_be_evaluated(algorith
     assert table["out_of_road"].to_list() == [0, 0]
 
 
-def busy_highways(**options):
-    return ganlane.sb3.make_vec_env("idm_mobil", num_envs=ROWS, **BUSY, **options)
-
-
-def sharp(model):
-    """``model`` with large random weights: it takes all actions, by what it reads."""
+def sharp(algorithm, options, wrap):
+    """A model on busy highways with large random weights: it takes all actions, as it reads."""
+    env = ganlane.sb3.make_vec_env("idm_mobil", num_envs=ROWS, **BUSY, **options)
+    model = untrained(algorithm, wrap(env) if wrap else env)
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
         for parameter in model.policy.parameters():
@@ -140,8 +138,9 @@ def sharp(model):
     return model
 
 
-def returns_in_the_own_loop(model, env):
+def returns_in_the_own_loop(model):
     """Returns of the episodes 0 to EPISODES - 1, as stable-baselines3's documentation drives."""
+    env = model.get_env()
     env.training = False
     env.seed(BUSY["seed"])
     observation = env.reset()
@@ -188,10 +187,8 @@ def test_an_evaluation_prints_the_reward_of_the_users_own_loop(
 ):
     # Running episodes move to smaller batches as early as they may.
     monkeypatch.setattr("ganlane.evaluation.episodes.SMALL_BATCH", 1)
-    env = busy_highways(**options)
-    env = wrap(env) if wrap else env
-    model = sharp(untrained(algorithm, env))
-    expected = returns_in_the_own_loop(model, env)
+    model = sharp(algorithm, options, wrap)
+    expected = returns_in_the_own_loop(model)
     assert np.ptp(expected) > 1.0
     # In another number of rows than the loop has.
     printed = returns_in_the_evaluation(ganlane.sb3.driver(model), ROWS - 1)
@@ -243,9 +240,7 @@ def test_a_masked_model_that_could_turn_back_without_a_mask_is_refused():
     ids=["normalised", "masked", "dqn", "sac"],
 )
 def test_a_stored_driver_drives_as_before(algorithm, options, wrap, tmp_path):
-    env = busy_highways(**options)
-    env = wrap(env) if wrap else env
-    driver = ganlane.sb3.driver(sharp(untrained(algorithm, env)))
+    driver = ganlane.sb3.driver(sharp(algorithm, options, wrap))
     driver.save(tmp_path / "ppo")
     again = ganlane.sb3.driver(algorithm.load(tmp_path / "ppo"), "again", stored=tmp_path / "ppo")
     assert again.name == "again"

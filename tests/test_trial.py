@@ -1,40 +1,20 @@
-"""The trial of the package: what breaks is seen, and what holds is counted."""
+"""The trial of the package sees what breaks: damaged files that are read, broken invariants."""
 
 import os
-import signal
-import time
+from pathlib import Path
 
 import pytest
 import torch
 from trial import damages
 from trial.damage import READERS, SCENE, Reader, Trial
-from trial.kill import TINY, differences, torn_write, train
 from trial.soak import actions, violations
-from trial.tally import FORK, forked
 
 import ganlane
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.files import write_bytes
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 CHOICE = {"traffic": {"name": "idm_mobil"}, "policy": "random", "env": "highway"}
-
-
-def work(item):
-    """Does what its item says, in a child."""
-    if item == "dies":
-        os.kill(os.getpid(), signal.SIGKILL)
-    if item == "hangs":
-        time.sleep(60)
-    return item.upper()
-
-
-def test_an_item_that_ends_or_hangs_its_process_is_reported_and_the_others_are_done():
-    done = dict(forked(work, ["a", "dies", "b", "hangs", "c"], at_most_s=1.0, memory_gib=64.0))
-    assert (done["a"], done["b"], done["c"]) == ("A", "B", "C")
-    assert done["dies"] == "LOST: the process ended (status -9)"
-    assert done["hangs"].startswith("LOST: more than 1 s")
 
 
 def refuses(path):
@@ -42,7 +22,7 @@ def refuses(path):
 
 
 def bombs(path):
-    print("EXECUTED")
+    Path("executed").touch()
     raise UserError("a sentence")
 
 
@@ -65,32 +45,6 @@ def test_a_reader_is_judged_by_how_it_ends(read, sealed, result, tmp_path, monke
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(READERS, "file", Reader("scene.csv", read, (damages.flip,), sealed))
     assert Trial(good, tmp_path / "damaged")(("file", 3)).startswith(result)
-
-
-def test_other_weights_figures_and_parts_of_files_are_seen(tmp_path):
-    whole, other = tmp_path / "whole", tmp_path / "other"
-    line = ["traffic=idm", "init=none", "total_decisions=96", "evaluate_every=0"]
-    for folder, seed in ((whole, 0), (other, 1)):
-        assert train([*TINY, *line, f"seed={seed}", f"hydra.run.dir={folder}"]) == 0
-    assert differences(whole, whole) == []
-    (other / ".metrics.csv.part").touch()
-    wrong = differences(other, whole)
-    assert "left behind: .metrics.csv.part" in wrong
-    assert "other weights in agent.safetensors" in wrong
-    assert "other figures in metrics.csv" in wrong
-
-
-def test_the_second_write_is_torn_and_the_file_before_stays(tmp_path):
-    def write_twice():
-        torn_write(1, 0.5)()
-        for content in (b"first", b"second"):
-            write_bytes(tmp_path / "file", content)
-
-    child = FORK.Process(target=write_twice)
-    child.start()
-    child.join()
-    assert child.exitcode == -signal.SIGKILL
-    assert (tmp_path / "file").read_bytes() == b"first"
 
 
 @pytest.fixture(scope="module")

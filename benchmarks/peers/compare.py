@@ -17,11 +17,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from benchmarks.peers.report import draw, fill, page
+from benchmarks.peers.report import PARTS, draw
 from benchmarks.peers.scene import (
     LAW,
     OBSTACLE,
@@ -46,9 +45,10 @@ from benchmarks.peers.simulators import (
     versions,
 )
 from benchmarks.peers.tolerance import Largest, between, largest, tolerance, unsettled_gap_m
-from benchmarks.script import make_parser, run_script
-from ganlane.errors import UserError
-from ganlane.files import write_bytes, write_json
+from benchmarks.script import ROOT, ReportSection, make_parser, run_script
+from ganlane.files import write_json
+
+DOCS = ROOT / "docs"
 
 
 class Apart(NamedTuple):
@@ -151,34 +151,21 @@ def every(trace: Trace, stride: int) -> Trace:
 
 
 def write(options: argparse.Namespace) -> str:
-    """Measure, write JSON and plot, and fill the page; its tables.
+    """Measure, write JSON and plot, and the tables into the page; the tables.
 
     Raises:
-        UserError: HighwayEnv or SUMO is not installed, or there is no such page.
+        UserError: HighwayEnv or SUMO is not installed.
     """
     require_peers()
-    if not options.page.is_file():
-        raise UserError(
-            f"{options.page}: no such page; run from the repository root or give --page."
-        )
+    sections = {name: ReportSection(DOCS / "peers.md", f"peers {name}") for name in PARTS}
     figures, traces = collect()
-    write_json(options.out / "peers.json", figures)
-    draw(traces, figures, options.out / "peers.png")
-    write_bytes(options.page, fill(options.page.read_text(), figures).encode())
-    return f"{page(figures)}\nresults: {options.out / 'peers.json'}"
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Compare; the exit status."""
-    parser = make_parser(__doc__)
-    parser.add_argument(
-        "--out", type=Path, default=Path("docs/figures"), help="folder of peers.json and peers.png"
-    )
-    parser.add_argument(
-        "--page", type=Path, default=Path("docs/peers.md"), help="page whose tables are replaced"
-    )
-    return run_script(write, parser.parse_args(arguments))
+    tables = {name: part(figures) for name, part in PARTS.items()}
+    write_json(DOCS / "figures" / "peers.json", figures)
+    draw(traces, figures, DOCS / "figures" / "peers.png")
+    for name, table in tables.items():
+        sections[name].write(table)
+    return "\n\n".join(tables.values())
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_script(write, make_parser(__doc__).parse_args()))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,35 +14,12 @@ from matplotlib.figure import Figure
 from benchmarks.peers.scene import OBSTACLE, SLOW_AND_GO, Scheme, Trace, equilibrium_gap
 from benchmarks.peers.tolerance import difference
 from benchmarks.script import markdown
-from ganlane.evaluation.table import Table
+from ganlane.evaluation.table import Cell, Table, number_of, text_of
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.idm import TABLE_V
 from ganlane.view.figures import COLOURS, INK, STYLE, save_figure
 
 Figures = dict[str, Any]
-
-
-def page(figures: Figures) -> str:
-    """All tables, one below the other."""
-    return "\n\n".join(part(figures) for part in PARTS.values())
-
-
-def fill(text: str, figures: Figures) -> str:
-    """``text`` with a new table between every ``<!-- NAME -->`` of :data:`PARTS` and the next
-    ``<!-- end -->``.
-    """
-
-    def replaced(match: re.Match[str]) -> str:
-        return f"<!-- {match[1]} -->\n\n{PARTS[match[1]](figures)}\n\n<!-- end -->"
-
-    return re.sub(
-        rf"<!-- ({'|'.join(PARTS)}) -->\n.*?<!-- end -->", replaced, text, flags=re.DOTALL
-    )
-
-
-def table(head: list[str], rows: list[list[str]]) -> str:
-    """A Markdown table."""
-    return markdown(Table("", head, rows, names=len(head)))
 
 
 def number(value: float) -> str:
@@ -55,69 +31,49 @@ def number(value: float) -> str:
 
 def traces_table(figures: Figures) -> str:
     """Largest differences of speed and distance per scene and peer."""
-    head = [
-        "scene",
-        "peer",
-        "quantity",
-        "peer - ganlane",
-        "law",
-        "scheme",
-        "allowed for the scheme",
-        "rest",
-    ]
-    rows = []
+    heads = {
+        "direct": "peer - ganlane",
+        "law": "law",
+        "scheme": "scheme",
+        "allowed": "allowed for the scheme",
+        "rest": "rest",
+    }
+    lines = []
     for row in figures["traces"]:
-        distance = (
-            ("position_m", "position, m") if row["scene"] == "free road" else ("gap_m", "gap, m")
-        )
-        for key, name in (("speed_mps", "speed, m/s"), distance):
-            pieces = [
-                number(row[piece][key]) for piece in ("direct", "law", "scheme", "allowed", "rest")
-            ]
-            rows.append([row["scene"], row["peer"], name, *pieces])
-    return table(head, rows)
+        distance = "position" if row["scene"] == "free road" else "gap"
+        for key, name in (("speed_mps", "speed, m/s"), (f"{distance}_m", f"{distance}, m")):
+            pieces = [number(row[piece][key]) for piece in heads]
+            lines.append([row["scene"], row["peer"], name, *pieces])
+    headings = ["scene", "peer", "quantity", *heads.values()]
+    return markdown(Table("", headings, lines, names=len(headings)))
 
 
-def settled_table(figures: Figures) -> str:
-    """Equilibrium gaps per speed and simulator."""
-    head = [
-        "speed, m/s",
-        "simulator",
-        "mean gap, m",
-        "formula of its law, m",
-        "largest distance, m",
-        "allowed, m",
-    ]
-    rows = [
-        [
-            f"{row['speed_mps']:g}",
-            row["simulator"],
-            f"{row['gap_m']:.6f}",
-            f"{row['formula_m']:.6f}",
-            f"{row['away_m']:.1e}",
-            f"{row['allowed_m']:.1e}",
-        ]
-        for row in figures["settled"]
-    ]
-    return table(head, rows)
+#: Heading to cell of the columns: equilibrium gaps per speed and simulator.
+SETTLED: dict[str, Cell] = {
+    "speed, m/s": lambda row: f"{row['speed_mps']:g}",
+    "simulator": text_of("simulator"),
+    "mean gap, m": number_of("gap_m", 6),
+    "formula of its law, m": number_of("formula_m", 6),
+    "largest distance, m": lambda row: f"{row['away_m']:.1e}",
+    "allowed, m": lambda row: f"{row['allowed_m']:.1e}",
+}
+#: Where the cars come to rest behind the obstacle.
+STOPS: dict[str, Cell] = {
+    "simulator": text_of("simulator"),
+    "final gap, m": number_of("final_gap_m", 4),
+    "lowest speed, m/s": number_of("lowest_mps", 4),
+}
+#: What other steps do.
+STEPS: dict[str, Cell] = {
+    "ganlane at 0.1 s against": text_of("other"),
+    "speed, m/s": lambda row: number(row["speed_mps"]),
+    "gap, m": lambda row: number(row["gap_m"]),
+}
 
 
-def stops_table(figures: Figures) -> str:
-    """Where the cars come to rest behind the obstacle."""
-    rows = [
-        [row["simulator"], f"{row['final_gap_m']:.4f}", f"{row['lowest_mps']:.4f}"]
-        for row in figures["stops"]
-    ]
-    return table(["simulator", "final gap, m", "lowest speed, m/s"], rows)
-
-
-def steps_table(figures: Figures) -> str:
-    """What other steps do."""
-    rows = [
-        [row["other"], *(number(row[key]) for key in ("speed_mps", "gap_m"))]
-        for row in figures["steps"]
-    ]
-    return table(["ganlane at 0.1 s against", "speed, m/s", "gap, m"], rows)
+def table_of(name: str, columns: Mapping[str, Cell]) -> Callable[[Figures], str]:
+    """Makes the Markdown table of the rows ``name``."""
+    return lambda figures: markdown(Table.of("", figures[name], columns, len(columns)))
 
 
 def versions_line(figures: Figures) -> str:
@@ -125,11 +81,12 @@ def versions_line(figures: Figures) -> str:
     return ", ".join(f"{name} {version}" for name, version in figures["versions"].items())
 
 
+#: Of the page, by name.
 PARTS: dict[str, Callable[[Figures], str]] = {
     "traces": traces_table,
-    "settled": settled_table,
-    "stops": stops_table,
-    "steps": steps_table,
+    "settled": table_of("settled", SETTLED),
+    "stops": table_of("stops", STOPS),
+    "steps": table_of("steps", STEPS),
     "versions": versions_line,
 }
 

@@ -42,7 +42,6 @@ from benchmarks.speed.systems import Road, installed_version
 from ganlane.agents import RainbowConfig
 from ganlane.evaluation import machine_sentence
 from ganlane.evaluation.table import Cell, Table, text_of
-from ganlane.files import write_json
 
 #: Defaults of each suite: batches and traffics.
 BATCHES = {
@@ -61,8 +60,8 @@ TRAFFICS = {
 }
 #: What the egos of the suite gymnasium do, and whether they keep their lanes.
 EGOS = {"random actions": False, "keeping its lane": True}
-#: Scenes of the suite scenarios: vehicles and lanes of each.
-SCENES = {"merge": (21, 3), "exit": (24, 4), "on_ramp": (20, 3)}
+#: Of the suite scenarios.
+SCENES = ("merge", "exit", "on_ramp")
 #: Suites that go through gymnasium.
 THROUGH_GYMNASIUM = ("gymnasium", "scenarios")
 #: Heading to cell of the tables' columns.
@@ -141,7 +140,7 @@ def peers_of(
 
     system = f"{name} {installed}{driven}"
     if road.scene == "on_ramp":
-        start = partial(start_on_ramp, road.seed, keep)
+        start = partial(start_on_ramp, keep)
         return [case(system, start, "native", changes="LC2013")]
     if options.suite == "train":
         learner = installed_version("stable-baselines3")
@@ -161,13 +160,10 @@ def peers_of(
 
 def rows_of(options: argparse.Namespace) -> list[Row]:
     """Rows of all groups, each group's peers first."""
-    road = Road(options.traffics[0], options.vehicles, options.lanes, options.seed)
+    road = Road(options.traffics[0], options.vehicles, options.lanes)
     roads = [road]
     if options.suite == "scenarios":
-        roads = [
-            replace(road, scene=scene, vehicles=vehicles, lanes=lanes)
-            for scene, (vehicles, lanes) in SCENES.items()
-        ]
+        roads = [road.with_scene(scene) for scene in SCENES]
     rows = []
     egos = list(EGOS) if options.suite in THROUGH_GYMNASIUM else [""]
     groups = itertools.product(options.threads, options.batches, roads, egos)
@@ -208,8 +204,6 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--repetitions", type=int, default=5, metavar="N", help="turns of every case")
     add("--seconds", type=float, default=0.5, help="a turn lasts about so long")
     add("--no-peers", action="store_true")
-    add("--seed", type=int, default=0)
-    add("--json", type=Path, metavar="FILE", help="all rows as JSON")
     add("--report", type=Path, metavar="FILE",
         help="a document with <!-- begin bench SUITE -->; on cuda, SUITE cuda")  # fmt: skip
     options = parser.parse_args(arguments)
@@ -228,15 +222,11 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 def compare(options: argparse.Namespace) -> str:
     """Measure all; the table, in the document too where one is named."""
     name = options.suite if options.device == "cpu" else f"{options.suite} {options.device}"
-    begin, end = f"<!-- begin bench {name} -->", f"<!-- end bench {name} -->"
-    section = ReportSection(options.report, begin, end)
-    rows = rows_of(options)
-    if options.json is not None:
-        write_json(options.json, {"rows": rows})
-    table = table_of(rows)
+    section = ReportSection(options.report, f"bench {name}")
+    table = table_of(rows_of(options))
     taken = f"Taken on {date.today()}: {machine_sentence(options.threads)}"
     command = f"    python -m benchmarks.speed {options.told}".rstrip()
-    section.write("\n" + "\n\n".join([command, taken, markdown(table)]) + "\n")
+    section.write("\n\n".join([command, taken, markdown(table)]))
     return table.text()
 
 

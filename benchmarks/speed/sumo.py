@@ -15,7 +15,7 @@ import numpy as np
 import ganlane
 from benchmarks.peers.simulators import vehicle_type
 from benchmarks.speed.measure import Runner
-from benchmarks.speed.systems import STEPS
+from benchmarks.speed.systems import SEED, STEPS
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
@@ -97,10 +97,10 @@ def write_vehicles(folder: Path, env: HighwayEnv) -> None:
 class OnRamp:
     """``env=on_ramp`` in SUMO, one environment: an ego and the drivers around it."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self) -> None:
         import libsumo
 
-        env: HighwayEnv = ganlane.make_env(env="on_ramp", num_envs=1, seed=seed).base_env
+        env: HighwayEnv = ganlane.make_env(env="on_ramp", num_envs=1, seed=SEED).base_env
         self.goal_m = env.episode.goal_m
         self.timeout_s = env.episode.timeout_s
         self.sumo: Any = libsumo
@@ -111,7 +111,7 @@ class OnRamp:
         write_vehicles(folder, env)
         if libsumo.isLoaded():
             libsumo.close()
-        libsumo.start([*sumo_command(folder, keys.PHYSICS_STEP_S), "--seed", str(seed)])
+        libsumo.start([*sumo_command(folder, keys.PHYSICS_STEP_S), "--seed", str(SEED)])
         libsumo.simulationStep()
         self._start = str(folder / "start.xml")
         libsumo.simulation.saveState(self._start)
@@ -135,10 +135,10 @@ class OnRamp:
             self.reset()
 
 
-def start_on_ramp(seed: int, keep: bool = False) -> Runner:
+def start_on_ramp(keep: bool = False) -> Runner:
     """SUMO's on-ramp: random actions, or the lane is kept."""
-    ramp = OnRamp(seed)
-    random = np.random.default_rng(seed)
+    ramp = OnRamp()
+    random = np.random.default_rng(SEED)
 
     def run(decisions: int) -> int:
         for action in random.integers(3, size=decisions).tolist():

@@ -33,6 +33,8 @@ DRAWN = 64
 #: Physics steps in a decision of one second.
 STEPS = round(1 / keys.PHYSICS_STEP_S)
 OBSERVATION = "lane_view"
+#: Of the episodes, of random actions and of the agents.
+SEED = 0
 #: HighwayEnv's action that keeps lane and speed.
 THEIR_KEEP = 1
 #: Its ``highway-v0`` ends an episode after so many seconds, as ours does.
@@ -46,19 +48,22 @@ class Road:
     traffic: str = "idm_mobil"
     vehicles: int = 9
     lanes: int = 3
-    seed: int = 0
     scene: str = "highway"
+
+    def with_scene(self, scene: str) -> Road:
+        """The road of a scene, which sets vehicles and lanes itself."""
+        env = ganlane.make_env(env=scene).base_env
+        return replace(self, scene=scene, vehicles=env.vehicles, lanes=env.road.lanes)
 
     def keys_of(self, mode: str) -> dict[str, Any]:
         """Keywords of :func:`ganlane.make_env` and of ``gymnasium.make`` for a mode."""
         shared = {
             "traffic": self.traffic,
             "observation": OBSERVATION,
-            "seed": self.seed,
+            "seed": SEED,
             "kernel": "native" if mode == "native" else "torch",
         }
         if self.scene != "highway":
-            # It sets vehicles and lanes itself.
             return {**shared, "env": self.scene}
         return {
             **shared,
@@ -128,7 +133,7 @@ def _stepping(env: Any, actions: Tensor) -> Runner:
 
 def start_environment(road: Road, mode: str, device: str, batch: int) -> Runner:
     """The environment with observation, reward and resets, driven by uniformly random actions."""
-    generator = torch.Generator().manual_seed(road.seed)
+    generator = torch.Generator().manual_seed(SEED)
     actions = torch.randint(3, (DRAWN, batch), generator=generator)
     return _stepping(road.make(mode, device, batch), actions)
 
@@ -145,7 +150,7 @@ def start_gymnasium(road: Road, mode: str, device: str, batch: int, keep: bool =
     Random actions, or with ``keep`` the lane is kept to the goal: episodes of 250 decisions in
     place of a dozen.
     """
-    actions = np.random.default_rng(road.seed).integers(3, size=(DRAWN, batch))
+    actions = np.random.default_rng(SEED).integers(3, size=(DRAWN, batch))
     if keep:
         actions[:] = keys.KEEP
     chosen = road.keys_of(mode)
@@ -194,7 +199,7 @@ def start_training(
     agent = Rainbow(
         replace(config, warmup=min(config.warmup, stored)),
         observation_size(OBSERVATION, road.vehicles),
-        seed=road.seed,
+        seed=SEED,
         device=device,
         legal=partial(legal_actions, road=env.base_env.road),
         compile=mode != "eager",
@@ -259,14 +264,14 @@ def make_highway(road: Road) -> Any:
         getattr(highway_env, "register_highway_envs", lambda: None)()
         config = _highway_settings(road) | seen
         env = gymnasium.make(f"{road.scene}-v0", config=config, disable_env_checker=True)
-    env.unwrapped.reset(seed=road.seed)
+    env.unwrapped.reset(seed=SEED)
     return env.unwrapped
 
 
 def start_highway(road: Road, keep: bool = False) -> Runner:
     """HighwayEnv: random actions, or the lane is kept; a reset after every end."""
     env = make_highway(road)
-    random = np.random.default_rng(road.seed)
+    random = np.random.default_rng(SEED)
 
     def run(decisions: int) -> int:
         drawn = random.integers(env.action_space.n, size=decisions)
@@ -288,11 +293,11 @@ def start_envpool(road: Road, batch: int, threads: int, keep: bool = False) -> R
         num_envs=batch,
         num_threads=min(threads, batch),
         max_episode_steps=TIMEOUT_S,
-        seed=road.seed,
+        seed=SEED,
         **_highway_settings(road),
     )
     env.reset()
-    actions = np.random.default_rng(road.seed).integers(5, size=(DRAWN, batch)).astype(np.int32)
+    actions = np.random.default_rng(SEED).integers(5, size=(DRAWN, batch)).astype(np.int32)
     if keep:
         actions[:] = THEIR_KEEP
 
@@ -322,7 +327,7 @@ def start_baseline(road: Road, config: RainbowConfig) -> Runner:
         exploration_initial_eps=0.05,
         exploration_final_eps=0.05,
         policy_kwargs={"net_arch": list(config.hidden)},
-        seed=road.seed,
+        seed=SEED,
         device="cpu",
     )
 

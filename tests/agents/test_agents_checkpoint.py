@@ -8,8 +8,6 @@ from tensordict import TensorDict
 
 from ganlane.agents import (
     RainbowConfig,
-    agent_file,
-    checkpoint,
     load_agent,
     read_agent,
     save_agent,
@@ -49,13 +47,6 @@ def test_another_observation_size_is_refused_naming_both(saved):
 def test_an_unknown_agent_is_refused_with_the_names_there_are():
     with user_error("agents that ship are agent_gan, agent_general, agent_idm"):
         load_agent("agent_xyz")
-
-
-def test_shipped_agents_are_found_by_name(saved, monkeypatch):
-    monkeypatch.setattr(checkpoint, "CHECKPOINTS", saved.parent)
-    saved.rename(saved.with_name("agent_idm.safetensors"))
-    assert agent_file("agent_idm") == agent_file("agent_idm@0")
-    assert load_agent("agent_idm")[1]["observation"] == "table3"
 
 
 #: What a file may say of a network that is none.

@@ -18,7 +18,7 @@ from ganlane.agents.loss import (
     project,
     update,
 )
-from ganlane.agents.network import redraw_noise
+from ganlane.agents.network import duel, redraw_noise
 from ganlane.runtime import has_compiler
 
 SIZE = 5
@@ -93,6 +93,11 @@ def test_the_kl_priority_is_the_cross_entropy_less_the_targets_entropy():
     priority = data["td_error"].squeeze(-1)
     torch.testing.assert_close(priority, cross_entropy - entropy, atol=1e-5, rtol=1e-5)
     assert (data["td_error"] >= 0).all()
+
+
+def test_dueling_takes_the_mean_advantage_off():
+    rows = torch.tensor([[10.0], [1.0], [2.0], [6.0]])
+    assert duel(rows).flatten().tolist() == [8.0, 9.0, 13.0]
 
 
 @pytest.mark.parametrize("distributional", [True, False])

@@ -8,7 +8,6 @@ from functools import cache
 from importlib.util import find_spec
 
 import pytest
-from reference.processes import ROOT
 
 from benchmarks.peers import compare, report, simulators
 from benchmarks.peers.scene import (
@@ -31,6 +30,7 @@ from benchmarks.peers.tolerance import (
     between,
     tolerance,
 )
+from benchmarks.script import ROOT, ReportSection
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.neighbours import FREE_GAP_M
 
@@ -89,9 +89,8 @@ def test_the_derived_tolerance_covers_the_other_scheme_and_no_more_than_a_fifth_
 
 def test_the_page_shows_the_figures_that_stand_beside_it():
     figures = json.loads((ROOT / "docs/figures/peers.json").read_text())
-    page = (ROOT / "docs/peers.md").read_text()
-    assert report.fill(page, figures) == page
-    assert all(f"<!-- {name} -->" in page for name in report.PARTS)
+    for name, part in report.PARTS.items():
+        assert ReportSection(ROOT / "docs/peers.md", f"peers {name}").read() == part(figures)
     assert (ROOT / "docs/figures/peers.png").stat().st_size < 150_000
 
 

@@ -14,7 +14,7 @@ from benchmarks.script import (
 from ganlane.errors import UserError
 from ganlane.evaluation.table import Table
 
-BEGIN, END = "<!-- begin -->", "<!-- end -->"
+BEGIN, END = "<!-- begin one -->", "<!-- end one -->"
 
 
 @pytest.mark.parametrize(
@@ -40,10 +40,10 @@ def test_what_stands_between_the_markers_is_rewritten_and_the_rest_stays(tmp_pat
     document = tmp_path / "page.md"
     document.write_text(f"# Title\n{BEGIN}{END} tail é\n", encoding="utf-8")
     for content in ("one", "two\nlines"):
-        ReportSection(document, BEGIN, END).write(content)
-        ReportSection(None, BEGIN, END).write("nowhere")
+        ReportSection(document, "one").write(content)
+        ReportSection(None, "one").write("nowhere")
         text = document.read_text(encoding="utf-8")
-        assert text == f"# Title\n{BEGIN}\n{content}\n{END} tail é\n"
+        assert text == f"# Title\n{BEGIN}\n\n{content}\n\n{END} tail é\n"
 
 
 @pytest.mark.parametrize(
@@ -53,10 +53,10 @@ def test_a_document_without_both_markers_once_and_in_order_is_refused_at_once(tm
     document = tmp_path / "page.md"
     document.write_text(text)
     with user_error(r"page\.md: expected the lines .* once each"):
-        ReportSection(document, BEGIN, END)
+        ReportSection(document, "one")
     assert document.read_text() == text
     with user_error(r"gone\.md: no such file"):
-        ReportSection(tmp_path / "gone.md", BEGIN, END)
+        ReportSection(tmp_path / "gone.md", "one")
     assert list(tmp_path.iterdir()) == [document]
 
 

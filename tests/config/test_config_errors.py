@@ -8,12 +8,11 @@ import errno
 import os
 import signal
 from operator import attrgetter
-from pathlib import Path
 from unittest.mock import Mock, patch
 
 import pytest
 from reference.processes import ROOT, run
-from reference.refusals import everything_below, is_one_sentence, user_error
+from reference.refusals import refusal, user_error
 
 from ganlane.__main__ import main
 from ganlane.config.compose import parsed
@@ -104,17 +103,9 @@ def run_task(task, *arguments):
 
 
 def refused(capsys, task, *arguments):
-    """The sentence with which ``ganlane evaluate`` ends when its task is this one.
-
-    Nothing new is left.
-    """
-    before = everything_below(Path.cwd())
-    assert run_task(task, *arguments) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert is_one_sentence(err, "evaluate")
-    assert everything_below(Path.cwd()) == before
-    return err
+    """The sentence with which ``ganlane evaluate`` ends when its task is this one."""
+    with patch("ganlane.config.run.function_of", lambda command: task):
+        return refusal(capsys, "evaluate", *arguments)
 
 
 def test_a_refusal_while_a_command_writes(empty_folder, capsys):

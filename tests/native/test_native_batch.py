@@ -4,6 +4,7 @@ environment does.
 
 import numpy as np
 import pytest
+from reference.kernels import MIXED
 
 from ganlane.gym.base import make_rows
 from ganlane.gym.native_rows import NativeRows
@@ -16,7 +17,6 @@ ROWS = 37
 
 
 LORRIES = {"truck_share": 0.3, "truck_desired_speed_mps": (20.0, 22.0)}
-MIXED = {"name": "mixed", "shares": {"idm_mobil": 2, "gan": 1, "human": 1, "idm_faults": 1}}
 FLOW = {"vph": 1200.0, "ramp_vph": 600.0, "slots": 20}
 OTHER_REWARD = {"soft_crash_behind": -5.0, "literal_low_acceleration": True}
 OTHER_REWARD |= {"low_acceleration": -0.2}

@@ -7,7 +7,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 import torch
-from reference.kernels import RUNNABLE, apart, kernel_of, random_environment
+from reference.kernels import MIXED, RUNNABLE, apart, kernel_of, random_environment
 from reference.worlds import environment, leaves, same_bits
 
 from ganlane import keys
@@ -30,12 +30,6 @@ from ganlane.weights import load_weights, save_weights
 pytestmark = pytest.mark.kernel
 PRESETS = {"gan": "paper", "gan_calibrated": "calibrated"}
 TRAFFICS = ["idm", "idm_mobil", "idm_faults", "idm_random", "human", *PRESETS]
-#: Parts of all kinds; no batch size here is a multiple of the sum of their shares.
-MIXED = {
-    "name": "mixed",
-    "shares": {"idm_mobil": 2}
-    | dict.fromkeys(("gan", "human", "idm_faults", "idm_random", "gan_calibrated"), 1),
-}
 #: Faults so often that a few decisions meet all of them.
 OFTEN = {
     "phantom_braking": {"per_hour": 400.0},
@@ -178,8 +172,8 @@ HIGHWAYS = [(traffic, {}) for traffic in [*TRAFFICS[1:], MIXED]]
 HIGHWAYS += [("idm", {"actions": form}) for form in ("lane_speed", "continuous")]
 HIGHWAYS += [("idm_mobil", {"env": "lane_drop", "recycle": False})]
 #: Some enter and some leave.
-FLOW = {"vph": 1200.0, "ramp_vph": 900.0, "exit_share": 0.3, "slots": 20}
-HIGHWAYS += [("idm_mobil", {"env": "weave", "flow": FLOW})]
+FLOW = {"vph": 1200.0, "ramp_vph": 900.0, "exit_share": 0.3, "slots": 20, "to_m": 210.0}
+HIGHWAYS += [("idm_mobil", {"env": "weave", "scene": {"merge_m": 50.0}, "flow": FLOW})]
 
 
 @pytest.fixture(scope="module", params=HIGHWAYS, ids=str)

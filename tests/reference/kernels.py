@@ -22,6 +22,12 @@ RUNNABLE = [
     pytest.param(name, marks=pytest.mark.slow) if name == "default" else name
     for name in list(VARIANTS)[list(VARIANTS).index(best_variant()) :]
 ]
+#: Parts of all kinds; no batch size of the tests is a multiple of the sum of their shares.
+MIXED = {
+    "name": "mixed",
+    "shares": {"idm_mobil": 2}
+    | dict.fromkeys(("gan", "human", "idm_faults", "idm_random", "gan_calibrated"), 1),
+}
 
 
 def kernel_of(env: HighwayEnv, variant: str | None = None) -> Kernel:

@@ -5,8 +5,8 @@ import os
 from contextlib import contextmanager
 
 import pytest
+from agents import agents_small
 
-from ganlane.agents import Rainbow, RainbowConfig
 from ganlane.build import make_env, make_traffic
 from ganlane.settings.commands import DrivingConfig
 from ganlane.settings.env import EnvConfig
@@ -37,7 +37,7 @@ def road(rows=8):
 
 
 def agent(seed=0, **options):
-    return Rainbow(RainbowConfig(**{**SMALL, **options}), OBSERVATION_SIZE, seed=seed)
+    return agents_small.agent(OBSERVATION_SIZE, seed, **{**SMALL, **options})
 
 
 def settings(decisions, progress=False, **options):

@@ -148,18 +148,6 @@ def test_a_wandb_that_does_not_start_is_one_sentence(fake, tmp_path, monkeypatch
         WandbLog(tmp_path)
 
 
-@pytest.mark.slow
-def test_the_real_wandb_keeps_an_offline_run(tmp_path, monkeypatch):
-    pytest.importorskip("wandb", reason="the extra wandb is not installed")
-    monkeypatch.delenv("WANDB_MODE", raising=False)
-    log = WandbLog(tmp_path)
-    log.write({"decisions": 100, "loss": 0.5})
-    log.write({"decisions": 100, "evaluation/mean_reward": 2.0})
-    log.close()
-    (stored,) = tmp_path.glob("wandb/offline-run-*/*.wandb")
-    assert b"evaluation/mean_reward" in stored.read_bytes()
-
-
 def test_the_option_chooses_the_logs(fake, tmp_path):
     pytest.importorskip("tensorboard", reason="the extra tensorboard is not installed")
     assert make_logs(LoggerConfig(), tmp_path) == []

@@ -1,6 +1,8 @@
 """The loop on a small highway: it learns, logs, stops, and resumes to the same weights."""
 
+import os
 import signal
+import time
 
 import pytest
 import torch
@@ -8,8 +10,8 @@ from agents.agents_small import same_weights, transitions
 from training.small_runs import OBSERVATION_SIZE, agent, road, rows, settings, signal_at, train
 
 from ganlane.agents import Rainbow, RainbowConfig, load_agent
-from ganlane.training import loop
-from ganlane.training.checkpoint import Checkpointer, TrainingState
+from ganlane.training import checkpoint, loop
+from ganlane.training.checkpoint import LAST, Checkpointer, TrainingState, load_checkpoint
 
 #: So long that the buffer is full for a while.
 WHOLE = settings(480, log_every=240)
@@ -24,10 +26,8 @@ def whole(tmp_path_factory):
     return learner, folder
 
 
-def test_the_agent_learns_to_stay_on_the_road_and_the_global_random_state_is_left_alone(tmp_path):
-    random_state = torch.get_rng_state()
+def test_the_agent_learns_to_stay_on_the_road(tmp_path):
     train(road(16), agent(), settings(1600), tmp_path)
-    assert torch.equal(torch.get_rng_state(), random_state)
     first, *_, last = rows(tmp_path / "metrics.csv")
     assert first["out_of_road_rate"] > 0.5
     assert last["out_of_road_rate"] < 0.2
@@ -127,3 +127,34 @@ def test_the_best_evaluated_agent_is_kept_and_the_last_one_too(tmp_path):
     assert torch.equal(last.network.head.weight_mu, learner.weights()["head.weight_mu"])
     assert metadata["training"]["mean_reward"] == 3.0
     assert metadata["training"]["decisions"] == 160
+
+
+def train_until_killed(folder):
+    """A run without an end, which saves whenever it may, in a child; its process."""
+    child = os.fork()
+    if child == 0:
+        try:
+            checkpoint.PATIENCE = 0.0
+            train(road(8), agent(), settings(10**9, checkpoint_every_s=0.0), folder)
+        finally:
+            os._exit(1)
+    return child
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_run_killed_at_any_moment_is_resumed_to_the_same_weights(tmp_path):
+    """Killed a tenth of a second after its first checkpoint; other moments are in tests/trial."""
+    folder = tmp_path / "parts"
+    last = folder / LAST
+    child = train_until_killed(folder)
+    while not last.exists():
+        assert os.waitpid(child, os.WNOHANG) == (0, 0)
+        time.sleep(0.01)
+    time.sleep(0.11)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    more = settings(int(load_checkpoint(last)["counters"]["decisions"]) + 160)
+    resumed, whole = agent(seed=5), agent()
+    train(road(8), resumed, more, folder, resume=last)
+    train(road(8), whole, more, tmp_path / "whole")
+    assert same_weights(whole, resumed)

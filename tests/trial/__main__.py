@@ -1,10 +1,8 @@
 """Tries to break the package, and counts what held.
 
     python -m tests.trial --minutes 60 --report docs/reliability.md
-    python -m tests.trial kill --runs 45 --minutes 15
-    python -m tests.trial damage --inputs 10000
+    python -m tests.trial kill --minutes 15
     python -m tests.trial damage --input 'scene CSV:17'         a damaged file again
-    python -m tests.trial soak --configurations 500 --minutes 40
     python -m tests.trial soak --configuration 12               a configuration again
 
 Parts: kill (kill -9, then resumed to the same bits), damage (damaged files), soak (random
@@ -28,39 +26,22 @@ from .kill import kill
 from .soak import once, soak
 from .tally import Tally
 
-MARKERS = "<!-- begin trial -->", "<!-- end trial -->"
+SECTION = "trial"
 #: Parts, and their shares of the minutes.
-SHARES = {"kill": 6, "damage": 4, "soak": 8}
+PARTS = {"kill": (kill, 6), "damage": (damage, 4), "soak": (soak, 8)}
 HEAD = "| part | tried | failed | minutes |\n|---|---|---|---|"
-
-
-def run(part: str, options: argparse.Namespace, minutes: float, scratch: Path) -> Tally:
-    """One part; its counts."""
-    tally = Tally(part)
-    begun = time.monotonic()
-    if part == "kill":
-        kill(tally, options.runs, options.seed, minutes, scratch)
-    elif part == "damage":
-        damage(tally, options.inputs, options.seed, minutes, scratch)
-    else:
-        soak(tally, options.configurations, options.seed, minutes)
-    tally.seconds = time.monotonic() - begun
-    return tally
 
 
 def parse() -> argparse.Namespace:
     """The command line."""
     parser = make_parser(__doc__)
     add = parser.add_argument
-    add("parts", nargs="*", choices=[[], *SHARES], default=list(SHARES), metavar="PART")
+    add("parts", nargs="*", choices=[[], *PARTS], metavar="PART")
     add("--minutes", type=float, default=10.0, help="of all parts together, about")
     add("--seed", type=int, default=0)
-    add("--runs", type=int, default=45, help="that kill disturbs")
-    add("--inputs", type=int, default=10_000, help="damaged files")
-    add("--configurations", type=int, default=500, help="that soak drives")
     add("--input", metavar="KIND:NUMBER", help="one damaged file, as a failure names it")
     add("--configuration", type=int, help="one configuration, as a failure names it")
-    add_report(parser, *MARKERS)
+    add_report(parser, SECTION)
     return parser.parse_args()
 
 
@@ -68,8 +49,9 @@ def attempt(options: argparse.Namespace) -> str:
     """The chosen parts one after the other, and their table; a failure ends the process with 1."""
     # Before the folder changes, which a relative path would not survive.
     document = None if options.report is None else options.report.absolute()
-    report = ReportSection(document, *MARKERS)
-    whole = sum(SHARES[part] for part in options.parts)
+    report = ReportSection(document, SECTION)
+    parts = options.parts or list(PARTS)
+    share_s = 60.0 * options.minutes / sum(PARTS[part][1] for part in parts)
     with tempfile.TemporaryDirectory(prefix="trial-") as name:
         scratch = Path(name)
         os.chdir(scratch)
@@ -80,11 +62,15 @@ def attempt(options: argparse.Namespace) -> str:
             if options.configuration is not None:
                 return once(options.configuration)
             tallies = []
-            for part in options.parts:
+            for part in parts:
+                tries, shares = PARTS[part]
+                tally = Tally(part)
                 folder = scratch / part
                 folder.mkdir()
-                minutes = options.minutes * SHARES[part] / whole
-                tallies.append(run(part, options, minutes, folder))
+                begun = time.monotonic()
+                tries(tally, options.seed, begun + shares * share_s, folder)
+                tally.seconds = time.monotonic() - begun
+                tallies.append(tally)
         finally:
             os.chdir("/")
     table = "\n".join([HEAD, *(tally.row() for tally in tallies)])

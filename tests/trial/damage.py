@@ -8,6 +8,7 @@ refused, or told of.
 from __future__ import annotations
 
 import io
+import itertools
 import os
 import pickle
 import random
@@ -73,7 +74,7 @@ class Reader(NamedTuple):
 def make_files(folder: Path) -> None:
     """One good file of each kind."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name in ("agent_idm", "generator_paper", "generator_calibrated"):
+    for name in ("agent_idm", "generator_paper"):
         shutil.copy(CHECKPOINTS / f"{name}.safetensors", folder)
     shutil.copy(SHIPPED_REFERENCE, folder / "reference.json")
     (folder / "scene.csv").write_text(SCENE)
@@ -132,7 +133,6 @@ JSON = (*TEXT, damages.in_json, damages.in_json)
 READERS = {
     "agent": Reader("agent_idm.safetensors", read_agent, WEIGHTS, True),
     "generator": Reader("generator_paper.safetensors", _generator, WEIGHTS, True),
-    "calibrated generator": Reader("generator_calibrated.safetensors", _generator, WEIGHTS, True),
     "last.pt": Reader("run/checkpoints/last.pt", _resumed, STATE, True, 1),
     "config.yaml": Reader("run/config.yaml", _resumed, TEXT, share=1),
     "metrics.csv, resumed": Reader("run/metrics.csv", read_rows, TEXT),
@@ -149,15 +149,13 @@ READERS = {
 }
 
 
-def damage(tally: Tally, count: int, seed: int, minutes: float, scratch: Path) -> None:
-    """Read ``count`` damaged files, or as many as the minutes allow."""
+def damage(tally: Tally, seed: int, end: float, scratch: Path) -> None:
+    """Read damaged files until the monotonic clock is at ``end``."""
     trial = Trial(good_files(scratch), scratch / "damaged")
-    end = time.monotonic() + 60.0 * minutes
     rng = random.Random(seed)
     names = [name for name, reader in READERS.items() for _ in range(reader.share)]
-    for first in range(0, count, BATCH):
-        numbers = range(first, min(first + BATCH, count))
-        items = [(rng.choice(names), seed * 10**7 + number) for number in numbers]
+    for first in itertools.count(seed * 10**7, BATCH):
+        items = [(rng.choice(names), number) for number in range(first, first + BATCH)]
         for (name, number), result in forked(trial, items, AT_MOST_S, MEMORY_GIB):
             kind = result.split(maxsplit=1)[0].rstrip(":")
             tally.what["damaged files"] += 1
@@ -209,10 +207,12 @@ class Trial:
         except UserError as error:
             result = f"REFUSED {error}"
         except BaseException as error:
-            result = f"TRACEBACK after {way.__name__}: {traceback_of(error)}"
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            told = f"{type(error).__name__}: {error} ({place})"
+            result = f"TRACEBACK after {way.__name__}: {told}"
             if isinstance(error, OSError) and error.errno is not None:
                 result = f"REFUSED {error}"
-        if "EXECUTED" in said.getvalue():
+        if Path("executed").exists():
             return "TRACEBACK the code of a bomb ran"
         return result[:400]
 
@@ -234,14 +234,6 @@ def quietly(reader: Reader, path: Path, said: io.StringIO) -> Any:
     with redirect_stdout(said), redirect_stderr(said), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return reader.read(path)
-
-
-def traceback_of(error: BaseException) -> str:
-    """Where an error came from, in a line."""
-    place = traceback.extract_tb(error.__traceback__)
-    ours = next((frame for frame in reversed(place) if "/ganlane/" in frame.filename), place[-1])
-    where = f"{Path(ours.filename).name}:{ours.lineno}"
-    return f"{type(error).__name__} at {where}: {str(error)[:200]!r}"
 
 
 def bits(content: Any) -> bytes:

@@ -8,6 +8,7 @@ process of its own, so ``kill -9`` of it is what it is to a user's run.
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import os
 import random
@@ -66,14 +67,13 @@ class Attempt(NamedTuple):
     said: str
 
 
-def kill(tally: Tally, count: int, seed: int, minutes: float, scratch: Path) -> None:
-    """Disturb ``count`` runs, or as many as the minutes allow, each three times or more."""
+def kill(tally: Tally, seed: int, end: float, scratch: Path) -> None:
+    """Disturb runs, each three times or more, until the monotonic clock is at ``end``."""
     rng = random.Random(seed)
-    end = time.monotonic() + 60.0 * minutes
     torch.set_num_threads(1)  # more must not exist before a fork
     train(["traffic=idm", "total_decisions=0"])  # refused, after Hydra was loaded
     undisturbed: dict[int, tuple[Path, float]] = {}
-    for number in range(count):
+    for number in itertools.count():
         if time.monotonic() > end:
             return
         scheme = number % len(SCHEMES)
@@ -183,8 +183,7 @@ def differences(folder: Path, whole: Path) -> list[str]:
     wrong = [f"left behind: {path.relative_to(folder)}" for path in folder.rglob(".*.part")]
     for path in whole.rglob("agent.safetensors"):
         name = path.relative_to(whole)
-        before, after = load_file(path), load_file(folder / name)
-        if _bits(before) != _bits(after):
+        if _bits(path) != _bits(folder / name):
             wrong.append(f"other weights in {name}")
     tables = [json.loads((run / "results.json").read_text())["rows"] for run in (folder, whole)]
     if tables[0] != tables[1]:
@@ -196,8 +195,8 @@ def differences(folder: Path, whole: Path) -> list[str]:
     return wrong
 
 
-def _bits(weights: dict[str, torch.Tensor]) -> dict[str, bytes]:
-    return {name: value.numpy().tobytes() for name, value in weights.items()}
+def _bits(path: Path) -> dict[str, bytes]:
+    return {name: value.numpy().tobytes() for name, value in load_file(path).items()}
 
 
 def _rows(path: Path) -> list[dict[str, str]]:

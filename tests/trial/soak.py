@@ -4,6 +4,7 @@ all of them.
 
 from __future__ import annotations
 
+import itertools
 import os
 import random
 import time
@@ -35,6 +36,8 @@ TRAFFICS = (*RULES, *RULES, "idm_random", "idm_faults", "human", "gan", "gan_cal
 ENVS = ("highway", "highway", "highway", "dense", "cut_in", "stalled_car", "stop_and_go")
 ROADS = ("merge", "on_ramp", "lane_drop", "weave", "exit")
 ENVS += (*ROADS, "blocked_lane", "replay")
+#: For which each configuration is driven.
+SECONDS = 2.0
 #: Pairs of vehicles in all rows together; generated traffic needs a kilobyte or more for each.
 MOST_PAIRS = 2_000_000
 #: Vehicles of a scenario, at most.
@@ -43,18 +46,15 @@ IN_SCENARIO = 44
 FASTEST_MPS = 70.0
 
 
-def soak(tally: Tally, count: int, seed: int, minutes: float) -> None:
-    """Drive ``count`` configurations, each for its share of the minutes.
-
-    Where making them takes longer than that, fewer are driven.
+def soak(tally: Tally, seed: int, end: float, scratch: Path) -> None:
+    """Drive configurations, each for a moment, until the monotonic clock is at ``end``; writes
+    nothing.
     """
     torch.set_num_threads(1)
-    begun = time.monotonic()
-    for i in range(count):
-        if time.monotonic() > begun + 60.0 * minutes:
+    for number in itertools.count(seed * 10**6):
+        if time.monotonic() > end:
             return
-        until = begun + 60.0 * minutes * (i + 1) / count
-        one_configuration(tally, seed * 10**6 + i, until)
+        one_configuration(tally, number, time.monotonic() + SECONDS)
 
 
 def once(number: int) -> str:
@@ -65,7 +65,7 @@ def once(number: int) -> str:
 
 
 def one_configuration(tally: Tally, number: int, until: float) -> None:
-    """The first choice of this number that is not refused, driven until then, or for a moment."""
+    """The first choice of this number that is not refused, driven until then."""
     rng = random.Random(number)
     while True:
         choice = random_choice(rng)
@@ -75,7 +75,7 @@ def one_configuration(tally: Tally, number: int, until: float) -> None:
         except UserError:  # its parts do not fit together
             continue
     what = f"configuration {number} (soak --configuration {number}): {choice}"
-    drive(tally, env, choice, what, max(until, time.monotonic() + 0.2))
+    drive(tally, env, choice, what, until)
     tally.what["configurations"] += 1
 
 
